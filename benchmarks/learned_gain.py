@@ -31,7 +31,7 @@ from coopoc.learned.nets.gain_net import GainNet
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Segments, clients
 from coopoc.learned.training.fit import descend
-from coopoc.learned.training.machine import one_core, row_threads
+from coopoc.learned.training.machine import one_core
 from coopoc.learned.training.schedule import Schedule
 
 ROUNDS = 5
@@ -48,7 +48,6 @@ class Row(NamedTuple):
     call: Callable[[], Any]
     error: float
     """Largest difference from plain torch: of trained weights, or of positions in m."""
-    threads: int = 1
 
 
 @intrinsic
@@ -142,18 +141,16 @@ def training(net: GainNet, pieces: Segments) -> list[Row]:
         Row(f"plain torch, batch {count}", count * length, lambda: plain_training(net, pieces, full), 0.0),
     ]
     ours = [
-        ("engine, batch 1", [one], [few], 1),
-        (f"engine, batch {count}", [full], [full], 1),
-        (f"engine, 4 nets x batch {count // 6}", four, [p[:2] for p in four], 1),
-        (f"engine, 4 nets x batch {count // 6}, 2 threads", four, [p[:2] for p in four], 2),
-        ("engine, 35 nets x batch 2", many, [p[:2] for p in many[:3]], 1),
-        ("engine, 35 nets x batch 2, 2 threads", many, [p[:2] for p in many[:3]], 2),
+        ("engine, batch 1", [one], [few]),
+        (f"engine, batch {count}", [full], [full]),
+        (f"engine, 4 nets x batch {count // 6}", four, [p[:2] for p in four]),
+        ("engine, 35 nets x batch 2", many, [p[:2] for p in many[:3]]),
     ]
-    for words, plans, checked, threads in ours:
+    for words, plans, checked in ours:
         wanted = torch.stack([plain_training(net, pieces, plan) for plan in checked])
         error = float((our_training(net, pieces, checked) - wanted).abs().max())
         total = sum(plan.size for plan in plans) * length
-        rows.append(Row(words, total, lambda plans=plans: our_training(net, pieces, plans), error, threads))
+        rows.append(Row(words, total, lambda plans=plans: our_training(net, pieces, plans), error))
     return rows
 
 
@@ -176,8 +173,7 @@ def seconds(rows: list[Row]) -> dict[str, float]:
     spent: dict[str, list[float]] = {row.words: [] for row in rows}
     for _ in range(ROUNDS):
         for row in rows:
-            with row_threads(row.threads):
-                spent[row.words].append(timed(row.call) / row.steps)
+            spent[row.words].append(timed(row.call) / row.steps)
     return {words: float(np.median(times)) for words, times in spent.items()}
 
 

@@ -260,6 +260,8 @@ def _help(commands: Mapping[str, Command], prog: str) -> str:
 
 def _summary(command: Command) -> str:
     """First line of the docstring; for a command that cannot be loaded the reason, and the others stay visible."""
+    if isinstance(command, EntryPoint) and (written := plugins.summary_in(command.value)) is not None:
+        return written
     try:
         loaded = command.load() if isinstance(command, EntryPoint) else command
     except Exception as error:

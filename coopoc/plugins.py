@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import ast
 import difflib
-import importlib.util
 import os
 import sys
 from collections.abc import Iterable, Mapping
@@ -92,23 +91,48 @@ def names_in(value: str) -> tuple[str, ...] | None:
     >>> names_in("coopoc.plugins:find")
     ()
     """
+    statement = _definition(value)
+    if isinstance(statement, ast.FunctionDef | ast.ClassDef):
+        return ()
+    written = getattr(statement, "value", None)
+    if isinstance(written, ast.Dict):
+        keys = [key.value for key in written.keys if isinstance(key, ast.Constant)]
+        return tuple(map(str, keys)) if len(keys) == len(written.keys) else None
+    named = isinstance(written, ast.Call) and getattr(written.func, "id", "") not in MAPPINGS
+    return () if named else None
+
+
+def summary_in(value: str) -> str | None:
+    """First line of the docstring of the function that an entry point names, or keys of its mapping, from its source.
+
+    >>> summary_in("coopoc.plugins:summary_in")[:27]
+    'First line of the docstring'
+    """
+    statement = _definition(value)
+    if isinstance(statement, ast.FunctionDef):
+        return (ast.get_docstring(statement) or "").partition("\n")[0]
+    keys = names_in(value)
+    return " | ".join(keys) if keys else None
+
+
+def _definition(value: str) -> ast.stmt | None:
+    """The statement that defines what "package.module:NAME" names; None if only an import can show it."""
     module, _, name = value.partition(":")
+    parts, path, origin = module.split("."), None, ""
     try:
-        spec = importlib.util.find_spec(module)
-        body = ast.parse(Path(str(spec and spec.origin)).read_text(encoding="utf-8")).body
+        for k in range(len(parts)):  # importlib.util.find_spec would import the packages above
+            finders = (f.find_spec(".".join(parts[: k + 1]), path) for f in sys.meta_path if hasattr(f, "find_spec"))
+            spec = next((spec for spec in finders if spec), None)
+            path, origin = (spec.submodule_search_locations, str(spec.origin)) if spec else ([], "")
+        body = ast.parse(Path(origin).read_text(encoding="utf-8")).body
     except (ImportError, OSError, SyntaxError, ValueError):
         return None
     for statement in body:
         if isinstance(statement, ast.FunctionDef | ast.ClassDef) and statement.name == name:
-            return ()
+            return statement
         targets = statement.targets if isinstance(statement, ast.Assign) else [getattr(statement, "target", None)]
         if any(isinstance(target, ast.Name) and target.id == name for target in targets):
-            written = getattr(statement, "value", None)
-            if isinstance(written, ast.Dict):
-                keys = [key.value for key in written.keys if isinstance(key, ast.Constant)]
-                return tuple(map(str, keys)) if len(keys) == len(written.keys) else None
-            named = isinstance(written, ast.Call) and getattr(written.func, "id", "") not in MAPPINGS
-            return () if named else None
+            return statement
     return None
 
 

@@ -3,11 +3,10 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from coopoc.arrays import Bools, Floats, Ints
+from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 
@@ -17,8 +16,6 @@ SLOWEST, FASTEST = 2e-3, 500.0
 """m/s: a car in degrees per second has 0.0003 at most, an airliner in metres 250."""
 LATEST = 1e11
 """s since 1970, the year 5138."""
-LONGEST_ID = 200
-"""Characters."""
 CELLS, PER_ROW = 500_000, 200
 """Steps times vehicles that any file may take, and how many more a row of it may."""
 
@@ -66,20 +63,20 @@ def assemble(
             raise InputError(field, f"{value} s", "must be > 0", "Give seconds.")
     if not len(t):
         raise InputError(file, "0 rows", "must hold at least two instants", "Check that the file is complete.")
-    ids, column = _ids(vehicle, file)
+    ids, column = _ids(vehicle)
     numbers = np.hstack([position, velocity]) if velocity is not None else np.asarray(position, dtype=float)
     stamps = np.round(np.asarray(t, dtype=float), 6)
     by_vehicle = np.split(np.argsort(column, kind="stable"), np.cumsum(np.bincount(column))[:-1])
-    for one, rows in zip(ids, by_vehicle, strict=True):
+    for vehicle_id, rows in zip(ids, by_vehicle, strict=True):
         late = np.flatnonzero(np.diff(stamps[rows]) <= 0)
         if len(late):
             before, after = stamps[rows[late[0]]], stamps[rows[late[0] + 1]]
-            raise InputError(
-                f"{file}: row {rows[late[0] + 1] + 1}, column t",
-                f"{after!s} s after {before!s} s of vehicle {one}",
-                "dt must be > 0: the stamps of a vehicle increase from row to row",
-                "Remove the repeated row." if before == after else "Sort the rows by time.",
+            where, given = (
+                f"{file}: row {rows[late[0] + 1] + 1}",
+                f"{after!s} s after {before!s} s of vehicle {vehicle_id}",
             )
+            allowed = "dt must be > 0: the stamps of a vehicle increase from row to row"
+            raise InputError(f"{where}, column t", given, allowed, "Sort the rows by time, or remove one that repeats.")
     if not any_scale:
         check_scale(stamps, numbers[:, :3], by_vehicle, file)
     if dt is None:
@@ -239,36 +236,32 @@ def check_size(steps: float, vehicles: int, rows: int, dt: float, file: str) -> 
         )
 
 
-def _ids(vehicle: Sequence[str], file: str) -> tuple[tuple[str, ...], Ints]:
+def _ids(vehicle: Sequence[str]) -> tuple[tuple[str, ...], Ints]:
     """Names in the order of their first row, and the (L,) column of each row."""
-    place: dict[str, int] = {}
-    column = np.array([place.setdefault(str(one), len(place)) for one in vehicle], dtype=np.int64)
-    for name, k in place.items():
-        if len(name) > LONGEST_ID:
-            where, allowed = f"{file}: row {np.argmax(column == k) + 1}", f"must have at most {LONGEST_ID} characters"
-            raise InputError(f"{where}, column id", f"{name[:40]}...", allowed, "Check the column.")
-    return tuple(place), column
+    column_of: dict[str, int] = {}
+    column = np.array([column_of.setdefault(str(name), len(column_of)) for name in vehicle], dtype=np.int64)
+    return tuple(column_of), column
 
 
 def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tuple[Floats, Floats]:
     """Equally spaced grid (T,) and the rows on it (T, N, C): instants without any vehicle are filled in."""
-    instants, step = np.unique(stamps, return_inverse=True)
-    gaps: Any = np.diff(instants) if len(instants) > 1 else np.ones(1)
-    steps = np.rint((instants - instants[0]) / gaps.min())
-    sparse = steps[-1] > 50 * len(steps)
-    place = np.zeros(len(steps), dtype=np.int64) if sparse else steps.astype(np.int64)
-    grid = instants.copy() if sparse else np.round(np.linspace(instants[0], instants[-1], place[-1] + 1), 6)
-    if sparse or np.abs(grid[place] - instants).max() > 1e-3 * gaps.min() + 1e-6:
+    instants, row_of = np.unique(stamps, return_inverse=True)
+    gaps = np.diff(instants) if len(instants) > 1 else np.ones(1)
+    step = np.rint((instants - instants[0]) / gaps.min())
+    spaced = bool(step[-1] <= 50 * len(step))
+    if spaced:
+        grid = np.round(np.linspace(instants[0], instants[-1], int(step[-1]) + 1), 6)
+        spaced = bool(np.abs(grid[step.astype(np.int64)] - instants).max() <= 1e-3 * gaps.min() + 1e-6)
+    if not spaced:
         given = f"instants between {gaps.min():g} and {gaps.max():g} s apart"
         hint = "Resample: load_fleet(..., dt=0.1), or FILE?dt=0.1 on the command line."
         raise InputError(f"{file}: t", given, "must be equally spaced", hint)
-    grid[place] = instants
+    grid[step.astype(np.int64)] = instants
     table = np.full((len(grid), column.max() + 1, numbers.shape[1]), np.nan)
-    table[place[step], column] = numbers
+    table[step.astype(np.int64)[row_of], column] = numbers
     return grid, table
 
 
 def _typical_speed(t: Floats, position: Floats) -> float:
     speed = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1) / np.diff(t)
-    moving: Bools = speed > 0
-    return float(np.median(speed[moving])) if moving.any() else 0.0
+    return float(np.median(speed[speed > 0])) if (speed > 0).any() else 0.0

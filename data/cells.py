@@ -195,7 +195,9 @@ def _read_csv(path: Path, text: Sequence[str]) -> pd.DataFrame:
     if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
         form["float_precision"] = "round_trip"  # the default became exact in 3.1
     try:
-        return pd.read_csv(path, header=0, index_col=False, skipinitialspace=True, encoding="utf-8-sig", **form)
+        options = {"header": 0, "index_col": False, "skipinitialspace": True, "encoding": "utf-8-sig", **form}
+        table: pd.DataFrame = pd.read_csv(path, **options)
+        return table
     except pd.errors.ParserError as error:
         wide = re.search(r"fields in line (\d+), saw (\d+)", str(error))
         raise _too_wide(path, int(wide[1]) - 1, int(wide[2]), len(header)) if wide else error from None

@@ -107,13 +107,13 @@ def make(recipe: tyro.conf.Positional[str], *, maps: Path, out: Path = Path("fle
 
 
 def convert_(source: tyro.conf.Positional[str], out: tyro.conf.Positional[Path]) -> None:
-    """Convert a drive to CSV, Parquet or a folder of TUM files.
+    """Convert a drive to CSV or Parquet.
 
     Example: coopoc data convert "fcd.xml?dt=0.1" drive.csv
 
     Args:
         source: name or path of the drive, and options.
-        out: file in .csv or .parquet, or a folder for TUM files.
+        out: file in .csv or .parquet.
     """
     print(f"{convert(source, out)!r} written to {out}", file=sys.stderr)
 

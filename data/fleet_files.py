@@ -1,4 +1,4 @@
-"""Readers and writers of drives: tables (those of CARLA, too), TUM trajectories, SUMO's floating-car data."""
+"""Readers of drives: tables (those of CARLA, too), TUM trajectories, SUMO's floating-car data; a writer of tables."""
 
 from __future__ import annotations
 
@@ -9,11 +9,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.file_names import file_name, inside
 from coopoc.formats import trajectories as tum
-from coopoc.formats.values import LARGEST
 from coopoc.plugins import one_of
 from coopoc.world.fleet import Fleet
 
@@ -21,6 +18,8 @@ from .assemble import assemble
 from .cells import named_columns, numeric, read_frame, seconds, words
 
 NEEDED, VELOCITY = ("id", "t", "x", "y", "z"), ("vx", "vy", "vz")
+FCD = {"id": "", "x": "", "y": "", "z": "0", "angle": "", "slope": "0", "speed": ""}
+"""Attributes of a vehicle in SUMO's file, and what stands for one that is not there; an empty one is refused."""
 
 
 def read_table(
@@ -102,32 +101,10 @@ def read_tum(path: Path, *, repeats: Literal["refuse", "drop"] = "refuse", **opt
     if not files:
         raise InputError("path", path, "must be a TUM file or a folder with .tum or .txt files", "Check the path.")
     poses = [tum.read_tum(file, repeats=repeats) for file in files]
-    ids = [file.stem for file, one in zip(files, poses, strict=True) for _ in range(len(one))]
-    t, x = (np.concatenate([getattr(one, field) for one in poses]) for field in ("stamps", "position"))
+    ids = [file.stem for file, track in zip(files, poses, strict=True) for _ in range(len(track))]
+    t, x = (np.concatenate([getattr(track, field) for track in poses]) for field in ("stamps", "position"))
     source = f"TUM {path.name}, velocity by backward difference"
     return assemble(ids, t, x, **options, file=path.name, name=path.stem, source=source)
-
-
-def write_tum(fleet: Fleet, folder: Path) -> None:
-    """Write <id>.tum for every vehicle: no velocity, and the identity as orientation, which a Fleet lacks.
-
-    Args:
-        fleet: to write.
-        folder: for the files.
-
-    Raises:
-        InputError: an id that is no file name, ids that differ in case only, or a symbolic link out of the folder.
-    """
-    hint = "Write a .csv or .parquet file, which takes any id."
-    paths = [folder / f"{file_name('id', name, hint)}.tum" for name in fleet.ids]
-    if len({name.casefold() for name in fleet.ids}) < len(fleet.ids):
-        raise InputError("id", sorted(fleet.ids), "must differ in more than their case", hint)
-    folder.mkdir(parents=True, exist_ok=True)
-    for column, path in enumerate(inside(folder, path) for path in paths):
-        present = fleet.present[:, column]
-        position = fleet.position[present, column]
-        poses = tum.Trajectory(np.round(fleet.t[present], 6), position, np.tile(np.eye(3), (len(position), 1, 1)))
-        tum.write_tum(poses, path)
 
 
 def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Fleet:
@@ -142,49 +119,28 @@ def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Flee
         options: dt (s, resample; None keeps SUMO's steps), max_gap and any_scale, as of `assemble`.
 
     Raises:
-        InputError: no XML, an attribute missing or no finite number, or what Fleet refuses.
+        InputError: no XML, an attribute that is missing or no finite number (with the vehicle's row, counted through
+            the file), or what Fleet refuses.
     """
-    vehicle, t, (*front, angle, slope, speed) = _fcd_rows(path)
-    angle, slope = np.radians(angle), np.radians(slope)
-    ahead = np.column_stack([np.sin(angle) * np.cos(slope), np.cos(angle) * np.cos(slope), np.sin(slope)])
-    centre, velocity = np.column_stack(front) - 0.5 * vehicle_length * ahead, speed[:, None] * ahead
-    source = f"SUMO FCD {path.name}, centres of vehicles {vehicle_length:g} m long"
-    return assemble(vehicle, t, centre, velocity, **options, file=path.name, name=path.stem, source=source)
+    import pandas as pd
 
-
-def _fcd_rows(path: Path) -> tuple[list[str], Floats, Floats]:
-    """Ids, times (L,) s, and x, y, z, angle deg, slope deg, speed m/s (6, L)."""
-    vehicle: list[str] = []
-    rows: list[list[float]] = []
-    now = "0"
+    rows: list[list[str]] = []
+    now = ""
     try:
         for event, element in ElementTree.iterparse(path, events=("start", "end")):
             if event == "start" and element.tag == "timestep":
-                now = element.attrib["time"]
+                now = element.get("time", "")
             elif event == "end" and element.tag == "vehicle":
-                a = element.attrib
-                given = [now, a["x"], a["y"], a.get("z", "0"), a["angle"], a.get("slope", "0"), a["speed"]]
-                vehicle.append(a["id"])
-                rows.append([_finite(word) for word in given])
-                if np.isnan(rows[-1]).any():
-                    allowed = "must be seven finite numbers: time, x, y, z, angle, slope, speed"
-                    where = f"{path.name}: vehicle {a['id']} at time {now} s"
-                    raise InputError(where, " ".join(given), allowed, "Mend the numbers or remove the vehicle.")
+                rows.append([element.get(name, default) for name, default in FCD.items()] + [now])
             elif event == "end" and element.tag == "timestep":
                 element.clear()
     except ElementTree.ParseError as error:
         raise InputError(path.name, error, "must be XML of sumo --fcd-output", "Write the file again.") from None
-    except KeyError as error:
-        hint = "Run sumo with --fcd-output.attributes x,y,z,angle,slope,speed."
-        allowed = f"every vehicle needs it (time {now} s)"
-        raise InputError(f"{path.name}: attribute {error}", "missing", allowed, hint) from None
-    table = np.array(rows).reshape(-1, 7)
-    return vehicle, table[:, 0], table[:, 1:].T
-
-
-def _finite(word: str) -> float:
-    try:
-        value = float(word) if word.isascii() and "_" not in word else np.nan
-    except ValueError:
-        return np.nan
-    return value if abs(value) <= LARGEST else np.nan
+    frame = pd.DataFrame(rows, columns=[*FCD, "t"], index=range(1, len(rows) + 1))
+    t, x, y, z, angle, slope, speed = (numeric(frame, name, path.name) for name in ("t", *FCD) if name != "id")
+    angle, slope = np.radians(angle), np.radians(slope)
+    ahead = np.column_stack([np.sin(angle) * np.cos(slope), np.cos(angle) * np.cos(slope), np.sin(slope)])
+    centre, velocity = np.column_stack([x, y, z]) - 0.5 * vehicle_length * ahead, speed[:, None] * ahead
+    source = f"SUMO FCD {path.name}, centres of vehicles {vehicle_length:g} m long"
+    ids = words(frame, "id", path.name)
+    return assemble(ids, t, centre, velocity, **options, file=path.name, name=path.stem, source=source)

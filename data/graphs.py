@@ -28,19 +28,15 @@ FLAT = 0.01
 def read_graph_log(path: Path, *, dt: float = 0.1) -> Log:
     """Log of a PyFG file: `graph_recording`, with the counts of what its file holds."""
     graph = read_pyfg(path)
-    seen, truth = graph_recording(graph, dt=dt)
-    vehicles = {name: "landmark" if k in seen.landmarks else "odometry" for k, name in enumerate(seen.ids)}
-    read = {"ranges": len(seen.links), "bearings": int(np.isfinite(seen.relative[0, :, 1]).sum())}
-    edges = len(graph.ranges) + len(graph.relative_point) + int(_others(graph).sum())
-    left = {
-        "edges outside the steps that all robots share, beside another of the same pair and step, or between points": (
-            edges - len(seen.links)
-        ),
-        "priors": len(graph.pose_prior) + len(graph.point_prior),
-    }
-    refused = {what: (count, "") for what, count in left.items() if count}
+    recording, truth = graph_recording(graph, dt=dt)
+    vehicles = {name: "landmark" if k in recording.landmarks else "odometry" for k, name in enumerate(recording.ids)}
+    read = {"ranges": len(recording.links), "bearings": int(np.isfinite(recording.relative[0, :, 1]).sum())}
+    left = len(graph.ranges) + len(graph.relative_point) + int(_others(graph).sum()) - len(recording.links)
+    where = "outside the steps that all robots share, beside another of the same pair and step, or between points"
+    counts = {f"edges {where}": left, "priors": len(graph.pose_prior) + len(graph.point_prior)}
+    refused = {what: (count, "") for what, count in counts.items() if count}
     read = {what: count for what, count in read.items() if count}
-    return Log(seen, truth, Summary(path.name, steps_in_words(seen), vehicles, read, refused), True)
+    return Log(recording, truth, Summary(path.name, steps_in_words(recording), vehicles, read, refused), True)
 
 
 def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]:
@@ -102,17 +98,18 @@ def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]
 
 def _chained(graph: Graph, places: Ints) -> Floats:
     """(n, 3) m, m, rad, poses of a robot by its odometry, the first at the origin."""
-    edges, path = graph.relative_pose, np.zeros((len(places), 3))
-    after = {a: k for k, (a, b) in enumerate(edges.nodes.tolist()) if graph.names[a][0] == graph.names[b][0]}
-    for n, (place, then) in enumerate(zip(places[:-1].tolist(), places[1:].tolist(), strict=True)):
-        k = after.get(place, -1)
-        if k < 0 or edges.nodes[k, 1] != then:
-            given = f"no odometry from {graph.names[place]} to {graph.names[then]}"
+    edges = graph.relative_pose
+    edge_of = {(a, b): k for k, (a, b) in enumerate(edges.nodes.tolist())}
+    steps = list(zip(places[:-1].tolist(), places[1:].tolist(), strict=True))
+    for first, second in steps:
+        if (first, second) not in edge_of:
+            given = f"no odometry from {graph.names[first]} to {graph.names[second]}"
             raise InputError("graph", given, "must join all poses of a robot", "Cut the file at the gap.")
-        (x, y, heading), (dx, dy), turn = path[n], edges.position[k], edges.orientation[k, 0]
-        c, s = np.cos(heading), np.sin(heading)
-        path[n + 1] = x + c * dx - s * dy, y + s * dx + c * dy, heading + turn
-    return path
+    index = [edge_of[step] for step in steps]
+    heading = np.concatenate([[0.0], np.cumsum(edges.orientation[index, 0])])
+    (dx, dy), c, s = edges.position[index].T, np.cos(heading[:-1]), np.sin(heading[:-1])
+    moved = np.column_stack([c * dx - s * dy, s * dx + c * dy])
+    return np.column_stack([np.vstack([np.zeros(2), np.cumsum(moved, axis=0)]), heading])
 
 
 def _others(graph: Graph) -> Bools:

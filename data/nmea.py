@@ -24,7 +24,7 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
     """Rows latitude, longitude, height (ellipsoidal: altitude and geoid separation), speed and compass_deg of a file,
     which is named after its vehicle.
 
-    GGA gives fixes, RMC dates, speed and course, VTG speed and course, GST standard deviations. Without a date, time is
+    GGA gives fixes, RMC dates, speed and course, GST standard deviations. Without a date, time is
     seconds of the day and goes on after midnight.
 
     Args:
@@ -43,7 +43,7 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
         raise MissingLibraryError("pynmeagps", "reading NMEA", "'coopoc[nmea]'") from None
     names = ("NMEAParseError", "NMEAMessageError", "NMEATypeError", "NMEAStreamError")
     damages = (*(getattr(exceptions, name) for name in names), ValueError, AttributeError, TypeError, LookupError)
-    found = _Sentences()
+    sentences = _Sentences()
     for number, line in enumerate(path.read_bytes().split(b"\n"), 1):
         start, where = line.find(b"$"), f"{path.name}: line {number}"
         if start < 0:
@@ -53,7 +53,7 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
             sentence: Any = NMEAReader.parse(line[start:].strip() + b"\r\n")
             if sentence is None:
                 raise ValueError("incomplete")
-            reason = found.add(sentence, number)
+            reason = sentences.add(sentence, number)
         except damages as error:
             where += f", {next(iter(str(error).splitlines()), '')[:60].partition(' - ')[0]}"
             reason = "damaged NMEA sentences"
@@ -61,13 +61,13 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
             summary.leave(reason, 1)
         elif reason:
             summary.refuse(reason, 1, where)
-    if not found.rows:
+    if not sentences.rows:
         hint = "Check that it holds GGA sentences with a fix."
         raise InputError(path.name, "0 fixes", "must hold NMEA sentences $..GGA", hint)
-    frame = pd.DataFrame(found.rows, columns=["t", "kind", "value", "row"]).set_index("row")
-    frame["std"] = [found.std.get((t, kind), np.nan) for t, kind in zip(frame["t"], frame["kind"], strict=True)]
-    early = frame["t"] < found.first_day  # sentences before the first date are of its day
-    return rows_of(frame.assign(t=frame["t"] + found.first_day * early, vehicle=path.stem), path.name)
+    frame = pd.DataFrame(sentences.rows, columns=["t", "kind", "value", "row"]).set_index("row")
+    frame["std"] = [sentences.std.get((t, kind), np.nan) for t, kind in zip(frame["t"], frame["kind"], strict=True)]
+    early = frame["t"] < sentences.first_day  # sentences before the first date are of its day
+    return rows_of(frame.assign(t=frame["t"] + sentences.first_day * early, vehicle=path.stem), path.name)
 
 
 class _Sentences:
@@ -77,14 +77,12 @@ class _Sentences:
         self.rows: list[tuple[float, str, float, int]] = []
         self.std: dict[tuple[float, str], float] = {}
         self.day, self.last, self.first_day = 0.0, -np.inf, 0.0
-        self.moved: set[float] = set()
 
     def add(self, s: Any, number: int) -> str:
         """Take a sentence of a line; why it was left out, or nothing."""
-        if s.msgID not in ("GGA", "RMC", "VTG", "GST"):
+        if s.msgID not in ("GGA", "RMC", "GST"):
             return f"NMEA sentences {s.msgID}"
-        if s.msgID != "VTG":
-            self._clock(s.time, getattr(s, "date", None))
+        self._clock(s.time, getattr(s, "date", None))
         if s.msgID == "GGA":
             if (s.lat or s.lon) and not (LATITUDE.fullmatch(s.payload[1]) and LONGITUDE.fullmatch(s.payload[3])):
                 raise ValueError("latitude and longitude must be ddmm.mmm and dddmm.mmm")
@@ -100,9 +98,10 @@ class _Sentences:
         elif s.msgID == "RMC" and s.status != "A":
             return "velocities that the receiver calls invalid"
         elif s.msgID == "RMC":
-            self._motion(float(s.spd or 0.0) * KNOT, s.cog, number)
-        elif np.isfinite(self.last) and s.sogk != "":
-            self._motion(float(s.sogk) / 3.6, s.cogt, number)
+            speed = float(s.spd or 0.0) * KNOT
+            self.rows.append((self.last, "speed", speed, number))
+            if s.cog not in ("", None) and speed > SLOW:
+                self.rows.append((self.last, "compass_deg", float(s.cog), number))
         return ""
 
     def _clock(self, time: Any, date: Any) -> None:
@@ -113,11 +112,3 @@ class _Sentences:
         elif self.day + seconds < self.last - DAY / 2:
             self.day += DAY
         self.last = self.day + seconds
-
-    def _motion(self, speed: float, course: Any, number: int) -> None:
-        """RMC and VTG of one epoch say the same."""
-        if self.last not in self.moved:
-            self.moved.add(self.last)
-            self.rows.append((self.last, "speed", speed, number))
-            if course not in ("", None) and speed > SLOW:
-                self.rows.append((self.last, "compass_deg", float(course), number))

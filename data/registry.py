@@ -17,7 +17,7 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.storage import is_recording, read_recording
 
 from . import fleet_store
-from .fleet_files import read_fcd, read_table, read_tum, tum_files, write_table, write_tum
+from .fleet_files import read_fcd, read_table, read_tum, tum_files, write_table
 from .graphs import read_graph_log
 from .log.read import Log, is_log, read_log, steps_in_words
 from .log.units import Summary
@@ -136,7 +136,7 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     name, options, part = _split(name_or_path, options)
     kind = _real(Path(name))
     if kind == "mrclam":
-        hint = "Take coopoc run real, or read_mrclam, calibrate and pose_recording of coopoc.data.mrclam_poses."
+        hint = "Take coopoc run real, or read_mrclam, calibrate and pose_recording of coopoc.data.mrclam."
         raise InputError("data", name, "is a folder of MR.CLAM, whose noise has to be calibrated first", hint)
     log: Log = _read(LOGS.get(kind, read_log), Path(name), options)
     return log.part(**part)
@@ -187,18 +187,18 @@ def convert(name_or_path: str | Path, out: str | Path, **options: Any) -> Fleet:
 
     Args:
         name_or_path: as in `load_fleet`.
-        out: .csv or .parquet file, or a folder (no suffix) for one TUM file per vehicle.
+        out: .csv or .parquet file.
         options: of the reader.
 
     Raises:
-        InputError: as `load_fleet`, another ending of `out`, or ids that are no file names for TUM.
+        InputError: as `load_fleet`, or another ending of `out`.
     """
     path = given_path(out)
-    if path.suffix not in (".csv", ".parquet", ""):
-        raise InputError("out", path.name, "must end in .csv or .parquet, or be a folder for TUM files", "Rename it.")
+    if path.suffix not in (".csv", ".parquet"):
+        raise InputError("out", path.name, "must end in .csv or .parquet", "Rename it.")
     fleet = load_fleet(name_or_path, **options)
     path.parent.mkdir(parents=True, exist_ok=True)
-    (write_table if path.suffix else write_tum)(fleet, path)
+    write_table(fleet, path)
     return fleet
 
 

@@ -16,7 +16,7 @@ from coopoc.errors import InputError
 from coopoc.formats.trajectories import read_kitti, read_tum
 from coopoc.formats.values import read_words, to_rotation
 
-from .cells import named_columns, numeric, read_frame, seconds, words
+from .cells import TABLES, named_columns, numeric, read_frame, seconds, words
 from .source import split
 
 if TYPE_CHECKING:
@@ -33,8 +33,8 @@ QUATERNION = ("qx", "qy", "qz", "qw")
 def read_paths(name: str) -> dict[str, Path]:
     """Trajectories of a file, by vehicle: TUM and KITTI hold one, named after the file, a table several.
 
-    A table has columns t, x, y, z (m; without z in the plane), and as known id, qx, qy, qz, qw, and cxx, cxy, cxz, cyy,
-    cyz, czz (m^2). KITTI files have no stamps: poses are numbered, or `?times=FILE` gives them.
+    A table has columns t, x, y, z (m; without z in the plane), and may have id, qx, qy, qz, qw, and cxx, cxy, cxz,
+    cyy, cyz, czz (m^2). KITTI files have no stamps: poses are numbered, or `?times=FILE` gives them.
 
     Raises:
         InputError: a file with a fault, named with its line or row.
@@ -45,7 +45,7 @@ def read_paths(name: str) -> dict[str, Path]:
     file = File(word)
     if not file.is_file():
         raise InputError("file", str(file), "must be a file", "Check the path.")
-    if file.suffix.lower() in (".csv", ".parquet", ".xlsx"):
+    if file.suffix.lower() in TABLES:
         return _of_table(file, dict(options.get("columns", {})))
     if len(next(read_words(file), (0, []))[1]) == 12:
         poses = read_kitti(file, options.get("times"))
@@ -60,27 +60,27 @@ def _of_table(file: File, columns: dict[str, str]) -> dict[str, Path]:
     from coopoc.evaluate.trajectory_scores import Path
 
     frame = read_frame(file, columns.get("id", "id"))
-    known = ("id", "t", "x", "y", "z", *QUATERNION, *COVARIANCE)
-    frame = named_columns(frame, columns, known, ("t", "x", "y"), file.name)
-    frame = frame.assign(t=seconds(frame, "t", file.name))
+    allowed = ("id", "t", "x", "y", "z", *QUATERNION, *COVARIANCE)
+    frame = named_columns(frame, columns, allowed, ("t", "x", "y"), file.name)
+    frame = frame.assign(t=seconds(frame, "t", file.name), z=frame.get("z", 0.0))
     frame["id"] = words(frame, "id", file.name) if "id" in frame.columns else file.stem
     twice = frame.duplicated(["id", "t"])
     if twice.any():
         row = frame[twice].iloc[0]
-        where, allowed = f"{file.name}: row {row.name}", f"is there twice for {row['id']}"
-        raise InputError(where, f"{float(row['t'])!r} s", allowed, "Leave one of them out.")
-
-    def numbers(rows: Any, *wanted: str) -> Any:
-        return np.column_stack([numeric(rows, name, file.name) for name in wanted])
-
-    found, given = {}, set(frame.columns)
-    for name, rows in frame.groupby("id", sort=False):
-        rows = rows.sort_values("t", kind="stable")
-        at = numbers(rows.assign(z=rows.get("z", 0.0)), "x", "y", "z")
-        turned = to_rotation(numbers(rows, *QUATERNION)) if set(QUATERNION) <= given else None
-        covariance = numbers(rows, *COVARIANCE)[:, SYMMETRIC] if set(COVARIANCE) <= given else None
-        found[str(name)] = Path(rows["t"].to_numpy(dtype=float), at, turned, covariance)
-    return found
+        where, once = f"{file.name}: row {row.name}", f"is there twice for {row['id']}"
+        raise InputError(where, f"{float(row['t'])!r} s", once, "Leave one of them out.")
+    paths = {}
+    for name, rows in frame.sort_values("t", kind="stable").groupby("id", sort=False):
+        position, quaternion, covariance = (
+            np.column_stack([numeric(rows, column, file.name) for column in group])
+            if set(group) <= set(frame.columns)
+            else None
+            for group in (("x", "y", "z"), QUATERNION, COVARIANCE)
+        )
+        rotation = None if quaternion is None else to_rotation(quaternion)
+        spread = None if covariance is None else covariance[:, SYMMETRIC]
+        paths[str(name)] = Path(rows["t"].to_numpy(dtype=float), position, rotation, spread)
+    return paths
 
 
 def score(
@@ -132,30 +132,30 @@ def score(
     return 0
 
 
-def _plain(values: dict[str, Any]) -> dict[str, Any]:
+def _plain(value: Any) -> Any:
     """JSON knows no NaN: null stands for an interval that one block does not give."""
-    return {
-        key: _plain(value) if isinstance(value, dict) else None if isinstance(value, float) and isnan(value) else value
-        for key, value in values.items()
-    }
+    if isinstance(value, dict):
+        return {key: _plain(part) for key, part in value.items()}
+    return None if isinstance(value, float) and isnan(value) else value
 
 
 def table(rows: list[Score], delta: float, unit: Unit) -> str:
     """The scores as a Markdown table."""
     from tabulate import tabulate
 
-    relative = f"RPE, {delta:g} {unit} [m]"
-    shown: list[dict[str, Any]] = [
-        {
-            "vehicle": row.vehicle,
-            "poses": row.poses,
-            "without truth": row.missed,
-            "RT-LE [m]": str(row.rt_le_m),
-            "APE [m]": str(row.ape_m),
-            "largest [m]": f"{row.ape_max_m:.3g}",
-            relative: "" if row.rpe_m is None else f"{row.rpe_m:.3g}",
-            "NEES": "" if row.nees is None else f"{row.nees:.3g}",
-        }
+    header = [
+        "vehicle",
+        "poses",
+        "without truth",
+        "RT-LE [m]",
+        "APE [m]",
+        "largest [m]",
+        f"RPE, {delta:g} {unit} [m]",
+        "NEES",
+    ]
+    shown = [
+        [row.vehicle, row.poses, row.missed, row.rt_le_m, row.ape_m, f"{row.ape_max_m:.3g}"]
+        + ["" if value is None else f"{value:.3g}" for value in (row.rpe_m, row.nees)]
         for row in rows
     ]
-    return str(tabulate(shown, headers="keys", tablefmt="github", disable_numparse=True))
+    return str(tabulate(shown, headers=header, tablefmt="github", disable_numparse=True))

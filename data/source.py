@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.file_names import given_path
 from coopoc.world.fleet import Fleet
@@ -33,7 +34,7 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     text = name_or_path if isinstance(name_or_path, str) else str(given_path(name_or_path))
     name, mark, query = text.partition("?")
     given_path(name)
-    if not mark or _exists(text):
+    if not mark or os.path.exists(text):
         return text, {}
     options: dict[str, Any] = {}
     for part in query.split("&"):
@@ -49,60 +50,33 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     return name, options
 
 
-def steps(t: Floats, since: float = 0.0, until: float = np.inf) -> tuple[int, int]:
-    """First step and last + 1 of those that are at least `since` and less than `until` s after the first one.
+def parted(data: Any, since: float | None = None, until: float | None = None) -> Any:
+    """The part of a Fleet or a Recording from `since` to before `until` s after its first step; of a Recording a note
+    names it. Without both it is the whole.
 
     Raises:
         InputError: fewer than two steps.
-
-    >>> steps(np.array([7.0, 7.5, 8.0, 8.5]), until=1.0)
-    (0, 2)
     """
-    first, last = np.searchsorted(t - t[0], np.array([since, until]) - ROUNDING * (t[1] - t[0]))
-    if not last - first >= 2:
-        given, length = f"since {since:g} s until {until:g} s", f"{t[-1] - t[0]:g} s"
-        raise InputError("since, until", given, f"must leave two steps of the {length}", "Count from the first step.")
-    return int(first), int(last)
-
-
-def parted(data: Any, since: float | None = None, until: float | None = None) -> Any:
-    """The part of a Fleet or a Recording from `since` to `until` s after its first step; of a Recording a note names
-    it. Without both it is the whole."""
     if since is None and until is None:
         return data
-    begin, end = since or 0.0, np.inf if until is None else until
-    part: Fleet | Recording = data.between(*steps(data.t, begin, end))
+    begin, end, t = since or 0.0, np.inf if until is None else until, data.t
+    first, last = np.searchsorted(t - t[0], np.array([begin, end]) - ROUNDING * (t[1] - t[0])).tolist()
+    if not last - first >= 2:
+        given, length = f"since {begin:g} s until {end:g} s", f"{t[-1] - t[0]:g} s"
+        raise InputError("since, until", given, f"must leave two steps of the {length}", "Count from the first step.")
+    part: Fleet | Recording = data.between(first, last)
     if isinstance(part, Recording):
         note = f"from {begin:g} s on" if until is None else f"from {begin:g} s to {end:g} s"
         return replace(part, notes=(*part.notes, note))
     return part
 
 
-def pairs(text: str, mark: str = ":") -> dict[str, str]:
+def pairs(text: str, value: Callable[[str], Any] = str) -> dict[str, Any]:
     """Names and values, as "t:time,id:car"; ValueError for anything else."""
-    found = [[word.strip() for word in pair.partition(mark)] for pair in text.split(",")]
-    if not all(map(all, found)):
+    made = [[word.strip() for word in pair.partition(":")] for pair in text.split(",")]
+    if not all(map(all, made)):
         raise ValueError(text)
-    return {name: value for name, _, value in found}
-
-
-def _exists(text: str) -> bool:
-    try:
-        return given_path(text).exists()
-    except InputError:  # options may be longer than the name of a file
-        return False
-
-
-def _seconds(text: str) -> dict[str, float]:
-    return {name: float(value) for name, value in pairs(text).items()}
-
-
-def _flag(text: str) -> bool:
-    return bool(["false", "true"].index(text.lower()))
-
-
-def _list(text: str) -> tuple[str, ...]:
-    return tuple(word.strip() for word in text.split(","))
+    return {name: value(word) for name, _, word in made}
 
 
 def _place(text: str) -> tuple[float, float, float]:
@@ -112,11 +86,11 @@ def _place(text: str) -> tuple[float, float, float]:
 
 READ: Mapping[str, tuple[Callable[[str], Any], str, str]] = {
     **dict.fromkeys(("dt", "max_gap", "since", "until", "vehicle_length"), (float, "a number of SI units", "0.1")),
-    "any_scale": (_flag, "true or false", "true"),
+    "any_scale": (lambda text: bool(["false", "true"].index(text.lower())), "true or false", "true"),
     "columns": (pairs, "name:header pairs, the name here and the header in the file", "t:time,id:car"),
     "kinds": (pairs, "word:kind pairs, the word in the file and the kind here", "uwb:range"),
-    "clock": (_seconds, "vehicle:seconds pairs", "blue:0.35"),
-    "ignore": (_list, "words between commas", "imu,lidar"),
+    "clock": (partial(pairs, value=float), "vehicle:seconds pairs", "blue:0.35"),
+    "ignore": (lambda text: tuple(map(str.strip, text.split(","))), "words between commas", "imu,lidar"),
     "origin": (_place, "latitude, longitude and height", "48.14,11.58,520"),
 }
 """Option -> what makes its value of a text, what is allowed, an example; others stay text."""

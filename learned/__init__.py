@@ -5,7 +5,7 @@ from .checkpoint import Checkpoint, load, save
 from .federation.federate import federate
 from .federation.history import Federation, ledger
 from .federation.participation import Participation
-from .method import Diagnostics, LearnedGain
+from .method import LearnedGain
 from .nets.cooperative import CooperativeGain
 from .nets.gain import Gain, Recurrent
 from .nets.gain_net import GainNet
@@ -27,7 +27,6 @@ __all__ = [
     "Checkpoint",
     "Client",
     "CooperativeGain",
-    "Diagnostics",
     "Federation",
     "Fit",
     "Gain",

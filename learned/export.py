@@ -1,4 +1,4 @@
-"""Export: one step of a GainNet as a pure function, in ONNX or TorchScript, checked against the net itself."""
+"""Export: one step of a GainNet as a pure function in ONNX, derived from `GainNet.step` and checked against it."""
 
 from __future__ import annotations
 
@@ -110,26 +110,6 @@ def to_onnx(model: GainNet | Checkpoint, path: Path | str) -> Path:
         net,
         lambda part: run(runtime.InferenceSession(part, providers=["CPUExecutionProvider"])),
     )
-
-
-def to_torchscript(model: GainNet | Checkpoint, path: Path | str) -> Path:
-    """Write one step of the net to a TorchScript file, as `to_onnx` does; the card is its extra file "card".
-
-    torch warns that TorchScript will go: it is for programs in C++ that have it already.
-
-    >>> import tempfile
-    >>> to_torchscript(GainNet(2, 1), Path(tempfile.mkdtemp()) / "step.pt").name
-    'step.pt'
-    """
-    net, card = _parts(model)
-    with _quiet(DeprecationWarning, "`torch.jit"):
-        traced = torch.jit.trace(Step(net).eval(), _example(net), check_trace=False)
-
-        def load(part: Path) -> Run:
-            step = torch.jit.load(part)
-            return lambda arrays: [a.detach().numpy() for a in step(*(torch.from_numpy(a) for a in arrays))]
-
-        return _kept(path, lambda part: traced.save(str(part), _extra_files=dict(card)), net, load)
 
 
 def first_inputs(net: GainNet, x0: Sequence[Sequence[float]]) -> list[AnyArray]:

@@ -28,25 +28,6 @@ SIZE = 3
 
 
 @dataclass(frozen=True, eq=False)
-class Diagnostics:
-    """The quantities that the paper calls the net's covariance estimates; none of them is a covariance.
-
-    A GRU state is a running average of tanh values: it stays in [-1, 1] at any noise and need not be symmetric or
-    positive. `posterior` is K times the assumed GNSS covariance, which equals the posterior covariance only if K is the
-    optimal gain. All are (R, T, E, 3, 3), the first step NaN; where a fix is missing the gain is zero and the states do
-    not change.
-    """
-
-    gain: Floats
-    process: Floats
-    prior: Floats
-    innovation: Floats
-    posterior: Floats
-
-    __repr__ = short_repr
-
-
-@dataclass(frozen=True, eq=False)
 class LearnedGain:
     """Position from own fixes and velocities with the gain of a net; no messages are exchanged.
 
@@ -104,31 +85,6 @@ class LearnedGain:
         seconds = time.perf_counter() - began
         notes = tuple(divergence(estimates, recording, columns))
         return Track(recording.t, tuple(columns), estimates, None, silent, silent, seconds, notes=notes)
-
-    def diagnostics(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Diagnostics:
-        """Gain, GRU states and K times the GNSS covariance at every step; see the caveat of `Diagnostics`.
-
-        Raises:
-            InputError: the net has no `trace`, that is, no GRU states that stand for covariances.
-        """
-        trace = getattr(self.model, "trace", None)
-        if trace is None:
-            allowed = "must be a net with a trace, such as GainNet"
-            raise InputError("model", type(self.model).__name__, allowed, "Read its gain from a stream's state.")
-        columns = check_recording(recording).columns(egos, missing=True)
-        gnss, velocity, x0 = self._lanes(recording, columns)
-        states: list[tuple[Tensor, ...]] = [(torch.full((len(x0), SIZE**2), torch.nan),) * 4]
-        with one_core(), torch.inference_mode():
-            memory = self.model.start(x0)
-            for fix, speed in zip(gnss.unbind(1), velocity.unbind(1), strict=True):
-                memory, gain, cells = trace(memory, fix, speed, recording.dt)
-                missing = fix.isnan().all(1, keepdim=True)
-                held = [torch.where(missing, old, new) for old, new in zip(states[-1][1:], cells, strict=True)]
-                states.append((gain.flatten(1), *held))
-        found = torch.stack([torch.stack(step) for step in states]).double().numpy()
-        found = found.reshape(len(states), 4, recording.runs, len(columns), SIZE, SIZE).transpose(1, 2, 0, 3, 4, 5)
-        gain, process, prior, innovation = found
-        return Diagnostics(gain, process, prior, innovation, gain * np.square(np.array(recording.sensors.gnss_std)))
 
     def _lanes(self, recording: Recording, columns: list[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Fixes and velocities (R E, T - 1, 3) and starts (R E, 3) for the net, relative to the first fix."""

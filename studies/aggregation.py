@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from functools import lru_cache, partial
+from functools import lru_cache
 from importlib.metadata import version
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -105,16 +105,9 @@ def fitted(p: Params) -> NoiseModel:
     return NoiseModel.fitted(replace(seen[acting[0]], gnss=gnss, velocity=velocity), fleet)
 
 
-class Trained(NamedTuple):
-    """A net of one training seed: the kept one, and that of the last round."""
-
-    kept: Any
-    last: Any
-
-
 @lru_cache(maxsize=2)
-def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> tuple[Trained, ...]:
-    """All training seeds of a method under a condition, in one rollout."""
+def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> tuple[Any, ...]:
+    """Nets of all training seeds of a method under a condition, trained in one rollout."""
     from coopoc.learned import GainNet
     from coopoc.learned.federation.federate import Plan, federate_many
     from coopoc.learned.federation.participation import Byzantine, Participation
@@ -128,13 +121,11 @@ def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> 
     if condition == "poisoned update":
         participation = Byzantine(names=(members(p).ids[int(p["members"]) // 2],), scale=-float(p["factor"]))
     plan = Plan(int(p["rounds"]), method, int(p["local_epochs"]), participation=participation)
-    federations = federate_many(nets, groups, range(len(nets)), plan)
-    return tuple(Trained(fed.model, fed.after(len(fed.history) - 1)) for fed in federations)
+    return tuple(fed.model for fed in federate_many(nets, groups, range(len(nets)), plan))
 
 
-def _pooled(p: Params, nets: list[Any], groups: list[tuple[Client, ...]]) -> tuple[Trained, ...]:
+def _pooled(p: Params, nets: list[Any], groups: list[tuple[Client, ...]]) -> tuple[Any, ...]:
     """Nets trained on all pieces in one place."""
-    from coopoc.learned.nets.stack import unflatten
     from coopoc.learned.training.clients import Segments
     from coopoc.learned.training.fit import Task, fit_many
     from coopoc.learned.training.schedule import Schedule
@@ -144,14 +135,11 @@ def _pooled(p: Params, nets: list[Any], groups: list[tuple[Client, ...]]) -> tup
         parts = ("training", "validation", "long")
         training, validation, long = (Segments.join([getattr(client, part) for client in group]) for part in parts)
         tasks.append(Task(net, training, validation, seed, long=long))
-    return tuple(
-        Trained(fit.model, unflatten(fit.history[-1].weights[None], fit.model)[0])
-        for fit in fit_many(tasks, Schedule(epochs=int(p["steps"])))
-    )
+    return tuple(fit.model for fit in fit_many(tasks, Schedule(epochs=int(p["steps"]))))
 
 
 def cell(p: Params) -> list[Row]:
-    """Rows of a method under a condition in a scenario: RT-LE of the kept weights and of those of the last round."""
+    """Rows of a method under a condition in a scenario."""
     if p["method"] == "bound":
         return lineup.bound_rows(p)
     trial = scene.trial(p)
@@ -160,9 +148,8 @@ def cell(p: Params) -> list[Row]:
     training = tuple((name, value) for name, value in p.items() if name not in OF_THE_TEST)
     rows: list[Row] = []
     for seed, net in enumerate(trained(p["condition"], p["method"], training)):
-        kept, last = (bounded_rt_le(each.method(p["method"]), *trial, LOST) for each in (net.kept, net.last))
-        columns = {"rt_le_m": kept, "last_rt_le_m": last}
-        rows += [{**row, "train_seed": seed} for row in rows_of(columns, trial[1])]
+        columns = {"rt_le_m": bounded_rt_le(net.method(p["method"]), *trial, LOST)}
+        rows += rows_of(columns, trial[1], train_seed=seed)
     return rows
 
 
@@ -171,13 +158,13 @@ def key(p: Params) -> dict[str, str]:
     return {**scene.facts(p), "clients": members(p).digest, "torch": version("torch")}
 
 
-def _error(results: Results, where: Where, value: str) -> Interval | str | None:
-    each = interval(results, where, value)
+def _error(results: Results, where: Where) -> Interval | str | None:
+    each = interval(results, where)
     return "diverged" if each and not each.mean < LOST / 1e3 else each
 
 
-def _table(scenario: int, value: str, weights: str) -> TableView:
-    """Methods down, conditions across, for one metric."""
+def _table(scenario: int) -> TableView:
+    """Methods down, conditions across."""
     at = {"scenario": scenario}
 
     def rows(results: Results) -> Any:
@@ -187,8 +174,8 @@ def _table(scenario: int, value: str, weights: str) -> TableView:
     return selections(
         ("Rule",),
         rows,
-        across(partial(_error, value=value), {name.capitalize(): {**at, "condition": name} for name in CONDITIONS}),
-        f"RT-LE [m], {weights}.",
+        across(_error, {name.capitalize(): {**at, "condition": name} for name in CONDITIONS}),
+        "RT-LE [m] of the weights that validated best.",
         *(f"{name}: {text};" for name, text in CONDITIONS.items()),
         "KF: fitted to the noise that the clients saw; the bound knows the acting noise and no bias.",
         at=at,
@@ -252,10 +239,8 @@ STUDY = Study(
         "offset_m": 10.0,
     },
     tables={
-        "scenario1": _table(1, "rt_le_m", "kept weights"),
-        "scenario2": _table(2, "rt_le_m", "kept weights"),
-        "scenario1_last": _table(1, "last_rt_le_m", "weights of the last round"),
-        "scenario2_last": _table(2, "last_rt_le_m", "weights of the last round"),
+        "scenario1": _table(1),
+        "scenario2": _table(2),
     },
     figures={
         "multiples": multiples(

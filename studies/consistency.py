@@ -8,11 +8,11 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.methods.catalogue import METHODS
-from coopoc.study.numbers import Where, mean
+from coopoc.study.numbers import Where, mean, present
 from coopoc.study.style import look
 
 from . import lineup, scene
-from .views import HEAD, labelled, of, selections
+from .views import HEAD, labelled, multiples, of, selections
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
@@ -54,24 +54,15 @@ def _ran(results: Results) -> list[tuple[str, str]]:
     return sorted(pairs, key=lambda pair: -_inside(results, of(*pair)))
 
 
-def _figure(results: Results) -> Plot | None:
-    """One row per method: its NEES per ego on a logarithmic axis, and the mean of a consistent filter."""
-    from coopoc.study.plot import Plot, canvas, plain_log, strokes
+def _each_ego(results: Results, where: Where) -> list[float]:
+    """NEES of each ego, as a multiple of that of a consistent filter; none of a method that was not run."""
+    kept = present(results, where, "nees")
+    return list(np.nanmean(results.values("nees", kept), axis=1) / 3.0) if kept else []
 
-    ran = _ran(results)
-    if not ran:
-        return None
-    with canvas(1, 1, width=6.2, height=0.9 + 0.2 * len(ran)) as (figure, panel):
-        panel.axvline(3.0, color="black", linewidth=0.9)
-        for row, pair in enumerate(ran):
-            each = np.nanmean(results.values("nees", of(*pair)), axis=1)
-            panel.plot(
-                each, np.full(len(each), row), **{**strokes({"method": pair[0]}), "linestyle": "none"}, alpha=0.8
-            )
-        plain_log(panel.xaxis)
-        labels = [look(method).label + ("" if known in USUAL else f", {known}") for method, known in ran]
-        panel.set(yticks=range(len(ran)), yticklabels=labels, ylim=(len(ran) - 0.4, -0.6), xlabel="NEES, one per ego")
-    return Plot(figure, scene.caption(results, NOTE))
+
+def _figure(results: Results) -> Plot | None:
+    text = "NEES over 3, a dot per ego: 1 is consistent."
+    return multiples(_ran(results), {"NEES / 3": {}}, _each_ego, text, NOTE)(results)
 
 
 def _findings(results: Results) -> dict[str, str]:

@@ -10,7 +10,7 @@ from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import rt_le
 from coopoc.evaluate.scores import rows_of
 from coopoc.evaluate.statistics import Interval
-from coopoc.study.numbers import Where, listed, present, seed_means
+from coopoc.study.numbers import Where, present, seed_means
 from coopoc.study.study import Params, Row
 from coopoc.study.style import Panel
 
@@ -30,9 +30,8 @@ NEAR = 0.03
 def cell(p: Params) -> list[Row]:
     """RT-LE of one net after every round; of an individual net only at its end.
 
-    `rt_le_m` is of the weights that validated best so far, which is what a training that ended there keeps, and
-    `raw_rt_le_m` of the weights as they are after the round. The centralised net's schedule is cut into as many equal
-    parts as there are rounds.
+    It is of the weights that validated best so far, which is what a training that ended there keeps. The centralised
+    net's schedule is cut into as many equal parts as there are rounds.
     """
     made, federated = (weights.checkpoint(name, p, p["train_seed"]) for name in (p["method"], FEDERATED))
     last, rounds = (len(one.card["history"]) - 1 for one in (made, federated))
@@ -46,8 +45,7 @@ def cell(p: Params) -> list[Row]:
     rows: list[Row] = []
     for number in (rounds,) if alone else range(rounds + 1):
         at = last if alone else round(number * last / rounds)
-        columns = {"rt_le_m": score(made.kept(at)), "raw_rt_le_m": score(at)}
-        rows += [{"round": number, **row} for row in rows_of(columns, egos)]
+        rows += [{"round": number, **row} for row in rows_of({"rt_le_m": score(made.kept(at))}, egos)]
     return rows
 
 
@@ -104,15 +102,6 @@ def _findings(results: Results) -> dict[str, str]:
             f"After {len(fed) - 1} rounds: federated {fed[-1]:.3f} m, centralised {end:.3f} m "
             f"({100 * (fed[-1] / end - 1):+.1f} %); federated is {when}."
         )
-    if fed or centralised:
-        frame = results.select(present(results, BOTH))
-        frame = frame[frame["round"] > 0]
-        worst = frame.groupby(["method", "round", "train_seed"])["raw_rt_le_m"].mean().groupby("method").max()
-        names = {"federated": FEDERATED, "centralised": CENTRALISED}
-        each = listed({words: worst.get(name) for words, name in names.items()})
-        text = "Weights as they are after a round, not the best so far, the worst of any round and seed"
-        texts |= {"worst": f"{text}: {each}."} if each else {}
-        texts["untrained"] = f"The untrained net: {(fed or centralised)[0]:.2f} m."
     return texts
 
 

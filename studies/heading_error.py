@@ -207,19 +207,6 @@ def _over_time(results: Results) -> Plot | None:
     return figures.curves(results, panels, lines, caption, width=7.4, **options)
 
 
-def _cost(results: Results) -> Plot | None:
-    """RT-LE over the compass's error."""
-    from coopoc.study import figures
-
-    x = {i: {**DRIVEN, "compass": word} for i, word in enumerate(COMPASSES)}
-    ticks = {i: TITLES[word].replace("no compass", "none") for i, word in enumerate(COMPASSES)}
-    panels = [Panel(x, {"max_neighbours": k}, f"K = {k}", "Compass", ticks) for k in (0, 10)]
-    names = [(pose(k), known) for k in (0, 10) for known in (ALWAYS, FIRST)]
-    lines = [of(*pair) for pair in (*names, ("joint", ALWAYS), ("bound", "bound"))]
-    caption = _note(results, "RT-LE by the error of the compass.")
-    return figures.curves(results, panels, lines, caption, number=rms, log=True)
-
-
 COST = (
     "K = {k}, {speed:g} m/s: {exact:.2f} m with an exact heading, {none:.2f} m with one that is estimated; with a "
     "compass of 10° taken as white noise {noise:.2f} m, by its first heading alone {first:.2f} m, and by a position "
@@ -273,7 +260,7 @@ STUDY = Study(
             _compasses, number=partial(mean, value="nees"), text="NEES of a pose (3 is consistent)", decimals=1
         ),
     },
-    figures={"heading": _over_time, "cost": _cost},
+    figures={"heading": _over_time},
     findings=_findings,
     limitations=(
         "One convoy: the value of a bearing depends on its geometry.",

@@ -13,8 +13,7 @@ from coopoc.arrays import Floats
 from coopoc.data.log.check import GATE, begin_of, together
 from coopoc.data.log.links import under
 from coopoc.data.log.read import Log
-from coopoc.data.mrclam import MrclamLog, read_mrclam
-from coopoc.data.mrclam_poses import Calibration, calibrate, pose_recording, surveyed
+from coopoc.data.mrclam import Calibration, MrclamLog, calibrate, pose_recording, read_mrclam, surveyed
 from coopoc.data.registry import kind_of, load_log
 from coopoc.data.source import split
 from coopoc.errors import InputError

@@ -10,11 +10,9 @@ import pandas as pd
 import pytest
 from filterpy.kalman import KalmanFilter
 from logs import drive, long, seen, write
-from matplotlib.figure import Figure
 
 import coopoc as co
 from coopoc.cli import main
-from coopoc.data.log import picture as log_picture
 from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
 from coopoc.data.registry import load_fleet
@@ -112,15 +110,6 @@ def test_the_check_finds_nothing_wrong_where_nothing_is(folders: Path) -> None:
     assert ranges["expected_std"] / 2 < ranges["robust_std"] < 1.5 * ranges["expected_std"]
 
 
-def test_a_picture_without_innovations_says_so(tmp_path: Path) -> None:
-    frame = long(seen(drive(2, steps=60)), messages=False)
-    first = frame["t"] == frame["t"].min()
-    log = read_log(write(frame[first | ~frame["kind"].isin(["x", "y", "z"])], tmp_path / "log.csv"))
-    axes = Figure().add_subplot()
-    log_picture.innovations(axes, check(log), [])
-    assert [text.get_text() for text in axes.texts] == ["no vehicle has a fix after its first"]
-
-
 def test_a_truth_in_another_frame_is_found(folders: Path, tmp_path: Path) -> None:
     moved = truth(drive(4, gap=15.0)).assign(x=lambda frame: frame["x"] - 40, y=lambda frame: frame["y"] + 9)
     write(moved, tmp_path / "vicon.csv")
@@ -129,6 +118,14 @@ def test_a_truth_in_another_frame_is_found(folders: Path, tmp_path: Path) -> Non
     east, north = re.findall(r"lie (\S+) m east and (\S+) m north", warnings[0])[0]
     assert float(east) == pytest.approx(40, abs=0.7)
     assert float(north) == pytest.approx(-9, abs=0.7)
+
+
+def test_a_truth_with_another_clock_is_named(folders: Path, tmp_path: Path) -> None:
+    late = truth(drive(4, gap=15.0)).assign(t=lambda frame: frame["t"] + 1.0)
+    warnings = check(read_log(folders / "without", truth=write(late, tmp_path / "vicon.csv"))).warnings
+    offsets = [float(match[1]) for text in warnings if (match := re.search(r"fixes are (\S+) s ahead of", text))]
+    assert offsets
+    assert offsets == pytest.approx([1.0] * len(offsets), abs=0.3)
 
 
 def _changed(frame: pd.DataFrame, kinds: list[str], change: object) -> pd.DataFrame:

@@ -106,6 +106,15 @@ def test_all_unknown_kinds_are_named_at_once(tmp_path: Path) -> None:
         co.read_log(tmp_path / "log.csv")
 
 
+@pytest.mark.parametrize(
+    "option", [{"columns": 3}, {"kinds": [1]}, {"ignore": 3}, {"origin": (1, 2)}, {"any_scale": "x"}, {"dt": "x"}]
+)
+def test_options_of_the_wrong_kind_are_refused(tmp_path: Path, option: dict[str, Any]) -> None:
+    (tmp_path / "log.csv").write_text(GOOD)
+    with pytest.raises(co.InputError, match=next(iter(option))):
+        read_log(tmp_path / "log.csv", **option)
+
+
 def test_every_mistake_of_the_page_is_tested() -> None:
     table = PAGE[PAGE.index("| mistake |") : PAGE.index("`coopoc data check` warns")]
     assert {row.split(" | ")[0][2:] for row in table.splitlines()[2:] if row} == set(MISTAKES)
@@ -154,8 +163,7 @@ def same(a: co.Recording, b: co.Recording) -> bool:
 
 
 @pytest.mark.parametrize("text", [GOOD, WIDE], ids=["long", "wide"])
-@pytest.mark.parametrize("mark", [";", "\t"])
-@pytest.mark.parametrize("point", [".", ","])
+@pytest.mark.parametrize(("mark", "point"), [(";", ","), ("\t", ".")])
 def test_separators_and_decimal_commas_change_nothing(tmp_path: Path, text: str, mark: str, point: str) -> None:
     (tmp_path / "a.csv").write_text(text)
     head, body = text.split("\n", 1)

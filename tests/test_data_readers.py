@@ -14,6 +14,7 @@ from coopoc.data.assemble import interpolate
 from coopoc.data.fleet_files import read_tum
 from coopoc.data.registry import convert, load_fleet
 from coopoc.errors import InputError
+from coopoc.formats.trajectories import Trajectory, write_tum
 from coopoc.world.fleet import Fleet
 
 GOOD = "id,t,x,y,z\na,0.0,0,0,0\nb,0.0,5,0,0\na,0.1,1,0,0\nb,0.1,5,1,0\na,0.2,2,0,0\nb,0.2,5,2,0\n"
@@ -28,13 +29,16 @@ def test_tables_come_back_bit_by_bit(tmp_path: Path, name: str, out: str) -> Non
 
 def test_tum_files_are_what_evo_reads(tmp_path: Path) -> None:
     """Independent check: evo reads the file that we write (evo is a tool of the tests only)."""
+    fleet = load_fleet("town10-clients")
+    x = fleet.position[:1550, 0]
+    write_tum(Trajectory(fleet.t[:1550], x, np.tile(np.eye(3), (1550, 1, 1))), tmp_path / "car.tum")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         file_interface = pytest.importorskip("evo.tools.file_interface")
-        fleet = convert("town10-clients", tmp_path / "folder")
-        path = file_interface.read_tum_trajectory_file(str(tmp_path / "folder" / f"{fleet.ids[0]}.tum"))
-    np.testing.assert_array_equal(path.positions_xyz, fleet.position[:1550, 0])
+        path = file_interface.read_tum_trajectory_file(str(tmp_path / "car.tum"))
+    np.testing.assert_array_equal(path.positions_xyz, x)
     np.testing.assert_allclose(path.timestamps, fleet.t[:1550], atol=1e-9)
+    np.testing.assert_array_equal(load_fleet(tmp_path).position[:, 0], x)
 
 
 def test_velocity_is_derived_backwards_and_absence_is_a_missing_row(tmp_path: Path) -> None:
@@ -145,8 +149,8 @@ def test_fcd_angles_are_clockwise_from_north_and_positions_the_front_bumper(tmp_
         (FCD.replace('angle="0"', ""), "angle"),
         (FCD[:-9], "XML"),
         ("<a/>", "0 rows"),
-        (FCD.replace('"10.7"', '"ten"'), "vehicle e at time 0.10 s = 0.10 ten"),
-        (FCD.replace('"0.10"', '"nan"'), "vehicle e at time nan s"),
+        (FCD.replace('"10.7"', '"ten"'), "row 2, column x = ten"),
+        (FCD.replace('"0.10"', '"nan"'), "row 2, column t = nan"),
     ],
 )
 def test_a_bad_fcd_file_is_named(tmp_path: Path, text: str, thing: str) -> None:
@@ -253,7 +257,6 @@ def test_dates_are_seconds_since_1970(tmp_path: Path, unit: str, zone: str | Non
         ("a,0.1,1_0,0,0", r"row 2, column x = 1_0"),
         ("a,0.1,١,0,0", r"row 2, column x = ١"),
         ("a,0.1,1e308,0,0", r"row 2, column x = 1e\+308"),
-        (f"{'a' * 5000},0.1,1,0,0", r"row 2, column id = a+\.\.\.: must have at most 200 characters"),
     ],
 )
 def test_a_row_that_is_none_is_named(tmp_path: Path, row: str, message: str) -> None:

@@ -18,7 +18,7 @@ from coopoc.learned.engine.layers import sigmoid, tanh
 from coopoc.learned.nets.gain import Recurrent
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch
-from coopoc.learned.training.machine import one_core, row_threads
+from coopoc.learned.training.machine import one_core
 from coopoc.learned.training.schedule import Moving, Schedule, advance
 
 
@@ -142,20 +142,17 @@ def test_a_net_is_an_ordinary_module() -> None:
 
 
 @pytest.mark.parametrize("lanes", [1, 2, 20])
-def test_a_model_does_not_know_of_the_others_nor_of_the_threads(lanes: int) -> None:
-    """Bit for bit: alone, in a stack, in a stack on two threads."""
+def test_a_model_does_not_know_of_the_others(lanes: int) -> None:
+    """Bit for bit: alone and in a stack."""
     nets, data = [GainNet(seed=s) for s in range(5)], batch(5, lanes, 30, torch.float32)
 
-    def run(rows: slice, count: int) -> tuple[Tensor, Tensor]:
+    def run(rows: slice) -> tuple[Tensor, Tensor]:
         theta = flatten(nets[rows]).requires_grad_()
-        with row_threads(count):
-            x = nets[0].rollout(theta, data.gnss[:, rows], data.velocity[:, rows], data.x0[rows], 0.1)
-            (gradient,) = torch.autograd.grad((x - data.truth[:, rows]).square().sum(), theta)
+        x = nets[0].rollout(theta, data.gnss[:, rows], data.velocity[:, rows], data.x0[rows], 0.1)
+        (gradient,) = torch.autograd.grad((x - data.truth[:, rows]).square().sum(), theta)
         return x.detach(), gradient
 
-    stacked, shared, alone = run(slice(0, 5), 1), run(slice(0, 5), 2), run(slice(3, 4), 1)
-    assert torch.equal(stacked[0], shared[0])
-    assert torch.equal(stacked[1], shared[1])
+    stacked, alone = run(slice(0, 5)), run(slice(3, 4))
     assert torch.equal(stacked[0][:, 3:4], alone[0])
     assert torch.equal(stacked[1][3:4], alone[1])
     one = Batch(*(part[:, 3:4] for part in data[:3]), data.x0[3:4], 0.1)
@@ -225,21 +222,19 @@ def test_descent_is_that_of_torch() -> None:
 
 
 @pytest.mark.parametrize("lanes", [1, 3])
-def test_descent_does_not_know_of_the_others_nor_of_the_threads(lanes: int) -> None:
+def test_descent_does_not_know_of_the_others(lanes: int) -> None:
     """Bit for bit, the numbers of `loss_and_gradient` and `advance` one after the other."""
     nets, data = [GainNet(seed=s) for s in range(3)], batch(3, lanes, 30, torch.float32)
 
-    def run(rows: list[int], threads: int, way: Callable[..., Any]) -> Tensor:
+    def run(rows: list[int], way: Callable[..., Any]) -> Tensor:
         state = moving([nets[r] for r in rows])
         mine = Batch(*(part[:, rows] for part in data[:3]), data.x0[rows], 0.1)
-        with row_threads(threads):
-            for step in range(1, 4):
-                way(nets[0], state, np.arange(len(rows)), mine, step, np.full(len(rows), 1e-2), Schedule())
+        for step in range(1, 4):
+            way(nets[0], state, np.arange(len(rows)), mine, step, np.full(len(rows), 1e-2), Schedule())
         return state.theta
 
-    stacked, alone = run([0, 1, 2], 1, GainNet.descend), run([1], 1, GainNet.descend)
-    assert torch.equal(stacked, run([0, 1, 2], 2, GainNet.descend))
-    assert torch.equal(stacked, run([0, 1, 2], 1, Gain.descend))
+    stacked, alone = run([0, 1, 2], GainNet.descend), run([1], GainNet.descend)
+    assert torch.equal(stacked, run([0, 1, 2], Gain.descend))
     assert torch.equal(stacked[1:2], alone)
     assert not torch.equal(alone, flatten(nets[1:2]))
 

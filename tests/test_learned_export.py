@@ -1,4 +1,4 @@
-"""Exported steps: ONNX by onnxruntime and TorchScript by torch's own loader, against the net."""
+"""Exported steps: ONNX by onnxruntime, against the net."""
 
 from __future__ import annotations
 
@@ -19,11 +19,10 @@ from coopoc import V2X, InputError, Sensors, load_fleet, observe
 from coopoc.arrays import AnyArray, Floats
 from coopoc.errors import MissingLibraryError
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF, checkpoint
-from coopoc.learned.export import AGREE, INPUTS, OUTPUTS, STEPS, agree, first_inputs, to_onnx, to_torchscript
+from coopoc.learned.export import AGREE, INPUTS, OUTPUTS, STEPS, agree, first_inputs, to_onnx
 from coopoc.learned.nets.gain import Recurrent
 from coopoc.learned.recipes import WEIGHTS
 
-pytestmark = pytest.mark.filterwarnings("ignore:`torch.jit:DeprecationWarning")  # of torch.jit.load
 onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
 ROOT = Path(__file__).resolve().parents[1]
 Step = Callable[[Sequence[AnyArray]], Sequence[AnyArray]]
@@ -39,18 +38,10 @@ def file(shipped: checkpoint.Checkpoint, tmp_path_factory: pytest.TempPathFactor
     return to_onnx(shipped, tmp_path_factory.mktemp("export") / "step.onnx")
 
 
-@pytest.fixture(scope="module")
-def script(shipped: checkpoint.Checkpoint, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    return to_torchscript(shipped, tmp_path_factory.mktemp("export") / "step.pt")
-
-
 def steps(file: Path) -> Step:
     """The step of an exported file."""
-    if file.suffix == ".onnx":
-        session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
-        return lambda arrays: session.run(list(OUTPUTS), dict(zip(INPUTS, arrays, strict=True)))
-    module = torch.jit.load(file)
-    return lambda arrays: [a.detach().numpy() for a in module(*(torch.from_numpy(a) for a in arrays))]
+    session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
+    return lambda arrays: session.run(list(OUTPUTS), dict(zip(INPUTS, arrays, strict=True)))
 
 
 def rolled(step: Step, net: GainNet, gnss: Floats, velocity: Floats, dt: float) -> Floats:
@@ -65,17 +56,14 @@ def rolled(step: Step, net: GainNet, gnss: Floats, velocity: Floats, dt: float) 
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", ["file", "script"])
-def test_a_whole_drive_has_the_error_of_the_net(
-    kind: str, shipped: checkpoint.Checkpoint, request: pytest.FixtureRequest
-) -> None:
+def test_a_whole_drive_has_the_error_of_the_net(file: Path, shipped: checkpoint.Checkpoint) -> None:
     """900 steps of four vehicles and two runs as eight lanes at once: RT-LE within 1e-4 m of torch's own steps."""
     fleet = load_fleet("town10").select([0, 12, 24, 36])
     seen = observe(fleet, Sensors.paper_scenario2(), V2X(max_neighbours=0), runs=2)
     net, origin = shipped.model, np.tile(fleet.position[0], (2, 1))
     assert isinstance(net, GainNet)
     gnss, velocity = (np.moveaxis(a, 1, 0).reshape(900, 8, 3) for a in (seen.gnss, seen.velocity))
-    found = rolled(steps(request.getfixturevalue(kind)), net, gnss - origin, velocity, seen.dt) + origin
+    found = rolled(steps(file), net, gnss - origin, velocity, seen.dt) + origin
     near, speed = (torch.tensor(a, dtype=torch.float32).transpose(0, 1) for a in (gnss - origin, velocity))
     with torch.no_grad():
         own = (
@@ -91,12 +79,9 @@ def test_a_whole_drive_has_the_error_of_the_net(
     assert np.sqrt(np.mean(((np.array(alone)[1:] - truth[1:, 6]) ** 2).sum(-1))) == pytest.approx(score[0][6], abs=1e-4)
 
 
-@pytest.mark.parametrize("kind", ["file", "script"])
 @pytest.mark.parametrize("lanes", [1, 7])
-def test_any_number_of_lanes_with_missing_fixes(
-    lanes: int, kind: str, shipped: checkpoint.Checkpoint, request: pytest.FixtureRequest
-) -> None:
-    net, step, draw = shipped.model, steps(request.getfixturevalue(kind)), np.random.default_rng(3)
+def test_any_number_of_lanes_with_missing_fixes(lanes: int, file: Path, shipped: checkpoint.Checkpoint) -> None:
+    net, step, draw = shipped.model, steps(file), np.random.default_rng(3)
     assert isinstance(net, GainNet)
     inputs = first_inputs(net, draw.normal(0, 2, (lanes, 3)).tolist())
     inputs[7] = np.where(np.arange(lanes)[:, None] % 2 == 0, np.nan, inputs[7] + 1).astype(np.float32)
@@ -108,8 +93,7 @@ def test_any_number_of_lanes_with_missing_fixes(
 def test_the_file_is_checked_before_it_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """A step that is off by 2e-5 m in one number after twenty steps is refused, and no file appears."""
     net, calls = GainNet(2, 1), iter(range(10 * STEPS))
-    one = to_torchscript(net, tmp_path / "good.pt")
-    good = steps(one)
+    good = steps(to_onnx(net, tmp_path / "good.onnx"))
     assert agree(net, good) <= AGREE
 
     def off(arrays: Sequence[AnyArray]) -> Sequence[AnyArray]:
@@ -121,24 +105,16 @@ def test_the_file_is_checked_before_it_is_kept(tmp_path: Path, monkeypatch: pyte
         agree(net, off)
     with pytest.raises(InputError, match="export = differs by nan"):
         agree(net, lambda arrays: [np.full_like(a, np.nan) for a in good(arrays)])
-    other = steps(to_torchscript(GainNet(2, 1, seed=1), tmp_path / "other.pt"))
-    monkeypatch.setattr(
-        torch.jit, "load", lambda part: lambda *given: [torch.from_numpy(a) for a in other([a.numpy() for a in given])]
-    )
+    other = onnxruntime.InferenceSession(to_onnx(GainNet(2, 1, seed=1), tmp_path / "other.onnx"))
+    monkeypatch.setattr(onnxruntime, "InferenceSession", lambda part, providers: other)
     with pytest.raises(InputError, match="export"):
-        to_torchscript(net, tmp_path / "bad.pt")
-    assert sorted(p.name for p in tmp_path.iterdir()) == ["good.pt", "other.pt"]
+        to_onnx(net, tmp_path / "bad.onnx")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["good.onnx", "other.onnx"]
 
 
-def test_the_card_travels_along(file: Path, script: Path, shipped: checkpoint.Checkpoint, tmp_path: Path) -> None:
-    extra = {"card": ""}
-    torch.jit.load(script, _extra_files=extra)
+def test_the_card_travels_along(file: Path, shipped: checkpoint.Checkpoint) -> None:
     props = {p.key: p.value for p in onnx.load(file).metadata_props}
-    for text in (props["card"], extra["card"]):
-        assert json.loads(text) == dict(shipped.card)
-    bare = {"card": ""}
-    torch.jit.load(to_torchscript(GainNet(2, 1), tmp_path / "a.pt"), _extra_files=bare)
-    assert not bare["card"]
+    assert json.loads(props["card"]) == dict(shipped.card)
 
 
 def test_the_file_names_its_arrays_and_no_machine(file: Path) -> None:

@@ -150,16 +150,3 @@ def test_divergence_is_reported_and_nan_is_refused() -> None:
     assert DIVERGED == 10.0
     with pytest.raises(InputError, match="not finite in run 0"):
         LearnedGain(constant(1e30 * np.eye(3)))(rec)
-
-
-def test_diagnostics_are_the_gain_and_the_gru_states() -> None:
-    rec = observe(drive(), Sensors(), runs=2)
-    method = LearnedGain(GainNet())
-    found, track = method.diagnostics(rec), method(rec)
-    assert found.gain.shape == found.process.shape == found.prior.shape == found.innovation.shape == (2, 60, 1, 3, 3)
-    assert np.nanmax(np.abs(found.process[:, 1:])) <= 1.0
-    assert np.isnan(found.gain[:, 0]).all()
-    np.testing.assert_allclose(found.posterior[:, 1:], 1.5**2 * found.gain[:, 1:])
-    prior = track.x[:, :-1] + 0.1 * rec.velocity[:, 1:]
-    moved = np.einsum("rteij,rtej->rtei", found.gain[:, 1:], rec.gnss[:, 1:] - prior)
-    np.testing.assert_allclose(track.x[:, 1:], prior + moved, atol=1e-4)

@@ -105,7 +105,7 @@ def test_real_graphs_reach_the_best_that_is_known(name: str, best: float) -> Non
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("loss", [None, "huber", "cauchy", "geman-mcclure", "truncated"])
 def test_tapes_are_the_formulas(dimension: int, objective: Objective, loss: str | None) -> None:
-    """Cost, gradient, J^T J and the exact Hessian of the tapes against NumPy's dual numbers and differences of them."""
+    """Cost, gradient, J^T J and the exact Hessian of the tapes against r and J of a problem and differences of them."""
     graph = random_graph(207, dimension, steps=20, priors=objective == "chordal", ranges=40)
     problem = from_graph(graph, objective, start="file")
     rho = None if loss is None else Loss(loss, 2.0)

@@ -1,8 +1,9 @@
-"""Measurements: one formula for NumPy, torch and CasADi; our derivative against CasADi's own differentiation."""
+"""Measurements: one formula for NumPy, torch and CasADi; the tapes' derivatives against torch's."""
 
 from __future__ import annotations
 
-import casadi as ca
+from typing import Any
+
 import numpy as np
 import pytest
 import torch
@@ -11,71 +12,64 @@ from scipy.spatial.transform import Rotation
 
 from coopoc import InputError
 from coopoc.optimize import MEASUREMENTS, Problem, backends, measurement, solve
-from coopoc.optimize.model import dual as dual_numbers
-from coopoc.optimize.model.dual import seeds
-from coopoc.optimize.model.space import Space, exp
+from coopoc.optimize.model.measurements import Measurement
+from coopoc.optimize.model.space import Space, exp, pose
+from coopoc.world.links import wrap
 
 VECTORS = np.random.default_rng(0).normal(size=(50, 3)) * [20, 20, 5]
 
 
 ROTATIONS = Rotation.random(50, random_state=1).as_matrix()
-PLAIN = sorted(kind for kind, known in MEASUREMENTS.items() if known.frame != "relative")
-CONSTANTS = [0.1]
-
-
-class Symbolic:
-    """CasADi as the namespace of a formula."""
-
-    sqrt, sin, cos, atan2, where = ca.sqrt, ca.sin, ca.cos, ca.atan2, ca.if_else
+COUNT = 12
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("kind", PLAIN)
-def test_derivative_equals_casadis(kind: str, dimension: int) -> None:
-    known = MEASUREMENTS[kind]
-    if dimension == 2 and known.plane is None:
+@pytest.mark.parametrize("kind", sorted(MEASUREMENTS))
+def test_derivatives_equal_torchs(kind: str, dimension: int) -> None:
+    """By the steps (dp, w) of the nodes, R Exp(w), far from the measured values, near them and at them."""
+    known, space, d = MEASUREMENTS[kind], Space(dimension, has_rotation=True), dimension
+    if d == 2 and known.plane is None:
         pytest.skip(f"{kind} does not exist in the plane")
-    v, given, size = ca.SX.sym("v", dimension), CONSTANTS[: known.constants], known.size(dimension)
-    formula = ca.vertcat(*known.residual(ca.vertsplit(v), [0.0] * size, given, Symbolic))
-    reference = ca.Function("h", [v], [formula, ca.jacobian(formula, v)])
-    vectors = VECTORS[:, :dimension]
-    zero, constants = np.zeros((len(vectors), size)), np.broadcast_to(given, (len(vectors), len(given)))
-    value, derivative = known.differentiate(vectors, None, zero, constants)
-    derivative = np.broadcast_to(derivative, (len(vectors), size, dimension))
-    for i, vector in enumerate(vectors):
-        h, J = (np.asarray(a) for a in reference(vector))
-        assert value[i] == pytest.approx(h[:, 0], abs=1e-13)
-        assert derivative[i] == pytest.approx(J, abs=1e-13)
-    assert known.predict(vectors, given) == pytest.approx(value, abs=1e-13)
+    rng = np.random.default_rng(3)
+    x = pose(rng.normal(size=(2, COUNT, d)) * 15.0, rng.normal(size=(2, COUNT) if d == 2 else (2, COUNT, 3)))
+    if kind.startswith("relative_pose"):
+        near = space.rotation(x[0, 4:]) @ exp(
+            np.full((COUNT - 4, space.angles), 1e-3) * (np.arange(4, COUNT) < 8)[:, None]
+        )
+        x[1, 4:] = space.join(x[1, 4:, :d], near)
+    z = np.ones((COUNT, known.size(d)))
+    if known.compares_poses:
+        z = pose(np.ones((COUNT, d)), np.zeros((COUNT,) if d == 2 else (COUNT, 3)))
+        z[:4] = x[1, 4:8]
+    nodes = np.arange(2 * COUNT).reshape(2, COUNT).T[:, : known.arity]
+    constants = np.full((COUNT, known.constants), 0.1)
+    problem = Problem(tuple(map(str, range(2 * COUNT))), dimension=d, poses=tuple(range(2 * COUNT)))
+    problem = problem.add(kind, nodes, z, std=1.0, constants=constants if known.constants else None)
+    linear = problem.linearise(x.reshape(1, 2 * COUNT, -1))
+    ours = np.concatenate([jacobian[0] for jacobian in linear.jacobian[0]], axis=-1)
+    for k in range(COUNT):
+        given = [torch.tensor(a) for a in (x.reshape(2 * COUNT, -1)[nodes[k]], z[k], constants[k])]
+        steps = torch.zeros((known.arity, space.dof), dtype=torch.float64)
+        theirs = torch.autograd.functional.jacobian(lambda s, own=given: by_torch(known, d, *own, s), steps)
+        assert ours[k] == pytest.approx(theirs.numpy().reshape(ours[k].shape), abs=1e-9)
+        gap = by_torch(known, d, *given, steps).numpy()
+        assert np.exp(1j * linear.residual[0][0, k]) == pytest.approx(np.exp(1j * gap), abs=1e-12)  # angles wrap
 
 
-@pytest.mark.parametrize("dimension", [2, 3])
-@pytest.mark.parametrize("kind", ["relative_pose", "relative_pose_log", "relative_pose_chordal"])
-def test_derivative_of_a_pose_equals_casadis(kind: str, dimension: int) -> None:
-    """By the position and by a right turn R Exp(w), w = 0, for a small and for any error of the rotation."""
-    known, space = MEASUREMENTS[kind], Space(dimension, has_rotation=True)
-    v, w = ca.SX.sym("v", dimension), ca.SX.sym("w", space.angles)
-    turn, d = ca.SX.sym("R", dimension, dimension), dimension
-    skew = ca.skew(w) if d == 3 else ca.vertcat(ca.horzcat(0, -w), ca.horzcat(w, 0))
-    turned = turn @ (ca.SX.eye(d) + skew)
-    z = ca.SX.sym("z", space.ambient)
-    local = [*ca.vertsplit(v), *(turned[i, j] for i in range(d) for j in range(d))]
-    formula = ca.vertcat(*known.residual(local, ca.vertsplit(z), [], Symbolic))
-    derivatives = [ca.substitute(ca.jacobian(formula, s), w, 0) for s in (v, w)]
-    reference = ca.Function("h", [v, turn, z], [ca.substitute(formula, w, 0), ca.horzcat(*derivatives)])
+def by_torch(known: Measurement, d: int, x: Any, z: Any, constants: Any, steps: Any) -> Any:
+    """h - z after the steps (arity, dof) of nodes x (arity, ambient)."""
+    at, w = x[:, :d] + steps[:, :d], steps[:, d:]
+    zero = torch.zeros_like(w[:, 0])
+    rows = [[zero, -w[:, 0]], [w[:, 0], zero]]
     if d == 3:
-        turns, others = ROTATIONS, ROTATIONS[::-1]
-    else:
-        angles = np.linspace(-3.0, 3.0, 50)
-        turns, others = exp(angles[:, None]), exp(angles[::-1, None])
-    near = turns @ exp(np.full((50, space.angles), 1e-3))
-    for measured in (others, near, turns):
-        z_values = space.join(VECTORS[::-1, :d], measured)
-        value, derivative = known.differentiate(VECTORS[:, :d], turns, z_values, np.empty((50, 0)))
-        for i in range(50):
-            h, J = (np.asarray(a) for a in reference(VECTORS[i, :d], turns[i], z_values[i]))
-            assert value[i] == pytest.approx(h[:, 0], abs=1e-9)
-            assert derivative[i] == pytest.approx(J, abs=1e-9)
+        rows = [[zero, -w[:, 2], w[:, 1]], [w[:, 2], zero, -w[:, 0]], [-w[:, 1], w[:, 0], zero]]
+    skew = torch.stack([torch.stack(row, -1) for row in rows], -2)
+    turned = x[:, d:].reshape(-1, d, d) @ torch.linalg.matrix_exp(skew)
+    vector, rotation = at[-1] - at[0] if known.arity == 2 else at[0], turned[0]
+    if known.arity == 2 and known.frame != "world":
+        vector, rotation = turned[0].T @ vector, turned[0].T @ turned[1]
+    local = [*vector, *rotation.flatten()] if known.frame == "relative" else [*vector]
+    return torch.stack(known.residual(local, z, constants, torch))
 
 
 def test_a_relative_pose_is_scipys_logarithm() -> None:
@@ -111,21 +105,8 @@ def test_torch_runs_the_same_formula(kind: str) -> None:
     local = VECTORS if rotation is None else space.join(VECTORS, rotation)
     columns = (torch.tensor(a).unbind(-1) for a in (local, z, constants))
     parts = torch.stack(known.residual(*columns, torch), -1).numpy()
-    assert known.wrapped(parts) == pytest.approx(known.difference(VECTORS, rotation, z, constants), abs=1e-13)
-
-
-def test_dual_arithmetic_equals_casadis() -> None:
-    def formula(x, y, z, m):
-        return 2.0 / x - (3.0 - y) / (x * x + 1.0) + m.sqrt(y**2 + z * z) * m.atan2(z, -x) / 4.0 - 1.0
-
-    v = ca.SX.sym("v", 3)
-    expression = formula(v[0], v[1], v[2], ca)
-    reference = ca.Function("f", [v], [expression, ca.jacobian(expression, v)])
-    ours = formula(*seeds(VECTORS), dual_numbers)
-    for i, vector in enumerate(VECTORS):
-        value, derivative = (np.asarray(a).ravel() for a in reference(vector))
-        assert ours.value[i] == pytest.approx(value[0], rel=1e-12)
-        assert ours.derivative[:, i] == pytest.approx(derivative, rel=1e-11, abs=1e-12)
+    parts[:, known.angles()] = wrap(parts[:, known.angles()])
+    assert known.difference(VECTORS, rotation, z, constants) == pytest.approx(parts, abs=1e-13)
 
 
 def test_angles_wrap() -> None:

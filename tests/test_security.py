@@ -16,9 +16,7 @@ import numpy as np
 import pytest
 from latex import compiled
 
-from coopoc import Fleet
 from coopoc.cli import main
-from coopoc.data.registry import convert, load_fleet
 from coopoc.errors import InputError
 from coopoc.study import store
 from coopoc.study.merge import merge
@@ -177,42 +175,6 @@ def test_a_study_of_ones_own_is_named_again_for_its_reference(
     assert "2 of 2 reference numbers hold." in capsys.readouterr().out
 
 
-@pytest.mark.parametrize("kind", IDS)
-def test_vehicle_ids_do_not_lead_out_of_the_folder(tmp_path: Path, kind: str) -> None:
-    t = 0.1 * np.arange(3)
-    x = np.cumsum(np.ones((3, 2, 3)), axis=0)
-    np.savez(tmp_path / "source.npz")  # a neighbour that must stay as it is
-    before = files(tmp_path)
-    (tmp_path / "mine.py").write_text(
-        "import numpy as np\nfrom coopoc import Fleet\nt = 0.1 * np.arange(3)\n"
-        f"x = np.cumsum(np.ones((3, 2, 3)), axis=0)\nFLEET = Fleet(({IDS[kind]!r}, 'b'), t, x, x)\n"
-    )
-    with pytest.raises(InputError, match=r"id = .*must be a file name.*Write a \.csv or \.parquet"):
-        convert(f"{tmp_path / 'mine.py'}:FLEET", tmp_path / "deep" / "tum")
-    written = {
-        path for path in files(tmp_path) - before if path.suffix != ".pyc"
-    }  # Python may keep bytecode of mine.py
-    assert written == {tmp_path / "mine.py"}
-    assert Fleet((IDS[kind], "b"), t, x, x).ids[0] == IDS[kind]  # any id is allowed in memory and in a table
-
-
-def test_ids_that_would_share_a_file_and_links_are_refused(tmp_path: Path) -> None:
-    source = "id,t,x,y,z\n" + "".join(f"{i},{t},0,{t},0\n" for i in "aA" for t in (0.0, 0.1))
-    (tmp_path / "drive.csv").write_text(source)
-    with pytest.raises(InputError, match="must differ in more than their case"):
-        convert(tmp_path / "drive.csv", tmp_path / "tum")
-    (tmp_path / "drive.csv").write_text(source.replace("A,", "b,"))
-    (tmp_path / "kept.txt").write_text("kept")
-    (tmp_path / "tum").mkdir()
-    (tmp_path / "tum" / "b.tum").symlink_to(tmp_path / "kept.txt")
-    with pytest.raises(InputError, match=r"leads out of .* by a symbolic link"):
-        convert(tmp_path / "drive.csv", tmp_path / "tum")
-    assert (tmp_path / "kept.txt").read_text() == "kept"
-    (tmp_path / "tum" / "b.tum").unlink()
-    convert(tmp_path / "drive.csv", tmp_path / "tum")
-    assert load_fleet(tmp_path / "tum").ids == ("a", "b")
-
-
 @pytest.mark.parametrize("name", ["../out", "/tmp/coopoc-out", "a/b", "..", "", "CON", "a\nb", 3, None])
 def test_a_manifest_cannot_name_another_folder(folder: Path, tmp_path: Path, name: object) -> None:
     edited(folder / "manifest.json", lambda m: {**m, "study": name})
@@ -323,16 +285,12 @@ def test_a_description_of_another_form_is_named_and_written_again(folder: Path, 
 FORMULAS = ("=1+1", "+1+1", "-1+1", "@SUM(A1)", "\t=1", '=cmd|"/c calc"!A1')
 
 
-def test_no_text_of_a_csv_is_a_formula(tmp_path: Path, folder: Path) -> None:
+def test_no_text_of_a_csv_is_a_formula() -> None:
     made = Table(("=head", "b"), tuple((text, -0.5) for text in (*FORMULAS, "-3", "–")), "")
     found = list(csv.reader(io.StringIO(made.to_csv())))
     assert found[0] == ["'=head", "b"]
     assert [row[0] for row in found[1:]] == [*(f"'{text}" for text in FORMULAS), "-3", "–"]
     assert {row[1] for row in found[1:]} == {"-0.5"}
-    Results.load(folder).to_csv(tmp_path / "rows.csv")
-    rows = list(csv.DictReader((tmp_path / "rows.csv").read_text().splitlines()))
-    assert {row["ego"] for row in rows} == {"'=a", "b"}
-    assert {row["text"] for row in rows} == {"'=1+1"}
 
 
 def test_no_text_of_a_latex_table_is_a_command(tmp_path: Path) -> None:

@@ -132,7 +132,7 @@ def looped(solver: Solver) -> Solver:
     """The solver of single problems as one of B realisations."""
 
     def each(problem: Problem, x: Floats) -> SolverResult:
-        parts = [problem.pick(b) for b in range(len(x))] if problem.batch else [problem]
+        parts = problem.realisations
         ends = [solver(part, start) for part, start in zip(parts, x, strict=True)]
         iterations, infeasible = np.array([(end.iterations, end.infeasible) for end in ends]).T
         return SolverResult(np.stack([end.x for end in ends]), iterations, infeasible.astype(bool), ends[0].extras)

@@ -58,14 +58,14 @@ def solve_batch(problem: Problem, backend: str | Backend = "gauss-newton", **opt
     >>> solve_batch(problem).x.shape
     (2, 1, 3)
     """
-    known = require_backend(backend)
+    solver_backend = require_backend(backend)
     instance("problem", problem, Problem)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     if problem.constraints:
         hint = "Solve one realisation after the other: solve(problem.pick(run), ...)."
         raise InputError("problem", repr(problem), "has constraints, which a batch cannot hold", hint)
-    solver = known.solver(problem, options)
+    solver = solver_backend.solver(problem, options)
     count, reach = problem.batch or 1, max(POSITION_TOLERANCE, options.get("tolerance", 0.0))
     per = max(1, CHUNK // sum(factor.nodes.size for factor in problem.factors))
     parts = []
@@ -80,10 +80,11 @@ def solve_batch(problem: Problem, backend: str | Backend = "gauss-newton", **opt
 
 def _checked(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
     """Cost, covariance and largest move of a Gauss-Newton step of each realisation; NaN where one is unobservable."""
-    singles = [problem.pick(b) for b in range(len(x))] if problem.batch else [problem]
-    each = [assess(single, at) for single, at in zip(singles, x, strict=True)]
-    cov = np.stack([one.covariance for one in each])
-    return np.array([one.cost for one in each]), cov, np.array([one.remaining for one in each])
+    singles = problem.realisations
+    assessments = [assess(single, at) for single, at in zip(singles, x, strict=True)]
+    cov = np.stack([assessment.covariance for assessment in assessments])
+    cost = np.array([assessment.cost for assessment in assessments])
+    return cost, cov, np.array([assessment.remaining for assessment in assessments])
 
 
 def _checked_stars(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:

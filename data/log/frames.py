@@ -6,16 +6,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 
 import numpy as np
+import pandas as pd
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
+from coopoc.world.links import wrap
 from coopoc.world.sensors import Sensors
 
-from .motion import samples
-from .units import ANGLES, KINDS, Rows, Summary, stacked
+from .units import ANGLES, KINDS, Rows, Summary
 
-DEGREES = ("latitude", "longitude", "height")
-ENU = (("x", "longitude"), ("y", "latitude"), ("z", "height"))
+ENU = {"longitude": "x", "latitude": "y", "height": "z"}
 MOTION = ("vx", "vy", "speed")
 Origin = tuple[float, float, float]
 MAJOR, FLATTENING = 6378137.0, 1 / 298.257223563
@@ -36,75 +36,61 @@ def on_one_clock(rows: Rows, clock: Mapping[str, float], name: str) -> Rows:
     """
     if np.isnan(rows.t).all():
         raise InputError("t", "in no file", "must be a column of some table", "Give the times of what was measured.")
-    for one in clock:
-        if one not in rows.vehicle:
-            allowed = f"must be a vehicle of {name}, which has {', '.join(sorted(set(rows.vehicle.tolist())))}"
-            raise InputError("clock", repr(one), allowed, "Name the vehicle as in the log.")
-    ahead, theirs = (np.array([clock.get(one, 0.0) for one in names]) for names in (rows.vehicle, rows.partner))
+    vehicles = set(rows.vehicle.tolist())
+    for vehicle in clock:
+        if vehicle not in vehicles:
+            allowed = f"must be a vehicle of {name}, which has {', '.join(sorted(vehicles))}"
+            raise InputError("clock", repr(vehicle), allowed, "Name the vehicle as in the log.")
+    ahead, partner_ahead = (np.array([clock.get(one, 0.0) for one in names]) for names in (rows.vehicle, rows.partner))
     t = np.where(np.isnan(rows.t), np.nanmin(rows.t), rows.t) - ahead
-    rows = replace(rows, t=t, arrival=rows.arrival - theirs)
+    rows = replace(rows, t=t, arrival=rows.arrival - partner_ahead)
     early = rows.arrival < t - 1e-9
     if early.any():
-        k = int(np.argmax(early))
-        given, allowed = f"{rows.arrival[k]:.6f} s, sent at {t[k]:.6f} s", "must not come before the message was sent"
+        given = f"{rows.arrival[early][0]:.6f} s, sent at {t[early][0]:.6f} s"
         hint = 'Give the offsets of the clocks, as clock={"car2": 0.35}, or mend the row.'
-        raise InputError(f"{rows.place(k)}, column arrival", given, allowed, hint)
+        field, allowed = f"{rows.place(early)}, column arrival", "must not come before the message was sent"
+        raise InputError(field, given, allowed, hint)
     return rows
 
 
-def origin_of(rows: Rows, given: Origin | None) -> Origin | None:
-    """The origin that is given, or the first fix in degrees; None where all positions are local.
+def local(rows: Rows, origin: Origin | None) -> tuple[Rows, Origin | None]:
+    """Rows in SI units, with x, y, z in place of latitude, longitude, height; and the origin of that frame: the given
+    one, or the first complete fix in degrees (its height 0 where there is none in the log), None where positions
+    were local.
 
     Raises:
-        InputError: positions in metres beside those in degrees, or degrees that are never complete.
+        InputError: positions in metres beside those in degrees without an origin, or degrees that are never complete.
     """
-    degrees = rows.take(rows.of(*DEGREES))
-    if given is not None or not len(degrees):
-        return given
-    flat = rows.of("x", "y")
-    if flat.any():
+    value, kind, std = rows.value.copy(), rows.kind.copy(), rows.std.copy()
+    for name in dict.fromkeys(kind.tolist()):
+        unit, same = KINDS[name], rows.kind == name
+        value[same] = unit.scale * value[same] + unit.offset
+        if unit.name in ANGLES[:3]:
+            value[same] = wrap(value[same])
+        std[same] *= abs(unit.scale)
+        kind[same] = unit.name
+    geodetic, flat = rows.of(*ENU), rows.of("x", "y")
+    if not geodetic.any():
+        return replace(rows, value=value, kind=kind, std=std), origin
+    if origin is None and flat.any():
         hint = "Pass origin=(latitude, longitude, height) of the local frame, or give all positions in one of the two; "
         hint += "ignore= leaves out kinds, and topics of a bag."
         raise InputError(f"{rows.place(flat)}, x", "metres", "stand beside fixes in degrees", hint)
-    heights = degrees.of("height").any()
-    for k in np.argsort(degrees.t, kind="stable").tolist():
-        here = degrees.take((degrees.t == degrees.t[k]) & (degrees.vehicle == degrees.vehicle[k]))
-        found = dict(zip(here.kind.tolist(), here.value.tolist(), strict=True))
-        if set(DEGREES[: 3 if heights else 2]) <= set(found):
-            return found["latitude"], found["longitude"], found.get("height", 0.0)
-    raise InputError("latitude, longitude", "never together", "must be given at one time", "Check the columns.")
-
-
-def local(rows: Rows, origin: Origin | None) -> Rows:
-    """Rows in SI units, with x, y, z in place of latitude, longitude, height (0 where there is none in the log)."""
-    value, kind, std = rows.value.copy(), rows.kind.copy(), rows.std.copy()
-    for name in dict.fromkeys(kind.tolist()):
-        one, here = KINDS[name], rows.kind == name
-        value[here] = one.scale * value[here] + one.offset
-        if one.name in ANGLES[:3]:
-            value[here] = np.arctan2(np.sin(value[here]), np.cos(value[here]))
-        std[here] *= abs(one.scale)
-        kind[here] = one.name
-    rows = replace(rows, value=value, kind=kind, std=std)
-    geodetic = rows.of(*DEGREES)
-    if not geodetic.any() or origin is None:
-        return rows
-    parts, heights = [rows.take(~geodetic)], rows.of("height").any()
-    for name in dict.fromkeys(rows.vehicle[geodetic].tolist()):
-        mine = rows.take(geodetic & (rows.vehicle == name))
-        fixes, first = samples(mine, DEGREES, Summary(), 3 if heights else 2)
-        at = fixes.value if heights else np.column_stack([fixes.value[:, :2], np.full(len(fixes.t), origin[2])])
-        enu, base = to_enu(at, origin), mine.take(first)
-        for axis, (to, what) in enumerate(ENU[: 3 if heights else 2]):
-            own = mine.take(mine.of(what) & np.isfinite(mine.std))
-            deviation = np.full(len(first), np.nan)
-            if len(own):
-                order = np.argsort(own.t, kind="stable")
-                place = np.clip(np.searchsorted(own.t[order], fixes.t - 1e-9), 0, len(own) - 1)
-                deviation = own.std[order][place]
-            kinds = np.full(len(first), to, dtype=object)
-            parts.append(replace(base, value=enu[:, axis], kind=kinds, std=deviation))
-    return stacked(parts)
+    frame = pd.DataFrame({"t": rows.t.round(6), "vehicle": rows.vehicle, "kind": kind, "value": value})[geodetic]
+    fixes = frame.pivot_table(index=["t", "vehicle"], columns="kind", values="value", aggfunc="first", sort=False)
+    if "height" not in fixes:
+        fixes["height"] = origin[2] if origin else 0.0
+    fixes = fixes.reindex(columns=["latitude", "longitude", "height"]).dropna()
+    if not len(fixes):
+        raise InputError("latitude, longitude", "never together", "must be given at one time", "Check the columns.")
+    if origin is None:
+        latitude, longitude, height = fixes.iloc[int(np.argmin(fixes.index.get_level_values("t")))].tolist()
+        origin = latitude, longitude, height
+    row = fixes.index.get_indexer(pd.MultiIndex.from_frame(frame[["t", "vehicle"]]))
+    axis = [list(ENU).index(name) for name in frame["kind"]]
+    value[geodetic] = np.where(row < 0, np.nan, to_enu(fixes.to_numpy(), origin)[row, axis])
+    kind[geodetic] = frame["kind"].map(ENU)
+    return replace(rows, value=value, kind=kind, std=std).take(~geodetic | np.isfinite(value)), origin
 
 
 def to_enu(geodetic: Floats, origin: Origin) -> Floats:
@@ -121,8 +107,8 @@ def to_enu(geodetic: Floats, origin: Origin) -> Floats:
     latitude, longitude = np.radians(origin[:2])
     s, c, sl, cl = np.sin(latitude), np.cos(latitude), np.sin(longitude), np.cos(longitude)
     east_north_up = np.array([[-sl, cl, 0.0], [-s * cl, -s * sl, c], [c * cl, c * sl, s]])
-    found: Floats = (_earth_centred(geodetic) - _earth_centred(np.array([origin]))) @ east_north_up.T
-    return found
+    enu: Floats = (_earth_centred(geodetic) - _earth_centred(np.array([origin]))) @ east_north_up.T
+    return enu
 
 
 def _earth_centred(geodetic: Floats) -> Floats:

@@ -7,6 +7,7 @@ from dataclasses import replace
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.world.fleet import Fleet
@@ -70,7 +71,7 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps) -> Linked:
     beside a range and a direction. A message at a step without a measurement is a link without one. Where no message
     was logged at all, every vehicle sends at every step and all arrives at once.
     """
-    there = np.stack([np.isfinite(one.velocity[:, 0]) for one in members.values()], axis=1)
+    there = np.stack([np.isfinite(member.velocity[:, 0]) for member in members.values()], axis=1)
     summary, sent = steps.summary, rows.take(rows.of("message"))
     pairs, component, value = _measured(rows.take(rows.in_group("relative")), members, there, steps)
     messages, arrived, broadcasts = _messages(sent, tuple(members), there, steps)
@@ -89,8 +90,8 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps) -> Linked:
         if len(keys):
             summary.assume("no messages were logged: every vehicle sends at every step, and all arrive at once")
     words = ("ranges", "bearings" if steps.body else "azimuths", "inclinations or elevations")
-    for k, what in enumerate(words):
-        summary.count(what, int(np.isfinite(relative[:, k]).sum()) if (component == k).any() else 0)
+    for k in np.unique(component).tolist():
+        summary.count(words[k], int(np.isfinite(relative[:, k]).sum()))
     order = np.lexsort((np.nan_to_num(relative[:, 0], nan=np.inf), keys[:, 1], keys[:, 0]))
     return Linked(Links(*keys[order].T), relative[order], broadcasts, arrival[order])
 
@@ -140,76 +141,67 @@ def of_vehicles(rows: Rows, landmarks: Collection[str], summary: Summary) -> Row
     return replace(rows, vehicle=vehicle, partner=partner).take(~left)
 
 
-def _columns(names: AnyArray, ids: Sequence[str]) -> Ints:
-    number = {name: k for k, name in enumerate(ids)}
-    return np.array([number.get(name, -1) for name in names.tolist()], dtype=np.int64)
+def _columns(names: AnyArray, ids: Collection[str]) -> Ints:
+    """(M,) columns of names, -1 where they are no member."""
+    return pd.Index(list(ids)).get_indexer(pd.Index(names)).astype(np.int64)
 
 
 def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: Steps) -> tuple[Ints, Ints, Floats]:
     """(M, 3) step, observer, neighbour, (M,) component, and (M,) range m, azimuth (in body frames bearing) rad or
     inclination rad, one of each."""
-    observer, partner = (_columns(names, tuple(members)) for names in (rows.vehicle, rows.partner))
-    (step, _), body, summary = steps.nearest(rows.t), steps.body, steps.summary
-    lag = rows.t - steps.grid[step]
-    value = rows.value.copy()
+    observer, partner = (_columns(names, members) for names in (rows.vehicle, rows.partner))
+    (step, lag), body, value = steps.nearest(rows.t), steps.body, rows.value.copy()
     component = np.array([COMPONENTS[kind] for kind in rows.kind.tolist()], dtype=np.int64)
     turned = rows.of("azimuth" if body else "bearing")
-    for column, (name, one) in enumerate(members.items()):
+    for column, (name, member) in enumerate(members.items()):
         mine = turned & (observer == column)
-        value[mine] += (-1 if body else 1) * one.heading(rows.t[mine]) if one.heading is not None else np.nan
-        if mine.any() and one.course:
-            summary.assume(COURSE.format("{}", one.course), name)
-    value[turned] = np.arctan2(np.sin(value[turned]), np.cos(value[turned]))
-    known, inside = (observer >= 0) & (partner >= 0), step >= 0
-    both = known & inside & there[step, observer] & there[step, partner]
+        value[mine] += (-1 if body else 1) * member.heading(rows.t[mine]) if member.heading is not None else np.nan
+        if mine.any() and member.course:
+            steps.summary.assume(COURSE.format("{}", member.course), name)
+    members_too, inside = (observer >= 0) & (partner >= 0), step >= 0
+    both = members_too & inside & there[step, observer] & there[step, partner]
+    good = both & np.isfinite(value)
     for wrong, reason in (
-        (~known, "relative measurements of members without a position"),
-        (known & ~inside, "relative measurements outside the recording"),
-        (known & inside & ~both, "relative measurements while one of the two is absent"),
-        (both & np.isnan(value), f"{'azimuths' if body else 'bearings'} at times without a heading"),
+        (~members_too, "relative measurements of members without a position"),
+        (members_too & ~inside, "relative measurements outside the recording"),
+        (members_too & inside & ~both, "relative measurements while one of the two is absent"),
+        (both & ~good, f"{'azimuths' if body else 'bearings'} at times without a heading"),
     ):
-        summary.refuse_rows(reason, rows, wrong)
-    good = np.flatnonzero(both & np.isfinite(value))
-    good = good[np.argsort(np.abs(lag[good]), kind="stable")]
-    seen = Measured(value[good], component[good], step[good], lag[good], observer[good], partner[good])
-    brought = _to_step(seen, list(members.values()), steps)
-    brought = np.where(seen.component == 1, wrap(brought), brought)
-    keys = np.column_stack([seen.step, seen.observer, seen.partner, seen.component])
-    first = np.unique(keys, axis=0, return_index=True)[1]
-    again = np.sort(np.delete(good, first))
-    summary.refuse_rows("relative measurements beside a nearer one of the same pair, kind and step", rows, again)
-    return keys[first, :3], keys[first, 3], brought[first]
+        steps.summary.refuse_rows(reason, rows, wrong)
+    keys = np.column_stack([step, observer, partner, component])
+    order = np.argsort(np.abs(lag), kind="stable")
+    order = order[good[order]]
+    keys, first = np.unique(keys[order], axis=0, return_index=True)
+    again = np.sort(np.delete(order, first))
+    steps.summary.refuse_rows("relative measurements beside a nearer one of the same pair, kind and step", rows, again)
+    measured = Measured(*(part[order] for part in (value, component, step, lag, observer, partner)))
+    return keys[:, :3], keys[:, 3], _to_step(measured, list(members.values()), steps)[first]
 
 
-def _messages(rows: Rows, ids: Sequence[str], there: Bools, steps: Steps) -> tuple[Ints, Ints, Bools]:
+def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> tuple[Ints, Ints, Bools]:
     """(M, 3) step sent, receiver, sender, (M,) step of arrival or -1, and (T, N) who sends when."""
-    sender, receiver, every = _columns(rows.vehicle, ids), _columns(rows.partner, ids), np.arange(len(ids))
-    (step, _), summary = steps.nearest(rows.t), steps.summary
+    sender, receiver, columns = _columns(rows.vehicle, ids), _columns(rows.partner, ids), np.arange(len(ids))
+    (step, _), summary, to_all = steps.nearest(rows.t), steps.summary, rows.partner == ""
     sent = (sender >= 0) & (step >= 0) & there[step, sender]
-    to_all = rows.partner == ""
-    here = there[step, receiver] & (receiver >= 0)
+    absent = sent & ~to_all & ~((receiver >= 0) & there[step, receiver])
     summary.refuse_rows("messages of a sender that is absent or has no position", rows, ~sent)
-    reason = "messages to a receiver that is absent or has no position"
-    summary.refuse_rows(reason, rows, sent & ~to_all & ~here)
+    summary.refuse_rows("messages to a receiver that is absent or has no position", rows, absent)
     broadcasts = np.zeros(there.shape, dtype=bool)
     broadcasts[step[sent], sender[sent]] = True
-    meant = np.where(to_all[:, None], sender[:, None] != every, receiver[:, None] == every)
+    meant = np.where(to_all[:, None], sender[:, None] != columns, receiver[:, None] == columns)
     k, j = np.nonzero(meant & there[step] & sent[:, None])
-    late = rows.arrival[k] - rows.t[k]
-    never = np.iinfo(np.int64).max
-    after = np.maximum(np.ceil((np.nan_to_num(late, posinf=0.0) - 2 * SAME) / steps.dt), 0).astype(np.int64)
-    arrived = np.where(np.isinf(late), never, step[k] + after)
-    keys, index = np.unique(np.column_stack([step[k], j, sender[k]]), axis=0, return_inverse=True)
-    first: Ints = np.full(len(keys), never)
-    np.minimum.at(first, index.reshape(-1), arrived)
-    _, once = np.unique(index, return_index=True)
-    summary.refuse_rows("messages beside another of the same pair and step", rows, np.sort(np.delete(k, once)))
+    steps_later = np.maximum(np.ceil((rows.arrival[k] - rows.t[k] - 2 * SAME) / steps.dt), 0)
+    frame = pd.DataFrame({"step": step[k], "receiver": j, "sender": sender[k], "arrival": step[k] + steps_later})
+    again = frame.duplicated(["step", "receiver", "sender"]).to_numpy()
+    summary.refuse_rows("messages beside another of the same pair and step", rows, k[again])
     summary.count("messages", int(sent.sum()))
     summary.count("messages that were lost", int(np.isinf(rows.arrival[sent]).sum()))
-    return keys.reshape(-1, 3), np.where(first == never, -1, first), broadcasts
+    first = frame.groupby(["step", "receiver", "sender"], as_index=False)["arrival"].min()
+    arrival = np.nan_to_num(first["arrival"], posinf=-1).astype(np.int64)
+    return first[["step", "receiver", "sender"]].to_numpy(dtype=np.int64), arrival, broadcasts
 
 
-def _to_step(seen: Measured, members: Sequence[Member], steps: Steps) -> Floats:
+def _to_step(rows: Measured, members: Sequence[Member], steps: Steps) -> Floats:
     """Values (M,) at their steps: z + f(now) - f(then), f being the range, azimuth or inclination of a vector.
 
     In the world `now` is the vector g from the observer to the partner at the step, from the last fixes and the
@@ -219,36 +211,36 @@ def _to_step(seen: Measured, members: Sequence[Member], steps: Steps) -> Floats:
     where the vectors or the range are not far longer than what lies between.
     """
     velocity, fixes, rate = (
-        np.stack([getattr(one, name) for one in members], axis=1) for name in ("velocity", "gnss", "yaw_rate")
+        np.stack([getattr(member, name) for member in members], axis=1) for name in ("velocity", "gnss", "yaw_rate")
     )
-    lag = seen.lag[:, None]
-    after = np.minimum(seen.step + (seen.lag > 0), len(velocity) - 1)
+    value, lag = rows.value, rows.lag[:, None]
+    after = np.minimum(rows.step + (rows.lag > 0), len(velocity) - 1)
 
     def during(of_step: Floats, column: Ints) -> Floats:
         """(M, ...) means over the step in which each time lies; of the one before where the member is absent then."""
         absent = np.isnan(velocity[after, column, 0])
-        return np.asarray(of_step[np.where(absent, seen.step, after), column])
+        return np.asarray(of_step[np.where(absent, rows.step, after), column])
 
-    moved, value = lag * during(velocity, seen.observer), seen.value
+    moved = lag * during(velocity, rows.observer)
     if steps.body:
-        keys = np.column_stack([seen.step, seen.lag, seen.observer, seen.partner])
+        keys = np.column_stack([rows.step, rows.lag, rows.observer, rows.partner])
         same = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
         polar = np.tile([np.nan, np.nan, np.pi / 2], (len(same), 1))
-        polar[same, seen.component] = seen.value
+        polar[same, rows.component] = value
         then = to_vector(polar)[same]
-        then[~np.array([one.stands for one in members])[seen.partner]] = np.nan
+        then[~np.array([member.stands for member in members])[rows.partner]] = np.nan
         now = then + moved
-        value = value + np.where(seen.component == 1, seen.lag * during(rate, seen.observer), 0.0)
+        value = value + np.where(rows.component == 1, rows.lag * during(rate, rows.observer), 0.0)
     else:
         path = np.cumsum(np.nan_to_num(velocity) * steps.dt, axis=0)
-        known = np.where(np.isfinite(fixes[..., 0]), np.arange(len(path))[:, None], -1)
-        last = np.maximum.accumulate(known, axis=0)
-        place = np.where(last[..., None] >= 0, (fixes - path)[last, np.arange(len(members))] + path, np.nan)
-        now = place[seen.step, seen.partner] - place[seen.step, seen.observer]
-        then = now + lag * during(velocity, seen.partner) - moved
+        fixed = np.where(np.isfinite(fixes[..., 0]), np.arange(len(path))[:, None], -1)
+        last = np.maximum.accumulate(fixed, axis=0)
+        position = np.where(last[..., None] >= 0, (fixes - path)[last, np.arange(len(members))] + path, np.nan)
+        now = position[rows.step, rows.partner] - position[rows.step, rows.observer]
+        then = now + lag * during(velocity, rows.partner) - moved
     change = np.column_stack(spherical(*now.T)) - np.column_stack(spherical(*then.T))
     change[:, 1:] = wrap(change[:, 1:])
-    distance = np.where(seen.component == 0, seen.value, np.inf)
+    distance = np.where(rows.component == 0, rows.value, np.inf)
     far = np.minimum(np.linalg.norm(now, axis=1), distance) > NEAR * np.linalg.norm(now - then, axis=1)
-    found: Floats = value + np.where(far, change[np.arange(len(change)), seen.component], 0.0)
-    return found
+    value = value + np.where(far, change[np.arange(len(change)), rows.component], 0.0)
+    return np.where(rows.component == 1, wrap(value), value)

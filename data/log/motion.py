@@ -7,12 +7,15 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
+from scipy.interpolate import make_interp_spline
 
 from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
+from coopoc.world.links import wrap
 
 from ..assemble import SAME, longest_gap, smooth
-from ..planar import nearest, steps_of
+from ..planar import steps_of
 from .units import Rows, Summary
 
 MOVING = 1.0
@@ -26,10 +29,11 @@ HeadingAt = Callable[[Floats], Floats]
 
 
 class Signal(NamedTuple):
-    """Samples of a vehicle at their own times: (M,) s, increasing, and (M, C)."""
+    """Samples of a vehicle at their own times: (M,) s, increasing, (M, C), and the first row (M,) of each."""
 
     t: Floats
     value: Floats
+    row: Ints
 
 
 class Steps(NamedTuple):
@@ -59,8 +63,9 @@ class Steps(NamedTuple):
         return longest_gap(t, self.dt, self.max_gap)
 
     def nearest(self, t: Floats) -> tuple[Ints, Floats]:
-        """Nearest step of each time (M,) s, -1 outside, and how far off it is in s."""
-        return steps_of(t - self.grid[0], self.dt, len(self.grid))
+        """Nearest step of each time (M,) s, -1 outside, and how much later than the step the time is, s."""
+        step, _ = steps_of(t - self.grid[0], self.dt, len(self.grid))
+        return step, t - self.grid[step]
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +93,8 @@ class Member:
     compass: Floats
 
 
-def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int) -> tuple[Signal, Ints]:
-    """Rows of one vehicle as samples (M, C) of some kinds at one time each, NaN where a kind is missing, and the first
-    row (M,) of each.
+def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 1) -> Signal:
+    """Rows of one vehicle as samples (M, C) of some kinds at one time each, NaN where a kind is missing.
 
     Args:
         rows: in SI units.
@@ -98,23 +102,20 @@ def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int) -
         summary: counts rows that repeat a kind at one time, and samples without the first `required` kinds.
         required: how many of the kinds a sample needs.
     """
-    mine = np.flatnonzero(rows.of(*names))
-    mine = mine[np.argsort(rows.t[mine], kind="stable")]
-    t = rows.t[mine]
+    index = np.flatnonzero(rows.of(*names))
+    index = index[np.argsort(rows.t[index], kind="stable")]
+    t = rows.t[index]
     fresh = np.append(True, np.diff(t) > SAME)[: len(t)]
-    sample = np.cumsum(fresh) - 1
-    column = np.array([list(names).index(kind) for kind in rows.kind[mine].tolist()], dtype=np.int64)
-    value = np.full((int(fresh.sum()), len(names)), np.nan)
-    first = np.unique(sample * len(names) + column, return_index=True)[1]
-    again = np.setdiff1d(np.arange(len(mine)), first)
-    summary.refuse_rows("repeated rows (same time, vehicle and kind)", rows, mine[again])
-    value[sample[first], column[first]] = rows.value[mine[first]]
-    whole = np.isfinite(value[:, :required]).all(axis=1)
-    begins = mine[fresh]
+    frame = pd.DataFrame({"sample": np.cumsum(fresh) - 1, "kind": rows.kind[index], "value": rows.value[index]})
+    again = frame.duplicated(["sample", "kind"])
+    summary.refuse_rows("repeated rows (same time, vehicle and kind)", rows, index[again])
+    table = frame[~again].pivot(index="sample", columns="kind", values="value").reindex(columns=list(names))
+    value = table.to_numpy(dtype=float)
+    whole, begins = np.isfinite(value[:, :required]).all(axis=1), index[fresh]
     if not whole.all():
         reason = f"incomplete rows, without all of {', '.join(names[:required])} at one time"
         summary.refuse(reason, int(np.isfinite(value[~whole]).sum()), rows.place(int(begins[~whole][0])))
-    return Signal(t[fresh][whole], value[whole]), begins[whole]
+    return Signal(t[fresh][whole], value[whole], begins[whole])
 
 
 def member(name: str, rows: Rows, steps: Steps) -> Member:
@@ -128,21 +129,19 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
     Raises:
         InputError: neither odometry nor two fixes, a speed without a heading; in body frames no speed or yaw rate.
     """
-    summary, size = steps.summary, len(steps.grid)
-    fixes, first = samples(rows, ("x", "y", "z"), summary, 2 if steps.planar else 3)
+    grid, summary, body = steps.grid, steps.summary, steps.body
+    fixes = samples(rows, ("x", "y", "z"), summary, 2 if steps.planar else 3)
     if steps.planar:
         fixes.value[:, 2] = 0.0
-    measured, _ = samples(rows, ("heading",), summary, 1)
-    still: Floats = np.zeros((size, 3))
-    none: Floats = np.full(size, np.nan)
+    measured, turn, speed = (samples(rows, (kind,), summary) for kind in ("heading", "yaw_rate", "speed"))
+    still: Floats = np.zeros((len(grid), 3))
+    none: Floats = np.full(len(grid), np.nan)
     if len(fixes.t) == 1 and not rows.in_group("odometry").any():
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m"
-        heading = heading_at(measured, None, np.inf) if len(measured.t) and not steps.body else None
+        heading = heading_at(measured, None, np.inf) if len(measured.t) and not body else None
         return Member(still + fixes.value[0], still, heading, text, "", True, still[:, 0], none)
-    turn, _ = samples(rows, ("yaw_rate",), summary, 1)
     derived = velocity_of_fixes(fixes, steps.gap(fixes.t)) if len(fixes.t) > 1 else None
-    if steps.body:
-        speed, _ = samples(rows, ("speed",), summary, 1)
+    if body:
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
             if not len(signal.t):
                 allowed, hint = "must have speeds and yaw rates in body frames", 'Log both, or pass frame="world".'
@@ -150,53 +149,55 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
         summary.refuse("world velocities in body frames", int(rows.of("vx", "vy", "vz").sum()))
         signals, course = [speed, turn], ""
         heading = heading_at(measured, turn, np.inf) if len(measured.t) else None
-        forward, rate = step_means(speed, steps.grid), step_means(turn, steps.grid)[:, 0]
-        velocity: Floats = forward * [1.0, 0.0, 0.0]
         along, _ = _heading(measured, turn, ((derived, "fixes"),), steps)
-        carried: Floats = still if along is None else np.nan_to_num(forward * _ahead(along(steps.grid)))
+        forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
+        carried: Floats = still if along is None else np.nan_to_num(forward * _ahead(along(grid)))
+        velocity: Floats = forward * [1.0, 0.0, 0.0]
     else:
-        moved, heading, course = _in_world(name, rows, turn, measured, derived, steps)
+        moved, heading, course = _in_world(name, rows, (measured, turn, speed), derived, steps)
         signals, rate = [moved], none
-        velocity = step_means(moved, steps.grid)
-        carried = velocity
-    there = np.ones(size, dtype=bool)
+        velocity = carried = step_means(moved, grid)
+    there = np.ones(len(grid), dtype=bool)
     for signal in signals:
         interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
-        there &= covered(signal.t, steps.grid, steps.gap(signal.t), max(steps.dt, 0.6 * interval))
-    gnss = _fixes_on_steps(rows, fixes, first, carried, there, steps)
-    known = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
-    if known.any() or not steps.body:
-        summary.refuse(f"steps of {name} before its first fix", int((there & ~known).sum()))
-        there &= known
+        there &= covered(signal.t, grid, steps.gap(signal.t), max(steps.dt, 0.6 * interval))
+    gnss = _fixes_on_steps(rows, fixes, carried, there, steps)
+    fixed = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
+    if fixed.any() or not body:
+        summary.refuse(f"steps of {name} before its first fix", int((there & ~fixed).sum()))
+        there &= fixed
     span = "throughout" if there.all() else f"{there.mean():.0%} of the time"
     text = f"{len(fixes.t)} fixes, {len(signals[0].t)} samples of odometry, {len(measured.t)} headings, {span}"
-    absent = np.where(there, 0.0, np.nan)
-    compass = _compass_on_steps(measured, rate, steps) + absent if steps.body else none
+    absent, compass = np.where(there, 0.0, np.nan), none
+    if body:
+        kept, step, lag = _nearest_of_each(measured, there, steps)
+        compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
     return Member(gnss, velocity + absent[:, None], heading, text, course, False, rate + absent, compass)
 
 
 def _in_world(
-    name: str, rows: Rows, turn: Signal, measured: Signal, derived: Signal | None, steps: Steps
+    name: str, rows: Rows, body: tuple[Signal, Signal, Signal], derived: Signal | None, steps: Steps
 ) -> tuple[Signal, HeadingAt | None, str]:
-    """Velocity at its own times, heading, and whose course the heading is."""
-    summary, rate = steps.summary, turn if len(turn.t) > 1 else None
-    world, _ = samples(rows, ("vx", "vy", "vz"), summary, 2)
-    speed, first = samples(rows, ("speed",), summary, 1)
+    """Velocity at its own times, heading, and whose course the heading is; `body` are heading, yaw rate and speed."""
+    summary, (measured, turn, speed) = steps.summary, body
+    world = samples(rows, ("vx", "vy", "vz"), summary, 2)
+    rate = turn if len(turn.t) > 1 else None
     heading, course = _heading(measured, rate, ((world, "odometry"), (derived, "fixes")), steps)
     if len(world.t):
-        summary.refuse_rows("speeds where a world velocity is given", rows, first)
-        return Signal(world.t, np.nan_to_num(world.value)), heading, course
+        summary.refuse_rows("speeds where a world velocity is given", rows, speed.row)
+        return world._replace(value=np.nan_to_num(world.value)), heading, course
     if len(speed.t):
         if heading is None:
             allowed, hint = "needs heading, compass_deg, or fixes of a moving vehicle", "Add one, or give vx and vy."
-            given = f"of {name}, which has no heading"
-            raise InputError(f"{rows.place(int(first[0]))}, speed", given, allowed, hint)
-        turned = heading(speed.t)
-        known = np.isfinite(turned)
-        summary.refuse_rows("speeds without a heading", rows, first[~known])
+            field = f"{rows.place(int(speed.row[0]))}, speed"
+            raise InputError(field, f"of {name}, which has no heading", allowed, hint)
         if course:
             summary.assume(COURSE.format("{}", course), name)
-        return Signal(speed.t[known], speed.value[known] * _ahead(turned[known])), heading, course
+        angle = heading(speed.t)
+        turned = np.isfinite(angle)
+        summary.refuse_rows("speeds without a heading", rows, speed.row[~turned])
+        velocity = speed.value[turned] * _ahead(angle[turned])
+        return Signal(speed.t[turned], velocity, speed.row[turned]), heading, course
     if derived is None:
         hint = "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z."
         raise InputError(f"vehicle {name}", "no odometry, and less than two fixes", "cannot be placed", hint)
@@ -210,13 +211,11 @@ def _heading(
     """Heading that was measured, else the course of the first of `moves` that moves, and whose course it is."""
     if len(measured.t):
         return heading_at(measured, rate, steps.gap(measured.t)), ""
-    for velocity, what in moves:
-        if velocity is not None:
-            moving = np.hypot(velocity.value[:, 0], velocity.value[:, 1]) > MOVING
-            v = velocity.value[moving]
-            if len(v):
-                course = Signal(velocity.t[moving], np.arctan2(v[:, 1:2], v[:, :1]))
-                return heading_at(course, rate, np.inf), what
+    for velocity, source in moves:
+        if velocity is not None and (moving := np.hypot(*velocity.value[:, :2].T) > MOVING).any():
+            east, north = velocity.value[moving, :2].T
+            course = Signal(velocity.t[moving], np.arctan2(north, east)[:, None], velocity.row[moving])
+            return heading_at(course, rate, np.inf), source
     return None, ""
 
 
@@ -241,7 +240,8 @@ def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
 def step_means(signal: Signal, grid: Floats) -> Floats:
     """(T, C) mean over the step that ends at each instant, of the samples joined by straight lines.
 
-    >>> step_means(Signal(np.array([0.0, 1]), np.array([[0.0], [2]])), np.array([0.0, 0.5, 1])).ravel().tolist()
+    >>> speed = Signal(np.array([0.0, 1]), np.array([[0.0], [2]]), np.arange(2))
+    >>> step_means(speed, np.array([0.0, 0.5, 1])).ravel().tolist()
     [0.0, 0.5, 1.5]
     """
     dt = grid[1] - grid[0]
@@ -251,18 +251,11 @@ def step_means(signal: Signal, grid: Floats) -> Floats:
 
 def _integral(signal: Signal, at: Floats) -> Floats:
     """(G, C) integral from the first sample, which holds before it, as the last one does behind it."""
-    t, v = signal
-    if len(t) == 1:
-        constant: Floats = (at - t[0])[:, None] * v
-        return constant
-    whole = np.vstack([0 * v[:1], np.cumsum(np.diff(t)[:, None] * (v[1:] + v[:-1]) / 2, axis=0)])
-    k = np.clip(np.searchsorted(t, at, side="right") - 1, 0, len(t) - 2)
-    inside = np.clip(at, t[0], t[-1])
-    s = (inside - t[k])[:, None]
-    bend = (v[k + 1] - v[k]) / (t[k + 1] - t[k])[:, None]
-    beyond = (at - inside)[:, None] * np.where((at < t[0])[:, None], v[0], v[-1])
-    out: Floats = whole[k] + s * v[k] + 0.5 * s**2 * bend + beyond
-    return out
+    start = signal.t[0]
+    ends = np.append(at, signal.t) - start
+    t = np.concatenate([[ends.min() - 1], signal.t - start, [ends.max() + 1]])
+    curve = make_interp_spline(t, np.pad(signal.value, ((1, 1), (0, 0)), "edge"), k=1).antiderivative()
+    return np.asarray(curve(at - start) - curve(0.0))
 
 
 def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingAt:
@@ -271,8 +264,8 @@ def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingA
     Between measured headings h_j it is W(t) + the line through h_j - W(t_j), with the integral W of the yaw rate, which
     is zero where there is none. Without a yaw rate, gaps longer than `gap` are unknown.
 
-    >>> at = heading_at(Signal(np.array([0.0, 1]), np.array([[3.0], [-3.0]])), None, 2.0)
-    >>> at(np.array([0.5, 9.0])).round(3).tolist()
+    >>> heading = heading_at(Signal(np.array([0.0, 1]), np.array([[3.0], [-3.0]]), np.arange(2)), None, 2.0)
+    >>> heading(np.array([0.5, 9.0])).round(3).tolist()
     [3.142, nan]
     """
     turned = (lambda at: _integral(yaw_rate, at)[:, 0]) if yaw_rate is not None else np.zeros_like
@@ -280,8 +273,8 @@ def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingA
     sampled = heading.t if yaw_rate is None else yaw_rate.t
 
     def at(times: Floats) -> Floats:
-        found = np.interp(times, heading.t, offset) + turned(times)
-        return np.where(covered(sampled, times, gap, gap / 2), np.arctan2(np.sin(found), np.cos(found)), np.nan)
+        angle = wrap(np.interp(times, heading.t, offset) + turned(times))
+        return np.where(covered(sampled, times, gap, gap / 2), angle, np.nan)
 
     return at
 
@@ -291,46 +284,41 @@ def velocity_of_fixes(fixes: Signal, gap: float) -> Signal:
 
     Its errors are those of the fixes: a filter that takes both for independent believes too much.
     """
-    t, x = fixes
+    t, x = fixes.t, fixes.value
     step = max(float(np.median(np.diff(t))), SAME)
-    out = np.zeros_like(x)
+    velocity = np.zeros_like(x)
     for part in np.split(np.arange(len(t)), np.flatnonzero(np.diff(t) > gap + SAME) + 1):
-        if len(part) < 2:
-            continue
         grid = np.arange(t[part[0]], t[part[-1]] + step / 2, step)
-        even = np.column_stack([np.interp(grid, t[part], column) for column in x[part].T])
-        speed = np.gradient(smooth(even, step, COURSE_RATE / step), step, axis=0) if len(grid) > 1 else 0 * even
-        out[part] = np.column_stack([np.interp(t[part], grid, column) for column in speed.T])
-    return Signal(t, out)
+        if len(grid) > 1:
+            even = np.column_stack([np.interp(grid, t[part], column) for column in x[part].T])
+            slope = np.gradient(smooth(even, step, COURSE_RATE / step), step, axis=0)
+            velocity[part] = np.column_stack([np.interp(t[part], grid, column) for column in slope.T])
+    return fixes._replace(value=velocity)
 
 
-def _fixes_on_steps(rows: Rows, fixes: Signal, first: Ints, velocity: Floats, there: Bools, steps: Steps) -> Floats:
+def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, Ints, Floats]:
+    """Index of the sample nearest in time to each step that has one while the member is there, these steps, and how
+    much later the samples are, s."""
+    step, lag = steps.nearest(signal.t)
+    order = np.argsort(np.abs(lag), kind="stable")
+    order = order[(step >= 0)[order] & there[step[order]]]
+    kept = order[np.unique(step[order], return_index=True)[1]]
+    return kept, step[kept], lag[kept]
+
+
+def _fixes_on_steps(rows: Rows, fixes: Signal, velocity: Floats, there: Bools, steps: Steps) -> Floats:
     """(T, 3) fixes, each brought to the nearest step by the velocity; of several at a step the nearest in time."""
-    grid, summary = steps.grid, steps.summary
-    gnss = np.full((len(grid), 3), np.nan)
-    step, _ = steps.nearest(fixes.t)
-    lag, outside = grid[step] - fixes.t, step < 0
-    absent = ~there[step] & ~outside
-    same = np.zeros(len(step), dtype=np.int64)
-    chosen = nearest(np.abs(lag), np.where(absent, -1, step), same, same)
-    beside = np.setdiff1d(np.flatnonzero(~outside & ~absent), chosen)
-    summary.refuse_rows("fixes outside the recording", rows, first[outside])
-    summary.refuse_rows("fixes in gaps of the odometry", rows, first[absent])
-    summary.refuse_rows("fixes beside a nearer one of the same step", rows, first[beside])
-    after = np.minimum(step[chosen] + 1, len(grid) - 1)
-    between = np.where((lag[chosen] < 0) & there[after], after, step[chosen])
-    gnss[step[chosen]] = fixes.value[chosen] + lag[chosen, None] * velocity[between]
-    summary.count("fixes", len(chosen))
+    gnss, summary = np.full((len(steps.grid), 3), np.nan), steps.summary
+    nearest, _ = steps.nearest(fixes.t)
+    kept, step, lag = _nearest_of_each(fixes, there, steps)
+    outside = nearest < 0
+    absent = ~outside & ~there[nearest]
+    beside = ~outside & ~absent & ~np.isin(np.arange(len(nearest)), kept)
+    summary.refuse_rows("fixes outside the recording", rows, fixes.row[outside])
+    summary.refuse_rows("fixes in gaps of the odometry", rows, fixes.row[absent])
+    summary.refuse_rows("fixes beside a nearer one of the same step", rows, fixes.row[beside])
+    after = np.minimum(step + 1, len(gnss) - 1)
+    between = np.where((lag > 0) & there[after], after, step)
+    gnss[step] = fixes.value[kept] - lag[:, None] * velocity[between]
+    summary.count("fixes", len(kept))
     return gnss
-
-
-def _compass_on_steps(measured: Signal, rate: Floats, steps: Steps) -> Floats:
-    """(T,) headings rad, each brought to the nearest step by the yaw rate; of several at a step the nearest in time."""
-    found = np.full(len(steps.grid), np.nan)
-    step, late = steps.nearest(measured.t)
-    same = np.zeros(len(step), dtype=np.int64)
-    kept = nearest(late, step, same, same)
-    at = step[kept]
-    turned = measured.value[kept, 0] + (steps.grid[at] - measured.t[kept]) * rate[at]
-    found[at] = np.arctan2(np.sin(turned), np.cos(turned))
-    return found

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
+import pandas as pd
 
 from coopoc.arrays import Floats, checked, instance, named, number
 from coopoc.errors import InputError
@@ -27,7 +27,7 @@ from ..bag import read_bag
 from ..cells import TABLES, headers
 from ..nmea import read_nmea
 from ..source import parted
-from .frames import Origin, assumed, local, on_one_clock, origin_of
+from .frames import Origin, assumed, local, on_one_clock
 from .links import linked, of_vehicles
 from .motion import Steps, member, samples
 from .tables import is_log_table, read_log_table
@@ -143,10 +143,12 @@ def read_log(
     one_of("frame", frame, get_args(Frame))
     instance("any_scale", any_scale, bool, "Give True or False.")
     texts("ignore", ignore)
-    ahead = named("clock", clock or {}, "Give clock={name: s}.")
-    for field, value in {"dt": dt, "max_gap": max_gap, **{f"clock of {one}": s for one, s in ahead.items()}}.items():
+    for field, value in {"dt": dt, "max_gap": max_gap}.items():
         if value is not None:
-            number(field, value, -np.inf if field.startswith("clock") else 1e-12, allowed="> 0 s", hint="Give seconds.")
+            number(field, value, 1e-12, allowed="> 0 s", hint="Give seconds.")
+    clock = named("clock", clock or {}, "Give clock={name: s}.")
+    for name, ahead in clock.items():
+        number(f"clock of {name}", ahead, -np.inf, hint="Give seconds.")
     if origin is not None:
         checked("origin", origin, "(3,)", (3,))
     options: dict[str, Any] = {
@@ -154,45 +156,43 @@ def read_log(
         "kinds": named("kinds", kinds or {}, "Give kinds={word: kind}."),
         "ignore": ignore,
     }
-    rows, actual = _rows(path, truth, summary, options)
+    rows, true_rows = _rows(path, truth, summary, options)
     check_time(rows.t, path.name)
-    rows = on_one_clock(rows, ahead, path.name)
-    origin = origin_of(rows, origin)
-    rows = local(rows, origin)
+    rows = on_one_clock(rows, clock, path.name)
+    rows, origin = local(rows, origin)
     if not any_scale:
         _check_scale(rows, path.name)
     ids = _ids(rows, body)
-    grid = _grid(rows, dt, path.name)
-    steps = Steps(grid, max_gap, not rows.of("z").any(), body, summary)
-    members = {one: member(one, rows.take(rows.vehicle == one), steps) for one in ids}
-    marks = [k for k, one in enumerate(members.values()) if body and one.stands]
+    steps = Steps(_grid(rows, dt, path.name), max_gap, not rows.of("z").any(), body, summary)
+    members = {name: member(name, rows.take(rows.vehicle == name), steps) for name in ids}
+    marks = [k for k, name in enumerate(ids) if body and members[name].stands]
     rows = of_vehicles(rows, [ids[k] for k in marks], summary)
-    found = linked(rows, members, steps)
-    noise = sensors or assumed(rows, steps.planar, body, summary, steps.dt)
-    to_landmark = np.isin(found.links.neighbour, marks)
-    pairs = (found.links.step * len(ids) + found.links.observer)[~to_landmark]
-    arrays = {
-        name: np.stack([getattr(one, name) for one in members.values()], axis=1)[None]
+    measured = linked(rows, members, steps)
+    to_landmark = np.isin(measured.links.neighbour, marks)
+    pairs = (measured.links.step * len(ids) + measured.links.observer)[~to_landmark]
+    gnss, velocity, yaw_rate, compass = (
+        np.stack([getattr(part, name) for part in members.values()], axis=1)[None]
         for name in ("gnss", "velocity", "yaw_rate", "compass")
-    }
+    )
+    sensors = sensors or assumed(rows, steps.planar, body, summary, steps.dt)
     recording = Recording(
         ids=tuple(ids),
-        t=grid,
-        gnss=arrays["gnss"],
-        velocity=arrays["velocity"],
-        links=found.links,
-        relative=found.relative[None],
-        broadcasts=found.broadcasts & ~np.isin(np.arange(len(ids)), marks),
-        arrival=np.where(to_landmark, -1, found.arrival)[None],
-        sensors=noise,
+        t=steps.grid,
+        gnss=gnss,
+        velocity=velocity,
+        links=measured.links,
+        relative=measured.relative[None],
+        broadcasts=measured.broadcasts & ~np.isin(np.arange(len(ids)), marks),
+        arrival=np.where(to_landmark, -1, measured.arrival)[None],
+        sensors=sensors,
         v2x=V2X(max_neighbours=int(np.bincount(pairs).max(initial=0)), radius=np.inf),
         observers=tuple(range(len(ids))),
         notes=(f"measurements of {path.name}, nothing is simulated", *summary.sentences),
-        body=Body(arrays["yaw_rate"], arrays["compass"]) if body else None,
+        body=Body(yaw_rate, compass) if body else None,
         landmarks=tuple(marks),
     )
-    fleet = None if actual is None else _truth(local(actual, origin), recording, max_gap, path.stem)
-    summary.grid, summary.vehicles = steps_in_words(recording), {name: one.text for name, one in members.items()}
+    fleet = None if true_rows is None else _truth(local(true_rows, origin)[0], recording, max_gap, path.stem)
+    summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
     return Log(recording, fleet, summary, "messages" in summary.read, origin)
 
 
@@ -203,68 +203,65 @@ def steps_in_words(recording: Recording) -> str:
 
 
 def _is_bag(path: Path) -> bool:
-    return (path / "metadata.yaml").is_file()
+    return (path / "metadata.yaml").is_file() or READERS.get(path.suffix.lower()) is read_bag
 
 
 def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[str, Any]) -> tuple[Rows, Rows | None]:
     """Measurements of a file or a folder, and the truth: of the file that is named, of `truth.*`, or of a topic."""
     if not path.exists():
         raise InputError("path", str(path), "must be a file or a folder", "Check the path.")
+    true_file = None if truth is None else Path(truth)
     actual: list[Rows] = []
-    if _is_bag(path) or READERS.get(path.suffix.lower()) is read_bag:
-        file = Path(truth) if truth is not None and Path(truth).exists() else None
-        files = [path]
-        read: Callable[..., Rows] = partial(read_bag, truth="" if file else str(truth or ""), actual=actual)
+    if _is_bag(path):
+        true_file = true_file if true_file is not None and true_file.exists() else None
+        rows = read_bag(path, summary, truth="" if true_file else str(truth or ""), actual=actual, **options)
     else:
-        if truth is not None and not Path(truth).is_file():
+        if true_file is not None and not true_file.is_file():
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
         files = sorted(f for f in path.iterdir() if f.suffix.lower() in READERS) if path.is_dir() else [path]
-        own = [f for f in files if f.stem.lower() == TRUTH and f != path]
-        file = Path(truth) if truth is not None else own[0] if own else None
-        files = [f for f in files if f not in own and f != file]
+        true_files = [f for f in files if f.stem.lower() == TRUTH and f != path]
+        true_file = true_file or next(iter(true_files), None)
+        files = [f for f in files if f not in (*true_files, true_file)]
         if not files:
             allowed = f"must hold files in {', '.join(READERS)}"
             raise InputError("path", str(path), allowed, "Point at the folder of the log.")
-        _check_headers(options["columns"], [*files, *([file] if file else [])], path.name)
-        read = _read_file
-    rows = stacked([read(one, summary, **options) for one in files])
+        _check_headers(options["columns"], [*files, *([true_file] if true_file else [])], path.name)
+        rows = stacked([_read_file(file, summary, **options) for file in files])
     if not len(rows):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
-    if file is not None:
-        actual = [_read_file(file, Summary(), **{**options, "ignore": ()})]
+    if true_file is not None:
+        actual = [_read_file(true_file, Summary(), **{**options, "ignore": ()})]
     return rows, actual[0] if actual else None
 
 
 def _read_file(file: Path, summary: Summary, **options: Any) -> Rows:
-    read = READERS.get(file.suffix.lower(), read_log_table)
-    return read(file, summary, **options)
+    return READERS.get(file.suffix.lower(), read_log_table)(file, summary, **options)
 
 
 def _check_headers(columns: Mapping[str, str], files: Sequence[Path], name: str) -> None:
     """InputError for a name of a column that none of the tables of a log has."""
-    found = {header for file in files if columns and file.suffix.lower() in TABLES for header in headers(file)}
+    names = {header for file in files if columns and file.suffix.lower() in TABLES for header in headers(file)}
     for key, header in columns.items():
-        if header not in found:
-            allowed = f"is in no table, which have {', '.join(sorted(found))}"
-            hint = suggestion(header, found, "Name a column of a table.")
+        if header not in names:
+            allowed = f"is in no table, which have {', '.join(sorted(names))}"
+            hint = suggestion(header, names, "Name a column of a table.")
             raise InputError(f"{name}: columns[{key!r}]", repr(header), allowed, hint)
 
 
 def _check_scale(rows: Rows, name: str) -> None:
-    parts, t, position = [], np.empty(0), np.empty((0, 3))
-    for one in dict.fromkeys(rows.vehicle[rows.of("x")].tolist()):
-        fixes, _ = samples(rows.take(rows.vehicle == one), ("x", "y", "z"), Summary(), 2)
-        parts.append(len(t) + np.arange(len(fixes.t)))
-        t, position = np.append(t, fixes.t), np.append(position, np.nan_to_num(fixes.value), axis=0)
-    if len(t):
-        check_scale(t, position, parts, name)
+    vehicles = dict.fromkeys(rows.vehicle[rows.of("x")].tolist())
+    fixes = [samples(rows.take(rows.vehicle == one), ("x", "y", "z"), Summary(), 2) for one in vehicles]
+    sizes = np.cumsum([0, *(len(signal.t) for signal in fixes)])
+    if sizes[-1]:
+        t, position = (np.concatenate(parts) for parts in ([s.t for s in fixes], [s.value for s in fixes]))
+        check_scale(t, np.nan_to_num(position), np.split(np.arange(len(t)), sizes[1:-1]), name)
 
 
 def _ids(rows: Rows, body: bool) -> list[str]:
     """Members that can be placed, in the order of their first row: by fixes, or in body frames by odometry, too."""
-    known = set(rows.vehicle[rows.of("x", *(("speed", "yaw_rate") if body else ()))].tolist())
-    if known:
-        return [one for one in dict.fromkeys(rows.vehicle.tolist()) if one in known]
+    placed = set(rows.vehicle[rows.of("x", *(("speed", "yaw_rate") if body else ()))].tolist())
+    if placed:
+        return [name for name in dict.fromkeys(rows.vehicle.tolist()) if name in placed]
     if body:
         hint = "Give speed and yaw_rate of every vehicle, and x, y (and z) of landmarks."
         raise InputError("fixes, odometry", "none", "must be there: a pose is carried on by odometry", hint)
@@ -273,18 +270,18 @@ def _ids(rows: Rows, body: bool) -> list[str]:
 
 
 def _grid(rows: Rows, dt: float | None, name: str) -> Floats:
-    """Steps over all fixes and odometry."""
-    names, t = set(rows.vehicle.tolist()), rows.t[rows.in_group("odometry", "fix")]
-    densest = 0.0
-    for group in ("fix", "odometry"):
-        here = rows.in_group(group)
-        gaps = [np.diff(np.unique(np.round(rows.t[here & (rows.vehicle == one)], 6))) for one in names]
-        densest = min((float(np.median(each)) for each in gaps if len(each)), default=densest)
-    if dt is None and not densest > 0:
+    """Steps over all fixes and odometry, None: of the median interval of the densest odometry, else fixes."""
+    intervals = []
+    for group in ("odometry", "fix"):
+        there = rows.in_group(group)
+        times = pd.DataFrame({"vehicle": rows.vehicle[there], "t": rows.t[there].round(6)}).drop_duplicates()
+        intervals.append(float(times.sort_values("t").groupby("vehicle")["t"].agg(lambda t: t.diff().median()).min()))
+    densest = next((interval for interval in intervals if interval > 0), 0.0)
+    if dt is None and not densest:
         raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
-    step = float(f"{densest:.3g}") if dt is None else dt
+    step, t = dt or float(f"{densest:.3g}"), rows.t[rows.in_group("odometry", "fix")]
     count = (t.max() - t.min()) / step + 1.5
-    check_size(count, len(names), len(rows), step, name)
+    check_size(count, len(set(rows.vehicle.tolist())), len(rows), step, name)
     if count < 2:
         allowed = f"must be well below the {np.ptp(t):g} s of the log"
         raise InputError("dt", f"{step:g} s", allowed, "Take a shorter dt.")
@@ -294,31 +291,29 @@ def _grid(rows: Rows, dt: float | None, name: str) -> Floats:
 
 def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -> Fleet:
     """Truth of the members that have one, on the steps of the recording."""
-    shape, start = (len(recording.t), len(recording.ids)), recording.t[0]
-    known = set(rows.vehicle.tolist())
-    if not known & set(recording.ids):
-        allowed = f"must name vehicles of the log: {', '.join(recording.ids)}"
-        where = f"{rows.file[0]}: column vehicle"
-        raise InputError(where, ", ".join(sorted(known)), allowed, "Rename them, or leave the truth out.")
-    axes = ("x", "y", "z") if rows.of("z").any() else ("x", "y")
-    position, heading = np.full((*shape, 3), np.nan), np.full((*shape, 1), np.nan)
-    for column, one in enumerate(recording.ids):
-        mine = rows.take(rows.vehicle == one)
-        for out, kinds in ((position, axes), (heading, ("heading",))):
-            true, _ = samples(mine, kinds, Summary(), len(kinds))
-            value = np.zeros((len(true.t), out.shape[2]))
-            value[:, : len(kinds)] = true.value if kinds is axes else np.unwrap(true.value, axis=0)
-            if len(true.t) > 1:
-                gap = longest_gap(true.t, recording.dt, max_gap)
-                out[:, column] = interpolate(true.t - start, value, recording.t - start, gap)
-            elif len(true.t) and kinds is axes:
-                out[:, column] = value[0]
-    there = np.isfinite(position[..., 0])
-    beside = np.zeros(shape, dtype=bool)
-    beside[1:] |= there[:-1]
-    beside[:-1] |= there[1:]
-    position[there & ~beside] = np.nan
-    velocity = backward_difference(recording.t, position, recording.ids)
-    turned = wrap(heading[..., 0]) if np.isfinite(heading).any() else None
-    source = f"truth of {name}"
-    return Fleet(recording.ids, recording.t, position, velocity, name=name, source=source, heading=turned)
+    ids, start = recording.ids, recording.t[0]
+    vehicles = sorted(set(rows.vehicle.tolist()))
+    if not set(vehicles) & set(ids):
+        allowed = f"must name vehicles of the log: {', '.join(ids)}"
+        field = f"{rows.file[0]}: column vehicle"
+        raise InputError(field, ", ".join(vehicles), allowed, "Rename them, or leave the truth out.")
+    axes = 3 if rows.of("z").any() else 2
+    poses = np.full((len(recording.t), len(ids), 4), np.nan)
+    for column, vehicle in enumerate(ids):
+        mine = rows.take(rows.vehicle == vehicle)
+        true = samples(mine, ("x", "y", "z"), Summary(), axes)
+        heading = samples(mine, ("heading",), Summary())
+        headings = np.unwrap(heading.value, axis=0)
+        for first, t, value in ((0, true.t, np.nan_to_num(true.value)), (3, heading.t, headings)):
+            out = poses[:, column, first : first + 3]
+            if len(t) > 1:
+                gap = longest_gap(t, recording.dt, max_gap)
+                out[:] = interpolate(t - start, value, recording.t - start, gap)
+            elif len(t) and not first:
+                out[:] = value[0]
+    position, angle = poses[..., :3], poses[..., 3]
+    there = np.pad(np.isfinite(position[..., 0]), ((1, 1), (0, 0)))
+    position[~(there[2:] | there[:-2])] = np.nan
+    velocity = backward_difference(recording.t, position, ids)
+    turned = wrap(angle) if np.isfinite(angle).any() else None
+    return Fleet(ids, recording.t, position, velocity, name=name, source=f"truth of {name}", heading=turned)

@@ -14,7 +14,6 @@ from coopoc.plugins import suggestion
 
 from ..cells import (
     TABLES,
-    USUAL,
     filled,
     headers,
     missing_column,
@@ -25,7 +24,7 @@ from ..cells import (
     seconds,
     words,
 )
-from .units import ANGLES, KINDS, Rows, Summary, rows_of, stacked
+from .units import KINDS, Rows, Summary, rows_of, stacked
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -35,7 +34,8 @@ OF_FLEETS = {"id", "t", "x", "y", "z", "vx", "vy", "vz"}
 """Columns of a table of drives."""
 OF_LOGS = {"kind", "partner", "arrival", *KINDS} - OF_FLEETS - {"speed", "heading", "height"}
 """Columns that no table of drives has."""
-LOST = ("lost", "-1")
+ITSELF = "must be another member: a vehicle neither measures itself nor sends to itself"
+UNIT = "Is it in another unit? Other kinds: {kinds}. Or an angle over several turns? Write it within one."
 
 
 def is_log_table(path: Path, columns: Mapping[str, str] | None = None) -> bool:
@@ -78,16 +78,17 @@ def read_log_table(
             allowed = "is needed; one of places alone has vehicle, x, y, each vehicle once"
             raise missing_column(file, "t", list(frame.columns), allowed)
         summary.assume("members of a table without times stand where it says, from the first instant on")
+    if "vehicle" not in frame.columns:
+        frame = frame.assign(vehicle=path.stem)
     read = _long if "kind" in frame.columns else _wide
-    rows = read(frame, path, summary, kinds or {}, ignore)
+    rows = read(frame, file, summary, kinds or {}, ignore)
     if "partner" not in frame.columns and rows.in_group("relative").any():
         raise missing_column(file, "partner", list(frame.columns), "is needed")
     _check(rows)
     return rows
 
 
-def _long(frame: pd.DataFrame, path: Path, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> Rows:
-    file = path.name
+def _long(frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> Rows:
     frame = frame.assign(kind=words(frame, "kind", file))
     left = frame["kind"].isin(list(ignore))
     for kind, count in frame["kind"][left].value_counts(sort=False).items():
@@ -95,115 +96,94 @@ def _long(frame: pd.DataFrame, path: Path, summary: Summary, kinds: Mapping[str,
     frame = frame[~left].assign(kind=frame["kind"][~left].replace(dict(kinds)))
     strange = frame["kind"][~frame["kind"].isin(list(KINDS))]
     if len(strange):
-        one, *others = dict.fromkeys(strange.tolist())
+        first, *others = dict.fromkeys(strange.tolist())
         more = f" Unknown too: {', '.join(map(repr, others))}." if others else ""
-        hint = f'Map it with kinds={{"{one}": ...}}, or leave it out: ignore=["{one}"].{more}'
-        hint = f"{suggestion(one, KINDS, '')} {hint}".lstrip()
-        where, allowed = f"{file}: row {strange.index[0]}, column kind", f"must be one of {', '.join(KINDS)}"
-        raise InputError(where, repr(one), allowed, hint)
-    return _rows(frame, path, "value", "std")
+        hint = f'Map it with kinds={{"{first}": ...}}, or leave it out: ignore=["{first}"].{more}'
+        hint = f"{suggestion(first, KINDS, '')} {hint}".lstrip()
+        field, allowed = f"{file}: row {strange.index[0]}, column kind", f"must be one of {', '.join(KINDS)}"
+        raise InputError(field, repr(first), allowed, hint)
+    return _rows(frame, file, "value", "std")
 
 
-def _wide(frame: pd.DataFrame, path: Path, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> Rows:
-    file = path.name
+def _wide(frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> Rows:
     frame = frame.rename(columns={**kinds, **{f"{name}_std": f"{kind}_std" for name, kind in kinds.items()}})
-    used = [kind for kind in KINDS if kind in frame.columns and kind not in ignore and kind != "message"]
-    used += ["message"] if {"message", "arrival"} & set(frame.columns) else []
-    if not used:
+    value = {kind: "arrival" if kind == "message" else kind for kind in KINDS if kind not in ignore}
+    value = {kind: column for kind, column in value.items() if column in frame.columns}
+    if not value:
         allowed = f"must be there, or columns named after kinds ({', '.join(KINDS)})"
-        wanted = 'name the columns: kinds={"...": "speed_kmh"}'
         error = missing_column(file, "kind", list(frame.columns), allowed)
-        raise InputError(error.field, error.value, error.allowed, f"{error.hint} Or {wanted}.")
-    if "std" in frame.columns:
-        bare = [kind for kind in used if f"{kind}_std" not in frame.columns]
-        if bare and (len(used) == 1 or all(KINDS[kind].group == "fix" for kind in used)):
-            summary.assume(f"column std of {file} is the standard deviation of each of {', '.join(bare)}")
-            frame = frame.assign(**{f"{kind}_std": frame["std"] for kind in bare})
-        else:
-            summary.leave(f"{file}: column std, which belongs to no kind (name it {used[0]}_std)", len(frame))
-        frame = frame.drop(columns="std")
-    known = {"t", "vehicle", "partner", "arrival", *used, *(f"{kind}_std" for kind in used)}
+        hint = f'{error.hint} Or name the columns: kinds={{"...": "speed_kmh"}}.'
+        raise InputError(error.field, error.value, error.allowed, hint)
+    if "std" in frame.columns and {KINDS[kind].group for kind in value} == {"fix"}:
+        summary.assume(f"column std of {file} is the standard deviation of each of {', '.join(value)}")
+        frame = frame.assign(**{f"{kind}_std": frame["std"] for kind in value}).drop(columns="std")
+    used = {"t", "vehicle", "partner", *value.values(), *(f"{kind}_std" for kind in value)}
     for column in frame.columns:
-        if column not in known:
-            summary.leave(f"{file}: column {column}", len(frame))
-    parts = []
-    for kind in used:
-        column = "arrival" if kind == "message" else kind
-        if column not in frame.columns:
-            raise missing_column(file, column, list(frame.columns), "is needed")
-        parts.append(_rows(frame[filled(frame[column])].assign(kind=kind), path, kind, f"{kind}_std"))
-    return stacked(parts)
+        if column not in used:
+            hint = f", which belongs to no kind (name it {next(iter(value))}_std)" if column == "std" else ""
+            summary.leave(f"{file}: column {column}{hint}", len(frame))
+    return stacked(
+        [
+            _rows(frame[filled(frame[column])].assign(kind=kind), file, kind, f"{kind}_std")
+            for kind, column in value.items()
+        ]
+    )
 
 
-def _rows(frame: pd.DataFrame, path: Path, value: str, std: str) -> Rows:
+def _rows(frame: pd.DataFrame, file: str, value: str, std: str) -> Rows:
     """Rows of a table with a column kind, whose values and standard deviations are in the columns of these names."""
-    file, given = path.name, frame.columns
     message = (frame["kind"] == "message").to_numpy()
+    for mask, column in ((~message, value), (message, "arrival")):
+        if mask.any() and column not in frame.columns:
+            raise missing_column(file, column, list(frame.columns), "is needed")
     values = np.full(len(frame), np.nan)
     if not message.all():
-        if value not in given:
-            raise missing_column(file, value, list(given), "is needed")
         values[~message] = numeric(frame[~message], value, file)
-    vehicles = [path.stem] * len(frame)
-    if "vehicle" in given:
-        vehicles = words(frame, "vehicle", file)
-    elif any(frame[name].nunique() > 1 for name in given if name.lower() in USUAL["vehicle"]):
-        raise missing_column(file, "vehicle", list(given), "is needed")
-    partner = frame["partner"] if "partner" in given else frame["kind"]
-    there = filled(partner) & ("partner" in given)
-    rows = {
-        "t": seconds(frame, "t", file) if "t" in given else np.nan,
-        "vehicle": vehicles,
-        "partner": partner.astype(str).str.strip().where(there, ""),
+    rows: dict[str, Any] = {
+        "t": seconds(frame, "t", file) if "t" in frame.columns else np.nan,
+        "vehicle": words(frame, "vehicle", file),
+        "partner": "",
         "value": values,
         "std": optional(frame, std, file),
         "arrival": _arrivals(frame, file, message),
     }
+    if "partner" in frame.columns:
+        rows["partner"] = frame["partner"].astype(str).str.strip().where(filled(frame["partner"]), "")
     return rows_of(frame[["kind"]].assign(**rows), file)
 
 
 def _arrivals(frame: pd.DataFrame, file: str, message: Bools) -> Floats:
     """Times of arrival, infinite for "lost"; NaN for what is no message."""
-    out = np.full(len(frame), np.nan)
-    if not message.any():
-        return out
-    if "arrival" not in frame.columns:
-        raise missing_column(file, "arrival", list(frame.columns), "is needed")
-    given: Any = frame["arrival"]
-    lost = message & given.astype(str).str.strip().str.lower().isin(LOST).to_numpy()
-    out[lost] = np.inf
-    there = message & ~lost
-    if given.dtype.kind in "OUT" or str(given.dtype) == "str":
-        given = given.astype(str).str.replace(",", ".")  # text, as it may hold "lost", whatever the decimal mark
-    if there.any():
-        out[there] = seconds(frame.assign(arrival=given)[there], "arrival", file)
-    return out
+    times = np.full(len(frame), np.nan)
+    if message.any():
+        cells: Any = frame["arrival"]
+        lost = message & (cells.astype(str).str.strip().str.lower() == "lost").to_numpy()
+        times[lost] = np.inf
+        if cells.dtype.kind in "OUT" or str(cells.dtype) == "str":
+            cells = cells.astype(str).str.replace(",", ".")  # text, as it may hold "lost", whatever the decimal mark
+        arrived = message & ~lost
+        if arrived.any():
+            times[arrived] = seconds(frame.assign(arrival=cells)[arrived], "arrival", file)
+    return times
 
 
 def _check(rows: Rows) -> None:
     """InputError at the first value that cannot be meant in its unit, or that lacks its partner."""
-
-    def refuse(kind: str, wrong: Bools, what: str, given: str, allowed: str, hint: str) -> None:
-        bad = np.flatnonzero((rows.kind == kind) & wrong)
-        if len(bad):
-            value = {"value": f"{rows.value[bad[0]]:.10g}", "std": f"{rows.std[bad[0]]:g}"}.get(given)
-            shown = value or repr(rows.partner[bad[0]]).replace("''", "empty")
-            raise InputError(f"{rows.place(int(bad[0]))}, {what}", shown, allowed, hint)
-
-    for name in dict.fromkeys(rows.kind.tolist()):
-        kind = KINDS[name]
-        hint = f"Is it in another unit? Other kinds: {', '.join(n for n in KINDS if KINDS[n].name == kind.name)}."
-        hint += " Or counted on over several turns? Write it within one." if kind.name in ANGLES else ""
-        refuse(name, np.abs(rows.value) > kind.limit, name, "value", f"must be within +-{kind.limit:.4g}", hint)
-        if name in ("range", "inclination"):
-            sign = ">" if name == "range" else ">="
-            wrong = (rows.value <= 0) if name == "range" else (rows.value < 0)
-            refuse(name, wrong, name, "value", f"must be {sign} 0", "Remove the row.")
-        hint = "Leave it empty where it is unknown; sensors= gives one for all."
-        refuse(name, rows.std <= 0, f"standard deviation of {name}", "std", "must be > 0", hint)
-        if kind.group == "relative":
-            hint = f"Name the vehicle or road-side unit to which the {name} was measured."
-            refuse(name, rows.partner == "", "column partner", "partner", "must be a name", hint)
-        allowed = "must be another member: a vehicle neither measures itself nor sends to itself"
-        wrong = rows.partner == rows.vehicle
-        refuse(name, wrong, "column partner", "partner", allowed, "Mend or remove the row.")
+    limit = np.array([KINDS[kind].limit for kind in rows.kind.tolist()])
+    alone = rows.in_group("relative") & (rows.partner == "")
+    for wrong, column, value, allowed, hint in (
+        (np.abs(rows.value) > limit, "{kind}", "value", "must be within +-{limit:.4g}", UNIT),
+        (rows.of("range") & (rows.value <= 0), "{kind}", "value", "must be > 0", "Remove the row."),
+        (rows.of("inclination") & (rows.value < 0), "{kind}", "value", "must be >= 0", "Remove the row."),
+        (rows.std <= 0, "standard deviation of {kind}", "std", "must be > 0", "Leave it empty where it is unknown."),
+        (alone, "column partner", "partner", "must be a name", "Name the vehicle or road-side unit."),
+        (rows.partner == rows.vehicle, "column partner", "partner", ITSELF, "Mend or remove the row."),
+    ):
+        if wrong.any():
+            k = int(np.argmax(wrong))
+            kind = rows.kind[k]
+            others = ", ".join(name for name in KINDS if KINDS[name].name == KINDS[kind].name)
+            given = getattr(rows, value)[k]
+            shown = (repr(given) if given else "empty") if value == "partner" else f"{given:.10g}"
+            allowed, hint = allowed.format(limit=limit[k]), hint.format(kinds=others)
+            raise InputError(f"{rows.place(k)}, {column.format(kind=kind)}", shown, allowed, hint)

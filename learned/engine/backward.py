@@ -24,9 +24,7 @@ from coopoc.learned.engine.optimiser import Found, Moments, Update, advance_row
 
 
 @compiled
-def descend(
-    moments: Moments, plan: Plan, drives: Drives, target: Floats, found: Found, update: Update, span: tuple[int, int]
-) -> None:
+def descend(moments: Moments, plan: Plan, drives: Drives, target: Floats, found: Found, update: Update) -> None:
     """Losses (R,) m^2 and gradients (R, P) of the models `update.rows`, and with step > 0 one step of AdamW.
 
     Args:
@@ -36,7 +34,6 @@ def descend(
         target: (T, R, B, 3) true positions m; with step -1 the gradient with respect to the estimates.
         found: outputs.
         update: the optimiser step.
-        span: first and last + 1 of the rows to compute.
     """
     theta, (steps, _, lanes, _) = moments.theta, drives.gnss.shape
     net = Net(np.empty(plan.parameters, theta.dtype), plan.layers, plan.columns)
@@ -46,7 +43,7 @@ def descend(
         np.zeros((steps * most, plan.width), theta.dtype),
     )
     x, state, adjoint = np.empty_like(drives.gnss), new_state(theta), new_state(theta)
-    for r in range(span[0], span[1]):
+    for r in range(len(update.rows)):
         unpack(theta[update.rows[r]], net)
         found.gradient[r] = 0.0
         loss = 0.0
@@ -82,7 +79,7 @@ def score(x: Floats, truth: Floats, r: Index, lane: Index) -> float:
             error = zero if np.isnan(truth[t, r, lane, i]) else x[t, r, lane, i] - truth[t, r, lane, i]
             x[t, r, lane, i] = scale * error
             squares += float(error * error)
-    return share * squares
+    return float(share * squares)
 
 
 @storage

@@ -1,4 +1,4 @@
-"""Compiled rollout of a GainNet along a drive: the arithmetic of `GainNet.trace`, and the tape that backward reads."""
+"""Compiled rollout of a GainNet along a drive: the arithmetic of `GainNet.step`, and the tape that backward reads."""
 
 from __future__ import annotations
 
@@ -53,11 +53,11 @@ def new_state(like: Floats) -> State:
 
 
 @compiled
-def forward(theta: Floats, plan: Plan, drives: Drives, x: Floats, span: tuple[int, int]) -> None:
-    """Estimates x (T, S, B, 3) m of the models of theta (S, P) in `span`; the tape holds one step only."""
+def forward(theta: Floats, plan: Plan, drives: Drives, x: Floats) -> None:
+    """Estimates x (T, S, B, 3) m of the models of theta (S, P); the tape holds one step only."""
     net = Net(np.empty(plan.parameters, x.dtype), plan.layers, plan.columns)
     tape, state = np.zeros((LANES, plan.width), x.dtype), new_state(x)
-    for s in range(span[0], span[1]):
+    for s in range(len(theta)):
         unpack(theta[s], net)
         for first in range(0, x.shape[2], LANES):
             follow(net, tape, drives, x, (s, first, min(LANES, x.shape[2] - first)), state, 0)

@@ -2,11 +2,6 @@
 
 from __future__ import annotations
 
-import os
-from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
-from functools import cache
-from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -18,7 +13,6 @@ from coopoc.arrays import AnyArray, Floats, Ints
 from coopoc.errors import InputError
 
 from ..training.clients import Batch
-from ..training.machine import threads
 from ..training.schedule import Moving, Schedule, update_of
 from . import backward, forward
 from .forward import Drives
@@ -32,7 +26,7 @@ def rollout(theta: Tensor, shapes: Shapes, gnss: Tensor, velocity: Tensor, x0: T
     """Estimates x (T, S, B, 3) m of S models with weights theta (S, P): `GainNet.step`, T times, compiled.
 
     x_t = x_{t-1} + dt u_t + K_t (z_t - x_{t-1} - dt u_t). Differentiable in theta and in nothing else, by explicit
-    backpropagation through time. The numbers of a model do not depend on the others, nor on the number of threads.
+    backpropagation through time. The numbers of a model do not depend on the others.
 
     Args:
         theta: (S, P) weights.
@@ -99,7 +93,7 @@ def _step(theta: Tensor, shapes: Shapes, batch: Batch, moments: Moments, update:
         raise InputError("truth", f"shape {truth.shape}", f"must be {drives.gnss.shape}", "Give one position per fix.")
     gradient, losses = np.empty((models, plan.parameters), truth.dtype), np.empty(models, truth.dtype)
     found = Found(gradient, losses, np.empty(models, np.bool_))
-    _spread(backward.descend, models, moments, plan, drives, truth, found, update)
+    backward.descend(moments, plan, drives, truth, found, update)
     return found
 
 
@@ -124,28 +118,8 @@ class _Rollout(torch.autograd.Function):
 def _forward(theta: Tensor, shapes: Shapes, drives: Drives) -> AnyArray:
     """Estimates (T, S, B, 3)."""
     x = np.empty_like(drives.gnss)
-    _spread(forward.forward, x.shape[1], _array(theta, theta.dtype), plan_of(shapes), drives, x)
+    forward.forward(_array(theta, theta.dtype), plan_of(shapes), drives, x)
     return x
-
-
-def _spread(kernel: Callable[..., None], models: int, *arguments: Any) -> None:
-    """Run a kernel over all models, a share of them in each thread."""
-    shares = max(1, min(threads(), models))
-    cuts = [models * share // shares for share in range(shares + 1)]
-    if shares == 1:
-        kernel(*arguments, (0, models))
-        return
-    jobs = [_pool(shares).submit(kernel, *arguments, span) for span in pairwise(cuts)]
-    for job in jobs:
-        job.result()
-
-
-@cache
-def _pool(workers: int) -> ThreadPoolExecutor:
-    return ThreadPoolExecutor(workers, "rollout")
-
-
-os.register_at_fork(after_in_child=_pool.cache_clear)  # a forked process has none of its parent's threads
 
 
 def _checked(theta: Tensor, shapes: Shapes, models: int, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: Any) -> Drives:

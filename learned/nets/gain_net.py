@@ -102,13 +102,7 @@ class GainNet(Recurrent):
         return Memory(unit, torch.zeros_like(unit), unit, x0, x0, x0, x0)
 
     def step(self, memory: Memory, gnss: Tensor, velocity: Tensor, dt: float | Tensor) -> tuple[Memory, Tensor]:
-        """One step: fix (B, 3) m, velocity (B, 3) m/s, dt s -> new memory (its `x` is the estimate), gain (B, 3, 3)."""
-        return self.trace(memory, gnss, velocity, dt)[:2]
-
-    def trace(
-        self, memory: Memory, gnss: Tensor, velocity: Tensor, dt: float | Tensor
-    ) -> tuple[Memory, Tensor, tuple[Tensor, Tensor, Tensor]]:
-        """`step`, and the new states (B, 9) of the GRUs for process noise, prior and innovation covariance.
+        """One step: fix (B, 3) m, velocity (B, 3) m/s, dt s -> new memory (its `x` is the estimate), gain (B, 3, 3).
 
         The gain of a missing fix is zero. The compiled engine is tested against this text.
         """
@@ -132,7 +126,7 @@ class GainNet(Recurrent):
         new = Memory(process, posterior, innovation, x, memory.x, x_prior, fix)
         held = memory._replace(x=x, x_before=memory.x)
         after = Memory(*(torch.where(missing, old, now) for old, now in zip(held, new, strict=True)))
-        return after, matrix, (process, prior, innovation)
+        return after, matrix
 
     def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
         """Estimates (B, T, 3) m as in `Recurrent`; compiled, except for inputs with gradients or on another device."""

@@ -16,7 +16,6 @@ from coopoc.errors import InputError, shown
 
 Item = TypeVar("Item")
 _line: ContextVar[int] = ContextVar("line", default=0)
-_threads: ContextVar[int | None] = ContextVar("threads", default=None)
 
 
 @contextmanager
@@ -33,21 +32,6 @@ def one_core() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(threads)
-
-
-@contextmanager
-def row_threads(number: int) -> Iterator[None]:
-    """So many threads for the models of a compiled rollout, inside `one_core` too; the numbers stay the same."""
-    token = _threads.set(number)
-    try:
-        yield
-    finally:
-        _threads.reset(token)
-
-
-def threads() -> int:
-    """Threads for the models of a rollout: those of `row_threads`, else as many as torch may use."""
-    return _threads.get() or torch.get_num_threads()
 
 
 @cache

@@ -2,7 +2,7 @@
 
 The state of member k is tuple k, its position first; its block is k - 1, and the ego's is the last, so that elimination
 ends with the ego's covariance. A filter calls, step by step, `gather` of `coopoc.kernels.stars.messages`,
-`predict_state`, `predict` of `coopoc.kernels.stars.elimination`, `rearrange`, `add_fix` and `add_relative`, and
+`predict_state`, `predict` of `coopoc.kernels.stars.elimination`, `rearrange`, its own fixes, `add_relative`, and
 `solve`. The argument `row` is any tuple of d numbers, from which the compiler takes d.
 """
 
@@ -30,7 +30,6 @@ from ..compiling.small import (
     square,
     store,
     subtract,
-    times,
     transpose,
     with_first3,
     zeros,
@@ -284,16 +283,6 @@ def add_relative(
     mine, egos = load(eta, i, row), load(eta, e, row)
     store(eta, i, with_first3(mine, add(first3(mine), vector)))
     store(eta, e, with_first3(egos, subtract(first3(egos), vector)))
-
-
-@inside
-def add_fix(joint: Joint, i: int, weight: Numbers, gap: Numbers, row: Numbers) -> None:
-    """Add a measured position to block i: its inverse variances, and the measured position less the predicted one."""
-    at = i * joint.stride + i
-    own = load(joint.information, at, square(row))
-    store(joint.information, at, add_diagonal(own, with_first3(zeros(weight[0], row), weight)))
-    mine = load(joint.eta, i, row)
-    store(joint.eta, i, with_first3(mine, add(first3(mine), times(weight, gap))))
 
 
 @inside

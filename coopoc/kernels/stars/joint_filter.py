@@ -6,12 +6,11 @@ No matrix is ever inverted as a whole. A drive and a stream call the same `step`
 from __future__ import annotations
 
 from ..compiling.compile import as_written, inner
-from ..compiling.small import load, negate, square, store, subtract
+from ..compiling.small import add, add_diagonal, load, negate, square, store, subtract, times
 from ..compiling.vectors import LANES
 from .elimination import predict
 from .joint import (
     Joint,
-    add_fix,
     add_relative,
     block_of,
     copy,
@@ -98,8 +97,10 @@ def add_fixes(star: Star, joint: Joint, n: int) -> None:
     for k in range(n):
         new = load(star.status, 5 * k + NEW, (0.0,))[0]
         p, q, r = load(star.motion, 4 * k + VARIANCE, ROW)
-        gap = subtract(load(star.motion, 4 * k + POSITION, ROW), load(joint.state, k, ROW))
-        add_fix(joint, block_of(k, n), (new / p, new / q, new / r), gap, ROW)
+        weight, i = (new / p, new / q, new / r), block_of(k, n)
+        gap, at = subtract(load(star.motion, 4 * k + POSITION, ROW), load(joint.state, k, ROW)), i * joint.stride + i
+        store(joint.information, at, add_diagonal(load(joint.information, at, square(ROW)), weight))
+        store(joint.eta, i, add(load(joint.eta, i, ROW), times(weight, gap)))
 
 
 @inner

@@ -10,7 +10,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
-from ...optimize.model.factor import Factor, of_checked, of_recorded
+from ...optimize.model.factor import Factor, of_checked
 from ...optimize.model.inputs import check_std
 from ...optimize.model.measurements import lookup
 from ...optimize.model.problem import Problem
@@ -149,7 +149,7 @@ def pose_subgraph(run: PoseRun, step: int, known: Mapping[str, Floats]) -> Probl
             factors.append(of_checked(kind, index[on, None], z[step, on], own_std[on] if len(own_std) > 1 else own_std))
     fresh = index[[c for c in marks if recording.ids[c] not in known]]
     if len(fresh):
-        factors.append(of_recorded("position", fresh[:, None], x0[fresh, :2], np.array(LANDMARK_STD)))
+        factors.append(of_checked("position", fresh[:, None], x0[fresh, :2], np.full((1, 2), LANDMARK_STD)))
     ends = np.stack([index[recording.links.observer], index[recording.links.neighbour]], axis=1)
     for kind, where, z, relative_std in run.relative:
         rows = links[where[links]]

@@ -54,8 +54,8 @@ class Cholesky:
         """
         from ...kernels.graphs.multifrontal import places, selected_inverse
 
-        found = selected_inverse(self._fronts, self._factor)
-        return found[places(self._fronts, self._rank[rows], self._rank[columns])]
+        inverse = selected_inverse(self._fronts, self._factor)
+        return inverse[places(self._fronts, self._rank[rows], self._rank[columns])]
 
 
 class DenseCholesky:

@@ -13,11 +13,12 @@ from weakref import WeakKeyDictionary, WeakValueDictionary
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
+from ..model.factor import steerable
 from ..model.problem import Problem
 from ..model.space import Space
-from ..model.symbolic import Structure, numbers_of, structure_of
+from ..model.symbolic import Kind, Structure, Term, numbers_of
+from ..model.tape import Model, write
 from .cholesky import Cholesky, DenseCholesky
-from .tape import Model, write
 
 DENSE = 200
 """Unknowns up to which one dense matrix is as fast."""
@@ -60,10 +61,10 @@ class Entries:
         key, offset = self.block
         return upper, lower, offset[np.searchsorted(key, upper * len(self.number) + lower)]
 
-    def places(self, pair: tuple[Ints, Ints, Ints], one: Ints, other: Ints) -> Ints:
-        """(..., M) where products of two unknowns of a pair's nodes belong, -1 where one is -1."""
+    def places(self, pair: tuple[Ints, Ints, Ints], unknown: Ints, another: Ints) -> Ints:
+        """(..., M) where products of two unknowns of a pair's nodes belong, -1 where unknown is -1."""
         upper, lower, offset = pair
-        low, high = np.minimum(one, other), np.maximum(one, other)
+        low, high = np.minimum(unknown, another), np.maximum(unknown, another)
         within = high - self.first[upper]
         at = self.start[upper] + within * self.height[upper] + within * (within + 1) // 2
         return np.where(low < 0, -1, at + offset + low - self.first[lower])
@@ -195,6 +196,18 @@ class Layout:
         for (tape, nodes, goal), own in zip(self._tapes[model], numbers, strict=True):
             accumulate(tape, x, nodes, own, goal, out)
         return out
+
+
+def structure_of(problem: Problem) -> Structure:
+    """The structure of a problem."""
+    space, movable = problem.space, problem.movable
+    factors = (Term(Kind(f.measurement, space, f.std is None, f.loss), f.nodes.tobytes()) for f in problem.factors)
+    constraints = (
+        Term(Kind(c.measurement, space), c.nodes.tobytes(), steerable(c, movable).tobytes())
+        for c in problem.constraints
+    )
+    still = b"" if movable is None else (~movable).tobytes()
+    return Structure(len(problem.names), space, still, tuple(factors), tuple(constraints))
 
 
 _small = lru_cache(maxsize=256)(Layout)

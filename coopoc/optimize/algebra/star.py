@@ -11,6 +11,11 @@ from ...arrays import Floats
 from ..model.linear import Linear
 from ..model.problem import Problem
 
+COFACTORS = np.array(
+    [[4, 2, 1, 5, 0, 2, 3, 1, 0], [8, 7, 5, 6, 8, 3, 7, 6, 4], [5, 1, 2, 3, 2, 0, 4, 0, 1], [7, 8, 4, 8, 6, 5, 6, 7, 3]]
+)
+"""Entries a, b, c, d of a 3 x 3 matrix, row by row, with a b - c d its adjugate."""
+
 
 @dataclass(frozen=True, eq=False)
 class Star:
@@ -62,9 +67,11 @@ def inverted(matrix: Floats) -> Floats:
     """Inverses (..., d, d); of 3 x 3 by the adjugate, which takes a quarter of LAPACK's time; NaN where singular."""
     with np.errstate(all="ignore"):
         if matrix.shape[-1] == 3:
-            a, b, c = np.moveaxis(matrix, -2, 0)
-            adjugate = np.stack([np.cross(b, c), np.cross(c, a), np.cross(a, b)], axis=-1)
-            return np.asarray(adjugate / (a * adjugate[..., 0]).sum(axis=-1)[..., None, None])
+            entries = matrix.reshape(*matrix.shape[:-2], 9)
+            a, b, c, d = (entries.take(chosen, axis=-1) for chosen in COFACTORS)
+            adjugate = a * b - c * d
+            determinant = (entries[..., :3] * adjugate[..., ::3]).sum(axis=-1, keepdims=True)
+            return np.asarray(adjugate / determinant).reshape(matrix.shape)
     singular = ~(np.linalg.det(matrix) > 0.0)[..., None, None]
     return np.where(singular, np.nan, np.linalg.inv(np.where(singular, np.eye(matrix.shape[-1]), matrix)))
 

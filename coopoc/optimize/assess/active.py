@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..model.factor import bounded, values
-from ..model.linear import chain, local
+from ..model.factor import as_factor, bounded
+from ..model.linear import linearise
 from ..model.problem import Problem
 
 NEAR = 5e-7
@@ -85,21 +85,15 @@ def _rows_of(problem: Problem, x: Floats, k: int) -> tuple[tuple[Floats, Floats,
     from scipy.sparse import csr_array
 
     item, space = problem.constraints[k], problem.space
-    known, which = item.measurement, bounded(item)
-    seen = local(space, known, x[None], item.nodes)
-    value, jacobian = values(known, item, *seen)
-    jacobians = chain(
-        space, known, x[None], item.nodes, seen, np.broadcast_to(jacobian, (*value.shape, jacobian.shape[-1]))
-    )
-    row, component = np.nonzero(which)
-    data = np.stack([s[0, row, component] for s in jacobians], axis=1)
-    if problem.movable is not None:
-        data = data * problem.movable[item.nodes[row]]
+    finite = bounded(item)
+    linear = linearise(space, [as_factor(item)], problem.movable, x[None])
+    row, component = np.nonzero(finite)
+    data = np.stack([jacobian[0, row, component] for jacobian in linear.jacobian[0]], axis=1)
     columns = space.dof * item.nodes[row][:, :, None] + np.arange(space.dof)
-    starts = np.arange(0, data.size + 1, known.arity * space.dof)
+    starts = np.arange(0, data.size + 1, item.nodes.shape[1] * space.dof)
     matrix = csr_array((data.ravel(), columns.ravel(), starts), shape=(len(row), len(problem.names) * space.dof))
     place = np.stack([np.full(len(row), k), row, component], axis=1)
-    return (value[0][which], item.lower[which], item.upper[which]), matrix, place
+    return (linear.residual[0][0, finite], item.lower[finite], item.upper[finite]), matrix, place
 
 
 def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:

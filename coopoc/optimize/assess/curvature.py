@@ -10,8 +10,9 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..algebra.cholesky import cholesky_of, with_still
 from ..algebra.sparse import sparse
-from ..model.linear import chain, local
-from ..model.measurements import Measurement
+from ..model.factor import Factor, as_factor, unchecked
+from ..model.linear import linearise
+from ..model.parts import taken
 from ..model.problem import Problem
 from .active import Active, constraint_rows
 
@@ -74,9 +75,7 @@ def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
         weight[place[own, 1], place[own, 2]] = active.multipliers[own]
         rows = np.flatnonzero(weight.any(axis=1))
         if len(rows) and not item.measurement.linear:
-            assert item.constants is not None
-            z = np.zeros((len(rows), item.lower.shape[1]))
-            second = _second(problem, item.measurement, item.constants[rows], z, x[item.nodes[rows]], weight[rows])
+            second = _second(problem, taken(as_factor(item), rows), x[item.nodes[rows]], weight[rows])
             curved = curved + _assembled(problem, item.nodes[rows], second)
     within = active.along.T @ curved @ active.along
     return not within.shape[0] or cholesky_of(within) is not None
@@ -95,27 +94,24 @@ def hessian(problem: Problem, x: Floats) -> Any:
     return with_still(into @ (half + triu(half, 1).T) @ into.T, still)
 
 
-def _second(problem: Problem, kind: Measurement, constants: Floats, z: Floats, at: Floats, weight: Floats) -> Floats:
+def _second(problem: Problem, factor: Factor, at: Floats, weight: Floats) -> Floats:
     """(M, arity dof, arity dof) second derivative of weight . h by the steps of each measurement's nodes.
 
     Every measurement gets nodes of its own, so that one call moves them all.
 
     Args:
-        z: (M, k) as measured.
+        factor: whose residual is h.
         at: (M, arity, ambient) nodes.
         weight: (M, size).
     """
     space, (count, arity) = problem.space, at.shape[:2]
-    nodes = np.arange(count * arity).reshape(count, arity)
+    apart = unchecked(factor, nodes=np.arange(count * arity).reshape(count, arity))
     gap = np.linalg.norm(space.position(at[:, -1] - at[:, 0]), axis=-1) if arity > 1 else np.ones(count)
     reach = np.where(np.arange(space.dof)[:, None] < problem.dimension, STEP * np.maximum(gap, 1e-3), STEP)
 
     def gradient(step: Floats) -> Floats:
         moved = space.retract(at, step).reshape(1, count * arity, -1)
-        measured = local(space, kind, moved, nodes)
-        difference, inner = kind.differentiate(*measured, z, constants)
-        inner = np.broadcast_to(inner, (*difference.shape, inner.shape[-1]))
-        jacobians = chain(space, kind, moved, nodes, measured, inner)
+        (jacobians,) = linearise(space, [apart], None, moved).jacobian
         # what has no weight may have no derivative
         kept = (np.where(weight[..., None] != 0.0, jacobian[0], 0.0) for jacobian in jacobians)
         return np.concatenate([np.einsum("mk,mkd->md", weight, jacobian) for jacobian in kept], axis=1)

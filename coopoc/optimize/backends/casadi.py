@@ -16,11 +16,12 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
+from ..algebra.sparse import structure_of
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
 from ..model.factor import steerable
 from ..model.problem import Problem
-from ..model.symbolic import Structure, expressions, parameters, structure_of
+from ..model.symbolic import Structure, expressions, numbers_of
 
 DENSE = 200
 """Numbers that can move up to which FATROP is faster than IPOPT."""
@@ -30,7 +31,7 @@ SUCCESS = "Solve_Succeeded"
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
 """Statuses of CasADi after which another chart would not help."""
 QUIET: dict[str, Any] = {"print_time": False, "calc_lam_p": False, "show_eval_warnings": False, "error_on_fail": False}
-IPOPT: dict[str, Any] = {
+IPOPT = {
     "print_level": 0,
     "sb": "yes",
     "nlp_scaling_method": "none",
@@ -88,8 +89,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
         return replace(end, extras=end.extras | {"method": method})
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
-        parts = [problem.pick(b) if problem.batch else problem for b in range(len(x))]
-        ends = [best(*given) for given in zip(parts, _numbers(problem, x), x, strict=True)]
+        ends = [best(*given) for given in zip(problem.realisations, _numbers(problem, x), x, strict=True)]
         counts, infeasible = np.array([(end.iterations, end.infeasible) for end in ends]).T
         return SolverResult(np.stack([end.x for end in ends]), counts, infeasible.astype(bool), ends[0].extras)
 
@@ -121,9 +121,13 @@ def _run(
 
 
 def _numbers(problem: Problem, x: Floats) -> Floats:
-    """(B, .) the parameters around x (B, n, ambient), and last by what the cost is multiplied: 1 / max diag J^T J."""
+    """(B, .) parameters around x (B, n, ambient): x, numbers of the factors, constants of the constraints, and last by
+    what the cost is multiplied: 1 / max diag J^T J."""
     curvature = diagonal(problem, problem.linearise(x)).max(axis=(1, 2))
-    return np.append(parameters(problem, x), 1.0 / np.maximum(curvature, 1e-12)[:, None], axis=1)
+    parts = [x.swapaxes(1, 2), *map(numbers_of, problem.factors)]
+    parts += [c.constants.T for c in problem.constraints if c.constants is not None]
+    flat = [np.broadcast_to(p, (len(x), *p.shape[-2:])).reshape(len(x), -1) for p in parts]
+    return np.concatenate([*flat, 1.0 / np.maximum(curvature, 1e-12)[:, None]], axis=1)
 
 
 def _sides(problem: Problem) -> tuple[Floats, Floats]:

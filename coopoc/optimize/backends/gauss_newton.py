@@ -36,7 +36,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
         if star:
             found = descend(problem, step, x, max_iterations, tolerance)
             return SolverResult(found.x, found.iterations)
-        ends = [solver(problem.pick(b), start[None]) for b, start in enumerate(x)]
+        ends = [solver(single, start[None]) for single, start in zip(problem.realisations, x, strict=True)]
         return SolverResult(np.concatenate([e.x for e in ends]), np.concatenate([e.iterations for e in ends]))
 
     return solver

@@ -88,8 +88,8 @@ def linear_step(problem: Problem) -> Step:
 
     def step(linear: Linear, damping: Floats) -> Floats:
         dx, rows = np.full_like(damping, np.nan), _rows(problem, linear)
-        added, any_damping = np.sqrt(damping + still), damping.any(axis=(1, 2)).tolist()
-        for b, touched in enumerate(added.any(axis=2)):
+        added: Floats = np.sqrt(damping + still)
+        for b, touched in enumerate(np.any(added != 0.0, axis=2).tolist()):
             graph: Any = gtsam.GaussianFactorGraph()
             for nodes, jacobians, goal in rows:
                 model = unit[goal.shape[-1]]
@@ -98,7 +98,7 @@ def linear_step(problem: Problem) -> Step:
                     graph.add(*row, model)
             for i in np.flatnonzero(touched).tolist():
                 graph.add(i, np.diag(added[b, i]), nothing, unit[len(nothing)])
-            damped = any_damping[b]
+            damped = bool(damping[b].any())
             if damped not in orderings:  # what is damped has every node, even one without measurements
                 orderings[damped] = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
             try:

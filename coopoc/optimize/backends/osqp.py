@@ -24,8 +24,8 @@ from ..algebra.sparse import Layout, Sparse, sparse
 from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
-from ..model.factor import bounded
-from ..model.linear import Linear, local
+from ..model.factor import as_factor, bounded
+from ..model.linear import Linear, linearise
 from ..model.problem import Problem
 
 SETTINGS = {
@@ -95,9 +95,9 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
             if not feasible:
                 return SolverResult(x, 0, True, dict(programme.counts))
         step = partial(_step, system, limits, programme)
-        found = minimise(problem, step, x[None], max_iterations, tolerance)
-        extras = found.extras | dict(programme.counts)
-        return SolverResult(found.x[0], int(np.ravel(found.iterations)[0]), extras=extras)
+        result = minimise(problem, step, x[None], max_iterations, tolerance)
+        extras = result.extras | dict(programme.counts)
+        return SolverResult(result.x[0], int(np.ravel(result.iterations)[0]), extras=extras)
 
     return solver
 
@@ -151,9 +151,8 @@ class Programme:
         Raises:
             Infeasible: no dx satisfies the bounds. numpy.linalg.LinAlgError: the KKT conditions stay unsatisfied.
         """
-        from scipy.sparse import csc_matrix
-
-        P = csc_matrix((values, self._pattern.indices, self._pattern.indptr), shape=(len(q), len(q)))
+        P = self._pattern
+        P.data = values
         self._update(P, q, lower, upper)
         for attempt in range(REPAIRS + 1):
             end = self._workspace.solve(raise_error=False)
@@ -207,9 +206,9 @@ def unbounded(indices: bytes, indptr: bytes, thread: int) -> Programme:
     row, start = np.frombuffer(indices, np.int64), np.frombuffer(indptr, np.int64)
     size = len(start) - 1
     identity = (row == np.repeat(np.arange(size), np.diff(start))).astype(np.float64)
-    found = Programme(csc_matrix((identity, row, start), shape=(size, size)), csc_matrix((0, size)))
-    found.solve(identity, np.zeros(size), np.empty(0), np.empty(0))
-    return found
+    programme = Programme(csc_matrix((identity, row, start), shape=(size, size)), csc_matrix((0, size)))
+    programme.solve(identity, np.zeros(size), np.empty(0), np.empty(0))
+    return programme
 
 
 @dataclass(frozen=True, eq=False)
@@ -224,8 +223,9 @@ class _Limits:
     def around(self, x: Floats) -> tuple[Floats, Floats]:
         """Bounds of C dx at x (n, ambient)."""
         space, constraints = self.problem.space, self.problem.constraints
-        seen = [local(space, c.measurement, x[None], c.nodes)[0][0][bounded(c)] for c in constraints]
-        value = np.concatenate([np.empty(0), *seen])
+        linear = linearise(space, [as_factor(c) for c in constraints], None, x[None])
+        parts = [h[0, bounded(c)] for h, c in zip(linear.residual, constraints, strict=True)]
+        value = np.concatenate([np.empty(0), *parts])
         return self.lower - value, self.upper - value
 
 

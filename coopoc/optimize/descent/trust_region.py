@@ -8,7 +8,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ..algebra.sparse import Sparse
-from ..algebra.tape import Model
+from ..model.tape import Model
 from .descend import GIVE_UP, HIDDEN, LEAST_DAMPING, progress
 
 OFF = 0.2
@@ -69,18 +69,18 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
     model: Model = "gauss-newton"
     record: list[tuple[float, float, float]] = []
     newton, converged, last, still = 0, False, np.inf, 0
-    cost, gradient, values = known = system.quadratic(x, "gauss-newton")
+    cost, gradient, values = undamped = system.quadratic(x, "gauss-newton")
     with progress("solve") as counted:
         while len(record) < max_iterations and not converged and mu < GIVE_UP:
             counted(cost)
             newton += model == "newton"
-            damping = _damping(system, known[2], mu)
+            damping = _damping(system, undamped[2], mu)
             definite = cholesky.factor(values if damping is None else _damped(system, values, damping))
             if not definite:
                 record.append((cost, mu, np.nan))
                 if model == "newton":
                     doubt, model = -DOUBT, "gauss-newton"
-                    cost, gradient, values = known = system.quadratic(x, model)
+                    cost, gradient, values = undamped = system.quadratic(x, model)
                 else:
                     mu = _grown(mu)
                 continue
@@ -113,7 +113,7 @@ def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> 
             last = promised
             if not converged:
                 cost, gradient, values = trial if model == used else system.quadratic(x, model)
-                known = (cost, gradient, values) if model == "gauss-newton" else known
+                undamped = (cost, gradient, values) if model == "gauss-newton" else undamped
     return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3), newton)
 
 

@@ -11,7 +11,17 @@ import numpy.typing as npt
 
 from ...arrays import Bools, Floats, Ints, frozen, instance
 from ...errors import InputError
-from .inputs import check_constants, check_nodes, check_root, check_std, check_values, fitting, numbers, whitening
+from .inputs import (
+    agreed,
+    check_constants,
+    check_nodes,
+    check_root,
+    check_std,
+    check_values,
+    fitting,
+    numbers,
+    whitening,
+)
 from .losses import Loss
 from .measurements import Measurement, lookup
 
@@ -27,7 +37,7 @@ class Factor:
         std: size, (size,), (M, size) or (B, M, size) standard deviations, W = diag(1/std); infinite: no information (a
             measurement that this realisation lacks).
         sqrt_information: instead of std, (size, size), (M, size, size) or (B, M, size, size), W^T W = cov^-1.
-        constants: (M, c) or (c,) known numbers of the kind, such as dt s of a speed.
+        constants: (M, c) or (c,) numbers of the kind, such as dt s of a speed.
         loss: rho, None for least squares.
         cov: instead of std, covariances shaped as sqrt_information.
 
@@ -50,11 +60,11 @@ class Factor:
     cov: InitVar[npt.ArrayLike | None] = None
 
     def __post_init__(self, cov: npt.ArrayLike | None) -> None:
-        known = self.measurement
-        object.__setattr__(self, "kind", known.name)
-        object.__setattr__(self, "nodes", check_nodes(known, self.nodes))
-        object.__setattr__(self, "z", check_values(known, self.z, len(self.nodes)))
-        object.__setattr__(self, "constants", check_constants(known, self.constants, len(self.nodes)))
+        measurement = self.measurement
+        object.__setattr__(self, "kind", measurement.name)
+        object.__setattr__(self, "nodes", check_nodes(measurement, self.nodes))
+        object.__setattr__(self, "z", check_values(measurement, self.z, len(self.nodes)))
+        object.__setattr__(self, "constants", check_constants(measurement, self.constants, len(self.nodes)))
         given = [
             name
             for name, v in (("std", self.std), ("sqrt_information", self.sqrt_information), ("cov", cov))
@@ -65,11 +75,11 @@ class Factor:
             raise InputError("std", " and ".join(given) or "nothing", allowed, "Give std=.")
         shape = (*self.z.shape[:-1], self.size)
         if self.std is not None:
-            object.__setattr__(self, "std", check_std(known, self.std, shape))
+            object.__setattr__(self, "std", check_std(measurement, self.std, shape))
         else:
-            root = whitening(known.name, cov) if cov is not None else self.sqrt_information
+            root = whitening(measurement.name, cov) if cov is not None else self.sqrt_information
             assert root is not None
-            object.__setattr__(self, "sqrt_information", check_root(known, root, shape))
+            object.__setattr__(self, "sqrt_information", check_root(measurement, root, shape))
         if self.loss is not None:
             instance("loss", self.loss, Loss, 'Give Loss("huber", 2.0), or None.')
         _ = self.batch  # refuses numbers of realisations that differ
@@ -93,12 +103,7 @@ class Factor:
     def batch(self) -> int | None:
         """B, or None for a single realisation."""
         arrays = (self.z, 3), (self.std, 3), (self.sqrt_information, 4)
-        sizes = {len(a) for a, rank in arrays if a is not None and a.ndim == rank}
-        if not sizes:
-            return None
-        if len(sizes - {1}) > 1:
-            raise InputError("std", f"for {sorted(sizes)} realisations", "must agree with z", "Give one axis B.")
-        return max(sizes)
+        return agreed("std", (len(a) for a, rank in arrays if a is not None and a.ndim == rank))
 
     @property
     def informative(self) -> Bools:
@@ -150,21 +155,14 @@ class Factor:
         return f"Factor({self.kind} x {len(self.nodes)}{'' if self.batch is None else f', {self.batch} realisations'})"
 
 
-def of_recorded(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
-    """A factor of nodes (M, arity) and z (M, k) that come from checked arrays; std, as in Factor, is checked.
+def of_checked(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
+    """A factor of nodes (M, arity), z (M, k) and std (M or 1, size) that come from checked arrays.
 
-    >>> of_recorded("range", np.array([[0, 1]]), np.array([[5.0]]), np.array([0.1]))
+    >>> of_checked("range", np.array([[0, 1]]), np.array([[5.0]]), np.array([[0.1]]))
     Factor(range x 1)
     """
-    known = lookup(kind)
-    size = known.size(fitting(known, z.shape[-1]) or 3)
-    return of_checked(kind, nodes, z, check_std(known, std, (len(nodes), size)))
-
-
-def of_checked(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
-    """A factor of nodes (M, arity), z (M, k) and std (M or 1, size) that come from checked arrays."""
     made = object.__new__(Factor)
-    made.__dict__.update(kind=kind, nodes=nodes, z=z, constants=check_constants(lookup(kind), None, len(nodes)))
+    made.__dict__.update(kind=kind, nodes=nodes, z=z, constants=np.empty((len(nodes), 0)))
     made.__dict__.update(std=std, sqrt_information=None, loss=None)
     return made
 
@@ -218,16 +216,16 @@ class Constraint:
     constants: Floats | None = None
 
     def __post_init__(self) -> None:
-        known = self.measurement
-        if known.compares_poses:
+        measurement = self.measurement
+        if measurement.compares_poses:
             raise InputError("kind", repr(self.kind), "compares poses and cannot bound them", "Hold the node instead.")
-        object.__setattr__(self, "kind", known.name)
-        object.__setattr__(self, "nodes", check_nodes(known, self.nodes))
-        object.__setattr__(self, "constants", check_constants(known, self.constants, len(self.nodes)))
+        object.__setattr__(self, "kind", measurement.name)
+        object.__setattr__(self, "nodes", check_nodes(measurement, self.nodes))
+        object.__setattr__(self, "constants", check_constants(measurement, self.constants, len(self.nodes)))
         given = {name: numbers(name, getattr(self, name)) for name in ("lower", "upper")}
         sizes = [side.shape[-1] for side in given.values() if side.ndim]
-        size = max(sizes, default=known.size())
-        fitting(known, size)
+        size = max(sizes, default=measurement.size())
+        fitting(measurement, size)
         for name, side in given.items():
             try:
                 object.__setattr__(self, name, frozen(np.broadcast_to(side, (len(self.nodes), size))))
@@ -264,13 +262,11 @@ class Constraint:
         return f"Constraint({self.lower.min()} <= {self.kind} <= {self.upper.max()} x {len(self.nodes)})"
 
 
-def values(
-    known: Measurement, constraint: Constraint, vector: Floats, rotation: Floats | None
-) -> tuple[Floats, Floats]:
-    """h (B, M, size) and its derivative by what is seen, of a constraint; angles are not wrapped."""
-    nothing: npt.NDArray[np.float64] = np.zeros((len(constraint.nodes), constraint.lower.shape[-1]))
-    assert constraint.constants is not None
-    return known.differentiate(vector, rotation, nothing, constraint.constants)
+def as_factor(constraint: Constraint) -> Factor:
+    """The factor whose residual is h of a constraint, angles in [-pi, pi]."""
+    shape = constraint.lower.shape
+    factor = of_checked(constraint.kind, constraint.nodes, np.zeros(shape), np.ones((1, shape[1])))
+    return unchecked(factor, constants=constraint.constants)
 
 
 def bounded(constraint: Constraint) -> Bools:

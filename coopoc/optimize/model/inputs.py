@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import lru_cache
 
 import numpy as np
@@ -39,14 +40,14 @@ def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
 
 
 @lru_cache(maxsize=256)
-def fitting(known: Measurement, given: int) -> int | None:
+def fitting(measurement: Measurement, given: int) -> int | None:
     """The dimension whose z has `given` numbers; None if both have; InputError if none has."""
-    fits = [d for d in (2, 3) if (d == 3 or known.plane is not None) and known.given(d) == given]
+    fits = [d for d in (2, 3) if (d == 3 or measurement.plane is not None) and measurement.given(d) == given]
     if not fits:
-        allowed = sorted({known.given(d) for d in (2, 3) if d == 3 or known.plane is not None})
-        hint = "Write poses with coopoc.optimize.pose." if known.compares_poses else "Give one per component."
+        allowed = sorted({measurement.given(d) for d in (2, 3) if d == 3 or measurement.plane is not None})
+        hint = "Write poses with coopoc.optimize.pose." if measurement.compares_poses else "Give one per component."
         words = f"must have {' or '.join(map(str, allowed))}"
-        raise InputError(f"z of {known.name}", f"{given} numbers per row", words, hint)
+        raise InputError(f"z of {measurement.name}", f"{given} numbers per row", words, hint)
     return fits[0] if len(fits) == 1 else None
 
 
@@ -55,80 +56,86 @@ def numbers(field: str, values: npt.ArrayLike) -> Floats:
     return checked(field, values)
 
 
-def check_nodes(known: Measurement, nodes: npt.ArrayLike) -> Ints:
+def agreed(field: str, batches: Iterable[int | None]) -> int | None:
+    """B, the number of realisations that all give but those of 1 and None; InputError if they differ."""
+    given = [batch for batch in batches if batch is not None]
+    if len({*given} - {1}) > 1:
+        hint = "Use the same number of realisations throughout."
+        raise InputError(field, f"for {sorted({*given})} realisations", "must agree", hint)
+    return max(given, default=None)
+
+
+def check_nodes(measurement: Measurement, nodes: npt.ArrayLike) -> Ints:
     """(M, arity) whole numbers, no node paired with itself."""
     array = checked("nodes", nodes, dtype=int)
-    if array.ndim != 2 or array.shape[1] != known.arity:
+    if array.ndim != 2 or array.shape[1] != measurement.arity:
         hint = "Give one row per measurement."
-        raise InputError("nodes", array.shape, f"must have shape (M, {known.arity}) for {known.name}", hint)
+        raise InputError("nodes", array.shape, f"must have shape (M, {measurement.arity}) for {measurement.name}", hint)
     refuse("nodes", array, array < 0, "must be an index >= 0", "Problem.add takes names; a Factor takes indices.")
-    if known.arity == 2 and (same := array[:, 0] == array[:, 1]).any():
+    if measurement.arity == 2 and (same := array[:, 0] == array[:, 1]).any():
         hint = "A vehicle does not measure itself."
         raise InputError("nodes", array[same][0].tolist(), "must be two different points", hint)
     return array
 
 
-def check_constants(known: Measurement, constants: npt.ArrayLike | None, count: int) -> Floats:
+def check_constants(measurement: Measurement, constants: npt.ArrayLike | None, count: int) -> Floats:
     """(M, c) finite numbers, as many as the kind has."""
-    if known.constants == 0 and (constants is None or np.size(constants) == 0):
+    if measurement.constants == 0 and (constants is None or np.size(constants) == 0):
         return frozen(np.empty((count, 0)))
-    given = numbers(f"constants of {known.name}", [] if constants is None else constants)
+    given = numbers(f"constants of {measurement.name}", [] if constants is None else constants)
     fits = (
         given.ndim in (1, 2)
-        and given.shape[-1] == known.constants
-        and given.size in (known.constants, count * known.constants)
+        and given.shape[-1] == measurement.constants
+        and given.size in (measurement.constants, count * measurement.constants)
     )
     if not fits or not np.isfinite(given).all():
         hint = "Give them as constants=, such as constants=[0.1] for the dt of a speed."
         raise InputError(
-            "constants", given.tolist(), f"must be {known.constants} finite numbers for {known.name}", hint
+            "constants", given.tolist(), f"must be {measurement.constants} finite numbers for {measurement.name}", hint
         )
-    return frozen(np.broadcast_to(given, (count, known.constants)))
+    return frozen(np.broadcast_to(given, (count, measurement.constants)))
 
 
-def check_values(known: Measurement, z: npt.ArrayLike, count: int) -> Floats:
+def check_values(measurement: Measurement, z: npt.ArrayLike, count: int) -> Floats:
     """z as (M, k) or (B, M, k): finite, distances > 0, angles in radians, rotations that are some."""
-    array = numbers(f"z of {known.name}", z)
+    array = numbers(f"z of {measurement.name}", z)
     if array.ndim not in (2, 3) or array.shape[-2] != count:
-        given = known.given()
-        shape = f"must have shape ({count}, {given}) or (B, {count}, {given}) for {known.name}"
+        given = measurement.given()
+        shape = f"must have shape ({count}, {given}) or (B, {count}, {given}) for {measurement.name}"
         raise InputError("z", array.shape, shape, "One row per row of nodes.")
-    dimension = fitting(known, array.shape[-1]) or 3
+    dimension = fitting(measurement, array.shape[-1]) or 3
     if not np.isfinite(array).all():
         bad = np.argwhere(~np.isfinite(array))[0]
         hint = "Drop the measurement, or give it std = inf and any finite z."
-        raise InputError(f"z of {known.name}", f"{array[tuple(bad)]} at {bad.tolist()}", "must be finite", hint)
-    if known.compares_poses:
-        _check_rotations(known, Space(dimension, has_rotation=True).rotation(array))
+        raise InputError(f"z of {measurement.name}", f"{array[tuple(bad)]} at {bad.tolist()}", "must be finite", hint)
+    if measurement.compares_poses:
+        check_rotations(f"z of {measurement.name}", Space(dimension, has_rotation=True).rotation(array))
         return array
-    for k, component in enumerate(known.kept(dimension)):
-        _check_component(known, known.components[component], array[..., k])
+    for k, component in enumerate(measurement.kept(dimension)):
+        _check_component(measurement, measurement.components[component], array[..., k])
     return array
 
 
-def _check_component(known: Measurement, component: str, column: Floats) -> None:
+def _check_component(measurement: Measurement, component: str, column: Floats) -> None:
     if component == "distance" and (column <= 0).any():
         hint = "Coincident vehicles have no direction: drop the pair."
-        raise InputError(f"z of {known.name}", column.min(), "must be a distance > 0 m", hint)
+        raise InputError(f"z of {measurement.name}", column.min(), "must be a distance > 0 m", hint)
     if component == "angle" and (np.abs(column) > 2 * np.pi).any():
         hint = "This looks like degrees: use np.deg2rad."
-        raise InputError(f"z of {known.name}", np.abs(column).max(), "must be within 2 pi rad", hint)
+        raise InputError(f"z of {measurement.name}", np.abs(column).max(), "must be within 2 pi rad", hint)
 
 
-def _check_rotations(known: Measurement, rotation: Floats) -> None:
+def check_rotations(field: str, rotation: Floats) -> None:
+    """InputError unless matrices (..., d, d) are rotations."""
     error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(rotation.shape[-1])).max(axis=(-1, -2))
     if (error > 1e-6).any() or (np.linalg.det(rotation) < 0).any():
-        raise InputError(
-            f"z of {known.name}",
-            f"a rotation off by {error.max():.1g}",
-            "must hold rotation matrices",
-            "Make it with coopoc.optimize.pose(position, angle).",
-        )
+        hint = "Make it with coopoc.optimize.pose(position, angle)."
+        raise InputError(field, f"a rotation off by {error.max():.1g}", "must hold rotation matrices", hint)
 
 
-def check_std(known: Measurement, std: npt.ArrayLike | float, shape: tuple[int, ...]) -> Floats:
+def check_std(measurement: Measurement, std: npt.ArrayLike | float, shape: tuple[int, ...]) -> Floats:
     """std as (M or 1, size) or (B, M or 1, size): > 0, angles at most pi."""
-    array, size = numbers(f"std of {known.name}", std), shape[-1]
+    array, size = numbers(f"std of {measurement.name}", std), shape[-1]
     wide = np.broadcast_to(array, (size,)) if array.ndim < 2 and array.size in (1, size) else array
     wide = wide[None] if wide.ndim == 1 else wide
     fits = wide.ndim in (2, 3) and wide.shape[-1] == size and wide.shape[-2] in (1, shape[-2])
@@ -137,21 +144,21 @@ def check_std(known: Measurement, std: npt.ArrayLike | float, shape: tuple[int, 
         raise InputError("std", array.shape, allowed, "One standard deviation per component.")
     if not (wide > 0).all():
         hint = "Give standard deviations; infinity means no information."
-        raise InputError(f"std of {known.name}", array[~(array > 0)][0], "must be > 0", hint)
-    kept = known.kept(3 if size == len(known.components) else 2)
-    angles = wide[..., [known.components[k] in ("angle", "turn") for k in kept]]
+        raise InputError(f"std of {measurement.name}", array[~(array > 0)][0], "must be > 0", hint)
+    kept = measurement.kept(3 if size == len(measurement.components) else 2)
+    angles = wide[..., [measurement.components[k] in ("angle", "turn") for k in kept]]
     if (np.isfinite(angles) & (angles > np.pi)).any():
-        raise InputError(f"std of {known.name}", angles.max(), "must be <= pi rad", "Angles are in radians.")
+        raise InputError(f"std of {measurement.name}", angles.max(), "must be <= pi rad", "Angles are in radians.")
     return frozen(wide)
 
 
-def check_root(known: Measurement, root: npt.ArrayLike, shape: tuple[int, ...]) -> Floats:
+def check_root(measurement: Measurement, root: npt.ArrayLike, shape: tuple[int, ...]) -> Floats:
     """sqrt_information as (M or 1, size, size) or (B, M or 1, size, size), finite."""
     array, size = numbers("sqrt_information", root), shape[-1]
     array = array[None] if array.ndim == 2 else array
     if array.ndim not in (3, 4) or array.shape[-2:] != (size, size) or array.shape[-3] not in (1, shape[-2]):
         allowed = f"must have shape ({size}, {size}), (M, {size}, {size}) or (B, M, {size}, {size})"
-        raise InputError(f"sqrt_information of {known.name}", array.shape, allowed, "W with W^T W = cov^-1.")
+        raise InputError(f"sqrt_information of {measurement.name}", array.shape, allowed, "W with W^T W = cov^-1.")
     if not np.isfinite(array).all():
         raise InputError("sqrt_information", "not finite", "must be finite", "Invert a positive definite covariance.")
     return frozen(array)

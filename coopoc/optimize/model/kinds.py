@@ -144,14 +144,14 @@ LEAST_SINE = 0.05
 """Of the inclination: near the vertical the azimuth carries no information."""
 
 
-def is_converted(known: Measurement) -> bool:
+def is_converted(measurement: Measurement) -> bool:
     """Whether a kind's measurements become vectors; of the others those that are linear stay, and angles are left out.
 
     >>> from coopoc.optimize.model.measurements import lookup
     >>> is_converted(lookup("spherical")), is_converted(lookup("range"))
     (True, False)
     """
-    return known.name == "spherical"
+    return measurement.name == "spherical"
 
 
 def converted_rows(z: list[Any], m: Any) -> tuple[Any, list[list[Any]]]:

@@ -13,8 +13,7 @@ from ...errors import InputError
 from ...one_file import in_file
 from ...plugins import find, names, one_of, unknown
 from ...world import links as polar
-from . import dual
-from .space import Space, exp
+from .space import Space
 
 Component = Literal["coordinate", "distance", "angle", "turn"]
 Frame = Literal["world", "body", "relative"]
@@ -37,7 +36,7 @@ class Measurement:
             namespace with sqrt, atan2 and where.
         linear: the formula is the world vector itself.
         plane: components that a problem of dimension 2 keeps (z = 0 there); None if it has none of them.
-        constants: how many known numbers each measurement carries, such as the time between two positions.
+        constants: how many numbers each measurement carries, such as the time between two positions.
         compares_poses: z is a pose (Space.ambient numbers), and the formula also gets it: (x, y, z, R, pose z, m).
     """
 
@@ -90,38 +89,24 @@ class Measurement:
         arguments = embed(local, dimension)
         if self.compares_poses:
             return [self.formula(*arguments, embed([*z], dimension), m)[k] for k in kept]
-        found = self.formula(*arguments, *constants, m)
-        return [found[k] - number for k, number in zip(kept, z, strict=True)]
+        predicted = self.formula(*arguments, *constants, m)
+        return [predicted[k] - number for k, number in zip(kept, z, strict=True)]
 
-    def differentiate(self, local: Floats, rotation: Floats | None, z: Floats, given: Floats) -> tuple[Floats, Floats]:
-        """(..., size) residuals and (..., size, E) their derivative by the local vector and, if relative, its turning.
+    def difference(self, local: Floats, rotation: Floats | None, z: Floats, constants: Floats) -> Floats:
+        """(..., size) residuals h(x) - z, angles in [-pi, pi).
 
         Args:
             local: (..., d) vector.
-            rotation: (..., d, d) or None.
+            rotation: (..., d, d), or None unless the frame is relative.
             z: (..., given).
-            given: (..., constants).
+            constants: (..., constants).
         """
-        if self.linear:
-            return local - z, np.eye(local.shape[-1])
-        numbers = _seed(local, rotation)
-        parts = self.residual(numbers, columns(z), columns(given), dual)
-        shape, coordinates = local.shape[:-1], len(numbers[0].derivative)
-        value = np.empty((*shape, len(parts)))
-        jacobian = np.empty((*shape, len(parts), coordinates))
-        by_part = jacobian.transpose(len(shape), len(shape) + 1, *range(len(shape)))
-        for k, part in enumerate(parts):
-            value[..., k] = part.value
-            by_part[k] = part.derivative
-        return self.wrapped(value), jacobian
-
-    def difference(self, local: Floats, rotation: Floats | None, z: Floats, given: Floats) -> Floats:
-        """(..., size) residuals h(x) - z, angles in [-pi, pi); arguments as `differentiate`."""
-        return self.differentiate(local, rotation, z, given)[0]
-
-    def wrapped(self, gap: Floats) -> Floats:
-        """`gap` (..., size) with its angles in [-pi, pi), in place."""
-        dimension = 3 if gap.shape[-1] == len(self.components) else 2
+        numbers = columns(local)
+        if rotation is not None:
+            numbers += columns(rotation.reshape(*rotation.shape[:-2], -1))
+        parts = self.residual(numbers, columns(z), columns(constants), np)
+        gap: Floats = np.stack(np.broadcast_arrays(*parts), axis=-1)
+        dimension = local.shape[-1]
         for k, component in enumerate(self.kept(dimension)):
             if self.components[component] == "angle":
                 gap[..., k] = polar.wrap(gap[..., k])
@@ -141,23 +126,6 @@ def embed(numbers: Sequence[Any], dimension: int) -> list[Any]:
         return at
     turned = [[numbers[d + d * i + j] if max(i, j) < d else float(i == j) for j in range(3)] for i in range(3)]
     return [*at, turned]
-
-
-def _seed(local: Floats, rotation: Floats | None) -> list[dual.Dual]:
-    """Dual numbers of the vector (d of them) and of the rotation R Exp(w) at w = 0, by the vector and w."""
-    d = local.shape[-1]
-    if rotation is None:
-        return list(dual.seeds(local))
-    turns = Space(d, has_rotation=True).angles
-    found = list(dual.seeds(local, d + turns))
-    generators = exp(0.5 * np.pi * np.eye(turns)) - exp(-0.5 * np.pi * np.eye(turns))
-    jacobians = rotation[..., None, :, :] @ (0.5 * generators)
-    for i in range(d):
-        for j in range(d):
-            jacobian = np.moveaxis(jacobians[..., i, j], -1, 0)
-            still = np.zeros((d, *jacobian.shape[1:]))
-            found.append(dual.Dual(rotation[..., i, j], np.concatenate([still, jacobian])))
-    return found
 
 
 MEASUREMENTS: dict[str, Measurement] = {}
@@ -187,7 +155,7 @@ def measurement(
     if isinstance(arity, bool) or not isinstance(arity, int) or arity not in (1, 2):
         raise InputError("arity", arity, "must be 1 (a node) or 2 (a pair)", "The formula gets one vector x, y, z.")
     given = components if isinstance(components, tuple | list) else ()
-    if not given or not all(isinstance(one, str) and one in get_args(Component) for one in given):
+    if not given or not all(isinstance(component, str) and component in get_args(Component) for component in given):
         hint = "Give one per number that the formula returns."
         raise InputError("components", components, f"must be among {get_args(Component)}", hint)
     one_of("frame", frame, get_args(Frame))
@@ -220,10 +188,10 @@ def lookup(kind: str) -> Measurement:
         return MEASUREMENTS[kind]
     if not in_file(kind) and kind not in names("coopoc.measurements"):
         raise unknown("kind", kind, sorted({*MEASUREMENTS, *names("coopoc.measurements")}))
-    found = find("coopoc.measurements", kind)
-    for known in MEASUREMENTS.values():
-        if known.formula is found:
-            return known
+    formula = find("coopoc.measurements", kind)
+    for registered in MEASUREMENTS.values():
+        if registered.formula is formula:
+            return registered
     raise InputError("kind", repr(kind), "is no measurement", "Decorate the formula: @measurement(name, arity, ...).")
 
 

@@ -16,7 +16,7 @@ from ...errors import InputError, shown
 from ...plugins import suggestion
 from ...world.sensors import Sensors
 from .factor import Constraint, Factor
-from .inputs import numbers
+from .inputs import agreed, check_rotations, numbers
 from .linear import Linear, linearise, sparse_jacobian
 from .measurements import lookup
 from .space import Space
@@ -125,10 +125,7 @@ class Problem:
             raise InputError(
                 "fixed", [self.names[k] for k in self.fixed[:3]], "needs an x0 to be fixed at", "Give x0=."
             )
-        sizes = {b for b in (*(f.batch for f in self.factors), self._start_batch) if b is not None and b > 1}
-        if len(sizes) > 1:
-            hint = "Use the same number of realisations throughout."
-            raise InputError("factors", f"{sorted(sizes)} realisations", "must agree", hint)
+        _ = self.batch  # refuses numbers of realisations that differ
 
     @cached_property
     def space(self) -> Space:
@@ -162,8 +159,7 @@ class Problem:
     @cached_property
     def batch(self) -> int | None:
         """B noise realisations, or None for a single problem."""
-        sizes = [b for b in (*(f.batch for f in self.factors), self._start_batch) if b is not None]
-        return max(sizes) if sizes else None
+        return agreed("factors", (*(f.batch for f in self.factors), self._start_batch))
 
     @cached_property
     def linear(self) -> bool:
@@ -212,13 +208,9 @@ class Problem:
     def _with(self, factor: Factor) -> Problem:
         """The problem with one more factor, which alone is checked: what was checked and found before is kept."""
         check_item(factor, self.names, self._turning, self.dimension)
-        sizes = {b for b in (self.batch, factor.batch) if b is not None and b > 1}
-        if len(sizes) > 1:
-            hint = "Use the same number of realisations throughout."
-            raise InputError("factors", f"{sorted(sizes)} realisations", "must agree", hint)
+        batch = agreed("factors", (self.batch, factor.batch))
         grown = self.replace_unchecked(factors=(*self.factors, factor))
-        batches = [b for b in (self.batch, factor.batch) if b is not None]
-        grown.__dict__["batch"] = max(batches) if batches else None
+        grown.__dict__["batch"] = batch
         return grown
 
     def constrain(
@@ -247,6 +239,11 @@ class Problem:
         """The realisations `which` of B; an int gives a single problem."""
         x0 = self.x0 if self._start_batch is None or self.x0 is None else self.x0[which]
         return self.replace_unchecked(factors=tuple(f.pick(which) for f in self.factors), x0=x0)
+
+    @cached_property
+    def realisations(self) -> tuple[Problem, ...]:
+        """A single problem for each of the B realisations, itself if it is one."""
+        return (self,) if self.batch is None else tuple(self.pick(b) for b in range(self.batch))
 
     def replace_unchecked(self, **changes: Any) -> Problem:
         """The problem with changes that come from checked parts and need not be checked again."""
@@ -391,13 +388,13 @@ def rows(kind: str, z: npt.ArrayLike, count: int) -> Floats:
 
 def check_item(item: Factor | Constraint, names: Sequence[str], poses: Collection[int], dimension: int) -> None:
     """InputError unless the nodes exist, have a rotation where the kind needs one, and the dimension fits."""
-    known, nodes = item.measurement, item.nodes
+    measurement, nodes = item.measurement, item.nodes
     if len(beyond := nodes[(nodes < 0) | (nodes >= len(names))]):
         raise no_such_node(int(beyond[0]), names)
     if item.dimension not in (None, dimension):
-        hint = f"Make it with Problem(names, dimension={item.dimension})." if known.plane else "Leave it out."
+        hint = f"Make it with Problem(names, dimension={item.dimension})." if measurement.plane else "Leave it out."
         raise InputError(f"{item.kind}", f"for {item.dimension} dimensions", f"must fit a problem of {dimension}", hint)
-    observers = {"world": nodes[:, :0], "body": nodes[:, :1], "relative": nodes}[known.frame]
+    observers = {"world": nodes[:, :0], "body": nodes[:, :1], "relative": nodes}[measurement.frame]
     turning = poses if isinstance(poses, frozenset) else frozenset(poses) if observers.size else frozenset()
     if lacking := sorted(set(observers.ravel().tolist()) - turning):
         allowed = "must be a pose: the measurement is in its body frame"
@@ -406,8 +403,8 @@ def check_item(item: Factor | Constraint, names: Sequence[str], poses: Collectio
 
 def no_such_node(node: Any, names: Sequence[str]) -> InputError:
     """The error for a node that is neither a name nor an index."""
-    known = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
-    allowed = f"must be an index < {len(names)} or one of {known}"
+    listed_names = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
+    allowed = f"must be an index < {len(names)} or one of {listed_names}"
     return InputError("node", shown(node), allowed, suggestion(node, names, "Name the point when the Problem is made."))
 
 
@@ -420,7 +417,5 @@ def points(space: Space, n: int, field: str, x: npt.ArrayLike, ranks: tuple[int,
         hint = "Make it with coopoc.optimize.pose." if space.has_rotation else "Give one row of metres per point."
         raise InputError(field, given, f"must be finite with shape ({n}, {space.ambient}){batch}", hint)
     if space.has_rotation:
-        turned = space.rotation(array)
-        if np.abs(turned @ np.swapaxes(turned, -1, -2) - np.eye(space.dimension)).max(initial=0.0) > 1e-6:
-            raise InputError(field, "a matrix that is no rotation", "must hold rotations", "Use coopoc.optimize.pose.")
+        check_rotations(field, space.rotation(array))
     return array

@@ -9,11 +9,10 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
-from .factor import Factor, steerable
+from .factor import Factor
 from .kinds import converted_rows, is_converted
 from .losses import LOSSES, Loss
 from .measurements import Measurement
-from .problem import Problem
 from .space import Space
 
 Columns = list[Any]
@@ -38,8 +37,8 @@ class Kind(NamedTuple):
     @property
     def widths(self) -> tuple[int, int, int]:
         """How many numbers z, constants and weights a measurement has."""
-        known, d = self.measurement, self.space.dimension
-        return known.given(d), known.constants, known.size(d) ** (1 + self.full)
+        measurement, d = self.measurement, self.space.dimension
+        return measurement.given(d), measurement.constants, measurement.size(d) ** (1 + self.full)
 
 
 class Term(NamedTuple):
@@ -85,18 +84,6 @@ class Structure(NamedTuple):
         return ~np.frombuffer(self.still, bool).reshape(shape) if self.still else np.ones(shape, dtype=bool)
 
 
-def structure_of(problem: Problem) -> Structure:
-    """The structure of a problem."""
-    space, movable = problem.space, problem.movable
-    factors = (Term(Kind(f.measurement, space, f.std is None, f.loss), f.nodes.tobytes()) for f in problem.factors)
-    constraints = (
-        Term(Kind(c.measurement, space), c.nodes.tobytes(), steerable(c, movable).tobytes())
-        for c in problem.constraints
-    )
-    still = b"" if movable is None else (~movable).tobytes()
-    return Structure(len(problem.names), space, still, tuple(factors), tuple(constraints))
-
-
 def numbers_of(factor: Factor) -> Floats:
     """(P, M) or (B, P, M): z, constants and weights of the measurements of a factor."""
     weight, batch = factor.sqrt_information, () if factor.batch is None else (factor.batch,)
@@ -113,15 +100,9 @@ def numbers_of(factor: Factor) -> Floats:
     return out
 
 
-def parameters(problem: Problem, x: Floats) -> Floats:
-    """(B, .) parameters of `expressions`: the centres x (B, n, ambient), then `numbers_of` factors, and constants."""
-    parts = [x.swapaxes(1, 2), *map(numbers_of, problem.factors)]
-    parts += [c.constants.T for c in problem.constraints if c.constants is not None]
-    return np.concatenate([np.broadcast_to(p, (len(x), *p.shape[-2:])).reshape(len(x), -1) for p in parts], axis=1)
-
-
 def expressions(structure: Structure) -> dict[str, Any]:
-    """CasADi's x (the free steps), p (see `parameters`), f (cost) and g (what the constraints bound).
+    """CasADi's x (the free steps), p (centres, numbers of factors, constants of constraints), f (cost) and g (what
+    the constraints bound).
 
     A step (dp, w) moves a node from the centre to (p + dp, R C(w)), C the Cayley map in space, which like Exp starts
     as I + [w]x but is rational, and the angle itself in the plane.
@@ -141,10 +122,12 @@ def expressions(structure: Structure) -> dict[str, Any]:
         square = sum(w * w for w in _white(kind, *place, nodes, ca.horzsplit(numbers[-1])))
         cost += 0.5 * ca.sum1(_robust(square, kind.loss))
     for term in structure.constraints:
-        known, size = term.kind.measurement, term.kind.widths[2]
-        numbers.append(ca.SX.sym("number", len(term.nodes), known.constants))
-        constants = ca.horzsplit(numbers[-1]) if known.constants else []
-        value: Any = ca.horzcat(*_residual(known, _local(known, *place, term.nodes), [0.0] * size, constants))
+        measurement, size = term.kind.measurement, term.kind.widths[2]
+        numbers.append(ca.SX.sym("number", len(term.nodes), measurement.constants))
+        constants = ca.horzsplit(numbers[-1]) if measurement.constants else []
+        value: Any = ca.horzcat(
+            *_residual(measurement, _local(measurement, *place, term.nodes), [0.0] * size, constants)
+        )
         bounds.append(ca.vec(value.T)[np.flatnonzero(np.frombuffer(term.steered, bool)).tolist()])
     return {"x": steps, "p": ca.veccat(centre, *numbers), "f": cost, "g": ca.vertcat(*bounds)}
 
@@ -177,21 +160,21 @@ def cost_of(kind: Kind, converted: bool) -> Cost:
     """
     import casadi as ca
 
-    known, space = kind.measurement, kind.space
-    nodes = ca.SX.sym("nodes", known.arity * space.ambient)
-    steps = ca.SX.sym("steps", known.arity * space.dof)
+    measurement, space = kind.measurement, kind.space
+    nodes = ca.SX.sym("nodes", measurement.arity * space.ambient)
+    steps = ca.SX.sym("steps", measurement.arity * space.dof)
     number: Any = ca.SX.sym("number", sum(kind.widths))
     square = ca.SX.sym("square")
     rows = [ca.horzsplit(ca.reshape(v, width, -1).T) for v, width in ((nodes, space.ambient), (steps, space.dof))]
-    vectors = converted and is_converted(known)
+    vectors = converted and is_converted(measurement)
     try:
         place = _moved(space, *rows)
         given: Columns = [number[k] for k in range(number.numel())]
-        white: Any = ca.vertcat(*_white(kind, *place, np.arange(known.arity)[None], given, vectors))
+        white: Any = ca.vertcat(*_white(kind, *place, np.arange(measurement.arity)[None], given, vectors))
     except Exception as problem:  # the formula is the user's, who must learn what it raised
         hint, why = "Take its functions from the namespace m, such as m.sqrt.", " ".join(str(problem).split())[:80]
-        raise InputError("kind", repr(known.name), f"must run on CasADi's numbers: {why}", hint) from problem
-    if converted and not (vectors or known.linear):
+        raise InputError("kind", repr(measurement.name), f"must run on CasADi's numbers: {why}", hint) from problem
+    if converted and not (vectors or measurement.linear):
         white = ca.SX(white.numel(), 1)
     return Cost(nodes, number, steps, white, square, _robust(square, kind.loss))
 
@@ -200,10 +183,10 @@ def _white(
     kind: Kind, at: Columns, turned: list[Columns], nodes: Ints, number: Columns, converted: bool = False
 ) -> Columns:
     """Whitened residuals, one column per component; `converted`: those of `converted_rows`."""
-    known, (given, constants, _) = kind.measurement, kind.widths
+    measurement, (given, constants, _) = kind.measurement, kind.widths
     z, assumed, weight = number[:given], number[given : given + constants], number[given + constants :]
-    local = _local(known, at, turned, nodes)
-    gap = _converted(local, z) if converted else _residual(known, local, z, assumed)
+    local = _local(measurement, at, turned, nodes)
+    gap = _converted(local, z) if converted else _residual(measurement, local, z, assumed)
     size = len(gap)
     if not kind.full:
         return [g * w for g, w in zip(gap, weight, strict=True)]
@@ -267,28 +250,28 @@ def _product(a: list[Columns], b: list[Columns]) -> list[Columns]:
     return [[sum(a[i][k] * b[k][j] for k in range(len(b))) for j in range(len(b[0]))] for i in range(len(a))]
 
 
-def _local(known: Measurement, at: Columns, turned: list[Columns], nodes: Ints) -> Columns:
+def _local(measurement: Measurement, at: Columns, turned: list[Columns], nodes: Ints) -> Columns:
     """Inputs of the formula as by `local`: the vector's columns and, if the frame is relative, the rotation's."""
     first, last = nodes[:, 0].tolist(), nodes[:, -1].tolist()
-    vector = [c[last] - c[first] if known.arity == 2 else c[last] for c in at]
-    if known.frame == "world":
+    vector = [c[last] - c[first] if measurement.arity == 2 else c[last] for c in at]
+    if measurement.frame == "world":
         return vector
     body = [[c[first] for c in row] for row in turned]
-    if known.arity == 1:
+    if measurement.arity == 1:
         return [*vector, *(c for row in body for c in row)]
     back = [list(column) for column in zip(*body, strict=True)]
     vector = [row[0] for row in _product(back, [[v] for v in vector])]
-    if known.frame == "body":
+    if measurement.frame == "body":
         return vector
     other = [[c[last] for c in row] for row in turned]
     return [*vector, *(c for row in _product(back, other) for c in row)]
 
 
-def _residual(known: Measurement, local: Columns, z: Columns, constants: Columns) -> Columns:
+def _residual(measurement: Measurement, local: Columns, z: Columns, constants: Columns) -> Columns:
     """h - z, angles in [-pi, pi]: the derivative of the remainder is 1."""
     m, dimension = _namespace(), 2 if len(local) in (2, 6) else 3
-    parts = known.residual(local, z, constants, m)
+    parts = measurement.residual(local, z, constants, m)
     return [
         m.remainder(part, 2.0 * np.pi) if angle else part
-        for part, angle in zip(parts, known.angles(dimension), strict=True)
+        for part, angle in zip(parts, measurement.angles(dimension), strict=True)
     ]

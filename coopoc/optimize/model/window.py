@@ -85,11 +85,11 @@ def _relative(edges: Ints, relative: Floats, sensors: Sensors | None) -> list[Fa
     """Factors of range, azimuth and inclination (..., M, 3): of the three where all are there, else of what is."""
     whole = np.isfinite(relative).all(axis=-1, keepdims=True)
     std = np.ones(3) if sensors is None else relative_std(relative, sensors)
-    seen = np.where(whole, relative, np.nan)
+    complete = np.where(whole, relative, np.nan)
     if sensors is None:
-        factors = _measured("displacement", edges, to_vector(seen), std)
+        factors = _measured("displacement", edges, to_vector(complete), std)
     else:
-        factors = _measured("spherical", edges, seen, std)
+        factors = _measured("spherical", edges, complete, std)
     for k, kind in enumerate(() if whole.all() else ("range", "azimuth", "inclination")):
         factors += _measured(kind, edges, np.where(whole, np.nan, relative)[..., k, None], std[..., k, None])
     return factors

@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ...arrays import Floats, Ints, checked, frozen, instance, plain
 from ...errors import InputError, shown
 from ..model.factor import unchecked
-from ..model.linear import local
+from ..model.linear import linearise
 from ..model.problem import Problem
 
 Candidates = Sequence[int | tuple[int, Sequence[int]]]
@@ -80,9 +80,7 @@ def squares(problem: Problem, marked: Marked, x: Floats) -> Floats:
     found = np.empty(len(marked.row))
     for k in np.unique(marked.factor):
         factor, here = problem.factors[k], marked.factor == k
-        assert factor.constants is not None
-        measured = local(problem.space, factor.measurement, x[None], factor.nodes)
-        residual = factor.whiten(factor.measurement.difference(*measured, factor.z, factor.constants))
+        (residual,) = linearise(problem.space, [unchecked(factor, loss=None)], None, x[None]).residual
         found[here] = np.square(residual[0]).sum(axis=-1)[marked.row[here]]
     return marked.sums(found)
 

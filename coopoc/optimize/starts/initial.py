@@ -8,11 +8,11 @@ from ...arrays import Floats
 from ...errors import InputError
 from ..algebra.sparse import Sparse, sparse
 from ..algebra.star import is_star, star_at
-from ..algebra.tape import Model
 from ..model.factor import Factor, unchecked
 from ..model.kinds import converted_rows, is_converted
 from ..model.measurements import columns
 from ..model.problem import Problem
+from ..model.tape import Model
 
 RIDGE = 1e-9
 """1/m^2 on every point, so that one without information has a place to start from."""
@@ -43,7 +43,7 @@ def initial_guess(problem: Problem) -> Floats:
         x, touched = _solution(sparse(problem), "converted")
         return x if touched else _apart(problem, x)
     if not is_star(problem):
-        return np.concatenate([initial_guess(problem.pick(b)) for b in range(batch)])
+        return np.concatenate([initial_guess(single) for single in problem.realisations])
     x, linear = np.zeros((batch, len(problem.names), problem.dimension)), converted(problem)
     return _apart(problem, star_at(linear, linear.linearise(x)).solve(RIDGE)[0])
 

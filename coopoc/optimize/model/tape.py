@@ -13,18 +13,20 @@ import numpy as np
 
 from ...arrays import Ints
 from ...errors import InputError
-from ..model.symbolic import Kind, cost_of
+from .symbolic import Kind, cost_of
 
 if TYPE_CHECKING:
     from ...kernels.graphs.graph_tape import Tape
 
-Model = Literal["cost", "gauss-newton", "newton", "converted"]
-"""What a tape gives: the cost alone, with J^T J, with the exact Hessian; or J^T J of the converted measurement."""
+Model = Literal["cost", "gauss-newton", "newton", "converted", "jacobian"]
+"""What a tape gives: the cost alone, with J^T J, with the exact Hessian; J^T J of the converted measurement; or the
+whitened residuals and their Jacobian."""
 
 
 class Written(NamedTuple):
     """A tape and what its outputs are: the cost, then entries (row, column) of the gradient (column -1) and of the
-    upper triangle of the curvature, by the dof of the first node and then of the second.
+    upper triangle of the curvature, by the dof of the first node and then of the second; or entries of the residual
+    (column -1) and of its Jacobian.
 
     Attributes:
         tape: for the kernel.
@@ -50,7 +52,11 @@ def write(kind: Kind, model: Model) -> Written:
     cost = 0.5 * ca.substitute(rho, square, ca.sumsqr(white))
     zero = ca.SX.zeros(steps.size1())
     outputs, entries = [cost], [(-1, -1)]
-    if model != "cost":
+    if model == "jacobian":
+        whole = ca.horzcat(white, ca.jacobian(white, steps))
+        entries = [(i, j - 1) for i in range(whole.size1()) for j in range(whole.size2())]
+        outputs = [whole[i, j + 1] for i, j in entries]
+    elif model != "cost":
         slope = ca.gradient(cost, steps)
         if model == "newton":
             curvature = ca.hessian(cost, steps)[0]
@@ -67,8 +73,8 @@ def write(kind: Kind, model: Model) -> Written:
     here = ca.substitute(ca.vertcat(*outputs), steps, zero)
     here = ca.cse(here)
     kept = [k for k in range(here.size1()) if k == 0 or not here[k].is_zero()]
-    found = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
-    tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], found), kind.measurement.name)
+    together = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
+    tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], together), kind.measurement.name)
     return Written(tape, np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2))
 
 
@@ -76,15 +82,16 @@ def _tape(function: Any, name: str) -> Tape:
     """The operations of a CasADi function of one vector."""
     from ...kernels.graphs.graph_tape import Operation, Tape
 
-    known, constant, read_in, write_out = _known(), int(Operation.CONST), int(Operation.INPUT), int(Operation.OUTPUT)
+    operations, constant = _operations(), int(Operation.CONST)
+    read_in, write_out = int(Operation.INPUT), int(Operation.OUTPUT)
     count = function.n_instructions()
     code, place, value = np.zeros(count, np.int64), np.zeros((count, 3), np.int64), np.zeros(count)
     for k in range(count):
-        found = function.instruction_id(k)
-        if found not in known:
-            allowed = f"must not use CasADi's operation {found}"
+        instruction = function.instruction_id(k)
+        if instruction not in operations:
+            allowed = f"must not use CasADi's operation {instruction}"
             raise InputError("kind", repr(name), allowed, "Use +, -, *, /, ** and the functions of m.")
-        code[k] = operation = known[found]
+        code[k] = operation = operations[instruction]
         read, written = function.instruction_input(k), function.instruction_output(k)
         if operation == constant:
             place[k, 0], value[k] = written[0], function.instruction_constant(k)
@@ -98,11 +105,12 @@ def _tape(function: Any, name: str) -> Tape:
 
 
 @lru_cache(maxsize=1)
-def _known() -> dict[int, int]:
+def _operations() -> dict[int, int]:
     """CasADi's number of an operation -> ours."""
     import casadi as ca
 
     from ...kernels.graphs.graph_tape import Operation
 
-    known = {getattr(ca, f"OP_{operation.name}"): int(operation) for operation in Operation}
-    return known | {ca.OP_SQ: int(Operation.MUL), ca.OP_TWICE: int(Operation.ADD)}  # of one slot, which is read twice
+    operations = {getattr(ca, f"OP_{operation.name}"): int(operation) for operation in Operation}
+    # the two of one slot, which is read twice
+    return operations | {ca.OP_SQ: int(Operation.MUL), ca.OP_TWICE: int(Operation.ADD)}
