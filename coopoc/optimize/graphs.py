@@ -57,8 +57,8 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
             robots stand to each other; "file" takes the vertices as they are; "tree" follows loop closures
             and measurements between robots, too; "linear" relaxes rotations (`starts/linear.py`); "incremental" solves
             the first poses of all robots, then more with them (`starts/graph_starts.py`); "auto" tries several and
-            keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their priors, or where the first pose that
-            measures them sees them, or by the ranges to them. The Solution names the start in extras["start"].
+            keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their priors, or where the first
+            pose that measures them sees them, or by the ranges to them. The Solution names the start in extras["start"].
 
     Raises:
         InputError: an unknown objective or start, a measurement without variance, by its vertices.
