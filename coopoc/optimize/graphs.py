@@ -58,7 +58,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
             and measurements between robots, too; "linear" relaxes rotations (`starts/linear.py`); "incremental" solves
             the first poses of all robots, then more with them (`starts/graph_starts.py`); "auto" tries several and
             keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their priors, or where the first
-            pose that measures them sees them, or by the ranges to them. The Solution names the start in extras["start"].
+            pose that measures them sees them, or by ranges. The Solution names the start in extras["start"].
 
     Raises:
         InputError: an unknown objective or start, a measurement without variance, by its vertices.
