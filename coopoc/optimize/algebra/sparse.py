@@ -202,7 +202,7 @@ class Layout:
         m, squares = self.entries.size, [np.empty((len(linear.x), 0))]
         for residual, jacobians in zip(linear.residual, linear.jacobian, strict=True):
             wide = np.concatenate([*jacobians, residual[..., None]], axis=-1)
-            squares.append((wide.swapaxes(-1, -2) @ wide).reshape(len(wide), -1))
+            squares.append((wide.swapaxes(-1, -2).copy() @ wide).reshape(len(wide), -1))
         total = summed(np.concatenate(squares, axis=1), self._products, m + len(self.entries.indices) + 2)
         return total[:, m + 1 : -1], total[:, 1 : m + 1]
 

@@ -12,7 +12,7 @@ exactly for the active set that the iterations have found (polishing).
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from threading import get_ident
 from typing import Any
@@ -79,33 +79,36 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     array([1., 8.])
     """
     check_limits(max_iterations, tolerance)
-    limits, layout = _limits(structure), layout_of(structure)
-    moving = layout.entries.number.ravel() >= 0
-    held = Programme(_pattern(layout), limits.matrix[:, moving]) if structure.constraints else None
+    limits, layout = _limits(structure) if structure.constraints else None, layout_of(structure)
+    moving = np.flatnonzero(layout.entries.number.ravel() >= 0)
+    held = Programme(_pattern(layout), limits.matrix[:, moving]) if limits else None
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
         programme = held or unbounded(layout, get_ident())
         programme.counts.update(osqp_iterations=0, repairs=0)
-        if held:
+        if limits:
             try:
                 start, feasible = _nearest(limits, x[0])
             except np.linalg.LinAlgError:
-                return SolverResult(x, np.zeros(1, dtype=np.int64), np.zeros(1, dtype=bool), dict(programme.counts))
+                return SolverResult(x, 0, extras=dict(programme.counts))
             x = start[None]
             if not feasible:
-                return SolverResult(x, np.zeros(1, dtype=np.int64), np.ones(1, dtype=bool), dict(programme.counts))
+                return SolverResult(x, 0, True, dict(programme.counts))
 
         def step(linear: Linear, damping: Floats) -> Floats:
             values, q = layout.normal_equations(linear)
-            dx = np.zeros((len(q), len(moving)))
-            values[:, layout.entries.diagonal] += damping.reshape(dx.shape)[:, moving]
-            dx[:, moving] = (
-                programme.solve(values[0], q[0], *limits.around(linear.x[0])) if held else programme.each(values, q)
-            )
+            if damping.any():
+                values[:, layout.entries.diagonal] += damping.reshape(len(q), -1)[:, moving]
+            dx = np.zeros((len(q), damping[0].size))
+            if limits:
+                dx[:, moving] = programme.solve(values[0], q[0], *limits.around(linear.x[0]))
+            else:
+                dx[:, moving] = programme.each(values, q)
             return dx.reshape(damping.shape)
 
         result = minimise(problem, step, x, max_iterations, tolerance)
-        return replace(result, extras=result.extras | dict(programme.counts))
+        result.extras.update(programme.counts)
+        return result
 
     return solver
 
@@ -115,9 +118,8 @@ def _pattern(layout: Layout) -> Any:
     from scipy.sparse import csc_matrix
 
     entries = layout.entries
-    identity = np.zeros(len(entries.indices))
-    identity[entries.diagonal] = 1.0
-    return csc_matrix((identity, entries.indices, entries.indptr), shape=(entries.size,) * 2)
+    identity = np.bincount(entries.diagonal, minlength=len(entries.indices))
+    return csc_matrix((identity.astype(np.float64), entries.indices, entries.indptr), shape=(entries.size,) * 2)
 
 
 class Infeasible(np.linalg.LinAlgError):
@@ -134,8 +136,10 @@ class Programme:
 
     def __init__(self, pattern: Any, rows: Any) -> None:
         self._pattern, self._rows = pattern, rows
-        self._row = pattern.indices.astype(np.int64)
-        self._column = np.repeat(np.arange(len(pattern.indptr) - 1), np.diff(pattern.indptr))
+        row, column = pattern.indices.astype(np.int64), np.repeat(np.arange(rows.shape[1]), np.diff(pattern.indptr))
+        off = np.flatnonzero(row != column)
+        self._entry = np.append(np.arange(len(row)), off)
+        self._column, self._row = np.append(column, row[off]), np.append(row, column[off])
         self._workspace: Any = None
         self._polishing = False
         self.counts = {"osqp_iterations": 0, "repairs": 0}
@@ -148,8 +152,11 @@ class Programme:
         """
         self.update(values, q, lower, upper)
         for attempt in range(REPAIRS + 1):
-            dx, y = self._iterate()
-            value = self._rows @ dx
+            end = self._workspace.solve(raise_error=False)
+            self.counts["osqp_iterations"] += int(end.info.iter)
+            if end.info.status.startswith("primal infeasible"):
+                raise Infeasible
+            dx, y, value = np.array(end.x), np.array(end.y), self._rows @ end.x
             active = bool(np.any((upper - value < y) | (value - lower < -y)))
             if self._holds(values, q, lower, upper, dx, y) and self._polishing >= active:
                 return dx
@@ -159,10 +166,16 @@ class Programme:
 
     def each(self, values: Floats, q: Floats) -> Floats:
         """dx (B, m) without bounds, checked together; one that fails is repaired, and NaN where that fails, too."""
-        dx, nothing = np.empty_like(q), np.empty(0)
+        dx, start, nothing = np.empty_like(q), np.zeros(q.shape[1]), np.empty(0)
+        self._polish(False)
+        core = self._workspace._solver  # osqp's class around it takes longer than a small programme
         for b in range(len(q)):
-            self.update(values[b], q[b], nothing, nothing)
-            dx[b] = self._iterate()[0]
+            core.update_data_vec(q[b], None, None)
+            core.update_data_mat(values[b], None, None, None)
+            core.warm_start(start, None)  # earlier solves must not show
+            core.solve()
+            dx[b] = core.solution.x
+            self.counts["osqp_iterations"] += int(core.info.iter)
         rest, _, allowed = self._stationary(values, q, dx)
         for b in np.flatnonzero(~(np.abs(rest) <= allowed).all(axis=1)).tolist():
             try:
@@ -181,20 +194,9 @@ class Programme:
             self._workspace.setup(self._pattern, q, self._rows, lower, upper, **settings)
             return
         self._polish(False)
-        core, infinity = self._workspace._solver, self._workspace.constant("OSQP_INFTY")
-        core.update_data_vec(q, np.maximum(lower, -infinity), np.minimum(upper, infinity))
-        core.update_data_mat(values, None, None, None)
+        self._workspace.update(Px=values, q=q, l=lower, u=upper)
         if not len(lower):  # the workspace is kept: earlier solves must not show
-            core.warm_start(np.zeros(len(q)), None)
-
-    def _iterate(self) -> tuple[Floats, Floats]:
-        """dx and y where the iterations end."""
-        core = self._workspace._solver  # osqp's class around it takes longer than a small programme
-        core.solve()
-        self.counts["osqp_iterations"] += int(core.info.iter)
-        if core.info.status.startswith("primal infeasible"):
-            raise Infeasible
-        return np.array(core.solution.x), np.array(core.solution.y)
+            self._workspace.warm_start(x=np.zeros(len(q)))
 
     def _polish(self, wanted: bool) -> None:
         """Whether OSQP solves for its active set exactly; without one it would print a message."""
@@ -214,11 +216,10 @@ class Programme:
 
     def _stationary(self, values: Floats, q: Floats, dx: Floats) -> tuple[Floats, Floats, Floats]:
         """P dx + q (B, m), the share of what adds up in it that is weak (B, 1), and what it may be."""
-        row, column, own = self._row, self._column, np.zeros_like(q)
-        own[:, column[row == column]] = values[:, row == column]
-        rest = sum(summed(values * dx[:, b], a, q.shape[1]) for a, b in ((row, column), (column, row)))
+        own = values[:, self._pattern.indptr[1:] - 1]
+        rest = summed(values[:, self._entry] * dx[:, self._column], self._row, q.shape[1]) + q
         weak = KKT * np.maximum(np.abs(q), np.abs(own * dx)).max(axis=1, keepdims=True)
-        return rest - own * dx + q, weak, weak + NEGLIGIBLE * own
+        return rest, weak, weak + NEGLIGIBLE * own
 
 
 @lru_cache(maxsize=64)
@@ -253,8 +254,6 @@ class _Limits:
 def _limits(problem: Problem) -> _Limits:
     from scipy.sparse import csc_matrix
 
-    if not problem.constraints:
-        return _Limits(problem, None, np.empty(0), np.empty(0))
     rows = constraint_rows(problem, np.zeros((len(problem.names), problem.space.ambient)))
     return _Limits(problem, csc_matrix(rows.matrix), rows.lower, rows.upper)
 
