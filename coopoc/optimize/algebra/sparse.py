@@ -157,7 +157,8 @@ def places_of(entries: Entries, nodes: Ints, written: Ints) -> Any:
 def summed(values: Floats, goal: Ints, size: int) -> Floats:
     """(B, size) sums of values (B, K) by where each belongs (K,)."""
     goal = goal + size * np.arange(len(values))[:, None]
-    return np.bincount(goal.ravel(), values.ravel(), size * len(values)).reshape(len(values), size)
+    total = np.bincount(goal.ravel(), values.ravel(), size * len(values))
+    return np.asarray(total, np.float64).reshape(len(values), size)
 
 
 class Layout:

@@ -68,7 +68,7 @@ def _evaluated(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[F
     rows = batch * count
     numbers, nodes = numbers_of(factor), factor.nodes
     if batch > 1:
-        numbers = np.broadcast_to(numbers, (batch, *numbers.shape[-2:])).swapaxes(0, 1)
+        numbers = np.tile(numbers, batch) if numbers.ndim == 2 else numbers.swapaxes(0, 1)
         nodes = (n * np.arange(batch)[:, None, None] + nodes).reshape(-1, arity)
     numbers = numbers.reshape(-1, rows)
     total = np.zeros((1 + arity * dof) * size * rows)
