@@ -396,7 +396,7 @@ def test_osqp_holds_answers_against_all_kkt_conditions() -> None:
     def holds(q: float, x: float, y: float) -> bool:
         one = eye(1, format="csc")
         sides = np.array([[-1.0], [1.0]])
-        return Programme(one, one)._holds(one, np.array([q]), *sides, np.array([x]), np.array([y]))
+        return Programme(one, one)._holds(np.ones(1), np.array([q]), *sides, np.array([x]), np.array([y]))
 
     assert holds(-2.0, 1.0, 1.0)  # pushed by the upper bound
     assert holds(2.0, -1.0, -1.0)
