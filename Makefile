@@ -21,8 +21,8 @@ PIP := $(VENV)/bin/python -m pip install --quiet --disable-pip-version-check -c 
 	$(if $(TORCH_INDEX),--extra-index-url $(TORCH_INDEX))
 
 PYTEST := OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest -n $(JOBS) --dist loadfile
-QUICK := $(patsubst %,tests/test_%.py,world misuse oracles_star kernels_vectors formats formats_errors data_readers data_log \
-	optimize_problem optimize_agreement statistics study_tables study_grid layering)
+QUICK := $(patsubst %,tests/test_%.py,world misuse star_filters kernels_vectors formats formats_errors data_readers data_log \
+	optimize_problem optimize_agreement statistics study_results study_grid layering)
 
 LOWER := build/lower
 
@@ -44,7 +44,7 @@ test-slow: $(VENV)/.ready-dev
 
 test-bounds: $(VENV)/.ready-dev
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/bounds OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest \
-		-n $(JOBS) --dist loadfile tests/test_memory_safety.py $(wildcard tests/test_kernels_s*.py)
+		-n $(JOBS) --dist loadfile tests/test_memory_safety.py tests/test_star_filters.py tests/test_solo_filters.py tests/test_kernels_scores.py
 
 test-lower:
 	$(PYTHON) -m venv $(LOWER)

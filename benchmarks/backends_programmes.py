@@ -14,8 +14,8 @@ from scipy.sparse import csc_matrix, triu
 from coopoc.optimize import Problem
 from coopoc.optimize.starts.initial import initial_guess
 
-PLAIN = {"print_time": False}, {"print_level": 0, "sb": "yes"}
-"""Options of CasADi's plugin, and of IPOPT behind it."""
+PLAIN = {"print_time": False}, {"print_level": 0}
+"""Options of CasADi's plugin, and of FATROP behind it."""
 
 
 def casadi_exact(problem: Problem) -> Job:
@@ -42,7 +42,7 @@ def casadi_exact(problem: Problem) -> Job:
         casadi.SX.sym(name, 3, n) for name, n in (("x", NEIGHBOURS + 1), ("fix", NEIGHBOURS + 1), ("seen", NEIGHBOURS))
     )
     nlp = {"x": casadi.vec(x), "p": casadi.veccat(fix, relative), "f": cost(x, fix, relative)}
-    solver = casadi.nlpsol("solver", "ipopt", nlp, {**quiet, "ipopt": inner})
+    solver = casadi.nlpsol("solver", "fatrop", nlp, {**quiet, "fatrop": inner})
 
     def batch() -> Any:
         numbers = np.concatenate([fixes.z.reshape(runs, -1), edges.z.reshape(runs, -1)], axis=1)
@@ -66,12 +66,12 @@ def casadi_exact(problem: Problem) -> Job:
             model.minimize(0.5 * total)
             for node, at in zip(nodes, start[b], strict=True):
                 model.set_initial(node, at)
-            model.solver("ipopt", quiet, inner)
+            model.solver("fatrop", quiet, inner)
             answer = model.solve()
             found.append([answer.value(node) for node in nodes])
         return np.stack(found)
 
-    job = "casadi ipopt, snapshot, exact"
+    job = "casadi fatrop, snapshot, exact"
     return Job(
         [
             Row(job, "ours", runs, ours(problem, "casadi", runs)),

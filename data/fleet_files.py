@@ -95,7 +95,7 @@ def read_tum(path: Path, *, repeats: Literal["refuse", "drop"] = "refuse", **opt
         options: dt (s, resample: needed when the vehicles' stamps differ), max_gap and any_scale, as of `assemble`.
 
     Raises:
-        InputError: no file, or what `coopoc.formats.tum.read_tum` raises.
+        InputError: no file, or what `coopoc.formats.trajectories.read_tum` raises.
     """
     files = tum_files(path)
     if not files:

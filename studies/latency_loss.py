@@ -27,7 +27,6 @@ CHANNELS: dict[str, tuple[str, dict[float, dict[str, Any]]]] = {
     "lost in runs of 10": ("%", IN_RUNS),
 }
 """What happens to messages -> its unit, and channel by how much of it."""
-LABELS = {"s": "Latency [s]", "%": "Lost [%]"}
 NOTE = (
     "K = 6. The moving horizon puts a late message at its true time; the others bring it forward with the velocity "
     "that came with it. What is older than 1 s is forgotten."

@@ -37,7 +37,7 @@ def callable_part(part: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def formation_fleet(vehicles: int = 11, steps: int = 901, ring: float = 22.0) -> Fleet:
-    """Rigid formation within 30 m on a gently sinuous path at 10 m/s (methods.md section 10): ten on a ring."""
+    """Rigid formation within 30 m on a gently sinuous path at 10 m/s: ten on a ring (docs/decisions.md)."""
     t = np.arange(steps) * 0.1
     course = 0.3 * np.sin(2 * np.pi * t / 60)
     path = np.cumsum(np.stack([np.cos(course), np.sin(course), 0 * t], axis=1), axis=0)

@@ -1,4 +1,4 @@
-"""Published and independently simulated figures (methods.md section 10), within 5 %."""
+"""Published and independently simulated figures of the paper's scenarios, within 5 %."""
 
 from __future__ import annotations
 

@@ -43,7 +43,7 @@ def test_the_ledger_of_a_track_is_its_bytes(crossing: Fleet) -> None:
 
 
 def test_break_even_of_the_papers_training() -> None:
-    """methods.md section 9.6: 20 rounds of 19,938 weights both ways are 3.2 MB per vehicle: about an hour of a CAM
+    """20 rounds of 19,938 weights both ways are 3.2 MB per vehicle: about an hour of a CAM
     stream of 0.9 kB/s, or 15 min of 350 B at 10 Hz."""
     weights = 20 * 4 * 19_938.0
     once = of_training(["a", "b", "server"], [weights] * 3, [weights, weights, 2 * weights], ["server"])

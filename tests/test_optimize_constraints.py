@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from itertools import pairwise
 
+import casadi as ca
 import numpy as np
 import pytest
 from scipy.linalg import null_space
@@ -25,6 +26,7 @@ from coopoc.optimize import (
     pose,
     solve,
 )
+from coopoc.optimize.assess.active import active_at
 from coopoc.world.recording import Recording
 
 INF = np.inf
@@ -241,6 +243,15 @@ def test_surface_lane_and_top_speed_are_scipys(seed: int, backend: str, options:
     assert np.abs(solution.x[:, 1]).max() <= 0.8 + 1e-9
 
 
+@pytest.mark.filterwarnings("ignore:delta_grad")  # SciPy's BFGS at the end of its convergence
+def test_scipys_trust_region_agrees_too() -> None:
+    problem = drive(7)
+    x, cost = scipys(problem, "trust-constr")
+    solution = solve(problem, "casadi")
+    assert solution.cost == pytest.approx(cost, rel=1e-6)
+    assert solution.x == pytest.approx(x, abs=1e-3)
+
+
 def test_the_covariance_holds_equalities_exactly() -> None:
     """Against Z (Z^T J^T J Z)^-1 Z^T with SciPy's null space; the inequalities that push are left out."""
     problem = drive(1)
@@ -253,6 +264,27 @@ def test_the_covariance_holds_equalities_exactly() -> None:
     cov = Z @ np.linalg.inv(Z.T @ (J.T @ J).toarray() @ Z) @ Z.T
     own = np.stack([cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3] for k in range(len(solution.x))])
     assert solution.covariance == pytest.approx(own, abs=1e-9)
+
+
+def test_multipliers_are_those_of_ipopt() -> None:
+    """An NLP written in CasADi here: its multipliers have our signs and values."""
+    problem = drive(2)
+    solution = solve(problem, "casadi")
+    held = active_at(problem, solution.x, gradient(problem, solution.x).reshape(-1, 3))
+    x = ca.SX.sym("x", 3, len(problem.names))
+    moved = next(f.nodes for f in problem.factors if f.kind == "displacement").tolist()
+    r, J = problem.whiten(solution.x)
+    step = ca.vec(x) - ca.DM(solution.x.ravel())
+    model = 0.5 * ca.sumsqr(ca.DM(r) + ca.DM(J.toarray()) @ step)  # the same gradient at the solution
+    rise = ca.vertcat(*(x[2, k] - road(x[0, k], x[1, k], ca) for k in range(x.shape[1])))
+    speed = ca.vertcat(*(ca.norm_2(x[:, j] - x[:, i]) / 0.5 for i, j in moved))
+    g, n, m = ca.vertcat(rise, x[1, :].T, speed), x.shape[1], len(moved)
+    quiet = {"print_time": False, "ipopt": {"print_level": 0, "sb": "yes", "tol": 1e-10, "mu_target": 1e-11}}
+    found = ca.nlpsol("s", "ipopt", {"x": ca.vec(x), "f": model, "g": g}, quiet)(
+        x0=solution.x.ravel(), lbg=[0.0] * n + [-0.8] * n + [-INF] * m, ubg=[0.0] * n + [0.8] * n + [14.0] * m
+    )
+    assert held.multipliers == pytest.approx(np.asarray(found["lam_g"]).ravel(), abs=1e-6)
+    assert np.abs(held.multipliers[n:]).max() > 0.01
 
 
 def test_poses_in_a_slab() -> None:
@@ -364,7 +396,7 @@ def test_osqp_holds_answers_against_all_kkt_conditions() -> None:
     def holds(q: float, x: float, y: float) -> bool:
         one = eye(1, format="csc")
         sides = np.array([[-1.0], [1.0]])
-        return Programme(one, one)._holds(one, np.array([q]), *sides, np.array([x]), np.array([y]))
+        return Programme(one, one)._holds(np.ones(1), np.array([q]), *sides, np.array([x]), np.array([y]))
 
     assert holds(-2.0, 1.0, 1.0)  # pushed by the upper bound
     assert holds(2.0, -1.0, -1.0)

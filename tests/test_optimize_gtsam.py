@@ -281,6 +281,32 @@ def test_marginals_of_poses_in_the_plane_equal_gtsams() -> None:
     assert solution.covariance[3, :2, :2] == pytest.approx(marginals.marginalCovariance(3), abs=1e-6)
 
 
+def test_marginals_of_poses_in_space_equal_gtsams() -> None:
+    """Priors and ranges; GTSAM has the rotation first and moves a position along the body's axes."""
+    rng = np.random.default_rng(10)
+    x = pose(rng.uniform(-9, 9, (3, 3)), rng.normal(size=(3, 3)))
+    z = pose(x[:, :3] + 0.2, rng.normal(size=(3, 3)) * 0.1)
+    z[:, 3:] = (x[:, 3:].reshape(3, 3, 3) @ z[:, 3:].reshape(3, 3, 3)).reshape(3, 9)
+    std = np.array([0.5, 0.6, 0.7, 0.05, 0.06, 0.07])
+    problem = Problem(tuple("abc"), x0=x, poses=range(3)).add("pose", [0, 1, 2], z, std=std)
+    problem = problem.add("range", [(0, 1), (1, 2), (0, 2)], [[9.0], [8.0], [7.0]], std=0.2)
+    solution = solve(problem, "gtsam")
+    graph, found, noise = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel
+    for i, (node, prior) in enumerate(zip(solution.x, z, strict=True)):
+        found.insert(i, gtsam.Pose3(gtsam.Rot3(node[3:].reshape(3, 3)), node[:3]))
+        turn = prior[3:].reshape(3, 3)
+        root = noise.Gaussian.SqrtInformation(np.diag(1 / std[:3]) @ turn.T, False)
+        graph.add(gtsam.PoseTranslationPrior3D(i, prior[:3], root))
+        graph.add(gtsam.PoseRotationPrior3D(i, gtsam.Rot3(turn), noise.Diagonal.Sigmas(std[3:])))
+    for i, j, far in ((0, 1, 9.0), (1, 2, 8.0), (0, 2, 7.0)):
+        graph.add(gtsam.RangeFactorPose3(i, j, far, noise.Isotropic.Sigma(1, 0.2)))
+    marginals = gtsam.Marginals(graph, found)
+    for i, covariance in enumerate(solution.covariance):
+        own, R = marginals.marginalCovariance(i), solution.rotation[i]
+        wide = np.block([[np.zeros((3, 3)), R], [np.eye(3), np.zeros((3, 3))]])
+        assert covariance == pytest.approx(wide @ own @ wide.T, abs=1e-6)
+
+
 def test_a_fixed_lag_is_exact_on_a_linear_chain() -> None:
     """The newest node of every lag against numpy.linalg.lstsq over the whole drive; a full covariance throughout."""
     rng, steps = np.random.default_rng(11), 12

@@ -343,6 +343,26 @@ def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed: int)
         assert found.cost >= verdict.lower_bound * (1 - 1e-9)
 
 
+def test_the_eigenvalue_is_that_of_the_whole_matrix() -> None:
+    """Schur complement and Q - diag(L, 0) are indefinite together; numpy.linalg.eigvalsh on the latter."""
+    for seed in range(4):
+        problem = anchored(seed)
+        form = quadratic(problem)
+        for solution in minima(problem, starts=6):
+            X = form.lift(solution.x, np.tile(np.eye(2), (6, 1, 1)))
+            Q = (form.rows.T @ form.rows).toarray()
+            CX = (Q @ X)[: form.bound]
+            assert np.abs((Q @ X)[form.bound :]).max() < 1e-4 * np.abs(Q).max()
+            S = Q.copy()
+            for block in form.stiefel:
+                S[np.ix_(block, block)] -= 0.5 * (CX[block] @ X[block].T + X[block] @ CX[block].T)
+            for (row,) in form.sphere:
+                S[row, row] -= CX[row] @ X[row]
+            smallest = certify(problem, solution).smallest_eigenvalue
+            tolerance = 1e-9 * np.abs(Q).max()
+            assert (np.linalg.eigvalsh(S)[0] < -tolerance) == (smallest < -tolerance)
+
+
 EXAMPLE = Path(__file__).resolve().parents[1] / "examples" / "range_only.py"
 
 

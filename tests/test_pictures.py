@@ -183,3 +183,13 @@ def test_pages_and_tables_show_names_as_text(tmp_path: Path) -> None:
     assert not any(re.match(r"\s*[=+@-]", text) for text in cells)
     known = {path.name for path in tmp_path.rglob("*") if path.is_file()}
     assert not any(name.strip("./") in known for name in NAMES.values())
+
+
+def test_a_solution_shows_nodes_factors_and_headings(seen: tuple[co.Fleet, co.Recording]) -> None:
+    problem = co.Problem.from_snapshot(seen[1], step=10, ego=24)
+    solution = co.solve(problem)
+    ax = solution.plot(problem=problem)
+    np.testing.assert_array_equal(ax.lines[0].get_xydata(), solution.position[:, :2])
+    assert [text.get_text() for text in ax.texts] == list(solution.names)
+    with pytest.raises(co.InputError, match="must be the one that was solved"):
+        solution.plot(problem=co.Problem(("a", "b")).add("position", ["a", "b"], np.zeros((2, 3)), std=1.0))

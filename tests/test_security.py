@@ -19,6 +19,7 @@ from latex import compiled
 from coopoc.cli import main
 from coopoc.errors import InputError
 from coopoc.study import store
+from coopoc.study.compare import compare
 from coopoc.study.merge import merge
 from coopoc.study.publish import tables, views
 from coopoc.study.report import report
@@ -348,3 +349,56 @@ def test_no_device_and_no_folder_is_replaced_by_a_file(folder: Path, tmp_path: P
         with pytest.raises(InputError, match=r"is a folder|must be a file, and is a device or a pipe"):
             write()
     assert os.stat(out).st_mode == before
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"axes": [["x"]]},
+        {"cells": {"0123456789abcdef0123": []}},
+        {"environment": {"python": ["3"]}},
+        {"settings": []},
+        {"question": None},
+    ],
+)
+def test_a_manifest_with_a_wrong_field_is_named(folder: Path, change: dict[str, Any]) -> None:
+    edited(folder / "manifest.json", lambda m: {**m, **change})
+    with pytest.raises(InputError, match=r"holds a damaged manifest\.json"):
+        compare(folder, folder)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"rows": [["<b>", {"mean": "<b>", "low": 0, "high": 0, "n": 0}]]},
+        {"rows": 3},
+        {"decimals": 10**9},
+        {"best": "<b>"},
+        {"header": None},
+    ],
+)
+def test_a_stored_table_of_another_form_is_named(folder: Path, change: dict[str, Any]) -> None:
+    stored = views(folder)["tables"][0]["table"]
+    assert Table.from_data(stored) == Table.from_data(json.loads(json.dumps(stored)))
+    with pytest.raises(InputError, match="table = dict: is damaged"):
+        Table.from_data({**stored, **change})
+    with pytest.raises(InputError, match="is damaged"):
+        Table.from_data([])
+
+
+@pytest.mark.parametrize("escape", ["\\ud800", "\\uDFff"])
+def test_half_a_surrogate_pair_is_no_text_and_a_whole_one_is(folder: Path, escape: str) -> None:
+    path = folder / "views.json"
+    known = path.read_text()
+    path.write_text(known.replace("Caption", f"Caption {escape}"))
+    with pytest.raises(InputError, match=r"holds a damaged views\.json"):
+        report([folder], folder / "report.html")
+    path.write_text(known.replace("Caption", "Caption \\ud83d\\ude97"))
+    assert "\U0001f697" in report([folder], folder / "report.html").read_text()
+
+
+def test_a_stored_table_is_the_table(folder: Path) -> None:
+    made = table(Results.load(folder))
+    assert Table.from_data(views(folder)["tables"][0]["table"]) == made
+    assert tables(folder, "latex") == [made.to_latex()]
+    assert (folder / "tables" / "rt_le.md").read_text() == made.to_markdown()

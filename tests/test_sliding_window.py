@@ -233,7 +233,7 @@ def test_no_message_ever_is_at_best_the_solo_filter(crossing: Fleet) -> None:
 @pytest.mark.parametrize("v2x", [V2X(4), V2X(4, loss=0.3), V2X(4, rate=2.0)], ids=["ideal", "lossy", "slow"])
 @pytest.mark.parametrize("noise_model", ["identity", "nominal"])
 def test_in_a_linear_model_every_window_ends_at_the_filter(v2x: V2X, noise_model: str, crossing: Fleet) -> None:
-    """The law of performance.md 1.2 and methods.md 6.9; JointFilter is held against filterpy in test_methods."""
+    """The newest point is the filter's; JointFilter is held against filterpy in test_methods."""
     recording = observe(crossing.between(0, 30), S2, v2x, runs=2)
     peer = JointFilter(noise_model, exact=False)(recording, [0, 3])
     lags = [FixedLagSmoother(lag=lag, noise_model=noise_model, exact=False) for lag in (1, 10)]

@@ -278,7 +278,7 @@ def test_a_range_that_would_be_negative_is_reflected() -> None:
 
 @pytest.mark.parametrize(("rate", "share"), [(10.0, 1.4), (2.5, 0.35)])
 def test_three_hundred_vehicles_saturate_the_channel_at_ten_hertz(rate: float, share: float) -> None:
-    """methods.md section 9.4: 300 x 350 B x 10 Hz = 8.4 Mb/s of 6 Mb/s; at 2.5 Hz 2.1 Mb/s, 35 %."""
+    """Closed form: 300 x 350 B x 10 Hz = 8.4 Mb/s of 6 Mb/s; at 2.5 Hz 2.1 Mb/s, 35 %."""
     jam = np.random.default_rng(0).uniform(-80, 80, (300, 3))
     assert channel_load(jam, 350, rate) == pytest.approx(np.full(300, share))
 

@@ -33,9 +33,11 @@ NO_ERROR = 1e-18
 def posterior_bound(
     fleet: Fleet, sensors: Sensors, ego: int | str, v2x: V2X | None = None, *, smoothing: bool = False
 ) -> Floats:
-    """Bound covariance of the ego's position at every step, (T, 3, 3) m^2.
+    r"""Bound covariance of the ego's position at every step, (T, 3, 3) m^2.
 
-    Filtering: J_t = (Q_t + J_{t-1}^-1)^-1 + F_t (Tichavsky, Muravchik, Nehorai 1998), F_t the Fisher information of the
+    $$ J_t = (Q_t + J_{t-1}^{-1})^{-1} + F_t $$
+
+    for filtering (Tichavsky, Muravchik, Nehorai 1998), $F_t$ the Fisher information of the
     fixes and relative measurements at the true positions, Q_t the true motion noise. Smoothing adds the information of
     the future. The information set is the ego's own measurements (solo, `v2x` None or K = 0), also the fixes and
     velocities of the linked neighbours over an ideal channel (star); a vehicle that leaves the star is forgotten, as

@@ -38,7 +38,9 @@ def _truth(track: Track, fleet: Fleet) -> Floats:
 
 
 def rt_le(track: Track, fleet: Fleet) -> Floats:
-    """Root mean square localization error over time, sqrt(mean_t |x_t - truth_t|^2), (R, E) m (paper, section IV.A).
+    r"""Root mean square localization error over time, (R, E) m (paper, section IV.A).
+
+    $$ \mathrm{RTLE} = \sqrt{\tfrac{1}{T} \sum_t \lVert \hat x_t - x_t \rVert^2} $$
 
     The mean is over the steps at which the truth of an ego is known; NaN where it never is.
 
@@ -78,7 +80,7 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
 
 
 def nees(track: Track, fleet: Fleet) -> Floats:
-    """Normalised estimation error squared, e^T P^-1 e, (R, T, E); its mean is 3 for a consistent filter.
+    r"""Normalised estimation error squared, $e^\top P^{-1} e$, (R, T, E); its mean is 3 for a consistent filter.
 
     NaN where the covariance is zero: at a start that is known, there is nothing to normalise by.
     """

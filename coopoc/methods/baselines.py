@@ -27,12 +27,14 @@ RECONSTRUCTION = "MSMV-R is a reconstruction: the equations of MSMV are not publ
 
 @dataclass(frozen=True, eq=False)
 class LKFSA:
-    """Per axis: z = [delta; gnss], H = [L; I], L the star's graph Laplacian, delta_i = -sum_j (x_j - x_i) as measured.
+    r"""Kalman filter per axis with $z = [\delta; z_\mathrm{gnss}]$, $H = [L; I]$, $L$ the star's graph Laplacian.
 
-    With the identity noise model this is LKF-SA as the paper compares with it. Cov(delta) is sigma^2 L and not the
+    $$ \delta_i = -\sum_j (x_j - x_i) \text{ as measured}, \qquad \mathrm{cov}(\delta) = \sigma^2 L $$
+
+    With the identity noise model this is LKF-SA as the paper compares with it. The covariance of $\delta$ is not the
     diagonal used here, so no weighting of this form is right; that of `JointFilter(exact=False)`, the edge form, is.
-    With other noise models delta_i has variance deg_i times the mean per-axis variance of the converted vectors. A
-    member whose measurement is incomplete has no edge.
+    With other noise models $\delta_i$ has variance $\deg_i$ times the mean per-axis variance of the converted vectors.
+    A member whose measurement is incomplete has no edge.
 
     Args:
         noise_model: "identity" (the paper), "nominal" or a NoiseModel.
@@ -60,9 +62,14 @@ class LKFSA:
 
 @dataclass(frozen=True, eq=False)
 class MSMV:
-    """Kalman filter of the ego with one pseudo-fix per neighbour: y_j = p_j - rho(r_ij), C_j = P_j + J C_r J^T.
+    r"""Kalman filter of the ego with one pseudo-fix $y_j$ per neighbour.
 
-    p_j, P_j are the neighbour's own solo estimate; P^-1 += C_p^-1 + sum C_j^-1. The errors of p_j are correlated in
+    $$
+    y_j = p_j - \rho(r_{ij}), \qquad C_j = P_j + J C_r J^\top, \qquad P^{-1} \leftarrow P^{-1} + C_p^{-1} + \sum_j
+    C_j^{-1}
+    $$
+
+    $p_j$, $P_j$ are the neighbour's own solo estimate. The errors of $p_j$ are correlated in
     time, so the covariance is over-confident (data incest), and NEES shows it. With the identity noise model all
     covariances are unit matrices and the message is shorter. The equations of MSMV are not public: this is a
     reconstruction.

@@ -30,12 +30,14 @@ BEARINGS = (
 
 @dataclass(frozen=True, eq=False)
 class CentralFilter:
-    """Kalman filter of all vehicles in information form, causal: the optimum of the same measurements.
+    r"""Kalman filter of all vehicles in information form, causal: the optimum of the same measurements.
 
-    Lambda = P^-1 + blkdiag(GNSS^-1) + B blkdiag(W_e) B^T over every pair e of the fleet, B its incidence matrix and W_e
-    the information of range and angles, linearised where prediction and measurement agree: to four digits the
-    accuracy of a converted update followed by an exact Gauss-Newton step, at one solution a step. Cost O(n^3) of the n
-    vehicles of a connected component, over others or at earlier steps: between components, covariances are zero.
+    $$ \Lambda = P^{-1} + \mathrm{blkdiag}(R_i^{-1}) + B \, \mathrm{blkdiag}(W_e) \, B^\top $$
+
+    over every pair $e$ of the fleet, $B$ its incidence matrix and $W_e$ the information of range and angles, linearised
+    where prediction and measurement agree: to four digits the accuracy of a converted update followed by an exact
+    Gauss-Newton step, at one solution a step. Cost O(n^3) of the n vehicles of a connected component, over others or at
+    earlier steps: between components, covariances are zero.
 
     A relative measurement reaches the centre if a message gets through between the two vehicles, either way. Bytes are
     those of the way to the centre and back.
@@ -84,7 +86,12 @@ def share_covariance(measured: Measured, pairs: Pairs, assumed: Assumed) -> bool
 
 @dataclass(frozen=True, eq=False)
 class BatchSmoother:
-    """argmin of sum |x_t - x_{t-1} - dt u_t|^2_Q + sum |z - x|^2_GNSS + sum |h(x_j - x_i) - y|^2 over fleet and drive.
+    r"""Most probable positions of the whole fleet over the whole drive.
+
+    $$
+    \min_x \sum \lVert x_t - x_{t-1} - \Delta t \, u_t \rVert^2_{Q^{-1}} + \sum \lVert z - x \rVert^2_{R^{-1}} +
+    \sum \lVert h(x_j - x_i) - y \rVert^2_{C^{-1}}
+    $$
 
     The converted measurements make a linear problem; from its solution one exact Gauss-Newton step on range and angles
     is enough on average. Steps with the same factors, each a tenth of its cost, follow until none moves a position by
@@ -93,9 +100,10 @@ class BatchSmoother:
     equations block-tridiagonal with blocks of 3N x 3N, and motion noise is diagonal, so that one sweep eliminates step
     after step,
 
-        S_t = J_t + D,   J_{t+1} = D S_t^-1 J_t + F_{t+1},   D = diag(1 / q),
+    $$ S_t = J_t + D, \qquad J_{t+1} = D S_t^{-1} J_t + F_{t+1}, \qquad D = \mathrm{diag}(1 / q), $$
 
-    and one sweep back gives positions and their marginal covariances, Sigma_t = S_t^-1 + S_t^-1 D Sigma_{t+1} D S_t^-1.
+    and one sweep back gives positions and their marginal covariances, $\Sigma_t = S_t^{-1} + S_t^{-1} D \Sigma_{t+1} D
+    S_t^{-1}$.
 
     Not causal: a reference for what the drive holds. O(T (3N)^3) and T (3N)^2 numbers per sweep, one run at a time:
     60 vehicles and 900 steps take 230 MB. A measurement counts if a message gets through between the two, however late.

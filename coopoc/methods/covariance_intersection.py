@@ -19,9 +19,11 @@ from .track import Track
 
 @dataclass(frozen=True, eq=False)
 class CovarianceIntersection:
-    """Filter of the ego that fuses pseudo-fixes y_j = p_j - rho(r_ij), C_j = P_j + J C_r J^T, by (split) CI.
+    r"""Filter of the ego that fuses pseudo-fixes $y_j = p_j - \rho(r_{ij})$, $C_j = P_j + J C_r J^\top$, by (split) CI.
 
-    A neighbour sends p_j, P_j of its *solo* filter, which is consistent by itself; a recursive scheme in which
+    $$ P^{-1} = w \, P_1^{-1} + (1 - w) \, P_2^{-1} $$
+
+    A neighbour sends $p_j$, $P_j$ of its *solo* filter, which is consistent by itself; a recursive scheme in which
     neighbours cooperate would need the links of all vehicles. The errors of p_j at different steps are correlated, and
     so is the ego's error with all that it has fused: CI and split CI need not know how much. Three errors are
     independent of these and enter as such: the ego's own fix in both forms and, in split CI alone, the ego's motion
@@ -29,7 +31,7 @@ class CovarianceIntersection:
     each other, which a GNSS error common to all would break. Because a used message may be used again, the newest one
     serves, brought forward with its velocity, until it is too old.
 
-    The weight w makes the trace of the fused covariance least. CI gains little where a neighbour knows the ego worse
+    The weight $w$ makes the trace of the fused covariance least. CI gains little where a neighbour knows the ego worse
     than the ego does: w is then 1.
 
     Args:

@@ -29,12 +29,15 @@ their own beliefs; with less, three rounds do not agree, and weigh precise fixes
 
 @dataclass(frozen=True, eq=False)
 class GaussianBeliefPropagation:
-    """Per step a prediction and the own fix, then `rounds` of messages between the vehicles in contact.
+    r"""Per step a prediction and the own fix, then `rounds` of messages between the vehicles in contact.
 
-    With (w, W) the information vector and matrix of the pair's measurements, and (eta, Lambda) the sender's belief less
-    the receiver's last message, the message about the receiver is
+    With $(w, W)$ the information vector and matrix of the pair's measurements, and $(\eta, \Lambda)$ the sender's
+    belief less the receiver's last message, the message about the receiver is
 
-        Lambda_m = W (W + Lambda)^-1 Lambda,   eta_m = W (W + Lambda)^-1 eta + Lambda (W + Lambda)^-1 w,
+    $$
+    \Lambda_m = W (W + \Lambda)^{-1} \Lambda, \qquad \eta_m = W (W + \Lambda)^{-1} \eta + \Lambda (W +
+    \Lambda)^{-1} w,
+    $$
 
     and a belief is the prior and the sum of the messages. A pair's two measurements are one factor, so that a tree of
     vehicles stays a tree: there a step's beliefs are exact after as many rounds as the tree is wide. On loops the means
@@ -90,12 +93,16 @@ class GaussianBeliefPropagation:
 
 @dataclass(frozen=True, eq=False)
 class ConsensusADMM:
-    """Per step a prediction and the own fix, then `rounds` iterations towards the most probable positions of the fleet.
+    r"""Per step a prediction and the own fix, then `rounds` iterations towards the most probable positions of the
+    fleet.
 
     Vehicle i holds copies y of itself and of those in contact. Its cost f_i is its own belief and half of what each of
-    its pairs measured; with a_k = z_k - u_k and scaled duals u:
+    its pairs measured; with $a_k = z_k - u_k$ and scaled duals $u$:
 
-        y = argmin f_i(y) + rho/2 sum_k |y_k - a_k|^2,   z_k = mean over holders of y_k + u_k,   u += y - z.
+    $$
+    y \leftarrow \arg\min_y f_i(y) + \tfrac{\rho}{2} \sum_k \lVert y_k - a_k \rVert^2, \quad z_k \leftarrow
+    \mathrm{mean}(y_k + u_k), \quad u \leftarrow u + y - z
+    $$
 
     The limit is the fleet's weighted least-squares solution of the step. z starts at the beliefs (warm), u at zero: the
     duals of the last step are its measurement noise.

@@ -24,11 +24,17 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class JointFilter:
-    """Kalman filter of the star {ego} + neighbours in information form; axes couple through the relative covariances.
+    r"""Kalman filter of the star {ego} + neighbours in information form; axes couple through the relative covariances.
 
-    Lambda = P^-1 + blkdiag(GNSS^-1) + B blkdiag(C_e^-1) B^T with C_e the rotated covariance of the converted vector at
-    the predicted geometry: at the measured one the weight would depend on the noise. Then, if `exact`, one Gauss-Newton
-    step on range, azimuth and inclination themselves. The states of the other members stay when one joins or leaves.
+    $$
+    \Lambda = P^{-1} + \mathrm{blkdiag}(R_i^{-1}) + B \, \mathrm{blkdiag}(C_e^{-1}) \, B^\top, \qquad \hat x =
+    \Lambda^{-1} \eta
+    $$
+
+    $R_i$ is the covariance of a fix, $B$ the star's incidence matrix, $C_e$ the rotated covariance of the converted
+    vector at the predicted geometry: at the measured one the weight would depend on the noise. Then, if `exact`, one
+    Gauss-Newton step on range, azimuth and inclination themselves. The states of the other members stay when one joins
+    or leaves.
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.

@@ -28,7 +28,8 @@ ASSUMED = Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02)
 
 @dataclass(frozen=True)
 class GNSS:
-    """The latest fix, x_t = z_t, with the assumed GNSS covariance; where there is none, the last one is held."""
+    r"""The latest fix, $\hat x_t = z_t$, with the assumed GNSS covariance; where there is none, the last one is
+    held."""
 
     name: str = "gnss"
     cooperative: bool = False
@@ -49,7 +50,8 @@ class GNSS:
 
 @dataclass(frozen=True, eq=False)
 class Kalman:
-    """Kalman filter of x_t = x_{t-1} + dt u_t, z_t = x_t + n, with the noise that `noise_model` names.
+    r"""Kalman filter of $x_t = x_{t-1} + \Delta t \, u_t + w$, $z_t = x_t + n$, with the noise that `noise_model`
+    names.
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.
@@ -103,12 +105,15 @@ class Kalman:
 
 @dataclass(frozen=True, eq=False)
 class AdaptiveKalman:
-    """Kalman filter whose GNSS variance r is estimated from its innovations, per axis.
+    r"""Kalman filter whose GNSS variance r is estimated from its innovations, per axis.
 
-    With innovation v of variance p + r, p that of the prediction: r <- r + (v^2 - p - r) / n, n <- min(n + 1, window).
-    So r is the mean of v^2 - p over all fixes and `prior_weight` fixes of the assumed variance, and once there are
-    `window` it forgets exponentially. The process noise follows the measured velocity as in NoiseModel.nominal. A bias
-    that is there from the first fix on does not show in innovations.
+    With innovation $\nu$ of variance $p + r$, $p$ that of the prediction,
+
+    $$ r \leftarrow r + (\nu^2 - p - r) / n, \qquad n \leftarrow \min(n + 1, \mathrm{window}). $$
+
+    So $r$ is the mean of $\nu^2 - p$ over all fixes and `prior_weight` fixes of the assumed variance, and once there
+    are `window` it forgets exponentially. The process noise follows the measured velocity as in NoiseModel.nominal. A
+    bias that is there from the first fix on does not show in innovations.
 
     A position is a mean of past fixes moved forward. Joseph's form splits its variance into a part that is linear in r
     and a part from motion. When r is revised, the past is reread with it: a start at a fix that was believed too good,

@@ -24,14 +24,19 @@ from .track import Track
 
 @dataclass(frozen=True, eq=False)
 class QCQPRelaxation:
-    """Per step and run: Shor's relaxation of the star's ranges and fixes, rounded, then Gauss-Newton.
+    r"""Per step and run: Shor's relaxation of the star's ranges and fixes, rounded, then Gauss-Newton.
 
-    minimise 1/2 sum_i |x_i - z_i|^2 / sigma_i^2 + 1/2 sum_j (|x_j - x_0| - r_j)^2 / sigma_r^2, which is not convex:
-    with a unit vector per range it is a QCQP. Angles are not used, and no step depends on another. Where the relaxation
-    is tight the refined point is the global optimum of its step; the notes report how often. A semidefinite programme
-    takes milliseconds per step and run, and is not batched: this is a baseline and a certificate for short drives. Late
-    fixes, whose axes differ in variance, make it slower. The covariance is that of the problem linearised at the point
-    found. A missing fix is the last one brought forward; a vehicle without a range takes no part.
+    $$
+    \min_x \tfrac{1}{2} \sum_i \lVert x_i - z_i \rVert^2 / \sigma_i^2 + \tfrac{1}{2} \sum_j (\lVert x_j - x_0
+    \rVert - r_j)^2 / \sigma_r^2
+    $$
+
+    is not convex: with a unit vector per range it is a QCQP. Angles are not used, and no step depends on another. Where
+    the relaxation is tight the refined point is the global optimum of its step; the notes report how often. A
+    semidefinite programme takes milliseconds per step and run, and is not batched: this is a baseline and a certificate
+    for short drives. Late fixes, whose axes differ in variance, make it slower. The covariance is that of the problem
+    linearised at the point found. A missing fix is the last one brought forward; a vehicle without a range takes no
+    part.
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.

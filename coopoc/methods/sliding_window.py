@@ -56,7 +56,9 @@ MOVING = f"windows were still moving after {REPEATS + 1} Gauss-Newton steps"
 
 @dataclass(frozen=True, eq=False)
 class CooperativeMAP:
-    """argmin of 1/2 sum |W (h(x) - z)|^2 over the ego and its neighbours at the last `window` steps.
+    r"""Most probable positions of the ego and its neighbours at the last `window` steps.
+
+    $$ \hat x = \arg\min_x \tfrac{1}{2} \sum_k \lVert W_k (h_k(x) - z_k) \rVert^2 $$
 
     Window 1 is the snapshot maximum likelihood; a longer one adds odometry, dt u with the assumed process noise, from
     step to step: a smoother whose newest point is the estimate, without a prior from before the window. Relative
@@ -220,7 +222,12 @@ class FixedLagSmoother:
 
 @dataclass(frozen=True, eq=False)
 class MovingHorizon:
-    """argmin over x_{t-N..t} of |x_{t-N} - x_a|^2_{P^-1} + sum |x_{k+1} - x_k - dt u_k|^2 + sum |h(x_k) - z_k|^2.
+    r"""Most probable positions of the star over the last N steps, behind an arrival cost.
+
+    $$
+    \min_{x_{t-N..t}} \lVert x_{t-N} - x_a \rVert^2_{P^{-1}} + \sum_k \lVert x_{k+1} - x_k - \Delta t \, u_k
+    \rVert^2_{Q^{-1}} + \sum_k \lVert h(x_k) - z_k \rVert^2_{R^{-1}}
+    $$
 
     x holds the ego and the neighbours of its star at each step. The arrival cost (x_a, P) is
     what the steps before the horizon leave when they are eliminated one by one, as a filter does. A message that comes

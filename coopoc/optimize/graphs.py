@@ -55,10 +55,10 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         start: "odometry" chains each robot's relative poses from a pose with a prior, else from its first vertex in the
             file; "apart" from a ring as wide as the mean range, all facing one way, as if nothing were known of how the
             robots stand to each other; "file" takes the vertices as they are; "tree" follows loop closures
-            and measurements between robots, too; "linear" relaxes rotations (`linear_start.py`); "incremental" solves
-            the first poses of all robots, then more with them (`incremental_start.py`); "auto" tries several and keeps
-            the one that leads lowest (`race.py`). Landmarks are put at their priors, or where the first pose that
-            measures them sees them, or by the ranges to them. The Solution names the start in extras["start"].
+            and measurements between robots, too; "linear" relaxes rotations (`starts/linear.py`); "incremental" solves
+            the first poses of all robots, then more with them (`starts/graph_starts.py`); "auto" tries several and
+            keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their priors, or where the first
+            pose that measures them sees them, or by ranges. The Solution names the start in extras["start"].
 
     Raises:
         InputError: an unknown objective or start, a measurement without variance, by its vertices.

@@ -70,7 +70,7 @@ class Recording:
         broadcasts: (T, N) True where a vehicle broadcasts.
         arrival: (R, L) step at which the neighbour's broadcast of the link's step arrives, -1 if lost or not sent.
         sensors: what a method may know (the bias is not among it).
-        v2x: what a method may know (the bias is not among it).
+        v2x: the channel: neighbours, radius, rate, latency, loss, cap.
         notes: labels that every table and figure carries (what is simulated, what uses truth).
         body: yaw rates and headings of a recording in body frames: `velocity` is then forward, left and up, azimuths
             count from the observer's heading; None for a recording in the world frame.

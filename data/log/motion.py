@@ -264,9 +264,9 @@ def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingA
     Between measured headings h_j it is W(t) + the line through h_j - W(t_j), with the integral W of the yaw rate, which
     is zero where there is none. Without a yaw rate, gaps longer than `gap` are unknown.
 
-    >>> heading = heading_at(Signal(np.array([0.0, 1]), np.array([[3.0], [-3.0]]), np.arange(2)), None, 2.0)
+    >>> heading = heading_at(Signal(np.array([0.0, 1]), np.array([[3.0], [-3.1]]), np.arange(2)), None, 2.0)
     >>> heading(np.array([0.5, 9.0])).round(3).tolist()
-    [3.142, nan]
+    [3.092, nan]
     """
     turned = (lambda at: _integral(yaw_rate, at)[:, 0]) if yaw_rate is not None else np.zeros_like
     offset = np.unwrap(heading.value[:, 0] - turned(heading.t))

@@ -1,1 +1,1 @@
-"""Training together: rules, participation, compression, topologies, and the guard against bad updates."""
+"""Training together: rules, participation, and the screening of bad updates."""

@@ -104,6 +104,7 @@ def federate(
     References:
         arXiv 2411.05847, algorithm 1; McMahan et al., AISTATS 2017.
 
+    >>> import torch
     >>> from coopoc.learned import clients, federate
     >>> from coopoc.world.fleet import Fleet
     >>> t = torch.arange(33) / 10

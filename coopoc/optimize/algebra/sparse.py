@@ -14,6 +14,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..model.factor import steerable
+from ..model.linear import Linear
 from ..model.problem import Problem
 from ..model.space import Space
 from ..model.symbolic import Kind, Structure, Term, numbers_of
@@ -153,6 +154,13 @@ def places_of(entries: Entries, nodes: Ints, written: Ints) -> Any:
     return goal
 
 
+def summed(values: Floats, goal: Ints, size: int) -> Floats:
+    """(B, size) sums of values (B, K) by where each belongs (K,)."""
+    goal = goal + size * np.arange(len(values))[:, None]
+    total = np.bincount(goal.ravel(), values.ravel(), size * len(values))
+    return np.asarray(total, np.float64).reshape(len(values), size)
+
+
 class Layout:
     """What problems of one structure share: the pattern of their Hessians, tapes, and analyses of the factorisation.
 
@@ -178,6 +186,26 @@ class Layout:
             small = self.entries.size <= DENSE
             self._local.cholesky = DenseCholesky(*pattern) if small else Cholesky(*pattern, group)
         return self._local.cholesky  # type: ignore[no-any-return]
+
+    @cached_property
+    def _products(self) -> Ints:
+        """Where the entries of (J, r)^T (J, r) of all measurements belong, see `places_of`."""
+        goals = [np.empty(0, np.int32)]
+        for term in self.terms:
+            r = term.nodes.shape[1] * term.kind.space.dof
+            i, j = np.indices((r + 1, r + 1)).reshape(2, -1)
+            written = np.where((i <= j) & (i < r), [i, np.where(j < r, j, -1)], -1)
+            goals.append(places_of(self.entries, term.nodes, written.T).T.ravel())
+        return np.concatenate(goals)
+
+    def normal_equations(self, linear: Linear) -> tuple[Floats, Floats]:
+        """The values of the upper triangle of J^T J (B, entries) and J^T r (B, m) of linearised problems."""
+        m, squares = self.entries.size, [np.empty((len(linear.x), 0))]
+        for residual, jacobians in zip(linear.residual, linear.jacobian, strict=True):
+            wide = np.concatenate([*jacobians, residual[..., None]], axis=-1)
+            squares.append((wide.swapaxes(-1, -2).copy() @ wide).reshape(len(wide), -1))
+        total = summed(np.concatenate(squares, axis=1), self._products, m + len(self.entries.indices) + 2)
+        return total[:, m + 1 : -1], total[:, 1 : m + 1]
 
     def total(self, model: Model, x: Floats, numbers: Sequence[Floats]) -> Floats:
         """The cost, the gradient, the Hessian's values and a last number, which is waste, at x (n, ambient).

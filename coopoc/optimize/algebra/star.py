@@ -57,7 +57,7 @@ class Star:
         def marginals() -> Floats:
             cov, turned = np.empty_like(own), reduced[..., :d]
             cov[:, self.separator] = corner
-            cov[:, others] = inverse + turned @ corner[:, None] @ turned.swapaxes(-1, -2)
+            cov[:, others] = inverse + turned @ corner[:, None] @ turned.swapaxes(-1, -2).copy()
             return cov
 
         return dx, marginals
@@ -91,7 +91,7 @@ def star_at(problem: Problem, linear: Linear) -> Star:
     own, arm = np.zeros((2, count, n, d, d))
     gradient = np.zeros((count, n, d))
     for factor, residual, (*_, jacobian) in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
-        nodes, transposed = factor.nodes, jacobian.swapaxes(-1, -2)
+        nodes, transposed = factor.nodes, jacobian.swapaxes(-1, -2).copy()  # BLAS takes longer for a view
         square = np.broadcast_to(transposed @ jacobian, (len(jacobian), len(nodes), d, d))
         slope = (transposed @ residual[..., None])[..., 0]
         other = np.where(nodes[:, 0] == separator, nodes[:, -1], nodes[:, 0])

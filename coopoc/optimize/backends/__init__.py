@@ -1,1 +1,1 @@
-"""One file per solver; each has build(problem, **options) -> Run."""
+"""One file per solver; each has a BACKEND whose `prepare(structure, **options)` returns a solver."""

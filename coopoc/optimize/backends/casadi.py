@@ -2,11 +2,13 @@
 
 The expressions (see `symbolic`) are differentiated once per structure; measurements, weights, bounds and the start are
 parameters, so that the next problem of the structure pays for its solution only. Poses are steps in a chart around a
-centre that moves to each answer until the step is below the tolerance.
+centre that moves to each answer until the step is below the tolerance. FATROP (interior point, dense elimination) takes
+small problems without inequalities, IPOPT the others and those where FATROP fails.
 """
 
 from __future__ import annotations
 
+from dataclasses import replace
 from functools import lru_cache
 from typing import Any
 
@@ -21,8 +23,11 @@ from ..model.factor import steerable
 from ..model.problem import Problem
 from ..model.symbolic import Structure, expressions, numbers_of
 
+DENSE = 200
+"""Numbers that can move up to which FATROP is faster than IPOPT."""
 ROUNDS = 10
 """Moves of the chart of the poses, at most."""
+SUCCESS = "Solve_Succeeded"
 HOPELESS = ("Infeasible_Problem_Detected", "Maximum_Iterations_Exceeded")
 """Statuses of CasADi after which another chart would not help."""
 QUIET: dict[str, Any] = {"print_time": False, "calc_lam_p": False, "show_eval_warnings": False, "error_on_fail": False}
@@ -40,6 +45,7 @@ IPOPT = {
     "acceptable_compl_inf_tol": 1e-17,
 }
 """For a cost scaled to a curvature of 1; what `tol` asks may lie below rounding, hence the acceptable level."""
+FATROP: dict[str, Any] = {"print_level": 0, "tolerance": 1e-12, "tol_acceptable": 1e-8, "acceptable_iter": 3}
 
 
 def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Solver:
@@ -68,11 +74,22 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
             f"must be at most the {moving} numbers that can move",
             "Leave out those that follow from the others.",
         )
-    nlp = NlpSolver(programme(form, int(max_iterations)))
+    methods = ("fatrop", "ipopt") if moving <= DENSE and np.array_equal(*sides) else ("ipopt",)
+
+    @lru_cache
+    def nlp(method: str) -> NlpSolver:
+        return NlpSolver(programme(form, method, int(max_iterations)))
+
+    def best(problem: Problem, numbers: Floats, x: Floats) -> SolverResult:
+        """Of the first method that succeeds, else of the last."""
+        for method in methods:
+            end = _run(form, nlp(method), problem, numbers, x, sides, tolerance)
+            if end.extras["return_status"] == SUCCESS:
+                break
+        return replace(end, extras=end.extras | {"method": method})
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
-        given = zip(problem.realisations, _numbers(problem, x), x, strict=True)
-        ends = [_run(form, nlp, *each, sides, tolerance) for each in given]
+        ends = [best(*given) for given in zip(problem.realisations, _numbers(problem, x), x, strict=True)]
         counts, infeasible = np.array([(end.iterations, end.infeasible) for end in ends]).T
         return SolverResult(np.stack([end.x for end in ends]), counts, infeasible.astype(bool), ends[0].extras)
 
@@ -163,24 +180,30 @@ class NlpSolver:
         self._found["x"][:] = np.nan
         self._evaluate()
         stats = self._buffer.stats()
-        return self._found["x"].copy(), self._found["lam_g"].copy(), int(stats["iter_count"]), stats["return_status"]
+        status = stats["return_status"]
+        if isinstance(status, int):  # FATROP has one number for all that is not a success
+            status = SUCCESS if stats["success"] else "Not_Solved"
+        return self._found["x"].copy(), self._found["lam_g"].copy(), int(stats["iter_count"]), status
 
 
 @lru_cache(maxsize=64)
-def programme(structure: Structure, max_iterations: int) -> Any:
-    """CasADi's nlpsol of a structure, kept for the next problems that share it."""
+def programme(structure: Structure, method: str, max_iterations: int) -> Any:
+    """CasADi's nlpsol of a structure by "fatrop" or "ipopt", kept for the next problems that share it."""
     import casadi as ca
 
     found, scale = expressions(structure), ca.SX.sym("scale")
     nlp = {**found, "p": ca.vertcat(found["p"], scale), "f": scale * found["f"]}
-    options: dict[str, Any] = {**QUIET, "ipopt": {**IPOPT, "max_iter": max_iterations}}
-    return ca.nlpsol("solver", "ipopt", nlp, options)
+    own = {"ipopt": IPOPT, "fatrop": FATROP}[method]
+    options: dict[str, Any] = {**QUIET, method: {**own, "max_iter": max_iterations}}
+    if method == "fatrop":
+        options["structure_detection"] = "none"
+    return ca.nlpsol("solver", method, nlp, options)
 
 
 BACKEND = Backend(
     "casadi",
     prepare,
-    "nonlinear programming by IPOPT, any constraints",
+    "nonlinear programming by FATROP or IPOPT, any constraints",
     "casadi",
     Capabilities(batched=True, losses=("huber", "cauchy", "geman-mcclure"), constraints="all"),
 )

@@ -16,8 +16,7 @@ def prepare(structure: Problem, refine: bool = True) -> Solver:
 
     Args:
         structure: a problem whose structure counts.
-        refine: from the rounded point to a minimum, by Newton's steps and gauss-newton; without it the answer is the
-            relaxation's own.
+        refine: from the rounded point to a minimum by gauss-newton; without it the answer is the relaxation's own.
     """
     return partial(_relaxed, refine)
 

@@ -88,14 +88,16 @@ def linear_step(problem: Problem) -> Step:
 
     def step(linear: Linear, damping: Floats) -> Floats:
         dx, rows = np.full_like(damping, np.nan), _rows(problem, linear)
-        for b, added in enumerate(np.sqrt(damping + still)):
+        added: Floats = np.sqrt(damping + still)
+        for b, touched in enumerate(np.any(added != 0.0, axis=2).tolist()):
             graph: Any = gtsam.GaussianFactorGraph()
             for nodes, jacobians, goal in rows:
                 model = unit[goal.shape[-1]]
-                for at, rhs, *by in zip(nodes, goal[b], *(jacobian[b] for jacobian in jacobians), strict=True):
-                    graph.add(*(part for pair in zip(at, by, strict=True) for part in pair), rhs, model)
-            for i in np.flatnonzero(added.any(axis=1)).tolist():
-                graph.add(i, np.diag(added[i]), nothing, unit[len(nothing)])
+                columns = [part for at, by in zip(nodes, jacobians, strict=True) for part in (at, by[b])]
+                for row in zip(*columns, goal[b], strict=True):
+                    graph.add(*row, model)
+            for i in np.flatnonzero(touched).tolist():
+                graph.add(i, np.diag(added[b, i]), nothing, unit[len(nothing)])
             damped = bool(damping[b].any())
             if damped not in orderings:  # what is damped has every node, even one without measurements
                 orderings[damped] = gtsam.Ordering.ColamdGaussianFactorGraph(graph)
@@ -111,14 +113,14 @@ def linear_step(problem: Problem) -> Step:
 
 
 def _rows(problem: Problem, linear: Linear) -> list[tuple[list[list[int]], list[Floats], Floats]]:
-    """Per factor the nodes (M, arity), a derivative (B, M, size, dof) by each of them, and -r (B, M, size).
+    """Per factor the nodes (arity, M), a derivative (B, M, size, dof) by each of them, and -r (B, M, size).
 
     The derivatives are read-only: GTSAM's wrapper takes those a tenth faster.
     """
     found = []
     for factor, residual, jacobians in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
         wide = [np.broadcast_to(jacobian, (*residual.shape, jacobian.shape[-1])) for jacobian in jacobians]
-        found.append((factor.nodes.tolist(), wide, -residual))
+        found.append((factor.nodes.T.tolist(), wide, -residual))
     return found
 
 

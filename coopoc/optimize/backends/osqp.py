@@ -13,14 +13,14 @@ exactly for the active set that the iterations have found (polishing).
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache, partial
+from functools import lru_cache
 from threading import get_ident
 from typing import Any
 
 import numpy as np
 
-from ...arrays import Floats, Ints
-from ..algebra.sparse import Layout, Sparse, sparse
+from ...arrays import Floats
+from ..algebra.sparse import Layout, layout_of, summed
 from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
@@ -79,52 +79,47 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     array([1., 8.])
     """
     check_limits(max_iterations, tolerance)
-    limits, programmes = _limits(structure), dict[Layout, Programme]()
+    limits, layout = _limits(structure) if structure.constraints else None, layout_of(structure)
+    moving = np.flatnonzero(layout.entries.number.ravel() >= 0)
+    held = Programme(_pattern(layout), limits.matrix[:, moving]) if limits else None
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
-        system = sparse(problem)
-        if system.layout not in programmes:
-            programmes[system.layout] = _programme(system, limits)
-        programme = programmes[system.layout]
+        programme = held or unbounded(layout, get_ident())
         programme.counts.update(osqp_iterations=0, repairs=0)
-        if problem.constraints:
+        if limits:
             try:
-                x, feasible = _nearest(limits, x)
+                start, feasible = _nearest(limits, x[0])
             except np.linalg.LinAlgError:
                 return SolverResult(x, 0, extras=dict(programme.counts))
+            x = start[None]
             if not feasible:
                 return SolverResult(x, 0, True, dict(programme.counts))
-        step = partial(_step, system, limits, programme)
-        result = minimise(problem, step, x[None], max_iterations, tolerance)
-        extras = result.extras | dict(programme.counts)
-        return SolverResult(result.x[0], int(np.ravel(result.iterations)[0]), extras=extras)
+
+        def step(linear: Linear, damping: Floats) -> Floats:
+            values, q = layout.normal_equations(linear)
+            if damping.any():
+                values[:, layout.entries.diagonal] += damping.reshape(len(q), -1)[:, moving]
+            dx = np.zeros((len(q), damping[0].size))
+            if limits:
+                dx[:, moving] = programme.solve(values[0], q[0], *limits.around(linear.x[0]))
+            else:
+                dx[:, moving] = programme.each(values, q)
+            return dx.reshape(damping.shape)
+
+        result = minimise(problem, step, x, max_iterations, tolerance)
+        result.extras.update(programme.counts)
+        return result
 
     return solver
 
 
-def _programme(system: Sparse, limits: _Limits) -> Programme:
-    """The quadratic programme of a structure."""
+def _pattern(layout: Layout) -> Any:
+    """The upper triangle of P (CSC) of a structure; ones on the diagonal."""
     from scipy.sparse import csc_matrix
 
-    entries = system.entries
-    if not len(limits.lower):
-        return unbounded(entries.indices.tobytes(), entries.indptr.tobytes(), get_ident())
-    pattern = csc_matrix((np.ones(len(entries.indices)), entries.indices, entries.indptr), shape=(entries.size,) * 2)
-    return Programme(pattern, csc_matrix(limits.matrix[:, _moving(system)]))
-
-
-def _moving(system: Sparse) -> Ints:
-    return np.flatnonzero(system.entries.number.ravel() >= 0)
-
-
-def _step(system: Sparse, limits: _Limits, programme: Programme, linear: Linear, damping: Floats) -> Floats:
-    """dx (1, n, dof) of the quadratic programme around a point."""
-    dx, moving = np.zeros(damping.size), _moving(system)
-    _, q, values = system.quadratic(linear.x[0], "gauss-newton")
-    values = np.array(values)
-    values[system.entries.diagonal] += damping.ravel()[moving]
-    dx[moving] = programme.solve(values, np.array(q), *limits.around(linear.x[0]))
-    return dx.reshape(damping.shape)
+    entries = layout.entries
+    identity = np.bincount(entries.diagonal, minlength=len(entries.indices))
+    return csc_matrix((identity.astype(np.float64), entries.indices, entries.indptr), shape=(entries.size,) * 2)
 
 
 class Infeasible(np.linalg.LinAlgError):
@@ -141,6 +136,10 @@ class Programme:
 
     def __init__(self, pattern: Any, rows: Any) -> None:
         self._pattern, self._rows = pattern, rows
+        row, column = pattern.indices.astype(np.int64), np.repeat(np.arange(rows.shape[1]), np.diff(pattern.indptr))
+        off = np.flatnonzero(row != column)
+        self._entry = np.append(np.arange(len(row)), off)
+        self._column, self._row = np.append(column, row[off]), np.append(row, column[off])
         self._workspace: Any = None
         self._polishing = False
         self.counts = {"osqp_iterations": 0, "repairs": 0}
@@ -151,9 +150,7 @@ class Programme:
         Raises:
             Infeasible: no dx satisfies the bounds. numpy.linalg.LinAlgError: the KKT conditions stay unsatisfied.
         """
-        P = self._pattern
-        P.data = values
-        self._update(P, q, lower, upper)
+        self.update(values, q, lower, upper)
         for attempt in range(REPAIRS + 1):
             end = self._workspace.solve(raise_error=False)
             self.counts["osqp_iterations"] += int(end.info.iter)
@@ -161,22 +158,43 @@ class Programme:
                 raise Infeasible
             dx, y, value = np.array(end.x), np.array(end.y), self._rows @ end.x
             active = bool(np.any((upper - value < y) | (value - lower < -y)))
-            if self._holds(P, q, lower, upper, dx, y) and self._polishing >= active:
+            if self._holds(values, q, lower, upper, dx, y) and self._polishing >= active:
                 return dx
             self.counts["repairs"] += attempt < REPAIRS and self._polishing >= active
             self._polish(active)
         raise np.linalg.LinAlgError("osqp: the KKT conditions of a quadratic programme stay unsatisfied")
 
-    def _update(self, P: Any, q: Floats, lower: Floats, upper: Floats) -> None:
+    def each(self, values: Floats, q: Floats) -> Floats:
+        """dx (B, m) without bounds, checked together; one that fails is repaired, and NaN where that fails, too."""
+        dx, start, nothing = np.empty_like(q), np.zeros(q.shape[1]), np.empty(0)
+        self._polish(False)
+        core = self._workspace._solver  # osqp's class around it takes longer than a small programme
+        for b in range(len(q)):
+            core.update_data_vec(q[b], None, None)
+            core.update_data_mat(values[b], None, None, None)
+            core.warm_start(start, None)  # earlier solves must not show
+            core.solve()
+            dx[b] = core.solution.x
+            self.counts["osqp_iterations"] += int(core.info.iter)
+        rest, _, allowed = self._stationary(values, q, dx)
+        for b in np.flatnonzero(~(np.abs(rest) <= allowed).all(axis=1)).tolist():
+            try:
+                dx[b] = self.solve(values[b], q[b], nothing, nothing)
+            except np.linalg.LinAlgError:
+                dx[b] = np.nan
+        return dx
+
+    def update(self, values: Floats, q: Floats, lower: Floats, upper: Floats) -> None:
+        """Put numbers into the workspace, which the first ones set up."""
         import osqp
 
         if self._workspace is None:
-            self._workspace = osqp.OSQP()
+            self._workspace, self._pattern.data = osqp.OSQP(), values
             settings = {**SETTINGS, **(BOUNDED if len(lower) else {})}
-            self._workspace.setup(P, q, self._rows, lower, upper, **settings)
+            self._workspace.setup(self._pattern, q, self._rows, lower, upper, **settings)
             return
         self._polish(False)
-        self._workspace.update(Px=P.data, q=q, **({"l": lower, "u": upper} if len(lower) else {}))
+        self._workspace.update(Px=values, q=q, l=lower, u=upper)
         if not len(lower):  # the workspace is kept: earlier solves must not show
             self._workspace.warm_start(x=np.zeros(len(q)))
 
@@ -186,28 +204,32 @@ class Programme:
             self._polishing = wanted
             self._workspace.update_settings(polishing=wanted)
 
-    def _holds(self, P: Any, q: Floats, lower: Floats, upper: Floats, dx: Floats, y: Floats) -> bool:
+    def _holds(self, values: Floats, q: Floats, lower: Floats, upper: Floats, dx: Floats, y: Floats) -> bool:
         """The KKT conditions, computed by ourselves: stationarity, bounds, and a push only where a bound is met."""
-        own, value = P.diagonal(), self._rows @ dx
-        weak = KKT * max(np.abs(q).max(), np.abs(own * dx).max())  # a share of what adds up
-        rest = P @ dx + P.T @ dx - own * dx + q + self._rows.T @ y
-        if not (np.abs(rest) <= weak + NEGLIGIBLE * own).all():
+        (rest,), (weak,), (allowed,) = self._stationary(values[None], q[None], dx[None])
+        value = self._rows @ dx
+        if not (np.abs(rest + self._rows.T @ y) <= allowed).all():
             return False
         kept = (value >= lower - CLOSE) & (value <= upper + CLOSE)
         pushed = ((y <= weak) | (value >= upper - CLOSE)) & ((y >= -weak) | (value <= lower + CLOSE))
         return bool(np.all(kept & pushed))
 
+    def _stationary(self, values: Floats, q: Floats, dx: Floats) -> tuple[Floats, Floats, Floats]:
+        """P dx + q (B, m), the share of what adds up in it that is weak (B, 1), and what it may be."""
+        own = values[:, self._pattern.indptr[1:] - 1]
+        rest = summed(values[:, self._entry] * dx[:, self._column], self._row, q.shape[1]) + q
+        weak = KKT * np.maximum(np.abs(q), np.abs(own * dx)).max(axis=1, keepdims=True)
+        return rest, weak, weak + NEGLIGIBLE * own
+
 
 @lru_cache(maxsize=64)
-def unbounded(indices: bytes, indptr: bytes, thread: int) -> Programme:
-    """The programme without bounds of a structure of P, its workspace set up once, its own for each thread."""
+def unbounded(layout: Layout, thread: int) -> Programme:
+    """The programme without bounds of a structure, its workspace set up once, its own for each thread."""
     from scipy.sparse import csc_matrix
 
-    row, start = np.frombuffer(indices, np.int64), np.frombuffer(indptr, np.int64)
-    size = len(start) - 1
-    identity = (row == np.repeat(np.arange(size), np.diff(start))).astype(np.float64)
-    programme = Programme(csc_matrix((identity, row, start), shape=(size, size)), csc_matrix((0, size)))
-    programme.solve(identity, np.zeros(size), np.empty(0), np.empty(0))
+    pattern, size = _pattern(layout), layout.entries.size
+    programme = Programme(pattern, csc_matrix((0, size)))
+    programme.update(pattern.data, np.zeros(size), np.empty(0), np.empty(0))
     return programme
 
 
@@ -232,8 +254,6 @@ class _Limits:
 def _limits(problem: Problem) -> _Limits:
     from scipy.sparse import csc_matrix
 
-    if not problem.constraints:
-        return _Limits(problem, None, np.empty(0), np.empty(0))
     rows = constraint_rows(problem, np.zeros((len(problem.names), problem.space.ambient)))
     return _Limits(problem, csc_matrix(rows.matrix), rows.lower, rows.upper)
 
@@ -262,5 +282,5 @@ BACKEND = Backend(
     prepare,
     "sequential quadratic programming, persistent workspace",
     "osqp",
-    Capabilities(constraints="linear"),
+    Capabilities(batched=True, constraints="linear"),
 )

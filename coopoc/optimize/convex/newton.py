@@ -86,6 +86,8 @@ class Reduced:
 
     def times(self, X: Floats) -> Floats:
         """C X."""
+        if self.problem.bound <= DENSE:
+            return np.asarray(self.matrix @ X)
         return np.asarray(self._rows[:, : self.problem.bound].T @ (self._rows @ self._all(X)))
 
     def settle(self, X: Floats) -> Floats:

@@ -15,6 +15,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 
 import numpy as np
+from scipy.sparse import csc_matrix
 from tqdm import tqdm
 
 from ...arrays import Floats
@@ -25,15 +26,18 @@ from ..model.problem import Problem
 from ..solution import Solution
 from ..solve import solve
 from .newton import DENSE, Reduced, Stationary, minimise
-from .qcqp import Multipliers, quadratic
+from .qcqp import Multipliers, multipliers, quadratic
 
 LARGEST = 60
 """Constrained rows up to which `shor` takes seconds at most; from some 30 rows on `staircase` is the faster one."""
 TIGHT = 1e-6
 """Gap of a tight relaxation, as a share of the cost (at least of 1)."""
-SOLVER = {"solver": "CLARABEL", "tol_gap_abs": 1e-10, "tol_gap_rel": 1e-10, "tol_feas": 1e-10, "max_threads": 1}
-POLISHED = 1e-13
-"""Decrease that the last step of a refinement may promise, as a share of the cost (at least of 1)."""
+SOLVER = {
+    **dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), 1e-9),
+    **dict.fromkeys(("verbose", "presolve_enable", "chordal_decomposition_enable"), False),
+    "max_threads": 1,
+}
+"""Settings of Clarabel."""
 START = 2
 """Columns beyond d at a random start: with none to spare the first steps end in local minima."""
 HEIGHT = 12
@@ -83,7 +87,7 @@ class Relaxation:
 
 
 def shor(problem: Problem, refine: bool = True) -> Relaxation:
-    """Shor's semidefinite relaxation by CVXPY and Clarabel, rounded and refined.
+    """Shor's semidefinite relaxation by Clarabel, rounded and refined.
 
     minimise 1/2 <C, Z> over Z >= 0 with Z_BB = I on Stiefel blocks, tr Z_BB = 1 on spheres. For scalar weights Z has
     d + m rows with m ranges, and the same value as with the d m + 1 rows of [1; vec s][1; vec s]^T. Tight (rank d) in
@@ -95,7 +99,7 @@ def shor(problem: Problem, refine: bool = True) -> Relaxation:
         refine: follow by `solve` from the rounded point.
 
     Raises:
-        InputError: as `quadratic`, or more than LARGEST constrained rows. MissingLibraryError: CVXPY.
+        InputError: as `quadratic`, or more than LARGEST constrained rows. MissingLibraryError: Clarabel.
 
     >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
     >>> relaxed = shor(problem.add("range", ("a", "b"), 6.0, std=1.0))
@@ -118,27 +122,38 @@ def shor(problem: Problem, refine: bool = True) -> Relaxation:
 def semidefinite(
     stiefel: tuple[int, int], sphere: tuple[int, int]
 ) -> Callable[[Floats], tuple[Floats, Floats, Floats]]:
-    """Solver of min 1/2 <C, Z> for blocks of these shapes, built once with C as a parameter.
+    """Solver of max 1/2 tr L over block-diagonal L with C - L >= 0, the dual of min 1/2 <C, Z>, built once per shape.
 
-    It takes C (bound, bound) and returns the multipliers of Stiefel blocks (n, k, k) and of spheres (m,), and Z.
+    Clarabel solves min q'x, A x + s = b, s in a cone; a new C is a new b. It takes C (bound, bound) and returns the
+    multipliers of Stiefel blocks (n, k, k) and of spheres (m,), and Z.
     """
-    if find_spec("cvxpy") is None:
-        raise MissingLibraryError("cvxpy", "a convex relaxation", "cvxpy")
-    cp = importlib.import_module("cvxpy")
+    if find_spec("clarabel") is None:
+        raise MissingLibraryError("clarabel", "a convex relaxation", "clarabel")
+    clarabel = importlib.import_module("clarabel")
     (n, k), (m, q) = stiefel, sphere
-    size = n * k + m * q
-    C, Z = cp.Parameter((size, size), symmetric=True), cp.Variable((size, size), PSD=True)
-    blocks = [Z[k * b : k * b + k, k * b : k * b + k] == np.eye(k) for b in range(n)]
-    units = [cp.sum(cp.reshape(cp.diag(Z)[n * k :], (m, q), order="C"), axis=1) == 1] if m else []
-    programme = cp.Problem(cp.Minimize(cp.sum(cp.multiply(C, Z))), [*blocks, *units])
+    size, pairs = n * k + m * q, k * (k + 1) // 2
+    (j, i), (high, low) = np.tril_indices(size), np.tril_indices(k)  # upper triangles, column by column
+    entry = np.zeros((size, size), dtype=np.int64)
+    entry[i, j] = np.arange(len(i))
+    first = k * np.arange(n)[:, None]
+    row = np.concatenate([entry[first + low, first + high].ravel(), entry.diagonal()[n * k :]])
+    column = np.concatenate([np.arange(n * pairs), n * pairs + np.repeat(np.arange(m), q)])
+    stretch = np.where(i == j, 1.0, np.sqrt(2.0))
+    A = csc_matrix((stretch[row], (row, column)), shape=(len(i), n * pairs + m))
+    goal = np.concatenate([np.tile((low == high).astype(float), n), np.ones(m)])
+    settings, cone = clarabel.DefaultSettings(), clarabel.PSDTriangleConeT(size)
+    for name, value in SOLVER.items():
+        setattr(settings, name, value)
+    solver = clarabel.DefaultSolver(csc_matrix((len(goal),) * 2), -goal, A, np.zeros(len(i)), [cone], settings)
 
-    def run(cost: Floats) -> tuple[Floats, Floats, Floats]:
-        scale = max(float(np.trace(cost)) / size, 1e-300)
-        C.value = 0.5 * (cost + cost.T) / scale
-        programme.solve(**SOLVER)
-        duals = np.array([block.dual_value for block in blocks]).reshape(n, k, k)
-        spheres = -scale * np.asarray(units[0].dual_value) if m else np.zeros(0)
-        return -scale * 0.5 * (duals + np.swapaxes(duals, 1, 2)), spheres, np.asarray(Z.value)
+    def run(C: Floats) -> tuple[Floats, Floats, Floats]:
+        scale = max(float(np.trace(C)) / size, 1e-300)
+        solver.update(b=stretch * C[i, j] / scale)
+        answer = solver.solve()
+        values, block, Z = scale * np.array(answer.x), np.zeros((n, k, k)), np.zeros((size, size))
+        Z[i, j] = Z[j, i] = np.array(answer.z) / stretch
+        block[:, low, high] = block[:, high, low] = values[: n * pairs].reshape(n, pairs)
+        return block, values[n * pairs :], Z
 
     return run
 
@@ -146,8 +161,7 @@ def semidefinite(
 def _rounded(problem: Problem, reduced: Reduced, Y: Floats, bound: float, began: float, refine: bool) -> Relaxation:
     """The relaxation Z = Y Y^T put back on the manifolds by the nearest of rank d, and what refining makes of it.
 
-    Gauss-Newton's steps creep in range-only problems: Newton's go first. The refined point's own bound is taken where
-    it is better; it never exceeds Shor's.
+    The refined point's own bound is taken where it is better; it never exceeds Shor's.
     """
     form, space = reduced.problem, problem.space
     _, values, rows = np.linalg.svd(Y, full_matrices=False)
@@ -156,10 +170,9 @@ def _rounded(problem: Problem, reduced: Reduced, Y: Floats, bound: float, began:
     top = np.pad(Y @ rows[:d].T, ((0, 0), (0, d - len(rows[:d]))))
     x, solution = space.join(*form.drop(reduced.settle(form.project(top)))), None
     if refine:
-        found = minimise(reduced, form.lift(space.position(x), space.rotation(x))[: form.bound], POLISHED)
-        near = space.join(*form.drop(reduced.settle(found.X)))
-        solution = solve(replace(problem, x0=near), throw=False)
-        bound = max(bound, reduced.lower_bound(found.multipliers)[0])
+        solution = solve(replace(problem, x0=x), throw=False)
+        X = form.lift(space.position(solution.x), space.rotation(solution.x))[: form.bound]
+        bound = max(bound, reduced.lower_bound(multipliers(form, X, reduced.times(X)))[0])
     return Relaxation(max(bound, 0.0), gap, x, problem.cost(x), solution, time.perf_counter() - began)
 
 

@@ -1,4 +1,4 @@
-"""The outer loop of a single problem: J^T J where its model is good, the exact Hessian where it misleads."""
+"""Levenberg-Marquardt of a single problem: J^T J where its model is good, the exact Hessian where it misleads."""
 
 from __future__ import annotations
 

@@ -66,9 +66,11 @@ def _evaluated(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[F
     (batch, n, _), (count, arity), size, dof = x.shape, factor.nodes.shape, factor.size, space.dof
     kind = Kind(factor.measurement, space, factor.std is None)
     rows = batch * count
-    numbers = numbers_of(factor)
-    numbers = np.broadcast_to(numbers, (batch, *numbers.shape[-2:])).swapaxes(0, 1).reshape(-1, rows)
-    nodes = (n * np.arange(batch)[:, None, None] + factor.nodes).reshape(-1, arity)
+    numbers, nodes = numbers_of(factor), factor.nodes
+    if batch > 1:
+        numbers = np.tile(numbers, batch) if numbers.ndim == 2 else numbers.swapaxes(0, 1)
+        nodes = (n * np.arange(batch)[:, None, None] + nodes).reshape(-1, arity)
+    numbers = numbers.reshape(-1, rows)
     total = np.zeros((1 + arity * dof) * size * rows)
     accumulate(write(kind, "jacobian").tape, x.reshape(batch * n, -1), nodes, numbers, _goal(kind, rows), total)
     end = size * rows

@@ -19,7 +19,7 @@ from .factor import Factor
 
 @runtime_checkable
 class Noise(Protocol):
-    """Protocol of a noise model; `coopoc.methods.NoiseModel` is one."""
+    """Protocol of a noise model; `coopoc.methods.noise_model.NoiseModel` is one."""
 
     @property
     def sensors(self) -> Sensors | None:
