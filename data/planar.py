@@ -45,7 +45,7 @@ def steps_of(t: Floats, dt: float, steps: int) -> tuple[Ints, Floats]:
     return np.where((step >= 0) & (step < steps), step, -1).astype(np.int64), np.abs(t - dt * step)
 
 
-def first_of_each(most: int, *keys: Ints) -> Bools:
+def first_of_each(most: int, *keys: Ints | Floats) -> Bools:
     """True for the first `most` of each run of rows with equal keys.
 
     >>> first_of_each(1, np.array([0, 0, 1])).tolist()
@@ -55,7 +55,7 @@ def first_of_each(most: int, *keys: Ints) -> Bools:
     return np.asarray(every - np.maximum.accumulate(np.where(_changes(*keys), every, 0)) < most)
 
 
-def _changes(*keys: Ints) -> Bools:
+def _changes(*keys: Ints | Floats) -> Bools:
     """True at the first of each run of equal rows."""
     rows = np.column_stack(keys)
     first: Bools = np.append(True, (np.diff(rows, axis=0) != 0).any(axis=1))[: len(rows)]

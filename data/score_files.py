@@ -77,6 +77,7 @@ def _of_table(file: File, columns: dict[str, str]) -> dict[str, Path]:
             else None
             for group in (("x", "y", "z"), QUATERNION, COVARIANCE)
         )
+        assert position is not None  # the reader requires x, y and z
         rotation = None if quaternion is None else to_rotation(quaternion)
         spread = None if covariance is None else covariance[:, SYMMETRIC]
         paths[str(name)] = Path(rows["t"].to_numpy(dtype=float), position, rotation, spread)

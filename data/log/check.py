@@ -291,10 +291,13 @@ def _of_truth(c: Check) -> list[str]:
     """A sentence where the fixes of a vehicle lie behind its truth along its way, by the same time at any speed, or
     beside it by more than their noise explains, as they do where the truth has another origin."""
     rec, truth, sentences = c.world, c.log.truth, []
-    for row in c.vehicles if truth is not None else ():
+    if truth is None:
+        return []
+    for row in c.vehicles:
         column = rec.ids.index(row["vehicle"])
-        gap = np.asarray(rec.gnss[0, :, column] - truth.position[:, column])[:, :2]
-        gap, velocity = (values[np.isfinite(gap[:, 0])] for values in (gap, rec.velocity[0, :, column, :2]))
+        every = np.asarray(rec.gnss[0, :, column] - truth.position[:, column])[:, :2]
+        both = np.isfinite(every[:, 0])
+        gap, velocity = every[both], rec.velocity[0, :, column, :2][both]
         if len(gap) >= ENOUGH and np.ptp(velocity, axis=0).any():
             line = linregress((velocity - velocity.mean(axis=0)).ravel(), (gap - np.median(gap, axis=0)).ravel())
             if abs(line.slope) >= max(SIGMAS * line.stderr, 0.5 * rec.dt):

@@ -174,7 +174,8 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     keys, first = np.unique(keys[order], axis=0, return_index=True)
     again = np.sort(np.delete(order, first))
     steps.summary.refuse_rows("relative measurements beside a nearer one of the same pair, kind and step", rows, again)
-    measured = Measured(*(part[order] for part in (value, component, step, lag, observer, partner)))
+    chosen = (step[order], lag[order], observer[order], partner[order])
+    measured = Measured(value[order], component[order], *chosen)
     return keys[:, :3], keys[:, 3], _to_step(measured, list(members.values()), steps)[first]
 
 
