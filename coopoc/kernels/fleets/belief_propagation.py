@@ -85,13 +85,13 @@ def pass_messages(count: int, edges: Edges, damping: float, messages: Gaussians,
         old, old_eta = load(messages.matrix, e, MATRIX), load(messages.vector, e, VECTOR)
         back, back_eta = load(messages.matrix, e + 1, MATRIX), load(messages.vector, e + 1, VECTOR)
         for m in (e, e + 1):
-            w, pull, sender = load(edges.information, m, MATRIX), load(edges.eta, m, VECTOR), edges.tail[m]
+            w, pair_eta, sender = load(edges.information, m, MATRIX), load(edges.eta, m, VECTOR), edges.tail[m]
             cavity = subtract(load(beliefs.matrix, sender, MATRIX), back)
             eta = subtract(load(beliefs.vector, sender, VECTOR), back_eta)
             gain = inverse(add(w, cavity))
             new = minus_product(w, minus_product(gain, cavity))
             new = scale(add(new, transpose(new)), 0.5 * (1.0 - damping))
-            new_eta = add(minus_apply(w, minus_apply(gain, subtract(eta, pull))), pull)
+            new_eta = add(minus_apply(w, minus_apply(gain, subtract(eta, pair_eta))), pair_eta)
             store(messages.matrix, m, add(scale(old, damping), new))
             store(messages.vector, m, add(scale(old_eta, damping), scale(new_eta, 1.0 - damping)))
             old, old_eta, back, back_eta = back, back_eta, old, old_eta

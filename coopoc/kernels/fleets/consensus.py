@@ -113,8 +113,8 @@ def solve(count: int, edges: Edges, rho: float, state: Consensus) -> None:
         holder = edges.tail[e]
         target = subtract(load(state.z, edges.head[e], VECTOR), load(state.dual, e, VECTOR))
         store(state.copy, e, target)
-        pull = subtract(apply(load(edges.information, e, MATRIX), target), load(edges.eta, e, VECTOR))
-        moved = apply(load(state.inner, e, MATRIX), pull)
+        pair_eta = subtract(apply(load(edges.information, e, MATRIX), target), load(edges.eta, e, VECTOR))
+        moved = apply(load(state.inner, e, MATRIX), pair_eta)
         store(state.own, holder, add(load(state.own, holder, VECTOR), moved))
     for n in range(len(state.holders)):
         store(state.own, n, scale(apply(load(state.outer, n, MATRIX), load(state.own, n, VECTOR)), rho))

@@ -223,8 +223,8 @@ def pair(vector: Vector, k: int, pairs: Pairs, relative: Floats, assumed: Assume
     for link, sign in ((pairs.link[k], 1.0), (pairs.link_back[k], -1.0)):
         if link >= 0:
             seen = load(relative[link], 0, (0.0, 0.0, 0.0, 0.0, 0.0))
-            weight, pull = measurement(scale(vector, sign), seen, assumed.std, assumed.min_range, converted)
-            information, eta = add(information, weight), add(eta, scale(pull, sign))
+            weight, pair_eta = measurement(scale(vector, sign), seen, assumed.std, assumed.min_range, converted)
+            information, eta = add(information, weight), add(eta, scale(pair_eta, sign))
     return information, eta
 
 

@@ -255,9 +255,9 @@ def linearise(x: Floats, factors: RunFactors, converted: bool) -> tuple[Floats, 
         for k in range(pairs.start[t], pairs.start[t + 1]):
             if pairs.alive[0, k]:
                 vector = subtract(load(x[t, pairs.second[k]], 0, VECTOR), load(x[t, pairs.first[k]], 0, VECTOR))
-                information, pull = pair(vector, k, pairs, factors.relative, factors.assumed, converted)
+                information, pair_eta = pair(vector, k, pairs, factors.relative, factors.assumed, converted)
                 store(weight, k, information)
-                store(eta[k], 0, pull)
+                store(eta[k], 0, pair_eta)
     return weight, eta
 
 
