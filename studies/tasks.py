@@ -24,7 +24,7 @@ from coopoc.world.spoofing import Spoofing, spoofed
 
 from . import pose_drives
 
-VERSION = "2"
+VERSION = "1"
 """Another set of tasks, seeds, egos or scores is another version."""
 
 
