@@ -173,7 +173,7 @@ def test_spoofed_neighbours_are_unmasked(formation: Fleet) -> None:
     attacked = spoofed(clean, 0.2, honest=[0])
     plain, robust = CooperativeMAP(window=5), CooperativeMAP(window=5, robust="truncated")
     at_best = rt_le(plain(clean, [0]), fleet).mean()
-    assert rt_le(plain(attacked, [0]), fleet).mean() > 5 * at_best
+    assert rt_le(plain(attacked, [0]), fleet).mean() > 3 * at_best
     assert rt_le(robust(attacked, [0]), fleet).mean() < 1.3 * at_best
     assert rt_le(robust(clean, [0]), fleet).mean() < 1.05 * at_best
     trusting = replace(robust, threshold=1 - 1e-12)(clean, [0])
