@@ -65,9 +65,8 @@ def _figure(results: Results) -> Plot | None:
     if present(results, {}) is None or results.frame["max_neighbours"].nunique() < 2:
         return None
     text = "RT-LE against the number of neighbours; bands: 95 % intervals over egos, then runs."
-    facet = "noise_model" if results.frame["noise_model"].nunique() > 1 else ""
     caption = scene.caption(results, text, _changed(results)).replace("  ", " ")
-    return figures.sweep(results, x="max_neighbours", log=True, caption=caption, facet=facet)
+    return figures.sweep(results, x="max_neighbours", log=True, caption=caption)
 
 
 def _findings(results: Results) -> dict[str, str]:
