@@ -15,7 +15,6 @@ from coopoc.study.compare import Comparison, compare, unpaired
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
 from coopoc.study.study import Params, Row, Study
-from coopoc.study.tables import FORMATS
 
 GRID = {"method": ("kf", "net"), "k": (0, 4)}
 SETTINGS = {"runs": 40, "seed": 0, "shift": 0.0, "spread": 0.0, "fails": "", "own": "–"}
@@ -93,8 +92,7 @@ def test_the_unpaired_interval_is_that_of_welch_for_one_ego() -> None:
     assert ours.high == pytest.approx(welch.high, abs=0.02)
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(1, marks=pytest.mark.slow)])
-def test_noise_alone_is_seldom_called_a_change(tmp_path: Path, seed: int) -> None:
+def test_noise_alone_is_seldom_called_a_change(tmp_path: Path) -> None:
     """100 groups of the same mean, 94 % intervals: 17 or more would be marked once in 10,000 times."""
 
     def noise(p: Params) -> list[Row]:
@@ -103,7 +101,7 @@ def test_noise_alone_is_seldom_called_a_change(tmp_path: Path, seed: int) -> Non
 
     study = Study("noise", "?", noise, {"k": tuple(range(100))}, {"seed": 0, "stream": 0})
     run_study(study, tmp_path / "a", progress=False)
-    run_study(study, tmp_path / "b", settings={"seed": seed, "stream": 1}, progress=False)
+    run_study(study, tmp_path / "b", settings={"stream": 1}, progress=False)
     found = compare(tmp_path / "a/noise", tmp_path / "b/noise")
     assert 0 < changes(found)["Change"].isin(["higher", "lower"]).sum() < 17
     assert "by chance alone about 5.0 would" in found.changes.notes[0]
@@ -148,13 +146,6 @@ def test_a_value_that_is_not_finite_leaves_its_ego_out(tmp_path: Path) -> None:
     assert "2 egos are left out" in found.changes.notes[-1]
     assert changes(found)["B - A"][1].mean == pytest.approx(0.5)
     assert set(changes(compare(a, b, "nees"))["Change"]) == {"no finite value"}
-
-
-@pytest.mark.parametrize("form", FORMATS)
-def test_every_format_holds_every_part(ran: Callable[..., Path], form: str) -> None:
-    text = compare(ran("a", fails="kf4"), ran("b", shift=0.3)).render(form)
-    for part in ("shift", "higher"):
-        assert part in text
 
 
 def test_what_cannot_be_compared_is_named(ran: Callable[..., Path], tmp_path: Path) -> None:
