@@ -23,7 +23,11 @@ CONDITIONS: dict[str, Any] = {
     "loss": None,
     "burst": None,
     "latency_s": None,
+    "outliers": "",
     "spoofed_share": 0.0,
+    "spoofed_from_s": 0.0,
+    "spoofed_ramp_s": 0.0,
+    "spoofed_collude": False,
     "own_share": 0.0,
     "common_share": 0.0,
     "drift_time_s": 60.0,
@@ -31,7 +35,8 @@ CONDITIONS: dict[str, Any] = {
     "heading_bias_deg": 0.0,
     "start": "gnss",
 }
-"""Other conditions: the channel (None: its own), spoofing, time-correlated errors, errors of the heading, the start."""
+"""Other conditions: the channel (None: its own), outliers (as `Outliers.named` has them), spoofing, time-correlated
+errors, errors of the heading, the start."""
 
 
 def _changed(results: Results) -> str:
