@@ -157,7 +157,7 @@ def cdf(net: Sequence[float], runs: int = 4, **at: object) -> Results:
     ],
 )
 def test_a_verdict_needs_runs_and_training_seeds(net: tuple[float, ...], runs: int, words: str) -> None:
-    found = error_cdf.STUDY.found(cdf(net, runs))
+    found = error_cdf.STUDY.answers(cdf(net, runs))
     assert list(found) == ["scenario 1"]
     assert words in found["scenario 1"]
 
@@ -165,7 +165,7 @@ def test_a_verdict_needs_runs_and_training_seeds(net: tuple[float, ...], runs: i
 def test_nothing_is_claimed_where_the_interval_is_not_finite() -> None:
     results = cdf((0.1, 0.1))
     one = replace(results, frame=results.frame[(results.frame["ego"] == 0) & (results.frame["run"] == 0)])
-    found = error_cdf.STUDY.found(one)
+    found = error_cdf.STUDY.answers(one)
     assert "cannot be judged against the fitted KF: too few seeds, egos or runs" in found["scenario 1"]
 
 

@@ -131,7 +131,7 @@ class Track:
         2
         """
         from ..escapes import picture
-        from ..pictures import COLORS, PALE, axes, ellipses, finish
+        from ..world.pictures import COLORS, PALE, axes, ellipses, finish
 
         run = number("run", run, 0, len(self.x) - 1, kind=int, allowed=f"in 0..{len(self.x) - 1}")
         fair = max(len(self.t) // 40, 1)
