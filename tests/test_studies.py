@@ -156,7 +156,7 @@ def cdf(net: Sequence[float], runs: int = 4, **at: object) -> Results:
     ],
 )
 def test_a_verdict_needs_runs_and_training_seeds(net: tuple[float, ...], runs: int, words: str) -> None:
-    found = error_cdf.STUDY.found(cdf(net, runs))
+    found = error_cdf.STUDY.answers(cdf(net, runs))
     assert list(found) == ["scenario 1"]
     assert words in found["scenario 1"]
 
