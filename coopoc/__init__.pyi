@@ -21,6 +21,7 @@ from .methods.baselines import LKFSA as LKFSA
 from .methods.baselines import MSMV as MSMV
 from .methods.centralised import BatchSmoother as BatchSmoother
 from .methods.centralised import CentralFilter as CentralFilter
+from .methods.cooperative_filter import CooperativeFilter as CooperativeFilter
 from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
 from .methods.decentralised import ConsensusADMM as ConsensusADMM
 from .methods.decentralised import GaussianBeliefPropagation as GaussianBeliefPropagation
@@ -59,6 +60,8 @@ from .study.study import Study as Study
 from .world.body_frames import in_world as in_world
 from .world.fleet import Fleet as Fleet
 from .world.links import Links as Links
+from .world.outliers import Fault as Fault
+from .world.outliers import Outliers as Outliers
 from .world.recording import Body as Body
 from .world.recording import Recording as Recording
 from .world.sensing import observe as observe

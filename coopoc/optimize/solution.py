@@ -113,7 +113,7 @@ class Solution:
         'North [m]'
         """
         from ..escapes import picture
-        from ..pictures import COLORS, INK, axes, ellipses, finish, pairs
+        from ..world.pictures import COLORS, INK, axes, ellipses, finish, pairs
         from .model.problem import Problem
 
         ax, at, few = axes(ax), self.position[:, :2], len(self.names) <= NAMED

@@ -274,7 +274,7 @@ class Recording:
         'East [m]'
         """
         from ..escapes import picture
-        from ..pictures import COLORS, INK, axes, finish, pairs
+        from .pictures import COLORS, INK, axes, finish, pairs
 
         run, last = number("run", run, 0, self.runs - 1, kind=int, allowed=f"in 0..{self.runs - 1}"), len(self.t) - 1
         step = number("step", last // 2 if step is None else step, 0, last, kind=int, allowed=f"in 0..{last}")
