@@ -41,6 +41,7 @@ from .methods.sliding_window import FixedLagSmoother as FixedLagSmoother
 from .methods.sliding_window import MovingHorizon as MovingHorizon
 from .methods.star import stars as stars
 from .methods.star_stream import RelativeMeasurement as RelativeMeasurement
+from .methods.star_stream import StarStream as StarStream
 from .methods.track import Method as Method
 from .methods.track import Track as Track
 from .optimize.backend import Backend as Backend
@@ -53,10 +54,14 @@ from .optimize.model.problem import Problem as Problem
 from .optimize.model.space import pose as pose
 from .optimize.solution import Solution as Solution
 from .optimize.solve import solve as solve
+from .pictures import plot_recording as plot_recording
+from .pictures import plot_solution as plot_solution
+from .pictures import plot_track as plot_track
 from .study.results import Results as Results
 from .study.run import run_study as run_study
 from .study.study import Study as Study
 from .world.body_frames import in_world as in_world
+from .world.channels import channel_load as channel_load
 from .world.fleet import Fleet as Fleet
 from .world.links import Links as Links
 from .world.recording import Body as Body
@@ -65,7 +70,6 @@ from .world.sensing import observe as observe
 from .world.sensors import Sensors as Sensors
 from .world.v2x import V2X as V2X
 from .world.v2x import Message as Message
-from .world.v2x import channel_load as channel_load
 
 __version__: str
 __all__: list[str]

@@ -9,10 +9,14 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Floats
-from .compiling.compile import compiled, inside
+from .compiling.compile import compiled, inside, part
 
 ROUNDING = 1e-9
 """s, by how much sums of time steps may miss a time."""
+ESTIMATE, NO_FIX_YET, BAD_INPUT = 0, 1, 2
+"""What a step of a stream returns."""
+VELOCITY, DT, FIX_AGE = slice(3, 6), 6, 7
+"""Where the input of a stream's step stands in its array, behind the fix."""
 
 
 class MotionNoise(NamedTuple):
@@ -93,3 +97,32 @@ def since(history: Floats, age: float, moved: Floats, variance: Floats) -> None:
             moved[c] += share * history[row, 1 + c]
             variance[c] += share * history[row, 4 + c]
         left -= history[row, 0]
+
+
+@part
+def dead_reckon(
+    given: Floats, history: Floats, motion: MotionNoise, moved: Floats, q: Floats, since_fix: Floats, late: Floats
+) -> int:
+    """Add a step to the history: its motion and the variance of that; what a fix of some age has missed since.
+
+    Nothing is changed where the input is bad. NO_FIX_YET: there is no fix.
+    """
+    dt, age, missing = given[DT], given[FIX_AGE], 0
+    for c in range(3):
+        missing += math.isnan(given[c])
+        if math.isinf(given[c]) or not math.isfinite(given[3 + c]):
+            return BAD_INPUT
+    if not (dt > 0.0 and math.isfinite(dt)) or missing % 3 != 0:
+        return BAD_INPUT
+    variance = process_variance(motion, given[VELOCITY], dt)
+    for c in range(3):
+        q[c], moved[c] = variance[c], dt * given[3 + c]
+    first, count, seen = history[0, 0], history[0, 1], history[0, 2]
+    push(history, dt, moved[:3], q)
+    if missing > 0:
+        return NO_FIX_YET
+    if not -ROUNDING <= age <= history[0, 2] + ROUNDING:
+        history[0, 0], history[0, 1], history[0, 2] = first, count, seen
+        return BAD_INPUT
+    since(history, age, since_fix, late)
+    return ESTIMATE

@@ -16,8 +16,7 @@ from ...short_repr import short_repr
 from ...world.recording import Recording, check_recording
 from ...world.sensors import Sensors
 from ...world.v2x import Message
-from ..options import check_options
-from ..track import Track
+from ..track import Track, check_options
 from ..whole_fleet import CENTRE, centre
 from .pose_factors import PLANE, PoseRun, node, pose_subgraph
 from .pose_inputs import SPREAD, UPLOAD, check_spread, first_poses, fleet_members, pose_egos
