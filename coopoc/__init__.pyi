@@ -54,9 +54,9 @@ from .optimize.model.problem import Problem as Problem
 from .optimize.model.space import pose as pose
 from .optimize.solution import Solution as Solution
 from .optimize.solve import solve as solve
-from .pictures import plot_recording as plot_recording
-from .pictures import plot_solution as plot_solution
-from .pictures import plot_track as plot_track
+from .plots import plot_recording as plot_recording
+from .plots import plot_solution as plot_solution
+from .plots import plot_track as plot_track
 from .study.results import Results as Results
 from .study.run import run_study as run_study
 from .study.study import Study as Study
@@ -64,6 +64,8 @@ from .world.body_frames import in_world as in_world
 from .world.channels import channel_load as channel_load
 from .world.fleet import Fleet as Fleet
 from .world.links import Links as Links
+from .world.outliers import Fault as Fault
+from .world.outliers import Outliers as Outliers
 from .world.recording import Body as Body
 from .world.recording import Recording as Recording
 from .world.sensing import observe as observe

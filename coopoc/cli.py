@@ -129,11 +129,11 @@ def compare(
         value: metric to compare.
         by: columns that identify a row in addition to the parameters, such as round.
         where: compare only the rows with these values.
-        format: format of the tables.
+        format: format of the table.
     """
     from .study.compare import compare as compare_runs
 
-    print(compare_runs(run_a, run_b, value, by, where).render(format))
+    print(compare_runs(run_a, run_b, value, by, where).render(format).rstrip("\n"))
 
 
 def table(

@@ -85,7 +85,7 @@ def _figure(results: Results) -> Plot | None:
         "schedule; lines: the best for the bytes. Horizontal: methods that receive nothing, and the bound of most "
         "neighbours at every step with what newcomers did before: no message brings more, whatever its bytes."
     )
-    return figures.pareto(results, PAYLOAD, where=where, caption=scene.caption(results, text))
+    return figures.pareto(results, scene.caption(results, text), PAYLOAD, where=where)
 
 
 class Choice(NamedTuple):

@@ -13,7 +13,7 @@ from coopoc.arrays import Floats
 from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
-from coopoc.study.numbers import interval, mean, present, seed_std, verdict
+from coopoc.study.numbers import interval, mean, present, seed_std
 from coopoc.study.study import Params, Row
 from coopoc.study.style import Panel
 from coopoc.world.fleet import Fleet
@@ -21,7 +21,7 @@ from coopoc.world.recording import Recording
 
 from . import lineup, scene
 from .lineup import PAST
-from .views import curves, of, table
+from .views import curves, of, table, verdict
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results

@@ -80,7 +80,7 @@ def _pareto(results: Results) -> Plot | None:
     if where is None or not (results.select(where)["bytes_per_second"] > 0).any():
         return None
     text = "RT-LE against the payload that an ego receives, at each K, rate and cap; lines: the best for the bytes."
-    return figures.pareto(results, where=where, caption=scene.caption(results, text, BOUND_NOTE))
+    return figures.pareto(results, scene.caption(results, text, BOUND_NOTE), where=where)
 
 
 def findings(results: Results) -> dict[str, str]:

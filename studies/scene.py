@@ -21,10 +21,11 @@ from coopoc.study.provenance import revision
 from coopoc.study.study import Params
 from coopoc.world.channels import channel as channel_of
 from coopoc.world.fleet import Fleet
+from coopoc.world.outliers import Outliers
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
-from coopoc.world.spoofing import spoofed
+from coopoc.world.spoofing import Spoofing, spoofed
 from coopoc.world.storage import digest
 from coopoc.world.v2x import V2X
 
@@ -141,6 +142,7 @@ def sensors(p: Params) -> Sensors:
         gnss_drift_time=float(p.get("drift_time_s", found.gnss_drift_time)),
         heading_std=np.deg2rad(float(p.get("heading_std_deg", 0.0))),
         heading_bias_std=np.deg2rad(float(p.get("heading_bias_deg", 0.0))),
+        outliers=Outliers.named(str(p.get("outliers", ""))),
     )
 
 
@@ -188,9 +190,10 @@ def heading(p: Params) -> str:
     low, high = noise.gnss_bias
     bias = f", bias U[{low:g}, {high:g}] m per run and axis" if high else ""
     near = f", {relative(noise)}, radius {p['radius_m']:g} m" if "radius_m" in p else ""
+    wrong = "".join(f", {note}" for note in noise.outliers.notes)
     return (
         f"Scenario {p['scenario']}: GNSS {noise.fix_std[0]:.3g} m per axis{bias}, velocity "
-        f"{100 * noise.velocity_std_ratio:g} % (per {p['velocity_reading']}){near}, {begin}"
+        f"{100 * noise.velocity_std_ratio:g} % (per {p['velocity_reading']}){near}{wrong}, {begin}"
     )
 
 
@@ -260,7 +263,7 @@ def facts(p: Params) -> Mapping[str, str]:
     Raises:
         InputError: parameters that no cell can be computed with.
     """
-    sensors(p), channel(p), start(p), egos(p["data"], str(p["egos"]))
+    sensors(p), attacking(p), channel(p), start(p), egos(p["data"], str(p["egos"]))
     if int(p.get("runs", 1)) < 1:
         raise InputError("runs", p["runs"], "must be >= 1", "Give the number of noise draws.")
     return {"code": revision(*CODE), **_digests(p["data"])}
@@ -278,8 +281,15 @@ def recording(p: Params) -> Recording:
     who = egos(p["data"], str(p["egos"]))
     observers = None if needs_whole_fleet(str(p.get("method"))) else who
     seen = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers)
-    share = float(p.get("spoofed_share", 0.0))
-    return spoofed(seen, share, seed=int(p["seed"]), honest=who) if share else seen
+    attack = attacking(p)
+    return spoofed(seen, attack, seed=int(p["seed"]), honest=who) if attack.share else seen
+
+
+def attacking(p: Params) -> Spoofing:
+    """The attack of the cell; a share of 0 is none."""
+    start, ramp = (float(p.get(name, 0.0)) for name in ("spoofed_from_s", "spoofed_ramp_s"))
+    collude = bool(p.get("spoofed_collude", False))
+    return Spoofing(float(p.get("spoofed_share", 0.0)), start=start, ramp=ramp, collude=collude)
 
 
 def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:

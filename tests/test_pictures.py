@@ -22,7 +22,6 @@ import coopoc as co
 from coopoc.data.log.check import check
 from coopoc.data.log.picture import draw
 from coopoc.data.log.read import read_log
-from coopoc.pictures import ellipses
 from coopoc.study.plot import legend
 from coopoc.study.publish import views
 from coopoc.study.report import report
@@ -30,6 +29,7 @@ from coopoc.study.results import Results
 from coopoc.study.run import run_study
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.tables import Table
+from coopoc.world.pictures import ellipses
 
 
 @pytest.fixture(scope="module")

@@ -1,4 +1,4 @@
-"""Studies of conditions on few cells: channel, spoofing, GNSS errors, consistency, places, cooperative gain, bounds."""
+"""Studies of conditions on few cells: channel, spoofing, GNSS errors, consistency, cooperative gain, bounds."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from coopoc.evaluate.bounds import past_bound, posterior_bound
 from coopoc.learned.checkpoint import Checkpoint, save
 from coopoc.learned.nets.noise_net import NoiseNet
 from coopoc.learned.recipes import Setting, jobs_of
-from coopoc.studies import cooperative_gain, correlated_gnss, generalisation, latency_loss, robustness, scene
+from coopoc.studies import cooperative_gain, correlated_gnss, latency_loss, robustness, scene
 from coopoc.studies.cooperative_gain import STUDY
 from coopoc.study import numbers
 from coopoc.study.publish import views as published
@@ -153,21 +153,6 @@ def test_a_consistent_filter_is_told_from_one_that_is_not(tmp_path: Path, short_
     assert good > 0.9 > 0.1 > bad
     rows = [[cell.strip() for cell in line.split("|")[1:3]] for line in table.splitlines()]
     assert rows.index(["Joint filter", "nominal"]) < rows.index(["LKF-SA", "identity"])  # the most credible first
-
-
-@pytest.mark.slow
-def test_generalisation_is_relative_to_the_oracle_of_each_place(tmp_path: Path) -> None:
-    wanted = {"runs": 2, "egos": "2", "method": "kalman,kalman-adaptive", "data": "town10,town04", "scenario": "2"}
-    results = run_study("generalisation", tmp_path, settings=wanted, progress=False)
-    for fleet in ("town10", "town04"):
-        where = {**generalisation.at(fleet, "scenario 2"), "method": "kalman"}
-        oracle, fitted = (
-            generalisation.multiple(results, {**where, "noise_model": known}) for known in ("oracle", "fitted")
-        )
-        assert oracle == 1.0
-        assert fitted is not None
-        assert fitted > 1.05
-    assert "Adaptive KF" in (tmp_path / "generalisation" / "tables" / "multiples.md").read_text()
 
 
 @pytest.fixture(scope="module")

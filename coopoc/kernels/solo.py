@@ -14,7 +14,8 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
-from .motion import BAD_INPUT, ESTIMATE, NO_FIX_YET, MotionNoise, dead_reckon, process_variance
+from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
+from .motion import MotionNoise, process_variance
 
 LEAST = 1e-4
 """m^2, least variance of a fix: 1 cm."""

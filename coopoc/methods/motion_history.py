@@ -11,7 +11,7 @@ import numpy.typing as npt
 
 from ..arrays import Floats, number, plain
 from ..errors import InputError, shown
-from ..kernels.motion import ROUNDING, push, since
+from ..kernels.dead_reckoning import ROUNDING, push, since
 
 
 class MotionHistory:

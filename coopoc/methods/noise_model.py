@@ -68,7 +68,7 @@ class NoiseModel:
     def nominal(cls, sensors: Sensors) -> NoiseModel:
         """The standard deviations of `sensors`, process noise from the measured velocity; all of the error of a fix or
         an azimuth as if it were white and its own."""
-        sensors = instance("sensors", sensors, Sensors).check_assumed().without_bias()
+        sensors = instance("sensors", sensors, Sensors).check_assumed().known()
         sensors = replace(sensors, azimuth_std=sensors.world_azimuth_std, heading_std=0.0, heading_bias_std=0.0)
         return cls("nominal", sensors, gnss_std=sensors.fix_std)
 

@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from ..arrays import Floats, Ints, instance
 from ..errors import InputError
-from ..kernels.motion import ESTIMATE, NO_FIX_YET, NO_MOTION_NOISE
+from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
+from ..kernels.motion import NO_MOTION_NOISE
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions
 from ..kernels.stars.star_stream import (
     FIX,

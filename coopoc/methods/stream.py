@@ -11,7 +11,8 @@ import numpy.typing as npt
 
 from ..arrays import Floats
 from ..errors import InputError
-from ..kernels.motion import ESTIMATE, NO_FIX_YET, MotionNoise
+from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
+from ..kernels.motion import MotionNoise
 from ..kernels.solo import FixNoise, packed, stream_step
 from ..world.recording import Recording, check_recording
 from .motion_history import MotionHistory, three

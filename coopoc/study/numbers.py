@@ -151,35 +151,3 @@ def seed_std(results: Results, where: Where) -> float | None:
     """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
     each = per_seed(results, where)
     return float(over_seeds(each).means.std(ddof=1)) if len(each) > 1 else None
-
-
-def verdict(results: Results, one: Where, other: Where, name: str) -> str:
-    """Sentence on the RT-LE of `one`, which is trained, against `other`, which is not, with the evidence.
-
-    Args:
-        results: of the study.
-        one: selection of one method.
-        other: selection of another method, over the same egos and runs.
-        name: of the other, for the sentence.
-    """
-    base, each = results.values("rt_le_m", other), per_seed(results, one)
-    gaps = [paired_difference(each.mean(axis=0), base)]
-    text = f"paired difference {gaps[0].mean:+.3f} m; 95 % {_ends(gaps[0])} over egos and runs, "
-    if len(each) > 1:
-        gaps.append(over_seeds(each - base).interval)
-        text += f"{_ends(gaps[1])} over {len(each)} training seeds"
-    else:
-        text += "of one training seed, whose spread is unknown"
-    if not all(np.isfinite([gap.low, gap.high]).all() for gap in gaps):
-        claim = f"cannot be judged against {name}: too few seeds, egos or runs"
-    elif all(gap.high < 0 for gap in gaps):
-        claim = f"beats {name}"
-    elif all(gap.low > 0 for gap in gaps):
-        claim = f"is worse than {name}"
-    else:
-        claim = f"cannot be distinguished from {name}"
-    return f"{claim} ({text})"
-
-
-def _ends(gap: Interval) -> str:
-    return f"[{gap.low:+.3f}, {gap.high:+.3f}]"

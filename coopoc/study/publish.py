@@ -124,8 +124,8 @@ def _reference(study: Study, results: Results) -> dict[str, str]:
     known = reference.Reference.load(study.reference)
     if reference.differing(results, known):
         return {}
-    found = reference.check(results, known)
-    return {"reference": f"{reference.summary(found)[:-1]} (coopoc reference)."} if found else {}
+    changes = reference.check(results, known)
+    return {"reference": f"{reference.table(changes).caption[:-1]} (coopoc reference)."} if changes else {}
 
 
 def _data(value: Any) -> Any:

@@ -263,7 +263,7 @@ def checkpoint(rows: Sequence[Row], job: Job, seconds: float) -> Checkpoint:
     card: dict[str, Any] = {
         "recipe": job.name,
         "settings": asdict(job.recipe) | asdict(job.setting),
-        "noise": asdict(sensors(job.setting)),
+        "noise": asdict(sensors(job)),
         "client": None,
         "clients": list(made.names),
         "training_pieces": list(made.sizes),

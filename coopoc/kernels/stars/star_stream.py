@@ -15,7 +15,8 @@ from ...arrays import Floats, Ints
 from ..compiling.compile import as_written, inner, inside, storage
 from ..compiling.small import store
 from ..compiling.vectors import LANES
-from ..motion import ESTIMATE, NO_FIX_YET, ROUNDING, MotionNoise, dead_reckon, process_variance
+from ..dead_reckoning import ESTIMATE, NO_FIX_YET, ROUNDING, dead_reckon
+from ..motion import MotionNoise, process_variance
 from .joint import Joint, joint_in, joint_rows, new_joint
 from .joint_filter import step
 from .messages import (
