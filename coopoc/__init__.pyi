@@ -31,7 +31,6 @@ from .methods.kalman import Kalman as Kalman
 from .methods.mds import MDS as MDS
 from .methods.noise_model import NoiseModel as NoiseModel
 from .methods.poses.pose_filter import PoseFilter as PoseFilter
-from .methods.poses.pose_smoother import PoseSmoother as PoseSmoother
 from .methods.poses.pose_start import pose_start as pose_start
 from .methods.poses.pose_stream import LandmarkMeasurement as LandmarkMeasurement
 from .methods.poses.pose_stream import OwnMeasurement as OwnMeasurement
