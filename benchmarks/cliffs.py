@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
-from tabulate import tabulate
-from timing import medians, timed
+from timing import medians, report, timed
 
 import coopoc as co
 from coopoc.learned import CooperativeGain, NoiseNet
@@ -151,11 +150,5 @@ def measured(rounds: int = ROUNDS) -> list[dict[str, Any]]:
     ]
 
 
-def main() -> None:
-    """Print the table."""
-    lines = [[row["name"], row["us"], row["ratio"], "yes" if row["right"] else "NO"] for row in measured()]
-    print(tabulate(lines, ["", "us", "x plain", "right"], tablefmt="github", floatfmt=("", ".4g", ".3g", "")))
-
-
 if __name__ == "__main__":
-    main()
+    print(report(measured()))

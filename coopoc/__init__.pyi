@@ -21,6 +21,7 @@ from .methods.baselines import LKFSA as LKFSA
 from .methods.baselines import MSMV as MSMV
 from .methods.centralised import BatchSmoother as BatchSmoother
 from .methods.centralised import CentralFilter as CentralFilter
+from .methods.cooperative_filter import CooperativeFilter as CooperativeFilter
 from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
 from .methods.decentralised import ConsensusADMM as ConsensusADMM
 from .methods.decentralised import GaussianBeliefPropagation as GaussianBeliefPropagation

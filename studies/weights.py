@@ -84,8 +84,8 @@ def _job(name: str, p: Params, seed: int) -> tuple[str, str]:
     if not is_trained(name) or not trainable({**p, "method": name}):
         raise unknown("trained method", name, LEARNED)
     digest = file_digest(name) if in_file(name) else ""
-    found = _jobs(_recipe(name), digest, p["clients"], Setting(seed, start(p), p["velocity_reading"]))
-    return found[INDIVIDUAL.index(name) if name in INDIVIDUAL else 0]
+    jobs = _jobs(_recipe(name), digest, p["clients"], Setting(seed, start(p), p["velocity_reading"]))
+    return jobs[INDIVIDUAL.index(name) if name in INDIVIDUAL else 0]
 
 
 @lru_cache
@@ -122,10 +122,10 @@ def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
 def _checkpoint(path: Path, key: str, net: str) -> Checkpoint:
     from coopoc.learned.checkpoint import load
 
-    found = load(path, net)
-    if found.card.get("key") != key:
+    checkpoint = load(path, net)
+    if checkpoint.card.get("key") != key:
         raise InputError("weights", path, "were trained otherwise", "Train again, or use another folder.")
-    return found
+    return checkpoint
 
 
 def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:

@@ -53,24 +53,16 @@ def play(stream: Any, recording: Recording, ego: int, run: int, first: int = 0) 
     return np.stack([x for x, _ in found]), np.stack([cov for _, cov in found])
 
 
+@pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("name", SOLO)
-def test_step_by_step_is_the_track(name: str, crossing: Fleet) -> None:
+def test_step_by_step_is_the_track(name: str, known: bool, crossing: Fleet) -> None:
+    """From the first fix, and from a known start, whose own step is no step of the stream."""
     method, start = SOLO[name]
-    recording = observe(crossing, S2, V2X(max_neighbours=0), runs=2)
-    track = method(recording, [3])
-    x, cov = play(start(), recording, 3, run=1)
-    np.testing.assert_allclose(x, track.x[1, :, 0], atol=1e-12)
-    np.testing.assert_allclose(cov, track.covariance[1, :, 0], atol=1e-12)
-
-
-@pytest.mark.parametrize("name", SOLO)
-def test_a_known_start_is_the_track_from_there(name: str, crossing: Fleet) -> None:
-    method, start = SOLO[name]
-    recording, x0 = observe(crossing, S2, V2X(max_neighbours=0)), crossing.position[0, 3]
-    track = replace(method, x0=x0[None])(recording, [3])
-    x, cov = play(start(x0), recording, 3, run=0, first=1)
-    np.testing.assert_allclose(x, track.x[0, 1:, 0], atol=1e-12)
-    np.testing.assert_allclose(cov, track.covariance[0, 1:, 0], atol=1e-12)
+    recording, x0 = observe(crossing, S2, V2X(max_neighbours=0), runs=2), crossing.position[0, 3]
+    track = (replace(method, x0=x0[None]) if known else method)(recording, [3])
+    x, cov = play(start(x0) if known else start(), recording, 3, run=1, first=int(known))
+    np.testing.assert_allclose(x, track.x[1, known:, 0], atol=1e-12)
+    np.testing.assert_allclose(cov, track.covariance[1, known:, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize("known", [False, True])

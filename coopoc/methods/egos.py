@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -23,13 +24,15 @@ BEYOND = 10.0
 
 class Estimate(NamedTuple):
     """One ego at one step: position (R, 3) m, covariance (R or 1, 3, 3) m^2, its links there, and its neighbours
-    (R, k, 3) m, NaN where it does not estimate them. At several steps, a slice: (R, steps, 3), (R, steps, 3, 3)."""
+    (R, k, 3) m, NaN where it does not estimate them. At several steps, a slice: (R, steps, 3), (R, steps, 3, 3).
+    Extras at all steps by name: (R, T, 1), or by link (R, k)."""
 
     step: int | slice
     x: Floats
     covariance: Floats
     links: Ints
     neighbours: Floats
+    extras: Mapping[str, Floats] = MappingProxyType({})
 
 
 def follow_egos(
@@ -58,6 +61,7 @@ def follow_egos(
     ends = np.cumsum([0, *(len(recording.links.of(ego)) for ego in columns)])
     neighbours = np.full((recording.runs, ends[-1], 3), np.nan)
     received, sent = np.zeros((2, recording.runs, len(columns)))
+    extras: dict[str, list[Floats]] = {}
     with tqdm(total=len(columns) * len(recording.t), desc=method.name, unit="step", delay=2.0) as bar:
         for e, ego in enumerate(columns):
             box = inbox(recording, ego, method.message)
@@ -66,12 +70,15 @@ def follow_egos(
                 x[:, found.step, e], cov[:, found.step, e] = found.x, found.covariance
                 here = slice(None) if len(found.links) == len(box.link) else np.searchsorted(box.link, found.links)
                 neighbours[:, ends[e] : ends[e + 1]][:, here] = found.neighbours
+                for name, values in found.extras.items():
+                    extras.setdefault(name, []).append(values)
                 bar.update(1 if isinstance(found.step, int) else len(recording.t[found.step]))
     notes = (*notes, *contradicted(x, recording, columns))
     for array in (x, cov, neighbours):
         array.flags.writeable = False  # so that the Track need not copy them
     seconds = time.perf_counter() - began
-    return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, notes)
+    whole = {name: np.concatenate(values, axis=-1) for name, values in extras.items()}
+    return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, notes, extras=whole)
 
 
 def contradicted(x: Floats, recording: Recording, columns: Sequence[int]) -> tuple[str, ...]:

@@ -41,7 +41,8 @@ class Track:
         notes: labels for tables and figures, such as "reconstruction".
         heading: (R, T, E) rad in [-pi, pi), or None of a method that does not estimate it.
         heading_covariance: (R, T, E, 4) of the heading with x, y, z and itself, m rad and rad^2; None as above.
-        extras: other states by name, (R, T, E) each, with their standard deviations under the name and "_std".
+        extras: other numbers by name, (R, T, E), or (R, L) by link; states with their standard deviations under the
+            name and "_std".
     """
 
     t: Floats
@@ -82,7 +83,13 @@ class Track:
         object.__setattr__(self, "notes", texts("notes", self.notes))
         if not isinstance(self.extras, Mapping):
             raise InputError("extras", shown(self.extras), "must be name -> (R, T, E)", "Give {} for none.")
-        extras = {name: checked(f"extras[{name}]", v, "(R, T, E)", x.shape[:3]) for name, v in self.extras.items()}
+        by_link = None if self.neighbours is None else self.neighbours.shape[:2]
+        extras = {
+            name: checked(f"extras[{name}]", v, "(R, L)" if np.ndim(v) == 2 else "(R, T, E)", by_link)
+            if np.ndim(v) == 2 and by_link
+            else checked(f"extras[{name}]", v, "(R, T, E)", x.shape[:3])
+            for name, v in self.extras.items()
+        }
         object.__setattr__(self, "extras", extras)
         if not np.isfinite(self.x).all():
             run, step, ego = np.argwhere(~np.isfinite(self.x).all(axis=-1))[0]

@@ -61,6 +61,9 @@ ROUNDS, BISECT, TOLERANCE = 60, 20, 1e-8
 """Of Newton's method; after BISECT rounds a step out of the bracket halves it."""
 LEAST = 1e-9
 """Least weight of the ego's own estimate: at zero nothing might be left to invert."""
+MOST = 1.0 - 1e-6
+"""Greatest weight but for 1: nearer to 1 the derivatives of what lacks a component, whose I is 1e8 m^2, bend within
+D / I = 1e-8, and Newton's steps there are shorter than TOLERANCE without a minimum."""
 
 
 @as_written
@@ -254,8 +257,9 @@ def source(fusion: Fusion, k: int, s: float) -> tuple[Numbers, Numbers, Numbers]
 
 @inner
 def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
-    """w of least trace in [LEAST, 1]."""
-    low, high, going = 0.0 * w + LEAST, 0.0 * w + 1.0, 0.0 * w + 1.0
+    """w of least trace in [LEAST, MOST], or 1."""
+    low, high, going = 0.0 * w + LEAST, 0.0 * w + MOST, 0.0 * w + 1.0
+    w = choose(w - MOST, high, w)
     for round_ in range(ROUNDS):
         first, second = derivatives(fusion, fixed, n, w)
         low, high = choose(first, low, w), choose(-first, high, w)
@@ -267,7 +271,7 @@ def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
         going = choose(abs(w - before) - TOLERANCE, going, 0.0 * w)
         if going <= 0.0 * w:
             break
-    return w
+    return choose(w - MOST + TOLERANCE, 0.0 * w + 1.0, w)
 
 
 @inner
