@@ -271,7 +271,8 @@ def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
         going = choose(abs(w - before) - TOLERANCE, going, 0.0 * w)
         if going <= 0.0 * w:
             break
-    return choose(w - MOST + TOLERANCE, 0.0 * w + 1.0, w)
+    best: float = choose(w - MOST + TOLERANCE, 0.0 * w + 1.0, w)
+    return best
 
 
 @inner
