@@ -26,8 +26,7 @@ from coopoc.data.assemble import backward_difference, smooth
 from coopoc.data.fleet_cards import facts
 from coopoc.data.fleet_files import read_fcd, write_table
 from coopoc.data.registry import DATASETS, card
-from coopoc.errors import InputError, MissingLibraryError
-from coopoc.plugins import unknown
+from coopoc.errors import InputError, MissingLibraryError, unknown
 from coopoc.world.fleet import Fleet
 
 Streets = dict[str, tuple[str, ...]]

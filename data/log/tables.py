@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from coopoc.errors import InputError
-from coopoc.plugins import suggestion
+from coopoc.errors import InputError, suggestion
 
 from ..cells import TABLES, USUAL, filled, headers, missing_column, named_columns, numeric, read_frame, seconds, words
 from .units import KINDS, Rows, Summary, in_group, place, rows_of
