@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +15,9 @@ from coopoc import V2X, Fleet, JointFilter, Kalman, Recording, Sensors, load_fle
 from coopoc.arrays import Floats
 from coopoc.kernels.stars.cooperative_state import NO_GUARDS, Guards
 from coopoc.methods.cooperative_filter import CooperativeFilter
-from coopoc.methods.noise_model import resolve
+from coopoc.methods.noise_model import NoiseModel, resolve
+from coopoc.methods.star_stream import Broadcast, RelativeMeasurement
+from coopoc.world.inbox import inbox
 from coopoc.world.spoofing import Spoofing, spoofed
 
 S2 = Sensors.paper_scenario2()
@@ -113,3 +116,44 @@ def test_the_filter_is_its_oracle(crossing: Fleet, case: str, robust: bool) -> N
         np.testing.assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=1e-6)
         if len(track.neighbours[run]):
             np.testing.assert_allclose(track.neighbours[run], np.concatenate(others), atol=1e-5)
+
+
+@pytest.mark.parametrize("case", ["late", "attack"])
+def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
+    """A stream has no recording: each vehicle's broadcast of a step is that of a stream of its own."""
+    sensors, v2x, change = BAD[case]
+    seen = change(observe(gappy(crossing), sensors, v2x, runs=1, observers=[0]))
+    track, box = CooperativeFilter()(seen), inbox(seen, 0, CooperativeFilter().message)
+    method = CooperativeFilter(NoiseModel.nominal(sensors))
+    streams = {j: method.start(max_age=v2x.max_age) for j in range(len(seen.ids))}
+    sent: dict[tuple[int, int], Broadcast | None] = {}
+    for t in range(len(seen.t)):
+        here = np.arange(box.start[t], box.start[t + 1])
+        for j, stream in streams.items():
+            if j and np.isfinite(seen.velocity[0, t, j, 0]):
+                stream.step(seen.gnss[0, t, j], seen.velocity[0, t, j], seen.dt)
+                sent[j, t] = stream.broadcast
+            elif j:
+                streams[j] = method.start(max_age=v2x.max_age)
+        given = [
+            RelativeMeasurement(seen.ids[j], seen.relative[0, box.link[link]], **newest(seen, sent, t, int(s), int(j)))
+            for link, j, s in zip(here, seen.links.neighbour[box.link[here]], box.newest[0, here], strict=True)
+        ]
+        x, cov = streams[0].step(seen.gnss[0, t, 0], seen.velocity[0, t, 0], seen.dt, neighbours=given)
+        np.testing.assert_allclose(x, track.x[0, t, 0], atol=1e-6)
+        assert track.covariance is not None
+        np.testing.assert_allclose(cov, track.covariance[0, t, 0], atol=1e-6)
+
+
+def newest(seen: Recording, sent: Mapping[tuple[int, int], Any], t: int, s: int, j: int) -> dict[str, Any]:
+    """The newest broadcast that is held, as a stream takes it."""
+    if s < 0 or sent[j, s] is None:
+        return {}
+    position, velocity, variance, odometer = sent[j, s]
+    return {
+        "gnss": position,
+        "velocity": velocity,
+        "variance": variance,
+        "odometer": odometer,
+        "age": (t - s) * seen.dt,
+    }

@@ -4,23 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import numpy.typing as npt
 
 from ..arrays import Floats
 from ..kernels.stars.cooperative_filter import run_filter
-from ..kernels.stars.cooperative_state import NO_GUARDS, Guards, Model
+from ..kernels.stars.cooperative_state import NO_GUARDS, Guards
 from ..kernels.stars.gaussian import REJECTED
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .baselines import solo_estimates
 from .egos import Estimate, follow_egos
-from .noise_model import NoiseModel, resolve
+from .noise_model import NoiseModel, constant_noise, resolve
 from .options import check_options
-from .star import ACCELERATION_STD, FORGOTTEN, assumptions, measurements, relative_noise
+from .star import assumptions, measurements, model_of
 from .track import Track
+
+if TYPE_CHECKING:
+    from .star_stream import StarStream
 
 ESTIMATE_AND_ODOMETER = Message("estimate, odometer and velocity", 14)
 """Solo estimate (3), its variance per axis (3), sum of all motions (3), velocity (3), id and time (2)."""
@@ -83,7 +87,7 @@ class CooperativeFilter:
         "range", "azimuth", "inclination" and "message", NaN where there was none, and whether it is "trusted".
         """
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
-        model = model_of(known, recording.dt, self.robust)
+        model = model_of(known, self.robust)
         assumed, broadcast, moved = assumptions(recording, known), None, NO_ODOMETER
         if self.robust:
             assumed, broadcast = solo_estimates(recording, known, columns)
@@ -100,20 +104,29 @@ class CooperativeFilter:
 
         return follow_egos(self, recording, egos, run, known.notes, missing=True)
 
+    def start(
+        self,
+        x0: npt.ArrayLike | None = None,
+        *,
+        interval: float | None = None,
+        history: float = 10.0,
+        max_age: float = 1.0,
+    ) -> StarStream:
+        """Start the filter for one step at a time, as `JointFilter.start`: each vehicle sends its `stream.broadcast`.
 
-def model_of(known: NoiseModel, dt: float, robust: bool) -> Model:
-    """The noise model of the kernel; of the textbook filter all errors are white."""
-    std, least = relative_noise(known)
-    white, own, common, keep, bias, heading = np.ones(3), 0.0, 0.0, 1.0, 0.0, 0.0
-    if robust and known.sensors is not None:
-        sensors, std = known.sensors, np.array(std)
-        own, common = sensors.gnss_drift_std**2, sensors.gnss_common_std**2
-        white = np.square(sensors.gnss_std) / np.square(sensors.fix_std)
-        keep = float(np.exp(-dt / sensors.gnss_drift_time))
-        heading, bias = (float(value**2) for value in known.compass)
-        std[1] = np.sqrt(std[1] ** 2 - heading - bias)
-    shape = float(least), float(known.exact_relative), FORGOTTEN, ACCELERATION_STD, dt
-    return Model(std, *shape, own, common, keep, white, bias, heading, float(robust))
+        >>> a, b = (CooperativeFilter("identity").start() for _ in range(2))
+        >>> _ = b.step([10.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)
+        >>> from coopoc.methods.star_stream import RelativeMeasurement
+        >>> seen = RelativeMeasurement("b", [9.0, 0.0, 1.5707963], *b.broadcast)
+        >>> x, _ = a.step([0.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[seen])
+        >>> float(x[0].round(3)), a.trusted  # 10 m apart by the fixes, 9 m as measured
+        (0.333, {'b': True})
+        """
+        from .star_stream import StarStream
+
+        known = constant_noise(self.noise_model)
+        guards = self.guards if self.robust else NO_GUARDS
+        return StarStream(known, model_of(known, self.robust), guards, x0, interval, history, max_age)
 
 
 def weight(q: Floats, gate: float) -> Any:

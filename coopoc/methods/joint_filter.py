@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy.typing as npt
 
+from ..kernels.stars.cooperative_state import NO_GUARDS
 from ..kernels.stars.joint_filter import run_filter
 from ..world.inbox import Inbox
 from ..world.recording import Recording
@@ -15,7 +16,7 @@ from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, constant_noise, resolve
 from .options import check_options
-from .star import assumptions, measurements
+from .star import assumptions, measurements, model_of
 from .track import Track
 
 if TYPE_CHECKING:
@@ -95,4 +96,5 @@ class JointFilter:
         from .star_stream import StarStream
 
         known = constant_noise(self.noise_model)
-        return StarStream(known, self.exact and known.exact_relative, x0, interval, history, max_age)
+        model = model_of(known, False)._replace(exact=float(self.exact and known.exact_relative))
+        return StarStream(known, model, NO_GUARDS, x0, interval, history, max_age)

@@ -269,7 +269,7 @@ class Oracle:
         s, dt = self.state, self.seen.dt
         b = s["belief"]
         if j not in s["trusted"]:
-            b.noise(("b", j), self.guards.wander**2)
+            b.noise(("b", j), self.guards.wander**2 * dt)
         self.late(j, message, t)
         if ("v", j) in b.names:
             b.noise(("v", j), (self.guards.acceleration * dt) ** 2)
