@@ -20,8 +20,8 @@ from timing import medians, report, rows_of, timed
 
 import coopoc as co
 from coopoc.kernels.stars.joint_filter import run_filter
+from coopoc.methods.egos import assumptions, measurements
 from coopoc.methods.sliding_window import Windows, dead_reckoned
-from coopoc.methods.star import assumptions, measurements
 from coopoc.optimize.batch import solve_batch
 from coopoc.optimize.model.problem import Problem
 from coopoc.optimize.starts.initial import converted

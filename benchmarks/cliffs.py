@@ -124,7 +124,7 @@ def stream_cases() -> Iterator[Case]:
 
         around = [[15.0, 0.6 * k, np.pi / 2] for k in range(n - 1)]
         relative = [co.RelativeMeasurement(f"v{k}", seen, z, u) for k, seen in enumerate(around)]
-        stream = co.Kalman(known).start() if n == 1 else co.JointFilter(known).start()
+        stream = co.Kalman(known).start() if n == 1 else co.StarStream(co.JointFilter(known))
         more = {} if n == 1 else {"neighbours": relative}
 
         def ours(stream: Any = stream, more: Any = more) -> Any:

@@ -26,11 +26,11 @@ from coopoc import (
     stars,
 )
 from coopoc.kernels.solo import FixNoise
+from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.kernels.stars.relative import angle
 from coopoc.methods.drift_filter import DriftFilter
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.noise_model import resolve
-from coopoc.methods.star import ESTIMATE_GROWTH
 from coopoc.methods.track import Method
 from coopoc.world.links import spherical, to_vector, vector_cov
 

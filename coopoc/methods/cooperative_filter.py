@@ -12,15 +12,14 @@ from ..arrays import Floats
 from ..kernels.stars.cooperative_filter import run_filter
 from ..kernels.stars.cooperative_state import NO_GUARDS, Guards, Model
 from ..kernels.stars.gaussian import REJECTED
+from ..kernels.stars.messages import ACCELERATION_STD, FORGOTTEN
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .baselines import solo_estimates
-from .egos import Estimate, follow_egos
+from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
 from .noise_model import NoiseModel, resolve
-from .options import check_options
-from .star import ACCELERATION_STD, FORGOTTEN, assumptions, measurements, relative_noise
-from .track import Track
+from .track import Track, check_options
 
 ESTIMATE_AND_ODOMETER = Message("estimate, odometer and velocity", 14)
 """Solo estimate (3), its variance per axis (3), sum of all motions (3), velocity (3), id and time (2)."""

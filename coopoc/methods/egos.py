@@ -1,4 +1,4 @@
-"""The loop of all cooperative methods: each ego opens its inbox, follows its star, and fills its part of the Track."""
+"""The loop of all cooperative methods: each ego opens its inbox, hands arguments to its kernel, and fills its Track."""
 
 from __future__ import annotations
 
@@ -11,8 +11,11 @@ import numpy as np
 from tqdm import tqdm
 
 from ..arrays import Floats, Ints
+from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
+from ..kernels.stars.relative import components
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, check_recording
+from .noise_model import NoiseModel, process_noise
 from .track import Method, Track
 
 BEYOND = 10.0
@@ -94,3 +97,44 @@ def contradicted(x: Floats, recording: Recording, columns: Sequence[int]) -> tup
         return ()
     why = "diverged, or fixes are worse than stated; covariances say nothing there"
     return (f"estimates are over {limit:.2g} m from most fixes in {lost} of {far.size} runs: {why}",)
+
+
+def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats | None = None) -> Measurements:
+    """Measurements and messages of one ego, as `coopoc.kernels.stars.messages.Measurements`.
+
+    Args:
+        recording: of all vehicles.
+        ego: column.
+        box: its messages.
+        broadcast: (R, T, N, 3) m, position in a message; None for the fix.
+    """
+    neighbour, start, newest = (
+        np.ascontiguousarray(numbers, dtype=np.int64)
+        for numbers in (recording.links.neighbour[box.link], box.start, box.newest)
+    )
+    gnss = recording.gnss
+    return Measurements(
+        gnss,
+        recording.velocity,
+        gnss if broadcast is None else broadcast,
+        components(recording.relative, box.link),
+        neighbour,
+        start,
+        newest,
+        np.ascontiguousarray(box.fresh),
+        int(ego),
+        recording.dt,
+    )
+
+
+def assumptions(recording: Recording, known: NoiseModel) -> Assumptions:
+    """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a
+    velocity."""
+    (process, motion), fixes = process_noise(known, recording), np.ascontiguousarray(known.fix_variance(recording))
+    noise = relative_noise(known)
+    return Assumptions(process, fixes, fixes, FIX_GROWTH, *noise, FORGOTTEN, ACCELERATION_STD, motion)
+
+
+def relative_noise(known: NoiseModel) -> tuple[Floats, float]:
+    """(3,) m, rad, rad and the least range m of relative measurements, or nothing for unit matrices."""
+    return (np.empty(0), 0.0) if known.sensors is None else (known.sensors.relative_std, known.sensors.min_range)
