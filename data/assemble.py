@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+import pandas as pd
 
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
@@ -63,20 +64,20 @@ def assemble(
             raise InputError(field, f"{value} s", "must be > 0", "Give seconds.")
     if not len(t):
         raise InputError(file, "0 rows", "must hold at least two instants", "Check that the file is complete.")
-    ids, column = _ids(vehicle)
+    names, column = np.unique(np.array(vehicle, dtype=str), return_inverse=True)
+    first = pd.Series(column).drop_duplicates().to_numpy()
+    ids, column = tuple(names[first].tolist()), np.argsort(first)[column]
     numbers = np.hstack([position, velocity]) if velocity is not None else np.asarray(position, dtype=float)
     stamps = np.round(np.asarray(t, dtype=float), 6)
-    by_vehicle = np.split(np.argsort(column, kind="stable"), np.cumsum(np.bincount(column))[:-1])
-    for vehicle_id, rows in zip(ids, by_vehicle, strict=True):
-        late = np.flatnonzero(np.diff(stamps[rows]) <= 0)
-        if len(late):
-            before, after = stamps[rows[late[0]]], stamps[rows[late[0] + 1]]
-            where, given = (
-                f"{file}: row {rows[late[0] + 1] + 1}",
-                f"{after!s} s after {before!s} s of vehicle {vehicle_id}",
-            )
-            allowed = "dt must be > 0: the stamps of a vehicle increase from row to row"
-            raise InputError(f"{where}, column t", given, allowed, "Sort the rows by time, or remove one that repeats.")
+    order = np.argsort(column, kind="stable")
+    late = order[1:][(np.diff(stamps[order]) <= 0) & (np.diff(column[order]) == 0)]
+    if len(late):
+        row, before = int(late[0]), order[np.flatnonzero(order == late[0])[0] - 1]
+        given = f"{stamps[row]!s} s after {stamps[before]!s} s of vehicle {ids[column[row]]}"
+        allowed = "dt must be > 0: the stamps of a vehicle increase from row to row"
+        hint = "Sort the rows by time, or remove one that repeats."
+        raise InputError(f"{file}: row {row + 1}, column t", given, allowed, hint)
+    by_vehicle = np.split(order, np.cumsum(np.bincount(column))[:-1])
     if not any_scale:
         check_scale(stamps, numbers[:, :3], by_vehicle, file)
     if dt is None:
@@ -87,17 +88,14 @@ def assemble(
         steps = (since.max() + SAME) / dt + 1
         check_size(steps, len(ids), len(stamps), dt, file)
         grid = dt * np.arange(int(steps))
-        gaps = [longest_gap(since[rows], dt, max_gap) for rows in by_vehicle]
-        each = zip(by_vehicle, gaps, strict=True)
-        table = np.stack([interpolate(since[rows], numbers[rows], grid, gap) for rows, gap in each], axis=1)
+        each = [(since[rows], numbers[rows], grid, longest_gap(since[rows], dt, max_gap)) for rows in by_vehicle]
+        table = np.stack([interpolate(*one) for one in each], axis=1)
         grid = start + grid
     present = np.isfinite(table[..., 0])
     lonely = (np.bincount(column) > 1) & ~(present[1:] & present[:-1]).any(axis=0)
     for k in np.flatnonzero(~present.any(axis=0) | lonely).tolist():
         given = f"{(column == k).sum()} rows, but {present[:, k].sum()} instants, no two in a row"
-        hint = (
-            "Resample all vehicles with a dt like that of its rows, bridge longer gaps with max_gap=, or leave it out."
-        )
+        hint = "Resample all with a dt like that of its rows, bridge longer gaps with max_gap=, or leave it out."
         raise InputError(f"{file}: vehicle {ids[k]}", given, "must be there at instants in a row", hint)
     u = table[..., 3:] if velocity is not None else backward_difference(grid, table[..., :3], ids, file)
     return Fleet(ids, grid, table[..., :3], u, name=name, source=source, licence=licence)
@@ -164,20 +162,15 @@ def smooth(position: Floats, dt: float, cutoff: float) -> Floats:
     >>> bool(np.allclose(smooth(np.arange(9.0) ** 2, 0.1, 0.5), np.arange(9.0) ** 2))
     True
     """
-    from scipy.linalg import cho_solve_banded, cholesky_banded
+    from scipy.linalg import solveh_banded
+    from scipy.sparse import diags_array, eye_array
 
     steps = len(position)
     if steps < 4:
         return np.array(position, dtype=float)
-    third = np.diff(np.eye(4), n=3, axis=0)[0]
-    bands = np.zeros((4, steps))
-    for i in range(4):
-        for j in range(i, 4):
-            bands[3 - (j - i), j : steps - 3 + j] += third[i] * third[j]
-    bands *= (2 * np.pi * cutoff * dt) ** -6
-    bands[3] += 1
-    flat = np.asarray(position, dtype=float).reshape(steps, -1)
-    return np.asarray(cho_solve_banded((cholesky_banded(bands), False), flat)).reshape(np.shape(position))
+    third = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(steps - 3, steps))
+    normal = (eye_array(steps) + (2 * np.pi * cutoff * dt) ** -6 * (third.T @ third)).todia()
+    return np.asarray(solveh_banded(normal.data[:2:-1], np.reshape(position, (steps, -1)))).reshape(np.shape(position))
 
 
 def check_scale(t: Floats, position: Floats, by_vehicle: Sequence[Ints], file: str) -> None:
@@ -199,7 +192,10 @@ def check_scale(t: Floats, position: Floats, by_vehicle: Sequence[Ints], file: s
 metres in a local frame. Give latitude and longitude to co.load_recording, which converts them, or pass any_scale=True.
     """
     check_time(t, file)
-    speed = max([0.0, *(_typical_speed(t[rows], position[rows]) for rows in by_vehicle)])
+    speed = 0.0
+    for rows in by_vehicle:
+        each = np.linalg.norm(np.diff(position[rows, :2], axis=0), axis=1) / np.diff(t[rows])
+        speed = max(speed, float(np.median(each[each > 0])) if (each > 0).any() else 0.0)
     (west, east), (south, north) = ((float(v.min()), float(v.max())) for v in position[:, :2].T)
     if 0 < speed < SLOWEST and max(-west, east) <= 360 and max(-south, north) <= 180:
         given = f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}"
@@ -211,7 +207,7 @@ metres in a local frame. Give latitude and longitude to co.load_recording, which
         raise InputError(where, given, f"must be below {FASTEST:g} m/s", hint)
 
 
-def check_time(t: Floats, file: str) -> None:
+def check_time(t: Floats, file: str, column: str = "t") -> None:
     """InputError where times (L,) s are beyond any date.
 
     >>> check_time(np.array([1.7e9]), "drive.csv")
@@ -219,7 +215,9 @@ def check_time(t: Floats, file: str) -> None:
     late = t[np.abs(t) > LATEST]
     if len(late):
         allowed = "must be seconds: it looks like milliseconds or nanoseconds since 1970"
-        raise InputError(f"{file}: column t", f"{late[0]:.15g}", allowed, "Divide it by 1e3 or 1e9, or store dates.")
+        raise InputError(
+            f"{file}: column {column}", f"{late[0]:.15g}", allowed, "Divide it by 1e3 or 1e9, or store dates."
+        )
 
 
 def check_size(steps: float, vehicles: int, rows: int, dt: float, file: str) -> None:
@@ -234,13 +232,6 @@ def check_size(steps: float, vehicles: int, rows: int, dt: float, file: str) -> 
             f"must be at most {PER_ROW} instants a row",
             "Check that t is in seconds (not nanoseconds or milliseconds), or take a longer dt.",
         )
-
-
-def _ids(vehicle: Sequence[str]) -> tuple[tuple[str, ...], Ints]:
-    """Names in the order of their first row, and the (L,) column of each row."""
-    column_of: dict[str, int] = {}
-    column = np.array([column_of.setdefault(str(name), len(column_of)) for name in vehicle], dtype=np.int64)
-    return tuple(column_of), column
 
 
 def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tuple[Floats, Floats]:
@@ -260,8 +251,3 @@ def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tupl
     table = np.full((len(grid), column.max() + 1, numbers.shape[1]), np.nan)
     table[step.astype(np.int64)[row_of], column] = numbers
     return grid, table
-
-
-def _typical_speed(t: Floats, position: Floats) -> float:
-    speed = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1) / np.diff(t)
-    return float(np.median(speed[speed > 0])) if (speed > 0).any() else 0.0

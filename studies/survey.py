@@ -56,7 +56,7 @@ def paper(
         jobs: number of worker processes.
         data: fleet to test on, a name or a path.
     """
-    from coopoc.data.fleet_store import in_words
+    from coopoc.data.fleet_cards import in_words
     from coopoc.data.registry import DATASETS, card
 
     def answers(results: Mapping[str, Results]) -> dict[str, str]:

@@ -16,7 +16,7 @@ from coopoc.arrays import Floats
 from coopoc.kernels.stars.cooperative_state import NO_GUARDS, Guards
 from coopoc.methods.cooperative_filter import CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel, resolve
-from coopoc.methods.star_stream import Broadcast, RelativeMeasurement
+from coopoc.methods.star_stream import Broadcast, RelativeMeasurement, StarStream
 from coopoc.world.inbox import inbox
 from coopoc.world.spoofing import Spoofing, spoofed
 
@@ -125,7 +125,7 @@ def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
     seen = change(observe(gappy(crossing), sensors, v2x, runs=1, observers=[0]))
     track, box = CooperativeFilter()(seen), inbox(seen, 0, CooperativeFilter().message)
     method = CooperativeFilter(NoiseModel.nominal(sensors))
-    streams = {j: method.start(max_age=v2x.max_age) for j in range(len(seen.ids))}
+    streams = {j: StarStream(method, max_age=v2x.max_age) for j in range(len(seen.ids))}
     sent: dict[tuple[int, int], Broadcast | None] = {}
     for t in range(len(seen.t)):
         here = np.arange(box.start[t], box.start[t + 1])
@@ -134,7 +134,7 @@ def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
                 stream.step(seen.gnss[0, t, j], seen.velocity[0, t, j], seen.dt)
                 sent[j, t] = stream.broadcast
             elif j:
-                streams[j] = method.start(max_age=v2x.max_age)
+                streams[j] = StarStream(method, max_age=v2x.max_age)
         given = [
             RelativeMeasurement(seen.ids[j], seen.relative[0, box.link[link]], **newest(seen, sent, t, int(s), int(j)))
             for link, j, s in zip(here, seen.links.neighbour[box.link[here]], box.newest[0, here], strict=True)

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
-import numpy.typing as npt
 
 from ..arrays import Floats
 from ..kernels.stars.cooperative_filter import run_filter
@@ -17,14 +16,9 @@ from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .baselines import solo_estimates
-from .egos import Estimate, follow_egos
-from .noise_model import NoiseModel, constant_noise, resolve
-from .options import check_options
-from .star import assumptions, measurements, model_of
-from .track import Track
-
-if TYPE_CHECKING:
-    from .star_stream import StarStream
+from .egos import Estimate, assumptions, follow_egos, measurements, model_of
+from .noise_model import NoiseModel, resolve
+from .track import Track, check_options
 
 ESTIMATE_AND_ODOMETER = Message("estimate, odometer and velocity", 14)
 """Solo estimate (3), its variance per axis (3), sum of all motions (3), velocity (3), id and time (2)."""
@@ -103,30 +97,6 @@ class CooperativeFilter:
             yield Estimate(slice(None), x, cov, box.link, neighbours, {**extras, "trusted": notes[..., 4]})
 
         return follow_egos(self, recording, egos, run, known.notes, missing=True)
-
-    def start(
-        self,
-        x0: npt.ArrayLike | None = None,
-        *,
-        interval: float | None = None,
-        history: float = 10.0,
-        max_age: float = 1.0,
-    ) -> StarStream:
-        """Start the filter for one step at a time, as `JointFilter.start`: each vehicle sends its `stream.broadcast`.
-
-        >>> a, b = (CooperativeFilter("identity").start() for _ in range(2))
-        >>> _ = b.step([10.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)
-        >>> from coopoc.methods.star_stream import RelativeMeasurement
-        >>> seen = RelativeMeasurement("b", [9.0, 0.0, 1.5707963], *b.broadcast)
-        >>> x, _ = a.step([0.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[seen])
-        >>> float(x[0].round(3)), a.trusted  # 10 m apart by the fixes, 9 m as measured
-        (0.333, {'b': True})
-        """
-        from .star_stream import StarStream
-
-        known = constant_noise(self.noise_model)
-        guards = self.guards if self.robust else NO_GUARDS
-        return StarStream(known, model_of(known, self.robust), guards, x0, interval, history, max_age)
 
 
 def weight(q: Floats, gate: float) -> Any:

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import Floats, checked, instance, number
-from ..errors import InputError
+from ..errors import InputError, suggestion
 from ..kernels.motion import NO_MOTION_NOISE, MotionNoise
-from ..plugins import suggestion
 from ..short_repr import short_repr
 from ..world.axes import check_texts, texts
 from ..world.fleet import Fleet

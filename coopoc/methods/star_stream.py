@@ -10,14 +10,15 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, instance
 from ..errors import InputError
-from ..kernels.motion import ROUNDING
-from ..kernels.solo import ESTIMATE, NO_FIX_YET, FixNoise
+from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET, ROUNDING
+from ..kernels.solo import FixNoise
 from ..kernels.stars.cooperative_filter import keep, make_filter, motion_of, restore, stream_row, stream_step
 from ..kernels.stars.cooperative_state import (
     AGE,
     KEPT_VARIANCE,
+    NO_GUARDS,
     ODOMETER,
     OWN,
     SENT,
@@ -28,14 +29,16 @@ from ..kernels.stars.cooperative_state import (
     VARIANCE,
     WIDTH,
     Filter,
-    Guards,
-    Model,
 )
 from ..kernels.stars.cooperative_state import ESTIMATE as POSITION
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.relative import components
-from .noise_model import NoiseModel, motion_noise
-from .stream import FilterStream, MotionHistory, fix_or_none, names_of, numbers, seconds, three
+from .cooperative_filter import CooperativeFilter
+from .egos import model_of
+from .joint_filter import JointFilter
+from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
+from .noise_model import constant_noise, motion_noise
+from .stream import FilterStream
 
 FIRST = np.zeros(1, np.int64)
 
@@ -102,35 +105,54 @@ class RelativeMeasurement:
 
 
 class StarStream:
-    """A filter of a star, fed step by step: like `FilterStream`, with the neighbours that are measured at each step.
+    """The joint or the cooperative filter, step by step: `FilterStream` with the neighbours measured at each step.
 
     The neighbours measured now are in the star. Between messages a neighbour moves with the velocity of its newest one
     until that is `max_age` seconds old; a velocity used for L seconds makes an error of L times its own. Of a vehicle
     that is measured but whose messages never arrive, nothing is assumed.
 
+    For a recording the std of ranges that are finer than their angles bear is raised (`noise_model.resolve`); a stream
+    does not know the ranges to come, and takes what the noise model says.
+
     Args:
-        known: the noise model.
-        model: the same, for the kernel.
-        guards: against what may be wrong.
+        filter: its noise model is "identity" or holds constant noise. In a robust one neighbours must send what
+            `broadcast` of theirs holds.
         x0: (3,) m, a position known before the first step; None starts at the first fix.
-        interval: s, the step that the assumed process noise belongs to; None for every step.
+        interval: s, the step that the assumed process noise belongs to: a motion of dt s has dt / interval times its
+            variance. None: every step is one, with the error of one measured velocity, as in a recording.
         history: s, how old a delayed fix may be.
-        max_age: s, older messages are not used.
+        max_age: s, older messages of neighbours are not used.
+
+    Raises:
+        InputError: a noise model that needs a recording, a time that is negative or not finite.
+
+    >>> from coopoc import JointFilter
+    >>> ego = StarStream(JointFilter("identity"))
+    >>> other = RelativeMeasurement("b", [9.0, 0.0, 1.5707963], gnss=[10.0, 0.0, 0.0], velocity=[9.0, 0.0, 0.0])
+    >>> x, _ = ego.step([0.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[other])
+    >>> float(x[0].round(3)), float(ego.neighbours["b"][0].round(3))  # 10 m apart by the fixes, 9 m as measured
+    (0.333, 9.667)
     """
 
     def __init__(
         self,
-        known: NoiseModel,
-        model: Model,
-        guards: Guards,
-        x0: npt.ArrayLike | None,
-        interval: float | None,
-        history: float,
-        max_age: float,
+        filter: JointFilter | CooperativeFilter,
+        x0: npt.ArrayLike | None = None,
+        *,
+        interval: float | None = None,
+        history: float = 10.0,
+        max_age: float = 1.0,
     ) -> None:
+        kind = CooperativeFilter if isinstance(filter, CooperativeFilter) else JointFilter
+        known = constant_noise(instance("filter", filter, kind).noise_model)
+        robust = isinstance(filter, CooperativeFilter) and filter.robust
+        self._model, self._guards = model_of(known, robust), NO_GUARDS
+        if isinstance(filter, JointFilter):
+            self._model = self._model._replace(exact=float(filter.exact and known.exact_relative))
+        elif robust:
+            self._guards = filter.guards
         self._motion, self._fix = motion_noise(known, interval), np.array(known.gnss_variance)
         self.max_age, self.history = seconds("max_age", max_age), MotionHistory(history)
-        self._model, self._guards = model, guards
         self._start = np.full(3, np.nan) if x0 is None else three("x0", x0)
         self._given = np.zeros(8)
         self._positions: dict[str, Floats] = {}
@@ -139,7 +161,7 @@ class StarStream:
         self._filters = [make_filter(1, 1) for _ in range(3)]
         self._inputs: list[tuple[Floats, Floats, Ints]] = []
         self._time, self._steps = 0.0, 0
-        self.solo = FilterStream(self._motion, FixNoise(self._fix), x0, history) if model.estimates else None
+        self.solo = FilterStream(self._motion, FixNoise(self._fix), x0, history) if robust else None
         self._odometer = np.zeros(3)
 
     @property

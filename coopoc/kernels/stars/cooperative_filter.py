@@ -13,8 +13,8 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, part
+from ..dead_reckoning import dead_reckon
 from ..motion import MotionNoise, process_variance
-from ..solo import dead_reckon
 from .cooperative_messages import distrust, fix_terms, receive, trust
 from .cooperative_state import (
     AGE,

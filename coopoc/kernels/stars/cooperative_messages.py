@@ -6,7 +6,7 @@ import math
 
 from ...arrays import Floats
 from ..compiling.compile import part
-from ..motion import ROUNDING
+from ..dead_reckoning import ROUNDING
 from .cooperative_state import (
     AGE,
     COUNT,

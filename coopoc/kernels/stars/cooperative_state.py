@@ -13,7 +13,7 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import part, storage
-from ..motion import ROUNDING
+from ..dead_reckoning import ROUNDING
 from .gaussian import (
     ABSENT,
     COMMON,
