@@ -70,8 +70,8 @@ def _table(at: dict[str, Any]) -> TableView:
 
 def _cdf(results: Results, at: dict[str, Any]) -> Plot | None:
     methods = ["gnss", "kalman", "okf", "fedkalmannet", "centralised", "individual1"]
-    known = ["none", "identity", "fitted", "oracle", "trained"]
-    where = present(results, {**at, "method": methods, "noise_model": known}, "error_quantiles_m")
+    models = ["none", "identity", "fitted", "oracle", "trained"]
+    where = present(results, {**at, "method": methods, "noise_model": models}, "error_quantiles_m")
     text = "Distribution of the error over all steps; markers: mean of the per-run maxima."
     return cdf(results, scene.caption(results, text, **at), where) if where else None
 
@@ -103,7 +103,7 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
     names = {"federated": "fedkalmannet", "centralised": "centralised", "OKF": "okf"}
     names |= {f"client {client}'s net": name for client, name in enumerate(weights.INDIVIDUAL, start=1)}
     means = {words: mean(results, {**at, "method": name}) for words, name in names.items()}
-    filters = {f"{known} KF": of("kalman", known, **at) for known in ("fitted", "oracle")}
+    filters = {f"{model} KF": of("kalman", model, **at) for model in ("fitted", "oracle")}
     means |= {words: mean(results, where) for words, where in filters.items()}
     if not listed(means):
         return ""

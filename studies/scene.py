@@ -19,6 +19,7 @@ from coopoc.errors import InputError
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.study.provenance import revision
 from coopoc.study.study import Params
+from coopoc.world.channels import channel as channel_of
 from coopoc.world.fleet import Fleet
 from coopoc.world.outliers import Outliers
 from coopoc.world.recording import Recording
@@ -27,7 +28,6 @@ from coopoc.world.sensors import Sensors
 from coopoc.world.spoofing import Spoofing, spoofed
 from coopoc.world.storage import digest
 from coopoc.world.v2x import V2X
-from coopoc.world.v2x import channel as channel_of
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
@@ -48,9 +48,11 @@ def fleet(data: str) -> Fleet:
     log = _log(data)
     if log is None:
         return load_fleet(data)
-    seen = log.recording
-    nothing = np.full((len(seen.t), len(seen.ids), 3), np.nan)
-    return log.truth or Fleet(seen.ids, seen.t, nothing, nothing, name=Path(data).stem, source="a log without truth")
+    measurements = log.recording
+    nothing = np.full((len(measurements.t), len(measurements.ids), 3), np.nan)
+    return log.truth or Fleet(
+        measurements.ids, measurements.t, nothing, nothing, name=Path(data).stem, source="a log without truth"
+    )
 
 
 @lru_cache(maxsize=2)
@@ -134,12 +136,12 @@ def sensors(p: Params) -> Sensors:
     presets = {0: Sensors.paper_training, 1: Sensors.paper_scenario1, 2: Sensors.paper_scenario2}
     if p["scenario"] not in presets:
         raise InputError("scenario", p["scenario"], "must be 0, 1 or 2", "0: training; see section IV of the paper.")
-    found = lasting(presets[p["scenario"]](), *(float(p.get(name, 0.0)) for name in LASTING))
+    noise = lasting(presets[p["scenario"]](), *(float(p.get(name, 0.0)) for name in LASTING))
     return replace(
-        found,
+        noise,
         velocity_std_ratio=ratio,
         velocity_reading=reading,
-        gnss_drift_time=float(p.get("drift_time_s", found.gnss_drift_time)),
+        gnss_drift_time=float(p.get("drift_time_s", noise.gnss_drift_time)),
         heading_std=np.deg2rad(float(p.get("heading_std_deg", 0.0))),
         heading_bias_std=np.deg2rad(float(p.get("heading_bias_deg", 0.0))),
         outliers=Outliers.named(str(p.get("outliers", ""))),
@@ -174,10 +176,10 @@ def acting(p: Params) -> Sensors:
 
 def start(p: Params) -> Start:
     """Start of the filters of a cell: "gnss", the first fix, unless it names "true", the true position."""
-    found: Start = p.get("start", "gnss")
-    if found not in get_args(Start):
-        raise InputError("start", repr(found), "must be gnss or true", "The first fix, or the true position.")
-    return found
+    begin: Start = p.get("start", "gnss")
+    if begin not in get_args(Start):
+        raise InputError("start", repr(begin), "must be gnss or true", "The first fix, or the true position.")
+    return begin
 
 
 def heading(p: Params) -> str:
@@ -243,15 +245,16 @@ def channel(p: Params) -> V2X:
     A cap of 0 is none; a rate of 0, and None for loss, burst and latency, are the channel's own.
     """
     cap = float(p.get("cap_bytes_per_second", 0.0))
-    found = channel_of(str(p.get("channel", "ideal")), int(p.get("max_neighbours", 0)))
+    most = int(p.get("max_neighbours", 0))
+    usual = channel_of(str(p["channel"]), most) if "channel" in p else V2X.ideal(most)
     losses = {"loss": p.get("loss"), "burst": p.get("burst"), "latency": p.get("latency_s")}
     given: dict[str, Any] = {field: float(value) for field, value in losses.items() if value is not None}
     return replace(
-        found,
+        usual,
         radius=float(p.get("radius_m", 30.0)),
-        rate=p.get("rate_hz") or found.rate,
+        rate=p.get("rate_hz") or usual.rate,
         bytes_per_second=cap or float("inf"),
-        schedule=p.get("schedule", found.schedule),
+        schedule=p.get("schedule", usual.schedule),
         **given,
     )
 
@@ -288,8 +291,8 @@ def told(p: Params) -> Recording | None:
 def _attacked(p: Params, told: bool) -> Recording:
     who, attack = egos(p["data"], str(p["egos"])), attacking(p)
     observers = None if needs_whole_fleet(str(p.get("method"))) else who
-    seen = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers, told)
-    return spoofed(seen, attack, seed=int(p["seed"]), honest=who, told=told) if attack.share else seen
+    drawn = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers, told)
+    return spoofed(drawn, attack, seed=int(p["seed"]), honest=who, told=told) if attack.share else drawn
 
 
 def attacking(p: Params) -> Spoofing:

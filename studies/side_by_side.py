@@ -73,13 +73,13 @@ def _findings(results: Results) -> dict[str, str]:
     texts = {}
     for k in results.frame["max_neighbours"].unique() if len(results.frame) else ():
         pairs = results.frame[["method", "noise_model"]].drop_duplicates().to_numpy().tolist()
-        each = ran({(m, known): rms(results, of(m, known, max_neighbours=k)) for m, known in pairs})
+        each = ran({(m, model): rms(results, of(m, model, max_neighbours=k)) for m, model in pairs})
         bound = next((value for (method, _), value in each.items() if method == "bound"), None)
         ranked = sorted((value, pair) for pair, value in each.items() if pair[0] != "bound")
         if ranked:
-            value, (method, known) = ranked[0]
+            value, (method, model) = ranked[0]
             gap = f", {value / bound:.2f} times the bound" if bound else ""
-            texts[f"K = {k}"] = f"K = {k}: {look(method).label} ({known}) has the lowest rms, {value:.3g} m{gap}."
+            texts[f"K = {k}"] = f"K = {k}: {look(method).label} ({model}) has the lowest rms, {value:.3g} m{gap}."
     return texts
 
 

@@ -24,14 +24,14 @@ Rows: TypeAlias = Iterable[tuple[Sequence[Entry], Where]]
 HEAD = ("Method", "Noise model")
 
 
-def of(method: str, known: str, /, **at: Any) -> dict[str, Any]:
+def of(method: str, noise_model: str, /, **at: Any) -> dict[str, Any]:
     """A method under a noise model, as parameters of a cell or as a selection."""
-    return {**at, "method": method, "noise_model": known}
+    return {**at, "method": method, "noise_model": noise_model}
 
 
 def labelled(pairs: Iterable[tuple[str, str]], **at: Any) -> Rows:
     """Rows of a table under HEAD: labels and selection of each method under its noise model."""
-    return [((look(method).label, known), of(method, known, **at)) for method, known in pairs]
+    return [((look(method).label, model), of(method, model, **at)) for method, model in pairs]
 
 
 def table(
@@ -140,16 +140,16 @@ def multiples(
     return view
 
 
-def verdict(results: Results, one: Where, other: Where, name: str) -> str:
-    """Sentence on the RT-LE of `one`, which is trained, against `other`, which is not, with the evidence.
+def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
+    """Sentence on the RT-LE of `trained`, against `other`, which needs no training, with the evidence.
 
     Args:
         results: of the study.
-        one: selection of one method.
+        trained: selection of one method.
         other: selection of another method, over the same egos and runs.
         name: of the other, for the sentence.
     """
-    base, each = results.values("rt_le_m", other), per_seed(results, one)
+    base, each = results.values("rt_le_m", other), per_seed(results, trained)
     gaps = [paired_difference(each.mean(axis=0), base)]
     text = f"paired difference {gaps[0].mean:+.3f} m; 95 % {_ends(gaps[0])} over egos and runs, "
     if len(each) > 1:

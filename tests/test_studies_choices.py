@@ -147,6 +147,6 @@ def test_a_rule_is_better_only_if_all_training_seeds_agree(gaps: tuple[float, ..
     rows += [{**row, "method": "median", "rt_le_m": row["rt_le_m"] + gaps[row["train_seed"]]} for row in rows]
     axes, settings = ("condition", "method", "scenario"), dict(aggregation.STUDY.settings)
     results = Results("aggregation", "", axes, settings, pd.DataFrame(rows), pd.DataFrame(), 0, {})
-    found = aggregation.STUDY.found(results)
+    found = aggregation.STUDY.answers(results)
     assert list(found) == ["scenario 1, iid"]
     assert words in found["scenario 1, iid"]

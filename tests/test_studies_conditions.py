@@ -131,7 +131,7 @@ def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path:
     assert common[0] is not None
     assert common[1] is not None
     assert common[1] > 0.8 * common[0]
-    found = correlated_gnss.STUDY.found(results)
+    found = correlated_gnss.STUDY.answers(results)
     assert list(found) == ["white", "own", "common"]
     assert all(text.startswith(f"{name}: ") for name, text in found.items())
     folder = tmp_path / "correlated_gnss"

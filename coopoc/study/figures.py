@@ -125,7 +125,7 @@ def curves(
         log: logarithmic vertical axis; a linear one starts at zero.
         logx: logarithmic horizontal axes.
     """
-    every, found = [*lines, *levels], []
+    every, shown = [*lines, *levels], []
     models = {str(of.get("noise_model")) for of in every if of.get("method") != "bound"} - {"none", "trained"}
     for panel in panels:
         drawn: list[tuple[Where, Any]] = []
@@ -135,13 +135,13 @@ def curves(
             drawn += [(of, ran(points))] if ran(points) else []
         if drawn or len(panels) == 1:
             flat = [(of, number(results, {**panel.where, **of})) for of in levels]
-            found.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
-    if not any(drawn for _, drawn in found):
+            shown.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
+    if not any(drawn for _, drawn in shown):
         return None
     named: list[dict[str, Any]] = []
-    size = {"width": width or 2.2 + 2.1 * len(found) + (len(found) == 1), "height": height}
-    with canvas(1, len(found), sharey=True, squeeze=False, **size) as (figure, (axes,)):
-        for axis, (panel, drawn) in zip(axes, found, strict=True):
+    size = {"width": width or 2.2 + 2.1 * len(shown) + (len(shown) == 1), "height": height}
+    with canvas(1, len(shown), sharey=True, squeeze=False, **size) as (figure, (axes,)):
+        for axis, (panel, drawn) in zip(axes, shown, strict=True):
             for of, points in drawn:
                 names = {name: of[name] for name in ("method", "noise_model") if name in of}
                 if len(models) < 2 and of.get("method") != "bound":
@@ -193,7 +193,7 @@ def multiples(
                 panel.plot(values, np.full(len(values), row), **style)
             panel.set(title=case, xlabel="× reference")
             plain_log(panel.xaxis)
-        labels = [look(m).label + ("" if known in ("trained", "none") else f", {known}") for m, known in rows]
+        labels = [look(m).label + ("" if model in ("trained", "none") else f", {model}") for m, model in rows]
         axes[0].set(yticks=range(len(rows)), yticklabels=labels, ylim=(len(rows) - 0.4, -0.6))
     return Plot(figure, caption)
 
@@ -211,11 +211,11 @@ def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> 
         value = points.mean if isinstance(points, Interval) else points
         axes.axhline(value, **{**options, "marker": ""})
         return True
-    means = {x: one.mean if isinstance(one, Interval) else one for x, one in points.items()}
-    bands = {x: one for x, one in points.items() if isinstance(one, Interval)}
+    means = {x: point.mean if isinstance(point, Interval) else point for x, point in points.items()}
+    bands = {x: point for x, point in points.items() if isinstance(point, Interval)}
     axes.plot(list(means), list(means.values()), **options)
     if bands:
-        ends = [one.low for one in bands.values()], [one.high for one in bands.values()]
+        ends = [point.low for point in bands.values()], [point.high for point in bands.values()]
         axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0)
     return bool(means)
 

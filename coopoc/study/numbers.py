@@ -61,9 +61,9 @@ def rms(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
     return float(np.sqrt(frame.groupby(["ego", *(["train_seed"] if seeded else [])])["square"].mean()).mean())
 
 
-def difference(results: Results, one: Where, other: Where) -> Interval | None:
-    """RT-LE of `one` less that of `other` in metres, paired by ego and run; None where either was not run."""
-    first, second = present(results, one), present(results, other)
+def difference(results: Results, method: Where, base: Where) -> Interval | None:
+    """RT-LE of `method` less that of `base` in metres, paired by ego and run; None where either was not run."""
+    first, second = present(results, method), present(results, base)
     if first is None or second is None:
         return None
     return paired_difference(results.values("rt_le_m", first), results.values("rt_le_m", second))
@@ -113,19 +113,19 @@ def listed(numbers: Mapping[str, float | None]) -> str:
 def sentence(template: str, **numbers: Any) -> str:
     """The template with its numbers; nothing if one of them was not run.
 
-    >>> sentence("{one:.1f} m", one=2.0), sentence("{one:.1f} m", one=None)
+    >>> sentence("{error:.1f} m", error=2.0), sentence("{error:.1f} m", error=None)
     ('2.0 m', '')
     """
     return "" if None in numbers.values() else template.format(**numbers)
 
 
-def ratio(one: float | None, other: float | None) -> float | None:
-    """one / other; None if either was not run.
+def ratio(value: float | None, base: float | None) -> float | None:
+    """value / base; None if either was not run.
 
     >>> ratio(3.0, 2.0), ratio(None, 2.0)
     (1.5, None)
     """
-    return one / other if one is not None and other else None
+    return value / base if value is not None and base else None
 
 
 def _seeds(results: Results, where: Where) -> list[Any]:
