@@ -1,11 +1,11 @@
-"""The snapshot and the joint filter of a star of ten neighbours: compiled, NumPy and the libraries, in one run.
+"""The joint filter of a star of ten neighbours: compiled, NumPy and the libraries, in one run.
 
     OMP_NUM_THREADS=1 python benchmarks/classical.py            # a Markdown table on stdout, about a minute
 
-Rows of a job solve the same problems, one row after the other in every round. Times are this thread's own, medians of
+Rows solve the same problems, one row after the other in every round. Times are this thread's own, medians of
 rounds; the ratios are to be compared. What a library needs as input, whitened or stacked, is prepared before its clock
 starts; ours are given with and without what the method does around the kernel. A row counts only if its answer is that
-of its problem: cost within 1e-6 relative and position within 1 mm of the reference, for the filter within 1e-9 m.
+of its problem, within 1e-9 m.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import gtsam
 import numpy as np
 from filterpy.kalman import KalmanFilter
 from timing import medians, report, rows_of, timed
@@ -21,10 +20,6 @@ from timing import medians, report, rows_of, timed
 import coopoc as co
 from coopoc.kernels.stars.joint_filter import run_filter
 from coopoc.methods.egos import assumptions, measurements
-from coopoc.methods.sliding_window import Windows, dead_reckoned
-from coopoc.optimize.batch import solve_batch
-from coopoc.optimize.model.problem import Problem
-from coopoc.optimize.starts.initial import converted
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -33,7 +28,7 @@ ROUNDS, NEIGHBOURS, STEPS, RUNS = 7, 10, 301, 10
 SENSORS = co.Sensors.paper_scenario2()
 KNOWN = co.NoiseModel("fitted", SENSORS, process_std=(0.15, 0.05, 0.01), gnss_std=SENSORS.gnss_std)
 SIZE = 3 * (NEIGHBOURS + 1)
-GTSAM, FILTERPY = "GTSAM, linear Between factors, converted problem", "filterpy, KalmanFilter"
+FILTERPY = "filterpy, KalmanFilter"
 
 
 class Row(NamedTuple):
@@ -56,74 +51,6 @@ def ring() -> co.Recording:
     velocity = np.diff(position, axis=0, prepend=2 * position[:1] - position[1:2]) / 0.1
     fleet = co.Fleet(tuple(f"v{i}" for i in range(NEIGHBOURS + 1)), t, position, velocity)
     return co.observe(fleet, SENSORS, co.V2X(max_neighbours=NEIGHBOURS), runs=RUNS, observers=[0])
-
-
-def snapshot_rows(recording: co.Recording) -> list[Row]:
-    """Each against `solve_batch` to 1e-10 m of the exact, and of the converted, problem."""
-    stars = [Problem.from_snapshot(recording, t, 0, run=None, noise=KNOWN) for t in range(20)]
-    exact = np.stack([solve_batch(p, tolerance=1e-10).x for p in stars], axis=1)
-    linear = np.stack([solve_batch(converted(p)).x for p in stars], axis=1)
-    floor = np.stack([p.linearise(exact[:, t]).cost for t, p in enumerate(stars)], axis=1)
-
-    def judged(words: str, solves: int, call: Callable[[], Any], found: Any, wanted: Any, costs: bool = True) -> Row:
-        """`found` (R, 20, n, 3) in the order of `stars`, or (R, 20, 3) of the ego."""
-        full = found.ndim == 4
-        away = float(np.abs(found - (wanted if full else wanted[:, :, 0])).max())
-        right = away < 1e-3
-        if full and costs:
-            cost = np.stack([p.linearise(found[:, t]).cost for t, p in enumerate(stars)], axis=1)
-            right = right and float((cost / floor - 1).max()) < 1e-6
-        return Row(words, solves, call, right)
-
-    box = inbox(recording, 0, FIX_AND_VELOCITY)
-    method, count = co.CooperativeMAP(noise_model=KNOWN), RUNS * STEPS
-    drive = Windows(recording, 0, box, KNOWN, dead_reckoned(recording, KNOWN), 1)
-    kernel = drive.solve(method.gnc)
-    whole = np.concatenate([kernel.x[:, :, None], kernel.neighbours.reshape(RUNS, STEPS, NEIGHBOURS, 3)], axis=2)[
-        :, :20
-    ]
-    graphs = [gtsam_snapshot(recording, run, t) for t in range(20) for run in range(RUNS)]
-    found = np.stack([gtsam_solve(g) for g in graphs]).reshape(20, RUNS, -1, 3).swapaxes(0, 1)
-
-    def kernels() -> Any:
-        return drive.solve(method.gnc)
-
-    def ours() -> Any:
-        return method(recording, [0])
-
-    def gtsam_all() -> Any:
-        return [gtsam_solve(g) for g in graphs]
-
-    return [
-        judged("compiled kernel, exact", count, kernels, whole, exact),
-        judged("CooperativeMAP, compiled", count, ours, ours().x[:, :20, 0], exact),
-        judged(GTSAM, len(graphs), gtsam_all, found, linear, costs=False),
-    ]
-
-
-def gtsam_snapshot(recording: co.Recording, run: int, t: int) -> tuple[Any, ...]:
-    """Fixes, converted vectors and their square-root informations, as NumPy makes them beforehand."""
-    links = slice(t * NEIGHBOURS, (t + 1) * NEIGHBOURS)
-    order = [0, *recording.links.neighbour[links]]
-    relative = recording.relative[run, links]
-    factor = converted(Problem.from_snapshot(recording, t, 0, run=run, noise=KNOWN)).factors[1]
-    return recording.gnss[run, t, order], to_vector(relative), factor.root
-
-
-def gtsam_solve(star: tuple[Any, ...]) -> np.ndarray:
-    """Graph built and solved, (n, 3)."""
-    fix, vector, root = star
-    graph, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    noise = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.gnss_std))
-    zero = np.zeros(3)
-    for k in range(len(fix)):
-        graph.add(gtsam.PriorFactorPoint3(k, fix[k], noise))
-        start.insert(k, zero)
-    for k in range(len(vector)):
-        edge = gtsam.noiseModel.Gaussian.SqrtInformation(root[k], False)
-        graph.add(gtsam.BetweenFactorPoint3(0, k + 1, vector[k], edge))
-    found = graph.linearize(start).optimize()
-    return np.stack([found.at(k) for k in range(len(fix))])
 
 
 def filter_rows(recording: co.Recording) -> list[Row]:
@@ -216,7 +143,7 @@ def seconds(rows: list[Row]) -> dict[str, float]:
 def parts() -> list[tuple[str, str, list[Row]]]:
     """The two jobs, each with the row that it is compared to."""
     recording = ring()
-    return [("snapshot", GTSAM, snapshot_rows(recording)), ("joint filter", FILTERPY, filter_rows(recording))]
+    return [("joint filter", FILTERPY, filter_rows(recording))]
 
 
 def measured(found: list[tuple[str, str, list[Row]]] | None = None) -> list[dict[str, Any]]:

@@ -33,8 +33,6 @@ GAPS = (
     "drift",
     "ci",
     "split-ci",
-    "cooperative-map",
-    "cooperative-map-5",
     "fixed-lag",
     "mhe",
     "gbp",

@@ -24,7 +24,6 @@ JOBS = {
     "lkf-sa": "identity",
     "lkf-sa, nominal": "nominal",
     "msmv-r": "nominal",
-    "cooperative-map-5": "nominal",
     "split-ci": "nominal",
     "ci": "nominal",
     "gbp": "nominal",

@@ -7,7 +7,7 @@ White noise of the paper's second scenario, nominal noise model, ideal channel. 
 share of steps whose run-averaged NEES lies in its 99 % band. Milliseconds are per step, run and ego (whole-fleet
 methods: per step, run and vehicle), on whatever this machine was doing.
 
-The rows of `measured` are robust windows, moving horizons and fixed lags at K = 6, each with its inbox and its Track:
+The rows of `measured` are moving horizons and fixed lags at K = 6, each with its inbox and its Track:
 microseconds per step and run of an ego, and their ratio to the joint filter's. Right means that a run has the digits
 that it has alone.
 """
@@ -24,7 +24,6 @@ from tabulate import tabulate
 import coopoc as co
 from coopoc.evaluate.metrics import nees_inside
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
-from coopoc.world.spoofing import spoofed
 
 ORDER = (
     "gnss",
@@ -41,8 +40,8 @@ ORDER = (
     "batch-smoother",
 )
 SENSORS = co.Sensors.paper_scenario2()
-JOBS = ("cooperative-map-gnc", "cooperative-map-gnc, spoofed", "mhe", "mhe, late", "fixed-lag")
-"""A method and a word more: a third of the neighbours is spoofed, or messages take 0.3 s."""
+JOBS = ("mhe", "mhe, late", "fixed-lag")
+"""A method and a word more: messages take 0.3 s."""
 ROUNDS, STEPS, RUNS = 3, 60, 16
 
 
@@ -81,8 +80,7 @@ def bounds(fleet: co.Fleet, egos: tuple[int, ...], v2x: co.V2X) -> list[list[obj
 def recorded(job: str, steps: int, runs: int) -> co.Recording:
     """Measurements and messages of a job's ego."""
     channel = co.V2X(max_neighbours=6, latency=0.3 if "late" in job else 0.0)
-    recording = co.observe(co.load_fleet("town10").between(0, steps), SENSORS, channel, runs=runs, observers=[0])
-    return spoofed(recording, 1 / 3, honest=[0]) if "spoofed" in job else recording
+    return co.observe(co.load_fleet("town10").between(0, steps), SENSORS, channel, runs=runs, observers=[0])
 
 
 def measured(rounds: int = ROUNDS, steps: int = STEPS, runs: int = RUNS) -> list[dict[str, Any]]:

@@ -40,7 +40,7 @@ BENCHMARKS = (
 BASELINE, RESULTS = HERE / "baseline.json", HERE / "results.json"
 TOLERANCE = 1.5
 """Of a new baseline's rows: two runs on a shared machine differ by less."""
-OURS = ("cliffs", "compiled", "JointFilter", "CooperativeMAP", "BatchSmoother", "engine", "ours", "import", "vehicles")
+OURS = ("cliffs", "compiled", "JointFilter", "BatchSmoother", "engine", "ours", "import", "vehicles")
 """Words of the rows that a new baseline names: a peer's time is not ours to keep."""
 
 Rows = Sequence[Mapping[str, Any]]

@@ -167,8 +167,6 @@ ORACLES = {
     "msmv-r": "msmv",
     "ci": "covariance_intersection",
     "split-ci": "covariance_intersection",
-    "cooperative-map": "window",
-    "cooperative-map-5": "window",
     "mhe": "moving_horizon",
     "gbp": "gbp",
     "admm": "admm",

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
 
-SILENT = ("gnss", "mds", "cooperative-map-gnc")
+SILENT = ("gnss", "mds")
 """Methods without a covariance, or with that of a fix; the last takes as long as all others together."""
 TRAINED = ("okf", "recursive", "cooperative")
 SOLO = ("kalman", "kalman-adaptive", "okf", "recursive")
@@ -74,7 +74,7 @@ STUDY = lineup.study(
     "consistency",
     "Which methods are consistent?",
     grid=_grid(),
-    settings={**scene.TOWN, **scene.WEIGHTS, "backend": "gauss-newton", "runs": 20, "train_seeds": 1},
+    settings={**scene.TOWN, **scene.WEIGHTS, "runs": 20, "train_seeds": 1},
     shares=("max_neighbours",),
     tables={
         "nees": selections(

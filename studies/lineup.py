@@ -18,7 +18,6 @@ from coopoc.evaluate.scores import BYTES, rows_of, scored
 from coopoc.methods.catalogue import METHODS
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
-from coopoc.methods.sliding_window import CooperativeMAP
 from coopoc.methods.track import Method
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row, Study
@@ -29,7 +28,7 @@ from coopoc.world.v2x import FIX_AND_VELOCITY
 
 from . import scene, weights
 
-COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint", "cooperative-map")
+COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint")
 BOUND = ("bound", "bound")
 """The bound as (method, noise model)."""
 PAST = ("bound", "with its past")
@@ -115,8 +114,6 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
     method: Method = make(noise_model(p))
     if isinstance(method, Kalman):
         method = replace(method, x0=first)
-    if isinstance(method, CooperativeMAP):
-        method = replace(method, backend=p.get("backend", method.backend))
     return [(None, method)]
 
 

@@ -24,8 +24,6 @@ IDEAL: dict[str, Any] = {"rate_hz": 10.0, "cap_bytes_per_second": 0.0}
 NEIGHBOURS = (0, 1, 2, 3, 4, 6, 8, 10)
 LIMITS = [{**IDEAL, "rate_hz": rate} for rate in (5.0, 2.0, 1.0)]
 LIMITS += [{**IDEAL, "cap_bytes_per_second": cap} for cap in (300.0, 600.0, 1200.0)]
-WINDOWED = (0, 2)
-"""K at which the sliding window is solved, too: one cell of it takes as long as ten others."""
 TRAINED = ("okf", "fedkalmannet", "centralised")
 MODELS = ["identity", "nominal", "fitted"]
 BUDGETED = ["lkf-sa", "joint"]
@@ -38,7 +36,6 @@ def _grid() -> list[dict[str, Any]]:
     shared = [(m, model) for m in lineup.COOPERATIVE for model in MODELS]
     return [
         *(of(*pair, max_neighbours=k, **IDEAL) for k in NEIGHBOURS for pair in (*solo, *shared)),
-        *(of("cooperative-map-5", "nominal", max_neighbours=k, **IDEAL) for k in WINDOWED),
         *(of(*pair, max_neighbours=10, **limit) for limit in LIMITS for pair in shared if pair[0] in BUDGETED),
     ]
 
@@ -154,7 +151,7 @@ STUDY = lineup.study(
     "What does another neighbour bring online, at what cost, and can collaborative training replace it?",
     grid=_grid(),
     where=_meaningful,
-    settings={**scene.TOWN, **scene.WEIGHTS, "runs": 30, "train_seeds": 5, "backend": "gauss-newton"},
+    settings={**scene.TOWN, **scene.WEIGHTS, "runs": 30, "train_seeds": 5},
     shares=("max_neighbours", "rate_hz", "cap_bytes_per_second"),
     tables={
         **{

@@ -18,7 +18,6 @@ TOGETHER = (
     ("joint", "nominal"),
     ("lkf-sa", "nominal"),
     ("split-ci", "nominal"),
-    ("cooperative-map-gnc", "nominal"),
     ("cooperative", "trained"),
 )
 METHODS = (*ALONE, *TOGETHER)

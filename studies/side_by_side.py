@@ -15,7 +15,7 @@ if TYPE_CHECKING:
     from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
-METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "cooperative-map", "bound")
+METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "mhe", "bound")
 CONDITIONS: dict[str, Any] = {
     "channel": "ideal",
     "rate_hz": 0.0,

@@ -10,15 +10,22 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from oracles.moving_horizon import Drive, fixed_lag, moving_horizon
-from test_kernels_window import CHANNELS, S2
 
-from coopoc import V2X, Fleet, JointFilter, NoiseModel, Recording, observe
+from coopoc import V2X, Fleet, JointFilter, NoiseModel, Recording, Sensors, observe
 from coopoc.methods import sliding_window as module
 from coopoc.methods.noise_model import resolve
 from coopoc.methods.sliding_window import FixedLagSmoother, MovingHorizon
 from coopoc.world.inbox import inbox
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
+S2 = Sensors.paper_scenario2()
+CHANNELS = [
+    V2X(max_neighbours=4),
+    V2X(max_neighbours=7, loss=0.3, latency=0.2),
+    V2X(max_neighbours=3, loss=1.0),
+    V2X(max_neighbours=5, bytes_per_second=1000.0),
+    V2X(max_neighbours=0),
+]
 FITTED = NoiseModel("fitted", S2, (0.3, 0.2, 0.01))
 METHODS = [
     MovingHorizon(horizon=1),

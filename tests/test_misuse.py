@@ -88,7 +88,6 @@ METHODS: tuple[Any, ...] = (
     co.JointFilter,
     co.LKFSA,
     co.MSMV,
-    co.CooperativeMAP,
     co.MovingHorizon,
     co.FixedLagSmoother,
     co.BatchSmoother,

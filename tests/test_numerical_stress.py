@@ -99,19 +99,6 @@ def test_a_relative_measurement_that_outruns_the_digits_is_assumed_coarser_and_t
     assert not usual.notes
 
 
-def test_a_window_beyond_double_precision_is_the_egos_own_fix() -> None:
-    """Micrometres apart, fixes of kilometres, ranges of tens of kilometres: no covariance is NaN, and it is noted."""
-    wide = co.Sensors((34.0, 2e4, 127.0), range_std=6e4, azimuth_std=0.3, inclination_std=1.0, velocity_floor=1e-6)
-    rng, t = np.random.default_rng(0), np.arange(12) / 10
-    place = rng.normal(0.0, 1e-6, (1, 5, 3))
-    velocity = np.tile(rng.normal(0.0, 5.0, (1, 5, 3)) * [1, 1, 0], (12, 1, 1))
-    fleet = co.Fleet(tuple("abcde"), t, place + t[:, None, None] * velocity, velocity)
-    seen = co.observe(fleet, replace(wide, velocity_std_ratio=1e-8), co.V2X(4, radius=1e9), runs=4, seed=0)
-    track = co.CooperativeMAP(window=5)(seen, [0])
-    assert np.isfinite(track.covariance).all()
-    assert any("windows beyond double precision are the ego's own fix" in note for note in track.notes)
-
-
 @pytest.mark.parametrize(
     "damage", [np.diag([1.0, -1e-6, 1.0]), np.eye(3) + 2 * (np.eye(3, k=1) + np.eye(3, k=-1)), np.triu(np.ones((3, 3)))]
 )

@@ -17,7 +17,7 @@ from .joint_filter import JointFilter
 from .kalman import GNSS, AdaptiveKalman, Kalman
 from .mds import MDS
 from .qcqp_relaxation import QCQPRelaxation
-from .sliding_window import CooperativeMAP, FixedLagSmoother, MovingHorizon
+from .sliding_window import FixedLagSmoother, MovingHorizon
 from .track import Method
 
 Factory = Callable[..., Method]
@@ -33,9 +33,6 @@ METHODS: Mapping[str, Factory] = {
     "drift": DriftFilter,
     "joint": JointFilter,
     "cooperative-filter": CooperativeFilter,
-    "cooperative-map": CooperativeMAP,
-    "cooperative-map-5": partial(CooperativeMAP, window=5, name="cooperative-map-5"),
-    "cooperative-map-gnc": partial(CooperativeMAP, window=5, robust="truncated", name="cooperative-map-gnc"),
     "ci": CovarianceIntersection,
     "split-ci": partial(CovarianceIntersection, split=True, name="split-ci"),
     "mds": MDS,

@@ -1,8 +1,7 @@
-"""The window of a star as one dense nonlinear least-squares problem of one run, written out factor by factor.
+"""Rows of a star's measurements at one step of a window, for a dense nonlinear least-squares problem of one run.
 
-Rows r and Jacobian J of the whitened factors: fixes (x - z) / std, motions (x_t - x_{t-1} - dt u) / std, relative
-measurements (h(x_j - x_0) - z) / std in range, azimuth and inclination, or with unit matrices the vector itself. A
-message counts at the first step at which it is held in the window; a component that is NaN is no row.
+Relative measurements are rows (h(x_j - x_0) - z) / std in range, azimuth and inclination, or with unit matrices the
+vector itself; a component that is NaN is no row.
 """
 
 from __future__ import annotations
@@ -34,35 +33,6 @@ def message(recording: Recording, known: NoiseModel, run: int, vehicle: int, t: 
         moved, grown, s = moved + dt * recording.velocity[run, s, vehicle], grown + process[run, s, vehicle], s - 1
     fix = recording.gnss[run, s, vehicle] + moved + age * dt * u
     return fix, known.gnss_variance + grown + age**2 * one, dt * u, one
-
-
-def linear_rows(
-    recording: Recording, box: Inbox, known: NoiseModel, run: int, ego: int, span: Sequence[int]
-) -> list[Row]:
-    """Fixes and motions as rows A x = b, whitened; keys of the points are (vehicle, step)."""
-    rows: list[Row] = []
-    held: dict[int, tuple[int, int, int]] = {}  # vehicle -> last step in the star, message, uses
-    for t in range(span[-1] + 1):
-        links = range(box.start[t], box.start[t + 1])
-        star = [(ego, t, True)] + [
-            (int(recording.links.neighbour[box.link[k]]), int(box.newest[run, k]), bool(box.fresh[run, k]))
-            for k in links
-        ]
-        for vehicle, sent, fresh in star:
-            last, before, uses = held.get(vehicle, (-2, -2, 0))
-            uses = uses + 1 if last == t - 1 and before == sent else 1
-            held[vehicle] = (t, sent, uses)
-            if t < span[0]:
-                continue
-            fix, variance, moved, one = message(recording, known, run, vehicle, t, max(sent, 0) if sent >= 0 else t)
-            had = np.isfinite(recording.gnss[run, sent, vehicle]).all()
-            if sent >= 0 and ((fresh and had) or last < span[0]) and np.isfinite(fix).all():
-                rows.append(({(vehicle, t): np.diag(variance**-0.5)}, fix * variance**-0.5, vehicle))
-            if last == t - 1 >= span[0]:
-                moved, one = (moved, (2 * uses - 1) * one) if sent >= 0 else (np.zeros(3), np.full(3, UNKNOWN))
-                weight = np.diag(one**-0.5)
-                rows.append(({(vehicle, t): weight, (vehicle, t - 1): -weight}, moved * one**-0.5, "motion"))
-    return rows
 
 
 def relative_rows(recording: Recording, box: Inbox, known: NoiseModel, run: int, ego: int, x: Any, t: int) -> list[Row]:
@@ -107,29 +77,3 @@ def solve_rows(rows: Sequence[Row], x: Any, ridge: float = 1e-12) -> tuple[Any, 
     cov = np.linalg.inv(information)
     move = (cov @ (a.T @ b)).reshape(-1, 3)
     return {key: x[key] + move[i] for i, key in enumerate(x)}, cov
-
-
-def window(recording: Recording, box: Inbox, known: NoiseModel, run: int, ego: int, span: Sequence[int], x: Any) -> Any:
-    """Minimum and covariance of the window from the points x, by dense Gauss-Newton."""
-    rows = linear_rows(recording, box, known, run, ego, span)
-    return descend(rows, lambda at: [r for t in span for r in relative_rows(recording, box, known, run, ego, at, t)], x)
-
-
-def descend(rows: Sequence[Row], relative: Any, x: Any) -> Any:
-    """Gauss-Newton until the last step is below a nanometre."""
-    for _ in range(100):
-        new, cov = solve_rows([*rows, *relative(x)], x)
-        moved = max(np.abs(new[key] - x[key]).max() for key in x)
-        x = new
-        if moved < 1e-9:
-            break
-    return x, cov
-
-
-def points(recording: Recording, box: Inbox, ego: int, span: Sequence[int], position: Floats) -> Any:
-    """Start: every point of the window at a given position (T, N, 3)."""
-    found = {}
-    for t in span:
-        for vehicle in [ego, *recording.links.neighbour[box.link[box.start[t] : box.start[t + 1]]]]:
-            found[int(vehicle), t] = position[t, vehicle].copy()
-    return found

@@ -12,16 +12,16 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import inner
-from ..compiling.small import apply, choose_each, from_upper, scale, subtract
-from ..compiling.vectors import choose, plus
+from ..compiling.small import apply, from_upper, scale, subtract
+from ..compiling.vectors import choose
 from .relative import Numbers, completed, converted, exact, vector
 
 LEAST_RANGE, LEAST_SINE = 1.0, 0.05
 """m; of the converted start, as in `coopoc.optimize.starts.initial`."""
-EXACT, AT_MEASUREMENT, AT_GAP = np.arange(3)
-"""Linear in range and angles at the present points; converted to a vector, weighted by the geometry of the measurement
-itself or by that of the points, which must not depend on the measurement. NumPy's integers: for each constant of
-Python's numba would compile a function once more."""
+EXACT, AT_GAP = np.arange(2)
+"""Linear in range and angles at the present points; converted to a vector, weighted by the geometry of the points,
+which must not depend on the measurement. NumPy's integers: for each constant of Python's numba would compile a function
+once more."""
 
 
 @inner
@@ -33,7 +33,7 @@ def edge(gap: Numbers, z: Numbers, std: Floats, least: float, how: int) -> tuple
         z: the measurement.
         std: (3,) m, rad, rad, of no length for unit matrices.
         least: m; the angles of a measurement that is shorter have their standard deviations inflated.
-        how: EXACT, AT_MEASUREMENT or AT_GAP.
+        how: EXACT or AT_GAP.
     """
     z = z if how == AT_GAP else inflated(z, least)
     x, y, up = gap
@@ -44,15 +44,8 @@ def edge(gap: Numbers, z: Numbers, std: Floats, least: float, how: int) -> tuple
     if how == EXACT:
         e = exact(x, y, up, z, z[5:], 0.0)
         return from_upper(e[:6]), e[6:]
-    if how == AT_GAP:
-        information = from_upper(converted(x, y, up, z[5:], least))
-        return information, apply(information, subtract(vector(completed(z, gap)), gap))
-    information = from_upper(as_measured(z))
-    eta = apply(information, subtract(vector(z), gap))
-    if o + 0.5 <= whole:
-        return information, eta
-    e = exact(x, y, up, z, z[5:], 0.0)
-    return choose_each(whole, information, from_upper(e[:6])), choose_each(whole, eta, e[6:])
+    information = from_upper(converted(x, y, up, z[5:], least))
+    return information, apply(information, subtract(vector(completed(z, gap)), gap))
 
 
 @inner
@@ -61,21 +54,3 @@ def inflated(z: Numbers, least: float) -> Numbers:
     wide = choose(1e300 - z[5], max(least / max(z[0], 1e-300), 1.0), 0.0 * z[0] + 1.0)
     s1, s2 = -max(-(wide * z[6]), -math.pi), -max(-(wide * z[7]), -math.pi)
     return z[0], z[1], z[2], z[3], z[4], z[5], max(s1, z[6]), max(s2, z[7])
-
-
-@inner
-def as_measured(z: Numbers) -> Numbers:
-    """Information, upper triangle, of the converted vector where it was measured."""
-    sa, ca, si, ci = z[1], z[2], z[3], z[4]
-    d = max(z[0], LEAST_RANGE)
-    b, c = z[6] * d * max(abs(si), LEAST_SINE), z[7] * d
-    a, b, c = 1.0 / (z[5] * z[5]), 1.0 / (b * b), 1.0 / (c * c)
-    flat, cross = plus(a * si * si, c * ci, ci), (a - c) * si * ci
-    return (
-        plus(flat * ca * ca, b * sa, sa),
-        (flat - b) * sa * ca,
-        cross * ca,
-        plus(flat * sa * sa, b * ca, ca),
-        cross * sa,
-        plus(a * ci * ci, c * si, si),
-    )

@@ -284,7 +284,7 @@ class Problem:
     ) -> Problem:
         """The star of one step: fixes of the ego and its linked neighbours, spherical factors between them.
 
-        All messages of the step are taken as received; `CooperativeMAP` obeys the channel instead. Missing
+        All messages of the step are taken as received; the methods obey the channel instead. Missing
         measurements are treated as in `from_window`.
 
         Args:
