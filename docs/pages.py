@@ -18,6 +18,7 @@ from mkdocs.structure.files import File, Files
 from scipy import stats
 
 import coopoc as co
+from coopoc.evaluate.bounds import fleet_bound
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
 from coopoc.plugins import find, names
 from coopoc.study import style
@@ -192,8 +193,8 @@ def _bounds(fleet: Any, sensors: Any) -> Iterator[tuple[str, Any]]:
     v2x = co.V2X(NEIGHBOURS)
     yield "solo", _root(co.posterior_bound(fleet, sensors, EGO))
     yield "star", _root(co.posterior_bound(fleet, sensors, EGO, v2x))
-    yield "fleet", _root(co.posterior_bound(fleet, sensors, EGO, v2x, information="fleet"))
-    yield "fleet, smoothing", _root(co.posterior_bound(fleet, sensors, EGO, v2x, smoothing=True, information="fleet"))
+    for name, smoothing in (("fleet", False), ("fleet, smoothing", True)):
+        yield name, _root(fleet_bound(fleet, sensors, v2x, smoothing=smoothing)[:, EGO])
 
 
 def _root(bound: Any) -> Any:
