@@ -15,7 +15,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from . import plugins
-from .errors import InputError, MissingLibraryError
+from .errors import InputError, MissingLibraryError, unknown
 
 Command: TypeAlias = Callable[..., int | None] | Mapping[str, Any] | EntryPoint
 
@@ -244,7 +244,7 @@ def _dispatch(commands: Mapping[str, Command], argv: list[str], prog: str) -> in
         return 0 if argv else 2
     name, rest = argv[0], argv[1:]
     if name not in commands:
-        raise plugins.unknown("command", name, commands)
+        raise unknown("command", name, commands)
     command = commands[name]
     loaded = command.load() if isinstance(command, EntryPoint) else command
     if isinstance(loaded, Mapping):

@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from coopoc.errors import InputError, MissingLibraryError
-from coopoc.plugins import unknown
+from coopoc.errors import InputError, MissingLibraryError, unknown
 
 from .log.units import Rows, Summary, rows_of
 

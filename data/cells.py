@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.arrays import Bools, Floats
-from coopoc.errors import InputError
+from coopoc.errors import InputError, suggestion, unknown
 from coopoc.formats.values import LARGEST
-from coopoc.plugins import suggestion, unknown
 
 if TYPE_CHECKING:
     import pandas as pd

@@ -8,9 +8,9 @@ from pathlib import Path
 
 import tyro
 
-from coopoc.errors import InputError
+from coopoc.errors import InputError, unknown
 from coopoc.one_file import in_file
-from coopoc.plugins import names, unknown
+from coopoc.plugins import names
 
 from .fleet_store import facts, in_words
 from .registry import DATASETS, LOGS, card, convert, kind_of, list_datasets, load_fleet, load_log

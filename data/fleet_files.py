@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from coopoc.arrays import one_of
 from coopoc.errors import InputError
 from coopoc.formats import trajectories as tum
-from coopoc.plugins import one_of
 from coopoc.world.fleet import Fleet
 
 from .assemble import assemble

@@ -15,8 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from coopoc.errors import InputError, MissingLibraryError
-from coopoc.plugins import unknown
+from coopoc.errors import InputError, MissingLibraryError, unknown
 from coopoc.world.fleet import Fleet
 
 from . import fleet_store

@@ -9,10 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from coopoc.errors import InputError
+from coopoc.errors import InputError, suggestion, unknown
 from coopoc.file_names import given_path
 from coopoc.one_file import in_file
-from coopoc.plugins import find, names, suggestion, unknown
+from coopoc.plugins import find, names
 from coopoc.world.fleet import Fleet
 from coopoc.world.storage import is_recording, read_recording
 
@@ -98,6 +98,8 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     >>> load_fleet("town10-clients").present.sum(axis=0)
     array([1550, 4600, 1450, 1420])
     """
+    if isinstance(name_or_path, str) and name_or_path in DATASETS and format is None and not options:
+        return DATASETS[name_or_path]()
     name, options, part = _split(name_or_path, {"format": format, **options})
     chosen = options.pop("format", None)
     if chosen is None and (in_file(name) or name in names("coopoc.datasets")):
@@ -148,6 +150,8 @@ def kind_of(name_or_path: str | Path) -> str:
     >>> kind_of("town10")
     ''
     """
+    if isinstance(name_or_path, str) and name_or_path in DATASETS:
+        return ""
     name, options = split(name_or_path)
     if name in DATASETS or in_file(name) or not Path(name).exists():
         return ""

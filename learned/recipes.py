@@ -10,13 +10,12 @@ from typing import Any, ClassVar, get_args
 
 import torch
 
-from coopoc.arrays import instance
-from coopoc.errors import InputError
+from coopoc.arrays import instance, one_of
+from coopoc.errors import InputError, unknown
 from coopoc.file_names import given_path
-from coopoc.methods.options import check_options
-from coopoc.methods.track import Method
+from coopoc.methods.track import Method, check_options
 from coopoc.one_file import file_digest, in_file
-from coopoc.plugins import find, one_of, unknown
+from coopoc.plugins import find
 from coopoc.world.outliers import Outliers
 from coopoc.world.sensors import Sensors, VelocityReading
 

@@ -13,7 +13,7 @@ from coopoc.evaluate.scores import BYTES
 from coopoc.study.numbers import Number, Where, across, difference, interval, listed, mean, present, ratio, rms
 from coopoc.study.style import look
 from coopoc.study.tables import Table
-from coopoc.world.v2x import CHANNELS
+from coopoc.world.channels import CHANNELS
 
 from . import lineup, scene, weights
 from .lineup import PAST

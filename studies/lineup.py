@@ -104,14 +104,15 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
         InputError: an unknown name.
     """
     name, first = p["method"], start(p)
-    if weights.is_trained(name):
+    if name not in METHODS and weights.is_trained(name):
         models: list[tuple[int, Any]] = [(seed, weights.checkpoint(name, p, seed).model) for seed in weights.seeds(p)]
         if name != "cooperative" or recording.v2x.max_neighbours == 0:
             return [(seed, model.method(name, first)) for seed, model in models]
         from coopoc.learned import CooperativeGain
 
         return [(seed, CooperativeGain(model, name)) for seed, model in models]
-    method: Method = find("coopoc.methods", name)(noise_model(p))
+    make = METHODS[name] if name in METHODS else find("coopoc.methods", name)
+    method: Method = make(noise_model(p))
     if isinstance(method, Kalman):
         method = replace(method, x0=first)
     if isinstance(method, CooperativeMAP):

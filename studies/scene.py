@@ -19,6 +19,7 @@ from coopoc.errors import InputError
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.study.provenance import revision
 from coopoc.study.study import Params
+from coopoc.world.channels import channel as channel_of
 from coopoc.world.fleet import Fleet
 from coopoc.world.outliers import Outliers
 from coopoc.world.recording import Recording
@@ -27,7 +28,6 @@ from coopoc.world.sensors import Sensors
 from coopoc.world.spoofing import Spoofing, spoofed
 from coopoc.world.storage import digest
 from coopoc.world.v2x import V2X
-from coopoc.world.v2x import channel as channel_of
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
@@ -245,7 +245,8 @@ def channel(p: Params) -> V2X:
     A cap of 0 is none; a rate of 0, and None for loss, burst and latency, are the channel's own.
     """
     cap = float(p.get("cap_bytes_per_second", 0.0))
-    usual = channel_of(str(p.get("channel", "ideal")), int(p.get("max_neighbours", 0)))
+    most = int(p.get("max_neighbours", 0))
+    usual = channel_of(str(p["channel"]), most) if "channel" in p else V2X.ideal(most)
     losses = {"loss": p.get("loss"), "burst": p.get("burst"), "latency": p.get("latency_s")}
     given: dict[str, Any] = {field: float(value) for field, value in losses.items() if value is not None}
     return replace(

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 from tyro.conf import Positional, arg
 
 from coopoc.data.registry import load_log
-from coopoc.errors import InputError
+from coopoc.errors import InputError, unknown
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.one_file import file_digest, from_file, in_file
-from coopoc.plugins import unknown
 from coopoc.study.study import Params
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors, VelocityReading

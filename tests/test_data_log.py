@@ -15,7 +15,6 @@ import coopoc as co
 from coopoc.data.log.frames import to_enu
 from coopoc.data.log.read import read_log
 from coopoc.evaluate.metrics import nees
-from coopoc.methods.catalogue import METHODS
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
@@ -176,26 +175,6 @@ def test_vehicles_come_and_go_and_nothing_is_dropped_in_silence(tmp_path: Path) 
     assert rec.stretches("car2") == ((0, 52), (120, 200))
     bridged = read_log(tmp_path / "log.csv", max_gap=8.0).recording
     assert bridged.stretches("car2") == ((0, 200),)
-
-
-def thinned(frame: pd.DataFrame, every: int = 10) -> pd.DataFrame:
-    """Fixes at a tenth of the rate."""
-    fix = frame["kind"].isin(["x", "y", "z"])
-    return frame[~fix | ((frame["t"] * 10).round().astype(int) % every == 0)]
-
-
-COOPERATIVE = ("joint", "lkf-sa", "lkf-sa-edge", "split-ci", "ci", "drift", "msmv-r")
-WINDOWS = ("cooperative-map", "cooperative-map-5", "mhe", "fixed-lag")
-
-
-@pytest.mark.parametrize("name", ["kalman", "kalman-adaptive", *COOPERATIVE, *WINDOWS])
-def test_methods_run_at_one_fix_a_second(tmp_path: Path, name: str) -> None:
-    fleet = drive(4)
-    frame = thinned(long(seen(fleet)))
-    rec = read_log(write(frame, tmp_path / "log.csv")).recording
-    assert np.isfinite(rec.gnss[0, :, 0, 0]).sum() == 20
-    error = float(co.rt_le(METHODS[name]("nominal")(rec, ["car1"]), fleet).mean())
-    assert error < 2.2, "a fix is 2.2 m off"
 
 
 def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path: Path) -> None:

@@ -16,11 +16,12 @@ import coopoc as co
 from coopoc import GNSS, V2X, Fleet, InputError, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, rt_le
 from coopoc.kernels.solo import FixNoise
+from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.methods.covariance_intersection import CovarianceIntersection
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.mds import MDS, complete, fit, shape
 from coopoc.methods.qcqp_relaxation import QCQPRelaxation
-from coopoc.methods.star import ESTIMATE_GROWTH, stars
+from coopoc.methods.star import stars
 from coopoc.world.inbox import inbox
 
 S2 = Sensors.paper_scenario2()

@@ -106,18 +106,13 @@ def test_gtsams_own_factors_have_our_cost_and_gradient(dimension: int, name: str
     ("dimension", "kind", "nodes", "noise", "loss", "why"),
     [
         (2, "relative_pose", BETWEEN, {"std": [0.3, 0.1, 0.1]}, None, "one std in all directions"),
-        (3, "relative_position", BETWEEN, {"std": [0.3, 0.3, 0.1]}, None, "one std in all directions"),
-        (3, "relative_pose", BETWEEN, {"cov": spd(6, 0.01)}, None, "couple"),
         (2, "relative_pose", BETWEEN, {"std": 0.1}, "huber", "two factors"),
-        (2, "pose", [("a",)], {"std": 0.1}, "huber", "two factors"),
         (3, "pose", [("a",)], {"cov": spd(6, 0.01)}, None, "couple"),
         (3, "relative_pose_chordal", BETWEEN, {"std": np.linspace(0.1, 0.4, 12)}, None, "of each axis"),
         (2, "relative_position", SEEN, {"std": 0.1}, None, "a pose to a point"),
-        (2, "displacement", [("a", "d")], {"std": 0.1}, None, "a pose to a point"),
         (3, "bearing", SEEN, {"std": 0.1}, None, "forward axis"),
         (3, "body_spherical", SEEN, {"std": 0.1}, None, "tangent plane"),
         (2, "azimuth", PAIRS, {"std": 0.1}, None, "no such factor"),
-        (3, "spherical", PAIRS, {"std": 0.1}, None, "no such factor"),
     ],
 )
 def test_what_gtsam_lacks_is_named(dimension: int, kind: str, nodes: list, noise: dict, loss, why: str) -> None:

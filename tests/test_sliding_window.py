@@ -25,7 +25,7 @@ from coopoc import (
 )
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
 from coopoc.evaluate.metrics import nees, nees_inside, rt_le
-from coopoc.methods.star import ACCELERATION_STD
+from coopoc.kernels.stars.messages import ACCELERATION_STD
 from coopoc.optimize import Problem, solve
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector, wrap

@@ -20,8 +20,8 @@ from coopoc.studies import scene, survey
 from coopoc.study import numbers
 from coopoc.study.report import report
 from coopoc.study.tables import Table
+from coopoc.world.channels import CHANNELS
 from coopoc.world.sensing import find_links
-from coopoc.world.v2x import CHANNELS
 
 QUICK = {"runs": 2, "egos": "2", "max_neighbours": "0,2", "method": "kalman,joint,split-ci,bound"}
 SIZES = ("payload_bytes_per_second", "bytes_per_second")

@@ -13,7 +13,7 @@ from tqdm import tqdm
 
 from ..arrays import Floats, Ints, checked, instance
 from ..errors import InputError
-from ..methods.star import FORGOTTEN
+from ..kernels.stars.messages import FORGOTTEN
 from ..world.axes import columns
 from ..world.body_frames import body_motion, midway, true_heading, turned
 from ..world.fleet import Fleet

@@ -9,11 +9,11 @@ from dataclasses import dataclass, field
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, instance
 from ..errors import InputError
+from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.motion import NO_MOTION_NOISE
-from ..kernels.solo import ESTIMATE, NO_FIX_YET
-from ..kernels.stars.messages import Assumptions
+from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions
 from ..kernels.stars.star_stream import (
     FIX,
     LAST_AGE,
@@ -28,9 +28,10 @@ from ..kernels.stars.star_stream import (
     resized,
     stream_step,
 )
-from .noise_model import NoiseModel, motion_noise
-from .star import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, relative_noise
-from .stream import MotionHistory, fix_or_none, names_of, numbers, seconds, three
+from .egos import relative_noise
+from .joint_filter import JointFilter
+from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
+from .noise_model import constant_noise, motion_noise
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,24 +78,39 @@ class StarStream:
     until that is `max_age` seconds old; a velocity used for L seconds makes an error of L times its own. Of a vehicle
     that is measured but whose messages never arrive, nothing is assumed.
 
+    For a recording the std of ranges that are finer than their angles bear is raised (`noise_model.resolve`); a stream
+    does not know the ranges to come, and takes what the noise model says.
+
     Args:
-        known: the noise model.
-        refine: one Gauss-Newton step on range and angles.
+        filter: its noise model is "identity" or holds constant noise.
         x0: (3,) m, a position known before the first step; None starts at the first fix.
-        interval: s, the step that the assumed process noise belongs to; None for every step.
+        interval: s, the step that the assumed process noise belongs to: a motion of dt s has dt / interval times its
+            variance. None: every step is one, with the error of one measured velocity, as in a recording.
         history: s, how old a delayed fix may be.
-        max_age: s, older messages are not used.
+        max_age: s, older messages of neighbours are not used.
+
+    Raises:
+        InputError: a noise model that needs a recording, a time that is negative or not finite.
+
+    >>> from coopoc import JointFilter
+    >>> ego = StarStream(JointFilter("identity"))
+    >>> other = RelativeMeasurement("b", [9.0, 0.0, 1.5707963], gnss=[10.0, 0.0, 0.0], velocity=[9.0, 0.0, 0.0])
+    >>> x, _ = ego.step([0.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[other])
+    >>> float(x[0].round(3)), float(ego.neighbours["b"][0].round(3))  # 10 m apart by the fixes, 9 m as measured
+    (0.333, 9.667)
     """
 
     def __init__(
         self,
-        known: NoiseModel,
-        refine: bool,
-        x0: npt.ArrayLike | None,
-        interval: float | None,
-        history: float,
-        max_age: float,
+        filter: JointFilter,
+        x0: npt.ArrayLike | None = None,
+        *,
+        interval: float | None = None,
+        history: float = 10.0,
+        max_age: float = 1.0,
     ) -> None:
+        known = constant_noise(instance("filter", filter, JointFilter).noise_model)
+        refine = filter.exact and known.exact_relative
         motion, fixes = motion_noise(known, interval), known.gnss_variance[None, None, None]
         assumed = Assumptions(
             fixes, fixes, fixes, FIX_GROWTH, *relative_noise(known), FORGOTTEN, ACCELERATION_STD, NO_MOTION_NOISE

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats, Ints, instance, listed, named, number
-from ..errors import InputError
-from ..plugins import suggestion
+from ..errors import InputError, suggestion
 from ..short_repr import short_repr
 from .algebra.sparse import sparse
 from .backend import require_backend

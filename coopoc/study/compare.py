@@ -11,10 +11,9 @@ from typing import Any, TypeAlias
 import numpy as np
 import pandas as pd
 
-from ..errors import InputError
+from ..errors import InputError, unknown
 from ..evaluate.statistics import Interval, paired_difference
 from ..file_names import given_path
-from ..plugins import unknown
 from .manifest import different, read
 from .results import NOTHING, SEED, Results, check_metric, ego_by_run, parsed
 from .style import label, words

@@ -10,9 +10,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ..errors import InputError
+from ..errors import InputError, unknown
 from ..file_names import file_name, given_path
-from ..plugins import unknown
 from . import reference, store
 from .results import Results
 from .study import Study

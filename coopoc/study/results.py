@@ -12,10 +12,9 @@ import pandas as pd
 import pyarrow as pa
 
 from ..arrays import Floats
-from ..errors import InputError
+from ..errors import InputError, unknown
 from ..evaluate.statistics import Interval, mean_interval
 from ..file_names import given_path
-from ..plugins import unknown
 from ..short_repr import short_repr
 from . import store
 from .cell import assignments, parse

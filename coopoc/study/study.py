@@ -11,10 +11,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError
+from ..errors import InputError, unknown
 from ..file_names import file_name
 from ..one_file import file_digest, from_file, in_file
-from ..plugins import find, unknown
+from ..plugins import find
 from .cell import Cell, Params, Row, Scalar, digest, parse
 from .provenance import code_of
 

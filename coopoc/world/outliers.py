@@ -5,9 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Literal, get_args
 
-from ..arrays import instance, listed, number
-from ..errors import InputError
-from ..plugins import one_of, unknown
+from ..arrays import instance, listed, number, one_of
+from ..errors import InputError, unknown
 
 Law = Literal["uniform", "exponential"]
 

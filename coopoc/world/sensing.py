@@ -8,17 +8,17 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from ..arrays import AnyArray, Bools, Floats, Ints, instance, number
+from ..arrays import AnyArray, Bools, Floats, Ints, instance, number, one_of
 from ..errors import InputError
-from ..plugins import one_of
 from .axes import columns
 from .body_frames import body_measurements, body_motion, gauss_markov, in_body
+from .channels import lost
 from .faults import PAIRS, wrong_fixes, wrong_odometry, wrong_relative
 from .fleet import Fleet
 from .links import Links, spherical, wrap
 from .recording import Recording
 from .sensors import Sensors, stream
-from .v2x import V2X, lost
+from .v2x import V2X
 
 Frame = Literal["world", "body"]
 _alive: WeakValueDictionary[tuple[Any, ...], AnyArray] = WeakValueDictionary()

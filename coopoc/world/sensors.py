@@ -8,9 +8,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ..arrays import Floats, instance, listed, number
+from ..arrays import Floats, instance, listed, number, one_of
 from ..errors import InputError, shown
-from ..plugins import one_of
 from .outliers import Outliers
 
 BiasMode = Literal["run", "sample"]

@@ -10,10 +10,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 import pandas as pd
 
-from coopoc.arrays import Floats, checked, instance, named, number
-from coopoc.errors import InputError
+from coopoc.arrays import Floats, checked, instance, named, number, one_of
+from coopoc.errors import InputError, suggestion
 from coopoc.file_names import given_path
-from coopoc.plugins import one_of, suggestion
 from coopoc.short_repr import short_repr
 from coopoc.world.axes import texts
 from coopoc.world.fleet import Fleet

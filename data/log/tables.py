@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.arrays import Bools, Floats
-from coopoc.errors import InputError
-from coopoc.plugins import suggestion
+from coopoc.errors import InputError, suggestion
 
 from ..cells import (
     TABLES,

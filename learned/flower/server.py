@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from coopoc import arrays
+from coopoc.arrays import one_of
 from coopoc.errors import InputError
 from coopoc.escapes import visible
 from coopoc.file_names import given_path
-from coopoc.plugins import one_of
 
 from ..checkpoint import Checkpoint, save
 from ..federation.combine import SERVER, screen

@@ -11,10 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc.arrays import AnyArray, Floats, instance, number
+from coopoc.arrays import AnyArray, Floats, instance, number, one_of
 from coopoc.errors import InputError, shown
-from coopoc.methods.options import check_options
-from coopoc.plugins import one_of
+from coopoc.methods.track import check_options
 from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
 from coopoc.world.sensing import observe

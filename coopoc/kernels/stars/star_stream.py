@@ -15,11 +15,12 @@ from ...arrays import Floats, Ints
 from ..compiling.compile import as_written, inner, inside, storage
 from ..compiling.small import store
 from ..compiling.vectors import LANES
-from ..motion import ROUNDING, MotionNoise, process_variance
-from ..solo import ESTIMATE, NO_FIX_YET, dead_reckon
+from ..dead_reckoning import ESTIMATE, NO_FIX_YET, ROUNDING, dead_reckon
+from ..motion import MotionNoise, process_variance
 from .joint import Joint, joint_in, joint_rows, new_joint
 from .joint_filter import step
 from .messages import (
+    FIX_GROWTH,
     MOVED,
     POSITION,
     PROCESS,
@@ -39,7 +40,6 @@ RELATIVE, MESSAGE, MESSAGE_AGE, VELOCITY, FIX = slice(0, 3), 3, 4, slice(5, 8), 
 LAST, LAST_AGE, LAST_SERVED, PREVIOUS, WIDTH = slice(11, 14), 14, 15, 16, 17
 """Behind it the velocity of its last message m/s, the age of that, how long it has served, s, and the neighbour's index
 in the last star, -1 for none."""
-FIX_GROWTH = (1.0, 0.0)
 
 
 class Noise(NamedTuple):
