@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -77,7 +77,7 @@ def pareto(
         alone = points[-1][0] == 0 or of["method"] == "bound"
         (levels if alone else marks).append((of, min(value for _, value in points) if alone else points))
     shown = [("", levels)]
-    flat = _coinciding(shown, True, NEAR * _height([*shown, ("", [(of, dict(points)) for of, points in marks])], True))
+    flat = _coinciding(shown, True, WIDTH * _height([*shown, ("", [(of, dict(points)) for of, points in marks])], True))
     with canvas(width=7.0) as (figure, panel):
         for of, points in marks:
             sent = [point for point in points if point[0] > 0]
@@ -89,7 +89,11 @@ def pareto(
         plain_log(panel.xaxis)
         plain_log(panel.yaxis)
         panel.set(xlabel=words(x), ylabel=words(y))
-        also = {name_of(group[0]): _joined(group).removeprefix(_label(group[0])) for group in flat}
+        also = {
+            name_of(group[0]): f" ({group[0].get('noise_model')}{_joined(group).removeprefix(_joined(group[:1]))})"
+            for group in flat
+            if len(group) > 1
+        }
         legend(panel, [*(of for of, _ in marks), *(group[0] for group in flat)], also)
     return Plot(figure, caption)
 
@@ -154,11 +158,11 @@ def curves(
                 names = {name: of[name] for name in ("method", "noise_model") if name in of}
                 if len(models) < 2 and of.get("method") != "bound":
                     names["noise_model"] = "none"
-                text = _joined(groups[id(of)])
+                text = _joined(groups[id(of)], models)
                 style = {name: of[name] for name in STYLE if name in of}
                 _draw(axis, names, points, {**style, "label": text} if "label" in of else style)
                 named += [names] if names not in named else []
-                also[name_of(names)] = text.removeprefix(_label(of))
+                also[name_of(names)] = text.removeprefix(_joined([of]))
             for group in _coinciding([(panel, drawn)], log, WIDTH * height_of):
                 leaders = [of for of in group if id(of) in groups]
                 points = next(points for of, points in drawn if of is group[0])
@@ -213,17 +217,15 @@ def _height(shown: Sequence[Any], log: bool) -> float:
     return float(np.log(max(values) / min(values))) if log else max(values)
 
 
-def _label(of: Where) -> str:
-    return str(of.get("label") or look(name_of(of)).label)
-
-
-def _joined(lines: Sequence[Where]) -> str:
-    """Labels of lines that are drawn as one: what they begin with once."""
-    first, *others = dict.fromkeys(map(_label, lines))
+def _joined(lines: Sequence[Where], models: Collection[str] = ()) -> str:
+    """Labels of lines that are drawn as one: what they begin with once, their noise models where there are several."""
+    first, *others = (str(of.get("label") or look(name_of(of)).label) for of in lines)
     start = first[: first.rfind(" ") + 1]
     if start and all(other.startswith(start) for other in others):
         return ", ".join([first, *(other.removeprefix(start) for other in others)])
-    return " = ".join([first, *others])
+    named = [str(of.get("noise_model")) for of in lines[1:]]
+    shown = [f"{n}, {m}" if len(models) > 1 and m in models else n for n, m in zip(others, named, strict=True)]
+    return " = ".join([first, *shown])
 
 
 def multiples(
