@@ -27,7 +27,7 @@ SURVEY: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "correlated_gnss": ("If GNSS errors are time-correlated?", ("own", "common")),
     "latency_loss": ("If messages are late or lost?", ("late", "lost one by one")),
     "heading_error": ("If the heading is not known?", ("cost, K = 2", "estimated, K = 2")),
-    "robustness": ("If neighbours are spoofed?", ("K = 4", "K = 10")),
+    "robustness": ("If measurements are wrong or neighbours spoofed?", ("5 % long ranges", "20 % spoofed")),
     "consistency": ("Which methods are consistent?", ("credible",)),
 }
 """Study -> question, and the keys of the findings that answer it."""
@@ -56,7 +56,7 @@ def paper(
         jobs: number of worker processes.
         data: fleet to test on, a name or a path.
     """
-    from coopoc.data.fleet_store import in_words
+    from coopoc.data.fleet_cards import in_words
     from coopoc.data.registry import DATASETS, card
 
     def answers(results: Mapping[str, Results]) -> dict[str, str]:
