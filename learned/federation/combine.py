@@ -114,9 +114,8 @@ def combine(rule: Rule, standing: Standing, answers: Mapping[str, Answer]) -> tu
     combined, state = rule(standing.state, theta, weights, sizes)
     if combined.shape != theta.shape:
         allowed = f"must have the shape {tuple(theta.shape)} of the net's weights"
-        raise InputError(
-            "aggregate", f"{rule.name} -> {tuple(combined.shape)}", allowed, "Combine over the clients only."
-        )
+        shape = f"{rule.name} -> {tuple(combined.shape)}"
+        raise InputError("aggregate", shape, allowed, "Combine over the clients only.")
     if not all(bool(part.isfinite().all()) for part in (combined, *state)):
         return unchanged, rejected, f"{rule.name} gives weights that are not finite: weights unchanged"
     return Standing(combined.to(theta.dtype), state, usual), rejected, ""

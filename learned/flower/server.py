@@ -157,11 +157,9 @@ def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object]) -> A
             good = {name: reply for name, reply in answers.items() if name not in rejected}
             pieces, losses = _numbers(good, "num-examples"), _numbers(good, "training-loss")
             combined, metrics = super().aggregate_train(server_round, list(good.values()))
-            now = (
-                self.row.weights
-                if combined is None
-                else torch.from_numpy(combined["theta"].numpy().copy()).to(theta.dtype)
-            )
+            now = self.row.weights
+            if combined is not None:
+                now = torch.from_numpy(combined["theta"].numpy().copy()).to(theta.dtype)
             self.row = Row(server_round, now, losses, {}, {n: int(k) for n, k in pieces.items()}, rejected)
             return combined, metrics
 
