@@ -13,8 +13,7 @@ from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.links import wrap
 
-from ..assemble import SAME, longest_gap, smooth
-from ..planar import steps_of
+from ..assemble import SAME, longest_gap, smooth, steps_of
 from .units import Rows, Summary, in_group, place
 
 MOVING = 1.0
