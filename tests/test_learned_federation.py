@@ -21,7 +21,6 @@ from coopoc.learned import Client, GainNet, Schedule, clients, federate
 from coopoc.learned.federation.combine import SERVER, Answer, Standing, combine, screen
 from coopoc.learned.federation.federate import Plan, federate_many
 from coopoc.learned.federation.history import Federation, Round, ledger
-from coopoc.learned.federation.local import adapt, local_fit
 from coopoc.learned.federation.participation import Byzantine, Participation, heterogeneous, poisoned
 from coopoc.learned.federation.rules import (
     RULES,
@@ -36,12 +35,9 @@ from coopoc.learned.federation.rules import (
     uniform,
 )
 from coopoc.learned.nets.gain import Gain
-from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch, Noise
-from coopoc.learned.training.fit import Judge, pooled
+from coopoc.learned.training.fit import Judge
 from coopoc.methods.track import Method
-
-PLAIN = Schedule(weight_decay=0.0, mirror=False, clip=1e9)
 
 
 class Steady(Gain):
@@ -66,13 +62,6 @@ class Steady(Gain):
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         raise NotImplementedError
-
-
-class Bowl(Steady):
-    """||theta - b||^2 with b the mean of a piece's truth: the federation's minimiser is the mean of all pieces' b."""
-
-    def losses(self, theta: Tensor, batch: Batch) -> Tensor:
-        return (theta[:, None] - batch.truth.mean(0)).square().sum(-1)
 
 
 def drives(count: int = 4, steps: int = 130, seed: int = 0) -> Fleet:
@@ -106,30 +95,6 @@ def test_the_order_of_the_clients_changes_nothing(four: tuple[Client, ...], opti
         assert torch.equal(a.weights, c.weights)
         assert (a.sent, a.absent) == (b.sent, b.absent) == (c.sent, c.absent)
     assert not torch.equal(one.history[-1].weights, trained(four, seed=4, **options).history[-1].weights)
-
-
-def test_a_client_alone_is_its_row_of_the_stack(four: tuple[Client, ...]) -> None:
-    """`local_fit` is what `adapt` makes of the client among others, bit for bit."""
-    theta = flatten([Steady(0.2 + 0.1 * i) for i in range(4)])
-    local = Schedule(epochs=2, epoch="pass", batch=3)
-    stacked, (pool, members) = theta.clone(), pooled([c.training for c in four])
-    losses, broken = adapt(stacked, Steady(), pool, members, [(5, c.name) for c in four], 2, 6, local)
-    assert not broken
-    for row, client in enumerate(four):
-        alone, loss, reason = local_fit(Steady(), theta[row], client, 5, 2, 6, local)
-        assert torch.equal(alone, stacked[row])
-        assert (loss, reason) == (float(losses[row]), None)
-    assert torch.equal(theta[0], torch.full((3,), 0.2))
-
-
-def test_a_client_alone_says_why_it_broke(four: tuple[Client, ...]) -> None:
-    broken = replace(four[0].training, gnss=torch.full_like(four[0].training.gnss, torch.nan))
-    weights, loss, reason = local_fit(
-        Steady(), flatten([Steady()])[0], replace(four[0], training=broken), 0, 1, 2, Schedule(epochs=1, epoch="pass")
-    )
-    assert torch.equal(weights, torch.full((3,), 0.3))
-    assert np.isnan(loss)
-    assert reason == "loss or gradient not finite at step 1"
 
 
 @dataclass(frozen=True)
@@ -279,19 +244,6 @@ def test_poisoned_data_and_poisoned_updates(four: tuple[Client, ...]) -> None:
     assert losses[0] < losses[1]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("aggregate", ["mean", "multi_krum"])
-def test_a_net_is_federated_the_same_way(aggregate: str) -> None:
-    """GainNet with all options at once moves, stays finite and repeats to the last bit."""
-    group, net = clients(drives(6), piece=10), GainNet(2, 1)
-    options: dict[str, Any] = {"participation": Participation(0.9)}
-    fed, again = (trained(group, 2, model=net, aggregate=aggregate, seed=1, **options) for _ in range(2))
-    path = torch.stack([row.weights for row in fed.history])
-    assert path.isfinite().all()
-    assert path.diff(dim=0).norm() > 0
-    assert torch.equal(path, torch.stack([row.weights for row in again.history]))
-
-
 @pytest.mark.parametrize("noise", ["static", "fresh", "wide"])
 def test_a_score_does_not_depend_on_who_is_judged_beside(noise: Noise) -> None:
     """Bit for bit, with pieces of different number, and equal to the mean of the pieces' losses on one draw."""
@@ -306,21 +258,6 @@ def test_a_score_does_not_depend_on_who_is_judged_beside(noise: Noise) -> None:
         torch.testing.assert_close(together[row], torch.stack(by_hand).max())
         off = torch.cat([(batch.gnss - batch.truth).flatten() for batch, _ in alone.batches])
         assert noise == "wide" or float(off.std()) == pytest.approx(1.5, rel=0.2)
-
-
-def test_a_net_alone_is_its_row_of_the_stack(four: tuple[Client, ...]) -> None:
-    """The compiled net's gradients do not depend on who is computed beside it: `local_fit` is `adapt`, bit for bit."""
-    pytest.importorskip("numba")
-    theta = flatten([GainNet(2, 1, seed=i) for i in range(4)])
-    stacked, (pool, members) = theta.clone(), pooled([c.training for c in four])
-    local = Schedule(epochs=2, epoch="pass")
-    losses, _ = adapt(stacked, GainNet(2, 1), pool, members, [(5, c.name) for c in four], 1, 3, local)
-    scores = Judge([[c.validation for c in four], [c.long for c in four]], GainNet(2, 1))(stacked)
-    for row, client in enumerate(four):
-        alone, loss, _ = local_fit(GainNet(2, 1), theta[row], client, 5, 1, 3, local)
-        assert torch.equal(alone, stacked[row])
-        assert loss == float(losses[row])
-        assert Judge([[client.validation], [client.long]], GainNet(2, 1))(alone[None]) == scores[row]
 
 
 SIZES = torch.tensor([3, 1, 5, 2, 4, 1, 6])
@@ -445,12 +382,6 @@ def test_trimmed_mean_is_that_of_scipy(share: float) -> None:
         np.testing.assert_allclose(combined(TrimmedMean(share), weights, SIZES[:count]), theirs, rtol=1e-12)
 
 
-@pytest.mark.parametrize("count", [1, 2, 4, 7])
-def test_median_is_that_of_numpy(count: int) -> None:
-    weights = answers(count)
-    np.testing.assert_array_equal(combined(RULES["median"], weights), np.median(weights.numpy(), axis=0))
-
-
 @pytest.mark.parametrize("name", sorted(RULES))
 def test_every_rule_keeps_what_all_agree_on(name: str) -> None:
     """Law: equal answers give themselves; the adaptive servers move towards them."""
@@ -503,31 +434,6 @@ def test_krum_says_how_many_clients_it_needs() -> None:
     with pytest.raises(InputError, match=r"4 with byzantine = 1: Krum needs more than 2 f \+ 2 = 4 clients"):
         krum_scores(answers(4), 1)
     assert (Krum(1).least, Krum(1, keep=9).least, RULES["median"].least) == (5, 9, 1)
-
-
-UPDATE = answers(1, 19_938, seed=9)[0].float() * 1e-2
-
-
-def bad(theta: Tensor) -> dict[str, Tensor]:
-    """Three answers that cannot be right."""
-    return {"nan": theta + torch.nan, "shape": theta[:-1], "far": theta + 10.0 * UPDATE * 100}
-
-
-@pytest.mark.parametrize("honest", [1, 2, 5])
-@pytest.mark.parametrize("which", [("nan",), ("shape",), ("far",), ("nan", "shape", "far")])
-def test_the_guard_rejects_what_cannot_be_right_and_nothing_else(honest: int, which: tuple[str, ...]) -> None:
-    """A thousand times too large is found among five honest answers as beside one, alone and with other faults."""
-    theta = torch.randn(19_938, generator=torch.Generator().manual_seed(2)) * 0.1
-    answers_ = {f"honest{i}": theta + UPDATE.roll(i) for i in range(honest)}
-    reasons, usual = screen(theta, answers_ | {name: bad(theta)[name] for name in which})
-    assert set(reasons) == set(which)
-    assert usual == pytest.approx(float(UPDATE.norm()), rel=1e-3)
-    words = {
-        "nan": "19938 of 19938 weights are not finite",
-        "shape": "weights of shape (19937,), the net has (19938,)",
-        "far": f"changes the weights by {1000 * float(UPDATE.norm()):.3g}",
-    }
-    assert all(words[name] in reasons[name] for name in which)
 
 
 def test_the_guard_remembers_what_is_usual() -> None:

@@ -26,11 +26,11 @@ from coopoc import (
     stars,
 )
 from coopoc.kernels.solo import FixNoise
+from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.kernels.stars.relative import angle
 from coopoc.methods.drift_filter import DriftFilter
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.noise_model import resolve
-from coopoc.methods.star import ESTIMATE_GROWTH
 from coopoc.methods.track import Method
 from coopoc.world.links import spherical, to_vector, vector_cov
 
@@ -159,13 +159,15 @@ def test_the_filter_is_its_oracle(crossing: Fleet, pair: Any, channel: str) -> N
 def test_it_is_with_missing_fixes_and_measurements(
     crossing: Fleet, pair: Any, damage: Callable[..., Recording]
 ) -> None:
+    """A missing component is no row of the dense oracle; in the kernel of covariance intersection its deviation of 1e3
+    leaves it 1e-8 of the information of others."""
     sensors = DRIFTING if isinstance(pair[0], DriftFilter) else S2
-    recording = observe(crossing, sensors, V2X(max_neighbours=4, loss=0.2), runs=2, observers=[0])
-    recording = damage(recording)
-    if damage is partial and isinstance(pair[0], MSMV | CovarianceIntersection | LKFSA):
+    recording = damage(observe(gappy(crossing), sensors, V2X(4, loss=0.2), runs=2, observers=[0]))
+    if damage is partial and isinstance(pair[0], MSMV | LKFSA):
         assert np.isfinite(pair[0](recording, [0]).x).all()
         return
-    assert_is_the_oracle(*pair, recording, 1e-6)
+    coarse = damage is partial and isinstance(pair[0], CovarianceIntersection)
+    assert_is_the_oracle(*pair, recording, 1e-4 if coarse else 1e-6)
 
 
 @pytest.mark.parametrize("runs", [1, 3, 5])
@@ -274,21 +276,3 @@ def test_the_laplacian_filter_equals_filterpy(formation: Fleet) -> None:
                 peer.x = first + peer.P @ weight @ (z - peer.H @ first)
             assert track.x[1, t, 0, c] == pytest.approx(peer.x[0], abs=1e-9)
             assert track.covariance[1, t, 0, c, c] == pytest.approx(peer.P[0, 0], rel=1e-9)
-
-
-def test_pseudo_fixes_are_fused_as_information(formation: Fleet) -> None:
-    """The first step in closed form: fix, and each neighbour's fix less the measurement, weighted by their
-    covariances."""
-    fleet = formation.select(range(4)).between(0, 2)
-    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
-    track = MSMV("nominal")(recording, [0])
-    assert track.covariance is not None
-    at = recording.links.of(0)[:3]
-    fixes, seen = recording.gnss[1, 0], recording.relative[1, at]
-    own = np.diag(np.square(S2.gnss_std))
-    weight = np.linalg.inv([own, *(own + vector_cov(seen, S2.relative_std, S2.min_range))])
-    positions = np.stack([fixes[0], *(fixes[recording.links.neighbour[at]] - to_vector(seen))])
-    cov = np.linalg.inv(np.eye(3) / 1e6 + weight.sum(axis=0))
-    x = fixes[0] + cov @ np.einsum("kij,kj->i", weight, positions - fixes[0])
-    assert track.x[1, 0, 0] == pytest.approx(x, abs=1e-9)
-    assert track.covariance[1, 0, 0] == pytest.approx(cov, rel=1e-9, abs=1e-12)

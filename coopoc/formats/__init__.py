@@ -6,9 +6,8 @@ from collections.abc import Iterable
 from pathlib import Path
 
 from ..arrays import instance
-from ..errors import InputError
+from ..errors import InputError, suggestion
 from ..file_names import given_path
-from ..plugins import suggestion
 from .g2o import read_g2o, write_g2o
 from .graph import Graph
 from .jrl import read_jrl

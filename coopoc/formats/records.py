@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats, Ints
-from ..errors import InputError
-from ..plugins import suggestion
+from ..errors import InputError, suggestion
 from .graph import ENDS, Edges, Graph, edges_of
 from .values import inverse, malformed, symmetric, to_numbers, to_text, upper_triangle
 

@@ -9,10 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import Floats, frozen
+from ..arrays import Floats, frozen, one_of
 from ..errors import InputError
 from ..file_names import given_path
-from ..plugins import one_of
 from ..short_repr import short_repr
 from .values import UNIT, read_table, to_orientation, to_rotation, to_text
 

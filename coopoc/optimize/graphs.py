@@ -9,11 +9,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..arrays import Floats, frozen, instance
+from ..arrays import Floats, frozen, instance, one_of
 from ..errors import InputError
 from ..formats import load_graph
 from ..formats.graph import ENDS, Graph
-from ..plugins import one_of
 from .algebra.sparse import keep
 from .model.factor import Factor
 from .model.problem import Problem, Search

@@ -1,8 +1,8 @@
-"""Figures of a study: a metric over an axis, its distribution, its bytes, and methods over a case."""
+"""Figures of a study: a metric over an axis, its bytes, and methods over a case."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -14,24 +14,16 @@ from ..escapes import picture
 from ..evaluate.statistics import Interval
 from .numbers import Number, Where, interval, mean, ran
 from .plot import Plot, canvas, legend, name_of, plain_log, strokes
-from .style import NEUTRAL, SYMBOLS, Panel, label, look, title, words
+from .style import NEUTRAL, Panel, look, words
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from .results import Results
 
-__all__ = ["Plot", "cdf", "curves", "multiples", "pareto", "sweep"]
+__all__ = ["Plot", "curves", "multiples", "pareto", "sweep"]
 
 
 def sweep(
-    results: Results,
-    x: str,
-    y: str = "rt_le_m",
-    where: Where | None = None,
-    caption: str = "",
-    log: bool = False,
-    facet: str = "",
+    results: Results, x: str, y: str = "rt_le_m", where: Where | None = None, caption: str = "", log: bool = False
 ) -> Plot:
     """Plot a metric against an axis: one line per method and noise model with its 95 % band; "bound" is dashed.
 
@@ -42,69 +34,24 @@ def sweep(
         x: column of the horizontal axis.
         y: metric.
         where: column -> value or values.
-        caption: under the figure; default the metric, the axis and what `where` selects.
+        caption: under the figure; default the metric and the axis.
         log: logarithmic vertical axis.
-        facet: column of which each value has a panel of its own.
 
     Raises:
         InputError: as `Results.summary`.
     """
-    rows, base = results.select(where), dict(where or {})
-    by = [name for name in _line_names(results, x, facet) if name != facet]
-    faces = rows[facet].unique() if facet else [""]
-    at = {value: {x: value} for value in sorted(rows[x].unique())}
-    panels = [
-        Panel(at, {**base, **({facet: face} if facet else {})}, title(facet, face) if facet else "", words(x))
-        for face in faces
-    ]
-    lines = [names for names, _ in _groups(rows, by)]
-    text = f"{words(y)} against {words(x)}{_selected(where)}. Bands: 95 % intervals over egos, then runs."
-    number = partial(interval, value=y)
-    width = 6.4 if len(panels) == 1 else None
-    plot = curves(results, panels, lines, caption or text, number, ylabel=words(y), log=log, width=width)
+    rows = results.select(where)
+    panel = Panel({value: {x: value} for value in sorted(rows[x].unique())}, dict(where or {}), xlabel=words(x))
+    lines = rows[_line_names(results, x)].drop_duplicates().to_dict("records")
+    text = caption or f"{words(y)} against {words(x)}. Bands: 95 % intervals over egos, then runs."
+    plot = curves(results, [panel], lines, text, partial(interval, value=y), ylabel=words(y), log=log, width=6.4)
     if plot is None:
         raise InputError(y, "no value", "must have been computed for a cell", "See the failed cells.")
     return plot
 
 
-def cdf(results: Results, value: str = "error_quantiles_m", where: Where | None = None, caption: str = "") -> Plot:
-    """Plot the share of errors below each value, with a marker at the mean of the per-run maxima.
-
-    Args:
-        results: of the study.
-        value: column of lists: equally likely quantiles of the errors of one run and ego, the last its maximum.
-        where: column -> value or values.
-        caption: under the figure.
-
-    Raises:
-        InputError: an unknown column or value.
-    """
-    drawn: list[dict[str, Any]] = []
-    maxima: dict[str, list[str]] = {}
-    with canvas() as (figure, axes):
-        for key, frame in results.groups(by := _line_names(results), where):
-            names = dict(zip(by, key, strict=True))
-            errors = np.sort(np.concatenate(frame[value].to_list()))
-            share = np.arange(1, len(errors) + 1) / len(errors)
-            worst = float(np.mean([np.max(q) for q in frame[value]]))
-            axes.plot(errors, share, **{**strokes(names), "marker": None})
-            axes.plot(worst, np.interp(worst, errors, share), **{**strokes(names), "linestyle": "none"}, zorder=3)
-            drawn.append(names)
-            maxima.setdefault(name_of(names), []).append(f"{worst:.1f}")
-        axes.set(xlabel="Error [m]", ylabel="Share of time steps below", ylim=(0, 1.02))
-        plain_log(axes.xaxis)
-        axes.set_xlim(left=0.1)
-        legend(axes, drawn, {method: f" (max {' / '.join(each)} m)" for method, each in maxima.items()})
-    text = f"Cumulative distribution of the error{_selected(where)}. Markers: mean of the per-run maxima."
-    return Plot(figure, caption or text)
-
-
 def pareto(
-    results: Results,
-    x: str = "bytes_per_second",
-    y: str = "rt_le_m",
-    where: Where | None = None,
-    caption: str = "",
+    results: Results, caption: str, x: str = "bytes_per_second", y: str = "rt_le_m", where: Where | None = None
 ) -> Plot:
     """Plot a metric against received bytes per second, a mark per cell; a line joins those that no cheaper one beats.
 
@@ -112,10 +59,10 @@ def pareto(
 
     Args:
         results: of the study.
+        caption: under the figure.
         x: bytes per second of online cooperation.
         y: metric.
         where: column -> value or values.
-        caption: under the figure.
 
     Raises:
         InputError: as `Results.summary`.
@@ -123,23 +70,32 @@ def pareto(
     names = _line_names(results)
     summary = results.summary(axes := [a for a in results.axes if a != "train_seed"], y, where)
     summary["bytes"] = results.summary(axes, x, where)["mean"]
-    drawn = []
+    marks, levels = list[tuple[Where, Any]](), list[tuple[Where, Any]]()
+    for key, group in summary.dropna(subset=["mean"]).groupby(names, sort=False):
+        of = dict(zip(names, key, strict=True))
+        points = sorted(zip(group["bytes"], group["mean"], strict=True))
+        alone = points[-1][0] == 0 or of["method"] == "bound"
+        (levels if alone else marks).append((of, min(value for _, value in points) if alone else points))
+    shown = [("", levels)]
+    flat = _coinciding(shown, True, WIDTH * _height([*shown, ("", [(of, dict(points)) for of, points in marks])], True))
     with canvas(width=7.0) as (figure, panel):
-        for of, group in _groups(summary.dropna(subset=["mean"]), names):
-            points = sorted(zip(group["bytes"], group["mean"], strict=True))
-            if points[-1][0] == 0 or of["method"] == "bound":
-                _draw(panel, of, min(value for _, value in points))
-            else:
-                sent = [point for point in points if point[0] > 0]
-                panel.plot(*zip(*sent, strict=True), **{**strokes(of), "linestyle": "none"})
-                best = [p for k, p in enumerate(sent) if all(p[1] < other[1] for other in sent[:k])]
-                panel.plot(*zip(*best, strict=True), **{**strokes(of), "marker": "", "linewidth": 0.8})
-            drawn.append(of)
+        for of, points in marks:
+            sent = [point for point in points if point[0] > 0]
+            panel.plot(*zip(*sent, strict=True), **{**strokes(of), "linestyle": "none"})
+            best = [p for k, p in enumerate(sent) if all(p[1] < other[1] for other in sent[:k])]
+            panel.plot(*zip(*best, strict=True), **{**strokes(of), "marker": "", "linewidth": 0.8})
+        for group in flat:
+            _draw(panel, group[0], next(value for of, value in levels if of is group[0]))
         plain_log(panel.xaxis)
         plain_log(panel.yaxis)
         panel.set(xlabel=words(x), ylabel=words(y))
-        legend(panel, drawn)
-    return Plot(figure, caption or f"{words(y)} against {words(x)}.")
+        also = {
+            name_of(group[0]): f" ({group[0].get('noise_model')}{_joined(group).removeprefix(_joined(group[:1]))})"
+            for group in flat
+            if len(group) > 1
+        }
+        legend(panel, [*(of for of, _ in marks), *(group[0] for group in flat)], also)
+    return Plot(figure, caption)
 
 
 STYLE = ("label", "color", "marker", "linestyle", "linewidth")
@@ -177,7 +133,7 @@ def curves(
         log: logarithmic vertical axis; a linear one starts at zero.
         logx: logarithmic horizontal axes.
     """
-    every, found = [*lines, *levels], []
+    every, shown = [*lines, *levels], []
     models = {str(of.get("noise_model")) for of in every if of.get("method") != "bound"} - {"none", "trained"}
     for panel in panels:
         drawn: list[tuple[Where, Any]] = []
@@ -187,19 +143,33 @@ def curves(
             drawn += [(of, ran(points))] if ran(points) else []
         if drawn or len(panels) == 1:
             flat = [(of, number(results, {**panel.where, **of})) for of in levels]
-            found.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
-    if not any(drawn for _, drawn in found):
+            shown.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
+    if not any(drawn for _, drawn in shown):
         return None
-    named: list[dict[str, Any]] = []
-    size = {"width": width or 2.2 + 2.1 * len(found) + (len(found) == 1), "height": height}
-    with canvas(1, len(found), sharey=True, squeeze=False, **size) as (figure, (axes,)):
-        for axis, (panel, drawn) in zip(axes, found, strict=True):
+    height_of = _height(shown, log)
+    groups = {id(group[0]): group for group in _coinciding(shown, log, NEAR * height_of)}
+    size = {"width": width or 2.2 + 2.1 * len(shown) + (len(shown) == 1), "height": height}
+    with canvas(1, len(shown), sharey=True, squeeze=False, **size) as (figure, (axes,)):
+        named, also = list[dict[str, Any]](), dict[str, str]()
+        for axis, (panel, drawn) in zip(axes, shown, strict=True):
             for of, points in drawn:
+                if id(of) not in groups:
+                    continue
                 names = {name: of[name] for name in ("method", "noise_model") if name in of}
                 if len(models) < 2 and of.get("method") != "bound":
                     names["noise_model"] = "none"
-                _draw(axis, names, points, {name: of[name] for name in STYLE if name in of})
+                text = _joined(groups[id(of)], models)
+                style = {name: of[name] for name in STYLE if name in of}
+                _draw(axis, names, points, {**style, "label": text} if "label" in of else style)
                 named += [names] if names not in named else []
+                also[name_of(names)] = text.removeprefix(_joined([of]))
+            for group in _coinciding([(panel, drawn)], log, WIDTH * height_of):
+                leaders = [of for of in group if id(of) in groups]
+                points = next(points for of, points in drawn if of is group[0])
+                if len(leaders) > 1 and isinstance(points, Mapping):
+                    x, y = list(points.items())[-1]
+                    below = {"xytext": (0, 5), "textcoords": "offset points", "ha": "right", "fontsize": 7}
+                    axis.annotate(_joined(leaders), (x, _mean(y)), **below)
             axis.set(title=picture(panel.title), xlabel=panel.xlabel)
             if logx:
                 plain_log(axis.xaxis)
@@ -210,8 +180,52 @@ def curves(
         if any("label" in of for of in every):
             axes[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
         else:
-            legend(axes[-1], named)
+            legend(axes[-1], named, also)
     return Plot(figure, caption)
+
+
+NEAR, WIDTH = 0.015, 0.009
+"""Shares of the height of a panel: within the first, lines are drawn and named as one if they are so in every panel;
+within the second, a line's width, they are named together in a panel."""
+
+
+def _coinciding(shown: Sequence[Any], log: bool, near: float) -> list[list[Where]]:
+    """Lines, each with those that lie near it at every point of every panel; a bound stands alone."""
+    lines: dict[int, tuple[Where, dict[Any, float]]] = {}
+    for panel, (_, drawn) in enumerate(shown):
+        for of, points in drawn:
+            values = points if isinstance(points, Mapping) else {"": points}
+            heights = {(panel, x): np.log(_mean(v)) if log else _mean(v) for x, v in values.items()}
+            lines.setdefault(id(of), (of, {}))[1].update(heights)
+    groups: list[list[Where]] = []
+    for of, heights in lines.values():
+        for group in groups:
+            other = lines[id(group[0])][1]
+            same = heights.keys() == other.keys() and all(abs(heights[at] - y) <= near for at, y in other.items())
+            if same and "bound" not in (of.get("method"), group[0].get("method")):
+                group.append(of)
+                break
+        else:
+            groups.append([of])
+    return groups
+
+
+def _height(shown: Sequence[Any], log: bool) -> float:
+    """What the lines of all panels span, from zero or in the logarithm."""
+    points = [points if isinstance(points, Mapping) else {"": points} for _, drawn in shown for _, points in drawn]
+    values = [_mean(value) for each in points for value in each.values()]
+    return float(np.log(max(values) / min(values))) if log else max(values)
+
+
+def _joined(lines: Sequence[Where], models: Collection[str] = ()) -> str:
+    """Labels of lines that are drawn as one: what they begin with once, their noise models where there are several."""
+    first, *others = (str(of.get("label") or look(name_of(of)).label) for of in lines)
+    start = first[: first.rfind(" ") + 1]
+    if start and all(other.startswith(start) for other in others):
+        return ", ".join([first, *(other.removeprefix(start) for other in others)])
+    named = [str(of.get("noise_model")) for of in lines[1:]]
+    shown = [f"{n}, {m}" if len(models) > 1 and m in models else n for n, m in zip(others, named, strict=True)]
+    return " = ".join([first, *shown])
 
 
 def multiples(
@@ -237,7 +251,9 @@ def multiples(
     size = {"width": 1.9 + 1.75 * len(cases), "height": 0.9 + 0.21 * len(rows)}
     with canvas(1, len(cases), sharex=True, sharey=True, squeeze=False, **size) as (figure, (axes,)):
         for panel, case in zip(axes, cases, strict=True):
-            panel.axvspan(1.0, (target or {}).get(case, 1.0), color=NEUTRAL, alpha=0.35, linewidth=0)
+            if case in (target or {}):
+                panel.axvspan(1.0, target[case], color=NEUTRAL, alpha=0.35, linewidth=0, label="target")
+                panel.legend(loc="lower right")
             panel.axvline(1.0, color="black", linewidth=0.9)
             for row, ((method, _), each) in enumerate(rows.items()):
                 values = each.get(case, ())
@@ -245,7 +261,7 @@ def multiples(
                 panel.plot(values, np.full(len(values), row), **style)
             panel.set(title=case, xlabel="× reference")
             plain_log(panel.xaxis)
-        labels = [look(m).label + ("" if known in ("trained", "none") else f", {known}") for m, known in rows]
+        labels = [look(m).label + ("" if model in ("trained", "none") else f", {model}") for m, model in rows]
         axes[0].set(yticks=range(len(rows)), yticklabels=labels, ylim=(len(rows) - 0.4, -0.6))
     return Plot(figure, caption)
 
@@ -256,39 +272,24 @@ def _line_names(results: Results, *across: str) -> list[str]:
     return usual if "method" in usual else [name for name in results.axes if name not in across]
 
 
-def _groups(frame: pd.DataFrame, by: Sequence[str]) -> list[tuple[dict[str, Any], pd.DataFrame]]:
-    """Rows of each combination of the columns `by`, with its names, in order of first appearance."""
-    if not by:
-        return [({}, frame)]
-    return [(dict(zip(by, k, strict=True)), g) for k, g in frame.groupby(list(by), sort=False, dropna=False)]
+def _mean(point: Any) -> float:
+    return float(point.mean if isinstance(point, Interval) else point)
 
 
-def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> bool:
-    """Draw a line through points, an Interval with its band, or a number across the panel; False without a number."""
+def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> None:
+    """Draw a line through points, an Interval with its band, or a number across the panel."""
     options = {**strokes(names), **(style or {})}
     if not isinstance(points, Mapping):
-        value = points.mean if isinstance(points, Interval) else points
-        axes.axhline(value, **{**options, "marker": ""})
-        return True
-    means = {x: one.mean if isinstance(one, Interval) else one for x, one in points.items()}
-    bands = {x: one for x, one in points.items() if isinstance(one, Interval)}
-    axes.plot(list(means), list(means.values()), **options)
+        axes.axhline(_mean(points), **{**options, "marker": ""})
+        return
+    bands = {x: point for x, point in points.items() if isinstance(point, Interval)}
+    axes.plot(list(points), list(map(_mean, points.values())), **options)
     if bands:
-        ends = [one.low for one in bands.values()], [one.high for one in bands.values()]
+        ends = [point.low for point in bands.values()], [point.high for point in bands.values()]
         axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0)
-    return bool(means)
 
 
 def _vertical(axes: Axes, text: str, log: bool) -> None:
     axes.set(ylabel=text, **({} if log else {"ylim": (0, None)}))
     if log:
         plain_log(axes.yaxis)
-
-
-def _selected(where: Where | None) -> str:
-    """What a figure is restricted to, for its caption."""
-    texts = []
-    for column, value in (where or {}).items():
-        values = value if isinstance(value, list | tuple) else [value]
-        texts.append(f"{SYMBOLS.get(column, words(column))} = {' or '.join(label(column, one) for one in values)}")
-    return f" at {', '.join(texts)}" if texts else ""

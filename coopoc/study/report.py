@@ -45,6 +45,7 @@ def report(
     lead: Sequence[str] = (),
     answers: Mapping[str, str] | None = None,
     cards: Mapping[str, Mapping[str, Any]] | None = None,
+    first: str = "",
 ) -> Path:
     """Write one page that shows several studies, and return its path.
 
@@ -55,6 +56,7 @@ def report(
         lead: sentences under the title, before the first study.
         answers: question -> answer, shown after the lead; default each study's question with its first finding.
         cards: name of a data set -> field -> value.
+        first: study whose first figure opens the page; default the first that has one.
 
     Raises:
         InputError: no folder, a folder that holds no study, two studies of one name, or an `out` that is a folder.
@@ -66,12 +68,13 @@ def report(
     names = [section["name"] for section in sections]
     if not sections or len(set(names)) < len(names):
         raise InputError("folders", names, "must be at least one, of different studies", "Give coopoc report FOLDER.")
-    first = next(({**s["figures"][0][0], "section": s["name"]} for s in sections if s["figures"]), None)
+    opening = [{**s["figures"][0][0], "section": s["name"]} for s in sections if s["figures"]]
+    opening.sort(key=lambda figure: figure["section"] != first)
     page = _template().render(
         title=title or f"coopoc: {', '.join(section['title'] for section in sections)}",
         lead=lead,
         answers=answers or {s["question"]: next(iter(s["findings"].values())) for s in sections if s["findings"]},
-        first=first if len(sections) > 1 else None,
+        first=opening[0] if opening and len(sections) > 1 else None,
         sections=sections,
         cards=cards or {},
         environment=environments([section["environment"] for section in sections]),
@@ -104,12 +107,12 @@ def _section(folder: Path) -> dict[str, Any]:
 
 def _blocks(shown: Sequence[Mapping[str, Any]]) -> list[list[dict[str, Any]]]:
     """Views in their order, those that differ in the noise model alone together, each with its noise model."""
-    found: dict[tuple[str, bool], list[dict[str, Any]]] = {}
+    blocks: dict[tuple[str, bool], list[dict[str, Any]]] = {}
     for view in shown:
-        stem, _, known = view["name"].rpartition("_")
-        key = (stem, True) if known in NOISE_MODELS else (view["name"], False)
-        found.setdefault(key, []).append({**view, "noise_model": known})
-    return list(found.values())
+        stem, _, model = view["name"].rpartition("_")
+        key = (stem, True) if model in NOISE_MODELS else (view["name"], False)
+        blocks.setdefault(key, []).append({**view, "noise_model": model})
+    return list(blocks.values())
 
 
 def _table(view: Mapping[str, Any], study: str) -> dict[str, Any]:
@@ -171,13 +174,13 @@ def explained(text: object) -> Markup:
     >>> explained("KF < KF")
     Markup('<abbr title="Kalman filter">KF</abbr> &lt; KF')
     """
-    seen: set[str] = set()
+    earlier: set[str] = set()
 
-    def one(match: re.Match[str]) -> str:
+    def marked(match: re.Match[str]) -> str:
         term = match[0]
-        if term in seen:
+        if term in earlier:
             return term
-        seen.add(term)
+        earlier.add(term)
         return f'<abbr title="{escape(TERMS[term])}">{term}</abbr>'
 
-    return Markup(_TERM.sub(one, str(escape(uncontrolled(str(text))))))
+    return Markup(_TERM.sub(marked, str(escape(uncontrolled(str(text))))))

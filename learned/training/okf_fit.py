@@ -78,10 +78,10 @@ def fit_okf_many(
     for step in watched(range(steps), progress, "step"):
         if step % 25 == 0 or step == steps - 1:
             with torch.no_grad():
-                found = _loss(like.stds(logs), *judge)
-            better = found < lowest
-            best[better], lowest[better] = logs.detach()[better], found[better]
-            history.append(found.tolist())
+                validated = _loss(like.stds(logs), *judge)
+            better = validated < lowest
+            best[better], lowest[better] = logs.detach()[better], validated[better]
+            history.append(validated.tolist())
         adam.zero_grad()
         _loss(like.stds(logs), *data).sum().backward()
         adam.step()

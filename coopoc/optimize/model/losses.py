@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ...arrays import Floats, number
-from ...plugins import one_of
+from ...arrays import Floats, number, one_of
 
 LOSSES: dict[str, tuple[Callable[[Any, float, Any], Any], Callable[[Floats, float], Floats]]] = {
     "huber": (

@@ -8,10 +8,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ...arrays import Bools, Floats, instance, number
-from ...errors import InputError
+from ...arrays import Bools, Floats, instance, number, one_of
+from ...errors import InputError, unknown
 from ...one_file import in_file
-from ...plugins import find, names, one_of, unknown
+from ...plugins import find, names
 from ...world import links as polar
 from .space import Space
 
