@@ -1,4 +1,4 @@
-"""Does a log make sense? Innovation statistics of a filter of each vehicle alone, and sentences on what looks wrong."""
+"""Innovation and residual statistics of a log against a filter of each vehicle; sentences on what is implausible."""
 
 from __future__ import annotations
 
