@@ -1,4 +1,4 @@
-"""GTSAM's rows of backends.py, and the pose smoother against a loop on GTSAM's incremental fixed-lag smoother."""
+"""GTSAM's rows of backends.py."""
 
 from __future__ import annotations
 

@@ -2,16 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 import pytest
+from oracles.cooperative import Oracle
 from test_star_filters import CHANNELS, gappy, holed, partial
 
 from coopoc import V2X, Fleet, JointFilter, Kalman, Recording, Sensors, load_fleet, observe, rt_le
 from coopoc.arrays import Floats
+from coopoc.kernels.stars.cooperative_state import NO_GUARDS, Guards
 from coopoc.methods.cooperative_filter import CooperativeFilter
+from coopoc.methods.noise_model import NoiseModel, resolve
+from coopoc.methods.star_stream import Broadcast, RelativeMeasurement, StarStream
+from coopoc.world.inbox import inbox
+from coopoc.world.spoofing import Spoofing, spoofed
 
 S2 = Sensors.paper_scenario2()
 
@@ -71,3 +78,82 @@ def test_wrong_ranges_cost_little_and_are_named() -> None:
     changed = wrong.relative[..., 0] - seen.relative[..., 0] > 8.0
     assert weights[changed].mean() < 0.1
     assert weights[~changed].mean() > 0.97
+
+
+HEADING = replace(S2, heading_std=0.03, heading_bias_std=0.05)
+LASTING = replace(S2, gnss_std=(1.5,) * 3, gnss_drift_std=2.0, gnss_common_std=1.0, gnss_drift_time=5.0)
+BAD: dict[str, tuple[Sensors, V2X, Callable[[Recording], Recording]]] = {
+    "nothing": (S2, CHANNELS["ideal"], lambda r: r),
+    "ranges": (S2, CHANNELS["ideal"], lambda r: too_long(r, 0.2)),
+    "late": (S2, CHANNELS["slow"], lambda r: r),
+    "alone": (S2, CHANNELS["alone"], lambda r: r),
+    "missing": (S2, CHANNELS["late"], lambda r: partial(holed(r))),
+    "heading": (HEADING, CHANNELS["all"], lambda r: too_long(r, 0.1)),
+    "lasting": (LASTING, CHANNELS["late"], lambda r: r),
+    "attack": (S2, CHANNELS["all"], lambda r: spoofed(r, Spoofing(0.5, start=2.0), seed=3, honest=[0])),
+    "all": (
+        replace(LASTING, heading_std=0.03, heading_bias_std=0.05),
+        CHANNELS["late"],
+        lambda r: holed(too_long(spoofed(r, Spoofing(0.4), seed=3, honest=[0]), 0.1)),
+    ),
+}
+
+
+@pytest.mark.parametrize("robust", [True, False])
+@pytest.mark.parametrize("case", BAD)
+def test_the_filter_is_its_oracle(crossing: Fleet, case: str, robust: bool) -> None:
+    """Against dense matrices, one number at a time; members come, go and lose trust."""
+    sensors, v2x, change = BAD[case]
+    fleet = gappy(crossing)
+    seen = change(observe(fleet, sensors, v2x, runs=2, observers=[0]))
+    method = CooperativeFilter(robust=robust)
+    track, known = method(seen), resolve("nominal", seen)
+    assert track.covariance is not None
+    assert track.neighbours is not None
+    for run in range(2):
+        x, cov, others = Oracle(seen, 0, run, known, Guards() if robust else NO_GUARDS, robust).loop()
+        np.testing.assert_allclose(track.x[run, :, 0], x, atol=1e-6)
+        np.testing.assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=1e-6)
+        if len(track.neighbours[run]):
+            np.testing.assert_allclose(track.neighbours[run], np.concatenate(others), atol=1e-5)
+
+
+@pytest.mark.parametrize("case", ["late", "attack"])
+def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
+    """A stream has no recording: each vehicle's broadcast of a step is that of a stream of its own."""
+    sensors, v2x, change = BAD[case]
+    seen = change(observe(gappy(crossing), sensors, v2x, runs=1, observers=[0]))
+    track, box = CooperativeFilter()(seen), inbox(seen, 0, CooperativeFilter().message)
+    method = CooperativeFilter(NoiseModel.nominal(sensors))
+    streams = {j: StarStream(method, max_age=v2x.max_age) for j in range(len(seen.ids))}
+    sent: dict[tuple[int, int], Broadcast | None] = {}
+    for t in range(len(seen.t)):
+        here = np.arange(box.start[t], box.start[t + 1])
+        for j, stream in streams.items():
+            if j and np.isfinite(seen.velocity[0, t, j, 0]):
+                stream.step(seen.gnss[0, t, j], seen.velocity[0, t, j], seen.dt)
+                sent[j, t] = stream.broadcast
+            elif j:
+                streams[j] = StarStream(method, max_age=v2x.max_age)
+        given = [
+            RelativeMeasurement(seen.ids[j], seen.relative[0, box.link[link]], **newest(seen, sent, t, int(s), int(j)))
+            for link, j, s in zip(here, seen.links.neighbour[box.link[here]], box.newest[0, here], strict=True)
+        ]
+        x, cov = streams[0].step(seen.gnss[0, t, 0], seen.velocity[0, t, 0], seen.dt, neighbours=given)
+        np.testing.assert_allclose(x, track.x[0, t, 0], atol=1e-6)
+        assert track.covariance is not None
+        np.testing.assert_allclose(cov, track.covariance[0, t, 0], atol=1e-6)
+
+
+def newest(seen: Recording, sent: Mapping[tuple[int, int], Any], t: int, s: int, j: int) -> dict[str, Any]:
+    """The newest broadcast that is held, as a stream takes it."""
+    if s < 0 or sent[j, s] is None:
+        return {}
+    position, velocity, variance, odometer = sent[j, s]
+    return {
+        "gnss": position,
+        "velocity": velocity,
+        "variance": variance,
+        "odometer": odometer,
+        "age": (t - s) * seen.dt,
+    }

@@ -10,14 +10,13 @@ import numpy as np
 
 from ..arrays import Floats
 from ..kernels.stars.cooperative_filter import run_filter
-from ..kernels.stars.cooperative_state import NO_GUARDS, Guards, Model
+from ..kernels.stars.cooperative_state import NO_GUARDS, Guards
 from ..kernels.stars.gaussian import REJECTED
-from ..kernels.stars.messages import ACCELERATION_STD, FORGOTTEN
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .baselines import solo_estimates
-from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
+from .egos import Estimate, assumptions, follow_egos, measurements, model_of
 from .noise_model import NoiseModel, resolve
 from .track import Track, check_options
 
@@ -82,7 +81,7 @@ class CooperativeFilter:
         "range", "azimuth", "inclination" and "message", NaN where there was none, and whether it is "trusted".
         """
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
-        model = model_of(known, recording.dt, self.robust)
+        model = model_of(known, self.robust)
         assumed, broadcast, moved = assumptions(recording, known), None, NO_ODOMETER
         if self.robust:
             assumed, broadcast = solo_estimates(recording, known, columns)
@@ -98,21 +97,6 @@ class CooperativeFilter:
             yield Estimate(slice(None), x, cov, box.link, neighbours, {**extras, "trusted": notes[..., 4]})
 
         return follow_egos(self, recording, egos, run, known.notes, missing=True)
-
-
-def model_of(known: NoiseModel, dt: float, robust: bool) -> Model:
-    """The noise model of the kernel; of the textbook filter all errors are white."""
-    std, least = relative_noise(known)
-    white, own, common, keep, bias, heading = np.ones(3), 0.0, 0.0, 1.0, 0.0, 0.0
-    if robust and known.sensors is not None:
-        sensors, std = known.sensors, np.array(std)
-        own, common = sensors.gnss_drift_std**2, sensors.gnss_common_std**2
-        white = np.square(sensors.gnss_std) / np.square(sensors.fix_std)
-        keep = float(np.exp(-dt / sensors.gnss_drift_time))
-        heading, bias = (float(value**2) for value in known.compass)
-        std[1] = np.sqrt(std[1] ** 2 - heading - bias)
-    shape = float(least), float(known.exact_relative), FORGOTTEN, ACCELERATION_STD, dt
-    return Model(std, *shape, own, common, keep, white, bias, heading, float(robust))
 
 
 def weight(q: Floats, gate: float) -> Any:

@@ -13,16 +13,19 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, part
-from ..motion import process_variance
+from ..dead_reckoning import dead_reckon
+from ..motion import MotionNoise, process_variance
 from .cooperative_messages import distrust, fix_terms, receive, trust
 from .cooperative_state import (
     AGE,
+    DT,
     ESTIMATE,
     FIX,
     FIX_VARIANCE,
     KNOWN,
     MOVED,
     ODOMETER,
+    OWN,
     PROCESS,
     SPEED,
     STEP,
@@ -71,7 +74,7 @@ def run_filter(
         most = max(most, seen.start[t + 1] - seen.start[t])
     x, cov, fixes = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, steps))
     neighbours, notes = np.empty((runs, links, 3)), np.empty((runs, links, 5))
-    own, rows, who = np.zeros(12), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
+    own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
     for run in range(runs):
         f, older, newer = new_filter(1 + most, vehicles), new_filter(1 + most, vehicles), new_filter(1 + most, vehicles)
         t = newest = 0
@@ -90,8 +93,8 @@ def run_filter(
             step(f, known, guards, own, rows, who, count)
             if f.alarm[0] > 0 and memory > 0:
                 f.alarm[0] = 0
-                copy_filter(older, f)
                 copy_filter(older, newer)
+                copy_filter(older, f)
                 distrust(f, known, guards)
                 t = f.step[0]
                 continue
@@ -132,11 +135,94 @@ def write(
         notes[run, first + i, 4] = f.status[who[i], TRUSTED]
 
 
+@compiled
+def stream_row(given: Floats, history: Floats, motion: MotionNoise, fix: Floats, own: Floats) -> int:
+    """The ego's row of a stream, by dead reckoning; a fix of some age is brought forward. `kernels.solo` says when it
+    is NO_FIX_YET or BAD_INPUT.
+
+    Args:
+        given: (8,) fix m, velocity m/s, dt s, age of the fix s.
+        history: of `motion`.
+        motion: noise.
+        fix: (3,) m^2, variance of a fix.
+        own: (OWN,) out.
+    """
+    since, late = np.zeros(3), np.zeros(3)
+    outcome = dead_reckon(given, history, motion, own[MOVED:PROCESS], own[PROCESS:DT], since, late)
+    own[DT] = given[6]
+    for c in range(3):
+        own[FIX + c], own[FIX_VARIANCE + c] = given[c] + since[c], fix[c] + late[c]
+    return int(outcome)
+
+
+@compiled
+def motion_of(rows: Floats, motion: MotionNoise, dt: float) -> None:
+    """Fill the variance of one step's motion of neighbours by the velocity of the newest message of each."""
+    interval = motion.interval if motion.interval > 0.0 else dt
+    for i in range(len(rows)):
+        q = process_variance(motion, rows[i, SPEED:STEP], interval)
+        for c in range(3):
+            rows[i, STEP + c] = q[c] * (dt / interval) ** 2
+
+
+@compiled
+def stream_step(
+    f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, start: Floats, answer: Floats
+) -> int:
+    """One step; 1 if a vehicle has lost trust.
+
+    Args:
+        f: filter.
+        known: noise model.
+        guards: against what may be wrong.
+        own: (OWN,).
+        rows: (k, WIDTH) of the neighbours that are measured now.
+        vehicles: (k,) which they are; the ego is vehicle 0.
+        start: (3,) m, known before the first step, NaN for none.
+        answer: (12 + 3 k,) out: position m, covariance m^2, positions of the neighbours m.
+    """
+    if f.g.vectors[0] == 0:
+        begin(f, known, guards, own, 0)
+        if math.isfinite(start[0]):
+            f.step[0] = 1
+            for c in range(3):
+                f.g.x[c], f.g.p[c, c] = start[c], 0.0
+    f.alarm[0] = 0
+    step(f, known, guards, own, rows, vehicles, len(vehicles))
+    for c in range(3):
+        answer[c] = f.g.x[c]
+        for d in range(3):
+            answer[3 + 3 * c + d] = f.g.p[c, d]
+        for i in range(len(vehicles)):
+            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[f.slot[vehicles[i]], POSITION] + c]
+    return int(f.alarm[0])
+
+
+@compiled
+def make_filter(slots: int, vehicles: int) -> Filter:
+    """A filter before its first step, for Python."""
+    return new_filter(slots, vehicles)
+
+
+@compiled
+def keep(source: Filter, target: Filter) -> None:
+    """Copy what is known."""
+    copy_filter(source, target)
+
+
+@compiled
+def restore(source: Filter, target: Filter, known: Model, guards: Guards) -> None:
+    """Go back to what was known, without those who have lost trust since."""
+    copy_filter(source, target)
+    distrust(target, known, guards)
+
+
 @part
 def gather_own(own: Floats, seen: Measurements, assumed: Assumptions, white: Floats, run: int, t: int) -> None:
     """The ego's fix and motion at a step."""
     u = seen.velocity[run, t, seen.ego]
     q = process_variance(assumed.motion, u, seen.dt)
+    own[DT] = seen.dt
     for c in range(3):
         own[FIX + c] = seen.gnss[run, t, seen.ego, c]
         own[FIX_VARIANCE + c] = number(assumed.fixes, run, t, seen.ego, c) * white[c]
@@ -159,7 +245,7 @@ def gather_neighbour(
     for c in range(5):
         rows[i, c] = seen.relative[run, link, c]
     j, sent = seen.neighbour[link], seen.newest[run, link]
-    rows[i, AGE] = t - sent if sent >= 0 else -1.0
+    rows[i, AGE] = (t - sent) * seen.dt if sent >= 0 else -1.0
     if sent < 0:
         return
     u = seen.velocity[run, sent, j]
@@ -188,13 +274,15 @@ def step(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, veh
         f: filter, after `begin`.
         known: noise model.
         guards: against what may be wrong.
-        own: (12,) the ego's row; the motion of the first step is not used.
+        own: (OWN,) the ego's row; the motion of the first step is not used.
         rows: (count, WIDTH) of the neighbours that are measured now.
         vehicles: (count,) which they are.
         count: of them.
     """
     leave(f, vehicles, count)
+    f.clock[1] = own[DT]
     if f.step[0] > 0:
+        f.clock[0] += own[DT]
         predict(f, known, own)
     for k in range(1, len(f.vehicle)):
         if f.vehicle[k] >= 0:

@@ -6,6 +6,7 @@ import math
 
 from ...arrays import Floats
 from ..compiling.compile import part
+from ..dead_reckoning import ROUNDING
 from .cooperative_state import (
     AGE,
     COUNT,
@@ -26,6 +27,7 @@ from .cooperative_state import (
     Guards,
     Model,
     follow,
+    late,
     measured_whole,
 )
 from .gaussian import ABSENT, CLONE, COMMON, ERROR, POSITION, VELOCITY, has, insert, remove, shift, term, update, widen
@@ -55,27 +57,27 @@ def receive(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> No
     """Use the newest message of member k, if it has not been used."""
     g, h, j, row = f.g, f.h, f.vehicle[k], f.row[k]
     age = rows[row, AGE]
-    sent = f.step[0] - age
-    if guards.acceleration > 0.0 and age != 0.0 and not has(g, k, VELOCITY):
+    sent = f.clock[0] - age
+    if guards.acceleration > 0.0 and late(age) and not has(g, k, VELOCITY):
         follow(f, rows, k)
-    if age < 0.0 or sent <= f.status[j, SENT] or not math.isfinite(rows[row, ESTIMATE]):
+    if age < 0.0 or sent <= f.status[j, SENT] + ROUNDING or not math.isfinite(rows[row, ESTIMATE]):
         return
     first, incomplete = 3 * g.block[k, POSITION], not measured_whole(rows, row)
     if g.p[first, first] >= KNOWN and (incomplete or f.joined[k] < f.step[0]):
         for c in range(3):  # nothing was known of where it is
-            g.x[first + c] = f.at[k, c] = rows[row, ESTIMATE + c] + age * known.dt * rows[row, SPEED + c]
-    velocity, back, late = has(g, k, VELOCITY), -age * known.dt, 0.0
-    before = known.estimates > 0.0 and f.status[j, SENT] >= 0.0
+            g.x[first + c] = f.at[k, c] = rows[row, ESTIMATE + c] + age * rows[row, SPEED + c]
+    velocity, back, changed = has(g, k, VELOCITY), -age, 0.0
+    before = known.estimates > 0.0 and f.status[j, SENT] > -math.inf
     clone = before and has(g, k, CLONE)
     if velocity:
-        late = (0.5 * guards.acceleration * back * back) ** 2
+        changed = (0.5 * guards.acceleration * back * back) ** 2
         use_velocity(f, known, guards, rows, k)
         if clone:
-            use_odometer(f, rows, k, back, late)
-    content(f, known, rows, k, late, clone, before)
+            use_odometer(f, rows, k, back, changed)
+    content(f, known, rows, k, changed, clone, before)
     if before and guards.trust > 0.0 and f.status[j, TRUSTED] > 0.0 and betrayed(f, known, guards, k):
-        f.betrayals[j, 0], f.betrayals[j, 1], f.alarm[0] = f.betrayals[j, 0] + 1.0, f.step[0], 1
-    if f.betrayals[j, 0] > 0.0 and f.step[0] <= f.betrayals[j, 1]:
+        f.betrayals[j, 0], f.betrayals[j, 1], f.alarm[0] = f.betrayals[j, 0] + 1.0, f.clock[0], 1
+    if f.betrayals[j, 0] > 0.0 and f.clock[0] <= f.betrayals[j, 1]:
         h.used[0] = h.used[1] = h.used[2] = False
     update(g.x, g.p, 3 * g.vectors[0], h, guards.fix_gate)
     f.q[k, 3] = max(h.q[0], h.q[1], h.q[2])
@@ -86,19 +88,19 @@ def receive(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> No
         f.status[j, LAST + 6 + c] = rows[row, ODOMETER + c]
         f.status[j, LAST + 9 + c] = rows[row, STEP + c]
     if velocity:
-        clone_position(f, k, back, late)
+        clone_position(f, k, back, changed)
 
 
 @part
-def content(f: Filter, known: Model, rows: Floats, k: int, late: float, clone: bool, before: bool) -> None:
+def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone: bool, before: bool) -> None:
     """Rows of what the message of member k says of its position when it was sent.
 
     The odometer's error of the fixes since the last message is `middle` times that of the whole way, so that they are
     seen as middle y + (1 - middle) c, y the position now and c its clone.
     """
     g, h, j, row = f.g, f.h, f.vehicle[k], f.row[k]
-    velocity, age, steps = has(g, k, VELOCITY), rows[row, AGE], f.step[0] - rows[row, AGE] - f.status[j, SENT]
-    back, terms = -age * known.dt, 1 + (1 if has(g, k, ERROR) else 0) + (1 if has(g, 0, COMMON) else 0)
+    velocity, age, steps = has(g, k, VELOCITY), rows[row, AGE], steps_between(f, rows, k)
+    back, old, terms = -age, age / f.clock[1], 1 + (1 if has(g, k, ERROR) else 0) + (1 if has(g, 0, COMMON) else 0)
     fix_terms(f, k)
     if velocity:
         term(h, terms, 3 * g.block[k, VELOCITY], back)
@@ -121,9 +123,16 @@ def content(f: Filter, known: Model, rows: Floats, k: int, late: float, clone: b
             else:
                 r += (1.0 - middle) ** 2 * spent
         if not velocity:
-            m += age * known.dt * rows[row, SPEED + c]
-            r += age * age * (one + (known.dt * known.dt * age * known.acceleration) ** 2)
-        h.z[c], h.variance[c] = m, r + late
+            m += age * rows[row, SPEED + c]
+            r += old * old * (one + (f.clock[1] * age * known.acceleration) ** 2)
+        h.z[c], h.variance[c] = m, r + changed
+
+
+@part
+def steps_between(f: Filter, rows: Floats, k: int) -> float:
+    """Steps between the last two messages of member k."""
+    since = f.clock[0] - rows[f.row[k], AGE] - f.status[f.vehicle[k], SENT]
+    return float(max(1.0, math.floor(since / f.clock[1] + 0.5)))
 
 
 @part
@@ -178,34 +187,34 @@ def use_velocity(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) 
     term(h, 0, 3 * g.block[k, VELOCITY], 1.0)
     for c in range(3):
         h.z[c], h.used[c], h.gated[c] = rows[row, SPEED + c], True, False
-        changed = guards.acceleration * known.dt * rows[row, AGE]
-        h.variance[c] = rows[row, STEP + c] / known.dt**2 + changed * changed
+        changed = guards.acceleration * rows[row, AGE]
+        h.variance[c] = rows[row, STEP + c] / f.clock[1] ** 2 + changed * changed
     update(g.x, g.p, 3 * g.vectors[0], h, 0.0)
 
 
 @part
-def use_odometer(f: Filter, rows: Floats, k: int, back: float, late: float) -> None:
+def use_odometer(f: Filter, rows: Floats, k: int, back: float, changed: float) -> None:
     """How far member k has moved between its last two messages."""
     g, h, j, row = f.g, f.h, f.vehicle[k], f.row[k]
-    steps = f.step[0] - rows[row, AGE] - f.status[j, SENT]
+    steps = steps_between(f, rows, k)
     term(h, 0, 3 * g.block[k, POSITION], 1.0)
     term(h, 1, 3 * g.block[k, VELOCITY], back)
     term(h, 2, 3 * g.block[k, CLONE], -1.0)
     for c in range(3):
         h.z[c], h.used[c], h.gated[c] = rows[row, ODOMETER + c] - f.status[j, LAST + 6 + c], True, False
-        h.variance[c] = 0.5 * steps * (rows[row, STEP + c] + f.status[j, LAST + 9 + c]) + late
+        h.variance[c] = 0.5 * steps * (rows[row, STEP + c] + f.status[j, LAST + 9 + c]) + changed
     update(g.x, g.p, 3 * g.vectors[0], h, 0.0)
 
 
 @part
-def clone_position(f: Filter, k: int, back: float, late: float) -> None:
+def clone_position(f: Filter, k: int, back: float, changed: float) -> None:
     """Remember, in the state, where member k was when it sent its newest message."""
     g = f.g
     remove(g, k, CLONE)
     clone, first, v = insert(g, k, CLONE, 0.0), 3 * g.block[k, POSITION], 3 * g.block[k, VELOCITY]
     shift(g, clone, first, 1.0)
     shift(g, clone, v, back)
-    widen(g, clone, late + JITTER)
+    widen(g, clone, changed + JITTER)
 
 
 @part
@@ -238,7 +247,7 @@ def log_odds(x: float, narrow: float, wide: float) -> float:
 def distrust(f: Filter, known: Model, guards: Guards) -> None:
     """In a state of before, take trust from those who have lost it since: their fixes have an unknown error again."""
     for j in range(len(f.slot)):
-        if f.betrayals[j, 0] == 0.0 or f.betrayals[j, 1] < f.step[0] or f.status[j, TRUSTED] == 0.0:
+        if f.betrayals[j, 0] == 0.0 or f.betrayals[j, 1] < f.clock[0] or f.status[j, TRUSTED] == 0.0:
             continue
         f.status[j, TRUSTED] = f.status[j, COUNT] = 0.0
         for c in range(3):
@@ -258,7 +267,7 @@ def trust(f: Filter, known: Model, guards: Guards) -> None:
     while True:
         best, most = ABSENT, guards.sure
         for k in range(1, len(f.vehicle)):
-            if f.vehicle[k] < 0 or f.status[f.vehicle[k], TRUSTED] > 0.0 or f.status[f.vehicle[k], SENT] < 0.0:
+            if f.vehicle[k] < 0 or f.status[f.vehicle[k], TRUSTED] > 0.0 or f.status[f.vehicle[k], SENT] == -math.inf:
                 continue
             odds = math.log((1.0 - guards.share) / guards.share) - guards.grudge * f.betrayals[f.vehicle[k], 0]
             for c in range(3):

@@ -6,12 +6,14 @@ star or not, is its status.
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import part, storage
+from ..dead_reckoning import ROUNDING
 from .gaussian import (
     ABSENT,
     COMMON,
@@ -31,15 +33,16 @@ from .gaussian import (
     widen,
 )
 
-FIX, FIX_VARIANCE, MOVED, PROCESS = 0, 3, 6, 9
-"""Of the ego's row of three numbers each: fix m (NaN for none), its variance m^2, motion m, its variance m^2."""
+FIX, FIX_VARIANCE, MOVED, PROCESS, DT, OWN = 0, 3, 6, 9, 12, 13
+"""Of the ego's row: fix m (NaN for none), its variance m^2, motion m, its variance m^2, three each, and dt s."""
 RELATIVE, AGE, ESTIMATE, VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
-"""Of a neighbour's row: `relative.five`, and its newest message: age in steps (-1 for none held), position m and its
+"""Of a neighbour's row: `relative.five`, and its newest message: age s (-1 for none held), position m and its
 variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that
 of a fix as its solo filter assumes it m^2."""
 TRUSTED, COUNT, SENT, MEAN, KEPT, KEPT_VARIANCE, LAST, STATUS = 0, 1, 2, 3, 6, 9, 12, 24
 """Of a vehicle's status: whether its fixes count as they are, messages in the mean innovation,
-step of its last message that was used (-1 for none), mean innovation m, error of its fixes when it left m and its
+when its last message that was used
+was sent s (-inf for none), mean innovation m, error of its fixes when it left m and its
 variance m^2, and ESTIMATE, VARIANCE, ODOMETER and STEP of that message."""
 KNOWN = 1e4
 """m^2, variance along x above which nothing is known of where a member is."""
@@ -58,7 +61,7 @@ class Guards(NamedTuple):
         share: prior share of vehicles with such an error.
         sure: log odds from which a member is trusted.
         grudge: log odds that each betrayal costs.
-        wander: m, change of the error in a step.
+        wander: m, change of the error in a second.
         window: messages in the mean innovation of a trusted member.
         revoke: log odds from which trust ends.
         memory: steps after which a state is kept to go back to.
@@ -73,7 +76,7 @@ class Guards(NamedTuple):
     share: float = 0.1
     sure: float = 1.0
     grudge: float = 10.0
-    wander: float = 0.05
+    wander: float = 0.16
     window: float = 30.0
     revoke: float = 3.0
     memory: float = 30.0
@@ -92,10 +95,9 @@ class Model(NamedTuple):
         exact: 1 for a second pass on range and angles themselves.
         flat: m^2, prior of a member that joins.
         acceleration: m/s^2, change of a velocity since it was sent, where members have no velocity in the state.
-        dt: s.
         own: m^2 of the error of a receiver that lasts, 0 for none.
         common: m^2 of the one that all share.
-        keep: their correlation from one step to the next.
+        time: s, their correlation time.
         white: (3,) share of the variance of a fix, as solo filters assume it, that is white.
         bias: rad^2 of the compass.
         heading: rad^2 of the compass's noise.
@@ -107,10 +109,9 @@ class Model(NamedTuple):
     exact: float
     flat: float
     acceleration: float
-    dt: float
     own: float
     common: float
-    keep: float
+    time: float
     white: Floats
     bias: float
     heading: float
@@ -127,8 +128,8 @@ class Filter(NamedTuple):
         slot: (vehicles,) of each vehicle, ABSENT for none.
         row: (slots,) of the step's input, ABSENT for none.
         joined: (slots,) step at which the member joined.
-        serves: (slots,) for how many steps in a row a message's velocity has served.
-        heard: (slots,) step of that message.
+        serves: (slots,) s for which a message's velocity has served.
+        heard: (slots,) s when that message was sent.
         hits: (slots, 3) how often in a row a component exceeded its gate.
         status: (vehicles, STATUS).
         at: (slots, 3) m, where relative measurements are linear.
@@ -136,8 +137,9 @@ class Filter(NamedTuple):
         q: (slots, 4) out: squared normalised innovations of range, azimuth and inclination and the largest one of
             the message, NaN where nothing was used; the ego's are those of its fix.
         step: (1,) number of the step.
-        betrayals: (vehicles, 2) how often a vehicle lost trust, and the last step at which its fixes do not count for
-            it; not part of what is restored.
+        clock: (2,) s, now, and since the last step.
+        betrayals: (vehicles, 2) how often a vehicle lost trust, and when it last did s: until then its fixes do not
+            count; not part of what is restored.
         alarm: (1,) out: whether a vehicle lost it now.
     """
 
@@ -155,6 +157,7 @@ class Filter(NamedTuple):
     work: Gaussian
     q: Floats
     step: Ints
+    clock: Floats
     betrayals: Floats
     alarm: Ints
 
@@ -178,6 +181,7 @@ def new_filter(slots: int, vehicles: int) -> Filter:
         new_gaussian(slots),
         np.zeros((slots, 4)),
         np.zeros(1, np.int64),
+        np.zeros(2),
         np.zeros((vehicles, 2)),
         np.zeros(1, np.int64),
     )
@@ -191,7 +195,7 @@ def copy_filter(source: Filter, target: Filter) -> None:
         new.x[i] = old.x[i]
         for j in range(n):
             new.p[i, j] = old.p[i, j]
-    new.vectors[0], target.step[0] = old.vectors[0], source.step[0]
+    new.vectors[0], target.step[0], target.clock[0] = old.vectors[0], source.step[0], source.clock[0]
     for i in range(len(old.owner)):
         new.owner[i] = old.owner[i]
     for k in range(len(source.vehicle)):
@@ -212,7 +216,7 @@ def begin(f: Filter, known: Model, guards: Guards, own: Floats, ego: int) -> Non
     """The ego stands somewhere near its first fix; no vehicle has been met."""
     for j in range(len(f.slot)):
         f.status[j, TRUSTED] = 1.0 if guards.trust == 0.0 or j == ego else 0.0
-        f.status[j, SENT] = -1.0
+        f.status[j, SENT] = -math.inf
         for c in range(3):
             f.status[j, KEPT_VARIANCE + c] = guards.tau**2
     f.vehicle[0], f.slot[ego] = ego, 0
@@ -253,8 +257,8 @@ def leave(f: Filter, vehicles: Ints, count: int) -> None:
 @part
 def predict(f: Filter, known: Model, own: Floats) -> None:
     """Move the ego; errors that last decay."""
-    g, spread = f.g, 1.0 - known.keep * known.keep
-    first = 3 * g.block[0, POSITION]
+    g, keep = f.g, math.exp(-own[DT] / known.time)
+    fades, first = 1.0 - keep * keep, 3 * g.block[0, POSITION]
     for c in range(3):
         g.x[first + c] += own[MOVED + c]
         g.p[first + c, first + c] += own[PROCESS + c]
@@ -263,42 +267,48 @@ def predict(f: Filter, known: Model, own: Floats) -> None:
             if f.vehicle[k] >= 0 and has(g, k, ERROR):
                 i = 3 * g.block[k, ERROR]
                 if f.status[f.vehicle[k], TRUSTED] > 0.0:
-                    shift(g, i, i, known.keep - 1.0)
-                widen(g, i, known.own * spread)
+                    shift(g, i, i, keep - 1.0)
+                widen(g, i, known.own * fades)
     if known.common > 0.0:
         i = 3 * g.block[0, COMMON]
-        shift(g, i, i, known.keep - 1.0)
-        widen(g, i, known.common * spread)
+        shift(g, i, i, keep - 1.0)
+        widen(g, i, known.common * fades)
 
 
 @part
 def predict_member(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> None:
     """Move a member by the velocity in the state, if its messages are late, else by that of its newest message.
 
-    A velocity that serves for the n-th step in a row makes the same error n times: the variance of the sum is n^2 of
-    that of one step, so this step adds 2 n - 1 of it.
+    A velocity that has served for L s and serves for dt more makes an error of (L + dt)^2 - L^2 times its own variance.
     """
-    g, row = f.g, f.row[k]
-    first, age, sent = 3 * g.block[k, POSITION], rows[row, AGE], f.step[0] - rows[row, AGE]
+    g, row, dt = f.g, f.row[k], f.clock[1]
+    first, age, sent = 3 * g.block[k, POSITION], rows[row, AGE], f.clock[0] - rows[row, AGE]
     if f.status[f.vehicle[k], TRUSTED] == 0.0:
-        widen(g, 3 * g.block[k, ERROR], guards.wander**2)
-    if guards.acceleration > 0.0 and age != 0.0 and not has(g, k, VELOCITY):
+        widen(g, 3 * g.block[k, ERROR], guards.wander**2 * dt)
+    if guards.acceleration > 0.0 and late(age) and not has(g, k, VELOCITY):
         follow(f, rows, k)
     if has(g, k, VELOCITY):
         v = 3 * g.block[k, VELOCITY]
-        widen(g, v, (guards.acceleration * known.dt) ** 2)
-        shift(g, first, v, known.dt)
+        widen(g, v, (guards.acceleration * dt) ** 2)
+        shift(g, first, v, dt)
         return
     if age < 0.0:
-        f.heard[k], f.serves[k] = -1.0, 0.0
+        f.heard[k], f.serves[k] = -math.inf, 0.0
         widen(g, first, known.flat)
         return
-    f.serves[k] = f.serves[k] + 1.0 if f.heard[k] == sent else 1.0
-    f.heard[k] = sent
-    often, late = 2.0 * f.serves[k] - 1.0, (known.dt * known.dt * age * known.acceleration) ** 2
+    if abs(f.heard[k] - sent) > ROUNDING:
+        f.serves[k] = 0.0
+    often, changed = 1.0 + 2.0 * f.serves[k] / dt, (dt * age * known.acceleration) ** 2
+    f.heard[k], f.serves[k] = sent, f.serves[k] + dt
     for c in range(3):
-        g.x[first + c] += known.dt * rows[row, SPEED + c]
-        g.p[first + c, first + c] += often * (rows[row, STEP + c] + late)
+        g.x[first + c] += dt * rows[row, SPEED + c]
+        g.p[first + c, first + c] += often * (rows[row, STEP + c] + changed)
+
+
+@part
+def late(age: float) -> bool:
+    """Whether the newest message is not of now."""
+    return age > ROUNDING or age < 0.0
 
 
 @part
@@ -318,8 +328,8 @@ def join(f: Filter, known: Model, rows: Floats, vehicle: int, row: int) -> None:
     while f.vehicle[k] >= 0:
         k += 1
     f.vehicle[k], f.slot[vehicle], f.row[k] = vehicle, k, row
-    f.joined[k], f.serves[k] = f.step[0], 1.0
-    f.heard[k] = f.step[0] - rows[row, AGE] if rows[row, AGE] >= 0.0 else -1.0
+    f.joined[k], f.serves[k] = f.step[0], f.clock[1]
+    f.heard[k] = f.clock[0] - rows[row, AGE] if rows[row, AGE] >= 0.0 else -math.inf
     for c in range(3):
         f.hits[k, c] = 0
     ego, first = 3 * g.block[0, POSITION], insert(g, k, POSITION, known.flat)
