@@ -136,7 +136,7 @@ def along(columns: Floats, q: int, ends: Ends, row: Row) -> float:
 
 @part
 def settle(poses: Poses) -> None:
-    """Apply the pending rows to the covariance, two of its rows at a time, so that each column is read half as often."""
+    """Apply the pending rows to the covariance, two of its rows at a time: each column is read half as often."""
     cov, columns, gains = poses.cov, poses.columns, poses.gains
     size, tiles, pending = len(poses.x), len(poses.x) // LANES, int(poses.totals[PENDING])
     for q in range(pending, ROWS if pending > 0 else 0):
