@@ -1,4 +1,4 @@
-"""Rows (one per vehicle and instant) -> Fleet: what every reader of drives ends with; and what no drive looks like."""
+"""Rows at their own times on equal steps: drives -> Fleet, measurements in a plane -> Recording in body frames."""
 
 from __future__ import annotations
 
@@ -7,9 +7,14 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
+from coopoc.world.links import Links
+from coopoc.world.recording import Body, Recording
+from coopoc.world.sensing import schedule
+from coopoc.world.sensors import Sensors
+from coopoc.world.v2x import V2X
 
 SAME = 1e-6
 """s, stamps this close are one instant: the digits that a double keeps of seconds since 1970."""
@@ -19,6 +24,8 @@ LATEST = 1e11
 """s since 1970, the year 5138."""
 CELLS, PER_ROW = 500_000, 200
 """Steps times vehicles that any file may take, and how many more a row of it may."""
+PLANE_STD = 0.01
+"""m and rad: how well z = 0, and with it an inclination of pi/2, is known where heights were not measured."""
 
 
 def assemble(
@@ -89,7 +96,7 @@ def assemble(
         check_size(steps, len(ids), len(stamps), dt, file)
         grid = dt * np.arange(int(steps))
         each = [(since[rows], numbers[rows], grid, longest_gap(since[rows], dt, max_gap)) for rows in by_vehicle]
-        table = np.stack([interpolate(*one) for one in each], axis=1)
+        table = np.stack([interpolate(*rows) for rows in each], axis=1)
         grid = start + grid
     present = np.isfinite(table[..., 0])
     lonely = (np.bincount(column) > 1) & ~(present[1:] & present[:-1]).any(axis=0)
@@ -251,3 +258,93 @@ def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tupl
     table = np.full((len(grid), column.max() + 1, numbers.shape[1]), np.nan)
     table[step.astype(np.int64)[row_of], column] = numbers
     return grid, table
+
+
+def nearest(late: Floats, step: Ints, observer: Ints, neighbour: Ints) -> Ints:
+    """Indices of one measurement per step, observer and neighbour, the nearest in time, sorted by these.
+
+    Args:
+        late: (M,) s between a measurement and its step.
+        step: (M,); negative ones are left out.
+        observer: (M,) columns; negative ones are left out.
+        neighbour: (M,) as `observer`.
+
+    >>> nearest(np.array([0.04, 0.01, 0.02]), np.array([3, 3, -1]), np.zeros(3, int), np.ones(3, int))
+    array([1])
+    """
+    keys = ["step", "observer", "neighbour"]
+    rows = pd.DataFrame(dict(zip([*keys, "late"], (step, observer, neighbour, late), strict=True)))
+    rows = rows[(rows[keys] >= 0).all(axis=1)].sort_values([*keys, "late"], kind="stable")
+    return np.asarray(rows.drop_duplicates(keys).index)
+
+
+def steps_of(t: Floats, dt: float, steps: int) -> tuple[Ints, Floats]:
+    """Step of each time (M,) s after the first step, -1 outside the drive, and how far off it is in s.
+
+    >>> steps_of(np.array([0.21, 9.0]), 0.1, 5)[0]
+    array([ 2, -1])
+    """
+    step = np.rint(t / dt)
+    return np.where((step >= 0) & (step < steps), step, -1).astype(np.int64), np.abs(t - dt * step)
+
+
+def first_of_each(most: int, *keys: Ints | Floats) -> Bools:
+    """True for the first `most` of the rows with equal keys.
+
+    >>> first_of_each(1, np.array([0, 0, 1])).tolist()
+    [True, False, True]
+    """
+    return np.asarray(pd.DataFrame(np.column_stack(keys)).groupby(list(range(len(keys)))).cumcount() < most)
+
+
+def planar_recording(
+    ids: Sequence[str],
+    t: Floats,
+    velocity: Floats,
+    yaw_rate: Floats,
+    place: Floats,
+    table: Floats,
+    sensors: Sensors,
+    v2x: V2X,
+    note: str,
+) -> Recording:
+    """One run, nothing simulated; landmarks stand, have their place as a fix at every step, and send nothing.
+
+    Args:
+        ids: of n robots, then of the landmarks.
+        t: (T,) s.
+        velocity: (T, n, 2) m/s in the robots' frames, forward and left.
+        yaw_rate: (T, n) rad/s.
+        place: (m, 2) m, of the landmarks.
+        table: (L, 5) step, observer, neighbour, range m, bearing rad; NaN for what was not measured.
+        sensors: the noise of all this.
+        v2x: which messages of robots arrive.
+        note: of the recording; that inclinations were not measured is added.
+    """
+    n = len(ids) - len(place)
+    table = table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
+    links = Links(*table[:, :3].astype(np.int64).T)
+    shape = (1, len(t), len(ids), 3)
+    gnss, moved, turning = np.full(shape, np.nan), np.zeros(shape), np.zeros(shape[:3])
+    gnss[0, :, n:] = np.column_stack([place, np.zeros(len(place))])
+    moved[0, :, :n, :2], turning[0, :, :n] = velocity, yaw_rate
+    still = np.zeros(shape[1:])
+    broadcasts, arrival = schedule(Fleet(tuple(ids), t, still, still), links, v2x, 1, 0)
+    arrival[:, links.neighbour >= n] = -1
+    broadcasts[:, n:] = False
+    return Recording(
+        ids=tuple(ids),
+        t=t,
+        gnss=gnss,
+        velocity=moved,
+        links=links,
+        relative=np.column_stack([table[:, 3:], np.full(len(table), np.pi / 2)])[None],
+        broadcasts=broadcasts,
+        arrival=arrival,
+        sensors=sensors,
+        v2x=v2x,
+        observers=tuple(range(len(ids))),
+        notes=(note, "inclination was not measured: pi/2 by the constraint z = 0"),
+        body=Body(turning, np.full(turning.shape, np.nan)),
+        landmarks=tuple(range(n, len(ids))),
+    )

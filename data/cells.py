@@ -87,7 +87,8 @@ def numeric(frame: pd.DataFrame, column: str, file: str, given: Bools | None = N
     try:
         values = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float)
     except (TypeError, ValueError, OverflowError):  # a list in a cell, an integer of a thousand digits
-        values = np.array([_number(cell) for cell in cells])
+        texts = cells.map(lambda cell: str(cell)[:300])
+        values = pd.to_numeric(texts, errors="coerce").to_numpy(dtype=float)
     _refuse(cells, ~(np.abs(values) <= LARGEST), file, "must be a finite number")
     return values
 
@@ -239,10 +240,3 @@ def _too_wide(path: Path, row: int, cells: int, names: int) -> InputError:
 def _no_table(path: Path, given: str) -> InputError:
     allowed = "must be a table with a header and cells between commas, semicolons or tabs, or of Parquet"
     return InputError(path.name, given, allowed, "Export it again as CSV, without empty rows and columns.")
-
-
-def _number(cell: object) -> float:
-    try:
-        return float(str(cell)) if str(cell).isascii() and "_" not in str(cell) else np.nan
-    except ValueError:
-        return np.nan

@@ -152,7 +152,7 @@ def kind_of(name_or_path: str | Path) -> str:
     if isinstance(name_or_path, str) and name_or_path in DATASETS:
         return ""
     name, options = split(name_or_path)
-    if name in DATASETS or in_file(name) or not Path(name).exists():
+    if name in DATASETS or not Path(name).exists():
         return ""
     return str(options.get("format") or detect(Path(name), options.get("columns")))
 

@@ -155,20 +155,21 @@ def rows(
 
 
 def bound_rows(p: Params) -> list[Row]:
-    """The bound of each ego over an ideal channel, which needs no draws, with the bytes that the ego would receive.
+    """The bound of each ego over an ideal channel, with the bytes that the ego would receive.
 
-    The noise model of PAST makes it the bound with the past of newcomers. Real data have none: the bound is of sensors
-    that measure at every step.
+    It needs no draws but where there are outliers or an attack: then it is that of an estimator which is told of them,
+    the mean over runs. The noise model of PAST makes it the bound with the past of newcomers. Real data have none: the
+    bound is of sensors that measure at every step.
     """
     bound = past_bound if (p["method"], p.get("noise_model")) == PAST else posterior_bound
     drive, v2x = scene.fleet(p["data"]), scene.channel(p)
     if scene.is_real(p["data"]):
         return [{"run": 0, "ego": ego} for ego in scene.egos(p["data"], str(p["egos"]))]
-    acting, rate = scene.acting(p), min(v2x.rate or np.inf, 1 / drive.dt)
+    acting, rate, told = scene.acting(p), min(v2x.rate or np.inf, 1 / drive.dt), scene.told(p)
     rows_of_egos: list[Row] = []
     for ego in scene.egos(p["data"], str(p["egos"])):
         column = drive.index(ego)
-        level = bound_rt_le(bound(drive, acting, column, v2x))
+        level = bound_rt_le(bound(drive, acting, column, v2x, recording=told))
         near = len(find_links(drive, [column], v2x.max_neighbours, v2x.radius, acting.min_range)) / len(drive.t)
         received = near * FIX_AND_VELOCITY.payload * rate
         sizes = {"bytes_per_second": received, "payload_bytes_per_second": received}

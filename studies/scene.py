@@ -280,11 +280,19 @@ def _digests(data: str) -> Mapping[str, str]:
 
 def recording(p: Params) -> Recording:
     """Recording of the cell's vehicles; the real measurements where there are any."""
-    who = egos(p["data"], str(p["egos"]))
+    return _attacked(p, told=False)
+
+
+def told(p: Params) -> Recording | None:
+    """The same without outliers and false fixes, as of an estimator which is told of them; None if there are none."""
+    return _attacked(p, told=True) if sensors(p).outliers.notes or attacking(p).share else None
+
+
+def _attacked(p: Params, told: bool) -> Recording:
+    who, attack = egos(p["data"], str(p["egos"])), attacking(p)
     observers = None if needs_whole_fleet(str(p.get("method"))) else who
-    drawn = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers)
-    attack = attacking(p)
-    return spoofed(drawn, attack, seed=int(p["seed"]), honest=who) if attack.share else drawn
+    drawn = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers, told)
+    return spoofed(drawn, attack, seed=int(p["seed"]), honest=who, told=told) if attack.share else drawn
 
 
 def attacking(p: Params) -> Spoofing:
@@ -301,9 +309,9 @@ def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:
 
 @lru_cache(maxsize=2)
 def _recording(
-    data: str, noise: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...] | None
+    data: str, noise: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...] | None, told: bool
 ) -> Recording:
     log = _log(data)
     if log is not None:
         return under(log.recording, v2x, runs=runs, seed=seed, logged=log.messages)
-    return observe(fleet(data), noise, v2x, runs=runs, seed=seed, observers=observers)
+    return observe(fleet(data), noise, v2x, runs=runs, seed=seed, observers=observers, told=told)

@@ -161,6 +161,7 @@ def test_what_is_told_is_what_differs_from_the_clean_recording(crossing: Fleet, 
         (lambda: Outliers.named("urban_canyn"), "urban_canyon"),
         (lambda: Outliers.named("ranges=2"), "rate"),
         (lambda: Outliers.named("ranges=many"), "ranges"),
+        (lambda: Outliers.named("ranges=0.1:2:3"), "ranges"),
         (lambda: Outliers.named("ranges"), "ranges"),
     ],
 )
@@ -173,7 +174,8 @@ def test_settings_of_studies_name_presets_and_rates() -> None:
     assert Outliers.named("") == Outliers()
     found = Outliers.named("urban_canyon+uwb_nlos+angles=0.01")
     assert (found.fixes, found.ranges) == (Outliers.urban_canyon().fixes, Outliers.uwb_nlos().ranges)
-    assert found.angles.rate == 0.01
+    assert found.angles == Fault(0.01)
+    assert Outliers.named("ranges=0.05:2").ranges == Fault(0.05, (3.0, 20.0), lasts=2.0)
     assert found.odometry.rate == 0
 
 

@@ -79,24 +79,36 @@ def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path, short
     assert "0.3 s" in table
 
 
-def test_who_trusts_everybody_is_led_astray_and_who_is_careful_is_not(tmp_path: Path, short_town: str) -> None:
+def test_what_is_wrong_harms_those_who_use_it(tmp_path: Path, short_town: str) -> None:
     wanted = {
         "data": short_town,
         "runs": 1,
         "egos": "1",
-        "method": "kalman,joint,cooperative-map-gnc",
-        "max_neighbours": "0,4",
-        "spoofed_share": "0.0,0.4",
+        "method": "kalman,joint,cooperative-map-gnc,bound",
+        "outliers": ",fixes=0.05:0",
+        "spoofed_share": "0.0,0.2",
+        "spoofed_from_s": "0.0",
+        "spoofed_collude": "False",
     }
     results = run_study("robustness", tmp_path, settings=wanted, progress=False)
-    alone, trusting, careful, unharmed = (
-        numbers.mean(results, robustness.at(method, 4, share))
-        for method, share in (("kalman", 0.4), ("joint", 0.4), *(("cooperative-map-gnc", s) for s in (0.4, 0.0)))
-    )
-    assert alone is not None
-    assert trusting is not None
-    assert trusting > 3 * alone
-    assert careful == pytest.approx(unharmed, rel=0.3)
+    clean, wild, spoofed = "nothing wrong", "5 % wild fixes", "20 % spoofed"
+    error = {
+        (method, case): np.array(numbers.mean(results, {"method": method, **robustness.CASES[case]}))
+        for method in str(wanted["method"]).split(",")
+        for case in (clean, wild, spoofed)
+    }
+    harm = {
+        (method, title): float(error[method, case] / error[method, clean])
+        for method in str(wanted["method"]).split(",")
+        for title, case in (("wild", wild), ("spoofed", spoofed))
+    }
+    assert harm["kalman", "spoofed"] == 1
+    assert harm["joint", "spoofed"] > 3
+    assert min(harm["kalman", "wild"], harm["joint", "wild"]) > 1.05
+    assert harm["cooperative-map-gnc", "spoofed"] < 1.3
+    assert 1 < harm["bound", "spoofed"] < harm["joint", "spoofed"]
+    assert 1 < harm["bound", "wild"] < 1.2
+    assert "told what is wrong" in (tmp_path / "robustness" / "tables" / "rt_le.md").read_text()
 
 
 QUICK = {"method": "kalman,joint,drift,bound", "max_neighbours": "0,6", "runs": 3, "egos": "2"}

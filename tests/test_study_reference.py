@@ -28,7 +28,12 @@ CHEAP: Mapping[str, dict[str, Any]] = {
     "neighbours": {"method": "kalman,joint,msmv-r", "max_neighbours": "1", "noise_model": "nominal"},
     "budget": {"method": "joint", "channel": "bsm", "max_neighbours": "10", "noise_model": "nominal"},
     "latency_loss": {"method": "lkf-sa,joint", "latency_s": "0.3"},
-    "robustness": {"method": "joint,ci", "max_neighbours": "4", "spoofed_share": "0.2"},
+    "robustness": {
+        "method": "joint,split-ci",
+        "spoofed_share": "0.2",
+        "spoofed_from_s": "0.0",
+        "spoofed_collude": "False",
+    },
 }
 """Cells that need no training and take a second or two each."""
 

@@ -95,27 +95,29 @@ class Outliers:
 
     @classmethod
     def named(cls, text: str) -> Outliers:
-        """Of presets and rates joined by "+", as settings of studies name them; "" is none.
+        """Of presets and kinds joined by "+", as settings of studies name them; "" is none.
+
+        A kind has a rate and may have a duration in s: ranges=0.05, ranges=0.05:2.
 
         Raises:
             InputError: an unknown preset or kind, a rate outside [0, 1].
 
-        >>> Outliers.named("urban_canyon+ranges=0.05").notes[0]
-        '5 % of the ranges 3 to 20 m too long'
+        >>> Outliers.named("urban_canyon+ranges=0.05:2").notes[0]
+        '5 % of the ranges 3 to 20 m too long, for 2 s'
         """
         found, kinds = cls(), [field.name for field in fields(cls)]
         for part in filter(None, instance("outliers", text, str).split("+")):
-            name, _, rate = part.partition("=")
-            if name in PRESETS and not rate:
+            name, _, numbers = part.partition("=")
+            if name in PRESETS and not numbers:
                 preset = PRESETS[name]()
                 found = replace(found, **{k: getattr(preset, k) for k in kinds if getattr(preset, k).rate})
-            elif name in kinds and rate:
+            elif name in kinds and numbers:
                 try:
-                    share = float(rate)
+                    given = dict(zip(("rate", "lasts"), map(float, numbers.split(":", 1)), strict=False))
                 except ValueError:
-                    hint = f"{name}=0.05 makes one in twenty wrong."
-                    raise InputError(name, repr(rate), "must be a rate in [0, 1]", hint) from None
-                found = replace(found, **{name: replace(getattr(found, name), rate=share)})
+                    hint = f"{name}=0.05 makes one in twenty wrong, {name}=0.05:2 for 2 s."
+                    raise InputError(name, repr(numbers), "must be RATE or RATE:SECONDS", hint) from None
+                found = replace(found, **{name: replace(getattr(found, name), **given)})
             else:
                 raise unknown("outliers", part, [*PRESETS, *(f"{kind}=RATE" for kind in kinds)])
         return found

@@ -55,7 +55,7 @@ class Spoofing:
         [0.0, 0.0, 0.5, 1.0]
         """
         since = t - t[0] - self.start
-        return np.clip(since / self.ramp, 0.0, 1.0) if self.ramp else (since >= -1e-9).astype(float)
+        return np.asarray(np.clip(since / self.ramp, 0.0, 1.0) if self.ramp else since >= -1e-9, dtype=float)
 
     @property
     def note(self) -> str:

@@ -1,4 +1,4 @@
-"""Rows of a log on one clock, in SI units and one local frame; and the noise that they state."""
+"""Clock offsets, SI units and the local east-north-up frame of a log's rows; the sensor noise that they state."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ from coopoc.errors import InputError
 from coopoc.world.links import wrap
 from coopoc.world.sensors import Sensors
 
+from ..assemble import PLANE_STD
 from .units import ANGLES, KINDS, Rows, Summary, place
 
 ENU = {"longitude": "x", "latitude": "y", "height": "z"}
 MOTION = ("vx", "vy", "speed")
 Origin = tuple[float, float, float]
-PLANE_STD = 0.01
-"""m, how well z = 0 is known where no height was logged; rad, the inclination that goes with it."""
 HEADING_STD = 0.05
 """rad, of a compass in body frames whose noise was not logged."""
 

@@ -1,4 +1,4 @@
-"""Relative measurements and messages of a log as links of a Recording, each at the nearest step to its time."""
+"""Association of relative measurements and messages of a log with steps and pairs: the links of a Recording."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from coopoc.world.recording import Recording
 from coopoc.world.sensing import schedule
 from coopoc.world.v2x import V2X
 
-from ..planar import first_of_each
+from ..assemble import first_of_each
 from .motion import COURSE, Member, Steps
 from .units import Rows, Summary, in_group
 

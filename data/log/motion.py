@@ -1,4 +1,4 @@
-"""One member of a log on the steps of a Recording: fixes, velocity or speed and yaw rate, heading, when it is there."""
+"""Resampling of one member of a log to steps: fixes, velocity or speed and yaw rate, heading, presence."""
 
 from __future__ import annotations
 
@@ -13,8 +13,7 @@ from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.links import wrap
 
-from ..assemble import SAME, longest_gap, smooth
-from ..planar import steps_of
+from ..assemble import SAME, longest_gap, smooth, steps_of
 from .units import Rows, Summary, in_group, place
 
 MOVING = 1.0

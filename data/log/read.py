@@ -33,11 +33,13 @@ from .tables import is_log_table, read_log_table
 from .units import Rows, Summary, distinct, in_group
 
 Frame = Literal["world", "body"]
+DATED, DAY = 1e8, 86400.0
+"""s: times above are since 1970; a day."""
 LONGEST, PAIR = 1.0, ("vehicle", "partner")
 """s, of a step that is not given; what names a pair."""
 READERS: Mapping[str, Callable[..., Rows]] = {
     **dict.fromkeys(TABLES, read_log_table),
-    **dict.fromkeys((".nmea", ".nme"), read_nmea),
+    **dict.fromkeys((".nmea", ".nme", ".gga"), read_nmea),
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
 }
 """Ending of a file -> (path, summary, *, columns, kinds, ignore) -> its rows. A new format is one more entry."""
@@ -160,9 +162,10 @@ def read_log(
         "kinds": named("kinds", kinds or {}, "Give kinds={word: kind}."),
         "ignore": ignore,
     }
-    rows, true_rows = _rows(path, truth, summary, options)
+    rows = _rows(path, truth, summary, options)
     for column in ("t", "arrival"):
         check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)
+    rows, true_rows = rows[rows["true"] == 0], rows[rows["true"] == 1]
     rows, origin = local(on_one_clock(rows, clock, path.name), origin)
     rows = distinct(rows, summary)
     if not any_scale:
@@ -198,7 +201,7 @@ def read_log(
         landmarks=tuple(marks),
     )
     fleet = None
-    if true_rows is not None:
+    if len(true_rows):
         fleet = _truth(distinct(local(true_rows, origin)[0], Summary()), recording, max_gap, path.stem)
     summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
     return Log(recording, fleet, summary, "messages" in summary.read, origin)
@@ -214,35 +217,36 @@ def _is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").is_file() or READERS.get(path.suffix.lower()) is read_bag
 
 
-def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[str, Any]) -> tuple[Rows, Rows | None]:
-    """Measurements of a file or a folder, and the truth: of the file that is named, of `truth.*`, or of a topic."""
+def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[str, Any]) -> Rows:
+    """Rows of a file or a folder, with those of the truth: of the file that is named, of `truth.*`, or of a topic."""
     if not path.exists():
         raise InputError("path", str(path), "must be a file or a folder", "Check the path.")
-    true_file = None if truth is None else Path(truth)
-    actual: list[Rows] = []
+    true_files = [Path(truth)] if truth is not None else []
     if _is_bag(path):
-        true_file = true_file if true_file is not None and true_file.exists() else None
-        rows = read_bag(path, summary, truth="" if true_file else str(truth or ""), actual=actual, **options)
+        if not (true_files and true_files[0].exists()):
+            options, true_files = {**options, "truth": str(truth or "")}, []
+        parts = [read_bag(path, summary, **options)]
     else:
-        if true_file is not None and not true_file.is_file():
+        if true_files and not true_files[0].is_file():
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
         files = sorted(f for f in path.iterdir() if f.suffix.lower() in READERS) if path.is_dir() else [path]
-        true_files = [f for f in files if f.stem.lower() == TRUTH and f != path]
-        true_file = true_file or next(iter(true_files), None)
-        files = [f for f in files if f not in (*true_files, true_file)]
+        true_files = true_files or [f for f in files if f.stem.lower() == TRUTH and f != path][:1]
+        files = [f for f in files if f not in true_files and (f.stem.lower() != TRUTH or f == path)]
         if not files:
             allowed = f"must hold files in {', '.join(READERS)}"
             raise InputError("path", str(path), allowed, "Point at the folder of the log.")
-        _check_headers(options["columns"], [*files, *([true_file] if true_file else [])], path.name)
-        rows = pd.concat([_read_file(file, summary, **options) for file in files], ignore_index=True)
-    if not len(rows):
+        _check_headers(options["columns"], [*files, *true_files], path.name)
+        parts = [_read_file(file, summary, **options) for file in files]
+    if not any(map(len, parts)):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
-    if true_file is not None:
-        actual = [_read_file(true_file, Summary(), **{**options, "ignore": ()})]
-    return rows, actual[0] if actual else None
+    options = {**options, "ignore": (), "truth": ""}
+    parts += [_read_file(file, Summary(), **options).assign(true=1.0) for file in true_files]
+    return pd.concat(parts, ignore_index=True)
 
 
 def _read_file(file: Path, summary: Summary, **options: Any) -> Rows:
+    if not _is_bag(file):
+        options.pop("truth", None)
     return READERS.get(file.suffix.lower(), read_log_table)(file, summary, **options)
 
 
@@ -311,6 +315,8 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
         allowed = f"must name vehicles of the log: {', '.join(ids)}"
         field = f"{rows['file'].iloc[0]}: column vehicle"
         raise InputError(field, ", ".join(vehicles), allowed, "Rename them, or leave the truth out.")
+    if start > DATED and rows["t"].max() < 2 * DAY:  # sentences of NMEA without a date are of the day of the log
+        rows = rows.assign(t=rows["t"] + DAY * round((float(recording.t.mean()) - rows["t"].mean()) / DAY))
     axes = 3 if (rows["kind"] == "z").any() else 2
     poses = np.full((len(recording.t), len(ids), 4), np.nan)
     for column, vehicle in enumerate(ids):
@@ -325,6 +331,10 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
             elif len(t) and not first:
                 out[:] = value[0]
     position, angle = poses[..., :3], poses[..., 3]
+    if not np.isfinite(position).any():
+        given = f"{rows['t'].min():.10g} to {rows['t'].max():.10g} s"
+        allowed = f"must overlap the log, from {start:.10g} to {recording.t[-1]:.10g} s"
+        raise InputError(f"{rows['file'].iloc[0]}: column t", given, allowed, "Does its clock or its date differ?")
     there = np.pad(np.isfinite(position[..., 0]), ((1, 1), (0, 0)))
     position[~(there[2:] | there[:-2])] = np.nan
     velocity = backward_difference(recording.t, position, ids)

@@ -55,10 +55,11 @@ ANGLES = ("heading", "azimuth", "bearing", "inclination")
 
 Rows = pd.DataFrame
 """L measurements, a row each, with the columns of BLANK, `file` and `row` (from 1, the header not counted)."""
-BLANK = {"t": np.nan, "vehicle": "", "kind": "", "partner": "", "value": np.nan, "std": np.nan, "arrival": np.nan}
+NONE = np.nan
+BLANK = {"t": NONE, "vehicle": "", "kind": "", "partner": "", "value": NONE, "std": NONE, "arrival": NONE, "true": 0.0}
 """t in s, of a message when it was sent, NaN of a place without a time; vehicle measures, or sends; partner is
 measured, or receives, "" for none or for a message to all; value and std in the unit of the kind, NaN where there is
-none; arrival in s, infinite for a message that was lost."""
+none; arrival in s, infinite for a message that was lost; true is 1 for what is of the truth, not measured."""
 
 
 def rows_of(frame: pd.DataFrame, file: str) -> Rows:
