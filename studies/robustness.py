@@ -18,6 +18,7 @@ TOGETHER = (
     ("joint", "nominal"),
     ("lkf-sa", "nominal"),
     ("split-ci", "nominal"),
+    ("cooperative-filter", "nominal"),
     ("cooperative", "trained"),
 )
 METHODS = (*ALONE, *TOGETHER)

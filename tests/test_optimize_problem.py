@@ -11,7 +11,7 @@ import pytest
 from coopoc import V2X, Fleet, InputError, NoiseModel, Sensors, load_fleet, observe
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, SolveError, Status, pose, solve, solve_batch
 from coopoc.optimize.model.window import relative_std
-from coopoc.optimize.starts.initial import converted, initial_guess
+from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.links import to_vector, vector_cov
 from coopoc.world.recording import Recording
 
@@ -82,17 +82,6 @@ def test_window_chains_who_stays(recording: Recording) -> None:
     stays = sum(name.split("@")[0] + f"@{int(name.split('@')[1]) - 1}" in problem.names for name in problem.names)
     assert len(moved.nodes) == stays
     assert [problem.names[h] for h in problem.separator] == [f"c0@{s}" for s in range(17, 21)]
-
-
-@pytest.mark.parametrize("length", [1, 3])
-def test_all_runs_at_once_hold_each_run(recording: Recording, length: int) -> None:
-    batch = Problem.from_window(recording, 20, 0, length, run=None)
-    assert batch.batch == 3
-    for run in range(3):
-        single, picked = Problem.from_window(recording, 20, 0, length, run=run), batch.pick(run)
-        assert picked.batch is None
-        x = np.random.default_rng(run).normal(size=(len(single.names), 3)) * 30
-        assert picked.cost(x) == single.cost(x)
 
 
 def test_the_noise_model_sets_the_weights(recording: Recording) -> None:
@@ -205,16 +194,6 @@ def test_the_limit_of_iterations_is_an_error_with_the_solution(backend: str) -> 
         solve(mixed(), backend, max_iterations=1)
     assert caught.value.solution.status is Status.MAX_ITERATIONS
     assert solve(mixed(), backend, throw=False, max_iterations=1).status is Status.MAX_ITERATIONS
-
-
-def test_converted_measurement_has_the_rotated_covariance(recording: Recording) -> None:
-    """Against vector_cov, J diag(std^2) J^T, wherever neither floor acts."""
-    problem = Problem.from_snapshot(recording, 20, 0)
-    _, edges = converted(problem).factors
-    cov = np.linalg.inv(np.swapaxes(edges.root, -1, -2) @ edges.root)
-    measured = problem.factors[1].z
-    assert (measured[:, 0] > 1).all()
-    assert cov == pytest.approx(vector_cov(measured, S2.relative_std), rel=1e-9, abs=1e-9)
 
 
 def test_a_start_is_the_least_squares_of_the_converted_vectors(recording: Recording) -> None:

@@ -19,13 +19,11 @@ from coopoc import (
     MovingHorizon,
     NoiseModel,
     Sensors,
-    load_fleet,
     observe,
 )
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
-from coopoc.evaluate.metrics import nees, nees_inside, rt_le
+from coopoc.evaluate.metrics import nees_inside, rt_le
 from coopoc.optimize import Problem, solve
-from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, wrap
 from coopoc.world.recording import Recording
 
@@ -41,16 +39,6 @@ def label(method: Window) -> str:
 @pytest.fixture(scope="module")
 def recording(crossing: Fleet) -> Recording:
     return observe(crossing, S2, V2X(max_neighbours=4), runs=3)
-
-
-@pytest.mark.parametrize("method", [FixedLagSmoother(lag=1), MovingHorizon(horizon=3)], ids=label)
-def test_bytes_are_those_of_the_inbox(method: Window, crossing: Fleet) -> None:
-    recording = observe(crossing, S2, V2X(max_neighbours=4, loss=0.2, rate=5.0, overhead=100), runs=3)
-    track = method(recording, [0, 3])
-    for e, ego in enumerate((0, 3)):
-        box = inbox(recording, ego, method.message)
-        assert np.array_equal(track.received_bytes[:, e], box.received_bytes)
-        assert (track.sent_bytes[:, e] == box.sent_bytes).all()
 
 
 @pytest.mark.parametrize("v2x", [V2X(4), V2X(4, loss=0.3), V2X(4, rate=2.0)], ids=["ideal", "lossy", "slow"])
@@ -112,16 +100,6 @@ def test_the_horizon_is_at_its_minimum(formation: Fleet) -> None:
         assert track.x[run, -1, 0] == pytest.approx(best.x.reshape(6, 4, 3)[-1, 0], abs=5e-4)
         cov = np.linalg.inv(best.jac.T @ best.jac)[-12:-9, -12:-9]
         assert track.covariance[run, -1, 0] == pytest.approx(cov, abs=2e-3)
-
-
-def test_a_late_message_is_worth_more_in_its_place() -> None:
-    """In traffic that brakes, at 1 s of latency: fixes that are brought forward make a filter over-confident."""
-    fleet = load_fleet("town10").between(300, 400)
-    recording = observe(fleet, S2, V2X(max_neighbours=4, latency=1.0), runs=5, observers=[12])
-    late, forward = MovingHorizon(horizon=10)(recording, [12]), JointFilter()(recording, [12])
-    assert late.notes == ()
-    assert rt_le(late, fleet).mean() < 0.92 * rt_le(forward, fleet).mean()
-    assert nees(late, fleet).mean() < 3.6 < 5.0 < nees(forward, fleet).mean()
 
 
 def test_what_comes_after_the_horizon_is_dropped_and_counted(formation: Fleet) -> None:

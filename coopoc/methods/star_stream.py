@@ -33,8 +33,7 @@ from ..kernels.stars.cooperative_state import (
 from ..kernels.stars.cooperative_state import ESTIMATE as POSITION
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.relative import components
-from .cooperative_filter import CooperativeFilter
-from .egos import model_of
+from .cooperative_filter import CooperativeFilter, model_of
 from .joint_filter import JointFilter
 from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
 from .noise_model import constant_noise, motion_noise
@@ -143,8 +142,9 @@ class StarStream:
         history: float = 10.0,
         max_age: float = 1.0,
     ) -> None:
-        kind = CooperativeFilter if isinstance(filter, CooperativeFilter) else JointFilter
-        known = constant_noise(instance("filter", filter, kind).noise_model)
+        if not isinstance(filter, CooperativeFilter):
+            filter = instance("filter", filter, JointFilter)
+        known = constant_noise(filter.noise_model)
         robust = isinstance(filter, CooperativeFilter) and filter.robust
         self._model, self._guards = model_of(known, robust), NO_GUARDS
         if isinstance(filter, JointFilter):

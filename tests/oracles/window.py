@@ -22,26 +22,30 @@ ACCELERATION_STD, UNKNOWN = 1.0, 1e6
 """m/s^2, change of a velocity since it was sent; m^2, variance of an unknown motion."""
 
 
-def message(recording: Recording, known: NoiseModel, run: int, vehicle: int, t: int, sent: int) -> tuple[Floats, ...]:
+def message(
+    recording: Recording, noise_model: NoiseModel, run: int, vehicle: int, t: int, sent: int
+) -> tuple[Floats, ...]:
     """Fix brought forward from step `sent`, its variance, motion of one step, and its variance without repetition."""
     dt, age = recording.dt, t - sent
     u = recording.velocity[run, sent, vehicle]
-    process = np.broadcast_to(known.process_variance(recording), recording.velocity.shape)
-    one = process[run, sent, vehicle] + (dt**2 * age * ACCELERATION_STD) ** 2
+    process = np.broadcast_to(noise_model.process_variance(recording), recording.velocity.shape)
+    step_variance = process[run, sent, vehicle] + (dt**2 * age * ACCELERATION_STD) ** 2
     s, moved, grown = sent, np.zeros(3), np.zeros(3)
     while s > 0 and np.isnan(recording.gnss[run, s, vehicle]).any():  # dead reckoning of the sender since its last fix
         moved, grown, s = moved + dt * recording.velocity[run, s, vehicle], grown + process[run, s, vehicle], s - 1
     fix = recording.gnss[run, s, vehicle] + moved + age * dt * u
-    return fix, known.gnss_variance + grown + age**2 * one, dt * u, one
+    return fix, noise_model.gnss_variance + grown + age**2 * step_variance, dt * u, step_variance
 
 
-def relative_rows(recording: Recording, box: Inbox, known: NoiseModel, run: int, ego: int, x: Any, t: int) -> list[Row]:
+def relative_rows(
+    recording: Recording, box: Inbox, noise_model: NoiseModel, run: int, ego: int, x: Any, t: int
+) -> list[Row]:
     """Relative measurements of a step, linear at the points x: J d = z - h, in terms of the points themselves."""
     rows: list[Row] = []
     for k in range(box.start[t], box.start[t + 1]):
         z, j = recording.relative[run, box.link[k]], int(recording.links.neighbour[box.link[k]])
         v = x[j, t] - x[ego, t]
-        if known.sensors is None:
+        if noise_model.sensors is None:
             if np.isfinite(z).all():
                 vector = z[0] * np.array([np.sin(z[2]) * np.cos(z[1]), np.sin(z[2]) * np.sin(z[1]), np.cos(z[2])])
                 rows.append(({(j, t): np.eye(3), (ego, t): -np.eye(3)}, vector, "relative"))
@@ -57,8 +61,8 @@ def relative_rows(recording: Recording, box: Inbox, known: NoiseModel, run: int,
         )
         off = z - h
         off[1:] = (off[1:] + np.pi) % (2 * np.pi) - np.pi
-        wide = 1.0 if np.isnan(z[0]) else max(known.sensors.min_range / z[0], 1.0)
-        std = np.minimum(known.sensors.relative_std * [1.0, wide, wide], [np.inf, np.pi, np.pi])
+        wide = 1.0 if np.isnan(z[0]) else max(noise_model.sensors.min_range / z[0], 1.0)
+        std = np.minimum(noise_model.sensors.relative_std * [1.0, wide, wide], [np.inf, np.pi, np.pi])
         root = jacobian / std[:, None]
         root[np.isnan(z)], off[np.isnan(z)] = 0.0, 0.0
         rows.append(({(j, t): root, (ego, t): -root}, root @ v + off / std, "relative"))
