@@ -26,8 +26,8 @@ import coopoc as co
 from coopoc.kernels.stars.joint_filter import run_filter
 from coopoc.methods.sliding_window import Windows, dead_reckoned
 from coopoc.methods.star import assumptions, measurements
-from coopoc.optimize.batch import solve_batch
 from coopoc.optimize.model.problem import Problem
+from coopoc.optimize.solve import solve_batch
 from coopoc.optimize.starts.initial import converted
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector

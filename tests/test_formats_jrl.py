@@ -13,7 +13,7 @@ import pytest
 from coopoc import InputError
 from coopoc.formats import load_graph, write_graph
 from coopoc.formats.jrl import read_jrl
-from coopoc.optimize.graphs import from_graph
+from coopoc.optimize.graph_problems import from_graph
 
 A, B, MARK = 97 << 56, 98 << 56, (97 << 56) + 1_000_000_000
 UNIT2, UNIT6 = np.eye(3).ravel().tolist(), np.eye(6).ravel().tolist()

@@ -20,17 +20,15 @@ from coopoc import InputError
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.algebra.sparse import Sparse, sparse
-from coopoc.optimize.assess.assess import SMALL, assess
-from coopoc.optimize.assess.curvature import newton_decrease
+from coopoc.optimize.assess.assess import SMALL, assess, newton_decrease
 from coopoc.optimize.backends.gtsam_factors import forms, graph_of, values, which_turn
+from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.descent.local_problem import LocalProblem
-from coopoc.optimize.descent.trust_region import arrive
-from coopoc.optimize.graphs import Objective, from_graph, read_graph
+from coopoc.optimize.graph_problems import Objective, from_graph, read_graph
 from coopoc.optimize.model.factor import Factor
-from coopoc.optimize.starts.graph_starts import chained, separated
-from coopoc.optimize.starts.linear import linear_start
+from coopoc.optimize.starts.chordal import chordal_start
+from coopoc.optimize.starts.graph_starts import chained, separated, trilaterate
 from coopoc.optimize.starts.race import expected
-from coopoc.optimize.starts.walk import trilaterate
 
 PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
 needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
@@ -76,7 +74,7 @@ def test_linear_solves_find_the_truth_whatever_the_odometry_was(dimension: int) 
     graph = replace(without_noise(201, dimension), relative_point=PointEdges())
     truth = Space(dimension, has_rotation=True).join(graph.position, graph.rotation)
     poses = np.flatnonzero(graph.is_pose)[:60]  # robot B may not be joined to A by loops
-    found = linear_start(graph, chained(graph))
+    found = chordal_start(graph, chained(graph))
     assert found[poses] == pytest.approx(truth[poses], abs=1e-3)
 
 

@@ -17,11 +17,11 @@ from coopoc.formats import write_graph
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges
 from coopoc.formats.values import to_orientation
 from coopoc.optimize import Problem, Status, pose, solve_gnc
-from coopoc.optimize.commands import solve_file
-from coopoc.optimize.graphs import from_graph, loop_closures
+from coopoc.optimize.graph_problems import from_graph, loop_closures
 from coopoc.optimize.model.space import exp
 from coopoc.optimize.robust.candidates import mark
 from coopoc.optimize.robust.loop_closures import predicted
+from coopoc.optimize.solver_commands import solve_file
 
 STD = np.array([0.02, 0.02, 0.01])
 

@@ -25,7 +25,7 @@ from coopoc.optimize import Problem, Solution, Status, solve
 from coopoc.optimize.convex import certify, newton, shor, staircase
 from coopoc.optimize.convex.newton import Reduced
 from coopoc.optimize.convex.qcqp import Quadratic, multipliers, quadratic
-from coopoc.optimize.graphs import from_graph, read_graph
+from coopoc.optimize.graph_problems import from_graph, read_graph
 
 PYFG = Path(__file__).resolve().parents[2] / "shared" / "data" / "pyfg"
 UP = 0.6

@@ -16,13 +16,12 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError
 from ..optimize.backend import require_backend
-from ..optimize.batch import solve_batch
 from ..optimize.model.problem import Problem
 from ..optimize.model.window import WindowStep
 from ..optimize.robust.candidates import Candidates, mark, reweigh
 from ..optimize.robust.gnc import EASY, RATE, ROUNDS, solve_gnc, surrogate_of
 from ..optimize.solution import Status
-from ..optimize.solve import solve
+from ..optimize.solve import solve, solve_batch
 from ..optimize.starts.initial import converted
 from ..plugins import one_of
 from ..world.inbox import Inbox

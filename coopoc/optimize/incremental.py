@@ -16,8 +16,7 @@ from ..short_repr import short_repr
 from .algebra.sparse import sparse
 from .backend import require_backend
 from .backends.gtsam_factors import estimate, forms, graph_of, linearised, tangent, values, which_turn
-from .descent.descend import TOLERANCE
-from .descent.trust_region import arrive
+from .descent.levenberg_marquardt import TOLERANCE, arrive
 from .model.factor import Factor
 from .model.problem import Problem
 from .model.space import Space

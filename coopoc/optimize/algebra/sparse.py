@@ -13,18 +13,14 @@ from weakref import WeakKeyDictionary, WeakValueDictionary
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
+from ..model.derivatives import Kind, Linear, Model, Structure, Term, numbers_of, write
 from ..model.factor import steerable
-from ..model.linear import Linear
 from ..model.problem import Problem
 from ..model.space import Space
-from ..model.symbolic import Kind, Structure, Term, numbers_of
-from ..model.tape import Model, write
 from .cholesky import Cholesky, DenseCholesky
 
 DENSE = 200
 """Unknowns up to which one dense matrix is as fast."""
-AT_ONCE = 100_000
-"""Places that are found at a time: many at once take memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,16 +29,14 @@ class Entries:
 
     Args:
         number: (n, dof) which of the m unknowns a direction of a node is, -1 where it cannot move.
-        start: (n,) first of a node's entries in its first column.
-        height: (n,) rows above a node's own block.
-        block: sorted keys j n + i of the blocks (i, j), i <= j, and the row of each within column j.
+        key: sorted j n + i of the blocks of nodes (i, j), i <= j.
+        place: (blocks, dof, dof) of each number of a block, -1 below the diagonal and where nothing can move.
         indptr: (m + 1,) and indices: of the CSC matrix.
     """
 
     number: Ints
-    start: Ints
-    height: Ints
-    block: tuple[Ints, Ints]
+    key: Ints
+    place: Ints
     indptr: Ints
     indices: Ints
 
@@ -56,19 +50,12 @@ class Entries:
         """(m,) places of the diagonal."""
         return self.indptr[1:] - 1
 
-    def pair(self, first: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
-        """(M,) which of two nodes has the columns of their block, which the rows, and where its rows begin."""
+    def places(self, first: Ints, last: Ints, row: Ints, column: Ints) -> Ints:
+        """(K, M) where products of directions (K,) of pairs of nodes (M,) belong, -1 if nowhere."""
         upper, lower = np.maximum(first, last), np.minimum(first, last)
-        key, offset = self.block
-        return upper, lower, offset[np.searchsorted(key, upper * len(self.number) + lower)]
-
-    def places(self, pair: tuple[Ints, Ints, Ints], unknown: Ints, another: Ints) -> Ints:
-        """(..., M) where products of two unknowns of a pair's nodes belong, -1 where unknown is -1."""
-        upper, lower, offset = pair
-        low, high = np.minimum(unknown, another), np.maximum(unknown, another)
-        within = high - self.first[upper]
-        at = self.start[upper] + within * self.height[upper] + within * (within + 1) // 2
-        return np.where(low < 0, -1, at + offset + low - self.first[lower])
+        block, turned = np.searchsorted(self.key, upper * len(self.number) + lower), first > last
+        row, column = row[:, None], column[:, None]
+        return self.place[block, np.where(turned, column, row), np.where(turned, row, column)]
 
     @cached_property
     def own(self) -> tuple[Bools, Ints, Ints]:
@@ -76,12 +63,6 @@ class Entries:
         row, column = np.broadcast_arrays(self.number[:, :, None], self.number[:, None, :])
         free = (row >= 0) & (column >= 0)
         return free, row[free], column[free]
-
-    @cached_property
-    def first(self) -> Ints:
-        """(n,) first unknown of each node."""
-        counts = (self.number >= 0).sum(axis=1)
-        return np.asarray(np.cumsum(counts) - counts)
 
 
 def entries_of(movable: Bools, measured: Sequence[Ints]) -> Entries:
@@ -91,44 +72,22 @@ def entries_of(movable: Bools, measured: Sequence[Ints]) -> Entries:
         movable: (n, dof) False where a node cannot move.
         measured: the nodes (M, arity) of each factor.
     """
-    n, dof = movable.shape
+    from scipy.sparse import coo_array
+
+    (n, dof), m = movable.shape, int(movable.sum())
     number = np.where(movable, np.cumsum(movable).reshape(n, dof) - 1, -1)
-    count = movable.sum(axis=1)
     keys = [np.arange(n) * (n + 1)]
     keys += [nodes.max(axis=1) * n + nodes.min(axis=1) for nodes in measured if nodes.shape[1] == 2]
     key = np.unique(np.concatenate(keys))
     j, i = np.divmod(key, n)
-    width = count[i]
-    before = np.cumsum(width) - width
-    head = before[np.searchsorted(key, np.arange(n) * n)]
-    offset = before - head[j]
-    height = np.bincount(j, width * (i != j), n).astype(np.int64)
-    per_node = count * height + count * (count + 1) // 2
-    start = np.cumsum(per_node) - per_node
-    length = np.repeat(height, count) + _within(count) + 1
-    indptr = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)
-    indices = _rows(number, count, (key, offset), height, start, n)
-    return Entries(number, start, height, (key, offset), indptr, indices)
-
-
-def _within(count: Ints) -> Ints:
-    """0, 1, ..., c - 1 for each c of `count`."""
-    total = np.cumsum(count)
-    return np.asarray(np.arange(total[-1] if len(total) else 0) - np.repeat(total - count, count))
-
-
-def _rows(number: Ints, count: Ints, block: tuple[Ints, Ints], height: Ints, start: Ints, n: int) -> Ints:
-    """Row indices of the CSC matrix, block by block and direction by direction."""
-    key, offset = block
-    j, i = np.divmod(key, n)
-    first = np.cumsum(count) - count
-    indices = np.empty(int((count * height + count * (count + 1) // 2).sum()), dtype=np.int64)
-    for c in range(int(count.max(initial=0))):
-        for r in range(int(count.max(initial=0))):
-            here = (c < count[j]) & (r < count[i]) & ((i != j) | (r <= c))
-            at = start[j] + c * height[j] + c * (c + 1) // 2 + offset + r
-            indices[at[here]] = (first[i] + r)[here]
-    return indices
+    row, column = np.broadcast_arrays(number[i][:, :, None], number[j][:, None, :])
+    there = (row >= 0) & (row <= column)
+    count = np.arange(np.count_nonzero(there))
+    matrix = coo_array((count, (row[there], column[there])), shape=(m, m)).tocsc()
+    place, rank = np.full(there.shape, -1, dtype=np.int64), np.empty_like(count)
+    rank[matrix.data] = count
+    place[there] = rank
+    return Entries(number, key, place, matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64))
 
 
 def places_of(entries: Entries, nodes: Ints, written: Ints) -> Any:
@@ -147,10 +106,8 @@ def places_of(entries: Entries, nodes: Ints, written: Ints) -> Any:
     goal[gradient] = np.where(columns[i[gradient]] < 0, nowhere, 1 + columns[i[gradient]])
     for first, last in combinations_with_replacement(range(nodes.shape[1]), 2):
         which = np.flatnonzero((j >= 0) & (i // dof == first) & (j // dof == last))
-        pair = entries.pair(nodes[:, first], nodes[:, last])
-        for some in np.array_split(which, 1 + which.size * len(nodes) // AT_ONCE):
-            at = entries.places(pair, columns[i[some]], columns[j[some]])
-            goal[some] = np.where(at < 0, nowhere, 1 + m + at)
+        at = entries.places(nodes[:, first], nodes[:, last], i[which] % dof, j[which] % dof)
+        goal[which] = np.where(at < 0, nowhere, 1 + m + at)
     return goal
 
 
@@ -244,14 +201,18 @@ _LARGE: WeakValueDictionary[Structure, Layout] = WeakValueDictionary()
 """Of large ones the problem that is at hand and those that differ from it in numbers alone."""
 
 
-def layout_of(problem: Problem) -> Layout:
-    """The layout of a single problem, shared with others of its structure."""
-    structure = structure_of(problem.replace_unchecked(constraints=()) if problem.constraints else problem)
-    if len(problem.names) * problem.space.dof <= DENSE:
+def shared_layout(structure: Structure) -> Layout:
+    """The layout of a structure, shared by its problems."""
+    if structure.nodes * structure.space.dof <= DENSE:
         return _small(structure)
     if (layout := _LARGE.get(structure)) is None:
         layout = _LARGE[structure] = Layout(structure)
     return layout
+
+
+def layout_of(problem: Problem) -> Layout:
+    """The layout of a single problem, without its constraints."""
+    return shared_layout(structure_of(problem)._replace(constraints=()))
 
 
 @dataclass(frozen=True, eq=False)

@@ -16,9 +16,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...arrays import Floats
-from ..model.factor import Factor
-from ..model.linear import linearise
-from ..model.losses import Loss
+from ..model.derivatives import linearise
+from ..model.factor import Factor, Loss
 from ..model.problem import Problem
 from ..model.space import Space, exp, log
 

@@ -23,9 +23,9 @@ from ...arrays import Floats
 from ..algebra.sparse import Layout, layout_of, summed
 from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
+from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
+from ..model.derivatives import Linear, linearise
 from ..model.factor import as_factor, bounded
-from ..model.linear import Linear, linearise
 from ..model.problem import Problem
 
 SETTINGS = {

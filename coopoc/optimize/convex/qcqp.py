@@ -24,7 +24,7 @@ from ...arrays import Floats, Ints
 from ...errors import InputError
 from ..model.factor import Factor
 from ..model.problem import Problem
-from ..starts.linear import nearest_rotation
+from ..starts.chordal import nearest_rotation
 
 
 @dataclass(frozen=True, eq=False)

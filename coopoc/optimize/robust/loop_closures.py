@@ -11,13 +11,14 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
 from ..algebra.sparse import sparse
-from ..descent.trust_region import arrive
-from ..model.linear import linearise
-from ..model.parts import restricted, rows_among, taken
+from ..descent.levenberg_marquardt import arrive
+from ..model.derivatives import linearise
+from ..model.factor import taken
 from ..model.problem import Problem
 from ..model.space import carried
+from ..starts.chordal import parts
+from ..starts.graph_starts import along_poses
 from ..starts.initial import initial_guess
-from ..starts.walk import along_poses, parts
 from .candidates import Marked, reweigh, squares
 
 ROUNDS = 100
@@ -234,8 +235,8 @@ class _Search:
     def _vote(self, body: Ints, bodies: tuple[int, int], groups: Ints) -> Placement:
         """The placement of a pair with which most of its candidates (groups of relative poses) agree, and its rival."""
         problem, marked, used = self.problem, self.marked, np.isin(body, bodies)
-        rows = rows_among(problem, used)
-        part = restricted(pinned(problem, body[body == bodies[0]]), used, self.x, rows)
+        rows = problem.rows_among(used)
+        part = pinned(problem, body[body == bodies[0]]).restricted(used, self.x, rows)
         inside = _among(marked, rows)
         sparse(part)  # is kept as long as the part is, so that all placements share its analysis
 

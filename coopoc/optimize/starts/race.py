@@ -8,7 +8,7 @@ import numpy as np
 
 from ...arrays import Floats, frozen
 from ..algebra.sparse import keep, sparse
-from ..descent.trust_region import Arrival, arrive
+from ..descent.levenberg_marquardt import Arrival, arrive
 from ..model.problem import Problem, Search
 
 STEPS = 12

@@ -18,10 +18,9 @@ from .algebra.sparse import keep
 from .model.factor import Factor
 from .model.problem import Problem, Search
 from .model.space import Space
+from .starts.chordal import parts, position_variance, rotation_variance
 from .starts.graph_starts import STARTS, contenders, incremental_start, separated
-from .starts.linear import position_variance, rotation_variance
 from .starts.race import race
-from .starts.walk import parts
 
 Objective = Literal["chordal", "geodesic"]
 KINDS = {

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...arrays import Floats
-from ..model.linear import Linear
+from ..model.derivatives import Linear
 from ..model.problem import Problem
 
 COFACTORS = np.array(

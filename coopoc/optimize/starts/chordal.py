@@ -11,7 +11,6 @@ from ...arrays import Floats, Ints
 from ...formats.graph import Graph
 from ..algebra.cholesky import Cholesky
 from ..model.space import Space
-from .walk import parts
 
 TIE = 1e-6
 """Weight of the start that is given beside the least weight of a measurement: it decides only what nothing measures."""
@@ -21,7 +20,7 @@ SWEEPS = 10
 """Solves with the rotations of the one before; the matrix is factored once."""
 
 
-def linear_start(graph: Graph, start: Floats) -> Floats:
+def chordal_start(graph: Graph, start: Floats) -> Floats:
     """(n, ambient): the least squares of relative poses, seen landmarks and priors over any matrices R_i, which
     are then projected to rotations; last over the positions with these rotations.
 
@@ -56,6 +55,15 @@ def linear_start(graph: Graph, start: Floats) -> Floats:
     held = vstack([A[:, places], eye_array(n, format="csr")[anchors]], format="csr")
     solve = _least_squares(held, np.append(weight, np.full(len(anchors), weight.max(initial=1.0))), 1)
     return space.join(solve(position, np.concatenate([goal - A[:, turns] @ whole[turns], position[anchors]])), rotation)
+
+
+def parts(n: int, pairs: Ints) -> Ints:
+    """(n,) number of the connected component that each node is in, by pairs (M, 2) that are joined."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    joined = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    return np.asarray(connected_components(joined, directed=False)[1])
 
 
 def nearest_rotation(matrix: Floats) -> Floats:
