@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from coopoc import InputError
-from coopoc.formats import load_graph, write_graph
+from coopoc.formats import load_graph
 from coopoc.formats.jrl import read_jrl
 from coopoc.optimize.graph_problems import from_graph
 
@@ -173,8 +173,3 @@ def test_what_is_no_json_is_named(tmp_path: Path) -> None:
         read_jrl(tmp_path / "a.jrl")
     with pytest.raises(InputError, match="must be a file"):
         read_jrl(tmp_path / "b.jrl")
-
-
-def test_jrl_is_not_written(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"must end in \.pyfg or \.g2o"):
-        write_graph(load_graph(written(tmp_path, documented())), tmp_path / "again.jrl")

@@ -9,11 +9,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from graph_files import write_graph
 
 import coopoc as co
 from coopoc.arrays import Bools, Floats, Ints
 from coopoc.evaluate.trajectory_scores import absolute_error
-from coopoc.formats import write_graph
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges
 from coopoc.formats.values import to_orientation
 from coopoc.optimize import Problem, Status, pose, solve_gnc

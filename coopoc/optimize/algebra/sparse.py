@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import combinations_with_replacement
 from typing import Any
-from weakref import WeakKeyDictionary, WeakValueDictionary
+from weakref import WeakValueDictionary
 
 import numpy as np
 
@@ -263,23 +263,14 @@ class Sparse:
         return self.space.retract(x, np.append(step, 0.0)[number])
 
 
-_KEPT: WeakKeyDictionary[Problem, Sparse] = WeakKeyDictionary()
-
-
 def sparse(problem: Problem) -> Sparse:
     """The cost of a single problem, without its constraints, ready to be evaluated; kept as long as the problem is.
 
     Raises:
         InputError: a formula that CasADi cannot run.
     """
-    if (kept := _KEPT.get(problem)) is None:
+    kept: Sparse | None = problem.__dict__.get("sparse")
+    if kept is None:
         numbers = tuple(numbers_of(factor) for factor in problem.factors)
-        kept = _KEPT[problem] = Sparse(problem.space, layout_of(problem), numbers)
+        kept = problem.__dict__["sparse"] = Sparse(problem.space, layout_of(problem), numbers)
     return kept
-
-
-def keep(former: Problem, problem: Problem) -> Problem:
-    """The problem, with what is kept of a former one that differs from it in x0 and its search alone."""
-    if former in _KEPT:
-        _KEPT[problem] = _KEPT[former]
-    return problem

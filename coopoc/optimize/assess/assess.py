@@ -10,7 +10,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, checked, instance
 from ...errors import InputError
-from ..algebra.cholesky import Cholesky, cholesky_of, with_still
+from ..algebra.cholesky import cholesky_of, columns_solved, with_still
 from ..algebra.sparse import Sparse, shared_layout, sparse, structure_of
 from ..model.derivatives import numbers_of
 from ..model.factor import as_factor, unchecked
@@ -174,13 +174,9 @@ def _null_rows(J: Any, length: Floats) -> Floats:
         factored, shift = cholesky_of(with_still(square, np.full(len(length), shift))), 10.0 * shift
     ways = np.random.default_rng(0).standard_normal((len(length), 12))
     for _ in range(6):
-        ways = np.linalg.qr(_solved(factored, ways))[0]
+        ways = np.linalg.qr(columns_solved(factored, ways))[0]
     ways = ways @ np.linalg.eigh(ways.T @ (square @ ways))[1]
     return np.asarray(ways[:, ~_seen(unit, ways)].T)
-
-
-def _solved(factored: Cholesky, right: Floats) -> Floats:
-    return np.stack([factored.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
 
 
 def _seen(J: Any, ways: Floats) -> Bools:

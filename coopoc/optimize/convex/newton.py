@@ -23,7 +23,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..algebra.cholesky import Cholesky, cholesky_of
+from ..algebra.cholesky import Cholesky, cholesky_of, columns_solved
 from .qcqp import Multipliers, Quadratic, multipliers
 
 DENSE = 500
@@ -82,7 +82,7 @@ class Reduced:
         if bound == self.gram.shape[0]:
             return X
         right = -(self._rows[:, bound:].T @ (self._rows[:, :bound] @ X))
-        return np.concatenate([X, _columns(self._inverse, right)])
+        return np.concatenate([X, columns_solved(self._inverse, right)])
 
     def times(self, X: Floats) -> Floats:
         """C X."""
@@ -138,10 +138,6 @@ class Reduced:
         """A cost that no point beats, for any multipliers L; the smallest eigenvalue of C - L and its eigenvector."""
         smallest, vector = self.smallest(L)
         return 0.5 * (L.trace + self.problem.trace * min(smallest, 0.0)), smallest, vector
-
-
-def _columns(factored: Cholesky, right: Floats) -> Floats:
-    return np.stack([factored.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

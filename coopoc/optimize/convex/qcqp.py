@@ -24,7 +24,7 @@ from ...arrays import Floats, Ints
 from ...errors import InputError
 from ..model.factor import Factor
 from ..model.problem import Problem
-from ..starts.chordal import nearest_rotation
+from ..model.space import nearest_rotation
 
 
 @dataclass(frozen=True, eq=False)

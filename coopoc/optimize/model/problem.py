@@ -31,6 +31,7 @@ DERIVED = (
     ("_turning", {"poses"}),
     ("space", {"dimension", "poses"}),
     ("movable", {"names", "dimension", "poses", "fixed"}),
+    ("sparse", {"names", "dimension", "poses", "fixed", "factors"}),
 )
 """What is found of a problem once, and the fields that it follows from: others may change and it still holds."""
 
@@ -276,6 +277,9 @@ class Problem:
     def rows_among(self, used: Bools) -> list[Ints]:
         """Of each factor, the rows whose nodes are all used (n,)."""
         return [np.flatnonzero(used[factor.nodes].all(axis=1)) for factor in self.factors]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in _fields()}
 
     def linearise(self, x: Floats) -> Linear:
         """Whitened residuals and derivatives at x (B, n, ambient)."""

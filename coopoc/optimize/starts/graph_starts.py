@@ -14,7 +14,6 @@ from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import arrive
 from ..model.problem import Problem
 from ..model.space import Space, carried
-from .chordal import chordal_start
 from .initial import initial_guess
 
 Roots = Iterable[tuple[int, Floats, Floats]]
@@ -113,6 +112,15 @@ def along_poses(problem: Problem) -> Floats:
     return np.asarray(x)
 
 
+def parts(n: int, pairs: Ints) -> Ints:
+    """(n,) number of the connected component that each node is in, by pairs (M, 2) that are joined."""
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    joined = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
+    return np.asarray(connected_components(joined, directed=False)[1])
+
+
 def trilaterate(places: Floats, ranges: Floats) -> Floats:
     """(d,) minimum of sum (|l - p_k| - r_k)^2, the lowest of those that three guesses lead to.
 
@@ -173,7 +181,6 @@ STARTS: dict[str, Callable[[Graph], Floats]] = {
     "apart": lambda graph: chained(graph, apart=True),
     "file": file,
     "tree": tree,
-    "linear": lambda graph: chordal_start(graph, chained(graph)),
 }
 
 
