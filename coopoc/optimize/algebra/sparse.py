@@ -111,13 +111,6 @@ def places_of(entries: Entries, nodes: Ints, written: Ints) -> Any:
     return goal
 
 
-def summed(values: Floats, goal: Ints, size: int) -> Floats:
-    """(B, size) sums of values (B, K) by where each belongs (K,)."""
-    goal = goal + size * np.arange(len(values))[:, None]
-    total = np.bincount(goal.ravel(), values.ravel(), size * len(values))
-    return np.asarray(total, np.float64).reshape(len(values), size)
-
-
 class Layout:
     """What problems of one structure share: the pattern of their Hessians, tapes, and analyses of the factorisation.
 
@@ -145,24 +138,37 @@ class Layout:
         return self._local.cholesky  # type: ignore[no-any-return]
 
     @cached_property
-    def _products(self) -> Ints:
-        """Where the entries of (J, r)^T (J, r) of all measurements belong, see `places_of`."""
-        goals = [np.empty(0, np.int32)]
+    def _products(self) -> Any:
+        """Adds the products (J, r)^T (J, r) of all measurements, see `places_of`. Where the derivatives by two nodes
+        are opposed, the last alone is there."""
+        from scipy.sparse import csr_array
+
+        goals, signs, top, places = [np.empty(0, np.int64)], [np.empty(0)], 0, [np.empty(0, np.int64)]
         for term in self.terms:
-            r = term.nodes.shape[1] * term.kind.space.dof
-            i, j = np.indices((r + 1, r + 1)).reshape(2, -1)
-            written = np.where((i <= j) & (i < r), [i, np.where(j < r, j, -1)], -1)
-            goals.append(places_of(self.entries, term.nodes, written.T).T.ravel())
-        return np.concatenate(goals)
+            (count, arity), dof = term.nodes.shape, term.kind.space.dof
+            width = 1 + (dof if term.kind.opposed else arity * dof)
+            i, j = np.triu_indices(arity * dof)
+            i, j = np.append(i, np.arange(arity * dof)), np.append(j, np.full(arity * dof, -1))
+            row, column = (i % dof, j % dof) if term.kind.opposed else (i, j)
+            sign = np.where(i // dof == np.where(j < 0, arity - 1, j // dof), 1.0, -1.0 if term.kind.opposed else 1.0)
+            at = row * width + np.where(j < 0, width - 1, column)
+            goals.append(places_of(self.entries, term.nodes, np.stack([i, j], axis=1)).T.ravel())
+            places.append((top + width * width * np.arange(count)[:, None] + at).ravel())
+            signs.append(np.tile(sign, count))
+            top += count * width * width
+        goal, place = np.concatenate(goals), np.concatenate(places)
+        return csr_array(
+            (np.concatenate(signs), (goal, place)), shape=(self.entries.size + len(self.entries.indices) + 2, top)
+        )
 
     def normal_equations(self, linear: Linear) -> tuple[Floats, Floats]:
         """The values of the upper triangle of J^T J (B, entries) and J^T r (B, m) of linearised problems."""
         m, squares = self.entries.size, [np.empty((len(linear.x), 0))]
-        for residual, jacobians in zip(linear.residual, linear.jacobian, strict=True):
-            wide = np.concatenate([*jacobians, residual[..., None]], axis=-1)
+        for term, residual, jacobians in zip(self.terms, linear.residual, linear.jacobian, strict=True):
+            wide = np.concatenate([*jacobians[-1 if term.kind.opposed else 0 :], residual[..., None]], axis=-1)
             squares.append((wide.swapaxes(-1, -2).copy() @ wide).reshape(len(wide), -1))
-        total = summed(np.concatenate(squares, axis=1), self._products, m + len(self.entries.indices) + 2)
-        return total[:, m + 1 : -1], total[:, 1 : m + 1]
+        total = self._products @ np.concatenate(squares, axis=1).T
+        return np.ascontiguousarray(total[m + 1 : -1].T), np.ascontiguousarray(total[1 : m + 1].T)
 
     def total(self, model: Model, x: Floats, numbers: Sequence[Floats]) -> Floats:
         """The cost, the gradient, the Hessian's values and a last number, which is waste, at x (n, ambient).

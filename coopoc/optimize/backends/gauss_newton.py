@@ -8,7 +8,7 @@ from ...arrays import Floats
 from ..algebra.schur import is_star, star_at
 from ..algebra.sparse import sparse
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, arrive, check_limits, descend
+from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, arrive, check_limits, minimise
 from ..model.derivatives import Linear
 from ..model.problem import Problem
 
@@ -33,8 +33,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
             extras = {"newton_steps": end.newton_steps, "record": end.record}
             return SolverResult(end.x[None], np.array([end.iterations]), extras=extras)
         if star:
-            found = descend(problem, step, x, max_iterations, tolerance)
-            return SolverResult(found.x, found.iterations)
+            return minimise(problem, step, x, max_iterations, tolerance)
         ends = [solver(single, start[None]) for single, start in zip(problem.realisations, x, strict=True)]
         return SolverResult(np.concatenate([e.x for e in ends]), np.concatenate([e.iterations for e in ends]))
 

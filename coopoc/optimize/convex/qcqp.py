@@ -126,6 +126,15 @@ class Multipliers:
         """What they promise: 1/2 trace is a lower bound if C - L is positive semidefinite."""
         return float(np.einsum("nii->", self.stiefel) + self.sphere.sum())
 
+    @property
+    def dense(self) -> Floats:
+        """L (bound, bound)."""
+        stiefel, sphere = self.problem.stiefel, self.problem.sphere
+        out = np.zeros((self.problem.bound,) * 2)
+        out[stiefel[:, :, None], stiefel[:, None, :]] = self.stiefel
+        out[sphere, sphere] = self.sphere[:, None]
+        return out
+
     @cached_property
     def matrix(self) -> Any:
         """L (bound, bound), sparse."""
