@@ -230,7 +230,10 @@ def test_the_elimination_is_numpys(make: Any, monkeypatch: pytest.MonkeyPatch) -
     a, v = reduced.smallest(L)
     assert a == pytest.approx(np.linalg.eigvalsh(C - L.matrix.toarray())[0], rel=1e-7)
     monkeypatch.setattr(newton, "DENSE", 0)
-    b, w = reduced.smallest(L)
+    monkeypatch.setattr(newton, "SMALL", 0)
+    large = Reduced(form)
+    assert large.times(X) == pytest.approx(C @ X, abs=1e-9 * np.abs(C).max())
+    b, w = large.smallest(L)
     assert a == pytest.approx(b, rel=1e-7)
     assert abs(v @ w) == pytest.approx(1.0, abs=1e-5)
 
