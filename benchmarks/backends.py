@@ -15,11 +15,10 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from backends_gtsam import gtsam_exact, gtsam_linear, pose_lag
+from backends_gtsam import gtsam_exact, gtsam_linear
 from backends_programmes import casadi_exact, osqp_linear
 from backends_star import Job, one_by_one, star
-from tabulate import tabulate
-from timing import timed
+from timing import report, timed
 
 from coopoc.optimize.starts.initial import converted
 
@@ -33,7 +32,6 @@ def jobs(runs: int = RUNS) -> list[Job]:
     return [
         gtsam_linear(linear),
         gtsam_exact(exact),
-        pose_lag(),
         casadi_exact(exact),
         osqp_linear(linear),
         one_by_one(linear, "converted"),
@@ -60,12 +58,5 @@ def measured(found: list[Job] | None = None, rounds: int = ROUNDS) -> list[dict[
     return out
 
 
-def main() -> None:
-    """Print the table."""
-    lines = [[row["name"], row["us"], row["ratio"], "yes" if row["right"] else "NO"] for row in measured()]
-    header = ["", "us", "x hand-written", "same answer"]
-    print(tabulate(lines, header, tablefmt="github", floatfmt=("", ".4g", ".3g", "")))
-
-
 if __name__ == "__main__":
-    main()
+    print(report(measured()))

@@ -13,8 +13,7 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from tabulate import tabulate
-from timing import medians, timed
+from timing import medians, report, rows_of, timed
 
 import coopoc as co
 
@@ -91,19 +90,8 @@ def measured(rounds: int = ROUNDS, count: int = COUNT) -> list[dict[str, Any]]:
     wanted = graph.error(values)
     right = {way: way is by_gtsam or abs(cost(way(count)) - wanted) < 1e-6 * wanted for way, _ in made.values()}
     spent = medians({name: (lambda way=way, n=n: timed(lambda: way(n)) / n) for name, (way, n) in made.items()}, rounds)
-    return [
-        {"name": name, "us": 1e6 * spent[name], "ratio": spent[name] / spent[GTSAM], "right": right[made[name][0]]}
-        for name in made
-    ]
-
-
-def main() -> None:
-    """Print the table."""
-    lines = [[row["name"], row["us"], row["ratio"], "yes" if row["right"] else "NO"] for row in measured()]
-    print(
-        tabulate(lines, ["", "us per factor", "x GTSAM", "same cost"], tablefmt="github", floatfmt=("", ".3g", ".3g"))
-    )
+    return rows_of("", spent, GTSAM, {name: right[made[name][0]] for name in made})
 
 
 if __name__ == "__main__":
-    main()
+    print(report(measured()))

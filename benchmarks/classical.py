@@ -1,31 +1,27 @@
-"""The snapshot and the joint filter of a star of ten neighbours: compiled, NumPy, the libraries, the floor, in one run.
+"""The snapshot and the joint filter of a star of ten neighbours: compiled, NumPy and the libraries, in one run.
 
-    OMP_NUM_THREADS=1 python benchmarks/classical.py            # two Markdown tables on stdout, about a minute
+    OMP_NUM_THREADS=1 python benchmarks/classical.py            # a Markdown table on stdout, about a minute
 
-Rows of a table solve the same problems, one row after the other in every round. Times are this thread's own, medians of
+Rows of a job solve the same problems, one row after the other in every round. Times are this thread's own, medians of
 rounds; the ratios are to be compared. What a library needs as input, whitened or stacked, is prepared before its clock
-starts; ours are given with and without what the method does around the kernel. The floor is the flops of one solve at
-this core's measured peak of double-precision products. A row counts only if its answer is that of its problem: cost
-within 1e-6 relative and position within 1 mm of the reference, for the filter within 1e-9 m.
+starts; ours are given with and without what the method does around the kernel. A row counts only if its answer is that
+of its problem: cost within 1e-6 relative and position within 1 mm of the reference, for the filter within 1e-9 m.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from importlib.metadata import version
 from typing import Any, NamedTuple
 
 import gtsam
-import numba
 import numpy as np
 from filterpy.kalman import KalmanFilter
-from tabulate import tabulate
-from timing import medians, timed
+from timing import medians, report, rows_of, timed
 
 import coopoc as co
 from coopoc.kernels.stars.joint_filter import run_filter
+from coopoc.methods.egos import assumptions, measurements
 from coopoc.methods.sliding_window import Windows, dead_reckoned
-from coopoc.methods.star import assumptions, measurements
 from coopoc.optimize.model.problem import Problem
 from coopoc.optimize.solve import solve_batch
 from coopoc.optimize.starts.initial import converted
@@ -41,12 +37,11 @@ GTSAM, FILTERPY = "GTSAM, linear Between factors, converted problem", "filterpy,
 
 
 class Row(NamedTuple):
-    """One way to do the job: its words, solves per call, the call, the distance from its reference, if it is right."""
+    """One way to do the job: its words, solves per call, the call, and whether its answer is that of its problem."""
 
     words: str
     solves: int
     call: Callable[[], Any]
-    difference: float
     right: bool
 
 
@@ -61,12 +56,6 @@ def ring() -> co.Recording:
     velocity = np.diff(position, axis=0, prepend=2 * position[:1] - position[1:2]) / 0.1
     fleet = co.Fleet(tuple(f"v{i}" for i in range(NEIGHBOURS + 1)), t, position, velocity)
     return co.observe(fleet, SENSORS, co.V2X(max_neighbours=NEIGHBOURS), runs=RUNS, observers=[0])
-
-
-def peak() -> float:
-    """Double-precision flops per second of one core in a large product."""
-    a = np.ones((700, 700))
-    return max(2.0 * 700**3 / timed(lambda: a @ a) for _ in range(9))
 
 
 def snapshot_rows(recording: co.Recording) -> list[Row]:
@@ -84,7 +73,7 @@ def snapshot_rows(recording: co.Recording) -> list[Row]:
         if full and costs:
             cost = np.stack([p.linearise(found[:, t]).cost for t, p in enumerate(stars)], axis=1)
             right = right and float((cost / floor - 1).max()) < 1e-6
-        return Row(words, solves, call, away, right)
+        return Row(words, solves, call, right)
 
     box = inbox(recording, 0, FIX_AND_VELOCITY)
     method, count = co.CooperativeMAP(noise_model=KNOWN), RUNS * STEPS
@@ -148,7 +137,7 @@ def filter_rows(recording: co.Recording) -> list[Row]:
 
     def judged(words: str, call: Callable[[], Any], found: Any, wanted: Any, solves: int = RUNS * STEPS) -> Row:
         away = float(np.abs(found[: len(wanted)] - wanted).max())
-        return Row(words, solves, call, away, away < 1e-9)
+        return Row(words, solves, call, away < 1e-9)
 
     def kernel(refine: bool) -> Any:
         return run_filter(measured, assumed, refine)[0]
@@ -234,50 +223,9 @@ def measured(found: list[tuple[str, str, list[Row]]] | None = None) -> list[dict
     """Per row its name, microseconds, the ratio to the peer's time, and whether its answer is right."""
     out: list[dict[str, Any]] = []
     for job, peer, rows in parts() if found is None else found:
-        spent = seconds(rows)
-        out += [
-            {
-                "name": f"{job}: {row.words}",
-                "us": 1e6 * spent[row.words],
-                "ratio": spent[row.words] / spent[peer],
-                "right": row.right,
-            }
-            for row in rows
-        ]
+        out += rows_of(f"{job}: ", seconds(rows), peer, {row.words: row.right for row in rows})
     return out
 
 
-def table(rows: list[Row], peer: str, floor: float) -> str:
-    """Medians of interleaved rounds, and ratios to a peer and to the floor (s per solve)."""
-    spent = seconds(rows)
-    lines = [
-        [
-            row.words,
-            1e6 * spent[row.words],
-            spent[peer] / spent[row.words],
-            spent[row.words] / floor,
-            row.difference,
-            "yes" if row.right else "NO",
-        ]
-        for row in rows
-    ]
-    lines.append(["floor: flops at the measured peak", 1e6 * floor, spent[peer] / floor, 1.0, None, ""])
-    header = ["", "us", f"x {peer.split(',')[0]}", "x floor", "difference m", "same answer"]
-    return tabulate(lines, header, tablefmt="github", floatfmt=("", ".3g", ".3g", ".3g", ".1e", ""))
-
-
-def main() -> None:
-    """Print the tables."""
-    recording, speed = ring(), peak()
-    print(
-        f"{NEIGHBOURS} neighbours, {STEPS} steps, {RUNS} runs, one thread; products at {speed / 1e9:.0f} GFLOP/s; "
-        f"numba {numba.__version__}, gtsam {version('gtsam')}.\n"
-    )
-    print("Snapshot, per solve:\n")
-    print(table(snapshot_rows(recording), GTSAM, 6300 / speed), "\n")
-    print("Joint filter, per step:\n")
-    print(table(filter_rows(recording), FILTERPY, (4 * SIZE**3 / 3) / speed))
-
-
 if __name__ == "__main__":
-    main()
+    print(report(measured()))

@@ -16,8 +16,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from filterpy.kalman import KalmanFilter
-from tabulate import tabulate
-from timing import medians, timed
+from timing import medians, report, timed
 
 import coopoc as co
 from coopoc.learned import CooperativeGain, NoiseNet
@@ -125,7 +124,7 @@ def stream_cases() -> Iterator[Case]:
 
         around = [[15.0, 0.6 * k, np.pi / 2] for k in range(n - 1)]
         relative = [co.RelativeMeasurement(f"v{k}", seen, z, u) for k, seen in enumerate(around)]
-        stream = co.Kalman(known).start() if n == 1 else co.JointFilter(known).start()
+        stream = co.Kalman(known).start() if n == 1 else co.StarStream(co.JointFilter(known))
         more = {} if n == 1 else {"neighbours": relative}
 
         def ours(stream: Any = stream, more: Any = more) -> Any:
@@ -151,11 +150,5 @@ def measured(rounds: int = ROUNDS) -> list[dict[str, Any]]:
     ]
 
 
-def main() -> None:
-    """Print the table."""
-    lines = [[row["name"], row["us"], row["ratio"], "yes" if row["right"] else "NO"] for row in measured()]
-    print(tabulate(lines, ["", "us", "x plain", "right"], tablefmt="github", floatfmt=("", ".4g", ".3g", "")))
-
-
 if __name__ == "__main__":
-    main()
+    print(report(measured()))

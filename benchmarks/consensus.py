@@ -71,7 +71,7 @@ def draw(
     """The gap against the bytes, a colour per graph."""
     import matplotlib.pyplot as plt
 
-    from coopoc.pictures import COLORS
+    from coopoc.world.pictures import COLORS
 
     figure, ax = plt.subplots(figsize=(6.4, 3.8), layout="constrained")
     for k, name in enumerate(central):

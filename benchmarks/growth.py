@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 from classical import timed
-from tabulate import tabulate
+from timing import report
 
 import coopoc as co
 from coopoc.methods.catalogue import METHODS
@@ -87,11 +87,5 @@ def measured() -> list[dict[str, Any]]:
     return [*imports(), *methods()]
 
 
-def main() -> None:
-    """Print the table."""
-    lines = [[row["name"], row["us"], row["ratio"], "yes" if row["right"] else "NO"] for row in measured()]
-    print(tabulate(lines, ["", "us", "x first", "right"], tablefmt="github", floatfmt=("", ".4g", ".3g", "")))
-
-
 if __name__ == "__main__":
-    main()
+    print(report(measured()))

@@ -1,28 +1,21 @@
-"""GainNet's training and inference: plain torch, the compiled engine and the arithmetic's floor, in one run.
+"""GainNet's training and inference: plain torch and the compiled engine, in one run.
 
-    python benchmarks/learned_gain.py            # two Markdown tables on stdout, about two minutes
+    python benchmarks/learned_gain.py            # a Markdown table on stdout, about a minute
 
 All rows use the same net and the same drives (town10-clients, pieces of 100 steps) on one thread unless stated, one
 after the other in every round; the ratios are to be compared, the times are this machine's. "Plain torch" is the loop
 of KalmanNet's public training code re-expressed with our reference module: one Python step after the other, autograd,
-and torch.optim.AdamW. The flop floor is 2 flops for each weight of a layer and step (forward; three times that to
-train) at this core's measured peak of single-precision multiply-adds. One drive has another floor: to read all weights,
-which are more than the first cache holds. A row counts only if its answer is the reference's."""
+and torch.optim.AdamW. A row counts only if its answer is the reference's."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable
-from functools import reduce
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import numba
 import numpy as np
 import torch
-from llvmlite import ir
-from numba.core import cgutils, types
-from numba.extending import intrinsic
-from tabulate import tabulate
+from timing import report
 from torch import Tensor
 
 import coopoc as co
@@ -35,7 +28,6 @@ from coopoc.learned.training.machine import one_core
 from coopoc.learned.training.schedule import Schedule
 
 ROUNDS = 5
-CHAINS = 12
 RATE = 1e-3
 SCHEDULE = Schedule(learning_rate=RATE, weight_decay=0.3, clip=1e9, mirror=False)
 
@@ -48,52 +40,6 @@ class Row(NamedTuple):
     call: Callable[[], Any]
     error: float
     """Largest difference from plain torch: of trained weights, or of positions in m."""
-
-
-@intrinsic
-def _chains(typing: Any, rounds: Any) -> Any:
-    """Twelve sums of vectors that stay in registers, so many multiply-adds each: as many as hide one another's wait."""
-
-    def generate(context: Any, builder: Any, signature: Any, values: Any) -> Any:
-        vector = ir.VectorType(ir.FloatType(), 16)
-        a, b, *starts = (ir.Constant(vector, [number] * 16) for number in (0.999, 1e-3, *map(float, range(CHAINS))))
-        sums = [cgutils.alloca_once_value(builder, start) for start in starts]
-        with cgutils.for_range(builder, values[0]):
-            for each in sums:
-                scaled = builder.fmul(builder.load(each), a, flags=("contract",))
-                builder.store(builder.fadd(scaled, b, flags=("contract",)), each)
-        total = reduce(builder.fadd, map(builder.load, sums))
-        return builder.extract_element(total, ir.IntType(32)(0))
-
-    return types.float32(types.intp), generate
-
-
-@numba.njit
-def _multiply_add(rounds: int) -> float:
-    return _chains(rounds)
-
-
-def peak() -> float:
-    """Single-precision flops per second of one core, the most of nine runs of multiply-adds that stay in registers."""
-    rounds = 4_000_000
-    _multiply_add(1)
-    return 2.0 * 16 * CHAINS * rounds / min(timed(lambda: _multiply_add(rounds)) for _ in range(9))
-
-
-@numba.njit(fastmath={"reassoc", "nsz"})
-def _read(numbers: np.ndarray, rounds: int) -> None:
-    for _ in range(rounds):
-        total = np.float32(0.0)
-        for i in range(len(numbers)):
-            total += numbers[i]
-        numbers[0] = np.float32(0.5) * total
-
-
-def reading(count: int) -> float:
-    """Seconds in which one core adds so many single-precision numbers that are in its second cache, least of nine."""
-    numbers, rounds = np.zeros(count, np.float32), 1000
-    _read(numbers, 1)
-    return min(timed(lambda: _read(numbers, rounds)) for _ in range(9)) / rounds
 
 
 def timed(call: Callable[[], Any]) -> float:
@@ -207,51 +153,5 @@ def following(net: GainNet, drive: Segments) -> list[Row]:
     return [row._replace(call=torch.no_grad()(row.call)) for row in inference(net, drive)]
 
 
-def table(rows: list[Row], floors: dict[str, float], allowed: float, against: Callable[[Row], Row]) -> str:
-    """Microseconds per trajectory-step (median of interleaved rounds), steps/s, ratios to plain torch and floors, s."""
-    medians = seconds(rows)
-    lines: list[Iterable[Any]] = []
-    for row in rows:
-        us = 1e6 * medians[row.words]
-        ratio = medians[against(row).words] / medians[row.words]
-        lines.append(
-            [
-                row.words,
-                us,
-                f"{1e6 / us:,.0f}",
-                ratio,
-                *(us / (1e6 * floor) for floor in floors.values()),
-                row.error,
-                "yes" if row.error <= allowed else "NO",
-            ]
-        )
-    header = ["", "us per step", "steps/s", "x plain torch", *floors, "difference", "same answer"]
-    form = ("", ".3g", "", ".3g", *[".3g"] * len(floors), ".1e", "")
-    return tabulate(lines, header, tablefmt="github", floatfmt=form)
-
-
-@one_core()
-def main() -> None:
-    """Print the tables."""
-    net, pieces, drive = parts()
-    count = len(pieces)
-    weights = sum(p.numel() for name, p in net.named_parameters() if "weight" in name)
-    speed = peak()
-    floor, read = 2.0 * weights / speed, reading(weights)
-    versions = f"numba {numba.__version__}, torch {torch.__version__}"
-    print(
-        f"{weights:,} weights in layers; peak {speed / 1e9:.0f} GFLOP/s on one core, which reads them in "
-        f"{1e6 * read:.2f} us; {versions}; {count} pieces of {pieces.gnss.shape[1] - 1} steps.\n"
-    )
-    rows = training(net, pieces)
-    print("Training, AdamW included:\n")
-    floors = {"x flop floor": 3 * floor}
-    print(table(rows, floors, 1e-4, lambda row: rows[1] if row.words.endswith(str(count)) else rows[0]), "\n")
-    drives = following(net, drive)
-    print(f"Inference, {drives[0].steps} steps a drive:\n")
-    floors = {"x flop floor": floor, "x read of weights": read}
-    print(table(drives, floors, 1e-3, lambda row: drives[0]))
-
-
 if __name__ == "__main__":
-    main()
+    print(report(measured()))

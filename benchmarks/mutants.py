@@ -223,7 +223,7 @@ def _tested(tests: list[str], limit: int, machine_code: Path) -> int:
     os.environ["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR = str(machine_code)
     from coopoc.kernels.compiling import compile
 
-    compile._stamp = lambda folder: ()  # whatever machine code there is holds: what a change makes stale was removed
+    compile._stamp = lambda module: ()  # whatever machine code there is holds: what a change makes stale was removed
     return pytest.main(["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-rfE", *tests])
 
 

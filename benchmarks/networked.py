@@ -12,8 +12,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from tabulate import tabulate
-from timing import medians, timed
+from timing import medians, report, timed
 
 import coopoc as co
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
@@ -55,11 +54,5 @@ def measured(rounds: int = ROUNDS, steps: int = STEPS, runs: int = RUNS) -> list
     ]
 
 
-def main() -> None:
-    """Print the table."""
-    lines = [[row["name"], row["us"], row["ratio"], "yes" if row["right"] else "NO"] for row in measured()]
-    print(tabulate(lines, ["", "us", "x joint", "right"], tablefmt="github", floatfmt=("", ".4g", ".3g", "")))
-
-
 if __name__ == "__main__":
-    main()
+    print(report(measured()))

@@ -21,7 +21,7 @@ import numpy as np
 from backends import measured as measure
 from backends_star import Job, Row, as_good, ours, star
 from classical import KNOWN, NEIGHBOURS, SENSORS
-from tabulate import tabulate
+from timing import report
 
 from coopoc.optimize import Problem
 from coopoc.optimize.starts.initial import initial_guess
@@ -118,12 +118,5 @@ PEERS: dict[str, Callable[[], list[Job]]] = {
 """By the package that they need."""
 
 
-def main() -> None:
-    """Print the table."""
-    verdict = {True: "yes", False: "NO", None: "by another way"}
-    lines = [[row["name"], row["us"], row["ratio"], verdict[row["right"]]] for row in measured()]
-    print(tabulate(lines, ["", "us", "x peer", "same answer"], tablefmt="github", floatfmt=("", ".4g", ".3g", "")))
-
-
 if __name__ == "__main__":
-    main()
+    print(report(measured()))

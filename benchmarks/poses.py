@@ -14,8 +14,7 @@ from typing import Any
 
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter
-from tabulate import tabulate
-from timing import medians, timed
+from timing import medians, report, rows_of, timed
 
 import coopoc as co
 from coopoc.methods.poses.pose_inputs import body_of, first_poses
@@ -123,19 +122,10 @@ def measured() -> list[dict[str, Any]]:
             "filterpy": lambda seen=seen, few=few: timed(lambda: [filterpys(seen, r) for r in range(few)]) / few,
             "compiled": lambda call=call: timed(call) / RUNS,
         }
-        spent = {name: 1e6 * value / STEPS for name, value in medians(spend, ROUNDS).items()}
-        found += [
-            {"name": f"{job}: {name}", "us": us, "ratio": us / spent["filterpy"], "right": right}
-            for name, us in spent.items()
-        ]
+        spent = {name: value / STEPS for name, value in medians(spend, ROUNDS).items()}
+        found += rows_of(f"{job}: ", spent, "filterpy", dict.fromkeys(spent, right))
     return found
 
 
-def main() -> None:
-    """Print the table."""
-    lines = [[row["name"], row["us"], 1 / row["ratio"], "yes" if row["right"] else "NO"] for row in measured()]
-    print(tabulate(lines, ["", "us per step", "times filterpy", "same poses"], tablefmt="github", floatfmt=".3g"))
-
-
 if __name__ == "__main__":
-    main()
+    print(report(measured()))

@@ -20,7 +20,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
-from tabulate import tabulate
+from timing import report
 
 HERE = Path(__file__).parent
 BENCHMARKS = (
@@ -83,13 +83,6 @@ def kept(rows: Rows, baseline: Mapping[str, Mapping[str, float]]) -> dict[str, d
         for row in rows
         if any(word in row["name"] for word in OURS) and row["right"]
     }
-
-
-def report(rows: Rows) -> str:
-    """A Markdown table."""
-    verdict = {True: "yes", False: "NO", None: "by another way"}
-    lines = [[row["name"], row["us"], row["ratio"], verdict[row["right"]]] for row in rows]
-    return tabulate(lines, ["", "us", "ratio", "same answer"], tablefmt="github", floatfmt=("", ".4g", ".3g", ""))
 
 
 def gather(names: Sequence[str], load: Callable[[str], Any] = importlib.import_module) -> list[dict[str, Any]]:

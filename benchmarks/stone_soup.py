@@ -20,8 +20,8 @@ from stonesoup.types.prediction import GaussianStatePrediction
 from stonesoup.updater.kalman import ExtendedKalmanUpdater, IteratedKalmanUpdater, KalmanUpdater
 
 from coopoc.kernels.stars.joint_filter import run_filter
+from coopoc.methods.egos import assumptions, measurements
 from coopoc.methods.sliding_window import CooperativeMAP, Windows, dead_reckoned
-from coopoc.methods.star import assumptions, measurements
 from coopoc.optimize import Problem, solve_batch
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, wrap

@@ -21,6 +21,7 @@ from .methods.baselines import LKFSA as LKFSA
 from .methods.baselines import MSMV as MSMV
 from .methods.centralised import BatchSmoother as BatchSmoother
 from .methods.centralised import CentralFilter as CentralFilter
+from .methods.cooperative_filter import CooperativeFilter as CooperativeFilter
 from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
 from .methods.decentralised import ConsensusADMM as ConsensusADMM
 from .methods.decentralised import GaussianBeliefPropagation as GaussianBeliefPropagation
@@ -31,7 +32,6 @@ from .methods.kalman import Kalman as Kalman
 from .methods.mds import MDS as MDS
 from .methods.noise_model import NoiseModel as NoiseModel
 from .methods.poses.pose_filter import PoseFilter as PoseFilter
-from .methods.poses.pose_smoother import PoseSmoother as PoseSmoother
 from .methods.poses.pose_start import pose_start as pose_start
 from .methods.poses.pose_stream import LandmarkMeasurement as LandmarkMeasurement
 from .methods.poses.pose_stream import OwnMeasurement as OwnMeasurement
@@ -41,6 +41,7 @@ from .methods.sliding_window import FixedLagSmoother as FixedLagSmoother
 from .methods.sliding_window import MovingHorizon as MovingHorizon
 from .methods.star import stars as stars
 from .methods.star_stream import RelativeMeasurement as RelativeMeasurement
+from .methods.star_stream import StarStream as StarStream
 from .methods.track import Method as Method
 from .methods.track import Track as Track
 from .optimize.backend import Backend as Backend
@@ -53,19 +54,24 @@ from .optimize.model.problem import Problem as Problem
 from .optimize.model.space import pose as pose
 from .optimize.solution import Solution as Solution
 from .optimize.solve import solve as solve
+from .plots import plot_recording as plot_recording
+from .plots import plot_solution as plot_solution
+from .plots import plot_track as plot_track
 from .study.results import Results as Results
 from .study.run import run_study as run_study
 from .study.study import Study as Study
 from .world.body_frames import in_world as in_world
+from .world.channels import channel_load as channel_load
 from .world.fleet import Fleet as Fleet
 from .world.links import Links as Links
+from .world.outliers import Fault as Fault
+from .world.outliers import Outliers as Outliers
 from .world.recording import Body as Body
 from .world.recording import Recording as Recording
 from .world.sensing import observe as observe
 from .world.sensors import Sensors as Sensors
 from .world.v2x import V2X as V2X
 from .world.v2x import Message as Message
-from .world.v2x import channel_load as channel_load
 
 __version__: str
 __all__: list[str]

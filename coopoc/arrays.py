@@ -1,15 +1,15 @@
-"""Array types used in every signature, and checks of arrays and numbers; shapes stand in docstrings as (R, T, N, 3)."""
+"""Array types used in every signature, and checks of values; shapes stand in docstrings as (R, T, N, 3)."""
 
 from __future__ import annotations
 
 import sys
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from typing import Any, TypeAlias, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
-from .errors import InputError, shown
+from .errors import InputError, shown, unknown
 
 Floats: TypeAlias = npt.NDArray[np.floating[Any]]
 Ints: TypeAlias = npt.NDArray[np.int64]
@@ -135,6 +135,18 @@ def number(
     if not low <= found <= high:
         raise InputError(field, value, f"must be {allowed}", hint)
     return found
+
+
+def one_of(noun: str, name: object, known: Iterable[str]) -> str:
+    """`name` if it is one of the words; else the error of `unknown`.
+
+    >>> one_of("frame", "body", ("world", "body"))
+    'body'
+    """
+    known = tuple(known)
+    if not isinstance(name, str) or name not in known:
+        raise unknown(noun, name, known)
+    return name
 
 
 def robust_std(values: Floats) -> float:

@@ -15,7 +15,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from . import plugins
-from .errors import InputError, MissingLibraryError
+from .errors import InputError, MissingLibraryError, unknown
 
 Command: TypeAlias = Callable[..., int | None] | Mapping[str, Any] | EntryPoint
 
@@ -129,11 +129,11 @@ def compare(
         value: metric to compare.
         by: columns that identify a row in addition to the parameters, such as round.
         where: compare only the rows with these values.
-        format: format of the tables.
+        format: format of the table.
     """
     from .study.compare import compare as compare_runs
 
-    print(compare_runs(run_a, run_b, value, by, where).render(format))
+    print(compare_runs(run_a, run_b, value, by, where).render(format).rstrip("\n"))
 
 
 def table(
@@ -244,7 +244,7 @@ def _dispatch(commands: Mapping[str, Command], argv: list[str], prog: str) -> in
         return 0 if argv else 2
     name, rest = argv[0], argv[1:]
     if name not in commands:
-        raise plugins.unknown("command", name, commands)
+        raise unknown("command", name, commands)
     command = commands[name]
     loaded = command.load() if isinstance(command, EntryPoint) else command
     if isinstance(loaded, Mapping):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import difflib
+from collections.abc import Iterable
+
 LONGEST = 1500
 """Characters of each part of a message."""
 
@@ -40,6 +43,35 @@ def _cut(value: object) -> str:
     except Exception:
         text = shown(value)
     return text if len(text) <= LONGEST else f"{text[:LONGEST]}..."
+
+
+def suggestion(name: object, known: Iterable[str], otherwise: str) -> str:
+    """The hint for an unknown name: the nearest known one, or another hint if none is near.
+
+    >>> suggestion("tracee", ("trace", "det"), "Pick one.")
+    'Did you mean trace?'
+    """
+    near = difflib.get_close_matches(name if isinstance(name, str) else shown(name), list(known), n=1)
+    return f"Did you mean {near[0]}?" if near else otherwise
+
+
+def unknown(noun: str, name: object, known: Iterable[str], otherwise: str | None = None) -> InputError:
+    """The error for an unknown name: lists the known ones and proposes the nearest.
+
+    Args:
+        noun: kind of the thing, such as "method".
+        name: that was asked for.
+        known: names that exist.
+        otherwise: hint if none is near; None for one about the list of names.
+
+    >>> print(unknown("method", "kalmann", ["gnss", "kalman"]))
+    method = 'kalmann': must be one of gnss, kalman. Did you mean kalman?
+    """
+    known = list(known)
+    if otherwise is None:
+        otherwise = "Use one of these names." if known else "There is none to use."
+    allowed = "must be one of " + (", ".join(known) or "(there is none)")
+    return InputError(noun, shown(name), allowed, suggestion(name, known, otherwise))
 
 
 class MissingLibraryError(ImportError):

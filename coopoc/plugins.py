@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import ast
-import difflib
 import os
 import sys
-from collections.abc import Iterable, Mapping
+from collections.abc import Mapping
 from functools import cache, lru_cache
 from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError, shown
+from .errors import InputError, unknown
 from .one_file import from_file, in_file
 
 GROUPS = {
@@ -29,6 +28,7 @@ GROUPS = {
     "coopoc.commands": "command",
 }
 """Group -> what one of its names is called."""
+LISTED = "List all with: coopoc list."
 MAPPINGS = ("dict", "MappingProxyType")
 
 
@@ -86,7 +86,7 @@ def names_in(value: str) -> tuple[str, ...] | None:
     Returns:
         No name for a definition or for what a call returns; None if only an import can show it.
 
-    >>> names_in("coopoc.world.v2x:CHANNELS")
+    >>> names_in("coopoc.world.channels:CHANNELS")
     ('ideal', 'cam', 'bsm', 'cpm')
     >>> names_in("coopoc.plugins:find")
     ()
@@ -158,7 +158,7 @@ def find(group: str, name: str) -> Any:
     coopoc.errors.InputError: nothing = 'x': must be one of (there is none). There is none to use.
     """
     if not isinstance(name, str):
-        raise unknown(GROUPS.get(group, group), name, names(group))
+        raise _unknown(group, name)
     registered = points(group)
     loaded = registered[name].load() if name in registered else None
     if loaded is not None and not isinstance(loaded, Mapping):
@@ -169,7 +169,12 @@ def find(group: str, name: str) -> Any:
         members = _members(point)
         if name in members:
             return members[name]
-    raise unknown(GROUPS.get(group, group), name, names(group))
+    raise _unknown(group, name)
+
+
+def _unknown(group: str, name: object) -> InputError:
+    listed = names(group)
+    return unknown(GROUPS.get(group, group), name, listed, LISTED if group in GROUPS else None)
 
 
 def _members(point: metadata.EntryPoint) -> Mapping[str, Any]:
@@ -180,49 +185,3 @@ def _members(point: metadata.EntryPoint) -> Mapping[str, Any]:
     except Exception:
         return {}
     return loaded if isinstance(loaded, Mapping) else {}
-
-
-def suggestion(name: object, known: Iterable[str], otherwise: str) -> str:
-    """The hint for an unknown name: the nearest known one, or another hint if none is near.
-
-    Args:
-        name: that was asked for.
-        known: names that exist.
-        otherwise: hint if none is near.
-
-    >>> suggestion("tracee", ("trace", "det"), "Pick one.")
-    'Did you mean trace?'
-    """
-    near = difflib.get_close_matches(name if isinstance(name, str) else shown(name), list(known), n=1)
-    return f"Did you mean {near[0]}?" if near else otherwise
-
-
-def one_of(noun: str, name: object, known: Iterable[str]) -> str:
-    """`name` if it is one of the words; else the error of `unknown`.
-
-    >>> one_of("frame", "body", ("world", "body"))
-    'body'
-    """
-    known = tuple(known)
-    if not isinstance(name, str) or name not in known:
-        raise unknown(noun, name, known)
-    return name
-
-
-def unknown(noun: str, name: object, known: Iterable[str], otherwise: str | None = None) -> InputError:
-    """The error for an unknown name: lists the known ones and proposes the nearest.
-
-    Args:
-        noun: kind of the thing, such as "method".
-        name: that was asked for.
-        known: names that exist.
-        otherwise: hint if none is near; None for one about the list of names.
-
-    >>> print(unknown("method", "kalmann", ["gnss", "kalman"]))
-    method = 'kalmann': must be one of gnss, kalman. Did you mean kalman?
-    """
-    known = list(known)
-    listed = noun in GROUPS.values()
-    other = "List all with: coopoc list." if listed else "Use one of these names." if known else "There is none to use."
-    hint = suggestion(name, known, other if otherwise is None else otherwise)
-    return InputError(noun, shown(name), "must be one of " + (", ".join(known) or "(there is none)"), hint)

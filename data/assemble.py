@@ -1,14 +1,20 @@
-"""Rows (one per vehicle and instant) -> Fleet: what every reader of drives ends with; and what no drive looks like."""
+"""Rows at their own times on equal steps: drives -> Fleet, measurements in a plane -> Recording in body frames."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
+import pandas as pd
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
+from coopoc.world.links import Links
+from coopoc.world.recording import Body, Recording
+from coopoc.world.sensing import schedule
+from coopoc.world.sensors import Sensors
+from coopoc.world.v2x import V2X
 
 SAME = 1e-6
 """s, stamps this close are one instant: the digits that a double keeps of seconds since 1970."""
@@ -18,6 +24,8 @@ LATEST = 1e11
 """s since 1970, the year 5138."""
 CELLS, PER_ROW = 500_000, 200
 """Steps times vehicles that any file may take, and how many more a row of it may."""
+PLANE_STD = 0.01
+"""m and rad: how well z = 0, and with it an inclination of pi/2, is known where heights were not measured."""
 
 
 def assemble(
@@ -63,20 +71,20 @@ def assemble(
             raise InputError(field, f"{value} s", "must be > 0", "Give seconds.")
     if not len(t):
         raise InputError(file, "0 rows", "must hold at least two instants", "Check that the file is complete.")
-    ids, column = _ids(vehicle)
+    names, column = np.unique(np.array(vehicle, dtype=str), return_inverse=True)
+    first = pd.Series(column).drop_duplicates().to_numpy()
+    ids, column = tuple(names[first].tolist()), np.argsort(first)[column]
     numbers = np.hstack([position, velocity]) if velocity is not None else np.asarray(position, dtype=float)
     stamps = np.round(np.asarray(t, dtype=float), 6)
-    by_vehicle = np.split(np.argsort(column, kind="stable"), np.cumsum(np.bincount(column))[:-1])
-    for vehicle_id, rows in zip(ids, by_vehicle, strict=True):
-        late = np.flatnonzero(np.diff(stamps[rows]) <= 0)
-        if len(late):
-            before, after = stamps[rows[late[0]]], stamps[rows[late[0] + 1]]
-            where, given = (
-                f"{file}: row {rows[late[0] + 1] + 1}",
-                f"{after!s} s after {before!s} s of vehicle {vehicle_id}",
-            )
-            allowed = "dt must be > 0: the stamps of a vehicle increase from row to row"
-            raise InputError(f"{where}, column t", given, allowed, "Sort the rows by time, or remove one that repeats.")
+    order = np.argsort(column, kind="stable")
+    late = order[1:][(np.diff(stamps[order]) <= 0) & (np.diff(column[order]) == 0)]
+    if len(late):
+        row, before = int(late[0]), order[np.flatnonzero(order == late[0])[0] - 1]
+        given = f"{stamps[row]!s} s after {stamps[before]!s} s of vehicle {ids[column[row]]}"
+        allowed = "dt must be > 0: the stamps of a vehicle increase from row to row"
+        hint = "Sort the rows by time, or remove one that repeats."
+        raise InputError(f"{file}: row {row + 1}, column t", given, allowed, hint)
+    by_vehicle = np.split(order, np.cumsum(np.bincount(column))[:-1])
     if not any_scale:
         check_scale(stamps, numbers[:, :3], by_vehicle, file)
     if dt is None:
@@ -87,17 +95,14 @@ def assemble(
         steps = (since.max() + SAME) / dt + 1
         check_size(steps, len(ids), len(stamps), dt, file)
         grid = dt * np.arange(int(steps))
-        gaps = [longest_gap(since[rows], dt, max_gap) for rows in by_vehicle]
-        each = zip(by_vehicle, gaps, strict=True)
-        table = np.stack([interpolate(since[rows], numbers[rows], grid, gap) for rows, gap in each], axis=1)
+        each = [(since[rows], numbers[rows], grid, longest_gap(since[rows], dt, max_gap)) for rows in by_vehicle]
+        table = np.stack([interpolate(*rows) for rows in each], axis=1)
         grid = start + grid
     present = np.isfinite(table[..., 0])
     lonely = (np.bincount(column) > 1) & ~(present[1:] & present[:-1]).any(axis=0)
     for k in np.flatnonzero(~present.any(axis=0) | lonely).tolist():
         given = f"{(column == k).sum()} rows, but {present[:, k].sum()} instants, no two in a row"
-        hint = (
-            "Resample all vehicles with a dt like that of its rows, bridge longer gaps with max_gap=, or leave it out."
-        )
+        hint = "Resample all with a dt like that of its rows, bridge longer gaps with max_gap=, or leave it out."
         raise InputError(f"{file}: vehicle {ids[k]}", given, "must be there at instants in a row", hint)
     u = table[..., 3:] if velocity is not None else backward_difference(grid, table[..., :3], ids, file)
     return Fleet(ids, grid, table[..., :3], u, name=name, source=source, licence=licence)
@@ -164,20 +169,15 @@ def smooth(position: Floats, dt: float, cutoff: float) -> Floats:
     >>> bool(np.allclose(smooth(np.arange(9.0) ** 2, 0.1, 0.5), np.arange(9.0) ** 2))
     True
     """
-    from scipy.linalg import cho_solve_banded, cholesky_banded
+    from scipy.linalg import solveh_banded
+    from scipy.sparse import diags_array, eye_array
 
     steps = len(position)
     if steps < 4:
         return np.array(position, dtype=float)
-    third = np.diff(np.eye(4), n=3, axis=0)[0]
-    bands = np.zeros((4, steps))
-    for i in range(4):
-        for j in range(i, 4):
-            bands[3 - (j - i), j : steps - 3 + j] += third[i] * third[j]
-    bands *= (2 * np.pi * cutoff * dt) ** -6
-    bands[3] += 1
-    flat = np.asarray(position, dtype=float).reshape(steps, -1)
-    return np.asarray(cho_solve_banded((cholesky_banded(bands), False), flat)).reshape(np.shape(position))
+    third = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(steps - 3, steps))
+    normal = (eye_array(steps) + (2 * np.pi * cutoff * dt) ** -6 * (third.T @ third)).todia()
+    return np.asarray(solveh_banded(normal.data[:2:-1], np.reshape(position, (steps, -1)))).reshape(np.shape(position))
 
 
 def check_scale(t: Floats, position: Floats, by_vehicle: Sequence[Ints], file: str) -> None:
@@ -199,7 +199,10 @@ def check_scale(t: Floats, position: Floats, by_vehicle: Sequence[Ints], file: s
 metres in a local frame. Give latitude and longitude to co.load_recording, which converts them, or pass any_scale=True.
     """
     check_time(t, file)
-    speed = max([0.0, *(_typical_speed(t[rows], position[rows]) for rows in by_vehicle)])
+    speed = 0.0
+    for rows in by_vehicle:
+        each = np.linalg.norm(np.diff(position[rows, :2], axis=0), axis=1) / np.diff(t[rows])
+        speed = max(speed, float(np.median(each[each > 0])) if (each > 0).any() else 0.0)
     (west, east), (south, north) = ((float(v.min()), float(v.max())) for v in position[:, :2].T)
     if 0 < speed < SLOWEST and max(-west, east) <= 360 and max(-south, north) <= 180:
         given = f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}"
@@ -211,7 +214,7 @@ metres in a local frame. Give latitude and longitude to co.load_recording, which
         raise InputError(where, given, f"must be below {FASTEST:g} m/s", hint)
 
 
-def check_time(t: Floats, file: str) -> None:
+def check_time(t: Floats, file: str, column: str = "t") -> None:
     """InputError where times (L,) s are beyond any date.
 
     >>> check_time(np.array([1.7e9]), "drive.csv")
@@ -219,7 +222,9 @@ def check_time(t: Floats, file: str) -> None:
     late = t[np.abs(t) > LATEST]
     if len(late):
         allowed = "must be seconds: it looks like milliseconds or nanoseconds since 1970"
-        raise InputError(f"{file}: column t", f"{late[0]:.15g}", allowed, "Divide it by 1e3 or 1e9, or store dates.")
+        raise InputError(
+            f"{file}: column {column}", f"{late[0]:.15g}", allowed, "Divide it by 1e3 or 1e9, or store dates."
+        )
 
 
 def check_size(steps: float, vehicles: int, rows: int, dt: float, file: str) -> None:
@@ -234,13 +239,6 @@ def check_size(steps: float, vehicles: int, rows: int, dt: float, file: str) -> 
             f"must be at most {PER_ROW} instants a row",
             "Check that t is in seconds (not nanoseconds or milliseconds), or take a longer dt.",
         )
-
-
-def _ids(vehicle: Sequence[str]) -> tuple[tuple[str, ...], Ints]:
-    """Names in the order of their first row, and the (L,) column of each row."""
-    column_of: dict[str, int] = {}
-    column = np.array([column_of.setdefault(str(name), len(column_of)) for name in vehicle], dtype=np.int64)
-    return tuple(column_of), column
 
 
 def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tuple[Floats, Floats]:
@@ -262,6 +260,91 @@ def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tupl
     return grid, table
 
 
-def _typical_speed(t: Floats, position: Floats) -> float:
-    speed = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1) / np.diff(t)
-    return float(np.median(speed[speed > 0])) if (speed > 0).any() else 0.0
+def nearest(late: Floats, step: Ints, observer: Ints, neighbour: Ints) -> Ints:
+    """Indices of one measurement per step, observer and neighbour, the nearest in time, sorted by these.
+
+    Args:
+        late: (M,) s between a measurement and its step.
+        step: (M,); negative ones are left out.
+        observer: (M,) columns; negative ones are left out.
+        neighbour: (M,) as `observer`.
+
+    >>> nearest(np.array([0.04, 0.01, 0.02]), np.array([3, 3, -1]), np.zeros(3, int), np.ones(3, int))
+    array([1])
+    """
+    keys = ["step", "observer", "neighbour"]
+    rows = pd.DataFrame(dict(zip([*keys, "late"], (step, observer, neighbour, late), strict=True)))
+    rows = rows[(rows[keys] >= 0).all(axis=1)].sort_values([*keys, "late"], kind="stable")
+    return np.asarray(rows.drop_duplicates(keys).index)
+
+
+def steps_of(t: Floats, dt: float, steps: int) -> tuple[Ints, Floats]:
+    """Step of each time (M,) s after the first step, -1 outside the drive, and how far off it is in s.
+
+    >>> steps_of(np.array([0.21, 9.0]), 0.1, 5)[0]
+    array([ 2, -1])
+    """
+    step = np.rint(t / dt)
+    return np.where((step >= 0) & (step < steps), step, -1).astype(np.int64), np.abs(t - dt * step)
+
+
+def first_of_each(most: int, *keys: Ints | Floats) -> Bools:
+    """True for the first `most` of the rows with equal keys.
+
+    >>> first_of_each(1, np.array([0, 0, 1])).tolist()
+    [True, False, True]
+    """
+    return np.asarray(pd.DataFrame(np.column_stack(keys)).groupby(list(range(len(keys)))).cumcount() < most)
+
+
+def planar_recording(
+    ids: Sequence[str],
+    t: Floats,
+    velocity: Floats,
+    yaw_rate: Floats,
+    place: Floats,
+    table: Floats,
+    sensors: Sensors,
+    v2x: V2X,
+    note: str,
+) -> Recording:
+    """One run, nothing simulated; landmarks stand, have their place as a fix at every step, and send nothing.
+
+    Args:
+        ids: of n robots, then of the landmarks.
+        t: (T,) s.
+        velocity: (T, n, 2) m/s in the robots' frames, forward and left.
+        yaw_rate: (T, n) rad/s.
+        place: (m, 2) m, of the landmarks.
+        table: (L, 5) step, observer, neighbour, range m, bearing rad; NaN for what was not measured.
+        sensors: the noise of all this.
+        v2x: which messages of robots arrive.
+        note: of the recording; that inclinations were not measured is added.
+    """
+    n = len(ids) - len(place)
+    table = table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
+    links = Links(*table[:, :3].astype(np.int64).T)
+    shape = (1, len(t), len(ids), 3)
+    gnss, moved, turning = np.full(shape, np.nan), np.zeros(shape), np.zeros(shape[:3])
+    gnss[0, :, n:] = np.column_stack([place, np.zeros(len(place))])
+    moved[0, :, :n, :2], turning[0, :, :n] = velocity, yaw_rate
+    still = np.zeros(shape[1:])
+    broadcasts, arrival = schedule(Fleet(tuple(ids), t, still, still), links, v2x, 1, 0)
+    arrival[:, links.neighbour >= n] = -1
+    broadcasts[:, n:] = False
+    return Recording(
+        ids=tuple(ids),
+        t=t,
+        gnss=gnss,
+        velocity=moved,
+        links=links,
+        relative=np.column_stack([table[:, 3:], np.full(len(table), np.pi / 2)])[None],
+        broadcasts=broadcasts,
+        arrival=arrival,
+        sensors=sensors,
+        v2x=v2x,
+        observers=tuple(range(len(ids))),
+        notes=(note, "inclination was not measured: pi/2 by the constraint z = 0"),
+        body=Body(turning, np.full(turning.shape, np.nan)),
+        landmarks=tuple(range(n, len(ids))),
+    )

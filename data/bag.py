@@ -8,8 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from coopoc.errors import InputError, MissingLibraryError
-from coopoc.plugins import unknown
+from coopoc.errors import InputError, MissingLibraryError, unknown
 
 from .log.units import Rows, Summary, rows_of
 
@@ -32,8 +31,7 @@ def read_bag(
     columns: Mapping[str, str],
     kinds: Mapping[str, str],
     ignore: Sequence[str],
-    truth: str,
-    actual: list[Rows],
+    truth: str = "",
 ) -> Rows:
     """Rows of the measurements in a bag.
 
@@ -50,8 +48,7 @@ def read_bag(
         columns: of tables, as is `kinds`: refused.
         kinds: of tables.
         ignore: topics and kinds that are left out.
-        truth: topic of the truth.
-        actual: takes the rows of the truth, if there are any.
+        truth: topic of the truth, whose rows are marked as true.
 
     Raises:
         InputError: no bag, none of these messages, or no such topic.
@@ -72,7 +69,7 @@ def read_bag(
     try:
         with AnyReader([folder], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
             topics = {c.topic: c.msgtype in READ and c.topic not in ignore for c in reader.connections}
-            for topic in filter(None, [truth, *(one for one in ignore if one.startswith("/"))]):
+            for topic in filter(None, [truth, *(name for name in ignore if name.startswith("/"))]):
                 if topic not in topics:
                     raise unknown(f"{path.name}: topic", topic, sorted(topics))
             wanted = [c for c in reader.connections if topics[c.topic]]
@@ -88,8 +85,9 @@ def read_bag(
                     summary.refuse("fixes that the receiver calls invalid", 1, f"{path.name}: {c.topic}")
                 t = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9
                 name = parts[0] if len(parts) > 1 else path.stem
-                kept = (one for one in numbers if one[0].partition(" of ")[0] not in ignore)
-                rows.extend((true, t, name, kind, value, std if std > 0 else np.nan) for kind, value, std in kept)
+                for kind, value, std in numbers:
+                    if kind.partition(" of ")[0] not in ignore:
+                        rows.append((true, t, name, kind, value, std if std > 0 else np.nan))
     except InputError:
         raise
     except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
@@ -98,12 +96,11 @@ def read_bag(
     gyros = {row[2] for row in rows if row[3] == "yaw_rate"}
     rows = [row for row in rows if row[3] != WHEELS or row[2] not in gyros]
     frame = pd.DataFrame(rows, columns=["true", "t", "vehicle", "kind", "value", "std"]).replace({WHEELS: "yaw_rate"})
-    measured, known = (frame[frame["true"] == true].reset_index(drop=True) for true in (False, True))
-    if not len(measured):
+    if frame["true"].all():
         kinds_read = ", ".join(kind.rpartition("/")[2] for kind in READ)
         raise InputError(path.name, "0 messages", f"must hold {kinds_read}", "Check the topics with: ros2 bag info.")
-    actual.extend(rows_of(known.set_index(known.index + 1), path.name) for _ in range(len(known) > 0))
-    return rows_of(measured.set_index(measured.index + 1), path.name)
+    frame.index = frame.groupby("true").cumcount() + 1
+    return rows_of(frame, path.name)
 
 
 def _numbers(kind: str, m: Any, true: bool) -> list[Number]:

@@ -16,9 +16,8 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.arrays import Bools, Floats
-from coopoc.errors import InputError
+from coopoc.errors import InputError, suggestion, unknown
 from coopoc.formats.values import LARGEST
-from coopoc.plugins import suggestion, unknown
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -27,7 +26,7 @@ TABLES = (".csv", ".parquet")
 COLUMNS = 5000
 """Most columns of a table."""
 USUAL = {
-    "vehicle": ("observer", "robot", "car", "agent", "sender", "vehicle_id", "robot_id"),
+    "vehicle": ("observer", "robot", "car", "agent", "sender", "vehicle_id", "robot_id", "id", "name"),
     "partner": ("neighbour", "neighbor", "to", "target", "subject", "other", "anchor", "receiver", "landmark"),
     "t": ("time", "timestamp", "stamp", "seconds", "datetime", "utc"),
 }
@@ -71,29 +70,27 @@ def headers(path: Path) -> list[str]:
         return []
 
 
-def numeric(frame: pd.DataFrame, column: str, file: str) -> Floats:
-    """A column as finite numbers; InputError with the row of the first cell that is none."""
+def numeric(frame: pd.DataFrame, column: str, file: str, given: Bools | None = None) -> Floats:
+    """A column as finite numbers, NaN where not `given` (default: everywhere); InputError with the row of the first
+    cell that is none."""
     import pandas as pd
 
-    given = frame[column]
-    if given.dtype.kind in "bmM":
+    if given is not None:
+        out = np.full(len(frame), np.nan)
+        if given.any():
+            out[given] = numeric(frame[given], column, file)
+        return out
+    cells = frame[column]
+    if cells.dtype.kind in "bmM":
         allowed = "must be a finite number"
-        raise InputError(f"{file}: column {column}", f"of type {given.dtype}", allowed, "Convert the column.")
+        raise InputError(f"{file}: column {column}", f"of type {cells.dtype}", allowed, "Convert the column.")
     try:
-        values = pd.to_numeric(given, errors="coerce").to_numpy(dtype=float)
+        values = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float)
     except (TypeError, ValueError, OverflowError):  # a list in a cell, an integer of a thousand digits
-        values = np.array([_number(cell) for cell in given])
-    _refuse(given, ~(np.abs(values) <= LARGEST), file, "must be a finite number")
+        texts = cells.map(lambda cell: str(cell)[:300])
+        values = pd.to_numeric(texts, errors="coerce").to_numpy(dtype=float)
+    _refuse(cells, ~(np.abs(values) <= LARGEST), file, "must be a finite number")
     return values
-
-
-def optional(frame: pd.DataFrame, column: str, file: str) -> Floats:
-    """A column of numbers in which cells may be empty; NaN where they are, or where there is no such column."""
-    out = np.full(len(frame), np.nan)
-    if column in frame.columns:
-        given = filled(frame[column])
-        out[given] = numeric(frame[given], column, file)
-    return out
 
 
 def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
@@ -243,10 +240,3 @@ def _too_wide(path: Path, row: int, cells: int, names: int) -> InputError:
 def _no_table(path: Path, given: str) -> InputError:
     allowed = "must be a table with a header and cells between commas, semicolons or tabs, or of Parquet"
     return InputError(path.name, given, allowed, "Export it again as CSV, without empty rows and columns.")
-
-
-def _number(cell: object) -> float:
-    try:
-        return float(str(cell)) if str(cell).isascii() and "_" not in str(cell) else np.nan
-    except ValueError:
-        return np.nan

@@ -1,4 +1,4 @@
-"""coopoc data list | show | check | make | convert."""
+"""coopoc data list | show | check | convert."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from pathlib import Path
 
 import tyro
 
-from coopoc.errors import InputError
+from coopoc.errors import InputError, unknown
 from coopoc.one_file import in_file
-from coopoc.plugins import names, unknown
+from coopoc.plugins import names
 
-from .fleet_store import facts, in_words
+from .fleet_cards import facts, in_words
 from .registry import DATASETS, LOGS, card, convert, kind_of, list_datasets, load_fleet, load_log
 from .source import split
 
@@ -89,23 +89,6 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
     print(f"picture: {draw(result, out)}", file=sys.stderr)
 
 
-def make(recipe: tyro.conf.Positional[str], *, maps: Path, out: Path = Path("fleets")) -> None:
-    """Make a bundled fleet again with SUMO from an OpenDRIVE map: the same bytes.
-
-    Example: coopoc data make town10 --maps carla_maps
-
-    Args:
-        recipe: name of a bundled fleet.
-        maps: folder with the .xodr files of CARLA.
-        out: folder for the fleet and its card.
-    """
-    from .generate import make as generate
-
-    made = generate(recipe, maps, out)
-    _print(made["name"], in_words(made))
-    print(f"written to {out}. Use it: --data {out / (made['name'] + '.npz')}", file=sys.stderr)
-
-
 def convert_(source: tyro.conf.Positional[str], out: tyro.conf.Positional[Path]) -> None:
     """Convert a drive to CSV or Parquet.
 
@@ -122,6 +105,5 @@ COMMANDS: Mapping[str, Callable[..., None]] = {
     "list": list_,
     "show": show,
     "check": check,
-    "make": make,
     "convert": convert_,
 }

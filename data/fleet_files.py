@@ -9,9 +9,9 @@ from typing import Any, Literal
 
 import numpy as np
 
+from coopoc.arrays import one_of
 from coopoc.errors import InputError
 from coopoc.formats import trajectories as tum
-from coopoc.plugins import one_of
 from coopoc.world.fleet import Fleet
 
 from .assemble import assemble
@@ -65,16 +65,19 @@ def read_table(
     return assemble(words(frame, "id", path.name), t, numbers[:, :3], velocity, **options, **labels)
 
 
-def write_table(fleet: Fleet, path: Path) -> None:
-    """Write id, t, x, y, z, vx, vy, vz of every present vehicle and instant; numbers come back bit by bit."""
+def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
+    """Write id, t, x, y, z and, if asked for, vx, vy, vz of every present vehicle and instant, vehicle by vehicle, to a
+    .parquet or (any other ending) CSV file; numbers come back bit by bit."""
     import pandas as pd
 
-    step, column = np.nonzero(fleet.present)
+    column, step = np.nonzero(fleet.present.T)
     frame = pd.DataFrame({"id": np.array(fleet.ids)[column], "t": np.round(fleet.t[step], 6)})
     frame[["x", "y", "z"]] = fleet.position[step, column]
-    frame[list(VELOCITY)] = fleet.velocity[step, column]
+    if velocity:
+        frame[list(VELOCITY)] = fleet.velocity[step, column]
     if path.suffix == ".parquet":
-        frame.to_parquet(path, index=False)
+        split = dict.fromkeys(frame.columns[2:], "BYTE_STREAM_SPLIT")
+        frame.to_parquet(path, index=False, compression="zstd", use_dictionary=["id", "t"], column_encoding=split)
     else:
         frame.to_csv(path, index=False, lineterminator="\n")
 

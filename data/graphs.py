@@ -16,10 +16,9 @@ from coopoc.world.recording import Recording
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
-from .assemble import backward_difference
+from .assemble import backward_difference, nearest, planar_recording, steps_of
 from .log.read import Log, steps_in_words
 from .log.units import Summary
-from .planar import nearest, planar_recording, steps_of
 
 FLAT = 0.01
 """m and rad, of heights and inclinations in a plane, and m/s, least noise of a velocity."""

@@ -21,8 +21,17 @@ from coopoc.world.recording import Recording
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
-from .assemble import backward_difference, check_size, check_time, interpolate
-from .planar import PLANE_STD, first_of_each, nearest, planar_recording, steps_of
+from .assemble import (
+    PLANE_STD,
+    backward_difference,
+    check_size,
+    check_time,
+    first_of_each,
+    interpolate,
+    nearest,
+    planar_recording,
+    steps_of,
+)
 
 MAX_GAP = 0.5
 """s without truth that is interpolated; longer gaps are NaN."""

@@ -3,20 +3,20 @@
 from __future__ import annotations
 
 import inspect
+import json
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
 
-from coopoc.errors import InputError
+from coopoc.errors import InputError, suggestion, unknown
 from coopoc.file_names import given_path
 from coopoc.one_file import in_file
-from coopoc.plugins import find, names, suggestion, unknown
+from coopoc.plugins import find, names
 from coopoc.world.fleet import Fleet
 from coopoc.world.storage import is_recording, read_recording
 
-from . import fleet_store
 from .fleet_files import read_fcd, read_table, read_tum, tum_files, write_table
 from .graphs import read_graph_log
 from .log.read import Log, is_log, read_log, steps_in_words
@@ -28,12 +28,13 @@ FLEETS = Path(__file__).parent / "fleets"
 
 
 def card(name: str) -> dict[str, Any]:
-    """The card of a bundled fleet: provenance and statistics.
+    """The card of a bundled fleet: name, map, map_licence, command, sumo (version), recipe, and `fleet_cards.facts`.
 
     >>> card("town10")["neighbours"]["mean"] > 5
     True
     """
-    return fleet_store.card_of(FLEETS / f"{name}.npz")
+    made: dict[str, Any] = json.loads((FLEETS / f"{name}.json").read_text())
+    return made
 
 
 def bundled(name: str) -> Fleet:
@@ -44,8 +45,7 @@ def bundled(name: str) -> Fleet:
     """
     made = card(name)
     source = "simulated with SUMO {sumo} on CARLA's {map}, seed {recipe[seed]}, smoothed".format(**made)
-    fleet = fleet_store.load(FLEETS / f"{name}.npz")
-    return replace(fleet, name=made["name"], source=source, licence=made["map_licence"])
+    return replace(read_table(FLEETS / f"{name}.parquet"), source=source, licence=made["map_licence"])
 
 
 DATASETS: Mapping[str, Callable[[], Fleet]] = {
@@ -73,11 +73,10 @@ DRIVES: Mapping[str, Callable[..., Fleet]] = {
     "table": read_table,
     "tum": read_tum,
     "fcd": read_fcd,
-    "fleet": lambda path: fleet_store.load(path, path.stem),
     "mrclam": _mrclam_fleet,
 }
 """Formats of drives -> reader; of MR.CLAM Vicon's truth, whose measurements `coopoc run real` takes."""
-ENDINGS = {".parquet": "table", ".csv": "table", ".xml": "fcd", ".npz": "fleet", ".tum": "tum", ".txt": "tum"}
+ENDINGS = {".parquet": "table", ".csv": "table", ".xml": "fcd", ".tum": "tum", ".txt": "tum"}
 
 
 def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options: Any) -> Fleet:
@@ -86,8 +85,8 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     Args:
         name_or_path: a key of DATASETS, a name under which an installed distribution registers one (entry points
             `coopoc.datasets`: a Fleet, or what makes one), "folder/mine.py:NAME" for the same in a file, or a path:
-            CSV or Parquet, TUM, SUMO FCD, MR.CLAM folder, .npz of `coopoc data make`, or a log with a truth
-            (`load_log`). Options may stand behind a question mark, as in "drive.csv?dt=0.1&columns=t:time".
+            CSV or Parquet, TUM, SUMO FCD, MR.CLAM folder, or a log with a truth (`load_log`). Options may stand behind
+            a question mark, as in "drive.csv?dt=0.1&columns=t:time".
         format: one of DRIVES or LOGS, instead of the one found from name and contents.
         options: of the reader, for example dt (s), max_gap (s), columns, vehicle_length, handedness; of all, since and
             until, s after the first step, of the part that is kept.
@@ -98,6 +97,8 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     >>> load_fleet("town10-clients").present.sum(axis=0)
     array([1550, 4600, 1450, 1420])
     """
+    if isinstance(name_or_path, str) and name_or_path in DATASETS and format is None and not options:
+        return DATASETS[name_or_path]()
     name, options, part = _split(name_or_path, {"format": format, **options})
     chosen = options.pop("format", None)
     if chosen is None and (in_file(name) or name in names("coopoc.datasets")):
@@ -148,8 +149,10 @@ def kind_of(name_or_path: str | Path) -> str:
     >>> kind_of("town10")
     ''
     """
+    if isinstance(name_or_path, str) and name_or_path in DATASETS:
+        return ""
     name, options = split(name_or_path)
-    if name in DATASETS or in_file(name) or not Path(name).exists():
+    if name in DATASETS or not Path(name).exists():
         return ""
     return str(options.get("format") or detect(Path(name), options.get("columns")))
 

@@ -84,9 +84,10 @@ def _place(text: str) -> tuple[float, float, float]:
     return latitude, longitude, height
 
 
+TRUE = ("false", "true")
 READ: Mapping[str, tuple[Callable[[str], Any], str, str]] = {
     **dict.fromkeys(("dt", "max_gap", "since", "until", "vehicle_length"), (float, "a number of SI units", "0.1")),
-    "any_scale": (lambda text: bool(["false", "true"].index(text.lower())), "true or false", "true"),
+    **dict.fromkeys(("any_scale", "mutual"), (lambda text: bool(TRUE.index(text.lower())), "true or false", "true")),
     "columns": (pairs, "name:header pairs, the name here and the header in the file", "t:time,id:car"),
     "kinds": (pairs, "word:kind pairs, the word in the file and the kind here", "uwb:range"),
     "clock": (partial(pairs, value=float), "vehicle:seconds pairs", "blue:0.35"),

@@ -41,11 +41,6 @@ FOUND = {
         "**Rules differ once a client is poisoned.** One poisoned update raises the mean's error from 0.91 to 1.48 m;"
         " the median, the trimmed mean, multi-Krum and the geometric median stay at 0.92 to 0.93 m, Krum at 0.95 m.",
     ),
-    "backends": (
-        "optimize.md#what-each-backend-is-for",
-        "**All backends find the same positions**, within 0.6 µm of SciPy's trust-region least squares; only their "
-        "times differ (medians of 60 solves, beside other load).",
-    ),
     "convergence": (
         "learned.md#the-papers-net",
         "**Federated training reaches the centralised net**: within 3 % from round 2 on, 1.411 and 1.409 m "
@@ -55,11 +50,6 @@ FOUND = {
         "learned.md#the-papers-net",
         "**A fitted Kalman filter is as good as the net**: 1.41 and 1.42 m in scenario 1, 0.89 and 0.92 m in "
         "scenario 2.",
-    ),
-    "generalisation": (
-        "learned.md#other-traffic-another-town-other-noise",
-        "**A trained gain generalises to other traffic**: under its training noise the recursive gain is within 1 % of "
-        "the oracle filter's rms in three fleets, FedKalmanNet within 7 to 31 %.",
     ),
     "learned_gains": (
         "learned.md#one-set-of-weights-four-noises",

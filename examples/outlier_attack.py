@@ -1,9 +1,9 @@
 """Neighbours that lie about where they are: the window estimate with and without graduated non-convexity.
 
-A share of the vehicles broadcasts fixes with a constant offset of 5 to 40 m on each axis. The window of the last five
-steps either believes all of them (least squares), or gives the fixes of each neighbour one weight and lets graduated
-non-convexity decide (CooperativeMAP(robust="truncated"), Yang et al., RA-L 2020). The egos themselves are honest, and
-the same vehicles, moved by the same offsets, are among the spoofed of every larger share.
+A share of the vehicles broadcasts fixes with a constant offset of 5 to 40 m, either way, on each axis. The window of
+the last five steps either believes all of them (least squares), or gives the fixes of each neighbour one weight and
+lets graduated non-convexity decide (CooperativeMAP(robust="truncated"), Yang et al., RA-L 2020). The egos themselves
+are honest, and the same vehicles, moved by the same offsets, are among the spoofed of every larger share.
 
 Run:  python examples/outlier_attack.py
 """
@@ -36,7 +36,7 @@ def main(steps: int = 12, runs: int = 3, shares: tuple[float, ...] = (0.0, 0.2, 
     rows = []
     print(f"{'spoofed':>9} {'least squares':>15} {'robust':>9}   RT-LE [m]")
     for share in shares:
-        seen = spoofed(clean, share, low=5.0, high=40.0, seed=0, honest=egos)
+        seen = spoofed(clean, share, seed=0, honest=egos)
         errors = [float(co.rt_le(method(seen, egos), fleet).mean()) for method in METHODS.values()]
         rows.append(Row(share, *errors))
         print(f"{100 * share:7.0f} % {rows[-1].least_squares:15.2f} {rows[-1].robust:9.2f}")

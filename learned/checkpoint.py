@@ -20,7 +20,7 @@ from torch import Tensor
 from coopoc.arrays import instance
 from coopoc.errors import InputError, shown
 from coopoc.file_names import given_path, replaceable
-from coopoc.methods.options import check_options
+from coopoc.methods.track import check_options
 from coopoc.one_file import in_file, path_of
 from coopoc.plugins import find, points
 from coopoc.seals import UNSEALED, holds, sealed

@@ -13,9 +13,8 @@ from torch import Tensor
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError, shown
-from coopoc.methods.options import check_options
 from coopoc.methods.stream import Stream
-from coopoc.methods.track import Track
+from coopoc.methods.track import Track, check_options
 from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message

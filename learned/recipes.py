@@ -10,12 +10,13 @@ from typing import Any, ClassVar, get_args
 
 import torch
 
-from coopoc.errors import InputError
+from coopoc.arrays import instance, one_of
+from coopoc.errors import InputError, unknown
 from coopoc.file_names import given_path
-from coopoc.methods.options import check_options
-from coopoc.methods.track import Method
+from coopoc.methods.track import Method, check_options
 from coopoc.one_file import file_digest, in_file
-from coopoc.plugins import find, one_of, unknown
+from coopoc.plugins import find
+from coopoc.world.outliers import Outliers
 from coopoc.world.sensors import Sensors, VelocityReading
 
 from .checkpoint import load
@@ -43,7 +44,8 @@ class Recipe:
         local_epochs: of a federation, per round.
         local_epoch: of a federation, a "pass" through the client's segments or a "step".
         aggregate: rule of a federation, a name or "mine.py:NAME".
-        noise: of the training drives, "static", "fresh" or "wide", where it is simulated.
+        noise: of the training drives, "static", "fresh" or "wide", where it is simulated; or outliers by name
+            (`Outliers.named`), added to static noise.
         piece: steps of a segment.
         split: share of the segments that train.
         net: the net, an entry point in `coopoc.nets` or "mine.py:NAME".
@@ -65,7 +67,7 @@ class Recipe:
     local_epochs: int = 5
     local_epoch: Epoch = "pass"
     aggregate: str = "mean"
-    noise: Noise = "static"
+    noise: str = "static"
     piece: int = 100
     split: float = 0.8
     net: str = "gain_net"
@@ -73,7 +75,8 @@ class Recipe:
 
     def __post_init__(self) -> None:
         one_of("kind of recipe", self.kind, KINDS)
-        one_of("noise", self.noise, get_args(Noise))
+        if instance("noise", self.noise, str) not in get_args(Noise):
+            Outliers.named(self.noise)
         one_of("local_epoch", self.local_epoch, get_args(Epoch))
         check_options(self, {"rounds": STEPS, "local_epochs": STEPS}, {"schedule": Schedule, "options": tuple})
         check_pieces(self.piece, self.split)
@@ -153,7 +156,7 @@ class Job:
             "recipe": asdict(self.recipe),
             "setting": asdict(self.setting),
             "client": self.client,
-            "sensors": asdict(sensors(self.setting)),
+            "sensors": asdict(sensors(self)),
             "fleet": fleet.digest,
             "revision": REVISION,
             "torch": torch.__version__,
@@ -163,9 +166,11 @@ class Job:
         return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
-def sensors(setting: Setting) -> Sensors:
-    """The paper's training noise in the setting's reading."""
-    return Sensors.paper_training(setting.reading)
+def sensors(job: Job) -> Sensors:
+    """The paper's training noise in the setting's reading, with the recipe's outliers."""
+    noise = job.recipe.noise
+    outliers = Outliers() if noise in get_args(Noise) else Outliers.named(noise)
+    return replace(Sensors.paper_training(job.setting.reading), outliers=outliers)
 
 
 def recipe_of(name: str) -> Recipe:
@@ -237,11 +242,12 @@ def job_clients(job: Job, fleet: Drives) -> tuple[Client, ...]:
     recipe, setting = job.recipe, job.setting
     if isinstance(fleet, MeasuredDrives):
         return measured_clients(fleet, start=setting.start, piece=recipe.piece, split=recipe.split)
+    noise: Any = recipe.noise if recipe.noise in get_args(Noise) else "static"
     return clients(
         fleet,
-        sensors(setting),
+        sensors(job),
         seed=setting.seed,
-        noise=recipe.noise,
+        noise=noise,
         start=setting.start,
         piece=recipe.piece,
         split=recipe.split,

@@ -10,12 +10,12 @@ from pathlib import Path
 
 import torch
 
+from coopoc.errors import unknown
 from coopoc.evaluate.metrics import nees_inside, rt_le
 from coopoc.fleets import load_fleet
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
-from coopoc.plugins import unknown
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X

@@ -130,7 +130,7 @@ def _card(job: Job, fleet: Drives, data: Sequence[Client]) -> dict[str, Any]:
         "key": job.key(fleet),
         "recipe": job.name,
         "settings": asdict(job.recipe) | asdict(job.setting),
-        "noise": "measured" if isinstance(fleet, MeasuredDrives) else asdict(sensors(job.setting)),
+        "noise": "measured" if isinstance(fleet, MeasuredDrives) else asdict(sensors(job)),
         "client": job.client,
         "fleet": fleet.name,
         "digest": fleet.digest,

@@ -97,12 +97,12 @@ def clients(p: Params, seed: int) -> tuple[Client, ...]:
 def fitted(p: Params) -> NoiseModel:
     """Noise model fitted to the recordings of all clients with training seed 0."""
     fleet, acting = members(p), noise(p)
-    seen = {sensors: observe(fleet, sensors, V2X(0), seed=0) for sensors in dict.fromkeys(acting)}
+    recordings = {sensors: observe(fleet, sensors, V2X(0), seed=0) for sensors in dict.fromkeys(acting)}
     gnss, velocity = (
-        np.stack([getattr(seen[sensors], name)[:, :, i] for i, sensors in enumerate(acting)], axis=2)
+        np.stack([getattr(recordings[sensors], name)[:, :, i] for i, sensors in enumerate(acting)], axis=2)
         for name in ("gnss", "velocity")
     )
-    return NoiseModel.fitted(replace(seen[acting[0]], gnss=gnss, velocity=velocity), fleet)
+    return NoiseModel.fitted(replace(recordings[acting[0]], gnss=gnss, velocity=velocity), fleet)
 
 
 @lru_cache(maxsize=2)

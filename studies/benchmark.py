@@ -15,14 +15,14 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
-from coopoc.errors import InputError
+from coopoc.errors import InputError, unknown
 from coopoc.evaluate.scores import scored
 from coopoc.evaluate.statistics import mean_interval
 from coopoc.file_names import given_path
 from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
 from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
-from coopoc.plugins import find, names, unknown
+from coopoc.plugins import find, names
 from coopoc.study.numbers import three
 from coopoc.study.provenance import environment
 

@@ -13,7 +13,7 @@ from coopoc.evaluate.scores import BYTES
 from coopoc.study.numbers import Number, Where, across, difference, interval, listed, mean, present, ratio, rms
 from coopoc.study.style import look
 from coopoc.study.tables import Table
-from coopoc.world.v2x import CHANNELS
+from coopoc.world.channels import CHANNELS
 
 from . import lineup, scene, weights
 from .lineup import PAST
@@ -55,9 +55,9 @@ def over(channel: str, k: int, **limits: Any) -> dict[str, Any]:
     return {"channel": channel, "max_neighbours": k, **FREE, **limits}
 
 
-def under(cap: float, schedule: str, method: str, known: str) -> dict[str, Any]:
+def under(cap: float, schedule: str, method: str, noise_model: str) -> dict[str, Any]:
     """The selection of a method under a cap and a schedule."""
-    return of(method, known, **over("ideal", MOST, cap_bytes_per_second=cap, schedule=schedule))
+    return of(method, noise_model, **over("ideal", MOST, cap_bytes_per_second=cap, schedule=schedule))
 
 
 def _grid() -> list[dict[str, Any]]:
@@ -85,7 +85,7 @@ def _figure(results: Results) -> Plot | None:
         "schedule; lines: the best for the bytes. Horizontal: methods that receive nothing, and the bound of most "
         "neighbours at every step with what newcomers did before: no message brings more, whatever its bytes."
     )
-    return figures.pareto(results, PAYLOAD, where=where, caption=scene.caption(results, text))
+    return figures.pareto(results, scene.caption(results, text), PAYLOAD, where=where)
 
 
 class Choice(NamedTuple):
@@ -129,13 +129,13 @@ def _findings(results: Results) -> dict[str, str]:
             words = f"At most {limit:g} B/s" if limit else "Without a byte while driving"
             how = f"{look(where['method']).label} ({where['noise_model']}){at}"
             texts[f"{limit:g} B/s"] = f"{words}: best is {how}, {best.error:.3f} m{gap(results, where)}."
-    for method, known in SCHEDULED:
+    for method, model in SCHEDULED:
         parts = []
         for cap in CAPS:
-            errors = {name: mean(results, under(cap, name, method, known)) for name in SCHEDULES}
+            errors = {name: mean(results, under(cap, name, method, model)) for name in SCHEDULES}
             if None not in errors.values():
                 parts.append(f"at {cap:g} B/s {listed(errors)}")
-        text = f"Heard first under a cap ({look(method).label}, {known}): {'; '.join(parts)}."
+        text = f"Heard first under a cap ({look(method).label}, {model}): {'; '.join(parts)}."
         texts[f"schedules, {method}"] = text if parts else ""
     return texts
 

@@ -34,7 +34,7 @@ def cell(p: Params) -> list[Row]:
     net's schedule is cut into as many equal parts as there are rounds.
     """
     made, federated = (weights.checkpoint(name, p, p["train_seed"]) for name in (p["method"], FEDERATED))
-    last, rounds = (len(one.card["history"]) - 1 for one in (made, federated))
+    last, rounds = (len(net.card["history"]) - 1 for net in (made, federated))
     recording, egos, drive = scene.trial(p)
     alone, start = p["method"] in weights.INDIVIDUAL, lineup.start(p)
 

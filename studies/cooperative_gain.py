@@ -13,7 +13,7 @@ from coopoc.arrays import Floats
 from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
-from coopoc.study.numbers import interval, mean, present, seed_std, verdict
+from coopoc.study.numbers import interval, mean, present, seed_std
 from coopoc.study.study import Params, Row
 from coopoc.study.style import Panel
 from coopoc.world.fleet import Fleet
@@ -21,7 +21,7 @@ from coopoc.world.recording import Recording
 
 from . import lineup, scene
 from .lineup import PAST
-from .views import curves, of, table
+from .views import curves, of, table, verdict
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
@@ -66,18 +66,18 @@ def cell(p: Params) -> list[Row]:
     """Rows of one method, K and loss, per training seed, ego and run; of a bound, one row per ego."""
     if p["method"] == "bound":
         return lineup.bound_rows(p)
-    seen = recording(p)
-    return lineup.rows(p, made=_methods(p, seen), seen=seen)
+    measured = recording(p)
+    return lineup.rows(p, made=_methods(p, measured), measured=measured)
 
 
-def _methods(p: Params, seen: Recording) -> Sequence[tuple[int | None, Method]]:
+def _methods(p: Params, measured: Recording) -> Sequence[tuple[int | None, Method]]:
     from coopoc.learned.nets.cooperative import NetNoise
 
     if p["noise_model"] != "per-fix":
-        return lineup.methods(p, seen)
-    process = NoiseModel.nominal(seen.sensors).process_variance(seen)
+        return lineup.methods(p, measured)
+    process = NoiseModel.nominal(measured.sensors).process_variance(measured)
     fix = np.square(gnss_std(p, scene.fleet(p["data"])))[None]
-    return [(None, JointFilter(NetNoise("per-fix", seen.sensors, fix=fix, process=process)))]
+    return [(None, JointFilter(NetNoise("per-fix", measured.sensors, fix=fix, process=process)))]
 
 
 def gnss_std(p: Params, drive: Fleet) -> Floats:
@@ -92,14 +92,14 @@ def gnss_std(p: Params, drive: Fleet) -> Floats:
 
 def recording(p: Params) -> Recording:
     """Recording of the cell's vehicles; the sensors of differing receivers are the rms over fleet and drive."""
-    seen = scene.recording(p)
+    drawn = scene.recording(p)
     if p["receivers"] == "alike":
-        return seen
+        return drawn
     drive = scene.fleet(p["data"])
     std = gnss_std(p, drive)
     mean_std = float(np.sqrt(np.square(std).mean()))
-    gnss = drive.position + std / np.array(seen.sensors.gnss_std) * (seen.gnss - drive.position)
-    return replace(seen, gnss=gnss, sensors=replace(seen.sensors, gnss_std=(mean_std,) * 3))
+    gnss = drive.position + std / np.array(drawn.sensors.gnss_std) * (drawn.gnss - drive.position)
+    return replace(drawn, gnss=gnss, sensors=replace(drawn.sensors, gnss_std=(mean_std,) * 3))
 
 
 INPUTS = (
@@ -130,12 +130,12 @@ def _finding(results: Results, loss: float) -> str:
     if where is None:
         return ""
     most = int(results.select(where)["max_neighbours"].max())
-    one, other = (of(*line, **ALIKE, loss=loss, max_neighbours=most) for line in LINES[:2])
-    if not present(results, other):
+    learned, joint = (of(*line, **ALIKE, loss=loss, max_neighbours=most) for line in LINES[:2])
+    if not present(results, joint):
         return ""
-    level, std = results.interval("rt_le_m", one).mean, seed_std(results, one)
+    level, std = results.interval("rt_le_m", learned).mean, seed_std(results, learned)
     seeds = f", seed std {std:.4f} m" if std is not None else ""
-    judged = verdict(results, one, other, "the joint filter that knows the noise")
+    judged = verdict(results, learned, joint, "the joint filter that knows the noise")
     return f"{100 * loss:g} % loss, K = {most}: the cooperative gain has {level:.3f} m{seeds} and {judged}."
 
 

@@ -5,19 +5,22 @@ from __future__ import annotations
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.numbers import Number, Where, interval, listed, mean, present, ratio, seed_std, verdict
+import numpy as np
+
+from coopoc.study.numbers import Number, Where, interval, listed, mean, present, ratio, seed_std
 from coopoc.study.study import Params
 
 from . import lineup, scene, weights
-from .views import HEAD, TableView, labelled, of, selections
+from .views import HEAD, TableView, labelled, of, selections, verdict
 
 if TYPE_CHECKING:
-    from coopoc.study.figures import Plot
+    from coopoc.study.plot import Plot
     from coopoc.study.results import Results
 
 CASES = ((1, 0.15), (2, 0.10), (2, 0.15))
 """Scenario and velocity noise: scenario 2 does not state it, so both of the paper's figures are shown."""
 CLASSIC = (("gnss", "none"), ("kalman", "identity"), ("kalman", "fitted"), ("kalman", "nominal"), ("kalman", "oracle"))
+LINES = ("method", "noise_model")
 LINEUP = (*CLASSIC, *((name, "trained") for name in weights.PAPER))
 
 
@@ -66,13 +69,33 @@ def _table(at: dict[str, Any]) -> TableView:
 
 
 def _cdf(results: Results, at: dict[str, Any]) -> Plot | None:
-    from coopoc.study import figures
-
     methods = ["gnss", "kalman", "okf", "fedkalmannet", "centralised", "individual1"]
-    known = ["none", "identity", "fitted", "oracle", "trained"]
-    where = present(results, {**at, "method": methods, "noise_model": known}, "error_quantiles_m")
+    models = ["none", "identity", "fitted", "oracle", "trained"]
+    where = present(results, {**at, "method": methods, "noise_model": models}, "error_quantiles_m")
     text = "Distribution of the error over all steps; markers: mean of the per-run maxima."
-    return figures.cdf(results, where=where, caption=scene.caption(results, text, **at)) if where else None
+    return cdf(results, scene.caption(results, text, **at), where) if where else None
+
+
+def cdf(results: Results, caption: str, where: Where) -> Plot:
+    """Share of the errors below each value, with a marker at the mean of the per-run maxima."""
+    from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
+
+    drawn, maxima = list[dict[str, Any]](), dict[str, list[str]]()
+    with canvas() as (figure, axes):
+        for key, frame in results.groups(LINES, where):
+            names = dict(zip(LINES, key, strict=True))
+            errors = np.sort(np.concatenate(frame["error_quantiles_m"].to_list()))
+            share = np.arange(1, len(errors) + 1) / len(errors)
+            worst = float(np.mean([np.max(q) for q in frame["error_quantiles_m"]]))
+            axes.plot(errors, share, **{**strokes(names), "marker": None})
+            axes.plot(worst, np.interp(worst, errors, share), **{**strokes(names), "linestyle": "none"}, zorder=3)
+            drawn.append(names)
+            maxima.setdefault(str(names["method"]), []).append(f"{worst:.1f}")
+        axes.set(xlabel="Error [m]", ylabel="Share of time steps below", ylim=(0, 1.02))
+        plain_log(axes.xaxis)
+        axes.set_xlim(left=0.1)
+        legend(axes, drawn, {method: f" (max {' / '.join(each)} m)" for method, each in maxima.items()})
+    return Plot(figure, caption)
 
 
 def _finding(results: Results, at: dict[str, Any]) -> str:
@@ -80,7 +103,7 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
     names = {"federated": "fedkalmannet", "centralised": "centralised", "OKF": "okf"}
     names |= {f"client {client}'s net": name for client, name in enumerate(weights.INDIVIDUAL, start=1)}
     means = {words: mean(results, {**at, "method": name}) for words, name in names.items()}
-    filters = {f"{known} KF": of("kalman", known, **at) for known in ("fitted", "oracle")}
+    filters = {f"{model} KF": of("kalman", model, **at) for model in ("fitted", "oracle")}
     means |= {words: mean(results, where) for words, where in filters.items()}
     if not listed(means):
         return ""

@@ -1,4 +1,4 @@
-"""What a heading costs: known, from a compass that errs, or estimated from odometry, bearings and fixes alone."""
+"""What a heading costs: exact, from a compass that errs, or estimated from odometry, bearings and fixes alone."""
 
 from __future__ import annotations
 
@@ -79,7 +79,7 @@ def channel(p: Params) -> V2X:
 
 
 @lru_cache(maxsize=1)
-def seen(noise: Sensors, v2x: V2X, speed: float, seconds: float, runs: int, seed: int) -> tuple[Recording, Floats]:
+def measured(noise: Sensors, v2x: V2X, speed: float, seconds: float, runs: int, seed: int) -> tuple[Recording, Floats]:
     """What all measure, and first headings where there is no compass; first positions are the first fixes."""
     recording = observe(convoy(speed, seconds), noise, v2x, runs=runs, seed=seed, frame="body")
     begin = np.full((runs, VEHICLES, 4), np.nan)
@@ -97,7 +97,7 @@ def cell(p: Params) -> list[Row]:
         square = np.trace(cov[..., :3, :3], axis1=-2, axis2=-1)
         return [{"run": 0, "ego": "all", "rt_le_m": _root(square), "heading_deg": np.rad2deg(_root(cov[..., 3, 3]))}]
     runs = int(p["runs"])
-    recording, begin = seen(noise, v2x, float(p["speed"]), float(p["after_s"]), runs, int(p["seed"]))
+    recording, begin = measured(noise, v2x, float(p["speed"]), float(p["after_s"]), runs, int(p["seed"]))
     track = tracked(p, recording, begin)
     position, rows = errors(track, fleet)[:, last], []
     for run in range(runs):
@@ -180,10 +180,10 @@ def _compasses(results: Results, number: Number, text: str, decimals: int) -> Ta
     """Methods and K down, compasses across."""
     rows = []
     for k in NEIGHBOURS:
-        for method, known in ((pose(k), ALWAYS), (pose(k), FIRST), ("joint", ALWAYS), ("bound", "bound")):
+        for method, model in ((pose(k), ALWAYS), (pose(k), FIRST), ("joint", ALWAYS), ("bound", "bound")):
             label = "Position filter" if method == "joint" else look(method).label
-            labels = (k, label, "" if method == "bound" else known)
-            rows.append((labels, of(method, known, **DRIVEN, max_neighbours=k)))
+            labels = (k, label, "" if method == "bound" else model)
+            rows.append((labels, of(method, model, **DRIVEN, max_neighbours=k)))
     columns = across(number, {TITLES[word]: {"compass": word} for word in COMPASSES})
     text = _note(results, f"{text} after {AFTER[-1]:g} s at {SPEED:g} m/s, by the compass.")
     return crossed(results, ("K", "Method", "Noise model"), rows, columns, text, decimals=decimals)
@@ -234,7 +234,7 @@ def _findings(results: Results) -> dict[str, str]:
             joint=rms(results, {**ten, "method": "joint"}),
         )
         blind = {**at, "compass": NONE}
-        texts[f"found, K = {k}"] = sentence(
+        texts[f"estimated, K = {k}"] = sentence(
             ESTIMATED,
             **fixed,
             still=heading(results, {**blind, "speed": 0.0}),

@@ -51,7 +51,7 @@ def times(results: Results, where: Where) -> float | None:
 
 
 def _table(at: Where) -> TableView:
-    rows = [((look(m).label, known, text), of(m, known, **at)) for (m, known), text in ASSUMED.items()]
+    rows = [((look(m).label, model, text), of(m, model, **at)) for (m, model), text in ASSUMED.items()]
     columns: dict[str, Number] = {
         "RT-LE [m]": interval,
         "Seed std [m]": seed_std,
@@ -68,7 +68,7 @@ def _table(at: Where) -> TableView:
 
 def _finding(results: Results, name: str) -> str:
     at = CASES[name]
-    each = ran({m: times(results, of(m, known, **at)) for m, known in ASSUMED if known == "trained"})
+    each = ran({m: times(results, of(m, model, **at)) for m, model in ASSUMED if model == "trained"})
     if not each:
         return ""
     best = min(each, key=lambda method: each[method])

@@ -67,16 +67,16 @@ def key(p: Params) -> dict[str, str]:
     Raises:
         InputError: an unknown method or metric, or other settings that no cell can be computed with.
     """
-    found = dict(scene.facts(p))
+    digests = dict(scene.facts(p))
     if weights.is_trained(p["method"]):
-        found["weights"] = weights.key(p["method"], p)
+        digests["weights"] = weights.key(p["method"], p)
     elif p["method"] not in (*METHODS, "bound"):
         find("coopoc.methods", p["method"])
     if p.get("metric"):
         find("coopoc.metrics", p["metric"])
     if p.get("noise_model") == "fitted":
-        found["clients"] = weights.drives(p["clients"]).digest
-    return found
+        digests["clients"] = weights.drives(p["clients"]).digest
+    return digests
 
 
 def noise_model(p: Params) -> NoiseModel | str:
@@ -103,17 +103,18 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
     Raises:
         InputError: an unknown name.
     """
-    name, known = p["method"], start(p)
-    if weights.is_trained(name):
+    name, first = p["method"], start(p)
+    if name not in METHODS and weights.is_trained(name):
         models: list[tuple[int, Any]] = [(seed, weights.checkpoint(name, p, seed).model) for seed in weights.seeds(p)]
         if name != "cooperative" or recording.v2x.max_neighbours == 0:
-            return [(seed, model.method(name, known)) for seed, model in models]
+            return [(seed, model.method(name, first)) for seed, model in models]
         from coopoc.learned import CooperativeGain
 
         return [(seed, CooperativeGain(model, name)) for seed, model in models]
-    method: Method = find("coopoc.methods", name)(noise_model(p))
+    make = METHODS[name] if name in METHODS else find("coopoc.methods", name)
+    method: Method = make(noise_model(p))
     if isinstance(method, Kalman):
-        method = replace(method, x0=known)
+        method = replace(method, x0=first)
     if isinstance(method, CooperativeMAP):
         method = replace(method, backend=p.get("backend", method.backend))
     return [(None, method)]
@@ -133,7 +134,7 @@ def rows(
     p: Params,
     quantiles: int = 0,
     made: Sequence[tuple[int | None, Method]] = (),
-    seen: Recording | None = None,
+    measured: Recording | None = None,
 ) -> list[Row]:
     """Rows of a cell, one per training seed, ego and run: errors, consistency, bytes, neighbours' errors.
 
@@ -141,38 +142,39 @@ def rows(
         p: parameters of the cell.
         quantiles: number of quantiles of the distances in each row.
         made: methods and their training seeds, instead of the method that the cell names.
-        seen: recording, instead of that of the cell.
+        measured: recording, instead of that of the cell.
     """
-    recording = scene.recording(p) if seen is None else seen
+    recording = measured or scene.recording(p)
     who, drive, metric = scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"]), str(p.get("metric", ""))
-    found: list[Row] = []
+    table: list[Row] = []
     for seed, method in made or methods(p, recording):
         score = scored if complete(recording, who, drive) else scored_where_present
         columns = score(method, recording, who, drive, quantiles, metric)
-        found += rows_of(columns, who, **({} if seed is None else {"train_seed": seed}))
-    return found
+        table += rows_of(columns, who, **({} if seed is None else {"train_seed": seed}))
+    return table
 
 
 def bound_rows(p: Params) -> list[Row]:
-    """The bound of each ego over an ideal channel, which needs no draws, with the bytes that the ego would receive.
+    """The bound of each ego over an ideal channel, with the bytes that the ego would receive.
 
-    The noise model of PAST makes it the bound with the past of newcomers. Real data have none: the bound is of sensors
-    that measure at every step.
+    It needs no draws but where there are outliers or an attack: then it is that of an estimator which is told of them,
+    the mean over runs. The noise model of PAST makes it the bound with the past of newcomers. Real data have none: the
+    bound is of sensors that measure at every step.
     """
     bound = past_bound if (p["method"], p.get("noise_model")) == PAST else posterior_bound
     drive, v2x = scene.fleet(p["data"]), scene.channel(p)
     if scene.is_real(p["data"]):
         return [{"run": 0, "ego": ego} for ego in scene.egos(p["data"], str(p["egos"]))]
-    acting, rate = scene.acting(p), min(v2x.rate or np.inf, 1 / drive.dt)
-    found: list[Row] = []
+    acting, rate, told = scene.acting(p), min(v2x.rate or np.inf, 1 / drive.dt), scene.told(p)
+    rows_of_egos: list[Row] = []
     for ego in scene.egos(p["data"], str(p["egos"])):
         column = drive.index(ego)
-        level = bound_rt_le(bound(drive, acting, column, v2x))
+        level = bound_rt_le(bound(drive, acting, column, v2x, recording=told))
         near = len(find_links(drive, [column], v2x.max_neighbours, v2x.radius, acting.min_range)) / len(drive.t)
         received = near * FIX_AND_VELOCITY.payload * rate
         sizes = {"bytes_per_second": received, "payload_bytes_per_second": received}
-        found.append({"run": 0, "ego": ego, "rt_le_m": level, "neighbours_mean": near, **sizes})
-    return found
+        rows_of_egos.append({"run": 0, "ego": ego, "rt_le_m": level, "neighbours_mean": near, **sizes})
+    return rows_of_egos
 
 
 RMS, MAXIMA, SUMS = ("rt_le_m", "neighbour_rt_le_m", "innovation_m"), ("max_error_m",), ("fixes", "seconds")
@@ -212,23 +214,23 @@ def scored_where_present(
 def _ego(
     method: Method, recording: Recording, ego: str, drive: Fleet, quantiles: int, metric: str
 ) -> dict[str, AnyArray]:
-    known = drive.present[:, drive.index(ego)]
+    tracked = drive.present[:, drive.index(ego)]
     parts, lengths = list[Mapping[str, AnyArray]](), list[int]()
     stretches = recording.stretches(ego)
-    cuts = [(a + i, a + j) for a, b in stretches for i, j in _runs(known[a:b])] if known.any() else stretches
+    cuts = [(a + i, a + j) for a, b in stretches for i, j in _runs(tracked[a:b])] if tracked.any() else stretches
     for start, stop in cuts:
-        seen = recording.between(start, stop)
+        stretch = recording.between(start, stop)
         # a truth that begins between two fixes leaves a start without one
-        begin = next(iter(seen.stretches(ego)), None)
+        begin = next(iter(stretch.stretches(ego)), None)
         if begin is None or begin[1] - begin[0] < 2:
             continue
-        seen, truth = seen.between(*begin), drive.between(start + begin[0], start + begin[1])
-        if known.any():
-            columns = scored(method, seen, [ego], truth, quantiles, metric)
+        stretch, truth = stretch.between(*begin), drive.between(start + begin[0], start + begin[1])
+        if tracked.any():
+            columns = scored(method, stretch, [ego], truth, quantiles, metric)
         else:
-            columns = _without_truth(method, seen, ego)
+            columns = _without_truth(method, stretch, ego)
         parts.append(columns)
-        lengths.append(len(seen.t))
+        lengths.append(len(stretch.t))
     if not parts:
         raise InputError("egos", repr(ego), "is never there at two steps in a row, with a fix", "Choose another ego.")
     return {name: _merged(name, [part[name] for part in parts], lengths) for name in parts[0]}
@@ -264,7 +266,7 @@ def _merged(name: str, parts: Sequence[AnyArray], lengths: Sequence[int]) -> Any
     return np.asarray(mean ** (1 / power))
 
 
-def _runs(known: Bools) -> list[tuple[int, int]]:
+def _runs(flags: Bools) -> list[tuple[int, int]]:
     """(start, stop) of the runs of True."""
-    edges = np.flatnonzero(np.diff(known.astype(int), prepend=0, append=0)).reshape(-1, 2)
+    edges = np.flatnonzero(np.diff(flags.astype(int), prepend=0, append=0)).reshape(-1, 2)
     return [(int(a), int(b)) for a, b in edges if b - a >= 2]

@@ -27,15 +27,15 @@ LIMITS += [{**IDEAL, "cap_bytes_per_second": cap} for cap in (300.0, 600.0, 1200
 WINDOWED = (0, 2)
 """K at which the sliding window is solved, too: one cell of it takes as long as ten others."""
 TRAINED = ("okf", "fedkalmannet", "centralised")
-KNOWN = ["identity", "nominal", "fitted"]
+MODELS = ["identity", "nominal", "fitted"]
 BUDGETED = ["lkf-sa", "joint"]
 FILTERS = ["kalman", "lkf-sa", "lkf-sa-edge", "msmv-r", "joint"]
 
 
 def _grid() -> list[dict[str, Any]]:
     """Every method at every K over an ideal channel, then the cooperative ones at K = 10 under rates and byte caps."""
-    solo = [("gnss", "none"), *((m, "trained") for m in TRAINED), BOUND, *(("kalman", known) for known in KNOWN)]
-    shared = [(m, known) for m in lineup.COOPERATIVE for known in KNOWN]
+    solo = [("gnss", "none"), *((m, "trained") for m in TRAINED), BOUND, *(("kalman", model) for model in MODELS)]
+    shared = [(m, model) for m in lineup.COOPERATIVE for model in MODELS]
     return [
         *(of(*pair, max_neighbours=k, **IDEAL) for k in NEIGHBOURS for pair in (*solo, *shared)),
         *(of("cooperative-map-5", "nominal", max_neighbours=k, **IDEAL) for k in WINDOWED),
@@ -62,11 +62,11 @@ BOUND_NOTE = "The bound is for the rms over runs of causal estimates, over an id
 k_table = partial(table, intervals=False)
 
 
-def _sweep(results: Results, known: str) -> Plot | None:
+def _sweep(results: Results, noise_model: str) -> Plot | None:
     from coopoc.study import figures
 
-    where = present(results, _under(known))
-    text = f"RT-LE against the number of neighbours, {known} noise model; bands: 95 % intervals over egos, then runs."
+    where = present(results, _under(noise_model))
+    text = f"RT-LE against the number of neighbours, {noise_model} noise model; bands: 95 % intervals."
     caption = scene.caption(results, text, BOUND_NOTE)
     return figures.sweep(results, x="max_neighbours", where=where, log=True, caption=caption) if where else None
 
@@ -80,21 +80,21 @@ def _pareto(results: Results) -> Plot | None:
     if where is None or not (results.select(where)["bytes_per_second"] > 0).any():
         return None
     text = "RT-LE against the payload that an ego receives, at each K, rate and cap; lines: the best for the bytes."
-    return figures.pareto(results, where=where, caption=scene.caption(results, text, BOUND_NOTE))
+    return figures.pareto(results, scene.caption(results, text, BOUND_NOTE), where=where)
 
 
 def findings(results: Results) -> dict[str, str]:
-    """The paper's order under identity covariances, and orders under fitted and known ones."""
-    return {"identity": _identity(results), "fitted": _fitted(results), "known": _known(results)}
+    """The paper's order under identity covariances, and orders under fitted and nominal ones."""
+    return {"identity": _identity(results), "fitted": _fitted(results), "nominal": _nominal(results)}
 
 
-def _at(method: str, known: str, k: int) -> dict[str, Any]:
-    return of(method, known, **IDEAL, max_neighbours=k)
+def _at(method: str, noise_model: str, k: int) -> dict[str, Any]:
+    return of(method, noise_model, **IDEAL, max_neighbours=k)
 
 
-def _steps(results: Results, known: str, *methods: str) -> list[int]:
+def _steps(results: Results, noise_model: str, *methods: str) -> list[int]:
     """The K >= 1 at which one of the methods was run with this noise model."""
-    where = present(results, {"method": list(methods), "noise_model": known, **IDEAL})
+    where = present(results, {"method": list(methods), "noise_model": noise_model, **IDEAL})
     return sorted(int(k) for k in results.select(where)["max_neighbours"].unique() if k) if where else []
 
 
@@ -134,7 +134,7 @@ def _fitted(results: Results) -> str:
     return f"Fitted covariances, K = {steps[-1]}: {order}."
 
 
-def _known(results: Results) -> str:
+def _nominal(results: Results) -> str:
     """With the bound, which is for the rms over runs."""
     steps = _steps(results, "nominal", *lineup.COOPERATIVE)
     if not steps:
@@ -158,14 +158,14 @@ STUDY = lineup.study(
     shares=("max_neighbours", "rate_hz", "cap_bytes_per_second"),
     tables={
         **{
-            f"rt_le_{known}": k_table(f"RT-LE [m] against K, {known} noise model.", BOUND_NOTE, where=_under(known))
-            for known in ("identity", "fitted", "nominal")
+            f"rt_le_{model}": k_table(f"RT-LE [m] against K, {model} noise model.", BOUND_NOTE, where=_under(model))
+            for model in ("identity", "fitted", "nominal")
         },
         "budget": k_table(
             "RT-LE [m] at K = 10 under rates and caps (0: no cap).",
             rows=["rate_hz", "cap_bytes_per_second"],
             columns=["method", "noise_model"],
-            where={"method": BUDGETED, "max_neighbours": 10, "noise_model": KNOWN},
+            where={"method": BUDGETED, "max_neighbours": 10, "noise_model": MODELS},
         ),
         "nees": k_table(
             "NEES against K (3 is consistent), nominal noise model.",
@@ -187,8 +187,8 @@ STUDY = lineup.study(
         ),
     },
     figures={
-        "rt_le_identity": partial(_sweep, known="identity"),
-        "rt_le_fitted": partial(_sweep, known="fitted"),
+        "rt_le_identity": partial(_sweep, noise_model="identity"),
+        "rt_le_fitted": partial(_sweep, noise_model="fitted"),
         "bytes": _pareto,
     },
     findings=findings,

@@ -111,11 +111,11 @@ def cell(p: Params) -> list[Row]:
     rows: list[Row] = []
     for ego, name in enumerate(drive.ids):
         for number, first in enumerate(range(start, len(recording.t) - block + 1, block)):
-            found = {what: _reduced(what, score[first : first + block, ego]) for what, score in scores.items()}
-            if any(np.isfinite(value) for value in found.values()):
-                found["bytes_per_second"] = float(received[0, ego])
-                found["sent_bytes_per_second"] = float(sent[0, ego])
-                rows.append({"run": number, "ego": name, **found})
+            values = {what: _reduced(what, score[first : first + block, ego]) for what, score in scores.items()}
+            if any(np.isfinite(value) for value in values.values()):
+                values["bytes_per_second"] = float(received[0, ego])
+                values["sent_bytes_per_second"] = float(sent[0, ego])
+                rows.append({"run": number, "ego": name, **values})
     return rows
 
 
@@ -132,22 +132,22 @@ def _filter(fusion: Mapping[str, Any], k: int, gate: float, drive: Drive) -> Pos
 
 def _scores(track: Track, drive: Drive) -> dict[str, Floats]:
     """Column -> (T, E) against the truth, as far as it is known, and innovations of the fixes, if there are any."""
-    found = {}
+    scores = {}
     if drive.truth is not None:
-        found["rt_le_m"] = errors(track, drive.truth)[0]
+        scores["rt_le_m"] = errors(track, drive.truth)[0]
         if drive.truth.heading is not None:
-            found["heading_deg"] = np.rad2deg(heading_error(track, drive.truth)[0])
-            found["nees"] = pose_nees(track, drive.truth)[0]
+            scores["heading_deg"] = np.rad2deg(heading_error(track, drive.truth)[0])
+            scores["nees"] = pose_nees(track, drive.truth)[0]
     innovation = np.linalg.norm(fix_innovations(track, drive.recording)[0], axis=-1)
-    return found | ({"innovation_m": innovation} if np.isfinite(innovation).any() else {})
+    return scores | ({"innovation_m": innovation} if np.isfinite(innovation).any() else {})
 
 
 def _reduced(what: str, values: Floats) -> float:
     """Root mean square of errors, mean of a NEES; NaN of none."""
-    known = values[np.isfinite(values)]
-    if not len(known):
+    finite = values[np.isfinite(values)]
+    if not len(finite):
         return float("nan")
-    return float(known.mean()) if what == "nees" else float(np.sqrt((known**2).mean()))
+    return float(finite.mean()) if what == "nees" else float(np.sqrt((finite**2).mean()))
 
 
 def _distinct(number: int, axis: tuple[int, ...], most: int) -> bool:

@@ -19,14 +19,15 @@ from coopoc.errors import InputError
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.study.provenance import revision
 from coopoc.study.study import Params
+from coopoc.world.channels import channel as channel_of
 from coopoc.world.fleet import Fleet
+from coopoc.world.outliers import Outliers
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
-from coopoc.world.spoofing import spoofed
+from coopoc.world.spoofing import Spoofing, spoofed
 from coopoc.world.storage import digest
 from coopoc.world.v2x import V2X
-from coopoc.world.v2x import channel as channel_of
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
@@ -47,9 +48,11 @@ def fleet(data: str) -> Fleet:
     log = _log(data)
     if log is None:
         return load_fleet(data)
-    seen = log.recording
-    nothing = np.full((len(seen.t), len(seen.ids), 3), np.nan)
-    return log.truth or Fleet(seen.ids, seen.t, nothing, nothing, name=Path(data).stem, source="a log without truth")
+    measurements = log.recording
+    nothing = np.full((len(measurements.t), len(measurements.ids), 3), np.nan)
+    return log.truth or Fleet(
+        measurements.ids, measurements.t, nothing, nothing, name=Path(data).stem, source="a log without truth"
+    )
 
 
 @lru_cache(maxsize=2)
@@ -133,14 +136,15 @@ def sensors(p: Params) -> Sensors:
     presets = {0: Sensors.paper_training, 1: Sensors.paper_scenario1, 2: Sensors.paper_scenario2}
     if p["scenario"] not in presets:
         raise InputError("scenario", p["scenario"], "must be 0, 1 or 2", "0: training; see section IV of the paper.")
-    found = lasting(presets[p["scenario"]](), *(float(p.get(name, 0.0)) for name in LASTING))
+    noise = lasting(presets[p["scenario"]](), *(float(p.get(name, 0.0)) for name in LASTING))
     return replace(
-        found,
+        noise,
         velocity_std_ratio=ratio,
         velocity_reading=reading,
-        gnss_drift_time=float(p.get("drift_time_s", found.gnss_drift_time)),
+        gnss_drift_time=float(p.get("drift_time_s", noise.gnss_drift_time)),
         heading_std=np.deg2rad(float(p.get("heading_std_deg", 0.0))),
         heading_bias_std=np.deg2rad(float(p.get("heading_bias_deg", 0.0))),
+        outliers=Outliers.named(str(p.get("outliers", ""))),
     )
 
 
@@ -172,10 +176,10 @@ def acting(p: Params) -> Sensors:
 
 def start(p: Params) -> Start:
     """Start of the filters of a cell: "gnss", the first fix, unless it names "true", the true position."""
-    found: Start = p.get("start", "gnss")
-    if found not in get_args(Start):
-        raise InputError("start", repr(found), "must be gnss or true", "The first fix, or the true position.")
-    return found
+    begin: Start = p.get("start", "gnss")
+    if begin not in get_args(Start):
+        raise InputError("start", repr(begin), "must be gnss or true", "The first fix, or the true position.")
+    return begin
 
 
 def heading(p: Params) -> str:
@@ -188,9 +192,10 @@ def heading(p: Params) -> str:
     low, high = noise.gnss_bias
     bias = f", bias U[{low:g}, {high:g}] m per run and axis" if high else ""
     near = f", {relative(noise)}, radius {p['radius_m']:g} m" if "radius_m" in p else ""
+    wrong = "".join(f", {note}" for note in noise.outliers.notes)
     return (
         f"Scenario {p['scenario']}: GNSS {noise.fix_std[0]:.3g} m per axis{bias}, velocity "
-        f"{100 * noise.velocity_std_ratio:g} % (per {p['velocity_reading']}){near}, {begin}"
+        f"{100 * noise.velocity_std_ratio:g} % (per {p['velocity_reading']}){near}{wrong}, {begin}"
     )
 
 
@@ -240,15 +245,16 @@ def channel(p: Params) -> V2X:
     A cap of 0 is none; a rate of 0, and None for loss, burst and latency, are the channel's own.
     """
     cap = float(p.get("cap_bytes_per_second", 0.0))
-    found = channel_of(str(p.get("channel", "ideal")), int(p.get("max_neighbours", 0)))
+    most = int(p.get("max_neighbours", 0))
+    usual = channel_of(str(p["channel"]), most) if "channel" in p else V2X.ideal(most)
     losses = {"loss": p.get("loss"), "burst": p.get("burst"), "latency": p.get("latency_s")}
     given: dict[str, Any] = {field: float(value) for field, value in losses.items() if value is not None}
     return replace(
-        found,
+        usual,
         radius=float(p.get("radius_m", 30.0)),
-        rate=p.get("rate_hz") or found.rate,
+        rate=p.get("rate_hz") or usual.rate,
         bytes_per_second=cap or float("inf"),
-        schedule=p.get("schedule", found.schedule),
+        schedule=p.get("schedule", usual.schedule),
         **given,
     )
 
@@ -259,7 +265,7 @@ def facts(p: Params) -> Mapping[str, str]:
     Raises:
         InputError: parameters that no cell can be computed with.
     """
-    sensors(p), channel(p), start(p), egos(p["data"], str(p["egos"]))
+    sensors(p), attacking(p), channel(p), start(p), egos(p["data"], str(p["egos"]))
     if int(p.get("runs", 1)) < 1:
         raise InputError("runs", p["runs"], "must be >= 1", "Give the number of noise draws.")
     return {"code": revision(*CODE), **_digests(p["data"])}
@@ -274,11 +280,26 @@ def _digests(data: str) -> Mapping[str, str]:
 
 def recording(p: Params) -> Recording:
     """Recording of the cell's vehicles; the real measurements where there are any."""
-    who = egos(p["data"], str(p["egos"]))
+    return _attacked(p, told=False)
+
+
+def told(p: Params) -> Recording | None:
+    """The same without outliers and false fixes, as of an estimator which is told of them; None if there are none."""
+    return _attacked(p, told=True) if sensors(p).outliers.notes or attacking(p).share else None
+
+
+def _attacked(p: Params, told: bool) -> Recording:
+    who, attack = egos(p["data"], str(p["egos"])), attacking(p)
     observers = None if needs_whole_fleet(str(p.get("method"))) else who
-    seen = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers)
-    share = float(p.get("spoofed_share", 0.0))
-    return spoofed(seen, share, seed=int(p["seed"]), honest=who) if share else seen
+    drawn = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers, told)
+    return spoofed(drawn, attack, seed=int(p["seed"]), honest=who, told=told) if attack.share else drawn
+
+
+def attacking(p: Params) -> Spoofing:
+    """The attack of the cell; a share of 0 is none."""
+    start, ramp = (float(p.get(name, 0.0)) for name in ("spoofed_from_s", "spoofed_ramp_s"))
+    collude = bool(p.get("spoofed_collude", False))
+    return Spoofing(float(p.get("spoofed_share", 0.0)), start=start, ramp=ramp, collude=collude)
 
 
 def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:
@@ -288,9 +309,9 @@ def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:
 
 @lru_cache(maxsize=2)
 def _recording(
-    data: str, noise: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...] | None
+    data: str, noise: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...] | None, told: bool
 ) -> Recording:
     log = _log(data)
     if log is not None:
         return under(log.recording, v2x, runs=runs, seed=seed, logged=log.messages)
-    return observe(fleet(data), noise, v2x, runs=runs, seed=seed, observers=observers)
+    return observe(fleet(data), noise, v2x, runs=runs, seed=seed, observers=observers, told=told)

@@ -23,7 +23,11 @@ CONDITIONS: dict[str, Any] = {
     "loss": None,
     "burst": None,
     "latency_s": None,
+    "outliers": "",
     "spoofed_share": 0.0,
+    "spoofed_from_s": 0.0,
+    "spoofed_ramp_s": 0.0,
+    "spoofed_collude": False,
     "own_share": 0.0,
     "common_share": 0.0,
     "drift_time_s": 60.0,
@@ -31,7 +35,8 @@ CONDITIONS: dict[str, Any] = {
     "heading_bias_deg": 0.0,
     "start": "gnss",
 }
-"""Other conditions: the channel (None: its own), spoofing, time-correlated errors, errors of the heading, the start."""
+"""Other conditions: the channel (None: its own), outliers (as `Outliers.named` has them), spoofing, time-correlated
+errors, errors of the heading, the start."""
 
 
 def _changed(results: Results) -> str:
@@ -60,22 +65,21 @@ def _figure(results: Results) -> Plot | None:
     if present(results, {}) is None or results.frame["max_neighbours"].nunique() < 2:
         return None
     text = "RT-LE against the number of neighbours; bands: 95 % intervals over egos, then runs."
-    facet = "noise_model" if results.frame["noise_model"].nunique() > 1 else ""
     caption = scene.caption(results, text, _changed(results)).replace("  ", " ")
-    return figures.sweep(results, x="max_neighbours", log=True, caption=caption, facet=facet)
+    return figures.sweep(results, x="max_neighbours", log=True, caption=caption)
 
 
 def _findings(results: Results) -> dict[str, str]:
     texts = {}
     for k in results.frame["max_neighbours"].unique() if len(results.frame) else ():
         pairs = results.frame[["method", "noise_model"]].drop_duplicates().to_numpy().tolist()
-        each = ran({(m, known): rms(results, of(m, known, max_neighbours=k)) for m, known in pairs})
+        each = ran({(m, model): rms(results, of(m, model, max_neighbours=k)) for m, model in pairs})
         bound = next((value for (method, _), value in each.items() if method == "bound"), None)
         ranked = sorted((value, pair) for pair, value in each.items() if pair[0] != "bound")
         if ranked:
-            value, (method, known) = ranked[0]
+            value, (method, model) = ranked[0]
             gap = f", {value / bound:.2f} times the bound" if bound else ""
-            texts[f"K = {k}"] = f"K = {k}: {look(method).label} ({known}) has the lowest rms, {value:.3g} m{gap}."
+            texts[f"K = {k}"] = f"K = {k}: {look(method).label} ({model}) has the lowest rms, {value:.3g} m{gap}."
     return texts
 
 

@@ -25,8 +25,8 @@ PAPER: Mapping[str, tuple[str, ...]] = {
 SURVEY: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "correlated_gnss": ("If GNSS errors are time-correlated?", ("own", "common")),
     "latency_loss": ("If messages are late or lost?", ("late", "lost one by one")),
-    "heading_error": ("If the heading is not known?", ("cost, K = 2", "found, K = 2")),
-    "robustness": ("If neighbours are spoofed?", ("K = 4", "K = 10")),
+    "heading_error": ("If the heading is not known?", ("cost, K = 2", "estimated, K = 2")),
+    "robustness": ("If measurements are wrong or neighbours spoofed?", ("5 % long ranges", "20 % spoofed")),
     "consistency": ("Which methods are consistent?", ("credible",)),
 }
 """Study -> question, and the keys of the findings that answer it."""
@@ -56,7 +56,7 @@ def paper(
         jobs: number of worker processes.
         data: fleet to test on, a name or a path.
     """
-    from coopoc.data.fleet_store import in_words
+    from coopoc.data.fleet_cards import in_words
     from coopoc.data.registry import DATASETS, card
 
     def answers(results: Mapping[str, Results]) -> dict[str, str]:
@@ -130,7 +130,7 @@ def survey_answers(results: Mapping[str, Results]) -> dict[str, str]:
 
 def reported(name: str, results: Results, keys: Sequence[str]) -> str:
     """The findings of a study under these keys, one after the other."""
-    texts = find("coopoc.studies", name).found(results)
+    texts = find("coopoc.studies", name).answers(results)
     return " ".join(texts[key][:1].upper() + texts[key][1:] for key in keys if key in texts)
 
 
@@ -139,8 +139,8 @@ def _under(results: Results, limit: float) -> str:
     from . import budget
 
     parts, each = [], budget.choices(results)
-    for words, known in PRIOR.items():
-        best = budget.best_under([choice for choice in each if choice.where["noise_model"] in known], limit)
+    for words, models in PRIOR.items():
+        best = budget.best_under([choice for choice in each if choice.where["noise_model"] in models], limit)
         if best is not None:
             k = best.where["max_neighbours"]
             use = f" with K = {k} and {best.size:.0f} B/s" if k else ""

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from coopoc.study.numbers import Number, Where, present
+import numpy as np
+
+from coopoc.evaluate.statistics import Interval, over_seeds, paired_difference
+from coopoc.study.numbers import Number, Where, per_seed, present
 from coopoc.study.style import Panel, look
 from coopoc.study.tables import Entry, Table, crossed, pivot
 
@@ -21,14 +24,14 @@ Rows: TypeAlias = Iterable[tuple[Sequence[Entry], Where]]
 HEAD = ("Method", "Noise model")
 
 
-def of(method: str, known: str, /, **at: Any) -> dict[str, Any]:
+def of(method: str, noise_model: str, /, **at: Any) -> dict[str, Any]:
     """A method under a noise model, as parameters of a cell or as a selection."""
-    return {**at, "method": method, "noise_model": known}
+    return {**at, "method": method, "noise_model": noise_model}
 
 
 def labelled(pairs: Iterable[tuple[str, str]], **at: Any) -> Rows:
     """Rows of a table under HEAD: labels and selection of each method under its noise model."""
-    return [((look(method).label, known), of(method, known, **at)) for method, known in pairs]
+    return [((look(method).label, model), of(method, model, **at)) for method, model in pairs]
 
 
 def table(
@@ -135,3 +138,35 @@ def multiples(
         return figures.multiples(rows, scene.caption(results, *texts, **(at or {})), target)
 
     return view
+
+
+def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
+    """Sentence on the RT-LE of `trained`, against `other`, which needs no training, with the evidence.
+
+    Args:
+        results: of the study.
+        trained: selection of one method.
+        other: selection of another method, over the same egos and runs.
+        name: of the other, for the sentence.
+    """
+    base, each = results.values("rt_le_m", other), per_seed(results, trained)
+    gaps = [paired_difference(each.mean(axis=0), base)]
+    text = f"paired difference {gaps[0].mean:+.3f} m; 95 % {_ends(gaps[0])} over egos and runs, "
+    if len(each) > 1:
+        gaps.append(over_seeds(each - base).interval)
+        text += f"{_ends(gaps[1])} over {len(each)} training seeds"
+    else:
+        text += "of one training seed, whose spread is unknown"
+    if not all(np.isfinite([gap.low, gap.high]).all() for gap in gaps):
+        claim = f"cannot be judged against {name}: too few seeds, egos or runs"
+    elif all(gap.high < 0 for gap in gaps):
+        claim = f"beats {name}"
+    elif all(gap.low > 0 for gap in gaps):
+        claim = f"is worse than {name}"
+    else:
+        claim = f"cannot be distinguished from {name}"
+    return f"{claim} ({text})"
+
+
+def _ends(gap: Interval) -> str:
+    return f"[{gap.low:+.3f}, {gap.high:+.3f}]"

@@ -12,10 +12,9 @@ from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 from tyro.conf import Positional, arg
 
 from coopoc.data.registry import load_log
-from coopoc.errors import InputError
+from coopoc.errors import InputError, unknown
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.one_file import file_digest, from_file, in_file
-from coopoc.plugins import unknown
 from coopoc.study.study import Params
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors, VelocityReading
@@ -85,8 +84,8 @@ def _job(name: str, p: Params, seed: int) -> tuple[str, str]:
     if not is_trained(name) or not trainable({**p, "method": name}):
         raise unknown("trained method", name, LEARNED)
     digest = file_digest(name) if in_file(name) else ""
-    found = _jobs(_recipe(name), digest, p["clients"], Setting(seed, start(p), p["velocity_reading"]))
-    return found[INDIVIDUAL.index(name) if name in INDIVIDUAL else 0]
+    jobs = _jobs(_recipe(name), digest, p["clients"], Setting(seed, start(p), p["velocity_reading"]))
+    return jobs[INDIVIDUAL.index(name) if name in INDIVIDUAL else 0]
 
 
 @lru_cache
@@ -123,10 +122,10 @@ def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
 def _checkpoint(path: Path, key: str, net: str) -> Checkpoint:
     from coopoc.learned.checkpoint import load
 
-    found = load(path, net)
-    if found.card.get("key") != key:
+    checkpoint = load(path, net)
+    if checkpoint.card.get("key") != key:
         raise InputError("weights", path, "were trained otherwise", "Train again, or use another folder.")
-    return found
+    return checkpoint
 
 
 def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +14,7 @@ import pytest
 
 from coopoc import Fleet, load_fleet
 from coopoc.data.fleet_files import write_table
+from coopoc.study.study import Study
 
 collect_ignore = ["fuzz"]
 """Its programs need atheris; what they found is replayed by test_data_fuzz.py."""
@@ -34,6 +36,14 @@ def callable_part(part: Callable[..., Any]) -> Callable[..., Any]:
         return part(*given)
 
     return cast(Callable[..., Any], call)
+
+
+def winding(steps: int = 60, speed: float = 8.0, period: float = 3.0, vehicles: int = 1) -> Fleet:
+    """Sinuous drives with x_t = x_{t-1} + dt u_t: turning at 1 / period rad/s."""
+    t = np.arange(steps) / 10
+    wave = t[:, None] / period + np.arange(vehicles)
+    velocity = speed * np.stack([np.cos(wave), np.sin(wave), 0.03 * np.cos(wave)], axis=-1)
+    return Fleet(tuple("abcdef"[:vehicles]), t, np.cumsum(0.1 * velocity, axis=0), velocity)
 
 
 def formation_fleet(vehicles: int = 11, steps: int = 901, ring: float = 22.0) -> Fleet:
@@ -74,6 +84,13 @@ def standing(position: Sequence[Sequence[float]], steps: int = 2) -> Fleet:
     """Vehicles that stand."""
     where = np.repeat(np.array(position, dtype=float)[None], steps, axis=0)
     return Fleet(tuple(f"s{i}" for i in range(len(position))), np.arange(steps) * 0.1, where, np.zeros_like(where))
+
+
+@pytest.fixture
+def study(monkeypatch: pytest.MonkeyPatch) -> Study:
+    """The small study that is installed as a third party's."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parent / "distribution"))
+    return cast(Study, importlib.import_module("small_study").STUDY)
 
 
 @pytest.fixture(scope="session")

@@ -68,3 +68,47 @@ def write(frame: pd.DataFrame, path: Path) -> Path:
     else:
         frame.to_csv(path, index=False)
     return path
+
+
+def at(fleet: Fleet, name: str, t: Any) -> Any:
+    """(M, 3) m, where a vehicle is at times between the steps."""
+    return np.column_stack([np.interp(t, fleet.t, axis) for axis in fleet.position[:, fleet.ids.index(name)].T])
+
+
+def fixes(fleet: Fleet, name: str, every: float, std: float, seed: int = 0) -> pd.DataFrame:
+    """Fixes x, y, z of one vehicle, in a wide table."""
+    t = np.arange(fleet.t[0], fleet.t[-1], every)
+    x = at(fleet, name, t) + np.random.default_rng(seed).normal(0, std, (len(t), 3))
+    return pd.DataFrame({"t": t, "vehicle": name, **dict(zip("xyz", x.T, strict=True)), "x_std": std, "y_std": std})
+
+
+def motion(fleet: Fleet, name: str, every: float, std: float, seed: int = 0) -> pd.DataFrame:
+    """World velocities vx, vy, vz of one vehicle, in a wide table."""
+    t = np.arange(fleet.t[0], fleet.t[-1], every)
+    u = (at(fleet, name, t + 0.05) - at(fleet, name, t - 0.05)) / 0.1
+    u += np.random.default_rng(seed).normal(0, std, u.shape)
+    return pd.DataFrame({"t": t, "vehicle": name, "vx": u[:, 0], "vy": u[:, 1], "vz": u[:, 2], "vx_std": std})
+
+
+def ranges(fleet: Fleet, name: str, other: str, every: float, std: float, seed: int = 0) -> pd.DataFrame:
+    """Ranges of one vehicle to another, in a wide table."""
+    t = np.arange(fleet.t[0], fleet.t[-1], every)
+    gap = np.linalg.norm(at(fleet, other, t) - at(fleet, name, t), axis=1)
+    noisy = gap + np.random.default_rng(seed).normal(0, std, len(t))
+    return pd.DataFrame({"t": t, "vehicle": name, "partner": other, "range": noisy, "range_std": std})
+
+
+def bends(vehicles: int = 2, minutes: float = 3.0, climb: float = 0.0) -> Fleet:
+    """Vehicles on bends through all directions at 8 m/s, 12 m apart; `climb` m of height that come and go."""
+    t = 0.02 * np.arange(int(minutes * 3000))
+    course = 2.5 * np.sin(0.1 * t)
+    velocity = np.stack([8 * np.cos(course), 8 * np.sin(course), 0.1 * climb * np.cos(0.1 * t)], axis=1)
+    apart = 12.0 * np.arange(vehicles)[:, None] * [0.3, 0.9, 0.0]
+    position = np.cumsum(0.02 * velocity, axis=0)[:, None] + apart
+    return Fleet(tuple(f"car{k}" for k in range(vehicles)), t, position, np.repeat(velocity[:, None], vehicles, axis=1))
+
+
+def outliers(values: Any, share: float = 0.05, seed: int = 9) -> Any:
+    """Ranges of which a share is 3 to 10 m too long, as by reflections."""
+    rng = np.random.default_rng(seed)
+    return values + np.where(rng.random(len(values)) < share, rng.uniform(3, 10, len(values)), 0.0)

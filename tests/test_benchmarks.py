@@ -113,6 +113,7 @@ def test_stone_soup_ends_where_we_end(load: Any, monkeypatch: pytest.MonkeyPatch
     assert all(joint.right(row.call()) for row in joint.rows)
 
 
+@pytest.mark.slow
 def test_the_baseline_names_rows_that_the_benchmarks_have(load: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """The jobs are built small and none is timed."""
     baseline = json.loads((FOLDER / "baseline.json").read_text())

@@ -31,6 +31,8 @@ NOISE = co.Sensors(
     azimuth_std=0.01,
     inclination_std=0.01,
 )
+UNSEEN = 1e3
+"""m and rad."""
 NEAR = co.V2X(max_neighbours=2, radius=60.0)
 
 
@@ -43,8 +45,13 @@ def test_solo_bound_tends_to_the_riccati_solution() -> None:
     )
 
 
-def point_marginals(fleet: Fleet, steps: int, v2x: V2X, observers: Any) -> gtsam.Marginals:
-    """Fixes, motions and converted measurements of observers and those they measure, at the truth, as GTSAM factors."""
+def point_marginals(
+    fleet: Fleet, steps: int, v2x: V2X, observers: Any, seen: co.Recording | None = None
+) -> gtsam.Marginals:
+    """Fixes, motions and converted measurements of observers and those they measure, at the truth, as GTSAM factors.
+
+    What a recording lacks in its first run has no factor, or, of one component, a standard deviation of UNSEEN.
+    """
     links = find_links(fleet, observers, v2x.max_neighbours, v2x.radius, S2.min_range)
     graph, values, before = gtsam.NonlinearFactorGraph(), gtsam.Values(), set()
     for t in range(steps):
@@ -53,13 +60,17 @@ def point_marginals(fleet: Fleet, steps: int, v2x: V2X, observers: Any) -> gtsam
         for m in members:
             key, here = gtsam.symbol(chr(97 + m), t), fleet.position[t, m]
             values.insert(key, here)
-            graph.add(gtsam.PriorFactorPoint3(key, here, sigmas(*S2.gnss_std)))
+            if seen is None or np.isfinite(seen.gnss[0, t, m, 0]):
+                graph.add(gtsam.PriorFactorPoint3(key, here, sigmas(*S2.gnss_std)))
             if m in before:
                 gap, motion = here - fleet.position[t - 1, m], 0.1 * S2.velocity_std(fleet.velocity[t, m])
                 graph.add(gtsam.BetweenFactorPoint3(gtsam.symbol(chr(97 + m), t - 1), key, gap, sigmas(*motion)))
-        for i, j in zip(links.observer[mine], links.neighbour[mine], strict=True):
+        for link, i, j in zip(mine, links.observer[mine], links.neighbour[mine], strict=True):
             vector = fleet.position[t, j] - fleet.position[t, i]
-            noise = gtsam.noiseModel.Gaussian.Covariance(vector_cov(np.array(spherical(*vector)), S2.relative_std))
+            std = (
+                S2.relative_std if seen is None else np.where(np.isnan(seen.relative[0, link]), UNSEEN, S2.relative_std)
+            )
+            noise = gtsam.noiseModel.Gaussian.Covariance(vector_cov(np.array(spherical(*vector)), std))
             ends = gtsam.symbol(chr(97 + i), t), gtsam.symbol(chr(97 + j), t)
             graph.add(gtsam.BetweenFactorPoint3(*ends, vector, noise))
         before = members
@@ -83,6 +94,65 @@ def test_bounds_equal_gtsam_marginals(neighbours: int, everyone: bool, crossing:
     for t in (0, 13, 29):
         expected = whole.marginalCovariance(gtsam.symbol(chr(97 + ego), t))
         assert smoothing[t] == pytest.approx(expected, rel=1e-6, abs=1e-9)
+
+
+WRONG = co.Outliers(
+    ranges=co.Fault(0.2, (3.0, 20.0)),
+    angles=co.Fault(0.2),
+    fixes=co.Fault(0.3, (10.0, 50.0), lasts=1.0),
+    outages=co.Fault(0.2, lasts=1.0),
+)
+
+
+def by_hand(clean: co.Recording, bad: co.Recording) -> co.Recording:
+    """The clean recording without the measurements that differ in the other one."""
+    kept = bad.relative == clean.relative
+    kept[..., 2] &= kept[..., 1]
+    fixes = np.where(bad.gnss == clean.gnss, clean.gnss, np.nan)
+    return replace(clean, gnss=fixes, relative=np.where(kept, clean.relative, np.nan))
+
+
+@pytest.mark.parametrize(("neighbours", "everyone"), [(0, False), (4, False), (3, True)])
+def test_an_estimator_that_is_told_what_is_wrong_has_gtsams_bound_without_it(
+    neighbours: int, everyone: bool, crossing: Fleet
+) -> None:
+    """What is wrong is found by comparison with the clean recording, and has no factor in GTSAM's graph."""
+    v2x, who = V2X(max_neighbours=neighbours, radius=30.0), range(8) if everyone else [0]
+    clean, bad, told = (
+        observe(crossing, replace(S2, outliers=o), v2x, runs=2, observers=list(who), told=t)
+        for o, t in ((co.Outliers(), False), (WRONG, False), (WRONG, True))
+    )
+    hand = by_hand(clean, bad)
+
+    def bound(seen: co.Recording) -> Any:
+        if everyone:
+            return fleet_bound(crossing, S2, v2x, recording=seen)[:, 0]
+        return posterior_bound(crossing, S2, 0, v2x, recording=seen)
+
+    one = bound(hand.of_runs(slice(0, 1)))
+    for t in (3, 17, 41):
+        expected = point_marginals(crossing, t + 1, v2x, who, hand).marginalCovariance(gtsam.symbol("a", t))
+        assert one[t] == pytest.approx(expected, rel=1e-3, abs=1e-6)
+    mean = (one + bound(hand.of_runs(slice(1, 2)))) / 2
+    assert bound(told) == pytest.approx(mean, rel=1e-12)
+    assert bound_rt_le(mean) > 1.1 * bound_rt_le(bound(clean))
+
+
+def test_the_joint_filter_that_is_told_what_is_wrong_reaches_the_bound(formation: Fleet) -> None:
+    fleet, v2x = formation.between(0, 200), V2X(max_neighbours=6)
+    told = observe(fleet, replace(S2, outliers=WRONG), v2x, runs=40, observers=[0], seed=2, told=True)
+    square = (rt_le(JointFilter("nominal")(told, [0]), fleet) ** 2).mean(axis=1)
+    bound = bound_rt_le(posterior_bound(fleet, S2, 0, v2x, recording=told)) ** 2
+    half = stats.t.ppf(0.995, 39) * square.std(ddof=1) / np.sqrt(40)
+    assert square.mean() + half > bound
+    assert square.mean() < 1.15 * bound
+
+
+def test_a_recording_of_something_else_is_refused(crossing: Fleet) -> None:
+    v2x = V2X(max_neighbours=4)
+    for other in (observe(crossing.between(0, 9), S2, v2x), observe(crossing, S2, V2X(max_neighbours=1))):
+        with pytest.raises(InputError, match="recording"):
+            posterior_bound(crossing, S2, 0, v2x, recording=other)
 
 
 def test_more_information_lowers_the_bound(crossing: Fleet) -> None:

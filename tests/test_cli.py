@@ -11,10 +11,9 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from small_runs import ENV
 
-DISTRIBUTION = Path(__file__).parent / "distribution"
 COMMAND = [sys.executable, "-m", "coopoc.cli"]
-ENV = {**os.environ, "PYTHONPATH": str(DISTRIBUTION), "COLUMNS": "100"}
 
 
 def coopoc(*words: str, cwd: Path) -> "subprocess.CompletedProcess[str]":

@@ -165,11 +165,3 @@ def test_scripts_and_targets_of_the_pages_exist() -> None:
     assert {name for name in scripts if not (ROOT / name).is_file()} == set()
     assert {name for name in modules if find_spec(name) is None} == set()
     assert targets - set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)) == set()
-
-
-def test_a_wrong_command_is_found() -> None:
-    for wrong in ("coopoc run neighbours --sett runs=5", "coopoc report --outt x"):
-        with pytest.raises(SystemExit):
-            parsed(words(wrong))
-    assert _status(words("coopoc run neighbors --dry-run")) == 2
-    assert _status(words("coopoc run neighbours --set run=5 --dry-run")) == 2

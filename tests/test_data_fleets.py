@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
-from coopoc.data import fleet_store as store
+from coopoc.data.fleet_cards import facts
 from coopoc.data.registry import DATASETS, FLEETS, card, convert, detect, list_datasets, load_fleet
 from coopoc.errors import InputError
-from coopoc.world.fleet import Fleet
 
 NAMES = ("town10", "town10-clients", "town10-validation", "town04")
 
@@ -30,7 +29,7 @@ def test_digest_source_and_licence_are_those_of_the_card(name: str) -> None:
     assert (fleet.name, fleet.licence) == (name, stated["map_licence"])
     assert stated["map"] in fleet.source
     assert str(stated["recipe"]["seed"]) in fleet.source
-    assert store.facts(fleet) == {key: stated[key] for key in store.facts(fleet)}
+    assert facts(fleet) == {key: stated[key] for key in facts(fleet)}
 
 
 @pytest.mark.parametrize("name", ["town10", "town10-validation", "town04"])
@@ -81,30 +80,13 @@ def test_fleets_are_disjoint() -> None:
             assert same.mean(axis=0).max() < 0.5, "no vehicle drives where one of another fleet drives"
 
 
-def test_storage_is_exact_deterministic_and_refuses_what_it_would_change(tmp_path: Path) -> None:
-    t = np.arange(50) / 10
-    x = np.cumsum(np.random.default_rng(0).normal(0.5, 0.1, (50, 3, 3)), axis=0)
-    x[20:, 1] = np.nan
-    fleet = store.quantise(Fleet(("a", "b", "c"), t, x, x, name="w"))
-    np.testing.assert_allclose(fleet.position, x, atol=0.5e-4)
-    for copy in ("1.npz", "2.npz"):
-        store.save(fleet, tmp_path / copy)
-    assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
-    assert store.load(tmp_path / "1.npz", "w").digest == fleet.digest
-    with pytest.raises(InputError, match="quantise"):
-        store.save(Fleet(("a", "b", "c"), t, x, x), tmp_path / "3.npz")
-    jump = np.where(np.arange(50)[:, None, None] < 10, 0.0, 9.0) * np.ones((1, 1, 3))
-    with pytest.raises(InputError, match="jump"):
-        store.save(store.quantise(Fleet(("a",), t, jump, jump)), tmp_path / "4.npz")
-
-
 def test_unknown_names_and_formats_are_refused_with_the_known_ones(tmp_path: Path) -> None:
     with pytest.raises(InputError, match="town10-validation"):
         load_fleet("town11")
     with pytest.raises(InputError, match=r"data = 'town10-client'.* Did you mean town10-clients\?"):
         load_fleet("town10-client")
     with pytest.raises(
-        InputError, match=r"must be one of table, tum, fcd, fleet, mrclam, pyfg, recording, log\. Or leave it out"
+        InputError, match=r"must be one of table, tum, fcd, mrclam, pyfg, recording, log\. Or leave it out"
     ):
         load_fleet(tmp_path, format="bag")
     with pytest.raises(InputError, match=r"format = 'tabel': .* Did you mean table\?"):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib.util
 import io
+import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from importlib.metadata import version
@@ -15,14 +16,20 @@ import pytest
 from scipy import signal
 from scipy.spatial import cKDTree
 
-from coopoc import load_fleet
+from coopoc import Sensors, load_fleet, observe
 from coopoc.data.assemble import smooth
-from coopoc.data.fleet_store import load
-from coopoc.data.generate import RECIPES, Recipe, make, program
-from coopoc.data.registry import FLEETS, bundled, card, convert
+from coopoc.data.registry import bundled, card, convert
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.study.run import run_study
+from coopoc.world.storage import read_recording, save_recording
 
+SCRIPT = Path(__file__).resolve().parents[1] / "examples" / "make_fleet.py"
+spec = importlib.util.spec_from_file_location("make_fleet", SCRIPT)
+assert spec is not None
+assert spec.loader is not None
+script = sys.modules["make_fleet"] = importlib.util.module_from_spec(spec)
+spec.loader.exec_module(script)
+Recipe, make = script.Recipe, script.make
 MAPS = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "carla_maps"
 TINY = Recipe("tiny", "Town10HD.xodr", vehicles=6, steps=(60, 60, 60, 60, 60, 40), seed=1, platoon=2)
 with_sumo = pytest.mark.skipif(
@@ -35,11 +42,11 @@ with_sumo = pytest.mark.skipif(
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path: Path) -> None:
     one, two = (make(TINY, MAPS, tmp_path / name) for name in ("one", "two"))
     other = make(replace(TINY, seed=2), MAPS, tmp_path / "other")
-    for suffix in ("npz", "json"):
+    for suffix in ("parquet", "json"):
         assert (tmp_path / "one" / f"tiny.{suffix}").read_bytes() == (tmp_path / "two" / f"tiny.{suffix}").read_bytes()
     assert one == two
     assert other["sha256"] != one["sha256"]
-    fleet = load(tmp_path / "one" / "tiny.npz")
+    fleet = load_fleet(tmp_path / "one" / "tiny.parquet")
     assert fleet.digest == one["sha256"]
     assert fleet.present.sum(axis=0).tolist() == [60, 60, 60, 60, 60, 40]
     assert one["speed"]["max"] > 2
@@ -53,6 +60,7 @@ def test_a_bundled_fleet_is_made_again_bit_by_bit(tmp_path: Path) -> None:
         pytest.skip(f"the bundled fleets were made with eclipse-sumo {stated['sumo']}")
     made = make("town10-clients", MAPS, tmp_path)
     assert {**made, "command": ""} == {**stated, "command": "", "recipe": made["recipe"]}
+    assert Recipe(**made["recipe"]) == script.bundled_recipe("town10-clients")
 
 
 @pytest.mark.skipif(not MAPS.is_dir(), reason="needs CARLA's maps at ../shared/data/carla_maps")
@@ -71,12 +79,6 @@ def test_elevation_is_that_of_the_map() -> None:
     assert len(error) > 1000, "positions beside the start of a piece of a reference line"
     assert np.percentile(error, 95) < 0.6
     assert np.ptp([z for index, z in zip(near, x[:, 2], strict=True) if index]) > 10
-
-
-def test_the_cards_hold_the_recipes() -> None:
-    for name, recipe in RECIPES.items():
-        stored = card(name)["recipe"]
-        assert Recipe(**{k: tuple(v) if isinstance(v, list) else v for k, v in stored.items()}) == recipe
 
 
 def test_smoothing_halves_the_cutoff_and_keeps_slow_motion() -> None:
@@ -107,30 +109,31 @@ def test_a_missing_map_is_named(tmp_path: Path) -> None:
 def test_without_sumo_the_pip_line_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingLibraryError, match=r"pip install 'coopoc\[sumo\]'"):
-        program("sumo")
+        script.program("sumo")
 
 
 @with_sumo
 def test_what_was_made_is_loaded_and_converted(tmp_path: Path) -> None:
-    made = tmp_path / "tiny.npz"
+    made = tmp_path / "tiny.parquet"
     make(TINY, MAPS, tmp_path)
     fleet = load_fleet(made)
-    assert load_fleet(f"{made}?format=fleet").digest == fleet.digest
+    assert load_fleet(f"{made}?format=table").digest == fleet.digest
     convert(made, tmp_path / "a.csv")
     np.testing.assert_array_equal(load_fleet(tmp_path / "a.csv").position, fleet.position)
     settings = {"data": str(made), "method": "kalman", "max_neighbours": "0", "runs": 1}
     assert not run_study("side_by_side", tmp_path / "runs", settings=settings, progress=False).failed
 
 
-@pytest.mark.parametrize("name", ["ids", "second", "steps"])
+@pytest.mark.parametrize("name", ["gnss", "t", "relative"])
 @pytest.mark.parametrize("claimed", [10**11, 2**61])
 def test_an_array_that_claims_all_memory_is_refused(tmp_path: Path, name: str, claimed: int) -> None:
-    with np.load(FLEETS / "town10-clients.npz") as stored, ZipFile(tmp_path / "a.npz", "w") as packed:
+    save_recording(observe(bundled("town10").between(0, 3), Sensors()), tmp_path / "a.npz")
+    with np.load(tmp_path / "a.npz") as stored, ZipFile(tmp_path / "b.npz", "w") as packed:
         for part in stored.files:
             file = io.BytesIO()
             shape = (claimed,) if part == name else stored[part].shape
             head = {"descr": stored[part].dtype.str, "fortran_order": False, "shape": shape}
             np.lib.format.write_array_header_1_0(file, head)
             packed.writestr(f"{part}.npy", file.getvalue() + stored[part].tobytes())
-    with pytest.raises(InputError, match=r"a\.npz = .*must be a fleet of coopoc data make"):
-        load_fleet(tmp_path / "a.npz")
+    with pytest.raises(InputError, match=r"b\.npz = .*must be a recording in \.npz"):
+        read_recording(tmp_path / "b.npz")

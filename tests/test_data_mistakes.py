@@ -23,7 +23,7 @@ GOOD = "t,vehicle,kind,partner,value,std,arrival\n" + "".join(
     for k in range(20)
 )
 WIDE = "t,vehicle,x,y,speed,heading\n" + "".join(f"{k / 10},red,{0.8 * k:.1f},0,8.0,0.0\n" for k in range(20))
-STILL = "t,vehicle,x,y,speed\n" + "".join(f"{k / 10},red,0,0,0.0\n" for k in range(20))
+STILL = "t,vehicle,x,y,speed\n" + "".join(f"{k / 10},red,0,0,0.8\n" for k in range(20))
 
 
 RANGES = "t,vehicle,partner,range\n0,tag,anchor,4.2\n1,tag,anchor,4.4\n"
@@ -136,7 +136,10 @@ KEPT: dict[str, tuple[Callable[[str], str], str]] = {
         lambda text: text.replace("message,red", "message,rde", 1),
         "messages to a receiver that is absent or has no position",
     ),
-    "a row twice": (lambda text: text + text.splitlines()[1] + "\n", "repeated rows (same time, vehicle and kind)"),
+    "a row twice": (
+        lambda text: text + text.splitlines()[1] + "\n",
+        "repeated rows (same time, vehicle, kind and partner)",
+    ),
     "a bearing of a vehicle that stands": (
         lambda text: text + "0.0,rsu,x,,5,1,\n0.0,rsu,y,,5,1,\n0.3,rsu,bearing,red,0.1,0.1,\n",
         "bearings at times without a heading",

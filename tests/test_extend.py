@@ -21,7 +21,7 @@ from coopoc.one_file import from_file
 from coopoc.optimize import MEASUREMENTS, Problem, Status, solve
 from coopoc.plugins import find
 from coopoc.study.run import plan, run_study
-from coopoc.world.v2x import channel
+from coopoc.world.channels import channel
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extend.md"
 COOPOC = f"{sys.executable} -W error -m coopoc.cli"

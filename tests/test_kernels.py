@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib
 import pickle
 import subprocess
 import sys
@@ -16,12 +17,31 @@ pytest.importorskip("numba")
 S2 = Sensors.paper_scenario2()
 
 
-def test_machine_code_is_stale_after_a_change_of_any_file_beside_it(tmp_path: Path) -> None:
-    file = tmp_path / "a.py"
-    file.write_text("one")
-    before = kernels._stamp.__wrapped__(tmp_path)
-    file.write_text("other")
-    assert kernels._stamp.__wrapped__(tmp_path) != before
+def test_machine_code_is_stale_after_a_change_of_a_file_that_it_imports_and_no_other(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """a calls b, which calls c; d is beside them."""
+    monkeypatch.syspath_prepend(tmp_path)
+    for name, text in (("a", "from b import x"), ("b", "from c import (\n    x,\n)"), ("c", "x = 1"), ("d", "x = 2")):
+        (tmp_path / f"stale_{name}.py").write_text(text.replace("from ", "from stale_") + "\n")
+    for name in "ad":
+        importlib.import_module(f"stale_{name}")
+
+    def stamp() -> object:
+        return kernels._stamp.__wrapped__("stale_a")
+
+    before = stamp()
+    (tmp_path / "stale_d.py").write_text("x = 33")
+    assert stamp() == before
+    (tmp_path / "stale_c.py").write_text("x = 333")
+    assert stamp() != before
+
+
+def test_a_kernel_depends_on_all_kernels_below_it() -> None:
+    importlib.import_module("coopoc.kernels.stars.joint_filter")
+    names = {name for name, *_ in kernels._stamp("coopoc.kernels.stars.joint_filter")}
+    assert {"joint.py", "messages.py", "relative.py", "small.py", "compile.py"} <= names
+    assert "horizon.py" not in names
 
 
 def test_importing_the_package_imports_no_numba() -> None:

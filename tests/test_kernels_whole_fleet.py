@@ -144,18 +144,6 @@ def test_vehicles_in_one_place_are_the_oracle() -> None:
     compare("central-filter", "nominal", recording, near=1e-8)
 
 
-def test_a_run_knows_nothing_of_those_it_shares_its_covariance_with(crossing: Fleet) -> None:
-    """To the last bit, whether runs receive the same or not."""
-    method = CentralFilter("identity")
-    for loss in (0.0, 0.3):
-        recordings = [observe(crossing, S2, V2X(max_neighbours=4, loss=loss), runs=runs) for runs in (1, 3)]
-        alone, many = (method(recording, [0, 5]) for recording in recordings)
-        np.testing.assert_array_equal(alone.x[0], many.x[0])
-        assert alone.covariance is not None
-        assert many.covariance is not None
-        np.testing.assert_array_equal(alone.covariance[0], many.covariance[0])
-
-
 def test_the_central_filter_is_filterpys(crossing: Fleet) -> None:
     """All vehicles in one state, every relative measurement a row: with unit noise the whole problem is linear."""
     fleet = crossing.select(range(6)).between(0, 30)

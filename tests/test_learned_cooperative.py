@@ -186,23 +186,6 @@ def test_net_noise_serves_other_filters_of_a_star(v2x: V2X) -> None:
     np.testing.assert_allclose(JointFilter(given)(seen).x, JointFilter(known)(seen).x, atol=1e-12)
 
 
-def test_order_of_vehicles_and_origin_change_nothing(crossing: Fleet) -> None:
-    v2x, order = V2X(4, loss=0.4), [3, 1, 7, 0, 5, 2, 6, 4]
-    ids = tuple(crossing.ids[i] for i in order)
-    mixed = Fleet(ids, crossing.t, crossing.position[:, order], crossing.velocity[:, order])
-    moved = Fleet(crossing.ids, crossing.t, crossing.position + np.array([3e3, -1e3, 20.0]), crossing.velocity)
-    track, other, far = (CooperativeGain(net())(drive(f, v2x), ["c0", "c5"]) for f in (crossing, mixed, moved))
-    np.testing.assert_allclose(other.x, track.x, atol=1e-8)
-    np.testing.assert_allclose(far.x - track.x, np.broadcast_to([3e3, -1e3, 20.0], track.x.shape), atol=1e-6)
-
-
-def test_zero_noise_is_zero_error(crossing: Fleet) -> None:
-    nothing = Sensors((0.0,) * 3, velocity_std_ratio=0.0, range_std=0.0, azimuth_std=0.0, inclination_std=0.0)
-    seen = observe(crossing, nothing, V2X(5), assumed=Sensors())
-    found = CooperativeGain(net())(seen, [0])
-    np.testing.assert_allclose(found.x[0, :, 0], crossing.position[:, 0], atol=1e-9)
-
-
 def test_bytes_are_those_of_what_arrived(crossing: Fleet) -> None:
     seen = drive(crossing, V2X(4, loss=0.5), observers=[2])
     assert CooperativeGain(net())(seen, [2]).received_bytes[:, 0].tolist() == [

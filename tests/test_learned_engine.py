@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import copy
-from collections.abc import Callable, Iterator
-from typing import Any
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
@@ -13,7 +12,7 @@ from numba import njit
 from torch import Tensor
 
 from coopoc import InputError
-from coopoc.learned import Gain, GainNet
+from coopoc.learned import GainNet
 from coopoc.learned.engine.layers import sigmoid, tanh
 from coopoc.learned.nets.gain import Recurrent
 from coopoc.learned.nets.stack import flatten
@@ -141,27 +140,6 @@ def test_a_net_is_an_ordinary_module() -> None:
     torch.testing.assert_close(ends[0], ends[1], rtol=1e-8, atol=1e-10)
 
 
-@pytest.mark.parametrize("lanes", [1, 2, 20])
-def test_a_model_does_not_know_of_the_others(lanes: int) -> None:
-    """Bit for bit: alone and in a stack."""
-    nets, data = [GainNet(seed=s) for s in range(5)], batch(5, lanes, 30, torch.float32)
-
-    def run(rows: slice) -> tuple[Tensor, Tensor]:
-        theta = flatten(nets[rows]).requires_grad_()
-        x = nets[0].rollout(theta, data.gnss[:, rows], data.velocity[:, rows], data.x0[rows], 0.1)
-        (gradient,) = torch.autograd.grad((x - data.truth[:, rows]).square().sum(), theta)
-        return x.detach(), gradient
-
-    stacked, alone = run(slice(0, 5)), run(slice(3, 4))
-    assert torch.equal(stacked[0][:, 3:4], alone[0])
-    assert torch.equal(stacked[1][3:4], alone[1])
-    one = Batch(*(part[:, 3:4] for part in data[:3]), data.x0[3:4], 0.1)
-    for whole, cut in zip(
-        nets[0].loss_and_gradient(flatten(nets), data), nets[0].loss_and_gradient(flatten(nets[3:4]), one), strict=True
-    ):
-        assert torch.equal(whole[3:4], cut)
-
-
 def test_an_optimiser_step_is_that_of_torch() -> None:
     """torch.optim.AdamW after clip_grad_norm_ on autograd's gradient of the loss with penalties; other rows stay."""
     torch.manual_seed(0)
@@ -219,24 +197,6 @@ def test_descent_is_that_of_torch() -> None:
             optimisers[row].step()
     torch.testing.assert_close(state.theta[[0, 3]], flatten([*leaves.values()]), rtol=1e-8, atol=1e-10)
     assert torch.equal(state.theta[1:3], started[1:3])
-
-
-@pytest.mark.parametrize("lanes", [1, 3])
-def test_descent_does_not_know_of_the_others(lanes: int) -> None:
-    """Bit for bit, the numbers of `loss_and_gradient` and `advance` one after the other."""
-    nets, data = [GainNet(seed=s) for s in range(3)], batch(3, lanes, 30, torch.float32)
-
-    def run(rows: list[int], way: Callable[..., Any]) -> Tensor:
-        state = moving([nets[r] for r in rows])
-        mine = Batch(*(part[:, rows] for part in data[:3]), data.x0[rows], 0.1)
-        for step in range(1, 4):
-            way(nets[0], state, np.arange(len(rows)), mine, step, np.full(len(rows), 1e-2), Schedule())
-        return state.theta
-
-    stacked, alone = run([0, 1, 2], GainNet.descend), run([1], GainNet.descend)
-    assert torch.equal(stacked, run([0, 1, 2], Gain.descend))
-    assert torch.equal(stacked[1:2], alone)
-    assert not torch.equal(alone, flatten(nets[1:2]))
 
 
 def test_gradients_of_inputs_go_through_the_reference() -> None:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ast
 import re
 import subprocess
 import sys
@@ -19,7 +18,6 @@ from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import recipe_of
 from coopoc.plugins import find
 
-LEARNED = Path(__file__).resolve().parents[1] / "learned"
 NET = "constant_gain.py:ConstantGain"
 
 
@@ -64,29 +62,3 @@ def test_what_is_neither_recipe_nor_net_is_refused(folder: Path) -> None:
         recipe_of("constant_gain.py:nn")
     with pytest.raises(InputError, match="Did you mean split"):
         recipe_of("splitt")
-
-
-def imported(path: Path) -> set[Path]:
-    """Files of learned/ that a file imports, anywhere in it."""
-    package, found = path.relative_to(LEARNED).parts[:-1], set()
-    for node in ast.walk(ast.parse(path.read_text())):
-        if not isinstance(node, ast.ImportFrom):
-            continue
-        words = (node.module or "").split(".") if node.module else []
-        if node.level:
-            base = [*package[: len(package) - node.level + 1], *words]
-        elif words[:2] == ["coopoc", "learned"]:
-            base = words[2:]
-        else:
-            continue
-        stem = LEARNED.joinpath(*base)
-        found |= {stem / f"{alias.name}.py" for alias in node.names} | {stem.with_suffix(".py")}
-    return {file for file in found if file.is_file()} - {path}
-
-
-def test_no_file_of_the_learned_package_imports_in_a_circle() -> None:
-    left = {file: imported(file) for file in LEARNED.rglob("*.py")}
-    while free := [file for file, needs in left.items() if not needs & left.keys()]:
-        for file in free:
-            del left[file]
-    assert not left, sorted(str(file.relative_to(LEARNED)) for file in left)

@@ -21,7 +21,7 @@ from coopoc.learned import Client, GainNet, Schedule, clients, federate
 from coopoc.learned.federation.combine import SERVER, Answer, Standing, combine, screen
 from coopoc.learned.federation.federate import Plan, federate_many
 from coopoc.learned.federation.history import Federation, Round, ledger
-from coopoc.learned.federation.local import adapt, local_fit
+from coopoc.learned.federation.local import local_fit
 from coopoc.learned.federation.participation import Byzantine, Participation, heterogeneous, poisoned
 from coopoc.learned.federation.rules import (
     RULES,
@@ -38,7 +38,7 @@ from coopoc.learned.federation.rules import (
 from coopoc.learned.nets.gain import Gain
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch, Noise
-from coopoc.learned.training.fit import Judge, pooled
+from coopoc.learned.training.fit import Judge
 from coopoc.methods.track import Method
 
 PLAIN = Schedule(weight_decay=0.0, mirror=False, clip=1e9)
@@ -106,20 +106,6 @@ def test_the_order_of_the_clients_changes_nothing(four: tuple[Client, ...], opti
         assert torch.equal(a.weights, c.weights)
         assert (a.sent, a.absent) == (b.sent, b.absent) == (c.sent, c.absent)
     assert not torch.equal(one.history[-1].weights, trained(four, seed=4, **options).history[-1].weights)
-
-
-def test_a_client_alone_is_its_row_of_the_stack(four: tuple[Client, ...]) -> None:
-    """`local_fit` is what `adapt` makes of the client among others, bit for bit."""
-    theta = flatten([Steady(0.2 + 0.1 * i) for i in range(4)])
-    local = Schedule(epochs=2, epoch="pass", batch=3)
-    stacked, (pool, members) = theta.clone(), pooled([c.training for c in four])
-    losses, broken = adapt(stacked, Steady(), pool, members, [(5, c.name) for c in four], 2, 6, local)
-    assert not broken
-    for row, client in enumerate(four):
-        alone, loss, reason = local_fit(Steady(), theta[row], client, 5, 2, 6, local)
-        assert torch.equal(alone, stacked[row])
-        assert (loss, reason) == (float(losses[row]), None)
-    assert torch.equal(theta[0], torch.full((3,), 0.2))
 
 
 def test_a_client_alone_says_why_it_broke(four: tuple[Client, ...]) -> None:
@@ -279,19 +265,6 @@ def test_poisoned_data_and_poisoned_updates(four: tuple[Client, ...]) -> None:
     assert losses[0] < losses[1]
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("aggregate", ["mean", "multi_krum"])
-def test_a_net_is_federated_the_same_way(aggregate: str) -> None:
-    """GainNet with all options at once moves, stays finite and repeats to the last bit."""
-    group, net = clients(drives(6), piece=10), GainNet(2, 1)
-    options: dict[str, Any] = {"participation": Participation(0.9)}
-    fed, again = (trained(group, 2, model=net, aggregate=aggregate, seed=1, **options) for _ in range(2))
-    path = torch.stack([row.weights for row in fed.history])
-    assert path.isfinite().all()
-    assert path.diff(dim=0).norm() > 0
-    assert torch.equal(path, torch.stack([row.weights for row in again.history]))
-
-
 @pytest.mark.parametrize("noise", ["static", "fresh", "wide"])
 def test_a_score_does_not_depend_on_who_is_judged_beside(noise: Noise) -> None:
     """Bit for bit, with pieces of different number, and equal to the mean of the pieces' losses on one draw."""
@@ -306,21 +279,6 @@ def test_a_score_does_not_depend_on_who_is_judged_beside(noise: Noise) -> None:
         torch.testing.assert_close(together[row], torch.stack(by_hand).max())
         off = torch.cat([(batch.gnss - batch.truth).flatten() for batch, _ in alone.batches])
         assert noise == "wide" or float(off.std()) == pytest.approx(1.5, rel=0.2)
-
-
-def test_a_net_alone_is_its_row_of_the_stack(four: tuple[Client, ...]) -> None:
-    """The compiled net's gradients do not depend on who is computed beside it: `local_fit` is `adapt`, bit for bit."""
-    pytest.importorskip("numba")
-    theta = flatten([GainNet(2, 1, seed=i) for i in range(4)])
-    stacked, (pool, members) = theta.clone(), pooled([c.training for c in four])
-    local = Schedule(epochs=2, epoch="pass")
-    losses, _ = adapt(stacked, GainNet(2, 1), pool, members, [(5, c.name) for c in four], 1, 3, local)
-    scores = Judge([[c.validation for c in four], [c.long for c in four]], GainNet(2, 1))(stacked)
-    for row, client in enumerate(four):
-        alone, loss, _ = local_fit(GainNet(2, 1), theta[row], client, 5, 1, 3, local)
-        assert torch.equal(alone, stacked[row])
-        assert loss == float(losses[row])
-        assert Judge([[client.validation], [client.long]], GainNet(2, 1))(alone[None]) == scores[row]
 
 
 SIZES = torch.tensor([3, 1, 5, 2, 4, 1, 6])

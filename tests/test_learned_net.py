@@ -7,6 +7,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import torch
+from conftest import winding
 from torch import nn
 
 from coopoc import Fleet, InputError, Sensors, observe
@@ -22,14 +23,6 @@ from coopoc.methods.track import Method
 def _one_core() -> Iterator[None]:
     with one_core():
         yield
-
-
-def drive(steps: int = 60, vehicles: int = 1) -> Fleet:
-    """A sinuous drive with x_t = x_{t-1} + dt u_t."""
-    t = np.arange(steps) / 10
-    wave = t[:, None] / 3 + np.arange(vehicles)
-    velocity = np.stack([8 * np.cos(wave), 8 * np.sin(wave), 0.2 * np.cos(wave)], axis=-1)
-    return Fleet(tuple("abcdef"[:vehicles]), t, np.cumsum(0.1 * velocity, axis=0), velocity)
 
 
 def batch(models: int, lanes: int, steps: int, dtype: torch.dtype = torch.float64) -> Batch:
@@ -108,7 +101,7 @@ def constant(gain: np.ndarray) -> GainNet:
 
 def test_constant_gain_equals_the_constant_gain_filter_by_hand() -> None:
     gain = np.array([[0.1, 0.02, 0.0], [-0.03, 0.2, 0.0], [0.0, 0.0, 0.5]])
-    rec = observe(drive(vehicles=2), Sensors(), runs=3)
+    rec = observe(winding(vehicles=2), Sensors(), runs=3)
     track = LearnedGain(constant(gain))(rec, [0, 1])
     x = rec.gnss[:, 0]
     for t in range(1, len(rec.t)):
@@ -120,21 +113,21 @@ def test_constant_gain_equals_the_constant_gain_filter_by_hand() -> None:
 def test_nothing_is_sent_online_and_no_covariance_is_claimed() -> None:
     method = LearnedGain(GainNet())
     assert isinstance(method, Method)
-    track = method(observe(drive(), Sensors(), runs=2))
+    track = method(observe(winding(), Sensors(), runs=2))
     assert not method.cooperative
     assert track.received_bytes.sum() == track.sent_bytes.sum() == method.message.payload == 0
     assert track.covariance is None
 
 
 def test_translating_the_world_translates_the_estimate() -> None:
-    here = drive()
+    here = winding()
     there = Fleet(here.ids, here.t, here.position + np.array([4e5, -5e6, 100.0]), here.velocity)
     tracks = [LearnedGain(GainNet())(observe(f, Sensors(), runs=2)).x for f in (here, there)]
     np.testing.assert_allclose(tracks[1] - tracks[0], np.broadcast_to([4e5, -5e6, 100.0], tracks[0].shape), atol=1e-4)
 
 
 def test_a_given_start_is_used_and_its_shape_checked() -> None:
-    fleet = drive()
+    fleet = winding()
     rec = observe(fleet, Sensors(), runs=2)
     track = LearnedGain(GainNet(), x0=fleet.position[0])(rec)
     np.testing.assert_array_equal(track.x[:, 0], np.broadcast_to(fleet.position[0], (2, 1, 3)))
@@ -143,7 +136,7 @@ def test_a_given_start_is_used_and_its_shape_checked() -> None:
 
 
 def test_divergence_is_reported_and_nan_is_refused() -> None:
-    rec = observe(drive(200), Sensors(), runs=2)
+    rec = observe(winding(200), Sensors(), runs=2)
     assert LearnedGain(constant(0.1 * np.eye(3)))(rec).notes == ()
     (note,) = LearnedGain(constant(2.05 * np.eye(3)))(rec).notes
     assert "diverged in 2 of 2 runs" in note

@@ -11,7 +11,7 @@ from filterpy.kalman import KalmanFilter
 from coopoc import Fleet, InputError, Sensors, observe
 from coopoc.evaluate.metrics import nees
 from coopoc.learned import OptimisedKF, Segments, clients, fit_okf
-from coopoc.learned.training.okf_fit import _stacked, fit_okf_many
+from coopoc.learned.training.okf_fit import fit_okf_many
 
 
 def walk(steps: int, seed: int = 0) -> Fleet:
@@ -71,28 +71,6 @@ def test_trained_covariance_is_calibrated() -> None:
     fleet = walk(400, seed=9)
     claimed = nees(method(observe(fleet, Sensors(), runs=30)), fleet)
     assert claimed[:, 50:].mean() == pytest.approx(3.0, rel=0.15)
-
-
-def test_stacked_training_is_training_one_by_one() -> None:
-    tasks = []
-    for seed in range(2):
-        (client,) = clients(walk(700 + 300 * seed, seed), Sensors(), piece=20, seed=seed)
-        tasks.append((client.training, client.validation))
-    together = fit_okf_many(tasks, steps=20)
-    for task, found in zip(tasks, together, strict=True):
-        alone = fit_okf(*task, steps=20)
-        np.testing.assert_allclose(alone.method.process_std, found.method.process_std, rtol=1e-8)
-        np.testing.assert_allclose(alone.method.gnss_std, found.method.gnss_std, rtol=1e-8)
-
-
-def test_fresh_noise_does_not_depend_on_the_stack() -> None:
-    (client,) = clients(walk(700), Sensors(), piece=20, noise="fresh")
-    task = (client.training, client.validation)
-    alone, *stacked = (fit_okf_many([task] * count, steps=5)[-1].method for count in (1, 2, 3))
-    for found in stacked:
-        np.testing.assert_allclose(found.gnss_std, alone.gnss_std, rtol=1e-8)
-    trained, judged = (_stacked([client.training], kind)[0].gnss for kind in ("training", "validation"))
-    assert float((trained - judged).abs().mean()) > 1.0, "m, of two independent draws"
 
 
 def test_padding_does_not_weigh() -> None:

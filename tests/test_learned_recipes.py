@@ -12,21 +12,22 @@ import torch
 from safetensors.torch import load_file, save_file
 
 import coopoc.learned.recipes as recipes
-from coopoc import GNSS, V2X, Fleet, InputError, Kalman, Sensors, load_fleet, observe
+from coopoc import GNSS, V2X, Fleet, InputError, Kalman, Outliers, Sensors, load_fleet, observe
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import (
     Checkpoint,
     GainNet,
     LearnedGain,
     NoiseParameters,
-    OptimisedKF,
     Schedule,
+    clients,
     load,
     load_method,
     save,
     train_all,
 )
 from coopoc.learned.checkpoint import read_card
+from coopoc.learned.nets.gain import Gain
 from coopoc.learned.nets.recursive import RecursiveGain
 from coopoc.learned.nets.split import SplitGain
 from coopoc.learned.nets.stack import flatten
@@ -63,24 +64,8 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
         again.after(2)
 
 
-def test_okf_round_trip(tmp_path: Path) -> None:
-    numbers = NoiseParameters()
-    with torch.no_grad():
-        numbers.logs.copy_(torch.tensor([[0.1, 0.2, 0.3], [0.1, 0.1, 0.01], [1.5, 1.6, 1.7]]).log())
-    method = numbers.method("okf")
-    np.testing.assert_allclose(method.gnss_std, (1.5, 1.6, 1.7), rtol=1e-6)
-    save(tmp_path / "okf.safetensors", Checkpoint(numbers, {}))
-    again = load_method(tmp_path / "okf.safetensors")
-    assert isinstance(again, OptimisedKF)
-    assert (again.process_std, again.velocity_ratio, again.gnss_std) == (
-        method.process_std,
-        method.velocity_ratio,
-        method.gnss_std,
-    )
-
-
-@pytest.mark.parametrize("net", [RecursiveGain(5, seed=2), SplitGain(5, seed=2), GainNet(2, 1)])
-def test_every_kind_of_net_round_trips(net: RecursiveGain | SplitGain | GainNet, tmp_path: Path) -> None:
+@pytest.mark.parametrize("net", [RecursiveGain(5, seed=2), SplitGain(5, seed=2), GainNet(2, 1), NoiseParameters()])
+def test_every_kind_of_net_round_trips(net: Gain, tmp_path: Path) -> None:
     again = load(save(tmp_path / "net.safetensors", Checkpoint(net, {}))).model
     assert type(again) is type(net)
     assert (again.settings, torch.equal(flatten([again]), flatten([net]))) == (net.settings, True)
@@ -148,6 +133,30 @@ def test_what_changes_the_weights_changes_the_key(tmp_path: Path, monkeypatch: p
     monkeypatch.setitem(recipes.RECIPES, "centralised", faster)
     train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"], progress=False)
     assert read_card(path)["key"] != before
+
+
+@pytest.mark.usefixtures("quick")
+def test_a_recipe_names_what_is_wrong_in_its_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Jumps and gaps reach the clients' pieces, none of which begins in a gap; noise that is drawn anew has none."""
+    plain, text = recipes.RECIPES["fedkalmannet"], "fixes=0.2:1+outages=0.3:1"
+    monkeypatch.setitem(recipes.RECIPES, "fedkalmannet", replace(plain, noise=text, piece=10))
+    (job,) = recipes.jobs_of("fedkalmannet", recipes.Setting(), drives())
+    sensors = recipes.sensors(job)
+    assert sensors == replace(Sensors.paper_training(), outliers=Outliers.named(text))
+    pieces = [part for client in recipes.job_clients(job, drives()) for part in (client.training, client.validation)]
+    fixes = [part.gnss.reshape(-1, 11, 3) for part in pieces]
+    assert not any(bool(torch.isnan(fix[:, 0]).any()) for fix in fixes)
+    assert any(bool(torch.isnan(fix).any()) for fix in fixes)
+    gaps = [torch.nan_to_num(fix - part.truth.reshape(-1, 11, 3)) for fix, part in zip(fixes, pieces, strict=True)]
+    assert max(float(gap.abs().max()) for gap in gaps) > 8
+    made = train_all(drives(), tmp_path, seeds=[0], recipes=["fedkalmannet"], progress=False)
+    (card,) = (checkpoint.card for checkpoint in made.values())
+    assert card["noise"]["outliers"]["outages"]["rate"] == 0.3
+    assert bool(torch.isfinite(flatten([made["fedkalmannet-gnss-axis-0"].model])).all())  # type: ignore[list-item]
+    with pytest.raises(InputError, match="outliers"):
+        clients(drives(), sensors, noise="wide", piece=10)
+    with pytest.raises(InputError, match="fogg"):
+        replace(plain, noise="fogg")
 
 
 @pytest.mark.usefixtures("quick")

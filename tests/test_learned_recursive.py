@@ -8,6 +8,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from conftest import winding
 from filterpy.kalman import KalmanFilter
 
 from coopoc import V2X, Fleet, Sensors, load_fleet, observe
@@ -17,13 +18,6 @@ from coopoc.learned import Schedule, clients, fit, load_method
 from coopoc.learned.nets.recursive import POOL, RecursiveFilter, RecursiveGain, after, first, noise
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch
-
-
-def drive(steps: int = 60) -> Fleet:
-    """A sinuous drive with x_t = x_{t-1} + dt u_t."""
-    t = np.arange(steps) / 10
-    velocity = np.stack([8 * np.cos(t / 3), 8 * np.sin(t / 3), 0.2 * np.cos(t / 3)], axis=-1)[:, None]
-    return Fleet(("a",), t, np.cumsum(0.1 * velocity, axis=0), velocity)
 
 
 def batch(models: int, lanes: int, steps: int, dtype: torch.dtype = torch.float64) -> Batch:
@@ -47,7 +41,7 @@ def trained(models: int, dtype: torch.dtype = torch.float64) -> torch.Tensor:
 
 def test_untrained_net_is_filterpys_filter() -> None:
     """With the noise that the levels tell: R and Q of each step, and P rescaled as R is learned."""
-    recording = observe(drive(), Sensors(gnss_std=(1.0, 2.0, 3.0)), runs=1)
+    recording = observe(winding(), Sensors(gnss_std=(1.0, 2.0, 3.0)), runs=1)
     fixes, speeds = (torch.tensor(a[0, :, 0]) for a in (recording.gnss, recording.velocity))
     levels, track = first(fixes[0]), RecursiveFilter(RecursiveGain())(recording)
     theirs = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
@@ -75,7 +69,7 @@ def test_loss_is_torchs_gaussian_likelihood() -> None:
 
 def test_levels_hold_the_noise() -> None:
     """1 m, 2 m and 4 m, drawn a little towards their mean square, and 15 % of a velocity that turns."""
-    recording = observe(drive(300), Sensors(gnss_std=(1.0, 2.0, 4.0), velocity_std_ratio=0.15), runs=60)
+    recording = observe(winding(300), Sensors(gnss_std=(1.0, 2.0, 4.0), velocity_std_ratio=0.15), runs=60)
     fixes, speeds = (torch.tensor(a[:, :, 0]) for a in (recording.gnss, recording.velocity))
     levels, shares = first(fixes[:, 0]), []
     for t in range(1, 300):
@@ -96,7 +90,7 @@ def test_axes_and_signs_are_all_alike() -> None:
 
 
 def test_missing_fixes_only_predict() -> None:
-    recording = observe(drive(40), Sensors(), runs=2)
+    recording = observe(winding(40), Sensors(), runs=2)
     gnss = recording.gnss.copy()
     gnss[1, 20:] = np.nan
     track = load_method("recursive")(replace(recording, gnss=gnss))
@@ -109,7 +103,7 @@ def test_missing_fixes_only_predict() -> None:
 
 
 def test_stream_is_the_method() -> None:
-    recording = observe(drive(), Sensors(), runs=1)
+    recording = observe(winding(), Sensors(), runs=1)
     method = load_method("recursive")
     track, stream = method(recording), method.start()
     assert track.covariance is not None
@@ -121,8 +115,8 @@ def test_stream_is_the_method() -> None:
 
 
 def test_a_known_start_is_exact_and_a_late_fix_counts_less() -> None:
-    recording = observe(drive(), Sensors(), runs=2)
-    truth = drive().position[0]
+    recording = observe(winding(), Sensors(), runs=2)
+    truth = winding().position[0]
     track = RecursiveFilter(RecursiveGain(), x0=truth)(recording)
     assert track.covariance is not None
     np.testing.assert_array_equal(track.x[:, 0, 0], np.broadcast_to(truth[0], (2, 3)))

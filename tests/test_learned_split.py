@@ -4,21 +4,15 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from conftest import winding
 from torch import Tensor, nn
 
-from coopoc import Fleet, Sensors, observe
+from coopoc import Sensors, observe
 from coopoc.learned import Schedule, clients, fit
 from coopoc.learned.nets.split import SplitGain
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import Batch
 from coopoc.methods.stream import Stream
-
-
-def drive(steps: int = 60) -> Fleet:
-    """A sinuous drive with x_t = x_{t-1} + dt u_t."""
-    t = np.arange(steps) / 10
-    velocity = np.stack([8 * np.cos(t / 3), 8 * np.sin(t / 3), 0.2 * np.cos(t / 3)], axis=-1)[:, None]
-    return Fleet(("a",), t, np.cumsum(0.1 * velocity, axis=0), velocity)
 
 
 def batch(models: int, lanes: int, steps: int) -> Batch:
@@ -83,7 +77,7 @@ def test_parameter_count() -> None:
 
 
 def test_the_start_is_a_stable_loop_near_a_constant_gain() -> None:
-    recording = observe(drive(900), Sensors(), runs=4)
+    recording = observe(winding(900), Sensors(), runs=4)
     method = SplitGain().method("split")
     track = method(recording)
     assert track.notes == ()
@@ -107,7 +101,7 @@ def test_it_sees_magnitudes() -> None:
 
 
 def test_stream_is_the_method() -> None:
-    recording = observe(drive(), Sensors(), runs=1)
+    recording = observe(winding(), Sensors(), runs=1)
     method = SplitGain(seed=2).method("split")
     stream: Stream[object] = method.start()  # type: ignore[attr-defined]
     stream.step(recording.gnss[0, 0, 0], np.zeros(3), dt=0.1)
@@ -119,7 +113,7 @@ def test_stream_is_the_method() -> None:
 
 def test_training_lowers_the_loss() -> None:
     """The start's gain of 0.1 is far too much for fixes of 6 m."""
-    (only,) = clients(drive(900), Sensors(gnss_std=(6.0, 6.0, 6.0)), piece=40)
+    (only,) = clients(winding(900), Sensors(gnss_std=(6.0, 6.0, 6.0)), piece=40)
     schedule = Schedule(epochs=30, batch=6, learning_rate=0.01, checks=3)
     found = fit(SplitGain(8), only.training, only.validation, schedule)
     assert found.best.validation_loss < 0.95 * found.history[0].validation_loss

@@ -11,7 +11,6 @@ import torch
 import coopoc.learned.training.fit as train
 from coopoc import Fleet, InputError, Sensors
 from coopoc.learned import GainNet, Schedule, Segments, clients, federate, fit
-from coopoc.learned.federation.rules import mean, uniform
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.training.clients import mirrored
 from coopoc.learned.training.fit import Task, fit_many
@@ -120,14 +119,6 @@ def test_federation_counts_its_bytes_and_keeps_every_round() -> None:
         fed.after(4)
 
 
-def test_aggregation_rules() -> None:
-    weights, sizes = torch.tensor([[1.0, 0.0], [4.0, 8.0]]), torch.tensor([3, 1])
-    assert mean(weights, sizes).tolist() == [1.75, 2.0]
-    assert uniform(weights, sizes).tolist() == [2.5, 4.0]
-    with pytest.raises(InputError, match="aggregation rule"):
-        federate(GainNet(), clients(drives(), piece=10), aggregate="vote")
-
-
 def test_same_seed_same_weights_and_another_seed_another_net() -> None:
     (client,) = clients(drives((300,)), piece=10)
     nets = [fit(GainNet(seed=s), client.training, client.validation, QUICK, seed=s).model for s in (1, 1, 2)]
@@ -143,19 +134,6 @@ def test_stacking_changes_no_net() -> None:
     for task, fitted in zip(tasks, together, strict=True):
         alone = fit_many([task], QUICK)[0]
         torch.testing.assert_close(flatten([alone.model]), flatten([fitted.model]), rtol=1e-5, atol=1e-6)
-
-
-def test_stacking_changes_no_check_either() -> None:
-    """A net with few pieces passes through them in fewer steps than its neighbour there; its checks are its own."""
-    short, long = clients(drives(), piece=10)
-    schedule = replace(QUICK, epoch="pass")
-    tasks = [Task(GainNet(), c.training, c.validation, 3) for c in (short, long)]
-    alone = [fit_many([task], schedule)[0] for task in tasks]
-    for one, stacked in zip(alone, fit_many(tasks, schedule), strict=True):
-        assert [row.step for row in stacked.history] == [row.step for row in one.history]
-        for field in ("training_loss", "validation_loss"):
-            ours, theirs = ([getattr(row, field) for row in found.history] for found in (stacked, one))
-            np.testing.assert_allclose(ours, theirs, rtol=1e-5)
 
 
 def test_long_pieces_for_some_tasks_only_are_refused() -> None:
@@ -205,15 +183,6 @@ def test_a_loss_that_overflows_is_infinite() -> None:
     (client,) = clients(drives((300,)), piece=100)
     net = GainNet(start_gain=3.0)
     assert train.Judge([[client.validation]], net)(flatten([net])).tolist() == [np.inf]
-
-
-def test_a_client_that_breaks_is_left_out_of_the_round() -> None:
-    one, two = clients(drives(), piece=10)
-    broken = replace(two, training=replace(two.training, gnss=two.training.gnss.clone().fill_(float("nan"))))
-    fed = federate(GainNet(), [one, broken], rounds=1, local_epochs=1, schedule=QUICK)
-    alone = federate(GainNet(), [one], rounds=1, local_epochs=1, schedule=QUICK)
-    assert fed.history[1].rejected == {"c1": "loss or gradient not finite at step 1"}
-    torch.testing.assert_close(fed.history[1].weights, alone.history[1].weights, rtol=1e-5, atol=1e-7)
 
 
 def test_rates_fall_as_torchs_cosine() -> None:

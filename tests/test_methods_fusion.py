@@ -13,14 +13,15 @@ from scipy.spatial import procrustes
 from scipy.spatial.distance import cdist
 
 import coopoc as co
-from coopoc import GNSS, V2X, Fleet, InputError, Kalman, NoiseModel, Sensors, observe
+from coopoc import GNSS, V2X, Fleet, InputError, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, rt_le
 from coopoc.kernels.solo import FixNoise
+from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.methods.covariance_intersection import CovarianceIntersection
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.mds import MDS, complete, fit, shape
 from coopoc.methods.qcqp_relaxation import QCQPRelaxation
-from coopoc.methods.star import ESTIMATE_GROWTH, stars
+from coopoc.methods.star import stars
 from coopoc.world.inbox import inbox
 
 S2 = Sensors.paper_scenario2()
@@ -126,30 +127,6 @@ def test_the_relaxation_finds_what_many_starts_find() -> None:
 def brief(method: object, fleet: Fleet) -> Fleet:
     """Semidefinite programmes take their time."""
     return fleet.between(0, 12) if isinstance(method, QCQPRelaxation) else fleet
-
-
-@pytest.mark.parametrize("method", METHODS, ids=label)
-def test_zero_noise_gives_zero_error(method, crossing: Fleet) -> None:
-    fleet = brief(method, crossing)
-    recording = observe(fleet, SILENT, V2X(max_neighbours=7, radius=200.0), assumed=S2)
-    worst = errors(method(recording, [0, 3]), fleet).max()
-    assert worst < 1e-5
-
-
-@pytest.mark.parametrize("channel", [V2X(max_neighbours=0), V2X(max_neighbours=4, loss=1.0)], ids=["alone", "deaf"])
-@pytest.mark.parametrize("method", METHODS, ids=label)
-def test_without_messages_it_is_the_solo_method(method, channel: V2X, crossing: Fleet) -> None:
-    """The filters equal the solo Kalman filter with its covariance, the snapshots the fix."""
-    recording = observe(crossing, S2, channel, runs=3)
-    track = method(recording, [0, 1])
-    if method in SNAPSHOTS:
-        assert track.x == pytest.approx(GNSS()(recording, [0, 1]).x, abs=1e-9)
-    else:
-        solo = Kalman(method.noise_model)(recording, [0, 1])
-        assert track.x == pytest.approx(solo.x, abs=1e-9)
-        assert track.covariance == pytest.approx(solo.covariance, abs=1e-9)
-    assert (track.received_bytes == 0).all()
-    assert (track.sent_bytes > 0).all() == (channel.max_neighbours > 0)
 
 
 @pytest.mark.parametrize("method", METHODS, ids=label)

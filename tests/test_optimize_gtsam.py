@@ -3,16 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import gtsam
 import numpy as np
 import pytest
 
-from coopoc import V2X, Fleet, InputError, Sensors, observe
+from coopoc import V2X, Fleet, Sensors, observe
 from coopoc.optimize import Loss, Problem, Status, pose, solve
 from coopoc.optimize.backends.gtsam_factors import forms, graph_of, tangent, values, which_turn
-from coopoc.optimize.incremental import FixedLag
 
 LOSSES = ("huber", "cauchy", "geman-mcclure", "truncated")
 
@@ -106,18 +104,13 @@ def test_gtsams_own_factors_have_our_cost_and_gradient(dimension: int, name: str
     ("dimension", "kind", "nodes", "noise", "loss", "why"),
     [
         (2, "relative_pose", BETWEEN, {"std": [0.3, 0.1, 0.1]}, None, "one std in all directions"),
-        (3, "relative_position", BETWEEN, {"std": [0.3, 0.3, 0.1]}, None, "one std in all directions"),
-        (3, "relative_pose", BETWEEN, {"cov": spd(6, 0.01)}, None, "couple"),
         (2, "relative_pose", BETWEEN, {"std": 0.1}, "huber", "two factors"),
-        (2, "pose", [("a",)], {"std": 0.1}, "huber", "two factors"),
         (3, "pose", [("a",)], {"cov": spd(6, 0.01)}, None, "couple"),
         (3, "relative_pose_chordal", BETWEEN, {"std": np.linspace(0.1, 0.4, 12)}, None, "of each axis"),
         (2, "relative_position", SEEN, {"std": 0.1}, None, "a pose to a point"),
-        (2, "displacement", [("a", "d")], {"std": 0.1}, None, "a pose to a point"),
         (3, "bearing", SEEN, {"std": 0.1}, None, "forward axis"),
         (3, "body_spherical", SEEN, {"std": 0.1}, None, "tangent plane"),
         (2, "azimuth", PAIRS, {"std": 0.1}, None, "no such factor"),
-        (3, "spherical", PAIRS, {"std": 0.1}, None, "no such factor"),
     ],
 )
 def test_what_gtsam_lacks_is_named(dimension: int, kind: str, nodes: list, noise: dict, loss, why: str) -> None:
@@ -305,114 +298,3 @@ def test_marginals_of_poses_in_space_equal_gtsams() -> None:
         own, R = marginals.marginalCovariance(i), solution.rotation[i]
         wide = np.block([[np.zeros((3, 3)), R], [np.eye(3), np.zeros((3, 3))]])
         assert covariance == pytest.approx(wide @ own @ wide.T, abs=1e-6)
-
-
-def test_a_fixed_lag_is_exact_on_a_linear_chain() -> None:
-    """The newest node of every lag against numpy.linalg.lstsq over the whole drive; a full covariance throughout."""
-    rng, steps = np.random.default_rng(11), 12
-    fixes, moves = rng.normal(size=(steps, 3)), rng.normal(size=(steps, 3))
-    whole = Problem([f"p{k}" for k in range(steps)]).add("position", list(range(steps)), fixes, cov=spd(3))
-    whole = whole.add("displacement", [(k - 1, k) for k in range(1, steps)], moves[1:], cov=spd(3, 0.1, seed=4))
-    residual, jacobian = whole.whiten(np.zeros((steps, 3)))
-    best = np.linalg.lstsq(jacobian.toarray(), -residual)[0].reshape(-1, 3)
-    spread = np.linalg.inv((jacobian.T @ jacobian).toarray())
-    for lag, threshold in ((0.5, 0.01), (3.5, 0.01), (3.5, np.inf), (np.inf, 0.01)):
-        smoother = FixedLag(lag, threshold)
-        for k in range(steps):
-            names = [f"p{k - 1}", f"p{k}"] if k else ["p0"]
-            piece = Problem(names).add("position", names[-1], fixes[k], cov=spd(3))
-            piece = piece.add("displacement", names, moves[k], cov=spd(3, 0.1, seed=4)) if k else piece
-            newest = smoother.update(piece, {names[-1]: float(k)})
-        assert newest.names == ("p11",)
-        assert newest.x[0] == pytest.approx(best[-1], abs=1e-9)
-        assert newest.covariance[0] == pytest.approx(spread[-3:, -3:], abs=1e-9)
-        assert set(smoother.stamps) == {f"p{k}" for k in range(steps) if k >= steps - 1 - lag}
-        kept = tuple(smoother.stamps)
-        assert smoother.estimate(kept).x == pytest.approx(best[-len(kept) :], abs=1e-9)
-
-
-def pieces(problem: Problem, steps: int) -> list[tuple[Problem, dict[str, float]]]:
-    """`plane` cut into its steps; the landmark is stamped at each, so that it stays."""
-    n = 2 * steps
-    moment = np.append(np.tile(np.arange(steps), 2), 0)
-    found = []
-    for k in range(steps):
-        factors = []
-        for factor in problem.factors:
-            rows = np.flatnonzero(moment[factor.nodes].max(axis=1) == k)
-            if len(rows):
-                std = factor.std if len(factor.std) == 1 else factor.std[rows]
-                factors.append(replace(factor, nodes=factor.nodes[rows], z=factor.z[rows], std=std))
-        touched = np.unique(np.concatenate([[k, steps + k, n], *(f.nodes.ravel() for f in factors)]))
-        place = {int(i): p for p, i in enumerate(touched)}
-        factors = [replace(f, nodes=np.vectorize(place.get)(f.nodes)) for f in factors]
-        names = [problem.names[i] for i in touched]
-        piece = Problem(names, tuple(factors), problem.x0[touched], dimension=2, poses=range(len(names) - 1))
-        found.append((piece, {problem.names[i]: float(k) for i in (k, steps + k, n)}))
-    return found
-
-
-def test_an_endless_lag_is_the_whole_problem() -> None:
-    """Poses, a landmark, ranges and bearings of the plane, step by step, against Gauss-Newton on all at once."""
-    problem = plane()
-    problem = problem.add("position", 16, problem.x0[16, :2], std=3.0)
-    whole, smoother = solve(problem), FixedLag(np.inf, threshold=1e-9, passes=8)
-    for piece, stamps in pieces(problem, 8):
-        newest = smoother.update(piece, stamps)
-        assert set(newest.names) == set(stamps)
-    newest = smoother.estimate(("7", "15", "16"))
-    assert newest.x == pytest.approx(whole.x[[7, 15, 16]], abs=1e-6)
-    with pytest.raises(InputError, match=r"wanted = '155': .* Did you mean 15\?"):
-        smoother.estimate(("155",))
-    every = smoother.estimate(problem.names)
-    assert every.x == pytest.approx(whole.x, abs=1e-6)
-    assert every.covariance == pytest.approx(whole.covariance, rel=0.05, abs=1e-3)  # their chord's J^T J, not ours
-
-
-def test_points_and_poses_in_space_are_linearised_in_gtsams_directions() -> None:
-    """Without noise all is exact: a body-frame vector to a point, which GTSAM lacks, and its covariances."""
-    rng = np.random.default_rng(12)
-    x = pose(rng.uniform(-9, 9, (4, 3)), rng.normal(size=(4, 3)))
-    x[2:, 3:] = np.eye(3).ravel()
-    problem = Problem(tuple("abcd"), x0=x, poses=range(2))
-    problem = problem.add("pose", [0, 1], x[:2], std=[0.5, 0.4, 0.3, 0.05, 0.06, 0.07])
-    pairs = [(0, 2), (1, 2), (1, 3)]
-    seen = [x[i, 3:].reshape(3, 3).T @ (x[j, :3] - x[i, :3]) for i, j in pairs]
-    problem = problem.add("relative_position", pairs, seen, std=[0.1, 0.2, 0.3])
-    whole = solve(problem)
-    found = FixedLag(1.0).update(problem, dict.fromkeys("abcd", 0.0))
-    assert found.x == pytest.approx(x, abs=1e-9)
-    assert found.covariance == pytest.approx(whole.covariance, abs=1e-9)
-
-
-ONE = Problem(("a",)).add("position", "a", [0, 0, 0], std=1.0)
-TWO = Problem(("a", "b")).add("displacement", ("a", "b"), [1, 0, 0], std=1.0)
-FLAT = Problem(("b",), dimension=2).add("position", "b", [0, 0], std=1.0)
-TURNED = Problem(("a",), x0=pose([[0, 0, 0]], [0, 0, 0]), poses=["a"])
-MANY = Problem(("b",)).add("position", "b", np.zeros((2, 1, 3)), std=1.0)
-FREE = Problem(("b", "c")).add("displacement", ("b", "c"), [1, 0, 0], std=1.0)
-
-
-@pytest.mark.parametrize(
-    ("call", "words"),
-    [
-        (lambda s: FixedLag(-1.0), "lag = -1.0"),
-        (lambda s: FixedLag(1.0, passes=0), "passes = 0"),
-        (lambda s: s.update(TWO, {}), "none of 'b'"),
-        (lambda s: s.update(TWO, {"b": 5.0, "c": 5.0}), "'c': 5.0"),
-        (lambda s: s.update(TWO, {"b": -5.0}), "within the lag"),
-        (lambda s: s.update(TWO, {"b": np.nan}), "stamps = nan"),
-        (lambda s: s.update(FLAT, {"b": 0.0}), "dimension 2"),
-        (lambda s: s.update(TURNED, {}), "point or pose"),
-        (lambda s: s.update(MANY, {"b": 0.0}), "batch 2"),
-        (lambda s: s.update(replace(ONE, x0=np.zeros((1, 3)), fixed=("a",)), {}), "fixed"),
-        (lambda s: s.update(ONE.constrain("position", "a", lower=0.0), {}), "constraints"),
-        (lambda s: s.update(FREE, {"b": 0.0, "c": 0.0}), "leave no node free"),
-        (lambda s: s.estimate(["z"]), "'z'"),
-    ],
-)
-def test_a_smoother_names_what_is_wrong(call: Callable, words: str) -> None:
-    smoother = FixedLag(1.0)
-    smoother.update(ONE, {"a": 0.0})
-    with pytest.raises(InputError, match=words):
-        call(smoother)

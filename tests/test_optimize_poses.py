@@ -61,20 +61,6 @@ def _relative(space: Space, truth: np.ndarray, nodes: list[int]) -> np.ndarray:
     return space.join(R[i].T @ (p[j] - p[i]), R[i].T @ R[j])
 
 
-@pytest.mark.parametrize("held", [(), ("A0", "L0")])
-@pytest.mark.parametrize("dimension", [2, 3])
-def test_jacobian_equals_finite_differences(dimension: int, held: tuple[str, ...]) -> None:
-    problem, truth = everything(dimension)
-    problem = co.Problem(problem.names, problem.factors, truth, dimension=dimension, poses=problem.poses, fixed=held)
-    space, x = problem.space, problem.space.retract(truth, np.full((9, problem.space.dof), 0.02) * free(problem))
-    _, J = problem.whiten(x)
-    dense, count = J.toarray(), 9 * space.dof
-    for k in range(count):
-        step = 1e-6 * np.eye(count)[k].reshape(9, -1) * free(problem)
-        up, down = (problem.whiten(space.retract(x, sign * step))[0] for sign in (1.0, -1.0))
-        assert dense[:, k] == pytest.approx((up - down) / 2e-6, abs=1e-6)
-
-
 def free(problem: Problem) -> np.ndarray:
     return np.ones((len(problem.names), problem.space.dof)) if problem.movable is None else problem.movable
 

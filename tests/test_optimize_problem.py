@@ -171,16 +171,18 @@ def test_wrong_input_says_what_to_do(case: str) -> None:
 
 @pytest.mark.parametrize(
     ("arguments", "field"),
-    [((60, 0, 1), "step"), ((-1, 0, 1), "step"), ((5, 0, 9), "length"), ((5, 0, 0), "length"), ((5, 99, 1), "egos")],
+    [
+        ((60, 0, 1), "step"),
+        ((-1, 0, 1), "step"),
+        ((5, 0, 9), "length"),
+        ((5, 0, 0), "length"),
+        ((5, 99, 1), "egos"),
+        ((5, 0, 1, 3), "run"),
+    ],
 )
-def test_a_window_that_does_not_exist(recording: Recording, arguments: tuple[int, int, int], field: str) -> None:
+def test_a_window_that_does_not_exist(recording: Recording, arguments: tuple[int, ...], field: str) -> None:
     with pytest.raises(InputError, match=field):
         Problem.from_window(recording, *arguments)
-
-
-def test_a_run_that_does_not_exist(recording: Recording) -> None:
-    with pytest.raises(InputError, match="run"):
-        Problem.from_snapshot(recording, 5, 0, run=3)
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
@@ -251,15 +253,6 @@ def test_a_point_that_can_turn_around_another_is_free(backend: str) -> None:
         assert solution.unobservable == ("c",)
 
 
-def test_converted_measurement_starts_at_the_truth_without_noise(crossing: Fleet) -> None:
-    silent = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
-    problem = Problem.from_snapshot(observe(crossing, silent, V2X(max_neighbours=5), assumed=S2), 10, 0)
-    truth = crossing.position[10, [crossing.index(n) for n in problem.names]]
-    assert initial_guess(problem)[0] == pytest.approx(truth, abs=1e-5)
-    gap = truth[1:] - truth[0]
-    assert to_vector(problem.factors[1].z) == pytest.approx(gap, abs=1e-12)
-
-
 @pytest.fixture(scope="module")
 def incomplete() -> Recording:
     """Half of the fixes are missing; of the relative measurements some all, some the azimuth, some the range."""
@@ -323,23 +316,6 @@ def test_what_another_realisation_lacks_does_not_show(incomplete: Recording, noi
                 assert batch.x[run] == pytest.approx(alone.x, abs=5e-7)
                 assert batch.covariance[run] == pytest.approx(alone.covariance, rel=1e-7, abs=1e-7)
     assert solved > 3
-
-
-def test_fixes_at_one_hertz_make_a_window() -> None:
-    fleet = load_fleet("town10").between(0, 30)
-    seen = observe(fleet, Sensors.paper_scenario2(), V2X.ideal(4), runs=2, observers=[5])
-    gnss = np.where((np.arange(len(fleet.t)) % 10 == 0)[None, :, None, None], seen.gnss, np.nan)
-    problem = Problem.from_window(replace(seen, gnss=gnss), 25, 5, 12)
-    (fixes,) = (f for f in problem.factors if f.kind == "position")
-    assert len(fixes.nodes) == 5
-    assert solve(problem).status is Status.SOLVED
-
-
-def test_many_single_measurements_are_one_line() -> None:
-    problem = Problem(("a", "b"))
-    for k in range(50):
-        problem = problem.add("range", ("a", "b"), 1.0 + k, std=0.5)
-    assert repr(problem) == "Problem(2 points; 50 range)"
 
 
 @pytest.mark.parametrize("poses", [(), (1,), (0, 2)])

@@ -22,7 +22,6 @@ import coopoc as co
 from coopoc.data.log.check import check
 from coopoc.data.log.picture import draw
 from coopoc.data.log.read import read_log
-from coopoc.pictures import ellipses
 from coopoc.study.plot import legend
 from coopoc.study.publish import views
 from coopoc.study.report import report
@@ -30,6 +29,7 @@ from coopoc.study.results import Results
 from coopoc.study.run import run_study
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.tables import Table
+from coopoc.world.pictures import ellipses
 
 
 @pytest.fixture(scope="module")
@@ -54,30 +54,30 @@ def test_an_ellipse_holds_95_percent() -> None:
 
 def test_a_recording_shows_its_fixes_and_links(seen: tuple[co.Fleet, co.Recording]) -> None:
     _fleet, recording = seen
-    ax = recording.plot(run=1, step=20)
+    ax = co.plot_recording(recording, run=1, step=20)
     np.testing.assert_array_equal(ax.lines[7].get_xydata(), recording.gnss[1, :, 7, :2])
     (lines,) = [c for c in ax.collections if isinstance(c, LineCollection)]
     assert len(lines.get_segments()) == int((recording.links.step == 20).sum()) > 0
     again = Figure().add_subplot()
-    assert recording.plot(again) is again
+    assert co.plot_recording(recording, again) is again
 
 
 def test_a_notebook_shows_a_picture_without_pyplot(seen: tuple[co.Fleet, co.Recording]) -> None:
     """IPython's own formatter makes a PNG of the figure; a plain Figure gives text alone."""
     formatters = pytest.importorskip("IPython.core.formatters")
 
-    shown, _ = formatters.DisplayFormatter().format(seen[1].plot(step=1).figure)
+    shown, _ = formatters.DisplayFormatter().format(co.plot_recording(seen[1], step=1).figure)
     assert shown["image/png"].startswith(b"\x89PNG")
 
 
 def test_a_track_shows_paths_and_truth(seen: tuple[co.Fleet, co.Recording]) -> None:
     fleet, recording = seen
     track = co.JointFilter("nominal")(recording, [24, 3])
-    ax = track.plot(fleet=fleet, every=20)
+    ax = co.plot_track(track, fleet=fleet, every=20)
     np.testing.assert_array_equal(ax.lines[0].get_xydata(), fleet.position[:, 24, :2])
     np.testing.assert_array_equal(ax.lines[3].get_xydata(), track.x[0, :, 1, :2])
     assert len(ax.patches) == 2 * 3
-    assert len(co.GNSS()(recording, [24]).plot().patches) in (0, 60)
+    assert len(co.plot_track(co.GNSS()(recording, [24])).patches) in (0, 60)
 
 
 @pytest.mark.parametrize(
@@ -92,7 +92,7 @@ def test_what_cannot_be_drawn_is_named(
     seen: tuple[co.Fleet, co.Recording], options: dict[str, object], message: str
 ) -> None:
     with pytest.raises(co.InputError, match=message):
-        seen[1].plot(**options)  # type: ignore[arg-type]
+        co.plot_recording(seen[1], **options)  # type: ignore[arg-type]
 
 
 NAMES = {
@@ -145,7 +145,7 @@ def test_pictures_show_names_as_text(kind: str, tmp_path: Path) -> None:
     with (tmp_path / "log.csv").open("w", newline="") as file:
         csv.writer(file).writerows([("t", "vehicle", "kind", "value"), *rows])
     log = read_log(tmp_path / "log.csv")
-    figures = [co.Kalman()(rec, [0]).plot(fleet=fleet).figure, rec.plot().figure, studied]
+    figures = [co.plot_track(co.Kalman()(rec, [0]), fleet=fleet).figure, co.plot_recording(rec).figure, studied]
     texts = [*map(words, figures), draw(check(log), tmp_path / "log.svg").read_text()]
     shown = re.sub(r"[\s_]+", "", "".join(c for c in name if c.isalnum() or c in " _="))[:6]
     for text in texts:
@@ -188,8 +188,10 @@ def test_pages_and_tables_show_names_as_text(tmp_path: Path) -> None:
 def test_a_solution_shows_nodes_factors_and_headings(seen: tuple[co.Fleet, co.Recording]) -> None:
     problem = co.Problem.from_snapshot(seen[1], step=10, ego=24)
     solution = co.solve(problem)
-    ax = solution.plot(problem=problem)
+    ax = co.plot_solution(solution, problem=problem)
     np.testing.assert_array_equal(ax.lines[0].get_xydata(), solution.position[:, :2])
     assert [text.get_text() for text in ax.texts] == list(solution.names)
     with pytest.raises(co.InputError, match="must be the one that was solved"):
-        solution.plot(problem=co.Problem(("a", "b")).add("position", ["a", "b"], np.zeros((2, 3)), std=1.0))
+        co.plot_solution(
+            solution, problem=co.Problem(("a", "b")).add("position", ["a", "b"], np.zeros((2, 3)), std=1.0)
+        )

@@ -10,8 +10,7 @@ import pytest
 
 from coopoc import V2X, Fleet, InputError, JointFilter, MovingHorizon, Recording, Sensors, observe
 from coopoc.world.exchange import exchange
-from coopoc.world.inbox import inbox
-from coopoc.world.schedules import within_cap
+from coopoc.world.inbox import inbox, within_cap
 from coopoc.world.v2x import FIX_AND_VELOCITY, Message, Schedule
 
 S2 = Sensors.paper_scenario2()

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import winding
 from oracles import solo as oracle
 from scipy import stats
 
@@ -15,18 +16,12 @@ from coopoc.evaluate.metrics import nees, nees_inside, rt_le
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import ASSUMED, AdaptiveKalman, solo_filter
 
+DRIVE = winding(900, 10.0, 7.0)
 DEFAULT, FOREVER = AdaptiveKalman(), AdaptiveKalman(window=np.inf)
 
 
-def drive(steps: int = 900) -> Fleet:
-    """A sinuous drive at 10 m/s with x_t = x_{t-1} + dt u_t."""
-    t = np.arange(steps) / 10
-    velocity = 10 * np.stack([np.cos(t / 7), np.sin(t / 7), 0.05 * np.cos(t / 3)], axis=-1)[:, None]
-    return Fleet(("a",), t, np.cumsum(0.1 * velocity, axis=0), velocity)
-
-
 def seen(std: tuple[float, float, float], runs: int, seed: int = 0, steps: int = 900) -> Recording:
-    return observe(drive(steps), Sensors(gnss_std=std), V2X(max_neighbours=0), runs=runs, seed=seed)
+    return observe(winding(steps, 10.0, 7.0), Sensors(gnss_std=std), V2X(max_neighbours=0), runs=runs, seed=seed)
 
 
 def test_the_estimate_converges_within_its_chi_square_error() -> None:
@@ -70,9 +65,9 @@ def test_one_set_of_defaults_is_as_good_as_knowing_the_noise(std: float) -> None
     """Within 1 % of the filter that knows the variances, and its NEES in the band, at 1.5 and 3.5 m."""
     recording = seen((std,) * 3, runs=60)
     track, known = DEFAULT(recording), Kalman("nominal")(recording)
-    assert rt_le(track, drive()).mean() < 1.01 * rt_le(known, drive()).mean()
-    assert nees_inside(track, drive())[0] >= 0.95
-    assert 2.7 < nees(track, drive()).mean() < 3.3
+    assert rt_le(track, DRIVE).mean() < 1.01 * rt_le(known, DRIVE).mean()
+    assert nees_inside(track, DRIVE)[0] >= 0.95
+    assert 2.7 < nees(track, DRIVE).mean() < 3.3
     assert track.notes == ("assumes velocity noise of 10 % of each axis, at least 0.02 m/s",)
 
 

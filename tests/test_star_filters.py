@@ -26,11 +26,11 @@ from coopoc import (
     stars,
 )
 from coopoc.kernels.solo import FixNoise
+from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.kernels.stars.relative import angle
 from coopoc.methods.drift_filter import DriftFilter
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.noise_model import resolve
-from coopoc.methods.star import ESTIMATE_GROWTH
 from coopoc.methods.track import Method
 from coopoc.world.links import spherical, to_vector, vector_cov
 
@@ -159,13 +159,15 @@ def test_the_filter_is_its_oracle(crossing: Fleet, pair: Any, channel: str) -> N
 def test_it_is_with_missing_fixes_and_measurements(
     crossing: Fleet, pair: Any, damage: Callable[..., Recording]
 ) -> None:
+    """A missing component is no row of the dense oracle; in the kernel of covariance intersection its deviation of 1e3
+    leaves it 1e-8 of the information of others."""
     sensors = DRIFTING if isinstance(pair[0], DriftFilter) else S2
-    recording = observe(crossing, sensors, V2X(max_neighbours=4, loss=0.2), runs=2, observers=[0])
-    recording = damage(recording)
-    if damage is partial and isinstance(pair[0], MSMV | CovarianceIntersection | LKFSA):
+    recording = damage(observe(gappy(crossing), sensors, V2X(4, loss=0.2), runs=2, observers=[0]))
+    if damage is partial and isinstance(pair[0], MSMV | LKFSA):
         assert np.isfinite(pair[0](recording, [0]).x).all()
         return
-    assert_is_the_oracle(*pair, recording, 1e-6)
+    coarse = damage is partial and isinstance(pair[0], CovarianceIntersection)
+    assert_is_the_oracle(*pair, recording, 1e-4 if coarse else 1e-6)
 
 
 @pytest.mark.parametrize("runs", [1, 3, 5])

@@ -6,6 +6,7 @@ import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,12 +15,12 @@ import pytest
 from conftest import crossing_fleet
 from filterpy.kalman import KalmanFilter
 
-from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, observe
+from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, StarStream, observe
 from coopoc.arrays import Bools, Floats
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF
 from coopoc.methods.kalman import AdaptiveKalman
+from coopoc.methods.motion_history import MotionHistory
 from coopoc.methods.star_stream import RelativeMeasurement
-from coopoc.methods.stream import MotionHistory
 from coopoc.world.inbox import Inbox, inbox
 from coopoc.world.links import Links
 from coopoc.world.recording import Recording
@@ -39,8 +40,8 @@ SOLO: dict[str, tuple[Any, Callable[..., Any]]] = {
 STARTS: dict[str, Callable[..., Any]] = {
     **{name: start for name, (_, start) in SOLO.items()},
     "net": lambda x0=None: LearnedGain(NET).start(x0),
-    "joint": JointFilter(NoiseModel.nominal(S2)).start,
-    "edge": JointFilter(FITTED, exact=False).start,
+    "joint": partial(StarStream, JointFilter(NoiseModel.nominal(S2))),
+    "edge": partial(StarStream, JointFilter(FITTED, exact=False)),
 }
 U, Z = np.array([9.0, -2.0, 0.1]), np.array([30.0, 20.0, 1.0])
 
@@ -52,24 +53,16 @@ def play(stream: Any, recording: Recording, ego: int, run: int, first: int = 0) 
     return np.stack([x for x, _ in found]), np.stack([cov for _, cov in found])
 
 
+@pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("name", SOLO)
-def test_step_by_step_is_the_track(name: str, crossing: Fleet) -> None:
+def test_step_by_step_is_the_track(name: str, known: bool, crossing: Fleet) -> None:
+    """From the first fix, and from a known start, whose own step is no step of the stream."""
     method, start = SOLO[name]
-    recording = observe(crossing, S2, V2X(max_neighbours=0), runs=2)
-    track = method(recording, [3])
-    x, cov = play(start(), recording, 3, run=1)
-    np.testing.assert_allclose(x, track.x[1, :, 0], atol=1e-12)
-    np.testing.assert_allclose(cov, track.covariance[1, :, 0], atol=1e-12)
-
-
-@pytest.mark.parametrize("name", SOLO)
-def test_a_known_start_is_the_track_from_there(name: str, crossing: Fleet) -> None:
-    method, start = SOLO[name]
-    recording, x0 = observe(crossing, S2, V2X(max_neighbours=0)), crossing.position[0, 3]
-    track = replace(method, x0=x0[None])(recording, [3])
-    x, cov = play(start(x0), recording, 3, run=0, first=1)
-    np.testing.assert_allclose(x, track.x[0, 1:, 0], atol=1e-12)
-    np.testing.assert_allclose(cov, track.covariance[0, 1:, 0], atol=1e-12)
+    recording, x0 = observe(crossing, S2, V2X(max_neighbours=0), runs=2), crossing.position[0, 3]
+    track = (replace(method, x0=x0[None]) if known else method)(recording, [3])
+    x, cov = play(start(x0) if known else start(), recording, 3, run=1, first=int(known))
+    np.testing.assert_allclose(x, track.x[1, known:, 0], atol=1e-12)
+    np.testing.assert_allclose(cov, track.covariance[1, known:, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize("known", [False, True])
@@ -127,7 +120,7 @@ def test_a_star_step_by_step_is_the_track(exact: bool, channel: str, crossing: F
     assert growing or len(set(recording.neighbours(0).tolist())) > 2
     method = JointFilter("nominal", exact=exact)
     track, box = method(recording, [0]), inbox(recording, 0, method.message)
-    stream = JointFilter(NoiseModel.nominal(recording.sensors), exact).start(max_age=recording.v2x.max_age)
+    stream = StarStream(JointFilter(NoiseModel.nominal(recording.sensors), exact), max_age=recording.v2x.max_age)
     for t in range(len(recording.t)):
         seen = relative_measurements(recording, box, 1, t)
         x, cov = stream.step(recording.gnss[1, t, 0], recording.velocity[1, t, 0], recording.dt, neighbours=seen)
@@ -146,11 +139,13 @@ def peer(x: Floats, known: NoiseModel) -> Any:
     return found
 
 
-@pytest.mark.parametrize(("method", "near"), [(Kalman(FITTED), 1e-9), (JointFilter(FITTED), 1e-4)])
-def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(method: Any, near: float) -> None:
+@pytest.mark.parametrize(
+    ("start", "near"), [(Kalman(FITTED).start, 1e-9), (partial(StarStream, JointFilter(FITTED)), 1e-4)]
+)
+def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(start: Any, near: float) -> None:
     """filterpy gets a late fix moved by, and with the variance of, the motion since, from the sum of all steps. The
     star's flat prior of 1e6 m^2 weighs 1e-5 of a fix."""
-    draw, stream = np.random.default_rng(0), method.start(interval=0.1)
+    draw, stream = np.random.default_rng(0), start(interval=0.1)
     stream.step(Z, U, 0.1)
     theirs, t, path = peer(Z, FITTED), [0.0, 0.1], [0 * U, 0.1 * U]
     for k in range(200):
@@ -303,8 +298,8 @@ def test_bad_starts_are_named() -> None:
         "x0": lambda: Kalman("identity").start([0.0, 0.0]),
         "interval": lambda: Kalman("identity").start(interval=0.0),
         "history": lambda: Kalman("identity").start(history=-1.0),
-        "max_age": lambda: JointFilter("identity").start(max_age=np.nan),
-        "noise_model": lambda: JointFilter("nominal").start(),
+        "max_age": lambda: StarStream(JointFilter("identity"), max_age=np.nan),
+        "noise_model": lambda: StarStream(JointFilter("nominal")),
     }.items():
         with pytest.raises(InputError, match=f"^{field} = "):
             make()
@@ -332,7 +327,7 @@ def test_the_replay_runs(log: str, request: pytest.FixtureRequest) -> None:
 
 def test_a_range_of_zero_is_refused_and_forgotten(crossing: Fleet) -> None:
     """No direction is seen in one place: a filter of a star gave NaN from there on."""
-    stream = JointFilter(FITTED).start()
+    stream = StarStream(JointFilter(FITTED))
     stream.step([0, 0, 0], [1, 0, 0], 0.1)
     with pytest.raises(InputError, match="the range first and > 0"):
         stream.step([0, 0, 0], [1, 0, 0], 0.1, [RelativeMeasurement("b", [0.0, 0.1, 1.5], [1, 0, 0], [1, 0, 0])])

@@ -5,7 +5,6 @@ from __future__ import annotations
 import subprocess
 import sys
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -157,16 +156,9 @@ def cdf(net: Sequence[float], runs: int = 4, **at: object) -> Results:
     ],
 )
 def test_a_verdict_needs_runs_and_training_seeds(net: tuple[float, ...], runs: int, words: str) -> None:
-    found = error_cdf.STUDY.found(cdf(net, runs))
+    found = error_cdf.STUDY.answers(cdf(net, runs))
     assert list(found) == ["scenario 1"]
     assert words in found["scenario 1"]
-
-
-def test_nothing_is_claimed_where_the_interval_is_not_finite() -> None:
-    results = cdf((0.1, 0.1))
-    one = replace(results, frame=results.frame[(results.frame["ego"] == 0) & (results.frame["run"] == 0)])
-    found = error_cdf.STUDY.found(one)
-    assert "cannot be judged against the fitted KF: too few seeds, egos or runs" in found["scenario 1"]
 
 
 def plant(folder: Path, name: str, p: Params, rounds: int = 2) -> Checkpoint:

@@ -20,8 +20,8 @@ from coopoc.studies import scene, survey
 from coopoc.study import numbers
 from coopoc.study.report import report
 from coopoc.study.tables import Table
+from coopoc.world.channels import CHANNELS
 from coopoc.world.sensing import find_links
-from coopoc.world.v2x import CHANNELS
 
 QUICK = {"runs": 2, "egos": "2", "max_neighbours": "0,2", "method": "kalman,joint,split-ci,bound"}
 SIZES = ("payload_bytes_per_second", "bytes_per_second")
@@ -120,7 +120,7 @@ def test_schedules_are_compared_on_the_same_egos_and_runs(tight: Results, short_
     for gap, wanted in zip(found[2:], gaps, strict=True):
         assert [gap.mean, gap.low, gap.high] == pytest.approx([wanted.mean, wanted.low, wanted.high])
         assert gap.mean != 0.0
-    said = study.STUDY.found(tight)["schedules, joint"]
+    said = study.STUDY.answers(tight)["schedules, joint"]
     for schedule, error in zip(study.SCHEDULES, errors, strict=True):
         assert f"{schedule} {error.mean():.3g} m" in said
 

@@ -1,4 +1,4 @@
-"""Studies of choices on few cells: backends, windows, aggregation rules, any methods side by side."""
+"""Studies of choices on few cells: aggregation rules, any methods side by side."""
 
 from __future__ import annotations
 
@@ -13,63 +13,14 @@ import torch
 import coopoc as co
 from coopoc.errors import InputError
 from coopoc.evaluate.metrics import rt_le
-from coopoc.fleets import load_fleet
 from coopoc.learned import GainNet
 from coopoc.learned.federation.federate import federate
-from coopoc.methods.catalogue import METHODS
-from coopoc.studies import ablation, aggregation, backends, scene
+from coopoc.studies import aggregation
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
-from coopoc.world.sensing import observe
 
 TWO = {"egos": "2", "runs": 2}
-
-
-def test_a_choice_at_its_default_is_the_method_of_that_name(tmp_path: Path, short_town: str) -> None:
-    chosen = {
-        **TWO,
-        "data": short_town,
-        "method": "gbp,joint,bound",
-        "value": "0,1,3",
-        "choice": "rounds,exact step,none",
-    }
-    results = run_study("ablation", tmp_path, settings=chosen, progress=False)
-    p = {**ablation.STUDY.settings, **TWO, "data": short_town}
-    seen = observe(load_fleet(short_town), scene.sensors(p), scene.channel(p), runs=2, seed=0)
-    same = {"gbp": ablation.at("gbp", "rounds", 3), "lkf-sa-edge": ablation.at("joint", "exact step", 0)}
-    for name, where in same.items():
-        egos = scene.egos(short_town, "2")
-        track = METHODS[name]("nominal")(seen, egos)
-        distance = np.linalg.norm(track.x - load_fleet(short_town).position[None][:, :, list(track.egos)], axis=-1)
-        expected = np.sqrt((distance**2).mean(axis=1)).T
-        assert results.values("rt_le_m", where) == pytest.approx(expected, rel=1e-12)
-    table = (tmp_path / "ablation" / "tables" / "choices.md").read_text()
-    assert "| Joint filter       | exact step |       1 |" in table
-    assert "| default" in table
-
-
-@pytest.mark.slow
-def test_backends_are_held_against_scipy(tmp_path: Path, short_town: str) -> None:
-    few = {"egos": "1", "samples": 2, "data": short_town, "max_neighbours": "2"}
-    results = run_study("backends", tmp_path, settings=few, progress=False)
-    assert results.failed == 0
-    assert set(results.frame["method"]) == set(backends.BACKENDS)
-    assert (results.frame["same"] == 1.0).all()
-    assert (results.frame["gap_m"] > 0).any()  # the referee is somebody else
-    found = backends.STUDY.found(results)
-    assert list(found) == ["minima"]
-    assert "100.0 % end where SciPy's least squares does, and 0 in a worse minimum." in found["minima"]
-
-
-def test_the_referee_solves_a_linear_problem_as_lstsq_does(short_town: str) -> None:
-    p = {**backends.STUDY.settings, "data": short_town, "max_neighbours": 6, "runs": 1}
-    seen = scene.recording(p)
-    problem = backends.PROBLEMS["converted"](seen, 40, scene.egos(short_town, "1")[0], 0)
-    zero = np.zeros((len(problem.names), 3))
-    residual, jacobian = problem.whiten(zero)
-    closed = np.linalg.lstsq(jacobian.toarray(), -residual, rcond=None)[0].reshape(zero.shape)
-    assert backends.referee(problem) == pytest.approx(closed, abs=1e-6)
 
 
 @pytest.mark.slow
@@ -196,6 +147,6 @@ def test_a_rule_is_better_only_if_all_training_seeds_agree(gaps: tuple[float, ..
     rows += [{**row, "method": "median", "rt_le_m": row["rt_le_m"] + gaps[row["train_seed"]]} for row in rows]
     axes, settings = ("condition", "method", "scenario"), dict(aggregation.STUDY.settings)
     results = Results("aggregation", "", axes, settings, pd.DataFrame(rows), pd.DataFrame(), 0, {})
-    found = aggregation.STUDY.found(results)
+    found = aggregation.STUDY.answers(results)
     assert list(found) == ["scenario 1, iid"]
     assert words in found["scenario 1, iid"]

@@ -1,6 +1,5 @@
 """Dask: a real scheduler and worker processes on loopback; tables are those of one process, whatever happens."""
 
-import importlib
 import json
 import os
 import signal
@@ -12,6 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from small_runs import ENV, numbers, shown, start
 
 from coopoc.errors import InputError
 from coopoc.study.compute import WorkerDiedError
@@ -22,15 +22,7 @@ pytestmark = pytest.mark.slow
 
 pytest.importorskip("distributed")
 
-DISTRIBUTION = Path(__file__).parent / "distribution"
-ENV = {**os.environ, "PYTHONPATH": str(DISTRIBUTION)}
 Process = "subprocess.Popen[bytes]"
-
-
-@pytest.fixture
-def study(monkeypatch: pytest.MonkeyPatch) -> Study:
-    monkeypatch.syspath_prepend(str(DISTRIBUTION))
-    return importlib.import_module("small_study").STUDY
 
 
 @pytest.fixture(scope="module")
@@ -77,24 +69,12 @@ def wait_for(happened: Callable[[], object], seconds: float = 40.0) -> None:
     raise AssertionError(f"did not happen in {seconds:g} s")
 
 
-def tables(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for kind in ("tables", "figures") for path in (folder / kind).iterdir()}
-
-
 def test_a_worker_that_is_killed_in_mid_run_changes_no_table(
     study: Study, worker: Callable[..., Process], scheduler: str, tmp_path: Path
 ) -> None:
     whole = run_study(study, tmp_path / "whole", progress=False)
     first, _ = worker(), worker()
-    words = ["run", "small", "--out", str(tmp_path), "--cluster", scheduler, "--set", "pause=0.3"]
-    driver = subprocess.Popen(
-        [sys.executable, "-m", "coopoc.cli", *words],
-        cwd=tmp_path,
-        env=ENV,
-        text=True,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-    )
+    driver = start(tmp_path, "--cluster", scheduler, "--set", "pause=0.3")
     folder = tmp_path / "small"
     wait_for(lambda: len(list(folder.glob("cells/*.parquet"))) >= 2)
     os.kill(first.pid, signal.SIGKILL)
@@ -104,10 +84,9 @@ def test_a_worker_that_is_killed_in_mid_run_changes_no_table(
     assert left >= 2
     assert "| Neighbours K" in stdout
     assert "9/9" in stderr
-    assert tables(folder) == tables(tmp_path / "whole/small")
+    assert shown(folder) == shown(tmp_path / "whole/small")
     found = pd.read_parquet(folder / "results.parquet")
-    other = ["cell", *(name for name in found if name.endswith("seconds"))]  # `pause` is in the names of cells, too
-    pd.testing.assert_frame_equal(found.drop(columns=other), whole.frame.drop(columns=other), check_exact=True)
+    pd.testing.assert_frame_equal(numbers(found), numbers(whole.frame), check_exact=True)
 
 
 def test_failures_come_back_as_rows_and_a_killer_ends_the_run(

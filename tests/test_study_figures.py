@@ -7,6 +7,7 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from coopoc.studies import error_cdf
 from coopoc.study import figures
 from coopoc.study.figures import Plot
 from coopoc.study.results import Results
@@ -52,15 +53,14 @@ LINES = [{"method": "joint"}, {"method": "bound"}]
 def all_plots(results: Results) -> dict[str, Callable[[], Plot]]:
     return {
         "sweep": lambda: figures.sweep(results, "max_neighbours", log=True),
-        "facets": lambda: figures.sweep(results, "max_neighbours", facet="noise_model"),
-        "pareto": lambda: figures.pareto(results),
+        "pareto": lambda: figures.pareto(results, "c"),
         "curves": lambda: figures.curves(results, [Panel({k: {"max_neighbours": k} for k in (0, 2)})], LINES, "c"),
         "multiples": lambda: figures.multiples({("joint", "fitted"): {"a": [0.9, 1.1]}}, "c"),
-        "cdf": lambda: figures.cdf(results, where={"max_neighbours": 2}),
+        "cdf": lambda: error_cdf.cdf(results, "c", where={"max_neighbours": 2}),
     }
 
 
-@pytest.mark.parametrize("name", ["sweep", "facets", "pareto", "cdf", "curves", "multiples"])
+@pytest.mark.parametrize("name", ["sweep", "pareto", "cdf", "curves", "multiples"])
 def test_the_same_numbers_give_the_same_bytes(results: Results, tmp_path: Path, name: str) -> None:
     make = all_plots(results)[name]
     assert make().save(tmp_path / "a") == make().save(tmp_path / "b") != ""
@@ -90,24 +90,8 @@ def test_a_sweep_draws_the_means_in_the_method_colour(results: Results) -> None:
     assert len(axes.collections) == 3
 
 
-def test_facets_are_panels_of_one_scale_and_the_caption_names_the_selection(results: Results) -> None:
-    where = {"noise_model": ["identity", "fitted"], "method": "kalman"}
-    plot = figures.sweep(results, "max_neighbours", where=where, facet="noise_model")
-    identity, fitted = plot.figure.axes
-    assert {identity.get_title(), fitted.get_title()} == {"identity", "fitted"}
-    for axes in (identity, fitted):
-        expected = (
-            results.select(**{**where, "noise_model": axes.get_title()}).groupby("max_neighbours")["rt_le_m"].mean()
-        )
-        (line,) = axes.lines
-        np.testing.assert_allclose(line.get_ydata(), expected.to_numpy())
-    assert identity.get_ylim() == fitted.get_ylim()
-    assert [text.get_text() for text in fitted.get_legend().get_texts()] == ["KF"]
-    assert "at Noise model = identity or fitted, Method = KF." in plot.caption
-
-
 def test_a_cdf_marks_the_mean_of_the_maxima(results: Results) -> None:
-    axes = figures.cdf(results, where={"max_neighbours": 2, "method": "joint"}).figure.axes[0]
+    axes = error_cdf.cdf(results, "c", where={"max_neighbours": 2, "method": "joint"}).figure.axes[0]
     curve, mark = axes.lines
     quantiles = results.select(max_neighbours=2, method="joint")["error_quantiles_m"]
     assert float(mark.get_xdata()[0]) == pytest.approx(np.mean([q[-1] for q in quantiles]))
@@ -121,7 +105,7 @@ def test_a_cdf_marks_the_mean_of_the_maxima(results: Results) -> None:
 @pytest.mark.parametrize("suffix", ["svg", "png"])
 def test_no_letter_of_the_legend_is_cut_off(results: Results, tmp_path: Path, suffix: str) -> None:
     """Letters are hinted wider at the 72 dpi of PDF and SVG than at others, and the legend must fit in all of them."""
-    plot = figures.cdf(results, where={"max_neighbours": 2})
+    plot = error_cdf.cdf(results, "c", where={"max_neighbours": 2})
     plot.save(tmp_path / "a")
     plot.figure.set_dpi({"svg": 72, "png": 200}[suffix])
     plot.figure.draw_without_rendering()
@@ -129,7 +113,7 @@ def test_no_letter_of_the_legend_is_cut_off(results: Results, tmp_path: Path, su
 
 
 def test_a_front_joins_what_no_cheaper_method_beats(results: Results) -> None:
-    axes = figures.pareto(results, where={"method": ["joint", "gnss"]}).figure.axes[0]
+    axes = figures.pareto(results, "c", where={"method": ["joint", "gnss"]}).figure.axes[0]
     level, marks, front = axes.lines
     means = (
         results.frame.query("method == 'joint' and max_neighbours > 0").groupby("bytes_per_second")["rt_le_m"].mean()

@@ -1,40 +1,20 @@
 """What may happen to a run: kills at any moment, a full disk, a read-only one, two runners. No cell is lost."""
 
-import importlib
 import multiprocessing
-import os
 import shutil
 import subprocess
-import sys
 import time
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from small_runs import COMMAND, ENV, files, numbers, shown, start
 
 from coopoc.errors import InputError
 from coopoc.study import store
 from coopoc.study.run import plan, run_study
 from coopoc.study.study import Params, Row, Study
-
-DISTRIBUTION = Path(__file__).parent / "distribution"
-ENV = {**os.environ, "PYTHONPATH": str(DISTRIBUTION)}
-COMMAND = [sys.executable, "-m", "coopoc.cli", "run", "small"]
-
-
-@pytest.fixture
-def study(monkeypatch: pytest.MonkeyPatch) -> Study:
-    monkeypatch.syspath_prepend(str(DISTRIBUTION))
-    return importlib.import_module("small_study").STUDY
-
-
-def views(folder: Path) -> dict[str, bytes]:
-    return {path.name: path.read_bytes() for kind in ("tables", "figures") for path in (folder / kind).iterdir()}
-
-
-def cells(folder: Path) -> dict[str, tuple[int, bytes]]:
-    return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in folder.glob("cells/*.parquet")}
 
 
 @pytest.mark.slow
@@ -54,24 +34,23 @@ def test_ten_kills_at_random_moments_change_nothing(study: Study, tmp_path: Path
         time.sleep(moment)
         process.kill()
         process.join()
-        after = cells(folder)
+        after = files(folder)
         assert {name: after[name] for name in before} == before
         assert all(store.load(folder, name.removesuffix(".parquet")) is not None for name in after)
         before = after
     assert len(before) >= 10
     resumed = run_study(study, tmp_path, settings=settings, progress=False)
-    after = cells(folder)
+    after = files(folder)
     assert {name: after[name] for name in before} == before
     assert len(after) == 30
-    timings = [name for name in whole.frame if name.endswith("seconds")]
-    assert resumed.frame.drop(columns=timings).equals(whole.frame.drop(columns=timings))
-    assert views(folder) == views(tmp_path / "whole/small")
+    assert numbers(resumed.frame).equals(numbers(whole.frame))
+    assert shown(folder) == shown(tmp_path / "whole/small")
     assert not list(folder.rglob(".*.part"))
 
 
 def test_a_kill_while_tables_and_figures_are_written_is_mended_by_the_next_run(study: Study, tmp_path: Path) -> None:
     run_study(study, tmp_path, progress=False)
-    whole = views(tmp_path / "small")
+    whole = shown(tmp_path / "small")
     process = multiprocessing.get_context("forkserver").Process(
         target=run_study, args=("small", tmp_path, 1, {}, False)
     )
@@ -83,13 +62,12 @@ def test_a_kill_while_tables_and_figures_are_written_is_mended_by_the_next_run(s
     process.join()
     (tmp_path / "small/views.json").write_text("")
     run_study(study, tmp_path, progress=False)
-    assert views(tmp_path / "small") == whole
+    assert shown(tmp_path / "small") == whole
 
 
 @pytest.mark.slow
 def test_two_runners_that_start_together(study: Study, tmp_path: Path) -> None:
-    words = [*COMMAND, "--out", str(tmp_path)]
-    both = [subprocess.Popen(words, env=ENV, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) for _ in "ab"]
+    both = [start(tmp_path) for _ in "ab"]
     ends = [(process, *process.communicate(timeout=60)) for process in both]
     statuses = sorted(process.returncode for process, _, _ in ends)
     assert statuses in ([0, 2], [0, 0]), ends
@@ -141,12 +119,12 @@ def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterward
     assert "No space left on device. Finished cells are kept: make room and repeat: 'disk/small/cells/" in message
     assert "coopoc: out = disk/small: cannot be written (Read-only file system). Choose another --out." in said
     assert any(line.startswith("| Neighbours K") for line in said)
-    kept, after = cells(tmp_path / "kept"), cells(tmp_path / "small")
+    kept, after = files(tmp_path / "kept"), files(tmp_path / "small")
     assert 0 < len(kept) < 9
     assert {name: after[name] for name in kept} == kept
     assert not list((tmp_path / "small").glob("failed/*"))
     run_study(study, tmp_path / "whole", progress=False)
-    assert views(tmp_path / "small") == views(tmp_path / "whole/small")
+    assert shown(tmp_path / "small") == shown(tmp_path / "whole/small")
 
 
 def test_cells_that_vanish_during_a_run_end_it_with_their_number_and_no_tables(study: Study, tmp_path: Path) -> None:

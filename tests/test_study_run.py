@@ -1,98 +1,18 @@
 """The engine: resume, failures, processes. The study is a real one that is installed as a third party's."""
 
-import importlib
-import os
-import signal
-import subprocess
-import sys
-import time
 from dataclasses import replace
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from small_runs import files, numbers
 
 from coopoc.errors import InputError
 from coopoc.study import store
 from coopoc.study.compute import WorkerDiedError, schedule
 from coopoc.study.publish import views
-from coopoc.study.results import Results
 from coopoc.study.run import plan, run_study
 from coopoc.study.study import Cell, Study
-
-DISTRIBUTION = Path(__file__).parent / "distribution"
-
-
-@pytest.fixture
-def study(monkeypatch: pytest.MonkeyPatch) -> Study:
-    monkeypatch.syspath_prepend(str(DISTRIBUTION))
-    return importlib.import_module("small_study").STUDY
-
-
-def numbers(frame: pd.DataFrame) -> pd.DataFrame:
-    return frame[[c for c in frame if not c.endswith("seconds")]]
-
-
-def files(folder: Path, kind: str = "cells") -> dict[str, tuple[int, bytes]]:
-    return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in (folder / kind).iterdir()}
-
-
-def command(out: Path, *settings: str, jobs: int = 1) -> list[str]:
-    return [
-        sys.executable,
-        "-m",
-        "coopoc.cli",
-        "run",
-        "small",
-        "--out",
-        str(out),
-        "--jobs",
-        str(jobs),
-        "--set",
-        "pause=0.12",
-        *settings,
-    ]
-
-
-def start(out: Path, jobs: int) -> "subprocess.Popen[bytes]":
-    env = {**os.environ, "PYTHONPATH": str(DISTRIBUTION)}
-    return subprocess.Popen(
-        command(out, jobs=jobs),
-        env=env,
-        stdout=subprocess.PIPE,
-        stderr=subprocess.PIPE,
-        cwd=out,
-        start_new_session=True,
-    )
-
-
-def wait_for(folder: Path, count: int) -> None:
-    for _ in range(5000):
-        if folder.is_dir() and len(list(folder.glob("*.parquet"))) >= count:
-            return
-        time.sleep(0.02)
-    raise AssertionError("no cell was finished in 100 s")
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("jobs", [1, 2])
-def test_a_killed_run_resumes_to_the_last_digit(study: Study, tmp_path: Path, jobs: int) -> None:
-    whole = run_study(study, tmp_path / "whole", settings={"pause": 0.12}, progress=False)
-    process = start(tmp_path, jobs)
-    wait_for(tmp_path / "small" / "cells", 2)
-    os.kill(process.pid, signal.SIGKILL)
-    process.communicate()
-    time.sleep(0.8)  # orphaned workers leave within half a second
-    before = files(tmp_path / "small")
-    finished = {name: content for name, content in before.items() if name.endswith(".parquet")}
-    assert 2 <= len(finished) < 9
-    resumed = run_study(study, tmp_path, settings={"pause": 0.12}, progress=False)
-    after = files(tmp_path / "small")
-    assert {name: after[name] for name in finished} == finished
-    pd.testing.assert_frame_equal(numbers(resumed.frame), numbers(whole.frame), check_exact=True)
-    for suffix in ("md", "csv", "tex", "html"):
-        path = Path("small") / "tables" / f"rt_le.{suffix}"
-        assert (tmp_path / path).read_bytes() == (tmp_path / "whole" / path).read_bytes()
 
 
 def test_two_processes_compute_what_one_computes(study: Study, tmp_path: Path) -> None:
@@ -240,30 +160,6 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
         store.write(path, broken)
     assert [p.name for p in tmp_path.iterdir()] == ["kept"]
     assert path.read_text() == "old"
-
-
-@pytest.mark.slow
-def test_two_runs_do_not_share_a_folder(study: Study, tmp_path: Path) -> None:
-    """The second would swap the manifest, and the first would publish the second's cells as its own."""
-    first = start(tmp_path, 1)
-    wait_for(tmp_path / "small" / "cells", 1)
-    with pytest.raises(InputError, match=r"small: is in use by another run\. Wait until it ends"):
-        run_study(study, tmp_path, settings={"runs": 2}, progress=False)
-    first.communicate()
-    assert first.returncode == 0
-    assert Results.load(tmp_path / "small").settings["runs"] == 4
-    assert run_study(study, tmp_path, settings={"runs": 2}, progress=False).failed == 0
-
-
-@pytest.mark.parametrize("name", ["manifest.json", "views.json"])
-def test_a_damaged_description_is_named_and_mended_by_the_next_run(study: Study, tmp_path: Path, name: str) -> None:
-    run_study(study, tmp_path, progress=False)
-    before = files(tmp_path / "small")
-    (tmp_path / "small" / name).write_text('{"half": ')
-    with pytest.raises(InputError, match=rf"holds a damaged {name} .*Repeat coopoc run"):
-        views(tmp_path / "small") if name == "views.json" else Results.load(tmp_path / "small")
-    assert run_study(study, tmp_path, progress=False).failed == 0
-    assert files(tmp_path / "small") == before
 
 
 def test_views_of_an_earlier_run_do_not_stay_among_those_of_this_one(study: Study, tmp_path: Path) -> None:

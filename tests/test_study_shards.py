@@ -1,13 +1,12 @@
 """Shards of a study: one folder or several, one after another or all at once; the tables are those of one run."""
 
-import importlib
-import os
 import subprocess
 import sys
 from pathlib import Path
 
 import pandas as pd
 import pytest
+from small_runs import ENV, files, numbers, shown, start
 
 from coopoc.errors import InputError
 from coopoc.study import store
@@ -18,35 +17,12 @@ from coopoc.study.results import Results
 from coopoc.study.run import plan, run_study
 from coopoc.study.study import Cell, Study
 
-DISTRIBUTION = Path(__file__).parent / "distribution"
-ENV = {**os.environ, "PYTHONPATH": str(DISTRIBUTION)}
 FORMS = ("md", "csv", "tex", "html")
-
-
-@pytest.fixture
-def study(monkeypatch: pytest.MonkeyPatch) -> Study:
-    monkeypatch.syspath_prepend(str(DISTRIBUTION))
-    return importlib.import_module("small_study").STUDY
-
-
-def tables(folder: Path) -> dict[str, bytes]:
-    """Every table and figure, byte for byte."""
-    views = [*(folder / "tables").iterdir(), *(folder / "figures").iterdir()]
-    return {path.name: path.read_bytes() for path in views}
-
-
-def cells(folder: Path) -> dict[str, tuple[int, bytes]]:
-    return {path.name: (path.stat().st_mtime_ns, path.read_bytes()) for path in (folder / "cells").glob("*.parquet")}
 
 
 def manifest(study: Study) -> Manifest:
     cells = {cell.name: cell.params for cell in study.cells()}
     return Manifest(study.name, study.question, study.axes, study.settings, cells, {}).as_stored()
-
-
-def start(out: Path, *words: str) -> "subprocess.Popen[str]":
-    command = [sys.executable, "-m", "coopoc.cli", "run", "small", "--out", str(out), *words]
-    return subprocess.Popen(command, env=ENV, cwd=out, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 4, 7, 20])
@@ -72,14 +48,11 @@ def test_three_shards_in_one_folder_make_the_tables_of_one_run(study: Study, tmp
         part = run_study(study, tmp_path, progress=False, shard=f"{index}/3")
         assert (part.frame["cell"].nunique(), part.failed, part.pending) == (3, 0, 0)
     assert not (tmp_path / "small/tables").exists()
-    before = cells(tmp_path / "small")
+    before = files(tmp_path / "small")
     found = run_study(study, tmp_path, progress=False)
-    assert cells(tmp_path / "small") == before
-    timings = [c for c in found.frame if c.endswith("seconds")]
-    pd.testing.assert_frame_equal(
-        found.frame.drop(columns=timings), whole.frame.drop(columns=timings), check_exact=True
-    )
-    assert tables(tmp_path / "small") == tables(tmp_path / "whole/small")
+    assert files(tmp_path / "small") == before
+    pd.testing.assert_frame_equal(numbers(found.frame), numbers(whole.frame), check_exact=True)
+    assert shown(tmp_path / "small") == shown(tmp_path / "whole/small")
 
 
 @pytest.mark.slow
@@ -93,7 +66,7 @@ def test_shards_work_in_one_folder_at_the_same_time(study: Study, tmp_path: Path
     done = plan(study, tmp_path, {"pause": 0.1})
     assert (done["finished"], done["to_compute"]) == (9, 0)
     run_study(study, tmp_path, settings={"pause": 0.1}, progress=False)
-    assert tables(tmp_path / "small") == tables(tmp_path / "whole/small")
+    assert shown(tmp_path / "small") == shown(tmp_path / "whole/small")
 
 
 def test_who_else_may_come_in_while_a_shard_is_at_work(study: Study, tmp_path: Path) -> None:
@@ -118,15 +91,15 @@ def test_folders_of_several_machines_merge_to_the_tables_of_one_run(study: Study
     for index in (1, 2, 3):
         run_study(study, tmp_path / f"m{index}", progress=False, shard=f"{index}/3")
     folders = [tmp_path / f"m{index}/small" for index in (1, 2, 3)]
-    before = {**cells(folders[0]), **cells(folders[1]), **cells(folders[2])}
+    before = {**files(folders[0]), **files(folders[1]), **files(folders[2])}
     half = merge(folders[:2], tmp_path / "all")
     assert (half.folder, half.cells, half.finished, half.missing) == (tmp_path / "all/small", 9, 6, 3)
     assert merge([folders[2]], tmp_path / "all").finished == 9
     run_study(study, tmp_path / "all", progress=False)
-    after = cells(tmp_path / "all/small")
+    after = files(tmp_path / "all/small")
     assert {name: content for name, (_, content) in after.items()} == {name: c for name, (_, c) in before.items()}
-    assert tables(tmp_path / "all/small") == tables(tmp_path / "whole/small")
-    assert {**cells(folders[0]), **cells(folders[1]), **cells(folders[2])} == before
+    assert shown(tmp_path / "all/small") == shown(tmp_path / "whole/small")
+    assert {**files(folders[0]), **files(folders[1]), **files(folders[2])} == before
 
 
 def test_a_failure_is_merged_unless_the_cell_is_finished_elsewhere(study: Study, tmp_path: Path) -> None:

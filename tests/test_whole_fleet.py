@@ -25,16 +25,9 @@ from coopoc.world.v2x import Message
 
 S2 = Sensors.paper_scenario2()
 SPEED = replace(S2, velocity_reading="speed")
-SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
 KNOWN = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.05), gnss_std=(3.0, 3.5, 4.0))
 LINEAR = NoiseModel("unit", None, process_std=(0.3, 0.4, 0.2), gnss_std=(2.0, 1.0, 3.0))
 """Relative vectors of unit covariance: all methods are then linear, and numpy.linalg.lstsq says what is right."""
-CAUSAL = [
-    GaussianBeliefPropagation(),
-    ConsensusADMM(),
-    CentralFilter(),
-]
-METHODS_HERE = [*CAUSAL, BatchSmoother()]
 
 
 def dense(
@@ -152,31 +145,6 @@ def test_on_loops_means_are_exact_and_gbp_is_too_sure(crossing: Fleet) -> None:
     for rho in (0.1, 1.0):
         admm = ConsensusADMM(LINEAR, rounds=2500, rho=rho)(recording, range(8))
         assert admm.x[0, 0] == pytest.approx(x, abs=1e-6)
-
-
-@pytest.mark.parametrize("method", CAUSAL, ids=lambda method: method.name)
-def test_a_run_and_a_step_know_nothing_of_others(method, crossing: Fleet) -> None:
-    budget = V2X(max_neighbours=4, loss=0.2, latency=0.1)
-    many = method(observe(crossing, S2, budget, runs=4), [0]).x
-    assert method(observe(crossing, S2, budget, runs=1), [0]).x == pytest.approx(many[:1], abs=1e-9)
-    assert method(observe(crossing.between(0, 25), S2, budget, runs=4), [0]).x == pytest.approx(many[:, :25], abs=1e-9)
-
-
-@pytest.mark.parametrize("method", METHODS_HERE, ids=lambda method: method.name)
-@pytest.mark.parametrize(
-    "channel",
-    [V2X(max_neighbours=0), V2X(max_neighbours=4, loss=1.0), V2X(max_neighbours=4, latency=2.0)],
-    ids=["no neighbours", "all lost", "too late"],
-)
-def test_nobody_to_talk_to_is_the_solo_filter(method, channel: V2X, crossing: Fleet) -> None:
-    """The smoother's last step is the filter's; its first is better."""
-    recording = observe(crossing, S2, channel, runs=3)
-    solo, track = Kalman("nominal")(recording, [0, 1]), method(recording, [0, 1])
-    assert track.covariance is not None
-    assert solo.covariance is not None
-    now = slice(-1, None) if method.name == "batch-smoother" else slice(None)
-    assert track.x[:, now] == pytest.approx(solo.x[:, now], abs=1e-8)
-    assert track.covariance[:, now] == pytest.approx(solo.covariance[:, now], abs=1e-8)
 
 
 @pytest.fixture(scope="module")

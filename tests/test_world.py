@@ -11,10 +11,11 @@ from scipy import stats
 from scipy.spatial.distance import cdist
 
 from coopoc import V2X, Fleet, InputError, Sensors, channel_load, observe
+from coopoc.world.channels import lost
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector, vector_cov
 from coopoc.world.sensors import stream
-from coopoc.world.v2x import FIX_AND_VELOCITY, lost
+from coopoc.world.v2x import FIX_AND_VELOCITY
 
 S2 = Sensors.paper_scenario2()
 

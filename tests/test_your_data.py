@@ -40,7 +40,7 @@ def test_the_table_of_the_page_is_a_log(tmp_path: Path) -> None:
     (tmp_path / "measurements.csv").write_text(blocks("csv")[0])
     log = co.read_log(tmp_path)
     assert log.recording.ids == ("red", "blue")
-    assert log.recording.arrival.tolist() == [[1]]
+    assert log.recording.arrival.tolist() == [[1, -1]]  # blue has the range, too, and no message of red
     assert log.recording.sensors.range_std == 0.3
 
 

@@ -7,17 +7,19 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
-from ..arrays import Floats, Ints, checked, instance
+from ..arrays import Bools, Floats, Ints, checked, instance
 from ..errors import InputError
-from ..methods.star import FORGOTTEN
+from ..kernels.stars.messages import FORGOTTEN
 from ..world.axes import columns
 from ..world.body_frames import body_motion, midway, true_heading, turned
 from ..world.fleet import Fleet
-from ..world.links import Links, spherical, vector_cov
+from ..world.links import Links, spherical
+from ..world.recording import Recording
 from ..world.sensing import find_links
 from ..world.sensors import Sensors
 from ..world.v2x import V2X
@@ -28,10 +30,18 @@ UNKNOWN_HEADING = 3.0 / np.pi**2
 
 NO_ERROR = 1e-18
 """m^2, variance of an error of the fixes that there is not."""
+LEAST = 1e-6
+"""m, of the distance in the plane: straight above one another, two vehicles have no azimuth."""
 
 
 def posterior_bound(
-    fleet: Fleet, sensors: Sensors, ego: int | str, v2x: V2X | None = None, *, smoothing: bool = False
+    fleet: Fleet,
+    sensors: Sensors,
+    ego: int | str,
+    v2x: V2X | None = None,
+    *,
+    smoothing: bool = False,
+    recording: Recording | None = None,
 ) -> Floats:
     r"""Bound covariance of the ego's position at every step, (T, 3, 3) m^2.
 
@@ -42,7 +52,8 @@ def posterior_bound(
     the future. The information set is the ego's own measurements (solo, `v2x` None or K = 0), also the fixes and
     velocities of the linked neighbours over an ideal channel (star); a vehicle that leaves the star is forgotten, as
     its motion is not received. The bias is left out: it is unobservable from a GNSS start. Drift and common errors of
-    the fixes are unknowns beside the positions (filtering only).
+    the fixes are unknowns beside the positions (filtering only). Outliers are not in the sensors' information: under
+    outliers and attacks the bound is that of an estimator which is told of them, from a `recording` without them.
 
     Args:
         fleet: truth.
@@ -50,9 +61,12 @@ def posterior_bound(
         ego: column or id.
         v2x: K and radius, not loss.
         smoothing: use measurements after t, too.
+        recording: of this drive, such as `observe(..., told=True)`: a fix, a range or an angle that it lacks (NaN) is
+            not measured, and the bound is the mean over its runs. Default: all is measured.
 
     Raises:
-        InputError: an acting std of zero, for which the bound is zero; an ego that is unknown or absent.
+        InputError: an acting std of zero, for which the bound is zero; an ego that is unknown or absent; a recording
+            of other vehicles, steps or links.
 
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
     >>> float(posterior_bound(fleet, Sensors(gnss_std=(2, 2, 2)), 0)[1, 0, 0])  # standing still: 4 / 2
@@ -64,10 +78,11 @@ def posterior_bound(
     instance("smoothing", smoothing, bool, "Give True for the bound of a smoother.")
     links = find_links(fleet, [column], v2x.max_neighbours, v2x.radius, sensors.min_range)
     steps = np.split(links.neighbour, np.searchsorted(links.step, np.arange(1, len(fleet.t))))
-    return _bound(fleet, sensors, links, [np.append(column, near) for near in steps], smoothing)[:, column]
+    members = [np.append(column, near) for near in steps]
+    return _bound(fleet, sensors, links, members, smoothing, recording)[:, column]
 
 
-def past_bound(fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X) -> Floats:
+def past_bound(fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X, *, recording: Recording | None = None) -> Floats:
     """`posterior_bound` (T, 3, 3) m^2, filtering, of an ego that knows all fixes and velocities of all vehicles, too.
 
     Messages that carry sums since departure bring a new neighbour's past, which a star that forgets absent vehicles
@@ -78,6 +93,7 @@ def past_bound(fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X) -> Floats:
         sensors: the noise that acts, stds positive.
         ego: column.
         v2x: K and radius, not loss.
+        recording: as in `posterior_bound`.
 
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
     >>> float(past_bound(fleet, Sensors(gnss_std=(2, 2, 2)), 0, V2X(0))[1, 0, 0])  # standing still: 4 / 2
@@ -85,10 +101,17 @@ def past_bound(fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X) -> Floats:
     """
     links = find_links(fleet, [ego], v2x.max_neighbours, v2x.radius, sensors.min_range)
     members = [np.flatnonzero(row) for row in fleet.present]
-    return _bound(fleet, sensors, links, members, smoothing=False)[:, ego]
+    return _bound(fleet, sensors, links, members, False, recording)[:, ego]
 
 
-def fleet_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, smoothing: bool = False) -> Floats:
+def fleet_bound(
+    fleet: Fleet,
+    sensors: Sensors,
+    v2x: V2X | None = None,
+    *,
+    smoothing: bool = False,
+    recording: Recording | None = None,
+) -> Floats:
     """Bound covariances (T, N, 3, 3) m^2 of all vehicles from all that any of them measures; NaN where absent.
 
     Args and errors: as in `posterior_bound`.
@@ -101,7 +124,7 @@ def fleet_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, smoot
     v2x = checked_noise(fleet, sensors, v2x)
     instance("smoothing", smoothing, bool, "Give True for the bound of a smoother.")
     links = find_links(fleet, range(len(fleet.ids)), v2x.max_neighbours, v2x.radius, sensors.min_range)
-    return _bound(fleet, sensors, links, [np.flatnonzero(row) for row in fleet.present], smoothing)
+    return _bound(fleet, sensors, links, [np.flatnonzero(row) for row in fleet.present], smoothing, recording)
 
 
 def pose_bound(
@@ -112,7 +135,7 @@ def pose_bound(
     J_t = (F_t J_{t-1}^-1 F_t^T + G_t Q_t G_t^T)^-1 + H_t^T R^-1 H_t (Tichavsky, Muravchik, Nehorai 1998) with the
     derivatives of `PoseFilter`'s motion and measurements at the truth. An error that lasts and acts is one number more,
     in this order: the speed's scale, the yaw rate's bias, the compass's bias. Nothing is known of first positions, of
-    first headings that they lie within a turn.
+    first headings that they lie within a turn. There are no outliers in it.
 
     Args:
         fleet: truth.
@@ -156,12 +179,51 @@ def checked_noise(fleet: Fleet, sensors: Sensors, v2x: V2X | None, landmarks: bo
     return v2x
 
 
-def _bound(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], smoothing: bool) -> Floats:
-    """Bound covariances (T, N, 3, 3) m^2 of positions, NaN for those that are no members."""
+class Measured(NamedTuple):
+    """What is measured in one run.
+
+    Attributes:
+        fixes: (T, N).
+        relative: (L, 3), of the links of the bound.
+    """
+
+    fixes: Bools
+    relative: Bools
+
+
+def _bound(
+    fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], smoothing: bool, recording: Recording | None
+) -> Floats:
+    """Bound covariances (T, N, 3, 3) m^2 of positions, NaN for those that are no members; the mean over runs."""
     if smoothing:
         require_white(sensors, "the smoothing bound")
-    stages = position_stages(fleet, sensors, links, members)
-    return _marginals(fleet, stages, covariances(stages, smoothing))[..., :3, :3]
+    runs = [None] if recording is None else _measured(fleet, links, np.unique(np.concatenate(members)), recording)
+    total: Floats = np.zeros(())
+    for run in runs:
+        stages = position_stages(fleet, sensors, links, members, run)
+        total = total + _marginals(fleet, stages, covariances(stages, smoothing))[..., :3, :3]
+    return total / len(runs)
+
+
+def _measured(fleet: Fleet, links: Links, members: Ints, recording: Recording) -> list[Measured | None]:
+    """What the members measure in each run; one run where all measure the same.
+
+    Raises:
+        InputError: a recording of other vehicles or steps, or one that lacks a link.
+    """
+    instance("recording", recording, Recording, "Give observe(..., told=True).")
+    if recording.ids != fleet.ids or len(recording.t) != len(fleet.t):
+        raise InputError("recording", repr(recording), "must hold the vehicles and steps of the fleet", "Observe it.")
+    sides = ("step", "observer", "neighbour")
+    known, wanted = (np.column_stack([getattr(of, side) for side in sides]) for of in (recording.links, links))
+    place = {link: k for k, link in enumerate(map(tuple, known.tolist()))}
+    rows = [place.get(tuple(link), -1) for link in wanted.tolist()]
+    if -1 in rows:
+        hint = "Observe the fleet with the same K and radius, and name the ego among the observers."
+        raise InputError("recording", repr(recording), "must hold the links of the bound", hint)
+    fixes, relative = np.isfinite(recording.gnss[..., 0]), np.isfinite(recording.relative[:, rows])
+    alike = all((part == part[:1]).all() for part in (fixes[:, :, members], relative))
+    return [Measured(fixes[r], relative[r]) for r in range(1 if alike else recording.runs)]
 
 
 def _marginals(fleet: Fleet, stages: list[Stage], found: Iterator[tuple[int, Floats]]) -> Floats:
@@ -196,18 +258,22 @@ class Stage:
     gained: Floats
 
 
-def position_stages(fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints]) -> list[Stage]:
+def position_stages(
+    fleet: Fleet, sensors: Sensors, links: Links, members: list[Ints], measured: Measured | None = None
+) -> list[Stage]:
     """Every step of the positions of vehicles (columns) that are members of it.
 
     Where fixes have time-correlated errors, z = x + own + common + white noise, three more numbers of a member are its
     own error, and one more member, in the column behind all, has the common error as its first three numbers. Errors
-    are Gauss-Markov, e_t = keep e_{t-1} + w.
+    are Gauss-Markov, e_t = keep e_{t-1} + w. Where not all is `measured`, positions have a faint prior, so that a
+    member without any measurement has a covariance.
     """
     drifts, white, stages = drifting(sensors), 1.0 / np.square(sensors.gnss_std), list[Stage]()
     own, common = (max(std**2, NO_ERROR) for std in (sensors.gnss_drift_std, sensors.gnss_common_std))
     keep, d = float(np.exp(-fleet.dt / sensors.gnss_drift_time)), 6 if drifts else 3
     behind = [len(fleet.ids)] if drifts else []
-    for now, previous, edges in steps_of(fleet, links, [np.append(row, behind).astype(np.int64) for row in members]):
+    rows_of = [np.append(row, behind).astype(np.int64) for row in members]
+    for now, previous, edges in steps_of(fleet, links, rows_of, measured and measured.relative):
         t, n, m = len(stages), len(now), len(now) - len(behind)
         motion, process, prior = np.ones((n, d)), np.zeros((n, d)), np.zeros((n, d))
         process[:m, :3] = (fleet.dt * sensors.velocity_std(fleet.velocity[t, now[:m]])) ** 2
@@ -217,8 +283,11 @@ def position_stages(fleet: Fleet, sensors: Sensors, links: Links, members: list[
             motion[:m, 3:], process[:m, 3:], prior[:m] = keep, own * (1 - keep**2), [1 / FORGOTTEN] * 3 + [1 / own] * 3
             motion[m, :3], process[m, :3], prior[m] = keep, common * (1 - keep**2), [1 / common] * 3 + [1.0] * 3
             rows[np.arange(m), :, np.arange(m), 3:] = rows[:, :, m, :3] = np.eye(3)
-        fixes = rows.reshape(3 * m, n * d)
-        gained = edge_information(edges, (n, d), sensors.relative_std) + (fixes.T * np.tile(white, m)) @ fixes
+        fixes, weight = rows.reshape(3 * m, n * d), np.tile(white, m)
+        if measured:
+            weight *= np.repeat(measured.fixes[t, now[:m]], 3)
+            prior[:m, :3] = np.maximum(prior[:m, :3], 1 / FORGOTTEN)
+        gained = edge_information(edges, (n, d), sensors.relative_std) + (fixes.T * weight) @ fixes
         unit = np.eye(d)
         stages.append(Stage(now, previous, motion[..., None] * unit, process[..., None] * unit, prior, gained))
     return stages
@@ -282,11 +351,25 @@ def _motion(fleet: Fleet, sensors: Sensors, lasting: list[int]) -> tuple[Floats,
     return motion, noise @ noise.swapaxes(-1, -2)
 
 
-Edges = tuple[Floats, Ints, Ints]
-"""Vectors (E, 3) m of relative measurements, places of observers and neighbours among the members, -1 if it is none."""
+class Edges(NamedTuple):
+    """E relative measurements.
+
+    Attributes:
+        vector: (E, 3) m, true.
+        observer: (E,) place among the members.
+        neighbour: (E,) place, -1 if it is no member.
+        measured: (E, 3) whether range, azimuth and inclination are measured; None: all are.
+    """
+
+    vector: Floats
+    observer: Ints
+    neighbour: Ints
+    measured: Bools | None
 
 
-def steps_of(fleet: Fleet, links: Links, members: list[Ints]) -> Iterator[tuple[Ints, Ints, Edges]]:
+def steps_of(
+    fleet: Fleet, links: Links, members: list[Ints], measured: Bools | None = None
+) -> Iterator[tuple[Ints, Ints, Edges]]:
     """Members of each step, their places one step before (-1 for new ones), and its true vectors."""
     start, before = np.searchsorted(links.step, np.arange(len(fleet.t) + 1)), np.full(len(fleet.ids) + 1, -1)
     for t, now in enumerate(members):
@@ -294,7 +377,8 @@ def steps_of(fleet: Fleet, links: Links, members: list[Ints]) -> Iterator[tuple[
         place[now] = np.arange(len(now))
         observer, neighbour = (side[start[t] : start[t + 1]] for side in (links.observer, links.neighbour))
         vector = fleet.position[t, neighbour] - fleet.position[t, observer]
-        yield now, before[now], (vector, place[observer], place[neighbour])
+        part = None if measured is None else measured[start[t] : start[t + 1]]
+        yield now, before[now], Edges(vector, place[observer], place[neighbour], part)
         before = place
 
 
@@ -309,18 +393,31 @@ def edge_information(edges: Edges, sizes: tuple[int, int], std: Floats, *, posed
         std: (3,) m, rad, rad.
         posed: whether the fourth number is the heading.
     """
-    (vector, observer, neighbour), (n, d) = edges, sizes
+    (vector, observer, neighbour, _), (n, d) = edges, sizes
     own, other = np.zeros((2, len(vector), 3, d))
     own[..., :3] = -np.eye(3)
     if posed:
         own[:, 0, 3], own[:, 1, 3] = vector[:, 1], -vector[:, 0]
     other[..., :3] = np.eye(3) * (neighbour >= 0)[:, None, None]
-    weight = np.linalg.inv(vector_cov(np.stack(spherical(*vector.T), axis=-1), std))
+    weight = vector_information(edges, std)
     found, ends = np.zeros((n, n, d, d)), ((observer, own), (np.maximum(neighbour, 0), other))
     for here, rows in ends:
         for there, others in ends:
             np.add.at(found, (here, there), rows.swapaxes(1, 2) @ weight @ others)
     return found.swapaxes(1, 2).reshape(n * d, n * d)
+
+
+def vector_information(edges: Edges, std: Floats) -> Floats:
+    r"""Information (E, 3, 3) 1/m^2 of relative vectors, $\sum_k \nabla h_k \nabla h_k^\top / \sigma_k^2$ over what is
+    measured of range, azimuth and inclination."""
+    away, azimuth, inclination = spherical(*edges.vector.T)
+    flat = np.maximum(np.hypot(*edges.vector[:, :2].T), LEAST)
+    sa, ca, si, ci, none = np.sin(azimuth), np.cos(azimuth), np.sin(inclination), np.cos(inclination), 0.0 * away
+    rows = [[si * ca, si * sa, ci], [-sa / flat, ca / flat, none], [ci * ca / away, ci * sa / away, -si / away]]
+    gradients = np.stack([np.stack(row, axis=-1) for row in rows], axis=1)
+    weight = np.broadcast_to(np.square(std) ** -1.0, edges.vector.shape)
+    weight = weight if edges.measured is None else weight * edges.measured
+    return np.asarray(gradients.swapaxes(1, 2) @ (weight[..., None] * gradients))
 
 
 def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Floats]]:

@@ -10,10 +10,9 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked, instance, number, refuse
+from ..arrays import Floats, checked, instance, number, one_of, refuse
 from ..errors import InputError
 from ..methods.track import Track
-from ..plugins import one_of
 from ..short_repr import short_repr
 from ..world.recording import Recording
 from ..world.v2x import Message

@@ -10,7 +10,7 @@ from scipy import stats
 
 from ..arrays import Floats, checked, instance, number, refuse
 from ..errors import InputError
-from ..kernels.scores import normalised
+from ..kernels.covariances import normalised
 from ..methods.track import Track
 from ..plugins import find
 from ..world.body_frames import true_heading, turned

@@ -8,9 +8,8 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ..arrays import Floats, Ints, checked, instance, named, number
-from ..errors import InputError
-from ..plugins import one_of, suggestion
+from ..arrays import Floats, Ints, checked, instance, named, number, one_of
+from ..errors import InputError, suggestion
 from ..short_repr import short_repr
 from .statistics import Interval, mean_interval
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..errors import InputError
+from ..errors import InputError, suggestion
 from ..file_names import given_path
-from ..plugins import suggestion
 from .g2o import read_g2o
 from .graph import Graph
 from .jrl import read_jrl

@@ -11,9 +11,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from ..arrays import Floats
-from ..errors import InputError
+from ..errors import InputError, suggestion
 from ..file_names import given_path
-from ..plugins import suggestion
 from .graph import ENDS, NAME, Graph, edges_of
 from .values import LARGEST
 

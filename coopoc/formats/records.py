@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..errors import InputError
-from ..plugins import suggestion
+from ..errors import InputError, suggestion
 from .graph import ENDS, Edges, Graph, edges_of
 from .values import inverse, malformed, symmetric, to_numbers
 

@@ -9,10 +9,9 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import Floats, frozen
+from ..arrays import Floats, frozen, one_of
 from ..errors import InputError
 from ..file_names import given_path
-from ..plugins import one_of
 from ..short_repr import short_repr
 from .values import UNIT, read_table, to_rotation
 
@@ -99,7 +98,7 @@ def read_tum(path: str | Path, *, repeats: Literal["refuse", "drop"] = "refuse")
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "a.tum"
-    >>> write_tum(Trajectory([0.0, 0.1], np.ones((2, 3)), np.tile(np.eye(3), (2, 1, 1))), file)
+    >>> _ = file.write_text("0.0 1 1 1 0 0 0 1\\n0.1 1 1 1 0 0 0 1\\n")
     >>> read_tum(file).stamps
     array([0. , 0.1])
     """

@@ -1,4 +1,4 @@
-"""Dead reckoning: the noise of a motion dt u, and the newest motions of one vehicle, so that a late fix can follow."""
+"""Process noise of a motion dt u, constant or a share of the measured velocity."""
 
 from __future__ import annotations
 
@@ -9,10 +9,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ..arrays import Floats
-from .compiling.compile import compiled, inside
-
-ROUNDING = 1e-9
-"""s, by how much sums of time steps may miss a time."""
+from .compiling.compile import inside
 
 
 class MotionNoise(NamedTuple):
@@ -57,39 +54,3 @@ def process_variance(noise: MotionNoise, velocity: Sequence[float] | Floats, dt:
         share * (noise.base[1] * noise.base[1] + moved_y * moved_y),
         share * (noise.base[2] * noise.base[2] + moved_z * moved_z),
     )
-
-
-# A history is one array (1 + capacity, 7), a ring. Row 0: first row in use, rows in use, seconds they span, seconds
-# asked for. Each other row is a step: dt s, motion (3,) m, its variance (3,) m^2.
-
-
-@compiled
-def push(history: Floats, dt: float, moved: Floats, variance: Floats) -> None:
-    """Add the newest step, and drop the oldest ones that are not needed to reach back as far as is asked for."""
-    capacity = len(history) - 1
-    first, count, seen = int(history[0, 0]), int(history[0, 1]), history[0, 2] + dt
-    row = 1 + (first + count) % capacity
-    history[row, 0] = dt
-    for c in range(3):
-        history[row, 1 + c], history[row, 4 + c] = moved[c], variance[c]
-    count += 1
-    while count > 1 and seen - history[1 + first, 0] >= history[0, 3]:
-        seen -= history[1 + first, 0]
-        first, count = (first + 1) % capacity, count - 1
-    history[0, 0], history[0, 1], history[0, 2] = first, count, seen
-
-
-@compiled
-def since(history: Floats, age: float, moved: Floats, variance: Floats) -> None:
-    """Motion (3,) m in the last `age` seconds and its variance (3,) m^2; of a step that is cut, its share."""
-    capacity, left = len(history) - 1, age
-    moved[:3], variance[:3] = 0.0, 0.0
-    for k in range(int(history[0, 1]) - 1, -1, -1):
-        if left <= 0.0:
-            break
-        row = 1 + (int(history[0, 0]) + k) % capacity
-        share = min(left / history[row, 0], 1.0)
-        for c in range(3):
-            moved[c] += share * history[row, 1 + c]
-            variance[c] += share * history[row, 4 + c]
-        left -= history[row, 0]

@@ -14,14 +14,11 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
-from .motion import ROUNDING, MotionNoise, process_variance, push, since
+from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
+from .motion import MotionNoise, process_variance
 
 LEAST = 1e-4
 """m^2, least variance of a fix: 1 cm."""
-ESTIMATE, NO_FIX_YET, BAD_INPUT = 0, 1, 2
-"""What a step of a stream returns."""
-GNSS, VELOCITY, DT, FIX_AGE = slice(0, 3), slice(3, 6), 6, 7
-"""Where the input of a stream's step stands in its array."""
 AxisState: TypeAlias = tuple[float, float, float, float, float]
 
 
@@ -135,35 +132,6 @@ def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, index: Ints,
 def packed(motion: MotionNoise, rule: FixNoise) -> Floats:
     """Both noises as one array: a tuple of arrays takes longer to hand over than a step takes."""
     return np.concatenate([motion.base, motion.ratio, motion[2:], rule.variance, rule[1:]])
-
-
-@part
-def dead_reckon(
-    given: Floats, history: Floats, motion: MotionNoise, moved: Floats, q: Floats, since_fix: Floats, late: Floats
-) -> int:
-    """Add a step to the history: its motion and the variance of that; what a fix of some age has missed since.
-
-    Nothing is changed where the input is bad. NO_FIX_YET: there is no fix.
-    """
-    dt, age, missing = given[DT], given[FIX_AGE], 0
-    for c in range(3):
-        missing += math.isnan(given[c])
-        if math.isinf(given[c]) or not math.isfinite(given[3 + c]):
-            return BAD_INPUT
-    if not (dt > 0.0 and math.isfinite(dt)) or missing % 3 != 0:
-        return BAD_INPUT
-    variance = process_variance(motion, given[VELOCITY], dt)
-    for c in range(3):
-        q[c], moved[c] = variance[c], dt * given[3 + c]
-    first, count, seen = history[0, 0], history[0, 1], history[0, 2]
-    push(history, dt, moved[:3], q)
-    if missing > 0:
-        return NO_FIX_YET
-    if not -ROUNDING <= age <= history[0, 2] + ROUNDING:
-        history[0, 0], history[0, 1], history[0, 2] = first, count, seen
-        return BAD_INPUT
-    since(history, age, since_fix, late)
-    return ESTIMATE
 
 
 @compiled

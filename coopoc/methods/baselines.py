@@ -15,12 +15,10 @@ from ..kernels.stars.pseudo_fixes import run_msmv
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
-from .egos import Estimate, follow_egos
+from .egos import Estimate, assumptions, follow_egos, measurements
 from .kalman import solo_filter
 from .noise_model import NoiseModel, resolve
-from .options import check_options
-from .star import assumptions, measurements
-from .track import Track
+from .track import Track, check_options
 
 RECONSTRUCTION = "MSMV-R is a reconstruction: the equations of MSMV are not public; the paper's curve is not matched"
 

@@ -9,6 +9,7 @@ from ..one_file import in_file
 from ..plugins import find, names
 from .baselines import LKFSA, MSMV
 from .centralised import BatchSmoother, CentralFilter
+from .cooperative_filter import CooperativeFilter
 from .covariance_intersection import CovarianceIntersection
 from .decentralised import ConsensusADMM, GaussianBeliefPropagation
 from .drift_filter import DriftFilter
@@ -31,6 +32,7 @@ METHODS: Mapping[str, Factory] = {
     "msmv-r": MSMV,
     "drift": DriftFilter,
     "joint": JointFilter,
+    "cooperative-filter": CooperativeFilter,
     "cooperative-map": CooperativeMAP,
     "cooperative-map-5": partial(CooperativeMAP, window=5, name="cooperative-map-5"),
     "cooperative-map-gnc": partial(CooperativeMAP, window=5, robust="truncated", name="cooperative-map-gnc"),

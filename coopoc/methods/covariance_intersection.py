@@ -5,16 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
+from ..kernels.stars.messages import ESTIMATE_GROWTH
 from ..kernels.stars.pseudo_fixes import run_intersection
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE_AND_COV, Message
 from .baselines import solo_estimates
-from .egos import Estimate, follow_egos
+from .egos import Estimate, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
-from .options import check_options
-from .star import ESTIMATE_GROWTH, measurements
-from .track import Track
+from .track import Track, check_options
 
 
 @dataclass(frozen=True, eq=False)

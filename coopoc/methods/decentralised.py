@@ -12,8 +12,7 @@ from ..errors import InputError
 from ..world.recording import Recording
 from ..world.v2x import Message
 from .noise_model import NoiseModel
-from .options import check_options
-from .track import Track
+from .track import Track, check_options
 from .whole_fleet import Answer, fleet_track
 
 if TYPE_CHECKING:

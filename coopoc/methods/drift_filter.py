@@ -11,11 +11,9 @@ from ..kernels.stars.drift import Drift, run_filter
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
-from .egos import Estimate, follow_egos
+from .egos import Estimate, assumptions, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
-from .options import check_options
-from .star import assumptions, measurements
-from .track import Track
+from .track import Track, check_options
 
 
 @dataclass(frozen=True, eq=False)

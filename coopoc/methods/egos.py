@@ -1,17 +1,22 @@
-"""The loop of all cooperative methods: each ego opens its inbox, follows its star, and fills its part of the Track."""
+"""The loop of all cooperative methods: each ego opens its inbox, hands arguments to its kernel, and fills its Track."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
 from tqdm import tqdm
 
 from ..arrays import Floats, Ints
+from ..kernels.stars.cooperative_state import Model
+from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
+from ..kernels.stars.relative import components
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, check_recording
+from .noise_model import NoiseModel, process_noise
 from .track import Method, Track
 
 BEYOND = 10.0
@@ -20,13 +25,15 @@ BEYOND = 10.0
 
 class Estimate(NamedTuple):
     """One ego at one step: position (R, 3) m, covariance (R or 1, 3, 3) m^2, its links there, and its neighbours
-    (R, k, 3) m, NaN where it does not estimate them. At several steps, a slice: (R, steps, 3), (R, steps, 3, 3)."""
+    (R, k, 3) m, NaN where it does not estimate them. At several steps, a slice: (R, steps, 3), (R, steps, 3, 3).
+    Extras at all steps by name: (R, T, 1), or by link (R, k)."""
 
     step: int | slice
     x: Floats
     covariance: Floats
     links: Ints
     neighbours: Floats
+    extras: Mapping[str, Floats] = MappingProxyType({})
 
 
 def follow_egos(
@@ -55,6 +62,7 @@ def follow_egos(
     ends = np.cumsum([0, *(len(recording.links.of(ego)) for ego in columns)])
     neighbours = np.full((recording.runs, ends[-1], 3), np.nan)
     received, sent = np.zeros((2, recording.runs, len(columns)))
+    extras: dict[str, list[Floats]] = {}
     with tqdm(total=len(columns) * len(recording.t), desc=method.name, unit="step", delay=2.0) as bar:
         for e, ego in enumerate(columns):
             box = inbox(recording, ego, method.message)
@@ -63,12 +71,15 @@ def follow_egos(
                 x[:, found.step, e], cov[:, found.step, e] = found.x, found.covariance
                 here = slice(None) if len(found.links) == len(box.link) else np.searchsorted(box.link, found.links)
                 neighbours[:, ends[e] : ends[e + 1]][:, here] = found.neighbours
+                for name, values in found.extras.items():
+                    extras.setdefault(name, []).append(values)
                 bar.update(1 if isinstance(found.step, int) else len(recording.t[found.step]))
     notes = (*notes, *contradicted(x, recording, columns))
     for array in (x, cov, neighbours):
         array.flags.writeable = False  # so that the Track need not copy them
     seconds = time.perf_counter() - began
-    return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, notes)
+    whole = {name: np.concatenate(values, axis=-1) for name, values in extras.items()}
+    return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, notes, extras=whole)
 
 
 def contradicted(x: Floats, recording: Recording, columns: Sequence[int]) -> tuple[str, ...]:
@@ -87,3 +98,59 @@ def contradicted(x: Floats, recording: Recording, columns: Sequence[int]) -> tup
         return ()
     why = "diverged, or fixes are worse than stated; covariances say nothing there"
     return (f"estimates are over {limit:.2g} m from most fixes in {lost} of {far.size} runs: {why}",)
+
+
+def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats | None = None) -> Measurements:
+    """Measurements and messages of one ego, as `coopoc.kernels.stars.messages.Measurements`.
+
+    Args:
+        recording: of all vehicles.
+        ego: column.
+        box: its messages.
+        broadcast: (R, T, N, 3) m, position in a message; None for the fix.
+    """
+    neighbour, start, newest = (
+        np.ascontiguousarray(numbers, dtype=np.int64)
+        for numbers in (recording.links.neighbour[box.link], box.start, box.newest)
+    )
+    gnss = recording.gnss
+    return Measurements(
+        gnss,
+        recording.velocity,
+        gnss if broadcast is None else broadcast,
+        components(recording.relative, box.link),
+        neighbour,
+        start,
+        newest,
+        np.ascontiguousarray(box.fresh),
+        int(ego),
+        recording.dt,
+    )
+
+
+def assumptions(recording: Recording, known: NoiseModel) -> Assumptions:
+    """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a
+    velocity."""
+    (process, motion), fixes = process_noise(known, recording), np.ascontiguousarray(known.fix_variance(recording))
+    noise = relative_noise(known)
+    return Assumptions(process, fixes, fixes, FIX_GROWTH, *noise, FORGOTTEN, ACCELERATION_STD, motion)
+
+
+def relative_noise(known: NoiseModel) -> tuple[Floats, float]:
+    """(3,) m, rad, rad and the least range m of relative measurements, or nothing for unit matrices."""
+    return (np.empty(0), 0.0) if known.sensors is None else (known.sensors.relative_std, known.sensors.min_range)
+
+
+def model_of(known: NoiseModel, robust: bool) -> Model:
+    """The noise model of the kernel; of the textbook filter all errors are white."""
+    std, least = relative_noise(known)
+    white, own, common, time, bias, heading = np.ones(3), 0.0, 0.0, 1.0, 0.0, 0.0
+    if robust and known.sensors is not None:
+        sensors, std = known.sensors, np.array(std)
+        own, common = sensors.gnss_drift_std**2, sensors.gnss_common_std**2
+        white = np.square(sensors.gnss_std) / np.square(sensors.fix_std)
+        time = float(sensors.gnss_drift_time)
+        heading, bias = (float(value**2) for value in known.compass)
+        std[1] = np.sqrt(std[1] ** 2 - heading - bias)
+    shape = float(least), float(known.exact_relative), FORGOTTEN, ACCELERATION_STD
+    return Model(std, *shape, own, common, time, white, bias, heading, float(robust))

@@ -18,9 +18,8 @@ from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NO_VARIANCE, NoiseModel, constant_noise, motion_noise, process_noise, resolve
-from .options import check_options
 from .stream import FilterStream
-from .track import Track
+from .track import Track, check_options
 
 ASSUMED = Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02)
 """Velocity noise of the paper's training, 10 % per axis, and where the estimate of the fixes' noise starts."""

@@ -13,9 +13,8 @@ from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .noise_model import NoiseModel, resolve
-from .options import check_options
 from .star import StarStep, bridged, stars
-from .track import Track
+from .track import Track, check_options
 
 LISTED = 10
 """How many of its ranges, nearest first, a neighbour's message lists."""

@@ -8,9 +8,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import Floats, checked, instance, number
-from ..errors import InputError
+from ..errors import InputError, suggestion
 from ..kernels.motion import NO_MOTION_NOISE, MotionNoise
-from ..plugins import suggestion
 from ..short_repr import short_repr
 from ..world.axes import check_texts, texts
 from ..world.fleet import Fleet
@@ -34,6 +33,7 @@ class NoiseModel:
         process_std: (3,) m per step, constant; None to follow the velocity.
         gnss_std: (3,) m.
         velocity: (T, N, 3) m/s true velocity, for the oracle only.
+        compass: (2,) rad, noise and constant error of the heading, both of which are within the azimuth's std.
         notes: of the Track, what was changed to stay within double precision.
     """
 
@@ -42,6 +42,7 @@ class NoiseModel:
     process_std: tuple[float, float, float] | None = None
     gnss_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
     velocity: Floats | None = None
+    compass: tuple[float, float] = (0.0, 0.0)
     notes: tuple[str, ...] = ()
 
     __repr__ = short_repr
@@ -69,9 +70,10 @@ class NoiseModel:
     def nominal(cls, sensors: Sensors) -> NoiseModel:
         """The standard deviations of `sensors`, process noise from the measured velocity; all of the error of a fix or
         an azimuth as if it were white and its own."""
-        sensors = instance("sensors", sensors, Sensors).check_assumed().without_bias()
+        sensors = instance("sensors", sensors, Sensors).check_assumed().known()
+        compass = sensors.heading_std, sensors.heading_bias_std
         sensors = replace(sensors, azimuth_std=sensors.world_azimuth_std, heading_std=0.0, heading_bias_std=0.0)
-        return cls("nominal", sensors, gnss_std=sensors.fix_std)
+        return cls("nominal", sensors, gnss_std=sensors.fix_std, compass=compass)
 
     @classmethod
     def oracle(cls, sensors: Sensors, fleet: Fleet) -> NoiseModel:

@@ -17,9 +17,8 @@ from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
 from .mds import bridged_stars, bridging_note
 from .noise_model import NoiseModel, resolve
-from .options import check_options
 from .star import StarStep
-from .track import Track
+from .track import Track, check_options
 
 
 @dataclass(frozen=True, eq=False)

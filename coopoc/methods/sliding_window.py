@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats, Ints, one_of
 from ..errors import InputError
 from ..optimize.backend import require_backend
 from ..optimize.model.problem import Problem
@@ -23,15 +23,13 @@ from ..optimize.robust.gnc import EASY, RATE, ROUNDS, solve_gnc, surrogate_of
 from ..optimize.solution import Status
 from ..optimize.solve import solve, solve_batch
 from ..optimize.starts.initial import converted
-from ..plugins import one_of
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
-from .egos import Estimate, follow_egos
+from .egos import Estimate, assumptions, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
-from .options import check_options
-from .star import assumptions, bridged, measurements
-from .track import Track
+from .star import bridged
+from .track import Track, check_options
 
 if TYPE_CHECKING:
     from ..kernels.windows.batch_window import Solutions

@@ -1,4 +1,4 @@
-"""The star of an ego and its neighbours, step by step: their newest messages, brought forward, and what is measured."""
+"""The star of an ego and its neighbours in plain NumPy, step by step: newest messages brought forward, measurements."""
 
 from __future__ import annotations
 
@@ -8,22 +8,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from ..kernels.stars.messages import Assumptions, Measurements
-from ..kernels.stars.relative import components
-from ..world.inbox import Inbox, inbox
+from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN
+from ..world.inbox import inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
-from .noise_model import NoiseModel, process_noise, resolve
-
-FORGOTTEN = 1e6
-"""m^2, prior variance of a vehicle that has just joined: nothing is known of it."""
-ACCELERATION_STD = 1.0
-"""m/s^2, how fast a velocity may have changed since the message that carried it."""
-FIX_GROWTH, ESTIMATE_GROWTH = (1.0, 0.0), (1.0, 2.0)
-"""(a, b): after `age` steps a position has gained age (a age + b) times the variance of one step. A fix that is moved
-with one velocity makes its error age times; an estimate has made that error once before, fully correlated."""
-POSITION = (0.0,) * 3
-"""A state that is a position: its size, for compiled code."""
+from .noise_model import NoiseModel, resolve
 
 
 @dataclass(frozen=True, eq=False)
@@ -138,44 +127,3 @@ def bridged(recording: Recording, known: NoiseModel) -> tuple[Floats, Floats]:
         variance[:, t] = np.where(gap, variance[:, t - 1] + process[:, t], variance[:, t])
     x.flags.writeable = False  # as the fixes are, for the same compiled code
     return x, variance
-
-
-def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats | None = None) -> Measurements:
-    """Measurements and messages of one ego, as `coopoc.kernels.stars.messages.Measurements`.
-
-    Args:
-        recording: of all vehicles.
-        ego: column.
-        box: its messages.
-        broadcast: (R, T, N, 3) m, position in a message; None for the fix.
-    """
-    neighbour, start, newest = (
-        np.ascontiguousarray(numbers, dtype=np.int64)
-        for numbers in (recording.links.neighbour[box.link], box.start, box.newest)
-    )
-    gnss = recording.gnss
-    return Measurements(
-        gnss,
-        recording.velocity,
-        gnss if broadcast is None else broadcast,
-        components(recording.relative, box.link),
-        neighbour,
-        start,
-        newest,
-        np.ascontiguousarray(box.fresh),
-        int(ego),
-        recording.dt,
-    )
-
-
-def assumptions(recording: Recording, known: NoiseModel) -> Assumptions:
-    """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a
-    velocity."""
-    (process, motion), fixes = process_noise(known, recording), np.ascontiguousarray(known.fix_variance(recording))
-    noise = relative_noise(known)
-    return Assumptions(process, fixes, fixes, FIX_GROWTH, *noise, FORGOTTEN, ACCELERATION_STD, motion)
-
-
-def relative_noise(known: NoiseModel) -> tuple[Floats, float]:
-    """(3,) m, rad, rad and the least range m of relative measurements, or nothing for unit matrices."""
-    return (np.empty(0), 0.0) if known.sensors is None else (known.sensors.relative_std, known.sensors.min_range)

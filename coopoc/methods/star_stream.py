@@ -5,32 +5,58 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats, Ints, instance
 from ..errors import InputError
-from ..kernels.motion import NO_MOTION_NOISE
-from ..kernels.solo import ESTIMATE, NO_FIX_YET
-from ..kernels.stars.messages import Assumptions
-from ..kernels.stars.star_stream import (
-    FIX,
-    LAST_AGE,
-    MESSAGE,
-    MESSAGE_AGE,
-    PREVIOUS,
-    RELATIVE,
-    VELOCITY,
+from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET, ROUNDING
+from ..kernels.solo import FixNoise
+from ..kernels.stars.cooperative_filter import keep, make_filter, motion_of, restore, stream_row, stream_step
+from ..kernels.stars.cooperative_state import (
+    AGE,
+    KEPT_VARIANCE,
+    NO_GUARDS,
+    ODOMETER,
+    OWN,
+    SENT,
+    SPEED,
+    STEP,
+    TRUSTED,
+    TYPICAL,
+    VARIANCE,
     WIDTH,
-    Noise,
-    packed,
-    resized,
-    stream_step,
+    Filter,
 )
-from .noise_model import NoiseModel, motion_noise
-from .star import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, relative_noise
-from .stream import MotionHistory, fix_or_none, names_of, numbers, seconds, three
+from ..kernels.stars.cooperative_state import ESTIMATE as POSITION
+from ..kernels.stars.gaussian import ABSENT
+from ..kernels.stars.relative import components
+from .cooperative_filter import CooperativeFilter
+from .egos import model_of
+from .joint_filter import JointFilter
+from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
+from .noise_model import constant_noise, motion_noise
+from .stream import FilterStream
+
+FIRST = np.zeros(1, np.int64)
+
+
+class Broadcast(NamedTuple):
+    """What a vehicle with a robust filter broadcasts, 56 B with its id and the time.
+
+    Attributes:
+        position: (3,) m, estimate of its solo filter.
+        velocity: (3,) m/s.
+        variance: (3,) m^2 of the estimate.
+        odometer: (3,) m, sum of all its motions.
+    """
+
+    position: npt.ArrayLike
+    velocity: npt.ArrayLike
+    variance: npt.ArrayLike
+    odometer: npt.ArrayLike
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,8 +66,10 @@ class RelativeMeasurement:
     Args:
         id: name of the neighbour.
         relative: (3,) range m, world azimuth rad, inclination rad; NaN for a component that is missing.
-        gnss: (3,) m, the fix in the message; None or NaN for none.
+        gnss: (3,) m, the fix in the message, or the estimate of `Broadcast`; None or NaN for none.
         velocity: (3,) m/s of the message; None for no message.
+        variance: (3,) m^2 of `Broadcast`, which a robust filter needs.
+        odometer: (3,) m of `Broadcast`.
         age: s since fix and velocity of the message were measured.
 
     >>> RelativeMeasurement("b", [9.0, 0.1, 1.57]).velocity is None
@@ -52,74 +80,108 @@ class RelativeMeasurement:
     relative: npt.ArrayLike
     gnss: npt.ArrayLike | None = None
     velocity: npt.ArrayLike | None = None
+    variance: npt.ArrayLike | None = None
+    odometer: npt.ArrayLike | None = None
     age: float = 0.0
     row: Floats = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        row = np.full(11, np.nan)
+        row = np.full(WIDTH, np.nan)
         relative, named = numbers(self.relative), isinstance(self.id, str) and self.id
         if relative.shape != (3,) or not named or not (0.0 < relative[0] < math.inf or math.isnan(relative[0])):
             text = "must have a name and three numbers, the range first and > 0"
             raise InputError("relative", (self.id, self.relative), text, "Give NaN for what was not measured.")
-        row[RELATIVE], row[MESSAGE] = relative, float(self.velocity is not None)
-        row[FIX], row[MESSAGE_AGE] = fix_or_none(self.gnss, "neighbour's gnss"), seconds("age", self.age)
+        row[:AGE], row[AGE] = components(relative[None, None], FIRST)[0, 0], seconds("age", self.age)
+        row[POSITION:VARIANCE] = fix_or_none(self.gnss, "neighbour's gnss")
+        if self.variance is not None:
+            row[VARIANCE:ODOMETER] = three("neighbour's variance", self.variance)
+        if self.odometer is not None:
+            row[ODOMETER:SPEED] = three("neighbour's odometer", self.odometer)
         if self.velocity is not None:
-            row[VELOCITY] = three("neighbour's velocity", self.velocity)
-        elif math.isfinite(row[FIX][0]):
+            row[SPEED:STEP] = three("neighbour's velocity", self.velocity)
+        elif math.isfinite(row[POSITION]):
             raise InputError("velocity", None, f"must come with the fix of {self.id}", "Send both in one message.")
         object.__setattr__(self, "row", row)
 
 
 class StarStream:
-    """The joint filter, fed step by step: like `FilterStream`, with the neighbours that are measured at each step.
+    """The joint or the cooperative filter, step by step: `FilterStream` with the neighbours measured at each step.
 
     The neighbours measured now are in the star. Between messages a neighbour moves with the velocity of its newest one
     until that is `max_age` seconds old; a velocity used for L seconds makes an error of L times its own. Of a vehicle
     that is measured but whose messages never arrive, nothing is assumed.
 
+    For a recording the std of ranges that are finer than their angles bear is raised (`noise_model.resolve`); a stream
+    does not know the ranges to come, and takes what the noise model says.
+
     Args:
-        known: the noise model.
-        refine: one Gauss-Newton step on range and angles.
+        filter: its noise model is "identity" or holds constant noise. In a robust one neighbours must send what
+            `broadcast` of theirs holds.
         x0: (3,) m, a position known before the first step; None starts at the first fix.
-        interval: s, the step that the assumed process noise belongs to; None for every step.
+        interval: s, the step that the assumed process noise belongs to: a motion of dt s has dt / interval times its
+            variance. None: every step is one, with the error of one measured velocity, as in a recording.
         history: s, how old a delayed fix may be.
-        max_age: s, older messages are not used.
+        max_age: s, older messages of neighbours are not used.
+
+    Raises:
+        InputError: a noise model that needs a recording, a time that is negative or not finite.
+
+    >>> from coopoc import JointFilter
+    >>> ego = StarStream(JointFilter("identity"))
+    >>> other = RelativeMeasurement("b", [9.0, 0.0, 1.5707963], gnss=[10.0, 0.0, 0.0], velocity=[9.0, 0.0, 0.0])
+    >>> x, _ = ego.step([0.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[other])
+    >>> float(x[0].round(3)), float(ego.neighbours["b"][0].round(3))  # 10 m apart by the fixes, 9 m as measured
+    (0.333, 9.667)
     """
 
     def __init__(
         self,
-        known: NoiseModel,
-        refine: bool,
-        x0: npt.ArrayLike | None,
-        interval: float | None,
-        history: float,
-        max_age: float,
+        filter: JointFilter | CooperativeFilter,
+        x0: npt.ArrayLike | None = None,
+        *,
+        interval: float | None = None,
+        history: float = 10.0,
+        max_age: float = 1.0,
     ) -> None:
-        motion, fixes = motion_noise(known, interval), known.gnss_variance[None, None, None]
-        assumed = Assumptions(
-            fixes, fixes, fixes, FIX_GROWTH, *relative_noise(known), FORGOTTEN, ACCELERATION_STD, NO_MOTION_NOISE
-        )
+        kind = CooperativeFilter if isinstance(filter, CooperativeFilter) else JointFilter
+        known = constant_noise(instance("filter", filter, kind).noise_model)
+        robust = isinstance(filter, CooperativeFilter) and filter.robust
+        self._model, self._guards = model_of(known, robust), NO_GUARDS
+        if isinstance(filter, JointFilter):
+            self._model = self._model._replace(exact=float(filter.exact and known.exact_relative))
+        elif robust:
+            self._guards = filter.guards
+        self._motion, self._fix = motion_noise(known, interval), np.array(known.gnss_variance)
         self.max_age, self.history = seconds("max_age", max_age), MotionHistory(history)
-        self._noise = packed(Noise(motion, assumed, self.max_age, refine))
-        self._members: dict[str, int] = {}
+        self._start = np.full(3, np.nan) if x0 is None else three("x0", x0)
+        self._given = np.zeros(8)
+        self._positions: dict[str, Floats] = {}
         self._messages: dict[str, tuple[Floats, float]] = {}
-        self._time, self._size = 0.0, 0
-        self._given, self._answer = np.zeros(12), np.zeros(12)
-        if x0 is not None:
-            self._given[8:11], self._given[11] = three("x0", x0), 1.0
-        self._memory: Floats = np.zeros(0)
-        self._columns: Ints = np.zeros(0, np.int64)
-        self._reserve(8)
-
-    def _reserve(self, most: int) -> None:
-        """Room for `most` members of the star, with the state and the information of the last one."""
-        self._memory = resized(self._memory, self._size, len(self._columns) // 3, most)
-        self._columns, self._rows = np.zeros(3 * most, np.int64), np.zeros((most, WIDTH))
+        self._numbers: dict[str, int] = {}
+        self._filters = [make_filter(1, 1) for _ in range(3)]
+        self._inputs: list[tuple[Floats, Floats, Ints]] = []
+        self._time, self._steps = 0.0, 0
+        self.solo = FilterStream(self._motion, FixNoise(self._fix), x0, history) if robust else None
+        self._odometer = np.zeros(3)
 
     @property
     def neighbours(self) -> dict[str, Floats]:
         """Positions (3,) m of the neighbours in the star."""
-        return dict(zip(self._members, self._answer[12:].reshape(-1, 3).copy(), strict=True))
+        return {name: position.copy() for name, position in self._positions.items()}
+
+    @property
+    def broadcast(self) -> Broadcast | None:
+        """What this vehicle sends now; None before its first fix, and of a filter that is not robust."""
+        if self.solo is None or (state := self.solo.state) is None:
+            return None
+        variance = state.share * state.noise + state.motion
+        return Broadcast(state.x, self._given[3:6].copy(), variance, self._odometer.copy())
+
+    @property
+    def trusted(self) -> dict[str, bool]:
+        """Whether the fixes of each neighbour in the star count as they are."""
+        status = self._filters[0].status
+        return {name: bool(status[self._numbers[name], TRUSTED]) for name in self._positions}
 
     def step(
         self,
@@ -139,45 +201,114 @@ class StarStream:
             neighbours: the relative measurements of now, one for each neighbour.
 
         Raises:
-            InputError: as `FilterStream.step`; a neighbour that is given twice. The filter is then as it was before.
+            InputError: as `FilterStream.step`; a neighbour that is given twice, or, of a robust filter, with a message
+                that is no `Broadcast`. The filter is then as it was before.
         """
         names = names_of("neighbours", neighbours, RelativeMeasurement)
+        if self.solo is not None:
+            self._check(neighbours)
         self.history.write(self._given, gnss, velocity, dt, fix_age)
-        rows, answer = self._fill(names, neighbours), np.empty(12 + 3 * len(names))
-        memory, history = self._memory, self.history.reserve()
-        outcome = stream_step(self._given, rows, memory, self._columns, self._size, history, self._noise, answer)
+        own = np.empty(OWN)
+        outcome = stream_row(self._given, self.history.reserve(), self._motion, self._fix, own)
         if outcome not in (ESTIMATE, NO_FIX_YET):
             self.history.check(gnss, velocity, dt, fix_age)
-        self._remember(names, rows, dt)
+        if self.solo is not None:
+            self.solo.step(gnss, velocity, dt, fix_age)
+            self._odometer += self._given[3:6] * dt
+        self._time += dt
+        rows = self._rows(names, neighbours, dt)
         if outcome == NO_FIX_YET:
-            return np.full(3, np.nan), None
-        self._members, self._size, self._answer = {name: k for k, name in enumerate(names, 1)}, 1 + len(names), answer
+            own[:3] = np.nan
+            if not self._steps and np.isnan(self._start[0]):
+                return np.full(3, np.nan), None
+        answer = np.empty(12 + 3 * len(names))
+        self._run(own, rows, self._columns(names), answer)
+        self._steps += 1
+        self._positions = dict(zip(names, answer[12:].reshape(-1, 3), strict=True))
         return answer[:3], answer[3:12].reshape(3, 3)
 
-    def _fill(self, names: list[str], neighbours: Sequence[RelativeMeasurement]) -> Floats:
-        """(k, WIDTH) the measurements, each with its vehicle's last message and index in the last star."""
-        if 3 * len(names) >= len(self._columns):
-            self._reserve(2 * (len(names) + 1))
-        rows = self._rows[: len(names)]
+    def _run(self, own: Floats, rows: Floats, vehicles: Ints, answer: Floats) -> None:
+        """Take a step; where a vehicle has lost trust, go back and come here again without its fixes."""
+        f, older, newer = self._filters
+        memory = int(self._guards.memory)
+        if memory and self._steps and self._steps % memory == 0:
+            keep(newer, older)
+            keep(f, newer)
+            del self._inputs[:-memory]
+        alarm = stream_step(f, self._model, self._guards, own, rows, vehicles, self._start, answer)
+        if not memory:
+            return
+        self._inputs.append((own, rows, vehicles))
+        while alarm:
+            restore(older, f, self._model, self._guards)
+            for k, (mine, theirs, who) in enumerate(self._inputs):
+                if k == len(self._inputs) - 1 - self._steps % memory:
+                    keep(f, newer)
+                out = np.empty(12 + 3 * len(who))
+                alarm = stream_step(f, self._model, self._guards, mine, theirs, who, self._start, out)
+                if alarm:
+                    break
+            else:
+                answer[:] = out
+
+    def _check(self, neighbours: Sequence[RelativeMeasurement]) -> None:
+        for each in neighbours:
+            if each.velocity is not None and not np.isfinite(each.row[POSITION:SPEED]).all():
+                allowed = "must hold position, variance and odometer for a robust filter"
+                raise InputError("neighbours", each.id, allowed, "Send stream.broadcast, or start with robust=False.")
+
+    def _rows(self, names: list[str], neighbours: Sequence[RelativeMeasurement], dt: float) -> Floats:
+        """(k, WIDTH) the measurements, each with the newest message of its vehicle."""
+        rows = np.empty((len(names), WIDTH))
         for row, name, measured in zip(rows, names, neighbours, strict=True):
-            row[:11] = measured.row
-            last, when = self._messages.get(name, NO_MESSAGE)
-            row[11:16], row[PREVIOUS] = last, self._members.get(name, -1)
-            row[LAST_AGE] += self._time - when
+            if measured.velocity is not None:
+                sent = self._time - measured.age
+                if name not in self._messages or sent >= self._messages[name][1] - ROUNDING:
+                    self._messages[name] = measured.row, sent
+            row[:AGE], row[AGE] = measured.row[:AGE], -1.0
+            message, sent = self._messages.get(name, (measured.row, -math.inf))
+            age = max(self._time - sent, 0.0)
+            if age > self.max_age + ROUNDING:
+                continue
+            row[POSITION:] = message[POSITION:]
+            row[AGE], row[TYPICAL:] = age if age > ROUNDING else 0.0, self._fix
+            if self.solo is None:
+                row[VARIANCE:ODOMETER] = self._fix
+        motion_of(rows, self._motion, dt)
+        if len(self._messages) > 64 + 2 * len(names):
+            oldest = self._time - self.max_age
+            self._messages = {name: last for name, last in self._messages.items() if last[1] >= oldest}
         return rows
 
-    def _remember(self, names: list[str], rows: Floats, dt: float) -> None:
-        """Keep the last messages; forget vehicles whose messages are too old."""
-        self._time += dt
-        if len(self._messages) > 64 + 2 * len(names):
-            self._messages = {
-                name: (last, when)
-                for name, (last, when) in self._messages.items()
-                if last[3] + self._time - when <= self.max_age
-            }
-        for name, last in zip(names, rows[:, 11:16].copy(), strict=True):
-            self._messages[name] = last, self._time
+    def _columns(self, names: list[str]) -> Ints:
+        """Numbers of the vehicles, 1 and up, and room for them in the filters."""
+        new = [name for name in names if name not in self._numbers]
+        if len(self._numbers) + len(new) >= 64 + 2 * len(names):
+            self._forget(names)
+        slots, vehicles = self._filters[0].vehicle.size, self._filters[0].slot.size
+        if len(names) >= slots or len(self._numbers) + len(new) >= vehicles:
+            more = max(slots, 2 * len(names) + 1), max(vehicles, 2 * (len(self._numbers) + len(new)) + 1)
+            self._filters = [grown(f, *more) for f in self._filters]
+        free = sorted(set(range(1, self._filters[0].slot.size)) - set(self._numbers.values()))
+        for name, number in zip(new, free, strict=False):
+            self._numbers[name] = number
+            for f in self._filters:
+                f.status[number], f.betrayals[number] = 0.0, 0.0
+                f.status[number, TRUSTED], f.status[number, SENT] = float(self._guards.trust == 0.0), -math.inf
+                f.status[number, KEPT_VARIANCE : KEPT_VARIANCE + 3] = self._guards.tau**2
+        return np.array([self._numbers[name] for name in names], dtype=np.int64)
+
+    def _forget(self, names: list[str]) -> None:
+        """Vehicles that are in no star that is remembered and whose messages are too old."""
+        for name, number in list(self._numbers.items()):
+            there = any(f.slot[number] != ABSENT for f in self._filters) or name in names
+            if not there and name not in self._messages:
+                del self._numbers[name]
 
 
-NO_MESSAGE = np.array([0.0, 0.0, 0.0, np.inf, 0.0]), 0.0
-"""Velocity m/s, age s and how long it has served, s, and when that was so."""
+def grown(f: Filter, slots: int, vehicles: int) -> Filter:
+    """The filter with more room."""
+    larger = make_filter(slots, vehicles)
+    keep(f, larger)
+    larger.betrayals[: len(f.betrayals)] = f.betrayals
+    return larger

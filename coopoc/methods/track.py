@@ -1,23 +1,21 @@
-"""Track: a method's estimates of its egos, and their bytes. Method: the protocol that all methods follow."""
+"""Track: a method's estimates of its egos, and their bytes. Method: the protocol that all follow; checks of options."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Protocol, runtime_checkable
+from dataclasses import dataclass, field, fields
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Floats, checked, instance, number
+from ..arrays import Floats, checked, number
 from ..errors import InputError, shown
 from ..short_repr import short_repr
 from ..world.axes import texts
-from ..world.fleet import Fleet
 from ..world.recording import Recording
+from ..world.sensors import Sensors
 from ..world.v2x import Message
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
+from .noise_model import NoiseModel
 
 UNSOUND = (
     "covariances are not positive semidefinite: the assumed standard deviations lie too far apart for double "
@@ -43,7 +41,8 @@ class Track:
         notes: labels for tables and figures, such as "reconstruction".
         heading: (R, T, E) rad in [-pi, pi), or None of a method that does not estimate it.
         heading_covariance: (R, T, E, 4) of the heading with x, y, z and itself, m rad and rad^2; None as above.
-        extras: other states by name, (R, T, E) each, with their standard deviations under the name and "_std".
+        extras: other numbers by name, (R, T, E), or (R, L) by link; states with their standard deviations under the
+            name and "_std".
     """
 
     t: Floats
@@ -84,7 +83,13 @@ class Track:
         object.__setattr__(self, "notes", texts("notes", self.notes))
         if not isinstance(self.extras, Mapping):
             raise InputError("extras", shown(self.extras), "must be name -> (R, T, E)", "Give {} for none.")
-        extras = {name: checked(f"extras[{name}]", v, "(R, T, E)", x.shape[:3]) for name, v in self.extras.items()}
+        by_link = None if self.neighbours is None else self.neighbours.shape[:2]
+        extras = {
+            name: checked(f"extras[{name}]", v, "(R, L)" if np.ndim(v) == 2 else "(R, T, E)", by_link)
+            if np.ndim(v) == 2 and by_link
+            else checked(f"extras[{name}]", v, "(R, T, E)", x.shape[:3])
+            for name, v in self.extras.items()
+        }
         object.__setattr__(self, "extras", extras)
         if not np.isfinite(self.x).all():
             run, step, ego = np.argwhere(~np.isfinite(self.x).all(axis=-1))[0]
@@ -98,52 +103,11 @@ class Track:
             self._note_unsound(self.covariance.reshape(-1, 3, 3))
 
     def _note_unsound(self, covariance: Floats) -> None:
-        from ..kernels.scores import unsound
+        from ..kernels.covariances import unsound
 
         if (found := unsound(covariance)) and not any(UNSOUND in note for note in self.notes):
             note = f"{found} of {len(covariance)} {UNSOUND}"
             object.__setattr__(self, "notes", (*self.notes, note))
-
-    def plot(
-        self, ax: Axes | None = None, *, fleet: Fleet | None = None, run: int = 0, every: int | None = None
-    ) -> Axes:
-        """Estimated paths of one run with 95 % ellipses, and the truth if a fleet is given.
-
-        Args:
-            ax: of matplotlib; None makes a figure, `plot().figure.savefig(...)` writes it.
-            fleet: that was observed, on the steps of the track.
-            run: 0..R-1.
-            every: steps from one ellipse to the next; None: a fortieth of the drive.
-
-        Raises:
-            InputError: a run that is not there, or a fleet of other steps.
-
-        >>> import coopoc as co
-        >>> fleet = co.Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
-        >>> len(co.Kalman()(co.observe(fleet, co.Sensors())).plot(fleet=fleet).lines)
-        2
-        """
-        from ..escapes import picture
-        from ..pictures import COLORS, PALE, axes, ellipses, finish
-
-        run = number("run", run, 0, len(self.x) - 1, kind=int, allowed=f"in 0..{len(self.x) - 1}")
-        fair = max(len(self.t) // 40, 1)
-        every = number("every", fair if every is None else every, 1, kind=int, allowed=">= 1 step")
-        if fleet is not None and instance("fleet", fleet, Fleet).position.shape[0] != len(self.t):
-            raise InputError(
-                "fleet", repr(fleet), f"must have {len(self.t)} steps", "Give the fleet that was observed."
-            )
-        ax = axes(ax)
-        for k, ego in enumerate(self.egos):
-            color = COLORS[k % len(COLORS)]
-            if fleet is not None:
-                label = "truth" if k == 0 else None
-                ax.plot(*fleet.position[:, ego, :2].T, color=PALE, lw=4, zorder=1, label=label)
-            name = f"vehicle {ego}" if fleet is None else fleet.ids[ego]
-            ax.plot(*self.x[run, :, k, :2].T, color=color, lw=1.2, zorder=2, label=picture(name))
-            if self.covariance is not None:
-                ellipses(ax, self.x[run, ::every, k, :2], self.covariance[run, ::every, k, :2, :2], color)
-        return finish(ax)
 
 
 @runtime_checkable
@@ -164,3 +128,52 @@ class Method(Protocol):
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates of the egos."""
+
+
+NUMBERS: dict[str, Any] = {"int": int, "float": float}
+TYPES: dict[str, Any] = {
+    "bool": bool | np.bool_,
+    "str": str,
+    "Message": Message,
+    "Sensors": Sensors,
+    "NoiseModel | str": NoiseModel | str,
+}
+
+
+Limits = Mapping[str, tuple[float, float, str]]
+"""Option -> least and largest value, and both in words."""
+
+
+def check_options(made: Any, limits: Limits | None = None, kinds: Mapping[str, Any] | None = None) -> None:
+    """InputError for an option of another type than its field of the dataclass has; NumPy's numbers become Python's.
+
+    Args:
+        made: instance of a dataclass, in its `__post_init__`.
+        limits: of numbers; default no NaN.
+        kinds: option -> its class, where that is none of TYPES.
+
+    >>> from coopoc import JointFilter
+    >>> JointFilter(exact="no")
+    Traceback (most recent call last):
+    ...
+    coopoc.errors.InputError: exact = 'no': must be bool. Give JointFilter(exact=...).
+    """
+    own = {str(f.type).removesuffix(" | None"): kinds[f.name] for f in fields(made) if kinds and f.name in kinds}
+    types = {**TYPES, **own}
+    for option in fields(made):
+        name, text, value = option.name, str(option.type), getattr(made, option.name)
+        if not option.init or (value is None and text.endswith("None")):
+            continue
+        text = text.removesuffix(" | None")
+        if isinstance(option.default, str) and text not in types:  # one of some words, which the method lists
+            text = "str"
+        hint = f"Give {type(made).__name__}({name}=...)."
+        if text in NUMBERS:
+            most = 2**62 if text == "int" else np.inf
+            low, high, words = (limits or {}).get(name, (-most, most, "no NaN"))
+            value = number(name, value, low, high, kind=NUMBERS[text], allowed=words, hint=hint)
+            object.__setattr__(made, name, value)
+        elif text == "Floats":
+            object.__setattr__(made, name, checked(name, value))
+        elif text in types and not isinstance(value, types[text]):
+            raise InputError(name, shown(value), f"must be {text}", hint)

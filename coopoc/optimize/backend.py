@@ -12,8 +12,8 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from ..errors import InputError, MissingLibraryError
-from ..plugins import find, names, suggestion, unknown
+from ..errors import InputError, MissingLibraryError, suggestion, unknown
+from ..plugins import find, names
 from .model.problem import Problem
 
 Options: TypeAlias = dict[str, Any]

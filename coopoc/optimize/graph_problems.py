@@ -9,10 +9,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..arrays import Floats, frozen, instance
+from ..arrays import Floats, frozen, instance, one_of
 from ..formats import load_graph
 from ..formats.graph import Graph
-from ..plugins import one_of
 from .convex.chordal import chordal_start
 from .model.factor import Factor
 from .model.problem import Problem, Search

@@ -4,23 +4,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from enum import Enum
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, instance
-from ..errors import InputError, shown
-from ..plugins import suggestion
+from ..arrays import Floats
+from ..errors import InputError, shown, suggestion
 from ..short_repr import short_repr
 from .model.space import Space
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
-
-    from .model.problem import Problem
-
-NAMED = 30
-"""Nodes up to which a picture shows names and ellipses."""
 
 
 class Status(Enum):
@@ -99,41 +90,6 @@ class Solution:
             raise InputError("point", shown(point), f"must be one of {known}", hint)
         where: Floats = self.x[self.names.index(point)]
         return where
-
-    def plot(self, ax: Axes | None = None, *, problem: Problem | None = None) -> Axes:
-        """Nodes in the plane, 95 % ellipses and names where they are few; with the problem its factors and headings.
-
-        Args:
-            ax: of matplotlib; None makes a figure, `plot().figure.savefig(...)` writes it.
-            problem: that was solved.
-
-        >>> from coopoc import Problem, solve
-        >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
-        >>> solve(problem).plot(problem=problem).get_ylabel()
-        'North [m]'
-        """
-        from ..escapes import picture
-        from ..pictures import COLORS, INK, axes, ellipses, finish, pairs
-        from .model.problem import Problem
-
-        ax, at, few = axes(ax), self.position[:, :2], len(self.names) <= NAMED
-        if problem is not None:
-            if instance("problem", problem, Problem).names != self.names:
-                raise InputError("problem", repr(problem), "must be the one that was solved", "Give it to both.")
-            between = [factor for factor in problem.factors if factor.nodes.shape[1] == 2]
-            for k, kind in enumerate(dict.fromkeys(factor.kind for factor in between)):
-                a, b = np.concatenate([factor.nodes for factor in between if factor.kind == kind]).T
-                pairs(ax, at[a], at[b], COLORS[(k + 1) % len(COLORS)], kind.replace("_", " "))
-            if few and problem.poses:
-                poses = list(problem.poses)
-                heading = self.rotation[poses][:, :2, 0]
-                ax.quiver(*at[poses].T, *heading.T, color=INK, angles="xy", width=0.004, zorder=4)
-        if few:
-            ellipses(ax, at, self.covariance[:, :2, :2], COLORS[0], "95 %")
-            for name, place in zip(self.names, at.tolist(), strict=True):
-                ax.annotate(picture(name), place, xytext=(5, 5), textcoords="offset points", fontsize=8, color=INK)
-        ax.plot(*at.T, "o", ms=4 if few else 1.5, color=COLORS[0], zorder=3)
-        return finish(ax)
 
     def __str__(self) -> str:
         at = ", ".join(f"{v:.2f}" for v in self.position[self.shown])

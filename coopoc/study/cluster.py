@@ -101,16 +101,16 @@ def _checked(client: Any, address: str, function: Function) -> dict[str, Mapping
     if several := [worker for worker, threads in client.nthreads().items() if threads > 1]:
         allowed = f"has a worker of several threads, {several[0]}, but cells do not share a process"
         raise InputError("cluster", address, allowed, "Start workers with --nthreads 1, and --nworkers for more.")
-    found = client.run(_environment, function, on_error="return")
+    answers = client.run(_environment, function, on_error="return")
     mine = environment()["coopoc"]
-    for worker, answer in found.items():
+    for worker, answer in answers.items():
         hint = "Install the same coopoc, and the package of the study, where the workers run."
         if isinstance(answer, BaseException):
             raise InputError("cluster", address, f"has a worker, {worker}, that cannot load the study ({answer})", hint)
         if answer["coopoc"] != mine:
             allowed = f"has a worker, {worker}, with coopoc {answer['coopoc']} instead of {mine}"
             raise InputError("cluster", address, allowed, hint)
-    return dict(found)
+    return dict(answers)
 
 
 def _environment(function: Function) -> dict[str, str]:

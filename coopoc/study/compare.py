@@ -4,18 +4,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, TypeAlias
 
 import numpy as np
 import pandas as pd
 
-from ..errors import InputError
-from ..evaluate.statistics import Interval, mean_interval, paired_difference
+from ..errors import InputError, unknown
+from ..evaluate.statistics import Interval, paired_difference
 from ..file_names import given_path
-from ..plugins import unknown
-from .manifest import Manifest, read
+from .manifest import different, read
 from .results import NOTHING, SEED, Results, check_metric, ego_by_run, parsed
 from .style import label, words
 from .tables import Entry, Table
@@ -40,7 +39,6 @@ class Change:
         difference: B - A with the interval that noise, or a tolerance, leaves it.
         better: direction of the metric, if it is known.
         same: A and B agree but for rounding.
-        pairs: number of draws that A and B share.
         missing: number of egos that are left out.
     """
 
@@ -51,7 +49,6 @@ class Change:
     difference: Interval
     better: Direction | None = None
     same: bool = False
-    pairs: int = 0
     missing: int = 0
 
     @property
@@ -104,31 +101,13 @@ def change_table(
     return Table(header, tuple(body), caption, decimals=decimals, notes=tuple(notes))
 
 
-@dataclass(frozen=True)
-class Comparison:
-    """Tables of the differences between two runs.
-
-    Args:
-        settings: settings and versions that differ; None if none does.
-        changes: the metric in both runs.
-    """
-
-    settings: Table | None
-    changes: Table
-
-    def render(self, form: str) -> str:
-        """The tables, one after another, in a format of `coopoc.study.tables.FORMATS`."""
-        shown = [self.settings, self.changes]
-        return "\n\n".join(table.render(form).rstrip("\n") for table in shown if table is not None)
-
-
 def compare(
     a: str | Path, b: str | Path, value: str = "rt_le_m", by: Sequence[str] = (), where: Sequence[str] = ()
-) -> Comparison:
+) -> Table:
     """Mean of a metric in two runs of one study, and B - A with its 95 % interval, for each combination of parameters.
 
-    Runs of the same noise seed are compared draw by draw (ego, run, training seed), so that common noise cancels.
-    Others are compared mean by mean, see `unpaired`. Intervals are over egos, then runs; means are over training seeds.
+    Draws (ego, run, training seed) that both have are compared one by one, so that common noise cancels. Intervals are
+    over egos, then runs; means are over training seeds. A note names settings and versions that differ.
 
     Args:
         a: folder of the study.
@@ -138,15 +117,17 @@ def compare(
         where: "method=okf,kalman": rows to compare.
 
     Raises:
-        InputError: folders of two studies or of none, an unknown column, a metric that is no number, or several rows of
-            one draw.
+        InputError: folders of two studies or of none, or of other noise seeds, an unknown column, a metric that is no
+            number, or several rows of one draw.
     """
     folders = given_path(a), given_path(b)
-    one, two = read(folders[0]), read(folders[1])
-    if one.study != two.study:
-        allowed = f"hold different studies, {one.study} and {two.study}"
-        raise InputError("folders", f"{a} and {b}", allowed, "Compare two runs of one study.")
-    names = list(dict.fromkeys((*one.axes, *two.axes)))
+    first, second = map(read, folders)
+    seeds = [manifest.settings.get("seed") for manifest in (first, second)]
+    if first.study != second.study or seeds[0] != seeds[1]:
+        texts = [f"{m.study} with noise seed {seed}" for m, seed in zip((first, second), seeds, strict=True)]
+        allowed = f"must be one study of one noise seed, not {texts[0]} and {texts[1]}"
+        raise InputError("folders", f"{a} and {b}", allowed, "Compare two runs of one study, with one seed.")
+    names = list(dict.fromkeys((*first.axes, *second.axes)))
     frames = [_frame(Results.load(folder), [*names, *by], value) for folder in folders]
     chosen = parsed(frames, where)
     for name, values in chosen.items():
@@ -154,14 +135,15 @@ def compare(
     if where and not any(map(len, frames)):
         raise InputError("where", " ".join(where), "must have a row in one of the runs", "Name fewer values.")
     labels = [name for name in (*names, *by) if name != SEED]
-    first, second = (_groups(frame, labels) for frame in frames)
-    paired = one.settings.get("seed") == two.settings.get("seed")
-    shared = [key for key in first if key in second]
-    changes = [_change(dict(zip(labels, key, strict=True)), first[key], second[key], value, paired) for key in shared]
-    how = "paired by ego, run and training seed" if paired else "not paired, as the noise seeds differ"
-    caption = f"{words(value)} in A = {folders[0]} and B = {folders[1]}; B - A with its 95 % interval, {how}."
-    notes = _notes(changes, len(first.keys() ^ second.keys()))
-    return Comparison(_settings(one, two, names), change_table(changes, ("A", "B"), caption, labels, 3, notes))
+    before, after = (_groups(frame, labels) for frame in frames)
+    shared = [key for key in before if key in after]
+    changes = [_change(dict(zip(labels, key, strict=True)), before[key], after[key], value) for key in shared]
+    caption = f"{words(value)} in A = {folders[0]} and B = {folders[1]}; B - A with its 95 % interval, draw by draw."
+    whole = (replace(m, settings={**m.settings, **m.environment}, cells={}, axes=()) for m in (first, second))
+    differ = [text for text in different(*whole) if text.split(" (")[0] not in names]
+    notes = _notes(changes, len(before.keys() ^ after.keys()))
+    notes += [f"A and B differ in {', '.join(differ)}."] if differ else []
+    return change_table(changes, ("A", "B"), caption, labels, 3, notes)
 
 
 def _frame(results: Results, names: Sequence[str], value: str) -> pd.DataFrame:
@@ -188,40 +170,16 @@ def _groups(frame: pd.DataFrame, names: Sequence[str]) -> dict[tuple[Any, ...], 
     return {tuple(map(plain, key)): group for key, group in frame.groupby(list(names), sort=False, dropna=False)}
 
 
-def _change(at: Mapping[str, Any], a: pd.DataFrame, b: pd.DataFrame, value: str, paired: bool) -> Change:
+def _change(at: Mapping[str, Any], a: pd.DataFrame, b: pd.DataFrame, value: str) -> Change:
     both = a[[*DRAW, value]].merge(b[[*DRAW, value]], on=DRAW, suffixes=("_a", "_b"))
-    if paired and len(both):
-        finite = both[[f"{value}_a", f"{value}_b"]].notna().all(axis=1)
-        both = both.assign(**{f"{value}{side}": both[f"{value}{side}"].where(finite) for side in ("_a", "_b")})
-        (first, missing), (second, _) = (ego_by_run(both, f"{value}{side}") for side in ("_a", "_b"))
-    else:
-        both = both[:0]
-        (first, lost), (second, gone) = ego_by_run(a, value), ego_by_run(b, value)
-        missing = lost + gone
-    if not first.size or not second.size:
+    sides = [f"{value}_a", f"{value}_b"]
+    both[sides] = both[sides].where(both[sides].notna().all(axis=1))
+    (first, missing), (second, _) = (ego_by_run(both, side) for side in sides)
+    if not first.size:
         return Change(at, value, math.nan, math.nan, NOTHING)
-    if both.empty:
-        gap, same = unpaired(mean_interval(first), mean_interval(second)), False
-    else:
-        gap, same = paired_difference(second, first), bool(np.allclose(first, second, rtol=SAME, atol=0))
-    means = float(first.mean()), float(second.mean())
-    return Change(at, value, *means, gap, same=same, pairs=len(both), missing=missing)
-
-
-def unpaired(a: Interval, b: Interval) -> Interval:
-    """Interval of b - a from the intervals of two independent means.
-
-    With [l, u] of each mean, b - a lies between -sqrt((b - l_b)^2 + (u_a - a)^2) and +sqrt((u_b - b)^2 + (a - l_a)^2).
-
-    References:
-        Zou and Donner, Statistics in Medicine 27, 2008.
-
-    >>> print(unpaired(Interval(1.0, 0.7, 1.3, 30), Interval(2.0, 1.6, 2.4, 30)))
-    1 [0.5, 1.5]
-    """
-    mean = b.mean - a.mean
-    low, high = math.hypot(b.mean - b.low, a.high - a.mean), math.hypot(b.high - b.mean, a.mean - a.low)
-    return Interval(mean, mean - low, mean + high, a.n + b.n)
+    same = bool(np.allclose(first, second, rtol=SAME, atol=0))
+    gap = paired_difference(second, first)
+    return Change(at, value, float(first.mean()), float(second.mean()), gap, same=same, missing=missing)
 
 
 def _notes(changes: Sequence[Change], single: int) -> list[str]:
@@ -237,13 +195,6 @@ def _notes(changes: Sequence[Change], single: int) -> list[str]:
     if missing := sum(change.missing for change in changes):
         notes.append(f"{missing} egos are left out because a run of theirs is missing or not finite.")
     return notes
-
-
-def _settings(one: Manifest, two: Manifest, names: Sequence[str]) -> Table | None:
-    pairs = [(one.settings, two.settings), (one.environment, two.environment)]
-    rows = [(name, *(str(m.get(name, "–")) for m in (a, b))) for a, b in pairs for name in {**a, **b}]
-    differ = tuple(row for row in rows if row[1] != row[2] and row[0] not in names)
-    return Table(("Setting", "A", "B"), differ, "Settings and versions that differ.") if differ else None
 
 
 def plain(value: Any) -> Any:

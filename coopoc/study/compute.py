@@ -49,10 +49,10 @@ class Outcome:
 
 def groups(cells: Sequence[Cell], shares: Sequence[str]) -> list[list[Cell]]:
     """Cells that agree on the parameters `shares`, and so on their recording, in the order of the grid."""
-    found: dict[tuple[Any, ...], list[Cell]] = {}
+    shared: dict[tuple[Any, ...], list[Cell]] = {}
     for cell in cells:
-        found.setdefault(tuple(cell.given.get(name) for name in shares), []).append(cell)
-    return list(found.values())
+        shared.setdefault(tuple(cell.given.get(name) for name in shares), []).append(cell)
+    return list(shared.values())
 
 
 def schedule(cells: Sequence[Cell], shares: Sequence[str], jobs: int) -> list[Cell]:

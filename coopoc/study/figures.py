@@ -1,4 +1,4 @@
-"""Figures of a study: a metric over an axis, its distribution, its bytes, and methods over a case."""
+"""Figures of a study: a metric over an axis, its bytes, and methods over a case."""
 
 from __future__ import annotations
 
@@ -13,25 +13,17 @@ from ..errors import InputError
 from ..escapes import picture
 from ..evaluate.statistics import Interval
 from .numbers import Number, Where, interval, mean, ran
-from .plot import Plot, canvas, legend, name_of, plain_log, strokes
-from .style import NEUTRAL, SYMBOLS, Panel, label, look, title, words
+from .plot import Plot, canvas, legend, plain_log, strokes
+from .style import NEUTRAL, Panel, look, words
 
 if TYPE_CHECKING:
-    import pandas as pd
-
     from .results import Results
 
-__all__ = ["Plot", "cdf", "curves", "multiples", "pareto", "sweep"]
+__all__ = ["Plot", "curves", "multiples", "pareto", "sweep"]
 
 
 def sweep(
-    results: Results,
-    x: str,
-    y: str = "rt_le_m",
-    where: Where | None = None,
-    caption: str = "",
-    log: bool = False,
-    facet: str = "",
+    results: Results, x: str, y: str = "rt_le_m", where: Where | None = None, caption: str = "", log: bool = False
 ) -> Plot:
     """Plot a metric against an axis: one line per method and noise model with its 95 % band; "bound" is dashed.
 
@@ -42,69 +34,24 @@ def sweep(
         x: column of the horizontal axis.
         y: metric.
         where: column -> value or values.
-        caption: under the figure; default the metric, the axis and what `where` selects.
+        caption: under the figure; default the metric and the axis.
         log: logarithmic vertical axis.
-        facet: column of which each value has a panel of its own.
 
     Raises:
         InputError: as `Results.summary`.
     """
-    rows, base = results.select(where), dict(where or {})
-    by = [name for name in _line_names(results, x, facet) if name != facet]
-    faces = rows[facet].unique() if facet else [""]
-    at = {value: {x: value} for value in sorted(rows[x].unique())}
-    panels = [
-        Panel(at, {**base, **({facet: face} if facet else {})}, title(facet, face) if facet else "", words(x))
-        for face in faces
-    ]
-    lines = [names for names, _ in _groups(rows, by)]
-    text = f"{words(y)} against {words(x)}{_selected(where)}. Bands: 95 % intervals over egos, then runs."
-    number = partial(interval, value=y)
-    width = 6.4 if len(panels) == 1 else None
-    plot = curves(results, panels, lines, caption or text, number, ylabel=words(y), log=log, width=width)
+    rows = results.select(where)
+    panel = Panel({value: {x: value} for value in sorted(rows[x].unique())}, dict(where or {}), xlabel=words(x))
+    lines = rows[_line_names(results, x)].drop_duplicates().to_dict("records")
+    text = caption or f"{words(y)} against {words(x)}. Bands: 95 % intervals over egos, then runs."
+    plot = curves(results, [panel], lines, text, partial(interval, value=y), ylabel=words(y), log=log, width=6.4)
     if plot is None:
         raise InputError(y, "no value", "must have been computed for a cell", "See the failed cells.")
     return plot
 
 
-def cdf(results: Results, value: str = "error_quantiles_m", where: Where | None = None, caption: str = "") -> Plot:
-    """Plot the share of errors below each value, with a marker at the mean of the per-run maxima.
-
-    Args:
-        results: of the study.
-        value: column of lists: equally likely quantiles of the errors of one run and ego, the last its maximum.
-        where: column -> value or values.
-        caption: under the figure.
-
-    Raises:
-        InputError: an unknown column or value.
-    """
-    drawn: list[dict[str, Any]] = []
-    maxima: dict[str, list[str]] = {}
-    with canvas() as (figure, axes):
-        for key, frame in results.groups(by := _line_names(results), where):
-            names = dict(zip(by, key, strict=True))
-            errors = np.sort(np.concatenate(frame[value].to_list()))
-            share = np.arange(1, len(errors) + 1) / len(errors)
-            worst = float(np.mean([np.max(q) for q in frame[value]]))
-            axes.plot(errors, share, **{**strokes(names), "marker": None})
-            axes.plot(worst, np.interp(worst, errors, share), **{**strokes(names), "linestyle": "none"}, zorder=3)
-            drawn.append(names)
-            maxima.setdefault(name_of(names), []).append(f"{worst:.1f}")
-        axes.set(xlabel="Error [m]", ylabel="Share of time steps below", ylim=(0, 1.02))
-        plain_log(axes.xaxis)
-        axes.set_xlim(left=0.1)
-        legend(axes, drawn, {method: f" (max {' / '.join(each)} m)" for method, each in maxima.items()})
-    text = f"Cumulative distribution of the error{_selected(where)}. Markers: mean of the per-run maxima."
-    return Plot(figure, caption or text)
-
-
 def pareto(
-    results: Results,
-    x: str = "bytes_per_second",
-    y: str = "rt_le_m",
-    where: Where | None = None,
-    caption: str = "",
+    results: Results, caption: str, x: str = "bytes_per_second", y: str = "rt_le_m", where: Where | None = None
 ) -> Plot:
     """Plot a metric against received bytes per second, a mark per cell; a line joins those that no cheaper one beats.
 
@@ -112,10 +59,10 @@ def pareto(
 
     Args:
         results: of the study.
+        caption: under the figure.
         x: bytes per second of online cooperation.
         y: metric.
         where: column -> value or values.
-        caption: under the figure.
 
     Raises:
         InputError: as `Results.summary`.
@@ -125,7 +72,8 @@ def pareto(
     summary["bytes"] = results.summary(axes, x, where)["mean"]
     drawn = []
     with canvas(width=7.0) as (figure, panel):
-        for of, group in _groups(summary.dropna(subset=["mean"]), names):
+        for key, group in summary.dropna(subset=["mean"]).groupby(names, sort=False):
+            of = dict(zip(names, key, strict=True))
             points = sorted(zip(group["bytes"], group["mean"], strict=True))
             if points[-1][0] == 0 or of["method"] == "bound":
                 _draw(panel, of, min(value for _, value in points))
@@ -139,7 +87,7 @@ def pareto(
         plain_log(panel.yaxis)
         panel.set(xlabel=words(x), ylabel=words(y))
         legend(panel, drawn)
-    return Plot(figure, caption or f"{words(y)} against {words(x)}.")
+    return Plot(figure, caption)
 
 
 STYLE = ("label", "color", "marker", "linestyle", "linewidth")
@@ -177,7 +125,7 @@ def curves(
         log: logarithmic vertical axis; a linear one starts at zero.
         logx: logarithmic horizontal axes.
     """
-    every, found = [*lines, *levels], []
+    every, shown = [*lines, *levels], []
     models = {str(of.get("noise_model")) for of in every if of.get("method") != "bound"} - {"none", "trained"}
     for panel in panels:
         drawn: list[tuple[Where, Any]] = []
@@ -187,13 +135,13 @@ def curves(
             drawn += [(of, ran(points))] if ran(points) else []
         if drawn or len(panels) == 1:
             flat = [(of, number(results, {**panel.where, **of})) for of in levels]
-            found.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
-    if not any(drawn for _, drawn in found):
+            shown.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
+    if not any(drawn for _, drawn in shown):
         return None
     named: list[dict[str, Any]] = []
-    size = {"width": width or 2.2 + 2.1 * len(found) + (len(found) == 1), "height": height}
-    with canvas(1, len(found), sharey=True, squeeze=False, **size) as (figure, (axes,)):
-        for axis, (panel, drawn) in zip(axes, found, strict=True):
+    size = {"width": width or 2.2 + 2.1 * len(shown) + (len(shown) == 1), "height": height}
+    with canvas(1, len(shown), sharey=True, squeeze=False, **size) as (figure, (axes,)):
+        for axis, (panel, drawn) in zip(axes, shown, strict=True):
             for of, points in drawn:
                 names = {name: of[name] for name in ("method", "noise_model") if name in of}
                 if len(models) < 2 and of.get("method") != "bound":
@@ -245,7 +193,7 @@ def multiples(
                 panel.plot(values, np.full(len(values), row), **style)
             panel.set(title=case, xlabel="× reference")
             plain_log(panel.xaxis)
-        labels = [look(m).label + ("" if known in ("trained", "none") else f", {known}") for m, known in rows]
+        labels = [look(m).label + ("" if model in ("trained", "none") else f", {model}") for m, model in rows]
         axes[0].set(yticks=range(len(rows)), yticklabels=labels, ylim=(len(rows) - 0.4, -0.6))
     return Plot(figure, caption)
 
@@ -256,13 +204,6 @@ def _line_names(results: Results, *across: str) -> list[str]:
     return usual if "method" in usual else [name for name in results.axes if name not in across]
 
 
-def _groups(frame: pd.DataFrame, by: Sequence[str]) -> list[tuple[dict[str, Any], pd.DataFrame]]:
-    """Rows of each combination of the columns `by`, with its names, in order of first appearance."""
-    if not by:
-        return [({}, frame)]
-    return [(dict(zip(by, k, strict=True)), g) for k, g in frame.groupby(list(by), sort=False, dropna=False)]
-
-
 def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> bool:
     """Draw a line through points, an Interval with its band, or a number across the panel; False without a number."""
     options = {**strokes(names), **(style or {})}
@@ -270,11 +211,11 @@ def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> 
         value = points.mean if isinstance(points, Interval) else points
         axes.axhline(value, **{**options, "marker": ""})
         return True
-    means = {x: one.mean if isinstance(one, Interval) else one for x, one in points.items()}
-    bands = {x: one for x, one in points.items() if isinstance(one, Interval)}
+    means = {x: point.mean if isinstance(point, Interval) else point for x, point in points.items()}
+    bands = {x: point for x, point in points.items() if isinstance(point, Interval)}
     axes.plot(list(means), list(means.values()), **options)
     if bands:
-        ends = [one.low for one in bands.values()], [one.high for one in bands.values()]
+        ends = [point.low for point in bands.values()], [point.high for point in bands.values()]
         axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0)
     return bool(means)
 
@@ -283,12 +224,3 @@ def _vertical(axes: Axes, text: str, log: bool) -> None:
     axes.set(ylabel=text, **({} if log else {"ylim": (0, None)}))
     if log:
         plain_log(axes.yaxis)
-
-
-def _selected(where: Where | None) -> str:
-    """What a figure is restricted to, for its caption."""
-    texts = []
-    for column, value in (where or {}).items():
-        values = value if isinstance(value, list | tuple) else [value]
-        texts.append(f"{SYMBOLS.get(column, words(column))} = {' or '.join(label(column, one) for one in values)}")
-    return f" at {', '.join(texts)}" if texts else ""

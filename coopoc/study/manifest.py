@@ -62,40 +62,42 @@ def read(folder: Path) -> Manifest:
     """
     path = folder / NAME
     given = store.content(path, _FIELDS, f"holds no {NAME}", "Give a folder that coopoc run has made.")
-    found = Manifest(**{name: given[name] for name in _FIELDS})
-    texts = [*found.axes, *found.environment.values()]
-    if not all(isinstance(text, str) for text in texts) or not all(isinstance(p, dict) for p in found.cells.values()):
+    manifest = Manifest(**{name: given[name] for name in _FIELDS})
+    texts = [*manifest.axes, *manifest.environment.values()]
+    if not all(isinstance(text, str) for text in texts) or not all(
+        isinstance(p, dict) for p in manifest.cells.values()
+    ):
         raise store.damaged(path, "axes, cells or environment")
-    file_name("study", found.study, f"Run the study again: {path} was not written by coopoc run.")
-    if wrong := next((name for name in found.cells if not re.fullmatch("[0-9a-f]{20}", name)), None):
+    file_name("study", manifest.study, f"Run the study again: {path} was not written by coopoc run.")
+    if wrong := next((name for name in manifest.cells if not re.fullmatch("[0-9a-f]{20}", name)), None):
         raise store.damaged(path, f"{wrong[:60]!r} is no name of a cell")
-    return found
+    return manifest
 
 
-def different(one: Manifest, other: Manifest) -> list[str]:
+def different(first: Manifest, second: Manifest) -> list[str]:
     """Differences between two manifests, their environments apart.
 
-    >>> one = Manifest("demo", "?", [], {"runs": 4}, {}, {})
-    >>> different(one, replace(one, settings={"runs": 2}))
+    >>> first = Manifest("demo", "?", [], {"runs": 4}, {}, {})
+    >>> different(first, replace(first, settings={"runs": 2}))
     ['runs (4, 2)']
     """
-    a, b = one.settings, other.settings
-    found = [f"{name} ({a.get(name)}, {b.get(name)})" for name in {**a, **b} if a.get(name) != b.get(name)]
-    if one.cells != other.cells:
-        same = len(one.cells.keys() & other.cells.keys())
-        found.append(f"cells ({len(one.cells)} and {len(other.cells)}, {same} of them the same)")
-    pairs = [(field, getattr(one, field), getattr(other, field)) for field in ("study", "question", "axes")]
-    return found + [f"{field} ({x}, {y})" for field, x, y in pairs if x != y]
+    a, b = first.settings, second.settings
+    texts = [f"{name} ({a.get(name)}, {b.get(name)})" for name in {**a, **b} if a.get(name) != b.get(name)]
+    if first.cells != second.cells:
+        same = len(first.cells.keys() & second.cells.keys())
+        texts.append(f"cells ({len(first.cells)} and {len(second.cells)}, {same} of them the same)")
+    pairs = [(field, getattr(first, field), getattr(second, field)) for field in ("study", "question", "axes")]
+    return texts + [f"{field} ({x}, {y})" for field, x, y in pairs if x != y]
 
 
-def environments(found: Sequence[Mapping[str, str]]) -> dict[str, str]:
+def environments(used: Sequence[Mapping[str, str]]) -> dict[str, str]:
     """Each field once; where machines or versions differ, all of its values.
 
     >>> environments([{"python": "3.11"}, {"python": "3.12"}])
     {'python': '3.11; 3.12'}
     """
-    fields = dict.fromkeys(name for each in found for name in each)
-    values = {name: [v for each in found if name in each for v in each[name].split("; ")] for name in fields}
+    fields = dict.fromkeys(name for each in used for name in each)
+    values = {name: [v for each in used if name in each for v in each[name].split("; ")] for name in fields}
     return {name: "; ".join(dict.fromkeys(listed)) for name, listed in values.items()}
 
 

@@ -61,9 +61,9 @@ def rms(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
     return float(np.sqrt(frame.groupby(["ego", *(["train_seed"] if seeded else [])])["square"].mean()).mean())
 
 
-def difference(results: Results, one: Where, other: Where) -> Interval | None:
-    """RT-LE of `one` less that of `other` in metres, paired by ego and run; None where either was not run."""
-    first, second = present(results, one), present(results, other)
+def difference(results: Results, method: Where, base: Where) -> Interval | None:
+    """RT-LE of `method` less that of `base` in metres, paired by ego and run; None where either was not run."""
+    first, second = present(results, method), present(results, base)
     if first is None or second is None:
         return None
     return paired_difference(results.values("rt_le_m", first), results.values("rt_le_m", second))
@@ -113,19 +113,19 @@ def listed(numbers: Mapping[str, float | None]) -> str:
 def sentence(template: str, **numbers: Any) -> str:
     """The template with its numbers; nothing if one of them was not run.
 
-    >>> sentence("{one:.1f} m", one=2.0), sentence("{one:.1f} m", one=None)
+    >>> sentence("{error:.1f} m", error=2.0), sentence("{error:.1f} m", error=None)
     ('2.0 m', '')
     """
     return "" if None in numbers.values() else template.format(**numbers)
 
 
-def ratio(one: float | None, other: float | None) -> float | None:
-    """one / other; None if either was not run.
+def ratio(value: float | None, base: float | None) -> float | None:
+    """value / base; None if either was not run.
 
     >>> ratio(3.0, 2.0), ratio(None, 2.0)
     (1.5, None)
     """
-    return one / other if one is not None and other else None
+    return value / base if value is not None and base else None
 
 
 def _seeds(results: Results, where: Where) -> list[Any]:
@@ -151,35 +151,3 @@ def seed_std(results: Results, where: Where) -> float | None:
     """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
     each = per_seed(results, where)
     return float(over_seeds(each).means.std(ddof=1)) if len(each) > 1 else None
-
-
-def verdict(results: Results, one: Where, other: Where, name: str) -> str:
-    """Sentence on the RT-LE of `one`, which is trained, against `other`, which is not, with the evidence.
-
-    Args:
-        results: of the study.
-        one: selection of one method.
-        other: selection of another method, over the same egos and runs.
-        name: of the other, for the sentence.
-    """
-    base, each = results.values("rt_le_m", other), per_seed(results, one)
-    gaps = [paired_difference(each.mean(axis=0), base)]
-    text = f"paired difference {gaps[0].mean:+.3f} m; 95 % {_ends(gaps[0])} over egos and runs, "
-    if len(each) > 1:
-        gaps.append(over_seeds(each - base).interval)
-        text += f"{_ends(gaps[1])} over {len(each)} training seeds"
-    else:
-        text += "of one training seed, whose spread is unknown"
-    if not all(np.isfinite([gap.low, gap.high]).all() for gap in gaps):
-        claim = f"cannot be judged against {name}: too few seeds, egos or runs"
-    elif all(gap.high < 0 for gap in gaps):
-        claim = f"beats {name}"
-    elif all(gap.low > 0 for gap in gaps):
-        claim = f"is worse than {name}"
-    else:
-        claim = f"cannot be distinguished from {name}"
-    return f"{claim} ({text})"
-
-
-def _ends(gap: Interval) -> str:
-    return f"[{gap.low:+.3f}, {gap.high:+.3f}]"

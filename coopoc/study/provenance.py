@@ -97,7 +97,7 @@ def code_of(function: Callable[..., Any]) -> str:
     return hashlib.sha256("\n".join(sorted(texts)).encode()).hexdigest()[:20]
 
 
-def _reach(thing: Any, texts: set[str], seen: list[Any]) -> None:
+def _reach(thing: Any, texts: set[str], visited: list[Any]) -> None:
     """Add the text of a value and of what it names: source of functions and classes, contents of constants."""
     if isinstance(thing, functools.partial):
         thing = [thing.func, thing.args, thing.keywords]
@@ -105,20 +105,20 @@ def _reach(thing: Any, texts: set[str], seen: list[Any]) -> None:
         thing = inspect.unwrap(thing)
     if isinstance(thing, str | int | float | bool | None | bytes):
         texts.add(repr(thing))
-    elif not any(thing is other for other in seen):
-        seen.append(thing)
+    elif not any(thing is other for other in visited):
+        visited.append(thing)
         if isinstance(thing, Mapping):
             thing = list(thing.items())
         if isinstance(thing, list | tuple | set | frozenset):
             for each in thing:
-                _reach(each, texts, seen)
+                _reach(each, texts, visited)
         elif isinstance(thing, np.ndarray):
             texts.add(repr(thing.tolist()))
         elif isinstance(thing, FunctionType | type):
             for each in _named(thing, texts):
-                _reach(each, texts, seen)
+                _reach(each, texts, visited)
         elif not isinstance(thing, ModuleType):
-            _reach([type(thing), {} if callable(thing) else getattr(thing, "__dict__", {})], texts, seen)
+            _reach([type(thing), {} if callable(thing) else getattr(thing, "__dict__", {})], texts, visited)
 
 
 def _named(thing: FunctionType | type, texts: set[str]) -> Iterator[Any]:

@@ -10,9 +10,8 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ..errors import InputError
+from ..errors import InputError, unknown
 from ..file_names import file_name, given_path
-from ..plugins import unknown
 from . import reference, store
 from .results import Results
 from .study import Study
@@ -77,7 +76,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
                     path.unlink()
     content = {
         **shown,
-        "findings": {**(made("findings", study.found) or {}), **_reference(study, results)},
+        "findings": {**(made("findings", study.answers) or {}), **_reference(study, results)},
         "recipe": dict(made("recipe", study.recipe) or {}),
         "missing": missing,
         "limitations": list(study.limitations),
@@ -93,12 +92,12 @@ def views(folder: str | Path) -> Mapping[str, Any]:
         InputError: the study was not run to its end, the file is damaged, or a view's name is no file name.
     """
     path = given_path(folder) / VIEWS
-    found = store.content(path, _FIELDS, "holds no views yet", "Run the study to its end: coopoc run NAME.")
-    for view in (*found["tables"], *found["figures"]):
+    stored = store.content(path, _FIELDS, "holds no views yet", "Run the study to its end: coopoc run NAME.")
+    for view in (*stored["tables"], *stored["figures"]):
         if not isinstance(view, dict) or not isinstance(view.get("caption"), str):
             raise store.damaged(path, "a view without a caption")
         file_name("view", view.get("name"), f"Run the study again: {path} was not written by coopoc run.")
-    return found
+    return stored
 
 
 def tables(folder: str | Path, form: str = "markdown", name: str | None = None) -> list[str]:
@@ -112,21 +111,21 @@ def tables(folder: str | Path, form: str = "markdown", name: str | None = None) 
     Raises:
         InputError: as `views`, or an unknown name or format.
     """
-    known = {view["name"]: view for view in views(folder)["tables"]}
-    if name is not None and name not in known:
-        raise unknown("table", name, known)
-    return [Table.from_data(known[n].get("table")).render(form) for n in (known if name is None else [name])]
+    shown = {view["name"]: view for view in views(folder)["tables"]}
+    if name is not None and name not in shown:
+        raise unknown("table", name, shown)
+    return [Table.from_data(shown[n].get("table")).render(form) for n in (shown if name is None else [name])]
 
 
 def _reference(study: Study, results: Results) -> dict[str, str]:
     """How many reference values hold; nothing for a run of other settings."""
     if study.reference is None or not Path(study.reference).is_file():
         return {}
-    known = reference.Reference.load(study.reference)
-    if reference.differing(results, known):
+    expected = reference.Reference.load(study.reference)
+    if reference.differing(results, expected):
         return {}
-    found = reference.check(results, known)
-    return {"reference": f"{reference.summary(found)[:-1]} (coopoc reference)."} if found else {}
+    changes = reference.check(results, expected)
+    return {"reference": f"{reference.table(changes).caption[:-1]} (coopoc reference)."} if changes else {}
 
 
 def _data(value: Any) -> Any:

@@ -12,7 +12,6 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import Positional, arg
 
-from ..arrays import instance, number
 from ..errors import InputError
 from ..evaluate.statistics import Interval
 from ..file_names import given_path
@@ -28,6 +27,16 @@ TOLERANCE, TRAINED = 0.01, 0.05
 trained by them."""
 SIGMA = 2.0
 """Standard errors by which means over other numbers of runs may differ in addition."""
+KINDS: Mapping[str, Any] = {
+    "where": dict,
+    "metric": str,
+    "value": float,
+    "runs": lambda runs: max(int(runs), 1),
+    "run_std": float,
+    "tolerance": float,
+    "better": lambda better: better if better in ("lower", "higher") else float(better),
+}
+"""Field of a number -> how it is read."""
 FREE = ("runs", "weights", "backend", "metric")
 """Settings that may differ from those of the reference."""
 
@@ -81,22 +90,10 @@ class Reference:
         fields = {"study": str, "settings": dict, "numbers": list}
         given = store.content(path, fields, "holds no reference numbers", hint)
         try:
-            numbers = tuple(_sound(Number(**each)) for each in given["numbers"])
-        except (TypeError, InputError) as error:
+            numbers = tuple(Number(**{name: KINDS[name](each[name]) for name in KINDS}) for each in given["numbers"])
+        except (TypeError, KeyError, ValueError, OverflowError) as error:
             raise InputError("file", str(path), f"is damaged ({error})", hint) from None
         return cls(given["study"], given["settings"], numbers)
-
-
-def _sound(read: Number) -> Number:
-    """A number as `save` wrote it; InputError for a field of another kind."""
-    instance("where", read.where, dict)
-    instance("metric", read.metric, str)
-    instance("runs", read.runs, int)
-    if read.better not in ("lower", "higher"):
-        number("better", read.better, -np.inf, np.inf, allowed="lower, higher or a number")
-    for field in ("value", "runs", "run_std", "tolerance"):
-        number(field, getattr(read, field), 1 if field == "runs" else -np.inf, np.inf, allowed="a number, runs >= 1")
-    return read
 
 
 def measure(results: Results, metrics: Mapping[str, Direction]) -> Reference:
@@ -105,13 +102,7 @@ def measure(results: Results, metrics: Mapping[str, Direction]) -> Reference:
     Args:
         results: of the study.
         metrics: name -> "lower", "higher" or the value that is best.
-
-    Raises:
-        InputError: a direction that is none of these.
     """
-    for name, better in metrics.items():
-        if not (better in ("lower", "higher") or isinstance(better, float)):
-            raise InputError("metrics", f"{name}: {better!r}", "must be 'lower', 'higher' or a number", "Give one.")
     numbers = []
     for point, rows in results.groups(results.axes) if len(results.frame) else ():
         where = {name: plain(value) for name, value in zip(results.axes, point, strict=True)}
@@ -156,21 +147,19 @@ def _change(was: Number, now: Number) -> Change:
     return Change(was.where, was.metric, was.value, now.value, interval, was.better)
 
 
-def summary(changes: Sequence[Change]) -> str:
-    """One sentence: the number of reference values that hold, and of those that are worse or better."""
+def table(changes: Sequence[Change], everything: bool = False) -> Table:
+    """The numbers that have moved, or all; the caption says how many hold, and how many are worse or better.
+
+    Args:
+        changes: of `check`.
+        everything: show the numbers that hold, too.
+    """
     counts = {word: sum(change.verdict == word for change in changes) for word in ("within noise", "worse", "better")}
-    moved = [f"{counts[word]} {word}" for word in ("worse", "better") if counts[word]]
-    return f"{counts['within noise']} of {len(changes)} reference numbers hold" + "".join(f"; {m}" for m in moved) + "."
-
-
-def table(changes: Sequence[Change], everything: bool = False) -> Table | None:
-    """The numbers that have moved, or all; None if there are none."""
+    moved = [f"; {counts[word]} {word}" for word in ("worse", "better") if counts[word]]
+    text = f"{counts['within noise']} of {len(changes)} reference numbers hold{''.join(moved)}."
     shown = [change for change in changes if everything or change.verdict != "within noise"]
     columns = [*dict.fromkeys(name for change in shown for name in change.at), "metric"]
-    text = (
-        f"{summary(changes)} A number may move by a share of it and, where runs differ, by {SIGMA:g} standard errors."
-    )
-    return change_table(shown, ("Reference", "Now"), text, columns, 4) if shown else None
+    return change_table(shown, ("Reference", "Now"), text, columns, 4)
 
 
 def reference(
@@ -211,5 +200,5 @@ def reference(
         return 0
     changes = check(results, Reference.load(file))
     shown = table(changes, everything=all)
-    print(shown.to_markdown() if shown else summary(changes))
+    print(shown.to_markdown() if shown.rows else shown.caption)
     return int(any(change.verdict == "worse" for change in changes))

@@ -104,12 +104,12 @@ def _section(folder: Path) -> dict[str, Any]:
 
 def _blocks(shown: Sequence[Mapping[str, Any]]) -> list[list[dict[str, Any]]]:
     """Views in their order, those that differ in the noise model alone together, each with its noise model."""
-    found: dict[tuple[str, bool], list[dict[str, Any]]] = {}
+    blocks: dict[tuple[str, bool], list[dict[str, Any]]] = {}
     for view in shown:
-        stem, _, known = view["name"].rpartition("_")
-        key = (stem, True) if known in NOISE_MODELS else (view["name"], False)
-        found.setdefault(key, []).append({**view, "noise_model": known})
-    return list(found.values())
+        stem, _, model = view["name"].rpartition("_")
+        key = (stem, True) if model in NOISE_MODELS else (view["name"], False)
+        blocks.setdefault(key, []).append({**view, "noise_model": model})
+    return list(blocks.values())
 
 
 def _table(view: Mapping[str, Any], study: str) -> dict[str, Any]:
@@ -171,13 +171,13 @@ def explained(text: object) -> Markup:
     >>> explained("KF < KF")
     Markup('<abbr title="Kalman filter">KF</abbr> &lt; KF')
     """
-    seen: set[str] = set()
+    earlier: set[str] = set()
 
-    def one(match: re.Match[str]) -> str:
+    def marked(match: re.Match[str]) -> str:
         term = match[0]
-        if term in seen:
+        if term in earlier:
             return term
-        seen.add(term)
+        earlier.add(term)
         return f'<abbr title="{escape(TERMS[term])}">{term}</abbr>'
 
-    return Markup(_TERM.sub(one, str(escape(uncontrolled(str(text))))))
+    return Markup(_TERM.sub(marked, str(escape(uncontrolled(str(text))))))

@@ -12,10 +12,9 @@ import pandas as pd
 import pyarrow as pa
 
 from ..arrays import Floats
-from ..errors import InputError
+from ..errors import InputError, unknown
 from ..evaluate.statistics import Interval, mean_interval
 from ..file_names import given_path
-from ..plugins import unknown
 from ..short_repr import short_repr
 from . import store
 from .cell import assignments, parse
@@ -93,8 +92,8 @@ class Results:
             values = list(wanted) if isinstance(wanted, list | tuple | set) else [wanted]
             for value in values:
                 if not _is(self.frame[name], value).any():
-                    known = ", ".join(map(str, self.frame[name].unique()[:12])) or "(no cell has finished)"
-                    raise InputError(name, repr(value), f"must be among {known}", "Widen the grid, or see failures.")
+                    there = ", ".join(map(str, self.frame[name].unique()[:12])) or "(no cell has finished)"
+                    raise InputError(name, repr(value), f"must be among {there}", "Widen the grid, or see failures.")
             frame = frame[np.logical_or.reduce([_is(frame[name], v) for v in values])]
         return frame
 
@@ -102,10 +101,10 @@ class Results:
         """(E, R) of one metric for paired comparisons, sorted by ego and run, averaged over training seeds."""
         frame = self.select(where, **also)
         self._one_cell(frame, [], value)
-        found = ego_by_run(frame, value)[0]
-        if found.size == 0:
+        grid = ego_by_run(frame, value)[0]
+        if grid.size == 0:
             raise InputError(value, "no finite value", "needs an ego with all its runs", "See the failed cells.")
-        return found
+        return grid
 
     def interval(self, value: str, where: Mapping[str, Any] | None = None, **also: Any) -> Interval:
         """Mean of one metric over egos and runs with its interval."""
@@ -135,8 +134,8 @@ class Results:
         for names, frame in self.groups(by, where):
             self._one_cell(frame, by, value)
             grid, missing = ego_by_run(frame, value)
-            found = mean_interval(grid) if grid.size else NOTHING
-            rows.append([*names, found.mean, found.low, found.high, found.n, missing])
+            each = mean_interval(grid) if grid.size else NOTHING
+            rows.append([*names, each.mean, each.low, each.high, each.n, missing])
         return pd.DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
 
     def to_parquet(self, path: str | Path) -> None:
@@ -157,13 +156,13 @@ def parsed(frames: Sequence[pd.DataFrame], texts: Sequence[str]) -> dict[str, tu
     Raises:
         InputError: a column that no frame has, or a value of another type.
     """
-    found = {}
+    chosen = {}
     for name, text in assignments(texts).items():
-        known = [frame[name].dropna() for frame in frames if name in frame]
-        if not known:
+        columns = [frame[name].dropna() for frame in frames if name in frame]
+        if not columns:
             raise unknown("column", name, [column for frame in frames for column in frame.columns])
-        found[name] = parse(name, text, tuple(pd.concat(known).iloc[:1].tolist()))
-    return found
+        chosen[name] = parse(name, text, tuple(pd.concat(columns).iloc[:1].tolist()))
+    return chosen
 
 
 def check_metric(frame: pd.DataFrame, value: str) -> None:

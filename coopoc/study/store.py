@@ -74,17 +74,17 @@ def content(path: Path, fields: Mapping[str, Any], absent: str, hint: str) -> di
         raise InputError("folder", str(path.parent), absent, hint)
     try:
         text = path.read_text()
-        found: Any = json.loads(text)
+        given: Any = json.loads(text)
         if "\\ud" in text.lower():
-            json.dumps(found, ensure_ascii=False).encode()  # half of a surrogate pair is no text: a ValueError
+            json.dumps(given, ensure_ascii=False).encode()  # half of a surrogate pair is no text: a ValueError
     except (ValueError, RecursionError) as error:
         raise damaged(path, str(error)) from None
-    if not isinstance(found, dict):
-        raise damaged(path, f"a {type(found).__name__} instead of fields")
+    if not isinstance(given, dict):
+        raise damaged(path, f"a {type(given).__name__} instead of fields")
     for name, kind in fields.items():
-        if not isinstance(found.get(name), kind):
-            raise damaged(path, f"{name} is a {type(found[name]).__name__}" if name in found else f"{name} is missing")
-    return found
+        if not isinstance(given.get(name), kind):
+            raise damaged(path, f"{name} is a {type(given[name]).__name__}" if name in given else f"{name} is missing")
+    return given
 
 
 def damaged(path: Path, damage: str) -> InputError:

@@ -11,10 +11,10 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..errors import InputError
+from ..errors import InputError, unknown
 from ..file_names import file_name
 from ..one_file import file_digest, from_file, in_file
-from ..plugins import find, unknown
+from ..plugins import find
 from .cell import Cell, Params, Row, Scalar, digest, parse
 from .provenance import code_of
 
@@ -120,10 +120,10 @@ class Study:
             raise InputError("grid", twice[0], "must not be there twice", "Give each value once.")
         return cells
 
-    def found(self, results: Results) -> dict[str, str]:
+    def answers(self, results: Results) -> dict[str, str]:
         """Findings by key: those whose numbers were run.
 
-        >>> Study("demo", "?", dict, {"x": (1,)}, findings=lambda results: {"a": "It does.", "b": ""}).found(None)
+        >>> Study("demo", "?", dict, {"x": (1,)}, findings=lambda results: {"a": "It does.", "b": ""}).answers(None)
         {'a': 'It does.'}
         """
         given = self.findings(results) if self.findings else {}
@@ -226,11 +226,11 @@ def _check_used(study: Study, name: str) -> None:
 
 def _narrow(grid: Any, name: str, value: Any) -> Any:
     listed = value.split(",") if isinstance(value, str) else value if isinstance(value, list | tuple) else [value]
-    known = list(grid[name]) if isinstance(grid, Mapping) else list(dict.fromkeys(p[name] for p in grid if name in p))
-    wanted = [parse(name, v, next((k for k in known if k is not None), None)) for v in listed]
+    values = list(grid[name]) if isinstance(grid, Mapping) else list(dict.fromkeys(p[name] for p in grid if name in p))
+    wanted = [parse(name, v, next((k for k in values if k is not None), None)) for v in listed]
     if isinstance(grid, Mapping):
         return {**grid, name: tuple(wanted)}
     for v in wanted:
-        if v not in known:
-            raise InputError(name, repr(v), f"must be among {known}", "The grid of this study is a fixed list.")
+        if v not in values:
+            raise InputError(name, repr(v), f"must be among {values}", "The grid of this study is a fixed list.")
     return [p for p in grid if name in p and p[name] in wanted]

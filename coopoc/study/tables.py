@@ -12,10 +12,10 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 from tabulate import tabulate
 
+from ..arrays import one_of
 from ..errors import InputError
 from ..escapes import markdown, spreadsheet, tex, visible
 from ..evaluate.statistics import Interval
-from ..plugins import one_of
 from .numbers import Number, Where
 from .style import METHODS, label, title, words
 

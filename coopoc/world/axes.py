@@ -9,8 +9,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Floats, checked, listed
-from ..errors import InputError, shown
-from ..plugins import unknown
+from ..errors import InputError, shown, unknown
 
 
 def texts(field: str, values: object) -> tuple[str, ...]:

@@ -8,8 +8,8 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from ..errors import InputError
+from .inbox import within_cap
 from .recording import Recording
-from .schedules import within_cap
 from .v2x import Message
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -16,9 +16,6 @@ from .axes import clock, columns, interval, names, texts
 from .links import Links
 from .sensors import Sensors
 from .v2x import V2X
-
-if TYPE_CHECKING:
-    from matplotlib.axes import Axes
 
 
 @dataclass(frozen=True, eq=False)
@@ -256,37 +253,6 @@ class Recording:
                 hint = "Cut the drive with fleet.between(...)." if step == 0 else "Take a method that does without."
                 raise InputError("egos", repr(ego), f"has no fix at step {step}, where this method needs one", hint)
         return cols
-
-    def plot(self, ax: Axes | None = None, *, run: int = 0, step: int | None = None) -> Axes:
-        """Fixes of one run, vehicle by vehicle, and at one step who measures whom.
-
-        Args:
-            ax: of matplotlib; None makes a figure, `plot().figure.savefig(...)` writes it.
-            run: 0..R-1.
-            step: 0..T-1; None: the middle.
-
-        Raises:
-            InputError: a run or a step that is not there.
-
-        >>> from coopoc import Fleet, Sensors, observe
-        >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
-        >>> observe(fleet, Sensors()).plot(step=1).get_xlabel()
-        'East [m]'
-        """
-        from ..escapes import picture
-        from ..pictures import COLORS, INK, axes, finish, pairs
-
-        run, last = number("run", run, 0, self.runs - 1, kind=int, allowed=f"in 0..{self.runs - 1}"), len(self.t) - 1
-        step = number("step", last // 2 if step is None else step, 0, last, kind=int, allowed=f"in 0..{last}")
-        ax, fixes, few = axes(ax), self.gnss[run, :, :, :2], len(self.ids) <= len(COLORS)
-        for k, name in enumerate(self.ids):
-            color = COLORS[k % len(COLORS)]
-            ax.plot(*fixes[:, k].T, ".", ms=1.6, color=color, alpha=0.6, label=picture(name) if few else None, zorder=2)
-        here = self.links.step == step
-        observer, neighbour = self.links.observer[here], self.links.neighbour[here]
-        pairs(ax, fixes[step, observer], fixes[step, neighbour], INK)
-        ax.plot(*fixes[step].T, "o", ms=4.5, mfc="white", mec=INK, zorder=3, label=f"t = {self.t[step]:g} s")
-        return finish(ax)
 
     def __repr__(self) -> str:
         return (

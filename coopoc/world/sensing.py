@@ -8,20 +8,19 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from ..arrays import AnyArray, Bools, Floats, Ints, instance, number
+from ..arrays import AnyArray, Bools, Floats, Ints, instance, number, one_of
 from ..errors import InputError
-from ..plugins import one_of
 from .axes import columns
-from .body_frames import body_measurements, gauss_markov, in_body
+from .body_frames import body_measurements, body_motion, gauss_markov, in_body
+from .channels import lost
+from .faults import PAIRS, wrong_fixes, wrong_odometry, wrong_relative
 from .fleet import Fleet
 from .links import Links, spherical, wrap
 from .recording import Recording
 from .sensors import Sensors, stream
-from .v2x import V2X, lost
+from .v2x import V2X
 
 Frame = Literal["world", "body"]
-PAIRS = 2_000_000
-"""Pairs of vehicles that are looked at in one go, at most: it bounds the memory."""
 _alive: WeakValueDictionary[tuple[Any, ...], AnyArray] = WeakValueDictionary()
 """Draws of recordings that still exist, by all that they depend on: the next channel need not draw them again."""
 
@@ -37,12 +36,14 @@ def observe(
     assumed: Sensors | None = None,
     frame: Frame = "world",
     landmarks: Sequence[int | str] = (),
+    told: bool = False,
 ) -> Recording:
     """Measurements of a drive in `runs` noise realisations.
 
     GNSS z = x + n + b + drift, velocity u + e, relative (d, az, inc) + n of the K nearest within the radius. Noise is
     keyed by (seed, sensor, run, vehicle, partner) and step: 30 runs are a prefix of 100, K = 2 is a subset of K = 10.
-    A noisy range that would be negative is reflected, as in the authors' public code.
+    A noisy range that would be negative is reflected, as in the authors' public code. `Sensors.outliers` are added to
+    these draws; the notes of the recording name them.
 
     Args:
         fleet: the truth.
@@ -55,6 +56,8 @@ def observe(
         frame: "world" for velocities and azimuths in the world; "body" for forward, left and up, azimuths from the
             observer's heading, yaw rates, and headings by a compass if `sensors.compass`.
         landmarks: vehicles that stand at known positions: all within the radius are measured, and none sends.
+        told: whether outliers are removed, as for an estimator which is told of them: a wrong fix, range or angle is
+            missing (NaN), and odometry has no slip.
 
     Raises:
         InputError: runs < 1, seed < 0, a rate above 1/dt, an unknown observer, an assumed std of zero, another frame,
@@ -71,25 +74,30 @@ def observe(
     observing = range(len(fleet.ids)) if observers is None else columns("observers", observers, fleet.ids)
     watching = tuple(sorted(set(observing)))
     one_of("frame", frame, get_args(Frame))
-    assumed = sensors.without_bias() if assumed is None else instance("assumed", assumed, Sensors)
+    assumed = sensors.known() if assumed is None else instance("assumed", assumed, Sensors)
     standing = columns("landmarks", landmarks, fleet.ids)
     links = find_links(fleet, watching, v2x.max_neighbours, v2x.radius, sensors.min_range, standing)
     broadcasts, arrival = schedule(fleet, links, v2x, runs, seed)
     arrival[:, np.isin(links.neighbour, standing)] = -1
     broadcasts[:, standing] = False
-    drawn, key = (fleet, sensors, runs, seed), (fleet, repr(sensors), runs, seed)
+    instance("told", told, bool, "Give True to remove outliers.")
+    drawn, key = (fleet, sensors, runs, seed, told), (fleet, repr(sensors), runs, seed, told)
     gnss = _once(("gnss", *key), lambda: _gnss(*drawn))
     if standing:
         gnss = gnss.copy()
         gnss[:, :, standing] = fleet.position[:, standing]
     who = (watching, tuple(standing), v2x.radius, v2x.max_neighbours)
-    relative = _once(("relative", *key, who), lambda: _relative_measurements(fleet, links, sensors, runs, seed))
+    relative = _once(
+        ("relative", *key, who), lambda: _relative_measurements(fleet, links, sensors, v2x, runs, seed, told)
+    )
     body = None
     if frame == "world":
         velocity = _once(("velocity", *key), lambda: _velocity(*drawn))
     else:
-        velocity, body = body_measurements(*drawn)
+        velocity, body = body_measurements(fleet, sensors, runs, seed)
+        wrong_odometry(velocity, body_motion(fleet)[0], fleet, sensors.outliers, seed, told)
         relative = in_body(relative, fleet, links, _heading(fleet, links, sensors, runs, seed))
+    notes = tuple(f"{note}{', removed' * told}" for note in sensors.outliers.notes)
     return Recording(
         ids=fleet.ids,
         t=fleet.t,
@@ -102,6 +110,7 @@ def observe(
         sensors=assumed,
         v2x=v2x,
         observers=watching,
+        notes=notes,
         body=body,
         landmarks=tuple(standing),
     )
@@ -193,7 +202,7 @@ def _noisy(fleet: Fleet, sensor: str, runs: int, seed: int, mean: Floats, std: F
     return found
 
 
-def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
+def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int, told: bool) -> Floats:
     fixes = _noisy(fleet, "gnss", runs, seed, fleet.position, np.array(sensors.gnss_std))
     low, high = sensors.gnss_bias
     steps = len(fleet.t) if sensors.gnss_bias_mode == "sample" else 1
@@ -205,11 +214,14 @@ def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
             if std > 0:  # the common error belongs to no vehicle
                 draws = [stream(seed, "gnss_drift", r, name).standard_normal((len(fleet.t), 3)) for name in names]
                 fixes[r] += std * gauss_markov(np.stack(draws, axis=1), fleet.dt / sensors.gnss_drift_time)
+    wrong_fixes(fixes, fleet, sensors.outliers, seed, told)
     return fixes
 
 
-def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int) -> Floats:
-    return _noisy(fleet, "velocity", runs, seed, fleet.velocity, sensors.velocity_std(fleet.velocity))
+def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int, told: bool) -> Floats:
+    velocity = _noisy(fleet, "velocity", runs, seed, fleet.velocity, sensors.velocity_std(fleet.velocity))
+    wrong_odometry(velocity, fleet.velocity, fleet, sensors.outliers, seed, told)
+    return velocity
 
 
 def _pairs(fleet: Fleet, links: Links) -> list[tuple[str, str, Ints]]:
@@ -220,7 +232,9 @@ def _pairs(fleet: Fleet, links: Links) -> list[tuple[str, str, Ints]]:
     return [(fleet.ids[links.observer[g[0]]], fleet.ids[links.neighbour[g[0]]], g) for g in groups]
 
 
-def _relative_measurements(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int) -> Floats:
+def _relative_measurements(
+    fleet: Fleet, links: Links, sensors: Sensors, v2x: V2X, runs: int, seed: int, told: bool
+) -> Floats:
     """(R, L, 3): the step's own draw of the pair's stream, so a link that comes and goes keeps its draws."""
     vector = fleet.position[links.step, links.neighbour] - fleet.position[links.step, links.observer]
     exact = np.stack(spherical(*vector.T), axis=-1) if len(links) else np.empty((0, 3))
@@ -236,6 +250,8 @@ def _relative_measurements(fleet: Fleet, links: Links, sensors: Sensors, runs: i
         relative[r] += exact
         relative[r, :, 0] = np.abs(relative[r, :, 0])
         relative[r, :, 1] = wrap(relative[r, :, 1] + turned[r])
+    reach = sensors.min_range, v2x.radius
+    wrong_relative(relative, pairs, fleet, links, sensors.outliers, reach, seed, told)
     return relative
 
 

@@ -8,9 +8,9 @@ from typing import Literal, get_args
 
 import numpy as np
 
-from ..arrays import Floats, listed, number
+from ..arrays import Floats, instance, listed, number, one_of
 from ..errors import InputError, shown
-from ..plugins import one_of
+from .outliers import Outliers
 
 BiasMode = Literal["run", "sample"]
 VelocityReading = Literal["axis", "speed"]
@@ -67,6 +67,8 @@ class Sensors:
     """s, correlation time of these two (Gauss-Markov); the default is one draw for a whole run."""
     min_range: float = 2.0
     """m, centres closer than a vehicle is wide are not measured (a range near zero makes angles seem exact)."""
+    outliers: Outliers = Outliers()
+    """What goes wrong beyond noise. It acts; what methods assume has none unless you say so."""
 
     def __post_init__(self) -> None:
         words = {"gnss_bias_mode": get_args(BiasMode), "velocity_reading": get_args(VelocityReading)}
@@ -75,6 +77,8 @@ class Sensors:
             name, value = field.name, getattr(self, field.name)
             if name in words:
                 one_of(name, value, words[name])
+            elif name == "outliers":
+                instance(name, value, Outliers, "Give Outliers(ranges=Fault(0.05, (3.0, 20.0))).")
             elif isinstance(field.default, bool):
                 if not isinstance(value, bool):
                     raise InputError(name, shown(value), "must be True or False", "Say whether there is one.")
@@ -130,9 +134,9 @@ class Sensors:
         """Noise std (..., 3) m/s that a method assumes at a *measured* velocity: never below `velocity_floor`."""
         return self.velocity_std(velocity, self.velocity_floor)
 
-    def without_bias(self) -> Sensors:
-        """The same sensors as a method may know them: it does not know the bias."""
-        return replace(self, gnss_bias=(0.0, 0.0))
+    def known(self) -> Sensors:
+        """The same sensors as a method may know them: it knows neither the bias nor the outliers."""
+        return replace(self, gnss_bias=(0.0, 0.0), outliers=Outliers())
 
     def check_assumed(self) -> Sensors:
         """Itself, if a method may assume it; InputError where an assumed std is zero."""

@@ -1,65 +1,122 @@
-"""Attack: a share of the vehicles broadcasts fixes that are off by a constant, as a spoofed or lying receiver does."""
+"""Attack: a share of the vehicles broadcasts displaced fixes, as a spoofed or a lying receiver does."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import number
+from ..arrays import Floats, instance, listed, number
 from ..errors import InputError
 from .recording import Recording
 from .sensors import stream
 
-MOST = 1e9
-"""m, no offset is larger."""
+
+@dataclass(frozen=True)
+class Spoofing:
+    r"""Offset of the fixes of spoofed vehicles, $o_t = \pm\, U(low, high) \min(1, (t - start) / ramp)$ on each axis.
+
+    Every vehicle has random signs and sizes of its own, unless they collude.
+
+    >>> Spoofing(0.2, start=30.0).note
+    '20 % of the vehicles spoofed, fixes 5 to 40 m off on each axis, from 30 s on'
+    """
+
+    share: float = 0.2
+    """Probability that a vehicle is spoofed, in [0, 1]."""
+    offset: tuple[float, float] = (5.0, 40.0)
+    """(low, high) m, on each axis."""
+    start: float = 0.0
+    """s into the drive."""
+    ramp: float = 0.0
+    """s over which the offset grows to its full size; 0: it jumps."""
+    collude: bool = False
+    """Whether all spoofed vehicles of a run have the same offset, so that they confirm one another."""
+
+    def __post_init__(self) -> None:
+        share = number("share", self.share, 0, 1, allowed="in [0, 1]", hint="0.2 attacks every fifth vehicle.")
+        given = listed("offset", self.offset, "Give (low, high) in metres.", "must be 2 numbers")
+        if len(given) != 2:
+            raise InputError("offset", self.offset, "must be 2 numbers", "Give (low, high) in metres.")
+        low, high = (number("offset", v, 0, 1e9, allowed=">= 0 m", hint="Signs are drawn.") for v in given)
+        if low > high:
+            raise InputError("offset", self.offset, "must be (low, high) with low <= high", "Swap the two.")
+        hint = "0 is from the first step on, at once."
+        start, ramp = (number(name, getattr(self, name), 0, 1e9, hint=hint) for name in ("start", "ramp"))
+        instance("collude", self.collude, bool, "Give True for one offset of all.")
+        for name, value in (("share", share), ("offset", (low, high)), ("start", start), ("ramp", ramp)):
+            object.__setattr__(self, name, value)
+
+    def size(self, t: Floats) -> Floats:
+        """(T,) share of the full offset at times t s.
+
+        >>> Spoofing(start=1.0, ramp=2.0).size(np.array([0.0, 1.0, 2.0, 9.0])).tolist()
+        [0.0, 0.0, 0.5, 1.0]
+        """
+        since = t - t[0] - self.start
+        return np.asarray(np.clip(since / self.ramp, 0.0, 1.0) if self.ramp else since >= -1e-9, dtype=float)
+
+    @property
+    def note(self) -> str:
+        """The attack in words."""
+        low, high = self.offset
+        return (
+            f"{100 * self.share:g} % of the vehicles spoofed, fixes {low:g} to {high:g} m off on each axis"
+            + (f", from {self.start:g} s on" if self.start else "")
+            + (f", growing over {self.ramp:g} s" if self.ramp else "")
+            + (", all alike" if self.collude else "")
+        )
 
 
 def spoofed(
     recording: Recording,
-    share: float,
-    low: float = 5.0,
-    high: float = 40.0,
+    attack: Spoofing | float,
     seed: int = 0,
     honest: Sequence[int | str] = (),
+    *,
+    told: bool = False,
 ) -> Recording:
-    """The recording with the fixes of spoofed vehicles moved: gnss' = gnss + o, o ~ U(low, high) on each axis.
+    """The recording with the fixes of spoofed vehicles displaced, gnss' = gnss + o.
 
-    In each run every vehicle that is not `honest` is spoofed with probability `share`, and keeps its offset for the
-    whole drive. Both draws are keyed by (seed, run, id): a vehicle spoofed at 20 % is spoofed, by the same offset, at
-    30 %, and no other noise changes. Velocities and relative measurements stay true. A spoofed vehicle reads
-    its own false fix, too: name the egos among the honest ones.
+    Which vehicles are spoofed, and by what, is keyed by (seed, run, id): a vehicle spoofed at a share of 20 % is
+    spoofed by the same offset at 30 %, and no other noise changes. Velocities and relative measurements stay true. A
+    spoofed vehicle reads its own false fix, too: name the egos among the honest ones.
 
     Args:
         recording: of an honest fleet.
-        share: in [0, 1].
-        low: m, least offset.
-        high: m, largest offset.
+        attack: or its share alone.
         seed: of the attack.
         honest: columns or ids of egos that are never spoofed.
+        told: whether false fixes are missing (NaN) instead, as for an estimator which is told of the attack.
 
     Raises:
-        InputError: a share outside [0, 1], low > high or not finite, seed < 0, an honest vehicle that is no ego.
+        InputError: a share outside [0, 1], seed < 0, an honest vehicle that is no ego.
 
     >>> from coopoc import Fleet, Sensors, observe
     >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
     >>> seen = observe(fleet, Sensors())
-    >>> (spoofed(seen, 1.0, honest=["a"]).gnss - seen.gnss)[0, :, :, 0].round(1)
+    >>> abs(spoofed(seen, 1.0, honest=["a"]).gnss - seen.gnss)[0, :, :, 0].round(1)
     array([[ 0. , 14.9],
            [ 0. , 14.9]])
     """
-    share = number("share", share, 0, 1, allowed="in [0, 1]", hint="0.2 attacks every fifth vehicle.")
-    low, high = (number("low, high", v, -MOST, MOST, allowed="finite", hint="Give metres.") for v in (low, high))
-    if low > high:
-        raise InputError("low, high", (low, high), "must be finite with low <= high", "Give metres per axis.")
+    attack = attack if isinstance(attack, Spoofing) else Spoofing(attack)
     seed = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number from 0 on will do.")
+    instance("told", told, bool, "Give True to remove false fixes.")
     spared = recording.columns(honest) if np.size(honest) else []
     offset = np.zeros((recording.runs, len(recording.ids), 3))
     for run in range(recording.runs):
+        common = _offset(stream(seed, "attack", run, ""), attack)
         for column, name in enumerate(recording.ids):
             draws = stream(seed, "attack", run, name)
-            if draws.uniform() < share and column not in spared:
-                offset[run, column] = draws.uniform(low, high, 3)
-    note = f"{100 * share:g} % of the vehicles spoofed: fixes {low:g} to {high:g} m off on each axis"
-    return replace(recording, gnss=recording.gnss + offset[:, None], notes=(*recording.notes, note))
+            if draws.uniform() < attack.share and column not in spared:
+                offset[run, column] = common if attack.collude else _offset(draws, attack)
+    error = attack.size(recording.t)[:, None, None] * offset[:, None]
+    gnss = np.where(error != 0, np.nan, recording.gnss) if told else recording.gnss + error
+    note = attack.note + ", removed" * told
+    return replace(recording, gnss=gnss, notes=(*recording.notes, note))
+
+
+def _offset(draws: np.random.Generator, attack: Spoofing) -> Floats:
+    size = draws.uniform(*attack.offset, 3)
+    return np.where(draws.uniform(size=3) < 0.5, size, -size)

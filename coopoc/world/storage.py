@@ -17,6 +17,7 @@ from ..errors import InputError
 from ..file_names import given_path
 from .fleet import Fleet
 from .links import Links
+from .outliers import Fault, Outliers
 from .recording import Body, Recording
 from .sensors import Sensors
 from .v2x import V2X
@@ -129,6 +130,8 @@ def digest(recording: Recording) -> str:
 
 def _recording(words: dict[str, Any], arrays: dict[str, Any]) -> tuple[Recording, Fleet | None]:
     noise: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in words["sensors"].items()}
+    if "outliers" in noise:
+        noise["outliers"] = Outliers(**{kind: Fault(**fault) for kind, fault in noise["outliers"].items()})
     ids, t = tuple(words["ids"]), arrays["t"]
     recording = Recording(
         ids=ids,

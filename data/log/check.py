@@ -2,16 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-from scipy.stats import linregress
+import pandas as pd
+from scipy.stats import chi2, linregress
 
-from coopoc.arrays import Floats, robust_std
+from coopoc.arrays import AnyArray, Floats, robust_std
 from coopoc.errors import InputError
-from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
+from coopoc.evaluate.metrics import dimensions, fix_innovations, normalised_innovations
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.methods.poses.pose_start import pose_start
@@ -28,6 +29,8 @@ WIDE, NARROW = 2.0, 0.4
 """Ratios of a measured to a stated standard deviation at which something is wrong."""
 FAR = 10.0
 """Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
+ALIKE = 0.97
+"""Correlation of the displacements of fixes and odometry that noise alone does not bring about."""
 ENOUGH = 20
 """Measurements from which a statistic is worth a word."""
 COARSE = 0.5
@@ -46,10 +49,26 @@ MISTAKEN = (
     (3.0, 3.6, "Are positions in feet? They are in m."),
 )
 """Ratios of the distance of fixes to that of odometry (least, largest), and the unit that explains them."""
-FEW, APART = 5, 3.0
+FEW, APART = 5, 1.5
 """Fixes with a truth from which a difference of frames shows; standard deviations of a fix that it must have."""
 SIGMAS = 6.0
-"""Standard errors of an offset of clocks beyond which it is no chance."""
+"""Standard errors of an offset beyond which it is no chance."""
+OUTLYING, OUTLIERS = 5.0, 0.01
+"""Standard deviations beyond which a measurement is an outlier; the share of them that is worth a word."""
+WINDOW, BLOCKS = 9, 10
+"""Measurements of a pair whose median is taken off before outliers are counted; parts of a drive whose medians say how
+sure an offset of a pair is."""
+UNUSED = 0.05
+"""Share of what was logged that may be left out without a word."""
+ADVICE = {
+    "repeated rows": "Do stamps lack their fraction, as stamp.sec without nanosec, or do two vehicles share a name?",
+    "fixes in gaps of the odometry": "Where a vehicle stands, log a speed of 0; raise max_gap= for longer gaps.",
+    "relative measurements of members": "Give a fix of each, or a table vehicle, x, y of places.",
+    "relative measurements while": "Do their clocks differ? Give clock=, or raise max_gap=.",
+    "fixes beside": "A shorter dt= uses them.",
+    "relative measurements beside": "A shorter dt= uses them.",
+}
+"""How to use what was left out, by the beginning of the reason."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,32 +241,58 @@ def _rms(vectors: Floats) -> float | None:
     return float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else None
 
 
-def _against_odometry(rec: Recording, column: int) -> tuple[float | None, float | None]:
-    """Distance of fixes over distance of odometry, over spans in which the odometry (if that stands still, the fixes)
-    moves far, with the fixes' noise taken off; and the angle between the two, deg. None where too little moves."""
-    fixes, velocity = rec.gnss[0, :, column, :2], rec.velocity[0, :, column, :2]
-    path = np.cumsum(np.nan_to_num(velocity) * rec.dt, axis=0)
-    gaps = np.cumsum(np.isnan(velocity[:, 0]))
-    variance = float(np.square(rec.sensors.fix_std[:2]).sum())
+def _moves(rec: Recording, column: int) -> tuple[AnyArray, AnyArray]:
+    """Displacements (M,) m, x + iy, of the fixes and of the odometry over the same spans, in which the odometry (if
+    that stands still, the fixes) moves far; none where too little moves."""
+    fixes, velocity = rec.gnss[0, :, column, :2] @ [1, 1j], rec.velocity[0, :, column, :2] @ [1, 1j]
+    path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
     for moves, far in ((path, FAR), (fixes, 2 * FAR)):
         pairs, last = [], -1
-        for step in np.flatnonzero(np.isfinite(fixes[:, 0])).tolist():
+        for step in np.flatnonzero(np.isfinite(fixes)).tolist():
             if last < 0 or gaps[step] != gaps[last]:
                 last = step
-            elif np.linalg.norm(moves[step] - moves[last]) > far * np.sqrt(variance):
+            elif abs(moves[step] - moves[last]) > far * np.hypot(*rec.sensors.fix_std[:2]):
                 pairs.append((last, step))
                 last = step
         if len(pairs) >= 3:
-            break
-    else:
+            a, b = np.array(pairs).T
+            return fixes[b] - fixes[a], path[b] - path[a]
+    return np.empty(0), np.empty(0)
+
+
+def _against_odometry(rec: Recording, column: int) -> tuple[float | None, float | None]:
+    """Distance of fixes over distance of odometry, with the fixes' noise taken off; and the angle between the two, deg.
+    None where too little moves."""
+    moved, driven = _moves(rec, column)
+    if not len(moved):
         return None, None
-    a, b = np.array(pairs).T
-    moved, driven = ((xy[b] - xy[a]) @ [1, 1j] for xy in (fixes, path))
-    square = max(float((np.abs(moved) ** 2).sum()) - 2 * variance * len(pairs), 0.0)
+    variance = 2 * len(moved) * float(np.square(rec.sensors.fix_std[:2]).sum())
     length = float(np.linalg.norm(driven))
     if length == 0:
         return float("inf"), None
-    return float(np.sqrt(square) / length), float(np.degrees(np.angle(np.vdot(driven, moved))))
+    far = max(float(np.linalg.norm(moved)) ** 2 - variance, 0.0) ** 0.5
+    return far / length, float(np.angle(np.vdot(driven, moved), deg=True))
+
+
+def _axes(rec: Recording, column: int) -> str:
+    """What is wrong with the axes of velocities that explain the fixes once they are mirrored at the diagonal, or whose
+    direction never changes while that of the fixes does; nothing where they agree."""
+    moved, driven = _moves(rec, column)
+    size = np.linalg.norm(moved) * np.linalg.norm(driven)
+    u = rec.velocity[0, np.isfinite(rec.velocity[0, :, column, 0]), column, :2]
+    if not size or rec.body is not None or abs(np.vdot(driven, moved)) > ALIKE * size:
+        return ""
+    if np.vdot(1j * driven.conj(), moved).real > ALIKE * size:
+        return (
+            "axes look swapped: fixes move as the odometry mirrored at the diagonal. Swap easting and northing, or vx "
+            "and vy; headings that are clockwise from north are compass_deg."
+        )
+    if np.square(u[:, 1]).mean() < 0.01 * np.square(u[:, 0]).mean():
+        return (
+            "vx, vy look like a body-frame velocity: along +x throughout, while the fixes turn. Name vx speed, and log "
+            "a heading or a yaw_rate."
+        )
+    return ""
 
 
 def _measurements(c: Check) -> list[dict[str, Any]]:
@@ -265,17 +310,49 @@ def _measurements(c: Check) -> list[dict[str, Any]]:
     return rows
 
 
+def _of_rows(c: Check) -> list[str]:
+    """Measurements and columns that were left out."""
+    summary, sentences = c.log.summary, []
+    left = {why: number for why, (number, _) in summary.refused.items() if not why.startswith("steps of")}
+    share = sum(left.values()) / max(sum(left.values()) + sum(summary.read.values()), 1)
+    if share > UNUSED:
+        why = max(left, key=lambda reason: left[reason])
+        hint = next((hint for begin, hint in ADVICE.items() if why.startswith(begin)), "")
+        first = summary.refused[why][1]
+        sentences.append(
+            f"{share:.0%} of what was logged is not used, first of all {left[why]} {why}"
+            + f" (first: {first})" * bool(first)
+            + f". {hint}".rstrip(" ")
+        )
+    columns = [what for what in summary.unused if ": column " in what]
+    if columns:
+        sentences.append(f"not read: {'; '.join(columns)}. Name what is meant with columns= or kinds=.")
+    return sentences
+
+
 def _of_vehicles(c: Check) -> list[str]:
-    """Noise, distances and directions of the fixes against the odometry."""
-    sentences = []
+    """Noise, outliers, distances and directions of the fixes against the odometry."""
+    sentences, size = [], dimensions(c.world)
     for row in c.vehicles:
         name, nis, distance, turn = (row[key] for key in ("vehicle", "nis", "fixes_per_odometry", "turned_deg"))
+        column = c.world.ids.index(name)
+        square = size * c.normalised[np.isfinite(c.normalised[:, column]), column]
+        usual = max(float(np.median(square)) / chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
+        outliers = float(np.mean(square > OUTLYING**2 * usual)) if len(square) else 0.0
+        if outliers > OUTLIERS:
+            sentences.append(
+                f"{name}: {outliers:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: "
+                "outliers, which a filter without a gate follows."
+            )
         if nis is not None and row["fixes"] > ENOUGH and not 0.2 <= nis <= 2:
             word = "larger" if nis > 2 else "smaller"
             sentences.append(
                 f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {word} than stated, "
                 "or correlated in time. Give std columns or sensors=."
             )
+        if axes := _axes(c.world, column):
+            sentences.append(f"{name}: {axes}")
+            continue
         if distance is not None and not 0.8 <= distance <= 1.25:
             unit = next((hint for low, high, hint in MISTAKEN if low < distance < high), "Check the units of both.")
             sentences.append(f"{name}: fixes travel {distance:.2f} times as far as the odometry says. {unit}")
@@ -295,9 +372,15 @@ def _of_truth(c: Check) -> list[str]:
         return []
     for row in c.vehicles:
         column = rec.ids.index(row["vehicle"])
-        every = np.asarray(rec.gnss[0, :, column] - truth.position[:, column])[:, :2]
+        every = np.asarray(rec.gnss[0, :, column] - truth.position[:, column])
         both = np.isfinite(every[:, 0])
-        gap, velocity = every[both], rec.velocity[0, :, column, :2][both]
+        gap, velocity = every[both, :2], rec.velocity[0, :, column, :2][both]
+        up, sure = _median(every[both, 2]) if len(gap) >= FEW and np.ptp(rec.gnss[0, both, column, 2]) else (0.0, 0.0)
+        if abs(up) > max(SIGMAS * sure, rec.sensors.fix_std[2] / 2):
+            sentences.append(
+                f"{row['vehicle']}: fixes lie {up:.3g} m above the truth in the median. Is one of the two above the "
+                "ellipsoid, the other above the geoid, or are antennas elsewhere?"
+            )
         if len(gap) >= ENOUGH and np.ptp(velocity, axis=0).any():
             line = linregress((velocity - velocity.mean(axis=0)).ravel(), (gap - np.median(gap, axis=0)).ravel())
             if abs(line.slope) >= max(SIGMAS * line.stderr, 0.5 * rec.dt):
@@ -318,29 +401,83 @@ def _of_truth(c: Check) -> list[str]:
 
 
 def _of_measurements(c: Check) -> list[str]:
-    """Residuals of relative measurements that no stated noise explains."""
+    """Residuals of relative measurements that no stated noise explains: scale, outliers, offsets of pairs."""
     sentences = []
-    for row in c.measurements:
+    for k, row in ((list(UNITS).index(row["measurement"]), row) for row in c.measurements):
         name, unit, median, std, should = (
-            row[k] for k in ("measurement", "unit", "median", "robust_std", "expected_std")
+            row[key] for key in ("measurement", "unit", "median", "robust_std", "expected_std")
         )
         if row["number"] < ENOUGH:
             continue
         word = "bearing" if name == "azimuth" and c.log.recording.body is not None else name
         stated = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
         position = float(np.sqrt(max(should**2 - row["stated_std"] ** 2, 0.0)))
-        wrong = std > WIDE * should or abs(median) > 3 * should or (name == "azimuth" and std > COARSE > 3 * position)
-        if name == "range":
+        wrong = std > WIDE * should or (name == "azimuth" and std > COARSE > 3 * position)
+        if name != "range":
+            wrong |= abs(median) > 3 * should
+        else:
             measured = c.world.relative[0, :, 0]
             true = measured - c.relative[:, 0]
             ratio = (measured / true)[true > FAR * position]
             wrong |= len(ratio) >= ENOUGH and not 0.8 <= float(np.median(ratio)) <= 1.25
+        outliers, offsets = _outliers(c, k, row["stated_std"]), _offsets(c, k, row["stated_std"])
+        if outliers > OUTLIERS:
+            sentences.append(
+                f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
+                "as of reflections. Drop them, or take a method with a gate or a robust loss."
+            )
         if wrong:
             sentences.append(f"{word}s miss the positions by {stated}. {HINTS[name]}")
+        elif offsets:
+            shown = ", ".join(f"{pair} by {offset:+.3g} {unit}" for pair, offset in offsets[:4])
+            more = f" and {len(offsets) - 4} pairs more" if len(offsets) > 4 else ""
+            sentences.append(
+                f"{word}s of {shown}{more} are off in the median, with {row['stated_std']:.3g} {unit} stated: an "
+                "offset of the sensors, of antennas, or of the fixes or heights of one of the two."
+            )
         elif std < NARROW * should and row["stated_std"] > 2 * std:
             sentences.append(f"{word}s are better than stated: {stated}.")
     return sentences
 
 
-CHECKS: tuple[Callable[[Check], list[str]], ...] = (_of_vehicles, _of_truth, _of_measurements)
+def _median(values: Floats) -> tuple[float, float]:
+    """Median, and its standard error by the medians of parts of the drive."""
+    parts = [np.median(part) for part in np.array_split(values, BLOCKS) if len(part)]
+    return float(np.median(values)), float(np.std(parts) / np.sqrt(len(parts)))
+
+
+def _by_pair(c: Check, k: int) -> Iterator[tuple[str, Floats, Floats]]:
+    """Names of a pair, its residuals of one kind in order of time, and what they should scatter by."""
+    links, ids = c.world.links, c.world.ids
+    there = np.isfinite(c.relative[:, k])
+    ends = np.column_stack([links.observer, links.neighbour])[there]
+    pairs, index = np.unique(ends if k else np.sort(ends), axis=0, return_inverse=True)
+    for number, (observer, neighbour) in enumerate(pairs.tolist()):
+        mine = np.flatnonzero(there)[index.reshape(-1) == number]
+        yield f"{ids[observer]} {'to' if k else 'and'} {ids[neighbour]}", c.relative[mine, k], c.expected[mine, k]
+
+
+def _outliers(c: Check, k: int, stated: float) -> float:
+    """Share of measurements beyond 5 standard deviations of the running median of their pair: errors of the filters
+    last longer than that window."""
+    near = [value - pd.Series(value).rolling(WINDOW, 1, center=True).median() for _, value, _ in _by_pair(c, k)]
+    off = np.concatenate(near)
+    return float(np.mean(np.abs(off) > OUTLYING * max(robust_std(off), 0.2 * stated)))
+
+
+def _offsets(c: Check, k: int, stated: float) -> list[tuple[str, float]]:
+    """Pairs whose residuals have a median above the stated standard deviation, and above what the errors of the filters
+    explain, which last for some time; largest first."""
+    made, fixes = [], np.isfinite(c.normalised).sum(axis=0)
+    variance, noise = np.nanmean(c.variance[..., :2], axis=(0, 2)), float(np.square(c.world.sensors.fix_std[:2]).mean())
+    share = 2 * np.nanmax((variance + noise) / np.maximum(variance * fixes, 1e-12), where=variance > 0, initial=0.0)
+    for pair, value, expected in _by_pair(c, k):
+        (offset, error), position = _median(value), max(float(np.mean(expected**2)) - stated**2, 0.0)
+        lasting = np.sqrt(stated**2 / len(value) + position * min(share, 1.0))
+        if len(value) >= ENOUGH and abs(offset) > max(stated, 3 * lasting, SIGMAS * error):
+            made.append((pair, offset))
+    return sorted(made, key=lambda row: -abs(row[1]))
+
+
+CHECKS: tuple[Callable[[Check], list[str]], ...] = (_of_rows, _of_vehicles, _of_truth, _of_measurements)
 """What looks wrong: each takes the filtered log and returns sentences. A new check is one more entry."""

@@ -9,21 +9,22 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from coopoc.arrays import AnyArray, Bools, Floats, Ints
+from coopoc.arrays import Bools, Floats, Ints
 from coopoc.world.fleet import Fleet
-from coopoc.world.links import Links, spherical, to_vector, wrap
+from coopoc.world.links import Links, spherical, wrap
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import schedule
 from coopoc.world.v2x import V2X
 
-from ..assemble import SAME
-from ..planar import first_of_each
+from ..assemble import first_of_each
 from .motion import COURSE, Member, Steps
-from .units import Rows, Summary
+from .units import Rows, Summary, in_group
 
 COMPONENTS: Mapping[str, int] = {"range": 0, "azimuth": 1, "bearing": 1, "inclination": 2}
+PAIR = ["step", "observer", "neighbour"]
 NEAR = 10.0
 """Distances, over what the two move until the step, below which the direction is not known well enough."""
+TWO_WAY = "{} ranges count for the other end, too: two-way ranging is known to both (mutual=False: to who logged it)"
 
 
 class Linked(NamedTuple):
@@ -42,58 +43,43 @@ class Linked(NamedTuple):
     arrival: Ints
 
 
-class Measured(NamedTuple):
-    """M relative measurements of pairs that are there.
-
-    Attributes:
-        value: (M,) range m, azimuth (in body frames bearing) rad, or inclination rad.
-        component: (M,) which of the three.
-        step: (M,) nearest to its time.
-        lag: (M,) s from the step to its time.
-        observer: (M,) column of the vehicle that measured.
-        partner: (M,) column of what was measured.
-    """
-
-    value: Floats
-    component: Ints
-    step: Ints
-    lag: Floats
-    observer: Ints
-    partner: Ints
-
-
-def linked(rows: Rows, members: Mapping[str, Member], steps: Steps) -> Linked:
+def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool) -> Linked:
     """Links of all relative measurements and messages.
 
     A bearing becomes an azimuth by the heading of its observer at its own time; in body frames an azimuth becomes a
     bearing by the heading that was measured. Then all are brought to the step. Of several measurements of a kind of one
-    pair at a step the nearest in time is kept. Where heights are all 0, an inclination that was not measured is pi/2
-    beside a range and a direction. A message at a step without a measurement is a link without one. Where no message
-    was logged at all, every vehicle sends at every step and all arrives at once.
+    pair at a step the nearest in time is kept; a `mutual` range is one of the other end, too, if that has none. Where
+    heights are all 0, an inclination that was not measured is pi/2 beside a range and a direction. A message at a step
+    without a measurement is a link without one. Where no message was logged at all, every vehicle sends at every step
+    and all arrives at once.
     """
     there = np.stack([np.isfinite(member.velocity[:, 0]) for member in members.values()], axis=1)
-    summary, sent = steps.summary, rows.take(rows.of("message"))
-    pairs, component, value = _measured(rows.take(rows.in_group("relative")), members, there, steps)
-    messages, arrived, broadcasts = _messages(sent, tuple(members), there, steps)
-    keys, index = np.unique(np.concatenate([pairs, messages]), axis=0, return_inverse=True)
-    index = index.reshape(-1)
-    relative, arrival = np.full((len(keys), 3), np.nan), np.full(len(keys), -1)
-    relative[index[: len(pairs)], component] = value
-    arrival[index[len(pairs) :]] = arrived
+    summary, sent = steps.summary, rows[rows["kind"] == "message"]
+    measured = _measured(rows[in_group(rows, "relative")], members, there, steps)
+    if mutual:
+        stands = np.array([member.stands for member in members.values()])
+        back = measured[(measured["component"] == 0) & ~stands[measured["neighbour"]]]
+        both = pd.concat([measured, back.rename(columns={"observer": "neighbour", "neighbour": "observer"})])
+        both = both.drop_duplicates([*PAIR, "component"])
+        if len(both) > len(measured):
+            summary.assume(TWO_WAY, str(len(both) - len(measured)))
+        measured = both
+    arrived, broadcasts = _messages(sent, tuple(members), there, steps)
+    table = measured.pivot(index=PAIR, columns="component", values="value").reindex(columns=[0, 1, 2])
+    table = table.join(arrived, how="outer").reset_index()
+    table = table.iloc[np.lexsort((table[0], table["observer"], table["step"]))]
+    relative, arrival = table[[0, 1, 2]].to_numpy(dtype=float), table["arrival"].fillna(-1).to_numpy(dtype=np.int64)
     if steps.planar:
         flat = np.isfinite(relative[:, :2]).all(axis=1) & np.isnan(relative[:, 2])
-        relative[flat, 2] = np.pi / 2
+        relative = np.where(flat[:, None] & (np.arange(3) == 2), np.pi / 2, relative)
         if flat.any():
             summary.assume("inclinations are pi/2: no height was logged, so that all are taken to be in one plane")
+    links = Links(*table[PAIR].to_numpy(dtype=np.int64).T)
     if not len(sent):
-        arrival, broadcasts = keys[:, 0].copy(), there
-        if len(keys):
+        arrival, broadcasts = links.step.copy(), there
+        if len(links):
             summary.assume("no messages were logged: every vehicle sends at every step, and all arrive at once")
-    words = ("ranges", "bearings" if steps.body else "azimuths", "inclinations or elevations")
-    for k in np.unique(component).tolist():
-        summary.count(words[k], int(np.isfinite(relative[:, k]).sum()))
-    order = np.lexsort((np.nan_to_num(relative[:, 0], nan=np.inf), keys[:, 1], keys[:, 0]))
-    return Linked(Links(*keys[order].T), relative[order], broadcasts, arrival[order])
+    return Linked(links, relative, broadcasts, arrival)
 
 
 def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logged: bool = True) -> Recording:
@@ -133,33 +119,33 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
 def of_vehicles(rows: Rows, landmarks: Collection[str], summary: Summary) -> Rows:
     """Rows in which vehicles measure: a range that a landmark measured is one to it; whatever else it measured or sent
     says nothing without its heading."""
-    mine, theirs = (np.isin(names, list(landmarks)) for names in (rows.vehicle, rows.partner))
-    turned = mine & ~theirs & rows.of("range")
-    vehicle, partner = (np.where(turned, b, a) for a, b in ((rows.vehicle, rows.partner), (rows.partner, rows.vehicle)))
-    left = mine & ~turned & rows.in_group("relative", "message")
-    summary.refuse_rows("messages of landmarks, and what they measured but ranges to vehicles", rows, left)
-    return replace(rows, vehicle=vehicle, partner=partner).take(~left)
+    mine, theirs = (rows[who].isin(list(landmarks)) for who in ("vehicle", "partner"))
+    turned = mine & ~theirs & (rows["kind"] == "range")
+    left = mine & ~turned & in_group(rows, "relative", "message")
+    summary.refuse("messages of landmarks, and what they measured but ranges to vehicles", rows[left])
+    swapped = {"vehicle": rows["partner"], "partner": rows["vehicle"]}
+    return rows.assign(**{who: rows[who].where(~turned, other) for who, other in swapped.items()})[~left]
 
 
-def _columns(names: AnyArray, ids: Collection[str]) -> Ints:
+def _columns(names: pd.Series[str], ids: Collection[str]) -> Ints:
     """(M,) columns of names, -1 where they are no member."""
     return pd.Index(list(ids)).get_indexer(pd.Index(names)).astype(np.int64)
 
 
-def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: Steps) -> tuple[Ints, Ints, Floats]:
-    """(M, 3) step, observer, neighbour, (M,) component, and (M,) range m, azimuth (in body frames bearing) rad or
-    inclination rad, one of each."""
-    observer, partner = (_columns(names, members) for names in (rows.vehicle, rows.partner))
-    (step, lag), body, value = steps.nearest(rows.t), steps.body, rows.value.copy()
-    component = np.array([COMPONENTS[kind] for kind in rows.kind.tolist()], dtype=np.int64)
-    turned = rows.of("azimuth" if body else "bearing")
+def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: Steps) -> pd.DataFrame:
+    """One of each step, observer, neighbour (columns of members) and component of a link, with its value: range m,
+    azimuth (in body frames bearing) rad or inclination rad."""
+    summary, body, value = steps.summary, steps.body, rows["value"].to_numpy(copy=True)
+    observer, neighbour = (_columns(rows[who], members) for who in ("vehicle", "partner"))
+    t, turned = rows["t"].to_numpy(), rows["kind"].eq("azimuth" if body else "bearing").to_numpy()
+    step, lag = steps.nearest(t)
     for column, (name, member) in enumerate(members.items()):
         mine = turned & (observer == column)
-        value[mine] += (-1 if body else 1) * member.heading(rows.t[mine]) if member.heading is not None else np.nan
+        value[mine] += (-1 if body else 1) * member.heading(t[mine]) if member.heading is not None else np.nan
         if mine.any() and member.course:
-            steps.summary.assume(COURSE.format("{}", member.course), name)
-    members_too, inside = (observer >= 0) & (partner >= 0), step >= 0
-    both = members_too & inside & there[step, observer] & there[step, partner]
+            summary.assume(COURSE.format("{}", member.course), name)
+    members_too, inside = (observer >= 0) & (neighbour >= 0), step >= 0
+    both = members_too & inside & there[step, observer] & there[step, neighbour]
     good = both & np.isfinite(value)
     for wrong, reason in (
         (~members_too, "relative measurements of members without a position"),
@@ -167,81 +153,70 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
         (members_too & inside & ~both, "relative measurements while one of the two is absent"),
         (both & ~good, f"{'azimuths' if body else 'bearings'} at times without a heading"),
     ):
-        steps.summary.refuse_rows(reason, rows, wrong)
-    keys = np.column_stack([step, observer, partner, component])
-    order = np.argsort(np.abs(lag), kind="stable")
-    order = order[good[order]]
-    keys, first = np.unique(keys[order], axis=0, return_index=True)
-    again = np.sort(np.delete(order, first))
-    steps.summary.refuse_rows("relative measurements beside a nearer one of the same pair, kind and step", rows, again)
-    chosen = (step[order], lag[order], observer[order], partner[order])
-    measured = Measured(value[order], component[order], *chosen)
-    return keys[:, :3], keys[:, 3], _to_step(measured, list(members.values()), steps)[first]
+        summary.refuse(reason, rows[wrong])
+    numbers = {"step": step, "lag": lag, "observer": observer, "neighbour": neighbour, "value": value}
+    table = rows.assign(**numbers, component=rows["kind"].map(COMPONENTS).astype(np.int64))[good]
+    table = table.sort_values("lag", key=np.abs, kind="stable")
+    again = table.duplicated([*PAIR, "component"])
+    reason = "relative measurements beside a nearer one of the same pair, kind and step"
+    summary.refuse(reason, table[again].sort_index())
+    table = table[~again]
+    words = ("ranges", "bearings" if body else "azimuths", "inclinations or elevations")
+    for k, number in table["component"].value_counts().sort_index().items():
+        summary.count(words[int(str(k))], int(number))
+    moved: pd.DataFrame = table.assign(value=_to_step(table, list(members.values()), steps))
+    return moved[[*PAIR, "component", "value"]]
 
 
-def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> tuple[Ints, Ints, Bools]:
-    """(M, 3) step sent, receiver, sender, (M,) step of arrival or -1, and (T, N) who sends when."""
-    sender, receiver, columns = _columns(rows.vehicle, ids), _columns(rows.partner, ids), np.arange(len(ids))
-    (step, _), summary, to_all = steps.nearest(rows.t), steps.summary, rows.partner == ""
+def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> tuple[pd.DataFrame, Bools]:
+    """Step of arrival, or -1, of each step, observer and neighbour with a message, and (T, N) who sends when."""
+    sender, receiver, columns = _columns(rows["vehicle"], ids), _columns(rows["partner"], ids), np.arange(len(ids))
+    (step, _), summary, to_all = steps.nearest(rows["t"].to_numpy()), steps.summary, rows["partner"].eq("").to_numpy()
     sent = (sender >= 0) & (step >= 0) & there[step, sender]
     absent = sent & ~to_all & ~((receiver >= 0) & there[step, receiver])
-    summary.refuse_rows("messages of a sender that is absent or has no position", rows, ~sent)
-    summary.refuse_rows("messages to a receiver that is absent or has no position", rows, absent)
+    summary.refuse("messages of a sender that is absent or has no position", rows[~sent])
+    summary.refuse("messages to a receiver that is absent or has no position", rows[absent])
     broadcasts = np.zeros(there.shape, dtype=bool)
     broadcasts[step[sent], sender[sent]] = True
     meant = np.where(to_all[:, None], sender[:, None] != columns, receiver[:, None] == columns)
     k, j = np.nonzero(meant & there[step] & sent[:, None])
-    steps_later = np.maximum(np.ceil((rows.arrival[k] - rows.t[k] - 2 * SAME) / steps.dt), 0)
-    frame = pd.DataFrame({"step": step[k], "receiver": j, "sender": sender[k], "arrival": step[k] + steps_later})
-    again = frame.duplicated(["step", "receiver", "sender"]).to_numpy()
-    summary.refuse_rows("messages beside another of the same pair and step", rows, k[again])
+    late = (rows["arrival"] - rows["t"]).to_numpy()
+    arrival = step[k] + np.maximum(np.ceil((late[k] - 2e-6) / steps.dt), 0.0)
+    table = pd.DataFrame({"step": step[k], "observer": j, "neighbour": sender[k], "arrival": arrival})
+    summary.refuse("messages beside another of the same pair and step", rows.iloc[k[table.duplicated(PAIR).to_numpy()]])
     summary.count("messages", int(sent.sum()))
-    summary.count("messages that were lost", int(np.isinf(rows.arrival[sent]).sum()))
-    first = frame.groupby(["step", "receiver", "sender"], as_index=False)["arrival"].min()
-    arrival = np.nan_to_num(first["arrival"], posinf=-1).astype(np.int64)
-    return first[["step", "receiver", "sender"]].to_numpy(dtype=np.int64), arrival, broadcasts
+    summary.count("messages that were lost", int(np.isinf(late[sent]).sum()))
+    return table.groupby(PAIR)[["arrival"]].min().replace(np.inf, -1), broadcasts
 
 
-def _to_step(rows: Measured, members: Sequence[Member], steps: Steps) -> Floats:
-    """Values (M,) at their steps: z + f(now) - f(then), f being the range, azimuth or inclination of a vector.
-
-    In the world `now` is the vector g from the observer to the partner at the step, from the last fixes and the
-    odometry since, and `then` is g + lag du, with the difference du of their velocities. In body frames a bearing grows
-    by lag w, with the observer's yaw rate w; what stands, and was measured by range and bearing at one time, moves by
-    lag v, with the observer's velocity v; how a vehicle moves in the observer's frame is not known. Nothing is moved
-    where the vectors or the range are not far longer than what lies between.
+def _to_step(table: pd.DataFrame, members: Sequence[Member], steps: Steps) -> Floats:
+    """Values (M,) at their steps: z + f(g) - f(g + lag du), f being the range, azimuth or inclination of the vector g
+    from the observer to the neighbour at the step, from the last fixes and the odometry since, and du the difference of
+    their velocities. Nothing is moved where g or the range is not far longer than lag du. In body frames a bearing
+    grows by lag w, with the observer's yaw rate w; how the two move in the observer's frame is not known.
     """
     velocity, fixes, rate = (
         np.stack([getattr(member, name) for member in members], axis=1) for name in ("velocity", "gnss", "yaw_rate")
     )
-    value, lag = rows.value, rows.lag[:, None]
-    after = np.minimum(rows.step + (rows.lag > 0), len(velocity) - 1)
+    step, observer, neighbour, component = (table[name].to_numpy() for name in (*PAIR, "component"))
+    value, lag = table["value"].to_numpy(), table["lag"].to_numpy()
+    after = np.minimum(step + (lag > 0), len(velocity) - 1)
 
     def during(of_step: Floats, column: Ints) -> Floats:
         """(M, ...) means over the step in which each time lies; of the one before where the member is absent then."""
-        absent = np.isnan(velocity[after, column, 0])
-        return np.asarray(of_step[np.where(absent, rows.step, after), column])
+        return np.asarray(of_step[np.where(np.isnan(velocity[after, column, 0]), step, after), column])
 
-    moved = lag * during(velocity, rows.observer)
     if steps.body:
-        keys = np.column_stack([rows.step, rows.lag, rows.observer, rows.partner])
-        same = np.unique(keys, axis=0, return_inverse=True)[1].reshape(-1)
-        polar = np.tile([np.nan, np.nan, np.pi / 2], (len(same), 1))
-        polar[same, rows.component] = value
-        then = to_vector(polar)[same]
-        then[~np.array([member.stands for member in members])[rows.partner]] = np.nan
-        now = then + moved
-        value = value + np.where(rows.component == 1, rows.lag * during(rate, rows.observer), 0.0)
-    else:
-        path = np.cumsum(np.nan_to_num(velocity) * steps.dt, axis=0)
-        fixed = np.where(np.isfinite(fixes[..., 0]), np.arange(len(path))[:, None], -1)
-        last = np.maximum.accumulate(fixed, axis=0)
-        position = np.where(last[..., None] >= 0, (fixes - path)[last, np.arange(len(members))] + path, np.nan)
-        now = position[rows.step, rows.partner] - position[rows.step, rows.observer]
-        then = now + lag * during(velocity, rows.partner) - moved
+        return np.where(component == 1, wrap(value + lag * during(rate, observer)), value)
+    path = np.cumsum(np.nan_to_num(velocity) * steps.dt, axis=0)
+    fixed = np.where(np.isfinite(fixes[..., 0]), np.arange(len(path))[:, None], -1)
+    last = np.maximum.accumulate(fixed, axis=0)
+    position = np.where(last[..., None] >= 0, (fixes - path)[last, np.arange(len(members))] + path, np.nan)
+    now = position[step, neighbour] - position[step, observer]
+    then = now + lag[:, None] * (during(velocity, neighbour) - during(velocity, observer))
     change = np.column_stack(spherical(*now.T)) - np.column_stack(spherical(*then.T))
     change[:, 1:] = wrap(change[:, 1:])
-    distance = np.where(rows.component == 0, rows.value, np.inf)
+    distance = np.where(component == 0, value, np.inf)
     far = np.minimum(np.linalg.norm(now, axis=1), distance) > NEAR * np.linalg.norm(now - then, axis=1)
-    value = value + np.where(far, change[np.arange(len(change)), rows.component], 0.0)
-    return np.where(rows.component == 1, wrap(value), value)
+    value = value + np.where(far, change[np.arange(len(change)), component], 0.0)
+    return np.where(component == 1, wrap(value), value)

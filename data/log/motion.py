@@ -7,19 +7,19 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-import pandas as pd
 from scipy.interpolate import make_interp_spline
 
 from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.links import wrap
 
-from ..assemble import SAME, longest_gap, smooth
-from ..planar import steps_of
-from .units import Rows, Summary
+from ..assemble import SAME, longest_gap, smooth, steps_of
+from .units import Rows, Summary, in_group, place
 
 MOVING = 1.0
 """m/s, least speed at which a course is a heading."""
+STANDS = 0.5
+"""m/s, a speed below which what has no heading is taken to stand."""
 COURSE_RATE = 0.25
 """Half-power frequency, in fixes, of the smoother that makes velocities of fixes."""
 COURSE = "the heading of {} is the course of the {}: no vehicle slips or reverses"
@@ -29,11 +29,10 @@ HeadingAt = Callable[[Floats], Floats]
 
 
 class Signal(NamedTuple):
-    """Samples of a vehicle at their own times: (M,) s, increasing, (M, C), and the first row (M,) of each."""
+    """Samples of a vehicle at their own times: (M,) s, increasing, and (M, C)."""
 
     t: Floats
     value: Floats
-    row: Ints
 
 
 class Steps(NamedTuple):
@@ -99,23 +98,15 @@ def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 
     Args:
         rows: in SI units.
         names: kinds, the columns of the samples.
-        summary: counts rows that repeat a kind at one time, and samples without the first `required` kinds.
+        summary: counts samples without the first `required` kinds.
         required: how many of the kinds a sample needs.
     """
-    index = np.flatnonzero(rows.of(*names))
-    index = index[np.argsort(rows.t[index], kind="stable")]
-    t = rows.t[index]
-    fresh = np.append(True, np.diff(t) > SAME)[: len(t)]
-    frame = pd.DataFrame({"sample": np.cumsum(fresh) - 1, "kind": rows.kind[index], "value": rows.value[index]})
-    again = frame.duplicated(["sample", "kind"])
-    summary.refuse_rows("repeated rows (same time, vehicle and kind)", rows, index[again])
-    table = frame[~again].pivot(index="sample", columns="kind", values="value").reindex(columns=list(names))
-    value = table.to_numpy(dtype=float)
-    whole, begins = np.isfinite(value[:, :required]).all(axis=1), index[fresh]
-    if not whole.all():
-        reason = f"incomplete rows, without all of {', '.join(names[:required])} at one time"
-        summary.refuse(reason, int(np.isfinite(value[~whole]).sum()), rows.place(int(begins[~whole][0])))
-    return Signal(t[fresh][whole], value[whole], begins[whole])
+    rows = rows[rows["kind"].isin(names)]
+    table = rows.pivot(index="t", columns="kind", values="value").reindex(columns=list(names))
+    whole = table[list(names[:required])].notna().all(axis=1)
+    reason = f"incomplete rows, without all of {', '.join(names[:required])} at one time"
+    summary.refuse(reason, rows[rows["t"].isin(table.index[~whole]) & rows["kind"].isin(names[:required])])
+    return Signal(table.index[whole].to_numpy(), table[whole].to_numpy(copy=True))
 
 
 def member(name: str, rows: Rows, steps: Steps) -> Member:
@@ -136,7 +127,7 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
     measured, turn, speed = (samples(rows, (kind,), summary) for kind in ("heading", "yaw_rate", "speed"))
     still: Floats = np.zeros((len(grid), 3))
     none: Floats = np.full(len(grid), np.nan)
-    if len(fixes.t) == 1 and not rows.in_group("odometry").any():
+    if len(fixes.t) == 1 and not in_group(rows, "odometry").any():
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m"
         heading = heading_at(measured, None, np.inf) if len(measured.t) and not body else None
         return Member(still + fixes.value[0], still, heading, text, "", True, still[:, 0], none)
@@ -146,7 +137,7 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
             if not len(signal.t):
                 allowed, hint = "must have speeds and yaw rates in body frames", 'Log both, or pass frame="world".'
                 raise InputError(f"vehicle {name}", f"no {kind}", allowed, hint)
-        summary.refuse("world velocities in body frames", int(rows.of("vx", "vy", "vz").sum()))
+        summary.refuse("world velocities in body frames", rows[rows["kind"].isin(["vx", "vy", "vz"])])
         signals, course = [speed, turn], ""
         heading = heading_at(measured, turn, np.inf) if len(measured.t) else None
         along, _ = _heading(measured, turn, ((derived, "fixes"),), steps)
@@ -180,24 +171,24 @@ def _in_world(
 ) -> tuple[Signal, HeadingAt | None, str]:
     """Velocity at its own times, heading, and whose course the heading is; `body` are heading, yaw rate and speed."""
     summary, (measured, turn, speed) = steps.summary, body
-    world = samples(rows, ("vx", "vy", "vz"), summary, 2)
+    world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), rows[rows["kind"] == "speed"]
     rate = turn if len(turn.t) > 1 else None
     heading, course = _heading(measured, rate, ((world, "odometry"), (derived, "fixes")), steps)
     if len(world.t):
-        summary.refuse_rows("speeds where a world velocity is given", rows, speed.row)
-        return world._replace(value=np.nan_to_num(world.value)), heading, course
-    if len(speed.t):
-        if heading is None:
-            allowed, hint = "needs heading, compass_deg, or fixes of a moving vehicle", "Add one, or give vx and vy."
-            field = f"{rows.place(int(speed.row[0]))}, speed"
-            raise InputError(field, f"of {name}, which has no heading", allowed, hint)
+        summary.refuse("speeds where a world velocity is given", speeds)
+        return Signal(world.t, np.nan_to_num(world.value)), heading, course
+    standing = np.abs(speed.value[:, 0]) < STANDS
+    if len(speed.t) and (heading is not None or standing.all()):
         if course:
             summary.assume(COURSE.format("{}", course), name)
-        angle = heading(speed.t)
-        turned = np.isfinite(angle)
-        summary.refuse_rows("speeds without a heading", rows, speed.row[~turned])
-        velocity = speed.value[turned] * _ahead(angle[turned])
-        return Signal(speed.t[turned], velocity, speed.row[turned]), heading, course
+        angle = np.full(len(standing), np.nan) if heading is None else heading(speed.t)
+        turned = np.isfinite(angle) | standing
+        summary.refuse("speeds without a heading", speeds[speeds["t"].isin(speed.t[~turned])])
+        velocity = speed.value * np.nan_to_num(_ahead(angle))
+        return Signal(speed.t[turned], velocity[turned]), heading, course
+    if len(speed.t):
+        allowed, hint = "needs heading, compass_deg, or fixes of a moving vehicle", "Add one, or give vx and vy."
+        raise InputError(f"{place(speeds)}, speed", f"of {name}, which has no heading", allowed, hint)
     if derived is None:
         hint = "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z."
         raise InputError(f"vehicle {name}", "no odometry, and less than two fixes", "cannot be placed", hint)
@@ -214,8 +205,7 @@ def _heading(
     for velocity, source in moves:
         if velocity is not None and (moving := np.hypot(*velocity.value[:, :2].T) > MOVING).any():
             east, north = velocity.value[moving, :2].T
-            course = Signal(velocity.t[moving], np.arctan2(north, east)[:, None], velocity.row[moving])
-            return heading_at(course, rate, np.inf), source
+            return heading_at(Signal(velocity.t[moving], np.arctan2(north, east)[:, None]), rate, np.inf), source
     return None, ""
 
 
@@ -240,7 +230,7 @@ def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
 def step_means(signal: Signal, grid: Floats) -> Floats:
     """(T, C) mean over the step that ends at each instant, of the samples joined by straight lines.
 
-    >>> speed = Signal(np.array([0.0, 1]), np.array([[0.0], [2]]), np.arange(2))
+    >>> speed = Signal(np.array([0.0, 1]), np.array([[0.0], [2]]))
     >>> step_means(speed, np.array([0.0, 0.5, 1])).ravel().tolist()
     [0.0, 0.5, 1.5]
     """
@@ -264,7 +254,7 @@ def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingA
     Between measured headings h_j it is W(t) + the line through h_j - W(t_j), with the integral W of the yaw rate, which
     is zero where there is none. Without a yaw rate, gaps longer than `gap` are unknown.
 
-    >>> heading = heading_at(Signal(np.array([0.0, 1]), np.array([[3.0], [-3.1]]), np.arange(2)), None, 2.0)
+    >>> heading = heading_at(Signal(np.array([0.0, 1]), np.array([[3.0], [-3.1]])), None, 2.0)
     >>> heading(np.array([0.5, 9.0])).round(3).tolist()
     [3.092, nan]
     """
@@ -293,7 +283,7 @@ def velocity_of_fixes(fixes: Signal, gap: float) -> Signal:
             even = np.column_stack([np.interp(grid, t[part], column) for column in x[part].T])
             slope = np.gradient(smooth(even, step, COURSE_RATE / step), step, axis=0)
             velocity[part] = np.column_stack([np.interp(t[part], grid, column) for column in slope.T])
-    return fixes._replace(value=velocity)
+    return Signal(t, velocity)
 
 
 def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, Ints, Floats]:
@@ -311,12 +301,15 @@ def _fixes_on_steps(rows: Rows, fixes: Signal, velocity: Floats, there: Bools, s
     gnss, summary = np.full((len(steps.grid), 3), np.nan), steps.summary
     nearest, _ = steps.nearest(fixes.t)
     kept, step, lag = _nearest_of_each(fixes, there, steps)
-    outside = nearest < 0
-    absent = ~outside & ~there[nearest]
-    beside = ~outside & ~absent & ~np.isin(np.arange(len(nearest)), kept)
-    summary.refuse_rows("fixes outside the recording", rows, fixes.row[outside])
-    summary.refuse_rows("fixes in gaps of the odometry", rows, fixes.row[absent])
-    summary.refuse_rows("fixes beside a nearer one of the same step", rows, fixes.row[beside])
+    absent = (nearest >= 0) & ~there[nearest]
+    beside = ~np.isin(np.arange(len(nearest)), kept) & (nearest >= 0) & ~absent
+    rows = rows[rows["kind"].eq("x")]
+    for why, left in (
+        ("fixes outside the recording", nearest < 0),
+        ("fixes in gaps of the odometry", absent),
+        ("fixes beside a nearer one of the same step", beside),
+    ):
+        summary.refuse(why, rows[rows["t"].isin(fixes.t[left])].drop_duplicates("t"))
     after = np.minimum(step + 1, len(gnss) - 1)
     between = np.where((lag > 0) & there[after], after, step)
     gnss[step] = fixes.value[kept] - lag[:, None] * velocity[between]

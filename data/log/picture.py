@@ -9,7 +9,7 @@ import numpy as np
 
 from coopoc.escapes import picture
 from coopoc.evaluate.metrics import dimensions
-from coopoc.pictures import COLORS, INK
+from coopoc.world.pictures import COLORS, INK
 
 from .check import Check
 

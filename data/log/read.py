@@ -10,10 +10,9 @@ from typing import Any, Literal, get_args
 import numpy as np
 import pandas as pd
 
-from coopoc.arrays import Floats, checked, instance, named, number
-from coopoc.errors import InputError
+from coopoc.arrays import Floats, checked, instance, named, number, one_of
+from coopoc.errors import InputError, suggestion
 from coopoc.file_names import given_path
-from coopoc.plugins import one_of, suggestion
 from coopoc.short_repr import short_repr
 from coopoc.world.axes import texts
 from coopoc.world.fleet import Fleet
@@ -31,9 +30,11 @@ from .frames import Origin, assumed, local, on_one_clock
 from .links import linked, of_vehicles
 from .motion import Steps, member, samples
 from .tables import is_log_table, read_log_table
-from .units import Rows, Summary, stacked
+from .units import Rows, Summary, distinct, in_group
 
 Frame = Literal["world", "body"]
+LONGEST, PAIR = 1.0, ("vehicle", "partner")
+"""s, of a step that is not given; what names a pair."""
 READERS: Mapping[str, Callable[..., Rows]] = {
     **dict.fromkeys(TABLES, read_log_table),
     **dict.fromkeys((".nmea", ".nme"), read_nmea),
@@ -104,6 +105,7 @@ def read_log(
     sensors: Sensors | None = None,
     any_scale: bool = False,
     frame: Frame = "world",
+    mutual: bool = True,
 ) -> Log:
     """Read a file or a folder of logged measurements: tables (CSV, Parquet), NMEA, or a ROS bag.
 
@@ -111,7 +113,8 @@ def read_log(
 
     Args:
         path: a file, or a folder whose files belong to one drive.
-        dt: s, steps of the recording; None: the median interval of the densest odometry (else of the densest fixes).
+        dt: s, steps of the recording; None: the median interval of the densest odometry (else fixes), or in the world,
+            where it is longer, that at which a pair is measured, 1 s at most.
         max_gap: s, the longest gap of a vehicle's odometry that is bridged; it is absent in longer ones. None: the
             largest of 5 dt, 0.5 s and 1.5 times its own median interval.
         columns: names in the files, as {"t": "timestamp", "vehicle": "car"}.
@@ -124,6 +127,7 @@ def read_log(
         any_scale: True accepts positions that do not look like metres and seconds.
         frame: "world", or "body" for pose filters: speed, yaw rate, compass and bearings stay as they were measured, a
             vehicle needs no fix, and what has one fix and no odometry is a landmark.
+        mutual: whether a range is known to both ends, as of two-way ranging; in body frames to who logged it.
 
     Returns:
         Log: recording, truth, summary.
@@ -141,14 +145,14 @@ def read_log(
     path, body = given_path(path), frame == "body"
     summary = Summary(path.name)
     one_of("frame", frame, get_args(Frame))
-    instance("any_scale", any_scale, bool, "Give True or False.")
+    for field, flag in {"any_scale": any_scale, "mutual": mutual}.items():
+        instance(field, flag, bool, "Give True or False.")
     texts("ignore", ignore)
-    for field, value in {"dt": dt, "max_gap": max_gap}.items():
-        if value is not None:
-            number(field, value, 1e-12, allowed="> 0 s", hint="Give seconds.")
     clock = named("clock", clock or {}, "Give clock={name: s}.")
-    for name, ahead in clock.items():
-        number(f"clock of {name}", ahead, -np.inf, hint="Give seconds.")
+    least = {"dt": 1e-12, "max_gap": 1e-12, **{f"clock of {name}": -np.inf for name in clock}}
+    for field, value in zip(least, (dt, max_gap, *clock.values()), strict=True):
+        if value is not None:
+            number(field, value, least[field], allowed="a number, of dt and max_gap > 0 s", hint="Give seconds.")
     if origin is not None:
         checked("origin", origin, "(3,)", (3,))
     options: dict[str, Any] = {
@@ -156,18 +160,21 @@ def read_log(
         "kinds": named("kinds", kinds or {}, "Give kinds={word: kind}."),
         "ignore": ignore,
     }
-    rows, true_rows = _rows(path, truth, summary, options)
-    check_time(rows.t, path.name)
-    rows = on_one_clock(rows, clock, path.name)
-    rows, origin = local(rows, origin)
+    rows = _rows(path, truth, summary, options)
+    for column in ("t", "arrival"):
+        check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)
+    rows, true_rows = rows[rows["true"] == 0], rows[rows["true"] == 1]
+    rows, origin = local(on_one_clock(rows, clock, path.name), origin)
+    rows = distinct(rows, summary)
     if not any_scale:
         _check_scale(rows, path.name)
     ids = _ids(rows, body)
-    steps = Steps(_grid(rows, dt, path.name), max_gap, not rows.of("z").any(), body, summary)
-    members = {name: member(name, rows.take(rows.vehicle == name), steps) for name in ids}
+    grid = _grid(rows, dt, body, summary)
+    steps = Steps(grid, max_gap, not (rows["kind"] == "z").any(), body, summary)
+    members = {name: member(name, rows[rows["vehicle"] == name], steps) for name in ids}
     marks = [k for k, name in enumerate(ids) if body and members[name].stands]
     rows = of_vehicles(rows, [ids[k] for k in marks], summary)
-    measured = linked(rows, members, steps)
+    measured = linked(rows, members, steps, mutual and not body)
     to_landmark = np.isin(measured.links.neighbour, marks)
     pairs = (measured.links.step * len(ids) + measured.links.observer)[~to_landmark]
     gnss, velocity, yaw_rate, compass = (
@@ -191,7 +198,9 @@ def read_log(
         body=Body(yaw_rate, compass) if body else None,
         landmarks=tuple(marks),
     )
-    fleet = None if true_rows is None else _truth(local(true_rows, origin)[0], recording, max_gap, path.stem)
+    fleet = None
+    if len(true_rows):
+        fleet = _truth(distinct(local(true_rows, origin)[0], Summary()), recording, max_gap, path.stem)
     summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
     return Log(recording, fleet, summary, "messages" in summary.read, origin)
 
@@ -206,35 +215,36 @@ def _is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").is_file() or READERS.get(path.suffix.lower()) is read_bag
 
 
-def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[str, Any]) -> tuple[Rows, Rows | None]:
-    """Measurements of a file or a folder, and the truth: of the file that is named, of `truth.*`, or of a topic."""
+def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[str, Any]) -> Rows:
+    """Rows of a file or a folder, with those of the truth: of the file that is named, of `truth.*`, or of a topic."""
     if not path.exists():
         raise InputError("path", str(path), "must be a file or a folder", "Check the path.")
-    true_file = None if truth is None else Path(truth)
-    actual: list[Rows] = []
+    true_files = [Path(truth)] if truth is not None else []
     if _is_bag(path):
-        true_file = true_file if true_file is not None and true_file.exists() else None
-        rows = read_bag(path, summary, truth="" if true_file else str(truth or ""), actual=actual, **options)
+        if not (true_files and true_files[0].exists()):
+            options, true_files = {**options, "truth": str(truth or "")}, []
+        parts = [read_bag(path, summary, **options)]
     else:
-        if true_file is not None and not true_file.is_file():
+        if true_files and not true_files[0].is_file():
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
         files = sorted(f for f in path.iterdir() if f.suffix.lower() in READERS) if path.is_dir() else [path]
-        true_files = [f for f in files if f.stem.lower() == TRUTH and f != path]
-        true_file = true_file or next(iter(true_files), None)
-        files = [f for f in files if f not in (*true_files, true_file)]
+        true_files = true_files or [f for f in files if f.stem.lower() == TRUTH and f != path][:1]
+        files = [f for f in files if f not in true_files and (f.stem.lower() != TRUTH or f == path)]
         if not files:
             allowed = f"must hold files in {', '.join(READERS)}"
             raise InputError("path", str(path), allowed, "Point at the folder of the log.")
-        _check_headers(options["columns"], [*files, *([true_file] if true_file else [])], path.name)
-        rows = stacked([_read_file(file, summary, **options) for file in files])
-    if not len(rows):
+        _check_headers(options["columns"], [*files, *true_files], path.name)
+        parts = [_read_file(file, summary, **options) for file in files]
+    if not any(map(len, parts)):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
-    if true_file is not None:
-        actual = [_read_file(true_file, Summary(), **{**options, "ignore": ()})]
-    return rows, actual[0] if actual else None
+    options = {**options, "ignore": (), "truth": ""}
+    parts += [_read_file(file, Summary(), **options).assign(true=1.0) for file in true_files]
+    return pd.concat(parts, ignore_index=True)
 
 
 def _read_file(file: Path, summary: Summary, **options: Any) -> Rows:
+    if not _is_bag(file):
+        options.pop("truth", None)
     return READERS.get(file.suffix.lower(), read_log_table)(file, summary, **options)
 
 
@@ -249,19 +259,18 @@ def _check_headers(columns: Mapping[str, str], files: Sequence[Path], name: str)
 
 
 def _check_scale(rows: Rows, name: str) -> None:
-    vehicles = dict.fromkeys(rows.vehicle[rows.of("x")].tolist())
-    fixes = [samples(rows.take(rows.vehicle == one), ("x", "y", "z"), Summary(), 2) for one in vehicles]
-    sizes = np.cumsum([0, *(len(signal.t) for signal in fixes)])
-    if sizes[-1]:
-        t, position = (np.concatenate(parts) for parts in ([s.t for s in fixes], [s.value for s in fixes]))
-        check_scale(t, np.nan_to_num(position), np.split(np.arange(len(t)), sizes[1:-1]), name)
+    fixes = [samples(mine, ("x", "y", "z"), Summary(), 2) for _, mine in rows.groupby("vehicle", sort=False)]
+    t, position = (np.concatenate(parts) for parts in zip(*fixes, strict=True))
+    if len(t):
+        ends = np.cumsum([len(signal.t) for signal in fixes])[:-1]
+        check_scale(t, np.nan_to_num(position), np.split(np.arange(len(t)), ends), name)
 
 
 def _ids(rows: Rows, body: bool) -> list[str]:
     """Members that can be placed, in the order of their first row: by fixes, or in body frames by odometry, too."""
-    placed = set(rows.vehicle[rows.of("x", *(("speed", "yaw_rate") if body else ()))].tolist())
-    if placed:
-        return [name for name in dict.fromkeys(rows.vehicle.tolist()) if name in placed]
+    placed = rows["kind"].isin(["x", "speed", "yaw_rate"] if body else ["x"])
+    if placed.any():
+        return [name for name in rows["vehicle"].unique() if name in set(rows["vehicle"][placed])]
     if body:
         hint = "Give speed and yaw_rate of every vehicle, and x, y (and z) of landmarks."
         raise InputError("fixes, odometry", "none", "must be there: a pose is carried on by odometry", hint)
@@ -269,40 +278,46 @@ def _ids(rows: Rows, body: bool) -> list[str]:
     raise InputError("fixes", "none", "must be there: a position in the local frame starts from one", hint)
 
 
-def _grid(rows: Rows, dt: float | None, name: str) -> Floats:
-    """Steps over all fixes and odometry, None: of the median interval of the densest odometry, else fixes."""
-    intervals = []
-    for group in ("odometry", "fix"):
-        there = rows.in_group(group)
-        times = pd.DataFrame({"vehicle": rows.vehicle[there], "t": rows.t[there].round(6)}).drop_duplicates()
-        intervals.append(float(times.sort_values("t").groupby("vehicle")["t"].agg(lambda t: t.diff().median()).min()))
-    densest = next((interval for interval in intervals if interval > 0), 0.0)
-    if dt is None and not densest:
+def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
+    """(T,) s, steps over all fixes and odometry."""
+
+    def densest(group: str, *keys: str) -> float:
+        times = rows[in_group(rows, group)].drop_duplicates([*keys, "t"]).sort_values("t")
+        return float(times.groupby(list(keys))["t"].agg(lambda t: t.diff().median()).min())
+
+    moves, fixes, pairs = densest("odometry", "vehicle"), densest("fix", "vehicle"), densest("relative", *PAIR)
+    step = dt or float(f"{moves if moves > 0 else fixes:.3g}")
+    if not step > 0:
         raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
-    step, t = dt or float(f"{densest:.3g}"), rows.t[rows.in_group("odometry", "fix")]
-    count = (t.max() - t.min()) / step + 1.5
-    check_size(count, len(set(rows.vehicle.tolist())), len(rows), step, name)
-    if count < 2:
-        allowed = f"must be well below the {np.ptp(t):g} s of the log"
+    if dt is None and not body and pairs > step and min(pairs, fixes, LONGEST) > step:
+        seldom = float(f"{min(pairs, fixes, LONGEST):.3g}")
+        summary.assume(f"steps of {seldom:g} s, as fixes and pairs are measured; odometry every {step:g} s is averaged")
+        step = seldom
+    t = rows["t"][in_group(rows, "odometry", "fix")]
+    span = float(t.max() - t.min())
+    check_size(span / step + 1.5, rows["vehicle"].nunique(), len(rows), step, summary.name)
+    if span / step < 0.5:
+        allowed = f"must be well below the {span:g} s of the log"
         raise InputError("dt", f"{step:g} s", allowed, "Take a shorter dt.")
-    grid: Floats = t.min() + step * np.arange(int(count))
+    grid: Floats = float(t.min()) + step * np.arange(int(span / step + 1.5))
     return grid
 
 
 def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -> Fleet:
-    """Truth of the members that have one, on the steps of the recording."""
-    ids, start = recording.ids, recording.t[0]
-    vehicles = sorted(set(rows.vehicle.tolist()))
-    if not set(vehicles) & set(ids):
+    """Truth of the members that have one, on the steps of the recording; a file that names none is that of the only
+    one."""
+    ids, start, vehicles = recording.ids, recording.t[0], sorted(rows["vehicle"].unique())
+    if len(ids) == 1 and vehicles == [Path(rows["file"].iloc[0]).stem]:
+        rows = rows.assign(vehicle=ids[0])
+    elif not set(vehicles) & set(ids):
         allowed = f"must name vehicles of the log: {', '.join(ids)}"
-        field = f"{rows.file[0]}: column vehicle"
+        field = f"{rows['file'].iloc[0]}: column vehicle"
         raise InputError(field, ", ".join(vehicles), allowed, "Rename them, or leave the truth out.")
-    axes = 3 if rows.of("z").any() else 2
+    axes = 3 if (rows["kind"] == "z").any() else 2
     poses = np.full((len(recording.t), len(ids), 4), np.nan)
     for column, vehicle in enumerate(ids):
-        mine = rows.take(rows.vehicle == vehicle)
-        true = samples(mine, ("x", "y", "z"), Summary(), axes)
-        heading = samples(mine, ("heading",), Summary())
+        mine = rows[rows["vehicle"] == vehicle]
+        true, heading = samples(mine, ("x", "y", "z"), Summary(), axes), samples(mine, ("heading",), Summary())
         headings = np.unwrap(heading.value, axis=0)
         for first, t, value in ((0, true.t, np.nan_to_num(true.value)), (3, heading.t, headings)):
             out = poses[:, column, first : first + 3]

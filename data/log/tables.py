@@ -4,30 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
-from coopoc.arrays import Bools, Floats
-from coopoc.errors import InputError
-from coopoc.plugins import suggestion
+from coopoc.errors import InputError, suggestion
 
-from ..cells import (
-    TABLES,
-    filled,
-    headers,
-    missing_column,
-    named_columns,
-    numeric,
-    optional,
-    read_frame,
-    seconds,
-    words,
-)
-from .units import KINDS, Rows, Summary, rows_of, stacked
-
-if TYPE_CHECKING:
-    import pandas as pd
+from ..cells import TABLES, USUAL, filled, headers, missing_column, named_columns, numeric, read_frame, seconds, words
+from .units import KINDS, Rows, Summary, in_group, place, rows_of
 
 LONG = ("t", "vehicle", "kind", "partner", "value", "std", "arrival")
 OF_FLEETS = {"id", "t", "x", "y", "z", "vx", "vy", "vz"}
@@ -70,8 +55,7 @@ def read_log_table(
     """
     file, given = path.name, dict(columns or {})
     frame = read_frame(path, *(given.get(key, key) for key in ("vehicle", "partner", "kind", "arrival")))
-    known = (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS))
-    frame = named_columns(frame, given, known, (), file)
+    frame = named_columns(frame, given, (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS)), (), file)
     if "t" not in frame.columns:
         placed = {"x", "y"} <= set(frame.columns) or {"latitude", "longitude"} <= set(frame.columns)
         if not (placed and "vehicle" in frame.columns and frame["vehicle"].is_unique):
@@ -81,14 +65,16 @@ def read_log_table(
     if "vehicle" not in frame.columns:
         frame = frame.assign(vehicle=path.stem)
     read = _long if "kind" in frame.columns else _wide
-    rows = read(frame, file, summary, kinds or {}, ignore)
-    if "partner" not in frame.columns and rows.in_group("relative").any():
+    rows = rows_of(read(frame, file, summary, kinds or {}, ignore), file)
+    if "partner" not in frame.columns and in_group(rows, "relative").any():
         raise missing_column(file, "partner", list(frame.columns), "is needed")
     _check(rows)
     return rows
 
 
-def _long(frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> Rows:
+def _long(
+    frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]
+) -> pd.DataFrame:
     frame = frame.assign(kind=words(frame, "kind", file))
     left = frame["kind"].isin(list(ignore))
     for kind, count in frame["kind"][left].value_counts(sort=False).items():
@@ -102,10 +88,12 @@ def _long(frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, 
         hint = f"{suggestion(first, KINDS, '')} {hint}".lstrip()
         field, allowed = f"{file}: row {strange.index[0]}, column kind", f"must be one of {', '.join(KINDS)}"
         raise InputError(field, repr(first), allowed, hint)
-    return _rows(frame, file, "value", "std")
+    return _cells(frame, file, "value", "std")
 
 
-def _wide(frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]) -> Rows:
+def _wide(
+    frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, str], ignore: Sequence[str]
+) -> pd.DataFrame:
     frame = frame.rename(columns={**kinds, **{f"{name}_std": f"{kind}_std" for name, kind in kinds.items()}})
     value = {kind: "arrival" if kind == "message" else kind for kind in KINDS if kind not in ignore}
     value = {kind: column for kind, column in value.items() if column in frame.columns}
@@ -117,73 +105,65 @@ def _wide(frame: pd.DataFrame, file: str, summary: Summary, kinds: Mapping[str, 
     if "std" in frame.columns and {KINDS[kind].group for kind in value} == {"fix"}:
         summary.assume(f"column std of {file} is the standard deviation of each of {', '.join(value)}")
         frame = frame.assign(**{f"{kind}_std": frame["std"] for kind in value}).drop(columns="std")
-    used = {"t", "vehicle", "partner", *value.values(), *(f"{kind}_std" for kind in value)}
-    for column in frame.columns:
-        if column not in used:
-            hint = f", which belongs to no kind (name it {next(iter(value))}_std)" if column == "std" else ""
-            summary.leave(f"{file}: column {column}{hint}", len(frame))
-    return stacked(
-        [
-            _rows(frame[filled(frame[column])].assign(kind=kind), file, kind, f"{kind}_std")
-            for kind, column in value.items()
-        ]
-    )
+    used = ["t", "vehicle", "partner", *value.values(), *(f"{kind}_std" for kind in value)]
+    for column in frame.columns.difference(used, sort=False):
+        near = next((key for key, usual in USUAL.items() if column.lower() in usual), "")
+        like = f"Did you mean {near}?" if near else suggestion(column, (*LONG, *KINDS), "")
+        if column == "std":
+            like = f"which belongs to no kind (name it {next(iter(value))}_std)"
+        summary.leave(f"{file}: column {column}{', ' * bool(like)}{like}", len(frame))
+    parts = (frame[filled(frame[column])].assign(kind=kind) for kind, column in value.items())
+    return pd.concat([_cells(part, file, kind, f"{kind}_std") for part, kind in zip(parts, value, strict=True)])
 
 
-def _rows(frame: pd.DataFrame, file: str, value: str, std: str) -> Rows:
-    """Rows of a table with a column kind, whose values and standard deviations are in the columns of these names."""
+def _cells(frame: pd.DataFrame, file: str, value: str, std: str) -> pd.DataFrame:
+    """Times, names and numbers of a table with a column kind; `value` and `std` are the columns of these."""
     message = (frame["kind"] == "message").to_numpy()
     for mask, column in ((~message, value), (message, "arrival")):
         if mask.any() and column not in frame.columns:
             raise missing_column(file, column, list(frame.columns), "is needed")
-    values = np.full(len(frame), np.nan)
-    if not message.all():
-        values[~message] = numeric(frame[~message], value, file)
-    rows: dict[str, Any] = {
-        "t": seconds(frame, "t", file) if "t" in frame.columns else np.nan,
-        "vehicle": words(frame, "vehicle", file),
-        "partner": "",
-        "value": values,
-        "std": optional(frame, std, file),
-        "arrival": _arrivals(frame, file, message),
-    }
-    if "partner" in frame.columns:
-        rows["partner"] = frame["partner"].astype(str).str.strip().where(filled(frame["partner"]), "")
-    return rows_of(frame[["kind"]].assign(**rows), file)
-
-
-def _arrivals(frame: pd.DataFrame, file: str, message: Bools) -> Floats:
-    """Times of arrival, infinite for "lost"; NaN for what is no message."""
-    times = np.full(len(frame), np.nan)
+    made: dict[str, Any] = {"vehicle": words(frame, "vehicle", file), "arrival": np.nan}
+    made |= {"value": numeric(frame, value, file, ~message), "std": np.nan}
+    if std in frame:
+        made["std"] = numeric(frame, std, file, filled(frame[std]))
+    if "t" in frame:
+        made["t"] = seconds(frame, "t", file)
+    if "partner" in frame:
+        made["partner"] = frame["partner"].astype(str).str.strip().where(filled(frame["partner"]), "")
     if message.any():
-        cells: Any = frame["arrival"]
+        cells = frame["arrival"]
         lost = message & (cells.astype(str).str.strip().str.lower() == "lost").to_numpy()
-        times[lost] = np.inf
         if cells.dtype.kind in "OUT" or str(cells.dtype) == "str":
             cells = cells.astype(str).str.replace(",", ".")  # text, as it may hold "lost", whatever the decimal mark
-        arrived = message & ~lost
-        if arrived.any():
-            times[arrived] = seconds(frame.assign(arrival=cells)[arrived], "arrival", file)
-    return times
+        made["arrival"] = np.where(lost, np.inf, np.nan)
+        if (message & ~lost).any():
+            made["arrival"][message & ~lost] = seconds(frame.assign(arrival=cells)[message & ~lost], "arrival", file)
+    return frame[["kind"]].assign(**made)
 
 
 def _check(rows: Rows) -> None:
     """InputError at the first value that cannot be meant in its unit, or that lacks its partner."""
-    limit = np.array([KINDS[kind].limit for kind in rows.kind.tolist()])
-    alone = rows.in_group("relative") & (rows.partner == "")
-    for wrong, column, value, allowed, hint in (
-        (np.abs(rows.value) > limit, "{kind}", "value", "must be within +-{limit:.4g}", UNIT),
-        (rows.of("range") & (rows.value <= 0), "{kind}", "value", "must be > 0", "Remove the row."),
-        (rows.of("inclination") & (rows.value < 0), "{kind}", "value", "must be >= 0", "Remove the row."),
-        (rows.std <= 0, "standard deviation of {kind}", "std", "must be > 0", "Leave it empty where it is unknown."),
-        (alone, "column partner", "partner", "must be a name", "Name the vehicle or road-side unit."),
-        (rows.partner == rows.vehicle, "column partner", "partner", ITSELF, "Mend or remove the row."),
+    kind, value, partner = (rows[name] for name in ("kind", "value", "partner"))
+    limit = kind.map({name: KINDS[name].limit for name in KINDS})
+    alone = in_group(rows, "relative") & (partner == "")
+    deviation = "standard deviation of {kind}"
+    for wrong, column, given, allowed, hint in (
+        (value.abs() > limit, "{kind}", value, "must be within +-{limit:.4g}", UNIT),
+        ((kind == "range") & (value <= 0), "{kind}", value, "must be > 0", "Remove the row."),
+        (
+            kind.isin(["inclination", "inclination_deg"]) & (value < 0),
+            "{kind}",
+            value,
+            "must be >= 0",
+            "Remove the row.",
+        ),
+        (rows["std"] <= 0, deviation, rows["std"], "must be > 0", "Leave it empty where it is unknown."),
+        (alone, "column partner", partner, "must be a name", "Name the vehicle or road-side unit."),
+        (partner == rows["vehicle"], "column partner", partner, ITSELF, "Mend or remove the row."),
     ):
         if wrong.any():
-            k = int(np.argmax(wrong))
-            kind = rows.kind[k]
-            others = ", ".join(name for name in KINDS if KINDS[name].name == KINDS[kind].name)
-            given = getattr(rows, value)[k]
-            shown = (repr(given) if given else "empty") if value == "partner" else f"{given:.10g}"
-            allowed, hint = allowed.format(limit=limit[k]), hint.format(kinds=others)
-            raise InputError(f"{rows.place(k)}, {column.format(kind=kind)}", shown, allowed, hint)
+            first, cell = kind[wrong].iloc[0], given[wrong].iloc[0]
+            others = ", ".join(name for name in KINDS if KINDS[name].name == KINDS[first].name)
+            shown = (repr(cell) if cell else "empty") if given is partner else f"{cell:.10g}"
+            allowed, hint = allowed.format(limit=KINDS[first].limit), hint.format(kinds=others)
+            raise InputError(f"{place(rows[wrong])}, {column.format(kind=first)}", shown, allowed, hint)

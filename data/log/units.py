@@ -1,17 +1,14 @@
-"""What a log is made of: kinds of measurements with their units, rows of them, and what became of the rows."""
+"""Kinds of measurements in a log and their units, the table of its rows, and the counts of what became of them."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
-from typing import TYPE_CHECKING, NamedTuple
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
-from coopoc.arrays import AnyArray, Bools, Floats, Ints
-
-if TYPE_CHECKING:
-    import pandas as pd
+from coopoc.arrays import Bools
 
 DEGREE, TURN = float(np.pi / 180), float(2 * np.pi) + 1e-3
 
@@ -29,7 +26,7 @@ class Kind(NamedTuple):
 
     group: str
     name: str
-    limit: float = np.inf
+    limit: float = 1e8
     scale: float = 1.0
     offset: float = 0.0
 
@@ -56,70 +53,39 @@ for _name in ("yaw_rate", "heading", "azimuth", "bearing", "inclination", "eleva
 KINDS["compass_deg"] = KINDS["heading_deg"]._replace(scale=-DEGREE, offset=float(np.pi / 2))
 ANGLES = ("heading", "azimuth", "bearing", "inclination")
 
-
-@dataclass(frozen=True, eq=False)
-class Rows:
-    """L measurements in the units of their kinds.
-
-    Args:
-        t: (L,) s; of a message, when it was sent; NaN of a place without a time.
-        vehicle: (L,) names: what measures, or sends.
-        kind: (L,) names of KINDS.
-        partner: (L,) names: what is measured, or receives; "" for none, or for a message to all.
-        value: (L,) NaN for a message.
-        std: (L,) NaN where it is not given.
-        arrival: (L,) s, infinite for a message that was lost; NaN where there is none.
-        file: (L,) names.
-        row: (L,) from 1, the header not counted.
-    """
-
-    t: Floats
-    vehicle: AnyArray
-    kind: AnyArray
-    partner: AnyArray
-    value: Floats
-    std: Floats
-    arrival: Floats
-    file: AnyArray
-    row: Ints
-
-    def __len__(self) -> int:
-        return len(self.t)
-
-    def take(self, which: Bools | Ints) -> Rows:
-        """Some of the rows."""
-        return replace(self, **{name: getattr(self, name)[which] for name in self.__dataclass_fields__})
-
-    def of(self, *kinds: str) -> Bools:
-        """(L,) True for rows of these kinds."""
-        return np.isin(self.kind, list(kinds))
-
-    def in_group(self, *groups: str) -> Bools:
-        """(L,) True for rows of these groups."""
-        return self.of(*(name for name, kind in KINDS.items() if kind.group in groups))
-
-    def place(self, which: Bools | int) -> str:
-        """File and row of one of them, or of the first where `which` is true."""
-        k = which if isinstance(which, int) else int(np.argmax(which))
-        return f"{self.file[k]}: row {self.row[k]}"
+Rows = pd.DataFrame
+"""L measurements, a row each, with the columns of BLANK, `file` and `row` (from 1, the header not counted)."""
+NONE = np.nan
+BLANK = {"t": NONE, "vehicle": "", "kind": "", "partner": "", "value": NONE, "std": NONE, "arrival": NONE, "true": 0.0}
+"""t in s, of a message when it was sent, NaN of a place without a time; vehicle measures, or sends; partner is
+measured, or receives, "" for none or for a message to all; value and std in the unit of the kind, NaN where there is
+none; arrival in s, infinite for a message that was lost; true is 1 for what is of the truth, not measured."""
 
 
 def rows_of(frame: pd.DataFrame, file: str) -> Rows:
-    """Rows of a table with columns t, vehicle, kind and value, and, if there are any, partner, std and arrival; its
-    index numbers them."""
-    numbers = {name: frame.get(name, np.full(len(frame), np.nan)) for name in ("t", "value", "std", "arrival")}
-    names = {name: frame.get(name, [""] * len(frame)) for name in ("vehicle", "kind", "partner")}
-    return Rows(
-        **{name: np.array(column, dtype=float) for name, column in numbers.items()},
-        **{name: np.array(list(column), dtype=object) for name, column in names.items()},
-        file=np.full(len(frame), file, dtype=object),
-        row=frame.index.to_numpy(dtype=np.int64),
-    )
+    """Rows of a table with some of these columns; its index numbers them."""
+    blank: dict[str, Any] = {name: value for name, value in BLANK.items() if name not in frame}
+    rows = frame.assign(**blank, file=file, row=frame.index)[[*BLANK, "file", "row"]]
+    names = {name: object if value == "" else float for name, value in BLANK.items()}
+    return rows.astype(names).reset_index(drop=True)
 
 
-def stacked(parts: Sequence[Rows]) -> Rows:
-    """All rows of several files."""
-    return Rows(**{name: np.concatenate([getattr(one, name) for one in parts]) for name in Rows.__dataclass_fields__})
+def in_group(rows: Rows, *groups: str) -> Bools:
+    """(L,) True for rows whose kinds are of these groups."""
+    return rows["kind"].isin([name for name, kind in KINDS.items() if kind.group in groups]).to_numpy()
+
+
+def place(rows: Rows) -> str:
+    """File and row of the first."""
+    first = rows.iloc[0]
+    return f"{first['file']}: row {first['row']}"
+
+
+def distinct(rows: Rows, summary: Summary) -> Rows:
+    """Rows but those that repeat a kind of measurement of one vehicle, or pair, at one time."""
+    again = rows.duplicated(["t", "vehicle", "kind", "partner"]) & (rows["kind"] != "message")
+    summary.refuse("repeated rows (same time, vehicle, kind and partner)", rows[again])
+    return rows[~again]
 
 
 @dataclass
@@ -160,17 +126,12 @@ class Summary:
         if number:
             self.read[what] = self.read.get(what, 0) + number
 
-    def refuse(self, reason: str, number: int, where: str = "") -> None:
-        """Add to what is not in the Recording."""
+    def refuse(self, reason: str, rows: Rows | int, where: str = "") -> None:
+        """Add rows, or a number of things, to what is not in the Recording."""
+        number = rows if isinstance(rows, int) else len(rows)
         if number:
-            before, first = self.refused.get(reason, (0, where))
+            before, first = self.refused.get(reason, (0, where if isinstance(rows, int) else place(rows)))
             self.refused[reason] = before + number, first
-
-    def refuse_rows(self, reason: str, rows: Rows, wrong: Bools | Ints) -> None:
-        """Refuse the rows that are True, or at these indices."""
-        which = np.flatnonzero(wrong) if wrong.dtype == bool else wrong
-        if len(which):
-            self.refuse(reason, len(which), rows.place(int(which[0])))
 
     def leave(self, what: str, number: int) -> None:
         """Add to what was not meant to be read."""

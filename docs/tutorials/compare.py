@@ -27,7 +27,7 @@ seen
 # the ego with the neighbours that it measures at one step.
 
 # %%
-seen.between(0, 300).plot(step=150).figure
+co.plot_recording(seen.between(0, 300), step=150).figure
 
 # %% [markdown]
 # ## Six methods
@@ -71,7 +71,7 @@ for name in ("Kalman filter, identity", "Kalman filter, nominal", "joint filter,
     print(f"{name:25s} NEES {co.nees(tracks[name], fleet).mean():6.2f}")
 
 # %%
-tracks["joint filter, nominal"].plot(fleet=fleet, every=45).figure
+co.plot_track(tracks["joint filter, nominal"], fleet=fleet, every=45).figure
 
 # %% [markdown]
 # ## Over neighbours, with tables and figures

@@ -57,7 +57,7 @@ log = co.read_log(
 print(log.summary)
 
 # %%
-log.recording.plot(step=300).figure
+co.plot_recording(log.recording, step=300).figure
 
 # %% [markdown]
 # ## Methods on it
@@ -74,7 +74,7 @@ for method in (co.Kalman("nominal"), co.JointFilter("nominal")):
     print(f"{method.name:8s} innovation {found['innovation_m'].mean():.2f} m, NIS {found['nis'].mean():.2f}")
 
 # %%
-track.plot(every=60).figure
+co.plot_track(track, every=60).figure
 
 # %% [markdown]
 # ## The same by commands

@@ -84,7 +84,7 @@ error = np.linalg.norm(solution.position - [at[:2] for at in truth.values()], ax
 dict(zip(names, error.round(2).tolist(), strict=True))
 
 # %%
-solution.plot(problem=robust).figure
+co.plot_solution(solution, problem=robust).figure
 
 # %% [markdown]
 # ## A wall

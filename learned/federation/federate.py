@@ -8,10 +8,10 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import get_args
 
-from coopoc.arrays import instance, listed
+from coopoc.arrays import instance, listed, one_of
 from coopoc.errors import InputError, shown
-from coopoc.methods.options import check_options
-from coopoc.plugins import find, one_of
+from coopoc.methods.track import check_options
+from coopoc.plugins import find
 
 from ..nets.gain import Gain
 from ..nets.stack import flatten

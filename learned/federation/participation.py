@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from coopoc.errors import InputError
-from coopoc.methods.options import check_options
+from coopoc.methods.track import check_options
 from coopoc.world.fleet import Fleet
 from coopoc.world.sensors import Sensors, stream
 

@@ -8,8 +8,7 @@ from contextlib import suppress
 from dataclasses import fields, replace
 from typing import Any
 
-from coopoc.errors import InputError
-from coopoc.plugins import unknown
+from coopoc.errors import InputError, unknown
 
 from ..recipes import Job, Recipe, Setting, recipe_of
 from ..training.schedule import Schedule

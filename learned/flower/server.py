@@ -13,10 +13,10 @@ import torch
 from torch import Tensor
 
 from coopoc import arrays
+from coopoc.arrays import one_of
 from coopoc.errors import InputError
 from coopoc.escapes import visible
 from coopoc.file_names import given_path
-from coopoc.plugins import one_of
 
 from ..checkpoint import Checkpoint, save
 from ..federation.combine import SERVER, screen
@@ -263,7 +263,7 @@ def checkpoint(rows: Sequence[Row], job: Job, seconds: float) -> Checkpoint:
     card: dict[str, Any] = {
         "recipe": job.name,
         "settings": asdict(job.recipe) | asdict(job.setting),
-        "noise": asdict(sensors(job.setting)),
+        "noise": asdict(sensors(job)),
         "client": None,
         "clients": list(made.names),
         "training_pieces": list(made.sizes),

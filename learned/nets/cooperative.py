@@ -11,8 +11,7 @@ from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.methods.joint_filter import JointFilter
 from coopoc.methods.noise_model import NoiseModel
-from coopoc.methods.options import check_options
-from coopoc.methods.track import Track
+from coopoc.methods.track import Track, check_options
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import Message
 

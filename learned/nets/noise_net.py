@@ -15,7 +15,7 @@ from torch import Tensor, nn
 
 from coopoc.arrays import Floats, Ints
 from coopoc.errors import InputError
-from coopoc.methods.star import FORGOTTEN
+from coopoc.kernels.stars.messages import FORGOTTEN
 from coopoc.methods.track import Method, Track
 from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, check_recording

@@ -17,9 +17,8 @@ from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.noise_model import check_interval
-from coopoc.methods.options import check_options
 from coopoc.methods.stream import FilterStream
-from coopoc.methods.track import Track
+from coopoc.methods.track import Track, check_options
 from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message

@@ -12,9 +12,8 @@ import torch
 from torch import Tensor, nn
 
 from coopoc.arrays import Floats
-from coopoc.methods.options import check_options
 from coopoc.methods.stream import Stream, solo_track_of
-from coopoc.methods.track import Track
+from coopoc.methods.track import Track, check_options
 from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording
 from coopoc.world.v2x import NO_MESSAGE, Message

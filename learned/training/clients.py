@@ -11,10 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc.arrays import AnyArray, Floats, instance, number
+from coopoc.arrays import AnyArray, Floats, instance, number, one_of
 from coopoc.errors import InputError, shown
-from coopoc.methods.options import check_options
-from coopoc.plugins import one_of
+from coopoc.methods.track import check_options
 from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
 from coopoc.world.sensing import observe
@@ -201,7 +200,8 @@ def clients(
 ) -> tuple[Client, ...]:
     """Every vehicle of a training fleet as a client: its noisy drive in pieces, `split` of them for training.
 
-    A piece is `piece` steps after one start sample; the last incomplete one is dropped. Which pieces validate is drawn
+    A piece is `piece` steps after one start sample; the last incomplete one, and one that begins without a fix, are
+    dropped. Which pieces validate is drawn
     once from the seed. Static noise, drawn once as the paper implies, is the default.
 
     Args:
@@ -229,11 +229,11 @@ def clients(
     check_pieces(piece, split)
     fleet = instance("fleet", fleet, Fleet)
     sensors = Sensors.paper_training() if sensors is None else instance("sensors", sensors, Sensors)
-    if noise != "static" and (sensors.gnss_bias[1] > 0 or sensors.gnss_drift_std > 0 or sensors.gnss_common_std > 0):
-        given = (sensors.gnss_bias, sensors.gnss_drift_std, sensors.gnss_common_std)
+    lasting = (sensors.gnss_bias, sensors.gnss_drift_std, sensors.gnss_common_std, sensors.outliers.notes)
+    if noise != "static" and lasting != ((0.0, 0.0), 0.0, 0.0, ()):
         raise InputError(
-            "gnss_bias, gnss_drift_std, gnss_common_std",
-            given,
+            "gnss_bias, gnss_drift_std, gnss_common_std, outliers",
+            lasting,
             f"must be zero with {noise} noise",
             "Train with white noise, or static.",
         )
@@ -269,6 +269,8 @@ def _cut(drive: Sequence[Floats], sensors: Sensors, piece: int, dt: float, noise
     """Segments of one vehicle's gnss, velocity, truth and true velocity (T, 3)."""
     count = len(drive[0]) // (piece + 1)
     gnss, velocity, truth, true_velocity = (d[: count * (piece + 1)].reshape(count, piece + 1, 3) for d in drive)
+    begun = np.isfinite(gnss[:, 0, 0])
+    gnss, velocity, truth, true_velocity = (d[begun] for d in (gnss, velocity, truth, true_velocity))
     origin = truth[:, :1]
     acting = replace(sensors, velocity_reading="axis") if noise == "wide" else sensors
     stds = np.broadcast_to(np.array(sensors.gnss_std), gnss.shape), acting.velocity_std(true_velocity)
@@ -283,7 +285,7 @@ def _cut(drive: Sequence[Floats], sensors: Sensors, piece: int, dt: float, noise
         tensor(true_velocity),
         tensor(stds[0]),
         tensor(stds[1]),
-        torch.full((count,), start == "true"),
+        torch.full((len(gnss),), start == "true"),
         dt,
         noise,
     )

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from coopoc.arrays import Floats, Ints, instance
 from coopoc.errors import InputError
-from coopoc.methods.options import check_options
+from coopoc.methods.track import check_options
 from coopoc.short_repr import short_repr
 from coopoc.world.sensors import stream
 

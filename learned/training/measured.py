@@ -8,9 +8,8 @@ from typing import Any, get_args
 import numpy as np
 import torch
 
-from coopoc.arrays import Floats, instance
+from coopoc.arrays import Floats, instance, one_of
 from coopoc.errors import InputError
-from coopoc.plugins import one_of
 from coopoc.world.axes import columns
 from coopoc.world.recording import Recording
 

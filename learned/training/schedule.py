@@ -10,9 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc.arrays import Floats, Ints
-from coopoc.methods.options import Limits, check_options
-from coopoc.plugins import one_of
+from coopoc.arrays import Floats, Ints, one_of
+from coopoc.methods.track import Limits, check_options
 
 from ..engine.optimiser import Found, Moments, Update
 from ..engine.optimiser import advance as advanced

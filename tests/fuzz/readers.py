@@ -46,7 +46,6 @@ def _reference(folder: Path) -> None:
     known = reference.Reference.load(folder / "made.json")
     found = Results(known.study, "", ("method",), known.settings, frame, pd.DataFrame(), 0, {})
     changes = reference.check(found, known)
-    reference.summary(changes)
     reference.table(changes)
 
 

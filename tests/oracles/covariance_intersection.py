@@ -1,14 +1,19 @@
-"""Split covariance intersection: the fusion of estimates whose errors are correlated by an unknown amount.
+"""Split covariance intersection with dense matrices, one run: errors that are correlated by an unknown amount.
 
-P^-1 = (Pd / w + Pi)^-1 + sum_j (Cd_j / (1 - w) + Ci_j)^-1 with the w in (0, 1] of least trace of P, and x the mean that
-belongs to it. Plain covariance intersection takes all error as dependent: P^-1 = w Pa^-1 + (1 - w) Pb^-1.
+Every error is the sum of a dependent and an independent one, P = Pd + Pi. What is measured is z = H x + e, of each
+neighbour the rows of its pseudo-fix that were measured, H_j = (radial; azimuthal; polar unit vector):
+
+    P1 = Pd / w + Pi,   P2 = H D H^T / (1 - w) + R,   K = P1 H^T (H P1 H^T + P2)^-1,   P = (1 - K H) P1,
+    Pi = (1 - K H) Pi (1 - K H)^T + K R K^T,   Pd = P - Pi = (1 - K H) Pd (1 - K H)^T / w + K H D H^T K^T / (1 - w),
+
+with the w in (0, 1] of least trace of P. The ego's own fix has no dependent error. Plain covariance intersection takes
+all other errors as dependent (Li, Nashashibi, Yang, 2013; Julier and Uhlmann, 2001).
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.optimize import brentq
 
 from coopoc import NoiseModel
@@ -20,57 +25,55 @@ LEAST = 1e-9
 """Least weight of one's own estimate: at zero nothing might be left to invert."""
 
 
-class Belief(NamedTuple):
-    """x (3,) m, and the covariances (3, 3) m^2 of its possibly correlated and of its independent error."""
-
-    x: Floats
-    dependent: Floats
-    independent: Floats
-
-
-def follow(stars: list[list[Member]], known: NoiseModel, split: bool) -> tuple[Floats, Floats]:
+def follow(stars: list[list[Member]], noise_model: NoiseModel, split: bool) -> tuple[Floats, Floats]:
     """x (T, 3) and covariance (T, 3, 3); a position in a message is the sender's own estimate."""
-    own, nothing, estimates = None, np.zeros((3, 3)), []
-    for star in stars:
-        ego, fix = star[0], Belief(star[0].position, nothing, np.diag(known.gnss_variance))
-        prior = fix
-        if own is not None:
-            prior = Belief(own.x + ego.moved, own.dependent, own.independent + np.diag(ego.process))
-        sources = [fix] if ego.new and own is not None else []
-        for one in star[1:]:
-            if np.isfinite(one.variance).all():
-                seen = np.array(spherical(*(one.position - prior.x)))
-                position = one.position - to_vector(np.where(np.isnan(one.relative), seen, one.relative))
-                sources.append(joined(Belief(position, np.diag(one.variance), known.relative_cov(seen)), split))
-        own = intersect(joined(prior, split), sources)[0]
-        estimates.append((own.x, own.dependent + own.independent))
-    return np.array([x for x, _ in estimates]), np.array([p for _, p in estimates])
+    nothing, fix_noise, steps = np.zeros((3, 3)), np.diag(noise_model.gnss_variance), []
+    for ego, *others in stars:
+        sources = []
+        if steps:
+            x, dependent, independent = steps[-1]
+            x, independent = x + ego.moved, independent + np.diag(ego.process)
+            sources = [(np.eye(3), ego.position, nothing, fix_noise)] if ego.new else []
+        else:
+            x, dependent, independent = ego.position, nothing, fix_noise
+        sources += [
+            pseudo_fix(member, x, noise_model, split) for member in others if np.isfinite(member.variance).all()
+        ]
+        if not split:
+            dependent, independent = dependent + independent, nothing
+        steps.append(fuse(x, dependent, independent, sources) if sources else (x, dependent, independent))
+    return np.array([x for x, _, _ in steps]), np.array([d + i for _, d, i in steps])
 
 
-def joined(belief: Belief, split: bool) -> Belief:
-    """Plain covariance intersection takes all error as dependent."""
-    return belief if split else Belief(belief.x, belief.dependent + belief.independent, 0.0 * belief.independent)
+def pseudo_fix(member: Member, x: Floats, noise_model: NoiseModel, split: bool) -> tuple[Floats, ...]:
+    """H, z, D and R of the ego's position by a neighbour's estimate: rows of what was measured, at the predicted
+    geometry."""
+    predicted = np.array(spherical(*(member.position - x)))
+    there = ~np.isnan(member.relative)
+    (sa, si), (ca, ci) = np.sin(predicted[1:]), np.cos(predicted[1:])
+    H = np.array([[si * ca, si * sa, ci], [-sa, ca, 0.0], [ci * ca, ci * sa, -si]])[there]
+    D, R = H @ np.diag(member.variance) @ H.T, H @ noise_model.relative_cov(predicted) @ H.T
+    z = H @ (member.position - to_vector(np.where(there, member.relative, predicted)))
+    return (H, z, D, R) if split else (H, z, D + R, 0.0 * R)
 
 
-def intersect(own: Belief, others: list[Belief]) -> tuple[Belief, float]:
-    """One's own estimate fused with others, consistent for any correlation of own with other dependent errors; and w.
+def fuse(x: Floats, Pd: Floats, Pi: Floats, sources: list[tuple[Floats, ...]]) -> tuple[Floats, Floats, Floats]:
+    """x, Pd and Pi after all sources at once."""
+    H, z = (np.concatenate([source[k] for source in sources]) for k in (0, 1))
+    D, R = (block_diag(*(source[k] for source in sources)) for k in (2, 3))
 
-    The information of a source is L = s K, K = (D + s I)^-1, and its derivative by s is K D K.
-    """
+    def gain(w: float) -> tuple[Floats, Floats]:
+        P1, P2 = Pd / w + Pi, D / max(1.0 - w, 1e-15) + R
+        K = P1 @ H.T @ np.linalg.inv(H @ P1 @ H.T + P2)
+        return K, np.eye(3) - K @ H
 
-    def sources(w: float) -> list[tuple[Floats, Floats, Floats, float]]:
-        each = [(own, w, 1.0), *((other, max(1.0 - w, 1e-15), -1.0) for other in others)]
-        inverse = [(b, s, sign, np.linalg.inv(b.dependent + s * b.independent)) for b, s, sign in each]
-        return [(b.x, s * k, s * k @ b.dependent @ k, sign / s) for b, s, sign, k in inverse]
+    def slope(w: float) -> float:
+        """d tr P / dw: K is the best gain at every w, so that only P1 and P2 change."""
+        K, rest = gain(w)
+        return float(np.trace(K @ D @ K.T) / max(1.0 - w, 1e-15) ** 2 - np.trace(rest @ Pd @ rest.T) / w**2)
 
-    def derivative(w: float) -> float:
-        cov = np.linalg.inv(sum(information for _, information, _, _ in sources(w)))
-        return -float(np.trace(cov @ sum(sign * change for _, _, change, sign in sources(w)) @ cov))
-
-    low, high = LEAST, 1.0
-    w = high if derivative(high) <= 0 else low if derivative(low) >= 0 else brentq(derivative, low, high, xtol=1e-13)
-    parts = sources(w)
-    cov = np.linalg.inv(sum(information for _, information, _, _ in parts))
-    x = own.x + cov @ sum(information @ (y - own.x) for y, information, _, _ in parts)
-    dependent = cov @ sum(change for _, _, change, _ in parts) @ cov
-    return Belief(x, dependent, cov - dependent), w
+    low, high = LEAST, 1.0 - LEAST
+    w = 1.0 if slope(high) <= 0 else low if slope(low) >= 0 else brentq(slope, low, high, xtol=1e-13)
+    K, rest = gain(w)
+    dependent = rest @ Pd @ rest.T / w + K @ D @ K.T / max(1.0 - w, 1e-15)
+    return x + K @ (z - H @ x), dependent, rest @ Pi @ rest.T + K @ R @ K.T

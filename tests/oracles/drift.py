@@ -10,7 +10,7 @@ import numpy as np
 
 from coopoc import NoiseModel
 from coopoc.arrays import Floats
-from coopoc.methods.star import FORGOTTEN
+from coopoc.kernels.stars.messages import FORGOTTEN
 from oracles.joint import converted, first_place, placed, whitened
 from oracles.messages import Member
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from coopoc import NoiseModel
 from coopoc.arrays import Floats
-from coopoc.methods.star import FORGOTTEN
+from coopoc.kernels.stars.messages import FORGOTTEN
 from coopoc.world.links import spherical, to_vector, wrap
 from oracles.messages import Member
 

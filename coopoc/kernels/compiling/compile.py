@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import gc
 import os
+import re
 import sys
 import threading
 from collections.abc import Callable
 from functools import cache, partial
+from importlib.util import resolve_name
 from pathlib import Path
 from typing import Any, TypeVar, cast
 
@@ -17,8 +19,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def compiled(function: Function) -> Function:
     """Compiled at the first call. A product and a sum may become one instruction; nothing is reordered.
 
-    The machine code is kept beside the source, or in the user's cache where that is read-only. It is made anew after a
-    change of any file of the kernels or of the function's own folder, since it holds what it calls.
+    The machine code is kept beside the source, or in the user's cache where that is read-only. It holds what it calls:
+    it is made anew after a change of the function's file, or of a file of the kernels or of its own folder that it
+    imports, directly or through others.
     """
     return _kept(function, {"contract"})
 
@@ -60,6 +63,7 @@ def storage(function: Function) -> Function:
 
 
 KERNELS = Path(__file__).resolve().parents[1]
+IMPORT = re.compile(r"^from (\.*[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
 PATIENCE = 2.0
 """s of compiling after which a line on stderr reports it."""
 PLAIN = "COOPOC_PLAIN_NJIT"
@@ -128,7 +132,7 @@ def _kept(function: Function, liberties: set[str]) -> Function:
         return cast(Function, made)
     if _hooks():
         file = made._cache._cache_file
-        file._source_stamp = _stamp(Path(function.__code__.co_filename).parent)
+        file._source_stamp = _stamp(function.__module__)
         file._load_index = partial(_index_or_none, file._load_index)
     return cast(Function, made)
 
@@ -142,6 +146,26 @@ def _index_or_none(load: Callable[[], Any]) -> Any:
 
 
 @cache
-def _stamp(folder: Path) -> tuple[tuple[str, int, int], ...]:
-    files = sorted({*KERNELS.rglob("*.py"), *folder.glob("*.py")})
+def _stamp(module: str) -> tuple[tuple[str, int, int], ...]:
+    """Name, time and size of every file whose change makes the machine code of a module stale."""
+    names, new = {module}, {module}
+    while new := {other for name in new for other in _imported(name)} - names:
+        names |= new
+    files = [_file(name) for name in sorted(names)]
     return tuple((file.name, file.stat().st_mtime_ns, file.stat().st_size) for file in files)
+
+
+@cache
+def _imported(module: str) -> set[str]:
+    """Modules of the kernels and of its own folder that a module imports at its top."""
+    file, package = _file(module), sys.modules[module].__package__
+    names = set()
+    for base, parts in IMPORT.findall(file.read_text(encoding="utf-8")):
+        base = resolve_name(base, package)
+        names |= {base, *(f"{base}.{name}" for name in re.findall(r"\w+", parts))}
+    files = {name: _file(name) for name in names if getattr(sys.modules.get(name), "__file__", None)}
+    return {name for name, other in files.items() if other.parent == file.parent or KERNELS in other.parents}
+
+
+def _file(module: str) -> Path:
+    return Path(str(sys.modules[module].__file__)).resolve()

@@ -12,9 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..compiling.compile import compiled, part, storage
+from ..compiling.compile import compiled, inner, part, storage
 from ..compiling.small import add, apply, from_upper, load, plus_applied, scale, store, subtract
-from ..stars.relative import at_measurement, completed, exact
+from ..stars.relative import Numbers, completed, exact, gram
 
 Vector = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
@@ -376,3 +376,13 @@ def fuse_delayed(latest: Ints, x: Floats, cov: Floats, measured: Measured, assum
                 for u in range(last + 1, t + 1):
                     correct(now[run, t], covariance[run, t], run, u, n, measured, assumed)
     return now, covariance
+
+
+@inner
+def at_measurement(seen: Numbers, std: Numbers, least: float) -> Numbers:
+    """The information of `exact`, upper triangle, at the measured vector itself; its distance is at least `least`."""
+    d, level = max(seen[0], least), max(abs(seen[3]), 1e-3)
+    a, b, c = 1.0 / std[0], seen[3] / (level * level * d * std[1]), 1.0 / (level * d * std[2])
+    tilt = c * seen[3] * seen[4]
+    along = a * seen[3] * seen[2], a * seen[3] * seen[1], a * seen[4]
+    return gram(along, -b * seen[1], b * seen[2], (tilt * seen[2], tilt * seen[1], -c * level * level))

@@ -26,6 +26,13 @@ as broadcast and brought forward, and its variance m^2."""
 SENT, USES, AGE, HELD, NEW = range(5)
 """Rows of a member in `Star.status`: the step of the message, for how many steps in a row its velocity has served, its
 age in steps, 1 if there is one, and 1 if its position counts."""
+FORGOTTEN = 1e6
+"""m^2, prior variance of a vehicle that has just joined: nothing is known of it."""
+ACCELERATION_STD = 1.0
+"""m/s^2, how fast a velocity may have changed since the message that carried it."""
+FIX_GROWTH, ESTIMATE_GROWTH = (1.0, 0.0), (1.0, 2.0)
+"""(a, b): after `age` steps a position has gained age (a age + b) times the variance of one step. A fix that is moved
+with one velocity makes its error age times; an estimate has made that error once before, fully correlated."""
 NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
 Index: TypeAlias = Any
@@ -141,12 +148,6 @@ def new_estimates(seen: Measurements) -> Estimates:
     return np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
 
 
-def new_star(most: int) -> Star:
-    """Room for `most` members."""
-    plain: Any = star_in
-    return cast(Star, plain.py_func(np.zeros(30 * most * LANES), np.zeros(3 * most, np.int64), most))
-
-
 @inner
 def largest(start: Ints) -> int:
     """Members of the largest star."""
@@ -254,29 +255,6 @@ def interpret(star: Star, known: Assumptions, k: int, dt: float) -> None:
     store(star.motion, 4 * k + PROCESS, choose_each(held, scale(one, often), (flat, flat, flat)))
     store(star.motion, 4 * k + POSITION, add(load(star.motion, 4 * k + POSITION, ROW), scale(moved, age)))
     store(star.motion, 4 * k + VARIANCE, add(load(star.motion, 4 * k + VARIANCE, ROW), grown))
-
-
-@inner
-def write_ego(
-    out: Estimates,
-    star: Star,
-    x: Floats,
-    cov: Floats,
-    first: int,
-    last: int,
-    t: int,
-    link: int,
-    n: int,
-) -> None:
-    """Copy the ego's estimate in runs first to last, and its neighbours' own ones, NaN where none is held."""
-    for lane in range(last - first + 1):
-        for i in range(3):
-            out[0][first + lane, t, i] = x[i, lane]
-            for j in range(3):
-                out[1][first + lane, t, i, j] = cov[3 * i + j, lane]
-            for k in range(1, n):
-                held = star.status[5 * k + HELD, lane] > 0.0 and star.motion[12 * k + 3 * VARIANCE + i, lane] < NOWHERE
-                out[2][first + lane, link + k - 1, i] = star.motion[12 * k + 3 * POSITION + i, lane] if held else np.nan
 
 
 @inside

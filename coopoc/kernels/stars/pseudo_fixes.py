@@ -54,14 +54,16 @@ from .messages import (
     largest,
     new_estimates,
     star_within,
-    write_ego,
 )
-from .relative import Numbers, completed, converted_cov, direction, vector
+from .relative import Numbers, completed, direction, vector
 
 ROUNDS, BISECT, TOLERANCE = 60, 20, 1e-8
 """Of Newton's method; after BISECT rounds a step out of the bracket halves it."""
 LEAST = 1e-9
 """Least weight of the ego's own estimate: at zero nothing might be left to invert."""
+MOST = 1.0 - 1e-6
+"""Greatest weight but for 1: nearer to 1 the derivatives of what lacks a component, whose I is 1e8 m^2, bend within
+D / I = 1e-8, and Newton's steps there are shorter than TOLERANCE without a minimum."""
 
 
 @as_written
@@ -255,8 +257,9 @@ def source(fusion: Fusion, k: int, s: float) -> tuple[Numbers, Numbers, Numbers]
 
 @inner
 def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
-    """w of least trace in [LEAST, 1]."""
-    low, high, going = 0.0 * w + LEAST, 0.0 * w + 1.0, 0.0 * w + 1.0
+    """w of least trace in [LEAST, MOST], or 1."""
+    low, high, going = 0.0 * w + LEAST, 0.0 * w + MOST, 0.0 * w + 1.0
+    w = choose(w - MOST, high, w)
     for round_ in range(ROUNDS):
         first, second = derivatives(fusion, fixed, n, w)
         low, high = choose(first, low, w), choose(-first, high, w)
@@ -268,7 +271,8 @@ def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
         going = choose(abs(w - before) - TOLERANCE, going, 0.0 * w)
         if going <= 0.0 * w:
             break
-    return w
+    best: float = choose(w - MOST + TOLERANCE, 0.0 * w + 1.0, w)
+    return best
 
 
 @inner
@@ -298,3 +302,55 @@ def inner_product(a: Numbers, b: Numbers) -> float:
     p = times(a, b)
     total: float = p[0] + p[1] + p[2] + p[3] + p[4] + p[5] + p[6] + p[7] + p[8]
     return total
+
+
+@inner
+def converted_cov(seen: Numbers, std: Numbers, least: float) -> Numbers:
+    """Covariance m^2, upper triangle, of a converted measurement at its own geometry: `vector_cov`.
+
+    Args:
+        seen: range m, sine and cosine of azimuth and of inclination.
+        std: 1e3 at most, so that a missing component has a variance beyond any other.
+    """
+    d, sa, ca, si, ci = seen[0], seen[1], seen[2], seen[3], seen[4]
+    d = max(d, least)
+    a, b, c = min_of(std[0]), min_of(std[1]) * d * si, min_of(std[2]) * d
+    a, b, c = a * a, b * b, c * c
+    flat, cross = a * si * si + c * ci * ci, (a - c) * si * ci
+    return (
+        flat * ca * ca + b * sa * sa,
+        (flat - b) * sa * ca,
+        cross * ca,
+        flat * sa * sa + b * ca * ca,
+        cross * sa,
+        a * ci * ci + c * si * si,
+    )
+
+
+@inside
+def min_of(std: float) -> float:
+    """At most 1e3."""
+    return -max(-std, -1e3)
+
+
+@inner
+def write_ego(
+    out: Estimates,
+    star: Star,
+    x: Floats,
+    cov: Floats,
+    first: int,
+    last: int,
+    t: int,
+    link: int,
+    n: int,
+) -> None:
+    """Copy the ego's estimate in runs first to last, and its neighbours' own ones, NaN where none is held."""
+    for lane in range(last - first + 1):
+        for i in range(3):
+            out[0][first + lane, t, i] = x[i, lane]
+            for j in range(3):
+                out[1][first + lane, t, i, j] = cov[3 * i + j, lane]
+            for k in range(1, n):
+                held = star.status[5 * k + HELD, lane] > 0.0 and star.motion[12 * k + 3 * VARIANCE + i, lane] < NOWHERE
+                out[2][first + lane, link + k - 1, i] = star.motion[12 * k + 3 * POSITION + i, lane] if held else np.nan

@@ -121,16 +121,6 @@ def converted(x: float, y: float, z: float, std: Numbers, least: float) -> Numbe
     )
 
 
-@inner
-def at_measurement(seen: Numbers, std: Numbers, least: float) -> Numbers:
-    """The information of `exact`, upper triangle, at the measured vector itself; its distance is at least `least`."""
-    d, level = max(seen[0], least), max(abs(seen[3]), 1e-3)
-    a, b, c = 1.0 / std[0], seen[3] / (level * level * d * std[1]), 1.0 / (level * d * std[2])
-    tilt = c * seen[3] * seen[4]
-    along = a * seen[3] * seen[2], a * seen[3] * seen[1], a * seen[4]
-    return gram(along, -b * seen[1], b * seen[2], (tilt * seen[2], tilt * seen[1], -c * level * level))
-
-
 @inside
 def gram(a: Numbers, bx: float, by: float, c: Numbers) -> Numbers:
     """J^T J, upper triangle, of the whitened rows a of range, (bx, by, 0) of azimuth and c of inclination."""
@@ -203,32 +193,3 @@ def direction(x: float, y: float, z: float) -> Five:
     o, one = 0.0 * d, 0.0 * d + 1.0
     sine, cosine = choose(flat, y / flat, o), choose(flat, x / flat, one)
     return d, sine, cosine, choose(d, flat / d, o), choose(d, z / d, one)
-
-
-@inner
-def converted_cov(seen: Numbers, std: Numbers, least: float) -> Numbers:
-    """Covariance m^2, upper triangle, of a converted measurement at its own geometry: `vector_cov`.
-
-    Args:
-        seen: range m, sine and cosine of azimuth and of inclination.
-        std: 1e3 at most, so that a missing component has a variance beyond any other.
-    """
-    d, sa, ca, si, ci = seen[0], seen[1], seen[2], seen[3], seen[4]
-    d = max(d, least)
-    a, b, c = min_of(std[0]), min_of(std[1]) * d * si, min_of(std[2]) * d
-    a, b, c = a * a, b * b, c * c
-    flat, cross = a * si * si + c * ci * ci, (a - c) * si * ci
-    return (
-        flat * ca * ca + b * sa * sa,
-        (flat - b) * sa * ca,
-        cross * ca,
-        flat * sa * sa + b * ca * ca,
-        cross * sa,
-        a * ci * ci + c * si * si,
-    )
-
-
-@inside
-def min_of(std: float) -> float:
-    """At most 1e3."""
-    return -max(-std, -1e3)

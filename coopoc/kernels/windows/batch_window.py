@@ -27,11 +27,10 @@ from ..stars.messages import (
     Assumptions,
     Measurements,
     Star,
-    new_star,
 )
 from .chains import System, advance, gap_of, gauss_newton, new_system
 from .robust import GNC, Weights, new_weights, residuals, reweigh, trust_all, weigh
-from .window_layout import ROW, Window, any_positive, count_of, enter, new_window, row_of
+from .window_layout import ROW, Window, any_positive, count_of, enter, new_star, new_window, row_of
 
 SOLVED, MET, LOST = range(3)
 """Solved exactly; solved converted, since two vehicles met; not solved: Gauss-Newton did not settle."""

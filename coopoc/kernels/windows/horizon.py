@@ -40,7 +40,6 @@ from ..stars.messages import (
     Measurements,
     clear,
     interpret,
-    new_star,
     receive,
 )
 from ..stars.relative import completed, vector
@@ -54,6 +53,7 @@ from .window_layout import (
     enter,
     largest_of,
     motion,
+    new_star,
     new_window,
     row_of,
     star_at,

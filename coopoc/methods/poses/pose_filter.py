@@ -9,17 +9,15 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Ints, checked, number
+from ...arrays import Bools, Floats, Ints, checked, number, one_of
 from ...errors import InputError
-from ...plugins import one_of
 from ...short_repr import short_repr
 from ...world.inbox import inbox
 from ...world.links import wrap
 from ...world.recording import Recording, check_recording
 from ...world.sensors import Sensors
 from ...world.v2x import NO_MESSAGE, Message
-from ..options import check_options
-from ..track import Track
+from ..track import Track, check_options
 from ..whole_fleet import CENTRE, centre
 from .pose_inputs import (
     POSE,

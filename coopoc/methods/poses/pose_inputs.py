@@ -9,10 +9,10 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints, checked, listed
 from ...errors import InputError
+from ...kernels.stars.messages import FORGOTTEN
 from ...world.recording import Body, Recording
 from ...world.sensors import Sensors
 from ...world.v2x import Message
-from ..star import FORGOTTEN
 
 if TYPE_CHECKING:
     from ...kernels.poses.ekf import PoseMeasurements

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ...arrays import Floats, instance, number
 from ...errors import InputError
 from ...world.links import wrap
-from ..stream import fix_or_none, numbers, three
+from ..motion_history import fix_or_none, numbers, three
 
 if TYPE_CHECKING:
     from ...kernels.poses.ekf import PoseOptions

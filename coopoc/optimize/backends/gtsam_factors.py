@@ -10,13 +10,11 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
-from itertools import chain
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 
 from ...arrays import Floats
-from ..model.derivatives import linearise
 from ..model.factor import Factor, Loss
 from ..model.problem import Problem
 from ..model.space import Space, exp, log
@@ -300,23 +298,6 @@ def tangent(space: Space, posed: Sequence[bool], x: Floats) -> Sequence[Floats]:
         matrix = np.eye(space.dof)
         matrix[:d, :d] = rotation
         found.append(still if not turns else matrix if d == 2 else np.roll(matrix, space.angles, axis=1))
-    return found
-
-
-def linearised(problem: Problem, which: Sequence[int], x: Floats, keys: Sequence[int]) -> list[Any]:
-    """The factors `which` as gtsam.LinearContainerFactors, linear around x (n, ambient) for good."""
-    import gtsam
-
-    jacobian: Any = gtsam.JacobianFactor
-    factors, posed = [problem.factors[f] for f in which], which_turn(problem)
-    linear, found = linearise(problem.space, factors, None, x[None]), []
-    turn, at = tangent(problem.space, posed, x), values(problem.space, posed, x, keys)
-    for factor, residual, jacobians in zip(factors, linear.residual, linear.jacobian, strict=True):
-        unit = gtsam.noiseModel.Unit.Create(factor.size)
-        wide = [np.broadcast_to(jacobian[0], (len(factor.nodes), *jacobian.shape[2:])) for jacobian in jacobians]
-        for k in np.flatnonzero(factor.informative).tolist():
-            blocks = [(keys[i], jacobian[k] @ turn[i]) for i, jacobian in zip(factor.nodes[k], wide, strict=True)]
-            found.append(gtsam.LinearContainerFactor(jacobian(*chain(*blocks), -residual[0, k], unit), at))
     return found
 
 

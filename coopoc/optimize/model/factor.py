@@ -11,9 +11,8 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Bools, Floats, Ints, frozen, instance, number
+from ...arrays import Bools, Floats, Ints, frozen, instance, number, one_of
 from ...errors import InputError
-from ...plugins import one_of
 from .inputs import (
     agreed,
     check_constants,

@@ -11,10 +11,10 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ...arrays import Bools, Floats, instance, number
-from ...errors import InputError
+from ...arrays import Bools, Floats, instance, number, one_of
+from ...errors import InputError, unknown
 from ...one_file import in_file
-from ...plugins import find, names, one_of, unknown
+from ...plugins import find, names
 from ...world.links import spherical as to_spherical
 from ...world.links import wrap
 from .space import Space

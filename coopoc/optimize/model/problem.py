@@ -12,8 +12,7 @@ import numpy as np
 import numpy.typing as npt
 
 from ...arrays import Bools, Floats, Ints, frozen, instance, listed
-from ...errors import InputError, shown
-from ...plugins import suggestion
+from ...errors import InputError, shown, suggestion
 from ...world.sensors import Sensors
 from .derivatives import Linear, linearise, sparse_jacobian
 from .factor import Constraint, Factor, taken, unchecked

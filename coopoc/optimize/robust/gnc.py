@@ -9,9 +9,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Floats, instance, number
+from ...arrays import Floats, instance, number, one_of
 from ...errors import InputError
-from ...plugins import one_of
 from ..backend import Backend
 from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status

@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from .arrays import Floats
-from .errors import InputError, shown
+from ..arrays import Floats
+from ..errors import InputError, shown
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

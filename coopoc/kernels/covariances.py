@@ -1,4 +1,4 @@
-"""NEES of a track, and whether its covariances are some, in one pass."""
+"""NEES of a track, e^T P^-1 e by P = L D L^T, and covariances that are none, in one pass each."""
 
 from __future__ import annotations
 
@@ -11,6 +11,21 @@ from .compiling.compile import compiled, part
 
 LIMIT = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
+
+
+@compiled
+def unsound(cov: Floats) -> int:
+    """Number of covariances (n, 3, 3) that are not finite, symmetric and positive semidefinite to a share of 1e-9."""
+    found = 0
+    for p in cov:
+        a, b, c, d, e, f = p[0, 0], p[1, 1], p[2, 2], p[1, 0], p[2, 0], p[2, 1]
+        skew = max(abs(p[0, 1] - d), abs(p[0, 2] - e), abs(p[1, 2] - f))
+        det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
+        sides = d * d <= LIMIT * a * b and e * e <= LIMIT * a * c and f * f <= LIMIT * b * c
+        sound = sides and a >= 0.0 and b >= 0.0 and c >= 0.0 and det >= (1.0 - LIMIT) * a * b * c
+        if not (sound and skew <= (LIMIT - 1.0) * max(a, b, c) and math.isfinite(a + b + c)):
+            found += 1
+    return found
 
 
 @part
@@ -38,18 +53,3 @@ def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
                     value = np.nan
                 found[run, t, e] = value
     return found, sound
-
-
-@compiled
-def unsound(cov: Floats) -> int:
-    """Number of covariances (n, 3, 3) that are not finite, symmetric and positive semidefinite to a share of 1e-9."""
-    found = 0
-    for p in cov:
-        a, b, c, d, e, f = p[0, 0], p[1, 1], p[2, 2], p[1, 0], p[2, 0], p[2, 1]
-        skew = max(abs(p[0, 1] - d), abs(p[0, 2] - e), abs(p[1, 2] - f))
-        det = a * (b * c - f * f) - d * (d * c - f * e) + e * (d * f - b * e)
-        sides = d * d <= LIMIT * a * b and e * e <= LIMIT * a * c and f * f <= LIMIT * b * c
-        sound = sides and a >= 0.0 and b >= 0.0 and c >= 0.0 and det >= (1.0 - LIMIT) * a * b * c
-        if not (sound and skew <= (LIMIT - 1.0) * max(a, b, c) and math.isfinite(a + b + c)):
-            found += 1
-    return found

@@ -1,7 +1,14 @@
-"""Generator of fleets: a Recipe and OpenDRIVE maps -> netconvert, routes, SUMO, smoothing -> a fleet and its card."""
+"""Make a bundled fleet again, or another one: OpenDRIVE map -> netconvert, routes, SUMO, smoothing -> table and card.
+
+    python examples/make_fleet.py town10 --maps carla_maps
+
+CARLA's maps (MIT licence) are not part of the package; SUMO comes with pip install 'coopoc[sumo]'. The same recipe and
+the SUMO that the card names give the same bytes.
+"""
 
 from __future__ import annotations
 
+import argparse
 import importlib.util
 import json
 import subprocess
@@ -15,13 +22,12 @@ from typing import Any
 
 import numpy as np
 
-from coopoc.errors import InputError, MissingLibraryError
-from coopoc.plugins import unknown
+from coopoc.data.assemble import backward_difference, smooth
+from coopoc.data.fleet_cards import facts
+from coopoc.data.fleet_files import read_fcd, write_table
+from coopoc.data.registry import DATASETS, card
+from coopoc.errors import InputError, MissingLibraryError, unknown
 from coopoc.world.fleet import Fleet
-
-from . import fleet_store
-from .assemble import smooth
-from .fleet_files import read_fcd
 
 Streets = dict[str, tuple[str, ...]]
 VEHICLE_LENGTH = 4.6
@@ -83,26 +89,22 @@ class Recipe:
         return WARMUP + max(self.lengths) * DT
 
 
-TOWN10, TOWN04 = "Town10HD.xodr", "Town04.xodr"
-CLOCKWISE, ANTICLOCKWISE = "10 0 3 2 1 8 -4 -5 -6 -7 17", "-17 7 6 5 4 -8 -1 -2 -3 -0 -10"
-CLIENTS = {"top_speed": (10.7, 10.7), "lights": False, "dawdle": 0.6, "tours": (CLOCKWISE, ANTICLOCKWISE)}
-RECIPES: dict[str, Recipe] = {
-    recipe.name: recipe
-    for recipe in (
-        Recipe("town10", TOWN10, 60, 900, 16, platoon=6),
-        Recipe("town10-validation", TOWN10, 60, 900, 32, platoon=6),
-        Recipe("town10-clients", TOWN10, 4, (1550, 4600, 1450, 1420), 50, **CLIENTS),  # type: ignore[arg-type]
-        Recipe("town04", TOWN04, 60, 900, 5, (11.0, 13.5), platoon=10, start="last"),
-    )
-}
-"""Of the bundled fleets."""
+def bundled_recipe(name: str) -> Recipe:
+    """Of a bundled fleet, from its card.
+
+    >>> bundled_recipe("town04").vehicles
+    60
+    """
+    stored = card(name)["recipe"].items()
+    fields: dict[str, Any] = {key: tuple(value) if isinstance(value, list) else value for key, value in stored}
+    return Recipe(**fields)
 
 
 def make(recipe: str | Recipe, map_folder: str | Path, out_folder: str | Path) -> dict[str, Any]:
-    """Drive a recipe in SUMO and write <name>.npz and its card <name>.json; the same recipe gives the same bytes.
+    """Drive a recipe in SUMO and write <name>.parquet and its card <name>.json: the same recipe, the same bytes.
 
     Args:
-        recipe: a Recipe, or the name of one in RECIPES.
+        recipe: a Recipe, or the name of a bundled fleet.
         map_folder: holds the OpenDRIVE file that the recipe names (CARLA's maps: MIT licence, not part of the package).
         out_folder: is created if needed; files of the same name are replaced.
 
@@ -113,23 +115,23 @@ def make(recipe: str | Recipe, map_folder: str | Path, out_folder: str | Path) -
         InputError: an unknown recipe, a missing map; a vehicle that could not drive or that jumps: take another seed.
         MissingLibraryError: eclipse-sumo is not installed.
     """
-    command = "coopoc.data.generate.make(Recipe(**card['recipe']), MAPS, OUT), in Python"
+    command = "make(Recipe(**card['recipe']), MAPS, OUT) of examples/make_fleet.py"
     if not isinstance(recipe, Recipe):
-        if recipe not in RECIPES:
-            raise unknown("recipe", recipe, RECIPES, "Or build a Recipe of your own, in Python.")
-        command, recipe = f"coopoc data make {recipe} --maps {map_folder}", RECIPES[recipe]
+        if recipe not in DATASETS:
+            raise unknown("recipe", recipe, DATASETS, "Or build a Recipe of your own, in Python.")
+        command, recipe = f"python examples/make_fleet.py {recipe} --maps {map_folder}", bundled_recipe(recipe)
     fleet, out = simulate(recipe, Path(map_folder)), Path(out_folder)
     out.mkdir(parents=True, exist_ok=True)
-    fleet_store.save(fleet, out / f"{recipe.name}.npz")
+    write_table(fleet, out / f"{recipe.name}.parquet", velocity=False)
     origin = {"name": recipe.name, "map": recipe.map, "map_licence": MAP_LICENCE, "command": command}
     settings = {"sumo": version("eclipse-sumo"), "recipe": asdict(recipe)}
-    card = {**origin, **settings, **fleet_store.facts(fleet)}
-    (out / f"{recipe.name}.json").write_text(json.dumps(card, indent=1) + "\n")
-    return card
+    made = {**origin, **settings, **facts(fleet)}
+    (out / f"{recipe.name}.json").write_text(json.dumps(made, indent=1) + "\n")
+    return made
 
 
 def simulate(recipe: Recipe, map_folder: Path) -> Fleet:
-    """The quantised fleet of a recipe: map, routes, SUMO, centres of the vehicles, smoothing, velocities."""
+    """The fleet of a recipe, in whole 0.1 mm: map, routes, SUMO, centres of the vehicles, smoothing, velocities."""
     with tempfile.TemporaryDirectory() as folder:
         network, routes, fcd = (Path(folder) / f for f in ("net.xml", "routes.xml", "fcd.xml"))
         _build_network(map_folder / recipe.map, recipe, network)
@@ -142,12 +144,12 @@ def simulate(recipe: Recipe, map_folder: Path) -> Fleet:
         allowed = f"must drive {recipe.vehicles} vehicles through all steps"
         hint = f"{len(ids)} departed; try another seed, fewer vehicles or smaller platoons."
         raise InputError("recipe", f"{recipe.name}, seed {recipe.seed}", allowed, hint)
-    position = smooth(position, DT, CUTOFF)
+    position = np.round(smooth(position, DT, CUTOFF), 4)
     for column, last in enumerate(recipe.lengths):
         position[last:, column] = np.nan
-    t = np.arange(steps) * DT
-    fleet = fleet_store.quantise(Fleet(tuple(ids), t, position, position, name=recipe.name))
-    acceleration = fleet_store.facts(fleet)["acceleration"]
+    t = np.arange(steps) / round(1 / DT)
+    fleet = Fleet(tuple(ids), t, position, backward_difference(t, position, ids), name=recipe.name)
+    acceleration = facts(fleet)["acceleration"]
     if acceleration > JUMP:
         raise InputError("acceleration", f"{acceleration} m/s^2", f"must stay below {JUMP} m/s^2", "Try another seed.")
     return fleet
@@ -262,3 +264,12 @@ def _run(name: str, options: Mapping[str, object]) -> None:
     done = subprocess.run([program(name), *words], capture_output=True, text=True, check=False)
     if done.returncode:
         raise InputError(name, done.stderr.strip()[-400:], "must run without an error", "Check the map and the recipe.")
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("recipe", choices=[*DATASETS], help="name of a bundled fleet")
+    parser.add_argument("--maps", type=Path, required=True, help="folder with the .xodr files of CARLA")
+    parser.add_argument("--out", type=Path, default=Path("fleets"), help="folder for the fleet and its card")
+    given = parser.parse_args()
+    print(json.dumps(make(given.recipe, given.maps, given.out), indent=1))

@@ -1,0 +1,81 @@
+"""Dead reckoning of one vehicle: its newest motions, which bring a late fix forward."""
+
+from __future__ import annotations
+
+import math
+
+from ..arrays import Floats
+from .compiling.compile import compiled, part
+from .motion import MotionNoise, process_variance
+
+ROUNDING = 1e-9
+"""s, by how much sums of time steps may miss a time."""
+ESTIMATE, NO_FIX_YET, BAD_INPUT = 0, 1, 2
+"""What a step of a stream returns."""
+VELOCITY, DT, FIX_AGE = slice(3, 6), 6, 7
+"""Where the input of a stream's step stands in its array, behind the fix."""
+
+
+# A history is one array (1 + capacity, 7), a ring. Row 0: first row in use, rows in use, seconds they span, seconds
+# asked for. Each other row is a step: dt s, motion (3,) m, its variance (3,) m^2.
+
+
+@compiled
+def push(history: Floats, dt: float, moved: Floats, variance: Floats) -> None:
+    """Add the newest step, and drop the oldest ones that are not needed to reach back as far as is asked for."""
+    capacity = len(history) - 1
+    first, count, seen = int(history[0, 0]), int(history[0, 1]), history[0, 2] + dt
+    row = 1 + (first + count) % capacity
+    history[row, 0] = dt
+    for c in range(3):
+        history[row, 1 + c], history[row, 4 + c] = moved[c], variance[c]
+    count += 1
+    while count > 1 and seen - history[1 + first, 0] >= history[0, 3]:
+        seen -= history[1 + first, 0]
+        first, count = (first + 1) % capacity, count - 1
+    history[0, 0], history[0, 1], history[0, 2] = first, count, seen
+
+
+@compiled
+def since(history: Floats, age: float, moved: Floats, variance: Floats) -> None:
+    """Motion (3,) m in the last `age` seconds and its variance (3,) m^2; of a step that is cut, its share."""
+    capacity, left = len(history) - 1, age
+    moved[:3], variance[:3] = 0.0, 0.0
+    for k in range(int(history[0, 1]) - 1, -1, -1):
+        if left <= 0.0:
+            break
+        row = 1 + (int(history[0, 0]) + k) % capacity
+        share = min(left / history[row, 0], 1.0)
+        for c in range(3):
+            moved[c] += share * history[row, 1 + c]
+            variance[c] += share * history[row, 4 + c]
+        left -= history[row, 0]
+
+
+@part
+def dead_reckon(
+    given: Floats, history: Floats, motion: MotionNoise, moved: Floats, q: Floats, since_fix: Floats, late: Floats
+) -> int:
+    """Add a step to the history: its motion and the variance of that; what a fix of some age has missed since.
+
+    Nothing is changed where the input is bad. NO_FIX_YET: there is no fix.
+    """
+    dt, age, missing = given[DT], given[FIX_AGE], 0
+    for c in range(3):
+        missing += math.isnan(given[c])
+        if math.isinf(given[c]) or not math.isfinite(given[3 + c]):
+            return BAD_INPUT
+    if not (dt > 0.0 and math.isfinite(dt)) or missing % 3 != 0:
+        return BAD_INPUT
+    variance = process_variance(motion, given[VELOCITY], dt)
+    for c in range(3):
+        q[c], moved[c] = variance[c], dt * given[3 + c]
+    first, count, seen = history[0, 0], history[0, 1], history[0, 2]
+    push(history, dt, moved[:3], q)
+    if missing > 0:
+        return NO_FIX_YET
+    if not -ROUNDING <= age <= history[0, 2] + ROUNDING:
+        history[0, 0], history[0, 1], history[0, 2] = first, count, seen
+        return BAD_INPUT
+    since(history, age, since_fix, late)
+    return ESTIMATE

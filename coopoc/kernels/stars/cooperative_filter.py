@@ -1,0 +1,445 @@
+"""The cooperative filter: an ego and its neighbours, of whom any measurement, message or member may be wrong.
+
+The order of a step: members leave, all that stay move, members join, then the ego's fix, the relative measurements
+(once at the prediction, once more at that solution), the messages, and at last who is trusted. A drive and a stream
+call the same `step`.
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ...arrays import Floats, Ints
+from ..compiling.compile import compiled, part
+from ..dead_reckoning import dead_reckon
+from ..motion import MotionNoise, process_variance
+from .cooperative_messages import distrust, fix_terms, receive, trust
+from .cooperative_state import (
+    AGE,
+    DT,
+    ESTIMATE,
+    FIX,
+    FIX_VARIANCE,
+    KNOWN,
+    MOVED,
+    ODOMETER,
+    OWN,
+    PROCESS,
+    SPEED,
+    STEP,
+    TRUSTED,
+    TYPICAL,
+    VARIANCE,
+    WIDTH,
+    Filter,
+    Guards,
+    Model,
+    begin,
+    copy_filter,
+    join,
+    leave,
+    measured_whole,
+    new_filter,
+    predict,
+    predict_member,
+)
+from .gaussian import ABSENT, COMPASS, POSITION, Gaussian, Rows, has, update
+from .messages import Assumptions, Measurements
+from .relative import Five, angle
+
+
+@compiled
+def run_filter(
+    seen: Measurements, assumed: Assumptions, moved: Floats, known: Model, guards: Guards
+) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+    """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; squared normalised innovations of the
+    ego's fix (R, T), and by link (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the
+    neighbour is trusted.
+
+    A vehicle that loses trust may have misled the filter for a while. The filter goes back to what it knew `memory` to
+    twice as many steps ago, and comes here again without that vehicle's fixes.
+
+    Args:
+        seen: measurements and messages of the ego.
+        assumed: process noise, and the variances of fixes and of positions in messages.
+        moved: (R, T, N, 3) m, sum of all motions until each step.
+        known: noise model.
+        guards: against what may be wrong.
+    """
+    runs, steps, vehicles = seen.gnss.shape[0], seen.gnss.shape[1], seen.gnss.shape[2]
+    links, most, memory = seen.relative.shape[1], 0, int(guards.memory)
+    for t in range(steps):
+        most = max(most, seen.start[t + 1] - seen.start[t])
+    x, cov, fixes = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, steps))
+    neighbours, notes = np.empty((runs, links, 3)), np.empty((runs, links, 5))
+    own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
+    for run in range(runs):
+        f, older, newer = new_filter(1 + most, vehicles), new_filter(1 + most, vehicles), new_filter(1 + most, vehicles)
+        t = newest = 0
+        while t < steps:
+            gather_own(own, seen, assumed, known.white, run, t)
+            first, count = seen.start[t], seen.start[t + 1] - seen.start[t]
+            for i in range(count):
+                who[i] = seen.neighbour[first + i]
+                gather_neighbour(rows, seen, assumed, moved, run, t, first + i, i)
+            if t == 0 and f.step[0] == 0 and f.g.vectors[0] == 0:
+                begin(f, known, guards, own, seen.ego)
+            if memory > 0 and t % memory == 0:
+                if t == newest:
+                    copy_filter(newer if t > 0 else f, older)
+                copy_filter(f, newer)
+            step(f, known, guards, own, rows, who, count)
+            if f.alarm[0] > 0 and memory > 0:
+                f.alarm[0] = 0
+                copy_filter(older, newer)
+                copy_filter(older, f)
+                distrust(f, known, guards)
+                t = f.step[0]
+                continue
+            if t == newest:
+                write(f, run, t, first, who, count, x, cov, fixes, neighbours, notes)
+                newest += 1
+            t += 1
+    return x, cov, neighbours, fixes, notes
+
+
+@part
+def write(
+    f: Filter,
+    run: int,
+    t: int,
+    first: int,
+    who: Ints,
+    count: int,
+    x: Floats,
+    cov: Floats,
+    fixes: Floats,
+    neighbours: Floats,
+    notes: Floats,
+) -> None:
+    """Copy the estimates of a step whose first link is `first`."""
+    fixes[run, t] = f.q[0, 3]
+    for c in range(3):
+        x[run, t, c] = f.g.x[c]
+        for d in range(3):
+            cov[run, t, c, d] = f.g.p[c, d]
+    for i in range(count):
+        k = f.slot[who[i]]
+        b = 3 * f.g.block[k, POSITION]
+        for c in range(3):
+            neighbours[run, first + i, c] = f.g.x[b + c]
+        for c in range(4):
+            notes[run, first + i, c] = f.q[k, c]
+        notes[run, first + i, 4] = f.status[who[i], TRUSTED]
+
+
+@compiled
+def stream_row(given: Floats, history: Floats, motion: MotionNoise, fix: Floats, own: Floats) -> int:
+    """The ego's row of a stream, by dead reckoning; a fix of some age is brought forward. `kernels.solo` says when it
+    is NO_FIX_YET or BAD_INPUT.
+
+    Args:
+        given: (8,) fix m, velocity m/s, dt s, age of the fix s.
+        history: of `motion`.
+        motion: noise.
+        fix: (3,) m^2, variance of a fix.
+        own: (OWN,) out.
+    """
+    since, late = np.zeros(3), np.zeros(3)
+    outcome = dead_reckon(given, history, motion, own[MOVED:PROCESS], own[PROCESS:DT], since, late)
+    own[DT] = given[6]
+    for c in range(3):
+        own[FIX + c], own[FIX_VARIANCE + c] = given[c] + since[c], fix[c] + late[c]
+    return int(outcome)
+
+
+@compiled
+def motion_of(rows: Floats, motion: MotionNoise, dt: float) -> None:
+    """Fill the variance of one step's motion of neighbours by the velocity of the newest message of each."""
+    interval = motion.interval if motion.interval > 0.0 else dt
+    for i in range(len(rows)):
+        q = process_variance(motion, rows[i, SPEED:STEP], interval)
+        for c in range(3):
+            rows[i, STEP + c] = q[c] * (dt / interval) ** 2
+
+
+@compiled
+def stream_step(
+    f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, start: Floats, answer: Floats
+) -> int:
+    """One step; 1 if a vehicle has lost trust.
+
+    Args:
+        f: filter.
+        known: noise model.
+        guards: against what may be wrong.
+        own: (OWN,).
+        rows: (k, WIDTH) of the neighbours that are measured now.
+        vehicles: (k,) which they are; the ego is vehicle 0.
+        start: (3,) m, known before the first step, NaN for none.
+        answer: (12 + 3 k,) out: position m, covariance m^2, positions of the neighbours m.
+    """
+    if f.g.vectors[0] == 0:
+        begin(f, known, guards, own, 0)
+        if math.isfinite(start[0]):
+            f.step[0] = 1
+            for c in range(3):
+                f.g.x[c], f.g.p[c, c] = start[c], 0.0
+    f.alarm[0] = 0
+    step(f, known, guards, own, rows, vehicles, len(vehicles))
+    for c in range(3):
+        answer[c] = f.g.x[c]
+        for d in range(3):
+            answer[3 + 3 * c + d] = f.g.p[c, d]
+        for i in range(len(vehicles)):
+            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[f.slot[vehicles[i]], POSITION] + c]
+    return int(f.alarm[0])
+
+
+@compiled
+def make_filter(slots: int, vehicles: int) -> Filter:
+    """A filter before its first step, for Python."""
+    return new_filter(slots, vehicles)
+
+
+@compiled
+def keep(source: Filter, target: Filter) -> None:
+    """Copy what is known."""
+    copy_filter(source, target)
+
+
+@compiled
+def restore(source: Filter, target: Filter, known: Model, guards: Guards) -> None:
+    """Go back to what was known, without those who have lost trust since."""
+    copy_filter(source, target)
+    distrust(target, known, guards)
+
+
+@part
+def gather_own(own: Floats, seen: Measurements, assumed: Assumptions, white: Floats, run: int, t: int) -> None:
+    """The ego's fix and motion at a step."""
+    u = seen.velocity[run, t, seen.ego]
+    q = process_variance(assumed.motion, u, seen.dt)
+    own[DT] = seen.dt
+    for c in range(3):
+        own[FIX + c] = seen.gnss[run, t, seen.ego, c]
+        own[FIX_VARIANCE + c] = number(assumed.fixes, run, t, seen.ego, c) * white[c]
+        own[MOVED + c] = seen.dt * u[c]
+        own[PROCESS + c] = q[c] + number(assumed.process, run, t, seen.ego, c)
+
+
+@part
+def gather_neighbour(
+    rows: Floats,
+    seen: Measurements,
+    assumed: Assumptions,
+    moved: Floats,
+    run: int,
+    t: int,
+    link: int,
+    i: int,
+) -> None:
+    """The measurement of a neighbour, and the newest message held."""
+    for c in range(5):
+        rows[i, c] = seen.relative[run, link, c]
+    j, sent = seen.neighbour[link], seen.newest[run, link]
+    rows[i, AGE] = (t - sent) * seen.dt if sent >= 0 else -1.0
+    if sent < 0:
+        return
+    u = seen.velocity[run, sent, j]
+    q = process_variance(assumed.motion, u, seen.dt)
+    for c in range(3):
+        rows[i, ESTIMATE + c] = seen.broadcast[run, sent, j, c]
+        rows[i, VARIANCE + c] = number(assumed.broadcast, run, sent, j, c)
+        rows[i, ODOMETER + c] = moved[run, sent, j, c]
+        rows[i, SPEED + c] = u[c]
+        rows[i, TYPICAL + c] = number(assumed.fixes, run, sent, j, c)
+        rows[i, STEP + c] = q[c] + number(assumed.process, run, sent, j, c)
+
+
+@part
+def number(values: Floats, run: int, t: int, member: int, c: int) -> float:
+    """One of what is broadcastable to (R, T, N, 3)."""
+    a, b, d = min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(member, values.shape[2] - 1)
+    return float(values[a, b, d, min(c, values.shape[3] - 1)])
+
+
+@part
+def step(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+    """Predict and update.
+
+    Args:
+        f: filter, after `begin`.
+        known: noise model.
+        guards: against what may be wrong.
+        own: (OWN,) the ego's row; the motion of the first step is not used.
+        rows: (count, WIDTH) of the neighbours that are measured now.
+        vehicles: (count,) which they are.
+        count: of them.
+    """
+    leave(f, vehicles, count)
+    f.clock[1] = own[DT]
+    if f.step[0] > 0:
+        f.clock[0] += own[DT]
+        predict(f, known, own)
+    for k in range(1, len(f.vehicle)):
+        if f.vehicle[k] >= 0:
+            predict_member(f, known, guards, rows, k)
+    for i in range(count):
+        if f.slot[vehicles[i]] < 0:
+            join(f, known, rows, vehicles[i], i)
+    for k in range(len(f.vehicle)):
+        if f.vehicle[k] >= 0:
+            first = 3 * f.g.block[k, POSITION]
+            for c in range(3):
+                f.at[k, c] = f.g.x[first + c]
+                f.q[k, c] = math.nan
+            f.q[k, 3] = math.nan
+    add_fix(f, guards, own)
+    if known.estimates > 0.0:
+        measure(f, known, guards, rows)
+    for k in range(1, len(f.vehicle)):
+        if f.vehicle[k] >= 0:
+            receive(f, known, guards, rows, k)
+    if known.estimates == 0.0:
+        measure(f, known, guards, rows)
+    if guards.trust > 0.0:
+        trust(f, known, guards)
+    f.step[0] += 1
+
+
+@part
+def add_fix(f: Filter, guards: Guards, own: Floats) -> None:
+    """The ego's fix: its position, the error of its receiver, and the one that all share."""
+    g, h = f.g, f.h
+    if math.isnan(own[FIX]):
+        return
+    fix_terms(f, 0)
+    for c in range(3):
+        h.z[c], h.variance[c], h.used[c] = own[FIX + c], own[FIX_VARIANCE + c], True
+        h.gated[c] = f.hits[0, c] < guards.patience
+    update(g.x, g.p, 3 * g.vectors[0], h, guards.fix_gate)
+    f.q[0, 3] = max(h.q[0], h.q[1], h.q[2])
+    for c in range(3):
+        f.hits[0, c] = f.hits[0, c] + 1 if guards.fix_gate > 0.0 and h.q[c] > guards.fix_gate else 0
+
+
+@part
+def measure(f: Filter, known: Model, guards: Guards, rows: Floats) -> None:
+    """The relative measurements: linear at the prediction, for positions and compass alone; then at that solution."""
+    g, work, n = f.g, f.work, 0
+    for k in range(len(f.vehicle)):
+        if f.vehicle[k] >= 0:
+            f.work.block[k, POSITION] = n
+            f.work.owner[n] = g.block[k, POSITION]
+            n += 1
+    if n < 2:
+        return
+    compass = ABSENT
+    if has(g, 0, COMPASS):
+        compass = n
+        work.owner[n] = g.block[0, COMPASS]
+        i = 3 * g.block[0, COMPASS] + 1
+        for j in range(3 * g.vectors[0]):  # the compass's noise is new at every step
+            g.p[i, j] = 0.0
+            g.p[j, i] = 0.0
+        g.x[i], g.p[i, i] = 0.0, known.heading
+        n += 1
+    if known.exact > 0.0:
+        for a in range(n):
+            for b in range(n):
+                for c in range(3):
+                    for d in range(3):
+                        work.p[3 * a + c, 3 * b + d] = g.p[3 * work.owner[a] + c, 3 * work.owner[b] + d]
+            for c in range(3):
+                work.x[3 * a + c] = g.x[3 * work.owner[a] + c]
+        for k in range(1, len(f.vehicle)):
+            if f.vehicle[k] >= 0 and relate(f, known, guards, rows, k, 0, work, compass):
+                update(work.x, work.p, 3 * n, f.h, guards.gate)
+        for k in range(len(f.vehicle)):
+            if f.vehicle[k] >= 0:
+                for c in range(3):
+                    f.at[k, c] = work.x[3 * work.block[k, POSITION] + c]
+    for k in range(1, len(f.vehicle)):
+        if f.vehicle[k] >= 0 and relate(
+            f, known, guards, rows, k, 1 if known.exact > 0.0 else 0, g, g.block[0, COMPASS]
+        ):
+            update(g.x, g.p, 3 * g.vectors[0], f.h, guards.gate)
+            for c in range(3):
+                if f.h.used[c]:
+                    f.q[k, c] = f.h.q[c]
+                    f.hits[k, c] = f.hits[k, c] + 1 if guards.gate > 0.0 and f.h.q[c] > guards.gate else 0
+
+
+@part
+def relate(
+    f: Filter, known: Model, guards: Guards, rows: Floats, k: int, exact: int, g: Gaussian, compass: int
+) -> bool:
+    """Rows of the measurement of member k; False if its geometry is not known."""
+    row, first = f.row[k], 3 * f.g.block[k, POSITION]
+    if not measured_whole(rows, row) and f.g.p[first, first] >= KNOWN:
+        return False
+    for c in range(3):
+        f.h.gated[c] = f.hits[k, c] < guards.patience
+    x, y, z = f.at[k, 0] - f.at[0, 0], f.at[k, 1] - f.at[0, 1], f.at[k, 2] - f.at[0, 2]
+    seen = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
+    relative_rows(f.h, x, y, z, seen, known.std, known.min_range, exact)
+    for c in range(3):
+        for i in range(3):
+            f.h.column[c, i], f.h.column[c, 3 + i] = 3 * g.block[k, POSITION] + i, 3 * g.block[0, POSITION] + i
+        f.h.column[c, 6], f.h.column[c, 7] = 3 * compass, 3 * compass + 1
+    f.h.terms[0] = 8 if compass >= 0 else 6
+    return True
+
+
+@part
+def relative_rows(h: Rows, x: float, y: float, z: float, seen: Five, std: Floats, least: float, exact: int) -> None:
+    """Rows of range, azimuth and inclination, in metres, of the vector to a neighbour and the compass's two errors.
+
+    Args:
+        h: rows that are filled: weights 0 to 2 of the neighbour, 3 to 5 of the ego, 6 and 7 of bias and noise.
+        x: m, the vector where the rows are linear.
+        y: m.
+        z: m.
+        seen: `relative.five`.
+        std: (3,) m, rad, rad, or of no length for 1 m each.
+        least: m, least distance at which an angle's error counts.
+        exact: 1 for range and angles themselves, 0 for the measured vector along their directions.
+    """
+    d, sa, ca, si, ci = seen
+    ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
+    reach = max(far, least)
+    flat = max(ground, 1e-3 * reach)
+    h.used[0], h.used[1], h.used[2] = d >= 0.0, sa != 0.0 or ca != 0.0, si != 0.0 or ci != 0.0
+    length = far if exact == 0 else reach
+    h.weight[0, 0], h.weight[0, 1], h.weight[0, 2] = x / far, y / far, z / far
+    h.weight[1, 0], h.weight[1, 1], h.weight[1, 2] = -y / flat, x / flat, 0.0
+    h.weight[2, 0], h.weight[2, 1], h.weight[2, 2] = x * z / (flat * length), y * z / (flat * length), -flat / length
+    if exact == 0:
+        d = d if h.used[0] else far
+        if not h.used[1]:
+            sa, ca = y / flat, x / flat
+        if not h.used[2]:
+            si, ci = ground / far, z / far
+        for c in range(3):
+            h.z[c] = d * (si * (h.weight[c, 0] * ca + h.weight[c, 1] * sa) + ci * h.weight[c, 2])
+        scale, turn = reach * ground / far, ground
+    else:
+        h.z[0] = d
+        h.z[1] = angle(sa * x - ca * y, ca * x + sa * y) * flat
+        h.z[2] = angle(si * z - ci * ground, ci * z + si * ground) * reach
+        for c in range(1, 3):
+            h.z[c] += h.weight[c, 0] * x + h.weight[c, 1] * y + h.weight[c, 2] * z
+        scale, turn = flat, flat
+    unit = len(std) == 0
+    range_std = 1.0 if unit else std[0]
+    azimuth_std = 1.0 if unit else std[1] * scale
+    inclination_std = 1.0 if unit else std[2] * reach
+    h.variance[0], h.variance[1] = range_std * range_std, azimuth_std * azimuth_std
+    h.variance[2] = inclination_std * inclination_std
+    for c in range(3):
+        for i in range(3):
+            h.weight[c, 3 + i] = -h.weight[c, i]
+        h.weight[c, 6] = h.weight[c, 7] = turn if c == 1 else 0.0

@@ -1,0 +1,137 @@
+"""Inputs of streams: checks of a step, and the newest motions of a vehicle, which bring a late fix forward."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+import numpy.typing as npt
+
+from ..arrays import Floats, number, plain
+from ..errors import InputError, shown
+from ..kernels.dead_reckoning import ROUNDING, push, since
+
+
+class MotionHistory:
+    """The newest motions of a vehicle, `span` seconds or what there has been, for fixes that come late.
+
+    Args:
+        span: s.
+    """
+
+    def __init__(self, span: float) -> None:
+        self.rows: Floats = np.zeros((65, 7))
+        self.rows[0, 3] = seconds("history", span)
+
+    def __len__(self) -> int:
+        return int(self.rows[0, 1])
+
+    def reserve(self) -> Floats:
+        """The rows, with room for one more step."""
+        first, count, room = int(self.rows[0, 0]), len(self), len(self.rows) - 1
+        if count + 1 >= room:
+            rows = np.zeros((1 + 2 * room, 7))
+            rows[1 : 1 + count] = self.rows[1 + (first + np.arange(count)) % room]
+            rows[0] = self.rows[0]
+            rows[0, 0] = 0.0
+            self.rows = rows
+        return self.rows
+
+    def push(self, dt: float, moved: Floats, variance: Floats) -> None:
+        """Add a step: dt s, motion (3,) m, its variance (3,) m^2."""
+        push(self.reserve(), dt, moved, variance)
+
+    def forward(self, gnss: npt.ArrayLike | None, age: float) -> tuple[Floats, Floats]:
+        """A fix of `age` seconds ago moved to now, (3,) m, NaN for none, and the variance of that motion, (3,) m^2."""
+        fix, moved, late = fix_or_none(gnss), np.zeros(3), np.zeros(3)
+        if not np.isnan(fix).all():
+            since(self.rows, age, moved, late)
+        return fix + moved, late
+
+    def check(self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float) -> None:
+        """InputError if a stream cannot take this step."""
+        number("dt", dt, sys.float_info.min, allowed="finite and > 0", hint="Give the seconds since the last step.")
+        three("velocity", velocity)
+        if np.isnan(fix_or_none(gnss)).all():
+            return
+        later = MotionHistory(0.0)
+        later.rows = self.reserve().copy()
+        later.push(dt, np.zeros(3), np.zeros(3))
+        kept = later.rows[0, 2]
+        hint, allowed = "Leave such a fix out (None), or keep more: start(..., history=).", f"in 0..{kept:g} s"
+        number("fix_age", fix_age, -ROUNDING, kept + ROUNDING, allowed=f"{allowed}, the motion that is kept", hint=hint)
+
+    def write(
+        self, given: Floats, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float
+    ) -> None:
+        """Write fix, velocity, dt and age of the fix to the input of a kernel; InputError as `check`."""
+        simple = isinstance(dt, float) and isinstance(fix_age, float) and {type(gnss), type(velocity)} <= PLAIN
+        try:
+            if not simple or np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
+                self.check(gnss, velocity, dt, fix_age)
+            given[:3], given[3:6], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
+        except Exception:  # a class from elsewhere may raise anything
+            self.check(gnss, velocity, dt, fix_age)
+            raise
+
+
+PLAIN = frozenset({list, tuple, np.ndarray, type(None)})
+"""What a stream takes as it is; anything else, such as an array with a mask, is checked first."""
+
+
+def three(field: str, value: npt.ArrayLike) -> Floats:
+    """(3,) finite numbers; InputError naming the field if they are not.
+
+    >>> three("velocity", [1, 2])
+    Traceback (most recent call last):
+    ...
+    coopoc.errors.InputError: velocity = [1, 2]: must be three finite numbers. Give east, north, up.
+    """
+    array = numbers(value)
+    if array.shape != (3,) or not np.isfinite(array).all():
+        raise InputError(field, value, "must be three finite numbers", "Give east, north, up.")
+    return array
+
+
+def names_of(field: str, given: Any, kind: type[Any]) -> list[str]:
+    """Names of the vehicles that a stream is given measurements of, each once.
+
+    Args:
+        field: name of the argument.
+        given: a sequence of measurements.
+        kind: their class.
+
+    Raises:
+        InputError: anything else, or a vehicle twice.
+    """
+    if not isinstance(given, Sequence) or not all(isinstance(each, kind) for each in given):
+        hint = f"Give a list of {kind.__name__}, empty for none."
+        raise InputError(field, shown(given), f"must hold {kind.__name__}s", hint)
+    names: list[str] = [each.id for each in given]
+    if len(set(names)) < len(names):
+        raise InputError(field, names, "must be given once each", "Merge the measurements of one vehicle.")
+    return names
+
+
+def fix_or_none(gnss: npt.ArrayLike | None, field: str = "gnss") -> Floats:
+    """(3,) m, all NaN if there is no fix; InputError for a fix in part."""
+    given = np.full(3, np.nan) if gnss is None else numbers(gnss)
+    return given if given.shape == (3,) and np.isnan(given).all() else three(field, "none" if gnss is None else gnss)
+
+
+def seconds(field: str, value: float) -> float:
+    """A time that is finite and >= 0; InputError naming the field if it is not."""
+    checked: float = number(field, value, hint="Give seconds.")
+    return checked
+
+
+def numbers(value: npt.ArrayLike) -> Floats:
+    """As an array of floats; an empty one of what holds no numbers.
+
+    >>> numbers("east").size
+    0
+    """
+    given = plain(value)
+    return given.astype(float) if given.dtype.kind in "fiu" else np.empty(0)

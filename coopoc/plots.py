@@ -1,0 +1,131 @@
+"""Pictures of recordings, tracks and solutions in the plane."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from .arrays import instance, number
+from .errors import InputError
+from .escapes import picture
+from .methods.track import Track
+from .world.fleet import Fleet
+from .world.pictures import COLORS, INK, PALE, axes, ellipses, finish, pairs
+from .world.recording import Recording
+
+if TYPE_CHECKING:
+    from matplotlib.axes import Axes
+
+    from .optimize.model.problem import Problem
+    from .optimize.solution import Solution
+
+NAMED = 30
+"""Nodes of a solution up to which each has its name and its ellipse."""
+
+
+def plot_recording(recording: Recording, ax: Axes | None = None, *, run: int = 0, step: int | None = None) -> Axes:
+    """Fixes of one run, vehicle by vehicle, and at one step who measures whom.
+
+    Args:
+        recording: any.
+        ax: of matplotlib; None makes a figure, `plot_recording(...).figure.savefig(...)` writes it.
+        run: 0..R-1.
+        step: 0..T-1; None: the middle.
+
+    Raises:
+        InputError: a run or a step that is not there.
+
+    >>> from coopoc import Fleet, Sensors, observe
+    >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+    >>> plot_recording(observe(fleet, Sensors()), step=1).get_xlabel()
+    'East [m]'
+    """
+    runs, last = recording.runs, len(recording.t) - 1
+    run = number("run", run, 0, runs - 1, kind=int, allowed=f"in 0..{runs - 1}")
+    step = number("step", last // 2 if step is None else step, 0, last, kind=int, allowed=f"in 0..{last}")
+    ax, fixes, few = axes(ax), recording.gnss[run, :, :, :2], len(recording.ids) <= len(COLORS)
+    for k, name in enumerate(recording.ids):
+        color = COLORS[k % len(COLORS)]
+        ax.plot(*fixes[:, k].T, ".", ms=1.6, color=color, alpha=0.6, label=picture(name) if few else None, zorder=2)
+    here = recording.links.step == step
+    observer, neighbour = recording.links.observer[here], recording.links.neighbour[here]
+    pairs(ax, fixes[step, observer], fixes[step, neighbour], INK)
+    ax.plot(*fixes[step].T, "o", ms=4.5, mfc="white", mec=INK, zorder=3, label=f"t = {recording.t[step]:g} s")
+    return finish(ax)
+
+
+def plot_track(
+    track: Track, ax: Axes | None = None, *, fleet: Fleet | None = None, run: int = 0, every: int | None = None
+) -> Axes:
+    """Estimated paths of one run with 95 % ellipses, and the truth if a fleet is given.
+
+    Args:
+        track: of any method.
+        ax: as in `plot_recording`.
+        fleet: that was observed, on the steps of the track.
+        run: 0..R-1.
+        every: steps from one ellipse to the next; None: a fortieth of the drive.
+
+    Raises:
+        InputError: a run that is not there, or a fleet of other steps.
+
+    >>> import coopoc as co
+    >>> fleet = co.Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+    >>> len(plot_track(co.Kalman()(co.observe(fleet, co.Sensors())), fleet=fleet).lines)
+    2
+    """
+    run = number("run", run, 0, len(track.x) - 1, kind=int, allowed=f"in 0..{len(track.x) - 1}")
+    fair = max(len(track.t) // 40, 1)
+    every = number("every", fair if every is None else every, 1, kind=int, allowed=">= 1 step")
+    if fleet is not None and instance("fleet", fleet, Fleet).position.shape[0] != len(track.t):
+        raise InputError("fleet", repr(fleet), f"must have {len(track.t)} steps", "Give the fleet that was observed.")
+    ax = axes(ax)
+    for k, ego in enumerate(track.egos):
+        color = COLORS[k % len(COLORS)]
+        if fleet is not None:
+            label = "truth" if k == 0 else None
+            ax.plot(*fleet.position[:, ego, :2].T, color=PALE, lw=4, zorder=1, label=label)
+        name = f"vehicle {ego}" if fleet is None else fleet.ids[ego]
+        ax.plot(*track.x[run, :, k, :2].T, color=color, lw=1.2, zorder=2, label=picture(name))
+        if track.covariance is not None:
+            ellipses(ax, track.x[run, ::every, k, :2], track.covariance[run, ::every, k, :2, :2], color)
+    return finish(ax)
+
+
+def plot_solution(solution: Solution, ax: Axes | None = None, *, problem: Problem | None = None) -> Axes:
+    """Nodes in the plane, 95 % ellipses and names where they are few; with the problem its factors and headings.
+
+    Args:
+        solution: of points or poses.
+        ax: as in `plot_recording`.
+        problem: that was solved.
+
+    Raises:
+        InputError: another problem.
+
+    >>> from coopoc import Problem, solve
+    >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
+    >>> plot_solution(solve(problem), problem=problem).get_ylabel()
+    'North [m]'
+    """
+    from .optimize.model.problem import Problem
+
+    ax, at, few = axes(ax), solution.position[:, :2], len(solution.names) <= NAMED
+    if problem is not None:
+        if instance("problem", problem, Problem).names != solution.names:
+            raise InputError("problem", repr(problem), "must be the one that was solved", "Give it to both.")
+        between = [factor for factor in problem.factors if factor.nodes.shape[1] == 2]
+        for k, kind in enumerate(dict.fromkeys(factor.kind for factor in between)):
+            a, b = np.concatenate([factor.nodes for factor in between if factor.kind == kind]).T
+            pairs(ax, at[a], at[b], COLORS[(k + 1) % len(COLORS)], kind.replace("_", " "))
+        if few and problem.poses:
+            poses = list(problem.poses)
+            heading = solution.rotation[poses][:, :2, 0]
+            ax.quiver(*at[poses].T, *heading.T, color=INK, angles="xy", width=0.004, zorder=4)
+    if few:
+        ellipses(ax, at, solution.covariance[:, :2, :2], COLORS[0], "95 %")
+        for name, place in zip(solution.names, at.tolist(), strict=True):
+            ax.annotate(picture(name), place, xytext=(5, 5), textcoords="offset points", fontsize=8, color=INK)
+    ax.plot(*at.T, "o", ms=4 if few else 1.5, color=COLORS[0], zorder=3)
+    return finish(ax)

@@ -1,0 +1,159 @@
+"""The cooperative filter: equal to the joint filter with everything off, and best of all where numbers are wrong."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+from oracles.cooperative import Oracle
+from test_star_filters import CHANNELS, gappy, holed, partial
+
+from coopoc import V2X, Fleet, JointFilter, Kalman, Recording, Sensors, load_fleet, observe, rt_le
+from coopoc.arrays import Floats
+from coopoc.kernels.stars.cooperative_state import NO_GUARDS, Guards
+from coopoc.methods.cooperative_filter import CooperativeFilter
+from coopoc.methods.noise_model import NoiseModel, resolve
+from coopoc.methods.star_stream import Broadcast, RelativeMeasurement, StarStream
+from coopoc.world.inbox import inbox
+from coopoc.world.spoofing import Spoofing, spoofed
+
+S2 = Sensors.paper_scenario2()
+
+
+def drive(steps: int = 80) -> Fleet:
+    """The start of a drive in dense traffic."""
+    return load_fleet("town10-validation").between(0, steps)
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+@pytest.mark.parametrize(("change", "near"), [(lambda r: r, 1e-8), (holed, 1e-8), (partial, 1e-4)])
+def test_textbook_is_the_joint_filter(channel: str, change: Callable[[Recording], Recording], near: float) -> None:
+    seen = change(observe(gappy(drive()), S2, CHANNELS[channel], runs=2, observers=[0, 9]))
+    ours, joint = CooperativeFilter(robust=False)(seen, [0, 9]), JointFilter()(seen, [0, 9])
+    np.testing.assert_allclose(ours.x, joint.x, atol=near)
+    assert ours.covariance is not None
+    assert joint.covariance is not None
+    np.testing.assert_allclose(ours.covariance, joint.covariance, rtol=near, atol=near)
+
+
+def test_textbook_is_the_joint_filter_with_unit_matrices() -> None:
+    seen = observe(drive(), S2, V2X(4), observers=[0])
+    ours, joint = (m("identity")(seen) for m in (lambda n: CooperativeFilter(n, robust=False), JointFilter))
+    np.testing.assert_allclose(ours.x, joint.x, atol=1e-9)
+    assert ours.covariance is not None
+    assert joint.covariance is not None
+    np.testing.assert_allclose(ours.covariance, joint.covariance, atol=1e-9)
+
+
+def test_alone_it_is_the_kalman_filter() -> None:
+    """But for the prior of the start, 1e6 m^2 beside a fix of 12 m^2; no fix is beyond the gate here."""
+    seen = observe(drive(), replace(S2, gnss_std=(1.0,) * 3), V2X(0), observers=[0], assumed=S2)
+    ours, kalman = CooperativeFilter()(seen), Kalman()(seen)
+    np.testing.assert_allclose(ours.x, kalman.x, atol=1e-3)
+    assert ours.covariance is not None
+    assert kalman.covariance is not None
+    np.testing.assert_allclose(ours.covariance, kalman.covariance, rtol=1e-4)
+
+
+def too_long(seen: Recording, share: float = 0.05) -> Recording:
+    """Ranges as behind a corner."""
+    rng, relative = np.random.default_rng(1), np.array(seen.relative)
+    hit = rng.random(relative.shape[:2]) < share
+    relative[..., 0] += np.where(hit, rng.uniform(3, 20, hit.shape), 0)
+    return replace(seen, relative=relative)
+
+
+def test_wrong_ranges_cost_little_and_are_named() -> None:
+    fleet = drive(300)
+    seen = observe(fleet, S2, V2X(6), runs=4, observers=[0])
+    wrong = too_long(seen)
+    cases = (CooperativeFilter(), seen), (CooperativeFilter(), wrong), (JointFilter(), wrong)
+    clean, robust, joint = (float(rt_le(method(given), fleet).mean()) for method, given in cases)
+    assert robust < 1.1 * clean
+    assert robust < 0.9 * joint
+    weights: Floats = CooperativeFilter()(wrong).extras["range"]
+    changed = wrong.relative[..., 0] - seen.relative[..., 0] > 8.0
+    assert weights[changed].mean() < 0.1
+    assert weights[~changed].mean() > 0.97
+
+
+HEADING = replace(S2, heading_std=0.03, heading_bias_std=0.05)
+LASTING = replace(S2, gnss_std=(1.5,) * 3, gnss_drift_std=2.0, gnss_common_std=1.0, gnss_drift_time=5.0)
+BAD: dict[str, tuple[Sensors, V2X, Callable[[Recording], Recording]]] = {
+    "nothing": (S2, CHANNELS["ideal"], lambda r: r),
+    "ranges": (S2, CHANNELS["ideal"], lambda r: too_long(r, 0.2)),
+    "late": (S2, CHANNELS["slow"], lambda r: r),
+    "alone": (S2, CHANNELS["alone"], lambda r: r),
+    "missing": (S2, CHANNELS["late"], lambda r: partial(holed(r))),
+    "heading": (HEADING, CHANNELS["all"], lambda r: too_long(r, 0.1)),
+    "lasting": (LASTING, CHANNELS["late"], lambda r: r),
+    "attack": (S2, CHANNELS["all"], lambda r: spoofed(r, Spoofing(0.5, start=2.0), seed=3, honest=[0])),
+    "all": (
+        replace(LASTING, heading_std=0.03, heading_bias_std=0.05),
+        CHANNELS["late"],
+        lambda r: holed(too_long(spoofed(r, Spoofing(0.4), seed=3, honest=[0]), 0.1)),
+    ),
+}
+
+
+@pytest.mark.parametrize("robust", [True, False])
+@pytest.mark.parametrize("case", BAD)
+def test_the_filter_is_its_oracle(crossing: Fleet, case: str, robust: bool) -> None:
+    """Against dense matrices, one number at a time; members come, go and lose trust."""
+    sensors, v2x, change = BAD[case]
+    fleet = gappy(crossing)
+    seen = change(observe(fleet, sensors, v2x, runs=2, observers=[0]))
+    method = CooperativeFilter(robust=robust)
+    track, known = method(seen), resolve("nominal", seen)
+    assert track.covariance is not None
+    assert track.neighbours is not None
+    for run in range(2):
+        x, cov, others = Oracle(seen, 0, run, known, Guards() if robust else NO_GUARDS, robust).loop()
+        np.testing.assert_allclose(track.x[run, :, 0], x, atol=1e-6)
+        np.testing.assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=1e-6)
+        if len(track.neighbours[run]):
+            np.testing.assert_allclose(track.neighbours[run], np.concatenate(others), atol=1e-5)
+
+
+@pytest.mark.parametrize("case", ["late", "attack"])
+def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
+    """A stream has no recording: each vehicle's broadcast of a step is that of a stream of its own."""
+    sensors, v2x, change = BAD[case]
+    seen = change(observe(gappy(crossing), sensors, v2x, runs=1, observers=[0]))
+    track, box = CooperativeFilter()(seen), inbox(seen, 0, CooperativeFilter().message)
+    method = CooperativeFilter(NoiseModel.nominal(sensors))
+    streams = {j: StarStream(method, max_age=v2x.max_age) for j in range(len(seen.ids))}
+    sent: dict[tuple[int, int], Broadcast | None] = {}
+    for t in range(len(seen.t)):
+        here = np.arange(box.start[t], box.start[t + 1])
+        for j, stream in streams.items():
+            if j and np.isfinite(seen.velocity[0, t, j, 0]):
+                stream.step(seen.gnss[0, t, j], seen.velocity[0, t, j], seen.dt)
+                sent[j, t] = stream.broadcast
+            elif j:
+                streams[j] = StarStream(method, max_age=v2x.max_age)
+        given = [
+            RelativeMeasurement(seen.ids[j], seen.relative[0, box.link[link]], **newest(seen, sent, t, int(s), int(j)))
+            for link, j, s in zip(here, seen.links.neighbour[box.link[here]], box.newest[0, here], strict=True)
+        ]
+        x, cov = streams[0].step(seen.gnss[0, t, 0], seen.velocity[0, t, 0], seen.dt, neighbours=given)
+        np.testing.assert_allclose(x, track.x[0, t, 0], atol=1e-6)
+        assert track.covariance is not None
+        np.testing.assert_allclose(cov, track.covariance[0, t, 0], atol=1e-6)
+
+
+def newest(seen: Recording, sent: Mapping[tuple[int, int], Any], t: int, s: int, j: int) -> dict[str, Any]:
+    """The newest broadcast that is held, as a stream takes it."""
+    if s < 0 or sent[j, s] is None:
+        return {}
+    position, velocity, variance, odometer = sent[j, s]
+    return {
+        "gnss": position,
+        "velocity": velocity,
+        "variance": variance,
+        "odometer": odometer,
+        "age": (t - s) * seen.dt,
+    }

@@ -1,0 +1,186 @@
+"""What `coopoc data check` says of logs with faults that are easy to overlook, and what a log is read as."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from logs import at, bends, fixes, motion, outliers, ranges, write
+
+import coopoc as co
+from coopoc.data.log.check import check
+from coopoc.data.log.read import Log, read_log
+
+
+def said(log: Log) -> str:
+    return "\n".join(check(log).warnings)
+
+
+def cars(folder: Path, change: Callable[[pd.DataFrame], pd.DataFrame] = lambda frame: frame, rate: float = 0.1) -> Path:
+    """Two cars on a plane: fixes twice a second, odometry, ranges five times a second by the first alone."""
+    fleet = bends()
+    parts = [ranges(fleet, "car0", "car1", 0.2, 0.3)]
+    for seed, name in enumerate(fleet.ids):
+        parts += [fixes(fleet, name, 0.5, 1.0, seed).drop(columns="z")]
+        parts += [motion(fleet, name, rate, 0.1, seed).drop(columns="vz")]
+    folder.mkdir(exist_ok=True)
+    write(change(pd.concat(parts, ignore_index=True)), folder / "log.csv")
+    truth = pd.concat(
+        [
+            pd.DataFrame({"t": fleet.t, "vehicle": n, "x": x[0], "y": x[1]})
+            for n, x in ((name, fleet.position[:, k].T) for k, name in enumerate(fleet.ids))
+        ]
+    )
+    write(truth[::5], folder / "truth.csv")
+    return folder
+
+
+def test_nothing_looks_wrong_where_nothing_is(tmp_path: Path) -> None:
+    assert said(read_log(cars(tmp_path / "log"))) == ""
+
+
+def in_fixes(frame: pd.DataFrame) -> pd.DataFrame:
+    here = np.flatnonzero(frame["x"].notna())[::20]
+    return frame.assign(x=frame["x"].where(~frame.index.isin(here), frame["x"] + 15))
+
+
+def body_twist(frame: pd.DataFrame) -> pd.DataFrame:
+    moves = frame["vx"].notna()
+    speed = np.hypot(frame["vx"], frame["vy"])
+    return frame.assign(vx=speed, vy=np.where(moves, 0.1 * np.sin(np.arange(len(frame))), np.nan))
+
+
+FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
+    "one range of twenty": (lambda f: f.assign(range=outliers(f["range"])), r"[45]\.\d% of the ranges lie beyond 5"),
+    "one fix of twenty": (in_fixes, r"car0: [45]\.\d% of the fixes lie beyond 5"),
+    "two metres on every range": (
+        lambda f: f.assign(range=f["range"] + 2),
+        r"ranges of car0 and car1 by \+[12]\.\S* m are off in the median, with 0\.3 m stated",
+    ),
+    "stamps without their fraction": (
+        lambda f: f.assign(t=np.floor(f["t"])),
+        r"\d\d% of what was logged is not used, first of all \d+ repeated rows .*stamp\.sec without nanosec",
+    ),
+    "a body twist as vx, vy": (body_twist, "car0: vx, vy look like a body-frame velocity"),
+    "easting and northing": (lambda f: f.rename(columns={"x": "y", "y": "x"}), "car0: axes look swapped"),
+    "velocities by name": (lambda f: f.rename(columns={"vx": "vy", "vy": "vx"}), "car0: axes look swapped"),
+    "a partner without a place": (
+        lambda f: pd.concat([f, f[f["range"].notna()].assign(partner="anchor")]),
+        r"\d+% of what was logged is not used, first of all \d+ relative measurements of members without a position",
+    ),
+    "columns of no kind": (
+        lambda f: f.assign(id=f["vehicle"], course_deg=10.0),
+        r"log.csv: column id, Did you mean vehicle\?; log.csv: column course_deg, Did you mean \w+_deg\?",
+    ),
+}
+
+
+@pytest.mark.parametrize("fault", FAULTS)
+def test_a_fault_has_a_line(tmp_path: Path, fault: str) -> None:
+    change, message = FAULTS[fault]
+    options = {"dt": 0.2} if "stamps" in fault else {}
+    text = said(read_log(cars(tmp_path / "log", change), **options))
+    assert pd.Series([text]).str.contains(message, regex=True)[0], text
+    if "twist" not in fault and "axes" not in message:
+        assert "look" not in text
+
+
+def test_a_range_is_known_to_both_ends_and_used_between_steps(tmp_path: Path) -> None:
+    """Odometry at 50 Hz, ranges at 5 Hz that one car logged: both are helped, at steps as fixes and ranges come."""
+    log = read_log(cars(tmp_path / "log", rate=0.02))
+    assert log.truth is not None
+    assert log.recording.dt == pytest.approx(0.2)
+    assert "steps of 0.2 s, as fixes and pairs are measured; odometry every 0.02 s is averaged" in str(log.summary)
+    assert "900 ranges count for the other end, too" in str(log.summary)
+    own = read_log(tmp_path / "log", mutual=False)
+    assert "count for the other end" not in str(own.summary)
+    alone, joint, one_way = (
+        co.rt_le(method(part.recording, ["car0", "car1"]), log.truth)[0]
+        for method, part in ((co.Kalman(), log), (co.JointFilter(), log), (co.JointFilter(), own))
+    )
+    assert (joint < 0.97 * alone).all()
+    assert one_way[0] < 0.97 * alone[0]
+    assert one_way[1] == pytest.approx(alone[1], abs=1e-4)
+    assert read_log(tmp_path / "log", dt=0.02).recording.dt == 0.02
+
+
+def test_the_height_of_a_truth_above_another_surface_is_named(tmp_path: Path) -> None:
+    """Four drones with a file of fixes and one of their radio each; the truth is above the geoid, one is 0.8 m off."""
+    fleet, log = bends(4, climb=20.0), tmp_path / "drones"
+    log.mkdir()
+    for seed, name in enumerate(fleet.ids):
+        parts = [fixes(fleet, name, 0.5, 0.5, seed).assign(z_std=0.5), motion(fleet, name, 0.1, 0.05, seed)]
+        write(pd.concat(parts), log / f"{name}_fixes.csv")
+        radio = [ranges(fleet, name, other, 0.2, 0.1, seed) for other in fleet.ids if other != name]
+        write(pd.concat(radio), log / f"{name}_radio.csv")
+    every = [at(fleet, name, fleet.t[::5]) for name in fleet.ids]
+    for up, message in (
+        (0.0, ""),
+        (15.0, "car0: fixes lie -15 m above the truth in the median"),
+        (0.8, "car0: fixes lie -0."),
+    ):
+        tables = [
+            pd.DataFrame({"t": fleet.t[::5], "vehicle": name, **dict(zip("xyz", x.T, strict=True))})
+            for name, x in zip(fleet.ids, every, strict=True)
+        ]
+        tables[0]["z"] += up
+        write(pd.concat(tables), log / "truth.csv")
+        text = said(read_log(log))
+        assert message in text
+        assert ("above the truth" in text) == bool(up)
+
+
+@pytest.mark.parametrize("who", ["logged", "not logged"])
+def test_an_offset_of_the_ranges_of_one_is_named(tmp_path: Path, who: str) -> None:
+    fleet, log = bends(3), tmp_path / "log"
+    log.mkdir()
+    for seed, name in enumerate(fleet.ids):
+        write(pd.concat([fixes(fleet, name, 0.2, 0.5, seed), motion(fleet, name, 0.1, 0.1, seed)]), log / f"{name}.csv")
+        for other in fleet.ids[:seed]:
+            frame = ranges(fleet, name, other, 0.2, 0.1, seed)
+            frame["range"] += 0.8 * (name == "car2")
+            write(frame if who == "logged" else frame.drop(columns="range_std"), log / f"{name}_{other}.csv")
+    text = said(read_log(log))
+    assert ("car0 and car2 by +0." in text and "car1 and car2 by +0." in text) == (who == "logged")
+    assert "car0 and car1" not in text
+
+
+def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path: Path) -> None:
+    """As receivers do, which give a course to what moves alone: a third of the drive stands."""
+    t = np.round(np.arange(0, 90, 0.2), 1)
+    moves = (t < 30) | (t >= 60)
+    x = np.cumsum(np.where(moves, 1.6, 0.0))
+    frame = pd.DataFrame({"t": t, "vehicle": "car", "x": x, "y": 0.0, "speed": np.where(moves, 8.0, 0.02)})
+    frame["heading"] = np.where(moves, 0.0, np.nan)
+    log = read_log(write(frame, tmp_path / "car.csv"))
+    assert np.isfinite(log.recording.gnss[0, :, 0, 0]).all()
+    assert not log.summary.refused
+    still = ~moves & (t > 31)
+    np.testing.assert_allclose(log.recording.velocity[0, still, 0], 0.0, atol=0.03)
+    frame.loc[~moves, "speed"] = np.nan  # a receiver that says nothing while it stands
+    text = said(read_log(write(frame, tmp_path / "car.csv")))
+    assert "first of all 14" in text
+    assert "fixes in gaps of the odometry" in text
+    assert "Where a vehicle stands, log a speed of 0" in text
+
+
+def test_one_car_with_a_gap_and_columns_of_its_own(tmp_path: Path) -> None:
+    fleet = bends(1)
+    frame = fixes(fleet, "car0", 1.0, 1.0).merge(motion(fleet, "car0", 0.1, 0.1), how="outer", on=["t", "vehicle"])
+    frame = frame[~frame["t"].between(60, 80)].drop(columns=["vehicle", "z", "vz"])
+    log = read_log(write(frame.assign(id=7, course_deg=90.0), tmp_path / "taxi.csv"))
+    assert log.recording.ids == ("taxi",)
+    (first, last), (again, end) = log.recording.stretches("taxi")
+    assert (first, last, end) == (0, pytest.approx(600, abs=5), len(log.recording.t))
+    assert again == pytest.approx(805, abs=5)  # with the first fix behind the gap
+    text = said(log)
+    assert "column id, Did you mean vehicle?" in text
+    assert "course_deg, Did you mean compass_deg?" in text
+    truth = fixes(fleet, "car0", 1.0, 1e-9)[["t", "x", "y"]]
+    (tmp_path / "log").mkdir()
+    write(frame, tmp_path / "log" / "taxi.csv")
+    write(truth, tmp_path / "log" / "truth.csv")
+    assert read_log(tmp_path / "log").truth is not None  # names no vehicle, and there is one
