@@ -1,1 +1,1 @@
-"""Datasets: the registry, the readers, the generator and the bundled fleets."""
+"""Datasets: the registry, the readers and the bundled fleets."""

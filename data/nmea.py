@@ -71,7 +71,7 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
 
 
 class _Sentences:
-    """What sentences say; seconds since 1970 if a date was seen, else seconds of the first day."""
+    """What sentences say; seconds since 1970 from the first date on, else seconds of the first day."""
 
     def __init__(self) -> None:
         self.rows: list[tuple[float, str, float, int]] = []

@@ -242,8 +242,8 @@ def _figure(results: Results) -> Plot | None:
     if len(ks) < 2 and len(marks) < 2:
         return None
     x, values = ("landmarks", marks) if len(marks) > 1 else ("max_neighbours", ks)
-    places = {i: {x: value} for i, value in enumerate(values)}
-    ticks = {i: str(value) for i, value in enumerate(values)}
+    places = {float(np.log1p(value)): {x: value} for value in values}
+    ticks = {place: str(also[x]) for place, also in places.items()}
     fusion: list[Where] = [{"method": name, "label": look(name).label} for name in METHODS if name != LEARNED]
     lines: list[Where] = []
     if x == "landmarks":

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 PAPER: Mapping[str, tuple[str, ...]] = {
     "convergence": ("centralised",),
     "error_cdf": ("scenario 1", "scenario 2"),
-    "neighbours": ("identity", "fitted"),
+    "neighbours": ("nominal",),
 }
 """Studies of the paper, and the keys of the findings that answer their questions."""
 SURVEY: Mapping[str, tuple[str, tuple[str, ...]]] = {
@@ -30,16 +31,15 @@ SURVEY: Mapping[str, tuple[str, tuple[str, ...]]] = {
     "consistency": ("Which methods are consistent?", ("credible",)),
 }
 """Study -> question, and the keys of the findings that answer it."""
+EVIDENCE = re.compile(r" \(paired[^)]*\)")
+"""What the first screen leaves to the sections."""
 LIMITS = {5000.0: "at most 5 kB/s", 300.0: "at most 300 B/s", 0.0: "no V2X"}
 PRIOR = {
     "with the noise known": ("nominal", "trained", "none"),
     "with the noise fitted elsewhere": ("fitted", "trained"),
 }
 """Noise models that are compared: the sensors' true figures, or figures fitted and trained without neighbours."""
-LEAD = (
-    "Three results of “Federated Data-Driven Kalman Filtering for State Estimation” (arXiv 2411.05847), on {where}.",
-    "The paper's baselines use identity covariances; each comparison is shown with them and with fitted ones.",
-)
+LEAD = "After “Federated Data-Driven Kalman Filtering for State Estimation” (arXiv 2411.05847), on {where}."
 
 
 def paper(
@@ -60,18 +60,22 @@ def paper(
     from coopoc.data.registry import DATASETS, card
 
     def answers(results: Mapping[str, Results]) -> dict[str, str]:
-        return {results[name].question: reported(name, results[name], keys) for name, keys in PAPER.items()}
+        lead.insert(0, reported("neighbours", results["neighbours"], ["answer"]))
+        texts = {results[name].question: reported(name, results[name], keys) for name, keys in PAPER.items()}
+        return {question: EVIDENCE.sub("", text) for question, text in texts.items()}
 
     bundled = [name for name in dict.fromkeys((data, "town10-clients")) if name in DATASETS]
-    where = "our fleets" if data in DATASETS else f"{Path(data).name} after training on ours"
+    place = "our fleets" if data in DATASETS else f"{Path(data).name} after training on ours"
+    lead = [LEAD.format(where=place)]
     return _run(
         tuple(PAPER),
         out,
         jobs,
         {"data": data},
         answers,
-        title="Collaborative training against collaborative decision",
-        lead=[text.format(where=where) for text in LEAD],
+        title="Should vehicles collaborate while they train, or while they decide?",
+        lead=lead,
+        first="neighbours",
         cards={name: in_words(card(name)) for name in bundled},
     )
 

@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any, cast
+from typing import cast
 
-import numba
 import numpy as np
 import pytest
 
@@ -26,16 +25,6 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the shared data folder is not beside the project")
     return SHARED
-
-
-def callable_part(part: Callable[..., Any]) -> Callable[..., Any]:
-    """A part of a kernel, which compiled code alone may call, for callers from Python."""
-
-    @numba.njit(error_model="numpy")
-    def call(*given):  # type: ignore[no-untyped-def]
-        return part(*given)
-
-    return cast(Callable[..., Any], call)
 
 
 def winding(steps: int = 60, speed: float = 8.0, period: float = 3.0, vehicles: int = 1) -> Fleet:

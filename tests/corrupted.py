@@ -38,20 +38,20 @@ def recording(runs: int = 4, whole: bool = True) -> Recording:
     return observe(fleet, Sensors.paper_scenario2(), channel, runs=runs, seed=5)
 
 
-def with_parts(seen: Recording, **parts: Any) -> Recording:
+def with_parts(valid: Recording, **parts: Any) -> Recording:
     """The recording with other arrays; `step`, `observer` and `neighbour` are those of its links."""
     links = {name: parts.pop(name) for name in COLUMNS if name in parts}
-    return replace(seen, **(parts | ({"links": replace(seen.links, **links)} if links else {})))
+    return replace(valid, **(parts | ({"links": replace(valid.links, **links)} if links else {})))
 
 
-def arrays(seen: Recording) -> dict[str, Any]:
+def arrays(valid: Recording) -> dict[str, Any]:
     """All arrays by name."""
-    return {n: getattr(seen, n) for n in ARRAYS} | {n: getattr(seen.links, n) for n in COLUMNS}
+    return {n: getattr(valid, n) for n in ARRAYS} | {n: getattr(valid.links, n) for n in COLUMNS}
 
 
-def wrong(seen: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
+def wrong(valid: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
     """Arrays that no recording may have."""
-    for name, good in arrays(seen).items():
+    for name, good in arrays(valid).items():
         for axis in range(good.ndim):
             for cut in (slice(0, 0), slice(0, -1), slice(0, 1)):
                 yield f"{name} axis {axis} {cut}", {name: good[(slice(None),) * axis + (cut,)]}
@@ -63,48 +63,48 @@ def wrong(seen: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
         yield f"{name} as ragged lists", {name: [[1, 2], [3]]}
         yield f"{name} is None", {name: None}
     for name in ("arrival", *COLUMNS):
-        yield f"{name} as floats", {name: arrays(seen)[name].astype(float)}
-    yield "broadcasts as numbers", {"broadcasts": seen.broadcasts.astype(int)}
+        yield f"{name} as floats", {name: arrays(valid)[name].astype(float)}
+    yield "broadcasts as numbers", {"broadcasts": valid.broadcasts.astype(int)}
     for name in COLUMNS:
-        good = arrays(seen)[name]
+        good = arrays(valid)[name]
         for shift in (-1000, -1, 1000, 2**40, 2**62):
             yield f"{name} {shift:+}", {name: good + shift}
             for at in (0, len(good) // 2, -1):
-                one = good.copy()
-                one[at] += shift if shift != -1 else -1 - one[at]
-                yield f"{name}[{at}] {shift:+}", {name: one}
-    yield "links backwards", {name: getattr(seen.links, name)[::-1] for name in COLUMNS}
-    yield "neighbour is observer", {"neighbour": seen.links.observer}
-    yield "arrival before sending", {"arrival": np.where(seen.arrival >= 0, seen.links.step - 1, -1)}
-    yield "arrival far below", {"arrival": seen.arrival - 1000}
+                changed = good.copy()
+                changed[at] += shift if shift != -1 else -1 - changed[at]
+                yield f"{name}[{at}] {shift:+}", {name: changed}
+    yield "links backwards", {name: getattr(valid.links, name)[::-1] for name in COLUMNS}
+    yield "neighbour is observer", {"neighbour": valid.links.observer}
+    yield "arrival before sending", {"arrival": np.where(valid.arrival >= 0, valid.links.step - 1, -1)}
+    yield "arrival far below", {"arrival": valid.arrival - 1000}
     for name, value in (("gnss", np.inf), ("velocity", -np.inf), ("relative", np.inf), ("t", np.nan), ("t", np.inf)):
-        bad = arrays(seen)[name].copy()
+        bad = arrays(valid)[name].copy()
         bad.ravel()[3] = value
         yield f"{name} holds {value}", {name: bad}
     for name in ("gnss", "velocity"):
-        bad = arrays(seen)[name].copy()
+        bad = arrays(valid)[name].copy()
         bad[0, 1, 0, 1] = np.nan
         yield f"{name} without y", {name: bad}
-    absent = seen.velocity.copy()
-    absent[:, seen.links.step[0], seen.links.neighbour[0]] = np.nan
+    absent = valid.velocity.copy()
+    absent[:, valid.links.step[0], valid.links.neighbour[0]] = np.nan
     yield "a link to an absent vehicle", {"velocity": absent}
-    once = seen.velocity.copy()
+    once = valid.velocity.copy()
     once[1, 4, 0] = np.nan
     yield "absent in one run", {"velocity": once}
-    yield "negative range", {"relative": seen.relative * [-1, 1, 1]}
-    yield "t backwards", {"t": seen.t[::-1]}
-    yield "t uneven", {"t": seen.t**2}
+    yield "negative range", {"relative": valid.relative * [-1, 1, 1]}
+    yield "t backwards", {"t": valid.t[::-1]}
+    yield "t uneven", {"t": valid.t**2}
     yield "observers beyond", {"observers": (0, 1, 99)}
     yield "observers below", {"observers": (-1, 0, 1, 2)}
     yield "observers fewer than observe", {"observers": (0,)}
-    yield "ids fewer", {"ids": seen.ids[:-1]}
-    yield "ids twice", {"ids": (seen.ids[0],) * len(seen.ids)}
-    yield "more neighbours than K", {"v2x": replace(seen.v2x, max_neighbours=1)}
+    yield "ids fewer", {"ids": valid.ids[:-1]}
+    yield "ids twice", {"ids": (valid.ids[0],) * len(valid.ids)}
+    yield "more neighbours than K", {"v2x": replace(valid.v2x, max_neighbours=1)}
 
 
-def rearranged(seen: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
+def rearranged(valid: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
     """The same numbers in other memory."""
-    same = arrays(seen)
+    same = arrays(valid)
 
     def all_of(change: Callable[[Any], Any]) -> dict[str, Any]:
         return {name: change(array) for name, array in same.items()}
@@ -135,32 +135,32 @@ def rearranged(seen: Recording) -> Iterator[tuple[str, dict[str, Any]]]:
     yield "unsigned links", {name: same[name].astype(np.uint64) for name in COLUMNS}
 
 
-def allowed(seen: Recording, rng: np.random.Generator) -> Iterator[tuple[str, dict[str, Any]]]:
+def allowed(valid: Recording, rng: np.random.Generator) -> Iterator[tuple[str, dict[str, Any]]]:
     """Odd recordings that hold nothing wrong: every method answers or says why it cannot."""
-    links, runs = len(seen.links), seen.runs
-    far, lost = seen.links.step + rng.integers(0, 40, (runs, links)), np.full((runs, links), -1)
+    links, runs = len(valid.links), valid.runs
+    far, lost = valid.links.step + rng.integers(0, 40, (runs, links)), np.full((runs, links), -1)
     yield "arrival at any later step", {"arrival": far}
     yield "arrival far beyond the end", {"arrival": far + 2**40}
     yield "everything lost", {"arrival": lost}
-    yield "nothing sent", {"broadcasts": np.zeros_like(seen.broadcasts), "arrival": lost}
+    yield "nothing sent", {"broadcasts": np.zeros_like(valid.broadcasts), "arrival": lost}
     for size in (0, 1, links // 2):
         chosen = np.sort(rng.permutation(links)[:size])
-        parts: dict[str, Any] = {name: getattr(seen.links, name)[chosen] for name in COLUMNS}
-        yield f"{size} links", {**parts, "relative": seen.relative[:, chosen], "arrival": seen.arrival[:, chosen]}
-    for name, mask in (("gnss", (runs, *seen.gnss.shape[1:3], 1)), ("relative", (runs, links, 1))):
-        yield f"{name} at times", {name: np.where(rng.random(mask) < 0.3, np.nan, arrays(seen)[name])}
-    yield "never a fix", {"gnss": np.full_like(seen.gnss, np.nan)}
-    yield "no azimuth", {"relative": np.where([False, True, False], np.nan, seen.relative)}
-    yield "zero ranges", {"relative": seen.relative * [0, 1, 1]}
-    yield "far away", {"gnss": seen.gnss + 1e7}
+        parts: dict[str, Any] = {name: getattr(valid.links, name)[chosen] for name in COLUMNS}
+        yield f"{size} links", {**parts, "relative": valid.relative[:, chosen], "arrival": valid.arrival[:, chosen]}
+    for name, mask in (("gnss", (runs, *valid.gnss.shape[1:3], 1)), ("relative", (runs, links, 1))):
+        yield f"{name} at times", {name: np.where(rng.random(mask) < 0.3, np.nan, arrays(valid)[name])}
+    yield "never a fix", {"gnss": np.full_like(valid.gnss, np.nan)}
+    yield "no azimuth", {"relative": np.where([False, True, False], np.nan, valid.relative)}
+    yield "zero ranges", {"relative": valid.relative * [0, 1, 1]}
+    yield "far away", {"gnss": valid.gnss + 1e7}
 
 
-def answers(seen: Recording, only: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
+def answers(valid: Recording, only: tuple[str, ...] = ()) -> Iterator[tuple[str, Any]]:
     """(method, what it answers): positions, or the exception."""
     for name, make in METHODS.items():
         if not only or name in only:
             try:
-                yield name, make("nominal")(seen, [0, 1]).x
+                yield name, make("nominal")(valid, [0, 1]).x
             except Exception as error:
                 yield name, error
 
@@ -198,8 +198,8 @@ if __name__ == "__main__":
     warnings.simplefilter("ignore")
     assert {f.name for f in fields(Links)} == set(COLUMNS)
     odd, *methods = sys.argv[1:]
-    found = 0
+    count = 0
     for line in complaints(tuple(methods), odd == "odd"):
         print(line, flush=True)
-        found += 1
-    sys.exit(found > 0)
+        count += 1
+    sys.exit(count > 0)

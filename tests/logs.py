@@ -27,7 +27,7 @@ def drive(vehicles: int = 4, steps: int = 200, dt: float = 0.1, start: float = 0
 NOISE = Sensors(gnss_std=(1.5, 1.5, 0.5), velocity_std_ratio=0.0, velocity_floor=0.1, range_std=0.3, min_range=0.0)
 
 
-def seen(fleet: Fleet, k: int = 3, **channel: Any) -> Recording:
+def observed(fleet: Fleet, k: int = 3, **channel: Any) -> Recording:
     """One run of noisy measurements, with noise on the velocity as wide as its floor."""
     recording = observe(fleet, NOISE, V2X(k, 120.0, **channel), runs=1, seed=3)
     noise = np.random.default_rng(0).normal(0, 0.1, recording.velocity.shape) * [1, 1, 0]

@@ -53,11 +53,11 @@ def rows() -> Iterator[tuple[str, str, str, str]]:
             if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
                 words = " ".join((ast.get_docstring(node) or "").split())
                 source = ast.get_source_segment(text, node) or ""
-                found = [name for name, pattern in REFERENCES.items() if re.search(pattern, words, re.IGNORECASE)]
-                if found:
+                references = [name for name, pattern in REFERENCES.items() if re.search(pattern, words, re.IGNORECASE)]
+                if references:
                     tolerance = ", ".join(dict.fromkeys(TOLERANCE.findall(source))) or "its own"
                     subject = node.name.removeprefix("test_").replace("_", " ")
-                    yield subject, ", ".join(found), tolerance, f"{file.stem}::{node.name}"
+                    yield subject, ", ".join(references), tolerance, f"{file.stem}::{node.name}"
 
 
 def page() -> str:

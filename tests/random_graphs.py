@@ -91,7 +91,7 @@ def random_graph(
 
 def _paths(rng: np.random.Generator, d: int, robots: int, steps: int) -> tuple[np.ndarray, np.ndarray]:
     """Positions (robots * steps, d) and rotations of drives that turn back towards the middle."""
-    found, turned = [], []
+    positions, turned = [], []
     for _ in range(robots):
         at, course, bend = rng.uniform(-10, 10, d) * np.r_[1, 1, np.full(d - 2, 0.2)], rng.uniform(-np.pi, np.pi), 0.0
         for _ in range(steps):
@@ -101,14 +101,14 @@ def _paths(rng: np.random.Generator, d: int, robots: int, steps: int) -> tuple[n
             course += bend + homing
             tilt = [] if d == 2 else [0.1 * rng.normal(), 0.1 * rng.normal()]
             angles = [course, *tilt]
-            found.append(at.copy())
+            positions.append(at.copy())
             turned.append(
                 [[np.cos(course), -np.sin(course)], [np.sin(course), np.cos(course)]]
                 if d == 2
                 else Rotation.from_euler("zyx", angles).as_matrix()
             )
             at += np.array(turned[-1])[:, 0]
-    return np.array(found), np.array(turned)
+    return np.array(positions), np.array(turned)
 
 
 def _small(rng: np.random.Generator, d: int, count: int, std: float) -> np.ndarray:

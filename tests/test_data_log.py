@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from logs import NOISE, drive, long, seen, write
+from logs import NOISE, drive, long, observed, write
 
 import coopoc as co
 from coopoc.data.log.read import read_log
@@ -21,7 +21,7 @@ def test_a_recording_comes_back_from_its_rows(tmp_path: Path, suffix: str) -> No
     """Fixes, velocities, relative measurements and messages; late and lost ones, too. Velocities are means over steps
     of samples joined by lines, so those of the rows are made such that their means are the recording's."""
     fleet = drive(start=1.7e9)
-    true = seen(fleet, rate=5.0, latency=0.25, loss=0.2)
+    true = observed(fleet, rate=5.0, latency=0.25, loss=0.2)
     frame = long(true)
     log = read_log(write(frame, tmp_path / f"log.{suffix}"))
     found = log.recording
@@ -146,7 +146,7 @@ def test_slow_fixes_are_brought_to_their_step_by_the_odometry(tmp_path: Path) ->
 
 
 def test_a_clock_that_is_ahead_is_set_back(tmp_path: Path) -> None:
-    true = seen(drive(2, start=100.0), k=1, latency=0.2)
+    true = observed(drive(2, start=100.0), k=1, latency=0.2)
     frame = long(true)
     late = frame["vehicle"] == "car1"
     received = (frame["kind"] == "message") & (frame["partner"] == "car1")
@@ -160,7 +160,7 @@ def test_a_clock_that_is_ahead_is_set_back(tmp_path: Path) -> None:
 
 
 def test_vehicles_come_and_go_and_nothing_is_dropped_in_silence(tmp_path: Path) -> None:
-    frame = long(seen(drive(3)), messages=False)
+    frame = long(observed(drive(3)), messages=False)
     gone = (frame["vehicle"] == "car2") & (frame["t"] > 5.02) & (frame["t"] < 12.02)
     odometry = frame["kind"].isin(["vx", "vy", "vz"])
     log = read_log(write(frame[~(gone & odometry)], tmp_path / "log.csv"))

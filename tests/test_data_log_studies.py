@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from filterpy.kalman import KalmanFilter
-from logs import drive, long, seen, write
+from logs import drive, long, observed, write
 
 import coopoc as co
 from coopoc.cli import main
@@ -34,7 +34,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A log without and one with a truth; car2 is away for seven seconds."""
     out = tmp_path_factory.mktemp("logs")
     fleet = drive(4, gap=15.0)
-    frame = long(seen(fleet), messages=False)
+    frame = long(observed(fleet), messages=False)
     frame = frame[~((frame["vehicle"] == "car2") & frame["t"].between(5, 12))]
     for name in ("without", "with"):
         (out / name).mkdir()
@@ -149,13 +149,13 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_the_check_says_what_looks_wrong(tmp_path: Path, case: str) -> None:
     kinds, change, message = WRONG[case]
-    frame = _changed(long(seen(drive(4, gap=15.0)), messages=False), kinds, change)
+    frame = _changed(long(observed(drive(4, gap=15.0)), messages=False), kinds, change)
     warnings = check(read_log(write(frame, tmp_path / "log.csv"))).warnings
     assert any(pd.Series([warning]).str.contains(message, regex=True)[0] for warning in warnings), warnings
 
 
 def test_stamps_in_milliseconds_are_found(tmp_path: Path) -> None:
-    frame = long(seen(drive(4, gap=15.0)), messages=False)
+    frame = long(observed(drive(4, gap=15.0)), messages=False)
     file = write(frame.assign(t=1000 * frame["t"]), tmp_path / "log.csv")
     assert any("Is t in ms" in warning for warning in check(read_log(file, dt=100, max_gap=1e4)).warnings)
 
@@ -186,7 +186,7 @@ def test_the_commands_take_a_log_and_options(
 
 def test_a_plane_has_two_dimensions(tmp_path: Path) -> None:
     """Without heights NIS is per two degrees of freedom: 1, and not 2/3."""
-    frame = long(seen(drive(4, steps=600, gap=15.0)), messages=False)
+    frame = long(observed(drive(4, steps=600, gap=15.0)), messages=False)
     frame = frame[~frame["kind"].isin(["z", "vz", "inclination"])]
     found = check(read_log(write(frame, tmp_path / "log.csv")))
     assert np.mean([row["nis"] for row in found.vehicles]) == pytest.approx(1.0, abs=0.1)

@@ -69,6 +69,32 @@ def test_nmea_is_fixes_speed_and_course(tmp_path: Path) -> None:
     assert np.linalg.norm(rec.velocity[0, 5:-5, 0], axis=-1) == pytest.approx(8.0, abs=0.2)
 
 
+def test_a_truth_in_nmea_is_of_the_only_car_and_of_its_day(tmp_path: Path) -> None:
+    """A truth of GGA alone has no date; one of another time is refused."""
+    pytest.importorskip("pynmeagps")
+    fleet, start = drive(1, steps=100), datetime(2024, 2, 28, 12)
+    (tmp_path / "a.nmea").write_text(nmea(fleet, 0, start))
+    (tmp_path / "truth.gga").write_text(nmea(fleet, 0, start, rmc=False))
+    log = read_log(tmp_path, origin=(48.14, 11.58, 560.0))
+    assert log.truth is not None
+    np.testing.assert_allclose(log.truth.position, fleet.position, atol=1e-3)
+    (tmp_path / "truth.gga").write_text(nmea(fleet, 0, start + timedelta(hours=2), rmc=False))
+    with pytest.raises(co.InputError, match=r"truth\.gga: column t = .*must overlap the log, .*Does its clock"):
+        read_log(tmp_path)
+
+
+def test_a_real_car_that_stops_keeps_all_its_fixes(shared: Path) -> None:
+    """1,653 fixes of a u-blox F9K, a third of them at standstill, where it gives no course; and a surveyed truth."""
+    pytest.importorskip("pynmeagps")
+    road = shared / "road" / "f9k"
+    log = read_log(road / "ublox_f9k.nmea", truth=road / "span_truth.gga")
+    assert log.summary.read == {"fixes": 1653}
+    assert list(log.summary.refused) == ["damaged NMEA sentences"]
+    assert log.truth is not None
+    error = np.linalg.norm((log.recording.gnss[0] - log.truth.position)[..., :2], axis=-1)
+    assert np.nanmedian(error) == pytest.approx(0.49, abs=0.05)  # stated by those who published it
+
+
 def test_damaged_sentences_are_counted(tmp_path: Path) -> None:
     pytest.importorskip("pynmeagps")
     lines = nmea(drive(1, steps=60), 0, datetime(2024, 1, 1)).splitlines(keepends=True)

@@ -81,25 +81,6 @@ def test_tanh_and_sigmoid_against_numpy() -> None:
     assert np.isnan(out).all()
 
 
-@pytest.mark.parametrize(("models", "lanes"), [(1, 1), (2, 2), (1, 7), (2, 5)])
-def test_gradcheck(models: int, lanes: int) -> None:
-    """torch.autograd.gradcheck: finite differences in float64, with missing fixes and variable dt."""
-    nets = [GainNet(2, 1, seed=s).double() for s in range(models)]
-    data, dt = batch(models, lanes, 6, gaps=0.3), torch.linspace(0.05, 0.2, 6)
-
-    def run(theta: Tensor) -> Tensor:
-        return nets[0].rollout(theta, data.gnss, data.velocity, data.x0, dt)
-
-    theta = flatten(nets)
-    torch.manual_seed(2)
-    weights, direction = theta + 0.05 * torch.randn_like(theta), torch.randn(3, theta.shape[1], dtype=torch.float64)
-
-    def along(step: Tensor) -> Tensor:
-        return run(weights + step @ direction)
-
-    assert torch.autograd.gradcheck(along, torch.zeros(models, 3, dtype=torch.float64, requires_grad=True), eps=1e-7)
-
-
 @pytest.mark.parametrize(
     ("models", "lanes", "steps"),
     [(3, 1, 100), pytest.param(1, 2, 900, marks=pytest.mark.slow), (2, 7, 100), (1, 72, 100)],
@@ -123,21 +104,6 @@ def test_float64_agrees_with_the_reference_with_gaps_and_variable_dt() -> None:
     found, mine, expected, theirs = gradients(nets, batch(2, 9, 60, gaps=0.4), dt)
     torch.testing.assert_close(found, expected, rtol=1e-9, atol=1e-9)
     torch.testing.assert_close(mine, theirs, rtol=1e-8, atol=1e-10)
-
-
-def test_a_net_is_an_ordinary_module() -> None:
-    """Two steps of torch.optim.Adam through forward end where they end through the reference."""
-    data, ends = batch(1, 3, 20), []
-    gnss, velocity, truth = (a[:, 0].transpose(0, 1) for a in data[:3])
-    for way in (GainNet.forward, Recurrent.forward):
-        net = GainNet(2, 1).double()
-        adam = torch.optim.Adam(net.parameters(), lr=1e-2)
-        for _ in range(2):
-            adam.zero_grad()
-            (way(net, gnss, velocity, data.x0[0], 0.1) - truth).square().mean().backward()
-            adam.step()
-        ends.append(flatten([net]))
-    torch.testing.assert_close(ends[0], ends[1], rtol=1e-8, atol=1e-10)
 
 
 def test_an_optimiser_step_is_that_of_torch() -> None:

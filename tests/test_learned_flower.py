@@ -17,7 +17,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from logs import long, seen, write
+from logs import long, observed, write
 from torch import Tensor
 
 from coopoc import Fleet, InputError, load_fleet
@@ -245,7 +245,7 @@ def test_a_node_may_train_on_what_it_measured(tmp_path: Path) -> None:
     from coopoc.learned.flower.client import configured
 
     fleet = drives(2)
-    recording = seen(fleet, 0)
+    recording = observed(fleet, 0)
     write(long(recording), tmp_path / "measurements.csv")
     there, column = np.nonzero(fleet.present)
     truth = {"t": fleet.t[there], "vehicle": [fleet.ids[c] for c in column]}

@@ -12,8 +12,7 @@ import corrupted
 import numpy as np
 import pytest
 
-from coopoc import V2X, Factor, Fleet, InputError, JointFilter, Links, Problem, Sensors, observe, rt_le
-from coopoc.arrays import checked, frozen, number
+from coopoc import V2X, Fleet, InputError, JointFilter, Sensors, observe
 
 KERNELS = ("kalman", "lkf-sa", "msmv-r", "joint", "ci", "gbp", "batch-smoother")
 FLEET = Fleet(("a", "b"), [0, 0.1], np.tile([[0, 0, 0], [9, 0, 0]], (2, 1, 1)), np.zeros((2, 2, 3)))
@@ -79,42 +78,6 @@ def test_whole_numbers_are_as_good_as_floats() -> None:
     assert given == Sensors((2.0,) * 3, range_std=1.0, min_range=2.0, gnss_drift_time=9.0)
     seen = observe(FLEET, given, V2X(radius=30, rate=10, latency=0), runs=np.int64(2))  # type: ignore[arg-type]
     assert JointFilter()(seen, [0]).x.shape == (2, 2, 1, 3)
-
-
-SEEN = observe(FLEET, Sensors())
-
-
-@pytest.mark.parametrize(
-    "call",
-    [
-        lambda: Sensors(gnss_drift_time=np.inf),
-        lambda: V2X(max_neighbours=2.0),  # type: ignore[arg-type]
-        lambda: observe(FLEET, V2X()),  # type: ignore[arg-type]
-        lambda: FLEET.select([]),
-        lambda: FLEET.index(True),
-        lambda: SEEN.columns([]),
-        lambda: SEEN.of_runs(slice(0, 0)),
-        lambda: rt_le(JointFilter()(SEEN, [1]), FLEET.select([0])),
-        lambda: Links([0, 0], [0, 0], [1, 1]),  # type: ignore[arg-type]
-        lambda: Factor("range", [[0, -1]], [[5.0]], std=1.0),  # type: ignore[arg-type]
-        lambda: Factor("range", [[0, 1]], [[True]], std=1.0),  # type: ignore[arg-type]
-        lambda: Problem(("a", "b"), (Factor("range", [[0, 2]], [[5.0]], std=1.0),)),  # type: ignore[arg-type]
-        lambda: Problem(("a",), x0=np.zeros((1, 3), complex)),
-    ],
-)
-def test_wrong_calls_end_in_an_input_error(call: Any) -> None:
-    with pytest.raises(InputError):
-        call()
-
-
-def test_checks_of_single_arrays_and_numbers() -> None:
-    view = np.arange(6.0).reshape(2, 3).T
-    assert frozen(view).flags.c_contiguous
-    assert frozen(view) is not view
-    assert checked("x", [], "(L,)", (0,), int).dtype == np.int64
-    assert number("x", np.float32(2)) == 2.0
-    with pytest.raises(InputError, match="whole number"):
-        number("x", 2.0, kind=int)
 
 
 CODE = """

@@ -84,17 +84,6 @@ def test_window_chains_who_stays(recording: Recording) -> None:
     assert [problem.names[h] for h in problem.separator] == [f"c0@{s}" for s in range(17, 21)]
 
 
-@pytest.mark.parametrize("length", [1, 3])
-def test_all_runs_at_once_hold_each_run(recording: Recording, length: int) -> None:
-    batch = Problem.from_window(recording, 20, 0, length, run=None)
-    assert batch.batch == 3
-    for run in range(3):
-        single, picked = Problem.from_window(recording, 20, 0, length, run=run), batch.pick(run)
-        assert picked.batch is None
-        x = np.random.default_rng(run).normal(size=(len(single.names), 3)) * 30
-        assert picked.cost(x) == single.cost(x)
-
-
 def test_the_noise_model_sets_the_weights(recording: Recording) -> None:
     nominal = Problem.from_window(recording, 20, 0, 3)
     stated = Problem.from_window(recording, 20, 0, 3, noise=NoiseModel.nominal(S2))

@@ -78,13 +78,6 @@ def test_a_node_that_nothing_measures_is_found_free(lost: int) -> None:
 
 
 @pytest.mark.parametrize("problem", [star(), star(2), drive()], ids=["3d", "2d", "poses"])
-def test_the_digits_of_a_realisation_do_not_depend_on_the_others(problem: Problem) -> None:
-    many, one = solve_batch(problem), solve_batch(problem.pick(np.array([4])))
-    assert np.array_equal(many.x[4:5], one.x)
-    assert np.array_equal(many.covariance[4:5], one.covariance)
-
-
-@pytest.mark.parametrize("problem", [star(), star(2), drive()], ids=["3d", "2d", "poses"])
 def test_a_batch_ends_where_each_problem_ends_alone(problem: Problem) -> None:
     """Problems without realisations are solved in NumPy, by dense matrices or SciPy's sparse ones."""
     batch = solve_batch(problem)

@@ -30,21 +30,6 @@ from coopoc.study.tables import Table, pivot
 
 EVIL = "from pathlib import Path\nPath({mark!r}).write_text('ran')\n"
 SCRIPT = '<script>alert("1")</script>'
-IDS = {
-    "up": "../../x",
-    "absolute": "/tmp/x",
-    "folder": "a/b",
-    "windows": "a\\b",
-    "drive": "C:x",
-    "device": "CON",
-    "device with suffix": "nul.txt",
-    "dot": "..",
-    "nul": "a\0b",
-    "line": "a\nb",
-    "long": "a" * 300,
-    "direction": "a\u202eb",
-    "space": "a ",
-}
 
 
 def cell(p: Params) -> list[Row]:
@@ -111,37 +96,6 @@ def test_weights_run_no_code_that_their_card_names(evil: tuple[Path, Path], tmp_
     with pytest.raises(InputError, match=r"whose code does not run unless you name it.*load\(.*net="):
         load(tmp_path / "net.safetensors")
     assert not mark.exists()
-
-
-@pytest.mark.filterwarnings("ignore:.*has no checksum")
-@pytest.mark.parametrize("card", ["{", "3", "[" * 100_000, '{"kind": "gain_net", "net": {"<b>": 1}}'])
-def test_a_damaged_card_is_named(tmp_path: Path, card: str) -> None:
-    torch = pytest.importorskip("torch")
-    from safetensors.torch import save_file
-
-    from coopoc.learned.checkpoint import load
-
-    save_file({"w": torch.zeros(1)}, tmp_path / "net.safetensors", metadata={"card": card})
-    with pytest.raises(InputError, match="checkpoint"):
-        load(tmp_path / "net.safetensors")
-
-
-@pytest.mark.filterwarnings("ignore:.*has no checksum")
-def test_a_net_of_ones_own_is_loaded_when_the_caller_names_its_file(tmp_path: Path) -> None:
-    pytest.importorskip("torch")
-    from safetensors.torch import save_file
-
-    from coopoc.learned.checkpoint import load
-    from coopoc.learned.nets.gain_net import GainNet
-
-    (tmp_path / "mine.py").write_text("from coopoc.learned.nets.gain_net import GainNet as Net\n")
-    net = GainNet()
-    name = f"{tmp_path / 'mine.py'}:Net"
-    card = {"kind": name, "net": dict(net.settings)}
-    weights = {name: tensor.contiguous() for name, tensor in net.state_dict().items()}
-    save_file(weights, tmp_path / "net.safetensors", metadata={"card": json.dumps(card)})
-    found = load(tmp_path / "net.safetensors", net=name).model
-    assert all(bool((a == b).all()) for a, b in zip(found.parameters(), net.parameters(), strict=True))
 
 
 @pytest.mark.parametrize("words", [["reference"], ["report"], ["table"], ["compare"], ["merge", "--out", "all"]])

@@ -31,7 +31,7 @@ def test_every_study_has_a_finding_and_a_page_that_is_there() -> None:
         page, _, place = re.findall(r"\[\w+\]\(([\w.]+)(#?)([\w-]*)\)", study)[0]
         titles = re.findall(r"^#+ (.*)", (ROOT / "docs" / page).read_text(), flags=re.MULTILINE)
         assert not place or place in {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
-    assert len(studies) >= 17
+    assert len(studies) >= 14
 
 
 def test_every_method_has_a_row_of_its_own_in_the_overview() -> None:
@@ -76,3 +76,25 @@ def test_doctests_of_pages_are_fenced() -> None:
     finally:
         sys.path.pop(0)
     assert fenced("Words.\n\n>>> 1 + 1\n2") == "Words.\n\n```pycon\n>>> 1 + 1\n2\n```"
+
+
+def test_a_dead_link_of_a_tutorial_and_an_unknown_command_of_a_formula_fail_the_build() -> None:
+    pytest.importorskip("mkdocs")
+    code = """
+import types, pages
+tutorial = types.SimpleNamespace(file=types.SimpleNamespace(src_uri="tutorials/a.py"))
+print(pages.on_page_content('<a href="../learned.md#the-papers-net">', tutorial))
+print(pages.on_page_content('<span class="arithmatex">\\\\(\\\\arg\\\\min_x\\\\)</span>', tutorial).count("argmin"))
+formula = '<span class="arithmatex">\\\\(\\\\nowhere\\\\)</span>'
+wrong = ('<a href="../nowhere.md">', '<a href="../learned.md#nowhere">', formula)
+for text in wrong:
+    try:
+        print(pages.on_page_content(text, tutorial))
+    except pages.PluginError as error:
+        print("refused", error)
+"""
+    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "docs", capture_output=True, text=True, check=True)
+    lines = out.stdout.splitlines()
+    assert lines[0] == '<a href="../../learned/#the-papers-net">'
+    assert lines[1] == "1"
+    assert [line.split()[0] for line in lines[2:]] == ["refused"] * 3

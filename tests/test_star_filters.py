@@ -276,21 +276,3 @@ def test_the_laplacian_filter_equals_filterpy(formation: Fleet) -> None:
                 peer.x = first + peer.P @ weight @ (z - peer.H @ first)
             assert track.x[1, t, 0, c] == pytest.approx(peer.x[0], abs=1e-9)
             assert track.covariance[1, t, 0, c, c] == pytest.approx(peer.P[0, 0], rel=1e-9)
-
-
-def test_pseudo_fixes_are_fused_as_information(formation: Fleet) -> None:
-    """The first step in closed form: fix, and each neighbour's fix less the measurement, weighted by their
-    covariances."""
-    fleet = formation.select(range(4)).between(0, 2)
-    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
-    track = MSMV("nominal")(recording, [0])
-    assert track.covariance is not None
-    at = recording.links.of(0)[:3]
-    fixes, seen = recording.gnss[1, 0], recording.relative[1, at]
-    own = np.diag(np.square(S2.gnss_std))
-    weight = np.linalg.inv([own, *(own + vector_cov(seen, S2.relative_std, S2.min_range))])
-    positions = np.stack([fixes[0], *(fixes[recording.links.neighbour[at]] - to_vector(seen))])
-    cov = np.linalg.inv(np.eye(3) / 1e6 + weight.sum(axis=0))
-    x = fixes[0] + cov @ np.einsum("kij,kj->i", weight, positions - fixes[0])
-    assert track.x[1, 0, 0] == pytest.approx(x, abs=1e-9)
-    assert track.covariance[1, 0, 0] == pytest.approx(cov, rel=1e-9, abs=1e-12)

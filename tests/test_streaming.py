@@ -161,21 +161,6 @@ def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(start: Any,
         np.testing.assert_allclose(cov, theirs.P, atol=near)
 
 
-@pytest.mark.parametrize("name", ["identity", "nominal", "fitted", "okf", "joint", "edge"])
-def test_a_missing_fix_has_infinite_variance(name: str) -> None:
-    """Against filterpy's update with a variance of 1e18 m^2, whatever the fix."""
-    stream = STARTS[name]()
-    _, before = stream.step(Z, U, 0.1)
-    x, cov = stream.step([np.nan] * 3, U, 0.1)
-    theirs = peer(Z, FITTED)
-    theirs.P = before
-    theirs.predict(u=U, B=0.1 * np.eye(3), Q=cov - before)
-    theirs.update(Z + 1000.0, R=1e18 * np.eye(3))
-    np.testing.assert_allclose(x, theirs.x, atol=1e-9)
-    np.testing.assert_allclose(cov, theirs.P, atol=1e-9)
-    assert (np.diag(cov) > np.diag(before)).all()
-
-
 @pytest.mark.parametrize("name", STARTS)
 def test_a_long_step_is_two_short_ones(name: str) -> None:
     """Where motion is white noise of steps of 0.1 s."""

@@ -70,7 +70,6 @@ def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:
     captions = {view["name"]: view["caption"] for kind in ("tables", "figures") for view in shown[kind]}
     assert "bound is for the rms over runs" in captions["rt_le_nominal"]
     assert "bound" not in captions["nees"]
-    assert "lines: the best for the bytes" in captions["bytes"]
     assert "budget" not in captions
 
 

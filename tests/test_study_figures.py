@@ -1,12 +1,18 @@
 """Figures: the same bytes twice, one look per method, and what is drawn is what was measured."""
 
+import json
 from collections.abc import Callable
+from itertools import combinations
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
 import pytest
+from matplotlib.axes import Axes
+from matplotlib.colors import to_rgb
 
+from coopoc.plugins import find
 from coopoc.studies import error_cdf
 from coopoc.study import figures
 from coopoc.study.figures import Plot
@@ -114,7 +120,7 @@ def test_no_letter_of_the_legend_is_cut_off(results: Results, tmp_path: Path, su
 
 def test_a_front_joins_what_no_cheaper_method_beats(results: Results) -> None:
     axes = figures.pareto(results, "c", where={"method": ["joint", "gnss"]}).figure.axes[0]
-    level, marks, front = axes.lines
+    marks, front, level = axes.lines
     means = (
         results.frame.query("method == 'joint' and max_neighbours > 0").groupby("bytes_per_second")["rt_le_m"].mean()
     )
@@ -134,3 +140,70 @@ def test_curves_draw_numbers_of_their_selections(results: Results) -> None:
     np.testing.assert_allclose(joint.get_ydata(), expected.to_numpy())
     assert level.get_ydata()[0] == pytest.approx(results.select(GNSS)["rt_le_m"].mean())
     assert figures.curves(results, [panel], [{"method": "okf"}], "c") is None
+
+
+def from_reference(file: Path) -> Results:
+    """Results whose means and spread over runs are the committed ones: two egos that are alike, eight runs."""
+    known = json.loads(file.read_text())
+    points: dict[str, dict[str, Any]] = {}
+    for number in known["numbers"]:
+        point = points.setdefault(json.dumps(number["where"]), dict(number["where"]))
+        point[number["metric"]] = (number["value"], number["run_std"])
+    rows = [
+        {k: v[0] + (-1) ** run * v[1] if isinstance(v, tuple) else v for k, v in {"train_seed": None, **point}.items()}
+        | {name: 100.0 * point.get("max_neighbours", 0) for name in ("bytes_per_second", "payload_bytes_per_second")}
+        | {"ego": ego, "run": run}
+        for point in points.values()
+        for ego in ("a", "b")
+        for run in range(8 if point["rt_le_m"][1] else 1)
+    ]
+    axes = tuple(known["numbers"][0]["where"])
+    return Results(known["study"], "?", axes, known["settings"], pd.DataFrame(rows), pd.DataFrame(), 0, {})
+
+
+FILES = sorted((Path(__file__).resolve().parents[1] / "studies" / "reference").glob("*.json"))
+
+
+@pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
+def test_no_figure_of_the_gallery_hides_a_line_or_shows_one_below_its_bound(file: Path) -> None:
+    results, lines_seen = from_reference(file), 0
+    for view in find("coopoc.studies", file.stem).figures.values():
+        plot = view(results) if "round" not in results.axes else None
+        for panel in plot.figure.axes if plot is not None else ():
+            panel.figure.draw_without_rendering()
+            texts = [text.get_text() for text in panel.texts]
+            lines = [line for line in panel.lines if len(line.get_xdata()) > 1 and line.get_linestyle() != "None"]
+            bounds = [line for line in lines if line.get_color() == "black" and line.get_linestyle() == "--"]
+            lines_seen += len(lines)
+            for first, second in combinations(
+                [
+                    line
+                    for line in lines
+                    if line.get_linestyle() not in ("--", ":") or line.get_marker() not in ("", "None")
+                ],
+                2,
+            ):
+                if first.get_color() != second.get_color() and list(first.get_xdata()) == list(second.get_xdata()):
+                    a, b = (panel.transData.transform(line.get_xydata())[:, 1] for line in (first, second))
+                    apart = np.abs(a - b).max() * 72 / panel.figure.dpi > first.get_linewidth() / 2
+                    assert apart or any(" = " in text for text in texts), (first.get_color(), second.get_color())
+            for bound in bounds:
+                below = dict(zip(bound.get_xdata(), bound.get_ydata(), strict=True))
+                for line in lines:
+                    for x, y in zip(line.get_xdata(), line.get_ydata(), strict=True):
+                        top = max([y, *_tops(panel, line, x)])
+                        assert x not in below or top > below[x] * (1 - SAMPLED), (panel.get_title(), x, y, below[x])
+    assert lines_seen or file.stem in WITHOUT_LINES
+
+
+SAMPLED = 0.02
+"""Share below a bound that the noise of some twenty runs explains."""
+WITHOUT_LINES = ("aggregation", "budget", "consistency", "convergence", "error_cdf", "learned_gains")
+"""Studies whose figures show points, or numbers that are no reference values."""
+
+
+def _tops(panel: Axes, line: Any, x: float) -> list[float]:
+    """Upper ends of the bands of a line's colour at a place."""
+    bands = [c for c in panel.collections if tuple(c.get_facecolor()[0][:3]) == to_rgb(line.get_color())]
+    corners = np.concatenate([path.vertices for band in bands for path in band.get_paths()] or [np.empty((0, 2))])
+    return list(corners[np.isclose(corners[:, 0], x), 1])

@@ -17,8 +17,6 @@ from coopoc.study.results import Results
 from coopoc.study.run import plan, run_study
 from coopoc.study.study import Cell, Study
 
-FORMS = ("md", "csv", "tex", "html")
-
 
 def manifest(study: Study) -> Manifest:
     cells = {cell.name: cell.params for cell in study.cells()}

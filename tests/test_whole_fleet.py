@@ -25,7 +25,6 @@ from coopoc.world.v2x import Message
 
 S2 = Sensors.paper_scenario2()
 SPEED = replace(S2, velocity_reading="speed")
-KNOWN = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.05), gnss_std=(3.0, 3.5, 4.0))
 LINEAR = NoiseModel("unit", None, process_std=(0.3, 0.4, 0.2), gnss_std=(2.0, 1.0, 3.0))
 """Relative vectors of unit covariance: all methods are then linear, and numpy.linalg.lstsq says what is right."""
 
@@ -79,38 +78,6 @@ def test_the_linearised_measurement_is_the_spherical_measurement(distance: float
     cov = np.linalg.inv(np.reshape(weight, (3, 3)))
     assert cov == pytest.approx(vector_cov(relative, S2.relative_std, S2.min_range), rel=1e-9)
     assert eta == pytest.approx(np.zeros(3), abs=1e-9)
-
-
-@pytest.mark.parametrize("fleet", ["whole", "gappy"])
-def test_linear_smoother_and_filter_equal_the_dense_least_squares(fleet: str, crossing: Fleet) -> None:
-    """Independent check: numpy.linalg.lstsq of the whole drive and of the drive up to a step, covariances too."""
-    drive = crossing.select(range(5)).between(0, 14)
-    recording = observe(coming_and_going(drive) if fleet == "gappy" else drive, S2, V2X(max_neighbours=3), seed=5)
-    smooth, filtered = BatchSmoother(LINEAR)(recording, [0, 1]), CentralFilter(LINEAR)(recording, [0, 1])
-    assert smooth.covariance is not None
-    assert filtered.covariance is not None
-    index, x, cov = dense(recording, LINEAR, dict.fromkeys(range(5), 13))
-    for e, ego in enumerate((0, 1)):
-        for t in (0, 5, 8, 13):
-            assert smooth.x[0, t, e] == pytest.approx(x[index[t, ego]], abs=1e-8)
-            assert smooth.covariance[0, t, e] == pytest.approx(block(cov, index[t, ego]), abs=1e-9)
-    for t in (0, 5, 9, 13):
-        index, x, cov = dense(recording, LINEAR, dict.fromkeys(range(5), t))
-        assert filtered.x[0, t, 0] == pytest.approx(x[index[t, 0]], abs=1e-8)
-        assert filtered.covariance[0, t, 0] == pytest.approx(block(cov, index[t, 0]), abs=1e-9)
-
-
-def test_a_late_answer_is_taken_up_by_the_own_filter(crossing: Fleet) -> None:
-    """Independent check: lstsq of the fleet up to step t - 3 and of the ego alone up to t."""
-    drive = crossing.select(range(4)).between(0, 12)
-    late = observe(drive, S2, V2X(max_neighbours=3, latency=0.3))
-    track = CentralFilter(LINEAR)(late, [2])
-    assert track.covariance is not None
-    for t in (4, 11):
-        index, x, cov = dense(late, LINEAR, {0: t - 3, 1: t - 3, 2: t, 3: t - 3})
-        assert track.x[0, t, 0] == pytest.approx(x[index[t, 2]], abs=1e-8)
-        assert track.covariance[0, t, 0] == pytest.approx(block(cov, index[t, 2]), abs=1e-9)
-    assert track.x[:, :3] == pytest.approx(Kalman(LINEAR)(late, [2]).x[:, :3])
 
 
 CHAIN = standing([[20.0 * i, 3.0 * (i % 2), 0.5 * i] for i in range(5)])
@@ -308,20 +275,3 @@ def test_who_hardly_moves_does_not_drown_the_rest(least: float, crossing: Fleet)
         gtol=1e-14,
     )
     assert np.abs(track.x[0] - best.x.reshape(8, 3)).max() < max(1e-5, 30 * least)
-
-
-@pytest.mark.parametrize("method", [GaussianBeliefPropagation("identity"), ConsensusADMM("identity", rounds=200)])
-def test_two_vehicles_reach_the_least_squares_solution(method, crossing: Fleet) -> None:
-    """The first step of a pair is a linear problem of two fixes and two relative measurements: numpy.linalg.lstsq."""
-    recording = observe(crossing.select(["c0", "c3"]).between(0, 2), S2, V2X(max_neighbours=1, radius=200.0))
-    first = recording.links.step == 0
-    ahead = to_vector(recording.relative[0, first]) * np.where(recording.links.observer[first] == 0, 1.0, -1.0)[:, None]
-    rows = np.array([[1.0, 0.0], [0.0, 1.0], [-1.0, 1.0], [-1.0, 1.0]])
-    right = np.concatenate([recording.gnss[0, 0], ahead])
-    best = np.linalg.lstsq(rows, right, rcond=None)[0]
-    track = method(recording, [0, 1])
-    assert track.x[0, 0] == pytest.approx(best, abs=1e-9)
-    if track.notes[0].startswith("GBP"):
-        assert track.covariance is not None
-        wanted = np.linalg.inv(rows.T @ rows)[0, 0] * np.eye(3)
-        assert track.covariance[0, 0, 0] == pytest.approx(wanted, abs=1e-12)

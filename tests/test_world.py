@@ -13,7 +13,7 @@ from scipy.spatial.distance import cdist
 from coopoc import V2X, Fleet, InputError, Sensors, channel_load, observe
 from coopoc.world.channels import lost
 from coopoc.world.inbox import inbox
-from coopoc.world.links import spherical, to_vector, vector_cov
+from coopoc.world.links import to_vector, vector_cov
 from coopoc.world.sensors import stream
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
@@ -132,11 +132,6 @@ def test_links_are_the_nearest_within_the_radius(crossing: Fleet) -> None:
             assert recording.neighbours(observer)[step] == len(expected)
 
 
-def test_spherical_there_and_back() -> None:
-    vector = np.random.default_rng(0).normal(0, 10, (50, 3))
-    assert to_vector(np.stack(spherical(*vector.T), axis=-1)) == pytest.approx(vector)
-
-
 def test_vector_cov_against_sampling() -> None:
     """Independent check: the sample covariance of converted draws (small angles, so that first order holds)."""
     relative, std = np.array([25.0, 0.7, 1.3]), np.array([0.3, 0.01, 0.02])
@@ -175,31 +170,6 @@ def test_loss_delay_rate_and_cap_act_on_messages(formation: Fleet) -> None:
     received = [capped.fresh[0, cap.links.neighbour[capped.link] == j].mean() for j in np.unique(cap.links.neighbour)]
     assert max(received) > 0.9  # the nearest is heard, the farthest pays
     assert min(received) < 0.1
-
-
-def test_a_fix_is_fresh_once(crossing: Fleet) -> None:
-    recording = observe(crossing, S2, V2X(max_neighbours=4, rate=3.0, latency=0.1, loss=0.2), runs=4, observers=[0])
-    box = inbox(recording, 0, FIX_AND_VELOCITY)
-    for run in range(4):
-        used = [
-            (recording.links.neighbour[k], s)
-            for k, s, f in zip(box.link, box.newest[run], box.fresh[run], strict=True)
-            if f
-        ]
-        assert len(used) == len(set(used))
-
-
-def test_any_step_will_do(crossing: Fleet) -> None:
-    """By default everybody broadcasts at every step, however long a step is."""
-    slow = Fleet(crossing.ids, crossing.t * 5, crossing.position, crossing.velocity)
-    assert observe(slow, S2, V2X(max_neighbours=2)).broadcasts.all()
-    with pytest.raises(InputError, match="seed = -1"):
-        observe(slow, S2, seed=-1)
-
-
-def test_rate_above_the_step_is_refused(crossing: Fleet) -> None:
-    with pytest.raises(InputError, match="rate = 20"):
-        observe(crossing, S2, V2X(rate=20.0))
 
 
 def test_recording_holds_no_truth(crossing: Fleet) -> None:

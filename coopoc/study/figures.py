@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -13,7 +13,7 @@ from ..errors import InputError
 from ..escapes import picture
 from ..evaluate.statistics import Interval
 from .numbers import Number, Where, interval, mean, ran
-from .plot import Plot, canvas, legend, plain_log, strokes
+from .plot import Plot, canvas, legend, name_of, plain_log, strokes
 from .style import NEUTRAL, Panel, look, words
 
 if TYPE_CHECKING:
@@ -70,23 +70,31 @@ def pareto(
     names = _line_names(results)
     summary = results.summary(axes := [a for a in results.axes if a != "train_seed"], y, where)
     summary["bytes"] = results.summary(axes, x, where)["mean"]
-    drawn = []
+    marks, levels = list[tuple[Where, Any]](), list[tuple[Where, Any]]()
+    for key, group in summary.dropna(subset=["mean"]).groupby(names, sort=False):
+        of = dict(zip(names, key, strict=True))
+        points = sorted(zip(group["bytes"], group["mean"], strict=True))
+        alone = points[-1][0] == 0 or of["method"] == "bound"
+        (levels if alone else marks).append((of, min(value for _, value in points) if alone else points))
+    shown = [("", levels)]
+    flat = _coinciding(shown, True, WIDTH * _height([*shown, ("", [(of, dict(points)) for of, points in marks])], True))
     with canvas(width=7.0) as (figure, panel):
-        for key, group in summary.dropna(subset=["mean"]).groupby(names, sort=False):
-            of = dict(zip(names, key, strict=True))
-            points = sorted(zip(group["bytes"], group["mean"], strict=True))
-            if points[-1][0] == 0 or of["method"] == "bound":
-                _draw(panel, of, min(value for _, value in points))
-            else:
-                sent = [point for point in points if point[0] > 0]
-                panel.plot(*zip(*sent, strict=True), **{**strokes(of), "linestyle": "none"})
-                best = [p for k, p in enumerate(sent) if all(p[1] < other[1] for other in sent[:k])]
-                panel.plot(*zip(*best, strict=True), **{**strokes(of), "marker": "", "linewidth": 0.8})
-            drawn.append(of)
+        for of, points in marks:
+            sent = [point for point in points if point[0] > 0]
+            panel.plot(*zip(*sent, strict=True), **{**strokes(of), "linestyle": "none"})
+            best = [p for k, p in enumerate(sent) if all(p[1] < other[1] for other in sent[:k])]
+            panel.plot(*zip(*best, strict=True), **{**strokes(of), "marker": "", "linewidth": 0.8})
+        for group in flat:
+            _draw(panel, group[0], next(value for of, value in levels if of is group[0]))
         plain_log(panel.xaxis)
         plain_log(panel.yaxis)
         panel.set(xlabel=words(x), ylabel=words(y))
-        legend(panel, drawn)
+        also = {
+            name_of(group[0]): f" ({group[0].get('noise_model')}{_joined(group).removeprefix(_joined(group[:1]))})"
+            for group in flat
+            if len(group) > 1
+        }
+        legend(panel, [*(of for of, _ in marks), *(group[0] for group in flat)], also)
     return Plot(figure, caption)
 
 
@@ -138,16 +146,30 @@ def curves(
             shown.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
     if not any(drawn for _, drawn in shown):
         return None
-    named: list[dict[str, Any]] = []
+    height_of = _height(shown, log)
+    groups = {id(group[0]): group for group in _coinciding(shown, log, NEAR * height_of)}
     size = {"width": width or 2.2 + 2.1 * len(shown) + (len(shown) == 1), "height": height}
     with canvas(1, len(shown), sharey=True, squeeze=False, **size) as (figure, (axes,)):
+        named, also = list[dict[str, Any]](), dict[str, str]()
         for axis, (panel, drawn) in zip(axes, shown, strict=True):
             for of, points in drawn:
+                if id(of) not in groups:
+                    continue
                 names = {name: of[name] for name in ("method", "noise_model") if name in of}
                 if len(models) < 2 and of.get("method") != "bound":
                     names["noise_model"] = "none"
-                _draw(axis, names, points, {name: of[name] for name in STYLE if name in of})
+                text = _joined(groups[id(of)], models)
+                style = {name: of[name] for name in STYLE if name in of}
+                _draw(axis, names, points, {**style, "label": text} if "label" in of else style)
                 named += [names] if names not in named else []
+                also[name_of(names)] = text.removeprefix(_joined([of]))
+            for group in _coinciding([(panel, drawn)], log, WIDTH * height_of):
+                leaders = [of for of in group if id(of) in groups]
+                points = next(points for of, points in drawn if of is group[0])
+                if len(leaders) > 1 and isinstance(points, Mapping):
+                    x, y = list(points.items())[-1]
+                    below = {"xytext": (0, 5), "textcoords": "offset points", "ha": "right", "fontsize": 7}
+                    axis.annotate(_joined(leaders), (x, _mean(y)), **below)
             axis.set(title=picture(panel.title), xlabel=panel.xlabel)
             if logx:
                 plain_log(axis.xaxis)
@@ -158,8 +180,52 @@ def curves(
         if any("label" in of for of in every):
             axes[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
         else:
-            legend(axes[-1], named)
+            legend(axes[-1], named, also)
     return Plot(figure, caption)
+
+
+NEAR, WIDTH = 0.015, 0.009
+"""Shares of the height of a panel: within the first, lines are drawn and named as one if they are so in every panel;
+within the second, a line's width, they are named together in a panel."""
+
+
+def _coinciding(shown: Sequence[Any], log: bool, near: float) -> list[list[Where]]:
+    """Lines, each with those that lie near it at every point of every panel; a bound stands alone."""
+    lines: dict[int, tuple[Where, dict[Any, float]]] = {}
+    for panel, (_, drawn) in enumerate(shown):
+        for of, points in drawn:
+            values = points if isinstance(points, Mapping) else {"": points}
+            heights = {(panel, x): np.log(_mean(v)) if log else _mean(v) for x, v in values.items()}
+            lines.setdefault(id(of), (of, {}))[1].update(heights)
+    groups: list[list[Where]] = []
+    for of, heights in lines.values():
+        for group in groups:
+            other = lines[id(group[0])][1]
+            same = heights.keys() == other.keys() and all(abs(heights[at] - y) <= near for at, y in other.items())
+            if same and "bound" not in (of.get("method"), group[0].get("method")):
+                group.append(of)
+                break
+        else:
+            groups.append([of])
+    return groups
+
+
+def _height(shown: Sequence[Any], log: bool) -> float:
+    """What the lines of all panels span, from zero or in the logarithm."""
+    points = [points if isinstance(points, Mapping) else {"": points} for _, drawn in shown for _, points in drawn]
+    values = [_mean(value) for each in points for value in each.values()]
+    return float(np.log(max(values) / min(values))) if log else max(values)
+
+
+def _joined(lines: Sequence[Where], models: Collection[str] = ()) -> str:
+    """Labels of lines that are drawn as one: what they begin with once, their noise models where there are several."""
+    first, *others = (str(of.get("label") or look(name_of(of)).label) for of in lines)
+    start = first[: first.rfind(" ") + 1]
+    if start and all(other.startswith(start) for other in others):
+        return ", ".join([first, *(other.removeprefix(start) for other in others)])
+    named = [str(of.get("noise_model")) for of in lines[1:]]
+    shown = [f"{n}, {m}" if len(models) > 1 and m in models else n for n, m in zip(others, named, strict=True)]
+    return " = ".join([first, *shown])
 
 
 def multiples(
@@ -185,7 +251,9 @@ def multiples(
     size = {"width": 1.9 + 1.75 * len(cases), "height": 0.9 + 0.21 * len(rows)}
     with canvas(1, len(cases), sharex=True, sharey=True, squeeze=False, **size) as (figure, (axes,)):
         for panel, case in zip(axes, cases, strict=True):
-            panel.axvspan(1.0, (target or {}).get(case, 1.0), color=NEUTRAL, alpha=0.35, linewidth=0)
+            if case in (target or {}):
+                panel.axvspan(1.0, target[case], color=NEUTRAL, alpha=0.35, linewidth=0, label="target")
+                panel.legend(loc="lower right")
             panel.axvline(1.0, color="black", linewidth=0.9)
             for row, ((method, _), each) in enumerate(rows.items()):
                 values = each.get(case, ())
@@ -204,20 +272,21 @@ def _line_names(results: Results, *across: str) -> list[str]:
     return usual if "method" in usual else [name for name in results.axes if name not in across]
 
 
-def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> bool:
-    """Draw a line through points, an Interval with its band, or a number across the panel; False without a number."""
+def _mean(point: Any) -> float:
+    return float(point.mean if isinstance(point, Interval) else point)
+
+
+def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> None:
+    """Draw a line through points, an Interval with its band, or a number across the panel."""
     options = {**strokes(names), **(style or {})}
     if not isinstance(points, Mapping):
-        value = points.mean if isinstance(points, Interval) else points
-        axes.axhline(value, **{**options, "marker": ""})
-        return True
-    means = {x: point.mean if isinstance(point, Interval) else point for x, point in points.items()}
+        axes.axhline(_mean(points), **{**options, "marker": ""})
+        return
     bands = {x: point for x, point in points.items() if isinstance(point, Interval)}
-    axes.plot(list(means), list(means.values()), **options)
+    axes.plot(list(points), list(map(_mean, points.values())), **options)
     if bands:
         ends = [point.low for point in bands.values()], [point.high for point in bands.values()]
         axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0)
-    return bool(means)
 
 
 def _vertical(axes: Axes, text: str, log: bool) -> None:

@@ -45,6 +45,7 @@ def report(
     lead: Sequence[str] = (),
     answers: Mapping[str, str] | None = None,
     cards: Mapping[str, Mapping[str, Any]] | None = None,
+    first: str = "",
 ) -> Path:
     """Write one page that shows several studies, and return its path.
 
@@ -55,6 +56,7 @@ def report(
         lead: sentences under the title, before the first study.
         answers: question -> answer, shown after the lead; default each study's question with its first finding.
         cards: name of a data set -> field -> value.
+        first: study whose first figure opens the page; default the first that has one.
 
     Raises:
         InputError: no folder, a folder that holds no study, two studies of one name, or an `out` that is a folder.
@@ -66,12 +68,13 @@ def report(
     names = [section["name"] for section in sections]
     if not sections or len(set(names)) < len(names):
         raise InputError("folders", names, "must be at least one, of different studies", "Give coopoc report FOLDER.")
-    first = next(({**s["figures"][0][0], "section": s["name"]} for s in sections if s["figures"]), None)
+    opening = [{**s["figures"][0][0], "section": s["name"]} for s in sections if s["figures"]]
+    opening.sort(key=lambda figure: figure["section"] != first)
     page = _template().render(
         title=title or f"coopoc: {', '.join(section['title'] for section in sections)}",
         lead=lead,
         answers=answers or {s["question"]: next(iter(s["findings"].values())) for s in sections if s["findings"]},
-        first=first if len(sections) > 1 else None,
+        first=opening[0] if opening and len(sections) > 1 else None,
         sections=sections,
         cards=cards or {},
         environment=environments([section["environment"] for section in sections]),

@@ -86,5 +86,6 @@ def pairs(ax: Axes, first: Floats, second: Floats, color: str = PALE, label: str
 
     lines = np.stack([first, second], axis=1)
     lines = lines[np.isfinite(lines).all(axis=(1, 2))]
-    ax.add_collection(LineCollection(list(lines), colors=color, linewidths=0.9, zorder=2.5, label=label))
+    dense = float(np.clip(np.sqrt(300 / max(len(lines), 1)), 0.08, 1.0))  # of thousands each is nearly transparent
+    ax.add_collection(LineCollection(list(lines), colors=color, linewidths=0.9, alpha=dense, zorder=2.5, label=label))
     ax.autoscale_view()

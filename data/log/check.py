@@ -1,4 +1,4 @@
-"""Does a log make sense? Innovation statistics of a filter of each vehicle alone, and sentences on what looks wrong."""
+"""Innovation and residual statistics of a log against a filter of each vehicle; sentences on what is implausible."""
 
 from __future__ import annotations
 
@@ -306,7 +306,7 @@ def _measurements(c: Check) -> list[dict[str, Any]]:
         row: dict[str, Any] = {"measurement": name, "unit": unit, "number": len(residual), "median": median}
         row |= {"robust_std": std, "stated_std": float(c.world.sensors.relative_std[k])}
         row["expected_std"] = float(np.sqrt(np.mean(c.expected[there, k] ** 2)))
-        rows.append(row | {"beyond_5_std": float(np.mean(np.abs(residual - median) > 5 * max(std, 1e-12)))})
+        rows.append(row | {"beyond_5_std": _outliers(c, k, row["stated_std"])})
     return rows
 
 
@@ -420,7 +420,7 @@ def _of_measurements(c: Check) -> list[str]:
             true = measured - c.relative[:, 0]
             ratio = (measured / true)[true > FAR * position]
             wrong |= len(ratio) >= ENOUGH and not 0.8 <= float(np.median(ratio)) <= 1.25
-        outliers, offsets = _outliers(c, k, row["stated_std"]), _offsets(c, k, row["stated_std"])
+        outliers, offsets = row["beyond_5_std"], _offsets(c, k, row["stated_std"])
         if outliers > OUTLIERS:
             sentences.append(
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
@@ -468,8 +468,9 @@ def _outliers(c: Check, k: int, stated: float) -> float:
 def _offsets(c: Check, k: int, stated: float) -> list[tuple[str, float]]:
     """Pairs whose residuals have a median above the stated standard deviation, and above what the errors of the filters
     explain, which last for some time; largest first."""
-    made, fixes = [], np.isfinite(c.normalised).sum(axis=0)
-    variance, noise = np.nanmean(c.variance[..., :2], axis=(0, 2)), float(np.square(c.world.sensors.fix_std[:2]).mean())
+    made, fixes, noise = [], np.isfinite(c.normalised).sum(axis=0), float(np.square(c.world.sensors.fix_std[:2]).mean())
+    there = np.isfinite(c.variance[..., 0]).sum(axis=0)
+    variance = np.nansum(c.variance[..., :2], axis=(0, 2)) / np.maximum(2 * there, 1)
     share = 2 * np.nanmax((variance + noise) / np.maximum(variance * fixes, 1e-12), where=variance > 0, initial=0.0)
     for pair, value, expected in _by_pair(c, k):
         (offset, error), position = _median(value), max(float(np.mean(expected**2)) - stated**2, 0.0)

@@ -1,4 +1,4 @@
-"""Rows of a log on one clock, in SI units and one local frame; and the noise that they state."""
+"""Clock offsets, SI units and the local east-north-up frame of a log's rows; the sensor noise that they state."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Relative measurements and messages of a log as links of a Recording, each at the nearest step to its time."""
+"""Association of relative measurements and messages of a log with steps and pairs: the links of a Recording."""
 
 from __future__ import annotations
 

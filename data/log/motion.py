@@ -1,4 +1,4 @@
-"""One member of a log on the steps of a Recording: fixes, velocity or speed and yaw rate, heading, when it is there."""
+"""Resampling of one member of a log to steps: fixes, velocity or speed and yaw rate, heading, presence."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The picture of a log: where everything drove, and how innovations compare with theory."""
+"""Plot of a log: paths, and the histogram of normalised innovations beside chi-squared."""
 
 from __future__ import annotations
 

@@ -33,11 +33,13 @@ from .tables import is_log_table, read_log_table
 from .units import Rows, Summary, distinct, in_group
 
 Frame = Literal["world", "body"]
+DATED, DAY = 1e8, 86400.0
+"""s: times above are since 1970; a day."""
 LONGEST, PAIR = 1.0, ("vehicle", "partner")
 """s, of a step that is not given; what names a pair."""
 READERS: Mapping[str, Callable[..., Rows]] = {
     **dict.fromkeys(TABLES, read_log_table),
-    **dict.fromkeys((".nmea", ".nme"), read_nmea),
+    **dict.fromkeys((".nmea", ".nme", ".gga"), read_nmea),
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
 }
 """Ending of a file -> (path, summary, *, columns, kinds, ignore) -> its rows. A new format is one more entry."""
@@ -313,6 +315,8 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
         allowed = f"must name vehicles of the log: {', '.join(ids)}"
         field = f"{rows['file'].iloc[0]}: column vehicle"
         raise InputError(field, ", ".join(vehicles), allowed, "Rename them, or leave the truth out.")
+    if start > DATED and rows["t"].max() < 2 * DAY:  # sentences of NMEA without a date are of the day of the log
+        rows = rows.assign(t=rows["t"] + DAY * round((float(recording.t.mean()) - rows["t"].mean()) / DAY))
     axes = 3 if (rows["kind"] == "z").any() else 2
     poses = np.full((len(recording.t), len(ids), 4), np.nan)
     for column, vehicle in enumerate(ids):
@@ -327,6 +331,10 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
             elif len(t) and not first:
                 out[:] = value[0]
     position, angle = poses[..., :3], poses[..., 3]
+    if not np.isfinite(position).any():
+        given = f"{rows['t'].min():.10g} to {rows['t'].max():.10g} s"
+        allowed = f"must overlap the log, from {start:.10g} to {recording.t[-1]:.10g} s"
+        raise InputError(f"{rows['file'].iloc[0]}: column t", given, allowed, "Does its clock or its date differ?")
     there = np.pad(np.isfinite(position[..., 0]), ((1, 1), (0, 0)))
     position[~(there[2:] | there[:-2])] = np.nan
     velocity = backward_difference(recording.t, position, ids)

@@ -29,24 +29,24 @@ class _Guard:
     """Notes what is written outside of a folder or run, while it is on; an audit hook cannot be removed."""
 
     def __init__(self) -> None:
-        self.folder, self.seen = "", list[str]()
+        self.folder, self.events = "", list[str]()
         sys.addaudithook(self.notice)
 
     def notice(self, event: str, given: tuple[Any, ...]) -> None:
         if not self.folder:
             return
         if event in FORBIDDEN:
-            self.seen.append(event)
+            self.events.append(event)
         elif event in ("open", "os.remove", "os.rename", "os.mkdir"):
             reads = event == "open" and not (isinstance(given[1], str) and set(given[1]) & set("wxa+"))
             if not (reads or isinstance(given[0], int) or str(given[0]).startswith(self.folder)):
-                self.seen.append(f"{event} {given[0]!r}")
+                self.events.append(f"{event} {given[0]!r}")
 
     @contextmanager
     def on(self, folder: Path) -> Iterator[list[str]]:
-        self.folder, self.seen = str(folder), []
+        self.folder, self.events = str(folder), []
         try:
-            yield self.seen
+            yield self.events
         finally:
             self.folder = ""
 
@@ -64,8 +64,8 @@ def verdict(reader: Reader, text: bytes, folder: Path) -> str:
         text: as `readers.packed` makes one.
         folder: empty, or with the files of another call, which are removed.
     """
-    found = _tried(reader, text, folder)
-    return found and _tried(reader, text, folder)  # a fault shows twice; a first call may compile and load kernels
+    fault = _tried(reader, text, folder)
+    return fault and _tried(reader, text, folder)  # a fault shows twice; a first call may compile and load kernels
 
 
 def _tried(reader: Reader, text: bytes, folder: Path) -> str:
@@ -78,7 +78,7 @@ def _tried(reader: Reader, text: bytes, folder: Path) -> str:
     for name, content in files.items():
         (folder / name).write_bytes(content)
     before, began = _peak(), time.process_time()
-    with warnings.catch_warnings(), _guard().on(folder) as seen:
+    with warnings.catch_warnings(), _guard().on(folder) as events:
         warnings.simplefilter("error")
         try:
             reader.read(folder)
@@ -92,7 +92,7 @@ def _tried(reader: Reader, text: bytes, folder: Path) -> str:
         return f"slow: {took:.1f} s"
     if (more := _peak() - before) > FREE + MEMORY * len(text):
         return f"memory: {more >> 20} MB"
-    return f"not allowed: {seen[0]}" if seen else ""
+    return f"not allowed: {events[0]}" if events else ""
 
 
 def _peak() -> int:

@@ -9,7 +9,7 @@ def batch_smoother(drive, x, steps=40):  # type: ignore[no-untyped-def]
     """Positions (T, N, 3) from a start of that shape, and covariances (T, N, 3, 3), of one run."""
     index = {key: 3 * k for k, key in enumerate((t, n) for t in range(drive.steps) for n in drive.here(t))}
     x, size, eye = x.copy(), 3 * len(index), np.eye(3)
-    for _ in range(steps if drive.known.sensors else 1):
+    for _ in range(steps if drive.noise_model.sensors else 1):
         A, b = np.zeros((size, size)), np.zeros(size)
 
         def add(terms, W, w, A=A, b=b):  # type: ignore[no-untyped-def]
@@ -30,7 +30,7 @@ def batch_smoother(drive, x, steps=40):  # type: ignore[no-untyped-def]
                 add([((t, n), 1.0), ((t - 1, n), -1.0)], W, W @ gap)
         for t in range(drive.steps):
             for k, i, j in drive.pairs(t):
-                W, w = drive.factor(k, x[t, j] - x[t, i], drive.known.sensors is None)
+                W, w = drive.factor(k, x[t, j] - x[t, i], drive.noise_model.sensors is None)
                 add([((t, j), 1.0), ((t, i), -1.0)], W, w)
         move = np.linalg.solve(A, b)
         for (t, n), at in index.items():

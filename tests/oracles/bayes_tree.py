@@ -57,9 +57,9 @@ def _groups(J: Any, dof: int) -> list[tuple[int, Any, Floats]]:
     blocks = np.zeros((int(first.sum()), dof))
     blocks[where, matrix.indices % dof] = matrix.data
     nodes, owner = node[first], row[first]
-    found = []
+    factors = []
     for count in (1, 2):
         picked = arity[owner] == count
         if picked.any():
-            found.append((1, nodes[picked].reshape(-1, count), blocks[picked].reshape(-1, count, 1, dof)))
-    return found
+            factors.append((1, nodes[picked].reshape(-1, count), blocks[picked].reshape(-1, count, 1, dof)))
+    return factors

@@ -15,8 +15,8 @@ def gbp(drive, rounds, damping=0.0):  # type: ignore[no-untyped-def]
     own = P[0].copy()
     for t in range(drive.steps):
         for n in drive.here(t):
-            one = drive.solo(t, n, x[t - 1, n], own[n]) if drive.stays(t, n) else drive.start(t, n)
-            x[t, n], own[n] = one
+            estimate = drive.solo(t, n, x[t - 1, n], own[n]) if drive.stays(t, n) else drive.start(t, n)
+            x[t, n], own[n] = estimate
         factors = [
             (i, j, *drive.factor_at_agreement(k, x[t, j] - x[t, i], own[i] + own[j])) for k, i, j in drive.pairs(t)
         ]

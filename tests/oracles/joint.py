@@ -15,65 +15,65 @@ from coopoc.world.links import spherical, to_vector, wrap
 from oracles.messages import Member
 
 
-def follow(stars: list[list[Member]], known: NoiseModel, exact: bool) -> tuple[Floats, Floats, list[Floats]]:
+def follow(stars: list[list[Member]], noise_model: NoiseModel, exact: bool) -> tuple[Floats, Floats, list[Floats]]:
     """x (T, 3), covariance (T, 3, 3) and the neighbours (k, 3) at each step."""
-    x, p, found = np.zeros((0, 3)), np.zeros((0, 0)), []
+    x, p, estimates = np.zeros((0, 3)), np.zeros((0, 0)), []
     for star in stars:
         x, p = predict(x, p, star)
-        x, p = update(x, p, star, known, exact)
-        found.append((x, p[:3, :3]))
-    return np.array([x[0] for x, _ in found]), np.array([p for _, p in found]), [x[1:] for x, _ in found]
+        x, p = update(x, p, star, noise_model, exact)
+        estimates.append((x, p[:3, :3]))
+    return np.array([x[0] for x, _ in estimates]), np.array([p for _, p in estimates]), [x[1:] for x, _ in estimates]
 
 
 def predict(x: Floats, p: Floats, star: list[Member]) -> tuple[Floats, Floats]:
     """Members that stay move; a member that joins is where the ego measures it, with a flat prior."""
     n, m = len(star), len(x)
     new = np.zeros((n, 3))
-    q = np.concatenate([np.full(3, FORGOTTEN) if one.before is None else one.process for one in star])
+    q = np.concatenate([np.full(3, FORGOTTEN) if member.before is None else member.process for member in star])
     pick = np.zeros((3 * n, 3 * m))
-    for k, one in enumerate(star):
-        if one.before is not None:
-            pick[3 * k : 3 * k + 3, 3 * one.before : 3 * one.before + 3] = np.eye(3)
-            new[k] = x[one.before] + one.moved
+    for k, member in enumerate(star):
+        if member.before is not None:
+            pick[3 * k : 3 * k + 3, 3 * member.before : 3 * member.before + 3] = np.eye(3)
+            new[k] = x[member.before] + member.moved
         else:
-            new[k] = one.position if k == 0 else first_place(one, new[0])
+            new[k] = member.position if k == 0 else first_place(member, new[0])
     return new, pick @ p @ pick.T + np.diag(q)
 
 
-def first_place(one: Member, ego: Floats) -> Floats:
+def first_place(member: Member, ego: Floats) -> Floats:
     """As measured; if a component is missing, as broadcast; without a fix somewhere near."""
-    if np.isfinite(one.relative).all():
-        return ego + to_vector(one.relative)
-    if one.new:
-        return np.array(one.position)
-    return ego + np.array([1.0, 1.0, 0.1]) * (1.0 + (0.0 if np.isnan(one.relative[0]) else one.relative[0]))
+    if np.isfinite(member.relative).all():
+        return ego + to_vector(member.relative)
+    if member.new:
+        return np.array(member.position)
+    return ego + np.array([1.0, 1.0, 0.1]) * (1.0 + (0.0 if np.isnan(member.relative[0]) else member.relative[0]))
 
 
-def placed(one: Member, information: Floats) -> bool:
+def placed(member: Member, information: Floats) -> bool:
     """Whether an incomplete measurement has a known geometry: 1e-4 /m^2 and more along x."""
-    return bool(np.isfinite(one.relative).all() or information > 1e-4)
+    return bool(np.isfinite(member.relative).all() or information > 1e-4)
 
 
-def update(x: Floats, p: Floats, star: list[Member], known: NoiseModel, exact: bool) -> tuple[Floats, Floats]:
+def update(x: Floats, p: Floats, star: list[Member], noise_model: NoiseModel, exact: bool) -> tuple[Floats, Floats]:
     """Fixes and converted vectors at the predicted geometry; then one exact step."""
     n = len(star)
     information, eta = np.linalg.inv(p), np.zeros(3 * n)
-    for k, one in enumerate(star):
-        if one.new:
+    for k, member in enumerate(star):
+        if member.new:
             at = slice(3 * k, 3 * k + 3)
-            information[at, at] += np.diag(1 / one.variance)
-            eta[at] += (one.position - x[k]) / one.variance
+            information[at, at] += np.diag(1 / member.variance)
+            eta[at] += (member.position - x[k]) / member.variance
     linear, linear_eta = information.copy(), eta.copy()
     used = [k for k in range(1, n) if placed(star[k], information[3 * k, 3 * k])]
     for k in used:
-        h, r, z = converted(star[k].relative, x[k] - x[0], known)
+        h, r, z = converted(star[k].relative, x[k] - x[0], noise_model)
         add(linear, linear_eta, k, h.T @ r @ h, h.T @ r @ z)
     move = np.linalg.solve(linear, linear_eta)
     if not exact:
         return x + move.reshape(-1, 3), np.linalg.inv(linear)
     at = x + move.reshape(-1, 3)
     for k in used:
-        jacobian, residual = whitened(star[k].relative, at[k] - at[0], known)
+        jacobian, residual = whitened(star[k].relative, at[k] - at[0], noise_model)
         ahead = move[3 * k : 3 * k + 3] - move[:3]
         add(information, eta, k, jacobian.T @ jacobian, jacobian.T @ (residual + jacobian @ ahead))
     p = np.linalg.inv(information)
@@ -88,12 +88,12 @@ def add(information: Floats, eta: Floats, k: int, weight: Floats, push: Floats) 
     eta += b.T @ push
 
 
-def converted(relative: Floats, gap: Floats, known: NoiseModel) -> tuple[Floats, Floats, Floats]:
+def converted(relative: Floats, gap: Floats, noise_model: NoiseModel) -> tuple[Floats, Floats, Floats]:
     """Unit directions of range, azimuth and inclination (rows) at `gap`, their information, and the converted vector
     less `gap` along them; a missing component has no row."""
     there = np.isfinite(relative)
     expected = np.array(spherical(*gap))
-    seen = np.where(there, relative, expected)
+    measured = np.where(there, relative, expected)
     _, az, inc = expected
     rows = np.array(
         [
@@ -102,18 +102,18 @@ def converted(relative: Floats, gap: Floats, known: NoiseModel) -> tuple[Floats,
             [np.cos(az) * np.cos(inc), np.sin(az) * np.cos(inc), -np.sin(inc)],
         ]
     )
-    cov = rows @ np.atleast_2d(known.relative_cov(expected)) @ rows.T
-    return rows[there], np.diag(1 / np.diag(cov)[there]), rows[there] @ (to_vector(seen) - gap)
+    cov = rows @ np.atleast_2d(noise_model.relative_cov(expected)) @ rows.T
+    return rows[there], np.diag(1 / np.diag(cov)[there]), rows[there] @ (to_vector(measured) - gap)
 
 
-def whitened(relative: Floats, gap: Floats, known: NoiseModel) -> tuple[Floats, Floats]:
+def whitened(relative: Floats, gap: Floats, noise_model: NoiseModel) -> tuple[Floats, Floats]:
     """Jacobian and residual of what was measured, in standard deviations."""
-    assert known.sensors is not None
+    assert noise_model.sensors is not None
     there, (x, y, z) = np.isfinite(relative), gap
     expected = np.array(spherical(*gap))
     residual = relative - expected
     residual[1:] = wrap(residual[1:])
-    d = max(expected[0], known.sensors.min_range)
+    d = max(expected[0], noise_model.sensors.min_range)
     ground = max(np.hypot(x, y), 1e-3 * d)
     jacobian = np.array(
         [
@@ -122,5 +122,5 @@ def whitened(relative: Floats, gap: Floats, known: NoiseModel) -> tuple[Floats, 
             [x * z / (ground * d**2), y * z / (ground * d**2), -ground / d**2],
         ]
     )
-    std = known.sensors.relative_std
+    std = noise_model.sensors.relative_std
     return (jacobian / std[:, None])[there], (residual / std)[there]

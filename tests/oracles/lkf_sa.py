@@ -15,30 +15,30 @@ from coopoc.world.links import to_vector
 from oracles.messages import Member
 
 
-def follow(stars: list[list[Member]], known: NoiseModel) -> tuple[Floats, Floats, list[Floats]]:
+def follow(stars: list[list[Member]], noise_model: NoiseModel) -> tuple[Floats, Floats, list[Floats]]:
     """x (T, 3), variance (T, 3) and the neighbours (k, 3) at each step."""
-    x, p, found = np.zeros((0, 3)), np.zeros((3, 0, 0)), []
+    x, p, estimates = np.zeros((0, 3)), np.zeros((3, 0, 0)), []
     for star in stars:
         x, p = predict(x, p, star)
-        x, p = update(x, p, star, known)
-        found.append((x, p[:, 0, 0]))
-    return np.array([x[0] for x, _ in found]), np.array([p for _, p in found]), [x[1:] for x, _ in found]
+        x, p = update(x, p, star, noise_model)
+        estimates.append((x, p[:, 0, 0]))
+    return np.array([x[0] for x, _ in estimates]), np.array([p for _, p in estimates]), [x[1:] for x, _ in estimates]
 
 
 def predict(x: Floats, p: Floats, star: list[Member]) -> tuple[Floats, Floats]:
     """Members that stay move; one that joins is where the ego measures it, with a flat prior."""
     n, pick = len(star), np.zeros((len(star), len(x)))
     new, q = np.zeros((n, 3)), np.full((n, 3), FORGOTTEN)
-    for k, one in enumerate(star):
-        if one.before is None:
-            new[k] = one.position if k == 0 else new[0] + to_vector(one.relative)
+    for k, member in enumerate(star):
+        if member.before is None:
+            new[k] = member.position if k == 0 else new[0] + to_vector(member.relative)
         else:
-            pick[k, one.before] = 1.0
-            new[k], q[k] = x[one.before] + one.moved, one.process
+            pick[k, member.before] = 1.0
+            new[k], q[k] = x[member.before] + member.moved, member.process
     return new, np.array([pick @ p[c] @ pick.T + np.diag(q[:, c]) for c in range(3)])
 
 
-def update(x: Floats, p: Floats, star: list[Member], known: NoiseModel) -> tuple[Floats, Floats]:
+def update(x: Floats, p: Floats, star: list[Member], noise_model: NoiseModel) -> tuple[Floats, Floats]:
     """Each axis by itself: P^-1 += L W L + diag(1/r)."""
     n = len(star)
     edges = [k for k in range(1, n) if np.isfinite(star[k].relative).all()]
@@ -52,15 +52,15 @@ def update(x: Floats, p: Floats, star: list[Member], known: NoiseModel) -> tuple
         delta[0] -= vector
         delta[k] += vector
     variance = np.ones(n)
-    if known.sensors is not None and edges:
-        mean = np.mean([np.trace(known.relative_cov(star[k].relative)) / 3 for k in edges])
+    if noise_model.sensors is not None and edges:
+        mean = np.mean([np.trace(noise_model.relative_cov(star[k].relative)) / 3 for k in edges])
         variance = np.maximum(np.diag(laplacian), 1.0) * mean
-    found = []
+    estimates = []
     for c in range(3):
-        fixes = np.array([1 / one.variance[c] if one.new else 0.0 for one in star])
-        position = np.array([one.position[c] for one in star])
+        fixes = np.array([1 / member.variance[c] if member.new else 0.0 for member in star])
+        position = np.array([member.position[c] for member in star])
         weight = laplacian @ np.diag(1 / variance)
         cov = np.linalg.inv(np.linalg.inv(p[c]) + weight @ laplacian + np.diag(fixes))
         eta = weight @ (delta[:, c] - laplacian @ x[:, c]) + fixes * (position - x[:, c])
-        found.append((x[:, c] + cov @ eta, cov))
-    return np.stack([x for x, _ in found], axis=1), np.array([p for _, p in found])
+        estimates.append((x[:, c] + cov @ eta, cov))
+    return np.stack([x for x, _ in estimates], axis=1), np.array([p for _, p in estimates])

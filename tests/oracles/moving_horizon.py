@@ -24,8 +24,8 @@ FLAT, STRAYED = 1e6, 0.03
 class Drive:
     """What one ego knows: the message of each member (vehicle, step), its uses, and the rows that follow from it."""
 
-    def __init__(self, recording: Recording, box: Inbox, known: NoiseModel, run: int, ego: int) -> None:
-        self.recording, self.box, self.known, self.run, self.ego = recording, box, known, run, ego
+    def __init__(self, recording: Recording, box: Inbox, noise_model: NoiseModel, run: int, ego: int) -> None:
+        self.recording, self.box, self.noise_model, self.run, self.ego = recording, box, noise_model, run, ego
         self.star: list[dict[int, int]] = []
         self.sent: dict[Any, tuple[int, bool, int]] = {}
         for t in range(len(recording.t)):
@@ -53,13 +53,17 @@ class Drive:
         rows: list[Row] = []
         for v in self.star[t]:
             sent, fresh, uses = self.sent[v, t]
-            fix, variance, moved, one = message(self.recording, self.known, self.run, v, t, sent if sent >= 0 else t)
+            fix, variance, moved, step_variance = message(
+                self.recording, self.noise_model, self.run, v, t, sent if sent >= 0 else t
+            )
             if sent >= 0 and fresh and np.isfinite(self.recording.gnss[self.run, sent, v]).all():
                 rows.append(({(v, t): np.diag(variance**-0.5)}, fix * variance**-0.5, v))
             if t and v in self.star[t - 1]:
-                moved, one = (moved, (2 * uses - 1) * one) if sent >= 0 else (np.zeros(3), np.full(3, UNKNOWN))
-                w = np.diag(one**-0.5)
-                rows.append(({(v, t): w, (v, t - 1): -w}, moved * one**-0.5, "motion"))
+                moved, step_variance = (
+                    (moved, (2 * uses - 1) * step_variance) if sent >= 0 else (np.zeros(3), np.full(3, UNKNOWN))
+                )
+                w = np.diag(step_variance**-0.5)
+                rows.append(({(v, t): w, (v, t - 1): -w}, moved * step_variance**-0.5, "motion"))
             else:
                 rows.append(({(v, t): np.eye(3) * FLAT**-0.5}, start[v, t] * FLAT**-0.5, "prior"))
         return rows
@@ -81,7 +85,7 @@ class Drive:
         rows: list[Row] = []
         for v, k in self.star[t].items():
             if k >= 0:
-                cov = self.known.relative_cov(np.array(spherical(*(x[v, t] - x[self.ego, t]))))
+                cov = self.noise_model.relative_cov(np.array(spherical(*(x[v, t] - x[self.ego, t]))))
                 w = np.linalg.cholesky(np.linalg.inv(cov)).T
                 z = to_vector(self.recording.relative[self.run, self.box.link[k]])
                 rows.append(({(v, t): w, (self.ego, t): -w}, w @ z, "relative"))
@@ -89,7 +93,7 @@ class Drive:
 
     def exact(self, t: int, x: Any) -> list[Row]:
         """Relative measurements in range and angles, linear at the points."""
-        return relative_rows(self.recording, self.box, self.known, self.run, self.ego, x, t)
+        return relative_rows(self.recording, self.box, self.noise_model, self.run, self.ego, x, t)
 
 
 def moving_horizon(drive: Drive, length: int, exact: bool, sweeps: int, late: bool = True) -> Any:
@@ -103,7 +107,7 @@ def moving_horizon(drive: Drive, length: int, exact: bool, sweeps: int, late: bo
     edges: dict[int, list[Row]] = {}
     base: dict[Any, Floats] = {}
     start: dict[Any, Floats] = {}
-    found: dict[Any, Floats] = {}
+    points: dict[Any, Floats] = {}
     steps = len(drive.star)
     covs = np.empty((steps, 3, 3))
 
@@ -136,8 +140,8 @@ def moving_horizon(drive: Drive, length: int, exact: bool, sweeps: int, late: bo
                 break
         i = 3 * list(x).index((drive.ego, now))
         covs[now] = cov[i : i + 3, i : i + 3]
-        found.update({(v, now): x[v, now] for v in drive.star[now]})
-    return found, covs
+        points.update({(v, now): x[v, now] for v in drive.star[now]})
+    return points, covs
 
 
 def fixed_lag(drive: Drive, lag: int, exact: bool) -> Any:

@@ -50,15 +50,15 @@ def step(
     return mean, cov, [k for k in range(n) if k not in [r[0] for r in rows]]
 
 
-def joint(x: Array, p: Array, fixes: Array, seen: list[Array], new: list[int]) -> tuple[Array, Array]:
+def joint(x: Array, p: Array, fixes: Array, relative: list[Array], new: list[int]) -> tuple[Array, Array]:
     """argmin of prior, fixes and exact range, azimuth and inclination by Gauss-Newton, and its covariance."""
     for k in new:
-        x[k] = fixes[k] if k == 0 or seen[k] is None else x[0] + cartesian(seen[k])
+        x[k] = fixes[k] if k == 0 or relative[k] is None else x[0] + cartesian(relative[k])
     prior, at = x.ravel().copy(), x.ravel().copy()
     weight = np.linalg.inv(p)
     for _ in range(4):
         h, r = weight + np.eye(len(at)) / FIX**2, weight @ (prior - at) + (fixes.ravel() - at) / FIX**2
-        for k, m in enumerate(seen):
+        for k, m in enumerate(relative):
             if m is not None:
                 v = at[3 * k : 3 * k + 3] - at[:3]
                 gap = m - polar(v)
@@ -72,9 +72,9 @@ def joint(x: Array, p: Array, fixes: Array, seen: list[Array], new: list[int]) -
     return at.reshape(-1, 3), np.linalg.inv(h)
 
 
-def laplacian(x: Array, p: Array, fixes: Array, seen: list[Array], new: list[int]) -> tuple[Array, Array]:
+def laplacian(x: Array, p: Array, fixes: Array, relative: list[Array], new: list[int]) -> tuple[Array, Array]:
     """z = [L x; x] with unit covariances, prior and all; L is the Laplacian of the star of those that are seen."""
-    n, vectors = len(x), {k: cartesian(m) for k, m in enumerate(seen) if m is not None}
+    n, vectors = len(x), {k: cartesian(m) for k, m in enumerate(relative) if m is not None}
     for k in new:
         x[k] = x[0] + vectors[k] if k in vectors else fixes[k]
     lap, delta = np.zeros((n, n)), np.zeros((n, 3))
@@ -100,7 +100,7 @@ def simulate(position: Array, velocity: Array, ego: int, most: int, rng: np.rand
         star = [ego, *(j for j in nearest(np.where(there[:, None], at, np.inf), ego, most))]
         truth = [polar(at[j] - at[ego]) for j in star[1:]]
         noisy = [m + rng.normal(size=3) * [RANGE, ANGLE, ANGLE] for m in truth]
-        seen = [None, *(m if d[0] >= 2.0 else None for m, d in zip(noisy, truth, strict=True))]
+        relative = [None, *(m if d[0] >= 2.0 else None for m, d in zip(noisy, truth, strict=True))]
         error[0, t] = ((fixes[ego] - at[ego]) ** 2).sum()
         for k, (update, unit) in enumerate(((laplacian, True), (joint, False)), 1):
             q = np.ones_like(std) if unit else (DT * std) ** 2
@@ -108,7 +108,7 @@ def simulate(position: Array, velocity: Array, ego: int, most: int, rng: np.rand
             mean, cov, new = step(x, p, star, before, DT * measured, q)
             if t == 0:
                 mean[0] = fixes[ego]
-            x, p = update(mean, cov, fixes[star], seen, new)
+            x, p = update(mean, cov, fixes[star], relative, new)
             state[k] = (x, p, star)
             error[k, t] = ((x[0] - at[ego]) ** 2).sum()
     return np.sqrt(error.mean(axis=1))

@@ -43,24 +43,24 @@ def update(x, P, h, z, variance, angle, passes=1):  # type: ignore[no-untyped-de
     return at, (np.eye(len(x)) - K @ H) @ P
 
 
-def pose_filter(seen, noise, begin, d, passes, run):  # type: ignore[no-untyped-def]
+def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped-def]
     """States (T, n, d) and covariances (T, n, d, d) of one run in one state, any numbers for members that are away."""
-    (steps, members), (ratio, floor, of_speed) = seen.active.shape, noise.velocity
+    (steps, members), (ratio, floor, of_speed) = drive.active.shape, noise.velocity
     out, covs = np.zeros((steps, members, d)), np.zeros((steps, members, d, d))
     x, P, lasting = np.zeros((members, d)), np.zeros((members * d,) * 2), np.array(noise.lasting)[: d - 4]
     for t in range(steps):
         F, Q = [], []
         for n in range(members):
-            own = seen.own[run, t, n]
-            if t and seen.active[t - 1, n] and seen.active[t, n]:
+            own = drive.own[run, t, n]
+            if t and drive.active[t - 1, n] and drive.active[t, n]:
                 u, state = own[4:], x[n].copy()
                 size = np.full(3, np.linalg.norm(u[:3])) if of_speed else np.abs(u[:3])
                 q = np.append(np.maximum(ratio * size, floor) ** 2, noise.yaw_rate)
-                F.append(jacobian(lambda s, u=u: motion(s, u, seen.dt), state))
-                G = jacobian(lambda v, s=state: motion(s, v, seen.dt), u)
+                F.append(jacobian(lambda s, u=u: motion(s, u, drive.dt), state))
+                G = jacobian(lambda v, s=state: motion(s, v, drive.dt), u)
                 F[-1][4:] *= noise.keep
                 Q.append(G @ np.diag(q) @ G.T + np.diag(np.append(np.zeros(4), (1 - noise.keep**2) * lasting)))
-                x[n] = motion(state, u, seen.dt)
+                x[n] = motion(state, u, drive.dt)
                 x[n, 4:] *= noise.keep
                 continue
             F.append(np.zeros((d, d)))
@@ -72,37 +72,37 @@ def pose_filter(seen, noise, begin, d, passes, run):  # type: ignore[no-untyped-
             Q.append(np.diag(wide))
         P = block_diag(*F) @ P @ block_diag(*F).T + block_diag(*Q)
         flat = x.ravel()
-        for n in np.flatnonzero(seen.active[t]):
-            own, b = seen.own[run, t, n], d * n
+        for n in np.flatnonzero(drive.active[t]):
+            own, b = drive.own[run, t, n], d * n
             if np.isfinite(own[3]):
                 flat, P = update(flat, P, lambda s, b=b: s[b + 3 : b + 4], own[3:4], [noise.heading], [True])
             if np.isfinite(own[:3]).all():
                 flat, P = update(flat, P, lambda s, b=b: s[b : b + 3], own[:3], np.array(noise.fix), [False] * 3)
-        links = range(seen.first[t], seen.first[t + 1])
-        known = [P[d * k, d * k] < FLAT / 2 for k in range(members)]
-        links = [k for k in links if known[seen.ends[k, 0]] and (seen.ends[k, 1] < 0 or known[seen.ends[k, 1]])]
+        links = range(drive.first[t], drive.first[t + 1])
+        located = [P[d * k, d * k] < FLAT / 2 for k in range(members)]
+        links = [k for k in links if located[drive.ends[k, 0]] and (drive.ends[k, 1] < 0 or located[drive.ends[k, 1]])]
         if len(links):
-            flat, P = relative(flat, P, seen, noise, (run, links, d), passes)
+            flat, P = relative(flat, P, drive, noise, (run, links, d), passes)
         x = flat.reshape(members, d).copy()
         out[t], covs[t] = x, P.reshape(members, d, members, d)[np.arange(members), :, np.arange(members)]
     return out, covs
 
 
-def relative(x, P, seen, noise, where, passes):  # type: ignore[no-untyped-def]
+def relative(x, P, drive, noise, where, passes):  # type: ignore[no-untyped-def]
     """All components that were measured, at once."""
     run, links, d = where
 
     def h(s):  # type: ignore[no-untyped-def]
-        found = []
+        predicted = []
         for k in links:
-            mine, other = s[d * seen.ends[k, 0] :][:4], seen.place[k]
-            if seen.ends[k, 1] >= 0:
-                other = s[d * seen.ends[k, 1] :][:3]
-            found.append(spherical(mine, other)[np.isfinite(seen.relative[run, k])])
-        return np.concatenate(found)
+            mine, other = s[d * drive.ends[k, 0] :][:4], drive.place[k]
+            if drive.ends[k, 1] >= 0:
+                other = s[d * drive.ends[k, 1] :][:3]
+            predicted.append(spherical(mine, other)[np.isfinite(drive.relative[run, k])])
+        return np.concatenate(predicted)
 
-    z = np.concatenate([seen.relative[run, k][np.isfinite(seen.relative[run, k])] for k in links])
-    kind = np.concatenate([np.flatnonzero(np.isfinite(seen.relative[run, k])) for k in links])
+    z = np.concatenate([drive.relative[run, k][np.isfinite(drive.relative[run, k])] for k in links])
+    kind = np.concatenate([np.flatnonzero(np.isfinite(drive.relative[run, k])) for k in links])
     if not len(z):
         return x, P
     return update(x, P, h, z, np.array(noise.relative)[kind], kind > 0, passes)

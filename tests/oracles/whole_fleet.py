@@ -10,14 +10,14 @@ from coopoc.world.links import spherical, to_vector, wrap
 class Drive:
     """One run of a recording whose pairs exchange messages by the steps `arrival` (P,), -1 for never."""
 
-    def __init__(self, recording, known, met, arrival, run):  # type: ignore[no-untyped-def]
-        self.known, self.met, self.dt, self.arrival = known, met, recording.dt, arrival
+    def __init__(self, recording, noise_model, met, arrival, run):  # type: ignore[no-untyped-def]
+        self.noise_model, self.met, self.dt, self.arrival = noise_model, met, recording.dt, arrival
         self.gnss, self.velocity, self.relative = (
             values[run] for values in (recording.gnss, recording.velocity, recording.relative)
         )
         self.q, self.r = (
             np.broadcast_to(values, recording.gnss.shape)[run]
-            for values in (known.process_variance(recording), known.fix_variance(recording))
+            for values in (noise_model.process_variance(recording), noise_model.fix_variance(recording))
         )
         self.steps, self.vehicles = self.gnss.shape[:2]
         self.active = np.zeros((self.steps, self.vehicles), dtype=bool)
@@ -45,14 +45,14 @@ class Drive:
         W, eta = np.zeros((3, 3)), np.zeros(3)
         for link, sign in ((self.met.link[k], 1.0), (self.met.link_back[k], -1.0)):
             if link >= 0:
-                H, r = rows(sign * vector, self.relative[link], self.known.sensors, converted)
+                H, r = rows(sign * vector, self.relative[link], self.noise_model.sensors, converted)
                 W, eta = W + H.T @ H, eta + sign * H.T @ r
         return W, eta
 
     def factor_at_agreement(self, k, vector, cov):  # type: ignore[no-untyped-def]
         """`factor` where belief and converted measurement agree; eta refers to `vector`."""
         W, eta = self.factor(k, vector, True)
-        if self.known.sensors is None:
+        if self.noise_model.sensors is None:
             return W, eta
         shift = np.linalg.solve(np.eye(3) + cov @ W, cov @ eta)
         W, eta = self.factor(k, vector + shift, False)
@@ -84,19 +84,19 @@ class Drive:
         for t in range(self.steps):
             held = [s for s in range(t + 1) if when[s] <= t]
             s = held[-1] if held else 0
-            one = (x[s, n], P[s, n]) if held else self.start(0, n)
+            estimate = (x[s, n], P[s, n]) if held else self.start(0, n)
             for u in range(s + 1, t + 1):
-                one = self.solo(u, n, *one)
-            out.append(one)
+                estimate = self.solo(u, n, *estimate)
+            out.append(estimate)
         return np.array([a for a, _ in out]), np.array([b for _, b in out])
 
 
-def rows(vector, seen, sensors, converted):  # type: ignore[no-untyped-def]
+def rows(vector, measured, sensors, converted):  # type: ignore[no-untyped-def]
     """Whitened Jacobian and residual of what was measured of range, azimuth, inclination; without sensors, unit rows
     along the three axes of the measured direction."""
-    there, least = np.isfinite(seen), sensors.min_range if sensors else 0.0
-    seen = np.where(there, seen, np.array(spherical(*vector)))
-    at = to_vector(seen) if converted or sensors is None else vector
+    there, least = np.isfinite(measured), sensors.min_range if sensors else 0.0
+    measured = np.where(there, measured, np.array(spherical(*vector)))
+    at = to_vector(measured) if converted or sensors is None else vector
     r = np.linalg.norm(at)
     d = max(r, least)
     far = at * d / r if converted else at  # angles of a measured range near zero are those of the least one
@@ -107,7 +107,7 @@ def rows(vector, seen, sensors, converted):  # type: ignore[no-untyped-def]
         J /= np.linalg.norm(J, axis=1)[:, None]
         return J[there], J[there] @ (at - vector)
     J /= sensors.relative_std[:, None]
-    off = seen - np.array(spherical(*vector))
+    off = measured - np.array(spherical(*vector))
     off[1:] = wrap(off[1:])
     residual = J @ (at - vector) if converted else off / sensors.relative_std
     return J[there], residual[there]

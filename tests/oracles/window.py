@@ -23,21 +23,23 @@ ACCELERATION_STD, UNKNOWN = 1.0, 1e6
 """m/s^2, change of a velocity since it was sent; m^2, variance of an unknown motion."""
 
 
-def message(recording: Recording, known: NoiseModel, run: int, vehicle: int, t: int, sent: int) -> tuple[Floats, ...]:
+def message(
+    recording: Recording, noise_model: NoiseModel, run: int, vehicle: int, t: int, sent: int
+) -> tuple[Floats, ...]:
     """Fix brought forward from step `sent`, its variance, motion of one step, and its variance without repetition."""
     dt, age = recording.dt, t - sent
     u = recording.velocity[run, sent, vehicle]
-    process = np.broadcast_to(known.process_variance(recording), recording.velocity.shape)
-    one = process[run, sent, vehicle] + (dt**2 * age * ACCELERATION_STD) ** 2
+    process = np.broadcast_to(noise_model.process_variance(recording), recording.velocity.shape)
+    step_variance = process[run, sent, vehicle] + (dt**2 * age * ACCELERATION_STD) ** 2
     s, moved, grown = sent, np.zeros(3), np.zeros(3)
     while s > 0 and np.isnan(recording.gnss[run, s, vehicle]).any():  # dead reckoning of the sender since its last fix
         moved, grown, s = moved + dt * recording.velocity[run, s, vehicle], grown + process[run, s, vehicle], s - 1
     fix = recording.gnss[run, s, vehicle] + moved + age * dt * u
-    return fix, known.gnss_variance + grown + age**2 * one, dt * u, one
+    return fix, noise_model.gnss_variance + grown + age**2 * step_variance, dt * u, step_variance
 
 
 def linear_rows(
-    recording: Recording, box: Inbox, known: NoiseModel, run: int, ego: int, span: Sequence[int]
+    recording: Recording, box: Inbox, noise_model: NoiseModel, run: int, ego: int, span: Sequence[int]
 ) -> list[Row]:
     """Fixes and motions as rows A x = b, whitened; keys of the points are (vehicle, step)."""
     rows: list[Row] = []
@@ -54,24 +56,30 @@ def linear_rows(
             held[vehicle] = (t, sent, uses)
             if t < span[0]:
                 continue
-            fix, variance, moved, one = message(recording, known, run, vehicle, t, max(sent, 0) if sent >= 0 else t)
+            fix, variance, moved, step_variance = message(
+                recording, noise_model, run, vehicle, t, max(sent, 0) if sent >= 0 else t
+            )
             had = np.isfinite(recording.gnss[run, sent, vehicle]).all()
             if sent >= 0 and ((fresh and had) or last < span[0]) and np.isfinite(fix).all():
                 rows.append(({(vehicle, t): np.diag(variance**-0.5)}, fix * variance**-0.5, vehicle))
             if last == t - 1 >= span[0]:
-                moved, one = (moved, (2 * uses - 1) * one) if sent >= 0 else (np.zeros(3), np.full(3, UNKNOWN))
-                weight = np.diag(one**-0.5)
-                rows.append(({(vehicle, t): weight, (vehicle, t - 1): -weight}, moved * one**-0.5, "motion"))
+                moved, step_variance = (
+                    (moved, (2 * uses - 1) * step_variance) if sent >= 0 else (np.zeros(3), np.full(3, UNKNOWN))
+                )
+                weight = np.diag(step_variance**-0.5)
+                rows.append(({(vehicle, t): weight, (vehicle, t - 1): -weight}, moved * step_variance**-0.5, "motion"))
     return rows
 
 
-def relative_rows(recording: Recording, box: Inbox, known: NoiseModel, run: int, ego: int, x: Any, t: int) -> list[Row]:
+def relative_rows(
+    recording: Recording, box: Inbox, noise_model: NoiseModel, run: int, ego: int, x: Any, t: int
+) -> list[Row]:
     """Relative measurements of a step, linear at the points x: J d = z - h, in terms of the points themselves."""
     rows: list[Row] = []
     for k in range(box.start[t], box.start[t + 1]):
         z, j = recording.relative[run, box.link[k]], int(recording.links.neighbour[box.link[k]])
         v = x[j, t] - x[ego, t]
-        if known.sensors is None:
+        if noise_model.sensors is None:
             if np.isfinite(z).all():
                 vector = z[0] * np.array([np.sin(z[2]) * np.cos(z[1]), np.sin(z[2]) * np.sin(z[1]), np.cos(z[2])])
                 rows.append(({(j, t): np.eye(3), (ego, t): -np.eye(3)}, vector, "relative"))
@@ -87,8 +95,8 @@ def relative_rows(recording: Recording, box: Inbox, known: NoiseModel, run: int,
         )
         off = z - h
         off[1:] = (off[1:] + np.pi) % (2 * np.pi) - np.pi
-        wide = 1.0 if np.isnan(z[0]) else max(known.sensors.min_range / z[0], 1.0)
-        std = np.minimum(known.sensors.relative_std * [1.0, wide, wide], [np.inf, np.pi, np.pi])
+        wide = 1.0 if np.isnan(z[0]) else max(noise_model.sensors.min_range / z[0], 1.0)
+        std = np.minimum(noise_model.sensors.relative_std * [1.0, wide, wide], [np.inf, np.pi, np.pi])
         root = jacobian / std[:, None]
         root[np.isnan(z)], off[np.isnan(z)] = 0.0, 0.0
         rows.append(({(j, t): root, (ego, t): -root}, root @ v + off / std, "relative"))
@@ -109,10 +117,14 @@ def solve_rows(rows: Sequence[Row], x: Any, ridge: float = 1e-12) -> tuple[Any, 
     return {key: x[key] + move[i] for i, key in enumerate(x)}, cov
 
 
-def window(recording: Recording, box: Inbox, known: NoiseModel, run: int, ego: int, span: Sequence[int], x: Any) -> Any:
+def window(
+    recording: Recording, box: Inbox, noise_model: NoiseModel, run: int, ego: int, span: Sequence[int], x: Any
+) -> Any:
     """Minimum and covariance of the window from the points x, by dense Gauss-Newton."""
-    rows = linear_rows(recording, box, known, run, ego, span)
-    return descend(rows, lambda at: [r for t in span for r in relative_rows(recording, box, known, run, ego, at, t)], x)
+    rows = linear_rows(recording, box, noise_model, run, ego, span)
+    return descend(
+        rows, lambda at: [r for t in span for r in relative_rows(recording, box, noise_model, run, ego, at, t)], x
+    )
 
 
 def descend(rows: Sequence[Row], relative: Any, x: Any) -> Any:
@@ -128,8 +140,8 @@ def descend(rows: Sequence[Row], relative: Any, x: Any) -> Any:
 
 def points(recording: Recording, box: Inbox, ego: int, span: Sequence[int], position: Floats) -> Any:
     """Start: every point of the window at a given position (T, N, 3)."""
-    found = {}
+    newest = {}
     for t in span:
         for vehicle in [ego, *recording.links.neighbour[box.link[box.start[t] : box.start[t + 1]]]]:
-            found[int(vehicle), t] = position[t, vehicle].copy()
-    return found
+            newest[int(vehicle), t] = position[t, vehicle].copy()
+    return newest
