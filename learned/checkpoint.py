@@ -157,7 +157,7 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
 
 
 def load_into(model: Gain, tensors: Mapping[str, Tensor], path: Path | str = "checkpoint") -> None:
-    """Put named tensors into a net; InputError naming the expected and the found shape if they do not fit."""
+    """Put named tensors into a net; InputError naming the expected and the given shape if they do not fit."""
     _match(path, {name: tuple(p.shape) for name, p in model.named_parameters()}, tensors)
     model.load_state_dict(dict(tensors))
 
@@ -202,9 +202,9 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
         InputError: no such file, another format, a wrong checksum.
     """
     with _opened(path) as file:
-        found = {name: file.get_tensor(name) for name in file.keys()}, _card(file, path)  # noqa: SIM118
+        content = {name: file.get_tensor(name) for name in file.keys()}, _card(file, path)  # noqa: SIM118
     right = holds(path.read_bytes())
-    if right is False or (right is None and CHECKSUM in found[1]):
+    if right is False or (right is None and CHECKSUM in content[1]):
         hint = "Copy it again from where it came from, or delete it and train again."
         raise InputError("checkpoint", path, "has another content than its checksum says: it is damaged", hint)
     if right is None:
@@ -212,11 +212,11 @@ def read(path: Path) -> tuple[dict[str, Tensor], dict[str, Any]]:
             f"{path} has no checksum, so that no damage of its weights would be noticed; coopoc.learned.save adds one"
         )
         warnings.warn(text, RuntimeWarning, stacklevel=3)
-    return found
+    return content
 
 
-def _match(path: Path | str, expected: Mapping[str, tuple[int, ...]], found: Mapping[str, Tensor]) -> None:
-    shapes = {name: tuple(tensor.shape) for name, tensor in found.items()}
+def _match(path: Path | str, expected: Mapping[str, tuple[int, ...]], tensors: Mapping[str, Tensor]) -> None:
+    shapes = {name: tuple(tensor.shape) for name, tensor in tensors.items()}
     for name in sorted(expected.keys() | shapes.keys()):
         if expected.get(name) != shapes.get(name):
             raise InputError(

@@ -135,8 +135,8 @@ def agree(net: GainNet, run: Run) -> float:
         given = [np.asarray(a, dtype=dtype) for a in (fix, velocity, dt)]
         with torch.inference_mode():
             own = [a.numpy() for a in Step(net)(*(torch.from_numpy(a) for a in (*mine[:-3], *given)))]
-        found = list(run([*theirs[:-3], *given]))
-        gaps = [float(np.abs(a - b).max()) for a, b in zip(own, found, strict=True)]
+        outputs = list(run([*theirs[:-3], *given]))
+        gaps = [float(np.abs(a - b).max()) for a, b in zip(own, outputs, strict=True)]
         worst = max(worst, *gaps) if np.isfinite(gaps).all() else np.nan
         if not worst <= AGREE:
             raise InputError(
@@ -145,7 +145,7 @@ def agree(net: GainNet, run: Run) -> float:
                 f"must agree to {AGREE:g}",
                 "Nothing was written; try another version of the exporting library.",
             )
-        mine, theirs = [*own[:-1], *given], [*found[:-1], *given]
+        mine, theirs = [*own[:-1], *given], [*outputs[:-1], *given]
     return worst
 
 

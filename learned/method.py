@@ -36,7 +36,7 @@ class LearnedGain:
     Args:
         model: trained net.
         name: label in tables.
-        x0: (R, E, 3) or (E, 3) m, a known start as in KalmanNet's published loop; None starts at the first fix.
+        x0: (R, E, 3) or (E, 3) m, an exact start as in KalmanNet's published loop; None starts at the first fix.
 
     References:
         arXiv 2411.05847, equations 4-6 and section II.B.
@@ -63,7 +63,7 @@ class LearnedGain:
         """The net as a stream, one step at a time (docs/streaming.md); dt and velocity enter as their product only.
 
         Args:
-            x0: (3,) m, known before the first step; None starts at the first fix.
+            x0: (3,) m, the exact start; None starts at the first fix.
             history: s, the oldest fix that is accepted.
 
         >>> from coopoc.learned import GainNet

@@ -89,5 +89,5 @@ def fit_pose_noise(tasks: Sequence[PoseTask], start: Sensors, evaluations: int =
         return -float(np.mean(scores))
 
     simplex = np.vstack([first, first + STEP * np.eye(len(first))])
-    found = minimize(loss, first, method="Nelder-Mead", options={"maxfev": evaluations, "initial_simplex": simplex})
-    return sensors(found.x)
+    optimum = minimize(loss, first, method="Nelder-Mead", options={"maxfev": evaluations, "initial_simplex": simplex})
+    return sensors(optimum.x)

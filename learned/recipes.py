@@ -185,13 +185,13 @@ def recipe_of(name: str) -> Recipe:
     >>> recipe_of("split").net
     'split'
     """
-    found = find("coopoc.recipes", name)
-    if isinstance(found, type) and issubclass(found, Gain):
+    given = find("coopoc.recipes", name)
+    if isinstance(given, type) and issubclass(given, Gain):
         return Recipe("federated", net=name)
-    if not isinstance(found, Recipe):
+    if not isinstance(given, Recipe):
         hint = "Write RECIPE = Recipe(...), or a class that derives from Gain."
-        raise InputError("recipe", repr(name), f"is a {type(found).__name__}, no Recipe and no net", hint)
-    return found
+        raise InputError("recipe", repr(name), f"is a {type(given).__name__}, no Recipe and no net", hint)
+    return given
 
 
 def jobs_of(name: str, setting: Setting, fleet: Drives, aggregate: str | None = None) -> list[Job]:

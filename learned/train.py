@@ -103,10 +103,10 @@ def _train(group: Sequence[Job], fleet: Drives, out: Path, progress: bool) -> No
 def trained(group: Sequence[Job], fleet: Drives, progress: bool = True) -> list[Checkpoint]:
     """Checkpoints of jobs of one recipe, trained together now."""
     data = {job.setting: job_clients(job, fleet) for job in group}
-    found = TRAINERS[group[0].recipe.kind](group, data, f"train {group[0].name}" if progress else None)
+    models = TRAINERS[group[0].recipe.kind](group, data, f"train {group[0].name}" if progress else None)
     return [
         replace(made, card=_card(job, fleet, data[job.setting]) | dict(made.card))
-        for job, made in zip(group, found, strict=True)
+        for job, made in zip(group, models, strict=True)
     ]
 
 
@@ -153,14 +153,14 @@ def _federated(todo: Sequence[Job], data: Data, stage: str | None) -> list[Check
     recipe, nets = todo[0].recipe, [untrained(job) for job in todo]
     plan = Plan(recipe.rounds, recipe.aggregate, recipe.local_epochs, recipe.schedule, recipe.local_epoch)
     done = federate_many(nets, [data[j.setting] for j in todo], [j.setting.seed for j in todo], plan, stage)
-    found = []
+    models = []
     for job, federation in zip(todo, done, strict=True):
         rows = [row.card for row in federation.history]
         weights = torch.stack([r.weights for r in federation.history])
         card = {"history": rows, "best": federation.best.number, "seconds": federation.seconds}
         model = federation.model.calibrate([client.training for client in data[job.setting]])
-        found.append(Checkpoint(model, card, weights))
-    return found
+        models.append(Checkpoint(model, card, weights))
+    return models
 
 
 def _fitted(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:

@@ -124,10 +124,10 @@ def test_gradient_is_that_of_finite_differences_and_models_do_not_touch() -> Non
 
 def test_a_known_start_is_certain() -> None:
     given = batch()
-    known = given._replace(known=torch.ones(2, 2, dtype=torch.bool))
+    known = given._replace(exact=torch.ones(2, 2, dtype=torch.bool))
     gnss, velocity = torch.cat([known.x0[None], known.gnss]), torch.cat([known.velocity[:1], known.velocity])
     given = Variances(torch.ones_like(gnss), torch.full_like(gnss, 0.25))
-    x, p = filtered(gnss, velocity, given, 0.1, known.known)
+    x, p = filtered(gnss, velocity, given, 0.1, known.exact)
     assert p[0].abs().max() == 0
     np.testing.assert_allclose(p[1], 0.25 / 1.25, rtol=1e-9)
     np.testing.assert_allclose(x[1], x[0] + 0.1 * velocity[1] + 0.2 * (gnss[1] - x[0] - 0.1 * velocity[1]), rtol=1e-9)

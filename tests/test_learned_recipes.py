@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import importlib.util
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
@@ -31,7 +32,14 @@ from coopoc.learned.nets.gain import Gain
 from coopoc.learned.nets.recursive import RecursiveGain
 from coopoc.learned.nets.split import SplitGain
 from coopoc.learned.nets.stack import flatten
-from coopoc.learned.shipped import SENSORS, differences, digest, machine, metrics
+
+SPEC = importlib.util.spec_from_file_location(
+    "shipped_weights", Path(__file__).resolve().parents[1] / "benchmarks" / "shipped_weights.py"
+)
+assert SPEC
+assert SPEC.loader
+shipped = importlib.util.module_from_spec(SPEC)
+SPEC.loader.exec_module(shipped)
 
 
 def drives() -> Fleet:
@@ -200,14 +208,14 @@ def test_shipped_weights_hold_over_unseen_drives(name: str) -> None:
 def test_cards_say_what_was_trained_and_how_well(name: str) -> None:
     checkpoint = load(recipes.WEIGHTS / f"{name}.safetensors")
     card = checkpoint.card
-    assert card["sha256"] == digest(checkpoint)
+    assert card["sha256"] == shipped.digest(checkpoint)
     (job,) = (
         job
         for job in recipes.jobs_of(card["recipe"], recipes.Setting(), load_fleet("town10-clients"))
         if job.client == card["client"]
     )
     assert card["settings"] == json.loads(json.dumps(asdict(job.recipe) | asdict(job.setting)))
-    assert set(card["metrics"]) == set(SENSORS)
+    assert set(card["metrics"]) == set(shipped.SENSORS)
     times = {case: row["times_oracle"] for case, row in card["metrics"].items()}
     assert all(0.95 < value < 2.0 for value in times.values())
     assert all(value > 1.0 for case, value in times.items() if case != "scenario 1"), "there the oracle misses the bias"
@@ -220,20 +228,20 @@ def test_shipped_weights_are_made_again_from_their_recipe(name: str) -> None:
     """To 1e-5 with the versions and the kind of machine that the card names, a few last bits of float32 after thousands
     of steps on another processor of that kind; elsewhere training ends within a few percent."""
     card = read_card(recipes.WEIGHTS / f"{name}.safetensors")
-    same = card["environment"]["torch"] == torch.__version__ and card["machine"] == machine()
-    assert differences(name, progress=False)[name] < (1e-5 if same else 0.3)
+    same = card["environment"]["torch"] == torch.__version__ and card["machine"] == shipped.machine()
+    assert shipped.differences(name, progress=False)[name] < (1e-5 if same else 0.3)
 
 
 def test_metrics_are_those_of_the_validation_fleet() -> None:
     """The oracle filter of the metrics, from outside by its nominal twin: Kalman with the acting noise is near 1."""
-    found = metrics(Kalman("nominal"), runs=2)
+    found = shipped.metrics(Kalman("nominal"), runs=2)
     assert all(0.99 < row["times_oracle"] < 1.1 for row in found.values())
     assert found["scenario 2, 10 %"]["rt_le_m"] < found["scenario 2, 15 %"]["rt_le_m"]
 
 
 def test_weights_that_are_not_shipped_cannot_be_made_again() -> None:
     with pytest.raises(InputError, match="weights = 'individual9'"):
-        differences("individual9")
+        shipped.differences("individual9")
 
 
 def test_every_flipped_bit_of_a_checkpoint_is_noticed(tmp_path: Path) -> None:

@@ -84,7 +84,7 @@ def test_levels_hold_the_noise() -> None:
 
 def test_axes_and_signs_are_all_alike() -> None:
     seen, like, theta = batch(1, 3, 12), RecursiveGain(5), trained(1)
-    turned = Batch(*(-a[..., [2, 0, 1]] for a in seen[:4]), seen.dt, seen.known)
+    turned = Batch(*(-a[..., [2, 0, 1]] for a in seen[:4]), seen.dt, seen.exact)
     for ours, theirs, sign in zip(like.rollout(theta, seen), like.rollout(theta, turned), (-1, 1), strict=True):
         torch.testing.assert_close(sign * ours[..., [2, 0, 1]], theirs)
 

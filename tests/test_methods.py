@@ -115,17 +115,6 @@ def test_filters_that_claim_a_covariance_are_consistent(name: str, formation: Fl
     assert nees_inside(METHODS[name]("nominal")(recording, [0]), fleet).min() >= 0.95
 
 
-def test_a_known_start_has_no_nees(formation: Fleet) -> None:
-    """At the known start error and covariance are zero: NaN there, and the gate looks at the other steps."""
-    fleet, everywhere = formation.between(0, 100), replace(S2, velocity_reading="speed")
-    recording = observe(fleet, everywhere, V2X(max_neighbours=0), runs=30, observers=[0])
-    track = Kalman("nominal", x0=fleet.position[0, :1])(recording, [0])
-    found = nees(track, fleet)
-    assert np.isnan(found[:, 0]).all()
-    assert np.isfinite(found[:, 1:]).all()
-    assert nees_inside(track, fleet).min() >= 0.95
-
-
 def test_a_fitted_noise_model_finds_the_acting_noise(formation: Fleet) -> None:
     training = observe(formation, Sensors(gnss_std=(1.0, 2.0, 3.0), velocity_reading="speed"), runs=2)
     fitted = NoiseModel.fitted(training, formation)

@@ -14,7 +14,6 @@ from coopoc import InputError
 from coopoc.optimize import MEASUREMENTS, Problem, backends, measurement, solve
 from coopoc.optimize.model.measurements import Measurement
 from coopoc.optimize.model.space import Space, exp, pose
-from coopoc.world.links import wrap
 
 VECTORS = np.random.default_rng(0).normal(size=(50, 3)) * [20, 20, 5]
 
@@ -94,19 +93,6 @@ def test_the_logarithm_of_a_relative_pose_is_scipys(far: float) -> None:
         twist = logm(np.linalg.inv(pair[0]) @ pair[1]).real
         assert found[k, :3] == pytest.approx(twist[:3, 3], abs=1e-7)
         assert found[k, 3:] == pytest.approx([twist[2, 1], twist[0, 2], twist[1, 0]], abs=1e-7)
-
-
-@pytest.mark.parametrize("kind", sorted(MEASUREMENTS))
-def test_torch_runs_the_same_formula(kind: str) -> None:
-    known, space = MEASUREMENTS[kind], Space(3, has_rotation=True)
-    z = space.join(VECTORS, ROTATIONS[::-1]) if known.compares_poses else np.zeros((50, known.size()))
-    rotation = ROTATIONS if known.frame == "relative" else None
-    constants = np.full((50, known.constants), 0.1)
-    local = VECTORS if rotation is None else space.join(VECTORS, rotation)
-    columns = (torch.tensor(a).unbind(-1) for a in (local, z, constants))
-    parts = torch.stack(known.residual(*columns, torch), -1).numpy()
-    parts[:, known.angles()] = wrap(parts[:, known.angles()])
-    assert known.difference(VECTORS, rotation, z, constants) == pytest.approx(parts, abs=1e-13)
 
 
 def test_angles_wrap() -> None:

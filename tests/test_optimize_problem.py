@@ -11,7 +11,7 @@ import pytest
 from coopoc import V2X, Fleet, InputError, NoiseModel, Sensors, load_fleet, observe
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, SolveError, Status, pose, solve, solve_batch
 from coopoc.optimize.model.window import relative_std
-from coopoc.optimize.starts.initial import converted, initial_guess
+from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.links import to_vector, vector_cov
 from coopoc.world.recording import Recording
 
@@ -194,16 +194,6 @@ def test_the_limit_of_iterations_is_an_error_with_the_solution(backend: str) -> 
         solve(mixed(), backend, max_iterations=1)
     assert caught.value.solution.status is Status.MAX_ITERATIONS
     assert solve(mixed(), backend, throw=False, max_iterations=1).status is Status.MAX_ITERATIONS
-
-
-def test_converted_measurement_has_the_rotated_covariance(recording: Recording) -> None:
-    """Against vector_cov, J diag(std^2) J^T, wherever neither floor acts."""
-    problem = Problem.from_snapshot(recording, 20, 0)
-    _, edges = converted(problem).factors
-    cov = np.linalg.inv(np.swapaxes(edges.root, -1, -2) @ edges.root)
-    measured = problem.factors[1].z
-    assert (measured[:, 0] > 1).all()
-    assert cov == pytest.approx(vector_cov(measured, S2.relative_std), rel=1e-9, abs=1e-9)
 
 
 def test_a_start_is_the_least_squares_of_the_converted_vectors(recording: Recording) -> None:

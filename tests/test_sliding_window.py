@@ -20,11 +20,10 @@ from coopoc import (
     MovingHorizon,
     NoiseModel,
     Sensors,
-    load_fleet,
     observe,
 )
 from coopoc.evaluate.bounds import bound_rt_le, posterior_bound
-from coopoc.evaluate.metrics import nees, nees_inside, rt_le
+from coopoc.evaluate.metrics import nees_inside, rt_le
 from coopoc.kernels.stars.messages import ACCELERATION_STD
 from coopoc.optimize import Problem, solve
 from coopoc.world.links import spherical, to_vector, wrap
@@ -188,16 +187,6 @@ def test_the_horizon_is_at_its_minimum(formation: Fleet) -> None:
         assert track.x[run, -1, 0] == pytest.approx(best.x.reshape(6, 4, 3)[-1, 0], abs=5e-4)
         cov = np.linalg.inv(best.jac.T @ best.jac)[-12:-9, -12:-9]
         assert track.covariance[run, -1, 0] == pytest.approx(cov, abs=2e-3)
-
-
-def test_a_late_message_is_worth_more_in_its_place() -> None:
-    """In traffic that brakes, at 1 s of latency: fixes that are brought forward make a filter over-confident."""
-    fleet = load_fleet("town10").between(300, 400)
-    recording = observe(fleet, S2, V2X(max_neighbours=4, latency=1.0), runs=5, observers=[12])
-    late, forward = MovingHorizon(horizon=10)(recording, [12]), JointFilter()(recording, [12])
-    assert late.notes == ()
-    assert rt_le(late, fleet).mean() < 0.92 * rt_le(forward, fleet).mean()
-    assert nees(late, fleet).mean() < 3.6 < 5.0 < nees(forward, fleet).mean()
 
 
 def test_what_comes_after_the_horizon_is_dropped_and_counted(formation: Fleet) -> None:

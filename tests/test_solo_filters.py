@@ -40,14 +40,6 @@ def assert_known(found: Floats, runs: int, slack: float = 1.1) -> None:
     assert (found.std(axis=0, ddof=1) < slack * high * error).all()
 
 
-def test_a_known_variance_gives_kalman() -> None:
-    recording = seen((3.5, 3.5, 3.5), runs=3, steps=200)
-    sure = replace(FOREVER, assumed=recording.sensors, prior_weight=np.inf)
-    ours, theirs = sure(recording), Kalman("nominal")(recording)
-    np.testing.assert_allclose(ours.x, theirs.x, atol=1e-12)
-    np.testing.assert_allclose(ours.covariance, theirs.covariance, atol=1e-12)
-
-
 def test_a_jump_of_the_noise_is_followed() -> None:
     """From 1.5 to 3.5 m in the middle of the drive, and back: the mean of 100 runs forgets as 0.99^fixes."""
     low, high = seen((1.5,) * 3, runs=100), seen((3.5,) * 3, runs=100, seed=1)

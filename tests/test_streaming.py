@@ -178,21 +178,6 @@ def test_a_long_step_is_two_short_ones(name: str) -> None:
         np.testing.assert_allclose(once.step(Z, U, 0.1)[0], twice.step(Z, U, 0.1)[0], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", STARTS)
-def test_a_late_fix_of_a_noise_free_drive_is_no_error(name: str) -> None:
-    """Fixes of any age up to 0.5 s, also of the middle of a step, one in three missing, dt between 0.05 and 0.3 s."""
-    draw, stream, t, where = np.random.default_rng(1), STARTS[name](), [0.0], [Z]
-    stream.step(Z, U, 0.1)
-    for _ in range(60):
-        dt, u = draw.uniform(0.05, 0.3), draw.normal(0, 9, 3)
-        t.append(t[-1] + dt)
-        where.append(where[-1] + dt * u)
-        age = min(draw.uniform(0, 0.5), t[-1])
-        then = np.array([np.interp(t[-1] - age, t, column) for column in np.array(where).T])
-        x, _ = stream.step(None if draw.uniform() < 0.3 else then, u, dt, fix_age=age)
-        np.testing.assert_allclose(x, where[-1], atol=2e-5 if name == "net" else 1e-9)
-
-
 @pytest.mark.parametrize("name", ["nominal", "adaptive", "joint", "net"])
 def test_nothing_is_known_before_the_first_fix(name: str) -> None:
     stream = STARTS[name]()

@@ -10,13 +10,14 @@ import numpy as np
 
 from ..arrays import Floats
 from ..kernels.stars.cooperative_filter import run_filter
-from ..kernels.stars.cooperative_state import NO_GUARDS, Guards
+from ..kernels.stars.cooperative_state import NO_GUARDS, Guards, Model
 from ..kernels.stars.gaussian import REJECTED
+from ..kernels.stars.messages import ACCELERATION_STD, FORGOTTEN
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .baselines import solo_estimates
-from .egos import Estimate, assumptions, follow_egos, measurements, model_of
+from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
 from .noise_model import NoiseModel, resolve
 from .track import Track, check_options
 
@@ -105,3 +106,18 @@ def weight(q: Floats, gate: float) -> Any:
         return np.where(np.isnan(q), np.nan, 1.0)
     share = gate / np.maximum(q, gate)
     return np.where(q > REJECTED * gate, 0.01 * share, share)
+
+
+def model_of(known: NoiseModel, robust: bool) -> Model:
+    """The noise model of the kernel; of the textbook filter all errors are white."""
+    std, least = relative_noise(known)
+    white, own, common, time, bias, heading = np.ones(3), 0.0, 0.0, 1.0, 0.0, 0.0
+    if robust and known.sensors is not None:
+        sensors, std = known.sensors, np.array(std)
+        own, common = sensors.gnss_drift_std**2, sensors.gnss_common_std**2
+        white = np.square(sensors.gnss_std) / np.square(sensors.fix_std)
+        time = float(sensors.gnss_drift_time)
+        heading, bias = (float(value**2) for value in known.compass)
+        std[1] = np.sqrt(std[1] ** 2 - heading - bias)
+    shape = float(least), float(known.exact_relative), FORGOTTEN, ACCELERATION_STD
+    return Model(std, *shape, own, common, time, white, bias, heading, float(robust))

@@ -11,7 +11,6 @@ import numpy as np
 from tqdm import tqdm
 
 from ..arrays import Floats, Ints
-from ..kernels.stars.cooperative_state import Model
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
 from ..kernels.stars.relative import components
 from ..world.inbox import Inbox, inbox
@@ -139,18 +138,3 @@ def assumptions(recording: Recording, known: NoiseModel) -> Assumptions:
 def relative_noise(known: NoiseModel) -> tuple[Floats, float]:
     """(3,) m, rad, rad and the least range m of relative measurements, or nothing for unit matrices."""
     return (np.empty(0), 0.0) if known.sensors is None else (known.sensors.relative_std, known.sensors.min_range)
-
-
-def model_of(known: NoiseModel, robust: bool) -> Model:
-    """The noise model of the kernel; of the textbook filter all errors are white."""
-    std, least = relative_noise(known)
-    white, own, common, time, bias, heading = np.ones(3), 0.0, 0.0, 1.0, 0.0, 0.0
-    if robust and known.sensors is not None:
-        sensors, std = known.sensors, np.array(std)
-        own, common = sensors.gnss_drift_std**2, sensors.gnss_common_std**2
-        white = np.square(sensors.gnss_std) / np.square(sensors.fix_std)
-        time = float(sensors.gnss_drift_time)
-        heading, bias = (float(value**2) for value in known.compass)
-        std[1] = np.sqrt(std[1] ** 2 - heading - bias)
-    shape = float(least), float(known.exact_relative), FORGOTTEN, ACCELERATION_STD
-    return Model(std, *shape, own, common, time, white, bias, heading, float(robust))

@@ -33,8 +33,7 @@ from ..kernels.stars.cooperative_state import (
 from ..kernels.stars.cooperative_state import ESTIMATE as POSITION
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.relative import components
-from .cooperative_filter import CooperativeFilter
-from .egos import model_of
+from .cooperative_filter import CooperativeFilter, model_of
 from .joint_filter import JointFilter
 from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
 from .noise_model import constant_noise, motion_noise

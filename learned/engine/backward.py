@@ -5,30 +5,36 @@ from __future__ import annotations
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.kernels.compiling.compile import compiled, part, storage
+from coopoc.kernels.compiling.compile import compiled, part
 from coopoc.learned.engine import layers as on
 from coopoc.learned.engine.forward import Drives, State, follow, missing, new_state
 from coopoc.learned.engine.layers import (
     CELLS,
-    LANES,
+    FROM_H,
+    FROM_X,
+    GATES,
     PAD,
     SHORTEST,
-    Index,
     Net,
     Plan,
+    aligned,
     backward_layer,
-    columns_of,
+    collect,
     new_net,
+    pack,
     unpack,
 )
-from coopoc.learned.engine.optimiser import Found, Moments, Update, advance_row
+from coopoc.learned.engine.optimiser import Moments, Outcome, Update, advance_row
+from coopoc.learned.engine.tile import Index, apart
 
-PRODUCT = 128
+TRAINED = 4
+"""Drives of which one tape holds all steps: so few that the second cache holds it."""
+PRODUCT = 64
 """Rows of the tape whose gradients are added to those of the weights at once: so few that the cache holds them."""
 
 
 @compiled
-def descend(moments: Moments, plan: Plan, drives: Drives, target: Floats, found: Found, update: Update) -> None:
+def descend(moments: Moments, plan: Plan, drives: Drives, target: Floats, outcome: Outcome, update: Update) -> None:
     """Losses (R,) m^2 and gradients (R, P) of the models `update.rows`, and with step > 0 one step of AdamW.
 
     Args:
@@ -36,23 +42,22 @@ def descend(moments: Moments, plan: Plan, drives: Drives, target: Floats, found:
         plan: layers and tape of the nets.
         drives: of the R models.
         target: (T, R, B, 3) true positions m; with step -1 the gradient with respect to the estimates.
-        found: outputs.
+        outcome: losses and gradients, written here.
         update: the optimiser step.
     """
     theta, (steps, _, lanes, _) = moments.theta, drives.gnss.shape
-    net = new_net(plan, theta)
-    most = min(LANES, lanes)
+    net, total, one = new_net(plan, theta), new_net(plan, theta), np.ones(1, theta.dtype)
+    most = min(TRAINED, lanes)
     together = min(steps, max(1, PRODUCT // most))
-    tape = np.zeros((steps * most, plan.width), theta.dtype)
-    gradient = np.zeros((together * most, plan.width), theta.dtype)
-    x, state, adjoint = np.empty_like(drives.gnss), new_state(theta), new_state(theta)
+    tape = aligned(steps * most, plan.width, theta)
+    gradient = aligned(together * most, plan.width, theta)
+    x, state, adjoint = np.empty_like(drives.gnss), new_state(most, theta), new_state(most, theta)
     for r in range(len(update.rows)):
         unpack(theta[update.rows[r]], net)
-        found.gradient[r] = 0.0
-        tape[:] = 0.0
+        total.matrices[:] = 0.0
         loss = 0.0
-        for first in range(0, lanes, LANES):
-            rows = (r, first, min(LANES, lanes - first))
+        for first in range(0, lanes, most):
+            rows = (r, first, min(most, lanes - first))
             follow(net, tape, drives, x, rows, state, 1)
             for lane in range(first, first + rows[2]):
                 if update.step < 0:
@@ -66,22 +71,22 @@ def descend(moments: Moments, plan: Plan, drives: Drives, target: Floats, found:
             for end in range(steps, 0, -together):
                 begin = max(0, end - together)
                 part_of_tape = tape[begin * rows[2] : end * rows[2]]
-                gradient[:] = 0.0
                 back(net, part_of_tape, gradient, drives.gnss[:end], x, begin, rows, adjoint)
-                collect(net, part_of_tape, gradient, found.gradient[r])
-        found.losses[r] = loss
+                collect(total, part_of_tape, gradient, one)
+        pack(total, outcome.gradient[r])
+        outcome.losses[r] = loss
         if update.step > 0:
-            advance_row(moments, found, update, r)
+            advance_row(moments, outcome, update, r)
 
 
 @part
 def score(x: Floats, truth: Floats, r: Index, lane: Index) -> float:
     """Squared error m^2 of a drive, sum over components, mean over the steps with a truth, over the number of drives; x
-    becomes its gradient in x, 0 where the truth is not known (NaN)."""
-    known, squares, zero = 0, 0.0, x.dtype.type(0.0)
+    becomes its gradient in x, 0 where there is no truth (NaN)."""
+    measured, squares, zero = 0, 0.0, x.dtype.type(0.0)
     for t in range(x.shape[0]):
-        known += not np.isnan(truth[t, r, lane, 0])
-    share = 1.0 / (max(known, 1) * x.shape[2])
+        measured += not np.isnan(truth[t, r, lane, 0])
+    share = 1.0 / (max(measured, 1) * x.shape[2])
     scale = x.dtype.type(2.0 * share)
     for t in range(x.shape[0]):
         for i in range(3):
@@ -89,36 +94,6 @@ def score(x: Floats, truth: Floats, r: Index, lane: Index) -> float:
             x[t, r, lane, i] = scale * error
             squares += float(error * error)
     return float(share * squares)
-
-
-@storage
-def collect(net: Net, tape: Floats, gradient: Floats, total: Floats) -> None:
-    """Add to the gradient (P,) of the weights that of every layer: dW = dy^T x and db = dy, summed over the steps."""
-    steps = len(tape)
-    for layer in range(len(net.layers)):
-        weight, bias, outputs, inputs, _, source, to, _ = columns_of(net, layer)
-        dy, x = np.empty((steps, outputs), tape.dtype), np.empty((steps, inputs), tape.dtype)
-        copy(gradient, to, dy)
-        copy(tape, source, x)
-        accumulate(np.dot(dy.T, x).reshape(-1), total[weight : weight + outputs * inputs])
-        for t in range(steps):
-            accumulate(dy[t], total[bias : bias + outputs])
-
-
-@part
-def copy(source: Floats, first: Index, target: Floats) -> None:
-    """Columns (T, n) of an array from `first` on."""
-    for t in range(len(target)):
-        row, into = source[t, first : first + target.shape[1]], target[t]
-        for j in range(len(into)):
-            into[j] = row[j]
-
-
-@part
-def accumulate(values: Floats, total: Floats) -> None:
-    """total (n,) += values (n,)."""
-    for i in range(len(total)):
-        total[i] += values[i]
 
 
 @part
@@ -143,8 +118,8 @@ def back(
         for lane in range(lanes):
             for i in range(3):
                 adjoint.x[lane, i] += adjoints[t, s, first + lane, i]
-            if not missing(gnss, (t, s, first + lane)):
-                move_back(net, tape[row + lane], gradient[row + lane], adjoint, lane)
+            gone = missing(gnss, (t, s, first + lane))
+            move_back(net, tape[row + lane], gradient[row + lane], adjoint, lane, gone)
         think_back(net, tape, gradient, row, lanes)
         for lane in range(lanes):
             if missing(gnss, (t, s, first + lane)):
@@ -156,18 +131,22 @@ def back(
 
 
 @part
-def move_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index) -> None:
-    """`forward.move` backwards: the gradient of gain, innovation and new states of a lane."""
-    columns = net.columns
+def move_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index, gone: bool) -> None:
+    """`forward.move` backwards: the gradient of gain, innovation and new states of a lane; without a fix it is zero."""
+    columns, zero = net.columns, tape.dtype.type(0.0)
     gain, residual = columns[on.GAIN], columns[on.RESIDUAL]
     process, innovation, posterior = columns[on.PROCESS], columns[on.INNOVATION], columns[on.POSTERIOR]
-    for i in range(3):
-        for j in range(3):
-            gradient[gain + 3 * i + j] = adjoint.x[lane, i] * tape[residual + j]
-            gradient[residual + j] += adjoint.x[lane, i] * tape[gain + 3 * i + j]
+    for j in range(3):
+        gradient[residual + j] = zero
+        for i in range(3):
+            along = zero if gone else adjoint.x[lane, i]
+            gradient[gain + 3 * i + j] = along * tape[residual + j]
+            gradient[residual + j] += along * tape[gain + 3 * i + j]
+    gradient[columns[on.EVOLVED] : columns[on.PRIOR_OLD]] = zero
     for j in range(CELLS):
-        gradient[process + j], gradient[innovation + j] = adjoint.process[lane, j], adjoint.innovation[lane, j]
-        gradient[posterior + j] = adjoint.prior[lane, j]
+        gradient[process + j] = zero if gone else adjoint.process[lane, j]
+        gradient[innovation + j] = zero if gone else adjoint.innovation[lane, j]
+        gradient[posterior + j] = zero if gone else adjoint.prior[lane, j]
 
 
 @part
@@ -195,22 +174,28 @@ def gru_back(
     net: Net, layer: Index, field: Index, to: Index, tape: Floats, gradient: Floats, row: Index, lanes: Index
 ) -> None:
     """`forward.gru` backwards."""
-    old, x, h = net.columns[field], net.columns[field + 1], net.columns[field + 2]
-    gates, new, one = net.columns[field + 3], net.columns[to], tape.dtype.type(1.0)
+    old, new = net.columns[field], net.columns[to]
     for lane in range(row, row + lanes):
-        gate, after = tape[lane, gates : gates + 3 * PAD], gradient[lane, new : new + CELLS]
-        before, kept = tape[lane, old : old + CELLS], tape[lane, h + 2 * CELLS : h + 3 * CELLS]
-        in_x, in_h = gradient[lane, x : x + 3 * CELLS], gradient[lane, h : h + 3 * CELLS]
-        in_old = gradient[lane, old : old + CELLS]
-        for j in range(CELLS):
-            reset, keep, fresh = gate[j], gate[PAD + j], gate[2 * PAD + j]
-            candidate = after[j] * (one - keep) * (one - fresh * fresh)
-            in_x[j] = in_h[j] = candidate * kept[j] * reset * (one - reset)
-            in_x[CELLS + j] = in_h[CELLS + j] = after[j] * (before[j] - fresh) * keep * (one - keep)
-            in_x[2 * CELLS + j], in_h[2 * CELLS + j] = candidate, candidate * reset
-            in_old[j] = after[j] * keep
+        after, unit = gradient[lane, new : new + CELLS], gradient[lane, old : old + GATES]
+        blend_back(tape[lane, old : old + 8 * PAD], after, unit)
     backward_layer(net, layer, tape, gradient, row, lanes)
     backward_layer(net, layer + 1, tape, gradient, row, lanes)
+
+
+@part
+def blend_back(unit: Floats, after: Floats, gradient: Floats) -> None:
+    """`forward.blend` backwards, with the gradient of the new state."""
+    apart()
+    one = unit.dtype.type(1.0)
+    for j in range(CELLS):
+        reset, keep, fresh = unit[GATES + j], unit[GATES + PAD + j], unit[GATES + 2 * PAD + j]
+        candidate = after[j] * (one - keep) * (one - fresh * fresh)
+        opened = candidate * unit[FROM_H + 2 * CELLS + j] * reset * (one - reset)
+        kept = after[j] * (unit[j] - fresh) * keep * (one - keep)
+        gradient[j] = after[j] * keep
+        gradient[FROM_X + j] = gradient[FROM_H + j] = opened
+        gradient[FROM_X + CELLS + j] = gradient[FROM_H + CELLS + j] = kept
+        gradient[FROM_X + 2 * CELLS + j], gradient[FROM_H + 2 * CELLS + j] = candidate, candidate * reset
 
 
 @part

@@ -11,18 +11,24 @@ from coopoc.kernels.compiling.compile import compiled, part, storage
 from coopoc.learned.engine import layers as on
 from coopoc.learned.engine.layers import (
     CELLS,
-    LANES,
+    FROM_H,
+    FROM_X,
+    GATES,
     PAD,
     SHORTEST,
-    Index,
     Net,
     Plan,
+    aligned,
     forward_layer,
     new_net,
     sigmoid,
     tanh,
     unpack,
 )
+from coopoc.learned.engine.tile import Index, apart
+
+FOLLOWED = 16
+"""Drives that are followed together, so that weights are fetched once for them."""
 
 
 class Drives(NamedTuple):
@@ -35,7 +41,7 @@ class Drives(NamedTuple):
 
 
 class State(NamedTuple):
-    """`gain_net.Memory` of LANES drives, changed in place: GRU states (LANES, 9) and positions (LANES, 3) m."""
+    """`gain_net.Memory` of L drives, changed in place: GRU states (L, 9) and positions (L, 3) m."""
 
     process: Floats
     prior: Floats
@@ -47,22 +53,21 @@ class State(NamedTuple):
 
 
 @storage
-def new_state(like: Floats) -> State:
+def new_state(lanes: Index, like: Floats) -> State:
     """Memory of a state."""
-    cells, positions = np.zeros((3, LANES, CELLS), like.dtype), np.zeros((4, LANES, 3), like.dtype)
+    cells, positions = np.zeros((3, lanes, CELLS), like.dtype), np.zeros((4, lanes, 3), like.dtype)
     return State(cells[0], cells[1], cells[2], positions[0], positions[1], positions[2], positions[3])
 
 
 @compiled
 def forward(theta: Floats, plan: Plan, drives: Drives, x: Floats) -> None:
     """Estimates x (T, S, B, 3) m of the models of theta (S, P); the tape holds one step only."""
-    net = new_net(plan, x)
-    tape, state = np.zeros((LANES, plan.width), x.dtype), new_state(x)
+    net, lanes = new_net(plan, x), min(FOLLOWED, x.shape[2])
+    tape, state = aligned(lanes, plan.width, x), new_state(lanes, x)
     for s in range(len(theta)):
         unpack(theta[s], net)
-        for first in range(0, x.shape[2], LANES):
-            tape[:] = 0.0
-            follow(net, tape, drives, x, (s, first, min(LANES, x.shape[2] - first)), state, 0)
+        for first in range(0, x.shape[2], lanes):
+            follow(net, tape, drives, x, (s, first, min(lanes, x.shape[2] - first)), state, 0)
 
 
 @part
@@ -137,7 +142,7 @@ def think(net: Net, state: State, tape: Floats, row: Index, lanes: Index) -> Non
     forward_layer(net, on.L_EVOLUTION, tape, row, lanes)
     gru(net, on.L_PRIOR_X, on.PRIOR_OLD, on.PRIOR, state.prior, tape, row, lanes)
     forward_layer(net, on.L_EXPECTED, tape, row, lanes)
-    forward_layer(net, on.L_OBSERVATION, tape, row, lanes)
+    forward_layer(net, on.L_OBSERVATION, tape, row, lanes)  # after `expected`, whose last vector reaches into it
     gru(net, on.L_INNOVATION_X, on.INNOVATION_OLD, on.INNOVATION, state.innovation, tape, row, lanes)
     forward_layer(net, on.L_HIDDEN, tape, row, lanes)
     forward_layer(net, on.L_GAIN, tape, row, lanes)
@@ -154,30 +159,32 @@ def gru(net: Net, layer: Index, field: Index, to: Index, state: Floats, tape: Fl
     """r, z = sigmoid(W x + U h), n = tanh(W x + r (U h)), h' = n + z (h - n), biases in W and U.
 
     The fields of a GRU follow each other: old state, W x, U h, gates. Gates are computed over PAD columns, of which
-    nine count.
+    nine count, because loops of such a length vectorise.
     """
-    old, x, h, gates = net.columns[field], net.columns[field + 1], net.columns[field + 2], net.columns[field + 3]
-    begin, real = net.columns[to], tape.dtype.type
+    old, begin = net.columns[field], net.columns[to]
     for lane in range(lanes):
         for j in range(CELLS):
             tape[row + lane, old + j] = state[lane, j]
     forward_layer(net, layer, tape, row, lanes)
     forward_layer(net, layer + 1, tape, row, lanes)
     for lane in range(row, row + lanes):
-        given, kept, gate = (
-            tape[lane, x : x + 3 * PAD],
-            tape[lane, h : h + 3 * PAD],
-            tape[lane, gates : gates + 3 * PAD],
-        )
-        before, new = tape[lane, old : old + CELLS], tape[lane, begin : begin + CELLS]
-        for j in range(PAD):
-            gate[j] = sigmoid(given[j] + kept[j], real)
-        for j in range(PAD):
-            gate[PAD + j] = sigmoid(given[CELLS + j] + kept[CELLS + j], real)
-        for j in range(PAD):
-            gate[2 * PAD + j] = tanh(given[2 * CELLS + j] + gate[j] * kept[2 * CELLS + j], real)
-        for j in range(CELLS):
-            new[j] = gate[2 * PAD + j] + gate[PAD + j] * (before[j] - gate[2 * PAD + j])
+        blend(tape[lane, old : old + 8 * PAD], tape[lane, begin : begin + CELLS])
+
+
+@part
+def blend(unit: Floats, new: Floats) -> None:
+    """Gates and new state of a GRU from its fields."""
+    apart()
+    real = new.dtype.type
+    for j in range(PAD):
+        unit[GATES + j] = sigmoid(unit[FROM_X + j] + unit[FROM_H + j], real)
+    for j in range(PAD):
+        unit[GATES + PAD + j] = sigmoid(unit[FROM_X + CELLS + j] + unit[FROM_H + CELLS + j], real)
+    for j in range(PAD):
+        fresh = unit[FROM_X + 2 * CELLS + j] + unit[GATES + j] * unit[FROM_H + 2 * CELLS + j]
+        unit[GATES + 2 * PAD + j] = tanh(fresh, real)
+    for j in range(CELLS):
+        new[j] = unit[GATES + 2 * PAD + j] + unit[GATES + PAD + j] * (unit[j] - unit[GATES + 2 * PAD + j])
 
 
 @part

@@ -1,8 +1,8 @@
 """Layers of a GainNet for the compiled engine: their numbers in flat weights, their columns on the tape, products.
 
 The tape has a row of numbers per step and drive: inputs and outputs of every layer, side by side, at columns that
-`plan_of` gives; the gradient of the tape has the same columns. A layer is y = W x + b, with ReLU where the net has one;
-the matrix of a layer with more outputs than inputs is transposed, so that the longer axis always runs along memory.
+`plan_of` gives; the gradient of the tape has the same columns. A layer is y = W x + b, with ReLU where the net has one.
+Products write whole vectors, so that a field is followed by room or by what is written later.
 """
 
 from __future__ import annotations
@@ -14,7 +14,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from coopoc.arrays import Floats, Ints
-from coopoc.kernels.compiling.compile import part, storage, summing
+from coopoc.kernels.compiling.compile import inside, part, storage
+from coopoc.learned.engine.tile import Index, apart, product
 
 SIZE = 3
 """Components of state and measurement, m = n = 3."""
@@ -22,12 +23,12 @@ CELLS = SIZE * SIZE
 """Entries of each covariance-like GRU state."""
 SHORTEST = 1e-12
 """Length in m up to which a vector has no direction: its feature is zero and has no gradient."""
-LANES = 4
-"""Drives that one tape holds."""
 PAD = 16
 """Columns of a gate of a GRU: more than the nine that count, because loops of such a length vectorise."""
-Index: TypeAlias = int | np.integer[Any]
-"""A number of a layer, field, row or column: Python's, or NumPy's from a table of them."""
+FROM_X, FROM_H, GATES = PAD, 3 * PAD, 5 * PAD
+"""Columns of W x, U h and the gates of a GRU from that of its old state."""
+ZEROS = 512
+"""Zeros at the end of the matrices, as many as the longest row has entries."""
 Shapes: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
 """Names and shapes of a net's parameters, in the order of theta."""
 
@@ -40,6 +41,8 @@ FIELDS = (
 """Fields of the tape, in their order: [process, evolved], [expected, observed], [prior, innovation, gain] and
 [prior_copy, back] stand side by side, because layers read two of them at once. `changes` holds the directions of the
 four changes: of the fix, innovation, evolution, update."""
+TOGETHER = ("process", "expected", "prior", "innovation", "prior_copy")
+"""Fields that end where the next one begins; the others have room for the last vector of what is written there."""
 (
     CHANGES,
     CORRECTED,
@@ -71,23 +74,23 @@ four changes: of the fix, innovation, evolution, update."""
 ) = np.arange(len(FIELDS))
 
 LAYERS = (
-    ("update.weight", "changes", 9, "corrected", True),
-    ("evolution.weight", "changes", 6, "evolved", True),
-    ("observation.weight", "changes", 0, "observed", True),
-    ("process.weight_ih", "corrected", 0, "process_x", False),
-    ("process.weight_hh", "process_old", 0, "process_h", False),
-    ("prior.weight_ih", "process", 0, "prior_x", False),
-    ("prior.weight_hh", "prior_old", 0, "prior_h", False),
-    ("prior_to_innovation.weight", "prior", 0, "expected", True),
-    ("innovation.weight_ih", "expected", 0, "innovation_x", False),
-    ("innovation.weight_hh", "innovation_old", 0, "innovation_h", False),
-    ("gain_hidden.weight", "prior", 0, "hidden", True),
-    ("gain.weight", "hidden", 0, "gain", False),
-    ("posterior_hidden.weight", "innovation", 0, "back", True),
-    ("posterior.weight", "prior_copy", 0, "posterior", True),
+    ("update.weight", "changes", 9, "corrected", True, True),
+    ("evolution.weight", "changes", 6, "evolved", True, True),
+    ("observation.weight", "changes", 0, "observed", True, True),
+    ("process.weight_ih", "corrected", 0, "process_x", False, True),
+    ("process.weight_hh", "process_old", 0, "process_h", False, False),
+    ("prior.weight_ih", "process", 0, "prior_x", False, False),
+    ("prior.weight_hh", "prior_old", 0, "prior_h", False, False),
+    ("prior_to_innovation.weight", "prior", 0, "expected", True, False),
+    ("innovation.weight_ih", "expected", 0, "innovation_x", False, True),
+    ("innovation.weight_hh", "innovation_old", 0, "innovation_h", False, False),
+    ("gain_hidden.weight", "prior", 0, "hidden", True, False),
+    ("gain.weight", "hidden", 0, "gain", False, True),
+    ("posterior_hidden.weight", "innovation", 0, "back", True, False),
+    ("posterior.weight", "prior_copy", 0, "posterior", True, True),
 )
 """Layers in the order of `L_UPDATE` and the rest: parameter, field and first column of the inputs, field of the
-outputs, whether a ReLU follows."""
+outputs, whether a ReLU follows, whether backward finds no gradient at the inputs yet."""
 (
     L_UPDATE,
     L_EVOLUTION,
@@ -104,27 +107,26 @@ outputs, whether a ReLU follows."""
     L_BACK,
     L_POSTERIOR,
 ) = np.arange(len(LAYERS))
-WEIGHT, BIAS, OUTPUTS, INPUTS, TALL, FROM, TO, RELU = np.arange(8)
-"""Columns of `Net.layers`: begin of weight and bias in theta, sizes, whether the matrix is transposed, columns of
-inputs and outputs on the tape, whether a ReLU follows."""
 
 
 class Plan(NamedTuple):
-    """For nets of one shape: layers (14, 8), first column of each field, columns of the tape, shape of `Net.matrices`,
-    number of parameters."""
+    """For nets of one shape: layers (14, 11), first column of each field, columns of the tape, length of
+    `Net.matrices`, number of parameters."""
 
     layers: Ints
     columns: Ints
     width: int
-    size: tuple[int, int, int]
+    size: int
     parameters: int
 
 
 class Net(NamedTuple):
-    """Matrices of one net with padded rows, all its weights (P,), and what `Plan` says of them."""
+    """All matrices of one net with rows of whole vectors, and what `Plan` says of them.
+
+    Of each layer stand one after the other W^T, which forward reads, W, which backward reads, and b.
+    """
 
     matrices: Floats
-    weights: Floats
     layers: Ints
     columns: Ints
 
@@ -136,132 +138,134 @@ def plan_of(shapes: Shapes) -> Plan:
     for name, shape in shapes:
         begin[name] = at
         at += math.prod(shape)
-    widths = {target: sizes[name][0] for name, _, _, target, _ in LAYERS}
-    widths |= {name: 3 * PAD for name in FIELDS if name.endswith("gates")} | {
-        "changes": 12,
-        "residual": 3,
-        "lengths": 4,
-    }
-    ends = np.cumsum([widths.get(name, CELLS) for name in FIELDS])
-    columns = dict(zip(FIELDS, [0, *ends[:-1].tolist()], strict=True))
-    rows = []
-    for name, source, first, target, relu in LAYERS:
+    widths = {target: sizes[name][0] for name, _, _, target, _, _ in LAYERS}
+    widths |= {name: 3 * PAD for name in FIELDS if name.endswith("gates")} | {"changes": 9 + PAD}
+    columns, end = {}, 0
+    for name in FIELDS:
+        columns[name], width = end, widths.get(name, CELLS)
+        end += width if name in TOGETHER else whole(end + whole(width)) - end
+    rows, size = [], 0
+    for name, source, first, target, relu, begins in LAYERS:
         outputs, inputs = sizes[name]
+        back = size + inputs * whole(outputs)
+        bias = back + outputs * whole(inputs)
         starts = begin[name], begin[name.replace("weight", "bias")]
-        rows.append([*starts, outputs, inputs, outputs > inputs, columns[source] + first, columns[target], relu])
-    longest = (max(max(sizes[name]) for name, *_ in LAYERS) // PAD + 2) * PAD
-    size = len(LAYERS), max(min(sizes[name]) for name, *_ in LAYERS) + CELLS, longest
-    return Plan(np.array(rows), np.array(list(columns.values())), int(ends[-1]) // PAD * PAD + 3 * PAD, size, at)
+        rows.append(
+            [*starts, outputs, inputs, size, back, bias, columns[source] + first, columns[target], relu, begins]
+        )
+        size = bias + whole(outputs)
+    return Plan(np.array(rows), np.array(list(columns.values())), end, size, at)
+
+
+def whole(columns: int) -> int:
+    """Columns rounded up to whole vectors."""
+    return -(-columns // PAD) * PAD
+
+
+@storage
+def aligned(rows: Index, columns: Index, like: Floats) -> Floats:
+    """Zeros that begin where a vector may begin: one that crosses a line of the cache takes twice as long.
+
+    What stands in new memory may be denormal, with which every operation takes a hundred times as long.
+    """
+    memory = np.zeros(rows * columns + PAD, like.dtype)
+    first = -(memory.ctypes.data // memory.itemsize) % PAD
+    return memory[first : first + rows * columns].reshape(rows, columns)
 
 
 @storage
 def new_net(plan: Plan, like: Floats) -> Net:
     """Memory of the weights of one net."""
-    return Net(np.zeros(plan.size, like.dtype), np.zeros(plan.parameters, like.dtype), plan.layers, plan.columns)
+    return Net(aligned(1, plan.size + ZEROS, like)[0], plan.layers, plan.columns)
 
 
 @part
 def unpack(theta: Floats, net: Net) -> None:
-    """Copy flat weights (P,), with the matrices of tall layers transposed."""
-    for i in range(len(theta)):
-        net.weights[i] = theta[i]
+    """Copy flat weights (P,) into the matrices."""
     for layer in range(len(net.layers)):
-        matrix, (at, _, outputs, inputs, tall, _, _, _) = net.matrices[layer], columns_of(net, layer)
+        weight, bias, outputs, inputs, ahead, back, start, _, _, _, _ = columns_of(net, layer)
+        across, along = outputs + -outputs % PAD, inputs + -inputs % PAD
         for o in range(outputs):
+            net.matrices[start + o] = theta[bias + o]
             for i in range(inputs):
-                if tall:
-                    matrix[i, o] = theta[at + o * inputs + i]
-                else:
-                    matrix[o, i] = theta[at + o * inputs + i]
+                value = theta[weight + o * inputs + i]
+                net.matrices[ahead + i * across + o] = net.matrices[back + o * along + i] = value
 
 
-@part
-def whole(rows: Index) -> Index:
-    """Rows of a matrix with those of zeros behind it."""
-    return (rows + CELLS - 1) // CELLS * CELLS
-
-
-@part
+@inside
 def columns_of(net: Net, name: Index) -> tuple[Any, ...]:
     """A row of `Net.layers`."""
     row = net.layers[name]
-    return row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7]
+    return row[0], row[1], row[2], row[3], row[4], row[5], row[6], row[7], row[8], row[9], row[10]
 
 
-@part
+@inside
 def forward_layer(net: Net, name: Index, tape: Floats, row: Index, lanes: Index) -> None:
     """y = W x + b of a layer at so many rows of the tape."""
-    _, bias, outputs, inputs, tall, source, to, relu = columns_of(net, name)
-    start, matrix, zero = net.weights[bias : bias + outputs], net.matrices[name], tape.dtype.type(0.0)
-    for lane in range(row, row + lanes):
-        y = tape[lane, to : to + outputs]
-        for o in range(outputs):
-            y[o] = start[o]
-    if tall:
-        add_rows(tape, to, tape, source, matrix[: whole(inputs)], outputs, row, lanes)
-    else:
-        add_dots(tape, to, tape, source, matrix[: whole(outputs)], inputs, row, lanes)
-    if relu:
-        for lane in range(row, row + lanes):
-            y = tape[lane, to : to + outputs]
-            for o in range(outputs):
-                y[o] = zero if y[o] < zero else y[o]
+    _, _, outputs, inputs, ahead, _, start, source, to, relu, _ = columns_of(net, name)
+    width, m, real = tape.shape[1], net.matrices, tape.dtype.type
+    x, y = (tape, row * width + source, width), (tape, row * width + to, width)
+    floor = real(0.0) if relu else real(-np.inf)
+    product(y, x, 1, (m, ahead, outputs + -outputs % PAD), (m, start, 0), (lanes, outputs, inputs), floor)
 
 
 @part
 def backward_layer(net: Net, name: Index, tape: Floats, gradient: Floats, row: Index, lanes: Index) -> None:
-    """Add W^T dy to dx of a layer at so many rows; where its ReLU is shut dy becomes zero."""
-    _, _, outputs, inputs, tall, source, to, relu = columns_of(net, name)
-    matrix, zero = net.matrices[name], tape.dtype.type(0.0)
+    """Add W^T dy to dx of a layer at so many rows, or write it if no gradient stands there yet; where the ReLU of the
+    layer is shut dy becomes zero."""
+    _, _, outputs, inputs, _, back, _, source, to, relu, begins = columns_of(net, name)
+    width = tape.shape[1]
     if relu:
         for lane in range(row, row + lanes):
-            y, dy = tape[lane, to : to + outputs], gradient[lane, to : to + outputs]
-            for o in range(outputs):
-                dy[o] = dy[o] if y[o] > zero else zero
-    if tall:
-        add_dots(gradient, source, gradient, to, matrix[: whole(inputs)], outputs, row, lanes)
+            shut(tape[lane, to : to + outputs], gradient[lane, to : to + outputs])
+    dx, dy, w = (gradient, row * width + source, width), (gradient, row * width + to, width), net.matrices
+    b, size, floor = (w, back, inputs + -inputs % PAD), (lanes, inputs, outputs), tape.dtype.type(-np.inf)
+    if begins:
+        product(dx, dy, 1, b, (w, len(w) - ZEROS, 0), size, floor)
     else:
-        add_rows(gradient, source, gradient, to, matrix[: whole(outputs)], inputs, row, lanes)
+        product(dx, dy, 1, b, dx, size, floor)
 
 
-@summing
-def add_rows(
-    target: Floats, to: Index, given: Floats, source: Index, matrix: Floats, n: Index, row: Index, lanes: Index
-) -> None:
-    """y (n,) += x (m,) M (m, n) in rows of two arrays; nine rows of M at a time, which all lanes share.
+@part
+def shut(y: Floats, dy: Floats) -> None:
+    """dy = 0 where y is not positive."""
+    apart()
+    for o in range(len(dy)):
+        dy[o] = dy[o] if y[o] > 0.0 else dy.dtype.type(0.0)
 
-    The zeros behind a matrix let whole blocks of nine rows and PAD columns count.
+
+@part
+def collect(total: Net, tape: Floats, gradient: Floats, one: Floats) -> None:
+    """Add to the gradient of the weights that of every layer: dW = dy^T x and db = dy, summed over the rows.
+
+    dW^T stands in place of W^T where it has the longer rows, else dW in place of W.
     """
-    m, n = len(matrix), (n + PAD - 1) // PAD * PAD
-    for p in range(0, m, 9):
-        w = matrix[p : p + 9]
-        for lane in range(row, row + lanes):
-            x, y = given[lane, source + p : source + p + 9], target[lane, to : to + n]
-            x0, x1, x2, x3, x4, x5, x6, x7, x8 = x[0], x[1], x[2], x[3], x[4], x[5], x[6], x[7], x[8]
-            for j in range(n):
-                s = x0 * w[0, j] + x1 * w[1, j] + x2 * w[2, j]
-                t = x3 * w[3, j] + x4 * w[4, j] + x5 * w[5, j]
-                y[j] += s + t + (x6 * w[6, j] + x7 * w[7, j] + x8 * w[8, j])
+    steps, width = tape.shape
+    m, floor = total.matrices, tape.dtype.type(-np.inf)
+    for layer in range(len(total.layers)):
+        _, _, outputs, inputs, ahead, back, start, source, to, _, _ = columns_of(total, layer)
+        x, dy = (tape, source, 1), (gradient, to, 1)
+        if outputs > inputs:
+            out = (m, ahead, outputs + -outputs % PAD)
+            product(out, x, width, (gradient, to, width), out, (inputs, outputs, steps), floor)
+        else:
+            out = (m, back, inputs + -inputs % PAD)
+            product(out, dy, width, (tape, source, width), out, (outputs, inputs, steps), floor)
+        out = (m, start, 0)
+        product(out, (one, 0, 0), 0, (gradient, to, width), out, (1, outputs, steps), floor)
 
 
-@summing
-def add_dots(
-    target: Floats, to: Index, given: Floats, source: Index, matrix: Floats, n: Index, row: Index, lanes: Index
-) -> None:
-    """y (m,) += M (m, n) x (n,), as `add_rows`."""
-    m, n = len(matrix), (n + PAD - 1) // PAD * PAD
-    for p in range(0, m, 9):
-        w = matrix[p : p + 9]
-        for lane in range(row, row + lanes):
-            x, y = given[lane, source : source + n], target[lane, to + p : to + p + 9]
-            s0 = s1 = s2 = s3 = s4 = s5 = s6 = s7 = s8 = target.dtype.type(0.0)
-            for j in range(n):
-                s0, s1, s2 = s0 + w[0, j] * x[j], s1 + w[1, j] * x[j], s2 + w[2, j] * x[j]
-                s3, s4, s5 = s3 + w[3, j] * x[j], s4 + w[4, j] * x[j], s5 + w[5, j] * x[j]
-                s6, s7, s8 = s6 + w[6, j] * x[j], s7 + w[7, j] * x[j], s8 + w[8, j] * x[j]
-            y[0], y[1], y[2] = y[0] + s0, y[1] + s1, y[2] + s2
-            y[3], y[4], y[5] = y[3] + s3, y[4] + s4, y[5] + s5
-            y[6], y[7], y[8] = y[6] + s6, y[7] + s7, y[8] + s8
+@part
+def pack(total: Net, gradient: Floats) -> None:
+    """Copy what `collect` has added to the gradient (P,) of the flat weights."""
+    for layer in range(len(total.layers)):
+        weight, bias, outputs, inputs, ahead, back, start, _, _, _, _ = columns_of(total, layer)
+        across, along = outputs + -outputs % PAD, inputs + -inputs % PAD
+        for o in range(outputs):
+            gradient[bias + o] = total.matrices[start + o]
+            for i in range(inputs):
+                at = ahead + i * across + o if outputs > inputs else back + o * along + i
+                gradient[weight + o * inputs + i] = total.matrices[at]
 
 
 @part

@@ -32,7 +32,7 @@ class Update(NamedTuple):
     limit: float
 
 
-class Found(NamedTuple):
+class Outcome(NamedTuple):
     """Outputs of a step: gradients (R, P), losses (R,), whether both are finite (R,)."""
 
     gradient: Floats
@@ -41,29 +41,29 @@ class Found(NamedTuple):
 
 
 @compiled
-def advance(moments: Moments, found: Found, update: Update) -> None:
+def advance(moments: Moments, outcome: Outcome, update: Update) -> None:
     """`schedule.advance`: change weights and moments (S, P) of the rows (R,) in place by their gradients (R, P).
 
-    Where loss or gradient is not finite, `found.finite` becomes false and nothing is changed.
+    Where loss or gradient is not finite, `outcome.finite` becomes false and nothing is changed.
     """
     for r in range(len(update.rows)):
-        advance_row(moments, found, update, r)
+        advance_row(moments, outcome, update, r)
 
 
 @part
-def advance_row(moments: Moments, found: Found, update: Update, r: int) -> None:
+def advance_row(moments: Moments, outcome: Outcome, update: Update, r: int) -> None:
     """`advance` of row r.
 
     References:
         Loshchilov and Hutter, ICLR 2019, algorithm 2.
     """
-    at, gradient = update.rows[r], found.gradient[r]
+    at, gradient = update.rows[r], outcome.gradient[r]
     theta, first, second = moments.theta[at], moments.first[at], moments.second[at]
     real = theta.dtype.type
     l2 = real(2.0 * update.l2)
     square = squared_norm(theta, gradient, l2)
-    found.finite[r] = np.isfinite(found.losses[r]) and not np.isnan(square)
-    if not found.finite[r]:
+    outcome.finite[r] = np.isfinite(outcome.losses[r]) and not np.isnan(square)
+    if not outcome.finite[r]:
         return
     scale = min(real(update.limit) / (np.sqrt(square) + real(1e-6)), real(1.0))
     keep = real(1.0 - update.rates[r] * update.decay)

@@ -17,7 +17,7 @@ from ..training.schedule import Moving, Schedule, update_of
 from . import backward, forward
 from .forward import Drives
 from .layers import Shapes, plan_of
-from .optimiser import Found, Moments, Update
+from .optimiser import Moments, Outcome, Update
 
 _NONE = np.empty(0)
 
@@ -65,8 +65,8 @@ def loss_and_gradient(theta: Tensor, shapes: Shapes, batch: Batch) -> tuple[Tens
     >>> loss_and_gradient(torch.zeros(1, 19938), GainNet().shapes, Batch(still, still, still, still[0], 0.1))[0]
     tensor([0.])
     """
-    found = _descend(theta, shapes, batch, 0)
-    return torch.from_numpy(found.losses), torch.from_numpy(found.gradient)
+    outcome = _descend(theta, shapes, batch, 0)
+    return torch.from_numpy(outcome.losses), torch.from_numpy(outcome.gradient)
 
 
 def descend(
@@ -74,17 +74,17 @@ def descend(
 ) -> tuple[Tensor, Tensor]:
     """One optimiser step in place of the rows (R,) of weights and moments, as `Gain.descend`."""
     moments = Moments(*(a.numpy() for a in moving))
-    found = _step(moving.theta, shapes, batch, moments, update_of(rows, step, rates, schedule))
-    return torch.from_numpy(found.losses), torch.from_numpy(found.finite)
+    outcome = _step(moving.theta, shapes, batch, moments, update_of(rows, step, rates, schedule))
+    return torch.from_numpy(outcome.losses), torch.from_numpy(outcome.finite)
 
 
-def _descend(theta: Tensor, shapes: Shapes, batch: Batch, step: int) -> Found:
+def _descend(theta: Tensor, shapes: Shapes, batch: Batch, step: int) -> Outcome:
     """Gradients (S, P) without an optimiser step, for step 0 with losses."""
     update = Update(np.arange(len(theta)), step, _NONE, 0.0, 0.0, 0.0)
     return _step(theta, shapes, batch, Moments(*[_array(theta, theta.dtype)] * 3), update)
 
 
-def _step(theta: Tensor, shapes: Shapes, batch: Batch, moments: Moments, update: Update) -> Found:
+def _step(theta: Tensor, shapes: Shapes, batch: Batch, moments: Moments, update: Update) -> Outcome:
     """Losses (R,) and gradients (R, P) of the rows, and an optimiser step if the update asks for one."""
     plan, models = plan_of(shapes), len(update.rows)
     drives = _checked(theta, shapes, models, batch.gnss, batch.velocity, batch.x0, batch.dt)
@@ -92,9 +92,9 @@ def _step(theta: Tensor, shapes: Shapes, batch: Batch, moments: Moments, update:
     if truth.shape != drives.gnss.shape:
         raise InputError("truth", f"shape {truth.shape}", f"must be {drives.gnss.shape}", "Give one position per fix.")
     gradient, losses = np.empty((models, plan.parameters), truth.dtype), np.empty(models, truth.dtype)
-    found = Found(gradient, losses, np.empty(models, np.bool_))
-    backward.descend(moments, plan, drives, truth, found, update)
-    return found
+    outcome = Outcome(gradient, losses, np.empty(models, np.bool_))
+    backward.descend(moments, plan, drives, truth, outcome, update)
+    return outcome
 
 
 class _Rollout(torch.autograd.Function):
@@ -111,8 +111,8 @@ class _Rollout(torch.autograd.Function):
     def backward(ctx: Any, adjoints: Tensor) -> tuple[Tensor, None, None]:
         (theta,) = ctx.saved_tensors
         gnss, velocity, x0 = (torch.from_numpy(a) for a in ctx.drives[:3])
-        found = _descend(theta, ctx.shapes, Batch(gnss, velocity, adjoints, x0, ctx.drives.dt), -1)
-        return torch.from_numpy(found.gradient), None, None
+        outcome = _descend(theta, ctx.shapes, Batch(gnss, velocity, adjoints, x0, ctx.drives.dt), -1)
+        return torch.from_numpy(outcome.gradient), None, None
 
 
 def _forward(theta: Tensor, shapes: Shapes, drives: Drives) -> AnyArray:
@@ -125,8 +125,8 @@ def _forward(theta: Tensor, shapes: Shapes, drives: Drives) -> AnyArray:
 def _checked(theta: Tensor, shapes: Shapes, models: int, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: Any) -> Drives:
     """The inputs of so many models as contiguous arrays of theta's dtype."""
     if theta.dtype not in (torch.float32, torch.float64) or theta.device.type != "cpu":
-        found = f"{theta.dtype} on {theta.device}"
-        raise InputError("theta", found, "must be float32 or float64 in main memory", "Use theta.cpu().float().")
+        given = f"{theta.dtype} on {theta.device}"
+        raise InputError("theta", given, "must be float32 or float64 in main memory", "Use theta.cpu().float().")
     steps, lanes = gnss.shape[0], gnss.shape[2]
     wanted = {
         "theta": (theta, (len(theta), plan_of(shapes).parameters)),

@@ -111,10 +111,11 @@ def combine(rule: Rule, standing: Standing, answers: Mapping[str, Answer]) -> tu
         note = f"{len(accepted)} answers accepted, {rule.name} takes at least {rule.least}: weights unchanged"
         return unchanged, rejected, note
     weights, sizes = torch.stack([a.weights for a in accepted]), torch.tensor([a.size for a in accepted])
-    found, state = rule(standing.state, theta, weights, sizes)
-    if found.shape != theta.shape:
+    combined, state = rule(standing.state, theta, weights, sizes)
+    if combined.shape != theta.shape:
         allowed = f"must have the shape {tuple(theta.shape)} of the net's weights"
-        raise InputError("aggregate", f"{rule.name} -> {tuple(found.shape)}", allowed, "Combine over the clients only.")
-    if not all(bool(part.isfinite().all()) for part in (found, *state)):
+        shape = f"{rule.name} -> {tuple(combined.shape)}"
+        raise InputError("aggregate", shape, allowed, "Combine over the clients only.")
+    if not all(bool(part.isfinite().all()) for part in (combined, *state)):
         return unchanged, rejected, f"{rule.name} gives weights that are not finite: weights unchanged"
-    return Standing(found.to(theta.dtype), state, usual), rejected, ""
+    return Standing(combined.to(theta.dtype), state, usual), rejected, ""

@@ -112,8 +112,8 @@ def federate(
     >>> federate("gain_net", clients(line, piece=10), rounds=1, local_epochs=1).history[1].sent_bytes
     79756
     """
-    found = find("coopoc.nets", model) if isinstance(model, str) else model
-    start = found() if isinstance(found, type) else found
+    given = find("coopoc.nets", model) if isinstance(model, str) else model
+    start = given() if isinstance(given, type) else given
     if not isinstance(start, Gain):
         raise InputError("model", shown(start), "must be a Gain", "Give GainNet(), or its name.")
     optimiser = Schedule() if schedule is None else schedule
@@ -155,11 +155,11 @@ def federate_many(
         for history, *rest in zip(histories, teams, standings, asked, done, notes, reports, strict=True):
             history.append(_row(history[-1], *rest))
     seconds = (time.perf_counter() - began) / len(groups)
-    found = []
+    federations = []
     for history, team in zip(histories, teams, strict=True):
         federation = Federation(models[0], tuple(history), team.sizes, seconds, team.names)
-        found.append(replace(federation, model=federation.after(federation.best.number)))
-    return found
+        federations.append(replace(federation, model=federation.after(federation.best.number)))
+    return federations
 
 
 def _group(clients: Sequence[Client], seed: int) -> Group:

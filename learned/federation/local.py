@@ -125,16 +125,16 @@ class Stack(NamedTuple):
         theta, members = self._rows(thetas)[rows], [self.members[row] for row in rows]
         seeds = [keys[row][1:] for row in rows]
         losses, stopped = adapt(theta, self.like, self.pool, members, seeds, number, rounds, local)
-        found = [Work({}, (), {}) for _ in self.teams]
+        works = [Work({}, (), {}) for _ in self.teams]
         trained = {keys[row][::2]: at for at, row in enumerate(rows)}
         for i, team in enumerate(self.teams):
             here = {name: trained[i, name] for name in team.names if name in asked[i]}
-            found[i] = Work(
+            works[i] = Work(
                 {name: theta[at] for name, at in here.items() if at not in stopped},
                 tuple(float(losses[here[name]]) if name in here else math.nan for name in team.names),
                 {name: stopped[at] for name, at in here.items() if at in stopped},
             )
-        return found
+        return works
 
     def _rows(self, thetas: Sequence[Tensor]) -> Tensor:
         """(S, P) weights of every client, those of its federation."""

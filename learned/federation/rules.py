@@ -293,8 +293,8 @@ def rule(given: str | Rule | Combine) -> Rule:
     >>> rule("krum").least
     5
     """
-    found = (RULES.get(given) or find("coopoc.rules", given)) if isinstance(given, str) else given
-    made = found() if isinstance(found, type) else found
+    chosen = (RULES.get(given) or find("coopoc.rules", given)) if isinstance(given, str) else given
+    made = chosen() if isinstance(chosen, type) else chosen
     if isinstance(made, Rule):
         return made
     if callable(made):

@@ -58,15 +58,15 @@ def client_app(source: Source | None = None) -> ClientApp:
     require_flower("a ClientApp")
     from flwr.clientapp import ClientApp
 
-    app, found = ClientApp(), source or configured
+    app, data = ClientApp(), source or configured
 
     @app.train()
     def train(message: Message, context: Context) -> Message:
-        return _replied(message, context, found, training=True)
+        return _replied(message, context, data, training=True)
 
     @app.evaluate()
     def evaluate(message: Message, context: Context) -> Message:
-        return _replied(message, context, found, training=False)
+        return _replied(message, context, data, training=False)
 
     return app
 

@@ -52,15 +52,15 @@ def local(job: Job) -> Schedule:
 
 def _words(text: str) -> dict[str, Any]:
     """The changes of a text such as "rounds=3 aggregate=median"."""
-    allowed, found = {field.name.replace("_", "-") for kind in (Recipe, Schedule) for field in fields(kind)}, {}
+    allowed, settings = {field.name.replace("_", "-") for kind in (Recipe, Schedule) for field in fields(kind)}, {}
     for word in text.split():
         key, _, value = word.partition("=")
         if key not in allowed and not key.startswith(PREFIX):
             raise unknown("change", key, [*sorted(allowed), f"{PREFIX}..."])
-        found[key] = value
+        settings[key] = value
         with suppress(json.JSONDecodeError):
-            found[key] = json.loads(value)
-    return found
+            settings[key] = json.loads(value)
+    return settings
 
 
 def _of(kind: type[Any], given: Mapping[str, Any]) -> dict[str, Any]:

@@ -129,8 +129,8 @@ def rounds(grid: Grid, job: Job, nodes: int, timeout: float, keep: Callable[[Row
     strategy, until = _strategy(job.recipe.aggregate, theta, keep), time.monotonic() + timeout
     while (online := len(list(grid.get_node_ids()))) < nodes:
         if time.monotonic() > until:
-            found = f"only {online} came online in {timeout:g} s"
-            raise TimeoutError(f"nodes = {nodes}: {found}. Start more, or wait for fewer.")
+            state = f"only {online} came online in {timeout:g} s"
+            raise TimeoutError(f"nodes = {nodes}: {state}. Start more, or wait for fewer.")
         time.sleep(0.2)
     strategy.start(grid, ArrayRecord({"theta": Array(theta.numpy())}), job.recipe.rounds, timeout)
 
@@ -156,10 +156,12 @@ def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object]) -> A
             rejected |= refused
             good = {name: reply for name, reply in answers.items() if name not in rejected}
             pieces, losses = _numbers(good, "num-examples"), _numbers(good, "training-loss")
-            found, metrics = super().aggregate_train(server_round, list(good.values()))
-            now = self.row.weights if found is None else torch.from_numpy(found["theta"].numpy().copy()).to(theta.dtype)
+            combined, metrics = super().aggregate_train(server_round, list(good.values()))
+            now = self.row.weights
+            if combined is not None:
+                now = torch.from_numpy(combined["theta"].numpy().copy()).to(theta.dtype)
             self.row = Row(server_round, now, losses, {}, {n: int(k) for n, k in pieces.items()}, rejected)
-            return found, metrics
+            return combined, metrics
 
         def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> Any:
             answers, rejected = read(replies, self.names, "validation-loss")
@@ -180,7 +182,7 @@ def read(replies: Iterable[Message], names: dict[int, str], loss: str) -> tuple[
         names: of the nodes, as first reported; a node cannot change its own.
         loss: the loss that an answer must hold.
     """
-    found: dict[str, Message] = {}
+    right: dict[str, Message] = {}
     rejected: dict[str, str] = {}
     for reply in sorted(replies, key=lambda reply: reply.metadata.src_node_id):
         node = reply.metadata.src_node_id
@@ -194,11 +196,11 @@ def read(replies: Iterable[Message], names: dict[int, str], loss: str) -> tuple[
         except Exception as error:  # a client may send anything
             rejected[who] = f"malformed answer ({type(error).__name__})"
             continue
-        if problem or names.get(node, name) != name or name in (SERVER, *found):
+        if problem or names.get(node, name) != name or name in (SERVER, *right):
             rejected[who] = problem or f"claims the name {name} of another node"
             continue
-        names[node], found[name] = name, reply
-    return dict(sorted(found.items())), rejected
+        names[node], right[name] = name, reply
+    return dict(sorted(right.items())), rejected
 
 
 def _problem(content: Any, loss: str) -> str:

@@ -8,7 +8,7 @@ A net of your own is one class in one file. Subclass `Recurrent` and write
 
 and everything else follows: the training loss, a rollout of many nets, the method (Recording -> Track), the stream.
 Where the loss or the method differs, subclass `Gain` and write `losses(theta, batch)` and `method(name, x0)`. The truth
-of a batch is NaN where it is not known; `error`, `known` and `over_time` leave these steps out.
+of a batch is NaN where there is no truth; `error`, `has_truth` and `over_time` leave these steps out.
 Arguments of the constructor that are kept as attributes of the same name make the net again from a checkpoint.
 """
 
@@ -49,7 +49,7 @@ class Gain(nn.Module, ABC):
 
     @abstractmethod
     def method(self, name: str, x0: Floats | None = None) -> Method:
-        """This net as a method, Recording -> Track, from the first fix or a known start (R, E, 3) or (E, 3) m."""
+        """This net as a method, Recording -> Track, from the first fix or an exact start (R, E, 3) or (E, 3) m."""
 
     def calibrate(self, parts: Sequence[Segments]) -> Gain:
         """The trained net, with what the loss cannot see set from the training segments of each client."""
@@ -134,7 +134,7 @@ class Recurrent(Gain):
             arXiv 2411.05847, equation 7.
         """
         x = self.rollout(theta, batch.gnss, batch.velocity, batch.x0, batch.dt)
-        return over_time(error(x, batch.truth).square().sum(-1), known(batch.truth))
+        return over_time(error(x, batch.truth).square().sum(-1), has_truth(batch.truth))
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`LearnedGain` with this net."""
@@ -162,7 +162,7 @@ def _arguments(kind: type[Gain]) -> tuple[str, ...]:
 
 
 def error(x: Tensor, truth: Tensor) -> Tensor:
-    """x - truth m, and 0, with a gradient of 0, where the truth is not known (NaN).
+    """x - truth m, and 0, with a gradient of 0, where there is no truth (NaN).
 
     >>> error(torch.ones(2), torch.tensor([3.0, torch.nan])).tolist()
     [-2.0, 0.0]
@@ -171,12 +171,12 @@ def error(x: Tensor, truth: Tensor) -> Tensor:
 
 
 def over_axes(terms: Tensor, truth: Tensor) -> Tensor:
-    """Sum (...) of the terms (..., 3) of a loss over the components whose truth (..., 3) is known."""
+    """Sum (...) of the terms (..., 3) of a loss over the components whose truth (..., 3) is not NaN."""
     return torch.where(truth.isfinite(), terms, 0.0).sum(-1)
 
 
-def known(truth: Tensor) -> Tensor:
-    """(...) whether a true position (..., 3) is known."""
+def has_truth(truth: Tensor) -> Tensor:
+    """(...) whether there is a true position (..., 3)."""
     return truth[..., 0].isfinite()
 
 

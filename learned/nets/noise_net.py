@@ -23,7 +23,7 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 
 from ..training.clients import Batch
 from ..training.machine import one_core
-from .gain import Gain, error, known, over_axes, over_time, seed_of, size
+from .gain import Gain, error, has_truth, over_axes, over_time, seed_of, size
 from .stack import flatten, layers, named
 
 MEMORY = 100.0
@@ -158,26 +158,26 @@ class NoiseNet(Gain):
     def variances(self, theta: Tensor, gnss: Tensor, velocity: Tensor, dt: float) -> Variances:
         """Variances by S nets theta (S, P) from fixes and velocities (T, S, B, 3) m and m/s, NaN where missing."""
         with torch.no_grad():
-            found = guess(gnss, velocity, dt)
+            features = guess(gnss, velocity, dt)
         net, floor = layers(theta, self), torch.exp(2.0 * named(theta, self)["floor"] - 10.0)
-        steps, models, *rest = found.gnss.shape
-        of_fix, of_motion = (f.transpose(0, 1).reshape(models, -1, f.shape[-1]) for f in found[3:])
+        steps, models, *rest = features.gnss.shape
+        of_fix, of_motion = (f.transpose(0, 1).reshape(models, -1, f.shape[-1]) for f in features[3:])
         out = [net["fix"](net["fix_hidden"](of_fix).tanh()), net["motion"](net["motion_hidden"](of_motion).tanh())]
         fix, axis, speed = torch.cat(out, 2).view(models, steps, *rest, 3).transpose(0, 1).unbind(-1)
         square = velocity.nan_to_num(0.0).square()
-        noise = torch.exp(2.0 * (found.axis + axis)) * square
-        noise = noise + torch.exp(2.0 * (found.speed + speed)) * square.sum(-1, keepdim=True)
-        return Variances(torch.exp(2.0 * (found.gnss + fix)), dt**2 * (noise + floor[:, None]))
+        noise = torch.exp(2.0 * (features.axis + axis)) * square
+        noise = noise + torch.exp(2.0 * (features.speed + speed)) * square.sum(-1, keepdim=True)
+        return Variances(torch.exp(2.0 * (features.gnss + fix)), dt**2 * (noise + floor[:, None]))
 
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:
         """(S, B) Gaussian negative log-likelihood of the true error, mean over time, sum over components."""
         gnss = torch.cat([batch.x0[None], batch.gnss])
         velocity = torch.cat([batch.velocity[:1], batch.velocity])
         noise = self.variances(theta, gnss, velocity, batch.dt)
-        x, relative = filtered(gnss, velocity, noise, batch.dt, batch.known)
+        x, relative = filtered(gnss, velocity, noise, batch.dt, batch.exact)
         squares = error(x[1:], batch.truth).square()
         terms = over_axes(0.5 * (squares / relative[1:] + relative[1:].log()), batch.truth)
-        return over_time(terms, known(batch.truth))
+        return over_time(terms, has_truth(batch.truth))
 
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """`NoiseFilter` with this net."""
@@ -185,7 +185,7 @@ class NoiseNet(Gain):
 
 
 def filtered(
-    gnss: Tensor, velocity: Tensor, noise: Variances, dt: float, known: Tensor | None = None
+    gnss: Tensor, velocity: Tensor, noise: Variances, dt: float, exact: Tensor | None = None
 ) -> tuple[Tensor, Tensor]:
     """Kalman filter per axis whose past is revised with its noise: estimate and variance (T, S, B, 3) m, m^2.
 
@@ -198,11 +198,11 @@ def filtered(
         velocity: (T, S, B, 3) m/s.
         noise: variances.
         dt: s.
-        known: (S, B) where gnss[0] is the exact start.
+        exact: (S, B) where gnss[0] is the exact start.
     """
     x, relative = gnss[0], FORGOTTEN / (FORGOTTEN + noise.fix[0])
-    if known is not None:
-        relative = torch.where(known[..., None], 0.0, relative)
+    if exact is not None:
+        relative = torch.where(exact[..., None], 0.0, relative)
     xs, ps, whole = [x], [relative * noise.fix[0]], bool(gnss.isfinite().all())
     rows = (gnss[1:], dt * velocity[1:], noise.fix[1:], noise.process[1:])
     for z, move, fix, process in zip(*rows, strict=True):
@@ -226,7 +226,7 @@ class NoiseFilter:
     Args:
         model: trained net.
         name: label in tables.
-        x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
+        x0: (R, E, 3) or (E, 3) m, an exact start; None starts at the first fix.
 
     >>> NoiseFilter(NoiseNet()).message.payload
     0
@@ -248,10 +248,10 @@ class NoiseFilter:
         theta = flatten([self.model]).double()
         with torch.inference_mode():
             noise = self.model.variances(theta, gnss, velocity, recording.dt)
-            known = None
+            exact = None
             if self.x0 is not None:
-                gnss[0], known = self._start(gnss[0], recording.runs), torch.ones(gnss.shape[1:3], dtype=torch.bool)
-            x, p = (runs(a, recording.runs) for a in filtered(gnss, velocity, noise, recording.dt, known))
+                gnss[0], exact = self._start(gnss[0], recording.runs), torch.ones(gnss.shape[1:3], dtype=torch.bool)
+            x, p = (runs(a, recording.runs) for a in filtered(gnss, velocity, noise, recording.dt, exact))
         silent = np.zeros((recording.runs, len(columns)))
         seconds = time.perf_counter() - began
         return Track(recording.t, tuple(columns), x, p[..., None] * np.eye(3), silent, silent, seconds)
@@ -278,8 +278,8 @@ def estimate_noise(
         for run in range(recording.runs):
             gnss, velocity = (lanes(a[run][None, :, columns]) for a in (recording.gnss, recording.velocity))
             noise = model.variances(theta, gnss, velocity, recording.dt)
-            for found, part in zip((fix, process), noise, strict=True):
-                found[run, :, columns] = np.moveaxis(runs(part, 1)[0], 1, 0)
+            for target, part in zip((fix, process), noise, strict=True):
+                target[run, :, columns] = np.moveaxis(runs(part, 1)[0], 1, 0)
     return fix, process
 
 

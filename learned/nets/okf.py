@@ -25,7 +25,7 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 
 from ..training.clients import Batch, Segments
 from ..training.machine import one_core
-from .gain import Gain, error, known, over_time, seed_of
+from .gain import Gain, error, has_truth, over_time, seed_of
 from .stack import flatten
 
 
@@ -37,7 +37,7 @@ class OptimisedKF:
         process_std: (3,) m per step, a.
         velocity_ratio: (3,) share of the measured velocity, b.
         gnss_std: (3,) m, r.
-        x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
+        x0: (R, E, 3) or (E, 3) m, an exact start; None starts at the first fix.
         name: label in tables.
 
     References:
@@ -70,7 +70,7 @@ class OptimisedKF:
         """The filter as a stream, one step at a time (docs/streaming.md).
 
         Args:
-            x0: (3,) m, known before the first step; None starts at the first fix.
+            x0: (3,) m, the exact start; None starts at the first fix.
             interval: s, the step of the training; the variance of a motion of dt s is dt / interval times a step's.
             history: s, the oldest fix that is accepted.
 
@@ -132,7 +132,7 @@ class NoiseParameters(Gain):
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:
         """(S, B) squared error of each segment, mean over time, sum over components, m^2."""
         x, _ = scan(self.stds(theta), batch)
-        return over_time(error(x, batch.truth).square().sum(-1), known(batch.truth))
+        return over_time(error(x, batch.truth).square().sum(-1), has_truth(batch.truth))
 
     def method(self, name: str, x0: Floats | None = None) -> OptimisedKF:
         """`OptimisedKF` with these parameters."""
@@ -148,8 +148,8 @@ class NoiseParameters(Gain):
         squares, pieces = torch.zeros(3), sum(map(len, parts))
         for segments in parts:
             drawn = [torch.Generator().manual_seed(0)]
-            seen = scan(self.stds(flatten([self])), segments.batch(torch.arange(len(segments))[None], drawn))[1]
-            squares += over_time(seen.square(), seen.isfinite()).sum((0, 1))
+            innovation = scan(self.stds(flatten([self])), segments.batch(torch.arange(len(segments))[None], drawn))[1]
+            squares += over_time(innovation.square(), innovation.isfinite()).sum((0, 1))
         return self.with_logs(self.logs + log_scale(squares / pieces))
 
 
@@ -167,7 +167,7 @@ def scan(stds: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     missing the filter predicts, and the innovation is NaN."""
     process, ratio, gnss_std = stds.unsqueeze(2).unbind(1)
     noise, x = gnss_std.square(), batch.x0
-    variance = noise if batch.known is None else noise * (~batch.known)[..., None]
+    variance = noise if batch.exact is None else noise * (~batch.exact)[..., None]
     estimates, normalised = [], []
     motions = process.square() + (ratio * batch.dt * batch.velocity).square()
     for fix, speed, motion in zip(batch.gnss.unbind(), batch.velocity.unbind(), motions.unbind(), strict=True):

@@ -21,7 +21,7 @@ from coopoc.world.v2x import NO_MESSAGE, Message
 from ..method import divergence
 from ..training.clients import Batch
 from ..training.machine import one_core
-from .gain import Gain, error, known, over_axes, over_time, seed_of, size
+from .gain import Gain, error, has_truth, over_axes, over_time, seed_of, size
 from .stack import Layers, flatten, gru, layers
 
 FORGET = 1.0 - 1.0 / 300.0
@@ -108,9 +108,9 @@ def noise(levels: Levels, dt: float) -> Noise:
     share, now = levels.turns / levels.squares, levels.velocity.square()
     ratio = dt**2 * (share * now + STILL**2) / gnss
     speed, error = now.sum(-1, keepdim=True).expand_as(now), (1.0 - FADE) * levels.turns
-    seen = [gnss, share, now + STILL**2, speed + STILL**2, levels.fixes, error + STILL**2]
+    features = [gnss, share, now + STILL**2, speed + STILL**2, levels.fixes, error + STILL**2]
     middle = torch.tensor([0.7, -2.3, 1.0, 2.0, 2.0, 0.0], dtype=gnss.dtype)
-    return Noise(gnss, ratio, 0.5 * torch.stack(seen, -1).log() - middle)
+    return Noise(gnss, ratio, 0.5 * torch.stack(features, -1).log() - middle)
 
 
 class Memory(NamedTuple):
@@ -162,24 +162,24 @@ class RecursiveGain(Gain):
         x, variance = self.rollout(theta, batch)
         squares = error(x, batch.truth).square()
         terms = over_axes(0.5 * (squares / variance + variance.log()), batch.truth)
-        return over_time(terms, known(batch.truth))
+        return over_time(terms, has_truth(batch.truth))
 
     def rollout(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
         """Estimates m and variances m^2 (T, S, B, 3) of S nets theta (S, P), differentiable in theta."""
-        net, memory, found = layers(theta, self), self.start(batch.x0, batch.known), []
+        net, memory, estimates = layers(theta, self), self.start(batch.x0, batch.exact), []
         for gnss, velocity in zip(batch.gnss, batch.velocity, strict=True):
             memory = self.step(net, memory, gnss, velocity, batch.dt)
-            found.append((memory.x, memory.variance))
-        x, variance = (torch.stack(part) for part in zip(*found, strict=True))
+            estimates.append((memory.x, memory.variance))
+        x, variance = (torch.stack(part) for part in zip(*estimates, strict=True))
         return x, variance
 
     def method(self, name: str, x0: Floats | None = None) -> RecursiveFilter:
         """`RecursiveFilter` with this net."""
         return RecursiveFilter(self, name, x0)
 
-    def start(self, x0: Tensor, known: Tensor | None = None) -> Memory:
-        """Before the first step, at x0 (S, B, 3) m: the first fix, or exact where `known` (S, B)."""
-        relative = torch.ones_like(x0) if known is None else (~known)[..., None].to(x0.dtype).expand_as(x0)
+    def start(self, x0: Tensor, exact: Tensor | None = None) -> Memory:
+        """Before the first step, at x0 (S, B, 3) m: the first fix, or exact where `exact` (S, B)."""
+        relative = torch.ones_like(x0) if exact is None else (~exact)[..., None].to(x0.dtype).expand_as(x0)
         hidden = torch.zeros(len(x0), 3 * x0.shape[1], self.hidden, dtype=x0.dtype)
         return Memory(first(x0), x0, relative, torch.zeros_like(x0), hidden, GNSS_STD**2 * relative)
 
@@ -254,9 +254,9 @@ class SoloRecursive:
     ) -> RecursiveState:
         """`RecursiveGain.step`; a fix of NaN only predicts."""
         dt = float(np.sqrt(process[0])) / STILL
-        step, seen, more = (_lanes(a, state.shape) for a in (moved / dt, fix, late))
+        step, measured, more = (_lanes(a, state.shape) for a in (moved / dt, fix, late))
         with torch.inference_mode():
-            return RecursiveState(self.model.step(self.net, state.memory, seen, step, dt, more), state.shape)
+            return RecursiveState(self.model.step(self.net, state.memory, measured, step, dt, more), state.shape)
 
     def read(self, state: RecursiveState) -> tuple[Floats, Floats]:
         """Position and diagonal covariance."""
@@ -277,7 +277,7 @@ class RecursiveFilter:
     Args:
         model: trained net.
         name: label in tables.
-        x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
+        x0: (R, E, 3) or (E, 3) m, an exact start; None starts at the first fix.
 
     References:
         Mortada et al., Recursive KalmanNet, EUSIPCO 2025 (arXiv 2506.11639).

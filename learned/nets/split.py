@@ -94,9 +94,9 @@ class SplitGain(Recurrent):
         missing, (models, lanes) = gnss.isnan().any(-1, keepdim=True), gnss.shape[:2]
         fix, prior = torch.where(missing, memory.gnss_before, gnss), memory.x + moved
         changes = memory.x - memory.x_before, memory.x - memory.prior_before, fix - memory.gnss_before, fix - prior
-        seen = ((torch.stack(changes) / SCALE).asinh() / 2).view(2, 2, models, lanes, SIZE).permute(0, 2, 3, 1, 4)
-        seen = net["see"](seen.reshape(2 * models, lanes, 2 * SIZE)).relu()
-        hidden = torch.where(missing.repeat(2, 1, 1), memory.hidden, gru(net, "cell", seen, memory.hidden))
+        features = ((torch.stack(changes) / SCALE).asinh() / 2).view(2, 2, models, lanes, SIZE).permute(0, 2, 3, 1, 4)
+        features = net["see"](features.reshape(2 * models, lanes, 2 * SIZE)).relu()
+        hidden = torch.where(missing.repeat(2, 1, 1), memory.hidden, gru(net, "cell", features, memory.hidden))
         first, second = net["factor"](hidden).view(2, models, lanes, SIZE, SIZE)
         gain = torch.where(missing[..., None], 0.0, first @ second)
         x = prior + (gain @ (fix - prior).unsqueeze(-1)).squeeze(-1)

@@ -32,7 +32,7 @@ DRAWS = 8
 
 
 class Batch(NamedTuple):
-    """Input of S models, B segments each: gnss, NaN where a fix is missing, velocity, truth, NaN where it is not known
+    """Input of S models, B segments each: gnss, NaN where a fix is missing, velocity, truth, NaN where there is none
     and no loss counts (T, S, B, 3); x0 (S, B, 3); dt s; whether x0 is the truth (S, B), None if it never is."""
 
     gnss: Tensor
@@ -40,7 +40,7 @@ class Batch(NamedTuple):
     truth: Tensor
     x0: Tensor
     dt: float
-    known: Tensor | None = None
+    exact: Tensor | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -95,12 +95,12 @@ class Segments:
             drives = torch.from_numpy(self._drives.take(index.numpy(), axis=2))
         else:
             drives = torch.stack([*self._drawn(index, draws), self.truth[index]]).permute(0, 3, 1, 2, 4).contiguous()
-        x0, known = drives[0, 0], None
+        x0, exact = drives[0, 0], None
         if self._any_true_start:
-            known = self.true_start[index]
-            x0, known = torch.where(known[..., None], drives[2, 0], x0), known if known.any() else None
+            exact = self.true_start[index]
+            x0, exact = torch.where(exact[..., None], drives[2, 0], x0), exact if exact.any() else None
         gnss, velocity, truth = drives[:, 1:].unbind()
-        return Batch(gnss, velocity, truth, x0, self.dt, known)
+        return Batch(gnss, velocity, truth, x0, self.dt, exact)
 
     @cached_property
     def _drives(self) -> AnyArray:
@@ -129,8 +129,8 @@ class Segments:
     def join(cls, parts: Sequence[Segments]) -> Segments:
         """All pieces of several parts in their order; the parts agree in length, dt and kind of noise."""
         if len({(p.truth.shape[1], p.dt, p.noise) for p in parts}) != 1:
-            found = [(p.truth.shape[1], p.dt, p.noise) for p in parts]
-            raise InputError("pieces", found, "must agree in length, dt and noise", "Cut all clients alike.")
+            agreed = [(p.truth.shape[1], p.dt, p.noise) for p in parts]
+            raise InputError("pieces", agreed, "must agree in length, dt and noise", "Cut all clients alike.")
         return parts[0]._each(lambda name: torch.cat([getattr(p, name) for p in parts]))
 
     def _each(self, made: Callable[[str], Tensor]) -> Segments:
@@ -167,7 +167,7 @@ def mirrored(batch: Batch, draws: Sequence[torch.Generator]) -> Batch:
         return torch.where(swap, vectors.index_select(-1, torch.tensor([1, 0, 2])), vectors) * signs
 
     gnss, velocity, truth = turn(torch.stack([batch.gnss, batch.velocity, batch.truth])).unbind()
-    return Batch(gnss, velocity, truth, turn(batch.x0), batch.dt, batch.known)
+    return Batch(gnss, velocity, truth, turn(batch.x0), batch.dt, batch.exact)
 
 
 @dataclass(frozen=True, eq=False)
@@ -238,7 +238,7 @@ def clients(
             "Train with white noise, or static.",
         )
     seen = observe(fleet, sensors, V2X(max_neighbours=0, rate=1 / fleet.dt), seed=seed)
-    found, longest = [], min(LONG * piece, max(int(fleet.present.sum(0).min()) - 1, 1))
+    agreed, longest = [], min(LONG * piece, max(int(fleet.present.sum(0).min()) - 1, 1))
     for column, name in enumerate(fleet.ids):
         there = np.flatnonzero(fleet.present[:, column])
         if len(there) and there[-1] - there[0] >= len(there):
@@ -254,8 +254,8 @@ def clients(
         long = _cut(drive, sensors, longest, fleet.dt, noise, start)
         uses = DRAWS if noise == "wide" else 1
         training, validation = pieces.take(sorted(order[:count])), pieces.take(sorted(order[count:]) * uses)
-        found.append(Client(name, training, validation, long.take([*range(len(long))] * uses)))
-    return tuple(found)
+        agreed.append(Client(name, training, validation, long.take([*range(len(long))] * uses)))
+    return tuple(agreed)
 
 
 def check_pieces(piece: int, split: float) -> None:

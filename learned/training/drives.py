@@ -28,7 +28,7 @@ class MeasuredDrives:
 
     Args:
         recording: in the world frame; every run of it is used.
-        truth: of the same members at the same steps, NaN where it is not known.
+        truth: of the same members at the same steps, NaN where there is none.
         ids: of the vehicles that train; empty: all that move.
 
     Raises:
@@ -88,7 +88,7 @@ class Logged(Protocol):
 
     @property
     def truth(self) -> Fleet | None:
-        """Where vehicles were, None if that is not known."""
+        """Where vehicles were, None if there is no truth."""
 
 
 def drives_of(data: Drives | Logged) -> Drives:

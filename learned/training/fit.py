@@ -132,12 +132,12 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
         seen.append(losses)
         checked = [row for row in range(len(tasks)) if step in due[row] and row not in stopped]
         if checked:
-            found = judge(theta)
+            validated = judge(theta)
             for row in checked:
                 mean = torch.stack([one[row] for one in seen[history[row][-1].step :]]).mean()
-                history[row].append(Progress(step, theta[row].clone(), float(mean), float(found[row])))
-                if found[row] < lowest[row]:
-                    best[row], lowest[row] = theta[row], found[row]
+                history[row].append(Progress(step, theta[row].clone(), float(mean), float(validated[row])))
+                if validated[row] < lowest[row]:
+                    best[row], lowest[row] = theta[row], validated[row]
     for row in torch.nonzero(lowest.isinf()).flatten().tolist():
         stopped.setdefault(row, "no weights had a finite validation loss; start from GainNet(start_gain=0.1)")
     seconds = (time.perf_counter() - began) / len(tasks)

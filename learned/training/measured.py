@@ -63,12 +63,12 @@ def measured_clients(
             hint = f"It takes {2 * (piece + 1)} steps with odometry, fixes and truth: give more, or shorten the pieces."
             raise InputError("recording", f"{name} with {len(pieces)} pieces of {piece}", "needs at least two", hint)
     longest = max(n for n, pieces in cuts.items() if all(pieces))
-    found = []
+    group = []
     for name, column, pieces, long in zip(drives.ids, cols, cuts[1], cuts[longest], strict=True):
         count = min(max(int(split * len(pieces)), 1), len(pieces) - 1)
         parts = (pieces[:count], piece), (pieces[count:], piece), (long, longest * piece)
-        found.append(Client(name, *(_segments(drives, column, *part, start) for part in parts)))
-    return tuple(found)
+        group.append(Client(name, *(_segments(drives, column, *part, start) for part in parts)))
+    return tuple(group)
 
 
 def _steps(recording: Recording, cols: Sequence[int], piece: int) -> int:

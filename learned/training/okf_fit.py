@@ -14,7 +14,7 @@ from coopoc.arrays import instance, number
 from coopoc.short_repr import short_repr
 from coopoc.world.sensors import stream
 
-from ..nets.gain import error, known, over_time
+from ..nets.gain import error, has_truth, over_time
 from ..nets.okf import NoiseParameters, OptimisedKF, log_scale, scan
 from .clients import Batch, Segments
 from .machine import one_core, watched
@@ -78,10 +78,10 @@ def fit_okf_many(
     for step in watched(range(steps), progress, "step"):
         if step % 25 == 0 or step == steps - 1:
             with torch.no_grad():
-                found = _loss(like.stds(logs), *judge)
-            better = found < lowest
-            best[better], lowest[better] = logs.detach()[better], found[better]
-            history.append(found.tolist())
+                validated = _loss(like.stds(logs), *judge)
+            better = validated < lowest
+            best[better], lowest[better] = logs.detach()[better], validated[better]
+            history.append(validated.tolist())
         adam.zero_grad()
         _loss(like.stds(logs), *data).sum().backward()
         adam.step()
@@ -106,13 +106,13 @@ def _stacked(parts: Sequence[Segments], kind: str) -> tuple[Batch, Tensor]:
     batch = pool.batch(index, [generator(stream(0, kind, 0, "")) for _ in parts])
     weight = torch.tensor([[float(i < len(p)) / len(p) for i in range(most)] for p in parts], dtype=torch.float64)
     gnss, velocity, truth, x0 = (array.double() for array in batch[:4])
-    return Batch(gnss, velocity, truth, x0, batch.dt, batch.known), weight
+    return Batch(gnss, velocity, truth, x0, batch.dt, batch.exact), weight
 
 
 def _loss(numbers: Tensor, batch: Batch, weight: Tensor) -> Tensor:
     """(S,) mean over pieces and time of the squared error, m^2."""
     squares = error(scan(numbers, batch)[0], batch.truth).square().sum(-1)
-    return (over_time(squares, known(batch.truth)) * weight).sum(1)
+    return (over_time(squares, has_truth(batch.truth)) * weight).sum(1)
 
 
 def _calibration(numbers: Tensor, batch: Batch, weight: Tensor) -> Tensor:

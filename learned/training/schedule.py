@@ -13,7 +13,7 @@ from torch import Tensor
 from coopoc.arrays import Floats, Ints, one_of
 from coopoc.methods.track import Limits, check_options
 
-from ..engine.optimiser import Found, Moments, Update
+from ..engine.optimiser import Moments, Outcome, Update
 from ..engine.optimiser import advance as advanced
 
 Epoch = Literal["step", "pass"]
@@ -103,9 +103,9 @@ def advance(
     References:
         Loshchilov and Hutter, ICLR 2019, algorithm 2.
     """
-    found = Found(gradient.numpy(), losses.numpy(), np.empty(len(rows), np.bool_))
-    advanced(Moments(*(a.numpy() for a in moving)), found, update_of(rows, step, rates, schedule))
-    return torch.from_numpy(found.finite)
+    outcome = Outcome(gradient.numpy(), losses.numpy(), np.empty(len(rows), np.bool_))
+    advanced(Moments(*(a.numpy() for a in moving)), outcome, update_of(rows, step, rates, schedule))
+    return torch.from_numpy(outcome.finite)
 
 
 def update_of(rows: Ints, step: int, rates: Floats, schedule: Schedule) -> Update:

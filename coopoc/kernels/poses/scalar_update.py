@@ -136,21 +136,23 @@ def along(columns: Floats, q: int, ends: Ends, row: Row) -> float:
 
 @part
 def settle(poses: Poses) -> None:
-    """Apply the pending rows to the covariance, which is read once for all of them."""
-    size, tiles, gains = len(poses.x), len(poses.x) // LANES, poses.gains
-    pending = int(poses.totals[PENDING])
+    """Apply the pending rows to the covariance, two of its rows at a time: each column is read half as often."""
+    cov, columns, gains = poses.cov, poses.columns, poses.gains
+    size, tiles, pending = len(poses.x), len(poses.x) // LANES, int(poses.totals[PENDING])
     for q in range(pending, ROWS if pending > 0 else 0):
         for i in range(size):
             gains[q, i] = 0.0
-    for i in range(size if pending > 0 else 0):
+    for i in range(0, size if pending > 0 else 0, 2):
         p, q, r, s = gains[0, i], gains[1, i], gains[2, i], gains[3, i]
-        if p != 0.0 or q != 0.0 or r != 0.0 or s != 0.0:
+        a, b, c, d = gains[0, i + 1], gains[1, i + 1], gains[2, i + 1], gains[3, i + 1]
+        if abs(p) + abs(q) + abs(r) + abs(s) + abs(a) + abs(b) + abs(c) + abs(d) != 0.0:
             for tile in range(tiles):
-                left = less(entries(poses.cov, i, tile, tiles), p, entries(poses.columns, 0, tile, tiles))
-                left = less(left, q, entries(poses.columns, 1, tile, tiles))
-                left = less(left, r, entries(poses.columns, 2, tile, tiles))
-                left = less(left, s, entries(poses.columns, 3, tile, tiles))
-                put(poses.cov, uint64(i * tiles + tile), left)
+                w, x = entries(columns, 0, tile, tiles), entries(columns, 1, tile, tiles)
+                y, z = entries(columns, 2, tile, tiles), entries(columns, 3, tile, tiles)
+                upper = less(less(less(less(entries(cov, i, tile, tiles), p, w), q, x), r, y), s, z)
+                lower = less(less(less(less(entries(cov, i + 1, tile, tiles), a, w), b, x), c, y), d, z)
+                put(cov, uint64(i * tiles + tile), upper)
+                put(cov, uint64((i + 1) * tiles + tile), lower)
     poses.totals[PENDING] = 0.0
 
 

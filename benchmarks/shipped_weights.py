@@ -1,9 +1,13 @@
-"""Shipped weights: made from their recipes, described by their cards, and made again to see that they are the same."""
+"""Shipped weights: made from their recipes with their cards, and made again to see that they are the same.
+
+python benchmarks/shipped_weights.py fedokf recursive      # largest difference of each from training again
+"""
 
 from __future__ import annotations
 
 import hashlib
 import platform
+import sys
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
@@ -13,17 +17,16 @@ import torch
 from coopoc.errors import unknown
 from coopoc.evaluate.metrics import nees_inside, rt_le
 from coopoc.fleets import load_fleet
+from coopoc.learned.checkpoint import Checkpoint, load, save
+from coopoc.learned.nets.stack import flatten
+from coopoc.learned.recipes import RECIPES, WEIGHTS, Job, Setting, jobs_of
+from coopoc.learned.train import trained
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
-
-from .checkpoint import Checkpoint, load, save
-from .nets.stack import flatten
-from .recipes import RECIPES, WEIGHTS, Job, Setting, jobs_of
-from .train import trained
 
 CLIENTS, JUDGES = "town10-clients", "town10-validation"
 """Fleets that the weights are trained on, and that their cards' metrics are of."""
@@ -99,9 +102,9 @@ def machine() -> str:
     """The processor, as far as rounding depends on it: architecture, model and vector instructions."""
     info = Path("/proc/cpuinfo")
     lines = info.read_text().split("\n\n")[0].splitlines() if info.is_file() else []
-    known = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
-    facts = [known[name] for name in ("model name", "cpu family", "model") if name in known] or [platform.processor()]
-    return ", ".join([platform.machine(), *facts, torch.backends.cpu.get_cpu_capability()])
+    facts = {name.strip(): value.strip() for name, _, value in (line.partition(":") for line in lines)}
+    names = [facts[name] for name in ("model name", "cpu family", "model") if name in facts] or [platform.processor()]
+    return ", ".join([platform.machine(), *names, torch.backends.cpu.get_cpu_capability()])
 
 
 def _made(recipe: str, progress: bool) -> dict[str, Checkpoint]:
@@ -112,13 +115,18 @@ def _made(recipe: str, progress: bool) -> dict[str, Checkpoint]:
 def metrics(method: Method, runs: int = 20) -> dict[str, dict[str, float]]:
     """RT-LE m, its multiple of the bias-ignorant oracle filter's and, where a covariance is claimed and no bias acts,
     the share of steps whose NEES is in its 99 % band, by the names of `SENSORS`: means over the validation fleet."""
-    fleet, found = load_fleet(JUDGES), {}
+    fleet, rows = load_fleet(JUDGES), {}
     egos = [i for i, column in enumerate(fleet.present.T) if column.all()]
     for name, sensors in SENSORS.items():
         recording = observe(fleet, sensors, V2X(max_neighbours=0), runs=runs, seed=1)
         track, oracle = method(recording, egos), Kalman(NoiseModel.oracle(sensors, fleet))(recording, egos)
         ours = float(rt_le(track, fleet).mean())
-        found[name] = {"rt_le_m": ours, "times_oracle": ours / float(rt_le(oracle, fleet).mean())}
+        rows[name] = {"rt_le_m": ours, "times_oracle": ours / float(rt_le(oracle, fleet).mean())}
         if track.covariance is not None and sensors.gnss_bias[1] == 0:
-            found[name]["nees_inside"] = float(nees_inside(track, fleet).mean())
-    return {name: {key: round(value, 4) for key, value in row.items()} for name, row in found.items()}
+            rows[name]["nees_inside"] = float(nees_inside(track, fleet).mean())
+    return {name: {key: round(value, 4) for key, value in row.items()} for name, row in rows.items()}
+
+
+if __name__ == "__main__":
+    for each in sys.argv[1:] or RECIPES:
+        print(differences(each))
