@@ -194,6 +194,7 @@ ORACLES = {
     "lkf-sa": "lkf_sa",
     "lkf-sa-edge": "joint",
     "joint": "joint",
+    "cooperative-filter": "cooperative",
     "drift": "drift",
     "msmv-r": "msmv",
     "ci": "covariance_intersection",

@@ -30,6 +30,8 @@ from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, VERSION, Task, bound,
 
 SMOOTHERS = frozenset({"batch-smoother"})
 """Methods that see the whole drive, for which a filtering bound is none."""
+PAST = frozenset({"cooperative-filter"})
+"""Filters of a star whose newcomers bring what they did before."""
 
 
 def benchmark(
@@ -111,6 +113,8 @@ def information(name: str, one: Method) -> str:
         return ""
     if not one.cooperative:
         return "solo"
+    if name in PAST:
+        return "past"
     return "fleet" if name in WHOLE_FLEET or needs_whole_fleet(name) else "star"
 
 
@@ -181,7 +185,7 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None) -> dict[str
 def page(cards: Iterable[Mapping[str, Any]]) -> str:
     """Markdown tables of cards, of simulated tasks and of logs and graphs where there are any.
 
-    Of simulated ones RT-LE in m and, in parentheses, over its bound, the least geometric mean first.
+    Of simulated ones RT-LE in m and, in parentheses, over its bound, the least geometric mean over all tasks first.
     """
     from tabulate import tabulate
 
@@ -223,10 +227,10 @@ def _simulated(cards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         if not cells:
             continue
         errors = [row["rt_le_m"][0] for row in cells.values() if "rt_le_m" in row]
-        mean = float(np.exp(np.mean(np.log(errors)))) if len(errors) == len(cells) else np.inf
+        mean = float(np.exp(np.mean(np.log(errors)))) if len(errors) == len(TASKS) else np.inf
         paper = cells.get("paper", {})
         shown = {"method": one["method"], "mean": three(mean) if np.isfinite(mean) else "-"}
-        shown |= {name: _cell(row) for name, row in cells.items()}
+        shown |= {task.name: _cell(cells[task.name]) if task.name in cells else "" for task in TASKS}
         shown |= {"NEES inside": paper.get("nees_inside", ""), "B/s": paper.get("received_bytes_per_second", "")}
         rows.append((mean, shown | {"us/step": paper.get("microseconds_per_step", "")}))
     return [shown for _, shown in sorted(rows, key=lambda row: row[0])]

@@ -19,6 +19,7 @@ TOGETHER = (
     ("lkf-sa", "nominal"),
     ("split-ci", "nominal"),
     ("cooperative-map-gnc", "nominal"),
+    ("cooperative-filter", "nominal"),
     ("cooperative", "trained"),
 )
 METHODS = (*ALONE, *TOGETHER)

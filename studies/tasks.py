@@ -15,7 +15,7 @@ import numpy as np
 from coopoc import V2X, Fleet, PoseFilter, Recording, Sensors, load_fleet, observe, read_graph, solve
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, posterior_bound
+from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, past_bound, posterior_bound
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.evaluate.statistics import mean_interval
@@ -24,7 +24,7 @@ from coopoc.world.spoofing import Spoofing, spoofed
 
 from . import pose_drives
 
-VERSION = "1"
+VERSION = "2"
 """Another set of tasks, seeds, egos or scores is another version."""
 
 
@@ -102,7 +102,7 @@ def recording(task: Task, everyone: bool, told: bool = False) -> tuple[Recording
 
 
 FEW = 3
-"""Runs over which the bound of a fleet is averaged where it depends on them: each takes half a minute."""
+"""Runs over which the bound of many vehicles is averaged where it depends on them: each takes half a minute."""
 
 
 @lru_cache(maxsize=64)
@@ -111,16 +111,18 @@ def bound(task: Task, information: str) -> float:
 
     Args:
         task: its drive and noise; a bias is left out, and of outliers and an attack the estimator is told.
-        information: "solo", "star" or "fleet".
+        information: "solo", "star", "past" (a star with the past of newcomers) or "fleet".
     """
     fleet, sensors = load_fleet(task.data), replace(task.sensors, gnss_bias=(0.0, 0.0))
     v2x = V2X(max_neighbours=task.v2x.max_neighbours, radius=task.v2x.radius)
     wrong = bool(sensors.outliers.notes or task.attack.share)
-    runs = FEW if information == "fleet" else task.runs
+    runs = FEW if information in ("past", "fleet") else task.runs
     told = recording(replace(task, v2x=v2x, runs=runs), information == "fleet", told=True)[0] if wrong else None
     if information == "fleet":
         whole = fleet_bound(fleet, sensors, v2x, recording=told)
         bounds: list[Floats] = [whole[:, ego] for ego in task.columns]
+    elif information == "past":
+        bounds = [past_bound(fleet, sensors, ego, v2x, recording=told) for ego in task.columns]
     else:
         bounds = [
             posterior_bound(fleet, sensors, ego, v2x if information == "star" else V2X(0), recording=told)

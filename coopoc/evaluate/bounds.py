@@ -100,7 +100,8 @@ def past_bound(fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X, *, recording:
     2.0
     """
     links = find_links(fleet, [ego], v2x.max_neighbours, v2x.radius, sensors.min_range)
-    members = [np.flatnonzero(row) for row in fleet.present]
+    near = np.isin(np.arange(len(fleet.ids)), [ego, *np.unique(links.neighbour)])  # the others say nothing about it
+    members = [np.flatnonzero(row & near) for row in fleet.present]
     return _bound(fleet, sensors, links, members, False, recording)[:, ego]
 
 

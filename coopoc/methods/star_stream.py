@@ -142,8 +142,9 @@ class StarStream:
         history: float = 10.0,
         max_age: float = 1.0,
     ) -> None:
-        kind = CooperativeFilter if isinstance(filter, CooperativeFilter) else JointFilter
-        known = constant_noise(instance("filter", filter, kind).noise_model)
+        if not isinstance(filter, CooperativeFilter):
+            filter = instance("filter", filter, JointFilter)
+        known = constant_noise(filter.noise_model)
         robust = isinstance(filter, CooperativeFilter) and filter.robust
         self._model, self._guards = model_of(known, robust), NO_GUARDS
         if isinstance(filter, JointFilter):

@@ -114,6 +114,7 @@ def curves(
     height: float = 3.1,
     log: bool = False,
     logx: bool = False,
+    merged: bool = True,
 ) -> Plot | None:
     """Plot a number of selections over a parameter, in panels that share the vertical axis; None if none was run.
 
@@ -132,6 +133,7 @@ def curves(
         height: inches.
         log: logarithmic vertical axis; a linear one starts at zero.
         logx: logarithmic horizontal axes.
+        merged: draw lines that coincide in all their panels as one, named together.
     """
     every, shown = [*lines, *levels], []
     models = {str(of.get("noise_model")) for of in every if of.get("method") != "bound"} - {"none", "trained"}
@@ -147,7 +149,7 @@ def curves(
     if not any(drawn for _, drawn in shown):
         return None
     height_of = _height(shown, log)
-    groups = {id(group[0]): group for group in _coinciding(shown, log, NEAR * height_of)}
+    groups = {id(group[0]): group for group in _coinciding(shown, log, NEAR * height_of if merged else -1.0)}
     size = {"width": width or 2.2 + 2.1 * len(shown) + (len(shown) == 1), "height": height}
     with canvas(1, len(shown), sharey=True, squeeze=False, **size) as (figure, (axes,)):
         named, also = list[dict[str, Any]](), dict[str, str]()
