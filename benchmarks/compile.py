@@ -20,7 +20,7 @@ from unseen_graphs import joined, world
 
 import coopoc as co
 from coopoc.methods.catalogue import METHODS, needs_whole_fleet
-from coopoc.optimize.graphs import from_graph
+from coopoc.optimize.graph_problems import from_graph
 
 Call = Callable[[], object]
 LIMIT = 10.0

@@ -22,7 +22,7 @@ from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import solve
 from coopoc.optimize.distributed import BYTES, Distributed, makers, owners, solve_distributed
-from coopoc.optimize.graphs import from_graph
+from coopoc.optimize.graph_problems import from_graph
 
 FOLDER = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
 ROUNDS = 200

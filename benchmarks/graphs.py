@@ -34,7 +34,7 @@ from coopoc.formats import GRAPHS, load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, solve
 from coopoc.optimize.backends.gtsam_factors import pose_of
-from coopoc.optimize.graphs import from_graph
+from coopoc.optimize.graph_problems import from_graph
 
 FOLDER = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
 UNMEASURED = 1e6

@@ -21,7 +21,7 @@ from unseen_graphs import joined, manhattan, world
 from coopoc.evaluate.trajectory_scores import absolute_error
 from coopoc.formats.graph import Graph
 from coopoc.optimize import solve_gnc
-from coopoc.optimize.graphs import from_graph, loop_closures
+from coopoc.optimize.graph_problems import from_graph, loop_closures
 
 SHARES = (0.1, 0.3, 0.5, 0.8)
 WRONG = 0.2

@@ -45,10 +45,10 @@ from .methods.track import Method as Method
 from .methods.track import Track as Track
 from .optimize.backend import Backend as Backend
 from .optimize.backend import backends as backends
-from .optimize.graphs import read_graph as read_graph
+from .optimize.graph_problems import read_graph as read_graph
 from .optimize.model.factor import Constraint as Constraint
 from .optimize.model.factor import Factor as Factor
-from .optimize.model.losses import Loss as Loss
+from .optimize.model.factor import Loss as Loss
 from .optimize.model.problem import Problem as Problem
 from .optimize.model.space import pose as pose
 from .optimize.solution import Solution as Solution

@@ -159,12 +159,12 @@ def find(group: str, name: str) -> Any:
     """
     if not isinstance(name, str):
         raise _unknown(group, name)
-    if in_file(name):
-        return from_file(name, GROUPS.get(group, group))
     registered = points(group)
     loaded = registered[name].load() if name in registered else None
     if loaded is not None and not isinstance(loaded, Mapping):
         return loaded
+    if in_file(name):
+        return from_file(name, GROUPS.get(group, group))
     for point in sorted(registered.values(), key=lambda point: name not in (names_in(point.value) or ())):
         members = _members(point)
         if name in members:

@@ -18,7 +18,7 @@ from coopoc.evaluate.trajectory_scores import absolute_error, align
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Solution, solve
-from coopoc.optimize.graphs import from_graph
+from coopoc.optimize.graph_problems import from_graph
 
 
 def main(path: str, picture: str | None = None) -> Solution:

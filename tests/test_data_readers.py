@@ -14,7 +14,6 @@ from coopoc.data.assemble import interpolate
 from coopoc.data.fleet_files import read_tum
 from coopoc.data.registry import convert, load_fleet
 from coopoc.errors import InputError
-from coopoc.formats.trajectories import Trajectory, write_tum
 from coopoc.world.fleet import Fleet
 
 GOOD = "id,t,x,y,z\na,0.0,0,0,0\nb,0.0,5,0,0\na,0.1,1,0,0\nb,0.1,5,1,0\na,0.2,2,0,0\nb,0.2,5,2,0\n"
@@ -31,7 +30,8 @@ def test_tum_files_are_what_evo_reads(tmp_path: Path) -> None:
     """Independent check: evo reads the file that we write (evo is a tool of the tests only)."""
     fleet = load_fleet("town10-clients")
     x = fleet.position[:1550, 0]
-    write_tum(Trajectory(fleet.t[:1550], x, np.tile(np.eye(3), (1550, 1, 1))), tmp_path / "car.tum")
+    still = np.tile([0.0, 0.0, 0.0, 1.0], (1550, 1))
+    np.savetxt(tmp_path / "car.tum", np.column_stack([fleet.t[:1550], x, still]), fmt="%.17g")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         file_interface = pytest.importorskip("evo.tools.file_interface")

@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 
 from coopoc import InputError
-from coopoc.formats import load_graph, write_graph
+from coopoc.formats import load_graph
 from coopoc.formats.jrl import read_jrl
-from coopoc.optimize.graphs import from_graph
+from coopoc.optimize.graph_problems import from_graph
 
 A, B, MARK = 97 << 56, 98 << 56, (97 << 56) + 1_000_000_000
 UNIT2, UNIT6 = np.eye(3).ravel().tolist(), np.eye(6).ravel().tolist()
@@ -173,8 +173,3 @@ def test_what_is_no_json_is_named(tmp_path: Path) -> None:
         read_jrl(tmp_path / "a.jrl")
     with pytest.raises(InputError, match="must be a file"):
         read_jrl(tmp_path / "b.jrl")
-
-
-def test_jrl_is_not_written(tmp_path: Path) -> None:
-    with pytest.raises(InputError, match=r"must end in \.pyfg or \.g2o"):
-        write_graph(load_graph(written(tmp_path, documented())), tmp_path / "again.jrl")

@@ -17,8 +17,7 @@ from coopoc import optimize
 from coopoc.errors import shown
 from coopoc.evaluate.trajectory_scores import Path as Path_
 from coopoc.evaluate.trajectory_scores import scores
-from coopoc.formats import load_graph, read_g2o, read_jrl, read_pyfg, write_g2o, write_graph, write_pyfg
-from coopoc.formats.graph import Graph
+from coopoc.formats import load_graph, read_g2o, read_jrl, read_pyfg
 from coopoc.study.merge import merge
 from coopoc.study.publish import views
 from coopoc.study.reference import Reference
@@ -255,12 +254,6 @@ def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path: Path) ->
         co.read_log,
     ):
         swept(lambda path, read=read: read(path), {"path": "nowhere.pyfg"})
-    graph = Graph(2, ("A0", "L0"), [True, False], [[0, 0], [3, 4]], [[0], [0]])
-    for write, name in ((write_graph, "a.pyfg"), (write_g2o, "b.g2o"), (write_pyfg, "d.pyfg")):
-        swept(lambda graph, write=write, name=name: write(graph, tmp_path / name), {"graph": graph})
-        for value in (None, 1.5, object(), ["a"]):
-            with pytest.raises(co.InputError, match=r"path|stamp|fixed"):
-                write(graph, value)
     for value in (None, 1, [], b"x"):
         with pytest.raises(co.InputError, match="study"):
             co.run_study(value, tmp_path, progress=False)  # type: ignore[arg-type]

@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 
 from coopoc import InputError
 from coopoc.optimize import Loss, Problem, Status, solve
-from coopoc.optimize.model.symbolic import _chart
+from coopoc.optimize.model.derivatives import cayley
 from coopoc.optimize.starts.initial import initial_guess
 
 
@@ -69,5 +69,5 @@ def test_steps_of_a_rotation_are_scipys(w: tuple[float, float, float]) -> None:
     """Cayley's map turns about w by 2 atan(|w| / 2), to first order by |w|."""
     size = float(np.linalg.norm(w))
     wanted = Rotation.from_rotvec(2.0 * np.arctan(size / 2.0) * np.array(w) / size).as_matrix()
-    found = np.array([[float(entry) for entry in row] for row in _chart([casadi.DM(value) for value in w])])
+    found = np.array([[float(entry) for entry in row] for row in cayley([casadi.DM(value) for value in w])])
     np.testing.assert_allclose(found, wanted, atol=1e-14)

@@ -9,10 +9,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from graph_files import write_graph
 from random_graphs import random_graph
 
 from coopoc.cli import main
-from coopoc.formats import write_graph
 from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import backends
 

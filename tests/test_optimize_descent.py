@@ -7,8 +7,8 @@ import pytest
 
 import coopoc as co
 from coopoc.optimize import Problem, solve, solve_batch
-from coopoc.optimize.descent import descend
-from coopoc.optimize.descent.descend import _damping
+from coopoc.optimize.descent import levenberg_marquardt
+from coopoc.optimize.descent.levenberg_marquardt import _damping
 
 
 def test_damping_follows_the_share_of_the_promise_that_came_true() -> None:
@@ -77,7 +77,7 @@ def test_a_bar_shows_steps_and_cost(
     capsys.readouterr()
     quick = co.solve(ranged(), backend)
     assert "solve" not in capsys.readouterr().err
-    monkeypatch.setattr(descend, "DELAY", -1.0)
+    monkeypatch.setattr(levenberg_marquardt, "DELAY", -1.0)
     shown = co.solve(ranged(), backend)
     assert "cost" in capsys.readouterr().err
     assert np.array_equal(shown.position, quick.position)

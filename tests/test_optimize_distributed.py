@@ -14,7 +14,7 @@ from coopoc import InputError
 from coopoc.formats.graph import RangeEdges
 from coopoc.optimize import Loss, Problem, Status, solve
 from coopoc.optimize.distributed import owners, solve_distributed
-from coopoc.optimize.graphs import from_graph
+from coopoc.optimize.graph_problems import from_graph
 
 
 def chain(robots: int = 3, length: int = 4) -> Problem:

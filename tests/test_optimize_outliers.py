@@ -9,19 +9,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from graph_files import write_graph
 
 import coopoc as co
 from coopoc.arrays import Bools, Floats, Ints
 from coopoc.evaluate.trajectory_scores import absolute_error
-from coopoc.formats import write_graph
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges
 from coopoc.formats.values import to_orientation
 from coopoc.optimize import Problem, Status, pose, solve_gnc
-from coopoc.optimize.commands import solve_file
-from coopoc.optimize.graphs import from_graph, loop_closures
+from coopoc.optimize.graph_problems import from_graph, loop_closures
 from coopoc.optimize.model.space import exp
 from coopoc.optimize.robust.candidates import mark
 from coopoc.optimize.robust.loop_closures import predicted
+from coopoc.optimize.solver_commands import solve_file
 
 STD = np.array([0.02, 0.02, 0.01])
 

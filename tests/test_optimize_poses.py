@@ -14,7 +14,7 @@ from coopoc.evaluate.trajectory_scores import absolute_error
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Problem, Status, pose, solve
-from coopoc.optimize.graphs import from_graph
+from coopoc.optimize.graph_problems import from_graph
 from coopoc.optimize.model.space import Space, exp, log
 
 PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"

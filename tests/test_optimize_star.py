@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from coopoc.optimize import Factor, Problem, pose, solve, solve_batch
-from coopoc.optimize.algebra.star import is_star, star_at
+from coopoc.optimize.algebra.schur import is_star, star_at
 from coopoc.optimize.starts.initial import initial_guess
 
 RUNS = 9

@@ -12,12 +12,12 @@ from typing import Any
 
 import numpy as np
 import pytest
+from graph_files import write_graph
 
 import coopoc as co
 from coopoc.data.commands import check as data_check
 from coopoc.data.graphs import graph_recording
 from coopoc.data.registry import load_log
-from coopoc.formats.g2o import write_g2o
 from coopoc.formats.pyfg import read_pyfg
 from coopoc.world.body_frames import body_motion
 
@@ -117,7 +117,7 @@ def inverted(line: str) -> str:
 
 
 def test_covariances_for_information_are_named_where_a_graph_is_solved(shared: Path, tmp_path: Path) -> None:
-    write_g2o(without_stamps(read_pyfg(shared / "pyfg" / "mrclam5a.pyfg")), tmp_path / "right.g2o")
+    write_graph(without_stamps(read_pyfg(shared / "pyfg" / "mrclam5a.pyfg")), tmp_path / "right.g2o")
     lines = (tmp_path / "right.g2o").read_text().splitlines()
     (tmp_path / "wrong.g2o").write_text("\n".join(map(inverted, lines)) + "\n")
     found = {}

@@ -14,7 +14,7 @@ from coopoc.data.score_files import read_paths, score
 from coopoc.errors import InputError
 from coopoc.evaluate.trajectory_scores import Path as Track
 from coopoc.evaluate.trajectory_scores import absolute_error, align, associated, relative_error, rms_interval, scores
-from coopoc.formats.trajectories import read_kitti, write_tum
+from coopoc.formats.trajectories import read_kitti
 from coopoc.formats.values import to_rotation
 
 EVO = {(1, "steps"): (0.028120377, 4540), (10, "steps"): (0.194007758, 454), (100, "m"): (1.193975925, 36)}
@@ -150,7 +150,8 @@ def test_the_command_gives_evos_figures_from_files(
     times = folder / "KITTI_00_gt_times.txt"
     truth = (f"{folder / 'KITTI_00_gt.txt'}?times={times}",)
     poses = read_kitti(folder / "KITTI_00_ORB.txt", times)
-    write_tum(poses, tmp_path / "orb.tum")
+    table = np.column_stack([poses.stamps, poses.position, Rotation.from_matrix(poses.rotation).as_quat()])
+    np.savetxt(tmp_path / "orb.tum", table, fmt="%.17g")
     frame = pd.DataFrame(poses.position, columns=["x", "y", "z"]).assign(zeit=poses.stamps)
     frame.to_csv(tmp_path / "orb.csv", index=False)
     names = (

@@ -6,7 +6,6 @@ from pathlib import Path
 
 import numpy as np
 
-from ..arrays import instance
 from ..errors import InputError
 from ..file_names import given_path
 from .graph import NAME, Graph
@@ -83,30 +82,6 @@ def read_g2o(path: str | Path) -> Graph:
         _refuse_offset(path.name, number, words, identity)
     fixed = [(number, word) for number, words in lines if words[0] == "FIX" for word in words[1:]]
     return GRAMMAR.read(path.name, records, fixed)
-
-
-def write_g2o(graph: Graph, path: str | Path) -> None:
-    """Write a g2o file: ids are the numbers of the names if poses are called A, points L, and no number comes twice.
-
-    Else poses get GTSAM's symbol keys, and points that are not called L, too. GTSAM reads such files; g2o's own program
-    reads ids of 32 bits only.
-
-    Raises:
-        InputError: a graph with stamps, which g2o has not, a singular covariance, or a vertex without a position.
-    """
-    numbers = {name[1:] for name in instance("graph", graph, Graph).names}
-    plain = len(numbers) == len(graph.names) and all(graph.names[k][0] == "A" for k in np.flatnonzero(graph.is_pose))
-    point = {name for name, pose in zip(graph.names, graph.is_pose, strict=True) if not pose}
-
-    def label(name: str) -> str:
-        short = name[0] == "L" if name in point else plain
-        return str(int(name[1:]) + (0 if short else ord(name[0]) << 56))
-
-    lines = GRAMMAR.write(graph, label)
-    if graph.dimension == 3 and (len(graph.relative_point) or len(graph.pose_prior)):
-        lines.insert(0, "PARAMS_SE3OFFSET 0 0 0 0 0 0 0 1")
-    lines += [f"FIX {label(graph.names[k])}" for k in graph.fixed.tolist()]
-    given_path(path).write_text("\n".join([*lines, ""]))
 
 
 def _identities(file: str, lines: list[tuple[int, list[str]]]) -> dict[str, bool]:

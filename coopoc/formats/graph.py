@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import InitVar, dataclass, fields, replace
+from dataclasses import InitVar, dataclass, fields
 from functools import cached_property
 from typing import Any
 
@@ -205,25 +205,6 @@ class Graph:
         letter = np.array([name[0] for name in self.names])
         first = dict.fromkeys(letter[self.is_pose].tolist())
         return {robot: np.flatnonzero(self.is_pose & (letter == robot)) for robot in first}
-
-    def stamped(self, stamps: npt.ArrayLike) -> Graph:
-        """The same graph with other stamps, an edge that of its first pose, else point; NaN takes them away.
-
-        Args:
-            stamps: a number or (n,), s; points do not keep them.
-
-        >>> graph = Graph(2, ("A0", "A1"), [True, True], np.zeros((2, 2)), np.zeros((2, 1)))
-        >>> graph.stamped([0, 0.1]).stamps
-        array([0. , 0.1])
-        """
-        every = np.broadcast_to(np.asarray(stamps, dtype=float), len(self.names))
-        own = np.where(self.is_pose, every, np.nan)
-        edges = {}
-        for field in ENDS:
-            edge = getattr(self, field)
-            first = np.where(self.is_pose[edge.nodes[:, 0]], edge.nodes[:, 0], edge.nodes[:, -1])
-            edges[field] = replace(edge, stamps=every[first])
-        return replace(self, stamps=own, **edges)
 
     def __repr__(self) -> str:
         poses = int(self.is_pose.sum())

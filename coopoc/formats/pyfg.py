@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from ..arrays import instance
-from ..errors import InputError
 from ..file_names import given_path
 from .graph import NAME, Graph
 from .records import Grammar, Record
@@ -56,21 +54,3 @@ def read_pyfg(path: str | Path) -> Graph:
     """
     path = given_path(path)
     return GRAMMAR.read(path.name, read_words(path))
-
-
-def write_pyfg(graph: Graph, path: str | Path) -> None:
-    """Write a PyFG file that reads back bit by bit.
-
-    Raises:
-        InputError: a pose or measurement without a stamp, a vertex without a position, or fixed vertices, for which
-            PyFG has no record.
-    """
-    if len(instance("graph", graph, Graph).fixed):
-        raise InputError(
-            "fixed",
-            f"{len(graph.fixed)} vertices",
-            "PyFG has no record for fixed vertices",
-            "Write dataclasses.replace(graph, fixed=()), or a pose prior.",
-        )
-    lines = GRAMMAR.write(graph, lambda name: name)
-    given_path(path).write_text("\n".join([*lines, ""]))

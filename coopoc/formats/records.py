@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Floats
 from ..errors import InputError, suggestion
 from .graph import ENDS, Edges, Graph, edges_of
-from .values import inverse, malformed, symmetric, to_numbers, to_text, upper_triangle
+from .values import inverse, malformed, symmetric, to_numbers
 
 VALUES = {"pose2": "x y theta", "pose3": "x y z qx qy qz qw", "point2": "x y", "point3": "x y z"}
 Index = dict[str, dict[str, int]]  # pose or point -> the word for a vertex -> its place
@@ -79,7 +79,7 @@ class _Rows:
 
 @dataclass(frozen=True)
 class Grammar:
-    """A format of lines, as `read` and `write` need it.
+    """A format of lines.
 
     Args:
         format: its name.
@@ -204,62 +204,6 @@ class Grammar:
         numbers = to_numbers(file, rows.lines, digits, self.form(rows.tag), len(digits[0]))
         stamps = numbers[:, 0] if record.stamped else np.full(len(digits), np.nan)
         return stamps, [words[start:stop] for words in rows.words], numbers[:, start - 1 :]
-
-    def write(self, graph: Graph, label: Callable[[str], str]) -> list[str]:
-        """Lines of a graph: vertices in its order, then what was measured, kind by kind.
-
-        Args:
-            graph: any.
-            label: name of a vertex -> the word for it.
-
-        Raises:
-            InputError: a position or stamp that the format needs and the graph lacks, a stamp that the format could not
-                keep, or a singular covariance where it wants information.
-        """
-        tags = {r.kind: tag for tag, r in self.records.items() if r.dimension in (0, graph.dimension)}
-        labels = [label(name) for name in graph.names]
-        out: list[str] = [""] * len(labels)
-        for kind in ("pose", "point"):
-            own = np.flatnonzero(graph.is_pose == (kind == "pose"))
-            values = np.hstack([graph.position, graph.orientation] if kind == "pose" else [graph.position])[own]
-            lines = self._lines(graph, tags[kind], graph.stamps[own], own[:, None], labels, values)
-            for k, line in zip(own, lines, strict=True):
-                out[k] = line
-        for kind in ENDS:
-            edges = getattr(graph, kind)
-            if kind == "ranges":
-                values, noise = edges.distance[:, None], edges.variance[:, None, None]
-            else:
-                values, noise = edges.position, edges.covariance
-            if "pose" in kind:
-                values = np.hstack([values, edges.orientation])
-            if self.noise == "information":
-                noise = inverse(noise, f"{kind}[{{}}]".format, "covariance")
-            numbers = np.hstack([values, upper_triangle(noise)])
-            out += self._lines(graph, tags[kind], edges.stamps, edges.nodes, labels, numbers)
-        return out
-
-    def _lines(
-        self, graph: Graph, tag: str, stamps: Floats, nodes: Ints, labels: Sequence[str], values: Floats
-    ) -> list[str]:
-        record = self.records[tag]
-        missing = np.flatnonzero(~np.isfinite(values).all(axis=1))
-        if len(missing):
-            hint = "Give it a position and an orientation, such as an initial guess."
-            name = graph.names[nodes[missing[0], 0]]
-            raise InputError(f"vertex {name}", "NaN", f"must be known: {tag} holds it", hint)
-        off = np.flatnonzero(np.isfinite(stamps) != record.stamped)
-        if len(off):
-            needs, value = ("must be given", "t") if record.stamped else ("has no place", "np.nan")
-            raise InputError(
-                f"stamp of {record.kind} of {graph.names[nodes[off[0], 0]]}",
-                stamps[off[0]],
-                f"{needs} in a line {tag} of {self.format}",
-                f"Write graph.stamped({value}), or replace the stamps.",
-            )
-        times = [f" {t!r}" if record.stamped else "" for t in stamps.tolist()]
-        ends = [" ".join(labels[k] for k in pair) + " 0" * record.offset for pair in nodes.tolist()]
-        return [f"{tag}{t} {names} {text}" for t, names, text in zip(times, ends, to_text(values), strict=True)]
 
 
 def _find(place: str, word: str, role: str, index: Index) -> int:

@@ -90,15 +90,6 @@ def read_table(path: Path, form: str) -> tuple[Ints, Floats]:
     return np.array(lines), to_numbers(path.name, lines, [words for _, words in rows], form, len(form.split()))
 
 
-def to_text(values: Floats) -> list[str]:
-    """One line per row of (M, C) numbers, with as many digits as it takes to read the same bits again.
-
-    >>> to_text(np.array([[0.1, 2.0]]))
-    ['0.1 2.0']
-    """
-    return [" ".join(map(repr, row)) for row in values.tolist()]
-
-
 def to_rotation(orientation: Floats) -> Floats:
     """Rotation matrices of angles or quaternions, R(theta) or R(q / |q|).
 

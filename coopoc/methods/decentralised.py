@@ -148,7 +148,7 @@ class ConsensusADMM:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
-            from ..kernels.fleets.consensus import run_filter
+            from ..kernels.fleets.admm import run_filter
             from ..kernels.fleets.graph import new_edges
 
             certain = PENALTY / np.median(assumed.fix.min(axis=-1))

@@ -1,21 +1,18 @@
 """The optimisation problem and its solvers: nodes, factors between them, and backends by name."""
 
 from . import backends as _package  # noqa: F401  (first: the function `backends` takes its name)
+from .assess.assess import joint_covariance
 from .backend import Backend, Capabilities, SolverResult, backends
-from .batch import Batch, solve_batch
 from .descent.local_problem import LocalProblem
 from .distributed import Distributed, solve_distributed
-from .graphs import loop_closures
-from .joint import joint_covariance
-from .model import kinds as _kinds  # noqa: F401  (registers the kinds that we know)
-from .model.factor import Constraint, Factor
-from .model.losses import Loss
+from .graph_problems import loop_closures
+from .model.factor import Constraint, Factor, Loss
 from .model.measurements import MEASUREMENTS, Measurement, measurement
 from .model.problem import Problem
 from .model.space import Space, pose
 from .robust.gnc import solve_gnc
 from .solution import Solution, SolveError, Status
-from .solve import solve
+from .solve import Batch, solve, solve_batch
 
 __all__ = [
     "MEASUREMENTS",

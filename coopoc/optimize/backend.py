@@ -13,7 +13,6 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..errors import InputError, MissingLibraryError, suggestion, unknown
-from ..one_file import in_file
 from ..plugins import find, names
 from .model.problem import Problem
 
@@ -163,7 +162,7 @@ def require_backend(backend: str | Backend) -> Backend:
         MissingLibraryError: its library is not installed; carries the line that installs it.
     """
     if isinstance(backend, str):
-        backend = _checked(backend) if in_file(backend) else _registered(backend)
+        backend = _checked(backend) if ".py" in backend else _registered(backend)  # a file may change
     elif not isinstance(backend, Backend):
         raise unknown("backend", backend, backends())
     if not backend.installed:

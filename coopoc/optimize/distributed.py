@@ -11,12 +11,11 @@ from ..arrays import Floats, Ints, instance, number
 from ..errors import InputError
 from ..short_repr import short_repr
 from .algebra.sparse import Sparse, sparse
-from .descent.trust_region import arrive
+from .descent.levenberg_marquardt import arrive
+from .model.derivatives import numbers_of
 from .model.factor import Factor, unchecked
-from .model.parts import restricted
 from .model.problem import Problem
 from .model.space import Space, log
-from .model.symbolic import numbers_of
 
 BYTES = 8
 """Of a number that is sent."""
@@ -280,7 +279,7 @@ def agents_of(problem: Problem, owner: tuple[str, ...], links: Sequence[Link]) -
         for factor, own in zip(problem.factors, rows, strict=True):
             used[factor.nodes[own]] = True
         mine = [link for link in links if robot in link.ends]
-        local = restricted(problem, used, np.array(problem.x0), rows)
+        local = problem.restricted(used, np.array(problem.x0), rows)
         nodes = np.flatnonzero(used)
         points = [k for link in mine if robot == link.ends[1] and not link.turns for k in link.nodes.tolist()]
         poses = np.setdiff1d(local.poses, np.searchsorted(nodes, points))

@@ -1,22 +1,23 @@
-"""solve: a Problem and the name of a backend give a Solution, verified independently of the solver."""
+"""solve and solve_batch: a Problem and the name of a backend give a Solution, verified independently of the solver."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, Ints, instance
+from ..arrays import Bools, Floats, Ints, instance
 from ..errors import InputError
+from ..short_repr import short_repr
+from .algebra.schur import is_star, star_at
 from .algebra.sparse import sparse
 from .assess.active import constraint_rows
-from .assess.assess import Assessment, assess
-from .assess.curvature import is_constrained_minimum, newton_decrease
+from .assess.assess import INFLATION, Assessment, assess, is_constrained_minimum, newton_decrease
 from .backend import Backend, Options, require_backend
-from .descent.descend import MAX_ITERATIONS
-from .model.parts import fused
+from .descent.levenberg_marquardt import MAX_ITERATIONS
+from .model.factor import fused
 from .model.problem import Problem, Search
 from .solution import Solution, SolveError, Status
 from .starts.initial import initial_guess, somewhere
@@ -29,6 +30,8 @@ PROMISE = 1e-8
 """What a Newton step may promise where Gauss-Newton's is below the tolerance: 1e-4 standard deviations away."""
 FEASIBLE = 1e-6
 """m, rad or m/s by which a constraint may be violated."""
+CHUNK = 40_000
+"""Nodes of measurements that one chunk may hold, so that a batch stays in the cache."""
 
 
 def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool = True, **options: Any) -> Solution:
@@ -60,7 +63,8 @@ def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool
         raise InputError("problem", repr(problem), "must be a single realisation", hint)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
-    problem = fused(problem)
+    if (factors := fused(problem.factors)) is not problem.factors:
+        problem = problem.replace_unchecked(factors=factors)
     solution = _solved(problem, known, options)
     if problem.search.start:
         solution = _with_search(solution, problem.search)
@@ -175,3 +179,81 @@ def _raise(solution: Solution) -> None:
         "must be observable",
         "Add a position factor (a fix) to one of them, or more measurements between them.",
     )
+
+
+@dataclass(frozen=True, eq=False)
+class Batch:
+    """Solutions of B realisations: x (B, n, ambient), covariance (B, n, dof, dof), the others (B,).
+
+    converged: a Gauss-Newton step from x would move no node by more than the tolerance of the options (at least
+    1e-6 m); where a node is unobservable it is False and the covariance NaN. Unlike `solve` it does not check whether
+    the stationary point is a saddle.
+    """
+
+    x: Floats
+    covariance: Floats
+    cost: Floats
+    iterations: Ints
+    converged: Bools
+
+    __repr__ = short_repr
+
+
+def solve_batch(problem: Problem, backend: str | Backend = "gauss-newton", **options: Any) -> Batch:
+    """Minima of all realisations, each as `solve` finds it.
+
+    The solver of their structure and the pattern of the checks are made once. A backend that is not batched is called
+    once per realisation.
+
+    Args:
+        problem: with a batch axis B (a single problem is a batch of one).
+        backend: as in `solve`.
+        options: of the backend.
+
+    Raises:
+        InputError: no measurements, constraints, an unknown backend or option, a problem beyond its capabilities.
+        MissingLibraryError: the backend's library is not installed.
+
+    >>> problem = Problem(("a",)).add("position", [["a"]], np.arange(6.0).reshape(2, 1, 3), std=1.0)
+    >>> solve_batch(problem).x.shape
+    (2, 1, 3)
+    """
+    solver_backend = require_backend(backend)
+    instance("problem", problem, Problem)
+    if not problem.factors:
+        raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
+    if problem.constraints:
+        hint = "Solve one realisation after the other: solve(problem.pick(run), ...)."
+        raise InputError("problem", repr(problem), "has constraints, which a batch cannot hold", hint)
+    solver = solver_backend.solver(problem, options)
+    count, reach = problem.batch or 1, max(POSITION_TOLERANCE, options.get("tolerance", 0.0))
+    per = max(1, CHUNK // sum(factor.nodes.size for factor in problem.factors))
+    parts = []
+    for first in range(0, count, per):
+        part = problem.pick(np.arange(first, min(first + per, count))) if problem.batch else problem
+        end = solver(part, (somewhere if part.linear else initial_guess)(part))
+        cost, cov, left = (_checked_stars if is_star(part) else _checked)(part, end.x)
+        there = ~np.isnan(left) & (left <= reach)
+        parts.append((end.x, cov, cost, end.iterations, there))
+    return Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
+
+
+def _checked(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
+    """Cost, covariance and largest move of a Gauss-Newton step of each realisation; NaN where one is unobservable."""
+    singles = problem.realisations
+    assessments = [assess(single, at) for single, at in zip(singles, x, strict=True)]
+    cov = np.stack([assessment.covariance for assessment in assessments])
+    cost = np.array([assessment.cost for assessment in assessments])
+    return cost, cov, np.array([assessment.remaining for assessment in assessments])
+
+
+def _checked_stars(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
+    """The same of stars, all at once."""
+    linear = problem.linearise(x)
+    star = star_at(problem, linear)
+    dx, marginals = star.solve()
+    cov = marginals()
+    inflation = np.einsum("bnii,bnii->bni", star.own, cov)
+    sound = ((inflation > 0) & (inflation < INFLATION)).all(axis=(1, 2))
+    cov[~sound], left = np.nan, np.abs(dx).max(axis=(1, 2))
+    return linear.cost, cov, np.where(sound, left, np.nan)

@@ -17,11 +17,11 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inside
 
-PANEL = 64
+PANEL = 32
 """Rows of a front that are eliminated before one product updates the rest."""
 WORTH = 8000
 """Multiplications from which a call of BLAS is faster than loops."""
-STRIP = 128
+STRIP = 64
 """Rows that one product updates: below the diagonal it would compute what nothing reads."""
 
 

@@ -117,6 +117,11 @@ def cholesky_of(matrix: Any) -> Cholesky | None:
     return cholesky if cholesky.factor(upper.data) else None
 
 
+def columns_solved(cholesky: Cholesky, right: Floats) -> Floats:
+    """(u, K) A^-1 right, column by column."""
+    return np.stack([cholesky.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
+
+
 def with_still(matrix: Any, added: Floats | Bools | None) -> Any:
     """A sparse matrix with numbers (n, dof) added to its diagonal, such as 1 where a node cannot move."""
     from scipy.sparse import diags_array

@@ -8,23 +8,19 @@ from dataclasses import dataclass
 from functools import cached_property, lru_cache
 from itertools import combinations_with_replacement
 from typing import Any
-from weakref import WeakKeyDictionary, WeakValueDictionary
+from weakref import WeakValueDictionary
 
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
+from ..model.derivatives import Kind, Linear, Model, Structure, Term, numbers_of, write
 from ..model.factor import steerable
-from ..model.linear import Linear
 from ..model.problem import Problem
 from ..model.space import Space
-from ..model.symbolic import Kind, Structure, Term, numbers_of
-from ..model.tape import Model, write
 from .cholesky import Cholesky, DenseCholesky
 
 DENSE = 200
 """Unknowns up to which one dense matrix is as fast."""
-AT_ONCE = 100_000
-"""Places that are found at a time: many at once take memory."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,16 +29,14 @@ class Entries:
 
     Args:
         number: (n, dof) which of the m unknowns a direction of a node is, -1 where it cannot move.
-        start: (n,) first of a node's entries in its first column.
-        height: (n,) rows above a node's own block.
-        block: sorted keys j n + i of the blocks (i, j), i <= j, and the row of each within column j.
+        key: sorted j n + i of the blocks of nodes (i, j), i <= j.
+        place: (blocks, dof, dof) of each number of a block, -1 below the diagonal and where nothing can move.
         indptr: (m + 1,) and indices: of the CSC matrix.
     """
 
     number: Ints
-    start: Ints
-    height: Ints
-    block: tuple[Ints, Ints]
+    key: Ints
+    place: Ints
     indptr: Ints
     indices: Ints
 
@@ -56,19 +50,12 @@ class Entries:
         """(m,) places of the diagonal."""
         return self.indptr[1:] - 1
 
-    def pair(self, first: Ints, last: Ints) -> tuple[Ints, Ints, Ints]:
-        """(M,) which of two nodes has the columns of their block, which the rows, and where its rows begin."""
+    def places(self, first: Ints, last: Ints, row: Ints, column: Ints) -> Ints:
+        """(K, M) where products of directions (K,) of pairs of nodes (M,) belong, -1 if nowhere."""
         upper, lower = np.maximum(first, last), np.minimum(first, last)
-        key, offset = self.block
-        return upper, lower, offset[np.searchsorted(key, upper * len(self.number) + lower)]
-
-    def places(self, pair: tuple[Ints, Ints, Ints], unknown: Ints, another: Ints) -> Ints:
-        """(..., M) where products of two unknowns of a pair's nodes belong, -1 where unknown is -1."""
-        upper, lower, offset = pair
-        low, high = np.minimum(unknown, another), np.maximum(unknown, another)
-        within = high - self.first[upper]
-        at = self.start[upper] + within * self.height[upper] + within * (within + 1) // 2
-        return np.where(low < 0, -1, at + offset + low - self.first[lower])
+        block, turned = np.searchsorted(self.key, upper * len(self.number) + lower), first > last
+        row, column = row[:, None], column[:, None]
+        return self.place[block, np.where(turned, column, row), np.where(turned, row, column)]
 
     @cached_property
     def own(self) -> tuple[Bools, Ints, Ints]:
@@ -76,12 +63,6 @@ class Entries:
         row, column = np.broadcast_arrays(self.number[:, :, None], self.number[:, None, :])
         free = (row >= 0) & (column >= 0)
         return free, row[free], column[free]
-
-    @cached_property
-    def first(self) -> Ints:
-        """(n,) first unknown of each node."""
-        counts = (self.number >= 0).sum(axis=1)
-        return np.asarray(np.cumsum(counts) - counts)
 
 
 def entries_of(movable: Bools, measured: Sequence[Ints]) -> Entries:
@@ -91,44 +72,22 @@ def entries_of(movable: Bools, measured: Sequence[Ints]) -> Entries:
         movable: (n, dof) False where a node cannot move.
         measured: the nodes (M, arity) of each factor.
     """
-    n, dof = movable.shape
+    from scipy.sparse import coo_array
+
+    (n, dof), m = movable.shape, int(movable.sum())
     number = np.where(movable, np.cumsum(movable).reshape(n, dof) - 1, -1)
-    count = movable.sum(axis=1)
     keys = [np.arange(n) * (n + 1)]
     keys += [nodes.max(axis=1) * n + nodes.min(axis=1) for nodes in measured if nodes.shape[1] == 2]
     key = np.unique(np.concatenate(keys))
     j, i = np.divmod(key, n)
-    width = count[i]
-    before = np.cumsum(width) - width
-    head = before[np.searchsorted(key, np.arange(n) * n)]
-    offset = before - head[j]
-    height = np.bincount(j, width * (i != j), n).astype(np.int64)
-    per_node = count * height + count * (count + 1) // 2
-    start = np.cumsum(per_node) - per_node
-    length = np.repeat(height, count) + _within(count) + 1
-    indptr = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)
-    indices = _rows(number, count, (key, offset), height, start, n)
-    return Entries(number, start, height, (key, offset), indptr, indices)
-
-
-def _within(count: Ints) -> Ints:
-    """0, 1, ..., c - 1 for each c of `count`."""
-    total = np.cumsum(count)
-    return np.asarray(np.arange(total[-1] if len(total) else 0) - np.repeat(total - count, count))
-
-
-def _rows(number: Ints, count: Ints, block: tuple[Ints, Ints], height: Ints, start: Ints, n: int) -> Ints:
-    """Row indices of the CSC matrix, block by block and direction by direction."""
-    key, offset = block
-    j, i = np.divmod(key, n)
-    first = np.cumsum(count) - count
-    indices = np.empty(int((count * height + count * (count + 1) // 2).sum()), dtype=np.int64)
-    for c in range(int(count.max(initial=0))):
-        for r in range(int(count.max(initial=0))):
-            here = (c < count[j]) & (r < count[i]) & ((i != j) | (r <= c))
-            at = start[j] + c * height[j] + c * (c + 1) // 2 + offset + r
-            indices[at[here]] = (first[i] + r)[here]
-    return indices
+    row, column = np.broadcast_arrays(number[i][:, :, None], number[j][:, None, :])
+    there = (row >= 0) & (row <= column)
+    count = np.arange(np.count_nonzero(there))
+    matrix = coo_array((count, (row[there], column[there])), shape=(m, m)).tocsc()
+    place, rank = np.full(there.shape, -1, dtype=np.int64), np.empty_like(count)
+    rank[matrix.data] = count
+    place[there] = rank
+    return Entries(number, key, place, matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64))
 
 
 def places_of(entries: Entries, nodes: Ints, written: Ints) -> Any:
@@ -147,18 +106,9 @@ def places_of(entries: Entries, nodes: Ints, written: Ints) -> Any:
     goal[gradient] = np.where(columns[i[gradient]] < 0, nowhere, 1 + columns[i[gradient]])
     for first, last in combinations_with_replacement(range(nodes.shape[1]), 2):
         which = np.flatnonzero((j >= 0) & (i // dof == first) & (j // dof == last))
-        pair = entries.pair(nodes[:, first], nodes[:, last])
-        for some in np.array_split(which, 1 + which.size * len(nodes) // AT_ONCE):
-            at = entries.places(pair, columns[i[some]], columns[j[some]])
-            goal[some] = np.where(at < 0, nowhere, 1 + m + at)
+        at = entries.places(nodes[:, first], nodes[:, last], i[which] % dof, j[which] % dof)
+        goal[which] = np.where(at < 0, nowhere, 1 + m + at)
     return goal
-
-
-def summed(values: Floats, goal: Ints, size: int) -> Floats:
-    """(B, size) sums of values (B, K) by where each belongs (K,)."""
-    goal = goal + size * np.arange(len(values))[:, None]
-    total = np.bincount(goal.ravel(), values.ravel(), size * len(values))
-    return np.asarray(total, np.float64).reshape(len(values), size)
 
 
 class Layout:
@@ -188,24 +138,37 @@ class Layout:
         return self._local.cholesky  # type: ignore[no-any-return]
 
     @cached_property
-    def _products(self) -> Ints:
-        """Where the entries of (J, r)^T (J, r) of all measurements belong, see `places_of`."""
-        goals = [np.empty(0, np.int32)]
+    def _products(self) -> Any:
+        """Adds the products (J, r)^T (J, r) of all measurements, see `places_of`. Where the derivatives by two nodes
+        are opposed, the last alone is there."""
+        from scipy.sparse import csr_array
+
+        goals, signs, top, places = [np.empty(0, np.int64)], [np.empty(0)], 0, [np.empty(0, np.int64)]
         for term in self.terms:
-            r = term.nodes.shape[1] * term.kind.space.dof
-            i, j = np.indices((r + 1, r + 1)).reshape(2, -1)
-            written = np.where((i <= j) & (i < r), [i, np.where(j < r, j, -1)], -1)
-            goals.append(places_of(self.entries, term.nodes, written.T).T.ravel())
-        return np.concatenate(goals)
+            (count, arity), dof = term.nodes.shape, term.kind.space.dof
+            width = 1 + (dof if term.kind.opposed else arity * dof)
+            i, j = np.triu_indices(arity * dof)
+            i, j = np.append(i, np.arange(arity * dof)), np.append(j, np.full(arity * dof, -1))
+            row, column = (i % dof, j % dof) if term.kind.opposed else (i, j)
+            sign = np.where(i // dof == np.where(j < 0, arity - 1, j // dof), 1.0, -1.0 if term.kind.opposed else 1.0)
+            at = row * width + np.where(j < 0, width - 1, column)
+            goals.append(places_of(self.entries, term.nodes, np.stack([i, j], axis=1)).T.ravel())
+            places.append((top + width * width * np.arange(count)[:, None] + at).ravel())
+            signs.append(np.tile(sign, count))
+            top += count * width * width
+        goal, place = np.concatenate(goals), np.concatenate(places)
+        return csr_array(
+            (np.concatenate(signs), (goal, place)), shape=(self.entries.size + len(self.entries.indices) + 2, top)
+        )
 
     def normal_equations(self, linear: Linear) -> tuple[Floats, Floats]:
         """The values of the upper triangle of J^T J (B, entries) and J^T r (B, m) of linearised problems."""
         m, squares = self.entries.size, [np.empty((len(linear.x), 0))]
-        for residual, jacobians in zip(linear.residual, linear.jacobian, strict=True):
-            wide = np.concatenate([*jacobians, residual[..., None]], axis=-1)
+        for term, residual, jacobians in zip(self.terms, linear.residual, linear.jacobian, strict=True):
+            wide = np.concatenate([*jacobians[-1 if term.kind.opposed else 0 :], residual[..., None]], axis=-1)
             squares.append((wide.swapaxes(-1, -2).copy() @ wide).reshape(len(wide), -1))
-        total = summed(np.concatenate(squares, axis=1), self._products, m + len(self.entries.indices) + 2)
-        return total[:, m + 1 : -1], total[:, 1 : m + 1]
+        total = self._products @ np.concatenate(squares, axis=1).T
+        return np.ascontiguousarray(total[m + 1 : -1].T), np.ascontiguousarray(total[1 : m + 1].T)
 
     def total(self, model: Model, x: Floats, numbers: Sequence[Floats]) -> Floats:
         """The cost, the gradient, the Hessian's values and a last number, which is waste, at x (n, ambient).
@@ -244,14 +207,18 @@ _LARGE: WeakValueDictionary[Structure, Layout] = WeakValueDictionary()
 """Of large ones the problem that is at hand and those that differ from it in numbers alone."""
 
 
-def layout_of(problem: Problem) -> Layout:
-    """The layout of a single problem, shared with others of its structure."""
-    structure = structure_of(problem.replace_unchecked(constraints=()) if problem.constraints else problem)
-    if len(problem.names) * problem.space.dof <= DENSE:
+def shared_layout(structure: Structure) -> Layout:
+    """The layout of a structure, shared by its problems."""
+    if structure.nodes * structure.space.dof <= DENSE:
         return _small(structure)
     if (layout := _LARGE.get(structure)) is None:
         layout = _LARGE[structure] = Layout(structure)
     return layout
+
+
+def layout_of(problem: Problem) -> Layout:
+    """The layout of a single problem, without its constraints."""
+    return shared_layout(structure_of(problem)._replace(constraints=()))
 
 
 @dataclass(frozen=True, eq=False)
@@ -302,23 +269,14 @@ class Sparse:
         return self.space.retract(x, np.append(step, 0.0)[number])
 
 
-_KEPT: WeakKeyDictionary[Problem, Sparse] = WeakKeyDictionary()
-
-
 def sparse(problem: Problem) -> Sparse:
     """The cost of a single problem, without its constraints, ready to be evaluated; kept as long as the problem is.
 
     Raises:
         InputError: a formula that CasADi cannot run.
     """
-    if (kept := _KEPT.get(problem)) is None:
+    kept: Sparse | None = problem.__dict__.get("sparse")
+    if kept is None:
         numbers = tuple(numbers_of(factor) for factor in problem.factors)
-        kept = _KEPT[problem] = Sparse(problem.space, layout_of(problem), numbers)
+        kept = problem.__dict__["sparse"] = Sparse(problem.space, layout_of(problem), numbers)
     return kept
-
-
-def keep(former: Problem, problem: Problem) -> Problem:
-    """The problem, with what is kept of a former one that differs from it in x0 and its search alone."""
-    if former in _KEPT:
-        _KEPT[problem] = _KEPT[former]
-    return problem

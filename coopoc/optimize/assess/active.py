@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
+from ..model.derivatives import linearise
 from ..model.factor import as_factor, bounded
-from ..model.linear import linearise
 from ..model.problem import Problem
 
 NEAR = 5e-7

@@ -1,18 +1,24 @@
-"""Cost, gradient, covariance, remaining step and unobservable nodes at a point, independently of the solver."""
+"""Assessment of a point independently of its solver: cost, gradient, covariance, unobservable nodes, curvature."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from ...arrays import Bools, Floats
-from ..algebra.cholesky import Cholesky, cholesky_of, with_still
-from ..algebra.sparse import Sparse, sparse
-from ..model.problem import Problem
-from .active import Active, active_at
+from ...arrays import Bools, Floats, checked, instance
+from ...errors import InputError
+from ..algebra.cholesky import cholesky_of, columns_solved, with_still
+from ..algebra.sparse import Sparse, shared_layout, sparse, structure_of
+from ..model.derivatives import numbers_of
+from ..model.factor import as_factor, unchecked
+from ..model.problem import Problem, several
+from .active import Active, active_at, constraint_rows
+
+if TYPE_CHECKING:
+    from ..solution import Solution
 
 INFLATION = 1e10
 """A variance this many times what it would be with all else known counts as unbounded."""
@@ -20,6 +26,9 @@ CANCELLED = 1e-7
 """Share of its terms that a row may keep along a direction that it does not see."""
 SMALL = 200
 """Columns up to which the null space of J is that of a dense matrix."""
+SLACK = 1e-6
+"""Share of the diagonal of J^T J by which the curvature may be negative: a flat minimum is one, whatever the
+rounding."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -165,13 +174,9 @@ def _null_rows(J: Any, length: Floats) -> Floats:
         factored, shift = cholesky_of(with_still(square, np.full(len(length), shift))), 10.0 * shift
     ways = np.random.default_rng(0).standard_normal((len(length), 12))
     for _ in range(6):
-        ways = np.linalg.qr(_solved(factored, ways))[0]
+        ways = np.linalg.qr(columns_solved(factored, ways))[0]
     ways = ways @ np.linalg.eigh(ways.T @ (square @ ways))[1]
     return np.asarray(ways[:, ~_seen(unit, ways)].T)
-
-
-def _solved(factored: Cholesky, right: Floats) -> Floats:
-    return np.stack([factored.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
 
 
 def _seen(J: Any, ways: Floats) -> Bools:
@@ -187,3 +192,111 @@ def _seen(J: Any, ways: Floats) -> Bools:
     left, terms = np.abs(rows @ ways), abs(rows) @ np.abs(ways)
     matters = terms > 1e-6 * terms.max(axis=0)  # a chain bends by angles that are small beside its length
     return np.asarray((matters & (left > CANCELLED * terms)).any(axis=0))
+
+
+def newton_decrease(problem: Problem, x: Floats) -> float | None:
+    """By how much a full Newton step from x (n, ambient) promises to lower the cost, 1/2 g^T H^-1 g; None if it curves
+    downwards there.
+
+    It is half the squared Newton decrement, the distance to the minimum in standard deviations, whatever the units of
+    the nodes (Boyd and Vandenberghe, Convex Optimization, section 9.5.1). A linear problem has J^T J alone and promises
+    nothing more here.
+    """
+    if problem.linear or problem.constraints:
+        return 0.0
+    system = sparse(problem)
+    _, gradient, values = system.quadratic(x, "newton")
+    if not np.isfinite(values).all():
+        return None
+    if not system.cholesky.factor(values):
+        own = system.entries.diagonal
+        values[own] += SLACK * system.quadratic(x, "gauss-newton")[2][own]
+        if not system.cholesky.factor(values):
+            return None
+    return float(0.5 * gradient @ system.cholesky.solve(gradient))
+
+
+def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
+    """True unless the Lagrangian of a single problem curves downwards at x (n, ambient) within what `active` allows.
+
+    Z^T (H + sum_c m_c d2 h_c / dx2) Z is positive definite, H the Hessian of the cost, m the multipliers and Z the
+    directions that remain. The far side of a range that must be met is a stationary point too, and a maximum.
+    Source: Nocedal and Wright, Numerical Optimization, 2nd ed., theorem 12.6.
+    """
+    if problem.linear and all(c.measurement.linear for c in problem.constraints):
+        return True
+    if not active.holds:
+        return newton_decrease(problem.replace_unchecked(constraints=()), x) is not None
+    within = active.along.T @ _lagrangian(problem, x, active) @ active.along
+    return not within.shape[0] or cholesky_of(within) is not None
+
+
+def _lagrangian(problem: Problem, x: Floats, active: Active) -> Any:
+    """(n dof, n dof) sparse exact Hessian of the Lagrangian at x (n, ambient), eased by SLACK, 1 for what cannot
+    move."""
+    from scipy.sparse import csc_array, csr_array, triu
+
+    system, structure, place = sparse(problem), structure_of(problem), constraint_rows(problem, x).place
+    terms, numbers = list(structure.factors), list(system.numbers)
+    for k, (item, term) in enumerate(zip(problem.constraints, structure.constraints, strict=True)):
+        own, weight = place[:, 0] == k, np.zeros(item.lower.shape)
+        weight[place[own, 1], place[own, 2]] = active.multipliers[own]
+        with np.errstate(divide="ignore"):
+            numbers.append(numbers_of(unchecked(as_factor(item), std=1.0 / weight)))
+        terms.append(term._replace(kind=term.kind._replace(bound=True)))
+    layout = shared_layout(structure._replace(factors=tuple(terms), constraints=()))
+    entries, size = layout.entries, system.size
+    values = layout.total("newton", x, numbers)[size + 1 : -1]
+    values[entries.diagonal] += SLACK * system.quadratic(x, "gauss-newton")[2][system.entries.diagonal]
+    half = csc_array((values, entries.indices, entries.indptr), shape=(size, size))
+    moving = np.flatnonzero(entries.number.ravel() >= 0)
+    into = csr_array((np.ones(size), (moving, np.arange(size))), shape=(entries.number.size, size))
+    still = None if problem.movable is None else ~problem.movable
+    return with_still(into @ (half + triu(half, 1).T) @ into.T, still)
+
+
+def joint_covariance(problem: Problem, solution: Solution, nodes: Sequence[str | int]) -> Floats:
+    """Covariance of some nodes together: their rows and columns of (J^T J)^-1 at the solution.
+
+    Two nodes of it give the covariance of their difference, which their marginals do not: P_ii + P_jj - P_ij - P_ji.
+
+    Args:
+        problem: that was solved.
+        solution: of it.
+        nodes: k names or indices.
+
+    Returns:
+        (k, k, dof, dof) m^2, rad^2: block [i, j] between nodes i and j, zero where one cannot move.
+
+    Raises:
+        InputError: an unknown node, a problem with constraints or realisations, one whose nodes can move freely.
+
+    >>> from coopoc import solve
+    >>> problem = Problem(("a", "b")).add("position", "a", [0, 0, 0], std=1.0)
+    >>> problem = problem.add("displacement", ("a", "b"), [5, 0, 0], std=1.0)
+    >>> joint_covariance(problem, solve(problem), ("a", "b"))[:, :, 0, 0].round(6)
+    array([[1., 1.],
+           [1., 2.]])
+    """
+    instance("problem", problem, Problem)
+    given: Any = getattr(solution, "x", None)
+    x = checked("solution", given, "(n, ambient)", (len(problem.names), problem.space.ambient))
+    if problem.constraints or problem.batch is not None:
+        what = "constraints" if problem.constraints else f"{problem.batch} realisations"
+        raise InputError("problem", what, "must be a single one without constraints", "Pick one: problem.pick(0).")
+    places = [problem.index(node) for node in (nodes if isinstance(nodes, str) else several(nodes))]
+    if len(places) > len(problem.names):
+        allowed = f"must name each of {len(problem.names)} nodes once"
+        raise InputError("nodes", f"{len(places)} nodes", allowed, "Leave out those that stand twice.")
+    dof, system = problem.space.dof, sparse(problem)
+    if not system.cholesky.factor(system.quadratic(x, "gauss-newton")[2]):
+        hint = "Measure what is free: see solution.unobservable."
+        raise InputError("problem", repr(problem), "must hold all nodes", hint)
+    wanted = system.entries.number[places].ravel()
+    moving = np.flatnonzero(wanted >= 0)
+    whole = np.zeros((len(wanted), len(wanted)))
+    for column in moving.tolist():
+        unit = np.zeros(system.size)
+        unit[wanted[column]] = 1.0
+        whole[moving, column] = system.cholesky.solve(unit)[wanted[moving]]
+    return whole.reshape(len(places), dof, len(places), dof).swapaxes(1, 2)

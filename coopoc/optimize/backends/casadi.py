@@ -18,10 +18,10 @@ from ...arrays import Floats
 from ...errors import InputError
 from ..algebra.sparse import structure_of
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
+from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
+from ..model.derivatives import Structure, expressions, numbers_of
 from ..model.factor import steerable
 from ..model.problem import Problem
-from ..model.symbolic import Structure, expressions, numbers_of
 
 DENSE = 200
 """Numbers that can move up to which FATROP is faster than IPOPT."""

@@ -5,12 +5,11 @@ from __future__ import annotations
 import numpy as np
 
 from ...arrays import Floats
+from ..algebra.schur import is_star, star_at
 from ..algebra.sparse import sparse
-from ..algebra.star import is_star, star_at
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, descend
-from ..descent.trust_region import arrive
-from ..model.linear import Linear
+from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, arrive, check_limits, minimise
+from ..model.derivatives import Linear
 from ..model.problem import Problem
 
 
@@ -23,7 +22,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
         tolerance: m, largest move of a point in the last step.
     """
     check_limits(max_iterations, tolerance)
-    star = is_star(structure)
+    star = structure.batch is not None and is_star(structure)
 
     def step(linear: Linear, damping: Floats) -> Floats:
         return star_at(structure, linear).solve(damping)[0]
@@ -34,8 +33,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
             extras = {"newton_steps": end.newton_steps, "record": end.record}
             return SolverResult(end.x[None], np.array([end.iterations]), extras=extras)
         if star:
-            found = descend(problem, step, x, max_iterations, tolerance)
-            return SolverResult(found.x, found.iterations)
+            return minimise(problem, step, x, max_iterations, tolerance)
         ends = [solver(single, start[None]) for single, start in zip(problem.realisations, x, strict=True)]
         return SolverResult(np.concatenate([e.x for e in ends]), np.concatenate([e.iterations for e in ends]))
 

@@ -16,9 +16,8 @@ import numpy as np
 from ...arrays import Floats
 from ..algebra.sparse import sparse
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..descent.descend import MAX_ITERATIONS, TOLERANCE, Step, check_limits, minimise
-from ..descent.trust_region import arrive
-from ..model.linear import Linear
+from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, Step, arrive, check_limits, minimise
+from ..model.derivatives import Linear
 from ..model.problem import Problem
 from .gtsam_factors import estimate, forms, graph_of, values, which_turn
 

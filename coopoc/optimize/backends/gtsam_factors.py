@@ -15,8 +15,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...arrays import Floats
-from ..model.factor import Factor
-from ..model.losses import Loss
+from ..model.factor import Factor, Loss
 from ..model.problem import Problem
 from ..model.space import Space, exp, log
 

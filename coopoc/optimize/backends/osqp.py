@@ -20,12 +20,12 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ..algebra.sparse import Layout, layout_of, summed
+from ..algebra.sparse import Layout, layout_of
 from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..descent.descend import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
+from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
+from ..model.derivatives import Linear, linearise
 from ..model.factor import as_factor, bounded
-from ..model.linear import Linear, linearise
 from ..model.problem import Problem
 
 SETTINGS = {
@@ -135,11 +135,14 @@ class Programme:
     """
 
     def __init__(self, pattern: Any, rows: Any) -> None:
+        from scipy.sparse import csr_array
+
         self._pattern, self._rows = pattern, rows
         row, column = pattern.indices.astype(np.int64), np.repeat(np.arange(rows.shape[1]), np.diff(pattern.indptr))
         off = np.flatnonzero(row != column)
         self._entry = np.append(np.arange(len(row)), off)
-        self._column, self._row = np.append(column, row[off]), np.append(row, column[off])
+        self._column, into = np.append(column, row[off]), np.append(row, column[off])
+        self._into = csr_array((np.ones(len(into)), (into, np.arange(len(into)))), shape=(rows.shape[1], len(into)))
         self._workspace: Any = None
         self._polishing = False
         self.counts = {"osqp_iterations": 0, "repairs": 0}
@@ -169,13 +172,21 @@ class Programme:
         dx, start, nothing = np.empty_like(q), np.zeros(q.shape[1]), np.empty(0)
         self._polish(False)
         core = self._workspace._solver  # osqp's class around it takes longer than a small programme
-        for b in range(len(q)):
-            core.update_data_vec(q[b], None, None)
-            core.update_data_mat(values[b], None, None, None)
-            core.warm_start(start, None)  # earlier solves must not show
-            core.solve()
-            dx[b] = core.solution.x
-            self.counts["osqp_iterations"] += int(core.info.iter)
+        vector, matrix, warm, run, iterations = (
+            core.update_data_vec,
+            core.update_data_mat,
+            core.warm_start,
+            core.solve,
+            0,
+        )
+        for slope, own, out in zip(q, values, dx, strict=True):
+            vector(slope, None, None)
+            matrix(own, None, None, None)
+            warm(start, None)  # earlier solves must not show
+            run()
+            out[:] = core.solution.x
+            iterations += core.info.iter
+        self.counts["osqp_iterations"] += int(iterations)
         rest, _, allowed = self._stationary(values, q, dx)
         for b in np.flatnonzero(~(np.abs(rest) <= allowed).all(axis=1)).tolist():
             try:
@@ -217,7 +228,7 @@ class Programme:
     def _stationary(self, values: Floats, q: Floats, dx: Floats) -> tuple[Floats, Floats, Floats]:
         """P dx + q (B, m), the share of what adds up in it that is weak (B, 1), and what it may be."""
         own = values[:, self._pattern.indptr[1:] - 1]
-        rest = summed(values[:, self._entry] * dx[:, self._column], self._row, q.shape[1]) + q
+        rest = (self._into @ (values[:, self._entry] * dx[:, self._column]).T).T + q
         weak = KKT * np.maximum(np.abs(q), np.abs(own * dx)).max(axis=1, keepdims=True)
         return rest, weak, weak + NEGLIGIBLE * own
 

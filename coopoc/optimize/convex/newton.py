@@ -23,12 +23,16 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..algebra.cholesky import Cholesky, cholesky_of
+from ..algebra.cholesky import Cholesky, cholesky_of, columns_solved
 from .qcqp import Multipliers, Quadratic, multipliers
 
 DENSE = 500
 """Up to this many constrained rows C is formed."""
+SMALL = 200
+"""Up to this many rows of X all matrices are dense."""
 MAX_ITERATIONS = 300
+LOOSE = 1e-10
+"""Share of the largest singular value below which positions are free."""
 LEAST = 1e-12
 """Damping beside the diagonal of Q of a step that needs none, since common rotations are free."""
 FIRST = 1e-6
@@ -76,13 +80,25 @@ class Reduced:
             raise np.linalg.LinAlgError("positions are free whatever the rotations and unit vectors")
         return found
 
+    @cached_property
+    def _small(self) -> tuple[Floats, Floats] | None:
+        """A, and all rows of X over the constrained ones, by the pseudo-inverse, where a dense matrix is faster."""
+        A, bound = self.problem.rows, self.problem.bound
+        if A.shape[1] > SMALL:
+            return None
+        A = A.toarray()
+        free = np.linalg.pinv(A[:, bound:], rcond=LOOSE) @ A[:, :bound]
+        return A, np.concatenate([np.eye(bound), -free])
+
     def _all(self, X: Floats) -> Floats:
         """The constrained rows X and the free ones where the cost is smallest."""
         bound = self.problem.bound
+        if self._small is not None:
+            return np.asarray(self._small[1] @ X)
         if bound == self.gram.shape[0]:
             return X
         right = -(self._rows[:, bound:].T @ (self._rows[:, :bound] @ X))
-        return np.concatenate([X, _columns(self._inverse, right)])
+        return np.concatenate([X, columns_solved(self._inverse, right)])
 
     def times(self, X: Floats) -> Floats:
         """C X."""
@@ -92,6 +108,8 @@ class Reduced:
 
     def settle(self, X: Floats) -> Floats:
         """All rows of X: the free ones where the cost is smallest."""
+        if self._small is not None:
+            return self._all(X)
         out = np.zeros((len(self._kept), X.shape[1]))
         out[self._kept] = self._all(X)
         return out
@@ -99,7 +117,8 @@ class Reduced:
     @cached_property
     def matrix(self) -> Floats:
         """C (bound, bound)."""
-        moved = self._rows @ self._all(np.eye(self.problem.bound))
+        small = self._small
+        moved = self._rows @ self._all(np.eye(self.problem.bound)) if small is None else small[0] @ small[1]
         return np.asarray(moved.T @ moved)
 
     @cached_property
@@ -119,11 +138,11 @@ class Reduced:
         shift that a factorisation shows to be below the spectrum."""
         from scipy.sparse.linalg import LinearOperator, eigsh
 
-        size, less = self.problem.bound, L.matrix
+        size = self.problem.bound
         if size <= DENSE:
-            values, vectors = np.linalg.eigh(self.matrix - less.toarray())
+            values, vectors = np.linalg.eigh(self.matrix - L.dense)
             return float(values[0]), vectors[:, 0]
-        shift, factored = -1e-7 * self.scale, None
+        less, shift, factored = L.matrix, -1e-7 * self.scale, None
         while factored is None:
             shift *= 10.0
             factored = cholesky_of(self.shifted(less, shift))
@@ -138,10 +157,6 @@ class Reduced:
         """A cost that no point beats, for any multipliers L; the smallest eigenvalue of C - L and its eigenvector."""
         smallest, vector = self.smallest(L)
         return 0.5 * (L.trace + self.problem.trace * min(smallest, 0.0)), smallest, vector
-
-
-def _columns(factored: Cholesky, right: Floats) -> Floats:
-    return np.stack([factored.solve(np.ascontiguousarray(column)) for column in right.T], axis=1)
 
 
 @dataclass(frozen=True, eq=False)

@@ -24,7 +24,7 @@ from ...arrays import Floats, Ints
 from ...errors import InputError
 from ..model.factor import Factor
 from ..model.problem import Problem
-from ..starts.linear import nearest_rotation
+from ..model.space import nearest_rotation
 
 
 @dataclass(frozen=True, eq=False)
@@ -125,6 +125,15 @@ class Multipliers:
     def trace(self) -> float:
         """What they promise: 1/2 trace is a lower bound if C - L is positive semidefinite."""
         return float(np.einsum("nii->", self.stiefel) + self.sphere.sum())
+
+    @property
+    def dense(self) -> Floats:
+        """L (bound, bound)."""
+        stiefel, sphere = self.problem.stiefel, self.problem.sphere
+        out = np.zeros((self.problem.bound,) * 2)
+        out[stiefel[:, :, None], stiefel[:, None, :]] = self.stiefel
+        out[sphere, sphere] = self.sphere[:, None]
+        return out
 
     @cached_property
     def matrix(self) -> Any:

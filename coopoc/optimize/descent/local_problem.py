@@ -10,9 +10,8 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..assess.active import Rows, constraint_rows
-from ..model.factor import unchecked
-from ..model.linear import linearise
-from ..model.losses import Loss
+from ..model.derivatives import linearise
+from ..model.factor import Loss, unchecked
 from ..model.problem import Problem
 from ..model.space import cross
 

@@ -1,15 +1,17 @@
-"""Factor and Constraint: M measurements of one kind with their standard deviations, and bounds on the same formulas."""
+"""Factor, Loss and Constraint: M measurements of one kind and their noise, robust losses, bounds on formulas."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from dataclasses import InitVar, dataclass, fields
 from functools import cache, cached_property
+from itertools import groupby
 from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Bools, Floats, Ints, frozen, instance
+from ...arrays import Bools, Floats, Ints, frozen, instance, number, one_of
 from ...errors import InputError
 from .inputs import (
     agreed,
@@ -22,8 +24,54 @@ from .inputs import (
     numbers,
     whitening,
 )
-from .losses import Loss
 from .measurements import Measurement, lookup
+
+LOSSES: dict[str, tuple[Callable[[Any, float, Any], Any], Callable[[Floats, float], Floats]]] = {
+    "huber": (
+        lambda s, c, m: m.where(s > c * c, 2.0 * c * m.sqrt(m.fmax(s, c * c)) - c * c, s),
+        lambda s, c: c / np.sqrt(np.maximum(s, c * c)),
+    ),
+    "cauchy": (lambda s, c, m: c * c * m.log1p(s / (c * c)), lambda s, c: 1.0 / (1.0 + s / (c * c))),
+    "geman-mcclure": (lambda s, c, m: s / (1.0 + s / (c * c)), lambda s, c: (1.0 + s / (c * c)) ** -2.0),
+    "truncated": (
+        lambda s, c, m: m.where(s > c * c, c * c, s),
+        lambda s, c: (s <= c * c).astype(np.float64),
+    ),
+}
+"""rho(s, c, m) of the squared residual in any namespace m, such as NumPy or CasADi, and rho'(s, c) in NumPy."""
+
+
+@dataclass(frozen=True)
+class Loss:
+    """rho(s) of the squared whitened residual s = |W (h(x) - z)|^2; half of it is what a measurement costs.
+
+    huber: s up to c^2, then 2 c sqrt(s) - c^2. cauchy: c^2 log(1 + s/c^2). geman-mcclure: s / (1 + s/c^2).
+    truncated: min(s, c^2). All equal s near zero. A measurement then has the weight rho'(s) (Barron, CVPR 2019;
+    Black and Rangarajan, IJCV 1996). Only huber has a single minimum where least squares has.
+
+    Args:
+        name: of the four.
+        scale: c > 0, in standard deviations.
+
+    >>> float(Loss("huber", 1.0).cost(np.array(9.0))), float(Loss("huber", 1.0).weight(np.array(9.0)).round(3))
+    (5.0, 0.333)
+    """
+
+    name: str
+    scale: float
+
+    def __post_init__(self) -> None:
+        one_of("loss", self.name, LOSSES)
+        hint, tiny = "It counts standard deviations: 1.5 to 3.", np.finfo(float).tiny
+        object.__setattr__(self, "scale", number("scale", self.scale, tiny, allowed="> 0 and finite", hint=hint))
+
+    def cost(self, square: Floats) -> Floats:
+        """rho(s)."""
+        return np.asarray(LOSSES[self.name][0](square, self.scale, np))
+
+    def weight(self, square: Floats) -> Floats:
+        """rho'(s), in [0, 1]."""
+        return LOSSES[self.name][1](square, self.scale)
 
 
 @dataclass(frozen=True, eq=False)
@@ -129,20 +177,6 @@ class Factor:
             return root
         return np.broadcast_to(root, (*root.shape[:-3], len(self.nodes), size, size))
 
-    def whiten(self, residual: Floats) -> Floats:
-        """W residual (..., M, size)."""
-        if self.std is not None:
-            return residual / self.std
-        assert self.sqrt_information is not None
-        return np.asarray((self.sqrt_information @ residual[..., None])[..., 0])
-
-    def whiten_jacobian(self, jacobian: Floats) -> Floats:
-        """W jacobian (..., M, size, D)."""
-        if self.std is not None:
-            return jacobian / self.std[..., None]
-        assert self.sqrt_information is not None
-        return np.asarray(self.sqrt_information @ jacobian)
-
     def pick(self, which: Ints | int) -> Factor:
         """The realisations `which` of B; an int gives a single one."""
         chosen = {
@@ -186,6 +220,48 @@ def _pick(array: Floats, rank: int, which: Ints | int) -> Floats:
     if len(array) == 1:
         return array[0] if isinstance(which, int) else array
     return array[which]
+
+
+def taken(factor: Factor, rows: Ints) -> Factor:
+    """Some measurements of a factor of a single problem."""
+    parts = {
+        name: array[rows] if len(array := getattr(factor, name)) == len(factor.nodes) else array
+        for name in ("z", "std", "sqrt_information", "constants")
+        if getattr(factor, name) is not None
+    }
+    return unchecked(factor, nodes=factor.nodes[rows], **parts)
+
+
+def fused(factors: Sequence[Factor]) -> Sequence[Factor]:
+    """A factor per kind, loss and form of its noise, of single realisations; the same if no two go together.
+
+    >>> fused([Factor("position", [[k]], [[0.0, 0, 0]], std=1.0 + k) for k in range(2)])
+    (Factor(position x 2),)
+    """
+    forms = [_form(factor) for factor in factors]
+    if len(set(forms)) == len(forms):
+        return factors
+    order = sorted(range(len(forms)), key=forms.__getitem__)
+    groups = [list(group) for _, group in groupby(order, key=forms.__getitem__)]
+    groups.sort(key=min)
+    return tuple(_joined([factors[k] for k in group]) for group in groups)
+
+
+def _form(factor: Factor) -> tuple[Any, ...]:
+    loss = ("", 0.0) if factor.loss is None else (factor.loss.name, factor.loss.scale)
+    return factor.kind, *loss, factor.std is None
+
+
+def _joined(factors: list[Factor]) -> Factor:
+    if len(factors) == 1:
+        return factors[0]
+    changes: dict[str, Floats] = {"nodes": np.concatenate([factor.nodes for factor in factors])}
+    for name in ("z", "std", "sqrt_information", "constants"):
+        arrays = [getattr(factor, name) for factor in factors]
+        if arrays[0] is not None:
+            wide = [np.broadcast_to(a, (len(f.nodes), *a.shape[1:])) for a, f in zip(arrays, factors, strict=True)]
+            changes[name] = np.concatenate(wide)
+    return unchecked(factors[0], **changes)
 
 
 @dataclass(frozen=True, eq=False)

@@ -143,8 +143,9 @@ def check_std(measurement: Measurement, std: npt.ArrayLike | float, shape: tuple
         allowed = f"must have shape ({size},) or {(shape[-2], size)} or (B, M, {size})"
         raise InputError("std", array.shape, allowed, "One standard deviation per component.")
     if not (wide > 0).all():
-        hint = "Give standard deviations; infinity means no information."
-        raise InputError(f"std of {measurement.name}", array[~(array > 0)][0], "must be > 0", hint)
+        hint, bad = "Give standard deviations; infinity means no information.", np.argwhere(~(wide > 0))[0]
+        given = f"{wide[tuple(bad)]} in row {bad[-2]}"
+        raise InputError(f"std of {measurement.name}", given, "must be > 0", hint)
     kept = measurement.kept(3 if size == len(measurement.components) else 2)
     angles = wide[..., [measurement.components[k] in ("angle", "turn") for k in kept]]
     if (np.isfinite(angles) & (angles > np.pi)).any():

@@ -14,22 +14,23 @@ import numpy.typing as npt
 from ...arrays import Bools, Floats, Ints, frozen, instance, listed
 from ...errors import InputError, shown, suggestion
 from ...world.sensors import Sensors
-from .factor import Constraint, Factor
+from .derivatives import Linear, linearise, sparse_jacobian
+from .factor import Constraint, Factor, taken, unchecked
 from .inputs import agreed, check_rotations, numbers
-from .linear import Linear, linearise, sparse_jacobian
 from .measurements import lookup
 from .space import Space
 from .window import Noise, WindowStep, recorded_steps, window_factors
 
 if TYPE_CHECKING:
     from ...world.recording import Recording
-    from .losses import Loss
+    from .factor import Loss
 
 DERIVED = (
     ("_place", {"names"}),
     ("_turning", {"poses"}),
     ("space", {"dimension", "poses"}),
     ("movable", {"names", "dimension", "poses", "fixed"}),
+    ("sparse", {"names", "dimension", "poses", "fixed", "factors"}),
 )
 """What is found of a problem once, and the fields that it follows from: others may change and it still holds."""
 
@@ -253,6 +254,31 @@ class Problem:
             if name in kept and inputs.isdisjoint(changes):
                 changed.__dict__[name] = kept[name]
         return changed
+
+    def restricted(self, used: Bools, x: Floats, rows: Sequence[Ints] | None = None) -> Problem:
+        """The single problem of some nodes, from x, which has no separator.
+
+        Args:
+            used: (n,) which nodes.
+            x: (n, ambient).
+            rows: of each factor, among the nodes that are used; None: all among them.
+        """
+        number = np.cumsum(used) - 1
+        rows = self.rows_among(used) if rows is None else rows
+        kept = [taken(factor, own) for factor, own in zip(self.factors, rows, strict=True) if len(own)]
+        changes: dict[str, Any] = {
+            name: tuple(number[[k for k in getattr(self, name) if used[k]]].tolist()) for name in ("poses", "fixed")
+        }
+        changes["names"] = tuple(name for name, keep in zip(self.names, used.tolist(), strict=True) if keep)
+        changes["factors"] = tuple(unchecked(factor, nodes=number[factor.nodes]) for factor in kept)
+        return self.replace_unchecked(**changes, x0=frozen(x[used]), separator=())
+
+    def rows_among(self, used: Bools) -> list[Ints]:
+        """Of each factor, the rows whose nodes are all used (n,)."""
+        return [np.flatnonzero(used[factor.nodes].all(axis=1)) for factor in self.factors]
+
+    def __getstate__(self) -> dict[str, Any]:
+        return {name: self.__dict__[name] for name in _fields()}
 
     def linearise(self, x: Floats) -> Linear:
         """Whitened residuals and derivatives at x (B, n, ambient)."""

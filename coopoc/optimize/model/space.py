@@ -118,6 +118,18 @@ def log(rotation: Floats) -> Floats:
     return np.asarray(flat).reshape(*rotation.shape[:-2], 3)
 
 
+def nearest_rotation(matrix: Floats) -> Floats:
+    """The nearest rotations (..., d, d), by singular values.
+
+    >>> nearest_rotation(np.array([[0.0, -2.0], [2.0, 0.0]])).round(6) + 0.0
+    array([[ 0., -1.],
+           [ 1.,  0.]])
+    """
+    left, _, right = np.linalg.svd(matrix)
+    left[..., :, -1] *= np.sign(np.linalg.det(left @ right))[..., None]
+    return np.asarray(left @ right)
+
+
 def cross(w: Floats) -> Floats:
     """(..., 3, 3) matrices [w]x with [w]x v = w x v."""
     x, y, z = np.moveaxis(w, -1, 0)

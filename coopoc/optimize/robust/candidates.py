@@ -10,8 +10,8 @@ import numpy.typing as npt
 
 from ...arrays import Floats, Ints, checked, frozen, instance, plain
 from ...errors import InputError, shown
+from ..model.derivatives import linearise
 from ..model.factor import unchecked
-from ..model.linear import linearise
 from ..model.problem import Problem
 
 Candidates = Sequence[int | tuple[int, Sequence[int]]]

@@ -3,21 +3,21 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
 from ..algebra.sparse import sparse
-from ..descent.trust_region import arrive
-from ..model.linear import linearise
-from ..model.parts import restricted, rows_among, taken
+from ..descent.levenberg_marquardt import arrive
+from ..model.derivatives import linearise
+from ..model.factor import taken
 from ..model.problem import Problem
 from ..model.space import carried
+from ..starts.graph_starts import along_poses, parts
 from ..starts.initial import initial_guess
-from ..starts.walk import along_poses, parts
 from .candidates import Marked, reweigh, squares
 
 ROUNDS = 100
@@ -96,18 +96,15 @@ def known_start(problem: Problem, marked: Marked, bound: Floats, inner: Callable
         joined.append(search.join(search.bodies()))
 
 
-@dataclass(frozen=True, eq=False)
-class Placement:
+class Placement(NamedTuple):
     """A hypothesis of how two bodies stand to each other.
 
-    Args:
+    Attributes:
         bodies: HELD or the first node of one, and the first node of the other, which moves.
         group: of candidates that places it.
         move: (2, ambient) a pose of the other before and after.
         fits: (G,) candidates between them that agree, itself included.
         misfit: sum of their d^2.
-        count: candidates between them.
-        rival: most that agree with a placement that does not fit, and not with this one.
     """
 
     bodies: tuple[int, int]
@@ -115,18 +112,11 @@ class Placement:
     move: Floats
     fits: Bools
     misfit: float
-    count: int
-    rival: int = 0
 
     @property
-    def agree(self) -> int:
-        """How many candidates agree."""
-        return int(self.fits.sum())
-
-    def described(self, problem: Problem) -> dict[str, Any]:
-        """For `Solution.extras`; bodies by the names of their first nodes."""
-        to, body = ("world" if k == HELD else problem.names[k] for k in self.bodies)
-        return {"body": body, "to": to, "agree": self.agree, "rival": self.rival, "candidates": self.count}
+    def rank(self) -> tuple[int, float]:
+        """How many candidates agree, and how well."""
+        return int(self.fits.sum()), -self.misfit
 
 
 class _Search:
@@ -207,68 +197,63 @@ class _Search:
         alike = marked.sums((between != own[marked.group]).any(axis=1)) == 0
         groups = np.flatnonzero(alike & poses[marked.factor[first]] & (own[:, 0] != own[:, 1]) & (self.left < CHANCES))
         pairs, which, count = np.unique(own[groups], axis=0, return_inverse=True, return_counts=True)
-        best, undecided = None, list[str]()
+        best, joined, undecided = None, dict[str, Any](), list[str]()
         for p in np.argsort(-count, kind="stable").tolist():
-            if best is not None and count[p] <= best.agree:
+            if best is not None and count[p] <= best.rank[0]:
                 break
-            found = self._vote(body, (int(pairs[p, 0]), int(pairs[p, 1])), groups[which.ravel() == p])
-            if found.agree < AGREEING or found.agree <= found.rival:
+            leader, rival = self._vote(body, (int(pairs[p, 0]), int(pairs[p, 1])), groups[which.ravel() == p])
+            to, of = ("world" if k == HELD else problem.names[k] for k in leader.bodies)
+            found = {"body": of, "to": to, "agree": leader.rank[0], "rival": rival, "candidates": int(count[p])}
+            if leader.rank[0] < AGREEING or leader.rank[0] <= rival:
                 sentence = "of {candidates} between {body} and {to} {agree} agree, {rival} otherwise"
-                undecided.append(sentence.format(**found.described(problem)))
-            elif best is None or found.agree > best.agree:
-                best = found
+                undecided.append(sentence.format(**found))
+            elif best is None or leader.rank > best.rank:
+                best, joined = leader, found
         if best is None:
             free = [problem.names[k] for k in np.unique(body[body != HELD])]
             what = "; ".join(undecided[:3]) or f"nothing between {', '.join(free[:3])} and the others"
             allowed = "must join what known inliers leave free, two and more that agree"
             raise InputError("candidates", what, allowed, HINT)
-        self.x, self.weight[best.group] = self._placed(body, best), 1.0
-        return best.described(problem)
+        self.x, self.weight[best.group] = self._placed(body, best.bodies[1], best.move), 1.0
+        return joined
 
-    def _placed(self, body: Ints, placement: Placement) -> Floats:
-        """(n, ambient) nodes with the second body moved."""
-        x, moving = self.x.copy(), body == placement.bodies[1]
-        x[moving] = carried(self.problem.space, x[moving], *placement.move)
+    def _placed(self, body: Ints, moving: int, move: Floats) -> Floats:
+        """(n, ambient) nodes with a body moved."""
+        x = self.x.copy()
+        x[body == moving] = carried(self.problem.space, x[body == moving], *move)
         return x
 
-    def _vote(self, body: Ints, bodies: tuple[int, int], groups: Ints) -> Placement:
-        """The placement of a pair with which most of its candidates (groups of relative poses) agree, and its rival."""
+    def _vote(self, body: Ints, bodies: tuple[int, int], groups: Ints) -> tuple[Placement, int]:
+        """The placement of a pair with which most of its candidates (groups of relative poses) agree, and how many
+        agree on the best other one."""
         problem, marked, used = self.problem, self.marked, np.isin(body, bodies)
-        rows = rows_among(problem, used)
-        part = restricted(pinned(problem, body[body == bodies[0]]), used, self.x, rows)
-        inside = _among(marked, rows)
+        rows = problem.rows_among(used)
+        part = pinned(problem, body[body == bodies[0]]).restricted(used, self.x, rows)
+        inside, space, tried = _among(marked, rows), problem.space, list[Placement]()
         sparse(part)  # is kept as long as the part is, so that all placements share its analysis
-
-        def placement(group: int) -> Placement:
-            first, weight = int(np.flatnonzero(marked.group == group)[0]), self.weight.copy()
-            factor, row = problem.factors[marked.factor[first]], marked.row[first]
-            (i, j), z, space = factor.nodes[row], factor.z[row], problem.space
-            origin = space.join(np.zeros(space.dimension))
-            if body[j] == bodies[1]:
-                move = np.stack([self.x[j], carried(space, z, origin, self.x[i])])
-            else:
-                move = np.stack([self.x[i], carried(space, origin, z, self.x[j])])
-            guess = Placement(bodies, group, move, np.zeros(len(self.bound), dtype=bool), 0.0, len(groups))
-            weight[group] = 1.0
-            distance, _ = predicted(part, inside, weight, self._placed(body, guess)[used])
-            fits = guess.fits.copy()
-            fits[groups] = distance[groups] <= self.bound[groups]
-            fits[group] = True
-            return replace(guess, fits=fits, misfit=float(distance[fits].sum()))
-
-        def spread(some: Ints) -> list[Placement]:
-            chosen = np.linspace(0, len(some) - 1, min(HYPOTHESES, len(some))).round().astype(np.int64)
-            return [placement(group) for group in some[np.unique(chosen)].tolist()]
-
-        def leading(tried: list[Placement]) -> Placement:
-            return max(tried, key=lambda each: (each.agree, -each.misfit))
-
-        tried = spread(groups)
-        others = [*np.flatnonzero(leading(tried).fits), *(each.group for each in tried)]
-        tried += spread(np.setdiff1d(groups, others))
-        best = leading(tried)
-        rivals = [each.fits & ~best.fits for each in tried if not best.fits[each.group]]
-        return replace(best, rival=max((int(fits.sum()) for fits in rivals), default=0))
+        origin = space.join(np.zeros(space.dimension))
+        for _ in range(2):  # spread over all, then over what the best leaves
+            best = max(tried, key=lambda each: each.rank, default=None)
+            done = [] if best is None else [*np.flatnonzero(best.fits), *(each.group for each in tried)]
+            left = np.setdiff1d(groups, done)
+            chosen = np.linspace(0, len(left) - 1, min(HYPOTHESES, len(left))).round().astype(np.int64)
+            for group in left[np.unique(chosen)].tolist():
+                first, weight = int(np.flatnonzero(marked.group == group)[0]), self.weight.copy()
+                factor, row = problem.factors[marked.factor[first]], marked.row[first]
+                (i, j), z = factor.nodes[row], factor.z[row]
+                if body[j] == bodies[1]:
+                    move = np.stack([self.x[j], carried(space, z, origin, self.x[i])])
+                else:
+                    move = np.stack([self.x[i], carried(space, origin, z, self.x[j])])
+                weight[group] = 1.0
+                distance, _ = predicted(part, inside, weight, self._placed(body, bodies[1], move)[used])
+                fits = np.zeros(len(self.bound), dtype=bool)
+                fits[groups] = distance[groups] <= self.bound[groups]
+                fits[group] = True
+                tried.append(Placement(bodies, group, move, fits, float(distance[fits].sum())))
+        best = max(tried, key=lambda each: each.rank)
+        others = (int((each.fits & ~best.fits).sum()) for each in tried if not best.fits[each.group])
+        return best, max(others, default=0)
 
 
 def pinned(problem: Problem, body: Ints) -> Problem:

@@ -6,13 +6,12 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
+from ..algebra.schur import is_star, star_at
 from ..algebra.sparse import Sparse, sparse
-from ..algebra.star import is_star, star_at
+from ..model.derivatives import Model
 from ..model.factor import Factor, unchecked
-from ..model.kinds import converted_rows, is_converted
-from ..model.measurements import columns
+from ..model.measurements import columns, converted_rows, is_converted
 from ..model.problem import Problem
-from ..model.tape import Model
 
 RIDGE = 1e-9
 """1/m^2 on every point, so that one without information has a place to start from."""
@@ -102,5 +101,5 @@ def _vector(factor: Factor) -> Factor:
     d, rows = converted_rows(columns(factor.z), np)
     inverse = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
     z, nothing = d[..., None] * inverse[..., 0, :], np.empty((len(factor.nodes), 0))
-    root = factor.whiten_jacobian(inverse)
+    root = factor.root @ inverse
     return unchecked(factor, kind="displacement", z=z, std=None, sqrt_information=root, constants=nothing, loss=None)

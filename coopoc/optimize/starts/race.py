@@ -7,8 +7,8 @@ from collections.abc import Callable, Mapping
 import numpy as np
 
 from ...arrays import Floats, frozen
-from ..algebra.sparse import keep, sparse
-from ..descent.trust_region import Arrival, arrive
+from ..algebra.sparse import sparse
+from ..descent.levenberg_marquardt import Arrival, arrive
 from ..model.problem import Problem, Search
 
 STEPS = 12
@@ -53,7 +53,7 @@ def race(
         tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
         if smooth(end):
             if tried[name][0] <= limit:
-                return keep(problem, problem.replace_unchecked(x0=frozen(end.x))), Search(name, taken)
+                return problem.replace_unchecked(x0=frozen(end.x)), Search(name, taken)
             straight |= {name} if end.converged else set()
     reached = {name: cost for name, (cost, _) in tried.items()}
     least = min(reached.values())
@@ -78,7 +78,7 @@ def race(
             end = arrive(system, grown, MORE, TOLERANCE)
             taken += steps + end.iterations
             name, x = ("incremental", end.x) if system.cost(end.x) < (1.0 - SAME) * system.cost(x) else (name, x)
-    return keep(problem, problem.replace_unchecked(x0=frozen(x))), Search(name, taken)
+    return problem.replace_unchecked(x0=frozen(x)), Search(name, taken)
 
 
 def _distinct(tried: dict[str, tuple[float, Floats]]) -> dict[str, tuple[float, Floats]]:

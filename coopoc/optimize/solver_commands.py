@@ -16,7 +16,7 @@ from ..errors import InputError
 from ..formats import load_graph
 from ..formats.graph import Graph
 from .backend import backends
-from .graphs import Objective, Start, from_graph, loop_closures, read_graph
+from .graph_problems import Objective, Start, from_graph, loop_closures, read_graph
 from .model.problem import Problem, Search
 from .robust.gnc import solve_gnc
 from .robust.loop_closures import AGREEING

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt: the outer loop that every backend with a linear step shares, for B problems at once."""
+"""Levenberg-Marquardt: of B problems at once by any linear step, and of a single one by sparse factors and Hessians."""
 
 from __future__ import annotations
 
@@ -12,8 +12,9 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
+from ..algebra.sparse import Sparse
 from ..backend import SolverResult
-from ..model.linear import Linear
+from ..model.derivatives import Linear, Model
 from ..model.problem import Problem
 
 Step = Callable[[Linear, Floats], Floats]
@@ -34,6 +35,27 @@ HIDDEN = 1e-9
 """Share of the cost below which rounding hides how much of a promised decrease came true."""
 FLAT = 1e-15
 """Share of the cost below which a promised decrease is rounding: no step can be judged there."""
+OFF = 0.2
+"""A share of the promised decrease this far from 1 casts doubt on J^T J."""
+DOUBT = 2
+"""Doubtful steps before the exact Hessian takes over."""
+GROWTH, DECAY = 10.0, 5.0
+"""Factors by which damping grows after a refused step and falls after a good one; two that share no power find the
+middle where a step overshoots."""
+FIRST = 1e-8
+"""Damping once some is needed, relative to the diagonal: the smooth modes of a chain of thousands of poses, which need
+it first, have that share of a pose's information."""
+ROUNDED = 1e-18
+"""Share of the cost, or of 1, whose promise ends the loop: some 1e-8 standard deviations to go, before the step that is
+taken."""
+LEAST_INFORMATION = 1e-9
+"""1/m^2 or 1/rad^2: the scale of what no measurement holds."""
+SLOW = 0.2
+"""A promise above this share of the one before shows that J^T J converges slowly, which casts doubt, too."""
+NEAR = 1e-3
+"""Share of the cost from which on the exact Hessian makes the last steps."""
+STILL = 12
+"""Hidden steps in a row that end the loop: damping has fallen from FIRST to none, or the matrix is singular without."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +194,115 @@ def diagonal(problem: Problem, linear: Linear) -> Floats:
         for column, jacobian in zip(factor.nodes.T, jacobians, strict=True):
             np.add.at(total.swapaxes(0, 1), column, np.square(jacobian).sum(axis=-2).swapaxes(0, 1))
     return total
+
+
+@dataclass(frozen=True, eq=False)
+class Arrival:
+    """Where the loop ended.
+
+    Args:
+        x: (n, ambient).
+        iterations: factorisations.
+        converged: the last step was below the tolerance, or what it promised is rounding.
+        record: (iterations, 3) the cost before each, its damping, and which share of the promised decrease came true
+            (NaN where the matrix was not positive definite).
+        newton_steps: how many iterations used the exact Hessian.
+    """
+
+    x: Floats
+    iterations: int
+    converged: bool
+    record: Floats
+    newton_steps: int
+
+
+def arrive(system: Sparse, x: Floats, max_iterations: int, tolerance: float) -> Arrival:
+    """A minimum from x (n, ambient): (H + mu D) dx = -g, D the diagonal of J^T J, which scales by the geometry.
+
+    H = J^T J, until two of its promises failed by more than a fifth or hardly fell, or the end is NEAR; then the exact
+    Hessian, with which the last steps converge quadratically however large the residuals are. Where that is not
+    positive definite J^T J takes over for some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where
+    less than a quarter of the promised decrease comes true and falls where more than three quarters do.
+
+    References:
+        More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3.
+    """
+    cholesky, mu, doubt = system.cholesky, 0.0, 0
+    model: Model = "gauss-newton"
+    record: list[tuple[float, float, float]] = []
+    newton, converged, last, still = 0, False, np.inf, 0
+    cost, gradient, values = undamped = system.quadratic(x, "gauss-newton")
+    with progress("solve") as counted:
+        while len(record) < max_iterations and not converged and mu < GIVE_UP:
+            counted(cost)
+            newton += model == "newton"
+            damping = _marquardt(system, undamped[2], mu)
+            definite = cholesky.factor(values if damping is None else _damped(system, values, damping))
+            if not definite:
+                record.append((cost, mu, np.nan))
+                if model == "newton":
+                    doubt, model = -DOUBT, "gauss-newton"
+                    cost, gradient, values = undamped = system.quadratic(x, model)
+                else:
+                    mu = _grown(mu)
+                continue
+            dx = -cholesky.solve(gradient)
+            promised = 0.5 * float((0.0 if damping is None else damping @ (dx * dx)) - gradient @ dx)
+            there = system.retract(x, dx)
+            near = promised <= NEAR * cost and doubt >= 0
+            used: Model = "newton" if near else model
+            trial = system.quadratic(there, used)
+            after = trial[0]
+            hidden = promised <= HIDDEN * cost and after <= cost * (1.0 + 1e-13)
+            share = 1.0 if hidden else (cost - after) / promised
+            still = still + 1 if hidden else 0
+            record.append((cost, mu, share))
+            converged = (
+                promised <= ROUNDED * max(cost, 1.0)
+                or still > STILL
+                or (hidden and np.abs(dx).max(initial=0.0) <= tolerance)
+            )
+            if not share > 0.0:
+                mu = _grown(mu)
+                continue
+            x = there
+            mu = _next(mu, share)
+            if model == "gauss-newton":
+                off = abs(share - 1.0) > OFF or (record[-1][1] == 0.0 and promised > SLOW * last)
+                doubt = doubt + 1 if doubt < 0 or off else max(doubt - 1, 0)
+                doubt = DOUBT if near else doubt
+                model = "newton" if doubt >= DOUBT else model
+            last = promised
+            if not converged:
+                cost, gradient, values = trial if model == used else system.quadratic(x, model)
+                undamped = (cost, gradient, values) if model == "gauss-newton" else undamped
+    return Arrival(x, len(record), bool(converged), np.array(record).reshape(-1, 3), newton)
+
+
+def _grown(mu: float) -> float:
+    return GROWTH * mu if mu > 0.0 else FIRST
+
+
+def _next(mu: float, share: float) -> float:
+    if share > 0.75:
+        return mu / DECAY if mu > LEAST_DAMPING else 0.0
+    return _grown(mu) if share < 0.25 else mu
+
+
+def _marquardt(system: Sparse, values: Floats, mu: float) -> Floats | None:
+    """(m,) mu times the diagonal of J^T J of `values`, and 1 where that is zero: what nothing measures stays where it
+    is. None where all is zero."""
+    diagonal = values[system.entries.diagonal]
+    unmeasured = diagonal == 0.0
+    if not mu and not unmeasured.any():
+        return None
+    return np.asarray(mu * np.maximum(diagonal, LEAST_INFORMATION) + unmeasured)
+
+
+def _damped(system: Sparse, values: Floats, damping: Floats) -> Floats:
+    whole = values.astype(np.float64)
+    whole[system.entries.diagonal] += damping
+    return whole
 
 
 DELAY = 2.0

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ...arrays import Floats
-from ..model.linear import Linear
+from ..model.derivatives import Linear
 from ..model.problem import Problem
 
 COFACTORS = np.array(
@@ -42,8 +42,10 @@ class Star:
         their covariances are S^-1 and H^-1 + T S^-1 T^T.
         """
         B, n, d = self.gradient.shape
-        others, index, own = np.arange(n) != self.separator, np.arange(d), self.own.copy()
-        own[..., index, index] += damping
+        others, index, own = np.arange(n) != self.separator, np.arange(d), self.own
+        if np.any(damping):
+            own = own.copy()
+            own[..., index, index] += damping
         arm, inverse = self.arm[:, others], inverted(own[:, others])
         reduced = inverse @ np.concatenate([arm, self.gradient[:, others, :, None]], axis=-1)
         flat = reduced.reshape(B, -1, d + 1)

@@ -10,17 +10,14 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from ..arrays import Floats, frozen, instance, one_of
-from ..errors import InputError
 from ..formats import load_graph
-from ..formats.graph import ENDS, Graph
-from .algebra.sparse import keep
+from ..formats.graph import Graph
+from .convex.chordal import chordal_start
 from .model.factor import Factor
 from .model.problem import Problem, Search
 from .model.space import Space
-from .starts.graph_starts import STARTS, contenders, incremental_start, separated
-from .starts.linear import position_variance, rotation_variance
+from .starts.graph_starts import STARTS, chained, contenders, incremental_start, parts, separated
 from .starts.race import race
-from .starts.walk import parts
 
 Objective = Literal["chordal", "geodesic"]
 KINDS = {
@@ -54,7 +51,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         start: "odometry" chains each robot's relative poses from a pose with a prior, else from its first vertex in the
             file; "apart" from a ring as wide as the mean range, all facing one way, as if nothing were known of how the
             robots stand to each other; "file" takes the vertices as they are; "tree" follows loop closures
-            and measurements between robots, too; "linear" relaxes rotations (`starts/linear.py`); "incremental" solves
+            and measurements between robots, too; "linear" relaxes rotations (`convex/chordal.py`); "incremental" solves
             the first poses of all robots, then more with them (`starts/graph_starts.py`); "auto" tries several and
             keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their priors, or where the first
             pose that measures them sees them, or by ranges. The Solution names the start in extras["start"].
@@ -70,11 +67,14 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     for name, value, allowed in (("objective", objective, Objective), ("start", start, Start)):
         one_of(name, value, get_args(allowed))
     poses = tuple(np.flatnonzero(graph.is_pose).tolist())
-    _refuse_exact(graph, objective)
     factors = _factors(graph, objective)
 
     def x0_of(name: str) -> Floats:
-        x0 = separated(graph, STARTS[name](graph))
+        x0 = STARTS.get(name, chained)(graph)
+        if name == "linear" and poses:
+            relaxed = Problem(graph.names, _factors(graph, "chordal"), x0, dimension=graph.dimension, poses=poses)
+            x0 = chordal_start(relaxed)
+        x0 = separated(graph, x0)
         return x0 if poses else x0[:, : graph.dimension]
 
     began = time.perf_counter()
@@ -88,7 +88,7 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
         problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
-    return keep(problem, problem.replace_unchecked(search=won._replace(seconds=time.perf_counter() - began)))
+    return problem.replace_unchecked(search=won._replace(seconds=time.perf_counter() - began))
 
 
 def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:
@@ -119,24 +119,6 @@ def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:
     return found
 
 
-def _refuse_exact(graph: Graph, objective: Objective) -> None:
-    """InputError for the first measurement without variance; a chordal objective sees means of variances alone."""
-    for kind in ENDS:
-        edges: Any = getattr(graph, kind)
-        if kind == "ranges":
-            least = edges.variance
-        elif objective == "geodesic":
-            least = np.linalg.eigvalsh(edges.covariance).min(axis=1, initial=np.inf)
-        else:
-            d, own = graph.dimension, np.einsum("mii->mi", edges.covariance)
-            least = np.minimum(own[:, :d].mean(axis=1), own[:, d:].mean(axis=1) if own.shape[1] > d else np.inf)
-        exact = np.flatnonzero(~(least > 0))
-        if len(exact):
-            ends = " ".join(graph.names[k] for k in edges.nodes[exact[0]])
-            hint = "Give it a variance, or fix its vertices where they are known exactly."
-            raise InputError(f"{kind} {ends}", f"least variance {least[exact[0]]:g}", "must be > 0", hint)
-
-
 def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
     d, found = graph.dimension, list[Factor]()
     for name, kind in KINDS.items():
@@ -161,6 +143,17 @@ def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
         zero = np.zeros((int((~apart).sum()), d))
         found.append(Factor("displacement", ranges.nodes[~apart], zero, std=sigma[~apart] + zero))
     return tuple(found)
+
+
+def position_variance(covariance: Floats, d: int) -> Floats:
+    """(M,) mean variance of the position."""
+    return np.asarray(np.einsum("mii->m", covariance[:, :d, :d]) / d)
+
+
+def rotation_variance(covariance: Floats, d: int) -> Floats:
+    """(M,) of an entry of the rotation, as the chordal objective has it."""
+    turn = np.einsum("mii->m", covariance[:, d:, d:])
+    return np.asarray(turn if d == 2 else 2.0 * turn / 3.0)
 
 
 def _fixed(graph: Graph) -> tuple[int, ...]:

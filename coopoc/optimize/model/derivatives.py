@@ -1,0 +1,475 @@
+"""Derivatives of a problem: measurements as CasADi expressions, their tapes of scalar operations, and linearisations.
+
+CasADi runs the measurement's own formula, differentiates what it costs and hands over a list of scalar operations,
+which the kernel in kernels/graphs/graph_tape.py runs for all measurements.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import lru_cache
+from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints
+from ...errors import InputError
+from .factor import LOSSES, Factor, Loss
+from .measurements import Measurement, converted_rows, is_converted
+from .space import Space
+
+if TYPE_CHECKING:
+    from ...kernels.graphs.graph_tape import Tape
+
+Numbers = list[Any]
+"""CasADi's scalars."""
+Model = Literal["cost", "gauss-newton", "newton", "converted", "jacobian"]
+"""What a tape gives: the cost alone, with J^T J, with the exact Hessian; J^T J of the converted measurement; or the
+whitened residuals and their Jacobian."""
+
+
+class Kind(NamedTuple):
+    """All that the formula of a factor's cost depends on.
+
+    Attributes:
+        measurement: of its kind.
+        space: of the problem.
+        full: its weight is a matrix.
+        loss: rho.
+        bound: a constraint, which costs its numbers times their weights, the multipliers.
+    """
+
+    measurement: Measurement
+    space: Space
+    full: bool = False
+    loss: Loss | None = None
+    bound: bool = False
+
+    @property
+    def opposed(self) -> bool:
+        """The derivative by the first node is minus that by the second."""
+        return self.measurement.arity == 2 and self.measurement.frame == "world"
+
+    @property
+    def widths(self) -> tuple[int, int, int]:
+        """How many numbers z, constants and weights a measurement has."""
+        measurement, d = self.measurement, self.space.dimension
+        return measurement.given(d), measurement.constants, measurement.size(d) ** (1 + self.full)
+
+
+class Term(NamedTuple):
+    """Structure of a factor or a constraint.
+
+    Attributes:
+        kind: of it.
+        raw: nodes (M, arity) int64 as bytes.
+        steered: (M, size) as bytes, see `steerable`; of a constraint.
+    """
+
+    kind: Kind
+    raw: bytes
+    steered: bytes = b""
+
+    @property
+    def nodes(self) -> Ints:
+        """(M, arity)."""
+        return np.frombuffer(self.raw, np.int64).reshape(-1, self.kind.measurement.arity)
+
+
+class Structure(NamedTuple):
+    """All of a problem that is no number: problems that share it share one solver.
+
+    Attributes:
+        nodes: n.
+        space: where they live.
+        still: (n, dof) as bytes, True where a node cannot move; empty: all move.
+        factors: in the problem's order.
+        constraints: as `factors`.
+    """
+
+    nodes: int
+    space: Space
+    still: bytes
+    factors: tuple[Term, ...]
+    constraints: tuple[Term, ...]
+
+    @property
+    def movable(self) -> Bools:
+        """(n, dof) True where a node can move."""
+        shape = (self.nodes, self.space.dof)
+        return ~np.frombuffer(self.still, bool).reshape(shape) if self.still else np.ones(shape, dtype=bool)
+
+
+def numbers_of(factor: Factor) -> Floats:
+    """(P, M) or (B, P, M): z, constants and weights of the measurements of a factor."""
+    weight, batch = factor.sqrt_information, () if factor.batch is None else (factor.batch,)
+    if factor.std is not None:
+        weight = 1.0 / factor.std
+    else:
+        assert weight is not None
+        weight = weight.reshape(*weight.shape[:-2], -1)
+    assert factor.constants is not None
+    first, second = factor.z.shape[-1], factor.z.shape[-1] + factor.constants.shape[1]
+    out = np.empty((*batch, second + weight.shape[-1], len(factor.nodes)))
+    out[..., :first, :], out[..., first:second, :] = factor.z.swapaxes(-1, -2), factor.constants.T
+    out[..., second:, :] = weight.swapaxes(-1, -2)
+    return out
+
+
+class Residual(NamedTuple):
+    """The whitened residual of one measurement, by CasADi's symbols.
+
+    Attributes:
+        nodes: (arity ambient,).
+        number: (P,) see `numbers_of`.
+        steps: (arity dof,) of the nodes.
+        white: (size,).
+    """
+
+    nodes: Any
+    number: Any
+    steps: Any
+    white: Any
+
+
+def residual_of(kind: Kind, converted: bool = False) -> Residual:
+    """The whitened residual of one measurement; of converted ones those without a linear form have none.
+
+    A step (dp, w) moves a node to (p + dp, R C(w)), C the Cayley map in space, which like Exp starts as I + [w]x but is
+    rational, and the angle itself in the plane.
+
+    Raises:
+        InputError: CasADi cannot run the formula.
+    """
+    import casadi as ca
+
+    measurement, space = kind.measurement, kind.space
+    arity, (given, constants, _) = measurement.arity, kind.widths
+    nodes, steps = ca.SX.sym("nodes", arity * space.ambient), ca.SX.sym("steps", arity * space.dof)
+    number: Any = ca.SX.sym("number", sum(kind.widths))
+    all_nodes, all_steps, numbers = (ca.vertsplit(each) for each in (nodes, steps, number))
+    places = [
+        _moved(space, all_nodes[k * space.ambient :][: space.ambient], all_steps[k * space.dof :][: space.dof])
+        for k in range(arity)
+    ]
+    z, assumed, weight = numbers[:given], numbers[given : given + constants], numbers[given + constants :]
+    vectors = converted and is_converted(measurement)
+    try:
+        local = _local(measurement, places)
+        gap = _converted(local, z) if vectors else _wrapped(measurement, local, z, assumed)
+        size = len(gap)
+        if kind.full:
+            gap = [sum(weight[size * k + j] * gap[j] for j in range(size)) for k in range(size)]
+        elif kind.bound:  # what has no multiplier may have no derivative
+            gap = [ca.if_else(w != 0.0, w * g, 0.0) for g, w in zip(gap, weight, strict=True)]
+        else:
+            gap = [g * w for g, w in zip(gap, weight, strict=True)]
+        white: Any = ca.vertcat(*gap)
+    except Exception as problem:  # the formula is the user's, who must learn what it raised
+        hint, why = "Take its functions from the namespace m, such as m.sqrt.", " ".join(str(problem).split())[:80]
+        raise InputError("kind", repr(measurement.name), f"must run on CasADi's numbers: {why}", hint) from problem
+    if converted and not (vectors or measurement.linear):
+        white = ca.SX(white.numel(), 1)
+    return Residual(nodes, number, steps, white)
+
+
+def robust(square: Any, loss: Loss | None) -> Any:
+    """rho of the squared residual; that of a truncated loss has a kink, with nothing beyond."""
+    return square if loss is None else LOSSES[loss.name][0](square, loss.scale, _namespace())
+
+
+def expressions(structure: Structure) -> dict[str, Any]:
+    """CasADi's x (the free steps), p (centres, numbers of factors, constants of constraints), f (cost) and g (what
+    the constraints bound)."""
+    import casadi as ca
+
+    space, n = structure.space, structure.nodes
+    centre = ca.SX.sym("centre", n, space.ambient)
+    steps: Any = ca.SX.sym("dx", int(structure.movable.sum()))
+    step: Any = ca.SX.zeros(n, space.dof)
+    for k, (i, j) in enumerate(np.argwhere(structure.movable).tolist()):
+        step[i, j] = steps[k]
+
+    def each(term: Term, number: Any) -> list[Any]:
+        """The whitened residuals of all measurements of a term, their numbers (M, P)."""
+        residual = residual_of(term.kind)
+        white = ca.Function("white", [residual.nodes, residual.number, residual.steps], [residual.white])
+        places = [(ca.vec(centre[nodes, :].T), ca.vec(step[nodes, :].T)) for nodes in term.nodes.tolist()]
+        return [white(at, number[k, :].T, moved) for k, (at, moved) in enumerate(places)]
+
+    cost, numbers, bounds = 0.0, list[Any](), list[Any]()
+    for term in structure.factors:
+        numbers.append(ca.SX.sym("number", len(term.nodes), sum(term.kind.widths)))
+        for white in each(term, numbers[-1]):
+            cost += 0.5 * robust(ca.sumsqr(white), term.kind.loss)
+    for term in structure.constraints:
+        given, constants, size = term.kind.widths
+        numbers.append(ca.SX.sym("number", len(term.nodes), constants))
+        plain = ca.horzcat(ca.SX.zeros(len(term.nodes), given), numbers[-1], ca.SX.ones(len(term.nodes), size))
+        value = ca.vertcat(*each(term, plain))
+        bounds.append(value[np.flatnonzero(np.frombuffer(term.steered, bool)).tolist()])
+    f, g = ca.cse([ca.SX(cost), ca.vertcat(*bounds)])  # a node's turn is that of all its measurements
+    return {"x": steps, "p": ca.veccat(centre, *numbers), "f": f, "g": g}
+
+
+def _converted(vector: Numbers, z: Numbers) -> Numbers:
+    d, rows = converted_rows(z, _namespace())
+    along, *across = (sum(a * v for a, v in zip(row, vector, strict=True)) for row in rows)
+    return [along - d, *across]
+
+
+def _wrapped(measurement: Measurement, local: Numbers, z: Numbers, constants: Numbers) -> Numbers:
+    """h - z, angles in [-pi, pi]: the derivative of the remainder is 1."""
+    m, dimension = _namespace(), 2 if len(local) in (2, 6) else 3
+    parts = measurement.residual(local, z, constants, m)
+    return [
+        m.remainder(part, 2.0 * np.pi) if angle else part
+        for part, angle in zip(parts, measurement.angles(dimension), strict=True)
+    ]
+
+
+@lru_cache(maxsize=1)
+def _namespace() -> Any:
+    """CasADi as the namespace of a formula."""
+    import casadi as ca
+
+    return SimpleNamespace(
+        sqrt=ca.sqrt,
+        sin=ca.sin,
+        cos=ca.cos,
+        atan2=ca.atan2,
+        log1p=ca.log1p,
+        fabs=ca.fabs,
+        fmax=ca.fmax,
+        where=ca.if_else,
+        remainder=ca.remainder,
+    )
+
+
+def _moved(space: Space, node: Numbers, step: Numbers) -> tuple[Numbers, list[Numbers]]:
+    """Position and rotation (d rows of d) of a node after a step."""
+    d = space.dimension
+    at = [node[k] + step[k] for k in range(d)]
+    if not space.has_rotation:
+        return at, []
+    return at, _product([node[d + d * i :][:d] for i in range(d)], cayley(step[d:]))
+
+
+def cayley(w: Numbers) -> list[Numbers]:
+    """C(w)."""
+    import casadi as ca
+
+    if len(w) == 1:
+        c, s = ca.cos(w[0]), ca.sin(w[0])
+        return [[c, -s], [s, c]]
+    x, y, z = w
+    zero = 0.0 * x
+    skew = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
+    twice = _product(skew, skew)
+    share = 1.0 / (1.0 + 0.25 * (x * x + y * y + z * z))
+    return [[float(i == j) + share * (skew[i][j] + 0.5 * twice[i][j]) for j in range(3)] for i in range(3)]
+
+
+def _product(a: list[Numbers], b: list[Numbers]) -> list[Numbers]:
+    return [[sum(a[i][k] * b[k][j] for k in range(len(b))) for j in range(len(b[0]))] for i in range(len(a))]
+
+
+def _local(measurement: Measurement, places: list[tuple[Numbers, list[Numbers]]]) -> Numbers:
+    """Inputs of the formula: the vector and, if the frame is relative, the rotation."""
+    (first, body), (last, other) = places[0], places[-1]
+    vector = [b - a for a, b in zip(first, last, strict=True)] if measurement.arity == 2 else last
+    if measurement.frame == "world":
+        return vector
+    if measurement.arity == 1:
+        return [*vector, *(c for row in body for c in row)]
+    back = [list(column) for column in zip(*body, strict=True)]
+    vector = [row[0] for row in _product(back, [[v] for v in vector])]
+    return vector if measurement.frame == "body" else [*vector, *(c for row in _product(back, other) for c in row)]
+
+
+class Written(NamedTuple):
+    """A tape and what its outputs are: the cost, then entries (row, column) of the gradient (column -1) and of the
+    upper triangle of the curvature, by the dof of the first node and then of the second; or entries of the residual
+    (column -1) and of its Jacobian.
+
+    Attributes:
+        tape: for the kernel.
+        entries: (outputs, 2); the cost has -1 twice.
+    """
+
+    tape: Tape
+    entries: Ints
+
+
+@lru_cache(maxsize=256)
+def write(kind: Kind, model: Model) -> Written:
+    """The tape of a kind.
+
+    Raises:
+        InputError: CasADi cannot run the formula, or no tape has an operation of it.
+    """
+    import casadi as ca
+
+    if model == "converted":
+        kind = kind._replace(loss=None)
+    nodes, number, steps, white = residual_of(kind, model == "converted")
+    square = ca.SX.sym("square")
+    rho = robust(square, kind.loss)
+    cost = ca.sum1(white) if kind.bound else 0.5 * ca.substitute(rho, square, ca.sumsqr(white))
+    zero = ca.SX.zeros(steps.size1())
+    outputs, entries = [cost], [(-1, -1)]
+    if model == "jacobian":
+        whole = ca.horzcat(white, ca.jacobian(white, steps))
+        entries = [(i, j - 1) for i in range(whole.size1()) for j in range(whole.size2())]
+        outputs = [whole[i, j + 1] for i, j in entries]
+    elif model != "cost":
+        slope = ca.gradient(cost, steps)
+        if model == "newton":
+            curvature = ca.hessian(cost, steps)[0]
+        else:
+            J = ca.jacobian(white, steps)
+            curvature = ca.mtimes(J.T, J) * ca.substitute(ca.jacobian(rho, square), square, ca.sumsqr(white))
+        for i in range(steps.size1()):
+            outputs.append(slope[i])
+            entries.append((i, -1))
+        for i in range(steps.size1()):
+            for j in range(i, steps.size1()):
+                outputs.append(curvature[i, j])
+                entries.append((i, j))
+    here = ca.substitute(ca.vertcat(*outputs), steps, zero)
+    here = ca.cse(here)
+    kept = [k for k in range(here.size1()) if k == 0 or not here[k].is_zero()]
+    together = [ca.vertcat(*(ca.densify(here[k]) for k in kept))]
+    tape = _tape(ca.Function("tape", [ca.vertcat(nodes, number)], together), kind.measurement.name)
+    return Written(tape, np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2))
+
+
+def _tape(function: Any, name: str) -> Tape:
+    """The operations of a CasADi function of one vector."""
+    from ...kernels.graphs.graph_tape import Operation, Tape
+
+    operations, constant = _operations(), int(Operation.CONST)
+    read_in, write_out = int(Operation.INPUT), int(Operation.OUTPUT)
+    count = function.n_instructions()
+    code, place, value = np.zeros(count, np.int64), np.zeros((count, 3), np.int64), np.zeros(count)
+    for k in range(count):
+        instruction = function.instruction_id(k)
+        if instruction not in operations:
+            allowed = f"must not use CasADi's operation {instruction}"
+            raise InputError("kind", repr(name), allowed, "Use +, -, *, /, ** and the functions of m.")
+        code[k] = operation = operations[instruction]
+        read, written = function.instruction_input(k), function.instruction_output(k)
+        if operation == constant:
+            place[k, 0], value[k] = written[0], function.instruction_constant(k)
+        elif operation == read_in:
+            place[k, :2] = written[0], read[1]
+        elif operation == write_out:
+            place[k, :2] = written[1], read[0]
+        else:
+            place[k] = written[0], read[0], read[-1]
+    return Tape(code, place, value, function.sz_w())
+
+
+@lru_cache(maxsize=1)
+def _operations() -> dict[int, int]:
+    """CasADi's number of an operation -> ours."""
+    import casadi as ca
+
+    from ...kernels.graphs.graph_tape import Operation
+
+    operations = {getattr(ca, f"OP_{operation.name}"): int(operation) for operation in Operation}
+    # the two of one slot, which is read twice
+    return operations | {ca.OP_SQ: int(Operation.MUL), ca.OP_TWICE: int(Operation.ADD)}
+
+
+@dataclass(frozen=True, eq=False)
+class Linear:
+    """A problem around x: per factor, whitened residuals and their derivative by the steps of its nodes.
+
+    A robust factor's residual and derivatives carry the root of its weight rho'.
+
+    Args:
+        x: (B, n, ambient).
+        residual: per factor (B, M, size).
+        jacobian: per factor and node (B, M, size, dof).
+        cost: (B,) 1/2 sum of rho.
+    """
+
+    x: Floats
+    residual: tuple[Floats, ...]
+    jacobian: tuple[tuple[Floats, ...], ...]
+    cost: Floats
+
+    def pick(self, index: Bools | Ints) -> Linear:
+        """The realisations `index` of B."""
+        jacobian = tuple(tuple(of_node[index] for of_node in nodes) for nodes in self.jacobian)
+        return Linear(self.x[index], tuple(r[index] for r in self.residual), jacobian, self.cost[index])
+
+
+def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x: Floats) -> Linear:
+    """Factors around x (B, n, ambient); what is not `movable` (n, dof) has no derivative."""
+    residuals, jacobians, cost = [], [], np.zeros(len(x))
+    for factor in factors:
+        residual, jacobian = _evaluated(space, factor, x)
+        square = np.einsum("bmk,bmk->bm", residual, residual)
+        if factor.loss is None:
+            cost += 0.5 * square.sum(axis=1)
+        else:
+            root = np.sqrt(factor.loss.weight(square))[..., None]
+            residual, jacobian = residual * root, tuple(s * root[..., None] for s in jacobian)
+            cost += 0.5 * factor.loss.cost(square).sum(axis=1)
+        if movable is not None:
+            jacobian = tuple(s * movable[n][:, None] for s, n in zip(jacobian, factor.nodes.T, strict=True))
+        residuals.append(residual)
+        jacobians.append(jacobian)
+    return Linear(x, tuple(residuals), tuple(jacobians), cost)
+
+
+def _evaluated(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[Floats, ...]]:
+    """Whitened residuals and derivatives of a factor at x by the tape of its kind, all realisations in one run."""
+    from ...kernels.graphs.graph_tape import accumulate
+
+    (batch, n, _), (count, arity), size, dof = x.shape, factor.nodes.shape, factor.size, space.dof
+    kind = Kind(factor.measurement, space, factor.std is None)
+    rows = batch * count
+    numbers, nodes = numbers_of(factor), factor.nodes
+    if batch > 1:
+        numbers = np.tile(numbers, batch) if numbers.ndim == 2 else numbers.swapaxes(0, 1)
+        nodes = (n * np.arange(batch)[:, None, None] + nodes).reshape(-1, arity)
+    numbers = numbers.reshape(-1, rows)
+    total = np.zeros((1 + arity * dof) * size * rows)
+    accumulate(write(kind, "jacobian").tape, x.reshape(batch * n, -1), nodes, numbers, _goal(kind, rows), total)
+    end = size * rows
+    jacobians = total[end:].reshape(arity, batch, count, size, dof)
+    return total[:end].reshape(batch, count, size), tuple(jacobians)
+
+
+@lru_cache(maxsize=64)
+def _goal(kind: Kind, rows: int) -> Any:
+    """(outputs, rows) int32, where a tape's outputs go: residuals (rows, size), Jacobians (arity, rows, size, dof)."""
+    size, dof = kind.measurement.size(kind.space.dimension), kind.space.dof
+    component, column = write(kind, "jacobian").entries.T
+    node, direction = np.divmod(column, dof)
+    first = np.where(column < 0, component, size * rows * (1 + node * dof) + component * dof + direction)
+    stride = np.where(column < 0, size, size * dof)
+    return (first[:, None] + stride[:, None] * np.arange(rows)).astype(np.int32)
+
+
+def sparse_jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int, int], index: int) -> Any:
+    """Sparse Jacobian (rows, n dof) of one realisation, CSR; shape is n and dof."""
+    from scipy.sparse import csr_array
+
+    (n, dof), top = shape, 0
+    data, rows, columns = [np.empty(0)], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    for factor, residual, jacobians in zip(factors, linear.residual, linear.jacobian, strict=True):
+        count, size = residual.shape[1:]
+        row = top + np.arange(count * size).reshape(count, size, 1)
+        for nodes, jacobian in zip(factor.nodes.T, jacobians, strict=True):
+            data.append(jacobian[index].ravel())
+            rows.append(np.broadcast_to(row, (count, size, dof)).ravel())
+            columns.append(np.broadcast_to(dof * nodes[:, None, None] + np.arange(dof), (count, size, dof)).ravel())
+        top += count * size
+    position = np.concatenate(rows), np.concatenate(columns)
+    return csr_array((np.concatenate(data), position), shape=(top, n * dof))
