@@ -20,13 +20,6 @@ from timing import medians, report, rows_of, timed
 import coopoc as co
 from coopoc.kernels.stars.joint_filter import run_filter
 from coopoc.methods.egos import assumptions, measurements
-<<<<<<< HEAD
-=======
-from coopoc.methods.sliding_window import Windows, dead_reckoned
-from coopoc.optimize.model.problem import Problem
-from coopoc.optimize.solve import solve_batch
-from coopoc.optimize.starts.initial import converted
->>>>>>> main
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector
 from coopoc.world.v2x import FIX_AND_VELOCITY

@@ -12,17 +12,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..errors import InputError
-<<<<<<< HEAD
-=======
-from ..optimize.backend import require_backend
-from ..optimize.model.problem import Problem
-from ..optimize.model.window import WindowStep
-from ..optimize.robust.candidates import Candidates, mark, reweigh
-from ..optimize.robust.gnc import EASY, RATE, ROUNDS, solve_gnc, surrogate_of
-from ..optimize.solution import Status
-from ..optimize.solve import solve, solve_batch
-from ..optimize.starts.initial import converted
->>>>>>> main
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
