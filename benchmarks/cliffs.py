@@ -21,7 +21,7 @@ from timing import medians, report, timed
 import coopoc as co
 from coopoc.learned import CooperativeGain, NoiseNet
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
-from coopoc.methods.drift_filter import DriftFilter
+from coopoc.methods.cooperative_filter import CooperativeFilter
 
 ROUNDS, NEIGHBOURS, STEPS, RUNS, EGO = 5, 6, 60, 10, 0
 GAPS = (
@@ -30,7 +30,7 @@ GAPS = (
     "lkf-sa-edge",
     "msmv-r",
     "joint",
-    "drift",
+    "cooperative-filter",
     "ci",
     "split-ci",
     "fixed-lag",
@@ -96,7 +96,11 @@ def method_cases() -> Iterator[Case]:
         yield case(f"{name}, one run", f"{name}, plain", method, seen(fleet, NOISE, everyone, runs=1), everyone)
     recording, drifting = seen(fleet, NOISE, False), replace(NOISE, gnss_drift_std=2.0, gnss_common_std=1.0)
     others = {
-        "drift, time-correlated errors": (DriftFilter(), seen(fleet, drifting, False), "joint, plain"),
+        "cooperative-filter, time-correlated errors": (
+            CooperativeFilter(),
+            seen(fleet, drifting, False),
+            "joint, plain",
+        ),
         "kalman-adaptive": (co.AdaptiveKalman(), recording, "kalman, plain"),
         "cooperative gain": (CooperativeGain(NoiseNet()), recording, "joint, plain"),
     }

@@ -195,7 +195,6 @@ ORACLES = {
     "lkf-sa-edge": "joint",
     "joint": "joint",
     "cooperative-filter": "cooperative",
-    "drift": "drift",
     "msmv-r": "msmv",
     "ci": "covariance_intersection",
     "split-ci": "covariance_intersection",

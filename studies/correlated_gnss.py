@@ -32,16 +32,16 @@ NEIGHBOURS = (0, 2, 6, 10)
 KS = {f"K = {k}": {"max_neighbours": k} for k in NEIGHBOURS}
 X = {k: {"max_neighbours": k} for k in NEIGHBOURS}
 SOLO = (("gnss", "none"), ("kalman", "nominal"), ("fedkalmannet", "trained"), ("recursive", "trained"))
-SHARED = (("joint", "nominal"), ("split-ci", "nominal"), ("drift", "nominal"))
-"""Nominal noise model: all but `drift` take the whole error of a fix as white, of the same variance."""
+SHARED = (("joint", "nominal"), ("split-ci", "nominal"), ("cooperative-filter", "nominal"))
+"""Nominal noise model: all but the last take the whole error of a fix as white, of the same variance."""
 NOTE = (
     "Lasting errors are 50 % or 90 % of a fix's variance, {drift_time_s:g} s correlated. All "
-    "but the drift filter take them as white noise of the same variance. The bound knows how they last."
+    "but the cooperative filter take them as white noise of the same variance. The bound knows how they last."
 )
 
 
 def _grid() -> list[dict[str, Any]]:
-    """Solo methods at K = 0 only; the drift filter there, too, as the solo filter of coloured noise."""
+    """Solo methods at K = 0 only; the cooperative filter there, too, as the solo filter of coloured noise."""
     return [
         of(*line, **case, max_neighbours=k)
         for case in CASES.values()
@@ -69,7 +69,7 @@ def _findings(results: Results) -> dict[str, str]:
     most = max((k for k in NEIGHBOURS if present(results, {"max_neighbours": k})), default=0)
     texts = {}
     for name, case in CASES.items() if most else ():
-        ks = {"kalman": 0, "joint": most, "drift": most, "bound": most}
+        ks = {"kalman": 0, "joint": most, "cooperative-filter": most, "bound": most}
         alone, joint, drift, bound = (rms(results, {**case, "method": m, "max_neighbours": k}) for m, k in ks.items())
         numbers = {"alone": alone, "joint": joint, "share": ratio(joint, alone), "drift": drift, "bound": bound}
         texts[name] = sentence(FINDING, name=name, most=most, **numbers)
@@ -111,7 +111,7 @@ STUDY = lineup.study(
         "A Gauss-Markov error with one correlation time stands for multipath and atmosphere; real ones depend on the "
         "place and on the satellites in view.",
         "The common error is the same over the whole map, which is nearly true over some hundred metres.",
-        "The drift filter and the bound treat a returning neighbour as new, although its error was partly known: "
+        "The cooperative filter and the bound treat a returning neighbour as new, although its error was partly known: "
         "the filter is somewhat over-confident, and the bound is not tight.",
         "Learned gains were trained with white noise.",
     ),

@@ -13,7 +13,6 @@ from coopoc import (
     V2X,
     Fleet,
     InputError,
-    JointFilter,
     Sensors,
     bound_rt_le,
     fleet_bound,
@@ -22,7 +21,8 @@ from coopoc import (
     posterior_bound,
     rt_le,
 )
-from coopoc.methods.drift_filter import DriftFilter
+from coopoc.kernels.stars.cooperative_state import NO_GUARDS
+from coopoc.methods.cooperative_filter import CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.world.body_frames import gauss_markov
 
@@ -61,19 +61,11 @@ def test_drift_is_each_receivers_and_the_common_error_everyones() -> None:
     np.testing.assert_allclose(alike[:, :, 0], alike[:, :, 1], atol=1e-12)
 
 
-def test_without_drift_it_is_the_joint_filter() -> None:
-    fleet = convoy()
-    seen = observe(fleet, WHITE, V2X(2, 20.0), runs=2)
-    ours, joint = DriftFilter()(seen, [0, 2]), JointFilter()(seen, [0, 2])
-    np.testing.assert_allclose(ours.x, joint.x, atol=1e-6)
-    np.testing.assert_allclose(ours.covariance, joint.covariance, atol=1e-6)
-
-
 def test_alone_it_is_filterpys_augmented_filter() -> None:
     """filterpy with state (x, drift, common) per axis, from the first fix with a vague position."""
     fleet = convoy(1)
     seen = observe(fleet, BOTH, V2X(0), runs=1, seed=3)
-    track, keep = DriftFilter()(seen, [0]), np.exp(-0.1 / 5.0)
+    track, keep = CooperativeFilter(guards=NO_GUARDS)(seen, [0]), np.exp(-0.1 / 5.0)
     q = NoiseModel.nominal(BOTH).process_variance(seen)[0, :, 0]
     for axis in range(3):
         kf = KalmanFilter(dim_x=3, dim_z=1)
@@ -102,7 +94,7 @@ def test_rms_and_nees_agree_with_the_bound() -> None:
     fleet, v2x = convoy(), V2X(3, 25.0)
     for sensors in (OWN, COMMON, BOTH):
         seen = observe(fleet, sensors, v2x, runs=60, observers=[0])
-        track = DriftFilter()(seen, [0])
+        track = CooperativeFilter(guards=NO_GUARDS)(seen, [0])
         rms = float(np.sqrt(np.mean(rt_le(track, fleet) ** 2)))
         assert rms == pytest.approx(bound_rt_le(posterior_bound(fleet, sensors, 0, v2x)), rel=0.12)
         assert np.nanmean(nees(track, fleet)) == pytest.approx(3.0, abs=0.45)

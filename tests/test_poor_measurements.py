@@ -31,7 +31,7 @@ from coopoc import (
 )
 from coopoc.learned import CooperativeGain, GainNet, LearnedGain, NoiseNet, RecursiveFilter, RecursiveGain
 from coopoc.learned.nets.cooperative import NetNoise
-from coopoc.methods.drift_filter import DriftFilter
+from coopoc.methods.cooperative_filter import CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.studies.views import of
 from coopoc.study import numbers
@@ -42,7 +42,7 @@ STARS = (
     JointFilter(),
     JointFilter(exact=False),
     LKFSA("nominal"),
-    DriftFilter(),
+    CooperativeFilter(robust=False),
     CooperativeGain(NoiseNet()),
     MSMV("nominal"),
     CovarianceIntersection(split=True),
@@ -130,7 +130,7 @@ def ranged() -> tuple[Fleet, Recording]:
     [
         JointFilter(),
         JointFilter(exact=False),
-        DriftFilter(),
+        CooperativeFilter(robust=False),
         FixedLagSmoother(lag=5),
         MovingHorizon(horizon=5),
     ],

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from filterpy.kalman import KalmanFilter
-from oracles import covariance_intersection, drift, joint, lkf_sa, messages, msmv
+from oracles import covariance_intersection, joint, lkf_sa, messages, msmv
 
 from coopoc import (
     LKFSA,
@@ -28,14 +28,12 @@ from coopoc import (
 from coopoc.kernels.solo import FixNoise
 from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.kernels.stars.relative import angle
-from coopoc.methods.drift_filter import DriftFilter
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.noise_model import resolve
 from coopoc.methods.track import Method
 from coopoc.world.links import spherical, to_vector, vector_cov
 
 S2 = Sensors.paper_scenario2()
-DRIFTING = replace(S2, gnss_drift_std=1.0, gnss_common_std=0.7, gnss_drift_time=5.0)
 CHANNELS = {
     "ideal": V2X(max_neighbours=4),
     "all": V2X(max_neighbours=20),
@@ -88,12 +86,6 @@ def by_joint(method: JointFilter, recording: Recording, stars: Any) -> Any:
     return joint.follow(stars, known, method.exact and known.exact_relative)
 
 
-def by_drift(method: DriftFilter, recording: Recording, stars: Any) -> Any:
-    known, s = known_of(method, recording), recording.sensors
-    errors = s.gnss_drift_std**2, s.gnss_common_std**2, float(np.exp(-recording.dt / s.gnss_drift_time))
-    return drift.follow(stars, known, np.square(s.gnss_std) - known.gnss_variance, errors)
-
-
 def by_lkf(method: LKFSA, recording: Recording, stars: Any) -> Any:
     x, variance, others = lkf_sa.follow(stars, known_of(method, recording))
     return x, variance[..., None] * np.eye(3), others
@@ -111,7 +103,6 @@ ORACLES: list[tuple[Any, Callable[..., Any]]] = [
     (JointFilter(), by_joint),
     (JointFilter(exact=False), by_joint),
     (JointFilter("identity"), by_joint),
-    (DriftFilter(), by_drift),
     (LKFSA(), by_lkf),
     (LKFSA("nominal"), by_lkf),
     (MSMV("nominal"), by_msmv),
@@ -150,8 +141,7 @@ def assert_is_the_oracle(method: Method, oracle: Callable[..., Any], recording: 
 @pytest.mark.parametrize("pair", ORACLES, ids=label)
 def test_the_filter_is_its_oracle(crossing: Fleet, pair: Any, channel: str) -> None:
     """Neighbours join and leave; messages are lost, late, slow and rejected; K = 0 and K > N."""
-    sensors = DRIFTING if isinstance(pair[0], DriftFilter) else S2
-    assert_is_the_oracle(*pair, observe(crossing, sensors, CHANNELS[channel], runs=2, observers=[0]))
+    assert_is_the_oracle(*pair, observe(crossing, S2, CHANNELS[channel], runs=2, observers=[0]))
 
 
 @pytest.mark.parametrize("damage", [holed, slow_fixes, partial], ids=lambda f: f.__name__)
@@ -161,8 +151,7 @@ def test_it_is_with_missing_fixes_and_measurements(
 ) -> None:
     """A missing component is no row of the dense oracle; in the kernel of covariance intersection its deviation of 1e3
     leaves it 1e-8 of the information of others."""
-    sensors = DRIFTING if isinstance(pair[0], DriftFilter) else S2
-    recording = damage(observe(gappy(crossing), sensors, V2X(4, loss=0.2), runs=2, observers=[0]))
+    recording = damage(observe(gappy(crossing), S2, V2X(4, loss=0.2), runs=2, observers=[0]))
     if damage is partial and isinstance(pair[0], MSMV | LKFSA):
         assert np.isfinite(pair[0](recording, [0]).x).all()
         return
@@ -173,9 +162,8 @@ def test_it_is_with_missing_fixes_and_measurements(
 @pytest.mark.parametrize("runs", [1, 3, 5])
 @pytest.mark.parametrize("pair", ORACLES, ids=label)
 def test_it_is_in_any_batch_and_with_absences(crossing: Fleet, pair: Any, runs: int) -> None:
-    sensors = DRIFTING if isinstance(pair[0], DriftFilter) else S2
     fleet = gappy(crossing).between(0, 45)
-    assert_is_the_oracle(*pair, observe(fleet, sensors, V2X(max_neighbours=5, loss=0.2), runs=runs, observers=[0]))
+    assert_is_the_oracle(*pair, observe(fleet, S2, V2X(max_neighbours=5, loss=0.2), runs=runs, observers=[0]))
 
 
 NOISES = {

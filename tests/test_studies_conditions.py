@@ -110,7 +110,7 @@ def test_what_is_wrong_harms_those_who_use_it(tmp_path: Path, short_town: str) -
     assert "told what is wrong" in (tmp_path / "robustness" / "tables" / "rt_le.md").read_text()
 
 
-QUICK = {"method": "kalman,joint,drift,bound", "max_neighbours": "0,6", "runs": 3, "egos": "2"}
+QUICK = {"method": "kalman,joint,cooperative-filter,bound", "max_neighbours": "0,6", "runs": 3, "egos": "2"}
 
 
 def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path: Path, short_town: str) -> None:
@@ -118,7 +118,7 @@ def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path:
     results = run_study("correlated_gnss", tmp_path, settings={**QUICK, **wanted, "data": short_town}, progress=False)
     value = {
         name: [
-            numbers.rms(results, {**correlated_gnss.CASES[name], "method": "drift", "max_neighbours": k})
+            numbers.rms(results, {**correlated_gnss.CASES[name], "method": "cooperative-filter", "max_neighbours": k})
             for k in (0, 6)
         ]
         for name in ("white", "own", "common")

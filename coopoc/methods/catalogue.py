@@ -12,7 +12,6 @@ from .centralised import BatchSmoother, CentralFilter
 from .cooperative_filter import CooperativeFilter
 from .covariance_intersection import CovarianceIntersection
 from .decentralised import ConsensusADMM, GaussianBeliefPropagation
-from .drift_filter import DriftFilter
 from .joint_filter import JointFilter
 from .kalman import GNSS, AdaptiveKalman, Kalman
 from .mds import MDS
@@ -30,7 +29,6 @@ METHODS: Mapping[str, Factory] = {
     "lkf-sa": LKFSA,
     "lkf-sa-edge": partial(JointFilter, exact=False, name="lkf-sa-edge"),
     "msmv-r": MSMV,
-    "drift": DriftFilter,
     "joint": JointFilter,
     "cooperative-filter": CooperativeFilter,
     "ci": CovarianceIntersection,
