@@ -258,7 +258,7 @@ def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path: Path) ->
         with pytest.raises(co.InputError, match="study"):
             co.run_study(value, tmp_path, progress=False)  # type: ignore[arg-type]
         with pytest.raises(co.InputError, match="path"):
-            co.run_study("backends", value, progress=False)  # type: ignore[arg-type]
+            co.run_study("neighbours", value, progress=False)  # type: ignore[arg-type]
 
 
 def test_a_duration_and_a_mask_are_no_numbers() -> None:

@@ -50,7 +50,8 @@ class CooperativeFilter:
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel, whose drift and compass errors are estimated along.
-        robust: False gives the textbook filter, `JointFilter`: all errors white, all members honest.
+        robust: False gives the textbook filter, `JointFilter`: all errors white, all members honest. With the identity
+            noise model nothing is gated.
         guards: limits of the above; the default was chosen on the validation tasks of CL-Bench.
 
     References:
@@ -87,7 +88,7 @@ class CooperativeFilter:
         if self.robust:
             assumed, broadcast = solo_estimates(recording, known, columns)
             moved = np.cumsum(np.nan_to_num(recording.dt * recording.velocity), axis=1)
-        guards = self.guards if self.robust else NO_GUARDS
+        guards = guards_of(self, known)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
             seen = measurements(recording, ego, box, broadcast)
@@ -106,6 +107,11 @@ def weight(q: Floats, gate: float) -> Any:
         return np.where(np.isnan(q), np.nan, 1.0)
     share = gate / np.maximum(q, gate)
     return np.where(q > REJECTED * gate, 0.01 * share, share)
+
+
+def guards_of(method: CooperativeFilter, known: NoiseModel) -> Guards:
+    """The method's own; none of the textbook filter, nor where no noise is stated that an innovation could exceed."""
+    return method.guards if method.robust and known.sensors is not None else NO_GUARDS
 
 
 def model_of(known: NoiseModel, robust: bool) -> Model:

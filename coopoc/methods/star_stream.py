@@ -33,7 +33,7 @@ from ..kernels.stars.cooperative_state import (
 from ..kernels.stars.cooperative_state import ESTIMATE as POSITION
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.relative import components
-from .cooperative_filter import CooperativeFilter, model_of
+from .cooperative_filter import CooperativeFilter, guards_of, model_of
 from .joint_filter import JointFilter
 from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
 from .noise_model import constant_noise, motion_noise
@@ -150,7 +150,7 @@ class StarStream:
         if isinstance(filter, JointFilter):
             self._model = self._model._replace(exact=float(filter.exact and known.exact_relative))
         elif robust:
-            self._guards = filter.guards
+            self._guards = guards_of(filter, known)
         self._motion, self._fix = motion_noise(known, interval), np.array(known.gnss_variance)
         self.max_age, self.history = seconds("max_age", max_age), MotionHistory(history)
         self._start = np.full(3, np.nan) if x0 is None else three("x0", x0)
@@ -212,6 +212,7 @@ class StarStream:
         outcome = stream_row(self._given, self.history.reserve(), self._motion, self._fix, own)
         if outcome not in (ESTIMATE, NO_FIX_YET):
             self.history.check(gnss, velocity, dt, fix_age)
+        dt = float(dt)
         if self.solo is not None:
             self.solo.step(gnss, velocity, dt, fix_age)
             self._odometer += self._given[3:6] * dt
