@@ -84,9 +84,9 @@ class MovingHorizon:
     x holds the ego and the neighbours of its star at each step. The arrival cost (x_a, P) is
     what the steps before the horizon leave when they are eliminated one by one, as a filter does. A message that comes
     late is put where it belongs: its fix at the step at which it was sent, its velocity in the place of the older one
-    that stood in for it. A velocity that stands in n times makes the same error n times (see star_steps). A fix that is
-    late by more than the horizon is dropped, and the notes count it. With linear relative measurements the newest point
-    is that of the Kalman filter.
+    that stood in for it. A velocity that stands in n times makes the same error n times (kernels/stars/messages.py). A
+    fix that is late by more than the horizon is dropped, and the notes count it. With linear relative
+    measurements the newest point is that of the Kalman filter.
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.

@@ -1,1 +1,1 @@
-"""."""
+"""Studies: a grid of cells, its results, tables, figures and report."""

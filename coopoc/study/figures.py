@@ -42,7 +42,8 @@ def sweep(
     """
     rows = results.select(where)
     panel = Panel({value: {x: value} for value in sorted(rows[x].unique())}, dict(where or {}), xlabel=words(x))
-    lines = rows[_line_names(results, x)].drop_duplicates().to_dict("records")
+    names = _line_names(results, x)
+    lines = [dict(zip(names, line, strict=True)) for line in rows[names].drop_duplicates().itertuples(index=False)]
     text = caption or f"{words(y)} against {words(x)}. Bands: 95 % intervals over egos, then runs."
     plot = curves(results, [panel], lines, text, partial(interval, value=y), ylabel=words(y), log=log, width=6.4)
     if plot is None:
@@ -79,22 +80,22 @@ def pareto(
     shown = [("", levels)]
     flat = _coinciding(shown, True, WIDTH * _height([*shown, ("", [(of, dict(points)) for of, points in marks])], True))
     with canvas(width=7.0) as (figure, panel):
-        for of, points in marks:
+        for line, points in marks:
             sent = [point for point in points if point[0] > 0]
-            panel.plot(*zip(*sent, strict=True), **{**strokes(of), "linestyle": "none"})
+            panel.plot(*zip(*sent, strict=True), **{**strokes(line), "linestyle": "none"})
             best = [p for k, p in enumerate(sent) if all(p[1] < other[1] for other in sent[:k])]
-            panel.plot(*zip(*best, strict=True), **{**strokes(of), "marker": "", "linewidth": 0.8})
-        for group in flat:
-            _draw(panel, group[0], next(value for of, value in levels if of is group[0]))
+            panel.plot(*zip(*best, strict=True), **{**strokes(line), "marker": "", "linewidth": 0.8})
+        for alike in flat:
+            _draw(panel, alike[0], next(value for line, value in levels if line is alike[0]))
         plain_log(panel.xaxis)
         plain_log(panel.yaxis)
         panel.set(xlabel=words(x), ylabel=words(y))
         also = {
-            name_of(group[0]): f" ({group[0].get('noise_model')}{_joined(group).removeprefix(_joined(group[:1]))})"
-            for group in flat
-            if len(group) > 1
+            name_of(alike[0]): f" ({alike[0].get('noise_model')}{_joined(alike).removeprefix(_joined(alike[:1]))})"
+            for alike in flat
+            if len(alike) > 1
         }
-        legend(panel, [*(of for of, _ in marks), *(group[0] for group in flat)], also)
+        legend(panel, [*(of for of, _ in marks), *(alike[0] for alike in flat)], also)
     return Plot(figure, caption)
 
 
@@ -253,7 +254,7 @@ def multiples(
     size = {"width": 1.9 + 1.75 * len(cases), "height": 0.9 + 0.21 * len(rows)}
     with canvas(1, len(cases), sharex=True, sharey=True, squeeze=False, **size) as (figure, (axes,)):
         for panel, case in zip(axes, cases, strict=True):
-            if case in (target or {}):
+            if target and case in target:
                 panel.axvspan(1.0, target[case], color=NEUTRAL, alpha=0.35, linewidth=0, label="target")
                 panel.legend(loc="lower right")
             panel.axvline(1.0, color="black", linewidth=0.9)

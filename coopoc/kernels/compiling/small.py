@@ -155,13 +155,6 @@ def add_diagonal(a: Any, v: Any) -> Any:
 
 
 @unrolled
-def outer_scale(a: Any, u: Any, v: Any) -> Any:
-    """diag(u) A diag(v)."""
-    d = order(a)
-    return [a[i * d + j] * u[i] * v[j] for i, j in _entries(d)]
-
-
-@unrolled
 def minus_product(a: Any, b: Any) -> Any:
     """-A B."""
     d = order(a)

@@ -1,4 +1,4 @@
-"""The cooperative filter: an ego and its neighbours, of whom any measurement, message or member may be wrong.
+"""The cooperative filter: sequential EKF of a star, in which any measurement, message or member may be wrong.
 
 The order of a step: members leave, all that stay move, members join, then the ego's fix, the relative measurements
 (once at the prediction, once more at that solution), the messages, and at last who is trusted. A drive and a stream

@@ -16,8 +16,6 @@ from ..compiling.small import apply, from_upper, scale, subtract
 from ..compiling.vectors import choose
 from .relative import Numbers, completed, converted, exact, vector
 
-LEAST_RANGE, LEAST_SINE = 1.0, 0.05
-"""m; of the converted start, as in `coopoc.optimize.starts.initial`."""
 EXACT, AT_GAP = np.arange(2)
 """Linear in range and angles at the present points; converted to a vector, weighted by the geometry of the points,
 which must not depend on the measurement. NumPy's integers: for each constant of Python's numba would compile a function

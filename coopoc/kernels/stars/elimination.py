@@ -20,7 +20,6 @@ from ..compiling.small import (
     minus_product,
     mirrored,
     negate,
-    outer_scale,
     store,
     transpose,
 )
@@ -91,13 +90,3 @@ def predict(a: Floats, n: int, stride: int, process: Floats, memory: Floats, blo
             for j in range(i, n):
                 at = i * stride + j
                 store(a, at, less_transposed_product(load(a, at, block), left, load(memory, j, block)))
-
-
-@inner
-def rescale(a: Floats, n: int, stride: int, factors: Floats, block: Numbers, row: Numbers) -> None:
-    """G A G in place of A, G diagonal: the information of a Gaussian whose numbers are divided by `factors`."""
-    for i in range(n):
-        left = load(factors, i, row)
-        for j in range(i, n):
-            at = i * stride + j
-            store(a, at, outer_scale(load(a, at, block), left, load(factors, j, row)))

@@ -1,6 +1,6 @@
 """The joint filter of a star: predict in information form, add fixes, then relative measurements by Gauss-Newton.
 
-No matrix is ever inverted as a whole. A drive and a stream call the same `step`.
+No matrix is ever inverted as a whole.
 """
 
 from __future__ import annotations
