@@ -56,7 +56,8 @@ def _over_runs(results: Results, where: Where) -> Interval | float | None:
     if kept is None or where["method"] == "bound":
         return rms(results, where)
     each = mean_interval(np.square(results.values("rt_le_m", kept)).mean(axis=0))
-    return Interval(*(float(np.sqrt(max(end, 0.0))) for end in (each.mean, each.low, each.high)), each.n)
+    middle, low, high = (float(np.sqrt(max(end, 0.0))) for end in (each.mean, each.low, each.high))
+    return Interval(middle, low, high, each.n)
 
 
 FINDING = (
