@@ -36,7 +36,8 @@ SHARED = (("joint", "nominal"), ("split-ci", "nominal"), ("cooperative-filter", 
 """Nominal noise model: all but the last take the whole error of a fix as white, of the same variance."""
 NOTE = (
     "Lasting errors are 50 % or 90 % of a fix's variance, {drift_time_s:g} s correlated. All "
-    "but the cooperative filter take them as white noise of the same variance. The bound knows how they last."
+    "but the cooperative filter take them as white noise of the same variance. The bound knows how they last; it is "
+    "that of a star of newcomers without a past, which the cooperative filter's messages bring along: it may lie below."
 )
 
 
