@@ -92,7 +92,6 @@ STUDY = lineup.study(
     settings={
         **scene.TOWN,
         **scene.WEIGHTS,
-        "backend": "gauss-newton",
         "max_neighbours": 6,
         "runs": 10,
         "train_seeds": 1,

@@ -87,7 +87,7 @@ STUDY = lineup.study(
     "side_by_side",
     "How do these methods compare with each other and with the bound?",
     grid={"max_neighbours": (0, 2, 6), "method": METHODS, "noise_model": ("nominal",)},
-    settings={**scene.TOWN, **scene.WEIGHTS, **CONDITIONS, "backend": "gauss-newton", "runs": 10, "train_seeds": 1},
+    settings={**scene.TOWN, **scene.WEIGHTS, **CONDITIONS, "runs": 10, "train_seeds": 1},
     reference=None,
     shares=("max_neighbours",),
     tables={
