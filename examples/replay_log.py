@@ -113,7 +113,7 @@ FILTERS: dict[str, Callable[[], Any]] = {
     "adaptive, 10 % of speed": lambda: co.AdaptiveKalman(SPEED).start(),
     "OKF": lambda: load_method("okf").start(),
     "FedKalmanNet": lambda: load_method("fedkalmannet").start(),
-    "Recursive gain": lambda: load_method("recursive").start(),
+    "Road filter": lambda: co.RoadFilter(noise_model(SPEED)).start(),
 }
 WAYS: dict[str, dict[str, bool]] = {
     "as recorded": {"jitter": False, "drop": False, "late": False},

@@ -94,22 +94,6 @@ RECIPES: dict[str, Recipe] = {
     "fedokf": Recipe("federated", Schedule(batch=12, learning_rate=0.05, weight_decay=0.0, mirror=False), net="okf"),
     "road": Recipe("centralised", ROAD, noise=ROADS, piece=1500, net="road"),
     "fedroad": Recipe("federated", ROAD, noise=ROADS, piece=1500, net="road"),
-    "cooperative": Recipe(
-        "federated",
-        Schedule(batch=8, learning_rate=0.01, weight_decay=0.01),
-        local_epochs=10,
-        noise="wide",
-        net="noise_net",
-    ),
-    "recursive": Recipe(
-        "federated",
-        Schedule(batch=24, mirror=False),
-        rounds=10,
-        local_epochs=10,
-        noise="wide",
-        piece=300,
-        net="recursive",
-    ),
     "split": Recipe(
         "federated",
         Schedule(batch=8, learning_rate=3e-3, weight_decay=0.1),
@@ -119,10 +103,6 @@ RECIPES: dict[str, Recipe] = {
         net="split",
     ),
 }
-
-MEASURED: dict[str, Schedule] = {"recursive": Schedule(batch=4, learning_rate=0.01, mirror=False)}
-"""Schedules on measured drives in place of the recipe's. In simulation the recursive gain starts at its optimum, and a
-hundred small steps are enough; what is measured has more to teach."""
 
 
 @dataclass(frozen=True)
@@ -211,8 +191,6 @@ def jobs_of(name: str, setting: Setting, fleet: Drives, aggregate: str | None = 
         if recipe.kind != "federated":
             raise InputError("aggregate", aggregate, f"goes with federations, {name} is {recipe.kind}", "Leave it out.")
         recipe = replace(recipe, aggregate=aggregate)
-    if isinstance(fleet, MeasuredDrives):
-        recipe = replace(recipe, schedule=MEASURED.get(name, recipe.schedule))
     if recipe.kind != "individual":
         return [Job(name, recipe, setting)]
     return [Job(name, recipe, setting, client) for client in range(1, len(fleet.ids) + 1)]

@@ -20,7 +20,7 @@ from ..world.recording import Recording, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 from .motion_history import MotionHistory
 from .noise_model import NoiseModel, constant_noise, motion_noise, process_noise, resolve
-from .track import Limits, Track, check_options
+from .track import Limits, Track, check_options, lost
 
 LIMITS: Limits = {
     "fix": (1e-6, 1e6, "> 0"),
@@ -119,7 +119,8 @@ class RoadFilter:
         names = "heading_error", "heading_error_std", "scale_error", "scale_error_std"
         extras = {name: errors[..., i] for i, name in enumerate(names)} if self.assumed(recording).heading else {}
         none = np.zeros((recording.runs, len(columns)))
-        return Track(recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, extras=extras)
+        took, notes = time.perf_counter() - began, lost(x, recording, columns)
+        return Track(recording.t, tuple(columns), x, cov, none, none, took, notes=notes, extras=extras)
 
     def assumed(self, recording: Recording) -> RoadErrors:
         """`errors`, or those that fit the recording."""
@@ -223,6 +224,8 @@ class RoadFilter:
     def _noise(self, recording: Recording) -> tuple[Floats, RoadNoise, MotionNoise]:
         """Variance m^2 of each step beside that of the motion, noise of fixes and errors, noise of the motion."""
         known, errors = resolve(self.noise_model, recording, relative=False), self.assumed(recording)
+        if known.sensors is None and self.errors is None:  # no noise is stated that a gate could measure by
+            errors = replace(errors, gate=np.inf)
         process, motion = process_noise(known, recording)
         return errors.motion**2 * process, road_noise(known, errors), louder(motion, errors)
 
