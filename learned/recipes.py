@@ -24,7 +24,7 @@ from .nets.gain import Gain
 from .training.clients import Client, Noise, Start, check_pieces, clients
 from .training.drives import Drives, MeasuredDrives
 from .training.measured import measured_clients
-from .training.roads import roads
+from .training.roads import PIECE, roads
 from .training.schedule import STEPS, Epoch, Schedule
 
 REVISION = 7
@@ -92,8 +92,8 @@ RECIPES: dict[str, Recipe] = {
     "individual": Recipe("individual", Schedule(epochs=500)),
     "okf": Recipe("okf", Schedule(epochs=300), net="okf"),
     "fedokf": Recipe("federated", Schedule(batch=12, learning_rate=0.05, weight_decay=0.0, mirror=False), net="okf"),
-    "road": Recipe("centralised", ROAD, noise=ROADS, piece=1500, net="road"),
-    "fedroad": Recipe("federated", ROAD, noise=ROADS, piece=1500, net="road"),
+    "road": Recipe("centralised", ROAD, noise=ROADS, piece=300, net="road"),
+    "fedroad": Recipe("federated", ROAD, noise=ROADS, piece=300, net="road"),
     "split": Recipe(
         "federated",
         Schedule(batch=8, learning_rate=3e-3, weight_decay=0.1),
@@ -225,7 +225,7 @@ def job_clients(job: Job, fleet: Drives) -> tuple[Client, ...]:
     what they measured: then the recipe's noise has no effect."""
     recipe, setting = job.recipe, job.setting
     if recipe.noise == ROADS and not isinstance(fleet, MeasuredDrives):
-        fleet = roads(fleet, setting.seed)
+        fleet, recipe = roads(fleet, setting.seed), replace(recipe, piece=max(recipe.piece, PIECE))
     if isinstance(fleet, MeasuredDrives):
         return measured_clients(fleet, start=setting.start, piece=recipe.piece, split=recipe.split)
     noise: Any = recipe.noise if recipe.noise in get_args(Noise) else "static"

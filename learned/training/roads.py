@@ -17,8 +17,8 @@ from coopoc.world.v2x import V2X
 
 from .drives import MeasuredDrives
 
-WORLDS = 6
-"""Worlds of each vehicle."""
+WORLDS, PIECE = 6, 1500
+"""Worlds of each vehicle, and steps of a piece, at least: errors last."""
 
 
 def roads(fleet: Fleet, seed: int = 0, worlds: int = WORLDS) -> MeasuredDrives:
