@@ -21,13 +21,13 @@ from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.algebra.sparse import Sparse, sparse
 from coopoc.optimize.assess.assess import SMALL, assess, newton_decrease
+from coopoc.optimize.assess.plausible import expected
 from coopoc.optimize.backends.gtsam_factors import forms, graph_of, values, which_turn
 from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.descent.local_problem import LocalProblem
 from coopoc.optimize.graph_problems import Objective, from_graph, read_graph
 from coopoc.optimize.model.factor import Factor
 from coopoc.optimize.starts.graph_starts import separated, trilaterate
-from coopoc.optimize.starts.race import expected
 
 PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
 needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")

@@ -1,9 +1,9 @@
 """GTSAM's own factors with exactly our objective, by kind, and problems as its graphs and values.
 
 The error e of a GTSAM class below gives our whitened residual, or one of the same length, as S e; S goes into its noise
-model and the loss into a robust one. What is not here GTSAM weighs in another way: its bearing in space lives in the
-tangent plane of a direction, and range, azimuth and inclination in the world frame it does not have. A point is a
-Point2/3, a pose a Pose2/3.
+model and the loss into a robust one. What is not here GTSAM weighs in another way, and is a CustomFactor of our
+residual: its bearing in space lives in the tangent plane of a direction, and range, azimuth and inclination in the
+world frame it does not have. A point is a Point2/3, a pose a Pose2/3.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...arrays import Floats
-from ..model.factor import Factor, Loss
+from ..model.derivatives import linearise
+from ..model.factor import Factor, Loss, unchecked
 from ..model.problem import Problem
 from ..model.space import Space, exp, log
 
@@ -221,16 +222,60 @@ FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
 """(factor, W (M or 1, size, size), dimension) -> parts, by kind."""
 
 
-def graph_of(problem: Problem, parts: Sequence[Form], keys: Sequence[int] | None = None) -> Any:
-    """The gtsam.NonlinearFactorGraph of the factors that have parts (see `forms`), and of the nodes that are fixed.
+class Callbacks:
+    """Residuals and derivatives of factors that GTSAM lacks, for its CustomFactors: all at once at each new point.
 
     Args:
-        keys: GTSAM's names of the nodes, default their indices.
+        problem: a single one.
+        factors: of it.
     """
+
+    def __init__(self, problem: Problem, factors: Sequence[Factor]) -> None:
+        self._space, self._posed = problem.space, which_turn(problem)
+        self._factors = [unchecked(factor, loss=None) for factor in factors]
+        self._raw: list[Any] = [None] * len(self._posed)
+
+    def _node(self, found: Any, i: int) -> tuple[Any, ...]:
+        """The numbers of a node in gtsam.Values, to be compared."""
+        if not self._posed[i]:
+            return tuple((found.atPoint2 if self._space.dimension == 2 else found.atPoint3)(i).tolist())
+        if self._space.dimension == 2:
+            at = found.atPose2(i)
+            return at.x(), at.y(), at.theta()
+        return tuple(found.atPose3(i).matrix().ravel().tolist())
+
+    def of(self, k: int, row: int, nodes: Sequence[int]) -> Callable[[Any, Any, Any], Any]:
+        """The error function of a measurement."""
+
+        def error(_: Any, found: Any, jacobians: Any) -> Any:
+            if any(self._raw[i] != self._node(found, i) for i in nodes):
+                every = range(len(self._posed))
+                x = estimate(self._space, self._posed, found, every)
+                self._raw = [self._node(found, i) for i in every]
+                self._linear = linearise(self._space, self._factors, None, x[None])
+                self._tangent = tangent(self._space, self._posed, x)
+            if jacobians is not None:
+                for place, i in enumerate(nodes):
+                    by = self._linear.jacobian[k][place][0]
+                    jacobians[place] = by[row] @ self._tangent[i]
+            return self._linear.residual[k][0, row]
+
+        return error
+
+
+def graph_of(problem: Problem, parts: Sequence[Form]) -> Any:
+    """The gtsam.NonlinearFactorGraph of the factors, of which those without parts (see `forms`) are CustomFactors, and
+    of the nodes that are fixed, with their indices as keys."""
     import gtsam
 
-    graph, posed = gtsam.NonlinearFactorGraph(), which_turn(problem)
-    keys = range(len(posed)) if keys is None else keys
+    graph, posed, keys = gtsam.NonlinearFactorGraph(), which_turn(problem), range(len(problem.names))
+    lacking = [factor for factor, form in zip(problem.factors, parts, strict=True) if isinstance(form, str)]
+    callbacks = Callbacks(problem, lacking)
+    for k, factor in enumerate(lacking):
+        model = _robust(gtsam.noiseModel.Unit.Create(factor.size), factor.loss)
+        for row in np.flatnonzero(factor.informative).tolist():
+            nodes = factor.nodes[row].tolist()
+            graph.add(gtsam.CustomFactor(model, nodes, callbacks.of(k, row, nodes)))
     for factor, form in zip(problem.factors, parts, strict=True):
         for part in () if isinstance(form, str) else form:
             models = _models(part.root, factor)
@@ -319,8 +364,13 @@ def _model(raw: bytes, size: int, loss: Loss | None) -> Any:
     noise, root = gtsam.noiseModel, np.frombuffer(raw).reshape(size, size)
     if not root.any():
         return None
-    model: Any = noise.Gaussian.SqrtInformation(root, not np.tril(root, -1).any())
+    return _robust(noise.Gaussian.SqrtInformation(root, not np.tril(root, -1).any()), loss)
+
+
+def _robust(model: Any, loss: Loss | None) -> Any:
+    """A noise model under a loss."""
+    from gtsam import noiseModel as noise
+
     if loss is None:
         return model
-    shape = getattr(noise.mEstimator, ESTIMATORS[loss.name]).Create(loss.scale)
-    return noise.Robust.Create(shape, model)
+    return noise.Robust.Create(getattr(noise.mEstimator, ESTIMATORS[loss.name]).Create(loss.scale), model)
