@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats
+from ..arrays import Floats
 from ..errors import InputError, suggestion
 from .graph import ENDS, Edges, Graph, edges_of
 from .values import inverse, malformed, symmetric, to_numbers
@@ -175,33 +175,26 @@ class Grammar:
             raise InputError(file, "0 vertices", "must have a line for every vertex", hint)
         return dimension, rows
 
-    def _implied(self, rows: Mapping[str, _Rows]) -> tuple[list[int], list[str], Bools]:
-        """Line, word and whether it is a pose, of the vertices that edges name; an end of a range is a pose unless
-        another edge says otherwise."""
-        named = dict[tuple[str, str], int]()
-        for kind, given in sorted(rows.items(), key=lambda item: item[0] == "ranges"):
-            roles, start = ENDS[kind], 1 + self.records[given.tag].stamped
-            for line, words in zip(given.lines, given.words, strict=True):
-                for role, word in zip(roles, words[start:], strict=False):
-                    if role != "any" or not {("pose", word), ("point", word)} & named.keys():
-                        named.setdefault(("pose" if role == "any" else role, word), line)
-        order = sorted(named, key=lambda end: (len(end[1]), end[1], end[0]))
-        return (
-            [named[end] for end in order],
-            [word for _, word in order],
-            np.array([kind == "pose" for kind, _ in order]),
-        )
+    def _implied(self, rows: Mapping[str, _Rows], dimension: int) -> tuple[list[int], list[str], dict[str, Any]]:
+        """`_vertices` that edges name, nowhere yet; what only ranges name is a pose."""
+        named = dict[str, tuple[int, bool]]()
+        for kind in [kind for kind in ENDS if kind in rows]:
+            for line, words in zip(rows[kind].lines, rows[kind].words, strict=True):
+                for role, word in zip(ENDS[kind], words[1:], strict=False):
+                    named.setdefault(word, (line, role != "point"))
+        order = sorted(named, key=lambda word: (len(word), word))
+        lines, poses = zip(*(named[word] for word in order), strict=True)
+        is_pose, nowhere = np.array(poses), np.full((len(order), dimension), np.nan)
+        turn = np.full((len(order), 1 if dimension == 2 else 4), np.nan)
+        turn[~is_pose] = 0.0 if dimension == 2 else np.eye(4)[3]
+        return list(lines), order, {"is_pose": is_pose, "position": nowhere, "orientation": turn}
 
     def _vertices(
         self, file: str, rows: Mapping[str, _Rows], dimension: int
     ) -> tuple[list[int], list[str], dict[str, Any]]:
         """Lines, words for and arrays of the poses and points, in the order of the file."""
         if not {"pose", "point"} & set(rows):
-            at, named, poses = self._implied(rows)
-            turned = np.full((len(named), 1 if dimension == 2 else 4), np.nan)
-            turned[~poses] = 0.0 if dimension == 2 else np.eye(4)[3]
-            nowhere = np.full((len(named), dimension), np.nan)
-            return at, named, {"is_pose": poses, "position": nowhere, "orientation": turned}
+            return self._implied(rows, dimension)
         parts = []
         for kind in ("pose", "point"):
             if kind in rows:

@@ -14,8 +14,8 @@ from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, check_limit
 from ..model.problem import Problem
 from .gtsam_factors import estimate, forms, graph_of, values, which_turn
 
-STARTS = 4
-"""Times that the optimiser begins anew where it ended, with damping as at first, while it moves."""
+STARTS = 3
+"""Times that the optimiser begins anew where it ended, with damping as at first, while the nodes move."""
 PRECISE = 1e-15
 """Share of the cost by which a step must lower it to be followed by another; GTSAM's own 1e-5 leaves millimetres."""
 
@@ -33,17 +33,16 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     def solver(problem: Problem, x: Floats) -> SolverResult:
         import gtsam
 
-        posed, keys, parts = which_turn(problem), range(len(problem.names)), forms(problem)
+        posed, parts = which_turn(problem), forms(problem)
         graph, used, custom = graph_of(problem, parts), 0, sum(isinstance(part, str) for part in parts)
-        for start in range(STARTS):
+        for _ in range(STARTS):
             params = gtsam.LevenbergMarquardtParams()
             params.setMaxIterations(max_iterations - used)
             params.setRelativeErrorTol(PRECISE)
             params.setAbsoluteErrorTol(0.0)
-            params.setDiagonalDamping(start > 0)
-            found = gtsam.LevenbergMarquardtOptimizer(graph, values(problem.space, posed, x, keys), params)
+            found = gtsam.LevenbergMarquardtOptimizer(graph, values(problem.space, posed, x), params)
             try:
-                x, before = estimate(problem.space, posed, found.optimize(), keys), x
+                x, before = estimate(problem.space, posed, found.optimize()), x
             except RuntimeError:  # a singular system: `solve` names the nodes that are free
                 break
             used += found.iterations()

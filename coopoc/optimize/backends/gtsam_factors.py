@@ -233,25 +233,15 @@ class Callbacks:
     def __init__(self, problem: Problem, factors: Sequence[Factor]) -> None:
         self._space, self._posed = problem.space, which_turn(problem)
         self._factors = [unchecked(factor, loss=None) for factor in factors]
-        self._raw: list[Any] = [None] * len(self._posed)
-
-    def _node(self, found: Any, i: int) -> tuple[Any, ...]:
-        """The numbers of a node in gtsam.Values, to be compared."""
-        if not self._posed[i]:
-            return tuple((found.atPoint2 if self._space.dimension == 2 else found.atPoint3)(i).tolist())
-        if self._space.dimension == 2:
-            at = found.atPose2(i)
-            return at.x(), at.y(), at.theta()
-        return tuple(found.atPose3(i).matrix().ravel().tolist())
+        self._at: Any = None
 
     def of(self, k: int, row: int, nodes: Sequence[int]) -> Callable[[Any, Any, Any], Any]:
         """The error function of a measurement."""
+        import gtsam
 
         def error(_: Any, found: Any, jacobians: Any) -> Any:
-            if any(self._raw[i] != self._node(found, i) for i in nodes):
-                every = range(len(self._posed))
-                x = estimate(self._space, self._posed, found, every)
-                self._raw = [self._node(found, i) for i in every]
+            if self._at is None or not found.equals(self._at, 0.0):
+                self._at, x = gtsam.Values(found), estimate(self._space, self._posed, found)
                 self._linear = linearise(self._space, self._factors, None, x[None])
                 self._tangent = tangent(self._space, self._posed, x)
             if jacobians is not None:
@@ -268,7 +258,7 @@ def graph_of(problem: Problem, parts: Sequence[Form]) -> Any:
     of the nodes that are fixed, with their indices as keys."""
     import gtsam
 
-    graph, posed, keys = gtsam.NonlinearFactorGraph(), which_turn(problem), range(len(problem.names))
+    graph, posed = gtsam.NonlinearFactorGraph(), which_turn(problem)
     lacking = [factor for factor, form in zip(problem.factors, parts, strict=True) if isinstance(form, str)]
     callbacks = Callbacks(problem, lacking)
     for k, factor in enumerate(lacking):
@@ -284,31 +274,30 @@ def graph_of(problem: Problem, parts: Sequence[Form]) -> Any:
                     nodes = nodes[::-1]  # such as a range from a point to a pose
                 made = getattr(gtsam, part.names[tuple([posed[i] for i in nodes])])
                 if model is not None:
-                    graph.add(made(*(keys[i] for i in nodes), *given, model))
+                    graph.add(made(*nodes, *given, model))
     for i in problem.fixed:
         assert problem.x0 is not None
         name = f"NonlinearEquality{'Pose' if posed[i] else 'Point'}{problem.dimension}"
-        graph.add(getattr(gtsam, name)(keys[i], _node(problem.dimension, problem.x0[i], posed[i])))
+        graph.add(getattr(gtsam, name)(i, _node(problem.dimension, problem.x0[i], posed[i])))
     return graph
 
 
-def values(space: Space, posed: Sequence[bool], x: Floats, keys: Iterable[int]) -> Any:
-    """gtsam.Values of nodes x (n, ambient), which are points or `posed`, under their keys."""
+def values(space: Space, posed: Sequence[bool], x: Floats) -> Any:
+    """gtsam.Values of nodes x (n, ambient), which are points or `posed`, under their indices."""
     import gtsam
 
     found = gtsam.Values()
-    for key, node, turns in zip(keys, x, posed, strict=True):
+    for key, (node, turns) in enumerate(zip(x, posed, strict=True)):
         found.insert(key, _node(space.dimension, node, turns))
     return found
 
 
-def estimate(space: Space, posed: Sequence[bool], found: Any, keys: Sequence[int]) -> Floats:
+def estimate(space: Space, posed: Sequence[bool], found: Any) -> Floats:
     """x (n, ambient) of the nodes in gtsam.Values, which holds no others."""
     from gtsam import utilities
 
-    d, x, rank = space.dimension, np.empty((len(posed), space.ambient)), np.argsort(keys)
-    turns = np.array(posed, dtype=bool)[rank]
-    points, poses = rank[~turns], rank[turns]
+    d, x = space.dimension, np.empty((len(posed), space.ambient))
+    points, poses = np.flatnonzero(~np.array(posed)), np.flatnonzero(posed)
     if len(points):
         x[points] = space.join(getattr(utilities, f"extractPoint{d}")(found))
     if len(poses) and d == 2:

@@ -15,7 +15,7 @@ from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, arrive
 from ..model.factor import Loss, unchecked
 from ..model.problem import Problem
-from .candidates import Marked, reweigh, squares
+from .candidates import Marked, mark, reweigh, squares
 
 ROUNDS = 300
 """About 20 are needed."""
@@ -110,16 +110,13 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
 
     Far from the minimum these losses are flat: every measurement is rejected, and no step is left.
     """
-    began = time.perf_counter()
-    robust = [k for k, f in enumerate(problem.factors) if f.loss is not None and f.loss.redescends]
-    rows = [row for k in robust for row in range(len(problem.factors[k].nodes))]
-    if problem.constraints or not rows:
+    if problem.constraints:
         return problem
-    first, taken = problem.factors[robust[0]].loss, 0
-    assert first is not None
-    which = np.repeat(robust, [len(problem.factors[k].nodes) for k in robust])
-    marked = Marked(which, np.array(rows), np.arange(len(rows)))
-    bound = np.array([getattr(problem.factors[k].loss, "scale", 1.0) ** 2 for k in which.tolist()])
+    began, taken, factors = time.perf_counter(), 0, problem.factors
+    robust = {k: f.loss for k, f in enumerate(factors) if f.loss is not None and f.loss.redescends}
+    bare = problem.replace_unchecked(factors=tuple(unchecked(f, loss=None) for f in factors))
+    marked = mark(bare, list(robust))
+    bound = np.array([robust[k].scale ** 2 for k in marked.factor.tolist()])
 
     def inner(part: Problem) -> Floats:
         nonlocal taken
@@ -127,19 +124,22 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
         taken += end.iterations
         return end.x
 
-    whole, surrogate = reweigh(problem, marked, np.ones(len(rows)), start), SURROGATES[first.name]
-    x = inner(whole)
+    surrogate, weight = SURROGATES[next(iter(robust.values())).name], np.ones(len(bound))
+    x = inner(reweigh(problem, marked, weight, start))
     mu = surrogate.first(float((squares(problem, marked, x) / bound).max()))
-    end = graduate(problem, marked, bound, surrogate, inner, x, np.ones(len(rows)), mu)
-    losses = [None if f.loss is None else Loss("cauchy", f.loss.scale) for f in problem.factors]
-    softer = tuple(unchecked(f, loss=loss) for f, loss in zip(problem.factors, losses, strict=True))
-    soft = inner(problem.replace_unchecked(factors=softer, x0=start))
-    starts = {"graduated": end.x, "x0": start, "cauchy": soft}
+    losses = [None if f.loss is None else Loss("cauchy", f.loss.scale) for f in factors]
+    softer = tuple(unchecked(f, loss=loss) for f, loss in zip(factors, losses, strict=True))
+    starts = {
+        "graduated": graduate(problem, marked, bound, surrogate, inner, x, weight, mu).x,
+        "x0": start,
+        "cauchy": inner(problem.replace_unchecked(factors=softer, x0=start)),
+    }
     ends = {name: inner(problem.replace_unchecked(x0=at)) for name, at in starts.items()}
-    cost = {name: sparse(problem).cost(at) for name, at in ends.items()}
-    best = min(ends, key=lambda name: cost[name] if np.isfinite(cost[name]) else np.inf)
-    search = problem.search
-    name = search.start if best == "x0" and search.start else best
-    search = search._replace(start=name, iterations=search.iterations + taken)
-    search = search._replace(seconds=search.seconds + time.perf_counter() - began)
+    cost = {name: np.nan_to_num(sparse(problem).cost(at), nan=np.inf) for name, at in ends.items()}
+    best, search = min(ends, key=cost.__getitem__), problem.search
+    search = search._replace(
+        start=search.start if best == "x0" and search.start else best,
+        iterations=search.iterations + taken,
+        seconds=search.seconds + time.perf_counter() - began,
+    )
     return problem.replace_unchecked(x0=frozen(ends[best]), search=search)
