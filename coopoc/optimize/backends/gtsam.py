@@ -15,7 +15,7 @@ from ..model.problem import Problem
 from .gtsam_factors import estimate, forms, graph_of, values, which_turn
 
 STARTS = 3
-"""Times that the optimiser begins anew where it ended, with damping as at first, while the nodes move."""
+"""Times that the optimiser begins anew where it ended, with damping as at first, while it ended with more."""
 PRECISE = 1e-15
 """Share of the cost by which a step must lower it to be followed by another; GTSAM's own 1e-5 leaves millimetres."""
 
@@ -26,7 +26,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     Args:
         structure: a problem whose structure counts.
         max_iterations: of GTSAM's linear solves that lowered the cost.
-        tolerance: m or rad, a move of the nodes by a run of the optimiser that is followed by no other.
+        tolerance: m or rad, which GTSAM, that stops by the cost, does not know.
     """
     check_limits(max_iterations, tolerance)
 
@@ -42,11 +42,11 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
             params.setAbsoluteErrorTol(0.0)
             found = gtsam.LevenbergMarquardtOptimizer(graph, values(problem.space, posed, x), params)
             try:
-                x, before = estimate(problem.space, posed, found.optimize()), x
+                x = estimate(problem.space, posed, found.optimize())
             except RuntimeError:  # a singular system: `solve` names the nodes that are free
                 break
             used += found.iterations()
-            if used >= max_iterations or np.abs(x - before).max(initial=0.0) <= tolerance:
+            if used >= max_iterations or found.lambda_() <= params.getlambdaInitial():
                 break
         return SolverResult(x, used, extras={"method": "LevenbergMarquardtOptimizer", "custom_factors": custom})
 
