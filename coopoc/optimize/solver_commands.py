@@ -6,6 +6,7 @@ import json
 import sys
 import time
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -60,10 +61,8 @@ def solve_file(
     graph = load_graph(file, repair)
     problem = (known_inliers_first if outliers else from_graph)(graph, objective, start, seconds)
     say(str(problem))
-    wanted = covariance or None
-    solution = (
-        without_outliers(problem, backend) if outliers else solve(problem, backend, throw=False, covariance=wanted)
-    )
+    solve_one = partial(solve, throw=False, covariance=covariance or None)
+    solution = (without_outliers if outliers else solve_one)(problem, backend)
     summary = described(solution) | {"fixed": [problem.names[k] for k in problem.fixed]}
     summary |= {"misfit": (size := None if outliers else misfit(solution))}
     if output is not None:

@@ -6,8 +6,6 @@ frame with a std each, is a callback from C++ into Python, which takes some twen
 
 from __future__ import annotations
 
-import numpy as np
-
 from ...arrays import Floats
 from ..backend import Backend, Solver, SolverResult
 from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, check_limits
@@ -48,7 +46,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
             used += found.iterations()
             if used >= max_iterations or found.lambda_() <= params.getlambdaInitial():
                 break
-        return SolverResult(x, used, extras={"method": "LevenbergMarquardtOptimizer", "custom_factors": custom})
+        return SolverResult(x, used, extras={"custom_factors": custom})
 
     return solver
 

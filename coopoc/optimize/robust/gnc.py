@@ -88,7 +88,7 @@ def solve_gnc(
     bound, each, extras = bounds(problem, marked, threshold), list[Solution](), dict[str, Any]()
 
     def inner(weighted: Problem) -> Floats:
-        each.append(solve(weighted, backend, throw=False, **options))
+        each.append(solve(weighted, backend, throw=False, covariance=False, **options))
         return each[-1].x
 
     if start == "known":
