@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, refuse
+from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, refuse, texts
 from ..errors import InputError, shown
 from ..short_repr import short_repr
-from .axes import clock, columns, interval, names, texts
+from .fleet import clock, columns, interval, names
 from .links import Links
 from .sensors import Sensors
 from .v2x import V2X
@@ -51,6 +51,10 @@ class Body:
         rate = checked("yaw_rate", self.yaw_rate, "(R, T, N)", velocity.shape[:3])
         allowed = "must be there with a velocity, and only there"
         refuse("yaw_rate", rate, np.isnan(rate) != np.isnan(velocity[..., 0]), allowed, "A vehicle that stands has 0.")
+
+
+MEASURED = "nothing is simulated"
+"""Words in the notes of a recording that holds measurements as they were logged."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -127,6 +131,11 @@ class Recording:
     def dt(self) -> float:
         """Sampling interval, s."""
         return interval(self.t)
+
+    @property
+    def measured(self) -> bool:
+        """Whether the notes say that nothing is simulated."""
+        return any(MEASURED in note for note in self.notes)
 
     @property
     def runs(self) -> int:
