@@ -93,7 +93,6 @@ METHODS: tuple[Any, ...] = (
     co.CentralFilter,
     co.CovarianceIntersection,
     co.GaussianBeliefPropagation,
-    co.ConsensusADMM,
 )
 FLEET = co.load_fleet("town10").between(0, 6).select([0, 1, 2, 3])
 SENSORS, CHANNEL = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=3)
