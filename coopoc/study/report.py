@@ -92,7 +92,7 @@ def _section(folder: Path) -> dict[str, Any]:
         "name": results.study,
         "title": words(results.study),
         "question": results.question,
-        "settings": results.settings,
+        "settings": {key: value for key, value in results.settings.items() if key not in shown["idle"]},
         "environment": results.environment,
         "pending": results.pending,
         "cells": results.frame["cell"].nunique() if len(results.frame) else 0,
@@ -133,7 +133,16 @@ def _figure(folder: Path, view: Mapping[str, Any], study: str) -> dict[str, Any]
         content[form] = path.read_bytes()
     name, drawn = f"{study}-{view['name']}", "svg" if len(content["svg"]) <= _LARGEST_SVG else "png"
     files = [_file(name, form, content[form]) for form in ("pdf", "png")]
-    return {**view, "uri": _file(name, drawn, content[drawn])["uri"], "files": files}
+    return {**view, **_marks(view.get("marks")), "uri": _file(name, drawn, content[drawn])["uri"], "files": files}
+
+
+def _marks(given: Any) -> dict[str, Any]:
+    """Size of a figure and its points, which show their values under a pointer; InputError if they are damaged."""
+    try:
+        width, height = map(float, given["size"])
+        return {"size": (width, height), "marks": [(float(x), float(y), str(text)) for x, y, text in given["points"]]}
+    except (TypeError, KeyError, ValueError) as error:
+        raise InputError("marks", type(given).__name__, f"are damaged ({error})", "Repeat coopoc run.") from None
 
 
 def _file(name: str, form: str, content: bytes) -> dict[str, str]:

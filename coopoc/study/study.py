@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import itertools
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -61,6 +61,7 @@ class Study:
         findings: Results -> key -> sentence for the top of the report, empty where the results lack its numbers. The
             key stays the same when the sentence changes: other code finds it by that.
         recipe: Results -> field -> value of the training, for the report.
+        idle: Results -> names of settings that do nothing in them, which the report leaves out.
         limitations: sentences.
         minutes: expected on one core.
         metrics: metrics with reference values -> "lower" or "higher", which is better, or the best value.
@@ -87,6 +88,7 @@ class Study:
     figures: Mapping[str, Callable[[Results], Plot | None]] = field(default_factory=dict)
     findings: Callable[[Results], Mapping[str, str]] | None = None
     recipe: Callable[[Results], Mapping[str, Any]] | None = None
+    idle: Callable[[Results], Collection[str]] | None = None
     limitations: tuple[str, ...] = ()
     minutes: float | None = None
     metrics: Mapping[str, str | float] = field(default_factory=dict)
