@@ -232,7 +232,7 @@ def idle(results: Results) -> set[str]:
     those that are off."""
     p = results.settings
     off = {n for n, value in p.items() if value in ("", None) or (value == 0 and type(value) in (bool, float))}
-    trained = {"trained", "fitted"} & set(results.frame.get("noise_model", ()))
+    trained = {"trained", "fitted"} & {*results.frame.get("noise_model", ["trained"])}
     drawn = () if measured(str(p["data"])) is None else ("seed", "runs", *SIMULATED)
     return off | set(drawn) | set(() if trained else TRAINING)
 

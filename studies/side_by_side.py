@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from coopoc.study.numbers import present, ran, rms
@@ -106,7 +107,11 @@ STUDY = lineup.study(
         "nis": _table("NIS of the fixes per dimension against K (1 is consistent).", "nis", best=None, intervals=False),
         "bytes": _table("Received per ego [B/s].", "bytes_per_second", best=None, intervals=False, decimals=0),
     },
-    figures={"rt_le": _figure, "errors": paths.errors, "paths": paths.plan},
+    figures={
+        "rt_le": _figure,
+        "errors": partial(paths.views, over_time=True),
+        "paths": partial(paths.views, over_time=False),
+    },
     findings=_findings,
     limitations=(
         "The bound applies to the rms over runs and assumes an ideal channel, whatever the channel of the cells.",

@@ -133,16 +133,7 @@ def _figure(folder: Path, view: Mapping[str, Any], study: str) -> dict[str, Any]
         content[form] = path.read_bytes()
     name, drawn = f"{study}-{view['name']}", "svg" if len(content["svg"]) <= _LARGEST_SVG else "png"
     files = [_file(name, form, content[form]) for form in ("pdf", "png")]
-    return {**view, **_marks(view.get("marks")), "uri": _file(name, drawn, content[drawn])["uri"], "files": files}
-
-
-def _marks(given: Any) -> dict[str, Any]:
-    """Size of a figure and its points, which show their values under a pointer; InputError if they are damaged."""
-    try:
-        width, height = map(float, given["size"])
-        return {"size": (width, height), "marks": [(float(x), float(y), str(text)) for x, y, text in given["points"]]}
-    except (TypeError, KeyError, ValueError) as error:
-        raise InputError("marks", type(given).__name__, f"are damaged ({error})", "Repeat coopoc run.") from None
+    return {**view, "uri": _file(name, drawn, content[drawn])["uri"], "files": files}
 
 
 def _file(name: str, form: str, content: bytes) -> dict[str, str]:

@@ -111,6 +111,10 @@ class Study:
             return tuple(self.grid)
         return tuple(dict.fromkeys(name for params in self.grid for name in params))
 
+    def values(self) -> dict[str, tuple[Scalar, ...]]:
+        """Values of each axis."""
+        return {name: tuple(_values(self.grid, name)) for name in self.axes}
+
     def cells(self) -> list[Cell]:
         """All cells in the order of the grid, each named by the hash of all that changes its numbers."""
         code = code_of(self.cell)
@@ -226,9 +230,13 @@ def _check_used(study: Study, name: str) -> None:
             raise InputError(name, repr(value), "leads to no cell under these settings", f"Write {name}={rest}.")
 
 
+def _values(grid: Any, name: str) -> list[Any]:
+    return list(grid[name]) if isinstance(grid, Mapping) else list(dict.fromkeys(p[name] for p in grid if name in p))
+
+
 def _narrow(grid: Any, name: str, value: Any) -> Any:
     listed = value.split(",") if isinstance(value, str) else value if isinstance(value, list | tuple) else [value]
-    values = list(grid[name]) if isinstance(grid, Mapping) else list(dict.fromkeys(p[name] for p in grid if name in p))
+    values = _values(grid, name)
     wanted = [parse(name, v, next((k for k in values if k is not None), None)) for v in listed]
     if isinstance(grid, Mapping):
         return {**grid, name: tuple(wanted)}
