@@ -24,7 +24,7 @@ from coopoc.learned.pose_noise import LEARNED, PoseTask, fit_pose_noise
 from coopoc.studies import pose_drives as drives
 from coopoc.studies.real import SETTLED, TRAINING, _filter
 
-GATE, BLOCK, LANDMARKS = 5.0, 30.0, (0, 2, 4)
+GATE, LANDMARKS = 5.0, (0, 2, 4)
 
 
 def main() -> None:
@@ -33,6 +33,7 @@ def main() -> None:
     options.add_argument("data")
     options.add_argument("--until", type=float, default=300.0)
     options.add_argument("--evaluations", type=int, default=150)
+    options.add_argument("--block", type=float, default=30.0)
     options.add_argument("--figure", default="")
     given = options.parse_args()
     alone = drives.drive(given.data, given.until, V2X(max_neighbours=0, radius=float("inf")), GATE)
@@ -72,7 +73,7 @@ def main() -> None:
             error = np.stack(
                 [errors(tracks[i % len(tracks)], drive.truth)[0, :, i] for i in range(len(drive.ids))], axis=1
             )
-            cells.append(mean_interval(blocks(error[start:], int(BLOCK / dt))))
+            cells.append(mean_interval(blocks(error[start:], int(given.block / dt))))
             if k:
                 account = of_track(tracks[0], recording, method.message)
                 per_second = account.of("online", "on air", "broadcast") / account.seconds
@@ -92,19 +93,20 @@ def blocks(error: Floats, size: int) -> Floats:
 
 def draw(shown: list[tuple[str, float, list[Any]]], file: str) -> None:
     """RT-LE against bytes per robot, a panel per number of landmarks; no bytes stand at 1."""
+    from matplotlib import colormaps
     from matplotlib import pyplot as plt
 
-    figure, axes = plt.subplots(1, len(LANDMARKS), figsize=(9.0, 3.2), sharex=True, layout="constrained")
+    figure, axes = plt.subplots(1, len(LANDMARKS), figsize=(9.0, 3.4), sharex=True, sharey=True, layout="constrained")
     for column, (axis, n) in enumerate(zip(axes, LANDMARKS, strict=True)):
-        for label, sent, cells in shown:
+        for number, (label, sent, cells) in enumerate(shown):
             one, online = cells[column], label.startswith("online")
             bars = [[one.mean - one.low], [one.high - one.mean]]
-            axis.errorbar(
-                max(sent, 1.0), one.mean, bars, fmt="s" if online else "o", color="#0072B2" if online else "#D55E00"
-            )
-            axis.annotate(label.replace("online, ", "").replace("trained ", ""), (max(sent, 1.0), one.mean), fontsize=7)
+            beside = 1.15 ** (number - 4) if online else 1.4 if "alone" in label else 1.0  # equal bytes, side by side
+            place, color = max(sent, 1.0) * beside, colormaps["tab10"](number)
+            axis.errorbar(place, one.mean, bars, fmt="s" if online else "o", color=color, label=label)
         axis.set(xscale="log", yscale="log", title=f"{n} landmarks", xlabel="Bytes sent per robot")
     axes[0].set_ylabel("RT-LE [m]")
+    figure.legend(*axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=4, fontsize=8)
     figure.savefig(file, dpi=120)
 
 
