@@ -9,13 +9,13 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopoc.arrays import Bools, Floats
+from coopoc.arrays import Bools, Floats, named, number
 from coopoc.errors import InputError, suggestion, unknown
 from coopoc.formats.values import LARGEST
 
@@ -120,6 +120,18 @@ def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
         return np.asarray(given.dt.total_seconds(), dtype=float)
     utc = pd.to_datetime(given, utc=True)
     return np.asarray(utc.dt.as_unit("us").astype("int64").to_numpy() / 1e6, dtype=float)  # in ns years end at 2262
+
+
+def factors(given: Mapping[str, float] | None, names: Collection[str], field: str = "scale") -> dict[str, float]:
+    """Numbers by name; InputError for a name that is none of `names`, and for what is no number but 0."""
+    made = {}
+    for name, value in named(field, given or {}, f"Give {field}={{name: number}}.").items():
+        if name not in names:
+            raise unknown(field, name, names)
+        made[name] = float(number(f"{field} of {name}", value, -LARGEST, LARGEST, allowed="finite and not 0"))
+        if not made[name]:
+            raise InputError(f"{field} of {name}", value, "must not be 0", "Leave it out.")
+    return made
 
 
 def words(frame: pd.DataFrame, column: str, file: str) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -46,7 +46,14 @@ def study(name: str, question: str, settings: Mapping[str, Any], scored: bool = 
         options: other fields of Study.
     """
     settings = {**settings, "metric": ""} if scored else settings
-    usual = {"settings": settings, "cell": cell, "key": key, "prepare": weights.prepare, "recipe": weights.described}
+    usual = {
+        "settings": settings,
+        "cell": cell,
+        "tracks": None if "cell" in options else tracks,
+        "key": key,
+        "prepare": weights.prepare,
+        "recipe": weights.described,
+    }
     return Study(name, question, **{**usual, "reference": reference(name), **options})
 
 
@@ -144,10 +151,12 @@ def rows(
     recording = measured or scene.recording(p)
     who, drive, metric = scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"]), str(p.get("metric", ""))
     table: list[Row] = []
+    strange = not made and p["method"] not in METHODS and not weights.is_trained(p["method"])
     for seed, method in made or methods(p, recording):
         score = scored if complete(recording, who, drive) else scored_where_present
         columns = score(method, recording, who, drive, quantiles, metric)
-        table += rows_of(columns, who, **({} if seed is None else {"train_seed": seed}))
+        more = ({} if seed is None else {"train_seed": seed}) | ({"label": method.name} if strange else {})
+        table += rows_of(columns, who, **more)
     return table
 
 
@@ -172,6 +181,18 @@ def bound_rows(p: Params) -> list[Row]:
         sizes = {"bytes_per_second": received, "payload_bytes_per_second": received}
         rows_of_egos.append({"run": 0, "ego": ego, "rt_le_m": level, "neighbours_mean": near, **sizes})
     return rows_of_egos
+
+
+def tracks(p: Params) -> Iterator[tuple[str, Floats, Floats, Floats | None]]:
+    """Name, times s, positions m and headings rad of each ego's path in each run, as the cell's method estimates it."""
+    recording = scene.recording(p)
+    for seed, method in methods(p, recording) if p["method"] != "bound" else ():
+        for ego in scene.egos(p["data"], str(p["egos"])):
+            found = [method(recording.between(*cut), [ego]) for cut in recording.stretches(ego)]
+            t = np.concatenate([track.t for track in found])
+            for run in range(recording.runs):
+                name = "-".join(filter(None, (f"seed{seed}" if seed is not None else "", ego, f"run{run}")))
+                yield name, t, np.concatenate([track.x[run, :, 0] for track in found]), None
 
 
 RMS, MAXIMA, SUMS = ("rt_le_m", "neighbour_rt_le_m", "innovation_m"), ("max_error_m",), ("fixes", "seconds")

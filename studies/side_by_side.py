@@ -79,7 +79,10 @@ def _findings(results: Results) -> dict[str, str]:
         if ranked:
             value, (method, model) = ranked[0]
             gap = f", {value / bound:.2f} times the bound" if bound else ""
-            texts[f"K = {k}"] = f"K = {k}: {look(method).label} ({model}) has the lowest rms, {value:.3g} m{gap}."
+            who = f"{look(method).label} ({model}) has the lowest rms"
+            if not k:
+                who = "there is no neighbour, and the lowest rms is that of a vehicle alone"
+            texts[f"K = {k}"] = f"K = {k}: {who}, {value:.3g} m{gap}."
     return texts
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -58,9 +59,36 @@ def table(
         if kept is None:
             return None
         shown = {"decimals": scene.decimals(results.settings), **options}
-        return pivot(results, rows, columns, value, kept, scene.caption(results, *texts), **shown)
+        made = pivot(results, rows, columns, value, kept, scene.caption(results, *texts), **shown)
+        return replace(made, notes=(*made.notes, *unused(results)))
 
     return view
+
+
+ALIKE = 1e-3
+"""m, difference of errors that is none."""
+
+
+def unused(results: Results) -> tuple[str, ...]:
+    """A sentence for each method and K whose errors are those of a vehicle alone, in every run and for every ego."""
+    rows = results.frame
+    value = next((name for name in ("rt_le_m", "innovation_m") if name in rows), "")
+    if not {"method", "max_neighbours", "sent_bytes_per_second", value} <= set(rows):
+        return ()
+    keys = [name for name in (*results.axes, "ego", "run", "train_seed") if name in rows]
+    keys, texts = [name for name in keys if name not in ("method", "max_neighbours")], []
+    sends = rows[(rows["max_neighbours"] > 0) & (rows["sent_bytes_per_second"] > 0)]
+    for (method, k), part in sends.groupby(["method", "max_neighbours"], sort=False):
+        solo = rows[((rows["method"] == "kalman") & (rows["max_neighbours"] == k))]
+        own = rows[(rows["method"] == method) & (rows["max_neighbours"] == 0)]
+        gaps = [part.merge(each, on=keys)[[f"{value}_x", f"{value}_y"]].diff(axis=1) for each in (solo, own)]
+        if any(len(gap) >= len(part) and gap.iloc[:, 1].abs().max() < ALIKE for gap in gaps):
+            why = "what was measured lacks what it takes, such as an azimuth"
+            if not part["bytes_per_second"].any():
+                why = "no message arrived" if part["neighbours_mean"].any() else "there was none"
+            text = f"{look(str(method)).label}, K = {k}: equal to solo within {ALIKE:g} m: no neighbour's measurement "
+            texts.append(f"{text}was used, because {why}.")
+    return tuple(texts)
 
 
 def selections(

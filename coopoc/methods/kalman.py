@@ -185,7 +185,9 @@ def solo_track(
     """Track of a solo filter with the variances p (R, T, E, 3) m^2; it receives and sends nothing."""
     cov, none = np.zeros((*p.shape, 3)), np.zeros((recording.runs, len(columns)))
     np.einsum("...ii->...i", cov)[:] = p
-    return Track(recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, notes=notes)
+    return Track(
+        recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, notes=notes, ids=recording.ids
+    )
 
 
 def solo_filter(

@@ -151,4 +151,4 @@ def solo_track_of(solo: Solo[State], recording: Recording, egos: Sequence[int | 
     claims = [covariance for _, covariance in estimates if covariance is not None]
     none = np.zeros((recording.runs, len(columns)))
     cov = np.stack(claims, axis=1) if claims else None
-    return Track(recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began)
+    return Track(recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, ids=recording.ids)

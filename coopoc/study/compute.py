@@ -96,9 +96,21 @@ def attempt(function: Function, cell: Cell) -> Outcome:
         with threadpool_limits(limits=1):
             rows = _checked(function(cell.given), cell)
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}"
+        reason = f"{type(error).__name__}: {error}{_place(error)}"
         return Outcome(cell, None, reason, traceback.format_exc(), time.perf_counter() - start)
     return Outcome(cell, rows, "", "", time.perf_counter() - start)
+
+
+def _place(error: BaseException) -> str:
+    """File, line and function in which code from elsewhere failed; nothing for an error of ours."""
+    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
+    names = [frame.f_globals.get("__name__", "") for frame in frames]
+    where = [k for k, name in enumerate(names) if not name.startswith(("coopoc.", "contextlib"))]
+    if not where:
+        return ""
+    file = frames[where[0]].f_code.co_filename
+    own = [each for each in traceback.extract_tb(error.__traceback__) if each.filename == file][-1]
+    return f" ({os.path.basename(file)}, line {own.lineno}, in {own.name})"
 
 
 def compute(function: Function, cells: Sequence[Cell], jobs: int) -> Generator[Outcome]:

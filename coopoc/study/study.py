@@ -5,12 +5,13 @@ from __future__ import annotations
 import inspect
 import itertools
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from ..arrays import Floats
 from ..errors import InputError, unknown
 from ..file_names import file_name
 from ..one_file import file_digest, from_file, in_file
@@ -66,6 +67,8 @@ class Study:
         metrics: metrics with reference values -> "lower" or "higher", which is better, or the best value.
         reference: file of the reference values, see `coopoc.study.reference`; it may be absent.
 
+        tracks: parameters -> name, t (T,) s, position (T, 3) m and heading (T,) rad or None of each estimated path.
+
     Raises:
         InputError: an empty grid, a cell twice, a parameter that is no scalar, a name that is both axis and setting, a
             name of the study or of a view that is no file name, or a view that cannot be called with results alone.
@@ -91,6 +94,7 @@ class Study:
     minutes: float | None = None
     metrics: Mapping[str, str | float] = field(default_factory=dict)
     reference: str | Path | None = None
+    tracks: Callable[[Params], Iterable[tuple[str, Floats, Floats, Floats | None]]] | None = None
 
     def __post_init__(self) -> None:
         file_name("study", self.name, "Rename the study: its folder has this name.")

@@ -8,8 +8,23 @@ from collections.abc import Iterable, Sequence
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked, listed
+from ..arrays import Floats, checked, listed, refuse
 from ..errors import InputError, shown, unknown
+
+FARTHEST, FASTEST = 1e8, 1e4
+"""m and m/s: what lies beyond was not measured on Earth, and its square leaves no digits to what stands beside it."""
+
+
+def plausible(field: str, values: Floats, limit: float) -> None:
+    """InputError for the first number beyond the limit; NaN stands for what is missing.
+
+    >>> plausible("velocity", np.array([3.0, -1e9]), FASTEST)
+    Traceback (most recent call last):
+    coopoc.errors.InputError: velocity[1] = -1000000000.0: must be within +-10000 in SI units. Is it in another unit?
+    """
+    if values.size and max(np.fmax.reduce(values, axis=None), -np.fmin.reduce(values, axis=None)) > limit:
+        wrong = np.abs(values) > limit
+        refuse(field, values, wrong, f"must be within +-{limit:g} in SI units", "Is it in another unit?")
 
 
 def texts(field: str, values: object) -> tuple[str, ...]:
@@ -51,6 +66,9 @@ def names(ids: Iterable[object]) -> tuple[str, ...]:
     found = tuple(str(i) for i in given)
     if not found:
         raise InputError("ids", "no vehicle", "must be at least one", "Check that the file holds a drive.")
+    for name in found:
+        if not name.isprintable():
+            raise InputError("ids", shown(name), "must be printable", "Remove line ends and control characters.")
     if len(set(found)) != len(found):
         twice = sorted(i for i, count in Counter(found).items() if count > 1)
         raise InputError("ids", twice[:3], "must be unique", "Rename the vehicles that share an id.")

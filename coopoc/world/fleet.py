@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, checked, number, refuse
 from ..errors import InputError
-from .axes import check_texts, clock, column, columns, interval, names
+from .axes import FARTHEST, FASTEST, check_texts, clock, column, columns, interval, names, plausible
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,6 +58,8 @@ class Fleet:
             refuse("heading", heading, np.isinf(heading), "must be finite, or NaN where unknown", "Replace it by NaN.")
             object.__setattr__(self, "heading", heading)
         _check_gaps(self)
+        plausible("position", self.position, FARTHEST)
+        plausible("velocity", self.velocity, FASTEST)
 
     @property
     def dt(self) -> float:
@@ -76,6 +78,19 @@ class Fleet:
         for array in (self.t, self.position, self.velocity, *(() if self.heading is None else (self.heading,))):
             sha.update(np.ascontiguousarray(array).tobytes())
         return sha.hexdigest()
+
+    def require(self, ids: Sequence[str], t: Floats) -> None:
+        """InputError unless the fleet has these vehicles in this order, and its steps are at times t (T,) s.
+
+        >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+        >>> fleet.require(("b",), fleet.t)
+        Traceback (most recent call last):
+        coopoc.errors.InputError: fleet = Fleet(unnamed: 1 vehicles x 2 steps, dt 0.1 s): ids and times differ from \
+those that were recorded. Give the fleet that was observed, its vehicles in the same order.
+        """
+        if tuple(ids) != self.ids or len(t) != len(self.t) or np.abs(t - self.t).max() > 0.01 * self.dt:
+            hint = "Give the fleet that was observed, its vehicles in the same order."
+            raise InputError("fleet", repr(self), "ids and times differ from those that were recorded", hint)
 
     def index(self, vehicle: str | int) -> int:
         """Column of a vehicle given by its id or its index; InputError if there is none."""

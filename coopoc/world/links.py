@@ -103,6 +103,21 @@ def to_vector(relative: Floats) -> Floats:
     return np.stack([d * np.sin(inc) * np.cos(az), d * np.sin(inc) * np.sin(az), d * np.cos(inc)], axis=-1)
 
 
+STEEP = 0.2
+"""rad from the vertical within which errors of the positions turn an azimuth as they like."""
+
+
+def told(relative: Floats) -> Floats:
+    """Measurements (..., 3) without the azimuths (NaN) of what is straight above or below: their variance grows without
+    bound as the horizontal distance vanishes.
+
+    >>> told(np.array([9.0, 0.5, 0.1])).tolist()
+    [9.0, nan, 0.1]
+    """
+    steep = np.abs(np.abs(relative[..., 2:]) - np.pi / 2) > np.pi / 2 - STEEP
+    return np.where(steep & (np.arange(3) == 1), np.nan, relative) if steep.any() else relative
+
+
 def vector_cov(relative: Floats, std: Floats, min_range: float = 0.0) -> Floats:
     """Covariance J diag(std^2) J^T of `to_vector(relative)`, J its Jacobian: (..., 3, 3) m^2.
 

@@ -12,8 +12,8 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, refuse
 from ..errors import InputError, shown
 from ..short_repr import short_repr
-from .axes import clock, columns, interval, names, texts
-from .links import Links
+from .axes import FARTHEST, FASTEST, clock, columns, interval, names, plausible, texts
+from .links import Links, told
 from .sensors import Sensors
 from .v2x import V2X
 
@@ -194,6 +194,11 @@ class Recording:
         return tuple((int(a), int(b)) for a, b, any_fix in firsts if any_fix and b - a >= shortest)
 
     @cached_property
+    def told(self) -> Floats:
+        """(R, L, 3) `relative` without azimuths of what is straight above or below, as estimators take it."""
+        return told(self.relative)
+
+    @cached_property
     def complete(self) -> bool:
         """Whether every vehicle has a fix wherever it is."""
         return bool((np.isfinite(self.gnss) | np.isnan(self.velocity)).all())
@@ -292,7 +297,12 @@ def check_measurements(gnss: Floats, velocity: Floats, relative: Floats) -> None
     """
     if not len(gnss):
         raise InputError("gnss", "no run", "must have at least one", "Use observe(..., runs=1).")
-    for name, values in (("gnss", gnss), ("velocity", velocity), ("relative", relative)):
+    for name, values, limit in (
+        ("gnss", gnss, FARTHEST),
+        ("velocity", velocity, FASTEST),
+        ("relative", relative, FARTHEST),
+    ):
+        plausible(name, values, limit)
         if _finite(values):
             continue
         refuse(name, values, np.isinf(values), "must be finite, or NaN where missing", "Replace it by NaN.")

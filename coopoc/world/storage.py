@@ -54,9 +54,8 @@ def save_recording(recording: Recording, path: str | Path, truth: Fleet | None =
     Raises:
         InputError: a truth of other vehicles or steps.
     """
-    if truth is not None and (truth.ids != recording.ids or len(truth.t) != len(recording.t)):
-        hint = "Give the fleet on the steps of the recording."
-        raise InputError("truth", repr(truth), "must hold the vehicles and steps of the recording", hint)
+    if truth is not None:
+        truth.require(recording.ids, recording.t)
     settings = {"sensors": asdict(recording.sensors), "v2x": asdict(recording.v2x)}
     words = {"ids": recording.ids, "notes": recording.notes, **settings}
     arrays: dict[str, Any] = {name: np.asarray(getattr(recording, name)) for name in ARRAYS}

@@ -254,7 +254,9 @@ class NoiseFilter:
             x, p = (runs(a, recording.runs) for a in filtered(gnss, velocity, noise, recording.dt, exact))
         silent = np.zeros((recording.runs, len(columns)))
         seconds = time.perf_counter() - began
-        return Track(recording.t, tuple(columns), x, p[..., None] * np.eye(3), silent, silent, seconds)
+        return Track(
+            recording.t, tuple(columns), x, p[..., None] * np.eye(3), silent, silent, seconds, ids=recording.ids
+        )
 
     def _start(self, fixes: Tensor, count: int) -> Tensor:
         shape = (count, fixes.shape[1] // count, 3)

@@ -87,7 +87,9 @@ class OptimisedKF:
         x, variance, _ = solo_filter(recording, columns, self._motion(0.0), fixes, self.x0)
         silent = np.zeros((recording.runs, len(columns)))
         seconds = time.perf_counter() - began
-        return Track(recording.t, tuple(columns), x, variance[..., None] * np.eye(3), silent, silent, seconds)
+        return Track(
+            recording.t, tuple(columns), x, variance[..., None] * np.eye(3), silent, silent, seconds, ids=recording.ids
+        )
 
     def _motion(self, interval: float) -> MotionNoise:
         base, ratio = np.array(self.process_std, dtype=float), np.array(self.velocity_ratio, dtype=float)
