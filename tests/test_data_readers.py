@@ -14,7 +14,6 @@ from coopoc.data.assemble import interpolate
 from coopoc.data.fleet_files import read_tum, write_table
 from coopoc.data.registry import convert, load_fleet
 from coopoc.errors import InputError
-from coopoc.world.fleet import Fleet
 
 GOOD = "id,t,x,y,z\na,0.0,0,0,0\nb,0.0,5,0,0\na,0.1,1,0,0\nb,0.1,5,1,0\na,0.2,2,0,0\nb,0.2,5,2,0\n"
 
