@@ -123,15 +123,13 @@ def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
 
 
 def factors(given: Mapping[str, float] | None, names: Collection[str], field: str = "scale") -> dict[str, float]:
-    """Numbers by name; InputError for a name that is none of `names`, and for what is no number but 0."""
-    made = {}
+    """Numbers by name; InputError for a name that is none of `names`, and for 0."""
     for name, value in named(field, given or {}, f"Give {field}={{name: number}}.").items():
         if name not in names:
             raise unknown(field, name, names)
-        made[name] = float(number(f"{field} of {name}", value, -LARGEST, LARGEST, allowed="finite and not 0"))
-        if not made[name]:
+        if not number(f"{field} of {name}", value, -LARGEST, LARGEST):
             raise InputError(f"{field} of {name}", value, "must not be 0", "Leave it out.")
-    return made
+    return dict(given or {})
 
 
 def words(frame: pd.DataFrame, column: str, file: str) -> list[str]:

@@ -17,7 +17,7 @@ from coopoc.errors import InputError
 from coopoc.escapes import picture
 from coopoc.formats.trajectories import read_kitti, read_tum
 from coopoc.formats.values import read_words, to_rotation
-from coopoc.world.pictures import COLORS, INK
+from coopoc.world.pictures import COLORS, INK, axes, finish
 
 from .cells import TABLES, named_columns, numeric, read_frame, seconds, words
 from .source import split
@@ -113,7 +113,7 @@ def score(
         offset: time in s that is added to the estimates' stamps.
         delta: distance between the poses of the relative error, in --unit.
         unit: unit of delta, steps or metres.
-        plot: picture of the paths and of the errors over time.
+        plot: picture of the paths.
         output: file for the scores as JSON.
     """
     from coopoc.evaluate.trajectory_scores import compared, scores
@@ -141,20 +141,12 @@ def score(
 
 
 def draw(pairs: Mapping[str, tuple[Path, Path, Path]], path: File) -> None:
-    """Picture of aligned estimates and truths in the plane, and of the errors over time."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(11, 4.5), layout="constrained")
-    places, errors = figure.subplots(1, 2)
+    """Picture of aligned estimates and, dashed, of their truths in the plane."""
+    ax = axes(None)
     for k, (name, (_, estimate, truth)) in enumerate(pairs.items()):
-        color = COLORS[k % len(COLORS)]
-        places.plot(*truth.position[:, :2].T, color=INK, lw=1, ls="--", zorder=3)
-        places.plot(*estimate.position[:, :2].T, color=color, label=picture(name))
-        errors.plot(estimate.t, np.linalg.norm(estimate.position - truth.position, axis=1), color=color)
-    places.set(xlabel="x [m]", ylabel="y [m]", aspect="equal", title="Paths, the truth dashed")
-    places.legend()
-    errors.set(xlabel="t [s]", ylabel="error [m]")
-    figure.savefig(path)
+        ax.plot(*truth.position[:, :2].T, color=INK, lw=1, ls="--")
+        ax.plot(*estimate.position[:, :2].T, color=COLORS[k % len(COLORS)], label=picture(name))
+    finish(ax).get_figure().savefig(path)
 
 
 def _plain(value: Any) -> Any:

@@ -193,7 +193,6 @@ def test_functions_refuse_arguments_of_the_wrong_kind() -> None:
     swept(RECORDING.between, {"start": 0, "stop": 3})
     swept(RECORDING.neighbours, {"ego": 0})
     swept(RECORDING.links.of, {"observer": 0})
-    swept(co.channel_load, {"position": np.zeros((2, 3)), "size": [100.0, 100.0], "rate": [1.0, 1.0]})
 
 
 PROBLEM = co.Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)

@@ -11,6 +11,7 @@ import traceback
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, TypeAlias
 
 import pyarrow as pa
@@ -102,15 +103,12 @@ def attempt(function: Function, cell: Cell) -> Outcome:
 
 
 def _place(error: BaseException) -> str:
-    """File, line and function in which code from elsewhere failed; nothing for an error of ours."""
-    frames = [frame for frame, _ in traceback.walk_tb(error.__traceback__)]
-    names = [frame.f_globals.get("__name__", "") for frame in frames]
-    where = [k for k, name in enumerate(names) if not name.startswith(("coopoc.", "contextlib"))]
-    if not where:
-        return ""
-    file = frames[where[0]].f_code.co_filename
-    own = [each for each in traceback.extract_tb(error.__traceback__) if each.filename == file][-1]
-    return f" ({os.path.basename(file)}, line {own.lineno}, in {own.name})"
+    """File, line and function of one's own in which it was raised; nothing for an error of ours."""
+    ours = str(Path(__file__).parents[2])
+    for frame in reversed(traceback.extract_tb(error.__traceback__)):
+        if "site-packages" not in frame.filename and not frame.filename.startswith(ours):
+            return f" ({Path(frame.filename).name}, line {frame.lineno}, in {frame.name})"
+    return ""
 
 
 def compute(function: Function, cells: Sequence[Cell], jobs: int) -> Generator[Outcome]:

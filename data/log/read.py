@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -88,7 +88,7 @@ def is_log(path: Path, columns: Mapping[str, str] | None = None) -> bool:
     (True, True)
     """
     if path.is_dir():
-        return _is_bag(path) or any(file.suffix.lower() in READERS for file in path.iterdir()) or bool(_topics(path))
+        return _is_bag(path) or any(True for _ in _files(path))
     ending = path.suffix.lower()
     return is_log_table(path, columns) if ending in TABLES else ending in READERS
 
@@ -244,8 +244,7 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
     else:
         if true_files and not true_files[0].is_file():
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
-        files = sorted(f for f in path.iterdir() if f.suffix.lower() in READERS) if path.is_dir() else [path]
-        files += _topics(path)
+        files = sorted(_files(path)) if path.is_dir() else [path]
         true_files = true_files or [f for f in files if f.stem.lower() == TRUTH and f != path][:1]
         files = [f for f in files if f not in true_files and (f.stem.lower() != TRUTH or f == path)]
         if not files:
@@ -270,9 +269,11 @@ def _read_file(file: Path, summary: Summary, **options: Any) -> Rows:
     return READERS.get(file.suffix.lower(), read_log_table)(file, summary, **options)
 
 
-def _topics(path: Path) -> list[Path]:
-    """Tables of topics in the folders of their namespaces."""
-    return sorted(file for file in path.glob("*/**/*.csv") if STAMP in headers(file)) if path.is_dir() else []
+def _files(path: Path) -> Iterator[Path]:
+    """Files of a folder, and topics that were written as tables in the folders of their namespaces."""
+    for file in path.rglob("*"):
+        if file.suffix.lower() in READERS and (file.parent == path or STAMP in headers(file)):
+            yield file
 
 
 def _check_headers(columns: Mapping[str, str], files: Sequence[Path], name: str) -> None:
