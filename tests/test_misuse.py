@@ -179,7 +179,7 @@ def test_functions_refuse_arguments_of_the_wrong_kind() -> None:
     }
     swept(co.RelativeMeasurement, relative)
     swept(co.Message, {"name": "m", "numbers": 6})
-    swept(co.NoiseModel, {"name": "n", "sensors": SENSORS, "gnss_std": (1, 1, 1), "velocity": None})
+    swept(co.NoiseModel, {"name": "n", "sensors": SENSORS, "gnss_std": (1, 1, 1), "fleet": None})
     for metric in (co.rt_le, co.max_error, co.nees):
         swept(metric, {"track": TRACK, "fleet": FLEET})
     swept(co.posterior_bound, {"fleet": FLEET, "sensors": SENSORS, "ego": 0, "smoothing": False})

@@ -104,7 +104,7 @@ def attempt(function: Function, cell: Cell) -> Outcome:
 
 def _place(error: BaseException) -> str:
     """File, line and function of one's own in which it was raised; nothing for an error of ours."""
-    ours = str(Path(__file__).parents[2])
+    ours = tuple(str(Path(__file__).parents[2] / name) for name in ("coopoc", "learned", "studies", "data"))
     for frame in reversed(traceback.extract_tb(error.__traceback__)):
         if "site-packages" not in frame.filename and not frame.filename.startswith(ours):
             return f" ({Path(frame.filename).name}, line {frame.lineno}, in {frame.name})"

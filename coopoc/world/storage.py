@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import tokenize
 import zipfile
 import zlib
 from dataclasses import asdict
@@ -11,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import format as npy
 
 from ..arrays import AnyArray
 from ..errors import InputError
@@ -25,7 +27,7 @@ from .v2x import V2X
 ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers", "landmarks")
 LINKS = ("step", "observer", "neighbour")
 BODY = ("yaw_rate", "heading")
-LARGEST = 2**32
+LARGEST = 2**31
 """Bytes of one unpacked file."""
 DAMAGES = (
     OSError,
@@ -39,6 +41,8 @@ DAMAGES = (
     NotImplementedError,
     RuntimeError,
     MemoryError,
+    SyntaxError,
+    tokenize.TokenError,
 )
 """What zipfile, zlib and NumPy raise on a damaged file."""
 
@@ -87,9 +91,29 @@ def unpacked(path: Path) -> dict[str, AnyArray]:
     """
     with zipfile.ZipFile(path) as packed:
         if sum(part.file_size for part in packed.infolist()) > LARGEST:
-            raise InputError(path.name, "more than 4 GB unpacked", "must be smaller", "Save fewer runs.")
+            raise InputError(path.name, "more than 2 GB unpacked", "must be smaller", "Save fewer runs.")
+        _check_shapes(packed)
     with np.load(path, allow_pickle=False) as stored:
         return dict(stored)
+
+
+def _check_shapes(packed: zipfile.ZipFile) -> None:
+    """ValueError for arrays that do not fit each other, by their headers: what is no recording fills no memory."""
+    shapes = {}
+    for name in packed.namelist():
+        with packed.open(name) as part:
+            major, _ = npy.read_magic(part)
+            read = npy.read_array_header_1_0 if major == 1 else npy.read_array_header_2_0
+            shapes[name.removesuffix(".npy")] = read(part)[0]
+    gnss, links = shapes["gnss"], shapes["links_step"]
+    runs, steps, vehicles, _ = gnss
+    every = dict.fromkeys(("velocity", "gnss"), gnss) | dict.fromkeys(BODY, gnss[:3])
+    every |= {"relative": (runs, *links, 3), "arrival": (runs, *links), "t": (steps,), "broadcasts": (steps, vehicles)}
+    every |= {f"links_{name}": links for name in LINKS} | {"coopoc_recording": (), "truth_heading": gnss[1:3]}
+    every |= dict.fromkeys(("truth_position", "truth_velocity"), gnss[1:])
+    for name, shape in shapes.items():
+        if shape != every.get(name, shape) or (name not in every and not (len(shape) == 1 and shape[0] <= vehicles)):
+            raise ValueError(f"{name} has shape {shape}")
 
 
 def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
