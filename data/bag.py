@@ -25,15 +25,15 @@ WHEELS = "yaw_rate of odometry"
 STAMP = "header.stamp.sec"
 """Column of a topic that was written as a table."""
 FIELDS = {
-    "latitude": ("latitude", "position_covariance", 4),
-    "longitude": ("longitude", "position_covariance", 0),
-    "altitude": ("height", "position_covariance", 8),
-    "twist.twist.linear.x": ("speed", "twist.covariance", 0),
-    "twist.twist.angular.z": ("yaw_rate", "twist.covariance", 35),
-    "angular_velocity.z": ("yaw_rate", "angular_velocity_covariance", 8),
-    **{f"pose.position.{axis}": (axis, "", 0) for axis in "xyz"},
+    "latitude": "latitude",
+    "longitude": "longitude",
+    "altitude": "height",
+    "twist.twist.linear.x": "speed",
+    "twist.twist.angular.z": "yaw_rate",
+    "angular_velocity.z": "yaw_rate",
+    **{f"pose.position.{axis}": axis for axis in "xyz"},
 }
-"""Column of a topic -> kind, and where the variance of it stands: NAME_k or NAME[k]."""
+"""Column of a topic -> kind; deviations are given with std=."""
 Number = tuple[str, float, float]
 """Kind, value and standard deviation."""
 
@@ -156,12 +156,7 @@ def of_topic(frame: pd.DataFrame, file: str, summary: Summary, true: bool) -> pd
     made = {"t": t}
     if true:
         frame = frame.rename(columns=lambda name: name.replace("pose.pose.", "pose."))
-    for name, (kind, covariance, k) in FIELDS.items():
-        if name in frame:
-            made[kind] = numeric(frame, name, file)
-            for variance in {f"{covariance}_{k}", f"{covariance}[{k}]"} & {*frame}:
-                given = numeric(frame, variance, file)
-                made[f"{kind}_std"] = np.sqrt(np.where(given > 0, given, np.nan))
+    made |= {kind: numeric(frame, name, file) for name, kind in FIELDS.items() if name in frame}
     turn = "pose.orientation" if true else "orientation"
     if {f"{turn}.{axis}" for axis in "xyzw"} <= {*frame}:
         made["heading"] = _yaw(*(numeric(frame, f"{turn}.{axis}", file) for axis in "xyzw"))

@@ -183,16 +183,16 @@ def bound_rows(p: Params) -> list[Row]:
     return rows_of_egos
 
 
-def tracks(p: Params) -> Iterator[tuple[str, Floats, Floats, Floats | None]]:
-    """Name, times s, positions m and headings rad of each ego's path in each run, as the cell's method estimates it."""
+def tracks(p: Params) -> Iterator[tuple[str, Floats, Floats]]:
+    """Name, times s and positions m of each ego's path in each run, as the cell's method estimates it."""
     recording = scene.recording(p)
     for seed, method in methods(p, recording) if p["method"] != "bound" else ():
         for ego in scene.egos(p["data"], str(p["egos"])):
             found = [method(recording.between(*cut), [ego]) for cut in recording.stretches(ego)]
             t = np.concatenate([track.t for track in found])
             for run in range(recording.runs):
-                name = "-".join(filter(None, (f"seed{seed}" if seed is not None else "", ego, f"run{run}")))
-                yield name, t, np.concatenate([track.x[run, :, 0] for track in found]), None
+                name = f"{ego}-run{run}" + (f"-seed{seed}" if seed is not None else "")
+                yield name, t, np.concatenate([track.x[run, :, 0] for track in found])
 
 
 RMS, MAXIMA, SUMS = ("rt_le_m", "neighbour_rt_le_m", "innovation_m"), ("max_error_m",), ("fixes", "seconds")

@@ -67,7 +67,7 @@ class Study:
         metrics: metrics with reference values -> "lower" or "higher", which is better, or the best value.
         reference: file of the reference values, see `coopoc.study.reference`; it may be absent.
 
-        tracks: parameters -> name, t (T,) s, position (T, 3) m and heading (T,) rad or None of each estimated path.
+        tracks: parameters -> name, t (T,) s and position (T, 3) m of each estimated path.
 
     Raises:
         InputError: an empty grid, a cell twice, a parameter that is no scalar, a name that is both axis and setting, a
@@ -94,7 +94,7 @@ class Study:
     minutes: float | None = None
     metrics: Mapping[str, str | float] = field(default_factory=dict)
     reference: str | Path | None = None
-    tracks: Callable[[Params], Iterable[tuple[str, Floats, Floats, Floats | None]]] | None = None
+    tracks: Callable[[Params], Iterable[tuple[str, Floats, Floats]]] | None = None
 
     def __post_init__(self) -> None:
         file_name("study", self.name, "Rename the study: its folder has this name.")
