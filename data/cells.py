@@ -47,7 +47,11 @@ def read_frame(path: Path, *text: str) -> pd.DataFrame:
 
     try:
         parquet = path.suffix.lower() == ".parquet"
-        frame = pd.read_parquet(path).reset_index(drop=True) if parquet else _read_csv(path, text)
+        frame = (
+            pd.read_parquet(path, use_threads=False, pre_buffer=False).reset_index(drop=True)
+            if parquet
+            else _read_csv(path, text)
+        )
     except InputError:
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all

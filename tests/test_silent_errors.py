@@ -137,3 +137,21 @@ def test_cooperation_that_changes_nothing_is_said_below_the_table() -> None:
         f"{text}no message arrived.",
     ]
     assert STUDY.answers(results)["K = 0"].startswith("K = 0: there is no neighbour")
+
+
+def test_calls_that_raised_what_is_no_error_of_ours(tmp_path: Path) -> None:
+    learned, study = pytest.importorskip("coopoc.learned"), co.Study("s", "?", dict, {"x": (1,)})
+    net = learned.NoiseParameters()
+    import torch
+
+    from coopoc.learned.checkpoint import load, write
+
+    tensors = dict(net.state_dict()) | {"history": torch.tensor(1.0)}
+    write(tmp_path / "a.safetensors", tensors, {"kind": "okf", "net": dict(net.settings)})
+    for field, call in {
+        "jobs": lambda: co.run_study(study, tmp_path, jobs="2"),  # type: ignore[arg-type]
+        "settings": lambda: co.run_study(study, tmp_path, settings=3),  # type: ignore[arg-type]
+        "checkpoint": lambda: load(tmp_path / "a.safetensors"),
+    }.items():
+        with pytest.raises(co.InputError, match=field):
+            call()

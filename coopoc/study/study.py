@@ -11,7 +11,6 @@ from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from ..arrays import Floats
 from ..errors import InputError, unknown
 from ..file_names import file_name
 from ..one_file import file_digest, from_file, in_file
@@ -94,7 +93,7 @@ class Study:
     minutes: float | None = None
     metrics: Mapping[str, str | float] = field(default_factory=dict)
     reference: str | Path | None = None
-    tracks: Callable[[Params], Iterable[tuple[str, Floats, Floats]]] | None = None
+    tracks: Callable[[Params], Iterable[tuple[Any, ...]]] | None = None
 
     def __post_init__(self) -> None:
         file_name("study", self.name, "Rename the study: its folder has this name.")
