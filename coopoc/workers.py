@@ -8,14 +8,13 @@ import sys
 import threading
 import time
 from functools import lru_cache
+from importlib import import_module
 
 
 def main() -> None:
     """The console script: without a traceback where it is interrupted while libraries load."""
     try:
-        from .cli import main as command
-
-        command()
+        import_module("coopoc.cli").main()
     except KeyboardInterrupt:
         sys.exit(130)
 
