@@ -104,7 +104,9 @@ def header(shape: tuple[int, ...]) -> bytes:
     return file.getvalue()
 
 
-@pytest.mark.parametrize("content", [header((3, 80, 2, 99)), header((10**9, 3)), b"\x93NUMPY\x01\x00\x06\x00{'a': "])
+@pytest.mark.parametrize(
+    "content", [header((3, 80, 2, 99)), header((10**11,)), header((2**61,)), b"\x93NUMPY\x01\x00\x06\x00{'a': "]
+)
 def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes) -> None:
     save_recording(SEEN, tmp_path / "good.npz", FLEET)
     assert read_recording(tmp_path / "good.npz")[0].runs == 3
