@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from coopoc.arrays import one_of
 from coopoc.errors import InputError, MissingLibraryError, unknown
 
 from .cells import numeric
@@ -77,6 +78,7 @@ def read_bag(
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingLibraryError("rosbags", "reading a ROS bag", "'coopoc[ros]'") from None
+    one_of("stamps", stamps, ("header", "received"))
     rows, behind = list[tuple[Any, ...]](), list[float]()
     folder = path.parent if path.suffix == ".db3" else path
     try:

@@ -46,10 +46,7 @@ def show(name: tyro.conf.Positional[str]) -> None:
         if log.truth is None:
             return
     fleet = load_fleet(name)
-    present = fleet.present.mean(axis=0)
-    first = {"source": fleet.source or "(not stated)", "licence": fleet.licence or "(not stated)"}
-    there = {"there": f"{present.min():.0%} to {present.max():.0%} of the time"}
-    _print(repr(fleet), first | there)
+    _print(repr(fleet), {"source": fleet.source or "(not stated)", "licence": fleet.licence or "(not stated)"})
 
 
 def _print(name: str, fields: dict[str, str]) -> None:

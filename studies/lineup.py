@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from coopoc.arrays import AnyArray, Bools, Floats
+from coopoc.arrays import AnyArray, Floats
 from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, past_bound, posterior_bound
 from coopoc.evaluate.ledger import of_track
@@ -22,6 +22,7 @@ from coopoc.methods.track import Method, far_off
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.fleet import Fleet
+from coopoc.world.links import stretches as where_true
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -231,7 +232,11 @@ def _ego(
     tracked = drive.present[:, drive.index(ego)]
     parts, lengths = list[Mapping[str, AnyArray]](), list[int]()
     stretches = recording.stretches(ego)
-    cuts = [(a + i, a + j) for a, b in stretches for i, j in _runs(tracked[a:b])] if tracked.any() else stretches
+    cuts = (
+        [(a + i, a + j) for a, b in stretches for i, j in where_true(tracked[a:b]) if j - i > 1]
+        if tracked.any()
+        else stretches
+    )
     for start, stop in cuts:
         stretch = recording.between(start, stop)
         # a truth that begins between two fixes leaves a start without one
@@ -279,9 +284,3 @@ def _merged(name: str, parts: Sequence[AnyArray], lengths: Sequence[int]) -> Any
         (np.nan_to_num(values) * weights).sum(axis=0), total, out=np.full(total.shape, np.nan), where=total > 0
     )
     return np.asarray(mean ** (1 / power))
-
-
-def _runs(flags: Bools) -> list[tuple[int, int]]:
-    """(start, stop) of the runs of True."""
-    edges = np.flatnonzero(np.diff(flags.astype(int), prepend=0, append=0)).reshape(-1, 2)
-    return [(int(a), int(b)) for a, b in edges if b - a >= 2]

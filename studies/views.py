@@ -71,21 +71,19 @@ ALIKE = 1e-3
 
 def unused(results: Results) -> tuple[str, ...]:
     """A sentence for each method and K whose errors are those of a vehicle alone, in every run and for every ego."""
-    rows = results.frame
-    value = next((name for name in ("rt_le_m", "innovation_m") if name in rows), "")
-    if not {"method", "max_neighbours", "sent_bytes_per_second", value} <= set(rows):
+    rows, texts, by = results.frame, list[str](), ["method", "max_neighbours"]
+    value = "rt_le_m" if "rt_le_m" in rows else "innovation_m"
+    if not {*by, "sent_bytes_per_second", value} <= set(rows):
         return ()
-    keys = [name for name in (*results.axes, "ego", "run", "train_seed") if name in rows]
-    keys, texts = [name for name in keys if name not in ("method", "max_neighbours")], []
-    sends = rows[(rows["max_neighbours"] > 0) & (rows["sent_bytes_per_second"] > 0)]
-    for (method, k), part in sends.groupby(["method", "max_neighbours"], sort=False):
-        solo = rows[((rows["method"] == "kalman") & (rows["max_neighbours"] == k))]
-        own = rows[(rows["method"] == method) & (rows["max_neighbours"] == 0)]
-        gaps = [part.merge(each, on=keys)[[f"{value}_x", f"{value}_y"]].diff(axis=1) for each in (solo, own)]
-        if any(len(gap) >= len(part) and gap.iloc[:, 1].abs().max() < ALIKE for gap in gaps):
+    keys = [name for name in (*results.axes, "ego", "run", "train_seed") if name in rows and name not in by]
+    for (method, k), part in rows[rows["sent_bytes_per_second"] > 0].groupby(by, sort=False):
+        own = (rows["method"] == method) & (rows["max_neighbours"] == 0)
+        both = part.merge(rows[own | (rows["method"] == "kalman") & (rows["max_neighbours"] == k)], on=keys)
+        gap = (both[f"{value}_x"] - both[f"{value}_y"]).abs().groupby([both[key] for key in keys], dropna=False).min()
+        if k and len(gap) == len(part) and gap.max() < ALIKE:
             why = "what was measured lacks what it takes, such as an azimuth"
             if not part["bytes_per_second"].any():
-                why = "no message arrived" if part["neighbours_mean"].any() else "there was none"
+                why = "no message arrived"
             text = f"{look(str(method)).label}, K = {k}: equal to solo within {ALIKE:g} m: no neighbour's measurement "
             texts.append(f"{text}was used, because {why}.")
     return tuple(texts)

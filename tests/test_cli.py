@@ -178,8 +178,8 @@ def test_failed_cells_set_the_status(tmp_path: Path) -> None:
     (tmp_path / "trouble").write_text("raise")
     done = coopoc("run", "small", "--set", "runs=2", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)
     assert done.returncode == 1
-    assert "diverged at step 3 (small_study.py, line 61, in cell) (max_neighbours = 1" in done.stderr
-    assert "\n  FloatingPointError: the filter diverged at step 3" in done.stderr
+    assert "diverged at step 3 (max_neighbours = 1" in done.stderr
+    assert 'small_study.py", line 61, in cell\n' in done.stderr
     assert "cells failed: 1, try them again with --retry-failed" in done.stderr
 
 

@@ -182,7 +182,7 @@ def test_the_commands_take_a_log_and_options(
     status, out = shell("run", "side_by_side", "--data", word, "--set", *options, "--out", "runs")
     assert status == 0
     assert "1 ego of with" in out
-    assert "of the time" in shell("data", "show", str(folders / "with"))[1]
+    assert "source" in shell("data", "show", str(folders / "with"))[1]
     assert shell("data", "check", "nowhere")[0] == 2
 
 

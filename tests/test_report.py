@@ -83,7 +83,7 @@ def test_nothing_outside_the_file_is_needed(made: tuple[Path, Page]) -> None:
         "Environment",
         "numpy",
         "Failed cells: 1",
-        "FloatingPointError: the filter diverged at step 3 (small_study.py, line 61, in cell)",
+        "FloatingPointError: the filter diverged at step 3",
         "K = 1, KF",
         "RT-LE [m] at a GNSS noise of 3.5 m.",
         "A lead.",

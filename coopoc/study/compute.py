@@ -11,7 +11,6 @@ import traceback
 from collections.abc import Callable, Generator, Sequence
 from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any, TypeAlias
 
 import pyarrow as pa
@@ -97,18 +96,9 @@ def attempt(function: Function, cell: Cell) -> Outcome:
         with threadpool_limits(limits=1):
             rows = _checked(function(cell.given), cell)
     except Exception as error:
-        reason = f"{type(error).__name__}: {error}{_place(error)}"
+        reason = f"{type(error).__name__}: {error}"
         return Outcome(cell, None, reason, traceback.format_exc(), time.perf_counter() - start)
     return Outcome(cell, rows, "", "", time.perf_counter() - start)
-
-
-def _place(error: BaseException) -> str:
-    """File, line and function of one's own in which it was raised; nothing for an error of ours."""
-    ours = tuple(str(Path(__file__).parents[2] / name) for name in ("coopoc", "learned", "studies", "data"))
-    for frame in reversed(traceback.extract_tb(error.__traceback__)):
-        if "site-packages" not in frame.filename and not frame.filename.startswith(ours):
-            return f" ({Path(frame.filename).name}, line {frame.lineno}, in {frame.name})"
-    return ""
 
 
 def compute(function: Function, cells: Sequence[Cell], jobs: int) -> Generator[Outcome]:

@@ -53,9 +53,8 @@ class Results:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        if {"method", "label"} <= set(self.frame):
-            named = self.frame.dropna(subset=["label"])
-            OWN.update(zip(named["method"].astype(str), named["label"].astype(str), strict=True))
+        if "label" in self.frame:
+            OWN.update(self.frame.dropna(subset=["label"]).groupby("method")["label"].first().astype(str))
 
     @classmethod
     def load(cls, folder: str | Path, names: Collection[str] | None = None) -> Results:

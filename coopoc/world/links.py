@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, Ints, checked, number, refuse
+from ..arrays import Bools, Floats, Ints, checked, number, refuse
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,6 +143,16 @@ def vector_cov(relative: Floats, std: Floats, min_range: float = 0.0) -> Floats:
     root = np.stack([np.stack(c, axis=-1) for c in columns], axis=-1)
     cov: Floats = root @ np.swapaxes(root, -1, -2)
     return cov
+
+
+def stretches(flags: Bools) -> list[tuple[int, int]]:
+    """(start, stop) of the runs of True.
+
+    >>> stretches(np.array([True, False, True, True]))
+    [(0, 1), (2, 4)]
+    """
+    edges = np.flatnonzero(np.diff(flags.astype(int), prepend=0, append=0)).reshape(-1, 2)
+    return [(int(start), int(stop)) for start, stop in edges]
 
 
 def wrap(angle: Any) -> Any:

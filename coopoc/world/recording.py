@@ -13,7 +13,7 @@ from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, ref
 from ..errors import InputError, shown
 from ..short_repr import short_repr
 from .fleet import FARTHEST, FASTEST, clock, columns, interval, names, plausible
-from .links import Links, told
+from .links import Links, stretches, told
 from .sensors import Sensors
 from .v2x import V2X
 
@@ -198,9 +198,8 @@ class Recording:
         (col,) = columns("vehicle", [vehicle], self.ids)
         there = np.isfinite(self.velocity[0, :, col, 0])
         fixed: Bools = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0))
-        edges = np.flatnonzero(np.diff(there.astype(int), prepend=0, append=0)).reshape(-1, 2)
-        firsts = [(start + int(np.argmax(fixed[start:stop])), stop, fixed[start:stop].any()) for start, stop in edges]
-        return tuple((int(a), int(b)) for a, b, any_fix in firsts if any_fix and b - a >= shortest)
+        firsts = [(a + int(np.argmax(fixed[a:b])), b) for a, b in stretches(there) if fixed[a:b].any()]
+        return tuple((a, b) for a, b in firsts if b - a >= shortest)
 
     @cached_property
     def told(self) -> Floats:

@@ -168,7 +168,6 @@ def read_log(
         "kinds": named("kinds", kinds or {}, "Give kinds={word: kind}."),
         "ignore": ignore,
     }
-    one_of("stamps", stamps, get_args(Stamps))
     rows = _rows(path, truth, summary, {**options, "stamps": stamps})
     factor = factors(scale, ("t", *KINDS))
     by_kind = rows["kind"].map(factor).fillna(1.0)
