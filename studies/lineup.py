@@ -22,7 +22,7 @@ from coopoc.methods.track import Method, far_off
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.fleet import Fleet
-from coopoc.world.links import stretches as where_true
+from coopoc.world.links import stretches
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -231,12 +231,9 @@ def _ego(
 ) -> dict[str, AnyArray]:
     tracked = drive.present[:, drive.index(ego)]
     parts, lengths = list[Mapping[str, AnyArray]](), list[int]()
-    stretches = recording.stretches(ego)
-    cuts = (
-        [(a + i, a + j) for a, b in stretches for i, j in where_true(tracked[a:b]) if j - i > 1]
-        if tracked.any()
-        else stretches
-    )
+    cuts = recording.stretches(ego)
+    if tracked.any():
+        cuts = tuple((a + i, a + j) for a, b in cuts for i, j in stretches(tracked[a:b]) if j - i > 1)
     for start, stop in cuts:
         stretch = recording.between(start, stop)
         # a truth that begins between two fixes leaves a start without one
