@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.arrays import Bools, Floats, named, number
-from coopoc.errors import InputError, suggestion, unknown
+from coopoc.errors import InputError, require, suggestion, unknown
 from coopoc.formats.values import LARGEST
 
 if TYPE_CHECKING:
@@ -46,13 +46,11 @@ def read_frame(path: Path, *text: str) -> pd.DataFrame:
     import pandas as pd
 
     try:
-        parquet = path.suffix.lower() == ".parquet"
-        frame = (
-            pd.read_parquet(path, use_threads=False, pre_buffer=False).reset_index(drop=True)
-            if parquet
-            else _read_csv(path, text)
-        )
-    except InputError:
+        if parquet := path.suffix.lower() == ".parquet":
+            require("pyarrow", "a Parquet table")
+        how: dict[str, Any] = {"use_threads": False, "pre_buffer": False}
+        frame = pd.read_parquet(path, **how).reset_index(drop=True) if parquet else _read_csv(path, text)
+    except (InputError, ImportError):
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
         raise _no_table(path, next(iter(str(error).splitlines()), type(error).__name__)[:200]) from None

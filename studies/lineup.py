@@ -54,6 +54,7 @@ def study(name: str, question: str, settings: Mapping[str, Any], scored: bool = 
         "key": key,
         "prepare": weights.prepare,
         "recipe": weights.described,
+        "idle": scene.idle,
     }
     return Study(name, question, **{**usual, "reference": reference(name), **options})
 
