@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import textbook
 from oracles.cooperative import Oracle
 from test_star_filters import CHANNELS, gappy, holed, partial
 
@@ -32,7 +33,7 @@ def drive(steps: int = 80) -> Fleet:
 @pytest.mark.parametrize(("change", "near"), [(lambda r: r, 1e-8), (holed, 1e-8), (partial, 1e-4)])
 def test_textbook_is_the_joint_filter(channel: str, change: Callable[[Recording], Recording], near: float) -> None:
     seen = change(observe(gappy(drive()), S2, CHANNELS[channel], runs=2, observers=[0, 9]))
-    ours, joint = CooperativeFilter(robust=False)(seen, [0, 9]), JointFilter()(seen, [0, 9])
+    ours, joint = CooperativeFilter(robust=False)(seen, [0, 9]), textbook(JointFilter())(seen, [0, 9])
     np.testing.assert_allclose(ours.x, joint.x, atol=near)
     assert ours.covariance is not None
     assert joint.covariance is not None

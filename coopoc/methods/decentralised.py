@@ -54,6 +54,8 @@ class GaussianBeliefPropagation:
         noise_model: "identity", "nominal" or a NoiseModel.
         rounds: of messages a step.
         damping: share of the old message that stays in the new one, in [0, 1); the fixed point is the same.
+        robust: an innovation beyond its gate weighs less, far beyond it nothing (`coopoc.kernels.gate`); False believes
+            every number.
 
     References:
         Murai et al., "A Robot Web for Distributed Many-Device Localization", IEEE T-RO 40, 2024.
@@ -62,6 +64,7 @@ class GaussianBeliefPropagation:
     noise_model: NoiseModel | str = "nominal"
     rounds: int = 3
     damping: float = 0.0
+    robust: bool = True
     name: str = "gbp"
     cooperative: bool = True
 
@@ -87,7 +90,7 @@ class GaussianBeliefPropagation:
             result = run_filter(measured, pairs, assumed, new_edges(pairs), int(self.rounds), float(self.damping))
             return Answer(*result, self.rounds, (LOOPS,))
 
-        return fleet_track(self, self.noise_model, recording, egos, solve)
+        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve)
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +121,8 @@ class ConsensusADMM:
         rounds: iterations a step.
         rho: 1/m^2, the penalty; any positive one converges. None: 3 1/m^2 or 6.75 times the information of a fix, the
             larger, so that few rounds suffice however certain fixes are.
+        robust: an innovation beyond its gate weighs less, far beyond it nothing (`coopoc.kernels.gate`); False believes
+            every number.
 
     References:
         Boyd et al., "Distributed Optimization and Statistical Learning via the ADMM", Foundations and Trends in Machine
@@ -127,6 +132,7 @@ class ConsensusADMM:
     noise_model: NoiseModel | str = "nominal"
     rounds: int = 3
     rho: float | None = None
+    robust: bool = True
     name: str = "admm"
     cooperative: bool = True
 
@@ -156,4 +162,4 @@ class ConsensusADMM:
             result = run_filter(measured, pairs, assumed, new_edges(pairs), int(self.rounds), float(rho))
             return Answer(*result, self.message.rounds, (OWN,))
 
-        return fleet_track(self, self.noise_model, recording, egos, solve)
+        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve)

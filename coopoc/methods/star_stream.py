@@ -29,6 +29,7 @@ from ..kernels.stars.cooperative_state import (
     VARIANCE,
     WIDTH,
     Filter,
+    Guards,
 )
 from ..kernels.stars.cooperative_state import ESTIMATE as POSITION
 from ..kernels.stars.gaussian import ABSENT
@@ -149,6 +150,9 @@ class StarStream:
         self._model, self._guards = model_of(known, robust), NO_GUARDS
         if isinstance(filter, JointFilter):
             self._model = self._model._replace(exact=float(filter.exact and known.exact_relative))
+            if filter.robust and known.exact_relative:
+                usual = Guards()
+                self._guards = NO_GUARDS._replace(gate=usual.gate, fix_gate=usual.fix_gate)
         elif robust:
             self._guards = guards_of(filter, known)
         self._motion, self._fix = motion_noise(known, interval), np.array(known.gnss_variance)

@@ -17,11 +17,14 @@ from scipy.linalg.lapack import dpotrf, dpotri
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled
-from ..compiling.small import load, store, subtract
-from .graph import VECTOR, Assumed, Measured, Pairs, pair
+from ..compiling.small import add_diagonal, load, store, subtract
+from ..gate import FIX_GATE, REJECTED
+from .graph import MATRIX, VECTOR, Assumed, Measured, Pairs, gate_pair, pair
 
 HARD = 1e7
 """Weight of the motion over that of a fix beyond which D - D S^-1 D loses its digits."""
+SLACK = 0.25
+"""Variance of the vehicles' own filters over that of a fix, where the weights are set first."""
 EXTRA, HALVINGS = 20, 12
 """Sweeps beyond the asked ones while steps must be shortened, and how often one is halved."""
 
@@ -33,7 +36,7 @@ class RunFactors(NamedTuple):
         active: (T, N).
         row: (T, N) the vehicle's number among those of its step, -1 where inactive.
         pairs: those that count; `alive` is (1, P).
-        relative: (L, 5).
+        relative: (L, 8), the last three the factors of the standard deviations.
         assumed: the noise model.
         fix_weight: (T, N, 3) 1/m^2, 0 where there is no fix.
         fix: (T, N, 3) m, any number where there is none.
@@ -89,8 +92,10 @@ def smooth(
     Raises:
         numpy.linalg.LinAlgError: a number is not finite.
     """
-    sweeps, whole, last = 0, False, np.inf
+    sweeps, whole, last, given = 0, False, np.inf, factors
     while True:
+        if given.assumed.robust and sweeps <= steps:
+            factors = reweighted(x, given, SLACK if sweeps == 0 else 0.0)
         moving, before = motions(x, factors), x
         weight, eta = linearise(x, factors, sweeps == 0)
         vectors = [row[there].ravel() for row, there in zip(sum_vectors(x, factors, eta), factors.active, strict=True)]
@@ -113,6 +118,33 @@ def smooth(
             last = size
 
 
+def reweighted(x: Floats, factors: RunFactors, slack: float) -> RunFactors:
+    """Weights by the distance of each measurement from positions (T, N, 3) m, gated.
+
+    Args:
+        x: the positions.
+        factors: whose relative measurements' are overwritten.
+        slack: variance of a position over that of a fix.
+    """
+    weight = factors.fix_weight
+    q = np.nansum(weight * (factors.fix - x) ** 2, axis=-1, keepdims=True) / (1.0 + slack)
+    share = np.where(q > REJECTED * FIX_GATE, np.inf, np.maximum(q / FIX_GATE, 1.0))
+    gate_pairs(x, factors, 2.0 * slack / float(weight[weight > 0].mean()))
+    return factors._replace(fix_weight=weight / share)
+
+
+@compiled
+def gate_pairs(x: Floats, factors: RunFactors, variance: float) -> None:
+    """Factors of the standard deviations of what pairs measured at positions (T, N, 3) m, whose differences have this
+    variance m^2."""
+    pairs, cov = factors.pairs, add_diagonal(MATRIX, (variance, variance, variance))
+    for t in range(len(x)):
+        for k in range(pairs.start[t], pairs.start[t + 1]):
+            if pairs.alive[0, k]:
+                vector = subtract(load(x[t, pairs.second[k]], 0, VECTOR), load(x[t, pairs.first[k]], 0, VECTOR))
+                gate_pair(vector, cov, k, pairs, factors.relative, factors.assumed)
+
+
 def descended(before: Floats, after: Floats, factors: RunFactors) -> tuple[Floats, bool]:
     """The step from `before` to `after`, halved until it does not raise the cost, and whether it is whole."""
     cost = misfit(before, factors)
@@ -132,13 +164,14 @@ def misfit(x: Floats, factors: RunFactors) -> float:
     for link, vector in ((pairs.link, gap), (pairs.link_back, -gap)):
         used = pairs.alive[0] & (link >= 0)
         seen, (east, north, up) = factors.relative[link[used]].T, vector[used].T
+        std = factors.assumed.std[:, None] * seen[5:]
         flat = np.hypot(east, north)
         apart = [
             np.where(seen[0] >= 0.0, seen[0] - np.hypot(flat, up), 0.0),
             np.arctan2(seen[1] * east - seen[2] * north, seen[2] * east + seen[1] * north),
             np.arctan2(seen[3] * up - seen[4] * flat, seen[4] * up + seen[3] * flat),
         ]
-        total += float(np.sum((np.stack(apart) / factors.assumed.std[:, None]) ** 2))
+        total += float(np.sum((np.stack(apart) / std) ** 2))
     return total
 
 

@@ -40,7 +40,7 @@ Index: TypeAlias = Any
 Three: TypeAlias = tuple[float, float, float]
 Estimates: TypeAlias = tuple[Floats, Floats, Floats]
 """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
-ROW, RELATIVE = (0.0,) * 3, (0.0,) * 8
+ROW, BLOCK, RELATIVE = (0.0,) * 3, (0.0,) * 9, (0.0,) * 8
 NONE = cast(int, np.int64(0))
 """Members before the first star. For a constant of Python's numba would compile the whole step once more."""
 

@@ -39,7 +39,8 @@ from ..compiling.small import (
 )
 from ..compiling.vectors import LANES, take
 from ..stars.elimination import eliminate, substitute
-from .window_layout import ONE, ROW, Window, count_of, fix_gap, largest_of, motion, row_of
+from ..stars.messages import BLOCK, ROW
+from .window_layout import Window, count_of, fix_gap, largest_of, motion, row_of
 
 
 class System(NamedTuple):
@@ -101,9 +102,9 @@ def gauss_newton(window: Window, span: tuple[int, int], system: System, coupled:
         for row in range(ego + 1, ego + count_of(window.sizes, step)):
             if step == last or window.later[row] < 0:
                 fold(window, span, step, row, system, coupled, prior)
-    cov = eliminate(system.core, system.core, system.vector, size, size, system.scratch, ONE, ROW)
+    cov = eliminate(system.core, system.core, system.vector, size, size, system.scratch)
     store(system.cov, 0, cov)
-    substitute(system.core, system.vector, size, size, ONE, ROW)
+    substitute(system.core, system.vector, size, size)
     for step in range(first, last + 1):
         ego = row_of(window.layout, step, 0)
         store(system.move, ego, load(system.vector, outer + step - first, ROW))
@@ -120,7 +121,7 @@ def assemble_core(window: Window, span: tuple[int, int], system: System, coupled
     first, last = span
     outer = max(coupled, 0)
     size = outer + last - first + 1
-    nothing = zeros(take(window.located, uint64(0)), ONE)
+    nothing = zeros(take(window.located, uint64(0)), BLOCK)
     for i in range(size):
         store(system.vector, i, zeros(nothing[0], ROW))
         for j in range(i, size):
@@ -130,16 +131,16 @@ def assemble_core(window: Window, span: tuple[int, int], system: System, coupled
     for s in range(last - first + 1):
         ego, i = row_of(window.layout, first + s, 0), outer + s
         own, diagonal = load(window.used, ego, ROW), i * (size + 1)
-        block, eta = add_diagonal(load(system.core, diagonal, ONE), own), times(own, fix_gap(window, ego))
+        block, eta = add_diagonal(load(system.core, diagonal, BLOCK), own), times(own, fix_gap(window, ego))
         eta = add(load(system.vector, i, ROW), eta)
         if s > 0:
             process, off = motion(window, row_of(window.layout, first + s - 1, 0), ego)
             block, eta, above = add_diagonal(block, process), add(eta, off), diagonal - size - 1
-            store(system.core, above, add_diagonal(load(system.core, above, ONE), process))
+            store(system.core, above, add_diagonal(load(system.core, above, BLOCK), process))
             store(system.core, above + 1, add_diagonal(nothing, negate(process)))
             store(system.vector, i - 1, subtract(load(system.vector, i - 1, ROW), off))
         for row in range(ego + 1, ego + count_of(window.sizes, first + s)):
-            block, eta = add(block, load(window.edge, row, ONE)), subtract(eta, load(window.eta, row, ROW))
+            block, eta = add(block, load(window.edge, row, BLOCK)), subtract(eta, load(window.eta, row, ROW))
         store(system.core, diagonal, block)
         store(system.vector, i, eta)
 
@@ -149,11 +150,11 @@ def add_arrival(window: Window, first: int, system: System, n: int, size: int) -
     """Move the arrival cost from where it expects the n points of the first step to the points."""
     for i in range(n):
         away = from_start(window, first, i, n)
-        own = mirrored(load(system.arrival, i * (window.layout[1] + 1), ONE))
+        own = mirrored(load(system.arrival, i * (window.layout[1] + 1), BLOCK))
         store(system.core, i * (size + 1), own)
         eta = plus_applied(load(system.vector, i, ROW), own, away)
         for j in range(i + 1, n):
-            block = load(system.arrival, i * window.layout[1] + j, ONE)
+            block = load(system.arrival, i * window.layout[1] + j, BLOCK)
             store(system.core, i * size + j, block)
             eta = plus_applied(eta, block, from_start(window, first, j, n))
             store(system.vector, j, plus_applied(load(system.vector, j, ROW), transpose(block), away))
@@ -177,10 +178,10 @@ def fold(
     h, outer, end = last - first + 1, max(coupled, 0), step - first
     size = outer + h
     nothing = zeros(take(window.located, uint64(0)), ROW)
-    eta, own, flat = nothing, zeros(nothing[0], ONE), nothing[0] + prior
+    eta, own, flat = nothing, zeros(nothing[0], BLOCK), nothing[0] + prior
     while True:
         here, arm = step - first, row * h
-        information, fix = load(window.edge, row, ONE), load(window.used, row, ROW)
+        information, fix = load(window.edge, row, BLOCK), load(window.used, row, ROW)
         store(system.arm, arm + here, negate(information))
         own = add_diagonal(add(own, information), fix)
         eta = add(add(eta, load(window.eta, row, ROW)), times(fix, fix_gap(window, row)))
@@ -188,7 +189,7 @@ def fold(
             i = row - row_of(window.layout, first, 1)
             for j in range(end + 1):
                 store(system.core, i * size + outer + j, add_to(system, i * size + outer + j, arm + j))
-            store(system.core, i * (size + 1), add(load(system.core, i * (size + 1), ONE), own))
+            store(system.core, i * (size + 1), add(load(system.core, i * (size + 1), BLOCK), own))
             store(system.vector, i, add(load(system.vector, i, ROW), eta))
             return
         before = window.previous[row] if here > 0 else -1
@@ -206,12 +207,12 @@ def fold(
         store(system.pivot, row, pivot)
         system.end[row] = end
         for i in range(here, end + 1):
-            store(system.scratch, i, minus_product(pivot, load(system.arm, arm + i, ONE)))
+            store(system.scratch, i, minus_product(pivot, load(system.arm, arm + i, BLOCK)))
         for i in range(here, end + 1):
-            left, at = load(system.arm, arm + i, ONE), (outer + i) * size + outer
+            left, at = load(system.arm, arm + i, BLOCK), (outer + i) * size + outer
             for j in range(i, end + 1):
-                right = load(system.scratch, j, ONE)
-                store(system.core, at + j, less_transposed_product(load(system.core, at + j, ONE), left, right))
+                right = load(system.scratch, j, BLOCK)
+                store(system.core, at + j, less_transposed_product(load(system.core, at + j, BLOCK), left, right))
             moved = less_transposed_applied(load(system.vector, outer + i, ROW), left, solved)
             store(system.vector, outer + i, moved)
         if before < 0:
@@ -219,14 +220,14 @@ def fold(
         own = mirrored(scale_rows(process, minus_product(pivot, own)))
         eta = subtract(times(process, solved), off)
         for i in range(here, end + 1):
-            store(system.arm, before * h + i, scale_rows(process, load(system.scratch, i, ONE)))
+            store(system.arm, before * h + i, scale_rows(process, load(system.scratch, i, BLOCK)))
         step, row = step - 1, before
 
 
 @inner
 def add_to(system: System, at: int, arm: int) -> Any:
     """A block of the dense matrix and one of a chain."""
-    return add(load(system.core, at, ONE), load(system.arm, arm, ONE))
+    return add(load(system.core, at, BLOCK), load(system.arm, arm, BLOCK))
 
 
 @inner
@@ -235,13 +236,13 @@ def unfold(window: Window, span: tuple[int, int], step: int, row: int, system: S
     first, last = span
     h, eta = last - first + 1, load(system.eta, row, ROW)
     for i in range(step - first, system.end[row] + 1):
-        eta = less_applied(eta, load(system.arm, row * h + i, ONE), load(system.vector, outer + i, ROW))
+        eta = less_applied(eta, load(system.arm, row * h + i, BLOCK), load(system.vector, outer + i, ROW))
     before = window.previous[row] if step > first else -1
     if before >= 0:
         before = row_of(window.layout, step - 1, before)
         process, _ = motion(window, before, row)
         eta = add(eta, times(process, load(system.move, before, ROW)))
-    store(system.move, row, minus_apply(load(system.pivot, row, ONE), eta))
+    store(system.move, row, minus_apply(load(system.pivot, row, BLOCK), eta))
 
 
 @inner
@@ -257,7 +258,7 @@ def advance(window: Window, span: tuple[int, int], system: System, share: Any) -
             store(window.point, row, add(load(window.point, row, ROW), scale(moved, share)))
             if row > ego:
                 ahead = scale(subtract(moved, own), share)
-                eta = less_applied(load(window.eta, row, ROW), load(window.edge, row, ONE), ahead)
+                eta = less_applied(load(window.eta, row, ROW), load(window.edge, row, BLOCK), ahead)
                 store(window.eta, row, eta)
     return most
 

@@ -12,10 +12,7 @@ from ..compiling.compile import inner, storage
 from ..compiling.small import load, subtract, times
 from ..compiling.vectors import LANES, put, take
 from ..stars.joint import LEAST_PROCESS
-from ..stars.messages import MOVED, POSITION, PROCESS, Assumptions, Measurements, Star, gather, star_in
-
-ONE, ROW = (0.0,) * 9, (0.0,) * 3
-"""Any block, any row."""
+from ..stars.messages import MOVED, POSITION, PROCESS, ROW, Assumptions, Measurements, Star, gather, star_in
 
 
 class Window(NamedTuple):
