@@ -295,9 +295,6 @@ def solo_rows(recording: co.Recording) -> list[Row]:
     """All vehicles; filterpy's is one vehicle's time times their number."""
     variance, vehicles = KNOWN.process_variance(recording), len(recording.ids)
 
-    def ours() -> Any:
-        return solo(recording)
-
     def peer(vehicle: int) -> np.ndarray:
         filter_ = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
         filter_.x, filter_.P = recording.gnss[0, 0, vehicle].copy(), np.diag(KNOWN.gnss_variance)
@@ -316,7 +313,6 @@ def solo_rows(recording: co.Recording) -> list[Row]:
         return Row(words, call, away < 1e-9)
 
     return [
-        row("solo filter, compiled", ours, ours()[0]),
         row(
             "Kalman, compiled",
             lambda: co.Kalman()(recording, range(vehicles)),

@@ -194,3 +194,29 @@ def refuse(field: str, values: AnyArray, wrong: npt.ArrayLike, allowed: str, hin
     if np.any(wrong):
         place = tuple(np.argwhere(wrong)[0].tolist())
         raise InputError(f"{field}[{', '.join(map(str, place))}]", values[place], allowed, hint)
+
+
+def texts(field: str, values: object) -> tuple[str, ...]:
+    """A tuple of texts; InputError if it is one text, or holds anything else.
+
+    >>> texts("notes", ["a reconstruction"])
+    ('a reconstruction',)
+    """
+    hint = 'Give a tuple such as ("a note",).'
+    found = listed(field, values, hint)
+    if not all(isinstance(value, str) for value in found):
+        raise InputError(field, shown(values), "must be a sequence of texts", hint)
+    return tuple(found)
+
+
+def check_texts(owner: object, *fields: str) -> None:
+    """InputError for the first of these attributes that is no text.
+
+    >>> from types import SimpleNamespace
+    >>> check_texts(SimpleNamespace(name=3), "name")
+    Traceback (most recent call last):
+    coopoc.errors.InputError: name = 3: must be text. Leave it out, or give a word.
+    """
+    for field in fields:
+        if not isinstance(value := getattr(owner, field), str):
+            raise InputError(field, shown(value), "must be text", "Leave it out, or give a word.")

@@ -169,7 +169,7 @@ class Job:
 def sensors(job: Job) -> Sensors:
     """The paper's training noise in the setting's reading, with the recipe's outliers."""
     noise = job.recipe.noise
-    outliers = Outliers() if noise in get_args(Noise) else Outliers.named(noise)
+    outliers = None if noise in get_args(Noise) else Outliers.named(noise)
     return replace(Sensors.paper_training(job.setting.reading), outliers=outliers)
 
 

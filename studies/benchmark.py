@@ -7,6 +7,7 @@ import re
 import sys
 import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
@@ -15,6 +16,7 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
+from coopoc.arrays import number
 from coopoc.errors import InputError, unknown
 from coopoc.evaluate.scores import scored
 from coopoc.evaluate.statistics import mean_interval
@@ -40,6 +42,7 @@ def benchmark(
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/benchmark"),
     data: Annotated[Path | None, arg(metavar="FOLDER")] = None,
     validation: bool = False,
+    seed: int | None = None,
     tasks: Annotated[tuple[str, ...], arg(metavar="TASK")] = (),
     table: bool = False,
 ) -> int:
@@ -56,10 +59,14 @@ def benchmark(
         out: folder of the cards.
         data: folder with MR.CLAM set 6 and PyFG files, for the tasks of real measurements (docs/benchmark.md).
         validation: run the validation tasks, for choosing parameters; their cards cannot be submitted.
+        seed: of other draws, to see whether a card holds on them; these cards cannot be submitted either.
         tasks: run only these tasks.
         table: print the table of all cards in the folder, best first.
     """
     known = {task.name: task for task in (VALIDATION if validation else TASKS)}
+    if seed is not None:
+        drawn = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number will do.")
+        known = {name: replace(task, seed=drawn) for name, task in known.items()}
     for name in tasks:
         if name not in known:
             raise InputError("tasks", repr(name), f"must be of {', '.join(known)}", "Leave it out for all.")
@@ -75,7 +82,7 @@ def benchmark(
         began = time.perf_counter()
         made = card(name, [known[task] for task in tasks or known] if simulated(name) else [], data)
         failed += sum("failed" in row for row in made["tasks"])
-        folder = out / "validation" if validation else out
+        folder = out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}")
         folder.mkdir(parents=True, exist_ok=True)
         file = folder / f"{re.sub(r'[^A-Za-z0-9-]+', '_', name).strip('_')}.json"
         file.write_text(json.dumps(made, indent=1) + "\n")

@@ -144,7 +144,7 @@ def sensors(p: Params) -> Sensors:
         gnss_drift_time=float(p.get("drift_time_s", noise.gnss_drift_time)),
         heading_std=np.deg2rad(float(p.get("heading_std_deg", 0.0))),
         heading_bias_std=np.deg2rad(float(p.get("heading_bias_deg", 0.0))),
-        outliers=Outliers.named(str(p.get("outliers", ""))),
+        outliers=Outliers.named(str(p["outliers"])) if p.get("outliers") else None,
     )
 
 
@@ -192,7 +192,7 @@ def heading(p: Params) -> str:
     low, high = noise.gnss_bias
     bias = f", bias U[{low:g}, {high:g}] m per run and axis" if high else ""
     near = f", {relative(noise)}, radius {p['radius_m']:g} m" if "radius_m" in p else ""
-    wrong = "".join(f", {note}" for note in noise.outliers.notes)
+    wrong = "".join(f", {note}" for note in noise.outliers.notes) if noise.outliers else ""
     return (
         f"Scenario {p['scenario']}: GNSS {noise.fix_std[0]:.3g} m per axis{bias}, velocity "
         f"{100 * noise.velocity_std_ratio:g} % (per {p['velocity_reading']}){near}{wrong}, {begin}"
@@ -285,21 +285,23 @@ def recording(p: Params) -> Recording:
 
 def told(p: Params) -> Recording | None:
     """The same without outliers and false fixes, as of an estimator which is told of them; None if there are none."""
-    return _attacked(p, told=True) if sensors(p).outliers.notes or attacking(p).share else None
+    return _attacked(p, told=True) if sensors(p).outliers or attacking(p) else None
 
 
 def _attacked(p: Params, told: bool) -> Recording:
     who, attack = egos(p["data"], str(p["egos"])), attacking(p)
     observers = None if needs_whole_fleet(str(p.get("method"))) else who
     drawn = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers, told)
-    return spoofed(drawn, attack, seed=int(p["seed"]), honest=who, told=told) if attack.share else drawn
+    return spoofed(drawn, attack, seed=int(p["seed"]), honest=who, told=told) if attack else drawn
 
 
-def attacking(p: Params) -> Spoofing:
-    """The attack of the cell; a share of 0 is none."""
+def attacking(p: Params) -> Spoofing | None:
+    """The attack of the cell, if there is one."""
+    if not (share := float(p.get("spoofed_share", 0.0))):
+        return None
     start, ramp = (float(p.get(name, 0.0)) for name in ("spoofed_from_s", "spoofed_ramp_s"))
     collude = bool(p.get("spoofed_collude", False))
-    return Spoofing(float(p.get("spoofed_share", 0.0)), start=start, ramp=ramp, collude=collude)
+    return Spoofing(share, start=start, ramp=ramp, collude=collude)
 
 
 def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:

@@ -115,7 +115,7 @@ def bound(task: Task, information: str) -> float:
     """
     fleet, sensors = load_fleet(task.data), replace(task.sensors, gnss_bias=(0.0, 0.0))
     v2x = V2X(max_neighbours=task.v2x.max_neighbours, radius=task.v2x.radius)
-    wrong = bool(sensors.outliers.notes or task.attack.share)
+    wrong = bool(sensors.outliers or task.attack.share)
     runs = FEW if information in ("past", "fleet") else task.runs
     told = recording(replace(task, v2x=v2x, runs=runs), information == "fleet", told=True)[0] if wrong else None
     if information == "fleet":

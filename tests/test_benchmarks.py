@@ -216,6 +216,10 @@ def test_the_cards_method_is_scored_as_by_hand(short: None, tmp_path: Path) -> N
     solo = {row["task"]: row for row in json.loads((tmp_path / "kalman.json").read_text())["tasks"]}
     assert solo["spoofed"]["rt_le_m"] == solo["paper"]["rt_le_m"]
     assert solo["paper"]["received_bytes_per_second"] == 0
+    assert benchmark.benchmark(("kalman",), out=tmp_path, seed=7, tasks=("paper",)) == 0
+    (other,) = json.loads((tmp_path / "seed-7" / "kalman.json").read_text())["tasks"]
+    low, _, high = (abs(value - solo["paper"]["rt_le_m"][0]) for value in other["rt_le_m"])
+    assert 0 < abs(other["rt_le_m"][0] - solo["paper"]["rt_le_m"][0]) < 2 * (low + high)
 
 
 def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(short: None, tmp_path: Path) -> None:

@@ -141,6 +141,7 @@ WRONG = {
         r"fixes travel 0\.4\d times as far.*miles an hour",
     ),
     "positions in feet": (["x", "y"], lambda v: v / 0.3048, r"fixes travel 3\.\d+ times as far"),
+    "positions in km": (["x", "y"], lambda v: v / 1000, r"are positions in km\?"),
     "azimuths clockwise from north": (["azimuth"], lambda v: (np.pi / 2 - v) % (2 * np.pi), r"azimuths miss"),
     "ranges in feet": (["range"], lambda v: v / 0.3048, r"ranges miss the positions by \d+"),
 }
@@ -174,6 +175,7 @@ def test_the_commands_take_a_log_and_options(
     assert status == 0
     assert "not used: 621 relative measurements while one of the two is absent" in out
     assert "check: 9% of what was logged is not used, first of all 621 relative measurements" in out
+    assert re.search(r"car2: .*, longest gap 7\.\d s from [45]\.\d s on", out)
     assert (tmp_path / "a.png").read_bytes().startswith(b"\x89PNG")
     word = f"{folders / 'with'}?dt=0.2&max_gap=10"
     options = ("method=kalman", "max_neighbours=0", "egos=car2")

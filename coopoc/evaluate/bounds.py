@@ -15,9 +15,8 @@ from tqdm import tqdm
 from ..arrays import Bools, Floats, Ints, checked, instance
 from ..errors import InputError
 from ..kernels.stars.messages import FORGOTTEN
-from ..world.axes import columns
 from ..world.body_frames import body_motion, midway, true_heading, turned
-from ..world.fleet import Fleet
+from ..world.fleet import Fleet, columns
 from ..world.links import Links, spherical
 from ..world.recording import Recording
 from ..world.sensing import find_links

@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats, checked, instance, number
+from ..arrays import Floats, check_texts, checked, instance, number, texts
 from ..errors import InputError, suggestion
 from ..kernels.motion import NO_MOTION_NOISE, MotionNoise
 from ..short_repr import short_repr
-from ..world.axes import check_texts, texts
 from ..world.fleet import Fleet
 from ..world.links import vector_cov
 from ..world.recording import Recording, check_recording

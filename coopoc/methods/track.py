@@ -8,10 +8,9 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Floats, checked, number
+from ..arrays import Floats, checked, number, texts
 from ..errors import InputError, shown
 from ..short_repr import short_repr
-from ..world.axes import texts
 from ..world.recording import Recording
 from ..world.sensors import Sensors
 from ..world.v2x import Message

@@ -9,10 +9,10 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, refuse
+from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, refuse, texts
 from ..errors import InputError, shown
 from ..short_repr import short_repr
-from .axes import clock, columns, interval, names, texts
+from .fleet import clock, columns, interval, names
 from .links import Links
 from .sensors import Sensors
 from .v2x import V2X

@@ -10,11 +10,10 @@ import numpy as np
 
 from ..arrays import AnyArray, Bools, Floats, Ints, instance, number, one_of
 from ..errors import InputError
-from .axes import columns
 from .body_frames import body_measurements, body_motion, gauss_markov, in_body
 from .channels import lost
 from .faults import PAIRS, wrong_fixes, wrong_odometry, wrong_relative
-from .fleet import Fleet
+from .fleet import Fleet, columns
 from .links import Links, spherical, wrap
 from .recording import Recording
 from .sensors import Sensors, stream
@@ -95,9 +94,11 @@ def observe(
         velocity = _once(("velocity", *key), lambda: _velocity(*drawn))
     else:
         velocity, body = body_measurements(fleet, sensors, runs, seed)
-        wrong_odometry(velocity, body_motion(fleet)[0], fleet, sensors.outliers, seed, told)
+        if sensors.outliers:
+            wrong_odometry(velocity, body_motion(fleet)[0], fleet, sensors.outliers, seed, told)
         relative = in_body(relative, fleet, links, _heading(fleet, links, sensors, runs, seed))
-    notes = tuple(f"{note}{', removed' * told}" for note in sensors.outliers.notes)
+    wrong = sensors.outliers.notes if sensors.outliers else ()
+    notes = tuple(f"{note}{', removed' * told}" for note in wrong)
     return Recording(
         ids=fleet.ids,
         t=fleet.t,
@@ -214,13 +215,15 @@ def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int, told: bool) -> F
             if std > 0:  # the common error belongs to no vehicle
                 draws = [stream(seed, "gnss_drift", r, name).standard_normal((len(fleet.t), 3)) for name in names]
                 fixes[r] += std * gauss_markov(np.stack(draws, axis=1), fleet.dt / sensors.gnss_drift_time)
-    wrong_fixes(fixes, fleet, sensors.outliers, seed, told)
+    if sensors.outliers:
+        wrong_fixes(fixes, fleet, sensors.outliers, seed, told)
     return fixes
 
 
 def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int, told: bool) -> Floats:
     velocity = _noisy(fleet, "velocity", runs, seed, fleet.velocity, sensors.velocity_std(fleet.velocity))
-    wrong_odometry(velocity, fleet.velocity, fleet, sensors.outliers, seed, told)
+    if sensors.outliers:
+        wrong_odometry(velocity, fleet.velocity, fleet, sensors.outliers, seed, told)
     return velocity
 
 
@@ -250,8 +253,9 @@ def _relative_measurements(
         relative[r] += exact
         relative[r, :, 0] = np.abs(relative[r, :, 0])
         relative[r, :, 1] = wrap(relative[r, :, 1] + turned[r])
-    reach = sensors.min_range, v2x.radius
-    wrong_relative(relative, pairs, fleet, links, sensors.outliers, reach, seed, told)
+    if sensors.outliers:
+        reach = sensors.min_range, v2x.radius
+        wrong_relative(relative, pairs, fleet, links, sensors.outliers, reach, seed, told)
     return relative
 
 

@@ -67,7 +67,7 @@ class Sensors:
     """s, correlation time of these two (Gauss-Markov); the default is one draw for a whole run."""
     min_range: float = 2.0
     """m, centres closer than a vehicle is wide are not measured (a range near zero makes angles seem exact)."""
-    outliers: Outliers = Outliers()
+    outliers: Outliers | None = None
     """What goes wrong beyond noise. It acts; what methods assume has none unless you say so."""
 
     def __post_init__(self) -> None:
@@ -78,7 +78,8 @@ class Sensors:
             if name in words:
                 one_of(name, value, words[name])
             elif name == "outliers":
-                instance(name, value, Outliers, "Give Outliers(ranges=Fault(0.05, (3.0, 20.0))).")
+                if value is not None:
+                    instance(name, value, Outliers, "Give Outliers(ranges=Fault(0.05, (3.0, 20.0))).")
             elif isinstance(field.default, bool):
                 if not isinstance(value, bool):
                     raise InputError(name, shown(value), "must be True or False", "Say whether there is one.")
@@ -136,7 +137,7 @@ class Sensors:
 
     def known(self) -> Sensors:
         """The same sensors as a method may know them: it knows neither the bias nor the outliers."""
-        return replace(self, gnss_bias=(0.0, 0.0), outliers=Outliers())
+        return replace(self, gnss_bias=(0.0, 0.0), outliers=None)
 
     def check_assumed(self) -> Sensors:
         """Itself, if a method may assume it; InputError where an assumed std is zero."""

@@ -130,7 +130,7 @@ def digest(recording: Recording) -> str:
 
 def _recording(words: dict[str, Any], arrays: dict[str, Any]) -> tuple[Recording, Fleet | None]:
     noise: dict[str, Any] = {name: tuple(v) if isinstance(v, list) else v for name, v in words["sensors"].items()}
-    if "outliers" in noise:
+    if noise.get("outliers"):
         noise["outliers"] = Outliers(**{kind: Fault(**fault) for kind, fault in noise["outliers"].items()})
     ids, t = tuple(words["ids"]), arrays["t"]
     recording = Recording(

@@ -7,8 +7,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from ..arrays import AnyArray, number, one_of
-from ..world.axes import check_texts
+from ..arrays import AnyArray, check_texts, number, one_of
 
 Schedule = Literal["nearest", "round robin"]
 

@@ -43,7 +43,7 @@ HINTS = {
 }
 """What to look for where measurements of a kind miss the positions."""
 MISTAKEN = (
-    (0.0, 3e-3, "Is t in ms, or finer? Divide it: stamps are in s."),
+    (-1.0, 3e-3, "Is t in ms, or finer, or are positions in km? Divide it: stamps are in s, positions in m."),
     (0.2, 0.4, "Is speed in km/h? Name it speed_kmh. Or in feet a second? Speeds are in m/s."),
     (0.42, 0.55, "Is speed in miles an hour, or in knots? Speeds are in m/s."),
     (3.0, 3.6, "Are positions in feet? They are in m."),
@@ -326,7 +326,8 @@ def _of_rows(c: Check) -> list[str]:
         )
     columns = [what for what in summary.unused if ": column " in what]
     if columns:
-        sentences.append(f"not read: {'; '.join(columns)}. Name what is meant with columns= or kinds=.")
+        truth = " A truth is another table: truth=FILE." * any("tru" in what or "gt" in what for what in columns)
+        sentences.append(f"not read: {'; '.join(columns)}. Name what is meant with columns= or kinds=.{truth}")
     return sentences
 
 
@@ -355,7 +356,7 @@ def _of_vehicles(c: Check) -> list[str]:
             continue
         if distance is not None and not 0.8 <= distance <= 1.25:
             unit = next((hint for low, high, hint in MISTAKEN if low < distance < high), "Check the units of both.")
-            sentences.append(f"{name}: fixes travel {distance:.2f} times as far as the odometry says. {unit}")
+            sentences.append(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
         if turn is not None and abs(turn) > 20:
             sentences.append(
                 f"{name}: fixes move {turn:.0f} deg anticlockwise of the odometry. Headings are anticlockwise "

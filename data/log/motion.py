@@ -157,7 +157,7 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
     if fixed.any() or not body:
         summary.refuse(f"steps of {name} before its first fix", int((there & ~fixed).sum()))
         there &= fixed
-    span = "throughout" if there.all() else f"{there.mean():.0%} of the time"
+    span = "throughout" if there.all() else f"{there.mean():.0%} of the time{_longest(there, grid)}"
     text = f"{len(fixes.t)} fixes, {len(signals[0].t)} samples of odometry, {len(measured.t)} headings, {span}"
     absent, compass = np.where(there, 0.0, np.nan), none
     if body:
@@ -212,6 +212,16 @@ def _heading(
 def _ahead(heading: Floats) -> Floats:
     """(M, 3) unit vectors."""
     return np.column_stack([np.cos(heading), np.sin(heading), 0 * heading])
+
+
+def _longest(there: Bools, grid: Floats) -> str:
+    """The longest gap between steps of a member, in words; none of less than a second."""
+    at = np.flatnonzero(there)
+    gaps = np.diff(grid[at])
+    if not len(gaps) or gaps.max() < 1.0:
+        return ""
+    k = int(np.argmax(gaps))
+    return f", longest gap {gaps[k]:.1f} s from {grid[at[k]] - grid[0]:.1f} s on"
 
 
 def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:

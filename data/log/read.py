@@ -10,11 +10,10 @@ from typing import Any, Literal, get_args
 import numpy as np
 import pandas as pd
 
-from coopoc.arrays import Floats, checked, instance, named, number, one_of
+from coopoc.arrays import Floats, checked, instance, named, number, one_of, texts
 from coopoc.errors import InputError, suggestion
 from coopoc.file_names import given_path
 from coopoc.short_repr import short_repr
-from coopoc.world.axes import texts
 from coopoc.world.fleet import Fleet
 from coopoc.world.links import wrap
 from coopoc.world.recording import Body, Recording

@@ -229,8 +229,8 @@ def clients(
     check_pieces(piece, split)
     fleet = instance("fleet", fleet, Fleet)
     sensors = Sensors.paper_training() if sensors is None else instance("sensors", sensors, Sensors)
-    lasting = (sensors.gnss_bias, sensors.gnss_drift_std, sensors.gnss_common_std, sensors.outliers.notes)
-    if noise != "static" and lasting != ((0.0, 0.0), 0.0, 0.0, ()):
+    lasting = (sensors.gnss_bias, sensors.gnss_drift_std, sensors.gnss_common_std, sensors.outliers)
+    if noise != "static" and lasting != ((0.0, 0.0), 0.0, 0.0, None):
         raise InputError(
             "gnss_bias, gnss_drift_std, gnss_common_std, outliers",
             lasting,

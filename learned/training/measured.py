@@ -10,7 +10,7 @@ import torch
 
 from coopoc.arrays import Floats, instance, one_of
 from coopoc.errors import InputError
-from coopoc.world.axes import columns
+from coopoc.world.fleet import columns
 from coopoc.world.recording import Recording
 
 from .clients import LONG, Client, Segments, Start, check_pieces
