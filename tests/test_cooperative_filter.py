@@ -71,7 +71,7 @@ def test_wrong_ranges_cost_little_and_are_named() -> None:
     fleet = drive(300)
     seen = observe(fleet, S2, V2X(6), runs=4, observers=[0])
     wrong = too_long(seen)
-    cases = (CooperativeFilter(), seen), (CooperativeFilter(), wrong), (JointFilter(), wrong)
+    cases = (CooperativeFilter(), seen), (CooperativeFilter(), wrong), (textbook(JointFilter()), wrong)
     clean, robust, joint = (float(rt_le(method(given), fleet).mean()) for method, given in cases)
     assert robust < 1.1 * clean
     assert robust < 0.9 * joint

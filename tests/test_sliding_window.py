@@ -83,7 +83,7 @@ def test_the_horizon_is_at_its_minimum(formation: Fleet) -> None:
     """Independent check: scipy.optimize.least_squares on a drive that the horizon holds whole, from the truth."""
     fleet = formation.select(range(4)).between(0, 6)
     recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
-    track, order = MovingHorizon(horizon=6)(recording, [0]), [0, *recording.links.neighbour[:3]]
+    track, order = textbook(MovingHorizon(horizon=6))(recording, [0]), [0, *recording.links.neighbour[:3]]
     for run in range(2):
         moved = recording.dt * recording.velocity[run][:, order]
         std = recording.dt * S2.assumed_velocity_std(recording.velocity[run][:, order])

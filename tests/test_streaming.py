@@ -140,7 +140,8 @@ def peer(x: Floats, known: NoiseModel) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("start", "near"), [(Kalman(FITTED).start, 1e-9), (partial(StarStream, textbook(JointFilter(FITTED))), 1e-4)]
+    ("start", "near"),
+    [(textbook(Kalman(FITTED)).start, 1e-9), (partial(StarStream, textbook(JointFilter(FITTED))), 1e-4)],
 )
 def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(start: Any, near: float) -> None:
     """filterpy gets a late fix moved by, and with the variance of, the motion since, from the sum of all steps. The

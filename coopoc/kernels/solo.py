@@ -16,7 +16,7 @@ import numpy as np
 from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
 from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
-from .gate import count, inflation
+from .gate import REJECTED, count, inflation
 from .motion import MotionNoise, process_variance
 
 LEAST = 1e-4
@@ -96,7 +96,8 @@ def step(
     """Predict x += dt u, p += q; where there is a fix z, estimate its noise r and update in Joseph's form.
 
     The running mean r <- r + (v^2 - p - r) / n of innovations v (Mehra, IEEE TAC 15(2), 1970) leaves out `late` m^2,
-    what a late fix has more: it and the prediction share the motion since; beyond the gate v is that at the gate.
+    what a late fix has more: it and the prediction share the motion since; a v that is rejected counts as the largest
+    one that is not.
     x += k (z - x), k = p / (p + f r), p = (1 - k)^2 p + k^2 f r.
     """
     (x, share, motion, noise, weight, _), (q, f, hits) = state, gated
@@ -106,7 +107,7 @@ def step(
     p, innovation = share * noise + motion, fix - x
     if math.isfinite(weight):
         weight = min(weight + 1.0, rule.window)
-        within = min(1.0, rule.gate / q) if f > 1.0 else 1.0
+        within = min(1.0, REJECTED * rule.gate / q) if f > 1.0 else 1.0
         noise = max(noise + (within * innovation * innovation - p - noise) / weight, LEAST)
         p = share * noise + motion
     if math.isinf(f):
@@ -120,7 +121,7 @@ def step(
 
 @compiled
 def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, index: Ints, x: Floats, p: Floats) -> Floats:
-    """Fill x m and p m^2 of the vehicles, and return the estimated variance of a fix at each step, if it is estimated.
+    """Fill x m and p m^2 of the vehicles, and return the variance of each fix, where it is estimated or gated.
 
     A vehicle that was absent starts at its first fix.
 
@@ -134,7 +135,8 @@ def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, index: Ints,
     """
     runs, steps, vehicles = seen.gnss.shape[0], seen.gnss.shape[1], len(seen.columns)
     adaptive = math.isfinite(rule.weight)
-    noise, states = np.empty(x.shape if adaptive else (0, 0, 0, 3)), np.empty((vehicles, 3, 6))
+    varies = adaptive or rule.gate > 0.0
+    noise, states = np.empty(x.shape if varies else (0, 0, 0, 3)), np.empty((vehicles, 3, 6))
     for run in range(runs):
         for t in range(steps):
             for e in range(vehicles):
@@ -155,8 +157,8 @@ def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, index: Ints,
                         state = step(before, moved[c], q[c], fix[c], 0.0, rule, gated)
                     put(now, state)
                     x[run, t, at, c], p[run, t, at, c] = state[0], state[1] * state[3] + state[2]
-                    if adaptive:
-                        noise[run, t, at, c] = state[3]
+                    if varies:
+                        noise[run, t, at, c] = state[3] if adaptive else state[3] * gated[1]
     return noise
 
 

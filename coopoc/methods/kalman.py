@@ -127,7 +127,7 @@ class AdaptiveKalman:
         prior_weight: fixes that this start counts for; inf keeps it for ever.
         x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
         window: fixes; inf never forgets.
-        robust: as of `Kalman`; a fix beyond the gate counts in the estimate of r as one at the gate.
+        robust: as of `Kalman`; a fix that is rejected counts in the estimate of r as the worst that is not.
 
     References:
         Mehra, IEEE TAC 15(2) 1970; Mohamed and Schwarz, Journal of Geodesy 73, 1999. Defaults were chosen on
@@ -220,8 +220,8 @@ def solo_filter(
         in_place: leave the vehicles at their columns among all N; of others nothing is written.
 
     Returns:
-        Position m, variance m^2, and estimated variance of a fix m^2 (of no length where it is known), (R, T, E, 3) or
-        (R, T, N, 3).
+        Position m, variance m^2, and variance of each fix m^2 where it is estimated or gated (else of no length),
+        (R, T, E, 3) or (R, T, N, 3).
 
     Raises:
         InputError: x0 of another shape.

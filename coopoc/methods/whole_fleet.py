@@ -14,6 +14,7 @@ from ..world.exchange import Exchange, exchange
 from ..world.recording import Recording, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 from .egos import contradicted
+from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel, resolve
 from .track import Method, Track
 
@@ -131,11 +132,14 @@ def kernel_arguments(
     pairs = Pairs(first, second, link, link_back, start, np.ascontiguousarray(both & (arrival >= 0)))
     relative = components(recording.relative, np.arange(len(recording.links)))
     relative = np.concatenate([relative, np.ones((*relative.shape[:2], 3))], axis=2)
-    variances = model.process_variance(recording), model.fix_variance(recording)
-    process, fix = (np.ascontiguousarray(variance, dtype=float) for variance in variances)
+    process, fix = model.process_variance(recording), model.fix_variance(recording)
+    if robust := robust and model.exact_relative:
+        vehicles = range(len(recording.ids))
+        fix = fix / model.gnss_variance * solo_filter(recording, vehicles, model, fix_noise(model, robust))[2]
+    process, fix = (np.ascontiguousarray(variance, dtype=float) for variance in (process, fix))
     std, min_range = (model.sensors.relative_std, model.sensors.min_range) if model.sensors else (np.zeros(0), 0.0)
     measured = Measured(recording.gnss, recording.velocity, relative, active, recording.dt)
-    return measured, pairs, Assumed(process, fix, std, min_range, robust and model.exact_relative)
+    return measured, pairs, Assumed(process, fix, std, min_range, robust)
 
 
 def located(recording: Recording) -> Bools:

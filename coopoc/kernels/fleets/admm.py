@@ -68,7 +68,7 @@ def run_filter(
     x, cov = np.empty((runs, steps, 3 * n)), np.zeros((runs, steps, 9 * n))
     z, own, own_dual, outer = np.zeros(3 * n), np.zeros(3 * n), np.zeros(3 * n), np.zeros(9 * n)
     copies, dual, inner = np.zeros(len(edges.eta)), np.zeros(len(edges.eta)), np.zeros(len(edges.information))
-    state, covariance = Consensus(z, own, own_dual, outer, np.zeros(n), copies, dual, inner), np.zeros(10 * n)
+    state, covariance = Consensus(z, own, own_dual, outer, np.zeros(n), copies, dual, inner), np.zeros(9 * n)
     for run in range(runs):
         for t in range(steps):
             advance(run, t, x[run], covariance, measured, assumed)

@@ -42,7 +42,7 @@ def run_filter(
     """
     runs, steps, vehicles = measured.active.shape
     x, cov = np.empty((runs, steps, 3 * vehicles)), np.zeros((runs, steps, 9 * vehicles))
-    own, prior = np.zeros(10 * vehicles), np.zeros(9 * vehicles)
+    own, prior = np.zeros(9 * vehicles), np.zeros(9 * vehicles)
     messages = Gaussians(np.zeros(len(edges.information)), np.zeros(len(edges.eta)))
     beliefs = Gaussians(np.zeros(9 * vehicles), np.zeros(3 * vehicles))
     for run in range(runs):

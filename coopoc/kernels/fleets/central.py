@@ -9,7 +9,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
 from ..compiling.small import add, from_upper, load, store, subtract
-from .graph import MATRIX, VECTOR, Assumed, Matrix, Measured, Pairs, at, connect, fix_inflation, pair_at_agreement
+from .graph import MATRIX, VECTOR, Assumed, Matrix, Measured, Pairs, at, connect, pair_at_agreement
 
 UNKNOWN = 1e6
 """m^2, variance of a vehicle before its first fix, where relative measurements are linearised."""
@@ -29,7 +29,7 @@ def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed) -> tuple[Floa
     """
     runs, steps, n = measured.active.shape
     x, cov = np.full((runs, steps, n, 3), np.nan), np.full((runs, steps, n, 3, 3), np.nan)
-    P, label, hits = np.zeros((3 * n, 3 * n)), np.arange(n), np.zeros(n)
+    P, label = np.zeros((3 * n, 3 * n)), np.arange(n)
     active, present, alive = measured.active[0], np.zeros(n, np.bool_), pairs.alive[0]
     for t in range(steps):
         predict(measured, assumed, t, present, x, P)
@@ -47,7 +47,7 @@ def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed) -> tuple[Floa
                     store(total[run], i, subtract(load(total[run], i, VECTOR), eta))
                     store(total[run], j, add(load(total[run], j, VECTOR), eta))
         B = np.eye(3 * n)
-        add_fixes(measured, assumed, t, present, x, P, B, total, hits)
+        add_fixes(measured, assumed, t, present, x, P, B, total)
         for k in range(pairs.start[t], pairs.start[t + 1]):
             if alive[k]:
                 add_pair(pairs.first[k], pairs.second[k], load(information[k - pairs.start[t]], 0, MATRIX), P, B)
@@ -96,37 +96,20 @@ def entry(P: Floats, i: int, j: int, c: int, d: int) -> float:
 
 @part
 def add_fixes(
-    measured: Measured,
-    assumed: Assumed,
-    t: int,
-    before: Bools,
-    x: Floats,
-    P: Floats,
-    B: Floats,
-    total: Floats,
-    hits: Floats,
+    measured: Measured, assumed: Assumed, t: int, before: Bools, x: Floats, P: Floats, B: Floats, total: Floats
 ) -> None:
-    """B += F P and the information vectors of the fixes; a vehicle that joins has the covariance of its own.
-
-    Runs share their covariance only where nothing is gated.
-    """
+    """B += F P and the information vectors of the fixes; a vehicle that joins has the covariance of its own."""
     for n in range(x.shape[2]):
-        noise, fix, share = at(assumed.fix, 0, t, n), measured.gnss[0, t, n], 1.0
-        if not before[n]:
-            hits[n] = 0.0
-        elif measured.active[0, t, n]:
-            a, b, c = 3 * n, 3 * n + 1, 3 * n + 2
-            own = from_upper((P[a, a], P[a, b], P[a, c], P[b, b], P[b, c], P[c, c]))
-            share = fix_inflation(load(x[0, t, n], 0, VECTOR), own, hits, 0, t, n, measured, assumed)
+        noise, fix = at(assumed.fix, 0, t, n), measured.gnss[0, t, n]
         for c in range(3 if measured.active[0, t, n] else 0):
             row = 3 * n + c
             if not before[n]:
                 P[row, row] = noise[c]
             elif not math.isnan(fix[c]):
                 for d in range(len(P)):
-                    B[row, d] += P[row, d] / (share * noise[c])
+                    B[row, d] += P[row, d] / noise[c]
                 for run in range(len(x)):
-                    total[run, row] += (measured.gnss[run, t, n, c] - x[run, t, n, c]) / (share * noise[c])
+                    total[run, row] += (measured.gnss[run, t, n, c] - x[run, t, n, c]) / noise[c]
 
 
 @part

@@ -13,8 +13,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, inner, part, storage
-from ..compiling.small import add, add_diagonal, apply, from_upper, load, plus_applied, scale, store, subtract
-from ..gate import FIX_GATE, count, distance, gain_of, inflation
+from ..compiling.small import add, apply, from_upper, load, plus_applied, scale, store, subtract
 from ..stars.gated import gate_components
 from ..stars.relative import Numbers, completed, exact, gram
 
@@ -25,7 +24,7 @@ Information = tuple[Matrix, Vector]
 VECTOR: Vector = (0.0, 0.0, 0.0)
 MATRIX: Matrix = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Their lengths are the counts that `load` takes."""
-SEEN, FIVE, NO_HITS = (0.0,) * 8, (0.0,) * 5, (0.0,) * 4
+SEEN, FIVE = (0.0,) * 8, (0.0,) * 5
 UNIT: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -73,10 +72,10 @@ class Assumed(NamedTuple):
 
     Attributes:
         process: broadcastable to (R, T, N, 3) m^2, variance of the motion.
-        fix: broadcastable to (R, T, N, 3) m^2, variance of a fix.
+        fix: broadcastable to (R, T, N, 3) m^2, variance of a fix, infinite for one that is rejected.
         std: (3,) m, rad, rad of a relative measurement; of no length for vectors of unit covariance.
         min_range: m, angles are no more certain than at this range.
-        robust: gate innovations.
+        robust: gate relative measurements.
     """
 
     process: Floats
@@ -128,15 +127,12 @@ def copy(source: Floats, target: Floats, count: int) -> None:
 
 
 @part
-def correct(
-    x: Floats, cov: Floats, hits: Floats, run: int, t: int, n: int, measured: Measured, assumed: Assumed
-) -> None:
+def correct(x: Floats, cov: Floats, run: int, t: int, n: int, measured: Measured, assumed: Assumed) -> None:
     """One Kalman step of vehicle n alone, in place: x += dt u, P += Q, then one update per axis that was measured.
 
     Args:
         x: (3 N) m.
         cov: (9 N) m^2.
-        hits: (N) of fixes.
         run: of the measurements.
         t: step.
         n: column.
@@ -148,31 +144,15 @@ def correct(
     for c in range(3):
         x[a + c] += measured.dt * u[c]
         cov[b + 4 * c] += q[c]
-    share = fix_inflation(load(x, n, VECTOR), load(cov, n, MATRIX), hits, run, t, n, measured, assumed)
     for c in range(3):
-        if not math.isnan(z[c]) and math.isfinite(share):
+        if not math.isnan(z[c]):
             row, innovation = load(cov, 3 * n + c, VECTOR), z[c] - x[a + c]
-            total = row[c] + share * r[c]
+            total = row[c] + r[c]
             for i in range(3):
                 gain = row[i] / total
                 x[a + i] += gain * innovation
                 for j in range(3):
                     cov[b + 3 * i + j] -= gain * row[j]
-
-
-@part
-def fix_inflation(
-    x: Vector, cov: Matrix, hits: Floats, run: int, t: int, n: int, measured: Measured, assumed: Assumed
-) -> float:
-    """By how much the variance of a fix grows that is beyond its gate at the prediction; 1 within it."""
-    z, r = measured.gnss[run, t, n], at(assumed.fix, run, t, n)
-    if not assumed.robust or math.isnan(z[0] + z[1] + z[2]):
-        return 1.0
-    noise = r[0], r[1], r[2]
-    q = distance((z[0] - x[0], z[1] - x[1], z[2] - x[2]), add_diagonal(cov, noise))
-    share = inflation(q, FIX_GATE, hits[n])
-    hits[n] = count(q, FIX_GATE, hits[n], gain_of(cov, noise))
-    return share
 
 
 @part
@@ -186,28 +166,22 @@ def begin_at_fix(x: Floats, cov: Floats, run: int, t: int, n: int, measured: Mea
 
 @part
 def advance(run: int, t: int, x: Floats, own: Floats, measured: Measured, assumed: Assumed) -> None:
-    """Positions x[t] (3 N) m and covariances own (9 N) m^2 of each vehicle from its own sensors; NaN m if inactive.
-
-    Behind the covariances are the hits of N vehicles' fixes.
-    """
-    vehicles = measured.active.shape[2]
-    hits = own[9 * vehicles :]
-    for n in range(vehicles):
+    """Positions x[t] (3 N) m and covariances own (9 N) m^2 of each vehicle from its own sensors; NaN m if inactive."""
+    for n in range(measured.active.shape[2]):
         if not measured.active[run, t, n]:
             store(x[t], n, (math.nan, math.nan, math.nan))
         elif t > 0 and measured.active[run, t - 1, n]:
             store(x[t], n, load(x[t - 1], n, VECTOR))
-            correct(x[t], own, hits, run, t, n, measured, assumed)
+            correct(x[t], own, run, t, n, measured, assumed)
         else:
             begin_at_fix(x[t], own, run, t, n, measured, assumed)
-            hits[n] = 0.0
 
 
 @compiled
 def own_filters(measured: Measured, assumed: Assumed) -> Floats:
     """Positions (R, T, 3 N) m of each vehicle's own filter, NaN where inactive."""
     runs, steps, vehicles = measured.active.shape
-    x, own = np.empty((runs, steps, 3 * vehicles)), np.zeros(10 * vehicles)
+    x, own = np.empty((runs, steps, 3 * vehicles)), np.zeros(9 * vehicles)
     for run in range(runs):
         for t in range(steps):
             advance(run, t, x[run], own, measured, assumed)
@@ -268,7 +242,7 @@ def gate_pair(vector: Vector, cov: Matrix, k: int, pairs: Pairs, relative: Float
         if link >= 0:
             s, there = assumed.std, scale(vector, sign)
             seen, std = filled(load(relative[link], 0, FIVE), there, (s[0], s[1], s[2]))
-            _, _, factor, _ = gate_components(there, cov, seen, std, NO_HITS, assumed.min_range)
+            _, _, factor, _ = gate_components(there, cov, seen, std, VECTOR, assumed.min_range)
             for c in range(3):
                 relative[link, 5 + c] = factor[c]
 
@@ -405,7 +379,7 @@ def fuse_delayed(latest: Ints, x: Floats, cov: Floats, measured: Measured, assum
     Returns:
         Positions (R, T, 3 N) m and covariances (R, T, 9 N) m^2.
     """
-    now, covariance, hits = np.empty_like(x), np.zeros_like(cov), np.zeros(latest.shape[2])
+    now, covariance = np.empty_like(x), np.zeros_like(cov)
     for run in range(x.shape[0]):
         for t in range(x.shape[1]):
             for n in range(latest.shape[2]):
@@ -421,7 +395,7 @@ def fuse_delayed(latest: Ints, x: Floats, cov: Floats, measured: Measured, assum
                     store(now[run, t], n, load(now[run, t - 1], n, VECTOR))
                     store(covariance[run, t], n, load(covariance[run, t - 1], n, MATRIX))
                 for u in range(last + 1, t + 1):
-                    correct(now[run, t], covariance[run, t], hits, run, u, n, measured, assumed)
+                    correct(now[run, t], covariance[run, t], run, u, n, measured, assumed)
     return now, covariance
 
 

@@ -18,13 +18,12 @@ from scipy.linalg.lapack import dpotrf, dpotri
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled
 from ..compiling.small import add_diagonal, load, store, subtract
-from ..gate import FIX_GATE, REJECTED
 from .graph import MATRIX, VECTOR, Assumed, Measured, Pairs, gate_pair, pair
 
 HARD = 1e7
 """Weight of the motion over that of a fix beyond which D - D S^-1 D loses its digits."""
-SLACK = 0.25
-"""Variance of the vehicles' own filters over that of a fix, where the weights are set first."""
+SLACK = 0.5
+"""Variance of the difference of two own filters over that of a fix, where the weights are set first."""
 EXTRA, HALVINGS = 20, 12
 """Sweeps beyond the asked ones while steps must be shortened, and how often one is halved."""
 
@@ -92,12 +91,11 @@ def smooth(
     Raises:
         numpy.linalg.LinAlgError: a number is not finite.
     """
-    sweeps, whole, last, given = 0, False, np.inf, factors
+    sweeps, whole, last = 0, False, np.inf
+    slack = SLACK / float(factors.fix_weight[factors.fix_weight > 0].mean())
     while True:
-        if given.assumed.robust and sweeps <= steps:
-            factors = reweighted(x, given, SLACK if sweeps == 0 else 0.0)
         moving, before = motions(x, factors), x
-        weight, eta = linearise(x, factors, sweeps == 0)
+        weight, eta = linearise(x, factors, sweeps == 0, sweeps <= steps, slack if sweeps == 0 else 0.0)
         vectors = [row[there].ravel() for row, there in zip(sum_vectors(x, factors, eta), factors.active, strict=True)]
         if sweeps <= steps or not whole:
             eliminated, inverses = moving, eliminate(factors, weight, moving, vectors, tick)
@@ -116,33 +114,6 @@ def smooth(
             return x, marginals(x, factors.active, eliminated, inverses), small
         if whole or size == np.inf:
             last = size
-
-
-def reweighted(x: Floats, factors: RunFactors, slack: float) -> RunFactors:
-    """Weights by the distance of each measurement from positions (T, N, 3) m, gated.
-
-    Args:
-        x: the positions.
-        factors: whose relative measurements' are overwritten.
-        slack: variance of a position over that of a fix.
-    """
-    weight = factors.fix_weight
-    q = np.nansum(weight * (factors.fix - x) ** 2, axis=-1, keepdims=True) / (1.0 + slack)
-    share = np.where(q > REJECTED * FIX_GATE, np.inf, np.maximum(q / FIX_GATE, 1.0))
-    gate_pairs(x, factors, 2.0 * slack / float(weight[weight > 0].mean()))
-    return factors._replace(fix_weight=weight / share)
-
-
-@compiled
-def gate_pairs(x: Floats, factors: RunFactors, variance: float) -> None:
-    """Factors of the standard deviations of what pairs measured at positions (T, N, 3) m, whose differences have this
-    variance m^2."""
-    pairs, cov = factors.pairs, add_diagonal(MATRIX, (variance, variance, variance))
-    for t in range(len(x)):
-        for k in range(pairs.start[t], pairs.start[t + 1]):
-            if pairs.alive[0, k]:
-                vector = subtract(load(x[t, pairs.second[k]], 0, VECTOR), load(x[t, pairs.first[k]], 0, VECTOR))
-                gate_pair(vector, cov, k, pairs, factors.relative, factors.assumed)
 
 
 def descended(before: Floats, after: Floats, factors: RunFactors) -> tuple[Floats, bool]:
@@ -280,14 +251,24 @@ def cholesky(matrix: Floats) -> Floats:
 
 
 @compiled
-def linearise(x: Floats, factors: RunFactors, converted: bool) -> tuple[Floats, Floats]:
-    """Information (9 P) of each pair and its information vector (P, 3) at positions (T, N, 3) m."""
-    pairs = factors.pairs
+def linearise(x: Floats, factors: RunFactors, converted: bool, gates: bool, variance: float) -> tuple[Floats, Floats]:
+    """Information (9 P) of each pair and its information vector (P, 3) at positions (T, N, 3) m.
+
+    Args:
+        x: m.
+        factors: of the run.
+        converted: measurements linear in the vector.
+        gates: set the factors of their deviations, if robust.
+        variance: m^2, of the difference of two positions, for gates.
+    """
+    pairs, cov = factors.pairs, add_diagonal(MATRIX, (variance, variance, variance))
     weight, eta = np.zeros(9 * len(pairs.first)), np.zeros((len(pairs.first), 3))
     for t in range(len(x)):
         for k in range(pairs.start[t], pairs.start[t + 1]):
             if pairs.alive[0, k]:
                 vector = subtract(load(x[t, pairs.second[k]], 0, VECTOR), load(x[t, pairs.first[k]], 0, VECTOR))
+                if gates and factors.assumed.robust:
+                    gate_pair(vector, cov, k, pairs, factors.relative, factors.assumed)
                 information, pair_eta = pair(vector, k, pairs, factors.relative, factors.assumed, converted)
                 store(weight, k, information)
                 store(eta[k], 0, pair_eta)

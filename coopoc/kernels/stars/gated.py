@@ -8,121 +8,86 @@ a gate is never tighter than that of the exact innovation.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, add_diagonal, choose_each, load, scale, store, subtract, zeros
-from ..compiling.vectors import LANES, choose
-from ..gate import FIX_GATE, PATIENCE, count, distance, gain_of, gated_update, inflation
-from .messages import BLOCK, POSITION, PROCESS, RELATIVE, ROW, VARIANCE, Star
-from .relative import Numbers, angle, incomplete, vector
+from ..compiling.vectors import LANES
+from ..gate import FIX_GATE, count, distance, gain_of, gated_update, inflation
+from .messages import POSITION, PROCESS, RELATIVE, ROW, VARIANCE, Star
+from .relative import Numbers, angle, incomplete
 
-HITS = (0.0,) * 4
+STATE = (0.0,) * 13
 
 
 class Gates(NamedTuple):
     """What the gates of a star remember; arrays are (., LANES).
 
     Attributes:
-        cov: (9 most,) m^2, bound of the covariance of each member's vector from the ego; of the ego, its covariance.
-        hits: (4 most,) of `coopoc.kernels.gate`, of range, azimuth, inclination and position.
-        last_cov: of the last star.
-        last_hits: of the last star.
+        state: (13 most,) of each member 9 m^2, the bound of the covariance of its vector from the ego (of the ego, its
+            covariance), and the hits of range, azimuth, inclination and position.
+        last: of the last star.
     """
 
-    cov: Floats
-    hits: Floats
-    last_cov: Floats
-    last_hits: Floats
+    state: Floats
+    last: Floats
 
 
 @storage
 def gates_within(most: int) -> Gates:
     """Room for `most` members."""
-    a, b = 9 * most, 4 * most
-    return Gates(np.zeros((a, LANES)), np.zeros((b, LANES)), np.zeros((a, LANES)), np.zeros((b, LANES)))
-
-
-def new_gates(most: int) -> Gates:
-    """The same, made by Python."""
-    plain: Any = gates_within
-    return cast(Gates, plain.py_func(most))
+    return Gates(np.zeros((13 * most, LANES)), np.zeros((13 * most, LANES)))
 
 
 @inner
 def carry(star: Star, gates: Gates, flat: float, n: int, old: int) -> None:
-    """Bring the bounds forward to this star. A member one of whose components has PATIENCE hits may be elsewhere: it is
-    forgotten, with `flat` m^2 as variance of its motion."""
+    """Bring what is remembered forward to this star; `flat` m^2 is the variance of a member that joins."""
     for k in range(old):
-        store(gates.last_cov, k, load(gates.cov, k, BLOCK))
-        store(gates.last_hits, k, load(gates.hits, k, HITS))
+        store(gates.last, k, load(gates.state, k, STATE))
     own = load(star.motion, PROCESS, ROW)
-    o = 0.0 * own[0]
-    forgotten, nothing = (o + flat, o + flat, o + flat), zeros(o, ROW)
     for k in range(n):
         place, process = star.previous[k], load(star.motion, 4 * k + PROCESS, ROW)
-        cov, hits = add_diagonal(zeros(o, BLOCK), forgotten), zeros(o, HITS)
-        if place >= 0:
-            hits = load(gates.last_hits, place, HITS)
-            if k > 0:
-                lost = max(max(hits[0], hits[1]), hits[2]) - PATIENCE
-                process = choose_each(lost, forgotten, process)
-                hits = choose_each(lost, zeros(o, HITS), hits)
-                store(star.motion, 4 * k + PROCESS, process)
-            cov = add_diagonal(load(gates.last_cov, place, BLOCK), add(process, own if k > 0 else nothing))
-        store(gates.cov, k, cov)
-        store(gates.hits, k, hits)
+        before = load(gates.last, max(place, 0), STATE)
+        if place < 0:
+            before, process = zeros(own[0], STATE), (0.0 * own[0] + flat, 0.0 * own[0] + flat, 0.0 * own[0] + flat)
+        elif k > 0:
+            process = add(process, own)
+        store(gates.state, k, (*add_diagonal(before[:9], process), *before[9:]))
 
 
 @inner
-def gate_star(star: Star, gates: Gates, state: Floats, known: Floats, flat: float, least: float, n: int) -> None:
+def gate_star(star: Star, gates: Gates, state: Floats, known: Floats, least: float, n: int) -> None:
     """Inflate the deviations of relative measurements and the variances of positions that are beyond their gates.
 
     Args:
         star: of this step.
         gates: brought forward.
-        state: (3 n, LANES) m, predicted positions; a member that is forgotten stands where it is measured.
+        state: (3 n, LANES) m, predicted positions.
         known: (n, LANES) 1 where something is known of where a member is, else 0.
-        flat: m^2, variance of one of which nothing is known.
         least: m.
     """
-    origin, own, hits = load(state, 0, ROW), load(gates.cov, 0, BLOCK), load(gates.hits, 0, HITS)
-    store(gates.hits, 0, (hits[0], hits[1], hits[2], gate_position(star, 0, origin, own, hits[3])))
+    origin, ego = load(state, 0, ROW), load(gates.state, 0, STATE)
+    hits = gate_position(star, 0, origin, ego[:9], ego[12])
+    store(gates.state, 0, (*ego[:12], hits))
     for k in range(1, n):
-        at, seen = load(state, k, ROW), load(star.relative, k, RELATIVE)
-        lost = choose(1e300 - (seen[5] + seen[6] + seen[7]), load(gates.cov, k, BLOCK)[0] - 0.5 * flat, 0.0 * at[0])
-        at = choose_each(lost, add(origin, vector(seen)), at)
-        store(state, k, at)
-        moved = gate_relative(star, gates, k, subtract(at, origin), load(known, k, (0.0,))[0], least)
-        gate_position(star, k, add(at, moved), add(own, load(gates.cov, k, BLOCK)), 0.0 * at[0])
+        at, seen, memory = load(state, k, ROW), load(star.relative, k, RELATIVE), load(gates.state, k, STATE)
+        o = 0.0 * at[0]
+        std = seen[5:]
+        if incomplete(seen):
+            std = choose_each(load(known, k, (0.0,))[0] - 0.5, std, (o + math.inf, o + math.inf, o + math.inf))
+        cov, moved, factor, three = gate_components(subtract(at, origin), memory[:9], seen, std, memory[9:12], least)
+        store(gates.state, k, (*cov, *three, o))
+        store(star.relative, k, inflated(seen, factor))
+        gate_position(star, k, add(at, moved), add(ego[:9], cov), o)
 
 
-@inside
-def gate_position(star: Star, k: int, at: Numbers, cov: Numbers, hits: float) -> float:
-    """Inflate the variance of a member's position; the hits that follow. Callers drop those of neighbours: where many
-    are beyond the gate, it is their messages that are wrong."""
-    variance = load(star.motion, 4 * k + VARIANCE, ROW)
-    q = distance(subtract(load(star.motion, 4 * k + POSITION, ROW), at), add_diagonal(cov, variance))
-    store(star.motion, 4 * k + VARIANCE, scale(variance, inflation(q, FIX_GATE, hits)))
-    return count(q, FIX_GATE, hits, gain_of(cov, variance))
-
-
-@inside
-def gate_relative(star: Star, gates: Gates, k: int, gap: Numbers, known: float, least: float) -> Numbers:
-    """How far the relative measurement of member k moves its vector from the ego, m; its bound shrinks."""
-    seen, cov, hits = load(star.relative, k, RELATIVE), load(gates.cov, k, BLOCK), load(gates.hits, k, HITS)
-    o = 0.0 * known
-    std = seen[5], seen[6], seen[7]
-    if incomplete(seen):
-        std = choose_each(known - 0.5, std, (o + math.inf, o + math.inf, o + math.inf))
-    cov, moved, factor, hits = gate_components(gap, cov, seen, std, hits, least)
-    store(gates.cov, k, cov)
-    store(gates.hits, k, hits)
-    store(star.relative, k, inflated(seen, factor))
-    return moved
+@inner
+def set_ego(gates: Gates, cov: Numbers) -> None:
+    """Remember the ego's covariance m^2."""
+    store(gates.state, 0, (*cov, *load(gates.state, 0, STATE)[9:]))
 
 
 @inside
@@ -130,6 +95,16 @@ def inflated(seen: Numbers, factor: Numbers) -> Numbers:
     """A measurement, its standard deviations times three factors."""
     a, b, c = factor
     return seen[0], seen[1], seen[2], seen[3], seen[4], a * seen[5], b * seen[6], c * seen[7]
+
+
+@inner
+def gate_position(star: Star, k: int, at: Numbers, cov: Numbers, hits: float) -> float:
+    """Inflate the variance of a member's position; the hits that follow. Callers drop those of neighbours: where many
+    are beyond the gate, it is their messages that are wrong."""
+    variance = load(star.motion, 4 * k + VARIANCE, ROW)
+    q = distance(subtract(load(star.motion, 4 * k + POSITION, ROW), at), add_diagonal(cov, variance))
+    store(star.motion, 4 * k + VARIANCE, scale(variance, inflation(q, FIX_GATE, hits)))
+    return count(q, FIX_GATE, hits, gain_of(cov, variance))
 
 
 @inner
@@ -143,7 +118,7 @@ def gate_components(
         cov: (9,) m^2, of it.
         seen: `relative.five`.
         std: m, rad, rad; infinite for what was not measured.
-        hits: (4,) the first three of these components.
+        hits: (3,) of these components.
         least: m, least distance at which an angle's error counts.
 
     Returns:
@@ -162,4 +137,4 @@ def gate_components(
     cov, moved, f, first = gated_update(cov, zeros(o, ROW), ray, seen[0] - far, a * a, hits[0])
     cov, moved, g, second = gated_update(cov, moved, side, turned * flat, b * b, hits[1])
     cov, moved, h, third = gated_update(cov, moved, up, raised * reach, c * c, hits[2])
-    return cov, moved, (math.sqrt(f), math.sqrt(g), math.sqrt(h)), (first, second, third, hits[3])
+    return cov, moved, (math.sqrt(f), math.sqrt(g), math.sqrt(h)), (first, second, third)

@@ -9,7 +9,7 @@ ends with the ego's covariance. A filter calls, step by step, `gather` of `coopo
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -65,43 +65,11 @@ class Joint(NamedTuple):
     stride: int
 
 
-def joint_rows(most: int) -> int:
-    """Rows of memory for `most` members."""
-    return 12 * most + 18 * (most * most + most)
-
-
-joint_size = storage(joint_rows)
-"""The same, for compiled code."""
-
-
-@storage
-def joint_in(memory: Floats, most: int) -> Joint:
-    """A Gaussian of up to `most` members in memory (>= joint_size LANES,)."""
-    size = len(memory) // LANES
-    rows = memory[: size * LANES].reshape((size, LANES))
-    a, b = 3 * most, 9 * most * most
-    return Joint(
-        rows[:a],
-        rows[4 * a : 4 * a + b],
-        rows[4 * a + b : 4 * a + 2 * b],
-        rows[a : 2 * a],
-        rows[2 * a : 3 * a],
-        rows[3 * a : 4 * a],
-        rows[4 * a + 2 * b :],
-        most,
-    )
-
-
 @storage
 def joint_within(most: int) -> Joint:
-    """Room for `most` members, made by compiled code."""
-    return joint_in(np.zeros(joint_size(most) * LANES), most)
-
-
-def new_joint(most: int, memory: Floats | None = None) -> Joint:
-    """Room for `most` members, or that in memory."""
-    plain: Any = joint_in
-    return cast(Joint, plain.py_func(np.zeros(joint_rows(most) * LANES) if memory is None else memory, most))
+    """Room for `most` members."""
+    a, b = np.zeros((4, 3 * most, LANES)), np.zeros((2, 9 * most * most, LANES))
+    return Joint(a[0], b[0], b[1], a[1], a[2], a[3], np.zeros((18 * most, LANES)), most)
 
 
 @inside

@@ -9,7 +9,7 @@ from ..compiling.compile import as_written, inner
 from ..compiling.small import add, add_diagonal, load, negate, store, subtract, times
 from ..compiling.vectors import LANES
 from .elimination import predict
-from .gated import Gates, carry, gate_star, gates_within
+from .gated import Gates, carry, gate_star, gates_within, set_ego
 from .joint import (
     Joint,
     add_relative,
@@ -88,20 +88,19 @@ def step(
 ) -> None:
     """Predict and update the state of n members, `old` of them before; the ego's covariance is then in `scratch`."""
     flat = 1.0 / known.flat
-    if robust:
-        carry(star, gates, known.flat, n, old)
     predict_state(star, joint, n, old)
     predict(joint.information, old, joint.stride, joint.process, joint.scratch)
     rearrange(star, joint, n, old, (flat, flat, flat))
     place_on_broadcast(star, joint, n)
     if robust:
+        carry(star, gates, known.flat, n, old)
         for k in range(1, n):
             store(joint.move, k, (placed(joint, k, load(star.relative, k, RELATIVE)),))
-        gate_star(star, gates, joint.state, joint.move, known.flat, known.min_range, n)
+        gate_star(star, gates, joint.state, joint.move, known.min_range, n)
     clear(joint.eta)
     add_fixes(star, joint, n)
     update(star, joint, known, refine, n)
-    store(gates.cov, 0, load(joint.scratch, 0, BLOCK))
+    set_ego(gates, load(joint.scratch, 0, BLOCK))
 
 
 @inner

@@ -239,7 +239,7 @@ def add_neighbours(star: Star, known: Assumptions, fusion: Fusion, x: Numbers, n
         noise, theirs, f = one, add_diagonal(zeros(o, BLOCK), variance), o + 1.0
         if fusion.robust:
             ahead = add(own_cov(fusion), theirs)
-            _, _, factor, _ = gate_components(gap, ahead, relative, relative[5:], (o, o, o, o), known.min_range)
+            _, _, factor, _ = gate_components(gap, ahead, relative, relative[5:], (o, o, o), known.min_range)
             relative = inflated(relative, factor)
         if len(known.relative_std):
             std = (relative[5], relative[6], relative[7])

@@ -6,7 +6,7 @@ the next one. LANES runs go side by side.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy import uint64
@@ -29,8 +29,8 @@ from ..compiling.small import (
 from ..compiling.vectors import LANES, choose, put, take
 from ..stars.edges import AT_GAP, EXACT, edge
 from ..stars.elimination import predict
-from ..stars.gated import Gates, carry, gate_position, gate_star, new_gates
-from ..stars.joint import Joint, add_relative, block_of, new_joint, rearrange, solve
+from ..stars.gated import Gates, carry, gate_position, gate_star, gates_within, set_ego
+from ..stars.joint import Joint, add_relative, block_of, joint_within, rearrange, solve
 from ..stars.messages import (
     BLOCK,
     MOVED,
@@ -46,6 +46,7 @@ from ..stars.messages import (
     clear,
     interpret,
     receive,
+    star_within,
 )
 from ..stars.relative import completed, vector
 from .chains import System, advance, gap_of, gauss_newton, new_system
@@ -56,7 +57,6 @@ from .window_layout import (
     enter,
     largest_of,
     motion,
-    new_star,
     new_window,
     row_of,
     star_at,
@@ -105,8 +105,9 @@ def horizons(seen: Measurements, known: Assumptions, arrival: Ints, settings: Se
     (runs, steps), most = seen.gnss.shape[:2], 1 + int(np.diff(seen.start).max(initial=0))
     x, cov = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3))
     estimates = Estimates(x, cov, np.empty((runs, len(seen.neighbour), 3)), np.zeros((runs, steps), np.bool_))
-    window, joint, star = new_window(settings.length, most), new_joint(most), new_star(most)
-    system, gates = new_system(settings.length, most, joint.information), new_gates(most)
+    window, within = new_window(settings.length, most), cast(Any, (joint_within, star_within, gates_within))
+    joint, star, gates = (make.py_func(most) for make in within)
+    system = new_system(settings.length, most, joint.information)
     for first in range(0, runs, LANES):
         here = first, min(first + LANES, runs) - 1
         follow_horizon((window, joint, star, system, gates), seen, known, arrival, settings, here, estimates)
@@ -155,7 +156,7 @@ def follow_horizon(
                 estimates.moving[runs[0] + lane, t] = settings.exact and system.active[lane] > 0.0
             if not any_positive(system.active):
                 break
-        store(gates.cov, 0, negate(load(system.cov, 0, BLOCK)))
+        set_ego(gates, negate(load(system.cov, 0, BLOCK)))
 
 
 @inner
@@ -258,7 +259,7 @@ def gate_step(window: Window, gates: Gates, known: Assumptions, t: int) -> None:
     star, old = star_at(window, t), count_of(window.sizes, t - 1) if t > 0 else 0
     carry(star, gates, known.flat, n, old)
     points, located = window.point[3 * here : 3 * (here + n)], window.located[here : here + n]
-    gate_star(star, gates, points, located, known.flat, known.min_range, n)
+    gate_star(star, gates, points, located, known.min_range, n)
 
 
 @inner
@@ -362,7 +363,7 @@ def gather_arrived(
                 star.status[5 * k + USES, lane] = step - used_since + 1
             interpret(star, known, k, seen.dt)
             if settings.robust and step < now:
-                point, cov = load(window.point, here + k, ROW), load(gates.cov, 0, BLOCK)
+                point, cov = load(window.point, here + k, ROW), load(gates.state, 0, BLOCK)
                 gate_position(star, k, point, scale(cov, 2.0), 0.0 * point[0])
 
 
