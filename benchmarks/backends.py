@@ -15,7 +15,7 @@ from __future__ import annotations
 from typing import Any
 
 import numpy as np
-from backends_gtsam import gtsam_exact, gtsam_linear
+from backends_gtsam import gtsam_linear
 from backends_programmes import casadi_exact, osqp_linear
 from backends_star import Job, one_by_one, star
 from timing import report, timed
@@ -31,7 +31,6 @@ def jobs(runs: int = RUNS) -> list[Job]:
     linear = converted(exact)
     return [
         gtsam_linear(linear),
-        gtsam_exact(exact),
         casadi_exact(exact),
         osqp_linear(linear),
         one_by_one(linear, "converted"),

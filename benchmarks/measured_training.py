@@ -20,7 +20,7 @@ from coopoc.learned.recipes import jobs_of
 from coopoc.learned.train import trained
 from coopoc.methods.track import Method
 
-DT, SCORED, RECIPES = 0.1, 1200, ("okf", "fedkalmannet", "recursive", "cooperative")
+DT, SCORED, RECIPES = 0.1, 1200, ("okf", "fedkalmannet", "road")
 
 
 def drive(seed: int, seconds: int) -> tuple[co.Recording, co.Fleet]:

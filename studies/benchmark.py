@@ -105,13 +105,12 @@ def method(name: str) -> Method:
     if in_file(name) or name in names("coopoc.methods"):
         made: Method = find("coopoc.methods", name)("nominal")
         return made
-    from coopoc.learned import CooperativeGain, load_method
+    from coopoc.learned import load_method
     from coopoc.learned.recipes import shipped_weights
 
     if name not in shipped_weights() and not given_path(name).is_file():
         raise unknown("method", name, [*names("coopoc.methods"), *shipped_weights()])
-    learned: Any = load_method(name)
-    return CooperativeGain(learned.model, name) if name == "cooperative" else learned
+    return load_method(name)
 
 
 def information(name: str, one: Method) -> str:

@@ -18,7 +18,7 @@ from coopoc.evaluate.scores import BYTES, rows_of, scored
 from coopoc.methods.catalogue import METHODS
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
-from coopoc.methods.track import Method
+from coopoc.methods.track import Method, far_off
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.fleet import Fleet
@@ -105,11 +105,7 @@ def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
     name, first = p["method"], start(p)
     if name not in METHODS and weights.is_trained(name):
         models: list[tuple[int, Any]] = [(seed, weights.checkpoint(name, p, seed).model) for seed in weights.seeds(p)]
-        if name != "cooperative" or recording.v2x.max_neighbours == 0:
-            return [(seed, model.method(name, first)) for seed, model in models]
-        from coopoc.learned import CooperativeGain
-
-        return [(seed, CooperativeGain(model, name)) for seed, model in models]
+        return [(seed, model.method(name, first)) for seed, model in models]
     make = METHODS[name] if name in METHODS else find("coopoc.methods", name)
     method: Method = make(noise_model(p))
     if isinstance(method, Kalman):
@@ -240,6 +236,7 @@ def _without_truth(method: Method, recording: Recording, ego: str) -> dict[str, 
     shape = (recording.runs, 1)
     return {
         **innovation_columns(track, recording),
+        "left_fixes": far_off(track.x, recording, track.egos).astype(float),
         **{name: account.of("online", *counted) / account.seconds for name, counted in BYTES.items()},
         "neighbours_mean": np.full(shape, near),
         "seconds": np.full(shape, track.seconds / recording.runs),

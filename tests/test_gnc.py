@@ -13,7 +13,7 @@ from scipy.stats import chi2
 
 from coopoc import InputError
 from coopoc.optimize import Loss, Problem, SolveError, Status, pose, solve_gnc
-from coopoc.optimize.robust.gnc import SURROGATES
+from coopoc.optimize.robust.graduated import SURROGATES
 
 
 def paper_rho(loss: str, r: float, mu: float, c: float = 1.0) -> float:

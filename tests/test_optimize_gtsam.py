@@ -90,7 +90,7 @@ def test_gtsams_own_factors_have_our_cost_and_gradient(dimension: int, name: str
     for scale in (0.5, 50.0):  # on either side of the loss's corner
         problem = measured(dimension, kind, nodes, noise, Loss(loss, scale) if loss else None)
         posed, x = which_turn(problem), problem.x0
-        at = values(problem.space, posed, x, range(5))
+        at = values(problem.space, posed, x)
         graph = graph_of(problem, forms(problem))
         assert graph.error(at) == pytest.approx(problem.cost(x), rel=1e-12)
         residual, jacobian = problem.whiten(x)
@@ -238,63 +238,12 @@ def test_a_limit_of_iterations_is_kept(formation: Fleet, case: str) -> None:
     assert solution.iterations == 2
 
 
-def test_marginals_of_poses_in_the_plane_equal_gtsams() -> None:
-    """Ranges and bearings of a landmark, a prior of each pose; GTSAM's covariance is in the body: R C R^T."""
-    rng = np.random.default_rng(8)
-    at, angle = rng.uniform(-20, 20, (4, 2)), np.array([0.3, -2.0, 2.9, 0.0])
-    x = pose(at, angle)
-    x[3, 2:] = np.eye(2).ravel()
-    problem = Problem(("a", "b", "c", "l"), x0=x, dimension=2, poses=range(3))
-    problem = problem.add("pose", [0, 1, 2], pose(at[:3] + 0.3, angle[:3] + 0.1), std=[1.0, 2.0, 0.3])
-    problem = problem.add("range", [("a", "b"), ("b", "l"), ("c", "l")], [[9.0], [12.0], [11.0]], std=0.3)
-    problem = problem.add("bearing", [("a", "l"), ("b", "l"), ("c", "a")], [[0.3], [0.9], [-2.0]], std=0.05)
-    solution = solve(problem, "gtsam")
-    graph, found, noise = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel
-    found.insert(3, solution.position[3])
-    for i, (node, z) in enumerate(zip(solution.x[:3], problem.factors[0].z, strict=True)):
-        found.insert(i, gtsam.Pose2(*node[:2], np.arctan2(node[4], node[2])))
-        turn = np.arctan2(z[4], z[2])  # the prior's std are along the axes of the measured pose
-        back = np.array([[np.cos(turn), np.sin(turn)], [-np.sin(turn), np.cos(turn)]])
-        root = noise.Gaussian.SqrtInformation(np.diag([1.0, 0.5]) @ back, False)
-        graph.add(gtsam.PoseTranslationPrior2D(i, z[:2], root))
-        graph.add(gtsam.PoseRotationPrior2D(i, gtsam.Rot2(turn), noise.Isotropic.Sigma(1, 0.3)))
-    tenth, twentieth = noise.Isotropic.Sigma(1, 0.3), noise.Isotropic.Sigma(1, 0.05)
-    graph.add(gtsam.RangeFactorPose2(0, 1, 9.0, tenth))
-    graph.add(gtsam.RangeFactor2D(1, 3, 12.0, tenth))
-    graph.add(gtsam.RangeFactor2D(2, 3, 11.0, tenth))
-    graph.add(gtsam.BearingFactor2D(0, 3, gtsam.Rot2(0.3), twentieth))
-    graph.add(gtsam.BearingFactor2D(1, 3, gtsam.Rot2(0.9), twentieth))
-    graph.add(gtsam.BearingFactorPose2(2, 0, gtsam.Rot2(-2.0), twentieth))
-    marginals = gtsam.Marginals(graph, found)
-    for i, covariance in enumerate(solution.covariance[:3]):
-        own, R = marginals.marginalCovariance(i), solution.rotation[i]
-        assert covariance[:2, :2] == pytest.approx(R @ own[:2, :2] @ R.T, abs=1e-6)
-        assert covariance[:2, 2] == pytest.approx(R @ own[:2, 2], abs=1e-6)
-        assert covariance[2, 2] == pytest.approx(own[2, 2], abs=1e-6)
-    assert solution.covariance[3, :2, :2] == pytest.approx(marginals.marginalCovariance(3), abs=1e-6)
-
-
-def test_marginals_of_poses_in_space_equal_gtsams() -> None:
-    """Priors and ranges; GTSAM has the rotation first and moves a position along the body's axes."""
-    rng = np.random.default_rng(10)
-    x = pose(rng.uniform(-9, 9, (3, 3)), rng.normal(size=(3, 3)))
-    z = pose(x[:, :3] + 0.2, rng.normal(size=(3, 3)) * 0.1)
-    z[:, 3:] = (x[:, 3:].reshape(3, 3, 3) @ z[:, 3:].reshape(3, 3, 3)).reshape(3, 9)
-    std = np.array([0.5, 0.6, 0.7, 0.05, 0.06, 0.07])
-    problem = Problem(tuple("abc"), x0=x, poses=range(3)).add("pose", [0, 1, 2], z, std=std)
-    problem = problem.add("range", [(0, 1), (1, 2), (0, 2)], [[9.0], [8.0], [7.0]], std=0.2)
-    solution = solve(problem, "gtsam")
-    graph, found, noise = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel
-    for i, (node, prior) in enumerate(zip(solution.x, z, strict=True)):
-        found.insert(i, gtsam.Pose3(gtsam.Rot3(node[3:].reshape(3, 3)), node[:3]))
-        turn = prior[3:].reshape(3, 3)
-        root = noise.Gaussian.SqrtInformation(np.diag(1 / std[:3]) @ turn.T, False)
-        graph.add(gtsam.PoseTranslationPrior3D(i, prior[:3], root))
-        graph.add(gtsam.PoseRotationPrior3D(i, gtsam.Rot3(turn), noise.Diagonal.Sigmas(std[3:])))
-    for i, j, far in ((0, 1, 9.0), (1, 2, 8.0), (0, 2, 7.0)):
-        graph.add(gtsam.RangeFactorPose3(i, j, far, noise.Isotropic.Sigma(1, 0.2)))
-    marginals = gtsam.Marginals(graph, found)
-    for i, covariance in enumerate(solution.covariance):
-        own, R = marginals.marginalCovariance(i), solution.rotation[i]
-        wide = np.block([[np.zeros((3, 3)), R], [np.eye(3), np.zeros((3, 3))]])
-        assert covariance == pytest.approx(wide @ own @ wide.T, abs=1e-6)
+@pytest.mark.parametrize("problem", [plane(noise=0.0), space(noise=0.0), space(chordal=True, noise=0.0)])
+def test_marginals_equal_gtsams(problem: Problem) -> None:
+    """gtsam.Marginals, which moves a pose along its body's axes, with the rotation first in space; without residuals,
+    on which J^T J of GTSAM's chords depends."""
+    solution, posed = solve(problem), which_turn(problem)
+    marginals = gtsam.Marginals(graph_of(problem, forms(problem)), values(problem.space, posed, solution.x))
+    for i, turn in enumerate(tangent(problem.space, posed, solution.x)):
+        own = turn @ marginals.marginalCovariance(i) @ turn.T
+        assert solution.covariance[i] == pytest.approx(own, abs=1e-6)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import AnyArray, Floats
 from ..errors import InputError
-from ..methods.track import Method, Track
+from ..methods.track import Method, Track, far_off
 from ..world.fleet import Fleet
 from ..world.recording import Recording
 from .ledger import Kind, Way, of_track
@@ -74,8 +74,9 @@ def scored(
 
     Returns:
         Columns (R, E): `neighbours_mean`; RT-LE, largest error and neighbours' error in m; the rates of BYTES;
-        `worse_than_gnss`, 1 or 0; `nees` and `nees_inside` of a method with a covariance; `seconds` of wall time per
-        run and vehicle served; and `error_quantiles_m` (R, E, q) and the column NAME of a metric if some are wanted.
+        `worse_than_gnss` and `left_fixes`, 1 or 0; `nees` and `nees_inside` of a method with a covariance; `seconds` of
+        wall time per run and vehicle served; and `error_quantiles_m` (R, E, q) and the column NAME of a metric if some
+        are wanted.
 
     >>> from coopoc import GNSS, Sensors, observe
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
@@ -121,6 +122,7 @@ def _columns(track: Track, recording: Recording, method: Method, drive: Fleet, q
         "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
         **{name: account.of("online", *counted) / account.seconds for name, counted in BYTES.items()},
         "worse_than_gnss": (level > 1.001 * fixes).astype(float),
+        "left_fixes": far_off(track.x, recording, mine).astype(float),
     }
     if quantiles:
         spaced = np.quantile(error, np.linspace(0, 1, quantiles), axis=1)

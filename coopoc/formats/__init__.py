@@ -14,8 +14,12 @@ from .pyfg import read_pyfg
 GRAPHS = {".pyfg": read_pyfg, ".g2o": read_g2o, ".jrl": read_jrl}
 
 
-def load_graph(path: str | Path) -> Graph:
+def load_graph(path: str | Path, repair: bool = False) -> Graph:
     """Graph of a file, .pyfg, .g2o or .jrl.
+
+    Args:
+        path: of the file.
+        repair: see `read_g2o`, whose matrices are information.
 
     Raises:
         InputError: another suffix, or what `read_pyfg`, `read_g2o` and `read_jrl` raise.
@@ -28,4 +32,4 @@ def load_graph(path: str | Path) -> Graph:
     if suffix not in GRAPHS:
         hint = suggestion(suffix, GRAPHS, "Rename or convert the file.")
         raise InputError("path", Path(path).name, f"must end in {' or '.join(GRAPHS)}", hint)
-    return GRAPHS[suffix](path)
+    return read_g2o(path, repair) if suffix == ".g2o" else GRAPHS[suffix](path)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -42,10 +43,11 @@ GRAMMAR = Grammar(
     noise="information",
     name=_name,
     others=("PARAMS_SE3OFFSET", "FIX"),
+    implied=True,
 )
 
 
-def read_g2o(path: str | Path) -> Graph:
+def read_g2o(path: str | Path, repair: bool = False) -> Graph:
     """Graph of a g2o file: the vertex with id 17 is called A17 if it is a pose and L17 if it is a point.
 
     Ids of 2^56 and more are GTSAM's symbol keys, which multi-robot files use: letter * 2^56 + number. A pose and a
@@ -60,7 +62,9 @@ def read_g2o(path: str | Path) -> Graph:
             `EDGE_SE3_PRIOR i offset x y z qx qy qz qw info`, `EDGE_POINTXYZ_PRIOR i x y z info`,
             `PARAMS_SE3OFFSET id x y z qx qy qz qw` (the identity, where an edge uses it); `FIX id ...`; and
             `EDGE_RANGE i j r information`, which g2o lacks and its users add under this name.
-            m and rad; info is the upper triangle by rows.
+            m and rad; info is the upper triangle by rows. A file of edges alone has the vertices that they name,
+            nowhere yet.
+        repair: take the nearest positive definite matrix for an information that is none, and say so in Graph.notes.
 
     Raises:
         InputError: with the line, a record that is none of these, words that are missing or no finite numbers, an
@@ -81,7 +85,7 @@ def read_g2o(path: str | Path) -> Graph:
     for number, words in records:
         _refuse_offset(path.name, number, words, identity)
     fixed = [(number, word) for number, words in lines if words[0] == "FIX" for word in words[1:]]
-    return GRAMMAR.read(path.name, records, fixed)
+    return replace(GRAMMAR.read(path.name, records, fixed, repair), guess=True)
 
 
 def _identities(file: str, lines: list[tuple[int, list[str]]]) -> dict[str, bool]:

@@ -155,6 +155,8 @@ class Graph:
         pose_prior: measured poses.
         point_prior: measured points.
         fixed: (F,) places in names of the vertices that stay where they are (g2o's FIX).
+        guess: the vertices are an initial guess, as in g2o, from which a solve may begin without being told.
+        notes: what the reader changed, such as noise that it repaired.
         place: (field, row) -> where it came from, for messages; readers pass the line of the file.
 
     Raises:
@@ -178,6 +180,8 @@ class Graph:
     pose_prior: PoseEdges = PoseEdges()
     point_prior: PointEdges = PointEdges()
     fixed: Ints = ()  # type: ignore[assignment]
+    guess: bool = False
+    notes: tuple[str, ...] = ()
     place: InitVar[Callable[[str, int], str] | None] = None
 
     def __post_init__(self, place: Callable[[str, int], str] | None) -> None:

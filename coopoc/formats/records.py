@@ -87,6 +87,7 @@ class Grammar:
         noise: "covariance" or "information".
         name: (word, pose or point) -> the name of that vertex, "" if the word is malformed.
         others: tags that the format's own reader takes care of.
+        implied: a file without any vertex has those that its edges name, in the order of their numbers.
     """
 
     format: str
@@ -94,6 +95,7 @@ class Grammar:
     noise: str
     name: Callable[[str, str], str]
     others: tuple[str, ...] = ()
+    implied: bool = False
 
     def form(self, tag: str) -> str:
         """Form of a line with a tag."""
@@ -104,13 +106,20 @@ class Grammar:
             noise = [f"and the {record.triangle} numbers of the {self.noise}'s upper triangle"]
         return " ".join([tag, record.words, *noise])
 
-    def read(self, file: str, lines: Iterable[tuple[int, list[str]]], fixed: Sequence[tuple[int, str]] = ()) -> Graph:
+    def read(
+        self,
+        file: str,
+        lines: Iterable[tuple[int, list[str]]],
+        fixed: Sequence[tuple[int, str]] = (),
+        repair: bool = False,
+    ) -> Graph:
         """Graph of the lines of a file.
 
         Args:
             file: named in messages.
             lines: (line number, words) of every record.
             fixed: (line number, vertex) of those that stay where they are.
+            repair: take the nearest positive definite matrix where the noise is none, and say so in the graph's notes.
 
         Raises:
             InputError: with the line, an unknown tag or vertex, another number of words, 2-D beside 3-D, no vertex at
@@ -133,9 +142,11 @@ class Grammar:
                 raise InputError(place("names", row), f"vertex {word}", f"must be called as {self.format} does", hint)
             index[kind][word] = row
         vertices = Graph(dimension, tuple(names), **arrays, place=place)
-        edges: dict[str, Any] = {kind: self._edges(file, rows[kind], index) for kind in ENDS if kind in rows}
+        notes = list[str]() if repair else None
+        edges: dict[str, Any] = {kind: self._edges(file, rows[kind], index, notes) for kind in ENDS if kind in rows}
         still = [_find(place("fixed", row), word, "any", index) for row, (_, word) in enumerate(fixed)]
-        return replace(vertices, **edges, fixed=np.array(still, dtype=np.int64), place=place)
+        fixed_at = np.array(still, dtype=np.int64)
+        return replace(vertices, **edges, fixed=fixed_at, notes=tuple(notes or ()), place=place)
 
     def _collect(self, file: str, lines: Iterable[tuple[int, list[str]]]) -> tuple[int, dict[str, _Rows]]:
         """Dimension of a file, and its lines by kind."""
@@ -159,15 +170,31 @@ class Grammar:
             given = rows.setdefault(record.kind, _Rows(tag))
             given.lines.append(number)
             given.words.append(words)
-        if not {"pose", "point"} & set(rows):
+        if not {"pose", "point"} & set(rows) and not (self.implied and dimension):
             hint = "Check that the file is complete."
             raise InputError(file, "0 vertices", "must have a line for every vertex", hint)
         return dimension, rows
+
+    def _implied(self, rows: Mapping[str, _Rows], dimension: int) -> tuple[list[int], list[str], dict[str, Any]]:
+        """`_vertices` that edges name, nowhere yet; what only ranges name is a pose."""
+        named = dict[str, tuple[int, bool]]()
+        for kind in [kind for kind in ENDS if kind in rows]:
+            for line, words in zip(rows[kind].lines, rows[kind].words, strict=True):
+                for role, word in zip(ENDS[kind], words[1:], strict=False):
+                    named.setdefault(word, (line, role != "point"))
+        order = sorted(named, key=lambda word: (len(word), word))
+        lines, poses = zip(*(named[word] for word in order), strict=True)
+        is_pose, nowhere = np.array(poses), np.full((len(order), dimension), np.nan)
+        turn = np.full((len(order), 1 if dimension == 2 else 4), np.nan)
+        turn[~is_pose] = 0.0 if dimension == 2 else np.eye(4)[3]
+        return list(lines), order, {"is_pose": is_pose, "position": nowhere, "orientation": turn}
 
     def _vertices(
         self, file: str, rows: Mapping[str, _Rows], dimension: int
     ) -> tuple[list[int], list[str], dict[str, Any]]:
         """Lines, words for and arrays of the poses and points, in the order of the file."""
+        if not {"pose", "point"} & set(rows):
+            return self._implied(rows, dimension)
         parts = []
         for kind in ("pose", "point"):
             if kind in rows:
@@ -182,7 +209,7 @@ class Grammar:
         fields = ("is_pose", "position", "orientation", "stamps")
         return lines[order].tolist(), words[order].tolist(), {f: a[order] for f, a in zip(fields, arrays, strict=True)}
 
-    def _edges(self, file: str, rows: _Rows, index: Index) -> Edges:
+    def _edges(self, file: str, rows: _Rows, index: Index, notes: list[str] | None) -> Edges:
         record, (stamps, ids, numbers) = self.records[rows.tag], self._split(file, rows)
         places = [f"{file}: line {line}" for line in rows.lines]
         nodes = [
@@ -192,7 +219,7 @@ class Grammar:
         count = len(record.values.split())
         noise = symmetric(numbers[:, count:], record.size)
         if self.noise == "information":
-            noise = inverse(noise, places.__getitem__, "information")
+            noise = inverse(noise, places.__getitem__, "information", notes)
         return edges_of(record.kind, nodes, numbers[:, :count], noise, stamps)
 
     def _split(self, file: str, rows: _Rows) -> tuple[Floats, list[list[str]], Floats]:

@@ -147,7 +147,11 @@ def upper_triangle(matrices: Floats) -> Floats:
     return np.asarray(matrices[:, i, j])
 
 
-def inverse(matrices: Floats, place: Callable[[int], str], what: str) -> Floats:
+REPAIRED = 1e-6
+"""Share of the largest eigenvalue, after scaling, that a repaired matrix has at least: none would have no inverse."""
+
+
+def inverse(matrices: Floats, place: Callable[[int], str], what: str, repairs: list[str] | None = None) -> Floats:
     """Inverses of M symmetric positive definite matrices, information <-> covariance.
 
     Rows and columns are first scaled by powers of two, which is exact, so that metres beside radians cost no digits.
@@ -156,6 +160,8 @@ def inverse(matrices: Floats, place: Callable[[int], str], what: str) -> Floats:
         matrices: (M, size, size).
         place: row -> where it stands, for the message.
         what: "information" or "covariance", for the message.
+        repairs: gets a line for each matrix that was not positive definite and whose eigenvalues, scaled to a unit
+            diagonal, were raised to REPAIRED of the largest; None: such a matrix is an error.
 
     Raises:
         InputError: a matrix that is singular or not positive, at its place.
@@ -169,13 +175,17 @@ def inverse(matrices: Floats, place: Callable[[int], str], what: str) -> Floats:
     both = scale[:, :, None] * scale[:, None, :]
     scaled = matrices * both
     bad = np.flatnonzero(~positive.all(axis=-1) | (np.linalg.eigvalsh(scaled)[:, :1] < 1e-13).any(axis=-1))
-    if len(bad):
-        row = int(bad[0])
-        raise InputError(
-            place(row),
-            f"{what} {upper_triangle(matrices[row : row + 1])[0].tolist()}",
-            "must be positive definite: a singular one has no inverse",
-            f"Give every component some {what}, or leave the measurement out.",
-        )
+    for row in bad.tolist():
+        own, axes = np.linalg.eigh(scaled[row])
+        if repairs is None or not own[-1] > 0:
+            raise InputError(
+                place(row),
+                f"{what} {upper_triangle(matrices[row : row + 1])[0].tolist()}",
+                "must be positive definite: a singular one has no inverse",
+                f"Give every component some {what}, leave the measurement out, or read the file with repair=True "
+                "(coopoc solve --repair), which takes the nearest that is.",
+            )
+        scaled[row] = axes * np.maximum(own, REPAIRED * own[-1]) @ axes.T
+        repairs.append(f"{place(row)}: {what} was not positive definite and was replaced by the nearest that is")
     inverses = np.linalg.inv(scaled) * both
     return np.asarray(0.5 * (inverses + inverses.swapaxes(-1, -2)))

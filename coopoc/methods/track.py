@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Floats, checked, number, texts
+from ..arrays import Bools, Floats, checked, number, texts
 from ..errors import InputError, shown
 from ..short_repr import short_repr
 from ..world.recording import Recording
@@ -107,6 +107,23 @@ class Track:
         if (found := unsound(covariance)) and not any(UNSOUND in note for note in self.notes):
             note = f"{found} of {len(covariance)} {UNSOUND}"
             object.__setattr__(self, "notes", (*self.notes, note))
+
+
+FAR = 100.0
+"""Standard deviations (norm of that of the fixes) between an estimate and a fix, beyond which a method is lost."""
+
+
+def far_off(x: Floats, recording: Recording, columns: Sequence[int], limit: float = FAR) -> Bools:
+    """(R, E) whether estimates (R, T, E, 3) m are ever farther from a fix than `limit` standard deviations."""
+    gap = np.linalg.norm(x - recording.gnss[:, :, list(columns)], axis=-1)
+    return np.asarray((gap > limit * float(np.linalg.norm(recording.sensors.gnss_std))).any(axis=1))
+
+
+def lost(x: Floats, recording: Recording, columns: Sequence[int], limit: float = FAR) -> tuple[str, ...]:
+    """A note of the runs whose estimates are `far_off`; none if none is."""
+    found = far_off(x, recording, columns, limit)
+    far = limit * float(np.linalg.norm(recording.sensors.gnss_std))
+    return (f"diverged in {found.sum()} of {found.size} runs (over {far:.0f} m from the fix)",) if found.any() else ()
 
 
 @runtime_checkable

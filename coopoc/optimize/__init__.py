@@ -3,7 +3,6 @@
 from . import backends as _package  # noqa: F401  (first: the function `backends` takes its name)
 from .assess.assess import joint_covariance
 from .backend import Backend, Capabilities, SolverResult, backends
-from .descent.local_problem import LocalProblem
 from .distributed import Distributed, solve_distributed
 from .graph_problems import loop_closures
 from .model.factor import Constraint, Factor, Loss
@@ -22,7 +21,6 @@ __all__ = [
     "Constraint",
     "Distributed",
     "Factor",
-    "LocalProblem",
     "Loss",
     "Measurement",
     "Problem",

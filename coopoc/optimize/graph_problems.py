@@ -16,7 +16,7 @@ from .convex.chordal import chordal_start
 from .model.factor import Factor
 from .model.problem import Problem, Search
 from .model.space import Space
-from .starts.graph_starts import STARTS, chained, contenders, incremental_start, parts, separated
+from .starts.graph_starts import STARTS, chained, contenders, incremental_start, parts, separated, unwound
 from .starts.race import race
 
 Objective = Literal["chordal", "geodesic"]
@@ -27,34 +27,45 @@ KINDS = {
     "point_prior": "position",
 }
 """Of measurements, by the name of a graph's edges."""
-Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "auto"]
+Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "relaxed", "auto"]
+RELAXED = 400
+"""Nodes up to which "auto" solves a relaxation where no other start leads to a cost that the noise explains."""
 
 
-def read_graph(path: str | Path, objective: Objective = "chordal", start: Start = "auto") -> Problem:
-    """The problem of a PyFG, g2o or JRL file; see `from_graph`.
+def read_graph(
+    path: str | Path, objective: Objective = "chordal", start: Start = "auto", repair: bool = False
+) -> Problem:
+    """The problem of a PyFG, g2o or JRL file; see `from_graph` and, of `repair`, `coopoc.formats.load_graph`.
 
     Raises:
         InputError: a line that is wrong, with file and number; an unknown suffix, objective or start.
     """
-    return from_graph(load_graph(path), objective, start)
+    return from_graph(load_graph(path, repair), objective, start)
 
 
-def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "auto") -> Problem:
+def from_graph(
+    graph: Graph, objective: Objective = "chordal", start: Start = "auto", seconds: float = np.inf
+) -> Problem:
     """The problem of a graph; of each connected part without priors and fixed vertices the first pose is fixed.
 
     chordal: kappa |R_j - R_i R_ij|_F^2 + tau |t_j - t_i - R_i t_ij|^2, tau = d / trace(cov_t) and kappa = 1 / var_theta
-    in the plane, 3 / (2 trace(cov_R)) in space, as SE-Sync (Rosen et al., IJRR 2019) and CORA (arXiv 2302.11614) have
-    it: quadratic, so that it can be certified. geodesic: |log(T_ij^-1 T_i^-1 T_j)|^2 with the full covariance.
+    in the plane, 3 / (2 trace(cov_R)) in space: quadratic, so that it can be certified. These are the weights of CORA
+    (arXiv 2302.11614), and those of SE-Sync (Rosen et al., IJRR 2019) where heading and position are not correlated;
+    else SE-Sync's kappa is the information of theta, which is larger. geodesic: |log(T_ij^-1 T_i^-1 T_j)|^2 with the
+    full covariance.
 
     Args:
         graph: of `coopoc.formats.load_graph`.
         start: "odometry" chains each robot's relative poses from a pose with a prior, else from its first vertex in the
             file; "apart" from a ring as wide as the mean range, all facing one way, as if nothing were known of how the
-            robots stand to each other; "file" takes the vertices as they are; "tree" follows loop closures
-            and measurements between robots, too; "linear" relaxes rotations (`convex/chordal.py`); "incremental" solves
-            the first poses of all robots, then more with them (`starts/graph_starts.py`); "auto" tries several and
-            keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their priors, or where the first
+            robots stand to each other; "file" takes the vertices as they are, which in PyFG are the truth; "tree"
+            follows loop closures and measurements between robots, too; "linear" relaxes rotations
+            (`convex/chordal.py`); "incremental" solves the first poses of all robots, then more with them
+            (`starts/graph_starts.py`); "relaxed" rounds a convex relaxation (`convex/relaxation.py`); "auto" tries all
+            that the graph offers, "file" only where vertices are no truth, and keeps the one that leads lowest
+            (`starts/race.py`). Landmarks are put at their priors, or where the first
             pose that measures them sees them, or by ranges. The Solution names the start in extras["start"].
+        seconds: limit of the relaxation.
 
     Raises:
         InputError: an unknown objective or start, a measurement without variance, by its vertices.
@@ -77,18 +88,31 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         x0 = separated(graph, x0)
         return x0 if poses else x0[:, : graph.dimension]
 
-    began = time.perf_counter()
-    names = contenders(graph) if start == "auto" else ("odometry" if start == "incremental" else start,)
+    def relaxed(at: Problem) -> Floats:
+        from .convex.relaxation import staircase
+
+        chordal = at if objective == "chordal" else at.replace_unchecked(factors=_factors(graph, "chordal"))
+        return staircase(chordal, refine=False, seconds=seconds).x
+
+    began, notes = time.perf_counter(), graph.notes
+    first = {"incremental": "odometry", "relaxed": "apart"}.get(start, start)
+    names = contenders(graph) if start == "auto" else (first,)
     given = x0_of(names[0])
     problem = Problem(graph.names, factors, given, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
     won = Search(names[0])
     if start == "auto":
         starts = {name: (lambda: given) if name == names[0] else partial(x0_of, name) for name in names}
-        problem, won = race(problem, starts, partial(incremental_start, graph) if poses else None)
+        growing = partial(incremental_start, graph) if poses else None
+        last = relaxed if len(graph.names) <= RELAXED else None
+        problem, won = race(problem, starts, growing, last, partial(unwound, graph))
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
         problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
-    return problem.replace_unchecked(search=won._replace(seconds=time.perf_counter() - began))
+    elif start == "relaxed":
+        problem, won = problem.replace_unchecked(x0=frozen(relaxed(problem))), Search(start)
+    elif start == "file" and not graph.guess:
+        notes = (*notes, "the start is the file's vertices, which may be the truth")
+    return problem.replace_unchecked(search=won._replace(seconds=time.perf_counter() - began, notes=notes))
 
 
 def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:

@@ -38,19 +38,24 @@ class Solution:
     Args:
         x: (n, ambient), see Space.
         covariance: (n, dof, dof) m^2, rad^2 marginals of (J^T J)^-1 at x, position in the world's directions, then
-            rotation in the body's; equalities taken as exact, inequalities as absent; NaN if rank deficient.
+            rotation in the body's; equalities taken as exact, inequalities as absent; NaN if rank deficient or not
+            asked for.
         cost: 1/2 sum of rho of the squared whitened residuals.
         gradient_norm: |J^T r| at x, with constraints that of the Lagrangian.
         status: how it ended.
         iterations: of the backend, and of the search for a start: extras["start_iterations"] of them.
         build_seconds: to prepare the solver and the start.
         solve_seconds: to run it, and of the search for a start: extras["start_seconds"] of them.
+        check_seconds: to compute what is here from x.
         backend: its name.
         names: of the nodes.
         shown: the node that `print` shows.
         space: of the problem.
         unobservable: names of the nodes that can move without changing the cost.
         violation: largest of a constraint, in its unit.
+        expected: cost at the minimum under the noise that is stated, half of the numbers measured beyond the unknowns.
+        notes: what the answer rests on that may be wrong: a cost that this noise does not explain, measurements that a
+            robust loss rejects, a start from the truth, a backend that was chosen.
         extras: the backend's own numbers.
     """
 
@@ -68,9 +73,17 @@ class Solution:
     unobservable: tuple[str, ...] = ()
     space: Space = field(default_factory=Space)
     violation: float = 0.0
+    check_seconds: float = 0.0
+    expected: float = np.nan
+    notes: tuple[str, ...] = ()
     extras: dict[str, Any] = field(default_factory=dict)
 
     __repr__ = short_repr
+
+    @property
+    def seconds(self) -> float:
+        """All that was waited for: build, search for a start, solve and checks."""
+        return self.build_seconds + self.solve_seconds + self.check_seconds
 
     @property
     def position(self) -> Floats:
@@ -94,10 +107,11 @@ class Solution:
     def __str__(self) -> str:
         at = ", ".join(f"{v:.2f}" for v in self.position[self.shown])
         variance = np.diag(self.covariance[self.shown])[: self.space.dimension]
-        std = ", ".join(f"{v:.2f}" for v in np.sqrt(variance))
+        std = f" +- ({', '.join(f'{v:.2f}' for v in np.sqrt(variance))})" if np.isfinite(variance).all() else ""
         return (
-            f"{self.status.name} in {self.iterations} iterations, {1e3 * self.solve_seconds:.1f} ms; "
-            f"cost {self.cost:.4g}, gradient {self.gradient_norm:.0e}; {self.names[self.shown]} ({at}) +- ({std}) m"
+            f"{self.status.name} in {self.iterations} iterations, {1e3 * self.seconds:.1f} ms; cost {self.cost:.4g} "
+            f"(expected {self.expected:.4g}), gradient {self.gradient_norm:.0e}; {self.names[self.shown]} ({at}){std} m"
+            + "".join(f"; {note}" for note in self.notes)
         )
 
 

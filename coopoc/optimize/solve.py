@@ -15,10 +15,12 @@ from .algebra.schur import is_star, star_at
 from .algebra.sparse import sparse
 from .assess.active import constraint_rows
 from .assess.assess import INFLATION, Assessment, assess, is_constrained_minimum, newton_decrease
+from .assess.plausible import judged
 from .backend import Backend, Options, require_backend
 from .descent.levenberg_marquardt import MAX_ITERATIONS
 from .model.factor import fused
-from .model.problem import Problem, Search
+from .model.problem import Problem
+from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
 from .starts.initial import initial_guess, somewhere
 
@@ -32,17 +34,31 @@ FEASIBLE = 1e-6
 """m, rad or m/s by which a constraint may be violated."""
 CHUNK = 40_000
 """Nodes of measurements that one chunk may hold, so that a batch stays in the cache."""
+MANY = 1000
+"""Nodes beyond which covariances are computed only where they are asked for: they take as long as some steps."""
+DEFAULTS = ("gauss-newton", "osqp", "casadi")
+"""Backends of a problem for which none is named: the first that can solve it."""
 
 
-def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool = True, **options: Any) -> Solution:
+def solve(
+    problem: Problem,
+    backend: str | Backend | None = None,
+    throw: bool = True,
+    covariance: bool | None = None,
+    **options: Any,
+) -> Solution:
     """The most probable positions: a minimum of the problem's cost, by the named backend.
 
-    Cost, gradient, covariance, status and times are computed here from x alone, independently of the solver.
+    Cost, gradient, covariance, status and times are computed here from x alone, independently of the solver; what makes
+    the answer doubtful is in `Solution.notes`. Losses that reject measurements, truncated and Geman-McClure, start by
+    graduated non-convexity where that leads lower than x0.
 
     Args:
         problem: a single one; `solve_batch` takes B realisations.
-        backend: a name of `backends()`, "folder/mine.py:BACKEND" or a Backend.
+        backend: a name of `backends()`, "folder/mine.py:BACKEND" or a Backend; None: gauss-newton, and where there are
+            constraints the first of osqp and casadi that holds them.
         throw: raise unless SOLVED; otherwise failure is data.
+        covariance: whether to compute marginals; None: of up to MANY nodes.
         options: of the backend, such as max_iterations and tolerance (m).
 
     Raises:
@@ -55,9 +71,10 @@ def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool
     >>> solve(problem.add("range", ("ego", "b"), 10.0, std=1.0)).x.round(3)[:, 0]
     array([-0.333,  9.333])
     """
-    known = require_backend(backend)
     instance("problem", problem, Problem)
+    known = _chosen(problem) if backend is None else require_backend(backend)
     instance("throw", throw, bool, "Give False to get the Solution whatever its status.")
+    wanted = len(problem.names) <= MANY if covariance is None else instance("covariance", covariance, bool)
     if problem.batch is not None:
         hint = "Pick one with problem.pick(0), or use solve_batch."
         raise InputError("problem", repr(problem), "must be a single realisation", hint)
@@ -65,55 +82,59 @@ def solve(problem: Problem, backend: str | Backend = "gauss-newton", throw: bool
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     if (factors := fused(problem.factors)) is not problem.factors:
         problem = problem.replace_unchecked(factors=factors)
-    solution = _solved(problem, known, options)
-    if problem.search.start:
-        solution = _with_search(solution, problem.search)
+    solution = _solved(problem, known, options, wanted)
+    if backend is None and known.name != DEFAULTS[0]:
+        solution = replace(solution, notes=(f"solved by {known.name}: gauss-newton cannot", *solution.notes))
     if throw and solution.status is not Status.SOLVED:
         _raise(solution)
     return solution
 
 
-def _solved(problem: Problem, backend: Backend, options: Options) -> Solution:
+def _chosen(problem: Problem) -> Backend:
+    """The first of DEFAULTS that can solve a problem, else the first."""
+    able = (one for one in map(require_backend, DEFAULTS) if not one.capabilities.lacking(problem))
+    return next(able, require_backend(DEFAULTS[0]))
+
+
+def _solved(problem: Problem, backend: Backend, options: Options, covariance: bool) -> Solution:
     """The result of a backend, and its assessment."""
     began = time.perf_counter()
     solver = backend.solver(problem, options)
-    start = _start(problem)[None]
-    built = time.perf_counter()
-    found = solver(problem, start)
+    start = _start(problem)
+    built, earlier = time.perf_counter(), problem.search.seconds
+    if any(f.loss is not None and f.loss.redescends for f in problem.factors):
+        problem = robust_start(problem, start)
+        assert problem.x0 is not None
+        start = problem.x0
+    found, search = solver(problem, start[None]), problem.search
     solved = time.perf_counter()
     x, iterations, infeasible = found.x[0], int(np.ravel(found.iterations)[0]), bool(np.ravel(found.infeasible)[0])
-    truth = assess(problem, x)
+    truth = assess(problem, x, covariance)
     out = truth.active is not None and (truth.violation > FEASIBLE or infeasible)
     violated = {"violated": truth.active.violated} if truth.active is not None and out else {}
     status = Status.INFEASIBLE if infeasible else _status(problem, x, truth)
     if status is Status.FAILED and iterations >= options.get("max_iterations", MAX_ITERATIONS):
         status = Status.MAX_ITERATIONS
+    expected, notes = judged(problem, x, truth.cost)
     return Solution(
         x=x,
         covariance=truth.covariance,
         cost=truth.cost,
         gradient_norm=truth.gradient_norm,
         status=status,
-        iterations=iterations,
+        iterations=iterations + search.iterations,
         build_seconds=built - began,
-        solve_seconds=solved - built,
+        solve_seconds=solved - built + earlier,
+        check_seconds=time.perf_counter() - solved,
         backend=backend.name,
         names=problem.names,
         shown=problem.separator[-1] if problem.separator else 0,
         unobservable=truth.unobservable,
         space=problem.space,
         violation=truth.violation,
-        extras=found.extras | violated,
-    )
-
-
-def _with_search(solution: Solution, search: Search) -> Solution:
-    """The solution, with the iterations and the time of the search for its start."""
-    return replace(
-        solution,
-        iterations=solution.iterations + search.iterations,
-        solve_seconds=solution.solve_seconds + search.seconds,
-        extras=solution.extras | search.extras,
+        expected=expected,
+        notes=(*search.notes, *notes),
+        extras=found.extras | violated | (search.extras if search.start else {}),
     )
 
 
@@ -173,11 +194,14 @@ def _raise(solution: Solution) -> None:
     if solution.status is not Status.RANK_DEFICIENT:
         raise SolveError(solution)
     shown = ", ".join(solution.unobservable[:6]) + (", ..." if len(solution.unobservable) > 6 else "")
+    hint = "Add a position factor (a fix) to one of them, or more measurements between them."
+    if rejected := [note for note in solution.notes if "rejects" in note]:
+        hint = f"The {', the '.join(rejected)}: give a nearer x0 or a larger scale, or measure more."
     raise InputError(
         "problem",
         f"{len(solution.unobservable)} of {len(solution.names)} points can move freely ({shown})",
         "must be observable",
-        "Add a position factor (a fix) to one of them, or more measurements between them.",
+        hint,
     )
 
 

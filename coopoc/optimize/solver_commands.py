@@ -6,8 +6,9 @@ import json
 import sys
 import time
 from dataclasses import fields, replace
+from functools import partial
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import Positional, arg
@@ -16,13 +17,12 @@ from ..errors import InputError
 from ..formats import load_graph
 from ..formats.graph import Graph
 from .backend import backends
-from .graph_problems import Objective, Start, from_graph, loop_closures, read_graph
-from .model.problem import Problem, Search
+from .graph_problems import Objective, Start, from_graph, loop_closures
+from .model.problem import Problem
 from .robust.gnc import solve_gnc
 from .robust.loop_closures import AGREEING
 from .solution import Solution, Status
 from .solve import solve
-from .starts.race import expected as expected_cost
 
 UNLIKELY = 30.0
 """Factor by which residuals may differ from what is stated; on real graphs they are 0.2 to 1 times as large."""
@@ -36,10 +36,12 @@ def solve_file(
     /,
     backend: Annotated[str, arg(metavar="NAME")] = "gauss-newton",
     objective: Objective = "chordal",
-    start: Literal["auto", "odometry", "tree", "linear", "incremental", "apart", "file", "relaxed"] = "auto",
+    start: Start = "auto",
     seconds: Annotated[float, arg(metavar="S")] = np.inf,
     output: Annotated[Path | None, arg(metavar="FILE")] = None,
     outliers: bool = False,
+    repair: bool = False,
+    covariance: bool = False,
 ) -> int:
     """Solve the factor graph of a PyFG, g2o or JRL file.
 
@@ -49,31 +51,28 @@ def solve_file(
         file: graph in .pyfg, .g2o or .jrl.
         backend: solver (see coopoc check).
         objective: chordal (quadratic, can be certified), or geodesic with the full covariances.
-        start: point where the solve begins, see docs/optimize.md; auto takes the lowest cost of several.
+        start: point where the solve begins, see docs/optimize.md; auto takes the lowest cost of all.
         seconds: time limit of the relaxation for --start relaxed.
         output: file for the solution with all nodes, as JSON; a summary goes to stdout.
         outliers: find wrong loop closures and relative poses between robots, and leave them out (solve_gnc).
+        repair: take the nearest positive definite matrix where a g2o file's information is none.
+        covariance: compute marginals of graphs of more than 1,000 nodes, too.
     """
-    begin: Start = "apart" if start == "relaxed" else start
-    problem = (
-        known_inliers_first(load_graph(file), objective, begin) if outliers else read_graph(file, objective, begin)
-    )
-    if start == "relaxed":
-        from .convex import staircase
-
-        began = time.perf_counter()
-        problem = replace(problem, x0=staircase(problem, refine=False, seconds=seconds).x)
-        problem = replace(problem, search=Search(start, seconds=time.perf_counter() - began))
+    graph = load_graph(file, repair)
+    problem = (known_inliers_first if outliers else from_graph)(graph, objective, start, seconds)
     say(str(problem))
-    solution = without_outliers(problem, backend) if outliers else solve(problem, backend, throw=False)
+    solve_one = partial(solve, throw=False, covariance=covariance or None)
+    solution = (without_outliers if outliers else solve_one)(problem, backend)
     summary = described(solution) | {"fixed": [problem.names[k] for k in problem.fixed]}
-    summary |= {"misfit": (size := None if outliers else misfit(problem, solution))}
+    summary |= {"misfit": (size := None if outliers else misfit(solution))}
     if output is not None:
         output.write_text(json.dumps(summary | nodes(solution)) + "\n")
         say(f"the solution is in {output}")
     print(json.dumps(summary, indent=1))
     if solution.status is not Status.SOLVED:
         say(solution.status.value)
+    for note in solution.notes:
+        say(note)
     for joint in solution.extras.get("joined", ()):
         if joint["rival"] >= AGREEING:
             say("{body} was placed by {agree} measurements; {rival} agree otherwise".format(**joint))
@@ -87,14 +86,14 @@ def say(message: str) -> None:
     print(f"coopoc: {message}", file=sys.stderr)
 
 
-def known_inliers_first(graph: Graph, objective: Objective, start: Start) -> Problem:
+def known_inliers_first(graph: Graph, objective: Objective, start: Start, seconds: float) -> Problem:
     """The problem of a graph from where its known inliers lead, all but relative poses beside each robot's odometry."""
     problem = from_graph(graph, objective, "odometry")
     doubtful = [row for _, rows in loop_closures(problem) for row in rows]
     every = graph.relative_pose
     kept = np.setdiff1d(np.arange(len(every)), doubtful)
     known = {field.name: getattr(every, field.name)[kept] for field in fields(every)}
-    began = from_graph(replace(graph, relative_pose=replace(every, **known)), objective, start)
+    began = from_graph(replace(graph, relative_pose=replace(every, **known)), objective, start, seconds)
     return problem.replace_unchecked(x0=began.x0, search=began.search)
 
 
@@ -115,21 +114,20 @@ def without_outliers(problem: Problem, backend: str) -> Solution:
     return replace(solution, extras=solution.extras | {"rejected": rejected})
 
 
-def misfit(problem: Problem, solution: Solution) -> float | None:
+def misfit(solution: Solution) -> float | None:
     """Size of the residuals over their standard deviations, the root of the cost over the expected one; 1 is as stated,
     None where the measurements only just suffice.
 
-    >>> misfit(tiny(), solve(tiny())) < 2
+    >>> misfit(solve(tiny())) < 2
     True
     """
-    size = len(problem.names) * problem.space.dof if problem.movable is None else int(problem.movable.sum())
-    mean, _ = expected_cost(problem, size)
+    mean = solution.expected
     return float(np.sqrt(solution.cost / mean)) if mean > 0 and np.isfinite(solution.cost) else None
 
 
 def described(solution: Solution) -> dict[str, Any]:
     """Status, cost and times of a solution, without its nodes."""
-    named = ("backend", "cost", "gradient_norm", "iterations", "build_seconds", "solve_seconds")
+    named = ("backend", "cost", "expected", "gradient_norm", "iterations", "build_seconds", "solve_seconds", "notes")
     found: dict[str, Any] = {"status": solution.status.name, "sentence": solution.status.value}
     found |= {name: getattr(solution, name) for name in named}
     found |= {"start": solution.extras.get("start"), "unobservable": list(solution.unobservable)}

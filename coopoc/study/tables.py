@@ -230,6 +230,7 @@ def pivot(
         }
         body.append((*(label(d, n) for d, n in zip(down, names, strict=True)), *map(entries.get, titles)))
     missing = int(summary["missing"].sum())
+    gone = [f"{missing} egos are left out because a run of theirs failed."] if missing else []
     return Table(
         (*map(words, down), *titles),
         tuple(body),
@@ -238,8 +239,18 @@ def pivot(
         along or ("column" if "method" in down else "row"),
         decimals=decimals,
         intervals=intervals,
-        notes=(f"{missing} egos are left out because a run of theirs failed.",) if missing else (),
+        notes=(*gone, *lost(results, where)),
     )
+
+
+def lost(results: Results, where: Mapping[str, Any] | None = None) -> list[str]:
+    """A sentence for each method whose estimates left the fixes by more than 100 standard deviations."""
+    frame = results.select(where or {})
+    if "left_fixes" not in frame or "method" not in frame:
+        return []
+    runs = frame.groupby("method", sort=False)["left_fixes"].agg(lambda flags: int((flags > 0).sum()))
+    text = "{} diverged in {} rows: an estimate is more than 100 standard deviations away from a fix."
+    return [text.format(label("method", name), count) for name, count in runs.items() if count]
 
 
 def crossed(
@@ -268,6 +279,7 @@ def crossed(
         entries = [number(results, where) for number in columns.values()]
         if any(entry is not None for entry in entries):
             body.append((*labels, *entries))
+    options["notes"] = (*options.get("notes", ()), *lost(results))
     return Table((*head, *columns), tuple(body), caption, **options) if body else None
 
 

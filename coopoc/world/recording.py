@@ -53,6 +53,10 @@ class Body:
         refuse("yaw_rate", rate, np.isnan(rate) != np.isnan(velocity[..., 0]), allowed, "A vehicle that stands has 0.")
 
 
+MEASURED = "nothing is simulated"
+"""Words in the notes of a recording that holds measurements as they were logged."""
+
+
 @dataclass(frozen=True, eq=False)
 class Recording:
     """Measurements of N vehicles over T steps in R runs, in the local east-north-up frame.
@@ -127,6 +131,11 @@ class Recording:
     def dt(self) -> float:
         """Sampling interval, s."""
         return interval(self.t)
+
+    @property
+    def measured(self) -> bool:
+        """Whether the notes say that nothing is simulated."""
+        return any(MEASURED in note for note in self.notes)
 
     @property
     def runs(self) -> int:

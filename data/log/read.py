@@ -16,7 +16,7 @@ from coopoc.file_names import given_path
 from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
 from coopoc.world.links import wrap
-from coopoc.world.recording import Body, Recording
+from coopoc.world.recording import MEASURED, Body, Recording
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
@@ -195,7 +195,7 @@ def read_log(
         sensors=sensors,
         v2x=V2X(max_neighbours=int(np.bincount(pairs).max(initial=0)), radius=np.inf),
         observers=tuple(range(len(ids))),
-        notes=(f"measurements of {path.name}, nothing is simulated", *summary.sentences),
+        notes=(f"measurements of {path.name}, {MEASURED}", *summary.sentences),
         body=Body(yaw_rate, compass) if body else None,
         landmarks=tuple(marks),
     )

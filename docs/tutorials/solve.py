@@ -70,9 +70,10 @@ dict(zip(names, error.round(2).tolist(), strict=True))
 # %% [markdown]
 # ## An outlier
 #
-# A robust loss discounts large residuals. Graduated non-convexity (Yang et al., RA-L 2020) starts from least squares
-# and tightens the loss; a measurement that ends with weight zero is an outlier. It still adds its truncated loss,
-# 3²/2 = 4.5, to the cost.
+# The solution says so itself: its note compares the cost with what the stated noise explains. A robust loss discounts
+# large residuals. With one that rejects, `solve` starts by graduated non-convexity (Yang et al., RA-L 2020), from least
+# squares with a loss that tightens; a measurement that ends with weight zero is an outlier. It still adds its truncated
+# loss, 3²/2 = 4.5, to the cost.
 
 # %%
 robust = problem.add("range", pairs, ranges, std=0.3, loss=co.optimize.Loss("truncated", 3.0)).add(
@@ -90,7 +91,8 @@ co.plot_solution(solution, problem=robust).figure
 # ## A wall
 #
 # Bounds are constraints on measurements. Without the bad range the estimate of blue is y = 2.1 m, but a wall at 1.5 m
-# lies north of it. osqp takes linear constraints, casadi any; another solver raises an error that names these two.
+# lies north of it. osqp takes linear constraints, casadi any, and `solve` chooses where no solver is named; another one
+# raises an error that names these two.
 
 # %%
 good = [k for k in range(len(pairs)) if k != 4]
@@ -98,7 +100,7 @@ clean = problem.add("range", [pairs[k] for k in good], ranges[good], std=0.3).ad
     "bearing", pairs, bearings, std=np.deg2rad(1)
 )
 walled = clean.constrain("position", "blue", lower=[-np.inf, -np.inf], upper=[np.inf, 1.5])
-for name, one in (("free", co.solve(clean)), ("walled", co.solve(walled, backend="casadi"))):
+for name, one in (("free", co.solve(clean)), ("walled", co.solve(walled))):
     print(f"{name:7s}", one.status.name, one["blue"][:2].round(2), f"cost {one.cost:.2f}")
 
 # %%

@@ -17,11 +17,13 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inside
 
-PANEL = 32
-"""Rows of a front that are eliminated before one product updates the rest."""
+PANEL = 16
+"""Rows of a front that are eliminated before one product updates the others of their block."""
+BLOCK = 128
+"""Rows of a block, after which one product updates the rest: wide enough for BLAS to be fast."""
 WORTH = 8000
 """Multiplications from which a call of BLAS is faster than loops."""
-STRIP = 64
+STRIP = 128
 """Rows that one product updates: below the diagonal it would compute what nothing reads."""
 
 
@@ -157,7 +159,10 @@ def factorise(fronts: Fronts, place: Ints, values: Floats, factor: Floats) -> bo
         _, c, m = shape(fronts, s)
         block = factor[fronts.start[s] : fronts.start[s + 1]].reshape(c, m)
         front = room[: m * m].reshape(m, m)
-        front[:c], front[c:] = block, 0.0
+        front[:c] = block
+        for i in range(c, m):
+            for j in range(i, m):
+                front[i, j] = 0.0
         locate(fronts, s, where)
         child = head[s]
         while child != -1:
@@ -173,7 +178,11 @@ def factorise(fronts: Fronts, place: Ints, values: Floats, factor: Floats) -> bo
         block[:] = front[:c]
         if m > c:
             parent = fronts.owner[fronts.rows[fronts.row[s]]]
-            updates[s], sibling[s], head[parent] = front[c:, c:].copy(), head[parent], s
+            update = np.empty((m - c, m - c))
+            for i in range(m - c):
+                for j in range(i, m - c):
+                    update[i, j] = front[c + i, c + j]
+            updates[s], sibling[s], head[parent] = update, head[parent], s
     return True
 
 
@@ -182,26 +191,38 @@ def eliminate(front: Floats, c: int) -> bool:
     """L^T of the first c columns of a symmetric matrix in its upper triangle, and what they leave of the others, in
     place; False at a pivot that is not positive."""
     m = len(front)
-    for first in range(0, c, PANEL):
-        last = min(first + PANEL, c)
-        by_loops = (last - first) * (m - last) ** 2 < WORTH
-        for k in range(first, last):
-            if not front[k, k] > 0.0:
-                return False
-            share = 1.0 / np.sqrt(front[k, k])
-            for i in range(k, m):
-                front[k, i] *= share
-            for j in range(k + 1, m if by_loops else last):
-                share = front[k, j]
-                for i in range(j, m):
-                    front[j, i] -= share * front[k, i]
+    for outer in range(0, c, BLOCK):
+        end = min(outer + BLOCK, c)
+        by_loops = (end - outer) * (m - end) ** 2 + (end - outer) ** 3 // 3 < WORTH
+        for first in range(outer, end, PANEL):
+            last = min(first + PANEL, end)
+            for k in range(first, last):
+                if not front[k, k] > 0.0:
+                    return False
+                share = 1.0 / np.sqrt(front[k, k])
+                for i in range(k, m):
+                    front[k, i] *= share
+                for j in range(k + 1, m if by_loops else last):
+                    share = front[k, j]
+                    for i in range(j, m):
+                        front[j, i] -= share * front[k, i]
+            if not by_loops:
+                downdate(front, first, last, end)
         if not by_loops:
-            panel = np.ascontiguousarray(front[first:last, last:])
-            for top in range(0, m - last, STRIP):
-                left = np.ascontiguousarray(panel[:, top : top + STRIP].T)
-                right = np.ascontiguousarray(panel[:, top:])
-                front[last + top : last + top + STRIP, last + top :] -= np.dot(left, right)
+            downdate(front, outer, end, m)
     return True
+
+
+@compiled
+def downdate(front: Floats, first: int, last: int, end: int) -> None:
+    """Subtract the products of the rows first to last, which are eliminated, from those below up to `end`."""
+    if last < end:
+        panel = np.ascontiguousarray(front[first:last, last:])
+        for top in range(0, end - last, STRIP):
+            wide = min(STRIP, end - last - top)
+            left = np.ascontiguousarray(panel[:, top : top + wide].T)
+            right = np.ascontiguousarray(panel[:, top:])
+            front[last + top : last + top + wide, last + top :] -= np.dot(left, right)
 
 
 @compiled

@@ -41,6 +41,13 @@ class Cholesky:
 
         return not len(values) or bool(factorise(self._fronts, self._place, values, self._factor))
 
+    @property
+    def pivots(self) -> Floats:
+        """(u,) squares of L's diagonal."""
+        from ...kernels.graphs.multifrontal import places
+
+        return np.asarray(np.square(self._factor[places(self._fronts, self._rank, self._rank)]))
+
     def solve(self, rhs: Floats) -> Floats:
         """(u,) A^-1 rhs."""
         from ...kernels.graphs.multifrontal import solved
@@ -85,6 +92,11 @@ class DenseCholesky:
         matrix[self._place] = values
         self._root, info = self._dpotrf(matrix.reshape(self._size, -1).T, clean=0, overwrite_a=1)
         return bool(info == 0)
+
+    @property
+    def pivots(self) -> Floats:
+        """(u,) squares of U's diagonal."""
+        return np.square(self._root.diagonal()) if self._size else np.zeros(0)
 
     def solve(self, rhs: Floats) -> Floats:
         """(u,) A^-1 rhs."""

@@ -13,7 +13,7 @@ from weakref import WeakValueDictionary
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..model.derivatives import Kind, Linear, Model, Structure, Term, numbers_of, write
+from ..model.derivatives import Kind, Model, Structure, Term, numbers_of, write
 from ..model.factor import steerable
 from ..model.problem import Problem
 from ..model.space import Space
@@ -136,39 +136,6 @@ class Layout:
             small = self.entries.size <= DENSE
             self._local.cholesky = DenseCholesky(*pattern) if small else Cholesky(*pattern, group)
         return self._local.cholesky  # type: ignore[no-any-return]
-
-    @cached_property
-    def _products(self) -> Any:
-        """Adds the products (J, r)^T (J, r) of all measurements, see `places_of`. Where the derivatives by two nodes
-        are opposed, the last alone is there."""
-        from scipy.sparse import csr_array
-
-        goals, signs, top, places = [np.empty(0, np.int64)], [np.empty(0)], 0, [np.empty(0, np.int64)]
-        for term in self.terms:
-            (count, arity), dof = term.nodes.shape, term.kind.space.dof
-            width = 1 + (dof if term.kind.opposed else arity * dof)
-            i, j = np.triu_indices(arity * dof)
-            i, j = np.append(i, np.arange(arity * dof)), np.append(j, np.full(arity * dof, -1))
-            row, column = (i % dof, j % dof) if term.kind.opposed else (i, j)
-            sign = np.where(i // dof == np.where(j < 0, arity - 1, j // dof), 1.0, -1.0 if term.kind.opposed else 1.0)
-            at = row * width + np.where(j < 0, width - 1, column)
-            goals.append(places_of(self.entries, term.nodes, np.stack([i, j], axis=1)).T.ravel())
-            places.append((top + width * width * np.arange(count)[:, None] + at).ravel())
-            signs.append(np.tile(sign, count))
-            top += count * width * width
-        goal, place = np.concatenate(goals), np.concatenate(places)
-        return csr_array(
-            (np.concatenate(signs), (goal, place)), shape=(self.entries.size + len(self.entries.indices) + 2, top)
-        )
-
-    def normal_equations(self, linear: Linear) -> tuple[Floats, Floats]:
-        """The values of the upper triangle of J^T J (B, entries) and J^T r (B, m) of linearised problems."""
-        m, squares = self.entries.size, [np.empty((len(linear.x), 0))]
-        for term, residual, jacobians in zip(self.terms, linear.residual, linear.jacobian, strict=True):
-            wide = np.concatenate([*jacobians[-1 if term.kind.opposed else 0 :], residual[..., None]], axis=-1)
-            squares.append((wide.swapaxes(-1, -2).copy() @ wide).reshape(len(wide), -1))
-        total = self._products @ np.concatenate(squares, axis=1).T
-        return np.ascontiguousarray(total[m + 1 : -1].T), np.ascontiguousarray(total[1 : m + 1].T)
 
     def total(self, model: Model, x: Floats, numbers: Sequence[Floats]) -> Floats:
         """The cost, the gradient, the Hessian's values and a last number, which is waste, at x (n, ambient).

@@ -59,10 +59,10 @@ class Assessment:
         return 0.0 if self.active is None else self.active.violation
 
 
-def assess(problem: Problem, x: Floats) -> Assessment:
-    """Assessment of a single problem at x (n, ambient)."""
+def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
+    """Assessment of a single problem at x (n, ambient); without constraints the covariance may be left out."""
     if not problem.constraints:
-        return _unconstrained(problem, sparse(problem), x)
+        return _unconstrained(problem, sparse(problem), x, covariance)
     linear = problem.linearise(x[None])
     J, shape = problem.jacobian(linear), (len(x), problem.space.dof)
     gradient = J.T @ np.concatenate([r.ravel() for r in linear.residual])
@@ -81,22 +81,29 @@ def assess(problem: Problem, x: Floats) -> Assessment:
     return Assessment(float(linear.cost[0]), size, cov, float(np.abs(dx).max(initial=0.0)), (), active)
 
 
-def _unconstrained(problem: Problem, system: Sparse, x: Floats) -> Assessment:
-    """The assessment of a problem without constraints."""
+def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool) -> Assessment:
+    """The assessment of a problem without constraints.
+
+    A pivot is the information of an unknown with those before it eliminated and those after it given, so that its
+    inverse is no larger than the variance: along a free direction one is rounding.
+    """
     cholesky = system.cholesky
     cost, gradient, values = system.quadratic(x, "gauss-newton")
+    cov = np.full((len(x), *(problem.space.dof,) * 2), np.nan)
     size = float(np.sqrt(gradient @ gradient))
-    unknown = Assessment(cost, size, np.full((len(x), *(problem.space.dof,) * 2), np.nan), np.nan)
+    unknown = Assessment(cost, size, cov, np.nan)
     if not np.isfinite(values).all():
         return unknown
     dx: Floats = np.zeros(0)
     inflation: Floats = np.full(1, np.inf)
     if cholesky.factor(values):
-        dx = -cholesky.solve(gradient)
-        free, rows, columns = system.entries.own
-        found, cov = cholesky.inverse(rows, columns), np.zeros(free.shape)
-        cov[free] = found
-        inflation = found[rows == columns] * values[system.entries.diagonal]
+        dx, own = -cholesky.solve(gradient), values[system.entries.diagonal]
+        inflation = own / cholesky.pivots
+        if covariance or not (inflation < INFLATION).all():
+            free, rows, columns = system.entries.own
+            found, cov = cholesky.inverse(rows, columns), np.zeros(free.shape)
+            cov[free] = found
+            inflation = found[rows == columns] * own
     if not (inflation < INFLATION).all():
         nodes = _unobservable(problem, problem.whiten(x)[1], None)
         if nodes or not len(dx):

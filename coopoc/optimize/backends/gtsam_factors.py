@@ -1,9 +1,9 @@
 """GTSAM's own factors with exactly our objective, by kind, and problems as its graphs and values.
 
 The error e of a GTSAM class below gives our whitened residual, or one of the same length, as S e; S goes into its noise
-model and the loss into a robust one. What is not here GTSAM weighs in another way: its bearing in space lives in the
-tangent plane of a direction, and range, azimuth and inclination in the world frame it does not have. A point is a
-Point2/3, a pose a Pose2/3.
+model and the loss into a robust one. What is not here GTSAM weighs in another way, and is a CustomFactor of our
+residual: its bearing in space lives in the tangent plane of a direction, and range, azimuth and inclination in the
+world frame it does not have. A point is a Point2/3, a pose a Pose2/3.
 """
 
 from __future__ import annotations
@@ -15,7 +15,8 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...arrays import Floats
-from ..model.factor import Factor, Loss
+from ..model.derivatives import linearise
+from ..model.factor import Factor, Loss, unchecked
 from ..model.problem import Problem
 from ..model.space import Space, exp, log
 
@@ -221,16 +222,50 @@ FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
 """(factor, W (M or 1, size, size), dimension) -> parts, by kind."""
 
 
-def graph_of(problem: Problem, parts: Sequence[Form], keys: Sequence[int] | None = None) -> Any:
-    """The gtsam.NonlinearFactorGraph of the factors that have parts (see `forms`), and of the nodes that are fixed.
+class Callbacks:
+    """Residuals and derivatives of factors that GTSAM lacks, for its CustomFactors: all at once at each new point.
 
     Args:
-        keys: GTSAM's names of the nodes, default their indices.
+        problem: a single one.
+        factors: of it.
     """
+
+    def __init__(self, problem: Problem, factors: Sequence[Factor]) -> None:
+        self._space, self._posed = problem.space, which_turn(problem)
+        self._factors = [unchecked(factor, loss=None) for factor in factors]
+        self._at: Any = None
+
+    def of(self, k: int, row: int, nodes: Sequence[int]) -> Callable[[Any, Any, Any], Any]:
+        """The error function of a measurement."""
+        import gtsam
+
+        def error(_: Any, found: Any, jacobians: Any) -> Any:
+            if self._at is None or not found.equals(self._at, 0.0):
+                self._at, x = gtsam.Values(found), estimate(self._space, self._posed, found)
+                self._linear = linearise(self._space, self._factors, None, x[None])
+                self._tangent = tangent(self._space, self._posed, x)
+            if jacobians is not None:
+                for place, i in enumerate(nodes):
+                    by = self._linear.jacobian[k][place][0]
+                    jacobians[place] = by[row] @ self._tangent[i]
+            return self._linear.residual[k][0, row]
+
+        return error
+
+
+def graph_of(problem: Problem, parts: Sequence[Form]) -> Any:
+    """The gtsam.NonlinearFactorGraph of the factors, of which those without parts (see `forms`) are CustomFactors, and
+    of the nodes that are fixed, with their indices as keys."""
     import gtsam
 
     graph, posed = gtsam.NonlinearFactorGraph(), which_turn(problem)
-    keys = range(len(posed)) if keys is None else keys
+    lacking = [factor for factor, form in zip(problem.factors, parts, strict=True) if isinstance(form, str)]
+    callbacks = Callbacks(problem, lacking)
+    for k, factor in enumerate(lacking):
+        model = _robust(gtsam.noiseModel.Unit.Create(factor.size), factor.loss)
+        for row in np.flatnonzero(factor.informative).tolist():
+            nodes = factor.nodes[row].tolist()
+            graph.add(gtsam.CustomFactor(model, nodes, callbacks.of(k, row, nodes)))
     for factor, form in zip(problem.factors, parts, strict=True):
         for part in () if isinstance(form, str) else form:
             models = _models(part.root, factor)
@@ -239,31 +274,30 @@ def graph_of(problem: Problem, parts: Sequence[Form], keys: Sequence[int] | None
                     nodes = nodes[::-1]  # such as a range from a point to a pose
                 made = getattr(gtsam, part.names[tuple([posed[i] for i in nodes])])
                 if model is not None:
-                    graph.add(made(*(keys[i] for i in nodes), *given, model))
+                    graph.add(made(*nodes, *given, model))
     for i in problem.fixed:
         assert problem.x0 is not None
         name = f"NonlinearEquality{'Pose' if posed[i] else 'Point'}{problem.dimension}"
-        graph.add(getattr(gtsam, name)(keys[i], _node(problem.dimension, problem.x0[i], posed[i])))
+        graph.add(getattr(gtsam, name)(i, _node(problem.dimension, problem.x0[i], posed[i])))
     return graph
 
 
-def values(space: Space, posed: Sequence[bool], x: Floats, keys: Iterable[int]) -> Any:
-    """gtsam.Values of nodes x (n, ambient), which are points or `posed`, under their keys."""
+def values(space: Space, posed: Sequence[bool], x: Floats) -> Any:
+    """gtsam.Values of nodes x (n, ambient), which are points or `posed`, under their indices."""
     import gtsam
 
     found = gtsam.Values()
-    for key, node, turns in zip(keys, x, posed, strict=True):
+    for key, (node, turns) in enumerate(zip(x, posed, strict=True)):
         found.insert(key, _node(space.dimension, node, turns))
     return found
 
 
-def estimate(space: Space, posed: Sequence[bool], found: Any, keys: Sequence[int]) -> Floats:
+def estimate(space: Space, posed: Sequence[bool], found: Any) -> Floats:
     """x (n, ambient) of the nodes in gtsam.Values, which holds no others."""
     from gtsam import utilities
 
-    d, x, rank = space.dimension, np.empty((len(posed), space.ambient)), np.argsort(keys)
-    turns = np.array(posed, dtype=bool)[rank]
-    points, poses = rank[~turns], rank[turns]
+    d, x = space.dimension, np.empty((len(posed), space.ambient))
+    points, poses = np.flatnonzero(~np.array(posed)), np.flatnonzero(posed)
     if len(points):
         x[points] = space.join(getattr(utilities, f"extractPoint{d}")(found))
     if len(poses) and d == 2:
@@ -319,8 +353,13 @@ def _model(raw: bytes, size: int, loss: Loss | None) -> Any:
     noise, root = gtsam.noiseModel, np.frombuffer(raw).reshape(size, size)
     if not root.any():
         return None
-    model: Any = noise.Gaussian.SqrtInformation(root, not np.tril(root, -1).any())
+    return _robust(noise.Gaussian.SqrtInformation(root, not np.tril(root, -1).any()), loss)
+
+
+def _robust(model: Any, loss: Loss | None) -> Any:
+    """A noise model under a loss."""
+    from gtsam import noiseModel as noise
+
     if loss is None:
         return model
-    shape = getattr(noise.mEstimator, ESTIMATORS[loss.name]).Create(loss.scale)
-    return noise.Robust.Create(shape, model)
+    return noise.Robust.Create(getattr(noise.mEstimator, ESTIMATORS[loss.name]).Create(loss.scale), model)

@@ -20,7 +20,7 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ..algebra.sparse import Layout, layout_of
+from ..algebra.sparse import Layout, layout_of, sparse
 from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
 from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
@@ -83,32 +83,28 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     moving = np.flatnonzero(layout.entries.number.ravel() >= 0)
     held = Programme(_pattern(layout), limits.matrix[:, moving]) if limits else None
 
-    def solver(problem: Problem, x: Floats) -> SolverResult:
+    def solver(problem: Problem, start: Floats) -> SolverResult:
+        system, x = sparse(problem), start
         programme = held or unbounded(layout, get_ident())
         programme.counts.update(osqp_iterations=0, repairs=0)
         if limits:
             try:
-                start, feasible = _nearest(limits, x[0])
+                x, feasible = _nearest(limits, start)
             except np.linalg.LinAlgError:
                 return SolverResult(x, 0, extras=dict(programme.counts))
-            x = start[None]
             if not feasible:
                 return SolverResult(x, 0, True, dict(programme.counts))
 
         def step(linear: Linear, damping: Floats) -> Floats:
-            values, q = layout.normal_equations(linear)
-            if damping.any():
-                values[:, layout.entries.diagonal] += damping.reshape(len(q), -1)[:, moving]
-            dx = np.zeros((len(q), damping[0].size))
-            if limits:
-                dx[:, moving] = programme.solve(values[0], q[0], *limits.around(linear.x[0]))
-            else:
-                dx[:, moving] = programme.each(values, q)
+            _, q, values = system.quadratic(linear.x[0], "gauss-newton")
+            values[layout.entries.diagonal] += damping.ravel()[moving]
+            sides = limits.around(linear.x[0]) if limits else (np.empty(0), np.empty(0))
+            dx = np.zeros(damping.size)
+            dx[moving] = programme.solve(values, q, *sides)
             return dx.reshape(damping.shape)
 
-        result = minimise(problem, step, x, max_iterations, tolerance)
-        result.extras.update(programme.counts)
-        return result
+        end = minimise(problem, step, x[None], max_iterations, tolerance)
+        return SolverResult(end.x[0], int(np.ravel(end.iterations)[0]), extras=end.extras | programme.counts)
 
     return solver
 
@@ -167,34 +163,6 @@ class Programme:
             self._polish(active)
         raise np.linalg.LinAlgError("osqp: the KKT conditions of a quadratic programme stay unsatisfied")
 
-    def each(self, values: Floats, q: Floats) -> Floats:
-        """dx (B, m) without bounds, checked together; one that fails is repaired, and NaN where that fails, too."""
-        dx, start, nothing = np.empty_like(q), np.zeros(q.shape[1]), np.empty(0)
-        self._polish(False)
-        core = self._workspace._solver  # osqp's class around it takes longer than a small programme
-        vector, matrix, warm, run, iterations = (
-            core.update_data_vec,
-            core.update_data_mat,
-            core.warm_start,
-            core.solve,
-            0,
-        )
-        for slope, own, out in zip(q, values, dx, strict=True):
-            vector(slope, None, None)
-            matrix(own, None, None, None)
-            warm(start, None)  # earlier solves must not show
-            run()
-            out[:] = core.solution.x
-            iterations += core.info.iter
-        self.counts["osqp_iterations"] += int(iterations)
-        rest, _, allowed = self._stationary(values, q, dx)
-        for b in np.flatnonzero(~(np.abs(rest) <= allowed).all(axis=1)).tolist():
-            try:
-                dx[b] = self.solve(values[b], q[b], nothing, nothing)
-            except np.linalg.LinAlgError:
-                dx[b] = np.nan
-        return dx
-
     def update(self, values: Floats, q: Floats, lower: Floats, upper: Floats) -> None:
         """Put numbers into the workspace, which the first ones set up."""
         import osqp
@@ -217,20 +185,14 @@ class Programme:
 
     def _holds(self, values: Floats, q: Floats, lower: Floats, upper: Floats, dx: Floats, y: Floats) -> bool:
         """The KKT conditions, computed by ourselves: stationarity, bounds, and a push only where a bound is met."""
-        (rest,), (weak,), (allowed,) = self._stationary(values[None], q[None], dx[None])
-        value = self._rows @ dx
-        if not (np.abs(rest + self._rows.T @ y) <= allowed).all():
+        own, value = values[self._pattern.indptr[1:] - 1], self._rows @ dx
+        rest = self._into @ (values[self._entry] * dx[self._column]) + q
+        weak = KKT * float(np.maximum(np.abs(q), np.abs(own * dx)).max(initial=0.0))
+        if not (np.abs(rest + self._rows.T @ y) <= weak + NEGLIGIBLE * own).all():
             return False
         kept = (value >= lower - CLOSE) & (value <= upper + CLOSE)
         pushed = ((y <= weak) | (value >= upper - CLOSE)) & ((y >= -weak) | (value <= lower + CLOSE))
         return bool(np.all(kept & pushed))
-
-    def _stationary(self, values: Floats, q: Floats, dx: Floats) -> tuple[Floats, Floats, Floats]:
-        """P dx + q (B, m), the share of what adds up in it that is weak (B, 1), and what it may be."""
-        own = values[:, self._pattern.indptr[1:] - 1]
-        rest = (self._into @ (values[:, self._entry] * dx[:, self._column]).T).T + q
-        weak = KKT * np.maximum(np.abs(q), np.abs(own * dx)).max(axis=1, keepdims=True)
-        return rest, weak, weak + NEGLIGIBLE * own
 
 
 @lru_cache(maxsize=64)
@@ -293,5 +255,5 @@ BACKEND = Backend(
     prepare,
     "sequential quadratic programming, persistent workspace",
     "osqp",
-    Capabilities(batched=True, constraints="linear"),
+    Capabilities(constraints="linear"),
 )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from time import perf_counter
 from typing import Any
 
@@ -66,14 +66,11 @@ class Descent:
         x: (B, n, ambient).
         iterations: (B,) linear steps taken.
         converged: (B,) the last step was below the tolerance.
-        record: (iterations, 3) of a single problem: the cost before each step, its damping, and which share of the
-            promised decrease came true; empty for B realisations.
     """
 
     x: Floats
     iterations: Ints
     converged: Bools
-    record: Floats = field(default_factory=lambda: np.empty((0, 3)))
 
 
 def descend(
@@ -105,7 +102,6 @@ def descend(
     done, mu = np.zeros(len(x), dtype=bool), np.zeros(len(x))
     active, now = np.arange(len(x)), problem
     linear, near = problem.linearise(best), tolerance / LINEAR if problem.linear else tolerance
-    record: list[tuple[float, float, float]] = []
     with progress("solve") as counted:
         for _ in range(max_iterations):
             counted(float(linear.cost.sum()))
@@ -118,8 +114,6 @@ def descend(
             promised = linear.cost - trial.cost if problem.linear else _promised(problem, linear, dx)
             telling = promised > HIDDEN * linear.cost
             share = np.where(telling, (linear.cost - trial.cost) / np.where(telling, promised, 1.0), 0.5)
-            if problem.batch is None:
-                record.append((linear.cost[0], mu[0], share[0]))
             mu[active] = _damping(mu[active], better, share)
             best[active[better]] = trial.x[better]
             flat = solved & (promised <= FLAT * linear.cost) & (not problem.constraints)
@@ -135,7 +129,7 @@ def descend(
             if not going.all():
                 active = active[going]
                 now = problem.pick(active) if problem.batch else problem
-    return Descent(best, count, done, np.array(record).reshape(-1, 3))
+    return Descent(best, count, done)
 
 
 def minimise(problem: Problem, step: Step, x: Floats, max_iterations: int, tolerance: float) -> SolverResult:
@@ -145,7 +139,7 @@ def minimise(problem: Problem, step: Step, x: Floats, max_iterations: int, toler
         dx, _ = _try(step, problem, problem.linearise(x), np.zeros(len(x)))
         return SolverResult(problem.space.retract(x, dx), np.ones(len(x), dtype=np.int64))
     end = descend(problem, step, x, max_iterations, tolerance)
-    return SolverResult(end.x, end.iterations, extras={"record": end.record})
+    return SolverResult(end.x, end.iterations)
 
 
 def check_limits(max_iterations: int, tolerance: float) -> None:

@@ -65,6 +65,11 @@ class Loss:
         hint, tiny = "It counts standard deviations: 1.5 to 3.", np.finfo(float).tiny
         object.__setattr__(self, "scale", number("scale", self.scale, tiny, allowed="> 0 and finite", hint=hint))
 
+    @property
+    def redescends(self) -> bool:
+        """True if the weight of a large residual falls so fast that its cost is bounded."""
+        return self.name in ("truncated", "geman-mcclure")
+
     def cost(self, square: Floats) -> Floats:
         """rho(s)."""
         return np.asarray(LOSSES[self.name][0](square, self.scale, np))

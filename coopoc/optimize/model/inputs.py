@@ -130,6 +130,8 @@ def check_rotations(field: str, rotation: Floats) -> None:
     error = np.abs(rotation @ np.swapaxes(rotation, -1, -2) - np.eye(rotation.shape[-1])).max(axis=(-1, -2))
     if (error > 1e-6).any() or (np.linalg.det(rotation) < 0).any():
         hint = "Make it with coopoc.optimize.pose(position, angle)."
+        if (rotation == 0).all(axis=(-2, -1)).any():
+            hint = "Zeros are none: points and anchors among poses need a rotation, too: co.pose(anchor, 0)."
         raise InputError(field, f"a rotation off by {error.max():.1g}", "must hold rotation matrices", hint)
 
 

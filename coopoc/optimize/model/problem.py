@@ -44,6 +44,7 @@ class Search(NamedTuple):
         start: name of the start, "" if the user gave x0.
         iterations: linear steps from all starts that were tried.
         seconds: to make the starts and to take those steps.
+        notes: what is to be said of it, for `Solution.notes`.
 
     >>> Search("odometry").iterations
     0
@@ -52,6 +53,7 @@ class Search(NamedTuple):
     start: str = ""
     iterations: int = 0
     seconds: float = 0.0
+    notes: tuple[str, ...] = ()
 
     @property
     def extras(self) -> dict[str, str | int | float]:

@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ...arrays import Floats, Ints, checked, frozen, instance, plain
 from ...errors import InputError, shown
-from ..model.derivatives import linearise
+from ..assess.plausible import squared
 from ..model.factor import unchecked
 from ..model.problem import Problem
 
@@ -61,17 +61,17 @@ def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None 
 
 
 def reweigh(problem: Problem, marked: Marked, weight: Floats, x0: Floats) -> Problem:
-    """The problem from x0 (n, ambient), with W of the candidates times sqrt(weight) (G,)."""
+    """The problem from x0 (n, ambient), with W of the candidates times sqrt(weight) (G,) in place of their loss."""
     factors = list(problem.factors)
     for k in np.unique(marked.factor):
         factor, here = factors[k], marked.factor == k
         root = np.ones((len(factor.nodes), 1))
         root[marked.row[here], 0] = np.sqrt(weight[marked.group[here]])
         if factor.std is None:
-            factors[k] = unchecked(factor, sqrt_information=factor.sqrt_information * root[..., None])
+            factors[k] = unchecked(factor, loss=None, sqrt_information=factor.sqrt_information * root[..., None])
         else:
             with np.errstate(divide="ignore"):  # no weight is an infinite std
-                factors[k] = unchecked(factor, std=factor.std / root)
+                factors[k] = unchecked(factor, loss=None, std=factor.std / root)
     return problem.replace_unchecked(factors=tuple(factors), x0=frozen(x0))
 
 
@@ -79,9 +79,8 @@ def squares(problem: Problem, marked: Marked, x: Floats) -> Floats:
     """(G,) r^2 of each group at x (n, ambient)."""
     found = np.empty(len(marked.row))
     for k in np.unique(marked.factor):
-        factor, here = problem.factors[k], marked.factor == k
-        (residual,) = linearise(problem.space, [unchecked(factor, loss=None)], None, x[None]).residual
-        found[here] = np.square(residual[0]).sum(axis=-1)[marked.row[here]]
+        here = marked.factor == k
+        found[here] = squared(problem, problem.factors[k], x)[marked.row[here]]
     return marked.sums(found)
 
 

@@ -2,78 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any, Literal, get_args
 
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Floats, instance, number, one_of
+from ...arrays import Floats, instance, one_of
 from ...errors import InputError
 from ..backend import Backend
 from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status
 from ..solve import solve
 from .candidates import Candidates, bounds, mark, reweigh, squares
+from .graduated import graduate, surrogate_of
 from .loop_closures import known_start
 
 Start = Literal["all", "known"]
-ROUNDS = 300
-"""About 20 are needed."""
-RATE = 1.4
-"""By which mu changes from round to round."""
-SETTLED = 1e-6
-"""Largest change of a weight that is none."""
-EASY = 1e-6
-"""Below this mu is not inverted: all candidates are far within their thresholds."""
-
-
-@dataclass(frozen=True)
-class Surrogate:
-    """A robust loss made convex by mu, as weights of the ratio s = r^2 / c^2.
-
-    Args:
-        first: mu from the largest ratio.
-        weight: w(s, mu) = d rho_mu / d r^2.
-        later: the next mu.
-        done: whether the weights (G,) have settled, from the new ones, those before and mu.
-        last: mu at which rho_mu is rho, or near enough.
-    """
-
-    first: Callable[[float], float]
-    weight: Callable[[Floats, float], Floats]
-    later: Callable[[float], float]
-    done: Callable[[Floats, Floats, float], bool]
-    last: float
-
-
-SURROGATES = {
-    "truncated": Surrogate(
-        lambda worst: 1.0 / max(2.0 * worst - 1.0, EASY),
-        lambda s, mu: np.clip(np.sqrt(mu * (mu + 1.0) / np.maximum(s, 1e-30)) - mu, 0.0, 1.0),
-        lambda mu: mu * RATE,
-        lambda new, old, mu: bool(((new == old) & ((new == 0.0) | (new == 1.0))).all()),
-        1e6,
-    ),
-    "geman-mcclure": Surrogate(
-        lambda worst: max(2.0 * worst, 1.0),
-        lambda s, mu: np.square(mu / (s + mu)),
-        lambda mu: max(mu / RATE, 1.0),
-        lambda new, old, mu: mu == 1.0 and bool((np.abs(new - old) <= SETTLED).all()),
-        1.0,
-    ),
-}
-"""Of Yang et al.: min(r^2, c^2) as mu grows from c^2 / (2 r_max^2 - c^2), r^2 / (1 + r^2/c^2) as it falls to 1."""
-
-
-def surrogate_of(loss: str, threshold: float) -> Surrogate:
-    """The surrogate of a loss; InputError if there is none, or if the threshold is no probability in (0, 1)."""
-    one_of("loss", loss, SURROGATES)
-    if not 0 < number("threshold", threshold, allowed="a probability in (0, 1)") < 1:
-        hint = "Use 0.99, or scipy.stats.chi2.cdf(c ** 2, size)."
-        raise InputError("threshold", threshold, "must be a probability in (0, 1)", hint)
-    return SURROGATES[loss]
 
 
 def solve_gnc(
@@ -143,34 +88,23 @@ def solve_gnc(
     bound, each, extras = bounds(problem, marked, threshold), list[Solution](), dict[str, Any]()
 
     def inner(weighted: Problem) -> Floats:
-        each.append(solve(weighted, backend, throw=False, **options))
+        each.append(solve(weighted, backend, throw=False, covariance=False, **options))
         return each[-1].x
 
-    rounds = 0
     if start == "known":
         known = known_start(problem, marked, bound, inner)
-        x, weight, rounds, mu = known.x, known.weight, known.rounds, surrogate.last
+        x, weight, before, mu = known.x, known.weight, known.rounds, surrogate.last
         extras |= {"joined": known.joined} if known.joined else {}
     else:
-        x, weight = inner(problem), np.ones(len(bound))
+        x, weight, before = inner(problem), np.ones(len(bound)), 0
         mu = surrogate.first(float((squares(problem, marked, x) / bound).max()))
-    settled = False
-    for _ in range(ROUNDS):
-        new = surrogate.weight(squares(problem, marked, x) / bound, mu)
-        settled, weight = surrogate.done(new, weight, mu), new
-        if settled:
-            break
-        x, mu, rounds = inner(reweigh(problem, marked, weight, x)), surrogate.later(mu), rounds + 1
-    final = solve(reweigh(problem, marked, weight, x), backend, throw=throw and settled, **options)
-    extras |= {"weights": weight[marked.group], "rounds": rounds, "mu": float(mu)}
-    solution = replace(
-        final,
-        extras=final.extras | extras,
-        iterations=sum(s.iterations for s in (*each, final)),
-        build_seconds=sum(s.build_seconds for s in (*each, final)),
-        solve_seconds=sum(s.solve_seconds for s in (*each, final)),
-        status=final.status if settled else Status.MAX_ITERATIONS,
-    )
-    if throw and not settled:
+    end = graduate(problem, marked, bound, surrogate, inner, x, weight, mu)
+    final = solve(reweigh(problem, marked, end.weight, end.x), backend, throw=throw and end.settled, **options)
+    extras |= {"weights": end.weight[marked.group], "rounds": before + end.rounds, "mu": float(end.mu)}
+    names = ("iterations", "build_seconds", "solve_seconds", "check_seconds")
+    work = {name: sum(getattr(s, name) for s in (*each, final)) for name in names}
+    status = final.status if end.settled else Status.MAX_ITERATIONS
+    solution = replace(final, extras=final.extras | extras, status=status, **work)
+    if throw and not end.settled:
         raise SolveError(solution)
     return solution

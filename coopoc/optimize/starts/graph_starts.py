@@ -185,15 +185,28 @@ STARTS: dict[str, Callable[[Graph], Floats]] = {
 
 
 def contenders(graph: Graph) -> tuple[str, ...]:
-    """The starts that may differ on a graph, cheapest first: without loops all are chained odometry."""
+    """The starts that may differ on a graph, cheapest first: without loops all are chained odometry, but the file's
+    vertices where they are a guess and not the truth."""
+    given = ("file",) if graph.guess and np.isfinite(graph.position).all() else ()
     edges = graph.relative_pose.nodes
     loops = len(edges) + len(graph.relative_point) + len(graph.point_prior) + len(graph.pose_prior)
     moved = len(graph.names) - len(np.setdiff1d(np.flatnonzero(~graph.is_pose), graph.relative_point.nodes[:, -1]))
     if loops <= moved - 1:
-        return ("odometry",)
+        return ("odometry", *given)
     own = int(_own(graph).sum())
     closed = len(edges) > own or own > int(graph.is_pose.sum()) - len(graph.robots)
-    return ("odometry", "tree", "linear") if closed else ("odometry", "linear")
+    return ("odometry", *given, "tree", "linear") if closed else ("odometry", *given, "linear")
+
+
+def unwound(graph: Graph, x: Floats) -> bool:
+    """Whether the errors of all relative rotations at x (n, ambient) sum to less than half a turn, so that no cycle is
+    wound up by a whole one, as in the local minima of pose graphs; False where more than rotations may hide one."""
+    if len(graph.ranges) or len(graph.relative_point) or len(graph.pose_prior) > 1:
+        return False
+    edges, turned = graph.relative_pose, Space(graph.dimension, has_rotation=True).rotation(x)
+    gap = turned[edges.nodes[:, 1]] - turned[edges.nodes[:, 0]] @ edges.rotation
+    sine = np.linalg.norm(gap, axis=(1, 2)) / np.sqrt(8.0)  # |R - S|_F = sqrt(8) sin(angle / 2)
+    return bool(2.0 * np.arcsin(np.minimum(sine, 1.0)).sum() < np.pi)
 
 
 def separated(graph: Graph, x0: Floats) -> Floats:

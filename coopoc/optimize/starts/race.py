@@ -8,6 +8,7 @@ import numpy as np
 
 from ...arrays import Floats, frozen
 from ..algebra.sparse import sparse
+from ..assess.plausible import expected
 from ..descent.levenberg_marquardt import Arrival, arrive
 from ..model.problem import Problem, Search
 
@@ -30,19 +31,22 @@ def race(
     problem: Problem,
     starts: Mapping[str, Callable[[], Floats]],
     growing: Callable[[Problem], tuple[Floats, int]] | None = None,
+    relaxed: Callable[[Problem], Floats] | None = None,
+    unwound: Callable[[Floats], bool] = lambda x: False,
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
-    A start from which no step was refused and no promise failed by half, and that leads to a cost which the assumed
-    noise explains, ends the search. Others are tried where the first had trouble, and all whose costs are near
-    the least go on (ROUNDS). Where the noise does not explain the end, the steps to it had trouble and no second start
-    led there, the growing start is tried, too: stated noise that is ten times too small costs a few more starts and not
-    that.
+    All starts are tried, and those whose costs are near the least go on (ROUNDS), unless one leads by steps of which
+    none was refused and whose promises came true by half and more, to a cost which the assumed noise explains, and to
+    an end that is `unwound`. Where the noise does not explain the end, the steps to it had trouble and no second start
+    led there, the growing start is tried, too, and where the noise still does not, the relaxation.
 
     Args:
         problem: at any start.
         starts: name -> x0 (n, ambient), cheapest first.
-        growing: problem -> x0 and iterations of a start that is tried last, "incremental".
+        growing: problem -> x0 and iterations of a start that is tried late, "incremental".
+        relaxed: problem -> x0, "relaxed", of one that is tried last; None where it would take too long.
+        unwound: x -> whether no other minimum of a lower cost is to be feared.
     """
     system, tried, taken = sparse(problem), {}, 0
     mean, variance = expected(problem, system.size)
@@ -52,7 +56,7 @@ def race(
         end = arrive(system, x, STEPS, TOLERANCE)
         tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
         if smooth(end):
-            if tried[name][0] <= limit:
+            if tried[name][0] <= limit and unwound(end.x):
                 return problem.replace_unchecked(x0=frozen(end.x)), Search(name, taken)
             straight |= {name} if end.converged else set()
     reached = {name: cost for name, (cost, _) in tried.items()}
@@ -78,6 +82,10 @@ def race(
             end = arrive(system, grown, MORE, TOLERANCE)
             taken += steps + end.iterations
             name, x = ("incremental", end.x) if system.cost(end.x) < (1.0 - SAME) * system.cost(x) else (name, x)
+    if relaxed is not None and system.cost(x) > limit:
+        end = arrive(system, relaxed(problem.replace_unchecked(x0=frozen(x))), MORE, TOLERANCE)
+        taken += end.iterations
+        name, x = ("relaxed", end.x) if system.cost(end.x) < (1.0 - SAME) * system.cost(x) else (name, x)
     return problem.replace_unchecked(x0=frozen(x)), Search(name, taken)
 
 
@@ -88,23 +96,6 @@ def _distinct(tried: dict[str, tuple[float, Floats]]) -> dict[str, tuple[float, 
         if all(abs(cost - other) > SAME * min(cost, other) for other, _ in found.values()):
             found[name] = cost, x
     return found
-
-
-def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
-    """Mean and variance of the cost at its minimum under the noise that it assumes.
-
-    Each number that is measured beyond the unknowns adds 1/2 to both. The entries of a rotation matrix count as the
-    angles that they hold; in the plane kappa |R_j - R_i R_ij|_F^2 is twice the square of the angle's error over its
-    variance, and adds 1 and 2.
-    """
-    d, angles = problem.dimension, problem.space.angles
-    matrices = [f for f in problem.factors if f.kind in ("pose_chordal", "relative_pose_chordal")]
-    spare = sum(len(f.nodes) * f.size for f in problem.factors)
-    spare -= (d * d - angles) * sum(len(f.nodes) for f in matrices) + unknowns
-    turns = sum(len(f.nodes) for f in matrices) - len({*problem.poses} - {*problem.fixed})
-    twice = max(turns, 0) if d == 2 and matrices else 0
-    mean = 0.5 * (max(spare, 0) + twice)
-    return mean, mean + twice
 
 
 def smooth(end: Arrival) -> bool:

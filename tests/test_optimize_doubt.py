@@ -1,0 +1,156 @@
+"""Where an answer may be wrong the solution says so: its cost, what a loss rejects, its start, its solver."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from itertools import combinations
+from pathlib import Path
+
+import gtsam
+import numpy as np
+import pytest
+from graph_files import write_graph
+from random_graphs import random_graph
+from scipy.optimize import least_squares
+from scipy.stats import chi2
+
+import coopoc as co
+from coopoc.cli import main
+from coopoc.formats import load_graph
+from coopoc.formats.graph import RangeEdges
+from coopoc.optimize import Loss, Problem, Status, solve
+from coopoc.optimize.assess.plausible import TAIL
+from coopoc.optimize.graph_problems import from_graph
+
+
+def ranged(seed: int, far: float, wrong: int = 0, loss: Loss | None = None) -> tuple[Problem, np.ndarray]:
+    """Eight points in space, each with a fix, and all ranges between them, a few 15 m too long; starts `far` away."""
+    rng = np.random.default_rng(seed)
+    truth, pairs = rng.uniform(-20, 20, (8, 3)), list(combinations(range(8), 2))
+    x0 = truth + far * np.eye(3)[0] if loss else rng.uniform(-far, far, (8, 3))
+    fixed = range(8) if loss else range(3)
+    z = np.array([[np.linalg.norm(truth[j] - truth[i]) + rng.normal(0, 0.1)] for i, j in pairs])
+    z[:wrong] += 15.0
+    fixes = truth[list(fixed)] + rng.normal(0, 0.3, (len(fixed), 3))
+    problem = Problem([f"v{k}" for k in range(8)], x0=x0).add("position", list(fixed), fixes, std=0.3, loss=loss)
+    return problem.add("range", pairs, z, std=0.1, loss=loss), truth
+
+
+def test_a_cost_that_the_noise_does_not_explain_is_noted() -> None:
+    """Ranges from random starts; SciPy's chi-square is the referee."""
+    noted = []
+    for seed in range(12):
+        problem, _ = ranged(seed, 20.0)
+        found = solve(problem, throw=False)
+        numbers = 3 * 3 + 28 - 24
+        assert found.expected == pytest.approx(0.5 * numbers)
+        noted.append(chi2.sf(2 * found.cost, numbers) < TAIL)
+        assert any("local minimum" in note for note in found.notes) == noted[-1]
+        assert ("noise explains" in str(found)) == noted[-1]
+        assert f"expected {found.expected:.4g}" in str(found)
+    assert 0 < sum(noted) < len(noted)
+
+
+@pytest.mark.parametrize("name", ["truncated", "geman-mcclure"])
+def test_losses_that_reject_start_by_graduation(name: str) -> None:
+    """From 4 m away, three of 28 ranges wrong; SciPy from the truth is the referee."""
+    for seed in range(4):
+        problem, truth = ranged(seed, 4.0, 3, Loss(name, 3.5))
+        found = solve(problem)
+        free = replace(problem, factors=tuple(replace(f, loss=None) for f in problem.factors))
+
+        def rows(v: np.ndarray, free: Problem = free, problem: Problem = problem) -> np.ndarray:
+            parts = free.linearise(v.reshape(1, 8, 3)).residual
+            square = np.concatenate([np.square(part[0]).sum(axis=-1) for part in parts])
+            return np.sqrt(problem.factors[0].loss.cost(square))
+
+        assert found.cost <= least_squares(rows, truth.ravel()).cost * (1 + 1e-6)
+        assert np.linalg.norm(found.x - truth, axis=1).max() < 1.0
+        assert any(f"{name} loss rejects" in note for note in found.notes)
+
+
+def test_points_that_a_loss_sets_free_are_told_from_unmeasured_ones() -> None:
+    torn = Problem(("a",)).add("position", ["a"] * 2, [[-40, 0, 0], [40, 0, 0]], std=1.0, loss=Loss("truncated", 1.0))
+    with pytest.raises(co.InputError, match=r"a can move|truncated loss rejects 2 of 2.*larger scale"):
+        solve(torn)
+
+
+def test_gtsam_solves_what_it_lacks_by_custom_factors(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Azimuth in the world frame, robust; every step is GTSAM's: its optimizer is called, and costs what ours costs."""
+    problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 1, 0]], std=2.0)
+    problem = problem.add("spherical", ("a", "b"), [10.0, 0.3, 1.5], std=[0.5, 0.05, 0.05], loss=Loss("cauchy", 1.0))
+    called, own = [], gtsam.LevenbergMarquardtOptimizer
+
+    def spy(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, params: gtsam.LevenbergMarquardtParams) -> object:
+        called.append(graph.error(values))
+        return own(graph, values, params)
+
+    monkeypatch.setattr(gtsam, "LevenbergMarquardtOptimizer", spy)
+    found = solve(problem, "gtsam")
+    assert found.extras["custom_factors"] == 1
+    assert called[-1] == pytest.approx(problem.cost(found.x), rel=1e-9)
+    assert found.x == pytest.approx(solve(problem).x, abs=1e-6)
+
+
+def test_edges_alone_are_read_and_solved_as_with_vertices(tmp_path: Path) -> None:
+    graph = replace(random_graph(3, robots=1, steps=30, landmarks=0, seen=0, loops=8), ranges=RangeEdges())
+    write_graph(graph, whole := tmp_path / "whole.g2o")
+    lines = [line for line in whole.read_text().splitlines() if line.startswith("EDGE")]
+    (alone := tmp_path / "alone.g2o").write_text("\n".join(lines))
+    assert load_graph(alone).names == graph.names
+    assert solve(co.read_graph(alone)).cost == pytest.approx(solve(co.read_graph(whole)).cost, rel=1e-9)
+
+
+def test_an_indefinite_information_is_repaired_where_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    (file := tmp_path / "bad.g2o").write_text("EDGE_SE2 0 1 1 0 0 4 0 0 4 0 9\nEDGE_SE2 1 2 1 0 0 1 2 0 1 0 9\n")
+    with pytest.raises(co.InputError, match=r"line 2 = information.*positive definite.*--repair"):
+        load_graph(file)
+    own, axes = np.linalg.eigh([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 9.0]])
+    nearest = axes * np.maximum(own, 0.0) @ axes.T
+    read = np.linalg.inv(load_graph(file, repair=True).relative_pose.covariance[1])
+    assert read == pytest.approx(nearest, abs=1e-4)
+    with pytest.raises(SystemExit):
+        main(["solve", str(file), "--repair"])
+    out, err = capsys.readouterr()
+    assert "line 2: information was not positive definite" in err
+    assert json.loads(out)["notes"] != []
+
+
+@pytest.mark.parametrize("seed", [9, 12])
+def test_a_race_ends_where_the_best_of_all_starts_ends(seed: int) -> None:
+    """Odometry that turns by 0.6 rad a step: some starts end in other minima."""
+    graph = random_graph(seed, robots=1, steps=40, landmarks=0, ranges=0, seen=0, loops=4, turn_std=0.6)
+    graph = replace(graph, ranges=RangeEdges(), guess=True)
+    costs = [
+        solve(from_graph(graph, start=start), throw=False).cost for start in ("odometry", "file", "linear", "tree")
+    ]
+    assert max(costs) > 1.01 * min(costs)
+    assert solve(from_graph(graph)).cost == pytest.approx(min(costs), rel=1e-9)
+    truth = solve(from_graph(replace(graph, guess=False), start="file"))
+    assert any("may be the truth" in note for note in truth.notes)
+
+
+def test_covariances_of_many_nodes_are_computed_where_asked() -> None:
+    """Also without them a free node is named, and the time that is printed is what was waited."""
+    graph = replace(random_graph(5, robots=1, steps=1100, landmarks=0, seen=0, loops=20), ranges=RangeEdges())
+    problem = from_graph(graph)
+    plain, full = solve(problem), solve(problem, covariance=True)
+    assert np.isnan(plain.covariance).all()
+    assert "+-" not in str(plain)
+    assert np.isfinite(full.covariance).all()
+    assert plain.cost == full.cost
+    assert plain.seconds >= plain.solve_seconds + plain.check_seconds > plain.solve_seconds
+    free = replace(problem, names=(*problem.names, "L0"), x0=np.vstack([problem.x0, problem.x0[:1]]))
+    found = solve(free, throw=False)
+    assert (found.status, found.unobservable) == (Status.RANK_DEFICIENT, ("L0",))
+
+
+def test_anchors_among_poses_and_constraints_without_a_backend() -> None:
+    with pytest.raises(co.InputError, match=r"anchors.*co.pose\(anchor, 0\)"):
+        Problem(("a", "l"), x0=[[*co.pose([0.0, 0.0])], [3, 4, 0, 0, 0, 0]], dimension=2, poses=("a",))
+    pair = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
+    for kind, nodes, backend in (("displacement", ("a", "b"), "osqp"), ("range", ("a", "b"), "casadi")):
+        found = solve(pair.constrain(kind, nodes, upper=[7, 9, 9] if kind == "displacement" else 7.0))
+        assert (found.backend, found.x[1, 0] - found.x[0, 0]) == (backend, pytest.approx(7.0, abs=1e-6))
+        assert f"solved by {backend}: gauss-newton cannot" in found.notes
