@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 
 from .compiling.compile import inside
-from .compiling.small import add, apply, from_upper, inverse, scale, subtract, times
+from .compiling.small import add, add_diagonal, apply, from_upper, inverse, scale, subtract, times
 from .compiling.vectors import choose
 
 GATE, FIX_GATE = 9.0, 12.0
@@ -20,6 +20,9 @@ REJECTED = 2.0
 """Gates beyond which it weighs nothing."""
 PATIENCE = 5.0
 """Sum of the gains of measurements in a row beyond the gate from which it is the filter that is wrong."""
+SLIP = 0.25
+"""m^2, what wheels that slip, or a speed that was measured too low, may add to an error on each axis: however precise
+fixes are, less is no sign of a wrong one."""
 Vector = tuple[float, ...]
 
 
@@ -56,8 +59,8 @@ def gain_of(cov: Vector, variance: Vector) -> float:
 
 @inside
 def distance(innovation: Vector, cov: Vector) -> float:
-    """Squared normalised innovation of a vector."""
-    return total(times(innovation, apply(inverse(cov), innovation)))
+    """Squared normalised innovation of a position."""
+    return total(times(innovation, apply(inverse(add_diagonal(cov, (SLIP, SLIP, SLIP))), innovation)))
 
 
 @inside

@@ -16,7 +16,7 @@ import numpy as np
 from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
 from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
-from .gate import REJECTED, count, inflation
+from .gate import REJECTED, SLIP, count, inflation
 from .motion import MotionNoise, process_variance
 
 LEAST = 1e-4
@@ -82,8 +82,8 @@ def gate_fix(states: Floats, moved: Vector, process: Vector, fix: Vector, late: 
         if not math.isnan(innovation):
             noise = states[c, 3]
             p = states[c, 1] * noise + states[c, 2] + process[c]
-            weight = 1.0 / (p + noise + late[c])
-            q, gain = q + innovation * innovation * weight, gain + p * weight / 3.0
+            s = p + noise + late[c]
+            q, gain = q + innovation * innovation / (s + SLIP), gain + p / (3.0 * s)
     if gate == 0.0 or q == 0.0:
         return 0.0, 1.0, hits
     return q, inflation(q, gate, hits), count(q, gate, hits, gain)
