@@ -9,8 +9,9 @@ import pytest
 from conftest import winding
 from filterpy.kalman import KalmanFilter
 
-from coopoc import V2X, CooperativeFilter, Recording, Sensors, load_fleet, observe
+from coopoc import V2X, CooperativeFilter, Kalman, Recording, Sensors, load_fleet, observe
 from coopoc.arrays import Floats, Ints
+from coopoc.kernels import gate
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
 
 S2 = Sensors.paper_scenario2()
@@ -100,3 +101,29 @@ def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() ->
         share = q / gate * (100.0 if q > 4.0 * gate else 1.0) if q > gate else 1.0
         peer.update(gnss[0, t, 0], R=12.25 * np.eye(3) + (share - 1.0) * S)
         assert track.x[0, t, 0] == pytest.approx(peer.x, abs=1e-3), t
+
+
+def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
+    """A fix beyond the gate has q / gate times its variance, one beyond REJECTED gates is left out, until those in a
+    row would have had gains that sum to PATIENCE."""
+    drive = observe(winding(300, 10.0, 7.0), S2, V2X(0), runs=1, seed=2)
+    gnss, rng = drive.gnss.copy(), np.random.default_rng(3)
+    wild = rng.random(300) < 0.15
+    wild[:5] = False
+    gnss[0, wild, 0] += rng.choice([-1, 1], (wild.sum(), 3)) * 10.0 ** rng.uniform(0.5, 4, (wild.sum(), 3))
+    gnss[0, 150:270, 0] = drive.gnss[0, 150:270, 0] + 60.0
+    track, hits, used = Kalman()(replace(drive, gnss=gnss), [0]), 0.0, 0
+    process = (0.1 * S2.assumed_velocity_std(drive.velocity[0, :, 0])) ** 2
+    peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
+    peer.x, peer.P, peer.B, peer.H, peer.R = gnss[0, 0, 0], 12.25 * np.eye(3), 0.1 * np.eye(3), np.eye(3), np.eye(3)
+    for t in range(1, 300):
+        peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
+        gap, variance = gnss[0, t, 0] - peer.x, np.diag(peer.P)
+        q = float((gap**2 / (variance + 12.25 + gate.SLIP)).sum())
+        share = max(q / gate.FIX_GATE, 1.0) if hits < gate.PATIENCE else 1.0
+        hits = hits + float((variance / (variance + 12.25)).mean()) if q > gate.FIX_GATE else 0.0
+        if share <= gate.REJECTED:
+            used += share > 1.0 or q > gate.FIX_GATE
+            peer.update(gnss[0, t, 0], R=12.25 * share)
+        np.testing.assert_allclose(track.x[0, t, 0], peer.x, atol=1e-9)
+    assert used > 10
