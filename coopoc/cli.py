@@ -15,7 +15,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from . import plugins
-from .errors import InputError, MissingLibraryError, unknown
+from .errors import InputError, MissingLibraryError, missing, unknown
 
 Command: TypeAlias = Callable[..., int | None] | Mapping[str, Any] | EntryPoint
 
@@ -65,12 +65,15 @@ def run(
         dry_run: print which cells would be kept, repeated and computed, then stop.
     """
     from .study.cell import assignments
-    from .study.publish import tables
-    from .study.run import plan, run_study
+    from .study.study import find_study
 
     changes = dict(assignments([text for group in set for text in group]))
     if data is not None:
         changes["data"] = data
+    find_study(name).override(changes)  # a mistake is told before pandas and Arrow are imported
+    from .study.publish import tables
+    from .study.run import plan, run_study
+
     if dry_run:
         print(json.dumps(plan(name, out, changes, shard, retry_failed), indent=1, default=str))
         return 0
@@ -223,6 +226,11 @@ def _status(argv: list[str]) -> int:
         status = _dispatch({**plugins.points("coopoc.commands"), **OWN}, argv, "coopoc")
         sys.stdout.flush()
         return status
+    except ModuleNotFoundError as error:
+        if (known := missing(error, " ".join(["coopoc", *argv[:1]]))) is error:
+            raise
+        print(f"coopoc: {known}", file=sys.stderr)
+        return 2
     except (InputError, MissingLibraryError) as error:
         print(f"coopoc: {error}", file=sys.stderr)
         return 2
@@ -247,9 +255,25 @@ def _dispatch(commands: Mapping[str, Command], argv: list[str], prog: str) -> in
         raise unknown("command", name, commands)
     command = commands[name]
     loaded = command.load() if isinstance(command, EntryPoint) else command
+    if loaded is run and {"-h", "--help"} & {*rest} and not rest[0].startswith("-"):
+        print(_settings(rest[0]))
     if isinstance(loaded, Mapping):
         return _dispatch(loaded, rest, f"{prog} {name}")
     return int(tyro.cli(loaded, prog=f"{prog} {name}", args=rest, config=(FlagCreatePairsOff,)) or 0)
+
+
+def _settings(name: str) -> str:
+    """The keys of --set that a study has: settings with their defaults, axes with their values, and names to choose."""
+    from .study.study import find_study
+
+    study, groups = find_study(name), {f"coopoc.{key}s": key for key in ("method", "channel", "metric")}
+    choices = {key: plugins.names(group) for group, key in groups.items()}
+    choices["data"] = (*plugins.names("coopoc.datasets"), "a path")
+    lines = [f"{study.name}: {study.question}", "", "keys of --set, with their defaults:"]
+    for key, values in {**{k: (v,) for k, v in study.settings.items()}, **study.values()}.items():
+        allowed = f"  (of {', '.join(choices[key])})" if key in choices else ""
+        lines.append(f"  {key}={','.join('' if v is None else str(v) for v in values)}{allowed}")
+    return "\n".join([*lines, ""])
 
 
 def _help(commands: Mapping[str, Command], prog: str) -> str:

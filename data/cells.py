@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.arrays import Bools, Floats
-from coopoc.errors import InputError, suggestion, unknown
+from coopoc.errors import InputError, require, suggestion, unknown
 from coopoc.formats.values import LARGEST
 
 if TYPE_CHECKING:
@@ -46,9 +46,10 @@ def read_frame(path: Path, *text: str) -> pd.DataFrame:
     import pandas as pd
 
     try:
-        parquet = path.suffix.lower() == ".parquet"
+        if parquet := path.suffix.lower() == ".parquet":
+            require("pyarrow", "a Parquet table")
         frame = pd.read_parquet(path).reset_index(drop=True) if parquet else _read_csv(path, text)
-    except InputError:
+    except (InputError, ImportError):
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
         raise _no_table(path, next(iter(str(error).splitlines()), type(error).__name__)[:200]) from None

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +47,7 @@ def study(name: str, question: str, settings: Mapping[str, Any], scored: bool = 
     """
     settings = {**settings, "metric": ""} if scored else settings
     usual = {"settings": settings, "cell": cell, "key": key, "prepare": weights.prepare, "recipe": weights.described}
+    usual["idle"] = scene.idle
     return Study(name, question, **{**usual, "reference": reference(name), **options})
 
 
@@ -168,6 +169,18 @@ def bound_rows(p: Params) -> list[Row]:
         sizes = {"bytes_per_second": received, "payload_bytes_per_second": received}
         rows_of_egos.append({"run": 0, "ego": ego, "rt_le_m": level, "neighbours_mean": near, **sizes})
     return rows_of_egos
+
+
+def tracks(p: Params) -> Iterator[tuple[str, Floats, Floats, Floats | None]]:
+    """Name, times s, positions m and headings rad of each ego's path in each run, as the cell's method estimates it."""
+    recording = scene.recording(p)
+    for seed, method in methods(p, recording) if p["method"] != "bound" else ():
+        for ego in scene.egos(p["data"], str(p["egos"])):
+            found = [method(recording.between(*cut), [ego]) for cut in recording.stretches(ego)]
+            t = np.concatenate([track.t for track in found])
+            for run in range(recording.runs):
+                name = "-".join(filter(None, (f"seed{seed}" if seed is not None else "", ego, f"run{run}")))
+                yield name, t, np.concatenate([track.x[run, :, 0] for track in found]), None
 
 
 RMS, MAXIMA, SUMS = ("rt_le_m", "neighbour_rt_le_m", "innovation_m"), ("max_error_m",), ("fixes", "seconds")

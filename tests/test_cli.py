@@ -54,7 +54,7 @@ def test_a_list_of_names_imports_no_library(tmp_path: Path) -> None:
     assert done.stdout.splitlines()[-1] == "0 []"
 
 
-NAMES = ("run", "merge", "compare", "table", "report", "list", "reference", "survey", "greet")
+NAMES = ("run", "merge", "compare", "table", "report", "list", "reference", "greet")
 MISTAKES = (
     (["run", "smal"], "study = 'smal': must be one of"),
     (["rn"], "command = 'rn': must be one of"),

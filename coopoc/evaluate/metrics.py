@@ -6,7 +6,7 @@ from collections.abc import Callable, Mapping
 from itertools import pairwise
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from ..arrays import Floats, checked, instance, number, refuse
 from ..errors import InputError
@@ -106,7 +106,7 @@ def nees_band(runs: int, level: float = 0.99, size: int = 3) -> tuple[float, flo
     """
     runs = number("runs", runs, 1, kind=int, allowed=">= 1", hint="Give the number of runs averaged.")
     level = number("level", level, 0, 1, allowed="in [0, 1]", hint="0.99 is the default.")
-    low, high = stats.chi2.ppf([(1 - level) / 2, (1 + level) / 2], size * runs) / runs
+    low, high = special.chdtri(size * runs, [(1 + level) / 2, (1 - level) / 2]) / runs
     return float(low), float(high)
 
 
