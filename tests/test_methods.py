@@ -16,7 +16,7 @@ from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
 S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
 COVARIANCES = {f"{name}-{noise}": (name, noise) for name in METHODS for noise in ("identity", "nominal")}
-SNAPSHOTS = {"gnss", "mds", "qcqp-relaxation"}
+SNAPSHOTS = {"gnss", "qcqp-relaxation"}
 """Methods without a memory: alone they give the fix."""
 OWN = {"kalman-adaptive"}
 """Alone neither a Kalman filter nor a fix: another noise model."""

@@ -117,7 +117,9 @@ class RoadFilter:
         extras = {name: errors[..., i] for i, name in enumerate(names)} if self.assumed(recording).heading else {}
         none = np.zeros((recording.runs, len(columns)))
         took, notes = time.perf_counter() - began, lost(x, recording, columns)
-        return Track(recording.t, tuple(columns), x, cov, none, none, took, notes=notes, extras=extras)
+        return Track(
+            recording.t, tuple(columns), x, cov, none, none, took, notes=notes, extras=extras, ids=recording.ids
+        )
 
     def assumed(self, recording: Recording) -> RoadErrors:
         """`errors`, or those that fit the recording."""

@@ -104,6 +104,7 @@ def fleet_track(
         met.sent_bytes[:, columns],
         time.perf_counter() - began,
         notes=model.notes + answer.notes + contradicted(x, recording, columns),
+        ids=recording.ids,
     )
 
 
@@ -130,7 +131,7 @@ def kernel_arguments(
     columns = (met.first, met.second, met.link, met.link_back, met.start)
     first, second, link, link_back, start = (np.ascontiguousarray(column, dtype=np.int64) for column in columns)
     pairs = Pairs(first, second, link, link_back, start, np.ascontiguousarray(both & (arrival >= 0)))
-    relative = components(recording.relative, np.arange(len(recording.links)))
+    relative = components(recording.told, np.arange(len(recording.links)))
     relative = np.concatenate([relative, np.ones((*relative.shape[:2], 3))], axis=2)
     process, fix = model.process_variance(recording), model.fix_variance(recording)
     if robust := robust and model.exact_relative:
