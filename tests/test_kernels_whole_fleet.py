@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import crossing_fleet
+from conftest import crossing_fleet, textbook
 from filterpy.kalman import KalmanFilter
 from oracles.batch_smoother import batch_smoother
 from oracles.central_filter import central_filter
@@ -61,7 +61,7 @@ def drive(crossing: Fleet, channel: str, runs: int = 1, gaps: bool = True, absen
 def compare(name: str, known: str | NoiseModel, recording: Recording, near: float = 1e-7) -> None:
     """Positions and covariances of all vehicles that are there throughout, in every run."""
     model = KNOWN.get(known, known) if isinstance(known, str) else known
-    method, noise = METHODS[name](model), resolve(model, recording)
+    method, noise = textbook(METHODS[name](model)), resolve(model, recording)
     there = np.isfinite(recording.velocity).all(axis=(0, 1, 3)) & np.isfinite(recording.gnss[:, 0]).all(axis=(0, 2))
     egos = np.flatnonzero(there).tolist()
     track, central = method(recording, egos), name in ("central-filter", "batch-smoother")

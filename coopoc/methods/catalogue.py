@@ -28,7 +28,7 @@ METHODS: Mapping[str, Factory] = {
     "kalman-adaptive": lambda noise_model: AdaptiveKalman(),
     "road-kalman": RoadFilter,
     "lkf-sa": LKFSA,
-    "lkf-sa-edge": partial(JointFilter, exact=False, name="lkf-sa-edge"),
+    "lkf-sa-edge": partial(JointFilter, exact=False, robust=False, name="lkf-sa-edge"),
     "msmv-r": MSMV,
     "joint": JointFilter,
     "cooperative-filter": CooperativeFilter,

@@ -47,6 +47,8 @@ class GaussianBeliefPropagation:
         noise_model: "identity", "nominal" or a NoiseModel.
         rounds: of messages a step.
         damping: share of the old message that stays in the new one, in [0, 1); the fixed point is the same.
+        robust: an innovation beyond its gate weighs less, far beyond it nothing (`coopoc.kernels.gate`); False believes
+            every number.
 
     References:
         Murai et al., "A Robot Web for Distributed Many-Device Localization", IEEE T-RO 40, 2024.
@@ -55,6 +57,7 @@ class GaussianBeliefPropagation:
     noise_model: NoiseModel | str = "nominal"
     rounds: int = 3
     damping: float = 0.0
+    robust: bool = True
     name: str = "gbp"
     cooperative: bool = True
 
@@ -80,4 +83,4 @@ class GaussianBeliefPropagation:
             result = run_filter(measured, pairs, assumed, new_edges(pairs), int(self.rounds), float(self.damping))
             return Answer(*result, self.rounds, (LOOPS,))
 
-        return fleet_track(self, self.noise_model, recording, egos, solve)
+        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve)
