@@ -39,11 +39,6 @@ SECTIONS = {
 }
 
 FOUND = {
-    "aggregation": (
-        "federation.md#aggregation-study",
-        "**Rules differ once a client is poisoned.** One poisoned update raises the mean's error from 0.91 to 1.48 m;"
-        " the median, the trimmed mean, multi-Krum and the geometric median stay at 0.92 to 0.93 m, Krum at 0.95 m.",
-    ),
     "convergence": (
         "learned.md#the-papers-net",
         "**Federated training reaches the centralised net**: within 3 % from round 1 on, 1.416 and 1.413 m "

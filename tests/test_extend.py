@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import re
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -194,6 +195,8 @@ def test_an_aggregation_rule_goes_wherever_a_bundled_one_goes(folder: Path, tmp_
     done = subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
     (command,) = commands("own_rules.py:best_half")
+    (folder / "examples").mkdir()
+    shutil.copy(Path(__file__).parents[1] / "examples" / "aggregation.py", folder / "examples")
     assert "| best half " in shell(command, folder)
     wrong = f"{COOPOC} train fedkalmannet --aggregate own_rules.py:best_hlaf --out {tmp_path}"
     done = subprocess.run(wrong.split(), cwd=folder, capture_output=True, text=True)

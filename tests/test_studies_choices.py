@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +16,13 @@ from coopoc.errors import InputError
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import GainNet
 from coopoc.learned.federation.federate import federate
-from coopoc.studies import aggregation
+from coopoc.one_file import from_file
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
 
+FILE = Path(__file__).parents[1] / "examples" / "aggregation.py"
+aggregation = sys.modules[from_file(f"{FILE}:STUDY").cell.__module__]
 TWO = {"egos": "2", "runs": 2}
 
 

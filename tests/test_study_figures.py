@@ -198,7 +198,7 @@ def test_no_figure_of_the_gallery_hides_a_line_or_shows_one_below_its_bound(file
 
 SAMPLED = 0.02
 """Share below a bound that the noise of some twenty runs explains."""
-WITHOUT_LINES = ("aggregation", "budget", "consistency", "convergence", "error_cdf", "learned_gains")
+WITHOUT_LINES = ("budget", "consistency", "convergence", "error_cdf", "learned_gains")
 """Studies whose figures show points, or numbers that are no reference values."""
 
 

@@ -1,10 +1,16 @@
-"""Which rule combines nets best when clients are alike, differ, are Byzantine or absent (the paper's outlook)."""
+"""Which rule combines nets best when clients are alike, differ, are Byzantine or absent (the paper's outlook).
+
+    coopoc run examples/aggregation.py:STUDY
+
+A study of one's own in one file: docs/extend.md. What it finds stands in docs/federation.md.
+"""
 
 from __future__ import annotations
 
 from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import version
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +20,8 @@ from coopoc.evaluate.scores import bounded_rt_le, rows_of
 from coopoc.evaluate.statistics import Interval, over_seeds
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
+from coopoc.studies import lineup, scene
+from coopoc.studies.views import TableView, multiples, selections
 from coopoc.study.numbers import Where, across, interval, listed, mean, per_seed, present, seed_means
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import look
@@ -21,9 +29,6 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
-
-from . import lineup, scene
-from .views import TableView, multiples, selections
 
 if TYPE_CHECKING:
     from coopoc.learned.training.clients import Client
@@ -262,5 +267,5 @@ STUDY = Study(
     ),
     minutes=25,
     metrics={"rt_le_m": "lower"},
-    reference=lineup.reference("aggregation"),
+    reference=Path(__file__).with_suffix(".json"),
 )
