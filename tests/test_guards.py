@@ -63,8 +63,8 @@ def test_no_net_invents_a_height(net: GainNet) -> None:
 def test_useless_weights_are_not_saved(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     """A net that starts far from a stable gain and takes one tiny step, unless it is asked for."""
     bad = Recipe("centralised", Schedule(epochs=1, learning_rate=1e-9), piece=20, options=(("start_gain", 0.9),))
-    monkeypatch.setitem(recipes.RECIPES, "bad", bad)
+    monkeypatch.setitem(recipes.RECIPES, "centralised", bad)
     with pytest.raises(InputError, match="times that of a Kalman filter with fitted noise"):
-        train_all(FLEET, tmp_path, seeds=[0], recipes=["bad"], progress=False, worst=1.1)
+        train_all(FLEET, tmp_path, seeds=[0], recipes=["centralised"], progress=False, worst=1.1)
     assert not list(tmp_path.iterdir())
-    assert train_all(FLEET, tmp_path, seeds=[0], recipes=["bad"], progress=False)
+    assert train_all(FLEET, tmp_path, seeds=[0], recipes=["centralised"], progress=False)
