@@ -44,5 +44,5 @@ BACKEND = Backend(
     "gauss-newton",
     prepare,
     "reference: Levenberg-Marquardt, all realisations at once; large graphs by sparse Cholesky factors",
-    capabilities=Capabilities(batched=True, compiled=True),
+    capabilities=Capabilities(batched=True),
 )
