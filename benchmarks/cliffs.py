@@ -19,7 +19,6 @@ from filterpy.kalman import KalmanFilter
 from timing import medians, report, timed
 
 import coopoc as co
-from coopoc.learned import CooperativeGain, NoiseNet
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
 from coopoc.methods.cooperative_filter import CooperativeFilter
 
@@ -102,7 +101,7 @@ def method_cases() -> Iterator[Case]:
             "joint, plain",
         ),
         "kalman-adaptive": (co.AdaptiveKalman(), recording, "kalman, plain"),
-        "cooperative gain": (CooperativeGain(NoiseNet()), recording, "joint, plain"),
+        "road-kalman": (co.RoadFilter(), recording, "kalman, plain"),
     }
     for name, (method, measured_by, plain) in others.items():
         yield case(name, plain, method, measured_by, False)

@@ -36,6 +36,8 @@ from .methods.poses.pose_start import pose_start as pose_start
 from .methods.poses.pose_stream import LandmarkMeasurement as LandmarkMeasurement
 from .methods.poses.pose_stream import OwnMeasurement as OwnMeasurement
 from .methods.qcqp_relaxation import QCQPRelaxation as QCQPRelaxation
+from .methods.road import RoadErrors as RoadErrors
+from .methods.road import RoadFilter as RoadFilter
 from .methods.sliding_window import FixedLagSmoother as FixedLagSmoother
 from .methods.sliding_window import MovingHorizon as MovingHorizon
 from .methods.star import stars as stars
@@ -60,7 +62,6 @@ from .study.results import Results as Results
 from .study.run import run_study as run_study
 from .study.study import Study as Study
 from .world.body_frames import in_world as in_world
-from .world.channels import channel_load as channel_load
 from .world.fleet import Fleet as Fleet
 from .world.links import Links as Links
 from .world.outliers import Fault as Fault

@@ -6,12 +6,10 @@ from .federation.federate import federate
 from .federation.history import Federation, ledger
 from .federation.participation import Participation
 from .method import LearnedGain
-from .nets.cooperative import CooperativeGain
 from .nets.gain import Gain, Recurrent
 from .nets.gain_net import GainNet
-from .nets.noise_net import NoiseNet
 from .nets.okf import NoiseParameters, OptimisedKF
-from .nets.recursive import RecursiveFilter, RecursiveGain
+from .nets.road import RoadConstants
 from .nets.split import SplitGain
 from .recipes import RECIPES, Recipe, Setting, load_method
 from .train import train_all
@@ -20,27 +18,25 @@ from .training.drives import MeasuredDrives
 from .training.fit import Fit, fit
 from .training.measured import measured_clients
 from .training.okf_fit import fit_okf
+from .training.roads import roads
 from .training.schedule import Schedule
 
 __all__ = [
     "RECIPES",
     "Checkpoint",
     "Client",
-    "CooperativeGain",
     "Federation",
     "Fit",
     "Gain",
     "GainNet",
     "LearnedGain",
     "MeasuredDrives",
-    "NoiseNet",
     "NoiseParameters",
     "OptimisedKF",
     "Participation",
     "Recipe",
     "Recurrent",
-    "RecursiveFilter",
-    "RecursiveGain",
+    "RoadConstants",
     "Schedule",
     "Segments",
     "Setting",
@@ -53,6 +49,7 @@ __all__ = [
     "load",
     "load_method",
     "measured_clients",
+    "roads",
     "save",
     "train_all",
 ]

@@ -14,7 +14,7 @@ from torch import Tensor
 from coopoc.arrays import Floats
 from coopoc.errors import InputError, shown
 from coopoc.methods.stream import Stream
-from coopoc.methods.track import Track, check_options
+from coopoc.methods.track import Track, check_options, lost
 from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message
@@ -80,10 +80,15 @@ class LearnedGain:
             moved = self.model(*self._lanes(recording, columns), recording.dt).numpy().astype(np.float64)
         moved = np.moveaxis(moved.reshape(recording.runs, len(columns), -1, SIZE), 2, 1)
         estimates = np.concatenate([x0[:, None], moved + origin], axis=1)
+        fixes, speeds = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
+        held = ((fixes == origin) | np.isnan(fixes)).all(axis=(0, 1)) & (speeds == 0.0).all(axis=(0, 1))
+        estimates = np.where(held, x0[:, None], estimates)  # a net has no height for a drive in one plane
         silent = np.zeros((recording.runs, len(columns)))
         seconds = time.perf_counter() - began
-        notes = tuple(divergence(estimates, recording, columns))
-        return Track(recording.t, tuple(columns), estimates, None, silent, silent, seconds, notes=notes)
+        notes = lost(estimates, recording, columns, DIVERGED)
+        return Track(
+            recording.t, tuple(columns), estimates, None, silent, silent, seconds, notes=notes, ids=recording.ids
+        )
 
     def _lanes(self, recording: Recording, columns: list[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Fixes and velocities (R E, T - 1, 3) and starts (R E, 3) for the net, relative to the first fix."""
@@ -108,13 +113,4 @@ class LearnedGain:
 
 
 DIVERGED = 10.0
-"""Standard deviations (norm of the assumed GNSS std) between estimate and fix beyond which a run counts as diverged."""
-
-
-def divergence(x: Floats, recording: Recording, columns: list[int]) -> list[str]:
-    """A note if an estimate is ever farther from its fix than `DIVERGED` standard deviations."""
-    limit = DIVERGED * float(np.linalg.norm(recording.sensors.gnss_std))
-    gap = np.linalg.norm(x - recording.gnss[:, :, columns], axis=-1)
-    lost = int((gap > limit).any(axis=1).sum())
-    total = gap.shape[0] * gap.shape[2]
-    return [f"diverged in {lost} of {total} runs (over {limit:.0f} m from the fix)"] if lost else []
+"""Standard deviations, as of `far_off`, beyond which a run of a net without a covariance counts as diverged."""

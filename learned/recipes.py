@@ -24,6 +24,7 @@ from .nets.gain import Gain
 from .training.clients import Client, Noise, Start, check_pieces, clients
 from .training.drives import Drives, MeasuredDrives
 from .training.measured import measured_clients
+from .training.roads import PIECE, roads
 from .training.schedule import STEPS, Epoch, Schedule
 
 REVISION = 7
@@ -44,8 +45,8 @@ class Recipe:
         local_epochs: of a federation, per round.
         local_epoch: of a federation, a "pass" through the client's segments or a "step".
         aggregate: rule of a federation, a name or "mine.py:NAME".
-        noise: of the training drives, "static", "fresh" or "wide", where it is simulated; or outliers by name
-            (`Outliers.named`), added to static noise.
+        noise: of the training drives, "static", "fresh" or "wide", where it is simulated; "roads" for worlds as real
+            roads have them (`training.roads`); or outliers by name (`Outliers.named`), added to static noise.
         piece: steps of a segment.
         split: share of the segments that train.
         net: the net, an entry point in `coopoc.nets` or "mine.py:NAME".
@@ -75,35 +76,24 @@ class Recipe:
 
     def __post_init__(self) -> None:
         one_of("kind of recipe", self.kind, KINDS)
-        if instance("noise", self.noise, str) not in get_args(Noise):
+        if instance("noise", self.noise, str) not in (*get_args(Noise), ROADS):
             Outliers.named(self.noise)
         one_of("local_epoch", self.local_epoch, get_args(Epoch))
         check_options(self, {"rounds": STEPS, "local_epochs": STEPS}, {"schedule": Schedule, "options": tuple})
         check_pieces(self.piece, self.split)
 
 
+ROADS = "roads"
+"""Noise of a recipe whose vehicles drive in worlds of their own (`training.roads`)."""
+ROAD = Schedule(epochs=120, batch=24, learning_rate=0.1, weight_decay=0.0, mirror=False)
 RECIPES: dict[str, Recipe] = {
     "fedkalmannet": Recipe("federated"),
     "centralised": Recipe("centralised", Schedule(epochs=1500)),
     "individual": Recipe("individual", Schedule(epochs=500)),
     "okf": Recipe("okf", Schedule(epochs=300), net="okf"),
     "fedokf": Recipe("federated", Schedule(batch=12, learning_rate=0.05, weight_decay=0.0, mirror=False), net="okf"),
-    "cooperative": Recipe(
-        "federated",
-        Schedule(batch=8, learning_rate=0.01, weight_decay=0.01),
-        local_epochs=10,
-        noise="wide",
-        net="noise_net",
-    ),
-    "recursive": Recipe(
-        "federated",
-        Schedule(batch=24, mirror=False),
-        rounds=10,
-        local_epochs=10,
-        noise="wide",
-        piece=300,
-        net="recursive",
-    ),
+    "road": Recipe("centralised", ROAD, noise=ROADS, piece=300, net="road"),
+    "fedroad": Recipe("federated", ROAD, noise=ROADS, piece=300, net="road"),
     "split": Recipe(
         "federated",
         Schedule(batch=8, learning_rate=3e-3, weight_decay=0.1),
@@ -113,10 +103,6 @@ RECIPES: dict[str, Recipe] = {
         net="split",
     ),
 }
-
-MEASURED: dict[str, Schedule] = {"recursive": Schedule(batch=4, learning_rate=0.01, mirror=False)}
-"""Schedules on measured drives in place of the recipe's. In simulation the recursive gain starts at its optimum, and a
-hundred small steps are enough; what is measured has more to teach."""
 
 
 @dataclass(frozen=True)
@@ -169,7 +155,7 @@ class Job:
 def sensors(job: Job) -> Sensors:
     """The paper's training noise in the setting's reading, with the recipe's outliers."""
     noise = job.recipe.noise
-    outliers = None if noise in get_args(Noise) else Outliers.named(noise)
+    outliers = None if noise in (*get_args(Noise), ROADS) else Outliers.named(noise)
     return replace(Sensors.paper_training(job.setting.reading), outliers=outliers)
 
 
@@ -205,8 +191,6 @@ def jobs_of(name: str, setting: Setting, fleet: Drives, aggregate: str | None = 
         if recipe.kind != "federated":
             raise InputError("aggregate", aggregate, f"goes with federations, {name} is {recipe.kind}", "Leave it out.")
         recipe = replace(recipe, aggregate=aggregate)
-    if isinstance(fleet, MeasuredDrives):
-        recipe = replace(recipe, schedule=MEASURED.get(name, recipe.schedule))
     if recipe.kind != "individual":
         return [Job(name, recipe, setting)]
     return [Job(name, recipe, setting, client) for client in range(1, len(fleet.ids) + 1)]
@@ -240,6 +224,8 @@ def job_clients(job: Job, fleet: Drives) -> tuple[Client, ...]:
     """The vehicles of a fleet as clients, with the noise, the split and the start of the job; of measured drives with
     what they measured: then the recipe's noise has no effect."""
     recipe, setting = job.recipe, job.setting
+    if recipe.noise == ROADS and not isinstance(fleet, MeasuredDrives):
+        fleet, recipe = roads(fleet, setting.seed), replace(recipe, piece=max(recipe.piece, PIECE))
     if isinstance(fleet, MeasuredDrives):
         return measured_clients(fleet, start=setting.start, piece=recipe.piece, split=recipe.split)
     noise: Any = recipe.noise if recipe.noise in get_args(Noise) else "static"

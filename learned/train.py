@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
@@ -10,16 +11,24 @@ from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
-from coopoc.arrays import listed, number
+from coopoc.arrays import Floats, listed, number
+from coopoc.errors import InputError
 from coopoc.file_names import given_path
+from coopoc.methods.kalman import Kalman
+from coopoc.methods.noise_model import NoiseModel
 from coopoc.one_file import in_file
 from coopoc.workers import leave_with
-from coopoc.world.sensors import VelocityReading
+from coopoc.world.fleet import Fleet
+from coopoc.world.sensing import observe
+from coopoc.world.sensors import Sensors, VelocityReading
+from coopoc.world.v2x import V2X
 
 from .checkpoint import Checkpoint, load, read_card, save
 from .federation.federate import Plan, federate_many
+from .nets.gain import Gain
 from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, sensors, untrained
 from .training.clients import Client, Segments, Start
 from .training.drives import Drives, Logged, MeasuredDrives, drives_of
@@ -39,6 +48,7 @@ def train_all(
     aggregate: str | None = None,
     jobs: int = 1,
     progress: bool = True,
+    worst: float = math.inf,
 ) -> dict[str, Checkpoint]:
     """Train every recipe in every setting, or read it from `out` where the same was trained before.
 
@@ -57,12 +67,14 @@ def train_all(
         aggregate: rule of the federations by name or path, default that of the recipe.
         jobs: processes; the weights do not depend on it.
         progress: bars on stderr that name the stage.
+        worst: times the error of a Kalman filter with fitted noise, on the pieces that validate, above which nothing is
+            saved.
 
     Returns:
         Checkpoints by label, such as "fedkalmannet-gnss-axis-0".
 
     Raises:
-        InputError: an unknown recipe; a log without a truth.
+        InputError: an unknown recipe; a log without a truth; a net that is worse than `worst`.
     """
     fleet, out = drives_of(data), given_path(out)
     jobs = number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1")
@@ -78,14 +90,14 @@ def train_all(
     if jobs > 1 and len(missing) > 1:
         with ProcessPoolExecutor(jobs, get_context("spawn")) as pool:
             todo = [
-                pool.submit(_in_worker, group, fleet, out, line if progress else None, os.getpid())
+                pool.submit(_in_worker, group, fleet, out, worst, line if progress else None, os.getpid())
                 for line, group in enumerate(missing)
             ]
             for done in todo:
                 done.result()
     else:
         for group in missing:
-            _train(group, fleet, out, progress)
+            _train(group, fleet, out, worst, progress)
     return {job.label: _loaded(job, path) for job, path in paths.items()}
 
 
@@ -94,9 +106,13 @@ def _loaded(job: Job, path: Path) -> Checkpoint:
     return load(path, job.recipe.net if in_file(job.recipe.net) else "")
 
 
-def _train(group: Sequence[Job], fleet: Drives, out: Path, progress: bool) -> None:
+def _train(group: Sequence[Job], fleet: Drives, out: Path, worst: float, progress: bool) -> None:
     """Train and save the checkpoints of one recipe."""
     for job, checkpoint in zip(group, trained(group, fleet, progress), strict=True):
+        if worst < math.inf and (times := over_fitted(checkpoint.model, job, fleet)) > worst:
+            allowed = f"must be at most {worst:g} times that of a Kalman filter with fitted noise"
+            hint = "Give more data or another recipe; --worse saves it all the same."
+            raise InputError(f"validation error of {job.label}", f"{times:.2f} times", allowed, hint)
         save(out / f"{job.label}.safetensors", checkpoint)
 
 
@@ -110,10 +126,39 @@ def trained(group: Sequence[Job], fleet: Drives, progress: bool = True) -> list[
     ]
 
 
-def _in_worker(group: Sequence[Job], fleet: Drives, out: Path, line: int | None, parent: int) -> None:
+def over_fitted(model: Gain, job: Job, fleet: Drives) -> float:
+    """RT-LE on the pieces that validate over that of a Kalman filter whose noise is fitted on those that train."""
+    data = job_clients(job, fleet)
+    gnss, velocity, truth, dt = _pieces(_joined(data, job.client, "training"))
+    steps, fixes = np.diff(truth, axis=0) - dt * velocity[1:], gnss - truth
+    process, fix = (_rms(e) for e in (steps, fixes))
+    gnss, velocity, truth, dt = _pieces(_joined(data, job.client, "validation"))
+    steps, names = len(gnss), tuple(map(str, range(gnss.shape[1])))
+    still = Fleet(names, dt * np.arange(steps), np.zeros_like(gnss), np.zeros_like(gnss))
+    seen = replace(observe(still, Sensors(), V2X(max_neighbours=0)), gnss=gnss[None], velocity=velocity[None])
+    methods = model.method(job.name), Kalman(NoiseModel("fitted", None, process, fix))
+    ours, theirs = (np.nansum((method(seen, names).x[0] - truth) ** 2) for method in methods)
+    return float(np.sqrt(ours / theirs))
+
+
+def _rms(errors: Floats) -> tuple[float, float, float]:
+    """Per axis, of those (..., 3) that are known; at least 1 mm."""
+    there = np.isfinite(errors)
+    squares = np.where(there, errors, 0.0) ** 2
+    x, y, z = np.sqrt(squares.sum(axis=(0, 1)) / there.sum(axis=(0, 1)).clip(1)).clip(1e-3).tolist()
+    return x, y, z
+
+
+def _pieces(given: Segments) -> tuple[Floats, Floats, Floats, float]:
+    """Fixes, velocities and truth (T + 1, n, 3) of pieces as they were drawn once, and dt."""
+    gnss, velocity, truth = (part.double().numpy().swapaxes(0, 1) for part in (given.gnss, given.velocity, given.truth))
+    return gnss, velocity, truth, given.dt
+
+
+def _in_worker(group: Sequence[Job], fleet: Drives, out: Path, worst: float, line: int | None, parent: int) -> None:
     leave_with(parent)
     with reporting_on(line or 0):
-        _train(group, fleet, out, line is not None)
+        _train(group, fleet, out, worst, line is not None)
 
 
 Data = dict[Setting, tuple[Client, ...]]

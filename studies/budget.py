@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
 
-TRAINED = ("fedokf", "recursive", "fedkalmannet")
+TRAINED = ("fedokf", "fedkalmannet")
 """Trained by federation, in the order of their bytes."""
 SOLO = (("gnss", "none"), ("kalman", "fitted"), ("kalman", "nominal"), *((name, "trained") for name in TRAINED))
 SHARED = (
@@ -32,7 +32,6 @@ SHARED = (
     ("joint", "fitted"),
     ("joint", "nominal"),
     ("split-ci", "nominal"),
-    ("cooperative", "trained"),
 )
 SCHEDULED = (("joint", "nominal"), ("split-ci", "nominal"))
 """Which of them run under every schedule."""

@@ -20,8 +20,8 @@ if TYPE_CHECKING:
 
 SILENT = ("gnss", "mds")
 """Methods without a covariance, or with that of a fix; the last takes as long as all others together."""
-TRAINED = ("okf", "recursive", "cooperative")
-SOLO = ("kalman", "kalman-adaptive", "okf", "recursive")
+TRAINED = ("okf",)
+SOLO = ("kalman", "kalman-adaptive", "road-kalman", "okf")
 GATE = 0.95
 USUAL = ("nominal", "trained")
 NOTE = (

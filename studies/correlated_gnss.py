@@ -31,7 +31,7 @@ CASES = {name: dict(zip(scene.LASTING, shares, strict=True)) for name, shares in
 NEIGHBOURS = (0, 2, 6, 10)
 KS = {f"K = {k}": {"max_neighbours": k} for k in NEIGHBOURS}
 X = {k: {"max_neighbours": k} for k in NEIGHBOURS}
-SOLO = (("gnss", "none"), ("kalman", "nominal"), ("fedkalmannet", "trained"), ("recursive", "trained"))
+SOLO = (("gnss", "none"), ("kalman", "nominal"), ("fedkalmannet", "trained"))
 SHARED = (("joint", "nominal"), ("split-ci", "nominal"), ("cooperative-filter", "nominal"))
 """Nominal noise model: all but the last take the whole error of a fix as white, of the same variance."""
 NOTE = (

@@ -13,13 +13,12 @@ from .views import labelled, multiples, of, selections
 if TYPE_CHECKING:
     from coopoc.study.results import Results
 
-ALONE = (("kalman", "nominal"), ("fedkalmannet", "trained"), ("recursive", "trained"))
+ALONE = (("kalman", "nominal"), ("fedkalmannet", "trained"))
 TOGETHER = (
     ("joint", "nominal"),
     ("lkf-sa", "nominal"),
     ("split-ci", "nominal"),
     ("cooperative-filter", "nominal"),
-    ("cooperative", "trained"),
 )
 METHODS = (*ALONE, *TOGETHER)
 

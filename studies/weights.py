@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import math
 import sys
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
@@ -32,8 +33,10 @@ INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
 """Nets of single clients, one per client, at most six."""
 PAPER = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
 """Methods that the paper trains, and the optimised Kalman filter."""
-LEARNED = (*PAPER, "fedokf", "split", "recursive", "cooperative")
+LEARNED = (*PAPER, "fedokf", "split", "road", "fedroad")
 """Methods that are trained."""
+WORST = 1.1
+"""Times the error of a Kalman filter with fitted noise, above which the command saves no weights."""
 
 
 class Setting(NamedTuple):
@@ -200,6 +203,7 @@ def train(
     aggregate: Annotated[str | None, arg(metavar="RULE")] = None,
     flower: bool = False,
     rounds: Annotated[int | None, arg(metavar="N")] = None,
+    worse: bool = False,
 ) -> None:
     """Train a recipe, or find its checkpoint if the same was trained before.
 
@@ -217,6 +221,7 @@ def train(
         aggregate: aggregation rule, a name or FILE.py:NAME, instead of the recipe's.
         flower: train on Flower's simulation engine, every client in its own process.
         rounds: number of rounds on Flower, instead of the recipe's.
+        worse: save also what errs more than a tenth more than a Kalman filter with fitted noise.
     """
     from coopoc.learned.train import train_all
 
@@ -231,9 +236,8 @@ def train(
     elif rounds is not None:
         raise InputError("rounds", rounds, "goes with --flower", "Add --flower, or leave the recipe's rounds.")
     else:
-        made = train_all(
-            clients, out, seeds=[seed], starts=[start], readings=[reading], recipes=[recipe], aggregate=aggregate
-        )
+        chosen = {"seeds": [seed], "starts": [start], "readings": [reading], "recipes": [recipe]}
+        made = train_all(clients, out, **chosen, aggregate=aggregate, worst=math.inf if worse else WORST)
     for label, checkpoint in made.items():
         print(f"{out / label}.safetensors  {checkpoint.card['parameters']} parameters")
     print(f"coopoc: {len(made)} checkpoints are in {out}", file=sys.stderr)

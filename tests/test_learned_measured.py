@@ -13,14 +13,12 @@ import torch
 from filterpy.kalman import KalmanFilter
 
 import coopoc as co
-import coopoc.learned.recipes as recipes
 from coopoc import V2X, Fleet, InputError, Recording, Sensors, observe
 from coopoc.cli import main
 from coopoc.learned import (
     GainNet,
-    NoiseNet,
     NoiseParameters,
-    RecursiveGain,
+    RoadConstants,
     Schedule,
     Segments,
     SplitGain,
@@ -31,13 +29,13 @@ from coopoc.learned.checkpoint import read_card
 from coopoc.learned.nets.gain import Gain
 from coopoc.learned.nets.okf import scan
 from coopoc.learned.nets.stack import flatten
-from coopoc.learned.recipes import MEASURED, RECIPES, Setting, jobs_of
+from coopoc.learned.recipes import RECIPES
 from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.drives import MeasuredDrives
 from coopoc.learned.training.measured import measured_clients
 from coopoc.learned.training.okf_fit import fit_okf
 
-NETS = (GainNet(2, 1), SplitGain(4), RecursiveGain(4), NoiseNet(4), NoiseParameters())
+NETS = (GainNet(2, 1), SplitGain(4), RoadConstants(), NoiseParameters())
 
 
 def walk(steps: int = 400, vehicles: int = 2, seed: int = 0, every: int = 1) -> tuple[Recording, Fleet]:
@@ -173,16 +171,6 @@ def test_what_cannot_be_learned_from_is_refused() -> None:
         train_all(recording, "nowhere")  # type: ignore[arg-type]
 
 
-def test_the_recursive_gain_takes_larger_steps_on_measured_drives() -> None:
-    """Its recipe takes one step per pass there; the shipped weights keep that."""
-    recording, fleet = walk()
-    measured, simulated = (
-        jobs_of("recursive", Setting(), data)[0].recipe.schedule for data in (MeasuredDrives(recording, fleet), fleet)
-    )
-    assert (simulated, measured) == (RECIPES["recursive"].schedule, MEASURED["recursive"])
-    assert measured.learning_rate > simulated.learning_rate
-
-
 @pytest.fixture(scope="module")
 def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Two vehicles and a road-side unit for 80 s: odometry at 10 Hz, fixes at 2 Hz that are off by 4 m to the east of
@@ -251,7 +239,6 @@ def test_every_recipe_trains_on_a_log_and_follows_the_rest(
     """A few steps, with fixes at every fifth step, in one plane: losses and estimates stay finite, and weights move."""
     quick = replace(RECIPES[name], schedule=Schedule(epochs=4, batch=2, checks=2), rounds=2, local_epochs=1)
     monkeypatch.setitem(RECIPES, name, quick)
-    monkeypatch.setattr(recipes, "MEASURED", {})
     whole = co.read_log(log)
     first, rest = whole.part(until=65), whole.part(since=65)
     made = train_all(first, tmp_path, recipes=[name], seeds=[0], progress=False)

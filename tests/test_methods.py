@@ -17,8 +17,8 @@ SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_
 COVARIANCES = {f"{name}-{noise}": (name, noise) for name in METHODS for noise in ("identity", "nominal")}
 SNAPSHOTS = {"gnss", "mds", "qcqp-relaxation"}
 """Methods without a memory: alone they give the fix."""
-OWN = {"kalman-adaptive", "cooperative-filter"}
-"""Alone neither a Kalman filter nor a fix: another noise model, a window."""
+OWN = {"kalman-adaptive"}
+"""Alone neither a Kalman filter nor a fix: another noise model."""
 
 
 def made(name: str, noise: str) -> tuple[Method, int]:

@@ -14,7 +14,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 GRAPH = ROOT.parent / "shared" / "data" / "pyfg" / "mrclam5a.pyfg"
-HERE = ["README", "index", "optimize", "streaming", "cooperative_gain", "studies", "learned"]
+HERE = ["README", "index", "optimize", "streaming", "studies", "learned"]
 HERE += ["federation", "budget", "robustness"]
 ELSEWHERE = {"extend": "test_extend.py", "your_data": "test_your_data.py"}
 """Pages whose blocks are files and commands, too."""

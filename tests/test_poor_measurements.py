@@ -23,27 +23,27 @@ from coopoc import (
     Method,
     MovingHorizon,
     Recording,
+    RoadFilter,
     Sensors,
     nees,
     observe,
     rt_le,
     run_study,
 )
-from coopoc.learned import CooperativeGain, GainNet, LearnedGain, NoiseNet, RecursiveFilter, RecursiveGain
-from coopoc.learned.nets.cooperative import NetNoise
+from coopoc.arrays import Floats
+from coopoc.learned import GainNet, LearnedGain
 from coopoc.methods.cooperative_filter import CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.studies.views import of
 from coopoc.study import numbers
 from coopoc.world.links import wrap
 
-SOLO = (Kalman(), LearnedGain(GainNet(4, 1)), RecursiveFilter(RecursiveGain()), NoiseNet().method("noise"))
+SOLO = (Kalman(), LearnedGain(GainNet(4, 1)), RoadFilter())
 STARS = (
     JointFilter(),
     JointFilter(exact=False),
     LKFSA("nominal"),
     CooperativeFilter(robust=False),
-    CooperativeGain(NoiseNet()),
     MSMV("nominal"),
     CovarianceIntersection(split=True),
 )
@@ -93,7 +93,15 @@ def test_a_missing_fix_is_one_of_boundless_variance(crossing: Fleet) -> None:
     some, known = holed(whole, 0.5), NoiseModel.nominal(whole.sensors)
     r = np.where(np.isnan(some.gnss), 1e12, 1.5**2)
     process = np.broadcast_to(known.process_variance(whole), whole.gnss.shape)
-    given = NetNoise("net", whole.sensors, fix=r, process=process)
+
+    class Given(NoiseModel):
+        def process_variance(self, recording: Recording) -> Floats:
+            return process
+
+        def fix_variance(self, recording: Recording) -> Floats:
+            return r
+
+    given = Given("given", whole.sensors)
     np.testing.assert_allclose(JointFilter(known)(some, [0]).x, JointFilter(given)(whole, [0]).x, atol=1e-5)
 
 

@@ -1,4 +1,4 @@
-"""Studies of conditions on few cells: channel, spoofing, GNSS errors, consistency, cooperative gain, bounds."""
+"""Studies of conditions on few cells: channel, spoofing, GNSS errors, consistency, bounds."""
 
 from __future__ import annotations
 
@@ -10,19 +10,13 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import crossing_fleet, formation_fleet
+from conftest import formation_fleet
 
 import coopoc as co
 from coopoc import InputError, Sensors, run_study
-from coopoc.data.fleet_files import write_table
 from coopoc.evaluate.bounds import past_bound, posterior_bound
-from coopoc.learned.checkpoint import Checkpoint, save
-from coopoc.learned.nets.noise_net import NoiseNet
-from coopoc.learned.recipes import Setting, jobs_of
-from coopoc.studies import cooperative_gain, correlated_gnss, latency_loss, robustness, scene
-from coopoc.studies.cooperative_gain import STUDY
+from coopoc.studies import correlated_gnss, latency_loss, robustness, scene
 from coopoc.study import numbers
-from coopoc.study.publish import views as published
 
 FILES = sorted((Path(__file__).resolve().parents[1] / "studies" / "reference").glob("*.json"))
 
@@ -53,7 +47,7 @@ def test_no_mark_lies_below_its_bound(file: Path) -> None:
 
 def test_most_studies_show_a_bound() -> None:
     shown = {file.stem for file in FILES for _, marks in conditions(file) if any(m == "bound" for m, _ in marks)}
-    assert {"budget", "cooperative_gain", "correlated_gnss", "neighbours", "learned_gains", "heading_error"} <= shown
+    assert {"budget", "correlated_gnss", "neighbours", "learned_gains", "heading_error"} <= shown
 
 
 def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path, short_town: str) -> None:
@@ -166,44 +160,6 @@ def test_a_consistent_filter_is_told_from_one_that_is_not(tmp_path: Path, short_
     assert rows.index(["Joint filter", "nominal"]) < rows.index(["LKF-SA", "identity"])  # the most credible first
 
 
-@pytest.fixture(scope="module")
-def weights(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """A folder with a net that is taken for a trained one: training has its own tests."""
-    folder, clients = tmp_path_factory.mktemp("weights"), co.load_fleet("town10-clients")
-    (job,) = jobs_of("cooperative", Setting(), clients)
-    save(folder / f"{job.label}.safetensors", Checkpoint(NoiseNet(), {"key": job.key(clients)}))
-    return str(folder)
-
-
-@pytest.mark.slow
-def test_views_say_what_was_run(tmp_path: Path, weights: str) -> None:
-    """On eight vehicles of six seconds."""
-    write_table(crossing_fleet(), tmp_path / "crossing.csv")
-    study = STUDY.override(
-        {
-            "runs": 4,
-            "train_seeds": 1,
-            "weights": weights,
-            "data": str(tmp_path / "crossing.csv"),
-            "max_neighbours": "0,6",
-            "loss": "0.0,0.7",
-        }
-    )
-    results = run_study(study, out=tmp_path, progress=False)
-    assert results.failed == 0
-    at = {"receivers": "alike", "max_neighbours": 6, "method": "cooperative"}
-    heard = [results.interval("bytes_per_second", {**at, "loss": loss}).mean for loss in (0.0, 0.7)]
-    assert heard[1] == pytest.approx(0.3 * heard[0], rel=0.1)
-    clear = results.values("rt_le_m", {**at, "loss": 0.0}).mean()
-    assert clear < results.values("rt_le_m", {**at, "loss": 0.7}).mean()
-    shown = published(tmp_path / "cooperative_gain")
-    assert [view["name"] for view in shown["tables"]] == ["rt_le", "bytes", "nees", "nees_inside", "receivers"]
-    assert [view["name"] for view in shown["figures"]] == ["rt_le"]
-    assert list(shown["findings"]) == ["0 % loss", "70 % loss"]
-    assert all(said.startswith(f"{key}, K = 6: ") for key, said in shown["findings"].items())
-    assert f"the cooperative gain has {clear:.3f} m" in shown["findings"]["0 % loss"]
-
-
 def test_bound_with_the_past_is_the_stars_where_nobody_comes_or_goes() -> None:
     fleet, noise = formation_fleet(5, 40), co.Sensors.paper_scenario2()
     for k in (0, 4):
@@ -217,18 +173,3 @@ def test_bound_with_the_past_is_lower_where_they_do(crossing: co.Fleet) -> None:
     past, star = (np.trace(b(crossing, noise, 1, v2x), axis1=1, axis2=2) for b in (past_bound, posterior_bound))
     assert (past <= star * (1 + 1e-9)).all()
     assert past[-1] < 0.98 * star[-1]
-
-
-@pytest.mark.parametrize("receivers", cooperative_gain.RECEIVERS)
-def test_receivers_differ_as_the_caption_says(receivers: str) -> None:
-    """Noise of every fix over 20 runs, and what nominal filters are told of all."""
-    p = {**STUDY.settings, "runs": 20, "egos": "1", "receivers": receivers, "max_neighbours": 0, "loss": 0.0}
-    fleet, seen = co.load_fleet("town10"), cooperative_gain.recording(p)
-    acting = np.sqrt(np.square(seen.gnss - fleet.position).mean(axis=(0, 3)))
-    poor = np.zeros((900, 60), dtype=bool)
-    poor[300 : 600 if receivers == "changing" else 300] = True
-    if receivers == "mixed":
-        poor[:, [c for c in range(60) if c % 5 < 2]] = True
-    assert acting[poor].mean() == pytest.approx(5.0, rel=0.01)
-    assert acting[~poor].mean() == pytest.approx(1.5, rel=0.01)
-    assert seen.sensors.gnss_std[0] == pytest.approx(np.sqrt(np.square(seen.gnss - fleet.position).mean()), rel=0.01)

@@ -16,6 +16,7 @@ from .joint_filter import JointFilter
 from .kalman import GNSS, AdaptiveKalman, Kalman
 from .mds import MDS
 from .qcqp_relaxation import QCQPRelaxation
+from .road import RoadFilter
 from .sliding_window import FixedLagSmoother, MovingHorizon
 from .track import Method
 
@@ -26,6 +27,7 @@ METHODS: Mapping[str, Factory] = {
     "gnss": lambda noise_model: GNSS(),
     "kalman": Kalman,
     "kalman-adaptive": lambda noise_model: AdaptiveKalman(),
+    "road-kalman": RoadFilter,
     "lkf-sa": LKFSA,
     "lkf-sa-edge": partial(JointFilter, exact=False, name="lkf-sa-edge"),
     "msmv-r": MSMV,

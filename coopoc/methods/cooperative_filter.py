@@ -4,27 +4,44 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+import numpy.typing as npt
 
 from ..arrays import Floats
 from ..kernels.stars.cooperative_filter import run_filter
 from ..kernels.stars.cooperative_state import NO_GUARDS, Guards, Model
 from ..kernels.stars.gaussian import REJECTED
-from ..kernels.stars.messages import ACCELERATION_STD, FORGOTTEN
+from ..kernels.stars.messages import ACCELERATION_STD, FORGOTTEN, Measurements
 from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
-from .baselines import solo_estimates
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
 from .noise_model import NoiseModel, resolve
 from .track import Track, check_options
 
-ESTIMATE_AND_ODOMETER = Message("estimate, odometer and velocity", 14)
-"""Solo estimate (3), its variance per axis (3), sum of all motions (3), velocity (3), id and time (2)."""
 NO_ODOMETER = np.zeros((1, 1, 1, 3))
 KINDS = ("range", "azimuth", "inclination", "message")
+
+
+class Broadcast(NamedTuple):
+    """What a vehicle with a robust filter broadcasts, with its id and the time.
+
+    Attributes:
+        position: (3,) m, estimate of the same filter alone, without neighbours and lasting errors.
+        velocity: (3,) m/s.
+        variance: (3,) m^2 of the estimate.
+        odometer: (3,) m, sum of all its motions.
+    """
+
+    position: npt.ArrayLike
+    velocity: npt.ArrayLike
+    variance: npt.ArrayLike
+    odometer: npt.ArrayLike
+
+
+BROADCAST = Message("estimate, odometer and velocity", 3 * len(Broadcast._fields) + 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,7 +91,7 @@ class CooperativeFilter:
     @property
     def message(self) -> Message:
         """Estimate and odometer; of the textbook filter a fix."""
-        return ESTIMATE_AND_ODOMETER if self.robust else FIX_AND_VELOCITY
+        return BROADCAST if self.robust else FIX_AND_VELOCITY
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.
@@ -86,7 +103,8 @@ class CooperativeFilter:
         model = model_of(known, self.robust)
         assumed, broadcast, moved = assumptions(recording, known), None, NO_ODOMETER
         if self.robust:
-            assumed, broadcast = solo_estimates(recording, known, columns)
+            broadcast, variance = broadcasts(recording, known, columns, guards_of(self, known))
+            assumed = assumed._replace(broadcast=variance)
             moved = np.cumsum(np.nan_to_num(recording.dt * recording.velocity), axis=1)
         guards = guards_of(self, known)
 
@@ -99,6 +117,32 @@ class CooperativeFilter:
             yield Estimate(slice(None), x, cov, box.link, neighbours, {**extras, "trusted": notes[..., 4]})
 
         return follow_egos(self, recording, egos, run, known.notes, missing=True)
+
+
+def broadcasts(recording: Recording, known: NoiseModel, egos: Sequence[int], guards: Guards) -> tuple[Floats, Floats]:
+    """Estimates m and variances m^2, (R, T, N, 3), of the vehicles in the stars of some egos, each filtered alone."""
+    links, assumed, model = recording.links, assumptions(recording, known), model_of(known, robust=False)
+    runs, steps = recording.gnss.shape[:2]
+    none, first = np.zeros((runs, 0), np.int64), np.zeros(steps + 1, np.int64)
+    x = np.full(recording.gnss.shape, np.nan)
+    variance = x.copy()
+    for j in np.union1d(egos, links.neighbour[np.isin(links.observer, egos)]):
+        alone = Measurements(
+            recording.gnss,
+            recording.velocity,
+            recording.gnss,
+            np.zeros((runs, 0, 5)),
+            none[0],
+            first,
+            none,
+            none > 0,
+            int(j),
+            recording.dt,
+        )
+        x[:, :, j], cov = run_filter(alone, assumed, NO_ODOMETER, model, guards)[:2]
+        variance[:, :, j] = np.diagonal(cov, axis1=-2, axis2=-1)
+    x.flags.writeable = False  # as the recording's, for which the kernel is compiled
+    return x, variance
 
 
 def weight(q: Floats, gate: float) -> Any:

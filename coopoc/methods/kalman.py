@@ -19,7 +19,7 @@ from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NO_VARIANCE, NoiseModel, constant_noise, motion_noise, process_noise, resolve
 from .stream import FilterStream
-from .track import Track, check_options
+from .track import Track, check_options, lost
 
 ASSUMED = Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02)
 """Velocity noise of the paper's training, 10 % per axis, and where the estimate of the fixes' noise starts."""
@@ -185,7 +185,10 @@ def solo_track(
     """Track of a solo filter with the variances p (R, T, E, 3) m^2; it receives and sends nothing."""
     cov, none = np.zeros((*p.shape, 3)), np.zeros((recording.runs, len(columns)))
     np.einsum("...ii->...i", cov)[:] = p
-    return Track(recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, notes=notes)
+    notes = (*notes, *lost(x, recording, columns))
+    return Track(
+        recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, notes=notes, ids=recording.ids
+    )
 
 
 def solo_filter(

@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -13,49 +12,38 @@ import numpy.typing as npt
 from ..arrays import Floats, Ints, instance
 from ..errors import InputError
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET, ROUNDING
-from ..kernels.solo import FixNoise
+from ..kernels.motion import MotionNoise
 from ..kernels.stars.cooperative_filter import keep, make_filter, motion_of, restore, stream_row, stream_step
 from ..kernels.stars.cooperative_state import (
     AGE,
+    FIX_VARIANCE,
     KEPT_VARIANCE,
+    MOTION,
     NO_GUARDS,
     ODOMETER,
     OWN,
-    SENT,
+    SINCE,
+    SOLO,
+    SOLO_VARIANCE,
     SPEED,
     STEP,
     TRUSTED,
     TYPICAL,
-    VARIANCE,
+    USED,
     WIDTH,
     Filter,
+    Guards,
+    Model,
 )
-from ..kernels.stars.cooperative_state import ESTIMATE as POSITION
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.relative import components
-from .cooperative_filter import CooperativeFilter, guards_of, model_of
+from ..world.links import told
+from .cooperative_filter import Broadcast, CooperativeFilter, guards_of, model_of
 from .joint_filter import JointFilter
 from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
 from .noise_model import constant_noise, motion_noise
-from .stream import FilterStream
 
 FIRST = np.zeros(1, np.int64)
-
-
-class Broadcast(NamedTuple):
-    """What a vehicle with a robust filter broadcasts, 56 B with its id and the time.
-
-    Attributes:
-        position: (3,) m, estimate of its solo filter.
-        velocity: (3,) m/s.
-        variance: (3,) m^2 of the estimate.
-        odometer: (3,) m, sum of all its motions.
-    """
-
-    position: npt.ArrayLike
-    velocity: npt.ArrayLike
-    variance: npt.ArrayLike
-    odometer: npt.ArrayLike
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,15 +78,15 @@ class RelativeMeasurement:
         if relative.shape != (3,) or not named or not (0.0 < relative[0] < math.inf or math.isnan(relative[0])):
             text = "must have a name and three numbers, the range first and > 0"
             raise InputError("relative", (self.id, self.relative), text, "Give NaN for what was not measured.")
-        row[:AGE], row[AGE] = components(relative[None, None], FIRST)[0, 0], seconds("age", self.age)
-        row[POSITION:VARIANCE] = fix_or_none(self.gnss, "neighbour's gnss")
+        row[:AGE], row[AGE] = components(told(relative)[None, None], FIRST)[0, 0], seconds("age", self.age)
+        row[SOLO:SOLO_VARIANCE] = fix_or_none(self.gnss, "neighbour's gnss")
         if self.variance is not None:
-            row[VARIANCE:ODOMETER] = three("neighbour's variance", self.variance)
+            row[SOLO_VARIANCE:ODOMETER] = three("neighbour's variance", self.variance)
         if self.odometer is not None:
             row[ODOMETER:SPEED] = three("neighbour's odometer", self.odometer)
         if self.velocity is not None:
             row[SPEED:STEP] = three("neighbour's velocity", self.velocity)
-        elif math.isfinite(row[POSITION]):
+        elif math.isfinite(row[SOLO]):
             raise InputError("velocity", None, f"must come with the fix of {self.id}", "Send both in one message.")
         object.__setattr__(self, "row", row)
 
@@ -151,18 +139,17 @@ class StarStream:
             self._model = self._model._replace(exact=float(filter.exact and known.exact_relative))
         elif robust:
             self._guards = guards_of(filter, known)
-        self._motion, self._fix = motion_noise(known, interval), np.array(known.gnss_variance)
+        self._motion: MotionNoise = motion_noise(known, interval)
+        self._fix = np.array(known.gnss_variance)
         self.max_age, self.history = seconds("max_age", max_age), MotionHistory(history)
         self._start = np.full(3, np.nan) if x0 is None else three("x0", x0)
         self._given = np.zeros(8)
         self._positions: dict[str, Floats] = {}
         self._messages: dict[str, tuple[Floats, float]] = {}
         self._numbers: dict[str, int] = {}
-        self._filters = [make_filter(1, 1) for _ in range(3)]
-        self._inputs: list[tuple[Floats, Floats, Ints]] = []
-        self._time, self._steps = 0.0, 0
-        self.solo = FilterStream(self._motion, FixNoise(self._fix), x0, history) if robust else None
-        self._odometer = np.zeros(3)
+        self._star, self._time = Recalled(self._model, self._guards, self._start), 0.0
+        self._alone = Recalled(model_of(known, robust=False), self._guards, self._start) if robust else None
+        self._odometer, self._estimate = np.zeros(3), np.full(12, np.nan)
 
     @property
     def neighbours(self) -> dict[str, Floats]:
@@ -172,15 +159,14 @@ class StarStream:
     @property
     def broadcast(self) -> Broadcast | None:
         """What this vehicle sends now; None before its first fix, and of a filter that is not robust."""
-        if self.solo is None or (state := self.solo.state) is None:
+        if np.isnan(self._estimate[0]):
             return None
-        variance = state.share * state.noise + state.motion
-        return Broadcast(state.x, self._given[3:6].copy(), variance, self._odometer.copy())
+        return Broadcast(self._estimate[:3], self._given[3:6].copy(), self._estimate[3::4], self._odometer.copy())
 
     @property
     def trusted(self) -> dict[str, bool]:
         """Whether the fixes of each neighbour in the star count as they are."""
-        status = self._filters[0].status
+        status = self._star.filters[0].status
         return {name: bool(status[self._numbers[name], TRUSTED]) for name in self._positions}
 
     def step(
@@ -205,7 +191,7 @@ class StarStream:
                 that is no `Broadcast`. The filter is then as it was before.
         """
         names = names_of("neighbours", neighbours, RelativeMeasurement)
-        if self.solo is not None:
+        if self._alone is not None:
             self._check(neighbours)
         self.history.write(self._given, gnss, velocity, dt, fix_age)
         own = np.empty(OWN)
@@ -213,48 +199,23 @@ class StarStream:
         if outcome not in (ESTIMATE, NO_FIX_YET):
             self.history.check(gnss, velocity, dt, fix_age)
         dt = float(dt)
-        if self.solo is not None:
-            self.solo.step(gnss, velocity, dt, fix_age)
-            self._odometer += self._given[3:6] * dt
+        self._odometer += self._given[3:6] * dt
         self._time += dt
         rows = self._rows(names, neighbours, dt)
         if outcome == NO_FIX_YET:
             own[:3] = np.nan
-            if not self._steps and np.isnan(self._start[0]):
+            if not self._star.steps and np.isnan(self._start[0]):
                 return np.full(3, np.nan), None
-        answer = np.empty(12 + 3 * len(names))
-        self._run(own, rows, self._columns(names), answer)
-        self._steps += 1
+        if self._alone is not None:
+            self._estimate = self._alone.step(own.copy(), rows[:0], FIRST[:0])
+        own[FIX_VARIANCE:MOTION] -= (1.0 - self._model.white) * self._fix
+        answer = self._star.step(own, rows, self._columns(names))
         self._positions = dict(zip(names, answer[12:].reshape(-1, 3), strict=True))
         return answer[:3], answer[3:12].reshape(3, 3)
 
-    def _run(self, own: Floats, rows: Floats, vehicles: Ints, answer: Floats) -> None:
-        """Take a step; where a vehicle has lost trust, go back and come here again without its fixes."""
-        f, older, newer = self._filters
-        memory = int(self._guards.memory)
-        if memory and self._steps and self._steps % memory == 0:
-            keep(newer, older)
-            keep(f, newer)
-            del self._inputs[:-memory]
-        alarm = stream_step(f, self._model, self._guards, own, rows, vehicles, self._start, answer)
-        if not memory:
-            return
-        self._inputs.append((own, rows, vehicles))
-        while alarm:
-            restore(older, f, self._model, self._guards)
-            for k, (mine, theirs, who) in enumerate(self._inputs):
-                if k == len(self._inputs) - 1 - self._steps % memory:
-                    keep(f, newer)
-                out = np.empty(12 + 3 * len(who))
-                alarm = stream_step(f, self._model, self._guards, mine, theirs, who, self._start, out)
-                if alarm:
-                    break
-            else:
-                answer[:] = out
-
     def _check(self, neighbours: Sequence[RelativeMeasurement]) -> None:
         for each in neighbours:
-            if each.velocity is not None and not np.isfinite(each.row[POSITION:SPEED]).all():
+            if each.velocity is not None and not np.isfinite(each.row[SOLO:SPEED]).all():
                 allowed = "must hold position, variance and odometer for a robust filter"
                 raise InputError("neighbours", each.id, allowed, "Send stream.broadcast, or start with robust=False.")
 
@@ -271,10 +232,10 @@ class StarStream:
             age = max(self._time - sent, 0.0)
             if age > self.max_age + ROUNDING:
                 continue
-            row[POSITION:] = message[POSITION:]
+            row[SOLO:] = message[SOLO:]
             row[AGE], row[TYPICAL:] = age if age > ROUNDING else 0.0, self._fix
-            if self.solo is None:
-                row[VARIANCE:ODOMETER] = self._fix
+            if self._alone is None:
+                row[SOLO_VARIANCE:ODOMETER] = self._fix
         motion_of(rows, self._motion, dt)
         if len(self._messages) > 64 + 2 * len(names):
             oldest = self._time - self.max_age
@@ -286,30 +247,71 @@ class StarStream:
         new = [name for name in names if name not in self._numbers]
         if len(self._numbers) + len(new) >= 64 + 2 * len(names):
             self._forget(names)
-        slots, vehicles = self._filters[0].vehicle.size, self._filters[0].slot.size
+        slots, vehicles = self._star.filters[0].vehicle.size, self._star.filters[0].slot.size
         if len(names) >= slots or len(self._numbers) + len(new) >= vehicles:
             more = max(slots, 2 * len(names) + 1), max(vehicles, 2 * (len(self._numbers) + len(new)) + 1)
-            self._filters = [grown(f, *more) for f in self._filters]
-        free = sorted(set(range(1, self._filters[0].slot.size)) - set(self._numbers.values()))
+            self._star.filters = [grown(f, *more) for f in self._star.filters]
+        free = sorted(set(range(1, self._star.filters[0].slot.size)) - set(self._numbers.values()))
         for name, number in zip(new, free, strict=False):
             self._numbers[name] = number
-            for f in self._filters:
-                f.status[number], f.betrayals[number] = 0.0, 0.0
-                f.status[number, TRUSTED], f.status[number, SENT] = float(self._guards.trust == 0.0), -math.inf
+            for f in self._star.filters:
+                f.status[number], f.revoked[number] = 0.0, 0.0
+                f.status[number, TRUSTED] = float(self._guards.trust == 0.0)
+                f.status[number, USED] = f.status[number, SINCE] = -math.inf
                 f.status[number, KEPT_VARIANCE : KEPT_VARIANCE + 3] = self._guards.tau**2
         return np.array([self._numbers[name] for name in names], dtype=np.int64)
 
     def _forget(self, names: list[str]) -> None:
         """Vehicles that are in no star that is remembered and whose messages are too old."""
         for name, number in list(self._numbers.items()):
-            there = any(f.slot[number] != ABSENT for f in self._filters) or name in names
+            there = any(f.slot[number] != ABSENT for f in self._star.filters) or name in names
             if not there and name not in self._messages:
                 del self._numbers[name]
+
+
+class Recalled:
+    """A filter that goes back and takes its last steps again where a vehicle has lost trust.
+
+    Args:
+        model: noise model.
+        guards: against what may be wrong.
+        start: (3,) m, known before the first step, NaN for none.
+    """
+
+    def __init__(self, model: Model, guards: Guards, start: Floats) -> None:
+        self.model, self.guards, self.start, self.steps = model, guards, start, 0
+        self.filters = [make_filter(1, 1) for _ in range(3)]
+        self._inputs: list[tuple[Floats, Floats, Ints]] = []
+
+    def step(self, own: Floats, rows: Floats, vehicles: Ints) -> Floats:
+        """Answer of `stream_step`; its arguments are kept."""
+        f, older, newer = self.filters
+        memory = int(self.guards.memory)
+        if memory and self.steps and self.steps % memory == 0:
+            keep(newer, older)
+            keep(f, newer)
+            del self._inputs[:-memory]
+        self.steps += 1
+        answer = np.empty(12 + 3 * len(vehicles))
+        alarm = stream_step(f, self.model, self.guards, own, rows, vehicles, self.start, answer)
+        if not memory:
+            return answer
+        self._inputs.append((own, rows, vehicles))
+        while alarm:
+            restore(older, f, self.model, self.guards)
+            for k, (mine, theirs, who) in enumerate(self._inputs):
+                if k == len(self._inputs) - 1 - (self.steps - 1) % memory:
+                    keep(f, newer)
+                answer = np.empty(12 + 3 * len(who))
+                alarm = stream_step(f, self.model, self.guards, mine, theirs, who, self.start, answer)
+                if alarm:
+                    break
+        return answer
 
 
 def grown(f: Filter, slots: int, vehicles: int) -> Filter:
     """The filter with more room."""
     larger = make_filter(slots, vehicles)
     keep(f, larger)
-    larger.betrayals[: len(f.betrayals)] = f.betrayals
+    larger.revoked[: len(f.revoked)] = f.revoked
     return larger

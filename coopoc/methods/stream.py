@@ -2,21 +2,16 @@
 
 from __future__ import annotations
 
-import time
-from collections.abc import Sequence
 from typing import Generic, NamedTuple, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Floats
-from ..errors import InputError
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.motion import MotionNoise
 from ..kernels.solo import FixNoise, packed, stream_step
-from ..world.recording import Recording, check_recording
 from .motion_history import MotionHistory, three
-from .track import Track
 
 State = TypeVar("State")
 
@@ -128,27 +123,3 @@ class FilterStream:
         if outcome != ESTIMATE:
             self.history.check(gnss, velocity, dt, fix_age)
         return answer[:3], answer[3:].reshape(3, 3)
-
-
-def solo_track_of(solo: Solo[State], recording: Recording, egos: Sequence[int | str], x0: Floats | None) -> Track:
-    """Track of a solo filter of one's own, from a known start x0 (..., E, 3) m or the first fix.
-
-    Raises:
-        InputError: an ego that is unknown or absent; x0 of another shape.
-    """
-    began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
-    gnss, velocity = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
-    if x0 is not None and np.shape(x0)[-2:] != gnss.shape[2:]:
-        raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {gnss.shape[2:]}", "One start per ego.")
-    on_time, dt = np.zeros(3), recording.dt
-    state = solo.begin(gnss[:, 0], on_time) if x0 is None else solo.begin(np.broadcast_to(x0, gnss[:, 0].shape), None)
-    estimates = [solo.read(state)]
-    for t in range(1, gnss.shape[1]):
-        process = solo.process(velocity[:, t], dt)
-        state = solo.advance(state, dt * velocity[:, t], process, gnss[:, t], on_time)
-        estimates.append(solo.read(state))
-    x = np.stack([position for position, _ in estimates], axis=1)
-    claims = [covariance for _, covariance in estimates if covariance is not None]
-    none = np.zeros((recording.runs, len(columns)))
-    cov = np.stack(claims, axis=1) if claims else None
-    return Track(recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began)

@@ -8,7 +8,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Floats, checked, number, texts
+from ..arrays import Bools, Floats, checked, number, texts
 from ..errors import InputError, shown
 from ..short_repr import short_repr
 from ..world.recording import Recording
@@ -42,6 +42,7 @@ class Track:
         heading_covariance: (R, T, E, 4) of the heading with x, y, z and itself, m rad and rad^2; None as above.
         extras: other numbers by name, (R, T, E), or (R, L) by link; states with their standard deviations under the
             name and "_std".
+        ids: of all vehicles of the Recording, so that no other fleet's truth is taken for theirs; () if unknown.
     """
 
     t: Floats
@@ -56,6 +57,7 @@ class Track:
     heading: Floats | None = None
     heading_covariance: Floats | None = None
     extras: Mapping[str, Floats] = field(default_factory=dict)
+    ids: tuple[str, ...] = ()
 
     __repr__ = short_repr
 
@@ -79,7 +81,8 @@ class Track:
             if name not in optional or getattr(self, name) is not None:
                 object.__setattr__(self, name, checked(name, getattr(self, name), axes, shape))
         object.__setattr__(self, "seconds", number("seconds", self.seconds))
-        object.__setattr__(self, "notes", texts("notes", self.notes))
+        for name in ("notes", "ids"):
+            object.__setattr__(self, name, texts(name, getattr(self, name)))
         if not isinstance(self.extras, Mapping):
             raise InputError("extras", shown(self.extras), "must be name -> (R, T, E)", "Give {} for none.")
         by_link = None if self.neighbours is None else self.neighbours.shape[:2]
@@ -107,6 +110,23 @@ class Track:
         if (found := unsound(covariance)) and not any(UNSOUND in note for note in self.notes):
             note = f"{found} of {len(covariance)} {UNSOUND}"
             object.__setattr__(self, "notes", (*self.notes, note))
+
+
+FAR = 100.0
+"""Standard deviations (norm of that of the fixes) between an estimate and a fix, beyond which a method is lost."""
+
+
+def far_off(x: Floats, recording: Recording, columns: Sequence[int], limit: float = FAR) -> Bools:
+    """(R, E) whether estimates (R, T, E, 3) m are ever farther from a fix than `limit` standard deviations."""
+    gap = np.linalg.norm(x - recording.gnss[:, :, list(columns)], axis=-1)
+    return np.asarray((gap > limit * float(np.linalg.norm(recording.sensors.gnss_std))).any(axis=1))
+
+
+def lost(x: Floats, recording: Recording, columns: Sequence[int], limit: float = FAR) -> tuple[str, ...]:
+    """A note of the runs whose estimates are `far_off`; none if none is."""
+    found = far_off(x, recording, columns, limit)
+    far = limit * float(np.linalg.norm(recording.sensors.gnss_std))
+    return (f"diverged in {found.sum()} of {found.size} runs (over {far:.0f} m from the fix)",) if found.any() else ()
 
 
 @runtime_checkable

@@ -43,7 +43,7 @@ for name, method in {
     "untrained net": LearnedGain(GainNet()),
     "five rounds": LearnedGain(fed.model),
     "twenty rounds (shipped)": load_method("fedkalmannet"),
-    "recursive gain (shipped)": load_method("recursive"),
+    "nine learned variances (shipped)": load_method("okf"),
     "Kalman filter, nominal": co.Kalman("nominal"),
 }.items():
     print(f"{name:26s}{co.rt_le(method(seen, [24]), fleet).mean():6.2f} m")
@@ -55,7 +55,7 @@ for name, method in {
 # and gives the numbers of the Track.
 
 # %%
-method = load_method("recursive")
+method = load_method("okf")
 stream = method.start()
 for step in range(5):
     x, covariance = stream.step(seen.gnss[0, step, 24], seen.velocity[0, step, 24], seen.dt)

@@ -170,11 +170,6 @@ def error(x: Tensor, truth: Tensor) -> Tensor:
     return torch.where(truth.isfinite(), x - truth, 0.0)
 
 
-def over_axes(terms: Tensor, truth: Tensor) -> Tensor:
-    """Sum (...) of the terms (..., 3) of a loss over the components whose truth (..., 3) is not NaN."""
-    return torch.where(truth.isfinite(), terms, 0.0).sum(-1)
-
-
 def has_truth(truth: Tensor) -> Tensor:
     """(...) whether there is a true position (..., 3)."""
     return truth[..., 0].isfinite()

@@ -15,7 +15,7 @@ from coopoc.arrays import Floats, checked, instance
 from coopoc.errors import InputError
 from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.solo import FixNoise
-from coopoc.methods.kalman import solo_filter
+from coopoc.methods.kalman import solo_filter, solo_track
 from coopoc.methods.noise_model import check_interval
 from coopoc.methods.stream import FilterStream
 from coopoc.methods.track import Track, check_options
@@ -85,9 +85,7 @@ class OptimisedKF:
         began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
         fixes = FixNoise(np.square(self.gnss_std))
         x, variance, _ = solo_filter(recording, columns, self._motion(0.0), fixes, self.x0)
-        silent = np.zeros((recording.runs, len(columns)))
-        seconds = time.perf_counter() - began
-        return Track(recording.t, tuple(columns), x, variance[..., None] * np.eye(3), silent, silent, seconds)
+        return solo_track(recording, columns, x, variance, began)
 
     def _motion(self, interval: float) -> MotionNoise:
         base, ratio = np.array(self.process_std, dtype=float), np.array(self.velocity_ratio, dtype=float)

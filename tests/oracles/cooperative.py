@@ -1,8 +1,8 @@
 """The cooperative filter with dense matrices and one number at a time, one run.
 
 State: named vectors, ("x", j) position, ("b", j) error of fixes, ("v", j) velocity and ("c", j) clone of vehicle j,
-("common",) and ("compass",). A number z = h x + noise beyond its gate has its innovation's variance multiplied by
-q / gate, and by 100 more beyond four times the gate.
+("common",) and ("compass",). Numbers z = H x + noise beyond their gate have their innovations' covariance multiplied
+by q / gate, and by 100 more beyond four times the gate. What is vague has a variance of FLAT m^2.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ import numpy as np
 
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
+from coopoc.kernels.stars.cooperative_messages import CLIP
 from coopoc.kernels.stars.cooperative_state import Guards
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector, wrap
 from coopoc.world.v2x import FIX_AND_VELOCITY
-from oracles import solo
 
-FLAT, NOWHERE = 1e6, 1e4
+FLAT = 1e6
 Name = tuple[Any, ...]
 
 
@@ -73,12 +73,17 @@ class Belief:
         return h
 
     def update(self, h: Floats, z: float, r: float, gate: float = 0.0) -> float:
-        innovation, s = z - h @ self.x, h @ self.p @ h + r
-        q = float(innovation**2 / s)
+        """One number; its squared normalised innovation."""
+        return self.updates(h[None], np.array([z]), np.array([r]), gate)
+
+    def updates(self, h: Floats, z: Floats, r: Floats, gate: float = 0.0) -> float:
+        """Several numbers with one gate; their squared Mahalanobis distance."""
+        gap, s = z - h @ self.x, h @ self.p @ h.T + np.diag(r)
+        q = float(gap @ np.linalg.solve(s, gap))
         if gate and q > gate:
-            s *= q / gate * (100.0 if q > 4 * gate else 1.0)
-        gain = self.p @ h / s
-        self.x, self.p = self.x + gain * innovation, self.p - np.outer(gain, gain) * s
+            s = s * (q / gate * (100.0 if q > 4 * gate else 1.0))
+        gain = np.linalg.solve(s, h @ self.p).T
+        self.x, self.p = self.x + gain @ gap, self.p - gain @ s @ gain.T
         return q
 
 
@@ -106,8 +111,10 @@ class Life(NamedTuple):
 class Oracle:
     """The filter of one ego in one run; `loop` goes back where a member has lost trust."""
 
-    def __init__(self, seen: Recording, ego: int, run: int, known: NoiseModel, guards: Guards, robust: bool) -> None:
-        s = known.sensors
+    def __init__(
+        self, seen: Recording, ego: int, run: int, known: NoiseModel, guards: Guards, robust: bool, alone: bool = False
+    ) -> None:
+        s, self.alone = known.sensors, alone
         self.seen, self.ego, self.run, self.known, self.guards, self.robust = seen, ego, run, known, guards, robust
         self.life, self.std, self.white = Life(0, 0, 1, 0, 0), np.ones(3), np.ones(3)
         if s is not None:
@@ -124,23 +131,20 @@ class Oracle:
         self.position, self.variance = seen.gnss[run].copy(), self.r.copy()
         if robust:
             for j in range(shape[2]):
-                for c in range(3):
-                    one = seen.gnss[run, :, j, c], seen.velocity[run, :, j, c], self.q[:, j, c]
-                    self.position[:, j, c], self.variance[:, j, c] = solo.kalman(*one, self.r[0, j, c], seen.dt)
+                x, cov, _ = Oracle(seen, j, run, known, guards, False, alone=True).loop()
+                self.position[:, j], self.variance[:, j] = x, np.diagonal(cov, axis1=1, axis2=2)
         self.odometer = np.cumsum(np.nan_to_num(seen.dt * seen.velocity[run]), axis=0)
-        self.betrayed: dict[int, list[float]] = {}
+        self.revoked: dict[int, list[float]] = {}
         self.box = inbox(seen, ego, FIX_AND_VELOCITY)
-        self.state: dict[str, Any] = {
-            "belief": Belief(),
-            "members": [],
-            "trusted": set(range(shape[2])) if not guards.trust else {ego},
-            "last": {},
-            "serves": {},
-            "joined": {},
-            "hits": {},
-            "mean": {},
-            "kept": {},
+        self.state = self.blank()
+
+    def blank(self) -> dict[str, Any]:
+        empty: dict[str, Any] = {
+            name: {} for name in ("last", "serves", "heard", "joined", "hits", "mean", "kept", "slot", "pace")
         }
+        everyone = set(range(self.seen.gnss.shape[2]))
+        trusted = everyone if not self.guards.trust else {self.ego}
+        return empty | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
     def loop(self) -> tuple[Floats, Floats, list[Floats]]:
         """x (T, 3), covariance (T, 3, 3), neighbours (k, 3) of each step."""
@@ -149,6 +153,13 @@ class Oracle:
         found: list[Any] = []
         t = 0
         while t < steps:
+            fix, u = self.seen.gnss[self.run, t, self.ego], self.seen.velocity[self.run, t, self.ego]
+            if np.isnan(u[0]) or (not self.state["belief"].names and np.isnan(fix[0])):
+                self.state, self.revoked = self.blank(), {}
+                found.append((np.full(3, np.nan), np.full((3, 3), np.nan), []))
+                t += 1
+                older = newer = t, copy.deepcopy(self.state)
+                continue
             if memory and t % memory == 0:
                 older = newer if t == len(found) else older
                 newer = t, copy.deepcopy(self.state)
@@ -156,7 +167,9 @@ class Oracle:
             if alarm and memory:
                 t, self.state = older[0], copy.deepcopy(older[1])
                 newer = older
-                self.distrust(t)
+                for j, (_, until) in self.revoked.items():
+                    if until >= t and j in self.state["trusted"]:
+                        self.doubt(j)
                 continue
             if t == len(found):
                 b = self.state["belief"]
@@ -168,6 +181,8 @@ class Oracle:
 
     def neighbours(self, t: int) -> tuple[Any, list[int]]:
         """Links of a step, and the columns that they join."""
+        if self.alone:
+            return np.arange(0), []
         here = np.arange(self.box.start[t], self.box.start[t + 1])
         return here, self.seen.links.neighbour[self.box.link[here]].tolist()
 
@@ -180,77 +195,203 @@ class Oracle:
         return Sent(s, self.position[s, j], self.variance[s, j], self.odometer[s, j], velocity, self.q[s, j])
 
     def step(self, t: int) -> bool:
-        s, g, dt = self.state, self.guards, self.seen.dt
-        b, life = s["belief"], self.life
+        s, g, b, life = self.state, self.guards, self.state["belief"], self.life
         here, others = self.neighbours(t)
         links = dict(zip(others, here.tolist(), strict=True))
         messages = {j: self.message(link, j) for j, link in links.items()}
         relative = {j: self.seen.relative[self.run, self.box.link[link]] for j, link in links.items()}
-        for j in [j for j in s["members"] if j not in others]:
-            if ("b", j) in b.names:
-                at = b.at(("b", j))
-                s["kept"][j] = b.x[at].copy(), np.maximum(np.diag(b.p)[at], 0.01)
-            for kind in "xbvc":
-                b.drop((kind, j))
-            s["members"].remove(j)
-        if t == 0:
-            b.add(("x", self.ego), self.seen.gnss[self.run, 0, self.ego], FLAT)
-            if life.own:
-                b.add(("b", self.ego), 0, life.own)
+        fix = self.seen.gnss[self.run, t, self.ego].copy()
+        if not b.names:
+            b.add(("x", self.ego), 0.0, 0.0)
             if life.common:
                 b.add(("common",), 0, life.common)
             if life.bias + life.heading:
                 b.add(("compass",), 0, [life.bias, 0, 0])
+            s["slot"][self.ego] = 0
+            again = self.start(t, fix, messages, relative)
         else:
-            self.predict(t)
+            again = bool(g.trust and np.isfinite(fix).all() and self.lost(t))
+            again = again and self.start(t, fix, messages, relative)
+        for j in list(s["members"]):
+            if j not in others or again or self.contradicted(t, j):
+                if j in others and j not in s["trusted"]:
+                    self.doubt(j)
+                if ("b", j) in b.names:
+                    at = b.at(("b", j))
+                    s["kept"][j] = b.x[at].copy(), np.maximum(np.diag(b.p)[at], 0.01)
+                for kind in "xbvc":
+                    b.drop((kind, j))
+                s["members"].remove(j)
+        dt = self.seen.dt
+        u, q = self.steady(t, self.ego, self.seen.velocity[self.run, t, self.ego], self.q[t, self.ego])
+        if t > s["joined"][self.ego]:
+            self.predict(dt * u, q)
         for j in s["members"]:
-            self.predict_member(t, j, messages[j])
+            messages[j] = self.predict_member(t, j, messages[j])
         for j in [j for j in others if j not in s["members"]]:
             self.join(t, j, messages[j], relative[j])
-        at = {j: b.x[b.at(("x", j))].copy() for j in (self.ego, *others)}
-        fix = self.seen.gnss[self.run, t, self.ego]
-        if np.isfinite(fix).all():
-            self.update(
-                ("fix",),
-                [(self.fix_terms(self.ego), fix[c], self.r[t, self.ego, c] * self.white[c]) for c in range(3)],
-                g.fix_gate,
+        for j in s["vague"].intersection(others):
+            message, last = messages[j], s["last"].get(j)
+            new = (
+                message is not None and np.isfinite(message.estimate).all() and not (last and message.step <= last.step)
             )
-        order = sorted(s["members"], key=lambda j: s["slot"][j])
-        alarm = False
+            if message and new and (s["joined"][j] < t or not np.isfinite(relative[j]).all()):
+                b.x[b.at(("x", j))] = message.estimate + (t - message.step) * dt * message.velocity
+        at = {j: b.x[b.at(("x", j))].copy() for j in (self.ego, *others)}
+        alarm = np.isfinite(fix).all() and self.add_fix(t, fix)
+        order = sorted(s["members"], key=lambda j: float(np.linalg.norm(at[j] - at[self.ego])))
         if self.robust:
             self.measure(at, order, relative)
         for j in order:
-            alarm |= self.receive(t, j, messages[j], relative[j], at)
+            alarm |= self.receive(t, j, messages[j])
         if not self.robust:
             self.measure(at, order, relative)
         if g.trust:
-            self.trust(dt)
+            self.trust()
+        return bool(alarm)
+
+    def add_fix(self, t: int, fix: Floats) -> bool:
+        """A slip of the odometer explains an innovation beyond the gate that is far smaller beside its variance."""
+        s, g, slip = self.state, self.guards, (self.guards.slip * self.seen.dt) ** 2
+        rows = [(self.fix_terms(self.ego), fix[c], self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
+        if slip and self.ego not in s["vague"]:
+            slipped = copy.deepcopy(s["belief"])
+            slipped.noise(("x", self.ego), slip)
+            q, less = (self.mahalanobis(b, rows)[0] for b in (s["belief"], slipped))
+            if q > g.fix_gate and less <= g.fix_gate and 4 * less <= q:
+                s["belief"] = slipped
+        q, alarm = self.use_fix(t, self.ego, rows, True)
+        s["hits"]["fix"] = s["hits"]["fix"] + 1 if g.fix_gate and q > g.fix_gate else 0
         return alarm
 
-    def update(self, key: Name, rows: list[Any], gate: float) -> list[float]:
-        """Numbers one after the other, each with its count of hits; terms, z and r of None were not measured."""
-        hits = self.state["hits"].setdefault(key, [0] * len(rows))
-        allowed = [gate if n < self.guards.patience else 0.0 for n in hits]
-        b, found = self.state["belief"], []
-        for c, row in enumerate(rows):
-            if row is None:
-                found.append(math.nan)
-                continue
-            q = b.update(b.row(row[0], c), row[1], row[2], allowed[c])
-            hits[c] = hits[c] + 1 if gate and q > gate else 0
-            found.append(q)
-        return found
+    def mahalanobis(self, b: Belief, rows: list[Any]) -> tuple[float, Floats, Floats, Floats]:
+        """Squared distance and innovations of rows, their covariance without noise, and the noise's variance."""
+        h = np.array([b.row(row[0], c) for c, row in enumerate(rows)])
+        gap, r = np.array([row[1] for row in rows]) - h @ b.x, np.array([row[2] for row in rows])
+        cov = h @ b.p @ h.T
+        return float(gap @ np.linalg.solve(cov + np.diag(r), gap)), gap, cov, r
+
+    def use_fix(self, t: int, j: int, rows: list[Any], again: bool) -> tuple[float, bool]:
+        """Squared Mahalanobis distance, and whether trust is revoked."""
+        s, g, b = self.state, self.guards, self.state["belief"]
+        used = [c for c, row in enumerate(rows) if row is not None]
+        h = np.array([b.row(rows[c][0], c) for c in used])
+        z, r = (np.array([rows[c][i] for c in used]) for i in (1, 2))
+        if not used:
+            return 0.0, False
+        if j in s["vague"] and len(used) == 3:
+            b.updates(h, z, r)
+            s["vague"].discard(j)
+            return 0.0, False
+        if g.trust and again and len(used) == 3 and self.wrong_on_average(j, *self.mahalanobis(b, rows)):
+            if j not in s["trusted"]:
+                self.doubt(j)
+                return self.gone, False
+            self.revoked[j] = [self.revoked.get(j, [0, 0])[0] + 1, t]
+            return self.gone, True
+        if j in self.revoked and t <= self.revoked[j][1]:
+            return float(self.distance(h, z, r)), False
+        return b.updates(h, z, r, g.fix_gate), False
+
+    def distance(self, h: Floats, z: Floats, r: Floats) -> Any:
+        b = self.state["belief"]
+        gap = z - h @ b.x
+        return gap @ np.linalg.solve(h @ b.p @ h.T + np.diag(r), gap)
+
+    def wrong_on_average(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
+        """The clipped mean innovation, beside what another error of the fixes would make of it."""
+        s, g, self.gone = self.state, self.guards, q
+        count, mean = s["mean"].get(j, (0.0, np.zeros(3)))
+        count = min(count + 1, g.window)
+        s["mean"][j] = count, mean
+        if j not in s["trusted"] and q > g.fix_gate:
+            return True
+        mean = mean + (gap * min(1.0, math.sqrt(CLIP / q)) - mean) / count
+        s["mean"][j] = count, mean
+        v = cov + np.diag(r) / count + (1.0 if self.life.own else 0.0) * np.eye(3)
+        odds = math.log((1 - g.share) / g.share) + normal(mean, v) - normal(mean, v + g.tau**2 * np.eye(3))
+        near = mean @ np.linalg.solve(v, mean)
+        enough = near >= 2 * (math.log((1 - g.share) / g.share) + g.revoke)
+        return bool(count >= 3 and enough and odds < -g.revoke)
+
+    def doubt(self, j: int) -> None:
+        s = self.state
+        s["trusted"].discard(j)
+        s["mean"].pop(j, None)
+        s["kept"].pop(j, None)
+        if ("x", j) in s["belief"].names:
+            s["belief"].drop(("b", j))
+            s["belief"].add(("b", j), 0.0, self.guards.tau**2 + self.life.own)
+
+    def start(self, t: int, fix: Floats, messages: dict[int, Any], relative: dict[int, Floats]) -> bool:
+        """The ego at its fix, or where two messages put it that contradict the fix."""
+        s, g, b = self.state, self.guards, self.state["belief"]
+        places = [(fix.copy(), self.r[t, self.ego])]
+        for j, message in messages.items():
+            if message is not None and np.isfinite(relative[j]).all():
+                places.append((message.estimate - to_vector(relative[j]), message.variance + 1))
+        votes = [1]
+        if g.fix_gate:
+            votes = [sum(((x - y) ** 2 / (p + q)).sum() <= g.fix_gate for y, q in places) for x, p in places]
+        best = int(np.argmax(votes))
+        late = (t - self.revoked.get(self.ego, [0, 0])[1]) * self.seen.dt > g.lost
+        if max(votes) < 2 and not late and t > 0 and self.ego not in s["trusted"]:
+            return False
+        b.drop(("b", self.ego))
+        b.transform(("x", self.ego), {})
+        if self.life.own:
+            b.add(("b", self.ego), 0, self.life.own)
+        b.noise(("x", self.ego), FLAT)
+        b.x[b.at(("x", self.ego))] = places[best if votes[0] <= 1 else 0][0]
+        s["joined"][self.ego], s["hits"]["fix"] = t, 0
+        s["trusted"].add(self.ego)
+        s["mean"].pop(self.ego, None)
+        s["vague"].add(self.ego)
+        if votes[0] <= 1 and max(votes) >= 2:
+            fix[:] = np.nan
+            s["vague"].discard(self.ego)
+        if self.ego in self.revoked and self.revoked[self.ego][1] >= t:
+            self.doubt(self.ego)
+        return True
+
+    def lost(self, t: int) -> bool:
+        s = self.state
+        heard = [j for j in s["members"] if j in s["last"]]
+        if any(j in s["trusted"] for j in heard):
+            return False
+        if self.ego in s["trusted"]:
+            return bool(s["hits"]["fix"] >= 2 and t - s["joined"][self.ego] - s["hits"]["fix"] <= 1)
+        patience = 0.0 if len(heard) >= 2 else self.guards.lost
+        return bool((t - self.revoked[self.ego][1]) * self.seen.dt > patience)
+
+    def contradicted(self, t: int, j: int) -> bool:
+        hits, since = self.state["hits"][("relative", j)], t - self.state["joined"][j]
+        most = max(hits)
+        return bool(most >= min(self.guards.patience, max(2, since - most)) or sum(n >= 3 for n in hits) >= 2)
 
     def fix_terms(self, j: int) -> dict[Name, float]:
         names = [("x", j), ("b", j), ("common",)]
         return {name: 1.0 for name in names if name in self.state["belief"].names}
 
-    def predict(self, t: int) -> None:
+    def steady(self, t: int, j: int, u: Floats, q: Floats) -> tuple[Floats, Floats]:
+        """Velocity and variance of a step's motion, or the last ones where no vehicle can have changed that fast."""
+        g, dt, before = self.guards, self.seen.dt, self.state["pace"].get(j)
+        if g.fix_gate and before is not None:
+            last, since, variance, slips = before
+            changed = (g.acceleration * max(t - since, 1) * dt) ** 2
+            if ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum() > 2 * g.fix_gate and slips < 5:
+                self.state["pace"][j] = last, since, variance, slips + 1
+                return last, variance + changed * dt**2
+        self.state["pace"][j] = u, t, q, 0
+        return u, q
+
+    def predict(self, moved: Floats, q: Floats) -> None:
         b, life = self.state["belief"], self.life
-        at = b.at(("x", self.ego))
-        b.x[at] += self.seen.dt * self.seen.velocity[self.run, t, self.ego]
-        b.noise(("x", self.ego), self.q[t, self.ego])
+        b.x[b.at(("x", self.ego))] += moved
+        b.noise(("x", self.ego), q)
         for name in b.names:
+            if name[0] == "b" and name[1] not in self.state["trusted"]:
+                b.noise(name, self.guards.walk**2 * self.seen.dt)
             if name[0] == "b" and life.own:
                 if name[1] in self.state["trusted"]:
                     b.transform(name, {name: life.keep})
@@ -259,43 +400,58 @@ class Oracle:
             b.transform(("common",), {("common",): life.keep})
             b.noise(("common",), life.common * (1 - life.keep**2))
 
-    def late(self, j: int, message: Sent | None, t: int) -> None:
-        """A member whose newest message is not of now gets a velocity."""
-        b, prompt = self.state["belief"], message is not None and message.step == t
-        if self.guards.acceleration and not prompt and ("v", j) not in b.names:
-            b.add(("v", j), 0.0 if message is None else message.velocity, 100.0)
+    def hear(self, j: int, message: Sent | None, t: int) -> None:
+        """A member whose newest message is not of now gets a velocity; that of a new message is used."""
+        s, g, dt = self.state, self.guards, self.seen.dt
+        b, tracked = s["belief"], ("v", j) in s["belief"].names
+        if not g.acceleration or message is None or (message.step == t and not tracked):
+            return
+        if not tracked:
+            b.add(("v", j), 0.0, 400.0)
+        elif s["heard"].get(j) == message.step:
+            return
+        s["heard"][j] = message.step
+        r = message.process / dt**2 + (g.acceleration * (t - message.step) * dt) ** 2
+        b.updates(np.array([b.row({("v", j): 1.0}, c) for c in range(3)]), message.velocity, r, g.fix_gate)
 
-    def predict_member(self, t: int, j: int, message: Sent | None) -> None:
+    def predict_member(self, t: int, j: int, message: Sent | None) -> Sent | None:
+        """The message, its velocity if need be replaced."""
         s, dt = self.state, self.seen.dt
         b = s["belief"]
-        if j not in s["trusted"]:
-            b.noise(("b", j), self.guards.wander**2 * dt)
-        self.late(j, message, t)
+        self.hear(j, message, t)
         if ("v", j) in b.names:
             b.noise(("v", j), (self.guards.acceleration * dt) ** 2)
             b.transform(("x", j), {("x", j): 1.0, ("v", j): dt})
-            return
+            return message
         if message is None:
             s["serves"][j] = -1, 0
             b.noise(("x", j), FLAT)
-            return
+            s["vague"].add(j)
+            return None
+        if message.step == t:
+            u, q = self.steady(t, j, message.velocity, message.process)
+            message = message._replace(velocity=u, process=q)
         before, times = s["serves"][j]
         times = times + 1 if before == message.step else 1
         s["serves"][j] = message.step, times
         b.x[b.at(("x", j))] += dt * message.velocity
         b.noise(("x", j), (2 * times - 1) * (message.process + (dt**2 * (t - message.step)) ** 2))
+        return message
 
     def join(self, t: int, j: int, message: Sent | None, relative: Floats) -> None:
         s = self.state
         b = s["belief"]
         taken = {s["slot"][i] for i in s["members"]} if s["members"] else set()
-        s.setdefault("slot", {})[j] = next(k for k in range(1, 10**6) if k not in taken)
+        s["slot"][j] = next(k for k in range(1, 10**6) if k not in taken)
         s["members"].append(j)
         s["joined"][j], s["hits"][("relative", j)] = t, [0, 0, 0]
         s["serves"][j] = (-1 if message is None else message.step), 1
         near = 1 + (0.0 if np.isnan(relative[0]) else relative[0])
         gap = to_vector(relative) if np.isfinite(relative).all() else np.array([near, near, 0.1 * near])
         b.add(("x", j), b.x[b.at(("x", self.ego))] + gap, FLAT)
+        s["vague"].add(j)
+        s["heard"].pop(j, None)
+        self.hear(j, message, t)
         if j not in s["trusted"]:
             mean, variance = s["kept"].get(j, (np.zeros(3), np.full(3, self.guards.tau**2)))
             b.add(("b", j), mean, variance + self.life.own)
@@ -312,21 +468,32 @@ class Oracle:
             i = b.at(("compass",)).start + 1
             b.x[i], b.p[i], b.p[:, i] = 0.0, 0.0, 0.0
             b.p[i, i] = self.life.heading
-        exact = self.known.exact_relative
+        exact, slip = self.known.exact_relative, (self.guards.slip * self.seen.dt) ** 2
         if exact:
-            kept, hits = copy.deepcopy(b), copy.deepcopy(s["hits"])
-            for j in order:
-                self.relate(j, at, relative[j], False, kept)
-            at = {j: b.x[b.at(("x", j))].copy() for j in (self.ego, *order)}
-            s["belief"], s["hits"] = kept, hits
-            b = kept
+            at, wrong = self.geometry(at, order, relative)
+            if slip and sum(wrong) >= 3 and 2 * sum(wrong) > len(order):
+                b.noise(("x", self.ego), slip)
+                at, _ = self.geometry(self.first, order, relative)
         for j in order:
             self.relate(j, at, relative[j], exact, b)
 
-    def relate(self, j: int, at: dict[int, Floats], relative: Floats, exact: bool, before: Belief) -> None:
-        b, there = self.state["belief"], np.isfinite(relative)
-        if not there.all() and b.p[b.at(("x", j)), b.at(("x", j))][0, 0] >= NOWHERE:
-            return
+    def geometry(
+        self, at: dict[int, Floats], order: list[int], relative: dict[int, Floats]
+    ) -> tuple[dict[int, Floats], list[bool]]:
+        """Positions after a linear update that is forgotten, and whether each measured member is beyond a gate."""
+        s, self.first = self.state, at
+        kept = s["belief"], s["hits"], s["vague"]
+        s["belief"], s["hits"], s["vague"] = copy.deepcopy(kept)
+        found = [self.relate(j, at, relative[j], False, kept[0]) for j in order]
+        b = s["belief"]
+        s["belief"], s["hits"], s["vague"] = kept
+        return {j: b.x[b.at(("x", j))].copy() for j in (self.ego, *order)}, [one for one in found if one is not None]
+
+    def relate(self, j: int, at: dict[int, Floats], relative: Floats, exact: bool, before: Belief) -> bool | None:
+        s, g, there = self.state, self.guards, np.isfinite(relative)
+        b, vague, hits = s["belief"], j in s["vague"], s["hits"][("relative", j)]
+        if not there.all() and vague:
+            return None
         gap, unit = at[j] - at[self.ego], self.known.sensors is None
         expected = np.array(spherical(*gap))
         far, azimuth, inclination = expected
@@ -350,38 +517,37 @@ class Oracle:
             z = rows @ to_vector(np.where(there, relative, expected))
             r = np.ones(3) if unit else (self.std * [1.0, reach * ground / far, reach]) ** 2
             turn = ground
-        listed: list[Any] = []
+        wrong = False
         for c in range(3):
             terms: dict[Name, Any] = {("x", j): rows[c], ("x", self.ego): -rows[c]}
             if c == 1 and ("compass",) in b.names:
                 terms[("compass",)] = np.array([turn, turn, 0.0])
-            listed.append((terms, z[c], r[c]) if there[c] else None)
-        self.update(("relative", j), listed, self.guards.gate)
+            if there[c]:
+                q = b.update(b.row(terms, c), z[c], r[c], 0.0 if vague else g.gate)
+                if not vague:
+                    hits[c] = hits[c] + 1 if g.gate and q > g.gate else 0
+                    wrong = wrong or q > g.gate
+        s["vague"].discard(j)
+        return wrong
 
-    def receive(self, t: int, j: int, message: Sent | None, relative: Floats, at: dict[int, Floats]) -> bool:
+    def receive(self, t: int, j: int, message: Sent | None) -> bool:
         s, g, dt = self.state, self.guards, self.seen.dt
         b = s["belief"]
-        self.late(j, message, t)
         last = s["last"].get(j)
         if message is None or (last and message.step <= last.step) or not np.isfinite(message.estimate).all():
             return False
-        age, x = t - message.step, b.at(("x", j))
-        if b.p[x, x][0, 0] >= NOWHERE and (not np.isfinite(relative).all() or s["joined"][j] < t):
-            b.x[x] = at[j] = message.estimate + age * dt * message.velocity
+        age = t - message.step
         tracked, before = ("v", j) in b.names, self.robust and last is not None
         clone, late = before and ("c", j) in b.names, 0.0
         if tracked:
             late = (0.5 * g.acceleration * (age * dt) ** 2) ** 2
-            r = message.process / dt**2 + (g.acceleration * age * dt) ** 2
-            for c in range(3):
-                b.update(b.row({("v", j): 1.0}, c), message.velocity[c], r[c])
         steps = message.step - last.step if before else 0
         moved = message.odometer - last.odometer if before else np.zeros(3)
         spent = 0.5 * steps * (message.process + last.process) if before else np.zeros(3)
         back = {("v", j): -age * dt} if tracked else {}
         if clone:
-            for c in range(3):
-                b.update(b.row({("x", j): 1.0, **back, ("c", j): -1.0}, c), moved[c], spent[c] + late)
+            h = np.array([b.row({("x", j): 1.0, **back, ("c", j): -1.0}, c) for c in range(3)])
+            b.updates(h, moved, spent + late, g.fix_gate)
         rows: list[Any] = []
         for c in range(3):
             m, r, middle, terms = message.estimate[c], message.variance[c], 1.0, dict(self.fix_terms(j)) | back
@@ -405,14 +571,7 @@ class Oracle:
                 m += age * dt * message.velocity[c]
                 r += age**2 * (message.process[c] + (dt**2 * age) ** 2)
             rows.append((terms, m, r + late))
-        alarm = bool(before and g.trust and j in s["trusted"] and self.suspicious(j, rows))
-        if alarm:
-            self.betrayed[j] = [self.betrayed.get(j, [0, 0])[0] + 1, t]
-        if j in self.betrayed and t <= self.betrayed[j][1]:
-            rows = [None] * 3
-        for c, row in enumerate(rows):
-            if row is not None:
-                b.update(b.row(row[0], c), row[1], row[2], g.fix_gate if before or not self.robust else 0.0)
+        alarm = self.use_fix(t, j, rows, before)[1]
         s["last"][j] = message
         if tracked:
             b.drop(("c", j))
@@ -421,50 +580,23 @@ class Oracle:
             b.noise(("c", j), late + 1e-12)
         return alarm
 
-    def suspicious(self, j: int, rows: list[Any]) -> bool:
-        """The clipped mean innovation of a trusted member, beside what an error of its fixes would make of it."""
-        s, g = self.state, self.guards
-        b, (count, mean) = s["belief"], s["mean"].get(j, (0.0, np.zeros(3)))
-        count, odds = min(count + 1, g.window), math.log((1 - g.share) / g.share)
-        for c, row in enumerate(rows):
-            if row is None:
-                continue
-            gap, p = row[1] - b.row(row[0], c) @ b.x, b.p[b.at(("x", j)), b.at(("x", j))][c, c]
-            far = 3 * math.sqrt(p + row[2])
-            mean[c] += (np.clip(gap, -far, far) - mean[c]) / count
-            v = p + row[2] / count + (1.0 if self.life.own else 0.0)
-            odds += normal(mean[c], v) - normal(mean[c], v + g.tau**2)
-        s["mean"][j] = count, mean
-        return odds < -g.revoke and count >= 3
-
-    def distrust(self, t: int) -> None:
-        s = self.state
-        for j, (_, until) in self.betrayed.items():
-            if until >= t and j in s["trusted"]:
-                s["trusted"].remove(j)
-                s["mean"].pop(j, None)
-                s["kept"].pop(j, None)
-                if j in s["members"]:
-                    s["belief"].drop(("b", j))
-                    s["belief"].add(("b", j), 0.0, self.guards.tau**2 + self.life.own)
-
-    def trust(self, dt: float) -> None:
+    def trust(self) -> None:
         """The surest member first: p(b = 0 | all) / p(b = 0) by Bayes' rule, of Gaussians."""
         s, g, own = self.state, self.guards, self.life.own
         b, wide = s["belief"], g.tau**2 + own
         narrow = 1 / (1 / own - 1 / wide) if own else 1e-6
         while True:
             odds = {}
-            for j in s["members"]:
-                if j in s["trusted"] or j not in s["last"]:
+            for j in (self.ego, *s["members"]):
+                if j in s["trusted"] or (j not in s["last"] and j != self.ego):
                     continue
-                odds[j] = math.log((1 - g.share) / g.share) - g.grudge * self.betrayed.get(j, [0, 0])[0]
                 at = b.at(("b", j))
-                for x, p in zip(b.x[at], np.diag(b.p)[at], strict=True):
-                    if own:
-                        odds[j] += normal(x, narrow + p) + 0.5 * math.log(2 * math.pi * wide / own * narrow)
-                    else:
-                        odds[j] += normal(x, p) - normal(0.0, wide)
+                x, p = b.x[at], b.p[at, at]
+                odds[j] = math.log((1 - g.share) / g.share) - g.penalty * self.revoked.get(j, [0, 0])[0]
+                if own:
+                    odds[j] += normal(x, narrow * np.eye(3) + p) + 1.5 * math.log(2 * math.pi * wide / own * narrow)
+                else:
+                    odds[j] += normal(x, p) - normal(0 * x, g.tau**2 * np.eye(3))
             best = max(odds, key=lambda j: (odds[j], -s["slot"][j]), default=-1)
             if best < 0 or odds[best] <= g.sure:
                 return
@@ -476,9 +608,9 @@ class Oracle:
                 b.drop(("b", best))
 
 
-def normal(x: float, variance: float) -> float:
-    """Logarithm of the density of N(0, variance)."""
-    return -0.5 * (math.log(2 * math.pi * variance) + x * x / variance)
+def normal(x: Floats, cov: Floats) -> float:
+    """Logarithm of the density of N(0, cov)."""
+    return float(-0.5 * (np.linalg.slogdet(2 * math.pi * cov)[1] + x @ np.linalg.solve(cov, x)))
 
 
 def between(

@@ -15,37 +15,40 @@ from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, part
 from ..dead_reckoning import dead_reckon
 from ..motion import MotionNoise, process_variance
-from .cooperative_messages import distrust, fix_terms, receive, trust
+from .cooperative_messages import fix_terms, receive, trust, use_fix
 from .cooperative_state import (
     AGE,
     DT,
-    ESTIMATE,
     FIX,
     FIX_VARIANCE,
-    KNOWN,
-    MOVED,
+    MOTION,
+    MOTION_VARIANCE,
     ODOMETER,
     OWN,
-    PROCESS,
+    SOLO,
+    SOLO_VARIANCE,
     SPEED,
     STEP,
     TRUSTED,
     TYPICAL,
-    VARIANCE,
     WIDTH,
     Filter,
     Guards,
     Model,
     begin,
     copy_filter,
+    distrust,
     join,
     leave,
     measured_whole,
     new_filter,
+    pause,
+    place,
     predict,
     predict_member,
+    steady,
 )
-from .gaussian import ABSENT, COMPASS, POSITION, Gaussian, Rows, has, update
+from .gaussian import ABSENT, COMPASS, KINDS, PLACE, Gaussian, Rows, expect, has, innovate, settle, update, widen
 from .messages import Assumptions, Measurements
 from .relative import Five, angle
 
@@ -58,8 +61,8 @@ def run_filter(
     ego's fix (R, T), and by link (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the
     neighbour is trusted.
 
-    A vehicle that loses trust may have misled the filter for a while. The filter goes back to what it knew `memory` to
-    twice as many steps ago, and comes here again without that vehicle's fixes.
+    Fixes of a vehicle that loses trust may have misled the filter for a while: it takes the last `memory` to twice as
+    many steps again, without them. A vehicle that is absent (a velocity of NaN) starts anew.
 
     Args:
         seen: measurements and messages of the ego.
@@ -84,12 +87,19 @@ def run_filter(
             for i in range(count):
                 who[i] = seen.neighbour[first + i]
                 gather_neighbour(rows, seen, assumed, moved, run, t, first + i, i)
-            if t == 0 and f.step[0] == 0 and f.g.vectors[0] == 0:
-                begin(f, known, guards, own, seen.ego)
+            if math.isnan(own[MOTION]) or (f.g.vectors[0] == 0 and math.isnan(own[FIX])):
+                pause(f, own[DT])
+                copy_filter(f, older)
+                copy_filter(f, newer)
+                x[run, t], cov[run, t] = math.nan, math.nan
+                newest, t = t + 1, t + 1
+                continue
             if memory > 0 and t % memory == 0:
                 if t == newest:
                     copy_filter(newer if t > 0 else f, older)
                 copy_filter(f, newer)
+            if f.g.vectors[0] == 0:
+                begin(f, known, guards, own, rows, count, seen.ego)
             step(f, known, guards, own, rows, who, count)
             if f.alarm[0] > 0 and memory > 0:
                 f.alarm[0] = 0
@@ -127,7 +137,7 @@ def write(
             cov[run, t, c, d] = f.g.p[c, d]
     for i in range(count):
         k = f.slot[who[i]]
-        b = 3 * f.g.block[k, POSITION]
+        b = 3 * f.g.block[k, PLACE]
         for c in range(3):
             neighbours[run, first + i, c] = f.g.x[b + c]
         for c in range(4):
@@ -148,7 +158,7 @@ def stream_row(given: Floats, history: Floats, motion: MotionNoise, fix: Floats,
         own: (OWN,) out.
     """
     since, late = np.zeros(3), np.zeros(3)
-    outcome = dead_reckon(given, history, motion, own[MOVED:PROCESS], own[PROCESS:DT], since, late)
+    outcome = dead_reckon(given, history, motion, own[MOTION:MOTION_VARIANCE], own[MOTION_VARIANCE:DT], since, late)
     own[DT] = given[6]
     for c in range(3):
         own[FIX + c], own[FIX_VARIANCE + c] = given[c] + since[c], fix[c] + late[c]
@@ -182,11 +192,11 @@ def stream_step(
         answer: (12 + 3 k,) out: position m, covariance m^2, positions of the neighbours m.
     """
     if f.g.vectors[0] == 0:
-        begin(f, known, guards, own, 0)
+        begin(f, known, guards, own, rows, len(vehicles), 0)
         if math.isfinite(start[0]):
-            f.step[0] = 1
+            f.step[0], f.vague[0] = 1, 0.0
             for c in range(3):
-                f.g.x[c], f.g.p[c, c] = start[c], 0.0
+                f.g.x[c] = start[c]
     f.alarm[0] = 0
     step(f, known, guards, own, rows, vehicles, len(vehicles))
     for c in range(3):
@@ -194,7 +204,7 @@ def stream_step(
         for d in range(3):
             answer[3 + 3 * c + d] = f.g.p[c, d]
         for i in range(len(vehicles)):
-            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[f.slot[vehicles[i]], POSITION] + c]
+            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[f.slot[vehicles[i]], PLACE] + c]
     return int(f.alarm[0])
 
 
@@ -206,13 +216,13 @@ def make_filter(slots: int, vehicles: int) -> Filter:
 
 @compiled
 def keep(source: Filter, target: Filter) -> None:
-    """Copy what is known."""
+    """Copy the state."""
     copy_filter(source, target)
 
 
 @compiled
 def restore(source: Filter, target: Filter, known: Model, guards: Guards) -> None:
-    """Go back to what was known, without those who have lost trust since."""
+    """Go back to a state, with trust revoked in those who have lost it since."""
     copy_filter(source, target)
     distrust(target, known, guards)
 
@@ -226,8 +236,8 @@ def gather_own(own: Floats, seen: Measurements, assumed: Assumptions, white: Flo
     for c in range(3):
         own[FIX + c] = seen.gnss[run, t, seen.ego, c]
         own[FIX_VARIANCE + c] = number(assumed.fixes, run, t, seen.ego, c) * white[c]
-        own[MOVED + c] = seen.dt * u[c]
-        own[PROCESS + c] = q[c] + number(assumed.process, run, t, seen.ego, c)
+        own[MOTION + c] = seen.dt * u[c]
+        own[MOTION_VARIANCE + c] = q[c] + number(assumed.process, run, t, seen.ego, c)
 
 
 @part
@@ -251,8 +261,8 @@ def gather_neighbour(
     u = seen.velocity[run, sent, j]
     q = process_variance(assumed.motion, u, seen.dt)
     for c in range(3):
-        rows[i, ESTIMATE + c] = seen.broadcast[run, sent, j, c]
-        rows[i, VARIANCE + c] = number(assumed.broadcast, run, sent, j, c)
+        rows[i, SOLO + c] = seen.broadcast[run, sent, j, c]
+        rows[i, SOLO_VARIANCE + c] = number(assumed.broadcast, run, sent, j, c)
         rows[i, ODOMETER + c] = moved[run, sent, j, c]
         rows[i, SPEED + c] = u[c]
         rows[i, TYPICAL + c] = number(assumed.fixes, run, sent, j, c)
@@ -279,94 +289,119 @@ def step(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, veh
         vehicles: (count,) which they are.
         count: of them.
     """
-    leave(f, vehicles, count)
+    leave(f, known, guards, own, rows, vehicles, count)
     f.clock[1] = own[DT]
     if f.step[0] > 0:
         f.clock[0] += own[DT]
-        predict(f, known, own)
+    if guards.fix_gate > 0.0:
+        steady(f, guards, f.vehicle[0], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
+    if f.step[0] > f.joined[0]:
+        predict(f, known, guards, own)
     for k in range(1, len(f.vehicle)):
         if f.vehicle[k] >= 0:
             predict_member(f, known, guards, rows, k)
     for i in range(count):
         if f.slot[vehicles[i]] < 0:
-            join(f, known, rows, vehicles[i], i)
+            join(f, known, guards, rows, vehicles[i], i)
     for k in range(len(f.vehicle)):
         if f.vehicle[k] >= 0:
-            first = 3 * f.g.block[k, POSITION]
+            first = 3 * f.g.block[k, PLACE]
+            if k > 0:
+                place(f, rows, k)
             for c in range(3):
                 f.at[k, c] = f.g.x[first + c]
                 f.q[k, c] = math.nan
             f.q[k, 3] = math.nan
-    add_fix(f, guards, own)
+    members = nearest_first(f)
+    add_fix(f, known, guards, own)
     if known.estimates > 0.0:
-        measure(f, known, guards, rows)
-    for k in range(1, len(f.vehicle)):
-        if f.vehicle[k] >= 0:
-            receive(f, known, guards, rows, k)
+        measure(f, known, guards, rows, members)
+    for i in range(members):
+        receive(f, known, guards, rows, f.order[i])
     if known.estimates == 0.0:
-        measure(f, known, guards, rows)
+        measure(f, known, guards, rows, members)
     if guards.trust > 0.0:
         trust(f, known, guards)
     f.step[0] += 1
 
 
 @part
-def add_fix(f: Filter, guards: Guards, own: Floats) -> None:
-    """The ego's fix: its position, the error of its receiver, and the one that all share."""
-    g, h = f.g, f.h
+def nearest_first(f: Filter) -> int:
+    """Sort the members by their distance; how many there are."""
+    members = 0
+    for k in range(1, len(f.vehicle)):
+        if f.vehicle[k] >= 0:
+            i = members
+            while i > 0 and gap2(f, f.order[i - 1]) > gap2(f, k):
+                f.order[i] = f.order[i - 1]
+                i -= 1
+            f.order[i] = k
+            members += 1
+    return members
+
+
+@part
+def gap2(f: Filter, k: int) -> float:
+    """Squared distance of a member, m^2."""
+    total = 0.0
+    for c in range(3):
+        total += (f.at[k, c] - f.at[0, c]) ** 2
+    return total
+
+
+@part
+def add_fix(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
+    """The ego's fix: its position, the error of its receiver, and the one that all share.
+
+    An innovation beyond the gate that an odometer's slip explains is one: it is far smaller beside the slip's variance.
+    """
+    g, h, slip = f.g, f.h, (guards.slip * own[DT]) ** 2
     if math.isnan(own[FIX]):
         return
     fix_terms(f, 0)
     for c in range(3):
-        h.z[c], h.variance[c], h.used[c] = own[FIX + c], own[FIX_VARIANCE + c], True
-        h.gated[c] = f.hits[0, c] < guards.patience
-    update(g.x, g.p, 3 * g.vectors[0], h, guards.fix_gate)
-    f.q[0, 3] = max(h.q[0], h.q[1], h.q[2])
-    for c in range(3):
-        f.hits[0, c] = f.hits[0, c] + 1 if guards.fix_gate > 0.0 and h.q[c] > guards.fix_gate else 0
+        expect(h, c, own[FIX + c], own[FIX_VARIANCE + c])
+    if f.vague[0] == 0.0 and slip > 0.0:
+        q, first = innovate(g, h), 3 * g.block[0, PLACE]
+        if q > guards.fix_gate:
+            widen(g, first, slip)
+            slipped = innovate(g, h)
+            if slipped > guards.fix_gate or 4.0 * slipped > q:
+                widen(g, first, -slip)
+    f.q[0, 3] = q = use_fix(f, known, guards, 0, True)
+    f.hits[0, 0] = f.hits[0, 0] + 1 if guards.fix_gate > 0.0 and q > guards.fix_gate else 0
 
 
 @part
-def measure(f: Filter, known: Model, guards: Guards, rows: Floats) -> None:
-    """The relative measurements: linear at the prediction, for positions and compass alone; then at that solution."""
-    g, work, n = f.g, f.work, 0
-    for k in range(len(f.vehicle)):
-        if f.vehicle[k] >= 0:
-            f.work.block[k, POSITION] = n
-            f.work.owner[n] = g.block[k, POSITION]
-            n += 1
-    if n < 2:
-        return
-    compass = ABSENT
+def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> None:
+    """The relative measurements: linear at the prediction, for positions and compass alone; then at that solution.
+
+    Where they contradict the prediction of most members, it is the ego whose odometer has slipped.
+    """
+    g = f.g
     if has(g, 0, COMPASS):
-        compass = n
-        work.owner[n] = g.block[0, COMPASS]
         i = 3 * g.block[0, COMPASS] + 1
         for j in range(3 * g.vectors[0]):  # the compass's noise is new at every step
             g.p[i, j] = 0.0
             g.p[j, i] = 0.0
         g.x[i], g.p[i, i] = 0.0, known.heading
-        n += 1
     if known.exact > 0.0:
-        for a in range(n):
-            for b in range(n):
-                for c in range(3):
-                    for d in range(3):
-                        work.p[3 * a + c, 3 * b + d] = g.p[3 * work.owner[a] + c, 3 * work.owner[b] + d]
-            for c in range(3):
-                work.x[3 * a + c] = g.x[3 * work.owner[a] + c]
-        for k in range(1, len(f.vehicle)):
-            if f.vehicle[k] >= 0 and relate(f, known, guards, rows, k, 0, work, compass):
-                update(work.x, work.p, 3 * n, f.h, guards.gate)
+        wrong = predicted_geometry(f, known, guards, rows, members)
+        if guards.slip > 0.0 and wrong >= 3 and 2 * wrong > members:
+            widen(g, 3 * g.block[0, PLACE], (guards.slip * f.clock[1]) ** 2)
+            predicted_geometry(f, known, guards, rows, members)
         for k in range(len(f.vehicle)):
             if f.vehicle[k] >= 0:
                 for c in range(3):
-                    f.at[k, c] = work.x[3 * work.block[k, POSITION] + c]
-    for k in range(1, len(f.vehicle)):
-        if f.vehicle[k] >= 0 and relate(
-            f, known, guards, rows, k, 1 if known.exact > 0.0 else 0, g, g.block[0, COMPASS]
-        ):
-            update(g.x, g.p, 3 * g.vectors[0], f.h, guards.gate)
+                    f.at[k, c] = f.work.x[3 * f.work.block[k, PLACE] + c]
+    for m in range(members):
+        k = f.order[m]
+        if relate(f, known, guards, rows, k, 1 if known.exact > 0.0 else 0, g):
+            if f.vague[k] > 0.0:
+                settle(g, f.h, k, f.vague[k])
+                f.vague[k] = f.q[k, 0] = f.q[k, 1] = f.q[k, 2] = 0.0
+                continue
+            update(g, f.h, 0.0)
             for c in range(3):
                 if f.h.used[c]:
                     f.q[k, c] = f.h.q[c]
@@ -374,21 +409,51 @@ def measure(f: Filter, known: Model, guards: Guards, rows: Floats) -> None:
 
 
 @part
-def relate(
-    f: Filter, known: Model, guards: Guards, rows: Floats, k: int, exact: int, g: Gaussian, compass: int
-) -> bool:
+def predicted_geometry(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> int:
+    """Update positions and compass alone, in `work`; how many members are beyond a gate."""
+    g, work, n, wrong = f.g, f.work, 0, 0
+    for k in range(len(f.vehicle)):
+        for kind in range(KINDS):
+            if f.vehicle[k] >= 0 and (kind == PLACE or (kind == COMPASS and k == 0)) and has(g, k, kind):
+                work.block[k, kind], work.owner[n] = n, k * KINDS + kind
+                n += 1
+            else:
+                work.block[k, kind] = ABSENT
+    work.vectors[0] = n
+    for a in range(n):
+        i = 3 * g.block[work.owner[a] // KINDS, work.owner[a] % KINDS]
+        for c in range(3):
+            work.x[3 * a + c] = g.x[i + c]
+        for b in range(n):
+            j = 3 * g.block[work.owner[b] // KINDS, work.owner[b] % KINDS]
+            for c in range(3):
+                for d in range(3):
+                    work.p[3 * a + c, 3 * b + d] = g.p[i + c, j + d]
+    for m in range(members):
+        k = f.order[m]
+        if relate(f, known, guards, rows, k, 0, work):
+            if f.vague[k] > 0.0:
+                settle(work, f.h, k, f.vague[k])
+                continue
+            update(work, f.h, 0.0)
+            wrong += f.h.q[0] > guards.gate or f.h.q[1] > guards.gate or f.h.q[2] > guards.gate
+    return wrong
+
+
+@part
+def relate(f: Filter, known: Model, guards: Guards, rows: Floats, k: int, exact: int, g: Gaussian) -> bool:
     """Rows of the measurement of member k; False if its geometry is not known."""
-    row, first = f.row[k], 3 * f.g.block[k, POSITION]
-    if not measured_whole(rows, row) and f.g.p[first, first] >= KNOWN:
+    row, compass = f.row[k], g.block[0, COMPASS]
+    if not measured_whole(rows, row) and f.vague[k] > 0.0:
         return False
     for c in range(3):
-        f.h.gated[c] = f.hits[k, c] < guards.patience
+        f.h.gate[c] = guards.gate
     x, y, z = f.at[k, 0] - f.at[0, 0], f.at[k, 1] - f.at[0, 1], f.at[k, 2] - f.at[0, 2]
     seen = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
     relative_rows(f.h, x, y, z, seen, known.std, known.min_range, exact)
     for c in range(3):
         for i in range(3):
-            f.h.column[c, i], f.h.column[c, 3 + i] = 3 * g.block[k, POSITION] + i, 3 * g.block[0, POSITION] + i
+            f.h.column[c, i], f.h.column[c, 3 + i] = 3 * g.block[k, PLACE] + i, 3 * g.block[0, PLACE] + i
         f.h.column[c, 6], f.h.column[c, 7] = 3 * compass, 3 * compass + 1
     f.h.terms[0] = 8 if compass >= 0 else 6
     return True

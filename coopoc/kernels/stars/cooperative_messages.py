@@ -1,4 +1,4 @@
-"""Messages of the members of a star: the fixes behind two estimates, odometers, and whose fixes are believed."""
+"""Fixes of a star's vehicles: those behind two solo estimates, odometers, and which receivers are trusted."""
 
 from __future__ import annotations
 
@@ -6,31 +6,46 @@ import math
 
 from ...arrays import Floats
 from ..compiling.compile import part
-from ..dead_reckoning import ROUNDING
 from .cooperative_state import (
     AGE,
     COUNT,
-    ESTIMATE,
-    KEPT,
-    KEPT_VARIANCE,
-    KNOWN,
     LAST,
     MEAN,
     ODOMETER,
-    SENT,
+    SOLO,
+    SOLO_VARIANCE,
     SPEED,
     STEP,
     TRUSTED,
     TYPICAL,
-    VARIANCE,
+    USED,
     Filter,
     Guards,
     Model,
-    follow,
-    late,
-    measured_whole,
+    doubt,
+    unused,
 )
-from .gaussian import ABSENT, CLONE, COMMON, ERROR, POSITION, VELOCITY, has, insert, remove, shift, term, update, widen
+from .gaussian import (
+    ABSENT,
+    CLONE,
+    COMMON,
+    ERROR,
+    PLACE,
+    VELOCITY,
+    correct,
+    distance,
+    expect,
+    has,
+    innovate,
+    insert,
+    remove,
+    settle,
+    shift,
+    term,
+    update,
+    weight,
+    widen,
+)
 
 JITTER = 1e-12
 """m^2 that keeps a clone from being the very number it was cloned of."""
@@ -38,13 +53,15 @@ NOTHING_NEW = 1e-9
 """Least weight of new fixes in an estimate."""
 PARTS = 50
 """Most parts of the way between two messages that are looked at one by one."""
+CLIP = 12.0
+"""Largest squared Mahalanobis distance of an innovation in a mean."""
 
 
 @part
 def fix_terms(f: Filter, k: int) -> None:
     """Position of member k, error of its fixes, and the one that all share."""
     g, n = f.g, 1
-    term(f.h, 0, 3 * g.block[k, POSITION], 1.0)
+    term(f.h, 0, 3 * g.block[k, PLACE], 1.0)
     if has(g, k, ERROR):
         term(f.h, n, 3 * g.block[k, ERROR], 1.0)
         n += 1
@@ -55,36 +72,24 @@ def fix_terms(f: Filter, k: int) -> None:
 @part
 def receive(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> None:
     """Use the newest message of member k, if it has not been used."""
-    g, h, j, row = f.g, f.h, f.vehicle[k], f.row[k]
+    g, j, row = f.g, f.vehicle[k], f.row[k]
     age = rows[row, AGE]
     sent = f.clock[0] - age
-    if guards.acceleration > 0.0 and late(age) and not has(g, k, VELOCITY):
-        follow(f, rows, k)
-    if age < 0.0 or sent <= f.status[j, SENT] + ROUNDING or not math.isfinite(rows[row, ESTIMATE]):
+    if not unused(f, rows, k):
         return
-    first, incomplete = 3 * g.block[k, POSITION], not measured_whole(rows, row)
-    if g.p[first, first] >= KNOWN and (incomplete or f.joined[k] < f.step[0]):
-        for c in range(3):  # nothing was known of where it is
-            g.x[first + c] = f.at[k, c] = rows[row, ESTIMATE + c] + age * rows[row, SPEED + c]
     velocity, back, changed = has(g, k, VELOCITY), -age, 0.0
-    before = known.estimates > 0.0 and f.status[j, SENT] > -math.inf
+    before = known.estimates > 0.0 and f.status[j, USED] > -math.inf
     clone = before and has(g, k, CLONE)
     if velocity:
         changed = (0.5 * guards.acceleration * back * back) ** 2
-        use_velocity(f, known, guards, rows, k)
         if clone:
-            use_odometer(f, rows, k, back, changed)
-    content(f, known, rows, k, changed, clone, before)
-    if before and guards.trust > 0.0 and f.status[j, TRUSTED] > 0.0 and betrayed(f, known, guards, k):
-        f.betrayals[j, 0], f.betrayals[j, 1], f.alarm[0] = f.betrayals[j, 0] + 1.0, f.clock[0], 1
-    if f.betrayals[j, 0] > 0.0 and f.clock[0] <= f.betrayals[j, 1]:
-        h.used[0] = h.used[1] = h.used[2] = False
-    update(g.x, g.p, 3 * g.vectors[0], h, guards.fix_gate)
-    f.q[k, 3] = max(h.q[0], h.q[1], h.q[2])
-    f.status[j, SENT] = sent
+            use_odometer(f, guards, rows, k, back, changed)
+    believed = content(f, known, rows, k, changed, clone, before)
+    f.q[k, 3] = use_fix(f, known, guards, k, before and believed)
+    f.status[j, USED] = sent
     for c in range(3):
-        f.status[j, LAST + c] = rows[row, ESTIMATE + c]
-        f.status[j, LAST + 3 + c] = rows[row, VARIANCE + c]
+        f.status[j, LAST + c] = rows[row, SOLO + c]
+        f.status[j, LAST + 3 + c] = rows[row, SOLO_VARIANCE + c]
         f.status[j, LAST + 6 + c] = rows[row, ODOMETER + c]
         f.status[j, LAST + 9 + c] = rows[row, STEP + c]
     if velocity:
@@ -92,12 +97,44 @@ def receive(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> No
 
 
 @part
-def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone: bool, before: bool) -> None:
+def use_fix(f: Filter, known: Model, guards: Guards, k: int, again: bool) -> float:
+    """Update by the rows of a vehicle's fix, unless its receiver errs otherwise than is assumed; squared Mahalanobis
+    distance.
+
+    Args:
+        f: filter.
+        known: noise model.
+        guards: against what may be wrong.
+        k: slot.
+        again: whether it is not the vehicle's first one, and one that the vehicle believes.
+    """
+    g, h, j, used = f.g, f.h, f.vehicle[k], 0
+    for c in range(3):
+        used += h.used[c]
+    if f.vague[k] > 0.0 and used == 3:
+        settle(g, h, k, f.vague[k])
+        f.vague[k] = 0.0
+        return 0.0
+    q = innovate(g, h)
+    if guards.trust > 0.0 and again and used == 3 and q > 0.0 and wrong_on_average(f, known, guards, k, q):
+        if f.status[j, TRUSTED] > 0.0:
+            f.revoked[j, 0], f.revoked[j, 1], f.alarm[0] = f.revoked[j, 0] + 1.0, f.clock[0], 1
+        else:
+            doubt(f, known, guards, j)
+        return q
+    if f.revoked[j, 0] == 0.0 or f.clock[0] > f.revoked[j, 1]:
+        correct(g, h, weight(q, guards.fix_gate))
+    return q
+
+
+@part
+def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone: bool, before: bool) -> bool:
     """Rows of what the message of member k says of its position when it was sent.
 
     The odometer's error of the fixes since the last message is `middle` times that of the whole way, so that they are
-    seen as middle y + (1 - middle) c, y the position now and c its clone.
+    seen as middle y + (1 - middle) c, y the position now and c its clone. True unless the sender disbelieved them.
     """
+    believed = True
     g, h, j, row = f.g, f.h, f.vehicle[k], f.row[k]
     velocity, age, steps = has(g, k, VELOCITY), rows[row, AGE], steps_between(f, rows, k)
     back, old, terms = -age, age / f.clock[1], 1 + (1 if has(g, k, ERROR) else 0) + (1 if has(g, 0, COMMON) else 0)
@@ -107,14 +144,14 @@ def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone
     if clone:
         term(h, terms + 1, 3 * g.block[k, CLONE], 0.0)
     for c in range(3):
-        one, h.used[c], h.gated[c] = rows[row, STEP + c], True, before or known.estimates == 0.0
-        m, r = rows[row, ESTIMATE + c], rows[row, VARIANCE + c]
+        one, used = rows[row, STEP + c], True
+        m, r = rows[row, SOLO + c], rows[row, SOLO_VARIANCE + c]
         if before:
             moved = rows[row, ODOMETER + c] - f.status[j, LAST + 6 + c]
             spent = one + 0.5 * (steps - 1.0) * (one + f.status[j, LAST + 9 + c])
             carried, p0 = f.status[j, LAST + c] + moved, f.status[j, LAST + 3 + c]
             m, r, walk, middle = fixes_between(m, r, carried, p0, spent, steps, rows[row, TYPICAL + c])
-            h.used[c] = r > 0.0
+            used, believed = r > 0.0, believed and r < 4.0 * rows[row, TYPICAL + c]
             r = r * known.white[c] + walk
             if clone:
                 m += (middle - 1.0) * moved
@@ -125,13 +162,15 @@ def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone
         if not velocity:
             m += age * rows[row, SPEED + c]
             r += old * old * (one + (f.clock[1] * age * known.acceleration) ** 2)
-        h.z[c], h.variance[c] = m, r + changed
+        expect(h, c, m, r + changed)
+        h.used[c] = used
+    return believed
 
 
 @part
 def steps_between(f: Filter, rows: Floats, k: int) -> float:
     """Steps between the last two messages of member k."""
-    since = f.clock[0] - rows[f.row[k], AGE] - f.status[f.vehicle[k], SENT]
+    since = f.clock[0] - rows[f.row[k], AGE] - f.status[f.vehicle[k], USED]
     return float(max(1.0, math.floor(since / f.clock[1] + 0.5)))
 
 
@@ -181,29 +220,17 @@ def fixes_between(
 
 
 @part
-def use_velocity(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> None:
-    """The velocity of the newest message of member k."""
-    g, h, row = f.g, f.h, f.row[k]
-    term(h, 0, 3 * g.block[k, VELOCITY], 1.0)
-    for c in range(3):
-        h.z[c], h.used[c], h.gated[c] = rows[row, SPEED + c], True, False
-        changed = guards.acceleration * rows[row, AGE]
-        h.variance[c] = rows[row, STEP + c] / f.clock[1] ** 2 + changed * changed
-    update(g.x, g.p, 3 * g.vectors[0], h, 0.0)
-
-
-@part
-def use_odometer(f: Filter, rows: Floats, k: int, back: float, changed: float) -> None:
+def use_odometer(f: Filter, guards: Guards, rows: Floats, k: int, back: float, changed: float) -> None:
     """How far member k has moved between its last two messages."""
     g, h, j, row = f.g, f.h, f.vehicle[k], f.row[k]
     steps = steps_between(f, rows, k)
-    term(h, 0, 3 * g.block[k, POSITION], 1.0)
+    term(h, 0, 3 * g.block[k, PLACE], 1.0)
     term(h, 1, 3 * g.block[k, VELOCITY], back)
     term(h, 2, 3 * g.block[k, CLONE], -1.0)
     for c in range(3):
-        h.z[c], h.used[c], h.gated[c] = rows[row, ODOMETER + c] - f.status[j, LAST + 6 + c], True, False
-        h.variance[c] = 0.5 * steps * (rows[row, STEP + c] + f.status[j, LAST + 9 + c]) + changed
-    update(g.x, g.p, 3 * g.vectors[0], h, 0.0)
+        spent = 0.5 * steps * (rows[row, STEP + c] + f.status[j, LAST + 9 + c])
+        expect(h, c, rows[row, ODOMETER + c] - f.status[j, LAST + 6 + c], spent + changed)
+    update(g, h, guards.fix_gate)
 
 
 @part
@@ -211,72 +238,64 @@ def clone_position(f: Filter, k: int, back: float, changed: float) -> None:
     """Remember, in the state, where member k was when it sent its newest message."""
     g = f.g
     remove(g, k, CLONE)
-    clone, first, v = insert(g, k, CLONE, 0.0), 3 * g.block[k, POSITION], 3 * g.block[k, VELOCITY]
+    clone, first, v = insert(g, k, CLONE, 0.0), 3 * g.block[k, PLACE], 3 * g.block[k, VELOCITY]
     shift(g, clone, first, 1.0)
     shift(g, clone, v, back)
     widen(g, clone, changed + JITTER)
 
 
 @part
-def betrayed(f: Filter, known: Model, guards: Guards, k: int) -> bool:
-    """Whether the mean innovation of a trusted member, each clipped, says that its fixes have an error."""
-    g, h, status = f.g, f.h, f.status
-    j, first = f.vehicle[k], 3 * g.block[k, POSITION]
+def wrong_on_average(f: Filter, known: Model, guards: Guards, k: int, q: float) -> bool:
+    """Whether the mean of a vehicle's innovations, each clipped, is likelier with another error of its fixes than is
+    assumed; or, where that error is being estimated, whether the last one says so."""
+    g, h, status, j = f.g, f.h, f.status, f.vehicle[k]
+    mean, s = status[j, MEAN : MEAN + 3], h.square[0]
     status[j, COUNT] = count = min(status[j, COUNT] + 1.0, guards.window)
-    odds = math.log((1.0 - guards.share) / guards.share)
+    if status[j, TRUSTED] == 0.0 and q > guards.fix_gate:
+        return True
+    clip = min(1.0, math.sqrt(CLIP / q))
     for c in range(3):
-        if not h.used[c]:
-            continue
-        gap, mean, p = h.z[c], MEAN + c, g.p[first + c, first + c]
-        for i in range(h.terms[0]):
-            gap -= h.weight[c, i] * g.x[h.column[c, i]]
-        far = 3.0 * math.sqrt(p + h.variance[c])
-        status[j, mean] += (min(max(gap, -far), far) - status[j, mean]) / count
-        v = p + h.variance[c] / count + (1.0 if known.own > 0.0 else 0.0)
-        odds += log_odds(status[j, mean], v, v + guards.tau**2)
-    return odds < -guards.revoke and count >= 3.0
-
-
-@part
-def log_odds(x: float, narrow: float, wide: float) -> float:
-    """log N(x; 0, narrow) - log N(x; 0, wide)."""
-    return 0.5 * math.log(wide / narrow) - 0.5 * x * x * (1.0 / narrow - 1.0 / wide)
-
-
-@part
-def distrust(f: Filter, known: Model, guards: Guards) -> None:
-    """In a state of before, take trust from those who have lost it since: their fixes have an unknown error again."""
-    for j in range(len(f.slot)):
-        if f.betrayals[j, 0] == 0.0 or f.betrayals[j, 1] < f.clock[0] or f.status[j, TRUSTED] == 0.0:
-            continue
-        f.status[j, TRUSTED] = f.status[j, COUNT] = 0.0
-        for c in range(3):
-            f.status[j, MEAN + c] = f.status[j, KEPT + c] = 0.0
-            f.status[j, KEPT_VARIANCE + c] = guards.tau**2
-        if f.slot[j] >= 0:
-            remove(f.g, f.slot[j], ERROR)
-            insert(f.g, f.slot[j], ERROR, guards.tau**2 + known.own)
+        mean[c] += (clip * h.gap[c] - mean[c]) / count
+        for d in range(3):
+            s[c, d] = h.variance[c] / count + (1.0 if known.own > 0.0 else 0.0) if c == d else 0.0
+            for i in range(h.terms[0]):
+                for m in range(h.terms[0]):
+                    s[c, d] += h.weight[c, i] * h.weight[d, m] * g.p[h.column[c, i], h.column[d, m]]
+    odds = math.log((1.0 - guards.share) / guards.share)
+    near, narrow = distance(s, mean)
+    if count < 3.0 or near < 2.0 * (odds + guards.revoke):
+        return False
+    for c in range(3):
+        s[c, c] += guards.tau**2
+    far, wide = distance(s, mean)
+    return bool(odds + 0.5 * math.log(wide / narrow) + 0.5 * (far - near) < -guards.revoke)
 
 
 @part
 def trust(f: Filter, known: Model, guards: Guards) -> None:
-    """Set the error of fixes to zero, or to what drifts, while that is likelier than any other: the surest first."""
-    g, h = f.g, f.h
-    wide = guards.tau**2 + known.own
-    narrow = 1.0 / (1.0 / known.own - 1.0 / wide) if known.own > 0.0 else 1e-6
+    """Set the error of fixes to zero, or to what drifts, while that is likelier than any other: the surest first.
+
+    The odds p(b = 0 | all) / p(b = 0) of a Gaussian b are by Bayes' rule those of the two hypotheses.
+    """
+    g, h, s, x = f.g, f.h, f.h.square[0], f.h.gap
+    wide, narrow, unit = guards.tau**2 + known.own, 0.0, guards.tau**2
+    if known.own > 0.0:
+        narrow = 1.0 / (1.0 / known.own - 1.0 / wide)
+        unit = wide / known.own * narrow
     while True:
         best, most = ABSENT, guards.sure
-        for k in range(1, len(f.vehicle)):
-            if f.vehicle[k] < 0 or f.status[f.vehicle[k], TRUSTED] > 0.0 or f.status[f.vehicle[k], SENT] == -math.inf:
+        for k in range(len(f.vehicle)):
+            j = f.vehicle[k]
+            if j < 0 or f.status[j, TRUSTED] > 0.0 or (k > 0 and f.status[j, USED] == -math.inf):
                 continue
-            odds = math.log((1.0 - guards.share) / guards.share) - guards.grudge * f.betrayals[f.vehicle[k], 0]
+            first = 3 * g.block[k, ERROR]
             for c in range(3):
-                i = 3 * g.block[k, ERROR] + c
-                if known.own > 0.0:
-                    v = narrow + g.p[i, i]
-                    odds += 0.5 * math.log(wide / known.own * narrow / v) - 0.5 * g.x[i] ** 2 / v
-                else:
-                    odds += 0.5 * math.log(wide / g.p[i, i]) - 0.5 * g.x[i] ** 2 / g.p[i, i]
+                x[c] = g.x[first + c]
+                for d in range(3):
+                    s[c, d] = g.p[first + c, first + d] + (narrow if c == d else 0.0)
+            q, det = distance(s, x)
+            odds = math.log((1.0 - guards.share) / guards.share) - guards.penalty * f.revoked[j, 0]
+            odds += 0.5 * math.log(unit**3 / det) - 0.5 * q
             if odds > most:
                 best, most = k, odds
         if best < 0:
@@ -285,8 +304,8 @@ def trust(f: Filter, known: Model, guards: Guards) -> None:
         f.status[j, TRUSTED], f.status[j, COUNT] = 1.0, 0.0
         term(h, 0, 3 * g.block[best, ERROR], 1.0)
         for c in range(3):
-            h.z[c], h.variance[c], h.used[c], h.gated[c] = 0.0, narrow, True, False
+            expect(h, c, 0.0, max(narrow, 1e-6))
             f.status[j, MEAN + c] = 0.0
-        update(g.x, g.p, 3 * g.vectors[0], h, 0.0)
+        update(g, h, 0.0)
         if known.own == 0.0:
             remove(g, best, ERROR)

@@ -20,32 +20,38 @@ from .gaussian import (
     COMPASS,
     ERROR,
     KINDS,
-    POSITION,
+    PLACE,
     VELOCITY,
     Gaussian,
     Rows,
+    clear,
+    expect,
     has,
     insert,
     new_gaussian,
     new_rows,
     remove,
     shift,
+    term,
+    update,
     widen,
 )
 
-FIX, FIX_VARIANCE, MOVED, PROCESS, DT, OWN = 0, 3, 6, 9, 12, 13
+FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, OWN = 0, 3, 6, 9, 12, 13
 """Of the ego's row: fix m (NaN for none), its variance m^2, motion m, its variance m^2, three each, and dt s."""
-RELATIVE, AGE, ESTIMATE, VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
-"""Of a neighbour's row: `relative.five`, and its newest message: age s (-1 for none held), position m and its
-variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that
-of a fix as its solo filter assumes it m^2."""
-TRUSTED, COUNT, SENT, MEAN, KEPT, KEPT_VARIANCE, LAST, STATUS = 0, 1, 2, 3, 6, 9, 12, 24
-"""Of a vehicle's status: whether its fixes count as they are, messages in the mean innovation,
-when its last message that was used
-was sent s (-inf for none), mean innovation m, error of its fixes when it left m and its
-variance m^2, and ESTIMATE, VARIANCE, ODOMETER and STEP of that message."""
-KNOWN = 1e4
-"""m^2, variance along x above which nothing is known of where a member is."""
+RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
+"""Of a neighbour's row: `relative.five`, and its newest message: age s (-1 for none held), solo estimate m and its
+variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that of a fix as its solo
+filter assumes it m^2."""
+TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, STATUS = 0, 1, 2, 3, 6, 9, 12, 24, 30, 31, 32
+"""Of a vehicle's status: whether its fixes are assumed to be right, fixes in the mean innovation, when its last message
+that was used was sent s (-inf for none), mean innovation m, error of its fixes when it left m and its variance m^2, and
+SOLO, SOLO_VARIANCE, ODOMETER and STEP of that message; its last plausible velocity m/s, the variance of one step's
+motion with it m^2, when that was s (-inf for never), and how many in a row were not."""
+SLIPPED = 5.0
+"""Implausible velocities in a row after which one counts again."""
+SPEED_VARIANCE = 400.0
+"""(m/s)^2, prior of a member's velocity."""
 
 
 class Guards(NamedTuple):
@@ -53,37 +59,41 @@ class Guards(NamedTuple):
 
     Attributes:
         gate: squared normalised innovation of a component of a relative measurement.
-        fix_gate: of a fix.
-        patience: a component that exceeds its gate that many times in a row counts again: then it is the filter that
-            is wrong.
+        fix_gate: squared Mahalanobis distance of a fix, of the fixes in a message, and of its odometer and velocity.
+        patience: a member whose component exceeds its gate that many times in a row, or as often as it did not before,
+            joins anew.
+        slip: m/s, error of an odometer that slips.
         trust: 1 if a newcomer's fixes have an unknown error until they are believed.
         tau: m, standard deviation of that error.
         share: prior share of vehicles with such an error.
         sure: log odds from which a member is trusted.
-        grudge: log odds that each betrayal costs.
-        wander: m, change of the error in a second.
-        window: messages in the mean innovation of a trusted member.
+        penalty: log odds that each revocation costs.
+        walk: m, change of the error in a second.
+        window: fixes in the mean innovation of a vehicle.
         revoke: log odds from which trust ends.
+        lost: s without trust in its receiver after which an ego alone starts anew.
         memory: steps after which a state is kept to go back to.
         acceleration: m/s^2, of a member whose messages are late; 0: it goes on with its last velocity.
     """
 
     gate: float = 9.0
     fix_gate: float = 16.0
-    patience: float = 5.0
+    patience: float = 30.0
+    slip: float = 10.0
     trust: float = 1.0
     tau: float = 20.0
     share: float = 0.1
     sure: float = 1.0
-    grudge: float = 10.0
-    wander: float = 0.16
+    penalty: float = 4.0
+    walk: float = 0.16
     window: float = 30.0
     revoke: float = 3.0
+    lost: float = 20.0
     memory: float = 30.0
     acceleration: float = 4.0
 
 
-NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, trust=0.0, memory=0.0, acceleration=0.0)
+NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, slip=0.0, trust=0.0, memory=0.0, acceleration=0.0)
 
 
 class Model(NamedTuple):
@@ -127,18 +137,20 @@ class Filter(NamedTuple):
         vehicle: (slots,) in each slot, ABSENT for none.
         slot: (vehicles,) of each vehicle, ABSENT for none.
         row: (slots,) of the step's input, ABSENT for none.
+        order: (slots,) members, nearest first: a gate depends on what was used before, not on how members are numbered.
         joined: (slots,) step at which the member joined.
         serves: (slots,) s for which a message's velocity has served.
         heard: (slots,) s when that message was sent.
-        hits: (slots, 3) how often in a row a component exceeded its gate.
+        vague: (slots,) m^2, variance of a position beyond that in P: next to nothing is known of it; 0 once it is.
+        hits: (slots, 3) how often in a row a component exceeded its gate; the ego's first counts its fixes.
         status: (vehicles, STATUS).
         at: (slots, 3) m, where relative measurements are linear.
         work: positions and compass alone, for the first pass of the relative measurements.
-        q: (slots, 4) out: squared normalised innovations of range, azimuth and inclination and the largest one of
-            the message, NaN where nothing was used; the ego's are those of its fix.
+        q: (slots, 4) out: squared normalised innovations of range, azimuth and inclination and squared Mahalanobis
+            distance of the message, NaN where nothing was used; the ego's are those of its fix.
         step: (1,) number of the step.
         clock: (2,) s, now, and since the last step.
-        betrayals: (vehicles, 2) how often a vehicle lost trust, and when it last did s: until then its fixes do not
+        revoked: (vehicles, 2) how often a vehicle lost trust, and when it last did s: until then its fixes do not
             count; not part of what is restored.
         alarm: (1,) out: whether a vehicle lost it now.
     """
@@ -148,9 +160,11 @@ class Filter(NamedTuple):
     vehicle: Ints
     slot: Ints
     row: Ints
+    order: Ints
     joined: Ints
     serves: Floats
     heard: Floats
+    vague: Floats
     hits: Ints
     status: Floats
     at: Floats
@@ -158,7 +172,7 @@ class Filter(NamedTuple):
     q: Floats
     step: Ints
     clock: Floats
-    betrayals: Floats
+    revoked: Floats
     alarm: Ints
 
 
@@ -173,8 +187,10 @@ def new_filter(slots: int, vehicles: int) -> Filter:
         np.full(vehicles, ABSENT),
         np.full(slots, ABSENT),
         np.zeros(slots, np.int64),
+        np.zeros(slots, np.int64),
         np.zeros(slots),
         np.full(slots, -1.0),
+        np.zeros(slots),
         np.zeros((slots, 3), np.int64),
         np.zeros((vehicles, STATUS)),
         np.zeros((slots, 3)),
@@ -189,7 +205,7 @@ def new_filter(slots: int, vehicles: int) -> Filter:
 
 @part
 def copy_filter(source: Filter, target: Filter) -> None:
-    """What was known at a step, without the betrayals noticed since."""
+    """Copy the state, but not which vehicles have lost trust."""
     n, new, old = 3 * source.g.vectors[0], target.g, source.g
     for i in range(n):
         new.x[i] = old.x[i]
@@ -200,7 +216,7 @@ def copy_filter(source: Filter, target: Filter) -> None:
         new.owner[i] = old.owner[i]
     for k in range(len(source.vehicle)):
         target.vehicle[k], target.row[k], target.joined[k] = source.vehicle[k], source.row[k], source.joined[k]
-        target.serves[k], target.heard[k] = source.serves[k], source.heard[k]
+        target.serves[k], target.heard[k], target.vague[k] = source.serves[k], source.heard[k], source.vague[k]
         for kind in range(KINDS):
             new.block[k, kind] = old.block[k, kind]
         for c in range(3):
@@ -212,67 +228,221 @@ def copy_filter(source: Filter, target: Filter) -> None:
 
 
 @part
-def begin(f: Filter, known: Model, guards: Guards, own: Floats, ego: int) -> None:
-    """The ego stands somewhere near its first fix; no vehicle has been met."""
+def begin(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, count: int, ego: int) -> None:
+    """The first step: no vehicle has been met."""
     for j in range(len(f.slot)):
+        for c in range(STATUS):
+            f.status[j, c] = 0.0
         f.status[j, TRUSTED] = 1.0 if guards.trust == 0.0 or j == ego else 0.0
-        f.status[j, SENT] = -math.inf
+        f.status[j, USED] = f.status[j, SINCE] = -math.inf
         for c in range(3):
             f.status[j, KEPT_VARIANCE + c] = guards.tau**2
     f.vehicle[0], f.slot[ego] = ego, 0
-    first = insert(f.g, 0, POSITION, known.flat)
-    for c in range(3):
-        f.g.x[first + c] = own[FIX + c]
-    if known.own > 0.0:
-        insert(f.g, 0, ERROR, known.own)
+    insert(f.g, 0, PLACE, 0.0)
     if known.common > 0.0:
         insert(f.g, 0, COMMON, known.common)
     if known.bias + known.heading > 0.0:
         first = insert(f.g, 0, COMPASS, known.bias)
         f.g.p[first + 2, first + 2] = 0.0
+    start(f, known, guards, own, rows, count)
 
 
 @part
-def leave(f: Filter, vehicles: Ints, count: int) -> None:
-    """Find each member's row; marginalise out those that have none, and remember the error of their fixes."""
+def start(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, count: int) -> bool:
+    """The ego stands somewhere near its fix, which is trusted.
+
+    Where no other position, of a message less its vector, agrees with the fix, but two or more do with one another, the
+    fix is not used. Of an ego that is not trusted, but has been until a while ago, two positions must agree; else
+    nothing is changed, and False returned.
+    """
+    best, most, alone, g, ego = ABSENT, 1, True, f.g, f.vehicle[0]
+    for i in range(-1, count if guards.fix_gate > 0.0 else -1):
+        agree = 0
+        for j in range(-1, count):
+            agree += apart(own, rows, i, j) <= guards.fix_gate
+        alone = alone and (i >= 0 or agree <= 1)
+        if agree > most:
+            best, most = i, agree
+    if most < 2 and f.status[ego, TRUSTED] == 0.0 and f.clock[0] <= f.revoked[ego, 1] + guards.lost:
+        return False
+    first, f.vague[0], f.joined[0], f.hits[0, 0] = clear(g, 0, 0.0), known.flat, f.step[0], 0
+    f.status[ego, TRUSTED], f.status[ego, COUNT] = 1.0, 0.0
+    remove(g, 0, ERROR)
+    if known.own > 0.0:
+        insert(g, 0, ERROR, known.own)
+    for c in range(3):
+        g.x[first + c], f.status[ego, MEAN + c] = own[FIX + c], 0.0
+    if alone and best >= 0:
+        f.vague[0] = 0.0
+        for c in range(3):
+            g.x[first + c], own[FIX + c] = rows[best, SOLO + c] - across(rows, best, c), math.nan
+        widen(g, first, known.flat)
+    distrust(f, known, guards)
+    return True
+
+
+@part
+def lost(f: Filter, guards: Guards) -> bool:
+    """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either all fixes but the first
+    contradict it, or its receiver is not trusted any more, for long or beside others that are not."""
+    ego, others = f.vehicle[0], 0
+    for k in range(1, len(f.vehicle)):
+        j = f.vehicle[k]
+        if j >= 0 and f.status[j, USED] > -math.inf:
+            if f.status[j, TRUSTED] > 0.0:
+                return False
+            others += 1
+    if f.status[ego, TRUSTED] > 0.0:
+        return bool(f.hits[0, 0] >= 2 and f.step[0] - f.joined[0] - f.hits[0, 0] <= 1)
+    return bool(f.clock[0] > f.revoked[ego, 1] + (0.0 if others >= 2 else guards.lost))
+
+
+@part
+def pause(f: Filter, dt: float) -> None:
+    """The ego is absent: it starts anew at its next fix."""
+    f.g.vectors[0], f.hits[0, 0] = 0, 0
+    for kind in range(KINDS):
+        f.g.block[0, kind] = ABSENT
+    for j in range(len(f.slot)):
+        f.revoked[j, 0] = 0.0
+    f.step[0] += 1
+    f.clock[0] += dt
+
+
+@part
+def distrust(f: Filter, known: Model, guards: Guards) -> None:
+    """In a state of before, revoke the trust that vehicles have lost since."""
+    for j in range(len(f.slot)):
+        if f.revoked[j, 0] > 0.0 and f.revoked[j, 1] >= f.clock[0] and f.status[j, TRUSTED] > 0.0:
+            doubt(f, known, guards, j)
+
+
+@part
+def doubt(f: Filter, known: Model, guards: Guards, j: int) -> None:
+    """The fixes of vehicle j have an error of which nothing is known."""
+    f.status[j, TRUSTED] = f.status[j, COUNT] = 0.0
+    for c in range(3):
+        f.status[j, MEAN + c] = f.status[j, KEPT + c] = 0.0
+        f.status[j, KEPT_VARIANCE + c] = guards.tau**2
+    if f.slot[j] >= 0:
+        remove(f.g, f.slot[j], ERROR)
+        insert(f.g, f.slot[j], ERROR, guards.tau**2 + known.own)
+
+
+@part
+def apart(own: Floats, rows: Floats, i: int, j: int) -> float:
+    """Squared Mahalanobis distance of two positions of the ego: of a neighbour's message less the measured vector, or,
+    -1, its own fix; infinite if one is missing."""
+    total = 0.0
+    for c in range(3):
+        gap, variance = 0.0, 0.0
+        for k, sign in ((i, 1.0), (j, -1.0)):
+            if k < 0:
+                gap, variance = gap + sign * own[FIX + c], variance + own[FIX_VARIANCE + c]
+            elif rows[k, AGE] < 0.0 or not measured_whole(rows, k):
+                return math.inf
+            else:
+                gap += sign * (rows[k, SOLO + c] - across(rows, k, c))
+                variance += rows[k, SOLO_VARIANCE + c] + 1.0
+        total += gap * gap / variance
+    return total if math.isfinite(total) else math.inf
+
+
+@part
+def across(rows: Floats, row: int, c: int) -> float:
+    """Component c of the measured vector to a neighbour, m."""
+    d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
+    return float(d * ci if c == 2 else d * si * (ca if c == 0 else sa))
+
+
+@part
+def leave(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+    """Find each member's row; marginalise out those that have none, and remember the error of their fixes.
+
+    A member that the ego's measurements contradict joins anew; where the ego is lost, it starts anew, and all join.
+    """
     for k in range(len(f.row)):
         f.row[k] = ABSENT
     for i in range(count):
         if f.slot[vehicles[i]] >= 0:
             f.row[f.slot[vehicles[i]]] = i
+    again = guards.trust > 0.0 and f.step[0] > 0 and not math.isnan(own[FIX]) and lost(f, guards)
+    again = again and start(f, known, guards, own, rows, count)
     for k in range(1, len(f.vehicle)):
         j = f.vehicle[k]
-        if j < 0 or f.row[k] >= 0:
+        if j < 0 or (f.row[k] >= 0 and not again and not contradicted(f, guards, k)):
             continue
+        if f.row[k] >= 0 and f.status[j, TRUSTED] == 0.0:  # the error was estimated beside a wrong position
+            doubt(f, known, guards, j)
         if has(f.g, k, ERROR):
             first = 3 * f.g.block[k, ERROR]
             for c in range(3):
                 f.status[j, KEPT + c] = f.g.x[first + c]
                 f.status[j, KEPT_VARIANCE + c] = max(f.g.p[first + c, first + c], 0.01)
-        for kind in range(4):
+        for kind in range(KINDS):
             remove(f.g, k, kind)
         f.slot[j], f.vehicle[k] = ABSENT, ABSENT
 
 
 @part
-def predict(f: Filter, known: Model, own: Floats) -> None:
-    """Move the ego; errors that last decay."""
-    g, keep = f.g, math.exp(-own[DT] / known.time)
-    fades, first = 1.0 - keep * keep, 3 * g.block[0, POSITION]
+def contradicted(f: Filter, guards: Guards, k: int) -> bool:
+    """Whether the ego's measurements of a member have contradicted its position for too long: two components three
+    times in a row, or one as often as it agreed before, at most `patience` times."""
+    several, since = 0, f.step[0] - f.joined[k]
     for c in range(3):
-        g.x[first + c] += own[MOVED + c]
-        g.p[first + c, first + c] += own[PROCESS + c]
-    if known.own > 0.0:
-        for k in range(len(f.vehicle)):
-            if f.vehicle[k] >= 0 and has(g, k, ERROR):
-                i = 3 * g.block[k, ERROR]
-                if f.status[f.vehicle[k], TRUSTED] > 0.0:
-                    shift(g, i, i, keep - 1.0)
-                widen(g, i, known.own * fades)
+        hits = f.hits[k, c]
+        several += hits >= 3
+        if hits >= min(guards.patience, max(2, since - hits)):
+            return True
+    return bool(several >= 2)
+
+
+@part
+def predict(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
+    """Move the ego; errors that last decay, errors of which nothing is known change."""
+    g, keep = f.g, math.exp(-own[DT] / known.time)
+    fades, first = 1.0 - keep * keep, 3 * g.block[0, PLACE]
+    for c in range(3):
+        g.x[first + c] += own[MOTION + c]
+        g.p[first + c, first + c] += own[MOTION_VARIANCE + c]
+    for k in range(len(f.vehicle)):
+        if f.vehicle[k] >= 0 and has(g, k, ERROR):
+            i, trusted = 3 * g.block[k, ERROR], f.status[f.vehicle[k], TRUSTED] > 0.0
+            if trusted:
+                shift(g, i, i, keep - 1.0)
+            widen(g, i, known.own * fades + (0.0 if trusted else guards.walk**2 * own[DT]))
     if known.common > 0.0:
         i = 3 * g.block[0, COMMON]
         shift(g, i, i, keep - 1.0)
         widen(g, i, known.common * fades)
+
+
+@part
+def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, variance: int, unit: float) -> None:
+    """Put vehicle j's last velocity in place of one that no vehicle can have reached since.
+
+    Args:
+        f: filter.
+        guards: against what may be wrong.
+        j: vehicle.
+        given: row of the input.
+        first: of its velocity or motion in the row.
+        variance: of one step's motion in the row.
+        unit: m/s of what the row holds.
+    """
+    dt, status, q = f.clock[1], f.status[j], 0.0
+    changed = (guards.acceleration * max(f.clock[0] - status[SINCE], dt)) ** 2
+    for c in range(3):
+        gap = unit * given[first + c] - status[PACE + c]
+        q += gap * gap / ((given[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
+    if q > 2.0 * guards.fix_gate and status[SLIPS] < SLIPPED:
+        status[SLIPS] += 1.0
+        for c in range(3):
+            given[first + c], given[variance + c] = status[PACE + c] / unit, status[PACE + 3 + c] + changed * dt * dt
+        return
+    status[SINCE], status[SLIPS] = f.clock[0], 0.0
+    for c in range(3):
+        status[PACE + c], status[PACE + 3 + c] = unit * given[first + c], given[variance + c]
 
 
 @part
@@ -282,11 +452,8 @@ def predict_member(f: Filter, known: Model, guards: Guards, rows: Floats, k: int
     A velocity that has served for L s and serves for dt more makes an error of (L + dt)^2 - L^2 times its own variance.
     """
     g, row, dt = f.g, f.row[k], f.clock[1]
-    first, age, sent = 3 * g.block[k, POSITION], rows[row, AGE], f.clock[0] - rows[row, AGE]
-    if f.status[f.vehicle[k], TRUSTED] == 0.0:
-        widen(g, 3 * g.block[k, ERROR], guards.wander**2 * dt)
-    if guards.acceleration > 0.0 and late(age) and not has(g, k, VELOCITY):
-        follow(f, rows, k)
+    first, age, sent = 3 * g.block[k, PLACE], rows[row, AGE], f.clock[0] - rows[row, AGE]
+    hear(f, guards, rows, k)
     if has(g, k, VELOCITY):
         v = 3 * g.block[k, VELOCITY]
         widen(g, v, (guards.acceleration * dt) ** 2)
@@ -294,8 +461,10 @@ def predict_member(f: Filter, known: Model, guards: Guards, rows: Floats, k: int
         return
     if age < 0.0:
         f.heard[k], f.serves[k] = -math.inf, 0.0
-        widen(g, first, known.flat)
+        f.vague[k] += known.flat
         return
+    if guards.fix_gate > 0.0 and age <= ROUNDING:
+        steady(f, guards, f.vehicle[k], rows[row], SPEED, STEP, 1.0)
     if abs(f.heard[k] - sent) > ROUNDING:
         f.serves[k] = 0.0
     often, changed = 1.0 + 2.0 * f.serves[k] / dt, (dt * age * known.acceleration) ** 2
@@ -306,41 +475,40 @@ def predict_member(f: Filter, known: Model, guards: Guards, rows: Floats, k: int
 
 
 @part
-def late(age: float) -> bool:
-    """Whether the newest message is not of now."""
-    return age > ROUNDING or age < 0.0
-
-
-@part
-def follow(f: Filter, rows: Floats, k: int) -> None:
-    """Give a member a velocity in the state: that of its newest message, or one like the ego's neighbours may have."""
-    row, g = f.row[k], f.g
-    first = insert(g, k, VELOCITY, 100.0)
+def hear(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
+    """Give a member whose newest message is not of now a velocity in the state, and use that of a new message."""
+    row, g, h = f.row[k], f.g, f.h
+    age = rows[row, AGE]
+    if guards.acceleration == 0.0 or age < 0.0 or (age <= ROUNDING and not has(g, k, VELOCITY)):
+        return
+    sent = f.clock[0] - age
+    if not has(g, k, VELOCITY):
+        insert(g, k, VELOCITY, SPEED_VARIANCE)
+    elif abs(f.heard[k] - sent) <= ROUNDING:
+        return
+    f.heard[k] = sent
+    term(h, 0, 3 * g.block[k, VELOCITY], 1.0)
     for c in range(3):
-        if rows[row, AGE] >= 0.0:
-            g.x[first + c] = rows[row, SPEED + c]
+        expect(h, c, rows[row, SPEED + c], rows[row, STEP + c] / f.clock[1] ** 2 + (guards.acceleration * age) ** 2)
+    update(g, h, guards.fix_gate)
 
 
 @part
-def join(f: Filter, known: Model, rows: Floats, vehicle: int, row: int) -> None:
+def join(f: Filter, known: Model, guards: Guards, rows: Floats, vehicle: int, row: int) -> None:
     """A newcomer is where the ego measures it; if a component lacks, its message will tell, else somewhere near."""
     g, k = f.g, 1
     while f.vehicle[k] >= 0:
         k += 1
     f.vehicle[k], f.slot[vehicle], f.row[k] = vehicle, k, row
-    f.joined[k], f.serves[k] = f.step[0], f.clock[1]
+    f.joined[k], f.serves[k], f.vague[k] = f.step[0], f.clock[1], known.flat
     f.heard[k] = f.clock[0] - rows[row, AGE] if rows[row, AGE] >= 0.0 else -math.inf
     for c in range(3):
         f.hits[k, c] = 0
-    ego, first = 3 * g.block[0, POSITION], insert(g, k, POSITION, known.flat)
-    d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
-    if measured_whole(rows, row):
-        g.x[first], g.x[first + 1], g.x[first + 2] = d * si * ca, d * si * sa, d * ci
-    else:
-        near = 1.0 + max(d, 0.0)
-        g.x[first], g.x[first + 1], g.x[first + 2] = near, near, 0.1 * near
+    ego, first = 3 * g.block[0, PLACE], insert(g, k, PLACE, 0.0)
+    near, whole = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row)
     for c in range(3):
-        g.x[first + c] += g.x[ego + c]
+        g.x[first + c] = g.x[ego + c] + (across(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
+    hear(f, guards, rows, k)
     if f.status[vehicle, TRUSTED] == 0.0:
         error = insert(g, k, ERROR, 0.0)
         for c in range(3):
@@ -348,6 +516,24 @@ def join(f: Filter, known: Model, rows: Floats, vehicle: int, row: int) -> None:
             g.p[error + c, error + c] = f.status[vehicle, KEPT_VARIANCE + c] + known.own
     elif known.own > 0.0:
         insert(g, k, ERROR, known.own)
+
+
+@part
+def unused(f: Filter, rows: Floats, k: int) -> bool:
+    """Whether member k has sent a message with a position since the last one that was used."""
+    row = f.row[k]
+    new = f.clock[0] - rows[row, AGE] > f.status[f.vehicle[k], USED] + ROUNDING
+    return bool(rows[row, AGE] >= 0.0 and new and math.isfinite(rows[row, SOLO]))
+
+
+@part
+def place(f: Filter, rows: Floats, k: int) -> None:
+    """Put a vague member where its first message does: what is measured of it is linear there, not where it was assumed
+    to be until now."""
+    row, first = f.row[k], 3 * f.g.block[k, PLACE]
+    if f.vague[k] > 0.0 and unused(f, rows, k) and (f.joined[k] < f.step[0] or not measured_whole(rows, row)):
+        for c in range(3):
+            f.g.x[first + c] = rows[row, SOLO + c] + rows[row, AGE] * rows[row, SPEED + c]
 
 
 @part
