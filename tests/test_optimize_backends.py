@@ -217,8 +217,9 @@ def test_unknown_names_list_the_known(dense: Recording, call, words: str) -> Non
 def test_a_missing_library_says_how_to_install_it(
     monkeypatch: pytest.MonkeyPatch, dense: Recording, backend: str
 ) -> None:
-    module = sys.modules["coopoc.optimize.backend"]
-    monkeypatch.setattr(module, "find_spec", lambda name: None if name == backend else find_spec(name))
+    for module in ("coopoc.optimize.backend", "coopoc.errors"):
+        lacking = lambda name: None if name == backend else find_spec(name)  # noqa: E731
+        monkeypatch.setattr(sys.modules[module], "find_spec", lacking)
     assert not backends()[backend].installed
     assert backends()["gauss-newton"].installed == (backend != "casadi")
     with pytest.raises(MissingLibraryError, match=f"pip install {backend}"):
