@@ -12,6 +12,7 @@ from filterpy.kalman import KalmanFilter
 from coopoc import GNSS, V2X, Fleet, InputError, JointFilter, Kalman, Method, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.methods.noise_model import resolve
 
 S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
@@ -123,6 +124,18 @@ def test_a_fitted_noise_model_finds_the_acting_noise(formation: Fleet) -> None:
     fitted = NoiseModel.fitted(training, formation)
     assert fitted.gnss_std == pytest.approx((1.0, 2.0, 3.0), rel=0.02)
     assert fitted.process_std == pytest.approx((0.1, 0.1, 0.1), rel=0.02)
+    late = replace(training, gnss=training.gnss + np.array([2.0, 0.0, 0.0]))  # an error that lasts is no less an error
+    assert NoiseModel.fitted(late, formation).gnss_std[0] == pytest.approx(np.hypot(1.0, 2.0), rel=0.01)
+
+
+def test_the_floor_of_a_range_is_the_spread_of_its_arc(formation: Fleet) -> None:
+    """Closed form: d e^2 / 2 of an angle's error e has a standard deviation of d std^2 / sqrt(2)."""
+    seen = observe(formation, Sensors(range_std=0.01, azimuth_std=0.1, inclination_std=0.05), V2X(2))
+    seen = replace(seen, relative=np.where([True, False, False], 20.0, seen.relative))
+    known = resolve("nominal", seen).sensors
+    assert known is not None
+    arc = 20.0 * np.hypot(0.1**2, 0.05**2) / np.sqrt(2)
+    assert known.range_std == pytest.approx(np.hypot(arc, 0.01), rel=1e-9)
 
 
 def test_a_bad_noise_model_is_named(crossing: Fleet) -> None:
