@@ -15,7 +15,7 @@ _STUB = Path(__file__).with_suffix(".pyi").read_text()
 _HOME = {name: module for module, name in re.findall(r"from (\.\S+) import (\w+)", _STUB)}
 """Public name -> module that defines it, as type checkers see it."""
 
-__version__ = "0.1.0"
+__version__ = "0.2.0"
 __all__ = sorted(_HOME)
 
 
@@ -23,7 +23,12 @@ def __getattr__(name: str) -> Any:
     """Import a public name from its home when it is first used: `import coopoc` stays quick."""
     if name not in _HOME:
         raise AttributeError(f"module 'coopoc' has no attribute {name!r}")
-    return getattr(importlib.import_module(_HOME[name], __name__), name)
+    try:
+        return getattr(importlib.import_module(_HOME[name], __name__), name)
+    except ModuleNotFoundError as error:
+        from .errors import missing
+
+        raise missing(error, f"coopoc.{name}") from None
 
 
 def __dir__() -> list[str]:

@@ -62,7 +62,6 @@ from .study.results import Results as Results
 from .study.run import run_study as run_study
 from .study.study import Study as Study
 from .world.body_frames import in_world as in_world
-from .world.channels import channel_load as channel_load
 from .world.fleet import Fleet as Fleet
 from .world.links import Links as Links
 from .world.outliers import Fault as Fault

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import EntryPoint, version
@@ -15,7 +16,7 @@ import tyro
 from tyro.conf import FlagCreatePairsOff, Positional, UseAppendAction, arg
 
 from . import plugins
-from .errors import InputError, MissingLibraryError, unknown
+from .errors import InputError, MissingLibraryError, missing, unknown
 
 Command: TypeAlias = Callable[..., int | None] | Mapping[str, Any] | EntryPoint
 
@@ -48,6 +49,7 @@ def run(
     cluster: Annotated[str, arg(metavar="tcp://HOST:PORT")] = "",
     retry_failed: bool = False,
     dry_run: bool = False,
+    tracks: Literal["none", "tum"] = "none",
 ) -> int:
     """Run a study, or resume it: finished cells are kept; --retry-failed repeats failed ones.
 
@@ -63,14 +65,18 @@ def run(
         cluster: address of a Dask scheduler whose workers compute the cells.
         retry_failed: repeat failed cells.
         dry_run: print which cells would be kept, repeated and computed, then stop.
+        tracks: tum writes the estimates, a TUM file for each ego and run, to FOLDER/NAME/tracks.
     """
     from .study.cell import assignments
-    from .study.publish import tables
-    from .study.run import plan, run_study
+    from .study.study import find_study
 
     changes = dict(assignments([text for group in set for text in group]))
     if data is not None:
         changes["data"] = data
+    find_study(name).override(changes)  # a mistake is told before pandas and Arrow are imported
+    from .study.publish import tables
+    from .study.run import plan, run_study, write_tracks
+
     if dry_run:
         print(json.dumps(plan(name, out, changes, shard, retry_failed), indent=1, default=str))
         return 0
@@ -81,6 +87,9 @@ def run(
     for _, row in results.failures.head(5).iterrows():
         params = ", ".join(f"{axis} = {row[axis]}" for axis in results.axes if axis in row)
         print(f"coopoc: failed: {row['reason']} ({params})", file=sys.stderr)
+        print(textwrap.indent("\n".join(row["traceback"].splitlines()[-5:]), "  "), file=sys.stderr)
+    if tracks == "tum":
+        print(f"coopoc: estimates are in {write_tracks(name, out, changes, shard)}", file=sys.stderr)
     failed = f"; cells failed: {results.failed}, try them again with --retry-failed" if results.failed else ""
     done = f"shard {shard} is in {folder}" if shard else f"results are in {folder}"
     then = "When all shards are: the same command without --shard" if shard else f"Report: coopoc report {folder}"
@@ -223,6 +232,11 @@ def _status(argv: list[str]) -> int:
         status = _dispatch({**plugins.points("coopoc.commands"), **OWN}, argv, "coopoc")
         sys.stdout.flush()
         return status
+    except ModuleNotFoundError as error:
+        if (known := missing(error, " ".join(["coopoc", *argv[:1]]))) is error:
+            raise
+        print(f"coopoc: {known}", file=sys.stderr)
+        return 2
     except (InputError, MissingLibraryError) as error:
         print(f"coopoc: {error}", file=sys.stderr)
         return 2
@@ -247,9 +261,25 @@ def _dispatch(commands: Mapping[str, Command], argv: list[str], prog: str) -> in
         raise unknown("command", name, commands)
     command = commands[name]
     loaded = command.load() if isinstance(command, EntryPoint) else command
+    if loaded is run and {"-h", "--help"} & {*rest} and not rest[0].startswith("-"):
+        print(_settings(rest[0]))
     if isinstance(loaded, Mapping):
         return _dispatch(loaded, rest, f"{prog} {name}")
     return int(tyro.cli(loaded, prog=f"{prog} {name}", args=rest, config=(FlagCreatePairsOff,)) or 0)
+
+
+def _settings(name: str) -> str:
+    """The keys of --set that a study has: settings with their defaults, axes with their values, and names to choose."""
+    from .study.study import find_study
+
+    study, groups = find_study(name), {f"coopoc.{key}s": key for key in ("method", "channel", "metric")}
+    choices = {key: plugins.names(group) for group, key in groups.items()}
+    choices["data"] = (*plugins.names("coopoc.datasets"), "a path")
+    lines = [f"{study.name}: {study.question}", "", "keys of --set, with their defaults:"]
+    for key, values in {**{k: (v,) for k, v in study.settings.items()}, **study.values()}.items():
+        allowed = f"  (of {', '.join(choices[key])})" if key in choices else ""
+        lines.append(f"  {key}={','.join('' if v is None else str(v) for v in values)}{allowed}")
+    return "\n".join([*lines, ""])
 
 
 def _help(commands: Mapping[str, Command], prog: str) -> str:

@@ -3,7 +3,12 @@
 from __future__ import annotations
 
 import difflib
+import json
+import re
 from collections.abc import Iterable
+from importlib import metadata
+from importlib.util import find_spec
+from urllib.parse import unquote, urlsplit
 
 LONGEST = 1500
 """Characters of each part of a message."""
@@ -79,7 +84,42 @@ class MissingLibraryError(ImportError):
 
     def __init__(self, library: str, needed_for: str, package: str, how: str = "pip install") -> None:
         self.given = (library, needed_for, package, how)
-        super().__init__(f"{needed_for} needs {library}, which is not installed. Run: {how} {package}")
+        super().__init__(f"{needed_for} needs {library}, which is not installed. Run: {how} {_where(package)}")
 
     def __reduce__(self) -> tuple[type[MissingLibraryError], tuple[str, str, str, str]]:
         return type(self), self.given
+
+
+def _where(package: str) -> str:
+    """An extra of coopoc as pip finds it: in the folder that it was installed from, else on the index."""
+    try:
+        source = json.loads(metadata.distribution("coopoc").read_text("direct_url.json") or "{}")
+    except metadata.PackageNotFoundError:
+        return package
+    if not package.startswith("'coopoc[") or not (url := str(source.get("url", ""))).startswith("file:"):
+        return package
+    editable = "-e " if source.get("dir_info", {}).get("editable") else ""
+    return f"{editable}{package.replace('coopoc', unquote(urlsplit(url).path), 1)}"
+
+
+def require(library: str, needed_for: str) -> None:
+    """Raise MissingLibraryError unless the library is installed.
+
+    >>> require("numpy", "everything")
+    """
+    if find_spec(library) is None:
+        raise MissingLibraryError(library, needed_for, dependencies().get(library, library))
+
+
+def dependencies() -> dict[str, str]:
+    """Libraries that coopoc itself needs, by the name that is imported: the name that pip installs."""
+    stated = [text for text in metadata.requires("coopoc") or () if "extra ==" not in text]
+    names = [re.split(r"[^\w-]", text)[0] for text in stated]
+    return {name.removesuffix("-base"): name for name in names}
+
+
+def missing(error: ModuleNotFoundError, needed_for: str) -> ImportError:
+    """The error for a library that could not be imported: with the line that installs it if coopoc needs it."""
+    library = (error.name or "").partition(".")[0]
+    known = dependencies()
+    return MissingLibraryError(library, needed_for, known[library]) if library in known else error

@@ -165,9 +165,9 @@ def find(group: str, name: str) -> Any:
         return loaded
     if in_file(name):
         return from_file(name, GROUPS.get(group, group))
-    for point in sorted(registered.values(), key=lambda point: name not in (names_in(point.value) or ())):
-        members = _members(point)
-        if name in members:
+    for point in registered.values():
+        written = names_in(point.value)
+        if (written is None or name in written) and name in (members := _members(point)):
             return members[name]
     raise _unknown(group, name)
 

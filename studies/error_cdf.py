@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopoc.study.numbers import Number, Where, interval, listed, mean, present, ratio, seed_std
+from coopoc.study.numbers import Number, Where, interval, listed, mean, present, seed_std
 from coopoc.study.study import Params
 from coopoc.study.style import look
 
@@ -40,35 +40,15 @@ def case(scenario: int, ratio: float) -> dict[str, Any]:
     return {"scenario": scenario, "velocity_ratio": ratio}
 
 
-def _worse(results: Results, where: Where) -> float | None:
-    """Percentage of egos and runs with a larger RT-LE than their fixes."""
-    share = mean(results, where, "worse_than_gnss")
-    return None if share is None else 100 * share
-
-
-def _reduction(results: Results, where: Where) -> float | None:
-    """Mean maximum of the fixes' errors less that of a method, m."""
-    of_fixes = mean(results, {**where, **of("gnss", "none")}, "max_error_m")
-    worst = mean(results, where, "max_error_m")
-    return None if of_fixes is None or worst is None else of_fixes - worst
-
-
-def _relative(results: Results, where: Where) -> float | None:
-    return ratio(_reduction(results, where), _reduction(results, {**where, **of("kalman", "fitted")}))
-
-
 COLUMNS: dict[str, Number] = {
     "RT-LE [m]": interval,
     "Seed std [m]": seed_std,
     "Maximum [m]": partial(interval, value="max_error_m"),
-    "Reduction [m]": _reduction,
-    "Reduction / fitted KF's": _relative,
-    "Worse than GNSS [%]": _worse,
 }
 
 
 def _table(at: dict[str, Any]) -> TableView:
-    text = "Errors; reduction: of the mean maximum against GNSS, and its ratio to that of the fitted KF."
+    text = "Errors over all steps; maximum: the mean of the largest of each run."
     return selections(HEAD, labelled(LINEUP, **at), COLUMNS, text, at=at)
 
 

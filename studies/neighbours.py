@@ -192,12 +192,6 @@ STUDY = lineup.study(
             where=_under("nominal", method=FILTERS),
             best=None,
         ),
-        "nees_inside": k_table(
-            "Share of steps whose run-averaged NEES is in the 99 % band (gate: 0.95), nominal noise model.",
-            value="nees_inside",
-            where=_under("nominal", method=FILTERS),
-            best=None,
-        ),
         "neighbours_errors": k_table(
             "Error of what the egos think of their neighbours [m].",
             value="neighbour_rt_le_m",

@@ -222,6 +222,21 @@ def conditions(p: Params) -> str:
     return f"{heading(p)}{labels}; {size}{trained}."
 
 
+SIMULATED = ("scenario", "velocity_ratio", "drift_time_s", "heading_std_deg", "heading_bias_deg", "outliers", *LASTING)
+"""Settings of simulated noise, which a log has of its own."""
+TRAINING = ("clients", "weights", "train_seeds", "velocity_reading")
+
+
+def idle(results: Results) -> set[str]:
+    """Settings that do nothing in these results: of noise where it was measured, of training where there was none, and
+    those that are off."""
+    p = results.settings
+    off = {n for n, value in p.items() if value in ("", None) or (value == 0 and type(value) in (bool, float))}
+    trained = {"trained", "fitted"} & {*results.frame.get("noise_model", ["trained"])}
+    drawn = () if measured(str(p["data"])) is None else ("seed", "runs", *SIMULATED)
+    return off | set(drawn) | set(() if trained else TRAINING)
+
+
 def caption(results: Results, *texts: str, **at: Any) -> str:
     """The texts, which may name settings in braces, and the conditions of the study, or of the selection `at` of it."""
     p = shown(results, **at)

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from coopoc.study.numbers import present, ran, rms
 from coopoc.study.style import look
 
-from . import lineup, scene
+from . import lineup, paths, scene
 from .views import TableView, of, table
 
 if TYPE_CHECKING:
@@ -53,6 +54,8 @@ def _table(text: str, value: str, **options: Any) -> TableView:
             return None
         methods = [str(name) for name in results.frame.dropna(subset=[value])["method"].unique()]
         texts = (text, *([_changed(results)] if _changed(results) else []))
+        if scene.is_real(str(results.settings["data"])) and "gnss" in methods and value == "rt_le_m":
+            texts += ("GNSS repeats a fix until the next one, and errs by the way driven since.",)
         rows, where = ("method", "noise_model"), {"method": methods}
         return table(*texts, value=value, rows=rows, where=where, **{"decimals": 2, **options})(results)
 
@@ -70,16 +73,21 @@ def _figure(results: Results) -> Plot | None:
 
 
 def _findings(results: Results) -> dict[str, str]:
-    texts = {}
-    for k in results.frame["max_neighbours"].unique() if len(results.frame) else ():
-        pairs = results.frame[["method", "noise_model"]].drop_duplicates().to_numpy().tolist()
+    """The best filter at each K, the largest first; smoothers know later measurements and are no filters."""
+    texts, rows = {}, results.frame
+    for k in sorted(rows["max_neighbours"].unique(), reverse=True) if len(rows) else ():
+        pairs = rows[["method", "noise_model"]].drop_duplicates().to_numpy().tolist()
         each = ran({(m, model): rms(results, of(m, model, max_neighbours=k)) for m, model in pairs})
         bound = next((value for (method, _), value in each.items() if method == "bound"), None)
-        ranked = sorted((value, pair) for pair, value in each.items() if pair[0] != "bound")
+        ranked = sorted((v, pair) for pair, v in each.items() if pair[0] not in ("bound", "batch-smoother"))
         if ranked:
             value, (method, model) = ranked[0]
             gap = f", {value / bound:.2f} times the bound" if bound else ""
-            texts[f"K = {k}"] = f"K = {k}: {look(method).label} ({model}) has the lowest rms, {value:.3g} m{gap}."
+            named = f" ({model})" if len({model for _, model in each} - {"bound"}) > 1 else ""
+            who = f"{look(method).label}{named} has the lowest rms of the filters"
+            if not k:
+                who = "there is no neighbour, and the lowest rms is that of a vehicle alone"
+            texts[f"K = {k}"] = f"K = {k}: {who}, {value:.3g} m{gap}."
     return texts
 
 
@@ -99,7 +107,11 @@ STUDY = lineup.study(
         "nis": _table("NIS of the fixes per dimension against K (1 is consistent).", "nis", best=None, intervals=False),
         "bytes": _table("Received per ego [B/s].", "bytes_per_second", best=None, intervals=False, decimals=0),
     },
-    figures={"rt_le": _figure},
+    figures={
+        "rt_le": _figure,
+        "errors": partial(paths.views, over_time=True),
+        "paths": partial(paths.views, over_time=False),
+    },
     findings=_findings,
     limitations=(
         "The bound applies to the rms over runs and assumes an ideal channel, whatever the channel of the cells.",

@@ -165,3 +165,13 @@ def test_scripts_and_targets_of_the_pages_exist() -> None:
     assert {name for name in scripts if not (ROOT / name).is_file()} == set()
     assert {name for name in modules if find_spec(name) is None} == set()
     assert targets - set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)) == set()
+
+
+def test_the_help_of_a_study_lists_its_settings() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "coopoc.cli", "run", "neighbours", "--help"], capture_output=True, text=True
+    )
+    assert done.returncode == 0
+    for line in ("  runs=30", "  max_neighbours=0,1,2,3,4,6,8,10", "  data=town10  (of town04, town10, "):
+        assert line in done.stdout
+    assert "--retry-failed" in done.stdout

@@ -17,6 +17,8 @@ from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
 from coopoc.data.registry import load_fleet
 from coopoc.evaluate.metrics import fix_innovations, innovation_columns, normalised_innovations
+from coopoc.studies import paths
+from coopoc.study.report import report
 from coopoc.world.storage import digest, read_recording, save_recording
 
 FEW = {"method": "gnss,kalman,joint,bound", "max_neighbours": "0,2"}
@@ -77,7 +79,7 @@ def test_a_recording_is_stored_bit_by_bit(tmp_path: Path) -> None:
     save_recording(read, tmp_path / "b.npz", true)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
     assert load_fleet(tmp_path / "a.npz").digest == fleet.digest
-    with pytest.raises(co.InputError, match="must hold the vehicles and steps"):
+    with pytest.raises(co.InputError, match="ids and times differ"):
         save_recording(recording, tmp_path / "c.npz", fleet.between(0, 50))
 
 
@@ -182,7 +184,7 @@ def test_the_commands_take_a_log_and_options(
     status, out = shell("run", "side_by_side", "--data", word, "--set", *options, "--out", "runs")
     assert status == 0
     assert "1 ego of with" in out
-    assert "speed" in shell("data", "show", str(folders / "with"))[1]
+    assert "source" in shell("data", "show", str(folders / "with"))[1]
     assert shell("data", "check", "nowhere")[0] == 2
 
 
@@ -192,3 +194,25 @@ def test_a_plane_has_two_dimensions(tmp_path: Path) -> None:
     frame = frame[~frame["kind"].isin(["z", "vz", "inclination"])]
     found = check(read_log(write(frame, tmp_path / "log.csv")))
     assert np.mean([row["nis"] for row in found.vehicles]) == pytest.approx(1.0, abs=0.1)
+
+
+def test_a_report_of_a_log_shows_its_paths_and_no_settings_of_simulated_noise(folders: Path, tmp_path: Path) -> None:
+    given = {**FEW, "method": "gnss,kalman,joint,batch-smoother", "data": str(folders / "with"), "egos": "car0+car2"}
+    results = co.run_study("side_by_side", tmp_path, settings=given, progress=False)
+    page = report([tmp_path / "side_by_side"], tmp_path / "report.html").read_text()
+    for words in ("Scenario", "town10", "Spoofed", "Train seeds"):
+        assert words not in page
+    for words in ("the truth is grey", "Distance from the truth over time", "GNSS repeats a fix", "is not ranked"):
+        assert words in page
+    log = co.read_log(folders / "with")
+    (begin, end), (again, _) = log.recording.stretches("car2")
+    panel = next(axes for axes in paths.errors(results).figure.axes if axes.get_title() == "car2")
+    drawn = {line.get_label(): line.get_xydata() for line in panel.lines}["_KF"]
+    track = co.Kalman("nominal")(log.recording.between(begin, end), ["car2"])
+    expected = np.linalg.norm(track.x[0, :, 0] - log.truth.position[begin:end, 2], axis=1)
+    np.testing.assert_allclose(drawn[: end - begin, 1], expected)
+    assert np.isnan(drawn[end - begin, 1])
+    assert drawn[end - begin + 1, 0] == log.recording.t[again]
+    texts = re.findall(r"<title>(KF: RT-LE .*?)</title>", page)
+    mean = results.interval("rt_le_m", method="kalman", max_neighbours=2)
+    assert f"KF: RT-LE {mean.mean:.3g} m [{mean.low:.3g}, {mean.high:.3g}]; Neighbours K 2" in texts

@@ -16,10 +16,12 @@ from coopoc import GNSS, V2X, Fleet, JointFilter, Kalman, Sensors, observe, rt_l
 from coopoc.errors import InputError
 from coopoc.evaluate.metrics import measure
 from coopoc.fleets import load_fleet
+from coopoc.formats.trajectories import read_tum
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.one_file import from_file
 from coopoc.optimize import MEASUREMENTS, Problem, Status, solve
 from coopoc.plugins import find
+from coopoc.study.results import Results
 from coopoc.study.run import plan, run_study
 from coopoc.world.channels import channel
 
@@ -56,9 +58,16 @@ def commands(word: str) -> list[str]:
 
 def test_a_method_of_ones_own_beside_others(folder: Path) -> None:
     (command,) = commands("alpha.py:Alpha")
-    table = shell(command, folder)
+    table = shell(f"{command} --tracks tum", folder)
+    rows, fleet = Results.load(folder / "runs/side_by_side").select(method="alpha.py:Alpha"), load_fleet("town10")
+    for _, row in rows.iterrows():
+        name = f"{row['max_neighbours']}-alpha.py_Alpha-nominal-{row['ego']}-run{row['run']}.tum"
+        error = (
+            read_tum(folder / "runs/side_by_side/tracks" / name).position - fleet.position[:, fleet.index(row["ego"])]
+        )
+        assert np.sqrt(np.mean(np.sum(error**2, axis=1))) == pytest.approx(row["rt_le_m"], rel=1e-6)
     alpha, *_, bound = re.findall(r"^\| (\S.*?) +\| \w+ +\| +\**([\d.]+)\**", table, flags=re.MULTILINE)[:4]
-    assert (alpha[0], bound[0]) == ("Alpha", "Cramér-Rao bound")
+    assert (alpha[0], bound[0]) == ("alpha", "Cramér-Rao bound")
     assert float(alpha[1]) > float(bound[1])
 
 

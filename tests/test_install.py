@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+
+from coopoc.errors import MissingLibraryError
 
 ROOT = Path(__file__).resolve().parents[1]
 PARTS = ["coopoc", "learned", "studies", "data", "pyproject.toml", "README.md", "LICENSE", "NOTICE"]
@@ -100,4 +103,41 @@ for words in (["train", "okf"], ["run", "neighbours", "--set", "method=okf", "ru
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     assert "SOLVED" in done.stdout
     assert "fedkalmannet" in done.stdout
-    assert done.stderr.count("pip install 'coopoc[learned]'") == 2
+    assert done.stderr.count(str(MissingLibraryError("torch", "a learned gain", "'coopoc[learned]'"))) == 2
+    assert re.search(r"pip install (-e )?'/.*\[learned\]'", done.stderr)  # from the folder: no index has it
+
+
+@pytest.mark.parametrize("library", ["casadi", "pyarrow", "cvxpy"])
+def test_what_is_missing_is_named_and_the_rest_works(tmp_path: Path, library: str) -> None:
+    code = f"""
+import sys
+import numpy as np
+sys.modules[{library!r}] = None  # as if it were not installed
+import coopoc as co
+from coopoc.cli import main
+still = np.zeros((3, 2, 3))
+seen = co.observe(co.Fleet(("a", "b"), [0, 0.1, 0.2], still + [[[0, 0, 0], [9, 1, 0]]], still), co.Sensors(), co.V2X(1))
+print(co.Kalman()(seen, ["a"]).x.shape)
+problem = co.Problem.from_snapshot(seen, step=1, ego="a")
+uses = {{
+    "casadi": lambda: co.solve(problem),
+    "pyarrow": lambda: co.load_fleet("town10"),
+    "cvxpy": lambda: co.solve(problem, "cvxpy"),
+}}
+for name, use in uses.items():
+    try:
+        use()
+    except co.MissingLibraryError as error:
+        print("refused", name, error)
+    except co.InputError as error:
+        print("another reason", name)
+main(["check"])
+"""
+    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 1
+    assert "(1, 3, 1, 3)" in done.stdout
+    refused = [line.split()[1] for line in done.stdout.splitlines() if line.startswith("refused")]
+    assert library in refused
+    assert set(refused) <= {library, *(["cvxpy"] if library == "casadi" else [])}
+    assert re.search(f"coopoc: {library}(-base)? is not installed. Run: pip install {library}", done.stderr)
+    assert done.stdout.count("SOLVED") == {"casadi": 0, "pyarrow": 5, "cvxpy": 4}[library]

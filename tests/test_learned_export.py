@@ -14,12 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from export_onnx import AGREE, INPUTS, OUTPUTS, STEPS, agree, first_inputs, to_onnx
 
 from coopoc import V2X, InputError, Sensors, load_fleet, observe
 from coopoc.arrays import AnyArray, Floats
 from coopoc.errors import MissingLibraryError
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF, checkpoint
-from coopoc.learned.export import AGREE, INPUTS, OUTPUTS, STEPS, agree, first_inputs, to_onnx
 from coopoc.learned.nets.gain import Recurrent
 from coopoc.learned.recipes import WEIGHTS
 

@@ -179,7 +179,7 @@ def test_functions_refuse_arguments_of_the_wrong_kind() -> None:
     }
     swept(co.RelativeMeasurement, relative)
     swept(co.Message, {"name": "m", "numbers": 6})
-    swept(co.NoiseModel, {"name": "n", "sensors": SENSORS, "gnss_std": (1, 1, 1), "velocity": None})
+    swept(co.NoiseModel, {"name": "n", "sensors": SENSORS, "gnss_std": (1, 1, 1), "fleet": None})
     for metric in (co.rt_le, co.max_error, co.nees):
         swept(metric, {"track": TRACK, "fleet": FLEET})
     swept(co.posterior_bound, {"fleet": FLEET, "sensors": SENSORS, "ego": 0, "smoothing": False})
@@ -193,7 +193,6 @@ def test_functions_refuse_arguments_of_the_wrong_kind() -> None:
     swept(RECORDING.between, {"start": 0, "stop": 3})
     swept(RECORDING.neighbours, {"ego": 0})
     swept(RECORDING.links.of, {"observer": 0})
-    swept(co.channel_load, {"position": np.zeros((2, 3)), "size": [100.0, 100.0], "rate": [1.0, 1.0]})
 
 
 PROBLEM = co.Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)

@@ -1,9 +1,6 @@
-"""The study of bytes, and the survey that answers by it: payload, air, schedules, and the break-even with training."""
+"""The study of bytes: payload, air, schedules, and the break-even with training."""
 
 from __future__ import annotations
-
-import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -16,9 +13,8 @@ from coopoc.learned import Checkpoint, save
 from coopoc.learned import load as load_weights
 from coopoc.learned.recipes import WEIGHTS, Setting, jobs_of
 from coopoc.studies import budget as study
-from coopoc.studies import scene, survey
+from coopoc.studies import scene
 from coopoc.study import numbers
-from coopoc.study.report import report
 from coopoc.study.tables import Table
 from coopoc.world.channels import CHANNELS
 from coopoc.world.sensing import find_links
@@ -136,37 +132,3 @@ def test_the_ledger_puts_training_and_deciding_on_one_axis(tight: Results, short
     once = (len(card["history"]) - 1) * 4 * (2 * card["parameters"] + 1)
     (row,) = [row for row in rows(study.even(tight)) if row[0] == study.WORDS["cam"]]
     assert row[3:] == (round(account.rate()), study.duration(once / account.rate()))
-
-
-@pytest.mark.slow
-def test_answers_come_from_the_numbers(tmp_path: Path, short_town: str) -> None:
-    few = {
-        "data": short_town,
-        "runs": 2,
-        "egos": "2",
-        "method": "gnss,kalman,joint,bound",
-        "max_neighbours": "0,4",
-        "train_seeds": 1,
-    }
-    two = {"runs": 1, "max_neighbours": "2", "after_s": "3,30", "speed": "0,1,10"}
-    found = {"budget": run_study("budget", tmp_path, settings={**few, "channel": "ideal"}, progress=False)}
-    found |= {"heading_error": run_study("heading_error", tmp_path, settings=two, progress=False)}
-    said = survey.survey_answers(found)
-    alone, together, bound = (
-        numbers.rms(found["budget"], {"method": method, "noise_model": known, "max_neighbours": k, "rate_hz": 0.0})
-        for method, known, k in (("kalman", "nominal", 0), ("joint", "nominal", 4), ("bound", "with its past", 4))
-    )
-    assert alone is not None
-    assert together is not None
-    assert bound is not None
-    limits = [f"Which method with {words}?" for words in survey.LIMITS.values()]
-    assert list(said) == [*limits, "If the heading is not known?"]
-    rich, poor, none, heading = said.values()
-    assert rich.startswith("With the noise known, Joint filter with K = 4 and ")
-    assert f"{together / bound:.2f} times the bound" in rich
-    assert none.startswith("With the noise known, KF: ")
-    assert "with the noise fitted elsewhere, KF" in none
-    assert poor != rich  # 4 neighbours at 10 Hz take more than 300 B/s
-    assert heading.startswith("K = 2, 10 m/s: ")
-    page = report([tmp_path / "budget"], tmp_path / "report.html", answers=said).read_text()
-    assert f"<dt>Which method with no V2X?</dt><dd>{none}</dd>" in re.sub("</?abbr[^>]*>", "", page)

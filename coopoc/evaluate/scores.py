@@ -74,9 +74,8 @@ def scored(
 
     Returns:
         Columns (R, E): `neighbours_mean`; RT-LE, largest error and neighbours' error in m; the rates of BYTES;
-        `worse_than_gnss` and `left_fixes`, 1 or 0; `nees` and `nees_inside` of a method with a covariance; `seconds` of
-        wall time per run and vehicle served; and `error_quantiles_m` (R, E, q) and the column NAME of a metric if some
-        are wanted.
+        `left_fixes`, 1 or 0; `nees` and `nees_inside` of a method with a covariance; `seconds` of wall time per run and
+        vehicle served; and `error_quantiles_m` (R, E, q) and the column NAME of a metric if some are wanted.
 
     >>> from coopoc import GNSS, Sensors, observe
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
@@ -91,7 +90,7 @@ def scored(
         if metric:
             parts[-1][metric.rpartition(":")[2]] = measure(metric, track, drive)
         if track.covariance is not None:
-            each = nees(track, drive)
+            each = nees(track, drive, method=method.name)
             parts[-1]["nees"] = np.nanmean(each, axis=1)
             squares.append(each.sum(axis=0))
     found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
@@ -112,17 +111,15 @@ def slabs(recording: Recording, egos: int) -> Iterator[Recording]:
 
 def _columns(track: Track, recording: Recording, method: Method, drive: Fleet, quantiles: int) -> dict[str, AnyArray]:
     """Columns that need no average over runs."""
-    error, mine = errors(track, drive), list(track.egos)
+    error = errors(track, drive)
     level = np.sqrt((error**2).mean(axis=1))
-    fixes = np.sqrt((np.square(recording.gnss.take(mine, axis=2) - drive.position[:, mine]).sum(axis=-1)).mean(axis=1))
     account = of_track(track, recording, method.message)
     found = {
         "rt_le_m": level,
         "max_error_m": error.max(axis=1),
         "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
         **{name: account.of("online", *counted) / account.seconds for name, counted in BYTES.items()},
-        "worse_than_gnss": (level > 1.001 * fixes).astype(float),
-        "left_fixes": far_off(track.x, recording, mine).astype(float),
+        "left_fixes": far_off(track.x, recording, list(track.egos)).astype(float),
     }
     if quantiles:
         spaced = np.quantile(error, np.linspace(0, 1, quantiles), axis=1)

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy import stats
+from scipy import special
 
 from ..arrays import AnyArray, Floats, checked, number
 from ..errors import InputError
@@ -100,7 +100,7 @@ def over_seeds(values: AnyArray, level: float = 0.95) -> Seeds:
     if values.ndim < 1 or len(values) < 2 or not np.isfinite(values).all():
         raise InputError("values", values.shape, "need at least two seeds of finite values", "Train more seeds.")
     means: Floats = values.reshape(len(values), -1).mean(axis=1)
-    half = stats.t.ppf((1 + level) / 2, len(means) - 1) * means.std(ddof=1) / np.sqrt(len(means))
+    half = special.stdtrit(len(means) - 1, (1 + level) / 2) * means.std(ddof=1) / np.sqrt(len(means))
     mean = float(means.mean())
     return Seeds(means, Interval(mean, mean - float(half), mean + float(half), len(means)))
 
@@ -135,7 +135,7 @@ def _interval(resampled: Floats, mean: float, values: Floats, level: float) -> I
     n = values.shape[0] if values.shape[0] > 1 else values.shape[1]
     if n < 2:
         return Interval(mean, math.nan, math.nan, values.size)
-    low = stats.norm.cdf(np.sqrt(n / (n - 1)) * stats.t.ppf((1 - level) / 2, n - 1))
+    low = special.ndtr(np.sqrt(n / (n - 1)) * special.stdtrit(n - 1, (1 - level) / 2))
     ends = np.quantile(resampled, [low, 1 - low])
     return Interval(mean, float(ends[0]), float(ends[1]), values.size)
 

@@ -186,7 +186,9 @@ def solo_track(
     cov, none = np.zeros((*p.shape, 3)), np.zeros((recording.runs, len(columns)))
     np.einsum("...ii->...i", cov)[:] = p
     notes = (*notes, *lost(x, recording, columns))
-    return Track(recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, notes=notes)
+    return Track(
+        recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, notes=notes, ids=recording.ids
+    )
 
 
 def solo_filter(

@@ -37,6 +37,7 @@ from ..kernels.stars.cooperative_state import (
 )
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.relative import components
+from ..world.links import told
 from .cooperative_filter import Broadcast, CooperativeFilter, guards_of, model_of
 from .joint_filter import JointFilter
 from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
@@ -77,7 +78,7 @@ class RelativeMeasurement:
         if relative.shape != (3,) or not named or not (0.0 < relative[0] < math.inf or math.isnan(relative[0])):
             text = "must have a name and three numbers, the range first and > 0"
             raise InputError("relative", (self.id, self.relative), text, "Give NaN for what was not measured.")
-        row[:AGE], row[AGE] = components(relative[None, None], FIRST)[0, 0], seconds("age", self.age)
+        row[:AGE], row[AGE] = components(told(relative)[None, None], FIRST)[0, 0], seconds("age", self.age)
         row[SOLO:SOLO_VARIANCE] = fix_or_none(self.gnss, "neighbour's gnss")
         if self.variance is not None:
             row[SOLO_VARIANCE:ODOMETER] = three("neighbour's variance", self.variance)

@@ -101,6 +101,7 @@ def fleet_track(
         met.sent_bytes[:, columns],
         time.perf_counter() - began,
         notes=model.notes + answer.notes + contradicted(x, recording, columns),
+        ids=recording.ids,
     )
 
 
@@ -127,7 +128,7 @@ def kernel_arguments(
     columns = (met.first, met.second, met.link, met.link_back, met.start)
     first, second, link, link_back, start = (np.ascontiguousarray(column, dtype=np.int64) for column in columns)
     pairs = Pairs(first, second, link, link_back, start, np.ascontiguousarray(both & (arrival >= 0)))
-    relative = components(recording.relative, np.arange(len(recording.links)))
+    relative = components(recording.told, np.arange(len(recording.links)))
     variances = model.process_variance(recording), model.fix_variance(recording)
     process, fix = (np.ascontiguousarray(variance, dtype=float) for variance in variances)
     std, min_range = (model.sensors.relative_std, model.sensors.min_range) if model.sensors else (np.zeros(0), 0.0)

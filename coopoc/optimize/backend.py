@@ -12,7 +12,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
-from ..errors import InputError, MissingLibraryError, suggestion, unknown
+from ..errors import InputError, require, suggestion, unknown
 from ..plugins import find, names
 from .model.problem import Problem
 
@@ -165,8 +165,8 @@ def require_backend(backend: str | Backend) -> Backend:
         backend = _checked(backend) if ".py" in backend else _registered(backend)  # a file may change
     elif not isinstance(backend, Backend):
         raise unknown("backend", backend, backends())
-    if not backend.installed:
-        raise MissingLibraryError(str(backend.library), f"backend {backend.name!r}", str(backend.library))
+    if backend.library is not None:
+        require(backend.library, f"backend {backend.name!r}")
     return backend
 
 

@@ -7,13 +7,14 @@ import sys
 import time
 from dataclasses import fields, replace
 from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import Positional, arg
 
-from ..errors import InputError
+from ..errors import InputError, dependencies
 from ..formats import load_graph
 from ..formats.graph import Graph
 from .backend import backends
@@ -153,16 +154,19 @@ def tiny(kind: str = "spherical") -> Problem:
 
 
 def check() -> int:
-    """Solve one tiny problem with every backend and compare the answers.
+    """Name libraries that are missing, solve one tiny problem with every backend and compare the answers.
 
     Example: coopoc check
     """
     failed = 0
+    absent = [package for library, package in dependencies().items() if find_spec(library) is None]
+    for package in absent:
+        say(f"{package} is not installed. Run: pip install {package}")
     print(f"{'backend':<14} {'constraints':<12} {'status':<10} {'cost':>12} {'differs [m]':>11} {'ms':>8}  measures")
     for name, backend in backends().items():
         fixed = backend.capabilities.constraints
-        if not backend.installed:
-            print(f"{name:<14} {fixed:<12} not installed: pip install {backend.library}")
+        if not backend.installed or find_spec("casadi") is None:
+            print(f"{name:<14} {fixed:<12} needs {backend.library if not backend.installed else 'casadi'}")
             continue
         kind = "range" if backend.capabilities.lacking(tiny()) else "spherical"
         expected = solve(tiny(kind))
@@ -174,4 +178,4 @@ def check() -> int:
         failed += not good
         print(f"{name:<14} {fixed:<12} {found.status.name:<10} {found.cost:12.6g} {off:11.1e} {took:8.1f}  {kind}")
     say(f"{len(backends())} backends, {failed} disagree with gauss-newton")
-    return int(failed > 0)
+    return int(failed > 0 or bool(absent))

@@ -163,7 +163,9 @@ def curves(
                     names["noise_model"] = "none"
                 text = _joined(groups[id(of)], models)
                 style = {name: of[name] for name in STYLE if name in of}
-                _draw(axis, names, points, {**style, "label": text} if "label" in of else style)
+                if "label" in of or len(groups[id(of)]) > 1:
+                    style["label"] = text if "label" in of else f"_{text}"
+                _draw(axis, names, points, style)
                 named += [names] if names not in named else []
                 also[name_of(names)] = text.removeprefix(_joined([of]))
             for group in _coinciding([(panel, drawn)], log, WIDTH * height_of):
@@ -289,7 +291,8 @@ def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> 
     axes.plot(list(points), list(map(_mean, points.values())), **options)
     if bands:
         ends = [point.low for point in bands.values()], [point.high for point in bands.values()]
-        axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0)
+        name = "_" + str(options["label"]).lstrip("_")
+        axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0, label=name)
 
 
 def _vertical(axes: Axes, text: str, log: bool) -> None:

@@ -24,6 +24,7 @@ _FIELDS = {
     "findings": dict,
     "recipe": dict,
     "missing": dict,
+    "idle": list,
     "limitations": list,
     "minutes": (int, float, type(None)),
 }
@@ -65,7 +66,8 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
             bar.update()
         for name, figure in study.figures.items():
             if (plot := made(name, figure)) is not None:
-                shown["figures"].append({"name": name, "caption": plot.save(folder / "figures" / name)})
+                caption = plot.save(folder / "figures" / name)
+                shown["figures"].append({"name": name, "caption": caption, "marks": plot.marks()})
             bar.update()
     with suppress(InputError):  # files of views that an earlier run made, and this one does not, show other numbers
         before = views(folder)
@@ -79,6 +81,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
         "findings": {**(made("findings", study.answers) or {}), **_reference(study, results)},
         "recipe": dict(made("recipe", study.recipe) or {}),
         "missing": missing,
+        "idle": sorted(made("idle", study.idle) or ()),
         "limitations": list(study.limitations),
         "minutes": study.minutes,
     }

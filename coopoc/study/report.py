@@ -92,7 +92,7 @@ def _section(folder: Path) -> dict[str, Any]:
         "name": results.study,
         "title": words(results.study),
         "question": results.question,
-        "settings": results.settings,
+        "settings": {key: value for key, value in results.settings.items() if key not in shown["idle"]},
         "environment": results.environment,
         "pending": results.pending,
         "cells": results.frame["cell"].nunique() if len(results.frame) else 0,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import itertools
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -61,10 +61,13 @@ class Study:
         findings: Results -> key -> sentence for the top of the report, empty where the results lack its numbers. The
             key stays the same when the sentence changes: other code finds it by that.
         recipe: Results -> field -> value of the training, for the report.
+        idle: Results -> names of settings that do nothing in them, which the report leaves out.
         limitations: sentences.
         minutes: expected on one core.
         metrics: metrics with reference values -> "lower" or "higher", which is better, or the best value.
         reference: file of the reference values, see `coopoc.study.reference`; it may be absent.
+
+        tracks: parameters -> name, t (T,) s and position (T, 3) m of each estimated path.
 
     Raises:
         InputError: an empty grid, a cell twice, a parameter that is no scalar, a name that is both axis and setting, a
@@ -87,10 +90,12 @@ class Study:
     figures: Mapping[str, Callable[[Results], Plot | None]] = field(default_factory=dict)
     findings: Callable[[Results], Mapping[str, str]] | None = None
     recipe: Callable[[Results], Mapping[str, Any]] | None = None
+    idle: Callable[[Results], Collection[str]] | None = None
     limitations: tuple[str, ...] = ()
     minutes: float | None = None
     metrics: Mapping[str, str | float] = field(default_factory=dict)
     reference: str | Path | None = None
+    tracks: Callable[[Params], Iterable[tuple[Any, ...]]] | None = None
 
     def __post_init__(self) -> None:
         file_name("study", self.name, "Rename the study: its folder has this name.")
@@ -108,6 +113,10 @@ class Study:
         if isinstance(self.grid, Mapping):
             return tuple(self.grid)
         return tuple(dict.fromkeys(name for params in self.grid for name in params))
+
+    def values(self) -> dict[str, tuple[Scalar, ...]]:
+        """Values of each axis."""
+        return {name: tuple(_values(self.grid, name)) for name in self.axes}
 
     def cells(self) -> list[Cell]:
         """All cells in the order of the grid, each named by the hash of all that changes its numbers."""
@@ -224,9 +233,13 @@ def _check_used(study: Study, name: str) -> None:
             raise InputError(name, repr(value), "leads to no cell under these settings", f"Write {name}={rest}.")
 
 
+def _values(grid: Any, name: str) -> list[Any]:
+    return list(grid[name]) if isinstance(grid, Mapping) else list(dict.fromkeys(p[name] for p in grid if name in p))
+
+
 def _narrow(grid: Any, name: str, value: Any) -> Any:
     listed = value.split(",") if isinstance(value, str) else value if isinstance(value, list | tuple) else [value]
-    values = list(grid[name]) if isinstance(grid, Mapping) else list(dict.fromkeys(p[name] for p in grid if name in p))
+    values = _values(grid, name)
     wanted = [parse(name, v, next((k for k in values if k is not None), None)) for v in listed]
     if isinstance(grid, Mapping):
         return {**grid, name: tuple(wanted)}

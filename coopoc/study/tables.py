@@ -25,6 +25,8 @@ if TYPE_CHECKING:
 Entry: TypeAlias = Interval | float | int | str | None
 Best: TypeAlias = Literal["min", "max"] | None
 REFERENCES = (METHODS["bound"].label, METHODS["oracle"].label, "oracle")
+SMOOTHERS = (METHODS["batch-smoother"].label,)
+"""Labels of methods that use later measurements, too: they are compared with each other alone."""
 FORMATS = {"markdown": "md", "csv": "csv", "latex": "tex", "html": "html"}
 
 
@@ -182,10 +184,14 @@ class Table:
             for j, entry in enumerate(row):
                 names = {*self.header[j].split(", "), *row}
                 mean = entry.mean if isinstance(entry, Interval) else entry
-                if isinstance(mean, float) and math.isfinite(mean) and not names & set(self.unranked):
+                if isinstance(mean, float) and math.isfinite(mean) and not names & {*self.unranked, *SMOOTHERS}:
                     places.setdefault(i if self.along == "row" else j, []).append((round(mean, self.decimals), i, j))
         pick = min if self.best == "min" else max
-        return {(i, j) for group in places.values() if len(group) > 1 for mean, i, j in group if mean == pick(group)[0]}
+        best = [[(i, j) for mean, i, j in group if mean == pick(group)[0]] for group in places.values()]
+        shares = zip(best, places.values(), strict=True)  # what three and most have is no distinction
+        return {
+            place for same, group in shares if len(same) <= max(2, len(group) / 2) and len(group) > 1 for place in same
+        }
 
 
 def pivot(
@@ -219,6 +225,9 @@ def pivot(
     """
     down, across = ([names] if isinstance(names, str) else list(names) for names in (rows, columns))
     summary = results.summary([*down, *across], value, where)
+    same = [name for name in down if len(down) > 1 and summary[name].nunique(dropna=False) == 1]
+    caption = " ".join([caption or f"{words(value)}: mean and 95 % interval.", *(_all(summary[s]) for s in same)])
+    down = [name for name in down if name not in same] or down[:1]
     summary["_title"] = [", ".join(title(c, row[c]) for c in across) for _, row in summary.iterrows()]
     titles = list(dict.fromkeys(summary["_title"]))
     body = []
@@ -229,18 +238,25 @@ def pivot(
             if row["n"]
         }
         body.append((*(label(d, n) for d, n in zip(down, names, strict=True)), *map(entries.get, titles)))
-    missing = int(summary["missing"].sum())
+    missing, smoothed = int(summary["missing"].sum()), [row for row in body if set(SMOOTHERS) & {*map(str, row)}]
     gone = [f"{missing} egos are left out because a run of theirs failed."] if missing else []
+    if smoothed and best:
+        gone.append(f"{', '.join(SMOOTHERS)}: knows later measurements, too, and is not ranked.")
     return Table(
         (*map(words, down), *titles),
-        tuple(body),
-        caption or f"{words(value)}: mean and 95 % interval.",
+        (*(row for row in body if row not in smoothed), *smoothed),
+        caption,
         best,
         along or ("column" if "method" in down else "row"),
         decimals=decimals,
         intervals=intervals,
         notes=(*gone, *lost(results, where)),
     )
+
+
+def _all(column: Any) -> str:
+    """What is the same in every row, and no column."""
+    return f"{words(str(column.name))}: {label(str(column.name), column.iloc[0])}."
 
 
 def lost(results: Results, where: Mapping[str, Any] | None = None) -> list[str]:

@@ -152,6 +152,7 @@ class PoseFilter:
             heading=wrap(x[..., 3]),
             heading_covariance=cov[..., 3, :4],
             extras=extras,
+            ids=recording.ids,
         )
 
     def start(self, dt: float, begin: Floats | None = None) -> PoseStream:

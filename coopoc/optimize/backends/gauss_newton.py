@@ -44,5 +44,6 @@ BACKEND = Backend(
     "gauss-newton",
     prepare,
     "reference: Levenberg-Marquardt, all realisations at once; large graphs by sparse Cholesky factors",
+    library="casadi",  # writes the derivatives of all measurements
     capabilities=Capabilities(batched=True, compiled=True),
 )

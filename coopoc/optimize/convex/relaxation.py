@@ -12,14 +12,13 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from importlib.util import find_spec
 
 import numpy as np
 from scipy.sparse import csc_matrix
 from tqdm import tqdm
 
 from ...arrays import Floats
-from ...errors import InputError, MissingLibraryError
+from ...errors import InputError, require
 from ...short_repr import short_repr
 from ..algebra.cholesky import cholesky_of
 from ..model.problem import Problem
@@ -129,8 +128,7 @@ def semidefinite(
     Clarabel solves min q'x, A x + s = b, s in a cone; a new C is a new b. It takes C (bound, bound) and returns the
     multipliers of Stiefel blocks (n, k, k) and of spheres (m,), and Z.
     """
-    if find_spec("clarabel") is None:
-        raise MissingLibraryError("clarabel", "a convex relaxation", "clarabel")
+    require("clarabel", "a convex relaxation")
     clarabel = importlib.import_module("clarabel")
     (n, k), (m, q) = stiefel, sphere
     size, pairs = n * k + m * q, k * (k + 1) // 2
