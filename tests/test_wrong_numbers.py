@@ -101,8 +101,8 @@ def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Flo
     way = np.random.default_rng(1).normal(size=(RUNS, 3))
     error = np.geomspace(1.0, 1e6, RUNS)[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
     velocity = recording.velocity.copy()
-    if kind == "velocity":
-        velocity[run, step, sender] += error
+    if kind == "velocity":  # a recording takes none of more than 10 km/s
+        velocity[run, step, sender] += 5e-3 * error
     given = replace(damaged(recording, kind, links), velocity=velocity) if kind else recording
     known = resolve("nominal", given)
     sent, variance = broadcasts(given, known, [EGO], method.guards)
