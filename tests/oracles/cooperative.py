@@ -116,7 +116,8 @@ class Oracle:
     ) -> None:
         s, self.alone = known.sensors, alone
         self.seen, self.ego, self.run, self.known, self.guards, self.robust = seen, ego, run, known, guards, robust
-        self.life, self.std, self.white = Life(0, 0, 1, 0, 0), np.ones(3), np.ones(3)
+        self.life, self.white = Life(0, 0, 1, 0, 0), np.ones(3)
+        self.std: Floats = np.ones(3)
         if s is not None:
             self.std = s.relative_std.copy()
         if robust and s is not None:
