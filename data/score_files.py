@@ -133,7 +133,7 @@ def score(
         for remark in row.remarks:
             print(f"coopoc: {row.vehicle}: {remark}", file=sys.stderr)
     if plot is not None:
-        draw(compared(*made, align, max_diff, offset), plot)
+        draw(compared(made[0], made[1], align, max_diff, offset), plot)
     if output is not None:
         output.write_text(json.dumps([_plain(asdict(row)) for row in rows], indent=1, allow_nan=False) + "\n")
         print(f"coopoc: scores are in {output}", file=sys.stderr)
@@ -146,7 +146,7 @@ def draw(pairs: Mapping[str, tuple[Path, Path, Path]], path: File) -> None:
     for k, (name, (_, estimate, truth)) in enumerate(pairs.items()):
         ax.plot(*truth.position[:, :2].T, color=INK, lw=1, ls="--")
         ax.plot(*estimate.position[:, :2].T, color=COLORS[k % len(COLORS)], label=picture(name))
-    finish(ax).get_figure().savefig(path)
+    finish(ax).figure.savefig(path)
 
 
 def _plain(value: Any) -> Any:

@@ -213,8 +213,8 @@ def _logs(cards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
         shown = {"task": row["task"], "method": one, "RT-LE [m]": "failed"}
         if "failed" not in row:
             shown["RT-LE [m]"] = "{} [{}, {}]".format(*map(three, row["rt_le_m"]))
-            own = row.get("calibrated_m", ())
-            shown["calibrated [m]"] = "{} [{}, {}]".format(*map(three, own)) if own else ""
+            if own := row.get("calibrated_m"):
+                shown["calibrated [m]"] = "{} [{}, {}]".format(*map(three, own))
             shown |= {"heading [°]": row.get("heading_deg", ""), "NEES": row.get("nees", "")}
             shown |= {"B/s": row["received_bytes_per_second"], "us/step": row["microseconds_per_step"]}
         rows.append(((row["task"], row.get("rt_le_m", [np.inf])[0]), shown))

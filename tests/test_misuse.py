@@ -93,7 +93,6 @@ METHODS: tuple[Any, ...] = (
     co.CentralFilter,
     co.CovarianceIntersection,
     co.GaussianBeliefPropagation,
-    co.ConsensusADMM,
 )
 FLEET = co.load_fleet("town10").between(0, 6).select([0, 1, 2, 3])
 SENSORS, CHANNEL = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=3)
@@ -204,7 +203,6 @@ def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
     swept(co.solve, {"problem": whole, "backend": "gauss-newton", "throw": True})
     swept(optimize.solve_batch, {"problem": whole, "backend": "gauss-newton"})
     swept(optimize.solve_gnc, {"problem": whole, "candidates": [0], "loss": "truncated", "threshold": 0.99})
-    swept(optimize.solve_distributed, {"problem": whole, "owner": "ab", "rounds": 1, "rho": 0.3, "loss": 0.0})
     swept(optimize.joint_covariance, {"problem": whole, "solution": solution, "nodes": ["a", "b"]})
     swept(optimize.loop_closures, {"problem": whole})
     swept(co.Loss, {"name": "huber", "scale": 1.0})

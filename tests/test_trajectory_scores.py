@@ -176,6 +176,7 @@ def test_estimates_share_a_truth_and_rotations_are_scored(
     times = folder / "KITTI_00_gt_times.txt"
     truth, poses = (read_kitti(folder / f"KITTI_00_{name}.txt", times) for name in ("gt", "ORB"))
     for name, factor in (("whole", 1.0), ("half", 0.5)):
+        assert poses.stamps is not None
         table = [poses.stamps, factor * poses.position, Rotation.from_matrix(poses.rotation).as_quat()]
         np.savetxt(tmp_path / f"{name}.txt", np.column_stack(table), fmt="%.17g")
     named = [str(tmp_path / f"{name}.txt") for name in ("whole", "half")]

@@ -129,6 +129,8 @@ def test_links_are_the_nearest_within_the_radius(crossing: Fleet) -> None:
             mine = (recording.links.step == step) & (recording.links.observer == observer)
             assert recording.links.neighbour[mine].tolist() == expected
             assert recording.neighbours(observer)[step] == len(expected)
+    pair = Fleet(("a", "b"), [0, 0.1], np.full((2, 2, 3), [[0, 0, 0], [25, 0, 0]]), np.zeros((2, 2, 3)))
+    assert len(observe(pair, S2, V2X(1, radius=25.0)).links) == 4  # one at the radius is within it
 
 
 def test_vector_cov_against_sampling() -> None:

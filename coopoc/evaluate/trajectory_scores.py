@@ -360,7 +360,7 @@ def angles(a: Floats, b: Floats) -> Floats:
     >>> angles(np.eye(3)[None], np.diag([-1.0, -1.0, 1.0])[None]).tolist()
     [180.0]
     """
-    return np.degrees(Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).magnitude())
+    return np.asarray(np.degrees(Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).magnitude()))
 
 
 def _rms(values: Floats) -> float:

@@ -137,6 +137,9 @@ class StarStream:
         self._model, self._guards = model_of(known, robust), NO_GUARDS
         if isinstance(filter, JointFilter):
             self._model = self._model._replace(exact=float(filter.exact and known.exact_relative))
+            if filter.robust and known.exact_relative:
+                usual = Guards()
+                self._guards = NO_GUARDS._replace(gate=usual.gate, fix_gate=usual.fix_gate)
         elif robust:
             self._guards = guards_of(filter, known)
         self._motion: MotionNoise = motion_noise(known, interval)
