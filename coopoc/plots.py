@@ -79,7 +79,7 @@ def plot_track(
     fair = max(len(track.t) // 40, 1)
     every = number("every", fair if every is None else every, 1, kind=int, allowed=">= 1 step")
     if fleet is not None:
-        instance("fleet", fleet, Fleet).require(track.ids or fleet.ids, track.t)
+        instance("fleet", fleet, Fleet).require((track.ids or fleet.ids)[: len(fleet.ids)], track.t)
     ax = axes(ax)
     for k, ego in enumerate(track.egos):
         color = COLORS[k % len(COLORS)]

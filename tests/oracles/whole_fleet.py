@@ -13,7 +13,7 @@ class Drive:
     def __init__(self, recording, noise_model, met, arrival, run):  # type: ignore[no-untyped-def]
         self.noise_model, self.met, self.dt, self.arrival = noise_model, met, recording.dt, arrival
         self.gnss, self.velocity, self.relative = (
-            values[run] for values in (recording.gnss, recording.velocity, recording.relative)
+            values[run] for values in (recording.gnss, recording.velocity, recording.told)
         )
         self.q, self.r = (
             np.broadcast_to(values, recording.gnss.shape)[run]
