@@ -30,7 +30,7 @@ def _truth(track: Track, fleet: Fleet) -> Floats:
     track = instance("track", track, Track, "A method makes one of a recording: the track stands before the fleet.")
     fleet = instance("fleet", fleet, Fleet, "Score a track against its fleet: the track stands before the fleet.")
     egos = np.array(track.egos, dtype=np.int64)
-    hint = "Score a track against the fleet that its recording was observed from."
+    hint = "Score a track against the fleet that its recording was observed from, cut alike: fleet.between(...)."
     if len(track.t) != len(fleet.t):
         raise InputError("track.t", f"{len(track.t)} steps", f"must have the fleet's {len(fleet.t)} steps", hint)
     refuse("track.egos", egos, egos >= len(fleet.ids), f"must be columns of the fleet, 0..{len(fleet.ids) - 1}", hint)

@@ -16,6 +16,7 @@
 
 # %%
 import tempfile
+import textwrap
 from pathlib import Path
 
 import numpy as np
@@ -73,7 +74,7 @@ print(log.summary)
 log.recording.stretches("blue")
 
 # %%
-METHODS = {"Kalman": co.Kalman("nominal"), "joint": co.JointFilter("nominal"), "cooperative": co.CooperativeFilter()}
+METHODS = {"Kalman": co.Kalman(), "joint": co.JointFilter(), "cooperative": co.CooperativeFilter()}
 errors = {}
 for name, method in METHODS.items():
     for car in ("red", "blue"):
@@ -81,9 +82,11 @@ for name, method in METHODS.items():
         for start, stop in log.recording.stretches(car):
             track = method(log.recording.between(start, stop), [car])
             true = log.truth.between(start, stop)
-            parts.append((track.t, np.linalg.norm(track.x[0, :, 0] - true.position[:, true.index(car)], axis=1)))
+            gap = track.x[0, :, 0] - true.position[:, true.index(car)]
+            parts.append((track.t, np.linalg.norm(gap, axis=1)))
         errors[name, car] = parts
-        rms = np.sqrt(np.nanmean(np.concatenate([error for _, error in parts]) ** 2))  # the last step has no truth
+        every = np.concatenate([error for _, error in parts])  # the last step has no truth
+        rms = np.sqrt(np.nanmean(every**2))
         print(f"{name:12s} {car:5s} {rms:.2f} m")
 
 # %% [markdown]
@@ -92,10 +95,10 @@ for name, method in METHODS.items():
 # ## The figure
 
 # %%
-from matplotlib.figure import Figure
+import matplotlib.pyplot as plt
 
-figure = Figure(figsize=(7.2, 4.2), dpi=110, layout="constrained")
-for ax, car in zip(figure.subplots(2, sharex=True, sharey=True), ("red", "blue"), strict=True):
+figure, axes = plt.subplots(2, sharex=True, sharey=True, figsize=(7.2, 4.2), layout="constrained")
+for ax, car in zip(axes, ("red", "blue"), strict=True):
     for color, name in zip(("#E69F00", "#009E73", "#7A1FA2"), METHODS, strict=True):
         for k, (seconds, error) in enumerate(errors[name, car]):
             ax.plot(seconds, error, color=color, lw=1.2, label=None if k else name)
@@ -104,10 +107,9 @@ for ax, car in zip(figure.subplots(2, sharex=True, sharey=True), ("red", "blue")
 ax.set_xlabel("time [s]")
 ax.legend(fontsize=8)
 figure.savefig(folder / "errors.png")
-figure
 
 # %%
-ax = co.plot_recording(log.recording, step=300)
+ax = co.plot_recording(log.recording, step=100)
 ax.legend(fontsize=8)
 ax.figure
 
@@ -140,4 +142,4 @@ print(f"innovation {found['innovation_m'].mean():.2f} m, NIS {found['nis'].mean(
 try:
     co.read_log(folder / "log.csv", columns={"t": "zeit", "vehicle": "auto"})
 except co.InputError as error:
-    print(error)
+    print(textwrap.fill(str(error), 88))
