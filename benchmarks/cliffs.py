@@ -35,7 +35,6 @@ GAPS = (
     "fixed-lag",
     "mhe",
     "gbp",
-    "admm",
     "central-filter",
     "batch-smoother",
 )

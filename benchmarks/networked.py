@@ -27,7 +27,6 @@ JOBS = {
     "split-ci": "nominal",
     "ci": "nominal",
     "gbp": "nominal",
-    "admm": "nominal",
     "central-filter": "nominal",
     "central-filter, identity": "identity",
 }

@@ -35,7 +35,6 @@ ORDER = (
     "fixed-lag",
     "mhe",
     "gbp",
-    "admm",
     "central-filter",
     "batch-smoother",
 )

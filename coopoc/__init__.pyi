@@ -23,13 +23,11 @@ from .methods.centralised import BatchSmoother as BatchSmoother
 from .methods.centralised import CentralFilter as CentralFilter
 from .methods.cooperative_filter import CooperativeFilter as CooperativeFilter
 from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
-from .methods.decentralised import ConsensusADMM as ConsensusADMM
 from .methods.decentralised import GaussianBeliefPropagation as GaussianBeliefPropagation
 from .methods.joint_filter import JointFilter as JointFilter
 from .methods.kalman import GNSS as GNSS
 from .methods.kalman import AdaptiveKalman as AdaptiveKalman
 from .methods.kalman import Kalman as Kalman
-from .methods.mds import MDS as MDS
 from .methods.noise_model import NoiseModel as NoiseModel
 from .methods.poses.pose_filter import PoseFilter as PoseFilter
 from .methods.poses.pose_start import pose_start as pose_start
@@ -62,7 +60,6 @@ from .study.results import Results as Results
 from .study.run import run_study as run_study
 from .study.study import Study as Study
 from .world.body_frames import in_world as in_world
-from .world.channels import channel_load as channel_load
 from .world.fleet import Fleet as Fleet
 from .world.links import Links as Links
 from .world.outliers import Fault as Fault

@@ -137,6 +137,18 @@ def number(
     return found
 
 
+def extent(field: str, value: Any, hint: str = "Give (low, high).") -> tuple[float, float]:
+    """(low, high), numbers from 0 on.
+
+    >>> extent("size", [3, 20])
+    (3.0, 20.0)
+    """
+    given = [number(field, each, 0, 1e9, allowed=">= 0", hint=hint) for each in listed(field, value, hint)]
+    if len(given) != 2 or given[0] > given[1]:
+        raise InputError(field, value, "must be 2 numbers (low, high) with low <= high", hint)
+    return given[0], given[1]
+
+
 def one_of(noun: str, name: object, known: Iterable[str]) -> str:
     """`name` if it is one of the words; else the error of `unknown`.
 

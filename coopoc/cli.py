@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable, Mapping, Sequence
 from importlib.metadata import EntryPoint, version
@@ -48,6 +49,7 @@ def run(
     cluster: Annotated[str, arg(metavar="tcp://HOST:PORT")] = "",
     retry_failed: bool = False,
     dry_run: bool = False,
+    tracks: Literal["none", "tum"] = "none",
 ) -> int:
     """Run a study, or resume it: finished cells are kept; --retry-failed repeats failed ones.
 
@@ -63,6 +65,7 @@ def run(
         cluster: address of a Dask scheduler whose workers compute the cells.
         retry_failed: repeat failed cells.
         dry_run: print which cells would be kept, repeated and computed, then stop.
+        tracks: tum writes the estimates, a TUM file for each ego and run, to FOLDER/NAME/tracks.
     """
     from .study.cell import assignments
     from .study.study import find_study
@@ -72,7 +75,7 @@ def run(
         changes["data"] = data
     find_study(name).override(changes)  # a mistake is told before pandas and Arrow are imported
     from .study.publish import tables
-    from .study.run import plan, run_study
+    from .study.run import plan, run_study, write_tracks
 
     if dry_run:
         print(json.dumps(plan(name, out, changes, shard, retry_failed), indent=1, default=str))
@@ -84,6 +87,9 @@ def run(
     for _, row in results.failures.head(5).iterrows():
         params = ", ".join(f"{axis} = {row[axis]}" for axis in results.axes if axis in row)
         print(f"coopoc: failed: {row['reason']} ({params})", file=sys.stderr)
+        print(textwrap.indent("\n".join(row["traceback"].splitlines()[-5:]), "  "), file=sys.stderr)
+    if tracks == "tum":
+        print(f"coopoc: estimates are in {write_tracks(name, out, changes, shard)}", file=sys.stderr)
     failed = f"; cells failed: {results.failed}, try them again with --retry-failed" if results.failed else ""
     done = f"shard {shard} is in {folder}" if shard else f"results are in {folder}"
     then = "When all shards are: the same command without --shard" if shard else f"Report: coopoc report {folder}"

@@ -61,11 +61,13 @@ def picture(text: str) -> str:
 
 
 def spreadsheet(text: str) -> str:
-    """Text that a spreadsheet takes for text: behind an apostrophe if it would be a formula and is no number.
+    """Text that a spreadsheet takes for text, without control characters: behind an apostrophe if it would be a formula
+    and is no number.
 
     >>> spreadsheet("=1+1"), spreadsheet("-0.5"), spreadsheet("KF")
     ("'=1+1", '-0.5', 'KF')
     """
+    text = uncontrolled(text)
     if not visible(text).startswith(("=", "+", "-", "@")):
         return text
     try:

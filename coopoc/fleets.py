@@ -11,7 +11,7 @@ from .world.recording import Recording
 
 
 def load_fleet(name_or_path: str | Path, **options: Any) -> Fleet:
-    """Fleet of a bundled dataset or of a file or folder: CSV, Parquet, TUM, SUMO FCD, CARLA table, MR.CLAM.
+    """Fleet of a bundled dataset or of a file or folder: CSV, Parquet, TUM, SUMO FCD, MR.CLAM.
 
     Args:
         name_or_path: a name that `coopoc data list` shows, or a path.

@@ -78,8 +78,8 @@ def plot_track(
     run = number("run", run, 0, len(track.x) - 1, kind=int, allowed=f"in 0..{len(track.x) - 1}")
     fair = max(len(track.t) // 40, 1)
     every = number("every", fair if every is None else every, 1, kind=int, allowed=">= 1 step")
-    if fleet is not None and instance("fleet", fleet, Fleet).position.shape[0] != len(track.t):
-        raise InputError("fleet", repr(fleet), f"must have {len(track.t)} steps", "Give the fleet that was observed.")
+    if fleet is not None:
+        instance("fleet", fleet, Fleet).require(track.ids or fleet.ids, track.t)
     ax = axes(ax)
     for k, ego in enumerate(track.egos):
         color = COLORS[k % len(COLORS)]

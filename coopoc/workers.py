@@ -1,12 +1,22 @@
-"""Worker processes that end when the process that started them does."""
+"""Processes: workers end when the process that started them does; Ctrl-C ends the command while it loads."""
 
 from __future__ import annotations
 
 import os
 import signal
+import sys
 import threading
 import time
 from functools import lru_cache
+from importlib import import_module
+
+
+def main() -> None:
+    """The console script: without a traceback where it is interrupted while libraries load."""
+    try:
+        import_module("coopoc.cli").main()
+    except KeyboardInterrupt:
+        sys.exit(130)
 
 
 @lru_cache

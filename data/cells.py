@@ -9,13 +9,13 @@ from __future__ import annotations
 import csv
 import re
 from collections import Counter
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopoc.arrays import Bools, Floats
+from coopoc.arrays import Bools, Floats, named, number
 from coopoc.errors import InputError, require, suggestion, unknown
 from coopoc.formats.values import LARGEST
 
@@ -48,7 +48,8 @@ def read_frame(path: Path, *text: str) -> pd.DataFrame:
     try:
         if parquet := path.suffix.lower() == ".parquet":
             require("pyarrow", "a Parquet table")
-        frame = pd.read_parquet(path).reset_index(drop=True) if parquet else _read_csv(path, text)
+        how: dict[str, Any] = {"use_threads": False, "pre_buffer": False}
+        frame = pd.read_parquet(path, **how).reset_index(drop=True) if parquet else _read_csv(path, text)
     except (InputError, ImportError):
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
@@ -121,6 +122,16 @@ def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
         return np.asarray(given.dt.total_seconds(), dtype=float)
     utc = pd.to_datetime(given, utc=True)
     return np.asarray(utc.dt.as_unit("us").astype("int64").to_numpy() / 1e6, dtype=float)  # in ns years end at 2262
+
+
+def factors(given: Mapping[str, float] | None, names: Collection[str], field: str = "scale") -> dict[str, float]:
+    """Numbers by name; InputError for a name that is none of `names`, and for 0."""
+    for name, value in named(field, given or {}, f"Give {field}={{name: number}}.").items():
+        if name not in names:
+            raise unknown(field, name, names)
+        if not number(f"{field} of {name}", value, -LARGEST, LARGEST):
+            raise InputError(f"{field} of {name}", value, "must not be 0", "Leave it out.")
+    return dict(given or {})
 
 
 def words(frame: pd.DataFrame, column: str, file: str) -> list[str]:

@@ -12,7 +12,7 @@ from coopoc.errors import InputError, unknown
 from coopoc.one_file import in_file
 from coopoc.plugins import names
 
-from .fleet_cards import facts, in_words
+from .fleet_cards import in_words
 from .registry import DATASETS, LOGS, card, convert, kind_of, list_datasets, load_fleet, load_log
 from .source import split
 
@@ -28,7 +28,7 @@ def list_() -> None:
 
 
 def show(name: tyro.conf.Positional[str]) -> None:
-    """Show the card of a bundled fleet, or statistics of a file of drives: speeds, neighbours, heights.
+    """Show the card of a bundled fleet, or what a file of drives or a log holds.
 
     Example: coopoc data show town10
 
@@ -46,10 +46,7 @@ def show(name: tyro.conf.Positional[str]) -> None:
         if log.truth is None:
             return
     fleet = load_fleet(name)
-    present = fleet.present.mean(axis=0)
-    first = {"source": fleet.source or "(not stated)", "licence": fleet.licence or "(not stated)"}
-    there = {"there": f"{present.min():.0%} to {present.max():.0%} of the time"}
-    _print(fleet.name, first | in_words(facts(fleet)) | there)
+    _print(repr(fleet), {"source": fleet.source or "(not stated)", "licence": fleet.licence or "(not stated)"})
 
 
 def _print(name: str, fields: dict[str, str]) -> None:

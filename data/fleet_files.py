@@ -1,4 +1,4 @@
-"""Readers of drives: tables (those of CARLA, too), TUM trajectories, SUMO's floating-car data; a writer of tables."""
+"""Readers of drives: tables, TUM trajectories, SUMO's floating-car data; a writer of tables."""
 
 from __future__ import annotations
 
@@ -9,13 +9,13 @@ from typing import Any, Literal
 
 import numpy as np
 
-from coopoc.arrays import one_of
 from coopoc.errors import InputError
+from coopoc.escapes import spreadsheet
 from coopoc.formats import trajectories as tum
 from coopoc.world.fleet import Fleet
 
 from .assemble import assemble
-from .cells import named_columns, numeric, read_frame, seconds, words
+from .cells import factors, named_columns, numeric, read_frame, seconds, words
 
 NEEDED, VELOCITY = ("id", "t", "x", "y", "z"), ("vx", "vy", "vz")
 FCD = {"id": "", "x": "", "y": "", "z": "0", "angle": "", "slope": "0", "speed": ""}
@@ -23,43 +23,31 @@ FCD = {"id": "", "x": "", "y": "", "z": "0", "angle": "", "slope": "0", "speed":
 
 
 def read_table(
-    path: Path, *, columns: Mapping[str, str] | None = None, handedness: str | None = None, **options: Any
+    path: Path, *, columns: Mapping[str, str] | None = None, scale: Mapping[str, float] | None = None, **options: Any
 ) -> Fleet:
     """Fleet of a CSV or Parquet file; without vx, vy, vz the velocity is the backward difference.
-
-    A table of CARLA, with yaw and velocities, needs `handedness`, and without a column t `dt`: rows of each id are then
-    equally spaced.
 
     Args:
         path: s, m, m/s in a local east-north-up frame; a missing row means absent.
         columns: names in the file, as {"id": "vehicle"}, where they differ from id, t, x, y, z, vx, vy, vz.
-        handedness: "left" for CARLA's own export, whose y is flipped, or "right".
+        scale: column -> its factor to SI units: {"y": -1, "vy": -1} for the left-handed tables of CARLA.
         options: dt (s, resample; None keeps the stamps), max_gap and any_scale, as of `assemble`.
 
     Raises:
         InputError: a missing column, text or NaN in a cell (with its row, the header not counted), stamps that no
-            filter can use, or an unknown frame or interval of a CARLA table.
+            filter can use.
     """
     names = dict(columns or {})
     frame = read_frame(path, names.get("id", "id"))
-    stamped = "t" in {*names, *frame.columns} or "yaw" not in frame.columns
-    needed = NEEDED if stamped else tuple(name for name in NEEDED if name != "t")
     given = bool({*VELOCITY} & {*names, *frame.columns})
-    frame = named_columns(frame, names, (*NEEDED, *VELOCITY), (*needed, *(VELOCITY if given else ())), path.name)
+    frame = named_columns(frame, names, (*NEEDED, *VELOCITY), (*NEEDED, *(VELOCITY if given else ())), path.name)
     source = f"table {path.name}" + ("" if given else ", velocity by backward difference")
-    if handedness or "yaw" in frame.columns:
-        one_of("handedness", handedness or "unknown", ("left", "right"))
-        source += f", {handedness}-handed"
-    if stamped:
-        t = seconds(frame, "t", path.name)
-    else:
-        dt = options.pop("dt", None)
-        if dt is None:
-            raise InputError("dt", "unknown", "must be given for a table without a column t", "Pass dt=0.1.")
-        t = dt * frame.groupby("id").cumcount().to_numpy()
-    numbers = np.column_stack([numeric(frame, name, path.name) for name in (*"xyz", *(VELOCITY if given else ()))])
-    if handedness == "left":
-        numbers[:, 1::3] *= -1
+    factor = factors(scale, (*NEEDED[1:], *VELOCITY))
+    t, *axes = (
+        factor.get(name, 1.0) * (seconds if name == "t" else numeric)(frame, name, path.name)
+        for name in (*NEEDED[1:], *(VELOCITY if given else ()))
+    )
+    numbers = np.column_stack(axes)
     labels: dict[str, Any] = {"file": path.name, "name": path.stem, "source": source}
     velocity = numbers[:, 3:] if given else None
     return assemble(words(frame, "id", path.name), t, numbers[:, :3], velocity, **options, **labels)
@@ -71,11 +59,13 @@ def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
     import pandas as pd
 
     column, step = np.nonzero(fleet.present.T)
-    frame = pd.DataFrame({"id": np.array(fleet.ids)[column], "t": np.round(fleet.t[step], 6)})
+    text = path.suffix != ".parquet"
+    ids = np.array([spreadsheet(name) if text else name for name in fleet.ids])
+    frame = pd.DataFrame({"id": ids[column], "t": np.round(fleet.t[step], 6)})
     frame[["x", "y", "z"]] = fleet.position[step, column]
     if velocity:
         frame[list(VELOCITY)] = fleet.velocity[step, column]
-    if path.suffix == ".parquet":
+    if not text:
         split = dict.fromkeys(frame.columns[2:], "BYTE_STREAM_SPLIT")
         frame.to_parquet(path, index=False, compression="zstd", use_dictionary=["id", "t"], column_encoding=split)
     else:

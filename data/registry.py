@@ -88,7 +88,7 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
             CSV or Parquet, TUM, SUMO FCD, MR.CLAM folder, or a log with a truth (`load_log`). Options may stand behind
             a question mark, as in "drive.csv?dt=0.1&columns=t:time".
         format: one of DRIVES or LOGS, instead of the one found from name and contents.
-        options: of the reader, for example dt (s), max_gap (s), columns, vehicle_length, handedness; of all, since and
+        options: of the reader, for example dt (s), max_gap (s), columns, vehicle_length, scale; of all, since and
             until, s after the first step, of the part that is kept.
 
     Raises:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import asdict
 from math import isnan
 from pathlib import Path as File
@@ -13,8 +14,10 @@ import numpy as np
 from tyro.conf import Positional, arg
 
 from coopoc.errors import InputError
+from coopoc.escapes import picture
 from coopoc.formats.trajectories import read_kitti, read_tum
 from coopoc.formats.values import read_words, to_rotation
+from coopoc.world.pictures import COLORS, INK, axes, finish
 
 from .cells import TABLES, named_columns, numeric, read_frame, seconds, words
 from .source import split
@@ -22,7 +25,7 @@ from .source import split
 if TYPE_CHECKING:
     from coopoc.evaluate.trajectory_scores import Path, Score
 
-Aligned = Literal["none", "each", "team"]
+Aligned = Literal["none", "each", "sim3", "team"]
 Unit = Literal["steps", "m"]
 
 COVARIANCE = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
@@ -93,9 +96,10 @@ def score(
     offset: float = 0.0,
     delta: float = 1.0,
     unit: Unit = "steps",
+    plot: Annotated[File | None, arg(metavar="FILE")] = None,
     output: Annotated[File | None, arg(metavar="FILE")] = None,
 ) -> int:
-    """Score trajectories of any program against a truth: RT-LE, APE, RPE and NEES, with intervals.
+    """Score trajectories of any program against a truth: RT-LE, APE and RPE of positions and rotations, and NEES.
 
     Example: coopoc score orb.txt --truth truth.txt --align each
 
@@ -103,15 +107,16 @@ def score(
 
     Args:
         estimates: TUM, KITTI, CSV or Parquet files; several vehicles are several files or a column id.
-        truth: files of the same kinds; vehicles are matched by file name or id.
-        align: none compares as given, each aligns every vehicle, team aligns all by one motion.
+        truth: files of the same kinds; vehicles are matched by file name or id, and a single one is that of all.
+        align: none compares as given, each aligns every vehicle, sim3 with its scale, team all by one motion.
         max_diff: largest difference of matched time stamps in s.
         offset: time in s that is added to the estimates' stamps.
         delta: distance between the poses of the relative error, in --unit.
         unit: unit of delta, steps or metres.
+        plot: picture of the paths.
         output: file for the scores as JSON.
     """
-    from coopoc.evaluate.trajectory_scores import scores
+    from coopoc.evaluate.trajectory_scores import compared, scores
 
     if not truth:
         raise InputError("truth", "()", "must name a file", "Add --truth FILE.")
@@ -127,10 +132,21 @@ def score(
     for row in rows:
         for remark in row.remarks:
             print(f"coopoc: {row.vehicle}: {remark}", file=sys.stderr)
+    if plot is not None:
+        draw(compared(made[0], made[1], align, max_diff, offset), plot)
     if output is not None:
         output.write_text(json.dumps([_plain(asdict(row)) for row in rows], indent=1, allow_nan=False) + "\n")
         print(f"coopoc: scores are in {output}", file=sys.stderr)
     return 0
+
+
+def draw(pairs: Mapping[str, tuple[Path, Path, Path]], path: File) -> None:
+    """Picture of aligned estimates and, dashed, of their truths in the plane."""
+    ax = axes(None)
+    for k, (name, (_, estimate, truth)) in enumerate(pairs.items()):
+        ax.plot(*truth.position[:, :2].T, color=INK, lw=1, ls="--")
+        ax.plot(*estimate.position[:, :2].T, color=COLORS[k % len(COLORS)], label=picture(name))
+    finish(ax).figure.savefig(path)
 
 
 def _plain(value: Any) -> Any:
@@ -152,11 +168,13 @@ def table(rows: list[Score], delta: float, unit: Unit) -> str:
         "APE [m]",
         "largest [m]",
         f"RPE, {delta:g} {unit} [m]",
+        "APE [°]",
+        "RPE [°]",
         "NEES",
     ]
     shown = [
         [row.vehicle, row.poses, row.missed, row.rt_le_m, row.ape_m, f"{row.ape_max_m:.3g}"]
-        + ["" if value is None else f"{value:.3g}" for value in (row.rpe_m, row.nees)]
+        + ["" if value is None else f"{value:.3g}" for value in (row.rpe_m, row.ape_deg, row.rpe_deg, row.nees)]
         for row in rows
     ]
     return str(tabulate(shown, headers=header, tablefmt="github", disable_numparse=True))

@@ -226,7 +226,6 @@ ORACLES = {
     "split-ci": "covariance_intersection",
     "mhe": "moving_horizon",
     "gbp": "gbp",
-    "admm": "admm",
     "central-filter": "central_filter",
     "batch-smoother": "batch_smoother",
 }

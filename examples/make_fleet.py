@@ -23,7 +23,6 @@ from typing import Any
 import numpy as np
 
 from coopoc.data.assemble import backward_difference, smooth
-from coopoc.data.fleet_cards import facts
 from coopoc.data.fleet_files import read_fcd, write_table
 from coopoc.data.registry import DATASETS, card
 from coopoc.errors import InputError, MissingLibraryError, unknown
@@ -36,6 +35,8 @@ DRIVER = 'sigmaStep="1" speedFactor="1" speedDev="0" accel="2" decel="3.5" tau="
 """Krauss' model: m/s^2, s and m as in dense city traffic; dawdling changes once a second, not at every 0.1 s."""
 JUMP = 8.0
 """m/s^2, less than the grip of a dry road."""
+RADIUS, CAP = 30.0, 10
+"""m and number of the neighbours that a card counts."""
 DT, WARMUP = 0.1, 60.0
 """s: the sampling interval, and what is driven before the first step that is kept."""
 CUTOFF = 0.5
@@ -128,6 +129,35 @@ def make(recipe: str | Recipe, map_folder: str | Path, out_folder: str | Path) -
     made = {**origin, **settings, **facts(fleet)}
     (out / f"{recipe.name}.json").write_text(json.dumps(made, indent=1) + "\n")
     return made
+
+
+def facts(fleet: Fleet) -> dict[str, Any]:
+    """Size and statistics of a fleet: speed m/s, neighbours within RADIUS, height m, largest acceleration m/s^2.
+
+    >>> x = np.array([[[0.0, 0, 0], [9, 0, 0], [99, 0, 0]]] * 2)
+    >>> facts(Fleet(("a", "b", "c"), [0, 0.1], x, 0 * x))["neighbours"]["mean"]
+    0.667
+    """
+    speed = np.linalg.norm(fleet.velocity, axis=2)[fleet.present]
+    near = [np.linalg.norm(x[:, None] - x[None], axis=2) <= RADIUS for x in fleet.position]
+    counts = np.minimum(np.array([n.sum(axis=1) for n in near]) - 1.0, CAP)[fleet.present]
+    change = np.linalg.norm(np.diff(fleet.velocity, axis=0), axis=2)
+    z = fleet.position[fleet.present][:, 2]
+    lengths = sorted(set(fleet.present.sum(axis=0).tolist()))
+    return {
+        "sha256": fleet.digest,
+        "vehicles": len(fleet.ids),
+        "steps": lengths[0] if len(lengths) == 1 else f"{lengths[0]}..{lengths[-1]}",
+        "dt": fleet.dt,
+        "speed": _rounded(min=speed.min(), mean=speed.mean(), max=speed.max(), standing=np.mean(speed < 0.1)),
+        "neighbours": _rounded(radius=RADIUS, cap=CAP, mean=counts.mean(), any=np.mean(counts > 0)),
+        "height": [round(float(z.min()), 3), round(float(z.max()), 3)],
+        "acceleration": round(float(np.nanmax(change, initial=0.0)) / fleet.dt, 3),
+    }
+
+
+def _rounded(**values: Any) -> dict[str, float]:
+    return {name: round(float(value), 3) + 0.0 for name, value in values.items()}
 
 
 def simulate(recipe: Recipe, map_folder: Path) -> Fleet:

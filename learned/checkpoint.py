@@ -152,7 +152,7 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
     load_into(model, tensors, path)
     if history is not None:
         count = sum(p.numel() for p in model.parameters())
-        _match(path, {_HISTORY: (len(history), count)}, {_HISTORY: history})
+        _match(path, {_HISTORY: (*history.shape[:1], count)}, {_HISTORY: history})
     return Checkpoint(model, card, history)
 
 

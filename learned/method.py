@@ -86,7 +86,9 @@ class LearnedGain:
         silent = np.zeros((recording.runs, len(columns)))
         seconds = time.perf_counter() - began
         notes = lost(estimates, recording, columns, DIVERGED)
-        return Track(recording.t, tuple(columns), estimates, None, silent, silent, seconds, notes=notes)
+        return Track(
+            recording.t, tuple(columns), estimates, None, silent, silent, seconds, notes=notes, ids=recording.ids
+        )
 
     def _lanes(self, recording: Recording, columns: list[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Fixes and velocities (R E, T - 1, 3) and starts (R E, 3) for the net, relative to the first fix."""

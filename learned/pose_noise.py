@@ -76,7 +76,10 @@ def fit_pose_noise(tasks: Sequence[PoseTask], start: Sensors, evaluations: int =
     first = np.log([getattr(start, name) for name in names])
 
     def sensors(x: Floats) -> Sensors:
-        return replace(start, **dict(zip(names, np.exp(x).tolist(), strict=True)))
+        stds = dict(zip(names, np.exp(x).tolist(), strict=True))
+        if "azimuth_std" in stds:  # of a drive without bearings it means nothing
+            stds["azimuth_std"] = min(stds["azimuth_std"], np.pi)
+        return replace(start, **stds)
 
     def loss(x: Floats) -> float:
         assumed = sensors(x)

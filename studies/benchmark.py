@@ -28,6 +28,7 @@ from coopoc.plugins import find, names
 from coopoc.study.numbers import three
 from coopoc.study.provenance import environment
 
+from .roads import road_row, roads
 from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, VERSION, Task, bound, graph_row, pose_row, recording
 
 SMOOTHERS = frozenset({"batch-smoother"})
@@ -57,7 +58,8 @@ def benchmark(
     Args:
         methods: names of coopoc list, learned gains, FILE.py:NAME; with --data also pose-fleet, ... and backends.
         out: folder of the cards.
-        data: folder with MR.CLAM set 6 and PyFG files, for the tasks of real measurements (docs/benchmark.md).
+        data: folder with the files of the tasks of real measurements (docs/benchmark.md), or a log of your own with a
+            truth, on which solo methods are run in the same way.
         validation: run the validation tasks, for choosing parameters; their cards cannot be submitted.
         seed: of other draws, to see whether a card holds on them; these cards cannot be submitted either.
         tasks: run only these tasks.
@@ -150,13 +152,16 @@ def _tried(name: str, task: Task) -> dict[str, Any]:
 
 
 def measured(name: str, data: Path) -> list[dict[str, Any]]:
-    """Rows of the tasks of real measurements: graphs of a backend, logs of a pose filter or of "mine.py:NAME"."""
+    """Rows of the tasks of real measurements: graphs of a backend, logs of a pose filter, roads of a solo method; of
+    "mine.py:NAME" logs, or roads if it says `roads = True`."""
     if name in names("coopoc.backends"):
         files = tqdm(BEST, desc=name, unit="graph", delay=2.0)
         return [_row(file, partial(graph_row, data, file, name)) for file in files]
-    if name in POSES or in_file(name):
+    if name in POSES or (in_file(name) and not getattr(find("coopoc.methods", name), "roads", False)):
         made: Any = find("coopoc.methods", name)("nominal") if in_file(name) else name
         return [_row(task.name, partial(pose_row, task, data, made)) for task in LOGGED]
+    if not (one := method(name)).cooperative:
+        return [_row(task, partial(road_row, task, data, one)) for task in roads(data)]
     return []
 
 
@@ -203,10 +208,13 @@ def page(cards: Iterable[Mapping[str, Any]]) -> str:
 def _logs(cards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     """RT-LE, heading error and NEES of pose filters, a row per task and method."""
     rows = []
-    for one, row in _rows(cards, {task.name for task in LOGGED}):
+    simulated_tasks = {task.name for task in TASKS} | set(BEST)
+    for one, row in _rows(cards, {row["task"] for card in cards for row in card["tasks"]} - simulated_tasks):
         shown = {"task": row["task"], "method": one, "RT-LE [m]": "failed"}
         if "failed" not in row:
             shown["RT-LE [m]"] = "{} [{}, {}]".format(*map(three, row["rt_le_m"]))
+            if own := row.get("calibrated_m"):
+                shown["calibrated [m]"] = "{} [{}, {}]".format(*map(three, own))
             shown |= {"heading [°]": row.get("heading_deg", ""), "NEES": row.get("nees", "")}
             shown |= {"B/s": row["received_bytes_per_second"], "us/step": row["microseconds_per_step"]}
         rows.append(((row["task"], row.get("rt_le_m", [np.inf])[0]), shown))

@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
 
-SILENT = ("gnss", "mds")
+SILENT = ("gnss",)
 """Methods without a covariance, or with that of a fix; the last takes as long as all others together."""
 TRAINED = ("okf",)
 SOLO = ("kalman", "kalman-adaptive", "road-kalman", "okf")

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from coopoc.arrays import AnyArray, Bools, Floats
+from coopoc.arrays import AnyArray, Floats
 from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, past_bound, posterior_bound
 from coopoc.evaluate.ledger import of_track
@@ -22,6 +22,7 @@ from coopoc.methods.track import Method, far_off
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.fleet import Fleet
+from coopoc.world.links import stretches
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -46,8 +47,15 @@ def study(name: str, question: str, settings: Mapping[str, Any], scored: bool = 
         options: other fields of Study.
     """
     settings = {**settings, "metric": ""} if scored else settings
-    usual = {"settings": settings, "cell": cell, "key": key, "prepare": weights.prepare, "recipe": weights.described}
-    usual["idle"] = scene.idle
+    usual = {
+        "settings": settings,
+        "cell": cell,
+        "tracks": None if "cell" in options else tracks,
+        "key": key,
+        "prepare": weights.prepare,
+        "recipe": weights.described,
+        "idle": scene.idle,
+    }
     return Study(name, question, **{**usual, "reference": reference(name), **options})
 
 
@@ -141,10 +149,12 @@ def rows(
     recording = measured or scene.recording(p)
     who, drive, metric = scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"]), str(p.get("metric", ""))
     table: list[Row] = []
+    strange = not made and p["method"] not in METHODS and not weights.is_trained(p["method"])
     for seed, method in made or methods(p, recording):
         score = scored if complete(recording, who, drive) else scored_where_present
         columns = score(method, recording, who, drive, quantiles, metric)
-        table += rows_of(columns, who, **({} if seed is None else {"train_seed": seed}))
+        more = ({} if seed is None else {"train_seed": seed}) | ({"label": method.name} if strange else {})
+        table += rows_of(columns, who, **more)
     return table
 
 
@@ -171,16 +181,16 @@ def bound_rows(p: Params) -> list[Row]:
     return rows_of_egos
 
 
-def tracks(p: Params) -> Iterator[tuple[str, Floats, Floats, Floats | None]]:
-    """Name, times s, positions m and headings rad of each ego's path in each run, as the cell's method estimates it."""
+def tracks(p: Params) -> Iterator[tuple[str, Floats, Floats]]:
+    """Name, times s and positions m of each ego's path in each run, as the cell's method estimates it."""
     recording = scene.recording(p)
     for seed, method in methods(p, recording) if p["method"] != "bound" else ():
         for ego in scene.egos(p["data"], str(p["egos"])):
             found = [method(recording.between(*cut), [ego]) for cut in recording.stretches(ego)]
             t = np.concatenate([track.t for track in found])
             for run in range(recording.runs):
-                name = "-".join(filter(None, (f"seed{seed}" if seed is not None else "", ego, f"run{run}")))
-                yield name, t, np.concatenate([track.x[run, :, 0] for track in found]), None
+                name = f"{ego}-run{run}" + (f"-seed{seed}" if seed is not None else "")
+                yield name, t, np.concatenate([track.x[run, :, 0] for track in found])
 
 
 RMS, MAXIMA, SUMS = ("rt_le_m", "neighbour_rt_le_m", "innovation_m"), ("max_error_m",), ("fixes", "seconds")
@@ -222,8 +232,9 @@ def _ego(
 ) -> dict[str, AnyArray]:
     tracked = drive.present[:, drive.index(ego)]
     parts, lengths = list[Mapping[str, AnyArray]](), list[int]()
-    stretches = recording.stretches(ego)
-    cuts = [(a + i, a + j) for a, b in stretches for i, j in _runs(tracked[a:b])] if tracked.any() else stretches
+    cuts = recording.stretches(ego)
+    if tracked.any():
+        cuts = tuple((a + i, a + j) for a, b in cuts for i, j in stretches(tracked[a:b]) if j - i > 1)
     for start, stop in cuts:
         stretch = recording.between(start, stop)
         # a truth that begins between two fixes leaves a start without one
@@ -271,9 +282,3 @@ def _merged(name: str, parts: Sequence[AnyArray], lengths: Sequence[int]) -> Any
         (np.nan_to_num(values) * weights).sum(axis=0), total, out=np.full(total.shape, np.nan), where=total > 0
     )
     return np.asarray(mean ** (1 / power))
-
-
-def _runs(flags: Bools) -> list[tuple[int, int]]:
-    """(start, stop) of the runs of True."""
-    edges = np.flatnonzero(np.diff(flags.astype(int), prepend=0, append=0)).reshape(-1, 2)
-    return [(int(a), int(b)) for a, b in edges if b - a >= 2]

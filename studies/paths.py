@@ -60,6 +60,6 @@ def _path(results: Results, name: str, ego: str) -> tuple[Floats, Floats]:
     """Times s and positions m in the first run, at the largest K; NaN where the vehicle is away."""
     rows = results.select(method=name).sort_values("max_neighbours")
     p = {**results.settings, **rows.iloc[-1][list(results.axes)], "egos": ego}
-    _, t, x, _ = next(lineup.tracks(p))
+    _, t, x = next(lineup.tracks(p))
     breaks = np.flatnonzero(np.diff(t) > 1.5 * np.median(np.diff(t))) + 1
     return np.insert(t, breaks, t[breaks]), np.insert(x, breaks, np.nan, axis=0)

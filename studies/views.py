@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
@@ -58,9 +59,34 @@ def table(
         if kept is None:
             return None
         shown = {"decimals": scene.decimals(results.settings), **options}
-        return pivot(results, rows, columns, value, kept, scene.caption(results, *texts), **shown)
+        made = pivot(results, rows, columns, value, kept, scene.caption(results, *texts), **shown)
+        return replace(made, notes=(*made.notes, *unused(results)))
 
     return view
+
+
+ALIKE = 1e-3
+"""m, difference of errors that is none."""
+
+
+def unused(results: Results) -> tuple[str, ...]:
+    """A sentence for each method and K whose errors are those of a vehicle alone, in every run and for every ego."""
+    rows, texts, by = results.frame, list[str](), ["method", "max_neighbours"]
+    value = "rt_le_m" if "rt_le_m" in rows else "innovation_m"
+    if not {*by, "sent_bytes_per_second", value} <= set(rows):
+        return ()
+    keys = [name for name in (*results.axes, "ego", "run", "train_seed") if name in rows and name not in by]
+    for (method, k), part in rows[rows["sent_bytes_per_second"] > 0].groupby(by, sort=False):
+        own = (rows["method"] == method) & (rows["max_neighbours"] == 0)
+        both = part.merge(rows[own | (rows["method"] == "kalman") & (rows["max_neighbours"] == k)], on=keys)
+        gap = (both[f"{value}_x"] - both[f"{value}_y"]).abs().groupby([both[key] for key in keys], dropna=False).min()
+        if k and len(gap) == len(part) and gap.max() < ALIKE:
+            why = "what was measured lacks what it takes, such as an azimuth"
+            if not part["bytes_per_second"].any():
+                why = "no message arrived"
+            text = f"{look(str(method)).label}, K = {k}: equal to solo within {ALIKE:g} m: no neighbour's measurement "
+            texts.append(f"{text}was used, because {why}.")
+    return tuple(texts)
 
 
 def selections(

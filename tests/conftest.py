@@ -6,7 +6,7 @@ import importlib
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 import pytest
@@ -25,6 +25,11 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the shared data folder is not beside the project")
     return SHARED
+
+
+def textbook(method: Any) -> Any:
+    """The method without gates, as its oracle is written."""
+    return replace(method, robust=False)
 
 
 def winding(steps: int = 60, speed: float = 8.0, period: float = 3.0, vehicles: int = 1) -> Fleet:

@@ -151,7 +151,7 @@ def test_the_joint_filter_that_is_told_what_is_wrong_reaches_the_bound(formation
 def test_a_recording_of_something_else_is_refused(crossing: Fleet) -> None:
     v2x = V2X(max_neighbours=4)
     for other in (observe(crossing.between(0, 9), S2, v2x), observe(crossing, S2, V2X(max_neighbours=1))):
-        with pytest.raises(InputError, match="recording"):
+        with pytest.raises(InputError, match="record"):
             posterior_bound(crossing, S2, 0, v2x, recording=other)
 
 

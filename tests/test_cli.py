@@ -165,11 +165,21 @@ def test_bad_usage_is_one_readable_line(
     assert out == ""
 
 
+def test_ctrl_c_while_libraries_load_ends_without_a_traceback(tmp_path: Path) -> None:
+    code = (
+        "import sys\nclass Stop:\n    def find_spec(self, name, *rest):\n        if name == 'tyro':\n"
+        "            raise KeyboardInterrupt\nsys.meta_path.insert(0, Stop())\nfrom coopoc.workers import main\nmain()"
+    )
+    done = subprocess.run([sys.executable, "-c", code, "list"], capture_output=True, text=True, cwd=tmp_path)
+    assert (done.returncode, done.stderr) == (130, "")
+
+
 def test_failed_cells_set_the_status(tmp_path: Path) -> None:
     (tmp_path / "trouble").write_text("raise")
     done = coopoc("run", "small", "--set", "runs=2", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)
     assert done.returncode == 1
-    assert "coopoc: failed: FloatingPointError: the filter diverged at step 3 (max_neighbours = 1, met" in done.stderr
+    assert "diverged at step 3 (max_neighbours = 1" in done.stderr
+    assert 'small_study.py", line 61, in cell\n' in done.stderr
     assert "cells failed: 1, try them again with --retry-failed" in done.stderr
 
 

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import textbook
 from oracles.cooperative import Oracle
 from test_star_filters import CHANNELS, gappy, holed, partial
 
@@ -32,7 +33,7 @@ def drive(steps: int = 80) -> Fleet:
 @pytest.mark.parametrize("change", [lambda r: r, holed, partial], ids=["whole", "holed", "partial"])
 def test_textbook_is_the_joint_filter(channel: str, change: Callable[[Recording], Recording]) -> None:
     seen = change(observe(gappy(drive()), S2, CHANNELS[channel], runs=2, observers=[0, 9]))
-    ours, joint = CooperativeFilter(robust=False)(seen, [0, 9]), JointFilter()(seen, [0, 9])
+    ours, joint = CooperativeFilter(robust=False)(seen, [0, 9]), textbook(JointFilter())(seen, [0, 9])
     np.testing.assert_allclose(ours.x, joint.x, atol=1e-9)
     assert ours.covariance is not None
     assert joint.covariance is not None
@@ -70,7 +71,7 @@ def test_wrong_ranges_cost_little_and_are_named() -> None:
     fleet = drive(300)
     seen = observe(fleet, S2, V2X(6), runs=4, observers=[0])
     wrong = too_long(seen)
-    cases = (CooperativeFilter(), seen), (CooperativeFilter(), wrong), (JointFilter(), wrong)
+    cases = (CooperativeFilter(), seen), (CooperativeFilter(), wrong), (textbook(JointFilter()), wrong)
     clean, robust, joint = (float(rt_le(method(given), fleet).mean()) for method, given in cases)
     assert robust < 1.1 * clean
     assert robust < 0.9 * joint

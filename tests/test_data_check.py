@@ -95,6 +95,22 @@ def test_a_german_table_is_read_and_its_outliers_are_named(tmp_path: Path) -> No
     assert "not read" not in text
 
 
+def test_wrong_ranges_are_named_and_mislead_no_filter(tmp_path: Path) -> None:
+    """From the file to the study's rows: with wrong ranges cooperation still helps, without gates it does not."""
+    folder = cars(tmp_path / "log", lambda f: f.assign(range=outliers(f["range"], 0.1)))
+    log = read_log(folder)
+    assert "of the ranges lie beyond 5" in said(log)
+    settings = {"data": str(folder), "method": "kalman,joint,fixed-lag,central-filter", "max_neighbours": "1"}
+    results = co.run_study("side_by_side", tmp_path / "out", settings=settings, progress=False)
+    assert not results.failed
+    error = results.frame.groupby("method")["rt_le_m"].mean()
+    for method in ("joint", "fixed-lag", "central-filter"):
+        assert error[method] < 0.99 * error["kalman"], method
+    assert log.truth is not None
+    ungated = co.rt_le(co.JointFilter(robust=False)(log.recording, ["car0", "car1"]), log.truth).mean()
+    assert ungated > error["kalman"]
+
+
 @pytest.mark.parametrize("fault", FAULTS)
 def test_a_fault_has_a_line(tmp_path: Path, fault: str) -> None:
     change, message = FAULTS[fault]

@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import importlib.util
-import io
 import sys
 import xml.etree.ElementTree as ElementTree
 from dataclasses import replace
 from importlib.metadata import version
 from pathlib import Path
-from zipfile import ZipFile
 
 import numpy as np
 import pytest
 from scipy import signal
 from scipy.spatial import cKDTree
 
-from coopoc import Sensors, load_fleet, observe
+from coopoc import load_fleet
 from coopoc.data.assemble import smooth
 from coopoc.data.registry import bundled, card, convert
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.study.run import run_study
-from coopoc.world.storage import read_recording, save_recording
 
 SCRIPT = Path(__file__).resolve().parents[1] / "examples" / "make_fleet.py"
 spec = importlib.util.spec_from_file_location("make_fleet", SCRIPT)
@@ -122,18 +119,3 @@ def test_what_was_made_is_loaded_and_converted(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_fleet(tmp_path / "a.csv").position, fleet.position)
     settings = {"data": str(made), "method": "kalman", "max_neighbours": "0", "runs": 1}
     assert not run_study("side_by_side", tmp_path / "runs", settings=settings, progress=False).failed
-
-
-@pytest.mark.parametrize("name", ["gnss", "t", "relative"])
-@pytest.mark.parametrize("claimed", [10**11, 2**61])
-def test_an_array_that_claims_all_memory_is_refused(tmp_path: Path, name: str, claimed: int) -> None:
-    save_recording(observe(bundled("town10").between(0, 3), Sensors()), tmp_path / "a.npz")
-    with np.load(tmp_path / "a.npz") as stored, ZipFile(tmp_path / "b.npz", "w") as packed:
-        for part in stored.files:
-            file = io.BytesIO()
-            shape = (claimed,) if part == name else stored[part].shape
-            head = {"descr": stored[part].dtype.str, "fortran_order": False, "shape": shape}
-            np.lib.format.write_array_header_1_0(file, head)
-            packed.writestr(f"{part}.npy", file.getvalue() + stored[part].tobytes())
-    with pytest.raises(InputError, match=r"b\.npz = .*must be a recording in \.npz"):
-        read_recording(tmp_path / "b.npz")

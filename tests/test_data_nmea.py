@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import builtins
 from collections.abc import Callable, Mapping
-from datetime import datetime, timedelta
+from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
-from logs import drive
+from logs import at, bends, drive, outliers, ranges, write
 
 import coopoc as co
 from coopoc.data.log.check import check
@@ -192,12 +194,82 @@ def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path: Path) -> None:
             read_log(path, dt=0.1, **wrong)
 
 
+def test_topics_as_tables_are_the_bag(tmp_path: Path) -> None:
+    """A folder per namespace, a column per field; speeds stay along the vehicle, whose imu has the heading."""
+    pymap3d = pytest.importorskip("pymap3d")
+    fleet = drive(2, steps=80, start=1.7e9)
+    for k, name in enumerate(fleet.ids):
+        lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, k].T, 48.14, 11.58, 560.0)
+        u = fleet.velocity[:, k]
+        yaw, sec = np.arctan2(u[:, 1], u[:, 0]), np.floor(fleet.t + 1e-6).astype(int)
+        stamp = {"header.stamp.sec": sec, "header.stamp.nanosec": np.rint(1e9 * (fleet.t - sec)).astype(int)}
+        status = np.where(np.arange(80) == 40, -1, 0)
+        turn = (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
+        turned = {f"orientation.{axis}": value for axis, value in zip("xyzw", turn, strict=True)}
+        topics = {
+            "gps/fix": {"status.status": status, "latitude": lat, "longitude": lon, "altitude": h},
+            "odom": {"pose.pose.position.x": 0.0, "twist.twist.linear.x": np.hypot(*u[:, :2].T)},
+            "imu": {**turned, "angular_velocity.z": np.gradient(np.unwrap(yaw), 0.1)},
+        }
+        for topic, columns in topics.items():
+            file = tmp_path / "dump" / name / f"{topic}.csv"
+            file.parent.mkdir(parents=True, exist_ok=True)
+            pd.DataFrame(stamp | columns).to_csv(file, index=False)
+    log = read_log(tmp_path / "dump", origin=(48.14, 11.58, 560.0), std={"x": 1.5, "range": 0.15})
+    assert co.load_recording(tmp_path / "dump").ids == log.recording.ids == ("car0", "car1")
+    assert log.summary.refused["fixes that the receiver calls invalid"][0] == 2
+    there = np.isfinite(log.recording.gnss[0, :, :, 0])
+    np.testing.assert_allclose(log.recording.gnss[0][there], fleet.position[there], atol=1e-5)
+    np.testing.assert_allclose(log.recording.velocity[0, 2:, :, :2], fleet.velocity[2:, :, :2], atol=0.06)
+    assert log.recording.sensors.gnss_std[0] == 1.5
+
+
+def test_times_of_a_bag_are_those_of_its_headers_or_of_its_reception(tmp_path: Path) -> None:
+    pytest.importorskip("rosbags")
+    fleet = drive(1, steps=60, start=1.7e9)
+    write_bag(tmp_path / "drive", fleet, pytest.importorskip("pymap3d"), 2, late=0.25)
+    by_header, received = (read_log(tmp_path / "drive", dt=0.1, stamps=stamps) for stamps in ("header", "received"))
+    assert received.recording.t[0] - by_header.recording.t[0] == pytest.approx(0.25, abs=1e-5)
+    assert "times are those of stamps=header; headers are between 0.25 and 0.25 s before" in str(by_header.summary)
+
+
+def test_cars_with_receivers_uwb_and_clocks_that_differ(tmp_path: Path) -> None:
+    """NMEA of two cars whose clocks are 0.3 s apart; UWB ranges in mm, one of twenty reflected, beside them."""
+    fleet, start = bends(), datetime(2026, 5, 1, 12, tzinfo=UTC)
+    log = tmp_path / "log"
+    log.mkdir()
+    slow = replace(fleet.between(0, 6000), t=fleet.t[:6000])
+    every = co.Fleet(slow.ids, slow.t[::10], slow.position[::10], slow.velocity[::10])
+    for k, late in enumerate((0.0, 0.3)):
+        (log / f"{every.ids[k]}.nmea").write_text(nmea(every, k, start + timedelta(seconds=late)))
+    uwb = ranges(every, "car0", "car1", 0.2, 0.15)
+    uwb["range"], uwb["t"] = 1000 * outliers(uwb["range"]), 1000 * (uwb["t"] + start.timestamp())
+    write(uwb.drop(columns="range_std"), log / "uwb.csv")
+    options = {"scale": {"range": 1e-3}, "std": {"range": 0.15}}
+    with pytest.raises(co.InputError, match="Divide it by 1e3"):
+        read_log(log, **options)  # type: ignore[arg-type]
+    uwb["t"] /= 1000
+    write(uwb.drop(columns="range_std"), log / "uwb.csv")
+    wrong, right = (read_log(log, clock=clock, **options) for clock in ({}, {"car1": 0.3}))  # type: ignore[arg-type]
+    assert right.recording.sensors.range_std == pytest.approx(0.15)
+    one, other = (at(every, name, right.recording.t - start.timestamp()) for name in every.ids)
+    error = right.recording.relative[0, :, 0] - np.linalg.norm(one - other, axis=1)[right.recording.links.step]
+    assert np.median(np.abs(error)) < 0.15
+    assert any("of the ranges lie beyond 5" in text for text in check(right).warnings)
+    assert float(np.nanmax(np.abs(wrong.recording.gnss[0, 50, 1] - right.recording.gnss[0, 50, 1]))) > 1.0
+
+
 def load_and_check(path: Path) -> int:
     return int(np.isfinite(co.load_recording(path, dt=0.1).gnss[0, :, :, 0]).sum())
 
 
 def write_bag(
-    path: Path, fleet: co.Fleet, pymap3d: Any, ros: int, names: Mapping[str, str] = MappingProxyType({})
+    path: Path,
+    fleet: co.Fleet,
+    pymap3d: Any,
+    ros: int,
+    names: Mapping[str, str] = MappingProxyType({}),
+    late: float = 0.0,
 ) -> None:
     from rosbags.rosbag1 import Writer as Writer1
     from rosbags.rosbag2 import Writer as Writer2
@@ -273,7 +345,7 @@ def write_bag(
                 for what, message in messages.items():
                     serialize = store.serialize_ros1 if ros == 1 else store.serialize_cdr
                     raw = serialize(message, names[what])
-                    writer.write(topics[column, what], round(t * 1e9), raw)
+                    writer.write(topics[column, what], round((t + late) * 1e9), raw)
 
 
 def test_what_is_no_bag_is_named(tmp_path: Path) -> None:

@@ -11,10 +11,9 @@ import pandas as pd
 import pytest
 
 from coopoc.data.assemble import interpolate
-from coopoc.data.fleet_files import read_tum
+from coopoc.data.fleet_files import read_tum, write_table
 from coopoc.data.registry import convert, load_fleet
 from coopoc.errors import InputError
-from coopoc.world.fleet import Fleet
 
 GOOD = "id,t,x,y,z\na,0.0,0,0,0\nb,0.0,5,0,0\na,0.1,1,0,0\nb,0.1,5,1,0\na,0.2,2,0,0\nb,0.2,5,2,0\n"
 
@@ -165,38 +164,18 @@ def test_a_column_by_a_wrong_name_is_proposed(tmp_path: Path) -> None:
         load_fleet(tmp_path / "drive.csv", columns={"x": "estings"})
 
 
-def carla(fleet: Fleet, left: bool = True, order: str = "time") -> pd.DataFrame:
-    """A fleet as CARLA exports it: x, y, z, yaw in degrees clockwise, velocities, and more, without stamps."""
-    mirror = np.array([1, -1, 1]) if left else np.ones(3)
-    x, u = fleet.position * mirror, fleet.velocity * mirror
-    yaw = np.degrees(np.arctan2(-fleet.velocity[..., 1], fleet.velocity[..., 0]))
-    ids = np.broadcast_to(100.0 + np.arange(len(fleet.ids)), yaw.shape)
-    cube = np.concatenate([ids[..., None], x, yaw[..., None], u, np.zeros((*yaw.shape, 6))], axis=2)
-    rows = (cube if order == "time" else cube.transpose(1, 0, 2)).reshape(-1, 14)
-    names = ["id", "x", "y", "z", "yaw", "vx", "vy", "vz", "ax", "ay", "az", "wx", "wy", "wz"]
-    return pd.DataFrame(rows, columns=names).astype({"id": int})
-
-
-@pytest.mark.parametrize("left", [True, False])
-@pytest.mark.parametrize("order", ["time", "vehicle"])
-def test_a_table_of_carla_is_a_right_handed_fleet(tmp_path: Path, order: str, left: bool) -> None:
-    fleet = load_fleet("town10").between(0, 100).select(range(0, 60, 6))
-    frame = carla(fleet, left, order)
-    frame.to_csv(tmp_path / "carla.csv")
-    frame.to_parquet(tmp_path / "locations.parquet")
-    for name in ("carla.csv", "locations.parquet"):
-        read = load_fleet(f"{tmp_path / name}?dt=0.1&handedness={'left' if left else 'right'}")
-        np.testing.assert_allclose(read.position, fleet.position, atol=1e-9)
-        np.testing.assert_allclose(read.velocity, fleet.velocity, atol=1e-9)
-        assert read.ids[:2] == ("100", "101")
-    for options, message in (
-        ({"dt": 0.1}, "handedness = .*must be one of left, right"),
-        ({"handedness": "up", "dt": 0.1}, "handedness = 'up'"),
-        ({"handedness": "left"}, "dt = unknown"),
-        ({"handedness": "left", "dt": 0.1, "columns": {"x": "xx"}}, r"column xx = missing.*Did you mean x\?"),
-    ):
+def test_a_left_handed_table_is_mirrored(tmp_path: Path) -> None:
+    """As CARLA exports it, with y to the right; stamps in ms."""
+    fleet = load_fleet("town10").between(0, 100).select([0, 6])
+    write_table(fleet, tmp_path / "drive.csv")
+    frame = pd.read_csv(tmp_path / "drive.csv")
+    frame.assign(t=1000 * frame["t"], y=-frame["y"], vy=-frame["vy"]).to_csv(tmp_path / "left.csv", index=False)
+    read = load_fleet(f"{tmp_path / 'left.csv'}?scale=y:-1,vy:-1,t:1e-3")
+    np.testing.assert_allclose(read.position, fleet.position, atol=1e-9)
+    np.testing.assert_allclose(read.velocity, fleet.velocity, atol=1e-9)
+    for scale, message in (({"yaw": -1}, "scale = 'yaw': must be one of t, x"), ({"y": 0}, "scale of y = 0: must not")):
         with pytest.raises(InputError, match=message):
-            load_fleet(tmp_path / "carla.csv", **options)
+            load_fleet(tmp_path / "left.csv", scale=scale)
 
 
 def drive(t: np.ndarray, **more: object) -> pd.DataFrame:

@@ -9,7 +9,7 @@ import pytest
 from conftest import coming_and_going, standing
 
 from coopoc import V2X, BatchSmoother, CentralFilter, Fleet, InputError, Sensors, observe
-from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagation
+from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.world import sensing
 from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox
@@ -66,7 +66,6 @@ def test_bytes_have_closed_forms() -> None:
     recording = observe(fleet, S2, V2X(max_neighbours=3, overhead=100), runs=2)
     for method, received, sent in (
         (GaussianBeliefPropagation(rounds=3), 3 * (3 * (36 + 100) + 20), 3 * (3 * (36 + 100) + 20)),
-        (ConsensusADMM(rounds=2), 3 * (3 * (12 + 100) + 56), 3 * (3 * (12 + 100) + 56)),
         (CentralFilter(), 44 + 100, 32 + 3 * 16 + 100),
         (BatchSmoother(), 44 + 100, 32 + 3 * 16 + 100),
     ):

@@ -11,15 +11,18 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import textbook
 
 from coopoc import GNSS, V2X, Fleet, JointFilter, Kalman, Sensors, observe, rt_le
 from coopoc.errors import InputError
 from coopoc.evaluate.metrics import measure
 from coopoc.fleets import load_fleet
+from coopoc.formats.trajectories import read_tum
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.one_file import from_file
 from coopoc.optimize import MEASUREMENTS, Problem, Status, solve
 from coopoc.plugins import find
+from coopoc.study.results import Results
 from coopoc.study.run import plan, run_study
 from coopoc.world.channels import channel
 
@@ -56,9 +59,16 @@ def commands(word: str) -> list[str]:
 
 def test_a_method_of_ones_own_beside_others(folder: Path) -> None:
     (command,) = commands("alpha.py:Alpha")
-    table = shell(command, folder)
-    alpha, *_, bound = re.findall(r"^\| (\S.*?) +\| \w+ +\| +\**([\d.]+)\**", table, flags=re.MULTILINE)[:4]
-    assert (alpha[0], bound[0]) == ("Alpha", "Cramér-Rao bound")
+    table = shell(f"{command} --tracks tum", folder)
+    rows, fleet = Results.load(folder / "runs/side_by_side").select(method="alpha.py:Alpha"), load_fleet("town10")
+    for _, row in rows.iterrows():
+        name = f"{row['max_neighbours']}-alpha.py_Alpha-nominal-{row['ego']}-run{row['run']}.tum"
+        error = (
+            read_tum(folder / "runs/side_by_side/tracks" / name).position - fleet.position[:, fleet.index(row["ego"])]
+        )
+        assert np.sqrt(np.mean(np.sum(error**2, axis=1))) == pytest.approx(row["rt_le_m"], rel=1e-6)
+    alpha, *_, bound = re.findall(r"^\| (\S.*?) +\|(?: [a-z]+ +\|)? +\**([\d.]+)\**", table, flags=re.MULTILINE)[:4]
+    assert (alpha[0], bound[0]) == ("alpha", "Cramér-Rao bound")
     assert float(alpha[1]) > float(bound[1])
 
 
@@ -70,10 +80,10 @@ def test_a_cooperative_filter_in_thirty_lines(folder: Path, formation: Fleet) ->
         Sensors.paper_scenario2(),
     )
     seen = observe(fleet, sensors, V2X(max_neighbours=4, loss=0.2, latency=0.1), runs=5, observers=[0])
-    ours, theirs = (rt_le(method(seen, [0]), fleet).mean() for method in (ekf, JointFilter()))
+    ours, theirs = (rt_le(method(seen, [0]), fleet).mean() for method in (ekf, textbook(JointFilter())))
     assert ours == pytest.approx(theirs, rel=0.03)
     alone = observe(fleet, sensors, V2X(max_neighbours=0), runs=2)
-    np.testing.assert_allclose(ekf(alone, [0]).x, Kalman()(alone, [0]).x, atol=2e-4)
+    np.testing.assert_allclose(ekf(alone, [0]).x, textbook(Kalman())(alone, [0]).x, atol=2e-4)
 
 
 def test_a_fleet_made_by_code(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:

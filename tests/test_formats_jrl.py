@@ -173,3 +173,12 @@ def test_what_is_no_json_is_named(tmp_path: Path) -> None:
         read_jrl(tmp_path / "a.jrl")
     with pytest.raises(InputError, match="must be a file"):
         read_jrl(tmp_path / "b.jrl")
+
+
+def test_a_value_of_another_kind_than_its_vertex_is_named(tmp_path: Path) -> None:
+    given = documented()
+    given["initialization"] = {"a": [{"type": "Point2", "key": A, "x": 1.0, "y": 2.0}]}
+    given.pop("groundtruth", None)
+    (tmp_path / "a.jrl").write_text(json.dumps(given))
+    with pytest.raises(InputError, match=r"initialization of a, value 0 = type Point2: must be a pose"):
+        read_jrl(tmp_path / "a.jrl")

@@ -9,6 +9,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import textbook
 from oracles.moving_horizon import Drive, fixed_lag, moving_horizon
 
 from coopoc import V2X, Fleet, JointFilter, NoiseModel, Recording, Sensors, observe
@@ -49,7 +50,7 @@ def label(method: Smoother) -> str:
 
 def assert_is_the_oracle(recording: Recording, method: Smoother, ego: int, runs: range, near: float = 1e-7) -> None:
     known, box = resolve(method.noise_model, recording), inbox(recording, ego, FIX_AND_VELOCITY)
-    track, exact = method(recording, [ego]), method.exact and known.exact_relative
+    track, exact = textbook(method)(recording, [ego]), method.exact and known.exact_relative
     assert track.covariance is not None
     assert track.neighbours is not None
     for run in runs:
@@ -116,8 +117,10 @@ def test_hardly_any_process_noise_loses_no_digits(crossing: Fleet, make: type) -
     recording = observe(crossing.between(0, 20), S2, V2X(max_neighbours=4, loss=0.2), runs=2)
     known = NoiseModel.oracle(S2, crossing.between(0, 20))
     wanted, found = (
-        JointFilter(known, exact=False)(recording, [1]),
-        make(known, exact=False, **({"lag": 3} if make is FixedLagSmoother else {"horizon": 3}))(recording, [1]),
+        textbook(JointFilter(known, exact=False))(recording, [1]),
+        textbook(make(known, exact=False, **({"lag": 3} if make is FixedLagSmoother else {"horizon": 3})))(
+            recording, [1]
+        ),
     )
     np.testing.assert_allclose(found.x, wanted.x, atol=1e-8)
     np.testing.assert_allclose(found.covariance, wanted.covariance, atol=1e-8)

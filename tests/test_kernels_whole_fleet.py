@@ -6,16 +6,15 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import crossing_fleet
+from conftest import crossing_fleet, textbook
 from filterpy.kalman import KalmanFilter
-from oracles.admm import admm
 from oracles.batch_smoother import batch_smoother
 from oracles.central_filter import central_filter
 from oracles.gbp import gbp
 from oracles.whole_fleet import Drive
 
 from coopoc import V2X, BatchSmoother, CentralFilter, Fleet, NoiseModel, Recording, Sensors, observe
-from coopoc.methods.decentralised import ConsensusADMM, GaussianBeliefPropagation
+from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.methods.noise_model import resolve
 from coopoc.world.exchange import exchange
 from coopoc.world.links import to_vector
@@ -27,7 +26,6 @@ KNOWN = {"nominal": "nominal", "identity": "identity", "fitted": NoiseModel("fit
 METHODS = {
     "gbp": GaussianBeliefPropagation,
     "gbp-damped": lambda known: GaussianBeliefPropagation(known, rounds=2, damping=0.4),
-    "admm": lambda known: ConsensusADMM(known, rounds=2, rho=0.7),
     "central-filter": CentralFilter,
     "batch-smoother": lambda known: BatchSmoother(known, exact_steps=12, settle=1e-9),
 }
@@ -63,7 +61,7 @@ def drive(crossing: Fleet, channel: str, runs: int = 1, gaps: bool = True, absen
 def compare(name: str, known: str | NoiseModel, recording: Recording, near: float = 1e-7) -> None:
     """Positions and covariances of all vehicles that are there throughout, in every run."""
     model = KNOWN.get(known, known) if isinstance(known, str) else known
-    method, noise = METHODS[name](model), resolve(model, recording)
+    method, noise = textbook(METHODS[name](model)), resolve(model, recording)
     there = np.isfinite(recording.velocity).all(axis=(0, 1, 3)) & np.isfinite(recording.gnss[:, 0]).all(axis=(0, 2))
     egos = np.flatnonzero(there).tolist()
     track, central = method(recording, egos), name in ("central-filter", "batch-smoother")
@@ -74,8 +72,6 @@ def compare(name: str, known: str | NoiseModel, recording: Recording, near: floa
         one = Drive(recording, noise, met, arrival[run], run)
         if name.startswith("gbp"):
             x, P = gbp(one, method.rounds, method.damping)
-        elif name == "admm":
-            x, P = admm(one, method.rounds, method.rho)
         elif name == "central-filter":
             x, P = central_filter(one)
         else:
@@ -103,7 +99,7 @@ def test_noise_models(name: str, known: str, crossing: Fleet) -> None:
 
 
 @pytest.mark.parametrize("runs", [1, 5])
-@pytest.mark.parametrize("name", ["gbp", "admm", "central-filter", "batch-smoother"])
+@pytest.mark.parametrize("name", ["gbp", "central-filter", "batch-smoother"])
 def test_batches_of_runs_without_gaps(name: str, runs: int, crossing: Fleet) -> None:
     compare(name, "nominal", drive(crossing, "plain", runs=runs, gaps=False, absences=False))
 

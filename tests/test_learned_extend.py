@@ -9,11 +9,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from export_onnx import to_onnx
 from test_extend import blocks, commands, shell
 
 from coopoc import InputError
 from coopoc.learned import Checkpoint, load, save
-from coopoc.learned.export import to_onnx
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import recipe_of
 from coopoc.plugins import find

@@ -406,6 +406,27 @@ def test_robust_rules_ignore_one_byzantine_client(name: str) -> None:
     assert combined(RULES["mean"], weights).max() > 1e4
 
 
+@pytest.mark.parametrize("name", [*RULES, Krum(2)])
+def test_a_rule_holds_as_many_byzantine_clients_as_it_tolerates_and_no_more(name: str | Rule) -> None:
+    """Of ten some send what is far off, together: within the hull of the honest, and far from it with one more."""
+    chosen = rule(name)
+    most = chosen.tolerated(10)
+    assert most == {"median": 4, "trimmed_mean": 2, "krum": 1, "multi_krum": 1}.get(str(name), 2 * (name == Krum(2)))
+    for hostile in (most, most + 1, 6):
+        weights = torch.cat([torch.randn(10 - hostile, 5), torch.full((hostile, 5), 1e6)])
+        moved = float(combined(chosen, weights, torch.ones(10)).abs().max())
+        if hostile == most:
+            assert moved < 5
+    assert moved > 1e4 or name == "fedadam"  # whose steps are bounded
+
+
+def test_a_federation_says_how_many_it_tolerates_and_warns_beyond(four: tuple[Client, ...]) -> None:
+    assert trained(four, 1, aggregate="trimmed_mean").tolerated == 1
+    assert trained(four, 1).tolerated == 0
+    with pytest.warns(RuntimeWarning, match=r"2 Byzantine clients of 4: TrimmedMean\(share=0.25\) tolerates 1 a round"):
+        trained(four, 1, aggregate="trimmed_mean", participation=Byzantine(names=("c0", "c1")))
+
+
 def test_a_plain_function_is_a_rule() -> None:
     weights = answers()
     torch.testing.assert_close(combined(rule(lambda w, n: w[0]), weights), weights[0])

@@ -1,4 +1,4 @@
-"""CovarianceIntersection, MDS and QCQPRelaxation over a Recording: consistency, laws and real channels."""
+"""CovarianceIntersection and QCQPRelaxation over a Recording: consistency, laws and real channels."""
 
 from __future__ import annotations
 
@@ -6,11 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from scipy.linalg import orthogonal_procrustes
 from scipy.optimize import least_squares
-from scipy.sparse.csgraph import shortest_path
-from scipy.spatial import procrustes
-from scipy.spatial.distance import cdist
 
 import coopoc as co
 from coopoc import V2X, Fleet, NoiseModel, Sensors, observe
@@ -19,7 +15,6 @@ from coopoc.kernels.solo import FixNoise
 from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.methods.covariance_intersection import CovarianceIntersection
 from coopoc.methods.kalman import solo_filter
-from coopoc.methods.mds import MDS, complete, fit, shape
 from coopoc.methods.qcqp_relaxation import QCQPRelaxation
 from coopoc.methods.star import stars
 from coopoc.world.inbox import inbox
@@ -33,7 +28,7 @@ FILTERS = [
     CovarianceIntersection("identity"),
     replace(SPLIT, noise_model="identity"),
 ]
-SNAPSHOTS = [MDS(), MDS("identity"), QCQPRelaxation(), QCQPRelaxation("identity")]
+SNAPSHOTS = [QCQPRelaxation(), QCQPRelaxation("identity")]
 METHODS = [*FILTERS, *SNAPSHOTS]
 
 
@@ -67,19 +62,6 @@ def test_a_late_message_is_no_surer_than_it_is() -> None:
         late = (age >= 5) & np.isfinite(star.variance[:, 1:]).all(axis=-1) & (t >= 20)
         share += [*(gap**2 / star.variance[:, 1:])[late]]
     assert 0.3 < np.array(share)[:, :2].mean() < 1.1
-
-
-def test_a_platoon_has_no_lateral_shape() -> None:
-    """Rank one: across the lane all stand on one line through the fixes, the middle vehicle at their mean."""
-    t = np.arange(40) * 0.1
-    lane = np.stack([10 * t[:, None] + 12.0 * np.arange(5), np.zeros((40, 5)), np.zeros((40, 5))], axis=2)
-    velocity = np.broadcast_to([10.0, 0.0, 0.0], lane.shape)
-    fleet = Fleet(tuple("abcde"), t, lane, velocity)
-    sensors = replace(SILENT, gnss_std=(0.0, 1.0, 1.0), velocity_std_ratio=0.1)
-    recording = observe(fleet, sensors, V2X(max_neighbours=4, radius=100.0), runs=6, assumed=S2)
-    track = MDS()(recording, [2])
-    mean = recording.gnss[..., 1:].mean(axis=2)
-    assert track.x[:, :, 0, 1:] == pytest.approx(mean, abs=1e-6)
 
 
 def test_the_relaxation_finds_what_many_starts_find() -> None:
@@ -118,16 +100,16 @@ def brief(method: object, fleet: Fleet) -> Fleet:
 
 @pytest.mark.parametrize("method", METHODS, ids=label)
 def test_bytes_by_closed_form(method, crossing: Fleet) -> None:
-    """One message per link and step: 14 numbers for an estimate with its covariance, 8 + 2 K for fix and K ranges."""
+    """One message per link and step: 14 numbers for an estimate with its covariance, 8 for a fix."""
     fleet = brief(method, crossing)
     recording = observe(fleet, S2, V2X(max_neighbours=3, overhead=10), runs=1)
-    numbers = 14 if method in FILTERS else 8 + 6 * isinstance(method, MDS)
+    numbers = 14 if method in FILTERS else 8
     track = method(recording, [1])
     assert (track.received_bytes == len(recording.links.of(1)) * (4 * numbers + 10)).all()
     assert (track.sent_bytes == len(fleet.t) * (4 * numbers + 10)).all()
 
 
-@pytest.mark.parametrize("method", [*FILTERS[:2], MDS(), QCQPRelaxation()], ids=label)
+@pytest.mark.parametrize("method", [*FILTERS[:2], QCQPRelaxation()], ids=label)
 def test_what_has_not_arrived_is_not_used(method, crossing: Fleet) -> None:
     """Poison: what the others measured at steps whose messages the inbox never yields changes nothing. An estimate
     remembers all fixes before it: there, those after the last message that is used."""
@@ -147,7 +129,7 @@ def test_what_has_not_arrived_is_not_used(method, crossing: Fleet) -> None:
     assert method(poisoned, [0]).x == pytest.approx(method(recording, [0]).x, abs=1e-7)
 
 
-@pytest.mark.parametrize("method", [MDS(), QCQPRelaxation()])
+@pytest.mark.parametrize("method", [QCQPRelaxation()])
 def test_snapshots_bring_the_last_fix_forward(method, crossing: Fleet) -> None:
     """Fixes once in five steps and a tenth of the ranges missing: the notes say so, and errors stay those of a fix."""
     fleet = brief(method, crossing)
@@ -158,41 +140,3 @@ def test_snapshots_bring_the_last_fix_forward(method, crossing: Fleet) -> None:
     track = method(replace(recording, gnss=gnss, relative=relative), [0, 3])
     assert errors(track, fleet).mean() < 1.3 * errors(method(recording, [0, 3]), fleet).mean() + 2.0
     assert track.notes[-1].endswith("brought forward with the velocity")
-
-
-def test_missing_distances_are_shortest_paths() -> None:
-    """Independent check: scipy.sparse.csgraph.shortest_path."""
-    rng = np.random.default_rng(6)
-    distance = cdist(*[rng.normal(size=(7, 3))] * 2)
-    kept = rng.random((7, 7)) < 0.25
-    kept[0] = True
-    measured = np.where(kept & ~np.eye(7, dtype=bool), distance, np.nan)
-    graph = np.where(np.isfinite(measured), measured, 0.0)
-    expected = shortest_path(graph, method="D", directed=False)
-    direct = np.isfinite(measured) | np.isfinite(measured.T)
-    expected = np.where(direct, distance, expected)
-    assert complete(measured[None])[0] == pytest.approx(expected)
-
-
-def test_a_complete_matrix_of_exact_distances_gives_the_shape() -> None:
-    """Independent check: scipy.spatial.procrustes finds no disparity, and cdist the same distances."""
-    rng = np.random.default_rng(7)
-    truth = rng.normal(size=(4, 6, 3))
-    found = shape(np.stack([cdist(p, p) for p in truth]))
-    for points, where in zip(found, truth, strict=True):
-        assert cdist(points, points) == pytest.approx(cdist(where, where), abs=1e-9)
-        assert procrustes(where, points)[2] < 1e-12
-
-
-@pytest.mark.parametrize("mirrored", [False, True])
-def test_fit_is_orthogonal_procrustes(mirrored: bool) -> None:
-    """Independent check: scipy.linalg.orthogonal_procrustes on centred points; a mirrored shape is turned back."""
-    rng = np.random.default_rng(8)
-    points = rng.normal(size=(5, 3)) * ([1, 1, -1] if mirrored else 1)
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    target = points * [1, 1, -1] @ turn + rng.normal(0, 0.1, (5, 3)) + 7.0
-    matrix, _ = orthogonal_procrustes(points - points.mean(axis=0), target - target.mean(axis=0))
-    expected = (points - points.mean(axis=0)) @ matrix + target.mean(axis=0)
-    assert fit(points[None], target[None], np.ones((1, 5)))[0] == pytest.approx(expected, abs=1e-9)
-    weighted = fit(points[None], target[None], np.array([[1.0, 1, 1, 1, 0]]))[0]
-    assert weighted[:4] == pytest.approx(fit(points[None, :4], target[None, :4], np.ones((1, 4)))[0], abs=1e-9)

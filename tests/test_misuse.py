@@ -93,7 +93,6 @@ METHODS: tuple[Any, ...] = (
     co.CentralFilter,
     co.CovarianceIntersection,
     co.GaussianBeliefPropagation,
-    co.ConsensusADMM,
 )
 FLEET = co.load_fleet("town10").between(0, 6).select([0, 1, 2, 3])
 SENSORS, CHANNEL = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=3)
@@ -179,7 +178,7 @@ def test_functions_refuse_arguments_of_the_wrong_kind() -> None:
     }
     swept(co.RelativeMeasurement, relative)
     swept(co.Message, {"name": "m", "numbers": 6})
-    swept(co.NoiseModel, {"name": "n", "sensors": SENSORS, "gnss_std": (1, 1, 1), "velocity": None})
+    swept(co.NoiseModel, {"name": "n", "sensors": SENSORS, "gnss_std": (1, 1, 1), "fleet": None})
     for metric in (co.rt_le, co.max_error, co.nees):
         swept(metric, {"track": TRACK, "fleet": FLEET})
     swept(co.posterior_bound, {"fleet": FLEET, "sensors": SENSORS, "ego": 0, "smoothing": False})
@@ -193,7 +192,6 @@ def test_functions_refuse_arguments_of_the_wrong_kind() -> None:
     swept(RECORDING.between, {"start": 0, "stop": 3})
     swept(RECORDING.neighbours, {"ego": 0})
     swept(RECORDING.links.of, {"observer": 0})
-    swept(co.channel_load, {"position": np.zeros((2, 3)), "size": [100.0, 100.0], "rate": [1.0, 1.0]})
 
 
 PROBLEM = co.Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
@@ -205,7 +203,6 @@ def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
     swept(co.solve, {"problem": whole, "backend": "gauss-newton", "throw": True})
     swept(optimize.solve_batch, {"problem": whole, "backend": "gauss-newton"})
     swept(optimize.solve_gnc, {"problem": whole, "candidates": [0], "loss": "truncated", "threshold": 0.99})
-    swept(optimize.solve_distributed, {"problem": whole, "owner": "ab", "rounds": 1, "rho": 0.3, "loss": 0.0})
     swept(optimize.joint_covariance, {"problem": whole, "solution": solution, "nodes": ["a", "b"]})
     swept(optimize.loop_closures, {"problem": whole})
     swept(co.Loss, {"name": "huber", "scale": 1.0})

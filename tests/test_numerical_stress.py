@@ -12,7 +12,7 @@ import coopoc as co
 from coopoc.methods.catalogue import METHODS
 
 STEPS = 15
-ITERATIVE = ("mds", "qcqp-relaxation")
+ITERATIVE = ("qcqp-relaxation",)
 """Methods that claim no accuracy beside an exact one: unfinished consensus, and points without weights."""
 COOPERATIVE = [name for name, make in METHODS.items() if make("nominal").cooperative and name not in ITERATIVE]
 

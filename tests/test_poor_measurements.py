@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import textbook
 from filterpy.kalman import KalmanFilter
 
 from coopoc import (
@@ -60,7 +61,7 @@ def holed(recording: Recording, share: float, vehicles: slice = slice(None)) -> 
 
 def test_kalman_without_fixes_predicts_as_filterpy_does(crossing: Fleet) -> None:
     seen = holed(observe(crossing, Sensors(), V2X(0), runs=1), 0.4)
-    track = Kalman()(seen, [1])
+    track = textbook(Kalman())(seen, [1])
     q = np.broadcast_to(NoiseModel.nominal(seen.sensors).process_variance(seen), seen.gnss.shape)[0, :, 1]
     kf = KalmanFilter(dim_x=3, dim_z=3)
     kf.x, kf.P, kf.H, kf.R, kf.F, kf.B = (

@@ -18,6 +18,8 @@ from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import rt_le
 from coopoc.methods.road import ROAD, from_logs, to_logs
 from coopoc.methods.track import Method
+from coopoc.studies.roads import road_row, roads
+from coopoc.studies.roads import seen as thinned
 
 ROADS = Path(__file__).parents[2] / "shared" / "data" / "road"
 PLAIN = replace(ROAD, gate=1e9, window=np.inf, correlation=0.0, fix=1.0, motion=1.0)
@@ -46,7 +48,7 @@ def noise_of(recording: Recording, errors: RoadErrors) -> tuple[Floats, Floats]:
     return errors.motion**2 * known.process_variance(recording), errors.fix**2 * known.gnss_variance
 
 
-@pytest.mark.parametrize("errors", [ROAD, PLAIN, RoadErrors(gate=0.7, window=4.0, correlation=0.4, shared=0.5)])
+@pytest.mark.parametrize("errors", [ROAD, PLAIN, RoadErrors(gate=0.7, window=4.0, correlation=0.4)])
 def test_equals_the_dense_filter(errors: RoadErrors) -> None:
     """Through gaps, jumps and missing fixes, to rounding."""
     recording, _ = seen()
@@ -120,9 +122,8 @@ def test_a_fix_counts_less_the_farther_it_is() -> None:
 def test_stated_errors_are_taken_from_the_sensors() -> None:
     recording, _ = seen()
     told = replace(recording.sensors, speed_scale_std=0.07, heading_bias_std=0.2, odometry_error_time=50.0)
-    assumed = RoadFilter().assumed(replace(recording, sensors=replace(told, gnss_drift_std=1.5)))
+    assumed = RoadFilter().assumed(replace(recording, sensors=told))
     assert (assumed.scale, assumed.heading, assumed.lasts) == (0.07, 0.2, 50.0)
-    assert (assumed.shared, assumed.correlation) == (0.5, 60.0)
     assert RoadFilter().assumed(replace(recording, notes=("nothing is simulated",))) == ROAD
 
 
@@ -187,3 +188,35 @@ def test_a_real_car() -> None:
     fitted = RoadFilter.fitted(drive.between(0, cut), truth.between(0, cut))
     assert level(RoadFilter()) < 1.02 * level(Kalman())
     assert level(fitted) < 0.98 * level(Kalman())
+
+
+def test_a_log_of_ones_own_is_a_task(tmp_path: Path) -> None:
+    """Odometry turned by 0.2 rad: the road filter is better as it comes, and no worse calibrated."""
+    recording, fleet = seen(6000, runs=1)
+    rows = ["t,vehicle,x,y,vx,vy"]
+    for t, fix, u in zip(recording.t, recording.gnss[0, :, 0], recording.velocity[0, :, 0], strict=True):
+        rows.append(f"{t},a,{fix[0]},{fix[1]},{u[0]},{u[1]}".replace("nan", ""))
+    true = [f"{t},a,{x},{y}" for t, (x, y, _) in zip(fleet.t, fleet.position[:, 0], strict=True)]
+    (tmp_path / "own").mkdir()
+    (tmp_path / "own" / "car.csv").write_text("\n".join(rows))
+    (tmp_path / "own" / "truth.csv").write_text("\n".join(["t,vehicle,x,y", *true]))
+    data = tmp_path / "own"
+    assert list(roads(data)) == ["own"]
+    kept = np.isfinite(thinned("own", data)[0].gnss[0, :, 0, 0])
+    assert 0.05 < kept.sum() / np.isfinite(recording.gnss[0, :, 0, 0]).sum() < 0.1
+    clock = recording.t % 180.0
+    assert not kept[clock >= 150.0].any()
+    mine, usual = (road_row("own", data, method) for method in (RoadFilter(), Kalman()))
+    assert mine["rt_le_m"][0] < 0.7 * usual["rt_le_m"][0]
+    assert mine["calibrated_m"][0] < 1.02 * mine["rt_le_m"][0]
+    assert mine["nees"] < usual["nees"]
+
+
+@pytest.mark.skipif(not ROADS.is_dir(), reason="the data of ../shared/data are not there")
+@pytest.mark.parametrize("task", ["f9k", "kitti"])
+def test_calibrated_it_is_the_best_on_real_roads(task: str) -> None:
+    """Before the Kalman filters as they come and calibrated; its NEES of (x, y) between 1 and 4."""
+    mine, usual, adaptive = (road_row(task, ROADS.parent, m) for m in (RoadFilter(), Kalman(), co.AdaptiveKalman()))
+    others = usual["rt_le_m"][0], usual["calibrated_m"][0], adaptive["rt_le_m"][0]
+    assert mine["calibrated_m"][0] < 0.97 * min(others)
+    assert 1.0 < mine["calibrated_nees"] < 4.0

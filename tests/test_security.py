@@ -248,6 +248,11 @@ def test_no_text_of_a_csv_is_a_formula() -> None:
     assert {row[1] for row in found[1:]} == {"-0.5"}
 
 
+def test_no_text_of_a_csv_starts_a_row_or_reaches_the_terminal() -> None:
+    text = Table(("a\x1b[31m", "b"), (("x\r=1+1", 1),), "").to_csv()
+    assert text == "a [31m,b\nx =1+1,1\n"
+
+
 def test_no_text_of_a_latex_table_is_a_command(tmp_path: Path) -> None:
     (tmp_path / "secret.tex").write_text("SECRET")
     text = r"\input{secret.tex}"

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from conftest import textbook
 from scipy import stats
 from scipy.optimize import least_squares
 
@@ -46,9 +47,9 @@ def recording(crossing: Fleet) -> Recording:
 def test_in_a_linear_model_every_window_ends_at_the_filter(v2x: V2X, noise_model: str, crossing: Fleet) -> None:
     """The newest point is the filter's; JointFilter is held against filterpy in test_methods."""
     recording = observe(crossing.between(0, 30), S2, v2x, runs=2)
-    peer = JointFilter(noise_model, exact=False)(recording, [0, 3])
-    lags = [FixedLagSmoother(lag=lag, noise_model=noise_model, exact=False) for lag in (1, 10)]
-    horizons = [MovingHorizon(horizon=n, noise_model=noise_model, exact=False) for n in (1, 5)]
+    peer = textbook(JointFilter(noise_model, exact=False))(recording, [0, 3])
+    lags = [textbook(FixedLagSmoother(lag=lag, noise_model=noise_model, exact=False)) for lag in (1, 10)]
+    horizons = [textbook(MovingHorizon(horizon=n, noise_model=noise_model, exact=False)) for n in (1, 5)]
     for method in (*lags, *horizons):
         track = method(recording, [0, 3])
         assert track.x == pytest.approx(peer.x, abs=1e-8)
@@ -82,7 +83,7 @@ def test_the_horizon_is_at_its_minimum(formation: Fleet) -> None:
     """Independent check: scipy.optimize.least_squares on a drive that the horizon holds whole, from the truth."""
     fleet = formation.select(range(4)).between(0, 6)
     recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
-    track, order = MovingHorizon(horizon=6)(recording, [0]), [0, *recording.links.neighbour[:3]]
+    track, order = textbook(MovingHorizon(horizon=6))(recording, [0]), [0, *recording.links.neighbour[:3]]
     for run in range(2):
         moved = recording.dt * recording.velocity[run][:, order]
         std = recording.dt * S2.assumed_velocity_std(recording.velocity[run][:, order])

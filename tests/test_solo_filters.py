@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import winding
+from conftest import textbook, winding
 from oracles import solo as oracle
 from scipy import stats
 
@@ -166,7 +166,7 @@ def test_kalman(crossing: Fleet, noise: str, known: bool) -> None:
 
 @pytest.mark.parametrize("runs", [1, 3])
 def test_adaptive(crossing: Fleet, runs: int) -> None:
-    seen, method = gaps(crossing, absent=False, runs=runs), AdaptiveKalman(window=20.0)
+    seen, method = gaps(crossing, absent=False, runs=runs), textbook(AdaptiveKalman(window=20.0))
     model = NoiseModel.nominal(method.assumed)
     q, r = model.process_variance(seen), model.gnss_variance
     track, std = method(seen, [2, 0]), method.gnss_std(seen, [2, 0])

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import textbook
 from filterpy.kalman import KalmanFilter
 from oracles import covariance_intersection, joint, lkf_sa, messages, msmv
 
@@ -100,15 +101,15 @@ def by_ci(method: CovarianceIntersection, recording: Recording, stars: Any) -> A
 
 
 ORACLES: list[tuple[Any, Callable[..., Any]]] = [
-    (JointFilter(), by_joint),
-    (JointFilter(exact=False), by_joint),
+    (textbook(JointFilter()), by_joint),
+    (textbook(JointFilter(exact=False)), by_joint),
     (JointFilter("identity"), by_joint),
     (LKFSA(), by_lkf),
     (LKFSA("nominal"), by_lkf),
     (MSMV("nominal"), by_msmv),
     (MSMV(), by_msmv),
-    (CovarianceIntersection(), by_ci),
-    (CovarianceIntersection(split=True), by_ci),
+    (textbook(CovarianceIntersection()), by_ci),
+    (textbook(CovarianceIntersection(split=True)), by_ci),
 ]
 
 
@@ -188,7 +189,7 @@ def test_a_state_without_process_noise_stays_finite(crossing: Fleet) -> None:
     known = NoiseModel("fitted", S2, (1e-60, 1e-30, 1e-60))
     still = replace(crossing, position=np.repeat(crossing.position[:1], 60, axis=0), velocity=0 * crossing.velocity)
     recording = observe(still, S2, V2X(max_neighbours=4, loss=0.2), runs=2)
-    track = JointFilter(known)(recording, [1])
+    track = textbook(JointFilter(known))(recording, [1])
     mean = recording.gnss[:, :, 1].mean(axis=1)
     assert np.isfinite(track.x).all()
     assert np.abs(track.x[:, -1, 0] - still.position[-1, 1]).mean() < np.abs(mean - still.position[-1, 1]).mean() + 0.5
@@ -199,7 +200,7 @@ def test_the_linear_filter_equals_filterpy(formation: Fleet) -> None:
     fleet = formation.select(range(4)).between(0, 40)
     recording = observe(fleet, S2, V2X(max_neighbours=3), runs=1, observers=[0])
     known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
-    track = JointFilter(known, exact=False)(recording, [0])
+    track = textbook(JointFilter(known, exact=False))(recording, [0])
     n, order = 12, [0, *recording.links.neighbour[:3]]
     peer = KalmanFilter(dim_x=n, dim_z=n + 9, dim_u=n)
     vectors = np.kron(np.hstack([-np.ones((3, 1)), np.eye(3)]), np.eye(3))

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import crossing_fleet
+from conftest import crossing_fleet, textbook
 from filterpy.kalman import KalmanFilter
 
 from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, StarStream, observe
@@ -40,8 +40,8 @@ SOLO: dict[str, tuple[Any, Callable[..., Any]]] = {
 STARTS: dict[str, Callable[..., Any]] = {
     **{name: start for name, (_, start) in SOLO.items()},
     "net": lambda x0=None: LearnedGain(NET).start(x0),
-    "joint": partial(StarStream, JointFilter(NoiseModel.nominal(S2))),
-    "edge": partial(StarStream, JointFilter(FITTED, exact=False)),
+    "joint": partial(StarStream, textbook(JointFilter(NoiseModel.nominal(S2)))),
+    "edge": partial(StarStream, textbook(JointFilter(FITTED, exact=False))),
 }
 U, Z = np.array([9.0, -2.0, 0.1]), np.array([30.0, 20.0, 1.0])
 
@@ -118,9 +118,9 @@ def test_a_star_step_by_step_is_the_track(exact: bool, channel: str, crossing: F
     kept = recording.links.step >= 20 if growing else np.random.default_rng(8).uniform(size=len(recording.links)) > 0.2
     recording = only(kept, recording)
     assert growing or len(set(recording.neighbours(0).tolist())) > 2
-    method = JointFilter("nominal", exact=exact)
+    method = textbook(JointFilter("nominal", exact=exact))
     track, box = method(recording, [0]), inbox(recording, 0, method.message)
-    stream = StarStream(JointFilter(NoiseModel.nominal(recording.sensors), exact), max_age=recording.v2x.max_age)
+    stream = StarStream(JointFilter(NoiseModel.nominal(recording.sensors), exact, False), max_age=recording.v2x.max_age)
     for t in range(len(recording.t)):
         seen = relative_measurements(recording, box, 1, t)
         x, cov = stream.step(recording.gnss[1, t, 0], recording.velocity[1, t, 0], recording.dt, neighbours=seen)
@@ -140,7 +140,8 @@ def peer(x: Floats, known: NoiseModel) -> Any:
 
 
 @pytest.mark.parametrize(
-    ("start", "near"), [(Kalman(FITTED).start, 1e-9), (partial(StarStream, JointFilter(FITTED)), 1e-4)]
+    ("start", "near"),
+    [(textbook(Kalman(FITTED)).start, 1e-9), (partial(StarStream, textbook(JointFilter(FITTED))), 1e-4)],
 )
 def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(start: Any, near: float) -> None:
     """filterpy gets a late fix moved by, and with the variance of, the motion since, from the sum of all steps. The

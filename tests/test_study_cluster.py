@@ -100,7 +100,10 @@ def test_failures_come_back_as_rows_and_a_killer_ends_the_run(
         worker()
     failed = run_study(study, tmp_path, settings=changes, progress=False, cluster=scheduler)
     row = failed.failures.iloc[0]
-    assert (failed.failed, row["reason"]) == (1, "FloatingPointError: the filter diverged at step 3")
+    assert (failed.failed, row["reason"]) == (
+        1,
+        "FloatingPointError: the filter diverged at step 3",
+    )
     assert "small_study.py" in row["traceback"]
     trouble.write_text("kill")
     for _ in range(2):

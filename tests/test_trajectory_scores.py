@@ -168,6 +168,35 @@ def test_the_command_gives_evos_figures_from_files(
     assert "APE [m]" in capsys.readouterr().out
 
 
+def test_estimates_share_a_truth_and_rotations_are_scored(
+    shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """SciPy's angles; a monocular estimate of half the size is the whole one under sim3."""
+    folder = shared / "evo_oracle"
+    times = folder / "KITTI_00_gt_times.txt"
+    truth, poses = (read_kitti(folder / f"KITTI_00_{name}.txt", times) for name in ("gt", "ORB"))
+    for name, factor in (("whole", 1.0), ("half", 0.5)):
+        assert poses.stamps is not None
+        table = [poses.stamps, factor * poses.position, Rotation.from_matrix(poses.rotation).as_quat()]
+        np.savetxt(tmp_path / f"{name}.txt", np.column_stack(table), fmt="%.17g")
+    named = [str(tmp_path / f"{name}.txt") for name in ("whole", "half")]
+    path, out = tmp_path / "a.png", tmp_path / "s.json"
+    assert score(tuple(named), (f"{folder / 'KITTI_00_gt.txt'}?times={times}",), "sim3", plot=path, output=out) == 0
+    rows = json.loads(out.read_text())
+    assert [row["vehicle"] for row in rows] == ["whole", "half"]
+    assert rows[0]["ape_m"] == pytest.approx(rows[1]["ape_m"], rel=1e-6)
+    assert path.stat().st_size > 10_000
+    at, turn = align(poses.position, truth.position).rotation, Rotation.from_matrix
+    gaps = (turn(at @ poses.rotation).inv() * turn(truth.rotation)).magnitude()
+    assert rows[0]["ape_deg"] == pytest.approx(np.degrees(np.sqrt(np.mean(gaps**2))), rel=1e-6)
+    steps = [turn(path.rotation[:-1]).inv() * turn(path.rotation[1:]) for path in (poses, truth)]
+    gaps = (steps[0].inv() * steps[1]).magnitude()
+    assert rows[0]["rpe_deg"] == pytest.approx(np.degrees(np.sqrt(np.mean(gaps**2))), rel=1e-6)
+    two, one = team()[0], {"red": team()[1]["red"]}
+    with pytest.raises(InputError, match="'blue': has no truth among red"):
+        scores(two, one)
+
+
 def test_tables_hold_vehicles_and_covariances(tmp_path: Path) -> None:
     estimates, truths = team()
     parts = []

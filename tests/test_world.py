@@ -8,9 +8,8 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from scipy import stats
-from scipy.spatial.distance import cdist
 
-from coopoc import V2X, Fleet, InputError, Sensors, channel_load, observe
+from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.world.channels import lost
 from coopoc.world.inbox import inbox
 from coopoc.world.links import to_vector, vector_cov
@@ -130,6 +129,8 @@ def test_links_are_the_nearest_within_the_radius(crossing: Fleet) -> None:
             mine = (recording.links.step == step) & (recording.links.observer == observer)
             assert recording.links.neighbour[mine].tolist() == expected
             assert recording.neighbours(observer)[step] == len(expected)
+    pair = Fleet(("a", "b"), [0, 0.1], np.full((2, 2, 3), [[0, 0, 0], [25, 0, 0]]), np.zeros((2, 2, 3)))
+    assert len(observe(pair, S2, V2X(1, radius=25.0)).links) == 4  # one at the radius is within it
 
 
 def test_vector_cov_against_sampling() -> None:
@@ -245,39 +246,3 @@ def test_a_range_that_would_be_negative_is_reflected() -> None:
     seen = observe(fleet, Sensors(range_std=10.0), V2X(1), runs=5, seed=2, observers=[0])
     assert (seen.relative[..., 0] >= 0).all()
     assert seen.relative[..., 0].mean() == pytest.approx(stats.foldnorm(0.3, scale=10.0).mean(), rel=0.03)
-
-
-@pytest.mark.parametrize(("rate", "share"), [(10.0, 1.4), (2.5, 0.35)])
-def test_three_hundred_vehicles_saturate_the_channel_at_ten_hertz(rate: float, share: float) -> None:
-    """Closed form: 300 x 350 B x 10 Hz = 8.4 Mb/s of 6 Mb/s; at 2.5 Hz 2.1 Mb/s, 35 %."""
-    jam = np.random.default_rng(0).uniform(-80, 80, (300, 3))
-    assert channel_load(jam, 350, rate) == pytest.approx(np.full(300, share))
-
-
-def test_each_receives_the_messages_in_range(crossing: Fleet) -> None:
-    """Against SciPy's distances, with sizes and rates of their own, and someone absent."""
-    rng = np.random.default_rng(1)
-    size, rate, place = rng.uniform(100, 400, 8), rng.uniform(1, 10, 8), crossing.position.copy()
-    place[20:40, 3] = np.nan
-    found = channel_load(place, size, rate, carrier_sense=40.0, bit_rate=1e5)
-    for t in (0, 25, 59):
-        near = cdist(place[t], place[t]) <= 40.0
-        wanted = near @ (8 * size * rate / 1e5)
-        wanted[np.isnan(place[t, :, 0])] = np.nan
-        np.testing.assert_allclose(found[t], wanted)
-    assert np.isnan(found).sum() == 20
-
-
-@pytest.mark.parametrize(
-    ("given", "words"),
-    [
-        ({"position": np.zeros(3)}, "position"),
-        ({"size": -1.0}, "size"),
-        ({"rate": [1.0, 2.0]}, "rate = .*must be a number >= 0, or 3"),
-        ({"carrier_sense": float("nan")}, "carrier_sense"),
-        ({"bit_rate": 0.0}, "bit_rate"),
-    ],
-)
-def test_a_channel_load_that_cannot_be_is_named(given: dict, words: str) -> None:
-    with pytest.raises(InputError, match=words):
-        channel_load(**{"position": np.zeros((3, 3)), "size": 350.0, "rate": 10.0, **given})

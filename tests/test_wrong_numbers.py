@@ -1,17 +1,30 @@
-"""One wrong number of any size: how far it moves an estimate, and the weight that it gets, against filterpy."""
+"""One wrong number of any size, against filterpy; and what would be wrong without a word: other truths, covariances
+that are none, cooperation that changes nothing."""
 
 from __future__ import annotations
 
-from dataclasses import replace
+import io
+import zipfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from conftest import winding
 from filterpy.kalman import KalmanFilter
 
-from coopoc import V2X, CooperativeFilter, Recording, Sensors, load_fleet, observe
+import coopoc as co
+from coopoc import V2X, CooperativeFilter, Kalman, Recording, Sensors, load_fleet, observe
 from coopoc.arrays import Floats, Ints
+from coopoc.evaluate.metrics import neighbour_rt_le
+from coopoc.evaluate.scores import scored
+from coopoc.kernels import gate
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.study.results import Results
+from coopoc.world.storage import read_recording, save_recording
 
 S2 = Sensors.paper_scenario2()
 RUNS, EGO = 60, 0
@@ -19,6 +32,8 @@ KINDS = ("range", "azimuth", "inclination", "fix", "message")
 AT_ONCE, LATER, MOSTLY = 0.5, 0.15, 0.1
 """m, how far one wrong number may move a robust filter's estimate, ever, from one second later on, and then in 49 runs
 of 50. A fix of 35 m or a range of 3 m is within the gates, and weighs as any other."""
+FURTHER = {"kalman": (0.8, 0.45), "kalman-adaptive": (0.8, 0.45), "ci": (1.6, 0.8)}
+"""m, the same of filters that have nothing else than a fix, or one neighbour of many."""
 ESTABLISHED = 10
 """Steps that a member has been in the star: the first number of a newcomer has nothing to be compared with."""
 
@@ -56,7 +71,7 @@ def damaged(recording: Recording, kind: str, links: Ints) -> Recording:
     return replace(recording, gnss=gnss, relative=relative)
 
 
-@pytest.mark.parametrize("name", sorted({*METHODS} - WHOLE_FLEET - {"qcqp-relaxation"}))
+@pytest.mark.parametrize("name", sorted({*METHODS} - {"qcqp-relaxation", "road-kalman"}))
 def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(
     name: str, recording: Recording, links: Ints
 ) -> None:
@@ -64,7 +79,8 @@ def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(
     moved further, by the largest ones at least."""
     method = METHODS[name]("nominal")
     robust = getattr(method, "robust", False) is True
-    runs = slice(0 if robust else RUNS - 4, RUNS)
+    some = 15 if name in WHOLE_FLEET else 1
+    runs, (once, after) = slice(0 if robust else RUNS - 4, RUNS, some), FURTHER.get(name, (AT_ONCE, LATER))
     step, clean = recording.links.step[links][runs], method(recording.of_runs(runs), [EGO]).x[:, :, 0]
     farthest = 0.0
     for kind in KINDS:
@@ -72,8 +88,9 @@ def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(
         moved = np.linalg.norm(x - clean, axis=-1)
         farthest = max(farthest, float(moved.max()))
         later: Floats = np.array([row[t + 10 :].max() for row, t in zip(moved, step, strict=True)])
-        assert not robust or (later.max() < LATER and np.quantile(later, 0.98) < MOSTLY), (kind, later.max())
-    assert (farthest < AT_ONCE) == robust
+        mostly = after if name in FURTHER else MOSTLY
+        assert not robust or (later.max() < after and np.quantile(later, 0.98) < mostly), (kind, later.max())
+    assert (farthest < once) == robust
 
 
 def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() -> None:
@@ -96,3 +113,170 @@ def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() ->
         share = q / gate * (100.0 if q > 4.0 * gate else 1.0) if q > gate else 1.0
         peer.update(gnss[0, t, 0], R=12.25 * np.eye(3) + (share - 1.0) * S)
         assert track.x[0, t, 0] == pytest.approx(peer.x, abs=1e-3), t
+
+
+def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
+    """A fix beyond the gate has q / gate times its variance, one beyond REJECTED gates is left out, until those in a
+    row would have had gains that sum to PATIENCE."""
+    drive = observe(winding(300, 10.0, 7.0), S2, V2X(0), runs=1, seed=2)
+    gnss, rng = drive.gnss.copy(), np.random.default_rng(3)
+    wild = rng.random(300) < 0.15
+    wild[:5] = False
+    gnss[0, wild, 0] += rng.choice([-1, 1], (wild.sum(), 3)) * 10.0 ** rng.uniform(0.5, 4, (wild.sum(), 3))
+    gnss[0, 150:270, 0] = drive.gnss[0, 150:270, 0] + 60.0
+    track, hits, used = Kalman()(replace(drive, gnss=gnss), [0]), 0.0, 0
+    process = (0.1 * S2.assumed_velocity_std(drive.velocity[0, :, 0])) ** 2
+    peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
+    peer.x, peer.P, peer.B, peer.H, peer.R = gnss[0, 0, 0], 12.25 * np.eye(3), 0.1 * np.eye(3), np.eye(3), np.eye(3)
+    for t in range(1, 300):
+        peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
+        gap, variance = gnss[0, t, 0] - peer.x, np.diag(peer.P)
+        q = float((gap**2 / (variance + 12.25 + gate.SLIP)).sum())
+        share = max(q / gate.FIX_GATE, 1.0) if hits < gate.PATIENCE else 1.0
+        hits = hits + float((variance / (variance + 12.25)).mean()) if q > gate.FIX_GATE else 0.0
+        if share <= gate.REJECTED:
+            used += share > 1.0 or q > gate.FIX_GATE
+            peer.update(gnss[0, t, 0], R=12.25 * share)
+        np.testing.assert_allclose(track.x[0, t, 0], peer.x, atol=1e-9)
+    assert used > 10
+
+
+S = co.Sensors(min_range=0.0)
+
+
+def drive(gap: tuple[float, float, float] = (9.0, 0.0, 0.0), steps: int = 80) -> co.Fleet:
+    """Two vehicles on a bend, the second `gap` m from the first."""
+    t = 0.1 * np.arange(steps)
+    velocity = np.stack([5 * np.cos(0.2 * t), 5 * np.sin(0.2 * t), 0 * t], axis=1)
+    position = np.cumsum(0.1 * velocity, axis=0)[:, None] + np.arange(2)[:, None] * np.array(gap)
+    return co.Fleet(("a", "b"), t, position, np.repeat(velocity[:, None], 2, axis=1))
+
+
+FLEET = drive()
+SEEN = co.observe(FLEET, S, co.V2X(1), runs=3)
+TRACK = co.Kalman()(SEEN, ["a"])
+USES: dict[str, Callable[[co.Fleet], Any]] = {
+    "rt_le": lambda fleet: co.rt_le(TRACK, fleet),
+    "nees": lambda fleet: co.nees(TRACK, fleet),
+    "neighbours": lambda fleet: neighbour_rt_le(TRACK, SEEN, fleet),
+    "fitted": lambda fleet: co.NoiseModel.fitted(SEEN, fleet),
+    "oracle": lambda fleet: co.Kalman(co.NoiseModel.oracle(S, fleet))(SEEN, ["a"]),
+    "bound": lambda fleet: co.posterior_bound(fleet, S, "a", recording=SEEN),
+}
+
+
+@pytest.mark.parametrize("use", USES)
+@pytest.mark.parametrize("other", ["order", "ids", "times", "steps"])
+def test_no_truth_of_another_drive_is_taken(use: str, other: str) -> None:
+    USES[use](FLEET)
+    wrong = {
+        "order": FLEET.select(["b", "a"]),
+        "ids": replace(FLEET, ids=("a", "c")),
+        "times": replace(FLEET, t=FLEET.t + 1),
+        "steps": FLEET.between(0, 79),
+    }
+    with pytest.raises(co.InputError, match="ids and times differ"):
+        USES[use](wrong[other])
+
+
+@dataclass(frozen=True)
+class Negative:
+    """A method whose covariance is -I from the fifth step on."""
+
+    name: str = "negative"
+    cooperative: bool = False
+    message: co.Message = co.Kalman().message
+
+    def __call__(self, recording: co.Recording, egos: Any = (0,)) -> co.Track:
+        track = co.Kalman()(recording, egos)
+        covariance = np.array(track.covariance)
+        covariance[:, 5:] = -np.eye(3)
+        return replace(track, covariance=covariance)
+
+
+def test_a_covariance_that_is_none_is_named_with_its_method_and_step() -> None:
+    with pytest.raises(co.InputError, match=r"at step 5: must be positive semidefinite, and negative returns another"):
+        scored(Negative(), SEEN, ["a"], FLEET)
+
+
+@pytest.mark.parametrize("method", [co.JointFilter(), co.FixedLagSmoother(), co.GaussianBeliefPropagation()])
+def test_who_flies_straight_above_helps_or_does_no_harm(method: Any) -> None:
+    """The azimuth of what is straight above says nothing: with it the joint filter had 0.67 m, alone 0.54 m."""
+    above = drive((0.0, 0.0, 10.0))
+    seen = co.observe(above, S, co.V2X(1, 60.0), runs=10, seed=1)
+    alone, together = (co.rt_le(which(seen, ["a"]), above).mean() for which in (co.Kalman(), method))
+    assert together < alone
+
+
+def test_plausible_limits_hold_where_a_noun_is_made() -> None:
+    for field, value in (("position", 1e9), ("velocity", 1e5)):
+        with pytest.raises(co.InputError, match=rf"{field}\[0, 0, 0\] = .*: must be within"):
+            replace(FLEET, **{field: np.full((80, 2, 3), value)})
+    for field, value in (("gnss", 1e9), ("velocity", 1e5), ("relative", 1e18)):
+        with pytest.raises(co.InputError, match=rf"{field}\[0, 0, 0.*: must be within"):
+            replace(SEEN, **{field: np.full(getattr(SEEN, field).shape, value)})
+    with pytest.raises(co.InputError, match="must be printable"):
+        replace(FLEET, ids=("a", "b\r=1+1"))
+
+
+def header(shape: tuple[int, ...]) -> bytes:
+    """An array of that shape by its header, without its numbers."""
+    file = io.BytesIO()
+    np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    return file.getvalue()
+
+
+BAD = (header((3, 80, 2, 99)), header((10**11,)), header((2**61,)), b"\x93NUMPY\x01\x00\x06\x00{'a': ")
+
+
+@pytest.mark.parametrize("content", BAD)
+def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes) -> None:
+    save_recording(SEEN, tmp_path / "good.npz", FLEET)
+    assert read_recording(tmp_path / "good.npz")[0].runs == 3
+    with zipfile.ZipFile(tmp_path / "good.npz") as good, zipfile.ZipFile(tmp_path / "bad.npz", "w") as bad:
+        for name in good.namelist():
+            bad.writestr(name, content if name == "relative.npy" else good.read(name))
+    with pytest.raises(co.InputError, match=r"bad.npz = .*must be a recording"):
+        read_recording(tmp_path / "bad.npz")
+
+
+def test_cooperation_that_changes_nothing_is_said_below_the_table() -> None:
+    """LKF-SA where only ranges were measured receives, and is the filter alone; the joint filter is helped."""
+    pytest.importorskip("coopoc.studies")
+    from coopoc.studies.side_by_side import STUDY
+    from coopoc.studies.views import unused
+
+    each = {"kalman": (0.5, 0, 0), "lkf-sa": (0.5004, 90, 90), "joint": (0.4, 90, 90), "mhe": (0.5, 0, 90)}
+    rows = [
+        {"method": m, "max_neighbours": k, "noise_model": "nominal", "ego": "a", "run": r, "neighbours_mean": 2.0}
+        | {"rt_le_m": e + 0.01 * r, "bytes_per_second": float(b), "sent_bytes_per_second": float(sent)}
+        for m, (e, b, sent) in each.items()
+        for k in (0, 2)
+        for r in (0, 1)
+    ]
+    rows = [{**row, "rt_le_m": 0.5} if row["max_neighbours"] == 0 else row for row in rows]
+    results = Results("s", "?", STUDY.axes, STUDY.settings, pd.DataFrame(rows), pd.DataFrame(), 0, {})
+    text = "K = 2: equal to solo within 0.001 m: no neighbour's measurement was used, because "
+    assert [note.partition(", ")[2] for note in unused(results)] == [
+        f"{text}what was measured lacks what it takes, such as an azimuth.",
+        f"{text}no message arrived.",
+    ]
+    assert STUDY.answers(results)["K = 0"].startswith("K = 0: there is no neighbour")
+
+
+def test_calls_that_raised_what_is_no_error_of_ours(tmp_path: Path) -> None:
+    learned, study = pytest.importorskip("coopoc.learned"), co.Study("s", "?", dict, {"x": (1,)})
+    net = learned.NoiseParameters()
+    import torch
+
+    from coopoc.learned.checkpoint import load, write
+
+    tensors = dict(net.state_dict()) | {"history": torch.tensor(1.0)}
+    write(tmp_path / "a.safetensors", tensors, {"kind": "okf", "net": dict(net.settings)})
+    for field, call in {
+        "jobs": lambda: co.run_study(study, tmp_path, jobs="2"),  # type: ignore[arg-type]
+        "settings": lambda: co.run_study(study, tmp_path, settings=3),  # type: ignore[arg-type]
+        "checkpoint": lambda: load(tmp_path / "a.safetensors"),
+    }.items():
+        with pytest.raises(co.InputError, match=field):
+            call()

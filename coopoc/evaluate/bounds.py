@@ -212,8 +212,7 @@ def _measured(fleet: Fleet, links: Links, members: Ints, recording: Recording) -
         InputError: a recording of other vehicles or steps, or one that lacks a link.
     """
     instance("recording", recording, Recording, "Give observe(..., told=True).")
-    if recording.ids != fleet.ids or len(recording.t) != len(fleet.t):
-        raise InputError("recording", repr(recording), "must hold the vehicles and steps of the fleet", "Observe it.")
+    fleet.require(recording.ids, recording.t)
     sides = ("step", "observer", "neighbour")
     known, wanted = (np.column_stack([getattr(of, side) for side in sides]) for of in (recording.links, links))
     place = {link: k for k, link in enumerate(map(tuple, known.tolist()))}

@@ -30,9 +30,8 @@ def _truth(track: Track, fleet: Fleet) -> Floats:
     track = instance("track", track, Track, "A method makes one of a recording: the track stands before the fleet.")
     fleet = instance("fleet", fleet, Fleet, "Score a track against its fleet: the track stands before the fleet.")
     egos = np.array(track.egos, dtype=np.int64)
-    hint = "Score a track against the fleet that its recording was observed from, cut alike: fleet.between(...)."
-    if len(track.t) != len(fleet.t):
-        raise InputError("track.t", f"{len(track.t)} steps", f"must have the fleet's {len(fleet.t)} steps", hint)
+    fleet.require(track.ids or fleet.ids, track.t)
+    hint = "Score a track against the fleet that its recording was observed from."
     refuse("track.egos", egos, egos >= len(fleet.ids), f"must be columns of the fleet, 0..{len(fleet.ids) - 1}", hint)
     return fleet.position[:, egos]
 
@@ -64,9 +63,7 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
 
     NaN where an ego has no neighbour or the method does not estimate them.
     """
-    if fleet.ids != recording.ids:
-        hint = "Give the fleet that the recording was observed from."
-        raise InputError("fleet", fleet.name or "unnamed", "must hold the vehicles that were observed", hint)
+    fleet.require(recording.ids, recording.t)
     if track.neighbours is None:
         return np.full((len(track.x), len(track.egos)), np.nan)
     mine = [recording.links.of(ego) for ego in track.egos]
@@ -79,10 +76,18 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
     return np.asarray(np.sqrt(np.stack(mean, axis=1)))
 
 
-def nees(track: Track, fleet: Fleet) -> Floats:
+def nees(track: Track, fleet: Fleet, *, method: str = "the method") -> Floats:
     r"""Normalised estimation error squared, $e^\top P^{-1} e$, (R, T, E); its mean is 3 for a consistent filter.
 
     NaN where the covariance is zero: at a start that is known, there is nothing to normalise by.
+
+    Args:
+        track: of a method with covariances.
+        fleet: the truth.
+        method: its name, for errors.
+
+    Raises:
+        InputError: another fleet, no covariance, or one that is singular or not positive semidefinite.
     """
     truth = _truth(track, fleet)
     if track.covariance is None:
@@ -90,6 +95,11 @@ def nees(track: Track, fleet: Fleet) -> Floats:
         raise InputError("covariance", None, "this method claims none", hint)
     arrays = (np.ascontiguousarray(values) for values in (track.x, truth, track.covariance))
     found, sound = normalised(*arrays)
+    if (found < -1e-9).any():
+        run, step, ego = np.argwhere(found < -1e-9)[0]
+        given = f"{track.covariance[run, step, ego].tolist()} of ego {track.egos[ego]} in run {run} at step {step}"
+        allowed = f"must be positive semidefinite, and {method} returns another"
+        raise InputError("covariance", given, allowed, "Its eigenvalues are variances, m^2.")
     if not sound:
         hint = "Assume noise in every direction: no standard deviation may be zero."
         raise InputError("covariance", "singular", "must have an inverse for NEES", hint)

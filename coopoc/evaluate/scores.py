@@ -90,7 +90,7 @@ def scored(
         if metric:
             parts[-1][metric.rpartition(":")[2]] = measure(metric, track, drive)
         if track.covariance is not None:
-            each = nees(track, drive)
+            each = nees(track, drive, method=method.name)
             parts[-1]["nees"] = np.nanmean(each, axis=1)
             squares.append(each.sum(axis=0))
     found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from ..arrays import Floats, Ints, checked, instance, named, number, one_of
 from ..errors import InputError, suggestion
@@ -14,7 +15,7 @@ from ..short_repr import short_repr
 from .statistics import Interval, mean_interval
 
 Unit = Literal["steps", "m"]
-Aligned = Literal["none", "each", "team"]
+Aligned = Literal["none", "each", "sim3", "team"]
 UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
 
 
@@ -243,6 +244,8 @@ class Score:
         ape_m: the same after the alignment.
         ape_max_m: largest error after the alignment.
         rpe_m: root of the mean squared relative error, None without rotations or in a drive shorter than its delta.
+        ape_deg: as `ape_m`, of the angles by which rotations differ, None without.
+        rpe_deg: as `rpe_m`, of rotations.
         nees: mean of e^T P^-1 e, 3 if consistent (2 where heights claim no variance), None without covariances.
         remarks: signs of another unit, clock or scale, a sentence each.
     """
@@ -254,6 +257,8 @@ class Score:
     ape_m: Interval
     ape_max_m: float
     rpe_m: float | None
+    ape_deg: float | None
+    rpe_deg: float | None
     nees: float | None
     remarks: tuple[str, ...] = ()
 
@@ -273,9 +278,9 @@ def scores(
 
     Args:
         estimates: by vehicle.
-        truths: by vehicle; one truth for one estimate needs no common name.
-        aligned: "none" compares in the frame given; "each" aligns every vehicle by itself (evo's `-a`); "team" moves
-            all by one motion, which keeps where they are to each other.
+        truths: by vehicle; one truth that has no estimate's name is that of all.
+        aligned: "none" compares in the frame given; "each" aligns every vehicle by itself (evo's `-a`), "sim3" with its
+            scale (`-as`); "team" moves all by one motion, which keeps where they are to each other.
         max_diff: s, how far stamps that belong together may be apart.
         offset: s, added to the estimates' stamps.
         delta: of the relative error.
@@ -293,7 +298,6 @@ def scores(
     >>> round(row.rt_le_m.mean, 6)
     0.5
     """
-    one_of("aligned", aligned, ("none", "each", "team"))
     hint = "Give vehicle -> Path."
     for side, paths in (("estimates", estimates), ("truths", truths)):
         if not named(side, paths, hint):
@@ -301,33 +305,66 @@ def scores(
         for name, path in paths.items():
             instance(f"{side}[{name!r}]", path, Path)
     blocks = number("blocks", blocks, 2, kind=int, allowed=">= 2")
-    alone = len(estimates) == len(truths) == 1
-    true_of = {name: _truth(name, truths, alone) for name in estimates}
-    pairs = {}
-    for name, path in estimates.items():
-        i, j = associated(path.t, true_of[name].t, max_diff, offset)
-        pairs[name] = _at(path, i), _at(true_of[name], j)
-    team = None
-    if aligned == "team":
-        team = align(*(np.concatenate([pair[k].position for pair in pairs.values()]) for k in (0, 1)))
     rows = []
-    for name, (estimate, truth) in pairs.items():
-        motion = team or (align(estimate.position, truth.position) if aligned == "each" else None)
-        moved = estimate if motion is None else _moved(estimate, motion)
+    for name, (estimate, moved, truth) in compared(estimates, truths, aligned, max_diff, offset).items():
         raw = np.linalg.norm(estimate.position - truth.position, axis=1)
         error = np.linalg.norm(moved.position - truth.position, axis=1)
-        relative = None
-        stamps = estimates[name].t + offset, true_of[name].t
+        relative = turns = turned = None
+        stamps = estimates[name].t + offset, _truth(name, truths, estimates).t
         found = remarks(stamps, (estimate.position, truth.position), max_diff)
         if len(ends(estimate.position, delta, unit)) < 2:
             found = (*found, f"no relative error: the drive is shorter than {delta:g} {unit}.")
         elif estimate.rotation is not None and truth.rotation is not None:
             both = (estimate.position, estimate.rotation), (truth.position, truth.rotation)
-            relative = float(np.sqrt(np.square(relative_error(*both, delta, unit)).mean()))
+            relative = _rms(relative_error(*both, delta, unit))
+            at = ends(estimate.position, delta, unit)
+            steps = (np.swapaxes(r[at[:-1]], -1, -2) @ r[at[1:]] for r in (estimate.rotation, truth.rotation))
+            turned = _rms(angles(*steps))
+        if moved.rotation is not None and truth.rotation is not None:
+            turns = _rms(angles(moved.rotation, truth.rotation))
         missed = len(estimates[name].t) - len(raw)
         spread = (rms_interval(raw, blocks), rms_interval(error, blocks), float(error.max()))
-        rows.append(Score(name, len(raw), missed, *spread, relative, _nees(moved, truth), found))
+        rows.append(Score(name, len(raw), missed, *spread, relative, turns, turned, _nees(moved, truth), found))
     return rows
+
+
+def compared(
+    estimates: Mapping[str, Path],
+    truths: Mapping[str, Path],
+    aligned: Aligned = "none",
+    max_diff: float = 0.01,
+    offset: float = 0.0,
+) -> dict[str, tuple[Path, Path, Path]]:
+    """Estimate, the same aligned, and truth of each vehicle at the stamps that belong together, as `scores` compares
+    them."""
+    one_of("aligned", aligned, get_args(Aligned))
+    pairs = {}
+    for name, path in estimates.items():
+        truth = _truth(name, truths, estimates)
+        i, j = associated(path.t, truth.t, max_diff, offset)
+        pairs[name] = _at(path, i), _at(truth, j)
+    team = None
+    if aligned == "team":
+        team = align(*(np.concatenate([pair[k].position for pair in pairs.values()]) for k in (0, 1)))
+    made = {}
+    for name, (estimate, truth) in pairs.items():
+        alone = {"each": False, "sim3": True}.get(aligned)
+        motion = team if alone is None else align(estimate.position, truth.position, scale=alone)
+        made[name] = estimate, estimate if motion is None else _moved(estimate, motion), truth
+    return made
+
+
+def angles(a: Floats, b: Floats) -> Floats:
+    """(T,) deg, of the rotations A^T B between (T, 3, 3) ones.
+
+    >>> angles(np.eye(3)[None], np.diag([-1.0, -1.0, 1.0])[None]).tolist()
+    [180.0]
+    """
+    return np.asarray(np.degrees(Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).magnitude()))
+
+
+def _rms(values: Floats) -> float:
+    return float(np.sqrt(np.square(values).mean()))
 
 
 def rms_interval(error: Floats, blocks: int = 20) -> Interval:
@@ -345,9 +382,9 @@ def rms_interval(error: Floats, blocks: int = 20) -> Interval:
     return Interval(rms, float(np.sqrt(max(found.low, 0.0))), float(np.sqrt(found.high)), count)
 
 
-def _truth(name: str, truths: Mapping[str, Path], alone: bool) -> Path:
-    """The truth of that name, or the only one."""
-    if name not in truths and not alone:
+def _truth(name: str, truths: Mapping[str, Path], estimates: Mapping[str, Path]) -> Path:
+    """The truth of that name, or the only one if it has no estimate's name."""
+    if name not in truths and (len(truths) > 1 or estimates.keys() & truths.keys()):
         hint = suggestion(name, truths, "Name the files, or the ids in them, alike.")
         raise InputError("vehicle", repr(name), f"has no truth among {', '.join(truths)}", hint)
     return truths.get(name) or next(iter(truths.values()))
@@ -360,7 +397,7 @@ def _at(path: Path, k: Ints) -> Path:
 
 def _moved(path: Path, motion: Alignment) -> Path:
     turn, cov = motion.rotation, path.covariance
-    turned = None if cov is None else turn @ cov @ turn.T
+    turned = None if cov is None else motion.scale**2 * (turn @ cov @ turn.T)
     rotation = None if path.rotation is None else turn @ path.rotation
     return Path(path.t, motion.apply(path.position), rotation, turned)
 

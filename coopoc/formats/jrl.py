@@ -108,8 +108,12 @@ def read_jrl(path: str | Path, unit: float = 1.0) -> Graph:
     for place, value in _values(path.name, whole):
         name, tag = name_of(place, get(place, value, "key")), str(get(place, value, "type"))
         if tag in (f"Pose{d}", f"Point{d}") and name not in log.values:
+            role = log.roles.setdefault(name, tag[:-1].lower())
+            if tag[:-1].lower() != role:
+                raise InputError(
+                    place, f"type {tag}", f"must be a {role}, as measurements of {name} have it", "Mend it."
+                )
             log.values[name] = read_value(place, tag, value)
-            log.roles.setdefault(name, tag[:-1].lower())
     return _graph(path.name, d, log)
 
 

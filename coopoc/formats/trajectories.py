@@ -120,6 +120,11 @@ def read_tum(path: str | Path, *, repeats: Literal["refuse", "drop"] = "refuse")
     return Trajectory(table[:, 0], table[:, 1:4], rotation, place=lambda row: f"{path.name}: line {lines[row]}")
 
 
+def write_tum(path: Path, t: Floats, position: Floats) -> None:
+    """Write a TUM file of times (T,) s and positions (T, 3) m; all point east."""
+    np.savetxt(path, np.column_stack([t, position, np.tile([0, 0, 0, 1], (len(t), 1))]), fmt="%.9f")
+
+
 def read_kitti(path: str | Path, times: str | Path | None = None) -> Trajectory:
     """Trajectory of a KITTI file.
 

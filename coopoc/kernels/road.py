@@ -29,8 +29,7 @@ class RoadNoise(NamedTuple):
 
     Attributes:
         fix: (3,) m^2, of a fix.
-        shared: of that variance, the share whose error lasts.
-        correlation: s, for which it does.
+        correlation: s, for which its error lasts.
         gate: standard deviations per axis from which a fix counts less.
         heading: rad, standard deviation of the heading's error.
         scale: of the scale's error.
@@ -39,7 +38,6 @@ class RoadNoise(NamedTuple):
     """
 
     fix: Floats
-    shared: float
     correlation: float
     gate: float
     heading: float
@@ -118,7 +116,7 @@ def correct(state: RoadState, noise: RoadNoise, fix: Floats, late: Floats) -> No
     """
     x, p, k, more = state.x, state.p, state.gain, state.more
     rho = math.exp(-more[SINCE] / noise.correlation) if noise.correlation > 0.0 else 0.0
-    lasting, level = 1.0 + noise.shared * 2.0 * rho / max(1.0 - rho, 1e-6), more[LEVEL]
+    lasting, level = 1.0 + 2.0 * rho / max(1.0 - rho, 1e-6), more[LEVEL]
     a, b, c = p[0, 0] + level * noise.fix[0] + late[0], p[1, 1] + level * noise.fix[1] + late[1], p[0, 1]
     e, n = fix[0] - x[0], fix[1] - x[1]
     square = 0.5 * (b * e * e - 2.0 * c * e * n + a * n * n) / (a * b - c * c)

@@ -1,7 +1,8 @@
 """Solo Kalman filters on position, axis by axis, with known or adaptively estimated noise of the fixes.
 
-The state of an axis is (x, share, motion, noise, weight): its position m, whose variance is share * noise + motion m^2,
-where `noise` m^2 is the variance of a fix as it is estimated now and `weight` the number of fixes behind that estimate.
+The state of an axis is (x, share, motion, noise, weight, hits): its position m, whose variance is share * noise +
+motion m^2, where `noise` m^2 is the variance of a fix as it is estimated now and `weight` the number of fixes behind
+that estimate; `hits` are those of fixes beyond the gate, the same on all axes.
 With an infinite weight the noise is known, and the filter is the Kalman filter, whose variance is all in `motion`.
 """
 
@@ -15,11 +16,15 @@ import numpy as np
 from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
 from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
+from .gate import REJECTED, SLIP, count, inflation
 from .motion import MotionNoise, process_variance
 
 LEAST = 1e-4
 """m^2, least variance of a fix: 1 cm."""
-AxisState: TypeAlias = tuple[float, float, float, float, float]
+NEVER = (0.0, 0.0, 0.0)
+"""m^2, what fixes that are not late have more."""
+AxisState: TypeAlias = tuple[float, float, float, float, float, float]
+Vector: TypeAlias = tuple[float, float, float]
 
 
 class FixNoise(NamedTuple):
@@ -29,11 +34,13 @@ class FixNoise(NamedTuple):
         variance: (3,) m^2 at the start.
         weight: fixes that the start counts for; infinite: known.
         window: most fixes in the running mean.
+        gate: squared normalised innovation of a fix from which it weighs less; 0 for none.
     """
 
     variance: Floats
     weight: float = math.inf
     window: float = math.inf
+    gate: float = 0.0
 
 
 class SoloMeasurements(NamedTuple):
@@ -60,39 +67,61 @@ class SoloMeasurements(NamedTuple):
 def start_state(x: float, late: float, exact: bool, variance: float, weight: float) -> AxisState:
     """State at a position that is known exactly, or as uncertain as a fix."""
     if exact:
-        return x, 0.0, 0.0, variance, weight
+        return x, 0.0, 0.0, variance, weight, 0.0
     if math.isinf(weight):
-        return x, 0.0, variance + late, variance, weight
-    return x, 1.0, late, variance, weight
+        return x, 0.0, variance + late, variance, weight, 0.0
+    return x, 1.0, late, variance, weight, 0.0
 
 
 @part
-def step(state: AxisState, moved: float, process: float, fix: float, late: float, window: float) -> AxisState:
+def gate_fix(states: Floats, moved: Vector, process: Vector, fix: Vector, late: Vector, gate: float) -> Vector:
+    """Squared normalised innovation of the axes' fix, its factor of their noise, and the hits that follow."""
+    q, gain, hits = 0.0, 0.0, states[0, 5]
+    for c in range(3):
+        innovation = fix[c] - states[c, 0] - moved[c]
+        if not math.isnan(innovation):
+            noise = states[c, 3]
+            p = states[c, 1] * noise + states[c, 2] + process[c]
+            s = p + noise + late[c]
+            q, gain = q + innovation * innovation / (s + SLIP), gain + p / (3.0 * s)
+    if gate == 0.0 or q == 0.0:
+        return 0.0, 1.0, hits
+    return q, inflation(q, gate, hits), count(q, gate, hits, gain)
+
+
+@part
+def step(
+    state: AxisState, moved: float, process: float, fix: float, late: float, rule: FixNoise, gated: Vector
+) -> AxisState:
     """Predict x += dt u, p += q; where there is a fix z, estimate its noise r and update in Joseph's form.
 
     The running mean r <- r + (v^2 - p - r) / n of innovations v (Mehra, IEEE TAC 15(2), 1970) leaves out `late` m^2,
-    what a late fix has more: it and the prediction share the motion since. x += k (z - x), k = p / (p + r),
-    p = (1 - k)^2 p + k^2 r.
+    what a late fix has more: it and the prediction share the motion since; a v that is rejected counts as the largest
+    one that is not.
+    x += k (z - x), k = p / (p + f r), p = (1 - k)^2 p + k^2 f r.
     """
-    x, share, motion, noise, weight = state
+    (x, share, motion, noise, weight, _), (q, f, hits) = state, gated
     x, motion = x + moved, motion + process
     if math.isnan(fix):
-        return x, share, motion, noise, weight
+        return x, share, motion, noise, weight, hits
     p, innovation = share * noise + motion, fix - x
+    if math.isfinite(weight):
+        weight = min(weight + 1.0, rule.window)
+        within = min(1.0, REJECTED * rule.gate / q) if f > 1.0 else 1.0
+        noise = max(noise + (within * innovation * innovation - p - noise) / weight, LEAST)
+        p = share * noise + motion
+    if math.isinf(f):
+        return x, share, motion, noise, weight, hits
+    k = p / (p + f * (noise + late))
+    x, rest, own = x + k * innovation, (1.0 - k) * (1.0 - k), k * k * f
     if math.isinf(weight):
-        k = p / (p + noise + late)
-        return x + k * innovation, 0.0, (1.0 - k) * (1.0 - k) * p + k * k * (noise + late), noise, weight
-    weight = min(weight + 1.0, window)
-    noise = max(noise + (innovation * innovation - p - noise) / weight, LEAST)
-    p = share * noise + motion
-    k = p / (p + noise + late)
-    rest = (1.0 - k) * (1.0 - k)
-    return x + k * innovation, rest * share + k * k, rest * motion + k * k * late, noise, weight
+        return x, 0.0, rest * p + own * (noise + late), noise, weight, hits
+    return x, rest * share + own, rest * motion + own * late, noise, weight, hits
 
 
 @compiled
 def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, index: Ints, x: Floats, p: Floats) -> Floats:
-    """Fill x m and p m^2 of the vehicles, and return the estimated variance of a fix at each step, if it is estimated.
+    """Fill x m and p m^2 of the vehicles, and return the variance of each fix, where it is estimated or gated.
 
     A vehicle that was absent starts at its first fix.
 
@@ -106,61 +135,63 @@ def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, index: Ints,
     """
     runs, steps, vehicles = seen.gnss.shape[0], seen.gnss.shape[1], len(seen.columns)
     adaptive = math.isfinite(rule.weight)
-    noise, states = np.empty(x.shape if adaptive else (0, 0, 0, 3)), np.empty((vehicles, 3, 5))
+    varies = adaptive or rule.gate > 0.0
+    noise, states = np.empty(x.shape if varies else (0, 0, 0, 3)), np.empty((vehicles, 3, 6))
     for run in range(runs):
         for t in range(steps):
             for e in range(vehicles):
                 n, at = seen.columns[e], index[e]
                 q = process_variance(seen.motion, seen.velocity[run, t, n], seen.dt)
+                u, more, fix = seen.velocity[run, t, n], seen.process[run, t, n], three(seen.gnss[run, t, n])
+                q = more[0] + q[0], more[1] + q[1], more[2] + q[2]
+                moved = seen.dt * u[0], seen.dt * u[1], seen.dt * u[2]
+                gated = gate_fix(states[e], moved, q, fix, NEVER, rule.gate if t > 0 else 0.0)
                 for c in range(3):
-                    fix, now = seen.gnss[run, t, n, c], states[e, c]
-                    moved = seen.dt * seen.velocity[run, t, n, c]
+                    now = states[e, c]
                     if t == 0 and known:
                         state = start_state(x[run, 0, at, c], 0.0, True, rule.variance[c], rule.weight)
-                    elif t == 0 or math.isnan(now[0] + moved):
-                        state = start_state(fix, 0.0, False, rule.variance[c], rule.weight)
+                    elif t == 0 or math.isnan(now[0] + moved[c]):
+                        state = start_state(fix[c], 0.0, False, rule.variance[c], rule.weight)
                     else:
-                        before = now[0], now[1], now[2], now[3], now[4]
-                        state = step(before, moved, seen.process[run, t, n, c] + q[c], fix, 0.0, rule.window)
+                        before = now[0], now[1], now[2], now[3], now[4], now[5]
+                        state = step(before, moved[c], q[c], fix[c], 0.0, rule, gated)
                     put(now, state)
                     x[run, t, at, c], p[run, t, at, c] = state[0], state[1] * state[3] + state[2]
-                    if adaptive:
-                        noise[run, t, at, c] = state[3]
+                    if varies:
+                        noise[run, t, at, c] = state[3] if adaptive else state[3] * gated[1]
     return noise
 
 
-def packed(motion: MotionNoise, rule: FixNoise) -> Floats:
-    """Both noises as one array: a tuple of arrays takes longer to hand over than a step takes."""
-    return np.concatenate([motion.base, motion.ratio, motion[2:], rule.variance, rule[1:]])
-
-
 @compiled
-def stream_step(given: Floats, state: Floats, history: Floats, noise: Floats, answer: Floats) -> int:
+def stream_step(
+    given: Floats, state: Floats, history: Floats, motion: MotionNoise, rule: FixNoise, answer: Floats
+) -> int:
     """One step of a stream: dead reckoning, the fix brought forward, `step` on every axis.
 
     Nothing is changed where the input is bad. A state of NaN has not started yet.
 
     Args:
         given: (8,) fix m, velocity m/s, dt s, age of the fix s.
-        state: (3, 5).
+        state: (3, 6).
         history: of `motion`.
-        noise: of `packed`.
+        motion: noise of the motion.
+        rule: noise of the fixes.
         answer: (12,) position m, covariance m^2.
     """
-    motion = MotionNoise(noise[:3], noise[3:6], noise[6], noise[7], noise[8])
-    rule = FixNoise(noise[9:12], noise[12], noise[13])
     q, late, moved = np.empty(3), np.zeros(3), np.zeros(3)
     outcome = dead_reckon(given, history, motion, answer, q, moved, late)
     starts = math.isnan(state[0, 0])
     if outcome == BAD_INPUT or (starts and outcome == NO_FIX_YET):
         return outcome
+    fix = given[0] + moved[0], given[1] + moved[1], given[2] + moved[2]
+    gated = gate_fix(state, three(answer), three(q), fix, three(late), rule.gate)
     for c in range(3):
-        now, fix = state[c], given[c] + moved[c]
+        now = state[c]
         if starts:
-            put(now, start_state(fix, late[c], False, rule.variance[c], rule.weight))
+            put(now, start_state(fix[c], late[c], False, rule.variance[c], rule.weight))
         else:
-            before = now[0], now[1], now[2], now[3], now[4]
-            put(now, step(before, answer[c], q[c], fix, late[c], rule.window))
+            before = now[0], now[1], now[2], now[3], now[4], now[5]
+            put(now, step(before, answer[c], q[c], fix[c], late[c], rule, gated))
     answer[:] = 0.0
     for c in range(3):
         answer[c], answer[3 + 4 * c] = state[c, 0], state[c, 1] * state[c, 3] + state[c, 2]
@@ -170,5 +201,11 @@ def stream_step(given: Floats, state: Floats, history: Floats, noise: Floats, an
 @part
 def put(state: Floats, values: AxisState) -> None:
     """Write the state of one axis."""
-    for i in range(5):
+    for i in range(6):
         state[i] = values[i]
+
+
+@part
+def three(values: Floats) -> Vector:
+    """The first numbers of an array."""
+    return values[0], values[1], values[2]

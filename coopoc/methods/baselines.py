@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..arrays import Floats
-from ..kernels.solo import FixNoise
 from ..kernels.stars.lkf_sa import run_lkf_sa
 from ..kernels.stars.messages import Assumptions
 from ..kernels.stars.pseudo_fixes import run_msmv
@@ -16,7 +15,7 @@ from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements
-from .kalman import solo_filter
+from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel, resolve
 from .track import Track, check_options
 
@@ -102,10 +101,12 @@ class MSMV:
         return follow_egos(self, recording, egos, run, (*known.notes, RECONSTRUCTION), missing=True)
 
 
-def solo_estimates(recording: Recording, known: NoiseModel, egos: Sequence[int]) -> tuple[Assumptions, Floats]:
+def solo_estimates(
+    recording: Recording, known: NoiseModel, egos: Sequence[int], robust: bool = False
+) -> tuple[Assumptions, Floats]:
     """What a filter assumes whose messages hold solo estimates, and these, (R, T, N, 3) m of all vehicles in the stars
-    of some egos (columns)."""
+    of some egos (columns); `robust` as of Kalman."""
     links = recording.links
     members = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
-    x, p, _ = solo_filter(recording, members, known, FixNoise(known.gnss_variance), in_place=True)
+    x, p, _ = solo_filter(recording, members, known, fix_noise(known, robust), in_place=True)
     return assumptions(recording, known)._replace(broadcast=p), x

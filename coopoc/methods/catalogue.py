@@ -11,10 +11,9 @@ from .baselines import LKFSA, MSMV
 from .centralised import BatchSmoother, CentralFilter
 from .cooperative_filter import CooperativeFilter
 from .covariance_intersection import CovarianceIntersection
-from .decentralised import ConsensusADMM, GaussianBeliefPropagation
+from .decentralised import GaussianBeliefPropagation
 from .joint_filter import JointFilter
 from .kalman import GNSS, AdaptiveKalman, Kalman
-from .mds import MDS
 from .qcqp_relaxation import QCQPRelaxation
 from .road import RoadFilter
 from .sliding_window import FixedLagSmoother, MovingHorizon
@@ -29,16 +28,14 @@ METHODS: Mapping[str, Factory] = {
     "kalman-adaptive": lambda noise_model: AdaptiveKalman(),
     "road-kalman": RoadFilter,
     "lkf-sa": LKFSA,
-    "lkf-sa-edge": partial(JointFilter, exact=False, name="lkf-sa-edge"),
+    "lkf-sa-edge": partial(JointFilter, exact=False, robust=False, name="lkf-sa-edge"),
     "msmv-r": MSMV,
     "joint": JointFilter,
     "cooperative-filter": CooperativeFilter,
     "ci": CovarianceIntersection,
     "split-ci": partial(CovarianceIntersection, split=True, name="split-ci"),
-    "mds": MDS,
     "qcqp-relaxation": QCQPRelaxation,
     "gbp": GaussianBeliefPropagation,
-    "admm": ConsensusADMM,
     "central-filter": CentralFilter,
     "batch-smoother": BatchSmoother,
     "fixed-lag": FixedLagSmoother,
@@ -46,7 +43,7 @@ METHODS: Mapping[str, Factory] = {
 }
 """Name -> a function of the noise model, and of options of the method by name."""
 
-WHOLE_FLEET = frozenset({"gbp", "admm", "central-filter", "batch-smoother"})
+WHOLE_FLEET = frozenset({"gbp", "central-filter", "batch-smoother"})
 """Methods that need what every vehicle measured, not only the egos."""
 
 

@@ -43,9 +43,12 @@ class CentralFilter:
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.
+        robust: an innovation beyond its gate weighs less, far beyond it nothing (`coopoc.kernels.gate`); False believes
+            every number.
     """
 
     noise_model: NoiseModel | str = "nominal"
+    robust: bool = True
     name: str = "central-filter"
     cooperative: bool = True
     message: Message = UPLOAD
@@ -71,7 +74,7 @@ class CentralFilter:
         relative = check_recording(recording).relative[0]
         alone = np.isnan(relative[:, 0]) & np.isfinite(relative[:, 1])
         notes = (CENTRE, BEARINGS) if 2 * alone.sum() > len(alone) else (CENTRE,)
-        return fleet_track(self, self.noise_model, recording, egos, solve, central=True)
+        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve, central=True)
 
 
 def share_covariance(measured: Measured, pairs: Pairs, assumed: Assumed) -> bool:
@@ -111,11 +114,14 @@ class BatchSmoother:
         noise_model: "identity", "nominal" or a NoiseModel.
         exact_steps: Gauss-Newton steps after the linear solution.
         settle: m, the largest step to stop at; inf stops after those.
+        robust: what does not fit the solution weighs less, what is far off nothing (`coopoc.kernels.gate`); weights are
+            set at the vehicles' own filters, and at each of the solutions that follow.
     """
 
     noise_model: NoiseModel | str = "nominal"
     exact_steps: int = 1
     settle: float = 1e-3
+    robust: bool = True
     name: str = "batch-smoother"
     cooperative: bool = True
     message: Message = UPLOAD
@@ -145,4 +151,4 @@ class BatchSmoother:
             note = (f"{lost} of {len(x)} runs did not settle within {self.settle:g} m",) if lost else ()
             return Answer(x, cov, 0, (NOT_CAUSAL, CENTRE, *note))
 
-        return fleet_track(self, self.noise_model, recording, egos, solve, central=True)
+        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve, central=True)

@@ -36,6 +36,7 @@ class CovarianceIntersection:
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.
         split: False for plain CI.
+        robust: a fix or a pseudo-fix beyond its gate weighs less, far beyond it nothing, in the senders' filters, too.
 
     References:
         Julier, Uhlmann, General decentralized data fusion with covariance intersection, Handbook of Multisensor Data
@@ -47,6 +48,7 @@ class CovarianceIntersection:
 
     noise_model: NoiseModel | str = "nominal"
     split: bool = False
+    robust: bool = True
     name: str = "ci"
     cooperative: bool = True
     message: Message = ESTIMATE_AND_COV
@@ -62,11 +64,12 @@ class CovarianceIntersection:
         the weight would depend on the noise.
         """
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
-        assumed, own = solo_estimates(recording, known, columns)
+        gates = self.robust and known.exact_relative
+        assumed, own = solo_estimates(recording, known, columns, gates)
         assumed = assumed._replace(growth=ESTIMATE_GROWTH)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, theirs = run_intersection(measurements(recording, ego, box, own), assumed, self.split)
+            x, cov, theirs = run_intersection(measurements(recording, ego, box, own), assumed, self.split, gates)
             yield Estimate(slice(None), x, cov, box.link, theirs)
 
         return follow_egos(self, recording, egos, run, known.notes, missing=True)

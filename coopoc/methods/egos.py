@@ -78,7 +78,9 @@ def follow_egos(
         array.flags.writeable = False  # so that the Track need not copy them
     seconds = time.perf_counter() - began
     whole = {name: np.concatenate(values, axis=-1) for name, values in extras.items()}
-    return Track(recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, notes, extras=whole)
+    return Track(
+        recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, notes, extras=whole, ids=recording.ids
+    )
 
 
 def contradicted(x: Floats, recording: Recording, columns: Sequence[int]) -> tuple[str, ...]:
@@ -117,7 +119,7 @@ def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats |
         gnss,
         recording.velocity,
         gnss if broadcast is None else broadcast,
-        components(recording.relative, box.link),
+        components(recording.told, box.link),
         neighbour,
         start,
         newest,

@@ -28,9 +28,12 @@ class JointFilter:
     Gauss-Newton step on range, azimuth and inclination themselves. The states of the other members stay when one joins
     or leaves. `StarStream` runs the same filter one step at a time.
 
+    Innovations beyond their gate weigh less, far beyond it nothing (`coopoc.kernels.gate`).
+
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.
         exact: False stops at the linear update, which is LKF-SA with the edges' covariance ("edge form").
+        robust: False believes every number: the textbook filter. With the identity noise model nothing is gated.
 
     References:
         Lerro, Bar-Shalom, Tracking with debiased consistent converted measurements versus EKF, IEEE TAES 29(3), 1993.
@@ -39,6 +42,7 @@ class JointFilter:
 
     noise_model: NoiseModel | str = "nominal"
     exact: bool = True
+    robust: bool = True
     name: str = "joint"
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
@@ -49,10 +53,11 @@ class JointFilter:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)
-        assumed, refine = assumptions(recording, known), self.exact and known.exact_relative
+        assumed, gates = assumptions(recording, known), self.robust and known.exact_relative
+        refine = self.exact and known.exact_relative
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, neighbours = run_filter(measurements(recording, ego, box), assumed, refine)
+            x, cov, neighbours = run_filter(measurements(recording, ego, box), assumed, refine, gates)
             yield Estimate(slice(None), x, cov, box.link, neighbours)
 
         return follow_egos(self, recording, egos, run, known.notes, missing=True)

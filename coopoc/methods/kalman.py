@@ -11,6 +11,7 @@ import numpy.typing as npt
 
 from ..arrays import Floats
 from ..errors import InputError
+from ..kernels.gate import FIX_GATE
 from ..kernels.motion import MotionNoise
 from ..kernels.solo import FixNoise, SoloMeasurements, run_filter
 from ..short_repr import short_repr
@@ -55,6 +56,8 @@ class Kalman:
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.
         x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
+        robust: a fix whose innovation is beyond its gate weighs less, far beyond it nothing (`coopoc.kernels.gate`),
+            unless many in a row are. False believes every fix. With the identity noise model nothing is gated.
 
     >>> from coopoc import Fleet, Sensors, observe
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
@@ -64,6 +67,7 @@ class Kalman:
 
     noise_model: NoiseModel | str = "nominal"
     x0: Floats | None = None
+    robust: bool = True
     name: str = "kalman"
     cooperative: bool = False
     message: Message = NO_MESSAGE
@@ -78,7 +82,7 @@ class Kalman:
         began = time.perf_counter()
         columns = check_recording(recording).columns(egos, missing=True)
         known = resolve(self.noise_model, recording, relative=False)
-        x, p, _ = solo_filter(recording, columns, known, FixNoise(known.gnss_variance), self.x0)
+        x, p, _ = solo_filter(recording, columns, known, fix_noise(known, self.robust), self.x0)
         return solo_track(recording, columns, x, p, began)
 
     def start(
@@ -99,7 +103,7 @@ class Kalman:
         ([1.0, 2.0, 0.0], np.float64(3.0))
         """
         known = constant_noise(self.noise_model)
-        return FilterStream(motion_noise(known, interval), FixNoise(known.gnss_variance), x0, history)
+        return FilterStream(motion_noise(known, interval), fix_noise(known, self.robust), x0, history)
 
 
 @dataclass(frozen=True, eq=False)
@@ -123,6 +127,7 @@ class AdaptiveKalman:
         prior_weight: fixes that this start counts for; inf keeps it for ever.
         x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
         window: fixes; inf never forgets.
+        robust: as of `Kalman`; a fix that is rejected counts in the estimate of r as the worst that is not.
 
     References:
         Mehra, IEEE TAC 15(2) 1970; Mohamed and Schwarz, Journal of Geodesy 73, 1999. Defaults were chosen on
@@ -139,6 +144,7 @@ class AdaptiveKalman:
     prior_weight: float = 5.0
     x0: Floats | None = None
     window: float = 100.0
+    robust: bool = True
     name: str = "kalman-adaptive"
     cooperative: bool = False
     message: Message = NO_MESSAGE
@@ -176,7 +182,13 @@ class AdaptiveKalman:
 
     @property
     def _fixes(self) -> FixNoise:
-        return FixNoise(NoiseModel.nominal(self.assumed).gnss_variance, float(self.prior_weight), float(self.window))
+        known = fix_noise(NoiseModel.nominal(self.assumed), self.robust)
+        return known._replace(weight=float(self.prior_weight), window=float(self.window))
+
+
+def fix_noise(known: NoiseModel, robust: bool) -> FixNoise:
+    """Known noise of fixes, gated if robust; not where no noise is stated that an innovation could exceed."""
+    return FixNoise(known.gnss_variance, gate=FIX_GATE if robust and known.exact_relative else 0.0)
 
 
 def solo_track(
@@ -186,7 +198,9 @@ def solo_track(
     cov, none = np.zeros((*p.shape, 3)), np.zeros((recording.runs, len(columns)))
     np.einsum("...ii->...i", cov)[:] = p
     notes = (*notes, *lost(x, recording, columns))
-    return Track(recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, notes=notes)
+    return Track(
+        recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, notes=notes, ids=recording.ids
+    )
 
 
 def solo_filter(
@@ -209,8 +223,8 @@ def solo_filter(
         in_place: leave the vehicles at their columns among all N; of others nothing is written.
 
     Returns:
-        Position m, variance m^2, and estimated variance of a fix m^2 (of no length where it is known), (R, T, E, 3) or
-        (R, T, N, 3).
+        Position m, variance m^2, and variance of each fix m^2 where it is estimated or gated (else of no length),
+        (R, T, E, 3) or (R, T, N, 3).
 
     Raises:
         InputError: x0 of another shape.

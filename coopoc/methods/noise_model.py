@@ -31,7 +31,7 @@ class NoiseModel:
         sensors: relative and velocity noise; None for identity.
         process_std: (3,) m per step, constant; None to follow the velocity.
         gnss_std: (3,) m.
-        velocity: (T, N, 3) m/s true velocity, for the oracle only.
+        fleet: whose true velocity is known, for the oracle only.
         compass: (2,) rad, noise and constant error of the heading, both of which are within the azimuth's std.
         notes: of the Track, what was changed to stay within double precision.
     """
@@ -40,7 +40,7 @@ class NoiseModel:
     sensors: Sensors | None = None
     process_std: tuple[float, float, float] | None = None
     gnss_std: tuple[float, float, float] = (1.0, 1.0, 1.0)
-    velocity: Floats | None = None
+    fleet: Fleet | None = None
     compass: tuple[float, float] = (0.0, 0.0)
     notes: tuple[str, ...] = ()
 
@@ -51,8 +51,8 @@ class NoiseModel:
         object.__setattr__(self, "notes", texts("notes", self.notes))
         if self.sensors is not None:
             instance("sensors", self.sensors, Sensors)
-        if self.velocity is not None:
-            object.__setattr__(self, "velocity", checked("velocity", self.velocity, "(T, N, 3)", (-1, -1, 3)))
+        if self.fleet is not None:
+            instance("fleet", self.fleet, Fleet)
         for field in ("process_std", "gnss_std"):
             if field == "gnss_std" or self.process_std is not None:
                 value = checked(field, getattr(self, field), "(3,)", (3,))
@@ -77,7 +77,7 @@ class NoiseModel:
     @classmethod
     def oracle(cls, sensors: Sensors, fleet: Fleet) -> NoiseModel:
         """`nominal` with the true velocity: the bias-ignorant oracle filter that a learned gain is compared with."""
-        return replace(cls.nominal(sensors), name="oracle", velocity=instance("fleet", fleet, Fleet).velocity)
+        return replace(cls.nominal(sensors), name="oracle", fleet=instance("fleet", fleet, Fleet))
 
     @classmethod
     def fitted(cls, recording: Recording, fleet: Fleet) -> NoiseModel:
@@ -91,10 +91,8 @@ class NoiseModel:
             recording: of the training vehicles.
             fleet: their true motion.
         """
-        true, rates = instance("fleet", fleet, Fleet).position, instance("recording", recording, Recording).velocity
-        if true.shape != rates.shape[1:]:
-            allowed = f"must hold the {rates.shape[1]} steps and {rates.shape[2]} vehicles of the recording"
-            raise InputError("fleet", repr(fleet), allowed, "Give the fleet that was observed.")
+        recording = instance("recording", recording, Recording)
+        instance("fleet", fleet, Fleet).require(recording.ids, recording.t)
         moved = np.diff(fleet.position, axis=0) - recording.dt * recording.velocity[:, 1:]
         floor = recording.dt * recording.sensors.velocity_floor
         process = np.maximum(np.sqrt(np.nanmean(moved**2, axis=(0, 1, 2))), floor)
@@ -107,8 +105,10 @@ class NoiseModel:
         if self.process_std is not None:
             return np.square(self.process_std)[None, None, None]
         assert self.sensors is not None
-        velocity = recording.velocity if self.velocity is None else self.velocity[None]
-        floor = 1e-6 if self.velocity is not None else self.sensors.velocity_floor
+        velocity, floor = recording.velocity, self.sensors.velocity_floor
+        if self.fleet is not None:
+            self.fleet.require(recording.ids, recording.t)
+            velocity, floor = self.fleet.velocity[None], 1e-6
         variance = np.empty(velocity.shape)
         for run, one in enumerate(velocity):  # a run at a time stays in the cache
             np.square(recording.dt * self.sensors.velocity_std(one, floor), out=variance[run])
@@ -234,7 +234,7 @@ def constant_noise(noise_model: NoiseModel | str) -> NoiseModel:
     """The noise model of a filter without a recording: "identity" or a NoiseModel of constant noise, which needs
     none."""
     model = noise_model if isinstance(noise_model, NoiseModel) else None
-    if noise_model == "nominal" or (model and (type(model) is not NoiseModel or model.velocity is not None)):
+    if noise_model == "nominal" or (model and (type(model) is not NoiseModel or model.fleet is not None)):
         raise InputError(
             "noise_model",
             repr(model.name if model else noise_model),
@@ -258,7 +258,7 @@ def process_noise(known: NoiseModel, recording: Recording) -> tuple[Floats, Moti
     """Process noise of a recording's steps as a sum: m^2 broadcastable to (R, T, N, 3), and that of the velocity.
 
     It is that of the measured velocity where it is constant or follows it, else `process_variance` alone."""
-    if type(known).process_variance is NoiseModel.process_variance and known.velocity is None:
+    if type(known).process_variance is NoiseModel.process_variance and known.fleet is None:
         return NO_VARIANCE, motion_noise(known, None)
     return np.ascontiguousarray(known.process_variance(recording)), NO_MOTION_NOISE
 

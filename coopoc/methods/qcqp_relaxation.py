@@ -15,9 +15,8 @@ from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, follow_egos
-from .mds import bridged_stars, bridging_note
 from .noise_model import NoiseModel, resolve
-from .star import StarStep
+from .star import StarStep, bridged, stars
 from .track import Track, check_options
 
 
@@ -93,3 +92,25 @@ def range_star(star: StarStep, run: int, members: Ints, known: NoiseModel) -> Pr
     range_std = 1.0 if known.sensors is None else known.sensors.range_std
     pairs = [(0, j) for j in range(1, len(members))]
     return problem.add("range", pairs, star.relative[run, members[1:] - 1, :1], std=range_std)
+
+
+def bridged_stars(
+    recording: Recording, ego: int, known: NoiseModel, message: Message, box: Inbox
+) -> Iterator[tuple[StarStep, Ints]]:
+    """The star at every step for a method without a memory, and the steps (R, n-1) of the messages held, -1 for none.
+
+    Where a fix is missing the last one counts, moved by the vehicle's own odometry; without one yet, no position does.
+    """
+    x, variance = bridged(recording, known)
+    variance = np.broadcast_to(variance, x.shape)
+    for star in stars(recording, ego, known, message, sent=(x, variance)):
+        star.position[:, 0], star.variance[:, 0] = x[:, star.step, ego], variance[:, star.step, ego]
+        yield star, box.newest[:, box.start[star.step] : box.start[star.step + 1]]
+
+
+def bridging_note(recording: Recording) -> tuple[str, ...]:
+    """A note on `bridged`, where it has replaced fixes."""
+    driving = np.isfinite(recording.velocity)
+    share = 100 * (np.isnan(recording.gnss) & driving).sum() / driving.sum()
+    note = f"{share:.0f} % of the fixes are missing: the last one is brought forward with the velocity"
+    return () if recording.complete else (note,)

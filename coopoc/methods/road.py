@@ -31,7 +31,6 @@ LIMITS: Limits = {
     "scale": (0.0, 1.0, "in [0, 1]"),
     "lasts": (1e-3, np.inf, "> 0 s"),
     "window": (2.0, np.inf, ">= 2"),
-    "shared": (0.0, 1.0, "in [0, 1]"),
 }
 
 
@@ -48,7 +47,6 @@ class RoadErrors:
         scale: of an error of the speed that lasts, as a share of it.
         lasts: s, correlation time of both.
         window: fixes over which their variance is raised to what innovations show.
-        shared: share of the variance of a fix that is correlated.
 
     Raises:
         InputError: numbers outside these ranges.
@@ -62,7 +60,6 @@ class RoadErrors:
     scale: float = 0.03
     lasts: float = 300.0
     window: float = 30.0
-    shared: float = 1.0
 
     def __post_init__(self) -> None:
         check_options(self, LIMITS)
@@ -70,7 +67,7 @@ class RoadErrors:
 
 ROAD = RoadErrors()
 """Of measurements that are not simulated, by hand, between what is learned in simulation and what real drives show."""
-EXACT = RoadErrors(fix=1.0, motion=1.0, correlation=0.0, gate=5.0, heading=0.0, scale=0.0, window=np.inf, shared=0.0)
+EXACT = RoadErrors(fix=1.0, motion=1.0, correlation=0.0, gate=5.0, heading=0.0, scale=0.0, window=np.inf)
 """Of simulated measurements whose noise is known and white: the Kalman filter, with a gate."""
 
 
@@ -120,16 +117,15 @@ class RoadFilter:
         extras = {name: errors[..., i] for i, name in enumerate(names)} if self.assumed(recording).heading else {}
         none = np.zeros((recording.runs, len(columns)))
         took, notes = time.perf_counter() - began, lost(x, recording, columns)
-        return Track(recording.t, tuple(columns), x, cov, none, none, took, notes=notes, extras=extras)
+        return Track(
+            recording.t, tuple(columns), x, cov, none, none, took, notes=notes, extras=extras, ids=recording.ids
+        )
 
     def assumed(self, recording: Recording) -> RoadErrors:
         """`errors`, or those that fit the recording."""
         if self.errors is not None:
             return self.errors
         told, usual = recording.sensors, ROAD if recording.measured else EXACT
-        if told.gnss_drift_std > 0:
-            share = told.gnss_drift_std**2 / (told.gnss_drift_std**2 + float(np.square(told.gnss_std).mean()))
-            usual = replace(usual, correlation=told.gnss_drift_time, shared=share)
         if told.speed_scale_std > 0:
             lasting = min(told.odometry_error_time, 1e6)
             usual = replace(usual, scale=told.speed_scale_std, heading=told.heading_bias_std, lasts=lasting)
@@ -243,12 +239,12 @@ MOST = np.log([1e2, 1e2, 1e3, 20.0, 1.0, 0.5, 1e5, 1e4])
 
 
 def to_logs(errors: RoadErrors) -> Floats:
-    """(7,) logarithms of the numbers that are fitted: all but `shared`."""
-    return np.asarray(np.log(astuple(errors)[:8]))
+    """(8,) logarithms of the numbers that are fitted: all but `shared`."""
+    return np.asarray(np.log(astuple(errors)))
 
 
 def from_logs(logs: Floats) -> RoadErrors:
-    """Errors of logarithms (7,), within LEAST and MOST."""
+    """Errors of logarithms (8,), within LEAST and MOST."""
     return RoadErrors(*np.exp(np.clip(logs, LEAST, MOST)).tolist())
 
 
@@ -286,7 +282,7 @@ def road_noise(known: NoiseModel, errors: RoadErrors) -> RoadNoise:
     """Both as the kernel takes them."""
     fix = np.square(errors.fix * np.array(known.gnss_std))
     e = errors
-    return RoadNoise(fix, e.shared, e.correlation, e.gate, e.heading, e.scale, e.lasts, e.window)
+    return RoadNoise(fix, e.correlation, e.gate, e.heading, e.scale, e.lasts, e.window)
 
 
 class RoadStream:

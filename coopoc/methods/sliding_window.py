@@ -41,6 +41,7 @@ class FixedLagSmoother:
         noise_model: "identity", "nominal" or a NoiseModel.
         lag: steps.
         exact: False keeps relative measurements as converted vectors.
+        robust: what is beyond its gate when it comes weighs less, far beyond it nothing (`coopoc.kernels.gate`).
 
     Raises:
         InputError: a lag < 0.
@@ -58,6 +59,7 @@ class FixedLagSmoother:
     noise_model: NoiseModel | str = "nominal"
     lag: int = 5
     exact: bool = True
+    robust: bool = True
     name: str = "fixed-lag"
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
@@ -92,6 +94,7 @@ class MovingHorizon:
         noise_model: "identity", "nominal" or a NoiseModel.
         horizon: N, steps.
         exact: False keeps relative measurements as converted vectors.
+        robust: what is beyond its gate when it comes weighs less, far beyond it nothing (`coopoc.kernels.gate`).
 
     Raises:
         InputError: a horizon < 1.
@@ -108,6 +111,7 @@ class MovingHorizon:
     noise_model: NoiseModel | str = "nominal"
     horizon: int = 10
     exact: bool = True
+    robust: bool = True
     name: str = "mhe"
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
@@ -133,9 +137,9 @@ def _behind_arrival_cost(
     from ..kernels.windows.horizon import Settings, horizons
 
     noise_model, counts = resolve(method.noise_model, recording), Counter[str]()
-    exact = method.exact and noise_model.exact_relative
+    exact, robust = (noise_model.exact_relative and wish for wish in (method.exact, method.robust))
     age = recording.v2x.max_age / recording.dt + 1e-9 if late else -1.0
-    settings = Settings(length, exact, REPEATS if exact and late else 0, STRAYED, age)
+    settings = Settings(length, exact, REPEATS if exact and late else 0, STRAYED, age, robust)
 
     def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
         seen, assumed = measurements(recording, ego, box), assumptions(recording, noise_model)

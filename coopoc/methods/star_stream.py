@@ -37,6 +37,7 @@ from ..kernels.stars.cooperative_state import (
 )
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.relative import components
+from ..world.links import told
 from .cooperative_filter import Broadcast, CooperativeFilter, guards_of, model_of
 from .joint_filter import JointFilter
 from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
@@ -77,7 +78,7 @@ class RelativeMeasurement:
         if relative.shape != (3,) or not named or not (0.0 < relative[0] < math.inf or math.isnan(relative[0])):
             text = "must have a name and three numbers, the range first and > 0"
             raise InputError("relative", (self.id, self.relative), text, "Give NaN for what was not measured.")
-        row[:AGE], row[AGE] = components(relative[None, None], FIRST)[0, 0], seconds("age", self.age)
+        row[:AGE], row[AGE] = components(told(relative)[None, None], FIRST)[0, 0], seconds("age", self.age)
         row[SOLO:SOLO_VARIANCE] = fix_or_none(self.gnss, "neighbour's gnss")
         if self.variance is not None:
             row[SOLO_VARIANCE:ODOMETER] = three("neighbour's variance", self.variance)
@@ -136,6 +137,9 @@ class StarStream:
         self._model, self._guards = model_of(known, robust), NO_GUARDS
         if isinstance(filter, JointFilter):
             self._model = self._model._replace(exact=float(filter.exact and known.exact_relative))
+            if filter.robust and known.exact_relative:
+                usual = Guards()
+                self._guards = NO_GUARDS._replace(gate=usual.gate, fix_gate=usual.fix_gate)
         elif robust:
             self._guards = guards_of(filter, known)
         self._motion: MotionNoise = motion_noise(known, interval)

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ..arrays import Floats
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.motion import MotionNoise
-from ..kernels.solo import FixNoise, packed, stream_step
+from ..kernels.solo import FixNoise, stream_step
 from .motion_history import MotionHistory, three
 
 State = TypeVar("State")
@@ -86,15 +86,15 @@ class FilterStream:
 
     def __init__(self, motion: MotionNoise, fixes: FixNoise, x0: npt.ArrayLike | None, history: float) -> None:
         self.history = MotionHistory(history)
-        self._state, self._given, self._noise = np.full((3, 5), np.nan), np.zeros(8), packed(motion, fixes)
+        self._state, self._given, self._noise = np.full((3, 6), np.nan), np.zeros(8), (motion, fixes)
         if x0 is not None:
             zero, weight = np.zeros(3), np.full(3, fixes.weight)
-            self._state[:] = np.stack([three("x0", x0), zero, zero, fixes.variance, weight], axis=1)
+            self._state[:] = np.stack([three("x0", x0), zero, zero, fixes.variance, weight, zero], axis=1)
 
     @property
     def state(self) -> AxisStates | None:
         """State of the filter; None before the first fix."""
-        return None if np.isnan(self._state[0, 0]) else AxisStates(*self._state.T.copy())
+        return None if np.isnan(self._state[0, 0]) else AxisStates(*self._state.T[:5].copy())
 
     def step(
         self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float = 0.0
@@ -117,7 +117,7 @@ class FilterStream:
         """
         self.history.write(self._given, gnss, velocity, dt, fix_age)
         answer = np.empty(12)
-        outcome = stream_step(self._given, self._state, self.history.reserve(), self._noise, answer)
+        outcome = stream_step(self._given, self._state, self.history.reserve(), *self._noise, answer)
         if outcome == NO_FIX_YET:
             return np.full(3, np.nan), None
         if outcome != ESTIMATE:

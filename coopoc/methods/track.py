@@ -42,6 +42,7 @@ class Track:
         heading_covariance: (R, T, E, 4) of the heading with x, y, z and itself, m rad and rad^2; None as above.
         extras: other numbers by name, (R, T, E), or (R, L) by link; states with their standard deviations under the
             name and "_std".
+        ids: of all vehicles of the Recording, so that no other fleet's truth is taken for theirs; () if unknown.
     """
 
     t: Floats
@@ -56,6 +57,7 @@ class Track:
     heading: Floats | None = None
     heading_covariance: Floats | None = None
     extras: Mapping[str, Floats] = field(default_factory=dict)
+    ids: tuple[str, ...] = ()
 
     __repr__ = short_repr
 
@@ -79,7 +81,8 @@ class Track:
             if name not in optional or getattr(self, name) is not None:
                 object.__setattr__(self, name, checked(name, getattr(self, name), axes, shape))
         object.__setattr__(self, "seconds", number("seconds", self.seconds))
-        object.__setattr__(self, "notes", texts("notes", self.notes))
+        for name in ("notes", "ids"):
+            object.__setattr__(self, name, texts(name, getattr(self, name)))
         if not isinstance(self.extras, Mapping):
             raise InputError("extras", shown(self.extras), "must be name -> (R, T, E)", "Give {} for none.")
         by_link = None if self.neighbours is None else self.neighbours.shape[:2]

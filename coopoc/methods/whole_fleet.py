@@ -14,6 +14,7 @@ from ..world.exchange import Exchange, exchange
 from ..world.recording import Recording, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 from .egos import contradicted
+from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel, resolve
 from .track import Method, Track
 
@@ -48,6 +49,7 @@ class Answer(NamedTuple):
 def fleet_track(
     method: Method,
     noise_model: NoiseModel | str,
+    robust: bool,
     recording: Recording,
     egos: Sequence[int | str],
     solve: Callable[[Measured, Pairs, Assumed], Answer],
@@ -59,6 +61,7 @@ def fleet_track(
     Args:
         method: whose Track it is.
         noise_model: as the method was given it.
+        robust: gate innovations.
         recording: observed by all vehicles.
         egos: columns or ids.
         solve: the method's kernel.
@@ -76,7 +79,7 @@ def fleet_track(
     model = resolve(noise_model, recording)
     met = centre(recording, method.message) if central else exchange(recording, method.message)
     arrival = met.either if central else met.both
-    measured, pairs, assumed = kernel_arguments(recording, met, model, arrival)
+    measured, pairs, assumed = kernel_arguments(recording, met, model, arrival, robust)
     answer = solve(measured, pairs, assumed)
     shape = (recording.runs, len(recording.t), len(columns))
     x = answer.x.reshape(recording.gnss.shape).take(columns, axis=2)
@@ -101,6 +104,7 @@ def fleet_track(
         met.sent_bytes[:, columns],
         time.perf_counter() - began,
         notes=model.notes + answer.notes + contradicted(x, recording, columns),
+        ids=recording.ids,
     )
 
 
@@ -116,7 +120,7 @@ def centre(recording: Recording, upload: Message) -> Exchange:
 
 
 def kernel_arguments(
-    recording: Recording, met: Exchange, model: NoiseModel, arrival: Ints
+    recording: Recording, met: Exchange, model: NoiseModel, arrival: Ints, robust: bool
 ) -> tuple[Measured, Pairs, Assumed]:
     """Arguments of the kernels by name; a pair takes part if its messages arrive and both vehicles are active."""
     from ..kernels.fleets.graph import Assumed, Measured, Pairs
@@ -127,12 +131,16 @@ def kernel_arguments(
     columns = (met.first, met.second, met.link, met.link_back, met.start)
     first, second, link, link_back, start = (np.ascontiguousarray(column, dtype=np.int64) for column in columns)
     pairs = Pairs(first, second, link, link_back, start, np.ascontiguousarray(both & (arrival >= 0)))
-    relative = components(recording.relative, np.arange(len(recording.links)))
-    variances = model.process_variance(recording), model.fix_variance(recording)
-    process, fix = (np.ascontiguousarray(variance, dtype=float) for variance in variances)
+    relative = components(recording.told, np.arange(len(recording.links)))
+    relative = np.concatenate([relative, np.ones((*relative.shape[:2], 3))], axis=2)
+    process, fix = model.process_variance(recording), model.fix_variance(recording)
+    if robust := robust and model.exact_relative:
+        vehicles = range(len(recording.ids))
+        fix = fix / model.gnss_variance * solo_filter(recording, vehicles, model, fix_noise(model, robust))[2]
+    process, fix = (np.ascontiguousarray(variance, dtype=float) for variance in (process, fix))
     std, min_range = (model.sensors.relative_std, model.sensors.min_range) if model.sensors else (np.zeros(0), 0.0)
     measured = Measured(recording.gnss, recording.velocity, relative, active, recording.dt)
-    return measured, pairs, Assumed(process, fix, std, min_range)
+    return measured, pairs, Assumed(process, fix, std, min_range, robust)
 
 
 def located(recording: Recording) -> Bools:

@@ -3,7 +3,6 @@
 from . import backends as _package  # noqa: F401  (first: the function `backends` takes its name)
 from .assess.assess import joint_covariance
 from .backend import Backend, Capabilities, SolverResult, backends
-from .distributed import Distributed, solve_distributed
 from .graph_problems import loop_closures
 from .model.factor import Constraint, Factor, Loss
 from .model.measurements import MEASUREMENTS, Measurement, measurement
@@ -19,7 +18,6 @@ __all__ = [
     "Batch",
     "Capabilities",
     "Constraint",
-    "Distributed",
     "Factor",
     "Loss",
     "Measurement",
@@ -36,6 +34,5 @@ __all__ = [
     "pose",
     "solve",
     "solve_batch",
-    "solve_distributed",
     "solve_gnc",
 ]

@@ -19,6 +19,7 @@ from ..short_repr import short_repr
 from . import store
 from .cell import assignments, parse
 from .manifest import read
+from .style import OWN
 
 SEED = "train_seed"
 """Column of the training seed: means are taken over it, and intervals are not."""
@@ -50,6 +51,10 @@ class Results:
     environment: Mapping[str, str]
 
     __repr__ = short_repr
+
+    def __post_init__(self) -> None:
+        if "label" in self.frame:
+            OWN.update(self.frame.dropna(subset=["label"]).groupby("method")["label"].first().astype(str))
 
     @classmethod
     def load(cls, folder: str | Path, names: Collection[str] | None = None) -> Results:
@@ -145,7 +150,7 @@ class Results:
     def _one_cell(self, frame: pd.DataFrame, by: Sequence[str], value: str) -> None:
         check_metric(frame, value)
         for axis in self.axes:
-            if axis not in (*by, SEED, "ego", "run") and frame[axis].nunique(dropna=False) > 1:
+            if axis in frame and axis not in (*by, SEED, "ego", "run") and frame[axis].nunique(dropna=False) > 1:
                 mixed = ", ".join(map(str, frame[axis].unique()))
                 raise InputError(axis, mixed, "would be averaged together", f"Name {axis} in where, rows or columns.")
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import sys
 from collections.abc import Mapping, Sequence
 from contextlib import ExitStack, closing
@@ -10,9 +11,10 @@ from typing import Any
 
 from tqdm import tqdm
 
-from ..arrays import instance
+from ..arrays import instance, named, number
 from ..errors import InputError
 from ..file_names import given_path
+from ..formats.trajectories import write_tum
 from ..world.fleet import Fleet
 from ..world.recording import Recording
 from ..world.storage import digest, save_recording
@@ -68,8 +70,7 @@ def run_study(
             finished cells are kept.
     """
     study, cells, part, folder = _resolve(study, out, settings, shard)
-    if jobs < 1:
-        raise InputError("jobs", jobs, "must be >= 1", "Give the number of worker processes.")
+    number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1", hint="Give the number of worker processes.")
     with ExitStack() as stack:
         workers = stack.enter_context(connected(cluster, study.cell)) if cluster else None
         used = environments([environment(), *(workers.environments.values() if workers else ())])
@@ -85,6 +86,35 @@ def run_study(
             raise InputError("out", str(folder), lost, "Repeat the command: it computes what is missing.")
         publish(study, results, folder, progress)
         return results
+
+
+def write_tracks(
+    study: Study | str, out: str | Path = "runs", settings: Mapping[str, Any] | None = None, shard: str = ""
+) -> Path:
+    """Estimate again what the cells of a study estimated, and write a TUM file for each ego and run of each cell.
+
+    Args:
+        study: as in `run_study`.
+        out: folder of all studies.
+        settings: changes of the study's settings or axes.
+        shard: "i/n", or nothing for all cells.
+
+    Returns:
+        The folder of the files, whose names begin with the parameters of the cell.
+
+    Raises:
+        InputError: a study whose cells have no estimates.
+    """
+    study, _, part, folder = _resolve(study, out, settings, shard)
+    if study.tracks is None:
+        raise InputError("tracks", study.name, "has cells without estimates of vehicles", "Take side_by_side.")
+    (folder := folder / "tracks").mkdir(parents=True, exist_ok=True)
+    for cell in part:
+        if store.load(folder.parent, cell.name) is not None:
+            for name, *path in study.tracks(cell.given):
+                words = [str(value) for value in cell.params.values()]
+                write_tum(folder / (re.sub(r"[^\w.+-]", "_", "-".join([*words, name])) + ".tum"), *path)
+    return folder
 
 
 def plan(
@@ -169,9 +199,10 @@ def _resolve(
     study: Study | str, out: str | Path, settings: Mapping[str, Any] | None, shard: str
 ) -> tuple[Study, list[Cell], list[Cell], Path]:
     """The study under its settings, all its cells, those of the shard, and its folder."""
-    named = find_study(study) if isinstance(study, str) else instance("study", study, Study)
+    found = find_study(study) if isinstance(study, str) else instance("study", study, Study)
     given_path(out)
-    changed = named.override({name: _as_path(name, value, out) for name, value in (settings or {}).items()})
+    given = named("settings", settings or {}, "Give settings={name: value}.")
+    changed = found.override({name: _as_path(name, value, out) for name, value in given.items()})
     cells = changed.cells()
     return changed, cells, part_of(cells, changed.shares, shard) if shard else cells, Path(out) / changed.name
 

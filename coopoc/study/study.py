@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import itertools
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -67,6 +67,8 @@ class Study:
         metrics: metrics with reference values -> "lower" or "higher", which is better, or the best value.
         reference: file of the reference values, see `coopoc.study.reference`; it may be absent.
 
+        tracks: parameters -> name, t (T,) s and position (T, 3) m of each estimated path.
+
     Raises:
         InputError: an empty grid, a cell twice, a parameter that is no scalar, a name that is both axis and setting, a
             name of the study or of a view that is no file name, or a view that cannot be called with results alone.
@@ -93,6 +95,7 @@ class Study:
     minutes: float | None = None
     metrics: Mapping[str, str | float] = field(default_factory=dict)
     reference: str | Path | None = None
+    tracks: Callable[[Params], Iterable[tuple[Any, ...]]] | None = None
 
     def __post_init__(self) -> None:
         file_name("study", self.name, "Rename the study: its folder has this name.")

@@ -60,6 +60,10 @@ SYMBOLS = {"max_neighbours": "K"}
 """Column -> the short form that fits over a column of numbers."""
 
 
+OWN: dict[str, str] = {}
+"""Method that is none of ours -> the name that its class gives itself, as its rows have it."""
+
+
 def look(method: str) -> Look:
     """The look of a method; a number at its end is a client; an unknown one has a look that its name alone decides.
 
@@ -73,9 +77,9 @@ def look(method: str) -> Look:
     if family in METHODS:
         shown = METHODS[family]
         return Look(f"{shown.label} {name[len(family) :].strip('-')}", shown.color, shown.marker)
-    method = method.rpartition(".py:")[2]  # of a file: its name there
+    given, method = method, method.rpartition(".py:")[2]  # of a file: its name there
     row, column = divmod(zlib.crc32(method.encode()) % 25, len(_COLORS))
-    return Look(method.replace("_", " "), _COLORS[column], "<>d8H"[row])
+    return Look(OWN.get(given, method.replace("_", " ")), _COLORS[column], "<>d8H"[row])
 
 
 def line(noise_model: object) -> Any:

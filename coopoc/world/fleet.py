@@ -13,6 +13,21 @@ import numpy.typing as npt
 from ..arrays import Bools, Floats, check_texts, checked, listed, number, refuse
 from ..errors import InputError, shown, unknown
 
+FARTHEST, FASTEST = 1e8, 1e4
+"""m and m/s: what lies beyond was not measured on Earth, and its square leaves no digits to what stands beside it."""
+
+
+def plausible(field: str, values: Floats, limit: float) -> None:
+    """InputError for the first number beyond the limit; NaN stands for what is missing.
+
+    >>> plausible("velocity", np.array([3.0, -1e9]), FASTEST)
+    Traceback (most recent call last):
+    coopoc.errors.InputError: velocity[1] = -1000000000.0: must be within +-10000 in SI units. Is it in another unit?
+    """
+    if values.size and max(np.fmax.reduce(values, axis=None), -np.fmin.reduce(values, axis=None)) > limit:
+        wrong = np.abs(values) > limit
+        refuse(field, values, wrong, f"must be within +-{limit:g} in SI units", "Is it in another unit?")
+
 
 @dataclass(frozen=True, eq=False)
 class Fleet:
@@ -59,6 +74,8 @@ class Fleet:
             refuse("heading", heading, np.isinf(heading), "must be finite, or NaN where unknown", "Replace it by NaN.")
             object.__setattr__(self, "heading", heading)
         _check_gaps(self)
+        plausible("position", self.position, FARTHEST)
+        plausible("velocity", self.velocity, FASTEST)
 
     @property
     def dt(self) -> float:
@@ -77,6 +94,19 @@ class Fleet:
         for array in (self.t, self.position, self.velocity, *(() if self.heading is None else (self.heading,))):
             sha.update(np.ascontiguousarray(array).tobytes())
         return sha.hexdigest()
+
+    def require(self, ids: Sequence[str], t: Floats) -> None:
+        """InputError unless the fleet has these vehicles in this order, and its steps are at times t (T,) s.
+
+        >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
+        >>> fleet.require(("b",), fleet.t)
+        Traceback (most recent call last):
+        coopoc.errors.InputError: fleet = Fleet(unnamed: 1 vehicles x 2 steps, dt 0.1 s): ids and times differ from \
+those that were recorded. Give the fleet that was observed, its vehicles in the same order.
+        """
+        if tuple(ids) != self.ids or len(t) != len(self.t) or np.abs(t - self.t).max() > 0.01 * self.dt:
+            hint = "Give the fleet that was observed, its vehicles in the same order."
+            raise InputError("fleet", repr(self), "ids and times differ from those that were recorded", hint)
 
     def index(self, vehicle: str | int) -> int:
         """Column of a vehicle given by its id or its index; InputError if there is none."""
@@ -128,6 +158,9 @@ def names(ids: Iterable[object]) -> tuple[str, ...]:
     found = tuple(str(i) for i in given)
     if not found:
         raise InputError("ids", "no vehicle", "must be at least one", "Check that the file holds a drive.")
+    for name in found:
+        if not name.isprintable():
+            raise InputError("ids", shown(name), "must be printable", "Remove line ends and control characters.")
     if len(set(found)) != len(found):
         twice = sorted(i for i, count in Counter(found).items() if count > 1)
         raise InputError("ids", twice[:3], "must be unique", "Rename the vehicles that share an id.")

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from ..arrays import Floats, Ints, checked, number, refuse
+from ..arrays import Bools, Floats, Ints, checked, number, refuse
 
 
 @dataclass(frozen=True, eq=False)
@@ -103,6 +103,21 @@ def to_vector(relative: Floats) -> Floats:
     return np.stack([d * np.sin(inc) * np.cos(az), d * np.sin(inc) * np.sin(az), d * np.cos(inc)], axis=-1)
 
 
+STEEP = 0.2
+"""rad from the vertical within which errors of the positions turn an azimuth as they like."""
+
+
+def told(relative: Floats) -> Floats:
+    """Measurements (..., 3) without the azimuths (NaN) of what is straight above or below: their variance grows without
+    bound as the horizontal distance vanishes.
+
+    >>> told(np.array([9.0, 0.5, 0.1])).tolist()
+    [9.0, nan, 0.1]
+    """
+    steep = np.abs(np.abs(relative[..., 2:]) - np.pi / 2) > np.pi / 2 - STEEP
+    return np.where(steep & (np.arange(3) == 1), np.nan, relative) if steep.any() else relative
+
+
 def vector_cov(relative: Floats, std: Floats, min_range: float = 0.0) -> Floats:
     """Covariance J diag(std^2) J^T of `to_vector(relative)`, J its Jacobian: (..., 3, 3) m^2.
 
@@ -128,6 +143,16 @@ def vector_cov(relative: Floats, std: Floats, min_range: float = 0.0) -> Floats:
     root = np.stack([np.stack(c, axis=-1) for c in columns], axis=-1)
     cov: Floats = root @ np.swapaxes(root, -1, -2)
     return cov
+
+
+def stretches(flags: Bools) -> list[tuple[int, int]]:
+    """(start, stop) of the runs of True.
+
+    >>> stretches(np.array([True, False, True, True]))
+    [(0, 1), (2, 4)]
+    """
+    edges = np.flatnonzero(np.diff(flags.astype(int), prepend=0, append=0)).reshape(-1, 2)
+    return [(int(start), int(stop)) for start, stop in edges]
 
 
 def wrap(angle: Any) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, fields, replace
 from typing import Literal, get_args
 
-from ..arrays import instance, listed, number, one_of
+from ..arrays import extent, instance, number, one_of
 from ..errors import InputError, unknown
 
 Law = Literal["uniform", "exponential"]
@@ -34,13 +34,7 @@ class Fault:
     def __post_init__(self) -> None:
         hint = "0.05 makes one measurement in twenty wrong."
         object.__setattr__(self, "rate", number("rate", self.rate, 0, 1, allowed="in [0, 1]", hint=hint))
-        given = listed("size", self.size, "Give (low, high).", "must be 2 numbers")
-        if len(given) != 2:
-            raise InputError("size", self.size, "must be 2 numbers", "Give (low, high).")
-        low, high = (number("size", v, 0, 1e9, allowed=">= 0", hint="Give (low, high).") for v in given)
-        if low > high:
-            raise InputError("size", self.size, "must be (low, high) with low <= high", "Swap the two.")
-        object.__setattr__(self, "size", (low, high))
+        object.__setattr__(self, "size", extent("size", self.size))
         one_of("law", self.law, get_args(Law))
         lasts = number("lasts", self.lasts, 0, 1e9, allowed=">= 0 s", hint="0 draws every measurement by itself.")
         object.__setattr__(self, "lasts", lasts)

@@ -12,8 +12,8 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, refuse, texts
 from ..errors import InputError, shown
 from ..short_repr import short_repr
-from .fleet import clock, columns, interval, names
-from .links import Links
+from .fleet import FARTHEST, FASTEST, clock, columns, interval, names, plausible
+from .links import Links, stretches, told
 from .sensors import Sensors
 from .v2x import V2X
 
@@ -198,9 +198,13 @@ class Recording:
         (col,) = columns("vehicle", [vehicle], self.ids)
         there = np.isfinite(self.velocity[0, :, col, 0])
         fixed: Bools = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0))
-        edges = np.flatnonzero(np.diff(there.astype(int), prepend=0, append=0)).reshape(-1, 2)
-        firsts = [(start + int(np.argmax(fixed[start:stop])), stop, fixed[start:stop].any()) for start, stop in edges]
-        return tuple((int(a), int(b)) for a, b, any_fix in firsts if any_fix and b - a >= shortest)
+        firsts = [(a + int(np.argmax(fixed[a:b])), b) for a, b in stretches(there) if fixed[a:b].any()]
+        return tuple((a, b) for a, b in firsts if b - a >= shortest)
+
+    @cached_property
+    def told(self) -> Floats:
+        """(R, L, 3) `relative` without azimuths of what is straight above or below, as estimators take it."""
+        return told(self.relative)
 
     @cached_property
     def complete(self) -> bool:
@@ -301,7 +305,12 @@ def check_measurements(gnss: Floats, velocity: Floats, relative: Floats) -> None
     """
     if not len(gnss):
         raise InputError("gnss", "no run", "must have at least one", "Use observe(..., runs=1).")
-    for name, values in (("gnss", gnss), ("velocity", velocity), ("relative", relative)):
+    for name, values, limit in (
+        ("gnss", gnss, FARTHEST),
+        ("velocity", velocity, FASTEST),
+        ("relative", relative, FARTHEST),
+    ):
+        plausible(name, values, limit)
         if _finite(values):
             continue
         refuse(name, values, np.isinf(values), "must be finite, or NaN where missing", "Replace it by NaN.")

@@ -7,8 +7,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats, instance, listed, number
-from ..errors import InputError
+from ..arrays import Floats, extent, instance, number
 from .recording import Recording
 from .sensors import stream
 
@@ -36,16 +35,11 @@ class Spoofing:
 
     def __post_init__(self) -> None:
         share = number("share", self.share, 0, 1, allowed="in [0, 1]", hint="0.2 attacks every fifth vehicle.")
-        given = listed("offset", self.offset, "Give (low, high) in metres.", "must be 2 numbers")
-        if len(given) != 2:
-            raise InputError("offset", self.offset, "must be 2 numbers", "Give (low, high) in metres.")
-        low, high = (number("offset", v, 0, 1e9, allowed=">= 0 m", hint="Signs are drawn.") for v in given)
-        if low > high:
-            raise InputError("offset", self.offset, "must be (low, high) with low <= high", "Swap the two.")
+        offset = extent("offset", self.offset, "Give (low, high) in metres: signs are drawn.")
         hint = "0 is from the first step on, at once."
         start, ramp = (number(name, getattr(self, name), 0, 1e9, hint=hint) for name in ("start", "ramp"))
         instance("collude", self.collude, bool, "Give True for one offset of all.")
-        for name, value in (("share", share), ("offset", (low, high)), ("start", start), ("ramp", ramp)):
+        for name, value in (("share", share), ("offset", offset), ("start", start), ("ramp", ramp)):
             object.__setattr__(self, name, value)
 
     def size(self, t: Floats) -> Floats:

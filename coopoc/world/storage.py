@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import json
+import math
+import tokenize
 import zipfile
 import zlib
 from dataclasses import asdict
@@ -11,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from numpy.lib import format as npy
 
 from ..arrays import AnyArray
 from ..errors import InputError
@@ -25,7 +28,7 @@ from .v2x import V2X
 ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers", "landmarks")
 LINKS = ("step", "observer", "neighbour")
 BODY = ("yaw_rate", "heading")
-LARGEST = 2**32
+LARGEST = 2**31
 """Bytes of one unpacked file."""
 DAMAGES = (
     OSError,
@@ -39,6 +42,8 @@ DAMAGES = (
     NotImplementedError,
     RuntimeError,
     MemoryError,
+    SyntaxError,
+    tokenize.TokenError,
 )
 """What zipfile, zlib and NumPy raise on a damaged file."""
 
@@ -54,9 +59,8 @@ def save_recording(recording: Recording, path: str | Path, truth: Fleet | None =
     Raises:
         InputError: a truth of other vehicles or steps.
     """
-    if truth is not None and (truth.ids != recording.ids or len(truth.t) != len(recording.t)):
-        hint = "Give the fleet on the steps of the recording."
-        raise InputError("truth", repr(truth), "must hold the vehicles and steps of the recording", hint)
+    if truth is not None:
+        truth.require(recording.ids, recording.t)
     settings = {"sensors": asdict(recording.sensors), "v2x": asdict(recording.v2x)}
     words = {"ids": recording.ids, "notes": recording.notes, **settings}
     arrays: dict[str, Any] = {name: np.asarray(getattr(recording, name)) for name in ARRAYS}
@@ -88,9 +92,24 @@ def unpacked(path: Path) -> dict[str, AnyArray]:
     """
     with zipfile.ZipFile(path) as packed:
         if sum(part.file_size for part in packed.infolist()) > LARGEST:
-            raise InputError(path.name, "more than 4 GB unpacked", "must be smaller", "Save fewer runs.")
+            raise InputError(path.name, "more than 2 GB unpacked", "must be smaller", "Save fewer runs.")
+        _check_shapes(packed)
     with np.load(path, allow_pickle=False) as stored:
         return dict(stored)
+
+
+def _check_shapes(packed: zipfile.ZipFile) -> None:
+    """ValueError for arrays larger than a recording with these fixes and links has, by their headers alone."""
+    shapes = {}
+    for name in packed.namelist():
+        with packed.open(name) as part:
+            major, _ = npy.read_magic(part)
+            read = npy.read_array_header_1_0 if major == 1 else npy.read_array_header_2_0
+            shapes[name.removesuffix(".npy")] = read(part)[0]
+    runs, steps, vehicles, _ = shapes["gnss"]
+    most = 3 * runs * max(steps * vehicles, *shapes["links_step"])
+    if shapes["t"] != (steps,) or any(math.prod(shape) > most for shape in shapes.values()):
+        raise ValueError(f"arrays of shapes {shapes}")
 
 
 def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:

@@ -17,7 +17,7 @@ from coopoc.methods.kalman import Kalman
 from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.methods.poses.pose_start import pose_start
 from coopoc.world.body_frames import midway, turned
-from coopoc.world.links import spherical, wrap
+from coopoc.world.links import spherical, stretches, wrap
 from coopoc.world.recording import Recording
 
 from .read import Log
@@ -123,8 +123,7 @@ def together(log: Log) -> tuple[Log, str]:
     """
     rec = log.recording
     there = np.isfinite(rec.velocity[0, :, _moving(rec), 0]).all(axis=0)
-    edges = np.flatnonzero(np.diff(there.astype(int), prepend=0, append=0)).reshape(-1, 2)
-    first, last = max(edges.tolist(), key=lambda edge: edge[1] - edge[0], default=(0, 0))
+    first, last = max(stretches(there), key=lambda edge: edge[1] - edge[0], default=(0, 0))
     if last - first < 2 or not _moving(rec):
         hint = "Raise max_gap, give clock= where stamps differ, or leave out files of vehicles that are hardly there."
         raise InputError("log", log.summary.name, "must hold steps at which all vehicles are there", hint)

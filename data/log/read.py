@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -21,17 +21,18 @@ from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
 from ..assemble import backward_difference, check_scale, check_size, check_time, interpolate, longest_gap
-from ..bag import read_bag
-from ..cells import TABLES, headers
+from ..bag import STAMP, read_bag
+from ..cells import TABLES, factors, headers
 from ..nmea import read_nmea
 from ..source import parted
-from .frames import Origin, assumed, local, on_one_clock
+from .frames import ENU, Origin, assumed, local, on_one_clock
 from .links import linked, of_vehicles
 from .motion import Steps, member, samples
 from .tables import is_log_table, read_log_table
-from .units import Rows, Summary, distinct, in_group
+from .units import KINDS, Rows, Summary, check_values, distinct, in_group
 
 Frame = Literal["world", "body"]
+Stamps = Literal["header", "received"]
 DATED, DAY = 1e8, 86400.0
 """s: times above are since 1970; a day."""
 LONGEST, PAIR = 1.0, ("vehicle", "partner")
@@ -87,7 +88,7 @@ def is_log(path: Path, columns: Mapping[str, str] | None = None) -> bool:
     (True, True)
     """
     if path.is_dir():
-        return _is_bag(path) or any(file.suffix.lower() in READERS for file in path.iterdir())
+        return _is_bag(path) or any(True for _ in _files(path))
     ending = path.suffix.lower()
     return is_log_table(path, columns) if ending in TABLES else ending in READERS
 
@@ -100,6 +101,9 @@ def read_log(
     columns: Mapping[str, str] | None = None,
     kinds: Mapping[str, str] | None = None,
     ignore: Sequence[str] = (),
+    scale: Mapping[str, float] | None = None,
+    std: Mapping[str, float] | None = None,
+    stamps: Stamps = "header",
     clock: Mapping[str, float] | None = None,
     origin: Origin | None = None,
     truth: str | Path | None = None,
@@ -121,6 +125,9 @@ def read_log(
         columns: names in the files, as {"t": "timestamp", "vehicle": "car"}.
         kinds: names in a column kind, as {"uwb": "range"}.
         ignore: kinds that are left out; topics of a bag.
+        scale: kind, or t -> factor to its unit here, as {"range": 0.001, "t": 1e-3} of mm and ms.
+        std: kind in SI units -> standard deviation of all its measurements, as {"range": 0.15, "x": 1.5}.
+        stamps: times of a bag's messages: those of the headers, or those at which they were "received".
         clock: vehicle -> s by which its clock is ahead; it is subtracted from its stamps.
         origin: latitude deg, longitude deg, height m of the local frame; None: the first fix.
         truth: file of the truth, if it is not in the folder under that name; topic in a bag.
@@ -161,12 +168,18 @@ def read_log(
         "kinds": named("kinds", kinds or {}, "Give kinds={word: kind}."),
         "ignore": ignore,
     }
-    rows = _rows(path, truth, summary, options)
+    rows = _rows(path, truth, summary, {**options, "stamps": stamps})
+    factor = factors(scale, ("t", *KINDS))
+    by_kind = rows["kind"].map(factor).fillna(1.0)
+    rows = rows.assign(value=by_kind * rows["value"], std=by_kind.abs() * rows["std"])
+    rows[["t", "arrival"]] *= factor.get("t", 1.0)
+    check_values(rows)
     for column in ("t", "arrival"):
         check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)
     rows, true_rows = rows[rows["true"] == 0], rows[rows["true"] == 1]
     rows, origin = local(on_one_clock(rows, clock, path.name), origin)
-    rows = distinct(rows, summary)
+    stated = factors(std, {kind.name for kind in KINDS.values()} - {*ENU, "message"}, "std")
+    rows = distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary)
     if not any_scale:
         _check_scale(rows, path.name)
     ids = _ids(rows, body)
@@ -201,7 +214,9 @@ def read_log(
     )
     fleet = None
     if len(true_rows):
-        fleet = _truth(distinct(local(true_rows, origin)[0], Summary()), recording, max_gap, path.stem)
+        true_rows = local(true_rows, origin)[0]
+        true_rows = true_rows[~(steps.planar & (true_rows["kind"] == "z"))]
+        fleet = _truth(distinct(true_rows, Summary()), recording, max_gap, path.stem)
     summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
     return Log(recording, fleet, summary, "messages" in summary.read, origin)
 
@@ -228,7 +243,7 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
     else:
         if true_files and not true_files[0].is_file():
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
-        files = sorted(f for f in path.iterdir() if f.suffix.lower() in READERS) if path.is_dir() else [path]
+        files = sorted(_files(path)) if path.is_dir() else [path]
         true_files = true_files or [f for f in files if f.stem.lower() == TRUTH and f != path][:1]
         files = [f for f in files if f not in true_files and (f.stem.lower() != TRUTH or f == path)]
         if not files:
@@ -236,6 +251,10 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
             raise InputError("path", str(path), allowed, "Point at the folder of the log.")
         _check_headers(options["columns"], [*files, *true_files], path.name)
         parts = [_read_file(file, summary, **options) for file in files]
+        parts = [
+            rows.assign(vehicle=file.relative_to(path).parts[0]) if path not in (file, file.parent) else rows
+            for file, rows in zip(files, parts, strict=True)
+        ]
     if not any(map(len, parts)):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
     options = {**options, "ignore": (), "truth": ""}
@@ -245,8 +264,15 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
 
 def _read_file(file: Path, summary: Summary, **options: Any) -> Rows:
     if not _is_bag(file):
-        options.pop("truth", None)
+        options = {name: value for name, value in options.items() if name not in ("truth", "stamps")}
     return READERS.get(file.suffix.lower(), read_log_table)(file, summary, **options)
+
+
+def _files(path: Path) -> Iterator[Path]:
+    """Files of a folder, and topics that were written as tables in the folders of their namespaces."""
+    for file in path.rglob("*"):
+        if file.suffix.lower() in READERS and (file.parent == path or STAMP in headers(file)):
+            yield file
 
 
 def _check_headers(columns: Mapping[str, str], files: Sequence[Path], name: str) -> None:

@@ -11,16 +11,15 @@ import pandas as pd
 
 from coopoc.errors import InputError, suggestion
 
+from ..bag import STAMP, TRUTH, of_topic
 from ..cells import TABLES, USUAL, filled, headers, missing_column, named_columns, numeric, read_frame, seconds, words
-from .units import KINDS, Rows, Summary, in_group, place, rows_of
+from .units import KINDS, Rows, Summary, in_group, rows_of
 
 LONG = ("t", "vehicle", "kind", "partner", "value", "std", "arrival")
 OF_FLEETS = {"id", "t", "x", "y", "z", "vx", "vy", "vz"}
 """Columns of a table of drives."""
 OF_LOGS = {"kind", "partner", "arrival", *KINDS} - OF_FLEETS - {"speed", "heading", "height"}
 """Columns that no table of drives has."""
-ITSELF = "must be another member: a vehicle neither measures itself nor sends to itself"
-UNIT = "Is it in another unit? Other kinds: {kinds}. Or an angle over several turns? Write it within one."
 
 
 def is_log_table(path: Path, columns: Mapping[str, str] | None = None) -> bool:
@@ -55,6 +54,8 @@ def read_log_table(
     """
     file, given = path.name, dict(columns or {})
     frame = read_frame(path, *(given.get(key, key) for key in ("vehicle", "partner", "kind", "arrival")))
+    if STAMP in frame:
+        frame = of_topic(frame, file, summary, path.stem.lower() in TRUTH)
     frame = named_columns(frame, given, (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS)), (), file)
     if "t" not in frame.columns:
         placed = {"x", "y"} <= set(frame.columns) or {"latitude", "longitude"} <= set(frame.columns)
@@ -68,7 +69,6 @@ def read_log_table(
     rows = rows_of(read(frame, file, summary, kinds or {}, ignore), file)
     if "partner" not in frame.columns and in_group(rows, "relative").any():
         raise missing_column(file, "partner", list(frame.columns), "is needed")
-    _check(rows)
     return rows
 
 
@@ -139,31 +139,3 @@ def _cells(frame: pd.DataFrame, file: str, value: str, std: str) -> pd.DataFrame
         if (message & ~lost).any():
             made["arrival"][message & ~lost] = seconds(frame.assign(arrival=cells)[message & ~lost], "arrival", file)
     return frame[["kind"]].assign(**made)
-
-
-def _check(rows: Rows) -> None:
-    """InputError at the first value that cannot be meant in its unit, or that lacks its partner."""
-    kind, value, partner = (rows[name] for name in ("kind", "value", "partner"))
-    limit = kind.map({name: KINDS[name].limit for name in KINDS})
-    alone = in_group(rows, "relative") & (partner == "")
-    deviation = "standard deviation of {kind}"
-    for wrong, column, given, allowed, hint in (
-        (value.abs() > limit, "{kind}", value, "must be within +-{limit:.4g}", UNIT),
-        ((kind == "range") & (value <= 0), "{kind}", value, "must be > 0", "Remove the row."),
-        (
-            kind.isin(["inclination", "inclination_deg"]) & (value < 0),
-            "{kind}",
-            value,
-            "must be >= 0",
-            "Remove the row.",
-        ),
-        (rows["std"] <= 0, deviation, rows["std"], "must be > 0", "Leave it empty where it is unknown."),
-        (alone, "column partner", partner, "must be a name", "Name the vehicle or road-side unit."),
-        (partner == rows["vehicle"], "column partner", partner, ITSELF, "Mend or remove the row."),
-    ):
-        if wrong.any():
-            first, cell = kind[wrong].iloc[0], given[wrong].iloc[0]
-            others = ", ".join(name for name in KINDS if KINDS[name].name == KINDS[first].name)
-            shown = (repr(cell) if cell else "empty") if given is partner else f"{cell:.10g}"
-            allowed, hint = allowed.format(limit=KINDS[first].limit), hint.format(kinds=others)
-            raise InputError(f"{place(rows[wrong])}, {column.format(kind=first)}", shown, allowed, hint)

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 
 from coopoc.arrays import Bools
+from coopoc.errors import InputError
 
 DEGREE, TURN = float(np.pi / 180), float(2 * np.pi) + 1e-3
 
@@ -51,6 +52,8 @@ the observer's heading, inclination from +z, elevation above the horizon. A unit
 for _name in ("yaw_rate", "heading", "azimuth", "bearing", "inclination", "elevation"):
     KINDS[f"{_name}_deg"] = KINDS[_name]._replace(scale=DEGREE * KINDS[_name].scale, limit=KINDS[_name].limit / DEGREE)
 KINDS["compass_deg"] = KINDS["heading_deg"]._replace(scale=-DEGREE, offset=float(np.pi / 2))
+ITSELF = "must be another member: a vehicle neither measures itself nor sends to itself"
+UNIT = "Is it in another unit? Other kinds: {kinds}; or give scale=. An angle over several turns? Write it within one."
 ANGLES = ("heading", "azimuth", "bearing", "inclination")
 
 Rows = pd.DataFrame
@@ -79,6 +82,34 @@ def place(rows: Rows) -> str:
     """File and row of the first."""
     first = rows.iloc[0]
     return f"{first['file']}: row {first['row']}"
+
+
+def check_values(rows: Rows) -> None:
+    """InputError at the first value that cannot be meant in its unit, or that lacks its partner."""
+    kind, value, partner = (rows[name] for name in ("kind", "value", "partner"))
+    limit = kind.map({name: KINDS[name].limit for name in KINDS})
+    alone = in_group(rows, "relative") & (partner == "")
+    deviation = "standard deviation of {kind}"
+    for wrong, column, given, allowed, hint in (
+        (value.abs() > limit, "{kind}", value, "must be within +-{limit:.4g}", UNIT),
+        ((kind == "range") & (value <= 0), "{kind}", value, "must be > 0", "Remove the row."),
+        (
+            kind.isin(["inclination", "inclination_deg"]) & (value < 0),
+            "{kind}",
+            value,
+            "must be >= 0",
+            "Remove the row.",
+        ),
+        (rows["std"] <= 0, deviation, rows["std"], "must be > 0", "Leave it empty where it is unknown."),
+        (alone, "column partner", partner, "must be a name", "Name the vehicle or road-side unit."),
+        (partner == rows["vehicle"], "column partner", partner, ITSELF, "Mend or remove the row."),
+    ):
+        if wrong.any():
+            first, cell = kind[wrong].iloc[0], given[wrong].iloc[0]
+            others = ", ".join(name for name in KINDS if KINDS[name].name == KINDS[first].name)
+            shown = (repr(cell) if cell else "empty") if given is partner else f"{cell:.10g}"
+            allowed, hint = allowed.format(limit=KINDS[first].limit), hint.format(kinds=others)
+            raise InputError(f"{place(rows[wrong])}, {column.format(kind=first)}", shown, allowed, hint)
 
 
 def distinct(rows: Rows, summary: Summary) -> Rows:

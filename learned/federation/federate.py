@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import time
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from typing import get_args
@@ -84,7 +85,8 @@ def federate(
 
     theta_i = fit(theta_g, D_i);  theta_g = sum_i a_i theta_i. A local epoch is a pass over the client's own pieces; the
     optimiser starts anew each round and its rate falls over all rounds. Clients send weights and one validation loss.
-    Implausible answers are rejected with a reason and training goes on.
+    Implausible answers are rejected with a reason and training goes on. The federation says how many Byzantine clients
+    its rule tolerates; where more are simulated, a warning does, if it tolerates any.
 
     Args:
         model: start, not changed: a net, a class of nets, a name in `coopoc.nets` or a path "mine.py:NAME".
@@ -135,6 +137,10 @@ def federate_many(
     teams = [_group(group, seed) for group, seed in zip(groups, seeds, strict=True)]
     for team in teams:
         plan.check(len(team.names))
+        hostile = len({*team.names} & {*getattr(presence, "names", ())})
+        if 0 < (most := chosen.tolerated(presence.count(len(team.names)))) < hostile:
+            text = f"{hostile} Byzantine clients of {len(team.names)}: {chosen.name} tolerates {most} a round"
+            warnings.warn(text, RuntimeWarning, stacklevel=3)
     stack = stacked(models[0], groups, teams)
     standings = [Standing(theta, chosen.start(theta)) for theta in flatten(models)]
     reports = stack.validated([s.theta for s in standings])
@@ -157,7 +163,8 @@ def federate_many(
     seconds = (time.perf_counter() - began) / len(groups)
     federations = []
     for history, team in zip(histories, teams, strict=True):
-        federation = Federation(models[0], tuple(history), team.sizes, seconds, team.names)
+        most = chosen.tolerated(presence.count(len(team.names)))
+        federation = Federation(models[0], tuple(history), team.sizes, seconds, team.names, most)
         federations.append(replace(federation, model=federation.after(federation.best.number)))
     return federations
 

@@ -33,6 +33,11 @@ class Rule:
         """Smallest number of clients that it can combine."""
         return 1
 
+    def tolerated(self, clients: int) -> int:
+        """Number of Byzantine clients among so many that cannot move the result as far as they like (the breakdown
+        point); 0 unless a rule knows better."""
+        return 0
+
     def start(self, theta: Tensor) -> State:
         """State before the first round, with weights theta (P,)."""
         return ()
@@ -62,6 +67,10 @@ class Function(Rule):
     def name(self) -> str:
         """Name of the function."""
         return getattr(self.function, "__name__", repr(self.function))
+
+    def tolerated(self, clients: int) -> int:
+        """Any minority for the median."""
+        return (clients - 1) // 2 if self.function is median else 0
 
     def combine(self, weights: Tensor, sizes: Tensor) -> Tensor:
         """The value of the function."""
@@ -122,9 +131,13 @@ class TrimmedMean(Rule):
     def __post_init__(self) -> None:
         within("share", self.share, 0 <= self.share < 0.5, "in [0, 0.5)")
 
+    def tolerated(self, clients: int) -> int:
+        """As many as are left out at either end."""
+        return int(self.share * clients)
+
     def combine(self, weights: Tensor, sizes: Tensor) -> Tensor:
         """Unweighted."""
-        cut = int(self.share * len(weights))
+        cut = self.tolerated(len(weights))
         return weights.sort(0).values[cut : len(weights) - cut].mean(0)
 
 
@@ -182,6 +195,10 @@ class Krum(Rule):
     def least(self) -> int:
         """2 f + 3, or m if that is more."""
         return max(2 * self.byzantine + 3, self.keep or 0)
+
+    def tolerated(self, clients: int) -> int:
+        """f."""
+        return self.byzantine if clients >= self.least else 0
 
     def combine(self, weights: Tensor, sizes: Tensor) -> Tensor:
         """Plain mean of the clients with the lowest scores; the first of equals."""

@@ -1,4 +1,4 @@
-"""RoadConstants: the seven numbers of a road filter as a net, learned alone, together or centralised."""
+"""RoadConstants: the eight numbers of a road filter as a net, learned alone, together or centralised."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ STEP = 0.02
 
 
 class RoadConstants(Gain):
-    """The numbers of `RoadErrors` but `shared`, as logarithms: a federation of road filters exchanges 28 bytes.
+    """The eight numbers of `RoadErrors` as logarithms: a federation of road filters exchanges 32 bytes.
 
-    The loss is `methods.road.true_cost` of the compiled filter; seven weights need no backpropagation, and have the
+    The loss is `methods.road.true_cost` of the compiled filter; eight weights need no backpropagation, and have the
     gradient of central differences.
 
     Args:
@@ -61,7 +61,7 @@ class RoadConstants(Gain):
         return torch.from_numpy(found).to(theta.dtype)
 
     def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
-        """Loss (S,) and its gradient (S, 7)."""
+        """Loss (S,) and its gradient (S, 8)."""
         at, gradient = theta.detach().double(), torch.zeros_like(theta)
         for k in range(theta.shape[1]):
             ahead, behind = (at.index_add(1, torch.tensor([k]), torch.full_like(at[:, :1], d)) for d in (STEP, -STEP))

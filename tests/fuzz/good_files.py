@@ -7,9 +7,6 @@ import json
 TABLE = "id,t,x,y,z,vx,vy,vz\n" + "".join(
     f"{v},{k / 10:.1f},{8 * k / 10 + 5 * (v == 'b'):.2f},1,0,8,0,0\n" for k in range(8) for v in "ab"
 )
-CARLA = ",id,x,y,z,yaw,vx,vy,vz,ax,ay,az,wx,wy,wz\n" + "".join(
-    f"{2 * k + v},{v},{0.8 * k:.2f},{10 * v},0,{-0.0:.1f},8,0,0,0,0,0,0,0,0\n" for k in range(12) for v in range(2)
-)
 FCD = (
     "<fcd-export>\n"
     + "".join(

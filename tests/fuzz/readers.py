@@ -61,7 +61,6 @@ NAMES = {"t": "time", "latitude": "lat", "longitude": "lon", "height": "alt"}
 READERS: Mapping[str, Reader] = {
     "csv": Reader({"a.csv": good.TABLE}, lambda d: load_fleet(d / "a.csv")),
     "csv resampled": Reader({"a.csv": good.TABLE}, lambda d: load_fleet(d / "a.csv", dt=0.1)),
-    "carla": Reader({"a.csv": good.CARLA}, lambda d: load_fleet(d / "a.csv", handedness="left", dt=0.1)),
     "fcd": Reader({"a.xml": good.FCD}, lambda d: load_fleet(d / "a.xml")),
     "tum": Reader({"a.tum": good.TUM}, lambda d: load_fleet(d / "a.tum")),
     "tum poses": Reader({"a.tum": good.TUM}, lambda d: read_tum(d / "a.tum", repeats="drop")),

@@ -45,7 +45,7 @@ def road(
                 weight[part] = max(1.0, d2 / errors.gate**2)
                 if part is plane:
                     level = np.clip(level * (1 + (min(d2, 5.0) - 1) / errors.window), 1.0, 400.0)
-            noise = np.diag(weight * (white * (1 + 2 * errors.shared * rho / (1 - rho)) + late))
+            noise = np.diag(weight * (white * (1 + 2 * rho / (1 - rho)) + late))
             gain = p @ measured.T @ np.linalg.inv(measured @ p @ measured.T + noise)
             gain[2:4] /= weight[0]
             rest = np.eye(5) - gain @ measured

@@ -89,31 +89,6 @@ def zeros(number: Any, like: Any) -> Any:
 
 
 @unrolled
-def square(row: Any) -> Any:
-    """A matrix of zeros for vectors as long as `row`."""
-    return [row[0] * 0.0 for _ in range(len(row) ** 2)]
-
-
-@unrolled
-def first3(v: Any) -> Any:
-    """The first three numbers."""
-    return v[:3]
-
-
-@unrolled
-def with_first3(v: Any, three: Any) -> Any:
-    """A vector with other first three numbers."""
-    return [*three, *v[3:]]
-
-
-@unrolled
-def add_corner(a: Any, b: Any) -> Any:
-    """A with B (3, 3) added to its upper left corner."""
-    d = order(a)
-    return [a[d * i + j] + b[3 * i + j] if max(i, j) < 3 else a[d * i + j] for i, j in _entries(d)]
-
-
-@unrolled
 def scale_rows(v: Any, a: Any) -> Any:
     """diag(v) A."""
     return [v[i] * a[i * len(v) + j] for i, j in _entries(len(v))]
@@ -141,10 +116,8 @@ def mirrored(a: Any) -> Any:
 
 @unrolled
 def from_upper(u: Any) -> Any:
-    """A symmetric matrix from its upper triangle, row by row, in d (d + 1) / 2 numbers."""
-    d = (math.isqrt(8 * len(u) + 1) - 1) // 2
-    place = {pair: k for k, pair in enumerate((i, j) for i in range(d) for j in range(i, d))}
-    return [u[place[min(i, j), max(i, j)]] for i, j in _entries(d)]
+    """A symmetric 3 x 3 matrix from its upper triangle, row by row."""
+    return [u[k] for k in (0, 1, 2, 1, 3, 4, 2, 4, 5)]
 
 
 @unrolled
@@ -209,12 +182,7 @@ def plus_applied(t: Any, a: Any, v: Any) -> Any:
 
 @unrolled
 def inverse(m: Any) -> Any:
-    """The inverse of a symmetric positive definite matrix, whose upper triangle counts: of 3 x 3 by its adjugate, of
-    any other size by M = L D L^T."""
-    return _adjugate(m) if len(m) == 9 else _factorised(m)
-
-
-def _adjugate(m: Numbers) -> Numbers:
+    """The inverse of a symmetric positive definite 3 x 3 matrix, whose upper triangle counts, by its adjugate."""
     a = (m[4] * m[8]).less(m[5], m[5])
     b, c = (m[2] * m[5]).less(m[1], m[8]), (m[1] * m[5]).less(m[2], m[4])
     s = (m[0] * a).plus(m[1], b).plus(m[2], c).over()
@@ -222,31 +190,3 @@ def _adjugate(m: Numbers) -> Numbers:
     f = (m[0] * m[4]).less(m[1], m[1]) * s
     a, b, c = a * s, b * s, c * s
     return [a, b, c, b, d, e, c, e, f]
-
-
-def _factorised(m: Numbers) -> Numbers:
-    """u_ij = l_ij d_j, p = 1 / d; w = L^-1; M^-1 = w^T D^-1 w."""
-    d = order(m)
-    p: list[Number] = []
-    u: dict[tuple[int, int], Number] = {}
-    l: dict[tuple[int, int], Number] = {}  # noqa: E741
-    w: dict[tuple[int, int], Number] = {}
-    for j in range(d):
-        left = [l[j, k] for k in range(j)]
-        p.append(_dot(m[j * d + j], left, [u[j, k] for k in range(j)]).over())
-        for i in range(j + 1, d):
-            u[i, j] = _dot(m[j * d + i], [l[i, k] for k in range(j)], [u[j, k] for k in range(j)])
-            l[i, j] = u[i, j] * p[j]
-    for j in range(d):
-        for i in range(j + 1, d):
-            between = range(j + 1, i)
-            w[i, j] = _dot(-l[i, j], [l[i, k] for k in between], [w[k, j] for k in between])
-
-    def entry(i: int, j: int) -> Number:
-        total = p[j] if i == j else w[j, i] * p[j]
-        for k in range(j + 1, d):
-            total = total + w[k, i] * w[k, j] * p[k]
-        return total
-
-    upper = {pair: entry(*pair) for pair in _entries(d) if pair[0] <= pair[1]}
-    return [upper[min(i, j), max(i, j)] for i, j in _entries(d)]

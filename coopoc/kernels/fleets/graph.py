@@ -14,6 +14,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, inner, part, storage
 from ..compiling.small import add, apply, from_upper, load, plus_applied, scale, store, subtract
+from ..stars.gated import gate_components
 from ..stars.relative import Numbers, completed, exact, gram
 
 Vector = tuple[float, float, float]
@@ -23,6 +24,7 @@ Information = tuple[Matrix, Vector]
 VECTOR: Vector = (0.0, 0.0, 0.0)
 MATRIX: Matrix = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Their lengths are the counts that `load` takes."""
+SEEN, FIVE = (0.0,) * 8, (0.0,) * 5
 UNIT: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
 
 
@@ -32,7 +34,8 @@ class Measured(NamedTuple):
     Attributes:
         gnss: (R, T, N, 3) m, NaN for no fix.
         velocity: (R, T, N, 3) m/s.
-        relative: (R, L, 5) of `coopoc.kernels.stars.relative.components`.
+        relative: (R, L, 8) `coopoc.kernels.stars.relative.components`, and factors of their three standard deviations,
+            which gates set.
         active: (R, T, N) True from a vehicle's first fix on, while it is present.
         dt: s.
     """
@@ -69,15 +72,17 @@ class Assumed(NamedTuple):
 
     Attributes:
         process: broadcastable to (R, T, N, 3) m^2, variance of the motion.
-        fix: broadcastable to (R, T, N, 3) m^2, variance of a fix.
+        fix: broadcastable to (R, T, N, 3) m^2, variance of a fix, infinite for one that is rejected.
         std: (3,) m, rad, rad of a relative measurement; of no length for vectors of unit covariance.
         min_range: m, angles are no more certain than at this range.
+        robust: gate relative measurements.
     """
 
     process: Floats
     fix: Floats
     std: Floats
     min_range: float
+    robust: bool
 
 
 class Edges(NamedTuple):
@@ -185,7 +190,7 @@ def own_filters(measured: Measured, assumed: Assumed) -> Floats:
 
 @part
 def filled(seen: Measurement, vector: Vector, std: Vector) -> tuple[Measurement, Vector]:
-    """A missing range or angle is that of `vector`, with infinite standard deviation."""
+    """A missing or rejected range or angle is that of `vector`, with infinite standard deviation."""
     a, b, c = std
     a = math.inf if seen[0] < 0.0 else a
     b = math.inf if seen[1] == 0.0 and seen[2] == 0.0 else b
@@ -203,7 +208,9 @@ def measurement(vector: Vector, seen: Measurement, std: Floats, min_range: float
     measured one.
     """
     unit = len(std) == 0
-    here, noise = filled(seen, vector, (1.0, 1.0, 1.0) if unit else (std[0], std[1], std[2]))
+    a, b, c = (1.0, 1.0, 1.0) if unit else (std[0], std[1], std[2])
+    five = seen[0], seen[1], seen[2], seen[3], seen[4]
+    here, noise = filled(five, vector, (a * seen[5], b * seen[6], c * seen[7]))
     d, ground = here[0], here[0] * here[3]
     if not unit and not converted:
         xx, xy, xz, yy, yz, zz, p, q, r = exact(vector[0], vector[1], vector[2], here, noise, min_range)
@@ -222,10 +229,22 @@ def pair(vector: Vector, k: int, pairs: Pairs, relative: Floats, assumed: Assume
     information, eta = MATRIX, VECTOR
     for link, sign in ((pairs.link[k], 1.0), (pairs.link_back[k], -1.0)):
         if link >= 0:
-            seen = load(relative[link], 0, (0.0, 0.0, 0.0, 0.0, 0.0))
+            seen = load(relative[link], 0, SEEN)
             weight, pair_eta = measurement(scale(vector, sign), seen, assumed.std, assumed.min_range, converted)
             information, eta = add(information, weight), add(eta, scale(pair_eta, sign))
     return information, eta
+
+
+@part
+def gate_pair(vector: Vector, cov: Matrix, k: int, pairs: Pairs, relative: Floats, assumed: Assumed) -> None:
+    """Factors of the standard deviations of what a pair measured, at its vector, of covariance `cov`."""
+    for link, sign in ((pairs.link[k], 1.0), (pairs.link_back[k], -1.0)):
+        if link >= 0:
+            s, there = assumed.std, scale(vector, sign)
+            seen, std = filled(load(relative[link], 0, FIVE), there, (s[0], s[1], s[2]))
+            _, _, factor, _ = gate_components(there, cov, seen, std, VECTOR, assumed.min_range)
+            for c in range(3):
+                relative[link, 5 + c] = factor[c]
 
 
 @part
@@ -237,6 +256,8 @@ def pair_at_agreement(
     They agree at v + (I + C W)^-1 C eta, C the covariance of the believed vector v. A good belief decides alone: then
     the weight does not depend on the noise, as it does at the measured geometry. A poor one is ignored.
     """
+    if assumed.robust:
+        gate_pair(vector, cov, k, pairs, relative, assumed)
     information, eta = pair(vector, k, pairs, relative, assumed, True)
     if len(assumed.std) == 0:
         return information, eta

@@ -17,11 +17,13 @@ from scipy.linalg.lapack import dpotrf, dpotri
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled
-from ..compiling.small import load, store, subtract
-from .graph import VECTOR, Assumed, Measured, Pairs, pair
+from ..compiling.small import add_diagonal, load, store, subtract
+from .graph import MATRIX, VECTOR, Assumed, Measured, Pairs, gate_pair, pair
 
 HARD = 1e7
 """Weight of the motion over that of a fix beyond which D - D S^-1 D loses its digits."""
+SLACK = 0.5
+"""Variance of the difference of two own filters over that of a fix, where the weights are set first."""
 EXTRA, HALVINGS = 20, 12
 """Sweeps beyond the asked ones while steps must be shortened, and how often one is halved."""
 
@@ -33,7 +35,7 @@ class RunFactors(NamedTuple):
         active: (T, N).
         row: (T, N) the vehicle's number among those of its step, -1 where inactive.
         pairs: those that count; `alive` is (1, P).
-        relative: (L, 5).
+        relative: (L, 8), the last three the factors of the standard deviations.
         assumed: the noise model.
         fix_weight: (T, N, 3) 1/m^2, 0 where there is no fix.
         fix: (T, N, 3) m, any number where there is none.
@@ -90,9 +92,10 @@ def smooth(
         numpy.linalg.LinAlgError: a number is not finite.
     """
     sweeps, whole, last = 0, False, np.inf
+    slack = SLACK / float(factors.fix_weight[factors.fix_weight > 0].mean())
     while True:
         moving, before = motions(x, factors), x
-        weight, eta = linearise(x, factors, sweeps == 0)
+        weight, eta = linearise(x, factors, sweeps == 0, sweeps <= steps, slack if sweeps == 0 else 0.0)
         vectors = [row[there].ravel() for row, there in zip(sum_vectors(x, factors, eta), factors.active, strict=True)]
         if sweeps <= steps or not whole:
             eliminated, inverses = moving, eliminate(factors, weight, moving, vectors, tick)
@@ -132,13 +135,14 @@ def misfit(x: Floats, factors: RunFactors) -> float:
     for link, vector in ((pairs.link, gap), (pairs.link_back, -gap)):
         used = pairs.alive[0] & (link >= 0)
         seen, (east, north, up) = factors.relative[link[used]].T, vector[used].T
+        std = factors.assumed.std[:, None] * seen[5:]
         flat = np.hypot(east, north)
         apart = [
             np.where(seen[0] >= 0.0, seen[0] - np.hypot(flat, up), 0.0),
             np.arctan2(seen[1] * east - seen[2] * north, seen[2] * east + seen[1] * north),
             np.arctan2(seen[3] * up - seen[4] * flat, seen[4] * up + seen[3] * flat),
         ]
-        total += float(np.sum((np.stack(apart) / factors.assumed.std[:, None]) ** 2))
+        total += float(np.sum((np.stack(apart) / std) ** 2))
     return total
 
 
@@ -247,14 +251,24 @@ def cholesky(matrix: Floats) -> Floats:
 
 
 @compiled
-def linearise(x: Floats, factors: RunFactors, converted: bool) -> tuple[Floats, Floats]:
-    """Information (9 P) of each pair and its information vector (P, 3) at positions (T, N, 3) m."""
-    pairs = factors.pairs
+def linearise(x: Floats, factors: RunFactors, converted: bool, gates: bool, variance: float) -> tuple[Floats, Floats]:
+    """Information (9 P) of each pair and its information vector (P, 3) at positions (T, N, 3) m.
+
+    Args:
+        x: m.
+        factors: of the run.
+        converted: measurements linear in the vector.
+        gates: set the factors of their deviations, if robust.
+        variance: m^2, of the difference of two positions, for gates.
+    """
+    pairs, cov = factors.pairs, add_diagonal(MATRIX, (variance, variance, variance))
     weight, eta = np.zeros(9 * len(pairs.first)), np.zeros((len(pairs.first), 3))
     for t in range(len(x)):
         for k in range(pairs.start[t], pairs.start[t + 1]):
             if pairs.alive[0, k]:
                 vector = subtract(load(x[t, pairs.second[k]], 0, VECTOR), load(x[t, pairs.first[k]], 0, VECTOR))
+                if gates and factors.assumed.robust:
+                    gate_pair(vector, cov, k, pairs, factors.relative, factors.assumed)
                 information, pair_eta = pair(vector, k, pairs, factors.relative, factors.assumed, converted)
                 store(weight, k, information)
                 store(eta[k], 0, pair_eta)

@@ -106,7 +106,7 @@ def step(
     run: int,
     t: int,
 ) -> None:
-    """One step of all members: prediction, then each one's compass and fix, then the relative measurements."""
+    """One step of all members: prediction, then each one's fix and compass, then the relative measurements."""
     d = options.d
     if t == 0:
         poses.totals[COST] = poses.totals[USED] = 0.0
@@ -122,10 +122,10 @@ def step(
                     poses.cov[member + i, member + i] = spread[i] * spread[i]
     for k in range(measured.own.shape[2]):
         own = measured.own[run, t, k]
-        if measured.active[t, k] and not math.isnan(own[3]):
-            update_heading(poses, d * k, own[3], noise.heading, noise.gate)
         if measured.active[t, k] and not math.isnan(own[0]):
             update_fix(poses, d * k, (own[0], own[1], own[2]), noise.fix, noise.gate)
+        if measured.active[t, k] and not math.isnan(own[3]):
+            update_heading(poses, d * k, own[3], noise.heading, noise.gate)
     settle(poses)
     if measured.first[t] == measured.first[t + 1]:
         return
@@ -202,7 +202,7 @@ def fuse_pair(
     best, chosen = math.inf, 1.0
     for attempt in range(tries + 1):
         weight = chosen if attempt == tries else (attempt + 1.0) / TRIED
-        pair.cov[:] = 0.0
+        pair.cov[:], pair.hits[0] = 0.0, 0.0
         set_member(pair, 0, poses, observer, d, weight)
         if other >= 0:
             set_member(pair, d, poses, other, d, max(1.0 - weight, LEAST) if tries > 0 else 1.0)

@@ -25,7 +25,7 @@ class PoseNoise(NamedTuple):
         lasting: stationary variances of scale error and of yaw-rate bias, rad^2/s^2.
         keep: share of both that is left after a step.
         flat: m^2, prior of a member that joins.
-        gate: standard deviations of its innovation beyond which a measurement is left out.
+        gate: standard deviations of its innovation beyond which a measurement weighs less.
     """
 
     fix: Three
@@ -126,6 +126,7 @@ def move_rows(cov: Floats, member: int, d: int, moved: Three, scale: float, dt: 
 @part
 def join(poses: Poses, member: int, d: int, own: Floats, noise: PoseNoise) -> None:
     """Begin a member where its fix and compass place it, and know nothing of it yet."""
+    poses.hits[member] = 0.0
     for i in range(member, member + d):
         for j in range(len(poses.x)):
             poses.cov[i, j] = poses.cov[j, i] = 0.0

@@ -15,7 +15,9 @@ from numpy import uint64
 
 from ...arrays import Floats
 from ..compiling.compile import part
+from ..compiling.small import add_diagonal
 from ..compiling.vectors import LANES, less, plus, put, take
+from ..gate import FIX_GATE, GATE, count, distance, gain_of, inflation
 
 HEADING = 3
 """Index of the heading in a member's state."""
@@ -44,6 +46,7 @@ class Poses(NamedTuple):
         columns: (ROWS, size) P h of pending rows.
         gains: (ROWS, size) P h / s of these.
         weights: (ROWS,) 1 / s of these.
+        hits: (size,) of `coopoc.kernels.gate`, at the first number of the member that measures.
         totals: (3,) sum of r^2 / s + log s, number of rows that were used, and of those that are pending.
     """
 
@@ -55,6 +58,7 @@ class Poses(NamedTuple):
     columns: Floats
     gains: Floats
     weights: Floats
+    hits: Floats
     totals: Floats
 
 
@@ -64,14 +68,14 @@ COST, USED, PENDING = range(3)
 def new_poses(numbers: int) -> Poses:
     """Room for so many numbers."""
     size = -(-numbers // LANES) * LANES
-    (x, linear, prior_x), (cov, prior_cov) = np.zeros((3, size)), np.zeros((2, size, size))
+    (x, linear, prior_x, hits), (cov, prior_cov) = np.zeros((4, size)), np.zeros((2, size, size))
     columns, gains = np.zeros((2, ROWS, size))
-    return Poses(x, cov, linear, prior_x, prior_cov, columns, gains, np.zeros(ROWS), np.zeros(3))
+    return Poses(x, cov, linear, prior_x, prior_cov, columns, gains, np.zeros(ROWS), hits, np.zeros(3))
 
 
 @part
 def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: float, gate: float) -> bool:
-    """x += P h r / s, P -= P h h^T P / s with s = h^T P h + variance; nothing where r^2 > gate^2 s.
+    """x += P h r / s, P -= P h h^T P / s with s = h^T P h + variance, inflated where r^2 > gate^2 s.
 
     The covariance follows when ROWS rows are pending, or with `settle`; a row sees those that are pending.
 
@@ -103,11 +107,14 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
             left = less(entries(columns, pending, tile, tiles), share, entries(columns, q, tile, tiles))
             put(columns, uint64(pending * tiles + tile), left)
     s = variance + along(columns, pending, ends, row)
-    weight = 1.0 / s
-    square = residual * residual * weight
-    poses.totals[COST] += min(square, gate * gate) + math.log(s)
-    if square > gate * gate:
+    square, limit, hits = residual * residual / s, gate * gate, poses.hits[k]
+    share = inflation(square, limit, hits)
+    if math.isfinite(gate):
+        poses.hits[k] = count(square, limit, hits, 1.0 - variance / s)
+    poses.totals[COST] += min(square, limit) + math.log(s)
+    if math.isinf(share):
         return False
+    weight = 1.0 / (s * share)
     for tile in range(tiles):
         column = entries(columns, pending, tile, tiles)
         put(poses.x, uint64(tile), plus(take(poses.x, uint64(tile)), residual * weight, column))
@@ -171,10 +178,22 @@ def update_heading(poses: Poses, member: int, heading: float, variance: float, g
 
 @part
 def update_fix(poses: Poses, member: int, fix: Three, variance: Three, gate: float) -> None:
-    """A position m."""
-    for axis in range(3):
+    """A position m, gated as a whole."""
+    share, m, cov, hits = 1.0, member, poses.cov, poses.hits
+    if math.isfinite(gate):
+        settle(poses)
+        gap, limit = (
+            (fix[0] - poses.x[m], fix[1] - poses.x[m + 1], fix[2] - poses.x[m + 2]),
+            FIX_GATE * gate * gate / GATE,
+        )
+        xy, xz, yz = cov[m, m + 1], cov[m, m + 2], cov[m + 1, m + 2]
+        own = cov[m, m], xy, xz, xy, cov[m + 1, m + 1], yz, xz, yz, cov[m + 2, m + 2]
+        q = distance(gap, add_diagonal(own, variance))
+        share = inflation(q, limit, hits[m])
+        hits[m] = count(q, limit, hits[m], gain_of(own, variance))
+    for axis in range(3 if math.isfinite(share) else 0):
         row = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0, 0.0)
-        update_row(poses, (member, ALONE), row, fix[axis] - poses.x[member + axis], variance[axis], gate)
+        update_row(poses, (member, ALONE), row, fix[axis] - poses.x[m + axis], share * variance[axis], math.inf)
 
 
 @part
@@ -219,7 +238,7 @@ def update_relative(
         left_out: a bit for each component that is left out.
 
     Returns:
-        The bits, and those of the components beyond the gate.
+        The bits, and those of the components that are rejected.
     """
     (k, o), x, linear = ends, poses.x, poses.linear
     for component in range(3):

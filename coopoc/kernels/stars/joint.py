@@ -1,15 +1,15 @@
-"""Gaussian of a star in information form: prediction, fixes and relative measurements in d x d blocks, d >= 3.
+"""Gaussian of a star in information form: prediction, fixes and relative measurements in 3 x 3 blocks.
 
-The state of member k is tuple k, its position first; its block is k - 1, and the ego's is the last, so that elimination
+The position of member k is tuple k; its block is k - 1, and the ego's is the last, so that elimination
 ends with the ego's covariance. A filter calls, step by step, `gather` of `coopoc.kernels.stars.messages`,
 `predict_state`, `predict` of `coopoc.kernels.stars.elimination`, `rearrange`, its own fixes, `add_relative`, and
-`solve`. The argument `row` is any tuple of d numbers, from which the compiler takes d.
+`solve`.
 """
 
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple
 
 import numpy as np
 
@@ -17,26 +17,22 @@ from ...arrays import Floats
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import (
     add,
-    add_corner,
     add_diagonal,
     apply,
     choose_each,
-    first3,
     from_upper,
     load,
     negate,
     plus_applied,
     scale,
-    square,
     store,
     subtract,
     transpose,
-    with_first3,
     zeros,
 )
 from ..compiling.vectors import LANES, choose
 from .elimination import eliminate, substitute
-from .messages import MOVED, NEW, POSITION, PROCESS, RELATIVE, ROW, Star, clear
+from .messages import BLOCK, MOVED, NEW, POSITION, PROCESS, RELATIVE, ROW, Star, clear
 from .relative import Numbers, completed, converted, exact, incomplete, vector
 
 LEAST_KNOWN = 1e-4
@@ -49,13 +45,13 @@ class Joint(NamedTuple):
     """A Gaussian of the members' states in information form, and scratch memory; arrays are (., LANES).
 
     Attributes:
-        state: (d most,).
-        information: (d^2 most^2,).
-        factor: (d^2 most^2,).
-        eta: (d most,) information vector.
-        move: (d most,) step of the state.
-        process: (d most,) process information, the inverse of the process noise.
-        scratch: (2 d^2 most,).
+        state: (3 most,).
+        information: (9 most^2,).
+        factor: (9 most^2,).
+        eta: (3 most,) information vector.
+        move: (3 most,) step of the state.
+        process: (3 most,) process information, the inverse of the process noise.
+        scratch: (18 most,).
         stride: blocks in a row.
     """
 
@@ -69,43 +65,11 @@ class Joint(NamedTuple):
     stride: int
 
 
-def joint_rows(most: int, row: Numbers) -> int:
-    """Rows of memory for `most` members."""
-    return 4 * len(row) * most + 2 * len(row) * len(row) * (most * most + most)
-
-
-joint_size = storage(joint_rows)
-"""The same, for compiled code."""
-
-
 @storage
-def joint_in(memory: Floats, most: int, row: Numbers) -> Joint:
-    """A Gaussian of up to `most` members, whose state is as long as `row`, in memory (>= joint_size LANES,)."""
-    d, size = len(row), len(memory) // LANES
-    rows = memory[: size * LANES].reshape((size, LANES))
-    a, b = d * most, d * d * most * most
-    return Joint(
-        rows[:a],
-        rows[4 * a : 4 * a + b],
-        rows[4 * a + b : 4 * a + 2 * b],
-        rows[a : 2 * a],
-        rows[2 * a : 3 * a],
-        rows[3 * a : 4 * a],
-        rows[4 * a + 2 * b :],
-        most,
-    )
-
-
-@storage
-def joint_within(most: int, row: Numbers) -> Joint:
-    """Room for `most` members, made by compiled code."""
-    return joint_in(np.zeros(joint_size(most, row) * LANES), most, row)
-
-
-def new_joint(most: int, row: Numbers, memory: Floats | None = None) -> Joint:
-    """Room for `most` members, or that in memory."""
-    plain: Any = joint_in
-    return cast(Joint, plain.py_func(np.zeros(joint_rows(most, row) * LANES) if memory is None else memory, most, row))
+def joint_within(most: int) -> Joint:
+    """Room for `most` members."""
+    a, b = np.zeros((4, 3 * most, LANES)), np.zeros((2, 9 * most * most, LANES))
+    return Joint(a[0], b[0], b[1], a[1], a[2], a[3], np.zeros((18 * most, LANES)), most)
 
 
 @inside
@@ -115,31 +79,27 @@ def block_of(k: int, n: int) -> int:
 
 
 @inner
-def predict_state(star: Star, joint: Joint, n: int, old: int, row: Numbers) -> None:
+def predict_state(star: Star, joint: Joint, n: int, old: int) -> None:
     """Move the members that stay; the ego starts where its first fix is, one that joins where the ego measures it, or,
     if the ego does not measure all three components, where its own message puts it.
 
     Fills the inverse process noise of the positions, in the order of the last star: zero for members that left.
     """
     for k in range(old):
-        store(joint.move, k, load(joint.state, k, row))
+        store(joint.move, k, load(joint.state, k, ROW))
     clear(joint.process)
     for k in range(n):
         place, row_of = star.previous[k], 4 * k
         if place >= 0:
-            before = load(joint.move, place, row)
-            at = add(first3(before), load(star.motion, row_of + MOVED, ROW))
-            store(joint.state, k, with_first3(before, at))
+            at = add(load(joint.move, place, ROW), load(star.motion, row_of + MOVED, ROW))
+            store(joint.state, k, at)
             p, q, r = load(star.motion, row_of + PROCESS, ROW)
             process = 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
-            at_block = block_of(place, old)
-            store(joint.process, at_block, with_first3(load(joint.process, at_block, row), process))
+            store(joint.process, block_of(place, old), process)
         elif k == 0:
-            first = load(star.motion, row_of + POSITION, ROW)
-            store(joint.state, k, with_first3(zeros(first[0], row), first))
+            store(joint.state, k, load(star.motion, row_of + POSITION, ROW))
         else:
-            at = first_place(star, k, first3(load(joint.state, 0, row)))
-            store(joint.state, k, with_first3(zeros(at[0], row), at))
+            store(joint.state, k, first_place(star, k, load(joint.state, 0, ROW)))
 
 
 @inside
@@ -159,22 +119,22 @@ def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
 
 
 @inner
-def place_on_broadcast(star: Star, joint: Joint, n: int, row: Numbers) -> None:
+def place_on_broadcast(star: Star, joint: Joint, n: int) -> None:
     """Put members of which nothing was known where their first message with a position does: what was measured of them
     is linear there, and not where they were assumed to be until now."""
     for k in range(1, n):
         if star.previous[k] >= 0:
-            state = load(joint.state, k, row)
-            own = load(joint.information, (k - 1) * joint.stride + k - 1, square(row))[0]
-            new, at = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5, first3(state)
+            at = load(joint.state, k, ROW)
+            own = load(joint.information, (k - 1) * joint.stride + k - 1, BLOCK)[0]
+            new = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5
             there = choose_each(new, load(star.motion, 4 * k + POSITION, ROW), at)
-            store(joint.state, k, with_first3(state, choose_each(own - LEAST_KNOWN, at, there)))
+            store(joint.state, k, choose_each(own - LEAST_KNOWN, at, there))
 
 
 @inside
-def placed(joint: Joint, k: int, seen: Numbers, row: Numbers) -> float:
+def placed(joint: Joint, k: int, seen: Numbers) -> float:
     """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
-    own = load(joint.information, (k - 1) * joint.stride + k - 1, square(row))[0]
+    own = load(joint.information, (k - 1) * joint.stride + k - 1, BLOCK)[0]
     whole = 0.0 * seen[0] + 1e300 - (seen[5] + seen[6] + seen[7])
     one = 0.0 * own + 1.0
     share: float = choose(whole, one, choose(own - LEAST_KNOWN, one, 0.0 * own))
@@ -191,12 +151,12 @@ def stayed(star: Star, n: int, old: int) -> bool:
 
 
 @inner
-def rearrange(star: Star, joint: Joint, n: int, old: int, prior: Numbers, row: Numbers) -> None:
+def rearrange(star: Star, joint: Joint, n: int, old: int, prior: Numbers) -> None:
     """Information in the order of the new star; that of a member that joins is diagonal, the tuple `prior`."""
     if stayed(star, n, old):
         return
-    block, stride = square(row), joint.stride
-    o = 0.0 * load(joint.information, 0, row)[0]
+    stride = joint.stride
+    o = 0.0 * load(joint.information, 0, ROW)[0]
     for k in range(n):
         for j in range(n):
             i, c = block_of(k, n), block_of(j, n)
@@ -204,39 +164,37 @@ def rearrange(star: Star, joint: Joint, n: int, old: int, prior: Numbers, row: N
                 continue
             p, q = star.previous[k], star.previous[j]
             if p < 0 or q < 0:
-                nothing = zeros(o, block)
+                nothing = zeros(o, BLOCK)
                 store(joint.factor, i * stride + c, add_diagonal(nothing, prior) if k == j else nothing)
                 continue
             p, q = block_of(p, old), block_of(q, old)
             if p <= q:
-                store(joint.factor, i * stride + c, load(joint.information, p * stride + q, block))
+                store(joint.factor, i * stride + c, load(joint.information, p * stride + q, BLOCK))
             else:
-                store(joint.factor, i * stride + c, transpose(load(joint.information, q * stride + p, block)))
-    copy(joint.factor, joint.information, n, stride, block)
+                store(joint.factor, i * stride + c, transpose(load(joint.information, q * stride + p, BLOCK)))
+    copy(joint.factor, joint.information, n, stride)
 
 
 @inner
-def copy(source: Floats, target: Floats, n: int, stride: int, block: Numbers) -> None:
+def copy(source: Floats, target: Floats, n: int, stride: int) -> None:
     """The blocks on and above the diagonal."""
     for i in range(n):
         for j in range(i, n):
-            store(target, i * stride + j, load(source, i * stride + j, block))
+            store(target, i * stride + j, load(source, i * stride + j, BLOCK))
 
 
 @inside
-def relative_information(
-    star: Star, joint: Joint, k: int, std: Floats, least: float, row: Numbers
-) -> tuple[Numbers, Numbers]:
+def relative_information(star: Star, joint: Joint, k: int, std: Floats, least: float) -> tuple[Numbers, Numbers]:
     """Information (3, 3) of the converted measurement of member k at the predicted geometry, and what it adds to the
     information vector: W and W (measured vector - predicted vector)."""
     seen = load(star.relative, k, RELATIVE)
-    gap = subtract(first3(load(joint.state, k, row)), first3(load(joint.state, 0, row)))
+    gap = subtract(load(joint.state, k, ROW), load(joint.state, 0, ROW))
     x, y, z = gap
     lacking = incomplete(seen)
     if len(std) or lacking:
         weight = converted(x, y, z, deviations(seen, gap, len(std) == 0), least)
         if lacking:
-            weight = scale(weight, placed(joint, k, seen, row))
+            weight = scale(weight, placed(joint, k, seen))
     else:
         o, one = 0.0 * x, 0.0 * x + 1.0
         weight = one, o, o, one, o, one
@@ -255,46 +213,43 @@ def deviations(seen: Numbers, gap: Numbers, unit: bool) -> Numbers:
 
 
 @inside
-def exact_information(star: Star, joint: Joint, k: int, n: int, least: float, row: Numbers) -> tuple[Numbers, Numbers]:
+def exact_information(star: Star, joint: Joint, k: int, n: int, least: float) -> tuple[Numbers, Numbers]:
     """The same of range and angles, linear at the state moved by `move`, as seen from the state."""
     seen = load(star.relative, k, RELATIVE)
-    ahead = subtract(first3(load(joint.move, k - 1, row)), first3(load(joint.move, n - 1, row)))
-    gap = subtract(first3(load(joint.state, k, row)), first3(load(joint.state, 0, row)))
+    ahead = subtract(load(joint.move, k - 1, ROW), load(joint.move, n - 1, ROW))
+    gap = subtract(load(joint.state, k, ROW), load(joint.state, 0, ROW))
     x, y, z = add(gap, ahead)
     found = exact(x, y, z, seen, (seen[5], seen[6], seen[7]), least)
     if incomplete(seen):
-        found = scale(found, placed(joint, k, seen, row))
+        found = scale(found, placed(joint, k, seen))
     weight = from_upper(found[:6])
     return weight, plus_applied(found[6:], weight, ahead)
 
 
 @inside
-def add_relative(
-    a: Floats, eta: Floats, stride: int, k: int, n: int, weight: Numbers, vector: Numbers, row: Numbers
-) -> None:
+def add_relative(a: Floats, eta: Floats, stride: int, k: int, n: int, weight: Numbers, vector: Numbers) -> None:
     """Add information (weight, vector) about the position of member k of n less that of the ego, to matrix and
     vector."""
-    i, e, like = k - 1, n - 1, square(row)
+    i, e = k - 1, n - 1
     for at in (i, e):
         diagonal = at * stride + at
-        store(a, diagonal, add_corner(load(a, diagonal, like), weight))
+        store(a, diagonal, add(load(a, diagonal, BLOCK), weight))
     at = i * stride + e
-    store(a, at, add_corner(load(a, at, like), negate(weight)))
-    mine, egos = load(eta, i, row), load(eta, e, row)
-    store(eta, i, with_first3(mine, add(first3(mine), vector)))
-    store(eta, e, with_first3(egos, subtract(first3(egos), vector)))
+    store(a, at, add(load(a, at, BLOCK), negate(weight)))
+    store(eta, i, add(load(eta, i, ROW), vector))
+    store(eta, e, subtract(load(eta, e, ROW), vector))
 
 
 @inside
-def solve(a: Floats, joint: Joint, eta: Floats, n: int, row: Numbers) -> Numbers:
+def solve(a: Floats, joint: Joint, eta: Floats, n: int) -> Numbers:
     """Step A^-1 eta of the state in place of eta; minus the covariance of the ego."""
-    cov = eliminate(a, joint.factor, eta, n, joint.stride, joint.scratch, square(row), row)
-    substitute(joint.factor, eta, n, joint.stride, square(row), row)
+    cov = eliminate(a, joint.factor, eta, n, joint.stride, joint.scratch)
+    substitute(joint.factor, eta, n, joint.stride)
     return cov
 
 
 @inside
-def move(joint: Joint, n: int, row: Numbers) -> None:
+def move(joint: Joint, n: int) -> None:
     """Add the step in `eta` to the state."""
     for k in range(n):
-        store(joint.state, k, add(load(joint.state, k, row), load(joint.eta, block_of(k, n), row)))
+        store(joint.state, k, add(load(joint.state, k, ROW), load(joint.eta, block_of(k, n), ROW)))

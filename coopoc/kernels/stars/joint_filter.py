@@ -6,9 +6,10 @@ No matrix is ever inverted as a whole.
 from __future__ import annotations
 
 from ..compiling.compile import as_written, inner
-from ..compiling.small import add, add_diagonal, load, negate, square, store, subtract, times
+from ..compiling.small import add, add_diagonal, load, negate, store, subtract, times
 from ..compiling.vectors import LANES
 from .elimination import predict
+from .gated import Gates, carry, gate_star, gates_within, set_ego
 from .joint import (
     Joint,
     add_relative,
@@ -18,15 +19,18 @@ from .joint import (
     joint_within,
     move,
     place_on_broadcast,
+    placed,
     predict_state,
     rearrange,
     relative_information,
     solve,
 )
 from .messages import (
+    BLOCK,
     NEW,
     NONE,
     POSITION,
+    RELATIVE,
     ROW,
     VARIANCE,
     Assumptions,
@@ -39,56 +43,64 @@ from .messages import (
     new_estimates,
     star_within,
 )
-from .relative import Numbers
 
 
 @as_written
-def run_filter(seen: Measurements, known: Assumptions, refine: bool) -> Estimates:
+def run_filter(seen: Measurements, known: Assumptions, refine: bool, robust: bool) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m.
 
     Args:
         seen: measurements and messages of the ego.
         known: noise model.
         refine: one Gauss-Newton step on range and angles.
+        robust: gate innovations.
     """
     runs, steps = seen.gnss.shape[:2]
     out = new_estimates(seen)
     most = largest(seen.start)
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
-        star, joint = star_within(most), joint_within(most, ROW)
+        star, joint, gates = star_within(most), joint_within(most), gates_within(most)
         for t in range(steps):
             n = gather(star, seen, known, first, last, t, old)
-            step(star, joint, known, refine, n, old)
-            write(out, joint, first, last, t, seen.start[t], n, ROW)
+            step(star, joint, gates, known, refine, robust, n, old)
+            write(out, joint, first, last, t, seen.start[t], n)
             old = n
     return out
 
 
 @inner
-def write(out: Estimates, joint: Joint, first: int, last: int, t: int, link: int, n: int, row: Numbers) -> None:
+def write(out: Estimates, joint: Joint, first: int, last: int, t: int, link: int, n: int) -> None:
     """Copy the estimates of a step in runs first to last; `link` is its first link."""
-    (x, cov, neighbours), d = out, len(row)
+    x, cov, neighbours = out
     for lane in range(last - first + 1):
         for i in range(3):
             x[first + lane, t, i] = joint.state[i, lane]
             for j in range(3):
-                cov[first + lane, t, i, j] = joint.scratch[d * min(i, j) + max(i, j), lane]
+                cov[first + lane, t, i, j] = joint.scratch[3 * min(i, j) + max(i, j), lane]
             for k in range(1, n):
-                neighbours[first + lane, link + k - 1, i] = joint.state[d * k + i, lane]
+                neighbours[first + lane, link + k - 1, i] = joint.state[3 * k + i, lane]
 
 
 @inner
-def step(star: Star, joint: Joint, known: Assumptions, refine: bool, n: int, old: int) -> None:
+def step(
+    star: Star, joint: Joint, gates: Gates, known: Assumptions, refine: bool, robust: bool, n: int, old: int
+) -> None:
     """Predict and update the state of n members, `old` of them before; the ego's covariance is then in `scratch`."""
     flat = 1.0 / known.flat
-    predict_state(star, joint, n, old, ROW)
-    predict(joint.information, old, joint.stride, joint.process, joint.scratch, square(ROW), ROW)
-    rearrange(star, joint, n, old, (flat, flat, flat), ROW)
-    place_on_broadcast(star, joint, n, ROW)
+    predict_state(star, joint, n, old)
+    predict(joint.information, old, joint.stride, joint.process, joint.scratch)
+    rearrange(star, joint, n, old, (flat, flat, flat))
+    place_on_broadcast(star, joint, n)
+    if robust:
+        carry(star, gates, known.flat, n, old)
+        for k in range(1, n):
+            store(joint.move, k, (placed(joint, k, load(star.relative, k, RELATIVE)),))
+        gate_star(star, gates, joint.state, joint.move, known.min_range, n)
     clear(joint.eta)
     add_fixes(star, joint, n)
-    update(star, joint, known, refine, n, n, ROW)
+    update(star, joint, known, refine, n)
+    set_ego(gates, load(joint.scratch, 0, BLOCK))
 
 
 @inner
@@ -99,28 +111,28 @@ def add_fixes(star: Star, joint: Joint, n: int) -> None:
         p, q, r = load(star.motion, 4 * k + VARIANCE, ROW)
         weight, i = (new / p, new / q, new / r), block_of(k, n)
         gap, at = subtract(load(star.motion, 4 * k + POSITION, ROW), load(joint.state, k, ROW)), i * joint.stride + i
-        store(joint.information, at, add_diagonal(load(joint.information, at, square(ROW)), weight))
+        store(joint.information, at, add_diagonal(load(joint.information, at, BLOCK), weight))
         store(joint.eta, i, add(load(joint.eta, i, ROW), times(weight, gap)))
 
 
 @inner
-def update(star: Star, joint: Joint, known: Assumptions, refine: bool, members: int, n: int, row: Numbers) -> None:
+def update(star: Star, joint: Joint, known: Assumptions, refine: bool, n: int) -> None:
     """Add the relative measurements, converted at the predicted geometry, and solve; to refine, solve a copy and add
-    them once more, exact, linear at that solution. n blocks are those of the members and what stands behind them."""
-    last = 1 if refine and members > 1 else 0
+    them once more, exact, linear at that solution."""
+    last = 1 if refine and n > 1 else 0
     clear(joint.move)
     for stage in range(last + 1):
         a, eta = joint.information, joint.eta
         if stage < last:
             a, eta = joint.factor, joint.move
-            copy(joint.information, a, n, joint.stride, square(row))
+            copy(joint.information, a, n, joint.stride)
             for i in range(n):
-                store(eta, i, load(joint.eta, i, row))
-        for k in range(1, members):
+                store(eta, i, load(joint.eta, i, ROW))
+        for k in range(1, n):
             if stage == 1:
-                weight, vector = exact_information(star, joint, k, n, known.min_range, row)
+                weight, vector = exact_information(star, joint, k, n, known.min_range)
             else:
-                weight, vector = relative_information(star, joint, k, known.relative_std, known.min_range, row)
-            add_relative(a, eta, joint.stride, k, n, weight, vector, row)
-        store(joint.scratch, 0, negate(solve(a, joint, eta, n, row)))
-    move(joint, n, row)
+                weight, vector = relative_information(star, joint, k, known.relative_std, known.min_range)
+            add_relative(a, eta, joint.stride, k, n, weight, vector)
+        store(joint.scratch, 0, negate(solve(a, joint, eta, n)))
+    move(joint, n)

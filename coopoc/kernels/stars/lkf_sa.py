@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from ..compiling.compile import as_written, inner, inside
-from ..compiling.small import add, add_diagonal, load, negate, scale, square, store, subtract, zeros
+from ..compiling.small import add, add_diagonal, load, negate, scale, store, subtract, zeros
 from ..compiling.vectors import LANES, choose
 from .elimination import predict
 from .joint import Joint, add_relative, joint_within, move, predict_state, rearrange, solve
 from .joint_filter import add_fixes, write
 from .messages import (
+    BLOCK,
     NONE,
     RELATIVE,
     ROW,
@@ -33,11 +34,11 @@ def run_lkf_sa(seen: Measurements, known: Assumptions) -> Estimates:
     most = largest(seen.start)
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
-        star, joint = star_within(most), joint_within(most, ROW)
+        star, joint = star_within(most), joint_within(most)
         for t in range(steps):
             n = gather(star, seen, known, first, last, t, old)
             step(star, joint, known, n, old)
-            write(out, joint, first, last, t, seen.start[t], n, ROW)
+            write(out, joint, first, last, t, seen.start[t], n)
             old = n
     return out
 
@@ -46,18 +47,18 @@ def run_lkf_sa(seen: Measurements, known: Assumptions) -> Estimates:
 def step(star: Star, joint: Joint, known: Assumptions, n: int, old: int) -> None:
     """Predict, add fixes and the Laplacian's measurement, and solve; the ego's covariance is then in `scratch`."""
     flat = 1.0 / known.flat
-    predict_state(star, joint, n, old, ROW)
+    predict_state(star, joint, n, old)
     for k in range(1, n):
         if star.previous[k] < 0:
             measured = vector(load(star.relative, k, RELATIVE))
             store(joint.state, k, add(load(joint.state, 0, ROW), measured))
-    predict(joint.information, old, joint.stride, joint.process, joint.scratch, square(ROW), ROW)
-    rearrange(star, joint, n, old, (flat, flat, flat), ROW)
+    predict(joint.information, old, joint.stride, joint.process, joint.scratch)
+    rearrange(star, joint, n, old, (flat, flat, flat))
     clear(joint.eta)
     add_fixes(star, joint, n)
     add_laplacian(star, joint, known, n)
-    store(joint.scratch, 0, negate(solve(joint.information, joint, joint.eta, n, ROW)))
-    move(joint, n, ROW)
+    store(joint.scratch, 0, negate(solve(joint.information, joint, joint.eta, n)))
+    move(joint, n)
 
 
 @inner
@@ -81,8 +82,8 @@ def add_laplacian(star: Star, joint: Joint, known: Assumptions, n: int) -> None:
         central = outer / max(count, o + 1.0)
     for k in range(1, n):
         edge, gap = edge_to(star, joint, k)
-        weight = add_diagonal(zeros(o, square(ROW)), (outer * edge, outer * edge, outer * edge))
-        add_relative(joint.information, joint.eta, stride, k, n, weight, scale(gap, outer), ROW)
+        weight = add_diagonal(zeros(o, BLOCK), (outer * edge, outer * edge, outer * edge))
+        add_relative(joint.information, joint.eta, stride, k, n, weight, scale(gap, outer))
     for i in range(n):
         row = count if i == e else -edge_to(star, joint, i + 1)[0]
         store(joint.eta, i, subtract(load(joint.eta, i, ROW), scale(gaps, row * central)))
@@ -104,5 +105,5 @@ def edge_to(star: Star, joint: Joint, k: int) -> tuple[float, Numbers]:
 @inside
 def add_at(joint: Joint, at: int, number: float) -> None:
     """Add to the diagonal of a block."""
-    block = load(joint.information, at, square(ROW))
+    block = load(joint.information, at, BLOCK)
     store(joint.information, at, add_diagonal(block, (number, number, number)))

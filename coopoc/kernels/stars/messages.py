@@ -40,7 +40,7 @@ Index: TypeAlias = Any
 Three: TypeAlias = tuple[float, float, float]
 Estimates: TypeAlias = tuple[Floats, Floats, Floats]
 """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
-ROW, RELATIVE = (0.0,) * 3, (0.0,) * 8
+ROW, BLOCK, RELATIVE = (0.0,) * 3, (0.0,) * 9, (0.0,) * 8
 NONE = cast(int, np.int64(0))
 """Members before the first star. For a constant of Python's numba would compile the whole step once more."""
 
@@ -121,24 +121,11 @@ class Star(NamedTuple):
 
 
 @storage
-def star_in(memory: Floats, columns: Ints, most: int) -> Star:
-    """A star of up to `most` members in memory (>= 30 most LANES,) and columns (>= 3 most,)."""
-    rows = memory[: 30 * most * LANES].reshape((30 * most, LANES))
-    return Star(
-        columns[:most],
-        columns[most : 2 * most],
-        rows[: 5 * most],
-        rows[5 * most : 17 * most],
-        rows[17 * most : 25 * most],
-        columns[2 * most : 3 * most],
-        rows[25 * most :],
-    )
-
-
-@storage
 def star_within(most: int) -> Star:
-    """Room for `most` members, made by compiled code."""
-    return star_in(np.zeros(30 * most * LANES), np.zeros(3 * most, np.int64), most)
+    """Room for `most` members."""
+    status, motion, relative = np.zeros((5 * most, LANES)), np.zeros((12 * most, LANES)), np.zeros((8 * most, LANES))
+    member, previous, last = np.zeros(most, np.int64), np.zeros(most, np.int64), np.zeros(most, np.int64)
+    return Star(member, previous, status, motion, relative, last, np.zeros((5 * most, LANES)))
 
 
 @storage

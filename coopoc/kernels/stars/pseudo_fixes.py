@@ -27,7 +27,6 @@ from ..compiling.small import (
     minus_product,
     negate,
     scale,
-    square,
     store,
     subtract,
     times,
@@ -35,7 +34,10 @@ from ..compiling.small import (
     zeros,
 )
 from ..compiling.vectors import LANES, choose
+from ..gate import FIX_GATE, count, distance, gain_of, inflation
+from .gated import gate_components, inflated
 from .messages import (
+    BLOCK,
     HELD,
     MOVED,
     NEW,
@@ -50,6 +52,7 @@ from .messages import (
     Estimates,
     Measurements,
     Star,
+    clear,
     gather,
     largest,
     new_estimates,
@@ -92,12 +95,12 @@ def fuse_pseudo_fixes(star: Star, known: Assumptions, x: Floats, cov: Floats, n:
     """P^-1 + C_p^-1 + sum_j C_j^-1, and the weighted mean that belongs to it, in place of x and P."""
     fix = load(star.motion, POSITION, ROW)
     if old == 0:
-        at, p = fix, zeros(fix[0], square(ROW))
+        at, p = fix, zeros(fix[0], BLOCK)
         flat = 0.0 * fix[0] + known.flat
         p = add_diagonal(p, (flat, flat, flat))
     else:
         at = add(load(x, 0, ROW), load(star.motion, MOVED, ROW))
-        p = add_diagonal(load(cov, 0, square(ROW)), load(star.motion, PROCESS, ROW))
+        p = add_diagonal(load(cov, 0, BLOCK), load(star.motion, PROCESS, ROW))
     weight, variance = load(star.status, NEW, (0.0,))[0], load(star.motion, VARIANCE, ROW)
     own = weight / variance[0], weight / variance[1], weight / variance[2]
     information, eta = add_diagonal(inverse(p), own), times(subtract(fix, at), own)
@@ -135,7 +138,9 @@ class Fusion(NamedTuple):
         used: (most, LANES) 1, or 0 for one without a message.
         weight: (1, LANES) w.
         cov: (9, LANES) m^2 of the fused estimate.
+        hits: (1, LANES) of the ego's fixes.
         split: keep independent errors apart.
+        robust: gate fixes and pseudo-fixes.
     """
 
     x: Floats
@@ -145,17 +150,20 @@ class Fusion(NamedTuple):
     used: Floats
     weight: Floats
     cov: Floats
+    hits: Floats
     split: bool
+    robust: bool
 
 
 @as_written
-def run_intersection(seen: Measurements, known: Assumptions, split: bool) -> Estimates:
+def run_intersection(seen: Measurements, known: Assumptions, split: bool, robust: bool) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, and the neighbours' own estimates (R, M, 3) m, NaN for none.
 
     Args:
         seen: `broadcast` holds every vehicle's own estimate.
         known: `broadcast` its variance m^2.
         split: keep independent errors apart.
+        robust: gate fixes and pseudo-fixes.
     """
     runs, steps = seen.gnss.shape[:2]
     out = new_estimates(seen)
@@ -168,10 +176,13 @@ def run_intersection(seen: Measurements, known: Assumptions, split: bool) -> Est
         np.ones((most, LANES)),
         np.zeros((1, LANES)),
         np.zeros((9, LANES)),
+        np.zeros((1, LANES)),
         split,
+        robust,
     )
     for first in range(0, runs, LANES):
         star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
+        clear(fusion.hits)
         for t in range(steps):
             n = gather(star, seen, known, first, last, t, old)
             intersect(star, known, fusion, n, old)
@@ -185,16 +196,21 @@ def intersect(star: Star, known: Assumptions, fusion: Fusion, n: int, old: int) 
     """Predict and fuse."""
     fix, variance = load(star.motion, POSITION, ROW), load(star.motion, VARIANCE, ROW)
     o = 0.0 * fix[0]
-    nothing = zeros(o, square(ROW))
+    nothing = zeros(o, BLOCK)
     if old == 0:
         x, fixed, w = fix, nothing, o + 0.5
         add_source(fusion, 0, nothing, add_diagonal(nothing, variance))
     else:
         new = load(star.status, NEW, (0.0,))[0]
         x, w = add(load(fusion.x, 0, ROW), load(star.motion, MOVED, ROW)), load(fusion.weight, 0, (0.0,))[0]
+        independent = add_diagonal(load(fusion.independent, 0, BLOCK), load(star.motion, PROCESS, ROW))
+        add_source(fusion, 0, load(fusion.dependent, 0, BLOCK), independent)
+        if fusion.robust:
+            own, hits = own_cov(fusion), load(fusion.hits, 0, (0.0,))[0]
+            q = distance(subtract(fix, x), add_diagonal(own, variance))
+            store(fusion.hits, 0, (count(q, FIX_GATE, hits, gain_of(own, variance)),))
+            variance = scale(variance, inflation(q, FIX_GATE, hits))
         fixed = add_diagonal(nothing, (new / variance[0], new / variance[1], new / variance[2]))
-        independent = add_diagonal(load(fusion.independent, 0, square(ROW)), load(star.motion, PROCESS, ROW))
-        add_source(fusion, 0, load(fusion.dependent, 0, square(ROW)), independent)
     add_neighbours(star, known, fusion, x, n)
     w = best_weight(fusion, fixed, n, w)
     total, eta, dependent = fixed, apply(fixed, subtract(fix, x)), nothing
@@ -220,14 +236,30 @@ def add_neighbours(star: Star, known: Assumptions, fusion: Fusion, x: Numbers, n
     for k in range(1, n):
         gap = subtract(load(star.motion, 4 * k + POSITION, ROW), x)
         relative, variance = load(star.relative, k, RELATIVE), load(star.motion, 4 * k + VARIANCE, ROW)
-        noise = one
+        noise, theirs, f = one, add_diagonal(zeros(o, BLOCK), variance), o + 1.0
+        if fusion.robust:
+            ahead = add(own_cov(fusion), theirs)
+            _, _, factor, _ = gate_components(gap, ahead, relative, relative[5:], (o, o, o), known.min_range)
+            relative = inflated(relative, factor)
         if len(known.relative_std):
             std = (relative[5], relative[6], relative[7])
             noise = from_upper(converted_cov(direction(gap[0], gap[1], gap[2]), std, known.min_range))
         held = load(star.status, 5 * k + HELD, (0.0,))[0]
-        store(fusion.used, k, (choose(o + NOWHERE - variance[0], held, o),))
-        store(fusion.gap, k, subtract(gap, vector(completed(relative, gap))))
-        add_source(fusion, k, add_diagonal(zeros(o, square(ROW)), variance), noise)
+        gap = subtract(gap, vector(completed(relative, gap)))
+        if fusion.robust:
+            f = inflation(distance(gap, add(ahead, noise)), FIX_GATE, o)
+        counts = choose(o + 1e300 - f, held, o)
+        f = choose(counts, f, o + 1.0)
+        store(fusion.used, k, (choose(o + NOWHERE - variance[0], counts, o),))
+        store(fusion.gap, k, gap)
+        add_source(fusion, k, scale(theirs, f), scale(noise, f))
+
+
+@inside
+def own_cov(fusion: Fusion) -> Numbers:
+    """Covariance m^2 of the ego's prediction."""
+    cov: Numbers = add(load(fusion.dependent, 0, BLOCK), load(fusion.independent, 0, BLOCK))
+    return cov
 
 
 @inside
@@ -245,7 +277,7 @@ def source(fusion: Fusion, k: int, s: float) -> tuple[Numbers, Numbers, Numbers]
 
     K I is (1 - K D) / s, which keeps its digits beside an I of 1e8 m^2; if not split it is 0.
     """
-    d, i = load(fusion.dependent, k, square(ROW)), load(fusion.independent, k, square(ROW))
+    d, i = load(fusion.dependent, k, BLOCK), load(fusion.independent, k, BLOCK)
     root = scale(inverse(add(d, scale(i, s))), load(fusion.used, k, (0.0,))[0])
     share = product(root, d)
     derivative = product(share, root)

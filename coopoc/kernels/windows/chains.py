@@ -39,7 +39,8 @@ from ..compiling.small import (
 )
 from ..compiling.vectors import LANES, take
 from ..stars.elimination import eliminate, substitute
-from .window_layout import ONE, ROW, Window, count_of, fix_gap, largest_of, motion, row_of
+from ..stars.messages import BLOCK, ROW
+from .window_layout import Window, count_of, fix_gap, motion, row_of
 
 
 class System(NamedTuple):
@@ -74,13 +75,13 @@ class System(NamedTuple):
     arrival: Floats
 
 
-def new_system(length: int, most: int, arrival: Floats | None = None) -> System:
-    """Room for windows of `length` steps of at most `most` members, behind an arrival cost or not."""
-    rows, core = (length + 1) * most, length + (0 if arrival is None else most - 1)
+def new_system(length: int, most: int, arrival: Floats) -> System:
+    """Room for windows of `length` steps of at most `most` members, behind an arrival cost."""
+    rows, core = (length + 1) * most, length + most - 1
     arm, eta, pivot, move = (np.zeros((size * rows, LANES)) for size in (9 * length, 3, 9, 3))
     dense, vector, scratch = (np.zeros((size * core, LANES)) for size in (9 * core, 3, 9))
     cov, most_moved, active = np.zeros((9, LANES)), np.zeros(LANES), np.zeros(LANES)
-    arrival, end = np.zeros((9, LANES)) if arrival is None else arrival, np.zeros(rows, np.int64)
+    end = np.zeros(rows, np.int64)
     return System(arm, eta, pivot, move, end, dense, vector, scratch, cov, most_moved, active, arrival)
 
 
@@ -89,57 +90,54 @@ def gauss_newton(window: Window, span: tuple[int, int], system: System, coupled:
     """Solve for the step of all points of a span; minus the covariance of the ego's newest point is in `system.cov`.
 
     Args:
-        coupled: neighbours in the arrival cost; -1 without one.
+        coupled: neighbours in the arrival cost.
         prior: 1/m^2, information of the first point of every other chain around `Window.start`.
     """
     first, last = span
-    outer = max(coupled, 0)
-    size = outer + last - first + 1
+    size = coupled + last - first + 1
     assemble_core(window, span, system, coupled)
     for step in range(first, last + 1):
         ego = row_of(window.layout, step, 0)
         for row in range(ego + 1, ego + count_of(window.sizes, step)):
             if step == last or window.later[row] < 0:
                 fold(window, span, step, row, system, coupled, prior)
-    cov = eliminate(system.core, system.core, system.vector, size, size, system.scratch, ONE, ROW)
+    cov = eliminate(system.core, system.core, system.vector, size, size, system.scratch)
     store(system.cov, 0, cov)
-    substitute(system.core, system.vector, size, size, ONE, ROW)
+    substitute(system.core, system.vector, size, size)
     for step in range(first, last + 1):
         ego = row_of(window.layout, step, 0)
-        store(system.move, ego, load(system.vector, outer + step - first, ROW))
+        store(system.move, ego, load(system.vector, coupled + step - first, ROW))
         for k in range(1, count_of(window.sizes, step)):
-            if coupled >= 0 and step == first:
+            if step == first:
                 store(system.move, ego + k, load(system.vector, k - 1, ROW))
             else:
-                unfold(window, span, step, ego + k, system, outer)
+                unfold(window, span, step, ego + k, system, coupled)
 
 
 @inner
 def assemble_core(window: Window, span: tuple[int, int], system: System, coupled: int) -> None:
     """Arrival cost, and information and eta of the ego's points: fixes, odometry, and the ego's end of each edge."""
     first, last = span
-    outer = max(coupled, 0)
-    size = outer + last - first + 1
-    nothing = zeros(take(window.located, uint64(0)), ONE)
+    size = coupled + last - first + 1
+    nothing = zeros(take(window.located, uint64(0)), BLOCK)
     for i in range(size):
         store(system.vector, i, zeros(nothing[0], ROW))
         for j in range(i, size):
             store(system.core, i * size + j, nothing)
-    if coupled >= 0:
-        add_arrival(window, first, system, outer + 1, size)
+    add_arrival(window, first, system, coupled + 1, size)
     for s in range(last - first + 1):
-        ego, i = row_of(window.layout, first + s, 0), outer + s
+        ego, i = row_of(window.layout, first + s, 0), coupled + s
         own, diagonal = load(window.used, ego, ROW), i * (size + 1)
-        block, eta = add_diagonal(load(system.core, diagonal, ONE), own), times(own, fix_gap(window, ego))
+        block, eta = add_diagonal(load(system.core, diagonal, BLOCK), own), times(own, fix_gap(window, ego))
         eta = add(load(system.vector, i, ROW), eta)
         if s > 0:
             process, off = motion(window, row_of(window.layout, first + s - 1, 0), ego)
             block, eta, above = add_diagonal(block, process), add(eta, off), diagonal - size - 1
-            store(system.core, above, add_diagonal(load(system.core, above, ONE), process))
+            store(system.core, above, add_diagonal(load(system.core, above, BLOCK), process))
             store(system.core, above + 1, add_diagonal(nothing, negate(process)))
             store(system.vector, i - 1, subtract(load(system.vector, i - 1, ROW), off))
         for row in range(ego + 1, ego + count_of(window.sizes, first + s)):
-            block, eta = add(block, load(window.edge, row, ONE)), subtract(eta, load(window.eta, row, ROW))
+            block, eta = add(block, load(window.edge, row, BLOCK)), subtract(eta, load(window.eta, row, ROW))
         store(system.core, diagonal, block)
         store(system.vector, i, eta)
 
@@ -149,11 +147,11 @@ def add_arrival(window: Window, first: int, system: System, n: int, size: int) -
     """Move the arrival cost from where it expects the n points of the first step to the points."""
     for i in range(n):
         away = from_start(window, first, i, n)
-        own = mirrored(load(system.arrival, i * (window.layout[1] + 1), ONE))
+        own = mirrored(load(system.arrival, i * (window.layout[1] + 1), BLOCK))
         store(system.core, i * (size + 1), own)
         eta = plus_applied(load(system.vector, i, ROW), own, away)
         for j in range(i + 1, n):
-            block = load(system.arrival, i * window.layout[1] + j, ONE)
+            block = load(system.arrival, i * window.layout[1] + j, BLOCK)
             store(system.core, i * size + j, block)
             eta = plus_applied(eta, block, from_start(window, first, j, n))
             store(system.vector, j, plus_applied(load(system.vector, j, ROW), transpose(block), away))
@@ -174,24 +172,24 @@ def fold(
     """Eliminate the chain that ends at a row onto the ego's points; its point in the first step joins them where an
     arrival cost couples it."""
     first, last = span
-    h, outer, end = last - first + 1, max(coupled, 0), step - first
-    size = outer + h
+    h, end = last - first + 1, step - first
+    size = coupled + h
     nothing = zeros(take(window.located, uint64(0)), ROW)
-    eta, own, flat = nothing, zeros(nothing[0], ONE), nothing[0] + prior
+    eta, own, flat = nothing, zeros(nothing[0], BLOCK), nothing[0] + prior
     while True:
         here, arm = step - first, row * h
-        information, fix = load(window.edge, row, ONE), load(window.used, row, ROW)
+        information, fix = load(window.edge, row, BLOCK), load(window.used, row, ROW)
         store(system.arm, arm + here, negate(information))
         own = add_diagonal(add(own, information), fix)
         eta = add(add(eta, load(window.eta, row, ROW)), times(fix, fix_gap(window, row)))
-        if coupled >= 0 and here == 0:
+        if here == 0:
             i = row - row_of(window.layout, first, 1)
             for j in range(end + 1):
-                store(system.core, i * size + outer + j, add_to(system, i * size + outer + j, arm + j))
-            store(system.core, i * (size + 1), add(load(system.core, i * (size + 1), ONE), own))
+                store(system.core, i * size + coupled + j, add_to(system, i * size + coupled + j, arm + j))
+            store(system.core, i * (size + 1), add(load(system.core, i * (size + 1), BLOCK), own))
             store(system.vector, i, add(load(system.vector, i, ROW), eta))
             return
-        before = window.previous[row] if here > 0 else -1
+        before = window.previous[row]
         process, off = nothing, nothing
         if before >= 0:
             before = row_of(window.layout, step - 1, before)
@@ -206,60 +204,57 @@ def fold(
         store(system.pivot, row, pivot)
         system.end[row] = end
         for i in range(here, end + 1):
-            store(system.scratch, i, minus_product(pivot, load(system.arm, arm + i, ONE)))
+            store(system.scratch, i, minus_product(pivot, load(system.arm, arm + i, BLOCK)))
         for i in range(here, end + 1):
-            left, at = load(system.arm, arm + i, ONE), (outer + i) * size + outer
+            left, at = load(system.arm, arm + i, BLOCK), (coupled + i) * size + coupled
             for j in range(i, end + 1):
-                right = load(system.scratch, j, ONE)
-                store(system.core, at + j, less_transposed_product(load(system.core, at + j, ONE), left, right))
-            moved = less_transposed_applied(load(system.vector, outer + i, ROW), left, solved)
-            store(system.vector, outer + i, moved)
+                right = load(system.scratch, j, BLOCK)
+                store(system.core, at + j, less_transposed_product(load(system.core, at + j, BLOCK), left, right))
+            moved = less_transposed_applied(load(system.vector, coupled + i, ROW), left, solved)
+            store(system.vector, coupled + i, moved)
         if before < 0:
             return
         own = mirrored(scale_rows(process, minus_product(pivot, own)))
         eta = subtract(times(process, solved), off)
         for i in range(here, end + 1):
-            store(system.arm, before * h + i, scale_rows(process, load(system.scratch, i, ONE)))
+            store(system.arm, before * h + i, scale_rows(process, load(system.scratch, i, BLOCK)))
         step, row = step - 1, before
 
 
 @inner
 def add_to(system: System, at: int, arm: int) -> Any:
     """A block of the dense matrix and one of a chain."""
-    return add(load(system.core, at, ONE), load(system.arm, arm, ONE))
+    return add(load(system.core, at, BLOCK), load(system.arm, arm, BLOCK))
 
 
 @inner
-def unfold(window: Window, span: tuple[int, int], step: int, row: int, system: System, outer: int) -> None:
+def unfold(window: Window, span: tuple[int, int], step: int, row: int, system: System, coupled: int) -> None:
     """The step of a point of a chain, those of the ego and of the point before being known."""
     first, last = span
     h, eta = last - first + 1, load(system.eta, row, ROW)
     for i in range(step - first, system.end[row] + 1):
-        eta = less_applied(eta, load(system.arm, row * h + i, ONE), load(system.vector, outer + i, ROW))
-    before = window.previous[row] if step > first else -1
+        eta = less_applied(eta, load(system.arm, row * h + i, BLOCK), load(system.vector, coupled + i, ROW))
+    before = window.previous[row]
     if before >= 0:
         before = row_of(window.layout, step - 1, before)
         process, _ = motion(window, before, row)
         eta = add(eta, times(process, load(system.move, before, ROW)))
-    store(system.move, row, minus_apply(load(system.pivot, row, ONE), eta))
+    store(system.move, row, minus_apply(load(system.pivot, row, BLOCK), eta))
 
 
 @inner
-def advance(window: Window, span: tuple[int, int], system: System, share: Any) -> Any:
-    """Move all points by a share of the step, and the edges' information vectors with them; the largest step m."""
-    most = 0.0 * share
+def advance(window: Window, span: tuple[int, int], system: System, share: Any) -> None:
+    """Move all points by a share of the step, and the edges' information vectors with them."""
     for step in range(span[0], span[1] + 1):
         ego = row_of(window.layout, step, 0)
         own = load(system.move, ego, ROW)
         for row in range(ego, ego + count_of(window.sizes, step)):
             moved = load(system.move, row, ROW)
-            most = max(most, largest_of(moved))
             store(window.point, row, add(load(window.point, row, ROW), scale(moved, share)))
             if row > ego:
                 ahead = scale(subtract(moved, own), share)
-                eta = less_applied(load(window.eta, row, ROW), load(window.edge, row, ONE), ahead)
+                eta = less_applied(load(window.eta, row, ROW), load(window.edge, row, BLOCK), ahead)
                 store(window.eta, row, eta)
-    return most
 
 
 @inner

@@ -6,7 +6,7 @@ the next one. LANES runs go side by side.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 from numpy import uint64
@@ -18,7 +18,9 @@ from ..compiling.small import (
     add_diagonal,
     choose_each,
     load,
+    negate,
     plus_applied,
+    scale,
     store,
     subtract,
     times,
@@ -27,12 +29,15 @@ from ..compiling.small import (
 from ..compiling.vectors import LANES, choose, put, take
 from ..stars.edges import AT_GAP, EXACT, edge
 from ..stars.elimination import predict
-from ..stars.joint import Joint, add_relative, block_of, new_joint, rearrange, solve
+from ..stars.gated import Gates, carry, gate_position, gate_star, gates_within, set_ego
+from ..stars.joint import Joint, add_relative, block_of, joint_within, rearrange, solve
 from ..stars.messages import (
+    BLOCK,
     MOVED,
     NEW,
     POSITION,
     RELATIVE,
+    ROW,
     SENT,
     USES,
     VARIANCE,
@@ -41,19 +46,17 @@ from ..stars.messages import (
     clear,
     interpret,
     receive,
+    star_within,
 )
 from ..stars.relative import completed, vector
 from .chains import System, advance, gap_of, gauss_newton, new_system
 from .window_layout import (
-    ONE,
-    ROW,
     Window,
     any_positive,
     count_of,
     enter,
     largest_of,
     motion,
-    new_star,
     new_window,
     row_of,
     star_at,
@@ -70,6 +73,7 @@ class Settings(NamedTuple):
         strayed: m.
         age: steps for which a velocity may serve, negative where a message counts when it arrives and not when it was
             sent.
+        robust: gate innovations.
     """
 
     length: int
@@ -77,6 +81,7 @@ class Settings(NamedTuple):
     repeats: int
     strayed: float
     age: float
+    robust: bool
 
 
 class Estimates(NamedTuple):
@@ -100,11 +105,12 @@ def horizons(seen: Measurements, known: Assumptions, arrival: Ints, settings: Se
     (runs, steps), most = seen.gnss.shape[:2], 1 + int(np.diff(seen.start).max(initial=0))
     x, cov = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3))
     estimates = Estimates(x, cov, np.empty((runs, len(seen.neighbour), 3)), np.zeros((runs, steps), np.bool_))
-    window, joint, star = new_window(settings.length, most), new_joint(most, ROW), new_star(most)
+    window, within = new_window(settings.length, most), cast(Any, (joint_within, star_within, gates_within))
+    joint, star, gates = (make.py_func(most) for make in within)
     system = new_system(settings.length, most, joint.information)
     for first in range(0, runs, LANES):
         here = first, min(first + LANES, runs) - 1
-        follow_horizon((window, joint, star, system), seen, known, arrival, settings, here, estimates)
+        follow_horizon((window, joint, star, system, gates), seen, known, arrival, settings, here, estimates)
     return estimates
 
 
@@ -119,15 +125,18 @@ def follow_horizon(
     estimates: Estimates,
 ) -> None:
     """Solve the window that ends at each step, in runs first to last."""
-    window, joint, star, system = memory
+    window, joint, star, system, gates = memory
     for t in range(len(seen.start) - 1):
         span = (max(0, t - settings.length + 1), t)
         enter(window, star, seen, known, runs, t)
         if settings.age >= 0.0:
             for step in range(span[0], t + 1):
-                gather_arrived(window, seen, known, arrival, settings.age, runs, step, t)
-        use_new_fixes(window, t if settings.age < 0.0 else span[0], t)
+                gather_arrived(window, gates, seen, known, arrival, settings, runs, step, t)
         start_points(window, known, t)
+        if settings.robust:
+            gate_step(window, gates, known, t)
+        link_points(window, known, t)
+        use_new_fixes(window, t if settings.age < 0.0 else span[0], t)
         if span[0] > 0:
             leave(window, joint, known, span[0] - 1)
         elif t == 0:
@@ -147,6 +156,7 @@ def follow_horizon(
                 estimates.moving[runs[0] + lane, t] = settings.exact and system.active[lane] > 0.0
             if not any_positive(system.active):
                 break
+        set_ego(gates, negate(load(system.cov, 0, BLOCK)))
 
 
 @inner
@@ -192,8 +202,8 @@ def put_edge(window: Window, known: Assumptions, ego: int, row: int, gap: Any, h
     information, eta = edge(gap, z, known.relative_std, known.min_range, how)
     eta = plus_applied(eta, information, subtract(gap, gap_of(window.point, ego, row)))
     o, used = 0.0 * gap[0], max(take(window.located, uint64(row)), whole_of(window, row)) - 0.5
-    information, eta = choose_each(used, information, zeros(o, ONE)), choose_each(used, eta, zeros(o, ROW))
-    store(window.edge, row, choose_each(active, information, load(window.edge, row, ONE)))
+    information, eta = choose_each(used, information, zeros(o, BLOCK)), choose_each(used, eta, zeros(o, ROW))
+    store(window.edge, row, choose_each(active, information, load(window.edge, row, BLOCK)))
     store(window.eta, row, choose_each(active, eta, load(window.eta, row, ROW)))
     store(window.base, row, choose_each(active, gap, load(window.base, row, ROW)))
 
@@ -219,10 +229,7 @@ def distance(window: Window, span: tuple[int, int]) -> Any:
 @inner
 def start_points(window: Window, known: Assumptions, t: int) -> None:
     """A new step where it is expected: a member that stays moves, one that joins stands where the ego measures it, and
-    one that nothing has located yet where its first position puts it, with its earlier points.
-
-    Its relative measurements are converted vectors, weighted by that geometry.
-    """
+    one that nothing has located yet where its first position puts it, with its earlier points."""
     ego, before = row_of(window.layout, t, 0), row_of(window.layout, t - 1, 0)
     for k in range(count_of(window.sizes, t)):
         row, previous = ego + k, window.previous[ego + k]
@@ -243,8 +250,25 @@ def start_points(window: Window, known: Assumptions, t: int) -> None:
         put(window.located, uint64(row), there)
         store(window.point, row, at)
         store(window.start, row, at)
-        if k > 0:
-            put_edge(window, known, ego, row, gap_of(window.point, ego, row), AT_GAP, 0.0 * new + 1.0)
+
+
+@inner
+def gate_step(window: Window, gates: Gates, known: Assumptions, t: int) -> None:
+    """Gate what is new at the newest step where its points are expected."""
+    here, n = row_of(window.layout, t, 0), count_of(window.sizes, t)
+    star, old = star_at(window, t), count_of(window.sizes, t - 1) if t > 0 else 0
+    carry(star, gates, known.flat, n, old)
+    points, located = window.point[3 * here : 3 * (here + n)], window.located[here : here + n]
+    gate_star(star, gates, points, located, known.min_range, n)
+
+
+@inner
+def link_points(window: Window, known: Assumptions, t: int) -> None:
+    """The relative measurements of a new step, where its points are expected."""
+    ego = row_of(window.layout, t, 0)
+    for row in range(ego + 1, ego + count_of(window.sizes, t)):
+        gap = gap_of(window.point, ego, row)
+        put_edge(window, known, ego, row, gap, AT_GAP, 0.0 * gap[0] + 1.0)
 
 
 @inside
@@ -269,7 +293,7 @@ def locate_before(window: Window, row: int, t: int, mask: Any, at: Any) -> None:
 def forget(joint: Joint, known: Assumptions, n: int) -> None:
     """Know nothing of the past of the first step."""
     clear(joint.information)
-    nothing = zeros(0.0 * take(joint.information, uint64(0)), ONE)
+    nothing = zeros(0.0 * take(joint.information, uint64(0)), BLOCK)
     flat = nothing[0] + 1.0 / known.flat
     for i in range(n):
         store(joint.information, i * (joint.stride + 1), add_diagonal(nothing, (flat, flat, flat)))
@@ -283,7 +307,7 @@ def leave(window: Window, joint: Joint, known: Assumptions, step: int) -> None:
     for k in range(n):
         i, row, fix = block_of(k, n), ego + k, load(window.used, ego + k, ROW)
         at, off = i * (joint.stride + 1), load(window.motion, 4 * row + POSITION, ROW)
-        store(joint.information, at, add_diagonal(load(joint.information, at, ONE), fix))
+        store(joint.information, at, add_diagonal(load(joint.information, at, BLOCK), fix))
         store(joint.eta, i, times(fix, subtract(off, load(window.start, row, ROW))))
         process, later = zeros(fix[0], ROW), window.later[row]
         if later >= 0:
@@ -291,13 +315,13 @@ def leave(window: Window, joint: Joint, known: Assumptions, step: int) -> None:
         store(joint.process, i, process)
     for k in range(1, n):
         away = subtract(gap_of(window.point, ego, ego + k), gap_of(window.start, ego, ego + k))
-        information = load(window.edge, ego + k, ONE)
+        information = load(window.edge, ego + k, BLOCK)
         eta = plus_applied(load(window.eta, ego + k, ROW), information, away)
-        add_relative(joint.information, joint.eta, joint.stride, k, n, information, eta, ROW)
-    solve(joint.information, joint, joint.eta, n, ROW)
-    predict(joint.information, n, joint.stride, joint.process, joint.scratch, ONE, ROW)
+        add_relative(joint.information, joint.eta, joint.stride, k, n, information, eta)
+    solve(joint.information, joint, joint.eta, n)
+    predict(joint.information, n, joint.stride, joint.process, joint.scratch)
     m, prior = count_of(window.sizes, step + 1), 1.0 / known.flat
-    rearrange(star_at(window, step + 1), joint, m, n, (prior, prior, prior), ROW)
+    rearrange(star_at(window, step + 1), joint, m, n, (prior, prior, prior))
     for row in range(after, after + m):
         if window.previous[row] >= 0:
             before = ego + window.previous[row]
@@ -308,10 +332,11 @@ def leave(window: Window, joint: Joint, known: Assumptions, step: int) -> None:
 @inner
 def gather_arrived(
     window: Window,
+    gates: Gates,
     seen: Measurements,
     known: Assumptions,
     arrival: Ints,
-    age: float,
+    settings: Settings,
     runs: tuple[int, int],
     step: int,
     now: int,
@@ -327,7 +352,7 @@ def gather_arrived(
             sent = step if come else seen.newest[run, link]
             if place >= 0 and step > 0:
                 carried = int(star.last_status[5 * place + SENT, run - runs[0]])
-                sent = max(sent, carried if step - carried <= age else -1)
+                sent = max(sent, carried if step - carried <= settings.age else -1)
             changed |= sent != seen.newest[run, link] or come != seen.fresh[run, link]
             seen.newest[run, link], seen.fresh[run, link] = sent, come
         if changed:
@@ -337,6 +362,9 @@ def gather_arrived(
                 used_since = max(seen.newest[run, link], window.joined[here + k])
                 star.status[5 * k + USES, lane] = step - used_since + 1
             interpret(star, known, k, seen.dt)
+            if settings.robust and step < now:
+                point, cov = load(window.point, here + k, ROW), load(gates.state, 0, BLOCK)
+                gate_position(star, k, point, scale(cov, 2.0), 0.0 * point[0])
 
 
 @inner

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy import uint64
@@ -12,10 +12,7 @@ from ..compiling.compile import inner, storage
 from ..compiling.small import load, subtract, times
 from ..compiling.vectors import LANES, put, take
 from ..stars.joint import LEAST_PROCESS
-from ..stars.messages import MOVED, POSITION, PROCESS, Assumptions, Measurements, Star, gather, star_in
-
-ONE, ROW = (0.0,) * 9, (0.0,) * 3
-"""Any block, any row."""
+from ..stars.messages import MOVED, POSITION, PROCESS, ROW, Assumptions, Measurements, Star, gather
 
 
 class Window(NamedTuple):
@@ -31,8 +28,7 @@ class Window(NamedTuple):
         status: (5 rows, LANES) of `coopoc.kernels.stars.messages.Star`.
         motion: (12 rows, LANES) of the same.
         relative: (8 rows, LANES) of the same.
-        fix: (3 rows, LANES) 1/m^2, information of the positions that count.
-        used: (3 rows, LANES) 1/m^2, the same times their GNC weights.
+        used: (3 rows, LANES) 1/m^2, information of the positions that count.
         edge: (9 rows, LANES), information of the relative measurements.
         eta: (3 rows, LANES), their information vectors at the points.
         point: (3 rows, LANES) m.
@@ -50,7 +46,6 @@ class Window(NamedTuple):
     status: Floats
     motion: Floats
     relative: Floats
-    fix: Floats
     used: Floats
     edge: Floats
     eta: Floats
@@ -66,7 +61,7 @@ def new_window(length: int, most: int) -> Window:
     rows = (length + 1) * most
     member, previous, later, joined = (np.full(rows, -1, np.int64) for _ in range(4))
     status, motion, relative, edge, located = (np.zeros((size * rows, LANES)) for size in (5, 12, 8, 9, 1))
-    fix, used, eta, point, start, base = (np.zeros((3 * rows, LANES)) for _ in range(6))
+    used, eta, point, start, base = (np.zeros((3 * rows, LANES)) for _ in range(5))
     return Window(
         np.zeros(length + 1, np.int64),
         member,
@@ -76,7 +71,6 @@ def new_window(length: int, most: int) -> Window:
         status,
         motion,
         relative,
-        fix,
         used,
         edge,
         eta,
@@ -169,9 +163,3 @@ def star_at(window: Window, step: int) -> Star:
         window.member[before : before + n],
         window.status[5 * before : 5 * (before + n)],
     )
-
-
-def new_star(most: int) -> Star:
-    """Room for `most` members."""
-    plain: Any = star_in
-    return cast(Star, plain.py_func(np.zeros(30 * most * LANES), np.zeros(3 * most, np.int64), most))

@@ -35,7 +35,10 @@ from .pose_stream import PoseStream
 
 if TYPE_CHECKING:
     from ...kernels.poses.ekf import PoseOptions
+    from ...kernels.poses.odometry import PoseNoise
 
+PASSES = 3
+"""Of the iterated filter: from one more on nothing moves by a hundredth of its standard deviation."""
 Unit = Literal["solo", "fleet"]
 Fusion = Literal["joint", "naive", "intersection"]
 
@@ -45,8 +48,8 @@ class PoseFilter:
     """Extended Kalman filter of (x, y, z, heading) driven by speed and yaw rate, with fixes, compass, ranges, bearings.
 
     th' = th + dt w, p' = p + dt R(th + dt w / 2) u; range |p_j - p_i|, bearing atan2(p_j - p_i) - th_i; a component
-    that was not measured is no row. A landmark's position is known. With `exact` one more Gauss-Newton step on the
-    relative measurements follows, from the same prior.
+    that was not measured is no row. A landmark's position is known. With `exact` two more Gauss-Newton steps on the
+    relative measurements follow, from the same prior: the iterated filter.
 
     Args:
         unit: "solo", each vehicle with its landmarks; "fleet", all vehicles.
@@ -55,7 +58,9 @@ class PoseFilter:
             "intersection" by covariance intersection.
         lasting: estimate the odometer's scale error and the yaw rate's bias, too (`Track.extras`).
         exact: False is the plain extended Kalman filter.
-        gate: standard deviations of an innovation beyond which a component is left out; infinity keeps all.
+        robust: a component beyond its gate weighs less, far beyond it nothing, unless many in a row are
+            (`coopoc.kernels.gate`); False believes every number.
+        gate: standard deviations of an innovation.
         begin: (N, 4) or (R, N, 4) m and rad, poses at the first step; None or NaN: the first fix and compass.
         spread: (4,) standard deviations of these.
         assumed: noise, default that of the recording.
@@ -77,7 +82,8 @@ class PoseFilter:
     fusion: Fusion = "joint"
     lasting: bool = False
     exact: bool = True
-    gate: float = np.inf
+    robust: bool = True
+    gate: float = 3.0
     begin: Floats | None = None
     spread: tuple[float, ...] = SPREAD
     assumed: Sensors | None = None
@@ -152,6 +158,7 @@ class PoseFilter:
             heading=wrap(x[..., 3]),
             heading_covariance=cov[..., 3, :4],
             extras=extras,
+            ids=recording.ids,
         )
 
     def start(self, dt: float, begin: Floats | None = None) -> PoseStream:
@@ -176,7 +183,7 @@ class PoseFilter:
         dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")
         first = np.full(4, np.nan) if begin is None else checked("begin", begin, "(4,)", (4,))
         spread = np.array(self.spread, dtype=float)
-        return PoseStream(pose_noise(self.assumed, dt, self.gate), self.options(), first, spread, dt)
+        return PoseStream(self.noise(self.assumed, dt), self.options(), first, spread, dt)
 
     def run_filter(
         self,
@@ -200,14 +207,18 @@ class PoseFilter:
         from ...kernels.poses.ekf import run_filter
         from ...kernels.poses.scalar_update import new_poses
 
-        noise, options = pose_noise(self.assumed or recording.sensors, recording.dt, self.gate), self.options()
+        noise, options = self.noise(self.assumed or recording.sensors, recording.dt), self.options()
         measured = pose_measurements(recording, members, links, kept, place)
         memory = new_poses(len(members) * options.d), new_poses(2 * options.d)
         first, spread = np.ascontiguousarray(begin[:, members]), np.array(self.spread, dtype=float)
         return run_filter(measured, noise, first, spread, options, *memory)
 
+    def noise(self, sensors: Sensors, dt: float) -> PoseNoise:
+        """What it assumes, as the kernel takes it."""
+        return pose_noise(sensors, dt, self.gate if self.robust else np.inf)
+
     def options(self) -> PoseOptions:
         """As the kernel takes them."""
         from ...kernels.poses.ekf import PoseOptions
 
-        return PoseOptions(6 if self.lasting else 4, 1 + self.exact, get_args(Fusion).index(self.fusion))
+        return PoseOptions(6 if self.lasting else 4, PASSES if self.exact else 1, get_args(Fusion).index(self.fusion))

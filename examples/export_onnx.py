@@ -1,4 +1,7 @@
-"""Export: one step of a GainNet as a pure function in ONNX, derived from `GainNet.step` and checked against it."""
+"""Export: one step of a GainNet as a pure function in ONNX, derived from `GainNet.step` and checked against it.
+
+python examples/export_onnx.py learned/weights/fedkalmannet.safetensors fedkalmannet.onnx
+"""
 
 from __future__ import annotations
 
@@ -6,6 +9,7 @@ import importlib
 import json
 import logging
 import os
+import sys
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -19,10 +23,9 @@ from torch import Tensor, nn
 from coopoc.arrays import AnyArray
 from coopoc.errors import InputError, MissingLibraryError
 from coopoc.file_names import given_path, replaceable
+from coopoc.learned.checkpoint import Checkpoint, load
+from coopoc.learned.nets.gain_net import GainNet, Memory
 from coopoc.world.sensors import stream
-
-from .checkpoint import Checkpoint
-from .nets.gain_net import GainNet, Memory
 
 INPUTS = (*Memory._fields, "gnss", "velocity", "dt")
 """Memory (B, 9) and (B, 3) m, fix (B, 3) m or NaN, velocity (B, 3) m/s, dt s without a dimension."""
@@ -200,3 +203,7 @@ def _library(name: str) -> Any:
         return importlib.import_module(name)
     except ImportError as error:
         raise MissingLibraryError(name, "exporting to ONNX", "'coopoc[export]'") from error
+
+
+if __name__ == "__main__":
+    print(to_onnx(load(sys.argv[1]), sys.argv[2]))

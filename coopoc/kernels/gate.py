@@ -1,0 +1,83 @@
+"""The gate of innovations: what is beyond it weighs less, what is far beyond nothing; many in a row count again.
+
+Many are as many as hold, together, more information than the prediction that contradicts them: the sum of the gains
+that they would have had. A filter that is sure of itself stays so for long, one that has just begun does not.
+
+A number, or LANES runs side by side. Every filter calls it where a measurement becomes information.
+"""
+
+from __future__ import annotations
+
+import math
+
+from .compiling.compile import inside
+from .compiling.small import add, add_diagonal, apply, from_upper, inverse, scale, subtract, times
+from .compiling.vectors import choose
+
+GATE, FIX_GATE = 9.0, 12.0
+"""Squared normalised innovation of a number, and of a position, from which it weighs less."""
+REJECTED = 2.0
+"""Gates beyond which it weighs nothing."""
+PATIENCE = 5.0
+"""Sum of the gains of measurements in a row beyond the gate from which it is the filter that is wrong."""
+SLIP = 0.25
+"""m^2, what wheels that slip, or a speed that was measured too low, may add to an error on each axis: however precise
+fixes are, less is no sign of a wrong one."""
+Vector = tuple[float, ...]
+
+
+@inside
+def inflation(q: float, gate: float, hits: float) -> float:
+    """S' / S: 1 within the gate, q / gate beyond, infinite from REJECTED gates on; 1 again from PATIENCE hits on.
+
+    So the influence of an innovation falls as 1 / sqrt(q), and ends.
+    """
+    share = choose(q - REJECTED * gate, math.inf, max(q / gate, 1.0))
+    counts: float = choose(PATIENCE - hits, share, 1.0)
+    return counts
+
+
+@inside
+def count(q: float, gate: float, hits: float, gain: float) -> float:
+    """Sum of the gains of measurements in a row beyond the gate."""
+    more: float = choose(q - gate, hits + gain, 0.0)
+    return more
+
+
+@inside
+def total(a: Vector) -> float:
+    """Sum of three."""
+    return a[0] + a[1] + a[2]
+
+
+@inside
+def gain_of(cov: Vector, variance: Vector) -> float:
+    """Gain of a position, the mean over the axes: tr P / (tr P + tr R)."""
+    own = cov[0] + cov[4] + cov[8]
+    return own / (own + total(variance))
+
+
+@inside
+def distance(innovation: Vector, cov: Vector) -> float:
+    """Squared normalised innovation of a position."""
+    return total(times(innovation, apply(inverse(add_diagonal(cov, (SLIP, SLIP, SLIP))), innovation)))
+
+
+@inside
+def gated_update(
+    cov: Vector, moved: Vector, h: Vector, innovation: float, variance: float, hits: float
+) -> tuple[Vector, Vector, float, float]:
+    """Kalman update of a vector's covariance and shift by one gated number, innovation = h v + noise.
+
+    Returns:
+        Covariance, shift, the factor of the noise's variance by which S is inflated, and hits.
+    """
+    g = apply(cov, h)
+    s, left = total(times(h, g)) + variance, innovation - total(times(h, moved))
+    q = left * left / s
+    f = inflation(q, GATE, hits)
+    factor = choose(q - GATE, 1.0 + (f - 1.0) * s / variance, 1.0)
+    gain = scale(g, 1.0 / (s * f))
+    a, b, c = gain
+    less = from_upper((a * g[0], a * g[1], a * g[2], b * g[1], b * g[2], c * g[2]))
+    return subtract(cov, less), add(moved, scale(gain, left)), factor, count(q, GATE, hits, 1.0 - variance / s)

@@ -1,0 +1,140 @@
+"""Gates of a star: which numbers of a step weigh less, before they become information.
+
+A filter in information form knows no innovation's covariance. So each member carries a bound of the covariance of its
+vector from the ego, which the member's own relative measurements and both motions give, and the ego its covariance:
+a gate is never tighter than that of the exact innovation.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...arrays import Floats
+from ..compiling.compile import inner, inside, storage
+from ..compiling.small import add, add_diagonal, choose_each, load, scale, store, subtract, zeros
+from ..compiling.vectors import LANES
+from ..gate import FIX_GATE, count, distance, gain_of, gated_update, inflation
+from .messages import POSITION, PROCESS, RELATIVE, ROW, VARIANCE, Star
+from .relative import Numbers, angle, incomplete
+
+STATE = (0.0,) * 13
+
+
+class Gates(NamedTuple):
+    """What the gates of a star remember; arrays are (., LANES).
+
+    Attributes:
+        state: (13 most,) of each member 9 m^2, the bound of the covariance of its vector from the ego (of the ego, its
+            covariance), and the hits of range, azimuth, inclination and position.
+        last: of the last star.
+    """
+
+    state: Floats
+    last: Floats
+
+
+@storage
+def gates_within(most: int) -> Gates:
+    """Room for `most` members."""
+    return Gates(np.zeros((13 * most, LANES)), np.zeros((13 * most, LANES)))
+
+
+@inner
+def carry(star: Star, gates: Gates, flat: float, n: int, old: int) -> None:
+    """Bring what is remembered forward to this star; `flat` m^2 is the variance of a member that joins."""
+    for k in range(old):
+        store(gates.last, k, load(gates.state, k, STATE))
+    own = load(star.motion, PROCESS, ROW)
+    for k in range(n):
+        place, process = star.previous[k], load(star.motion, 4 * k + PROCESS, ROW)
+        before = load(gates.last, max(place, 0), STATE)
+        if place < 0:
+            before, process = zeros(own[0], STATE), (0.0 * own[0] + flat, 0.0 * own[0] + flat, 0.0 * own[0] + flat)
+        elif k > 0:
+            process = add(process, own)
+        store(gates.state, k, (*add_diagonal(before[:9], process), *before[9:]))
+
+
+@inner
+def gate_star(star: Star, gates: Gates, state: Floats, known: Floats, least: float, n: int) -> None:
+    """Inflate the deviations of relative measurements and the variances of positions that are beyond their gates.
+
+    Args:
+        star: of this step.
+        gates: brought forward.
+        state: (3 n, LANES) m, predicted positions.
+        known: (n, LANES) 1 where something is known of where a member is, else 0.
+        least: m.
+    """
+    origin, ego = load(state, 0, ROW), load(gates.state, 0, STATE)
+    hits = gate_position(star, 0, origin, ego[:9], ego[12])
+    store(gates.state, 0, (*ego[:12], hits))
+    for k in range(1, n):
+        at, seen, memory = load(state, k, ROW), load(star.relative, k, RELATIVE), load(gates.state, k, STATE)
+        o = 0.0 * at[0]
+        std = seen[5:]
+        if incomplete(seen):
+            std = choose_each(load(known, k, (0.0,))[0] - 0.5, std, (o + math.inf, o + math.inf, o + math.inf))
+        cov, moved, factor, three = gate_components(subtract(at, origin), memory[:9], seen, std, memory[9:12], least)
+        store(gates.state, k, (*cov, *three, o))
+        store(star.relative, k, inflated(seen, factor))
+        gate_position(star, k, add(at, moved), add(ego[:9], cov), o)
+
+
+@inner
+def set_ego(gates: Gates, cov: Numbers) -> None:
+    """Remember the ego's covariance m^2."""
+    store(gates.state, 0, (*cov, *load(gates.state, 0, STATE)[9:]))
+
+
+@inside
+def inflated(seen: Numbers, factor: Numbers) -> Numbers:
+    """A measurement, its standard deviations times three factors."""
+    a, b, c = factor
+    return seen[0], seen[1], seen[2], seen[3], seen[4], a * seen[5], b * seen[6], c * seen[7]
+
+
+@inner
+def gate_position(star: Star, k: int, at: Numbers, cov: Numbers, hits: float) -> float:
+    """Inflate the variance of a member's position; the hits that follow. Callers drop those of neighbours: where many
+    are beyond the gate, it is their messages that are wrong."""
+    variance = load(star.motion, 4 * k + VARIANCE, ROW)
+    q = distance(subtract(load(star.motion, 4 * k + POSITION, ROW), at), add_diagonal(cov, variance))
+    store(star.motion, 4 * k + VARIANCE, scale(variance, inflation(q, FIX_GATE, hits)))
+    return count(q, FIX_GATE, hits, gain_of(cov, variance))
+
+
+@inner
+def gate_components(
+    gap: Numbers, cov: Numbers, seen: Numbers, std: Numbers, hits: Numbers, least: float
+) -> tuple[Numbers, Numbers, Numbers, Numbers]:
+    """Update a vector by range, azimuth and inclination, one after the other, gated.
+
+    Args:
+        gap: m, the predicted vector.
+        cov: (9,) m^2, of it.
+        seen: `relative.five`.
+        std: m, rad, rad; infinite for what was not measured.
+        hits: (3,) of these components.
+        least: m, least distance at which an angle's error counts.
+
+    Returns:
+        Covariance, move m, factors of the standard deviations, and hits.
+    """
+    x, y, z = gap
+    o = 0.0 * x
+    ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
+    reach = max(far, least)
+    flat = max(ground, 1e-3 * reach)
+    turned = angle(seen[1] * x - seen[2] * y, seen[2] * x + seen[1] * y)
+    raised = angle(seen[3] * z - seen[4] * ground, seen[4] * z + seen[3] * ground)
+    a, b, c = std[0], std[1] * flat, std[2] * reach
+    ray, side = (x / far, y / far, z / far), (-y / flat, x / flat, o)
+    up = scale((x * z, y * z, -ground * ground), 1.0 / (flat * reach))
+    cov, moved, f, first = gated_update(cov, zeros(o, ROW), ray, seen[0] - far, a * a, hits[0])
+    cov, moved, g, second = gated_update(cov, moved, side, turned * flat, b * b, hits[1])
+    cov, moved, h, third = gated_update(cov, moved, up, raised * reach, c * c, hits[2])
+    return cov, moved, (math.sqrt(f), math.sqrt(g), math.sqrt(h)), (first, second, third)

@@ -1,0 +1,111 @@
+"""CL-Bench's real roads: solo methods on a log with a truth, whose fixes are thinned and cut off alike for all."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from coopoc import V2X, Fleet, Kalman, NoiseModel, Recording, RoadFilter, Sensors, observe, read_log
+from coopoc.arrays import Floats
+from coopoc.data.log.read import is_log
+from coopoc.data.registry import load_log
+from coopoc.data.source import split
+from coopoc.errors import InputError
+from coopoc.evaluate.statistics import mean_interval
+from coopoc.methods.track import Method
+from coopoc.world.recording import MEASURED
+
+from .tasks import located
+
+SHARE, BLOCK = 0.4, 30.0
+"""Share of a drive that calibrates, and s of a block, a quarter of the rest at most, over which errors are averaged."""
+EVERY, OUTAGE, PERIOD = 10, 30.0, 180.0
+"""One fix in so many is kept, and none in the last s of every period of s."""
+ROADS = {"f9k": ("ublox_f9k.nmea", "span_truth.gga"), "kitti": ("KITTI_00_ORB.txt", "KITTI_00_gt.txt")}
+"""Task -> files of the measurements and of the truth."""
+
+
+def roads(data: Path) -> Mapping[str, tuple[str, ...]]:
+    """The tasks of a folder of data, or the one of a log of one's own."""
+    path = Path(split(str(data))[0])
+    return {path.stem: ()} if path.exists() and is_log(path) else ROADS
+
+
+@lru_cache(maxsize=2)
+def seen(task: str, data: Path) -> tuple[Recording, Fleet]:
+    """Measurements with thinned fixes, and the truth.
+
+    Raises:
+        InputError: a file that is missing, a log without a truth.
+    """
+    files = [located(data, name) for name in roads(data)[task]]
+    if task == "kitti":
+        recording, truth = _kitti(*map(np.loadtxt, files))
+    else:
+        log = read_log(files[0], truth=files[1]) if files else load_log(str(data))
+        if log.truth is None:
+            raise InputError("data", str(data), "must hold a truth", 'Name its file: "LOG?truth=FILE".')
+        recording, truth = log.recording, log.truth
+    clock, gnss = (recording.t - recording.t[0]) % PERIOD, recording.gnss.copy()
+    for column in range(len(recording.ids)):
+        kept = np.flatnonzero(np.isfinite(gnss[0, :, column, 0]))[::EVERY]
+        starts = [start for start, _ in recording.stretches(column)]
+        gone = np.setdiff1d(np.arange(len(clock)), [*kept[clock[kept] < PERIOD - OUTAGE], *starts])
+        gnss[:, gone, column] = np.nan
+    return replace(recording, gnss=gnss), truth
+
+
+def _kitti(odometry: Floats, truth: Floats) -> tuple[Recording, Fleet]:
+    """Poses 3x4 of a camera (x right, z ahead) in the plane, and fixes of 2.5 m that are drawn once."""
+    ways = [np.column_stack([poses[:, 11], poses[:, 3], 0.0 * poses[:, 3]])[:, None] for poses in (odometry, truth)]
+    measured, motion = (np.diff(way, axis=0, prepend=way[:1]) / 0.1037 for way in ways)
+    fleet = Fleet(("car",), 0.1037 * np.arange(len(truth)), ways[1], motion, name="KITTI 00")
+    drawn = observe(fleet, Sensors(gnss_std=(2.5, 2.5, 0.01)), V2X(max_neighbours=0), seed=2026)
+    return replace(drawn, velocity=measured[None], sensors=Sensors(), notes=(f"odometry: {MEASURED}",)), fleet
+
+
+def road_row(task: str, data: Path, made: Method) -> dict[str, Any]:
+    """Error of the part that does not calibrate, as the method comes and calibrated on the first part.
+
+    Args:
+        task: that is run.
+        data: folder of the data, or a log.
+        made: solo method; Kalman and road filters can be calibrated.
+    """
+    recording, truth = seen(task, data)
+    start = int(SHARE * len(recording.t))
+    row = {"task": task, **_scored(made, recording, truth, start)}
+    if isinstance(made, Kalman) or (isinstance(made, RoadFilter) and made.errors is None):
+        first = recording.between(0, start), truth.between(0, start)
+        fitted = Kalman(NoiseModel.fitted(*first)) if isinstance(made, Kalman) else RoadFilter.fitted(*first)
+        own = _scored(fitted, recording, truth, start)
+        row |= {"calibrated_m": own["rt_le_m"], "calibrated_nees": own["nees"]}
+    return row | {"received_bytes_per_second": 0}
+
+
+def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> dict[str, Any]:
+    """RT-LE m in the plane with its interval over vehicles and blocks of time, NEES of (x, y), us of a step."""
+    blocks, ratios, seconds = list[float](), list[Floats](), 0.0
+    size = max(int(min(BLOCK / recording.dt, (len(recording.t) - start) / 4)), 1)
+    for column in recording.observers:
+        squares = np.full(len(recording.t), np.nan)
+        for begin, stop in recording.stretches(column):
+            if stop <= start:
+                continue
+            track = method(recording.between(begin, stop), [column])
+            gap = (track.x[0, :, 0] - truth.position[begin:stop, column])[:, :2]
+            squares[begin:stop], seconds = np.square(gap).sum(axis=-1), seconds + track.seconds
+            if track.covariance is not None:
+                inside = np.linalg.inv(track.covariance[0, :, 0, :2, :2])
+                ratios.append(np.einsum("ti,tij,tj->t", gap, inside, gap)[max(start - begin, 0) :])
+        parts = [squares[k : k + size] for k in range(start, len(squares) - size + 1, size)]
+        blocks += [float(np.sqrt(np.nanmean(part))) for part in parts if np.isfinite(part).any()]
+    level = mean_interval(np.array([blocks]))
+    row: dict[str, Any] = {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
+    row |= {"nees": round(float(np.nanmean(np.concatenate(ratios))), 2)} if ratios else {}
+    return row | {"microseconds_per_step": round(1e6 * seconds / len(recording.t), 2)}
