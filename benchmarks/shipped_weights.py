@@ -40,7 +40,6 @@ SENSORS = {
 LIMITS = {
     "static": "Trained at 1.5 m and 10 % of each velocity component; at other noise it filters for these.",
     "fresh": "Trained at 1.5 m and 10 % of each velocity component; at other noise it filters for these.",
-    "wide": "Trained at 1 to 6 m and at 5 to 20 % of each velocity component or of the speed; beyond them untried.",
     "roads": "Trained where everything errs (training.roads); where odometry is exact a Kalman filter is better.",
 }
 EVERYWHERE = "Four simulated drives on one flat map at 10 Hz."

@@ -2,21 +2,34 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
 import threading
 import time
+from contextlib import suppress
 from functools import lru_cache
 from importlib import import_module
 
 
 def main() -> None:
-    """The console script: without a traceback where it is interrupted while libraries load."""
+    """The console script: without a traceback where it is interrupted while libraries load.
+
+    It ends without the destructors of C++ libraries: one whose thread still runs would call "terminate".
+    """
+    status: object = 130
     try:
         import_module("coopoc.cli").main()
+    except SystemExit as ended:
+        status = ended.code
     except KeyboardInterrupt:
-        sys.exit(130)
+        pass
+    atexit._run_exitfuncs()
+    with suppress(OSError):
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(status if isinstance(status, int) else bool(status))
 
 
 @lru_cache

@@ -48,8 +48,7 @@ def read_frame(path: Path, *text: str) -> pd.DataFrame:
     try:
         if parquet := path.suffix.lower() == ".parquet":
             require("pyarrow", "a Parquet table")
-        how: dict[str, Any] = {"use_threads": False, "pre_buffer": False}
-        frame = pd.read_parquet(path, **how).reset_index(drop=True) if parquet else _read_csv(path, text)
+        frame = pd.read_parquet(path).reset_index(drop=True) if parquet else _read_csv(path, text)
     except (InputError, ImportError):
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all

@@ -10,7 +10,6 @@ from .nets.gain import Gain, Recurrent
 from .nets.gain_net import GainNet
 from .nets.okf import NoiseParameters, OptimisedKF
 from .nets.road import RoadConstants
-from .nets.split import SplitGain
 from .recipes import RECIPES, Recipe, Setting, load_method
 from .train import train_all
 from .training.clients import Client, Segments, clients
@@ -40,7 +39,6 @@ __all__ = [
     "Schedule",
     "Segments",
     "Setting",
-    "SplitGain",
     "clients",
     "federate",
     "fit",

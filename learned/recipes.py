@@ -45,7 +45,7 @@ class Recipe:
         local_epochs: of a federation, per round.
         local_epoch: of a federation, a "pass" through the client's segments or a "step".
         aggregate: rule of a federation, a name or "mine.py:NAME".
-        noise: of the training drives, "static", "fresh" or "wide", where it is simulated; "roads" for worlds as real
+        noise: of the training drives, "static" or "fresh", where it is simulated; "roads" for worlds as real
             roads have them (`training.roads`); or outliers by name (`Outliers.named`), added to static noise.
         piece: steps of a segment.
         split: share of the segments that train.
@@ -94,14 +94,6 @@ RECIPES: dict[str, Recipe] = {
     "fedokf": Recipe("federated", Schedule(batch=12, learning_rate=0.05, weight_decay=0.0, mirror=False), net="okf"),
     "road": Recipe("centralised", ROAD, noise=ROADS, piece=300, net="road"),
     "fedroad": Recipe("federated", ROAD, noise=ROADS, piece=300, net="road"),
-    "split": Recipe(
-        "federated",
-        Schedule(batch=8, learning_rate=3e-3, weight_decay=0.1),
-        local_epochs=10,
-        noise="wide",
-        piece=300,
-        net="split",
-    ),
 }
 
 
@@ -168,8 +160,8 @@ def recipe_of(name: str) -> Recipe:
         InputError: an unknown name, or an object that is neither a Recipe nor a net.
 
     >>> from coopoc.learned.recipes import recipe_of
-    >>> recipe_of("split").net
-    'split'
+    >>> recipe_of("okf").net
+    'okf'
     """
     given = find("coopoc.recipes", name)
     if isinstance(given, type) and issubclass(given, Gain):

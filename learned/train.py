@@ -133,8 +133,8 @@ def over_fitted(model: Gain, job: Job, fleet: Drives) -> float:
     steps, fixes = np.diff(truth, axis=0) - dt * velocity[1:], gnss - truth
     process, fix = (_rms(e) for e in (steps, fixes))
     gnss, velocity, truth, dt = _pieces(_joined(data, job.client, "validation"))
-    steps, names = len(gnss), tuple(map(str, range(gnss.shape[1])))
-    still = Fleet(names, dt * np.arange(steps), np.zeros_like(gnss), np.zeros_like(gnss))
+    names = tuple(map(str, range(gnss.shape[1])))
+    still = Fleet(names, dt * np.arange(len(gnss)), np.zeros_like(gnss), np.zeros_like(gnss))
     seen = replace(observe(still, Sensors(), V2X(max_neighbours=0)), gnss=gnss[None], velocity=velocity[None])
     methods = model.method(job.name), Kalman(NoiseModel("fitted", None, process, fix))
     ours, theirs = (np.nansum((method(seen, names).x[0] - truth) ** 2) for method in methods)

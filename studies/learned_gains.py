@@ -31,7 +31,6 @@ ASSUMED = {
     ("kalman", "nominal"): "the acting share of the measured velocity",
     ("kalman", "oracle"): "the acting share of the true velocity",
     **{(name, "trained"): "trained at 10 %" for name in ("okf", "fedokf", "fedkalmannet", "centralised")},
-    ("split", "trained"): "trained at 5 to 20 %",
     lineup.BOUND: "the acting share of the true velocity",
 }
 """(method, noise model) -> assumption on the velocity noise."""

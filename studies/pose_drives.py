@@ -202,7 +202,7 @@ def _log(data: str) -> tuple[MrclamLog | Log, str]:
         raise InputError("data", repr(data), "must be the path of measurements, not only of drives", hint)
     log = load_log(data)
     if log.recording.body is None:
-        hint = f'Read it so: --data "{name}?frame=body".'
+        hint = f'Read it so: --data "{name}?frame=body". For positions: coopoc benchmark METHOD --data {name}.'
         raise InputError("data", repr(data), "must be a log in body frames, for poses", hint)
     return together(log)
 

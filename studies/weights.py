@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from tyro.conf import Positional, arg
 
@@ -33,7 +33,7 @@ INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
 """Nets of single clients, one per client, at most six."""
 PAPER = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
 """Methods that the paper trains, and the optimised Kalman filter."""
-LEARNED = (*PAPER, "fedokf", "split", "road", "fedroad")
+LEARNED = (*PAPER, "fedokf", "road", "fedroad")
 """Methods that are trained."""
 WORST = 1.1
 """Times the error of a Kalman filter with fitted noise, above which the command saves no weights."""
@@ -236,7 +236,7 @@ def train(
     elif rounds is not None:
         raise InputError("rounds", rounds, "goes with --flower", "Add --flower, or leave the recipe's rounds.")
     else:
-        chosen = {"seeds": [seed], "starts": [start], "readings": [reading], "recipes": [recipe]}
+        chosen: Any = {"seeds": [seed], "starts": [start], "readings": [reading], "recipes": [recipe]}
         made = train_all(clients, out, **chosen, aggregate=aggregate, worst=math.inf if worse else WORST)
     for label, checkpoint in made.items():
         print(f"{out / label}.safetensors  {checkpoint.card['parameters']} parameters")

@@ -15,9 +15,9 @@ from test_star_filters import CHANNELS, gappy, holed, partial
 from coopoc import V2X, Fleet, JointFilter, Kalman, Recording, Sensors, load_fleet, observe, rt_le
 from coopoc.arrays import Floats
 from coopoc.kernels.stars.cooperative_state import NO_GUARDS, Guards
-from coopoc.methods.cooperative_filter import CooperativeFilter
+from coopoc.methods.cooperative_filter import Broadcast, CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel, resolve
-from coopoc.methods.star_stream import Broadcast, RelativeMeasurement, StarStream
+from coopoc.methods.star_stream import RelativeMeasurement, StarStream
 from coopoc.world.inbox import inbox
 from coopoc.world.spoofing import Spoofing, spoofed
 
@@ -143,6 +143,7 @@ def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
         x, cov = streams[0].step(seen.gnss[0, t, 0], seen.velocity[0, t, 0], seen.dt, neighbours=given)
         np.testing.assert_allclose(x, track.x[0, t, 0], atol=1e-6)
         assert track.covariance is not None
+        assert cov is not None
         np.testing.assert_allclose(cov, track.covariance[0, t, 0], atol=1e-6)
 
 

@@ -100,7 +100,7 @@ def test_a_backend_is_checked_as_all_are(folder: Path, monkeypatch: pytest.Monke
     done = subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True)
     assert done.stdout.startswith("SOLVED"), done.stderr
     monkeypatch.chdir(folder)
-    problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
+    problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 4, 0]], std=[1.0, 2.0, 3.0])
     problem = problem.add("range", ("ego", "b"), 10.0, std=1.0)
     mine, ours = solve(problem, "least_squares.py:BACKEND"), solve(problem, "gtsam")
     assert mine.x == pytest.approx(ours.x, abs=1e-8)

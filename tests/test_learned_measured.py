@@ -21,7 +21,6 @@ from coopoc.learned import (
     RoadConstants,
     Schedule,
     Segments,
-    SplitGain,
     load_method,
     train_all,
 )
@@ -35,7 +34,7 @@ from coopoc.learned.training.drives import MeasuredDrives
 from coopoc.learned.training.measured import measured_clients
 from coopoc.learned.training.okf_fit import fit_okf
 
-NETS = (GainNet(2, 1), SplitGain(4), RoadConstants(), NoiseParameters())
+NETS = (GainNet(2, 1), RoadConstants(), NoiseParameters())
 
 
 def walk(steps: int = 400, vehicles: int = 2, seed: int = 0, every: int = 1) -> tuple[Recording, Fleet]:

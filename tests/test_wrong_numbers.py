@@ -22,8 +22,13 @@ from coopoc.arrays import Floats, Ints
 from coopoc.evaluate.metrics import neighbour_rt_le
 from coopoc.evaluate.scores import scored
 from coopoc.kernels import gate
+from coopoc.kernels.stars.cooperative_filter import run_filter
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.methods.cooperative_filter import broadcasts, model_of
+from coopoc.methods.egos import assumptions, measurements
+from coopoc.methods.noise_model import resolve
 from coopoc.study.results import Results
+from coopoc.world.inbox import inbox
 from coopoc.world.storage import read_recording, save_recording
 
 S2 = Sensors.paper_scenario2()
@@ -65,7 +70,7 @@ def damaged(recording: Recording, kind: str, links: Ints) -> Recording:
         relative[run, links, 1] = rng.uniform(-np.pi, np.pi, RUNS)
     elif kind == "inclination":
         relative[run, links, 2] = rng.uniform(0.0, np.pi, RUNS)
-    else:
+    elif kind in ("fix", "message"):
         who = np.full(RUNS, EGO) if kind == "fix" else sender
         gnss[run, step, who] += size[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
     return replace(recording, gnss=gnss, relative=relative)
@@ -91,6 +96,52 @@ def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(
         mostly = after if name in FURTHER else MOSTLY
         assert not robust or (later.max() < after and np.quantile(later, 0.98) < mostly), (kind, later.max())
     assert (farthest < once) == robust
+
+
+def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Floats]:
+    """Position (R, T, 3) m of the cooperative filter and its std (R, T) m, a wrong number in each run. "position",
+    "odometer" and "velocity" are those of a message."""
+    method, run, of = CooperativeFilter(), np.arange(RUNS), recording.links
+    step, sender = of.step[links], of.neighbour[links]
+    way = np.random.default_rng(1).normal(size=(RUNS, 3))
+    error = np.geomspace(1.0, 1e6, RUNS)[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
+    velocity = recording.velocity.copy()
+    if kind == "velocity":  # a recording takes none of more than 10 km/s
+        velocity[run, step, sender] += 5e-3 * error
+    given = replace(damaged(recording, kind, links), velocity=velocity) if kind else recording
+    known = resolve("nominal", given)
+    sent, variance = broadcasts(given, known, [EGO], method.guards)
+    sent, moved = sent.copy(), np.cumsum(np.nan_to_num(given.dt * given.velocity), axis=1)
+    if kind in ("position", "odometer"):
+        (sent if kind == "position" else moved)[run, step, sender] += error
+    sent.flags.writeable = False
+    seen = measurements(given, EGO, inbox(given, EGO, method.message), sent)
+    assumed = assumptions(given, known)._replace(broadcast=variance)
+    x, cov = run_filter(seen, assumed, moved, model_of(known, True), method.guards)[:2]
+    return x, np.sqrt(np.trace(cov, axis1=-2, axis2=-1))
+
+
+@pytest.mark.parametrize("kind", [*KINDS, "position", "odometer", "velocity"])
+@pytest.mark.parametrize("first", [0, 20], ids=["at any step", "after two seconds"])
+def test_one_wrong_number_of_any_size_moves_the_cooperative_filter_by_a_stated_distance(
+    first: int, kind: str, recording: Recording
+) -> None:
+    """Of 1 to 1e6 m, a neighbour's first one, too. After two seconds by less than 0.25 m, and one second later by 0.15
+    m, 0.3 m of a velocity; at any step, the first one, too, by twice the stated std and then by 1.2 of it, but for the
+    ego's very first fix."""
+    own = recording.links.of(EGO)
+    when = recording.links.step[own]
+    links = np.random.default_rng(2).choice(own[(when >= first) & (when < 68)], RUNS)
+    links[::4] = links[::4] if first else own[when == 0][0]
+    (x, _), (clean, std) = estimates(recording, kind, links), estimates(recording, "", links)
+    moved, step = np.linalg.norm(x - clean, axis=-1), recording.links.step[links]
+    scaled = moved / (1.0 if first else std)
+    later: Floats = np.array([row[t + 10 :].max() for row, t in zip(scaled, step, strict=True)])
+    most = {"fix": 8.0}.get(kind, 2.0), 1.2
+    if first:
+        most = (0.3, 0.3) if kind == "velocity" else (0.25, 0.15)
+    assert scaled.max() < most[0]
+    assert later.max() < most[1]
 
 
 def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import numpy.typing as npt
@@ -12,9 +12,8 @@ import numpy.typing as npt
 from ..arrays import Floats
 from ..kernels.stars.cooperative_filter import run_filter
 from ..kernels.stars.cooperative_state import NO_GUARDS, Guards, Model
-from ..kernels.stars.gaussian import REJECTED
-from ..kernels.stars.messages import ACCELERATION_STD, FORGOTTEN, Measurements
-from ..world.inbox import Inbox
+from ..kernels.stars.messages import ACCELERATION_STD, FORGOTTEN
+from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
@@ -22,7 +21,7 @@ from .noise_model import NoiseModel, resolve
 from .track import Track, check_options
 
 NO_ODOMETER = np.zeros((1, 1, 1, 3))
-KINDS = ("range", "azimuth", "inclination", "message")
+KINDS = ("range", "azimuth", "inclination", "message", "trusted")
 
 
 class Broadcast(NamedTuple):
@@ -56,14 +55,16 @@ class CooperativeFilter:
     \theta_{ij} = \angle(x_j - x_i) + \beta + w
     $$
 
-    - *Trust*: a newcomer's fixes have an unknown offset $b_j \sim N(0, \tau^2)$. When the odds
-      $p(b_j = 0 \mid \text{all}) / p(b_j = 0)$ allow, $b_j$ is set to 0, the surest member first, and all its fixes
-      count in retrospect. A mean innovation that has become unlikely revokes it; the filter then goes back some seconds
-      and comes again without these fixes.
-    - *Gates*: a component whose squared normalised innovation exceeds its gate is down-weighted (Huber), far beyond it
-      rejected; after five in a row it counts again, for then it is the filter that is wrong.
-    - *Messages* hold the solo estimate, its variance, the odometer and the velocity. Two of them tell what the fixes
-      between said, so that a lost message loses nothing and no fix counts twice.
+    - *Trust*: the fixes of a vehicle that is new have an unknown offset $b_j \sim N(0, \tau^2)$. When the odds
+      $p(b_j = 0 \mid \text{all}) / p(b_j = 0)$ allow, $b_j$ is set to 0, the surest first, and all its fixes count in
+      retrospect. A mean innovation that has become unlikely revokes the trust, in the ego's own receiver, too: the
+      filter takes the last seconds again without these fixes.
+    - *Gates*: where the squared Mahalanobis distance $q$ of a fix, or of a component of a relative measurement,
+      exceeds its gate, the innovation's covariance is multiplied by $q / \mathrm{gate}$, far beyond it by 100 more. A
+      member that is contradicted for too long joins anew; an ego that rests on nothing that is trusted starts anew.
+      Velocities that no vehicle can have reached are replaced by the last ones.
+    - *Messages* hold the estimate of the same filter alone, its variance, the odometer and the velocity. The fixes that
+      were used between two of them follow, so that a lost message loses nothing and no fix counts twice.
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel, whose drift and compass errors are estimated along.
@@ -72,8 +73,9 @@ class CooperativeFilter:
         guards: limits of the above; the default was chosen on the validation tasks of CL-Bench.
 
     References:
-        Huber, Robust estimation of a location parameter, Ann. Math. Stat. 35(1), 1964; Friedland, Treatment of bias in
-        recursive filtering, IEEE TAC 14(4), 1969; Roumeliotis, Burdick, Stochastic cloning, IEEE ICRA, 2002.
+        Chang, Robust Kalman filtering based on Mahalanobis distance as outlier judging criterion, J. Geodesy 88, 2014;
+        Friedland, Treatment of bias in recursive filtering, IEEE TAC 14(4), 1969; Roumeliotis, Burdick, Stochastic
+        cloning, IEEE ICRA, 2002.
 
     >>> CooperativeFilter().message.payload
     56
@@ -102,6 +104,7 @@ class CooperativeFilter:
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
         model = model_of(known, self.robust)
         assumed, broadcast, moved = assumptions(recording, known), None, NO_ODOMETER
+        notes = list(known.notes)
         if self.robust:
             broadcast, variance = broadcasts(recording, known, columns, guards_of(self, known))
             assumed = assumed._replace(broadcast=variance)
@@ -110,47 +113,53 @@ class CooperativeFilter:
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
             seen = measurements(recording, ego, box, broadcast)
-            x, cov, neighbours, fixes, notes = run_filter(seen, assumed, moved, model, guards)
-            extras = {"fix": weight(fixes[..., None], guards.fix_gate)}
-            for k, kind in enumerate(KINDS):
-                extras[kind] = weight(notes[..., k], guards.fix_gate if kind == "message" else guards.gate)
-            yield Estimate(slice(None), x, cov, box.link, neighbours, {**extras, "trusted": notes[..., 4]})
+            x, cov, neighbours, fixes, weights = run_filter(seen, assumed, moved, model, guards)
+            extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate(KINDS)}
+            mine = recording.ids[ego]
+            notes.extend(rejected(f"fixes, {mine}", fixes))
+            if model.own + model.common == 0.0 and guards.fix_gate:
+                notes.extend(lasting(mine, recording.gnss[:, :, ego] - x, recording.dt))
+            for j in np.unique(seen.neighbour):
+                of, pair = weights[:, seen.neighbour == j], f"{mine} and {recording.ids[j]}"
+                for k, kind in enumerate(KINDS[:4]):
+                    notes.extend(rejected(f"{kind}, {pair}", of[..., k]))
+                notes.extend(rejected(f"trust, {pair}", of[..., 4], 0.5))
+            yield Estimate(slice(None), x, cov, box.link, neighbours, extras)
 
-        return follow_egos(self, recording, egos, run, known.notes, missing=True)
+        return follow_egos(self, recording, egos, run, notes, missing=True)
 
 
 def broadcasts(recording: Recording, known: NoiseModel, egos: Sequence[int], guards: Guards) -> tuple[Floats, Floats]:
     """Estimates m and variances m^2, (R, T, N, 3), of the vehicles in the stars of some egos, each filtered alone."""
     links, assumed, model = recording.links, assumptions(recording, known), model_of(known, robust=False)
-    runs, steps = recording.gnss.shape[:2]
-    none, first = np.zeros((runs, 0), np.int64), np.zeros(steps + 1, np.int64)
     x = np.full(recording.gnss.shape, np.nan)
-    variance = x.copy()
+    variance, nothing = x.copy(), inbox(recording, egos[0], FIX_AND_VELOCITY)
+    seen = measurements(recording, egos[0], nothing)._replace(start=np.zeros(len(recording.t) + 1, np.int64))
     for j in np.union1d(egos, links.neighbour[np.isin(links.observer, egos)]):
-        alone = Measurements(
-            recording.gnss,
-            recording.velocity,
-            recording.gnss,
-            np.zeros((runs, 0, 5)),
-            none[0],
-            first,
-            none,
-            none > 0,
-            int(j),
-            recording.dt,
-        )
-        x[:, :, j], cov = run_filter(alone, assumed, NO_ODOMETER, model, guards)[:2]
+        x[:, :, j], cov = run_filter(seen._replace(ego=int(j)), assumed, NO_ODOMETER, model, guards)[:2]
         variance[:, :, j] = np.diagonal(cov, axis1=-2, axis2=-1)
     x.flags.writeable = False  # as the recording's, for which the kernel is compiled
     return x, variance
 
 
-def weight(q: Floats, gate: float) -> Any:
-    """Share of a number's information that was used, by its squared normalised innovation."""
-    if gate == 0.0:
-        return np.where(np.isnan(q), np.nan, 1.0)
-    share = gate / np.maximum(q, gate)
-    return np.where(q > REJECTED * gate, 0.01 * share, share)
+def rejected(what: str, weights: Floats, share: float = 0.05) -> list[str]:
+    """A note if that share of numbers, ten at least, weighed next to nothing.
+
+    >>> rejected("range, a and b", np.array([1.0] * 30 + [0.001] * 10))
+    ['range, a and b: 10 of 40 rejected']
+    """
+    count, measured = int((weights < 0.1).sum()), int(np.isfinite(weights).sum())
+    return [f"{what}: {count} of {measured} rejected"] if count >= max(10, share * measured) else []
+
+
+def lasting(ego: str, residual: Floats, dt: float) -> list[str]:
+    """A note if the residuals (R, T, 3) m of an ego's fixes are correlated over a second: their errors last."""
+    lag = max(round(1.0 / dt), 1)
+    product = residual[:, lag:] * residual[:, :-lag]
+    found = float(np.nanmean(product) / np.nanmean(residual**2)) if np.isfinite(product).any() else 0.0
+    if found < 0.1 + 4.0 / np.sqrt(max(np.isfinite(product).sum(), 1)):
+        return []
+    return [f"fixes, {ego}: errors a second apart are correlated by {found:.2f}; give Sensors(gnss_drift_std=...)"]
 
 
 def guards_of(method: CooperativeFilter, known: NoiseModel) -> Guards:

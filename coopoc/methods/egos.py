@@ -40,13 +40,14 @@ def follow_egos(
     recording: Recording,
     egos: Sequence[int | str],
     follow: Callable[[int, Inbox], Iterable[Estimate]],
-    notes: tuple[str, ...] = (),
+    notes: Sequence[str] = (),
     *,
     missing: bool = False,
 ) -> Track:
     """Track of the egos from what `follow(column, inbox)` yields, every step once in any order; bytes counted.
 
     Args:
+        notes: of the Track; `follow` may add some.
         missing: whether the method does without a fix where it is missing.
 
     Raises:

@@ -47,7 +47,6 @@ class Capabilities:
 
     Args:
         batched: the solver takes B realisations in one call; `solve_batch` calls any other once per realisation.
-        compiled: the methods have a compiled form of the same algorithm and run it in place of the solver.
         kinds: of measurement; None: all that are registered, those of other distributions too.
         losses: robust losses; None: all.
         poses: nodes may have a rotation.
@@ -55,7 +54,6 @@ class Capabilities:
     """
 
     batched: bool = False
-    compiled: bool = False
     kinds: tuple[str, ...] | None = None
     losses: tuple[str, ...] | None = None
     poses: bool = True

@@ -146,8 +146,7 @@ def _checked(content: bytes) -> pa.Table:
     """The table of a file whose checksum is right; pa.ArrowInvalid otherwise."""
     if not holds(content):
         raise pa.ArrowInvalid("its checksum is wrong")
-    # its threads may still run when the process ends, which C++ calls "terminate ... without an active exception"
-    return pq.read_table(BytesIO(content), use_threads=False, pre_buffer=False)
+    return pq.read_table(BytesIO(content))
 
 
 def _read(path: Path, name: str) -> pa.Table | None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, fields
 from functools import cached_property
 from typing import Literal, NamedTuple, get_args
 
@@ -20,15 +20,10 @@ from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors, stream
 from coopoc.world.v2x import V2X
 
-Noise = Literal["static", "fresh", "wide"]
+Noise = Literal["static", "fresh"]
 Start = Literal["gnss", "true"]
 LONG = 9
 """Training pieces that a long piece is as long as: 900 steps, the paper's test drive."""
-WIDE = ((2 / 3, 1 / 2), (4.0, 2.0))
-"""Least and greatest factors of the GNSS and the velocity std under wide noise: 1.5 m and 10 % become 1 to 6 m and 5 to
-20 %, so that 1.8 m and 3.5 m, 10 % and 15 %, where the paper tests, lie well inside."""
-DRAWS = 8
-"""Uses of a piece in validation under wide noise, whose size differs from use to use."""
 
 
 class Batch(NamedTuple):
@@ -56,8 +51,7 @@ class Segments:
         velocity_std: (n, T + 1, 3) m/s of the noise, for new draws.
         true_start: (n,) whether the filter starts at the truth (KalmanNet's published loop) or at the first fix.
         dt: s.
-        noise: "static" was drawn once, or measured; "fresh" is drawn anew at every use; "wide" too, and then every use
-            of a piece also draws how large its noise is, log-uniformly between the factors `WIDE`.
+        noise: "static" was drawn once, or measured; "fresh" is drawn anew at every use.
     """
 
     gnss: Tensor
@@ -116,10 +110,8 @@ class Segments:
         """gnss and velocity (S, B, T + 1, 3) with new noise."""
         shape = (2, index.shape[1], *self.truth.shape[1:])
         normals = torch.stack([torch.randn(shape, generator=draw) for draw in draws], dim=1)
-        gnss_std, velocity_std = self.gnss_std[index], self.velocity_std[index]
-        if self.noise == "wide":
-            gnss_std, velocity_std = _widened(gnss_std, velocity_std, draws)
-        return self.truth[index] + gnss_std * normals[0], self.true_velocity[index] + velocity_std * normals[1]
+        gnss, velocity = (self.gnss_std[index] * normals[0], self.velocity_std[index] * normals[1])
+        return self.truth[index] + gnss, self.true_velocity[index] + velocity
 
     def take(self, index: Sequence[int]) -> Segments:
         """The pieces `index`."""
@@ -137,17 +129,6 @@ class Segments:
         """The same pieces with every tensor field replaced by what `made` gives for its name."""
         tensors = {f.name: made(f.name) for f in fields(self) if isinstance(getattr(self, f.name), Tensor)}
         return Segments(**tensors, dt=self.dt, noise=self.noise)
-
-
-def _widened(gnss_std: Tensor, velocity_std: Tensor, draws: Sequence[torch.Generator]) -> tuple[Tensor, Tensor]:
-    """Stds (S, B, T + 1, 3) of pieces times factors log-uniform between `WIDE`, one per piece and kind; every other use
-    reads "10 % of the velocity" as of the speed: then each axis has the norm of all three."""
-    dice = torch.stack([torch.rand((3, gnss_std.shape[1]), generator=draw) for draw in draws], dim=1)
-    low, high = torch.tensor(WIDE).log().unbind()
-    factors = torch.lerp(low[:, None, None], high[:, None, None], dice[:2]).exp()[..., None, None]
-    of_speed = torch.linalg.vector_norm(velocity_std, dim=-1, keepdim=True)
-    velocity_std = torch.where(dice[2, ..., None, None] < 0.5, velocity_std, of_speed)
-    return factors[0] * gnss_std, factors[1] * velocity_std
 
 
 def mirrored(batch: Batch, draws: Sequence[torch.Generator]) -> Batch:
@@ -208,7 +189,7 @@ def clients(
         fleet: drives (T, N); a vehicle may leave early.
         sensors: default `Sensors.paper_training()`.
         seed: of noise and split.
-        noise: "static", "fresh" (new at every use) or "wide" (new, and of a size that differs from use to use).
+        noise: "static" or "fresh" (new at every use).
         start: "gnss" (first fix) or "true".
         piece: steps of a segment.
         split: share of the segments that train.
@@ -252,9 +233,8 @@ def clients(
         order = stream(seed, "split", 0, name).permutation(len(pieces)).tolist()
         count = min(max(int(split * len(pieces)), 1), len(pieces) - 1)
         long = _cut(drive, sensors, longest, fleet.dt, noise, start)
-        uses = DRAWS if noise == "wide" else 1
-        training, validation = pieces.take(sorted(order[:count])), pieces.take(sorted(order[count:]) * uses)
-        agreed.append(Client(name, training, validation, long.take([*range(len(long))] * uses)))
+        training, validation = pieces.take(sorted(order[:count])), pieces.take(sorted(order[count:]))
+        agreed.append(Client(name, training, validation, long))
     return tuple(agreed)
 
 
@@ -272,8 +252,7 @@ def _cut(drive: Sequence[Floats], sensors: Sensors, piece: int, dt: float, noise
     begun = np.isfinite(gnss[:, 0, 0])
     gnss, velocity, truth, true_velocity = (d[begun] for d in (gnss, velocity, truth, true_velocity))
     origin = truth[:, :1]
-    acting = replace(sensors, velocity_reading="axis") if noise == "wide" else sensors
-    stds = np.broadcast_to(np.array(sensors.gnss_std), gnss.shape), acting.velocity_std(true_velocity)
+    stds = np.broadcast_to(np.array(sensors.gnss_std), gnss.shape), sensors.velocity_std(true_velocity)
 
     def tensor(numbers: Floats) -> Tensor:
         return torch.tensor(numbers, dtype=torch.float32)

@@ -116,7 +116,8 @@ class Oracle:
     ) -> None:
         s, self.alone = known.sensors, alone
         self.seen, self.ego, self.run, self.known, self.guards, self.robust = seen, ego, run, known, guards, robust
-        self.life, self.std, self.white = Life(0, 0, 1, 0, 0), np.ones(3), np.ones(3)
+        self.life, self.white = Life(0, 0, 1, 0, 0), np.ones(3)
+        self.std: Floats = np.ones(3)
         if s is not None:
             self.std = s.relative_std.copy()
         if robust and s is not None:
@@ -620,16 +621,15 @@ def between(
     keep = prod (1 - K_i)."""
     if p > p0 + 2 * spent + 1e-9:
         return now, p, 0.0, 1.0
-    parts = min(steps, 50)
-    after = p0 + (p - p0) * (np.arange(parts) + 1) / parts
-    before = np.append(p0, after[:-1])
-    taken = -np.log(np.minimum(after / (before + spent / parts), 1)).sum()
-    usual = -steps / parts * np.log(np.maximum(1 - after / fix, 1e-3)).sum()
+    p0 = max(p0, 1e-12)
+    before, mean = ((p0 + p) / 2 - sign * (p - p0) / (2 * steps) for sign in (1, -1))
+    taken = max(math.log(p0 / p) + steps * math.log(1 + spent / steps / before), 0.0)
+    usual = -steps * math.log(max(1 - mean / fix, 1e-3))
     if steps > 1 and 2 * taken > usual:
         taken = usual
     new, k = 1 - math.exp(-taken), 1 - math.exp(-taken / steps)
     if new < 1e-9:
         return None
-    white = after.mean() / k * k / (2 - k) * (2 - new) / new
+    white = mean / (2 - k) * (2 - new) / new
     middle = min(max(1 / new - (1 - k) / (k * steps), 0.5), 1.0) if steps > 1 else 1.0
     return carried + (now - carried) / new, white, spent * (steps - 1 / steps) / (12 * steps), middle

@@ -2,6 +2,7 @@
 
 Columns of nearly equal structure are a supernode, whose front is the dense matrix of its columns and of the rows below
 them: it adds up what the matrix and its children say of them, eliminates the columns, and hands the rest to its parent.
+In a postorder what waits for a parent is a stack of upper triangles.
 
 References:
     Duff and Reid, The multifrontal solution of indefinite sparse symmetric linear equations, ACM TOMS 1983; Liu, The
@@ -15,15 +16,15 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ..compiling.compile import compiled, inside
+from ..compiling.compile import compiled, inside, part
 
 PANEL = 16
 """Rows of a front that are eliminated before one product updates the others of their block."""
 BLOCK = 128
 """Rows of a block, after which one product updates the rest: wide enough for BLAS to be fast."""
-WORTH = 8000
+WORTH = 200_000
 """Multiplications from which a call of BLAS is faster than loops."""
-STRIP = 128
+STRIP = 64
 """Rows that one product updates: below the diagonal it would compute what nothing reads."""
 
 
@@ -94,6 +95,32 @@ def structures(indptr: Ints, indices: Ints, order: Ints) -> tuple[Ints, Ints, In
 
 
 @compiled
+def postorder(parent: Ints, size: Ints) -> Ints:
+    """(n,) columns of a tree, each after its subtree, which is in one piece, and after the largest of its children.
+
+    Columns that follow their only large child can join it.
+
+    Args:
+        parent: (n,) in the tree, -1 for a root.
+        size: (n,) rows of each.
+    """
+    n, at, count = len(parent), len(parent), 0
+    head, sibling = np.full(n + 1, -1), np.full(n + 1, -1)
+    stack, out = np.empty(n, np.int64), np.empty(n, np.int64)
+    for k in np.argsort(-size):
+        sibling[k], head[parent[k]] = head[parent[k]], k
+    k = head[-1]
+    while k != -1 or count:
+        while k != -1:
+            stack[count], k = k, sibling[k]
+            count += 1
+        count, at = count - 1, at - 1
+        out[at] = stack[count]
+        k = head[out[at]]
+    return out
+
+
+@compiled
 def supernodes(parent: Ints, begin: Ints, rows: Ints, width: Ints) -> Ints:
     """First column of each supernode, and n: a column joins its last child where that adds few zeros.
 
@@ -110,7 +137,7 @@ def supernodes(parent: Ints, begin: Ints, rows: Ints, width: Ints) -> Ints:
     for k in range(n):
         below = width[rows[begin[k] : begin[k + 1]]].sum()
         more, whole = zeros + wide * (width[k] + below - below_last), wide + width[k]
-        most = (0.5 if whole <= 12 else 0.02) * whole * (0.5 * (whole + 1) + below)
+        most = min(0.5, 0.03 + 8.0 / whole) * whole * (0.5 * (whole + 1) + below)
         if k > 0 and parent[k - 1] == k and more <= most:
             wide, zeros = whole, more
         else:
@@ -152,37 +179,49 @@ def factorise(fronts: Fronts, place: Ints, values: Floats, factor: Floats) -> bo
     for k in range(len(place)):
         factor[place[k]] = values[k]
     count, where = len(fronts.first) - 1, np.empty(len(fronts.order), np.int64)
-    highest = int((np.diff(fronts.first) + np.diff(fronts.row)).max())
-    room, updates = np.empty(highest * highest), [np.empty((0, 0)) for _ in range(count)]
-    head, sibling = np.full(count, -1), np.full(count, -1)
+    below = np.diff(fronts.row)
+    size, held, top, most = below * (below + 1) // 2, np.zeros(count, np.int64), 0, 0
+    for s in range(count):
+        top += size[s] - held[s]
+        most = max(most, top)
+        if below[s]:
+            held[fronts.owner[fronts.rows[fronts.row[s]]]] += size[s]
+    widest = np.where(below > 0, below + np.diff(fronts.first), 0).max()
+    room, updates = np.empty(widest * widest), np.empty(most)
+    waiting, depth, top = np.empty(count, np.int64), 0, 0
     for s in range(count):
         _, c, m = shape(fronts, s)
         block = factor[fronts.start[s] : fronts.start[s + 1]].reshape(c, m)
-        front = room[: m * m].reshape(m, m)
-        front[:c] = block
-        for i in range(c, m):
-            for j in range(i, m):
-                front[i, j] = 0.0
+        front = block
+        if m > c:
+            front = room[: m * m].reshape(m, m)
+            front[:c] = block
+            for i in range(c, m):
+                for j in range(i, m):
+                    front[i, j] = 0.0
         locate(fronts, s, where)
-        child = head[s]
-        while child != -1:
-            update, to = updates[child], where[fronts.rows[fronts.row[child] : fronts.row[child + 1]]]
+        bottom = top - held[s]
+        while top > bottom:
+            depth -= 1
+            child = waiting[depth]
+            to = where[fronts.rows[fronts.row[child] : fronts.row[child + 1]]]
+            top -= size[child]
+            at = top
             for i in range(len(to)):
                 line = front[to[i]]
                 for j in range(i, len(to)):
-                    line[to[j]] += update[i, j]
-            updates[child] = np.empty((0, 0))
-            child = sibling[child]
+                    line[to[j]] += updates[at]
+                    at += 1
         if not eliminate(front, c):
             return False
-        block[:] = front[:c]
         if m > c:
-            parent = fronts.owner[fronts.rows[fronts.row[s]]]
-            update = np.empty((m - c, m - c))
-            for i in range(m - c):
-                for j in range(i, m - c):
-                    update[i, j] = front[c + i, c + j]
-            updates[s], sibling[s], head[parent] = update, head[parent], s
+            block[:] = front[:c]
+            for i in range(c, m):
+                for j in range(i, m):
+                    updates[top] = front[i, j]
+                    top += 1
+            waiting[depth] = s
+            depth += 1
     return True
 
 
@@ -193,36 +232,48 @@ def eliminate(front: Floats, c: int) -> bool:
     m = len(front)
     for outer in range(0, c, BLOCK):
         end = min(outer + BLOCK, c)
-        by_loops = (end - outer) * (m - end) ** 2 + (end - outer) ** 3 // 3 < WORTH
-        for first in range(outer, end, PANEL):
-            last = min(first + PANEL, end)
-            for k in range(first, last):
-                if not front[k, k] > 0.0:
-                    return False
-                share = 1.0 / np.sqrt(front[k, k])
-                for i in range(k, m):
-                    front[k, i] *= share
-                for j in range(k + 1, m if by_loops else last):
-                    share = front[k, j]
-                    for i in range(j, m):
-                        front[j, i] -= share * front[k, i]
+        by_loops = (end - outer) * (m - outer) ** 2 < WORTH
+        for panel in range(outer, end, PANEL):
+            stop = min(panel + PANEL, end)
+            for first in range(panel, stop, 4):
+                last = min(first + 4, stop)
+                for k in range(first, last):
+                    if not front[k, k] > 0.0:
+                        return False
+                    share = 1.0 / np.sqrt(front[k, k])
+                    for i in range(k, m):
+                        front[k, i] *= share
+                    for j in range(k + 1, last):
+                        share = front[k, j]
+                        for i in range(j, m):
+                            front[j, i] -= share * front[k, i]
+                by_four(front, first, last, m if by_loops else stop)
             if not by_loops:
-                downdate(front, first, last, end)
+                downdate(front, panel, stop, end)
         if not by_loops:
             downdate(front, outer, end, m)
     return True
+
+
+@part
+def by_four(front: Floats, first: int, last: int, end: int) -> None:
+    """`downdate` of up to four rows, without BLAS."""
+    p, q, r = min(first + 1, last - 1), min(first + 2, last - 1), min(first + 3, last - 1)
+    for j in range(last, end):
+        a, b = front[first, j], front[p, j] if p > first else 0.0
+        c, d = front[q, j] if q > p else 0.0, front[r, j] if r > q else 0.0
+        for i in range(j, len(front)):
+            front[j, i] -= a * front[first, i] + b * front[p, i] + c * front[q, i] + d * front[r, i]
 
 
 @compiled
 def downdate(front: Floats, first: int, last: int, end: int) -> None:
     """Subtract the products of the rows first to last, which are eliminated, from those below up to `end`."""
     if last < end:
-        panel = np.ascontiguousarray(front[first:last, last:])
+        panel = np.ascontiguousarray(front[first:last, last:].T)
         for top in range(0, end - last, STRIP):
-            wide = min(STRIP, end - last - top)
-            left = np.ascontiguousarray(panel[:, top : top + wide].T)
-            right = np.ascontiguousarray(panel[:, top:])
-            front[last + top : last + top + wide, last + top :] -= np.dot(left, right)
+            stop = min(top + STRIP, end - last)
+            front[last + top : last + stop, last + top :] -= np.dot(panel[top:stop], panel[top:].T)
 
 
 @compiled

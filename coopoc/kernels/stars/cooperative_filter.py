@@ -48,7 +48,20 @@ from .cooperative_state import (
     predict_member,
     steady,
 )
-from .gaussian import ABSENT, COMPASS, KINDS, PLACE, Gaussian, Rows, expect, has, innovate, settle, update, widen
+from .gaussian import (
+    COMPASS,
+    PLACE,
+    Gaussian,
+    Rows,
+    copy_gaussian,
+    expect,
+    has,
+    innovate,
+    settle,
+    update,
+    weight,
+    widen,
+)
 from .messages import Assumptions, Measurements
 from .relative import Five, angle
 
@@ -57,9 +70,8 @@ from .relative import Five, angle
 def run_filter(
     seen: Measurements, assumed: Assumptions, moved: Floats, known: Model, guards: Guards
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
-    """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; squared normalised innovations of the
-    ego's fix (R, T), and by link (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the
-    neighbour is trusted.
+    """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; weights of the ego's fix (R, T), and by link
+    (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the neighbour is trusted.
 
     Fixes of a vehicle that loses trust may have misled the filter for a while: it takes the last `memory` to twice as
     many steps again, without them. A vehicle that is absent (a velocity of NaN) starts anew.
@@ -109,7 +121,7 @@ def run_filter(
                 t = f.step[0]
                 continue
             if t == newest:
-                write(f, run, t, first, who, count, x, cov, fixes, neighbours, notes)
+                write(f, guards, run, t, first, who, count, x, cov, fixes, neighbours, notes)
                 newest += 1
             t += 1
     return x, cov, neighbours, fixes, notes
@@ -118,6 +130,7 @@ def run_filter(
 @part
 def write(
     f: Filter,
+    guards: Guards,
     run: int,
     t: int,
     first: int,
@@ -130,7 +143,7 @@ def write(
     notes: Floats,
 ) -> None:
     """Copy the estimates of a step whose first link is `first`."""
-    fixes[run, t] = f.q[0, 3]
+    fixes[run, t] = weight(f.q[0, 3], guards.fix_gate)
     for c in range(3):
         x[run, t, c] = f.g.x[c]
         for d in range(3):
@@ -141,7 +154,7 @@ def write(
         for c in range(3):
             neighbours[run, first + i, c] = f.g.x[b + c]
         for c in range(4):
-            notes[run, first + i, c] = f.q[k, c]
+            notes[run, first + i, c] = weight(f.q[k, c], guards.gate if c < 3 else guards.fix_gate)
         notes[run, first + i, 4] = f.status[who[i], TRUSTED]
 
 
@@ -374,7 +387,7 @@ def add_fix(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
 
 @part
 def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> None:
-    """The relative measurements: linear at the prediction, for positions and compass alone; then at that solution.
+    """The relative measurements: linear at the prediction, on a copy; then at that solution.
 
     Where they contradict the prediction of most members, it is the ego whose odometer has slipped.
     """
@@ -386,10 +399,10 @@ def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int)
             g.p[j, i] = 0.0
         g.x[i], g.p[i, i] = 0.0, known.heading
     if known.exact > 0.0:
-        wrong = predicted_geometry(f, known, guards, rows, members)
+        wrong = first_pass(f, known, guards, rows, members)
         if guards.slip > 0.0 and wrong >= 3 and 2 * wrong > members:
             widen(g, 3 * g.block[0, PLACE], (guards.slip * f.clock[1]) ** 2)
-            predicted_geometry(f, known, guards, rows, members)
+            first_pass(f, known, guards, rows, members)
         for k in range(len(f.vehicle)):
             if f.vehicle[k] >= 0:
                 for c in range(3):
@@ -409,26 +422,10 @@ def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int)
 
 
 @part
-def predicted_geometry(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> int:
-    """Update positions and compass alone, in `work`; how many members are beyond a gate."""
-    g, work, n, wrong = f.g, f.work, 0, 0
-    for k in range(len(f.vehicle)):
-        for kind in range(KINDS):
-            if f.vehicle[k] >= 0 and (kind == PLACE or (kind == COMPASS and k == 0)) and has(g, k, kind):
-                work.block[k, kind], work.owner[n] = n, k * KINDS + kind
-                n += 1
-            else:
-                work.block[k, kind] = ABSENT
-    work.vectors[0] = n
-    for a in range(n):
-        i = 3 * g.block[work.owner[a] // KINDS, work.owner[a] % KINDS]
-        for c in range(3):
-            work.x[3 * a + c] = g.x[i + c]
-        for b in range(n):
-            j = 3 * g.block[work.owner[b] // KINDS, work.owner[b] % KINDS]
-            for c in range(3):
-                for d in range(3):
-                    work.p[3 * a + c, 3 * b + d] = g.p[i + c, j + d]
+def first_pass(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> int:
+    """Update a copy of the Gaussian, linear at the prediction; how many members are beyond a gate."""
+    work, wrong = f.work, 0
+    copy_gaussian(f.g, work)
     for m in range(members):
         k = f.order[m]
         if relate(f, known, guards, rows, k, 0, work):

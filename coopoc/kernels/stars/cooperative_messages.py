@@ -51,8 +51,6 @@ JITTER = 1e-12
 """m^2 that keeps a clone from being the very number it was cloned of."""
 NOTHING_NEW = 1e-9
 """Least weight of new fixes in an estimate."""
-PARTS = 50
-"""Most parts of the way between two messages that are looked at one by one."""
 CLIP = 12.0
 """Largest squared Mahalanobis distance of an innovation in a mean."""
 
@@ -198,22 +196,17 @@ def fixes_between(
     """
     if p > p0 + 2.0 * spent + 1e-9:  # the sender has started anew
         return now, p, 0.0, 1.0
-    parts = int(min(steps, PARTS))
-    each, taken, all_taken, sizes, before = steps / parts, 0.0, 0.0, 0.0, p0
-    for i in range(parts):
-        after = p0 + (p - p0) * (i + 1.0) / parts
-        taken -= math.log(min(after / (before + spent / parts), 1.0))
-        all_taken -= each * math.log(max(1.0 - after / fix, 1e-3))
-        sizes += after
-        before = after
-    if steps > 1.0 and 2.0 * taken > all_taken:
-        taken = all_taken
+    p0 = max(p0, 1e-12)
+    start, mean = p0 + 0.5 * (p - p0) * (1.0 - 1.0 / steps), p0 + 0.5 * (p - p0) * (1.0 + 1.0 / steps)
+    taken = max(math.log(p0 / p) + steps * math.log(1.0 + spent / steps / start), 0.0)
+    usual = -steps * math.log(max(1.0 - mean / fix, 1e-3))
+    if steps > 1.0 and 2.0 * taken > usual:
+        taken = usual
     new = 1.0 - math.exp(-taken)
     if new < NOTHING_NEW:
         return now, 0.0, 0.0, 1.0
     keep, k = 1.0 - new, 1.0 - math.exp(-taken / steps)
-    fix = sizes / parts / k
-    white = fix * k / (2.0 - k) * (1.0 + keep) / new
+    white = mean / (2.0 - k) * (1.0 + keep) / new
     middle = (1.0 / new - (1.0 - k) / (k * steps)) if steps > 1.0 else 1.0
     walk = spent * (steps - 1.0 / steps) / (12.0 * steps)
     return carried + (now - carried) / new, white, walk, min(max(middle, 0.5), 1.0)

@@ -25,6 +25,7 @@ from .gaussian import (
     Gaussian,
     Rows,
     clear,
+    copy_gaussian,
     expect,
     has,
     insert,
@@ -63,7 +64,7 @@ class Guards(NamedTuple):
         patience: a member whose component exceeds its gate that many times in a row, or as often as it did not before,
             joins anew.
         slip: m/s, error of an odometer that slips.
-        trust: 1 if a newcomer's fixes have an unknown error until they are believed.
+        trust: 1 if the fixes of a vehicle that is new have an unknown error until they are trusted.
         tau: m, standard deviation of that error.
         share: prior share of vehicles with such an error.
         sure: log odds from which a member is trusted.
@@ -83,14 +84,14 @@ class Guards(NamedTuple):
     trust: float = 1.0
     tau: float = 20.0
     share: float = 0.1
-    sure: float = 1.0
+    sure: float = 2.0
     penalty: float = 4.0
-    walk: float = 0.16
+    walk: float = 0.5
     window: float = 30.0
     revoke: float = 3.0
     lost: float = 20.0
     memory: float = 30.0
-    acceleration: float = 4.0
+    acceleration: float = 6.0
 
 
 NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, slip=0.0, trust=0.0, memory=0.0, acceleration=0.0)
@@ -145,7 +146,7 @@ class Filter(NamedTuple):
         hits: (slots, 3) how often in a row a component exceeded its gate; the ego's first counts its fixes.
         status: (vehicles, STATUS).
         at: (slots, 3) m, where relative measurements are linear.
-        work: positions and compass alone, for the first pass of the relative measurements.
+        work: the Gaussian in the first pass of the relative measurements.
         q: (slots, 4) out: squared normalised innovations of range, azimuth and inclination and squared Mahalanobis
             distance of the message, NaN where nothing was used; the ego's are those of its fix.
         step: (1,) number of the step.
@@ -206,19 +207,11 @@ def new_filter(slots: int, vehicles: int) -> Filter:
 @part
 def copy_filter(source: Filter, target: Filter) -> None:
     """Copy the state, but not which vehicles have lost trust."""
-    n, new, old = 3 * source.g.vectors[0], target.g, source.g
-    for i in range(n):
-        new.x[i] = old.x[i]
-        for j in range(n):
-            new.p[i, j] = old.p[i, j]
-    new.vectors[0], target.step[0], target.clock[0] = old.vectors[0], source.step[0], source.clock[0]
-    for i in range(len(old.owner)):
-        new.owner[i] = old.owner[i]
+    copy_gaussian(source.g, target.g)
+    target.step[0], target.clock[0] = source.step[0], source.clock[0]
     for k in range(len(source.vehicle)):
         target.vehicle[k], target.row[k], target.joined[k] = source.vehicle[k], source.row[k], source.joined[k]
         target.serves[k], target.heard[k], target.vague[k] = source.serves[k], source.heard[k], source.vague[k]
-        for kind in range(KINDS):
-            new.block[k, kind] = old.block[k, kind]
         for c in range(3):
             target.hits[k, c] = source.hits[k, c]
     for j in range(len(source.slot)):
@@ -495,7 +488,7 @@ def hear(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
 
 @part
 def join(f: Filter, known: Model, guards: Guards, rows: Floats, vehicle: int, row: int) -> None:
-    """A newcomer is where the ego measures it; if a component lacks, its message will tell, else somewhere near."""
+    """Insert a member where the ego measures it, or, where a component is missing, somewhere near."""
     g, k = f.g, 1
     while f.vehicle[k] >= 0:
         k += 1

@@ -153,6 +153,19 @@ def remove(g: Gaussian, member: int, kind: int) -> None:
 
 
 @part
+def copy_gaussian(source: Gaussian, target: Gaussian) -> None:
+    """Copy the vectors; the target has room for as many members or more."""
+    for i in range(3 * source.vectors[0]):
+        target.x[i] = source.x[i]
+        for j in range(3 * source.vectors[0]):
+            target.p[i, j] = source.p[i, j]
+    target.vectors[0] = source.vectors[0]
+    for i in range(len(source.owner)):
+        target.owner[i] = source.owner[i]
+        target.block[i // KINDS, i % KINDS] = source.block[i // KINDS, i % KINDS]
+
+
+@part
 def shift(g: Gaussian, i: int, j: int, factor: float) -> None:
     """x_i += factor x_j of two vectors by their first numbers; of one vector x_i *= 1 + factor."""
     n = 3 * g.vectors[0]
@@ -189,8 +202,8 @@ def expect(h: Rows, c: int, z: float, variance: float) -> None:
 @part
 def weight(q: float, gate: float) -> float:
     """Share of its information that a number keeps: 1 / (inflation of the innovation's covariance)."""
-    if gate == 0.0 or q <= gate:
-        return 1.0
+    if gate == 0.0 or not q > gate:
+        return 1.0 + 0.0 * q
     return gate / q * (0.01 if q > REJECTED * gate else 1.0)
 
 

@@ -149,7 +149,7 @@ def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
     """
     from scipy.sparse import coo_array
 
-    from ...kernels.graphs.multifrontal import Fronts, structures, supernodes
+    from ...kernels.graphs.multifrontal import Fronts, postorder, structures, supernodes
 
     name, begin, width = np.unique(group, return_index=True, return_counts=True)
     n, last = len(name), begin + width - 1
@@ -161,6 +161,8 @@ def analysed(indptr: Ints, indices: Ints, group: Ints) -> Any:
     pattern = coo_array((np.ones(2 * len(row)), both), shape=(n, n)).tocsr()
     both_ways = pattern.indptr.astype(np.int64), pattern.indices.astype(np.int64)
     order = minimum_degree(*both_ways)
+    parent, at, _ = structures(*both_ways, order)
+    order = order[postorder(parent, np.diff(at))]
     parent, at, below = structures(*both_ways, order)
     head = supernodes(parent, at, below, width[order])
     first = np.concatenate([[0], np.cumsum(width[order])])

@@ -65,15 +65,12 @@ def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
     """
     d, angles = problem.dimension, problem.space.angles
     matrices = sum(len(f.nodes) for f in problem.factors if f.kind in ("pose_chordal", "relative_pose_chordal"))
-    spare = sum(numbers_measured(factor) for factor in problem.factors) - (d * d - angles) * matrices - unknowns
+    spare = (
+        sum(f.size * int(np.count_nonzero(f.informative)) for f in problem.factors)
+        - (d * d - angles) * matrices
+        - unknowns
+    )
     spare += sum(int(np.isfinite(side).sum()) for c in problem.constraints for side in (c.lower, c.upper))
     turns = matrices - len({*problem.poses} - {*problem.fixed}) if matrices and d == 2 else 0
     mean = 0.5 * (max(spare, 0) + max(turns, 0))
     return mean, mean + max(turns, 0)
-
-
-def numbers_measured(factor: Factor) -> int:
-    """How many of a factor's numbers have a finite standard deviation."""
-    if factor.std is None:
-        return factor.size * int(np.count_nonzero(factor.informative))
-    return int(np.isfinite(factor.std).sum()) * (len(factor.nodes) // len(factor.std))

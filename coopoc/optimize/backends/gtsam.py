@@ -32,7 +32,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
         import gtsam
 
         posed, parts = which_turn(problem), forms(problem)
-        graph, used, custom = graph_of(problem, parts), 0, sum(isinstance(part, str) for part in parts)
+        graph, used, custom = graph_of(problem, parts), 0, parts.count(None)
         for _ in range(STARTS):
             params = gtsam.LevenbergMarquardtParams()
             params.setMaxIterations(max_iterations - used)

@@ -48,31 +48,27 @@ class Part(NamedTuple):
     root: Floats
 
 
-Form: TypeAlias = list[Part] | str
-"""The parts of a factor, or why it has none."""
+Form: TypeAlias = list[Part] | None
+"""The parts of a factor, None if GTSAM has none with its objective."""
 
 
 def forms(problem: Problem) -> list[Form]:
-    """Of each factor of a single problem its parts in GTSAM, or why it has none."""
+    """Of each factor of a single problem its parts in GTSAM."""
     return [_form(problem, factor) for factor in problem.factors]
 
 
 def _form(problem: Problem, factor: Factor) -> Form:
     if factor.kind not in FORMS:
-        return "GTSAM has no such factor"
+        return None
     kinds = [(POINT,) * factor.nodes.shape[1]]
     if problem.poses:
         kinds = sorted(set(map(tuple, np.array(which_turn(problem))[factor.nodes].tolist())))
     shared = factor.std is not None and len(factor.std) == 1
     parts = FORMS[factor.kind](factor, factor.root[:1] if shared else factor.root, problem.dimension)
-    if isinstance(parts, str):
-        return parts
-    if len(parts) > 1 and factor.loss is not None:
-        return "it takes two factors in GTSAM, which no robust loss can join"
-    lacking = [row for row in kinds for part in parts if row not in part.names and row[::-1] not in part.names]
-    if lacking:
-        return f"GTSAM has none from {' to '.join('a pose' if turns else 'a point' for turns in lacking[0])}"
-    return parts
+    if parts is None or (len(parts) > 1 and factor.loss is not None):  # which no robust loss can join
+        return None
+    known = all(row in part.names or row[::-1] in part.names for row in kinds for part in parts)
+    return parts if known else None
 
 
 def pose_of(d: int, x: Floats) -> Any:
@@ -107,11 +103,12 @@ def _range(factor: Factor, W: Floats, d: int) -> Form:
 
 
 def _bearing(factor: Factor, W: Floats, d: int) -> Form:
-    """Of a bearing alone, or of range and bearing; GTSAM's order is the other, in which a diagonal W stays one."""
-    if d == 3 and factor.kind == "bearing":
-        return "GTSAM's bearing in space has no forward axis"
+    """Of a bearing alone, or of range and bearing; GTSAM's order is the other, in which a diagonal W stays one.
+
+    In space GTSAM weighs a bearing by its tangent plane, not by azimuth and inclination, and has no forward axis.
+    """
     if d == 3:
-        return "GTSAM weighs a bearing in space by its tangent plane, not by azimuth and inclination"
+        return None
     name = "Bearing" if factor.kind == "bearing" else "BearingRange"
 
     def arguments() -> Iterable[tuple[Any, ...]]:
@@ -129,11 +126,9 @@ def _relative_position(factor: Factor, W: Floats, d: int) -> Form:
 
 def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
     """GTSAM's chord T_j - T_i Z for the translation, its geodesic for the rotation alone."""
-    if _coupled(W, d):
-        return "its std must not couple position and rotation"
-    chord = _chord(W[:, :d, :d], {0: np.arange(d)}, factor.z, d)
-    if isinstance(chord, str):
-        return chord
+    chord = None if _coupled(W, d) else _chord(W[:, :d, :d], {0: np.arange(d)}, factor.z, d)
+    if chord is None:
+        return None
     size, first = (3, 2) if d == 2 else (6, 0)
     root = np.zeros((len(W), size, size))
     root[:, first : first + size - d, first : first + size - d] = W[:, d:, d:]
@@ -167,14 +162,14 @@ def _chord(W: Floats, columns: dict[int, Any], z: Floats, d: int) -> Form:
         expected[:, rows, rows] = own[:, None]
     scale = np.sqrt(np.einsum("mii->mi", information))
     if (np.abs(information - expected) > SAME * scale[:, :, None] * scale[:, None, :]).any():
-        return "it needs one std in all directions of the body" + (" and of each axis" if len(columns) > 1 else "")
+        return None
     root = np.sqrt(weight)[:, :, None] * np.eye(weight.shape[1])
     return [Part({(POSE, POSE): f"FrobeniusBetweenFactorPose{d}"}, _poses(d, z), root)]
 
 
 def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:
     if _coupled(W, d):
-        return "its std must not couple position and rotation"
+        return None
     turned = Space(d, has_rotation=True).rotation(factor.z)
 
     def rotations() -> Iterable[tuple[Any, ...]]:
@@ -259,7 +254,7 @@ def graph_of(problem: Problem, parts: Sequence[Form]) -> Any:
     import gtsam
 
     graph, posed = gtsam.NonlinearFactorGraph(), which_turn(problem)
-    lacking = [factor for factor, form in zip(problem.factors, parts, strict=True) if isinstance(form, str)]
+    lacking = [factor for factor, form in zip(problem.factors, parts, strict=True) if form is None]
     callbacks = Callbacks(problem, lacking)
     for k, factor in enumerate(lacking):
         model = _robust(gtsam.noiseModel.Unit.Create(factor.size), factor.loss)
@@ -267,7 +262,7 @@ def graph_of(problem: Problem, parts: Sequence[Form]) -> Any:
             nodes = factor.nodes[row].tolist()
             graph.add(gtsam.CustomFactor(model, nodes, callbacks.of(k, row, nodes)))
     for factor, form in zip(problem.factors, parts, strict=True):
-        for part in () if isinstance(form, str) else form:
+        for part in form or ():
             models = _models(part.root, factor)
             for nodes, given, model in zip(factor.nodes.tolist(), part.arguments(), models, strict=True):
                 if tuple([posed[i] for i in nodes]) not in part.names:

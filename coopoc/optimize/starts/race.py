@@ -38,8 +38,9 @@ def race(
 
     All starts are tried, and those whose costs are near the least go on (ROUNDS), unless one leads by steps of which
     none was refused and whose promises came true by half and more, to a cost which the assumed noise explains, and to
-    an end that is `unwound`. Where the noise does not explain the end, the steps to it had trouble and no second start
-    led there, the growing start is tried, too, and where the noise still does not, the relaxation.
+    an end that is `unwound` or to which another led as smoothly. Where the noise does not explain the end and the steps
+    to it had trouble, the growing start is tried, too, unless a second start led there, and then the relaxation. Where
+    the steps went straight the noise is taken as stated too small, which a note of the Solution leaves open.
 
     Args:
         problem: at any start.
@@ -48,7 +49,7 @@ def race(
         relaxed: problem -> x0, "relaxed", of one that is tried last; None where it would take too long.
         unwound: x -> whether no other minimum of a lower cost is to be feared.
     """
-    system, tried, taken = sparse(problem), {}, 0
+    system, tried, taken, calm = sparse(problem), {}, 0, list[float]()
     mean, variance = expected(problem, system.size)
     limit, straight = mean + EXCESS * np.sqrt(variance), set[str]()
     for name, start in starts.items():
@@ -56,7 +57,9 @@ def race(
         end = arrive(system, x, STEPS, TOLERANCE)
         tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
         if smooth(end):
-            if tried[name][0] <= limit and unwound(end.x):
+            cost, calm = tried[name][0], [*calm, tried[name][0]]
+            alike = sum(abs(cost - other) <= SAME * cost for other in calm) > 1
+            if cost <= limit and (alike or unwound(end.x)):
                 return problem.replace_unchecked(x0=frozen(end.x)), Search(name, taken)
             straight |= {name} if end.converged else set()
     reached = {name: cost for name, (cost, _) in tried.items()}
@@ -82,7 +85,7 @@ def race(
             end = arrive(system, grown, MORE, TOLERANCE)
             taken += steps + end.iterations
             name, x = ("incremental", end.x) if system.cost(end.x) < (1.0 - SAME) * system.cost(x) else (name, x)
-    if relaxed is not None and system.cost(x) > limit:
+    if relaxed is not None and name not in straight and system.cost(x) > limit:
         end = arrive(system, relaxed(problem.replace_unchecked(x0=frozen(x))), MORE, TOLERANCE)
         taken += end.iterations
         name, x = ("relaxed", end.x) if system.cost(end.x) < (1.0 - SAME) * system.cost(x) else (name, x)
