@@ -128,8 +128,8 @@ print(f"innovation {found['innovation_m'].mean():.2f} m, NIS {found['nis'].mean(
 # %% [markdown]
 # ## The same by commands
 #
-# With the log and `truth.csv` in one folder, named in place of `log.csv`, these print the summary, test the units against the geometry, and write
-# tables with intervals and a report with the map and the errors over time:
+# With the log and `truth.csv` in one folder, named in place of `log.csv`, these print the summary, test units against
+# the geometry, and write tables with intervals and a report with the map and the errors over time:
 #
 #     coopoc data check "log.csv?columns=t:zeit,vehicle:auto"
 #     coopoc run side_by_side --data "log.csv?columns=t:zeit,vehicle:auto"
