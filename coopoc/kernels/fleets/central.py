@@ -8,8 +8,8 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
-from ..compiling.small import add, from_upper, load, store, subtract
-from .graph import MATRIX, VECTOR, Assumed, Matrix, Measured, Pairs, at, connect, pair_at_agreement
+from ..compiling.small import add, add_diagonal, from_upper, load, store, subtract
+from .graph import MATRIX, VECTOR, Assumed, Matrix, Measured, Pairs, at, connect, gate_pair, pair_at_agreement
 
 UNKNOWN = 1e6
 """m^2, variance of a vehicle before its first fix, where relative measurements are linearised."""
@@ -42,6 +42,10 @@ def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed) -> tuple[Floa
                 between = difference(P, i, j)
                 for run in range(runs):
                     vector = subtract(load(x[run, t, j], 0, VECTOR), load(x[run, t, i], 0, VECTOR))
+                    if assumed.robust:
+                        away, joined = (not present[i]) + (not present[j]), at(assumed.fix, 0, t, i)[0] - UNKNOWN
+                        known = add_diagonal(between, (away * joined, away * joined, away * joined))
+                        gate_pair(vector, known, k, pairs, measured.relative[run], assumed)
                     weight, eta = pair_at_agreement(vector, between, k, pairs, measured.relative[run], assumed)
                     store(information[k - pairs.start[t]], 0, weight)
                     store(total[run], i, subtract(load(total[run], i, VECTOR), eta))

@@ -256,8 +256,6 @@ def pair_at_agreement(
     They agree at v + (I + C W)^-1 C eta, C the covariance of the believed vector v. A good belief decides alone: then
     the weight does not depend on the noise, as it does at the measured geometry. A poor one is ignored.
     """
-    if assumed.robust:
-        gate_pair(vector, cov, k, pairs, relative, assumed)
     information, eta = pair(vector, k, pairs, relative, assumed, True)
     if len(assumed.std) == 0:
         return information, eta
@@ -308,6 +306,8 @@ def linearise(
             i, j = pairs.first[k], pairs.second[k]
             vector = subtract(load(x, j, VECTOR), load(x, i, VECTOR))
             cov = add(load(own, i, MATRIX), load(own, j, MATRIX))
+            if assumed.robust:
+                gate_pair(vector, cov, k, pairs, measured.relative[run], assumed)
             information, eta = pair_at_agreement(vector, cov, k, pairs, measured.relative[run], assumed)
             for head, tail, sign in ((i, j, -1.0), (j, i, 1.0)):
                 edges.head[count], edges.tail[count] = head, tail

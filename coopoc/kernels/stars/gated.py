@@ -44,7 +44,8 @@ def gates_within(most: int) -> Gates:
 
 @inner
 def carry(star: Star, gates: Gates, flat: float, n: int, old: int) -> None:
-    """Bring what is remembered forward to this star; `flat` m^2 is the variance of a member that joins."""
+    """Bring what is remembered forward to this star; `flat` m^2 is the variance of a member that joins, and the ego
+    begins at its fix."""
     for k in range(old):
         store(gates.last, k, load(gates.state, k, STATE))
     own = load(star.motion, PROCESS, ROW)
@@ -53,6 +54,7 @@ def carry(star: Star, gates: Gates, flat: float, n: int, old: int) -> None:
         before = load(gates.last, max(place, 0), STATE)
         if place < 0:
             before, process = zeros(own[0], STATE), (0.0 * own[0] + flat, 0.0 * own[0] + flat, 0.0 * own[0] + flat)
+            process = load(star.motion, VARIANCE, ROW) if k == 0 else process
         elif k > 0:
             process = add(process, own)
         store(gates.state, k, (*add_diagonal(before[:9], process), *before[9:]))
