@@ -7,6 +7,7 @@
 # make fuzz    every text reader under coverage-guided fuzzing, MINUTES each (default 10); finds go to build/fuzz
 # make docs    the site in build/site, tutorials executed; a warning is an error
 # make benchmark   every benchmark, its ratios against benchmarks/baseline.json
+# make release   wheel, sdist and the list of what they need (CycloneDX) in dist/, built twice and compared
 # make clean   forget the environment (results in runs/ stay)
 #
 # TORCH_INDEX: where the package index serves torch's CUDA build (several GB; it works, too), name an index of CPU builds:
@@ -26,7 +27,7 @@ QUICK := $(patsubst %,tests/test_%.py,world misuse star_filters kernels_vectors 
 
 LOWER := build/lower
 
-.PHONY: paper test test-quick test-slow test-bounds test-lower fuzz docs benchmark help clean
+.PHONY: paper test test-quick test-slow test-bounds test-lower fuzz docs benchmark release help clean
 
 paper: $(READY)
 	$(VENV)/bin/coopoc paper --out runs/paper --jobs $(JOBS)
@@ -65,6 +66,21 @@ docs: $(VENV)/.ready-docs
 help:
 	@sed -n 's/^# \(make [a-z-]* .*\)/\1/p' Makefile
 
+# The same commit gives the same bytes: times are the commit's, and the sdist is packed anew, as setuptools keeps those of
+# the files.
+release: export SOURCE_DATE_EPOCH := $(shell git log -1 --format=%ct)
+release: $(READY)
+	$(PIP) build cyclonedx-bom setuptools wheel
+	rm -rf dist build/first build/lib
+	for out in build/first dist; do \
+		$(VENV)/bin/python -m build --no-isolation --outdir $$out . && rm -rf build/lib build/bdist.* && cd $$out && \
+		tar xzf *.tar.gz && name=$$(basename *.tar.gz .tar.gz) && tar --sort=name --mtime=@$$SOURCE_DATE_EPOCH --owner=0 \
+		--group=0 --numeric-owner --format=ustar -cf - $$name | gzip -9n > $$name.tar.gz && rm -r $$name && cd $(CURDIR) || exit 1; \
+	done
+	cd dist && sha256sum * | tee SHA256SUMS && cd ../build/first && sha256sum -c ../../dist/SHA256SUMS
+	$(VENV)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --of JSON \
+		-o dist/coopoc.cdx.json $(VENV)/bin/python
+
 benchmark: $(VENV)/.ready-dev
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py --gate
 
@@ -75,6 +91,8 @@ $(READY): pyproject.toml constraints.txt
 	@echo "Installing the pinned packages into $(VENV): some minutes the first time." >&2
 	$(PIP) setuptools wheel torch
 	$(PIP) --no-build-isolation --editable '.[learned]'
+	@echo 'import sys; sys.meta_path.sort(key=lambda f: "editable___coopoc" not in getattr(f, "__module__", ""))' > \
+		"$$($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/coopoc-first.pth"
 	@touch $(READY)
 
 $(VENV)/.ready-dev: $(READY)

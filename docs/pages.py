@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import html
 import io
 import re
@@ -87,12 +88,14 @@ def on_page_content(content: str, page: Page, **_: Any) -> str:
     Raises:
         PluginError: a link to no page or heading, or a formula that MathML cannot show.
     """
-    content = FORMULA.sub(_formula, content)
+    content = STDERR.sub("", FORMULA.sub(_formula, content))
     if not page.file.src_uri.endswith(".py"):
         return content  # mkdocs checks the links of pages
     return TUTORIAL_LINK.sub(_address, content)
 
 
+STDERR = re.compile(r'<div class="jp-RenderedText[^>]*vnd\.jupyter\.stderr[^>]*>\s*<pre>.*?</pre>\s*</div>', re.DOTALL)
+"""Notices of kernels that compile, and progress."""
 TUTORIAL_LINK = re.compile(r'href="\.\./([\w/]+)\.md(?:#([\w-]+))?"')
 
 
@@ -132,17 +135,17 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 def _methods() -> Iterator[tuple[str, str | bytes]]:
     """A page for each method: what it is, what it sends, how it does on one drive."""
-    fleet = co.load_fleet("town10").between(0, STEPS)
-    sensors = co.Sensors.paper_scenario2()
+    fleet, sensors = co.load_fleet("town10").between(0, STEPS), co.Sensors.paper_scenario2()
     everyone = co.observe(fleet, sensors, co.V2X(NEIGHBOURS), runs=RUNS, seed=0)
     bounds = dict(_bounds(fleet, sensors))
     solo = _error(co.Kalman("nominal")(everyone, [EGO]), fleet)
-    table = _rows((DOCS / "methods.md").read_text())
+    page = (DOCS / "methods.md").read_text()
+    table, failures = _rows(page), dict(re.findall(r"^\| `([\w-]+)` \| ([^|]+) \|$", page, flags=re.MULTILINE))
     lines = []
     for name, make in METHODS.items():
         method = make("nominal")
         kind, look = type(method), style.look(name)
-        track = method(everyone, [EGO])
+        said, track = _example(name)
         bound = "fleet, smoothing" if name == "batch-smoother" else "fleet" if name in WHOLE_FLEET else "star"
         curves = (solo, _error(track, fleet), bounds[bound if method.cooperative else "solo"])
         yield f"methods/{name}.png", _picture(fleet.t, curves, look, bound if method.cooperative else "solo")
@@ -152,6 +155,7 @@ def _methods() -> Iterator[tuple[str, str | bytes]]:
             f"- **Does:** {what}",
             f"- **Sends per step:** {sends or 'nothing'}{f' ({size} B payload)' if size and ' B' not in sends else ''}",
             f"- **Covariance:** {covariance}",
+            f"- **Fails when:** {failures[name]}",
             f"- **RT-LE in the picture:** {_rms(track, fleet):.2f} m; solo Kalman filter {_root_mean(solo):.2f} m",
         ]
         notes = [f"- {note}" for note in track.notes]
@@ -165,6 +169,7 @@ def _methods() -> Iterator[tuple[str, str | bytes]]:
                     "",
                     *facts,
                     "",
+                    *("```python", EXAMPLE.format(name=name), "```", "", "```", said.rstrip(), "```", ""),
                     f"![Error of {look.label} over time]({name}.png)",
                     "",
                     f"Root mean square error of one ego over {RUNS} noise draws, `town10`, scenario 2, "
@@ -181,6 +186,26 @@ def _methods() -> Iterator[tuple[str, str | bytes]]:
         lines.append(f"| [{look.label}]({name}.md) | `{name}` | {what} | {_rms(track, fleet):.2f} |")
     head = ["# Each method", "", "| method | name | what it does | RT-LE [m] |", "|---|---|---|---|"]
     yield "methods/index.md", "\n".join([*head, *lines, ""])
+
+
+EXAMPLE = """import coopoc as co
+from coopoc.plugins import find
+
+fleet = co.load_fleet("town10").between(0, 200)
+sensors, v2x = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=4)
+recording = co.observe(fleet, sensors, v2x, runs=10, seed=0)
+method = find("coopoc.methods", "{name}")("nominal")
+track = method(recording, egos=[24])
+print(f"{{co.rt_le(track, fleet).mean():.2f}} m, {{track.received_bytes.mean() / 20:.0f}} B/s received")"""
+"""Of every method; it is run when the site is built."""
+
+
+def _example(name: str) -> tuple[str, Any]:
+    """What the example prints, and its Track."""
+    out, names = io.StringIO(), dict[str, Any]()
+    with contextlib.redirect_stdout(out):
+        exec(EXAMPLE.format(name=name), names)
+    return out.getvalue(), names["track"]
 
 
 ORACLES = {

@@ -187,9 +187,14 @@ def test_no_figure_of_the_gallery_hides_a_line_or_shows_one_below_its_bound(file
                     a, b = (panel.transData.transform(line.get_xydata())[:, 1] for line in (first, second))
                     apart = np.abs(a - b).max() * 72 / panel.figure.dpi > first.get_linewidth() / 2
                     assert apart or any(" = " in text for text in texts), (first.get_color(), second.get_color())
-            for bound in bounds:
+            pasts = [line for line in lines if line.get_color() == "black" and line.get_linestyle() == ":"]
+            sums = {look("cooperative-filter").color: pasts}  # its messages bring the past of newcomers
+            for level in (line for line in panel.lines if line.get_color() == "black" and _across(line, panel)):
+                marks = [y for line in panel.lines if not _across(line, panel) for y in line.get_ydata()]
+                assert not marks or min(marks) > min(level.get_ydata()) * (1 - SAMPLED), panel.get_title()
+            for bound in (*bounds, *pasts):
                 below = dict(zip(bound.get_xdata(), bound.get_ydata(), strict=True))
-                for line in lines:
+                for line in [line for line in lines if bound in (sums.get(line.get_color()) or bounds)]:
                     for x, y in zip(line.get_xdata(), line.get_ydata(), strict=True):
                         top = max([y, *_tops(panel, line, x)])
                         assert x not in below or top > below[x] * (1 - SAMPLED), (panel.get_title(), x, y, below[x])
@@ -200,6 +205,11 @@ SAMPLED = 0.02
 """Share below a bound that the noise of some twenty runs explains."""
 WITHOUT_LINES = ("budget", "consistency", "convergence", "error_cdf", "learned_gains")
 """Studies whose figures show points, or numbers that are no reference values."""
+
+
+def _across(line: Any, panel: Axes) -> bool:
+    """Whether a line is a level across the panel, with no places of its own."""
+    return bool(line.get_transform() is not panel.transData and line.get_linestyle() != "-")
 
 
 def _tops(panel: Axes, line: Any, x: float) -> list[float]:
