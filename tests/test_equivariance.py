@@ -17,7 +17,7 @@ NOISE = co.Sensors(
     gnss_std=(1.5, 1.5, 2.5), velocity_reading="speed", azimuth_std=0.05, inclination_std=0.05, yaw_rate_std=0.02
 )
 CHANNEL = co.V2X(max_neighbours=4, radius=60.0, loss=0.2, latency=0.1)
-NEAR = {"qcqp-relaxation": 2e-4, "mhe": 2e-4}
+NEAR = {"mhe": 2e-4}
 """m, where an iteration or a cone solver stops at its own tolerance, of 0.1 mm and less; 1e-6 elsewhere."""
 AXIS = ("kalman-adaptive",)
 """Methods that estimate a variance for each axis, and so know directions."""
@@ -88,9 +88,7 @@ def assert_equivariant(
 
 
 @pytest.mark.parametrize("change", CHANGES)
-@pytest.mark.parametrize(
-    "name", [pytest.param(name, marks=pytest.mark.slow) if name == "qcqp-relaxation" else name for name in METHODS]
-)
+@pytest.mark.parametrize("name", METHODS)
 def test_every_method_follows_the_world(name: str, change: str, crossing: co.Fleet) -> None:
     """The law itself is the reference: the world has no preferred origin, direction, side or numbering."""
     if name in AXIS and change == "rotation":

@@ -9,7 +9,7 @@ import pytest
 from conftest import textbook
 from filterpy.kalman import KalmanFilter
 
-from coopoc import GNSS, V2X, Fleet, InputError, JointFilter, Kalman, Method, NoiseModel, Sensors, observe
+from coopoc import GNSS, V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
 from coopoc.methods.noise_model import resolve
@@ -17,21 +17,16 @@ from coopoc.methods.noise_model import resolve
 S2 = Sensors.paper_scenario2()
 SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
 COVARIANCES = {f"{name}-{noise}": (name, noise) for name in METHODS for noise in ("identity", "nominal")}
-SNAPSHOTS = {"gnss", "qcqp-relaxation"}
+SNAPSHOTS = {"gnss"}
 """Methods without a memory: alone they give the fix."""
 OWN = {"kalman-adaptive"}
 """Alone neither a Kalman filter nor a fix: another noise model."""
 
 
-def made(name: str, noise: str) -> tuple[Method, int]:
-    """A method and the number of steps to run it: semidefinite programmes take their time."""
-    return METHODS[name](noise), 10 if name == "qcqp-relaxation" else 40
-
-
 @pytest.mark.parametrize(("name", "noise"), COVARIANCES.values(), ids=COVARIANCES)
 def test_zero_noise_gives_zero_error(name: str, noise: str, crossing: Fleet) -> None:
-    method, steps = made(name, noise)
-    fleet = crossing.between(0, steps)
+    method = METHODS[name](noise)
+    fleet = crossing.between(0, 40)
     recording = observe(fleet, SILENT, V2X(max_neighbours=7, radius=200.0), assumed=S2)
     assert errors(method(recording, [0, 3]), fleet).max() < 1e-6
 
@@ -39,8 +34,8 @@ def test_zero_noise_gives_zero_error(name: str, noise: str, crossing: Fleet) -> 
 @pytest.mark.parametrize(("name", "noise"), COVARIANCES.values(), ids=COVARIANCES)
 def test_a_run_and_a_step_know_nothing_of_others(name: str, noise: str, crossing: Fleet) -> None:
     """One run is the first of five, and a short drive the beginning of a long one: estimates are causal."""
-    method, steps = made(name, noise)
-    fleet, channel = crossing.between(0, steps), V2X(max_neighbours=4, loss=0.2, latency=0.1)
+    method = METHODS[name](noise)
+    fleet, channel = crossing.between(0, 40), V2X(max_neighbours=4, loss=0.2, latency=0.1)
     many = method(observe(fleet, S2, channel, runs=5), [0]).x
     assert method(observe(fleet, S2, channel, runs=1), [0]).x == pytest.approx(many[:1], abs=1e-8)
     if name != "batch-smoother":
@@ -52,8 +47,8 @@ def test_a_run_and_a_step_know_nothing_of_others(name: str, noise: str, crossing
 @pytest.mark.parametrize(("name", "noise"), COVARIANCES.values(), ids=COVARIANCES)
 def test_without_messages_it_is_the_solo_method(name: str, noise: str, channel: V2X, crossing: Fleet) -> None:
     """The Kalman filter with its covariance, or the fix; flat priors of positions weigh 1e-6 of a fix."""
-    method, steps = made(name, noise)
-    recording = observe(crossing.between(0, steps), S2, channel, runs=3)
+    method = METHODS[name](noise)
+    recording = observe(crossing.between(0, 40), S2, channel, runs=3)
     track = method(recording, [0, 1])
     gates = name != "cooperative-filter" and getattr(method, "robust", False)  # whose gate of a fix is another one
     solo = Kalman(noise, robust=gates)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +17,8 @@ from coopoc.kernels.solo import FixNoise
 from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.methods.covariance_intersection import CovarianceIntersection
 from coopoc.methods.kalman import solo_filter
-from coopoc.methods.qcqp_relaxation import QCQPRelaxation
 from coopoc.methods.star import stars
+from coopoc.one_file import from_file
 from coopoc.world.inbox import inbox
 
 S2 = Sensors.paper_scenario2()
@@ -28,6 +30,7 @@ FILTERS = [
     CovarianceIntersection("identity"),
     replace(SPLIT, noise_model="identity"),
 ]
+QCQPRelaxation: Any = from_file(f"{Path(__file__).parents[1] / 'examples' / 'qcqp_relaxation.py'}:QCQPRelaxation")
 SNAPSHOTS = [QCQPRelaxation(), QCQPRelaxation("identity")]
 METHODS = [*FILTERS, *SNAPSHOTS]
 

@@ -12,9 +12,7 @@ import coopoc as co
 from coopoc.methods.catalogue import METHODS
 
 STEPS = 15
-ITERATIVE = ("qcqp-relaxation",)
-"""Methods that claim no accuracy beside an exact one: unfinished consensus, and points without weights."""
-COOPERATIVE = [name for name, make in METHODS.items() if make("nominal").cooperative and name not in ITERATIVE]
+COOPERATIVE = [name for name, make in METHODS.items() if make("nominal").cooperative]
 
 
 def in_line(count: int, gap: float, offset: float = 0.0) -> co.Fleet:

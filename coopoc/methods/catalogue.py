@@ -14,7 +14,6 @@ from .covariance_intersection import CovarianceIntersection
 from .decentralised import GaussianBeliefPropagation
 from .joint_filter import JointFilter
 from .kalman import GNSS, AdaptiveKalman, Kalman
-from .qcqp_relaxation import QCQPRelaxation
 from .road import RoadFilter
 from .sliding_window import FixedLagSmoother, MovingHorizon
 from .track import Method
@@ -34,7 +33,6 @@ METHODS: Mapping[str, Factory] = {
     "cooperative-filter": CooperativeFilter,
     "ci": CovarianceIntersection,
     "split-ci": partial(CovarianceIntersection, split=True, name="split-ci"),
-    "qcqp-relaxation": QCQPRelaxation,
     "gbp": GaussianBeliefPropagation,
     "central-filter": CentralFilter,
     "batch-smoother": BatchSmoother,

@@ -111,19 +111,3 @@ def stars(
             np.append(each > 0, box.fresh[:, here], axis=1) & known_position,
             recording.relative[:, box.link[here]],
         )
-
-
-def bridged(recording: Recording, known: NoiseModel) -> tuple[Floats, Floats]:
-    """All fixes (R, T, N, 3) m and their variances m^2, broadcastable to them; a missing one is the last one moved by
-    odometry, z_t = z_{t-1} + dt u_t, whose variance has grown by the process noise."""
-    x, variance = recording.gnss, np.ascontiguousarray(known.fix_variance(recording))
-    if recording.complete:
-        return x, variance
-    x, variance = x.copy(), np.broadcast_to(variance, x.shape).copy()
-    process, missing = np.broadcast_to(known.process_variance(recording), x.shape), np.isnan(x)
-    for t in range(1, x.shape[1]):
-        gap, moved = missing[:, t], recording.dt * recording.velocity[:, t]
-        x[:, t] = np.where(gap, x[:, t - 1] + moved, x[:, t])
-        variance[:, t] = np.where(gap, variance[:, t - 1] + process[:, t], variance[:, t])
-    x.flags.writeable = False  # as the fixes are, for the same compiled code
-    return x, variance

@@ -1,4 +1,9 @@
-"""QCQPRelaxation: ranges and fixes of one step as a QCQP, its semidefinite relaxation, rounded and refined."""
+"""QCQPRelaxation: ranges and fixes of one step as a QCQP, its semidefinite relaxation, rounded and refined.
+
+    coopoc run side_by_side --set method=joint,examples/qcqp_relaxation.py:QCQPRelaxation max_neighbours=10 runs=2
+
+A method that optimises, in one file: docs/extend.md. It has no memory, and 4.5 m where fixes have 6.1 m.
+"""
 
 from __future__ import annotations
 
@@ -7,17 +12,17 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Ints
-from ..optimize.convex.relaxation import shor
-from ..optimize.model.problem import Problem
-from ..optimize.solve import solve
-from ..world.inbox import Inbox
-from ..world.recording import Recording
-from ..world.v2x import FIX_AND_VELOCITY, Message
-from .egos import Estimate, follow_egos
-from .noise_model import NoiseModel, resolve
-from .star import StarStep, bridged, stars
-from .track import Track, check_options
+from coopoc.arrays import Floats, Ints
+from coopoc.methods.egos import Estimate, follow_egos
+from coopoc.methods.noise_model import NoiseModel, resolve
+from coopoc.methods.star import StarStep, stars
+from coopoc.methods.track import Track, check_options
+from coopoc.optimize.convex.relaxation import shor
+from coopoc.optimize.model.problem import Problem
+from coopoc.optimize.solve import solve
+from coopoc.world.inbox import Inbox
+from coopoc.world.recording import Recording
+from coopoc.world.v2x import FIX_AND_VELOCITY, Message
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,3 +119,19 @@ def bridging_note(recording: Recording) -> tuple[str, ...]:
     share = 100 * (np.isnan(recording.gnss) & driving).sum() / driving.sum()
     note = f"{share:.0f} % of the fixes are missing: the last one is brought forward with the velocity"
     return () if recording.complete else (note,)
+
+
+def bridged(recording: Recording, known: NoiseModel) -> tuple[Floats, Floats]:
+    """All fixes (R, T, N, 3) m and their variances m^2, broadcastable to them; a missing one is the last one moved by
+    odometry, z_t = z_{t-1} + dt u_t, whose variance has grown by the process noise."""
+    x, variance = recording.gnss, np.ascontiguousarray(known.fix_variance(recording))
+    if recording.complete:
+        return x, variance
+    x, variance = x.copy(), np.broadcast_to(variance, x.shape).copy()
+    process, missing = np.broadcast_to(known.process_variance(recording), x.shape), np.isnan(x)
+    for t in range(1, x.shape[1]):
+        gap, moved = missing[:, t], recording.dt * recording.velocity[:, t]
+        x[:, t] = np.where(gap, x[:, t - 1] + moved, x[:, t])
+        variance[:, t] = np.where(gap, variance[:, t - 1] + process[:, t], variance[:, t])
+    x.flags.writeable = False  # as the fixes are, for the same compiled code
+    return x, variance
