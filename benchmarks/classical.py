@@ -57,7 +57,7 @@ def filter_rows(recording: co.Recording) -> list[Row]:
     """The linear filter against filterpy's, run by run, and what the exact one costs more."""
     box = inbox(recording, 0, FIX_AND_VELOCITY)
     measured, assumed = measurements(recording, 0, box), assumptions(recording, KNOWN)
-    linear, exact = co.JointFilter(KNOWN, exact=False), co.JointFilter(KNOWN)
+    linear, exact = (co.JointFilter(KNOWN, exact=wish, robust=False) for wish in (False, True))  # as filterpy's
     drives = [peer_drive(recording, run) for run in range(2)]
     peer = np.stack([filterpy_drive(d) for d in drives])
     best = exact(recording, [0]).x[:, :, 0]
@@ -67,7 +67,7 @@ def filter_rows(recording: co.Recording) -> list[Row]:
         return Row(words, solves, call, away < 1e-9)
 
     def kernel(refine: bool) -> Any:
-        return run_filter(measured, assumed, refine)[0]
+        return run_filter(measured, assumed, refine, False)[0]
 
     def all_steps(method: co.JointFilter) -> Any:
         return method(recording, [0]).x[:, :, 0]
