@@ -105,6 +105,8 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     for name, there in FILES.items():
         if there.exists():
             (out / name).symlink_to(there)
+    for name in ("benchmarks", "examples"):
+        (out / name).symlink_to(ROOT / name)
     return out
 
 

@@ -206,7 +206,9 @@ def test_a_report_of_a_log_shows_its_paths_and_no_settings_of_simulated_noise(fo
         assert words in page
     log = co.read_log(folders / "with")
     (begin, end), (again, _) = log.recording.stretches("car2")
-    panel = next(axes for axes in paths.errors(results).figure.axes if axes.get_title() == "car2")
+    plot = paths.views(results, over_time=True)
+    assert plot is not None
+    panel = plot.figure.axes[1]
     drawn = {line.get_label(): line.get_xydata() for line in panel.lines}["_KF"]
     track = co.Kalman("nominal")(log.recording.between(begin, end), ["car2"])
     expected = np.linalg.norm(track.x[0, :, 0] - log.truth.position[begin:end, 2], axis=1)

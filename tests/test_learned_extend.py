@@ -60,5 +60,5 @@ def test_what_is_neither_recipe_nor_net_is_refused(folder: Path) -> None:
     assert recipe_of(NET).net == NET
     with pytest.raises(InputError, match="no Recipe and no net"):
         recipe_of("constant_gain.py:nn")
-    with pytest.raises(InputError, match="Did you mean split"):
-        recipe_of("splitt")
+    with pytest.raises(InputError, match="Did you mean fedroad"):
+        recipe_of("fedroads")

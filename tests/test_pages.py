@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
-HERE = ["README", "index", "optimize", "streaming", "studies", "learned"]
+HERE = ["README", "index", "methods", "optimize", "streaming", "studies", "learned"]
 HERE += ["federation", "budget", "robustness"]
 ELSEWHERE = {"extend": "test_extend.py", "your_data": "test_your_data.py"}
 """Pages whose blocks are files and commands, too."""
@@ -33,7 +33,7 @@ def blocks(page: str) -> list[tuple[str, str]]:
 def printed(page: str, folder: Path) -> str:
     (folder / "page.py").write_text("\n".join(code for code, _ in blocks(page)))
     flags = ["-W", "error", "-W", "ignore:'click.utils"]  # of a library that Flower imports
-    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / "examples")}
     done = subprocess.run(
         [sys.executable, *flags, "page.py"], cwd=folder, capture_output=True, text=True, env=environment
     )

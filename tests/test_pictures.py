@@ -102,12 +102,14 @@ NAMES = {
     "path": "../../etc/passwd",
     "formula": "=cmd|' /C calc'!A0",
     "formula behind a blank": " =1+1",
-    "line": "a\n\n# b",
-    "right to left": "a\u202egnp.exe",
-    "terminal": "a\x1b[2Jb",
     "hidden": "_a",
     "percent": "%s {0} {{ 7 * 7 }}",
 }
+
+
+UNPRINTABLE = {"line": "a\n\n# b", "right to left": "a\u202egnp.exe", "terminal": "a\x1b[2Jb"}
+"""Names that no vehicle may have, and any other text."""
+ALL = NAMES | UNPRINTABLE
 
 
 def controls(text: str) -> set[str]:
@@ -155,17 +157,24 @@ def test_pictures_show_names_as_text(kind: str, tmp_path: Path) -> None:
         assert shown in "".join(c for c in plain if c.isalnum() or c == "=")
 
 
+@pytest.mark.parametrize("kind", UNPRINTABLE)
+def test_no_vehicle_has_a_name_that_acts_on_a_terminal(kind: str) -> None:
+    still = np.zeros((2, 1, 3))
+    with pytest.raises(co.InputError, match="must be printable"):
+        co.Fleet((UNPRINTABLE[kind],), [0.0, 0.1], still, still)
+
+
 def cell(p: Params) -> list[Row]:
     return [{"run": run, "ego": p["name"], "rt_le_m": 1.0 + run} for run in range(2)]
 
 
 def test_pages_and_tables_show_names_as_text(tmp_path: Path) -> None:
     def table(results: Results) -> Table:
-        rows = tuple((name, 1.0, f"{name} [m]") for name in NAMES.values())
-        return Table(("Name", "RT-LE", r"$\input{x}$"), rows, " ".join(NAMES.values()), notes=tuple(NAMES.values()))
+        rows = tuple((name, 1.0, f"{name} [m]") for name in ALL.values())
+        return Table(("Name", "RT-LE", r"$\input{x}$"), rows, " ".join(ALL.values()), notes=tuple(ALL.values()))
 
-    grid = {"name": tuple(NAMES.values())}
-    study = Study("made", "What?\u202e", cell, grid, tables={"t": table}, limitations=tuple(NAMES.values()))
+    grid = {"name": tuple(ALL.values())}
+    study = Study("made", "What?\u202e", cell, grid, tables={"t": table}, limitations=tuple(ALL.values()))
     assert run_study(study, tmp_path, progress=False).failed == 0
     folder = tmp_path / "made"
     page = Page(report([folder], tmp_path / "report.html").read_text())
@@ -179,10 +188,10 @@ def test_pages_and_tables_show_names_as_text(tmp_path: Path) -> None:
     assert "\\input" not in made.to_latex()
     assert "Output written" in compiled(made.to_latex(), tmp_path)
     cells = [row[0] for row in csv.reader(io.StringIO(made.to_csv()))][1:]
-    assert len(cells) >= len(NAMES)
+    assert len(cells) >= len(ALL)
     assert not any(re.match(r"\s*[=+@-]", text) for text in cells)
     known = {path.name for path in tmp_path.rglob("*") if path.is_file()}
-    assert not any(name.strip("./") in known for name in NAMES.values())
+    assert not any(name.strip("./") in known for name in ALL.values())
 
 
 def test_a_solution_shows_nodes_factors_and_headings(seen: tuple[co.Fleet, co.Recording]) -> None:

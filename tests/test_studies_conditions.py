@@ -78,7 +78,7 @@ def test_what_is_wrong_harms_those_who_use_it(tmp_path: Path, short_town: str) -
         "data": short_town,
         "runs": 1,
         "egos": "1",
-        "method": "kalman,joint,bound",
+        "method": "kalman,lkf-sa,joint,bound",
         "outliers": ",fixes=0.05:0",
         "spoofed_share": "0.0,0.2",
         "spoofed_from_s": "0.0",
@@ -97,9 +97,9 @@ def test_what_is_wrong_harms_those_who_use_it(tmp_path: Path, short_town: str) -
         for title, case in (("wild", wild), ("spoofed", spoofed))
     }
     assert harm["kalman", "spoofed"] == 1
-    assert harm["joint", "spoofed"] > 3
-    assert min(harm["kalman", "wild"], harm["joint", "wild"]) > 1.05
-    assert 1 < harm["bound", "spoofed"] < harm["joint", "spoofed"]
+    assert harm["lkf-sa", "spoofed"] > 3 > 1.5 > harm["joint", "spoofed"]
+    assert min(harm["kalman", "wild"], harm["lkf-sa", "wild"]) > 1.02
+    assert 1 < harm["bound", "spoofed"] < harm["lkf-sa", "spoofed"]
     assert 1 < harm["bound", "wild"] < 1.2
     assert "told what is wrong" in (tmp_path / "robustness" / "tables" / "rt_le.md").read_text()
 

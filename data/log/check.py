@@ -180,7 +180,9 @@ def _filtered(log: Log) -> Check:
         parts = [(0, steps, PoseFilter("solo", gate=GATE, begin=begin)(rec, _moving(rec)))]
     else:
         stretches = [(column, *stretch) for column in range(vehicles) for stretch in rec.stretches(column)]
-        parts = [(first, last, Kalman()(rec.between(first, last), [column])) for column, first, last in stretches]
+        parts = [
+            (first, last, Kalman(robust=False)(rec.between(first, last), [column])) for column, first, last in stretches
+        ]
     for first, last, track in parts:
         there, columns, part = slice(first, last), list(track.egos), rec.between(first, last)
         squares = normalised_innovations(track, part)

@@ -35,7 +35,7 @@ class RoadConstants(Gain):
     Args:
         seed: without effect, every net has this argument; the start is the same for each.
 
-    >>> RoadConstants().method("road").errors.gate
+    >>> round(RoadConstants().method("road").errors.gate, 6)
     2.0
     """
 

@@ -111,6 +111,7 @@ VIEWS = json.dumps(
         "recipe": {},
         "missing": {},
         "limitations": ["One town."],
+        "idle": ["seed"],
         "minutes": 1.5,
     },
     indent=1,

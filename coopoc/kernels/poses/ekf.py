@@ -150,10 +150,11 @@ def update_jointly(
             left_out[k - begin] = UNPLACED
     if options.passes > 1:
         poses.prior_x[:], poses.prior_cov[:] = poses.x, poses.cov
+    cost = poses.totals[COST]  # of a pass: that of the last one is Laplace's approximation of the likelihood
     for again in range(options.passes):
         poses.linear[:] = poses.x
         if again:
-            poses.x[:], poses.cov[:] = poses.prior_x, poses.prior_cov
+            poses.x[:], poses.cov[:], poses.totals[COST] = poses.prior_x, poses.prior_cov, cost
         for k in range(begin, end):
             ends = (d * measured.ends[k, 0], d * measured.ends[k, 1])
             bits = add_relative(measured, noise, poses, ends, run, k, left_out[k - begin])

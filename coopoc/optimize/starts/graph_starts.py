@@ -203,7 +203,10 @@ def unwound(graph: Graph, x: Floats) -> bool:
     wound up by a whole one, as in the local minima of pose graphs; False where more than rotations may hide one."""
     if len(graph.ranges) or len(graph.relative_point) or len(graph.pose_prior) > 1:
         return False
-    edges, turned = graph.relative_pose, Space(graph.dimension, has_rotation=True).rotation(x)
+    edges = graph.relative_pose
+    if not len(edges):
+        return True
+    turned = Space(graph.dimension, has_rotation=True).rotation(x)
     gap = turned[edges.nodes[:, 1]] - turned[edges.nodes[:, 0]] @ edges.rotation
     sine = np.linalg.norm(gap, axis=(1, 2)) / np.sqrt(8.0)  # |R - S|_F = sqrt(8) sin(angle / 2)
     return bool(2.0 * np.arcsin(np.minimum(sine, 1.0)).sum() < np.pi)
