@@ -149,7 +149,7 @@ def cell(p: Params) -> list[Row]:
         return lineup.bound_rows(p)
     trial = scene.trial(p)
     if p["method"] == "kalman":
-        return rows_of({"rt_le_m": bounded_rt_le(Kalman(fitted(p)), *trial, LOST)}, trial[1])
+        return rows_of({"rt_le_m": bounded_rt_le(Kalman(fitted(p), robust=False), *trial, LOST)}, trial[1])
     training = tuple((name, value) for name, value in p.items() if name not in OF_THE_TEST)
     rows: list[Row] = []
     for seed, net in enumerate(trained(p["condition"], p["method"], training)):
