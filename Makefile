@@ -91,7 +91,7 @@ $(READY): pyproject.toml constraints.txt
 	@echo "Installing the pinned packages into $(VENV): some minutes the first time." >&2
 	$(PIP) setuptools wheel torch
 	$(PIP) --no-build-isolation --editable '.[learned]'
-	@echo 'import sys; sys.meta_path.sort(key=lambda f: "editable___coopoc" not in getattr(f, "__module__", ""))' > \
+	@echo 'import os, sys; "PYTHONPATH" in os.environ or sys.meta_path.sort(key=lambda f: "editable___coopoc" not in getattr(f, "__module__", ""))' > \
 		"$$($(VENV)/bin/python -c 'import sysconfig; print(sysconfig.get_path("purelib"))')/coopoc-first.pth"
 	@touch $(READY)
 

@@ -212,14 +212,21 @@ def intersect(star: Star, known: Assumptions, fusion: Fusion, n: int, old: int) 
             variance = scale(variance, inflation(q, FIX_GATE, hits))
         fixed = add_diagonal(nothing, (new / variance[0], new / variance[1], new / variance[2]))
     add_neighbours(star, known, fusion, x, n)
+    alone = inverse(add(fixed, source(fusion, 0, o + 1.0)[0]))
     w = best_weight(fusion, fixed, n, w)
-    total, eta, dependent = fixed, apply(fixed, subtract(fix, x)), nothing
-    for k in range(n):
-        s = w if k == 0 else 1.0 - w
-        information, derivative, _ = source(fusion, k, s)
-        total, dependent = add(total, information), add(dependent, scale(derivative, s))
-        eta = add(eta, apply(information, load(fusion.gap, k, ROW)))
-    cov = inverse(total)
+    for _ in range(2):
+        total, eta, dependent = fixed, apply(fixed, subtract(fix, x)), nothing
+        for k in range(n):
+            s = w if k == 0 else 1.0 - w
+            information, derivative, _ = source(fusion, k, s)
+            total, dependent = add(total, information), add(dependent, scale(derivative, s))
+            eta = add(eta, apply(information, load(fusion.gap, k, ROW)))
+        cov = inverse(total)
+        # A weight that is worse than none was lost to rounding, where without a fix all information is small.
+        worse = choose(trace(cov), trace(cov) - (1.0 + 1e-9) * trace(alone), o + 1.0)
+        if worse <= o:
+            break
+        w = choose(worse, o + 1.0, w)
     dependent = product(product(cov, dependent), cov)
     store(fusion.x, 0, add(x, apply(cov, eta)))
     store(fusion.cov, 0, cov)
@@ -253,6 +260,13 @@ def add_neighbours(star: Star, known: Assumptions, fusion: Fusion, x: Numbers, n
         store(fusion.used, k, (choose(o + NOWHERE - variance[0], counts, o),))
         store(fusion.gap, k, gap)
         add_source(fusion, k, scale(theirs, f), scale(noise, f))
+
+
+@inside
+def trace(a: Numbers) -> float:
+    """Of a 3 x 3 matrix."""
+    diagonal: float = a[0] + a[4] + a[8]
+    return diagonal
 
 
 @inside
