@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 from scipy.stats import chi2, linregress
 
-from coopoc.arrays import AnyArray, Floats, robust_std
+from coopoc.arrays import AnyArray, Bools, Floats, robust_std
 from coopoc.errors import InputError
 from coopoc.evaluate.metrics import dimensions, fix_innovations, normalised_innovations
 from coopoc.methods.kalman import Kalman
@@ -122,7 +122,7 @@ def together(log: Log) -> tuple[Log, str]:
         InputError: the vehicles share no two steps.
     """
     rec = log.recording
-    there = np.isfinite(rec.velocity[0, :, _moving(rec), 0]).all(axis=0)
+    there: Bools = np.isfinite(rec.velocity[0][:, _moving(rec), 0]).all(axis=1)
     first, last = max(stretches(there), key=lambda edge: edge[1] - edge[0], default=(0, 0))
     if last - first < 2 or not _moving(rec):
         hint = "Raise max_gap, give clock= where stamps differ, or leave out files of vehicles that are hardly there."
