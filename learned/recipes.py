@@ -217,7 +217,8 @@ def job_clients(job: Job, fleet: Drives) -> tuple[Client, ...]:
     what they measured: then the recipe's noise has no effect."""
     recipe, setting = job.recipe, job.setting
     if recipe.noise == ROADS and not isinstance(fleet, MeasuredDrives):
-        fleet, recipe = roads(fleet, setting.seed), replace(recipe, piece=max(recipe.piece, PIECE))
+        long = min(PIECE, len(fleet.t) // 3)  # errors last, and a drive holds two pieces at least
+        fleet, recipe = roads(fleet, setting.seed), replace(recipe, piece=max(recipe.piece, long))
     if isinstance(fleet, MeasuredDrives):
         return measured_clients(fleet, start=setting.start, piece=recipe.piece, split=recipe.split)
     noise: Any = recipe.noise if recipe.noise in get_args(Noise) else "static"

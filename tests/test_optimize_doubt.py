@@ -1,4 +1,4 @@
-"""Where an answer may be wrong the solution says so: its cost, what a loss rejects, its start, its solver."""
+"""Where an answer may be wrong the solution has a note: its cost, what a loss rejects, its start, its solver."""
 
 from __future__ import annotations
 

@@ -267,9 +267,9 @@ def true_cost(x: Floats, cov: Floats, true: Floats, fix: Floats | float = 0.0, d
     det = np.maximum(a * b - c * c, 1e-12)
     e, n = error[..., 0], error[..., 1]
     nees = (b * e * e - 2.0 * c * e * n + a * n * n) / det
-    surprise = np.where(there, 0.5 * np.log(det) + 3.0 * np.log1p(nees / 4.0), 0.0).sum(axis=-1) / count
+    misfit = np.where(there, 0.5 * np.log(det) + 3.0 * np.log1p(nees / 4.0), 0.0).sum(axis=-1) / count
     level = 0.5 * np.log((e * e + n * n).sum(axis=-1) / count + 1e-6)
-    return np.asarray(distance * level + (LIKELIHOOD if distance else 1.0) * surprise)
+    return np.asarray(distance * level + (LIKELIHOOD if distance else 1.0) * misfit)
 
 
 def louder(motion: MotionNoise, errors: RoadErrors) -> MotionNoise:

@@ -70,7 +70,7 @@ dict(zip(names, error.round(2).tolist(), strict=True))
 # %% [markdown]
 # ## An outlier
 #
-# The solution says so itself: its note compares the cost with what the stated noise explains. A robust loss discounts
+# The solution's note compares the cost with what the stated noise explains. A robust loss discounts
 # large residuals. With one that rejects, `solve` starts by graduated non-convexity (Yang et al., RA-L 2020), from least
 # squares with a loss that tightens; a measurement that ends with weight zero is an outlier. It still adds its truncated
 # loss, 3²/2 = 4.5, to the cost.

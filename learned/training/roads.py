@@ -18,7 +18,7 @@ from coopoc.world.v2x import V2X
 from .drives import MeasuredDrives
 
 WORLDS, PIECE = 6, 1500
-"""Worlds of each vehicle, and steps of a piece, at least: errors last."""
+"""Worlds of each vehicle, and steps of a piece where a drive holds three: errors last."""
 
 
 def roads(fleet: Fleet, seed: int = 0, worlds: int = WORLDS) -> MeasuredDrives:

@@ -141,7 +141,7 @@ class Oracle:
 
     def blank(self) -> dict[str, Any]:
         empty: dict[str, Any] = {
-            name: {} for name in ("last", "serves", "heard", "joined", "hits", "mean", "kept", "slot", "pace")
+            name: {} for name in ("last", "serves", "sent", "joined", "hits", "mean", "kept", "slot", "pace")
         }
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.guards.trust else {self.ego}
@@ -357,12 +357,12 @@ class Oracle:
 
     def lost(self, t: int) -> bool:
         s = self.state
-        heard = [j for j in s["members"] if j in s["last"]]
-        if any(j in s["trusted"] for j in heard):
+        held = [j for j in s["members"] if j in s["last"]]
+        if any(j in s["trusted"] for j in held):
             return False
         if self.ego in s["trusted"]:
             return bool(s["hits"]["fix"] >= 2 and t - s["joined"][self.ego] - s["hits"]["fix"] <= 1)
-        patience = 0.0 if len(heard) >= 2 else self.guards.lost
+        patience = 0.0 if len(held) >= 2 else self.guards.lost
         return bool((t - self.revoked[self.ego][1]) * self.seen.dt > patience)
 
     def contradicted(self, t: int, j: int) -> bool:
@@ -401,7 +401,7 @@ class Oracle:
             b.transform(("common",), {("common",): life.keep})
             b.noise(("common",), life.common * (1 - life.keep**2))
 
-    def hear(self, j: int, message: Sent | None, t: int) -> None:
+    def update_velocity(self, j: int, message: Sent | None, t: int) -> None:
         """A member whose newest message is not of now gets a velocity; that of a new message is used."""
         s, g, dt = self.state, self.guards, self.seen.dt
         b, tracked = s["belief"], ("v", j) in s["belief"].names
@@ -409,9 +409,9 @@ class Oracle:
             return
         if not tracked:
             b.add(("v", j), 0.0, 400.0)
-        elif s["heard"].get(j) == message.step:
+        elif s["sent"].get(j) == message.step:
             return
-        s["heard"][j] = message.step
+        s["sent"][j] = message.step
         r = message.process / dt**2 + (g.acceleration * (t - message.step) * dt) ** 2
         b.updates(np.array([b.row({("v", j): 1.0}, c) for c in range(3)]), message.velocity, r, g.fix_gate)
 
@@ -419,7 +419,7 @@ class Oracle:
         """The message, its velocity if need be replaced."""
         s, dt = self.state, self.seen.dt
         b = s["belief"]
-        self.hear(j, message, t)
+        self.update_velocity(j, message, t)
         if ("v", j) in b.names:
             b.noise(("v", j), (self.guards.acceleration * dt) ** 2)
             b.transform(("x", j), {("x", j): 1.0, ("v", j): dt})
@@ -451,8 +451,8 @@ class Oracle:
         gap = to_vector(relative) if np.isfinite(relative).all() else np.array([near, near, 0.1 * near])
         b.add(("x", j), b.x[b.at(("x", self.ego))] + gap, FLAT)
         s["vague"].add(j)
-        s["heard"].pop(j, None)
-        self.hear(j, message, t)
+        s["sent"].pop(j, None)
+        self.update_velocity(j, message, t)
         if j not in s["trusted"]:
             mean, variance = s["kept"].get(j, (np.zeros(3), np.full(3, self.guards.tau**2)))
             b.add(("b", j), mean, variance + self.life.own)

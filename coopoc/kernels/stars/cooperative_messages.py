@@ -240,7 +240,7 @@ def clone_position(f: Filter, k: int, back: float, changed: float) -> None:
 @part
 def wrong_on_average(f: Filter, known: Model, guards: Guards, k: int, q: float) -> bool:
     """Whether the mean of a vehicle's innovations, each clipped, is likelier with another error of its fixes than is
-    assumed; or, where that error is being estimated, whether the last one says so."""
+    assumed; or, where that error is being estimated, with the last one alone."""
     g, h, status, j = f.g, f.h, f.status, f.vehicle[k]
     mean, s = status[j, MEAN : MEAN + 3], h.square[0]
     status[j, COUNT] = count = min(status[j, COUNT] + 1.0, guards.window)

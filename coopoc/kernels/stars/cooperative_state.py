@@ -141,7 +141,7 @@ class Filter(NamedTuple):
         order: (slots,) members, nearest first: a gate depends on what was used before, not on how members are numbered.
         joined: (slots,) step at which the member joined.
         serves: (slots,) s for which a message's velocity has served.
-        heard: (slots,) s when that message was sent.
+        sent: (slots,) s when that message was sent.
         vague: (slots,) m^2, variance of a position beyond that in P: next to nothing is known of it; 0 once it is.
         hits: (slots, 3) how often in a row a component exceeded its gate; the ego's first counts its fixes.
         status: (vehicles, STATUS).
@@ -164,7 +164,7 @@ class Filter(NamedTuple):
     order: Ints
     joined: Ints
     serves: Floats
-    heard: Floats
+    sent: Floats
     vague: Floats
     hits: Ints
     status: Floats
@@ -211,7 +211,7 @@ def copy_filter(source: Filter, target: Filter) -> None:
     target.step[0], target.clock[0] = source.step[0], source.clock[0]
     for k in range(len(source.vehicle)):
         target.vehicle[k], target.row[k], target.joined[k] = source.vehicle[k], source.row[k], source.joined[k]
-        target.serves[k], target.heard[k], target.vague[k] = source.serves[k], source.heard[k], source.vague[k]
+        target.serves[k], target.sent[k], target.vague[k] = source.serves[k], source.sent[k], source.vague[k]
         for c in range(3):
             target.hits[k, c] = source.hits[k, c]
     for j in range(len(source.slot)):
@@ -446,29 +446,29 @@ def predict_member(f: Filter, known: Model, guards: Guards, rows: Floats, k: int
     """
     g, row, dt = f.g, f.row[k], f.clock[1]
     first, age, sent = 3 * g.block[k, PLACE], rows[row, AGE], f.clock[0] - rows[row, AGE]
-    hear(f, guards, rows, k)
+    update_velocity(f, guards, rows, k)
     if has(g, k, VELOCITY):
         v = 3 * g.block[k, VELOCITY]
         widen(g, v, (guards.acceleration * dt) ** 2)
         shift(g, first, v, dt)
         return
     if age < 0.0:
-        f.heard[k], f.serves[k] = -math.inf, 0.0
+        f.sent[k], f.serves[k] = -math.inf, 0.0
         f.vague[k] += known.flat
         return
     if guards.fix_gate > 0.0 and age <= ROUNDING:
         steady(f, guards, f.vehicle[k], rows[row], SPEED, STEP, 1.0)
-    if abs(f.heard[k] - sent) > ROUNDING:
+    if abs(f.sent[k] - sent) > ROUNDING:
         f.serves[k] = 0.0
     often, changed = 1.0 + 2.0 * f.serves[k] / dt, (dt * age * known.acceleration) ** 2
-    f.heard[k], f.serves[k] = sent, f.serves[k] + dt
+    f.sent[k], f.serves[k] = sent, f.serves[k] + dt
     for c in range(3):
         g.x[first + c] += dt * rows[row, SPEED + c]
         g.p[first + c, first + c] += often * (rows[row, STEP + c] + changed)
 
 
 @part
-def hear(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
+def update_velocity(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
     """Give a member whose newest message is not of now a velocity in the state, and use that of a new message."""
     row, g, h = f.row[k], f.g, f.h
     age = rows[row, AGE]
@@ -477,9 +477,9 @@ def hear(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
     sent = f.clock[0] - age
     if not has(g, k, VELOCITY):
         insert(g, k, VELOCITY, SPEED_VARIANCE)
-    elif abs(f.heard[k] - sent) <= ROUNDING:
+    elif abs(f.sent[k] - sent) <= ROUNDING:
         return
-    f.heard[k] = sent
+    f.sent[k] = sent
     term(h, 0, 3 * g.block[k, VELOCITY], 1.0)
     for c in range(3):
         expect(h, c, rows[row, SPEED + c], rows[row, STEP + c] / f.clock[1] ** 2 + (guards.acceleration * age) ** 2)
@@ -494,14 +494,14 @@ def join(f: Filter, known: Model, guards: Guards, rows: Floats, vehicle: int, ro
         k += 1
     f.vehicle[k], f.slot[vehicle], f.row[k] = vehicle, k, row
     f.joined[k], f.serves[k], f.vague[k] = f.step[0], f.clock[1], known.flat
-    f.heard[k] = f.clock[0] - rows[row, AGE] if rows[row, AGE] >= 0.0 else -math.inf
+    f.sent[k] = f.clock[0] - rows[row, AGE] if rows[row, AGE] >= 0.0 else -math.inf
     for c in range(3):
         f.hits[k, c] = 0
     ego, first = 3 * g.block[0, PLACE], insert(g, k, PLACE, 0.0)
     near, whole = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row)
     for c in range(3):
         g.x[first + c] = g.x[ego + c] + (across(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
-    hear(f, guards, rows, k)
+    update_velocity(f, guards, rows, k)
     if f.status[vehicle, TRUSTED] == 0.0:
         error = insert(g, k, ERROR, 0.0)
         for c in range(3):
