@@ -187,6 +187,8 @@ def _fixed(graph: Graph) -> tuple[int, ...]:
         len(graph.names), np.concatenate([each.nodes for each in edges if len(each)] or [np.empty((0, 2), int)])
     )
     held = [graph.fixed, *(each.nodes[:, 0] for each in (graph.pose_prior, graph.point_prior) if len(each))]
-    free = np.flatnonzero(graph.is_pose & ~np.isin(part, part[np.concatenate(held)]))
+    holding = np.zeros(len(part), dtype=bool)
+    holding[part[np.concatenate(held)]] = True
+    free = np.flatnonzero(graph.is_pose & ~holding[part])
     first = free[np.unique(part[free], return_index=True)[1]]
     return tuple(np.sort(np.concatenate([graph.fixed, first])).tolist())
