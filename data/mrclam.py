@@ -279,7 +279,7 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
 
 def _driven(speed: Floats, slip: Floats, wheel: Floats, turning: Floats) -> Floats:
     """(T, N) m/s, forward speed of what was logged."""
-    return speed * wheel * np.maximum(1.0 - slip * np.abs(turning), 0.0)
+    return np.asarray(speed * wheel * np.maximum(1.0 - slip * np.abs(turning), 0.0))
 
 
 def _delayed(log: MrclamLog, values: Floats, lag: float) -> Floats:

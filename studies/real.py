@@ -296,22 +296,26 @@ def _trade(results: Results) -> Plot | None:
     """RT-LE over the bytes sent, a panel per number of landmarks; no bytes stand at the left."""
     from coopoc.study import figures
 
-    each = [where for _, where in _rows(results) if present(results, where)]
-    if not any(where["method"] in TRAINED for where in each):
+    base = _base(results)["method"]
+    each = [where for _, where in _rows(results) if where["method"] in (base, *TRAINED) and present(results, where)]
+    if all(where["method"] == base for where in each):
         return None
 
     def error(results: Results, where: Where) -> Any:
         at = {**each[where["at"]], "landmarks": where["landmarks"]}
-        return interval(results, at) if at["method"] in where["of"] else None
+        kind = 0 if at["method"] == base else 2 if at["max_neighbours"] else 1
+        return interval(results, at) if kind == where["kind"] else None
 
     places = {max(_sent(results, where) or 0.0, 1.0 + 0.3 * i): {"at": i} for i, where in enumerate(each)}
-    marks = [n for n in _numbers(results)[1] if n <= FEW]
-    panels = [Panel(places, {"landmarks": n}, _landmarks(n), "Sent [B]") for n in marks]
-    online = {"of": list(_base(results).values()), "label": "Cooperating online", "color": "#0072B2", "marker": "s"}
-    taught = {"of": TRAINED, "label": "Training on the first part", "color": "#D55E00", "marker": "o"}
+    marks, ticks = [n for n in _numbers(results)[1] if n <= FEW], {1.0: "0", 1e2: "100", 1e4: "10 k", 1e6: "1 M"}
+    panels = [Panel(places, {"landmarks": n}, _landmarks(n), "Sent [B]", ticks) for n in marks]
+    looks = ("Cooperating", "#0072B2", "s"), ("Training", "#D55E00", "o"), ("Both", "#009E73", "D")
+    lines = [
+        {"kind": k, "label": label, "color": color, "marker": mark} for k, (label, color, mark) in enumerate(looks)
+    ]
     text = f"RT-LE against the bytes that a vehicle sends; what sends none is at the left. {BYTES}"
     caption = _caption(results, text.format(driven(results.settings)))
-    return figures.curves(results, panels, [online, taught], caption, error, log=True, logx=True, merged=False)
+    return figures.curves(results, panels, lines, caption, error, log=True, logx=True, merged=False)
 
 
 def _figure(results: Results) -> Plot | None:
