@@ -220,7 +220,7 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
     better, worse = list[str](), list[str]()
     for rule in RULES[1:]:
         if len(plain) > 1 and present(results, {**at, "method": rule}):
-            gap = over_seeds(per_seed(results, {**at, "method": rule}) - plain).interval
+            gap = over_seeds(per_seed(results, {**at, "method": rule}) - plain)
             (better if gap.high < 0 else worse if gap.low > 0 else []).append(f"{rule} {gap.mean:+.3f} m")
     beside = {
         words: mean(results, {**at, "condition": "iid", "method": method})

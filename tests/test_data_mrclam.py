@@ -16,11 +16,9 @@ from coopoc.data.registry import load_fleet, load_log
 from coopoc.studies.pose_drives import thinned
 from coopoc.world.body_frames import gauss_markov
 from coopoc.world.links import wrap
-from coopoc.world.v2x import V2X
 
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "mrclam" / "MRCLAM_Dataset6"
 present = pytest.mark.skipif(not FOLDER.is_dir(), reason="UTIAS MR.CLAM set 6 is not at ../shared/data/mrclam")
-ALL = V2X(max_neighbours=4, radius=float("inf"))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +33,7 @@ def known(log: MrclamLog) -> Calibration:
 
 @pytest.fixture(scope="module")
 def seen(log: MrclamLog, known: Calibration) -> co.Recording:
-    return pose_recording(log, ALL, known)
+    return pose_recording(log, known)
 
 
 @present

@@ -170,14 +170,8 @@ def curves(
                 _draw(axis, names, points, style)
                 named += [names] if names not in named else []
                 also[name_of(names)] = text.removeprefix(_joined([of]))
-            for group in _coinciding([(panel, drawn)], log, WIDTH * height_of):
-                leaders = [of for of in group if id(of) in groups]
-                points = next(points for of, points in drawn if of is group[0])
-                if len(leaders) > 1 and isinstance(points, Mapping):
-                    x, y = list(points.items())[-1]
-                    below = {"xytext": (0, 5), "textcoords": "offset points", "ha": "right", "fontsize": 7}
-                    below["path_effects"] = [withStroke(linewidth=2, foreground="white")]
-                    axis.annotate(_joined(leaders), (x, _mean(y)), **below)
+            alone = [(of, points) for of, points in drawn if id(of) in groups and isinstance(points, Mapping)]
+            _name_alike(axis, alone, log, WIDTH * height_of)
             axis.set(title=picture(panel.title), xlabel=panel.xlabel)
             if logx:
                 plain_log(axis.xaxis)
@@ -190,6 +184,16 @@ def curves(
         else:
             legend(axes[-1], named, also)
     return Plot(figure, caption)
+
+
+def _name_alike(axes: Axes, drawn: Sequence[tuple[Where, Any]], log: bool, near: float) -> None:
+    """Name lines together at their ends that coincide in this panel alone."""
+    for group in _coinciding([("", drawn)], log, near):
+        if len(group) > 1:
+            x, y = list(next(points for of, points in drawn if of is group[0]).items())[-1]
+            halo = [withStroke(linewidth=2, foreground="white")]
+            place: dict[str, Any] = {"xytext": (0, 5), "textcoords": "offset points", "ha": "right"}
+            axes.annotate(_joined(group), (x, _mean(y)), fontsize=7, path_effects=halo, **place)
 
 
 NEAR, WIDTH = 0.015, 0.009
