@@ -253,7 +253,4 @@ def test_what_no_memory_holds_is_refused_at_once(tmp_path: Path) -> None:
     (tmp_path / "b.csv").write_text(",".join(["t"] * 100_000) + "\n")
     with pytest.raises(InputError, match=r"b\.csv = 100000 columns: must be at most 5000"):
         load_fleet(tmp_path / "b.csv", format="table")
-    (tmp_path / "b.csv").write_text("id,t,x,y,z,x\na,0,0,0,0,0\n")
-    with pytest.raises(InputError, match=r"header = 'x' twice"):
-        load_fleet(tmp_path / "b.csv")
     assert time.process_time() - began < 5.0

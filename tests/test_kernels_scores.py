@@ -38,7 +38,7 @@ def test_what_egos_think_of_neighbours(track: Track, crossing: Fleet) -> None:
 
 
 def test_neighbours_are_counted_per_step(crossing: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
-    """All eight are within the radius at every step, and the three nearest are linked; runs are scored four at a time."""
+    """All eight are within the radius at every step, and the three nearest are linked; runs are scored by fours."""
     seen = observe(crossing, S2, V2X(max_neighbours=3, radius=1e4), runs=6)
     monkeypatch.setattr(scores, "SLAB", 1)
     found = scores.scored(JointFilter(), seen, ["c0", "c5"], crossing)
