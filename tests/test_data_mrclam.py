@@ -93,6 +93,9 @@ def test_first_poses_are_found_from_what_is_seen(log: MrclamLog, seen: co.Record
     assert np.linalg.norm(begin[:, :2] - log.fleet.position[0, :, :2], axis=1).max() < 1.5
     with pytest.raises(co.InputError, match="sees no landmark"):
         co.pose_start(thinned(seen, 0, 0))
+    links, fewer, marks = seen.links, thinned(seen, 3, 50).links, seen.landmarks
+    chosen = ~np.isin(links.neighbour, marks) | np.isin(links.neighbour, marks[::5]) | (links.step < 50)
+    np.testing.assert_array_equal(fewer.neighbour, links.neighbour[chosen])
 
 
 @pytest.fixture(scope="module")

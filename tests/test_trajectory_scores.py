@@ -240,6 +240,9 @@ def test_what_cannot_be_scored_is_named(tmp_path: Path) -> None:
         read_paths(str(tmp_path / "nowhere.tum"))
     with pytest.raises(InputError, match="must name a file"):
         score(("a.tum",))
+    for delta in (0.5, 1.5, float("nan")):
+        with pytest.raises(InputError, match="delta"):
+            scores(estimates, truths, delta=delta)
 
 
 def wandering(count: int = 200) -> Track:
@@ -286,9 +289,3 @@ def test_a_clock_of_its_own_is_mended_by_an_offset(tmp_path: Path, capsys: pytes
     assert "nan" not in shown.out
     (kept,) = json.loads((tmp_path / "one.json").read_text(), parse_constant=pytest.fail)
     assert kept["ape_m"]["low"] is None
-
-
-def test_a_part_of_a_step_is_refused() -> None:
-    for delta in (0.5, 1.5, float("nan")):
-        with pytest.raises(InputError, match="delta"):
-            scores({"a": wandering()}, {"a": wandering()}, delta=delta)
