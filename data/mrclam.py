@@ -19,14 +19,12 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.links import wrap
 from coopoc.world.recording import Recording
 from coopoc.world.sensors import Sensors
-from coopoc.world.v2x import V2X
 
 from .assemble import (
     PLANE_STD,
     backward_difference,
     check_size,
     check_time,
-    first_of_each,
     interpolate,
     nearest,
     planar_recording,
@@ -178,16 +176,14 @@ class Calibration(NamedTuple):
     turn: Floats
 
 
-def pose_recording(log: MrclamLog, v2x: V2X, calibration: Calibration) -> Recording:
+def pose_recording(log: MrclamLog, calibration: Calibration) -> Recording:
     """Recording of the robots' own measurements, one run: odometry, range and bearing of robots and landmarks.
 
     There are no fixes and no compass. Inclinations are pi/2: the robots drive on one floor. Of several measurements of
-    a subject in a step the one nearest to the step's instant is kept; at most K robots, nearest first by measured
-    range, and all landmarks.
+    a subject in a step the one nearest to the step's instant is kept; `data.log.links.under` chooses a channel.
 
     Args:
         log: of read_mrclam.
-        v2x: K, radius and channel.
         calibration: of its sensors: odometry is scaled and delayed by it, since it is a record of commands.
 
     Raises:
@@ -196,10 +192,6 @@ def pose_recording(log: MrclamLog, v2x: V2X, calibration: Calibration) -> Record
     robots, marks = log.fleet.ids, surveyed(log)
     wheel, turning = (_delayed(log, values, calibration.lag) for values in (log.speed, log.turn_rate))
     forward = _driven(calibration.speed, calibration.slip, wheel, turning)
-    others = _on_steps(log, log.others)
-    others = others[others[:, 3] <= v2x.radius]
-    others = others[np.lexsort((others[:, 3], others[:, 1], others[:, 0]))]
-    others = others[first_of_each(v2x.max_neighbours, others[:, 0], others[:, 1])]
     sightings = _on_steps(log, log.sightings)
     sightings[:, 2] += len(robots)
     return planar_recording(
@@ -208,9 +200,8 @@ def pose_recording(log: MrclamLog, v2x: V2X, calibration: Calibration) -> Record
         forward[..., None] * [1.0, 0.0],
         calibration.turn * turning,
         marks[:, 1:],
-        np.vstack([others, sightings]),
+        np.vstack([_on_steps(log, log.others), sightings]),
         calibration.sensors,
-        v2x,
         "odometry, ranges and bearings are real; no fix, no compass, nothing simulated",
     )
 

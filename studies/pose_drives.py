@@ -142,7 +142,7 @@ def drive(data: str, until: float, v2x: V2X, gate: float) -> Drive:
     """
     log = _part(data)
     if isinstance(log, MrclamLog):
-        recording = pose_recording(log, v2x, _calibration(data, until))
+        recording = under(pose_recording(log, _calibration(data, until)), v2x, logged=False)
         return Drive(recording, pose_start(recording, gate=gate), log.fleet, True)
     recording = under(log.recording, v2x, logged=log.messages)
     if in_world(data):

@@ -229,8 +229,12 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path: Path) -> None
     assert found.tolist() == pytest.approx([np.sqrt(np.mean(apart**2))], rel=1e-9)
     error = results.select(method="pose-fleet").groupby("max_neighbours")["rt_le_m"].mean()
     assert error[2] < 0.8 * error[0]
-    assert "600 bearings" in (tmp_path / "real" / "tables" / "rt_le.md").read_text()
-    assert any(text.startswith("K = 1 without a landmark") for text in find_study("real").answers(results).values())
+    caption = (tmp_path / "real" / "tables" / "rt_le.md").read_text()
+    assert "600 bearings" in caption
+    assert "then they are thinned" in caption
+    said = find_study("real").answers(results)["worth, K = 1"]
+    assert said.startswith("K = 1 without a landmark")
+    assert " with 1 landmark " in said
 
 
 def test_the_study_trains_and_cooperates_on_a_log_in_the_world(tmp_path: Path) -> None:

@@ -17,11 +17,9 @@ from coopoc.data.registry import load_fleet, load_log
 from coopoc.studies.pose_drives import thinned
 from coopoc.world.body_frames import gauss_markov, midway, turned
 from coopoc.world.links import wrap
-from coopoc.world.v2x import V2X
 
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "mrclam" / "MRCLAM_Dataset6"
 present = pytest.mark.skipif(not FOLDER.is_dir(), reason="UTIAS MR.CLAM set 6 is not at ../shared/data/mrclam")
-ALL = V2X(max_neighbours=4, radius=float("inf"))
 
 
 @pytest.fixture(scope="module")
@@ -36,7 +34,7 @@ def known(log: MrclamLog) -> Calibration:
 
 @pytest.fixture(scope="module")
 def seen(log: MrclamLog, known: Calibration) -> co.Recording:
-    return pose_recording(log, ALL, known)
+    return pose_recording(log, known)
 
 
 @present
@@ -116,6 +114,9 @@ def test_first_poses_are_found_from_what_is_seen(log: MrclamLog, seen: co.Record
     assert np.linalg.norm(begin[:, :2] - log.fleet.position[0, :, :2], axis=1).max() < 1.5
     with pytest.raises(co.InputError, match="sees no landmark"):
         co.pose_start(thinned(seen, 0, 0))
+    links, fewer, marks = seen.links, thinned(seen, 3, 50).links, seen.landmarks
+    chosen = ~np.isin(links.neighbour, marks) | np.isin(links.neighbour, marks[::5]) | (links.step < 50)
+    np.testing.assert_array_equal(fewer.neighbour, links.neighbour[chosen])
 
 
 @pytest.fixture(scope="module")
