@@ -161,5 +161,5 @@ def pose(position: Floats, turn: Floats | float = 0.0) -> Floats:
     if w.ndim > len(wanted) or any(n not in (1, m) for n, m in zip(w.shape[::-1], wanted[::-1], strict=False)):
         hint = "A heading for each position in the plane, a rotation vector in space."
         raise InputError("turn", f"shape {w.shape}", f"must fit to {wanted}", hint)
-    w = np.broadcast_to(w[..., None], (*at.shape[:-1], 1)) if space.dimension == 2 else w
+    w = w[..., None] if space.dimension == 2 else w
     return space.join(at, exp(np.broadcast_to(w, (*at.shape[:-1], space.angles))))
