@@ -13,7 +13,6 @@ from ..arrays import Floats, Ints, instance
 from ..errors import InputError
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET, ROUNDING
 from ..kernels.motion import MotionNoise
-from ..kernels.stars.cooperative_filter import keep, make_filter, motion_of, restore, stream_row, stream_step
 from ..kernels.stars.cooperative_state import (
     AGE,
     FIX_VARIANCE,
@@ -37,6 +36,7 @@ from ..kernels.stars.cooperative_state import (
 )
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.relative import components
+from ..kernels.stars.streams import keep, make_filter, motion_of, restore, stream_row, stream_step
 from ..world.links import told
 from .cooperative_filter import Broadcast, CooperativeFilter, guards_of, model_of
 from .joint_filter import JointFilter
