@@ -103,8 +103,8 @@ class CooperativeFilter:
         """
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
         model, guards = model_of(known, self.robust), guards_of(self, known)
-        assumed, broadcast, moved = assumptions(recording, known), None, NO_ODOMETER
-        notes = list(known.notes)
+        assumed, broadcast, notes = assumptions(recording, known), None, list(known.notes)
+        moved: Floats = NO_ODOMETER
         if self.robust:
             broadcast, variance, moved = broadcasts(recording, known, columns, guards)
             assumed = assumed._replace(broadcast=variance)
@@ -120,9 +120,9 @@ class CooperativeFilter:
             low, measured = (weights < 0.1).sum(axis=0), np.isfinite(weights).sum(axis=0)
             for j in np.unique(seen.neighbour):
                 here = seen.neighbour == j
-                for kind, *counts in zip(KINDS, low[here].sum(axis=0), measured[here].sum(axis=0), strict=True):
+                for kind, count, of in zip(KINDS, low[here].sum(axis=0), measured[here].sum(axis=0), strict=True):
                     what = f"{kind}, {mine} and {recording.ids[j]}"
-                    notes.extend(rejected(what, *counts, 0.5 if kind == "trusted" else 0.05))
+                    notes.extend(rejected(what, count, of, 0.5 if kind == "trusted" else 0.05))
             yield Estimate(slice(None), x, cov, box.link, neighbours, extras)
 
         return follow_egos(self, recording, egos, run, notes, missing=True)
