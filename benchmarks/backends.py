@@ -2,7 +2,7 @@
 
     OMP_NUM_THREADS=1 python benchmarks/backends.py            # a Markdown table on stdout, about a minute
 
-A star of ten neighbours, as many noise realisations as a row names. Ours is what a user writes, `solve_batch(problem,
+A star of ten neighbours, as many noise realisations as a row names. Ours is what a user writes, `solve(problem,
 backend)`: start, whitening, the check of every answer and the covariances are in its time. The hand-written loops keep
 what they can between two solves, get whitened arrays or starts that are prepared before their clock starts, and give x
 only. Rows of a job are timed one after the other in every round; times are this thread's own, medians of rounds. "x
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from backends_gtsam import gtsam_linear
 from backends_programmes import casadi_exact, osqp_linear
-from backends_star import Job, one_by_one, star
+from backends_star import Job, one_by_one, stars
 from timing import report, timed
 
 from coopoc.optimize.starts.initial import converted
@@ -27,8 +27,8 @@ ROUNDS, RUNS = 7, 200
 
 def jobs(runs: int = RUNS) -> list[Job]:
     """All of them; a call of each has run once."""
-    exact = star(runs)
-    linear = converted(exact)
+    exact = stars(runs)
+    linear = [converted(star) for star in exact]
     return [
         gtsam_linear(linear),
         casadi_exact(exact),

@@ -7,15 +7,15 @@ from typing import Any
 
 import gtsam
 import numpy as np
-from backends_star import Job, Row, as_good, single
+from backends_star import Job, Row, as_good, ours
 from classical import KNOWN, NEIGHBOURS
 
 from coopoc.optimize import Problem
 
 
-def gtsam_linear(problem: Problem) -> Job:
+def gtsam_linear(problems: list[Problem]) -> Job:
     """Prior and Between factors of the converted problem."""
-    (fixes, edges), runs = problem.factors, problem.batch or 1
+    given = [(fixes.z, edges.z, edges.root) for fixes, edges in (problem.factors for problem in problems)]
     model = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.gnss_std))
     zero, keys = gtsam.Values(), range(NEIGHBOURS + 1)
     for k in keys:
@@ -30,20 +30,20 @@ def gtsam_linear(problem: Problem) -> Job:
             graph.add(gtsam.BetweenFactorPoint3(0, k + 1, vector[k], edge))
         return graph.linearize(zero).optimize().vector().reshape(-1, 3)
 
-    def batch() -> Any:
-        return np.stack([one(*given) for given in zip(fixes.z, edges.z, edges.root, strict=True)])
+    def each() -> Any:
+        return np.stack([one(*numbers) for numbers in given])
 
     def custom() -> Any:
-        return np.stack([custom_factors(fixes.z[b], edges.z[b], edges.root[b]) for b in range(4)])
+        return np.stack([custom_factors(*numbers) for numbers in given[:4]])
 
     job = "gtsam, snapshot, converted"
     return Job(
         [
-            Row(job, "ours, solve() one by one", 4, single(problem, "gtsam", 4)),
-            Row(job, "hand-written", runs, batch),
+            Row(job, "ours, solve() one by one", 4, ours(problems[:4], "gtsam")),
+            Row(job, "hand-written", len(given), each),
             Row(job, "CustomFactors and Levenberg-Marquardt", 4, custom),
         ],
-        as_good(problem),
+        as_good(problems),
     )
 
 

@@ -7,7 +7,7 @@ from typing import Any
 import casadi
 import numpy as np
 import osqp
-from backends_star import Job, Row, as_good, ours, single
+from backends_star import Job, Row, as_good, ours
 from classical import KNOWN, NEIGHBOURS, SENSORS
 from scipy.sparse import csc_matrix, triu
 
@@ -18,10 +18,9 @@ PLAIN = {"print_time": False}, {"print_level": 0}
 """Options of CasADi's plugin, and of FATROP behind it."""
 
 
-def casadi_exact(problem: Problem) -> Job:
+def casadi_exact(problems: list[Problem]) -> Job:
     """One programme whose measurements are parameters, by the same solver."""
-    (fixes, edges), runs = problem.factors, problem.batch or 1
-    start = initial_guess(problem)
+    given = [(*(factor.z for factor in problem.factors), initial_guess(problem)) for problem in problems]
     std, fix_std = np.array(SENSORS.relative_std), np.array(KNOWN.gnss_std)
     quiet, inner = PLAIN
 
@@ -44,19 +43,18 @@ def casadi_exact(problem: Problem) -> Job:
     nlp = {"x": casadi.vec(x), "p": casadi.veccat(fix, relative), "f": cost(x, fix, relative)}
     solver = casadi.nlpsol("solver", "fatrop", nlp, {**quiet, "fatrop": inner})
 
-    def batch() -> Any:
-        numbers = np.concatenate([fixes.z.reshape(runs, -1), edges.z.reshape(runs, -1)], axis=1)
-        return np.stack(
-            [np.asarray(solver(x0=a.ravel(), p=p)["x"]).reshape(-1, 3) for a, p in zip(start, numbers, strict=True)]
-        )
+    numbers = [(np.concatenate([fix.ravel(), seen.ravel()]), start.ravel()) for fix, seen, start in given]
+
+    def each() -> Any:
+        return np.stack([np.asarray(solver(x0=start, p=p)["x"]).reshape(-1, 3) for p, start in numbers])
 
     def opti() -> Any:
         found = []
-        for b in range(2):
+        for fixes, edges, start in given[:2]:
             model = casadi.Opti()
             nodes = [model.variable(3) for _ in range(NEIGHBOURS + 1)]
-            total = sum(casadi.sumsqr((node - fix) / fix_std) for node, fix in zip(nodes, fixes.z[b], strict=True))
-            for node, (r, azimuth, inclination) in zip(nodes[1:], edges.z[b], strict=True):
+            total = sum(casadi.sumsqr((node - fix) / fix_std) for node, fix in zip(nodes, fixes, strict=True))
+            for node, (r, azimuth, inclination) in zip(nodes[1:], edges, strict=True):
                 gap = node - nodes[0]
                 flat = casadi.sqrt(gap[0] ** 2 + gap[1] ** 2)
                 turn = casadi.atan2(gap[1], gap[0]) - azimuth
@@ -64,7 +62,7 @@ def casadi_exact(problem: Problem) -> Job:
                 total += ((casadi.norm_2(gap) - r) / std[0]) ** 2 + (turn / std[1]) ** 2
                 total += ((casadi.atan2(flat, gap[2]) - inclination) / std[2]) ** 2
             model.minimize(0.5 * total)
-            for node, at in zip(nodes, start[b], strict=True):
+            for node, at in zip(nodes, start, strict=True):
                 model.set_initial(node, at)
             model.solver("fatrop", quiet, inner)
             answer = model.solve()
@@ -74,21 +72,21 @@ def casadi_exact(problem: Problem) -> Job:
     job = "casadi fatrop, snapshot, exact"
     return Job(
         [
-            Row(job, "ours", runs, ours(problem, "casadi", runs)),
-            Row(job, "hand-written", runs, batch),
+            Row(job, "ours, solve() one by one", 20, ours(problems[:20], "casadi")),
+            Row(job, "hand-written", len(given), each),
             Row(job, "Opti, rebuilt", 2, opti),
         ],
-        as_good(problem),
+        as_good(problems),
     )
 
 
 SIZE = 3 * (NEIGHBOURS + 1)
 
 
-def osqp_linear(problem: Problem) -> Job:
+def osqp_linear(problems: list[Problem]) -> Job:
     """One workspace; P and q are ready before the clock starts. `update` writes into the P of `setup`."""
-    runs = problem.batch or 1
-    rows = [problem.pick(b).whiten(np.zeros((NEIGHBOURS + 1, 3))) for b in range(runs)]
+    runs = len(problems)
+    rows = [problem.whiten(np.zeros((NEIGHBOURS + 1, 3))) for problem in problems]
     matrices = [csc_matrix(triu(J.T @ J, format="csc")) for _, J in rows]
     gradients = [np.asarray(J.T @ r) for r, J in rows]
     settings = {
@@ -134,10 +132,10 @@ def osqp_linear(problem: Problem) -> Job:
     job = "osqp, snapshot, converted"
     return Job(
         [
-            Row(job, "ours, solve() one by one", 4, single(problem, "osqp", 4)),
+            Row(job, "ours, solve() one by one", 4, ours(problems[:4], "osqp")),
             Row(job, "hand-written", runs, batch),
             Row(job, "hand-written, without osqp's Python class", runs, bare),
             Row(job, "setup at each solve", 10, setups),
         ],
-        as_good(problem),
+        as_good(problems),
     )

@@ -10,7 +10,7 @@ from classical import KNOWN, NEIGHBOURS, SENSORS
 from scipy.optimize import least_squares
 
 import coopoc as co
-from coopoc.optimize import Problem, solve, solve_batch
+from coopoc.optimize import Problem, solve
 from coopoc.optimize.model.factor import Factor
 from coopoc.world.links import wrap
 
@@ -36,8 +36,8 @@ class Job(NamedTuple):
     right: Callable[[Any], bool]
 
 
-def star(runs: int, neighbours: int = NEIGHBOURS) -> Problem:
-    """An ego with ten neighbours around it, all realisations at once."""
+def stars(runs: int, neighbours: int = NEIGHBOURS) -> list[Problem]:
+    """An ego with ten neighbours around it, a problem for each realisation."""
     around = np.linspace(0, 2 * np.pi, neighbours, endpoint=False)
     gap = np.linspace(12, 25, neighbours)
     offset = np.vstack([np.zeros(3), np.stack([gap * np.cos(around), gap * np.sin(around), 0.05 * gap], axis=1)])
@@ -49,32 +49,23 @@ def star(runs: int, neighbours: int = NEIGHBOURS) -> Problem:
         velocity,
     )
     recording = co.observe(fleet, SENSORS, co.V2X(max_neighbours=neighbours), runs=runs, observers=[0])
-    return Problem.from_snapshot(recording, 1, 0, run=None, noise=KNOWN)
+    return [Problem.from_snapshot(recording, 1, 0, run, KNOWN) for run in range(runs)]
 
 
-def as_good(problem: Problem) -> Callable[[Any], bool]:
-    """Whether x (solves, n, 3) is gauss-newton's, cost and position."""
-    best = solve_batch(problem, tolerance=1e-10)
-    assert best.converged.all()
+def as_good(problems: list[Problem]) -> Callable[[Any], bool]:
+    """Whether x (solves, n, 3) is gauss-newton's of the first problems, cost and position."""
+    best = [solve(problem, tolerance=1e-10) for problem in problems]
 
     def right(x: Any) -> bool:
-        few = np.arange(len(x))
-        cost = problem.pick(few).linearise(np.asarray(x)).cost
-        return float(np.abs(x - best.x[few]).max()) < 1e-3 and float((cost / best.cost[few] - 1).max()) < 1e-6
+        each = zip(problems, best, x, strict=False)
+        return all(np.abs(at - own.x).max() < 1e-3 and p.cost(at) / own.cost - 1 < 1e-6 for p, own, at in each)
 
     return right
 
 
-def ours(problem: Problem, backend: str, count: int, **options: Any) -> Callable[[], Any]:
-    """`solve_batch` of the first realisations."""
-    part = problem.pick(np.arange(count))
-    return lambda: solve_batch(part, backend, **options).x
-
-
-def single(problem: Problem, backend: str, count: int, **options: Any) -> Callable[[], Any]:
+def ours(problems: list[Problem], backend: str, **options: Any) -> Callable[[], Any]:
     """`solve` of one after the other: status, saddle and free points looked at for each."""
-    parts = [problem.pick(k) for k in range(count)]
-    return lambda: np.stack([solve(part, backend, **options).x for part in parts])
+    return lambda: np.stack([solve(problem, backend, **options).x for problem in problems])
 
 
 COUNT = 20
@@ -151,9 +142,9 @@ def fixes(problem: Problem) -> np.ndarray:
     return x
 
 
-def one_by_one(problem: Problem, name: str) -> Job:
+def one_by_one(problems: list[Problem], name: str) -> Job:
     """A star after the other: SciPy, the hand-written loop, ours by backend."""
-    parts = [problem.pick(k) for k in range(COUNT)]
+    parts = problems[:COUNT]
 
     def each(way: Callable[[Problem], Any]) -> Callable[[], Any]:
         return lambda: np.stack([way(part) for part in parts])
@@ -163,8 +154,8 @@ def one_by_one(problem: Problem, name: str) -> Job:
         [
             Row(words, "SciPy's least_squares", COUNT, each(scipys)),
             Row(words, "hand-written, x alone", COUNT, each(gauss_newton)),
-            Row(words, "ours, gauss-newton", COUNT, single(problem, "gauss-newton", COUNT)),
-            Row(words, "ours, gtsam", COUNT, single(problem, "gtsam", COUNT)),
+            Row(words, "ours, gauss-newton", COUNT, ours(parts, "gauss-newton")),
+            Row(words, "ours, gtsam", COUNT, ours(parts, "gtsam")),
         ],
-        as_good(problem),
+        as_good(parts),
     )

@@ -19,14 +19,14 @@ from typing import Any
 
 import numpy as np
 from backends import measured as measure
-from backends_star import Job, Row, as_good, ours, star
+from backends_star import Job, Row, as_good, ours, stars
 from classical import KNOWN, NEIGHBOURS, SENSORS
 from timing import report
 
 from coopoc.optimize import Problem
 from coopoc.optimize.starts.initial import initial_guess
 
-RUNS, FEW = 200, 40
+RUNS = 40
 
 
 def relative_factor(z: Any, std: Any) -> Any:
@@ -60,34 +60,34 @@ def relative_factor(z: Any, std: Any) -> Any:
     return RelativeMeasurement()
 
 
-def ceres_exact(problem: Problem) -> Job:
+def ceres_exact(problems: list[Problem]) -> Job:
     """One Ceres problem per realisation: priors of its own, Python's cost functions, a dense Schur complement."""
     import pyceres
 
-    fixes, edges = problem.factors
-    start, spread = initial_guess(problem), np.diag(np.square(KNOWN.gnss_std))
-    z, std = edges.z.tolist(), list(SENSORS.relative_std)
+    spread, std = np.diag(np.square(KNOWN.gnss_std)), list(SENSORS.relative_std)
+    given = [(fixes.z, edges.z.tolist()) for fixes, edges in (problem.factors for problem in problems)]
+    starts = [initial_guess(problem) for problem in problems]
     options = pyceres.SolverOptions()
     options.linear_solver_type = pyceres.LinearSolverType.DENSE_SCHUR
     options.logging_type = pyceres.LoggingType.SILENT
     options.function_tolerance = options.gradient_tolerance = options.parameter_tolerance = 1e-10
 
-    def one(b: int) -> Any:
-        model, points = pyceres.Problem(), [each.copy() for each in start[b]]
-        for point, fix in zip(points, fixes.z[b], strict=True):
+    def one(fixes: Any, z: Any, start: Any) -> Any:
+        model, points = pyceres.Problem(), [each.copy() for each in start]
+        for point, fix in zip(points, fixes, strict=True):
             model.add_residual_block(pyceres.factors.NormalPrior(fix, spread), None, [point])
         for k in range(NEIGHBOURS):
-            model.add_residual_block(relative_factor(z[b][k], std), None, [points[0], points[k + 1]])
+            model.add_residual_block(relative_factor(z[k], std), None, [points[0], points[k + 1]])
         pyceres.solve(options, model, pyceres.SolverSummary())
         return points
 
     job = "snapshot, exact"
     return Job(
         [
-            Row(job, "solve_batch, gauss-newton", RUNS, ours(problem, "gauss-newton", RUNS)),
-            Row(job, "pyceres", FEW, lambda: np.stack([one(b) for b in range(FEW)])),
+            Row(job, "gauss-newton", RUNS, ours(problems, "gauss-newton")),
+            Row(job, "pyceres", RUNS, lambda: np.stack([one(*of, at) for of, at in zip(given, starts, strict=True)])),
         ],
-        as_good(problem),
+        as_good(problems),
     )
 
 
@@ -112,7 +112,7 @@ def of_stone_soup() -> list[Job]:
 
 
 PEERS: dict[str, Callable[[], list[Job]]] = {
-    "pyceres": lambda: [ceres_exact(star(RUNS))],
+    "pyceres": lambda: [ceres_exact(stars(RUNS))],
     "stonesoup": of_stone_soup,
 }
 """By the package that they need."""

@@ -201,7 +201,6 @@ def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
     whole = PROBLEM.add("range", ("a", "b"), 10.0, std=1.0)
     solution = co.solve(whole)
     swept(co.solve, {"problem": whole, "backend": "gauss-newton", "throw": True})
-    swept(optimize.solve_batch, {"problem": whole, "backend": "gauss-newton"})
     swept(optimize.solve_gnc, {"problem": whole, "candidates": [0], "loss": "truncated", "threshold": 0.99})
     swept(optimize.joint_covariance, {"problem": whole, "solution": solution, "nodes": ["a", "b"]})
     swept(optimize.loop_closures, {"problem": whole})

@@ -13,7 +13,6 @@ import pytest
 import coopoc as co
 from coopoc.learned import GainNet, LearnedGain, clients, federate, load, save
 from coopoc.learned.checkpoint import Checkpoint
-from coopoc.optimize import solve_batch
 
 LINE = 400
 """Characters that a result may take in an interpreter."""
@@ -49,8 +48,6 @@ def test_solutions_show_status_and_cost(recording: co.Recording) -> None:
     solution = co.solve(problem)
     assert "status=SOLVED" in one_line(solution)
     assert f"cost={solution.cost:.6g}" in repr(solution)
-    ranges = co.Problem(("a", "b")).add("position", ["a", "b"], np.zeros((5, 2, 3)), std=1.0)
-    assert "x (5, 2, 3)" in one_line(solve_batch(ranges))
 
 
 def test_trained_nets_do_not_show_their_weights(tmp_path: Path) -> None:

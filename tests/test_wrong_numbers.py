@@ -167,8 +167,8 @@ def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() ->
 
 
 def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
-    """A fix beyond the gate has q / gate times its variance, one beyond REJECTED gates is left out, until those in a
-    row would have had gains that sum to PATIENCE."""
+    """A fix beyond the gate has q / gate times its variance, one beyond REJECTED gates is left out, until the gains
+    that they would have had, less LEAK of the others', sum to PATIENCE."""
     drive = observe(winding(300, 10.0, 7.0), S2, V2X(0), runs=1, seed=2)
     gnss, rng = drive.gnss.copy(), np.random.default_rng(3)
     wild = rng.random(300) < 0.15
@@ -184,7 +184,8 @@ def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
         gap, variance = gnss[0, t, 0] - peer.x, np.diag(peer.P)
         q = float((gap**2 / (variance + 12.25 + gate.SLIP)).sum())
         share = max(q / gate.FIX_GATE, 1.0) if hits < gate.PATIENCE else 1.0
-        hits = hits + float((variance / (variance + 12.25)).mean()) if q > gate.FIX_GATE else 0.0
+        gain = float((variance / (variance + 12.25)).mean())
+        hits = hits + gain if q > gate.FIX_GATE else max(hits - gate.LEAK * gain, 0.0)
         if share <= gate.REJECTED:
             used += share > 1.0 or q > gate.FIX_GATE
             peer.update(gnss[0, t, 0], R=12.25 * share)

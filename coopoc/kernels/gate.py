@@ -1,4 +1,4 @@
-"""The gate of innovations: what is beyond it weighs less, what is far beyond nothing; many in a row count again.
+"""The gate of innovations: what is beyond it weighs less, what is far beyond nothing; many count again.
 
 Many are as many as hold, together, more information than the prediction that contradicts them: the sum of the gains
 that they would have had. A filter that is sure of itself stays so for long, one that has just begun does not.
@@ -19,7 +19,13 @@ GATE, FIX_GATE = 9.0, 12.0
 REJECTED = 2.0
 """Gates beyond which it weighs nothing."""
 PATIENCE = 5.0
-"""Sum of the gains of measurements in a row beyond the gate from which it is the filter that is wrong."""
+"""Sum of the gains of measurements beyond the gate from which it is the filter that is wrong."""
+LEAK = 0.5
+"""Share of its gain that a measurement within the gate takes from that sum: those of a filter that is wrong are not
+all beyond."""
+YOUNG = 4.8
+"""That sum at the start of a pose or of a relative vector, which a wrong heading or a wrong first measurement may have
+placed: the next ones that contradict it are believed. Of a position it is 0, since fixes err together."""
 SLIP = 0.25
 """m^2, what wheels that slip, or a speed that was measured too low, may add to an error on each axis: however precise
 fixes are, less is no sign of a wrong one."""
@@ -39,8 +45,8 @@ def inflation(q: float, gate: float, hits: float) -> float:
 
 @inside
 def count(q: float, gate: float, hits: float, gain: float) -> float:
-    """Sum of the gains of measurements in a row beyond the gate."""
-    more: float = choose(q - gate, hits + gain, 0.0)
+    """Sum of the gains of measurements beyond the gate, less LEAK of those within."""
+    more: float = choose(q - gate, hits + gain, max(hits - LEAK * gain, 0.0))
     return more
 
 

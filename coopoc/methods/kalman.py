@@ -57,7 +57,7 @@ class Kalman:
         noise_model: "identity", "nominal" or a NoiseModel.
         x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
         robust: a fix whose innovation is beyond its gate weighs less, far beyond it nothing (`coopoc.kernels.gate`),
-            unless many in a row are. False believes every fix. With the identity noise model nothing is gated.
+            unless many are. False believes every fix. With the identity noise model nothing is gated.
 
     >>> from coopoc import Fleet, Sensors, observe
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))

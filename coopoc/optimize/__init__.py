@@ -10,12 +10,11 @@ from .model.problem import Problem
 from .model.space import Space, pose
 from .robust.gnc import solve_gnc
 from .solution import Solution, SolveError, Status
-from .solve import Batch, solve, solve_batch
+from .solve import solve
 
 __all__ = [
     "MEASUREMENTS",
     "Backend",
-    "Batch",
     "Capabilities",
     "Constraint",
     "Factor",
@@ -33,6 +32,5 @@ __all__ = [
     "measurement",
     "pose",
     "solve",
-    "solve_batch",
     "solve_gnc",
 ]

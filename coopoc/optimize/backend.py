@@ -9,9 +9,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any, Literal, TypeAlias
 
-import numpy as np
-
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Floats
 from ..errors import InputError, require, suggestion, unknown
 from ..plugins import find, names
 from .model.problem import Problem
@@ -21,24 +19,24 @@ Options: TypeAlias = dict[str, Any]
 
 @dataclass(frozen=True, eq=False)
 class SolverResult:
-    """Result of a solver, which `solve` verifies; with a leading axis B where the solver was given one.
+    """Result of a solver, which `solve` verifies.
 
     Args:
         x: (n, ambient) nodes, see Space.
         iterations: how many it took.
         infeasible: True if the solver found that no point satisfies the constraints.
-        extras: numbers of its own, for `Solution.extras`; a batch drops them.
+        extras: numbers of its own, for `Solution.extras`.
     """
 
     x: Floats
-    iterations: int | Ints
-    infeasible: bool | Bools = False
+    iterations: int
+    infeasible: bool = False
     extras: dict[str, Any] = field(default_factory=dict)
 
 
 Solver: TypeAlias = Callable[[Problem, Floats], SolverResult]
-"""(problem, start) -> result. The problem has the structure for which the solver was prepared, with numbers of its own.
-A batched solver gets B realisations and starts (B, n, ambient), any other a single problem and start (n, ambient)."""
+"""(problem, start (n, ambient)) -> result. The problem has the structure for which the solver was prepared, with
+numbers of its own."""
 
 
 @dataclass(frozen=True)
@@ -46,14 +44,12 @@ class Capabilities:
     """Which problems a backend can solve, as data: `solve` and its errors read it.
 
     Args:
-        batched: the solver takes B realisations in one call; `solve_batch` calls any other once per realisation.
         kinds: of measurement; None: all that are registered, those of other distributions too.
         losses: robust losses; None: all.
         poses: nodes may have a rotation.
         constraints: "none", "linear" (on kinds whose formula is linear) or "all".
     """
 
-    batched: bool = False
     kinds: tuple[str, ...] | None = None
     losses: tuple[str, ...] | None = None
     poses: bool = True
@@ -105,7 +101,7 @@ class Backend:
         return self.library is None or find_spec(self.library) is not None
 
     def solver(self, problem: Problem, options: Options) -> Solver:
-        """The solver of a problem; it takes (B, n, ambient) starts whether the backend is batched or not.
+        """The solver of a problem.
 
         Raises:
             InputError: an unknown option, or a problem beyond the capabilities; it names the backends that can.
@@ -120,21 +116,8 @@ class Backend:
             allowed_ = f"cannot be solved by {self.name}, only by {able}" if able else "cannot be solved by any backend"
             raise InputError("problem", f"with {', '.join(lacking)}", allowed_, "Name one that can, or change it.")
         if problem.movable is not None and not problem.movable.any():
-            return lambda part, x: SolverResult(x, np.zeros(len(x), dtype=np.int64), np.zeros(len(x), dtype=bool))
-        solver = self.prepare(problem, **options)
-        return solver if self.capabilities.batched else looped(solver)
-
-
-def looped(solver: Solver) -> Solver:
-    """The solver of single problems as one of B realisations."""
-
-    def each(problem: Problem, x: Floats) -> SolverResult:
-        parts = problem.realisations
-        ends = [solver(part, start) for part, start in zip(parts, x, strict=True)]
-        iterations, infeasible = np.array([(end.iterations, end.infeasible) for end in ends]).T
-        return SolverResult(np.stack([end.x for end in ends]), iterations, infeasible.astype(bool), ends[0].extras)
-
-    return each
+            return lambda part, x: SolverResult(x, 0)
+        return self.prepare(problem, **options)
 
 
 @lru_cache(maxsize=64)

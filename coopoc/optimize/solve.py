@@ -1,20 +1,18 @@
-"""solve and solve_batch: a Problem and the name of a backend give a Solution, verified independently of the solver."""
+"""solve: a Problem and the name of a backend give a Solution, verified independently of the solver."""
 
 from __future__ import annotations
 
 import time
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, instance
+from ..arrays import Floats, Ints, instance
 from ..errors import InputError
-from ..short_repr import short_repr
-from .algebra.schur import is_star, star_at
 from .algebra.sparse import sparse
 from .assess.active import constraint_rows
-from .assess.assess import INFLATION, Assessment, assess, is_constrained_minimum, newton_decrease
+from .assess.assess import Assessment, assess, is_constrained_minimum, newton_decrease
 from .assess.plausible import judged
 from .backend import Backend, Options, require_backend
 from .descent.levenberg_marquardt import MAX_ITERATIONS
@@ -32,8 +30,6 @@ PROMISE = 1e-8
 """What a Newton step may promise where Gauss-Newton's is below the tolerance: 1e-4 standard deviations away."""
 FEASIBLE = 1e-6
 """m, rad or m/s by which a constraint may be violated."""
-CHUNK = 40_000
-"""Nodes of measurements that one chunk may hold, so that a batch stays in the cache."""
 MANY = 1000
 """Nodes beyond which covariances are computed only where they are asked for: they take as long as some steps."""
 DEFAULTS = ("gauss-newton", "osqp", "casadi")
@@ -54,7 +50,7 @@ def solve(
     graduated non-convexity where that leads lower than x0.
 
     Args:
-        problem: a single one; `solve_batch` takes B realisations.
+        problem: a single one.
         backend: a name of `backends()`, "folder/mine.py:BACKEND" or a Backend; None: gauss-newton, and where there are
             constraints the first of osqp and casadi that holds them.
         throw: raise unless SOLVED; otherwise failure is data.
@@ -76,7 +72,7 @@ def solve(
     instance("throw", throw, bool, "Give False to get the Solution whatever its status.")
     wanted = len(problem.names) <= MANY if covariance is None else instance("covariance", covariance, bool)
     if problem.batch is not None:
-        hint = "Pick one with problem.pick(0), or use solve_batch."
+        hint = "Solve one after the other: solve(problem.pick(0))."
         raise InputError("problem", repr(problem), "must be a single realisation", hint)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
@@ -106,9 +102,9 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         problem = robust_start(problem, start)
         assert problem.x0 is not None
         start = problem.x0
-    found, search = solver(problem, start[None]), problem.search
+    found, search = solver(problem, start), problem.search
     solved = time.perf_counter()
-    x, iterations, infeasible = found.x[0], int(np.ravel(found.iterations)[0]), bool(np.ravel(found.infeasible)[0])
+    x, iterations, infeasible = found.x, found.iterations, found.infeasible
     truth = assess(problem, x, covariance)
     out = truth.active is not None and (truth.violation > FEASIBLE or infeasible)
     violated = {"violated": truth.active.violated} if truth.active is not None and out else {}
@@ -141,8 +137,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
 def _start(problem: Problem) -> Floats:
     """(n, ambient); InputError if a measurement or a constraint has no derivative there."""
     if problem.linear and not problem.constraints:
-        return np.asarray(somewhere(problem)[0])
-    start: Floats = initial_guess(problem)[0]
+        return somewhere(problem)
+    start = initial_guess(problem)
     if not problem.constraints and np.isfinite(sparse(problem).quadratic(start, "gauss-newton")[1]).all():
         return start
     with np.errstate(all="ignore"):
@@ -203,81 +199,3 @@ def _raise(solution: Solution) -> None:
         "must be observable",
         hint,
     )
-
-
-@dataclass(frozen=True, eq=False)
-class Batch:
-    """Solutions of B realisations: x (B, n, ambient), covariance (B, n, dof, dof), the others (B,).
-
-    converged: a Gauss-Newton step from x would move no node by more than the tolerance of the options (at least
-    1e-6 m); where a node is unobservable it is False and the covariance NaN. Unlike `solve` it does not check whether
-    the stationary point is a saddle.
-    """
-
-    x: Floats
-    covariance: Floats
-    cost: Floats
-    iterations: Ints
-    converged: Bools
-
-    __repr__ = short_repr
-
-
-def solve_batch(problem: Problem, backend: str | Backend = "gauss-newton", **options: Any) -> Batch:
-    """Minima of all realisations, each as `solve` finds it.
-
-    The solver of their structure and the pattern of the checks are made once. A backend that is not batched is called
-    once per realisation.
-
-    Args:
-        problem: with a batch axis B (a single problem is a batch of one).
-        backend: as in `solve`.
-        options: of the backend.
-
-    Raises:
-        InputError: no measurements, constraints, an unknown backend or option, a problem beyond its capabilities.
-        MissingLibraryError: the backend's library is not installed.
-
-    >>> problem = Problem(("a",)).add("position", [["a"]], np.arange(6.0).reshape(2, 1, 3), std=1.0)
-    >>> solve_batch(problem).x.shape
-    (2, 1, 3)
-    """
-    solver_backend = require_backend(backend)
-    instance("problem", problem, Problem)
-    if not problem.factors:
-        raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
-    if problem.constraints:
-        hint = "Solve one realisation after the other: solve(problem.pick(run), ...)."
-        raise InputError("problem", repr(problem), "has constraints, which a batch cannot hold", hint)
-    solver = solver_backend.solver(problem, options)
-    count, reach = problem.batch or 1, max(POSITION_TOLERANCE, options.get("tolerance", 0.0))
-    per = max(1, CHUNK // sum(factor.nodes.size for factor in problem.factors))
-    parts = []
-    for first in range(0, count, per):
-        part = problem.pick(np.arange(first, min(first + per, count))) if problem.batch else problem
-        end = solver(part, (somewhere if part.linear else initial_guess)(part))
-        cost, cov, left = (_checked_stars if is_star(part) else _checked)(part, end.x)
-        there = ~np.isnan(left) & (left <= reach)
-        parts.append((end.x, cov, cost, end.iterations, there))
-    return Batch(*(np.concatenate(column) for column in zip(*parts, strict=True)))
-
-
-def _checked(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
-    """Cost, covariance and largest move of a Gauss-Newton step of each realisation; NaN where one is unobservable."""
-    singles = problem.realisations
-    assessments = [assess(single, at) for single, at in zip(singles, x, strict=True)]
-    cov = np.stack([assessment.covariance for assessment in assessments])
-    cost = np.array([assessment.cost for assessment in assessments])
-    return cost, cov, np.array([assessment.remaining for assessment in assessments])
-
-
-def _checked_stars(problem: Problem, x: Floats) -> tuple[Floats, Floats, Floats]:
-    """The same of stars, all at once."""
-    linear = problem.linearise(x)
-    star = star_at(problem, linear)
-    dx, marginals = star.solve()
-    cov = marginals()
-    inflation = np.einsum("bnii,bnii->bni", star.own, cov)
-    sound = ((inflation > 0) & (inflation < INFLATION)).all(axis=(1, 2))
-    cov[~sound], left = np.nan, np.abs(dx).max(axis=(1, 2))
-    return linear.cost, cov, np.where(sound, left, np.nan)

@@ -203,7 +203,7 @@ def fuse_pair(
     best, chosen = math.inf, 1.0
     for attempt in range(tries + 1):
         weight = chosen if attempt == tries else (attempt + 1.0) / TRIED
-        pair.cov[:], pair.hits[0] = 0.0, 0.0
+        pair.cov[:], pair.hits[:] = 0.0, 0.0
         set_member(pair, 0, poses, observer, d, weight)
         if other >= 0:
             set_member(pair, d, poses, other, d, max(1.0 - weight, LEAST) if tries > 0 else 1.0)

@@ -46,7 +46,7 @@ class Poses(NamedTuple):
         columns: (ROWS, size) P h of pending rows.
         gains: (ROWS, size) P h / s of these.
         weights: (ROWS,) 1 / s of these.
-        hits: (size,) of `coopoc.kernels.gate`, at the first number of the member that measures.
+        hits: (size,) of `coopoc.kernels.gate`: of fixes at a member's first number, of its other rows at the second.
         totals: (3,) sum of r^2 / s + log s, number of rows that were used, and of those that are pending.
     """
 
@@ -107,10 +107,10 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
             left = less(entries(columns, pending, tile, tiles), share, entries(columns, q, tile, tiles))
             put(columns, uint64(pending * tiles + tile), left)
     s = variance + along(columns, pending, ends, row)
-    square, limit, hits = residual * residual / s, gate * gate, poses.hits[k]
+    square, limit, hits = residual * residual / s, gate * gate, poses.hits[k + 1]
     share = inflation(square, limit, hits)
     if math.isfinite(gate):
-        poses.hits[k] = count(square, limit, hits, 1.0 - variance / s)
+        poses.hits[k + 1] = count(square, limit, hits, 1.0 - variance / s)
     poses.totals[COST] += min(square, limit) + math.log(s)
     if math.isinf(share):
         return False

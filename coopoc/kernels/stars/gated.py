@@ -16,8 +16,8 @@ from ...arrays import Floats
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, add_diagonal, choose_each, load, scale, store, subtract, zeros
 from ..compiling.vectors import LANES
-from ..gate import FIX_GATE, count, distance, gain_of, gated_update, inflation
-from .messages import POSITION, PROCESS, RELATIVE, ROW, VARIANCE, Star
+from ..gate import FIX_GATE, YOUNG, count, distance, gain_of, gated_update, inflation
+from .messages import BLOCK, POSITION, PROCESS, RELATIVE, ROW, VARIANCE, Star
 from .relative import Numbers, angle, incomplete
 
 STATE = (0.0,) * 13
@@ -53,7 +53,8 @@ def carry(star: Star, gates: Gates, flat: float, n: int, old: int) -> None:
         place, process = star.previous[k], load(star.motion, 4 * k + PROCESS, ROW)
         before = load(gates.last, max(place, 0), STATE)
         if place < 0:
-            before, process = zeros(own[0], STATE), (0.0 * own[0] + flat, 0.0 * own[0] + flat, 0.0 * own[0] + flat)
+            y, f = 0.0 * own[0] + YOUNG, 0.0 * own[0] + flat
+            before, process = (*zeros(y, BLOCK), y, y, y, 0.0 * y), (f, f, f)
             process = load(star.motion, VARIANCE, ROW) if k == 0 else process
         elif k > 0:
             process = add(process, own)

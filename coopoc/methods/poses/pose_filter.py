@@ -58,7 +58,7 @@ class PoseFilter:
             "intersection" by covariance intersection.
         lasting: estimate the odometer's scale error and the yaw rate's bias, too (`Track.extras`).
         exact: False is the plain extended Kalman filter.
-        robust: a component beyond its gate weighs less, far beyond it nothing, unless many in a row are
+        robust: a component beyond its gate weighs less, far beyond it nothing, unless many are
             (`coopoc.kernels.gate`); False believes every number.
         gate: standard deviations of an innovation.
         begin: (N, 4) or (R, N, 4) m and rad, poses at the first step; None or NaN: the first fix and compass.

@@ -16,10 +16,10 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
-from ..algebra.sparse import structure_of
+from ..algebra.sparse import sparse, structure_of
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, check_limits, diagonal
-from ..model.derivatives import Structure, expressions, numbers_of
+from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, check_limits
+from ..model.derivatives import Structure, expressions
 from ..model.factor import steerable
 from ..model.problem import Problem
 
@@ -89,9 +89,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
         return replace(end, extras=end.extras | {"method": method})
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
-        ends = [best(*given) for given in zip(problem.realisations, _numbers(problem, x), x, strict=True)]
-        counts, infeasible = np.array([(end.iterations, end.infeasible) for end in ends]).T
-        return SolverResult(np.stack([end.x for end in ends]), counts, infeasible.astype(bool), ends[0].extras)
+        return best(problem, _numbers(problem, x), x)
 
     return solver
 
@@ -116,18 +114,18 @@ def _run(
             x = space.retract(x, _exponential(step, space.dimension) if space.has_rotation else step)
         if not space.has_rotation or status in HOPELESS or np.abs(x - before).max(initial=0.0) <= tolerance:
             break
-        numbers = _numbers(problem, x[None])[0]
+        numbers = _numbers(problem, x)
     return SolverResult(x, count, status == HOPELESS[0], {"return_status": status, "rounds": rounds})
 
 
 def _numbers(problem: Problem, x: Floats) -> Floats:
-    """(B, .) parameters around x (B, n, ambient): x, numbers of the factors, constants of the constraints, and last by
+    """Parameters around x (n, ambient): x, numbers of the factors, constants of the constraints, and last by
     what the cost is multiplied: 1 / max diag J^T J."""
-    curvature = diagonal(problem, problem.linearise(x)).max(axis=(1, 2))
-    parts = [x.swapaxes(1, 2), *map(numbers_of, problem.factors)]
+    system = sparse(problem)
+    curvature = system.quadratic(x, "gauss-newton")[2][system.entries.diagonal].max(initial=1e-12)
+    parts = [x.T, *system.numbers]
     parts += [c.constants.T for c in problem.constraints if c.constants is not None]
-    flat = [np.broadcast_to(p, (len(x), *p.shape[-2:])).reshape(len(x), -1) for p in parts]
-    return np.concatenate([*flat, 1.0 / np.maximum(curvature, 1e-12)[:, None]], axis=1)
+    return np.concatenate([*(part.ravel() for part in parts), [1.0 / curvature]])
 
 
 def _sides(problem: Problem) -> tuple[Floats, Floats]:
@@ -205,5 +203,5 @@ BACKEND = Backend(
     prepare,
     "nonlinear programming by FATROP or IPOPT, any constraints",
     "casadi",
-    Capabilities(batched=True, losses=("huber", "cauchy", "geman-mcclure"), constraints="all"),
+    Capabilities(losses=("huber", "cauchy", "geman-mcclure"), constraints="all"),
 )

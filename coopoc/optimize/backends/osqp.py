@@ -23,8 +23,8 @@ from ...arrays import Floats
 from ..algebra.sparse import Layout, layout_of, sparse
 from ..assess.active import constraint_rows
 from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, check_limits, minimise
-from ..model.derivatives import Linear, linearise
+from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, arrive, check_limits
+from ..model.derivatives import linearise
 from ..model.factor import as_factor, bounded
 from ..model.problem import Problem
 
@@ -95,16 +95,17 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
             if not feasible:
                 return SolverResult(x, 0, True, dict(programme.counts))
 
-        def step(linear: Linear, damping: Floats) -> Floats:
-            _, q, values = system.quadratic(linear.x[0], "gauss-newton")
-            values[layout.entries.diagonal] += damping.ravel()[moving]
-            sides = limits.around(linear.x[0]) if limits else (np.empty(0), np.empty(0))
-            dx = np.zeros(damping.size)
-            dx[moving] = programme.solve(values, q, *sides)
-            return dx.reshape(damping.shape)
+        def step(x: Floats, values: Floats, gradient: Floats) -> tuple[Floats, float] | None:
+            sides = limits.around(x) if limits else (np.empty(0), np.empty(0))
+            try:
+                return programme.solve(values, gradient, *sides) if system.cholesky.factor(values) else None
+            except np.linalg.LinAlgError:
+                return None
 
-        end = minimise(problem, step, x[None], max_iterations, tolerance)
-        return SolverResult(end.x[0], int(np.ravel(end.iterations)[0]), extras=end.extras | programme.counts)
+        end = arrive(
+            system, x, min(1, max_iterations) if problem.linear else max_iterations, tolerance, step, bool(limits)
+        )
+        return SolverResult(end.x, end.iterations, extras=dict(programme.counts))
 
     return solver
 
@@ -143,8 +144,8 @@ class Programme:
         self._polishing = False
         self.counts = {"osqp_iterations": 0, "repairs": 0}
 
-    def solve(self, values: Floats, q: Floats, lower: Floats, upper: Floats) -> Floats:
-        """dx for the values of the upper triangle of P.
+    def solve(self, values: Floats, q: Floats, lower: Floats, upper: Floats) -> tuple[Floats, float]:
+        """dx for the values of the upper triangle of P, and y . C dx, the push of the bounds along it.
 
         Raises:
             Infeasible: no dx satisfies the bounds. numpy.linalg.LinAlgError: the KKT conditions stay unsatisfied.
@@ -158,7 +159,7 @@ class Programme:
             dx, y, value = np.array(end.x), np.array(end.y), self._rows @ end.x
             active = bool(np.any((upper - value < y) | (value - lower < -y)))
             if self._holds(values, q, lower, upper, dx, y) and self._polishing >= active:
-                return dx
+                return dx, float(y @ value)
             self.counts["repairs"] += attempt < REPAIRS and self._polishing >= active
             self._polish(active)
         raise np.linalg.LinAlgError("osqp: the KKT conditions of a quadratic programme stay unsatisfied")
@@ -242,11 +243,13 @@ def _nearest(limits: _Limits, x: Floats) -> tuple[Floats, bool]:
     space, (rows, size) = limits.problem.space, limits.matrix.shape
     try:
         programme = Programme(eye(size, format="csc"), limits.matrix)
-        return space.retract(x, programme.solve(np.ones(size), np.zeros(size), lower, upper).reshape(len(x), -1)), True
+        return space.retract(
+            x, programme.solve(np.ones(size), np.zeros(size), lower, upper)[0].reshape(len(x), -1)
+        ), True
     except Infeasible:
         slack, weight = csc_matrix(hstack([limits.matrix, eye(rows)])), np.repeat([FAR, 1.0], [size, rows])
         programme = Programme(diags(weight, format="csc"), slack)
-        step = programme.solve(weight, np.zeros(size + rows), lower, upper)[:size]
+        step = programme.solve(weight, np.zeros(size + rows), lower, upper)[0][:size]
         return space.retract(x, step.reshape(len(x), -1)), False
 
 

@@ -126,7 +126,7 @@ class _Search:
     def __init__(self, problem: Problem, marked: Marked, bound: Floats) -> None:
         self.problem, self.marked, self.bound = problem, marked, bound
         self.weight, self.left = np.zeros(len(bound)), np.zeros(len(bound), dtype=np.int64)
-        self.x = along_poses(reweigh(problem, marked, self.weight, initial_guess(problem)[0]))
+        self.x = along_poses(reweigh(problem, marked, self.weight, initial_guess(problem)))
 
     def bodies(self) -> Ints:
         """(n,) the body of each node, HELD or its first pose (if it has none, its first node)."""

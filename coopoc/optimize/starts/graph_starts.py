@@ -91,7 +91,7 @@ def along_poses(problem: Problem) -> Floats:
 
     The start of a graph may follow measurements that have no weight here.
     """
-    space, x, d = problem.space, initial_guess(problem)[0], problem.dimension
+    space, x, d = problem.space, initial_guess(problem), problem.dimension
     used = [(f, f.informative) for f in problem.factors]
     moved = [
         Moves(f.nodes[on], space.position(f.z[on]), space.rotation(f.z[on]), 1.0 / np.square(f.root[on]).sum((1, 2)))

@@ -6,7 +6,6 @@ import numpy as np
 
 from ...arrays import Floats
 from ...errors import InputError
-from ..algebra.schur import is_star, star_at
 from ..algebra.sparse import Sparse, sparse
 from ..model.derivatives import Model
 from ..model.factor import Factor, unchecked
@@ -28,73 +27,62 @@ def converted(problem: Problem) -> Problem:
 
 
 def initial_guess(problem: Problem) -> Floats:
-    """(B, n, ambient): x0 if the problem has one, else the solution of `converted`.
+    """(n, ambient): x0 if the problem has one, else the solution of `converted`.
 
     Raises:
         InputError: poses without an x0.
     """
-    batch = problem.batch or 1
     if problem.x0 is not None:
-        return np.array(np.broadcast_to(problem.x0, (batch, len(problem.names), problem.space.ambient)))
+        return problem.x0.copy()
     if problem.poses:
         raise InputError("x0", "none", "is needed where there are poses", "Give poses: coopoc.optimize.pose, or chain.")
-    if problem.batch is None:
-        x, touched = _solution(sparse(problem), "converted")
-        return x if touched else _apart(problem, x)
-    if not is_star(problem):
-        return np.concatenate([initial_guess(single) for single in problem.realisations])
-    x, linear = np.zeros((batch, len(problem.names), problem.dimension)), converted(problem)
-    return _apart(problem, star_at(linear, linear.linearise(x)).solve(RIDGE)[0])
+    x, touched = _solution(sparse(problem), "converted")
+    return x if touched else _apart(problem, x)
 
 
 def _solution(system: Sparse, model: Model) -> tuple[Floats, bool]:
-    """(1, n, d) where a quadratic cost of points is least, and whether every point has a part in it."""
+    """(n, d) where a quadratic cost of points is least, and whether every point has a part in it."""
     zero = np.zeros(system.entries.number.shape)
     _, gradient, values = system.quadratic(zero, model)
     own = values[system.entries.diagonal]
     values[system.entries.diagonal] = own + RIDGE
     system.cholesky.factor(values)
-    return system.retract(zero, -system.cholesky.solve(gradient))[None], bool(own.min(initial=np.inf) > 0.0)
+    return system.retract(zero, -system.cholesky.solve(gradient)), bool(own.min(initial=np.inf) > 0.0)
 
 
 def somewhere(problem: Problem) -> Floats:
-    """(B, n, ambient): x0, or all points at their fixes or at one of them, which is near enough for a linear problem.
+    """(n, ambient): x0, or all points at their fixes or at one of them, which is near enough for a linear problem.
 
     Raises:
         InputError: poses without an x0.
     """
     if problem.x0 is not None or problem.poses:
         return initial_guess(problem)
-    x = np.zeros((problem.batch or 1, len(problem.names), problem.dimension))
+    x = np.zeros((len(problem.names), problem.dimension))
     fixes = [f for f in problem.factors if f.kind == "position"]
     if fixes:
-        x[:] = fixes[0].z[..., :1, :]
+        x[:] = fixes[0].z[0]
     for f in fixes:
-        x[:, f.nodes[:, 0]] = f.z
+        x[f.nodes[:, 0]] = f.z
     return x
 
 
 def _apart(problem: Problem, x: Floats) -> Floats:
     """x with what no linear factor touches on a spiral around the others: two in one place have no direction."""
-    touched = np.zeros(x.shape[:2], dtype=bool)
+    touched = np.zeros(len(x), dtype=bool)
     for f in problem.factors:
         if not (f.measurement.linear or is_converted(f.measurement)):
             continue
-        informative = f.informative
-        if informative.all():
-            touched[:, f.nodes] = True
-        else:
-            for column in f.nodes.T:
-                np.logical_or.at(touched.T, column, np.atleast_2d(informative).T)
+        touched[f.nodes[f.informative]] = True
     if touched.all():
         return x
     ranges = [f.z[..., 0].mean() for f in problem.factors if f.measurement.components[0] == "distance"]
-    place = np.cumsum(~touched, axis=1) - 1
+    place = np.cumsum(~touched) - 1
     turn, radius = 2.4 * place, np.sqrt(1.0 + place) * (ranges[0] if ranges else 1.0)
     spiral = np.zeros_like(x)
     spiral[..., 0], spiral[..., 1] = radius * np.cos(turn), radius * np.sin(turn)
-    middle = (x * touched[..., None]).sum(axis=1) / np.maximum(touched.sum(axis=1), 1)[:, None]
-    return np.where(touched[..., None], x, middle[:, None] + spiral)
+    middle = x[touched].sum(axis=0) / max(touched.sum(), 1)
+    return np.where(touched[:, None], x, middle + spiral)
 
 
 def _vector(factor: Factor) -> Factor:
