@@ -82,7 +82,7 @@ class RelativeMeasurement:
     variance: npt.ArrayLike | None = None
     odometer: npt.ArrayLike | None = None
     age: float = 0.0
-    row: Floats = field(init=False, repr=False)
+    row: bytes = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         row = np.full(WIDTH, np.nan)
@@ -100,7 +100,7 @@ class RelativeMeasurement:
             row[SPEED:STEP] = three("neighbour's velocity", self.velocity)
         elif math.isfinite(row[SOLO]):
             raise InputError("velocity", None, f"must come with the fix of {self.id}", "Send both in one message.")
-        object.__setattr__(self, "row", row)
+        object.__setattr__(self, "row", row.tobytes())
 
 
 class StarStream:
@@ -211,9 +211,8 @@ class StarStream:
             self._check(neighbours)
         self.history.write(self._given, gnss, velocity, dt, fix_age)
         columns, time, motion, fix = self._columns(names), self._time + float(dt), self._motion, self._fix
-        rows, own, history, last = np.empty((len(names), WIDTH)), np.empty(OWN), self.history.reserve(), self._last
-        for i, each in enumerate(neighbours):
-            rows[i] = each.row
+        rows: Floats = np.frombuffer(bytearray().join([each.row for each in neighbours])).reshape(len(names), WIDTH)
+        own, history, last = np.empty(OWN), self.history.reserve(), self._last
         outcome = stream_rows(self._given, history, motion, fix, own, rows, columns, last, time, self.max_age)
         if outcome not in (ESTIMATE, NO_FIX_YET):
             self.history.check(gnss, velocity, dt, fix_age)
@@ -230,16 +229,19 @@ class StarStream:
 
     def _check(self, neighbours: Sequence[RelativeMeasurement]) -> None:
         for each in neighbours:
-            if each.velocity is not None and not np.isfinite(each.row[SOLO:SPEED]).all():
+            if each.velocity is not None and not np.isfinite(np.frombuffer(each.row)[SOLO:SPEED]).all():
                 allowed = "must hold position, variance and odometer for a robust filter"
                 raise InputError("neighbours", each.id, allowed, "Send stream.broadcast, or start with robust=False.")
 
     def _columns(self, names: list[str]) -> Ints:
         """Numbers of the vehicles, 1 and up; the filter has room for them."""
-        if new := [name for name in names if name not in self._numbers]:
-            self._meet(new, names)
+        try:
+            columns = np.fromiter(map(self._numbers.__getitem__, names), np.int64, len(names))
+        except KeyError:
+            self._meet([name for name in names if name not in self._numbers], names)
+            return self._columns(names)
         self._star.reserve(1 + len(names), len(self._last))
-        return np.array([self._numbers[name] for name in names], dtype=np.int64)
+        return columns
 
     def _meet(self, new: list[str], names: list[str]) -> None:
         """Number new vehicles; forget those that are in no star that is remembered, and whose messages are too old."""

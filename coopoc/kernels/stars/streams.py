@@ -43,16 +43,12 @@ from .messages import (
     ACCELERATION_STD,
     FIX_GROWTH,
     FORGOTTEN,
-    HELD,
-    NEW,
     NOWHERE,
-    USES,
     Assumptions,
     interpret,
     measured,
     star_within,
 )
-from .messages import AGE as AGED
 
 INDEX, SERVES, USED_AT = range(3)
 """Of a vehicle's newest message: its index in the last star of the joint filter (-1 for none; the ego's is that of the
@@ -156,16 +152,19 @@ def joint_step(
         star.previous[k] = int(min(memory[INDEX], 0.0) if k == 0 else memory[INDEX])
         serves = 0.0 if new or memory[INDEX] < 0.0 else memory[SERVES]
         memory[SERVES], memory[USED_AT] = serves + dt, memory[AGE]
+        counts = 1.0 if new and held and there else 0.0
+        status = 0.0, 1.0 + serves / dt, max(age, 0.0) / dt, 1.0 if held else 0.0, counts
         for lane in range(LANES):
-            star.status[5 * k + USES, lane], star.status[5 * k + AGED, lane] = 1.0 + serves / dt, max(age, 0.0) / dt
-            star.status[5 * k + HELD, lane] = 1.0 if held else 0.0
-            star.status[5 * k + NEW, lane] = 1.0 if new and held and there else 0.0
-            for i in range(12):
-                counts = held and (i < 6 or there)
-                value = row[at[i // 3] + i % 3] if counts else 0.0 if i < 9 else NOWHERE
-                star.motion[12 * k + i, lane] = value
+            for i in range(5):
+                star.status[5 * k + i, lane] = status[i]
             if k > 0:
                 measured(star.relative, row, std, k, lane)
+        for i in range(12):
+            value = 0.0 if i < 9 else NOWHERE
+            if held and (i < 6 or there):
+                value = row[at[i // 3] + i % 3]
+            for lane in range(LANES):
+                star.motion[12 * k + i, lane] = value
         interpret(star, known, k, dt)
     step_joint(star, joint, gates, known, refine, robust, n, old)
     last[:, INDEX] = -1.0
