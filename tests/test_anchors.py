@@ -84,6 +84,7 @@ def test_scenario1_anchors(formation: Fleet) -> None:
     standard error of 0.15 m; the others repeat within 0.1 m.
     """
     sensors = replace(Sensors.paper_scenario1(), gnss_bias_mode="sample")
+    assert sensors.gnss_std == (1.8, 1.8, 1.8)
     recording = fixture(formation, 0, 1.5, sensors)
     for method, mean, largest, spread in (
         (GNSS(), 3.38, 8.0, 0.0),

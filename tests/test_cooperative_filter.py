@@ -15,7 +15,7 @@ from test_star_filters import CHANNELS, gappy, holed, partial
 from coopoc import V2X, Fleet, JointFilter, Kalman, Recording, Sensors, load_fleet, observe, rt_le
 from coopoc.arrays import Floats
 from coopoc.kernels.stars.cooperative_state import NO_GUARDS, Guards
-from coopoc.methods.cooperative_filter import Broadcast, CooperativeFilter
+from coopoc.methods.cooperative_filter import Broadcast, CooperativeFilter, lasting
 from coopoc.methods.noise_model import NoiseModel, resolve
 from coopoc.methods.star_stream import RelativeMeasurement, StarStream
 from coopoc.world.inbox import inbox
@@ -31,22 +31,14 @@ def drive(steps: int = 80) -> Fleet:
 
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("change", [lambda r: r, holed, partial], ids=["whole", "holed", "partial"])
-def test_textbook_is_the_joint_filter(channel: str, change: Callable[[Recording], Recording]) -> None:
+@pytest.mark.parametrize("known", ["nominal", "identity"])
+def test_textbook_is_the_joint_filter(channel: str, change: Callable[[Recording], Recording], known: str) -> None:
     seen = change(observe(gappy(drive()), S2, CHANNELS[channel], runs=2, observers=[0, 9]))
-    ours, joint = CooperativeFilter(robust=False)(seen, [0, 9]), textbook(JointFilter())(seen, [0, 9])
+    ours, joint = CooperativeFilter(known, robust=False)(seen, [0, 9]), textbook(JointFilter(known))(seen, [0, 9])
     np.testing.assert_allclose(ours.x, joint.x, atol=1e-9)
     assert ours.covariance is not None
     assert joint.covariance is not None
     np.testing.assert_allclose(ours.covariance, joint.covariance, rtol=1e-9, atol=1e-9)
-
-
-def test_textbook_is_the_joint_filter_with_unit_matrices() -> None:
-    seen = observe(drive(), S2, V2X(4), observers=[0])
-    ours, joint = (m("identity")(seen) for m in (lambda n: CooperativeFilter(n, robust=False), JointFilter))
-    np.testing.assert_allclose(ours.x, joint.x, atol=1e-9)
-    assert ours.covariance is not None
-    assert joint.covariance is not None
-    np.testing.assert_allclose(ours.covariance, joint.covariance, atol=1e-9)
 
 
 def test_alone_it_is_the_kalman_filter() -> None:
@@ -79,6 +71,9 @@ def test_wrong_ranges_cost_little_and_are_named() -> None:
     changed = wrong.relative[..., 0] - seen.relative[..., 0] > 8.0
     assert weights[changed].mean() < 0.1
     assert weights[~changed].mean() > 0.97
+    white = np.random.default_rng(0).normal(size=(4, 1000, 3))
+    assert lasting("a", white, 1.0) == lasting("a", np.repeat(white, 2, axis=1), 0.5) == []
+    assert "correlated by 0.5" in lasting("a", np.repeat(white, 2, axis=1), 1.0)[0]
 
 
 HEADING = replace(S2, heading_std=0.03, heading_bias_std=0.05)

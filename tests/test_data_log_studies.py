@@ -17,7 +17,7 @@ from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
 from coopoc.data.registry import load_fleet
 from coopoc.evaluate.metrics import fix_innovations, innovation_columns, normalised_innovations
-from coopoc.studies import paths
+from coopoc.studies import lineup, paths
 from coopoc.study.report import report
 from coopoc.world.storage import digest, read_recording, save_recording
 
@@ -66,6 +66,9 @@ def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> 
     assert 0.8 < rows.query("method == 'kalman'")["nis"].mean() < 1.2
     tables = sorted(file.stem for file in (tmp_path / "side_by_side").rglob("*.md"))
     assert {"innovation", "nis"} <= set(tables)
+    parts = [np.array([[3.0]]), np.array([[4.0]])]
+    merged = [lineup._merged(name, parts, (1, 3)).item() for name in ("innovation_m", "nis", "fixes", "max_error_m")]
+    assert merged == pytest.approx([np.sqrt(57 / 4), 15 / 4, 7, 4])
 
 
 def test_a_recording_is_stored_bit_by_bit(tmp_path: Path) -> None:

@@ -138,6 +138,7 @@ KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n0 -1 0 5 1 0 0 6 0 0 1 7\n"
     [
         (TUM + "0.2 1 2\n", "a.tum: line 4 = 0.2 1 2 (3 words)", "t x y z qx qy qz qw"),
         (TUM + "0.2 x 0 0 0 0 0 1\n", "a.tum: line 4", "finite"),
+        (TUM + "0.2 nan 0 0 0 0 0 1\n", "a.tum: line 4", "finite"),
         (TUM + "0.2 0 0 0 0 0 0 0\n", "a.tum: line 4 = quaternion [0.0, 0.0, 0.0, 0.0]", "length 1"),
         (TUM + "0.1 0 0 0 0 0 0 1\n", "a.tum: line 4, column t", "must increase"),
         ("# t x y z\n", "a.tum = 0 lines", "complete"),

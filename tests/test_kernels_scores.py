@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from coopoc import V2X, Fleet, JointFilter, Kalman, Sensors, Track, observe
+from coopoc.evaluate import scores
 from coopoc.evaluate.metrics import errors, nees, neighbour_rt_le
-from coopoc.evaluate.scores import scored
 
 S2 = Sensors.paper_scenario2()
 
@@ -37,10 +37,14 @@ def test_what_egos_think_of_neighbours(track: Track, crossing: Fleet) -> None:
     assert np.isnan(found[2]).all()
 
 
-def test_neighbours_are_counted_per_step(crossing: Fleet) -> None:
-    """All eight are within the radius at every step, and the three nearest are linked."""
-    seen = observe(crossing, S2, V2X(max_neighbours=3, radius=1e4), runs=2)
-    assert scored(JointFilter(), seen, ["c0", "c5"], crossing)["neighbours_mean"].tolist() == [[3.0, 3.0]] * 2
+def test_neighbours_are_counted_per_step(crossing: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+    """All eight are within the radius at every step, and the three nearest are linked; runs are scored by fours."""
+    seen = observe(crossing, S2, V2X(max_neighbours=3, radius=1e4), runs=6)
+    monkeypatch.setattr(scores, "SLAB", 1)
+    found = scores.scored(JointFilter(), seen, ["c0", "c5"], crossing)
+    assert found["neighbours_mean"].tolist() == [[3.0, 3.0]] * 6
+    each = nees(JointFilter()(seen, ["c0", "c5"]), crossing).mean(axis=1)
+    np.testing.assert_allclose(found["nees"], each, rtol=1e-12)
 
 
 def test_a_start_that_is_known_has_no_nees(crossing: Fleet) -> None:

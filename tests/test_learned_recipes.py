@@ -79,7 +79,7 @@ def test_every_kind_of_net_round_trips(net: Gain, tmp_path: Path) -> None:
 
 
 @pytest.mark.filterwarnings("ignore:.*has no checksum")
-def test_another_shape_is_refused_naming_both(tmp_path: Path) -> None:
+def test_another_shape_history_and_kind_are_refused_naming_both(tmp_path: Path) -> None:
     path = save(tmp_path / "net.safetensors", Checkpoint(GainNet(5, 40), {}))
     tensors, card = load_file(path), read_card(path)
     tensors["gain.weight"] = torch.zeros(9, 90)
@@ -87,10 +87,6 @@ def test_another_shape_is_refused_naming_both(tmp_path: Path) -> None:
     assert card["parameters"] == 23_928
     with pytest.raises(InputError, match=r"gain.weight of shape \(9, 90\): expected \(9, 720\)"):
         load(path)
-
-
-@pytest.mark.filterwarnings("ignore:.*has no checksum")
-def test_a_history_of_another_net_and_another_kind_are_refused(tmp_path: Path) -> None:
     longer = torch.zeros(2, 19_939)
     path = save(tmp_path / "net.safetensors", Checkpoint(GainNet(), {}, longer))
     with pytest.raises(InputError, match=r"history of shape \(2, 19939\): expected \(2, 19938\)"):

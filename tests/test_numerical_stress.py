@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -127,22 +127,30 @@ def test_the_smoother_descends_where_whole_steps_lead_away() -> None:
     assert error.max() < 3.0 * np.abs(recording.gnss[:, :, 0] - fleet.position[:, 0]).max()
 
 
+def errors_of(names: str, words: str, drives: Iterable[tuple[co.Fleet, co.Recording]]) -> dict[str, float]:
+    """Rms error of the first vehicle, m; all but kalman say the words in a note."""
+    squares: dict[str, list[np.ndarray]] = {}
+    for fleet, recording in drives:
+        for name in names.split():
+            track = METHODS[name]("nominal")(recording, [0])
+            squares.setdefault(name, []).append(((track.x[:, :, 0] - fleet.position[:, 0]) ** 2).sum(axis=-1))
+            assert name == "kalman" or any(words in note for note in track.notes), name
+    return {name: float(np.sqrt(np.mean(found))) for name, found in squares.items()}
+
+
 @pytest.mark.parametrize(("range_std", "angle_std"), [(0.05, 0.3), (0.001, 1.0), (1e-4, 0.1)])
 def test_a_fine_range_in_a_coarse_direction_is_not_taken_for_exact(range_std: float, angle_std: float) -> None:
     """Uncertain angles put a neighbour on an arc. Taken as stated, joint is 34, 42 and 12 m off, and LKF-SA's edge form
     6, 31 and 2 m, where a filter of the ego alone is 0.7 m off; and claims centimetres."""
-    squares: dict[str, list[np.ndarray]] = {}
+    drives = []
     for seed in (1, 2):
         fleet, rng = in_line(4, 0.0), np.random.default_rng(seed)
         place = rng.uniform(-20, 20, (1, 4, 3)) * [1.0, 1.0, 0.0]
         fleet = replace(fleet, position=fleet.position + place)
         sensors = co.Sensors((1.5, 1.5, 1.5), range_std=range_std, azimuth_std=angle_std, inclination_std=angle_std)
-        recording = observed(fleet, sensors, 6, seed)
-        for name in ("kalman", "lkf-sa-edge", "joint", "ci", "split-ci", "fixed-lag", "gbp", "batch-smoother", "mhe"):
-            track = METHODS[name]("nominal")(recording, [0])
-            squares.setdefault(name, []).append(((track.x[:, :, 0] - fleet.position[:, 0]) ** 2).sum(axis=-1))
-            assert name == "kalman" or any("put what is" in note and "on an arc" in note for note in track.notes), name
-    error = {name: float(np.sqrt(np.mean(found))) for name, found in squares.items()}
+        drives.append((fleet, observed(fleet, sensors, 6, seed)))
+    names = "kalman lkf-sa-edge joint ci split-ci fixed-lag gbp batch-smoother mhe"
+    error = errors_of(names, " rad put what is ", drives)
     assert all(each < 4.0 * error["kalman"] for each in error.values()), error
 
 
@@ -155,7 +163,7 @@ def without_azimuth(recording: co.Recording) -> co.Recording:
 def test_fine_ranges_alone_bend_as_fixes_are_uncertain() -> None:
     """UWB of 1 mm between fixes of 1.5 m, 20 m apart. Taken as stated, the central filter was 27 m off, the fixed-lag
     smoother 54 m and joint 1 m, where a filter of the ego alone is 0.7 m off."""
-    squares: dict[str, list[np.ndarray]] = {}
+    drives = []
     for seed in (1, 2, 3):
         rng, t = np.random.default_rng(seed), np.arange(60) / 10
         heading = rng.uniform(0, 2 * np.pi, 4) + np.cumsum(rng.normal(0, 0.02, (60, 4)), 0)
@@ -164,11 +172,9 @@ def test_fine_ranges_alone_bend_as_fixes_are_uncertain() -> None:
         sensors = co.Sensors((1.5, 1.5, 1.5), range_std=1e-3)
         fleet = co.Fleet(tuple("abcd"), t, position, velocity)
         seen = co.observe(fleet, sensors, co.V2X(5, radius=200.0), runs=3, seed=seed)
-        for name in ("kalman", "joint", "lkf-sa-edge", "central-filter", "fixed-lag", "gbp", "batch-smoother"):
-            track = METHODS[name]("nominal")(without_azimuth(seen), [0])
-            squares.setdefault(name, []).append(((track.x[:, :, 0] - fleet.position[:, 0]) ** 2).sum(axis=-1))
-            assert name == "kalman" or any("no azimuth put what is" in note for note in track.notes), name
-    error = {name: float(np.sqrt(np.mean(found))) for name, found in squares.items()}
+        drives.append((fleet, without_azimuth(seen)))
+    names = "kalman joint lkf-sa-edge central-filter fixed-lag gbp batch-smoother"
+    error = errors_of(names, "no azimuth put what is", drives)
     assert all(each < 1.05 * error["kalman"] for each in error.values()), error
 
 

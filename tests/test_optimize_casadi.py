@@ -50,6 +50,7 @@ def test_ranges_end_where_scipy_ends(start: float | None) -> None:
     [
         ({"max_iterations": -1}, "must be a whole number"),
         ({"tolerance": 0}, "must be a number > 0"),
+        ({"structure": 0}, "is no option of casadi"),
     ],
 )
 def test_wrong_options(options: dict[str, object], words: str) -> None:

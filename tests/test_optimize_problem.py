@@ -123,7 +123,7 @@ BAD = {
     "shape of z": (lambda: PAIR.add("spherical", ("a", "b"), [5.0], std=1.0), "must have 2 or 3"),
     "shape of std": (lambda: PAIR.add("spherical", ("a", "b"), [5.0, 0.1, 1], std=[1.0, 1.0]), "must have shape"),
     "arity": (lambda: PAIR.add("range", ("a",), 5.0, std=1.0), "must name 2 points"),
-    "twice a name": (lambda: Problem(("a", "a")), "must be unique"),
+    "twice a name": (lambda: Problem(("b", "a", "a")), r"\['a'\]: must be unique"),
     "x0": (lambda: Problem(("a", "b"), x0=np.zeros((3, 3))), "shape"),
     "no factors": (lambda: solve(Problem(("a",))), "no measurements"),
     "words for z": (lambda: PAIR.add("range", ("a", "b"), "far", std=1.0), "array of numbers"),

@@ -309,5 +309,5 @@ def test_a_range_of_zero_is_refused_and_forgotten(crossing: Fleet) -> None:
     recording = observe(crossing, Sensors(), V2X(max_neighbours=2))
     relative = recording.relative.copy()
     relative[0, 3, 0] = 0.0
-    with pytest.raises(InputError, match="must be a range > 0 m"):
+    with pytest.raises(InputError, match=r"\[0, 3\] = 0\.0: must be a range > 0 m"):
         replace(recording, relative=relative)

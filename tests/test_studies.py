@@ -21,6 +21,7 @@ from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import Setting, jobs_of, load_method
 from coopoc.plugins import find
 from coopoc.studies import convergence, error_cdf, lineup, neighbours, scene, weights
+from coopoc.studies.paper import reported
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
@@ -71,6 +72,8 @@ def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:
     assert "bound is for the rms over runs" in captions["rt_le_nominal"]
     assert "bound" not in captions["nees"]
     assert "budget" not in captions
+    (key, text), *_ = study("neighbours").answers(results).items()
+    assert reported("neighbours", results, [key, "what is not said"])[1:] == text[1:]
 
 
 @pytest.mark.parametrize("rate", [10.0, 2.0])

@@ -87,13 +87,18 @@ def test_no_two_methods_look_alike() -> None:
 
 
 def test_a_sweep_draws_the_means_in_the_method_colour(results: Results) -> None:
-    axes = figures.sweep(results, "max_neighbours", where={"noise_model": ["fitted", "nominal"]}).figure.axes[0]
+    where = {"noise_model": ["fitted", "nominal"]}
+    axes = figures.sweep(results, "max_neighbours", where=where, log=True).figure.axes[0]
     drawn = {line.get_color(): line for line in axes.lines}
     assert set(drawn) == {look(m).color for m in ("kalman", "joint", "bound")}
     expected = results.frame.query("method == 'joint'").groupby("max_neighbours")["rt_le_m"].mean()
     np.testing.assert_allclose(drawn[look("joint").color].get_ydata(), expected.to_numpy())
     assert drawn[look("bound").color].get_linestyle() == "--"
     assert len(axes.collections) == 3
+    axes.set_ylim(1.0, 2e4)
+    assert [axes.yaxis.get_major_formatter()(value) for value in (10.0, 20.0)] == ["10", ""]
+    *_, one, other = figures.sweep(results, "max_neighbours").figure.axes[0].get_legend().get_texts()
+    assert (one.get_text(), other.get_text()) == ("identity", "fitted / trained")
 
 
 def test_a_cdf_marks_the_mean_of_the_maxima(results: Results) -> None:

@@ -87,7 +87,7 @@ class Track:
             raise InputError("extras", shown(self.extras), "must be name -> (R, T, E)", "Give {} for none.")
         by_link = None if self.neighbours is None else self.neighbours.shape[:2]
         extras = {
-            name: checked(f"extras[{name}]", v, "(R, L)" if np.ndim(v) == 2 else "(R, T, E)", by_link)
+            name: checked(f"extras[{name}]", v, "(R, L)", by_link)
             if np.ndim(v) == 2 and by_link
             else checked(f"extras[{name}]", v, "(R, T, E)", x.shape[:3])
             for name, v in self.extras.items()

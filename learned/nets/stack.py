@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Sequence
-from typing import NamedTuple, TypeVar
+from typing import TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -31,21 +31,6 @@ def unflatten(theta: Tensor, like: Net) -> list[Net]:
     return models
 
 
-class Layer(NamedTuple):
-    """A stacked linear layer, or one of the two of a GRU: weight (S, out, in), bias (S, 1, out), weight^T as a view."""
-
-    weight: Tensor
-    bias: Tensor
-    transposed: Tensor
-
-    def __call__(self, x: Tensor) -> Tensor:
-        """Output (S, B, out) of an input (S, B, in)."""
-        return torch.baddbmm(self.bias, x, self.transposed)
-
-
-Layers = dict[str, Layer]
-
-
 def named(theta: Tensor, like: nn.Module) -> dict[str, Tensor]:
     """Views (S, ...) into flat weights, or gradients, (S, P) by the names of the parameters of `like`.
 
@@ -57,31 +42,3 @@ def named(theta: Tensor, like: nn.Module) -> dict[str, Tensor]:
         views[name] = theta[:, at : at + parameter.numel()].view(len(theta), *parameter.shape)
         at += parameter.numel()
     return views
-
-
-def layers(theta: Tensor, like: nn.Module) -> Layers:
-    """The weights of `named` as stacked linear layers: "update", ..., and of a GRU cell "process_ih", "process_hh".
-
-    >>> layers(torch.zeros(1, 63), nn.ModuleDict({"a": nn.GRUCell(2, 3)}))["a_hh"].weight.shape
-    torch.Size([1, 9, 3])
-    """
-    views = named(theta, like)
-    return {
-        name.replace(".weight", "").replace("weight_", "").replace(".", "_"): Layer(
-            weight, views[name.replace("weight", "bias")].unsqueeze(1), weight.mT
-        )
-        for name, weight in views.items()
-        if "weight" in name
-    }
-
-
-def gru(net: Layers, name: str, x: Tensor, h: Tensor) -> Tensor:
-    """State (S, B, H) of stacked GRU cells after an input x (S, B, n); torch's GRUCell is the same for one net.
-
-    r, z = sigmoid(W x + U h);  n = tanh(W x + r (U h));  h <- n + z (h - n), biases inside W and U.
-    """
-    size = h.shape[-1]
-    gates, fresh = net[f"{name}_ih"](x).split([2 * size, size], -1)
-    more, kept = net[f"{name}_hh"](h).split([2 * size, size], -1)
-    reset, keep = (gates + more).sigmoid().chunk(2, -1)
-    return torch.lerp(torch.addcmul(fresh, reset, kept).tanh(), h, keep)

@@ -48,11 +48,6 @@ class Kind(NamedTuple):
     bound: bool = False
 
     @property
-    def opposed(self) -> bool:
-        """The derivative by the first node is minus that by the second."""
-        return self.measurement.arity == 2 and self.measurement.frame == "world"
-
-    @property
     def widths(self) -> tuple[int, int, int]:
         """How many numbers z, constants and weights a measurement has."""
         measurement, d = self.measurement, self.space.dimension
