@@ -110,8 +110,8 @@ def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Flo
         velocity[run, step, sender] += 5e-3 * error
     given = replace(damaged(recording, kind, links), velocity=velocity) if kind else recording
     known = resolve("nominal", given)
-    sent, variance = broadcasts(given, known, [EGO], method.guards)
-    sent, moved = sent.copy(), np.cumsum(np.nan_to_num(given.dt * given.velocity), axis=1)
+    sent, variance, moved = broadcasts(given, known, [EGO], method.guards)
+    sent = sent.copy()
     if kind in ("position", "odometer"):
         (sent if kind == "position" else moved)[run, step, sender] += error
     sent.flags.writeable = False
