@@ -140,11 +140,11 @@ def per_seed(results: Results, where: Where) -> Floats:
     return np.array([results.values("rt_le_m", {**where, "train_seed": seed}) for seed in seeds])
 
 
-def seed_means(results: Results, where: Where) -> list[float]:
-    """Mean RT-LE, m, for each training seed; of a method that is not trained one, and none if it was not run."""
+def seed_means(results: Results, where: Where, number: Number = mean) -> list[float]:
+    """A number for each training seed; of a method that is not trained one, and none if it was not run."""
     seeds = _seeds(results, where)
     wheres = [{**where, "train_seed": seed} for seed in seeds] or [dict(where)]
-    return [value for each in wheres if (value := mean(results, each)) is not None]
+    return [value for each in wheres if (value := number(results, each)) is not None]
 
 
 def seed_std(results: Results, where: Where) -> float | None:
