@@ -33,7 +33,7 @@ from coopoc.evaluate.trajectory_scores import absolute_error, rms
 from coopoc.formats import GRAPHS, load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, solve
-from coopoc.optimize.backends.gtsam_factors import pose_of
+from coopoc.optimize.backends.gtsam import pose_of
 from coopoc.optimize.graph_problems import from_graph
 
 FOLDER = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"

@@ -89,20 +89,6 @@ def test_scale_and_bias_are_found_where_they_act() -> None:
     assert np.abs(co.heading_error(track, fleet)).mean() < np.abs(co.heading_error(ignored, fleet)).mean()
 
 
-def test_range_alone_and_bearing_alone_help_and_both_help_more() -> None:
-    fleet = convoy()
-    seen = observed(fleet, runs=10)
-
-    def error(*components: int) -> float:
-        relative = np.full(seen.relative.shape, np.nan)
-        relative[..., components] = seen.relative[..., components]
-        return float(co.rt_le(co.PoseFilter("fleet")(replace(seen, relative=relative), [1, 2]), fleet).mean())
-
-    nothing, ranges, bearings, both = error(), error(0), error(1), error(0, 1)
-    assert both < min(ranges, bearings)
-    assert max(ranges, bearings) < nothing
-
-
 def test_the_gate_keeps_outliers_out() -> None:
     """Every twentieth range is 20 m too long; without outliers the gate changes next to nothing."""
     fleet = convoy(masts=2)
