@@ -61,7 +61,7 @@ fuzz: $(VENV)/.ready-fuzz
 	while read -r name; do $(VENV)/bin/python -m fuzz.run "$$name" --minutes $(MINUTES) --executions 1000000; done
 
 docs: $(VENV)/.ready-docs
-	NO_MKDOCS_2_WARNING=1 JUPYTER_CONFIG_PATH=docs OMP_NUM_THREADS=1 $(VENV)/bin/python -m mkdocs build
+	NO_MKDOCS_2_WARNING=1 TQDM_DISABLE=1 OMP_NUM_THREADS=1 $(VENV)/bin/python -m mkdocs build
 
 help:
 	@sed -n 's/^# \(make [a-z-]* .*\)/\1/p' Makefile

@@ -29,11 +29,11 @@ from tabulate import tabulate
 from unseen_graphs import FAMILIES
 
 from coopoc.errors import InputError
-from coopoc.evaluate.trajectory_scores import absolute_error
+from coopoc.evaluate.trajectory_scores import absolute_error, rms
 from coopoc.formats import GRAPHS, load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, solve
-from coopoc.optimize.backends.gtsam_factors import pose_of
+from coopoc.optimize.backends.gtsam import pose_of
 from coopoc.optimize.graph_problems import from_graph
 
 FOLDER = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
@@ -86,7 +86,7 @@ def error(graph: Graph, position: np.ndarray) -> float:
     if len(truth) <= graph.dimension or not np.isfinite(truth).all():
         return np.nan
     try:
-        return float(absolute_error(position[graph.is_pose], truth).rmse)
+        return float(rms(absolute_error(position[graph.is_pose], truth)))
     except InputError:
         return np.nan
 

@@ -305,10 +305,10 @@ def planar_recording(
     place: Floats,
     table: Floats,
     sensors: Sensors,
-    v2x: V2X,
     note: str,
 ) -> Recording:
-    """One run, nothing simulated; landmarks stand, have their place as a fix at every step, and send nothing.
+    """One run, nothing simulated, over an ideal channel; landmarks stand, have their place as a fix at every step, and
+    send nothing.
 
     Args:
         ids: of n robots, then of the landmarks.
@@ -318,10 +318,10 @@ def planar_recording(
         place: (m, 2) m, of the landmarks.
         table: (L, 5) step, observer, neighbour, range m, bearing rad; NaN for what was not measured.
         sensors: the noise of all this.
-        v2x: which messages of robots arrive.
         note: of the recording; that inclinations were not measured is added.
     """
     n = len(ids) - len(place)
+    v2x = V2X(max_neighbours=n - 1, radius=np.inf)
     table = table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
     links = Links(*table[:, :3].astype(np.int64).T)
     shape = (1, len(t), len(ids), 3)

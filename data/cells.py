@@ -7,6 +7,7 @@ index of a frame is the row in the file, from 1, so that an error names it whate
 from __future__ import annotations
 
 import csv
+import json
 import re
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
@@ -22,7 +23,9 @@ from coopoc.formats.values import LARGEST
 if TYPE_CHECKING:
     import pandas as pd
 
-TABLES = (".csv", ".parquet")
+TABLES = (".csv", ".parquet", ".jsonl")
+WHOLE = re.compile(r"^(\d+)\.0$")
+"""What a spreadsheet or pandas makes of a whole number beside empty cells: 7.0 is the name 7."""
 COLUMNS = 5000
 """Most columns of a table."""
 USUAL = {
@@ -34,10 +37,11 @@ USUAL = {
 
 
 def read_frame(path: Path, *text: str) -> pd.DataFrame:
-    """Table of a .parquet or (any other ending) CSV file.
+    """Table of a .parquet, .jsonl or (any other ending) CSV file.
 
     Args:
-        path: of the file; CSV between commas, or between semicolons or tabs with decimal commas.
+        path: of the file; JSON with an object per line; CSV between commas, or between semicolons or tabs with decimal
+            commas.
         text: columns of a CSV file that are kept as they are written: "007" stays "007".
 
     Raises:
@@ -48,7 +52,11 @@ def read_frame(path: Path, *text: str) -> pd.DataFrame:
     try:
         if parquet := path.suffix.lower() == ".parquet":
             require("pyarrow", "a Parquet table")
-        frame = pd.read_parquet(path).reset_index(drop=True) if parquet else _read_csv(path, text)
+        if path.suffix.lower() == ".jsonl":
+            lines = path.read_text("utf-8-sig").splitlines()
+            frame = pd.DataFrame([json.loads(line) for line in lines if line.strip()])
+        else:
+            frame = pd.read_parquet(path).reset_index(drop=True) if parquet else _read_csv(path, text)
     except (InputError, ImportError):
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
@@ -64,6 +72,9 @@ def headers(path: Path) -> list[str]:
     try:
         if path.suffix.lower() == ".csv":
             return [name.strip() for name in _first_lines(path)[1]]
+        if path.suffix.lower() == ".jsonl":
+            with path.open(encoding="utf-8-sig") as file:
+                return list(json.loads(file.readline(100_000)))
         from pyarrow.parquet import read_schema
 
         return [str(name) for name in read_schema(path).names]
@@ -141,7 +152,7 @@ def words(frame: pd.DataFrame, column: str, file: str) -> list[str]:
         file,
         "must be a name",
     )
-    return [str(value).strip() for value in frame[column].tolist()]
+    return [WHOLE.sub(r"\1", str(value).strip()) for value in frame[column].tolist()]
 
 
 def filled(cells: pd.Series[Any]) -> Bools:

@@ -14,7 +14,6 @@ from coopoc.world.body_frames import midway, turned
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 from coopoc.world.sensors import Sensors
-from coopoc.world.v2x import V2X
 
 from .assemble import backward_difference, nearest, planar_recording, steps_of
 from .log.read import Log, steps_in_words
@@ -87,7 +86,6 @@ def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]
         graph.position[marks],
         _relative(graph, column, n, begin, t),
         _sensors(graph, dt),
-        V2X(max_neighbours=n - 1, radius=float("inf")),
         "odometry and relative measurements are real; no fix, no compass",
     )
     position = truth[..., :3]

@@ -19,14 +19,12 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.links import wrap
 from coopoc.world.recording import Recording
 from coopoc.world.sensors import Sensors
-from coopoc.world.v2x import V2X
 
 from .assemble import (
     PLANE_STD,
     backward_difference,
     check_size,
     check_time,
-    first_of_each,
     interpolate,
     nearest,
     planar_recording,
@@ -166,48 +164,44 @@ class Calibration(NamedTuple):
     Attributes:
         sensors: standard deviations of white noise that leads as far astray as the real errors do.
         lag: s, by which the robots follow their odometry.
-        speed: (N,) true over logged speed.
+        speed: (N,) true over logged speed, straight ahead.
+        slip: (N,) s/rad, share of it that is lost in a turn of 1 rad/s.
         turn: (N,) true over logged turn rate.
     """
 
     sensors: Sensors
     lag: float
     speed: Floats
+    slip: Floats
     turn: Floats
 
 
-def pose_recording(log: MrclamLog, v2x: V2X, calibration: Calibration) -> Recording:
+def pose_recording(log: MrclamLog, calibration: Calibration) -> Recording:
     """Recording of the robots' own measurements, one run: odometry, range and bearing of robots and landmarks.
 
     There are no fixes and no compass. Inclinations are pi/2: the robots drive on one floor. Of several measurements of
-    a subject in a step the one nearest to the step's instant is kept; at most K robots, nearest first by measured
-    range, and all landmarks.
+    a subject in a step the one nearest to the step's instant is kept; `data.log.links.under` chooses a channel.
 
     Args:
         log: of read_mrclam.
-        v2x: K, radius and channel.
         calibration: of its sensors: odometry is scaled and delayed by it, since it is a record of commands.
 
     Raises:
         InputError: a folder without positions of landmarks.
     """
     robots, marks = log.fleet.ids, surveyed(log)
-    forward = calibration.speed * _delayed(log, log.speed, calibration.lag)
-    others = _on_steps(log, log.others)
-    others = others[others[:, 3] <= v2x.radius]
-    others = others[np.lexsort((others[:, 3], others[:, 1], others[:, 0]))]
-    others = others[first_of_each(v2x.max_neighbours, others[:, 0], others[:, 1])]
+    wheel, turning = (_delayed(log, values, calibration.lag) for values in (log.speed, log.turn_rate))
+    forward = _driven(calibration.speed, calibration.slip, wheel, turning)
     sightings = _on_steps(log, log.sightings)
     sightings[:, 2] += len(robots)
     return planar_recording(
         (*robots, *(f"landmark{int(subject)}" for subject in marks[:, 0])),
         log.fleet.t,
         forward[..., None] * [1.0, 0.0],
-        calibration.turn * _delayed(log, log.turn_rate, calibration.lag),
+        calibration.turn * turning,
         marks[:, 1:],
-        np.vstack([others, sightings]),
+        np.vstack([_on_steps(log, log.others), sightings]),
         calibration.sensors,
-        v2x,
         "odometry, ranges and bearings are real; no fix, no compass, nothing simulated",
     )
 
@@ -229,7 +223,8 @@ def surveyed(log: MrclamLog) -> Floats:
 def calibrate(log: MrclamLog, until: float) -> Calibration:
     """Calibration on the first `until` seconds.
 
-    The lag minimises the residual of the turn rate; the scales are least squares, per robot. Errors that last are
+    The lag minimises the residual of the turn rate; scales and slip are least squares, per robot, over sums of WINDOW:
+    of single steps they would be too small, because the robots follow their commands gradually. Errors that last are
     noise whose sums grow faster than those of white noise, n s^2: the s here is that of the sums over WINDOW, of the
     odometry's errors, and of those of all that a robot measures in that time.
 
@@ -251,24 +246,31 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
     rate = np.diff(log.heading, axis=0)[: len(velocity)] / dt
     lag = min(LAGS, key=lambda lag: float(np.nanvar(rate - _delayed(log, log.turn_rate, lag)[first])))
     wheel, turning = (_delayed(log, values, lag)[first] for values in (log.speed, log.turn_rate))
-    speed, turn = (_slope(true, logged) for true, logged in ((velocity[..., 0], wheel), (rate, turning)))
-    ahead, aside, off = velocity[..., 0] - speed * wheel, velocity[..., 1], rate - turn * turning
+    speed, lost = _factors(window, velocity[..., 0], wheel, wheel * np.abs(turning))
+    (turn,), slip = _factors(window, rate, turning), -lost / speed
+    driven = _driven(speed, slip, wheel, turning)
+    ahead, aside, off = velocity[..., 0] - driven, velocity[..., 1], rate - turn * turning
     forward, side, yaw = (summed(error, window) for error in (ahead, aside, off))
     ranges, bearings = _relative(log, until)
     sensors = Sensors(
-        velocity_std_ratio=forward / float(np.sqrt(np.mean((speed * wheel) ** 2))),
+        velocity_std_ratio=forward / float(np.sqrt(np.mean(driven**2))),
         velocity_floor=side,
         yaw_rate_std=yaw,
         range_std=ranges,
         azimuth_std=bearings,
         inclination_std=PLANE_STD,
         compass=False,
-        speed_scale_std=_in_blocks(ahead, speed * wheel, block),
+        speed_scale_std=_in_blocks(ahead, driven, block),
         yaw_rate_bias_std=_in_blocks(off, np.ones(rate.shape), block),
         odometry_error_time=LASTING,
         min_range=0.0,
     )
-    return Calibration(sensors, float(lag), speed, turn)
+    return Calibration(sensors, float(lag), speed, slip, turn)
+
+
+def _driven(speed: Floats, slip: Floats, wheel: Floats, turning: Floats) -> Floats:
+    """(T, N) m/s, forward speed of what was logged."""
+    return np.asarray(speed * wheel * np.maximum(1.0 - slip * np.abs(turning), 0.0))
 
 
 def _delayed(log: MrclamLog, values: Floats, lag: float) -> Floats:
@@ -276,15 +278,20 @@ def _delayed(log: MrclamLog, values: Floats, lag: float) -> Floats:
     return np.column_stack([np.interp(log.fleet.t - lag, log.fleet.t, column) for column in values.T])
 
 
-def _slope(true: Floats, logged: Floats) -> Floats:
-    """(N,) least-squares factor of the logged values (T, N) on the true ones, NaN where these are unknown."""
-    return np.asarray(np.nansum(true * logged, axis=0) / (np.isfinite(true) * logged**2).sum(axis=0))
+def _factors(window: int, true: Floats, *logged: Floats) -> Floats:
+    """(regressors, N) least-squares factors of logged values (T, N) on true ones, over sums of a window, where the true
+    ones are known."""
+    known = np.isfinite(true)
+    parts = (np.where(known, values, 0.0)[: len(true) // window * window] for values in (true, *logged))
+    sums = [part.reshape(-1, window, true.shape[1]).sum(axis=1).T for part in parts]
+    pairs = zip(np.stack(sums[1:], axis=-1), sums[0], strict=True)
+    return np.array([np.linalg.lstsq(left, right)[0] for left, right in pairs]).T
 
 
 def _in_blocks(error: Floats, regressor: Floats, steps: int) -> float:
     """Rms over robots and blocks of steps of the factor of a regressor (T, N) that explains errors (T, N) best."""
     starts = range(0, len(error) - steps + 1, steps)
-    factors = [_slope(error[first : first + steps], regressor[first : first + steps]) for first in starts]
+    factors = [_factors(1, error[first : first + steps], regressor[first : first + steps])[0] for first in starts]
     return float(np.sqrt(np.nanmean(np.square(factors))))
 
 

@@ -17,6 +17,7 @@ from coopoc.plugins import find, names
 from coopoc.world.fleet import Fleet
 from coopoc.world.storage import is_recording, read_recording
 
+from .cells import TABLES
 from .fleet_files import read_fcd, read_table, read_tum, tum_files, write_table
 from .graphs import read_graph_log
 from .log.read import Log, is_log, read_log, steps_in_words
@@ -76,7 +77,7 @@ DRIVES: Mapping[str, Callable[..., Fleet]] = {
     "mrclam": _mrclam_fleet,
 }
 """Formats of drives -> reader; of MR.CLAM Vicon's truth, whose measurements `coopoc run real` takes."""
-ENDINGS = {".parquet": "table", ".csv": "table", ".xml": "fcd", ".tum": "tum", ".txt": "tum"}
+ENDINGS = {**dict.fromkeys(TABLES, "table"), ".xml": "fcd", ".tum": "tum", ".txt": "tum"}
 
 
 def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options: Any) -> Fleet:
@@ -169,7 +170,7 @@ def detect(path: Path, columns: Mapping[str, str] | None = None) -> str:
     """
     kind = _real(path, columns) or ("tum" if path.is_dir() and tum_files(path) else ENDINGS.get(path.suffix))
     if kind is None:
-        endings = ".csv, .parquet, .tum, .txt, .xml, .nmea, .bag, .pyfg or .npz"
+        endings = ".csv, .parquet, .jsonl, .tum, .txt, .xml, .nmea, .bag, .pyfg or .npz"
         allowed = f"must end in {endings}, or be a folder of TUM, MR.CLAM or log files"
         raise InputError("data", path.name, allowed, f"Pass format= one of {', '.join((*DRIVES, *LOGS))}.")
     return kind

@@ -8,25 +8,20 @@ from collections.abc import Mapping
 from dataclasses import asdict
 from math import isnan
 from pathlib import Path as File
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import Annotated, Any
 
 import numpy as np
 from tyro.conf import Positional, arg
 
 from coopoc.errors import InputError
 from coopoc.escapes import picture
+from coopoc.evaluate.trajectory_scores import Aligned, Path, Score, Unit, compared, scores
 from coopoc.formats.trajectories import read_kitti, read_tum
 from coopoc.formats.values import read_words, to_rotation
 from coopoc.world.pictures import COLORS, INK, axes, finish
 
 from .cells import TABLES, named_columns, numeric, read_frame, seconds, words
 from .source import split
-
-if TYPE_CHECKING:
-    from coopoc.evaluate.trajectory_scores import Path, Score
-
-Aligned = Literal["none", "each", "sim3", "team"]
-Unit = Literal["steps", "m"]
 
 COVARIANCE = ("cxx", "cxy", "cxz", "cyy", "cyz", "czz")
 SYMMETRIC = np.array([[0, 1, 2], [1, 3, 4], [2, 4, 5]])
@@ -42,8 +37,6 @@ def read_paths(name: str) -> dict[str, Path]:
     Raises:
         InputError: a file with a fault, named with its line or row.
     """
-    from coopoc.evaluate.trajectory_scores import Path
-
     word, options = split(name)
     file = File(word)
     if not file.is_file():
@@ -60,8 +53,6 @@ def read_paths(name: str) -> dict[str, Path]:
 
 
 def _of_table(file: File, columns: dict[str, str]) -> dict[str, Path]:
-    from coopoc.evaluate.trajectory_scores import Path
-
     frame = read_frame(file, columns.get("id", "id"))
     allowed = ("id", "t", "x", "y", "z", *QUATERNION, *COVARIANCE)
     frame = named_columns(frame, columns, allowed, ("t", "x", "y"), file.name)
@@ -116,8 +107,6 @@ def score(
         plot: picture of the paths.
         output: file for the scores as JSON.
     """
-    from coopoc.evaluate.trajectory_scores import compared, scores
-
     if not truth:
         raise InputError("truth", "()", "must name a file", "Add --truth FILE.")
     made: list[dict[str, Path]] = [{}, {}]

@@ -6,6 +6,7 @@ import contextlib
 import html
 import io
 import re
+import sys
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,6 @@ from matplotlib.ticker import LogLocator, NullFormatter
 from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.exceptions import PluginError
 from mkdocs.structure.files import File, Files
-from mkdocs.structure.pages import Page
 from scipy import stats
 
 import coopoc as co
@@ -28,7 +28,10 @@ from coopoc.study import style
 
 matplotlib.use("Agg")
 DOCS = Path(__file__).parent
-STEPS, RUNS, EGO, NEIGHBOURS = 200, 10, 24, 4
+sys.path.insert(0, str(DOCS))
+from tutorial import page as tutorial  # noqa: E402
+
+RUNS, EGO, NEIGHBOURS = 10, 24, 4
 SECTIONS = {
     "world": ("Worlds and measurements", "Fleets, sensors, V2X, recordings."),
     "methods": ("Methods", "Recording → Track."),
@@ -81,22 +84,13 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
 
 
-def on_page_content(content: str, page: Page, **_: Any) -> str:
-    """Render the formulas of a page and of its docstrings as MathML, which browsers draw without any script; turn the
-    links of a tutorial to pages into addresses.
+def on_page_content(content: str, **_: Any) -> str:
+    """Render the formulas of a page and of its docstrings as MathML, which browsers draw without any script.
 
     Raises:
-        PluginError: a link to no page or heading, or a formula that MathML cannot show.
+        PluginError: a formula that MathML cannot show.
     """
-    content = STDERR.sub("", FORMULA.sub(_formula, content))
-    if not page.file.src_uri.endswith(".py"):
-        return content  # mkdocs checks the links of pages
-    return TUTORIAL_LINK.sub(_address, content)
-
-
-STDERR = re.compile(r'<div class="jp-RenderedText[^>]*vnd\.jupyter\.stderr[^>]*>\s*<pre>.*?</pre>\s*</div>', re.DOTALL)
-"""Notices of kernels that compile, and progress."""
-TUTORIAL_LINK = re.compile(r'href="\.\./([\w/]+)\.md(?:#([\w-]+))?"')
+    return FORMULA.sub(_formula, content)
 
 
 def _formula(match: re.Match[str]) -> str:
@@ -105,15 +99,6 @@ def _formula(match: re.Match[str]) -> str:
     if "\\" in shown:
         raise PluginError(f"A formula that MathML cannot show: {text}")
     return shown
-
-
-def _address(match: re.Match[str]) -> str:
-    path = DOCS / f"{match[1]}.md"
-    titles = re.findall(r"^#+ (.*)", path.read_text(), flags=re.MULTILINE) if path.is_file() else []
-    places = {re.sub(r"[^\w -]", "", title).lower().replace(" ", "-") for title in titles}
-    if not places or (match[2] and match[2] not in places):
-        raise PluginError(f"A tutorial links to {match[0]}, which is not there.")
-    return f'href="../../{match[1]}/{f"#{match[2]}" if match[2] else ""}"'
 
 
 def _place(entries: Any, places: dict[str, list[Any]]) -> None:
@@ -127,25 +112,38 @@ def _place(entries: Any, places: dict[str, list[Any]]) -> None:
 
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the pages that are made."""
-    made = {**dict(_methods()), "gallery.md": _gallery(), **dict(_api())}
+    made = {**dict(_methods()), **dict(_tutorials()), "gallery.md": _gallery(), **dict(_api())}
     for path, content in made.items():
         files.append(File.generated(config, path, content=content))
     return files
 
 
+def _tutorials() -> Iterator[tuple[str, str | bytes]]:
+    """The tutorials, run, and their pictures."""
+    for path in sorted((DOCS / "tutorials").glob("*.py")):
+        content, pictures = tutorial(path.read_text(), path.stem)
+        yield f"tutorials/{path.stem}.md", content
+        yield from ((f"tutorials/{file}", picture) for file, picture in pictures.items())
+
+
 def _methods() -> Iterator[tuple[str, str | bytes]]:
     """A page for each method: what it is, what it sends, how it does on one drive."""
-    fleet, sensors = co.load_fleet("town10").between(0, STEPS), co.Sensors.paper_scenario2()
-    everyone = co.observe(fleet, sensors, co.V2X(NEIGHBOURS), runs=RUNS, seed=0)
-    bounds = dict(_bounds(fleet, sensors))
-    solo = _error(co.Kalman("nominal")(everyone, [EGO]), fleet)
+    lines, names = (
+        ["# Each method", "", "| method | name | what it does | RT-LE [m] |", "|---|---|---|---|"],
+        dict[str, Any](),
+    )
+    exec(RECORDING, names)
+    fleet = names["fleet"]
+    bounds = dict(_bounds(fleet, names["sensors"]))
+    solo = _error(co.Kalman("nominal")(names["recording"], [EGO]), fleet)
     page = (DOCS / "methods.md").read_text()
     table, failures = _rows(page), dict(re.findall(r"^\| `([\w-]+)` \| ([^|]+) \|$", page, flags=re.MULTILINE))
-    lines = []
     for name, make in METHODS.items():
         method = make("nominal")
         kind, look = type(method), style.look(name)
-        said, track = _example(name)
+        with contextlib.redirect_stdout(io.StringIO()) as said:
+            exec(METHOD.format(name=name), names)
+        track = names["track"]
         bound = "fleet, smoothing" if name == "batch-smoother" else "fleet" if name in WHOLE_FLEET else "star"
         curves = (solo, _error(track, fleet), bounds[bound if method.cooperative else "solo"])
         yield f"methods/{name}.png", _picture(fleet.t, curves, look, bound if method.cooperative else "solo")
@@ -169,7 +167,8 @@ def _methods() -> Iterator[tuple[str, str | bytes]]:
                     "",
                     *facts,
                     "",
-                    *("```python", EXAMPLE.format(name=name), "```", "", "```", said.rstrip(), "```", ""),
+                    *("```python", f"{RECORDING}{METHOD.format(name=name)}", "```", ""),
+                    *("```", said.getvalue().rstrip(), "```", ""),
                     f"![Error of {look.label} over time]({name}.png)",
                     "",
                     f"Root mean square error of one ego over {RUNS} noise draws, `town10`, scenario 2, "
@@ -184,28 +183,20 @@ def _methods() -> Iterator[tuple[str, str | bytes]]:
             ),
         )
         lines.append(f"| [{look.label}]({name}.md) | `{name}` | {what} | {_rms(track, fleet):.2f} |")
-    head = ["# Each method", "", "| method | name | what it does | RT-LE [m] |", "|---|---|---|---|"]
-    yield "methods/index.md", "\n".join([*head, *lines, ""])
+    yield "methods/index.md", "\n".join([*lines, ""])
 
 
-EXAMPLE = """import coopoc as co
+RECORDING = """import coopoc as co
 from coopoc.plugins import find
 
 fleet = co.load_fleet("town10").between(0, 200)
 sensors, v2x = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=4)
 recording = co.observe(fleet, sensors, v2x, runs=10, seed=0)
-method = find("coopoc.methods", "{name}")("nominal")
+"""
+METHOD = """method = find("coopoc.methods", "{name}")("nominal")
 track = method(recording, egos=[24])
 print(f"{{co.rt_le(track, fleet).mean():.2f}} m, {{track.received_bytes.mean() / 20:.0f}} B/s received")"""
-"""Of every method; it is run when the site is built."""
-
-
-def _example(name: str) -> tuple[str, Any]:
-    """What the example prints, and its Track."""
-    out, names = io.StringIO(), dict[str, Any]()
-    with contextlib.redirect_stdout(out):
-        exec(EXAMPLE.format(name=name), names)
-    return out.getvalue(), names["track"]
+"""The example of every method: it is run when the site is built, its recording once."""
 
 
 ORACLES = {
@@ -256,8 +247,8 @@ def _rows(page: str) -> dict[str, tuple[str, str, str]]:
         cells = [cell.strip() for cell in line.strip("|").split("|")]
         if len(cells) == 5 and cells[0].startswith("`"):
             own, others = (re.findall(r"`([\w-]+)`", cells[k]) for k in (0, 2))
-            found |= dict.fromkeys(own, (cells[2], cells[3], cells[4]))
-            found |= {name: (cells[2], cells[3], cells[4]) for name in others if name not in found}
+            said = tuple(cell.replace("](#", "](../methods.md#") for cell in cells[2:])
+            found |= dict.fromkeys(own, said) | {name: said for name in others if name not in found}
     return found
 
 

@@ -7,6 +7,7 @@ A study of one's own in one file: docs/extend.md. What it finds stands in docs/f
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import version
@@ -15,17 +16,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coopoc.arrays import Floats
 from coopoc.errors import InputError
-from coopoc.evaluate.scores import bounded_rt_le, rows_of
+from coopoc.evaluate.metrics import rt_le
+from coopoc.evaluate.scores import rows_of
 from coopoc.evaluate.statistics import Interval, over_seeds
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
+from coopoc.methods.track import Method
 from coopoc.studies import lineup, scene
 from coopoc.studies.views import TableView, multiples, selections
 from coopoc.study.numbers import Where, across, interval, listed, mean, per_seed, present, seed_means
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import look
 from coopoc.world.fleet import Fleet
+from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
@@ -149,13 +154,23 @@ def cell(p: Params) -> list[Row]:
         return lineup.bound_rows(p)
     trial = scene.trial(p)
     if p["method"] == "kalman":
-        return rows_of({"rt_le_m": bounded_rt_le(Kalman(fitted(p), robust=False), *trial, LOST)}, trial[1])
+        return rows_of({"rt_le_m": bounded_rt_le(Kalman(fitted(p), robust=False), *trial)}, trial[1])
     training = tuple((name, value) for name, value in p.items() if name not in OF_THE_TEST)
     rows: list[Row] = []
     for seed, net in enumerate(trained(p["condition"], p["method"], training)):
-        columns = {"rt_le_m": bounded_rt_le(net.method(p["method"]), *trial, LOST)}
+        columns = {"rt_le_m": bounded_rt_le(net.method(p["method"]), *trial)}
         rows += rows_of(columns, trial[1], train_seed=seed)
     return rows
+
+
+def bounded_rt_le(method: Method, recording: Recording, egos: Sequence[str], drive: Fleet) -> Floats:
+    """RT-LE (R, E) m, cut at LOST, which is also that of a method whose estimates are not finite."""
+    try:
+        return np.fmin(rt_le(method(recording, egos), drive), LOST)
+    except InputError as error:
+        if error.field != "x":  # the estimates of the track, of which one is not finite
+            raise
+        return np.full((recording.runs, len(egos)), LOST)
 
 
 def key(p: Params) -> dict[str, str]:
@@ -205,7 +220,7 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
     better, worse = list[str](), list[str]()
     for rule in RULES[1:]:
         if len(plain) > 1 and present(results, {**at, "method": rule}):
-            gap = over_seeds(per_seed(results, {**at, "method": rule}) - plain).interval
+            gap = over_seeds(per_seed(results, {**at, "method": rule}) - plain)
             (better if gap.high < 0 else worse if gap.low > 0 else []).append(f"{rule} {gap.mean:+.3f} m")
     beside = {
         words: mean(results, {**at, "condition": "iid", "method": method})

@@ -14,7 +14,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from coopoc.evaluate.trajectory_scores import absolute_error, align
+from coopoc.evaluate.trajectory_scores import absolute_error, align, rms
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Solution, solve
@@ -30,7 +30,7 @@ def main(path: str, picture: str | None = None) -> Solution:
     after = absolute_error(solution.position[graph.is_pose], graph.position[graph.is_pose])
     print(problem)
     print(f"cost {problem.cost(problem.x0):.1f} -> {solution.cost:.2f} in {solution.solve_seconds:.1f} s")
-    print(f"ATE {float(before.rmse):.3f} m (odometry) -> {float(after.rmse):.3f} m")
+    print(f"ATE {float(rms(before)):.3f} m (odometry) -> {float(rms(after)):.3f} m")
     if picture is not None:
         draw(graph, solution, Path(picture))
     return solution

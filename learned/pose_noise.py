@@ -42,6 +42,14 @@ class PoseTask(NamedTuple):
     first: int
 
 
+def averaged(several: Sequence[Sensors]) -> tuple[Sensors, Floats]:
+    """The first of some with the mean logarithms of what all have learned, and these logarithms (N, numbers): a
+    federation of one round."""
+    names = [name for name in LEARNED if getattr(several[0], name) > 0]
+    logs = np.log([[getattr(one, name) for name in names] for one in several])
+    return replace(several[0], **dict(zip(names, np.exp(logs.mean(axis=0)).tolist(), strict=True))), logs
+
+
 def log_score(track: Track, fleet: Fleet) -> Floats:
     """Log density (R, T, E) of the true (x, y, heading) under an estimate, but for a constant; NaN without truth.
 

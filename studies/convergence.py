@@ -81,13 +81,14 @@ def _figure(results: Results) -> Plot | None:
     from coopoc.study import figures
 
     rounds = sorted(results.frame["round"].unique()) if "round" in results.frame else [0]
-    panel = Panel({number: {"round": number} for number in rounds}, xlabel="Round")
+    ticks = {number: str(number) for number in rounds if number % 5 == 0}
+    panel = Panel({number: {"round": number} for number in rounds}, xlabel="Round", ticks=ticks)
     text = (
         "RT-LE after every round with the weights that validated best so far (mean over training seeds, band from the "
         "lowest to the highest); horizontal: the individual nets at their end."
     )
     lines, ends = ([{"method": name} for name in names] for names in (BOTH["method"], weights.INDIVIDUAL))
-    return figures.curves(results, [panel], lines, scene.caption(results, text), _seeds, ends, width=6.4)
+    return figures.curves(results, [panel], lines, scene.caption(results, text), _seeds, ends, width=6.4, log=True)
 
 
 def _findings(results: Results) -> dict[str, str]:

@@ -56,8 +56,9 @@ class Drive:
     @property
     def ids(self) -> tuple[str, ...]:
         """Of those that move."""
-        marks = self.recording.landmarks
-        return tuple(name for k, name in enumerate(self.recording.ids) if k not in marks)
+        rec = self.recording
+        stand = np.flatnonzero(np.nansum(np.abs(rec.velocity), axis=(0, 1, 3)) == 0.0) if rec.body is None else ()
+        return tuple(name for k, name in enumerate(rec.ids) if k not in rec.landmarks and k not in stand)
 
 
 def calibrated(p: Params) -> float:
@@ -102,6 +103,12 @@ def has_true_poses(data: str) -> bool:
     return isinstance(log, MrclamLog) or (log.truth is not None and log.truth.heading is not None)
 
 
+def in_world(data: str) -> bool:
+    """Whether velocities are those of the world's frame: there are no headings to be estimated."""
+    log = _part(data)
+    return isinstance(log, Log) and log.recording.body is None
+
+
 def check(data: str, until: float, gate: float) -> None:
     """Read all that cells share.
 
@@ -116,7 +123,7 @@ def check(data: str, until: float, gate: float) -> None:
     log = _part(data)
     if isinstance(log, MrclamLog):
         surveyed(log), _calibration(data, until)
-    else:
+    elif not in_world(data):
         _begin(data, gate)
 
 
@@ -131,13 +138,15 @@ def drive(data: str, until: float, v2x: V2X, gate: float) -> Drive:
         gate: of the filters that find first poses.
 
     Raises:
-        InputError: a log in the world's frame, or one that cannot be followed.
+        InputError: a log that cannot be followed.
     """
     log = _part(data)
     if isinstance(log, MrclamLog):
-        recording = pose_recording(log, v2x, _calibration(data, until))
+        recording = under(pose_recording(log, _calibration(data, until)), v2x, logged=False)
         return Drive(recording, pose_start(recording, gate=gate), log.fleet, True)
     recording = under(log.recording, v2x, logged=log.messages)
+    if in_world(data):
+        return Drive(recording, None, log.truth, False)
     lasting = recording.sensors.speed_scale_std > 0 or recording.sensors.yaw_rate_bias_std > 0
     begin, where = _begin(data, gate)
     return Drive(recording, begin, log.truth, lasting, SURE if where else SPREAD)
@@ -150,7 +159,7 @@ def described(data: str) -> str:
         return "Wheel odometry, ranges and bearings of {}; no fix, no compass. The first {:.3g} s calibrate the noise."
     read = ", ".join(f"{number} {what}" for what, number in log.summary.read.items() if number)
     where = "" if (span := _log(data)[1]) == "throughout" else f" {span},"
-    begin = _begin(data, GATE)[1]
+    begin = "" if in_world(data) else _begin(data, GATE)[1]
     return (
         f"What {{}} holds ({read}),{where} with the noise that it states{begin}; the first {{:.3g}} s are not scored."
     )
@@ -187,7 +196,7 @@ def thinned(recording: Recording, landmarks: int, start: int) -> Recording:
 
 
 def _part(data: str) -> MrclamLog | Log:
-    """What is followed: of a log its longest part in which all vehicles are there."""
+    """What is followed: of a log in body frames its longest part in which all vehicles are there."""
     return _log(data)[0]
 
 
@@ -201,10 +210,7 @@ def _log(data: str) -> tuple[MrclamLog | Log, str]:
         hint = "Check it; a log may hold what vehicles measured (docs/your_data.md), a folder a set of MR.CLAM."
         raise InputError("data", repr(data), "must be the path of measurements, not only of drives", hint)
     log = load_log(data)
-    if log.recording.body is None:
-        hint = f'Read it so: --data "{name}?frame=body". For positions: coopoc benchmark METHOD --data {name}.'
-        raise InputError("data", repr(data), "must be a log in body frames, for poses", hint)
-    return together(log)
+    return (log, "throughout") if log.recording.body is None else together(log)
 
 
 @lru_cache(maxsize=2)

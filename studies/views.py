@@ -179,7 +179,7 @@ def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
     gaps = [paired_difference(each.mean(axis=0), base)]
     text = f"paired difference {gaps[0].mean:+.3f} m; 95 % {_ends(gaps[0])} over egos and runs, "
     if len(each) > 1:
-        gaps.append(over_seeds(each - base).interval)
+        gaps.append(over_seeds(each - base))
         text += f"{_ends(gaps[1])} over {len(each)} training seeds"
     else:
         text += "of one training seed, whose spread is unknown"

@@ -108,16 +108,6 @@ def test_what_was_measured_is_what_the_recording_holds(tmp_path: Path) -> None:
     np.testing.assert_allclose(wrapped(log.truth.heading[:, rec.ids.index("blue")] - cars["blue"][1]), 0, atol=1e-9)
 
 
-def test_pose_filters_run_on_a_log_and_cooperation_helps(tmp_path: Path) -> None:
-    log = co.read_log(written(tmp_path / "log", noise=1.0), frame="body")
-    assert log.truth is not None
-    filters = (co.PoseFilter("solo"), co.PoseFilter("fleet"))
-    tracks = [one(log.recording, list(CARS)) for one in filters]
-    errors = [co.rt_le(track, log.truth).mean() for track in tracks]
-    assert errors[1] < 0.9 * errors[0]
-    assert 1.5 < np.nanmean(co.pose_nees(tracks[1], log.truth)) < 5
-
-
 def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path: Path) -> None:
     """One car has fixes; the others measure it and each other, and none has a compass."""
     folder = written(tmp_path / "log", noise=1.0, compass=False)
@@ -227,7 +217,7 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path: Path) -> None
     frame = results.frame
     assert set(frame["max_neighbours"]) == {0, 1, 2}
     assert set(frame["landmarks"]) == {0, 1}
-    assert set(frame.loc[frame["method"] == "pose-learned", "max_neighbours"]) == {0, 2}
+    assert set(frame.loc[frame["method"] == "trained-centralised", "max_neighbours"]) == {0, 2}
     log = load_log(data)
     alone = co.PoseFilter("solo", gate=5.0)(log.recording, list(CARS))
     apart = np.linalg.norm(alone.x[0, 100:150, 1] - np.pad(drives()["blue"][0][100:150], ((0, 0), (0, 1))), axis=1)
@@ -243,9 +233,26 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path: Path) -> None
     assert " with 1 landmark " in said
 
 
+def test_the_study_trains_and_cooperates_on_a_log_in_the_world(tmp_path: Path) -> None:
+    """A road filter fitted by hand is the study's row; federated, eight numbers of 4 B go up and come back."""
+    data = str(written(tmp_path / "log", noise=1.0))
+    settings = {"data": data, "calibrate_s": 20.0, "block_s": 5.0, "drive_s": 100.0, "max_neighbours": "0,2"}
+    results = co.run_study("real", tmp_path, settings=settings, progress=False)
+    assert results.failed == 0
+    log = load_log(data)
+    assert log.truth is not None
+    start, stop = (int(seconds / log.recording.dt) for seconds in (20.0, 25.0))
+    made = co.RoadFilter.fitted(log.recording.between(0, start), log.truth.between(0, start))
+    track = made(log.recording, ["blue"])
+    apart = np.linalg.norm(track.x[0, :, 0] - log.truth.position[:, log.truth.index("blue")], axis=1)[start:stop]
+    found = results.select(method="trained-centralised", ego="blue", run=0)
+    assert found["rt_le_m"].tolist() == pytest.approx([np.sqrt(np.mean(apart**2))], rel=1e-6)
+    assert set(results.select(method="trained-federated")["sent_bytes"]) == {64.0}
+    assert (results.select(method="cooperative-filter", max_neighbours=2)["sent_bytes"] > 1000).all()
+    assert "Trained alone" in (tmp_path / "real" / "tables" / "rt_le.md").read_text()
+
+
 def test_studies_say_where_a_log_belongs(tmp_path: Path) -> None:
     folder = written(tmp_path / "log")
-    with pytest.raises(co.InputError, match=r"Read it so: --data .*frame=body"):
-        co.run_study("real", tmp_path, settings={"data": str(folder)}, progress=False)
     with pytest.raises(co.InputError, match="Take coopoc run real"):
         co.run_study("side_by_side", tmp_path, settings={"data": f"{folder}?frame=body"}, progress=False)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 
 import coopoc as co
@@ -185,6 +186,50 @@ def parts(folder: Path) -> Path:
     (folder / "car.csv").write_text("\n".join([head.replace("vehicle", "car"), *rest]))
     (folder / "truth.csv").write_text(WIDE.replace("speed,heading", "a,b"))
     return folder
+
+
+def test_a_wide_table_repeats_a_fix_beside_each_partner(tmp_path: Path) -> None:
+    """The long table without a word is the reference; names are whole numbers that pandas has written as floats."""
+    t, made = np.arange(0, 20, 0.5), {"wide": [], "long": []}
+    names, at = ["1.0", "2.0", "007"], np.array([[0.0, 0.0], [0.0, 9.0], [12.0, 0.0]])
+    for now in t.tolist():
+        for k, name in enumerate(names):
+            x, y = at[k] + [8 * now, 0.1 * k * now]
+            made["long"] += [[now, name, kind, "", value] for kind, value in zip(("x", "y"), (x, y), strict=True)]
+            for j in {0, 1, 2} - {k}:
+                gap = np.hypot(*(at[j] + [8 * now, 0.1 * j * now] - [x, y]))
+                made["wide"].append([now, name, x, y, names[j].removesuffix(".0"), gap])
+                made["long"].append([now, name, "range", names[j].removesuffix(".0"), gap])
+    heads = {"wide": "t,vehicle,x,y,partner,range", "long": "t,vehicle,kind,partner,value"}
+    for form, rows in made.items():
+        (tmp_path / f"{form}.csv").write_text("\n".join([heads[form], *(",".join(map(str, row)) for row in rows)]))
+    wide, long = (co.read_log(tmp_path / f"{form}.csv") for form in made)
+    assert same(wide.recording, long.recording)
+    assert wide.recording.ids == ("1", "2", "007")
+    assert not wide.summary.refused
+    assert len(wide.recording.links) == 6 * len(t)
+
+
+@pytest.mark.parametrize("period", [86400, 604800])
+def test_clocks_that_begin_anew_go_on(tmp_path: Path, period: int) -> None:
+    """Seconds of the day at midnight, of the GPS week at its end: the file with stamps that go on is the reference. One
+    vehicle comes after the turn, one cell per object of JSON and per cell of CSV."""
+    t, rows = period - 10 + np.arange(0, 20, 0.5), []
+    for now in t.tolist():
+        rows += [{"t": now, "vehicle": "a", "x": 8 * now, "y": 0.0, "vx": 8.0, "vy": 0.0}]
+        rows += [{"t": now, "vehicle": "b", "x": 8 * now, "y": 5.0, "vx": 8.0, "vy": 0.0}] * (now > period + 2)
+    plain, anew = (pd.DataFrame(rows) for _ in "ab")
+    anew["t"] %= period
+    plain.to_csv(tmp_path / "plain.csv", index=False)
+    anew.to_json(tmp_path / "anew.jsonl", orient="records", lines=True)
+    one, other = (co.read_log(tmp_path / name) for name in ("plain.csv", "anew.jsonl"))
+    assert same(one.recording, other.recording)
+    assert other.summary.assumed.keys() - one.summary.assumed.keys() == {
+        f"stamps begin anew after {period} s: those before half of it count on"
+    }
+    (tmp_path / "bad.jsonl").write_text('{"t": 0,\n')
+    with pytest.raises(co.InputError, match=r"bad\.jsonl = .*must be a table"):
+        co.read_log(tmp_path / "bad.jsonl")
 
 
 def test_a_header_may_stand_in_one_of_several_tables(tmp_path: Path) -> None:

@@ -8,19 +8,18 @@ from typing import Any
 
 import numpy as np
 import pytest
+from scipy.linalg import lstsq
 
 import coopoc as co
 from coopoc.arrays import robust_std
 from coopoc.data.mrclam import Calibration, MrclamLog, calibrate, grouped, pose_recording, read_mrclam, summed
 from coopoc.data.registry import load_fleet, load_log
 from coopoc.studies.pose_drives import thinned
-from coopoc.world.body_frames import gauss_markov
+from coopoc.world.body_frames import gauss_markov, midway, turned
 from coopoc.world.links import wrap
-from coopoc.world.v2x import V2X
 
 FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "mrclam" / "MRCLAM_Dataset6"
 present = pytest.mark.skipif(not FOLDER.is_dir(), reason="UTIAS MR.CLAM set 6 is not at ../shared/data/mrclam")
-ALL = V2X(max_neighbours=4, radius=float("inf"))
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +34,7 @@ def known(log: MrclamLog) -> Calibration:
 
 @pytest.fixture(scope="module")
 def seen(log: MrclamLog, known: Calibration) -> co.Recording:
-    return pose_recording(log, ALL, known)
+    return pose_recording(log, known)
 
 
 @present
@@ -75,15 +74,35 @@ def test_white_noise_keeps_its_standard_deviation_and_errors_that_last_are_widen
 
 
 @present
-def test_odometry_follows_its_log_late_and_turns_less(log: MrclamLog, known: Calibration) -> None:
-    """SciPy's least squares and correlation on the first 300 s."""
+def test_odometry_follows_its_log_late_and_slower_in_turns(log: MrclamLog, known: Calibration) -> None:
+    """SciPy's correlation and least squares over 5 s of the first 300 s; the rest, which calibrated nothing, moves by
+    what it says with half the error of a scale alone."""
     rate = np.diff(log.heading[:3000], axis=0) / 0.1
     late = [np.corrcoef(rate[10:, 0], np.roll(log.turn_rate[1:3000, 0], k)[10:])[0, 1] for k in range(5)]
     assert abs(known.lag - 0.1 * int(np.argmax(late))) <= 0.1
-    assert (known.turn < 1.0).all()
-    assert (known.speed < 1.0).all()
+    wheel, turning = (np.interp(log.fleet.t - known.lag, log.fleet.t, v[:, 0]) for v in (log.speed, log.turn_rate))
+    way = turned(log.fleet.velocity[:, 0], -midway(log.heading)[:, 0])[:, 0]
+    sums = np.stack([way, wheel, wheel * np.abs(turning)], axis=1)[1:7501].reshape(-1, 50, 3).sum(axis=1)
+    ahead, lost = lstsq(sums[:59, 1:], sums[:59, 0])[0]
+    assert (known.speed[0], known.slip[0]) == pytest.approx((ahead, -lost / ahead), rel=0.01)
+    slope = lstsq(sums[:59, 1:2], sums[:59, 0])[0][0]
+    with_slip, without = (np.std(sums[60:] @ scales) for scales in ([-1, ahead, lost], [-1, slope, 0.0]))
+    assert with_slip < 0.5 * without
     with pytest.raises(co.InputError, match="Leave a part to score"):
         calibrate(log, 1e4)
+
+
+@present
+def test_no_landmark_and_one_are_no_worse_than_published_filters_of_the_same_state(
+    log: MrclamLog, seen: co.Recording
+) -> None:
+    """A plain extended Kalman filter of 25 numbers, written elsewhere: 0.32 m without and 0.25 m with a landmark."""
+    begin = co.pose_start(seen, gate=5.0)
+    for landmarks, most in ((0, 0.32), (1, 0.25)):
+        made = co.PoseFilter("fleet", lasting=True, gate=5.0, begin=begin)
+        track = made(thinned(seen, landmarks, 3000), log.fleet.ids)
+        squares = np.square(track.x[0, 3000:7500] - log.fleet.position[3000:7500]).sum(axis=-1)
+        assert np.sqrt(np.nanmean(squares.reshape(-1, 300, 5), axis=1)).mean() < most
 
 
 @present
@@ -137,12 +156,12 @@ def test_the_study_runs_on_any_set(which: str, other_set: Path, tmp_path: Path) 
     nees = results.frame.groupby(["method", "max_neighbours", "landmarks"])["nees"].mean()
     assert 2.0 < nees["pose-fleet", most, 15] < 7.0
     assert 2.0 < nees["pose-intersection", most, 15] < 7.0
-    assert nees["pose-learned", most, 15] < 7.0
+    assert nees["trained-centralised", most, 15] < 7.0
     assert nees["pose-naive", most, 0] > 10.0
     folder = tmp_path / "real"
     tables = {file.stem for file in (folder / "tables").glob("*.md")}
-    assert tables == {"rt_le", "heading", "nees", "bytes", "fusion", "learned"}
-    assert (folder / "figures" / "rt_le.png").stat().st_size > 10_000
+    assert tables == {"rt_le", "heading", "nees", "difference"}
+    assert all((folder / "figures" / f"{name}.png").stat().st_size > 10_000 for name in ("rt_le", "training"))
 
 
 @present

@@ -20,7 +20,7 @@ from coopoc.cli import main
 from coopoc.formats import load_graph
 from coopoc.formats.graph import RangeEdges
 from coopoc.optimize import Loss, Problem, Status, solve
-from coopoc.optimize.assess.plausible import TAIL
+from coopoc.optimize.assess.assess import TAIL
 from coopoc.optimize.graph_problems import from_graph
 
 

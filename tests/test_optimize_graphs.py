@@ -20,9 +20,8 @@ from coopoc import InputError
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.algebra.sparse import Sparse, sparse
-from coopoc.optimize.assess.assess import SMALL, _seen, assess, newton_decrease
-from coopoc.optimize.assess.plausible import expected
-from coopoc.optimize.backends.gtsam_factors import forms, graph_of, values, which_turn
+from coopoc.optimize.assess.assess import SMALL, _seen, assess, expected, newton_decrease
+from coopoc.optimize.backends.gtsam import forms, graph_of, values, which_turn
 from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import Objective, from_graph, read_graph
 from coopoc.optimize.model.factor import Factor

@@ -10,7 +10,7 @@ import pytest
 
 from coopoc import V2X, Fleet, Sensors, observe
 from coopoc.optimize import Loss, Problem, Status, pose, solve
-from coopoc.optimize.backends.gtsam_factors import forms, graph_of, tangent, values, which_turn
+from coopoc.optimize.backends.gtsam import forms, graph_of, tangent, values, which_turn
 
 LOSSES = ("huber", "cauchy", "geman-mcclure", "truncated")
 

@@ -10,7 +10,7 @@ from random_graphs import random_graph
 from coopoc import InputError
 from coopoc.optimize import Problem, solve
 from coopoc.optimize.assess.assess import joint_covariance
-from coopoc.optimize.backends.gtsam_factors import forms, graph_of, values, which_turn
+from coopoc.optimize.backends.gtsam import forms, graph_of, values, which_turn
 from coopoc.optimize.graph_problems import from_graph
 
 

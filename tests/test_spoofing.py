@@ -7,10 +7,12 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 import pytest
 
+import coopoc as co
 from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.optimize import Problem, solve, solve_gnc
 from coopoc.world.recording import Recording
@@ -153,3 +155,12 @@ def test_the_example_prints_its_table(example: ModuleType, capsys: pytest.Captur
     assert capsys.readouterr().out.count("\n") == 3
     assert few.least_squares > 3 * clean.least_squares
     assert few.robust < 1.3 * clean.least_squares
+
+
+@pytest.mark.parametrize("method", [co.GaussianBeliefPropagation, co.CentralFilter])
+def test_a_fleet_in_which_a_fifth_lies_is_no_worse_than_alone(method: Any) -> None:
+    """At the first fixes, 5 m apart by noise, each number of a liar is within its gate: their vector is not."""
+    fleet = co.load_fleet("town10-validation").between(0, 100)
+    seen = spoofed(observe(fleet, S2, V2X(max_neighbours=6), runs=2), 0.2, seed=1, honest=range(5))
+    alone, together = (co.rt_le(which("nominal")(seen, range(5)), fleet).mean() for which in (co.Kalman, method))
+    assert together < 1.01 * alone

@@ -109,8 +109,8 @@ CHANNELS = {
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize("exact", [True, False])
-def test_a_star_step_by_step_is_the_track(exact: bool, channel: str, crossing: Fleet) -> None:
+@pytest.mark.parametrize(("exact", "robust"), [(True, True), (True, False), (False, False)])
+def test_a_star_step_by_step_is_the_track(exact: bool, robust: bool, channel: str, crossing: Fleet) -> None:
     """Neighbours come and go, a fifth of the measurements fails, and some are seen without a message; the track comes
     from the recording's inbox. Where eleven come at once, a stream begins with room for seven."""
     growing = channel == "growing"
@@ -118,9 +118,9 @@ def test_a_star_step_by_step_is_the_track(exact: bool, channel: str, crossing: F
     kept = recording.links.step >= 20 if growing else np.random.default_rng(8).uniform(size=len(recording.links)) > 0.2
     recording = only(kept, recording)
     assert growing or len(set(recording.neighbours(0).tolist())) > 2
-    method = textbook(JointFilter("nominal", exact=exact))
+    method = JointFilter("nominal", exact, robust)
     track, box = method(recording, [0]), inbox(recording, 0, method.message)
-    stream = StarStream(JointFilter(NoiseModel.nominal(recording.sensors), exact, False), max_age=recording.v2x.max_age)
+    stream = StarStream(replace(method, noise_model=NoiseModel.nominal(S2)), max_age=recording.v2x.max_age)
     for t in range(len(recording.t)):
         seen = relative_measurements(recording, box, 1, t)
         x, cov = stream.step(recording.gnss[1, t, 0], recording.velocity[1, t, 0], recording.dt, neighbours=seen)

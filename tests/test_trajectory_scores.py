@@ -13,7 +13,15 @@ from scipy.spatial.transform import Rotation
 from coopoc.data.score_files import read_paths, score
 from coopoc.errors import InputError
 from coopoc.evaluate.trajectory_scores import Path as Track
-from coopoc.evaluate.trajectory_scores import absolute_error, align, associated, relative_error, rms_interval, scores
+from coopoc.evaluate.trajectory_scores import (
+    absolute_error,
+    align,
+    associated,
+    relative_error,
+    rms,
+    rms_interval,
+    scores,
+)
 from coopoc.formats.trajectories import read_kitti
 from coopoc.formats.values import to_rotation
 
@@ -27,9 +35,7 @@ def test_aligned_error_is_evos(shared: Path) -> None:
     truth = read_kitti(folder / "KITTI_00_gt.txt", folder / "KITTI_00_gt_times.txt")
     estimate = read_kitti(folder / "KITTI_00_ORB.txt")
     found = absolute_error(estimate.position, truth.position)
-    np.testing.assert_allclose(
-        [found.rmse, found.error.mean(), found.error.max()], [1.303450, 1.156997, 3.587949], atol=5e-7
-    )
+    np.testing.assert_allclose([rms(found), found.mean(), found.max()], [1.303450, 1.156997, 3.587949], atol=5e-7)
 
 
 @pytest.mark.parametrize("d", [2, 3])
@@ -49,10 +55,10 @@ def test_alignment_is_scipys_and_undoes_a_known_motion(d: int) -> None:
     np.testing.assert_allclose(back.rotation, np.broadcast_to(turn, (4, d, d)), atol=1e-12)
     np.testing.assert_allclose(back.scale, 3.0)
     np.testing.assert_allclose(back.apply(truth), moved, atol=1e-11)
-    before = absolute_error(estimate, truth).rmse
-    np.testing.assert_allclose(absolute_error(estimate @ turn.T - 7, truth).rmse, before, rtol=1e-12)
-    assert (before < absolute_error(estimate, truth, aligned=False).rmse).all()
-    assert (absolute_error(estimate, truth, scale=True).rmse <= before).all()
+    before = rms(absolute_error(estimate, truth))
+    np.testing.assert_allclose(rms(absolute_error(estimate @ turn.T - 7, truth)), before, rtol=1e-12)
+    assert (before < rms(np.linalg.norm(estimate - truth, axis=-1))).all()
+    assert (rms(absolute_error(estimate, truth, scale=True)) <= before).all()
 
 
 def test_a_mirrored_path_is_not_answered_by_a_reflection() -> None:
@@ -65,26 +71,24 @@ def test_alignment_that_is_open_or_ill_formed_is_refused() -> None:
     line = np.outer(np.arange(9.0), [1, 2, 3])
     with pytest.raises(InputError, match=r"singular values.*straight drive"):
         align(line, line)
-    assert absolute_error(line[:, :2] @ [[0, 1], [-1, 0]], line[:, :2]).error.max() < 1e-12
+    assert absolute_error(line[:, :2] @ [[0, 1], [-1, 0]], line[:, :2]).max() < 1e-12
     with pytest.raises(InputError, match=r"singular values.*at least 1"):
         align(line[:, :2] * 0, line[:, :2])
     with pytest.raises(InputError, match=r"shapes \(9, 3\) and \(8, 3\)"):
         align(line, line[:-1])
     with pytest.raises(InputError, match=r"estimate\[0, 0\] = not finite"):
         align(line * np.nan, line)
-    with pytest.raises(InputError, match=r"scale = True.*aligned=True"):
-        absolute_error(line, line, aligned=False, scale=True)
 
 
 @pytest.mark.parametrize(("delta", "unit"), EVO)
 def test_relative_errors_are_evos(shared: Path, delta: float, unit: str) -> None:
     """Independent check: evo's rmse and pairs, measured with evo 1.38.1."""
     truth, estimate = (read_kitti(shared / "evo_oracle" / f"KITTI_00_{name}.txt") for name in ("gt", "ORB"))
-    both = (estimate.position, estimate.rotation), (truth.position, truth.rotation)
-    error = relative_error(*both, delta, unit)  # type: ignore[arg-type]
+    paths = (Track(np.arange(len(of)), of.position, of.rotation) for of in (estimate, truth))
+    error = relative_error(*paths, delta, unit)[0]  # type: ignore[arg-type]
     rmse, pairs = EVO[delta, unit]
     assert len(error) == pairs
-    assert np.sqrt(np.mean(error**2)) == pytest.approx(rmse, rel=1e-6)
+    assert rms(error) == pytest.approx(rmse, rel=1e-6)
 
 
 def test_stamps_are_paired_as_evo_pairs_them() -> None:
@@ -234,10 +238,6 @@ def test_what_cannot_be_scored_is_named(tmp_path: Path) -> None:
         scores({"green": estimates["red"]}, truths)
     with pytest.raises(InputError, match="must be a file"):
         read_paths(str(tmp_path / "nowhere.tum"))
-    with pytest.raises(InputError, match="must fit into the drive once"):
-        relative_error(
-            (np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1))), (np.zeros((2, 3)), np.tile(np.eye(3), (2, 1, 1))), 5
-        )
     with pytest.raises(InputError, match="must name a file"):
         score(("a.tum",))
     for delta in (0.5, 1.5, float("nan")):

@@ -8,12 +8,11 @@ from typing import Any
 import numpy as np
 
 from ..arrays import AnyArray, Floats
-from ..errors import InputError
 from ..methods.track import Method, Track, far_off
 from ..world.fleet import Fleet
 from ..world.recording import Recording
 from .ledger import Kind, Way, of_track
-from .metrics import errors, measure, nees, neighbour_rt_le, rt_le, share_of_average
+from .metrics import errors, measure, nees, neighbour_rt_le, share_of_average
 
 BYTES: Mapping[str, tuple[Kind, Way]] = {
     "bytes_per_second": ("on air", "per receiver"),
@@ -39,24 +38,6 @@ def rows_of(columns: Mapping[str, AnyArray], who: Sequence[str], **more: Any) ->
         for e, ego in enumerate(who)
         for r in range(runs)
     ]
-
-
-def bounded_rt_le(method: Method, recording: Recording, egos: Sequence[str], drive: Fleet, most: float) -> Floats:
-    """RT-LE (R, E) m, cut at `most`, which is also that of a method whose estimates are not finite.
-
-    Args:
-        method: that follows the egos.
-        recording: its measurements and messages.
-        egos: ids.
-        drive: the truth.
-        most: m.
-    """
-    try:
-        return np.fmin(rt_le(method(recording, egos), drive), most)
-    except InputError as error:
-        if error.field != "x":  # the estimates of the track, of which one is not finite
-            raise
-        return np.full((recording.runs, len(egos)), most)
 
 
 def scored(

@@ -58,7 +58,7 @@ def mean_interval(values: AnyArray, level: float = 0.95, resamples: int = 2000, 
     return _interval(_resampled(values, resamples, seed), float(values.mean()), values, level)
 
 
-def paired_difference(a: AnyArray, b: AnyArray, level: float = 0.95, resamples: int = 2000, seed: int = 0) -> Interval:
+def paired_difference(a: AnyArray, b: AnyArray) -> Interval:
     """Mean of a - b on the same egos and runs, with its interval: common noise cancels.
 
     Args:
@@ -71,20 +71,14 @@ def paired_difference(a: AnyArray, b: AnyArray, level: float = 0.95, resamples: 
     >>> paired_difference(np.array([2.0, 3.0]), np.array([1.0, 2.0])).high
     1.0
     """
-    a, b = _pair(a, b)
-    return mean_interval(a - b, level, resamples, seed)
+    first, second = _checked("a", a), _checked("b", b)
+    if first.shape != second.shape:
+        raise InputError("b", second.shape, f"must have the shape of a, {first.shape}", "Pair the same egos and runs.")
+    return mean_interval(first - second)
 
 
-@dataclass(frozen=True)
-class Seeds:
-    """A metric per training seed: `means` (S,), and the Student-t interval of their mean."""
-
-    means: Floats
-    interval: Interval
-
-
-def over_seeds(values: AnyArray, level: float = 0.95) -> Seeds:
-    """Spread over training seeds, apart from noise: one mean per seed, and mean +- t_{S-1} s / sqrt(S).
+def over_seeds(values: AnyArray) -> Interval:
+    """Mean over training seeds with its 95 % interval, apart from noise: of S means mean +- t_{S-1} s / sqrt(S).
 
     Args:
         values: (S, E, R) or (S, R) or (S,) of one metric, seeds first.
@@ -92,17 +86,15 @@ def over_seeds(values: AnyArray, level: float = 0.95) -> Seeds:
     Raises:
         InputError: fewer than two seeds, or a value that is not finite.
 
-    >>> over_seeds(np.array([1.0, 1.2, 1.1])).means.tolist()
-    [1.0, 1.2, 1.1]
+    >>> print(over_seeds(np.array([1.0, 1.2, 1.1])))
+    1.1 [0.852, 1.35]
     """
     values = checked("values", values)
-    number("level", level, 1e-9, 1 - 1e-9, allowed=LEVEL, hint="0.95 is the default.")
     if values.ndim < 1 or len(values) < 2 or not np.isfinite(values).all():
         raise InputError("values", values.shape, "need at least two seeds of finite values", "Train more seeds.")
     means: Floats = values.reshape(len(values), -1).mean(axis=1)
-    half = special.stdtrit(len(means) - 1, (1 + level) / 2) * means.std(ddof=1) / np.sqrt(len(means))
-    mean = float(means.mean())
-    return Seeds(means, Interval(mean, mean - float(half), mean + float(half), len(means)))
+    half = float(special.stdtrit(len(means) - 1, 0.975) * means.std(ddof=1) / np.sqrt(len(means)))
+    return Interval(float(means.mean()), float(means.mean()) - half, float(means.mean()) + half, len(means))
 
 
 def _resampled(values: Floats, resamples: int, seed: int) -> Floats:
@@ -147,10 +139,3 @@ def _checked(name: str, values: AnyArray) -> Floats:
     if not np.isfinite(array).all():
         raise InputError(name, "not finite", "must be finite", "Leave out failed cells before you average.")
     return array
-
-
-def _pair(a: AnyArray, b: AnyArray) -> tuple[Floats, Floats]:
-    first, second = _checked("a", a), _checked("b", b)
-    if first.shape != second.shape:
-        raise InputError("b", second.shape, f"must have the shape of a, {first.shape}", "Pair the same egos and runs.")
-    return first, second

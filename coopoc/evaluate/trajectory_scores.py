@@ -75,79 +75,65 @@ def align(estimate: Floats, truth: Floats, *, scale: bool = False) -> Alignment:
     return Alignment(rotation, (mean_y - grown[..., None, None] * turned)[..., 0, :], grown)
 
 
-@dataclass(frozen=True, eq=False)
-class AbsoluteError:
-    """Absolute position error (APE, also ATE) of a trajectory: (..., T) m, and its rmse, (...,) m."""
-
-    error: Floats
-
-    __repr__ = short_repr
-
-    @property
-    def rmse(self) -> Floats:
-        """sqrt(mean_t e_t^2), m."""
-        return np.asarray(np.sqrt((self.error**2).mean(axis=-1)))
-
-
-def absolute_error(estimate: Floats, truth: Floats, *, aligned: bool = True, scale: bool = False) -> AbsoluteError:
-    """e_t = |truth_t - (s R x_t + t)|, after the best alignment unless the frame is known.
+def absolute_error(estimate: Floats, truth: Floats, *, scale: bool = False) -> Floats:
+    """Absolute position error (APE, also ATE) after the best alignment, e_t = |truth_t - (s R x_t + t)|, (..., T) m.
 
     Args:
         estimate: (..., T, d) m at the same instants, d = 2 or 3.
         truth: (..., T, d) m at the same instants, d = 2 or 3.
-        aligned: align first; False compares in the frame given.
         scale: estimate the scale as well.
 
     Raises:
-        InputError: what `align` raises, or a scale without an alignment.
+        InputError: what `align` raises.
 
     Source: Sturm et al., IROS 2012 (absolute trajectory error); evo's "APE, translation part" is the same number.
 
     >>> x = np.array([[0.0, 0], [1, 0], [2, 1]])
-    >>> absolute_error(x, x + [3.0, 4], aligned=False).rmse
-    array(5.)
+    >>> rms(absolute_error(x, x + [3.0, 4])).round(9)
+    np.float64(0.0)
     """
-    if scale and not aligned:
-        raise InputError("scale", scale, "must be False without an alignment", "Set aligned=True.")
-    x, y = _pair(estimate, truth)
-    if aligned:
-        x = align(x, y, scale=scale).apply(x)
-    return AbsoluteError(np.linalg.norm(y - x, axis=-1))
+    return np.asarray(np.linalg.norm(truth - align(estimate, truth, scale=scale).apply(estimate), axis=-1))
 
 
-def relative_error(
-    estimate: tuple[Floats, Floats], truth: tuple[Floats, Floats], delta: float = 1.0, unit: Unit = "steps"
-) -> Floats:
-    """(n,) m, |E_k| of E_k = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j), translation part, over pairs i, j that are `delta` apart.
+def rms(error: Floats) -> Floats:
+    """sqrt(mean_t e_t^2) of errors (..., T).
+
+    >>> rms(np.array([3.0, 4.0, 0.0, 0.0]))
+    np.float64(2.5)
+    """
+    return np.sqrt(np.square(error).mean(axis=-1))  # type: ignore[no-any-return]
+
+
+def relative_error(estimate: Path, truth: Path, delta: float = 1.0, unit: Unit = "steps") -> tuple[Floats, Floats]:
+    """(n,) m and (n,) deg, translation and rotation of E_k = (Q_i^-1 Q_j)^-1 (P_i^-1 P_j) over pairs i, j that are
+    `delta` apart.
 
     Args:
-        estimate: positions (T, 3) m and rotations (T, 3, 3), body to frame.
-        truth: the same at the same instants.
+        estimate: T poses P; neither path lacks its rotations.
+        truth: T poses Q at the same instants.
         delta: from i to j, and from there to the next; a whole number of steps.
         unit: "steps", or "m" along the estimated path.
 
+    Returns:
+        No error for a drive shorter than `delta`.
+
     Raises:
-        InputError: other shapes, a part of a step, or a drive shorter than `delta`.
+        InputError: what `ends` raises.
 
-    Source: Sturm et al., IROS 2012, equation 2; evo's "RPE, translation part" is the same number.
+    Source: Sturm et al., IROS 2012, equation 2; evo's "RPE" of both parts is the same number.
 
-    >>> still = (np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
-    >>> moved = (np.array([[0.0, 0, 0], [1, 0, 0], [2, 0, 0]]), still[1])
-    >>> relative_error(moved, still)
+    >>> still = Path(np.arange(3.0), np.zeros((3, 3)), np.tile(np.eye(3), (3, 1, 1)))
+    >>> relative_error(Path(still.t, np.arange(3.0)[:, None] * [1, 0, 0], still.rotation), still)[0]
     array([1., 1.])
     """
-    x, r = (checked("estimate", part) for part in estimate)
-    y, q = (checked("truth", part) for part in truth)
-    if not (x.shape == y.shape == (len(x), 3) and r.shape == q.shape == (len(x), 3, 3)):
-        given = f"shapes {x.shape}, {r.shape}, {y.shape}, {q.shape}"
-        raise InputError("estimate, truth", given, "must be (T, 3) and (T, 3, 3)", "Take both at the same instants.")
-    at = ends(x, delta, unit)
-    i, j = at[:-1], at[1:]
-    if not len(i):
-        raise InputError("delta", f"{delta:g} {unit}", "must fit into the drive once", "Take a smaller one.")
-    moved = np.einsum("kab,ka->kb", r[i], x[j] - x[i])
-    wanted = np.einsum("kab,ka->kb", q[i], y[j] - y[i])
-    return np.asarray(np.linalg.norm(moved - wanted, axis=1))
+    i, j = (at := ends(estimate.position, delta, unit))[:-1], at[1:]
+    moves, turns = [], []
+    for path in (estimate, truth):
+        assert path.rotation is not None
+        back = path.rotation[i].swapaxes(-1, -2)
+        moves.append(np.einsum("kab,kb->ka", back, path.position[j] - path.position[i]))
+        turns.append(back @ path.rotation[j])
+    return np.linalg.norm(moves[0] - moves[1], axis=1), angles(*turns)
 
 
 def ends(x: Floats, delta: float, unit: Unit) -> Ints:
@@ -272,7 +258,6 @@ def scores(
     offset: float = 0.0,
     delta: float = 1.0,
     unit: Unit = "steps",
-    blocks: int = 20,
 ) -> list[Score]:
     """One row for each vehicle of the estimates.
 
@@ -285,7 +270,6 @@ def scores(
         offset: s, added to the estimates' stamps.
         delta: of the relative error.
         unit: of `delta`.
-        blocks: of time, over which intervals are drawn: errors of one drive are correlated, its blocks hardly.
 
     Raises:
         InputError: a vehicle without a truth, stamps that do not meet, positions that leave the alignment open.
@@ -304,7 +288,6 @@ def scores(
             raise InputError(side, "none", "must be at least one", hint)
         for name, path in paths.items():
             instance(f"{side}[{name!r}]", path, Path)
-    blocks = number("blocks", blocks, 2, kind=int, allowed=">= 2")
     rows = []
     for name, (estimate, moved, truth) in compared(estimates, truths, aligned, max_diff, offset).items():
         raw = np.linalg.norm(estimate.position - truth.position, axis=1)
@@ -315,15 +298,11 @@ def scores(
         if len(ends(estimate.position, delta, unit)) < 2:
             found = (*found, f"no relative error: the drive is shorter than {delta:g} {unit}.")
         elif estimate.rotation is not None and truth.rotation is not None:
-            both = (estimate.position, estimate.rotation), (truth.position, truth.rotation)
-            relative = _rms(relative_error(*both, delta, unit))
-            at = ends(estimate.position, delta, unit)
-            steps = (np.swapaxes(r[at[:-1]], -1, -2) @ r[at[1:]] for r in (estimate.rotation, truth.rotation))
-            turned = _rms(angles(*steps))
+            relative, turned = (float(rms(error)) for error in relative_error(estimate, truth, delta, unit))
         if moved.rotation is not None and truth.rotation is not None:
-            turns = _rms(angles(moved.rotation, truth.rotation))
+            turns = float(rms(angles(moved.rotation, truth.rotation)))
         missed = len(estimates[name].t) - len(raw)
-        spread = (rms_interval(raw, blocks), rms_interval(error, blocks), float(error.max()))
+        spread = (rms_interval(raw), rms_interval(error), float(error.max()))
         rows.append(Score(name, len(raw), missed, *spread, relative, turns, turned, _nees(moved, truth), found))
     return rows
 
@@ -363,23 +342,16 @@ def angles(a: Floats, b: Floats) -> Floats:
     return np.asarray(np.degrees(Rotation.from_matrix(np.swapaxes(a, -1, -2) @ b).magnitude()))
 
 
-def _rms(values: Floats) -> float:
-    return float(np.sqrt(np.square(values).mean()))
-
-
-def rms_interval(error: Floats, blocks: int = 20) -> Interval:
-    """Root of the mean square of errors (T,) m with its 95 % interval by a bootstrap over blocks of time.
+def rms_interval(error: Floats) -> Interval:
+    """Root of the mean square of errors (T,) m with its 95 % interval by a bootstrap over 20 blocks of time: errors of
+    one drive are correlated, its blocks hardly.
 
     >>> rms_interval(np.full(100, 2.0)).mean
     2.0
     """
-    count = min(blocks, len(error))
-    squares = np.array([np.mean(part**2) for part in np.array_split(error, count)])
-    rms = float(np.sqrt(np.mean(error**2)))
-    if count < 2:
-        return Interval(rms, np.nan, np.nan, count)
-    found = mean_interval(squares)
-    return Interval(rms, float(np.sqrt(max(found.low, 0.0))), float(np.sqrt(found.high)), count)
+    count = min(20, len(error))
+    found = mean_interval(np.array([np.mean(part**2) for part in np.array_split(error, count)]))
+    return Interval(float(rms(error)), float(np.sqrt(max(found.low, 0.0))), float(np.sqrt(found.high)), count)
 
 
 def _truth(name: str, truths: Mapping[str, Path], estimates: Mapping[str, Path]) -> Path:
@@ -490,7 +462,7 @@ def _scale(estimate: Floats, truth: Floats) -> str:
         factor = float(align(estimate, truth, scale=True).scale)
     except InputError:  # a straight drive, or a standing one: its frame is open, and so is its scale
         return ""
-    rigid, free = (float(absolute_error(estimate, truth, scale=scale).rmse) for scale in (False, True))
+    rigid, free = (float(rms(absolute_error(estimate, truth, scale=scale))) for scale in (False, True))
     if not factor or abs(factor - 1) < 0.05 or free > rigid / 2:
         return ""
     return f"divided by {1 / factor:.3g}, its aligned error falls from {rigid:.3g} to {free:.3g} m: another scale."

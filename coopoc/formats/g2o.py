@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import InputError
 from ..file_names import given_path
 from .graph import NAME, Graph
-from .records import Grammar, Record
+from .records import KINDS, Grammar, Record
 from .values import read_words, to_numbers
 
 OFFSET = "PARAMS_SE3OFFSET id x y z qx qy qz qw"
@@ -23,23 +23,26 @@ def _name(word: str, kind: str) -> str:
     return name if letter >= 0 and NAME.fullmatch(name) else ""
 
 
+TAGS = {
+    2: ("VERTEX_SE2", "VERTEX_XY", "EDGE_PRIOR_SE2", "EDGE_PRIOR_XY", "EDGE_SE2", "EDGE_SE2_XY"),
+    3: (
+        "VERTEX_SE3:QUAT",
+        "VERTEX_TRACKXYZ",
+        "EDGE_SE3_PRIOR",
+        "EDGE_POINTXYZ_PRIOR",
+        "EDGE_SE3:QUAT",
+        "EDGE_SE3_TRACKXYZ",
+    ),
+}
+OFFSETS = ("EDGE_SE3_PRIOR", "EDGE_SE3_TRACKXYZ")
+RECORDS = {
+    tag: Record(kind, d, offset=tag in OFFSETS)
+    for d, tags in TAGS.items()
+    for kind, tag in zip(KINDS, tags, strict=True)
+}
 GRAMMAR = Grammar(
     "g2o",
-    {
-        "VERTEX_SE2": Record("pose", 2),
-        "VERTEX_XY": Record("point", 2),
-        "EDGE_PRIOR_SE2": Record("pose_prior", 2),
-        "EDGE_PRIOR_XY": Record("point_prior", 2),
-        "EDGE_SE2": Record("relative_pose", 2),
-        "EDGE_SE2_XY": Record("relative_point", 2),
-        "VERTEX_SE3:QUAT": Record("pose", 3),
-        "VERTEX_TRACKXYZ": Record("point", 3),
-        "EDGE_SE3_PRIOR": Record("pose_prior", 3, offset=True),
-        "EDGE_POINTXYZ_PRIOR": Record("point_prior", 3),
-        "EDGE_SE3:QUAT": Record("relative_pose", 3),
-        "EDGE_SE3_TRACKXYZ": Record("relative_point", 3, offset=True),
-        "EDGE_RANGE": Record("ranges", 0),
-    },
+    {**RECORDS, "EDGE_RANGE": Record("ranges", 0)},
     noise="information",
     name=_name,
     others=("PARAMS_SE3OFFSET", "FIX"),

@@ -6,26 +6,28 @@ from pathlib import Path
 
 from ..file_names import given_path
 from .graph import NAME, Graph
-from .records import Grammar, Record
+from .records import KINDS, Grammar, Record
 from .values import read_words
 
+TAGS = {
+    2: ("VERTEX_SE2", "VERTEX_XY", "VERTEX_SE2:PRIOR", "VERTEX_XY:PRIOR", "EDGE_SE2", "EDGE_SE2_XY"),
+    3: (
+        "VERTEX_SE3:QUAT",
+        "VERTEX_XYZ",
+        "VERTEX_SE3:QUAT:PRIOR",
+        "VERTEX_XYZ:PRIOR",
+        "EDGE_SE3:QUAT",
+        "EDGE_SE3_XYZ",
+    ),
+}
+RECORDS = {
+    tag: Record(kind, d, stamped=kind != "point")
+    for d, tags in TAGS.items()
+    for kind, tag in zip(KINDS, tags, strict=True)
+}
 GRAMMAR = Grammar(
     "PyFG",
-    {
-        "VERTEX_SE2": Record("pose", 2, stamped=True),
-        "VERTEX_XY": Record("point", 2),
-        "VERTEX_SE2:PRIOR": Record("pose_prior", 2, stamped=True),
-        "VERTEX_XY:PRIOR": Record("point_prior", 2, stamped=True),
-        "EDGE_SE2": Record("relative_pose", 2, stamped=True),
-        "EDGE_SE2_XY": Record("relative_point", 2, stamped=True),
-        "VERTEX_SE3:QUAT": Record("pose", 3, stamped=True),
-        "VERTEX_XYZ": Record("point", 3),
-        "VERTEX_SE3:QUAT:PRIOR": Record("pose_prior", 3, stamped=True),
-        "VERTEX_XYZ:PRIOR": Record("point_prior", 3, stamped=True),
-        "EDGE_SE3:QUAT": Record("relative_pose", 3, stamped=True),
-        "EDGE_SE3_XYZ": Record("relative_point", 3, stamped=True),
-        "EDGE_RANGE": Record("ranges", 0, stamped=True),
-    },
+    {**RECORDS, "EDGE_RANGE": Record("ranges", 0, stamped=True)},
     noise="covariance",
     name=lambda word, kind: word if NAME.fullmatch(word) else "",
 )

@@ -14,6 +14,8 @@ from .graph import ENDS, Edges, Graph, edges_of
 from .values import inverse, malformed, symmetric, to_numbers
 
 VALUES = {"pose2": "x y theta", "pose3": "x y z qx qy qz qw", "point2": "x y", "point3": "x y z"}
+KINDS = ("pose", "point", *ENDS)[:-1]
+"""Of vertices and edges, in the order of a format's tags; ranges have one tag for the plane and for space."""
 Index = dict[str, dict[str, int]]  # pose or point -> the word for a vertex -> its place
 
 

@@ -102,53 +102,57 @@ class CooperativeFilter:
         "range", "azimuth", "inclination" and "message", NaN where there was none, and whether it is "trusted".
         """
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
-        model = model_of(known, self.robust)
-        assumed, broadcast, moved = assumptions(recording, known), None, NO_ODOMETER
-        notes = list(known.notes)
+        model, guards = model_of(known, self.robust), guards_of(self, known)
+        assumed, broadcast, notes = assumptions(recording, known), None, list(known.notes)
+        moved: Floats = NO_ODOMETER
         if self.robust:
-            broadcast, variance = broadcasts(recording, known, columns, guards_of(self, known))
+            broadcast, variance, moved = broadcasts(recording, known, columns, guards)
             assumed = assumed._replace(broadcast=variance)
-            moved = np.cumsum(np.nan_to_num(recording.dt * recording.velocity), axis=1)
-        guards = guards_of(self, known)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
             seen = measurements(recording, ego, box, broadcast)
             x, cov, neighbours, fixes, weights = run_filter(seen, assumed, moved, model, guards)
             extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate(KINDS)}
             mine = recording.ids[ego]
-            notes.extend(rejected(f"fixes, {mine}", fixes))
+            notes.extend(rejected(f"fixes, {mine}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
             if model.own + model.common == 0.0 and guards.fix_gate:
                 notes.extend(lasting(mine, recording.gnss[:, :, ego] - x, recording.dt))
+            low, measured = (weights < 0.1).sum(axis=0), np.isfinite(weights).sum(axis=0)
             for j in np.unique(seen.neighbour):
-                of, pair = weights[:, seen.neighbour == j], f"{mine} and {recording.ids[j]}"
-                for k, kind in enumerate(KINDS[:4]):
-                    notes.extend(rejected(f"{kind}, {pair}", of[..., k]))
-                notes.extend(rejected(f"trust, {pair}", of[..., 4], 0.5))
+                here = seen.neighbour == j
+                for kind, count, of in zip(KINDS, low[here].sum(axis=0), measured[here].sum(axis=0), strict=True):
+                    what = f"{kind}, {mine} and {recording.ids[j]}"
+                    notes.extend(rejected(what, count, of, 0.5 if kind == "trusted" else 0.05))
             yield Estimate(slice(None), x, cov, box.link, neighbours, extras)
 
         return follow_egos(self, recording, egos, run, notes, missing=True)
 
 
-def broadcasts(recording: Recording, known: NoiseModel, egos: Sequence[int], guards: Guards) -> tuple[Floats, Floats]:
-    """Estimates m and variances m^2, (R, T, N, 3), of the vehicles in the stars of some egos, each filtered alone."""
+def broadcasts(
+    recording: Recording, known: NoiseModel, egos: Sequence[int], guards: Guards
+) -> tuple[Floats, Floats, Floats]:
+    """Estimates m, variances m^2 and sums of motions m, (R, T, N, 3), of the vehicles in the stars of some egos, each
+    filtered alone until it is in none any more."""
     links, assumed, model = recording.links, assumptions(recording, known), model_of(known, robust=False)
     x = np.full(recording.gnss.shape, np.nan)
-    variance, nothing = x.copy(), inbox(recording, egos[0], FIX_AND_VELOCITY)
-    seen = measurements(recording, egos[0], nothing)._replace(start=np.zeros(len(recording.t) + 1, np.int64))
-    for j in np.union1d(egos, links.neighbour[np.isin(links.observer, egos)]):
-        x[:, :, j], cov = run_filter(seen._replace(ego=int(j)), assumed, NO_ODOMETER, model, guards)[:2]
-        variance[:, :, j] = np.diagonal(cov, axis1=-2, axis2=-1)
+    variance, moved, nothing = x.copy(), x.copy(), inbox(recording, egos[0], FIX_AND_VELOCITY)
+    seen, here = measurements(recording, egos[0], nothing), np.isin(links.observer, egos)
+    for j in np.unique(links.neighbour[here]):
+        last = int(links.step[here & (links.neighbour == j)].max()) + 1
+        alone = seen._replace(ego=int(j), start=np.zeros(last + 1, np.int64))
+        x[:, :last, j], cov = run_filter(alone, assumed, NO_ODOMETER, model, guards)[:2]
+        variance[:, :last, j] = np.diagonal(cov, axis1=-2, axis2=-1)
+        moved[:, :last, j] = np.cumsum(np.nan_to_num(recording.dt * recording.velocity[:, :last, j]), axis=1)
     x.flags.writeable = False  # as the recording's, for which the kernel is compiled
-    return x, variance
+    return x, variance, moved
 
 
-def rejected(what: str, weights: Floats, share: float = 0.05) -> list[str]:
-    """A note if that share of numbers, ten at least, weighed next to nothing.
+def rejected(what: str, count: int, measured: int, share: float = 0.05) -> list[str]:
+    """A note if that share of the measured numbers, ten at least, weighed next to nothing.
 
-    >>> rejected("range, a and b", np.array([1.0] * 30 + [0.001] * 10))
+    >>> rejected("range, a and b", 10, 40)
     ['range, a and b: 10 of 40 rejected']
     """
-    count, measured = int((weights < 0.1).sum()), int(np.isfinite(weights).sum())
     return [f"{what}: {count} of {measured} rejected"] if count >= max(10, share * measured) else []
 
 

@@ -106,10 +106,10 @@ def names_of(field: str, given: Any, kind: type[Any]) -> list[str]:
     Raises:
         InputError: anything else, or a vehicle twice.
     """
-    if not isinstance(given, Sequence) or not all(isinstance(each, kind) for each in given):
+    names = [each.id for each in given if isinstance(each, kind)] if isinstance(given, Sequence) else None
+    if names is None or len(names) < len(given):
         hint = f"Give a list of {kind.__name__}, empty for none."
         raise InputError(field, shown(given), f"must hold {kind.__name__}s", hint)
-    names: list[str] = [each.id for each in given]
     if len(set(names)) < len(names):
         raise InputError(field, names, "must be given once each", "Merge the measurements of one vehicle.")
     return names

@@ -11,14 +11,16 @@ import numpy.typing as npt
 
 from ..arrays import Floats, Ints, instance
 from ..errors import InputError
-from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET, ROUNDING
+from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.motion import MotionNoise
-from ..kernels.stars.cooperative_filter import keep, make_filter, motion_of, restore, stream_row, stream_step
 from ..kernels.stars.cooperative_state import (
     AGE,
+    DT,
+    FIX,
     FIX_VARIANCE,
     KEPT_VARIANCE,
     MOTION,
+    MOTION_VARIANCE,
     NO_GUARDS,
     ODOMETER,
     OWN,
@@ -28,7 +30,6 @@ from ..kernels.stars.cooperative_state import (
     SPEED,
     STEP,
     TRUSTED,
-    TYPICAL,
     USED,
     WIDTH,
     Filter,
@@ -37,11 +38,22 @@ from ..kernels.stars.cooperative_state import (
 )
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.relative import components
+from ..kernels.stars.streams import (
+    INDEX,
+    USED_AT,
+    joint_step,
+    make_filter,
+    make_joint,
+    restore,
+    stream_rows,
+    stream_step,
+)
 from ..world.links import told
 from .cooperative_filter import Broadcast, CooperativeFilter, guards_of, model_of
+from .egos import relative_noise
 from .joint_filter import JointFilter
 from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
-from .noise_model import constant_noise, motion_noise
+from .noise_model import NoiseModel, constant_noise, motion_noise
 
 FIRST = np.zeros(1, np.int64)
 
@@ -70,7 +82,7 @@ class RelativeMeasurement:
     variance: npt.ArrayLike | None = None
     odometer: npt.ArrayLike | None = None
     age: float = 0.0
-    row: Floats = field(init=False, repr=False)
+    row: bytes = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         row = np.full(WIDTH, np.nan)
@@ -88,7 +100,7 @@ class RelativeMeasurement:
             row[SPEED:STEP] = three("neighbour's velocity", self.velocity)
         elif math.isfinite(row[SOLO]):
             raise InputError("velocity", None, f"must come with the fix of {self.id}", "Send both in one message.")
-        object.__setattr__(self, "row", row)
+        object.__setattr__(self, "row", row.tobytes())
 
 
 class StarStream:
@@ -132,32 +144,33 @@ class StarStream:
     ) -> None:
         if not isinstance(filter, CooperativeFilter):
             filter = instance("filter", filter, JointFilter)
+        elif not filter.robust:
+            filter = JointFilter(filter.noise_model, robust=False)
         known = constant_noise(filter.noise_model)
-        robust = isinstance(filter, CooperativeFilter) and filter.robust
-        self._model, self._guards = model_of(known, robust), NO_GUARDS
-        if isinstance(filter, JointFilter):
-            self._model = self._model._replace(exact=float(filter.exact and known.exact_relative))
-            if filter.robust and known.exact_relative:
-                usual = Guards()
-                self._guards = NO_GUARDS._replace(gate=usual.gate, fix_gate=usual.fix_gate)
-        elif robust:
-            self._guards = guards_of(filter, known)
+        start = np.full(3, np.nan) if x0 is None else three("x0", x0)
+        self._star: Joint | Recalled
+        self._alone: Recalled | None = None
+        self._guards = NO_GUARDS
+        if isinstance(filter, CooperativeFilter):
+            model, self._guards = model_of(known, robust=True), guards_of(filter, known)
+            self._star, self._white = Recalled(model, self._guards, start), model.white
+            self._alone = Recalled(model_of(known, robust=False), self._guards, start)
+        else:
+            self._star = Joint(known, filter.exact, filter.robust, start)
         self._motion: MotionNoise = motion_noise(known, interval)
         self._fix = np.array(known.gnss_variance)
         self.max_age, self.history = seconds("max_age", max_age), MotionHistory(history)
-        self._start = np.full(3, np.nan) if x0 is None else three("x0", x0)
-        self._given = np.zeros(8)
-        self._positions: dict[str, Floats] = {}
-        self._messages: dict[str, tuple[Floats, float]] = {}
-        self._numbers: dict[str, int] = {}
-        self._star, self._time = Recalled(self._model, self._guards, self._start), 0.0
-        self._alone = Recalled(model_of(known, robust=False), self._guards, self._start) if robust else None
-        self._odometer, self._estimate = np.zeros(3), np.full(12, np.nan)
+        self._given, self._time, self._begun = np.zeros(8), 0.0, x0 is not None
+        self._numbers, self._names = dict[str, int](), list[str]()
+        self._last: Floats = np.full((1, WIDTH), np.nan)
+        self._last[0, INDEX] = -1.0
+        self._answer: Floats = np.full(12, np.nan)
+        self._odometer, self._estimate = np.zeros(3), self._answer
 
     @property
     def neighbours(self) -> dict[str, Floats]:
         """Positions (3,) m of the neighbours in the star."""
-        return {name: position.copy() for name, position in self._positions.items()}
+        return dict(zip(self._names, self._answer[12:].reshape(-1, 3).copy(), strict=True))
 
     @property
     def broadcast(self) -> Broadcast | None:
@@ -169,8 +182,8 @@ class StarStream:
     @property
     def trusted(self) -> dict[str, bool]:
         """Whether the fixes of each neighbour in the star count as they are."""
-        status = self._star.filters[0].status
-        return {name: bool(status[self._numbers[name], TRUSTED]) for name in self._positions}
+        numbers, first = [self._numbers[name] for name in self._names], self._star.filters[:1]
+        return {name: all(f.status[k, TRUSTED] for f in first) for name, k in zip(self._names, numbers, strict=True)}
 
     def step(
         self,
@@ -197,79 +210,99 @@ class StarStream:
         if self._alone is not None:
             self._check(neighbours)
         self.history.write(self._given, gnss, velocity, dt, fix_age)
-        own = np.empty(OWN)
-        outcome = stream_row(self._given, self.history.reserve(), self._motion, self._fix, own)
+        columns, time, motion, fix = self._columns(names), self._time + float(dt), self._motion, self._fix
+        rows: Floats = np.frombuffer(bytearray().join([each.row for each in neighbours])).reshape(len(names), WIDTH)
+        own, history, last = np.empty(OWN), self.history.reserve(), self._last
+        outcome = stream_rows(self._given, history, motion, fix, own, rows, columns, last, time, self.max_age)
         if outcome not in (ESTIMATE, NO_FIX_YET):
             self.history.check(gnss, velocity, dt, fix_age)
-        dt = float(dt)
-        self._odometer += self._given[3:6] * dt
-        self._time += dt
-        rows = self._rows(names, neighbours, dt)
-        if outcome == NO_FIX_YET:
-            own[:3] = np.nan
-            if not self._star.steps and np.isnan(self._start[0]):
-                return np.full(3, np.nan), None
+        self._time = time
+        self._begun |= outcome == ESTIMATE
+        if not self._begun:
+            return np.full(3, np.nan), None
         if self._alone is not None:
-            self._estimate = self._alone.step(own.copy(), rows[:0], FIRST[:0])
-        own[FIX_VARIANCE:MOTION] -= (1.0 - self._model.white) * self._fix
-        answer = self._star.step(own, rows, self._columns(names))
-        self._positions = dict(zip(names, answer[12:].reshape(-1, 3), strict=True))
-        return answer[:3], answer[3:12].reshape(3, 3)
+            self._odometer += self._given[3:6] * own[DT]
+            self._estimate = self._alone.step(own.copy(), rows[:0], columns[:0], last)
+            own[FIX_VARIANCE:MOTION] -= (1.0 - self._white) * self._fix
+        self._names, self._answer = names, self._star.step(own, rows, columns, last)
+        return self._answer[:3], self._answer[3:12].reshape(3, 3)
 
     def _check(self, neighbours: Sequence[RelativeMeasurement]) -> None:
         for each in neighbours:
-            if each.velocity is not None and not np.isfinite(each.row[SOLO:SPEED]).all():
+            if each.velocity is not None and not np.isfinite(np.frombuffer(each.row)[SOLO:SPEED]).all():
                 allowed = "must hold position, variance and odometer for a robust filter"
                 raise InputError("neighbours", each.id, allowed, "Send stream.broadcast, or start with robust=False.")
 
-    def _rows(self, names: list[str], neighbours: Sequence[RelativeMeasurement], dt: float) -> Floats:
-        """(k, WIDTH) the measurements, each with the newest message of its vehicle."""
-        rows = np.empty((len(names), WIDTH))
-        for row, name, measured in zip(rows, names, neighbours, strict=True):
-            if measured.velocity is not None:
-                sent = self._time - measured.age
-                if name not in self._messages or sent >= self._messages[name][1] - ROUNDING:
-                    self._messages[name] = measured.row, sent
-            row[:AGE], row[AGE] = measured.row[:AGE], -1.0
-            message, sent = self._messages.get(name, (measured.row, -math.inf))
-            age = max(self._time - sent, 0.0)
-            if age > self.max_age + ROUNDING:
-                continue
-            row[SOLO:] = message[SOLO:]
-            row[AGE], row[TYPICAL:] = age if age > ROUNDING else 0.0, self._fix
-            if self._alone is None:
-                row[SOLO_VARIANCE:ODOMETER] = self._fix
-        motion_of(rows, self._motion, dt)
-        if len(self._messages) > 64 + 2 * len(names):
-            oldest = self._time - self.max_age
-            self._messages = {name: last for name, last in self._messages.items() if last[1] >= oldest}
-        return rows
-
     def _columns(self, names: list[str]) -> Ints:
-        """Numbers of the vehicles, 1 and up, and room for them in the filters."""
-        new = [name for name in names if name not in self._numbers]
-        if len(self._numbers) + len(new) >= 64 + 2 * len(names):
-            self._forget(names)
-        slots, vehicles = self._star.filters[0].vehicle.size, self._star.filters[0].slot.size
-        if len(names) >= slots or len(self._numbers) + len(new) >= vehicles:
-            more = max(slots, 2 * len(names) + 1), max(vehicles, 2 * (len(self._numbers) + len(new)) + 1)
-            self._star.filters = [grown(f, *more) for f in self._star.filters]
-        free = sorted(set(range(1, self._star.filters[0].slot.size)) - set(self._numbers.values()))
+        """Numbers of the vehicles, 1 and up; the filter has room for them."""
+        try:
+            columns = np.fromiter(map(self._numbers.__getitem__, names), np.int64, len(names))
+        except KeyError:
+            self._meet([name for name in names if name not in self._numbers], names)
+            return self._columns(names)
+        self._star.reserve(1 + len(names), len(self._last))
+        return columns
+
+    def _meet(self, new: list[str], names: list[str]) -> None:
+        """Number new vehicles; forget those that are in no star that is remembered, and whose messages are too old."""
+        if len(self._numbers) + len(new) >= len(self._last):
+            oldest = self._time - self.max_age
+            for name, number in list(self._numbers.items()):
+                there = self._last[number, INDEX] >= 0 or any(f.slot[number] != ABSENT for f in self._star.filters)
+                if not there and name not in names and self._last[number, AGE] < oldest:
+                    del self._numbers[name]
+        if (wanted := len(self._numbers) + len(new)) >= len(self._last):
+            self._last = np.pad(self._last, ((0, 2 * wanted), (0, 0)))
+            self._star.reserve(1, len(self._last))
+        free = sorted(set(range(1, len(self._last))) - set(self._numbers.values()))
         for name, number in zip(new, free, strict=False):
             self._numbers[name] = number
+            self._last[number], self._last[number, [INDEX, USED_AT, AGE]] = np.nan, (-1.0, -math.inf, -math.inf)
             for f in self._star.filters:
                 f.status[number], f.revoked[number] = 0.0, 0.0
                 f.status[number, TRUSTED] = float(self._guards.trust == 0.0)
                 f.status[number, USED] = f.status[number, SINCE] = -math.inf
                 f.status[number, KEPT_VARIANCE : KEPT_VARIANCE + 3] = self._guards.tau**2
-        return np.array([self._numbers[name] for name in names], dtype=np.int64)
 
-    def _forget(self, names: list[str]) -> None:
-        """Vehicles that are in no star that is remembered and whose messages are too old."""
-        for name, number in list(self._numbers.items()):
-            there = any(f.slot[number] != ABSENT for f in self._star.filters) or name in names
-            if not there and name not in self._messages:
-                del self._numbers[name]
+
+class Joint:
+    """The joint filter, step by step: `reserve` and `step` as those of `Recalled`.
+
+    Args:
+        known: noise model.
+        exact: refine by one Gauss-Newton step.
+        robust: gate innovations.
+        start: (3,) m, known before the first step, NaN for none.
+    """
+
+    filters: tuple[Filter, ...] = ()
+
+    def __init__(self, known: NoiseModel, exact: bool, robust: bool, start: Floats) -> None:
+        std, least = relative_noise(known)
+        self.options = np.array(std), float(least), exact and known.exact_relative, robust and known.exact_relative
+        self.joint, self.gates, self.start = *make_joint(1), start
+
+    def reserve(self, slots: int, vehicles: int) -> None:
+        """Room for a star of that many members."""
+        if (most := self.joint.stride) < slots:
+            joint, gates = make_joint(2 * slots)
+            joint.state[: 3 * most], gates.state[: 13 * most] = self.joint.state, self.gates.state
+            lanes = self.joint.information.shape[1]
+            blocks = self.joint.information.reshape(most, most, 9, lanes)
+            joint.information.reshape(2 * slots, 2 * slots, 9, lanes)[:most, :most] = blocks
+            self.joint, self.gates = joint, gates
+
+    def step(self, own: Floats, rows: Floats, vehicles: Ints, last: Floats) -> Floats:
+        """Answer of `joint_step`; the motion from a start that is known is a fix, too."""
+        if math.isfinite(self.start[0]):
+            weight = 0.0 if math.isnan(own[FIX]) else 1.0 / own[FIX_VARIANCE:MOTION]
+            more = 1.0 / (own[MOTION_VARIANCE:DT] + 1e-18)
+            began = self.start + own[MOTION:MOTION_VARIANCE]
+            own[:FIX_VARIANCE] = (np.nan_to_num(own[:FIX_VARIANCE]) * weight + began * more) / (weight + more)
+            own[FIX_VARIANCE:MOTION], self.start = 1.0 / (weight + more), np.full(3, np.nan)
+        answer = np.empty(12 + 3 * len(vehicles))
+        joint_step(self.joint, self.gates, *self.options, own, rows, vehicles, last, answer)
+        return answer
 
 
 class Recalled:
@@ -286,13 +319,25 @@ class Recalled:
         self.filters = [make_filter(1, 1) for _ in range(3)]
         self._inputs: list[tuple[Floats, Floats, Ints]] = []
 
-    def step(self, own: Floats, rows: Floats, vehicles: Ints) -> Floats:
+    def reserve(self, slots: int, vehicles: int) -> None:
+        """Room for a star of that many members, of that many vehicles."""
+        f = self.filters[0]
+        if slots > len(f.vehicle) or vehicles > len(f.slot):
+            self.filters = [self._grown(f, max(len(f.vehicle), 2 * slots), vehicles) for f in self.filters]
+
+    def _grown(self, f: Filter, slots: int, vehicles: int) -> Filter:
+        larger = make_filter(slots, vehicles)
+        restore(f, larger, self.model, self.guards)
+        larger.revoked[: len(f.revoked)] = f.revoked
+        return larger
+
+    def step(self, own: Floats, rows: Floats, vehicles: Ints, last: Floats) -> Floats:
         """Answer of `stream_step`; its arguments are kept."""
         f, older, newer = self.filters
         memory = int(self.guards.memory)
         if memory and self.steps and self.steps % memory == 0:
-            keep(newer, older)
-            keep(f, newer)
+            restore(newer, older, self.model, self.guards)
+            restore(f, newer, self.model, self.guards)
             del self._inputs[:-memory]
         self.steps += 1
         answer = np.empty(12 + 3 * len(vehicles))
@@ -304,17 +349,9 @@ class Recalled:
             restore(older, f, self.model, self.guards)
             for k, (mine, theirs, who) in enumerate(self._inputs):
                 if k == len(self._inputs) - 1 - (self.steps - 1) % memory:
-                    keep(f, newer)
+                    restore(f, newer, self.model, self.guards)
                 answer = np.empty(12 + 3 * len(who))
                 alarm = stream_step(f, self.model, self.guards, mine, theirs, who, self.start, answer)
                 if alarm:
                     break
         return answer
-
-
-def grown(f: Filter, slots: int, vehicles: int) -> Filter:
-    """The filter with more room."""
-    larger = make_filter(slots, vehicles)
-    keep(f, larger)
-    larger.revoked[: len(f.revoked)] = f.revoked
-    return larger

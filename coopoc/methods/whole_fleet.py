@@ -30,6 +30,11 @@ CENTRE = (
 )
 
 
+NEAREST = 0.1
+"""Share of a range's standard deviation: angles are no more certain than at this distance, whatever the sensors'
+`min_range`. In one place they weighed so much that belief propagation lost all digits."""
+
+
 class Answer(NamedTuple):
     """Estimates of the fleet at each step.
 
@@ -138,7 +143,10 @@ def kernel_arguments(
         vehicles = range(len(recording.ids))
         fix = fix / model.gnss_variance * solo_filter(recording, vehicles, model, fix_noise(model, robust))[2]
     process, fix = (np.ascontiguousarray(variance, dtype=float) for variance in (process, fix))
-    std, min_range = (model.sensors.relative_std, model.sensors.min_range) if model.sensors else (np.zeros(0), 0.0)
+    std: Floats = np.zeros(0)
+    known, min_range = model.sensors, 0.0
+    if known is not None:
+        std, min_range = known.relative_std, max(known.min_range, NEAREST * known.relative_std[0])
     measured = Measured(recording.gnss, recording.velocity, relative, active, recording.dt)
     return measured, pairs, Assumed(process, fix, std, min_range, robust)
 

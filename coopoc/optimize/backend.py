@@ -9,12 +9,18 @@ from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any, Literal, TypeAlias
 
+import numpy as np
+
 from ..arrays import Floats
 from ..errors import InputError, require, suggestion, unknown
 from ..plugins import find, names
 from .model.problem import Problem
 
 Options: TypeAlias = dict[str, Any]
+MAX_ITERATIONS = 500
+"""About 6 are needed with angles, some 50 for range-only problems of flat geometry."""
+TOLERANCE = 1e-8
+"""m or rad, largest move of a node in the last step."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -118,6 +124,14 @@ class Backend:
         if problem.movable is not None and not problem.movable.any():
             return lambda part, x: SolverResult(x, 0)
         return self.prepare(problem, **options)
+
+
+def check_limits(max_iterations: int, tolerance: float) -> None:
+    """InputError unless max_iterations is a whole number >= 0 and tolerance a number > 0."""
+    if not isinstance(max_iterations, int | np.integer) or max_iterations < 0:
+        raise InputError("max_iterations", repr(max_iterations), "must be a whole number >= 0", "Leave it out for 500.")
+    if not isinstance(tolerance, float | int) or not tolerance > 0:
+        raise InputError("tolerance", repr(tolerance), "must be a number > 0 (m)", "Leave it out for 1e-8.")
 
 
 @lru_cache(maxsize=64)

@@ -77,31 +77,15 @@ def from_graph(
     """
     for name, value, allowed in (("objective", objective, Objective), ("start", start, Start)):
         one_of(name, value, get_args(allowed))
-    poses = tuple(np.flatnonzero(graph.is_pose).tolist())
-    factors = _factors(graph, objective)
-
-    def x0_of(name: str) -> Floats:
-        x0 = STARTS.get(name, chained)(graph)
-        if name == "linear" and poses:
-            relaxed = Problem(graph.names, _factors(graph, "chordal"), x0, dimension=graph.dimension, poses=poses)
-            x0 = chordal_start(relaxed)
-        x0 = separated(graph, x0)
-        return x0 if poses else x0[:, : graph.dimension]
-
-    def relaxed(at: Problem) -> Floats:
-        from .convex.relaxation import staircase
-
-        chordal = at if objective == "chordal" else at.replace_unchecked(factors=_factors(graph, "chordal"))
-        return staircase(chordal, refine=False, seconds=seconds).x
-
-    began, notes = time.perf_counter(), graph.notes
+    began, notes, factors = time.perf_counter(), graph.notes, _factors(graph, objective)
+    poses, relaxed = tuple(np.flatnonzero(graph.is_pose).tolist()), partial(_relaxed, graph, objective, seconds)
     first = {"incremental": "odometry", "relaxed": "apart"}.get(start, start)
     names = contenders(graph) if start == "auto" else (first,)
-    given = x0_of(names[0])
+    given = _x0(graph, poses, names[0])
     problem = Problem(graph.names, factors, given, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
     won = Search(names[0])
     if start == "auto":
-        starts = {name: (lambda: given) if name == names[0] else partial(x0_of, name) for name in names}
+        starts = {name: (lambda: given) if name == names[0] else partial(_x0, graph, poses, name) for name in names}
         growing = partial(incremental_start, graph) if poses else None
         last = relaxed if len(graph.names) <= RELAXED else None
         problem, won = race(problem, starts, growing, last, partial(unwound, graph))
@@ -113,6 +97,24 @@ def from_graph(
     elif start == "file" and not graph.guess:
         notes = (*notes, "the start is the file's vertices, which may be the truth")
     return problem.replace_unchecked(search=won._replace(seconds=time.perf_counter() - began, notes=notes))
+
+
+def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:
+    """(n, ambient) of a start that needs no search."""
+    x0 = STARTS.get(name, chained)(graph)
+    if name == "linear" and poses:
+        factors = _factors(graph, "chordal")
+        x0 = chordal_start(Problem(graph.names, factors, x0, dimension=graph.dimension, poses=poses))
+    x0 = separated(graph, x0)
+    return x0 if poses else x0[:, : graph.dimension]
+
+
+def _relaxed(graph: Graph, objective: Objective, seconds: float, at: Problem) -> Floats:
+    """(n, ambient) of the rounded relaxation of the chordal problem."""
+    from .convex.relaxation import staircase
+
+    chordal = at if objective == "chordal" else at.replace_unchecked(factors=_factors(graph, "chordal"))
+    return staircase(chordal, refine=False, seconds=seconds).x
 
 
 def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:
@@ -187,6 +189,8 @@ def _fixed(graph: Graph) -> tuple[int, ...]:
         len(graph.names), np.concatenate([each.nodes for each in edges if len(each)] or [np.empty((0, 2), int)])
     )
     held = [graph.fixed, *(each.nodes[:, 0] for each in (graph.pose_prior, graph.point_prior) if len(each))]
-    free = np.flatnonzero(graph.is_pose & ~np.isin(part, part[np.concatenate(held)]))
+    holding = np.zeros(len(part), dtype=bool)
+    holding[part[np.concatenate(held)]] = True
+    free = np.flatnonzero(graph.is_pose & ~holding[part])
     first = free[np.unique(part[free], return_index=True)[1]]
     return tuple(np.sort(np.concatenate([graph.fixed, first])).tolist())

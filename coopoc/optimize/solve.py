@@ -12,10 +12,8 @@ from ..arrays import Floats, Ints, instance
 from ..errors import InputError
 from .algebra.sparse import sparse
 from .assess.active import constraint_rows
-from .assess.assess import Assessment, assess, is_constrained_minimum, newton_decrease
-from .assess.plausible import judged
-from .backend import Backend, Options, require_backend
-from .descent.levenberg_marquardt import MAX_ITERATIONS
+from .assess.assess import Assessment, assess, is_constrained_minimum, judged, newton_decrease
+from .backend import MAX_ITERATIONS, Backend, Options, require_backend
 from .model.factor import fused
 from .model.problem import Problem
 from .robust.graduated import robust_start

@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from matplotlib.axes import Axes
+from matplotlib.patheffects import withStroke
 
 from ..errors import InputError
 from ..escapes import picture
@@ -71,31 +72,32 @@ def pareto(
     names = _line_names(results)
     summary = results.summary(axes := [a for a in results.axes if a != "train_seed"], y, where)
     summary["bytes"] = results.summary(axes, x, where)["mean"]
-    marks, levels = list[tuple[Where, Any]](), list[tuple[Where, Any]]()
+    shown = list[tuple[Where, Any]]()
     for key, group in summary.dropna(subset=["mean"]).groupby(names, sort=False):
         of = dict(zip(names, key, strict=True))
         points = sorted(zip(group["bytes"], group["mean"], strict=True))
         alone = points[-1][0] == 0 or of["method"] == "bound"
-        (levels if alone else marks).append((of, min(value for _, value in points) if alone else points))
-    shown = [("", levels)]
-    flat = _coinciding(shown, True, WIDTH * _height([*shown, ("", [(of, dict(points)) for of, points in marks])], True))
+        shown.append((of, min(value for _, value in points) if alone else {x: y for x, y in points if x > 0}))
+    groups = _coinciding([("", shown)], True, WIDTH * _height([("", shown)], True))
+    groups.sort(key=lambda alike: not isinstance(next(of[1] for of in shown if of[0] is alike[0]), Mapping))
     with canvas(width=7.0) as (figure, panel):
-        for line, points in marks:
-            sent = [point for point in points if point[0] > 0]
+        for line, points in (next(of for of in shown if of[0] is alike[0]) for alike in groups):
+            if not isinstance(points, Mapping):
+                _draw(panel, line, points)
+                continue
+            sent = list(points.items())
             panel.plot(*zip(*sent, strict=True), **{**strokes(line), "linestyle": "none"})
             best = [p for k, p in enumerate(sent) if all(p[1] < other[1] for other in sent[:k])]
             panel.plot(*zip(*best, strict=True), **{**strokes(line), "marker": "", "linewidth": 0.8})
-        for alike in flat:
-            _draw(panel, alike[0], next(value for line, value in levels if line is alike[0]))
         plain_log(panel.xaxis)
         plain_log(panel.yaxis)
         panel.set(xlabel=words(x), ylabel=words(y))
         also = {
             name_of(alike[0]): f" ({alike[0].get('noise_model')}{_joined(alike).removeprefix(_joined(alike[:1]))})"
-            for alike in flat
+            for alike in groups
             if len(alike) > 1
         }
-        legend(panel, [*(of for of, _ in marks), *(alike[0] for alike in flat)], also)
+        legend(panel, [alike[0] for alike in groups], also)
     return Plot(figure, caption)
 
 
@@ -168,13 +170,8 @@ def curves(
                 _draw(axis, names, points, style)
                 named += [names] if names not in named else []
                 also[name_of(names)] = text.removeprefix(_joined([of]))
-            for group in _coinciding([(panel, drawn)], log, WIDTH * height_of):
-                leaders = [of for of in group if id(of) in groups]
-                points = next(points for of, points in drawn if of is group[0])
-                if len(leaders) > 1 and isinstance(points, Mapping):
-                    x, y = list(points.items())[-1]
-                    below = {"xytext": (0, 5), "textcoords": "offset points", "ha": "right", "fontsize": 7}
-                    axis.annotate(_joined(leaders), (x, _mean(y)), **below)
+            alone = [(of, points) for of, points in drawn if id(of) in groups and isinstance(points, Mapping)]
+            _name_alike(axis, alone, log, WIDTH * height_of)
             axis.set(title=picture(panel.title), xlabel=panel.xlabel)
             if logx:
                 plain_log(axis.xaxis)
@@ -187,6 +184,16 @@ def curves(
         else:
             legend(axes[-1], named, also)
     return Plot(figure, caption)
+
+
+def _name_alike(axes: Axes, drawn: Sequence[tuple[Where, Any]], log: bool, near: float) -> None:
+    """Name lines together at their ends that coincide in this panel alone."""
+    for group in _coinciding([("", drawn)], log, near):
+        if len(group) > 1:
+            x, y = list(next(points for of, points in drawn if of is group[0]).items())[-1]
+            halo = [withStroke(linewidth=2, foreground="white")]
+            place: dict[str, Any] = {"xytext": (0, 5), "textcoords": "offset points", "ha": "right"}
+            axes.annotate(_joined(group), (x, _mean(y)), fontsize=7, path_effects=halo, **place)
 
 
 NEAR, WIDTH = 0.015, 0.009
@@ -257,8 +264,8 @@ def multiples(
     with canvas(1, len(cases), sharex=True, sharey=True, squeeze=False, **size) as (figure, (axes,)):
         for panel, case in zip(axes, cases, strict=True):
             if target and case in target:
-                panel.axvspan(1.0, target[case], color=NEUTRAL, alpha=0.35, linewidth=0, label="target")
-                panel.legend(loc="lower right")
+                band = panel.axvspan(1.0, target[case], color=NEUTRAL, alpha=0.35, linewidth=0, label="target")
+                axes[-1].legend(handles=[band], loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
             panel.axvline(1.0, color="black", linewidth=0.9)
             for row, ((method, _), each) in enumerate(rows.items()):
                 values = each.get(case, ())

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from ..arrays import Floats
-from ..evaluate.statistics import Interval, over_seeds, paired_difference
+from ..evaluate.statistics import Interval, paired_difference
 
 if TYPE_CHECKING:
     from .results import Results
@@ -150,4 +150,4 @@ def seed_means(results: Results, where: Where, number: Number = mean) -> list[fl
 def seed_std(results: Results, where: Where) -> float | None:
     """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
     each = per_seed(results, where)
-    return float(over_seeds(each).means.std(ddof=1)) if len(each) > 1 else None
+    return float(each.mean(axis=(1, 2)).std(ddof=1)) if len(each) > 1 else None

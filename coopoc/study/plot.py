@@ -16,7 +16,7 @@ from matplotlib.axes import Axes
 from matplotlib.axis import Axis
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from matplotlib.ticker import FuncFormatter, LogLocator
+from matplotlib.ticker import FuncFormatter, LogLocator, MaxNLocator
 
 from ..escapes import picture
 from . import store
@@ -157,6 +157,17 @@ def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, s
     axes.legend(handles=handles, loc="upper left", handlelength=2.6, bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
 
 
+class _Between(LogLocator):
+    """Ticks between those of a logarithmic axis, evenly spaced where it spans less than a factor of two."""
+
+    def tick_values(self, vmin: float, vmax: float) -> Any:
+        return (
+            super().tick_values(vmin, vmax)
+            if vmax > 2 * vmin
+            else MaxNLocator(5, steps=[1, 2, 5, 10]).tick_values(vmin, vmax)
+        )
+
+
 def plain_log(axis: Axis) -> None:
     """Make an axis logarithmic with plain numbers at 1, 2 and 5 of each decade: at more if it spans less than one, at
     the decades alone if it spans many."""
@@ -165,7 +176,7 @@ def plain_log(axis: Axis) -> None:
     else:
         axis.axes.set_yscale("log")
     axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
-    axis.set_minor_locator(LogLocator(subs=(1.2, 1.5, 3.0, 4.0, 7.0), numticks=50))
+    axis.set_minor_locator(_Between(subs=(1.2, 1.5, 3.0, 4.0, 7.0), numticks=50))
 
     def spans() -> float:
         low, high = axis.get_view_interval()

@@ -20,8 +20,23 @@ from .units import ANGLES, KINDS, Rows, Summary, place
 ENU = {"longitude": "x", "latitude": "y", "height": "z"}
 MOTION = ("vx", "vy", "speed")
 Origin = tuple[float, float, float]
+PERIODS = (86400.0, 604800.0)
+"""s, of clocks: a day, a GPS week."""
 HEADING_STD = 0.05
 """rad, of a compass in body frames whose noise was not logged."""
+
+
+def unwrapped(rows: Rows, summary: Summary) -> Rows:
+    """Rows whose stamps go on where those of a vehicle begin anew, at midnight or at the end of a GPS week."""
+    last = rows.groupby(["file", "vehicle"], sort=False)["t"].shift()
+    for period in PERIODS:
+        inside = rows["t"].dropna().between(0, period)
+        away = rows["t"].between(0.25 * period, 0.75 * period)
+        if (rows["t"] < last - 0.9 * period).any() and inside.all() and not away.any():
+            summary.assume(f"stamps begin anew after {period:g} s: those before half of it count on")
+            early = {name: rows[name].mask(rows[name] < period / 2, rows[name] + period) for name in ("t", "arrival")}
+            return rows.assign(**early)
+    return rows
 
 
 def on_one_clock(rows: Rows, clock: Mapping[str, float], name: str) -> Rows:

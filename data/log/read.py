@@ -25,9 +25,9 @@ from ..bag import STAMP, read_bag
 from ..cells import TABLES, factors, headers
 from ..nmea import read_nmea
 from ..source import parted
-from .frames import ENU, Origin, assumed, local, on_one_clock
+from .frames import ENU, Origin, assumed, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
-from .motion import Steps, member, samples
+from .motion import Member, Steps, member, samples
 from .tables import is_log_table, read_log_table
 from .units import KINDS, Rows, Summary, check_values, distinct, in_group
 
@@ -150,17 +150,14 @@ def read_log(
     >>> read_log(file).recording
     Recording(1 runs x 3 steps x 1 vehicles, 0 links, K <= 0)
     """
-    path, body = given_path(path), frame == "body"
+    path, body, clock = given_path(path), frame == "body", named("clock", clock or {}, "Give clock={name: s}.")
     summary = Summary(path.name)
     one_of("frame", frame, get_args(Frame))
+    texts("ignore", ignore)
     for field, flag in {"any_scale": any_scale, "mutual": mutual}.items():
         instance(field, flag, bool, "Give True or False.")
-    texts("ignore", ignore)
-    clock = named("clock", clock or {}, "Give clock={name: s}.")
-    least = {"dt": 1e-12, "max_gap": 1e-12, **{f"clock of {name}": -np.inf for name in clock}}
-    for field, value in zip(least, (dt, max_gap, *clock.values()), strict=True):
-        if value is not None:
-            number(field, value, least[field], allowed="a number, of dt and max_gap > 0 s", hint="Give seconds.")
+    _check_seconds({"dt": dt, "max_gap": max_gap}, 1e-12)
+    _check_seconds({f"clock of {name}": ahead for name, ahead in clock.items()}, -np.inf)
     if origin is not None:
         checked("origin", origin, "(3,)", (3,))
     options: dict[str, Any] = {
@@ -173,6 +170,7 @@ def read_log(
     by_kind = rows["kind"].map(factor).fillna(1.0)
     rows = rows.assign(value=by_kind * rows["value"], std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
+    rows = unwrapped(rows, summary)
     check_values(rows)
     for column in ("t", "arrival"):
         check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)
@@ -186,9 +184,24 @@ def read_log(
     grid = _grid(rows, dt, body, summary)
     steps = Steps(grid, max_gap, not (rows["kind"] == "z").any(), body, summary)
     members = {name: member(name, rows[rows["vehicle"] == name], steps) for name in ids}
+    recording = _recording(rows, members, steps, mutual and not body, sensors)
+    fleet = None
+    if len(true_rows):
+        true_rows = local(true_rows, origin)[0]
+        true_rows = true_rows[~(steps.planar & (true_rows["kind"] == "z"))]
+        fleet = _truth(distinct(true_rows, Summary()), recording, max_gap, path.stem)
+    summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
+    return Log(recording, fleet, summary, "messages" in summary.read, origin)
+
+
+def _recording(
+    rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool, sensors: Sensors | None
+) -> Recording:
+    """One run of what vehicles, and landmarks in body frames, have measured on steps."""
+    ids, body, summary = tuple(members), steps.body, steps.summary
     marks = [k for k, name in enumerate(ids) if body and members[name].stands]
     rows = of_vehicles(rows, [ids[k] for k in marks], summary)
-    measured = linked(rows, members, steps, mutual and not body)
+    measured = linked(rows, members, steps, mutual)
     to_landmark = np.isin(measured.links.neighbour, marks)
     pairs = (measured.links.step * len(ids) + measured.links.observer)[~to_landmark]
     gnss, velocity, yaw_rate, compass = (
@@ -196,8 +209,8 @@ def read_log(
         for name in ("gnss", "velocity", "yaw_rate", "compass")
     )
     sensors = sensors or assumed(rows, steps.planar, body, summary, steps.dt)
-    recording = Recording(
-        ids=tuple(ids),
+    return Recording(
+        ids=ids,
         t=steps.grid,
         gnss=gnss,
         velocity=velocity,
@@ -208,17 +221,16 @@ def read_log(
         sensors=sensors,
         v2x=V2X(max_neighbours=int(np.bincount(pairs).max(initial=0)), radius=np.inf),
         observers=tuple(range(len(ids))),
-        notes=(f"measurements of {path.name}, {MEASURED}", *summary.sentences),
+        notes=(f"measurements of {summary.name}, {MEASURED}", *summary.sentences),
         body=Body(yaw_rate, compass) if body else None,
         landmarks=tuple(marks),
     )
-    fleet = None
-    if len(true_rows):
-        true_rows = local(true_rows, origin)[0]
-        true_rows = true_rows[~(steps.planar & (true_rows["kind"] == "z"))]
-        fleet = _truth(distinct(true_rows, Summary()), recording, max_gap, path.stem)
-    summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
-    return Log(recording, fleet, summary, "messages" in summary.read, origin)
+
+
+def _check_seconds(given: Mapping[str, float | None], least: float) -> None:
+    for field, value in given.items():
+        if value is not None:
+            number(field, value, least, allowed="a number, of dt and max_gap > 0 s", hint="Give seconds.")
 
 
 def steps_in_words(recording: Recording) -> str:

@@ -129,7 +129,9 @@ def _cells(frame: pd.DataFrame, file: str, value: str, std: str) -> pd.DataFrame
     if "t" in frame:
         made["t"] = seconds(frame, "t", file)
     if "partner" in frame:
-        made["partner"] = frame["partner"].astype(str).str.strip().where(filled(frame["partner"]), "")
+        given = filled(frame["partner"])
+        made["partner"] = np.full(len(frame), "", dtype=object)
+        made["partner"][given] = words(frame[given], "partner", file)
     if message.any():
         cells = frame["arrival"]
         lost = message & (cells.astype(str).str.strip().str.lower() == "lost").to_numpy()

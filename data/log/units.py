@@ -113,9 +113,14 @@ def check_values(rows: Rows) -> None:
 
 
 def distinct(rows: Rows, summary: Summary) -> Rows:
-    """Rows but those that repeat a kind of measurement of one vehicle, or pair, at one time."""
-    again = rows.duplicated(["t", "vehicle", "kind", "partner"]) & (rows["kind"] != "message")
-    summary.refuse("repeated rows (same time, vehicle, kind and partner)", rows[again])
+    """Rows but those that repeat a kind of measurement of one vehicle, or pair, at one time; nothing is lost where a
+    wide table repeats a fix beside each of several partners."""
+    of_pair, key = in_group(rows, "relative", "message"), ["t", "vehicle", "kind", "partner"]
+    beside = rows["partner"].ne("") & ~of_pair
+    rows = rows.assign(partner=rows["partner"].where(of_pair, ""))
+    again = rows.duplicated(key) & (rows["kind"] != "message")
+    lost = again & ~(beside & rows.duplicated([*key, "value"]))
+    summary.refuse("repeated rows (same time, vehicle, kind and partner)", rows[lost])
     return rows[~again]
 
 

@@ -70,6 +70,7 @@ READERS: Mapping[str, Reader] = {
     "pyfg recording": Reader({"a.pyfg": good.ROBOTS}, lambda d: load_log(d / "a.pyfg")),
     "mrclam": Reader(good.MRCLAM, load_fleet),
     "log": Reader({"log.csv": good.LOG}, lambda d: read_log(d / "log.csv", any_scale=True)),
+    "json log": Reader({"log.jsonl": good.JSONL}, lambda d: read_log(d / "log.jsonl")),
     "wide log": Reader({"car.csv": good.WIDE}, lambda d: read_log(d / "car.csv", columns=NAMES)),
     "nmea": Reader({"car.nmea": good.NMEA}, lambda d: read_log(d / "car.nmea")),
     "manifest": Reader({"manifest.json": good.MANIFEST}, _manifest),

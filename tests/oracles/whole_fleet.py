@@ -94,7 +94,7 @@ class Drive:
 def rows(vector, measured, sensors, converted):  # type: ignore[no-untyped-def]
     """Whitened Jacobian and residual of what was measured of range, azimuth, inclination; without sensors, unit rows
     along the three axes of the measured direction."""
-    there, least = np.isfinite(measured), sensors.min_range if sensors else 0.0
+    there, least = np.isfinite(measured), max(sensors.min_range, 0.1 * sensors.range_std) if sensors else 0.0
     measured = np.where(there, measured, np.array(spherical(*vector)))
     at = to_vector(measured) if converted or sensors is None else vector
     r = np.linalg.norm(at)

@@ -43,7 +43,10 @@ def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed) -> tuple[Floa
                 for run in range(runs):
                     vector = subtract(load(x[run, t, j], 0, VECTOR), load(x[run, t, i], 0, VECTOR))
                     if assumed.robust:
-                        away, joined = (not present[i]) + (not present[j]), at(assumed.fix, 0, t, i)[0] - UNKNOWN
+                        away, joined = (
+                            (not present[i]) + (not present[j]),
+                            min(at(assumed.fix, 0, t, i)[0], UNKNOWN) - UNKNOWN,
+                        )
                         known = add_diagonal(between, (away * joined, away * joined, away * joined))
                         gate_pair(vector, known, k, pairs, measured.relative[run], assumed)
                     weight, eta = pair_at_agreement(vector, between, k, pairs, measured.relative[run], assumed)

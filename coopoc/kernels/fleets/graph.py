@@ -13,7 +13,8 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, inner, part, storage
-from ..compiling.small import add, apply, from_upper, load, plus_applied, scale, store, subtract
+from ..compiling.small import add, add_diagonal, apply, from_upper, load, plus_applied, scale, store, subtract
+from ..gate import FIX_GATE, distance, inflation
 from ..stars.gated import gate_components
 from ..stars.relative import Numbers, completed, exact, gram
 
@@ -237,14 +238,23 @@ def pair(vector: Vector, k: int, pairs: Pairs, relative: Floats, assumed: Assume
 
 @part
 def gate_pair(vector: Vector, cov: Matrix, k: int, pairs: Pairs, relative: Floats, assumed: Assumed) -> None:
-    """Factors of the standard deviations of what a pair measured, at its vector, of covariance `cov`."""
+    """Factors of the standard deviations of what a pair measured, at its vector, of covariance `cov`.
+
+    Each number is gated alone, and all of them as a vector: false fixes of either vehicle displace the believed one.
+    """
     for link, sign in ((pairs.link[k], 1.0), (pairs.link_back[k], -1.0)):
         if link >= 0:
             s, there = assumed.std, scale(vector, sign)
             seen, std = filled(load(relative[link], 0, FIVE), there, (s[0], s[1], s[2]))
             _, _, factor, _ = gate_components(there, cov, seen, std, VECTOR, assumed.min_range)
+            far, ground, spread = max(seen[0], assumed.min_range), seen[0] * seen[3], 0.0
             for c in range(3):
-                relative[link, 5 + c] = factor[c]
+                own = std[c] if c == 0 else std[c] * far
+                spread += own * own if own < math.inf else 0.0
+            gap = subtract((ground * seen[2], ground * seen[1], seen[0] * seen[4]), there)
+            whole = inflation(distance(gap, add_diagonal(cov, (spread, spread, spread))), FIX_GATE, 0.0)
+            for c in range(3):
+                relative[link, 5 + c] = factor[c] * math.sqrt(whole)
 
 
 @part

@@ -13,8 +13,8 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, part
-from ..dead_reckoning import dead_reckon
-from ..motion import MotionNoise, process_variance
+from ..motion import process_variance
+from .cooperative_members import join, leave, place, predict, predict_member, steady
 from .cooperative_messages import fix_terms, receive, trust, use_fix
 from .cooperative_state import (
     AGE,
@@ -38,22 +38,14 @@ from .cooperative_state import (
     begin,
     copy_filter,
     distrust,
-    join,
-    leave,
     measured_whole,
     new_filter,
     pause,
-    place,
-    predict,
-    predict_member,
-    steady,
 )
 from .gaussian import (
     COMPASS,
     PLACE,
-    Gaussian,
     Rows,
-    copy_gaussian,
     expect,
     has,
     innovate,
@@ -83,7 +75,7 @@ def run_filter(
         known: noise model.
         guards: against what may be wrong.
     """
-    runs, steps, vehicles = seen.gnss.shape[0], seen.gnss.shape[1], seen.gnss.shape[2]
+    runs, steps, vehicles = seen.gnss.shape[0], len(seen.start) - 1, seen.gnss.shape[2]
     links, most, memory = seen.relative.shape[1], 0, int(guards.memory)
     for t in range(steps):
         most = max(most, seen.start[t + 1] - seen.start[t])
@@ -94,8 +86,8 @@ def run_filter(
         f, older, newer = new_filter(1 + most, vehicles), new_filter(1 + most, vehicles), new_filter(1 + most, vehicles)
         t = newest = 0
         while t < steps:
-            gather_own(own, seen, assumed, known.white, run, t)
             first, count = seen.start[t], seen.start[t + 1] - seen.start[t]
+            gather_own(own, seen, assumed, known.white, run, t)
             for i in range(count):
                 who[i] = seen.neighbour[first + i]
                 gather_neighbour(rows, seen, assumed, moved, run, t, first + i, i)
@@ -156,88 +148,6 @@ def write(
         for c in range(4):
             notes[run, first + i, c] = weight(f.q[k, c], guards.gate if c < 3 else guards.fix_gate)
         notes[run, first + i, 4] = f.status[who[i], TRUSTED]
-
-
-@compiled
-def stream_row(given: Floats, history: Floats, motion: MotionNoise, fix: Floats, own: Floats) -> int:
-    """The ego's row of a stream, by dead reckoning; a fix of some age is brought forward. `kernels.solo` says when it
-    is NO_FIX_YET or BAD_INPUT.
-
-    Args:
-        given: (8,) fix m, velocity m/s, dt s, age of the fix s.
-        history: of `motion`.
-        motion: noise.
-        fix: (3,) m^2, variance of a fix.
-        own: (OWN,) out.
-    """
-    since, late = np.zeros(3), np.zeros(3)
-    outcome = dead_reckon(given, history, motion, own[MOTION:MOTION_VARIANCE], own[MOTION_VARIANCE:DT], since, late)
-    own[DT] = given[6]
-    for c in range(3):
-        own[FIX + c], own[FIX_VARIANCE + c] = given[c] + since[c], fix[c] + late[c]
-    return int(outcome)
-
-
-@compiled
-def motion_of(rows: Floats, motion: MotionNoise, dt: float) -> None:
-    """Fill the variance of one step's motion of neighbours by the velocity of the newest message of each."""
-    interval = motion.interval if motion.interval > 0.0 else dt
-    for i in range(len(rows)):
-        q = process_variance(motion, rows[i, SPEED:STEP], interval)
-        for c in range(3):
-            rows[i, STEP + c] = q[c] * (dt / interval) ** 2
-
-
-@compiled
-def stream_step(
-    f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, start: Floats, answer: Floats
-) -> int:
-    """One step; 1 if a vehicle has lost trust.
-
-    Args:
-        f: filter.
-        known: noise model.
-        guards: against what may be wrong.
-        own: (OWN,).
-        rows: (k, WIDTH) of the neighbours that are measured now.
-        vehicles: (k,) which they are; the ego is vehicle 0.
-        start: (3,) m, known before the first step, NaN for none.
-        answer: (12 + 3 k,) out: position m, covariance m^2, positions of the neighbours m.
-    """
-    if f.g.vectors[0] == 0:
-        begin(f, known, guards, own, rows, len(vehicles), 0)
-        if math.isfinite(start[0]):
-            f.step[0], f.vague[0] = 1, 0.0
-            for c in range(3):
-                f.g.x[c] = start[c]
-    f.alarm[0] = 0
-    step(f, known, guards, own, rows, vehicles, len(vehicles))
-    for c in range(3):
-        answer[c] = f.g.x[c]
-        for d in range(3):
-            answer[3 + 3 * c + d] = f.g.p[c, d]
-        for i in range(len(vehicles)):
-            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[f.slot[vehicles[i]], PLACE] + c]
-    return int(f.alarm[0])
-
-
-@compiled
-def make_filter(slots: int, vehicles: int) -> Filter:
-    """A filter before its first step, for Python."""
-    return new_filter(slots, vehicles)
-
-
-@compiled
-def keep(source: Filter, target: Filter) -> None:
-    """Copy the state."""
-    copy_filter(source, target)
-
-
-@compiled
-def restore(source: Filter, target: Filter, known: Model, guards: Guards) -> None:
-    """Go back to a state, with trust revoked in those who have lost it since."""
-    copy_filter(source, target)
-    distrust(target, known, guards)
 
 
 @part
@@ -327,11 +237,11 @@ def step(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, veh
             f.q[k, 3] = math.nan
     members = nearest_first(f)
     add_fix(f, known, guards, own)
-    if known.estimates > 0.0:
+    if known.estimates > 0.0 and members > 0:
         measure(f, known, guards, rows, members)
     for i in range(members):
         receive(f, known, guards, rows, f.order[i])
-    if known.estimates == 0.0:
+    if known.estimates == 0.0 and members > 0:
         measure(f, known, guards, rows, members)
     if guards.trust > 0.0:
         trust(f, known, guards)
@@ -387,7 +297,7 @@ def add_fix(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
 
 @part
 def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> None:
-    """The relative measurements: linear at the prediction, on a copy; then at that solution.
+    """The relative measurements: linear at the prediction, then at that solution.
 
     Where they contradict the prediction of most members, it is the ego whose odometer has slipped.
     """
@@ -406,10 +316,13 @@ def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int)
         for k in range(len(f.vehicle)):
             if f.vehicle[k] >= 0:
                 for c in range(3):
-                    f.at[k, c] = f.work.x[3 * f.work.block[k, PLACE] + c]
+                    i = 3 * g.block[k, PLACE] + c
+                    f.at[k, c] = g.x[i]
+                    for row in range(3 * members):
+                        f.at[k, c] += f.h.gain[row, i] * f.h.white[row]
     for m in range(members):
         k = f.order[m]
-        if relate(f, known, guards, rows, k, 1 if known.exact > 0.0 else 0, g):
+        if relate(f, known, guards, rows, k, 1 if known.exact > 0.0 else 0):
             if f.vague[k] > 0.0:
                 settle(g, f.h, k, f.vague[k])
                 f.vague[k] = f.q[k, 0] = f.q[k, 1] = f.q[k, 2] = 0.0
@@ -423,24 +336,29 @@ def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int)
 
 @part
 def first_pass(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> int:
-    """Update a copy of the Gaussian, linear at the prediction; how many members are beyond a gate."""
-    work, wrong = f.work, 0
-    copy_gaussian(f.g, work)
+    """Innovations of the measurements linear at the prediction, each decorrelated from all before it; how many members
+    are beyond a gate. Neither x nor P changes."""
+    g, h, wrong = f.g, f.h, 0
     for m in range(members):
         k = f.order[m]
-        if relate(f, known, guards, rows, k, 0, work):
-            if f.vague[k] > 0.0:
-                settle(work, f.h, k, f.vague[k])
-                continue
-            update(work, f.h, 0.0)
-            wrong += f.h.q[0] > guards.gate or f.h.q[1] > guards.gate or f.h.q[2] > guards.gate
+        i, vague = 3 * g.block[k, PLACE], f.vague[k]
+        p, q, r = g.p[i, i], g.p[i + 1, i + 1], g.p[i + 2, i + 2]
+        h.before[0] = 3 * m
+        whole = relate(f, known, guards, rows, k, 0)
+        for c in range(3):
+            h.used[c], h.gate[c] = h.used[c] and whole, 0.0 if vague > 0.0 else guards.gate
+        widen(g, i, vague)
+        innovate(g, h)
+        g.p[i, i], g.p[i + 1, i + 1], g.p[i + 2, i + 2] = p, q, r
+        wrong += vague == 0.0 and (h.q[0] > guards.gate or h.q[1] > guards.gate or h.q[2] > guards.gate)
+    h.before[0] = 0
     return wrong
 
 
 @part
-def relate(f: Filter, known: Model, guards: Guards, rows: Floats, k: int, exact: int, g: Gaussian) -> bool:
+def relate(f: Filter, known: Model, guards: Guards, rows: Floats, k: int, exact: int) -> bool:
     """Rows of the measurement of member k; False if its geometry is not known."""
-    row, compass = f.row[k], g.block[0, COMPASS]
+    g, row, compass = f.g, f.row[k], f.g.block[0, COMPASS]
     if not measured_whole(rows, row) and f.vague[k] > 0.0:
         return False
     for c in range(3):

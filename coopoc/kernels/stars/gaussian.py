@@ -57,8 +57,9 @@ class Rows(NamedTuple):
         terms: (1,) terms in use.
         gap: (3,) out: innovations.
         q: (3,) out: squared normalised innovation, 0 where nothing was measured.
-        gain: (3, size) scratch: columns of the square root of what the update takes from P.
-        white: (3,) scratch: whitened innovations.
+        before: (1,) rows of before that P and x do not hold yet.
+        gain: (3 members, size) scratch: columns of the square root of what the update takes from P.
+        white: (3 members,) scratch: whitened innovations.
         square: (2, 3, 3) scratch.
     """
 
@@ -71,6 +72,7 @@ class Rows(NamedTuple):
     terms: Ints
     gap: Floats
     q: Floats
+    before: Ints
     gain: Floats
     white: Floats
     square: Floats
@@ -97,8 +99,9 @@ def new_rows(members: int) -> Rows:
         np.zeros(1, np.int64),
         np.zeros(3),
         np.zeros(3),
-        np.zeros((3, 3 * KINDS * members)),
-        np.zeros(3),
+        np.zeros(1, np.int64),
+        np.zeros((3 * members, 3 * KINDS * members)),
+        np.zeros(3 * members),
         np.zeros((2, 3, 3)),
     )
 
@@ -217,16 +220,17 @@ def update(g: Gaussian, h: Rows, gate: float) -> float:
 
 @part
 def innovate(g: Gaussian, h: Rows) -> float:
-    """Decorrelate each row from those before it, and gate it; squared Mahalanobis distance of all.
+    """Decorrelate each row from those before it, and gate it; squared Mahalanobis distance of the three.
 
     `gain` is U = P H^T L^-T, S = L L^T the innovation's covariance. Where the squared normalised innovation q of a row
     exceeds its gate, its variance is multiplied by q / gate, and by 100 more where it exceeds REJECTED times the gate.
     """
     x, p, n, terms, total = g.x, g.p, 3 * g.vectors[0], h.terms[0], 0.0
     for c in range(3):
-        h.q[c] = h.white[c] = h.gap[c] = 0.0
+        row = h.before[0] + c
+        h.q[c] = h.white[row] = h.gap[c] = 0.0
         for j in range(n):
-            h.gain[c, j] = 0.0
+            h.gain[row, j] = 0.0
         if not h.used[c]:
             continue
         innovation, variance = h.z[c], h.variance[c]
@@ -234,24 +238,24 @@ def innovate(g: Gaussian, h: Rows) -> float:
             i, w = h.column[c, k], h.weight[c, k]
             innovation -= w * x[i]
             for j in range(n):
-                h.gain[c, j] += w * p[i, j]
+                h.gain[row, j] += w * p[i, j]
         h.gap[c] = innovation
         for k in range(terms):
-            variance += h.weight[c, k] * h.gain[c, h.column[c, k]]
-        for d in range(c):
+            variance += h.weight[c, k] * h.gain[row, h.column[c, k]]
+        for d in range(row):
             shared = 0.0
             for k in range(terms):
                 shared += h.weight[c, k] * h.gain[d, h.column[c, k]]
             innovation -= shared * h.white[d]
             variance -= shared * shared
             for j in range(n):
-                h.gain[c, j] -= shared * h.gain[d, j]
+                h.gain[row, j] -= shared * h.gain[d, j]
         h.q[c] = innovation * innovation / variance
         scale = math.sqrt(weight(h.q[c], h.gate[c]) / variance)
-        h.white[c] = innovation * scale
-        total += h.white[c] * h.white[c]
+        h.white[row] = innovation * scale
+        total += h.white[row] * h.white[row]
         for j in range(n):
-            h.gain[c, j] *= scale
+            h.gain[row, j] *= scale
     return float(total)
 
 

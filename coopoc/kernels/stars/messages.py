@@ -8,17 +8,15 @@ whose position was used before, or has no fix, has new = 0.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, TypeAlias, cast
+from typing import NamedTuple, TypeAlias, cast
 
 import numpy as np
-from numpy import uint64
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, choose_each, load, scale, store
 from ..compiling.vectors import LANES, choose, put, take
 from ..motion import MotionNoise, process_variance
-from .relative import Five
 
 MOVED, PROCESS, POSITION, VARIANCE = range(4)
 """Rows of a member in `Star.motion`, three numbers each: motion m and its variance m^2 since the last step, position m
@@ -35,8 +33,6 @@ FIX_GROWTH, ESTIMATE_GROWTH = (1.0, 0.0), (1.0, 2.0)
 with one velocity makes its error age times; an estimate has made that error once before, fully correlated."""
 NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
-Index: TypeAlias = Any
-"""An integer, NumPy's unsigned one where the compiler need not look for negative ones."""
 Three: TypeAlias = tuple[float, float, float]
 Estimates: TypeAlias = tuple[Floats, Floats, Floats]
 """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
@@ -163,11 +159,11 @@ def gather(star: Star, seen: Measurements, known: Assumptions, first: int, last:
         link = seen.start[t] + k - 1
         star.member[k] = member = seen.ego if k == 0 else seen.neighbour[link]
         star.previous[k] = index_of(member, star.last_member, old)
-        for lane in range(uint64(LANES)):
+        for lane in range(LANES):
             run = min(first + int(lane), last)
             receive(star, seen, known, run, t, link, k, lane)
             if k > 0:
-                measured(star.relative, five_of(seen.relative, run, link), known.relative_std, k, lane)
+                measured(star.relative, seen.relative[run, link], known.relative_std, k, lane)
         interpret(star, known, k, seen.dt)
     return int(n)
 
@@ -177,7 +173,7 @@ def remember(star: Star, old: int) -> None:
     """Make the star the last one."""
     for k in range(old):
         star.last_member[k] = star.member[k]
-        for row in (uint64(5 * k + SENT), uint64(5 * k + USES)):
+        for row in (5 * k + SENT, 5 * k + USES):
             put(star.last_status, row, take(star.status, row))
 
 
@@ -201,25 +197,25 @@ def index_of(member: int, members: Ints, count: int) -> int:
 @inside
 def receive(star: Star, seen: Measurements, known: Assumptions, run: int, t: int, link: int, k: int, lane: int) -> None:
     """Copy the last message of member k in one run: velocity, process noise, position, its variance, and its status."""
-    previous, i, here, status = star.previous[k], uint64(run), uint64(link), uint64(5 * k)
-    before = uint64(5 * max(previous, 0))
-    sent = t if k == 0 else seen.newest[i, here]
+    previous, status, at = star.previous[k], 5 * k, 12 * k
+    before = 5 * max(previous, 0)
+    sent = t if k == 0 else seen.newest[run, link]
     when = sent if sent >= 0 else t
-    again = previous >= 0 and star.last_status[before + uint64(SENT), lane] == sent
-    star.status[status + uint64(SENT), lane] = sent
-    star.status[status + uint64(USES), lane] = star.last_status[before + uint64(USES), lane] + 1.0 if again else 1.0
-    star.status[status + uint64(AGE), lane] = t - when
-    star.status[status + uint64(HELD), lane] = 1.0 if sent >= 0 else 0.0
-    j, m, at = uint64(when), uint64(star.member[k]), uint64(12 * k)
-    put_lane(star.motion, at, lane, three_of(seen.velocity, i, j, m))
-    put_lane(star.motion, at + uint64(3), lane, three_of(known.process, i, j, m))
-    fresh = k == 0 or seen.fresh[i, here]
-    x, y, z = three_of(seen.gnss, i, j, m) if k == 0 else three_of(seen.broadcast, i, j, m)
+    again = previous >= 0 and star.last_status[before + SENT, lane] == sent
+    star.status[status + SENT, lane] = sent
+    star.status[status + USES, lane] = star.last_status[before + USES, lane] + 1.0 if again else 1.0
+    star.status[status + AGE, lane] = t - when
+    star.status[status + HELD, lane] = 1.0 if sent >= 0 else 0.0
+    j = star.member[k]
+    put_lane(star.motion, at, lane, three_of(seen.velocity, run, when, j))
+    put_lane(star.motion, at + 3, lane, three_of(known.process, run, when, j))
+    fresh = k == 0 or seen.fresh[run, link]
+    x, y, z = three_of(seen.gnss, run, when, j) if k == 0 else three_of(seen.broadcast, run, when, j)
     there = math.isfinite(x + y + z)
-    put_lane(star.motion, at + uint64(6), lane, (x, y, z) if there else (0.0, 0.0, 0.0))
-    variance = three_of(known.fixes, i, j, m) if k == 0 else three_of(known.broadcast, i, j, m)
-    put_lane(star.motion, at + uint64(9), lane, variance if there else (NOWHERE, NOWHERE, NOWHERE))
-    star.status[status + uint64(NEW), lane] = 1.0 if fresh and there else 0.0
+    put_lane(star.motion, at + 6, lane, (x, y, z) if there else (0.0, 0.0, 0.0))
+    variance = three_of(known.fixes, run, when, j) if k == 0 else three_of(known.broadcast, run, when, j)
+    put_lane(star.motion, at + 9, lane, variance if there else (NOWHERE, NOWHERE, NOWHERE))
+    star.status[status + NEW, lane] = 1.0 if fresh and there else 0.0
 
 
 @inside
@@ -229,8 +225,8 @@ def interpret(star: Star, known: Assumptions, k: int, dt: float) -> None:
     A velocity that serves for the n-th step in a row makes the same error n times: the variance of the sum is n^2 of
     that of one step, so this step adds 2 n - 1 of it. It has changed since it was sent, too.
     """
-    uses, age = take(star.status, uint64(5 * k + USES)), take(star.status, uint64(5 * k + AGE))
-    held = take(star.status, uint64(5 * k + HELD))
+    uses, age = take(star.status, 5 * k + USES), take(star.status, 5 * k + AGE)
+    held = take(star.status, 5 * k + HELD)
     late, often = dt * dt * age * known.acceleration, 2.0 * uses - 1.0
     velocity, late = load(star.motion, 4 * k + MOVED, ROW), late * late
     one = add(load(star.motion, 4 * k + PROCESS, ROW), process_variance(known.motion, velocity, dt))
@@ -245,48 +241,32 @@ def interpret(star: Star, known: Assumptions, k: int, dt: float) -> None:
 
 
 @inside
-def measured(relative: Floats, seen: Five, std: Floats, k: int, lane: int) -> None:
+def measured(relative: Floats, seen: Floats, std: Floats, k: int, lane: int) -> None:
     """Copy the measurement of member k, of `components`; what is missing points east, its deviation infinite."""
-    d, sa, ca, si, ci = seen
-    at, unit = uint64(8 * k), len(std) == 0
+    d, sa, ca, si, ci = seen[0], seen[1], seen[2], seen[3], seen[4]
+    at, unit = 8 * k, len(std) == 0
     has_azimuth, has_inclination = sa != 0.0 or ca != 0.0, si != 0.0 or ci != 0.0
     relative[at, lane] = max(d, 0.0)
     range_std, azimuth_std, inclination_std = (1.0, 1.0, 1.0) if unit else (std[0], std[1], std[2])
     azimuth = sa, ca if has_azimuth else 1.0, si if has_inclination else 1.0
-    put_lane(relative, at + uint64(1), lane, azimuth)
-    relative[at + uint64(4), lane] = ci
+    put_lane(relative, at + 1, lane, azimuth)
+    relative[at + 4, lane] = ci
     deviations = (
         range_std if d >= 0.0 else math.inf,
         azimuth_std if has_azimuth else math.inf,
         inclination_std if has_inclination else math.inf,
     )
-    put_lane(relative, at + uint64(5), lane, deviations)
+    put_lane(relative, at + 5, lane, deviations)
 
 
 @inside
-def three_of(values: Any, run: Index, t: Index, member: Index) -> Three:
+def three_of(values: Floats, run: int, t: int, member: int) -> Three:
     """Three of what is broadcastable to (R, T, N, 3)."""
-    one = uint64(1)
-    i: Index = min(run, uint64(values.shape[0]) - one)
-    j: Index = min(t, uint64(values.shape[1]) - one)
-    k: Index = min(member, uint64(values.shape[2]) - one)
-    return values[i, j, k, uint64(0)], values[i, j, k, one], values[i, j, k, uint64(2)]
+    i, j, k = min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(member, values.shape[2] - 1)
+    return values[i, j, k, 0], values[i, j, k, 1], values[i, j, k, 2]
 
 
 @inside
-def five_of(relative: Any, run: int, link: int) -> Five:
-    """The five numbers of a measurement of `components`."""
-    i, j = uint64(run), uint64(link)
-    return (
-        relative[i, j, uint64(0)],
-        relative[i, j, uint64(1)],
-        relative[i, j, uint64(2)],
-        relative[i, j, uint64(3)],
-        relative[i, j, uint64(4)],
-    )
-
-
-@inside
-def put_lane(memory: Floats, at: Index, lane: int, values: Three) -> None:
+def put_lane(memory: Floats, at: int, lane: int, values: Three) -> None:
     """Write three numbers of one run."""
-    memory[at, lane], memory[at + uint64(1), lane], memory[at + uint64(2), lane] = values
+    memory[at, lane], memory[at + 1, lane], memory[at + 2, lane] = values

@@ -72,8 +72,6 @@ def entries_of(movable: Bools, measured: Sequence[Ints]) -> Entries:
         movable: (n, dof) False where a node cannot move.
         measured: the nodes (M, arity) of each factor.
     """
-    from scipy.sparse import coo_array
-
     (n, dof), m = movable.shape, int(movable.sum())
     number = np.where(movable, np.cumsum(movable).reshape(n, dof) - 1, -1)
     keys = [np.arange(n) * (n + 1)]
@@ -82,12 +80,10 @@ def entries_of(movable: Bools, measured: Sequence[Ints]) -> Entries:
     j, i = np.divmod(key, n)
     row, column = np.broadcast_arrays(number[i][:, :, None], number[j][:, None, :])
     there = (row >= 0) & (row <= column)
-    count = np.arange(np.count_nonzero(there))
-    matrix = coo_array((count, (row[there], column[there])), shape=(m, m)).tocsc()
-    place, rank = np.full(there.shape, -1, dtype=np.int64), np.empty_like(count)
-    rank[matrix.data] = count
-    place[there] = rank
-    return Entries(number, key, place, matrix.indptr.astype(np.int64), matrix.indices.astype(np.int64))
+    row, column = row[there], column[there]
+    order, place = np.lexsort((row, column)), np.full(there.shape, -1, dtype=np.int64)
+    place.ravel()[np.flatnonzero(there)[order]] = np.arange(len(order))
+    return Entries(number, key, place, np.searchsorted(column[order], np.arange(m + 1)), row[order])
 
 
 def places_of(entries: Entries, nodes: Ints, written: Ints) -> Any:

@@ -17,8 +17,7 @@ import numpy as np
 from ...arrays import Floats
 from ...errors import InputError
 from ..algebra.sparse import sparse, structure_of
-from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, check_limits
+from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Capabilities, Solver, SolverResult, check_limits
 from ..model.derivatives import Structure, expressions
 from ..model.factor import steerable
 from ..model.problem import Problem

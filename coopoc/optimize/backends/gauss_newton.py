@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from ...arrays import Floats
 from ..algebra.sparse import sparse
-from ..backend import Backend, Solver, SolverResult
-from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, arrive, check_limits
+from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Solver, SolverResult, check_limits
+from ..descent.levenberg_marquardt import arrive
 from ..model.problem import Problem
 
 

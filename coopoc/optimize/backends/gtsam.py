@@ -1,21 +1,43 @@
 """gtsam: GTSAM's own Levenberg-Marquardt on its own factors, and on CustomFactors where it has none.
 
-No step is ours: the answer is a second opinion. What GTSAM lacks, such as range, azimuth and inclination in the world
-frame with a std each, is a callback from C++ into Python, which takes some twenty times as long as a factor of its own.
+No step is ours: the answer is a second opinion. The error e of a GTSAM class below gives our whitened residual, or one
+of the same length, as S e; S goes into its noise model and the loss into a robust one. What is not here GTSAM weighs in
+another way, or does not have, and is a CustomFactor of our residual, a callback from C++ into Python, which takes some
+twenty times as long: a bearing in space, and range, azimuth and inclination in the world frame with a std each. A point
+is a Point2/3, a pose a Pose2/3.
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from functools import lru_cache
+from typing import Any, NamedTuple, TypeAlias
+
+import numpy as np
+
 from ...arrays import Floats
-from ..backend import Backend, Solver, SolverResult
-from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, check_limits
+from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Solver, SolverResult, check_limits
+from ..model.derivatives import linearise
+from ..model.factor import Factor, Loss, unchecked
 from ..model.problem import Problem
-from .gtsam_factors import estimate, forms, graph_of, values, which_turn
+from ..model.space import Space, exp, log
 
 STARTS = 3
 """Times that the optimiser begins anew where it ended, with damping as at first, while it ended with more."""
 PRECISE = 1e-15
 """Share of the cost by which a step must lower it to be followed by another; GTSAM's own 1e-5 leaves millimetres."""
+POINT, POSE = False, True
+Names: TypeAlias = Mapping[tuple[bool, ...], str]
+"""GTSAM's class by which of the nodes are poses."""
+SAME = 1e-12
+"""Share by which two weights may differ and count as equal."""
+ESTIMATORS = {
+    "huber": "Huber",
+    "cauchy": "Cauchy",
+    "geman-mcclure": "GemanMcClure",
+    "truncated": "TruncatedLeastSquares",
+}
+"""GTSAM's names of our losses; their values and weights are the same."""
 
 
 def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE) -> Solver:
@@ -49,6 +71,332 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
         return SolverResult(x, used, extras={"custom_factors": custom})
 
     return solver
+
+
+class Part(NamedTuple):
+    """A GTSAM class that states a factor, or those of its residuals that `root` keeps.
+
+    Attributes:
+        names: of the class, by which of the nodes are poses.
+        arguments: by measurement what the class takes between keys and noise model.
+        root: (M or 1, k, k) S, square root of the information of its k errors.
+    """
+
+    names: Names
+    arguments: Callable[[], Iterable[tuple[Any, ...]]]
+    root: Floats
+
+
+Form: TypeAlias = list[Part] | None
+"""The parts of a factor, None if GTSAM has none with its objective."""
+
+
+def forms(problem: Problem) -> list[Form]:
+    """Of each factor of a single problem its parts in GTSAM."""
+    return [_form(problem, factor) for factor in problem.factors]
+
+
+def _form(problem: Problem, factor: Factor) -> Form:
+    if factor.kind not in FORMS:
+        return None
+    kinds = [(POINT,) * factor.nodes.shape[1]]
+    if problem.poses:
+        kinds = sorted(set(map(tuple, np.array(which_turn(problem))[factor.nodes].tolist())))
+    shared = factor.std is not None and len(factor.std) == 1
+    parts = FORMS[factor.kind](factor, factor.root[:1] if shared else factor.root, problem.dimension)
+    if parts is None or (len(parts) > 1 and factor.loss is not None):  # which no robust loss can join
+        return None
+    known = all(row in part.names or row[::-1] in part.names for row in kinds for part in parts)
+    return parts if known else None
+
+
+def pose_of(d: int, x: Floats) -> Any:
+    """gtsam.Pose2 or Pose3 of a pose (ambient,)."""
+    import gtsam
+
+    if d == 2:
+        return gtsam.Pose2(x[0], x[1], np.arctan2(x[4], x[2]))
+    return gtsam.Pose3(gtsam.Rot3(x[3:].reshape(3, 3)), x[:3])
+
+
+def _poses(d: int, x: Floats) -> Callable[[], Iterable[tuple[Any, ...]]]:
+    return lambda: ((pose_of(d, each),) for each in x)
+
+
+def _position(factor: Factor, W: Floats, d: int) -> Form:
+    names: Names = {(POINT,): f"PriorFactorPoint{d}", (POSE,): f"PoseTranslationPrior{d}D"}
+    return [Part(names, lambda: zip(factor.z, strict=True), W)]
+
+
+def _displacement(factor: Factor, W: Floats, d: int) -> Form:
+    return [Part({(POINT, POINT): f"BetweenFactorPoint{d}"}, lambda: zip(factor.z, strict=True), W)]
+
+
+def _range(factor: Factor, W: Floats, d: int) -> Form:
+    names: Names = {
+        (POINT, POINT): f"RangeFactor{d}",
+        (POSE, POINT): f"RangeFactor{d}D",
+        (POSE, POSE): f"RangeFactorPose{d}",
+    }
+    return [Part(names, lambda: zip(factor.z[:, 0], strict=True), W)]
+
+
+def _bearing(factor: Factor, W: Floats, d: int) -> Form:
+    """Of a bearing alone, or of range and bearing; GTSAM's order is the other, in which a diagonal W stays one.
+
+    In space GTSAM weighs a bearing by its tangent plane, not by azimuth and inclination, and has no forward axis.
+    """
+    if d == 3:
+        return None
+    name = "Bearing" if factor.kind == "bearing" else "BearingRange"
+
+    def arguments() -> Iterable[tuple[Any, ...]]:
+        import gtsam
+
+        return ((gtsam.Rot2(angle), *far) for *far, angle in factor.z)
+
+    names: Names = {(POSE, POINT): f"{name}Factor2D", (POSE, POSE): f"{name}FactorPose2"}
+    return [Part(names, arguments, W[:, ::-1, ::-1])]
+
+
+def _relative_position(factor: Factor, W: Floats, d: int) -> Form:
+    return _chord(W, {0: np.arange(d)}, Space(d, has_rotation=True).join(factor.z), d)
+
+
+def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
+    """GTSAM's chord T_j - T_i Z for the translation, its geodesic for the rotation alone."""
+    chord = None if _coupled(W, d) else _chord(W[:, :d, :d], {0: np.arange(d)}, factor.z, d)
+    if chord is None:
+        return None
+    size, first = (3, 2) if d == 2 else (6, 0)
+    root = np.zeros((len(W), size, size))
+    root[:, first : first + size - d, first : first + size - d] = W[:, d:, d:]
+    return [*chord, Part({(POSE, POSE): f"BetweenFactorPose{d}"}, _poses(d, factor.z), root)]
+
+
+def _relative_log(factor: Factor, W: Floats, d: int) -> Form:
+    """GTSAM's errors in space are those of the rotation first."""
+    root = W if d == 2 else np.roll(W, -d, axis=2)
+    return [Part({(POSE, POSE): f"BetweenFactorPose{d}"}, _poses(d, factor.z), root)]
+
+
+def _relative_chordal(factor: Factor, W: Floats, d: int) -> Form:
+    columns = {0: np.arange(d), **{1 + k: d + k + d * np.arange(d) for k in range(d)}}
+    return _chord(W, columns, factor.z, d)
+
+
+def _chord(W: Floats, columns: dict[int, Any], z: Floats, d: int) -> Form:
+    """GTSAM's T_j - T_i Z is R_i times our residual, column by column: each must have one std and no correlation.
+
+    Args:
+        columns: our residuals of the translation (0) and of each column of the rotation (1 + k).
+        z: (M, ambient) poses.
+    """
+    information = np.swapaxes(W, -1, -2) @ W
+    weight = np.zeros((len(W), (d + 1) ** 2))
+    expected = np.zeros_like(information)
+    for column, rows in columns.items():
+        own = information[:, rows[0], rows[0]]
+        weight[:, (d + 1) * ((column - 1) % (d + 1)) + np.arange(d)] = own[:, None]
+        expected[:, rows, rows] = own[:, None]
+    scale = np.sqrt(np.einsum("mii->mi", information))
+    if (np.abs(information - expected) > SAME * scale[:, :, None] * scale[:, None, :]).any():
+        return None
+    root = np.sqrt(weight)[:, :, None] * np.eye(weight.shape[1])
+    return [Part({(POSE, POSE): f"FrobeniusBetweenFactorPose{d}"}, _poses(d, z), root)]
+
+
+def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:
+    if _coupled(W, d):
+        return None
+    turned = Space(d, has_rotation=True).rotation(factor.z)
+
+    def rotations() -> Iterable[tuple[Any, ...]]:
+        import gtsam
+
+        return ((gtsam.Rot2(float(log(turn)[0])) if d == 2 else gtsam.Rot3(turn),) for turn in turned)
+
+    root = W[:, :d, :d] @ np.swapaxes(turned, -1, -2)
+    return [
+        Part({(POSE,): f"PoseTranslationPrior{d}D"}, lambda: zip(factor.z[:, :d], strict=True), root),
+        Part({(POSE,): f"PoseRotationPrior{d}D"}, rotations, W[:, d:, d:]),
+    ]
+
+
+def _chordal_prior(factor: Factor, W: Floats, d: int) -> Form:
+    """GTSAM's errors are the columns of T - Z, ours its translation and then the rows of its rotation."""
+    side = d + 1
+    rows, cols = np.divmod(np.arange(d * d), d)
+    theirs = np.concatenate([side * d + np.arange(d), side * cols + rows])
+    root = np.zeros((len(W), side**2, side**2))
+    root[:, : W.shape[1], theirs] = W
+    name = f"FrobeniusPriorPose{d}"
+    return [Part({(POSE,): name}, lambda: ((pose_of(d, z).matrix(),) for z in factor.z), root)]
+
+
+def _coupled(W: Floats, d: int) -> bool:
+    """Whether position and rotation are correlated."""
+    coupled = max(np.abs(W[:, :d, d:]).max(), np.abs(W[:, d:, :d]).max())
+    return bool(coupled > SAME * np.abs(W).max())
+
+
+FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
+    "position": _position,
+    "displacement": _displacement,
+    "range": _range,
+    "bearing": _bearing,
+    "body_spherical": _bearing,
+    "relative_position": _relative_position,
+    "relative_pose": _relative_pose,
+    "relative_pose_log": _relative_log,
+    "relative_pose_chordal": _relative_chordal,
+    "pose": _pose_prior,
+    "pose_chordal": _chordal_prior,
+}
+"""(factor, W (M or 1, size, size), dimension) -> parts, by kind."""
+
+
+class Callbacks:
+    """Residuals and derivatives of factors that GTSAM lacks, for its CustomFactors: all at once at each new point.
+
+    Args:
+        problem: a single one.
+        factors: of it.
+    """
+
+    def __init__(self, problem: Problem, factors: Sequence[Factor]) -> None:
+        self._space, self._posed = problem.space, which_turn(problem)
+        self._factors = [unchecked(factor, loss=None) for factor in factors]
+        self._at: Any = None
+
+    def of(self, k: int, row: int, nodes: Sequence[int]) -> Callable[[Any, Any, Any], Any]:
+        """The error function of a measurement."""
+        import gtsam
+
+        def error(_: Any, found: Any, jacobians: Any) -> Any:
+            if self._at is None or not found.equals(self._at, 0.0):
+                self._at, x = gtsam.Values(found), estimate(self._space, self._posed, found)
+                self._linear = linearise(self._space, self._factors, None, x[None])
+                self._tangent = tangent(self._space, self._posed, x)
+            if jacobians is not None:
+                for place, i in enumerate(nodes):
+                    by = self._linear.jacobian[k][place][0]
+                    jacobians[place] = by[row] @ self._tangent[i]
+            return self._linear.residual[k][0, row]
+
+        return error
+
+
+def graph_of(problem: Problem, parts: Sequence[Form]) -> Any:
+    """The gtsam.NonlinearFactorGraph of the factors, of which those without parts (see `forms`) are CustomFactors, and
+    of the nodes that are fixed, with their indices as keys."""
+    import gtsam
+
+    graph, posed = gtsam.NonlinearFactorGraph(), which_turn(problem)
+    lacking = [factor for factor, form in zip(problem.factors, parts, strict=True) if form is None]
+    callbacks = Callbacks(problem, lacking)
+    for k, factor in enumerate(lacking):
+        model = _robust(gtsam.noiseModel.Unit.Create(factor.size), factor.loss)
+        for row in np.flatnonzero(factor.informative).tolist():
+            nodes = factor.nodes[row].tolist()
+            graph.add(gtsam.CustomFactor(model, nodes, callbacks.of(k, row, nodes)))
+    for factor, form in zip(problem.factors, parts, strict=True):
+        for part in form or ():
+            models = _models(part.root, factor)
+            for nodes, given, model in zip(factor.nodes.tolist(), part.arguments(), models, strict=True):
+                if tuple([posed[i] for i in nodes]) not in part.names:
+                    nodes = nodes[::-1]  # such as a range from a point to a pose
+                made = getattr(gtsam, part.names[tuple([posed[i] for i in nodes])])
+                if model is not None:
+                    graph.add(made(*nodes, *given, model))
+    for i in problem.fixed:
+        assert problem.x0 is not None
+        name = f"NonlinearEquality{'Pose' if posed[i] else 'Point'}{problem.dimension}"
+        graph.add(getattr(gtsam, name)(i, _node(problem.dimension, problem.x0[i], posed[i])))
+    return graph
+
+
+def values(space: Space, posed: Sequence[bool], x: Floats) -> Any:
+    """gtsam.Values of nodes x (n, ambient), which are points or `posed`, under their indices."""
+    import gtsam
+
+    found = gtsam.Values()
+    for key, (node, turns) in enumerate(zip(x, posed, strict=True)):
+        found.insert(key, _node(space.dimension, node, turns))
+    return found
+
+
+def estimate(space: Space, posed: Sequence[bool], found: Any) -> Floats:
+    """x (n, ambient) of the nodes in gtsam.Values, which holds no others."""
+    from gtsam import utilities
+
+    d, x = space.dimension, np.empty((len(posed), space.ambient))
+    points, poses = np.flatnonzero(~np.array(posed)), np.flatnonzero(posed)
+    if len(points):
+        x[points] = space.join(getattr(utilities, f"extractPoint{d}")(found))
+    if len(poses) and d == 2:
+        rows = utilities.extractPose2(found)
+        x[poses] = space.join(rows[:, :2], exp(rows[:, 2:]))
+    elif len(poses):
+        rows = utilities.extractPose3(found)
+        x[poses] = space.join(rows[:, 9:], rows[:, :9].reshape(-1, 3, 3))
+    return x
+
+
+def which_turn(problem: Problem) -> list[bool]:
+    """Of each node whether it is a pose."""
+    poses = set(problem.poses)
+    return [i in poses for i in range(len(problem.names))]
+
+
+def tangent(space: Space, posed: Sequence[bool], x: Floats) -> Sequence[Floats]:
+    """Of each node of x (n, ambient) the (dof, own) matrix T with our step = T GTSAM's, which has `own` numbers.
+
+    GTSAM moves a pose in its body's directions, in space with the rotation first; we move its position in the world's.
+    A covariance of GTSAM's becomes T C T^T, a derivative by our step times T is one by GTSAM's.
+
+    >>> from coopoc.optimize import pose
+    >>> tangent(Space(2, has_rotation=True), [True], pose([[5.0, 1.0]], np.pi / 2))[0].round(3) + 0.0
+    array([[ 0., -1.,  0.],
+           [ 1.,  0.,  0.],
+           [ 0.,  0.,  1.]])
+    """
+    d, still, found = space.dimension, np.eye(space.dof, space.dimension), []
+    for turns, rotation in zip(posed, space.rotation(x), strict=True):
+        matrix = np.eye(space.dof)
+        matrix[:d, :d] = rotation
+        found.append(still if not turns else matrix if d == 2 else np.roll(matrix, space.angles, axis=1))
+    return found
+
+
+def _node(d: int, x: Floats, turns: bool) -> Any:
+    return pose_of(d, x) if turns else x[:d]
+
+
+def _models(root: Floats, factor: Factor) -> list[Any]:
+    """A noise model per measurement of roots (M or 1, k, k), one object for equal ones; None: it has no information."""
+    size, loss = root.shape[-1], factor.loss
+    return [_model(row.tobytes(), size, loss) for row in root] * (len(factor.nodes) if len(root) == 1 else 1)
+
+
+@lru_cache(maxsize=1024)
+def _model(raw: bytes, size: int, loss: Loss | None) -> Any:
+    """Of one measurement, kept for the next equal ones; what GTSAM itself takes for diagonal may have entries below."""
+    import gtsam
+
+    noise, root = gtsam.noiseModel, np.frombuffer(raw).reshape(size, size)
+    if not root.any():
+        return None
+    return _robust(noise.Gaussian.SqrtInformation(root, not np.tril(root, -1).any()), loss)
+
+
+def _robust(model: Any, loss: Loss | None) -> Any:
+    """A noise model under a loss."""
+    from gtsam import noiseModel as noise
+
+    if loss is None:
+        return model
+    return noise.Robust.Create(getattr(noise.mEstimator, ESTIMATORS[loss.name]).Create(loss.scale), model)
 
 
 BACKEND = Backend(

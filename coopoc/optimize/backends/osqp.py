@@ -22,8 +22,8 @@ import numpy as np
 from ...arrays import Floats
 from ..algebra.sparse import Layout, layout_of, sparse
 from ..assess.active import constraint_rows
-from ..backend import Backend, Capabilities, Solver, SolverResult
-from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, arrive, check_limits
+from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Capabilities, Solver, SolverResult, check_limits
+from ..descent.levenberg_marquardt import arrive
 from ..model.derivatives import linearise
 from ..model.factor import as_factor, bounded
 from ..model.problem import Problem

@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 
 from ...arrays import Floats
-from ...errors import InputError
 from ..algebra.sparse import Sparse
 from ..model.derivatives import Model
 
@@ -19,10 +18,6 @@ Step = Callable[[Floats, Floats, Floats], tuple[Floats, float] | None]
 """(x (n, ambient), the Hessian's values, gradient (m,)) -> dx (m,) and what bounds push along it, y . C dx; None where
 the Hessian is not positive definite."""
 
-MAX_ITERATIONS = 500
-"""About 6 are needed with angles, some 50 for range-only problems of flat geometry."""
-TOLERANCE = 1e-8
-"""m or rad, largest move of a node in the last step."""
 GIVE_UP = 1e12
 """Damping beyond which no step can help."""
 LEAST_DAMPING = 1e-9
@@ -52,14 +47,6 @@ NEAR = 1e-3
 """Share of the cost from which on the exact Hessian makes the last steps."""
 STILL = 12
 """Hidden steps in a row that end the loop: damping has fallen from FIRST to none, or the matrix is singular without."""
-
-
-def check_limits(max_iterations: int, tolerance: float) -> None:
-    """InputError unless max_iterations is a whole number >= 0 and tolerance a number > 0."""
-    if not isinstance(max_iterations, int | np.integer) or max_iterations < 0:
-        raise InputError("max_iterations", repr(max_iterations), "must be a whole number >= 0", "Leave it out for 500.")
-    if not isinstance(tolerance, float | int) or not tolerance > 0:
-        raise InputError("tolerance", repr(tolerance), "must be a number > 0 (m)", "Leave it out for 1e-8.")
 
 
 @dataclass(frozen=True, eq=False)

@@ -142,7 +142,9 @@ class Problem:
             return None
         movable = np.ones((n, space.dof), dtype=bool)
         if space.has_rotation:
-            movable[np.setdiff1d(np.arange(n), self.poses), space.dimension :] = False
+            turnless = np.ones(n, dtype=bool)
+            turnless[list(self.poses)] = False
+            movable[turnless, space.dimension :] = False
         movable[list(self.fixed)] = False
         return movable
 

@@ -97,8 +97,11 @@ def exp(w: Floats) -> Floats:
            [ 1.,  0.]])
     """
     if w.shape[-1] == 1:
-        c, s = np.cos(w[..., 0]), np.sin(w[..., 0])
-        return np.stack([np.stack([c, -s], axis=-1), np.stack([s, c], axis=-1)], axis=-2)
+        turned = np.empty((*w.shape[:-1], 2, 2))
+        turned[..., 0, 0] = turned[..., 1, 1] = np.cos(w[..., 0])
+        turned[..., 1, 0] = np.sin(w[..., 0])
+        turned[..., 0, 1] = -turned[..., 1, 0]
+        return turned
     angle = np.linalg.norm(w, axis=-1)[..., None, None]
     safe = np.where(angle > 1e-8, angle, 1.0)
     first = np.where(angle > 1e-8, np.sin(safe) / safe, 1.0)
@@ -132,10 +135,10 @@ def nearest_rotation(matrix: Floats) -> Floats:
 
 def cross(w: Floats) -> Floats:
     """(..., 3, 3) matrices [w]x with [w]x v = w x v."""
-    x, y, z = np.moveaxis(w, -1, 0)
-    zero = np.zeros_like(x)
-    rows = [[zero, -z, y], [z, zero, -x], [-y, x, zero]]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+    matrix = np.zeros((*w.shape, 3))
+    for i, j, k in ((0, 1, 2), (1, 2, 0), (2, 0, 1)):
+        matrix[..., j, i], matrix[..., i, j] = w[..., k], -w[..., k]
+    return matrix
 
 
 FARTHEST = 1e6

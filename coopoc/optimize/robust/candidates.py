@@ -10,7 +10,7 @@ import numpy.typing as npt
 
 from ...arrays import Floats, Ints, checked, frozen, instance, plain
 from ...errors import InputError, shown
-from ..assess.plausible import squared
+from ..assess.assess import squared
 from ..model.factor import unchecked
 from ..model.problem import Problem
 

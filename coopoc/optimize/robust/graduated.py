@@ -12,7 +12,8 @@ import numpy as np
 from ...arrays import Floats, frozen, number, one_of
 from ...errors import InputError
 from ..algebra.sparse import sparse
-from ..descent.levenberg_marquardt import MAX_ITERATIONS, TOLERANCE, arrive
+from ..backend import MAX_ITERATIONS, TOLERANCE
+from ..descent.levenberg_marquardt import arrive
 from ..model.factor import Loss, unchecked
 from ..model.problem import Problem
 from .candidates import Marked, mark, reweigh, squares

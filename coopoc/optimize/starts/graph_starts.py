@@ -32,6 +32,12 @@ STEPS = 5
 """Of each stage."""
 TOLERANCE = 1e-2
 """m or rad, a step at which a stage has arrived for the purpose."""
+DESCENT = 60
+"""Steps of a trilateration, of which ten are usual."""
+PLACED = 1e-6
+"""Share of the longest range: a shorter step is its last."""
+FIRST, LEAST = 1e-3, 1e-9
+"""Damping at first, beside directions of length 1, and at least."""
 HOLDING = 2
 """Ranges per dimension from which a point is placed by them."""
 
@@ -56,7 +62,7 @@ def walk(n: int, d: int, moves: Moves, roots: Roots) -> tuple[Floats, Floats, Bo
     ends = np.stack([moves.nodes[which], moves.nodes[which, ::-1]], axis=1).reshape(-1, 2)  # there and back
     key, first = np.unique(ends[:, 0] * n + ends[:, 1], return_index=True)  # of parallel edges the shortest
     edge, forward = which[first // 2], first % 2 == 0
-    graph = csr_array((moves.length[edge], (key // n, key % n)), shape=(n, n))
+    graph = csr_array((moves.length[edge], key % n, np.searchsorted(key, n * np.arange(n + 1))), shape=(n, n))
     for root, at, turned in roots:
         if known[root]:
             continue
@@ -113,12 +119,14 @@ def along_poses(problem: Problem) -> Floats:
 
 
 def parts(n: int, pairs: Ints) -> Ints:
-    """(n,) number of the connected component that each node is in, by pairs (M, 2) that are joined."""
-    from scipy.sparse import csr_array
-    from scipy.sparse.csgraph import connected_components
-
-    joined = csr_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    return np.asarray(connected_components(joined, directed=False)[1])
+    """(n,) the first node of the connected component that each is in, by pairs (M, 2) that are joined."""
+    part = np.arange(n)
+    while (apart := part[pairs[:, 0]] != part[pairs[:, 1]]).any():
+        ends = part[pairs[apart]]
+        np.minimum.at(part, ends.max(axis=1), ends.min(axis=1))
+        while (part != (up := part[part])).any():
+            part = up
+    return part
 
 
 def trilaterate(places: Floats, ranges: Floats) -> Floats:
@@ -134,8 +142,6 @@ def trilaterate(places: Floats, ranges: Floats) -> Floats:
     >>> trilaterate(np.array([[0.0, 0], [8, 0], [4, 1]]), np.array([5.0, 5, 2])).round(6)
     array([4., 3.])
     """
-    from scipy.optimize import least_squares
-
     d, middle = places.shape[1], places.mean(axis=0)
     p = places - middle
     if len(p) <= d:
@@ -145,9 +151,26 @@ def trilaterate(places: Floats, ranges: Floats) -> Floats:
     normal = np.linalg.eigh(p.T @ p)[1][:, 0]
     flat = guess - normal * (guess @ normal)
     height = np.sqrt(max(float(np.mean(ranges**2 - np.square(p - flat).sum(axis=1))), 0.0))
-    guesses = (guess, flat + height * normal, flat - height * normal)
-    ends = [least_squares(lambda at: np.linalg.norm(at - p, axis=1) - ranges, at, method="lm") for at in guesses]
-    return np.asarray(min(ends, key=lambda end: float(end.cost)).x + middle)
+    at, damping = np.array([guess, flat + height * normal, flat - height * normal]), np.full((3, 1, 1), FIRST)
+    now = _squares(p, ranges, at)
+    for _ in range(DESCENT):
+        step = -np.linalg.solve(now[:, :d, :d] + damping * np.eye(d), now[:, :d, d:])[..., 0]
+        there = _squares(p, ranges, at + step)
+        better = there[:, d, d] < now[:, d, d]
+        at[better], now[better] = at[better] + step[better], there[better]
+        damping = np.where(better[:, None, None], np.maximum(0.1 * damping, LEAST), 10.0 * damping)
+        if np.abs(step).max() <= PLACED * ranges.max():
+            break
+    return np.asarray(at[np.argmin(now[:, d, d])] + middle)
+
+
+def _squares(places: Floats, ranges: Floats, at: Floats) -> Floats:
+    """(G, d + 1, d + 1) [u e]^T [u e] at G points: the directions u (K, d) from the places and the errors e (K, 1) of
+    the ranges, so that the last number is the cost."""
+    gap = at[:, None] - places
+    distance = np.linalg.norm(gap, axis=2, keepdims=True)
+    rows = np.concatenate([gap / np.maximum(distance, LEAST), distance - ranges[:, None]], axis=2)
+    return np.asarray(rows.swapaxes(1, 2) @ rows)
 
 
 def chained(graph: Graph, apart: bool = False) -> Floats:

@@ -8,7 +8,7 @@ import numpy as np
 
 from ...arrays import Floats, frozen
 from ..algebra.sparse import sparse
-from ..assess.plausible import expected
+from ..assess.assess import expected
 from ..descent.levenberg_marquardt import Arrival, arrive
 from ..model.problem import Problem, Search
 
