@@ -22,6 +22,7 @@ class PoseNoise(NamedTuple):
         heading: rad^2, of a compass.
         relative: three variances, m^2, rad^2, rad^2.
         velocity: noise of the odometer: ratio, least std m/s, 1 for a ratio of the speed on every axis.
+        late: share of the last velocity in the mean square that the ratio is of; 1 for its own.
         yaw_rate: rad^2/s^2.
         lasting: stationary variances of scale error and of yaw-rate bias, rad^2/s^2.
         keep: share of both that is left after a step.
@@ -33,6 +34,7 @@ class PoseNoise(NamedTuple):
     heading: float
     relative: Three
     velocity: Three
+    late: float
     yaw_rate: float
     lasting: tuple[float, float]
     keep: float
@@ -41,14 +43,20 @@ class PoseNoise(NamedTuple):
 
 
 @part
-def velocity_variances(u: Three, noise: PoseNoise) -> Three:
-    """Variance (m/s)^2 of each component of a measured velocity, forward, left and up."""
+def velocity_variances(poses: Poses, member: int, u: Three, noise: PoseNoise) -> Three:
+    """Variance (m/s)^2 of each component of a measured velocity, forward, left and up.
+
+    It follows the mean square of late velocities: a share of a measured one is small where the error makes it slow, and
+    of a fleet that holds together the slow ones would count more.
+    """
     ratio, floor, of_speed = noise.velocity
-    a, b, c = abs(u[0]), abs(u[1]), abs(u[2])
+    for i in range(3):
+        poses.level[member + i] += noise.late * (u[i] * u[i] - poses.level[member + i])
+    a, b, c = poses.level[member], poses.level[member + 1], poses.level[member + 2]
     if of_speed > 0.0:
-        a = b = c = math.sqrt(a * a + b * b + c * c)
-    a, b, c = max(ratio * a, floor), max(ratio * b, floor), max(ratio * c, floor)
-    return a * a, b * b, c * c
+        a = b = c = a + b + c
+    least, square = floor * floor, ratio * ratio
+    return max(square * a, least), max(square * b, least), max(square * c, least)
 
 
 @part
@@ -68,7 +76,7 @@ def predict(poses: Poses, member: int, d: int, velocity: Three, rate: float, dt:
         noise: that is assumed.
     """
     x, cov, (forward, left, up) = poses.x, poses.cov, velocity
-    qf, ql, qu = velocity_variances(velocity, noise)
+    qf, ql, qu = velocity_variances(poses, member, velocity, noise)
     scale, bias = 1.0, 0.0
     if d > 4:
         scale, bias = 1.0 / (1.0 + x[member + 4]), x[member + 5]
@@ -132,6 +140,8 @@ def join(poses: Poses, member: int, d: int, own: Floats, noise: PoseNoise) -> No
         for j in range(len(poses.x)):
             poses.cov[i, j] = poses.cov[j, i] = 0.0
         poses.x[i] = 0.0
+    for i in range(3):
+        poses.level[member + i] = own[4 + i] * own[4 + i]
     for i in range(4):
         poses.x[member + i] = 0.0 if math.isnan(own[i]) else own[i]
         poses.cov[member + i, member + i] = noise.flat if i < HEADING else UNKNOWN_HEADING

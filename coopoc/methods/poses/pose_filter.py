@@ -59,7 +59,8 @@ class PoseFilter:
         lasting: estimate the odometer's scale error and the yaw rate's bias, too (`Track.extras`).
         exact: False is the plain extended Kalman filter.
         robust: a component beyond its gate weighs less, far beyond it nothing, unless many are
-            (`coopoc.kernels.gate`); False believes every number.
+            (`coopoc.kernels.gate`), and noise that is a share of a velocity is one of the mean of a second; False
+            believes every number.
         gate: standard deviations of an innovation.
         begin: (N, 4) or (R, N, 4) m and rad, poses at the first step; None or NaN: the first fix and compass.
         spread: (4,) standard deviations of these.
@@ -215,7 +216,8 @@ class PoseFilter:
 
     def noise(self, sensors: Sensors, dt: float) -> PoseNoise:
         """What it assumes, as the kernel takes it."""
-        return pose_noise(sensors, dt, self.gate if self.robust else np.inf)
+        found = pose_noise(sensors, dt, self.gate)
+        return found if self.robust else found._replace(gate=np.inf, late=1.0)
 
     def options(self) -> PoseOptions:
         """As the kernel takes them."""
