@@ -42,8 +42,8 @@ def page(source: str, name: str) -> tuple[str, dict[str, bytes]]:
         printed, shown, figures = _run(text, names)
         for said in filter(None, (printed, shown if isinstance(shown, str) else "")):
             parts.append(f"```text\n{said.rstrip()}\n```")
-        if hasattr(shown, "_repr_html_"):
-            parts.append(shown._repr_html_())
+        if hasattr(shown, "to_markdown"):
+            parts.append(shown.to_markdown(index=False))
         for figure in figures:
             pictures[file := f"{name}-{len(pictures) + 1}.png"] = _png(figure)
             parts.append(f"![What the code above draws]({file})")
@@ -62,7 +62,7 @@ def _run(text: str, names: dict[str, Any]) -> tuple[str, Any, list[Figure]]:
     plt.close("all")
     if isinstance(value, Figure):
         return out.getvalue(), None, [*figures, value]
-    return out.getvalue(), value if value is None or hasattr(value, "_repr_html_") else repr(value), figures
+    return out.getvalue(), value if value is None or hasattr(value, "to_markdown") else repr(value), figures
 
 
 def _png(figure: Figure) -> bytes:

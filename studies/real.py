@@ -319,28 +319,23 @@ def _trade(results: Results) -> Plot | None:
 
 
 def _figure(results: Results) -> Plot | None:
-    """Over the landmarks, a line per K and, at the largest, per way of fusion; where their number is one, over K."""
+    """Over the landmarks, a line per K and, at the largest, per way of fusion."""
     from matplotlib import colormaps
 
     from coopoc.study import figures
 
     ks, marks = _numbers(results)
-    if len(ks) < 2 and len(marks) < 2:
+    if len(marks) < 2:
         return None
-    x, values = ("landmarks", marks) if len(marks) > 1 else ("max_neighbours", ks)
-    places = {float(np.log1p(value)): {x: value} for value in values}
-    ticks = {place: str(also[x]) for place, also in places.items()}
-    base = _base(results)
-    fusion: list[Where] = [{"method": name, "label": look(name).label} for name in EVERY if name not in TRAINED]
-    lines: list[Where] = []
-    if x == "landmarks":
-        colors = {k: colormaps["viridis"](k / 4.6) for k in ks}
-        lines = [{**base, "max_neighbours": k, "label": f"One state, K = {k}", "color": colors[k]} for k in ks]
-        fusion = [{**line, "max_neighbours": ks[-1]} for line in fusion[1:]] if ks[-1] else []
-    panel = Panel(places, xlabel=words(x), ticks=ticks)
-    text = f"RT-LE against {words(x)}; the ways of fusion at K = {ks[-1]}; bands: 95 % intervals."
-    caption = _caption(results, text)
-    return figures.curves(results, [panel], [*lines, *fusion], caption, number=interval, width=6.6, log=True)
+    places = {float(np.log1p(n)): {"landmarks": n} for n in marks}
+    ticks = {place: str(also["landmarks"]) for place, also in places.items()}
+    colors, base = {k: colormaps["viridis"](k / 4.6) for k in ks}, _base(results)
+    lines = [{**base, "max_neighbours": k, "label": f"One state, K = {k}", "color": colors[k]} for k in ks]
+    names = [*METHODS][1:] if ks[-1] else []
+    lines += [{"method": name, "label": look(name).label, "max_neighbours": ks[-1]} for name in names]
+    panel = Panel(places, xlabel=words("landmarks"), ticks=ticks)
+    caption = _caption(results, f"RT-LE against landmarks; the ways of fusion at K = {ks[-1]}; bands: 95 % intervals.")
+    return figures.curves(results, [panel], lines, caption, number=interval, width=6.6, log=True)
 
 
 def _findings(results: Results) -> dict[str, str]:

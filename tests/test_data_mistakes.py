@@ -13,7 +13,7 @@ import pytest
 
 import coopoc as co
 from coopoc.data.log.read import read_log
-from coopoc.data.registry import load_log
+from coopoc.data.registry import kind_of, load_log
 
 PAGE = (Path(__file__).resolve().parents[1] / "docs" / "your_data.md").read_text()
 GOOD = "t,vehicle,kind,partner,value,std,arrival\n" + "".join(
@@ -227,6 +227,7 @@ def test_clocks_that_begin_anew_go_on(tmp_path: Path, period: int) -> None:
     assert other.summary.assumed.keys() - one.summary.assumed.keys() == {
         f"stamps begin anew after {period} s: those before half of it count on"
     }
+    assert kind_of(tmp_path / "anew.jsonl") == kind_of(tmp_path / "plain.csv") == "log"
     (tmp_path / "bad.jsonl").write_text('{"t": 0,\n')
     with pytest.raises(co.InputError, match=r"bad\.jsonl = .*must be a table"):
         co.read_log(tmp_path / "bad.jsonl")

@@ -20,7 +20,7 @@ from coopoc import InputError
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.algebra.sparse import Sparse, sparse
-from coopoc.optimize.assess.assess import SMALL, assess, expected, newton_decrease
+from coopoc.optimize.assess.assess import SMALL, _seen, assess, expected, newton_decrease
 from coopoc.optimize.backends.gtsam import forms, graph_of, values, which_turn
 from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import Objective, from_graph, read_graph
@@ -332,6 +332,8 @@ def test_a_weak_measurement_is_no_free_node(weight: float) -> None:
     apart = solve(replace(problem, factors=(cut,)), throw=False)
     assert apart.status is Status.RANK_DEFICIENT
     assert set(apart.unobservable) == {f"A{k}" for k in range(50, 100)}
+    ways = np.array([[1.0, 1.0], [1.0, 1.0 + 1e-6]])
+    assert all(_seen(csc_array([[1.0, -1.0]]), unit * ways).tolist() == [False, True] for unit in (1.0, 1e-4))
 
 
 @pytest.mark.parametrize("unseen", [1, 40])

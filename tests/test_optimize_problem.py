@@ -233,6 +233,7 @@ def test_a_point_that_can_turn_around_another_is_free(backend: str) -> None:
         solution = solve(hanging, backend, throw=False)
         assert solution.status is Status.RANK_DEFICIENT
         assert solution.unobservable == ("c",)
+    assert initial_guess(replace(hanging, x0=None))[2] == pytest.approx([4.5 + 7.3, 0.0, 0.0])
 
 
 @pytest.fixture(scope="module")

@@ -125,10 +125,10 @@ def test_the_command_says_what_is_worse(tmp_path: Path, capsys: pytest.CaptureFi
     run_study("heading_error", tmp_path, settings=few, progress=False)
     folder, file = str(tmp_path / "heading_error"), str(tmp_path / "own.json")
     assert "reference numbers hold" in (tmp_path / "heading_error" / "views.json").read_text()
-    for words, status in ((["--write", "--file", file], 0), (["--file", file], 0)):
+    for more in (["--write"], []):
         with pytest.raises(SystemExit) as ended:
-            main(["reference", folder, *words])
-        assert ended.value.code == status
+            main(["reference", folder, "--file", file, *more])
+        assert ended.value.code == 0
     assert "1 of 1 reference numbers hold." in capsys.readouterr().out
     known = Reference.load(file)
     lower = replace(known, numbers=tuple(replace(n, value=0.5 * n.value) for n in known.numbers[:1]))

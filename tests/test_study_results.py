@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import csv
-import io
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
@@ -174,19 +172,11 @@ def test_latex() -> None:
 
 
 def test_csv_keeps_every_digit_and_the_interval() -> None:
-    header, first, second = csv.reader(io.StringIO(TABLE.to_csv()))
-    assert header == [
-        "K",
-        "KF & co",
-        "KF & co low",
-        "KF & co high",
-        "50 %_x",
-        "50 %_x low",
-        "50 %_x high",
-        "Cramér-Rao bound",
+    assert TABLE.to_csv().splitlines() == [
+        "K,KF & co,KF & co low,KF & co high,50 %_x,50 %_x low,50 %_x high,Cramér-Rao bound",
+        "0,0.8047,0.75,0.85,1.2,1.1,1.3,0.5",
+        "4,0.912,,,,,,0.4",
     ]
-    assert first == ["0", "0.8047", "0.75", "0.85", "1.2", "1.1", "1.3", "0.5"]
-    assert second == ["4", "0.912", "", "", "", "", "", "0.4"]
 
 
 def test_html_is_well_formed_and_escaped() -> None:

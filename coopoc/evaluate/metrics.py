@@ -120,19 +120,19 @@ def nees_band(runs: int, level: float = 0.99) -> tuple[float, float]:
     return float(low), float(high)
 
 
-def nees_inside(track: Track, fleet: Fleet, level: float = 0.99) -> Floats:
+def nees_inside(track: Track, fleet: Fleet) -> Floats:
     """Share of the steps whose run-averaged NEES lies inside the band, (E,); >= 0.95 passes the consistency gate."""
     found = nees(track, fleet)
-    return share_of_average(found.mean(axis=0), len(found), level)
+    return share_of_average(found.mean(axis=0), len(found))
 
 
-def share_of_average(average: Floats, runs: int, level: float = 0.99) -> Floats:
+def share_of_average(average: Floats, runs: int) -> Floats:
     """`nees_inside` of the average over `runs` runs of what `nees` has found, (T, E); NaN does not count.
 
     >>> share_of_average(np.array([[3.0], [9.0]]), 30)
     array([0.5])
     """
-    low, high = nees_band(runs, level)
+    low, high = nees_band(runs)
     inside = np.where(np.isnan(average), np.nan, (average >= low) & (average <= high))
     return np.asarray(np.nanmean(inside, axis=0))
 

@@ -52,10 +52,8 @@ def sweep(
     return plot
 
 
-def pareto(
-    results: Results, caption: str, x: str = "bytes_per_second", y: str = "rt_le_m", where: Where | None = None
-) -> Plot:
-    """Plot a metric against received bytes per second, a mark per cell; a line joins those that no cheaper one beats.
+def pareto(results: Results, caption: str, x: str = "bytes_per_second", where: Where | None = None) -> Plot:
+    """Plot RT-LE against received bytes per second, a mark per cell; a line joins those that no cheaper one beats.
 
     Methods that receive nothing are horizontal lines.
 
@@ -63,14 +61,13 @@ def pareto(
         results: of the study.
         caption: under the figure.
         x: bytes per second of online cooperation.
-        y: metric.
         where: column -> value or values.
 
     Raises:
         InputError: as `Results.summary`.
     """
     names = _line_names(results)
-    summary = results.summary(axes := [a for a in results.axes if a != "train_seed"], y, where)
+    summary = results.summary(axes := [a for a in results.axes if a != "train_seed"], "rt_le_m", where)
     summary["bytes"] = results.summary(axes, x, where)["mean"]
     shown = list[tuple[Where, Any]]()
     for key, group in summary.dropna(subset=["mean"]).groupby(names, sort=False):
@@ -91,7 +88,7 @@ def pareto(
             panel.plot(*zip(*best, strict=True), **{**strokes(line), "marker": "", "linewidth": 0.8})
         plain_log(panel.xaxis)
         plain_log(panel.yaxis)
-        panel.set(xlabel=words(x), ylabel=words(y))
+        panel.set(xlabel=words(x), ylabel=words("rt_le_m"))
         also = {
             name_of(alike[0]): f" ({alike[0].get('noise_model')}{_joined(alike).removeprefix(_joined(alike[:1]))})"
             for alike in groups

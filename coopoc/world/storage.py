@@ -125,7 +125,7 @@ def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
     except DAMAGES as error:
         if isinstance(error, InputError) and error.field == path.name:
             raise
-        found = next(iter(str(error).splitlines()), type(error).__name__)[:200]
+        found = next(iter(str(error).splitlines()), type(error).__name__)
     raise InputError(path.name, found, "must be a recording in .npz", "Write it again with save_recording.")
 
 

@@ -23,12 +23,13 @@ OF_LOGS = {"kind", "partner", "arrival", *KINDS} - OF_FLEETS - {"speed", "headin
 
 
 def is_log_table(path: Path, columns: Mapping[str, str] | None = None) -> bool:
-    """Whether a file is a table with a column that only a log has, by its header or by our names in `columns`."""
+    """Whether a file is a table with a column that only a log has, by its header or by our names in `columns`; or one
+    without an id that lacks heights or has speeds, as no table of drives does."""
     if path.suffix.lower() not in TABLES:
         return False
-    return bool(
-        set(columns or ()) & ({*LONG, *KINDS} - OF_FLEETS) or OF_LOGS & {name.lower() for name in headers(path)}
-    )
+    given, ours = {name.lower() for name in headers(path)}, set(columns or ())
+    drive = "id" in given | ours or ("z" in given | ours and not {"speed", "heading"} & given)
+    return bool(ours & ({*LONG, *KINDS} - OF_FLEETS) or OF_LOGS & given or (given and not drive))
 
 
 def read_log_table(
