@@ -186,7 +186,7 @@ def gather_neighbour(
     for c in range(3):
         rows[i, SOLO + c] = seen.broadcast[run, sent, j, c]
         rows[i, SOLO_VARIANCE + c] = number(assumed.broadcast, run, sent, j, c)
-        rows[i, ODOMETER + c] = moved[run, sent, j, c]
+        rows[i, ODOMETER + c] = number(moved, run, sent, j, c)
         rows[i, SPEED + c] = u[c]
         rows[i, TYPICAL + c] = number(assumed.fixes, run, sent, j, c)
         rows[i, STEP + c] = q[c] + number(assumed.process, run, sent, j, c)
