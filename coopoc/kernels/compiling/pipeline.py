@@ -2,7 +2,6 @@
 
 from typing import Any
 
-from llvmlite.binding import Linkage
 from numba._dynfunc import make_function
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
@@ -18,9 +17,6 @@ class KernelLibrary(JITCodeLibrary):
 
     def _optimize_final_module(self) -> None:
         if not self.is_part:
-            for function in self._final_module.functions:
-                if function.linkage == Linkage.linkonce_odr:  # what only this kernel calls
-                    function.linkage = "internal"
             passes, builder = self._codegen._module_pass_manager()
             passes.run(self._final_module, builder)
 
