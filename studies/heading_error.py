@@ -251,7 +251,7 @@ STUDY = Study(
     "What does an erroneous or unknown heading cost, and how soon does a fleet estimate its headings?",
     cell,
     _grid(),
-    settings={"runs": 20, "seed": 0, "radius_m": 60.0, "gnss_std_m": 1.5, "yaw_rate_std": 0.01, "score_s": 0.1},
+    settings={"runs": 60, "seed": 0, "radius_m": 60.0, "gnss_std_m": 1.5, "yaw_rate_std": 0.01, "score_s": 0.1},
     key=key,
     shares=("compass", "max_neighbours", "speed", "after_s"),
     tables={
@@ -268,6 +268,6 @@ STUDY = Study(
         "Only the last step of a drive is scored; without a compass the initial headings are estimated from all of it.",
     ),
     reference=reference("heading_error"),
-    minutes=5,
+    minutes=12,
     metrics={"rt_le_m": "lower", "heading_deg": "lower", "nees": 3.0},
 )

@@ -133,8 +133,8 @@ class _Search:
         problem = self.problem
         measured = [f.nodes[f.informative] for f in reweigh(problem, self.marked, self.weight, self.x).factors]
         pairs = [nodes for nodes in measured if nodes.shape[1] == 2]
-        pairs = np.concatenate([np.empty((0, 2), np.int64), *pairs])
-        part = np.unique(parts(len(problem.names), pairs), return_inverse=True)[1]
+        joined = parts(len(problem.names), np.concatenate([np.empty((0, 2), np.int64), *pairs]))
+        part = np.unique(joined, return_inverse=True)[1]
         alone = [nodes[:, 0] for nodes in measured if nodes.shape[1] == 1]
         nodes = np.concatenate([problem.poses, np.setdiff1d(np.arange(len(part)), problem.poses)]).astype(np.int64)
         first = nodes[np.unique(part[nodes], return_index=True)[1]]
