@@ -45,8 +45,7 @@ test-slow: $(VENV)/.ready-dev
 
 test-bounds: $(VENV)/.ready-dev
 	NUMBA_BOUNDSCHECK=1 NUMBA_CACHE_DIR=$(abspath $(VENV))/bounds OMP_NUM_THREADS=1 $(VENV)/bin/python -m pytest \
-		-n $(JOBS) --dist loadfile tests/test_memory_safety.py tests/test_star_filters.py tests/test_solo_filters.py tests/test_kernels_scores.py \
-		tests/test_cooperative_filter.py tests/test_streaming.py
+		-n $(JOBS) --dist loadfile tests/test_memory_safety.py tests/test_star_filters.py tests/test_solo_filters.py tests/test_kernels_scores.py
 
 test-lower:
 	$(PYTHON) -m venv $(LOWER)
