@@ -163,9 +163,7 @@ def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, index: Ints,
 
 
 @compiled
-def stream_step(
-    given: Floats, state: Floats, history: Floats, motion: MotionNoise, rule: FixNoise, answer: Floats
-) -> int:
+def stream_step(given: Floats, state: Floats, history: Floats, noise: Floats, answer: Floats) -> int:
     """One step of a stream: dead reckoning, the fix brought forward, `step` on every axis.
 
     Nothing is changed where the input is bad. A state of NaN has not started yet.
@@ -174,10 +172,11 @@ def stream_step(
         given: (8,) fix m, velocity m/s, dt s, age of the fix s.
         state: (3, 6).
         history: of `motion`.
-        motion: noise of the motion.
-        rule: noise of the fixes.
+        noise: (15,) the numbers of a MotionNoise and a FixNoise: to hand over tuples takes longer than the step.
         answer: (12,) position m, covariance m^2.
     """
+    motion = MotionNoise(noise[:3], noise[3:6], noise[6], noise[7], noise[8])
+    rule = FixNoise(noise[9:12], noise[12], noise[13], noise[14])
     q, late, moved = np.empty(3), np.zeros(3), np.zeros(3)
     outcome = dead_reckon(given, history, motion, answer, q, moved, late)
     starts = math.isnan(state[0, 0])
