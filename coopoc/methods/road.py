@@ -70,8 +70,8 @@ class RoadErrors:
 
 
 ROAD = RoadErrors()
-"""Of measurements that are not simulated, by hand: chosen on worlds of `learned.training.roads` of another drive, and on
-the first parts of two real ones."""
+"""Of measurements that are not simulated, by hand: between what is learned in simulation and what the first parts of
+real drives show."""
 EXACT = RoadErrors(fix=1.0, motion=1.0, correlation=0.0, gate=5.0, heading=0.0, scale=0.0, window=np.inf, least=1.0)
 """Of simulated measurements whose noise is known and white: the Kalman filter, with a gate."""
 
