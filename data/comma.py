@@ -1,9 +1,8 @@
-"""Segments of comma2k19 (NumPy arrays without an ending) as rows of a log: fixes, speed, heading, true positions."""
+"""Segments of comma2k19 (NumPy arrays without an ending) as rows of a log: fixes, speed, course, true positions."""
 
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -15,8 +14,9 @@ from coopoc.errors import InputError
 from .log.units import Rows, Summary, rows_of
 from .nmea import SLOW
 
-FIXES, SPEED, TRUTH = "processed_log/GNSS/live_gnss_ublox", "processed_log/CAN/speed", "global_pose"
-"""Folders of a segment; others of it are not read."""
+FIXES, SPEED, TRUTH = "processed_log/GNSS/live_gnss_ublox/", "processed_log/CAN/speed/", "global_pose/frame_"
+"""Arrays of a segment; others are not read."""
+PLACE = ("latitude", "longitude", "height")
 
 
 def is_segment(path: Path) -> bool:
@@ -24,7 +24,7 @@ def is_segment(path: Path) -> bool:
     return (path / FIXES / "value").is_file()
 
 
-def read_segment(path: Path, summary: Summary, **_: Any) -> Rows:
+def read_segment(path: Path, summary: Summary) -> Rows:
     """Rows latitude, longitude, height and compass_deg of the u-blox receiver, speed of the CAN bus, and the truth: the
     fused positions of the camera. The compass is the receiver's course, of a car that moves.
 
@@ -33,43 +33,35 @@ def read_segment(path: Path, summary: Summary, **_: Any) -> Rows:
         summary: takes what is assumed.
 
     Raises:
-        InputError: an array that is missing, damaged, or of another shape.
+        InputError: an array that is missing, damaged, of another shape or without finite numbers.
     """
-    (at, fixes), (moving, speed) = (
-        (_array(path, f"{part}/t"), _array(path, f"{part}/value", columns))
-        for part, columns in ((FIXES, 6), (SPEED, 1))
-    )
-    when, ecef = _array(path, f"{TRUTH}/frame_times"), _array(path, f"{TRUTH}/frame_positions", 3)
-    for part, t, values in ((FIXES, at, fixes), (SPEED, moving, speed), (TRUTH, when, ecef)):
-        if len(t) != len(values):
-            raise InputError(f"{path.name}/{part}", f"{len(values)} rows", f"must be {len(t)}", "Copy it again.")
-    true = np.column_stack(pymap3d.ecef2geodetic(*ecef.T))
-    drives = fixes[:, 2] > SLOW
+    at, latitude, longitude, speed, _, height, course = _arrays(path, f"{FIXES}t", f"{FIXES}value", 6)
+    when, driven = _arrays(path, f"{SPEED}t", f"{SPEED}value", 1)
+    true_t, *ecef = _arrays(path, f"{TRUTH}times", f"{TRUTH}positions", 3)
     summary.assume("the heading is the course that the receiver states while it moves")
-    names = ("latitude", "longitude", "height")
-    parts = [
-        *((at, name, fixes[:, k], 0.0) for name, k in zip(names, (0, 1, 4), strict=True)),
-        (at[drives], "compass_deg", fixes[drives, 5], 0.0),
-        (moving, "speed", speed[:, 0], 0.0),
-        *((when, name, true[:, k], 1.0) for k, name in enumerate(names)),
-    ]
-    rows = [pd.DataFrame({"t": t, "kind": kind, "value": value, "true": of}) for t, kind, value, of in parts]
+    columns = [(at, *row, 0.0) for row in zip(PLACE, (latitude, longitude, height), strict=True)]
+    columns += [(true_t, *row, 1.0) for row in zip(PLACE, pymap3d.ecef2geodetic(*ecef), strict=True)]
+    columns += [(when, "speed", driven, 0.0), (at[speed > SLOW], "compass_deg", course[speed > SLOW], 0.0)]
+    rows = [pd.DataFrame({"t": t, "kind": kind, "value": value, "true": true}) for t, kind, value, true in columns]
     return rows_of(pd.concat(rows, ignore_index=True).assign(vehicle=path.name), path.name)
 
 
-def _array(path: Path, name: str, columns: int = 0) -> Floats:
-    """(M,) finite numbers of an array, or (M, columns)."""
-    field, shape = f"{path.name}/{name}", f"(M, {columns})" if columns else "(M,)"
-    try:
-        with (path / name).open("rb") as file:
-            if file.read(6) != b"\x93NUMPY":
-                raise ValueError("no NumPy array")
-        array = np.load(path / name, mmap_mode="r")  # a header that claims more than there is, is refused
-        values = np.array(array, dtype=float)
-    except (OSError, ValueError, TypeError, OverflowError, SyntaxError) as error:
-        given = next(iter(str(error).splitlines()), type(error).__name__)[:200]
-        raise InputError(field, given, f"must be an array {shape} of numpy.save", "Copy it again.") from None
-    if values.shape[1:] != (columns,) * (columns > 0) or not len(values) or not np.isfinite(values).all():
-        given = f"{values.shape}" + " with others" * bool(values.size and not np.isfinite(values).all())
-        raise InputError(field, given, f"must be {shape}, M > 0, all finite numbers", "Copy it again.")
-    return values
+def _arrays(path: Path, times: str, values: str, columns: int) -> list[Floats]:
+    """Times (M,) and the columns (M,) of an array."""
+    read = list[Floats]()
+    for name in (times, values):
+        try:
+            with (path / name).open("rb") as file:
+                if file.read(6) != b"\x93NUMPY":
+                    raise ValueError("no NumPy array")
+            array = np.array(np.load(path / name, mmap_mode="r"), dtype=float)  # a header may claim more than there is
+        except (OSError, ValueError, TypeError, OverflowError, SyntaxError) as error:
+            given = next(iter(str(error).splitlines()), type(error).__name__)[:200]
+            raise InputError(f"{path.name}/{name}", given, "must be an array of numpy.save", "Copy it again.") from None
+        wanted = (len(array) if array.ndim and not read else len(read[0]) if read else 1,)
+        wanted += (columns,) * len(read)
+        if array.shape != wanted or not array.size or not np.isfinite(array).all():
+            allowed = f"must be {wanted}, all finite numbers"
+            raise InputError(f"{path.name}/{name}", f"an array {array.shape}", allowed, "Copy it again.")
+        read += [*array.T] if read else [array]
+    return read

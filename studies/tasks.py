@@ -12,13 +12,28 @@ from typing import Any
 
 import numpy as np
 
-from coopoc import V2X, Fleet, PoseFilter, Recording, Sensors, load_fleet, observe, read_graph, solve
+from coopoc import (
+    V2X,
+    Fleet,
+    PoseFilter,
+    Problem,
+    Recording,
+    Sensors,
+    load_fleet,
+    observe,
+    pose_start,
+    read_graph,
+    read_log,
+    solve,
+)
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, past_bound, posterior_bound
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.evaluate.statistics import mean_interval
+from coopoc.methods.poses.pose_start import at_ranges
+from coopoc.methods.track import Track
 from coopoc.world.outliers import Fault, Outliers
 from coopoc.world.spoofing import Spoofing, spoofed
 
@@ -133,6 +148,7 @@ def bound(task: Task, information: str) -> float:
 
 POSES: Mapping[str, Mapping[str, Any]] = {
     "pose-solo": {"unit": "solo"},
+    "pose-plain": {"unit": "solo", "exact": False, "robust": False},
     "pose-fleet": {"unit": "fleet"},
     "pose-intersection": {"unit": "fleet", "fusion": "intersection"},
     "pose-naive": {"unit": "fleet", "fusion": "naive"},
@@ -170,6 +186,7 @@ class Logged:
 LOGGED = (
     Logged("robots", "MR.CLAM 6: odometry, two landmarks, four neighbours, nothing else.", "MRCLAM_Dataset6", 30.0),
     Logged("uwb", "Four robots that range one another and one anchor.", "tiers.pyfg", 10.0),
+    Logged("indoor", "A robot that ranges four anchors, two of them behind walls.", "Indoor_UWB_Input.txt", 3.0),
 )
 
 
@@ -195,6 +212,13 @@ def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, 
         assert drive.truth is not None
         start = int(until / drive.truth.dt)
         return pose_drives.thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
+    if task.name == "indoor":
+        log = read_log(path, truth=path.with_name("Indoor_UWB_GT.txt"), frame="body")
+        assert log.truth is not None
+        start = int(0.4 * len(log.recording.t))
+        noise = replace(log.recording.sensors, range_std=RANGE_STD)
+        begin = pose_start(log.recording.between(0, start), gate=GATE, assumed=noise)
+        return log.recording, log.truth, start, {"begin": begin, "assumed": noise}
     drive = pose_drives.drive(str(path), 0.0, V2X(max_neighbours=3, radius=float("inf")), GATE)
     if drive.truth is None or drive.truth.heading is None:
         raise InputError("data", str(path), "must hold true poses", "Take the file as it was published.")
@@ -228,7 +252,9 @@ def pose_row(task: Logged, folder: Path, made: Any) -> dict[str, Any]:
     level = mean_interval(np.sqrt(squares))
     row: dict[str, Any] = {"task": task.name, "data": hashed(path)}
     row |= {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
-    if track.heading is not None:
+    if fleet.heading is None:
+        row |= {"nees": round(float(np.nanmean(planar(track, fleet)[1][start:])), 2)}
+    elif track.heading is not None:
         turned = np.rad2deg(_blocks(heading_error(track, fleet)[0], start, task.block_s / fleet.dt))
         row |= {"heading_deg": round(float(np.nanmean(turned)), 3)}
         row |= {"nees": round(float(np.nanmean(pose_nees(track, fleet)[0, start:])), 2)}
@@ -248,6 +274,57 @@ def graph_row(folder: Path, file: str, backend: str) -> dict[str, Any]:
     return row | {"over_best": round(solution.cost / BEST[path.name], 5), "seconds": round(seconds, 3)}
 
 
+NETWORK, KNOWN = "test1_0.db3", ("1", "2", "4")
+"""File of seven robots that stand and range one another, and those whose places are known, so that nothing is left to
+turn or mirror."""
+
+
+def network_row(folder: Path, backend: str) -> dict[str, Any]:
+    """RT-LE m of robots that stand, from the medians of the ranges of each pair, over the robots: as measured, and less
+    the offset that ranges between the known robots show."""
+    from rosbags.highlevel import AnyReader
+    from rosbags.typesys import Stores, get_typestore
+
+    path, made = located(folder, NETWORK), dict[str, list[Any]]()
+    with AnyReader([path.parent], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
+        for topic, _, raw in reader.messages():
+            m: Any = reader.deserialize(raw, topic.msgtype)
+            name = "".join(sorted(c for c in topic.topic if c.isdigit()))
+            made.setdefault(name, []).append(getattr(m, "range", None) or [m.pose.position.x, m.pose.position.y])
+    places = {name: np.median(values, axis=0) for name, values in made.items() if len(name) == 1}
+    pairs = [tuple(name) for name in made if len(name) == 2 and set(name) <= set(places)]
+    measured = np.array([np.median(made["".join(pair)]) for pair in pairs])
+    among = [set(pair) <= set(KNOWN) for pair in pairs]
+    true = np.array([np.linalg.norm(places[a] - places[b]) for a, b in pairs])
+    free, levels, seconds = [name for name in places if name not in KNOWN], list[Any](), 0.0
+    problem = Problem(tuple(places), dimension=2).add("position", KNOWN, [places[name] for name in KNOWN], std=1e-3)
+    centres = np.array([[*places[name], 0.0] for name in KNOWN])[None]
+    for offset in (0.0, float(np.mean((measured - true)[among]))):
+        less = dict(zip(map(frozenset, pairs), measured - offset, strict=True))
+        start = [
+            places[name]
+            if name in KNOWN
+            else at_ranges(centres, np.array([less[frozenset({name, k})] for k in KNOWN]))[0, :2]
+            for name in places
+        ]
+        whole = replace(problem, x0=np.array(start)).add("range", pairs, (measured - offset)[:, None], std=RANGE_STD)
+        solution = solve(whole, backend)
+        gaps = [np.linalg.norm(solution.x[[*places].index(name)] - places[name]) for name in free]
+        level, seconds = mean_interval(np.array([gaps])), seconds + solution.solve_seconds
+        levels.append([round(value, 4) for value in (level.mean, level.low, level.high)])
+    row: dict[str, Any] = {"task": "tiers_ros2", "data": hashed(path), "status": solution.status.name}
+    row |= {"rt_le_m": levels[0], "calibrated_m": levels[1], "received_bytes_per_second": 0}
+    return row | {"microseconds_per_step": round(1e6 * seconds, 2)}
+
+
+def planar(track: Track, fleet: Fleet) -> tuple[Floats, Floats]:
+    """Errors (T, 2) m of a track of one ego in the plane, and their NEES (T,), NaN without a covariance."""
+    gap = (track.x[0, :, 0] - fleet.position[:, track.egos[0]])[:, :2]
+    if track.covariance is None:
+        return gap, np.full(len(gap), np.nan)
+    return gap, np.einsum("ti,tij,tj->t", gap, np.linalg.inv(track.covariance[0, :, 0, :2, :2]), gap)
+
+
 def _blocks(error: Floats, start: int, length: float) -> Floats:
     """(E, B) root mean square of errors (T, E) over blocks of steps from the start on, of those without a gap."""
     size = max(int(length), 1)
@@ -256,9 +333,10 @@ def _blocks(error: Floats, start: int, length: float) -> Floats:
     return np.asarray(found.T)
 
 
-def hashed(path: Path) -> str:
-    """First 12 hex digits of the SHA-256 of a file, or of the measurements of a folder."""
+def hashed(*paths: Path) -> str:
+    """First 12 hex digits of the SHA-256 of files, or of all in folders."""
     sha = hashlib.sha256()
-    for file in sorted(path.glob("*.dat")) if path.is_dir() else [path]:
-        sha.update(file.read_bytes())
+    for path in paths:
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            sha.update(file.read_bytes() if file.is_file() else b"")
     return sha.hexdigest()[:12]

@@ -63,7 +63,7 @@ class RoadErrors:
     scale: float = 0.03
     lasts: float = 300.0
     window: float = 30.0
-    least: float = 0.05
+    least: float = 0.15
 
     def __post_init__(self) -> None:
         check_options(self, LIMITS)
