@@ -29,20 +29,7 @@ from coopoc.study.numbers import three
 from coopoc.study.provenance import environment
 
 from .roads import road_row, roads
-from .tasks import (
-    BEST,
-    LOGGED,
-    POSES,
-    TASKS,
-    VALIDATION,
-    VERSION,
-    Task,
-    bound,
-    graph_row,
-    network_row,
-    pose_row,
-    recording,
-)
+from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, VERSION, Task, bound, graph_row, pose_row, recording
 
 SMOOTHERS = frozenset({"batch-smoother"})
 """Methods that see the whole drive, for which a filtering bound is none."""
@@ -169,8 +156,7 @@ def measured(name: str, data: Path) -> list[dict[str, Any]]:
     "mine.py:NAME" logs, or roads if it says `roads = True`."""
     if name in names("coopoc.backends"):
         files = tqdm(BEST, desc=name, unit="graph", delay=2.0)
-        rows = [_row(file, partial(graph_row, data, file, name)) for file in files]
-        return [*rows, _row("tiers_ros2", partial(network_row, data, name))]
+        return [_row(file, partial(graph_row, data, file, name)) for file in files]
     if name in POSES or (in_file(name) and not getattr(find("coopoc.methods", name), "roads", False)):
         made: Any = find("coopoc.methods", name)("nominal") if in_file(name) else name
         return [_row(task.name, partial(pose_row, task, data, made)) for task in LOGGED]

@@ -16,7 +16,6 @@ from coopoc import (
     V2X,
     Fleet,
     PoseFilter,
-    Problem,
     Recording,
     Sensors,
     load_fleet,
@@ -32,7 +31,6 @@ from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, past_bound, posteri
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.evaluate.statistics import mean_interval
-from coopoc.methods.poses.pose_start import at_ranges
 from coopoc.methods.track import Track
 from coopoc.world.outliers import Fault, Outliers
 from coopoc.world.spoofing import Spoofing, spoofed
@@ -272,49 +270,6 @@ def graph_row(folder: Path, file: str, backend: str) -> dict[str, Any]:
     seconds = solution.build_seconds + solution.solve_seconds
     row = {"task": path.name, "data": hashed(path), "status": solution.status.name, "cost": round(solution.cost, 4)}
     return row | {"over_best": round(solution.cost / BEST[path.name], 5), "seconds": round(seconds, 3)}
-
-
-NETWORK, KNOWN = "test1_0.db3", ("1", "2", "4")
-"""File of seven robots that stand and range one another, and those whose places are known, so that nothing is left to
-turn or mirror."""
-
-
-def network_row(folder: Path, backend: str) -> dict[str, Any]:
-    """RT-LE m of robots that stand, from the medians of the ranges of each pair, over the robots: as measured, and less
-    the offset that ranges between the known robots show."""
-    from rosbags.highlevel import AnyReader
-    from rosbags.typesys import Stores, get_typestore
-
-    path, made = located(folder, NETWORK), dict[str, list[Any]]()
-    with AnyReader([path.parent], default_typestore=get_typestore(Stores.ROS2_HUMBLE)) as reader:
-        for topic, _, raw in reader.messages():
-            m: Any = reader.deserialize(raw, topic.msgtype)
-            name = "".join(sorted(c for c in topic.topic if c.isdigit()))
-            made.setdefault(name, []).append(getattr(m, "range", None) or [m.pose.position.x, m.pose.position.y])
-    places = {name: np.median(values, axis=0) for name, values in made.items() if len(name) == 1}
-    pairs = [tuple(name) for name in made if len(name) == 2 and set(name) <= set(places)]
-    measured = np.array([np.median(made["".join(pair)]) for pair in pairs])
-    among = [set(pair) <= set(KNOWN) for pair in pairs]
-    true = np.array([np.linalg.norm(places[a] - places[b]) for a, b in pairs])
-    free, levels, seconds = [name for name in places if name not in KNOWN], list[Any](), 0.0
-    problem = Problem(tuple(places), dimension=2).add("position", KNOWN, [places[name] for name in KNOWN], std=1e-3)
-    centres = np.array([[*places[name], 0.0] for name in KNOWN])[None]
-    for offset in (0.0, float(np.mean((measured - true)[among]))):
-        less = dict(zip(map(frozenset, pairs), measured - offset, strict=True))
-        start = [
-            places[name]
-            if name in KNOWN
-            else at_ranges(centres, np.array([less[frozenset({name, k})] for k in KNOWN]))[0, :2]
-            for name in places
-        ]
-        whole = replace(problem, x0=np.array(start)).add("range", pairs, (measured - offset)[:, None], std=RANGE_STD)
-        solution = solve(whole, backend)
-        gaps = [np.linalg.norm(solution.x[[*places].index(name)] - places[name]) for name in free]
-        level, seconds = mean_interval(np.array([gaps])), seconds + solution.solve_seconds
-        levels.append([round(value, 4) for value in (level.mean, level.low, level.high)])
-    row: dict[str, Any] = {"task": "tiers_ros2", "data": hashed(path), "status": solution.status.name}
-    row |= {"rt_le_m": levels[0], "calibrated_m": levels[1], "received_bytes_per_second": 0}
-    return row | {"microseconds_per_step": round(1e6 * seconds, 2)}
 
 
 def planar(track: Track, fleet: Fleet) -> tuple[Floats, Floats]:

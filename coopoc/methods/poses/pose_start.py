@@ -145,7 +145,7 @@ SHARP = 0.1
 """m, of landmarks beside a line, below which ranges leave the side open."""
 
 
-def at_ranges(centres: Floats, ranges: Floats) -> Floats:
+def _at_ranges(centres: Floats, ranges: Floats) -> Floats:
     """(A, 3) m, points at these ranges (n,) from centres (A, n, 3), in the plane: the difference of two squared ranges
     is linear in the point."""
     middle = centres.mean(axis=1, keepdims=True)
@@ -175,7 +175,7 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, known:
         if np.linalg.matrix_rank(apart[:, :2], SHARP) > 1:
             moved = np.broadcast_to(way[recording.links.step[links[first]]], (len(angles), len(first), 3))
             centres = known[first] - turned(moved, angles[:, None])
-            return np.column_stack([at_ranges(centres, relative[first, 0]), angles])
+            return np.column_stack([_at_ranges(centres, relative[first, 0]), angles])
         given = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
         allowed = (
             "must hold a fix, or a range and bearing of a landmark or of a vehicle whose pose is found, or three ranges"
