@@ -11,17 +11,20 @@ import pymap3d
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
 
-from .log.units import Rows, Summary, rows_of
+from .log.units import Rows, Summary, of_kinds
 from .nmea import SLOW
 
-FIXES, SPEED, TRUTH = "processed_log/GNSS/live_gnss_ublox/", "processed_log/CAN/speed/", "global_pose/frame_"
-"""Arrays of a segment; others are not read."""
-PLACE = ("latitude", "longitude", "height")
+PARTS = {
+    ("processed_log/GNSS/live_gnss_ublox/value", "t"): "latitude longitude fast utc height compass_deg",
+    ("processed_log/CAN/speed/value", "t"): "speed",
+    ("global_pose/frame_positions", "frame_times"): "x y z",
+}
+"""Array and that of its times beside it -> names of its columns; others are not read."""
 
 
 def is_segment(path: Path) -> bool:
     """Whether a folder is a segment."""
-    return (path / FIXES / "value").is_file()
+    return (path / next(iter(PARTS))[0]).is_file()
 
 
 def read_segment(path: Path, summary: Summary) -> Rows:
@@ -35,33 +38,34 @@ def read_segment(path: Path, summary: Summary) -> Rows:
     Raises:
         InputError: an array that is missing, damaged, of another shape or without finite numbers.
     """
-    at, latitude, longitude, speed, _, height, course = _arrays(path, f"{FIXES}t", f"{FIXES}value", 6)
-    when, driven = _arrays(path, f"{SPEED}t", f"{SPEED}value", 1)
-    true_t, *ecef = _arrays(path, f"{TRUTH}times", f"{TRUTH}positions", 3)
+    tables = []
+    for (name, times), columns in PARTS.items():
+        table, t = (_array(path, part) for part in (name, str(Path(name).with_name(times))))
+        if (shape := (len(t), len(columns.split()))) != table.shape or t.shape[1] > 1:
+            raise InputError(
+                f"{path.name}/{name}", f"{table.shape}", f"must be {shape}, as its times", "Copy it again."
+            )
+        tables.append(pd.DataFrame(table, columns=columns.split()).assign(t=t))
+    fixes, _, true = tables
+    fixes.loc[fixes["fast"] < SLOW, "compass_deg"] = np.nan
     summary.assume("the heading is the course that the receiver states while it moves")
-    columns = [(at, *row, 0.0) for row in zip(PLACE, (latitude, longitude, height), strict=True)]
-    columns += [(true_t, *row, 1.0) for row in zip(PLACE, pymap3d.ecef2geodetic(*ecef), strict=True)]
-    columns += [(when, "speed", driven, 0.0), (at[speed > SLOW], "compass_deg", course[speed > SLOW], 0.0)]
-    rows = [pd.DataFrame({"t": t, "kind": kind, "value": value, "true": true}) for t, kind, value, true in columns]
-    return rows_of(pd.concat(rows, ignore_index=True).assign(vehicle=path.name), path.name)
+    names = ("latitude", "longitude", "height")
+    degrees = pymap3d.ecef2geodetic(*true[[*"xyz"]].to_numpy().T)
+    tables[2] = true[["t"]].assign(true=1.0, **dict(zip(names, degrees, strict=True)))
+    return of_kinds(pd.concat(tables, ignore_index=True).assign(vehicle=path.name), path.name)
 
 
-def _arrays(path: Path, times: str, values: str, columns: int) -> list[Floats]:
-    """Times (M,) and the columns (M,) of an array."""
-    read = list[Floats]()
-    for name in (times, values):
-        try:
-            with (path / name).open("rb") as file:
-                if file.read(6) != b"\x93NUMPY":
-                    raise ValueError("no NumPy array")
-            array = np.array(np.load(path / name, mmap_mode="r"), dtype=float)  # a header may claim more than there is
-        except (OSError, ValueError, TypeError, OverflowError, SyntaxError) as error:
-            given = next(iter(str(error).splitlines()), type(error).__name__)[:200]
-            raise InputError(f"{path.name}/{name}", given, "must be an array of numpy.save", "Copy it again.") from None
-        wanted = (len(array) if array.ndim and not read else len(read[0]) if read else 1,)
-        wanted += (columns,) * len(read)
-        if array.shape != wanted or not array.size or not np.isfinite(array).all():
-            allowed = f"must be {wanted}, all finite numbers"
-            raise InputError(f"{path.name}/{name}", f"an array {array.shape}", allowed, "Copy it again.")
-        read += [*array.T] if read else [array]
-    return read
+def _array(path: Path, name: str) -> Floats:
+    """(M, columns) finite numbers, M > 0."""
+    try:
+        with (path / name).open("rb") as file:
+            if file.read(6) != b"\x93NUMPY":
+                raise ValueError("no NumPy array")
+        array = np.array(np.load(path / name, mmap_mode="r"), dtype=float)  # a header may claim more than there is
+        array = array.reshape(len(array), -1)
+        if not np.isfinite(array).all():
+            raise ValueError("numbers that are not finite")
+    except (OSError, ValueError, TypeError, OverflowError, SyntaxError) as error:
+        given = next(iter(str(error).splitlines()), type(error).__name__)[:200]
+        raise InputError(f"{path.name}/{name}", given, "must be an array of numpy.save", "Copy it again.") from None
+    return array

@@ -9,9 +9,10 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
+from coopoc.errors import InputError
 from coopoc.formats.values import read_words, to_numbers
 
-from .log.units import BLANK, Rows, Summary, rows_of
+from .log.units import Rows, Summary, of_kinds
 
 FORMS = {
     "range2": "t range range_cov x y partner",
@@ -42,12 +43,12 @@ def read_librsf(path: Path, summary: Summary, **_: Any) -> Rows:
         summary: counts the lines with other tags.
 
     Raises:
-        InputError: a line that does not have its form.
+        InputError: a line that does not have its form, no line with a tag.
     """
     every, vehicle = dict[str, dict[int, list[str]]](), re.sub("_(input|gt)$", "", path.stem, flags=re.IGNORECASE)
     for number, (tag, *words) in read_words(path):
         every.setdefault(tag, {})[number] = words
-    parts = [pd.DataFrame()]
+    parts = list[pd.DataFrame]()
     for tag, lines in every.items():
         if tag not in FORMS:
             summary.leave(f"{path.name}: lines {tag}", len(lines))
@@ -60,16 +61,14 @@ def read_librsf(path: Path, summary: Summary, **_: Any) -> Rows:
             both, track = f["first_cov"] + f["second_cov"], 2 * f["half_track"]
             f = f.assign(speed=(f["first"] + f["second"]) / 2, yaw_rate=(f["second"] - f["first"]) / track)
             f = f.assign(speed_cov=both / 4, yaw_rate_cov=both / track**2)
+        f = f.assign(**{f"{name[:-3]}std": f[name].clip(0) ** 0.5 for name in f if name.endswith("_cov")})
         if "partner" in f:
             f["partner"] = f["partner"].map("{:g}".format)
             anchors = f.drop(columns="range").assign(vehicle=f["partner"], partner="", t=np.nan)
-            parts += _rows(anchors.drop_duplicates(anchors.columns.intersection(["vehicle", *"xyz"])))
+            parts.append(anchors.drop_duplicates(["vehicle", "x", "y"]))
             f = f.drop(columns=[*"xyz"], errors="ignore")
-        parts += _rows(f)
-    return rows_of(pd.concat(parts), path.name)
-
-
-def _rows(f: pd.DataFrame) -> list[pd.DataFrame]:
-    known, kinds = f[f.columns.intersection([*BLANK])], f.columns.intersection(["range", "speed", "yaw_rate", *"xyz"])
-    variance = {kind: f.get(f"{kind}_cov", pd.Series(np.nan, f.index)) for kind in kinds}
-    return [known.assign(kind=kind, value=f[kind], std=variance[kind].clip(0) ** 0.5) for kind in kinds]
+        parts.append(f)
+    if not parts:
+        allowed = f"must hold lines that begin with {', '.join(FORMS)}"
+        raise InputError(path.name, "none of them", allowed, "Check that this is the file you meant.")
+    return of_kinds(pd.concat(parts), path.name)
