@@ -36,6 +36,7 @@ from .cooperative_state import (
     Filter,
     Guards,
     Model,
+    Sent,
     begin,
     copy_filter,
     distrust,
@@ -62,7 +63,7 @@ from .relative import Five, angle
 
 @compiled
 def run_filter(
-    seen: Measurements, assumed: Assumptions, moved: Floats, known: Model, guards: Guards
+    seen: Measurements, assumed: Assumptions, sent: Sent, known: Model, guards: Guards
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; weights of the ego's fix (R, T), and by link
     (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the neighbour is trusted.
@@ -72,8 +73,8 @@ def run_filter(
 
     Args:
         seen: measurements and messages of the ego.
-        assumed: process noise, and the variances of fixes and of positions in messages.
-        moved: (R, T, N, 3) m, sum of all motions until each step.
+        assumed: process noise, and the variance of fixes.
+        sent: in messages.
         known: noise model.
         guards: against what may be wrong.
     """
@@ -92,7 +93,7 @@ def run_filter(
             gather_own(own, seen, assumed, known.white, run, t)
             for i in range(count):
                 who[i] = seen.neighbour[first + i]
-                gather_neighbour(rows, seen, assumed, moved, run, t, first + i, i)
+                gather_neighbour(rows, seen, assumed, sent, run, t, first + i, i)
             if math.isnan(own[MOTION]) or (f.g.vectors[0] == 0 and math.isnan(own[FIX])):
                 pause(f, own[DT])
                 copy_filter(f, older)
@@ -170,7 +171,7 @@ def gather_neighbour(
     rows: Floats,
     seen: Measurements,
     assumed: Assumptions,
-    moved: Floats,
+    sent: Sent,
     run: int,
     t: int,
     link: int,
@@ -179,25 +180,25 @@ def gather_neighbour(
     """The measurement of a neighbour, and the newest message held."""
     for c in range(5):
         rows[i, c] = seen.relative[run, link, c]
-    j, sent = seen.neighbour[link], seen.newest[run, link]
-    rows[i, AGE] = (t - sent) * seen.dt if sent >= 0 else -1.0
-    if sent < 0:
+    j, when = seen.neighbour[link], seen.newest[run, link]
+    rows[i, AGE] = (t - when) * seen.dt if when >= 0 else -1.0
+    if when < 0:
         return
-    u = seen.velocity[run, sent, j]
+    u = seen.velocity[run, when, j]
     q = process_variance(assumed.motion, u, seen.dt)
     for c in range(3):
-        rows[i, SOLO + c] = seen.broadcast[run, sent, j, c]
-        rows[i, SOLO_VARIANCE + c] = number(assumed.broadcast, run, sent, j, c)
-        rows[i, ODOMETER + c] = number(moved, run, sent, j, c)
+        rows[i, SOLO + c] = number(sent.position, j, run, when, c)
+        rows[i, SOLO_VARIANCE + c] = number(sent.variance, j, run, when, c)
+        rows[i, ODOMETER + c] = number(sent.odometer, j, run, when, c)
         rows[i, SPEED + c] = u[c]
-        rows[i, TYPICAL + c] = number(assumed.fixes, run, sent, j, c)
-        rows[i, STEP + c] = q[c] + number(assumed.process, run, sent, j, c)
+        rows[i, TYPICAL + c] = number(assumed.fixes, run, when, j, c)
+        rows[i, STEP + c] = q[c] + number(assumed.process, run, when, j, c)
 
 
 @copied
-def number(values: Floats, run: int, t: int, member: int, c: int) -> float:
-    """One of what is broadcastable to (R, T, N, 3)."""
-    a, b, d = min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(member, values.shape[2] - 1)
+def number(values: Floats, i: int, j: int, k: int, c: int) -> float:
+    """One of what is broadcastable to four axes."""
+    a, b, d = min(i, values.shape[0] - 1), min(j, values.shape[1] - 1), min(k, values.shape[2] - 1)
     return float(values[a, b, d, min(c, values.shape[3] - 1)])
 
 

@@ -13,6 +13,7 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import copied, part, storage
+from ..compiling.vectors import LANES, put, take
 from ..dead_reckoning import ROUNDING
 from .gaussian import (
     ABSENT,
@@ -89,6 +90,20 @@ class Guards(NamedTuple):
 
 
 NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, slip=0.0, trust=0.0, memory=0.0, acceleration=0.0)
+
+
+class Sent(NamedTuple):
+    """What is in the messages; arrays are broadcastable to (N, R, T, 3), the vehicles first.
+
+    Attributes:
+        position: m.
+        variance: m^2.
+        odometer: m, sum of all motions until each step.
+    """
+
+    position: Floats
+    variance: Floats
+    odometer: Floats
 
 
 class Model(NamedTuple):
@@ -210,8 +225,8 @@ def copy_filter(source: Filter, target: Filter) -> None:
             target.hits[k, c] = source.hits[k, c]
     for j in range(len(source.slot)):
         target.slot[j] = source.slot[j]
-        for i in range(STATUS):
-            target.status[j, i] = source.status[j, i]
+    for i in range(len(source.slot) * STATUS // LANES):
+        put(target.status, i, take(source.status, i))
 
 
 @part
