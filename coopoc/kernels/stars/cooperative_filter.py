@@ -47,7 +47,6 @@ from .cooperative_state import (
 from .gaussian import (
     COMPASS,
     PLACE,
-    Rows,
     copy_moments,
     correct,
     expect,
@@ -57,8 +56,8 @@ from .gaussian import (
     weight,
     widen,
 )
-from .messages import Assumptions, Measurements
-from .relative import Five, angle
+from .messages import Assumptions, Measurements, three_of
+from .relative import angle
 
 
 @compiled
@@ -156,26 +155,17 @@ def write(
 @copied
 def gather_own(own: Floats, seen: Measurements, assumed: Assumptions, white: Floats, run: int, t: int) -> None:
     """The ego's fix and motion at a step."""
-    u = seen.velocity[run, t, seen.ego]
-    q = process_variance(assumed.motion, u, seen.dt)
+    u, r = seen.velocity[run, t, seen.ego], three_of(assumed.fixes, run, t, seen.ego)
+    q, more = process_variance(assumed.motion, u, seen.dt), three_of(assumed.process, run, t, seen.ego)
     own[DT] = seen.dt
     for c in range(3):
-        own[FIX + c] = seen.gnss[run, t, seen.ego, c]
-        own[FIX_VARIANCE + c] = number(assumed.fixes, run, t, seen.ego, c) * white[c]
-        own[MOTION + c] = seen.dt * u[c]
-        own[MOTION_VARIANCE + c] = q[c] + number(assumed.process, run, t, seen.ego, c)
+        own[FIX + c], own[FIX_VARIANCE + c] = seen.gnss[run, t, seen.ego, c], r[c] * white[c]
+        own[MOTION + c], own[MOTION_VARIANCE + c] = seen.dt * u[c], q[c] + more[c]
 
 
 @copied
 def gather_neighbour(
-    rows: Floats,
-    seen: Measurements,
-    assumed: Assumptions,
-    sent: Sent,
-    run: int,
-    t: int,
-    link: int,
-    i: int,
+    rows: Floats, seen: Measurements, assumed: Assumptions, sent: Sent, run: int, t: int, link: int, i: int
 ) -> None:
     """The measurement of a neighbour, and the newest message held."""
     for c in range(5):
@@ -184,22 +174,16 @@ def gather_neighbour(
     rows[i, AGE] = (t - when) * seen.dt if when >= 0 else -1.0
     if when < 0:
         return
-    u = seen.velocity[run, when, j]
-    q = process_variance(assumed.motion, u, seen.dt)
+    u, fix = seen.velocity[run, when, j], three_of(assumed.fixes, run, when, j)
+    q, more = process_variance(assumed.motion, u, seen.dt), three_of(assumed.process, run, when, j)
+    x, p, s = (
+        three_of(sent.position, j, run, when),
+        three_of(sent.variance, j, run, when),
+        three_of(sent.odometer, j, run, when),
+    )
     for c in range(3):
-        rows[i, SOLO + c] = number(sent.position, j, run, when, c)
-        rows[i, SOLO_VARIANCE + c] = number(sent.variance, j, run, when, c)
-        rows[i, ODOMETER + c] = number(sent.odometer, j, run, when, c)
-        rows[i, SPEED + c] = u[c]
-        rows[i, TYPICAL + c] = number(assumed.fixes, run, when, j, c)
-        rows[i, STEP + c] = q[c] + number(assumed.process, run, when, j, c)
-
-
-@copied
-def number(values: Floats, i: int, j: int, k: int, c: int) -> float:
-    """One of what is broadcastable to four axes."""
-    a, b, d = min(i, values.shape[0] - 1), min(j, values.shape[1] - 1), min(k, values.shape[2] - 1)
-    return float(values[a, b, d, min(c, values.shape[3] - 1)])
+        rows[i, SOLO + c], rows[i, SOLO_VARIANCE + c], rows[i, ODOMETER + c] = x[c], p[c], s[c]
+        rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c] + more[c], fix[c]
 
 
 @copied
@@ -355,43 +339,37 @@ def first_pass(f: Filter, known: Model, guards: Guards, rows: Floats, members: i
 
 @copied
 def relate(f: Filter, known: Model, guards: Guards, rows: Floats, k: int, exact: int) -> bool:
-    """Rows of the measurement of member k; False if its geometry is not known."""
-    g, h, row = f.g, f.h, f.row[k]
+    """Rows of range, azimuth and inclination of member k, in metres; False if its geometry is not known.
+
+    Args:
+        f: filter; the rows are linear at `at`.
+        known: noise model.
+        guards: for their gate.
+        rows: measurements.
+        k: slot.
+        exact: 1 for range and angles themselves, 0 for the measured vector along their directions.
+    """
+    g, h, row, std = f.g, f.h, f.row[k], known.std
     if not measured_whole(rows, row) and f.vague[k] > 0.0:
         return False
     x, y, z = f.at[k, 0] - f.at[0, 0], f.at[k, 1] - f.at[0, 1], f.at[k, 2] - f.at[0, 2]
-    seen = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
-    relative_rows(h, x, y, z, seen, known.std, known.min_range, exact)
-    for c in range(3):
-        h.gate[c] = guards.gate
-    h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]
-    h.terms[0] = 3 if has(g, 0, COMPASS) else 2
-    return True
-
-
-@copied
-def relative_rows(h: Rows, x: float, y: float, z: float, seen: Five, std: Floats, least: float, exact: int) -> None:
-    """Rows of range, azimuth and inclination, in metres, of the neighbour, the ego and the compass's two errors.
-
-    Args:
-        h: rows that are filled.
-        x: m, the vector to the neighbour where the rows are linear.
-        y: m.
-        z: m.
-        seen: `relative.five`.
-        std: (3,) m, rad, rad, or of no length for 1 m each.
-        least: m, least distance at which an angle's error counts.
-        exact: 1 for range and angles themselves, 0 for the measured vector along their directions.
-    """
-    d, sa, ca, si, ci = seen
+    d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
     ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
-    reach = max(far, least)
+    reach = max(far, known.min_range)
     flat = max(ground, 1e-3 * reach)
     h.used[0], h.used[1], h.used[2] = d >= 0.0, sa != 0.0 or ca != 0.0, si != 0.0 or ci != 0.0
     length = far if exact == 0 else reach
-    along, side = (x / far, y / far, z / far), (-y / flat, x / flat, 0.0)
-    up = x * z / (flat * length), y * z / (flat * length), -flat / length
-    w = *along, *side, *up
+    w = (
+        x / far,
+        y / far,
+        z / far,
+        -y / flat,
+        x / flat,
+        0.0,
+        x * z / (flat * length),
+        y * z / (flat * length),
+        -flat / length,
+    )
     if exact == 0:
         d = d if h.used[0] else far
         if not h.used[1]:
@@ -401,16 +379,18 @@ def relative_rows(h: Rows, x: float, y: float, z: float, seen: Five, std: Floats
         store(h.z, 0, apply(w, (d * si * ca, d * si * sa, d * ci)))
         turn, azimuth_std = ground, reach * ground / far
     else:
-        azimuth, inclination = (
-            angle(sa * x - ca * y, ca * x + sa * y),
-            angle(si * z - ci * ground, ci * z + si * ground),
-        )
+        turned = angle(sa * x - ca * y, ca * x + sa * y)
+        raised = angle(si * z - ci * ground, ci * z + si * ground)
         _, b, c = apply(w, (x, y, z))
-        store(h.z, 0, (d, azimuth * flat + b, inclination * reach + c))
+        store(h.z, 0, (d, turned * flat + b, raised * reach + c))
         turn = azimuth_std = flat
     a, b, c = (std[0], std[1] * azimuth_std, std[2] * reach) if len(std) else (1.0, 1.0, 1.0)
     store(h.variance, 0, (a * a, b * b, c * c))
-    o = 0.0
     store(h.weight, 0, w)
     store(h.weight, 1, negate(w))
-    store(h.weight, 2, (o, o, o, turn, turn, o, o, o, o))
+    store(h.weight, 2, (0.0, 0.0, 0.0, turn, turn, 0.0, 0.0, 0.0, 0.0))
+    for c in range(3):
+        h.gate[c] = guards.gate
+    h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]
+    h.terms[0] = 3 if has(g, 0, COMPASS) else 2
+    return True

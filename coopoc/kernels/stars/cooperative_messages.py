@@ -245,7 +245,7 @@ def wrong_on_average(f: Filter, known: Model, guards: Guards, k: int, q: float) 
     """Whether the mean of a vehicle's innovations, each clipped, is likelier with another error of its fixes than is
     assumed; or, where that error is being estimated, with the last one alone."""
     h, status, j = f.h, f.status, f.vehicle[k]
-    mean, s = status[j, MEAN : MEAN + 3], h.square[0]
+    mean, s = status[j, MEAN : MEAN + 3], h.square
     status[j, COUNT] = count = min(status[j, COUNT] + 1.0, guards.window)
     if status[j, TRUSTED] == 0.0 and q > guards.fix_gate:
         return True
@@ -271,7 +271,7 @@ def trust(f: Filter, known: Model, guards: Guards) -> None:
 
     The odds p(b = 0 | all) / p(b = 0) of a Gaussian b are by Bayes' rule those of the two hypotheses.
     """
-    g, h, s, x = f.g, f.h, f.h.square[0], f.h.gap
+    g, h, s, x = f.g, f.h, f.h.square, f.h.gap
     wide, narrow, unit = guards.tau**2 + known.own, 0.0, guards.tau**2
     if known.own > 0.0:
         narrow = 1.0 / (1.0 / known.own - 1.0 / wide)

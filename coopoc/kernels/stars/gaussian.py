@@ -14,7 +14,18 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import copied, part, storage
-from ..compiling.small import less_applied, load, plus_applied, scale, store
+from ..compiling.small import (
+    inverse,
+    less_applied,
+    less_transposed_product,
+    load,
+    minus_apply,
+    minus_product,
+    plus_applied,
+    scale,
+    store,
+    transpose,
+)
 from ..compiling.vectors import LANES, less, plus, put, take
 from .messages import BLOCK, ROW
 
@@ -64,7 +75,7 @@ class Rows(NamedTuple):
         cov: (9,) out: H P H^T.
         gain: (3 size,) out: columns of the square root of what the update takes from P.
         white: (3,) out: whitened innovations.
-        square: (2, 3, 3) scratch.
+        square: (3, 3) scratch.
     """
 
     z: Floats
@@ -107,7 +118,7 @@ def new_rows(members: int) -> Rows:
         np.zeros(9),
         np.zeros(36 * (1 + KINDS * members // 4)),
         np.zeros(3),
-        np.zeros((2, 3, 3)),
+        np.zeros((3, 3)),
     )
 
 
@@ -233,17 +244,12 @@ def update(g: Gaussian, h: Rows, gate: float) -> None:
 
 
 @copied
-def innovate(g: Gaussian, h: Rows) -> float:
-    """Decorrelate each row from those before it, and gate it; squared Mahalanobis distance of the three.
-
-    `gain` is U = P H^T L^-T, S = L L^T the innovation's covariance. Where the squared normalised innovation q of a row
-    exceeds its gate, its variance is multiplied by q / gate, and by 100 more where it exceeds REJECTED times the gate.
-    """
+def project(g: Gaussian, h: Rows) -> None:
+    """Innovations z - H x, H P in place of `gain`, and H P H^T."""
     gain, wide, third = h.gain, len(g.x) // LANES, len(g.x) // 3
-    lanes = (3 * g.vectors[0] + LANES - 1) // LANES
     for k in range(h.terms[0]):
         i, w = 3 * h.block[k] * wide, load(h.weight, k, BLOCK)
-        for j in range(lanes):
+        for j in range((3 * g.vectors[0] + LANES - 1) // LANES):
             a, b, c = take(g.p, i + j), take(g.p, i + wide + j), take(g.p, i + 2 * wide + j)
             d, e, f = w[0] * a, w[3] * a, w[6] * a
             if k > 0:
@@ -260,15 +266,26 @@ def innovate(g: Gaussian, h: Rows) -> float:
         three = plus_applied(three, w, load(gain, 2 * third + b, ROW))
     store(h.gap, 0, gap)
     store(h.cov, 0, (*one, *two, *three))
-    x, d = whitened(h, 0, gap[0], h.variance[0] + one[0])
-    s = one[1] * d
-    y, e = whitened(h, 1, gap[1] - s * x, h.variance[1] + two[1] - s * s)
+
+
+@copied
+def innovate(g: Gaussian, h: Rows) -> float:
+    """Decorrelate each row from those before it, and gate it; squared Mahalanobis distance of the three.
+
+    `gain` is U = P H^T L^-T, S = L L^T the innovation's covariance. Where the squared normalised innovation q of a row
+    exceeds its gate, its variance is multiplied by q / gate, and by 100 more where it exceeds REJECTED times the gate.
+    """
+    project(g, h)
+    gain, wide, gap, cov = h.gain, len(g.x) // LANES, load(h.gap, 0, ROW), load(h.cov, 0, BLOCK)
+    x, d = whitened(h, 0, gap[0], h.variance[0] + cov[0])
+    s = cov[1] * d
+    y, e = whitened(h, 1, gap[1] - s * x, h.variance[1] + cov[4] - s * s)
     a = -e * s * d
-    s, t = one[2] * d, two[2] * e + one[2] * a
-    z, f = whitened(h, 2, gap[2] - s * x - t * y, h.variance[2] + three[2] - s * s - t * t)
+    s, t = cov[2] * d, cov[5] * e + cov[2] * a
+    z, f = whitened(h, 2, gap[2] - s * x - t * y, h.variance[2] + cov[8] - s * s - t * t)
     b, c = -f * (s * d + t * a), -f * t * e
     store(h.white, 0, (x, y, z))
-    for j in range(lanes):
+    for j in range((3 * g.vectors[0] + LANES - 1) // LANES):
         p, q, r = take(gain, j), take(gain, wide + j), take(gain, 2 * wide + j)
         put(gain, j, d * p)
         put(gain, wide + j, plus(e * q, a, p))
@@ -314,43 +331,25 @@ def settle(g: Gaussian, h: Rows, member: int, flat: float) -> None:
     With z = A x + B y + w the position is A^-1 (z - B y - w), which is put into the state as another vector; that both
     are the same but for N(0, flat) is then the measurement, and the vector replaces the position.
     """
-    place, terms, a, inverse = g.block[member, PLACE], h.terms[0], h.square[0], h.square[1]
-    n, size, new = 3 * g.vectors[0], len(g.x), insert(g, member, FRESH, 0.0)
+    place, n, b = g.block[member, PLACE], 3 * g.vectors[0], BLOCK
+    for k in range(h.terms[0]):
+        if h.block[k] == place:
+            a = load(h.weight, k, BLOCK)
+            b = minus_product(inverse(less_transposed_product(BLOCK, a, a)), transpose(a))
+            store(h.weight, k, BLOCK)
+    for k in range(h.terms[0]):
+        store(h.weight, k, minus_product(b, load(h.weight, k, BLOCK)))
+    store(h.z, 0, minus_apply(b, load(h.z, 0, ROW)))
+    project(g, h)
+    new = insert(g, member, FRESH, 0.0)
     for c in range(3):
-        h.white[c] = h.z[c]
+        g.x[new + c] = -h.gap[c]
         for j in range(n):
-            h.gain[c * size + j] = 0.0
-        for i in range(3 * terms):
-            b, at = h.block[i // 3], 9 * (i // 3) + 3 * c + i % 3
-            w, k = h.weight[at], 3 * b + i % 3
-            if b == place:
-                a[c, i % 3], h.weight[at] = w, 0.0
-                continue
-            h.white[c] -= w * g.x[k]
-            for j in range(n):
-                h.gain[c * size + j] -= w * g.p[k, j]
-    for c in range(3):
-        i, k = (c + 1) % 3, (c + 2) % 3
+            g.p[new + c, j] = g.p[j, new + c] = h.gain[c * len(g.x) + j]
         for d in range(3):
-            j, m = (d + 1) % 3, (d + 2) % 3
-            inverse[d, c] = a[i, j] * a[k, m] - a[i, m] * a[k, j]
-    det = a[0, 0] * inverse[0, 0] + a[0, 1] * inverse[1, 0] + a[0, 2] * inverse[2, 0]
-    for c in range(3):
-        for d in range(3):
-            inverse[c, d] /= det
-            a[c, d] = h.variance[c] if c == d else 0.0
-            for i in range(3 * terms):
-                a[c, d] -= h.weight[9 * (i // 3) + 3 * c + i % 3] * h.gain[d * size + 3 * h.block[i // 3] + i % 3]
-    for c in range(3):
-        for k in range(3):
-            g.x[new + c] += inverse[c, k] * h.white[k]
-            for j in range(n):
-                g.p[new + c, j] += inverse[c, k] * h.gain[k * size + j]
-            for d in range(3):
-                for m in range(3):
-                    g.p[new + c, new + d] += inverse[c, k] * a[k, m] * inverse[d, m]
-        for j in range(n):
-            g.p[j, new + c] = g.p[new + c, j]
+            g.p[new + c, new + d] = h.cov[3 * c + d]
+            for k in range(3):
+                g.p[new + c, new + d] += b[3 * c + k] * h.variance[k] * b[3 * d + k]
     term(h, 0, new // 3, 1.0)
     term(h, 1, place, -1.0)
     for c in range(3):
