@@ -70,7 +70,7 @@ def trained(data: str, until: float, gate: float, evaluations: int) -> dict[str,
         seen = [replace(first, observers=(first.ids.index(name),)) for name in alone.ids]
         own: list[Any] = [RoadFilter.fitted(one, truth).errors for one in seen]
         logs, whole = np.array([to_logs(one) for one in own]), RoadFilter.fitted(first, truth).errors
-        one_for_all: Any = from_logs(logs.mean(axis=0))
+        one_for_all: Any = from_logs(logs.mean(axis=0), 1.0)
     else:
         assert truth is not None
 
