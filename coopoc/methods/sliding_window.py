@@ -37,7 +37,7 @@ class FixedLagSmoother:
     + \sum_k \lVert h(\hat x^0_k) + H_k d_k - z_k \rVert^2_{R^{-1}}
     $$
 
-    with the points $\hat x^0$ of the step before, l = lag and the prior (x_a, P). At every step one Gauss-Newton step of
+    with the points $\hat x^0$ of the step before, l = lag, the prior (x_a, P). At every step one Gauss-Newton step of
     the window: its measurements are linearised anew at the smoothed points, the oldest step is eliminated into the
     prior of the next, and the newest point is the estimate: causal, and in a linear model the filter's own for every
     lag. A lag of 0 is JointFilter, but for measured ranges below `min_range`, whose
