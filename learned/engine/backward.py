@@ -132,7 +132,7 @@ def back(
 
 @part
 def correct_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index, gone: bool) -> None:
-    """`forward.correct` backwards: the gradient of gain, innovation and new states of a lane; without a fix it is zero."""
+    """`forward.correct` backwards: the gradient of gain, innovation and new states; without a fix it is zero."""
     columns, zero = net.columns, tape.dtype.type(0.0)
     gain, residual = columns[on.GAIN], columns[on.RESIDUAL]
     process, innovation, posterior = columns[on.PROCESS], columns[on.INNOVATION], columns[on.POSTERIOR]
