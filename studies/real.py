@@ -315,7 +315,7 @@ def _trade(results: Results) -> Plot | None:
     ]
     text = f"RT-LE against the bytes that a vehicle sends; what sends none is at the left. {BYTES}"
     caption = _caption(results, text.format(driven(results.settings)))
-    return figures.curves(results, panels, lines, caption, error, log=True, logx=True, merged=False)
+    return figures.curves(results, panels, lines, caption, error, log=True, logx=True)
 
 
 def _figure(results: Results) -> Plot | None:
@@ -412,5 +412,4 @@ STUDY = Study(
         "One drive: intervals over blocks of time do not extend to other vehicles or places.",
         "With one joint state a centre receives every measurement at its step; late messages are lost.",
     ),
-    minutes=6,
 )
