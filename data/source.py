@@ -1,4 +1,4 @@
-"""A data set, how to read it and which part of it in one word: "drive.csv?dt=0.1&columns=t:time,id:car&since=300"."""
+"""Parse a data set's name with options and its part: "drive.csv?dt=0.1&columns=t:time,id:car&since=300"."""
 
 from __future__ import annotations
 
