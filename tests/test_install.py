@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from shell import ran
 
 from coopoc.errors import MissingLibraryError
 
@@ -32,7 +33,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def outside(site: Path, tmp_path: Path, *command: str) -> str:
     """Output of a command run in an empty folder that sees the installed wheel first."""
     env = {**os.environ, "PYTHONPATH": str(site), "MYPYPATH": str(site)}
-    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+    done = ran(command, cwd=tmp_path, env=env)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
     return done.stdout
 
@@ -93,12 +94,9 @@ for words in (["train", "okf"], ["run", "neighbours", "--set", "method=okf", "ru
     except SystemExit as end:
         assert end.code == 2, (words, end.code)
 """
-    done = subprocess.run(
+    done = ran(
         [sys.executable, "-c", code],
         cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
     )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     assert "SOLVED" in done.stdout
@@ -134,7 +132,7 @@ for name, use in uses.items():
         print("another reason", name)
 main(["check"])
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = ran([sys.executable, "-c", code], cwd=tmp_path)
     assert done.returncode == 1
     assert "(1, 3, 1, 3)" in done.stdout
     refused = [line.split()[1] for line in done.stdout.splitlines() if line.startswith("refused")]

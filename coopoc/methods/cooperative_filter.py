@@ -110,7 +110,8 @@ class CooperativeFilter:
         def sent() -> Sent:
             if self.robust:
                 return broadcasts(recording, known, columns, guards)
-            return Sent(*(np.moveaxis(a, 2, 0).copy() for a in (recording.gnss, assumed.fixes)), NOTHING)
+            fixes, variance = (np.moveaxis(a, 2, 0).copy() for a in (recording.gnss, assumed.fixes))
+            return Sent(fixes, variance, NOTHING)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
             seen = measurements(recording, ego, box)
@@ -128,7 +129,7 @@ class CooperativeFilter:
                     notes.extend(rejected(what, count, of, 0.5 if kind == "trusted" else 0.05))
             yield Estimate(slice(None), x, cov, box.link, neighbours, extras)
 
-        return follow_egos(self, recording, egos, run, notes, missing=True)
+        return follow_egos(self, recording, egos, run, notes)
 
 
 def broadcasts(recording: Recording, known: NoiseModel, egos: Sequence[int], guards: Guards) -> Sent:

@@ -103,6 +103,7 @@ def read_log(
     kinds: Mapping[str, str] | None = None,
     ignore: Sequence[str] = (),
     scale: Mapping[str, float] | None = None,
+    offset: Mapping[str, float] | None = None,
     std: Mapping[str, float] | None = None,
     stamps: Stamps = "header",
     clock: Mapping[str, float] | None = None,
@@ -127,6 +128,8 @@ def read_log(
         kinds: names in a column kind, as {"uwb": "range"}.
         ignore: kinds that are left out; topics of a bag.
         scale: kind, or t -> factor to its unit here, as {"range": 0.001, "t": 1e-3} of mm and ms.
+        offset: kind in its unit here -> what all its measurements are too large by, as {"range": 0.4} of radios whose
+            delays are not calibrated.
         std: kind in SI units -> standard deviation of all its measurements, as {"range": 0.15, "x": 1.5}.
         stamps: times of a bag's messages: those of the headers, or those at which they were "received".
         clock: vehicle -> s by which its clock is ahead; it is subtracted from its stamps.
@@ -168,8 +171,8 @@ def read_log(
     }
     rows = _rows(path, truth, summary, {**options, "stamps": stamps})
     factor = factors(scale, ("t", *KINDS))
-    by_kind = rows["kind"].map(factor).fillna(1.0)
-    rows = rows.assign(value=by_kind * rows["value"], std=by_kind.abs() * rows["std"])
+    by_kind, less = rows["kind"].map(factor).fillna(1.0), rows["kind"].map(factors(offset, KINDS, "offset"))
+    rows = rows.assign(value=by_kind * rows["value"] - less.fillna(0.0), std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
     rows = unwrapped(rows, summary)
     check_values(rows)
