@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections import defaultdict
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -116,15 +115,11 @@ def plot_solution(solution: Solution, ax: Axes | None = None, *, problem: Proble
     if problem is not None:
         if instance("problem", problem, Problem).names != solution.names:
             raise InputError("problem", repr(problem), "must be the one that was solved", "Give it to both.")
-        kinds, alike = defaultdict[Any, dict[str, int]](dict), defaultdict[str, list[Any]](list)
-        for factor in problem.factors:
-            for nodes in np.sort(factor.nodes).tolist() if factor.nodes.shape[1] == 2 else ():
-                kinds[tuple(nodes)][factor.kind.replace("_", " ")] = 0
-        for nodes, named in kinds.items():
-            alike[", ".join(named)].append(nodes)
-        for k, (label, ends) in enumerate(alike.items()):
-            a, b = np.array(ends).T
-            pairs(ax, at[a], at[b], COLORS[(k + 1) % len(COLORS)], label)
+        between = [factor for factor in problem.factors if factor.nodes.shape[1] == 2]
+        kinds = list(dict.fromkeys(factor.kind for factor in between))
+        for k, kind in enumerate(kinds):  # the first are the widest: of one pair all show
+            a, b = np.concatenate([factor.nodes for factor in between if factor.kind == kind]).T
+            pairs(ax, at[a], at[b], COLORS[(k + 1) % len(COLORS)], kind.replace("_", " "), 1.2 * (len(kinds) - k))
         if few and problem.poses:
             poses = list(problem.poses)
             heading = solution.rotation[poses][:, :2, 0]
