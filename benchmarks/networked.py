@@ -9,6 +9,7 @@ the oracles of the tests hold the numbers.
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -29,8 +30,11 @@ JOBS = {
     "gbp": "nominal",
     "central-filter": "nominal",
     "central-filter, identity": "identity",
+    "joint, gates": "nominal",
+    "gbp, gates": "nominal",
+    "central-filter, gates": "nominal",
 }
-"""What is assumed of the noise, by the method's name and a word more."""
+"""What is assumed of the noise, by the method's name and a word more; only those with gates have any."""
 
 
 def measured(rounds: int = ROUNDS, steps: int = STEPS, runs: int = RUNS) -> list[dict[str, Any]]:
@@ -39,6 +43,8 @@ def measured(rounds: int = ROUNDS, steps: int = STEPS, runs: int = RUNS) -> list
     for name, known in JOBS.items():
         word = name.partition(",")[0]
         everyone, method = word in WHOLE_FLEET, METHODS[word](known)
+        if hasattr(method, "robust"):
+            method = replace(method, robust="gates" in name)
         channel, observers = co.V2X(max_neighbours=NEIGHBOURS), None if everyone else [EGO]
         recording = co.observe(fleet, co.Sensors.paper_scenario2(), channel, runs=runs, observers=observers)
         calls[name] = lambda method=method, recording=recording: method(recording, [EGO])

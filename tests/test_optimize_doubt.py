@@ -61,8 +61,8 @@ def test_losses_that_reject_start_by_graduation(name: str) -> None:
         free = replace(problem, factors=tuple(replace(f, loss=None) for f in problem.factors))
 
         def rows(v: np.ndarray, free: Problem = free, problem: Problem = problem) -> np.ndarray:
-            parts = free.linearise(v.reshape(1, 8, 3)).residual
-            square = np.concatenate([np.square(part[0]).sum(axis=-1) for part in parts])
+            parts = free.linearise(v.reshape(8, 3)).residual
+            square = np.concatenate([np.square(part).sum(axis=-1) for part in parts])
             return np.sqrt(problem.factors[0].loss.cost(square))
 
         assert found.cost <= least_squares(rows, truth.ravel()).cost * (1 + 1e-6)

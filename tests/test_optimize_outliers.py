@@ -75,7 +75,7 @@ def test_predictions_are_those_of_dense_algebra() -> None:
     marked = mark(problem, [candidate])
     x = np.asarray(problem.x0)
     distance, spread = predicted(problem, marked, np.zeros(len(candidate[1])), x)
-    linear = problem.linearise(x[None])
+    linear = problem.linearise(x)
     whole = problem.jacobian(linear).toarray()
     size = problem.factors[0].size
     rows: Ints = (size * np.array(candidate[1])[:, None] + np.arange(size)).ravel()
@@ -84,7 +84,7 @@ def test_predictions_are_those_of_dense_algebra() -> None:
     P = np.linalg.inv((known.T @ known)[np.ix_(moving, moving)])
     for k, row in enumerate(candidate[1]):
         J = whole[size * row : size * row + size][:, moving]
-        S, r = J @ P @ J.T + np.eye(size), linear.residual[0][0, row]
+        S, r = J @ P @ J.T + np.eye(size), linear.residual[0][row]
         assert distance[k] == pytest.approx(r @ np.linalg.solve(S, r), rel=1e-6)
         assert spread[k] == pytest.approx(np.log(np.linalg.det(S)), rel=1e-6)
 

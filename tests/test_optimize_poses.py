@@ -47,7 +47,7 @@ def everything(dimension: int, seed: int = 0, noise: float = 0.05) -> tuple[Prob
             problem = problem.add(kind, chosen, moved, std=np.full(size, 0.3))
             continue
         zero = problem.add(kind, chosen, np.full((len(nodes), size), 1.0), std=1.0, constants=constants or None)
-        h = zero.linearise(truth[None]).residual[-1][0] + 1.0
+        h = zero.linearise(truth).residual[-1] + 1.0
         measured = h + noise * rng.normal(size=h.shape)
         problem = problem.add(kind, chosen, measured, std=np.full(size, 0.3), constants=constants or None)
     return problem, truth

@@ -138,18 +138,7 @@ BAD = {
         "a and b coincide",
     ),
     "unobservable": (lambda: solve(Problem("ab").add("displacement", ("a", "b"), [5, 0, 0], std=1.0)), "move freely"),
-    "batch": (
-        lambda: solve(Problem("a").add("position", [["a"]], np.zeros((2, 1, 3)), std=1.0)),
-        "one after the other",
-    ),
-    "uneven batch": (
-        lambda: (
-            Problem("a")
-            .add("position", [["a"]], np.zeros((2, 1, 3)), std=1.0)
-            .add("position", [["a"]], np.zeros((3, 1, 3)), std=1.0)
-        ),
-        "must agree",
-    ),
+    "two runs": (lambda: Problem("a").add("position", "a", np.zeros((2, 1, 3)), std=1.0), "a problem for each run"),
 }
 
 
@@ -282,23 +271,6 @@ def test_what_is_missing_is_no_factor(incomplete: Recording, noise: NoiseModel |
             assert solve(replace(hand, x0=ours.x)).x == pytest.approx(ours.x, abs=1e-6)
             assert hand.cost(ours.x) == pytest.approx(ours.cost, rel=1e-9)
     assert solved >= 2
-
-
-@pytest.mark.parametrize("noise", [None, NoiseModel.identity()])
-def test_what_another_realisation_lacks_does_not_show(incomplete: Recording, noise: NoiseModel | None) -> None:
-    """Patterns of missing data differ from run to run; a run picked from all of them is its own problem."""
-    solved = 0
-    for step in (6, 12, 20):
-        every = Problem.from_window(incomplete, step, 5, 5, run=None, noise=noise)
-        for run in range(incomplete.runs):
-            alone = solve(Problem.from_window(incomplete, step, 5, 5, run, noise), throw=False)
-            picked = solve(every.pick(run), throw=False)
-            assert picked.status is alone.status
-            if alone.status is Status.SOLVED:
-                solved += 1
-                assert picked.x == pytest.approx(alone.x, abs=5e-7)
-                assert picked.covariance == pytest.approx(alone.covariance, rel=1e-7, abs=1e-7)
-    assert solved > 3
 
 
 @pytest.mark.parametrize("poses", [(), (1,), (0, 2)])

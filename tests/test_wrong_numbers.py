@@ -110,14 +110,11 @@ def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Flo
         velocity[run, step, sender] += 5e-3 * error
     given = replace(damaged(recording, kind, links), velocity=velocity) if kind else recording
     known = resolve("nominal", given)
-    sent, variance, moved = broadcasts(given, known, [EGO], method.guards)
-    sent = sent.copy()
+    sent = broadcasts(given, known, [EGO], method.guards)
     if kind in ("position", "odometer"):
-        (sent if kind == "position" else moved)[run, step, sender] += error
-    sent.flags.writeable = False
-    seen = measurements(given, EGO, inbox(given, EGO, method.message), sent)
-    assumed = assumptions(given, known)._replace(broadcast=variance)
-    x, cov = run_filter(seen, assumed, moved, model_of(known, True), method.guards)[:2]
+        getattr(sent, kind)[sender, run, step] += error
+    seen = measurements(given, EGO, inbox(given, EGO, method.message))
+    x, cov = run_filter(seen, assumptions(given, known), sent, model_of(known, True), method.guards)[:2]
     return x, np.sqrt(np.trace(cov, axis1=-2, axis2=-1))
 
 

@@ -14,7 +14,8 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from ..arrays import Floats, Ints
-from .compiling.compile import compiled, part
+from .compiling.compile import compiled, inside, part
+from .compiling.small import load, store
 from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
 from .gate import REJECTED, SLIP, count, inflation
 from .motion import MotionNoise, process_variance
@@ -24,6 +25,8 @@ LEAST = 1e-4
 NEVER = (0.0, 0.0, 0.0)
 """m^2, what fixes that are not late have more."""
 AxisState: TypeAlias = tuple[float, float, float, float, float, float]
+STATE: AxisState = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""Its length is the count that `load` takes."""
 Vector: TypeAlias = tuple[float, float, float]
 
 
@@ -63,7 +66,7 @@ class SoloMeasurements(NamedTuple):
     dt: float
 
 
-@part
+@inside
 def start_state(x: float, late: float, exact: bool, variance: float, weight: float) -> AxisState:
     """State at a position that is known exactly, or as uncertain as a fix."""
     if exact:
@@ -73,23 +76,27 @@ def start_state(x: float, late: float, exact: bool, variance: float, weight: flo
     return x, 1.0, late, variance, weight, 0.0
 
 
-@part
+@inside
 def gate_fix(states: Floats, moved: Vector, process: Vector, fix: Vector, late: Vector, gate: float) -> Vector:
     """Squared normalised innovation of the axes' fix, its factor of their noise, and the hits that follow."""
     q, gain, hits = 0.0, 0.0, states[0, 5]
+    if gate == 0.0:
+        return q, 1.0, hits
     for c in range(3):
         innovation = fix[c] - states[c, 0] - moved[c]
         if not math.isnan(innovation):
-            noise = states[c, 3]
-            p = states[c, 1] * noise + states[c, 2] + process[c]
-            s = p + noise + late[c]
-            q, gain = q + innovation * innovation / (s + SLIP), gain + p / (3.0 * s)
-    if gate == 0.0 or q == 0.0:
-        return 0.0, 1.0, hits
+            s = (states[c, 1] + 1.0) * states[c, 3] + states[c, 2] + process[c] + late[c]
+            q += innovation * innovation / (s + SLIP)
+    if q <= gate and hits == 0.0:
+        return q, 1.0, 0.0
+    for c in range(3):
+        if not math.isnan(fix[c]):
+            p = states[c, 1] * states[c, 3] + states[c, 2] + process[c]
+            gain += p / (3.0 * (p + states[c, 3] + late[c]))
     return q, inflation(q, gate, hits), count(q, gate, hits, gain)
 
 
-@part
+@inside
 def step(
     state: AxisState, moved: float, process: float, fix: float, late: float, rule: FixNoise, gated: Vector
 ) -> AxisState:
@@ -133,13 +140,28 @@ def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, index: Ints,
         x: (R, T, E or N, 3).
         p: the same.
     """
-    runs, steps, vehicles = seen.gnss.shape[0], seen.gnss.shape[1], len(seen.columns)
-    adaptive = math.isfinite(rule.weight)
-    varies = adaptive or rule.gate > 0.0
-    noise, states = np.empty(x.shape if varies else (0, 0, 0, 3)), np.empty((vehicles, 3, 6))
-    for run in range(runs):
-        for t in range(steps):
-            for e in range(vehicles):
+    varies = math.isfinite(rule.weight) or rule.gate > 0.0
+    noise, states = np.empty(x.shape if varies else (0, 0, 0, 3)), np.empty((len(seen.columns), 3, 6))
+    filter_runs(seen, rule, known, index, states, x, p, noise)
+    return noise
+
+
+@part
+def filter_runs(
+    seen: SoloMeasurements,
+    rule: FixNoise,
+    known: bool,
+    index: Ints,
+    states: Floats,
+    x: Floats,
+    p: Floats,
+    noise: Floats,
+) -> None:
+    """`run_filter` in given memory."""
+    adaptive, varies = math.isfinite(rule.weight), len(noise) > 0
+    for run in range(seen.gnss.shape[0]):
+        for t in range(seen.gnss.shape[1]):
+            for e in range(len(seen.columns)):
                 n, at = seen.columns[e], index[e]
                 q = process_variance(seen.motion, seen.velocity[run, t, n], seen.dt)
                 u, more, fix = seen.velocity[run, t, n], seen.process[run, t, n], three(seen.gnss[run, t, n])
@@ -147,25 +169,20 @@ def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, index: Ints,
                 moved = seen.dt * u[0], seen.dt * u[1], seen.dt * u[2]
                 gated = gate_fix(states[e], moved, q, fix, NEVER, rule.gate if t > 0 else 0.0)
                 for c in range(3):
-                    now = states[e, c]
                     if t == 0 and known:
                         state = start_state(x[run, 0, at, c], 0.0, True, rule.variance[c], rule.weight)
-                    elif t == 0 or math.isnan(now[0] + moved[c]):
+                    elif t == 0 or math.isnan(states[e, c, 0] + moved[c]):
                         state = start_state(fix[c], 0.0, False, rule.variance[c], rule.weight)
                     else:
-                        before = now[0], now[1], now[2], now[3], now[4], now[5]
-                        state = step(before, moved[c], q[c], fix[c], 0.0, rule, gated)
-                    put(now, state)
+                        state = step(load(states[e, c], 0, STATE), moved[c], q[c], fix[c], 0.0, rule, gated)
+                    store(states[e, c], 0, state)
                     x[run, t, at, c], p[run, t, at, c] = state[0], state[1] * state[3] + state[2]
                     if varies:
                         noise[run, t, at, c] = state[3] if adaptive else state[3] * gated[1]
-    return noise
 
 
 @compiled
-def stream_step(
-    given: Floats, state: Floats, history: Floats, motion: MotionNoise, rule: FixNoise, answer: Floats
-) -> int:
+def stream_step(given: Floats, state: Floats, history: Floats, noise: Floats, answer: Floats) -> int:
     """One step of a stream: dead reckoning, the fix brought forward, `step` on every axis.
 
     Nothing is changed where the input is bad. A state of NaN has not started yet.
@@ -174,10 +191,11 @@ def stream_step(
         given: (8,) fix m, velocity m/s, dt s, age of the fix s.
         state: (3, 6).
         history: of `motion`.
-        motion: noise of the motion.
-        rule: noise of the fixes.
+        noise: (15,) the numbers of a MotionNoise and a FixNoise: to hand over tuples takes longer than the step.
         answer: (12,) position m, covariance m^2.
     """
+    motion = MotionNoise(noise[:3], noise[3:6], noise[6], noise[7], noise[8])
+    rule = FixNoise(noise[9:12], noise[12], noise[13], noise[14])
     q, late, moved = np.empty(3), np.zeros(3), np.zeros(3)
     outcome = dead_reckon(given, history, motion, answer, q, moved, late)
     starts = math.isnan(state[0, 0])
@@ -186,26 +204,17 @@ def stream_step(
     fix = given[0] + moved[0], given[1] + moved[1], given[2] + moved[2]
     gated = gate_fix(state, three(answer), three(q), fix, three(late), rule.gate)
     for c in range(3):
-        now = state[c]
         if starts:
-            put(now, start_state(fix[c], late[c], False, rule.variance[c], rule.weight))
+            store(state[c], 0, start_state(fix[c], late[c], False, rule.variance[c], rule.weight))
         else:
-            before = now[0], now[1], now[2], now[3], now[4], now[5]
-            put(now, step(before, answer[c], q[c], fix[c], late[c], rule, gated))
+            store(state[c], 0, step(load(state[c], 0, STATE), answer[c], q[c], fix[c], late[c], rule, gated))
     answer[:] = 0.0
     for c in range(3):
         answer[c], answer[3 + 4 * c] = state[c, 0], state[c, 1] * state[c, 3] + state[c, 2]
     return ESTIMATE
 
 
-@part
-def put(state: Floats, values: AxisState) -> None:
-    """Write the state of one axis."""
-    for i in range(6):
-        state[i] = values[i]
-
-
-@part
+@inside
 def three(values: Floats) -> Vector:
     """The first numbers of an array."""
     return values[0], values[1], values[2]

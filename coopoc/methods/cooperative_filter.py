@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy.typing as npt
 
 from ..arrays import Floats
 from ..kernels.stars.cooperative_filter import run_filter
-from ..kernels.stars.cooperative_state import NO_GUARDS, Guards, Model
+from ..kernels.stars.cooperative_state import NO_GUARDS, Guards, Model, Sent
 from ..kernels.stars.messages import ACCELERATION_STD, FORGOTTEN
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, check_recording
@@ -20,7 +21,7 @@ from .egos import Estimate, assumptions, follow_egos, measurements, relative_noi
 from .noise_model import NoiseModel, resolve
 from .track import Track, check_options
 
-NO_ODOMETER = np.zeros((1, 1, 1, 3))
+NOTHING = np.zeros((1, 1, 1, 3))
 KINDS = ("range", "azimuth", "inclination", "message", "trusted")
 
 
@@ -103,15 +104,17 @@ class CooperativeFilter:
         """
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
         model, guards = model_of(known, self.robust), guards_of(self, known)
-        assumed, broadcast, notes = assumptions(recording, known), None, list(known.notes)
-        moved: Floats = NO_ODOMETER
-        if self.robust:
-            broadcast, variance, moved = broadcasts(recording, known, columns, guards)
-            assumed = assumed._replace(broadcast=variance)
+        assumed, notes = assumptions(recording, known), list(known.notes)
+
+        @cache
+        def sent() -> Sent:
+            if self.robust:
+                return broadcasts(recording, known, columns, guards)
+            return Sent(*(np.moveaxis(a, 2, 0).copy() for a in (recording.gnss, assumed.fixes)), NOTHING)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            seen = measurements(recording, ego, box, broadcast)
-            x, cov, neighbours, fixes, weights = run_filter(seen, assumed, moved, model, guards)
+            seen = measurements(recording, ego, box)
+            x, cov, neighbours, fixes, weights = run_filter(seen, assumed, sent(), model, guards)
             extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate(KINDS)}
             mine = recording.ids[ego]
             notes.extend(rejected(f"fixes, {mine}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
@@ -128,23 +131,21 @@ class CooperativeFilter:
         return follow_egos(self, recording, egos, run, notes, missing=True)
 
 
-def broadcasts(
-    recording: Recording, known: NoiseModel, egos: Sequence[int], guards: Guards
-) -> tuple[Floats, Floats, Floats]:
-    """Estimates m, variances m^2 and sums of motions m, (R, T, N, 3), of the vehicles in the stars of some egos, each
-    filtered alone until it is in none any more."""
+def broadcasts(recording: Recording, known: NoiseModel, egos: Sequence[int], guards: Guards) -> Sent:
+    """Messages of the vehicles in the stars of some egos, each filtered alone until it is in none any more."""
     links, assumed, model = recording.links, assumptions(recording, known), model_of(known, robust=False)
-    x = np.full(recording.gnss.shape, np.nan)
-    variance, moved, nothing = x.copy(), x.copy(), inbox(recording, egos[0], FIX_AND_VELOCITY)
+    x, variance, moved = (np.zeros_like(np.moveaxis(recording.gnss, 2, 0), order="C") for _ in range(3))
+    none, nothing = Sent(NOTHING, NOTHING, NOTHING), inbox(recording, egos[0], FIX_AND_VELOCITY)
     seen, here = measurements(recording, egos[0], nothing), np.isin(links.observer, egos)
     for j in np.unique(links.neighbour[here]):
         last = int(links.step[here & (links.neighbour == j)].max()) + 1
         alone = seen._replace(ego=int(j), start=np.zeros(last + 1, np.int64))
-        x[:, :last, j], cov = run_filter(alone, assumed, NO_ODOMETER, model, guards)[:2]
-        variance[:, :last, j] = np.diagonal(cov, axis1=-2, axis2=-1)
-        moved[:, :last, j] = np.cumsum(np.nan_to_num(recording.dt * recording.velocity[:, :last, j]), axis=1)
-    x.flags.writeable = False  # as the recording's, for which the kernel is compiled
-    return x, variance, moved
+        x[j, :, :last], cov = run_filter(alone, assumed, none, model, guards)[:2]
+        variance[j, :, :last] = np.diagonal(cov, axis1=-2, axis2=-1)
+        steps = recording.dt * recording.velocity[:, :last, j]
+        steps[np.isnan(steps)] = 0.0
+        np.cumsum(steps, axis=1, out=moved[j, :, :last])
+    return Sent(x, variance, moved)
 
 
 def rejected(what: str, count: int, measured: int, share: float = 0.05) -> list[str]:

@@ -86,7 +86,7 @@ class FilterStream:
 
     def __init__(self, motion: MotionNoise, fixes: FixNoise, x0: npt.ArrayLike | None, history: float) -> None:
         self.history = MotionHistory(history)
-        self._state, self._given, self._noise = np.full((3, 6), np.nan), np.zeros(8), (motion, fixes)
+        self._state, self._given, self._noise = np.full((3, 6), np.nan), np.zeros(8), np.hstack((*motion, *fixes))
         if x0 is not None:
             zero, weight = np.zeros(3), np.full(3, fixes.weight)
             self._state[:] = np.stack([three("x0", x0), zero, zero, fixes.variance, weight, zero], axis=1)
@@ -117,7 +117,7 @@ class FilterStream:
         """
         self.history.write(self._given, gnss, velocity, dt, fix_age)
         answer = np.empty(12)
-        outcome = stream_step(self._given, self._state, self.history.reserve(), *self._noise, answer)
+        outcome = stream_step(self._given, self._state, self.history.reserve(), self._noise, answer)
         if outcome == NO_FIX_YET:
             return np.full(3, np.nan), None
         if outcome != ESTIMATE:

@@ -118,8 +118,10 @@ FAR = 100.0
 
 def far_off(x: Floats, recording: Recording, columns: Sequence[int], limit: float = FAR) -> Bools:
     """(R, E) whether estimates (R, T, E, 3) m are ever farther from a fix than `limit` standard deviations."""
-    gap = np.linalg.norm(x - recording.gnss[:, :, list(columns)], axis=-1)
-    return np.asarray((gap > limit * float(np.linalg.norm(recording.sensors.gnss_std))).any(axis=1))
+    gap = recording.gnss.take(columns, axis=2)
+    gap -= x
+    far = np.einsum("...c,...c->...", gap, gap) > limit**2 * np.square(recording.sensors.gnss_std).sum()
+    return np.asarray(far.any(axis=1))
 
 
 def lost(x: Floats, recording: Recording, columns: Sequence[int], limit: float = FAR) -> tuple[str, ...]:

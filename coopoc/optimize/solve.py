@@ -48,7 +48,7 @@ def solve(
     graduated non-convexity where that leads lower than x0.
 
     Args:
-        problem: a single one.
+        problem: what to solve.
         backend: a name of `backends()`, "folder/mine.py:BACKEND" or a Backend; None: gauss-newton, and where there are
             constraints the first of osqp and casadi that holds them.
         throw: raise unless SOLVED; otherwise failure is data.
@@ -56,8 +56,8 @@ def solve(
         options: of the backend, such as max_iterations and tolerance (m).
 
     Raises:
-        InputError: unknown backend or option, a problem beyond the backend's capabilities, B realisations, points that
-            coincide, or (if `throw`) free points.
+        InputError: unknown backend or option, a problem beyond the backend's capabilities, points that coincide, or (if
+            `throw`) free points.
         MissingLibraryError: the backend's library is not installed.
         SolveError: (if `throw`) no minimum was reached; it carries the Solution.
 
@@ -69,9 +69,6 @@ def solve(
     known = _chosen(problem) if backend is None else require_backend(backend)
     instance("throw", throw, bool, "Give False to get the Solution whatever its status.")
     wanted = len(problem.names) <= MANY if covariance is None else instance("covariance", covariance, bool)
-    if problem.batch is not None:
-        hint = "Solve one after the other: solve(problem.pick(0))."
-        raise InputError("problem", repr(problem), "must be a single realisation", hint)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     if (factors := fused(problem.factors)) is not problem.factors:
@@ -140,11 +137,11 @@ def _start(problem: Problem) -> Floats:
     if not problem.constraints and np.isfinite(sparse(problem).quadratic(start, "gauss-newton")[1]).all():
         return start
     with np.errstate(all="ignore"):
-        linear = problem.linearise(start[None])
+        linear = problem.linearise(start)
     for factor, residual, jacobian in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
-        bad = ~np.isfinite(residual[0]).all(axis=-1)
+        bad = ~np.isfinite(residual).all(axis=1)
         for by_node in jacobian:
-            bad = bad | ~np.isfinite(by_node[0]).all(axis=(-2, -1))
+            bad = bad | ~np.isfinite(by_node).all(axis=(1, 2))
         if bad.any():
             raise _without_direction(problem, factor.kind, factor.nodes[np.flatnonzero(bad)[0]])
     if problem.constraints:

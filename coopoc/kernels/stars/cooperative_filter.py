@@ -12,7 +12,8 @@ import math
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ..compiling.compile import compiled, part
+from ..compiling.compile import compiled, copied
+from ..compiling.small import apply, negate, store
 from ..motion import process_variance
 from .cooperative_members import join, leave, place, predict, predict_member, steady
 from .cooperative_messages import fix_terms, receive, trust, use_fix
@@ -35,6 +36,7 @@ from .cooperative_state import (
     Filter,
     Guards,
     Model,
+    Sent,
     begin,
     copy_filter,
     distrust,
@@ -45,22 +47,22 @@ from .cooperative_state import (
 from .gaussian import (
     COMPASS,
     PLACE,
-    Rows,
+    copy_moments,
+    correct,
     expect,
     has,
     innovate,
     settle,
-    update,
     weight,
     widen,
 )
-from .messages import Assumptions, Measurements
-from .relative import Five, angle
+from .messages import Assumptions, Measurements, three_of
+from .relative import angle
 
 
 @compiled
 def run_filter(
-    seen: Measurements, assumed: Assumptions, moved: Floats, known: Model, guards: Guards
+    seen: Measurements, assumed: Assumptions, sent: Sent, known: Model, guards: Guards
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; weights of the ego's fix (R, T), and by link
     (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the neighbour is trusted.
@@ -70,8 +72,8 @@ def run_filter(
 
     Args:
         seen: measurements and messages of the ego.
-        assumed: process noise, and the variances of fixes and of positions in messages.
-        moved: (R, T, N, 3) m, sum of all motions until each step.
+        assumed: process noise, and the variance of fixes.
+        sent: in messages.
         known: noise model.
         guards: against what may be wrong.
     """
@@ -90,7 +92,7 @@ def run_filter(
             gather_own(own, seen, assumed, known.white, run, t)
             for i in range(count):
                 who[i] = seen.neighbour[first + i]
-                gather_neighbour(rows, seen, assumed, moved, run, t, first + i, i)
+                gather_neighbour(rows, seen, assumed, sent, run, t, first + i, i)
             if math.isnan(own[MOTION]) or (f.g.vectors[0] == 0 and math.isnan(own[FIX])):
                 pause(f, own[DT])
                 copy_filter(f, older)
@@ -119,7 +121,7 @@ def run_filter(
     return x, cov, neighbours, fixes, notes
 
 
-@part
+@copied
 def write(
     f: Filter,
     guards: Guards,
@@ -150,56 +152,41 @@ def write(
         notes[run, first + i, 4] = f.status[who[i], TRUSTED]
 
 
-@part
+@copied
 def gather_own(own: Floats, seen: Measurements, assumed: Assumptions, white: Floats, run: int, t: int) -> None:
     """The ego's fix and motion at a step."""
-    u = seen.velocity[run, t, seen.ego]
-    q = process_variance(assumed.motion, u, seen.dt)
+    u, r = seen.velocity[run, t, seen.ego], three_of(assumed.fixes, run, t, seen.ego)
+    q, more = process_variance(assumed.motion, u, seen.dt), three_of(assumed.process, run, t, seen.ego)
     own[DT] = seen.dt
     for c in range(3):
-        own[FIX + c] = seen.gnss[run, t, seen.ego, c]
-        own[FIX_VARIANCE + c] = number(assumed.fixes, run, t, seen.ego, c) * white[c]
-        own[MOTION + c] = seen.dt * u[c]
-        own[MOTION_VARIANCE + c] = q[c] + number(assumed.process, run, t, seen.ego, c)
+        own[FIX + c], own[FIX_VARIANCE + c] = seen.gnss[run, t, seen.ego, c], r[c] * white[c]
+        own[MOTION + c], own[MOTION_VARIANCE + c] = seen.dt * u[c], q[c] + more[c]
 
 
-@part
+@copied
 def gather_neighbour(
-    rows: Floats,
-    seen: Measurements,
-    assumed: Assumptions,
-    moved: Floats,
-    run: int,
-    t: int,
-    link: int,
-    i: int,
+    rows: Floats, seen: Measurements, assumed: Assumptions, sent: Sent, run: int, t: int, link: int, i: int
 ) -> None:
     """The measurement of a neighbour, and the newest message held."""
     for c in range(5):
         rows[i, c] = seen.relative[run, link, c]
-    j, sent = seen.neighbour[link], seen.newest[run, link]
-    rows[i, AGE] = (t - sent) * seen.dt if sent >= 0 else -1.0
-    if sent < 0:
+    j, when = seen.neighbour[link], seen.newest[run, link]
+    rows[i, AGE] = (t - when) * seen.dt if when >= 0 else -1.0
+    if when < 0:
         return
-    u = seen.velocity[run, sent, j]
-    q = process_variance(assumed.motion, u, seen.dt)
+    u, fix = seen.velocity[run, when, j], three_of(assumed.fixes, run, when, j)
+    q, more = process_variance(assumed.motion, u, seen.dt), three_of(assumed.process, run, when, j)
+    x, p, s = (
+        three_of(sent.position, j, run, when),
+        three_of(sent.variance, j, run, when),
+        three_of(sent.odometer, j, run, when),
+    )
     for c in range(3):
-        rows[i, SOLO + c] = seen.broadcast[run, sent, j, c]
-        rows[i, SOLO_VARIANCE + c] = number(assumed.broadcast, run, sent, j, c)
-        rows[i, ODOMETER + c] = number(moved, run, sent, j, c)
-        rows[i, SPEED + c] = u[c]
-        rows[i, TYPICAL + c] = number(assumed.fixes, run, sent, j, c)
-        rows[i, STEP + c] = q[c] + number(assumed.process, run, sent, j, c)
+        rows[i, SOLO + c], rows[i, SOLO_VARIANCE + c], rows[i, ODOMETER + c] = x[c], p[c], s[c]
+        rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c] + more[c], fix[c]
 
 
-@part
-def number(values: Floats, run: int, t: int, member: int, c: int) -> float:
-    """One of what is broadcastable to (R, T, N, 3)."""
-    a, b, d = min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(member, values.shape[2] - 1)
-    return float(values[a, b, d, min(c, values.shape[3] - 1)])
-
-
-@part
+@copied
 def step(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Predict and update.
 
@@ -248,7 +235,7 @@ def step(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, veh
     f.step[0] += 1
 
 
-@part
+@copied
 def nearest_first(f: Filter) -> int:
     """Sort the members by their distance; how many there are."""
     members = 0
@@ -263,7 +250,7 @@ def nearest_first(f: Filter) -> int:
     return members
 
 
-@part
+@copied
 def gap2(f: Filter, k: int) -> float:
     """Squared distance of a member, m^2."""
     total = 0.0
@@ -272,39 +259,39 @@ def gap2(f: Filter, k: int) -> float:
     return total
 
 
-@part
+@copied
 def add_fix(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
     """The ego's fix: its position, the error of its receiver, and the one that all share.
 
     An innovation beyond the gate that an odometer's slip explains is one: it is far smaller beside the slip's variance.
     """
-    g, h, slip = f.g, f.h, (guards.slip * own[DT]) ** 2
+    g, h, slip, first = f.g, f.h, (guards.slip * own[DT]) ** 2, 3 * f.g.block[0, PLACE]
     if math.isnan(own[FIX]):
         return
     fix_terms(f, 0)
     for c in range(3):
         expect(h, c, own[FIX + c], own[FIX_VARIANCE + c])
-    if f.vague[0] == 0.0 and slip > 0.0:
-        q, first = innovate(g, h), 3 * g.block[0, PLACE]
-        if q > guards.fix_gate:
-            widen(g, first, slip)
-            slipped = innovate(g, h)
-            if slipped > guards.fix_gate or 4.0 * slipped > q:
-                widen(g, first, -slip)
-    f.q[0, 3] = q = use_fix(f, known, guards, 0, True)
+    q = innovate(g, h)
+    if f.vague[0] == 0.0 and slip > 0.0 and q > guards.fix_gate:
+        widen(g, first, slip)
+        slipped = innovate(g, h)
+        if slipped > guards.fix_gate or 4.0 * slipped > q:
+            widen(g, first, -slip)
+            innovate(g, h)
+    f.q[0, 3] = q = use_fix(f, known, guards, 0, True, q)
     f.hits[0, 0] = f.hits[0, 0] + 1 if guards.fix_gate > 0.0 and q > guards.fix_gate else 0
 
 
-@part
+@copied
 def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> None:
     """The relative measurements: linear at the prediction, then at that solution.
 
     Where they contradict the prediction of most members, it is the ego whose odometer has slipped.
     """
-    g = f.g
-    if has(g, 0, COMPASS):
+    g, h = f.g, f.h
+    if has(g, 0, COMPASS):  # the compass's noise is new at every step
         i = 3 * g.block[0, COMPASS] + 1
-        for j in range(3 * g.vectors[0]):  # the compass's noise is new at every step
+        for j in range(3 * g.vectors[0]):
             g.p[i, j] = 0.0
             g.p[j, i] = 0.0
         g.x[i], g.p[i, i] = 0.0, known.heading
@@ -316,110 +303,94 @@ def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int)
         for k in range(len(f.vehicle)):
             if f.vehicle[k] >= 0:
                 for c in range(3):
-                    i = 3 * g.block[k, PLACE] + c
-                    f.at[k, c] = g.x[i]
-                    for row in range(3 * members):
-                        f.at[k, c] += f.h.gain[row, i] * f.h.white[row]
+                    f.at[k, c] = f.trial.x[3 * g.block[k, PLACE] + c]
     for m in range(members):
         k = f.order[m]
         if relate(f, known, guards, rows, k, 1 if known.exact > 0.0 else 0):
             if f.vague[k] > 0.0:
-                settle(g, f.h, k, f.vague[k])
+                settle(g, h, k, f.vague[k])
                 f.vague[k] = f.q[k, 0] = f.q[k, 1] = f.q[k, 2] = 0.0
                 continue
-            update(g, f.h, 0.0)
+            innovate(g, h)
+            correct(g, h, 1.0)
             for c in range(3):
-                if f.h.used[c]:
-                    f.q[k, c] = f.h.q[c]
-                    f.hits[k, c] = f.hits[k, c] + 1 if guards.gate > 0.0 and f.h.q[c] > guards.gate else 0
+                if h.used[c]:
+                    f.q[k, c] = h.q[c]
+                    f.hits[k, c] = f.hits[k, c] + 1 if guards.gate > 0.0 and h.q[c] > guards.gate else 0
 
 
-@part
+@copied
 def first_pass(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> int:
-    """Innovations of the measurements linear at the prediction, each decorrelated from all before it; how many members
-    are beyond a gate. Neither x nor P changes."""
-    g, h, wrong = f.g, f.h, 0
+    """Update `trial` by the measurements linear at the prediction; how many members are beyond a gate."""
+    g, h, wrong = f.trial, f.h, 0
+    copy_moments(f.g, g)
     for m in range(members):
         k = f.order[m]
-        i, vague = 3 * g.block[k, PLACE], f.vague[k]
-        p, q, r = g.p[i, i], g.p[i + 1, i + 1], g.p[i + 2, i + 2]
-        h.before[0] = 3 * m
-        whole = relate(f, known, guards, rows, k, 0)
-        for c in range(3):
-            h.used[c], h.gate[c] = h.used[c] and whole, 0.0 if vague > 0.0 else guards.gate
-        widen(g, i, vague)
-        innovate(g, h)
-        g.p[i, i], g.p[i + 1, i + 1], g.p[i + 2, i + 2] = p, q, r
-        wrong += vague == 0.0 and (h.q[0] > guards.gate or h.q[1] > guards.gate or h.q[2] > guards.gate)
-    h.before[0] = 0
+        vague = f.vague[k]
+        if relate(f, known, guards, rows, k, 0):
+            for c in range(3):
+                h.gate[c] = 0.0 if vague > 0.0 else guards.gate
+            widen(g, 3 * g.block[k, PLACE], vague)
+            innovate(g, h)
+            correct(g, h, 1.0)
+            wrong += vague == 0.0 and (h.q[0] > guards.gate or h.q[1] > guards.gate or h.q[2] > guards.gate)
     return wrong
 
 
-@part
+@copied
 def relate(f: Filter, known: Model, guards: Guards, rows: Floats, k: int, exact: int) -> bool:
-    """Rows of the measurement of member k; False if its geometry is not known."""
-    g, row, compass = f.g, f.row[k], f.g.block[0, COMPASS]
-    if not measured_whole(rows, row) and f.vague[k] > 0.0:
-        return False
-    for c in range(3):
-        f.h.gate[c] = guards.gate
-    x, y, z = f.at[k, 0] - f.at[0, 0], f.at[k, 1] - f.at[0, 1], f.at[k, 2] - f.at[0, 2]
-    seen = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
-    relative_rows(f.h, x, y, z, seen, known.std, known.min_range, exact)
-    for c in range(3):
-        for i in range(3):
-            f.h.column[c, i], f.h.column[c, 3 + i] = 3 * g.block[k, PLACE] + i, 3 * g.block[0, PLACE] + i
-        f.h.column[c, 6], f.h.column[c, 7] = 3 * compass, 3 * compass + 1
-    f.h.terms[0] = 8 if compass >= 0 else 6
-    return True
-
-
-@part
-def relative_rows(h: Rows, x: float, y: float, z: float, seen: Five, std: Floats, least: float, exact: int) -> None:
-    """Rows of range, azimuth and inclination, in metres, of the vector to a neighbour and the compass's two errors.
+    """Rows of range, azimuth and inclination of member k, in metres; False if its geometry is not known.
 
     Args:
-        h: rows that are filled: weights 0 to 2 of the neighbour, 3 to 5 of the ego, 6 and 7 of bias and noise.
-        x: m, the vector where the rows are linear.
-        y: m.
-        z: m.
-        seen: `relative.five`.
-        std: (3,) m, rad, rad, or of no length for 1 m each.
-        least: m, least distance at which an angle's error counts.
+        f: filter; the rows are linear at `at`.
+        known: noise model.
+        guards: for their gate.
+        rows: measurements.
+        k: slot.
         exact: 1 for range and angles themselves, 0 for the measured vector along their directions.
     """
-    d, sa, ca, si, ci = seen
+    g, h, row, std = f.g, f.h, f.row[k], known.std
+    if not measured_whole(rows, row) and f.vague[k] > 0.0:
+        return False
+    x, y, z = f.at[k, 0] - f.at[0, 0], f.at[k, 1] - f.at[0, 1], f.at[k, 2] - f.at[0, 2]
+    d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
     ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
-    reach = max(far, least)
+    reach = max(far, known.min_range)
     flat = max(ground, 1e-3 * reach)
     h.used[0], h.used[1], h.used[2] = d >= 0.0, sa != 0.0 or ca != 0.0, si != 0.0 or ci != 0.0
     length = far if exact == 0 else reach
-    h.weight[0, 0], h.weight[0, 1], h.weight[0, 2] = x / far, y / far, z / far
-    h.weight[1, 0], h.weight[1, 1], h.weight[1, 2] = -y / flat, x / flat, 0.0
-    h.weight[2, 0], h.weight[2, 1], h.weight[2, 2] = x * z / (flat * length), y * z / (flat * length), -flat / length
+    w = (
+        x / far,
+        y / far,
+        z / far,
+        -y / flat,
+        x / flat,
+        0.0,
+        x * z / (flat * length),
+        y * z / (flat * length),
+        -flat / length,
+    )
     if exact == 0:
         d = d if h.used[0] else far
         if not h.used[1]:
             sa, ca = y / flat, x / flat
         if not h.used[2]:
             si, ci = ground / far, z / far
-        for c in range(3):
-            h.z[c] = d * (si * (h.weight[c, 0] * ca + h.weight[c, 1] * sa) + ci * h.weight[c, 2])
-        scale, turn = reach * ground / far, ground
+        store(h.z, 0, apply(w, (d * si * ca, d * si * sa, d * ci)))
+        turn, azimuth_std = ground, reach * ground / far
     else:
-        h.z[0] = d
-        h.z[1] = angle(sa * x - ca * y, ca * x + sa * y) * flat
-        h.z[2] = angle(si * z - ci * ground, ci * z + si * ground) * reach
-        for c in range(1, 3):
-            h.z[c] += h.weight[c, 0] * x + h.weight[c, 1] * y + h.weight[c, 2] * z
-        scale, turn = flat, flat
-    unit = len(std) == 0
-    range_std = 1.0 if unit else std[0]
-    azimuth_std = 1.0 if unit else std[1] * scale
-    inclination_std = 1.0 if unit else std[2] * reach
-    h.variance[0], h.variance[1] = range_std * range_std, azimuth_std * azimuth_std
-    h.variance[2] = inclination_std * inclination_std
+        turned = angle(sa * x - ca * y, ca * x + sa * y)
+        raised = angle(si * z - ci * ground, ci * z + si * ground)
+        _, b, c = apply(w, (x, y, z))
+        store(h.z, 0, (d, turned * flat + b, raised * reach + c))
+        turn = azimuth_std = flat
+    a, b, c = (std[0], std[1] * azimuth_std, std[2] * reach) if len(std) else (1.0, 1.0, 1.0)
+    store(h.variance, 0, (a * a, b * b, c * c))
+    store(h.weight, 0, w)
+    store(h.weight, 1, negate(w))
+    store(h.weight, 2, (0.0, 0.0, 0.0, turn, turn, 0.0, 0.0, 0.0, 0.0))
     for c in range(3):
-        for i in range(3):
-            h.weight[c, 3 + i] = -h.weight[c, i]
-        h.weight[c, 6] = h.weight[c, 7] = turn if c == 1 else 0.0
+        h.gate[c] = guards.gate
+    h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]
+    h.terms[0] = 3 if has(g, 0, COMPASS) else 2
+    return True

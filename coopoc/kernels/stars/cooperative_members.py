@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from ...arrays import Floats, Ints
-from ..compiling.compile import part
+from ..compiling.compile import copied, part
 from ..dead_reckoning import ROUNDING
 from .cooperative_state import (
     AGE,
@@ -52,7 +52,7 @@ from .gaussian import (
 )
 
 
-@part
+@copied
 def leave(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Find each member's row; marginalise out those that have none, and remember the error of their fixes.
 
@@ -81,7 +81,7 @@ def leave(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, ve
         f.slot[j], f.vehicle[k] = ABSENT, ABSENT
 
 
-@part
+@copied
 def contradicted(f: Filter, guards: Guards, k: int) -> bool:
     """Whether the ego's measurements of a member have contradicted its position for too long: two components three
     times in a row, or one as often as it agreed before, at most `patience` times."""
@@ -94,11 +94,12 @@ def contradicted(f: Filter, guards: Guards, k: int) -> bool:
     return bool(several >= 2)
 
 
-@part
+@copied
 def predict(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
     """Move the ego; errors that last decay, errors of which nothing is known change."""
-    g, keep = f.g, math.exp(-own[DT] / known.time)
-    fades, first = 1.0 - keep * keep, 3 * g.block[0, PLACE]
+    g, first = f.g, 3 * f.g.block[0, PLACE]
+    keep = math.exp(-own[DT] / known.time) if known.own + known.common > 0.0 else 1.0
+    fades = 1.0 - keep * keep
     for c in range(3):
         g.x[first + c] += own[MOTION + c]
         g.p[first + c, first + c] += own[MOTION_VARIANCE + c]
@@ -114,7 +115,7 @@ def predict(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
         widen(g, i, known.common * fades)
 
 
-@part
+@copied
 def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, variance: int, unit: float) -> None:
     """Put vehicle j's last velocity in place of one that no vehicle can have reached since.
 
@@ -142,7 +143,7 @@ def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, varianc
         status[PACE + c], status[PACE + 3 + c] = unit * given[first + c], given[variance + c]
 
 
-@part
+@copied
 def predict_member(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> None:
     """Move a member by the velocity in the state, if its messages are late, else by that of its newest message.
 
@@ -150,7 +151,8 @@ def predict_member(f: Filter, known: Model, guards: Guards, rows: Floats, k: int
     """
     g, row, dt = f.g, f.row[k], f.clock[1]
     first, age, sent = 3 * g.block[k, PLACE], rows[row, AGE], f.clock[0] - rows[row, AGE]
-    update_velocity(f, guards, rows, k)
+    if late(f, guards, rows, k):
+        update_velocity(f, guards, rows, k)
     if has(g, k, VELOCITY):
         v = 3 * g.block[k, VELOCITY]
         widen(g, v, (guards.acceleration * dt) ** 2)
@@ -171,20 +173,25 @@ def predict_member(f: Filter, known: Model, guards: Guards, rows: Floats, k: int
         g.p[first + c, first + c] += often * (rows[row, STEP + c] + changed)
 
 
+@copied
+def late(f: Filter, guards: Guards, rows: Floats, k: int) -> bool:
+    """Whether a member has a velocity in the state, or its newest message is not of now."""
+    age = rows[f.row[k], AGE]
+    return bool(guards.acceleration > 0.0 and age >= 0.0 and (age > ROUNDING or has(f.g, k, VELOCITY)))
+
+
 @part
 def update_velocity(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
     """Give a member whose newest message is not of now a velocity in the state, and use that of a new message."""
     row, g, h = f.row[k], f.g, f.h
     age = rows[row, AGE]
-    if guards.acceleration == 0.0 or age < 0.0 or (age <= ROUNDING and not has(g, k, VELOCITY)):
-        return
     sent = f.clock[0] - age
     if not has(g, k, VELOCITY):
         insert(g, k, VELOCITY, SPEED_VARIANCE)
     elif abs(f.sent[k] - sent) <= ROUNDING:
         return
     f.sent[k] = sent
-    term(h, 0, 3 * g.block[k, VELOCITY], 1.0)
+    term(h, 0, g.block[k, VELOCITY], 1.0)
     for c in range(3):
         expect(h, c, rows[row, SPEED + c], rows[row, STEP + c] / f.clock[1] ** 2 + (guards.acceleration * age) ** 2)
     update(g, h, guards.fix_gate)
@@ -205,7 +212,8 @@ def join(f: Filter, known: Model, guards: Guards, rows: Floats, vehicle: int, ro
     near, whole = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row)
     for c in range(3):
         g.x[first + c] = g.x[ego + c] + (across(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
-    update_velocity(f, guards, rows, k)
+    if late(f, guards, rows, k):
+        update_velocity(f, guards, rows, k)
     if f.status[vehicle, TRUSTED] == 0.0:
         error = insert(g, k, ERROR, 0.0)
         for c in range(3):
@@ -215,7 +223,7 @@ def join(f: Filter, known: Model, guards: Guards, rows: Floats, vehicle: int, ro
         insert(g, k, ERROR, known.own)
 
 
-@part
+@copied
 def place(f: Filter, rows: Floats, k: int) -> None:
     """Put a vague member where its first message does: what is measured of it is linear there, not where it was assumed
     to be until now."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from ...arrays import Floats
-from ..compiling.compile import part
+from ..compiling.compile import copied, part
 from .cooperative_state import (
     AGE,
     COUNT,
@@ -55,19 +55,19 @@ CLIP = 12.0
 """Largest squared Mahalanobis distance of an innovation in a mean."""
 
 
-@part
+@copied
 def fix_terms(f: Filter, k: int) -> None:
     """Position of member k, error of its fixes, and the one that all share."""
     g, n = f.g, 1
-    term(f.h, 0, 3 * g.block[k, PLACE], 1.0)
+    term(f.h, 0, g.block[k, PLACE], 1.0)
     if has(g, k, ERROR):
-        term(f.h, n, 3 * g.block[k, ERROR], 1.0)
+        term(f.h, n, g.block[k, ERROR], 1.0)
         n += 1
     if has(g, 0, COMMON):
-        term(f.h, n, 3 * g.block[0, COMMON], 1.0)
+        term(f.h, n, g.block[0, COMMON], 1.0)
 
 
-@part
+@copied
 def receive(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> None:
     """Use the newest message of member k, if it has not been used."""
     g, j, row = f.g, f.vehicle[k], f.row[k]
@@ -83,7 +83,7 @@ def receive(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> No
         if clone:
             use_odometer(f, guards, rows, k, back, changed)
     believed = content(f, known, rows, k, changed, clone, before)
-    f.q[k, 3] = use_fix(f, known, guards, k, before and believed)
+    f.q[k, 3] = use_fix(f, known, guards, k, before and believed, innovate(g, f.h))
     f.status[j, USED] = sent
     for c in range(3):
         f.status[j, LAST + c] = rows[row, SOLO + c]
@@ -94,8 +94,8 @@ def receive(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> No
         clone_position(f, k, back, changed)
 
 
-@part
-def use_fix(f: Filter, known: Model, guards: Guards, k: int, again: bool) -> float:
+@copied
+def use_fix(f: Filter, known: Model, guards: Guards, k: int, again: bool, q: float) -> float:
     """Update by the rows of a vehicle's fix, unless its receiver errs otherwise than is assumed; squared Mahalanobis
     distance.
 
@@ -105,6 +105,7 @@ def use_fix(f: Filter, known: Model, guards: Guards, k: int, again: bool) -> flo
         guards: against what may be wrong.
         k: slot.
         again: whether it is not the vehicle's first one, and one that the vehicle believes.
+        q: of `innovate`.
     """
     g, h, j, used = f.g, f.h, f.vehicle[k], 0
     for c in range(3):
@@ -113,7 +114,6 @@ def use_fix(f: Filter, known: Model, guards: Guards, k: int, again: bool) -> flo
         settle(g, h, k, f.vague[k])
         f.vague[k] = 0.0
         return 0.0
-    q = innovate(g, h)
     if guards.trust > 0.0 and again and used == 3 and q > 0.0 and wrong_on_average(f, known, guards, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.revoked[j, 0], f.revoked[j, 1], f.alarm[0] = f.revoked[j, 0] + 1.0, f.clock[0], 1
@@ -125,7 +125,7 @@ def use_fix(f: Filter, known: Model, guards: Guards, k: int, again: bool) -> flo
     return q
 
 
-@part
+@copied
 def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone: bool, before: bool) -> bool:
     """Rows of what the message of member k says of its position when it was sent.
 
@@ -138,9 +138,9 @@ def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone
     back, old, terms = -age, age / f.clock[1], 1 + (1 if has(g, k, ERROR) else 0) + (1 if has(g, 0, COMMON) else 0)
     fix_terms(f, k)
     if velocity:
-        term(h, terms, 3 * g.block[k, VELOCITY], back)
+        term(h, terms, g.block[k, VELOCITY], back)
     if clone:
-        term(h, terms + 1, 3 * g.block[k, CLONE], 0.0)
+        term(h, terms + 1, g.block[k, CLONE], 0.0)
     for c in range(3):
         one, used = rows[row, STEP + c], True
         m, r = rows[row, SOLO + c], rows[row, SOLO_VARIANCE + c]
@@ -153,8 +153,8 @@ def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone
             r = r * known.white[c] + walk
             if clone:
                 m += (middle - 1.0) * moved
-                h.weight[c, 0], h.weight[c, terms] = middle, middle * back
-                h.weight[c, terms + 1] = 1.0 - middle
+                h.weight[4 * c], h.weight[9 * terms + 4 * c] = middle, middle * back
+                h.weight[9 * terms + 9 + 4 * c] = 1.0 - middle
             else:
                 r += (1.0 - middle) ** 2 * spent
         if not velocity:
@@ -165,7 +165,7 @@ def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone
     return believed
 
 
-@part
+@copied
 def steps_between(f: Filter, rows: Floats, k: int) -> float:
     """Steps between the last two messages of member k."""
     since = f.clock[0] - rows[f.row[k], AGE] - f.status[f.vehicle[k], USED]
@@ -197,17 +197,20 @@ def fixes_between(
     if p > p0 + 2.0 * spent + 1e-9:  # the sender has started anew
         return now, p, 0.0, 1.0
     p0 = max(p0, 1e-12)
+    if steps == 1.0:
+        new = 1.0 - p / (p0 + spent)
+        return (now, 0.0, 0.0, 1.0) if new < NOTHING_NEW else (carried + (now - carried) / new, p / new, 0.0, 1.0)
     start, mean = p0 + 0.5 * (p - p0) * (1.0 - 1.0 / steps), p0 + 0.5 * (p - p0) * (1.0 + 1.0 / steps)
     taken = max(math.log(p0 / p) + steps * math.log(1.0 + spent / steps / start), 0.0)
     usual = -steps * math.log(max(1.0 - mean / fix, 1e-3))
-    if steps > 1.0 and 2.0 * taken > usual:
+    if 2.0 * taken > usual:
         taken = usual
     new = 1.0 - math.exp(-taken)
     if new < NOTHING_NEW:
         return now, 0.0, 0.0, 1.0
     keep, k = 1.0 - new, 1.0 - math.exp(-taken / steps)
     white = mean / (2.0 - k) * (1.0 + keep) / new
-    middle = (1.0 / new - (1.0 - k) / (k * steps)) if steps > 1.0 else 1.0
+    middle = 1.0 / new - (1.0 - k) / (k * steps)
     walk = spent * (steps - 1.0 / steps) / (12.0 * steps)
     return carried + (now - carried) / new, white, walk, min(max(middle, 0.5), 1.0)
 
@@ -217,9 +220,9 @@ def use_odometer(f: Filter, guards: Guards, rows: Floats, k: int, back: float, c
     """How far member k has moved between its last two messages."""
     g, h, j, row = f.g, f.h, f.vehicle[k], f.row[k]
     steps = steps_between(f, rows, k)
-    term(h, 0, 3 * g.block[k, PLACE], 1.0)
-    term(h, 1, 3 * g.block[k, VELOCITY], back)
-    term(h, 2, 3 * g.block[k, CLONE], -1.0)
+    term(h, 0, g.block[k, PLACE], 1.0)
+    term(h, 1, g.block[k, VELOCITY], back)
+    term(h, 2, g.block[k, CLONE], -1.0)
     for c in range(3):
         spent = 0.5 * steps * (rows[row, STEP + c] + f.status[j, LAST + 9 + c])
         expect(h, c, rows[row, ODOMETER + c] - f.status[j, LAST + 6 + c], spent + changed)
@@ -237,23 +240,21 @@ def clone_position(f: Filter, k: int, back: float, changed: float) -> None:
     widen(g, clone, changed + JITTER)
 
 
-@part
+@copied
 def wrong_on_average(f: Filter, known: Model, guards: Guards, k: int, q: float) -> bool:
     """Whether the mean of a vehicle's innovations, each clipped, is likelier with another error of its fixes than is
     assumed; or, where that error is being estimated, with the last one alone."""
-    g, h, status, j = f.g, f.h, f.status, f.vehicle[k]
-    mean, s = status[j, MEAN : MEAN + 3], h.square[0]
+    h, status, j = f.h, f.status, f.vehicle[k]
+    mean, s = status[j, MEAN : MEAN + 3], h.square
     status[j, COUNT] = count = min(status[j, COUNT] + 1.0, guards.window)
     if status[j, TRUSTED] == 0.0 and q > guards.fix_gate:
         return True
-    clip = min(1.0, math.sqrt(CLIP / q))
+    clip = math.sqrt(CLIP / q) if q > CLIP else 1.0
     for c in range(3):
         mean[c] += (clip * h.gap[c] - mean[c]) / count
         for d in range(3):
-            s[c, d] = h.variance[c] / count + (1.0 if known.own > 0.0 else 0.0) if c == d else 0.0
-            for i in range(h.terms[0]):
-                for m in range(h.terms[0]):
-                    s[c, d] += h.weight[c, i] * h.weight[d, m] * g.p[h.column[c, i], h.column[d, m]]
+            s[c, d] = h.cov[3 * c + d]
+        s[c, c] += h.variance[c] / count + (1.0 if known.own > 0.0 else 0.0)
     odds = math.log((1.0 - guards.share) / guards.share)
     near, narrow = distance(s, mean)
     if count < 3.0 or near < 2.0 * (odds + guards.revoke):
@@ -270,7 +271,7 @@ def trust(f: Filter, known: Model, guards: Guards) -> None:
 
     The odds p(b = 0 | all) / p(b = 0) of a Gaussian b are by Bayes' rule those of the two hypotheses.
     """
-    g, h, s, x = f.g, f.h, f.h.square[0], f.h.gap
+    g, h, s, x = f.g, f.h, f.h.square, f.h.gap
     wide, narrow, unit = guards.tau**2 + known.own, 0.0, guards.tau**2
     if known.own > 0.0:
         narrow = 1.0 / (1.0 / known.own - 1.0 / wide)
@@ -295,7 +296,7 @@ def trust(f: Filter, known: Model, guards: Guards) -> None:
             return
         j = f.vehicle[best]
         f.status[j, TRUSTED], f.status[j, COUNT] = 1.0, 0.0
-        term(h, 0, 3 * g.block[best, ERROR], 1.0)
+        term(h, 0, g.block[best, ERROR], 1.0)
         for c in range(3):
             expect(h, c, 0.0, max(narrow, 1e-6))
             f.status[j, MEAN + c] = 0.0

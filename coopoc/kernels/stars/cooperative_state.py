@@ -12,7 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ..compiling.compile import part, storage
+from ..compiling.compile import copied, part, storage
+from ..compiling.vectors import LANES, put, take
 from ..dead_reckoning import ROUNDING
 from .gaussian import (
     ABSENT,
@@ -91,6 +92,20 @@ class Guards(NamedTuple):
 NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, slip=0.0, trust=0.0, memory=0.0, acceleration=0.0)
 
 
+class Sent(NamedTuple):
+    """What is in the messages; arrays are broadcastable to (N, R, T, 3), the vehicles first.
+
+    Attributes:
+        position: m.
+        variance: m^2.
+        odometer: m, sum of all motions until each step.
+    """
+
+    position: Floats
+    variance: Floats
+    odometer: Floats
+
+
 class Model(NamedTuple):
     """Noise model of the filter.
 
@@ -128,6 +143,7 @@ class Filter(NamedTuple):
 
     Attributes:
         g: Gaussian.
+        trial: x and P of a first pass.
         h: rows of an update.
         vehicle: (slots,) in each slot, ABSENT for none.
         slot: (vehicles,) of each vehicle, ABSENT for none.
@@ -150,6 +166,7 @@ class Filter(NamedTuple):
     """
 
     g: Gaussian
+    trial: Gaussian
     h: Rows
     vehicle: Ints
     slot: Ints
@@ -172,9 +189,10 @@ class Filter(NamedTuple):
 @storage
 def new_filter(slots: int, vehicles: int) -> Filter:
     """A filter before its first step; vehicle 0 .. vehicles - 1."""
-    g = new_gaussian(slots)
+    g, trial = new_gaussian(slots), new_gaussian(slots)
     return Filter(
         g,
+        Gaussian(trial.x, trial.p, g.block, g.owner, g.vectors),
         new_rows(slots),
         np.full(slots, ABSENT),
         np.full(vehicles, ABSENT),
@@ -207,8 +225,8 @@ def copy_filter(source: Filter, target: Filter) -> None:
             target.hits[k, c] = source.hits[k, c]
     for j in range(len(source.slot)):
         target.slot[j] = source.slot[j]
-        for i in range(STATUS):
-            target.status[j, i] = source.status[j, i]
+    for i in range(len(source.slot) * STATUS // LANES):
+        put(target.status, i, take(source.status, i))
 
 
 @part
@@ -249,23 +267,24 @@ def start(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, co
             best, most = i, agree
     if most < 2 and f.status[ego, TRUSTED] == 0.0 and f.clock[0] <= f.revoked[ego, 1] + guards.lost:
         return False
-    first, f.vague[0], f.joined[0], f.hits[0, 0] = clear(g, 0, 0.0), known.flat, f.step[0], 0
+    f.vague[0], f.joined[0], f.hits[0, 0] = known.flat, f.step[0], 0
+    clear(g, 0)
     f.status[ego, TRUSTED], f.status[ego, COUNT] = 1.0, 0.0
     remove(g, 0, ERROR)
     if known.own > 0.0:
         insert(g, 0, ERROR, known.own)
     for c in range(3):
-        g.x[first + c], f.status[ego, MEAN + c] = own[FIX + c], 0.0
+        g.x[c], f.status[ego, MEAN + c] = own[FIX + c], 0.0
     if alone and best >= 0:
         f.vague[0] = 0.0
         for c in range(3):
-            g.x[first + c], own[FIX + c] = rows[best, SOLO + c] - across(rows, best, c), math.nan
-        widen(g, first, known.flat)
+            g.x[c], own[FIX + c] = rows[best, SOLO + c] - across(rows, best, c), math.nan
+        widen(g, 0, known.flat)
     distrust(f, known, guards)
     return True
 
 
-@part
+@copied
 def lost(f: Filter, guards: Guards) -> bool:
     """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either all fixes but the first
     contradict it, or its receiver is not trusted any more, for long or beside others that are not."""
@@ -284,6 +303,8 @@ def lost(f: Filter, guards: Guards) -> bool:
 @part
 def pause(f: Filter, dt: float) -> None:
     """The ego is absent: it starts anew at its next fix."""
+    for k in range(f.g.vectors[0]):
+        clear(f.g, 3 * k)
     f.g.vectors[0], f.hits[0, 0] = 0, 0
     for kind in range(KINDS):
         f.g.block[0, kind] = ABSENT
@@ -339,7 +360,7 @@ def across(rows: Floats, row: int, c: int) -> float:
     return float(d * ci if c == 2 else d * si * (ca if c == 0 else sa))
 
 
-@part
+@copied
 def unused(f: Filter, rows: Floats, k: int) -> bool:
     """Whether member k has sent a message with a position since the last one that was used."""
     row = f.row[k]
@@ -347,7 +368,7 @@ def unused(f: Filter, rows: Floats, k: int) -> bool:
     return bool(rows[row, AGE] >= 0.0 and new and math.isfinite(rows[row, SOLO]))
 
 
-@part
+@copied
 def measured_whole(rows: Floats, row: int) -> bool:
     """Whether range and both angles were measured."""
     angles = (rows[row, 1] != 0.0 or rows[row, 2] != 0.0) and (rows[row, 3] != 0.0 or rows[row, 4] != 0.0)

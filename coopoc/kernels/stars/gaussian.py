@@ -1,7 +1,8 @@
 """A Gaussian of 3-vectors that come and go, in covariance form, and its update by up to three numbers with gates.
 
 A vector belongs to a member of the star and has a kind: its position, the error of its fixes, ... The vectors in use
-stand side by side in x and P, so that every loop runs over contiguous numbers; `block` holds where.
+stand side by side in x and P, and zeros behind them, so that every loop runs over whole LANES of contiguous numbers;
+`block` holds where.
 """
 
 from __future__ import annotations
@@ -12,7 +13,21 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..compiling.compile import part, storage
+from ..compiling.compile import copied, part, storage
+from ..compiling.small import (
+    inverse,
+    less_applied,
+    less_transposed_product,
+    load,
+    minus_apply,
+    minus_product,
+    plus_applied,
+    scale,
+    store,
+    transpose,
+)
+from ..compiling.vectors import LANES, less, plus, put, take
+from .messages import BLOCK, ROW
 
 PLACE, ERROR, VELOCITY, CLONE, FRESH = range(5)
 """Kinds of a neighbour's vectors: position m, error of its fixes m, velocity m/s, where it was when it sent its last
@@ -20,20 +35,20 @@ message that was used m, and scratch of `settle`."""
 COMMON, COMPASS = 2, 3
 """Of the ego in place of velocity and clone: the error m that all fixes share, and (bias, noise of this step, 0) of its
 compass, rad."""
-KINDS, TERMS = 5, 8
+KINDS, TERMS = 5, 5
 ABSENT = -1
 REJECTED = 4.0
 """Times the gate: from there on a number is not only down-weighted."""
 
 
 class Gaussian(NamedTuple):
-    """Mean and covariance of the vectors in use.
+    """Mean and covariance of the vectors in use; numbers beyond them are 0.
 
     Attributes:
-        x: (size,).
-        p: (size, size), of which the first 3 vectors[0] numbers are in use.
+        x: (size,), a multiple of 12.
+        p: (size, size).
         block: (members, KINDS) index of each vector, ABSENT for none.
-        owner: (size // 3,) member KINDS + kind of each vector.
+        owner: (members KINDS,) member KINDS + kind of each vector.
         vectors: (1,) how many are in use.
     """
 
@@ -45,34 +60,34 @@ class Gaussian(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """Up to three measured numbers z_c = sum_i weight[c, i] x[column[c, i]] + N(0, variance[c]), and what came of them.
+    """Up to three measured numbers z = sum_k W_k v_k + N(0, diag(variance)) of vectors v_k, and what came of them.
 
     Attributes:
         z: (3,).
         variance: (3,).
         used: (3,) False where nothing was measured.
         gate: (3,) on the squared normalised innovation of each number, 0 for none.
-        column: (3, TERMS).
-        weight: (3, TERMS).
+        block: (TERMS,) indices of the vectors.
+        weight: (9 TERMS,) the matrices W_k.
         terms: (1,) terms in use.
         gap: (3,) out: innovations.
         q: (3,) out: squared normalised innovation, 0 where nothing was measured.
-        before: (1,) rows of before that P and x do not hold yet.
-        gain: (3 members, size) scratch: columns of the square root of what the update takes from P.
-        white: (3 members,) scratch: whitened innovations.
-        square: (2, 3, 3) scratch.
+        cov: (9,) out: H P H^T.
+        gain: (3 size,) out: columns of the square root of what the update takes from P.
+        white: (3,) out: whitened innovations.
+        square: (3, 3) scratch.
     """
 
     z: Floats
     variance: Floats
     used: Bools
     gate: Floats
-    column: Ints
+    block: Ints
     weight: Floats
     terms: Ints
     gap: Floats
     q: Floats
-    before: Ints
+    cov: Floats
     gain: Floats
     white: Floats
     square: Floats
@@ -81,9 +96,10 @@ class Rows(NamedTuple):
 @storage
 def new_gaussian(members: int) -> Gaussian:
     """Room for all vectors of that many members."""
-    size = 3 * KINDS * members
+    size = 12 * (1 + KINDS * members // 4)
     block = np.full((members, KINDS), ABSENT)
-    return Gaussian(np.zeros(size), np.zeros((size, size)), block, np.zeros(size // 3, np.int64), np.zeros(1, np.int64))
+    owner = np.zeros(KINDS * members, np.int64)
+    return Gaussian(np.zeros(size), np.zeros((size, size)), block, owner, np.zeros(1, np.int64))
 
 
 @storage
@@ -94,15 +110,15 @@ def new_rows(members: int) -> Rows:
         np.zeros(3),
         np.zeros(3, np.bool_),
         np.zeros(3),
-        np.zeros((3, TERMS), np.int64),
-        np.zeros((3, TERMS)),
+        np.zeros(TERMS, np.int64),
+        np.zeros(9 * TERMS),
         np.zeros(1, np.int64),
         np.zeros(3),
         np.zeros(3),
-        np.zeros(1, np.int64),
-        np.zeros((3 * members, 3 * KINDS * members)),
-        np.zeros(3 * members),
-        np.zeros((2, 3, 3)),
+        np.zeros(9),
+        np.zeros(36 * (1 + KINDS * members // 4)),
+        np.zeros(3),
+        np.zeros((3, 3)),
     )
 
 
@@ -118,19 +134,18 @@ def insert(g: Gaussian, member: int, kind: int, variance: float) -> int:
     b = g.vectors[0]
     g.vectors[0] = b + 1
     g.block[member, kind], g.owner[b] = b, member * KINDS + kind
-    return clear(g, 3 * b, variance)
+    widen(g, 3 * b, variance)
+    return int(3 * b)
 
 
 @part
-def clear(g: Gaussian, first: int, variance: float) -> int:
-    """Give a vector mean 0 and that variance, independent of all others; its first number."""
+def clear(g: Gaussian, first: int) -> None:
+    """Set mean and covariances of a vector to 0."""
     for i in range(first, first + 3):
         g.x[i] = 0.0
         for j in range(3 * g.vectors[0]):
             g.p[i, j] = 0.0
             g.p[j, i] = 0.0
-        g.p[i, i] = variance
-    return int(first)
 
 
 @part
@@ -148,6 +163,7 @@ def remove(g: Gaussian, member: int, kind: int) -> None:
     for j in range(n):
         for c in range(3):
             g.p[j, 3 * b + c] = g.p[j, 3 * last + c]
+    clear(g, 3 * last)
     moved = g.owner[last]
     g.owner[b] = moved
     g.block[moved // KINDS, moved % KINDS] = b
@@ -158,14 +174,25 @@ def remove(g: Gaussian, member: int, kind: int) -> None:
 @part
 def copy_gaussian(source: Gaussian, target: Gaussian) -> None:
     """Copy the vectors; the target has room for as many members or more."""
-    for i in range(3 * source.vectors[0]):
+    n = 3 * max(source.vectors[0], target.vectors[0])
+    for i in range(n):
         target.x[i] = source.x[i]
-        for j in range(3 * source.vectors[0]):
+        for j in range(n):
             target.p[i, j] = source.p[i, j]
     target.vectors[0] = source.vectors[0]
     for i in range(len(source.owner)):
         target.owner[i] = source.owner[i]
         target.block[i // KINDS, i % KINDS] = source.block[i // KINDS, i % KINDS]
+
+
+@copied
+def copy_moments(source: Gaussian, target: Gaussian) -> None:
+    """Copy x and P into arrays of the same size."""
+    wide, lanes = len(source.x) // LANES, (3 * source.vectors[0] + LANES - 1) // LANES
+    for j in range(lanes):
+        put(target.x, j, take(source.x, j))
+        for i in range(j, 3 * source.vectors[0] * wide, wide):
+            put(target.p, i, take(source.p, i))
 
 
 @part
@@ -181,28 +208,28 @@ def shift(g: Gaussian, i: int, j: int, factor: float) -> None:
             g.p[k, i + c] += factor * g.p[k, j + c]
 
 
-@part
+@copied
 def widen(g: Gaussian, i: int, variance: float) -> None:
     """Add white noise of that variance to a vector."""
     for c in range(3):
         g.p[i + c, i + c] += variance
 
 
-@part
-def term(h: Rows, k: int, first: int, weight: float) -> None:
-    """Let the k-th term of row c be `weight` times number c of the vector that starts at `first`."""
-    for c in range(3):
-        h.column[c, k], h.weight[c, k] = first + c, weight
+@copied
+def term(h: Rows, k: int, block: int, weight: float) -> None:
+    """Let the k-th term of the rows be `weight` times a vector, and the last one."""
+    h.block[k], o = block, 0.0
+    store(h.weight, k, (weight, o, o, o, weight, o, o, o, weight))
     h.terms[0] = k + 1
 
 
-@part
+@copied
 def expect(h: Rows, c: int, z: float, variance: float) -> None:
     """Row c measured z with that variance, and has no gate of its own."""
     h.z[c], h.variance[c], h.used[c], h.gate[c] = z, variance, True, 0.0
 
 
-@part
+@copied
 def weight(q: float, gate: float) -> float:
     """Share of its information that a number keeps: 1 / (inflation of the innovation's covariance)."""
     if gate == 0.0 or not q > gate:
@@ -211,65 +238,90 @@ def weight(q: float, gate: float) -> float:
 
 
 @part
-def update(g: Gaussian, h: Rows, gate: float) -> float:
-    """Kalman update by the rows, as one vector with a gate; its squared Mahalanobis distance."""
-    q = innovate(g, h)
-    correct(g, h, weight(q, gate))
-    return q
+def update(g: Gaussian, h: Rows, gate: float) -> None:
+    """Kalman update by the rows, as one vector with a gate."""
+    correct(g, h, weight(innovate(g, h), gate))
 
 
-@part
+@copied
+def project(g: Gaussian, h: Rows) -> None:
+    """Innovations z - H x, H P in place of `gain`, and H P H^T."""
+    gain, wide, third = h.gain, len(g.x) // LANES, len(g.x) // 3
+    for k in range(h.terms[0]):
+        i, w = 3 * h.block[k] * wide, load(h.weight, k, BLOCK)
+        for j in range((3 * g.vectors[0] + LANES - 1) // LANES):
+            a, b, c = take(g.p, i + j), take(g.p, i + wide + j), take(g.p, i + 2 * wide + j)
+            d, e, f = w[0] * a, w[3] * a, w[6] * a
+            if k > 0:
+                d, e, f = take(gain, j) + d, take(gain, wide + j) + e, take(gain, 2 * wide + j) + f
+            put(gain, j, plus(plus(d, w[1], b), w[2], c))
+            put(gain, wide + j, plus(plus(e, w[4], b), w[5], c))
+            put(gain, 2 * wide + j, plus(plus(f, w[7], b), w[8], c))
+    gap, one, two, three = load(h.z, 0, ROW), ROW, ROW, ROW
+    for k in range(h.terms[0]):
+        b, w = h.block[k], load(h.weight, k, BLOCK)
+        gap = less_applied(gap, w, load(g.x, b, ROW))
+        one = plus_applied(one, w, load(gain, b, ROW))
+        two = plus_applied(two, w, load(gain, third + b, ROW))
+        three = plus_applied(three, w, load(gain, 2 * third + b, ROW))
+    store(h.gap, 0, gap)
+    store(h.cov, 0, (*one, *two, *three))
+
+
+@copied
 def innovate(g: Gaussian, h: Rows) -> float:
     """Decorrelate each row from those before it, and gate it; squared Mahalanobis distance of the three.
 
     `gain` is U = P H^T L^-T, S = L L^T the innovation's covariance. Where the squared normalised innovation q of a row
     exceeds its gate, its variance is multiplied by q / gate, and by 100 more where it exceeds REJECTED times the gate.
     """
-    x, p, n, terms, total = g.x, g.p, 3 * g.vectors[0], h.terms[0], 0.0
-    for c in range(3):
-        row = h.before[0] + c
-        h.q[c] = h.white[row] = h.gap[c] = 0.0
-        for j in range(n):
-            h.gain[row, j] = 0.0
-        if not h.used[c]:
-            continue
-        innovation, variance = h.z[c], h.variance[c]
-        for k in range(terms):
-            i, w = h.column[c, k], h.weight[c, k]
-            innovation -= w * x[i]
-            for j in range(n):
-                h.gain[row, j] += w * p[i, j]
-        h.gap[c] = innovation
-        for k in range(terms):
-            variance += h.weight[c, k] * h.gain[row, h.column[c, k]]
-        for d in range(row):
-            shared = 0.0
-            for k in range(terms):
-                shared += h.weight[c, k] * h.gain[d, h.column[c, k]]
-            innovation -= shared * h.white[d]
-            variance -= shared * shared
-            for j in range(n):
-                h.gain[row, j] -= shared * h.gain[d, j]
-        h.q[c] = innovation * innovation / variance
-        scale = math.sqrt(weight(h.q[c], h.gate[c]) / variance)
-        h.white[row] = innovation * scale
-        total += h.white[row] * h.white[row]
-        for j in range(n):
-            h.gain[row, j] *= scale
-    return float(total)
+    project(g, h)
+    gain, wide, gap, cov = h.gain, len(g.x) // LANES, load(h.gap, 0, ROW), load(h.cov, 0, BLOCK)
+    x, d = whitened(h, 0, gap[0], h.variance[0] + cov[0])
+    s = cov[1] * d
+    y, e = whitened(h, 1, gap[1] - s * x, h.variance[1] + cov[4] - s * s)
+    a = -e * s * d
+    s, t = cov[2] * d, cov[5] * e + cov[2] * a
+    z, f = whitened(h, 2, gap[2] - s * x - t * y, h.variance[2] + cov[8] - s * s - t * t)
+    b, c = -f * (s * d + t * a), -f * t * e
+    store(h.white, 0, (x, y, z))
+    for j in range((3 * g.vectors[0] + LANES - 1) // LANES):
+        p, q, r = take(gain, j), take(gain, wide + j), take(gain, 2 * wide + j)
+        put(gain, j, d * p)
+        put(gain, wide + j, plus(e * q, a, p))
+        put(gain, 2 * wide + j, plus(plus(f * r, c, q), b, p))
+    return x * x + y * y + z * z
 
 
-@part
+@copied
+def whitened(h: Rows, c: int, innovation: float, variance: float) -> tuple[float, float]:
+    """Innovation of row c over its gated standard deviation, and 1 over that; 0 where nothing was measured."""
+    if not h.used[c]:
+        h.q[c] = h.gap[c] = 0.0
+        return 0.0, 0.0
+    h.q[c] = q = innovation * innovation / variance
+    scale = math.sqrt(weight(q, h.gate[c]) / variance)
+    return innovation * scale, scale
+
+
+@copied
 def correct(g: Gaussian, h: Rows, share: float) -> None:
     """P <- P - share U U^T: the innovation's covariance is that of `innovate` over `share`."""
-    x, p, n = g.x, g.p, 3 * g.vectors[0]
-    y0, y1, y2 = share * h.white[0], share * h.white[1], share * h.white[2]
-    for i in range(n):
-        u0, u1, u2 = h.gain[0, i], h.gain[1, i], h.gain[2, i]
-        x[i] += u0 * y0 + u1 * y1 + u2 * y2
-        u0, u1, u2 = share * u0, share * u1, share * u2
-        for j in range(n):
-            p[i, j] -= u0 * h.gain[0, j] + u1 * h.gain[1, j] + u2 * h.gain[2, j]
+    p, gain, wide, third = g.p, h.gain, len(g.x) // LANES, len(g.x) // 3
+    lanes = (3 * g.vectors[0] + LANES - 1) // LANES
+    x, y, z = share * h.white[0], share * h.white[1], share * h.white[2]
+    for j in range(lanes):
+        u, v, w = take(gain, j), take(gain, wide + j), take(gain, 2 * wide + j)
+        put(g.x, j, plus(plus(plus(take(g.x, j), x, u), y, v), z, w))
+    for k in range(g.vectors[0]):
+        i, a = 3 * k * wide, scale(load(gain, k, ROW), share)
+        b, c = scale(load(gain, third + k, ROW), share), scale(load(gain, 2 * third + k, ROW), share)
+        for j in range(lanes):
+            u, v, w = take(gain, j), take(gain, wide + j), take(gain, 2 * wide + j)
+            first, second, third_ = i + j, i + wide + j, i + 2 * wide + j
+            put(p, first, less(less(less(take(p, first), a[0], u), b[0], v), c[0], w))
+            put(p, second, less(less(less(take(p, second), a[1], u), b[1], v), c[1], w))
+            put(p, third_, less(less(less(take(p, third_), a[2], u), b[2], v), c[2], w))
 
 
 @part
@@ -279,53 +331,32 @@ def settle(g: Gaussian, h: Rows, member: int, flat: float) -> None:
     With z = A x + B y + w the position is A^-1 (z - B y - w), which is put into the state as another vector; that both
     are the same but for N(0, flat) is then the measurement, and the vector replaces the position.
     """
-    first, terms, a, inverse = 3 * g.block[member, PLACE], h.terms[0], h.square[0], h.square[1]
-    n, new = 3 * g.vectors[0], insert(g, member, FRESH, 0.0)
+    place, n, b = g.block[member, PLACE], 3 * g.vectors[0], BLOCK
+    for k in range(h.terms[0]):
+        if h.block[k] == place:
+            a = load(h.weight, k, BLOCK)
+            b = minus_product(inverse(less_transposed_product(BLOCK, a, a)), transpose(a))
+            store(h.weight, k, BLOCK)
+    for k in range(h.terms[0]):
+        store(h.weight, k, minus_product(b, load(h.weight, k, BLOCK)))
+    store(h.z, 0, minus_apply(b, load(h.z, 0, ROW)))
+    project(g, h)
+    new = insert(g, member, FRESH, 0.0)
     for c in range(3):
-        h.white[c] = h.z[c]
-        for d in range(3):
-            a[c, d] = 0.0
+        g.x[new + c] = -h.gap[c]
         for j in range(n):
-            h.gain[c, j] = 0.0
-        for k in range(terms):
-            i, w = h.column[c, k], h.weight[c, k]
-            if first <= i < first + 3:
-                a[c, i - first] += w
-                h.weight[c, k] = 0.0
-                continue
-            h.white[c] -= w * g.x[i]
-            for j in range(n):
-                h.gain[c, j] -= w * g.p[i, j]
-    for c in range(3):
-        i, k = (c + 1) % 3, (c + 2) % 3
+            g.p[new + c, j] = g.p[j, new + c] = h.gain[c * len(g.x) + j]
         for d in range(3):
-            j, m = (d + 1) % 3, (d + 2) % 3
-            inverse[d, c] = a[i, j] * a[k, m] - a[i, m] * a[k, j]
-    det = a[0, 0] * inverse[0, 0] + a[0, 1] * inverse[1, 0] + a[0, 2] * inverse[2, 0]
-    for c in range(3):
-        for d in range(3):
-            inverse[c, d] /= det
-            a[c, d] = h.variance[c] if c == d else 0.0
-            for k in range(terms):
-                a[c, d] -= h.weight[c, k] * h.gain[d, h.column[c, k]]
-    for c in range(3):
-        for k in range(3):
-            g.x[new + c] += inverse[c, k] * h.white[k]
-            for j in range(n):
-                g.p[new + c, j] += inverse[c, k] * h.gain[k, j]
-            for d in range(3):
-                for m in range(3):
-                    g.p[new + c, new + d] += inverse[c, k] * a[k, m] * inverse[d, m]
-        for j in range(n):
-            g.p[j, new + c] = g.p[new + c, j]
-    term(h, 0, new, 1.0)
-    term(h, 1, first, -1.0)
+            g.p[new + c, new + d] = h.cov[3 * c + d]
+            for k in range(3):
+                g.p[new + c, new + d] += b[3 * c + k] * h.variance[k] * b[3 * d + k]
+    term(h, 0, new // 3, 1.0)
+    term(h, 1, place, -1.0)
     for c in range(3):
         expect(h, c, 0.0, flat)
     update(g, h, 0.0)
     remove(g, member, PLACE)
-    b = first // 3
-    g.block[member, PLACE], g.owner[b], g.block[member, FRESH] = b, member * KINDS + PLACE, ABSENT
+    g.block[member, PLACE], g.owner[place], g.block[member, FRESH] = place, member * KINDS + PLACE, ABSENT
 
 
 @part

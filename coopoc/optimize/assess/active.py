@@ -86,14 +86,14 @@ def _rows_of(problem: Problem, x: Floats, k: int) -> tuple[tuple[Floats, Floats,
 
     item, space = problem.constraints[k], problem.space
     finite = bounded(item)
-    linear = linearise(space, [as_factor(item)], problem.movable, x[None])
+    linear = linearise(space, [as_factor(item)], problem.movable, x)
     row, component = np.nonzero(finite)
-    data = np.stack([jacobian[0, row, component] for jacobian in linear.jacobian[0]], axis=1)
+    data = np.stack([jacobian[row, component] for jacobian in linear.jacobian[0]], axis=1)
     columns = space.dof * item.nodes[row][:, :, None] + np.arange(space.dof)
     starts = np.arange(0, data.size + 1, item.nodes.shape[1] * space.dof)
     matrix = csr_array((data.ravel(), columns.ravel(), starts), shape=(len(row), len(problem.names) * space.dof))
     place = np.stack([np.full(len(row), k), row, component], axis=1)
-    return (linear.residual[0][0, finite], item.lower[finite], item.upper[finite]), matrix, place
+    return (linear.residual[0][finite], item.lower[finite], item.upper[finite]), matrix, place
 
 
 def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:

@@ -67,7 +67,7 @@ def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
     """Assessment of a single problem at x (n, ambient); without constraints the covariance may be left out."""
     if not problem.constraints:
         return _unconstrained(problem, sparse(problem), x, covariance)
-    linear = problem.linearise(x[None])
+    linear = problem.linearise(x)
     J, shape = problem.jacobian(linear), (len(x), problem.space.dof)
     gradient = J.T @ np.concatenate([r.ravel() for r in linear.residual])
     active = active_at(problem, x, gradient.reshape(shape))
@@ -79,10 +79,10 @@ def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
         sound = False
     if not sound or not (np.isfinite(dx).all() and np.isfinite(cov).all()):
         unknown = np.full((*shape, shape[1]), np.nan)
-        return Assessment(float(linear.cost[0]), size, unknown, np.nan, _unobservable(problem, J, active), active)
+        return Assessment(linear.cost, size, unknown, np.nan, _unobservable(problem, J, active), active)
     if still is not None:
         cov = cov * ~(still[:, :, None] | still[:, None, :])
-    return Assessment(float(linear.cost[0]), size, cov, float(np.abs(dx).max(initial=0.0)), (), active)
+    return Assessment(linear.cost, size, cov, float(np.abs(dx).max(initial=0.0)), (), active)
 
 
 def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool) -> Assessment:
@@ -292,8 +292,8 @@ def judged(problem: Problem, x: Floats, cost: float) -> tuple[float, tuple[str, 
 
 def squared(problem: Problem, factor: Factor, x: Floats) -> Floats:
     """(M,) |W (h(x) - z)|^2 of the measurements of a factor at x (n, ambient)."""
-    (residual,) = linearise(problem.space, [unchecked(factor, loss=None)], None, x[None]).residual
-    return np.asarray(np.square(residual[0]).sum(axis=-1))
+    (residual,) = linearise(problem.space, [unchecked(factor, loss=None)], None, x).residual
+    return np.asarray(np.square(residual).sum(axis=-1))
 
 
 def implausible(cost: float, mean: float, variance: float) -> bool:
@@ -341,7 +341,7 @@ def joint_covariance(problem: Problem, solution: Solution, nodes: Sequence[str |
         (k, k, dof, dof) m^2, rad^2: block [i, j] between nodes i and j, zero where one cannot move.
 
     Raises:
-        InputError: an unknown node, a problem with constraints or realisations, one whose nodes can move freely.
+        InputError: an unknown node, a problem with constraints, one whose nodes can move freely.
 
     >>> from coopoc import solve
     >>> problem = Problem(("a", "b")).add("position", "a", [0, 0, 0], std=1.0)
@@ -353,9 +353,8 @@ def joint_covariance(problem: Problem, solution: Solution, nodes: Sequence[str |
     instance("problem", problem, Problem)
     given: Any = getattr(solution, "x", None)
     x = checked("solution", given, "(n, ambient)", (len(problem.names), problem.space.ambient))
-    if problem.constraints or problem.batch is not None:
-        what = "constraints" if problem.constraints else f"{problem.batch} realisations"
-        raise InputError("problem", what, "must be a single one without constraints", "Pick one: problem.pick(0).")
+    if problem.constraints:
+        raise InputError("problem", "constraints", "must have none", "Read solution.covariance instead.")
     places = [problem.index(node) for node in (nodes if isinstance(nodes, str) else several(nodes))]
     if len(places) > len(problem.names):
         allowed = f"must name each of {len(problem.names)} nodes once"

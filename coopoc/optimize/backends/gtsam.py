@@ -276,13 +276,13 @@ class Callbacks:
         def error(_: Any, found: Any, jacobians: Any) -> Any:
             if self._at is None or not found.equals(self._at, 0.0):
                 self._at, x = gtsam.Values(found), estimate(self._space, self._posed, found)
-                self._linear = linearise(self._space, self._factors, None, x[None])
+                self._linear = linearise(self._space, self._factors, None, x)
                 self._tangent = tangent(self._space, self._posed, x)
             if jacobians is not None:
                 for place, i in enumerate(nodes):
-                    by = self._linear.jacobian[k][place][0]
+                    by = self._linear.jacobian[k][place]
                     jacobians[place] = by[row] @ self._tangent[i]
-            return self._linear.residual[k][0, row]
+            return self._linear.residual[k][row]
 
         return error
 

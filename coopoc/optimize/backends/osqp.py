@@ -219,8 +219,8 @@ class _Limits:
     def around(self, x: Floats) -> tuple[Floats, Floats]:
         """Bounds of C dx at x (n, ambient)."""
         space, constraints = self.problem.space, self.problem.constraints
-        linear = linearise(space, [as_factor(c) for c in constraints], None, x[None])
-        parts = [h[0, bounded(c)] for h, c in zip(linear.residual, constraints, strict=True)]
+        linear = linearise(space, [as_factor(c) for c in constraints], None, x)
+        parts = [h[bounded(c)] for h, c in zip(linear.residual, constraints, strict=True)]
         value = np.concatenate([np.empty(0), *parts])
         return self.lower - value, self.upper - value
 

@@ -168,8 +168,7 @@ def quadratic(problem: Problem) -> Quadratic:
     have no such form.
 
     Raises:
-        InputError: another kind, weights that differ between axes where a rotation acts, a robust loss, constraints, B
-            realisations.
+        InputError: another kind, weights that differ between axes where a rotation acts, a robust loss, constraints.
 
     >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
     >>> quadratic(problem.add("range", ("a", "b"), 5.0, std=0.5)).rows.shape
@@ -341,8 +340,6 @@ def one_weight(root: Floats) -> Floats | None:
 
 
 def _check(problem: Problem) -> None:
-    if problem.batch is not None:
-        raise InputError("problem", repr(problem), "must be a single realisation", "Pick one with problem.pick(0).")
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     if problem.constraints:

@@ -98,18 +98,17 @@ class Structure(NamedTuple):
 
 
 def numbers_of(factor: Factor) -> Floats:
-    """(P, M) or (B, P, M): z, constants and weights of the measurements of a factor."""
-    weight, batch = factor.sqrt_information, () if factor.batch is None else (factor.batch,)
+    """(P, M) z, constants and weights of the measurements of a factor."""
+    weight = factor.sqrt_information
     if factor.std is not None:
         weight = 1.0 / factor.std
     else:
         assert weight is not None
-        weight = weight.reshape(*weight.shape[:-2], -1)
+        weight = weight.reshape(len(weight), -1)
     assert factor.constants is not None
     first, second = factor.z.shape[-1], factor.z.shape[-1] + factor.constants.shape[1]
-    out = np.empty((*batch, second + weight.shape[-1], len(factor.nodes)))
-    out[..., :first, :], out[..., first:second, :] = factor.z.swapaxes(-1, -2), factor.constants.T
-    out[..., second:, :] = weight.swapaxes(-1, -2)
+    out = np.empty((second + weight.shape[-1], len(factor.nodes)))
+    out[:first], out[first:second], out[second:] = factor.z.T, factor.constants.T, weight.T
     return out
 
 
@@ -386,35 +385,30 @@ class Linear:
     A robust factor's residual and derivatives carry the root of its weight rho'.
 
     Args:
-        x: (B, n, ambient).
-        residual: per factor (B, M, size).
-        jacobian: per factor and node (B, M, size, dof).
-        cost: (B,) 1/2 sum of rho.
+        x: (n, ambient).
+        residual: per factor (M, size).
+        jacobian: per factor and node (M, size, dof).
+        cost: 1/2 sum of rho.
     """
 
     x: Floats
     residual: tuple[Floats, ...]
     jacobian: tuple[tuple[Floats, ...], ...]
-    cost: Floats
-
-    def pick(self, index: Bools | Ints) -> Linear:
-        """The realisations `index` of B."""
-        jacobian = tuple(tuple(of_node[index] for of_node in nodes) for nodes in self.jacobian)
-        return Linear(self.x[index], tuple(r[index] for r in self.residual), jacobian, self.cost[index])
+    cost: float
 
 
 def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x: Floats) -> Linear:
-    """Factors around x (B, n, ambient); what is not `movable` (n, dof) has no derivative."""
-    residuals, jacobians, cost = [], [], np.zeros(len(x))
+    """Factors around x (n, ambient); what is not `movable` (n, dof) has no derivative."""
+    residuals, jacobians, cost = [], [], 0.0
     for factor in factors:
         residual, jacobian = _evaluated(space, factor, x)
-        square = np.einsum("bmk,bmk->bm", residual, residual)
+        square = np.square(residual).sum(axis=1)
         if factor.loss is None:
-            cost += 0.5 * square.sum(axis=1)
+            cost += 0.5 * float(square.sum())
         else:
-            root = np.sqrt(factor.loss.weight(square))[..., None]
+            root = np.sqrt(factor.loss.weight(square))[:, None]
             residual, jacobian = residual * root, tuple(s * root[..., None] for s in jacobian)
-            cost += 0.5 * factor.loss.cost(square).sum(axis=1)
+            cost += 0.5 * float(factor.loss.cost(square).sum())
         if movable is not None:
             jacobian = tuple(s * movable[n][:, None] for s, n in zip(jacobian, factor.nodes.T, strict=True))
         residuals.append(residual)
@@ -423,22 +417,14 @@ def linearise(space: Space, factors: Sequence[Factor], movable: Bools | None, x:
 
 
 def _evaluated(space: Space, factor: Factor, x: Floats) -> tuple[Floats, tuple[Floats, ...]]:
-    """Whitened residuals and derivatives of a factor at x by the tape of its kind, all realisations in one run."""
+    """Whitened residuals and derivatives of a factor at x by the tape of its kind."""
     from ...kernels.graphs.graph_tape import accumulate
 
-    (batch, n, _), (count, arity), size, dof = x.shape, factor.nodes.shape, factor.size, space.dof
-    kind = Kind(factor.measurement, space, factor.std is None)
-    rows = batch * count
-    numbers, nodes = numbers_of(factor), factor.nodes
-    if batch > 1:
-        numbers = np.tile(numbers, batch) if numbers.ndim == 2 else numbers.swapaxes(0, 1)
-        nodes = (n * np.arange(batch)[:, None, None] + nodes).reshape(-1, arity)
-    numbers = numbers.reshape(-1, rows)
-    total = np.zeros((1 + arity * dof) * size * rows)
-    accumulate(write(kind, "jacobian").tape, x.reshape(batch * n, -1), nodes, numbers, _goal(kind, rows), total)
-    end = size * rows
-    jacobians = total[end:].reshape(arity, batch, count, size, dof)
-    return total[:end].reshape(batch, count, size), tuple(jacobians)
+    (rows, arity), size, dof = factor.nodes.shape, factor.size, space.dof
+    kind, end = Kind(factor.measurement, space, factor.std is None), size * rows
+    total = np.zeros((1 + arity * dof) * end)
+    accumulate(write(kind, "jacobian").tape, x, factor.nodes, numbers_of(factor), _goal(kind, rows), total)
+    return total[:end].reshape(rows, size), tuple(total[end:].reshape(arity, rows, size, dof))
 
 
 @lru_cache(maxsize=64)
@@ -452,19 +438,19 @@ def _goal(kind: Kind, rows: int) -> Any:
     return (first[:, None] + stride[:, None] * np.arange(rows)).astype(np.int32)
 
 
-def sparse_jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int, int], index: int) -> Any:
-    """Sparse Jacobian (rows, n dof) of one realisation, CSR; shape is n and dof."""
+def sparse_jacobian(linear: Linear, factors: Sequence[Factor], shape: tuple[int, int]) -> Any:
+    """Sparse Jacobian (rows, n dof), CSR; shape is n and dof."""
     from scipy.sparse import csr_array
 
     (n, dof), top = shape, 0
-    data, rows, columns = [np.empty(0)], [np.empty(0, np.int64)], [np.empty(0, np.int64)]
+    data, rows, columns = list[Floats](), [np.empty(0, np.int64)], [np.empty(0, np.int64)]
     for factor, residual, jacobians in zip(factors, linear.residual, linear.jacobian, strict=True):
-        count, size = residual.shape[1:]
+        count, size = residual.shape
         row = top + np.arange(count * size).reshape(count, size, 1)
         for nodes, jacobian in zip(factor.nodes.T, jacobians, strict=True):
-            data.append(jacobian[index].ravel())
+            data.append(jacobian.ravel())
             rows.append(np.broadcast_to(row, (count, size, dof)).ravel())
             columns.append(np.broadcast_to(dof * nodes[:, None, None] + np.arange(dof), (count, size, dof)).ravel())
         top += count * size
     position = np.concatenate(rows), np.concatenate(columns)
-    return csr_array((np.concatenate(data), position), shape=(top, n * dof))
+    return csr_array((np.concatenate([np.empty(0), *data]), position), shape=(top, n * dof))

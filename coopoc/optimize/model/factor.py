@@ -14,7 +14,6 @@ import numpy.typing as npt
 from ...arrays import Bools, Floats, Ints, frozen, instance, number, one_of
 from ...errors import InputError
 from .inputs import (
-    agreed,
     check_constants,
     check_nodes,
     check_root,
@@ -86,10 +85,9 @@ class Factor:
     Args:
         kind: a registered measurement.
         nodes: (M, arity); of two, the first observes the second.
-        z: (M, k) or (B, M, k) for B noise realisations: m, rad; kinds that compare poses have k = d + d^2 (see `pose`).
-        std: size, (size,), (M, size) or (B, M, size) standard deviations, W = diag(1/std); infinite: no information (a
-            measurement that this realisation lacks).
-        sqrt_information: instead of std, (size, size), (M, size, size) or (B, M, size, size), W^T W = cov^-1.
+        z: (M, k) m, rad; kinds that compare poses have k = d + d^2 (see `pose`).
+        std: size, (size,) or (M, size) standard deviations, W = diag(1/std); infinite: no information.
+        sqrt_information: instead of std, (size, size) or (M, size, size), W^T W = cov^-1.
         constants: (M, c) or (c,) numbers of the kind, such as dt s of a speed.
         loss: rho, None for least squares.
         cov: instead of std, covariances shaped as sqrt_information.
@@ -126,7 +124,7 @@ class Factor:
         if len(given) != 1:
             allowed = "exactly one of std, cov and sqrt_information must be given"
             raise InputError("std", " and ".join(given) or "nothing", allowed, "Give std=.")
-        shape = (*self.z.shape[:-1], self.size)
+        shape = len(self.nodes), self.size
         if self.std is not None:
             object.__setattr__(self, "std", check_std(measurement, self.std, shape))
         else:
@@ -135,7 +133,6 @@ class Factor:
             object.__setattr__(self, "sqrt_information", check_root(measurement, root, shape))
         if self.loss is not None:
             instance("loss", self.loss, Loss, 'Give Loss("huber", 2.0), or None.')
-        _ = self.batch  # refuses numbers of realisations that differ
 
     @property
     def measurement(self) -> Measurement:
@@ -152,46 +149,29 @@ class Factor:
         """Residuals per measurement."""
         return self.measurement.size(self.dimension or 3)
 
-    @cached_property
-    def batch(self) -> int | None:
-        """B, or None for a single realisation."""
-        arrays = (self.z, 3), (self.std, 3), (self.sqrt_information, 4)
-        return agreed("std", (len(a) for a, rank in arrays if a is not None and a.ndim == rank))
-
     @property
     def informative(self) -> Bools:
-        """(M,) or (B, M) True where the measurement carries information."""
+        """(M,) True where the measurement carries information."""
         if self.std is not None:
             informed = np.isfinite(self.std).any(axis=-1)
         else:
             assert self.sqrt_information is not None
             informed = (self.sqrt_information != 0).any(axis=(-2, -1))
-        return np.broadcast_to(informed, (*informed.shape[:-1], len(self.nodes)))
+        return np.broadcast_to(informed, len(self.nodes))
 
     @property
     def root(self) -> Floats:
-        """W as (M, size, size), or (B, M, size, size)."""
+        """W as (M, size, size)."""
         size = self.size
         if self.std is not None:
-            root = np.zeros((*self.std.shape[:-2], len(self.nodes), size * size))
-            root[..., :: size + 1] = 1.0 / self.std
-            return root.reshape(*root.shape[:-1], size, size)
+            root = np.zeros((len(self.nodes), size * size))
+            root[:, :: size + 1] = 1.0 / self.std
+            return root.reshape(-1, size, size)
         assert self.sqrt_information is not None
-        root = self.sqrt_information
-        if root.shape[-3] == len(self.nodes):
-            return root
-        return np.broadcast_to(root, (*root.shape[:-3], len(self.nodes), size, size))
-
-    def pick(self, which: Ints | int) -> Factor:
-        """The realisations `which` of B; an int gives a single one."""
-        chosen = {
-            name: None if (a := getattr(self, name)) is None else _pick(a, rank, which)
-            for name, rank in (("z", 3), ("std", 3), ("sqrt_information", 4))
-        }
-        return unchecked(self, **chosen)
+        return np.broadcast_to(self.sqrt_information, (len(self.nodes), size, size))
 
     def __repr__(self) -> str:
-        return f"Factor({self.kind} x {len(self.nodes)}{'' if self.batch is None else f', {self.batch} realisations'})"
+        return f"Factor({self.kind} x {len(self.nodes)})"
 
 
 def of_checked(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
@@ -219,16 +199,8 @@ def _fields() -> tuple[str, ...]:
     return tuple(field.name for field in fields(Factor))
 
 
-def _pick(array: Floats, rank: int, which: Ints | int) -> Floats:
-    if array.ndim < rank:
-        return array
-    if len(array) == 1:
-        return array[0] if isinstance(which, int) else array
-    return array[which]
-
-
 def taken(factor: Factor, rows: Ints) -> Factor:
-    """Some measurements of a factor of a single problem."""
+    """Some measurements of a factor."""
     parts = {
         name: array[rows] if len(array := getattr(factor, name)) == len(factor.nodes) else array
         for name in ("z", "std", "sqrt_information", "constants")
@@ -238,7 +210,7 @@ def taken(factor: Factor, rows: Ints) -> Factor:
 
 
 def fused(factors: Sequence[Factor]) -> Sequence[Factor]:
-    """A factor per kind, loss and form of its noise, of single realisations; the same if no two go together.
+    """A factor per kind, loss and form of its noise; the same if no two go together.
 
     >>> fused([Factor("position", [[k]], [[0.0, 0, 0]], std=1.0 + k) for k in range(2)])
     (Factor(position x 2),)

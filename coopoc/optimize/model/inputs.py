@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
 from functools import lru_cache
 
 import numpy as np
@@ -56,15 +55,6 @@ def numbers(field: str, values: npt.ArrayLike) -> Floats:
     return checked(field, values)
 
 
-def agreed(field: str, batches: Iterable[int | None]) -> int | None:
-    """B, the number of realisations that all give but those of 1 and None; InputError if they differ."""
-    given = [batch for batch in batches if batch is not None]
-    if len({*given} - {1}) > 1:
-        hint = "Use the same number of realisations throughout."
-        raise InputError(field, f"for {sorted({*given})} realisations", "must agree", hint)
-    return max(given, default=None)
-
-
 def check_nodes(measurement: Measurement, nodes: npt.ArrayLike) -> Ints:
     """(M, arity) whole numbers, no node paired with itself."""
     array = checked("nodes", nodes, dtype=int)
@@ -97,12 +87,11 @@ def check_constants(measurement: Measurement, constants: npt.ArrayLike | None, c
 
 
 def check_values(measurement: Measurement, z: npt.ArrayLike, count: int) -> Floats:
-    """z as (M, k) or (B, M, k): finite, distances > 0, angles in radians, rotations that are some."""
+    """z as (M, k): finite, distances > 0, angles in radians, rotations that are some."""
     array = numbers(f"z of {measurement.name}", z)
-    if array.ndim not in (2, 3) or array.shape[-2] != count:
-        given = measurement.given()
-        shape = f"must have shape ({count}, {given}) or (B, {count}, {given}) for {measurement.name}"
-        raise InputError("z", array.shape, shape, "One row per row of nodes.")
+    if array.ndim != 2 or len(array) != count:
+        shape = f"must have shape ({count}, {measurement.given()}) for {measurement.name}"
+        raise InputError("z", array.shape, shape, "One row per row of nodes; a problem for each run.")
     dimension = fitting(measurement, array.shape[-1]) or 3
     if not np.isfinite(array).all():
         bad = np.argwhere(~np.isfinite(array))[0]
@@ -112,7 +101,7 @@ def check_values(measurement: Measurement, z: npt.ArrayLike, count: int) -> Floa
         check_rotations(f"z of {measurement.name}", Space(dimension, has_rotation=True).rotation(array))
         return array
     for k, component in enumerate(measurement.kept(dimension)):
-        _check_component(measurement, measurement.components[component], array[..., k])
+        _check_component(measurement, measurement.components[component], array[:, k])
     return array
 
 
@@ -135,32 +124,30 @@ def check_rotations(field: str, rotation: Floats) -> None:
         raise InputError(field, f"a rotation off by {error.max():.1g}", "must hold rotation matrices", hint)
 
 
-def check_std(measurement: Measurement, std: npt.ArrayLike | float, shape: tuple[int, ...]) -> Floats:
-    """std as (M or 1, size) or (B, M or 1, size): > 0, angles at most pi."""
+def check_std(measurement: Measurement, std: npt.ArrayLike | float, shape: tuple[int, int]) -> Floats:
+    """std as (M or 1, size): > 0, angles at most pi."""
     array, size = numbers(f"std of {measurement.name}", std), shape[-1]
-    wide = np.broadcast_to(array, (size,)) if array.ndim < 2 and array.size in (1, size) else array
-    wide = wide[None] if wide.ndim == 1 else wide
-    fits = wide.ndim in (2, 3) and wide.shape[-1] == size and wide.shape[-2] in (1, shape[-2])
-    if not fits:
-        allowed = f"must have shape ({size},) or {(shape[-2], size)} or (B, M, {size})"
+    wide = np.broadcast_to(array, (1, size)) if array.ndim < 2 and array.size in (1, size) else array
+    if wide.ndim != 2 or wide.shape[1] != size or len(wide) not in (1, shape[0]):
+        allowed = f"must have shape ({size},) or {shape}"
         raise InputError("std", array.shape, allowed, "One standard deviation per component.")
     if not (wide > 0).all():
         hint, bad = "Give standard deviations; infinity means no information.", np.argwhere(~(wide > 0))[0]
-        given = f"{wide[tuple(bad)]} in row {bad[-2]}"
+        given = f"{wide[tuple(bad)]} in row {bad[0]}"
         raise InputError(f"std of {measurement.name}", given, "must be > 0", hint)
     kept = measurement.kept(3 if size == len(measurement.components) else 2)
-    angles = wide[..., [measurement.components[k] in ("angle", "turn") for k in kept]]
+    angles = wide[:, [measurement.components[k] in ("angle", "turn") for k in kept]]
     if (np.isfinite(angles) & (angles > np.pi)).any():
         raise InputError(f"std of {measurement.name}", angles.max(), "must be <= pi rad", "Angles are in radians.")
     return frozen(wide)
 
 
-def check_root(measurement: Measurement, root: npt.ArrayLike, shape: tuple[int, ...]) -> Floats:
-    """sqrt_information as (M or 1, size, size) or (B, M or 1, size, size), finite."""
+def check_root(measurement: Measurement, root: npt.ArrayLike, shape: tuple[int, int]) -> Floats:
+    """sqrt_information as (M or 1, size, size), finite."""
     array, size = numbers("sqrt_information", root), shape[-1]
     array = array[None] if array.ndim == 2 else array
-    if array.ndim not in (3, 4) or array.shape[-2:] != (size, size) or array.shape[-3] not in (1, shape[-2]):
-        allowed = f"must have shape ({size}, {size}), (M, {size}, {size}) or (B, M, {size}, {size})"
+    if array.ndim != 3 or array.shape[1:] != (size, size) or len(array) not in (1, shape[0]):
+        allowed = f"must have shape ({size}, {size}) or (M, {size}, {size})"
         raise InputError(f"sqrt_information of {measurement.name}", array.shape, allowed, "W with W^T W = cov^-1.")
     if not np.isfinite(array).all():
         raise InputError("sqrt_information", "not finite", "must be finite", "Invert a positive definite covariance.")

@@ -16,7 +16,7 @@ from ...errors import InputError, shown, suggestion
 from ...world.sensors import Sensors
 from .derivatives import Linear, linearise, sparse_jacobian
 from .factor import Constraint, Factor, taken, unchecked
-from .inputs import agreed, check_rotations, numbers
+from .inputs import check_rotations, numbers
 from .measurements import lookup
 from .space import Space
 from .window import Noise, WindowStep, recorded_steps, window_factors
@@ -63,7 +63,7 @@ class Search(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Problem:
-    """minimise over n nodes 1/2 sum_k rho(|W_k (h_k(x) - z_k)|^2), for one or for B noise realisations at once.
+    """minimise over n nodes 1/2 sum_k rho(|W_k (h_k(x) - z_k)|^2).
 
     A node is a point or a pose in 2 or 3 dimensions, a row of x: its position and, in a problem with poses, its
     rotation matrix (see Space).
@@ -71,7 +71,7 @@ class Problem:
     Args:
         names: (n,) unique names of the nodes.
         factors: the measurements.
-        x0: (n, ambient) or (B, n, ambient) where the solver starts. None: the converted measurements' linear solution;
+        x0: (n, ambient) where the solver starts. None: the converted measurements' linear solution;
             poses need an x0.
         separator: nodes that the others hang on, such as the ego at each step. What remains without them must fall into
             small groups (the neighbours); they are eliminated last; the last of them is the one a Solution shows.
@@ -127,7 +127,6 @@ class Problem:
             raise InputError(
                 "fixed", [self.names[k] for k in self.fixed[:3]], "needs an x0 to be fixed at", "Give x0=."
             )
-        _ = self.batch  # refuses numbers of realisations that differ
 
     @cached_property
     def space(self) -> Space:
@@ -155,15 +154,6 @@ class Problem:
     @cached_property
     def _turning(self) -> frozenset[int]:
         return frozenset(self.poses)
-
-    @property
-    def _start_batch(self) -> int | None:
-        return len(self.x0) if self.x0 is not None and self.x0.ndim == 3 else None
-
-    @cached_property
-    def batch(self) -> int | None:
-        """B noise realisations, or None for a single problem."""
-        return agreed("factors", (*(f.batch for f in self.factors), self._start_batch))
 
     @cached_property
     def linear(self) -> bool:
@@ -212,10 +202,7 @@ class Problem:
     def _with(self, factor: Factor) -> Problem:
         """The problem with one more factor, which alone is checked: what was checked and found before is kept."""
         check_item(factor, self.names, self._turning, self.dimension)
-        batch = agreed("factors", (self.batch, factor.batch))
-        grown = self.replace_unchecked(factors=(*self.factors, factor))
-        grown.__dict__["batch"] = batch
-        return grown
+        return self.replace_unchecked(factors=(*self.factors, factor))
 
     def constrain(
         self,
@@ -239,16 +226,6 @@ class Problem:
         constraint = Constraint(kind, index, low, high, constants)  # type: ignore[arg-type]
         return replace(self, constraints=(*self.constraints, constraint))
 
-    def pick(self, which: Ints | int) -> Problem:
-        """The realisations `which` of B; an int gives a single problem."""
-        x0 = self.x0 if self._start_batch is None or self.x0 is None else self.x0[which]
-        return self.replace_unchecked(factors=tuple(f.pick(which) for f in self.factors), x0=x0)
-
-    @cached_property
-    def realisations(self) -> tuple[Problem, ...]:
-        """A single problem for each of the B realisations, itself if it is one."""
-        return (self,) if self.batch is None else tuple(self.pick(b) for b in range(self.batch))
-
     def replace_unchecked(self, **changes: Any) -> Problem:
         """The problem with changes that come from checked parts and need not be checked again."""
         changed = object.__new__(Problem)
@@ -260,7 +237,7 @@ class Problem:
         return changed
 
     def restricted(self, used: Bools, x: Floats, rows: Sequence[Ints] | None = None) -> Problem:
-        """The single problem of some nodes, from x, which has no separator.
+        """The problem of some nodes, from x, which has no separator.
 
         Args:
             used: (n,) which nodes.
@@ -285,32 +262,31 @@ class Problem:
         return {name: self.__dict__[name] for name in _fields()}
 
     def linearise(self, x: Floats) -> Linear:
-        """Whitened residuals and derivatives at x (B, n, ambient)."""
+        """Whitened residuals and derivatives at x (n, ambient)."""
         return linearise(self.space, self.factors, self.movable, x)
 
     def whiten(self, x: npt.ArrayLike) -> tuple[Floats, Any]:
-        """Residual r (rows,) and sparse Jacobian J (rows, n dof) of a single problem at x (n, ambient): cost = 1/2 r.r.
+        """Residual r (rows,) and sparse Jacobian J (rows, n dof) at x (n, ambient): cost = 1/2 r.r.
 
         A robust factor's rows carry the root of its weight rho': J^T r is the gradient, but 1/2 r.r is not the cost.
         """
         linear = self.linearise(self._at(x))
         return np.concatenate([r.ravel() for r in linear.residual]), self.jacobian(linear)
 
-    def jacobian(self, linear: Linear, which: int = 0) -> Any:
-        """Sparse Jacobian (rows, n dof) of one of the realisations of `linearise`, CSR."""
-        return sparse_jacobian(linear, self.factors, (len(self.names), self.space.dof), which)
+    def jacobian(self, linear: Linear) -> Any:
+        """Sparse Jacobian (rows, n dof) of `linearise`, CSR."""
+        return sparse_jacobian(linear, self.factors, (len(self.names), self.space.dof))
 
     def cost(self, x: npt.ArrayLike) -> float:
-        """1/2 sum of rho of a single problem at x (n, ambient)."""
-        return float(self.linearise(self._at(x)).cost[0])
+        """1/2 sum of rho at x (n, ambient)."""
+        return self.linearise(self._at(x)).cost
 
     def _at(self, x: npt.ArrayLike) -> Floats:
-        """x (1, n, ambient) of a single problem."""
-        return points(self.space, len(self.names), "x", x, (2,))[None]
+        return points(self.space, len(self.names), "x", x)
 
     @classmethod
     def from_snapshot(
-        cls, recording: Recording, step: int, ego: int | str, run: int | None = 0, noise: Noise | None = None
+        cls, recording: Recording, step: int, ego: int | str, run: int = 0, noise: Noise | None = None
     ) -> Problem:
         """The star of one step: fixes of the ego and its linked neighbours, spherical factors between them.
 
@@ -321,7 +297,7 @@ class Problem:
             recording: of the measurements.
             step: t.
             ego: column or id.
-            run: realisation, None for all R at once.
+            run: noise realisation.
             noise: noise model, default the recording's sensors.
 
         Raises:
@@ -336,14 +312,13 @@ class Problem:
         step: int,
         ego: int | str,
         length: int,
-        run: int | None = 0,
+        run: int = 0,
         noise: Noise | None = None,
     ) -> Problem:
         """The stars of the last `length` steps, one point per vehicle and step, joined by odometry dt u.
 
-        A missing fix makes no factor; of a relative measurement its parts make one each where some are missing. In a
-        problem of all R realisations what one of them lacks has an infinite std. Arguments and errors as
-        `from_snapshot`; the first step of the window must exist.
+        A missing fix makes no factor; of a relative measurement its parts make one each where some are missing.
+        Arguments and errors as `from_snapshot`; the first step of the window must exist.
         """
         steps, names = recorded_steps(recording, step, ego, length, run, noise)
         return cls.from_steps(steps, recording.sensors if noise is None else noise.sensors, names)
@@ -373,11 +348,10 @@ class Problem:
         for factor in self.factors:
             count[factor.kind] += len(factor.nodes)
         kinds = ", ".join(f"{number} {kind}" for kind, number in count.items())
-        runs = "" if self.batch is None else f", {self.batch} realisations"
         what = "points" if not self.poses else "poses" if len(self.poses) == len(self.names) else "nodes"
         plane = " in the plane" if self.dimension == 2 else ""
         bound = f"; {len(self.constraints)} constraints" if self.constraints else ""
-        return f"Problem({len(self.names)} {what}{plane}; {kinds or 'no factors'}{runs}{bound})"
+        return f"Problem({len(self.names)} {what}{plane}; {kinds or 'no factors'}{bound})"
 
 
 _space = cache(Space)
@@ -410,7 +384,7 @@ def several(nodes: Any) -> list[Any]:
 
 
 def rows(kind: str, z: npt.ArrayLike, count: int) -> Floats:
-    """z (count, size) or with a leading batch axis, from a number, a row or rows."""
+    """z (count, size) from a number, a row or rows."""
     values = numbers(f"z of {kind}", z)
     return values.reshape(count, -1) if values.ndim < 2 and values.size % count == 0 else values
 
@@ -437,14 +411,13 @@ def no_such_node(node: Any, names: Sequence[str]) -> InputError:
     return InputError("node", shown(node), allowed, suggestion(node, names, "Name the point when the Problem is made."))
 
 
-def points(space: Space, n: int, field: str, x: npt.ArrayLike, ranks: tuple[int, ...] = (2, 3)) -> Floats:
-    """x as an array (n, ambient) or (B, n, ambient); InputError if it is not one, or holds matrices of no rotation."""
+def points(space: Space, n: int, field: str, x: npt.ArrayLike) -> Floats:
+    """x as an array (n, ambient); InputError if it is not one, or holds matrices of no rotation."""
     array = numbers(field, x)
-    if array.ndim not in ranks or array.shape[-2:] != (n, space.ambient) or not np.isfinite(array).all():
-        batch = f", or (B, n, {space.ambient})" if 3 in ranks else ""
+    if array.shape != (n, space.ambient) or not np.isfinite(array).all():
         given = f"shape {array.shape}" if np.isfinite(array).all() else "not finite"
         hint = "Make it with coopoc.optimize.pose." if space.has_rotation else "Give one row of metres per point."
-        raise InputError(field, given, f"must be finite with shape ({n}, {space.ambient}){batch}", hint)
+        raise InputError(field, given, f"must be finite with shape ({n}, {space.ambient})", hint)
     if space.has_rotation:
         check_rotations(field, space.rotation(array))
     return array

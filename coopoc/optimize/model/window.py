@@ -35,17 +35,17 @@ class Noise(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class WindowStep:
-    """One step of the n members of a star, the ego first, in one (no leading axis) or B realisations.
+    """One step of the n members of a star, the ego first.
 
     NaN is what was not measured.
 
     Args:
         previous: (n,) index of each member in the previous step, -1 if it was not there.
-        fix: (B, n, 3) m, GNSS.
-        fix_std: (B, n, 3) m; infinite where the fix is not to be used.
-        moved: (B, n, 3) m since the previous step.
-        moved_std: (B, n, 3) m.
-        relative: (B, n - 1, 3) m, rad, rad of the neighbours as the ego measures them.
+        fix: (n, 3) m, GNSS.
+        fix_std: (n, 3) m; infinite where the fix is not to be used.
+        moved: (n, 3) m since the previous step.
+        moved_std: (n, 3) m.
+        relative: (n - 1, 3) m, rad, rad of the neighbours as the ego measures them.
     """
 
     previous: Ints
@@ -72,18 +72,18 @@ def window_factors(
     for s, before, top in zip(steps[1:], tops, tops[1:], strict=False):
         stays = np.flatnonzero(s.previous >= 0)
         pairs.append(np.stack([before + s.previous[stays], top + stays], axis=1))
-        motions.append((s.moved[..., stays, :], s.moved_std[..., stays, :]))
+        motions.append((s.moved[stays], s.moved_std[stays]))
     if motions:
         factors += _measured("displacement", np.concatenate(pairs), *_joined(motions))
     counts = [len(s.previous) - 1 for s in steps]
     edges = np.stack([np.repeat(tops[:-1], counts), np.delete(np.arange(tops[-1]), tops[:-1])], axis=1)
-    relative = np.concatenate([s.relative for s in steps], axis=-2)
+    relative = np.concatenate([s.relative for s in steps])
     return int(tops[-1]), (*factors, *_relative(edges, relative, sensors)), tuple(tops[:-1].tolist())
 
 
 def _relative(edges: Ints, relative: Floats, sensors: Sensors | None) -> list[Factor]:
-    """Factors of range, azimuth and inclination (..., M, 3): of the three where all are there, else of what is."""
-    whole = np.isfinite(relative).all(axis=-1, keepdims=True)
+    """Factors of range, azimuth and inclination (M, 3): of the three where all are there, else of what is."""
+    whole = np.isfinite(relative).all(axis=1, keepdims=True)
     std = np.ones(3) if sensors is None else relative_std(relative, sensors)
     complete = np.where(whole, relative, np.nan)
     if sensors is None:
@@ -91,48 +91,36 @@ def _relative(edges: Ints, relative: Floats, sensors: Sensors | None) -> list[Fa
     else:
         factors = _measured("spherical", edges, complete, std)
     for k, kind in enumerate(() if whole.all() else ("range", "azimuth", "inclination")):
-        factors += _measured(kind, edges, np.where(whole, np.nan, relative)[..., k, None], std[..., k, None])
+        factors += _measured(kind, edges, np.where(whole, np.nan, relative)[:, k, None], std[..., k, None])
     return factors
 
 
-FILLER = {"spherical": (1.0, 0.0, 0.5 * np.pi), "range": (1.0,)}
-"""A valid z, of no weight, in the place of what a realisation lacks; 0 for other kinds."""
-
-
 def _measured(kind: str, nodes: Ints, z: Floats, std: Floats) -> list[Factor]:
-    """The factor of the rows that some realisation measured; a row that one lacks has an infinite std in it."""
-    there = np.isfinite(z)
-    rows = there.all(axis=-1).reshape(-1, max(len(nodes), 1)).any(axis=0)
-    if not rows.any():
-        return []
-    if not rows.all():
-        nodes, z, there = nodes[rows], z[..., rows, :], there[..., rows, :]
-        std = std if std.ndim == 1 else std[..., rows, :]
-    if there.all():
-        return [Factor(kind, nodes, z, std)]
-    return [Factor(kind, nodes, np.where(there, z, FILLER.get(kind, 0.0)), np.where(there, std, np.inf))]
+    """The factor of the rows that were measured."""
+    rows = np.isfinite(z).all(axis=1)
+    return [Factor(kind, nodes[rows], z[rows], std if std.ndim == 1 else std[rows])] if rows.any() else []
 
 
 def relative_std(relative: Floats, sensors: Sensors) -> Floats:
-    """Std (3,), or (..., M, 3) if a range is below `min_range`: that of its angles is inflated by min_range / range.
+    """Std (3,), or (M, 3) if a range is below `min_range`: that of its angles is inflated by min_range / range.
 
     Centres are never closer than `min_range`, so such a range is noise, and without this the angles would place the
     neighbour to the centimetre (`vector_cov` does the same).
     """
-    ratio = np.fmax(sensors.min_range / relative[..., 0], 1.0)
+    ratio = np.fmax(sensors.min_range / relative[:, 0], 1.0)
     if (ratio == 1.0).all():
         return sensors.relative_std
-    scale = np.stack([np.ones_like(ratio), ratio, ratio], axis=-1)
+    scale = np.stack([np.ones_like(ratio), ratio, ratio], axis=1)
     inflated: Floats = np.minimum(scale * sensors.relative_std, [np.inf, np.pi, np.pi])
     return inflated
 
 
 def _joined(parts: Sequence[tuple[Floats, Floats]]) -> Iterator[npt.NDArray[np.float64]]:
-    return (np.concatenate(column, axis=-2) for column in zip(*parts, strict=True))
+    return (np.concatenate(column) for column in zip(*parts, strict=True))
 
 
 def recorded_steps(
-    recording: Recording, step: int, ego: int | str, length: int, run: int | None, noise: Noise | None
+    recording: Recording, step: int, ego: int | str, length: int, run: int, noise: Noise | None
 ) -> tuple[list[WindowStep], list[str]]:
     """The `length` steps that end at `step` with all that was measured, and the names of their points.
 
@@ -156,27 +144,26 @@ def recorded_steps(
 
 
 def _recorded(
-    recording: Recording, step: int, members: Ints, previous: Ints, links: Ints, run: int | None, noise: Noise | None
+    recording: Recording, step: int, members: Ints, previous: Ints, links: Ints, run: int, noise: Noise | None
 ) -> WindowStep:
-    runs = slice(None) if run is None else run
-    fix, velocity = recording.gnss[runs, step, members], recording.velocity[runs, step, members]
+    fix, velocity = recording.gnss[run, step, members], recording.velocity[run, step, members]
     if noise is None:
         fix_std = np.array(recording.sensors.gnss_std)
         moved_std = recording.dt * recording.sensors.assumed_velocity_std(velocity)
     else:
         fix_std = np.sqrt(noise.gnss_variance)
         variance = np.broadcast_to(noise.process_variance(recording), recording.velocity.shape)
-        moved_std = np.sqrt(variance[runs, step, members])
+        moved_std = np.sqrt(variance[run, step, members])
     fix_std = np.broadcast_to(fix_std, fix.shape)
-    return WindowStep(previous, fix, fix_std, recording.dt * velocity, moved_std, recording.relative[runs, links])
+    return WindowStep(previous, fix, fix_std, recording.dt * velocity, moved_std, recording.relative[run, links])
 
 
-def _check(recording: Recording, step: int, length: int, run: int | None) -> None:
-    for name, value in (("step", step), ("length", length), *(() if run is None else (("run", run),))):
+def _check(recording: Recording, step: int, length: int, run: int) -> None:
+    for name, value in (("step", step), ("length", length), ("run", run)):
         number(name, value, -(2**62), 2**62, kind=int, allowed="counted from 0", hint="Give a whole number.")
     if not 0 <= step < len(recording.t):
         raise InputError("step", step, f"must be in 0..{len(recording.t) - 1}", "The drive has no other steps.")
     if not 1 <= length <= step + 1:
         raise InputError("length", length, f"must be in 1..{step + 1} at step {step}", "Start later or shorten it.")
-    if run is not None and not 0 <= run < recording.runs:
+    if not 0 <= run < recording.runs:
         raise InputError("run", run, f"must be in 0..{recording.runs - 1}", "Or None for all at once.")

@@ -9,7 +9,6 @@ import numpy as np
 import numpy.typing as npt
 
 from ...arrays import Floats, instance, one_of
-from ...errors import InputError
 from ..backend import Backend
 from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status
@@ -81,8 +80,7 @@ def solve_gnc(
     >>> float(solution.x[0, 0].round(3)), solution.extras["weights"]
     (0.5, array([1., 1., 0.]))
     """
-    if instance("problem", problem, Problem).batch is not None:
-        raise InputError("problem", repr(problem), "must be a single realisation", "Pick one with problem.pick(0).")
+    instance("problem", problem, Problem)
     marked, surrogate = mark(problem, candidates, groups), surrogate_of(loss, threshold)
     one_of("start", start, get_args(Start))
     bound, each, extras = bounds(problem, marked, threshold), list[Solution](), dict[str, Any]()

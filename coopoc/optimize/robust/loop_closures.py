@@ -285,10 +285,10 @@ def predicted(problem: Problem, marked: Marked, weight: Floats, x: Floats) -> tu
         here = marked.factor == k
         factor = taken(problem.factors[k], marked.row[here])
         with np.errstate(all="ignore"):
-            linear = linearise(problem.space, [factor], None, x[None])
+            linear = linearise(problem.space, [factor], None, x)
         shape = (len(factor.nodes), factor.size, problem.space.dof)
-        J = np.concatenate([np.broadcast_to(own[0], shape) for own in linear.jacobian[0]], axis=2)
-        r = linear.residual[0][0]
+        J = np.concatenate([np.broadcast_to(own, shape) for own in linear.jacobian[0]], axis=2)
+        r = linear.residual[0]
         # an angle between nodes that coincide has no derivative
         lost = ~np.isfinite(r).all(axis=1) | ~np.isfinite(J).all(axis=(1, 2))
         r, J = np.where(lost[:, None], 0.0, r), np.where(lost[:, None, None], 0.0, J)

@@ -76,11 +76,11 @@ def _apart(problem: Problem, x: Floats) -> Floats:
         touched[f.nodes[f.informative]] = True
     if touched.all():
         return x
-    ranges = [f.z[..., 0].mean() for f in problem.factors if f.measurement.components[0] == "distance"]
+    ranges = [f.z[:, 0].mean() for f in problem.factors if f.measurement.components[0] == "distance"]
     place = np.cumsum(~touched) - 1
     turn, radius = 2.4 * place, np.sqrt(1.0 + place) * (ranges[0] if ranges else 1.0)
     spiral = np.zeros_like(x)
-    spiral[..., 0], spiral[..., 1] = radius * np.cos(turn), radius * np.sin(turn)
+    spiral[:, 0], spiral[:, 1] = radius * np.cos(turn), radius * np.sin(turn)
     middle = x[touched].sum(axis=0) / max(touched.sum(), 1)
     return np.where(touched[:, None], x, middle + spiral)
 
@@ -88,6 +88,6 @@ def _apart(problem: Problem, x: Floats) -> Floats:
 def _vector(factor: Factor) -> Factor:
     d, rows = converted_rows(columns(factor.z), np)
     inverse = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-    z, nothing = d[..., None] * inverse[..., 0, :], np.empty((len(factor.nodes), 0))
+    z, nothing = d[:, None] * inverse[:, 0], np.empty((len(factor.nodes), 0))
     root = factor.root @ inverse
     return unchecked(factor, kind="displacement", z=z, std=None, sqrt_information=root, constants=nothing, loss=None)
