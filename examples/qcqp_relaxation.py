@@ -82,7 +82,7 @@ class QCQPRelaxation:
                     points[run, members], covariance[run] = solution.x, solution.covariance[0]
                 yield Estimate(star.step, points[:, 0], covariance, star.link, points[:, 1:])
 
-        track = follow_egos(self, recording, egos, run_ego, missing=True)
+        track = follow_egos(self, recording, egos, run_ego)
         share = f"{sum(tight)} of {len(tight)} relaxations were tight"
         return replace(track, notes=(share, *known.notes, *bridging_note(recording)))
 

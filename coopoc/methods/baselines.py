@@ -54,7 +54,7 @@ class LKFSA:
             x, cov, neighbours = run_lkf_sa(measurements(recording, ego, box), assumed)
             yield Estimate(slice(None), x, cov, box.link, neighbours)
 
-        return follow_egos(self, recording, egos, run, known.notes, missing=True)
+        return follow_egos(self, recording, egos, run, known.notes)
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,7 +98,7 @@ class MSMV:
             x, cov, theirs = run_msmv(measurements(recording, ego, box, own), assumed)
             yield Estimate(slice(None), x, cov, box.link, theirs)
 
-        return follow_egos(self, recording, egos, run, (*known.notes, RECONSTRUCTION), missing=True)
+        return follow_egos(self, recording, egos, run, (*known.notes, RECONSTRUCTION))
 
 
 def solo_estimates(

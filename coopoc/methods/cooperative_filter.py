@@ -128,7 +128,7 @@ class CooperativeFilter:
                     notes.extend(rejected(what, count, of, 0.5 if kind == "trusted" else 0.05))
             yield Estimate(slice(None), x, cov, box.link, neighbours, extras)
 
-        return follow_egos(self, recording, egos, run, notes, missing=True)
+        return follow_egos(self, recording, egos, run, notes)
 
 
 def broadcasts(recording: Recording, known: NoiseModel, egos: Sequence[int], guards: Guards) -> Sent:

@@ -72,4 +72,4 @@ class CovarianceIntersection:
             x, cov, theirs = run_intersection(measurements(recording, ego, box, own), assumed, self.split, gates)
             yield Estimate(slice(None), x, cov, box.link, theirs)
 
-        return follow_egos(self, recording, egos, run, known.notes, missing=True)
+        return follow_egos(self, recording, egos, run, known.notes)

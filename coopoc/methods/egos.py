@@ -41,22 +41,17 @@ def follow_egos(
     egos: Sequence[int | str],
     follow: Callable[[int, Inbox], Iterable[Estimate]],
     notes: Sequence[str] = (),
-    *,
-    missing: bool = False,
 ) -> Track:
     """Track of the egos from what `follow(column, inbox)` yields, every step once in any order; bytes counted.
 
     Args:
         notes: of the Track; `follow` may add some.
-        missing: whether the method does without a fix where it is missing.
 
     Raises:
-        InputError: an ego that is unknown, no observer of this recording, or absent at times; a missing fix.
+        InputError: an ego that is unknown, no observer of this recording, absent at times, or without a first fix.
     """
     began = time.perf_counter()
-    columns = check_recording(recording).columns(egos, missing)
-    if not missing:
-        recording.require_complete()
+    columns = check_recording(recording).columns(egos, missing=True)
     shape = (recording.runs, len(recording.t), len(columns), 3)
     x, cov = np.empty(shape), np.empty((*shape, 3))
     ends = np.cumsum([0, *(len(recording.links.of(ego)) for ego in columns)])

@@ -60,4 +60,4 @@ class JointFilter:
             x, cov, neighbours = run_filter(measurements(recording, ego, box), assumed, refine, gates)
             yield Estimate(slice(None), x, cov, box.link, neighbours)
 
-        return follow_egos(self, recording, egos, run, known.notes, missing=True)
+        return follow_egos(self, recording, egos, run, known.notes)

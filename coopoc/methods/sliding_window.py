@@ -150,7 +150,7 @@ def _behind_arrival_cost(
         counts[MOVING] += int(solved.moving.sum())
         yield Estimate(slice(None), solved.x, solved.covariance, box.link, solved.neighbours)
 
-    track = follow_egos(method, recording, egos, drive, missing=True)
+    track = follow_egos(method, recording, egos, drive)
     return replace(track, notes=(*noise_model.notes, *_counted(counts)))
 
 

@@ -215,17 +215,6 @@ class Recording:
     def _observing(self) -> frozenset[int]:
         return frozenset(self.observers)
 
-    def require_complete(self) -> None:
-        """InputError, which names the vehicle and the step, if a fix is missing."""
-        if not self.complete:
-            _, step, column, _ = np.argwhere(np.isnan(self.gnss) & np.isfinite(self.velocity))[0]
-            raise InputError(
-                "gnss",
-                f"none of {self.ids[column]} at step {step}",
-                "must be there at every step here",
-                "Take a filter, a learned gain or the joint filter, which do without.",
-            )
-
     def neighbours(self, ego: int | str) -> Ints:
         """(T,) how many neighbours the ego had at each step: the actual number, at most `v2x.max_neighbours`."""
         (column,) = columns("ego", [ego], self.ids)
