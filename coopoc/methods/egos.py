@@ -51,7 +51,7 @@ def follow_egos(
         InputError: an ego that is unknown, no observer of this recording, absent at times, or without a first fix.
     """
     began = time.perf_counter()
-    columns = check_recording(recording).columns(egos, missing=True)
+    columns = check_recording(recording).columns(egos)
     shape = (recording.runs, len(recording.t), len(columns), 3)
     x, cov = np.empty(shape), np.empty((*shape, 3))
     ends = np.cumsum([0, *(len(recording.links.of(ego)) for ego in columns)])

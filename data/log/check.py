@@ -448,9 +448,9 @@ def _of_measurements(c: Check) -> list[str]:
 def _other_angle(c: Check) -> str:
     """What azimuths look like that miss the positions by the course of their observers."""
     links = c.world.links
-    east, north = c.world.velocity[0, links.step, links.observer, :2].T
-    there = np.isfinite(c.relative[:, 1]) & (np.hypot(east, north) > MOVING)
-    residual, course = c.relative[there, 1], np.arctan2(north, east)[there]
+    moves = c.world.velocity[0, links.step, links.observer, :2] @ [1, 1j]
+    there = np.isfinite(c.relative[:, 1]) & (np.abs(moves) > MOVING)
+    residual, course = c.relative[there, 1], np.angle(moves[there])
     for kind, turn in (("bearing", course), ("azimuth", -course)):
         if len(course) >= ENOUGH and 3 * np.median(np.abs(wrap(residual + turn))) < np.median(np.abs(residual)):
             return f"They look like {kind}s: name them {kind}."

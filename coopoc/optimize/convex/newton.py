@@ -30,6 +30,8 @@ DENSE = 500
 """Up to this many constrained rows C is formed."""
 SMALL = 200
 """Up to this many rows of X all matrices are dense."""
+ENOUGH = 1e-11
+"""Decrease that a last step promises, as a share of the cost (at least of 1); it is still taken."""
 MAX_ITERATIONS = 300
 LOOSE = 1e-10
 """Share of the largest singular value below which positions are free."""
@@ -173,15 +175,13 @@ class Stationary:
 def minimise(
     reduced: Reduced,
     X: Floats,
-    tolerance: float = 1e-11,
-    deadline: float = np.inf,
-    tick: Callable[[], object] = lambda: None,
+    deadline: float,
+    tick: Callable[[], object],
 ) -> Stationary:
     """A stationary point of 1/2 <C, X X^T> near X (bound, p), or where the time is over; Newton's steps converge
     quadratically.
 
     Args:
-        tolerance: of the decrease that a step promises, as a share of the cost (at least of 1); it is still taken.
         deadline: time.perf_counter() at which to stop.
         tick: called after every step.
     """
@@ -209,7 +209,7 @@ def minimise(
                 trial = form.project(X + (B @ xi).reshape(size, -1)[: form.bound])
                 CT = reduced.times(trial)
                 after = 0.5 * float(np.sum(trial * CT))
-                small = promised <= tolerance * max(cost, 1.0)
+                small = promised <= ENOUGH * max(cost, 1.0)
                 share = 1.0 if small and after <= cost * (1.0 + 1e-12) else (cost - after) / promised
                 moved = share > 0.0
                 if moved:
