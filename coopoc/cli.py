@@ -268,16 +268,26 @@ def _dispatch(commands: Mapping[str, Command], argv: list[str], prog: str) -> in
     return int(tyro.cli(loaded, prog=f"{prog} {name}", args=rest, config=(FlagCreatePairsOff,)) or 0)
 
 
+CHOICES = {
+    "start": "gnss, true",
+    "scenario": "0, 1, 2",
+    "velocity_reading": "axis, speed",
+    "noise_model": "identity, nominal, fitted, oracle",
+}
+"""Keys of --set that have no group of entry points -> values."""
+
+
 def _settings(name: str) -> str:
     """The keys of --set that a study has: settings with their defaults, axes with their values, and names to choose."""
     from .study.study import find_study
 
-    study, groups = find_study(name), {f"coopoc.{key}s": key for key in ("method", "channel", "metric")}
-    choices = {key: plugins.names(group) for group, key in groups.items()}
-    choices["data"] = (*plugins.names("coopoc.datasets"), "a path")
+    study, groups = find_study(name), ("method", "recipe", "channel", "metric", "dataset")
+    choices = {key: ", ".join(plugins.names(f"coopoc.{key}s")) for key in groups} | CHOICES
+    choices |= {"method": "{method}, {recipe}, bound".format(**choices), "data": f"{choices['dataset']}, a path"}
+    listed = () if isinstance(study.grid, Mapping) else study.axes  # a fixed list has no other values
     lines = [f"{study.name}: {study.question}", "", "keys of --set, with their defaults:"]
     for key, values in {**{k: (v,) for k, v in study.settings.items()}, **study.values()}.items():
-        allowed = f"  (of {', '.join(choices[key])})" if key in choices else ""
+        allowed = f"  (of {choices[key]})" if key in choices and key not in listed else ""
         lines.append(f"  {key}={','.join('' if v is None else str(v) for v in values)}{allowed}")
     return "\n".join([*lines, ""])
 

@@ -11,7 +11,7 @@ from importlib import metadata
 from pathlib import Path
 from typing import Any
 
-from .errors import InputError, unknown
+from .errors import InputError, missing, unknown
 from .one_file import from_file, in_file
 
 GROUPS = {
@@ -151,6 +151,7 @@ def find(group: str, name: str) -> Any:
     Raises:
         InputError: no such name (lists the names and the nearest one), no such file, or two distributions claim the
             name.
+        MissingLibraryError: a library that it needs is not installed.
 
     >>> find("nothing", "x")
     Traceback (most recent call last):
@@ -160,7 +161,10 @@ def find(group: str, name: str) -> Any:
     if not isinstance(name, str):
         raise _unknown(group, name)
     registered = points(group)
-    loaded = registered[name].load() if name in registered else None
+    try:
+        loaded = registered[name].load() if name in registered else None
+    except ModuleNotFoundError as error:
+        raise missing(error, name) from None
     if loaded is not None and not isinstance(loaded, Mapping):
         return loaded
     if in_file(name):

@@ -280,7 +280,6 @@ STUDY = Study(
         "multi_krum expect one bad client.",
         "Intervals of the differences are not corrected for the number of rules that are compared.",
     ),
-    minutes=25,
     metrics={"rt_le_m": "lower"},
     reference=Path(__file__).with_suffix(".json"),
 )

@@ -240,6 +240,5 @@ STUDY = lineup.study(
         "Under a cap the nearest neighbours' messages pass first unless another schedule is named.",
         "Numbers count as float32; a CAM rounds positions to 6 mm and speeds to 5 mm/s instead.",
     ),
-    minutes=13,
     metrics={"rt_le_m": "lower"},
 )

@@ -94,6 +94,5 @@ STUDY = lineup.study(
     limitations=(
         "White noise and an ideal channel; other studies cover late messages, correlated errors and spoofing.",
     ),
-    minutes=10,
     metrics={"rt_le_m": "lower", "nees": 3.0},
 )

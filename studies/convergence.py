@@ -143,6 +143,5 @@ STUDY = lineup.study(
     figures={"rounds": _figure},
     findings=_findings,
     limitations=("The centralised net has no rounds: its schedule is divided into as many equal parts.",),
-    minutes=2,
     metrics={"rt_le_m": "lower"},
 )

@@ -124,6 +124,5 @@ STUDY = lineup.study(
         "the filter is somewhat over-confident, and the bound is not tight.",
         "Learned gains were trained with white noise.",
     ),
-    minutes=12,
     metrics={"rt_le_m": "lower", "nees": 3.0},
 )

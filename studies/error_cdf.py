@@ -64,23 +64,26 @@ def cdf(results: Results, caption: str, where: Where) -> Plot:
     """Share of the errors below each value, with a marker at the mean of the per-run maxima."""
     from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
 
-    drawn, maxima, places = list[dict[str, Any]](), dict[str, list[str]](), dict[str, Any]()
+    drawn, maxima, places = list[dict[str, Any]](), dict[str, list[str]](), list[tuple[str, str, Any]]()
     with canvas(width=7.8) as (figure, axes):
         for key, frame in results.groups(LINES, where):
             names = dict(zip(LINES, key, strict=True))
+            method, model = map(str, key)
             errors = np.sort(np.concatenate(frame["error_quantiles_m"].to_list()))
             share = np.arange(1, len(errors) + 1) / len(errors)
             worst = float(np.mean([np.max(q) for q in frame["error_quantiles_m"]]))
             at = np.log(np.quantile(errors, np.linspace(0.05, 0.95, 19)))
-            twin = next((method for method, other in places.items() if np.abs(at - other).max() < NEAR), None)
-            if twin is not None:  # it would be hidden
-                maxima[twin].append(look(str(names["method"])).label)
+            twin, known, _ = next((place for place in places if np.abs(at - place[2]).max() < NEAR), ("", "", 0))
+            if twin:  # it would be hidden
+                same = f"{look(twin).label} {known}".removesuffix(" trained")
+                maxima.setdefault(method, []).append(f"; {model} = {known}" if twin == method else f" = {same}")
+                drawn.append(names)
                 continue
-            places[str(names["method"])] = at
+            places.append((method, model, at))
             axes.plot(errors, share, **{**strokes(names), "marker": None})
             axes.plot(worst, np.interp(worst, errors, share), **{**strokes(names), "linestyle": "none"}, zorder=3)
             drawn.append(names)
-            maxima.setdefault(str(names["method"]), []).append(f"{worst:.1f}")
+            maxima.setdefault(method, []).append(f"{worst:.1f}")
         axes.set(xlabel="Error [m]", ylabel="Share of time steps below", ylim=(0, 1.02))
         plain_log(axes.xaxis)
         axes.set_xlim(left=0.1)
@@ -90,8 +93,9 @@ def cdf(results: Results, caption: str, where: Where) -> Plot:
 
 def _worst(texts: Sequence[str]) -> str:
     """Methods that are drawn as one, and the maxima of all noise models."""
-    twins = "".join(f" = {text}" for text in texts if not text[0].isdigit())
-    return f"{twins} (max {' / '.join(text for text in texts if text[0].isdigit())} m)"
+    numbers = " / ".join(text for text in texts if text[0].isdigit())
+    same, others = ("".join(text for text in texts if text[0] == mark) for mark in " ;")
+    return f"{same} (max {numbers} m{others})" if numbers else same
 
 
 def _finding(results: Results, at: dict[str, Any]) -> str:
@@ -121,6 +125,5 @@ STUDY = lineup.study(
     figures={f"cdf_scenario{s}_{100 * r:g}": partial(_cdf, at=case(s, r)) for s, r in CASES},
     findings=lambda results: {f"scenario {s}": _finding(results, case(s, r)) for s, r in CASES[:2]},
     limitations=("The nets and the fitted noise model come from drives with 1.5 m and 10 %; the test noise differs.",),
-    minutes=3,
     metrics={"rt_le_m": "lower"},
 )

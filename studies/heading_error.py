@@ -204,7 +204,7 @@ def _over_time(results: Results) -> Plot | None:
     panels = [Panel(x, {"compass": NONE, "max_neighbours": k}, f"K = {k}", "Time [s]") for k in (0, 10)]
     caption = _note(results, "Heading error over the time that is driven without a compass; dotted: the bound.")
     options: dict[str, Any] = {"number": heading, "ylabel": "Heading error [°]", "log": True, "logx": True}
-    return figures.curves(results, panels, lines, caption, width=7.4, merged=False, **options)
+    return figures.curves(results, panels, lines, caption, width=7.4, **options)
 
 
 COST = (
@@ -268,6 +268,5 @@ STUDY = Study(
         "Only the last step of a drive is scored; without a compass the initial headings are estimated from all of it.",
     ),
     reference=reference("heading_error"),
-    minutes=12,
     metrics={"rt_le_m": "lower", "heading_deg": "lower", "nees": 3.0},
 )

@@ -106,6 +106,5 @@ STUDY = lineup.study(
     },
     findings=_findings,
     limitations=("Latency is the same for all messages of a cell, in whole steps of the drive.",),
-    minutes=15,
     metrics={"rt_le_m": "lower"},
 )

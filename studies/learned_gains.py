@@ -106,6 +106,5 @@ STUDY = lineup.study(
         "adaptive filter estimates the noise of fixes and assumes the velocity noise of the training drives.",
         "Gains trained at 5 to 20 % and 1 to 6 m have seen the test noise among others; the paper's nets have not.",
     ),
-    minutes=6,
     metrics={"rt_le_m": "lower", "nees": 3.0},
 )

@@ -1,4 +1,4 @@
-"""The method of a cell by name and noise model, and its rows, also of vehicles that come and go or have no truth."""
+"""Make the method of a cell by name and noise model, run it, and score every ego."""
 
 from __future__ import annotations
 

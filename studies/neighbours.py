@@ -206,6 +206,5 @@ STUDY = lineup.study(
         "MSMV-R is a reconstruction; no variant of MSMV that we tried is flat in K like the paper's curve.",
         "The nets and the fitted noise model come from solo drives with 1.5 m and 10 %; the test noise differs.",
     ),
-    minutes=5,
     metrics={"rt_le_m": "lower", "nees": 3.0},
 )

@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 DRAWN = ("gnss", "kalman", "joint", "cooperative-filter")
 """Methods that are drawn, those of them that were run."""
+HELD = "GNSS repeats a fix until the next one, and errs by the way driven since."
 
 
 def views(results: Results, over_time: bool) -> Plot | None:
@@ -41,16 +42,17 @@ def views(results: Results, over_time: bool) -> Plot | None:
                 marks = {"marker": ".", "linestyle": "none"} if name == "gnss" and not over_time else {"marker": ""}
                 style = {**strokes({"method": name}), "linewidth": 1.1, "markersize": 2, **marks}
                 axes.plot(*((t, gap) if over_time else x[:, :2].T), **style)
-            axes.annotate(picture(ego), (0.01, 0.9) if over_time else x[0, :2], **(_CORNER if over_time else {}))
-            axes.set(xlabel="Time [s]" if over_time else "East [m]", ylabel="Error [m]" if over_time else "North [m]")
+            axes.annotate(picture(ego), (0.01, 0.9) if over_time else x[-1, :2], **(_CORNER if over_time else {}))
+            axes.set(ylabel="Error [m]" if over_time else "North [m]")
+        axes.set(xlabel="Time [s]" if over_time else "East [m]")
         legend(grid[0, 0], [{"method": name} for name in methods])
         if over_time:
             plain_log(grid[0, 0].yaxis)
         else:
             grid[0, 0].set_aspect("equal", adjustable="datalim")
-    what = "Distance from the truth over time" if over_time else "Paths of the vehicles; the truth is grey"
+    what = f"Distance from the truth over time. {HELD}" if over_time else "Paths of the vehicles; the truth is grey."
     most = results.frame["max_neighbours"].max()
-    return Plot(figure, scene.caption(results, f"{what}. Filters with K = {most}."))
+    return Plot(figure, scene.caption(results, f"{what} Filters with K = {most}."))
 
 
 _CORNER: Any = {"xycoords": "axes fraction"}

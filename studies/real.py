@@ -70,7 +70,7 @@ def trained(data: str, until: float, gate: float, evaluations: int) -> dict[str,
         seen = [replace(first, observers=(first.ids.index(name),)) for name in alone.ids]
         own: list[Any] = [RoadFilter.fitted(one, truth).errors for one in seen]
         logs, whole = np.array([to_logs(one) for one in own]), RoadFilter.fitted(first, truth).errors
-        one_for_all: Any = from_logs(logs.mean(axis=0))
+        one_for_all: Any = from_logs(logs.mean(axis=0), 1.0)
     else:
         assert truth is not None
 
@@ -315,7 +315,7 @@ def _trade(results: Results) -> Plot | None:
     ]
     text = f"RT-LE against the bytes that a vehicle sends; what sends none is at the left. {BYTES}"
     caption = _caption(results, text.format(driven(results.settings)))
-    return figures.curves(results, panels, lines, caption, error, log=True, logx=True, merged=False)
+    return figures.curves(results, panels, lines, caption, error, log=True, logx=True)
 
 
 def _figure(results: Results) -> Plot | None:
@@ -412,5 +412,4 @@ STUDY = Study(
         "One drive: intervals over blocks of time do not extend to other vehicles or places.",
         "With one joint state a centre receives every measurement at its step; late messages are lost.",
     ),
-    minutes=6,
 )

@@ -20,14 +20,20 @@ from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.track import Method
 from coopoc.world.recording import MEASURED
 
-from .tasks import located
+from .tasks import hashed, located, planar
 
 SHARE, BLOCK = 0.4, 30.0
 """Share of a drive that calibrates, and s of a block, a quarter of the rest at most, over which errors are averaged."""
 EVERY, OUTAGE, PERIOD = 10, 30.0, 180.0
 """One fix in so many is kept, and none in the last s of every period of s."""
-ROADS = {"f9k": ("ublox_f9k.nmea", "span_truth.gga"), "kitti": ("KITTI_00_ORB.txt", "KITTI_00_gt.txt")}
-"""Task -> files of the measurements and of the truth."""
+ROADS: Mapping[str, tuple[str, ...]] = {
+    "f9k": ("ublox_f9k.nmea", "span_truth.gga"),
+    "kitti": ("KITTI_00_ORB.txt", "KITTI_00_gt.txt"),
+    "comma2k19": ("comma2k19",),
+}
+"""Task -> files of the measurements and of the truth, or a folder of both."""
+STEP = 0.1
+"""s, of comma2k19, whose speeds come every 0.01 s."""
 
 
 def roads(data: Path) -> Mapping[str, tuple[str, ...]]:
@@ -47,7 +53,10 @@ def seen(task: str, data: Path) -> tuple[Recording, Fleet]:
     if task == "kitti":
         recording, truth = _kitti(*map(np.loadtxt, files))
     else:
-        log = read_log(files[0], truth=files[1]) if files else load_log(str(data))
+        if files:
+            log = read_log(files[0], **({"truth": files[1]} if files[1:] else {"dt": STEP}))
+        else:
+            log = load_log(str(data))
         if log.truth is None:
             raise InputError("data", str(data), "must hold a truth", 'Name its file: "LOG?truth=FILE".')
         recording, truth = log.recording, log.truth
@@ -78,8 +87,11 @@ def road_row(task: str, data: Path, made: Method) -> dict[str, Any]:
         made: solo method; Kalman and road filters can be calibrated.
     """
     recording, truth = seen(task, data)
-    start = int(SHARE * len(recording.t))
-    row = {"task": task, **_scored(made, recording, truth, start)}
+    start, column = int(SHARE * len(recording.t)), recording.observers[0]
+    begin, _ = recording.stretches(column)[0]
+    made(recording.between(begin, begin + 3), [column])  # compiles
+    row = {"task": task, "data": hashed(*(located(data, name) for name in roads(data)[task]))}
+    row |= _scored(made, recording, truth, start)
     if isinstance(made, Kalman) or (isinstance(made, RoadFilter) and made.errors is None):
         first = recording.between(0, start), truth.between(0, start)
         fitted = Kalman(NoiseModel.fitted(*first)) if isinstance(made, Kalman) else RoadFilter.fitted(*first)
@@ -98,14 +110,13 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> d
             if stop <= start:
                 continue
             track = method(recording.between(begin, stop), [column])
-            gap = (track.x[0, :, 0] - truth.position[begin:stop, column])[:, :2]
+            gap, nees = planar(track, truth.between(begin, stop))
             squares[begin:stop], seconds = np.square(gap).sum(axis=-1), seconds + track.seconds
-            if track.covariance is not None:
-                inside = np.linalg.inv(track.covariance[0, :, 0, :2, :2])
-                ratios.append(np.einsum("ti,tij,tj->t", gap, inside, gap)[max(start - begin, 0) :])
+            ratios.append(nees[max(start - begin, 0) :])
         parts = [squares[k : k + size] for k in range(start, len(squares) - size + 1, size)]
         blocks += [float(np.sqrt(np.nanmean(part))) for part in parts if np.isfinite(part).any()]
     level = mean_interval(np.array([blocks]))
     row: dict[str, Any] = {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
-    row |= {"nees": round(float(np.nanmean(np.concatenate(ratios))), 2)} if ratios else {}
+    nees = np.concatenate(ratios)
+    row |= {"nees": round(float(np.nanmean(nees)), 2)} if np.isfinite(nees).any() else {}
     return row | {"microseconds_per_step": round(1e6 * seconds / len(recording.t), 2)}

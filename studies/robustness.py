@@ -111,6 +111,5 @@ STUDY = lineup.study(
         "One kind is wrong at a time; CL-Bench's `storm` has several at once.",
         "Velocities and relative measurements of spoofed vehicles stay true.",
     ),
-    minutes=40,
     metrics={"rt_le_m": "lower", "nees": 3.0},
 )

@@ -11,9 +11,6 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from coopoc.arrays import Bools
-from coopoc.data.log.links import under
-from coopoc.data.log.read import Log
-from coopoc.data.registry import LOGS, kind_of, load_fleet, load_log
 from coopoc.data.source import split
 from coopoc.errors import InputError
 from coopoc.methods.catalogue import needs_whole_fleet
@@ -30,6 +27,7 @@ from coopoc.world.storage import digest
 from coopoc.world.v2x import V2X
 
 if TYPE_CHECKING:
+    from coopoc.data.log.read import Log
     from coopoc.study.results import Results
 
 Start = Literal["gnss", "true"]
@@ -45,6 +43,8 @@ TOWN: Mapping[str, Any] = {**DRAWN, "scenario": 2, "velocity_ratio": 0.15, "velo
 @lru_cache(maxsize=4)
 def fleet(data: str) -> Fleet:
     """The fleet of a bundled name or a path: of a log its truth, NaN where it is unknown."""
+    from coopoc.data.registry import load_fleet
+
     log = _log(data)
     if log is None:
         return load_fleet(data)
@@ -62,6 +62,8 @@ def _log(data: str) -> Log | None:
     Raises:
         InputError: one in body frames.
     """
+    from coopoc.data.registry import LOGS, kind_of, load_log  # pandas, which a mistake in --set need not wait for
+
     if kind_of(data) not in LOGS:
         return None
     log = load_log(data)
@@ -82,8 +84,13 @@ def measured(data: str) -> Recording | None:
     log = _log(data)
     if log is None:
         return None
-    everything = V2X(len(fleet(data).ids), radius=float("inf"))
-    return under(log.recording, everything, runs=1, seed=0, logged=log.messages)
+    return _under(log, V2X(len(fleet(data).ids), radius=float("inf")), runs=1, seed=0)
+
+
+def _under(log: Log, v2x: V2X, runs: int, seed: int) -> Recording:
+    from coopoc.data.log.links import under
+
+    return under(log.recording, v2x, runs=runs, seed=seed, logged=log.messages)
 
 
 @lru_cache(maxsize=4)
@@ -191,7 +198,7 @@ def heading(p: Params) -> str:
     noise = acting(p)
     low, high = noise.gnss_bias
     bias = f", bias U[{low:g}, {high:g}] m per run and axis" if high else ""
-    near = f", {relative(noise)}, radius {p['radius_m']:g} m" if "radius_m" in p else ""
+    near = f", {relative(noise)}, radius {channel(p).radius:g} m" if "radius_m" in p else ""
     wrong = "".join(f", {note}" for note in noise.outliers.notes) if noise.outliers else ""
     return (
         f"Scenario {p['scenario']}: GNSS {noise.fix_std[0]:.3g} m per axis{bias}, velocity "
@@ -210,9 +217,9 @@ def relative(noise: Sensors) -> str:
 
 
 def conditions(p: Params) -> str:
-    """Heading and size of a cell, for captions; of real data also its simulated parts and uses of the truth."""
+    """Heading and size of a cell, for captions; of real data whose they are."""
     real = measured(p["data"])
-    labels = "" if real is None else f" ({'; '.join(real.notes)})"
+    labels = f" ({real.notes[0]})" if real is not None and real.notes else ""
     who = egos(p["data"], str(p["egos"]))
     log = _log(p["data"])
     alike = log is not None and (log.messages or not channel(p).loss)
@@ -257,7 +264,8 @@ def _count(number: int, noun: str) -> str:
 def channel(p: Params) -> V2X:
     """Neighbourhood and budget of the cell, ideal where it names nothing else.
 
-    A cap of 0 is none; a rate of 0, and None for loss, burst and latency, are the channel's own.
+    A cap of 0 is none; a radius of 0 is 30 m, or all that a log has; a rate of 0, and None for loss, burst and
+    latency, are the channel's own.
     """
     cap = float(p.get("cap_bytes_per_second", 0.0))
     most = int(p.get("max_neighbours", 0))
@@ -266,7 +274,7 @@ def channel(p: Params) -> V2X:
     given: dict[str, Any] = {field: float(value) for field, value in losses.items() if value is not None}
     return replace(
         usual,
-        radius=float(p.get("radius_m", 30.0)),
+        radius=float(p.get("radius_m", 30.0)) or (float("inf") if is_real(str(p["data"])) else 30.0),
         rate=p.get("rate_hz") or usual.rate,
         bytes_per_second=cap or float("inf"),
         schedule=p.get("schedule", usual.schedule),
@@ -330,5 +338,5 @@ def _recording(
 ) -> Recording:
     log = _log(data)
     if log is not None:
-        return under(log.recording, v2x, runs=runs, seed=seed, logged=log.messages)
+        return _under(log, v2x, runs, seed)
     return observe(fleet(data), noise, v2x, runs=runs, seed=seed, observers=observers, told=told)

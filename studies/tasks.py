@@ -12,13 +12,24 @@ from typing import Any
 
 import numpy as np
 
-from coopoc import V2X, Fleet, PoseFilter, Recording, Sensors, load_fleet, observe, read_graph, solve
+from coopoc import (
+    V2X,
+    Fleet,
+    PoseFilter,
+    Recording,
+    Sensors,
+    load_fleet,
+    observe,
+    read_graph,
+    solve,
+)
 from coopoc.arrays import Floats
 from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, past_bound, posterior_bound
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.evaluate.statistics import mean_interval
+from coopoc.methods.track import Track
 from coopoc.world.outliers import Fault, Outliers
 from coopoc.world.spoofing import Spoofing, spoofed
 
@@ -133,6 +144,7 @@ def bound(task: Task, information: str) -> float:
 
 POSES: Mapping[str, Mapping[str, Any]] = {
     "pose-solo": {"unit": "solo"},
+    "pose-plain": {"unit": "solo", "exact": False, "robust": False},
     "pose-fleet": {"unit": "fleet"},
     "pose-intersection": {"unit": "fleet", "fusion": "intersection"},
     "pose-naive": {"unit": "fleet", "fusion": "naive"},
@@ -228,7 +240,9 @@ def pose_row(task: Logged, folder: Path, made: Any) -> dict[str, Any]:
     level = mean_interval(np.sqrt(squares))
     row: dict[str, Any] = {"task": task.name, "data": hashed(path)}
     row |= {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
-    if track.heading is not None:
+    if fleet.heading is None:
+        row |= {"nees": round(float(np.nanmean(planar(track, fleet)[1][start:])), 2)}
+    elif track.heading is not None:
         turned = np.rad2deg(_blocks(heading_error(track, fleet)[0], start, task.block_s / fleet.dt))
         row |= {"heading_deg": round(float(np.nanmean(turned)), 3)}
         row |= {"nees": round(float(np.nanmean(pose_nees(track, fleet)[0, start:])), 2)}
@@ -248,6 +262,14 @@ def graph_row(folder: Path, file: str, backend: str) -> dict[str, Any]:
     return row | {"over_best": round(solution.cost / BEST[path.name], 5), "seconds": round(seconds, 3)}
 
 
+def planar(track: Track, fleet: Fleet) -> tuple[Floats, Floats]:
+    """Errors (T, 2) m of a track of one ego in the plane, and their NEES (T,), NaN without a covariance."""
+    gap = (track.x[0, :, 0] - fleet.position[:, track.egos[0]])[:, :2]
+    if track.covariance is None:
+        return gap, np.full(len(gap), np.nan)
+    return gap, np.einsum("ti,tij,tj->t", gap, np.linalg.inv(track.covariance[0, :, 0, :2, :2]), gap)
+
+
 def _blocks(error: Floats, start: int, length: float) -> Floats:
     """(E, B) root mean square of errors (T, E) over blocks of steps from the start on, of those without a gap."""
     size = max(int(length), 1)
@@ -256,9 +278,10 @@ def _blocks(error: Floats, start: int, length: float) -> Floats:
     return np.asarray(found.T)
 
 
-def hashed(path: Path) -> str:
-    """First 12 hex digits of the SHA-256 of a file, or of the measurements of a folder."""
+def hashed(*paths: Path) -> str:
+    """First 12 hex digits of the SHA-256 of files, or of all in folders."""
     sha = hashlib.sha256()
-    for file in sorted(path.glob("*.dat")) if path.is_dir() else [path]:
-        sha.update(file.read_bytes())
+    for path in paths:
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            sha.update(file.read_bytes() if file.is_file() else b"")
     return sha.hexdigest()[:12]

@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from tyro.conf import Positional, arg
 
-from coopoc.data.registry import load_log
 from coopoc.errors import InputError, unknown
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.one_file import file_digest, from_file, in_file
@@ -72,6 +71,7 @@ def drives(clients: str) -> Drives:
     """What nets are trained on: a fleet, whose measurements are simulated, or of real data its own measurements."""
     if not is_real(clients):
         return fleet(clients)
+    from coopoc.data.registry import load_log
     from coopoc.learned.training.drives import drives_of
 
     return drives_of(load_log(clients))
@@ -149,8 +149,9 @@ def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:
 @lru_cache
 def _fitted(clients: str, reading: VelocityReading) -> NoiseModel:
     if is_real(clients):
-        log = load_log(clients)
-        return NoiseModel.fitted(log.recording, fleet(clients))
+        from coopoc.data.registry import load_log
+
+        return NoiseModel.fitted(load_log(clients).recording, fleet(clients))
     acting, moving = Sensors.paper_training(reading), fleet(clients)
     return NoiseModel.fitted(observe(moving, acting, V2X(max_neighbours=0), seed=0), moving)
 

@@ -7,6 +7,7 @@ import subprocess
 from pathlib import Path
 
 import pytest
+from shell import ran
 
 
 def compiled(tables: str, folder: Path) -> str:
@@ -17,11 +18,9 @@ def compiled(tables: str, folder: Path) -> str:
         pytest.skip("LaTeX has no booktabs: apt-get install texlive-latex-recommended")
     source = r"\documentclass{article}\usepackage{booktabs,graphicx}\begin{document}" + tables + r"\end{document}"
     (folder / "t.tex").write_text(source)
-    done = subprocess.run(
+    done = ran(
         ["pdflatex", "-interaction=nonstopmode", "-halt-on-error", "t.tex"],
         cwd=folder,
-        capture_output=True,
-        text=True,
         timeout=60,
     )
     assert done.returncode == 0, done.stdout[-2000:]

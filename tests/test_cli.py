@@ -11,13 +11,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from shell import ran
 from small_runs import ENV
 
 COMMAND = [sys.executable, "-m", "coopoc.cli"]
 
 
 def coopoc(*words: str, cwd: Path) -> "subprocess.CompletedProcess[str]":
-    return subprocess.run([*COMMAND, *words], cwd=cwd, env=ENV, capture_output=True, text=True, timeout=120)
+    return ran([*COMMAND, *words], cwd=cwd, env=ENV, timeout=120)
 
 
 @pytest.fixture(scope="module")
@@ -39,7 +40,7 @@ def test_help_and_a_list_load_nothing_heavy_and_show_what_others_add(tmp_path: P
             f"import sys, coopoc.cli as c\ntry: c.main(['{command}'])\nexcept SystemExit as e: "
             f"print(e.code, sorted(set({heavy}) & set(sys.modules)))"
         )
-        done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, timeout=60)
+        done = ran([sys.executable, "-c", code], cwd=tmp_path, timeout=60)
         assert done.stdout.splitlines()[-1] == "0 []", done.stdout
     own = coopoc("--help", cwd=tmp_path)
     assert re.search(r"greet +Greet somebody\.", own.stdout)
@@ -81,7 +82,7 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, ...], l
     lines = [*([name, "--help"] for name in NAMES), *(words for words, _ in MISTAKES), *OF_OTHERS]
     command = [sys.executable, "-c", ONE_BY_ONE, json.dumps(lines)]
     cwd = tmp_path_factory.mktemp("answers")
-    done = subprocess.run(command, cwd=cwd, env=ENV, capture_output=True, text=True, timeout=120)
+    done = ran(command, cwd=cwd, env=ENV, timeout=120)
     assert done.returncode == 0, done.stderr
     assert not list(cwd.iterdir())
     return {tuple(words): json.loads(line) for words, line in zip(lines, done.stdout.splitlines(), strict=True)}
@@ -118,12 +119,10 @@ def test_tables_on_stdout(folder: Path) -> None:
 @pytest.mark.parametrize("format", ["markdown", "latex"])
 def test_a_reader_that_leaves_early_is_no_error(folder: Path, format: str) -> None:
     words = " ".join([*COMMAND, "table", "runs/small", "--format", format])
-    done = subprocess.run(
+    done = ran(
         ["bash", "-c", f"{words} | true; exit ${{PIPESTATUS[0]}}"],
         cwd=folder,
         env=ENV,
-        capture_output=True,
-        text=True,
         timeout=60,
     )
     assert (done.returncode, done.stderr) == (0, "")
@@ -162,7 +161,7 @@ def test_ctrl_c_while_libraries_load_ends_without_a_traceback(tmp_path: Path) ->
         "import sys\nclass Stop:\n    def find_spec(self, name, *rest):\n        if name == 'tyro':\n"
         "            raise KeyboardInterrupt\nsys.meta_path.insert(0, Stop())\nfrom coopoc.workers import main\nmain()"
     )
-    done = subprocess.run([sys.executable, "-c", code, "list"], capture_output=True, text=True, cwd=tmp_path)
+    done = ran([sys.executable, "-c", code, "list"], cwd=tmp_path)
     assert (done.returncode, done.stderr) == (130, "")
 
 

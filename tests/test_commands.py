@@ -17,6 +17,7 @@ from typing import Any
 
 import pytest
 import tyro
+from shell import ran
 
 import coopoc as co
 from coopoc import plugins
@@ -170,9 +171,7 @@ def test_scripts_and_targets_of_the_pages_exist() -> None:
 
 
 def test_the_help_of_a_study_lists_its_settings() -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "coopoc.cli", "run", "neighbours", "--help"], capture_output=True, text=True
-    )
+    done = ran([sys.executable, "-m", "coopoc.cli", "run", "neighbours", "--help"])
     assert done.returncode == 0
     for line in ("  runs=30", "  max_neighbours=0,1,2,3,4,6,8,10", "  data=town10  (of town04, town10, "):
         assert line in done.stdout

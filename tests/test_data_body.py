@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -11,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from shell import ran
 
 import coopoc as co
 from coopoc.data.log.check import check as check_poses
@@ -168,7 +168,7 @@ def test_mistakes_are_named(tmp_path: Path, drop: str, options: dict[str, Any], 
 def test_the_check_follows_the_fleet_and_finds_mirrored_bearings(tmp_path: Path, mirrored: bool) -> None:
     folder = written(tmp_path / "log", noise=1.0, mirrored=mirrored, compass=False)
     command = [sys.executable, "-W", "error", "-m", "coopoc.cli", "data", "check", f"{folder}?frame=body"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    done = ran(command, cwd=tmp_path, check=True)
     assert "a filter of each vehicle alone, throughout" in done.stdout
     assert "bearing" in done.stdout
     assert ("check: bearings" in done.stdout) == mirrored
@@ -199,7 +199,7 @@ def test_what_no_filter_can_follow_is_still_summarised(tmp_path: Path) -> None:
     frame = frame[~frame["kind"].isin(["x", "y"]) & (frame["vehicle"] != "mast")]
     frame.to_csv(tmp_path / "log.csv", index=False)
     command = [sys.executable, "-m", "coopoc.cli", "data", "check", "log.csv?frame=body"]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=True)
+    done = ran(command, cwd=tmp_path, check=True)
     assert "400 samples of odometry" in done.stdout
     assert "no filter follows it" in done.stdout
 

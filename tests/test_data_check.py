@@ -78,6 +78,17 @@ FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
 }
 
 
+def test_an_offset_of_ranges_is_taken_off(tmp_path: Path) -> None:
+    """Two metres on every range, and a range that is too large by two metres in millimetres."""
+    folder = cars(tmp_path / "log", lambda f: f.assign(range=1000 * (f["range"] + 2)))
+    log = read_log(folder, scale={"range": 1e-3}, std={"range": 0.3}, offset={"range": 2.0})
+    assert said(log) == ""
+    plain = read_log(cars(tmp_path / "plain"))
+    np.testing.assert_allclose(log.recording.relative, plain.recording.relative, atol=1e-9)
+    with pytest.raises(co.InputError, match="offset = 'uwb': must be one of"):
+        read_log(folder, offset={"uwb": 1.0})
+
+
 def test_a_german_table_is_read_and_its_outliers_are_named(tmp_path: Path) -> None:
     """Semicolons, decimal commas, headers of another language, one wide table."""
     names = {"t": "Zeit", "vehicle": "Fahrzeug", "partner": "Ziel", "x": "Rechtswert", "y": "Hochwert"}

@@ -8,8 +8,10 @@ from pathlib import Path
 
 import numpy as np
 import pandas as pd
+import pymap3d
 import pytest
 
+import coopoc as co
 from coopoc.data.assemble import interpolate
 from coopoc.data.fleet_files import write_table
 from coopoc.data.registry import convert, load_fleet
@@ -254,3 +256,73 @@ def test_what_no_memory_holds_is_refused_at_once(tmp_path: Path) -> None:
     with pytest.raises(InputError, match=r"b\.csv = 100000 columns: must be at most 5000"):
         load_fleet(tmp_path / "b.csv", format="table")
     assert time.process_time() - began < 5.0
+
+
+def segment(folder: Path) -> tuple[np.ndarray, np.ndarray]:
+    """A minute on a road to the north-east, as comma2k19 stores it; its fixes in degrees and its true places."""
+    t = 5000 + np.arange(0, 60, 0.1)
+    fixes = np.column_stack([37.7 + 1e-6 * np.arange(600), -122.4 + 1e-6 * np.arange(600), 0 * t + 50.0])
+    ecef = np.column_stack(pymap3d.geodetic2ecef(*fixes.T))
+    gnss = np.column_stack([fixes[:, :2], 0 * t + 1.4, 1e3 * t, fixes[:, 2], 0 * t + 38.4])
+    for name, array in {
+        "processed_log/GNSS/live_gnss_ublox/t": t,
+        "processed_log/GNSS/live_gnss_ublox/value": gnss,
+        "processed_log/CAN/speed/t": t,
+        "processed_log/CAN/speed/value": np.full((600, 1), 1.4),
+        "global_pose/frame_times": t,
+        "global_pose/frame_positions": ecef,
+    }.items():
+        (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        with (folder / name).open("wb") as file:
+            np.save(file, array)
+    return fixes, ecef
+
+
+def test_a_segment_of_comma2k19(tmp_path: Path) -> None:
+    """Fixes lie on the truth, by pymap3d, and speed with course follows them."""
+    fixes, _ = segment(tmp_path / "drive")
+    log = co.read_log(tmp_path / "drive")
+    assert log.truth is not None
+    true = np.column_stack(pymap3d.geodetic2enu(*fixes.T, *fixes[0]))
+    np.testing.assert_allclose(log.truth.position[1:-1, 0], true[1:-1], atol=1e-5)
+    np.testing.assert_allclose(log.recording.gnss[0, 1:-1, 0], true[1:-1], atol=1e-5)
+    np.testing.assert_allclose(log.recording.velocity[0, 2:-1, 0], np.diff(true, axis=0)[1:-1] / 0.1, atol=0.05)
+
+
+def test_a_real_segment_of_comma2k19(shared: Path) -> None:
+    log = co.read_log(shared / "road" / "comma2k19", dt=0.1)
+    assert log.truth is not None
+    gap = (log.recording.gnss[0] - log.truth.position)[:, 0, :2]
+    assert np.nanmedian(np.hypot(*gap.T)) < 2.0
+    assert log.summary.read == {"fixes": 571}
+
+
+@pytest.mark.parametrize(
+    ("name", "wrong", "thing"),
+    [
+        ("global_pose/frame_times", None, "global_pose/frame_times = "),
+        ("global_pose/frame_positions", b"no array", "no NumPy array"),
+        ("processed_log/CAN/speed/value", b"cut", "must be an array of numpy.save"),
+        ("processed_log/CAN/speed/value", np.full((600, 1), np.nan), "not finite"),
+        ("processed_log/CAN/speed/value", np.zeros((600, 2)), r"\(600, 2\): must be \(600, 1\)"),
+        ("processed_log/CAN/speed/t", np.zeros((600, 2)), "as its times"),
+        ("processed_log/CAN/speed/t", np.zeros(0), "must be an array of numpy.save"),
+        ("processed_log/CAN/speed/t", np.float64(3.0), "must be an array of numpy.save"),
+        ("processed_log/GNSS/live_gnss_ublox/value", np.array([[{}] * 6], dtype=object), "must be an array"),
+        ("processed_log/GNSS/live_gnss_ublox/t", np.array(["a"] * 600), "must be an array"),
+        ("processed_log/GNSS/live_gnss_ublox/t", b"huge", "must be an array of numpy.save"),
+    ],
+)
+def test_a_damaged_array_of_comma2k19_is_named(tmp_path: Path, name: str, wrong: object, thing: str) -> None:
+    segment(tmp_path / "drive")
+    file = tmp_path / "drive" / name
+    good = file.read_bytes()
+    if isinstance(wrong, bytes):
+        file.write_bytes({b"cut": good[:-9], b"huge": good.replace(b"(600,)", b"(9e9,)")}.get(wrong, wrong))
+    elif wrong is None:
+        file.unlink()
+    else:
+        with file.open("wb") as out:
+            np.save(out, wrong, allow_pickle=True)  # type: ignore[arg-type]
+    with pytest.raises(InputError, match=thing):
+        co.read_log(tmp_path / "drive")

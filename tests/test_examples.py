@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import ast
-import subprocess
 import sys
 from pathlib import Path
+
+from shell import ran
 
 import coopoc
 
@@ -14,7 +15,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 def test_first_steps_runs() -> None:
     script = ROOT / "examples" / "first_steps.py"
-    out = subprocess.run([sys.executable, "-W", "error", script], capture_output=True, text=True, check=True).stdout
+    out = ran([sys.executable, "-W", "error", script], check=True).stdout
     assert out.count("SOLVED") == 4
     assert "FedKalmanNet" in out
 

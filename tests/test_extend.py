@@ -13,6 +13,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import textbook
+from shell import ran
 
 from coopoc import GNSS, V2X, Fleet, JointFilter, Kalman, Sensors, observe, rt_le
 from coopoc.errors import InputError
@@ -38,7 +39,7 @@ def blocks(language: str) -> list[str]:
 def shell(command: str, folder: Path, **env: str) -> str:
     """What a command prints; the test fails with its complaint if it fails."""
     script = command.replace("coopoc ", f"{COOPOC} ", 1)
-    done = subprocess.run(script.split(), cwd=folder, env={**os.environ, **env}, capture_output=True, text=True)
+    done = ran(script.split(), cwd=folder, env={**os.environ, **env})
     assert done.returncode == 0, done.stderr
     return done.stdout
 
@@ -98,7 +99,7 @@ def test_a_backend_is_checked_as_all_are(folder: Path, monkeypatch: pytest.Monke
     (block,) = [text for text in blocks("python") if "least_squares.py:BACKEND" in text]
     script = folder / "own_backend.py"
     script.write_text(block)
-    done = subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True)
+    done = ran([sys.executable, "-W", "error", script], cwd=folder)
     assert done.stdout.startswith("SOLVED"), done.stderr
     monkeypatch.chdir(folder)
     problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 4, 0]], std=[1.0, 2.0, 3.0])
@@ -119,7 +120,7 @@ def test_a_measurement_is_at_once_in_the_backends_and_in_constraints(
     (block,) = [text for text in blocks("python") if '"lidar.py:elevation"' in text]
     script = folder / "own_measurement.py"
     script.write_text(block)
-    done = subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True)
+    done = ran([sys.executable, "-W", "error", script], cwd=folder)
     assert done.stdout.startswith("SOLVED"), done.stderr
     monkeypatch.chdir(folder)
     problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
@@ -155,7 +156,7 @@ def test_a_channel_and_a_metric_go_by_their_file(folder: Path, word: str, names:
     (block,) = [text for text in blocks("python") if word in text]
     script = folder / f"own_{word[:4]}.py"
     script.write_text(block)
-    done = subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True)
+    done = ran([sys.executable, "-W", "error", script], cwd=folder)
     rows = [line.split() for line in done.stdout.splitlines()]
     assert [row[0] for row in rows] == names, done.stderr
     assert all(float(row[1]) > 0 for row in rows)
@@ -192,14 +193,14 @@ def test_an_aggregation_rule_goes_wherever_a_bundled_one_goes(folder: Path, tmp_
     (block,) = [text for text in blocks("python") if "own_rules.py:ClippedMean" in text]
     script = folder / "own_federation.py"
     script.write_text(block + "\nassert not all(fed.history[0].weights == fed.history[2].weights)\n")
-    done = subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True)
+    done = ran([sys.executable, "-W", "error", script], cwd=folder)
     assert done.returncode == 0, done.stderr
     (command,) = commands("own_rules.py:best_half")
     (folder / "examples").mkdir()
     shutil.copy(Path(__file__).parents[1] / "examples" / "aggregation.py", folder / "examples")
     assert "| best half " in shell(command, folder)
     wrong = f"{COOPOC} train fedkalmannet --aggregate own_rules.py:best_hlaf --out {tmp_path}"
-    done = subprocess.run(wrong.split(), cwd=folder, capture_output=True, text=True)
+    done = ran(wrong.split(), cwd=folder)
     assert done.returncode == 2
     assert "Did you mean own_rules.py:best_half?" in done.stderr
 

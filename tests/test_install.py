@@ -10,6 +10,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from shell import ran
 
 from coopoc.errors import MissingLibraryError
 
@@ -32,7 +33,7 @@ def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def outside(site: Path, tmp_path: Path, *command: str) -> str:
     """Output of a command run in an empty folder that sees the installed wheel first."""
     env = {**os.environ, "PYTHONPATH": str(site), "MYPYPATH": str(site)}
-    done = subprocess.run(command, cwd=tmp_path, env=env, capture_output=True, text=True, check=False)
+    done = ran(command, cwd=tmp_path, env=env)
     assert done.returncode == 0, done.stdout[-6000:] + done.stderr[-3000:]
     return done.stdout
 
@@ -93,12 +94,9 @@ for words in (["train", "okf"], ["run", "neighbours", "--set", "method=okf", "ru
     except SystemExit as end:
         assert end.code == 2, (words, end.code)
 """
-    done = subprocess.run(
+    done = ran(
         [sys.executable, "-c", code],
         cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
     )
     assert done.returncode == 0, done.stdout[-3000:] + done.stderr[-3000:]
     assert "SOLVED" in done.stdout
@@ -107,10 +105,11 @@ for words in (["train", "okf"], ["run", "neighbours", "--set", "method=okf", "ru
     assert re.search(r"pip install (-e )?'/.*\[learned\]'", done.stderr)  # from the folder: no index has it
 
 
-@pytest.mark.parametrize("library", ["casadi", "pyarrow", "cvxpy"])
+@pytest.mark.parametrize("library", ["casadi", "pyarrow", "cvxpy", "osqp", "gtsam", "pandas"])
 def test_what_is_missing_is_named_and_the_rest_works(tmp_path: Path, library: str) -> None:
     code = f"""
 import sys
+from functools import partial
 import numpy as np
 sys.modules[{library!r}] = None  # as if it were not installed
 import coopoc as co
@@ -121,8 +120,8 @@ print(co.Kalman()(seen, ["a"]).x.shape)
 problem = co.Problem.from_snapshot(seen, step=1, ego="a")
 uses = {{
     "casadi": lambda: co.solve(problem),
-    "pyarrow": lambda: co.load_fleet("town10"),
-    "cvxpy": lambda: co.solve(problem, "cvxpy"),
+    "fleet": lambda: co.load_fleet("town10"),
+    **{{name: partial(co.solve, problem, name) for name in ("cvxpy", "osqp", "gtsam")}},
 }}
 for name, use in uses.items():
     try:
@@ -133,11 +132,10 @@ for name, use in uses.items():
         print("another reason", name)
 main(["check"])
 """
-    done = subprocess.run([sys.executable, "-c", code], cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = ran([sys.executable, "-c", code], cwd=tmp_path)
     assert done.returncode == 1
     assert "(1, 3, 1, 3)" in done.stdout
     refused = [line.split()[1] for line in done.stdout.splitlines() if line.startswith("refused")]
-    assert library in refused
-    assert set(refused) <= {library, *(["cvxpy"] if library == "casadi" else [])}
+    assert refused == ["fleet" if library in ("pyarrow", "pandas") else library]
     assert re.search(f"coopoc: {library}(-base)? is not installed. Run: pip install {library}", done.stderr)
-    assert done.stdout.count("SOLVED") == {"casadi": 0, "pyarrow": 5, "cvxpy": 4}[library]
+    assert done.stdout.count("SOLVED") == {"casadi": 0, "pyarrow": 5, "pandas": 5}.get(library, 4)

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import importlib
 import pickle
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from shell import ran
 
 from coopoc import Sensors
 from coopoc.kernels.compiling import compile as kernels
@@ -46,7 +46,7 @@ def test_a_kernel_depends_on_all_kernels_below_it() -> None:
 
 def test_importing_the_package_imports_no_numba() -> None:
     code = "import sys, coopoc; print('numba' in sys.modules)"
-    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    done = ran([sys.executable, "-c", code], check=True)
     assert done.stdout.strip() == "False"
 
 
@@ -59,7 +59,7 @@ def test_machine_code_of_types_that_are_gone_is_made_again(tmp_path: Path) -> No
 
     def run() -> str:
         command = [sys.executable, tmp_path / "own.py"]
-        return subprocess.run(command, capture_output=True, text=True, check=True).stdout
+        return ran(command, check=True).stdout
 
     assert (run(), run()) == ("8.0 0\n", "8.0 1\n")
     (index,) = tmp_path.glob("__pycache__/*.nbi")

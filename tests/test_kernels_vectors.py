@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from shell import ran
 
 from coopoc.arrays import Floats
 from coopoc.kernels.compiling.compile import as_written
@@ -79,7 +79,7 @@ def test_plain_njit_gives_the_same_without_the_private_hooks(tmp_path: Path) -> 
         "-k",
         "against_numpy and False",
     ]
-    done = subprocess.run(command, capture_output=True, text=True, env=env)
+    done = ran(command, env=env)
     assert done.returncode == 0, done.stdout
 
 

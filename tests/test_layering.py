@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import ast
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
+from shell import ran
 
 ROOT = Path(__file__).resolve().parents[1]
 FLOORS = ["kernels", "formats", "world", "optimize", "methods", "evaluate", "study", "cli"]
@@ -105,5 +105,5 @@ def test_import_is_light() -> None:
     """`import coopoc` and the core nouns load none of the heavy libraries."""
     heavy = {"torch", "cvxpy", "gtsam", "casadi", "osqp", "pandas", "matplotlib", "sklearn"}
     code = "import sys, coopoc; coopoc.Fleet, coopoc.observe; print(*sys.modules)"
-    loaded = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout.split()
+    loaded = ran([sys.executable, "-c", code], check=True).stdout.split()
     assert not heavy & set(loaded)

@@ -6,7 +6,6 @@ import builtins
 import json
 import os
 import re
-import subprocess
 import sys
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -15,6 +14,7 @@ import numpy as np
 import pytest
 import torch
 from export_onnx import AGREE, INPUTS, OUTPUTS, STEPS, agree, first_inputs, to_onnx
+from shell import ran
 
 from coopoc import V2X, InputError, Sensors, load_fleet, observe
 from coopoc.arrays import AnyArray, Floats
@@ -151,9 +151,7 @@ def test_the_documented_program_needs_onnxruntime_and_numpy_only(file: Path, tmp
     (tmp_path / "fedkalmannet.onnx").write_bytes(file.read_bytes())
     ban = "import sys\nfor name in ('torch', 'coopoc', 'onnx'):\n    sys.modules[name] = None\n"
     (tmp_path / "run.py").write_text(ban + block)
-    out = subprocess.run(
-        [sys.executable, "-W", "error", "run.py"], cwd=tmp_path, capture_output=True, text=True, check=True
-    ).stdout
+    out = ran([sys.executable, "-W", "error", "run.py"], cwd=tmp_path, check=True).stdout
     x = np.array([float(word) for word in re.findall(r"-?\d+\.\d+", out)])
     assert x.shape == (3,)
     assert np.linalg.norm(x - [1090.0, 2000.0, 0.0]) < 3.0, "it drove 10 s at 9 m/s"

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
 import torch
 from export_onnx import to_onnx
+from shell import ran
 from test_extend import blocks, commands, shell
 
 from coopoc import InputError
@@ -33,7 +33,7 @@ def test_a_net_of_ones_own_federates_saves_loads_and_streams(folder: Path) -> No
     (block,) = (text for text in blocks("python") if "load_method" in text)
     script = folder / "own_net.py"
     script.write_text(f"{block}\nassert abs(x - track.x[0, -1, 0]).max() < 1e-4\n")
-    done = subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True)
+    done = ran([sys.executable, "-W", "error", script], cwd=folder)
     assert done.returncode == 0, done.stderr
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import subprocess
 import sys
 import tomllib
 from collections.abc import Callable, Iterable, Mapping
@@ -18,6 +17,7 @@ import pandas as pd
 import pytest
 import torch
 from logs import long, observed, write
+from shell import ran
 from torch import Tensor
 
 from coopoc import Fleet, InputError, load_fleet
@@ -306,7 +306,7 @@ def test_train_with_flower_is_train(tmp_path: Path) -> None:
             tmp_path / "weights",
         )
     ]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=300)
+    done = ran(command, timeout=300)
     assert done.returncode == 0, done.stderr
     (path,) = (tmp_path / "weights").iterdir()
     card, found, stamp = load(path).card, load(path).history, path.stat().st_mtime_ns

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from shell import ran
 
 from coopoc import Fleet
 from coopoc.data.fleet_files import write_table
@@ -138,7 +139,7 @@ def test_the_script_survives_the_death_of_a_node(tmp_path: Path, mark: str) -> N
     fleet = drives(4)
     write_table(fleet, tmp_path / "four.parquet")
     command = script(tmp_path / "site", "--data", tmp_path / "four.parquet", "--kill", 2, "--change", CHANGE)
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    done = ran(command, timeout=600)
     assert done.returncode == 0, done.stderr
     job = job_of({"recipe": "fedkalmannet", "rounds": 3, **TINY})
     card = checked(tmp_path / "site" / "fedkalmannet.safetensors", job, fleet)
@@ -152,7 +153,7 @@ def test_a_run_that_fails_ends_the_script_with_an_error(tmp_path: Path, mark: st
     """Flower has no strategy for the rule: the ServerApp raises, and the exit status is not zero."""
     write_table(drives(1), tmp_path / "one.parquet")
     command = script(tmp_path / "site", "--data", tmp_path / "one.parquet", "--change", f"aggregate=uniform {CHANGE}")
-    done = subprocess.run(command, capture_output=True, text=True, timeout=600)
+    done = ran(command, timeout=600)
     assert done.returncode != 0
     assert "the run failed" in done.stderr
     assert "aggregate = 'uniform'" in (tmp_path / "site" / "run.log").read_text()

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import corrupted
 import numpy as np
 import pytest
+from shell import ran
 
 from coopoc import V2X, Fleet, InputError, JointFilter, Sensors, observe
 
@@ -50,7 +50,7 @@ def test_the_error_names_field_value_and_allowed(parts: dict[str, Any], words: s
 def program(*given: str, **env: str) -> str:
     """What tests/corrupted.py complains about, in a process that may crash."""
     command = [sys.executable, str(Path(corrupted.__file__)), *given]
-    done = subprocess.run(command, capture_output=True, text=True, env={**os.environ, **env})
+    done = ran(command, env={**os.environ, **env})
     assert done.returncode in (0, 1), f"{given}: ended by signal {-done.returncode}\n{done.stderr[-2000:]}"
     return done.stdout
 
@@ -113,5 +113,5 @@ def test_under_the_switch_scalar_and_vector_access_is_checked() -> None:
     """NUMBA_BOUNDSCHECK=1 holds for the intrinsics, which work on pointers, too."""
     command = [sys.executable, "-c", CODE]
     env = {**os.environ, "NUMBA_BOUNDSCHECK": "1"}
-    done = subprocess.run(command, capture_output=True, text=True, check=True, env=env)
+    done = ran(command, check=True, env=env)
     assert done.stdout.split("\n")[:-1] == ["copied checks", "plain checks"]

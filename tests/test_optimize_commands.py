@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import subprocess
 import sys
 from pathlib import Path
 
@@ -11,6 +10,7 @@ import numpy as np
 import pytest
 from graph_files import write_graph
 from random_graphs import random_graph
+from shell import ran
 
 from coopoc.cli import main
 from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
@@ -94,7 +94,7 @@ def test_check_solves_one_problem_with_every_backend(capsys: pytest.CaptureFixtu
 def test_the_example_draws_a_graph_file(tmp_path: Path) -> None:
     picture, script = tmp_path / "drive.png", ROOT / "examples" / "graph_file.py"
     command = [sys.executable, "-W", "error", script, PYFG / "mrclam5a.pyfg", picture]
-    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    out = ran(command, check=True).stdout
     assert "-> 69.10 in" in out
     assert "-> 0.214 m" in out
     assert picture.stat().st_size > 10_000

@@ -7,23 +7,15 @@ from dataclasses import replace
 import casadi as ca
 import numpy as np
 import pytest
+from oracles.whitened import whitened
 
-from coopoc.optimize import MEASUREMENTS, Problem, SolveError, Status, backends, solve
+from coopoc.optimize import Problem, SolveError, Status, backends, solve
 from coopoc.optimize.assess.assess import newton_decrease
 
 
 def casadis_hessian(problem: Problem, x: np.ndarray) -> np.ndarray:
     v = ca.SX.sym("x", 3, len(problem.names))
-    cost = 0
-    for factor in problem.factors:
-        for k, nodes in enumerate(factor.nodes.tolist()):
-            gap = v[:, nodes[-1]] - (v[:, nodes[0]] if len(nodes) == 2 else 0)
-            h = ca.vertcat(*MEASUREMENTS[factor.kind].formula(gap[0], gap[1], gap[2], ca)) - factor.z[k]
-            h = [
-                ca.atan2(ca.sin(h[c]), ca.cos(h[c])) if angle else h[c]
-                for c, angle in enumerate(factor.measurement.angles())
-            ]
-            cost += 0.5 * ca.sumsqr(ca.DM(factor.root[k]) @ ca.vertcat(*h))
+    cost = 0.5 * ca.sumsqr(whitened(problem, v))
     return np.asarray(ca.Function("H", [v], [ca.hessian(cost, ca.vec(v))[0]])(x.T))
 
 

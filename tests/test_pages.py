@@ -4,12 +4,12 @@ from __future__ import annotations
 
 import os
 import re
-import subprocess
 import sys
 from itertools import zip_longest
 from pathlib import Path
 
 import pytest
+from shell import ran
 
 ROOT = Path(__file__).resolve().parents[1]
 HERE = ["README", "index", "methods", "optimize", "streaming", "studies", "learned"]
@@ -34,9 +34,7 @@ def printed(page: str, folder: Path) -> str:
     (folder / "page.py").write_text("\n".join(code for code, _ in blocks(page)))
     flags = ["-W", "error", "-W", "ignore:'click.utils"]  # of a library that Flower imports
     environment = {**os.environ, "OMP_NUM_THREADS": "1", "PYTHONPATH": str(ROOT / "examples")}
-    done = subprocess.run(
-        [sys.executable, *flags, "page.py"], cwd=folder, capture_output=True, text=True, env=environment
-    )
+    done = ran([sys.executable, *flags, "page.py"], cwd=folder, env=environment)
     assert done.returncode == 0, done.stderr
     return done.stdout
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import os
-import subprocess
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -13,6 +12,7 @@ import numpy as np
 import pytest
 from conftest import textbook
 from oracles import pose_filter as oracle
+from shell import ran
 
 import coopoc as co
 from coopoc.methods.poses.pose_inputs import pose_measurements, pose_noise, to_landmarks
@@ -273,5 +273,5 @@ def test_no_kernel_of_poses_reads_beyond_its_arrays(tmp_path: Path) -> None:
     """numba's bounds checks, over members that come and go, in a process of its own."""
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", "dense_oracle"]
     env = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
-    done = subprocess.run(words, capture_output=True, text=True, env=env, cwd=Path(__file__).parents[1])
+    done = ran(words, env=env, cwd=Path(__file__).parents[1])
     assert done.returncode == 0, done.stdout[-2000:]

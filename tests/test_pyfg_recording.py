@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import re
-import subprocess
 import sys
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path
@@ -13,6 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 from graph_files import write_graph
+from shell import ran
 
 import coopoc as co
 from coopoc.data.commands import check as data_check
@@ -124,7 +124,7 @@ def test_covariances_for_information_are_named_where_a_graph_is_solved(shared: P
     found = {}
     for name in ("right", "wrong"):
         command = [sys.executable, "-m", "coopoc.cli", "solve", f"{name}.g2o", "--objective", "geodesic"]
-        done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+        done = ran(command, cwd=tmp_path)
         found[name] = json.loads(done.stdout)["misfit"], "covariances where the format has information" in done.stderr
     assert 0.1 < found["right"][0] < 1.0
     assert not found["right"][1]

@@ -15,20 +15,11 @@ import pytest
 from coopoc.study.report import report
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
-from coopoc.study.tables import Table, pivot
+from coopoc.study.tables import Table
 
 playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed: pip install 'coopoc[dev]'")
 
 WIDTHS = {"desktop": (1280, 900), "phone": (390, 844)}
-
-
-def _known(known: str) -> Any:
-    """The study's table under a name that ends in a noise model; its rows are those of this noise model."""
-
-    def table(results: Results) -> Table:
-        return pivot(results, "method", "max_neighbours", "rt_le_m", caption=f"RT-LE [m], {known} noise model.")
-
-    return table
 
 
 def _numbers(results: Results) -> Table:
@@ -56,9 +47,7 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(Path(__file__).parent / "distribution"))
         small = importlib.import_module("small_study").STUDY
-    tables = {f"rt_le_{k}": _known(k) for k in ("identity", "fitted", "nominal")}
-    figures = {f"rt_le_{k}": small.figures["rt_le"] for k in ("identity", "fitted")}
-    study = replace(small, tables={**tables, "numbers": _numbers, "wide": _wide, **small.tables}, figures=figures)
+    study = replace(small, tables={"numbers": _numbers, "wide": _wide, **small.tables})
     run_study(study, out, progress=False)
     return report([out / "small"], out / "report.html", cards={"circle": {"vehicles": 5, "name": "a" * 120}})
 
@@ -97,10 +86,6 @@ def _column(page: Any, table: str, index: int) -> list[str]:
     return [re.split(r"\s", cell)[0] if index else cell for cell in cells]
 
 
-def _shown(page: Any) -> list[str]:
-    return [panel.get_attribute("data-noise_model") for panel in page.locator(".panel").all() if panel.is_visible()]
-
-
 @pytest.mark.parametrize(
     ("title", "upwards", "downwards"),
     [
@@ -130,28 +115,12 @@ def test_intervals_sort_by_their_mean_from_the_keyboard(page: Any) -> None:
     assert [head.get_attribute("aria-sort") for head in heads.all()] == [None, None, "ascending", None]
 
 
-def test_the_switch_holds_for_the_whole_page(page: Any) -> None:
-    tabs = page.locator("#small-table-rt_le_identity-panel").locator("xpath=..").get_by_role("tab")
-    assert tabs.all_inner_texts() == ["Identity", "Fitted", "Nominal"]
-    assert _shown(page) == ["identity", "identity"]
-    tabs.nth(1).click()
-    assert _shown(page) == ["fitted", "fitted"]
-    page.keyboard.press("ArrowRight")  # no figure has it: that block keeps what it shows
-    assert _shown(page) == ["fitted", "nominal"]
-    assert [tab.get_attribute("aria-selected") for tab in tabs.all()] == ["false", "false", "true"]
-    page.emulate_media(media="print")
-    assert _shown(page) == ["identity", "fitted", "identity", "fitted", "nominal"]
-
-
 def test_nothing_is_wider_than_the_page(page: Any) -> None:
-    for tab in page.get_by_role("tab").all():
-        tab.click()
-        wide, window = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
-        assert wide <= window
-        for image in page.locator("figure img:visible").all():
-            box = image.bounding_box()
-            assert box["width"] > 300
-            assert box["x"] + box["width"] <= window
+    wide, window = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
+    assert wide <= window
+    box = page.locator("figure img").bounding_box()
+    assert box["width"] > 300
+    assert box["x"] + box["width"] <= window
     beyond = """[...document.querySelectorAll("body *")].filter(e => !e.closest(".wide") && e.getClientRects().length
         && e.getBoundingClientRect().right > innerWidth + 1).map(e => e.outerHTML.slice(0, 80))"""
     assert page.evaluate(beyond) == []
@@ -175,6 +144,7 @@ def test_without_javascript_everything_is_there(browser: Any, page_file: Path) -
     context = browser.new_context(java_script_enabled=False)
     plain = context.new_page()
     plain.goto(page_file.as_uri())
-    assert _shown(plain) == ["identity", "fitted", "identity", "fitted", "nominal"]
+    assert [table.is_visible() for table in plain.locator(".table table").all()] == [True] * 3
+    assert plain.locator("figure img").is_visible()
     assert plain.locator("button").count() == 0
     context.close()

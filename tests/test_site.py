@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import re
-import subprocess
 import sys
 from pathlib import Path
 
 import pytest
+from shell import ran
 
 ROOT = Path(__file__).resolve().parents[1]
 TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
@@ -24,7 +24,7 @@ def test_every_page_has_a_place() -> None:
 def test_every_study_has_a_finding_and_a_page_that_is_there() -> None:
     pytest.importorskip("mkdocs")
     code = "import pages; print(len(pages.names('coopoc.studies')), pages._gallery())"
-    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "docs", capture_output=True, text=True, check=True)
+    out = ran([sys.executable, "-c", code], cwd=ROOT / "docs", check=True)
     title, *studies = out.stdout.split("\n## ")
     for study in studies:
         assert "**" in study, study
@@ -48,7 +48,7 @@ def test_every_method_has_a_row_of_its_own_in_the_overview() -> None:
     ids=lambda path: path.stem,
 )
 def test_a_tutorial_runs(tutorial: Path, tmp_path: Path) -> None:
-    done = subprocess.run([sys.executable, "-W", "error", tutorial], cwd=tmp_path, capture_output=True, text=True)
+    done = ran([sys.executable, "-W", "error", tutorial], cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout
     if tutorial.stem == "paper":
@@ -98,5 +98,5 @@ try:
 except pages.PluginError:
     print("refused")
 """
-    out = subprocess.run([sys.executable, "-c", code], cwd=ROOT / "docs", capture_output=True, text=True, check=True)
+    out = ran([sys.executable, "-c", code], cwd=ROOT / "docs", check=True)
     assert out.stdout.split() == ["1", "refused"]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,6 +13,7 @@ import numpy as np
 import pytest
 from conftest import crossing_fleet, textbook
 from filterpy.kalman import KalmanFilter
+from shell import ran
 
 from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, StarStream, observe
 from coopoc.arrays import Bools, Floats
@@ -287,7 +287,7 @@ def test_the_replay_runs(log: str, request: pytest.FixtureRequest) -> None:
         folder = request.getfixturevalue("shared") / "evo_oracle"
         arguments = [folder / f"KITTI_00_{part}.txt" for part in ("ORB", "gt_times", "gt")]
     command = [sys.executable, "-W", "error", ROOT / "examples" / "replay_log.py", *arguments, "--steps", "150"]
-    out = subprocess.run(command, capture_output=True, text=True, check=True).stdout
+    out = ran(command, check=True).stdout
     assert ("No log given" in out) == (log == "bundled")
     rows = [line.split("  ") for line in out.splitlines() if line.startswith(("Kal", "adap", "OKF", "Fed"))]
     numbers = np.array([[float(word) for word in row[1:] if word.strip()] for row in rows])

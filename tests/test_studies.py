@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -10,6 +9,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from shell import ran
 
 import coopoc as co
 from coopoc.data.fleet_files import write_table
@@ -252,7 +252,7 @@ def test_order_of_the_paper_under_identity_and_the_honest_order(town10: co.Fleet
 )
 def test_mistakes_end_with_a_sentence_and_status_2(arguments: list[str], words: str, tmp_path: Path) -> None:
     command = [str(Path(sys.executable).with_name("coopoc")), *arguments]
-    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    done = ran(command, cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert words in done.stderr
     assert "Traceback" not in done.stderr

@@ -40,7 +40,8 @@ def test_no_mark_lies_below_its_bound(file: Path) -> None:
         for (method, known), mark in marks.items():
             if method == "bound" or not bounds:
                 continue
-            own = max(bounds.values())
+            past = bounds.get("with its past") if method == "cooperative-filter" else None  # its messages bring it
+            own = past or max(bounds.values())
             error = mark["run_std"] / mark["runs"] ** 0.5
             rms = (mark["value"] ** 2 + mark["run_std"] ** 2) ** 0.5  # bounds are of squares, values means over runs
             assert rms + 3.0 * error > own, (where, method, known, rms, own)

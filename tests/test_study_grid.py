@@ -48,7 +48,7 @@ def test_all_that_changes_the_numbers_changes_the_name_and_nothing_else_does() -
     base = names()
     assert len(set(base)) == 4
     assert names() == base
-    assert names(question="Another wording?", limitations=("x",), minutes=3.0) == base
+    assert names(question="Another wording?", limitations=("x",)) == base
     assert names(settings={"ratio": 0.1, "egos": [0, 1], "runs": 3}) == base
     for changed in ({"settings": {"runs": 4, "egos": (0, 1), "ratio": 0.1}}, {"key": lambda p: {"fleet": "f00d"}}):
         assert not set(names(**changed)) & set(base)

@@ -1,12 +1,12 @@
 """Entry points: names, mappings, clashes, and distributions that are broken."""
 
 import os
-import subprocess
 import sys
 from importlib import metadata
 from pathlib import Path
 
 import pytest
+from shell import ran
 
 from coopoc import plugins
 from coopoc.errors import InputError
@@ -85,6 +85,6 @@ def test_entry_points_are_pythons_own_after_the_backport_was_imported() -> None:
         "from coopoc.cli import main\nmain(['solve', '--help'])"
     )
     pytest.importorskip("importlib_metadata")
-    found = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False)
+    found = ran([sys.executable, "-c", code])
     assert found.returncode == 0, found.stderr
     assert "coopoc solve" in found.stdout

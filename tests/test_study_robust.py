@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from shell import ran
 from small_runs import COMMAND, ENV, files, numbers, shown, start
 
 from coopoc.errors import InputError
@@ -86,12 +87,10 @@ def in_a_small_disk(script: str, tmp_path: Path) -> list[str]:
     mount = "mount -t tmpfs -o size=10m tmpfs disk"
     if subprocess.run([*shell, mount], cwd=tmp_path, capture_output=True, timeout=20).returncode:
         pytest.skip("this system lets nobody mount a disk of their own")
-    done = subprocess.run(
+    done = ran(
         [*shell, f"{mount}\n{script}"],
         cwd=tmp_path,
         env={**ENV, "RUN": " ".join(COMMAND)},
-        capture_output=True,
-        text=True,
         timeout=120,
     )
     return (done.stdout + done.stderr).splitlines()

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
+from shell import ran
 
 import coopoc as co
 from coopoc.data.log.units import KINDS
@@ -49,7 +50,7 @@ def test_every_command_runs(folder: Path) -> None:
     commands = [line for block in blocks("sh") for line in block.splitlines()]
     assert len(commands) == 7
     for command in commands[1:]:
-        done = subprocess.run([*COOPOC, *words(command)[1:]], cwd=folder, capture_output=True, text=True, check=False)
+        done = ran([*COOPOC, *words(command)[1:]], cwd=folder)
         assert done.returncode == 0, done.stderr
         if "data check" in command:
             assert "nothing looks wrong" in done.stdout
@@ -65,9 +66,7 @@ def test_every_block_of_python_runs(folder: Path) -> None:
     code = "\n".join(text for text in blocks("python") if not text.startswith("# make_log"))
     script = folder / "page.py"
     script.write_text(code)
-    done = subprocess.run(
-        [sys.executable, "-W", "error", script], cwd=folder, capture_output=True, text=True, check=False
-    )
+    done = ran([sys.executable, "-W", "error", script], cwd=folder)
     assert done.returncode == 0, done.stderr
     assert "not used" not in done.stdout
     assert "read: 180 fixes, 2700 ranges" in done.stdout

@@ -1,9 +1,10 @@
-"""The gate of innovations: what is beyond it weighs less, what is far beyond nothing; many count again.
+"""Innovation gating: a redescending weight of the normalised innovation squared, and release after lock-out.
 
 Many are as many as hold, together, more information than the prediction that contradicts them: the sum of the gains
 that they would have had. A filter that is sure of itself stays so for long, one that has just begun does not.
 
-A number, or LANES runs side by side. Every filter calls it where a measurement becomes information.
+A number, or LANES runs side by side. Filters call it where a measurement becomes information; blocks of the
+cooperative filter (`stars.gaussian.weight`) and fixes on roads (`road.correct`) have shapes of their own.
 """
 
 from __future__ import annotations
@@ -45,7 +46,7 @@ def inflation(q: float, gate: float, hits: float) -> float:
 
 @inside
 def count(q: float, gate: float, hits: float, gain: float) -> float:
-    """Sum of the gains of measurements beyond the gate, less LEAK of those within."""
+    """Next value of the lock-out counter: the gains of measurements beyond the gate, less LEAK of those within."""
     more: float = choose(q - gate, hits + gain, max(hits - LEAK * gain, 0.0))
     return more
 

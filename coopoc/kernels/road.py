@@ -16,12 +16,15 @@ from .compiling.compile import compiled, part
 from .motion import MotionNoise, process_variance
 from .solo import SoloMeasurements
 
-Z, Z_VARIANCE, SINCE, LEVEL = range(4)
-"""Places in `RoadState.more`: height m, its variance m^2, s since the last fix, factor of a fix's variance."""
+Z, Z_VARIANCE, SINCE, LEVEL, SCALE, FIXES = range(6)
+"""Places in `RoadState.more`: height m, its variance m^2, s since the last fix, factor of a fix's variance, factor of
+the whole covariance, number of fixes."""
 
 
 SUDDEN, LOUDEST = 5.0, 400.0
 """Most d^2 that raises the variance of fixes, and the most that it is raised to, as a multiple."""
+MOST_SCALE, BELIEVED = 4.0, 2.0
+"""Most of the factor of the covariance, and the fixes that its start counts as."""
 
 
 class RoadNoise(NamedTuple):
@@ -35,6 +38,7 @@ class RoadNoise(NamedTuple):
         scale: of the scale's error.
         lasts: s, correlation time of both.
         window: fixes, over which the variance of a fix is raised to what innovations show.
+        least: of the factor of the covariance, which innovations show; from 1 on there is none.
     """
 
     fix: Floats
@@ -44,6 +48,7 @@ class RoadNoise(NamedTuple):
     scale: float
     lasts: float
     window: float
+    least: float
 
 
 class RoadState(NamedTuple):
@@ -53,7 +58,7 @@ class RoadState(NamedTuple):
         x: (4,).
         p: (4, 4).
         gain: (4, 2), memory.
-        more: (4,).
+        more: (6,).
     """
 
     x: Floats
@@ -73,6 +78,7 @@ def begin(state: RoadState, noise: RoadNoise, fix: Floats, late: Floats) -> None
     p[0, 0], p[1, 1] = noise.fix[0] + late[0], noise.fix[1] + late[1]
     p[2, 2], p[3, 3] = noise.heading * noise.heading, noise.scale * noise.scale
     more[Z], more[Z_VARIANCE], more[SINCE], more[LEVEL] = fix[2], noise.fix[2] + late[2], 0.0, 1.0
+    more[SCALE], more[FIXES] = 1.0, BELIEVED
 
 
 @part
@@ -143,6 +149,11 @@ def correct(state: RoadState, noise: RoadNoise, fix: Floats, late: Floats) -> No
     more[Z] += g * up
     more[Z_VARIANCE] = (1.0 - g) * (1.0 - g) * q + g * g * r
     more[SINCE] = 0.0
+    more[FIXES] = min(more[FIXES] + 1.0, noise.window)
+    if noise.least < 1.0:
+        scale = more[SCALE]
+        scale += (min(square, SUDDEN * scale) - scale) / more[FIXES]
+        more[SCALE] = min(max(scale, noise.least), MOST_SCALE)
     more[LEVEL] = min(max(level * (1.0 + (min(square, SUDDEN) - 1.0) / noise.window), 1.0), LOUDEST)
 
 
@@ -179,7 +190,7 @@ def run_road(seen: SoloMeasurements, noise: RoadNoise, x: Floats, cov: Floats, e
         errors: (R, T, E, 4) heading error rad, its standard deviation, scale error, its standard deviation.
     """
     runs, steps, vehicles = x.shape[:3]
-    state = RoadState(np.empty(4), np.empty((4, 4)), np.empty((4, 2)), np.zeros(4))
+    state = RoadState(np.empty(4), np.empty((4, 4)), np.empty((4, 2)), np.zeros(6))
     moved, q, late = np.empty(3), np.empty(3), np.zeros(3)
     cov[:] = 0.0
     for run in range(runs):
@@ -192,10 +203,11 @@ def run_road(seen: SoloMeasurements, noise: RoadNoise, x: Floats, cov: Floats, e
                     moved[c] = seen.dt * seen.velocity[run, t, n, c]
                     q[c] = motion[c] + seen.process[run, t, n, c]
                 road_step(state, noise, moved, q, seen.dt, seen.gnss[run, t, n], late)
+                scale = state.more[SCALE]
                 x[run, t, e, 0], x[run, t, e, 1], x[run, t, e, 2] = state.x[0], state.x[1], state.more[Z]
                 for i in range(2):
                     for j in range(2):
-                        cov[run, t, e, i, j] = state.p[i, j]
+                        cov[run, t, e, i, j] = scale * state.p[i, j]
                     errors[run, t, e, 2 * i] = state.x[2 + i]
-                    errors[run, t, e, 2 * i + 1] = math.sqrt(state.p[2 + i, 2 + i])
-                cov[run, t, e, 2, 2] = state.more[Z_VARIANCE]
+                    errors[run, t, e, 2 * i + 1] = math.sqrt(scale * state.p[2 + i, 2 + i])
+                cov[run, t, e, 2, 2] = scale * state.more[Z_VARIANCE]

@@ -1,4 +1,4 @@
-"""The loop of all cooperative methods: each ego opens its inbox, hands arguments to its kernel, and fills its Track."""
+"""The loop of filters of a star: each ego opens its inbox, hands arguments to its kernel, and fills its Track."""
 
 from __future__ import annotations
 

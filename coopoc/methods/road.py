@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ..arrays import Floats, instance
 from ..errors import InputError
 from ..kernels.motion import MotionNoise
-from ..kernels.road import Z_VARIANCE, RoadNoise, RoadState, Z, road_motion, road_step, run_road
+from ..kernels.road import SCALE, Z_VARIANCE, RoadNoise, RoadState, Z, road_motion, road_step, run_road
 from ..kernels.solo import SoloMeasurements
 from ..short_repr import short_repr
 from ..world.fleet import Fleet
@@ -31,6 +31,7 @@ LIMITS: Limits = {
     "scale": (0.0, 1.0, "in [0, 1]"),
     "lasts": (1e-3, np.inf, "> 0 s"),
     "window": (2.0, np.inf, ">= 2"),
+    "least": (1e-6, 1.0, "in 1e-6..1"),
 }
 
 
@@ -47,6 +48,8 @@ class RoadErrors:
         scale: of an error of the speed that lasts, as a share of it.
         lasts: s, correlation time of both.
         window: fixes over which their variance is raised to what innovations show.
+        least: of the factor by which innovations lower the whole covariance, for errors that last show in no
+            innovation; 1 where the level is known, as of simulated or calibrated errors.
 
     Raises:
         InputError: numbers outside these ranges.
@@ -54,20 +57,22 @@ class RoadErrors:
 
     fix: float = 2.0
     motion: float = 1.0
-    correlation: float = 2.0
+    correlation: float = 1.5
     gate: float = 1.4
     heading: float = 0.1
     scale: float = 0.03
     lasts: float = 300.0
     window: float = 30.0
+    least: float = 0.15
 
     def __post_init__(self) -> None:
         check_options(self, LIMITS)
 
 
 ROAD = RoadErrors()
-"""Of measurements that are not simulated, by hand, between what is learned in simulation and what real drives show."""
-EXACT = RoadErrors(fix=1.0, motion=1.0, correlation=0.0, gate=5.0, heading=0.0, scale=0.0, window=np.inf)
+"""Of measurements that are not simulated, by hand: between what is learned in simulation and what the first parts of
+real drives show."""
+EXACT = RoadErrors(fix=1.0, motion=1.0, correlation=0.0, gate=5.0, heading=0.0, scale=0.0, window=np.inf, least=1.0)
 """Of simulated measurements whose noise is known and white: the Kalman filter, with a gate."""
 
 
@@ -201,7 +206,7 @@ class RoadFilter:
             return every
 
         def cost(logs: Floats) -> float:
-            made, total, steps = cls(noise_model, from_logs(at(logs))), 0.0, 0
+            made, total, steps = cls(noise_model, from_logs(at(logs), 1.0)), 0.0, 0
             for part, column, target in parts:
                 x, cov, _ = made.filtered(part, [column])
                 fix = 0.0 if truth is not None else made._noise(part)[1].fix[:2]
@@ -212,7 +217,7 @@ class RoadFilter:
 
         simplex = first[free] + np.vstack([np.zeros(len(free)), 0.7 * np.eye(len(free))])
         found = minimize(cost, first[free], method="Nelder-Mead", options={"maxfev": 400, "initial_simplex": simplex})
-        return cls(noise_model, from_logs(at(found.x)))
+        return cls(noise_model, from_logs(at(found.x), 1.0))
 
     def _noise(self, recording: Recording) -> tuple[Floats, RoadNoise, MotionNoise]:
         """Variance m^2 of each step beside that of the motion, noise of fixes and errors, noise of the motion."""
@@ -236,13 +241,13 @@ MOST = np.log([1e2, 1e2, 1e3, 20.0, 1.0, 0.5, 1e5, 1e4])
 
 
 def to_logs(errors: RoadErrors) -> Floats:
-    """(8,) logarithms of the numbers that are fitted: all but `shared`."""
-    return np.asarray(np.log(astuple(errors)))
+    """(8,) logarithms of the numbers that are fitted: all but `least`."""
+    return np.asarray(np.log(astuple(errors)[:-1]))
 
 
-def from_logs(logs: Floats) -> RoadErrors:
+def from_logs(logs: Floats, least: float = ROAD.least) -> RoadErrors:
     """Errors of logarithms (8,), within LEAST and MOST."""
-    return RoadErrors(*np.exp(np.clip(logs, LEAST, MOST)).tolist())
+    return RoadErrors(*np.exp(np.clip(logs, LEAST, MOST)).tolist(), least)
 
 
 def true_cost(x: Floats, cov: Floats, true: Floats, fix: Floats | float = 0.0, distance: float = 1.0) -> Floats:
@@ -279,7 +284,7 @@ def road_noise(known: NoiseModel, errors: RoadErrors) -> RoadNoise:
     """Both as the kernel takes them."""
     fix = np.square(errors.fix * np.array(known.gnss_std))
     e = errors
-    return RoadNoise(fix, e.correlation, e.gate, e.heading, e.scale, e.lasts, e.window)
+    return RoadNoise(fix, e.correlation, e.gate, e.heading, e.scale, e.lasts, e.window, e.least)
 
 
 class RoadStream:
@@ -293,7 +298,7 @@ class RoadStream:
 
     def __init__(self, motion: MotionNoise, noise: RoadNoise, history: float) -> None:
         self.history, self._motion, self._noise = MotionHistory(history), motion, noise
-        self.state = RoadState(np.full(4, np.nan), np.zeros((4, 4)), np.empty((4, 2)), np.zeros(5))
+        self.state = RoadState(np.full(4, np.nan), np.zeros((4, 4)), np.empty((4, 2)), np.zeros(6))
 
     def step(
         self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float = 0.0
@@ -311,4 +316,4 @@ class RoadStream:
             return np.full(3, np.nan), None
         cov = np.zeros((3, 3))
         cov[:2, :2], cov[2, 2] = state.p[:2, :2], state.more[Z_VARIANCE]
-        return np.append(state.x[:2], state.more[Z]), cov
+        return np.append(state.x[:2], state.more[Z]), state.more[SCALE] * cov

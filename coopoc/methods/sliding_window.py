@@ -29,11 +29,18 @@ MOVING = f"windows were still moving after {REPEATS + 1} Gauss-Newton steps"
 
 @dataclass(frozen=True, eq=False)
 class FixedLagSmoother:
-    """The joint filter's star over the steps t-lag..t, given what the steps before left when they were eliminated.
+    r"""The joint filter's star over the steps t-l..t, given what the steps before left when they were eliminated.
 
-    At every step one Gauss-Newton step of the window: its measurements are linearised anew at the smoothed points, the
-    oldest step is eliminated into the prior of the next, and the newest point is the estimate: causal, and in a linear
-    model the filter's own for every lag. A lag of 0 is JointFilter, but for measured ranges below `min_range`, whose
+    $$
+    \hat x_{t-l..t} = \hat x^0 + \arg\min_{d} \lVert \hat x^0_{t-l} + d_{t-l} - x_a \rVert^2_{P^{-1}}
+    + \sum_k \lVert \hat x^0_{k+1} + d_{k+1} - \hat x^0_k - d_k - \Delta t \, u_k \rVert^2_{Q^{-1}}
+    + \sum_k \lVert h(\hat x^0_k) + H_k d_k - z_k \rVert^2_{R^{-1}}
+    $$
+
+    with the points $\hat x^0$ of the step before, l = lag, the prior (x_a, P). At every step one Gauss-Newton step of
+    the window: its measurements are linearised anew at the smoothed points, the oldest step is eliminated into the
+    prior of the next, and the newest point is the estimate: causal, and in a linear model the filter's own for every
+    lag. A lag of 0 is JointFilter, but for measured ranges below `min_range`, whose
     angles are widened here (`relative_std`). Messages are brought forward as there; MovingHorizon puts them at their
     true time.
 

@@ -73,16 +73,19 @@ def pareto(results: Results, caption: str, x: str = "bytes_per_second", where: W
     for key, group in summary.dropna(subset=["mean"]).groupby(names, sort=False):
         of = dict(zip(names, key, strict=True))
         points = sorted(zip(group["bytes"], group["mean"], strict=True))
-        alone = points[-1][0] == 0 or of["method"] == "bound"
-        shown.append((of, min(value for _, value in points) if alone else {x: y for x, y in points if x > 0}))
+        marks = {(sent, k): y for k, (sent, y) in enumerate(points) if sent}  # several may cost the same
+        alone = not marks or of["method"] == "bound"
+        shown.append((of, min(y for _, y in points) if alone else marks))
+    drawn = {id(of): points for of, points in shown}
     groups = _coinciding([("", shown)], True, WIDTH * _height([("", shown)], True))
-    groups.sort(key=lambda alike: not isinstance(next(of[1] for of in shown if of[0] is alike[0]), Mapping))
+    groups.sort(key=lambda alike: not isinstance(drawn[id(alike[0])], Mapping))
     with canvas(width=7.0) as (figure, panel):
-        for line, points in (next(of for of in shown if of[0] is alike[0]) for alike in groups):
+        for line, *_ in groups:
+            points = drawn[id(line)]
             if not isinstance(points, Mapping):
                 _draw(panel, line, points)
                 continue
-            sent = list(points.items())
+            sent = [(at, y) for (at, _), y in points.items()]
             panel.plot(*zip(*sent, strict=True), **{**strokes(line), "linestyle": "none"})
             best = [p for k, p in enumerate(sent) if all(p[1] < other[1] for other in sent[:k])]
             panel.plot(*zip(*best, strict=True), **{**strokes(line), "marker": "", "linewidth": 0.8})
@@ -111,10 +114,8 @@ def curves(
     levels: Sequence[Where] = (),
     ylabel: str = "RT-LE [m]",
     width: float | None = None,
-    height: float = 3.1,
     log: bool = False,
     logx: bool = False,
-    merged: bool = True,
 ) -> Plot | None:
     """Plot a number of selections over a parameter, in panels that share the vertical axis; None if none was run.
 
@@ -130,10 +131,8 @@ def curves(
         levels: lines that do not depend on the place and are drawn across.
         ylabel: label of the vertical axis.
         width: inches.
-        height: inches.
         log: logarithmic vertical axis; a linear one starts at zero.
         logx: logarithmic horizontal axes.
-        merged: draw lines that coincide in all their panels as one, named together.
     """
     every, shown = [*lines, *levels], []
     models = {str(of.get("noise_model")) for of in every if of.get("method") != "bound"} - {"none", "trained"}
@@ -149,8 +148,8 @@ def curves(
     if not any(drawn for _, drawn in shown):
         return None
     height_of = _height(shown, log)
-    groups = {id(group[0]): group for group in _coinciding(shown, log, NEAR * height_of if merged else -1.0)}
-    size = {"width": width or 2.2 + 2.1 * len(shown) + (len(shown) == 1), "height": height}
+    groups = {id(group[0]): group for group in _coinciding(shown, log, WIDTH * height_of)}
+    size = {"width": width or 2.2 + 2.1 * len(shown) + (len(shown) == 1), "height": 3.1}
     with canvas(1, len(shown), sharey=True, squeeze=False, **size) as (figure, (axes,)):
         named, also = list[dict[str, Any]](), dict[str, str]()
         for axis, (panel, drawn) in zip(axes, shown, strict=True):
@@ -193,9 +192,9 @@ def _name_alike(axes: Axes, drawn: Sequence[tuple[Where, Any]], log: bool, near:
             axes.annotate(_joined(group), (x, _mean(y)), fontsize=7, path_effects=halo, **place)
 
 
-NEAR, WIDTH = 0.015, 0.009
-"""Shares of the height of a panel: within the first, lines are drawn and named as one if they are so in every panel;
-within the second, a line's width, they are named together in a panel."""
+WIDTH = 0.009
+"""Share of the height of a panel, a line's width: lines within it in every panel are drawn and named as one, in one
+panel they are named together."""
 
 
 def _coinciding(shown: Sequence[Any], log: bool, near: float) -> list[list[Where]]:

@@ -26,7 +26,6 @@ _FIELDS = {
     "missing": dict,
     "idle": list,
     "limitations": list,
-    "minutes": (int, float, type(None)),
 }
 
 
@@ -83,7 +82,6 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
         "missing": missing,
         "idle": sorted(made("idle", study.idle) or ()),
         "limitations": list(study.limitations),
-        "minutes": study.minutes,
     }
     store.write(folder / VIEWS, json.dumps(content, indent=1, default=_data, ensure_ascii=False) + "\n")
 

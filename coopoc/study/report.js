@@ -1,6 +1,6 @@
 "use strict";
-// What the page does beyond being read: sort a table, switch the noise model, mark the place in the contents.
-// Without it every row and every panel is there.
+// What the page does beyond being read: sort a table, enlarge a figure, mark the place in the contents.
+// Without it all is there.
 (() => {
   const SECONDS = { s: 1, min: 60, h: 3600 };
   const NUMBER = /^([+\-−]?)(\d[\d,]*\.?\d*(?:e[+-]?\d+)?|inf)(?:\s+(s|min|h)$)?/;
@@ -48,52 +48,6 @@
     });
   }
 
-  // Tabs over the panels of a block; all blocks that have a panel of the chosen noise model follow.
-  function tabs(block) {
-    const panels = [...block.children];
-    const list = document.createElement("div");
-    list.className = "tabs";
-    list.setAttribute("role", "tablist");
-    list.setAttribute("aria-label", "Noise model");
-    const buttons = panels.map((panel) => {
-      const button = document.createElement("button");
-      Object.assign(button, { type: "button", id: `${panel.id}-tab`, textContent: panel.dataset.noise_model });
-      button.setAttribute("role", "tab");
-      button.setAttribute("aria-controls", panel.id);
-      panel.setAttribute("role", "tabpanel");
-      panel.setAttribute("aria-labelledby", button.id);
-      return button;
-    });
-    const show = (model) => {
-      const at = panels.findIndex((panel) => panel.dataset.noise_model === model);
-      if (at < 0) return;
-      panels.forEach((panel, i) => panel.classList.toggle("other", i !== at));
-      buttons.forEach((button, i) => {
-        button.setAttribute("aria-selected", String(i === at));
-        button.tabIndex = i === at ? 0 : -1;
-      });
-    };
-    const choose = (button) => {
-      const before = button.getBoundingClientRect().top;
-      blocks.forEach((each) => each(button.textContent));
-      button.focus({ preventScroll: true });
-      window.scrollBy({ top: button.getBoundingClientRect().top - before, behavior: "instant" });
-    };
-    buttons.forEach((button, i) => {
-      button.addEventListener("click", () => choose(button));
-      button.addEventListener("keydown", (event) => {
-        const step = { ArrowRight: 1, ArrowLeft: -1 }[event.key];
-        if (!step) return;
-        event.preventDefault();
-        choose(buttons[(i + step + buttons.length) % buttons.length]);
-      });
-    });
-    list.append(...buttons);
-    block.prepend(list);
-    show(panels[0].dataset.noise_model);
-    return show;
-  }
-
   // On a phone a figure fits; this one draws it large enough to read, in a box that scrolls.
   function enlargeable(figure) {
     const button = document.createElement("button");
@@ -115,7 +69,6 @@
   }
 
   [...document.querySelectorAll("table")].filter((table) => table.tHead).forEach(sortable);
-  const blocks = [...document.querySelectorAll(".block")].map(tabs);
   document.querySelectorAll("figure").forEach(enlargeable);
   document.addEventListener("scroll", mark, { passive: true });
   mark();

@@ -31,9 +31,6 @@ _MIME = {
     "svg": "image/svg+xml",
 }
 _LARGEST_SVG = 1_000_000
-NOISE_MODELS = ("identity", "fitted", "nominal", "oracle")
-"""Ends of the names of views that differ in nothing else: the page shows one of them at a time."""
-
 
 _TERM = re.compile(rf"(?<![\w-])({'|'.join(map(re.escape, sorted(TERMS, key=len, reverse=True)))})(?![\w-])")
 
@@ -54,7 +51,7 @@ def report(
         out: the file.
         title: of the page.
         lead: sentences under the title, before the first study.
-        answers: question -> answer, shown after the lead; default each study's question with its first finding.
+        answers: question -> answer, after the lead; default those of several studies, each with its first finding.
         cards: name of a data set -> field -> value.
         first: study whose first figure opens the page; default the first that has one.
 
@@ -68,13 +65,14 @@ def report(
     names = [section["name"] for section in sections]
     if not sections or len(set(names)) < len(names):
         raise InputError("folders", names, "must be at least one, of different studies", "Give coopoc report FOLDER.")
-    opening = [{**s["figures"][0][0], "section": s["name"]} for s in sections if s["figures"]]
+    several = sections if len(sections) > 1 else []
+    opening = [{**s["figures"][0], "section": s["name"]} for s in several if s["figures"]]
     opening.sort(key=lambda figure: figure["section"] != first)
     page = _template().render(
         title=title or f"coopoc: {', '.join(section['title'] for section in sections)}",
         lead=lead,
-        answers=answers or {s["question"]: next(iter(s["findings"].values())) for s in sections if s["findings"]},
-        first=opening[0] if opening and len(sections) > 1 else None,
+        answers=answers or {s["question"]: next(iter(s["findings"].values())) for s in several if s["findings"]},
+        first=opening[0] if opening else None,
         sections=sections,
         cards=cards or {},
         environment=environments([section["environment"] for section in sections]),
@@ -96,23 +94,13 @@ def _section(folder: Path) -> dict[str, Any]:
         "environment": results.environment,
         "pending": results.pending,
         "cells": results.frame["cell"].nunique() if len(results.frame) else 0,
-        "tables": _blocks([_table(view, results.study) for view in shown["tables"]]),
-        "figures": _blocks([_figure(folder, view, results.study) for view in shown["figures"]]),
+        "tables": [_table(view, results.study) for view in shown["tables"]],
+        "figures": [_figure(folder, view, results.study) for view in shown["figures"]],
         "failures": [
             {"cell": ", ".join(title(axis, row[axis]) for axis in results.axes if axis in row), "reason": row["reason"]}
             for _, row in results.failures.iterrows()
         ],
     }
-
-
-def _blocks(shown: Sequence[Mapping[str, Any]]) -> list[list[dict[str, Any]]]:
-    """Views in their order, those that differ in the noise model alone together, each with its noise model."""
-    blocks: dict[tuple[str, bool], list[dict[str, Any]]] = {}
-    for view in shown:
-        stem, _, model = view["name"].rpartition("_")
-        key = (stem, True) if model in NOISE_MODELS else (view["name"], False)
-        blocks.setdefault(key, []).append({**view, "noise_model": model})
-    return list(blocks.values())
 
 
 def _table(view: Mapping[str, Any], study: str) -> dict[str, Any]:

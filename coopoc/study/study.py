@@ -63,10 +63,8 @@ class Study:
         recipe: Results -> field -> value of the training, for the report.
         idle: Results -> names of settings that do nothing in them, which the report leaves out.
         limitations: sentences.
-        minutes: expected on one core.
         metrics: metrics with reference values -> "lower" or "higher", which is better, or the best value.
         reference: file of the reference values, see `coopoc.study.reference`; it may be absent.
-
         tracks: parameters -> name, t (T,) s and position (T, 3) m of each estimated path.
 
     Raises:
@@ -92,7 +90,6 @@ class Study:
     recipe: Callable[[Results], Mapping[str, Any]] | None = None
     idle: Callable[[Results], Collection[str]] | None = None
     limitations: tuple[str, ...] = ()
-    minutes: float | None = None
     metrics: Mapping[str, str | float] = field(default_factory=dict)
     reference: str | Path | None = None
     tracks: Callable[[Params], Iterable[tuple[Any, ...]]] | None = None

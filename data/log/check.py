@@ -438,7 +438,7 @@ def _of_measurements(c: Check) -> list[str]:
             more = f" and {len(offsets) - 4} pairs more" if len(offsets) > 4 else ""
             sentences.append(
                 f"{word}s of {shown}{more} are off in the median, with {row['stated_std']:.3g} {unit} stated: an "
-                "offset of the sensors, of antennas, or of the fixes or heights of one of the two."
+                "offset of the sensors, of antennas, or of fixes or heights of one of the two; offset= takes it off."
             )
         elif not wrong and std < NARROW * should and row["stated_std"] > 2 * std:
             sentences.append(f"{word}s are better than stated: {stated}.")

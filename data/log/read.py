@@ -23,6 +23,7 @@ from coopoc.world.v2x import V2X
 from ..assemble import backward_difference, check_scale, check_size, check_time, interpolate, longest_gap
 from ..bag import STAMP, read_bag
 from ..cells import TABLES, factors, headers
+from ..comma import is_segment, read_segment
 from ..nmea import read_nmea
 from ..source import parted
 from .frames import ENU, Origin, assumed, local, on_one_clock, unwrapped
@@ -78,7 +79,8 @@ class Log:
 
 
 def is_log(path: Path, columns: Mapping[str, str] | None = None) -> bool:
-    """Whether a path is a log: a bag, NMEA, a folder with such files or tables, or a table with a column of a log.
+    """Whether a path is a log: a bag, NMEA, a segment of comma2k19, a folder of such files, or a
+    table with a column of a log.
 
     Args:
         path: of a file or folder.
@@ -88,9 +90,8 @@ def is_log(path: Path, columns: Mapping[str, str] | None = None) -> bool:
     (True, True)
     """
     if path.is_dir():
-        return _is_bag(path) or bool(_files(path))
-    ending = path.suffix.lower()
-    return is_log_table(path, columns) if ending in TABLES else ending in READERS
+        return _is_bag(path) or is_segment(path) or bool(_files(path))
+    return is_log_table(path, columns) if path.suffix.lower() in TABLES else _is_read(path)
 
 
 def read_log(
@@ -102,6 +103,7 @@ def read_log(
     kinds: Mapping[str, str] | None = None,
     ignore: Sequence[str] = (),
     scale: Mapping[str, float] | None = None,
+    offset: Mapping[str, float] | None = None,
     std: Mapping[str, float] | None = None,
     stamps: Stamps = "header",
     clock: Mapping[str, float] | None = None,
@@ -126,6 +128,8 @@ def read_log(
         kinds: names in a column kind, as {"uwb": "range"}.
         ignore: kinds that are left out; topics of a bag.
         scale: kind, or t -> factor to its unit here, as {"range": 0.001, "t": 1e-3} of mm and ms.
+        offset: kind in its unit here -> what all its measurements are too large by, as {"range": 0.4} of radios whose
+            delays are not calibrated.
         std: kind in SI units -> standard deviation of all its measurements, as {"range": 0.15, "x": 1.5}.
         stamps: times of a bag's messages: those of the headers, or those at which they were "received".
         clock: vehicle -> s by which its clock is ahead; it is subtracted from its stamps.
@@ -167,8 +171,8 @@ def read_log(
     }
     rows = _rows(path, truth, summary, {**options, "stamps": stamps})
     factor = factors(scale, ("t", *KINDS))
-    by_kind = rows["kind"].map(factor).fillna(1.0)
-    rows = rows.assign(value=by_kind * rows["value"], std=by_kind.abs() * rows["std"])
+    by_kind, less = rows["kind"].map(factor).fillna(1.0), rows["kind"].map(factors(offset, KINDS, "offset"))
+    rows = rows.assign(value=by_kind * rows["value"] - less.fillna(0.0), std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
     rows = unwrapped(rows, summary)
     check_values(rows)
@@ -248,6 +252,11 @@ def _is_bag(path: Path) -> bool:
     return (path / "metadata.yaml").is_file() or READERS.get(path.suffix.lower()) is read_bag
 
 
+def _is_read(file: Path) -> bool:
+    ending = file.suffix.lower()
+    return ending in READERS
+
+
 def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[str, Any]) -> Rows:
     """Rows of a file or a folder, with those of the truth: of the file that is named, of `truth.*`, or of a topic."""
     if not path.exists():
@@ -257,6 +266,8 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
         if not (true_files and true_files[0].exists()):
             options, true_files = {**options, "truth": str(truth or "")}, []
         parts = [read_bag(path, summary, **options)]
+    elif is_segment(path):
+        parts, true_files = [read_segment(path, summary)], []
     else:
         if true_files and not true_files[0].is_file():
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
@@ -286,7 +297,7 @@ def _read_file(file: Path, path: Path, summary: Summary, **options: Any) -> Rows
 
 
 def _every_file(path: Path) -> list[Path]:
-    return [file for file in path.rglob("[!.]*") if file.suffix.lower() in READERS]
+    return [file for file in path.rglob("[!.]*") if _is_read(file)]
 
 
 def _files(path: Path) -> list[Path]:
@@ -319,13 +330,14 @@ def _check_scale(rows: Rows, name: str) -> None:
 def _ids(rows: Rows, body: bool, summary: Summary) -> list[str]:
     """Members that can be placed, in the order of their first row: by fixes, or in body frames by odometry, too."""
     placed = rows["kind"].isin(["x", "speed", "yaw_rate"] if body else ["x"])
-    if placed.any():
-        return [name for name in rows["vehicle"].unique() if name in set(rows["vehicle"][placed])]
+    names, moving = (set(rows["vehicle"][which]) for which in (placed, in_group(rows, "odometry")))
+    if names and (not moving or names & moving):
+        return [name for name in rows["vehicle"].unique() if name in names]
     if body:
         hint = f"Give speed and yaw_rate of every vehicle, and x, y (and z) of landmarks. {summary.unread}".rstrip()
         raise InputError("fixes, odometry", "none", "must be there: a pose is carried on by odometry", hint)
-    hint = "Give x, y (and z) or latitude, longitude (and height) of every vehicle, at least once. "
-    hint = (hint + summary.unread).rstrip()
+    hint = "Give x, y (and z) or latitude, longitude (and height) of every vehicle, at least once; where ranges to "
+    hint = f'{hint}anchors place it, read frame="body". {summary.unread}'.rstrip()
     raise InputError("fixes", "none", "must be there: a position in the local frame starts from one", hint)
 
 

@@ -73,6 +73,17 @@ def rows_of(frame: pd.DataFrame, file: str) -> Rows:
     return rows.astype(names).reset_index(drop=True)
 
 
+def of_kinds(frame: pd.DataFrame, file: str) -> Rows:
+    """Rows of a table with a column for each kind, and perhaps KIND_std beside it; an empty cell is no measurement."""
+    known = frame[frame.columns.intersection([*BLANK])].fillna({"partner": "", "true": 0.0})
+    parts = [
+        known.assign(kind=kind, value=frame[kind], std=frame.get(f"{kind}_std", NONE))
+        for kind in KINDS
+        if kind in frame
+    ]
+    return rows_of(pd.concat(parts).dropna(subset="value"), file)
+
+
 def in_group(rows: Rows, *groups: str) -> Bools:
     """(L,) True for rows whose kinds are of these groups."""
     return rows["kind"].isin([name for name, kind in KINDS.items() if kind.group in groups]).to_numpy()

@@ -112,7 +112,8 @@ def missing(gnss: Floats, at: tuple[Index, Index, Index]) -> bool:
 def look(
     drives: Drives, state: State, net: Net, tape: Floats, row: Index, t: Index, rows: tuple[Index, Index, Index]
 ) -> None:
-    """Directions of the four changes, their lengths, and the innovation; a missing fix repeats the last."""
+    """Input features of GainNet: directions and lengths of four differences, and the innovation; a missing fix repeats
+    the last."""
     real, at = tape.dtype.type, net.columns[on.CHANGES]
     residual, lengths = net.columns[on.RESIDUAL], net.columns[on.LENGTHS]
     s, first, lanes = rows
@@ -136,7 +137,7 @@ def look(
 
 @part
 def think(net: Net, state: State, tape: Floats, row: Index, lanes: Index) -> None:
-    """The net itself, from the changes to the gain and the posterior."""
+    """Forward pass of the GRUs, from the features to the gain and the posterior."""
     forward_layer(net, on.L_UPDATE, tape, row, lanes)
     gru(net, on.L_PROCESS_X, on.PROCESS_OLD, on.PROCESS, state.process, tape, row, lanes)
     forward_layer(net, on.L_EVOLUTION, tape, row, lanes)

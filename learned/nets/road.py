@@ -52,7 +52,7 @@ class RoadConstants(Gain):
         found = np.empty(fixes.shape[1:3])
         for s, logs in enumerate(theta.detach().double().numpy()):
             gnss, speed = (np.ascontiguousarray(part[:, s].swapaxes(0, 1))[:, :, None] for part in (fixes, velocity))
-            errors, motion = from_logs(logs), motion_noise(KNOWN, None)
+            errors, motion = from_logs(logs, 1.0), motion_noise(KNOWN, None)
             no_process = np.broadcast_to(0.0, gnss.shape)
             seen = SoloMeasurements(gnss, speed, no_process, louder(motion, errors), np.array([0]), batch.dt)
             x, cov, lasting = (np.empty((*gnss.shape[:3], *size)) for size in ((3,), (3, 3), (4,)))

@@ -113,7 +113,6 @@ VIEWS = json.dumps(
         "missing": {},
         "limitations": ["One town."],
         "idle": ["seed"],
-        "minutes": 1.5,
     },
     indent=1,
 )

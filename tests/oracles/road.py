@@ -24,7 +24,7 @@ def road(
     """
     keep, lasting = np.exp(-dt / errors.lasts), np.array([errors.heading, errors.scale])
     x, p = np.array([*z[0, :2], 0.0, 0.0, z[0, 2]]), np.diag([*r[:2], *lasting**2, r[2]])
-    means, covariances, since, level = [x], [p], 0.0, 1.0
+    means, covariances, since, level, common, fixes = [x], [p], 0.0, 1.0, 1.0, 2.0
     measured, plane, height = np.eye(5)[[0, 1, 4]], [0, 1], [2]
     for t in range(1, len(z)):
         b, s = x[2:4]
@@ -44,6 +44,9 @@ def road(
                 d2 = v[part] @ np.linalg.solve(marginal[np.ix_(part, part)], v[part]) / len(part)
                 weight[part] = max(1.0, d2 / errors.gate**2)
                 if part is plane:
+                    fixes = min(fixes + 1.0, errors.window)
+                    if errors.least < 1.0:
+                        common = np.clip(common + (min(d2, 5.0 * common) - common) / fixes, errors.least, 4.0)
                     level = np.clip(level * (1 + (min(d2, 5.0) - 1) / errors.window), 1.0, 400.0)
             noise = np.diag(weight * (white * (1 + 2 * rho / (1 - rho)) + late))
             gain = p @ measured.T @ np.linalg.inv(measured @ p @ measured.T + noise)
@@ -51,5 +54,5 @@ def road(
             rest = np.eye(5) - gain @ measured
             x, p, since = x + gain @ v, rest @ p @ rest.T + gain @ noise @ gain.T, 0.0
         means.append(x)
-        covariances.append(p)
+        covariances.append(common * p)
     return np.array(means), np.array(covariances)

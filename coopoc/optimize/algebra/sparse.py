@@ -1,4 +1,4 @@
-"""The cost of a single problem by tapes: value, gradient and sparse Hessian at a point, and factors of it."""
+"""The cost of a problem by tapes: value, gradient and sparse Hessian at a point, and factors of it."""
 
 from __future__ import annotations
 
@@ -180,13 +180,13 @@ def shared_layout(structure: Structure) -> Layout:
 
 
 def layout_of(problem: Problem) -> Layout:
-    """The layout of a single problem, without its constraints."""
+    """The layout of a problem, without its constraints."""
     return shared_layout(structure_of(problem)._replace(constraints=()))
 
 
 @dataclass(frozen=True, eq=False)
 class Sparse:
-    """The cost of a single problem over its m unknowns; build it with `sparse`. It does not hold the problem, which
+    """The cost of a problem over its m unknowns; build it with `sparse`. It does not hold the problem, which
     holds it.
 
     Args:
@@ -233,7 +233,7 @@ class Sparse:
 
 
 def sparse(problem: Problem) -> Sparse:
-    """The cost of a single problem, without its constraints, ready to be evaluated; kept as long as the problem is.
+    """The cost of a problem, without its constraints, ready to be evaluated; kept as long as the problem is.
 
     Raises:
         InputError: a formula that CasADi cannot run.

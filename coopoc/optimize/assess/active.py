@@ -73,7 +73,7 @@ class Active:
 
 
 def constraint_rows(problem: Problem, x: Floats) -> Rows:
-    """The constraints of a single problem at x (n, ambient)."""
+    """The constraints of a problem at x (n, ambient)."""
     from scipy.sparse import vstack
 
     parts = [_rows_of(problem, x, k) for k in range(len(problem.constraints))]

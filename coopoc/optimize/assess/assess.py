@@ -37,7 +37,7 @@ REJECTED = 0.5
 
 @dataclass(frozen=True, eq=False)
 class Assessment:
-    """Of a single problem at x.
+    """Of a problem at x.
 
     Args:
         cost: 1/2 sum of rho.
@@ -64,7 +64,7 @@ class Assessment:
 
 
 def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
-    """Assessment of a single problem at x (n, ambient); without constraints the covariance may be left out."""
+    """Assessment of a problem at x (n, ambient); without constraints the covariance may be left out."""
     if not problem.constraints:
         return _unconstrained(problem, sparse(problem), x, covariance)
     linear = problem.linearise(x)
@@ -228,7 +228,7 @@ def newton_decrease(problem: Problem, x: Floats) -> float | None:
 
 
 def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
-    """True unless the Lagrangian of a single problem curves downwards at x (n, ambient) within what `active` allows.
+    """True unless the Lagrangian of a problem curves downwards at x (n, ambient) within what `active` allows.
 
     Z^T (H + sum_c m_c d2 h_c / dx2) Z is positive definite, H the Hessian of the cost, m the multipliers and Z the
     directions that remain. The far side of a range that must be met is a stationary point too, and a maximum.
@@ -267,7 +267,7 @@ def _lagrangian(problem: Problem, x: Floats, active: Active) -> Any:
 
 
 def judged(problem: Problem, x: Floats, cost: float) -> tuple[float, tuple[str, ...]]:
-    """The expected cost at a minimum x (n, ambient) of a single problem, and what is to be said of it.
+    """Expected cost at a minimum x (n, ambient) by the chi-square law, and notes on one that is far from it.
 
     Measurements that a robust loss rejects count neither in the cost nor in what is expected.
     """

@@ -92,7 +92,7 @@ Form: TypeAlias = list[Part] | None
 
 
 def forms(problem: Problem) -> list[Form]:
-    """Of each factor of a single problem its parts in GTSAM."""
+    """Of each factor of a problem its parts in GTSAM."""
     return [_form(problem, factor) for factor in problem.factors]
 
 

@@ -24,14 +24,13 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..algebra.cholesky import Cholesky, cholesky_of, columns_solved
+from ..descent.levenberg_marquardt import DECAY, GROWTH
 from .qcqp import Multipliers, Quadratic, multipliers
 
 DENSE = 500
 """Up to this many constrained rows C is formed."""
 SMALL = 200
 """Up to this many rows of X all matrices are dense."""
-ENOUGH = 1e-11
-"""Decrease that a last step promises, as a share of the cost (at least of 1); it is still taken."""
 MAX_ITERATIONS = 300
 LOOSE = 1e-10
 """Share of the largest singular value below which positions are free."""
@@ -41,6 +40,8 @@ FIRST = 1e-6
 """Damping once some is needed."""
 MOST = 1e6
 """Damping beyond which no step can help."""
+PROMISE = 1e-11
+"""Share of the cost, or of 1, whose promise by a step ends the loop; the step is still taken."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -163,7 +164,7 @@ class Reduced:
 
 @dataclass(frozen=True, eq=False)
 class Stationary:
-    """Where a minimisation ended: X (bound, p), cost, multipliers, iterations; whether the tolerance was met."""
+    """Result of Newton's method: X (bound, p), cost, multipliers, iterations; whether the tolerance was met."""
 
     X: Floats
     cost: float
@@ -175,8 +176,8 @@ class Stationary:
 def minimise(
     reduced: Reduced,
     X: Floats,
-    deadline: float,
-    tick: Callable[[], object],
+    deadline: float = np.inf,
+    tick: Callable[[], object] = lambda: None,
 ) -> Stationary:
     """A stationary point of 1/2 <C, X X^T> near X (bound, p), or where the time is over; Newton's steps converge
     quadratically.
@@ -209,16 +210,16 @@ def minimise(
                 trial = form.project(X + (B @ xi).reshape(size, -1)[: form.bound])
                 CT = reduced.times(trial)
                 after = 0.5 * float(np.sum(trial * CT))
-                small = promised <= ENOUGH * max(cost, 1.0)
+                small = promised <= PROMISE * max(cost, 1.0)
                 share = 1.0 if small and after <= cost * (1.0 + 1e-12) else (cost - after) / promised
                 moved = share > 0.0
                 if moved:
                     X, CX, cost = trial, CT, after
                 if small or mu > MOST:
                     return Stationary(X, cost, multipliers(form, X, CX), count, small)
-                mu = max(mu / 5.0, LEAST) if share > 0.75 else mu if share > 0.25 else max(10.0 * mu, FIRST)
+                mu = max(mu / DECAY, LEAST) if share > 0.75 else mu if share > 0.25 else max(GROWTH * mu, FIRST)
             else:
-                mu = max(10.0 * mu, FIRST)
+                mu = max(GROWTH * mu, FIRST)
             if count >= MAX_ITERATIONS or time.perf_counter() > deadline:
                 return Stationary(X, cost, multipliers(form, X, CX), count, False)
 

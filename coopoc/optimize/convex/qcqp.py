@@ -161,7 +161,7 @@ def orthogonal(blocks: Floats) -> Floats:
 
 
 def quadratic(problem: Problem) -> Quadratic:
-    """The QCQP of a single problem.
+    """The QCQP of a problem.
 
     Exact for position, displacement (any weights; among poses the same for all axes), range, relative_position (one
     weight), pose_chordal and relative_pose_chordal (one weight for the position, one for the rotation). Other kinds

@@ -24,8 +24,6 @@ LEAST_DAMPING = 1e-9
 """Damping below which none is left: far below any diagonal it changes no digit of a step."""
 HIDDEN = 1e-9
 """Share of the cost below which rounding hides how much of a promised decrease came true."""
-FLAT = 1e-15
-"""Share of the cost below which a promised decrease is rounding: no step can be judged there."""
 OFF = 0.2
 """A share of the promised decrease this far from 1 casts doubt on J^T J."""
 DOUBT = 2
@@ -51,7 +49,7 @@ STILL = 12
 
 @dataclass(frozen=True, eq=False)
 class Arrival:
-    """Where the loop ended.
+    """Result of Levenberg-Marquardt.
 
     Args:
         x: (n, ambient).
@@ -72,7 +70,8 @@ class Arrival:
 def arrive(
     system: Sparse, x: Floats, max_iterations: int, tolerance: float, step: Step | None = None, bounded: bool = False
 ) -> Arrival:
-    """A minimum from x (n, ambient): (H + mu D) dx = -g, D the diagonal of J^T J, which scales by the geometry.
+    """Minimise by Levenberg-Marquardt from x (n, ambient): (H + mu D) dx = -g, D the diagonal of J^T J, which scales by
+    the geometry.
 
     H = J^T J, until two of its promises failed by more than a fifth or hardly fell, or the end is NEAR; then the exact
     Hessian, with which the last steps converge quadratically however large the residuals are. Where that is not

@@ -302,11 +302,6 @@ class Constraint:
         """2 or 3, or None if the kind looks the same in both."""
         return fitting(self.measurement, self.lower.shape[-1])
 
-    @property
-    def equality(self) -> Bools:
-        """(M, size) True where lower = upper."""
-        return np.asarray(self.lower == self.upper)
-
     def violation(self, value: Floats) -> Floats:
         """(M, size) how far h (M, size) lies outside."""
         return np.maximum(np.maximum(self.lower - value, value - self.upper), 0.0)

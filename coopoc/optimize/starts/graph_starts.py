@@ -11,7 +11,7 @@ from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
 from ...formats.graph import Graph
 from ..algebra.sparse import sparse
-from ..descent.levenberg_marquardt import arrive
+from ..descent.levenberg_marquardt import GROWTH, arrive
 from ..model.problem import Problem
 from ..model.space import Space, carried
 from .initial import initial_guess
@@ -158,7 +158,7 @@ def trilaterate(places: Floats, ranges: Floats) -> Floats:
         there = _squares(p, ranges, at + step)
         better = there[:, d, d] < now[:, d, d]
         at[better], now[better] = at[better] + step[better], there[better]
-        damping = np.where(better[:, None, None], np.maximum(0.1 * damping, LEAST), 10.0 * damping)
+        damping = np.where(better[:, None, None], np.maximum(damping / GROWTH, LEAST), GROWTH * damping)
         if np.abs(step).max() <= PLACED * ranges.max():
             break
     return np.asarray(at[np.argmin(now[:, d, d])] + middle)

@@ -1,4 +1,4 @@
-"""The choice among starts: a few steps from each, cheapest first; the lowest goes on, or one that grows."""
+"""Multi-start: a few steps of Levenberg-Marquardt from each start, and the lowest goes on."""
 
 from __future__ import annotations
 
