@@ -90,7 +90,9 @@ READ: Mapping[str, tuple[Callable[[str], Any], str, str]] = {
     **dict.fromkeys(("any_scale", "mutual"), (lambda text: bool(TRUE.index(text.lower())), "true or false", "true")),
     "columns": (pairs, "name:header pairs, the name here and the header in the file", "t:time,id:car"),
     "kinds": (pairs, "word:kind pairs, the word in the file and the kind here", "uwb:range"),
-    **dict.fromkeys(("scale", "std"), (partial(pairs, value=float), "name:number pairs", "range:0.001,t:1e-3")),
+    **dict.fromkeys(
+        ("scale", "std", "offset"), (partial(pairs, value=float), "name:number pairs", "range:0.001,t:1e-3")
+    ),
     "clock": (partial(pairs, value=float), "vehicle:seconds pairs", "blue:0.35"),
     "ignore": (lambda text: tuple(map(str.strip, text.split(","))), "words between commas", "imu,lidar"),
     "origin": (_place, "latitude, longitude and height", "48.14,11.58,520"),

@@ -87,7 +87,9 @@ def road_row(task: str, data: Path, made: Method) -> dict[str, Any]:
         made: solo method; Kalman and road filters can be calibrated.
     """
     recording, truth = seen(task, data)
-    start = int(SHARE * len(recording.t))
+    start, column = int(SHARE * len(recording.t)), recording.observers[0]
+    begin, _ = recording.stretches(column)[0]
+    made(recording.between(begin, begin + 3), [column])  # compiles
     row = {"task": task, "data": hashed(*(located(data, name) for name in roads(data)[task]))}
     row |= _scored(made, recording, truth, start)
     if isinstance(made, Kalman) or (isinstance(made, RoadFilter) and made.errors is None):

@@ -142,15 +142,15 @@ KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n0 -1 0 5 1 0 0 6 0 0 1 7\n"
         (TUM + "0.2 0 0 0 0 0 0 0\n", "a.tum: line 4 = quaternion [0.0, 0.0, 0.0, 0.0]", "length 1"),
         (TUM + "0.1 0 0 0 0 0 0 1\n", "a.tum: line 4, column t", "must increase"),
         ("# t x y z\n", "a.tum = 0 lines", "complete"),
-        (KITTI + "1 0 0 5 0 1 0 6\n", "a.kitti: line 3 = 1 0 0 5 0 1 0 6 (8 words)", "r11 r12 r13 t1 r21"),
-        (KITTI + "1 0 0 5 0 1 0 6 0 0 nan 7\n", "a.kitti: line 3", "finite"),
-        (KITTI + "1 0 0 5 0 1.01 0 6 0 0 1 7\n", "a.kitti: line 3 = rotation", "orthonormal"),
-        (KITTI + "1 0 0 5 0 1 0 6 0 0 -1 7\n", "a.kitti: line 3 = rotation", "determinant 1"),
+        (KITTI + "1 0 0 5 0 1 0 6\n", "a.txt: line 3 = 1 0 0 5 0 1 0 6 (8 words)", "r11 r12 r13 t1 r21"),
+        (KITTI + "1 0 0 5 0 1 0 6 0 0 nan 7\n", "a.txt: line 3", "finite"),
+        (KITTI + "1 0 0 5 0 1.01 0 6 0 0 1 7\n", "a.txt: line 3 = rotation", "orthonormal"),
+        (KITTI + "1 0 0 5 0 1 0 6 0 0 -1 7\n", "a.txt: line 3 = rotation", "determinant 1"),
     ],
 )
 def test_a_bad_line_of_a_trajectory_is_named(tmp_path: Path, text: str, thing: str, hint: str) -> None:
-    name, read, good = ("a.tum", read_tum, TUM) if "tum" in thing else ("a.kitti", read_kitti, KITTI)
-    assert len(read(_file(tmp_path / "good", good))) == 2
+    good, name, read = (KITTI, "a.txt", read_kitti) if "a.txt" in thing else (TUM, "a.tum", read_tum)
+    assert len(read(_file(tmp_path / name, good))) == 2
     _assert_refused(lambda: read(_file(tmp_path / name, text)), thing, hint)
 
 
