@@ -20,7 +20,9 @@ from coopoc import (
     Sensors,
     load_fleet,
     observe,
+    pose_start,
     read_graph,
+    read_log,
     solve,
 )
 from coopoc.arrays import Floats
@@ -182,6 +184,7 @@ class Logged:
 LOGGED = (
     Logged("robots", "MR.CLAM 6: odometry, two landmarks, four neighbours, nothing else.", "MRCLAM_Dataset6", 30.0),
     Logged("uwb", "Four robots that range one another and one anchor.", "tiers.pyfg", 10.0),
+    Logged("indoor", "A robot that ranges four anchors, two of them behind walls.", "Indoor_UWB_Input.txt", 3.0),
 )
 
 
@@ -207,6 +210,13 @@ def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, 
         assert drive.truth is not None
         start = int(until / drive.truth.dt)
         return pose_drives.thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
+    if task.name == "indoor":
+        log = read_log(path, truth=path.with_name("Indoor_UWB_GT.txt"), frame="body")
+        assert log.truth is not None
+        start = int(0.4 * len(log.recording.t))
+        noise = replace(log.recording.sensors, range_std=RANGE_STD)
+        begin = pose_start(log.recording.between(0, start), gate=GATE, assumed=noise)
+        return log.recording, log.truth, start, {"begin": begin, "assumed": noise}
     drive = pose_drives.drive(str(path), 0.0, V2X(max_neighbours=3, radius=float("inf")), GATE)
     if drive.truth is None or drive.truth.heading is None:
         raise InputError("data", str(path), "must hold true poses", "Take the file as it was published.")
