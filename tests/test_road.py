@@ -215,7 +215,7 @@ def test_a_log_of_ones_own_is_a_task(tmp_path: Path) -> None:
 @pytest.mark.skipif(not ROADS.is_dir(), reason="the data of ../shared/data are not there")
 @pytest.mark.parametrize("task", ["f9k", "kitti", "comma2k19"])
 def test_calibrated_it_is_the_best_on_real_roads(task: str) -> None:
-    """Before Kalman filters, as they come or calibrated; its NEES of (x, y) between 1 and 4, as it comes from 0.4 on."""
+    """Before Kalman filters, as they come or calibrated; NEES of (x, y) between 1 and 4, as it comes from 0.4 on."""
     mine, usual, adaptive = (road_row(task, ROADS.parent, m) for m in (RoadFilter(), Kalman(), co.AdaptiveKalman()))
     others = usual["rt_le_m"][0], usual["calibrated_m"][0], adaptive["rt_le_m"][0]
     assert mine["calibrated_m"][0] < 0.97 * min(others)
