@@ -115,13 +115,13 @@ def of_training(
 def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
     """The ledger of a drive: the messages that the egos of a track broadcast and received.
 
+    A message as long as the neighbourhood goes to a centre, which answers each: at every step at which the vehicle is
+    there, one on either way has its overhead.
+
     Args:
         track: with its bytes on air.
         recording: that the track is of.
         message: of the method.
-
-    Raises:
-        InputError: a message as long as the neighbourhood under an overhead: its payload has no one share of the air.
 
     >>> from coopoc import Fleet, GNSS, Sensors, observe
     >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
@@ -130,7 +130,9 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
     0.0
     """
     names, overhead = [recording.ids[ego] for ego in track.egos], recording.v2x.overhead
-    return of_drive(names, len(track.t) * recording.dt, track.sent_bytes, track.received_bytes, message, overhead)
+    messages = np.isfinite(recording.velocity[0, :, track.egos, 0]).sum(axis=1) if message.per_neighbour else None
+    seconds, moved = len(track.t) * recording.dt, (track.sent_bytes, track.received_bytes)
+    return of_drive(names, seconds, *moved, message, overhead, messages)
 
 
 def break_even(training: Ledger, online: Ledger, kind: Kind = "payload", way: Way = "per receiver") -> float:
@@ -160,7 +162,13 @@ def break_even(training: Ledger, online: Ledger, kind: Kind = "payload", way: Wa
 
 
 def of_drive(
-    names: Sequence[str], seconds: npt.ArrayLike, sent: Floats, received: Floats, message: Message, overhead: int
+    names: Sequence[str],
+    seconds: npt.ArrayLike,
+    sent: Floats,
+    received: Floats,
+    message: Message,
+    overhead: int,
+    messages: npt.NDArray[np.integer] | None = None,
 ) -> Ledger:
     """The ledger of online cooperation from bytes on air.
 
@@ -171,13 +179,10 @@ def of_drive(
         received: (R, V) bytes.
         message: that they carry.
         overhead: bytes per message on air.
-
-    Raises:
-        InputError: as in `of_track`.
+        messages: (V,) how many on either way have it, where they have no one size.
     """
-    if message.per_neighbour and overhead:
-        raise InputError("message", message.name, "must have one size under an overhead", "Use overhead = 0.")
     size, moved = message.size(overhead), np.zeros((2, 2, 2, len(received), len(names)))
     for k, on_air in enumerate((sent, received)):
-        moved[k, 1] = on_air * (message.size() / size if size else 1.0), on_air
+        payload = on_air * (message.size() / size if size else 1.0)
+        moved[k, 1] = payload if messages is None else on_air - overhead * messages, on_air
     return Ledger(tuple(names), np.broadcast_to(np.asarray(seconds, float), len(names)), moved[0], moved[1])

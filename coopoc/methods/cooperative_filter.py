@@ -110,7 +110,8 @@ class CooperativeFilter:
         def sent() -> Sent:
             if self.robust:
                 return broadcasts(recording, known, columns, guards)
-            return Sent(*(np.moveaxis(a, 2, 0).copy() for a in (recording.gnss, assumed.fixes)), NOTHING)
+            fixes, variance = (np.moveaxis(a, 2, 0).copy() for a in (recording.gnss, assumed.fixes))
+            return Sent(fixes, variance, NOTHING)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
             seen = measurements(recording, ego, box)

@@ -41,11 +41,6 @@ def part(function: Function) -> Function:
     return _within(function, {"contract"})
 
 
-def copied(function: Function) -> Function:
-    """A part that is copied into its few callers, whose many arrays a call would hand over number by number."""
-    return _within(function, {"contract"}, forceinline=True)
-
-
 def summing(function: Function) -> Function:
     """A part that adds many terms: it may do so in several sums, in one way for all arguments."""
     return _within(function, {"contract", "reassoc"})

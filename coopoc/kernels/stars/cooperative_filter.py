@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ..compiling.compile import compiled, copied
+from ..compiling.compile import compiled, inside
 from ..compiling.small import apply, negate, store
 from ..motion import process_variance
 from .cooperative_members import join, leave, place, predict, predict_member, steady
@@ -121,7 +121,7 @@ def run_filter(
     return x, cov, neighbours, fixes, notes
 
 
-@copied
+@inside
 def write(
     f: Filter,
     guards: Guards,
@@ -152,7 +152,7 @@ def write(
         notes[run, first + i, 4] = f.status[who[i], TRUSTED]
 
 
-@copied
+@inside
 def gather_own(own: Floats, seen: Measurements, assumed: Assumptions, white: Floats, run: int, t: int) -> None:
     """The ego's fix and motion at a step."""
     u, r = seen.velocity[run, t, seen.ego], three_of(assumed.fixes, run, t, seen.ego)
@@ -163,7 +163,7 @@ def gather_own(own: Floats, seen: Measurements, assumed: Assumptions, white: Flo
         own[MOTION + c], own[MOTION_VARIANCE + c] = seen.dt * u[c], q[c] + more[c]
 
 
-@copied
+@inside
 def gather_neighbour(
     rows: Floats, seen: Measurements, assumed: Assumptions, sent: Sent, run: int, t: int, link: int, i: int
 ) -> None:
@@ -186,7 +186,7 @@ def gather_neighbour(
         rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c] + more[c], fix[c]
 
 
-@copied
+@inside
 def step(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Predict and update.
 
@@ -235,7 +235,7 @@ def step(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, veh
     f.step[0] += 1
 
 
-@copied
+@inside
 def nearest_first(f: Filter) -> int:
     """Sort the members by their distance; how many there are."""
     members = 0
@@ -250,7 +250,7 @@ def nearest_first(f: Filter) -> int:
     return members
 
 
-@copied
+@inside
 def gap2(f: Filter, k: int) -> float:
     """Squared distance of a member, m^2."""
     total = 0.0
@@ -259,7 +259,7 @@ def gap2(f: Filter, k: int) -> float:
     return total
 
 
-@copied
+@inside
 def add_fix(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
     """The ego's fix: its position, the error of its receiver, and the one that all share.
 
@@ -282,7 +282,7 @@ def add_fix(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
     f.hits[0, 0] = f.hits[0, 0] + 1 if guards.fix_gate > 0.0 and q > guards.fix_gate else 0
 
 
-@copied
+@inside
 def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> None:
     """The relative measurements: linear at the prediction, then at that solution.
 
@@ -319,7 +319,7 @@ def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int)
                     f.hits[k, c] = f.hits[k, c] + 1 if guards.gate > 0.0 and h.q[c] > guards.gate else 0
 
 
-@copied
+@inside
 def first_pass(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> int:
     """Update `trial` by the measurements linear at the prediction; how many members are beyond a gate."""
     g, h, wrong = f.trial, f.h, 0
@@ -337,7 +337,7 @@ def first_pass(f: Filter, known: Model, guards: Guards, rows: Floats, members: i
     return wrong
 
 
-@copied
+@inside
 def relate(f: Filter, known: Model, guards: Guards, rows: Floats, k: int, exact: int) -> bool:
     """Rows of range, azimuth and inclination of member k, in metres; False if its geometry is not known.
 

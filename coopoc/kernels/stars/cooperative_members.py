@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from ...arrays import Floats, Ints
-from ..compiling.compile import copied, part
+from ..compiling.compile import inside, part
 from ..dead_reckoning import ROUNDING
 from .cooperative_state import (
     AGE,
@@ -52,7 +52,7 @@ from .gaussian import (
 )
 
 
-@copied
+@inside
 def leave(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Find each member's row; marginalise out those that have none, and remember the error of their fixes.
 
@@ -81,7 +81,7 @@ def leave(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, ve
         f.slot[j], f.vehicle[k] = ABSENT, ABSENT
 
 
-@copied
+@inside
 def contradicted(f: Filter, guards: Guards, k: int) -> bool:
     """Whether the ego's measurements of a member have contradicted its position for too long: two components three
     times in a row, or one as often as it agreed before, at most `patience` times."""
@@ -94,7 +94,7 @@ def contradicted(f: Filter, guards: Guards, k: int) -> bool:
     return bool(several >= 2)
 
 
-@copied
+@inside
 def predict(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
     """Move the ego; errors that last decay, errors of which nothing is known change."""
     g, first = f.g, 3 * f.g.block[0, PLACE]
@@ -115,7 +115,7 @@ def predict(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
         widen(g, i, known.common * fades)
 
 
-@copied
+@inside
 def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, variance: int, unit: float) -> None:
     """Put vehicle j's last velocity in place of one that no vehicle can have reached since.
 
@@ -143,7 +143,7 @@ def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, varianc
         status[PACE + c], status[PACE + 3 + c] = unit * given[first + c], given[variance + c]
 
 
-@copied
+@inside
 def predict_member(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> None:
     """Move a member by the velocity in the state, if its messages are late, else by that of its newest message.
 
@@ -173,7 +173,7 @@ def predict_member(f: Filter, known: Model, guards: Guards, rows: Floats, k: int
         g.p[first + c, first + c] += often * (rows[row, STEP + c] + changed)
 
 
-@copied
+@inside
 def late(f: Filter, guards: Guards, rows: Floats, k: int) -> bool:
     """Whether a member has a velocity in the state, or its newest message is not of now."""
     age = rows[f.row[k], AGE]
@@ -223,7 +223,7 @@ def join(f: Filter, known: Model, guards: Guards, rows: Floats, vehicle: int, ro
         insert(g, k, ERROR, known.own)
 
 
-@copied
+@inside
 def place(f: Filter, rows: Floats, k: int) -> None:
     """Put a vague member where its first message does: what is measured of it is linear there, not where it was assumed
     to be until now."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 
 from ...arrays import Floats
-from ..compiling.compile import copied, part
+from ..compiling.compile import inside, part
 from .cooperative_state import (
     AGE,
     COUNT,
@@ -55,7 +55,7 @@ CLIP = 12.0
 """Largest squared Mahalanobis distance of an innovation in a mean."""
 
 
-@copied
+@inside
 def fix_terms(f: Filter, k: int) -> None:
     """Position of member k, error of its fixes, and the one that all share."""
     g, n = f.g, 1
@@ -67,7 +67,7 @@ def fix_terms(f: Filter, k: int) -> None:
         term(f.h, n, g.block[0, COMMON], 1.0)
 
 
-@copied
+@inside
 def receive(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> None:
     """Use the newest message of member k, if it has not been used."""
     g, j, row = f.g, f.vehicle[k], f.row[k]
@@ -94,7 +94,7 @@ def receive(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> No
         clone_position(f, k, back, changed)
 
 
-@copied
+@inside
 def use_fix(f: Filter, known: Model, guards: Guards, k: int, again: bool, q: float) -> float:
     """Update by the rows of a vehicle's fix, unless its receiver errs otherwise than is assumed; squared Mahalanobis
     distance.
@@ -125,7 +125,7 @@ def use_fix(f: Filter, known: Model, guards: Guards, k: int, again: bool, q: flo
     return q
 
 
-@copied
+@inside
 def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone: bool, before: bool) -> bool:
     """Rows of what the message of member k says of its position when it was sent.
 
@@ -165,7 +165,7 @@ def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone
     return believed
 
 
-@copied
+@inside
 def steps_between(f: Filter, rows: Floats, k: int) -> float:
     """Steps between the last two messages of member k."""
     since = f.clock[0] - rows[f.row[k], AGE] - f.status[f.vehicle[k], USED]
@@ -240,7 +240,7 @@ def clone_position(f: Filter, k: int, back: float, changed: float) -> None:
     widen(g, clone, changed + JITTER)
 
 
-@copied
+@inside
 def wrong_on_average(f: Filter, known: Model, guards: Guards, k: int, q: float) -> bool:
     """Whether the mean of a vehicle's innovations, each clipped, is likelier with another error of its fixes than is
     assumed; or, where that error is being estimated, with the last one alone."""

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ..compiling.compile import copied, part, storage
+from ..compiling.compile import inside, part, storage
 from ..compiling.vectors import LANES, put, take
 from ..dead_reckoning import ROUNDING
 from .gaussian import (
@@ -284,7 +284,7 @@ def start(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, co
     return True
 
 
-@copied
+@inside
 def lost(f: Filter, guards: Guards) -> bool:
     """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either all fixes but the first
     contradict it, or its receiver is not trusted any more, for long or beside others that are not."""
@@ -360,7 +360,7 @@ def across(rows: Floats, row: int, c: int) -> float:
     return float(d * ci if c == 2 else d * si * (ca if c == 0 else sa))
 
 
-@copied
+@inside
 def unused(f: Filter, rows: Floats, k: int) -> bool:
     """Whether member k has sent a message with a position since the last one that was used."""
     row = f.row[k]
@@ -368,7 +368,7 @@ def unused(f: Filter, rows: Floats, k: int) -> bool:
     return bool(rows[row, AGE] >= 0.0 and new and math.isfinite(rows[row, SOLO]))
 
 
-@copied
+@inside
 def measured_whole(rows: Floats, row: int) -> bool:
     """Whether range and both angles were measured."""
     angles = (rows[row, 1] != 0.0 or rows[row, 2] != 0.0) and (rows[row, 3] != 0.0 or rows[row, 4] != 0.0)

@@ -77,10 +77,10 @@ def gate_star(star: Star, gates: Gates, state: Floats, known: Floats, least: flo
     store(gates.state, 0, (*ego[:12], hits))
     for k in range(1, n):
         at, seen, memory = load(state, k, ROW), load(star.relative, k, RELATIVE), load(gates.state, k, STATE)
-        o = 0.0 * at[0]
-        std = seen[5:]
+        o, std = 0.0 * at[0], seen[5:]
         if incomplete(seen):
-            std = choose_each(load(known, k, (0.0,))[0] - 0.5, std, (o + math.inf, o + math.inf, o + math.inf))
+            far = o + math.inf
+            std = choose_each(load(known, k, (0.0,))[0] - 0.5, std, (far, far, far))
         cov, moved, factor, three = gate_components(subtract(at, origin), memory[:9], seen, std, memory[9:12], least)
         store(gates.state, k, (*cov, *three, o))
         store(star.relative, k, inflated(seen, factor))

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..compiling.compile import copied, part, storage
+from ..compiling.compile import inside, part, storage
 from ..compiling.small import (
     inverse,
     less_applied,
@@ -185,7 +185,7 @@ def copy_gaussian(source: Gaussian, target: Gaussian) -> None:
         target.block[i // KINDS, i % KINDS] = source.block[i // KINDS, i % KINDS]
 
 
-@copied
+@inside
 def copy_moments(source: Gaussian, target: Gaussian) -> None:
     """Copy x and P into arrays of the same size."""
     wide, lanes = len(source.x) // LANES, (3 * source.vectors[0] + LANES - 1) // LANES
@@ -208,14 +208,14 @@ def shift(g: Gaussian, i: int, j: int, factor: float) -> None:
             g.p[k, i + c] += factor * g.p[k, j + c]
 
 
-@copied
+@inside
 def widen(g: Gaussian, i: int, variance: float) -> None:
     """Add white noise of that variance to a vector."""
     for c in range(3):
         g.p[i + c, i + c] += variance
 
 
-@copied
+@inside
 def term(h: Rows, k: int, block: int, weight: float) -> None:
     """Let the k-th term of the rows be `weight` times a vector, and the last one."""
     h.block[k], o = block, 0.0
@@ -223,13 +223,13 @@ def term(h: Rows, k: int, block: int, weight: float) -> None:
     h.terms[0] = k + 1
 
 
-@copied
+@inside
 def expect(h: Rows, c: int, z: float, variance: float) -> None:
     """Row c measured z with that variance, and has no gate of its own."""
     h.z[c], h.variance[c], h.used[c], h.gate[c] = z, variance, True, 0.0
 
 
-@copied
+@inside
 def weight(q: float, gate: float) -> float:
     """Share of its information that a number keeps: 1 / (inflation of the innovation's covariance)."""
     if gate == 0.0 or not q > gate:
@@ -243,7 +243,7 @@ def update(g: Gaussian, h: Rows, gate: float) -> None:
     correct(g, h, weight(innovate(g, h), gate))
 
 
-@copied
+@inside
 def project(g: Gaussian, h: Rows) -> None:
     """Innovations z - H x, H P in place of `gain`, and H P H^T."""
     gain, wide, third = h.gain, len(g.x) // LANES, len(g.x) // 3
@@ -268,7 +268,7 @@ def project(g: Gaussian, h: Rows) -> None:
     store(h.cov, 0, (*one, *two, *three))
 
 
-@copied
+@inside
 def innovate(g: Gaussian, h: Rows) -> float:
     """Decorrelate each row from those before it, and gate it; squared Mahalanobis distance of the three.
 
@@ -293,7 +293,7 @@ def innovate(g: Gaussian, h: Rows) -> float:
     return x * x + y * y + z * z
 
 
-@copied
+@inside
 def whitened(h: Rows, c: int, innovation: float, variance: float) -> tuple[float, float]:
     """Innovation of row c over its gated standard deviation, and 1 over that; 0 where nothing was measured."""
     if not h.used[c]:
@@ -304,7 +304,7 @@ def whitened(h: Rows, c: int, innovation: float, variance: float) -> tuple[float
     return innovation * scale, scale
 
 
-@copied
+@inside
 def correct(g: Gaussian, h: Rows, share: float) -> None:
     """P <- P - share U U^T: the innovation's covariance is that of `innovate` over `share`."""
     p, gain, wide, third = g.p, h.gain, len(g.x) // LANES, len(g.x) // 3

@@ -1,9 +1,11 @@
-"""Gaussian of a star in information form: prediction, fixes and relative measurements in 3 x 3 blocks.
+"""Gaussian of a star in information form: prediction, fixes, relative measurements and elimination in 3 x 3 blocks.
 
 The position of member k is tuple k; its block is k - 1, and the ego's is the last, so that elimination
 ends with the ego's covariance. A filter calls, step by step, `gather` of `coopoc.kernels.stars.messages`,
-`predict_state`, `predict` of `coopoc.kernels.stars.elimination`, `rearrange`, its own fixes, `add_relative`, and
-`solve`.
+`predict_state`, `predict`, `rearrange`, its own fixes, `add_relative`, and `solve`.
+
+A matrix of n x n blocks stands in memory as `compiling.small` keeps it: block (i, j), j >= i, is tuple number
+i stride + j; those below the diagonal are never read.
 """
 
 from __future__ import annotations
@@ -21,7 +23,14 @@ from ..compiling.small import (
     apply,
     choose_each,
     from_upper,
+    inverse,
+    less_applied,
+    less_transposed_applied,
+    less_transposed_product,
     load,
+    minus_apply,
+    minus_product,
+    mirrored,
     negate,
     plus_applied,
     scale,
@@ -31,7 +40,6 @@ from ..compiling.small import (
     zeros,
 )
 from ..compiling.vectors import LANES, choose
-from .elimination import eliminate, substitute
 from .messages import BLOCK, MOVED, NEW, POSITION, PROCESS, RELATIVE, ROW, Star, clear
 from .relative import Numbers, completed, converted, exact, incomplete, vector
 
@@ -70,6 +78,70 @@ def joint_within(most: int) -> Joint:
     """Room for `most` members."""
     a, b = np.zeros((4, 3 * most, LANES)), np.zeros((2, 9 * most * most, LANES))
     return Joint(a[0], b[0], b[1], a[1], a[2], a[3], np.zeros((18 * most, LANES)), most)
+
+
+@inner
+def eliminate(source: Floats, a: Floats, eta: Floats, n: int, stride: int, memory: Floats) -> Numbers:
+    """Factorise A = R^T D R: D^-1 R in `a` (which may be `source`), minus the inverse pivots on its diagonal, and
+    D^-1 R^-T eta in place of eta.
+
+    Returns the last of them, -Cov of the last block. The next pivot is inverted as soon as its row is ready, while the
+    rows below are still worked on. `memory` holds n blocks.
+    """
+    p: Numbers = negate(inverse(load(source, 0, BLOCK)))
+    for k in range(n):
+        first = k * stride
+        v = minus_apply(p, load(eta, k, ROW))
+        store(eta, k, v)
+        store(a, first + k, p)
+        for j in range(k + 1, n):
+            one = load(source, first + j, BLOCK)
+            store(memory, j, one)
+            store(a, first + j, minus_product(p, one))
+        for i in range(k + 1, n):
+            left = load(memory, i, BLOCK)
+            for j in range(i, n):
+                at = i * stride + j
+                store(a, at, less_transposed_product(load(source, at, BLOCK), left, load(a, first + j, BLOCK)))
+            store(eta, i, less_transposed_applied(load(eta, i, ROW), left, v))
+            if i == k + 1:
+                p = negate(inverse(load(a, i * stride + i, BLOCK)))
+        source = a
+    return p
+
+
+@inner
+def substitute(factor: Floats, x: Floats, n: int, stride: int) -> None:
+    """Solution A^-1 eta in place of what `eliminate` left in eta."""
+    for k in range(n - 1, -1, -1):
+        v = load(x, k, ROW)
+        for j in range(k + 1, n):
+            v = less_applied(v, load(factor, k * stride + j, BLOCK), load(x, j, ROW))
+        store(x, k, v)
+
+
+@inner
+def predict(a: Floats, n: int, stride: int, process: Floats, memory: Floats) -> None:
+    """Information (A^-1 + Q)^-1 in place of A, Q^-1 = diag(process): with infinite process noise (0) a block is
+    forgotten, one after the other as a rank-3 update. `memory` holds 2 n blocks.
+
+    With E_k the columns of block k and W_k = Q_k^-1, A <- A - A E_k (E_k^T A E_k + W_k)^-1 E_k^T A.
+    """
+    for k in range(n):
+        for i in range(k):
+            store(memory, n + i, transpose(load(a, i * stride + k, BLOCK)))
+        for j in range(k + 1, n):
+            store(memory, n + j, load(a, k * stride + j, BLOCK))
+        own = mirrored(load(a, k * stride + k, BLOCK))
+        store(memory, n + k, own)
+        pivot = negate(inverse(add_diagonal(own, load(process, k, ROW))))
+        for j in range(n):
+            store(memory, j, minus_product(pivot, load(memory, n + j, BLOCK)))
+        for i in range(n):
+            left = load(memory, n + i, BLOCK)
+            for j in range(i, n):
+                at = i * stride + j
+                store(a, at, less_transposed_product(load(a, at, BLOCK), left, load(memory, j, BLOCK)))
 
 
 @inside
@@ -141,19 +213,13 @@ def placed(joint: Joint, k: int, seen: Numbers) -> float:
     return share
 
 
-@inside
-def stayed(star: Star, n: int, old: int) -> bool:
-    """True if every member stands where it stood."""
-    moved = int(n != old)
-    for k in range(n):
-        moved += star.previous[k] != k
-    return moved == 0
-
-
 @inner
 def rearrange(star: Star, joint: Joint, n: int, old: int, prior: Numbers) -> None:
     """Information in the order of the new star; that of a member that joins is diagonal, the tuple `prior`."""
-    if stayed(star, n, old):
+    moved = int(n != old)
+    for k in range(n):
+        moved += star.previous[k] != k
+    if moved == 0:
         return
     stride = joint.stride
     o = 0.0 * load(joint.information, 0, ROW)[0]
@@ -192,7 +258,11 @@ def relative_information(star: Star, joint: Joint, k: int, std: Floats, least: f
     x, y, z = gap
     lacking = incomplete(seen)
     if len(std) or lacking:
-        weight = converted(x, y, z, deviations(seen, gap, len(std) == 0), least)
+        deviations = seen[5:]
+        if len(std) == 0:  # 1 m along each
+            flat2 = x * x + y * y
+            deviations = seen[5], seen[6] / math.sqrt(flat2), seen[7] / math.sqrt(flat2 + z * z)
+        weight = converted(x, y, z, deviations, least)
         if lacking:
             weight = scale(weight, placed(joint, k, seen))
     else:
@@ -204,22 +274,13 @@ def relative_information(star: Star, joint: Joint, k: int, std: Floats, least: f
 
 
 @inside
-def deviations(seen: Numbers, gap: Numbers, unit: bool) -> Numbers:
-    """Standard deviations of range m and angles rad; of a unit covariance 1 m along each."""
-    if unit:
-        flat2 = gap[0] * gap[0] + gap[1] * gap[1]
-        return seen[5], seen[6] / math.sqrt(flat2), seen[7] / math.sqrt(flat2 + gap[2] * gap[2])
-    return seen[5], seen[6], seen[7]
-
-
-@inside
 def exact_information(star: Star, joint: Joint, k: int, n: int, least: float) -> tuple[Numbers, Numbers]:
     """The same of range and angles, linear at the state moved by `move`, as seen from the state."""
     seen = load(star.relative, k, RELATIVE)
     ahead = subtract(load(joint.move, k - 1, ROW), load(joint.move, n - 1, ROW))
     gap = subtract(load(joint.state, k, ROW), load(joint.state, 0, ROW))
     x, y, z = add(gap, ahead)
-    found = exact(x, y, z, seen, (seen[5], seen[6], seen[7]), least)
+    found = exact(x, y, z, seen, seen[5:], least)
     if incomplete(seen):
         found = scale(found, placed(joint, k, seen))
     weight = from_upper(found[:6])

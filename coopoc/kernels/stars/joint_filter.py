@@ -8,7 +8,6 @@ from __future__ import annotations
 from ..compiling.compile import as_written, inner
 from ..compiling.small import add, add_diagonal, load, negate, store, subtract, times
 from ..compiling.vectors import LANES
-from .elimination import predict
 from .gated import Gates, carry, gate_star, gates_within, set_ego
 from .joint import (
     Joint,
@@ -20,6 +19,7 @@ from .joint import (
     move,
     place_on_broadcast,
     placed,
+    predict,
     predict_state,
     rearrange,
     relative_information,

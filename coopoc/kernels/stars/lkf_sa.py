@@ -5,8 +5,7 @@ from __future__ import annotations
 from ..compiling.compile import as_written, inner, inside
 from ..compiling.small import add, add_diagonal, load, negate, scale, store, subtract, zeros
 from ..compiling.vectors import LANES, choose
-from .elimination import predict
-from .joint import Joint, add_relative, joint_within, move, predict_state, rearrange, solve
+from .joint import Joint, add_relative, joint_within, move, predict, predict_state, rearrange, solve
 from .joint_filter import add_fixes, write
 from .messages import (
     BLOCK,

@@ -33,7 +33,6 @@ FIX_GROWTH, ESTIMATE_GROWTH = (1.0, 0.0), (1.0, 2.0)
 with one velocity makes its error age times; an estimate has made that error once before, fully correlated."""
 NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
-Three: TypeAlias = tuple[float, float, float]
 Estimates: TypeAlias = tuple[Floats, Floats, Floats]
 """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
 ROW, BLOCK, RELATIVE = (0.0,) * 3, (0.0,) * 9, (0.0,) * 8
@@ -197,7 +196,7 @@ def index_of(member: int, members: Ints, count: int) -> int:
 @inside
 def receive(star: Star, seen: Measurements, known: Assumptions, run: int, t: int, link: int, k: int, lane: int) -> None:
     """Copy the last message of member k in one run: velocity, process noise, position, its variance, and its status."""
-    previous, status, at = star.previous[k], 5 * k, 12 * k
+    previous, status = star.previous[k], 5 * k
     before = 5 * max(previous, 0)
     sent = t if k == 0 else seen.newest[run, link]
     when = sent if sent >= 0 else t
@@ -207,15 +206,15 @@ def receive(star: Star, seen: Measurements, known: Assumptions, run: int, t: int
     star.status[status + AGE, lane] = t - when
     star.status[status + HELD, lane] = 1.0 if sent >= 0 else 0.0
     j = star.member[k]
-    put_lane(star.motion, at, lane, three_of(seen.velocity, run, when, j))
-    put_lane(star.motion, at + 3, lane, three_of(known.process, run, when, j))
-    fresh = k == 0 or seen.fresh[run, link]
-    x, y, z = three_of(seen.gnss, run, when, j) if k == 0 else three_of(seen.broadcast, run, when, j)
-    there = math.isfinite(x + y + z)
-    put_lane(star.motion, at + 6, lane, (x, y, z) if there else (0.0, 0.0, 0.0))
-    variance = three_of(known.fixes, run, when, j) if k == 0 else three_of(known.broadcast, run, when, j)
-    put_lane(star.motion, at + 9, lane, variance if there else (NOWHERE, NOWHERE, NOWHERE))
-    star.status[status + NEW, lane] = 1.0 if fresh and there else 0.0
+    at, variance = three_of(seen.broadcast, run, when, j), three_of(known.broadcast, run, when, j)
+    if k == 0:
+        at, variance = three_of(seen.gnss, run, when, j), three_of(known.fixes, run, when, j)
+    there = math.isfinite(at[0] + at[1] + at[2])
+    if not there:
+        at, variance = ROW, (NOWHERE, NOWHERE, NOWHERE)
+    velocity, process = three_of(seen.velocity, run, when, j), three_of(known.process, run, when, j)
+    put_lane(star.motion, 12 * k, lane, (*velocity, *process, *at, *variance))
+    star.status[status + NEW, lane] = 1.0 if there and (k == 0 or seen.fresh[run, link]) else 0.0
 
 
 @inside
@@ -244,29 +243,25 @@ def interpret(star: Star, known: Assumptions, k: int, dt: float) -> None:
 def measured(relative: Floats, seen: Floats, std: Floats, k: int, lane: int) -> None:
     """Copy the measurement of member k, of `components`; what is missing points east, its deviation infinite."""
     d, sa, ca, si, ci = seen[0], seen[1], seen[2], seen[3], seen[4]
-    at, unit = 8 * k, len(std) == 0
-    has_azimuth, has_inclination = sa != 0.0 or ca != 0.0, si != 0.0 or ci != 0.0
-    relative[at, lane] = max(d, 0.0)
-    range_std, azimuth_std, inclination_std = (1.0, 1.0, 1.0) if unit else (std[0], std[1], std[2])
-    azimuth = sa, ca if has_azimuth else 1.0, si if has_inclination else 1.0
-    put_lane(relative, at + 1, lane, azimuth)
-    relative[at + 4, lane] = ci
-    deviations = (
-        range_std if d >= 0.0 else math.inf,
-        azimuth_std if has_azimuth else math.inf,
-        inclination_std if has_inclination else math.inf,
-    )
-    put_lane(relative, at + 5, lane, deviations)
+    a, b, c = (std[0], std[1], std[2]) if len(std) else (1.0, 1.0, 1.0)
+    if d < 0.0:
+        d, a = 0.0, math.inf
+    if sa == 0.0 and ca == 0.0:
+        ca, b = 1.0, math.inf
+    if si == 0.0 and ci == 0.0:
+        si, c = 1.0, math.inf
+    put_lane(relative, 8 * k, lane, (d, sa, ca, si, ci, a, b, c))
 
 
 @inside
-def three_of(values: Floats, run: int, t: int, member: int) -> Three:
+def three_of(values: Floats, run: int, t: int, member: int) -> tuple[float, float, float]:
     """Three of what is broadcastable to (R, T, N, 3)."""
     i, j, k = min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(member, values.shape[2] - 1)
     return values[i, j, k, 0], values[i, j, k, 1], values[i, j, k, 2]
 
 
 @inside
-def put_lane(memory: Floats, at: int, lane: int, values: Three) -> None:
-    """Write three numbers of one run."""
-    memory[at, lane], memory[at + 1, lane], memory[at + 2, lane] = values
+def put_lane(memory: Floats, at: int, lane: int, values: tuple[float, ...]) -> None:
+    """Write numbers of one run."""
+    for i in range(len(values)):
+        memory[at + i, lane] = values[i]

@@ -38,7 +38,7 @@ from ..compiling.small import (
     zeros,
 )
 from ..compiling.vectors import LANES, take
-from ..stars.elimination import eliminate, substitute
+from ..stars.joint import eliminate, substitute
 from ..stars.messages import BLOCK, ROW
 from .window_layout import Window, count_of, fix_gap, motion, row_of
 

@@ -6,6 +6,7 @@ the next one. LANES runs go side by side.
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple, cast
 
 import numpy as np
@@ -16,7 +17,9 @@ from ..compiling.compile import as_written, inner, inside
 from ..compiling.small import (
     add,
     add_diagonal,
+    apply,
     choose_each,
+    from_upper,
     load,
     negate,
     plus_applied,
@@ -27,10 +30,8 @@ from ..compiling.small import (
     zeros,
 )
 from ..compiling.vectors import LANES, choose, put, take
-from ..stars.edges import AT_GAP, EXACT, edge
-from ..stars.elimination import predict
 from ..stars.gated import Gates, carry, gate_position, gate_star, gates_within, set_ego
-from ..stars.joint import Joint, add_relative, block_of, joint_within, rearrange, solve
+from ..stars.joint import Joint, add_relative, block_of, joint_within, predict, rearrange, solve
 from ..stars.messages import (
     BLOCK,
     MOVED,
@@ -48,7 +49,7 @@ from ..stars.messages import (
     receive,
     star_within,
 )
-from ..stars.relative import completed, vector
+from ..stars.relative import Numbers, completed, converted, exact, vector
 from .chains import System, advance, gap_of, gauss_newton, new_system
 from .window_layout import (
     Window,
@@ -61,6 +62,11 @@ from .window_layout import (
     row_of,
     star_at,
 )
+
+EXACT, AT_GAP = np.arange(2)
+"""Linear in range and angles at the present points; converted to a vector, weighted by the geometry of the points,
+which must not depend on the measurement. NumPy's integers: for each constant of Python's numba would compile a function
+once more."""
 
 
 class Settings(NamedTuple):
@@ -206,6 +212,38 @@ def put_edge(window: Window, known: Assumptions, ego: int, row: int, gap: Any, h
     store(window.edge, row, choose_each(active, information, load(window.edge, row, BLOCK)))
     store(window.eta, row, choose_each(active, eta, load(window.eta, row, ROW)))
     store(window.base, row, choose_each(active, gap, load(window.base, row, ROW)))
+
+
+@inner
+def edge(gap: Numbers, z: Numbers, std: Floats, least: float, how: int) -> tuple[Numbers, Numbers]:
+    """E = J^T W J and eta = J^T W (z - h) at the vector `gap` m; without standard deviations E is the unit matrix.
+
+    Args:
+        gap: from the ego to the neighbour.
+        z: the measurement.
+        std: (3,) m, rad, rad, of no length for unit matrices.
+        least: m; the angles of a measurement that is shorter have their standard deviations inflated.
+        how: EXACT or AT_GAP.
+    """
+    z = z if how == AT_GAP else inflated(z, least)
+    x, y, up = gap
+    o, whole = 0.0 * z[0], 1e300 - (z[5] + z[6] + z[7])
+    if len(std) == 0:
+        there = choose(whole, o + 1.0, o)
+        return from_upper((there, o, o, there, o, there)), scale(subtract(vector(z), gap), there)
+    if how == EXACT:
+        e = exact(x, y, up, z, z[5:], 0.0)
+        return from_upper(e[:6]), e[6:]
+    information = from_upper(converted(x, y, up, z[5:], least))
+    return information, apply(information, subtract(vector(completed(z, gap)), gap))
+
+
+@inner
+def inflated(z: Numbers, least: float) -> Numbers:
+    """The measurement, its angles' standard deviations inflated by least / range, up to half a turn."""
+    wide = choose(1e300 - z[5], max(least / max(z[0], 1e-300), 1.0), 0.0 * z[0] + 1.0)
+    s1, s2 = -max(-(wide * z[6]), -math.pi), -max(-(wide * z[7]), -math.pi)
+    return z[0], z[1], z[2], z[3], z[4], z[5], max(s1, z[6]), max(s2, z[7])
 
 
 @inner
