@@ -145,16 +145,6 @@ SHARP = 0.1
 """m, of landmarks beside a line, below which ranges leave the side open."""
 
 
-def _at_ranges(centres: Floats, ranges: Floats) -> Floats:
-    """(A, 3) m, points at these ranges (n,) from centres (A, n, 3), in the plane: the difference of two squared ranges
-    is linear in the point."""
-    middle = centres.mean(axis=1, keepdims=True)
-    square = np.square(centres[..., :2]).sum(axis=-1) - ranges**2
-    left, right = 2.0 * (centres - middle)[..., :2], square - square.mean(axis=1, keepdims=True)
-    planar = (np.linalg.pinv(left) @ right[..., None])[..., 0]
-    return np.column_stack([planar, middle[:, 0, 2]])
-
-
 def _hypotheses(recording: Recording, run: int, column: int, links: Ints, known: Floats, angles: Floats) -> Floats:
     """(headings, 4) poses at the first step that the first fix, or what is seen first, leaves for each heading; `known`
     (L, 3) m are the places of what the links measure."""
@@ -171,11 +161,14 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, known:
     if not len(fixes) and not len(seen):
         ranged = np.flatnonzero(np.isfinite(relative[:, 0]))
         first = ranged[np.unique(known[ranged], axis=0, return_index=True)[1]]
-        apart = known[first] - known[first].mean(axis=0)
-        if np.linalg.matrix_rank(apart[:, :2], SHARP) > 1:
-            moved = np.broadcast_to(way[recording.links.step[links[first]]], (len(angles), len(first), 3))
-            centres = known[first] - turned(moved, angles[:, None])
-            return np.column_stack([_at_ranges(centres, relative[first, 0]), angles])
+        steps = recording.links.step[links[first]]
+        moved = turned(np.broadcast_to(way[steps], (len(angles), len(steps), 3)), angles[:, None])
+        centres = known[first] - moved
+        apart = centres - centres.mean(axis=1, keepdims=True)
+        if np.linalg.matrix_rank(apart[0, :, :2], SHARP) > 1:  # the difference of two squared ranges is linear
+            square = np.square(centres[..., :2]).sum(axis=-1) - relative[first, 0] ** 2
+            place = 0.5 * np.linalg.pinv(apart[..., :2]) @ square[..., None]
+            return np.column_stack([place[..., 0], centres[..., 2].mean(axis=1), angles])
         given = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
         allowed = (
             "must hold a fix, or a range and bearing of a landmark or of a vehicle whose pose is found, or three ranges"
