@@ -164,8 +164,8 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, known:
         steps = recording.links.step[links[first]]
         moved = turned(np.broadcast_to(way[steps], (len(angles), len(steps), 3)), angles[:, None])
         centres = known[first] - moved
-        apart = centres - centres.mean(axis=1, keepdims=True)
-        if np.linalg.matrix_rank(apart[0, :, :2], SHARP) > 1:  # the difference of two squared ranges is linear
+        apart = centres - centres.sum(axis=1, keepdims=True) / max(len(steps), 1)
+        if len(steps) and np.linalg.matrix_rank(apart[0, :, :2], SHARP) > 1:  # squared ranges differ linearly
             square = np.square(centres[..., :2]).sum(axis=-1) - relative[first, 0] ** 2
             place = 0.5 * np.linalg.pinv(apart[..., :2]) @ square[..., None]
             return np.column_stack([place[..., 0], centres[..., 2].mean(axis=1), angles])
