@@ -45,7 +45,7 @@ class Rival:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of one ego in one run."""
-        began, (column,) = time.perf_counter(), recording.columns(egos, missing=True)
+        began, (column,) = time.perf_counter(), recording.columns(egos)
         fixes, velocity = recording.gnss[0, :, column], recording.velocity[0, :, column]
         known, dt = NoiseModel.nominal(recording.sensors), recording.dt
         q = np.broadcast_to(known.process_variance(recording), recording.gnss.shape)[0, :, column]

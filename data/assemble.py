@@ -209,7 +209,8 @@ metres in a local frame. Give latitude and longitude to co.load_recording, which
         hint = "Give latitude and longitude to co.load_recording, which converts them, or pass any_scale=True."
         raise InputError(f"{file}: columns x, y", given, "look like degrees, must be metres in a local frame", hint)
     if speed > FASTEST:
-        hint = "Check the units (seconds, metres) and that no two vehicles share an id, or pass any_scale=True."
+        hint = "Check the units (t in s, of days as in spreadsheets scale=t:86400; positions in m) and that no two "
+        hint += "vehicles share an id, or pass any_scale=True."
         where, given = f"{file}: columns t, x, y, z", f"a typical speed of {speed:.4g} m/s"
         raise InputError(where, given, f"must be below {FASTEST:g} m/s", hint)
 

@@ -32,6 +32,9 @@ USUAL = {
     "vehicle": ("observer", "robot", "car", "agent", "sender", "vehicle_id", "robot_id", "id", "name"),
     "partner": ("neighbour", "neighbor", "to", "target", "subject", "other", "anchor", "receiver", "landmark"),
     "t": ("time", "timestamp", "stamp", "seconds", "datetime", "utc"),
+    "latitude": ("lat",),
+    "longitude": ("lon", "lng", "long"),
+    "height": ("alt", "altitude"),
 }
 """Headers that others give to the columns."""
 
@@ -261,4 +264,4 @@ def _too_wide(path: Path, row: int, cells: int, names: int) -> InputError:
 
 def _no_table(path: Path, given: str) -> InputError:
     allowed = "must be a table with a header and cells between commas, semicolons or tabs, or of Parquet"
-    return InputError(path.name, given, allowed, "Export it again as CSV, without empty rows and columns.")
+    return InputError(path.name, given, allowed, "Export it again as CSV in UTF-8, without empty rows and columns.")

@@ -74,7 +74,7 @@ class LearnedGain:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates of the egos, all runs at once; `notes` count the runs that diverged from the fixes."""
-        began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
+        began, columns = time.perf_counter(), check_recording(recording).columns(egos)
         x0, origin = self._x0(recording, columns), recording.gnss[:, :1, columns]
         with one_core(), torch.inference_mode():
             moved = self.model(*self._lanes(recording, columns), recording.dt).numpy().astype(np.float64)

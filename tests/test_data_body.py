@@ -176,6 +176,13 @@ def test_the_check_follows_the_fleet_and_finds_mirrored_bearings(tmp_path: Path,
     assert (tmp_path / "log-check.png").stat().st_size > 20_000
 
 
+@pytest.mark.parametrize(("frame", "hint"), [("world", "They look like bearings"), ("body", "Then name them bearing")])
+def test_bearings_that_are_called_azimuths_are_named(tmp_path: Path, frame: Any, hint: str) -> None:
+    log, _ = table(noise=1.0, compass=frame == "world")
+    log.replace({"kind": {"bearing": "azimuth"}}).to_csv(tmp_path / "log.csv", index=False)
+    assert hint in "\n".join(check_poses(co.read_log(tmp_path / "log.csv", frame=frame)).warnings)
+
+
 def test_the_check_scores_those_whose_truth_is_known(tmp_path: Path) -> None:
     folder = written(tmp_path / "log", noise=1.0)
     truth = table()[1]

@@ -71,9 +71,9 @@ FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
         lambda f: pd.concat([f, f[f["range"].notna()].assign(partner="anchor")]),
         r"\d+% of what was logged is not used, first of all \d+ relative measurements of members without a position",
     ),
-    "columns of no kind": (
-        lambda f: f.assign(id=f["vehicle"], course_deg=10.0),
-        r"log.csv: column id, Did you mean vehicle\?; log.csv: column course_deg, Did you mean \w+_deg\?",
+    "fixes far from the truth of who stands": (
+        lambda f: f.assign(**dict.fromkeys(["x", "y", "vx", "vy"], 0 * f["x"])),
+        r"car0: fixes lie \S+ m east and \S+ m north of the truth in the median. Has it another frame",
     ),
 }
 
@@ -152,14 +152,16 @@ def test_a_range_is_known_to_both_ends_and_used_between_steps(tmp_path: Path) ->
 
 
 def test_the_height_of_a_truth_above_another_surface_is_named(tmp_path: Path) -> None:
-    """Four drones with a file of fixes and one of their radio each; the truth is above the geoid, one is 0.8 m off."""
+    """Four drones with a folder each of fixes and of their radio; the truth is above the geoid, one is 0.8 m off."""
     fleet, log = bends(4, climb=20.0), tmp_path / "drones"
     log.mkdir()
     for seed, name in enumerate(fleet.ids):
         parts = [fixes(fleet, name, 0.5, 0.5, seed).assign(z_std=0.5), motion(fleet, name, 0.1, 0.05, seed)]
-        write(pd.concat(parts), log / f"{name}_fixes.csv")
         radio = [ranges(fleet, name, other, 0.2, 0.1, seed) for other in fleet.ids if other != name]
-        write(pd.concat(radio), log / f"{name}_radio.csv")
+        (log / name).mkdir()
+        write(pd.concat(parts).drop(columns="vehicle"), log / name / "gps.csv")
+        write(pd.concat(radio).drop(columns="vehicle"), log / name / "radio.csv")
+        (log / name / "._gps.csv").write_bytes(b"\x00\xff")
     every = [at(fleet, name, fleet.t[::5]) for name in fleet.ids]
     for up, message in (
         (0.0, ""),
@@ -177,18 +179,18 @@ def test_the_height_of_a_truth_above_another_surface_is_named(tmp_path: Path) ->
         assert ("above the truth" in text) == bool(up)
 
 
-@pytest.mark.parametrize("who", ["logged", "not logged"])
-def test_an_offset_of_the_ranges_of_one_is_named(tmp_path: Path, who: str) -> None:
+@pytest.mark.parametrize(("who", "offset"), [("logged", 0.8), ("not logged", 0.8), ("logged", 20.0)])
+def test_an_offset_of_the_ranges_of_one_is_named(tmp_path: Path, who: str, offset: float) -> None:
     fleet, log = bends(3), tmp_path / "log"
     log.mkdir()
     for seed, name in enumerate(fleet.ids):
         write(pd.concat([fixes(fleet, name, 0.2, 0.5, seed), motion(fleet, name, 0.1, 0.1, seed)]), log / f"{name}.csv")
         for other in fleet.ids[:seed]:
             frame = ranges(fleet, name, other, 0.2, 0.1, seed)
-            frame["range"] += 0.8 * (name == "car2")
+            frame["range"] += offset * (name == "car2")
             write(frame if who == "logged" else frame.drop(columns="range_std"), log / f"{name}_{other}.csv")
     text = said(read_log(log))
-    assert ("car0 and car2 by +0." in text and "car1 and car2 by +0." in text) == (who == "logged")
+    assert ("car0 and car2 by +" in text and "car1 and car2 by +" in text) == (who == "logged")
     assert "car0 and car1" not in text
 
 
@@ -221,8 +223,7 @@ def test_one_car_with_a_gap_and_columns_of_its_own(tmp_path: Path) -> None:
     assert (first, last, end) == (0, pytest.approx(600, abs=5), len(log.recording.t))
     assert again == pytest.approx(805, abs=5)  # with the first fix behind the gap
     text = said(log)
-    assert "column id, Did you mean vehicle?" in text
-    assert "course_deg, Did you mean compass_deg?" in text
+    assert "column id, Did you mean vehicle?; taxi.csv: column course_deg, Did you mean compass_deg?" in text
     truth = fixes(fleet, "car0", 1.0, 1e-9)[["t", "x", "y"]]
     (tmp_path / "log").mkdir()
     write(frame, tmp_path / "log" / "taxi.csv")

@@ -76,6 +76,8 @@ MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
     "a clock of an unknown vehicle": (GOOD, {"clock": {"bleu": 0.1}}, ""),
     "a misspelt option": (GOOD, {"dts": 0.1}, "option"),
     "steps longer than the log": (GOOD, {"dt": 5.0}, "dt"),
+    "one instant": ("t,vehicle,x,y\n3,red,0,0\n3,blue,9,0\n", {}, "log.csv: t"),
+    "headers that are short": ("t,vehicle,lat,lon,speed\n0,red,48,11,0\n1,red,48,11,0\n", {}, "fixes"),
 }
 
 
@@ -143,6 +145,10 @@ KEPT: dict[str, tuple[Callable[[str], str], str]] = {
     "a bearing of a vehicle that stands": (
         lambda text: text + "0.0,rsu,x,,5,1,\n0.0,rsu,y,,5,1,\n0.3,rsu,bearing,red,0.1,0.1,\n",
         "bearings at times without a heading",
+    ),
+    "odometry without a fix": (
+        lambda text: text + "0.1,rsu,vx,,1,0.1,\n",
+        "odometry and headings of vehicles without a position",
     ),
     "half a fix": (lambda text: text.replace("0.0,red,y,,0.0,1.5,\n", "", 1), "incomplete rows, without all of x, y"),
 }
@@ -227,6 +233,15 @@ def test_clocks_that_begin_anew_go_on(tmp_path: Path, period: int) -> None:
     assert other.summary.assumed.keys() - one.summary.assumed.keys() == {
         f"stamps begin anew after {period} s: those before half of it count on"
     }
+    after, file = plain["t"] >= period, tmp_path / "truth.csv"
+    for truth in (plain, anew, anew[after]):
+        truth.drop(columns=["vx", "vy"]).to_csv(file, index=False)
+        for name, log in (("plain.csv", one), ("anew.jsonl", other)):
+            actual = load_log(f"{tmp_path / name}?truth={file}").truth
+            assert actual is not None
+            there = np.isfinite(actual.position[..., 0])
+            assert there.sum() == len(truth)
+            np.testing.assert_allclose(actual.position[there], log.recording.gnss[0][there], atol=1e-9)
     assert kind_of(tmp_path / "anew.jsonl") == kind_of(tmp_path / "plain.csv") == "log"
     (tmp_path / "bad.jsonl").write_text('{"t": 0,\n')
     with pytest.raises(co.InputError, match=r"bad\.jsonl = .*must be a table"):

@@ -165,7 +165,7 @@ def test_a_bag_is_read(tmp_path: Path, ros: int) -> None:
     assert np.isnan(log.truth.position[:, 1]).all()
     assert any("/car0/note" in what for what in log.summary.unused)
     assert float(co.rt_le(co.Kalman()(rec, [0]), log.truth)[0, 0]) < 0.05
-    assert load_and_check(path) == 80 * 2
+    assert np.isfinite(co.load_recording(path, dt=0.1).gnss[0, :, :, 0]).sum() == 80 * 2
 
 
 def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path: Path) -> None:
@@ -257,10 +257,6 @@ def test_cars_with_receivers_uwb_and_clocks_that_differ(tmp_path: Path) -> None:
     assert np.median(np.abs(error)) < 0.15
     assert any("of the ranges lie beyond 5" in text for text in check(right).warnings)
     assert float(np.nanmax(np.abs(wrong.recording.gnss[0, 50, 1] - right.recording.gnss[0, 50, 1]))) > 1.0
-
-
-def load_and_check(path: Path) -> int:
-    return int(np.isfinite(co.load_recording(path, dt=0.1).gnss[0, :, :, 0]).sum())
 
 
 def write_bag(

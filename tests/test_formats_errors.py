@@ -142,11 +142,16 @@ KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n0 -1 0 5 1 0 0 6 0 0 1 7\n"
         (TUM + "0.2 0 0 0 0 0 0 0\n", "a.tum: line 4 = quaternion [0.0, 0.0, 0.0, 0.0]", "length 1"),
         (TUM + "0.1 0 0 0 0 0 0 1\n", "a.tum: line 4, column t", "must increase"),
         ("# t x y z\n", "a.tum = 0 lines", "complete"),
+        (KITTI + "1 0 0 5 0 1 0 6\n", "a.txt: line 3 = 1 0 0 5 0 1 0 6 (8 words)", "r11 r12 r13 t1 r21"),
+        (KITTI + "1 0 0 5 0 1 0 6 0 0 nan 7\n", "a.txt: line 3", "finite"),
+        (KITTI + "1 0 0 5 0 1.01 0 6 0 0 1 7\n", "a.txt: line 3 = rotation", "orthonormal"),
+        (KITTI + "1 0 0 5 0 1 0 6 0 0 -1 7\n", "a.txt: line 3 = rotation", "determinant 1"),
     ],
 )
-def test_a_bad_tum_line_is_named(tmp_path: Path, text: str, thing: str, hint: str) -> None:
-    assert len(read_tum(_file(tmp_path / "good.tum", TUM))) == 2
-    _assert_refused(lambda: read_tum(_file(tmp_path / "a.tum", text)), thing, hint)
+def test_a_bad_line_of_a_trajectory_is_named(tmp_path: Path, text: str, thing: str, hint: str) -> None:
+    good, name, read = (KITTI, "a.txt", read_kitti) if "a.txt" in thing else (TUM, "a.tum", read_tum)
+    assert len(read(_file(tmp_path / name, good))) == 2
+    _assert_refused(lambda: read(_file(tmp_path / name, text)), thing, hint)
 
 
 def test_a_repeated_stamp_is_named_by_all_its_digits_and_can_be_left_out(tmp_path: Path) -> None:
@@ -159,20 +164,6 @@ def test_a_repeated_stamp_is_named_by_all_its_digits_and_can_be_left_out(tmp_pat
     assert (kept.stamps == [float(stamps[row]) for row in (0, 1, 3)]).all()
     assert kept.position[:, 0].tolist() == [0, 1, 3]
     _assert_refused(lambda: read_tum(file, repeats="keep"), "repeats", "drop")
-
-
-@pytest.mark.parametrize(
-    ("text", "thing", "hint"),
-    [
-        (KITTI + "1 0 0 5 0 1 0 6\n", "a.txt: line 3 = 1 0 0 5 0 1 0 6 (8 words)", "r11 r12 r13 t1 r21"),
-        (KITTI + "1 0 0 5 0 1 0 6 0 0 nan 7\n", "a.txt: line 3", "finite"),
-        (KITTI + "1 0 0 5 0 1.01 0 6 0 0 1 7\n", "a.txt: line 3 = rotation", "orthonormal"),
-        (KITTI + "1 0 0 5 0 1 0 6 0 0 -1 7\n", "a.txt: line 3 = rotation", "determinant 1"),
-    ],
-)
-def test_a_bad_kitti_line_is_named(tmp_path: Path, text: str, thing: str, hint: str) -> None:
-    assert len(read_kitti(_file(tmp_path / "good.txt", KITTI))) == 2
-    _assert_refused(lambda: read_kitti(_file(tmp_path / "a.txt", text)), thing, hint)
 
 
 def test_stamps_of_kitti_stand_in_a_file_of_their_own(tmp_path: Path) -> None:

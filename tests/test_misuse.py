@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Callable
-from dataclasses import fields
+from dataclasses import fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -108,6 +108,22 @@ def ours(call: Callable[[], object], what: str) -> None:
         pass
     except Exception as error:
         pytest.fail(f"{what}: {type(error).__name__}: {error}")
+
+
+BARE = replace(TRACK, covariance=None)
+
+
+@pytest.mark.parametrize(
+    ("call", "words"),
+    [
+        (lambda: co.nees(BARE, FLEET), "this method claims none"),
+        (lambda: replace(TRACK, x=np.nan * TRACK.x), "not finite in run 0 at step 0"),
+        (lambda: co.Kalman()(replace(RECORDING, gnss=np.nan * RECORDING.gnss), [0]), "has no fix at step 0"),
+    ],
+)
+def test_what_cannot_be_computed_says_why(call: Callable[[], object], words: str) -> None:
+    with pytest.raises(co.InputError, match=words):
+        call()
 
 
 def swept(make: Callable[..., object], given: dict[str, Any], wrong: tuple[Any, ...] = ALL) -> None:

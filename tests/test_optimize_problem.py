@@ -10,7 +10,8 @@ import pytest
 from oracles.whitened import whitened
 
 from coopoc import V2X, Fleet, InputError, NoiseModel, Sensors, load_fleet, observe
-from coopoc.optimize import Loss, Problem, SolveError, Status, pose, solve
+from coopoc.optimize import Factor, Loss, Problem, SolveError, Status, pose, solve
+from coopoc.optimize.convex.qcqp import quadratic
 from coopoc.optimize.model.window import relative_std
 from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.links import to_vector, vector_cov
@@ -113,6 +114,23 @@ BAD = {
     "no std": (lambda: PAIR.add("range", ("a", "b"), 5.0), "exactly one of std, cov"),
     "shape of z": (lambda: PAIR.add("spherical", ("a", "b"), [5.0], std=1.0), "must have 2 or 3"),
     "shape of std": (lambda: PAIR.add("spherical", ("a", "b"), [5.0, 0.1, 1], std=[1.0, 1.0]), "must have shape"),
+    "shape of cov": (lambda: PAIR.add("position", "a", [0, 0, 0], cov=np.ones((2, 3))), "square matrices"),
+    "std of a turn": (lambda: PAIR.add("azimuth", ("a", "b"), 0.1, std=4.0), "<= pi rad"),
+    "shape of a root": (lambda: PAIR.add("azimuth", ("a", "b"), 0.1, sqrt_information=np.eye(2)), r"\(1, 1\)"),
+    "root not finite": (lambda: PAIR.add("azimuth", ("a", "b"), 0.1, sqrt_information=[[np.inf]]), "must be finite"),
+    "heights in a plane": (
+        lambda: Problem("ab", dimension=2).constrain("inclination", ("a", "b"), 0.0, 1.0),
+        "does not exist in two dimensions",
+    ),
+    "no factor": (lambda: Problem("a", factors=(1,)), "must be Factors"),
+    "nodes of a factor": (lambda: Factor("range", [[0]], [[5.0]], std=[[1.0]]), r"must have shape \(M, 2\) for range"),
+    "a factor of another problem": (lambda: Problem("a", factors=PAIR.factors), "one of a"),
+    "no bound": (lambda: PAIR.constrain("position", "a"), "must bound something"),
+    "bounds of a pose": (lambda: PAIR.constrain("relative_pose", ("a", "b")), "cannot bound them"),
+    "a loss relaxed": (
+        lambda: quadratic(PAIR.add("range", ("a", "b"), 9.0, std=1.0, loss=Loss("huber", 2.0))),
+        "is not quadratic",
+    ),
     "arity": (lambda: PAIR.add("range", ("a",), 5.0, std=1.0), "must name 2 points"),
     "twice a name": (lambda: Problem(("b", "a", "a")), r"\['a'\]: must be unique"),
     "x0": (lambda: Problem(("a", "b"), x0=np.zeros((3, 3))), "shape"),

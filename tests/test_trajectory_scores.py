@@ -243,6 +243,8 @@ def test_what_cannot_be_scored_is_named(tmp_path: Path) -> None:
     for delta in (0.5, 1.5, float("nan")):
         with pytest.raises(InputError, match="delta"):
             scores(estimates, truths, delta=delta)
+    with pytest.raises(InputError, match="rotation = None"):
+        relative_error(wandering(), Track(wandering().t, wandering().position))
 
 
 def wandering(count: int = 200) -> Track:

@@ -106,8 +106,8 @@ def nees(track: Track, fleet: Fleet, *, method: str = "the method") -> Floats:
     return found
 
 
-def nees_band(runs: int, level: float = 0.99) -> tuple[float, float]:
-    """Two-sided chi-square band of the run-averaged NEES of one step, for `runs` runs (Bar-Shalom, section 5.4).
+def nees_band(runs: int) -> tuple[float, float]:
+    """Two-sided 99 % chi-square band of the run-averaged NEES of one step, for `runs` runs (Bar-Shalom, section 5.4).
 
     Steps of one run are not independent, so the band is of each step's average over runs, never of a pool of steps.
 
@@ -115,8 +115,7 @@ def nees_band(runs: int, level: float = 0.99) -> tuple[float, float]:
     [1.97, 4.28]
     """
     runs = number("runs", runs, 1, kind=int, allowed=">= 1", hint="Give the number of runs averaged.")
-    level = number("level", level, 0, 1, allowed="in [0, 1]", hint="0.99 is the default.")
-    low, high = special.chdtri(3 * runs, [(1 + level) / 2, (1 - level) / 2]) / runs
+    low, high = special.chdtri(3 * runs, [0.995, 0.005]) / runs
     return float(low), float(high)
 
 

@@ -13,7 +13,6 @@ from ..arrays import AnyArray, Floats, checked, number
 from ..errors import InputError
 
 _CHUNK = 4_000_000
-LEVEL = "between 0 and 1"
 
 
 @dataclass(frozen=True)
@@ -35,8 +34,8 @@ class Interval:
         return f"{self.mean:.3g}" + (f" [{self.low:.3g}, {self.high:.3g}]" if math.isfinite(self.low) else "")
 
 
-def mean_interval(values: AnyArray, level: float = 0.95, resamples: int = 2000, seed: int = 0) -> Interval:
-    """Mean over E egos and R runs with the interval of a bootstrap over egos, then over the runs of each.
+def mean_interval(values: AnyArray, resamples: int = 2000, seed: int = 0) -> Interval:
+    """Mean over E egos and R runs with the 95 % interval of a bootstrap over egos, then over the runs of each.
 
     The percentiles are widened to Phi(sqrt(n/(n-1)) t_{n-1}), n = E (or R for one ego): the plain percentile interval
     is too narrow for few egos (Hesterberg, The American Statistician 69, 2015, section 4.3.2). With normal egos and
@@ -44,7 +43,6 @@ def mean_interval(values: AnyArray, level: float = 0.95, resamples: int = 2000, 
 
     Args:
         values: (E, R) or (R,) of one metric.
-        level: of the interval.
         resamples: of the bootstrap.
         seed: of its draws.
 
@@ -55,7 +53,7 @@ def mean_interval(values: AnyArray, level: float = 0.95, resamples: int = 2000, 
     Interval(mean=1.0, low=1.0, high=1.0, n=15)
     """
     values = _checked("values", values)
-    return _interval(_resampled(values, resamples, seed), float(values.mean()), values, level)
+    return _interval(_resampled(values, resamples, seed), float(values.mean()), values)
 
 
 def paired_difference(a: AnyArray, b: AnyArray) -> Interval:
@@ -122,12 +120,11 @@ def _counts(egos: int, runs: int, resamples: int, seed: int) -> AnyArray:
     return found
 
 
-def _interval(resampled: Floats, mean: float, values: Floats, level: float) -> Interval:
-    number("level", level, 1e-9, 1 - 1e-9, allowed=LEVEL, hint="0.95 is the default.")
+def _interval(resampled: Floats, mean: float, values: Floats) -> Interval:
     n = values.shape[0] if values.shape[0] > 1 else values.shape[1]
     if n < 2:
         return Interval(mean, math.nan, math.nan, values.size)
-    low = special.ndtr(np.sqrt(n / (n - 1)) * special.stdtrit(n - 1, (1 - level) / 2))
+    low = special.ndtr(np.sqrt(n / (n - 1)) * special.stdtrit(n - 1, 0.025))
     ends = np.quantile(resampled, [low, 1 - low])
     return Interval(mean, float(ends[0]), float(ends[1]), values.size)
 

@@ -109,7 +109,7 @@ def relative_error(estimate: Path, truth: Path, delta: float = 1.0, unit: Unit =
     `delta` apart.
 
     Args:
-        estimate: T poses P; neither path lacks its rotations.
+        estimate: T poses P, with their rotations.
         truth: T poses Q at the same instants.
         delta: from i to j, and from there to the next; a whole number of steps.
         unit: "steps", or "m" along the estimated path.
@@ -118,7 +118,7 @@ def relative_error(estimate: Path, truth: Path, delta: float = 1.0, unit: Unit =
         No error for a drive shorter than `delta`.
 
     Raises:
-        InputError: what `ends` raises.
+        InputError: a path without rotations, and what `ends` raises.
 
     Source: Sturm et al., IROS 2012, equation 2; evo's "RPE" of both parts is the same number.
 
@@ -129,7 +129,8 @@ def relative_error(estimate: Path, truth: Path, delta: float = 1.0, unit: Unit =
     i, j = (at := ends(estimate.position, delta, unit))[:-1], at[1:]
     moves, turns = [], []
     for path in (estimate, truth):
-        assert path.rotation is not None
+        if path.rotation is None:
+            raise InputError("rotation", None, "must be that of each pose", "Compare positions with absolute_error.")
         back = path.rotation[i].swapaxes(-1, -2)
         moves.append(np.einsum("kab,kb->ka", back, path.position[j] - path.position[i]))
         turns.append(back @ path.rotation[j])

@@ -10,7 +10,7 @@ import numpy as np
 from ..errors import InputError
 from ..file_names import given_path
 from .graph import NAME, Graph
-from .records import KINDS, Grammar, Record
+from .records import Grammar, by_tag
 from .values import read_words, to_numbers
 
 OFFSET = "PARAMS_SE3OFFSET id x y z qx qy qz qw"
@@ -34,15 +34,9 @@ TAGS = {
         "EDGE_SE3_TRACKXYZ",
     ),
 }
-OFFSETS = ("EDGE_SE3_PRIOR", "EDGE_SE3_TRACKXYZ")
-RECORDS = {
-    tag: Record(kind, d, offset=tag in OFFSETS)
-    for d, tags in TAGS.items()
-    for kind, tag in zip(KINDS, tags, strict=True)
-}
 GRAMMAR = Grammar(
     "g2o",
-    {**RECORDS, "EDGE_RANGE": Record("ranges", 0)},
+    by_tag(TAGS, offset=("EDGE_SE3_PRIOR", "EDGE_SE3_TRACKXYZ")),
     noise="information",
     name=_name,
     others=("PARAMS_SE3OFFSET", "FIX"),

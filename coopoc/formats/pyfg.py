@@ -5,8 +5,8 @@ from __future__ import annotations
 from pathlib import Path
 
 from ..file_names import given_path
-from .graph import NAME, Graph
-from .records import KINDS, Grammar, Record
+from .graph import ENDS, NAME, Graph
+from .records import Grammar, by_tag
 from .values import read_words
 
 TAGS = {
@@ -20,14 +20,9 @@ TAGS = {
         "EDGE_SE3_XYZ",
     ),
 }
-RECORDS = {
-    tag: Record(kind, d, stamped=kind != "point")
-    for d, tags in TAGS.items()
-    for kind, tag in zip(KINDS, tags, strict=True)
-}
 GRAMMAR = Grammar(
     "PyFG",
-    {**RECORDS, "EDGE_RANGE": Record("ranges", 0, stamped=True)},
+    by_tag(TAGS, stamped=("pose", *ENDS)),
     noise="covariance",
     name=lambda word, kind: word if NAME.fullmatch(word) else "",
 )

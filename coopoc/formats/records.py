@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -68,6 +68,16 @@ class Record:
     def width(self) -> int:
         """Words of the line, the tag included."""
         return 1 + len(self.words.split()) + self.triangle
+
+
+def by_tag(
+    tags: Mapping[int, Sequence[str]], stamped: Collection[str] = (), offset: Collection[str] = ()
+) -> dict[str, Record]:
+    """Records of the tags of a format, dimension -> tag of each of KINDS, and of EDGE_RANGE: kinds with a stamp, tags
+    with an offset."""
+    made = {tag: (kind, d) for d, row in tags.items() for kind, tag in zip(KINDS, row, strict=True)}
+    made["EDGE_RANGE"] = "ranges", 0
+    return {tag: Record(kind, d, kind in stamped, tag in offset) for tag, (kind, d) in made.items()}
 
 
 @dataclass

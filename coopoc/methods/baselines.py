@@ -90,7 +90,7 @@ class MSMV:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
-        known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
+        known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         assumed, own = solo_estimates(recording, known, columns)
         assumed = assumed._replace(growth=(0.0, 1.0), acceleration=0.0)
 

@@ -102,7 +102,7 @@ class CooperativeFilter:
         `extras` hold the weights, 1 for a number that was believed, of each ego's "fix" (R, T, E) and by link (R, L) of
         "range", "azimuth", "inclination" and "message", NaN where there was none, and whether it is "trusted".
         """
-        known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
+        known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         model, guards = model_of(known, self.robust), guards_of(self, known)
         assumed, notes = assumptions(recording, known), list(known.notes)
 

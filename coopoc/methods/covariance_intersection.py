@@ -63,7 +63,7 @@ class CovarianceIntersection:
         age (age + 2) of its variances at most. Relative noise is rotated to the predicted geometry: at the measured one
         the weight would depend on the noise.
         """
-        known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos, missing=True)
+        known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         gates = self.robust and known.exact_relative
         assumed, own = solo_estimates(recording, known, columns, gates)
         assumed = assumed._replace(growth=ESTIMATE_GROWTH)

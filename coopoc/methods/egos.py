@@ -48,10 +48,10 @@ def follow_egos(
         notes: of the Track; `follow` may add some.
 
     Raises:
-        InputError: an ego that is unknown, no observer of this recording, or absent at times; no fix at the first step.
+        InputError: an ego that is unknown, no observer of this recording, absent at times, or without a first fix.
     """
     began = time.perf_counter()
-    columns = check_recording(recording).columns(egos, missing=True)
+    columns = check_recording(recording).columns(egos)
     shape = (recording.runs, len(recording.t), len(columns), 3)
     x, cov = np.empty(shape), np.empty((*shape, 3))
     ends = np.cumsum([0, *(len(recording.links.of(ego)) for ego in columns)])

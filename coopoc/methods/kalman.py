@@ -38,7 +38,7 @@ class GNSS:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
         began = time.perf_counter()
-        columns = check_recording(recording).columns(egos, missing=True)
+        columns = check_recording(recording).columns(egos)
         fixes = recording.gnss[:, :, columns]
         there = np.isfinite(fixes).all(axis=-1, keepdims=True)
         newest = np.maximum.accumulate(np.where(there, np.arange(len(recording.t))[:, None, None], 0), axis=1)
@@ -80,7 +80,7 @@ class Kalman:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began = time.perf_counter()
-        columns = check_recording(recording).columns(egos, missing=True)
+        columns = check_recording(recording).columns(egos)
         known = resolve(self.noise_model, recording, relative=False)
         x, p, _ = solo_filter(recording, columns, known, fix_noise(known, self.robust), self.x0)
         return solo_track(recording, columns, x, p, began)
@@ -159,7 +159,7 @@ class AdaptiveKalman:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
-        began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
+        began, columns = time.perf_counter(), check_recording(recording).columns(egos)
         x, p, _ = solo_filter(recording, columns, NoiseModel.nominal(self.assumed), self._fixes, self.x0)
         of = "each axis" if self.assumed.velocity_reading == "axis" else "the speed"
         share, floor = 100 * self.assumed.velocity_std_ratio, self.assumed.velocity_floor
@@ -174,7 +174,7 @@ class AdaptiveKalman:
 
     def gnss_std(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Floats:
         """(R, T, E, 3) m, the estimated standard deviation of the fixes at every step."""
-        columns = check_recording(recording).columns(egos, missing=True)
+        columns = check_recording(recording).columns(egos)
         known = NoiseModel.nominal(self.assumed)
         noise = solo_filter(recording, columns, known, self._fixes, self.x0)[2]
         assumed = np.broadcast_to(known.gnss_variance, (recording.runs, len(recording.t), len(egos), 3))

@@ -116,7 +116,7 @@ class RoadFilter:
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos, with `extras` heading_error and scale_error; InputError if one is unknown or absent."""
         began = time.perf_counter()
-        columns = check_recording(recording).columns(egos, missing=True)
+        columns = check_recording(recording).columns(egos)
         x, cov, errors = self.filtered(recording, columns)
         names = "heading_error", "heading_error_std", "scale_error", "scale_error_std"
         extras = {name: errors[..., i] for i, name in enumerate(names)} if self.assumed(recording).heading else {}
@@ -147,20 +147,17 @@ class RoadFilter:
         run_road(seen, noise, x, cov, lasting)
         return x, cov, lasting
 
-    def start(
-        self, *, errors: RoadErrors | None = None, interval: float | None = None, history: float = 10.0
-    ) -> RoadStream:
+    def start(self, *, interval: float | None = None, history: float = 10.0) -> RoadStream:
         """Start the filter for one step at a time, from the first fix: `step(gnss, velocity, dt, fix_age)`.
 
         Args:
-            errors: None: the filter's own, else ROAD.
             interval: s, the step that the assumed process noise belongs to, as of `Kalman.start`.
             history: s, how old a delayed fix may be.
 
         >>> RoadFilter("identity").start().step([1.0, 2.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)[0].tolist()
         [1.0, 2.0, 0.0]
         """
-        known, errors = constant_noise(self.noise_model), errors or self.errors or ROAD
+        known, errors = constant_noise(self.noise_model), self.errors or ROAD
         return RoadStream(louder(motion_noise(known, interval), errors), road_noise(known, errors), history)
 
     @classmethod

@@ -75,7 +75,7 @@ def stars(
     >>> [star.member.tolist() for star in stars(observe(fleet, Sensors(), V2X()), "a")]
     [[0, 1], [0, 1]]
     """
-    known, ego = resolve(noise_model, recording), check_recording(recording).columns([ego], missing=True)[0]
+    known, ego = resolve(noise_model, recording), check_recording(recording).columns([ego])[0]
     box, shape, dt = inbox(recording, ego, message), recording.gnss.shape, recording.dt
     q = np.broadcast_to(known.process_variance(recording), shape)
     r = np.broadcast_to(known.fix_variance(recording), shape)

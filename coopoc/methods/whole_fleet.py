@@ -80,7 +80,7 @@ def fleet_track(
     from ..kernels.fleets.graph import fuse_delayed, latest_available
 
     began = time.perf_counter()
-    columns = check_recording(recording).columns(egos, missing=True)
+    columns = check_recording(recording).columns(egos)
     model = resolve(noise_model, recording)
     met = centre(recording, method.message) if central else exchange(recording, method.message)
     arrival = met.either if central else met.both

@@ -93,18 +93,12 @@ def parse(name: str, value: Any, default: Any) -> Any:
     try:
         if kind is bool:
             return _BOOLS[str(value).lower()]
-        if kind is int and isinstance(value, float):
-            return _whole(value)
+        if kind is int and isinstance(value, float) and value % 1:
+            raise ValueError
         return kind(value)
     except (ValueError, KeyError, TypeError, OverflowError):
         words = {int: "a whole number", float: "a number", bool: "true or false"}.get(kind, kind.__name__)
         raise InputError(name, repr(value), f"must be {words}", f"The default is {default!r}.") from None
-
-
-def _whole(value: float) -> int:
-    if value != int(value):
-        raise ValueError(value)
-    return int(value)
 
 
 def _guess(value: Any) -> Any:

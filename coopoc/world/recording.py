@@ -232,28 +232,23 @@ class Recording:
                 raise InputError("egos", repr(ego), allowed, "Name it in observe(..., observers=[...]).")
         return cols
 
-    def columns(self, egos: Sequence[int | str], missing: bool = False) -> list[int]:
-        """Columns of the egos; InputError if one is unknown, no observer of this recording, or absent at times.
-
-        Args:
-            missing: whether fixes may be missing (NaN) after the first one while the vehicle drives on.
-        """
+    def columns(self, egos: Sequence[int | str]) -> list[int]:
+        """Columns of the egos; InputError if one is unknown, no observer of this recording, absent at times, or without
+        a first fix. Later ones may be missing (NaN)."""
         cols = self.observing(egos)
-        moves, seen = (np.isfinite(values.take(cols, axis=2)) for values in (self.velocity, self.gnss))
-        if moves.all() and (seen[:, 0] if missing else seen).all():
+        moves, seen = (np.isfinite(values.take(cols, axis=2)) for values in (self.velocity, self.gnss[:, :1]))
+        if moves.all() and seen.all():
             return cols
         there: Bools = np.asarray(moves.all(axis=(0, 1, 3)))
-        fixes: Bools = np.asarray(seen.all(axis=(0, 3)))
-        for ego, present, fix in zip(egos, there, fixes.T, strict=True):
+        fixed: Bools = np.asarray(seen.all(axis=(0, 1, 3)))
+        for ego, present, fix in zip(egos, there, fixed, strict=True):
             if not present:
                 hint = (
                     "Cut it with recording.between(...), recording.stretches(ego) names its parts, or choose another."
                 )
                 raise InputError("egos", repr(ego), "is absent at some steps", hint)
-            if not (fix[0] if missing else fix.all()):
-                step = int(np.argmin(fix))
-                hint = "Cut the drive with fleet.between(...)." if step == 0 else "Take a method that does without."
-                raise InputError("egos", repr(ego), f"has no fix at step {step}, where this method needs one", hint)
+            if not fix:
+                raise InputError("egos", repr(ego), "has no fix at step 0", "Cut the drive with fleet.between(...).")
         return cols
 
     def __repr__(self) -> str:

@@ -20,6 +20,7 @@ from coopoc.world.body_frames import midway, turned
 from coopoc.world.links import spherical, stretches, wrap
 from coopoc.world.recording import Recording
 
+from .motion import MOVING
 from .read import Log
 
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
@@ -36,14 +37,14 @@ ENOUGH = 20
 COARSE = 0.5
 """rad: no sensor's angles scatter as much about positions that are better known."""
 HINTS = {
-    "range": "Are ranges or positions in feet? They are in m.",
+    "range": "Are clocks, or the positions of one, off?",
     "azimuth": "Check their zero (+x, or the heading for a bearing), their sense (anticlockwise), their unit (rad), "
     "whose heading they count from, and that no axis is mirrored.",
     "inclination": "Inclinations count from +z, elevations from the horizon.",
 }
 """What to look for where measurements of a kind miss the positions."""
 MISTAKEN = (
-    (-1.0, 3e-3, "Is t in ms, or finer, or are positions in km? Divide it: stamps are in s, positions in m."),
+    (-1.0, 3e-3, "Is t in ms (scale=t:1e-3) or finer, or are positions in km? Or is a fix repeated?"),
     (0.2, 0.4, "Is speed in km/h? Name it speed_kmh. Or in feet a second? Speeds are in m/s."),
     (0.42, 0.55, "Is speed in miles an hour, or in knots? Speeds are in m/s."),
     (3.0, 3.6, "Are positions in feet? They are in m."),
@@ -60,10 +61,13 @@ WINDOW, BLOCKS = 9, 10
 sure an offset of a pair is."""
 UNUSED = 0.05
 """Share of what was logged that may be left out without a word."""
+PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
 ADVICE = {
     "repeated rows": "Do stamps lack their fraction, as stamp.sec without nanosec, or do two vehicles share a name?",
     "fixes in gaps of the odometry": "Where a vehicle stands, log a speed of 0; raise max_gap= for longer gaps.",
-    "relative measurements of members": "Give a fix of each, or a table vehicle, x, y of places.",
+    "relative measurements of members": PLACED,
+    "odometry and headings of vehicles": PLACED,
+    "azimuths at times without": "Do they count from the heading? Then name them bearing; else log a heading.",
     "relative measurements while": "Do their clocks differ? Give clock=, or raise max_gap=.",
     "fixes beside": "A shorter dt= uses them.",
     "relative measurements beside": "A shorter dt= uses them.",
@@ -285,8 +289,8 @@ def _axes(rec: Recording, column: int) -> str:
         return ""
     if np.vdot(1j * driven.conj(), moved).real > ALIKE * size:
         return (
-            "axes look swapped: fixes move as the odometry mirrored at the diagonal. Swap easting and northing, or vx "
-            "and vy; headings that are clockwise from north are compass_deg."
+            "axes look swapped: fixes move as the odometry mirrored at the diagonal. Swap easting and northing, "
+            "latitude and longitude, or vx and vy; headings that are clockwise from north are compass_deg."
         )
     if np.square(u[:, 1]).mean() < 0.01 * np.square(u[:, 0]).mean():
         return (
@@ -325,11 +329,7 @@ def _of_rows(c: Check) -> list[str]:
             + f" (first: {first})" * bool(first)
             + f". {hint}".rstrip(" ")
         )
-    columns = [what for what in summary.unused if ": column " in what]
-    if columns:
-        truth = " A truth is another table: truth=FILE." * any("tru" in what or "gt" in what for what in columns)
-        sentences.append(f"not read: {'; '.join(columns)}. Name what is meant with columns= or kinds=.{truth}")
-    return sentences
+    return [*sentences, *filter(None, [summary.unread])]
 
 
 def _of_vehicles(c: Check) -> list[str]:
@@ -372,15 +372,14 @@ def _of_truth(c: Check) -> list[str]:
     rec, truth, sentences = c.world, c.log.truth, []
     if truth is None:
         return []
-    for row in c.vehicles:
-        column = rec.ids.index(row["vehicle"])
+    for column, name in enumerate(rec.ids):
         every = np.asarray(rec.gnss[0, :, column] - truth.position[:, column])
         both = np.isfinite(every[:, 0])
         gap, velocity = every[both, :2], rec.velocity[0, :, column, :2][both]
         up, sure = _median(every[both, 2]) if len(gap) >= FEW and np.ptp(rec.gnss[0, both, column, 2]) else (0.0, 0.0)
         if abs(up) > max(SIGMAS * sure, rec.sensors.fix_std[2] / 2):
             sentences.append(
-                f"{row['vehicle']}: fixes lie {up:.3g} m above the truth in the median. Is one of the two above the "
+                f"{name}: fixes lie {up:.3g} m above the truth in the median. Is one of the two above the "
                 "ellipsoid, the other above the geoid, or are antennas elsewhere?"
             )
         if len(gap) >= ENOUGH and np.ptp(velocity, axis=0).any():
@@ -388,16 +387,15 @@ def _of_truth(c: Check) -> list[str]:
             if abs(line.slope) >= max(SIGMAS * line.stderr, 0.5 * rec.dt):
                 way = "ahead of" if line.slope > 0 else "behind"
                 sentences.append(
-                    f"{row['vehicle']}: its fixes are {abs(line.slope):.2f} s {way} the truth along its way: the clock "
+                    f"{name}: its fixes are {abs(line.slope):.2f} s {way} the truth along its way: the clock "
                     "of the truth differs, or fixes carry the time at which they arrived."
                 )
                 continue
         east, north = np.median(gap, axis=0) if len(gap) >= FEW else (0.0, 0.0)
         if np.hypot(east, north) >= APART * np.hypot(*rec.sensors.fix_std[:2]):
             sentences.append(
-                f"{row['vehicle']}: fixes lie {east:.3g} m east and {north:.3g} m north of the truth in the median. "
-                "Fixes in degrees are local at the first one: give origin= of the frame of the truth, or the truth in "
-                "degrees."
+                f"{name}: fixes lie {east:.3g} m east and {north:.3g} m north of the truth in the median. Has it "
+                "another frame? Fixes in degrees are local at the first: give origin= of the truth, or it in degrees."
             )
     return sentences
 
@@ -412,16 +410,21 @@ def _of_measurements(c: Check) -> list[str]:
         if row["number"] < ENOUGH:
             continue
         word = "bearing" if name == "azimuth" and c.log.recording.body is not None else name
+        hint = HINTS[name]
         stated = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
         position = float(np.sqrt(max(should**2 - row["stated_std"] ** 2, 0.0)))
         wrong = std > WIDE * should or (name == "azimuth" and std > COARSE > 3 * position)
         if name != "range":
             wrong |= abs(median) > 3 * should
+            hint = (_other_angle(c) if k == 1 else "") or hint
         else:
             measured = c.world.relative[0, :, 0]
             true = measured - c.relative[:, 0]
-            ratio = (measured / true)[true > FAR * position]
-            wrong |= len(ratio) >= ENOUGH and not 0.8 <= float(np.median(ratio)) <= 1.25
+            far = measured + true > 2 * FAR * position
+            ratio = float(np.median(measured[far] / np.maximum(true[far], 1e-3))) if far.sum() >= ENOUGH else 1.0
+            wrong |= not 0.8 <= ratio <= 1.25
+            if not 0.4 <= ratio <= 2.5:
+                hint = f"They are {ratio:.3g} times as long; of mm scale=range:0.001 makes m, of feet 0.3048."
         outliers, offsets = row["beyond_5_std"], _offsets(c, k, row["stated_std"])
         if outliers > OUTLIERS:
             sentences.append(
@@ -429,17 +432,29 @@ def _of_measurements(c: Check) -> list[str]:
                 "as of reflections. Drop them, or take a method with a gate or a robust loss."
             )
         if wrong:
-            sentences.append(f"{word}s miss the positions by {stated}. {HINTS[name]}")
-        elif offsets:
+            sentences.append(f"{word}s miss the positions by {stated}. {hint}")
+        if offsets and (not wrong or hint == HINTS["range"]):
             shown = ", ".join(f"{pair} by {offset:+.3g} {unit}" for pair, offset in offsets[:4])
             more = f" and {len(offsets) - 4} pairs more" if len(offsets) > 4 else ""
             sentences.append(
                 f"{word}s of {shown}{more} are off in the median, with {row['stated_std']:.3g} {unit} stated: an "
                 "offset of the sensors, of antennas, or of fixes or heights of one of the two; offset= takes it off."
             )
-        elif std < NARROW * should and row["stated_std"] > 2 * std:
+        elif not wrong and std < NARROW * should and row["stated_std"] > 2 * std:
             sentences.append(f"{word}s are better than stated: {stated}.")
     return sentences
+
+
+def _other_angle(c: Check) -> str:
+    """What azimuths look like that miss the positions by the course of their observers."""
+    links = c.world.links
+    moves = c.world.velocity[0, links.step, links.observer, :2] @ [1, 1j]
+    there = np.isfinite(c.relative[:, 1]) & (np.abs(moves) > MOVING)
+    residual, course = c.relative[there, 1], np.angle(moves[there])
+    for kind, turn in (("bearing", course), ("azimuth", -course)):
+        if len(course) >= ENOUGH and 3 * np.median(np.abs(wrap(residual + turn))) < np.median(np.abs(residual)):
+            return f"They look like {kind}s: name them {kind}."
+    return ""
 
 
 def _median(values: Floats) -> tuple[float, float]:

@@ -27,10 +27,11 @@ HEADING_STD = 0.05
 
 
 def unwrapped(rows: Rows, summary: Summary) -> Rows:
-    """Rows whose stamps go on where those of a vehicle begin anew, at midnight or at the end of a GPS week."""
+    """Rows whose stamps go on where those of a vehicle begin anew, at midnight or at the end of a GPS week; those of
+    another file, such as the truth, may count on."""
     last = rows.groupby(["file", "vehicle"], sort=False)["t"].shift()
     for period in PERIODS:
-        inside = rows["t"].dropna().between(0, period)
+        inside = rows["t"].dropna().between(0, 1.25 * period)
         away = rows["t"].between(0.25 * period, 0.75 * period)
         if (rows["t"] < last - 0.9 * period).any() and inside.all() and not away.any():
             summary.assume(f"stamps begin anew after {period:g} s: those before half of it count on")

@@ -13,7 +13,7 @@ from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
 from coopoc.world.links import wrap
 
-from ..assemble import SAME, longest_gap, smooth, steps_of
+from ..assemble import SAME, longest_gap, nearest, smooth, steps_of
 from .units import Rows, Summary, in_group, place
 
 MOVING = 1.0
@@ -300,9 +300,8 @@ def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, 
     """Index of the sample nearest in time to each step that has one while the member is there, these steps, and how
     much later the samples are, s."""
     step, lag = steps.nearest(signal.t)
-    order = np.argsort(np.abs(lag), kind="stable")
-    order = order[(step >= 0)[order] & there[step[order]]]
-    kept = order[np.unique(step[order], return_index=True)[1]]
+    here = np.where(there[step], step, -1)
+    kept = nearest(np.abs(lag), here, step, step)
     return kept, step[kept], lag[kept]
 
 

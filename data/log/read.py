@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
@@ -35,8 +35,8 @@ from .units import KINDS, Rows, Summary, check_values, distinct, in_group
 
 Frame = Literal["world", "body"]
 Stamps = Literal["header", "received"]
-DATED, DAY = 1e8, 86400.0
-"""s: times above are since 1970; a day."""
+DAY = 86400.0
+"""s."""
 LONGEST, PAIR = 1.0, ("vehicle", "partner")
 """s, of a step that is not given; what names a pair."""
 READERS: Mapping[str, Callable[..., Rows]] = {
@@ -92,7 +92,7 @@ def is_log(path: Path, columns: Mapping[str, str] | None = None) -> bool:
     (True, True)
     """
     if path.is_dir():
-        return _is_bag(path) or is_segment(path) or any(True for _ in _files(path))
+        return _is_bag(path) or is_segment(path) or bool(_files(path))
     return is_log_table(path, columns) if path.suffix.lower() in TABLES else _is_read(path)
 
 
@@ -186,7 +186,9 @@ def read_log(
     rows = distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary)
     if not any_scale:
         _check_scale(rows, path.name)
-    ids = _ids(rows, body)
+    ids = _ids(rows, body, summary)
+    carried = in_group(rows, "odometry", "heading") & ~rows["vehicle"].isin(ids)
+    summary.refuse("odometry and headings of vehicles without a position", rows[carried])
     grid = _grid(rows, dt, body, summary)
     steps = Steps(grid, max_gap, not (rows["kind"] == "z").any(), body, summary)
     members = {name: member(name, rows[rows["vehicle"] == name], steps) for name in ids}
@@ -197,6 +199,9 @@ def read_log(
         true_rows = true_rows[~(steps.planar & (true_rows["kind"] == "z"))]
         fleet = _truth(distinct(true_rows, Summary()), recording, max_gap, path.stem)
     summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
+    if fleet is not None:
+        for name, share in zip(ids, np.isfinite(fleet.position[..., 0]).mean(axis=0), strict=True):
+            summary.vehicles[name] += f", truth {share:.0%}"
     return Log(recording, fleet, summary, "messages" in summary.read, origin)
 
 
@@ -268,36 +273,42 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
     else:
         if true_files and not true_files[0].is_file():
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
-        files = sorted(_files(path)) if path.is_dir() else [path]
-        true_files = true_files or [f for f in files if f.stem.lower() == TRUTH and f != path][:1]
+        files = _files(path) if path.is_dir() else [path]
+        summary.refuse("files in folders of a folder with files", len(_every_file(path)) - len(files) * path.is_dir())
+        true_files = true_files or [f for f in files if f.stem.lower() == TRUTH and f != path]
         files = [f for f in files if f not in true_files and (f.stem.lower() != TRUTH or f == path)]
         if not files:
             allowed = f"must hold files in {', '.join(READERS)}"
             raise InputError("path", str(path), allowed, "Point at the folder of the log.")
         _check_headers(options["columns"], [*files, *true_files], path.name)
-        parts = [_read_file(file, summary, **options) for file in files]
-        parts = [
-            rows.assign(vehicle=file.relative_to(path).parts[0]) if path not in (file, file.parent) else rows
-            for file, rows in zip(files, parts, strict=True)
-        ]
+        parts = [_read_file(file, path, summary, **options) for file in files]
     if not any(map(len, parts)):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
     options = {**options, "ignore": (), "truth": ""}
-    parts += [_read_file(file, Summary(), **options).assign(true=1.0) for file in true_files]
+    parts += [_read_file(file, path, Summary(), **options).assign(true=1.0) for file in true_files]
     return pd.concat(parts, ignore_index=True)
 
 
-def _read_file(file: Path, summary: Summary, **options: Any) -> Rows:
+def _read_file(file: Path, path: Path, summary: Summary, **options: Any) -> Rows:
+    """Rows of a file of a log; what names no vehicle in a folder below is of the vehicle of that folder."""
     if not _is_bag(file):
         options = {name: value for name, value in options.items() if name not in ("truth", "stamps")}
-    return READERS.get(file.suffix.lower(), read_log_table)(file, summary, **options)
+    rows = READERS.get(file.suffix.lower(), read_log_table)(file, summary, **options)
+    below = path in file.parents and file.parent != path and rows["vehicle"].eq(file.stem).all()
+    return rows.assign(vehicle=file.relative_to(path).parts[0]) if below else rows
 
 
-def _files(path: Path) -> Iterator[Path]:
-    """Files of a folder, and topics that were written as tables in the folders of their namespaces."""
-    for file in path.rglob("*"):
-        if _is_read(file) and (file.parent == path or STAMP in headers(file)):
-            yield file
+def _every_file(path: Path) -> list[Path]:
+    return [file for file in path.rglob("[!.]*") if _is_read(file)]
+
+
+def _files(path: Path) -> list[Path]:
+    """Files of a folder; below it topics that were written as tables, and those of a folder per vehicle where it has
+    none itself but a truth."""
+    every = _every_file(path)
+    bare = not any(_is_bag(file) or (file.parent == path and file.stem.lower() != TRUTH) for file in every)
+    bare = bare and any(map(is_log, every))
+    return sorted(file for file in every if bare or file.parent == path or STAMP in headers(file))
 
 
 def _check_headers(columns: Mapping[str, str], files: Sequence[Path], name: str) -> None:
@@ -318,17 +329,17 @@ def _check_scale(rows: Rows, name: str) -> None:
         check_scale(t, np.nan_to_num(position), np.split(np.arange(len(t)), ends), name)
 
 
-def _ids(rows: Rows, body: bool) -> list[str]:
+def _ids(rows: Rows, body: bool, summary: Summary) -> list[str]:
     """Members that can be placed, in the order of their first row: by fixes, or in body frames by odometry, too."""
     placed = rows["kind"].isin(["x", "speed", "yaw_rate"] if body else ["x"])
     names, moving = (set(rows["vehicle"][which]) for which in (placed, in_group(rows, "odometry")))
     if names and (not moving or names & moving):
         return [name for name in rows["vehicle"].unique() if name in names]
     if body:
-        hint = "Give speed and yaw_rate of every vehicle, and x, y (and z) of landmarks."
+        hint = f"Give speed and yaw_rate of every vehicle, and x, y (and z) of landmarks. {summary.unread}".rstrip()
         raise InputError("fixes, odometry", "none", "must be there: a pose is carried on by odometry", hint)
     hint = "Give x, y (and z) or latitude, longitude (and height) of every vehicle, at least once; where ranges to "
-    hint += 'anchors place it, read frame="body".'
+    hint = f'{hint}anchors place it, read frame="body". {summary.unread}'.rstrip()
     raise InputError("fixes", "none", "must be there: a position in the local frame starts from one", hint)
 
 
@@ -340,6 +351,11 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         return float(times.groupby(list(keys))["t"].agg(lambda t: t.diff().median()).min())
 
     moves, fixes, pairs = densest("odometry", "vehicle"), densest("fix", "vehicle"), densest("relative", *PAIR)
+    t = rows["t"][in_group(rows, "odometry", "fix")]
+    span = float(t.max() - t.min())
+    if not span:
+        allowed = "must hold two instants or more"
+        raise InputError(f"{summary.name}: t", f"{t.min():.10g} s throughout", allowed, "Is the file complete?")
     step = dt or float(f"{moves if moves > 0 else fixes:.3g}")
     if not step > 0:
         raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
@@ -347,8 +363,6 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         seldom = float(f"{min(pairs, fixes, LONGEST):.3g}")
         summary.assume(f"steps of {seldom:g} s, as fixes and pairs are measured; odometry every {step:g} s is averaged")
         step = seldom
-    t = rows["t"][in_group(rows, "odometry", "fix")]
-    span = float(t.max() - t.min())
     check_size(span / step + 1.5, rows["vehicle"].nunique(), len(rows), step, summary.name)
     if span / step < 0.5:
         allowed = f"must be well below the {span:g} s of the log"
@@ -367,7 +381,7 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
         allowed = f"must name vehicles of the log: {', '.join(ids)}"
         field = f"{rows['file'].iloc[0]}: column vehicle"
         raise InputError(field, ", ".join(vehicles), allowed, "Rename them, or leave the truth out.")
-    if start > DATED and rows["t"].max() < 2 * DAY:  # sentences of NMEA without a date are of the day of the log
+    if rows["t"].max() < 2 * DAY:  # seconds of the day, as of NMEA without a date, are of the day of the log
         rows = rows.assign(t=rows["t"] + DAY * round((float(recording.t.mean()) - rows["t"].mean()) / DAY))
     axes = 3 if (rows["kind"] == "z").any() else 2
     poses = np.full((len(recording.t), len(ids), 4), np.nan)

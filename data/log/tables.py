@@ -18,7 +18,11 @@ from .units import KINDS, Rows, Summary, in_group, rows_of
 LONG = ("t", "vehicle", "kind", "partner", "value", "std", "arrival")
 OF_FLEETS = {"id", "t", "x", "y", "z", "vx", "vy", "vz"}
 """Columns of a table of drives."""
-OF_LOGS = {"kind", "partner", "arrival", *KINDS} - OF_FLEETS - {"speed", "heading", "height"}
+OF_LOGS = (
+    {"kind", "partner", "arrival", *KINDS, *(f"{kind}_std" for kind in KINDS)}
+    - OF_FLEETS
+    - {"speed", "heading", "height"}
+)
 """Columns that no table of drives has."""
 
 

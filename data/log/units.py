@@ -195,6 +195,14 @@ class Summary:
         """What is assumed, with the names."""
         return tuple(sentence.format(", ".join(names)) for sentence, names in self.assumed.items())
 
+    @property
+    def unread(self) -> str:
+        """Sentences on columns that are of no kind."""
+        columns = [what for what in self.unused if ": column " in what]
+        truth = " A truth is another table: truth=FILE." * any("tru" in what or "gt" in what for what in columns)
+        name = "Name what is meant with columns= or kinds=."
+        return f"not read: {'; '.join(columns)}. {name}{truth}" if columns else ""
+
     def __str__(self) -> str:
         count = len(self.vehicles)
         lines = [f"{self.name}: {self.grid}, {count} vehicle{'s' * (count != 1)}"]

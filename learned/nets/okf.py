@@ -82,7 +82,7 @@ class OptimisedKF:
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Estimates and covariances of the egos."""
-        began, columns = time.perf_counter(), check_recording(recording).columns(egos, missing=True)
+        began, columns = time.perf_counter(), check_recording(recording).columns(egos)
         fixes = FixNoise(np.square(self.gnss_std))
         x, variance, _ = solo_filter(recording, columns, self._motion(0.0), fixes, self.x0)
         return solo_track(recording, columns, x, variance, began)

@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ...arrays import Floats, Ints, instance, number
+from ...arrays import Floats, Ints, number
 from ...errors import InputError
 from ...world.body_frames import turned
 from ...world.links import to_vector, wrap
@@ -15,15 +15,11 @@ from ...world.sensors import Sensors
 from .pose_filter import PoseFilter
 from .pose_inputs import body_of, fleet_members, to_landmarks
 
+HEADINGS = 24
+"""That are tried, around the circle."""
 
-def pose_start(
-    recording: Recording,
-    *,
-    seconds: float = 30.0,
-    headings: int = 24,
-    gate: float = 5.0,
-    assumed: Sensors | None = None,
-) -> Floats:
+
+def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0) -> Floats:
     """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN for landmarks.
 
     With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
@@ -35,9 +31,7 @@ def pose_start(
     Args:
         recording: in body frames.
         seconds: of it that are used.
-        headings: that are tried.
         gate: as of the filter.
-        assumed: noise, default that of the recording.
 
     Raises:
         InputError: a vehicle that has no fix and sees neither a landmark nor a vehicle with a pose in that time.
@@ -55,12 +49,10 @@ def pose_start(
     True
     """
     check_recording(recording, body=True)
-    headings = number("headings", headings, 4, 360, kind=int, allowed="4..360", hint="24 are 15 degrees apart.")
     steps = int(min(number("seconds", seconds, hint="30 is the default.") / recording.dt + 1.0, len(recording.t)))
     part = recording.between(0, max(steps, 2))
-    noise = recording.sensors if assumed is None else instance("assumed", assumed, Sensors)
-    spread = (*_spread(noise), np.pi / headings)
-    filter_ = PoseFilter("solo", gate=gate, spread=spread, assumed=noise)
+    spread = (*_spread(recording.sensors), np.pi / HEADINGS)
+    filter_ = PoseFilter("solo", gate=gate, spread=spread)
     begin = np.full((recording.runs, len(recording.ids), 4), np.nan)
     for run in range(recording.runs):
         known = np.full((len(part.t), len(part.ids), 3), np.nan)
@@ -68,7 +60,7 @@ def pose_start(
         waiting = fleet_members(part)
         while waiting:
             column, links = _next(part, run, waiting, known)
-            begin[run, column], known[:, column] = _most_likely(part, run, column, links, known, filter_, headings)
+            begin[run, column], known[:, column] = _most_likely(part, run, column, links, known, filter_)
             waiting.remove(column)
     return begin
 
@@ -90,15 +82,15 @@ def _next(recording: Recording, run: int, waiting: list[int], known: Floats) -> 
 
 
 def _most_likely(
-    recording: Recording, run: int, column: int, links: Ints, known: Floats, filter_: PoseFilter, headings: int
+    recording: Recording, run: int, column: int, links: Ints, known: Floats, filter_: PoseFilter
 ) -> tuple[Floats, Floats]:
     """First pose (4,) of a vehicle, and its positions (T, 3) m from there on, by the solo filter of most likelihood."""
-    angles = 2 * np.pi * np.arange(headings) / headings
+    angles = 2 * np.pi * np.arange(HEADINGS) / HEADINGS
     place = known[recording.links.step[links], recording.links.neighbour[links]]
-    tried = np.full((headings, len(recording.ids), 4), np.nan)
+    tried = np.full((HEADINGS, len(recording.ids), 4), np.nan)
     tried[:, column] = _hypotheses(recording, run, column, links, place, angles)
-    copies = recording.of_runs(np.full(headings, run))
-    noise = filter_.assumed or recording.sensors
+    copies = recording.of_runs(np.full(HEADINGS, run))
+    noise = recording.sensors
     if len(to_landmarks(recording, links)) < len(links):
         filter_ = replace(filter_, assumed=_of_vehicles(noise, recording.relative[run, links, 0]))
     x, _, cost = filter_.run_filter(copies, [column], links, tried, place=place)

@@ -74,8 +74,6 @@ def _apart(problem: Problem, x: Floats) -> Floats:
         if not (f.measurement.linear or is_converted(f.measurement)):
             continue
         touched[f.nodes[f.informative]] = True
-    if touched.all():
-        return x
     ranges = [f.z[:, 0].mean() for f in problem.factors if f.measurement.components[0] == "distance"]
     place = np.cumsum(~touched) - 1
     turn, radius = 2.4 * place, np.sqrt(1.0 + place) * (ranges[0] if ranges else 1.0)
