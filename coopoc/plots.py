@@ -116,9 +116,10 @@ def plot_solution(solution: Solution, ax: Axes | None = None, *, problem: Proble
         if instance("problem", problem, Problem).names != solution.names:
             raise InputError("problem", repr(problem), "must be the one that was solved", "Give it to both.")
         between = [factor for factor in problem.factors if factor.nodes.shape[1] == 2]
-        for k, kind in enumerate(dict.fromkeys(factor.kind for factor in between)):
+        kinds = list(dict.fromkeys(factor.kind for factor in between))
+        for k, kind in enumerate(kinds):  # the first are the widest: of one pair all show
             a, b = np.concatenate([factor.nodes for factor in between if factor.kind == kind]).T
-            pairs(ax, at[a], at[b], COLORS[(k + 1) % len(COLORS)], kind.replace("_", " "))
+            pairs(ax, at[a], at[b], COLORS[(k + 1) % len(COLORS)], kind.replace("_", " "), 1.2 * (len(kinds) - k))
         if few and problem.poses:
             poses = list(problem.poses)
             heading = solution.rotation[poses][:, :2, 0]

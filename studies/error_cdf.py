@@ -73,16 +73,14 @@ def cdf(results: Results, caption: str, where: Where) -> Plot:
             share = np.arange(1, len(errors) + 1) / len(errors)
             worst = float(np.mean([np.max(q) for q in frame["error_quantiles_m"]]))
             at = np.log(np.quantile(errors, np.linspace(0.05, 0.95, 19)))
-            twin, known, _ = next((place for place in places if np.abs(at - place[2]).max() < NEAR), ("", "", 0))
-            if twin:  # it would be hidden
-                same = f"{look(twin).label} {known}".removesuffix(" trained")
-                maxima.setdefault(method, []).append(f"; {model} = {known}" if twin == method else f" = {same}")
-                drawn.append(names)
+            near = (f"{look(m).label} {k}" for m, k, x in places if m != method and np.abs(at - x).max() < NEAR)
+            drawn.append(names)
+            if twin := next(near, ""):  # it would be hidden
+                maxima.setdefault(method, []).append(f" = {twin.removesuffix(' trained')}")
                 continue
             places.append((method, model, at))
             axes.plot(errors, share, **{**strokes(names), "marker": None})
             axes.plot(worst, np.interp(worst, errors, share), **{**strokes(names), "linestyle": "none"}, zorder=3)
-            drawn.append(names)
             maxima.setdefault(method, []).append(f"{worst:.1f}")
         axes.set(xlabel="Error [m]", ylabel="Share of time steps below", ylim=(0, 1.02))
         plain_log(axes.xaxis)
@@ -94,8 +92,8 @@ def cdf(results: Results, caption: str, where: Where) -> Plot:
 def _worst(texts: Sequence[str]) -> str:
     """Methods that are drawn as one, and the maxima of all noise models."""
     numbers = " / ".join(text for text in texts if text[0].isdigit())
-    same, others = ("".join(text for text in texts if text[0] == mark) for mark in " ;")
-    return f"{same} (max {numbers} m{others})" if numbers else same
+    same = "".join(text for text in texts if text[0] == " ")
+    return f"{same} (max {numbers} m)" if numbers else same
 
 
 def _finding(results: Results, at: dict[str, Any]) -> str:

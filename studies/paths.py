@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -42,7 +42,8 @@ def views(results: Results, over_time: bool) -> Plot | None:
                 marks = {"marker": ".", "linestyle": "none"} if name == "gnss" and not over_time else {"marker": ""}
                 style = {**strokes({"method": name}), "linewidth": 1.1, "markersize": 2, **marks}
                 axes.plot(*((t, gap) if over_time else x[:, :2].T), **style)
-            axes.annotate(picture(ego), (0.01, 0.9) if over_time else x[-1, :2], **(_CORNER if over_time else {}))
+            frame = "axes fraction" if over_time else "data"
+            axes.annotate(picture(ego), (0.01, 0.9) if over_time else x[-1, :2], xycoords=frame)
             axes.set(ylabel="Error [m]" if over_time else "North [m]")
         axes.set(xlabel="Time [s]" if over_time else "East [m]")
         legend(grid[0, 0], [{"method": name} for name in methods])
@@ -53,9 +54,6 @@ def views(results: Results, over_time: bool) -> Plot | None:
     what = f"Distance from the truth over time. {HELD}" if over_time else "Paths of the vehicles; the truth is grey."
     most = results.frame["max_neighbours"].max()
     return Plot(figure, scene.caption(results, f"{what} Filters with K = {most}."))
-
-
-_CORNER: Any = {"xycoords": "axes fraction"}
 
 
 def _path(results: Results, name: str, ego: str) -> tuple[Floats, Floats]:

@@ -3,7 +3,7 @@
 #
 # Two cars and a road-side unit: fixes once a second, wheel speed and compass ten times a second, UWB ranges five
 # times a second, and their own column layout. The first cell writes such a file as a logger would: no fix under a
-# bridge for seven seconds, a logger of `blue` that stops for four, and 5 % of the ranges too long by reflections. The
+# bridge for seven seconds, a logger of `cab` that stops for four, and 5 % of the ranges too long by reflections. The
 # other cells work the same on your file; [Your data](../your_data.md) describes all kinds and columns.
 
 # %%
@@ -19,12 +19,12 @@ import coopoc as co
 rng = np.random.default_rng(2)
 t = np.round(np.arange(0, 60, 0.1), 1)
 rows, truth = [], []
-for car, lane in (("red", 0.0), ("blue", 3.5)):
+for car, lane in (("van", 0.0), ("cab", 3.5)):
     course = 0.4 * np.sin(2 * np.pi * t / 40)
     x, y = np.cumsum(np.cos(course)) + 4 * lane, np.cumsum(np.sin(course)) + lane
     truth += [(now, car, x[k], y[k]) for k, now in enumerate(t)]
     for k, now in enumerate(t):
-        if car == "blue" and 44 < now < 48:
+        if car == "cab" and 44 < now < 48:
             continue
         if k % 10 == 0 and not 25 < now < 32:
             rows += [(now, car, "x", "", x[k] + rng.normal(0, 2)), (now, car, "y", "", y[k] + rng.normal(0, 2))]
@@ -59,17 +59,17 @@ print(log.summary)
 # %% [markdown]
 # ## Methods, where a vehicle is there
 #
-# A method follows a vehicle without a break. `blue` was away for four seconds: `recording.stretches` gives the steps
+# A method follows a vehicle without a break. `cab` was away for four seconds: `recording.stretches` gives the steps
 # in which a vehicle is there, and `between` cuts recording and truth alike. A filter starts anew in each stretch.
 
 # %%
-log.recording.stretches("blue")
+log.recording.stretches("cab")
 
 # %%
-METHODS = {"Kalman": co.Kalman(), "joint": co.JointFilter(), "cooperative": co.CooperativeFilter()}
+METHODS = {"Kalman": co.Kalman(), "no gate": co.JointFilter(robust=False), "cooperative": co.CooperativeFilter()}
 errors = {}
 for name, method in METHODS.items():
-    for car in ("red", "blue"):
+    for car in ("van", "cab"):
         parts = []
         for start, stop in log.recording.stretches(car):
             track = method(log.recording.between(start, stop), [car])
@@ -82,7 +82,7 @@ for name, method in METHODS.items():
         print(f"{name:12s} {car:5s} {rms:.2f} m")
 
 # %% [markdown]
-# The joint filter believes the reflected ranges; the cooperative filter gates them.
+# Without its gate the joint filter believes the reflected ranges; the cooperative filter gates them.
 #
 # ## The figure
 
@@ -90,7 +90,7 @@ for name, method in METHODS.items():
 import matplotlib.pyplot as plt
 
 figure, axes = plt.subplots(2, sharex=True, sharey=True, figsize=(7.2, 4.2), layout="constrained")
-for ax, car in zip(axes, ("red", "blue"), strict=True):
+for ax, car in zip(axes, ("van", "cab"), strict=True):
     for color, name in zip(("#E69F00", "#009E73", "#7A1FA2"), METHODS, strict=True):
         for k, (seconds, error) in enumerate(errors[name, car]):
             ax.plot(seconds, error, color=color, lw=1.2, label=None if k else name)
@@ -102,7 +102,7 @@ figure.savefig(folder / "errors.png")
 
 # %%
 ax = co.plot_recording(log.recording, step=100)
-ax.legend(fontsize=8)
+ax.legend(fontsize=8, markerscale=2)
 ax.figure
 
 # %% [markdown]
@@ -114,7 +114,7 @@ ax.figure
 # %%
 from coopoc.evaluate.metrics import innovation_columns
 
-found = innovation_columns(co.Kalman("nominal")(log.recording, ["red"]), log.recording)
+found = innovation_columns(co.Kalman("nominal")(log.recording, ["van"]), log.recording)
 print(f"innovation {found['innovation_m'].mean():.2f} m, NIS {found['nis'].mean():.2f}")
 
 # %% [markdown]

@@ -15,8 +15,8 @@ import numpy as np
 from ...arrays import Floats
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, add_diagonal, choose_each, load, scale, store, subtract, zeros
-from ..compiling.vectors import LANES
-from ..gate import FIX_GATE, YOUNG, count, distance, gain_of, gated_update, inflation
+from ..compiling.vectors import LANES, choose
+from ..gate import FIX_GATE, LEAK, YOUNG, distance, gain_of, gated_update, inflation
 from .messages import BLOCK, POSITION, PROCESS, RELATIVE, ROW, VARIANCE, Star
 from .relative import Numbers, angle, incomplete
 
@@ -65,6 +65,10 @@ def carry(star: Star, gates: Gates, flat: float, n: int, old: int) -> None:
 def gate_star(star: Star, gates: Gates, state: Floats, known: Floats, least: float, n: int) -> None:
     """Inflate the deviations of relative measurements and the variances of positions that are beyond their gates.
 
+    Where the ego's own fix is beyond, the neighbours' speak for or against it: if most of them are beyond as well, it
+    is the ego's position that is wrong, and in the end all count again. Otherwise many neighbours beyond the gate are
+    many wrong messages.
+
     Args:
         star: of this step.
         gates: brought forward.
@@ -73,18 +77,19 @@ def gate_star(star: Star, gates: Gates, state: Floats, known: Floats, least: flo
         least: m.
     """
     origin, ego = load(state, 0, ROW), load(gates.state, 0, STATE)
-    hits = gate_position(star, 0, origin, ego[:9], ego[12])
-    store(gates.state, 0, (*ego[:12], hits))
+    o, hits = 0.0 * ego[12], ego[12]
+    total = own = gate_position(star, 0, origin, ego[:9], hits)
     for k in range(1, n):
         at, seen, memory = load(state, k, ROW), load(star.relative, k, RELATIVE), load(gates.state, k, STATE)
-        o, std = 0.0 * at[0], seen[5:]
+        std = seen[5:]
         if incomplete(seen):
             far = o + math.inf
             std = choose_each(load(known, k, (0.0,))[0] - 0.5, std, (far, far, far))
         cov, moved, factor, three = gate_components(subtract(at, origin), memory[:9], seen, std, memory[9:12], least)
         store(gates.state, k, (*cov, *three, o))
         store(star.relative, k, inflated(seen, factor))
-        gate_position(star, k, add(at, moved), add(ego[:9], cov), o)
+        total = total + gate_position(star, k, add(at, moved), add(ego[:9], cov), hits)
+    store(gates.state, 0, (*ego[:12], choose(own, max(hits + total, o), max(hits + LEAK * own, o))))
 
 
 @inner
@@ -102,12 +107,13 @@ def inflated(seen: Numbers, factor: Numbers) -> Numbers:
 
 @inner
 def gate_position(star: Star, k: int, at: Numbers, cov: Numbers, hits: float) -> float:
-    """Inflate the variance of a member's position; the hits that follow. Callers drop those of neighbours: where many
-    are beyond the gate, it is their messages that are wrong."""
+    """Inflate the variance of a member's position; the gain that it would have had, less than 0 within the gate."""
     variance = load(star.motion, 4 * k + VARIANCE, ROW)
     q = distance(subtract(load(star.motion, 4 * k + POSITION, ROW), at), add_diagonal(cov, variance))
     store(star.motion, 4 * k + VARIANCE, scale(variance, inflation(q, FIX_GATE, hits)))
-    return count(q, FIX_GATE, hits, gain_of(cov, variance))
+    gain: float = gain_of(cov, variance)
+    signed: float = choose(q - FIX_GATE, gain, -gain)
+    return signed
 
 
 @inner

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ...errors import InputError
+from ...errors import InputError, require
 from .factor import LOSSES, Factor, Loss
 from .measurements import Measurement, converted_rows, is_converted
 from .space import Space
@@ -303,7 +303,9 @@ def write(kind: Kind, model: Model) -> Written:
 
     Raises:
         InputError: CasADi cannot run the formula, or no tape has an operation of it.
+        MissingLibraryError: CasADi is not installed.
     """
+    require("casadi", "the derivative of a measurement")
     import casadi as ca
 
     if model == "converted":
