@@ -179,11 +179,11 @@ def road_motion(motion: MotionNoise, velocity: Floats, dt: float, moved: Floats,
 
 
 @compiled
-def run_road(seen: SoloMeasurements, noise: RoadNoise, x: Floats, cov: Floats, errors: Floats) -> None:
+def run_road(measurements: SoloMeasurements, noise: RoadNoise, x: Floats, cov: Floats, errors: Floats) -> None:
     """Fill the estimates of all runs and E vehicles, each alone.
 
     Args:
-        seen: the vehicles and their measurements.
+        measurements: the vehicles and their measurements.
         noise: that is assumed.
         x: (R, T, E, 3) m.
         cov: (R, T, E, 3, 3) m^2.
@@ -195,14 +195,14 @@ def run_road(seen: SoloMeasurements, noise: RoadNoise, x: Floats, cov: Floats, e
     cov[:] = 0.0
     for run in range(runs):
         for e in range(vehicles):
-            n = seen.columns[e]
+            n = measurements.columns[e]
             state.x[0] = math.nan
             for t in range(steps):
-                motion = process_variance(seen.motion, seen.velocity[run, t, n], seen.dt)
+                motion = process_variance(measurements.motion, measurements.velocity[run, t, n], measurements.dt)
                 for c in range(3):
-                    moved[c] = seen.dt * seen.velocity[run, t, n, c]
-                    q[c] = motion[c] + seen.process[run, t, n, c]
-                road_step(state, noise, moved, q, seen.dt, seen.gnss[run, t, n], late)
+                    moved[c] = measurements.dt * measurements.velocity[run, t, n, c]
+                    q[c] = motion[c] + measurements.process[run, t, n, c]
+                road_step(state, noise, moved, q, measurements.dt, measurements.gnss[run, t, n], late)
                 scale = state.more[SCALE]
                 x[run, t, e, 0], x[run, t, e, 1], x[run, t, e, 2] = state.x[0], state.x[1], state.more[Z]
                 for i in range(2):

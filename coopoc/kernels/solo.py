@@ -127,30 +127,32 @@ def step(
 
 
 @compiled
-def run_filter(seen: SoloMeasurements, rule: FixNoise, known: bool, index: Ints, x: Floats, p: Floats) -> Floats:
+def run_filter(
+    measurements: SoloMeasurements, rule: FixNoise, exact: bool, index: Ints, x: Floats, p: Floats
+) -> Floats:
     """Fill x m and p m^2 of the vehicles, and return the variance of each fix, where it is estimated or gated.
 
     A vehicle that was absent starts at its first fix.
 
     Args:
-        seen: the vehicles and their measurements.
+        measurements: the vehicles and their measurements.
         rule: noise of the fixes.
-        known: whether x[:, 0] is given and exact; if not, it is a fix.
+        exact: whether x[:, 0] is given and exact; if not, it is a fix.
         index: (E,) of the vehicles in x and p.
         x: (R, T, E or N, 3).
         p: the same.
     """
     varies = math.isfinite(rule.weight) or rule.gate > 0.0
-    noise, states = np.empty(x.shape if varies else (0, 0, 0, 3)), np.empty((len(seen.columns), 3, 6))
-    filter_runs(seen, rule, known, index, states, x, p, noise)
+    noise, states = np.empty(x.shape if varies else (0, 0, 0, 3)), np.empty((len(measurements.columns), 3, 6))
+    filter_runs(measurements, rule, exact, index, states, x, p, noise)
     return noise
 
 
 @part
 def filter_runs(
-    seen: SoloMeasurements,
+    measurements: SoloMeasurements,
     rule: FixNoise,
-    known: bool,
+    exact: bool,
     index: Ints,
     states: Floats,
     x: Floats,
@@ -159,17 +161,21 @@ def filter_runs(
 ) -> None:
     """`run_filter` in given memory."""
     adaptive, varies = math.isfinite(rule.weight), len(noise) > 0
-    for run in range(seen.gnss.shape[0]):
-        for t in range(seen.gnss.shape[1]):
-            for e in range(len(seen.columns)):
-                n, at = seen.columns[e], index[e]
-                q = process_variance(seen.motion, seen.velocity[run, t, n], seen.dt)
-                u, more, fix = seen.velocity[run, t, n], seen.process[run, t, n], three(seen.gnss[run, t, n])
+    for run in range(measurements.gnss.shape[0]):
+        for t in range(measurements.gnss.shape[1]):
+            for e in range(len(measurements.columns)):
+                n, at = measurements.columns[e], index[e]
+                q = process_variance(measurements.motion, measurements.velocity[run, t, n], measurements.dt)
+                u, more, fix = (
+                    measurements.velocity[run, t, n],
+                    measurements.process[run, t, n],
+                    three(measurements.gnss[run, t, n]),
+                )
                 q = more[0] + q[0], more[1] + q[1], more[2] + q[2]
-                moved = seen.dt * u[0], seen.dt * u[1], seen.dt * u[2]
+                moved = measurements.dt * u[0], measurements.dt * u[1], measurements.dt * u[2]
                 gated = gate_fix(states[e], moved, q, fix, NEVER, rule.gate if t > 0 else 0.0)
                 for c in range(3):
-                    if t == 0 and known:
+                    if t == 0 and exact:
                         state = start_state(x[run, 0, at, c], 0.0, True, rule.variance[c], rule.weight)
                     elif t == 0 or math.isnan(states[e, c, 0] + moved[c]):
                         state = start_state(fix[c], 0.0, False, rule.variance[c], rule.weight)

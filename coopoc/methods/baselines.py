@@ -102,11 +102,11 @@ class MSMV:
 
 
 def solo_estimates(
-    recording: Recording, known: NoiseModel, egos: Sequence[int], robust: bool = False
+    recording: Recording, noise_model: NoiseModel, egos: Sequence[int], robust: bool = False
 ) -> tuple[Assumptions, Floats]:
     """What a filter assumes whose messages hold solo estimates, and these, (R, T, N, 3) m of all vehicles in the stars
     of some egos (columns); `robust` as of Kalman."""
     links = recording.links
     members = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
-    x, p, _ = solo_filter(recording, members, known, fix_noise(known, robust), in_place=True)
-    return assumptions(recording, known)._replace(broadcast=p), x
+    x, p, _ = solo_filter(recording, members, noise_model, fix_noise(noise_model, robust), in_place=True)
+    return assumptions(recording, noise_model)._replace(broadcast=p), x

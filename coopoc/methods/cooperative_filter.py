@@ -132,9 +132,9 @@ class CooperativeFilter:
         return follow_egos(self, recording, egos, run, notes)
 
 
-def broadcasts(recording: Recording, known: NoiseModel, egos: Sequence[int], guards: Guards) -> Sent:
+def broadcasts(recording: Recording, noise_model: NoiseModel, egos: Sequence[int], guards: Guards) -> Sent:
     """Messages of the vehicles in the stars of some egos, each filtered alone until it is in none any more."""
-    links, assumed, model = recording.links, assumptions(recording, known), model_of(known, robust=False)
+    links, assumed, model = recording.links, assumptions(recording, noise_model), model_of(noise_model, robust=False)
     x, variance, moved = (np.zeros_like(np.moveaxis(recording.gnss, 2, 0), order="C") for _ in range(3))
     none, nothing = Sent(NOTHING, NOTHING, NOTHING), inbox(recording, egos[0], FIX_AND_VELOCITY)
     seen, here = measurements(recording, egos[0], nothing), np.isin(links.observer, egos)
@@ -168,21 +168,21 @@ def lasting(ego: str, residual: Floats, dt: float) -> list[str]:
     return [f"fixes, {ego}: errors a second apart are correlated by {found:.2f}; give Sensors(gnss_drift_std=...)"]
 
 
-def guards_of(method: CooperativeFilter, known: NoiseModel) -> Guards:
+def guards_of(method: CooperativeFilter, noise_model: NoiseModel) -> Guards:
     """The method's own; none of the textbook filter, nor where no noise is stated that an innovation could exceed."""
-    return method.guards if method.robust and known.sensors is not None else NO_GUARDS
+    return method.guards if method.robust and noise_model.sensors is not None else NO_GUARDS
 
 
-def model_of(known: NoiseModel, robust: bool) -> Model:
+def model_of(noise_model: NoiseModel, robust: bool) -> Model:
     """The noise model of the kernel; of the textbook filter all errors are white."""
-    std, least = relative_noise(known)
+    std, least = relative_noise(noise_model)
     white, own, common, time, bias, heading = np.ones(3), 0.0, 0.0, 1.0, 0.0, 0.0
-    if robust and known.sensors is not None:
-        sensors, std = known.sensors, np.array(std)
+    if robust and noise_model.sensors is not None:
+        sensors, std = noise_model.sensors, np.array(std)
         own, common = sensors.gnss_drift_std**2, sensors.gnss_common_std**2
         white = np.square(sensors.gnss_std) / np.square(sensors.fix_std)
         time = float(sensors.gnss_drift_time)
-        heading, bias = (float(value**2) for value in known.compass)
+        heading, bias = (float(value**2) for value in noise_model.compass)
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
-    shape = float(least), float(known.exact_relative), FORGOTTEN, ACCELERATION_STD
+    shape = float(least), float(noise_model.exact_relative), FORGOTTEN, ACCELERATION_STD
     return Model(std, *shape, own, common, time, white, bias, heading, float(robust))

@@ -186,9 +186,9 @@ class AdaptiveKalman:
         return known._replace(weight=float(self.prior_weight), window=float(self.window))
 
 
-def fix_noise(known: NoiseModel, robust: bool) -> FixNoise:
+def fix_noise(noise_model: NoiseModel, robust: bool) -> FixNoise:
     """Known noise of fixes, gated if robust; not where no noise is stated that an innovation could exceed."""
-    return FixNoise(known.gnss_variance, gate=FIX_GATE if robust and known.exact_relative else 0.0)
+    return FixNoise(noise_model.gnss_variance, gate=FIX_GATE if robust and noise_model.exact_relative else 0.0)
 
 
 def solo_track(

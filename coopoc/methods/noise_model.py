@@ -178,7 +178,7 @@ def resolve(noise_model: NoiseModel | str, recording: Recording | None, relative
     )
 
 
-def _with_range_floor(known: NoiseModel, recording: Recording | None) -> NoiseModel:
+def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> NoiseModel:
     """The model with a floor for the range's std where the direction of a range is uncertain; a note reports it.
 
     A direction that is off by e shortens d to d cos e along the assumed one: by d e^2 / 2, whose standard deviation is
@@ -188,46 +188,50 @@ def _with_range_floor(known: NoiseModel, recording: Recording | None) -> NoiseMo
     References:
         Lerro, Bar-Shalom, IEEE Trans. AES 29(3), 1993 (converted measurements beyond d std^2 = 0.4 std of the range).
     """
-    if known.sensors is None or not isinstance(recording, Recording) or not (links := recording.relative.shape[1]):
-        return known
+    if (
+        noise_model.sensors is None
+        or not isinstance(recording, Recording)
+        or not (links := recording.relative.shape[1])
+    ):
+        return noise_model
     sample = recording.relative[0, np.linspace(0, links - 1, min(links, SAMPLED)).astype(np.int64)]
-    noise, seen = known.sensors, sample[np.isfinite(sample[:, 0])]
+    noise, seen = noise_model.sensors, sample[np.isfinite(sample[:, 0])]
     directed = seen[np.isfinite(seen[:, 1])]
     if not len(seen):
-        return known
-    far, notes = float(np.median((directed if len(directed) else seen)[:, 0])), known.notes
+        return noise_model
+    far, notes = float(np.median((directed if len(directed) else seen)[:, 0])), noise_model.notes
     if noise.range_std > far / 2:
         given = f"ranges of {far:.3g} m with a std of {noise.range_std:.3g} m"
-        return replace(known, notes=(*notes, f"{given}: none is negative, so that their errors have a mean"))
+        return replace(noise_model, notes=(*notes, f"{given}: none is negative, so that their errors have a mean"))
     if len(directed):
         arc = far * float(np.hypot(noise.azimuth_std**2, noise.inclination_std**2)) / np.sqrt(2.0)
         why = f"angles of {max(noise.azimuth_std, noise.inclination_std):.2g} rad"
     else:
-        fix = float(np.square(known.gnss_std[:2]).mean())
+        fix = float(np.square(noise_model.gnss_std[:2]).mean())
         arc, why = np.sqrt(2.0) * fix / far, f"fixes of {np.sqrt(fix):.2g} m and no azimuth"
     if arc <= noise.range_std:
-        return known
+        return noise_model
     std = float(np.hypot(arc, noise.range_std))
     text = (
         f"assumes a range std of {std:.2g} m, not {noise.range_std:.2g} m: {why} put what is {far:.3g} m away on an arc"
     )
-    return replace(known, sensors=replace(noise, range_std=std), notes=(*notes, text))
+    return replace(noise_model, sensors=replace(noise, range_std=std), notes=(*notes, text))
 
 
-def _resolvable(known: NoiseModel) -> NoiseModel:
+def _resolvable(noise_model: NoiseModel) -> NoiseModel:
     """With relative noise that is not finer than FINEST and UNEVEN say, angles at a distance of 1 m; a note names the
     floor."""
-    if known.sensors is None:
-        return known
-    fix, coarse = max(known.gnss_std), max(known.sensors.relative_std * np.array([1.0, FAR, FAR]))
+    if noise_model.sensors is None:
+        return noise_model
+    fix, coarse = max(noise_model.gnss_std), max(noise_model.sensors.relative_std * np.array([1.0, FAR, FAR]))
     least = max(FINEST * fix, float(np.sqrt(UNEVEN * fix * min(fix, coarse))))
-    if min(known.sensors.relative_std) >= least:
-        return known
+    if min(noise_model.sensors.relative_std) >= least:
+        return noise_model
     names = ("range_std", "azimuth_std", "inclination_std")
-    raised = {name: max(getattr(known.sensors, name), min(least, np.pi)) for name in names}
-    beside = f"finer ones beside a fix of {max(known.gnss_std):g} m exceed double precision"
+    raised = {name: max(getattr(noise_model.sensors, name), min(least, np.pi)) for name in names}
+    beside = f"finer ones beside a fix of {max(noise_model.gnss_std):g} m exceed double precision"
     note = f"assumes relative std of at least {least:.2g} m and rad: {beside}"
-    return replace(known, sensors=replace(known.sensors, **raised), notes=(*known.notes, note))
+    return replace(noise_model, sensors=replace(noise_model.sensors, **raised), notes=(*noise_model.notes, note))
 
 
 def constant_noise(noise_model: NoiseModel | str) -> NoiseModel:
@@ -244,23 +248,26 @@ def constant_noise(noise_model: NoiseModel | str) -> NoiseModel:
     return resolve(noise_model, None)
 
 
-def motion_noise(known: NoiseModel, interval: float | None) -> MotionNoise:
-    """White motion noise as `known` assumes it of a recording with dt = `interval` s; None for the dt of each step."""
+def motion_noise(noise_model: NoiseModel, interval: float | None) -> MotionNoise:
+    """White motion noise that is assumed of a recording with dt = `interval` s; None for the dt of each step."""
     interval = 0.0 if interval is None else check_interval(interval)
-    if known.process_std is not None:
-        return MotionNoise(np.array(known.process_std, dtype=float), np.zeros(3), 0.0, 0.0, interval)
-    assert known.sensors is not None
-    ratio, of_speed = np.full(3, known.sensors.velocity_std_ratio), known.sensors.velocity_reading == "speed"
-    return MotionNoise(np.zeros(3), ratio, float(known.sensors.velocity_floor), float(of_speed), interval)
+    if noise_model.process_std is not None:
+        return MotionNoise(np.array(noise_model.process_std, dtype=float), np.zeros(3), 0.0, 0.0, interval)
+    assert noise_model.sensors is not None
+    ratio, of_speed = (
+        np.full(3, noise_model.sensors.velocity_std_ratio),
+        noise_model.sensors.velocity_reading == "speed",
+    )
+    return MotionNoise(np.zeros(3), ratio, float(noise_model.sensors.velocity_floor), float(of_speed), interval)
 
 
-def process_noise(known: NoiseModel, recording: Recording) -> tuple[Floats, MotionNoise]:
+def process_noise(noise_model: NoiseModel, recording: Recording) -> tuple[Floats, MotionNoise]:
     """Process noise of a recording's steps as a sum: m^2 broadcastable to (R, T, N, 3), and that of the velocity.
 
     It is that of the measured velocity where it is constant or follows it, else `process_variance` alone."""
-    if type(known).process_variance is NoiseModel.process_variance and known.fleet is None:
-        return NO_VARIANCE, motion_noise(known, None)
-    return np.ascontiguousarray(known.process_variance(recording)), NO_MOTION_NOISE
+    if type(noise_model).process_variance is NoiseModel.process_variance and noise_model.fleet is None:
+        return NO_VARIANCE, motion_noise(noise_model, None)
+    return np.ascontiguousarray(noise_model.process_variance(recording)), NO_MOTION_NOISE
 
 
 def check_interval(interval: float) -> float:

@@ -277,9 +277,14 @@ class Joint:
 
     filters: tuple[Filter, ...] = ()
 
-    def __init__(self, known: NoiseModel, exact: bool, robust: bool, start: Floats) -> None:
-        std, least = relative_noise(known)
-        self.options = np.array(std), float(least), exact and known.exact_relative, robust and known.exact_relative
+    def __init__(self, noise_model: NoiseModel, exact: bool, robust: bool, start: Floats) -> None:
+        std, least = relative_noise(noise_model)
+        self.options = (
+            np.array(std),
+            float(least),
+            exact and noise_model.exact_relative,
+            robust and noise_model.exact_relative,
+        )
         self.joint, self.gates, self.start = *make_joint(1), start
 
     def reserve(self, slots: int, vehicles: int) -> None:

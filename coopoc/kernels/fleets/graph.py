@@ -190,19 +190,19 @@ def own_filters(measured: Measured, assumed: Assumed) -> Floats:
 
 
 @part
-def filled(seen: Measurement, vector: Vector, std: Vector) -> tuple[Measurement, Vector]:
+def filled(measured: Measurement, vector: Vector, std: Vector) -> tuple[Measurement, Vector]:
     """A missing or rejected range or angle is that of `vector`, with infinite standard deviation."""
     a, b, c = std
-    a = math.inf if seen[0] < 0.0 else a
-    b = math.inf if seen[1] == 0.0 and seen[2] == 0.0 else b
-    c = math.inf if seen[3] == 0.0 and seen[4] == 0.0 else c
+    a = math.inf if measured[0] < 0.0 else a
+    b = math.inf if measured[1] == 0.0 and measured[2] == 0.0 else b
+    c = math.inf if measured[3] == 0.0 and measured[4] == 0.0 else c
     if a + b + c == math.inf:
-        seen = completed((seen[0], seen[1], seen[2], seen[3], seen[4], a, b, c), vector)
-    return seen, (a, b, c)
+        measured = completed((measured[0], measured[1], measured[2], measured[3], measured[4], a, b, c), vector)
+    return measured, (a, b, c)
 
 
 @compiled
-def measurement(vector: Vector, seen: Measurement, std: Floats, min_range: float, converted: bool) -> Information:
+def measurement(vector: Vector, measured: Measurement, std: Floats, min_range: float, converted: bool) -> Information:
     """Information J^T J and information vector J^T r of one relative measurement at `vector`.
 
     J and r belong to the whitened range and angles. A converted measurement is linear in the vector, with J at the
@@ -210,8 +210,8 @@ def measurement(vector: Vector, seen: Measurement, std: Floats, min_range: float
     """
     unit = len(std) == 0
     a, b, c = (1.0, 1.0, 1.0) if unit else (std[0], std[1], std[2])
-    five = seen[0], seen[1], seen[2], seen[3], seen[4]
-    here, noise = filled(five, vector, (a * seen[5], b * seen[6], c * seen[7]))
+    five = measured[0], measured[1], measured[2], measured[3], measured[4]
+    here, noise = filled(five, vector, (a * measured[5], b * measured[6], c * measured[7]))
     d, ground = here[0], here[0] * here[3]
     if not unit and not converted:
         xx, xy, xz, yy, yz, zz, p, q, r = exact(vector[0], vector[1], vector[2], here, noise, min_range)
@@ -410,10 +410,10 @@ def fuse_delayed(latest: Ints, x: Floats, cov: Floats, measured: Measured, assum
 
 
 @inner
-def at_measurement(seen: Numbers, std: Numbers, least: float) -> Numbers:
+def at_measurement(measured: Numbers, std: Numbers, least: float) -> Numbers:
     """The information of `exact`, upper triangle, at the measured vector itself; its distance is at least `least`."""
-    d, level = max(seen[0], least), max(abs(seen[3]), 1e-3)
-    a, b, c = 1.0 / std[0], seen[3] / (level * level * d * std[1]), 1.0 / (level * d * std[2])
-    tilt = c * seen[3] * seen[4]
-    along = a * seen[3] * seen[2], a * seen[3] * seen[1], a * seen[4]
-    return gram(along, -b * seen[1], b * seen[2], (tilt * seen[2], tilt * seen[1], -c * level * level))
+    d, level = max(measured[0], least), max(abs(measured[3]), 1e-3)
+    a, b, c = 1.0 / std[0], measured[3] / (level * level * d * std[1]), 1.0 / (level * d * std[2])
+    tilt = c * measured[3] * measured[4]
+    along = a * measured[3] * measured[2], a * measured[3] * measured[1], a * measured[4]
+    return gram(along, -b * measured[1], b * measured[2], (tilt * measured[2], tilt * measured[1], -c * level * level))

@@ -62,7 +62,7 @@ from .relative import angle
 
 @compiled
 def run_filter(
-    seen: Measurements, assumed: Assumptions, sent: Sent, known: Model, guards: Guards
+    measurements: Measurements, assumed: Assumptions, sent: Sent, model: Model, guards: Guards
 ) -> tuple[Floats, Floats, Floats, Floats, Floats]:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; weights of the ego's fix (R, T), and by link
     (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the neighbour is trusted.
@@ -71,16 +71,16 @@ def run_filter(
     many steps again, without them. A vehicle that is absent (a velocity of NaN) starts anew.
 
     Args:
-        seen: measurements and messages of the ego.
+        measurements: measurements and messages of the ego.
         assumed: process noise, and the variance of fixes.
         sent: in messages.
-        known: noise model.
+        model: noise model.
         guards: against what may be wrong.
     """
-    runs, steps, vehicles = seen.gnss.shape[0], len(seen.start) - 1, seen.gnss.shape[2]
-    links, most, memory = seen.relative.shape[1], 0, int(guards.memory)
+    runs, steps, vehicles = measurements.gnss.shape[0], len(measurements.start) - 1, measurements.gnss.shape[2]
+    links, most, memory = measurements.relative.shape[1], 0, int(guards.memory)
     for t in range(steps):
-        most = max(most, seen.start[t + 1] - seen.start[t])
+        most = max(most, measurements.start[t + 1] - measurements.start[t])
     x, cov, fixes = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, steps))
     neighbours, notes = np.empty((runs, links, 3)), np.empty((runs, links, 5))
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
@@ -88,11 +88,11 @@ def run_filter(
         f, older, newer = new_filter(1 + most, vehicles), new_filter(1 + most, vehicles), new_filter(1 + most, vehicles)
         t = newest = 0
         while t < steps:
-            first, count = seen.start[t], seen.start[t + 1] - seen.start[t]
-            gather_own(own, seen, assumed, known.white, run, t)
+            first, count = measurements.start[t], measurements.start[t + 1] - measurements.start[t]
+            gather_own(own, measurements, assumed, model.white, run, t)
             for i in range(count):
-                who[i] = seen.neighbour[first + i]
-                gather_neighbour(rows, seen, assumed, sent, run, t, first + i, i)
+                who[i] = measurements.neighbour[first + i]
+                gather_neighbour(rows, measurements, assumed, sent, run, t, first + i, i)
             if math.isnan(own[MOTION]) or (f.g.vectors[0] == 0 and math.isnan(own[FIX])):
                 pause(f, own[DT])
                 copy_filter(f, older)
@@ -105,13 +105,13 @@ def run_filter(
                     copy_filter(newer if t > 0 else f, older)
                 copy_filter(f, newer)
             if f.g.vectors[0] == 0:
-                begin(f, known, guards, own, rows, count, seen.ego)
-            step(f, known, guards, own, rows, who, count)
+                begin(f, model, guards, own, rows, count, measurements.ego)
+            step(f, model, guards, own, rows, who, count)
             if f.alarm[0] > 0 and memory > 0:
                 f.alarm[0] = 0
                 copy_filter(older, newer)
                 copy_filter(older, f)
-                distrust(f, known, guards)
+                distrust(f, model, guards)
                 t = f.step[0]
                 continue
             if t == newest:
@@ -153,29 +153,29 @@ def write(
 
 
 @inside
-def gather_own(own: Floats, seen: Measurements, assumed: Assumptions, white: Floats, run: int, t: int) -> None:
+def gather_own(own: Floats, measurements: Measurements, assumed: Assumptions, white: Floats, run: int, t: int) -> None:
     """The ego's fix and motion at a step."""
-    u, r = seen.velocity[run, t, seen.ego], three_of(assumed.fixes, run, t, seen.ego)
-    q, more = process_variance(assumed.motion, u, seen.dt), three_of(assumed.process, run, t, seen.ego)
-    own[DT] = seen.dt
+    u, r = measurements.velocity[run, t, measurements.ego], three_of(assumed.fixes, run, t, measurements.ego)
+    q, more = process_variance(assumed.motion, u, measurements.dt), three_of(assumed.process, run, t, measurements.ego)
+    own[DT] = measurements.dt
     for c in range(3):
-        own[FIX + c], own[FIX_VARIANCE + c] = seen.gnss[run, t, seen.ego, c], r[c] * white[c]
-        own[MOTION + c], own[MOTION_VARIANCE + c] = seen.dt * u[c], q[c] + more[c]
+        own[FIX + c], own[FIX_VARIANCE + c] = measurements.gnss[run, t, measurements.ego, c], r[c] * white[c]
+        own[MOTION + c], own[MOTION_VARIANCE + c] = measurements.dt * u[c], q[c] + more[c]
 
 
 @inside
 def gather_neighbour(
-    rows: Floats, seen: Measurements, assumed: Assumptions, sent: Sent, run: int, t: int, link: int, i: int
+    rows: Floats, measurements: Measurements, assumed: Assumptions, sent: Sent, run: int, t: int, link: int, i: int
 ) -> None:
     """The measurement of a neighbour, and the newest message held."""
     for c in range(5):
-        rows[i, c] = seen.relative[run, link, c]
-    j, when = seen.neighbour[link], seen.newest[run, link]
-    rows[i, AGE] = (t - when) * seen.dt if when >= 0 else -1.0
+        rows[i, c] = measurements.relative[run, link, c]
+    j, when = measurements.neighbour[link], measurements.newest[run, link]
+    rows[i, AGE] = (t - when) * measurements.dt if when >= 0 else -1.0
     if when < 0:
         return
-    u, fix = seen.velocity[run, when, j], three_of(assumed.fixes, run, when, j)
-    q, more = process_variance(assumed.motion, u, seen.dt), three_of(assumed.process, run, when, j)
+    u, fix = measurements.velocity[run, when, j], three_of(assumed.fixes, run, when, j)
+    q, more = process_variance(assumed.motion, u, measurements.dt), three_of(assumed.process, run, when, j)
     x, p, s = (
         three_of(sent.position, j, run, when),
         three_of(sent.variance, j, run, when),
@@ -187,32 +187,32 @@ def gather_neighbour(
 
 
 @inside
-def step(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+def step(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Predict and update.
 
     Args:
         f: filter, after `begin`.
-        known: noise model.
+        model: noise model.
         guards: against what may be wrong.
         own: (OWN,) the ego's row; the motion of the first step is not used.
         rows: (count, WIDTH) of the neighbours that are measured now.
         vehicles: (count,) which they are.
         count: of them.
     """
-    leave(f, known, guards, own, rows, vehicles, count)
+    leave(f, model, guards, own, rows, vehicles, count)
     f.clock[1] = own[DT]
     if f.step[0] > 0:
         f.clock[0] += own[DT]
     if guards.fix_gate > 0.0:
         steady(f, guards, f.vehicle[0], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
     if f.step[0] > f.joined[0]:
-        predict(f, known, guards, own)
+        predict(f, model, guards, own)
     for k in range(1, len(f.vehicle)):
         if f.vehicle[k] >= 0:
-            predict_member(f, known, guards, rows, k)
+            predict_member(f, model, guards, rows, k)
     for i in range(count):
         if f.slot[vehicles[i]] < 0:
-            join(f, known, guards, rows, vehicles[i], i)
+            join(f, model, guards, rows, vehicles[i], i)
     for k in range(len(f.vehicle)):
         if f.vehicle[k] >= 0:
             first = 3 * f.g.block[k, PLACE]
@@ -223,15 +223,15 @@ def step(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, veh
                 f.q[k, c] = math.nan
             f.q[k, 3] = math.nan
     members = nearest_first(f)
-    add_fix(f, known, guards, own)
-    if known.estimates > 0.0 and members > 0:
-        measure(f, known, guards, rows, members)
+    add_fix(f, model, guards, own)
+    if model.estimates > 0.0 and members > 0:
+        measure(f, model, guards, rows, members)
     for i in range(members):
-        receive(f, known, guards, rows, f.order[i])
-    if known.estimates == 0.0 and members > 0:
-        measure(f, known, guards, rows, members)
+        receive(f, model, guards, rows, f.order[i])
+    if model.estimates == 0.0 and members > 0:
+        measure(f, model, guards, rows, members)
     if guards.trust > 0.0:
-        trust(f, known, guards)
+        trust(f, model, guards)
     f.step[0] += 1
 
 
@@ -260,7 +260,7 @@ def gap2(f: Filter, k: int) -> float:
 
 
 @inside
-def add_fix(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
+def add_fix(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
     """The ego's fix: its position, the error of its receiver, and the one that all share.
 
     An innovation beyond the gate that an odometer's slip explains is one: it is far smaller beside the slip's variance.
@@ -278,12 +278,12 @@ def add_fix(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
         if slipped > guards.fix_gate or 4.0 * slipped > q:
             widen(g, first, -slip)
             innovate(g, h)
-    f.q[0, 3] = q = use_fix(f, known, guards, 0, True, q)
+    f.q[0, 3] = q = use_fix(f, model, guards, 0, True, q)
     f.hits[0, 0] = f.hits[0, 0] + 1 if guards.fix_gate > 0.0 and q > guards.fix_gate else 0
 
 
 @inside
-def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> None:
+def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int) -> None:
     """The relative measurements: linear at the prediction, then at that solution.
 
     Where they contradict the prediction of most members, it is the ego whose odometer has slipped.
@@ -294,19 +294,19 @@ def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int)
         for j in range(3 * g.vectors[0]):
             g.p[i, j] = 0.0
             g.p[j, i] = 0.0
-        g.x[i], g.p[i, i] = 0.0, known.heading
-    if known.exact > 0.0:
-        wrong = first_pass(f, known, guards, rows, members)
+        g.x[i], g.p[i, i] = 0.0, model.heading
+    if model.exact > 0.0:
+        wrong = first_pass(f, model, guards, rows, members)
         if guards.slip > 0.0 and wrong >= 3 and 2 * wrong > members:
             widen(g, 3 * g.block[0, PLACE], (guards.slip * f.clock[1]) ** 2)
-            first_pass(f, known, guards, rows, members)
+            first_pass(f, model, guards, rows, members)
         for k in range(len(f.vehicle)):
             if f.vehicle[k] >= 0:
                 for c in range(3):
                     f.at[k, c] = f.trial.x[3 * g.block[k, PLACE] + c]
     for m in range(members):
         k = f.order[m]
-        if relate(f, known, guards, rows, k, 1 if known.exact > 0.0 else 0):
+        if relate(f, model, guards, rows, k, 1 if model.exact > 0.0 else 0):
             if f.vague[k] > 0.0:
                 settle(g, h, k, f.vague[k])
                 f.vague[k] = f.q[k, 0] = f.q[k, 1] = f.q[k, 2] = 0.0
@@ -320,14 +320,14 @@ def measure(f: Filter, known: Model, guards: Guards, rows: Floats, members: int)
 
 
 @inside
-def first_pass(f: Filter, known: Model, guards: Guards, rows: Floats, members: int) -> int:
+def first_pass(f: Filter, model: Model, guards: Guards, rows: Floats, members: int) -> int:
     """Update `trial` by the measurements linear at the prediction; how many members are beyond a gate."""
     g, h, wrong = f.trial, f.h, 0
     copy_moments(f.g, g)
     for m in range(members):
         k = f.order[m]
         vague = f.vague[k]
-        if relate(f, known, guards, rows, k, 0):
+        if relate(f, model, guards, rows, k, 0):
             for c in range(3):
                 h.gate[c] = 0.0 if vague > 0.0 else guards.gate
             widen(g, 3 * g.block[k, PLACE], vague)
@@ -338,24 +338,24 @@ def first_pass(f: Filter, known: Model, guards: Guards, rows: Floats, members: i
 
 
 @inside
-def relate(f: Filter, known: Model, guards: Guards, rows: Floats, k: int, exact: int) -> bool:
+def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int, exact: int) -> bool:
     """Rows of range, azimuth and inclination of member k, in metres; False if its geometry is not known.
 
     Args:
         f: filter; the rows are linear at `at`.
-        known: noise model.
+        model: noise model.
         guards: for their gate.
         rows: measurements.
         k: slot.
         exact: 1 for range and angles themselves, 0 for the measured vector along their directions.
     """
-    g, h, row, std = f.g, f.h, f.row[k], known.std
+    g, h, row, std = f.g, f.h, f.row[k], model.std
     if not measured_whole(rows, row) and f.vague[k] > 0.0:
         return False
     x, y, z = f.at[k, 0] - f.at[0, 0], f.at[k, 1] - f.at[0, 1], f.at[k, 2] - f.at[0, 2]
     d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
     ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
-    reach = max(far, known.min_range)
+    reach = max(far, model.min_range)
     flat = max(ground, 1e-3 * reach)
     h.used[0], h.used[1], h.used[2] = d >= 0.0, sa != 0.0 or ca != 0.0, si != 0.0 or ci != 0.0
     length = far if exact == 0 else reach

@@ -53,7 +53,7 @@ from .gaussian import (
 
 
 @inside
-def leave(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+def leave(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Find each member's row; marginalise out those that have none, and remember the error of their fixes.
 
     A member that the ego's measurements contradict joins anew; where the ego is lost, it starts anew, and all join.
@@ -64,13 +64,13 @@ def leave(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, ve
         if f.slot[vehicles[i]] >= 0:
             f.row[f.slot[vehicles[i]]] = i
     again = guards.trust > 0.0 and f.step[0] > 0 and not math.isnan(own[FIX]) and lost(f, guards)
-    again = again and start(f, known, guards, own, rows, count)
+    again = again and start(f, model, guards, own, rows, count)
     for k in range(1, len(f.vehicle)):
         j = f.vehicle[k]
         if j < 0 or (f.row[k] >= 0 and not again and not contradicted(f, guards, k)):
             continue
         if f.row[k] >= 0 and f.status[j, TRUSTED] == 0.0:  # the error was estimated beside a wrong position
-            doubt(f, known, guards, j)
+            doubt(f, model, guards, j)
         if has(f.g, k, ERROR):
             first = 3 * f.g.block[k, ERROR]
             for c in range(3):
@@ -95,10 +95,10 @@ def contradicted(f: Filter, guards: Guards, k: int) -> bool:
 
 
 @inside
-def predict(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
+def predict(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
     """Move the ego; errors that last decay, errors of which nothing is known change."""
     g, first = f.g, 3 * f.g.block[0, PLACE]
-    keep = math.exp(-own[DT] / known.time) if known.own + known.common > 0.0 else 1.0
+    keep = math.exp(-own[DT] / model.time) if model.own + model.common > 0.0 else 1.0
     fades = 1.0 - keep * keep
     for c in range(3):
         g.x[first + c] += own[MOTION + c]
@@ -108,11 +108,11 @@ def predict(f: Filter, known: Model, guards: Guards, own: Floats) -> None:
             i, trusted = 3 * g.block[k, ERROR], f.status[f.vehicle[k], TRUSTED] > 0.0
             if trusted:
                 shift(g, i, i, keep - 1.0)
-            widen(g, i, known.own * fades + (0.0 if trusted else guards.walk**2 * own[DT]))
-    if known.common > 0.0:
+            widen(g, i, model.own * fades + (0.0 if trusted else guards.walk**2 * own[DT]))
+    if model.common > 0.0:
         i = 3 * g.block[0, COMMON]
         shift(g, i, i, keep - 1.0)
-        widen(g, i, known.common * fades)
+        widen(g, i, model.common * fades)
 
 
 @inside
@@ -144,7 +144,7 @@ def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, varianc
 
 
 @inside
-def predict_member(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> None:
+def predict_member(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None:
     """Move a member by the velocity in the state, if its messages are late, else by that of its newest message.
 
     A velocity that has served for L s and serves for dt more makes an error of (L + dt)^2 - L^2 times its own variance.
@@ -160,13 +160,13 @@ def predict_member(f: Filter, known: Model, guards: Guards, rows: Floats, k: int
         return
     if age < 0.0:
         f.sent[k], f.serves[k] = -math.inf, 0.0
-        f.vague[k] += known.flat
+        f.vague[k] += model.flat
         return
     if guards.fix_gate > 0.0 and age <= ROUNDING:
         steady(f, guards, f.vehicle[k], rows[row], SPEED, STEP, 1.0)
     if abs(f.sent[k] - sent) > ROUNDING:
         f.serves[k] = 0.0
-    often, changed = 1.0 + 2.0 * f.serves[k] / dt, (dt * age * known.acceleration) ** 2
+    often, changed = 1.0 + 2.0 * f.serves[k] / dt, (dt * age * model.acceleration) ** 2
     f.sent[k], f.serves[k] = sent, f.serves[k] + dt
     for c in range(3):
         g.x[first + c] += dt * rows[row, SPEED + c]
@@ -198,13 +198,13 @@ def update_velocity(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
 
 
 @part
-def join(f: Filter, known: Model, guards: Guards, rows: Floats, vehicle: int, row: int) -> None:
+def join(f: Filter, model: Model, guards: Guards, rows: Floats, vehicle: int, row: int) -> None:
     """Insert a member where the ego measures it, or, where a component is missing, somewhere near."""
     g, k = f.g, 1
     while f.vehicle[k] >= 0:
         k += 1
     f.vehicle[k], f.slot[vehicle], f.row[k] = vehicle, k, row
-    f.joined[k], f.serves[k], f.vague[k] = f.step[0], f.clock[1], known.flat
+    f.joined[k], f.serves[k], f.vague[k] = f.step[0], f.clock[1], model.flat
     f.sent[k] = f.clock[0] - rows[row, AGE] if rows[row, AGE] >= 0.0 else -math.inf
     for c in range(3):
         f.hits[k, c] = 0
@@ -218,9 +218,9 @@ def join(f: Filter, known: Model, guards: Guards, rows: Floats, vehicle: int, ro
         error = insert(g, k, ERROR, 0.0)
         for c in range(3):
             g.x[error + c] = f.status[vehicle, KEPT + c]
-            g.p[error + c, error + c] = f.status[vehicle, KEPT_VARIANCE + c] + known.own
-    elif known.own > 0.0:
-        insert(g, k, ERROR, known.own)
+            g.p[error + c, error + c] = f.status[vehicle, KEPT_VARIANCE + c] + model.own
+    elif model.own > 0.0:
+        insert(g, k, ERROR, model.own)
 
 
 @inside

@@ -68,7 +68,7 @@ def fix_terms(f: Filter, k: int) -> None:
 
 
 @inside
-def receive(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> None:
+def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None:
     """Use the newest message of member k, if it has not been used."""
     g, j, row = f.g, f.vehicle[k], f.row[k]
     age = rows[row, AGE]
@@ -76,14 +76,14 @@ def receive(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> No
     if not unused(f, rows, k):
         return
     velocity, back, changed = has(g, k, VELOCITY), -age, 0.0
-    before = known.estimates > 0.0 and f.status[j, USED] > -math.inf
+    before = model.estimates > 0.0 and f.status[j, USED] > -math.inf
     clone = before and has(g, k, CLONE)
     if velocity:
         changed = (0.5 * guards.acceleration * back * back) ** 2
         if clone:
             use_odometer(f, guards, rows, k, back, changed)
-    believed = content(f, known, rows, k, changed, clone, before)
-    f.q[k, 3] = use_fix(f, known, guards, k, before and believed, innovate(g, f.h))
+    believed = content(f, model, rows, k, changed, clone, before)
+    f.q[k, 3] = use_fix(f, model, guards, k, before and believed, innovate(g, f.h))
     f.status[j, USED] = sent
     for c in range(3):
         f.status[j, LAST + c] = rows[row, SOLO + c]
@@ -95,13 +95,13 @@ def receive(f: Filter, known: Model, guards: Guards, rows: Floats, k: int) -> No
 
 
 @inside
-def use_fix(f: Filter, known: Model, guards: Guards, k: int, again: bool, q: float) -> float:
+def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: float) -> float:
     """Update by the rows of a vehicle's fix, unless its receiver errs otherwise than is assumed; squared Mahalanobis
     distance.
 
     Args:
         f: filter.
-        known: noise model.
+        model: noise model.
         guards: against what may be wrong.
         k: slot.
         again: whether it is not the vehicle's first one, and one that the vehicle believes.
@@ -114,11 +114,11 @@ def use_fix(f: Filter, known: Model, guards: Guards, k: int, again: bool, q: flo
         settle(g, h, k, f.vague[k])
         f.vague[k] = 0.0
         return 0.0
-    if guards.trust > 0.0 and again and used == 3 and q > 0.0 and wrong_on_average(f, known, guards, k, q):
+    if guards.trust > 0.0 and again and used == 3 and q > 0.0 and wrong_on_average(f, model, guards, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.revoked[j, 0], f.revoked[j, 1], f.alarm[0] = f.revoked[j, 0] + 1.0, f.clock[0], 1
         else:
-            doubt(f, known, guards, j)
+            doubt(f, model, guards, j)
         return q
     if f.revoked[j, 0] == 0.0 or f.clock[0] > f.revoked[j, 1]:
         correct(g, h, weight(q, guards.fix_gate))
@@ -126,7 +126,7 @@ def use_fix(f: Filter, known: Model, guards: Guards, k: int, again: bool, q: flo
 
 
 @inside
-def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone: bool, before: bool) -> bool:
+def content(f: Filter, model: Model, rows: Floats, k: int, changed: float, clone: bool, before: bool) -> bool:
     """Rows of what the message of member k says of its position when it was sent.
 
     The odometer's error of the fixes since the last message is `middle` times that of the whole way, so that they are
@@ -150,7 +150,7 @@ def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone
             carried, p0 = f.status[j, LAST + c] + moved, f.status[j, LAST + 3 + c]
             m, r, walk, middle = fixes_between(m, r, carried, p0, spent, steps, rows[row, TYPICAL + c])
             used, believed = r > 0.0, believed and r < 4.0 * rows[row, TYPICAL + c]
-            r = r * known.white[c] + walk
+            r = r * model.white[c] + walk
             if clone:
                 m += (middle - 1.0) * moved
                 h.weight[4 * c], h.weight[9 * terms + 4 * c] = middle, middle * back
@@ -159,7 +159,7 @@ def content(f: Filter, known: Model, rows: Floats, k: int, changed: float, clone
                 r += (1.0 - middle) ** 2 * spent
         if not velocity:
             m += age * rows[row, SPEED + c]
-            r += old * old * (one + (f.clock[1] * age * known.acceleration) ** 2)
+            r += old * old * (one + (f.clock[1] * age * model.acceleration) ** 2)
         expect(h, c, m, r + changed)
         h.used[c] = used
     return believed
@@ -241,7 +241,7 @@ def clone_position(f: Filter, k: int, back: float, changed: float) -> None:
 
 
 @inside
-def wrong_on_average(f: Filter, known: Model, guards: Guards, k: int, q: float) -> bool:
+def wrong_on_average(f: Filter, model: Model, guards: Guards, k: int, q: float) -> bool:
     """Whether the mean of a vehicle's innovations, each clipped, is likelier with another error of its fixes than is
     assumed; or, where that error is being estimated, with the last one alone."""
     h, status, j = f.h, f.status, f.vehicle[k]
@@ -254,7 +254,7 @@ def wrong_on_average(f: Filter, known: Model, guards: Guards, k: int, q: float) 
         mean[c] += (clip * h.gap[c] - mean[c]) / count
         for d in range(3):
             s[c, d] = h.cov[3 * c + d]
-        s[c, c] += h.variance[c] / count + (1.0 if known.own > 0.0 else 0.0)
+        s[c, c] += h.variance[c] / count + (1.0 if model.own > 0.0 else 0.0)
     odds = math.log((1.0 - guards.share) / guards.share)
     near, narrow = distance(s, mean)
     if count < 3.0 or near < 2.0 * (odds + guards.revoke):
@@ -266,16 +266,16 @@ def wrong_on_average(f: Filter, known: Model, guards: Guards, k: int, q: float) 
 
 
 @part
-def trust(f: Filter, known: Model, guards: Guards) -> None:
+def trust(f: Filter, model: Model, guards: Guards) -> None:
     """Set the error of fixes to zero, or to what drifts, while that is likelier than any other: the surest first.
 
     The odds p(b = 0 | all) / p(b = 0) of a Gaussian b are by Bayes' rule those of the two hypotheses.
     """
     g, h, s, x = f.g, f.h, f.h.square, f.h.gap
-    wide, narrow, unit = guards.tau**2 + known.own, 0.0, guards.tau**2
-    if known.own > 0.0:
-        narrow = 1.0 / (1.0 / known.own - 1.0 / wide)
-        unit = wide / known.own * narrow
+    wide, narrow, unit = guards.tau**2 + model.own, 0.0, guards.tau**2
+    if model.own > 0.0:
+        narrow = 1.0 / (1.0 / model.own - 1.0 / wide)
+        unit = wide / model.own * narrow
     while True:
         best, most = ABSENT, guards.sure
         for k in range(len(f.vehicle)):
@@ -301,5 +301,5 @@ def trust(f: Filter, known: Model, guards: Guards) -> None:
             expect(h, c, 0.0, max(narrow, 1e-6))
             f.status[j, MEAN + c] = 0.0
         update(g, h, 0.0)
-        if known.own == 0.0:
+        if model.own == 0.0:
             remove(g, best, ERROR)

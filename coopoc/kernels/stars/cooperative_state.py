@@ -230,7 +230,7 @@ def copy_filter(source: Filter, target: Filter) -> None:
 
 
 @part
-def begin(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, count: int, ego: int) -> None:
+def begin(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, count: int, ego: int) -> None:
     """The first step: no vehicle has been met."""
     for j in range(len(f.slot)):
         for c in range(STATUS):
@@ -241,16 +241,16 @@ def begin(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, co
             f.status[j, KEPT_VARIANCE + c] = guards.tau**2
     f.vehicle[0], f.slot[ego] = ego, 0
     insert(f.g, 0, PLACE, 0.0)
-    if known.common > 0.0:
-        insert(f.g, 0, COMMON, known.common)
-    if known.bias + known.heading > 0.0:
-        first = insert(f.g, 0, COMPASS, known.bias)
+    if model.common > 0.0:
+        insert(f.g, 0, COMMON, model.common)
+    if model.bias + model.heading > 0.0:
+        first = insert(f.g, 0, COMPASS, model.bias)
         f.g.p[first + 2, first + 2] = 0.0
-    start(f, known, guards, own, rows, count)
+    start(f, model, guards, own, rows, count)
 
 
 @part
-def start(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, count: int) -> bool:
+def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, count: int) -> bool:
     """The ego stands somewhere near its fix, which is trusted.
 
     Where no other position, of a message less its vector, agrees with the fix, but two or more do with one another, the
@@ -267,20 +267,20 @@ def start(f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, co
             best, most = i, agree
     if most < 2 and f.status[ego, TRUSTED] == 0.0 and f.clock[0] <= f.revoked[ego, 1] + guards.lost:
         return False
-    f.vague[0], f.joined[0], f.hits[0, 0] = known.flat, f.step[0], 0
+    f.vague[0], f.joined[0], f.hits[0, 0] = model.flat, f.step[0], 0
     clear(g, 0)
     f.status[ego, TRUSTED], f.status[ego, COUNT] = 1.0, 0.0
     remove(g, 0, ERROR)
-    if known.own > 0.0:
-        insert(g, 0, ERROR, known.own)
+    if model.own > 0.0:
+        insert(g, 0, ERROR, model.own)
     for c in range(3):
         g.x[c], f.status[ego, MEAN + c] = own[FIX + c], 0.0
     if alone and best >= 0:
         f.vague[0] = 0.0
         for c in range(3):
             g.x[c], own[FIX + c] = rows[best, SOLO + c] - across(rows, best, c), math.nan
-        widen(g, 0, known.flat)
-    distrust(f, known, guards)
+        widen(g, 0, model.flat)
+    distrust(f, model, guards)
     return True
 
 
@@ -315,15 +315,15 @@ def pause(f: Filter, dt: float) -> None:
 
 
 @part
-def distrust(f: Filter, known: Model, guards: Guards) -> None:
+def distrust(f: Filter, model: Model, guards: Guards) -> None:
     """In a state of before, revoke the trust that vehicles have lost since."""
     for j in range(len(f.slot)):
         if f.revoked[j, 0] > 0.0 and f.revoked[j, 1] >= f.clock[0] and f.status[j, TRUSTED] > 0.0:
-            doubt(f, known, guards, j)
+            doubt(f, model, guards, j)
 
 
 @part
-def doubt(f: Filter, known: Model, guards: Guards, j: int) -> None:
+def doubt(f: Filter, model: Model, guards: Guards, j: int) -> None:
     """The fixes of vehicle j have an error of which nothing is known."""
     f.status[j, TRUSTED] = f.status[j, COUNT] = 0.0
     for c in range(3):
@@ -331,7 +331,7 @@ def doubt(f: Filter, known: Model, guards: Guards, j: int) -> None:
         f.status[j, KEPT_VARIANCE + c] = guards.tau**2
     if f.slot[j] >= 0:
         remove(f.g, f.slot[j], ERROR)
-        insert(f.g, f.slot[j], ERROR, guards.tau**2 + known.own)
+        insert(f.g, f.slot[j], ERROR, guards.tau**2 + model.own)
 
 
 @part

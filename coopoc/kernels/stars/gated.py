@@ -62,7 +62,7 @@ def carry(star: Star, gates: Gates, flat: float, n: int, old: int) -> None:
 
 
 @inner
-def gate_star(star: Star, gates: Gates, state: Floats, known: Floats, least: float, n: int) -> None:
+def gate_star(star: Star, gates: Gates, state: Floats, placed: Floats, least: float, n: int) -> None:
     """Inflate the deviations of relative measurements and the variances of positions that are beyond their gates.
 
     Where the ego's own fix is beyond, the neighbours' speak for or against it: if most of them are beyond as well, it
@@ -73,7 +73,7 @@ def gate_star(star: Star, gates: Gates, state: Floats, known: Floats, least: flo
         star: of this step.
         gates: brought forward.
         state: (3 n, LANES) m, predicted positions.
-        known: (n, LANES) 1 where something is known of where a member is, else 0.
+        placed: (n, LANES) 1 where something is known of where a member is, else 0.
         least: m.
     """
     origin, ego = load(state, 0, ROW), load(gates.state, 0, STATE)
@@ -84,7 +84,7 @@ def gate_star(star: Star, gates: Gates, state: Floats, known: Floats, least: flo
         std = seen[5:]
         if incomplete(seen):
             far = o + math.inf
-            std = choose_each(load(known, k, (0.0,))[0] - 0.5, std, (far, far, far))
+            std = choose_each(load(placed, k, (0.0,))[0] - 0.5, std, (far, far, far))
         cov, moved, factor, three = gate_components(subtract(at, origin), memory[:9], seen, std, memory[9:12], least)
         store(gates.state, k, (*cov, *three, o))
         store(star.relative, k, inflated(seen, factor))
@@ -99,10 +99,19 @@ def set_ego(gates: Gates, cov: Numbers) -> None:
 
 
 @inside
-def inflated(seen: Numbers, factor: Numbers) -> Numbers:
+def inflated(measured: Numbers, factor: Numbers) -> Numbers:
     """A measurement, its standard deviations times three factors."""
     a, b, c = factor
-    return seen[0], seen[1], seen[2], seen[3], seen[4], a * seen[5], b * seen[6], c * seen[7]
+    return (
+        measured[0],
+        measured[1],
+        measured[2],
+        measured[3],
+        measured[4],
+        a * measured[5],
+        b * measured[6],
+        c * measured[7],
+    )
 
 
 @inner
@@ -118,14 +127,14 @@ def gate_position(star: Star, k: int, at: Numbers, cov: Numbers, hits: float) ->
 
 @inner
 def gate_components(
-    gap: Numbers, cov: Numbers, seen: Numbers, std: Numbers, hits: Numbers, least: float
+    gap: Numbers, cov: Numbers, measured: Numbers, std: Numbers, hits: Numbers, least: float
 ) -> tuple[Numbers, Numbers, Numbers, Numbers]:
     """Update a vector by range, azimuth and inclination, one after the other, gated.
 
     Args:
         gap: m, the predicted vector.
         cov: (9,) m^2, of it.
-        seen: `relative.five`.
+        measured: `relative.five`.
         std: m, rad, rad; infinite for what was not measured.
         hits: (3,) of these components.
         least: m, least distance at which an angle's error counts.
@@ -138,12 +147,12 @@ def gate_components(
     ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
     reach = max(far, least)
     flat = max(ground, 1e-3 * reach)
-    turned = angle(seen[1] * x - seen[2] * y, seen[2] * x + seen[1] * y)
-    raised = angle(seen[3] * z - seen[4] * ground, seen[4] * z + seen[3] * ground)
+    turned = angle(measured[1] * x - measured[2] * y, measured[2] * x + measured[1] * y)
+    raised = angle(measured[3] * z - measured[4] * ground, measured[4] * z + measured[3] * ground)
     a, b, c = std[0], std[1] * flat, std[2] * reach
     ray, side = (x / far, y / far, z / far), (-y / flat, x / flat, o)
     up = scale((x * z, y * z, -ground * ground), 1.0 / (flat * reach))
-    cov, moved, f, first = gated_update(cov, zeros(o, ROW), ray, seen[0] - far, a * a, hits[0])
+    cov, moved, f, first = gated_update(cov, zeros(o, ROW), ray, measured[0] - far, a * a, hits[0])
     cov, moved, g, second = gated_update(cov, moved, side, turned * flat, b * b, hits[1])
     cov, moved, h, third = gated_update(cov, moved, up, raised * reach, c * c, hits[2])
     return cov, moved, (math.sqrt(f), math.sqrt(g), math.sqrt(h)), (first, second, third)

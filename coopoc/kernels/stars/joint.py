@@ -204,10 +204,10 @@ def place_on_broadcast(star: Star, joint: Joint, n: int) -> None:
 
 
 @inside
-def placed(joint: Joint, k: int, seen: Numbers) -> float:
+def placed(joint: Joint, k: int, measured: Numbers) -> float:
     """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
     own = load(joint.information, (k - 1) * joint.stride + k - 1, BLOCK)[0]
-    whole = 0.0 * seen[0] + 1e300 - (seen[5] + seen[6] + seen[7])
+    whole = 0.0 * measured[0] + 1e300 - (measured[5] + measured[6] + measured[7])
     one = 0.0 * own + 1.0
     share: float = choose(whole, one, choose(own - LEAST_KNOWN, one, 0.0 * own))
     return share

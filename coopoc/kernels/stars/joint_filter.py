@@ -46,25 +46,25 @@ from .messages import (
 
 
 @as_written
-def run_filter(seen: Measurements, known: Assumptions, refine: bool, robust: bool) -> Estimates:
+def run_filter(measurements: Measurements, model: Assumptions, refine: bool, robust: bool) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m.
 
     Args:
-        seen: measurements and messages of the ego.
-        known: noise model.
+        measurements: measurements and messages of the ego.
+        model: noise model.
         refine: one Gauss-Newton step on range and angles.
         robust: gate innovations.
     """
-    runs, steps = seen.gnss.shape[:2]
-    out = new_estimates(seen)
-    most = largest(seen.start)
+    runs, steps = measurements.gnss.shape[:2]
+    out = new_estimates(measurements)
+    most = largest(measurements.start)
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
         star, joint, gates = star_within(most), joint_within(most), gates_within(most)
         for t in range(steps):
-            n = gather(star, seen, known, first, last, t, old)
-            step(star, joint, gates, known, refine, robust, n, old)
-            write(out, joint, first, last, t, seen.start[t], n)
+            n = gather(star, measurements, model, first, last, t, old)
+            step(star, joint, gates, model, refine, robust, n, old)
+            write(out, joint, first, last, t, measurements.start[t], n)
             old = n
     return out
 
@@ -84,22 +84,22 @@ def write(out: Estimates, joint: Joint, first: int, last: int, t: int, link: int
 
 @inner
 def step(
-    star: Star, joint: Joint, gates: Gates, known: Assumptions, refine: bool, robust: bool, n: int, old: int
+    star: Star, joint: Joint, gates: Gates, model: Assumptions, refine: bool, robust: bool, n: int, old: int
 ) -> None:
     """Predict and update the state of n members, `old` of them before; the ego's covariance is then in `scratch`."""
-    flat = 1.0 / known.flat
+    flat = 1.0 / model.flat
     predict_state(star, joint, n, old)
     predict(joint.information, old, joint.stride, joint.process, joint.scratch)
     rearrange(star, joint, n, old, (flat, flat, flat))
     place_on_broadcast(star, joint, n)
     if robust:
-        carry(star, gates, known.flat, n, old)
+        carry(star, gates, model.flat, n, old)
         for k in range(1, n):
             store(joint.move, k, (placed(joint, k, load(star.relative, k, RELATIVE)),))
-        gate_star(star, gates, joint.state, joint.move, known.min_range, n)
+        gate_star(star, gates, joint.state, joint.move, model.min_range, n)
     clear(joint.eta)
     add_fixes(star, joint, n)
-    update(star, joint, known, refine, n)
+    update(star, joint, model, refine, n)
     set_ego(gates, load(joint.scratch, 0, BLOCK))
 
 
@@ -116,7 +116,7 @@ def add_fixes(star: Star, joint: Joint, n: int) -> None:
 
 
 @inner
-def update(star: Star, joint: Joint, known: Assumptions, refine: bool, n: int) -> None:
+def update(star: Star, joint: Joint, model: Assumptions, refine: bool, n: int) -> None:
     """Add the relative measurements, converted at the predicted geometry, and solve; to refine, solve a copy and add
     them once more, exact, linear at that solution."""
     last = 1 if refine and n > 1 else 0
@@ -130,9 +130,9 @@ def update(star: Star, joint: Joint, known: Assumptions, refine: bool, n: int) -
                 store(eta, i, load(joint.eta, i, ROW))
         for k in range(1, n):
             if stage == 1:
-                weight, vector = exact_information(star, joint, k, n, known.min_range)
+                weight, vector = exact_information(star, joint, k, n, model.min_range)
             else:
-                weight, vector = relative_information(star, joint, k, known.relative_std, known.min_range)
+                weight, vector = relative_information(star, joint, k, model.relative_std, model.min_range)
             add_relative(a, eta, joint.stride, k, n, weight, vector)
         store(joint.scratch, 0, negate(solve(a, joint, eta, n)))
     move(joint, n)

@@ -26,26 +26,26 @@ from .relative import Numbers, vector
 
 
 @as_written
-def run_lkf_sa(seen: Measurements, known: Assumptions) -> Estimates:
+def run_lkf_sa(measurements: Measurements, model: Assumptions) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
-    runs, steps = seen.gnss.shape[:2]
-    out = new_estimates(seen)
-    most = largest(seen.start)
+    runs, steps = measurements.gnss.shape[:2]
+    out = new_estimates(measurements)
+    most = largest(measurements.start)
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
         star, joint = star_within(most), joint_within(most)
         for t in range(steps):
-            n = gather(star, seen, known, first, last, t, old)
-            step(star, joint, known, n, old)
-            write(out, joint, first, last, t, seen.start[t], n)
+            n = gather(star, measurements, model, first, last, t, old)
+            step(star, joint, model, n, old)
+            write(out, joint, first, last, t, measurements.start[t], n)
             old = n
     return out
 
 
 @inner
-def step(star: Star, joint: Joint, known: Assumptions, n: int, old: int) -> None:
+def step(star: Star, joint: Joint, model: Assumptions, n: int, old: int) -> None:
     """Predict, add fixes and the Laplacian's measurement, and solve; the ego's covariance is then in `scratch`."""
-    flat = 1.0 / known.flat
+    flat = 1.0 / model.flat
     predict_state(star, joint, n, old)
     for k in range(1, n):
         if star.previous[k] < 0:
@@ -55,23 +55,23 @@ def step(star: Star, joint: Joint, known: Assumptions, n: int, old: int) -> None
     rearrange(star, joint, n, old, (flat, flat, flat))
     clear(joint.eta)
     add_fixes(star, joint, n)
-    add_laplacian(star, joint, known, n)
+    add_laplacian(star, joint, model, n)
     store(joint.scratch, 0, negate(solve(joint.information, joint, joint.eta, n)))
     move(joint, n)
 
 
 @inner
-def add_laplacian(star: Star, joint: Joint, known: Assumptions, n: int) -> None:
+def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
     """Add L W L and L W (delta - L x), L the Laplacian of the star of complete measurements: W is 1, or the edges'
     information over the degree; that of an edge is the inverse mean variance per axis of the converted vectors."""
-    o, std, stride, e = 0.0 * load(joint.state, 0, ROW)[0], known.relative_std, joint.stride, n - 1
+    o, std, stride, e = 0.0 * load(joint.state, 0, ROW)[0], model.relative_std, joint.stride, n - 1
     count, total, gaps = o, o, (o, o, o)
     for k in range(1, n):
         edge, gap = edge_to(star, joint, k)
         count, gaps = count + edge, add(gaps, gap)
         if len(std):
             d, up = (
-                max(load(star.relative, 8 * k, (0.0,))[0], known.min_range),
+                max(load(star.relative, 8 * k, (0.0,))[0], model.min_range),
                 load(star.relative, 8 * k + 3, (0.0,))[0],
             )
             total = total + edge * (std[0] * std[0] + d * d * (std[1] * std[1] * up * up + std[2] * std[2]))

@@ -124,10 +124,14 @@ def star_within(most: int) -> Star:
 
 
 @storage
-def new_estimates(seen: Measurements) -> Estimates:
+def new_estimates(measurements: Measurements) -> Estimates:
     """Room for the estimates of all runs and steps, made by compiled code."""
-    runs, steps = seen.gnss.shape[:2]
-    return np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, seen.relative.shape[1], 3))
+    runs, steps = measurements.gnss.shape[:2]
+    return (
+        np.empty((runs, steps, 3)),
+        np.empty((runs, steps, 3, 3)),
+        np.empty((runs, measurements.relative.shape[1], 3)),
+    )
 
 
 @inner
@@ -140,30 +144,30 @@ def largest(start: Ints) -> int:
 
 
 @inner
-def gather(star: Star, seen: Measurements, known: Assumptions, first: int, last: int, t: int, old: int) -> int:
+def gather(star: Star, measurements: Measurements, model: Assumptions, first: int, last: int, t: int, old: int) -> int:
     """Fill the star of step t for runs first to last, at most LANES, the last one repeated; the number of its members.
 
     Args:
         star: of the last step, of `old` members.
-        seen: measurements and messages.
-        known: noise model.
+        measurements: measurements and messages.
+        model: noise model.
         first: run.
         last: run.
         t: step.
         old: members of the last star.
     """
-    n = 1 + seen.start[t + 1] - seen.start[t]
+    n = 1 + measurements.start[t + 1] - measurements.start[t]
     remember(star, old)
     for k in range(n):
-        link = seen.start[t] + k - 1
-        star.member[k] = member = seen.ego if k == 0 else seen.neighbour[link]
+        link = measurements.start[t] + k - 1
+        star.member[k] = member = measurements.ego if k == 0 else measurements.neighbour[link]
         star.previous[k] = index_of(member, star.last_member, old)
         for lane in range(LANES):
             run = min(first + int(lane), last)
-            receive(star, seen, known, run, t, link, k, lane)
+            receive(star, measurements, model, run, t, link, k, lane)
             if k > 0:
-                measured(star.relative, seen.relative[run, link], known.relative_std, k, lane)
-        interpret(star, known, k, seen.dt)
+                measured(star.relative, measurements.relative[run, link], model.relative_std, k, lane)
+        interpret(star, model, k, measurements.dt)
     return int(n)
 
 
@@ -194,11 +198,13 @@ def index_of(member: int, members: Ints, count: int) -> int:
 
 
 @inside
-def receive(star: Star, seen: Measurements, known: Assumptions, run: int, t: int, link: int, k: int, lane: int) -> None:
+def receive(
+    star: Star, measurements: Measurements, model: Assumptions, run: int, t: int, link: int, k: int, lane: int
+) -> None:
     """Copy the last message of member k in one run: velocity, process noise, position, its variance, and its status."""
     previous, status = star.previous[k], 5 * k
     before = 5 * max(previous, 0)
-    sent = t if k == 0 else seen.newest[run, link]
+    sent = t if k == 0 else measurements.newest[run, link]
     when = sent if sent >= 0 else t
     again = previous >= 0 and star.last_status[before + SENT, lane] == sent
     star.status[status + SENT, lane] = sent
@@ -206,19 +212,19 @@ def receive(star: Star, seen: Measurements, known: Assumptions, run: int, t: int
     star.status[status + AGE, lane] = t - when
     star.status[status + HELD, lane] = 1.0 if sent >= 0 else 0.0
     j = star.member[k]
-    at, variance = three_of(seen.broadcast, run, when, j), three_of(known.broadcast, run, when, j)
+    at, variance = three_of(measurements.broadcast, run, when, j), three_of(model.broadcast, run, when, j)
     if k == 0:
-        at, variance = three_of(seen.gnss, run, when, j), three_of(known.fixes, run, when, j)
+        at, variance = three_of(measurements.gnss, run, when, j), three_of(model.fixes, run, when, j)
     there = math.isfinite(at[0] + at[1] + at[2])
     if not there:
         at, variance = ROW, (NOWHERE, NOWHERE, NOWHERE)
-    velocity, process = three_of(seen.velocity, run, when, j), three_of(known.process, run, when, j)
+    velocity, process = three_of(measurements.velocity, run, when, j), three_of(model.process, run, when, j)
     put_lane(star.motion, 12 * k, lane, (*velocity, *process, *at, *variance))
-    star.status[status + NEW, lane] = 1.0 if there and (k == 0 or seen.fresh[run, link]) else 0.0
+    star.status[status + NEW, lane] = 1.0 if there and (k == 0 or measurements.fresh[run, link]) else 0.0
 
 
 @inside
-def interpret(star: Star, known: Assumptions, k: int, dt: float) -> None:
+def interpret(star: Star, model: Assumptions, k: int, dt: float) -> None:
     """What the last message of member k means now: the velocity moves it, the position is brought forward.
 
     A velocity that serves for the n-th step in a row makes the same error n times: the variance of the sum is n^2 of
@@ -226,13 +232,13 @@ def interpret(star: Star, known: Assumptions, k: int, dt: float) -> None:
     """
     uses, age = take(star.status, 5 * k + USES), take(star.status, 5 * k + AGE)
     held = take(star.status, 5 * k + HELD)
-    late, often = dt * dt * age * known.acceleration, 2.0 * uses - 1.0
+    late, often = dt * dt * age * model.acceleration, 2.0 * uses - 1.0
     velocity, late = load(star.motion, 4 * k + MOVED, ROW), late * late
-    one = add(load(star.motion, 4 * k + PROCESS, ROW), process_variance(known.motion, velocity, dt))
+    one = add(load(star.motion, 4 * k + PROCESS, ROW), process_variance(model.motion, velocity, dt))
     one = add(one, (late, late, late))
     moved = scale(velocity, choose(held, dt + 0.0 * age, 0.0 * age))
-    flat = 0.0 * age + known.flat
-    grown = scale(one, age * (known.growth[0] * age + known.growth[1]))
+    flat = 0.0 * age + model.flat
+    grown = scale(one, age * (model.growth[0] * age + model.growth[1]))
     store(star.motion, 4 * k + MOVED, moved)
     store(star.motion, 4 * k + PROCESS, choose_each(held, scale(one, often), (flat, flat, flat)))
     store(star.motion, 4 * k + POSITION, add(load(star.motion, 4 * k + POSITION, ROW), scale(moved, age)))
@@ -240,9 +246,9 @@ def interpret(star: Star, known: Assumptions, k: int, dt: float) -> None:
 
 
 @inside
-def measured(relative: Floats, seen: Floats, std: Floats, k: int, lane: int) -> None:
+def measured(relative: Floats, measured: Floats, std: Floats, k: int, lane: int) -> None:
     """Copy the measurement of member k, of `components`; what is missing points east, its deviation infinite."""
-    d, sa, ca, si, ci = seen[0], seen[1], seen[2], seen[3], seen[4]
+    d, sa, ca, si, ci = measured[0], measured[1], measured[2], measured[3], measured[4]
     a, b, c = (std[0], std[1], std[2]) if len(std) else (1.0, 1.0, 1.0)
     if d < 0.0:
         d, a = 0.0, math.inf

@@ -70,33 +70,33 @@ D / I = 1e-8, and Newton's steps there are shorter than TOLERANCE without a mini
 
 
 @as_written
-def run_msmv(seen: Measurements, known: Assumptions) -> Estimates:
+def run_msmv(measurements: Measurements, model: Assumptions) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, and the neighbours' own estimates (R, M, 3) m, NaN for none.
 
     Args:
-        seen: `broadcast` holds every vehicle's own estimate.
-        known: `broadcast` its variance m^2.
+        measurements: `broadcast` holds every vehicle's own estimate.
+        model: `broadcast` its variance m^2.
     """
-    runs, steps = seen.gnss.shape[:2]
-    out = new_estimates(seen)
-    most, x, cov = largest(seen.start), np.zeros((3, LANES)), np.zeros((9, LANES))
+    runs, steps = measurements.gnss.shape[:2]
+    out = new_estimates(measurements)
+    most, x, cov = largest(measurements.start), np.zeros((3, LANES)), np.zeros((9, LANES))
     for first in range(0, runs, LANES):
         star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
         for t in range(steps):
-            n = gather(star, seen, known, first, last, t, old)
-            fuse_pseudo_fixes(star, known, x, cov, n, old)
-            write_ego(out, star, x, cov, first, last, t, seen.start[t], n)
+            n = gather(star, measurements, model, first, last, t, old)
+            fuse_pseudo_fixes(star, model, x, cov, n, old)
+            write_ego(out, star, x, cov, first, last, t, measurements.start[t], n)
             old = n
     return out
 
 
 @inside
-def fuse_pseudo_fixes(star: Star, known: Assumptions, x: Floats, cov: Floats, n: int, old: int) -> None:
+def fuse_pseudo_fixes(star: Star, model: Assumptions, x: Floats, cov: Floats, n: int, old: int) -> None:
     """P^-1 + C_p^-1 + sum_j C_j^-1, and the weighted mean that belongs to it, in place of x and P."""
     fix = load(star.motion, POSITION, ROW)
     if old == 0:
         at, p = fix, zeros(fix[0], BLOCK)
-        flat = 0.0 * fix[0] + known.flat
+        flat = 0.0 * fix[0] + model.flat
         p = add_diagonal(p, (flat, flat, flat))
     else:
         at = add(load(x, 0, ROW), load(star.motion, MOVED, ROW))
@@ -105,7 +105,7 @@ def fuse_pseudo_fixes(star: Star, known: Assumptions, x: Floats, cov: Floats, n:
     own = weight / variance[0], weight / variance[1], weight / variance[2]
     information, eta = add_diagonal(inverse(p), own), times(subtract(fix, at), own)
     for k in range(1, n):
-        position, variance = pseudo_fix(star, known, k, at)
+        position, variance = pseudo_fix(star, model, k, at)
         new = load(star.status, 5 * k + NEW, (0.0,))[0]
         weight_k = scale(inverse(variance), new)
         information, eta = add(information, weight_k), add(eta, apply(weight_k, subtract(position, at)))
@@ -115,14 +115,14 @@ def fuse_pseudo_fixes(star: Star, known: Assumptions, x: Floats, cov: Floats, n:
 
 
 @inside
-def pseudo_fix(star: Star, known: Assumptions, k: int, at: Numbers) -> tuple[Numbers, Numbers]:
+def pseudo_fix(star: Star, model: Assumptions, k: int, at: Numbers) -> tuple[Numbers, Numbers]:
     """Position of the ego by member k's estimate and the measurement of it, and its covariance."""
     theirs, relative = load(star.motion, 4 * k + POSITION, ROW), load(star.relative, k, RELATIVE)
     seen = completed(relative, subtract(theirs, at))
     one, o = 0.0 * at[0] + 1.0, 0.0 * at[0]
     cov = from_upper((one, o, o, one, o, one))
-    if len(known.relative_std):
-        cov = from_upper(converted_cov(seen, (relative[5], relative[6], relative[7]), known.min_range))
+    if len(model.relative_std):
+        cov = from_upper(converted_cov(seen, (relative[5], relative[6], relative[7]), model.min_range))
         cov = add_diagonal(cov, load(star.motion, 4 * k + VARIANCE, ROW))
     return subtract(theirs, vector(seen)), cov
 
@@ -156,18 +156,18 @@ class Fusion(NamedTuple):
 
 
 @as_written
-def run_intersection(seen: Measurements, known: Assumptions, split: bool, robust: bool) -> Estimates:
+def run_intersection(measurements: Measurements, model: Assumptions, split: bool, robust: bool) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, and the neighbours' own estimates (R, M, 3) m, NaN for none.
 
     Args:
-        seen: `broadcast` holds every vehicle's own estimate.
-        known: `broadcast` its variance m^2.
+        measurements: `broadcast` holds every vehicle's own estimate.
+        model: `broadcast` its variance m^2.
         split: keep independent errors apart.
         robust: gate fixes and pseudo-fixes.
     """
-    runs, steps = seen.gnss.shape[:2]
-    out = new_estimates(seen)
-    most = largest(seen.start)
+    runs, steps = measurements.gnss.shape[:2]
+    out = new_estimates(measurements)
+    most = largest(measurements.start)
     fusion = Fusion(
         np.zeros((3, LANES)),
         np.zeros((9 * most, LANES)),
@@ -184,15 +184,15 @@ def run_intersection(seen: Measurements, known: Assumptions, split: bool, robust
         star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
         clear(fusion.hits)
         for t in range(steps):
-            n = gather(star, seen, known, first, last, t, old)
-            intersect(star, known, fusion, n, old)
-            write_ego(out, star, fusion.x, fusion.cov, first, last, t, seen.start[t], n)
+            n = gather(star, measurements, model, first, last, t, old)
+            intersect(star, model, fusion, n, old)
+            write_ego(out, star, fusion.x, fusion.cov, first, last, t, measurements.start[t], n)
             old = n
     return out
 
 
 @inner
-def intersect(star: Star, known: Assumptions, fusion: Fusion, n: int, old: int) -> None:
+def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) -> None:
     """Predict and fuse."""
     fix, variance = load(star.motion, POSITION, ROW), load(star.motion, VARIANCE, ROW)
     o = 0.0 * fix[0]
@@ -211,7 +211,7 @@ def intersect(star: Star, known: Assumptions, fusion: Fusion, n: int, old: int) 
             store(fusion.hits, 0, (count(q, FIX_GATE, hits, gain_of(own, variance)),))
             variance = scale(variance, inflation(q, FIX_GATE, hits))
         fixed = add_diagonal(nothing, (new / variance[0], new / variance[1], new / variance[2]))
-    add_neighbours(star, known, fusion, x, n)
+    add_neighbours(star, model, fusion, x, n)
     alone = inverse(add(fixed, source(fusion, 0, o + 1.0)[0]))
     w = best_weight(fusion, fixed, n, w)
     for _ in range(2):
@@ -236,7 +236,7 @@ def intersect(star: Star, known: Assumptions, fusion: Fusion, n: int, old: int) 
 
 
 @inner
-def add_neighbours(star: Star, known: Assumptions, fusion: Fusion, x: Numbers, n: int) -> None:
+def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n: int) -> None:
     """Pseudo-fixes of the neighbours of which a position is held, at the geometry of the ego's predicted position."""
     o = 0.0 * x[0]
     one = from_upper((o + 1.0, o, o, o + 1.0, o, o + 1.0))
@@ -246,11 +246,11 @@ def add_neighbours(star: Star, known: Assumptions, fusion: Fusion, x: Numbers, n
         noise, theirs, f = one, add_diagonal(zeros(o, BLOCK), variance), o + 1.0
         if fusion.robust:
             ahead = add(own_cov(fusion), theirs)
-            _, _, factor, _ = gate_components(gap, ahead, relative, relative[5:], (o, o, o), known.min_range)
+            _, _, factor, _ = gate_components(gap, ahead, relative, relative[5:], (o, o, o), model.min_range)
             relative = inflated(relative, factor)
-        if len(known.relative_std):
+        if len(model.relative_std):
             std = (relative[5], relative[6], relative[7])
-            noise = from_upper(converted_cov(direction(gap[0], gap[1], gap[2]), std, known.min_range))
+            noise = from_upper(converted_cov(direction(gap[0], gap[1], gap[2]), std, model.min_range))
         held = load(star.status, 5 * k + HELD, (0.0,))[0]
         gap = subtract(gap, vector(completed(relative, gap)))
         if fusion.robust:
@@ -351,14 +351,14 @@ def inner_product(a: Numbers, b: Numbers) -> float:
 
 
 @inner
-def converted_cov(seen: Numbers, std: Numbers, least: float) -> Numbers:
+def converted_cov(measured: Numbers, std: Numbers, least: float) -> Numbers:
     """Covariance m^2, upper triangle, of a converted measurement at its own geometry: `vector_cov`.
 
     Args:
-        seen: range m, sine and cosine of azimuth and of inclination.
+        measured: range m, sine and cosine of azimuth and of inclination.
         std: 1e3 at most, so that a missing component has a variance beyond any other.
     """
-    d, sa, ca, si, ci = seen[0], seen[1], seen[2], seen[3], seen[4]
+    d, sa, ca, si, ci = measured[0], measured[1], measured[2], measured[3], measured[4]
     d = max(d, least)
     a, b, c = min_of(std[0]), min_of(std[1]) * d * si, min_of(std[2]) * d
     a, b, c = a * a, b * b, c * c

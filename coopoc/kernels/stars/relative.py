@@ -52,10 +52,10 @@ def or_else(value: float, missing: float) -> float:
 
 
 @inner
-def vector(seen: Numbers) -> Numbers:
+def vector(measured: Numbers) -> Numbers:
     """The measured vector, m."""
-    ground = seen[0] * seen[3]
-    return ground * seen[2], ground * seen[1], seen[0] * seen[4]
+    ground = measured[0] * measured[3]
+    return ground * measured[2], ground * measured[1], measured[0] * measured[4]
 
 
 @as_written
@@ -135,20 +135,20 @@ def gram(a: Numbers, bx: float, by: float, c: Numbers) -> Numbers:
 
 
 @inner
-def exact(x: float, y: float, z: float, seen: Numbers, std: Numbers, least: float) -> Numbers:
+def exact(x: float, y: float, z: float, measured: Numbers, std: Numbers, least: float) -> Numbers:
     """J^T J, upper triangle, and J^T r of the whitened range, azimuth and inclination at the vector (x, y, z).
 
     An angle's residual is that between the measured direction and the vector's, which never needs wrapping.
     """
     flat2 = plus(x * x, y, y)
     flat, r = math.sqrt(flat2), math.sqrt(plus(flat2, z, z))
-    turned = angle(less(seen[1] * x, seen[2], y), plus(seen[2] * x, seen[1], y))
-    raised = angle(less(seen[3] * z, seen[4], flat), plus(seen[4] * z, seen[3], flat))
+    turned = angle(less(measured[1] * x, measured[2], y), plus(measured[2] * x, measured[1], y))
+    raised = angle(less(measured[3] * z, measured[4], flat), plus(measured[4] * z, measured[3], flat))
     d = max(r, least)
     ground = max(flat, 1e-3 * d)
     a, b, c = 1.0 / (r * std[0]), 1.0 / (ground * ground * std[1]), 1.0 / (ground * d * d * std[2])
     along, bx, by, raise_ = (a * x, a * y, a * z), -b * y, b * x, (c * x * z, c * y * z, -c * ground * ground)
-    ar, br, cr = (seen[0] - r) / std[0], turned / std[1], raised / std[2]
+    ar, br, cr = (measured[0] - r) / std[0], turned / std[1], raised / std[2]
     return (
         *gram(along, bx, by, raise_),
         dot(along[0], ar, bx, br, raise_[0], cr),
@@ -165,23 +165,23 @@ def dot(a: float, x: float, b: float, y: float, c: float, z: float) -> float:
 
 
 @inside
-def incomplete(seen: Numbers) -> bool:
-    """True if any of these runs lacks a component; `seen` with the three standard deviations behind."""
-    return not seen[5] + seen[6] + seen[7] <= 0.0 * seen[0] + 1e300
+def incomplete(measured: Numbers) -> bool:
+    """True if any of these runs lacks a component; `measured` with the three standard deviations behind."""
+    return not measured[5] + measured[6] + measured[7] <= 0.0 * measured[0] + 1e300
 
 
 @inner
-def completed(seen: Numbers, gap: Numbers) -> Five:
+def completed(measured: Numbers, gap: Numbers) -> Five:
     """The measurement, its missing components (of infinite deviation) those of the vector `gap`."""
     d, sa, ca, si, ci = direction(gap[0], gap[1], gap[2])
     limit = 0.0 * d + 1e300
-    reach, azimuth, inclination = limit - seen[5], limit - seen[6], limit - seen[7]
+    reach, azimuth, inclination = limit - measured[5], limit - measured[6], limit - measured[7]
     return (
-        choose(reach, seen[0], d),
-        choose(azimuth, seen[1], sa),
-        choose(azimuth, seen[2], ca),
-        choose(inclination, seen[3], si),
-        choose(inclination, seen[4], ci),
+        choose(reach, measured[0], d),
+        choose(azimuth, measured[1], sa),
+        choose(azimuth, measured[2], ca),
+        choose(inclination, measured[3], si),
+        choose(inclination, measured[4], ci),
     )
 
 

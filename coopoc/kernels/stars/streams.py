@@ -181,13 +181,13 @@ def joint_step(
 
 @compiled
 def stream_step(
-    f: Filter, known: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, start: Floats, answer: Floats
+    f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, start: Floats, answer: Floats
 ) -> int:
     """One step; 1 if a vehicle has lost trust.
 
     Args:
         f: filter.
-        known: noise model.
+        model: noise model.
         guards: against what may be wrong.
         own: (OWN,).
         rows: (k, WIDTH) of the neighbours that are measured now.
@@ -196,13 +196,13 @@ def stream_step(
         answer: (12 + 3 k,) out: position m, covariance m^2, positions of the neighbours m.
     """
     if f.g.vectors[0] == 0:
-        begin(f, known, guards, own, rows, len(vehicles), 0)
+        begin(f, model, guards, own, rows, len(vehicles), 0)
         if math.isfinite(start[0]):
             f.step[0], f.vague[0] = 1, 0.0
             for c in range(3):
                 f.g.x[c] = start[c]
     f.alarm[0] = 0
-    step(f, known, guards, own, rows, vehicles, len(vehicles))
+    step(f, model, guards, own, rows, vehicles, len(vehicles))
     for c in range(3):
         answer[c] = f.g.x[c]
         for d in range(3):
@@ -219,7 +219,7 @@ def make_filter(slots: int, vehicles: int) -> Filter:
 
 
 @compiled
-def restore(source: Filter, target: Filter, known: Model, guards: Guards) -> None:
+def restore(source: Filter, target: Filter, model: Model, guards: Guards) -> None:
     """Copy a state; trust is revoked in those who have lost it in the target since."""
     copy_filter(source, target)
-    distrust(target, known, guards)
+    distrust(target, model, guards)

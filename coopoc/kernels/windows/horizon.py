@@ -99,32 +99,32 @@ class Estimates(NamedTuple):
     moving: Bools
 
 
-def horizons(seen: Measurements, known: Assumptions, arrival: Ints, settings: Settings) -> Estimates:
+def horizons(measurements: Measurements, model: Assumptions, arrival: Ints, settings: Settings) -> Estimates:
     """Estimates at the newest step of all windows of a drive.
 
     Args:
-        seen: `newest` and `fresh` are overwritten where messages count when they were sent.
-        known: the noise that is assumed.
+        measurements: `newest` and `fresh` are overwritten where messages count when they were sent.
+        model: the noise that is assumed.
         arrival: (R, M) step at which the message of each link arrives, -1 for never.
         settings: of the windows.
     """
-    (runs, steps), most = seen.gnss.shape[:2], 1 + int(np.diff(seen.start).max(initial=0))
+    (runs, steps), most = measurements.gnss.shape[:2], 1 + int(np.diff(measurements.start).max(initial=0))
     x, cov = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3))
-    estimates = Estimates(x, cov, np.empty((runs, len(seen.neighbour), 3)), np.zeros((runs, steps), np.bool_))
+    estimates = Estimates(x, cov, np.empty((runs, len(measurements.neighbour), 3)), np.zeros((runs, steps), np.bool_))
     window, within = new_window(settings.length, most), cast(Any, (joint_within, star_within, gates_within))
     joint, star, gates = (make.py_func(most) for make in within)
     system = new_system(settings.length, most, joint.information)
     for first in range(0, runs, LANES):
         here = first, min(first + LANES, runs) - 1
-        follow_horizon((window, joint, star, system, gates), seen, known, arrival, settings, here, estimates)
+        follow_horizon((window, joint, star, system, gates), measurements, model, arrival, settings, here, estimates)
     return estimates
 
 
 @as_written
 def follow_horizon(
     memory: Any,
-    seen: Measurements,
-    known: Assumptions,
+    measurements: Measurements,
+    model: Assumptions,
     arrival: Ints,
     settings: Settings,
     runs: tuple[int, int],
@@ -132,27 +132,27 @@ def follow_horizon(
 ) -> None:
     """Solve the window that ends at each step, in runs first to last."""
     window, joint, star, system, gates = memory
-    for t in range(len(seen.start) - 1):
+    for t in range(len(measurements.start) - 1):
         span = (max(0, t - settings.length + 1), t)
-        enter(window, star, seen, known, runs, t)
+        enter(window, star, measurements, model, runs, t)
         if settings.age >= 0.0:
             for step in range(span[0], t + 1):
-                gather_arrived(window, gates, seen, known, arrival, settings, runs, step, t)
-        start_points(window, known, t)
+                gather_arrived(window, gates, measurements, model, arrival, settings, runs, step, t)
+        start_points(window, model, t)
         if settings.robust:
-            gate_step(window, gates, known, t)
-        link_points(window, known, t)
+            gate_step(window, gates, model, t)
+        link_points(window, model, t)
         use_new_fixes(window, t if settings.age < 0.0 else span[0], t)
         if span[0] > 0:
-            leave(window, joint, known, span[0] - 1)
+            leave(window, joint, model, span[0] - 1)
         elif t == 0:
-            forget(joint, known, count_of(window.sizes, 0))
+            forget(joint, model, count_of(window.sizes, 0))
         system.active[:] = 1.0
         for count in range(settings.repeats + 1):
-            solve_window(window, known, span, settings.exact, count == 0, system)
+            solve_window(window, model, span, settings.exact, count == 0, system)
             for lane in range(runs[1] - runs[0] + 1):
                 if system.active[lane] > 0.0:
-                    write_lane(window, system.cov, seen.start[t], (runs[0] + lane, lane), t, estimates)
+                    write_lane(window, system.cov, measurements.start[t], (runs[0] + lane, lane), t, estimates)
             if settings.repeats == 0 and settings.age < 0.0:
                 break
             put(system.most, uint64(0), distance(window, span))
@@ -167,45 +167,45 @@ def follow_horizon(
 
 @inner
 def solve_window(
-    window: Window, known: Assumptions, span: tuple[int, int], exact: bool, entered: bool, system: System
+    window: Window, model: Assumptions, span: tuple[int, int], exact: bool, entered: bool, system: System
 ) -> None:
     """One Gauss-Newton step of the window in the active runs.
 
     Args:
         window: its steps, and their relative measurements as last made linear.
-        known: the noise that is assumed.
+        model: the noise that is assumed.
         span: its first and last step.
         exact: measurements in range and angles.
         entered: the newest step has just come: it is solved converted, and made exact where that leads.
         system: the normal equations.
     """
     active, last = take(system.active, uint64(0)), span[1]
-    coupled, prior = count_of(window.sizes, span[0]) - 1, 1.0 / known.flat
+    coupled, prior = count_of(window.sizes, span[0]) - 1, 1.0 / model.flat
     for step in range(span[0], last + (0 if entered else 1) if exact else span[0]):
-        linearise_step(window, known, step, active)
+        linearise_step(window, model, step, active)
     gauss_newton(window, span, system, coupled, prior)
     if exact and entered:
         ego = row_of(window.layout, last, 0)
         for row in range(ego + 1, ego + count_of(window.sizes, last)):
             gap = add(gap_of(window.point, ego, row), gap_of(system.move, ego, row))
-            put_edge(window, known, ego, row, gap, EXACT, active)
+            put_edge(window, model, ego, row, gap, EXACT, active)
         gauss_newton(window, span, system, coupled, prior)
     advance(window, span, system, active)
 
 
 @inner
-def linearise_step(window: Window, known: Assumptions, step: int, active: Any) -> None:
+def linearise_step(window: Window, model: Assumptions, step: int, active: Any) -> None:
     """The relative measurements of a step in range and angles, where its points are."""
     ego = row_of(window.layout, step, 0)
     for row in range(ego + 1, ego + count_of(window.sizes, step)):
-        put_edge(window, known, ego, row, gap_of(window.point, ego, row), EXACT, active)
+        put_edge(window, model, ego, row, gap_of(window.point, ego, row), EXACT, active)
 
 
 @inner
-def put_edge(window: Window, known: Assumptions, ego: int, row: int, gap: Any, how: Any, active: Any) -> None:
+def put_edge(window: Window, model: Assumptions, ego: int, row: int, gap: Any, how: Any, active: Any) -> None:
     """The relative measurement of a row, linear at the vector `gap`, where `active` is positive."""
     z = load(window.relative, row, RELATIVE)
-    information, eta = edge(gap, z, known.relative_std, known.min_range, how)
+    information, eta = edge(gap, z, model.relative_std, model.min_range, how)
     eta = plus_applied(eta, information, subtract(gap, gap_of(window.point, ego, row)))
     o, used = 0.0 * gap[0], max(take(window.located, uint64(row)), whole_of(window, row)) - 0.5
     information, eta = choose_each(used, information, zeros(o, BLOCK)), choose_each(used, eta, zeros(o, ROW))
@@ -265,7 +265,7 @@ def distance(window: Window, span: tuple[int, int]) -> Any:
 
 
 @inner
-def start_points(window: Window, known: Assumptions, t: int) -> None:
+def start_points(window: Window, model: Assumptions, t: int) -> None:
     """A new step where it is expected: a member that stays moves, one that joins stands where the ego measures it, and
     one that nothing has located yet where its first position puts it, with its earlier points."""
     ego, before = row_of(window.layout, t, 0), row_of(window.layout, t - 1, 0)
@@ -291,22 +291,22 @@ def start_points(window: Window, known: Assumptions, t: int) -> None:
 
 
 @inner
-def gate_step(window: Window, gates: Gates, known: Assumptions, t: int) -> None:
+def gate_step(window: Window, gates: Gates, model: Assumptions, t: int) -> None:
     """Gate what is new at the newest step where its points are expected."""
     here, n = row_of(window.layout, t, 0), count_of(window.sizes, t)
     star, old = star_at(window, t), count_of(window.sizes, t - 1) if t > 0 else 0
-    carry(star, gates, known.flat, n, old)
+    carry(star, gates, model.flat, n, old)
     points, located = window.point[3 * here : 3 * (here + n)], window.located[here : here + n]
-    gate_star(star, gates, points, located, known.min_range, n)
+    gate_star(star, gates, points, located, model.min_range, n)
 
 
 @inner
-def link_points(window: Window, known: Assumptions, t: int) -> None:
+def link_points(window: Window, model: Assumptions, t: int) -> None:
     """The relative measurements of a new step, where its points are expected."""
     ego = row_of(window.layout, t, 0)
     for row in range(ego + 1, ego + count_of(window.sizes, t)):
         gap = gap_of(window.point, ego, row)
-        put_edge(window, known, ego, row, gap, AT_GAP, 0.0 * gap[0] + 1.0)
+        put_edge(window, model, ego, row, gap, AT_GAP, 0.0 * gap[0] + 1.0)
 
 
 @inside
@@ -328,17 +328,17 @@ def locate_before(window: Window, row: int, t: int, mask: Any, at: Any) -> None:
 
 
 @inner
-def forget(joint: Joint, known: Assumptions, n: int) -> None:
+def forget(joint: Joint, model: Assumptions, n: int) -> None:
     """Know nothing of the past of the first step."""
     clear(joint.information)
     nothing = zeros(0.0 * take(joint.information, uint64(0)), BLOCK)
-    flat = nothing[0] + 1.0 / known.flat
+    flat = nothing[0] + 1.0 / model.flat
     for i in range(n):
         store(joint.information, i * (joint.stride + 1), add_diagonal(nothing, (flat, flat, flat)))
 
 
 @inner
-def leave(window: Window, joint: Joint, known: Assumptions, step: int) -> None:
+def leave(window: Window, joint: Joint, model: Assumptions, step: int) -> None:
     """A step becomes the past of the next one: its mean, moved, is where that expects its points, and its covariance,
     grown by the process noise, the arrival cost."""
     ego, after, n = row_of(window.layout, step, 0), row_of(window.layout, step + 1, 0), count_of(window.sizes, step)
@@ -358,7 +358,7 @@ def leave(window: Window, joint: Joint, known: Assumptions, step: int) -> None:
         add_relative(joint.information, joint.eta, joint.stride, k, n, information, eta)
     solve(joint.information, joint, joint.eta, n)
     predict(joint.information, n, joint.stride, joint.process, joint.scratch)
-    m, prior = count_of(window.sizes, step + 1), 1.0 / known.flat
+    m, prior = count_of(window.sizes, step + 1), 1.0 / model.flat
     rearrange(star_at(window, step + 1), joint, m, n, (prior, prior, prior))
     for row in range(after, after + m):
         if window.previous[row] >= 0:
@@ -371,8 +371,8 @@ def leave(window: Window, joint: Joint, known: Assumptions, step: int) -> None:
 def gather_arrived(
     window: Window,
     gates: Gates,
-    seen: Measurements,
-    known: Assumptions,
+    measurements: Measurements,
+    model: Assumptions,
     arrival: Ints,
     settings: Settings,
     runs: tuple[int, int],
@@ -384,22 +384,22 @@ def gather_arrived(
     at the step at which it was sent."""
     star, here = star_at(window, step), row_of(window.layout, step, 0)
     for k in range(1, count_of(window.sizes, step)):
-        link, place, changed = seen.start[step] + k - 1, window.previous[here + k], step == now
+        link, place, changed = measurements.start[step] + k - 1, window.previous[here + k], step == now
         for run in range(runs[0], runs[1] + 1):
             come = 0 <= arrival[run, link] <= now
-            sent = step if come else seen.newest[run, link]
+            sent = step if come else measurements.newest[run, link]
             if place >= 0 and step > 0:
                 carried = int(star.last_status[5 * place + SENT, run - runs[0]])
                 sent = max(sent, carried if step - carried <= settings.age else -1)
-            changed |= sent != seen.newest[run, link] or come != seen.fresh[run, link]
-            seen.newest[run, link], seen.fresh[run, link] = sent, come
+            changed |= sent != measurements.newest[run, link] or come != measurements.fresh[run, link]
+            measurements.newest[run, link], measurements.fresh[run, link] = sent, come
         if changed:
             for lane in range(uint64(LANES)):
                 run = min(runs[0] + int(lane), runs[1])
-                receive(star, seen, known, run, step, link, k, lane)
-                used_since = max(seen.newest[run, link], window.joined[here + k])
+                receive(star, measurements, model, run, step, link, k, lane)
+                used_since = max(measurements.newest[run, link], window.joined[here + k])
                 star.status[5 * k + USES, lane] = step - used_since + 1
-            interpret(star, known, k, seen.dt)
+            interpret(star, model, k, measurements.dt)
             if settings.robust and step < now:
                 point, cov = load(window.point, here + k, ROW), load(gates.state, 0, BLOCK)
                 gate_position(star, k, point, scale(cov, 2.0), 0.0 * point[0])

@@ -95,10 +95,12 @@ def count_of(sizes: Ints, step: int) -> int:
 
 
 @inner
-def enter(window: Window, star: Star, seen: Measurements, known: Assumptions, runs: tuple[int, int], t: int) -> None:
+def enter(
+    window: Window, star: Star, measurements: Measurements, model: Assumptions, runs: tuple[int, int], t: int
+) -> None:
     """Gather what is known of step t into its slot."""
     old = count_of(window.sizes, t - 1) if t > 0 else 0
-    n = gather(star, seen, known, runs[0], runs[1], t, old)
+    n = gather(star, measurements, model, runs[0], runs[1], t, old)
     here, before = row_of(window.layout, t, 0), row_of(window.layout, t - 1, 0)
     window.sizes[t % len(window.sizes)] = n
     for k in range(n):

@@ -65,9 +65,9 @@ def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0
     return begin
 
 
-def _next(recording: Recording, run: int, waiting: list[int], known: Floats) -> tuple[int, Ints]:
+def _next(recording: Recording, run: int, waiting: list[int], places: Floats) -> tuple[int, Ints]:
     """The vehicle whose pose is found next, and its links that count: those to landmarks of one that has a fix or sees
-    two of them; else, of the one with most, those to all whose places `known` (T, N, 3) m are finite."""
+    two of them; else, of the one with most, those to all whose places `places` (T, N, 3) m are finite."""
     every: list[Ints] = []
     for column in waiting:
         links = recording.links.of(column)
@@ -76,17 +76,17 @@ def _next(recording: Recording, run: int, waiting: list[int], known: Floats) -> 
         fix = np.isfinite(recording.gnss[run, :, column, 0]).any()
         if fix or len(np.unique(recording.links.neighbour[whole])) > 1:
             return column, marks
-        every.append(links[np.isfinite(known[recording.links.step[links], recording.links.neighbour[links], 0])])
+        every.append(links[np.isfinite(places[recording.links.step[links], recording.links.neighbour[links], 0])])
     most = int(np.argmax([np.isfinite(recording.relative[run, links, :2]).all(axis=1).sum() for links in every]))
     return waiting[most], every[most]
 
 
 def _most_likely(
-    recording: Recording, run: int, column: int, links: Ints, known: Floats, filter_: PoseFilter
+    recording: Recording, run: int, column: int, links: Ints, places: Floats, filter_: PoseFilter
 ) -> tuple[Floats, Floats]:
     """First pose (4,) of a vehicle, and its positions (T, 3) m from there on, by the solo filter of most likelihood."""
     angles = 2 * np.pi * np.arange(HEADINGS) / HEADINGS
-    place = known[recording.links.step[links], recording.links.neighbour[links]]
+    place = places[recording.links.step[links], recording.links.neighbour[links]]
     tried = np.full((HEADINGS, len(recording.ids), 4), np.nan)
     tried[:, column] = _hypotheses(recording, run, column, links, place, angles)
     copies = recording.of_runs(np.full(HEADINGS, run))
@@ -133,9 +133,9 @@ def _cost_of_bearings(recording: Recording, run: int, column: int, angles: Float
     return found
 
 
-def _hypotheses(recording: Recording, run: int, column: int, links: Ints, known: Floats, angles: Floats) -> Floats:
-    """(headings, 4) poses at the first step that the first fix, or what is seen first, leaves for each heading; `known`
-    (L, 3) m are the places of what the links measure."""
+def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places: Floats, angles: Floats) -> Floats:
+    """(headings, 4) poses at the first step that the first fix, or what is seen first, leaves for each heading, with
+    `places` (L, 3) m of what the links measure."""
     body, relative = body_of(recording), recording.relative[run, links]
     fixes = np.flatnonzero(np.isfinite(recording.gnss[run, :, column, 0]))
     seen = np.flatnonzero(np.isfinite(relative[:, :2]).all(axis=1))
@@ -143,7 +143,7 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, known:
         given = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
         allowed = "must hold a fix, or a range and bearing of a landmark or of a vehicle whose pose is found"
         raise InputError("seconds", given, allowed, "Take more seconds, or give its pose.")
-    if not len(fixes) and np.isnan(body.heading[run, :, column]).all() and (known[seen] == known[seen[0]]).all():
+    if not len(fixes) and np.isnan(body.heading[run, :, column]).all() and (places[seen] == places[seen[0]]).all():
         given = f"{recording.ids[column]} sees one landmark alone, and has neither fix nor compass"
         raise InputError("seconds", given, "must hold a second place", "Take more seconds, or give its pose.")
     turns = _turns(recording, run, column)
@@ -159,7 +159,7 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, known:
         step = int(recording.links.step[link])
         flat = np.array([*relative[seen[0], :2], np.pi / 2])
         flat[2] = relative[seen[0], 2] if np.isfinite(relative[seen[0], 2]) else flat[2]
-        place = known[seen[0]]
+        place = places[seen[0]]
         offset = way[step] + turned(to_vector(flat), np.asarray(turns[step]))
     compass = body.heading[run, 0, column]
     angles = angles if np.isnan(compass) else np.full(len(angles), compass)

@@ -326,19 +326,19 @@ def values(space: Space, posed: Sequence[bool], x: Floats) -> Any:
     return found
 
 
-def estimate(space: Space, posed: Sequence[bool], found: Any) -> Floats:
+def estimate(space: Space, posed: Sequence[bool], values: Any) -> Floats:
     """x (n, ambient) of the nodes in gtsam.Values, which holds no others."""
     from gtsam import utilities
 
     d, x = space.dimension, np.empty((len(posed), space.ambient))
     points, poses = np.flatnonzero(~np.array(posed)), np.flatnonzero(posed)
     if len(points):
-        x[points] = space.join(getattr(utilities, f"extractPoint{d}")(found))
+        x[points] = space.join(getattr(utilities, f"extractPoint{d}")(values))
     if len(poses) and d == 2:
-        rows = utilities.extractPose2(found)
+        rows = utilities.extractPose2(values)
         x[poses] = space.join(rows[:, :2], exp(rows[:, 2:]))
     elif len(poses):
-        rows = utilities.extractPose3(found)
+        rows = utilities.extractPose3(values)
         x[poses] = space.join(rows[:, 9:], rows[:, :9].reshape(-1, 3, 3))
     return x
 

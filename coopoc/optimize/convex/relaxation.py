@@ -245,17 +245,17 @@ def scaled_bound(reduced: Reduced, L: Multipliers) -> float:
     return 0.5 * (share * L.trace - shift * L.problem.trace)
 
 
-def _escape(reduced: Reduced, found: Stationary, smallest: float, v: Floats) -> Floats:
+def _escape(reduced: Reduced, end: Stationary, smallest: float, v: Floats) -> Floats:
     """A lower point with one more column: along v the cost is cost + 1/2 smallest a^2 + O(a^3)."""
     form = reduced.problem
-    wide = np.column_stack([found.X, np.zeros(len(v))])
+    wide = np.column_stack([end.X, np.zeros(len(v))])
     along = np.zeros_like(wide)
     along[:, -1] = v
     reach = np.sqrt(form.bound)
     while True:
         Y = form.project(wide + reach * along)
         cost = 0.5 * float(np.sum(Y * reduced.times(Y)))
-        if cost <= found.cost + 0.125 * smallest * reach * reach or reach < 1e-6:
+        if cost <= end.cost + 0.125 * smallest * reach * reach or reach < 1e-6:
             return Y
         reach *= 0.5
 

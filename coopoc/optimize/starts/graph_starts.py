@@ -278,26 +278,26 @@ def _walked(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bo
     return walk(len(graph.names), graph.dimension, moves, roots)
 
 
-def _landmarks(graph: Graph, position: Floats, rotation: Floats, known: Bools) -> Floats:
+def _landmarks(graph: Graph, position: Floats, rotation: Floats, placed: Bools) -> Floats:
     """Nodes with the points at their priors, where a pose sees them, or by ranges."""
     points = graph.point_prior
-    position[points.nodes[:, 0]], known[points.nodes[:, 0]] = points.position, True
+    position[points.nodes[:, 0]], placed[points.nodes[:, 0]] = points.position, True
     for (i, j), at in zip(graph.relative_point.nodes.tolist(), graph.relative_point.position, strict=True):
-        if not known[j]:
-            position[j], known[j] = position[i] + rotation[i] @ at, True
-    for j in np.flatnonzero(~known & ~graph.is_pose).tolist():
-        others, ranges = _ranged(graph, j, known)
+        if not placed[j]:
+            position[j], placed[j] = position[i] + rotation[i] @ at, True
+    for j in np.flatnonzero(~placed & ~graph.is_pose).tolist():
+        others, ranges = _ranged(graph, j, placed)
         if len(others):
             position[j] = trilaterate(position[others], ranges)
-        known[j] = True
+        placed[j] = True
     return Space(graph.dimension, has_rotation=True).join(position, rotation)
 
 
-def _ranged(graph: Graph, point: int, known: Bools) -> tuple[Ints, Floats]:
+def _ranged(graph: Graph, point: int, placed: Bools) -> tuple[Ints, Floats]:
     """The known nodes to which a point has ranges, and these."""
     rows = np.flatnonzero((graph.ranges.nodes == point).any(axis=1))
     others = graph.ranges.nodes[rows].sum(axis=1) - point
-    return others[known[others]], graph.ranges.distance[rows[known[others]]]
+    return others[placed[others]], graph.ranges.distance[rows[placed[others]]]
 
 
 def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
