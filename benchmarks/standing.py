@@ -19,7 +19,8 @@ from rosbags.typesys import Stores, get_typestore
 from tabulate import tabulate
 
 import coopoc as co
-from coopoc.studies.tasks import RANGE_STD, hashed, located
+from coopoc.studies.pose_drives import hashed
+from coopoc.studies.tasks import RANGE_STD, located
 
 FILE, KNOWN = "test1_0.db3", ("1", "2", "4")
 

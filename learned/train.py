@@ -109,7 +109,7 @@ def _loaded(job: Job, path: Path) -> Checkpoint:
 def _train(group: Sequence[Job], fleet: Drives, out: Path, worst: float, progress: bool) -> None:
     """Train and save the checkpoints of one recipe."""
     for job, checkpoint in zip(group, trained(group, fleet, progress), strict=True):
-        if worst < math.inf and (times := over_fitted(checkpoint.model, job, fleet)) > worst:
+        if worst < math.inf and (times := ratio_to_fitted_filter(checkpoint.model, job, fleet)) > worst:
             allowed = f"must be at most {worst:g} times that of a Kalman filter with fitted noise"
             hint = "Give more data or another recipe; --worse saves it all the same."
             raise InputError(f"validation error of {job.label}", f"{times:.2f} times", allowed, hint)
@@ -126,7 +126,7 @@ def trained(group: Sequence[Job], fleet: Drives, progress: bool = True) -> list[
     ]
 
 
-def over_fitted(model: Gain, job: Job, fleet: Drives) -> float:
+def ratio_to_fitted_filter(model: Gain, job: Job, fleet: Drives) -> float:
     """RT-LE on the pieces that validate over that of a Kalman filter whose noise is fitted on those that train."""
     data = job_clients(job, fleet)
     gnss, velocity, truth, dt = _pieces(_joined(data, job.client, "training"))

@@ -171,10 +171,16 @@ def digests(data: str) -> dict[str, str]:
     if not isinstance(log, MrclamLog):
         truth = "" if log.truth is None else log.truth.digest
         return {"log": digest(log.recording), "truth": truth}
+    return {"log": hashed(Path(data))}
+
+
+def hashed(*paths: Path) -> str:
+    """First 12 hex digits of the SHA-256 of files, or of all in folders."""
     sha = hashlib.sha256()
-    for file in sorted(Path(data).glob("*.dat")):
-        sha.update(file.name.encode() + file.read_bytes())
-    return {"log": sha.hexdigest()}
+    for path in paths:
+        for file in sorted(path.rglob("*")) if path.is_dir() else [path]:
+            sha.update(file.read_bytes() if file.is_file() else b"")
+    return sha.hexdigest()[:12]
 
 
 def thinned(recording: Recording, landmarks: int, start: int) -> Recording:

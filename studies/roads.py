@@ -20,7 +20,8 @@ from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.track import Method
 from coopoc.world.recording import MEASURED
 
-from .tasks import hashed, located, planar
+from .pose_drives import hashed
+from .tasks import located, planar
 
 SHARE, BLOCK = 0.4, 30.0
 """Share of a drive that calibrates, and s of a block, a quarter of the rest at most, over which errors are averaged."""

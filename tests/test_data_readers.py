@@ -301,7 +301,7 @@ def test_a_real_segment_of_comma2k19(shared: Path) -> None:
     ("name", "wrong", "thing"),
     [
         ("global_pose/frame_times", None, "global_pose/frame_times = "),
-        ("global_pose/frame_positions", b"no array", "no NumPy array"),
+        ("global_pose/frame_positions", b"PK no array", "must be an array of numpy.save"),
         ("processed_log/CAN/speed/value", b"cut", "must be an array of numpy.save"),
         ("processed_log/CAN/speed/value", np.full((600, 1), np.nan), "not finite"),
         ("processed_log/CAN/speed/value", np.zeros((600, 2)), r"\(600, 2\): must be \(600, 1\)"),

@@ -5,9 +5,10 @@ from __future__ import annotations
 import os
 import re
 import shutil
-import subprocess
 import sys
+from collections.abc import Callable
 from pathlib import Path
+from textwrap import indent
 
 import numpy as np
 import pandas as pd
@@ -59,6 +60,15 @@ def commands(word: str) -> list[str]:
     return [line for block in blocks("sh") for line in block.splitlines() if word in line]
 
 
+def output(folder: Path, word: str, change: Callable[[str], str] = str) -> str:
+    """What the page's block with a word in it prints."""
+    (block,) = [text for text in blocks("python") if word in text]
+    (folder / "block.py").write_text(change(block))
+    done = ran([sys.executable, "-W", "error", "block.py"], cwd=folder)
+    assert done.returncode == 0, done.stderr
+    return done.stdout
+
+
 def test_a_method_of_ones_own_beside_others(folder: Path) -> None:
     (command,) = commands("alpha.py:Alpha")
     table = shell(f"{command} --tracks tum", folder)
@@ -96,11 +106,7 @@ def test_a_fleet_made_by_code(folder: Path, monkeypatch: pytest.MonkeyPatch) -> 
 
 
 def test_a_backend_is_checked_as_all_are(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    (block,) = [text for text in blocks("python") if "least_squares.py:BACKEND" in text]
-    script = folder / "own_backend.py"
-    script.write_text(block)
-    done = ran([sys.executable, "-W", "error", script], cwd=folder)
-    assert done.stdout.startswith("SOLVED"), done.stderr
+    assert output(folder, "least_squares.py:BACKEND").startswith("SOLVED")
     monkeypatch.chdir(folder)
     problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 4, 0]], std=[1.0, 2.0, 3.0])
     problem = problem.add("range", ("ego", "b"), 10.0, std=1.0)
@@ -117,11 +123,7 @@ def test_a_backend_is_checked_as_all_are(folder: Path, monkeypatch: pytest.Monke
 def test_a_measurement_is_at_once_in_the_backends_and_in_constraints(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    (block,) = [text for text in blocks("python") if '"lidar.py:elevation"' in text]
-    script = folder / "own_measurement.py"
-    script.write_text(block)
-    done = ran([sys.executable, "-W", "error", script], cwd=folder)
-    assert done.stdout.startswith("SOLVED"), done.stderr
+    assert output(folder, '"lidar.py:elevation"').startswith("SOLVED")
     monkeypatch.chdir(folder)
     problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
     problem = problem.add("lidar.py:elevation", ("ego", "b"), 0.2, std=0.01)
@@ -153,12 +155,8 @@ def test_a_measurement_is_at_once_in_the_backends_and_in_constraints(
     ],
 )
 def test_a_channel_and_a_metric_go_by_their_file(folder: Path, word: str, names: list[str]) -> None:
-    (block,) = [text for text in blocks("python") if word in text]
-    script = folder / f"own_{word[:4]}.py"
-    script.write_text(block)
-    done = ran([sys.executable, "-W", "error", script], cwd=folder)
-    rows = [line.split() for line in done.stdout.splitlines()]
-    assert [row[0] for row in rows] == names, done.stderr
+    rows = [line.split() for line in output(folder, word).splitlines()]
+    assert [row[0] for row in rows] == names
     assert all(float(row[1]) > 0 for row in rows)
 
 
@@ -190,11 +188,8 @@ def test_a_channel_and_a_metric_keep_their_promise(tmp_path: Path, crossing: Fle
 @pytest.mark.slow
 def test_an_aggregation_rule_goes_wherever_a_bundled_one_goes(folder: Path, tmp_path: Path) -> None:
     """In `federate`, in the study of rules, in `coopoc train`; an unknown rule is named with the nearest one."""
-    (block,) = [text for text in blocks("python") if "own_rules.py:ClippedMean" in text]
-    script = folder / "own_federation.py"
-    script.write_text(block + "\nassert not all(fed.history[0].weights == fed.history[2].weights)\n")
-    done = ran([sys.executable, "-W", "error", script], cwd=folder)
-    assert done.returncode == 0, done.stderr
+    differ = "\nassert not all(fed.history[0].weights == fed.history[2].weights)\n"
+    output(folder, "own_rules.py:ClippedMean", lambda block: block + differ)
     (command,) = commands("own_rules.py:best_half")
     (folder / "examples").mkdir()
     shutil.copy(Path(__file__).parents[1] / "examples" / "aggregation.py", folder / "examples")
@@ -213,13 +208,8 @@ def test_a_study_runs_in_worker_processes_and_reports(folder: Path) -> None:
 
 
 def test_a_notebook_gets_a_frame_and_a_table(folder: Path) -> None:
-    (block,) = [text for text in blocks("python") if "results.frame" in text]
-    script = folder / "notebook.py"
-    script.write_text(
-        f"if __name__ == '__main__':\n{re.sub('^', '    ', block, flags=re.MULTILINE)}\n"
-        "    assert gain.low > 0, gain\n    assert '<table>' in table._repr_html_()\n"
-    )
-    subprocess.run([sys.executable, "-W", "error", script], cwd=folder, capture_output=True, check=True)
+    checks = "\nassert gain.low > 0, gain\nassert '<table>' in table._repr_html_()\n"
+    output(folder, "results.frame", lambda block: f"if __name__ == '__main__':\n{indent(block + checks, '    ')}")
 
 
 @pytest.mark.slow

@@ -119,20 +119,20 @@ def back(
             for i in range(3):
                 adjoint.x[lane, i] += adjoints[t, s, first + lane, i]
             gone = missing(gnss, (t, s, first + lane))
-            move_back(net, tape[row + lane], gradient[row + lane], adjoint, lane, gone)
-        think_back(net, tape, gradient, row, lanes)
+            correct_back(net, tape[row + lane], gradient[row + lane], adjoint, lane, gone)
+        infer_back(net, tape, gradient, row, lanes)
         for lane in range(lanes):
             if missing(gnss, (t, s, first + lane)):
                 for i in range(3):
                     adjoint.x[lane, i] += adjoint.x_before[lane, i]
                     adjoint.x_before[lane, i] = 0.0
             else:
-                look_back(net, tape[row + lane], gradient[row + lane], adjoint, lane)
+                features_back(net, tape[row + lane], gradient[row + lane], adjoint, lane)
 
 
 @part
-def move_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index, gone: bool) -> None:
-    """`forward.move` backwards: the gradient of gain, innovation and new states of a lane; without a fix it is zero."""
+def correct_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index, gone: bool) -> None:
+    """`forward.correct` backwards: the gradient of gain, innovation and new states; without a fix it is zero."""
     columns, zero = net.columns, tape.dtype.type(0.0)
     gain, residual = columns[on.GAIN], columns[on.RESIDUAL]
     process, innovation, posterior = columns[on.PROCESS], columns[on.INNOVATION], columns[on.POSTERIOR]
@@ -150,8 +150,8 @@ def move_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: In
 
 
 @part
-def think_back(net: Net, tape: Floats, gradient: Floats, row: Index, lanes: Index) -> None:
-    """`forward.think` backwards: from the gradient of gain, posterior and states to that of changes and old states."""
+def infer_back(net: Net, tape: Floats, gradient: Floats, row: Index, lanes: Index) -> None:
+    """`forward.infer` backwards: from the gradient of gain, posterior and states to that of changes and old states."""
     prior, copy = net.columns[on.PRIOR], net.columns[on.PRIOR_COPY]
     backward_layer(net, on.L_POSTERIOR, tape, gradient, row, lanes)
     for lane in range(row, row + lanes):
@@ -199,8 +199,8 @@ def blend_back(unit: Floats, after: Floats, gradient: Floats) -> None:
 
 
 @part
-def look_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index) -> None:
-    """`forward.look` backwards, and `adjoint` of the state of a lane before the step."""
+def features_back(net: Net, tape: Floats, gradient: Floats, adjoint: State, lane: Index) -> None:
+    """`forward.features` backwards, and `adjoint` of the state of a lane before the step."""
     real, at, columns = tape.dtype.type, net.columns[on.CHANGES], net.columns
     residual, lengths = columns[on.RESIDUAL], columns[on.LENGTHS]
     for change in range(1, 4):

@@ -80,10 +80,10 @@ def follow(
     start(state, drives.x0, rows)
     for t in range(len(drives.dt)):
         row = keep * t * lanes
-        look(drives, state, net, tape, row, t, rows)
-        think(net, state, tape, row, lanes)
+        features(drives, state, net, tape, row, t, rows)
+        infer(net, state, tape, row, lanes)
         for lane in range(lanes):
-            move(drives, state, net, tape[row + lane], lane, (t, s, first + lane))
+            correct(drives, state, net, tape[row + lane], lane, (t, s, first + lane))
             for i in range(3):
                 x[t, s, first + lane, i] = state.x[lane, i]
 
@@ -109,7 +109,7 @@ def missing(gnss: Floats, at: tuple[Index, Index, Index]) -> bool:
 
 
 @part
-def look(
+def features(
     drives: Drives, state: State, net: Net, tape: Floats, row: Index, t: Index, rows: tuple[Index, Index, Index]
 ) -> None:
     """Input features of GainNet: directions and lengths of four differences, and the innovation; a missing fix repeats
@@ -136,7 +136,7 @@ def look(
 
 
 @part
-def think(net: Net, state: State, tape: Floats, row: Index, lanes: Index) -> None:
+def infer(net: Net, state: State, tape: Floats, row: Index, lanes: Index) -> None:
     """Forward pass of the GRUs, from the features to the gain and the posterior."""
     forward_layer(net, on.L_UPDATE, tape, row, lanes)
     gru(net, on.L_PROCESS_X, on.PROCESS_OLD, on.PROCESS, state.process, tape, row, lanes)
@@ -189,7 +189,7 @@ def blend(unit: Floats, new: Floats) -> None:
 
 
 @part
-def move(drives: Drives, state: State, net: Net, tape: Floats, lane: Index, at: tuple[Index, Index, Index]) -> None:
+def correct(drives: Drives, state: State, net: Net, tape: Floats, lane: Index, at: tuple[Index, Index, Index]) -> None:
     """x <- x_prior + K (z - x_prior) and the new states of a lane; without a fix x <- x_prior and nothing else."""
     t, s, b = at
     gone, gain, residual = missing(drives.gnss, at), net.columns[on.GAIN], net.columns[on.RESIDUAL]
