@@ -48,7 +48,7 @@ def test_the_table_of_the_page_is_a_log(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_every_command_runs(folder: Path) -> None:
     commands = [line for block in blocks("sh") for line in block.splitlines()]
-    assert len(commands) == 7
+    assert len(commands) == 8
     for command in commands[1:]:
         done = ran([*COOPOC, *words(command)[1:]], cwd=folder)
         assert done.returncode == 0, done.stderr
