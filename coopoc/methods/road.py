@@ -247,7 +247,7 @@ def to_logs(errors: RoadErrors) -> Floats:
 
 def from_logs(logs: Floats, least: float = ROAD.least) -> RoadErrors:
     """Errors of logarithms (8,), within LEAST and MOST."""
-    return RoadErrors(*np.exp(np.clip(logs, LEAST, MOST)).tolist(), least)
+    return replace(RoadErrors(*np.exp(np.clip(logs, LEAST, MOST)).tolist()), least=least)
 
 
 def true_cost(x: Floats, cov: Floats, true: Floats, fix: Floats | float = 0.0, distance: float = 1.0) -> Floats:
