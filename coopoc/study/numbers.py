@@ -128,21 +128,26 @@ def ratio(value: float | None, base: float | None) -> float | None:
     return value / base if value is not None and base else None
 
 
-def per_seed(results: Results, where: Where) -> Floats:
-    """(S, E, R) m, RT-LE for each training seed; S = 0 for a method that is not trained."""
+def _seeds(results: Results, where: Where) -> list[Any]:
     kept = present(results, where)
     frame = results.select(kept) if kept else results.frame.iloc[:0]
-    seeds = sorted(frame["train_seed"].dropna().unique()) if "train_seed" in frame else []
+    return sorted(frame["train_seed"].dropna().unique()) if "train_seed" in frame else []
+
+
+def per_seed(results: Results, where: Where) -> Floats:
+    """(S, E, R) m, RT-LE for each training seed; S = 0 for a method that is not trained."""
+    seeds = _seeds(results, where)
     return np.array([results.values("rt_le_m", {**where, "train_seed": seed}) for seed in seeds])
 
 
-def seed_means(results: Results, where: Where) -> list[float]:
-    """The mean for each training seed; of a method that is not trained one, and none if it was not run."""
-    each, alone = per_seed(results, where), mean(results, where)
-    return [float(seed.mean()) for seed in each] if len(each) else [] if alone is None else [alone]
+def seed_means(results: Results, where: Where, number: Number = mean) -> list[float]:
+    """A number for each training seed; of a method that is not trained one, and none if it was not run."""
+    seeds = _seeds(results, where)
+    wheres = [{**where, "train_seed": seed} for seed in seeds] or [dict(where)]
+    return [value for each in wheres if (value := number(results, each)) is not None]
 
 
 def seed_std(results: Results, where: Where) -> float | None:
     """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
-    each = seed_means(results, where)
-    return float(np.std(each, ddof=1)) if len(each) > 1 else None
+    each = per_seed(results, where)
+    return float(each.mean(axis=(1, 2)).std(ddof=1)) if len(each) > 1 else None
