@@ -220,7 +220,7 @@ def minimise(
                 mu = max(mu / DECAY, LEAST) if share > 0.75 else mu if share > 0.25 else max(GROWTH * mu, FIRST)
             else:
                 mu = max(GROWTH * mu, FIRST)
-            if count >= MAX_ITERATIONS or time.perf_counter() > deadline:
+            if count >= MAX_ITERATIONS or mu > MOST**4 or time.perf_counter() > deadline:  # no curvature is as negative
                 return Stationary(X, cost, multipliers(form, X, CX), count, False)
 
 
