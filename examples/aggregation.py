@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from coopoc.learned.training.clients import Client
     from coopoc.study.results import Results
 
-RULES = ("mean", "uniform", "fedavgm", "fedadam", "median", "trimmed_mean", "krum", "multi_krum")
+RULES = ("mean", "uniform", "median", "trimmed_mean", "krum", "multi_krum")
 BESIDE = ("centralised", "kalman")
 """Methods beside the rules under `iid` and `heterogeneous`."""
 METHODS = (*RULES, *BESIDE, "bound")

@@ -33,8 +33,6 @@ if TYPE_CHECKING:
 
 STRATEGIES: dict[str, tuple[str, dict[str, Any]]] = {
     "mean": ("FedAvg", {}),
-    "fedavgm": ("FedAvgM", {"server_momentum": 0.5}),
-    "fedadam": ("FedAdam", {"eta": 0.01, "beta_1": 0.5}),
     "median": ("FedMedian", {}),
     "trimmed_mean": ("FedTrimmedAvg", {"beta": 0.25}),
     "krum": ("Krum", {"num_malicious_nodes": 1}),
