@@ -19,7 +19,9 @@ from coopoc import (
     Sensors,
     load_fleet,
     observe,
+    pose_start,
     read_graph,
+    read_log,
     solve,
 )
 from coopoc.arrays import Floats
@@ -178,6 +180,7 @@ class Logged:
 LOGGED = (
     Logged("robots", "MRCLAM_Dataset6", 30.0),
     Logged("uwb", "tiers.pyfg", 10.0),
+    Logged("indoor", "Indoor_UWB_Input.txt", 3.0),
 )
 
 
@@ -203,6 +206,13 @@ def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, 
         assert drive.truth is not None
         start = int(until / drive.truth.dt)
         return pose_drives.thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
+    if task.name == "indoor":
+        log = read_log(path, truth=path.with_name("Indoor_UWB_GT.txt"), frame="body")
+        assert log.truth is not None
+        start = int(0.4 * len(log.recording.t))
+        noise = replace(log.recording.sensors, range_std=RANGE_STD)
+        begin = pose_start(log.recording.between(0, start), gate=GATE, assumed=noise)
+        return log.recording, log.truth, start, {"begin": begin, "assumed": noise}
     drive = pose_drives.drive(str(path), 0.0, V2X(max_neighbours=3, radius=float("inf")), GATE)
     if drive.truth is None or drive.truth.heading is None:
         raise InputError("data", str(path), "must hold true poses", "Take the file as it was published.")
@@ -236,7 +246,9 @@ def pose_row(task: Logged, folder: Path, made: Any) -> dict[str, Any]:
     level = mean_interval(np.sqrt(squares))
     row: dict[str, Any] = {"task": task.name, "data": hashed(path)}
     row |= {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
-    if track.heading is not None:
+    if fleet.heading is None:
+        row |= {"nees": round(float(np.nanmean(planar(track, fleet)[1][start:])), 2)}
+    elif track.heading is not None:
         turned = np.rad2deg(_blocks(heading_error(track, fleet)[0], start, task.block_s / fleet.dt))
         row |= {"heading_deg": round(float(np.nanmean(turned)), 3)}
         row |= {"nees": round(float(np.nanmean(pose_nees(track, fleet)[0, start:])), 2)}

@@ -263,3 +263,56 @@ def test_studies_say_where_a_log_belongs(tmp_path: Path) -> None:
     folder = written(tmp_path / "log")
     with pytest.raises(co.InputError, match="Take coopoc run real"):
         co.run_study("side_by_side", tmp_path, settings={"data": f"{folder}?frame=body"}, progress=False)
+
+
+def librsf(folder: Path, wheels: bool) -> tuple[Any, Any]:
+    """A robot on a circle of 5 m ranges four anchors without error, as libRSF writes it; its true way and headings."""
+    t = np.arange(0, 40, 0.1)
+    angle = 0.15 * t
+    place = 5 * np.column_stack([np.cos(angle), np.sin(angle)])
+    measured, true = [], []
+    for k, (now, (x, y)) in enumerate(zip(t, place, strict=True)):
+        number = k % 4
+        corner = np.array([-8.0 + 16 * (number % 2), -8.0 + 16 * (number // 2), 1.5 * (not wheels)])
+        reach = np.linalg.norm(corner - [x, y, 0.0])
+        places = " ".join(map(str, corner[: 2 if wheels else 3]))
+        measured.append(f"range{2 if wheels else 3} {now:.1f} {reach:.12g} 0.01 {places} {100 + number} 0")
+        if wheels:  # 0.75 m/s and 0.15 rad/s, 0.2 m from wheel to wheel
+            measured.append(f"odom2diff {now:.1f} 0.735 0.765 0 0.1 0.0001 0.0001 0.0001")
+        else:
+            measured.append(f"odom3 {now:.1f} 0.75 0 0 0 0 0.15 {'0.0001 ' * 6}")
+        true.append(f"point2 {now:.1f} {x} {y} 0 0 0 0" if wheels else f"point3 {now:.1f} {x} {y} 0 {'0 ' * 9}")
+    folder.mkdir()
+    (folder / "Hall_Input.txt").write_text("\n".join([*measured, "imu 0.0 1 2 3"]))
+    (folder / "Hall_GT.txt").write_text("\n".join(true))
+    (folder / "readme.txt").write_text("Not a measurement.")
+    return place, wrapped(angle + np.pi / 2)
+
+
+@pytest.mark.parametrize("wheels", [True, False])
+def test_libRSFs_text_is_followed_from_ranges_alone(tmp_path: Path, wheels: bool) -> None:
+    """The pose of a robot without a fix, bearing or compass comes from ranges to four anchors."""
+    place, heading = librsf(tmp_path / "hall", wheels)
+    log = load_log(f"{tmp_path / 'hall'}?frame=body")
+    ego = log.recording.ids.index("Hall")
+    assert {log.recording.ids[k] for k in log.recording.landmarks} == {"100", "101", "102", "103"}
+    assert log.summary.unused == {"Hall_Input.txt: lines imu": 1}
+    assert log.truth is not None
+    np.testing.assert_allclose(log.truth.position[:, ego, :2], place, atol=1e-9)
+    noise = log.recording.sensors
+    assert (noise.range_std, noise.yaw_rate_std) == pytest.approx((0.1, np.sqrt(2e-4) / 0.2 if wheels else 0.01))
+    begin = co.pose_start(log.recording)
+    track = co.PoseFilter("solo", begin=begin)(log.recording, ["Hall"])
+    assert track.heading is not None
+    assert np.linalg.norm(track.x[0, 50:, 0, :2] - place[50:], axis=1).max() < 0.15
+    assert np.abs(wrapped(track.heading[0, 50:, 0] - heading[50:])).max() < 0.05
+    with pytest.raises(co.InputError, match="where ranges to anchors place it"):
+        co.read_log(tmp_path / "hall")
+
+
+def test_two_anchors_leave_the_side_open(tmp_path: Path) -> None:
+    librsf(tmp_path / "hall", True)
+    file = tmp_path / "hall" / "Hall_Input.txt"
+    file.write_text("\n".join(line for line in file.read_text().split("\n") if not line.endswith(("102 0", "103 0"))))
+    with pytest.raises(co.InputError, match="or three ranges"):
+        co.pose_start(co.read_log(file, frame="body").recording)

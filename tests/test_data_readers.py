@@ -289,12 +289,18 @@ def test_a_segment_of_comma2k19(tmp_path: Path) -> None:
     np.testing.assert_allclose(log.recording.velocity[0, 2:-1, 0], np.diff(true, axis=0)[1:-1] / 0.1, atol=0.05)
 
 
-def test_a_real_segment_of_comma2k19(shared: Path) -> None:
+def test_a_real_segment_of_comma2k19_and_a_real_robot_of_libRSF(shared: Path) -> None:
     log = co.read_log(shared / "road" / "comma2k19", dt=0.1)
     assert log.truth is not None
     gap = (log.recording.gnss[0] - log.truth.position)[:, 0, :2]
     assert np.nanmedian(np.hypot(*gap.T)) < 2.0
     assert log.summary.read == {"fixes": 571}
+    robot = co.read_log(shared / "uwb" / "indoor", frame="body")
+    assert robot.truth is not None
+    assert robot.summary.read == {"ranges": 233}
+    ego = robot.recording.ids.index("Indoor_UWB")
+    track = co.PoseFilter("solo", begin=co.pose_start(robot.recording), gate=5.0)(robot.recording, [ego])
+    assert np.sqrt(np.nanmean(np.square((track.x[0, :, 0] - robot.truth.position[:, ego])[:, :2]).sum(1))) < 0.2
 
 
 @pytest.mark.parametrize(

@@ -24,6 +24,7 @@ from ..assemble import backward_difference, check_scale, check_size, check_time,
 from ..bag import STAMP, read_bag
 from ..cells import TABLES, factors, headers
 from ..comma import is_segment, read_segment
+from ..librsf import is_librsf, read_librsf
 from ..nmea import read_nmea
 from ..source import parted
 from .frames import ENU, Origin, assumed, local, on_one_clock, unwrapped
@@ -42,6 +43,7 @@ READERS: Mapping[str, Callable[..., Rows]] = {
     **dict.fromkeys(TABLES, read_log_table),
     **dict.fromkeys((".nmea", ".nme", ".gga"), read_nmea),
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
+    ".txt": read_librsf,
 }
 """Ending of a file -> (path, summary, *, columns, kinds, ignore) -> its rows. A new format is one more entry."""
 TRUTH = "truth"
@@ -79,7 +81,7 @@ class Log:
 
 
 def is_log(path: Path, columns: Mapping[str, str] | None = None) -> bool:
-    """Whether a path is a log: a bag, NMEA, a segment of comma2k19, a folder of such files, or a
+    """Whether a path is a log: a bag, NMEA, libRSF's text, a segment of comma2k19, a folder of such files, or a
     table with a column of a log.
 
     Args:
@@ -254,7 +256,7 @@ def _is_bag(path: Path) -> bool:
 
 def _is_read(file: Path) -> bool:
     ending = file.suffix.lower()
-    return ending in READERS
+    return is_librsf(file) if ending == ".txt" and file.is_file() else ending in READERS
 
 
 def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[str, Any]) -> Rows:

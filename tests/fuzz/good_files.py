@@ -34,6 +34,13 @@ ROBOTS = (
 )
 TUM = "# t x y z qx qy qz qw\n" + "".join(f"{k / 10} {k} 0 0 0 0 0.6 0.8\n" for k in range(8))
 KITTI = "".join(f"1 0 0 {k} 0 1 0 0 0 0 1 0\n" for k in range(8))
+LIBRSF = {
+    "a_Input.txt": "".join(
+        f"range2 {k / 10} 4.0 0.01 {3 * (k % 3)} {k % 2} {k % 3} 0\nodom2diff {k / 10} 0.5 0.6 0 0.1 0.01 0.01 0.01\n"
+        for k in range(6)
+    ),
+    "a_GT.txt": "".join(f"point2 {k / 10} {k / 20} 1 0 0 0 0\n" for k in range(6)),
+}
 MRCLAM = {
     "Barcodes.dat": "# Subject Barcode\n1 5\n2 14\n6 63\n",
     **{

@@ -69,6 +69,7 @@ READERS: Mapping[str, Reader] = {
     "pyfg": Reader({"a.pyfg": good.PYFG}, lambda d: read_graph(d / "a.pyfg")),
     "pyfg recording": Reader({"a.pyfg": good.ROBOTS}, lambda d: load_log(d / "a.pyfg")),
     "mrclam": Reader(good.MRCLAM, load_fleet),
+    "librsf": Reader(good.LIBRSF, lambda d: read_log(d, frame="body", any_scale=True)),
     "log": Reader({"log.csv": good.LOG}, lambda d: read_log(d / "log.csv", any_scale=True)),
     "json log": Reader({"log.jsonl": good.JSONL}, lambda d: read_log(d / "log.jsonl")),
     "wide log": Reader({"car.csv": good.WIDE}, lambda d: read_log(d / "car.csv", columns=NAMES)),

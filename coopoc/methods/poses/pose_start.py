@@ -23,10 +23,10 @@ def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0
     """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN for landmarks.
 
     With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
-    odometry until then its pose at the first step. A solo filter starts from each of some headings around the circle;
-    the one whose innovations, and bearings of other vehicles from fix to fix, have the largest likelihood over the
-    first seconds is kept. A compass leaves one. Vehicles without a fix that see fewer than two landmarks come last:
-    for them those that were found before are places, too.
+    odometry until then its pose at the first step; or its first ranges to three landmarks or more, by least squares. A
+    solo filter starts from each of some headings around the circle; the one whose innovations, and bearings of other
+    vehicles from fix to fix, have the largest likelihood over the first seconds is kept. A compass leaves one. Vehicles
+    without a fix that see fewer than two landmarks come last: for them those that were found before are places, too.
 
     Args:
         recording: in body frames.
@@ -133,24 +133,42 @@ def _cost_of_bearings(recording: Recording, run: int, column: int, angles: Float
     return found
 
 
+SHARP = 0.1
+"""m, of landmarks beside a line, below which ranges leave the side open."""
+
+
 def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places: Floats, angles: Floats) -> Floats:
     """(headings, 4) poses at the first step that the first fix, or what is seen first, leaves for each heading, with
     `places` (L, 3) m of what the links measure."""
     body, relative = body_of(recording), recording.relative[run, links]
     fixes = np.flatnonzero(np.isfinite(recording.gnss[run, :, column, 0]))
     seen = np.flatnonzero(np.isfinite(relative[:, :2]).all(axis=1))
-    if not len(fixes) and not len(seen):
-        given = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
-        allowed = "must hold a fix, or a range and bearing of a landmark or of a vehicle whose pose is found"
-        raise InputError("seconds", given, allowed, "Take more seconds, or give its pose.")
-    if not len(fixes) and np.isnan(body.heading[run, :, column]).all() and (places[seen] == places[seen[0]]).all():
-        given = f"{recording.ids[column]} sees one landmark alone, and has neither fix nor compass"
-        raise InputError("seconds", given, "must hold a second place", "Take more seconds, or give its pose.")
     turns = _turns(recording, run, column)
     middle = turns - 0.5 * recording.dt * body.yaw_rate[run, :, column]
     way = recording.dt * turned(recording.velocity[run, :, column], middle)
     way[0] = 0.0
     way = np.cumsum(way, axis=0)
+    compass = body.heading[run, 0, column]
+    angles = angles if np.isnan(compass) else np.full(len(angles), compass)
+    if not len(fixes) and not len(seen):
+        ranged = np.flatnonzero(np.isfinite(relative[:, 0]))
+        first = ranged[np.unique(places[ranged], axis=0, return_index=True)[1]]
+        steps = recording.links.step[links[first]]
+        moved = turned(np.broadcast_to(way[steps], (len(angles), len(steps), 3)), angles[:, None])
+        centres = places[first] - moved
+        apart = centres - centres.sum(axis=1, keepdims=True) / max(len(steps), 1)
+        if len(steps) and np.linalg.matrix_rank(apart[0, :, :2], SHARP) > 1:  # squared ranges differ linearly
+            square = np.square(centres[..., :2]).sum(axis=-1) - relative[first, 0] ** 2
+            place = 0.5 * np.linalg.pinv(apart[..., :2]) @ square[..., None]
+            return np.column_stack([place[..., 0], centres[..., 2].mean(axis=1), angles])
+        given = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
+        allowed = (
+            "must hold a fix, or a range and bearing of a landmark or of a vehicle whose pose is found, or three ranges"
+        )
+        raise InputError("seconds", given, allowed, "Take more seconds, or give its pose.")
+    if not len(fixes) and np.isnan(body.heading[run, :, column]).all() and (places[seen] == places[seen[0]]).all():
+        given = f"{recording.ids[column]} sees one landmark alone, and has neither fix nor compass"
+        raise InputError("seconds", given, "must hold a second place", "Take more seconds, or give its pose.")
     if len(fixes):
         step = int(fixes[0])
         place, offset = recording.gnss[run, step, column], way[step]
@@ -161,7 +179,5 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places
         flat[2] = relative[seen[0], 2] if np.isfinite(relative[seen[0], 2]) else flat[2]
         place = places[seen[0]]
         offset = way[step] + turned(to_vector(flat), np.asarray(turns[step]))
-    compass = body.heading[run, 0, column]
-    angles = angles if np.isnan(compass) else np.full(len(angles), compass)
     position = place - turned(np.broadcast_to(offset, (len(angles), 3)), angles)
     return np.column_stack([position, angles])
