@@ -31,11 +31,6 @@ from coopoc.study.provenance import environment
 from .roads import road_row, roads
 from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, VERSION, Task, bound, graph_row, pose_row, recording
 
-SMOOTHERS = frozenset({"batch-smoother"})
-"""Methods that see the whole drive, for which a filtering bound is none."""
-PAST = frozenset({"cooperative-filter"})
-"""Filters of a star whose newcomers bring what they did before."""
-
 
 def benchmark(
     methods: Annotated[Positional[tuple[str, ...]], arg(metavar="METHOD")] = (),
@@ -117,11 +112,11 @@ def method(name: str) -> Method:
 
 def information(name: str, one: Method) -> str:
     """Information set whose bound a method is held against."""
-    if name in SMOOTHERS:
+    if name == "batch-smoother":  # it sees the whole drive
         return ""
     if not one.cooperative:
         return "solo"
-    if name in PAST:
+    if name == "cooperative-filter":  # newcomers bring what they did before
         return "past"
     return "fleet" if name in WHOLE_FLEET or needs_whole_fleet(name) else "star"
 

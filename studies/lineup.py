@@ -12,13 +12,12 @@ import numpy as np
 from coopoc.arrays import AnyArray, Floats
 from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, past_bound, posterior_bound
-from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import innovation_columns
-from coopoc.evaluate.scores import BYTES, rows_of, scored
+from coopoc.evaluate.scores import online_columns, rows_of, scored
 from coopoc.methods.catalogue import METHODS
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
-from coopoc.methods.track import Method, far_off
+from coopoc.methods.track import Method
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.fleet import Fleet
@@ -105,7 +104,7 @@ def noise_model(p: Params) -> NoiseModel | str:
     return str(p["noise_model"])
 
 
-def methods(p: Params, recording: Recording) -> list[tuple[int | None, Method]]:
+def methods(p: Params) -> list[tuple[int | None, Method]]:
     """The method of a cell, once per training seed if it is trained.
 
     Raises:
@@ -152,7 +151,7 @@ def rows(
     who, drive, metric = scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"]), str(p.get("metric", ""))
     table: list[Row] = []
     strange = not made and p["method"] not in METHODS and not weights.is_trained(p["method"])
-    for seed, method in made or methods(p, recording):
+    for seed, method in made or methods(p):
         score = scored if complete(recording, who, drive) else scored_where_present
         columns = score(method, recording, who, drive, quantiles, metric)
         more = ({} if seed is None else {"train_seed": seed}) | ({"label": method.name} if strange else {})
@@ -186,7 +185,7 @@ def bound_rows(p: Params) -> list[Row]:
 def tracks(p: Params) -> Iterator[tuple[str, Floats, Floats]]:
     """Name, times s and positions m of each ego's path in each run, as the cell's method estimates it."""
     recording = scene.recording(p)
-    for seed, method in methods(p, recording) if p["method"] != "bound" else ():
+    for seed, method in methods(p) if p["method"] != "bound" else ():
         for ego in scene.egos(p["data"], str(p["egos"])):
             found = [method(recording.between(*cut), [ego]) for cut in recording.stretches(ego)]
             t = np.concatenate([track.t for track in found])
@@ -257,13 +256,11 @@ def _ego(
 
 def _without_truth(method: Method, recording: Recording, ego: str) -> dict[str, AnyArray]:
     track = method(recording, [ego])
-    account = of_track(track, recording, method.message)
     near = len(recording.links.of(recording.ids.index(ego))) / len(recording.t)
     shape = (recording.runs, 1)
     return {
         **innovation_columns(track, recording),
-        "left_fixes": far_off(track.x, recording, track.egos).astype(float),
-        **{name: account.of("online", *counted) / account.seconds for name, counted in BYTES.items()},
+        **online_columns(track, recording, method),
         "neighbours_mean": np.full(shape, near),
         "seconds": np.full(shape, track.seconds / recording.runs),
     }

@@ -49,7 +49,6 @@ def test_break_even_of_the_papers_training() -> None:
     for rate, minutes in ((900.0, 59.1), (3500.0, 15.2)):
         drive = of_drive(["a"], 2.0, np.zeros((1, 1)), np.array([[2 * rate]]), NO_MESSAGE, 0)
         assert break_even(once, drive) / 60 == pytest.approx(minutes, abs=0.05)
-    assert break_even(once, drive, way="broadcast") == float("inf")
     with pytest.raises(InputError, match="training"):
         break_even(drive, drive)
     with pytest.raises(InputError, match="seconds"):

@@ -135,15 +135,14 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
     return of_drive(names, seconds, *moved, message, overhead, messages)
 
 
-def break_even(training: Ledger, online: Ledger, kind: Kind = "payload", way: Way = "per receiver") -> float:
+def break_even(training: Ledger, online: Ledger, kind: Kind = "payload") -> float:
     """Seconds of driving after which online cooperation has moved as many bytes per vehicle as the training; inf:
     never.
 
     Args:
         training: its bytes are taken.
         online: its rate is taken.
-        kind: of the bytes in both.
-        way: of counting in both.
+        kind: of the bytes in both, counted per receiver.
 
     Raises:
         InputError: a training without bytes, or a drive of no time.
@@ -154,10 +153,10 @@ def break_even(training: Ledger, online: Ledger, kind: Kind = "payload", way: Wa
     """
     instance("training", training, Ledger)
     instance("online", online, Ledger)
-    bytes_ = training.per_vehicle("training", kind, way)
+    bytes_ = training.per_vehicle("training", kind)
     if not bytes_ > 0:
         raise InputError("training", bytes_, "must have moved some bytes", "Give the ledger of a training.")
-    rate = online.rate(kind, way)
+    rate = online.rate(kind)
     return bytes_ / rate if rate else np.inf
 
 

@@ -90,17 +90,22 @@ def slabs(recording: Recording, egos: int) -> Iterator[Recording]:
         yield recording.of_runs(slice(first, first + runs)) if runs < recording.runs else recording
 
 
+def online_columns(track: Track, recording: Recording, method: Method) -> dict[str, AnyArray]:
+    """Bytes per second of a track, and whether it ever left the fixes, which need no truth."""
+    account = of_track(track, recording, method.message)
+    rates = {name: account.of("online", *counted) / account.seconds for name, counted in BYTES.items()}
+    return {**rates, "left_fixes": far_off(track.x, recording, list(track.egos)).astype(float)}
+
+
 def _columns(track: Track, recording: Recording, method: Method, drive: Fleet, quantiles: int) -> dict[str, AnyArray]:
     """Columns that need no average over runs."""
     error = errors(track, drive)
     level = np.sqrt((error**2).mean(axis=1))
-    account = of_track(track, recording, method.message)
     found = {
         "rt_le_m": level,
         "max_error_m": error.max(axis=1),
         "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
-        **{name: account.of("online", *counted) / account.seconds for name, counted in BYTES.items()},
-        "left_fixes": far_off(track.x, recording, list(track.egos)).astype(float),
+        **online_columns(track, recording, method),
     }
     if quantiles:
         spaced = np.quantile(error, np.linspace(0, 1, quantiles), axis=1)

@@ -52,13 +52,11 @@ class Capabilities:
     Args:
         kinds: of measurement; None: all that are registered, those of other distributions too.
         losses: robust losses; None: all.
-        poses: nodes may have a rotation.
         constraints: "none", "linear" (on kinds whose formula is linear) or "all".
     """
 
     kinds: tuple[str, ...] | None = None
     losses: tuple[str, ...] | None = None
-    poses: bool = True
     constraints: Literal["none", "linear", "all"] = "none"
 
     def lacking(self, problem: Problem) -> list[str]:
@@ -78,7 +76,6 @@ class Capabilities:
         return [
             *(f"kind {kind}" for kind in sorted(kinds)),
             *(f"loss {loss}" for loss in sorted(losses)),
-            *(["poses"] if problem.poses and not self.poses else []),
             *(f"a constraint on {kind}" for kind in sorted({c.kind for c in barred})),
         ]
 

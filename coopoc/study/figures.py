@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping, Sequence
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,17 +22,14 @@ if TYPE_CHECKING:
 __all__ = ["Plot", "curves", "multiples", "pareto", "sweep"]
 
 
-def sweep(
-    results: Results, x: str, y: str = "rt_le_m", where: Where | None = None, caption: str = "", log: bool = False
-) -> Plot:
-    """Plot a metric against an axis: one line per method and noise model with its 95 % band; "bound" is dashed.
+def sweep(results: Results, x: str, where: Where | None = None, caption: str = "", log: bool = False) -> Plot:
+    """Plot RT-LE against an axis: one line per method and noise model with its 95 % band; "bound" is dashed.
 
     Without a column `method` there is one line per combination of the other axes.
 
     Args:
         results: of the study.
         x: column of the horizontal axis.
-        y: metric.
         where: column -> value or values.
         caption: under the figure; default the metric and the axis.
         log: logarithmic vertical axis.
@@ -45,10 +41,10 @@ def sweep(
     panel = Panel({value: {x: value} for value in sorted(rows[x].unique())}, dict(where or {}), xlabel=words(x))
     names = _line_names(results, x)
     lines = [dict(zip(names, line, strict=True)) for line in rows[names].drop_duplicates().itertuples(index=False)]
-    text = caption or f"{words(y)} against {words(x)}. Bands: 95 % intervals over egos, then runs."
-    plot = curves(results, [panel], lines, text, partial(interval, value=y), ylabel=words(y), log=log, width=6.4)
+    text = caption or f"{words('rt_le_m')} against {words(x)}. Bands: 95 % intervals over egos, then runs."
+    plot = curves(results, [panel], lines, text, interval, ylabel=words("rt_le_m"), log=log, width=6.4)
     if plot is None:
-        raise InputError(y, "no value", "must have been computed for a cell", "See the failed cells.")
+        raise InputError("rt_le_m", "no value", "must have been computed for a cell", "See the failed cells.")
     return plot
 
 

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from coopoc.errors import InputError
 
-from .rules import Rule, State
+from .rules import Rule
 
 SERVER = "server"
 """The server's name in the traffic of a round."""
@@ -29,10 +29,9 @@ class Answer(NamedTuple):
 
 
 class Standing(NamedTuple):
-    """What a server carries from round to round: weights (P,), state of its rule, usual change (`screen`)."""
+    """What a server carries from round to round: weights (P,), and the usual change (`screen`)."""
 
     theta: Tensor
-    state: State
     usual: float | None = None
 
 
@@ -83,7 +82,7 @@ def screen(
 def combine(rule: Rule, standing: Standing, answers: Mapping[str, Answer]) -> tuple[Standing, dict[str, str], str]:
     """Screen the answers, then combine the accepted ones, in the order of the clients' names.
 
-    Weights and state are unchanged if too few answers are accepted, or if the result is not finite.
+    Weights are unchanged if too few answers are accepted, or if the result is not finite.
 
     Args:
         rule: aggregation rule.
@@ -98,7 +97,7 @@ def combine(rule: Rule, standing: Standing, answers: Mapping[str, Answer]) -> tu
 
     >>> from coopoc.learned.federation.rules import rule
     >>> two = {"b": Answer(torch.tensor([3.0]), 1), "a": Answer(torch.tensor([torch.nan]), 3)}
-    >>> after, rejected, note = combine(rule("mean"), Standing(torch.tensor([2.0]), ()), two)
+    >>> after, rejected, note = combine(rule("mean"), Standing(torch.tensor([2.0])), two)
     >>> after.theta.tolist(), rejected
     ([3.0], {'a': '1 of 1 weights are not finite'})
     """
@@ -111,11 +110,11 @@ def combine(rule: Rule, standing: Standing, answers: Mapping[str, Answer]) -> tu
         note = f"{len(accepted)} answers accepted, {rule.name} takes at least {rule.least}: weights unchanged"
         return unchanged, rejected, note
     weights, sizes = torch.stack([a.weights for a in accepted]), torch.tensor([a.size for a in accepted])
-    combined, state = rule(standing.state, theta, weights, sizes)
+    combined = rule(theta, weights, sizes)
     if combined.shape != theta.shape:
         allowed = f"must have the shape {tuple(theta.shape)} of the net's weights"
         shape = f"{rule.name} -> {tuple(combined.shape)}"
         raise InputError("aggregate", shape, allowed, "Combine over the clients only.")
-    if not all(bool(part.isfinite().all()) for part in (combined, *state)):
+    if not combined.isfinite().all():
         return unchanged, rejected, f"{rule.name} gives weights that are not finite: weights unchanged"
-    return Standing(combined.to(theta.dtype), state, usual), rejected, ""
+    return Standing(combined.to(theta.dtype), usual), rejected, ""

@@ -142,7 +142,7 @@ def federate_many(
             text = f"{hostile} Byzantine clients of {len(team.names)}: {chosen.name} tolerates {most} a round"
             warnings.warn(text, RuntimeWarning, stacklevel=3)
     stack = stacked(models[0], groups, teams)
-    standings = [Standing(theta, chosen.start(theta)) for theta in flatten(models)]
+    standings = [Standing(theta) for theta in flatten(models)]
     reports = stack.validated([s.theta for s in standings])
     histories = [[Round(0, s.theta, (math.nan,) * len(r), r)] for s, r in zip(standings, reports, strict=True)]
     for number in watched(range(1, plan.rounds + 1), progress, "round"):

@@ -13,14 +13,12 @@ from coopoc.plugins import find
 
 Combine = Callable[[Tensor, Tensor], Tensor]
 """New weights (P,) from the clients' weights (C, P) and numbers of training pieces (C,)."""
-State = tuple[Tensor, ...]
 
 
 class Rule:
-    """theta, state <- rule(state, theta, weights, sizes).
+    """theta <- rule(theta, weights, sizes), which remembers nothing: servers with memory are Flower's.
 
-    A rule holds its parameters; what it carries from round to round is in its state. A stateless rule overrides
-    `combine`, one with a state `start` and `__call__`.
+    A rule that needs the clients' weights alone overrides `combine`, one that needs their changes `__call__`.
     """
 
     @property
@@ -38,17 +36,13 @@ class Rule:
         point); 0 unless a rule knows better."""
         return 0
 
-    def start(self, theta: Tensor) -> State:
-        """State before the first round, with weights theta (P,)."""
-        return ()
-
     def combine(self, weights: Tensor, sizes: Tensor) -> Tensor:
         """New weights (P,) from those of the clients (C, P) and their pieces (C,)."""
         raise NotImplementedError(f"{type(self).__name__} defines neither combine nor __call__")
 
-    def __call__(self, state: State, theta: Tensor, weights: Tensor, sizes: Tensor) -> tuple[Tensor, State]:
-        """New weights (P,) and state; theta (P,) is what the clients received."""
-        return self.combine(weights, sizes), state
+    def __call__(self, theta: Tensor, weights: Tensor, sizes: Tensor) -> Tensor:
+        """New weights (P,); theta (P,) is what the clients received."""
+        return self.combine(weights, sizes)
 
 
 def within(field: str, value: object, good: bool, allowed: str, hint: str = "The docstring cites its source.") -> None:

@@ -138,7 +138,7 @@ def follow_horizon(
         if settings.age >= 0.0:
             for step in range(span[0], t + 1):
                 gather_arrived(window, gates, measurements, model, arrival, settings, runs, step, t)
-        start_points(window, model, t)
+        start_points(window, t)
         if settings.robust:
             gate_step(window, gates, model, t)
         link_points(window, model, t)
@@ -265,7 +265,7 @@ def distance(window: Window, span: tuple[int, int]) -> Any:
 
 
 @inner
-def start_points(window: Window, model: Assumptions, t: int) -> None:
+def start_points(window: Window, t: int) -> None:
     """A new step where it is expected: a member that stays moves, one that joins stands where the ego measures it, and
     one that nothing has located yet where its first position puts it, with its earlier points."""
     ego, before = row_of(window.layout, t, 0), row_of(window.layout, t - 1, 0)

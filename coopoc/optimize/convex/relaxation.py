@@ -265,7 +265,7 @@ class Certificate:
     """Bounds of a solution's cost against the smallest cost of any point.
 
     Args:
-        certified: no point has a cost smaller by more than the tolerance.
+        certified: no point has a cost smaller by more than a share GAP of max(cost, 1).
         sentence: the verdict in words.
         cost: of the solution.
         lower_bound: no point has a smaller cost.
@@ -287,7 +287,7 @@ class Certificate:
         return self.sentence
 
 
-def certify(problem: Problem, solution: Solution, tolerance: float = GAP, seconds: float = 0.0) -> Certificate:
+def certify(problem: Problem, solution: Solution, seconds: float = 0.0) -> Certificate:
     """Certificate of a solution, at the price of one eigenvalue; a relaxation is solved only if there are `seconds`.
 
     With the multipliers L that belong to the solution's X in closed form, every point of the QCQP costs at least
@@ -301,7 +301,6 @@ def certify(problem: Problem, solution: Solution, tolerance: float = GAP, second
     Args:
         problem: one that `quadratic` takes.
         solution: of it.
-        tolerance: largest gap, as a share of max(cost, 1).
         seconds: for a better bound where the first proves nothing: that of `staircase` from the solution.
 
     Raises:
@@ -318,9 +317,9 @@ def certify(problem: Problem, solution: Solution, tolerance: float = GAP, second
     X = form.lift(problem.space.position(x), problem.space.rotation(x))[: form.bound]
     reduced = Reduced(form)
     bound, smallest, _ = reduced.lower_bound(multipliers(form, X, reduced.times(X)))
-    if seconds > 0 and solution.cost - bound > tolerance * max(solution.cost, 1.0):
+    if seconds > 0 and solution.cost - bound > GAP * max(solution.cost, 1.0):
         bound = max(bound, staircase(replace(problem, x0=x), refine=False, seconds=seconds).lower_bound)
-    certified = solution.cost - bound <= tolerance * max(solution.cost, 1.0)
+    certified = solution.cost - bound <= GAP * max(solution.cost, 1.0)
     sentence = (
         f"certified global optimum of {problem!r}"
         if certified
