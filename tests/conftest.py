@@ -13,6 +13,7 @@ import pytest
 
 from coopoc import Fleet, load_fleet
 from coopoc.data.fleet_files import write_table
+from coopoc.errors import InputError
 from coopoc.study.study import Study
 
 collect_ignore = ["fuzz"]
@@ -25,6 +26,11 @@ def shared() -> Path:
     if not SHARED.is_dir():
         pytest.skip("the shared data folder is not beside the project")
     return SHARED
+
+
+def refused(match: str) -> Any:
+    """Context in which something is refused, with these words."""
+    return pytest.raises(InputError, match=match)
 
 
 def textbook(method: Any) -> Any:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import textbook
+from numpy.testing import assert_allclose
 from oracles.cooperative import Oracle
 from test_star_filters import CHANNELS, gappy, holed, partial
 
@@ -35,20 +36,20 @@ def drive(steps: int = 80) -> Fleet:
 def test_textbook_is_the_joint_filter(channel: str, change: Callable[[Recording], Recording], known: str) -> None:
     seen = change(observe(gappy(drive()), S2, CHANNELS[channel], runs=2, observers=[0, 9]))
     ours, joint = CooperativeFilter(known, robust=False)(seen, [0, 9]), textbook(JointFilter(known))(seen, [0, 9])
-    np.testing.assert_allclose(ours.x, joint.x, atol=1e-9)
+    assert_allclose(ours.x, joint.x, atol=1e-9)
     assert ours.covariance is not None
     assert joint.covariance is not None
-    np.testing.assert_allclose(ours.covariance, joint.covariance, rtol=1e-9, atol=1e-9)
+    assert_allclose(ours.covariance, joint.covariance, rtol=1e-9, atol=1e-9)
 
 
 def test_alone_it_is_the_kalman_filter() -> None:
     """But for the prior of the start, 1e6 m^2 beside a fix of 12 m^2; no fix is beyond the gate here."""
     seen = observe(drive(), replace(S2, gnss_std=(1.0,) * 3), V2X(0), observers=[0], assumed=S2)
     ours, kalman = CooperativeFilter()(seen), Kalman()(seen)
-    np.testing.assert_allclose(ours.x, kalman.x, atol=1e-3)
+    assert_allclose(ours.x, kalman.x, atol=1e-3)
     assert ours.covariance is not None
     assert kalman.covariance is not None
-    np.testing.assert_allclose(ours.covariance, kalman.covariance, rtol=1e-4)
+    assert_allclose(ours.covariance, kalman.covariance, rtol=1e-4)
 
 
 def too_long(seen: Recording, share: float = 0.05) -> Recording:
@@ -108,10 +109,10 @@ def test_the_filter_is_its_oracle(crossing: Fleet, case: str, robust: bool) -> N
     assert track.neighbours is not None
     for run in range(2):
         x, cov, others = Oracle(seen, 0, run, known, Guards() if robust else NO_GUARDS, robust).loop()
-        np.testing.assert_allclose(track.x[run, :, 0], x, atol=1e-6)
-        np.testing.assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=1e-6)
+        assert_allclose(track.x[run, :, 0], x, atol=1e-6)
+        assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=1e-6)
         if len(track.neighbours[run]):
-            np.testing.assert_allclose(track.neighbours[run], np.concatenate(others), atol=1e-5)
+            assert_allclose(track.neighbours[run], np.concatenate(others), atol=1e-5)
 
 
 @pytest.mark.parametrize("case", ["late", "attack"])
@@ -136,10 +137,10 @@ def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
             for link, j, s in zip(here, seen.links.neighbour[box.link[here]], box.newest[0, here], strict=True)
         ]
         x, cov = streams[0].step(seen.gnss[0, t, 0], seen.velocity[0, t, 0], seen.dt, neighbours=given)
-        np.testing.assert_allclose(x, track.x[0, t, 0], atol=1e-6)
+        assert_allclose(x, track.x[0, t, 0], atol=1e-6)
         assert track.covariance is not None
         assert cov is not None
-        np.testing.assert_allclose(cov, track.covariance[0, t, 0], atol=1e-6)
+        assert_allclose(cov, track.covariance[0, t, 0], atol=1e-6)
 
 
 def newest(seen: Recording, sent: Mapping[tuple[int, int], Any], t: int, s: int, j: int) -> dict[str, Any]:

@@ -9,7 +9,9 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import refused
 from logs import NOISE, drive, long, observed, write
+from numpy.testing import assert_allclose
 
 import coopoc as co
 from coopoc.data.log.read import read_log
@@ -26,17 +28,17 @@ def test_a_recording_comes_back_from_its_rows(tmp_path: Path, suffix: str) -> No
     log = read_log(write(frame, tmp_path / f"log.{suffix}"))
     found = log.recording
     assert found.ids == true.ids
-    np.testing.assert_allclose(found.t, true.t, rtol=0, atol=1e-6)
-    np.testing.assert_allclose(found.gnss, true.gnss, atol=1e-5)
+    assert_allclose(found.t, true.t, rtol=0, atol=1e-6)
+    assert_allclose(found.gnss, true.gnss, atol=1e-5)
     means = true.velocity.copy()
     means[:, 1:] = (means[:, 1:] + means[:, :-1]) / 2  # trapezoids between samples at the steps
-    np.testing.assert_allclose(found.velocity, means, atol=1e-4)  # stamps have 7 digits behind the point
+    assert_allclose(found.velocity, means, atol=1e-4)  # stamps have 7 digits behind the point
     for name in ("step", "observer", "neighbour"):
         one = pd.DataFrame({k: getattr(true.links, k) for k in ("step", "observer", "neighbour")})
         other = pd.DataFrame({k: getattr(found.links, k) for k in ("step", "observer", "neighbour")})
         order, back = (f.sort_values(["step", "observer", "neighbour"]).index for f in (one, other))
         np.testing.assert_array_equal(one.loc[order, name], other.loc[back, name])
-    np.testing.assert_allclose(found.relative[0, back], true.relative[0, order], atol=1e-9)
+    assert_allclose(found.relative[0, back], true.relative[0, order], atol=1e-9)
     sent = true.broadcasts[true.links.step, true.links.neighbour]
     wanted = np.where(sent, true.arrival[0], -1)
     np.testing.assert_array_equal(found.arrival[0, back], wanted[order])
@@ -55,8 +57,8 @@ def test_degrees_are_metres_by_the_radii_of_curvature(tmp_path: Path, latitude: 
     x, y = read_log(write(pd.DataFrame(frame), tmp_path / "car.csv")).recording.gnss[0, :, 0, :2].T
     s = np.sin(np.radians(latitude)) ** 2
     normal, meridian = a / np.sqrt(1 - e2 * s), a * (1 - e2) / (1 - e2 * s) ** 1.5
-    np.testing.assert_allclose(y, (meridian + 20) * np.radians(d), rtol=1e-4)
-    np.testing.assert_allclose(x, (normal + 20) * np.cos(np.radians(latitude + d)) * np.radians(d), rtol=1e-4)
+    assert_allclose(y, (meridian + 20) * np.radians(d), rtol=1e-4)
+    assert_allclose(x, (normal + 20) * np.cos(np.radians(latitude + d)) * np.radians(d), rtol=1e-4)
 
 
 def test_a_drive_in_degrees_is_one_in_metres(tmp_path: Path) -> None:
@@ -71,11 +73,11 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path: Path) -> None:
     names = {"t": "time", "latitude": "lat", "longitude": "lon", "height": "alt", "compass_deg": "yaw"}
     log = read_log(tmp_path / "car7.csv", columns=names, origin=origin)
     assert log.recording.ids == ("car7",)
-    np.testing.assert_allclose(log.recording.gnss[0, :, 0], fleet.position[:, 0], atol=1e-6)
-    np.testing.assert_allclose(log.recording.velocity[0, 5:, 0], fleet.velocity[5:, 0], atol=0.05)
+    assert_allclose(log.recording.gnss[0, :, 0], fleet.position[:, 0], atol=1e-6)
+    assert_allclose(log.recording.velocity[0, 5:, 0], fleet.velocity[5:, 0], atol=0.05)
     free = read_log(tmp_path / "car7.csv", columns=names)
     assert free.origin == pytest.approx((lat[0], lon[0], h[0]))
-    np.testing.assert_allclose(free.recording.gnss[0, 0, 0], 0, atol=1e-9)
+    assert_allclose(free.recording.gnss[0, 0, 0], 0, atol=1e-9)
 
 
 def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhere(tmp_path: Path) -> None:
@@ -116,12 +118,12 @@ def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path: Path) -> N
     write(pd.DataFrame({"t": [0.0], "vehicle": "rsu", "x": 20.0, "y": 5.0}), tmp_path / "log" / "rsu.csv")
     log = read_log(tmp_path / "log", dt=0.1)
     rec, col = log.recording, log.recording.ids.index("car")
-    np.testing.assert_allclose(rec.relative[0, :, 1], azimuth, atol=0.01)
+    assert_allclose(rec.relative[0, :, 1], azimuth, atol=0.01)
     gap = np.array([20.0, 5.0]) - x[10:90:5]
-    np.testing.assert_allclose(rec.relative[0, :, 1], np.arctan2(gap[:, 1], gap[:, 0]), atol=2e-4)
+    assert_allclose(rec.relative[0, :, 1], np.arctan2(gap[:, 1], gap[:, 0]), atol=2e-4)
     assert np.isnan(rec.relative[0, :, [0, 2]]).all()
     true = 3 * np.column_stack([np.cos(heading), np.sin(heading)])
-    np.testing.assert_allclose(rec.velocity[0, 1:, col, :2], (true[1:] + true[:-1]) / 2, atol=2e-3)
+    assert_allclose(rec.velocity[0, 1:, col, :2], (true[1:] + true[:-1]) / 2, atol=2e-3)
     assert (rec.gnss[0, :, rec.ids.index("rsu")] == [20.0, 5.0, 0.0]).all()
     assert "stands at" in log.summary.vehicles["rsu"]
 
@@ -140,7 +142,7 @@ def test_slow_fixes_are_brought_to_their_step_by_the_odometry(tmp_path: Path) ->
     log = read_log(tmp_path / "log")
     fixed = np.isfinite(log.recording.gnss[0, :, 0, 0])
     assert np.flatnonzero(fixed).tolist() == list(range(3, 190, 10))
-    np.testing.assert_allclose(log.recording.gnss[0, fixed, 0], fleet.position[fixed, 0], atol=0.01)
+    assert_allclose(log.recording.gnss[0, fixed, 0], fleet.position[fixed, 0], atol=0.01)
     assert log.recording.stretches("a") == ((3, 200),)
     assert log.summary.refused["steps of a before its first fix"][0] == 3
 
@@ -153,9 +155,9 @@ def test_a_clock_that_is_ahead_is_set_back(tmp_path: Path) -> None:
     frame.loc[late, "t"] += 0.37
     frame.loc[received, "arrival"] = [f"{float(a) + 0.37:.6f}" for a in frame.loc[received, "arrival"]]
     log = read_log(write(frame, tmp_path / "log.csv"), clock={"car1": 0.37}, dt=0.1)
-    np.testing.assert_allclose(log.recording.gnss, true.gnss, atol=1e-5)
+    assert_allclose(log.recording.gnss, true.gnss, atol=1e-5)
     np.testing.assert_array_equal(np.sort(log.recording.arrival), np.sort(true.arrival))
-    with pytest.raises(co.InputError, match=r"clock = 'car9'.*car0, car1"):
+    with refused(r"clock = 'car9'.*car0, car1"):
         read_log(tmp_path / "log.csv", clock={"car9": 1.0})
 
 
@@ -244,8 +246,8 @@ def test_ranges_and_azimuths_of_passing_cars_are_those_at_the_step(tmp_path: Pat
     gap = (place[links.step, links.neighbour] - place[links.step, links.observer])[:, :2]
     far = np.hypot(*gap.T) > 12.0  # nearer, fixes would not know the direction
     assert far.sum() > 120
-    np.testing.assert_allclose(found.relative[0, far, 0], np.hypot(*gap[far].T), atol=1e-9)
-    np.testing.assert_allclose(found.relative[0, far, 1], np.arctan2(gap[far, 1], gap[far, 0]), atol=1e-9)
+    assert_allclose(found.relative[0, far, 0], np.hypot(*gap[far].T), atol=1e-9)
+    assert_allclose(found.relative[0, far, 1], np.arctan2(gap[far, 1], gap[far, 0]), atol=1e-9)
     assert np.isfinite(found.relative[0]).all()
     assert (found.relative[0, :, 0] > 0).all()
 

@@ -10,6 +10,8 @@ import numpy as np
 import pandas as pd
 import pymap3d
 import pytest
+from conftest import refused
+from numpy.testing import assert_allclose
 
 import coopoc as co
 from coopoc.data.assemble import interpolate
@@ -38,7 +40,7 @@ def test_tum_files_are_what_evo_reads(tmp_path: Path) -> None:
         file_interface = pytest.importorskip("evo.tools.file_interface")
         path = file_interface.read_tum_trajectory_file(str(tmp_path / "car.tum"))
     np.testing.assert_array_equal(path.positions_xyz, x)
-    np.testing.assert_allclose(path.timestamps, fleet.t[:1550], atol=1e-9)
+    assert_allclose(path.timestamps, fleet.t[:1550], atol=1e-9)
     np.testing.assert_array_equal(load_fleet(tmp_path).position[:, 0], x)
 
 
@@ -46,7 +48,7 @@ def test_velocity_is_derived_backwards_and_absence_is_a_missing_row(tmp_path: Pa
     (tmp_path / "a.csv").write_text(GOOD.replace("b,0.0,5,0,0\n", ""))
     fleet = load_fleet(tmp_path / "a.csv")
     assert fleet.present.tolist() == [[True, False], [True, True], [True, True]]
-    np.testing.assert_allclose(fleet.velocity[1:, 1], [[0, 10, 0], [0, 10, 0]])
+    assert_allclose(fleet.velocity[1:, 1], [[0, 10, 0], [0, 10, 0]])
     assert "backward difference" in fleet.source
 
 
@@ -85,18 +87,18 @@ def test_a_bad_table_names_the_thing_and_the_mend(tmp_path: Path, case: str) -> 
 
 def test_dt_must_be_positive_and_resamples_stamps_that_differ(tmp_path: Path) -> None:
     (tmp_path / "a.csv").write_text(GOOD)
-    with pytest.raises(InputError, match="dt = 0 s: must be > 0"):
+    with refused("dt = 0 s: must be > 0"):
         load_fleet(tmp_path / "a.csv", dt=0)
     (tmp_path / "b.csv").write_text(GOOD.replace("b,0.1", "b,0.13"))
     fleet = load_fleet(tmp_path / "b.csv", dt=0.05)
-    np.testing.assert_allclose(fleet.position[:, 0, 0], [0, 0.5, 1, 1.5, 2], atol=1e-12)
+    assert_allclose(fleet.position[:, 0, 0], [0, 0.5, 1, 1.5, 2], atol=1e-12)
     assert fleet.dt == 0.05
 
 
 @pytest.mark.parametrize(("stamp", "thing"), [("0.2", "none for c at t = 0.2 s"), ("0.17", "c = 1 rows, but 0")])
 def test_resampling_loses_no_vehicle(tmp_path: Path, stamp: str, thing: str) -> None:
     (tmp_path / "a.csv").write_text(GOOD + f"c,{stamp},9,9,9\n")
-    with pytest.raises(InputError, match=thing):
+    with refused(thing):
         load_fleet(tmp_path / "a.csv", dt=0.1)
 
 
@@ -107,7 +109,7 @@ def test_an_empty_tum_file_is_named_and_a_byte_order_mark_skipped(tmp_path: Path
     (tmp_path / "car.tum").write_text(TUM, encoding="utf-8-sig")
     assert load_fleet(tmp_path).ids == ("car",)
     (tmp_path / "lost.tum").write_text("# t x y z qx qy qz qw\n")
-    with pytest.raises(InputError, match=r"lost\.tum = 0 lines"):
+    with refused(r"lost\.tum = 0 lines"):
         load_fleet(tmp_path)
 
 
@@ -122,11 +124,11 @@ def test_fcd_angles_are_clockwise_from_north_and_positions_the_front_bumper(tmp_
     """Closed form: a vehicle 4 m long that faces east has its middle 2 m west of its front bumper."""
     (tmp_path / "a.xml").write_text(FCD)
     fleet = load_fleet(tmp_path / "a.xml", vehicle_length=4.0)
-    np.testing.assert_allclose(fleet.position[:, 0], [[8, 5, 0], [8.7, 5, 0]], atol=1e-12)
-    np.testing.assert_allclose(fleet.velocity[:, 0], [[7, 0, 0], [7, 0, 0]], atol=1e-12)
+    assert_allclose(fleet.position[:, 0], [[8, 5, 0], [8.7, 5, 0]], atol=1e-12)
+    assert_allclose(fleet.velocity[:, 0], [[7, 0, 0], [7, 0, 0]], atol=1e-12)
     half = np.sqrt(3) / 2
-    np.testing.assert_allclose(fleet.position[1, 1], [0, -2 * half, 2], atol=1e-12)
-    np.testing.assert_allclose(fleet.velocity[1, 1], [0, 2 * half, 1], atol=1e-12)
+    assert_allclose(fleet.position[1, 1], [0, -2 * half, 2], atol=1e-12)
+    assert_allclose(fleet.velocity[1, 1], [0, 2 * half, 1], atol=1e-12)
     assert not fleet.present[0, 1]
 
 
@@ -142,13 +144,13 @@ def test_fcd_angles_are_clockwise_from_north_and_positions_the_front_bumper(tmp_
 )
 def test_a_bad_fcd_file_is_named(tmp_path: Path, text: str, thing: str) -> None:
     (tmp_path / "a.xml").write_text(text)
-    with pytest.raises(InputError, match=thing):
+    with refused(thing):
         load_fleet(tmp_path / "a.xml")
 
 
 def test_a_column_by_a_wrong_name_is_proposed(tmp_path: Path) -> None:
     (tmp_path / "drive.csv").write_text(GOOD.replace("id,t,x,y,z", "id,t,easting,y,z"))
-    with pytest.raises(InputError, match=r"column estings = missing: .* Did you mean easting\?"):
+    with refused(r"column estings = missing: .* Did you mean easting\?"):
         load_fleet(tmp_path / "drive.csv", columns={"x": "estings"})
 
 
@@ -159,10 +161,10 @@ def test_a_left_handed_table_is_mirrored(tmp_path: Path) -> None:
     frame = pd.read_csv(tmp_path / "drive.csv")
     frame.assign(t=1000 * frame["t"], y=-frame["y"], vy=-frame["vy"]).to_csv(tmp_path / "left.csv", index=False)
     read = load_fleet(f"{tmp_path / 'left.csv'}?scale=y:-1,vy:-1,t:1e-3")
-    np.testing.assert_allclose(read.position, fleet.position, atol=1e-9)
-    np.testing.assert_allclose(read.velocity, fleet.velocity, atol=1e-9)
+    assert_allclose(read.position, fleet.position, atol=1e-9)
+    assert_allclose(read.velocity, fleet.velocity, atol=1e-9)
     for scale, message in (({"yaw": -1}, "scale = 'yaw': must be one of t, x"), ({"y": 0}, "scale of y = 0: must not")):
-        with pytest.raises(InputError, match=message):
+        with refused(message):
             load_fleet(tmp_path / "left.csv", scale=scale)
 
 
@@ -181,7 +183,7 @@ def test_a_gap_is_one_whenever_time_starts(tmp_path: Path, start: float) -> None
     assert fleet.present.sum() == len(t)
     bridged = load_fleet(tmp_path / "a.csv", dt=0.1, max_gap=13.2)
     assert bridged.present.all()
-    np.testing.assert_allclose(bridged.position[:, 0, 0], 8 * (bridged.t - start), atol=1e-5)
+    assert_allclose(bridged.position[:, 0, 0], 8 * (bridged.t - start), atol=1e-5)
 
 
 def test_interpolation_agrees_with_pandas() -> None:
@@ -192,14 +194,14 @@ def test_interpolation_agrees_with_pandas() -> None:
     union = series.reindex(np.union1d(series.index, np.round(grid - 1.7e9, 3))).interpolate("index")
     wanted = union.reindex(np.round(grid - 1.7e9, 3)).to_numpy(copy=True)
     wanted[(grid - 1.7e9 > 0.2001) & (grid - 1.7e9 < 0.8999)] = np.nan
-    np.testing.assert_allclose(interpolate(t, series.to_numpy()[:, None], grid, 0.5)[:, 0], wanted, atol=1e-6)
+    assert_allclose(interpolate(t, series.to_numpy()[:, None], grid, 0.5)[:, 0], wanted, atol=1e-6)
 
 
 def test_degrees_are_not_metres(tmp_path: Path) -> None:
     t = np.arange(0, 5, 0.1)
     degrees = {"x": 11.58 + 1e-5 * t, "y": 48.14 + 4e-5 * t}
     drive(t).assign(**degrees).to_csv(tmp_path / "a.csv", index=False)
-    with pytest.raises(InputError, match=r"columns x, y = 11\.58\.\.11\.58.*look like degrees.*load_recording"):
+    with refused(r"columns x, y = 11\.58\.\.11\.58.*look like degrees.*load_recording"):
         load_fleet(tmp_path / "a.csv")
     assert load_fleet(tmp_path / "a.csv", any_scale=True).position[0, 0, 1] == 48.14
 
@@ -213,7 +215,7 @@ def test_dates_are_seconds_since_1970(tmp_path: Path, unit: str, zone: str | Non
     frame.to_parquet(tmp_path / "a.parquet", index=False)
     frame.assign(t=[stamp.isoformat() for stamp in stamps]).to_csv(tmp_path / "a.csv", index=False)
     for name in ("a.parquet", "a.csv"):
-        np.testing.assert_allclose(load_fleet(tmp_path / name).t, 1.7e9 + np.arange(5) / 10, atol=1e-6, rtol=0)
+        assert_allclose(load_fleet(tmp_path / name).t, 1.7e9 + np.arange(5) / 10, atol=1e-6, rtol=0)
 
 
 @pytest.mark.parametrize(
@@ -228,7 +230,7 @@ def test_dates_are_seconds_since_1970(tmp_path: Path, unit: str, zone: str | Non
 )
 def test_a_row_that_is_none_is_named(tmp_path: Path, row: str, message: str) -> None:
     (tmp_path / "a.csv").write_text(f"id,t,x,y,z\na,0,0,0,0\n{row}\na,0.2,2,0,0\n")
-    with pytest.raises(InputError, match=message):
+    with refused(message):
         load_fleet(tmp_path / "a.csv")
 
 
@@ -250,10 +252,10 @@ def test_damaged_tables_are_named(tmp_path: Path) -> None:
 def test_what_no_memory_holds_is_refused_at_once(tmp_path: Path) -> None:
     began = time.process_time()
     drive(1e18 + 1e8 * np.arange(5)).to_csv(tmp_path / "a.csv", index=False)
-    with pytest.raises(InputError, match=r"a\.csv: column t with dt = 0\.1 s = .* steps .*nanoseconds"):
+    with refused(r"a\.csv: column t with dt = 0\.1 s = .* steps .*nanoseconds"):
         load_fleet(tmp_path / "a.csv", dt=0.1, any_scale=True)
     (tmp_path / "b.csv").write_text(",".join(["t"] * 100_000) + "\n")
-    with pytest.raises(InputError, match=r"b\.csv = 100000 columns: must be at most 5000"):
+    with refused(r"b\.csv = 100000 columns: must be at most 5000"):
         load_fleet(tmp_path / "b.csv", format="table")
     assert time.process_time() - began < 5.0
 
@@ -284,9 +286,9 @@ def test_a_segment_of_comma2k19(tmp_path: Path) -> None:
     log = co.read_log(tmp_path / "drive")
     assert log.truth is not None
     true = np.column_stack(pymap3d.geodetic2enu(*fixes.T, *fixes[0]))
-    np.testing.assert_allclose(log.truth.position[1:-1, 0], true[1:-1], atol=1e-5)
-    np.testing.assert_allclose(log.recording.gnss[0, 1:-1, 0], true[1:-1], atol=1e-5)
-    np.testing.assert_allclose(log.recording.velocity[0, 2:-1, 0], np.diff(true, axis=0)[1:-1] / 0.1, atol=0.05)
+    assert_allclose(log.truth.position[1:-1, 0], true[1:-1], atol=1e-5)
+    assert_allclose(log.recording.gnss[0, 1:-1, 0], true[1:-1], atol=1e-5)
+    assert_allclose(log.recording.velocity[0, 2:-1, 0], np.diff(true, axis=0)[1:-1] / 0.1, atol=0.05)
 
 
 def test_a_real_segment_of_comma2k19_and_a_real_robot_of_libRSF(shared: Path) -> None:
@@ -330,5 +332,5 @@ def test_a_damaged_array_of_comma2k19_is_named(tmp_path: Path, name: str, wrong:
     else:
         with file.open("wb") as out:
             np.save(out, wrong, allow_pickle=True)  # type: ignore[arg-type]
-    with pytest.raises(InputError, match=thing):
+    with refused(thing):
         co.read_log(tmp_path / "drive")

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 import coopoc as co
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
@@ -78,13 +79,13 @@ def assert_equivariant(
     method: Callable[..., co.Track], rec: co.Recording, change: Change, near: float, egos: tuple[str, ...]
 ) -> None:
     here, there = method(rec, egos), method(change.of(rec), egos)
-    np.testing.assert_allclose(there.x, here.x @ change.matrix.T + change.shift, rtol=0, atol=near)
+    assert_allclose(there.x, here.x @ change.matrix.T + change.shift, rtol=0, atol=near)
     if here.covariance is not None:
         turned = change.matrix @ here.covariance @ change.matrix.T
-        np.testing.assert_allclose(there.covariance, turned, rtol=0, atol=10 * near * np.abs(turned).max())
+        assert_allclose(there.covariance, turned, rtol=0, atol=10 * near * np.abs(turned).max())
     if here.heading is not None:
         apart = there.heading - change.azimuth(here.heading)
-        np.testing.assert_allclose(np.sin(apart / 2), 0, atol=near)
+        assert_allclose(np.sin(apart / 2), 0, atol=near)
 
 
 @pytest.mark.parametrize("change", CHANGES)
@@ -123,7 +124,7 @@ def test_every_solver_follows_the_world(backend: str, change: str, crossing: co.
     for window in (1, 5):
         here, there = (solve(Problem.from_window(seen, 7, "c0", window), backend) for seen in (rec, world.of(rec)))
         column = [there.names.index(name) for name in here.names]
-        np.testing.assert_allclose(there.position[column], here.position @ world.matrix.T + world.shift, atol=1e-6)
+        assert_allclose(there.position[column], here.position @ world.matrix.T + world.shift, atol=1e-6)
         turned = world.matrix @ here.covariance @ world.matrix.T
-        np.testing.assert_allclose(there.covariance[column], turned, rtol=1e-6, atol=1e-7)
+        assert_allclose(there.covariance[column], turned, rtol=1e-6, atol=1e-7)
         assert there.cost == pytest.approx(here.cost, rel=1e-7)

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pytest
 from graph_files import write_graph
+from numpy.testing import assert_allclose
 from scipy.io import mmread
 from scipy.spatial.transform import Rotation
 
@@ -104,7 +105,7 @@ def test_pyfg_numbers_are_what_cora_made_of_them(shared: Path) -> None:
     folder = shared / "pyfg/cora_unit/small_ra_slam_problem"
     graph = load_graph(folder / "factor_graph.pyfg")
     x = mmread(folder / "X_gt.mm").toarray()
-    np.testing.assert_allclose(graph.rotation[:6].swapaxes(-1, -2).reshape(12, 2), x[:12], atol=1e-15)
+    assert_allclose(graph.rotation[:6].swapaxes(-1, -2).reshape(12, 2), x[:12], atol=1e-15)
     np.testing.assert_array_equal(graph.position, x[17:])
     np.testing.assert_array_equal(graph.ranges.distance, mmread(folder / "RangeDistances.mm").diagonal())
     np.testing.assert_array_equal(1 / graph.ranges.variance, mmread(folder / "OmegaRange.mm").diagonal())
@@ -157,17 +158,15 @@ def _matrices(position: np.ndarray, rotation: np.ndarray) -> np.ndarray:
 def _assert_gtsam_agrees(graph: Graph, factors: Any, values: Any, keys: dict[str, int], atol: float = 1e-12) -> None:
     """Poses, measured poses and covariances; GTSAM orders 3-D covariances rotation first."""
     order = [0, 1, 2] if graph.dimension == 2 else [3, 4, 5, 0, 1, 2]
-    np.testing.assert_allclose(
-        _poses(values, graph, keys), _matrices(graph.position, graph.rotation)[graph.is_pose], atol=atol
-    )
+    assert_allclose(_poses(values, graph, keys), _matrices(graph.position, graph.rotation)[graph.is_pose], atol=atol)
     edges = graph.relative_pose
     found = [factors.at(k) for k in range(factors.size()) if "Between" in type(factors.at(k)).__name__]
     assert [f.keys() for f in found] == [[keys[graph.names[n]] for n in nodes] for nodes in edges.nodes]
     measured = np.array([f.measured().matrix() for f in found])
-    np.testing.assert_allclose(measured, _matrices(edges.position, edges.rotation), atol=atol)
+    assert_allclose(measured, _matrices(edges.position, edges.rotation), atol=atol)
     cov = np.array([f.noiseModel().covariance() for f in found])
     scale = np.abs(edges.covariance).max(axis=(1, 2), keepdims=True)
-    np.testing.assert_allclose(cov / scale, edges.covariance[:, order][:, :, order] / scale, atol=max(atol, 1e-10))
+    assert_allclose(cov / scale, edges.covariance[:, order][:, :, order] / scale, atol=max(atol, 1e-10))
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
@@ -203,7 +202,7 @@ def test_gtsams_own_landmark_graph_reads_as_gtsam_reads_it() -> None:
     seen = [factors.at(k) for k in range(factors.size()) if "BearingRange" in type(factors.at(k)).__name__]
     assert len(seen) == len(graph.relative_point) == 80
     distance = [f.measured().range() for f in seen]
-    np.testing.assert_allclose(np.linalg.norm(graph.relative_point.position, axis=1), distance, atol=1e-12)
+    assert_allclose(np.linalg.norm(graph.relative_point.position, axis=1), distance, atol=1e-12)
 
 
 def test_a_graph_cannot_be_changed_and_lists_its_robots() -> None:
@@ -227,13 +226,11 @@ def test_rotations_are_scipys() -> None:
         [1, 0, 0, 1e-9],
     ]
     turned = Rotation.from_quat(q)
-    np.testing.assert_allclose(to_rotation(q), turned.as_matrix(), atol=1e-14)
-    np.testing.assert_allclose(
-        Rotation.from_quat(to_orientation(turned.as_matrix())).as_matrix(), turned.as_matrix(), atol=1e-14
-    )
+    assert_allclose(to_rotation(q), turned.as_matrix(), atol=1e-14)
+    assert_allclose(Rotation.from_quat(to_orientation(turned.as_matrix())).as_matrix(), turned.as_matrix(), atol=1e-14)
     assert (to_orientation(turned.as_matrix())[:, 3] >= 0).all()
     theta = np.linspace(-3.1, 3.1, 50)[:, None]
-    np.testing.assert_allclose(to_orientation(to_rotation(theta)), theta, atol=1e-15)
+    assert_allclose(to_orientation(to_rotation(theta)), theta, atol=1e-15)
 
 
 def random_trajectory(count: int = 40) -> Trajectory:
@@ -257,4 +254,4 @@ def test_a_tum_file_is_numpys_table(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "a.tum", np.column_stack([poses.stamps, poses.position, quaternion]), fmt="%.17g")
     again = read_tum(tmp_path / "a.tum")
     assert_same(replace(again, rotation=poses.rotation), poses)
-    np.testing.assert_allclose(again.rotation, poses.rotation, atol=1e-15)
+    assert_allclose(again.rotation, poses.rotation, atol=1e-15)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 
 from coopoc import V2X, Fleet, JointFilter, Kalman, Sensors, Track, observe
 from coopoc.evaluate import scores
@@ -19,9 +20,9 @@ def track(crossing: Fleet) -> Track:
 
 def test_errors_and_nees_are_numpys(track: Track, crossing: Fleet) -> None:
     gap = track.x - crossing.position[:, [0, 5]]
-    np.testing.assert_allclose(errors(track, crossing), np.linalg.norm(gap, axis=-1), rtol=1e-14)
+    assert_allclose(errors(track, crossing), np.linalg.norm(gap, axis=-1), rtol=1e-14)
     solved = np.linalg.solve(track.covariance, gap[..., None])[..., 0]
-    np.testing.assert_allclose(nees(track, crossing), (gap * solved).sum(axis=-1), rtol=1e-9)
+    assert_allclose(nees(track, crossing), (gap * solved).sum(axis=-1), rtol=1e-9)
 
 
 def test_what_egos_think_of_neighbours(track: Track, crossing: Fleet) -> None:
@@ -44,7 +45,7 @@ def test_neighbours_are_counted_per_step(crossing: Fleet, monkeypatch: pytest.Mo
     found = scores.scored(JointFilter(), seen, ["c0", "c5"], crossing)
     assert found["neighbours_mean"].tolist() == [[3.0, 3.0]] * 6
     each = nees(JointFilter()(seen, ["c0", "c5"]), crossing).mean(axis=1)
-    np.testing.assert_allclose(found["nees"], each, rtol=1e-12)
+    assert_allclose(found["nees"], each, rtol=1e-12)
 
 
 def test_a_start_that_is_known_has_no_nees(crossing: Fleet) -> None:
@@ -54,4 +55,4 @@ def test_a_start_that_is_known_has_no_nees(crossing: Fleet) -> None:
     assert np.isfinite(found[:, 1:]).all()
     gap = (known.x - crossing.position[:, [0]])[:, 1:]
     solved = np.linalg.solve(known.covariance[:, 1:], gap[..., None])[..., 0]
-    np.testing.assert_allclose(found[:, 1:], (gap * solved).sum(axis=-1), rtol=1e-9)
+    assert_allclose(found[:, 1:], (gap * solved).sum(axis=-1), rtol=1e-9)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from numpy.testing import assert_allclose
 from test_equivariance import Change, assert_equivariant
 
 import coopoc as co
@@ -73,7 +74,7 @@ def test_the_hour_of_the_day_the_future_and_other_runs_change_nothing(
     whole = x(name, seen)
     np.testing.assert_array_equal(x(name, seen.between(0, steps)), whole[:, :steps])
     np.testing.assert_array_equal(x(name, seen.of_runs(slice(0, 1))), whole[:1])
-    np.testing.assert_allclose(x(name, replace(seen, t=seen.t + since)), whole, atol=1e-3)
+    assert_allclose(x(name, replace(seen, t=seen.t + since)), whole, atol=1e-3)
 
 
 @FEW
@@ -82,7 +83,7 @@ def test_a_stream_is_the_drive(seen: co.Recording) -> None:
     stream = co.Kalman(co.NoiseModel.nominal(seen.sensors)).start()
     steps = zip(seen.gnss[0, :, 0], seen.velocity[0, :, 0], strict=True)
     found = [stream.step(fix, velocity, seen.dt)[0] for fix, velocity in steps]
-    np.testing.assert_allclose(found, x("kalman", seen)[0, :, 0], atol=1e-9)
+    assert_allclose(found, x("kalman", seen)[0, :, 0], atol=1e-9)
 
 
 @FEW
@@ -102,7 +103,7 @@ def test_the_mean_over_a_step_is_that_over_its_halves(samples: list[tuple[float,
     signal = Signal(np.cumsum(gaps), values[:, None])
     grid = dt * np.arange(9)
     halves = step_means(signal, 0.5 * dt * np.arange(-1, 17))[:, 0]
-    np.testing.assert_allclose(step_means(signal, grid)[:, 0], (halves[::2] + halves[1::2]) / 2, atol=1e-6, rtol=1e-9)
+    assert_allclose(step_means(signal, grid)[:, 0], (halves[::2] + halves[1::2]) / 2, atol=1e-6, rtol=1e-9)
 
 
 @FEW
@@ -117,4 +118,4 @@ def test_files_hold_what_was_written(seen: co.Recording, fleet: co.Fleet) -> Non
         assert np.array_equal(again.position, fleet.position)
         assert np.array_equal(again.velocity, fleet.velocity)
     write_tum(FOLDER / "a.tum", fleet.t, fleet.position[:, 0])
-    np.testing.assert_allclose(read_tum(FOLDER / "a.tum").position, fleet.position[:, 0], atol=1e-8)
+    assert_allclose(read_tum(FOLDER / "a.tum").position, fleet.position[:, 0], atol=1e-8)

@@ -13,10 +13,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 import torch
+from conftest import refused
 from export_onnx import AGREE, INPUTS, OUTPUTS, STEPS, agree, first_inputs, to_onnx
 from shell import ran
 
-from coopoc import V2X, InputError, Sensors, load_fleet, observe
+from coopoc import V2X, Sensors, load_fleet, observe
 from coopoc.arrays import AnyArray, Floats
 from coopoc.errors import MissingLibraryError
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF, checkpoint
@@ -101,13 +102,13 @@ def test_the_file_is_checked_before_it_is_kept(tmp_path: Path, monkeypatch: pyte
         found[3][0, 0] += 2e-5 * (next(calls) == 20)
         return found
 
-    with pytest.raises(InputError, match=r"export = differs by .* at step 21"):
+    with refused(r"export = differs by .* at step 21"):
         agree(net, off)
-    with pytest.raises(InputError, match="export = differs by nan"):
+    with refused("export = differs by nan"):
         agree(net, lambda arrays: [np.full_like(a, np.nan) for a in good(arrays)])
     other = onnxruntime.InferenceSession(to_onnx(GainNet(2, 1, seed=1), tmp_path / "other.onnx"))
     monkeypatch.setattr(onnxruntime, "InferenceSession", lambda part, providers: other)
-    with pytest.raises(InputError, match="export"):
+    with refused("export"):
         to_onnx(net, tmp_path / "bad.onnx")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["good.onnx", "other.onnx"]
 
@@ -132,7 +133,7 @@ def test_the_file_names_its_arrays_and_no_machine(file: Path) -> None:
 
 def test_other_models_and_a_missing_library_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     okf = OptimisedKF((0.1,) * 3, (0.1,) * 3, (1.5,) * 3)
-    with pytest.raises(InputError, match="model = OptimisedKF"):
+    with refused("model = OptimisedKF"):
         to_onnx(okf, tmp_path / "a.onnx")  # type: ignore[arg-type]
     find = builtins.__import__
     for name in ("onnx", "onnxruntime", "onnxscript"):

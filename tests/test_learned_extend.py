@@ -8,11 +8,11 @@ from pathlib import Path
 
 import pytest
 import torch
+from conftest import refused
 from export_onnx import to_onnx
 from shell import ran
 from test_extend import blocks, commands, shell
 
-from coopoc import InputError
 from coopoc.learned import Checkpoint, load, save
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import recipe_of
@@ -49,16 +49,16 @@ def test_a_recipe_of_ones_own_trains_and_runs_beside_others(folder: Path) -> Non
 def test_a_checkpoint_of_a_file_runs_no_file_by_itself(folder: Path) -> None:
     net = find("coopoc.nets", NET)()
     path = save(folder / "own.safetensors", Checkpoint(net, {}))
-    with pytest.raises(InputError, match="names a file, whose code does not run"):
+    with refused("names a file, whose code does not run"):
         load(path)
     assert torch.equal(flatten([load(path, NET).model]), flatten([net]))
-    with pytest.raises(InputError, match="must be a GainNet"):
+    with refused("must be a GainNet"):
         to_onnx(net, folder / "own.onnx")
 
 
 def test_what_is_neither_recipe_nor_net_is_refused(folder: Path) -> None:
     assert recipe_of(NET).net == NET
-    with pytest.raises(InputError, match="no Recipe and no net"):
+    with refused("no Recipe and no net"):
         recipe_of("constant_gain.py:nn")
-    with pytest.raises(InputError, match="Did you mean fedroad"):
+    with refused("Did you mean fedroad"):
         recipe_of("fedroads")

@@ -16,11 +16,12 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
+from conftest import refused
 from logs import long, observed, write
 from shell import ran
 from torch import Tensor
 
-from coopoc import Fleet, InputError, load_fleet
+from coopoc import Fleet, load_fleet
 from coopoc.cli import main
 from coopoc.data.fleet_files import write_table
 from coopoc.errors import MissingLibraryError
@@ -201,7 +202,7 @@ def test_a_silent_client_is_absent_and_welcome_back() -> None:
 def test_too_few_nodes_end_the_run() -> None:
     with pytest.raises(TimeoutError, match="only 1 came online in 0 s"):
         rounds(room({1: lambda _: None}), job_of(TINY), 2, 0.0, print)
-    with pytest.raises(InputError, match="aggregate = 'uniform'"):
+    with refused("aggregate = 'uniform'"):
         rounds(room({1: lambda _: None}), job_of(TINY | {"aggregate": "uniform"}), 1, 1.0, print)
 
 
@@ -230,7 +231,7 @@ def test_a_node_must_say_which_drive_is_its_own(tmp_path: Path) -> None:
     write_table(drives(2), tmp_path / "two.csv")
     own: dict[str, Any] = {}
     for message in ("data = missing", "vehicle = missing"):
-        with pytest.raises(InputError, match=message):
+        with refused(message):
             configured(Context(1, 1, own, RecordDict(), TINY))
         own["data"] = str(tmp_path / "two.csv")
     own["vehicle"] = "c1"
@@ -268,7 +269,7 @@ def test_one_vehicle_alone_has_the_pieces_that_it_has_in_the_fleet() -> None:
 def test_the_apps_configuration_is_the_recipe() -> None:
     config = tomllib.loads((ROOT / "examples" / "flower" / "pyproject.toml").read_text())
     assert job_of(config["tool"]["flwr"]["app"]["config"]) == Job("fedkalmannet", RECIPES["fedkalmannet"], Setting())
-    with pytest.raises(InputError, match=r"change = 'round'.*Did you mean rounds"):
+    with refused(r"change = 'round'.*Did you mean rounds"):
         job_of({"recipe": "fedkalmannet", "change": "round=3"})
 
 

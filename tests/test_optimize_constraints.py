@@ -8,10 +8,11 @@ from itertools import pairwise
 import casadi as ca
 import numpy as np
 import pytest
+from conftest import refused
 from scipy.linalg import null_space
 from scipy.optimize import LinearConstraint, NonlinearConstraint, lsq_linear, minimize
 
-from coopoc import V2X, Fleet, InputError, Sensors, observe
+from coopoc import V2X, Fleet, Sensors, observe
 from coopoc.optimize import (
     MEASUREMENTS,
     Backend,
@@ -349,9 +350,9 @@ def test_an_empty_set_is_infeasible_and_names_the_worst(case: str) -> None:
 def test_a_backend_without_constraints_names_those_that_hold_them(backend: str) -> None:
     """Only osqp holds linear ones beside casadi."""
     if backend != "osqp":
-        with pytest.raises(InputError, match=rf"on position: cannot be solved by {backend}, only by .*casadi.*osqp"):
+        with refused(rf"on position: cannot be solved by {backend}, only by .*casadi.*osqp"):
             solve(PAIR.constrain("position", "a", upper=1.0), backend)
-    with pytest.raises(InputError, match=rf"constraint on range: cannot be solved by {backend}, only by \['casadi'\]"):
+    with refused(rf"constraint on range: cannot be solved by {backend}, only by \['casadi'\]"):
         solve(PAIR.constrain("range", ("a", "b"), upper=1.0), backend)
 
 
@@ -394,7 +395,7 @@ def test_more_equalities_than_numbers_are_refused_by_casadi() -> None:
     assert solve(fixed, "casadi").x == pytest.approx(np.array([[1, 0, 0], [6, 0, 0]]), abs=1e-9)
     more = fixed.constrain("displacement", ("a", "b"), [5, 0, 0], [5, 0, 0])
     assert solve(more, "osqp").x == pytest.approx(np.array([[1, 0, 0], [6, 0, 0]]), abs=1e-9)
-    with pytest.raises(InputError, match=r"9 equalities.*6 numbers that can move"):
+    with refused(r"9 equalities.*6 numbers that can move"):
         solve(more, "casadi")
 
 

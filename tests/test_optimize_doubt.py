@@ -10,6 +10,7 @@ from pathlib import Path
 import gtsam
 import numpy as np
 import pytest
+from conftest import refused
 from graph_files import write_graph
 from random_graphs import random_graph
 from scipy.optimize import least_squares
@@ -72,7 +73,7 @@ def test_losses_that_reject_start_by_graduation(name: str) -> None:
 
 def test_points_that_a_loss_sets_free_are_told_from_unmeasured_ones() -> None:
     torn = Problem(("a",)).add("position", ["a"] * 2, [[-40, 0, 0], [40, 0, 0]], std=1.0, loss=Loss("truncated", 1.0))
-    with pytest.raises(co.InputError, match=r"a can move|truncated loss rejects 2 of 2.*larger scale"):
+    with refused(r"a can move|truncated loss rejects 2 of 2.*larger scale"):
         solve(torn)
 
 
@@ -104,7 +105,7 @@ def test_edges_alone_are_read_and_solved_as_with_vertices(tmp_path: Path) -> Non
 
 def test_an_indefinite_information_is_repaired_where_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     (file := tmp_path / "bad.g2o").write_text("EDGE_SE2 0 1 1 0 0 4 0 0 4 0 9\nEDGE_SE2 1 2 1 0 0 1 2 0 1 0 9\n")
-    with pytest.raises(co.InputError, match=r"line 2 = information.*positive definite.*--repair"):
+    with refused(r"line 2 = information.*positive definite.*--repair"):
         load_graph(file)
     own, axes = np.linalg.eigh([[1.0, 2.0, 0.0], [2.0, 1.0, 0.0], [0.0, 0.0, 9.0]])
     nearest = axes * np.maximum(own, 0.0) @ axes.T
@@ -147,7 +148,7 @@ def test_covariances_of_many_nodes_are_computed_where_asked() -> None:
 
 
 def test_anchors_among_poses_and_constraints_without_a_backend() -> None:
-    with pytest.raises(co.InputError, match=r"anchors.*co.pose\(anchor, 0\)"):
+    with refused(r"anchors.*co.pose\(anchor, 0\)"):
         Problem(("a", "l"), x0=[[*co.pose([0.0, 0.0])], [3, 4, 0, 0, 0, 0]], dimension=2, poses=("a",))
     pair = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
     for kind, nodes, backend in (("displacement", ("a", "b"), "osqp"), ("range", ("a", "b"), "casadi")):

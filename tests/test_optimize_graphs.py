@@ -10,13 +10,13 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
+from conftest import refused
 from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import random_graph
 from scipy.optimize import least_squares
 from scipy.sparse import csc_array
 
 import coopoc as co
-from coopoc import InputError
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Loss, Problem, Space, Status, measurement, solve
 from coopoc.optimize.algebra.sparse import Sparse, sparse
@@ -151,7 +151,7 @@ def test_a_formula_that_casadi_cannot_run_is_refused() -> None:
 
     try:
         problem = Problem("ab", x0=np.eye(2), dimension=2).add("half_range_of_test", ("a", "b"), 1.0, std=0.1)
-        with pytest.raises(InputError, match=r"half_range_of_test.*namespace m"):
+        with refused(r"half_range_of_test.*namespace m"):
             solve(problem)
     finally:
         del MEASUREMENTS["half_range_of_test"]
@@ -308,10 +308,10 @@ def test_a_measurement_without_variance_is_named(objective: Objective) -> None:
     graph = random_graph(217, robots=1, steps=20, landmarks=1, ranges=4, seen=0, loops=0)
     covariance, variance = np.array(graph.relative_pose.covariance), np.array(graph.ranges.variance)
     covariance[7, 2] = covariance[7, :, 2] = 0.0
-    with pytest.raises(InputError, match=r"relative_pose\w* = .*(row|number) 7"):
+    with refused(r"relative_pose\w* = .*(row|number) 7"):
         from_graph(replace(graph, relative_pose=replace(graph.relative_pose, covariance=covariance)), objective)
     variance[2] = 0.0
-    with pytest.raises(InputError, match=r"std of range = 0.0 in row 2: must be > 0"):
+    with refused(r"std of range = 0.0 in row 2: must be > 0"):
         from_graph(replace(graph, ranges=replace(graph.ranges, variance=variance)), objective)
 
 

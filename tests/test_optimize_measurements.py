@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from conftest import refused
 from scipy.linalg import logm
 from scipy.spatial.transform import Rotation
 
-from coopoc import InputError
 from coopoc.optimize import MEASUREMENTS, Problem, backends, measurement, solve
 from coopoc.optimize.model.measurements import Measurement
 from coopoc.optimize.model.space import Space, exp, pose
@@ -108,7 +108,7 @@ def test_angles_wrap() -> None:
 def test_a_decorated_function_is_all_it_takes() -> None:
     """A new measurement, the squared range, is at once in every backend."""
 
-    with pytest.raises(InputError, match=r"frame = 'bodi': .* Did you mean body\?"):
+    with refused(r"frame = 'bodi': .* Did you mean body\?"):
         measurement("squared range", arity=2, components=("coordinate",), frame="bodi")  # type: ignore[arg-type]
 
     @measurement("squared range", arity=2, components=("coordinate",))
@@ -121,7 +121,7 @@ def test_a_decorated_function_is_all_it_takes() -> None:
         for backend in sorted(set(backends()) - {"cvxpy"}):
             solution = solve(problem, backend)
             assert np.linalg.norm(solution["b"] - solution["a"]) == pytest.approx(10.0, abs=1e-5)
-        with pytest.raises(InputError, match="registered already"):
+        with refused("registered already"):
             measurement("squared range", arity=2, components=("coordinate",))(squared)
     finally:
         del MEASUREMENTS["squared range"]
@@ -137,6 +137,6 @@ def test_a_decorated_function_is_all_it_takes() -> None:
     ],
 )
 def test_a_measurement_that_cannot_be(options: dict[str, object], words: str) -> None:
-    with pytest.raises(InputError, match=words):
+    with refused(words):
         measurement("odd", **{"arity": 2, "components": ("distance",), **options})
     assert "odd" not in MEASUREMENTS

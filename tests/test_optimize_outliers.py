@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import refused
 from graph_files import write_graph
 
 import coopoc as co
@@ -94,7 +95,7 @@ def test_known_inliers_that_do_not_hold_a_body_in_itself_are_refused() -> None:
     problem = problem.add("relative_position", ("A1", "L0"), [1.0, 0.0], std=0.1)
     problem = problem.add("range", ("A0", "A1"), 1.0, std=0.1)
     problem = problem.add("relative_pose", ("A0", "A1"), pose([1.0, 0.0]), std=STD)
-    with pytest.raises(co.InputError, match=r"candidates.*known inliers that hold all nodes.*all"):
+    with refused(r"candidates.*known inliers that hold all nodes.*all"):
         solve_gnc(problem.replace_unchecked(x0=pose(np.array([[0.0, 0], [1, 0], [2, 0]]))), [2], start="known")
 
 
@@ -117,7 +118,7 @@ def test_the_command_names_what_it_rejects(tmp_path: Path, capsys: pytest.Captur
     assert wanted <= {tuple(pair) for pair in found}
     chain, _ = drive(1, loops=0)
     write_graph(chain, tmp_path / "chain.g2o")
-    with pytest.raises(co.InputError, match="outliers"):
+    with refused("outliers"):
         solve_file(tmp_path / "chain.g2o", outliers=True)
 
 
@@ -259,14 +260,14 @@ def test_wrong_loops_that_agree_with_each_other_are_reported() -> None:
     assert 26 <= joint["agree"] <= 28
     assert 10 <= joint["rival"] <= 12
     problem = from_graph(turned(20), start="odometry")
-    with pytest.raises(co.InputError, match=r"40 between B0 and world \d\d agree, \d\d otherwise"):
+    with refused(r"40 between B0 and world \d\d agree, \d\d otherwise"):
         solve_gnc(problem, loop_closures(problem), start="known")
 
 
 def test_one_measurement_decides_nothing() -> None:
     problem = Problem(("A0", "B0"), x0=pose(np.zeros((2, 2))), dimension=2, poses=(0, 1), fixed=(0,))
     problem = problem.add("relative_pose", ("A0", "B0"), pose([1.0, 0.0]), std=[0.1, 0.1, 0.1])
-    with pytest.raises(co.InputError, match=r"of 1 between B0 and world 1 agree"):
+    with refused(r"of 1 between B0 and world 1 agree"):
         solve_gnc(problem, [0], start="known")
-    with pytest.raises(co.InputError, match=r"between B0 and world"):
+    with refused(r"between B0 and world"):
         solve_gnc(problem.add("bearing", ("A0", "B0"), 0.1, std=0.1), [0, 1], start="known")

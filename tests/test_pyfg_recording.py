@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import refused
 from graph_files import write_graph
 from shell import ran
 
@@ -83,9 +84,9 @@ def test_graphs_that_are_no_recording_are_named(tmp_path: Path) -> None:
     assert fleet.position[-1, 0, 0] == pytest.approx(29.0)
     assert co.load_recording(file).ids == ("A",)
     file.write_text("\n".join(lines + edges[:9] + edges[10:]) + "\n")
-    with pytest.raises(co.InputError, match="no odometry from A9 to A10"):
+    with refused("no odometry from A9 to A10"):
         graph_recording(read_pyfg(file))
-    with pytest.raises(co.InputError, match="share two steps"):
+    with refused("share two steps"):
         graph_recording(read_pyfg(file), dt=5.0)
 
 

@@ -6,9 +6,9 @@ from html.parser import HTMLParser
 from pathlib import Path
 
 import pytest
+from conftest import refused
 from latex import compiled
 
-from coopoc.errors import InputError
 from coopoc.study.report import report
 from coopoc.study.run import run_study
 
@@ -117,9 +117,9 @@ def test_the_same_folders_give_the_same_page(made: tuple[Path, Page], tmp_path: 
 
 def test_folders_that_cannot_be_shown_are_named(made: tuple[Path, Page], tmp_path: Path) -> None:
     folder = made[0].parents[1] / "small"
-    with pytest.raises(InputError, match="different studies"):
+    with refused("different studies"):
         report([folder, folder], tmp_path / "r.html")
-    with pytest.raises(InputError, match=r"is a folder\. Name the file"):
+    with refused(r"is a folder\. Name the file"):
         report([folder], tmp_path)
-    with pytest.raises(InputError, match=r"holds no manifest\.json"):
+    with refused(r"holds no manifest\.json"):
         report([tmp_path], tmp_path / "r.html")

@@ -6,11 +6,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import textbook, winding
+from conftest import refused, textbook, winding
+from numpy.testing import assert_allclose
 from oracles import solo as oracle
 from scipy import stats
 
-from coopoc import GNSS, V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, load_fleet, observe
+from coopoc import GNSS, V2X, Fleet, Kalman, NoiseModel, Recording, Sensors, load_fleet, observe
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import nees, nees_inside, rt_le
 from coopoc.kernels.solo import FixNoise
@@ -88,9 +89,9 @@ def test_steps_without_a_fix_teach_nothing() -> None:
     assert after is not None
     np.testing.assert_array_equal(after.noise, before.noise)
     np.testing.assert_array_equal(after.weight, before.weight)
-    np.testing.assert_allclose(x, before.x + np.array([4.5, 0.0, 0.0]))
+    assert_allclose(x, before.x + np.array([4.5, 0.0, 0.0]))
     grown = np.diag(cov) - (before.share * before.noise + before.motion)
-    np.testing.assert_allclose(grown, 5 * (0.1 * ASSUMED.assumed_velocity_std(np.array([9.0, 0, 0]))) ** 2)
+    assert_allclose(grown, 5 * (0.1 * ASSUMED.assumed_velocity_std(np.array([9.0, 0, 0]))) ** 2)
 
 
 def test_late_fixes_do_not_count_as_noisy() -> None:
@@ -118,7 +119,7 @@ def test_a_known_variance_gives_kalman_with_late_and_missing_fixes() -> None:
         given = {"gnss": fix, "velocity": draw.normal(0, 9, 3), "dt": draw.uniform(0.05, 0.3)}
         late = draw.uniform(0, 0.5) * (k > 20)
         for a, b in zip(ours.step(**given, fix_age=late), theirs.step(**given, fix_age=late), strict=True):
-            np.testing.assert_allclose(a, b, atol=1e-12)
+            assert_allclose(a, b, atol=1e-12)
 
 
 def test_bad_settings_are_named() -> None:
@@ -129,7 +130,7 @@ def test_bad_settings_are_named() -> None:
         "velocity_floor": lambda: AdaptiveKalman(Sensors(velocity_floor=0.0))(recording),
         "x0": lambda: AdaptiveKalman(x0=np.zeros((2, 3)))(recording),
     }.items():
-        with pytest.raises(InputError, match=f"^{field} = "):
+        with refused(f"^{field} = "):
             make()
 
 
@@ -160,8 +161,8 @@ def test_kalman(crossing: Fleet, noise: str, known: bool) -> None:
     for run, n, c in np.ndindex(3, 4, 3):
         series = (seen.gnss[run, :, n, c], seen.velocity[run, :, n, c], q[run, :, n, c], r[c], seen.dt)
         mean, variance = oracle.kalman(*series, None if start is None else start[n, c])
-        np.testing.assert_allclose(x[run, :, n, c], mean, rtol=1e-12, atol=1e-12)
-        np.testing.assert_allclose(p[run, :, n, c], variance, rtol=1e-10)
+        assert_allclose(x[run, :, n, c], mean, rtol=1e-12, atol=1e-12)
+        assert_allclose(p[run, :, n, c], variance, rtol=1e-10)
 
 
 @pytest.mark.parametrize("runs", [1, 3])
@@ -173,8 +174,8 @@ def test_adaptive(crossing: Fleet, runs: int) -> None:
     for run, (e, n), c in ((a, b, c) for a in range(runs) for b in enumerate([2, 0]) for c in range(3)):
         series = (seen.gnss[run, :, n, c], seen.velocity[run, :, n, c], q[run, :, n, c], r[c], seen.dt)
         mean, noise = oracle.adaptive(*series, 5.0, 20.0)
-        np.testing.assert_allclose(track.x[run, :, e, c], mean, rtol=1e-11, atol=1e-11)
-        np.testing.assert_allclose(std[run, :, e, c] ** 2, noise, rtol=1e-10)
+        assert_allclose(track.x[run, :, e, c], mean, rtol=1e-11, atol=1e-11)
+        assert_allclose(std[run, :, e, c] ** 2, noise, rtol=1e-10)
 
 
 def test_gnss_holds_the_last_fix(crossing: Fleet) -> None:

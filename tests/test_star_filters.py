@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 from conftest import textbook
 from filterpy.kalman import KalmanFilter
+from numpy.testing import assert_allclose
 from oracles import covariance_intersection, joint, lkf_sa, messages, msmv
 
 from coopoc import (
@@ -136,10 +137,10 @@ def assert_is_the_oracle(method: Method, oracle: Callable[..., Any], recording: 
         if sent:  # the positions in messages, brought forward
             held = [[np.where(np.isfinite(m.variance), m.position, np.nan) for m in star[1:]] for star in each]
             others = [[np.reshape(star, (-1, 3)) for star in held]]
-        np.testing.assert_allclose(track.x[run, :, 0], x, atol=near)
-        np.testing.assert_allclose(track.covariance[run, :, 0], cov, atol=near * np.abs(cov).max())
+        assert_allclose(track.x[run, :, 0], x, atol=near)
+        assert_allclose(track.covariance[run, :, 0], cov, atol=near * np.abs(cov).max())
         if others and len(track.neighbours[run]):
-            np.testing.assert_allclose(track.neighbours[run], np.concatenate(others[0]), atol=1e-5)
+            assert_allclose(track.neighbours[run], np.concatenate(others[0]), atol=1e-5)
 
 
 @pytest.mark.parametrize("channel", CHANNELS)

@@ -11,11 +11,12 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import crossing_fleet, textbook
+from conftest import crossing_fleet, refused, textbook
 from filterpy.kalman import KalmanFilter
+from numpy.testing import assert_allclose
 from shell import ran
 
-from coopoc import V2X, Fleet, InputError, JointFilter, Kalman, NoiseModel, Sensors, StarStream, observe
+from coopoc import V2X, Fleet, JointFilter, Kalman, NoiseModel, Sensors, StarStream, observe
 from coopoc.arrays import Bools, Floats
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF
 from coopoc.methods.kalman import AdaptiveKalman
@@ -61,8 +62,8 @@ def test_step_by_step_is_the_track(name: str, known: bool, crossing: Fleet) -> N
     recording, x0 = observe(crossing, S2, V2X(max_neighbours=0), runs=2), crossing.position[0, 3]
     track = (replace(method, x0=x0[None]) if known else method)(recording, [3])
     x, cov = play(start(x0) if known else start(), recording, 3, run=1, first=int(known))
-    np.testing.assert_allclose(x, track.x[1, known:, 0], atol=1e-12)
-    np.testing.assert_allclose(cov, track.covariance[1, known:, 0], atol=1e-12)
+    assert_allclose(x, track.x[1, known:, 0], atol=1e-12)
+    assert_allclose(cov, track.covariance[1, known:, 0], atol=1e-12)
 
 
 @pytest.mark.parametrize("known", [False, True])
@@ -73,7 +74,7 @@ def test_a_net_step_by_step_is_its_track(known: bool, crossing: Fleet) -> None:
     for t in range(known, len(recording.t)):
         x, cov = stream.step(recording.gnss[0, t, 3], recording.velocity[0, t, 3], recording.dt)
         assert cov is None
-        np.testing.assert_allclose(x, track.x[0, t, 0], atol=1e-5)
+        assert_allclose(x, track.x[0, t, 0], atol=1e-5)
 
 
 def relative_measurements(recording: Recording, box: Inbox, run: int, t: int) -> list[RelativeMeasurement]:
@@ -124,11 +125,11 @@ def test_a_star_step_by_step_is_the_track(exact: bool, robust: bool, channel: st
     for t in range(len(recording.t)):
         seen = relative_measurements(recording, box, 1, t)
         x, cov = stream.step(recording.gnss[1, t, 0], recording.velocity[1, t, 0], recording.dt, neighbours=seen)
-        np.testing.assert_allclose(x, track.x[1, t, 0], atol=1e-12)
-        np.testing.assert_allclose(cov, track.covariance[1, t, 0], atol=1e-12)
+        assert_allclose(x, track.x[1, t, 0], atol=1e-12)
+        assert_allclose(cov, track.covariance[1, t, 0], atol=1e-12)
         assert list(stream.neighbours) == [s.id for s in seen]
         for k, s in enumerate(seen, start=int(box.start[t])):
-            np.testing.assert_allclose(stream.neighbours[s.id], track.neighbours[1, k], atol=1e-9)
+            assert_allclose(stream.neighbours[s.id], track.neighbours[1, k], atol=1e-9)
 
 
 def peer(x: Floats, known: NoiseModel) -> Any:
@@ -158,8 +159,8 @@ def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(start: Any,
             moved = path[-1] - [np.interp(t[-1] - age, t, column) for column in np.array(path).T]
             theirs.update(z + moved, R=np.diag(FITTED.gnss_variance + age / 0.1 * np.square(FITTED.process_std)))
         x, cov = stream.step(z if there else None, u, dt, fix_age=age)
-        np.testing.assert_allclose(x, theirs.x, atol=near)
-        np.testing.assert_allclose(cov, theirs.P, atol=near)
+        assert_allclose(x, theirs.x, atol=near)
+        assert_allclose(cov, theirs.P, atol=near)
 
 
 @pytest.mark.parametrize("name", STARTS)
@@ -173,10 +174,10 @@ def test_a_long_step_is_two_short_ones(name: str) -> None:
     twice.step(None, U, 0.1)
     (x, cov), (same_x, same_cov) = once.step(None, U, 0.2), twice.step(None, U, 0.1)
     near = 1e-6 if name == "net" else 1e-12
-    np.testing.assert_allclose(x, same_x, atol=near)
+    assert_allclose(x, same_x, atol=near)
     if cov is not None:
-        np.testing.assert_allclose(cov, same_cov, atol=1e-12)
-        np.testing.assert_allclose(once.step(Z, U, 0.1)[0], twice.step(Z, U, 0.1)[0], atol=1e-12)
+        assert_allclose(cov, same_cov, atol=1e-12)
+        assert_allclose(once.step(Z, U, 0.1)[0], twice.step(Z, U, 0.1)[0], atol=1e-12)
 
 
 @pytest.mark.parametrize("name", ["nominal", "adaptive", "joint", "net"])
@@ -187,10 +188,10 @@ def test_nothing_is_known_before_the_first_fix(name: str) -> None:
         assert np.isnan(x).all()
         assert cov is None
     x, cov = stream.step(Z, U, 0.1, fix_age=0.3)
-    np.testing.assert_allclose(x, Z + 0.3 * U, atol=1e-5)
+    assert_allclose(x, Z + 0.3 * U, atol=1e-5)
     if name == "nominal":
         variance = np.square(S2.gnss_std) + 3 * (0.1 * S2.assumed_velocity_std(U)) ** 2
-        np.testing.assert_allclose(np.diag(cov), variance)
+        assert_allclose(np.diag(cov), variance)
 
 
 def window(draw: np.random.Generator, steps: int, late: int, q: float, r: float) -> tuple[float, float, float, float]:
@@ -240,7 +241,7 @@ def test_bad_input_is_named_and_forgotten(name: str, field: str, given: dict[str
     one, other = STARTS[name](), STARTS[name]()
     for stream in (one, other):
         stream.step(Z, U, 0.1)
-    with pytest.raises(InputError, match=f"^{field} = "):
+    with refused(f"^{field} = "):
         one.step(**{"gnss": Z, "velocity": U, "dt": 0.1} | given)
     np.testing.assert_array_equal(one.step(Z, U, 0.1)[0], other.step(Z, U, 0.1)[0])
     np.testing.assert_array_equal(one.history.rows, other.history.rows)
@@ -261,7 +262,7 @@ def test_the_motion_that_is_kept_is_its_integral() -> None:
         for age in (0.0, 0.31 * seen, seen):
             since = sums[k] - [np.interp(end[k] - age, end, column) for column in sums.T]
             fix, late = history.forward([5.0, 0.0, -1.0], age)
-            np.testing.assert_allclose([*(fix - [5.0, 0.0, -1.0]), *late], since, atol=1e-9)
+            assert_allclose([*(fix - [5.0, 0.0, -1.0]), *late], since, atol=1e-9)
 
 
 def test_bad_starts_are_named() -> None:
@@ -272,10 +273,10 @@ def test_bad_starts_are_named() -> None:
         "max_age": lambda: StarStream(JointFilter("identity"), max_age=np.nan),
         "noise_model": lambda: StarStream(JointFilter("nominal")),
     }.items():
-        with pytest.raises(InputError, match=f"^{field} = "):
+        with refused(f"^{field} = "):
             make()
     oracle = Kalman(NoiseModel.oracle(S2, Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))))
-    with pytest.raises(InputError, match=r"noise_model = 'oracle'.*NoiseModel.nominal"):
+    with refused(r"noise_model = 'oracle'.*NoiseModel.nominal"):
         oracle.start()
 
 
@@ -300,7 +301,7 @@ def test_a_range_of_zero_is_refused_and_forgotten(crossing: Fleet) -> None:
     """No direction is seen in one place: a filter of a star gave NaN from there on."""
     stream = StarStream(JointFilter(FITTED))
     stream.step([0, 0, 0], [1, 0, 0], 0.1)
-    with pytest.raises(InputError, match="the range first and > 0"):
+    with refused("the range first and > 0"):
         stream.step([0, 0, 0], [1, 0, 0], 0.1, [RelativeMeasurement("b", [0.0, 0.1, 1.5], [1, 0, 0], [1, 0, 0])])
     near = RelativeMeasurement("b", [1e-6, 0.1, 1.5], [1, 0, 0], [1, 0, 0])
     x, cov = stream.step([0, 0, 0], [1, 0, 0], 0.1, neighbours=[near])
@@ -309,5 +310,5 @@ def test_a_range_of_zero_is_refused_and_forgotten(crossing: Fleet) -> None:
     recording = observe(crossing, Sensors(), V2X(max_neighbours=2))
     relative = recording.relative.copy()
     relative[0, 3, 0] = 0.0
-    with pytest.raises(InputError, match=r"\[0, 3\] = 0\.0: must be a range > 0 m"):
+    with refused(r"\[0, 3\] = 0\.0: must be a range > 0 m"):
         replace(recording, relative=relative)

@@ -10,10 +10,10 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import formation_fleet
+from conftest import formation_fleet, refused
 
 import coopoc as co
-from coopoc import InputError, Sensors, run_study
+from coopoc import Sensors, run_study
 from coopoc.evaluate.bounds import past_bound, posterior_bound
 from coopoc.studies import correlated_gnss, latency_loss, robustness, scene
 from coopoc.study import numbers
@@ -134,7 +134,7 @@ def test_shares_keep_the_variance_of_a_fix() -> None:
     assert noise.fix_std == pytest.approx((3.5, 3.5, 3.5))
     assert noise.gnss_drift_std == pytest.approx(3.5 * np.sqrt(0.45))
     for own, common in ((0.6, 0.4), (-0.1, 0.0)):
-        with pytest.raises(InputError, match="own_share"):
+        with refused("own_share"):
             scene.lasting(Sensors(), own, common)
 
 

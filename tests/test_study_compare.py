@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from conftest import refused
 
-from coopoc.errors import InputError
 from coopoc.study.compare import compare
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
@@ -103,7 +103,7 @@ def test_several_rows_of_one_draw_need_a_name(tmp_path: Path) -> None:
 
     ran = runner(tmp_path, rounds)
     a, b = ran("a"), ran("b", shift=0.5)
-    with pytest.raises(InputError, match=r"several rows per ego, run and training seed.*--by round"):
+    with refused(r"several rows per ego, run and training seed.*--by round"):
         compare(a, b)
     found = changes(compare(a, b, by=["round"], where=["method=kf", "k=0"]))
     assert found["Round"].tolist() == ["0", "1"]
@@ -134,17 +134,17 @@ def test_every_format_holds_every_part(ran: Callable[..., Path], form: str) -> N
 def test_what_cannot_be_compared_is_named(ran: Callable[..., Path], tmp_path: Path) -> None:
     a, b = ran("a"), ran("b")
     run_study(Study("other", "?", cell, GRID, SETTINGS), tmp_path, progress=False)
-    with pytest.raises(InputError, match=r"must be one study of one noise seed, not demo .* and other"):
+    with refused(r"must be one study of one noise seed, not demo .* and other"):
         compare(a, tmp_path / "other")
-    with pytest.raises(InputError, match="not demo with noise seed 0 and demo with noise seed 1"):
+    with refused("not demo with noise seed 0 and demo with noise seed 1"):
         compare(a, ran("c", seed=1))
-    with pytest.raises(InputError, match=r"holds no manifest\.json"):
+    with refused(r"holds no manifest\.json"):
         compare(a, tmp_path)
-    with pytest.raises(InputError, match=r"metric = 'rt_le'.*Did you mean rt_le_m"):
+    with refused(r"metric = 'rt_le'.*Did you mean rt_le_m"):
         compare(a, b, "rt_le")
-    with pytest.raises(InputError, match="metric = 'word': must be a column of numbers"):
+    with refused("metric = 'word': must be a column of numbers"):
         compare(a, b, "word")
-    with pytest.raises(InputError, match=r"column = 'metod'.*Did you mean method"):
+    with refused(r"column = 'metod'.*Did you mean method"):
         compare(a, b, where=["metod=kf"])
-    with pytest.raises(InputError, match="must have a row in one of the runs"):
+    with refused("must have a row in one of the runs"):
         compare(a, b, where=["method=okf"])

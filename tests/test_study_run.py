@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from conftest import refused
 from small_runs import files, numbers
 
-from coopoc.errors import InputError
 from coopoc.study import store
 from coopoc.study.compute import WorkerDiedError, schedule
 from coopoc.study.publish import views
@@ -104,14 +104,14 @@ def test_changed_settings_compute_anew_and_keep_what_is_there(study: Study, tmp_
 
 
 def test_bad_input_is_named_before_any_work(study: Study, tmp_path: Path) -> None:
-    with pytest.raises(InputError, match="max_neighbours = -1: must be >= 0"):
+    with refused("max_neighbours = -1: must be >= 0"):
         run_study(study, tmp_path, settings={"max_neighbours": -1})
-    with pytest.raises(InputError, match="jobs = 0: must be >= 1"):
+    with refused("jobs = 0: must be >= 1"):
         run_study(study, tmp_path, jobs=0)
-    with pytest.raises(InputError, match=r"study = 'smal'.*Did you mean small\?"):
+    with refused(r"study = 'smal'.*Did you mean small\?"):
         run_study("smal", tmp_path)
     (tmp_path / "file").write_text("")
-    with pytest.raises(InputError, match="cannot be written"):
+    with refused("cannot be written"):
         run_study(study, tmp_path / "file", progress=False)
     assert not (tmp_path / "small").exists()
 

@@ -6,9 +6,9 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from conftest import refused
 from small_runs import ENV, files, numbers, shown, start
 
-from coopoc.errors import InputError
 from coopoc.study import store
 from coopoc.study.compute import part_of
 from coopoc.study.manifest import Manifest, locked
@@ -35,7 +35,7 @@ def test_shards_are_disjoint_whole_and_of_equal_size(count: int) -> None:
 
 @pytest.mark.parametrize("text", ["0/3", "4/3", "1", "1/", "a/b", "-1/3", "1/0"])
 def test_a_shard_that_is_none_is_named(study: Study, tmp_path: Path, text: str) -> None:
-    with pytest.raises(InputError, match=r"must be i/n with 1 <= i <= n\. Write for example: --shard 2/3"):
+    with refused(r"must be i/n with 1 <= i <= n\. Write for example: --shard 2/3"):
         run_study(study, tmp_path / "new", shard=text, progress=False)
     assert not (tmp_path / "new").exists()
 
@@ -70,16 +70,16 @@ def test_shards_work_in_one_folder_at_the_same_time(study: Study, tmp_path: Path
 def test_who_else_may_come_in_while_a_shard_is_at_work(study: Study, tmp_path: Path) -> None:
     folder = tmp_path / "small"
     with locked(folder, manifest(study), "2/3"):
-        with pytest.raises(InputError, match="is in use by another run"):
+        with refused("is in use by another run"):
             run_study(study, tmp_path, progress=False)
-        with pytest.raises(InputError, match=r"in use by shards that differ in runs \(2, 4\), cells \(9 and 9, 0 of"):
+        with refused(r"in use by shards that differ in runs \(2, 4\), cells \(9 and 9, 0 of"):
             run_study(study, tmp_path, settings={"runs": 2}, shard="1/3", progress=False)
-        with pytest.raises(InputError, match="in use by another process with shard 2/3"):
+        with refused("in use by another process with shard 2/3"):
             run_study(study, tmp_path, shard="2/3", progress=False)
         assert run_study(study, tmp_path, shard="1/3", progress=False).frame["cell"].nunique() == 3
-        with pytest.raises(InputError, match="is in use by another run"):
+        with refused("is in use by another run"):
             merge([folder], tmp_path)
-    with locked(folder, manifest(study)), pytest.raises(InputError, match="is in use by another run"):
+    with locked(folder, manifest(study)), refused("is in use by another run"):
         run_study(study, tmp_path, shard="1/3", progress=False)
     assert Results.load(folder).pending == 6
 
@@ -120,12 +120,12 @@ def test_a_failure_is_merged_unless_the_cell_is_finished_elsewhere(study: Study,
 def test_what_does_not_belong_together_is_not_merged(study: Study, tmp_path: Path) -> None:
     run_study(study, tmp_path / "a", progress=False, shard="1/9")
     run_study(study, tmp_path / "b", settings={"runs": 2}, progress=False, shard="1/9")
-    with pytest.raises(InputError, match=r"a/small and .*b/small: differ in runs \(4, 2\), cells \(9 and 9, 0 of them"):
+    with refused(r"a/small and .*b/small: differ in runs \(4, 2\), cells \(9 and 9, 0 of them"):
         merge([tmp_path / "a/small", tmp_path / "b/small"], tmp_path / "all")
     assert not (tmp_path / "all").exists()
-    with pytest.raises(InputError, match=r"holds no manifest\.json"):
+    with refused(r"holds no manifest\.json"):
         merge([tmp_path], tmp_path / "all")
-    with pytest.raises(InputError, match="must be at least one"):
+    with refused("must be at least one"):
         merge([], tmp_path / "all")
 
 
