@@ -1,7 +1,5 @@
 """A seeded sampler of wrong, odd and rearranged recordings, and the answer of every method; a program of its own."""
 
-from __future__ import annotations
-
 import sys
 import warnings
 from collections.abc import Callable, Iterator

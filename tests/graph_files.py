@@ -1,7 +1,5 @@
 """PyFG and g2o files of a graph, written from the definitions of the formats: what the readers must give back."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Compile a table as a paper would; skips, and says why, where there is no LaTeX with booktabs."""
 
-from __future__ import annotations
-
 import shutil
 import subprocess
 from pathlib import Path

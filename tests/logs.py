@@ -1,7 +1,5 @@
 """Logs written from simulated recordings, for tests of what reads them."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

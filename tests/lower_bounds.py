@@ -1,7 +1,5 @@
 """Print the least version of each dependency as a constraint of pip: what `make test-lower` installs."""
 
-from __future__ import annotations
-
 import re
 import tomllib
 from pathlib import Path

@@ -3,8 +3,6 @@
 python tests/oracle_page.py        # writes the page; tests/test_reliability.py holds that it is current
 """
 
-from __future__ import annotations
-
 import ast
 import re
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Random factor graphs of robots that drive about: odometry, loops, landmarks, ranges."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.spatial.transform import Rotation
 

@@ -1,7 +1,5 @@
 """Commands in a process of their own."""
 
-from __future__ import annotations
-
 import subprocess
 from typing import Any
 

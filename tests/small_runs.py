@@ -1,7 +1,5 @@
 """Runs of the small study: its command, the numbers of its results, and what stands in its folder."""
 
-from __future__ import annotations
-
 import os
 import subprocess
 import sys

@@ -1,7 +1,5 @@
 """Published and independently simulated figures of the paper's scenarios, within 5 %."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

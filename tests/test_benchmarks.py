@@ -1,7 +1,5 @@
 """Benchmarks: the gate of benchmarks/run.py on made-up tables, CL-Bench and its cards."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import json

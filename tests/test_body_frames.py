@@ -1,7 +1,5 @@
 """Recordings in body frames: turned by the compass they are those of the world, draw by draw."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Posterior Cramer-Rao bounds against GTSAM's marginals, closed forms, and the filters that they bound."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Every `coopoc` command on a page: its options parse, and its studies, methods, settings and data exist."""
 
-from __future__ import annotations
-
 import functools
 import inspect
 import re

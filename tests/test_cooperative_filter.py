@@ -1,7 +1,5 @@
 """The cooperative filter: equal to the joint filter with everything off, and best of all where numbers are wrong."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Logs in body frames: speed, yaw rate, compass and bearings stay as they were measured, for pose filters."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """What `coopoc data check` says of logs with faults that are easy to overlook, and what a log is read as."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from pathlib import Path
 

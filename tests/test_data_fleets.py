@@ -1,7 +1,5 @@
 """The bundled fleets: exact storage, cards that tell the truth, the properties that the studies build on."""
 
-from __future__ import annotations
-
 from itertools import combinations
 from pathlib import Path
 

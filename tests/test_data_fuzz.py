@@ -1,7 +1,5 @@
 """Mutated files: whatever stands in one, a reader keeps its contract (`tests/fuzz/contract.py`)."""
 
-from __future__ import annotations
-
 import os
 from pathlib import Path
 

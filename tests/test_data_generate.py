@@ -1,7 +1,5 @@
 """The generator: the same seed gives the same bytes, and wrong recipes are refused."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 import xml.etree.ElementTree as ElementTree

@@ -1,7 +1,5 @@
 """Logs of one's own: what is read is what was measured, whatever the units, rates, clocks and gaps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Logs of one's own from file to table and picture: the check, studies, and a Recording as a setting."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Typical mistakes in logs: each ends in the message that docs/your_data.md shows, with file, row and column."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,5 @@
 """MR.CLAM with nothing simulated: what is read, refused, calibrated and estimated, and the study, on two folders."""
 
-from __future__ import annotations
-
 import shutil
 from pathlib import Path
 from typing import Any

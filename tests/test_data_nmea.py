@@ -1,7 +1,5 @@
 """NMEA and ROS bags: logs of receivers and robots, checked against pynmeagps, pymap3d and what the test wrote."""
 
-from __future__ import annotations
-
 import builtins
 from collections.abc import Callable, Mapping
 from dataclasses import replace

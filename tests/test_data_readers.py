@@ -1,7 +1,5 @@
 """CSV, Parquet, TUM and SUMO FCD: round trips, and errors that name the thing and the mend."""
 
-from __future__ import annotations
-
 import time
 import warnings
 from pathlib import Path

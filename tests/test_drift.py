@@ -1,7 +1,5 @@
 """Fixes that err for a while: their statistics, the filter that estimates the error, and the bound."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

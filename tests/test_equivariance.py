@@ -1,7 +1,5 @@
 """Equivariance: a recording that is moved, turned about z, mirrored in y or renumbered gives the track that is."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """The examples run as they stand; the lazy names of the package are those that types see."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Links and exchange of a fleet: neighbours by brute force, draws, bytes in closed form, caps and losses."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

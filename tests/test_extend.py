@@ -1,7 +1,5 @@
 """docs/extend.md as it stands: its files are written, its Python and its commands are run, in a folder of their own."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

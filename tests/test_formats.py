@@ -1,7 +1,5 @@
 """PyFG, g2o, TUM and KITTI files: what comes back, and what CORA's matrices, GTSAM and SciPy say of it."""
 
-from __future__ import annotations
-
 import time
 from dataclasses import fields, is_dataclass, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Every wrong line of a PyFG, g2o, TUM or KITTI file is named with its place and a hint."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """JRL files: one written from the format's documentation, GTSAM as referee of its covariances, errors."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Graduated non-convexity: its surrogates, what it finds among all subsets, groups, poses, and what it refuses."""
 
-from __future__ import annotations
-
 import itertools
 
 import gtsam

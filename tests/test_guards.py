@@ -1,7 +1,5 @@
 """What says that a method is lost, keeps a net in its plane, and refuses weights that are no use."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The built wheel, installed elsewhere and used from outside the repository: imports, data, workers, types."""
 
-from __future__ import annotations
-
 import os
 import re
 import shutil

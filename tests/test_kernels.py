@@ -1,7 +1,5 @@
 """Machine code: when it is made anew, and that the package imports no numba."""
 
-from __future__ import annotations
-
 import importlib
 import pickle
 import sys

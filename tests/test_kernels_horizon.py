@@ -3,8 +3,6 @@
 `test_methods_horizon` holds them against SciPy, filterpy and gtsam.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

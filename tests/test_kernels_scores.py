@@ -1,7 +1,5 @@
 """Errors and NEES of tracks: the compiled pass against NumPy's own solve, and against the reference."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose

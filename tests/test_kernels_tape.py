@@ -1,7 +1,5 @@
 """Operations of a tape against CasADi's own evaluation of the same operation."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

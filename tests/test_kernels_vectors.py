@@ -1,7 +1,5 @@
 """Vectors of runs and small matrices: blocks against NumPy, side by side and alone."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

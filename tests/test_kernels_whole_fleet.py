@@ -1,7 +1,5 @@
 """Kernels of the whole fleet against dense oracles: gaps, absences, losses, delays, missing angles; filterpy."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

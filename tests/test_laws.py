@@ -1,7 +1,5 @@
 """Laws that hold for any drive: drives, noise, changes of the world and numbers in files are Hypothesis's."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from tempfile import mkdtemp

@@ -1,7 +1,5 @@
 """Imports run one way: world, optimize, methods, evaluate, study, cli; and the core names no plug-in package."""
 
-from __future__ import annotations
-
 import ast
 import sys
 from collections.abc import Iterator

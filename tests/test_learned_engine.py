@@ -1,7 +1,5 @@
 """The compiled engine against plain torch: values, gradients, missing fixes, rows that do not know of each other."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Iterator
 

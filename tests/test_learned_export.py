@@ -1,7 +1,5 @@
 """Exported steps: ONNX by onnxruntime, against the net."""
 
-from __future__ import annotations
-
 import builtins
 import json
 import os

@@ -1,7 +1,5 @@
 """The sections of docs/extend.md on nets and recipes, as they stand: trained, federated, saved, streamed, studied."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

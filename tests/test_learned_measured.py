@@ -1,7 +1,5 @@
 """Training on measured fixes and odometry: pieces, missing truth and fixes, known noise, and a log from end to end."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """GainNet and its method, against an independent wiring of the published architecture and filters by hand."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 
 import numpy as np

@@ -1,7 +1,5 @@
 """OptimisedKF: recovers known noise, equals filterpy's filter, and its covariance is calibrated."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

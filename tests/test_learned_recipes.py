@@ -1,7 +1,5 @@
 """Checkpoints, recipes and train_all: round trips, refusals, resuming."""
 
-from __future__ import annotations
-
 import importlib.util
 import json
 from dataclasses import asdict, replace

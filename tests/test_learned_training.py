@@ -1,7 +1,5 @@
 """Clients, fit and federate: pieces, laws, determinism and guards; AdamW against torch's own."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

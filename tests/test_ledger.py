@@ -1,7 +1,5 @@
 """The ledger: training and online cooperation on one axis, as payload and on air, sent once and per receiver."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """No array reaches compiled code that does not fit: a wrong recording is refused where it is made."""
 
-from __future__ import annotations
-
 import os
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Laws that every method obeys, and independent filters that it equals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """CovarianceIntersection and QCQPRelaxation over a Recording: consistency, laws and real channels."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Wrong calls of the public functions: each is refused with an error of ours that names the field, or has an answer."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from dataclasses import fields, replace

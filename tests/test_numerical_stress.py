@@ -1,7 +1,5 @@
 """Noise from a tenth of a millimetre to ten kilometres, in line, far away, close together: estimates that stay sane."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
 

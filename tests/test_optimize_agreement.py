@@ -4,8 +4,6 @@ The reference is gauss-newton, which test_optimize_backends.py, test_optimize_po
 hold against SciPy, GTSAM's marginals and numpy.linalg.lstsq; under an active bound SciPy's SLSQP has the last word.
 """
 
-from __future__ import annotations
-
 import itertools
 import re
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Backends: they agree with each other and with tools that we did not write, before anything of ours refines them."""
 
-from __future__ import annotations
-
 import sys
 from importlib.util import find_spec
 

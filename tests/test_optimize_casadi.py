@@ -1,7 +1,5 @@
 """casadi: it ends where SciPy ends, refuses what it cannot, and moves rotations as SciPy does."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi

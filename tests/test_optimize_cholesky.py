@@ -1,7 +1,5 @@
 """The sparse Cholesky factor against NumPy's dense one: solves, definiteness, entries of the inverse."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from scipy.sparse import csc_matrix, triu

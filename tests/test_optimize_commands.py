@@ -1,7 +1,5 @@
 """coopoc solve and coopoc check, as a user types them."""
 
-from __future__ import annotations
-
 import json
 import sys
 from pathlib import Path

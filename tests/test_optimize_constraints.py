@@ -1,7 +1,5 @@
 """Constraints: closed forms, SciPy's constrained solvers, KKT written out here; sets that are empty; who refuses."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from itertools import pairwise
 

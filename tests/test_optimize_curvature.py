@@ -1,7 +1,5 @@
 """SOLVED is a minimum: the curvature against CasADi's own Hessian, and a saddle that every backend stops at."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

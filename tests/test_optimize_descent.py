@@ -1,7 +1,5 @@
 """Levenberg-Marquardt: its damping, laws that its steps obey, and the bar of a solve that lasts."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 

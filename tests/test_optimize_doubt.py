@@ -1,7 +1,5 @@
 """Where an answer may be wrong the solution has a note: its cost, what a loss rejects, its start, its solver."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import replace
 from itertools import combinations

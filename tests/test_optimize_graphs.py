@@ -1,8 +1,6 @@
 """Graphs of poses, landmarks and ranges: that the loop arrives, from which start, and that no minimum lies above
 GTSAM's; and real graphs that GTSAM brings."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 from typing import Any

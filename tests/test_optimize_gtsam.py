@@ -1,7 +1,5 @@
 """GTSAM's own factors, optimisers and smoothers: they say our objective to the last digits, and find its minimum."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 
 import gtsam

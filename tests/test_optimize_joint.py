@@ -1,7 +1,5 @@
 """Joint covariances against NumPy's inverse and GTSAM's joint marginals."""
 
-from __future__ import annotations
-
 import gtsam
 import numpy as np
 import pytest

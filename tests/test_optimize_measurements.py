@@ -1,7 +1,5 @@
 """Measurements: one formula for NumPy, torch and CasADi; the tapes' derivatives against torch's."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

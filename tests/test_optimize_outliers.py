@@ -1,8 +1,6 @@
 """Wrong loop closures, and robots that only doubtful measurements join: GNC from the known inliers, against labels and
 dense algebra."""
 
-from __future__ import annotations
-
 import json
 from dataclasses import fields, replace
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Points and poses in one problem: derivatives against finite differences, minima against SciPy, files."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Problems: built by hand, from a snapshot, from a window; residuals, Jacobian, and what a wrong input says."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import casadi as ca

@@ -1,8 +1,6 @@
 """Relaxations and certificates: they bound every cost, agree with models written for CVXPY by hand, and are attained
 where tight; a local minimum gets no certificate."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 import time

@@ -1,7 +1,5 @@
 """Robust losses and graduated non-convexity against GTSAM's, SciPy's robust minima and CasADi's curvature."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

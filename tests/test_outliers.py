@@ -1,7 +1,5 @@
 """Outliers: their rates, sizes and durations, pairs with clean draws, what an estimator is told, and the bounds."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

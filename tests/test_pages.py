@@ -1,7 +1,5 @@
 """The Python of the pages as it stands, page by page in an empty folder; what they show is what it prints."""
 
-from __future__ import annotations
-
 import os
 import re
 import sys

@@ -1,7 +1,5 @@
 """The README's table by a simulation that shares no code with the toolkit, on the fleet's arrays alone."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pictures and hostile names: what is drawn is where the numbers say, text is text everywhere."""
 
-from __future__ import annotations
-
 import csv
 import io
 import re

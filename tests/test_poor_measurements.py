@@ -1,7 +1,5 @@
 """Poor measurements: fixes that are missing or late, ranges without directions, headings that are wrong."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Pose filters against a dense oracle, filterpy, GTSAM, the position filter; streams against Tracks."""
 
-from __future__ import annotations
-
 import os
 import sys
 from dataclasses import replace

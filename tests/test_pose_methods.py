@@ -1,7 +1,5 @@
 """What pose filters promise: consistency, order of accuracy, bias states, gates, partial measurements, refusals."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

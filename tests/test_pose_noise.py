@@ -1,7 +1,5 @@
 """Learned noise of pose filters: the noise that acts is the most likely one, and its log score is SciPy's density."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """PyFG as a Recording in body frames: read against the file's lines, and range-only cooperation on a real log."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys

@@ -1,7 +1,5 @@
 """docs/reliability.md names tests that exist, and docs/oracles.md is what the tests say."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """The page of a real study in headless Chromium: it works offline, sorts, switches, and fits a desk and a phone."""
 
-from __future__ import annotations
-
 import importlib
 import re
 import shutil

@@ -1,8 +1,6 @@
 """The road filter: dense and filterpy's oracles, the tuned Kalman filter on exact odometry, streams, calibration, real
 cars."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Schedules under a cap on bytes: the token bucket, nearest first and round robin."""
 
-from __future__ import annotations
-
 import itertools
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """Data, weights and results are not trusted: reading them runs no code and writes nothing outside the named folder."""
 
-from __future__ import annotations
-
 import csv
 import io
 import json

@@ -1,7 +1,5 @@
 """What the interpreter shows of a result: one line with its kind and sizes, never its numbers by the thousand."""
 
-from __future__ import annotations
-
 import dataclasses
 import importlib
 import re

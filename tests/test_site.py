@@ -1,7 +1,5 @@
 """The site: every page has a place, and the tutorials run as they stand."""
 
-from __future__ import annotations
-
 import re
 import sys
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Sliding windows: laws of a cooperative method, closed forms, minima, the linear case, late messages."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

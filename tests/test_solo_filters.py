@@ -1,7 +1,5 @@
 """Solo filters against textbook oracles, with gaps and absences; what the noise-adaptive one estimates."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Spoofed neighbours: the attack itself, the window estimate that sees through it, and the example."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 from dataclasses import replace

@@ -1,7 +1,5 @@
 """Every filter of a star against its dense textbook oracle and filterpy: gaps, absences, losses, delays, any batch."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable
 from dataclasses import replace

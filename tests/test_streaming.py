@@ -1,7 +1,5 @@
 """Streaming: the laws that every filter obeys when it is fed step by step, and independent answers."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import replace

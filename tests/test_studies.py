@@ -1,7 +1,5 @@
 """The studies themselves, at a size that a test can afford, and what a user does wrong with them."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from pathlib import Path

@@ -1,7 +1,5 @@
 """The study of bytes: payload, air, schedules, and the break-even with training."""
 
-from __future__ import annotations
-
 import numpy as np
 import pytest
 from conftest import refused

@@ -1,7 +1,5 @@
 """Studies of choices on few cells: aggregation rules, any methods side by side."""
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """Studies of conditions on few cells: channel, spoofing, GNSS errors, consistency, bounds."""
 
-from __future__ import annotations
-
 import json
 from collections import defaultdict
 from collections.abc import Iterator

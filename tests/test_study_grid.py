@@ -1,7 +1,5 @@
 """Study: what names a cell, how --set changes a study, and which code counts."""
 
-from __future__ import annotations
-
 import hashlib
 import importlib
 import sys

@@ -1,7 +1,5 @@
 """Reference numbers: verdicts by hand, and cheap cells of each study at full size against what was committed."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from dataclasses import replace

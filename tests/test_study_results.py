@@ -1,7 +1,5 @@
 """Results and tables: means against pandas, what must not be mixed, tables in every format."""
 
-from __future__ import annotations
-
 from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any

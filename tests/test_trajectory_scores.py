@@ -1,7 +1,5 @@
 """Scores of foreign trajectories: evo's figures, its association, SciPy's align_vectors, and laws."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 

@@ -1,7 +1,5 @@
 """Whole-fleet methods against dense least squares, SciPy, GTSAM, closed forms, and the laws that they obey."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

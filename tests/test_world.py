@@ -1,7 +1,5 @@
 """The world: fleets that cannot be used, noise keys, links, messages."""
 
-from __future__ import annotations
-
 import zlib
 from dataclasses import replace
 

@@ -1,8 +1,6 @@
 """One wrong number of any size, against filterpy; and what would be wrong without a word: other truths, covariances
 that are none, cooperation that changes nothing."""
 
-from __future__ import annotations
-
 import io
 import zipfile
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """docs/your_data.md as it stands: its script, its commands and its Python run one by one in an empty folder."""
 
-from __future__ import annotations
-
 import re
 import subprocess
 import sys

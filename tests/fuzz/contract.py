@@ -1,7 +1,5 @@
 """What a reader owes to any file: our exceptions alone, no warning, little time and memory, nothing done elsewhere."""
 
-from __future__ import annotations
-
 import resource
 import shutil
 import sys

@@ -1,7 +1,5 @@
 """Small good files, one per reader, from which fuzzing starts."""
 
-from __future__ import annotations
-
 import json
 
 TABLE = "id,t,x,y,z,vx,vy,vz\n" + "".join(

@@ -1,7 +1,5 @@
 """The text readers: for each its good files, from which fuzzing starts, and a call that reads a folder of them."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple

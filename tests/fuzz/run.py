@@ -6,8 +6,6 @@ Prints the executions, the coverage of libFuzzer and one line per find. A find t
 `tests/test_data_fuzz.py` reads again.
 """
 
-from __future__ import annotations
-
 import argparse
 import hashlib
 import re

@@ -1,7 +1,5 @@
 """All positions of a drive as one dense least-squares problem, by Gauss-Newton to convergence."""
 
-from __future__ import annotations
-
 import numpy as np
 
 

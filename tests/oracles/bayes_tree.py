@@ -1,7 +1,5 @@
 """Marginal covariances by GTSAM: its Bayes tree of the rows of a Jacobian."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The Kalman filter of all vehicles with one dense covariance, updated in information form."""
 
-from __future__ import annotations
-
 import numpy as np
 
 UNKNOWN = 1e6

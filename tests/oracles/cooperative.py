@@ -5,8 +5,6 @@ State: named vectors, ("x", j) position, ("b", j) error of fixes, ("v", j) veloc
 by q / gate, and by 100 more beyond four times the gate. What is vague has a variance of FLAT m^2.
 """
 
-from __future__ import annotations
-
 import copy
 import math
 from typing import Any, NamedTuple

@@ -10,8 +10,6 @@ with the w in (0, 1] of least trace of P. The ego's own fix has no dependent err
 all other errors as dependent (Li, Nashashibi, Yang, 2013; Julier and Uhlmann, 2001).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import brentq

@@ -3,8 +3,6 @@
 Murai et al., "A Robot Web for Distributed Many-Device Localization", T-RO 40, 2024.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 

@@ -4,8 +4,6 @@ Predict x_j += moved_j, P += Q. Update in information form with H and R as they 
 Gauss-Newton step of the same cost at the solution of the linear update, with range and angles themselves.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from coopoc import NoiseModel

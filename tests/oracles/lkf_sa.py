@@ -4,8 +4,6 @@ delta_i = -sum_j (x_j - x_i) as measured, of variance 1, or deg_i times the mean
 vectors. A member whose measurement is incomplete has no edge.
 """
 
-from __future__ import annotations
-
 import numpy as np
 
 from coopoc import NoiseModel

@@ -1,7 +1,5 @@
 """The members of a star at a step, one run, as objects: `coopoc.stars` for the oracles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from coopoc.arrays import Floats

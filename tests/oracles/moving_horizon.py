@@ -4,8 +4,6 @@ Eliminating the steps before the window is the same as keeping their rows as the
 cost. Relative measurements of the window's steps are rows linear around vectors that every Gauss-Newton step renews.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """MSMV-R, one run: P^-1 = P_prior^-1 + C_p^-1 + sum_j C_j^-1, each neighbour a pseudo-fix y_j = p_j - rho(r_ij)."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coopoc import NoiseModel

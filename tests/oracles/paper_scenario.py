@@ -4,8 +4,6 @@ Each run draws fixes, velocities and relative measurements, and follows one ego 
 with unit covariances, and by the joint filter of its star with the acting noise. arXiv 2411.05847, IV.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

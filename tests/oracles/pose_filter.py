@@ -1,7 +1,5 @@
 """The pose filter with stacked rows, one dense covariance and numerical derivatives."""
 
-from __future__ import annotations
-
 import numpy as np
 from scipy.linalg import block_diag
 

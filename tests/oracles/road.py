@@ -1,7 +1,5 @@
 """Road filter of one vehicle with dense matrices: the plane with heading and scale errors, the height beside it."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coopoc.arrays import Floats

@@ -1,7 +1,5 @@
 """Kalman and running-mean adaptive filters of one vehicle on one axis, as loops over time."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coopoc.arrays import Floats

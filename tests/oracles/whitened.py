@@ -1,7 +1,5 @@
 """Whitened residuals of points in CasADi's expressions, from the formulas of their kinds."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi as ca

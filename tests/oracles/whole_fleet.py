@@ -1,7 +1,5 @@
 """What the oracles of whole-fleet methods share, from the equations: rows of measurements, solo steps, late answers."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coopoc.world.links import spherical, to_vector, wrap

@@ -4,8 +4,6 @@ Relative measurements are rows (h(x_j - x_0) - z) / std in range, azimuth and in
 vector itself; a component that is NaN is no row.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import Any
 
