@@ -278,6 +278,8 @@ def add_fix(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
         if slipped > guards.fix_gate or 4.0 * slipped > q:
             widen(g, first, -slip)
             innovate(g, h)
+        else:
+            q = slipped
     f.q[0, 3] = q = use_fix(f, model, guards, 0, True, q)
     f.hits[0, 0] = f.hits[0, 0] + 1 if guards.fix_gate > 0.0 and q > guards.fix_gate else 0
 
