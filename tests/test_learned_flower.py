@@ -1,5 +1,7 @@
 """The Flower apps: the weights of `federate`, Flower's own average, bad and missing answers, silent errors."""
 
+from __future__ import annotations
+
 import importlib.util
 import sys
 import tomllib

@@ -4,6 +4,8 @@ The wire, the server's memory and its files are searched for a drive that is dis
 gives this drive away shows that the search would find it.
 """
 
+from __future__ import annotations
+
 import importlib.util
 import os
 import re
