@@ -45,7 +45,7 @@ def read_librsf(path: Path, summary: Summary, **_: Any) -> Rows:
     Raises:
         InputError: a line that does not have its form, no line with a tag.
     """
-    every, vehicle = dict[str, dict[int, list[str]]](), re.sub("_(input|gt)$", "", path.stem, flags=re.IGNORECASE)
+    every, vehicle = dict[str, dict[int, list[str]]](), re.sub("(?i)_(input|gt)$", "", path.stem)
     for number, (tag, *words) in read_words(path):
         every.setdefault(tag, {})[number] = words
     parts = list[pd.DataFrame]()
@@ -61,7 +61,7 @@ def read_librsf(path: Path, summary: Summary, **_: Any) -> Rows:
             both, track = f["first_cov"] + f["second_cov"], 2 * f["half_track"]
             f = f.assign(speed=(f["first"] + f["second"]) / 2, yaw_rate=(f["second"] - f["first"]) / track)
             f = f.assign(speed_cov=both / 4, yaw_rate_cov=both / track**2)
-        f = f.assign(**{f"{name[:-3]}std": f[name].clip(0) ** 0.5 for name in f if name.endswith("_cov")})
+        f = f.assign(**{f"{name[:-3]}std": f[name].clip(0) ** 0.5 for name in map(str, f) if name.endswith("_cov")})
         if "partner" in f:
             f["partner"] = f["partner"].map("{:g}".format)
             anchors = f.drop(columns="range").assign(vehicle=f["partner"], partner="", t=np.nan)

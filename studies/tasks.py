@@ -211,7 +211,7 @@ def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, 
         assert log.truth is not None
         start = int(0.4 * len(log.recording.t))
         noise = replace(log.recording.sensors, range_std=RANGE_STD)
-        begin = pose_start(log.recording.between(0, start), gate=GATE, assumed=noise)
+        begin = pose_start(replace(log.recording.between(0, start), sensors=noise), gate=GATE)
         return log.recording, log.truth, start, {"begin": begin, "assumed": noise}
     drive = pose_drives.drive(str(path), 0.0, V2X(max_neighbours=3, radius=float("inf")), GATE)
     if drive.truth is None or drive.truth.heading is None:
