@@ -130,18 +130,18 @@ def test_a_cluster_that_cannot_compute_is_named_before_any_work(
 ) -> None:
     monkeypatch.setattr("coopoc.study.cluster.PATIENCE", 3.0)
 
-    def refused(match: str, address: str = scheduler) -> None:
+    def not_run(match: str, address: str = scheduler) -> None:
         with refused(match):
             run_study(study, tmp_path / "new", progress=False, cluster=address)
         assert not (tmp_path / "new").exists()
 
-    refused("has no Dask scheduler", "tcp://127.0.0.1:9")
-    refused("has no Dask scheduler", "nowhere at all")
-    refused("has no Dask scheduler", "tcp://127.0.0.1:99999")
-    refused(r"has no worker\. Start one on each machine: dask worker tcp://")
+    not_run("has no Dask scheduler", "tcp://127.0.0.1:9")
+    not_run("has no Dask scheduler", "nowhere at all")
+    not_run("has no Dask scheduler", "tcp://127.0.0.1:99999")
+    not_run(r"has no worker\. Start one on each machine: dask worker tcp://")
     monkeypatch.setattr("coopoc.study.cluster.PATIENCE", 30.0)
     several = worker("--nthreads", "2")
-    refused("has a worker of several threads.*Start workers with --nthreads 1")
+    not_run("has a worker of several threads.*Start workers with --nthreads 1")
     end(several)
     worker(PYTHONPATH="")
-    refused("that cannot load the study .*small_study.*Install the same coopoc")
+    not_run("that cannot load the study .*small_study.*Install the same coopoc")
