@@ -11,6 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 import pytest
+from conftest import refused
 from small_runs import ENV, numbers, shown, start
 
 from coopoc.study.compute import WorkerDiedError
