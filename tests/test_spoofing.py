@@ -156,10 +156,11 @@ def test_the_example_prints_its_table(example: ModuleType, capsys: pytest.Captur
     assert few.robust < 1.3 * clean.least_squares
 
 
-@pytest.mark.parametrize("method", [co.GaussianBeliefPropagation, co.CentralFilter])
-def test_a_fleet_in_which_a_fifth_lies_is_no_worse_than_alone(method: Any) -> None:
-    """At the first fixes, 5 m apart by noise, each number of a liar is within its gate: their vector is not."""
+@pytest.mark.parametrize(("method", "most"), [(co.GaussianBeliefPropagation, 1.01), (co.CentralFilter, 0.5)])
+def test_a_fleet_in_which_a_fifth_lies_is_no_worse_than_alone(method: Any, most: float) -> None:
+    """At the first fixes, 5 m apart by noise, each number of a liar is within its gate: their vector is not. A centre
+    doubts the fixes that others contradict."""
     fleet = co.load_fleet("town10-validation").between(0, 100)
     seen = spoofed(observe(fleet, S2, V2X(max_neighbours=6), runs=2), 0.2, seed=1, honest=range(5))
     alone, together = (co.rt_le(which("nominal")(seen, range(5)), fleet).mean() for which in (co.Kalman, method))
-    assert together < 1.01 * alone
+    assert together < most * alone
