@@ -338,7 +338,7 @@ class Oracle:
         if g.fix_gate:
             votes = [sum(((x - y) ** 2 / (p + q)).sum() <= g.fix_gate for y, q in places) for x, p in places]
         best = int(np.argmax(votes))
-        late = (t - self.revoked.get(self.ego, [0, 0])[1]) * self.seen.dt > g.lost
+        late = (t - self.revoked.get(self.ego, [0, 0])[1]) * self.seen.dt > g.lost * (1 if self.life.own else 2)
         if self.ego not in s["trusted"] and votes[0] < max(len(votes), 2) and not late:
             return False
         b.drop(("b", self.ego))

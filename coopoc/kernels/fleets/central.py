@@ -114,15 +114,16 @@ def add_fixes(
     The own filter of a vehicle whose fixes are false from the start believes them: here others contradict it.
     """
     for n in range(x.shape[2]):
-        noise, fix, q, gain = at(assumed.fix, 0, t, n), measured.gnss[0, t, n], 0.0, 0.0
+        noise, fix = at(assumed.fix, 0, t, n), measured.gnss[0, t, n]
+        q = gain = 0.0
         for c in range(3):
             gap, own = fix[c] - x[0, t, n, c], P[3 * n + c, 3 * n + c]
             s = own + noise[c]
             if not math.isnan(gap):
                 q += gap * gap / s
-                gain += own / (3.0 * s)
+                gain += own / s
         share = inflation(q, FIX_GATE, hits[n]) if assumed.robust else 1.0
-        hits[n] = count(q, FIX_GATE, hits[n], gain)
+        hits[n] = count(q, FIX_GATE, hits[n], gain / 3.0)
         for c in range(3 if measured.active[0, t, n] else 0):
             row, variance = 3 * n + c, share * noise[c]
             if not before[n]:
