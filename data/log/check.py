@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import chi2, linregress
+import scipy  # its statistics take half a second, and are imported where they are used
 
 from coopoc.arrays import AnyArray, Bools, Floats, robust_std
 from coopoc.errors import InputError
@@ -57,8 +57,7 @@ SIGMAS = 6.0
 OUTLYING, OUTLIERS = 5.0, 0.01
 """Standard deviations beyond which a measurement is an outlier; the share of them that is worth a word."""
 WINDOW, BLOCKS = 9, 10
-"""Measurements of a pair whose median is taken off before outliers are counted; parts of a drive whose medians say how
-sure an offset of a pair is."""
+"""Measurements of a pair whose median is taken off to count outliers; parts of a drive that show how sure it is."""
 UNUSED = 0.05
 """Share of what was logged that may be left out without a word."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
@@ -339,7 +338,7 @@ def _of_vehicles(c: Check) -> list[str]:
         name, nis, distance, turn = (row[key] for key in ("vehicle", "nis", "fixes_per_odometry", "turned_deg"))
         column = c.world.ids.index(name)
         square = size * c.normalised[np.isfinite(c.normalised[:, column]), column]
-        usual = max(float(np.median(square)) / chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
+        usual = max(float(np.median(square)) / scipy.stats.chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
         outliers = float(np.mean(square > OUTLYING**2 * usual)) if len(square) else 0.0
         if outliers > OUTLIERS:
             sentences.append(
@@ -383,7 +382,7 @@ def _of_truth(c: Check) -> list[str]:
                 "ellipsoid, the other above the geoid, or are antennas elsewhere?"
             )
         if len(gap) >= ENOUGH and np.ptp(velocity, axis=0).any():
-            line = linregress((velocity - velocity.mean(axis=0)).ravel(), (gap - np.median(gap, axis=0)).ravel())
+            line = scipy.stats.linregress((velocity - velocity.mean(0)).ravel(), (gap - np.median(gap, 0)).ravel())
             if abs(line.slope) >= max(SIGMAS * line.stderr, 0.5 * rec.dt):
                 way = "ahead of" if line.slope > 0 else "behind"
                 sentences.append(
