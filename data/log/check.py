@@ -402,7 +402,7 @@ def _of_truth(c: Check) -> list[str]:
 def _of_measurements(c: Check) -> list[str]:
     """Residuals of relative measurements that no stated noise explains: scale, outliers, offsets of pairs."""
     sentences = []
-    for k, row in ((list(UNITS).index(row["measurement"]), row) for row in c.measurements):
+    for row in c.measurements:
         name, unit, median, std, should = (
             row[key] for key in ("measurement", "unit", "median", "robust_std", "expected_std")
         )
@@ -415,7 +415,7 @@ def _of_measurements(c: Check) -> list[str]:
         wrong = std > WIDE * should or (name == "azimuth" and std > COARSE > 3 * position)
         if name != "range":
             wrong |= abs(median) > 3 * should
-            hint = (_other_angle(c) if k == 1 else "") or hint
+            hint = (_other_angle(c) if name == "azimuth" else "") or hint
         else:
             measured = c.world.relative[0, :, 0]
             true = measured - c.relative[:, 0]
@@ -424,7 +424,7 @@ def _of_measurements(c: Check) -> list[str]:
             wrong |= not 0.8 <= ratio <= 1.25
             if not 0.4 <= ratio <= 2.5:
                 hint = f"They are {ratio:.3g} times as long; of mm scale=range:0.001 makes m, of feet 0.3048."
-        outliers, offsets = row["beyond_5_std"], _offsets(c, k, row["stated_std"])
+        outliers, offsets = row["beyond_5_std"], _offsets(c, list(UNITS).index(name), row["stated_std"])
         if outliers > OUTLIERS:
             sentences.append(
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
