@@ -190,14 +190,11 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
     References:
         Lerro, Bar-Shalom, IEEE Trans. AES 29(3), 1993 (converted measurements beyond d std^2 = 0.4 std of the range).
     """
-    if (
-        noise_model.sensors is None
-        or not isinstance(recording, Recording)
-        or not (links := recording.relative.shape[1])
-    ):
+    noise, links = noise_model.sensors, recording.relative.shape[1] if isinstance(recording, Recording) else 0
+    if noise is None or recording is None or not links:
         return noise_model
     sample = recording.relative[0, np.linspace(0, links - 1, min(links, SAMPLED)).astype(np.int64)]
-    noise, seen = noise_model.sensors, sample[np.isfinite(sample[:, 0])]
+    seen = sample[np.isfinite(sample[:, 0])]
     directed = seen[np.isfinite(seen[:, 1])]
     if not len(seen):
         return noise_model
@@ -267,12 +264,10 @@ def motion_noise(noise_model: NoiseModel, interval: float | None) -> MotionNoise
     interval = 0.0 if interval is None else check_interval(interval)
     if noise_model.process_std is not None:
         return MotionNoise(np.array(noise_model.process_std, dtype=float), np.zeros(3), 0.0, 0.0, interval)
-    assert noise_model.sensors is not None
-    ratio, of_speed = (
-        np.full(3, noise_model.sensors.velocity_std_ratio),
-        noise_model.sensors.velocity_reading == "speed",
-    )
-    return MotionNoise(np.zeros(3), ratio, float(noise_model.sensors.velocity_floor), float(of_speed), interval)
+    sensors = noise_model.sensors
+    assert sensors is not None
+    ratio, of_speed = np.full(3, sensors.velocity_std_ratio), sensors.velocity_reading == "speed"
+    return MotionNoise(np.zeros(3), ratio, float(sensors.velocity_floor), float(of_speed), interval)
 
 
 def process_noise(noise_model: NoiseModel, recording: Recording) -> tuple[Floats, MotionNoise]:
