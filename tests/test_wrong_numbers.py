@@ -170,7 +170,8 @@ def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
     """A fix beyond the gate has q / gate times its variance, one beyond REJECTED gates is left out, until the gains
     that they would have had, less LEAK of the others', sum to PATIENCE."""
     drive, process, peer = wild_fixes(300)
-    gnss = drive.gnss + 60.0 * (abs(np.arange(300) - 210) < 60)[:, None, None]
+    gnss = drive.gnss.copy()
+    gnss[0, 150:270] += 60.0
     track, hits, used = Kalman()(replace(drive, gnss=gnss), [0]), 0.0, 0
     for t in range(1, 300):
         peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
