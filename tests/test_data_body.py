@@ -296,7 +296,7 @@ def test_libRSFs_text_is_followed_from_ranges_alone(tmp_path: Path, wheels: bool
     log = load_log(f"{tmp_path / 'hall'}?frame=body")
     ego = log.recording.ids.index("Hall")
     assert {log.recording.ids[k] for k in log.recording.landmarks} == {"100", "101", "102", "103"}
-    assert log.summary.unused == {"Hall_Input.txt: lines imu": 1}
+    assert (log.summary.unused, log.summary.refused) == ({"Hall_Input.txt: lines imu": 1}, {})
     assert log.truth is not None
     assert_allclose(log.truth.position[:, ego, :2], place, atol=1e-9)
     noise = log.recording.sensors

@@ -1,5 +1,6 @@
 """The studies themselves, at a size that a test can afford, and what a user does wrong with them."""
 
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -20,7 +21,7 @@ from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import Setting, jobs_of, load_method
 from coopoc.plugins import find
 from coopoc.studies import convergence, error_cdf, lineup, neighbours, scene, weights
-from coopoc.studies.paper import reported
+from coopoc.studies.paper import EVIDENCE, reported
 from coopoc.study.publish import views as published
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
@@ -160,6 +161,8 @@ def test_a_verdict_needs_runs_and_training_seeds(net: tuple[float, ...], runs: i
     found = error_cdf.STUDY.answers(cdf(net, runs))
     assert list(found) == ["scenario 1"]
     assert words in found["scenario 1"]
+    line = r"Scenario 1: federated [\d.]+ m, fitted KF [\d.]+ m\."
+    assert re.fullmatch(line, EVIDENCE.sub("", found["scenario 1"]))
 
 
 def plant(folder: Path, name: str, p: Params, rounds: int = 2) -> Checkpoint:

@@ -128,18 +128,13 @@ def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats |
 def assumptions(recording: Recording, noise_model: NoiseModel) -> Assumptions:
     """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a
     velocity."""
-    (process, motion), fixes = (
-        process_noise(noise_model, recording),
-        np.ascontiguousarray(noise_model.fix_variance(recording)),
-    )
+    process, motion = process_noise(noise_model, recording)
+    fixes = np.ascontiguousarray(noise_model.fix_variance(recording))
     noise = relative_noise(noise_model)
     return Assumptions(process, fixes, fixes, FIX_GROWTH, *noise, FORGOTTEN, ACCELERATION_STD, motion)
 
 
 def relative_noise(noise_model: NoiseModel) -> tuple[Floats, float]:
     """(3,) m, rad, rad and the least range m of relative measurements, or nothing for unit matrices."""
-    return (
-        (np.empty(0), 0.0)
-        if noise_model.sensors is None
-        else (noise_model.sensors.relative_std, noise_model.sensors.min_range)
-    )
+    sensors = noise_model.sensors
+    return (np.empty(0), 0.0) if sensors is None else (sensors.relative_std, sensors.min_range)

@@ -161,6 +161,8 @@ TYPES: dict[str, Any] = {
 }
 
 
+TINY = 5e-324
+"""The least positive number."""
 Limits = Mapping[str, tuple[float, float, str]]
 """Option -> least and largest value, and both in words."""
 

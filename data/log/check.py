@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import chi2, linregress
+import scipy  # its statistics take half a second, and are imported where they are used
 
 from coopoc.arrays import AnyArray, Bools, Floats, robust_std
 from coopoc.errors import InputError
@@ -57,8 +57,7 @@ SIGMAS = 6.0
 OUTLYING, OUTLIERS = 5.0, 0.01
 """Standard deviations beyond which a measurement is an outlier; the share of them that is worth a word."""
 WINDOW, BLOCKS = 9, 10
-"""Measurements of a pair whose median is taken off before outliers are counted; parts of a drive whose medians say how
-sure an offset of a pair is."""
+"""Measurements of a pair whose median is taken off to count outliers; parts of a drive that show how sure it is."""
 UNUSED = 0.05
 """Share of what was logged that may be left out without a word."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
@@ -339,7 +338,7 @@ def _of_vehicles(c: Check) -> list[str]:
         name, nis, distance, turn = (row[key] for key in ("vehicle", "nis", "fixes_per_odometry", "turned_deg"))
         column = c.world.ids.index(name)
         square = size * c.normalised[np.isfinite(c.normalised[:, column]), column]
-        usual = max(float(np.median(square)) / chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
+        usual = max(float(np.median(square)) / scipy.stats.chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
         outliers = float(np.mean(square > OUTLYING**2 * usual)) if len(square) else 0.0
         if outliers > OUTLIERS:
             sentences.append(
@@ -383,7 +382,7 @@ def _of_truth(c: Check) -> list[str]:
                 "ellipsoid, the other above the geoid, or are antennas elsewhere?"
             )
         if len(gap) >= ENOUGH and np.ptp(velocity, axis=0).any():
-            line = linregress((velocity - velocity.mean(axis=0)).ravel(), (gap - np.median(gap, axis=0)).ravel())
+            line = scipy.stats.linregress((velocity - velocity.mean(0)).ravel(), (gap - np.median(gap, 0)).ravel())
             if abs(line.slope) >= max(SIGMAS * line.stderr, 0.5 * rec.dt):
                 way = "ahead of" if line.slope > 0 else "behind"
                 sentences.append(
@@ -403,7 +402,7 @@ def _of_truth(c: Check) -> list[str]:
 def _of_measurements(c: Check) -> list[str]:
     """Residuals of relative measurements that no stated noise explains: scale, outliers, offsets of pairs."""
     sentences = []
-    for k, row in ((list(UNITS).index(row["measurement"]), row) for row in c.measurements):
+    for row in c.measurements:
         name, unit, median, std, should = (
             row[key] for key in ("measurement", "unit", "median", "robust_std", "expected_std")
         )
@@ -416,7 +415,7 @@ def _of_measurements(c: Check) -> list[str]:
         wrong = std > WIDE * should or (name == "azimuth" and std > COARSE > 3 * position)
         if name != "range":
             wrong |= abs(median) > 3 * should
-            hint = (_other_angle(c) if k == 1 else "") or hint
+            hint = (_other_angle(c) if name == "azimuth" else "") or hint
         else:
             measured = c.world.relative[0, :, 0]
             true = measured - c.relative[:, 0]
@@ -425,7 +424,7 @@ def _of_measurements(c: Check) -> list[str]:
             wrong |= not 0.8 <= ratio <= 1.25
             if not 0.4 <= ratio <= 2.5:
                 hint = f"They are {ratio:.3g} times as long; of mm scale=range:0.001 makes m, of feet 0.3048."
-        outliers, offsets = row["beyond_5_std"], _offsets(c, k, row["stated_std"])
+        outliers, offsets = row["beyond_5_std"], _offsets(c, list(UNITS).index(name), row["stated_std"])
         if outliers > OUTLIERS:
             sentences.append(
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
