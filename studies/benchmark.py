@@ -125,11 +125,7 @@ def information(name: str, one: Method) -> str:
 
 
 def tried(name: str, task: Task) -> dict[str, Any]:
-    """A method's row for one task: error with its interval, bound, consistency, bytes and time; or why it failed."""
-    return _row(task.name, partial(_tried, name, task))
-
-
-def _tried(name: str, task: Task) -> dict[str, Any]:
+    """A method's row for one task: error with its interval, bound, consistency, bytes and time."""
     one = method(name)
     held = information(name, one)
     seen, fleet = recording(task, held in ("", "fleet"))
@@ -189,7 +185,9 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None) -> dict[str
         data: folder of the real measurements; None leaves these tasks out.
     """
     digest = file_digest(name, "method") if in_file(name) else ""
-    rows = [tried(name, task) for task in tqdm(list(tasks), desc=name, unit="task", delay=2.0)]
+    rows = [
+        _row(task.name, partial(tried, name, task)) for task in tqdm(list(tasks), desc=name, unit="task", delay=2.0)
+    ]
     rows += [] if data is None else measured(name, data)
     used = environment()
     versions = {library: used[library] for library in ("coopoc", "numpy", "numba", "torch") if library in used}

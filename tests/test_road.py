@@ -17,7 +17,6 @@ from coopoc import V2X, Fleet, Kalman, NoiseModel, Recording, RoadErrors, RoadFi
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import rt_le
 from coopoc.methods.road import ROAD, from_logs, to_logs
-from coopoc.methods.track import Method
 from coopoc.studies import benchmark
 from coopoc.studies.roads import road_row, roads
 from coopoc.studies.roads import seen as thinned
@@ -175,27 +174,6 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
 
 def test_logarithms_and_back() -> None:
     assert to_logs(from_logs(to_logs(ROAD))) == pytest.approx(to_logs(ROAD))
-
-
-@pytest.mark.skipif(not (ROADS / "f9k").is_dir(), reason="the data of ../shared/data are not there")
-def test_a_real_car() -> None:
-    """F9K, one fix in ten: within 2 % of the Kalman filter or better, and calibrated on the first 40 % 2 % better."""
-    log = co.read_log(ROADS / "f9k" / "ublox_f9k.nmea", truth=ROADS / "f9k" / "span_truth.gga")
-    assert log.truth is not None
-    gnss = log.recording.gnss.copy()
-    gnss[:, np.arange(gnss.shape[1]) % 10 > 0] = np.nan
-    start, stop = max(log.recording.stretches(0), key=lambda cut: cut[1] - cut[0])
-    drive, truth = replace(log.recording, gnss=gnss).between(start, stop), log.truth.between(start, stop)
-    cut = 4 * len(drive.t) // 10 // 10 * 10
-    rest, true = drive.between(cut, len(drive.t)), truth.between(cut, len(drive.t))
-
-    def level(method: Method) -> float:
-        error = (method(rest, [0]).x[0, :, 0] - true.position[:, 0])[:, :2]
-        return float(np.sqrt(np.nanmean(np.square(error).sum(1))))
-
-    fitted = RoadFilter.fitted(drive.between(0, cut), truth.between(0, cut))
-    assert level(RoadFilter()) < 1.02 * level(Kalman())
-    assert level(fitted) < 0.98 * level(Kalman())
 
 
 def test_a_log_of_ones_own_is_a_task(tmp_path: Path) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,7 +11,6 @@ from ..arrays import Floats
 from ..kernels.stars.lkf_sa import run_lkf_sa
 from ..kernels.stars.messages import Assumptions
 from ..kernels.stars.pseudo_fixes import run_msmv
-from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements
@@ -46,12 +45,13 @@ class LKFSA(Checked):
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)
         assumed = assumptions(recording, known)
-
-        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, neighbours = run_lkf_sa(measurements(recording, ego, box), assumed)
-            yield Estimate(slice(None), x, cov, box.link, neighbours)
-
-        return follow_egos(self, recording, egos, run, known.notes)
+        return follow_egos(
+            self,
+            recording,
+            egos,
+            lambda ego, box: [Estimate(*run_lkf_sa(measurements(recording, ego, box), assumed))],
+            known.notes,
+        )
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,12 +87,13 @@ class MSMV(Checked):
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         assumed, own = solo_estimates(recording, known, columns)
         assumed = assumed._replace(growth=(0.0, 1.0), acceleration=0.0)
-
-        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, theirs = run_msmv(measurements(recording, ego, box, own), assumed)
-            yield Estimate(slice(None), x, cov, box.link, theirs)
-
-        return follow_egos(self, recording, egos, run, (*known.notes, RECONSTRUCTION))
+        return follow_egos(
+            self,
+            recording,
+            egos,
+            lambda ego, box: [Estimate(*run_msmv(measurements(recording, ego, box, own), assumed))],
+            (*known.notes, RECONSTRUCTION),
+        )
 
 
 def solo_estimates(

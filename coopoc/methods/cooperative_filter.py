@@ -124,7 +124,7 @@ class CooperativeFilter(Checked):
                 for kind, count, of in zip(KINDS, low[here].sum(axis=0), measured[here].sum(axis=0), strict=True):
                     what = f"{kind}, {mine} and {recording.ids[j]}"
                     notes.extend(rejected(what, count, of, 0.5 if kind == "trusted" else 0.05))
-            yield Estimate(slice(None), x, cov, box.link, neighbours, extras)
+            yield Estimate(x, cov, neighbours, extras=extras)
 
         return follow_egos(self, recording, egos, run, notes)
 

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..kernels.stars.messages import ESTIMATE_GROWTH
 from ..kernels.stars.pseudo_fixes import run_intersection
-from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE_AND_COV, Message
 from .baselines import solo_estimates
@@ -64,9 +63,12 @@ class CovarianceIntersection(Checked):
         gates = self.robust and known.exact_relative
         assumed, own = solo_estimates(recording, known, columns, gates)
         assumed = assumed._replace(growth=ESTIMATE_GROWTH)
-
-        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, theirs = run_intersection(measurements(recording, ego, box, own), assumed, self.split, gates)
-            yield Estimate(slice(None), x, cov, box.link, theirs)
-
-        return follow_egos(self, recording, egos, run, known.notes)
+        return follow_egos(
+            self,
+            recording,
+            egos,
+            lambda ego, box: [
+                Estimate(*run_intersection(measurements(recording, ego, box, own), assumed, self.split, gates))
+            ],
+            known.notes,
+        )

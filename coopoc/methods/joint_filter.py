@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..kernels.stars.joint_filter import run_filter
-from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements
@@ -52,9 +51,10 @@ class JointFilter(Checked):
         known = resolve(self.noise_model, recording)
         assumed, gates = assumptions(recording, known), self.robust and known.exact_relative
         refine = self.exact and known.exact_relative
-
-        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, neighbours = run_filter(measurements(recording, ego, box), assumed, refine, gates)
-            yield Estimate(slice(None), x, cov, box.link, neighbours)
-
-        return follow_egos(self, recording, egos, run, known.notes)
+        return follow_egos(
+            self,
+            recording,
+            egos,
+            lambda ego, box: [Estimate(*run_filter(measurements(recording, ego, box), assumed, refine, gates))],
+            known.notes,
+        )
