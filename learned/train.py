@@ -34,7 +34,7 @@ from .training.clients import Client, Segments, Start
 from .training.drives import Drives, Logged, MeasuredDrives, drives_of
 from .training.fit import Fit, Task, fit_many
 from .training.machine import reporting_on
-from .training.okf_fit import fit_okf_many
+from .training.okf_fit import fit_okf
 
 
 def train_all(
@@ -223,7 +223,7 @@ def _of_fit(fit: Fit) -> Checkpoint:
 
 def _okf(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
     tasks = [(_joined(data[j.setting], None, "training"), _joined(data[j.setting], None, "validation")) for j in todo]
-    fits = fit_okf_many(tasks, todo[0].recipe.schedule.epochs, progress=stage)
+    fits = fit_okf(tasks, todo[0].recipe.schedule.epochs, progress=stage)
     return [Checkpoint(f.model, {"validation_loss": f.validation_loss, "seconds": f.seconds}) for f in fits]
 
 

@@ -17,13 +17,13 @@ from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements
 from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel, resolve
-from .track import Track, check_options
+from .track import Checked, Track
 
 RECONSTRUCTION = "MSMV-R is a reconstruction: the equations of MSMV are not public; the paper's curve is not matched"
 
 
 @dataclass(frozen=True, eq=False)
-class LKFSA:
+class LKFSA(Checked):
     r"""Kalman filter per axis with $z = [\delta; z_\mathrm{gnss}]$, $H = [L; I]$, $L$ the star's graph Laplacian.
 
     $$ \delta_i = -\sum_j (x_j - x_i) \text{ as measured}, \qquad \mathrm{cov}(\delta) = \sigma^2 L $$
@@ -42,9 +42,6 @@ class LKFSA:
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)
@@ -58,7 +55,7 @@ class LKFSA:
 
 
 @dataclass(frozen=True, eq=False)
-class MSMV:
+class MSMV(Checked):
     r"""Kalman filter of the ego with one pseudo-fix $y_j$ per neighbour.
 
     $$
@@ -78,9 +75,6 @@ class MSMV:
     noise_model: NoiseModel | str = "identity"
     name: str = "msmv-r"
     cooperative: bool = True
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     @property
     def message(self) -> Message:

@@ -13,11 +13,11 @@ from ..world.v2x import ESTIMATE_AND_COV, Message
 from .baselines import solo_estimates
 from .egos import Estimate, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
-from .track import Track, check_options
+from .track import Checked, Track
 
 
 @dataclass(frozen=True, eq=False)
-class CovarianceIntersection:
+class CovarianceIntersection(Checked):
     r"""Filter of the ego that fuses pseudo-fixes $y_j = p_j - \rho(r_{ij})$, $C_j = P_j + J C_r J^\top$, by (split) CI.
 
     $$ P^{-1} = w \, P_1^{-1} + (1 - w) \, P_2^{-1} $$
@@ -52,9 +52,6 @@ class CovarianceIntersection:
     name: str = "ci"
     cooperative: bool = True
     message: Message = ESTIMATE_AND_COV
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of their neighbours' estimates; InputError if one is unknown or absent.

@@ -11,11 +11,11 @@ from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
-from .track import Track, check_options
+from .track import Checked, Track
 
 
 @dataclass(frozen=True, eq=False)
-class JointFilter:
+class JointFilter(Checked):
     r"""Kalman filter of the star {ego} + neighbours in information form; axes couple through the relative covariances.
 
     $$
@@ -46,9 +46,6 @@ class JointFilter:
     name: str = "joint"
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""

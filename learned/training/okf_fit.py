@@ -10,12 +10,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc.arrays import instance, number
 from coopoc.short_repr import short_repr
 from coopoc.world.sensors import stream
 
 from ..nets.gain import error, has_truth, over_time
-from ..nets.okf import NoiseParameters, OptimisedKF, log_scale, scan
+from ..nets.okf import NoiseParameters, log_scale, scan
 from .clients import Batch, Segments
 from .machine import one_core, watched
 from .schedule import generator
@@ -31,45 +30,31 @@ class OkfFit:
 
     __repr__ = short_repr
 
-    @property
-    def method(self) -> OptimisedKF:
-        """The filter."""
-        return self.model.method("okf")
 
-
-def fit_okf(training: Segments, validation: Segments, steps: int = 300, velocity_part: bool = True) -> OkfFit:
-    """Train the noise parameters by gradient through the Kalman recursion on 1/T sum_t ||xhat_t - x_t||^2.
+@one_core()
+def fit_okf(
+    tasks: Sequence[tuple[Segments, Segments]],
+    steps: int = 300,
+    progress: str | None = None,
+) -> list[OkfFit]:
+    """Train noise parameters by gradient through the Kalman recursion on 1/T sum_t ||xhat_t - x_t||^2, of several
+    settings at once.
 
     The estimates depend on ratios of variances only, so the loss cannot see a common factor per axis; that factor is
     set afterwards so that the training innovations have the variance that the filter claims for them.
 
     Args:
-        training: segments to train on.
-        validation: segments that select the parameters.
+        tasks: of each setting the segments to train on, and those that select the parameters.
         steps: of Adam on all training segments.
-        velocity_part: train b too, else b = 0.
+        progress: name of the stage of a progress bar on stderr.
 
-    >>> from coopoc.learned import clients, fit_okf
+    >>> from coopoc.learned import clients
     >>> from coopoc.world.fleet import Fleet
     >>> (only,) = clients(Fleet(("a",), np.arange(33) / 10, np.zeros((33, 1, 3)), np.zeros((33, 1, 3))), piece=10)
-    >>> fit_okf(only.training, only.validation, steps=2, velocity_part=False).method.velocity_ratio
-    (0.0, 0.0, 0.0)
+    >>> len(fit_okf([(only.training, only.validation)], steps=2)[0].validation_loss)
+    2
     """
-    for name, part in (("training", training), ("validation", validation)):
-        instance(name, part, Segments, "Give the pieces of a Client.")
-    steps = number("steps", steps, 1, 10**7, kind=int, allowed="in 1..10^7", hint="300 is the default.")
-    return fit_okf_many([(training, validation)], steps, velocity_part)[0]
-
-
-@one_core()
-def fit_okf_many(
-    tasks: Sequence[tuple[Segments, Segments]],
-    steps: int = 300,
-    velocity_part: bool = True,
-    progress: str | None = None,
-) -> list[OkfFit]:
-    """`fit_okf` for many settings, stacked; `progress` names the stage of a progress bar on stderr."""
-    began, like = time.perf_counter(), NoiseParameters(velocity_part)
+    began, like = time.perf_counter(), NoiseParameters()
     data, judge = (_stacked([task[i] for task in tasks], kind) for i, kind in enumerate(("training", "validation")))
     logs = like.logs.detach().double().flatten().repeat(len(tasks), 1).requires_grad_()
     adam = torch.optim.Adam([logs], lr=0.1)
