@@ -45,9 +45,7 @@ def test_an_ellipse_holds_95_percent() -> None:
     (patch,) = [patch for patch in ax.patches if isinstance(patch, Ellipse)]
     assert patch.width * patch.height == pytest.approx(4 * stats.chi2.ppf(0.95, 2) * np.sqrt(np.linalg.det(cov)))
     points = np.random.default_rng(0).multivariate_normal([3.0, -2.0], cov, 20_000)
-    angle = np.radians(patch.angle)
-    turn = np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]])
-    along = (points - np.array(patch.center)) @ turn / [patch.width / 2, patch.height / 2]
+    along = patch.get_patch_transform().inverted().transform(points)  # to the unit circle
     assert ((along**2).sum(axis=1) < 1).mean() == pytest.approx(0.95, abs=0.005)
 
 
