@@ -13,7 +13,7 @@ from ..arrays import Floats
 from ..world.recording import Recording, check_recording
 from ..world.v2x import Message
 from .noise_model import NoiseModel
-from .track import TINY, Track, check_options
+from .track import TINY, Checked, Track, check_options
 from .whole_fleet import CENTRE, UPLOAD, Answer, fleet_track
 
 if TYPE_CHECKING:
@@ -27,7 +27,7 @@ BEARINGS = (
 
 
 @dataclass(frozen=True, eq=False)
-class CentralFilter:
+class CentralFilter(Checked):
     r"""Kalman filter of all vehicles in information form, causal: the optimum of the same measurements.
 
     $$ \Lambda = P^{-1} + \mathrm{blkdiag}(R_i^{-1}) + B \, \mathrm{blkdiag}(W_e) \, B^\top $$
@@ -51,9 +51,6 @@ class CentralFilter:
     name: str = "central-filter"
     cooperative: bool = True
     message: Message = UPLOAD
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""

@@ -150,7 +150,7 @@ def _behind_arrival_cost(
             counts[DROPPED] += int((box.arrival - recording.links.step[box.link] >= length).sum())
         solved = horizons(seen, assumed, np.ascontiguousarray(box.arrival), settings)
         counts[MOVING] += int(solved.moving.sum())
-        yield Estimate(slice(None), solved.x, solved.covariance, box.link, solved.neighbours)
+        yield Estimate(solved.x, solved.covariance, solved.neighbours)
 
     track = follow_egos(method, recording, egos, drive)
     return replace(track, notes=(*noise_model.notes, *_counted(counts)))

@@ -167,6 +167,13 @@ Limits = Mapping[str, tuple[float, float, str]]
 """Option -> least and largest value, and both in words."""
 
 
+class Checked:
+    """A dataclass whose options are checked when it is made."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
+
+
 def check_options(made: Any, limits: Limits | None = None, kinds: Mapping[str, Any] | None = None) -> None:
     """InputError for an option of another type than its field of the dataclass has; NumPy's numbers become Python's.
 
