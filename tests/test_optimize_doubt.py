@@ -67,7 +67,6 @@ def test_losses_that_reject_start_by_graduation(name: str) -> None:
         assert found.cost <= least_squares(rows, truth.ravel()).cost * (1 + 1e-6)
         assert np.linalg.norm(found.x - truth, axis=1).max() < 1.0
         assert any(f"{name} loss rejects" in note for note in found.notes)
-        assert found.seconds > 0
 
 
 def test_points_that_a_loss_sets_free_are_told_from_unmeasured_ones() -> None:
