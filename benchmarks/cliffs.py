@@ -124,14 +124,16 @@ def stream_cases() -> Iterator[Case]:
 
         around = [[15.0, 0.6 * k, np.pi / 2] for k in range(n - 1)]
         relative = [co.RelativeMeasurement(f"v{k}", seen, z, u) for k, seen in enumerate(around)]
-        stream = co.Kalman(known).start() if n == 1 else co.StarStream(co.JointFilter(known))
         more = {} if n == 1 else {"neighbours": relative}
-
-        def ours(stream: Any = stream, more: Any = more) -> Any:
-            return [stream.step(z, u, 0.1, **more)[0] for _ in range(steps)][-1]
-
         yield Case(f"filterpy, {3 * n} numbers", f"filterpy, {3 * n} numbers", theirs, steps)
-        yield Case(name, f"filterpy, {3 * n} numbers", ours, steps)
+        for robust in (False, True):
+            solo, star = co.Kalman(known, robust=robust), co.StarStream(co.JointFilter(known, robust=robust))
+            stream = solo.start() if n == 1 else star
+
+            def ours(stream: Any = stream, more: Any = more) -> Any:
+                return [stream.step(z, u, 0.1, **more)[0] for _ in range(steps)][-1]
+
+            yield Case(name + ", gates" * robust, f"filterpy, {3 * n} numbers", ours, steps)
 
 
 def measured(rounds: int = ROUNDS) -> list[dict[str, Any]]:

@@ -198,7 +198,7 @@ def missing_column(file: str, column: str, given: Sequence[str], allowed: str, k
     key = key or column
     usual = [header for header in given if header.lower() in USUAL.get(key, ())]
     header = usual[0] if usual else "..."
-    hint = f'Add it, or pass columns={{"{key}": "{header}"}}.'
+    hint = f'Add it, or pass columns={{"{key}": "{header}"}}; with a command, FILE?columns={key}:{header}.'
     if usual:
         hint = f"Did you mean {header}? {hint}"
     allowed = f"{allowed}; the file has {', '.join(given)}"

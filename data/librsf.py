@@ -18,7 +18,7 @@ FORMS = {
     "range2": "t range range_cov x y partner",
     "range3": "t range range_cov x y z partner",
     "odom2diff": "t first second sideways half_track first_cov second_cov sideways_cov",
-    "odom3": "t speed vy vz wx wy yaw_rate speed_cov vy_cov vz_cov wx_cov wy_cov yaw_rate_cov",
+    "odom3": "t speed sideways lift wx wy yaw_rate speed_cov sideways_cov lift_cov wx_cov wy_cov yaw_rate_cov",
     "point2": "t x y",
     "point3": "t x y z",
 }

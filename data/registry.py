@@ -23,7 +23,7 @@ from .graphs import read_graph_log
 from .log.read import Log, is_log, read_log, steps_in_words
 from .log.units import Summary
 from .mrclam import MAX_GAP, read_mrclam
-from .source import parted, split
+from .source import AUTO, parted, split
 
 FLEETS = Path(__file__).parent / "fleets"
 
@@ -235,7 +235,11 @@ def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:
             raise unknown("option", name, accepted or ["(none)"], suggestion(name, accepted, "Leave it out."))
     if not path.exists():
         raise InputError("data", str(path), "must be the path of a file or folder", "Check the path.")
-    return read(path, **options)
+    if options.get("offset") != AUTO:
+        return read(path, **options)
+    from .log.check import less_offsets
+
+    return less_offsets(read(path, **{**options, "offset": None}))
 
 
 def _made(registered: Any, name: str) -> Fleet:

@@ -80,7 +80,7 @@ class QCQPRelaxation:
                     else:
                         solution = solve(problem)
                     points[run, members], covariance[run] = solution.x, solution.covariance[0]
-                yield Estimate(star.step, points[:, 0], covariance, star.link, points[:, 1:])
+                yield Estimate(points[:, 0], covariance, points[:, 1:], star.step, star.link)
 
         track = follow_egos(self, recording, egos, run_ego)
         share = f"{sum(tight)} of {len(tight)} relaxations were tight"

@@ -16,7 +16,6 @@ from .training.clients import Client, Segments, clients
 from .training.drives import MeasuredDrives
 from .training.fit import Fit, fit
 from .training.measured import measured_clients
-from .training.okf_fit import fit_okf
 from .training.roads import roads
 from .training.schedule import Schedule
 
@@ -42,7 +41,6 @@ __all__ = [
     "clients",
     "federate",
     "fit",
-    "fit_okf",
     "ledger",
     "load",
     "load_method",

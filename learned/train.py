@@ -7,6 +7,7 @@ import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from dataclasses import asdict, replace
+from itertools import starmap
 from multiprocessing import get_context
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from coopoc.arrays import Floats, listed, number
+from coopoc.arrays import listed, number
 from coopoc.errors import InputError
 from coopoc.file_names import given_path
 from coopoc.methods.kalman import Kalman
@@ -22,6 +23,7 @@ from coopoc.methods.noise_model import NoiseModel
 from coopoc.one_file import in_file
 from coopoc.workers import leave_with
 from coopoc.world.fleet import Fleet
+from coopoc.world.recording import Recording
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors, VelocityReading
 from coopoc.world.v2x import V2X
@@ -34,7 +36,7 @@ from .training.clients import Client, Segments, Start
 from .training.drives import Drives, Logged, MeasuredDrives, drives_of
 from .training.fit import Fit, Task, fit_many
 from .training.machine import reporting_on
-from .training.okf_fit import fit_okf_many
+from .training.okf_fit import fit_okf
 
 
 def train_all(
@@ -129,30 +131,22 @@ def trained(group: Sequence[Job], fleet: Drives, progress: bool = True) -> list[
 def ratio_to_fitted_filter(model: Gain, job: Job, fleet: Drives) -> float:
     """RT-LE on the pieces that validate over that of a Kalman filter whose noise is fitted on those that train."""
     data = job_clients(job, fleet)
-    gnss, velocity, truth, dt = _pieces(_joined(data, job.client, "training"))
-    steps, fixes = np.diff(truth, axis=0) - dt * velocity[1:], gnss - truth
-    process, fix = (_rms(e) for e in (steps, fixes))
-    gnss, velocity, truth, dt = _pieces(_joined(data, job.client, "validation"))
-    names = tuple(map(str, range(gnss.shape[1])))
-    still = Fleet(names, dt * np.arange(len(gnss)), np.zeros_like(gnss), np.zeros_like(gnss))
-    seen = replace(observe(still, Sensors(), V2X(max_neighbours=0)), gnss=gnss[None], velocity=velocity[None])
-    methods = model.method(job.name), Kalman(NoiseModel("fitted", None, process, fix))
-    ours, theirs = (np.nansum((method(seen, names).x[0] - truth) ** 2) for method in methods)
+    known = NoiseModel.fitted(*_drives(_joined(data, job.client, "training")))
+    seen, truth = _drives(_joined(data, job.client, "validation"))
+    methods = model.method(job.name), Kalman(known)
+    ours, theirs = (np.nansum((method(seen, seen.ids).x[0] - truth.position) ** 2) for method in methods)
     return float(np.sqrt(ours / theirs))
 
 
-def _rms(errors: Floats) -> tuple[float, float, float]:
-    """Per axis, of those (..., 3) that are known; at least 1 mm."""
-    there = np.isfinite(errors)
-    squares = np.where(there, errors, 0.0) ** 2
-    x, y, z = np.sqrt(squares.sum(axis=(0, 1)) / there.sum(axis=(0, 1)).clip(1)).clip(1e-3).tolist()
-    return x, y, z
-
-
-def _pieces(given: Segments) -> tuple[Floats, Floats, Floats, float]:
-    """Fixes, velocities and truth (T + 1, n, 3) of pieces as they were drawn once, and dt."""
+def _drives(given: Segments) -> tuple[Recording, Fleet]:
+    """Pieces, as they were drawn once, as vehicles that drive at one time; where no piece has a true height it is 0."""
     gnss, velocity, truth = (part.double().numpy().swapaxes(0, 1) for part in (given.gnss, given.velocity, given.truth))
-    return gnss, velocity, truth, given.dt
+    truth = np.where(np.isnan(truth).all(axis=(0, 1)), 0.0, truth)
+    names = tuple(map(str, range(gnss.shape[1])))
+    fleet = Fleet(names, given.dt * np.arange(len(gnss)), truth, 0 * truth)
+    still = replace(fleet, position=np.zeros_like(truth), velocity=np.zeros_like(truth))
+    seen = observe(still, Sensors(), V2X(max_neighbours=0))
+    return replace(seen, gnss=gnss[None], velocity=velocity[None]), fleet
 
 
 def _in_worker(group: Sequence[Job], fleet: Drives, out: Path, worst: float, line: int | None, parent: int) -> None:
@@ -223,8 +217,7 @@ def _of_fit(fit: Fit) -> Checkpoint:
 
 def _okf(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
     tasks = [(_joined(data[j.setting], None, "training"), _joined(data[j.setting], None, "validation")) for j in todo]
-    fits = fit_okf_many(tasks, todo[0].recipe.schedule.epochs, progress=stage)
-    return [Checkpoint(f.model, {"validation_loss": f.validation_loss, "seconds": f.seconds}) for f in fits]
+    return list(starmap(Checkpoint, fit_okf(tasks, todo[0].recipe.schedule.epochs, progress=stage)))
 
 
 TRAINERS: dict[str, Trainer] = {"federated": _federated, "centralised": _fitted, "individual": _fitted, "okf": _okf}

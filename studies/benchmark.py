@@ -19,7 +19,7 @@ from tyro.conf import Positional, arg
 from coopoc.arrays import number
 from coopoc.errors import InputError, unknown
 from coopoc.evaluate.scores import scored
-from coopoc.evaluate.statistics import mean_interval
+from coopoc.evaluate.statistics import mean_interval, paired_difference
 from coopoc.file_names import given_path
 from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
 from coopoc.methods.track import Method
@@ -30,6 +30,9 @@ from coopoc.study.provenance import environment
 
 from .roads import road_row, roads
 from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, VERSION, Task, bound, graph_row, pose_row, recording
+
+ROAD = "road-kalman"
+"""Of which others are shown to be better or worse on the same blocks of real roads."""
 
 
 def benchmark(
@@ -122,11 +125,7 @@ def information(name: str, one: Method) -> str:
 
 
 def tried(name: str, task: Task) -> dict[str, Any]:
-    """A method's row for one task: error with its interval, bound, consistency, bytes and time; or why it failed."""
-    return _row(task.name, partial(_tried, name, task))
-
-
-def _tried(name: str, task: Task) -> dict[str, Any]:
+    """A method's row for one task: error with its interval, bound, consistency, bytes and time."""
     one = method(name)
     held = information(name, one)
     seen, fleet = recording(task, held in ("", "fleet"))
@@ -152,7 +151,7 @@ def measured(name: str, data: Path) -> list[dict[str, Any]]:
     if name in names("coopoc.backends"):
         files = tqdm(BEST, desc=name, unit="graph", delay=2.0)
         return [_row(file, partial(graph_row, data, file, name)) for file in files]
-    if name in POSES or (in_file(name) and not getattr(find("coopoc.methods", name), "roads", False)):
+    if name in POSES or (in_file(name) and not _on_roads(name)):
         made: Any = find("coopoc.methods", name)("nominal") if in_file(name) else name
         return [_row(task.name, partial(pose_row, task, data, made)) for task in LOGGED]
     if not (one := method(name)).cooperative:
@@ -168,8 +167,13 @@ def _row(task: str, made: Callable[[], dict[str, Any]]) -> dict[str, Any]:
 
 
 def simulated(name: str) -> bool:
-    """Whether the simulated tasks are for a name: those of backends and of pose filters are real ones."""
-    return name not in POSES and name not in names("coopoc.backends")
+    """Whether the simulated tasks are for a name: those of backends, of pose filters and of what says `roads` are real
+    ones."""
+    return name not in POSES and name not in names("coopoc.backends") and not _on_roads(name)
+
+
+def _on_roads(name: str) -> bool:
+    return in_file(name) and getattr(find("coopoc.methods", name), "roads", False)
 
 
 def card(name: str, tasks: Iterable[Task], data: Path | None = None) -> dict[str, Any]:
@@ -181,7 +185,9 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None) -> dict[str
         data: folder of the real measurements; None leaves these tasks out.
     """
     digest = file_digest(name, "method") if in_file(name) else ""
-    rows = [tried(name, task) for task in tqdm(list(tasks), desc=name, unit="task", delay=2.0)]
+    rows = [
+        _row(task.name, partial(tried, name, task)) for task in tqdm(list(tasks), desc=name, unit="task", delay=2.0)
+    ]
     rows += [] if data is None else measured(name, data)
     used = environment()
     versions = {library: used[library] for library in ("coopoc", "numpy", "numba", "torch") if library in used}
@@ -210,6 +216,10 @@ def _logs(cards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
             shown["RT-LE [m]"] = "{} [{}, {}]".format(*map(three, row["rt_le_m"]))
             if own := row.get("calibrated_m"):
                 shown["calibrated [m]"] = "{} [{}, {}]".format(*map(three, own))
+            rival = next((held for _, held in _rows([c for c in cards if c["method"] == ROAD], {row["task"]})), {})
+            for key, word in (("blocks_m", ""), ("calibrated_blocks_m", ", calibrated")):
+                if one != ROAD and len(row.get(key, ())) == len(rival.get(key, "-")):
+                    shown[f"less {ROAD}{word} [m]"] = str(paired_difference(np.array(row[key]), np.array(rival[key])))
             shown |= {"heading [°]": row.get("heading_deg", ""), "NEES": row.get("nees", "")}
             shown |= {"B/s": row["received_bytes_per_second"], "us/step": row["microseconds_per_step"]}
         rows.append(((row["task"], row.get("rt_le_m", [np.inf])[0]), shown))

@@ -22,7 +22,10 @@ PAPER: Mapping[str, tuple[str, ...]] = {
     "neighbours": ("nominal",),
 }
 """Studies of the paper, and the keys of the findings that answer their questions."""
-EVIDENCE = re.compile(r" \(paired[^)]*\)")
+EVIDENCE = re.compile(
+    r" \(paired[^)]*\)|, (centralised [\d.]+ m, )?OKF [\d.]+ m|, oracle KF [\d.]+ m"
+    r"|; (the )?federated (net|is) [^.(]*(\(paired[^)]*\))?"
+)
 """What the first screen leaves to the sections."""
 LEAD = "After “Federated Data-Driven Kalman Filtering for State Estimation” (arXiv 2411.05847), on {where}."
 

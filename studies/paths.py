@@ -51,7 +51,9 @@ def views(results: Results, over_time: bool) -> Plot | None:
             plain_log(grid[0, 0].yaxis)
         else:
             grid[0, 0].set_aspect("equal", adjustable="datalim")
-    what = f"Distance from the truth over time. {HELD}" if over_time else "Paths of the vehicles; the truth is grey."
+    what = "Paths of the vehicles; the truth is grey."
+    if over_time:
+        what = f"Distance from the truth over time.{' ' + HELD if 'gnss' in methods else ''}"
     most = results.frame["max_neighbours"].max()
     return Plot(figure, scene.caption(results, f"{what} Filters with K = {most}."))
 

@@ -15,7 +15,6 @@ from coopoc.data.source import split
 from coopoc.errors import InputError
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors, fix_innovations, heading_error, pose_nees
-from coopoc.learned.pose_noise import PoseTask, averaged, fit_pose_noise
 from coopoc.methods.cooperative_filter import CooperativeFilter
 from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.methods.road import RoadFilter, from_logs, to_logs
@@ -61,6 +60,8 @@ def trained(data: str, until: float, gate: float, evaluations: int) -> dict[str,
     vehicle sends for them: federated its constants once and as many for the answer, centralised 4 B for each number
     that it measured in the plane. Errors of a road filter, or noise of a pose filter, the centralised one learned
     alone and together."""
+    from coopoc.learned.pose_noise import PoseTask, averaged, fit_pose_noise  # torch, which a mistake need not wait for
+
     whole: Any
     vehicles, marks = drives.counts(data)
     alone = drives.drive(data, until, near(0), gate)
@@ -234,10 +235,16 @@ def _caption(results: Results, text: str) -> str:
     p = results.settings
     data = str(p["data"])
     marks = drives.counts(data)[1]
-    parts = [text, drives.described(data).format(Path(split(data)[0]).name, drives.calibrated(p))]
-    thinned = "Poses are found with all landmarks; then they are thinned and the rest is scored."
-    parts.append(thinned if marks else "There are no landmarks.")
-    parts.append(f"Intervals are over vehicles, then blocks of {drives.block(p):.3g} s.")
+    parts = [
+        text,
+        drives.described(data).format(Path(split(data)[0]).name, drives.calibrated(p)),
+        "Poses are found with all landmarks; then they are thinned and the rest is scored."
+        if marks
+        else "There are no landmarks.",
+        f"Intervals are over vehicles, then blocks of {drives.block(p):.3g} s.",
+    ]
+    if not (drives.in_world(data) or drives.has_true_poses(data)):
+        parts.append("No row is trained: that takes a truth with headings.")
     if 0 < marks < max(LANDMARKS):
         parts.append(f"A number of landmarks above {marks} is all that there are.")
     return " ".join(parts)

@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from coopoc import V2X, Fleet, Kalman, NoiseModel, Recording, RoadFilter, Sensors, observe, read_log
+from coopoc import V2X, Fleet, Kalman, NoiseModel, Recording, Sensors, observe, read_log
 from coopoc.arrays import Floats
 from coopoc.data.log.read import is_log
 from coopoc.data.registry import load_log
@@ -85,7 +85,7 @@ def road_row(task: str, data: Path, made: Method) -> dict[str, Any]:
     Args:
         task: that is run.
         data: folder of the data, or a log.
-        made: solo method; Kalman and road filters can be calibrated.
+        made: solo method; Kalman and road filters can be calibrated, and what has a method `fitted`.
     """
     recording, truth = seen(task, data)
     start, column = int(SHARE * len(recording.t)), recording.observers[0]
@@ -93,11 +93,12 @@ def road_row(task: str, data: Path, made: Method) -> dict[str, Any]:
     made(recording.between(begin, begin + 3), [column])  # compiles
     row = {"task": task, "data": hashed(*(located(data, name) for name in roads(data)[task]))}
     row |= _scored(made, recording, truth, start)
-    if isinstance(made, Kalman) or (isinstance(made, RoadFilter) and made.errors is None):
+    if isinstance(made, Kalman) or (hasattr(made, "fitted") and not getattr(made, "errors", None)):
         first = recording.between(0, start), truth.between(0, start)
-        fitted = Kalman(NoiseModel.fitted(*first)) if isinstance(made, Kalman) else RoadFilter.fitted(*first)
+        fitted = Kalman(NoiseModel.fitted(*first)) if isinstance(made, Kalman) else made.fitted(*first)
         own = _scored(fitted, recording, truth, start)
-        row |= {"calibrated_m": own["rt_le_m"], "calibrated_nees": own["nees"]}
+        row |= {f"calibrated_{name}": own[name] for name in ("blocks_m", "nees") if name in own}
+        row["calibrated_m"] = own["rt_le_m"]
     return row | {"received_bytes_per_second": 0}
 
 
@@ -118,6 +119,7 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> d
         blocks += [float(np.sqrt(np.nanmean(part))) for part in parts if np.isfinite(part).any()]
     level = mean_interval(np.array([blocks]))
     row: dict[str, Any] = {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
+    row["blocks_m"] = [round(value, 4) for value in blocks]
     nees = np.concatenate(ratios)
     row |= {"nees": round(float(np.nanmean(nees)), 2)} if np.isfinite(nees).any() else {}
     return row | {"microseconds_per_step": round(1e6 * seconds / len(recording.t), 2)}

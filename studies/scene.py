@@ -222,9 +222,9 @@ def conditions(p: Params) -> str:
     labels = f" ({real.notes[0]})" if real is not None and real.notes else ""
     who = egos(p["data"], str(p["egos"]))
     log = _log(p["data"])
-    alike = log is not None and (log.messages or not channel(p).loss)
-    runs = log.recording.runs if log is not None and alike else p["runs"]
-    size = f"{_count(runs, 'run')}, {_count(len(who), 'ego')} of {Path(split(p['data'])[0]).name}"
+    runs = log.recording.runs if log is not None and (log.messages or not channel(p).loss) else p["runs"]
+    name, there = Path(split(p["data"])[0]).name, _there(p["data"]).any(axis=0).sum()
+    size = f"{_count(runs, 'run')}, {_count(len(who), 'ego')} of {name} ({_count(there, 'vehicle')})"
     trained = f", {_count(p['train_seeds'], 'training seed')}" if p["train_seeds"] else ""
     return f"{heading(p)}{labels}; {size}{trained}."
 

@@ -33,15 +33,20 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_help_and_a_list_load_nothing_heavy_and_show_what_others_add(tmp_path: Path) -> None:
+def test_help_a_list_and_a_mistake_load_nothing_heavy_and_show_what_others_add(tmp_path: Path) -> None:
     heavy = ["numpy", "torch", "pandas", "pyarrow", "matplotlib", "joblib", "scipy", "gtsam", "casadi", "cvxpy"]
-    for command in ("--help", "list"):
+    mistake = ["run", "real", "--data", "nowhere"]
+    for status, command, unused in (
+        (0, ["--help"], heavy),
+        (0, ["list"], heavy),
+        (2, mistake, ["torch", "scipy.stats"]),
+    ):
         code = (
-            f"import sys, coopoc.cli as c\ntry: c.main(['{command}'])\nexcept SystemExit as e: "
-            f"print(e.code, sorted(set({heavy}) & set(sys.modules)))"
+            f"import sys, coopoc.cli as c\ntry: c.main({command})\nexcept SystemExit as e: "
+            f"print(e.code, sorted(set({unused}) & set(sys.modules)))"
         )
         done = ran([sys.executable, "-c", code], cwd=tmp_path, timeout=60)
-        assert done.stdout.splitlines()[-1] == "0 []", done.stdout
+        assert done.stdout.splitlines()[-1] == f"{status} []", done.stdout
     own = coopoc("--help", cwd=tmp_path)
     assert re.search(r"greet +Greet somebody\.", own.stdout)
     assert re.search(r"run +Run a study", own.stdout)

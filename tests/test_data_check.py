@@ -1,5 +1,6 @@
 """What `coopoc data check` says of logs with faults that are easy to overlook, and what a log is read as."""
 
+import re
 from collections.abc import Callable
 from pathlib import Path
 
@@ -12,6 +13,7 @@ from logs import at, bends, fixes, motion, outliers, ranges, write
 import coopoc as co
 from coopoc.data.log.check import check
 from coopoc.data.log.read import Log, read_log
+from coopoc.data.registry import load_log
 
 
 def said(log: Log) -> str:
@@ -84,6 +86,8 @@ def test_an_offset_of_ranges_is_taken_off(tmp_path: Path) -> None:
     assert said(log) == ""
     plain = read_log(cars(tmp_path / "plain"))
     np.testing.assert_allclose(log.recording.relative, plain.recording.relative, atol=1e-9)
+    pair = read_log(folder, scale={"range": 1e-3}, std={"range": 0.3}, offset={"car1-car0": 2.0, "range": 9.0})
+    np.testing.assert_array_equal(pair.recording.relative, log.recording.relative)
     with refused("offset = 'uwb': must be one of"):
         read_log(folder, offset={"uwb": 1.0})
 
@@ -178,19 +182,41 @@ def test_the_height_of_a_truth_above_another_surface_is_named(tmp_path: Path) ->
         assert ("above the truth" in text) == bool(up)
 
 
-@pytest.mark.parametrize(("who", "offset"), [("logged", 0.8), ("not logged", 0.8), ("logged", 20.0)])
-def test_an_offset_of_the_ranges_of_one_is_named(tmp_path: Path, who: str, offset: float) -> None:
-    fleet, log = bends(3), tmp_path / "log"
+def three(log: Path, **offsets: float) -> Path:
+    """Three cars, whose ranges are too long by pair."""
+    fleet = bends(3)
     log.mkdir()
     for seed, name in enumerate(fleet.ids):
         write(pd.concat([fixes(fleet, name, 0.2, 0.5, seed), motion(fleet, name, 0.1, 0.1, seed)]), log / f"{name}.csv")
         for other in fleet.ids[:seed]:
             frame = ranges(fleet, name, other, 0.2, 0.1, seed)
-            frame["range"] += offset * (name == "car2")
-            write(frame if who == "logged" else frame.drop(columns="range_std"), log / f"{name}_{other}.csv")
-    text = said(read_log(log))
+            frame["range"] += offsets.get(f"{other}_{name}", 0.0)
+            write(frame, log / f"{name}_{other}.csv")
+    return log
+
+
+@pytest.mark.parametrize(("who", "offset"), [("logged", 0.8), ("not logged", 0.8), ("logged", 20.0)])
+def test_an_offset_of_the_ranges_of_one_is_named(tmp_path: Path, who: str, offset: float) -> None:
+    log = three(tmp_path / "log", car0_car2=offset, car1_car2=offset)
+    text = said(read_log(log, std=None if who == "logged" else {"range": 1.0}))
     assert ("car0 and car2 by +" in text and "car1 and car2 by +" in text) == (who == "logged")
     assert "car0 and car1" not in text
+    assert ("offset=car" in text) == (who == "logged")
+
+
+@pytest.mark.parametrize("known", [True, False])
+def test_offsets_of_pairs_are_found_on_the_first_part(tmp_path: Path, known: bool) -> None:
+    """Those that were added, to 0.03 m with a truth and 0.1 m without one: the rest is as if they had not been."""
+    path, fleet = three(tmp_path / "log", car0_car1=0.5, car0_car2=-0.3), bends(3)
+    if known:
+        write(pd.concat([fixes(fleet, name, 0.1, 1e-9) for name in fleet.ids]), path / "truth.csv")
+    log, right = load_log(f"{path}?offset=auto&since=80"), load_log(f"{three(tmp_path / 'right')}?since=80")
+    found = {pair: float(by) for by, pair in re.findall(r"(\S+) m of (car\d and car\d)", " ".join(log.recording.notes))}
+    assert found == pytest.approx({"car0 and car1": 0.5, "car0 and car2": -0.3}, abs=0.03 if known else 0.1)
+    off, links = (log.recording.relative - right.recording.relative)[0, :, 0], log.recording.links
+    for other, added in (("car1", 0.5), ("car2", -0.3)):
+        pair = links.observer + links.neighbour == int(other[-1])
+        assert np.median(off[pair]) == pytest.approx(added - found[f"car0 and {other}"], abs=1e-3)
 
 
 def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path: Path) -> None:

@@ -145,7 +145,7 @@ def test_the_scan_without_fixes_is_filterpys_prediction() -> None:
 def test_recovers_known_noise_where_fixes_are_rare() -> None:
     """0.2 m a step and 1.5 m, with a fix at every fifth step: the numbers that `walk` was made with."""
     (client,) = measured_clients(MeasuredDrives(*walk(16000, 1, every=5)), piece=40)
-    found = fit_okf(client.training, client.validation, steps=100, velocity_part=False).method
+    found = fit_okf([(client.training, client.validation)], steps=100)[0][0].method("okf")
     assert_allclose(found.process_std, 0.2, rtol=0.15)
     assert_allclose(found.gnss_std, 1.5, rtol=0.08)
 

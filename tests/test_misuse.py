@@ -299,7 +299,6 @@ def test_training_refuses_values_from_elsewhere() -> None:
     net = learned.NoiseParameters()
     fit = {"model": net, "training": client.training, "validation": client.validation, "schedule": schedule, "seed": 0}
     swept(learned.fit, {**fit, "progress": None, "long": None}, few)
-    swept(learned.fit_okf, {"training": client.training, "validation": client.validation, "steps": 2}, few)
     federation = {"model": "okf", "clients": [client], "rounds": 1, "local_epochs": 1, "schedule": schedule, "seed": 0}
     more = dict.fromkeys(("progress", "participation"))
     swept(learned.federate, {**federation, **more, "aggregate": "mean", "epoch": "pass"}, few)

@@ -1,13 +1,14 @@
 """The road filter: dense and filterpy's oracles, the tuned Kalman filter on exact odometry, streams, calibration, real
 cars."""
 
+import importlib
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from conftest import refused, winding
-from filterpy.kalman import ExtendedKalmanFilter
 from numpy.testing import assert_allclose
 from oracles.road import road
 
@@ -16,7 +17,7 @@ from coopoc import V2X, Fleet, Kalman, NoiseModel, Recording, RoadErrors, RoadFi
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import rt_le
 from coopoc.methods.road import ROAD, from_logs, to_logs
-from coopoc.methods.track import Method
+from coopoc.studies import benchmark
 from coopoc.studies.roads import road_row, roads
 from coopoc.studies.roads import seen as thinned
 
@@ -62,27 +63,34 @@ def test_equals_the_dense_filter(errors: RoadErrors) -> None:
         assert_allclose(track.extras["scale_error_std"][run, :, 0] ** 2, p[:, 3, 3], rtol=1e-7)
 
 
-def test_without_a_gate_it_is_filterpys_extended_filter() -> None:
+@pytest.fixture
+def rivals(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """benchmarks/rivals.py."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    return importlib.import_module("rivals")
+
+
+@pytest.mark.parametrize("name", ["EKF", "StoneSoup"])
+def test_without_a_gate_it_is_the_extended_filter_of_others(rivals: Any, name: str) -> None:
+    if name == "StoneSoup":
+        pytest.importorskip("stonesoup")
     recording, _ = seen(runs=1)
-    (q,), r = noise_of(recording, PLAIN)[0][:, :, 0], noise_of(recording, PLAIN)[1]
-    keep, dt = np.exp(-recording.dt / PLAIN.lasts), recording.dt
-    ekf = ExtendedKalmanFilter(4, 2)
-    ekf.x, ekf.R = np.array([*recording.gnss[0, 0, 0, :2], 0.0, 0.0]), np.diag(r[:2])
-    ekf.P = np.diag([*r[:2], PLAIN.heading**2, PLAIN.scale**2])
-    track = RoadFilter(errors=PLAIN)(recording)
-    for t in range(1, len(recording.t)):
-        b, s = ekf.x[2:]
-        u, v = dt * recording.velocity[0, t, 0, :2]
-        east, north = np.cos(b) * u - np.sin(b) * v, np.sin(b) * u + np.cos(b) * v
-        ekf.F = np.array(
-            [[1, 0, -(1 + s) * north, east], [0, 1, (1 + s) * east, north], [0, 0, keep, 0], [0, 0, 0, keep]]
-        )
-        ekf.x = np.array([ekf.x[0] + (1 + s) * east, ekf.x[1] + (1 + s) * north, keep * b, keep * s])
-        more = (1 - keep**2) * np.array([PLAIN.heading**2, PLAIN.scale**2])
-        ekf.P = ekf.F @ ekf.P @ ekf.F.T + np.diag([*q[t, :2], *more])
-        if np.isfinite(fix := recording.gnss[0, t, 0, :2]).all():
-            ekf.update(fix, lambda x: np.eye(2, 4), lambda x: x[:2])
-        assert_allclose(track.x[0, t, 0, :2], ekf.x[:2], atol=1e-8)
+    mine, other = RoadFilter(errors=PLAIN)(recording), getattr(rivals, name)()(recording)
+    assert mine.covariance is not None
+    assert_allclose(mine.x[..., :2], other.x[..., :2], atol=1e-8)
+    assert_allclose(mine.covariance[..., :2, :2], other.covariance[..., :2, :2], rtol=1e-7, atol=1e-10)
+
+
+def test_rivals_do_what_they_are_for(rivals: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The smoother is better where fixes jump, and the filter with a wide kernel; calibrated a rival is better."""
+    recording, fleet = seen(runs=1)
+    wrong = rt_le(rivals.EKF()(recording), fleet)
+    assert rt_le(rivals.FixedLag()(recording), fleet) < 0.7 * wrong
+    unmoved = replace(rivals.FixedLag(), known=replace(PLAIN, gate=1e4))(recording)
+    assert rt_le(unmoved, fleet) == pytest.approx(wrong, rel=0.05)
+    monkeypatch.setattr(rivals, "EVALUATIONS", 40)
+    fitted = rivals.EKF().fitted(recording, fleet)
+    assert rt_le(fitted(recording), fleet) < 0.9 * wrong
 
 
 def test_exact_odometry_gives_the_tuned_kalman_filter() -> None:
@@ -168,27 +176,6 @@ def test_logarithms_and_back() -> None:
     assert to_logs(from_logs(to_logs(ROAD))) == pytest.approx(to_logs(ROAD))
 
 
-@pytest.mark.skipif(not (ROADS / "f9k").is_dir(), reason="the data of ../shared/data are not there")
-def test_a_real_car() -> None:
-    """F9K, one fix in ten: within 2 % of the Kalman filter or better, and calibrated on the first 40 % 2 % better."""
-    log = co.read_log(ROADS / "f9k" / "ublox_f9k.nmea", truth=ROADS / "f9k" / "span_truth.gga")
-    assert log.truth is not None
-    gnss = log.recording.gnss.copy()
-    gnss[:, np.arange(gnss.shape[1]) % 10 > 0] = np.nan
-    start, stop = max(log.recording.stretches(0), key=lambda cut: cut[1] - cut[0])
-    drive, truth = replace(log.recording, gnss=gnss).between(start, stop), log.truth.between(start, stop)
-    cut = 4 * len(drive.t) // 10 // 10 * 10
-    rest, true = drive.between(cut, len(drive.t)), truth.between(cut, len(drive.t))
-
-    def level(method: Method) -> float:
-        error = (method(rest, [0]).x[0, :, 0] - true.position[:, 0])[:, :2]
-        return float(np.sqrt(np.nanmean(np.square(error).sum(1))))
-
-    fitted = RoadFilter.fitted(drive.between(0, cut), truth.between(0, cut))
-    assert level(RoadFilter()) < 1.02 * level(Kalman())
-    assert level(fitted) < 0.98 * level(Kalman())
-
-
 def test_a_log_of_ones_own_is_a_task(tmp_path: Path) -> None:
     """Odometry turned by 0.2 rad: the road filter is better as it comes, and no worse calibrated."""
     recording, fleet = seen(6000, runs=1)
@@ -209,6 +196,10 @@ def test_a_log_of_ones_own_is_a_task(tmp_path: Path) -> None:
     assert mine["rt_le_m"][0] < 0.7 * usual["rt_le_m"][0]
     assert mine["calibrated_m"][0] < 1.02 * mine["rt_le_m"][0]
     assert mine["nees"] < usual["nees"]
+    assert np.mean(mine["calibrated_blocks_m"]) == pytest.approx(mine["calibrated_m"][0], abs=1e-4)
+    cards = [{"method": name, "tasks": [row]} for name, row in (("road-kalman", mine), ("kalman", usual))]
+    less = co.paired_difference(np.array(usual["blocks_m"]), np.array(mine["blocks_m"]))
+    assert f"| {less} " in benchmark.page(cards)
 
 
 @pytest.mark.skipif(not ROADS.is_dir(), reason="the data of ../shared/data are not there")

@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -15,7 +16,6 @@ from matplotlib.colors import to_rgb
 from coopoc.plugins import find
 from coopoc.studies import error_cdf
 from coopoc.study import figures
-from coopoc.study.figures import Plot
 from coopoc.study.results import Results
 from coopoc.study.style import METHODS, Panel, look
 
@@ -56,20 +56,18 @@ GNSS = {"method": "gnss", "noise_model": "identity", "max_neighbours": 0}
 LINES = [{"method": "joint"}, {"method": "bound"}]
 
 
-def all_plots(results: Results) -> dict[str, Callable[[], Plot]]:
-    return {
-        "sweep": lambda: figures.sweep(results, "max_neighbours", log=True),
-        "pareto": lambda: figures.pareto(results, "c"),
-        "curves": lambda: figures.curves(results, [Panel({k: {"max_neighbours": k} for k in (0, 2)})], LINES, "c"),
-        "multiples": lambda: figures.multiples({("joint", "fitted"): {"a": [0.9, 1.1]}}, "c"),
-        "cdf": lambda: error_cdf.cdf(results, "c", where={"max_neighbours": 2}),
-    }
+PLOTS: dict[str, Callable[[Results], Any]] = {
+    "sweep": lambda results: figures.sweep(results, "max_neighbours", log=True),
+    "pareto": lambda results: figures.pareto(results, "c"),
+    "curves": lambda results: figures.curves(results, [Panel({k: {"max_neighbours": k} for k in (0, 2)})], LINES, "c"),
+    "multiples": lambda _: figures.multiples({("joint", "fitted"): {"a": [0.9, 1.1]}}, "c"),
+    "cdf": lambda results: error_cdf.cdf(results, "c", where={"max_neighbours": 2}),
+}
 
 
-@pytest.mark.parametrize("name", ["sweep", "pareto", "cdf", "curves", "multiples"])
-def test_the_same_numbers_give_the_same_bytes(results: Results, tmp_path: Path, name: str) -> None:
-    make = all_plots(results)[name]
-    assert make().save(tmp_path / "a") == make().save(tmp_path / "b") != ""
+@pytest.mark.parametrize("make", PLOTS.values(), ids=PLOTS)
+def test_the_same_numbers_give_the_same_bytes(results: Results, tmp_path: Path, make: Callable[[Results], Any]) -> None:
+    assert make(results).save(tmp_path / "a") == make(results).save(tmp_path / "b") != ""
     for suffix in ("pdf", "png", "svg"):
         first, second = ((tmp_path / f"{n}.{suffix}").read_bytes() for n in "ab")
         assert first == second
@@ -145,6 +143,11 @@ def test_curves_draw_numbers_of_their_selections(results: Results) -> None:
     np.testing.assert_allclose(joint.get_ydata(), expected.to_numpy())
     assert level.get_ydata()[0] == pytest.approx(results.select(GNSS)["rt_le_m"].mean())
     assert figures.curves(results, [panel], [{"method": "okf"}], "c") is None
+
+
+def test_one_run_of_one_ego_shows_its_points_without_an_interval(results: Results) -> None:
+    one = replace(results, frame=results.select(run=0, method="joint"))
+    assert [text for *_, text in figures.sweep(one, "max_neighbours").marks()["points"] if "[" not in text]
 
 
 def from_reference(file: Path) -> Results:

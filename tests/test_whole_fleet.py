@@ -207,7 +207,7 @@ def test_settled_is_converged_gauss_newton_where_one_step_is_not(crossing: Fleet
 def test_what_does_not_settle_is_said(crossing: Fleet) -> None:
     recording = observe(crossing, S2, V2X(max_neighbours=3), runs=2)
     assert "2 of 2 runs did not settle within 1e-300 m" in BatchSmoother(settle=1e-300)(recording, [0]).notes
-    with refused(r"settle = 0\.0 m: must be > 0"):
+    with refused(r"settle = 0\.0: must be > 0 m"):
         BatchSmoother(settle=0.0)
 
 

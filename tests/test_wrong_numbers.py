@@ -141,41 +141,40 @@ def test_one_wrong_number_of_any_size_moves_the_cooperative_filter_by_a_stated_d
     assert first == 0 or kind not in KINDS or later[SIZES > FAR].max() < BEYOND
 
 
+def wild_fixes(steps: int) -> tuple[co.Recording, np.ndarray, KalmanFilter]:
+    """A vehicle of whose fixes 15 % are 3 m to 10 km off on each axis, its motion's variances, and filterpy's filter at
+    the first fix."""
+    drive = observe(winding(steps, 10.0, 7.0), S2, V2X(0), runs=1, seed=2)
+    rng, gnss = np.random.default_rng(3), drive.gnss.copy()
+    wild = rng.random(steps) < 0.15
+    wild[:5] = False
+    gnss[0, wild, 0] += rng.choice([-1, 1], (wild.sum(), 3)) * 10.0 ** rng.uniform(0.5, 4, (wild.sum(), 3))
+    peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
+    peer.x, peer.P, peer.B, peer.H, peer.R = gnss[0, 0, 0], 12.25 * np.eye(3), 0.1 * np.eye(3), np.eye(3), np.eye(3)
+    return replace(drive, gnss=gnss), (0.1 * S2.assumed_velocity_std(drive.velocity[0, :, 0])) ** 2, peer
+
+
 def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() -> None:
     """filterpy, its R such that S is q / gate times as large where q = y' S^-1 y exceeds the gate, and a hundred times
     that beyond four gates. The flat prior weighs 1e-6 of a fix."""
-    drive = observe(winding(200, 10.0, 7.0), S2, V2X(0), runs=1, seed=2)
-    gnss, rng = drive.gnss.copy(), np.random.default_rng(3)
-    wild = rng.random(200) < 0.15
-    wild[:5] = False
-    gnss[0, wild, 0] += rng.choice([-1, 1], (wild.sum(), 3)) * 10.0 ** rng.uniform(0.5, 4, (wild.sum(), 3))
-    method = CooperativeFilter()
-    track, gate = method(replace(drive, gnss=gnss), [0]), method.guards.fix_gate
-    process = (0.1 * S2.assumed_velocity_std(drive.velocity[0, :, 0])) ** 2
-    peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
-    peer.x, peer.P, peer.B, peer.H = gnss[0, 0, 0], np.eye(3) * 12.25, 0.1 * np.eye(3), np.eye(3)
+    (drive, process, peer), method = wild_fixes(200), CooperativeFilter()
+    track, gate = method(drive, [0]), method.guards.fix_gate
     for t in range(1, 200):
         peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
-        innovation, S = gnss[0, t, 0] - peer.x, peer.P + 12.25 * np.eye(3)
+        innovation, S = drive.gnss[0, t, 0] - peer.x, peer.P + 12.25 * np.eye(3)
         q = innovation @ np.linalg.solve(S, innovation)
         share = q / gate * (100.0 if q > 4.0 * gate else 1.0) if q > gate else 1.0
-        peer.update(gnss[0, t, 0], R=12.25 * np.eye(3) + (share - 1.0) * S)
+        peer.update(drive.gnss[0, t, 0], R=12.25 * np.eye(3) + (share - 1.0) * S)
         assert track.x[0, t, 0] == pytest.approx(peer.x, abs=1e-3), t
 
 
 def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
     """A fix beyond the gate has q / gate times its variance, one beyond REJECTED gates is left out, until the gains
     that they would have had, less LEAK of the others', sum to PATIENCE."""
-    drive = observe(winding(300, 10.0, 7.0), S2, V2X(0), runs=1, seed=2)
-    gnss, rng = drive.gnss.copy(), np.random.default_rng(3)
-    wild = rng.random(300) < 0.15
-    wild[:5] = False
-    gnss[0, wild, 0] += rng.choice([-1, 1], (wild.sum(), 3)) * 10.0 ** rng.uniform(0.5, 4, (wild.sum(), 3))
-    gnss[0, 150:270, 0] = drive.gnss[0, 150:270, 0] + 60.0
+    drive, process, peer = wild_fixes(300)
+    gnss = drive.gnss.copy()
+    gnss[0, 150:270] += 60.0
     track, hits, used = Kalman()(replace(drive, gnss=gnss), [0]), 0.0, 0
-    process = (0.1 * S2.assumed_velocity_std(drive.velocity[0, :, 0])) ** 2
-    peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
-    peer.x, peer.P, peer.B, peer.H, peer.R = gnss[0, 0, 0], 12.25 * np.eye(3), 0.1 * np.eye(3), np.eye(3), np.eye(3)
     for t in range(1, 300):
         peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
         gap, variance = gnss[0, t, 0] - peer.x, np.diag(peer.P)

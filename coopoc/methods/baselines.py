@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -11,19 +11,18 @@ from ..arrays import Floats
 from ..kernels.stars.lkf_sa import run_lkf_sa
 from ..kernels.stars.messages import Assumptions
 from ..kernels.stars.pseudo_fixes import run_msmv
-from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements
 from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel, resolve
-from .track import Track, check_options
+from .track import Checked, Track
 
 RECONSTRUCTION = "MSMV-R is a reconstruction: the equations of MSMV are not public; the paper's curve is not matched"
 
 
 @dataclass(frozen=True, eq=False)
-class LKFSA:
+class LKFSA(Checked):
     r"""Kalman filter per axis with $z = [\delta; z_\mathrm{gnss}]$, $H = [L; I]$, $L$ the star's graph Laplacian.
 
     $$ \delta_i = -\sum_j (x_j - x_i) \text{ as measured}, \qquad \mathrm{cov}(\delta) = \sigma^2 L $$
@@ -42,23 +41,21 @@ class LKFSA:
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)
         assumed = assumptions(recording, known)
-
-        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, neighbours = run_lkf_sa(measurements(recording, ego, box), assumed)
-            yield Estimate(slice(None), x, cov, box.link, neighbours)
-
-        return follow_egos(self, recording, egos, run, known.notes)
+        return follow_egos(
+            self,
+            recording,
+            egos,
+            lambda ego, box: [Estimate(*run_lkf_sa(measurements(recording, ego, box), assumed))],
+            known.notes,
+        )
 
 
 @dataclass(frozen=True, eq=False)
-class MSMV:
+class MSMV(Checked):
     r"""Kalman filter of the ego with one pseudo-fix $y_j$ per neighbour.
 
     $$
@@ -79,9 +76,6 @@ class MSMV:
     name: str = "msmv-r"
     cooperative: bool = True
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
     @property
     def message(self) -> Message:
         """Without covariance under the identity noise model, with it otherwise."""
@@ -93,12 +87,13 @@ class MSMV:
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         assumed, own = solo_estimates(recording, known, columns)
         assumed = assumed._replace(growth=(0.0, 1.0), acceleration=0.0)
-
-        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, theirs = run_msmv(measurements(recording, ego, box, own), assumed)
-            yield Estimate(slice(None), x, cov, box.link, theirs)
-
-        return follow_egos(self, recording, egos, run, (*known.notes, RECONSTRUCTION))
+        return follow_egos(
+            self,
+            recording,
+            egos,
+            lambda ego, box: [Estimate(*run_msmv(measurements(recording, ego, box, own), assumed))],
+            (*known.notes, RECONSTRUCTION),
+        )
 
 
 def solo_estimates(

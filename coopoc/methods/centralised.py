@@ -10,11 +10,10 @@ import numpy as np
 from tqdm import tqdm
 
 from ..arrays import Floats
-from ..errors import InputError
 from ..world.recording import Recording, check_recording
 from ..world.v2x import Message
 from .noise_model import NoiseModel
-from .track import Track, check_options
+from .track import TINY, Checked, Track, check_options
 from .whole_fleet import CENTRE, UPLOAD, Answer, fleet_track
 
 if TYPE_CHECKING:
@@ -28,7 +27,7 @@ BEARINGS = (
 
 
 @dataclass(frozen=True, eq=False)
-class CentralFilter:
+class CentralFilter(Checked):
     r"""Kalman filter of all vehicles in information form, causal: the optimum of the same measurements.
 
     $$ \Lambda = P^{-1} + \mathrm{blkdiag}(R_i^{-1}) + B \, \mathrm{blkdiag}(W_e) \, B^\top $$
@@ -52,9 +51,6 @@ class CentralFilter:
     name: str = "central-filter"
     cooperative: bool = True
     message: Message = UPLOAD
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
@@ -127,11 +123,8 @@ class BatchSmoother:
     message: Message = UPLOAD
 
     def __post_init__(self) -> None:
-        check_options(self)
-        if self.exact_steps < 0:
-            raise InputError("exact_steps", self.exact_steps, "must be a whole number >= 0", "Use 1; 0 is linear only.")
-        if not self.settle > 0:
-            raise InputError("settle", f"{self.settle} m", "must be > 0", "Use 1e-3, or infinity for no further steps.")
+        steps = (0, 1e18, "a whole number >= 0, 0 for linear only")
+        check_options(self, {"exact_steps": steps, "settle": (TINY, np.inf, "> 0 m, infinity for no further steps")})
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""

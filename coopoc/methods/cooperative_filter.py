@@ -19,7 +19,7 @@ from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
 from .noise_model import NoiseModel, resolve
-from .track import Track, check_options
+from .track import Checked, Track
 
 NOTHING = np.zeros((1, 1, 1, 3))
 KINDS = ("range", "azimuth", "inclination", "message", "trusted")
@@ -45,7 +45,7 @@ BROADCAST = Message("estimate, odometer and velocity", 3 * len(Broadcast._fields
 
 
 @dataclass(frozen=True, eq=False)
-class CooperativeFilter:
+class CooperativeFilter(Checked):
     r"""Kalman filter of the star {ego} + neighbours that expects wrong numbers: one method for every condition.
 
     The state holds the members' positions and, where they are needed, the error of each receiver's fixes, the error
@@ -88,9 +88,6 @@ class CooperativeFilter:
     name: str = "cooperative-filter"
     cooperative: bool = True
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
     @property
     def message(self) -> Message:
         """Estimate and odometer; of the textbook filter a fix."""
@@ -127,7 +124,7 @@ class CooperativeFilter:
                 for kind, count, of in zip(KINDS, low[here].sum(axis=0), measured[here].sum(axis=0), strict=True):
                     what = f"{kind}, {mine} and {recording.ids[j]}"
                     notes.extend(rejected(what, count, of, 0.5 if kind == "trusted" else 0.05))
-            yield Estimate(slice(None), x, cov, box.link, neighbours, extras)
+            yield Estimate(x, cov, neighbours, extras=extras)
 
         return follow_egos(self, recording, egos, run, notes)
 

@@ -2,22 +2,21 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..kernels.stars.messages import ESTIMATE_GROWTH
 from ..kernels.stars.pseudo_fixes import run_intersection
-from ..world.inbox import Inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import ESTIMATE_AND_COV, Message
 from .baselines import solo_estimates
 from .egos import Estimate, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
-from .track import Track, check_options
+from .track import Checked, Track
 
 
 @dataclass(frozen=True, eq=False)
-class CovarianceIntersection:
+class CovarianceIntersection(Checked):
     r"""Filter of the ego that fuses pseudo-fixes $y_j = p_j - \rho(r_{ij})$, $C_j = P_j + J C_r J^\top$, by (split) CI.
 
     $$ P^{-1} = w \, P_1^{-1} + (1 - w) \, P_2^{-1} $$
@@ -53,9 +52,6 @@ class CovarianceIntersection:
     cooperative: bool = True
     message: Message = ESTIMATE_AND_COV
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of their neighbours' estimates; InputError if one is unknown or absent.
 
@@ -67,9 +63,12 @@ class CovarianceIntersection:
         gates = self.robust and known.exact_relative
         assumed, own = solo_estimates(recording, known, columns, gates)
         assumed = assumed._replace(growth=ESTIMATE_GROWTH)
-
-        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, theirs = run_intersection(measurements(recording, ego, box, own), assumed, self.split, gates)
-            yield Estimate(slice(None), x, cov, box.link, theirs)
-
-        return follow_egos(self, recording, egos, run, known.notes)
+        return follow_egos(
+            self,
+            recording,
+            egos,
+            lambda ego, box: [
+                Estimate(*run_intersection(measurements(recording, ego, box, own), assumed, self.split, gates))
+            ],
+            known.notes,
+        )

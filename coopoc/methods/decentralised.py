@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ..errors import InputError
 from ..world.recording import Recording
 from ..world.v2x import Message
 from .noise_model import NoiseModel
@@ -62,11 +61,9 @@ class GaussianBeliefPropagation:
     cooperative: bool = True
 
     def __post_init__(self) -> None:
-        check_options(self)
-        if self.rounds < 1:
-            raise InputError("rounds", self.rounds, "must be a whole number >= 1", "Use 1 for one exchange a step.")
-        if not 0 <= self.damping < 1:
-            raise InputError("damping", self.damping, "must be in [0, 1)", "Use 0 for none, 0.4 to 0.6 for hard loops.")
+        rounds = (1, 1e18, "a whole number >= 1, 1 for one exchange a step")
+        damping = (0, 1.0 - 1e-16, "in [0, 1), 0 for none, 0.4 to 0.6 for hard loops")
+        check_options(self, {"rounds": rounds, "damping": damping})
 
     @property
     def message(self) -> Message:

@@ -23,15 +23,15 @@ BEYOND = 10.0
 
 
 class Estimate(NamedTuple):
-    """One ego at one step: position (R, 3) m, covariance (R or 1, 3, 3) m^2, its links there, and its neighbours
-    (R, k, 3) m, NaN where it does not estimate them. At several steps, a slice: (R, steps, 3), (R, steps, 3, 3).
-    Extras at all steps by name: (R, T, 1), or by link (R, k)."""
+    """One ego throughout: position (R, T, 3) m, covariance (R, T, 3, 3) m^2 and its neighbours (R, L, 3) m by link, NaN
+    where it does not estimate them; or at one step or some, a slice: (R, 3), (R or 1, 3, 3), and the neighbours of its
+    links there. Extras at all steps by name: (R, T, 1), or by link (R, k)."""
 
-    step: int | slice
     x: Floats
     covariance: Floats
-    links: Ints
     neighbours: Floats
+    step: int | slice = slice(None)
+    links: Ints | None = None
     extras: Mapping[str, Floats] = MappingProxyType({})
 
 
@@ -64,7 +64,7 @@ def follow_egos(
             received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
             for found in follow(ego, box):
                 x[:, found.step, e], cov[:, found.step, e] = found.x, found.covariance
-                here = slice(None) if len(found.links) == len(box.link) else np.searchsorted(box.link, found.links)
+                here = slice(None) if found.links is None else np.searchsorted(box.link, found.links)
                 neighbours[:, ends[e] : ends[e + 1]][:, here] = found.neighbours
                 for name, values in found.extras.items():
                     extras.setdefault(name, []).append(values)
@@ -128,18 +128,13 @@ def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats |
 def assumptions(recording: Recording, noise_model: NoiseModel) -> Assumptions:
     """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a
     velocity."""
-    (process, motion), fixes = (
-        process_noise(noise_model, recording),
-        np.ascontiguousarray(noise_model.fix_variance(recording)),
-    )
+    process, motion = process_noise(noise_model, recording)
+    fixes = np.ascontiguousarray(noise_model.fix_variance(recording))
     noise = relative_noise(noise_model)
     return Assumptions(process, fixes, fixes, FIX_GROWTH, *noise, FORGOTTEN, ACCELERATION_STD, motion)
 
 
 def relative_noise(noise_model: NoiseModel) -> tuple[Floats, float]:
     """(3,) m, rad, rad and the least range m of relative measurements, or nothing for unit matrices."""
-    return (
-        (np.empty(0), 0.0)
-        if noise_model.sensors is None
-        else (noise_model.sensors.relative_std, noise_model.sensors.min_range)
-    )
+    sensors = noise_model.sensors
+    return (np.empty(0), 0.0) if sensors is None else (sensors.relative_std, sensors.min_range)

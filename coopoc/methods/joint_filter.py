@@ -2,20 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..kernels.stars.joint_filter import run_filter
-from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
-from .track import Track, check_options
+from .track import Checked, Track
 
 
 @dataclass(frozen=True, eq=False)
-class JointFilter:
+class JointFilter(Checked):
     r"""Kalman filter of the star {ego} + neighbours in information form; axes couple through the relative covariances.
 
     $$
@@ -47,17 +46,15 @@ class JointFilter:
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
 
-    def __post_init__(self) -> None:
-        check_options(self)
-
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)
         assumed, gates = assumptions(recording, known), self.robust and known.exact_relative
         refine = self.exact and known.exact_relative
-
-        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            x, cov, neighbours = run_filter(measurements(recording, ego, box), assumed, refine, gates)
-            yield Estimate(slice(None), x, cov, box.link, neighbours)
-
-        return follow_egos(self, recording, egos, run, known.notes)
+        return follow_egos(
+            self,
+            recording,
+            egos,
+            lambda ego, box: [Estimate(*run_filter(measurements(recording, ego, box), assumed, refine, gates))],
+            known.notes,
+        )

@@ -20,7 +20,7 @@ from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NO_VARIANCE, NoiseModel, constant_noise, motion_noise, process_noise, resolve
 from .stream import FilterStream
-from .track import Track, check_options, lost
+from .track import TINY, Checked, Track, check_options, lost
 
 ASSUMED = Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02)
 """Velocity noise of the paper's training, 10 % per axis, and where the estimate of the fixes' noise starts."""
@@ -49,7 +49,7 @@ class GNSS:
 
 
 @dataclass(frozen=True, eq=False)
-class Kalman:
+class Kalman(Checked):
     r"""Kalman filter of $x_t = x_{t-1} + \Delta t \, u_t + w$, $z_t = x_t + n$, with the noise that `noise_model`
     names.
 
@@ -73,9 +73,6 @@ class Kalman:
     message: Message = NO_MESSAGE
 
     __repr__ = short_repr
-
-    def __post_init__(self) -> None:
-        check_options(self)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
@@ -152,10 +149,8 @@ class AdaptiveKalman:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_options(self)
-        for field in ("prior_weight", "window"):
-            if not (value := getattr(self, field)) > 0:
-                raise InputError(field, value, "must be > 0", "Use infinity for never.")
+        positive = (TINY, np.inf, "> 0, infinity for never")
+        check_options(self, {"prior_weight": positive, "window": positive})
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""

@@ -183,19 +183,18 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
 
     A direction that is off by e shortens d to d cos e along the assumed one: by d e^2 / 2, whose standard deviation is
     d std^2 / sqrt(2). Of measured angles std is theirs; where there are none, that of the line between two fixes,
-    sqrt(2) std of a fix / d. A finer range, taken for exact along a line, moves estimates by ten times what is claimed.
+    sqrt(2) std of a fix / d, and the same until the next fix: the n ranges until then may together say no more than
+    one, which is sqrt(n) times the std of each. A finer range, taken for exact along a line, moves estimates by ten
+    times what is claimed.
 
     References:
         Lerro, Bar-Shalom, IEEE Trans. AES 29(3), 1993 (converted measurements beyond d std^2 = 0.4 std of the range).
     """
-    if (
-        noise_model.sensors is None
-        or not isinstance(recording, Recording)
-        or not (links := recording.relative.shape[1])
-    ):
+    noise, links = noise_model.sensors, recording.relative.shape[1] if isinstance(recording, Recording) else 0
+    if noise is None or recording is None or not links:
         return noise_model
     sample = recording.relative[0, np.linspace(0, links - 1, min(links, SAMPLED)).astype(np.int64)]
-    noise, seen = noise_model.sensors, sample[np.isfinite(sample[:, 0])]
+    seen = sample[np.isfinite(sample[:, 0])]
     directed = seen[np.isfinite(seen[:, 1])]
     if not len(seen):
         return noise_model
@@ -208,7 +207,11 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
         why = f"angles of {max(noise.azimuth_std, noise.inclination_std):.2g} rad"
     else:
         fix = float(np.square(noise_model.gnss_std[:2]).mean())
-        arc, why = np.sqrt(2.0) * fix / far, f"fixes of {np.sqrt(fix):.2g} m and no azimuth"
+        often = _ranges_per_fix(recording)
+        arc, why = (
+            np.sqrt(2.0 * often) * fix / far,
+            f"fixes of {np.sqrt(fix):.2g} m, {often:.0f} ranges of a pair to a fix and no azimuth",
+        )
     if arc <= noise.range_std:
         return noise_model
     std = float(np.hypot(arc, noise.range_std))
@@ -216,6 +219,14 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
         f"assumes a range std of {std:.2g} m, not {noise.range_std:.2g} m: {why} put what is {far:.3g} m away on an arc"
     )
     return replace(noise_model, sensors=replace(noise, range_std=std), notes=(*notes, text))
+
+
+def _ranges_per_fix(recording: Recording) -> float:
+    """Ranges of the pair that measures most, to a fix of the moving vehicle that has the most; at least 1."""
+    links, moving = recording.links, (recording.velocity[0] != 0.0).any(axis=(0, 2))
+    ranges = np.unique(links.observer * len(moving) + links.neighbour, return_counts=True)[1].max()
+    fixes = np.isfinite(recording.gnss[0, :, moving, 0]).sum(axis=1).max(initial=0)
+    return max(float(ranges / (fixes or ranges)), 1.0)
 
 
 def _resolvable(noise_model: NoiseModel) -> NoiseModel:
@@ -253,12 +264,10 @@ def motion_noise(noise_model: NoiseModel, interval: float | None) -> MotionNoise
     interval = 0.0 if interval is None else check_interval(interval)
     if noise_model.process_std is not None:
         return MotionNoise(np.array(noise_model.process_std, dtype=float), np.zeros(3), 0.0, 0.0, interval)
-    assert noise_model.sensors is not None
-    ratio, of_speed = (
-        np.full(3, noise_model.sensors.velocity_std_ratio),
-        noise_model.sensors.velocity_reading == "speed",
-    )
-    return MotionNoise(np.zeros(3), ratio, float(noise_model.sensors.velocity_floor), float(of_speed), interval)
+    sensors = noise_model.sensors
+    assert sensors is not None
+    ratio, of_speed = np.full(3, sensors.velocity_std_ratio), sensors.velocity_reading == "speed"
+    return MotionNoise(np.zeros(3), ratio, float(sensors.velocity_floor), float(of_speed), interval)
 
 
 def process_noise(noise_model: NoiseModel, recording: Recording) -> tuple[Floats, MotionNoise]:

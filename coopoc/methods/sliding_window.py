@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..errors import InputError
 from ..world.inbox import Inbox
 from ..world.recording import Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
@@ -72,9 +71,7 @@ class FixedLagSmoother:
     message: Message = FIX_AND_VELOCITY
 
     def __post_init__(self) -> None:
-        check_options(self)
-        if self.lag < 0:
-            raise InputError("lag", self.lag, "must be a whole number >= 0", "Use 0 for the filter.")
+        check_options(self, {"lag": (0, 1e18, "a whole number >= 0, 0 for the filter")})
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
@@ -124,9 +121,7 @@ class MovingHorizon:
     message: Message = FIX_AND_VELOCITY
 
     def __post_init__(self) -> None:
-        check_options(self)
-        if self.horizon < 1:
-            raise InputError("horizon", self.horizon, "must be a whole number >= 1", "Use 10 to 20 at 10 Hz.")
+        check_options(self, {"horizon": (1, 1e18, "a whole number >= 1, such as 10 to 20 at 10 Hz")})
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
@@ -155,7 +150,7 @@ def _behind_arrival_cost(
             counts[DROPPED] += int((box.arrival - recording.links.step[box.link] >= length).sum())
         solved = horizons(seen, assumed, np.ascontiguousarray(box.arrival), settings)
         counts[MOVING] += int(solved.moving.sum())
-        yield Estimate(slice(None), solved.x, solved.covariance, box.link, solved.neighbours)
+        yield Estimate(solved.x, solved.covariance, solved.neighbours)
 
     track = follow_egos(method, recording, egos, drive)
     return replace(track, notes=(*noise_model.notes, *_counted(counts)))

@@ -161,8 +161,17 @@ TYPES: dict[str, Any] = {
 }
 
 
+TINY = 5e-324
+"""The least positive number."""
 Limits = Mapping[str, tuple[float, float, str]]
 """Option -> least and largest value, and both in words."""
+
+
+class Checked:
+    """A dataclass whose options are checked when it is made."""
+
+    def __post_init__(self) -> None:
+        check_options(self)
 
 
 def check_options(made: Any, limits: Limits | None = None, kinds: Mapping[str, Any] | None = None) -> None:

@@ -9,9 +9,7 @@ from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any, Literal, TypeAlias
 
-import numpy as np
-
-from ..arrays import Floats
+from ..arrays import Floats, number
 from ..errors import InputError, require, suggestion, unknown
 from ..plugins import find, names
 from .model.problem import Problem
@@ -125,10 +123,8 @@ class Backend:
 
 def check_limits(max_iterations: int, tolerance: float) -> None:
     """InputError unless max_iterations is a whole number >= 0 and tolerance a number > 0."""
-    if not isinstance(max_iterations, int | np.integer) or max_iterations < 0:
-        raise InputError("max_iterations", repr(max_iterations), "must be a whole number >= 0", "Leave it out for 500.")
-    if not isinstance(tolerance, float | int) or not tolerance > 0:
-        raise InputError("tolerance", repr(tolerance), "must be a number > 0 (m)", "Leave it out for 1e-8.")
+    number("max_iterations", max_iterations, kind=int, allowed="a whole number >= 0", hint="Leave it out for 500.")
+    number("tolerance", tolerance, 5e-324, allowed="a number > 0 (m)", hint="Leave it out for 1e-8.")
 
 
 @lru_cache(maxsize=64)

@@ -69,8 +69,8 @@ class Plot:
                     continue
                 places = curve.get_transform().transform(points) * 72 / figure.dpi
                 level = curve.get_transform() is not axes.transData  # across the panel, at no place
-                corners = [path.vertices for path in bands[name].get_paths()] if name in bands else [np.empty((0, 2))]
-                band = np.concatenate(corners)
+                paths = bands[name].get_paths() if name in bands else ()  # none of one ego, which has no interval
+                band = np.concatenate([np.empty((0, 2)), *(path.vertices for path in paths)])
                 for (x, y), place in list(zip(points, places, strict=True))[:: len(points) // MOST + 1]:
                     ends = [f"{end:.3g}" for end in sorted({*band[np.isclose(band[:, 0], x), 1]})]
                     within = f" [{ends[0]}, {ends[-1]}]" if ends else ""

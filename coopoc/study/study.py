@@ -7,6 +7,7 @@ import itertools
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cache
 from importlib import metadata
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -117,7 +118,7 @@ class Study:
 
     def cells(self) -> list[Cell]:
         """All cells in the order of the grid, each named by the hash of all that changes its numbers."""
-        code = code_of(self.cell)
+        code = cache(lambda: code_of(self.cell))  # half a second, which a mistake need not wait for
         cells = [_named(self, params, code) for params in _expand(self)]
         if not cells:
             raise InputError("grid", "no cell", "must have at least one", "Widen an axis, or relax --set.")
@@ -201,13 +202,13 @@ def _check_view(where: str, view: Any) -> None:
         raise InputError(where, str(error), "must be a function of the Results alone", hint) from None
 
 
-def _named(study: Study, params: Mapping[str, Scalar], code: str) -> Cell:
+def _named(study: Study, params: Mapping[str, Scalar], code: Callable[[], str]) -> Cell:
     for name, value in params.items():
         if not isinstance(value, Scalar):
             raise InputError(name, repr(value), "must be a number, a word, a bool or None", "Pass a name instead.")
     given = {**study.settings, **params}
     content = {"study": study.name, "given": given, "axes": sorted(params), "key": study.key(given)}
-    content["code"] = code
+    content["code"] = code()
     content["files"] = {name: file_digest(v, name) for name, v in given.items() if isinstance(v, str) and in_file(v)}
     return Cell(params, given, digest({**content, "coopoc": metadata.version("coopoc")}))
 

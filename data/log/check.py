@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
-from scipy.stats import chi2, linregress
+import scipy  # its statistics take half a second, and are imported where they are used
 
 from coopoc.arrays import AnyArray, Bools, Floats, robust_std
 from coopoc.errors import InputError
@@ -57,8 +57,9 @@ SIGMAS = 6.0
 OUTLYING, OUTLIERS = 5.0, 0.01
 """Standard deviations beyond which a measurement is an outlier; the share of them that is worth a word."""
 WINDOW, BLOCKS = 9, 10
-"""Measurements of a pair whose median is taken off before outliers are counted; parts of a drive whose medians say how
-sure an offset of a pair is."""
+"""Measurements of a pair whose median is taken off to count outliers; parts of a drive that show how sure it is."""
+FIRST = 0.4
+"""Share of a log that shows by what its ranges are too long."""
 UNUSED = 0.05
 """Share of what was logged that may be left out without a word."""
 PLACED = "Give a fix of each, a table vehicle, x, y of places, or a column vehicle where files are not named after one."
@@ -203,9 +204,7 @@ def _filtered(log: Log) -> Check:
         relative = rec.relative.copy()
         relative[..., 1] = wrap(relative[..., 1] + heading[links.step, links.observer])
         world = replace(rec, body=None, velocity=turned(rec.velocity, midway(heading)), relative=relative)
-    gap = x[links.step, links.neighbour] - x[links.step, links.observer]
-    residual = world.relative[0] - np.column_stack(spherical(*gap.T))
-    residual[:, 1:] = wrap(residual[:, 1:])
+    gap, residual = _residual(world, x)
     both = (variance[links.step, links.neighbour] + variance[links.step, links.observer])[:, :2].mean(axis=1)
     flat, distance = (np.maximum(np.linalg.norm(gap[:, :axes], axis=1), 1.0) for axes in (2, 3))
     expected = np.column_stack([both, both / flat**2, both / distance**2])
@@ -213,6 +212,15 @@ def _filtered(log: Log) -> Check:
     expected += np.square([noise.range_std, noise.world_azimuth_std, noise.inclination_std])
     log = replace(log, recording=rec)
     return Check(log, span + start, world, x, variance, fix, normalised, residual, np.sqrt(expected))
+
+
+def _residual(world: Recording, x: Floats) -> tuple[Floats, Floats]:
+    """(L, 3) m, from observers to neighbours at positions x (T, N, 3), and measured less computed from these."""
+    links = world.links
+    gap = x[links.step, links.neighbour] - x[links.step, links.observer]
+    residual = world.relative[0] - np.column_stack(spherical(*gap.T))
+    residual[:, 1:] = wrap(residual[:, 1:])
+    return gap, residual
 
 
 def _vehicles(c: Check) -> list[dict[str, Any]]:
@@ -339,7 +347,7 @@ def _of_vehicles(c: Check) -> list[str]:
         name, nis, distance, turn = (row[key] for key in ("vehicle", "nis", "fixes_per_odometry", "turned_deg"))
         column = c.world.ids.index(name)
         square = size * c.normalised[np.isfinite(c.normalised[:, column]), column]
-        usual = max(float(np.median(square)) / chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
+        usual = max(float(np.median(square)) / scipy.stats.chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
         outliers = float(np.mean(square > OUTLYING**2 * usual)) if len(square) else 0.0
         if outliers > OUTLIERS:
             sentences.append(
@@ -383,7 +391,7 @@ def _of_truth(c: Check) -> list[str]:
                 "ellipsoid, the other above the geoid, or are antennas elsewhere?"
             )
         if len(gap) >= ENOUGH and np.ptp(velocity, axis=0).any():
-            line = linregress((velocity - velocity.mean(axis=0)).ravel(), (gap - np.median(gap, axis=0)).ravel())
+            line = scipy.stats.linregress((velocity - velocity.mean(0)).ravel(), (gap - np.median(gap, 0)).ravel())
             if abs(line.slope) >= max(SIGMAS * line.stderr, 0.5 * rec.dt):
                 way = "ahead of" if line.slope > 0 else "behind"
                 sentences.append(
@@ -403,7 +411,7 @@ def _of_truth(c: Check) -> list[str]:
 def _of_measurements(c: Check) -> list[str]:
     """Residuals of relative measurements that no stated noise explains: scale, outliers, offsets of pairs."""
     sentences = []
-    for k, row in ((list(UNITS).index(row["measurement"]), row) for row in c.measurements):
+    for row in c.measurements:
         name, unit, median, std, should = (
             row[key] for key in ("measurement", "unit", "median", "robust_std", "expected_std")
         )
@@ -416,7 +424,7 @@ def _of_measurements(c: Check) -> list[str]:
         wrong = std > WIDE * should or (name == "azimuth" and std > COARSE > 3 * position)
         if name != "range":
             wrong |= abs(median) > 3 * should
-            hint = (_other_angle(c) if k == 1 else "") or hint
+            hint = (_other_angle(c) if name == "azimuth" else "") or hint
         else:
             measured = c.world.relative[0, :, 0]
             true = measured - c.relative[:, 0]
@@ -425,7 +433,7 @@ def _of_measurements(c: Check) -> list[str]:
             wrong |= not 0.8 <= ratio <= 1.25
             if not 0.4 <= ratio <= 2.5:
                 hint = f"They are {ratio:.3g} times as long; of mm scale=range:0.001 makes m, of feet 0.3048."
-        outliers, offsets = row["beyond_5_std"], _offsets(c, k, row["stated_std"])
+        outliers, offsets = row["beyond_5_std"], _offsets(c, list(UNITS).index(name), *2 * [row["stated_std"]])
         if outliers > OUTLIERS:
             sentences.append(
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
@@ -436,9 +444,11 @@ def _of_measurements(c: Check) -> list[str]:
         if offsets and (not wrong or hint == HINTS["range"]):
             shown = ", ".join(f"{pair} by {offset:+.3g} {unit}" for pair, offset in offsets[:4])
             more = f" and {len(offsets) - 4} pairs more" if len(offsets) > 4 else ""
+            given = ",".join(f"{pair.replace(' and ', '-')}:{offset:.3g}" for pair, offset in offsets)
             sentences.append(
                 f"{word}s of {shown}{more} are off in the median, with {row['stated_std']:.3g} {unit} stated: an "
-                "offset of the sensors, of antennas, or of fixes or heights of one of the two; offset= takes it off."
+                "offset of the sensors, of antennas, or of fixes or heights of one of the two; "
+                + (f"offset={given} takes it off." if word == "range" else "offset= takes it off.")
             )
         elif not wrong and std < NARROW * should and row["stated_std"] > 2 * std:
             sentences.append(f"{word}s are better than stated: {stated}.")
@@ -482,8 +492,8 @@ def _outliers(c: Check, k: int, stated: float) -> float:
     return float(np.mean(np.abs(off) > OUTLYING * max(robust_std(off), 0.2 * stated)))
 
 
-def _offsets(c: Check, k: int, stated: float) -> list[tuple[str, float]]:
-    """Pairs whose residuals have a median above the stated standard deviation, and above what the errors of the filters
+def _offsets(c: Check, k: int, stated: float, least: float) -> list[tuple[str, float]]:
+    """Pairs whose residuals have a median above `least`, and above what the errors of the filters
     explain, which last for some time; largest first."""
     made, fixes, noise = [], np.isfinite(c.normalised).sum(axis=0), float(np.square(c.world.sensors.fix_std[:2]).mean())
     there = np.isfinite(c.variance[..., 0]).sum(axis=0)
@@ -492,9 +502,36 @@ def _offsets(c: Check, k: int, stated: float) -> list[tuple[str, float]]:
     for pair, value, expected in _by_pair(c, k):
         (offset, error), position = _median(value), max(float(np.mean(expected**2)) - stated**2, 0.0)
         lasting = np.sqrt(stated**2 / len(value) + position * min(share, 1.0))
-        if len(value) >= ENOUGH and abs(offset) > max(stated, 3 * lasting, SIGMAS * error):
+        if len(value) >= ENOUGH and abs(offset) > max(least, 3 * lasting, SIGMAS * error):
             made.append((pair, offset))
     return sorted(made, key=lambda row: -abs(row[1]))
+
+
+def less_offsets(log: Log) -> Log:
+    """The log with each pair's ranges less what they are too long by in the median over its first part, against the
+    truth where there is one, else against the filters of each vehicle alone; nothing is taken off where that part shows
+    none for sure. The summary names pairs and offsets.
+
+    Raises:
+        InputError: as `check`.
+    """
+    rec, until, by = log.recording, FIRST * float(np.ptp(log.recording.t)), "filters of each vehicle alone show"
+    c = _filtered(log.part(until=until))
+    if c.log.truth is not None:
+        true, by = c.log.truth.position, "the truth shows"
+        residual = _residual(c.world, np.where(np.isfinite(true), true, c.x))[1]
+        c = replace(c, relative=residual, variance=0 * c.variance)
+    relative, ends = rec.relative.copy(), np.sort([rec.links.observer, rec.links.neighbour], axis=0)
+    found = dict(_offsets(c, 0, rec.sensors.range_std, 0.0))
+    for one, other in np.unique(ends, axis=1).T:
+        pair = f"{rec.ids[one]} and {rec.ids[other]}"
+        if offset := found.get(pair, 0.0):
+            log.summary.assume(
+                f"ranges are less what {by} in the first {until:.3g} s: {{}}", f"{offset:+.3g} m of {pair}"
+            )
+            relative[:, (ends[0] == one) & (ends[1] == other), 0] -= offset
+    notes = dict.fromkeys((*rec.notes, *log.summary.sentences))
+    return replace(log, recording=replace(rec, relative=relative, notes=tuple(notes)))
 
 
 CHECKS: tuple[Callable[[Check], list[str]], ...] = (_of_rows, _of_vehicles, _of_truth, _of_measurements)

@@ -11,6 +11,7 @@ import pandas as pd
 import pymap3d
 
 from coopoc.errors import InputError
+from coopoc.world.fleet import columns
 from coopoc.world.links import wrap
 from coopoc.world.sensors import Sensors
 
@@ -40,7 +41,7 @@ def unwrapped(rows: Rows, summary: Summary) -> Rows:
     return rows
 
 
-def on_one_clock(rows: Rows, clock: Mapping[str, float], name: str) -> Rows:
+def on_one_clock(rows: Rows, clock: Mapping[str, float]) -> Rows:
     """Rows with stamps, in whole microseconds, less the s that each vehicle's clock is ahead; those without a time, of
     places, at the first instant.
 
@@ -49,11 +50,7 @@ def on_one_clock(rows: Rows, clock: Mapping[str, float], name: str) -> Rows:
     """
     if rows["t"].isna().all():
         raise InputError("t", "in no file", "must be a column of some table", "Give the times of what was measured.")
-    vehicles = sorted(rows["vehicle"].unique())
-    for vehicle in clock:
-        if vehicle not in vehicles:
-            allowed = f"must be a vehicle of {name}, which has {', '.join(vehicles)}"
-            raise InputError("clock", repr(vehicle), allowed, "Name the vehicle as in the log.")
+    columns("clock", list(clock), sorted(rows["vehicle"].unique()))
     ahead, partner_ahead = (rows[who].map(clock).fillna(0.0) for who in ("vehicle", "partner"))
     t = (rows["t"].fillna(rows["t"].min()) - ahead).round(6)
     rows = rows.assign(t=t, arrival=rows["arrival"] - partner_ahead)

@@ -24,7 +24,7 @@ COMPONENTS: Mapping[str, int] = {"range": 0, "azimuth": 1, "bearing": 1, "inclin
 PAIR = ["step", "observer", "neighbour"]
 NEAR = 10.0
 """Distances, over what the two move until the step, below which the direction is not known well enough."""
-TWO_WAY = "{} ranges count for the other end, too: two-way ranging is known to both (mutual=False: to who logged it)"
+TWO_WAY = "{} ranges count for the other end, too: two-way ranging is known to both ends (else mutual=False)"
 
 
 class Linked(NamedTuple):

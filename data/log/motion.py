@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy.interpolate import make_interp_spline
+import scipy
 
 from coopoc.arrays import Bools, Floats, Ints
 from coopoc.errors import InputError
@@ -254,8 +254,8 @@ def _integral(signal: Signal, at: Floats) -> Floats:
     start = signal.t[0]
     ends = np.append(at, signal.t) - start
     t = np.concatenate([[ends.min() - 1], signal.t - start, [ends.max() + 1]])
-    curve = make_interp_spline(t, np.pad(signal.value, ((1, 1), (0, 0)), "edge"), k=1).antiderivative()
-    return np.asarray(curve(at - start) - curve(0.0))
+    path = scipy.interpolate.make_interp_spline(t, np.pad(signal.value, ((1, 1), (0, 0)), "edge"), k=1).antiderivative()
+    return np.asarray(path(at - start) - path(0.0))
 
 
 def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingAt:

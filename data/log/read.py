@@ -130,8 +130,9 @@ def read_log(
         kinds: names in a column kind, as {"uwb": "range"}.
         ignore: kinds that are left out; topics of a bag.
         scale: kind, or t -> factor to its unit here, as {"range": 0.001, "t": 1e-3} of mm and ms.
-        offset: kind in its unit here -> what all its measurements are too large by, as {"range": 0.4} of radios whose
-            delays are not calibrated.
+        offset: kind, or pair, in its unit here -> what all its measurements, or the pair's ranges, are too large by, as
+            {"range": 0.4, "red-blue": 0.3} of radios whose delays are not calibrated; `check.less_offsets` finds
+            those of the pairs.
         std: kind in SI units -> standard deviation of all its measurements, as {"range": 0.15, "x": 1.5}.
         stamps: times of a bag's messages: those of the headers, or those at which they were "received".
         clock: vehicle -> s by which its clock is ahead; it is subtracted from its stamps.
@@ -157,7 +158,7 @@ def read_log(
     Recording(1 runs x 3 steps x 1 vehicles, 0 links, K <= 0)
     """
     path, body, clock = given_path(path), frame == "body", named("clock", clock or {}, "Give clock={name: s}.")
-    summary = Summary(path.name)
+    summary, offset = Summary(path.name), named("offset", offset or {}, "Give offset={name: number}.")
     one_of("frame", frame, get_args(Frame))
     texts("ignore", ignore)
     for field, flag in {"any_scale": any_scale, "mutual": mutual}.items():
@@ -173,15 +174,19 @@ def read_log(
     }
     rows = _rows(path, truth, summary, {**options, "stamps": stamps})
     factor = factors(scale, ("t", *KINDS))
-    by_kind, less = rows["kind"].map(factor).fillna(1.0), rows["kind"].map(factors(offset, KINDS, "offset"))
-    rows = rows.assign(value=by_kind * rows["value"] - less.fillna(0.0), std=by_kind.abs() * rows["std"])
+    by_kind, key, ends = rows["kind"].map(factor).fillna(1.0), rows["kind"], (rows["vehicle"], rows["partner"])
+    for one, other in (ends, ends[::-1]):
+        pair = one + "-" + other
+        key = key.mask((rows["kind"] == "range") & pair.isin(list(offset)), pair)
+    less = key.map(factors(offset, {*KINDS, *key}, "offset")).fillna(0.0)
+    rows = rows.assign(value=by_kind * rows["value"] - less, std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
     rows = unwrapped(rows, summary)
     check_values(rows)
     for column in ("t", "arrival"):
         check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)
     rows, true_rows = rows[rows["true"] == 0], rows[rows["true"] == 1]
-    rows, origin = local(on_one_clock(rows, clock, path.name), origin)
+    rows, origin = local(on_one_clock(rows, clock), origin)
     stated = factors(std, {kind.name for kind in KINDS.values()} - {*ENU, "message"}, "std")
     rows = distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary)
     if not any_scale:

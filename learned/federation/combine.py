@@ -36,11 +36,11 @@ class Standing(NamedTuple):
 
 
 def screen(
-    theta: Tensor, answers: Mapping[str, Tensor], usual: float | None = None, limit: float = LIMIT
+    theta: Tensor, answers: Mapping[str, Tensor], usual: float | None = None
 ) -> tuple[dict[str, str], float | None]:
     """Reject answers of another shape, with weights that are not finite, or with a change that is far too large.
 
-    With d_i = ||theta_i - theta||, client i is rejected if d_i > limit median_j d_j over the answers of the round. The
+    With d_i = ||theta_i - theta||, client i is rejected if d_i > LIMIT median_j d_j over the answers of the round. The
     median of one or two answers is in the hands of one client, and where most answers change nothing it is 0: then the
     median of the previous round takes its place, and in the first round max(||theta||, 1) is the longest change.
 
@@ -48,7 +48,6 @@ def screen(
         theta: (P,) weights that the clients received.
         answers: weights that each client sent, by name.
         usual: median d of the previous round, None in the first.
-        limit: longest accepted update, in multiples of the usual one.
 
     Returns:
         Reasons by name, and the median d of the accepted answers (`usual` if there are none).
@@ -67,9 +66,9 @@ def screen(
         else:
             far[name] = float(torch.linalg.vector_norm(sent.double() - theta.double()))
     if len(far) >= 3 and median(far.values()) > 0:
-        most = limit * median(far.values())
+        most = LIMIT * median(far.values())
     elif usual:
-        most = limit * usual
+        most = LIMIT * usual
     else:
         most = max(float(torch.linalg.vector_norm(theta)), 1.0)
     for name, length in far.items():

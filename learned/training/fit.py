@@ -188,7 +188,7 @@ class Judge:
 
     def __init__(self, kinds: Sequence[Sequence[Segments]], like: Gain) -> None:
         self.like = like
-        self.batches = [_padded(parts) for parts in kinds]
+        self.batches = [padded(parts) for parts in kinds]
 
     def __call__(self, theta: Tensor) -> Tensor:
         with torch.no_grad():
@@ -197,7 +197,7 @@ class Judge:
         return torch.stack(means).nan_to_num(math.inf, math.inf).amax(0)
 
 
-def _padded(parts: Sequence[Segments]) -> tuple[Batch, Tensor]:
+def padded(parts: Sequence[Segments]) -> tuple[Batch, Tensor]:
     """All pieces of S models as one batch, and the share (S, B) of each in its model's mean, 0 for padding."""
     pool, members = pooled([_drawn(part) for part in parts])
     most = max(map(len, members))

@@ -4,73 +4,46 @@ from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc.arrays import instance, number
-from coopoc.short_repr import short_repr
-from coopoc.world.sensors import stream
-
-from ..nets.gain import error, has_truth, over_time
-from ..nets.okf import NoiseParameters, OptimisedKF, log_scale, scan
+from ..nets.gain import over_time
+from ..nets.okf import NoiseParameters, log_scale, scan
 from .clients import Batch, Segments
+from .fit import padded
 from .machine import one_core, watched
-from .schedule import generator
 
 
-@dataclass(frozen=True, eq=False)
-class OkfFit:
-    """A trained filter, its validation loss per check, m^2, and the training seconds."""
-
-    model: NoiseParameters
-    validation_loss: tuple[float, ...]
-    seconds: float
-
-    __repr__ = short_repr
-
-    @property
-    def method(self) -> OptimisedKF:
-        """The filter."""
-        return self.model.method("okf")
-
-
-def fit_okf(training: Segments, validation: Segments, steps: int = 300, velocity_part: bool = True) -> OkfFit:
-    """Train the noise parameters by gradient through the Kalman recursion on 1/T sum_t ||xhat_t - x_t||^2.
+@one_core()
+def fit_okf(
+    tasks: Sequence[tuple[Segments, Segments]],
+    steps: int = 300,
+    progress: str | None = None,
+) -> list[tuple[NoiseParameters, dict[str, Any]]]:
+    """Train noise parameters by gradient through the Kalman recursion on 1/T sum_t ||xhat_t - x_t||^2, of several
+    settings at once.
 
     The estimates depend on ratios of variances only, so the loss cannot see a common factor per axis; that factor is
     set afterwards so that the training innovations have the variance that the filter claims for them.
 
     Args:
-        training: segments to train on.
-        validation: segments that select the parameters.
+        tasks: of each setting the segments to train on, and those that select the parameters.
         steps: of Adam on all training segments.
-        velocity_part: train b too, else b = 0.
+        progress: name of the stage of a progress bar on stderr.
 
-    >>> from coopoc.learned import clients, fit_okf
+    Returns:
+        Of each setting the trained parameters, the validation loss per check, m^2, and the training seconds.
+
+    >>> from coopoc.learned import clients
     >>> from coopoc.world.fleet import Fleet
     >>> (only,) = clients(Fleet(("a",), np.arange(33) / 10, np.zeros((33, 1, 3)), np.zeros((33, 1, 3))), piece=10)
-    >>> fit_okf(only.training, only.validation, steps=2, velocity_part=False).method.velocity_ratio
-    (0.0, 0.0, 0.0)
+    >>> len(fit_okf([(only.training, only.validation)], steps=2)[0][1]["validation_loss"])
+    2
     """
-    for name, part in (("training", training), ("validation", validation)):
-        instance(name, part, Segments, "Give the pieces of a Client.")
-    steps = number("steps", steps, 1, 10**7, kind=int, allowed="in 1..10^7", hint="300 is the default.")
-    return fit_okf_many([(training, validation)], steps, velocity_part)[0]
-
-
-@one_core()
-def fit_okf_many(
-    tasks: Sequence[tuple[Segments, Segments]],
-    steps: int = 300,
-    velocity_part: bool = True,
-    progress: str | None = None,
-) -> list[OkfFit]:
-    """`fit_okf` for many settings, stacked; `progress` names the stage of a progress bar on stderr."""
-    began, like = time.perf_counter(), NoiseParameters(velocity_part)
-    data, judge = (_stacked([task[i] for task in tasks], kind) for i, kind in enumerate(("training", "validation")))
+    began, like = time.perf_counter(), NoiseParameters()
+    data, judge = (_doubled(*padded([task[i] for task in tasks])) for i in range(2))
     logs = like.logs.detach().double().flatten().repeat(len(tasks), 1).requires_grad_()
     adam = torch.optim.Adam([logs], lr=0.1)
     fall = torch.optim.lr_scheduler.CosineAnnealingLR(adam, steps)
@@ -78,41 +51,32 @@ def fit_okf_many(
     for step in watched(range(steps), progress, "step"):
         if step % 25 == 0 or step == steps - 1:
             with torch.no_grad():
-                validated = _loss(like.stds(logs), *judge)
+                validated = _loss(like, logs, *judge)
             better = validated < lowest
             best[better], lowest[better] = logs.detach()[better], validated[better]
             history.append(validated.tolist())
         adam.zero_grad()
-        _loss(like.stds(logs), *data).sum().backward()
+        _loss(like, logs, *data).sum().backward()
         adam.step()
         fall.step()
     with torch.no_grad():
         best = best.view(-1, 3, 3) + _calibration(like.stds(best), *data)[:, None]
     seconds = (time.perf_counter() - began) / len(tasks)
+    losses = zip(*history, strict=True)
     return [
-        OkfFit(like.with_logs(row), tuple(h), seconds) for row, h in zip(best, zip(*history, strict=True), strict=True)
+        (like.with_logs(row), {"validation_loss": h, "seconds": seconds}) for row, h in zip(best, losses, strict=True)
     ]
 
 
-def _stacked(parts: Sequence[Segments], kind: str) -> tuple[Batch, Tensor]:
-    """All pieces of S settings in float64, and their weight (S, B) in the mean, 0 for padding.
-
-    New noise is drawn once, the same for every setting and another for training than for validation.
-    """
-    pool, most = Segments.join(parts), max(map(len, parts))
-    ends = np.cumsum([len(p) for p in parts])
-    rows = [np.resize(np.arange(end - len(p), end), most) for p, end in zip(parts, ends, strict=True)]
-    index = torch.from_numpy(np.stack(rows))
-    batch = pool.batch(index, [generator(stream(0, kind, 0, "")) for _ in parts])
-    weight = torch.tensor([[float(i < len(p)) / len(p) for i in range(most)] for p in parts], dtype=torch.float64)
+def _doubled(batch: Batch, share: Tensor) -> tuple[Batch, Tensor]:
+    """The same in float64."""
     gnss, velocity, truth, x0 = (array.double() for array in batch[:4])
-    return Batch(gnss, velocity, truth, x0, batch.dt, batch.exact), weight
+    return Batch(gnss, velocity, truth, x0, batch.dt, batch.exact), share.double()
 
 
-def _loss(numbers: Tensor, batch: Batch, weight: Tensor) -> Tensor:
+def _loss(like: NoiseParameters, logs: Tensor, batch: Batch, weight: Tensor) -> Tensor:
     """(S,) mean over pieces and time of the squared error, m^2."""
-    squares = error(scan(numbers, batch)[0], batch.truth).square().sum(-1)
-    return (over_time(squares, has_truth(batch.truth)) * weight).sum(1)
+    return (like.losses(logs, batch) * weight).sum(1)
 
 
 def _calibration(numbers: Tensor, batch: Batch, weight: Tensor) -> Tensor:

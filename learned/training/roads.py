@@ -21,7 +21,7 @@ WORLDS, PIECE = 6, 1500
 """Worlds of each vehicle, and steps of a piece where a drive holds three: errors last."""
 
 
-def roads(fleet: Fleet, seed: int = 0, worlds: int = WORLDS) -> MeasuredDrives:
+def roads(fleet: Fleet, seed: int = 0) -> MeasuredDrives:
     """Each vehicle of a fleet in some worlds, each of which is a vehicle of the answer, with its truth.
 
     A vehicle drives to and fro along its way until the fleet's last step. A world draws, most of it log-uniformly,
@@ -32,18 +32,17 @@ def roads(fleet: Fleet, seed: int = 0, worlds: int = WORLDS) -> MeasuredDrives:
     Args:
         fleet: drives (T, N), of which a vehicle may leave early.
         seed: of all draws.
-        worlds: of each vehicle.
 
     >>> t = np.arange(50) / 10
     >>> line = Fleet(("a",), t, np.zeros((50, 1, 3)), np.zeros((50, 1, 3)))
-    >>> roads(line, worlds=2).ids
+    >>> roads(line).ids[:2]
     ('a-0', 'a-1')
     """
-    each = [(column, k) for column in range(len(fleet.ids)) for k in range(worlds)]
+    each = [(column, k) for column in range(len(fleet.ids)) for k in range(WORLDS)]
     ids = tuple(f"{fleet.ids[column]}-{k}" for column, k in each)
     parts = zip(*(_world(fleet, column, k, seed) for column, k in each), strict=True)
     gnss, velocity, position, motion = (np.stack(part, axis=1) for part in parts)
-    truth = Fleet(ids, fleet.t, position, motion, name=f"{fleet.name}-roads", source=f"{fleet.name} in {worlds} worlds")
+    truth = Fleet(ids, fleet.t, position, motion, name=f"{fleet.name}-roads", source=f"{fleet.name} in {WORLDS} worlds")
     like = observe(truth, Sensors(), V2X(max_neighbours=0), seed=seed)
     return MeasuredDrives(replace(like, gnss=gnss[None], velocity=velocity[None]), truth, ids)
 

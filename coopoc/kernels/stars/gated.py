@@ -102,16 +102,7 @@ def set_ego(gates: Gates, cov: Numbers) -> None:
 def inflated(measured: Numbers, factor: Numbers) -> Numbers:
     """A measurement, its standard deviations times three factors."""
     a, b, c = factor
-    return (
-        measured[0],
-        measured[1],
-        measured[2],
-        measured[3],
-        measured[4],
-        a * measured[5],
-        b * measured[6],
-        c * measured[7],
-    )
+    return (*measured[:5], a * measured[5], b * measured[6], c * measured[7])
 
 
 @inner

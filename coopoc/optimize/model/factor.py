@@ -302,10 +302,6 @@ class Constraint:
         """2 or 3, or None if the kind looks the same in both."""
         return fitting(self.measurement, self.lower.shape[-1])
 
-    def violation(self, value: Floats) -> Floats:
-        """(M, size) how far h (M, size) lies outside."""
-        return np.maximum(np.maximum(self.lower - value, value - self.upper), 0.0)
-
     def __repr__(self) -> str:
         return f"Constraint({self.lower.min()} <= {self.kind} <= {self.upper.max()} x {len(self.nodes)})"
 
