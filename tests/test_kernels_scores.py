@@ -40,7 +40,8 @@ def test_neighbours_are_counted_per_step(crossing: Fleet, monkeypatch: pytest.Mo
     """All eight are within the radius at every step, and the three nearest are linked; runs are scored by fours."""
     seen = observe(crossing, S2, V2X(max_neighbours=3, radius=1e4), runs=6)
     monkeypatch.setattr(scores, "SLAB", 1)
-    found = scores.scored(JointFilter(), seen, ["c0", "c5"], crossing)
+    found = scores.scored(JointFilter(), seen, ["c0", "c5"], crossing, quantiles=3)
+    assert_allclose(found["error_quantiles_m"][..., 2], found["max_error_m"])
     assert found["neighbours_mean"].tolist() == [[3.0, 3.0]] * 6
     each = nees(JointFilter()(seen, ["c0", "c5"]), crossing).mean(axis=1)
     assert_allclose(found["nees"], each, rtol=1e-12)

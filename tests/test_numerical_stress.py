@@ -198,8 +198,8 @@ def test_ranges_between_rare_fixes_say_no_more_than_where_they_point() -> None:
     seen = co.observe(fleet, NOISE, co.V2X(5), runs=6)
     rare = np.where(np.arange(600)[:, None, None] % 100, np.nan, seen.gnss)
     velocity = seen.velocity + np.random.default_rng(0).normal(0, 0.1, seen.velocity.shape)
-    drives = [(fleet, without_azimuth(replace(seen, gnss=rare, velocity=velocity)))]
-    error = errors_of("kalman joint mhe central-filter", "100 ranges of a pair to a fix", drives)
+    seen = without_azimuth(replace(seen, gnss=rare, velocity=velocity))
+    error = errors_of("kalman joint mhe central-filter", "100 ranges of a pair to a fix", [(fleet, seen)])
     assert all(each <= error["kalman"] for each in error.values()), error
 
 

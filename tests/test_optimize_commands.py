@@ -56,6 +56,7 @@ def test_solve_writes_the_solution(file: Path, capsys: pytest.CaptureFixture[str
     status, out, err = run(capsys, "solve", str(file), "--backend", backend, "--output", str(target))
     assert (status, json.loads(out)["status"]) == (0, "SOLVED")
     assert str(target) in err
+    assert "in the plane" in err
     found = json.loads(target.read_text())
     assert found["seconds"] >= found["solve_seconds"] + found["check_seconds"] > found["solve_seconds"]
     assert found["nodes"]["A2"]["position"] == pytest.approx([8.0, 1.0], abs=1e-4)

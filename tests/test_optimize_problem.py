@@ -220,6 +220,13 @@ def test_a_start_is_the_least_squares_of_the_converted_vectors(recording: Record
     assert initial_guess(problem).ravel() == pytest.approx(wanted, abs=1e-5)
 
 
+def test_fine_measurements_do_not_hide_what_is_free() -> None:
+    """What rounding leaves of J^T J along a free direction looks like a variance of 1e-8 m^2."""
+    for fine in np.random.default_rng(0).uniform(1e-4, 2e-4, (60, 3, 3)):
+        free = Problem("ab").add("displacement", [(0, 1)] * 3, fine, std=fine)
+        assert solve(free, throw=False).status is Status.RANK_DEFICIENT
+
+
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
 def test_a_point_that_can_turn_around_another_is_free(backend: str) -> None:
     """One range leaves two of its three directions open, and the rounding of J^T J does not hide it."""

@@ -39,7 +39,8 @@ def test_an_attack_moves_the_fixes_of_some_by_a_constant(crossing: Fleet) -> Non
     size = np.abs(offset[:, 0][moved])
     assert size.min() > 5.0 - 1e-9
     assert size.max() < 40.0 + 1e-9
-    assert abs((offset[:, 0][moved] > 0).mean() - 0.5) < 3 * 0.5 / np.sqrt(size.size)
+    signs = np.sign(many.gnss - clean.gnss)[:, 0]  # of liars and axes, independent: squares of sums are counts
+    assert (signs.sum(axis=(1, 2)) ** 2).sum() < 1.7 * np.abs(signs).sum()
     assert abs(moved[:, 1:].mean() - 0.2) < 3 * np.sqrt(0.2 * 0.8 / moved[:, 1:].size)
     assert abs(more[:, 1:].mean() - 0.5) < 3 * np.sqrt(0.5 * 0.5 / more[:, 1:].size)
     prefix = spoofed(observe(crossing, S2, V2X(max_neighbours=4), runs=3), 0.2, seed=2, honest=["c0"])
@@ -156,10 +157,11 @@ def test_the_example_prints_its_table(example: ModuleType, capsys: pytest.Captur
     assert few.robust < 1.3 * clean.least_squares
 
 
-@pytest.mark.parametrize("method", [co.GaussianBeliefPropagation, co.CentralFilter])
-def test_a_fleet_in_which_a_fifth_lies_is_no_worse_than_alone(method: Any) -> None:
-    """At the first fixes, 5 m apart by noise, each number of a liar is within its gate: their vector is not."""
+@pytest.mark.parametrize(("method", "most"), [(co.GaussianBeliefPropagation, 1.01), (co.CentralFilter, 0.5)])
+def test_a_fleet_in_which_a_fifth_lies_is_no_worse_than_alone(method: Any, most: float) -> None:
+    """At the first fixes, 5 m apart by noise, each number of a liar is within its gate: their vector is not. A centre
+    doubts the fixes that others contradict."""
     fleet = co.load_fleet("town10-validation").between(0, 100)
     seen = spoofed(observe(fleet, S2, V2X(max_neighbours=6), runs=2), 0.2, seed=1, honest=range(5))
     alone, together = (co.rt_le(which("nominal")(seen, range(5)), fleet).mean() for which in (co.Kalman, method))
-    assert together < 1.01 * alone
+    assert together < most * alone

@@ -32,9 +32,10 @@ from coopoc.world.storage import read_recording, save_recording
 S2 = Sensors.paper_scenario2()
 RUNS, EGO = 60, 0
 KINDS = ("range", "azimuth", "inclination", "fix", "message")
-AT_ONCE, LATER, MOSTLY = 0.5, 0.15, 0.1
-"""m, how far one wrong number may move a robust filter's estimate, ever, from one second later on, and then in 49 runs
-of 50. A fix of 35 m or a range of 3 m is within the gates, and weighs as any other."""
+AT_ONCE, LATER, BEYOND = 0.5, 0.15, 0.1
+"""m, how far one wrong number may move a robust filter's estimate, ever, from one second later on, and then where it is
+wrong by FAR or more. A fix of 20 m or a range of 3 m is within the gates, and weighs as any other."""
+SIZES, FAR = np.geomspace(1.0, 1e6, RUNS), 30.0
 FURTHER = {"kalman": (0.8, 0.45), "kalman-adaptive": (0.8, 0.45), "ci": (1.6, 0.8)}
 """m, the same of filters that have nothing else than a fix, or one neighbour of many."""
 ESTABLISHED = 10
@@ -59,7 +60,7 @@ def links(recording: Recording) -> Ints:
 def damaged(recording: Recording, kind: str, links: Ints) -> Recording:
     """One wrong number in each run, of 1 to 1e6 m in a random direction; of an angle anything."""
     rng, run = np.random.default_rng(1), np.arange(RUNS)
-    size, way = np.geomspace(1.0, 1e6, RUNS), rng.normal(size=(RUNS, 3))
+    size, way = SIZES, rng.normal(size=(RUNS, 3))
     gnss, relative = recording.gnss.copy(), recording.relative.copy()
     step, sender = recording.links.step[links], recording.links.neighbour[links]
     if kind == "range":
@@ -91,8 +92,8 @@ def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(
         moved = np.linalg.norm(x - clean, axis=-1)
         farthest = max(farthest, float(moved.max()))
         later: Floats = np.array([row[t + 10 :].max() for row, t in zip(moved, step, strict=True)])
-        mostly = after if name in FURTHER else MOSTLY
-        assert not robust or (later.max() < after and np.quantile(later, 0.98) < mostly), (kind, later.max())
+        beyond = after if name in FURTHER else BEYOND
+        assert not robust or (later.max() < after and later[SIZES[runs] > FAR].max() < beyond), (kind, later)
     assert (farthest < once) == robust
 
 
@@ -102,7 +103,7 @@ def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Flo
     method, run, of = CooperativeFilter(), np.arange(RUNS), recording.links
     step, sender = of.step[links], of.neighbour[links]
     way = np.random.default_rng(1).normal(size=(RUNS, 3))
-    error = np.geomspace(1.0, 1e6, RUNS)[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
+    error = SIZES[:, None] * way / np.linalg.norm(way, axis=1, keepdims=True)
     velocity = recording.velocity.copy()
     if kind == "velocity":  # a recording takes none of more than 10 km/s
         velocity[run, step, sender] += 5e-3 * error
@@ -122,8 +123,8 @@ def test_one_wrong_number_of_any_size_moves_the_cooperative_filter_by_a_stated_d
     first: int, kind: str, recording: Recording
 ) -> None:
     """Of 1 to 1e6 m, a neighbour's first one, too. After two seconds by less than 0.25 m, and one second later by 0.15
-    m, 0.3 m of a velocity; at any step, the first one, too, by twice the stated std and then by 1.2 of it, but for the
-    ego's very first fix."""
+    m, 0.1 m of more than FAR, 0.3 m of a velocity; at any step, the first one, too, by twice the stated std and then by
+    1.2 of it, but for the ego's very first fix."""
     own = recording.links.of(EGO)
     when = recording.links.step[own]
     links = np.random.default_rng(2).choice(own[(when >= first) & (when < 68)], RUNS)
@@ -137,43 +138,43 @@ def test_one_wrong_number_of_any_size_moves_the_cooperative_filter_by_a_stated_d
         most = (0.3, 0.3) if kind == "velocity" else (0.25, 0.15)
     assert scaled.max() < most[0]
     assert later.max() < most[1]
+    assert first == 0 or kind not in KINDS or later[SIZES > FAR].max() < BEYOND
+
+
+def wild_fixes(steps: int) -> tuple[co.Recording, np.ndarray, KalmanFilter]:
+    """A vehicle of whose fixes 15 % are 3 m to 10 km off on each axis, its motion's variances, and filterpy's filter at
+    the first fix."""
+    drive = observe(winding(steps, 10.0, 7.0), S2, V2X(0), runs=1, seed=2)
+    rng, gnss = np.random.default_rng(3), drive.gnss.copy()
+    wild = rng.random(steps) < 0.15
+    wild[:5] = False
+    gnss[0, wild, 0] += rng.choice([-1, 1], (wild.sum(), 3)) * 10.0 ** rng.uniform(0.5, 4, (wild.sum(), 3))
+    peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
+    peer.x, peer.P, peer.B, peer.H, peer.R = gnss[0, 0, 0], 12.25 * np.eye(3), 0.1 * np.eye(3), np.eye(3), np.eye(3)
+    return replace(drive, gnss=gnss), (0.1 * S2.assumed_velocity_std(drive.velocity[0, :, 0])) ** 2, peer
 
 
 def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() -> None:
     """filterpy, its R such that S is q / gate times as large where q = y' S^-1 y exceeds the gate, and a hundred times
     that beyond four gates. The flat prior weighs 1e-6 of a fix."""
-    drive = observe(winding(200, 10.0, 7.0), S2, V2X(0), runs=1, seed=2)
-    gnss, rng = drive.gnss.copy(), np.random.default_rng(3)
-    wild = rng.random(200) < 0.15
-    wild[:5] = False
-    gnss[0, wild, 0] += rng.choice([-1, 1], (wild.sum(), 3)) * 10.0 ** rng.uniform(0.5, 4, (wild.sum(), 3))
-    method = CooperativeFilter()
-    track, gate = method(replace(drive, gnss=gnss), [0]), method.guards.fix_gate
-    process = (0.1 * S2.assumed_velocity_std(drive.velocity[0, :, 0])) ** 2
-    peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
-    peer.x, peer.P, peer.B, peer.H = gnss[0, 0, 0], np.eye(3) * 12.25, 0.1 * np.eye(3), np.eye(3)
+    (drive, process, peer), method = wild_fixes(200), CooperativeFilter()
+    track, gate = method(drive, [0]), method.guards.fix_gate
     for t in range(1, 200):
         peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
-        innovation, S = gnss[0, t, 0] - peer.x, peer.P + 12.25 * np.eye(3)
+        innovation, S = drive.gnss[0, t, 0] - peer.x, peer.P + 12.25 * np.eye(3)
         q = innovation @ np.linalg.solve(S, innovation)
         share = q / gate * (100.0 if q > 4.0 * gate else 1.0) if q > gate else 1.0
-        peer.update(gnss[0, t, 0], R=12.25 * np.eye(3) + (share - 1.0) * S)
+        peer.update(drive.gnss[0, t, 0], R=12.25 * np.eye(3) + (share - 1.0) * S)
         assert track.x[0, t, 0] == pytest.approx(peer.x, abs=1e-3), t
 
 
 def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
     """A fix beyond the gate has q / gate times its variance, one beyond REJECTED gates is left out, until the gains
     that they would have had, less LEAK of the others', sum to PATIENCE."""
-    drive = observe(winding(300, 10.0, 7.0), S2, V2X(0), runs=1, seed=2)
-    gnss, rng = drive.gnss.copy(), np.random.default_rng(3)
-    wild = rng.random(300) < 0.15
-    wild[:5] = False
-    gnss[0, wild, 0] += rng.choice([-1, 1], (wild.sum(), 3)) * 10.0 ** rng.uniform(0.5, 4, (wild.sum(), 3))
-    gnss[0, 150:270, 0] = drive.gnss[0, 150:270, 0] + 60.0
+    drive, process, peer = wild_fixes(300)
+    gnss = drive.gnss.copy()
+    gnss[0, 150:270] += 60.0
     track, hits, used = Kalman()(replace(drive, gnss=gnss), [0]), 0.0, 0
-    process = (0.1 * S2.assumed_velocity_std(drive.velocity[0, :, 0])) ** 2
-    peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
-    peer.x, peer.P, peer.B, peer.H, peer.R = gnss[0, 0, 0], 12.25 * np.eye(3), 0.1 * np.eye(3), np.eye(3), np.eye(3)
     for t in range(1, 300):
         peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
         gap, variance = gnss[0, t, 0] - peer.x, np.diag(peer.P)

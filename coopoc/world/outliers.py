@@ -36,7 +36,7 @@ class Fault:
         object.__setattr__(self, "rate", number("rate", self.rate, 0, 1, allowed="in [0, 1]", hint=hint))
         object.__setattr__(self, "size", extent("size", self.size))
         one_of("law", self.law, get_args(Law))
-        lasts = number("lasts", self.lasts, 0, 1e9, allowed=">= 0 s", hint="0 draws every measurement by itself.")
+        lasts = number("lasts", self.lasts, allowed=">= 0 s", hint="0 draws every measurement by itself.")
         object.__setattr__(self, "lasts", lasts)
 
 

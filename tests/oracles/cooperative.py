@@ -207,10 +207,15 @@ class Oracle:
             if life.bias + life.heading:
                 b.add(("compass",), 0, [life.bias, 0, 0])
             s["slot"][self.ego] = 0
+            s["trusted"].add(self.ego)
             again = self.start(t, fix, messages, relative)
         else:
+            young = self.ego in s["trusted"]
             again = bool(g.trust and np.isfinite(fix).all() and self.lost(t))
             again = again and self.start(t, fix, messages, relative)
+            if again and young:
+                self.revoked[self.ego] = [self.revoked.get(self.ego, [0, 0])[0] + 1, t]
+                self.doubt(self.ego)
         for j in list(s["members"]):
             if j not in others or again or self.contradicted(t, j):
                 if j in others and j not in s["trusted"]:
@@ -333,8 +338,8 @@ class Oracle:
         if g.fix_gate:
             votes = [sum(((x - y) ** 2 / (p + q)).sum() <= g.fix_gate for y, q in places) for x, p in places]
         best = int(np.argmax(votes))
-        late = (t - self.revoked.get(self.ego, [0, 0])[1]) * self.seen.dt > g.lost
-        if max(votes) < 2 and not late and t > 0 and self.ego not in s["trusted"]:
+        late = (t - self.revoked.get(self.ego, [0, 0])[1]) * self.seen.dt > g.lost * (1 if self.life.own else 2)
+        if self.ego not in s["trusted"] and votes[0] < max(len(votes), 2) and not late:
             return False
         b.drop(("b", self.ego))
         b.transform(("x", self.ego), {})

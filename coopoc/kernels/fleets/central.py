@@ -8,8 +8,9 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
-from ..compiling.small import add, add_diagonal, from_upper, load, store, subtract
-from .graph import MATRIX, VECTOR, Assumed, Matrix, Measured, Pairs, at, connect, gate_pair, pair_at_agreement
+from ..compiling.small import add, add_diagonal, load, store, subtract
+from ..gate import FIX_GATE, count, inflation
+from .graph import MATRIX, VECTOR, Assumed, Matrix, Measured, Pairs, Vector, at, connect, gate_pair, pair_at_agreement
 
 UNKNOWN = 1e6
 """m^2, variance of a vehicle before its first fix, where relative measurements are linearised."""
@@ -29,7 +30,7 @@ def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed) -> tuple[Floa
     """
     runs, steps, n = measured.active.shape
     x, cov = np.full((runs, steps, n, 3), np.nan), np.full((runs, steps, n, 3, 3), np.nan)
-    P, label = np.zeros((3 * n, 3 * n)), np.arange(n)
+    P, label, hits = np.zeros((3 * n, 3 * n)), np.arange(n), np.zeros(n)
     active, present, alive = measured.active[0], np.zeros(n, np.bool_), pairs.alive[0]
     for t in range(steps):
         predict(measured, assumed, t, present, x, P)
@@ -43,18 +44,16 @@ def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed) -> tuple[Floa
                 for run in range(runs):
                     vector = subtract(load(x[run, t, j], 0, VECTOR), load(x[run, t, i], 0, VECTOR))
                     if assumed.robust:
-                        away, joined = (
-                            (not present[i]) + (not present[j]),
-                            min(at(assumed.fix, 0, t, i)[0], UNKNOWN) - UNKNOWN,
-                        )
-                        known = add_diagonal(between, (away * joined, away * joined, away * joined))
+                        joined = min(at(assumed.fix, 0, t, i)[0], UNKNOWN) - UNKNOWN
+                        joined *= (not present[i]) + (not present[j])
+                        known = add_diagonal(between, (joined, joined, joined))
                         gate_pair(vector, known, k, pairs, measured.relative[run], assumed)
                     weight, eta = pair_at_agreement(vector, between, k, pairs, measured.relative[run], assumed)
                     store(information[k - pairs.start[t]], 0, weight)
                     store(total[run], i, subtract(load(total[run], i, VECTOR), eta))
                     store(total[run], j, add(load(total[run], j, VECTOR), eta))
         B = np.eye(3 * n)
-        add_fixes(measured, assumed, t, present, x, P, B, total)
+        add_fixes(measured, assumed, t, present, x, P, B, total, hits)
         for k in range(pairs.start[t], pairs.start[t + 1]):
             if alive[k]:
                 add_pair(pairs.first[k], pairs.second[k], load(information[k - pairs.start[t]], 0, MATRIX), P, B)
@@ -72,51 +71,68 @@ def predict(measured: Measured, assumed: Assumed, t: int, before: Bools, x: Floa
     for n in range(x.shape[2]):
         if measured.active[0, t, n]:
             process = at(assumed.process, 0, t, n)
-            for c in range(3 * n, 3 * n + 3):
+            for c in range(3):
+                row = 3 * n + c
                 if not before[n]:
-                    P[c], P[:, c] = 0.0, 0.0
-                P[c, c] = P[c, c] + process[c - 3 * n] if before[n] else UNKNOWN
+                    P[row], P[:, row] = 0.0, 0.0
+                P[row, row] = P[row, row] + process[c] if before[n] else UNKNOWN
                 for run in range(len(x)):
-                    if before[n]:
-                        moved = measured.dt * measured.velocity[run, t, n, c - 3 * n]
-                        x[run, t, n, c - 3 * n] = x[run, t - 1, n, c - 3 * n] + moved
-                    else:
-                        x[run, t, n, c - 3 * n] = measured.gnss[run, t, n, c - 3 * n]
+                    moved = x[run, t - 1, n, c] + measured.dt * measured.velocity[run, t, n, c]
+                    x[run, t, n, c] = moved if before[n] else measured.gnss[run, t, n, c]
 
 
 @part
 def difference(P: Floats, i: int, j: int) -> Matrix:
     """Covariance of x_j - x_i."""
-    xx, xy, xz = entry(P, i, j, 0, 0), entry(P, i, j, 0, 1), entry(P, i, j, 0, 2)
-    yy, yz, zz = entry(P, i, j, 1, 1), entry(P, i, j, 1, 2), entry(P, i, j, 2, 2)
-    covariance: Matrix = from_upper((xx, xy, xz, yy, yz, zz))
-    return covariance
+    return *row_of(P, i, j, 0), *row_of(P, i, j, 1), *row_of(P, i, j, 2)
 
 
 @part
-def entry(P: Floats, i: int, j: int, c: int, d: int) -> float:
-    """Entry of `difference`."""
-    a, b = 3 * i, 3 * j
-    value: float = P[a + c, a + d] + P[b + c, b + d] - P[a + c, b + d] - P[b + c, a + d]
-    return value
+def row_of(P: Floats, i: int, j: int, c: int) -> Vector:
+    """Row c of `difference`."""
+    a, b = P[3 * i + c], P[3 * j + c]
+    row: Vector = subtract(
+        subtract(add(load(a, i, VECTOR), load(b, j, VECTOR)), load(a, j, VECTOR)), load(b, i, VECTOR)
+    )
+    return row
 
 
 @part
 def add_fixes(
-    measured: Measured, assumed: Assumed, t: int, before: Bools, x: Floats, P: Floats, B: Floats, total: Floats
+    measured: Measured,
+    assumed: Assumed,
+    t: int,
+    before: Bools,
+    x: Floats,
+    P: Floats,
+    B: Floats,
+    total: Floats,
+    hits: Floats,
 ) -> None:
-    """B += F P and the information vectors of the fixes; a vehicle that joins has the covariance of its own."""
+    """B += F P and the information vectors of the fixes; a vehicle that joins has the covariance of its own.
+
+    The own filter of a vehicle whose fixes are false from the start believes them: here others contradict it.
+    """
     for n in range(x.shape[2]):
         noise, fix = at(assumed.fix, 0, t, n), measured.gnss[0, t, n]
+        q = gain = 0.0
+        for c in range(3):
+            gap, own = fix[c] - x[0, t, n, c], P[3 * n + c, 3 * n + c]
+            s = own + noise[c]
+            if not math.isnan(gap):
+                q += gap * gap / s
+                gain += own / s
+        share = inflation(q, FIX_GATE, hits[n]) if assumed.robust else 1.0
+        hits[n] = count(q, FIX_GATE, hits[n], gain / 3.0)
         for c in range(3 if measured.active[0, t, n] else 0):
-            row = 3 * n + c
+            row, variance = 3 * n + c, share * noise[c]
             if not before[n]:
-                P[row, row] = noise[c]
+                P[row, row] = variance
             elif not math.isnan(fix[c]):
                 for d in range(len(P)):
-                    B[row, d] += P[row, d] / noise[c]
+                    B[row, d] += P[row, d] / variance
                 for run in range(len(x)):
-                    total[run, row] += (measured.gnss[run, t, n, c] - x[run, t, n, c]) / noise[c]
+                    total[run, row] += (measured.gnss[run, t, n, c] - x[run, t, n, c]) / variance
 
 
 @part

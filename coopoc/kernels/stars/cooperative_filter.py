@@ -88,7 +88,8 @@ def run_filter(
         f, older, newer = new_filter(1 + most, vehicles), new_filter(1 + most, vehicles), new_filter(1 + most, vehicles)
         t = newest = 0
         while t < steps:
-            first, count = measurements.start[t], measurements.start[t + 1] - measurements.start[t]
+            first = measurements.start[t]
+            count = measurements.start[t + 1] - first
             gather_own(own, measurements, assumed, model.white, run, t)
             for i in range(count):
                 who[i] = measurements.neighbour[first + i]
@@ -115,41 +116,21 @@ def run_filter(
                 t = f.step[0]
                 continue
             if t == newest:
-                write(f, guards, run, t, first, who, count, x, cov, fixes, neighbours, notes)
+                fixes[run, t] = weight(f.q[0, 3], guards.fix_gate)
                 newest += 1
+                for c in range(3):
+                    x[run, t, c] = f.g.x[c]
+                    for d in range(3):
+                        cov[run, t, c, d] = f.g.p[c, d]
+                for i in range(count):
+                    k = f.slot[who[i]]
+                    for c in range(3):
+                        neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c]
+                    for c in range(4):
+                        notes[run, first + i, c] = weight(f.q[k, c], guards.gate if c < 3 else guards.fix_gate)
+                    notes[run, first + i, 4] = f.status[who[i], TRUSTED]
             t += 1
     return x, cov, neighbours, fixes, notes
-
-
-@inside
-def write(
-    f: Filter,
-    guards: Guards,
-    run: int,
-    t: int,
-    first: int,
-    who: Ints,
-    count: int,
-    x: Floats,
-    cov: Floats,
-    fixes: Floats,
-    neighbours: Floats,
-    notes: Floats,
-) -> None:
-    """Copy the estimates of a step whose first link is `first`."""
-    fixes[run, t] = weight(f.q[0, 3], guards.fix_gate)
-    for c in range(3):
-        x[run, t, c] = f.g.x[c]
-        for d in range(3):
-            cov[run, t, c, d] = f.g.p[c, d]
-    for i in range(count):
-        k = f.slot[who[i]]
-        b = 3 * f.g.block[k, PLACE]
-        for c in range(3):
-            neighbours[run, first + i, c] = f.g.x[b + c]
-        for c in range(4):
-            notes[run, first + i, c] = weight(f.q[k, c], guards.gate if c < 3 else guards.fix_gate)
-        notes[run, first + i, 4] = f.status[who[i], TRUSTED]
 
 
 @inside
@@ -203,8 +184,7 @@ def step(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, veh
     f.clock[1] = own[DT]
     if f.step[0] > 0:
         f.clock[0] += own[DT]
-    if guards.fix_gate > 0.0:
-        steady(f, guards, f.vehicle[0], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
+    steady(f, guards, f.vehicle[0], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
     if f.step[0] > f.joined[0]:
         predict(f, model, guards, own)
     for k in range(1, len(f.vehicle)):
@@ -281,7 +261,7 @@ def add_fix(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
         else:
             q = slipped
     f.q[0, 3] = q = use_fix(f, model, guards, 0, True, q)
-    f.hits[0, 0] = f.hits[0, 0] + 1 if guards.fix_gate > 0.0 and q > guards.fix_gate else 0
+    f.hits[0, 0] = f.hits[0, 0] + 1 if 0.0 < guards.fix_gate < q else 0
 
 
 @inside
@@ -318,7 +298,7 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
             for c in range(3):
                 if h.used[c]:
                     f.q[k, c] = h.q[c]
-                    f.hits[k, c] = f.hits[k, c] + 1 if guards.gate > 0.0 and h.q[c] > guards.gate else 0
+                    f.hits[k, c] = f.hits[k, c] + 1 if 0.0 < guards.gate < h.q[c] else 0
 
 
 @inside
@@ -335,7 +315,7 @@ def first_pass(f: Filter, model: Model, guards: Guards, rows: Floats, members: i
             widen(g, 3 * g.block[k, PLACE], vague)
             innovate(g, h)
             correct(g, h, 1.0)
-            wrong += vague == 0.0 and (h.q[0] > guards.gate or h.q[1] > guards.gate or h.q[2] > guards.gate)
+            wrong += vague == 0.0 and max(h.q[0], h.q[1], h.q[2]) > guards.gate
     return wrong
 
 

@@ -56,15 +56,21 @@ from .gaussian import (
 def leave(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Find each member's row; marginalise out those that have none, and remember the error of their fixes.
 
-    A member that the ego's measurements contradict joins anew; where the ego is lost, it starts anew, and all join.
+    A member that the ego's measurements contradict joins anew; where the ego is lost, it starts anew, and all join. Of
+    fixes of which all but the first contradict that one, either may be wrong: they are not trusted until others agree.
     """
     for k in range(len(f.row)):
         f.row[k] = ABSENT
     for i in range(count):
         if f.slot[vehicles[i]] >= 0:
             f.row[f.slot[vehicles[i]]] = i
+    ego = f.vehicle[0]
+    young = f.status[ego, TRUSTED] > 0.0
     again = guards.trust > 0.0 and f.step[0] > 0 and not math.isnan(own[FIX]) and lost(f, guards)
     again = again and start(f, model, guards, own, rows, count)
+    if again and young:
+        f.revoked[ego, 0], f.revoked[ego, 1] = f.revoked[ego, 0] + 1.0, f.clock[0]
+        doubt(f, model, guards, ego)
     for k in range(1, len(f.vehicle)):
         j = f.vehicle[k]
         if j < 0 or (f.row[k] >= 0 and not again and not contradicted(f, guards, k)):
@@ -133,7 +139,7 @@ def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, varianc
     for c in range(3):
         gap = unit * given[first + c] - status[PACE + c]
         q += gap * gap / ((given[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
-    if q > 2.0 * guards.fix_gate and status[SLIPS] < SLIPPED:
+    if 0.0 < 2.0 * guards.fix_gate < q and status[SLIPS] < SLIPPED:
         status[SLIPS] += 1.0
         for c in range(3):
             given[first + c], given[variance + c] = status[PACE + c] / unit, status[PACE + 3 + c] + changed * dt * dt
@@ -162,7 +168,7 @@ def predict_member(f: Filter, model: Model, guards: Guards, rows: Floats, k: int
         f.sent[k], f.serves[k] = -math.inf, 0.0
         f.vague[k] += model.flat
         return
-    if guards.fix_gate > 0.0 and age <= ROUNDING:
+    if age <= ROUNDING:
         steady(f, guards, f.vehicle[k], rows[row], SPEED, STEP, 1.0)
     if abs(f.sent[k] - sent) > ROUNDING:
         f.serves[k] = 0.0

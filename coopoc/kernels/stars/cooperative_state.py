@@ -67,7 +67,7 @@ class Guards(NamedTuple):
         walk: m, change of the error in a second.
         window: fixes in the mean innovation of a vehicle.
         revoke: log odds from which trust ends.
-        lost: s without trust in its receiver after which an ego alone starts anew.
+        lost: s without trust in its receiver after which an ego alone starts anew; twice that where no error lasts.
         memory: steps after which a state is kept to go back to.
         acceleration: m/s^2, of a member whose messages are late; 0: it goes on with its last velocity.
     """
@@ -254,18 +254,21 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
     """The ego stands somewhere near its fix, which is trusted.
 
     Where no other position, of a message less its vector, agrees with the fix, but two or more do with one another, the
-    fix is not used. Of an ego that is not trusted, but has been until a while ago, two positions must agree; else
-    nothing is changed, and False returned.
+    fix is not used. Of an ego that is not trusted, but has been until a while ago, all must agree with the fix: two
+    that multipath displaced do so by chance; else nothing is changed, and False returned.
     """
-    best, most, alone, g, ego = ABSENT, 1, True, f.g, f.vehicle[0]
+    best, most, heard, mine, g, ego = ABSENT, 1, 0, 0, f.g, f.vehicle[0]
     for i in range(-1, count if guards.fix_gate > 0.0 else -1):
         agree = 0
         for j in range(-1, count):
             agree += apart(own, rows, i, j) <= guards.fix_gate
-        alone = alone and (i >= 0 or agree <= 1)
+        heard += agree > 0
+        if i < 0:
+            mine = agree
         if agree > most:
             best, most = i, agree
-    if most < 2 and f.status[ego, TRUSTED] == 0.0 and f.clock[0] <= f.revoked[ego, 1] + guards.lost:
+    soon = f.revoked[ego, 1] + guards.lost * (2.0 - (model.own > 0.0))
+    if mine < max(heard, 2) and f.status[ego, TRUSTED] == 0.0 and f.clock[0] <= soon:
         return False
     f.vague[0], f.joined[0], f.hits[0, 0] = model.flat, f.step[0], 0
     clear(g, 0)
@@ -275,7 +278,7 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
         insert(g, 0, ERROR, model.own)
     for c in range(3):
         g.x[c], f.status[ego, MEAN + c] = own[FIX + c], 0.0
-    if alone and best >= 0:
+    if mine <= 1 and best >= 0:
         f.vague[0] = 0.0
         for c in range(3):
             g.x[c], own[FIX + c] = rows[best, SOLO + c] - across(rows, best, c), math.nan

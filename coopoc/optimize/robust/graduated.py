@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -113,7 +112,7 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
     """
     if problem.constraints:
         return problem
-    began, taken, factors = time.perf_counter(), 0, problem.factors
+    taken, factors = 0, problem.factors
     robust = {k: f.loss for k, f in enumerate(factors) if f.loss is not None and f.loss.redescends}
     bare = problem.replace_unchecked(factors=tuple(unchecked(f, loss=None) for f in factors))
     marked = mark(bare, list(robust))
@@ -141,6 +140,5 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
     search = search._replace(
         start=search.start if best == "x0" and search.start else best,
         iterations=search.iterations + taken,
-        seconds=search.seconds + time.perf_counter() - began,
     )
     return problem.replace_unchecked(x0=frozen(ends[best]), search=search)
