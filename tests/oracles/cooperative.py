@@ -118,6 +118,7 @@ class Oracle:
         self.std: Floats = np.ones(3)
         if s is not None:
             self.std = s.relative_std.copy()
+            self.guards = guards._replace(lost=guards.lost / (1 + (s.gnss_drift_std > 0)))
         if robust and s is not None:
             heading, bias = (float(v**2) for v in known.compass)
             keep = math.exp(-seen.dt / s.gnss_drift_time)
@@ -338,7 +339,7 @@ class Oracle:
         if g.fix_gate:
             votes = [sum(((x - y) ** 2 / (p + q)).sum() <= g.fix_gate for y, q in places) for x, p in places]
         best = int(np.argmax(votes))
-        late = (t - self.revoked.get(self.ego, [0, 0])[1]) * self.seen.dt > g.lost * (1 if self.life.own else 2)
+        late = (t - self.revoked.get(self.ego, [0, 0])[1]) * self.seen.dt > 2 * g.lost
         if self.ego not in s["trusted"] and votes[0] < max(len(votes), 2) and not late:
             return False
         b.drop(("b", self.ego))

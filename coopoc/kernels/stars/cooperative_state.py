@@ -67,7 +67,7 @@ class Guards(NamedTuple):
         walk: m, change of the error in a second.
         window: fixes in the mean innovation of a vehicle.
         revoke: log odds from which trust ends.
-        lost: s without trust in its receiver after which an ego alone starts anew; twice that where no error lasts.
+        lost: s without trust in its receiver after which an ego is lost; twice that if it is alone, half where errors last.
         memory: steps after which a state is kept to go back to.
         acceleration: m/s^2, of a member whose messages are late; 0: it goes on with its last velocity.
     """
@@ -267,7 +267,7 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
             mine = agree
         if agree > most:
             best, most = i, agree
-    soon = f.revoked[ego, 1] + guards.lost * (2.0 - (model.own > 0.0))
+    soon = f.revoked[ego, 1] + 2.0 * guards.lost
     if mine < max(heard, 2) and f.status[ego, TRUSTED] == 0.0 and f.clock[0] <= soon:
         return False
     f.vague[0], f.joined[0], f.hits[0, 0] = model.flat, f.step[0], 0
