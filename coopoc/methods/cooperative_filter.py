@@ -132,7 +132,7 @@ class CooperativeFilter(Checked):
 def broadcasts(recording: Recording, noise_model: NoiseModel, egos: Sequence[int], guards: Guards) -> Sent:
     """Messages of the vehicles in the stars of some egos, each filtered alone until it is in none any more."""
     links, assumed, model = recording.links, assumptions(recording, noise_model), model_of(noise_model, robust=False)
-    x, variance, moved = (np.zeros_like(np.moveaxis(recording.gnss, 2, 0), order="C") for _ in range(3))
+    x, variance, moved = (np.zeros(np.moveaxis(recording.gnss, 2, 0).shape) for _ in range(3))
     none, nothing = Sent(NOTHING, NOTHING, NOTHING), inbox(recording, egos[0], FIX_AND_VELOCITY)
     seen, here = measurements(recording, egos[0], nothing), np.isin(links.observer, egos)
     for j in np.unique(links.neighbour[here]):

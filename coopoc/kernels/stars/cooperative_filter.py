@@ -49,6 +49,8 @@ from .gaussian import (
     PLACE,
     copy_moments,
     correct,
+    correct_mean,
+    correct_rows,
     expect,
     has,
     innovate,
@@ -303,7 +305,10 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
 
 @inside
 def first_pass(f: Filter, model: Model, guards: Guards, rows: Floats, members: int) -> int:
-    """Update `trial` by the measurements linear at the prediction; how many members are beyond a gate."""
+    """Update `trial` by the measurements linear at the prediction; how many members are beyond a gate.
+
+    Of its covariance only the rows that a later member's measurement needs are kept up to date.
+    """
     g, h, wrong = f.trial, f.h, 0
     copy_moments(f.g, g)
     for m in range(members):
@@ -314,7 +319,11 @@ def first_pass(f: Filter, model: Model, guards: Guards, rows: Floats, members: i
                 h.gate[c] = 0.0 if vague > 0.0 else guards.gate
             widen(g, 3 * g.block[k, PLACE], vague)
             innovate(g, h)
-            correct(g, h, 1.0)
+            correct_mean(g, h, 1.0)
+            for k in f.order[m + 1 : members]:
+                correct_rows(g, h, 1.0, g.block[k, PLACE])
+            for term in range(1, h.terms[0]):
+                correct_rows(g, h, 1.0, h.block[term])
             wrong += vague == 0.0 and max(h.q[0], h.q[1], h.q[2]) > guards.gate
     return wrong
 

@@ -67,7 +67,7 @@ class Guards(NamedTuple):
         walk: m, change of the error in a second.
         window: fixes in the mean innovation of a vehicle.
         revoke: log odds from which trust ends.
-        lost: s without trust in its receiver after which an ego is lost; twice that if it is alone, half where errors last.
+        lost: s without trust in its receiver after which an ego is lost; if alone twice that, half where errors last.
         memory: steps after which a state is kept to go back to.
         acceleration: m/s^2, of a member whose messages are late; 0: it goes on with its last velocity.
     """

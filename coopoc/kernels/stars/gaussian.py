@@ -307,21 +307,33 @@ def whitened(h: Rows, c: int, innovation: float, variance: float) -> tuple[float
 @inside
 def correct(g: Gaussian, h: Rows, share: float) -> None:
     """P <- P - share U U^T: the innovation's covariance is that of `innovate` over `share`."""
-    p, gain, wide, third = g.p, h.gain, len(g.x) // LANES, len(g.x) // 3
-    lanes = (3 * g.vectors[0] + LANES - 1) // LANES
+    correct_mean(g, h, share)
+    for k in range(g.vectors[0]):
+        correct_rows(g, h, share, k)
+
+
+@inside
+def correct_mean(g: Gaussian, h: Rows, share: float) -> None:
+    """x <- x + share U times the whitened innovations."""
+    gain, wide = h.gain, len(g.x) // LANES
     x, y, z = share * h.white[0], share * h.white[1], share * h.white[2]
-    for j in range(lanes):
+    for j in range((3 * g.vectors[0] + LANES - 1) // LANES):
         u, v, w = take(gain, j), take(gain, wide + j), take(gain, 2 * wide + j)
         put(g.x, j, plus(plus(plus(take(g.x, j), x, u), y, v), z, w))
-    for k in range(g.vectors[0]):
-        i, a = 3 * k * wide, scale(load(gain, k, ROW), share)
-        b, c = scale(load(gain, third + k, ROW), share), scale(load(gain, 2 * third + k, ROW), share)
-        for j in range(lanes):
-            u, v, w = take(gain, j), take(gain, wide + j), take(gain, 2 * wide + j)
-            first, second, third_ = i + j, i + wide + j, i + 2 * wide + j
-            put(p, first, less(less(less(take(p, first), a[0], u), b[0], v), c[0], w))
-            put(p, second, less(less(less(take(p, second), a[1], u), b[1], v), c[1], w))
-            put(p, third_, less(less(less(take(p, third_), a[2], u), b[2], v), c[2], w))
+
+
+@inside
+def correct_rows(g: Gaussian, h: Rows, share: float, k: int) -> None:
+    """Three rows of P, those of the k-th vector."""
+    p, gain, wide, third = g.p, h.gain, len(g.x) // LANES, len(g.x) // 3
+    i, a = 3 * k * wide, scale(load(gain, k, ROW), share)
+    b, c = scale(load(gain, third + k, ROW), share), scale(load(gain, 2 * third + k, ROW), share)
+    for j in range((3 * g.vectors[0] + LANES - 1) // LANES):
+        u, v, w = take(gain, j), take(gain, wide + j), take(gain, 2 * wide + j)
+        first, second, third_ = i + j, i + wide + j, i + 2 * wide + j
+        put(p, first, less(less(less(take(p, first), a[0], u), b[0], v), c[0], w))
+        put(p, second, less(less(less(take(p, second), a[1], u), b[1], v), c[1], w))
+        put(p, third_, less(less(less(take(p, third_), a[2], u), b[2], v), c[2], w))
 
 
 @part
