@@ -330,10 +330,9 @@ def correct_rows(g: Gaussian, h: Rows, share: float, k: int) -> None:
     b, c = scale(load(gain, third + k, ROW), share), scale(load(gain, 2 * third + k, ROW), share)
     for j in range((3 * g.vectors[0] + LANES - 1) // LANES):
         u, v, w = take(gain, j), take(gain, wide + j), take(gain, 2 * wide + j)
-        first, second, third_ = i + j, i + wide + j, i + 2 * wide + j
-        put(p, first, less(less(less(take(p, first), a[0], u), b[0], v), c[0], w))
-        put(p, second, less(less(less(take(p, second), a[1], u), b[1], v), c[1], w))
-        put(p, third_, less(less(less(take(p, third_), a[2], u), b[2], v), c[2], w))
+        for row in range(3):
+            at = i + row * wide + j
+            put(p, at, less(less(less(take(p, at), a[row], u), b[row], v), c[row], w))
 
 
 @part
