@@ -132,7 +132,7 @@ class CooperativeFilter(Checked):
 def broadcasts(recording: Recording, noise_model: NoiseModel, egos: Sequence[int], guards: Guards) -> Sent:
     """Messages of the vehicles in the stars of some egos, each filtered alone until it is in none any more."""
     links, assumed, model = recording.links, assumptions(recording, noise_model), model_of(noise_model, robust=False)
-    x, variance, moved = (np.zeros(np.moveaxis(recording.gnss, 2, 0).shape) for _ in range(3))
+    x, variance, moved = np.zeros((3, *np.moveaxis(recording.gnss, 2, 0).shape))
     none, nothing = Sent(NOTHING, NOTHING, NOTHING), inbox(recording, egos[0], FIX_AND_VELOCITY)
     seen, here = measurements(recording, egos[0], nothing), np.isin(links.observer, egos)
     for j in np.unique(links.neighbour[here]):
@@ -140,9 +140,7 @@ def broadcasts(recording: Recording, noise_model: NoiseModel, egos: Sequence[int
         alone = seen._replace(ego=int(j), start=np.zeros(last + 1, np.int64))
         x[j, :, :last], cov = run_filter(alone, assumed, none, model, guards)[:2]
         variance[j, :, :last] = np.diagonal(cov, axis1=-2, axis2=-1)
-        steps = recording.dt * recording.velocity[:, :last, j]
-        steps[np.isnan(steps)] = 0.0
-        np.cumsum(steps, axis=1, out=moved[j, :, :last])
+        np.nancumsum(recording.dt * recording.velocity[:, :last, j], axis=1, out=moved[j, :, :last])
     return Sent(x, variance, moved)
 
 

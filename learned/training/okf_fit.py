@@ -36,6 +36,7 @@ def fit_okf(
     Returns:
         Of each setting the trained parameters, the validation loss per check, m^2, and the training seconds.
 
+    >>> import numpy as np
     >>> from coopoc.learned import clients
     >>> from coopoc.world.fleet import Fleet
     >>> (only,) = clients(Fleet(("a",), np.arange(33) / 10, np.zeros((33, 1, 3)), np.zeros((33, 1, 3))), piece=10)

@@ -9,8 +9,8 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
 from ..compiling.small import add, add_diagonal, load, store, subtract
-from ..gate import FIX_GATE, count, inflation
-from .graph import MATRIX, VECTOR, Assumed, Matrix, Measured, Pairs, Vector, at, connect, gate_pair, pair_at_agreement
+from ..gate import FIX_GATE, count, distance, gain_of, inflation
+from .graph import MATRIX, VECTOR, Assumed, Matrix, Measured, Pairs, at, connect, gate_pair, pair_at_agreement
 
 UNKNOWN = 1e6
 """m^2, variance of a vehicle before its first fix, where relative measurements are linearised."""
@@ -53,7 +53,7 @@ def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed) -> tuple[Floa
                     store(total[run], i, subtract(load(total[run], i, VECTOR), eta))
                     store(total[run], j, add(load(total[run], j, VECTOR), eta))
         B = np.eye(3 * n)
-        add_fixes(measured, assumed, t, present, x, P, B, total, hits)
+        add_fixes(measured, assumed, t, present, x, P, B, total, np.bincount(label)[label] > 1, hits)
         for k in range(pairs.start[t], pairs.start[t + 1]):
             if alive[k]:
                 add_pair(pairs.first[k], pairs.second[k], load(information[k - pairs.start[t]], 0, MATRIX), P, B)
@@ -82,19 +82,17 @@ def predict(measured: Measured, assumed: Assumed, t: int, before: Bools, x: Floa
 
 
 @part
-def difference(P: Floats, i: int, j: int) -> Matrix:
-    """Covariance of x_j - x_i."""
-    return *row_of(P, i, j, 0), *row_of(P, i, j, 1), *row_of(P, i, j, 2)
+def block(P: Floats, i: int, j: int) -> Matrix:
+    """Covariance of x_i with x_j."""
+    row = 3 * i
+    return *load(P[row], j, VECTOR), *load(P[row + 1], j, VECTOR), *load(P[row + 2], j, VECTOR)
 
 
 @part
-def row_of(P: Floats, i: int, j: int, c: int) -> Vector:
-    """Row c of `difference`."""
-    a, b = P[3 * i + c], P[3 * j + c]
-    row: Vector = subtract(
-        subtract(add(load(a, i, VECTOR), load(b, j, VECTOR)), load(a, j, VECTOR)), load(b, i, VECTOR)
-    )
-    return row
+def difference(P: Floats, i: int, j: int) -> Matrix:
+    """Covariance of x_j - x_i."""
+    cov: Matrix = subtract(subtract(add(block(P, i, i), block(P, j, j)), block(P, i, j)), block(P, j, i))
+    return cov
 
 
 @part
@@ -107,23 +105,22 @@ def add_fixes(
     P: Floats,
     B: Floats,
     total: Floats,
+    together: Bools,
     hits: Floats,
 ) -> None:
     """B += F P and the information vectors of the fixes; a vehicle that joins has the covariance of its own.
 
-    The own filter of a vehicle whose fixes are false from the start believes them: here others contradict it.
+    The own filter of a vehicle whose fixes are false from the start believes them: here others, if it is `together`
+    with any, contradict it.
     """
     for n in range(x.shape[2]):
-        noise, fix = at(assumed.fix, 0, t, n), measured.gnss[0, t, n]
-        q = gain = 0.0
-        for c in range(3):
-            gap, own = fix[c] - x[0, t, n, c], P[3 * n + c, 3 * n + c]
-            s = own + noise[c]
-            if not math.isnan(gap):
-                q += gap * gap / s
-                gain += own / s
-        share = inflation(q, FIX_GATE, hits[n]) if assumed.robust else 1.0
-        hits[n] = count(q, FIX_GATE, hits[n], gain / 3.0)
+        noise, fix = load(at(assumed.fix, 0, t, n), 0, VECTOR), measured.gnss[0, t, n]
+        gap, share = subtract(load(fix, 0, VECTOR), load(x[0, t, n], 0, VECTOR)), 1.0
+        if assumed.robust and together[n] and gap[0] + gap[1] + gap[2] + noise[0] < math.inf:
+            own = block(P, n, n)
+            q = distance(gap, add_diagonal(own, noise))
+            share = inflation(q, FIX_GATE, hits[n])
+            hits[n] = count(q, FIX_GATE, hits[n], gain_of(own, noise))
         for c in range(3 if measured.active[0, t, n] else 0):
             row, variance = 3 * n + c, share * noise[c]
             if not before[n]:

@@ -316,7 +316,7 @@ def correct(g: Gaussian, h: Rows, share: float) -> None:
 def correct_mean(g: Gaussian, h: Rows, share: float) -> None:
     """x <- x + share U times the whitened innovations."""
     gain, wide = h.gain, len(g.x) // LANES
-    x, y, z = share * h.white[0], share * h.white[1], share * h.white[2]
+    x, y, z = scale(load(h.white, 0, ROW), share)
     for j in range((3 * g.vectors[0] + LANES - 1) // LANES):
         u, v, w = take(gain, j), take(gain, wide + j), take(gain, 2 * wide + j)
         put(g.x, j, plus(plus(plus(take(g.x, j), x, u), y, v), z, w))
