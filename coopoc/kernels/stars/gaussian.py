@@ -122,6 +122,18 @@ def new_rows(members: int) -> Rows:
     )
 
 
+@inside
+def lanes(g: Gaussian) -> int:
+    """LANES of numbers that hold the vectors in use."""
+    return int((3 * g.vectors[0] + LANES - 1) // LANES)
+
+
+@inside
+def three_rows(rows: Floats, i: int, wide: int) -> tuple[float, float, float]:
+    """LANES of three rows, `wide` of them apart."""
+    return take(rows, i), take(rows, i + wide), take(rows, i + 2 * wide)
+
+
 @part
 def has(g: Gaussian, member: int, kind: int) -> bool:
     """Whether a vector is in the state."""
@@ -142,10 +154,7 @@ def insert(g: Gaussian, member: int, kind: int, variance: float) -> int:
 def clear(g: Gaussian, first: int) -> None:
     """Set mean and covariances of a vector to 0."""
     for i in range(first, first + 3):
-        g.x[i] = 0.0
-        for j in range(3 * g.vectors[0]):
-            g.p[i, j] = 0.0
-            g.p[j, i] = 0.0
+        g.x[i], g.p[i], g.p[:, i] = 0.0, 0.0, 0.0
 
 
 @part
@@ -188,8 +197,8 @@ def copy_gaussian(source: Gaussian, target: Gaussian) -> None:
 @inside
 def copy_moments(source: Gaussian, target: Gaussian) -> None:
     """Copy x and P into arrays of the same size."""
-    wide, lanes = len(source.x) // LANES, (3 * source.vectors[0] + LANES - 1) // LANES
-    for j in range(lanes):
+    wide = len(source.x) // LANES
+    for j in range(lanes(source)):
         put(target.x, j, take(source.x, j))
         for i in range(j, 3 * source.vectors[0] * wide, wide):
             put(target.p, i, take(source.p, i))
@@ -249,8 +258,8 @@ def project(g: Gaussian, h: Rows) -> None:
     gain, wide, third = h.gain, len(g.x) // LANES, len(g.x) // 3
     for k in range(h.terms[0]):
         i, w = 3 * h.block[k] * wide, load(h.weight, k, BLOCK)
-        for j in range((3 * g.vectors[0] + LANES - 1) // LANES):
-            a, b, c = take(g.p, i + j), take(g.p, i + wide + j), take(g.p, i + 2 * wide + j)
+        for j in range(lanes(g)):
+            a, b, c = three_rows(g.p, i + j, wide)
             d, e, f = w[0] * a, w[3] * a, w[6] * a
             if k > 0:
                 d, e, f = take(gain, j) + d, take(gain, wide + j) + e, take(gain, 2 * wide + j) + f
@@ -285,8 +294,8 @@ def innovate(g: Gaussian, h: Rows) -> float:
     z, f = whitened(h, 2, gap[2] - s * x - t * y, h.variance[2] + cov[8] - s * s - t * t)
     b, c = -f * (s * d + t * a), -f * t * e
     store(h.white, 0, (x, y, z))
-    for j in range((3 * g.vectors[0] + LANES - 1) // LANES):
-        p, q, r = take(gain, j), take(gain, wide + j), take(gain, 2 * wide + j)
+    for j in range(lanes(g)):
+        p, q, r = three_rows(gain, j, wide)
         put(gain, j, d * p)
         put(gain, wide + j, plus(e * q, a, p))
         put(gain, 2 * wide + j, plus(plus(f * r, c, q), b, p))
@@ -317,8 +326,8 @@ def correct_mean(g: Gaussian, h: Rows, share: float) -> None:
     """x <- x + share U times the whitened innovations."""
     gain, wide = h.gain, len(g.x) // LANES
     x, y, z = scale(load(h.white, 0, ROW), share)
-    for j in range((3 * g.vectors[0] + LANES - 1) // LANES):
-        u, v, w = take(gain, j), take(gain, wide + j), take(gain, 2 * wide + j)
+    for j in range(lanes(g)):
+        u, v, w = three_rows(gain, j, wide)
         put(g.x, j, plus(plus(plus(take(g.x, j), x, u), y, v), z, w))
 
 
@@ -328,8 +337,8 @@ def correct_rows(g: Gaussian, h: Rows, share: float, k: int) -> None:
     p, gain, wide, third = g.p, h.gain, len(g.x) // LANES, len(g.x) // 3
     i, a = 3 * k * wide, scale(load(gain, k, ROW), share)
     b, c = scale(load(gain, third + k, ROW), share), scale(load(gain, 2 * third + k, ROW), share)
-    for j in range((3 * g.vectors[0] + LANES - 1) // LANES):
-        u, v, w = take(gain, j), take(gain, wide + j), take(gain, 2 * wide + j)
+    for j in range(lanes(g)):
+        u, v, w = three_rows(gain, j, wide)
         for row in range(3):
             at = i + row * wide + j
             put(p, at, less(less(less(take(p, at), a[row], u), b[row], v), c[row], w))
