@@ -1,6 +1,7 @@
 """Mutated files: whatever stands in one, a reader keeps its contract (`tests/fuzz/contract.py`)."""
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -20,13 +21,7 @@ def mutated(text: str, rng: np.random.Generator) -> bytes:
         lines = data.split("\n")
         line = int(rng.integers(len(lines)))
         if kind <= 2:
-            words = (
-                data.replace(",", "\0,\0")
-                .replace(" ", "\0 \0")
-                .replace('"', '\0"\0')
-                .replace("\n", "\0\n\0")
-                .split("\0")
-            )
+            words = re.split('([, "\n])', data)
             words[int(rng.integers(len(words)))] = str(rng.choice(TOKENS))
             data = "".join(words)
         elif kind == 3:

@@ -31,11 +31,13 @@ def test_a_recording_comes_back_from_its_rows(tmp_path: Path, suffix: str) -> No
     means = true.velocity.copy()
     means[:, 1:] = (means[:, 1:] + means[:, :-1]) / 2  # trapezoids between samples at the steps
     assert_allclose(found.velocity, means, atol=1e-4)  # stamps have 7 digits behind the point
-    for name in ("step", "observer", "neighbour"):
-        one = pd.DataFrame({k: getattr(true.links, k) for k in ("step", "observer", "neighbour")})
-        other = pd.DataFrame({k: getattr(found.links, k) for k in ("step", "observer", "neighbour")})
-        order, back = (f.sort_values(["step", "observer", "neighbour"]).index for f in (one, other))
-        np.testing.assert_array_equal(one.loc[order, name], other.loc[back, name])
+    keys = ["step", "observer", "neighbour"]
+    one, other = (
+        pd.DataFrame({key: getattr(recording.links, key) for key in keys}).sort_values(keys)
+        for recording in (true, found)
+    )
+    np.testing.assert_array_equal(one, other)
+    order, back = one.index, other.index
     assert_allclose(found.relative[0, back], true.relative[0, order], atol=1e-9)
     sent = true.broadcasts[true.links.step, true.links.neighbour]
     wanted = np.where(sent, true.arrival[0], -1)
