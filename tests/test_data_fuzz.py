@@ -27,9 +27,11 @@ def mutated(text: str, rng: np.random.Generator) -> bytes:
         elif kind == 3:
             data = data[:at] + chr(int(rng.choice([*range(32, 127), 0, 9, 228, 8232]))) + data[at + 1 :]
         elif kind == 4:
-            data = "\n".join([*lines[: line + 1], *lines[line:]])
+            lines.insert(line, lines[line])
+            data = "\n".join(lines)
         elif kind == 5:
-            data = "\n".join([*lines[:line], *lines[line + 1 :]])
+            del lines[line]
+            data = "\n".join(lines)
         elif kind == 6:
             other = int(rng.integers(len(lines)))
             lines[line], lines[other] = lines[other], lines[line]
