@@ -40,12 +40,12 @@ def read_table(
     names = dict(columns or {})
     frame = read_frame(path, names.get("id", "id"))
     given = bool({*VELOCITY} & {*names, *frame.columns})
-    frame = named_columns(frame, names, (*NEEDED, *VELOCITY), (*NEEDED, *(VELOCITY if given else ())), path.name)
+    used = NEEDED + given * VELOCITY
+    frame = named_columns(frame, names, (*NEEDED, *VELOCITY), used, path.name)
     source = f"table {path.name}" + ("" if given else ", velocity by backward difference")
     factor = factors(scale, (*NEEDED[1:], *VELOCITY))
     t, *axes = (
-        factor.get(name, 1.0) * (seconds if name == "t" else numeric)(frame, name, path.name)
-        for name in (*NEEDED[1:], *(VELOCITY if given else ()))
+        factor.get(name, 1.0) * (seconds if name == "t" else numeric)(frame, name, path.name) for name in used[1:]
     )
     numbers = np.column_stack(axes)
     labels: dict[str, Any] = {"file": path.name, "name": path.stem, "source": source}

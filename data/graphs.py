@@ -28,13 +28,14 @@ def read_graph_log(path: Path, *, dt: float = 0.1) -> Log:
     graph = read_pyfg(path)
     recording, truth = graph_recording(graph, dt=dt)
     vehicles = {name: "landmark" if k in recording.landmarks else "odometry" for k, name in enumerate(recording.ids)}
-    read = {"ranges": len(recording.links), "bearings": int(np.isfinite(recording.relative[0, :, 1]).sum())}
+    summary = Summary(path.name, steps_in_words(recording), vehicles)
+    summary.count("ranges", len(recording.links))
+    summary.count("bearings", int(np.isfinite(recording.relative[0, :, 1]).sum()))
     left = len(graph.ranges) + len(graph.relative_point) + int(_others(graph).sum()) - len(recording.links)
     where = "outside the steps that all robots share, beside another of the same pair and step, or between points"
-    counts = {f"edges {where}": left, "priors": len(graph.pose_prior) + len(graph.point_prior)}
-    refused = {what: (count, "") for what, count in counts.items() if count}
-    read = {what: count for what, count in read.items() if count}
-    return Log(recording, truth, Summary(path.name, steps_in_words(recording), vehicles, read, refused), True)
+    summary.refuse(f"edges {where}", left)
+    summary.refuse("priors", len(graph.pose_prior) + len(graph.point_prior))
+    return Log(recording, truth, summary, True)
 
 
 def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]:
@@ -66,17 +67,15 @@ def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]
 
     path = np.stack([on_steps(places, _chained(graph, places)) for places in robots.values()], axis=1)
     marks = np.flatnonzero(~graph.is_pose & np.isfinite(graph.position).all(axis=1))
-    truth = np.zeros((len(t), n + len(marks), 4))
+    truth, column = np.zeros((len(t), n + len(marks), 4)), np.full(len(graph.names), -1)
     for k, places in enumerate(robots.values()):
         pose = np.column_stack([graph.position[places], np.unwrap(graph.orientation[places, 0])])
         truth[:, k, [0, 1, 3]] = on_steps(places, pose)
+        column[places] = k
     truth[:, n:, :2] = graph.position[marks]
     ids = (*robots, *(graph.names[k] for k in marks))
     moved = np.diff(path, axis=0, prepend=path[:1]) / dt
     velocity = turned(moved * [1.0, 1.0, 0.0], -midway(path[..., 2]))[..., :2]
-    column = np.full(len(graph.names), -1)
-    for k, places in enumerate(robots.values()):
-        column[places] = k
     column[marks] = n + np.arange(len(marks))
     recording = planar_recording(
         ids,
@@ -89,8 +88,7 @@ def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]
         "odometry and relative measurements are real; no fix, no compass",
     )
     position = truth[..., :3]
-    u = backward_difference(t, position, ids)
-    return recording, Fleet(ids, t, position, u, name="pyfg", heading=truth[..., 3])
+    return recording, Fleet(ids, t, position, backward_difference(t, position, ids), name="pyfg", heading=truth[..., 3])
 
 
 def _chained(graph: Graph, places: Ints) -> Floats:
@@ -104,8 +102,7 @@ def _chained(graph: Graph, places: Ints) -> Floats:
             raise InputError("graph", given, "must join all poses of a robot", "Cut the file at the gap.")
     index = [edge_of[step] for step in steps]
     heading = np.concatenate([[0.0], np.cumsum(edges.orientation[index, 0])])
-    (dx, dy), c, s = edges.position[index].T, np.cos(heading[:-1]), np.sin(heading[:-1])
-    moved = np.column_stack([c * dx - s * dy, s * dx + c * dy])
+    moved = turned(np.pad(edges.position[index], ((0, 0), (0, 1))), heading[:-1])[:, :2]
     return np.column_stack([np.vstack([np.zeros(2), np.cumsum(moved, axis=0)]), heading])
 
 

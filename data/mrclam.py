@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from coopoc.arrays import Bools, Floats, Ints, robust_std
 from coopoc.errors import InputError
@@ -123,9 +124,8 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
     table = _measurements(folder, numbers)
     table[:, 0] -= start
     subject = table[:, 2]
-    robot_column = {number: k for k, number in enumerate(numbers)}
     others = table[np.isin(subject, numbers)]
-    others[:, 2] = [robot_column[number] for number in others[:, 2].tolist()]
+    others[:, 2] = np.searchsorted(numbers, others[:, 2])
     sightings = table[subject > SUBJECTS]
     row = {number: k for k, number in enumerate(marks[:, 0].tolist())}
     sightings[:, 2] = [row.get(number, -1) for number in sightings[:, 2].tolist()]
@@ -344,8 +344,7 @@ def _measurements(folder: Path, numbers: list[int]) -> Floats:
     file = folder / "Barcodes.dat"
     codes = _read(file, "subject barcode")
     for column, what in ((1, "barcode"), (0, "subject")):
-        twice = np.ones(len(codes), dtype=bool)
-        twice[np.unique(codes[:, column], return_index=True)[1]] = False
+        twice = pd.Series(codes[:, column]).duplicated().to_numpy()
         _refuse(file, twice, f"must give each {what} once", "Remove the line that repeats it.")
     subject_of = {code: subject for subject, code in codes.tolist()}
     parts = []
@@ -363,8 +362,6 @@ def _measurements(folder: Path, numbers: list[int]) -> Floats:
 
 def _read(file: Path, form: str, *, strictly: bool = False) -> Floats:
     """(M, C) numbers of a file; a column time increases, the last column, an angle or its rate, is within a turn."""
-    import pandas as pd
-
     if not file.is_file():
         hint = "Point at a folder MRCLAM_DatasetN with its .dat files."
         raise InputError("folder", file.parent, f"has no {file.name}", hint)

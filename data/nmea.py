@@ -38,11 +38,9 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
     import pandas as pd
 
     try:
-        from pynmeagps import NMEAReader, exceptions
+        from pynmeagps import NMEAReader
     except ImportError:
         raise MissingLibraryError("pynmeagps", "reading NMEA", "'coopoc[nmea]'") from None
-    names = ("NMEAParseError", "NMEAMessageError", "NMEATypeError", "NMEAStreamError")
-    damages = (*(getattr(exceptions, name) for name in names), ValueError, AttributeError, TypeError, LookupError)
     sentences = _Sentences()
     for number, line in enumerate(path.read_bytes().split(b"\n"), 1):
         start, where = line.find(b"$"), f"{path.name}: line {number}"
@@ -54,7 +52,7 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
             if sentence is None:
                 raise ValueError("incomplete")
             reason = sentences.add(sentence, number)
-        except damages as error:
+        except Exception as error:  # of pynmeagps: a damaged sentence meets them all
             where += f", {next(iter(str(error).splitlines()), '')[:60].partition(' - ')[0]}"
             reason = "damaged NMEA sentences"
         if reason.startswith("NMEA"):

@@ -114,9 +114,11 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
         hint = suggestion(name, registered, "List the bundled fleets with coopoc data list, or check the path.")
         raise InputError("data", repr(name), allowed, hint)
     chosen = chosen or detect(path, options.get("columns"))
-    if chosen not in DRIVES and chosen not in LOGS:
-        raise unknown("format", chosen, (*DRIVES, *LOGS), "Or leave it out.")
-    truth = _read(DRIVES[chosen], path, options) if chosen in DRIVES else _read(LOGS[chosen], path, options).truth
+    readers = {**DRIVES, **LOGS}
+    if chosen not in readers:
+        raise unknown("format", chosen, readers, "Or leave it out.")
+    read = _read(readers[chosen], path, options)
+    truth = read if chosen in DRIVES else read.truth
     if truth is None:
         hint = "Add a table truth.csv to its folder, pass truth=, or take co.load_recording."
         raise InputError(path.name, "no truth", "is a log without one: there is nothing to score against", hint)
@@ -150,8 +152,6 @@ def kind_of(name_or_path: str | Path) -> str:
     >>> kind_of("town10")
     ''
     """
-    if isinstance(name_or_path, str) and name_or_path in DATASETS:
-        return ""
     name, options = split(name_or_path)
     if name in DATASETS or not Path(name).exists():
         return ""

@@ -42,7 +42,7 @@ def read_paths(name: str) -> dict[str, Path]:
     if not file.is_file():
         raise InputError("file", str(file), "must be a file", "Check the path.")
     if file.suffix.lower() in TABLES:
-        return _of_table(file, dict(options.get("columns", {})))
+        return _of_table(file, options.get("columns", {}))
     if len(next(read_words(file), (0, []))[1]) == 12:
         poses = read_kitti(file, options.get("times"))
         stamps = np.arange(len(poses), dtype=float) if poses.stamps is None else poses.stamps

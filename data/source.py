@@ -80,8 +80,8 @@ def pairs(text: str, value: Callable[[str], Any] = str) -> dict[str, Any]:
 
 
 def _place(text: str) -> tuple[float, float, float]:
-    latitude, longitude, height = map(float, text.split(","))
-    return latitude, longitude, height
+    x, y, z = map(float, text.replace("/", ",").split(","))
+    return x, y, z
 
 
 AUTO, TRUE = "auto", ("false", "true")
@@ -96,6 +96,11 @@ READ: Mapping[str, tuple[Callable[[str], Any], str, str]] = {
         lambda text: text if text == AUTO else pairs(text, float),
         "kind:number or one-other:number pairs, or auto",
         "range:0.4",
+    ),
+    "antenna": (
+        lambda text: pairs(text, _place) if ":" in text else _place(text),
+        "metres forward/left/up, or vehicle:forward/left/up pairs",
+        "car1:1.2/0.3/0",
     ),
     "clock": (partial(pairs, value=float), "vehicle:seconds pairs", "blue:0.35"),
     "ignore": (lambda text: tuple(map(str.strip, text.split(","))), "words between commas", "imu,lidar"),

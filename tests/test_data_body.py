@@ -113,9 +113,8 @@ def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path: Pa
     """One car has fixes; the others measure it and each other, and none has a compass."""
     folder = written(tmp_path / "log", noise=1.0, compass=False)
     frame = pd.read_csv(folder / "log.csv")
-    frame[(frame["vehicle"].isin(["red", "mast"])) | ~frame["kind"].isin(["x", "y"])].to_csv(
-        folder / "log.csv", index=False
-    )
+    kept = frame["vehicle"].isin(["red", "mast"]) | ~frame["kind"].isin(["x", "y"])
+    frame[kept].to_csv(folder / "log.csv", index=False)
     log = co.read_log(folder, frame="body")
     begin, cars = co.pose_start(log.recording)[0], drives()
     for name, (place, heading, _, _) in cars.items():
@@ -125,10 +124,8 @@ def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path: Pa
     track = co.PoseFilter("fleet", begin=begin[None])(log.recording, list(CARS))
     assert log.truth is not None
     assert np.nanmean(co.pose_nees(track, log.truth)[:, 100:]) < 6
-    without = frame[~frame["kind"].isin(["bearing", "range"]) | (frame["partner"] != "red")]
-    without[(without["vehicle"].isin(["red", "mast"])) | ~without["kind"].isin(["x", "y"])].to_csv(
-        folder / "log.csv", index=False
-    )
+    kept &= ~frame["kind"].isin(["bearing", "range"]) | (frame["partner"] != "red")
+    frame[kept].to_csv(folder / "log.csv", index=False)
     with refused("has no fix and sees no landmark"):
         co.pose_start(co.read_log(folder, frame="body").recording)
 

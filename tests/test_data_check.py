@@ -8,7 +8,8 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
-from logs import at, bends, fixes, motion, outliers, ranges, write
+from logs import bends, fixes, motion, outliers, ranges, write
+from numpy.testing import assert_allclose
 
 import coopoc as co
 from coopoc.data.log.check import check
@@ -29,13 +30,8 @@ def cars(folder: Path, change: Callable[[pd.DataFrame], pd.DataFrame] = lambda f
         parts += [motion(fleet, name, rate, 0.1, seed).drop(columns="vz")]
     folder.mkdir(exist_ok=True)
     write(change(pd.concat(parts, ignore_index=True)), folder / "log.csv")
-    truth = pd.concat(
-        [
-            pd.DataFrame({"t": fleet.t, "vehicle": n, "x": x[0], "y": x[1]})
-            for n, x in ((name, fleet.position[:, k].T) for k, name in enumerate(fleet.ids))
-        ]
-    )
-    write(truth[::5], folder / "truth.csv")
+    truth = pd.concat([fixes(fleet, name, 0.1, 1e-9).drop(columns="z") for name in fleet.ids])
+    write(truth, folder / "truth.csv")
     return folder
 
 
@@ -85,7 +81,7 @@ def test_an_offset_of_ranges_is_taken_off(tmp_path: Path) -> None:
     log = read_log(folder, scale={"range": 1e-3}, std={"range": 0.3}, offset={"range": 2.0})
     assert said(log) == ""
     plain = read_log(cars(tmp_path / "plain"))
-    np.testing.assert_allclose(log.recording.relative, plain.recording.relative, atol=1e-9)
+    assert_allclose(log.recording.relative, plain.recording.relative, atol=1e-9)
     pair = read_log(folder, scale={"range": 1e-3}, std={"range": 0.3}, offset={"car1-car0": 2.0, "range": 9.0})
     np.testing.assert_array_equal(pair.recording.relative, log.recording.relative)
     with refused("offset = 'uwb': must be one of"):
@@ -165,16 +161,12 @@ def test_the_height_of_a_truth_above_another_surface_is_named(tmp_path: Path) ->
         write(pd.concat(parts).drop(columns="vehicle"), log / name / "gps.csv")
         write(pd.concat(radio).drop(columns="vehicle"), log / name / "radio.csv")
         (log / name / "._gps.csv").write_bytes(b"\x00\xff")
-    every = [at(fleet, name, fleet.t[::5]) for name in fleet.ids]
     for up, message in (
         (0.0, ""),
         (15.0, "car0: fixes lie -15 m above the truth in the median"),
         (0.8, "car0: fixes lie -0."),
     ):
-        tables = [
-            pd.DataFrame({"t": fleet.t[::5], "vehicle": name, **dict(zip("xyz", x.T, strict=True))})
-            for name, x in zip(fleet.ids, every, strict=True)
-        ]
+        tables = [fixes(fleet, name, 0.1, 1e-9) for name in fleet.ids]
         tables[0]["z"] += up
         write(pd.concat(tables), log / "truth.csv")
         text = said(read_log(log))
@@ -230,7 +222,7 @@ def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path: Path) -> 
     assert np.isfinite(log.recording.gnss[0, :, 0, 0]).all()
     assert not log.summary.refused
     still = ~moves & (t > 31)
-    np.testing.assert_allclose(log.recording.velocity[0, still, 0], 0.0, atol=0.03)
+    assert_allclose(log.recording.velocity[0, still, 0], 0.0, atol=0.03)
     frame.loc[~moves, "speed"] = np.nan  # a receiver that says nothing while it stands
     text = said(read_log(write(frame, tmp_path / "car.csv")))
     assert "first of all 14" in text
@@ -254,3 +246,29 @@ def test_one_car_with_a_gap_and_columns_of_its_own(tmp_path: Path) -> None:
     write(frame, tmp_path / "log" / "taxi.csv")
     write(truth, tmp_path / "log" / "truth.csv")
     assert read_log(tmp_path / "log").truth is not None  # names no vehicle, and there is one
+
+
+@pytest.mark.parametrize("given", ["vx,vy", "heading,speed", "", "speed,yaw_rate"])
+def test_an_arm_of_an_antenna_is_taken_off(tmp_path: Path, given: str) -> None:
+    """Closed form: on a circle of radius r to the left an antenna drives one of hypot(r - left, forward), and its own
+    course is off by arctan2(forward, r - left)."""
+    t, r, arm = np.round(np.arange(0, 90, 0.1), 1), 30.0, 1.5 + 0.5j
+    ahead = 1j * np.exp(0.2j * t)
+    seen, u = (arm - 1j * r) * ahead, 0.2 * r * ahead
+    every = {
+        "t": t,
+        "x": seen.real,
+        "y": seen.imag,
+        "vx": u.real,
+        "vy": u.imag,
+        "heading": np.angle(u),
+        "speed": abs(u),
+    }
+    frame = pd.DataFrame({**every, "yaw_rate": 0.2})[["t", "x", "y", *filter(None, given.split(","))]]
+    file = f"{write(frame, tmp_path / 'car.csv')}?frame={'body' if 'yaw' in given else 'world'}"
+    course = np.exp(1j * np.arctan2(1.5, r - 0.5) * (given in ("", "speed,yaw_rate")))
+    for option in ("", "&antenna=1.5/0.5/9", "&antenna=car:1.5/0.5/9"):
+        off = bool(option) * arm * course
+        rec = load_log(file + option).recording
+        assert_allclose(rec.gnss[0, :, 0] @ [1, 1j, 0], seen - off * ahead, atol=0.02)
+        assert ("car (1.5, 0.5, 0 m forward, left, up, by" in " ".join(rec.notes)) == bool(option)

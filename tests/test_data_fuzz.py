@@ -1,6 +1,7 @@
 """Mutated files: whatever stands in one, a reader keeps its contract (`tests/fuzz/contract.py`)."""
 
 import os
+import re
 from pathlib import Path
 
 import numpy as np
@@ -20,21 +21,17 @@ def mutated(text: str, rng: np.random.Generator) -> bytes:
         lines = data.split("\n")
         line = int(rng.integers(len(lines)))
         if kind <= 2:
-            words = (
-                data.replace(",", "\0,\0")
-                .replace(" ", "\0 \0")
-                .replace('"', '\0"\0')
-                .replace("\n", "\0\n\0")
-                .split("\0")
-            )
+            words = re.split('([, "\n])', data)
             words[int(rng.integers(len(words)))] = str(rng.choice(TOKENS))
             data = "".join(words)
         elif kind == 3:
             data = data[:at] + chr(int(rng.choice([*range(32, 127), 0, 9, 228, 8232]))) + data[at + 1 :]
         elif kind == 4:
-            data = "\n".join([*lines[: line + 1], *lines[line:]])
+            lines.insert(line, lines[line])
+            data = "\n".join(lines)
         elif kind == 5:
-            data = "\n".join([*lines[:line], *lines[line + 1 :]])
+            del lines[line]
+            data = "\n".join(lines)
         elif kind == 6:
             other = int(rng.integers(len(lines)))
             lines[line], lines[other] = lines[other], lines[line]

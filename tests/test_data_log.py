@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pymap3d
 import pytest
 from conftest import refused
 from logs import NOISE, drive, long, observed, write
@@ -31,11 +32,13 @@ def test_a_recording_comes_back_from_its_rows(tmp_path: Path, suffix: str) -> No
     means = true.velocity.copy()
     means[:, 1:] = (means[:, 1:] + means[:, :-1]) / 2  # trapezoids between samples at the steps
     assert_allclose(found.velocity, means, atol=1e-4)  # stamps have 7 digits behind the point
-    for name in ("step", "observer", "neighbour"):
-        one = pd.DataFrame({k: getattr(true.links, k) for k in ("step", "observer", "neighbour")})
-        other = pd.DataFrame({k: getattr(found.links, k) for k in ("step", "observer", "neighbour")})
-        order, back = (f.sort_values(["step", "observer", "neighbour"]).index for f in (one, other))
-        np.testing.assert_array_equal(one.loc[order, name], other.loc[back, name])
+    keys = ["step", "observer", "neighbour"]
+    one, other = (
+        pd.DataFrame({key: getattr(recording.links, key) for key in keys}).sort_values(keys)
+        for recording in (true, found)
+    )
+    np.testing.assert_array_equal(one, other)
+    order, back = one.index, other.index
     assert_allclose(found.relative[0, back], true.relative[0, order], atol=1e-9)
     sent = true.broadcasts[true.links.step, true.links.neighbour]
     wanted = np.where(sent, true.arrival[0], -1)
@@ -60,7 +63,6 @@ def test_degrees_are_metres_by_the_radii_of_curvature(tmp_path: Path, latitude: 
 
 
 def test_a_drive_in_degrees_is_one_in_metres(tmp_path: Path) -> None:
-    pymap3d = pytest.importorskip("pymap3d")
     fleet = drive(1)
     origin = (48.14, 11.58, 520.0)
     lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, 0].T, *origin)
@@ -99,13 +101,12 @@ def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path: Path) -> N
     """The observer turns at 0.5 rad/s and measures a road-side unit between the steps; closed form, there and at the
     step."""
     t = np.arange(0, 10, 0.1)
-    heading = 0.3 + 0.5 * t
-    x = np.column_stack([np.sin(heading), -np.cos(heading)]) * 6 - np.array([np.sin(0.3), -np.cos(0.3)]) * 6
+    at = t[10:90:5] + 0.04
+    heading = 0.3 + 0.5 * np.append(t, at)
+    way = 6 * np.column_stack([np.sin(heading) - np.sin(0.3), np.cos(0.3) - np.cos(heading)])
+    (x, own), (heading, h) = (np.split(values, [len(t)]) for values in (way, heading))
     wide = pd.DataFrame({"t": t, "vehicle": "car", "x": x[:, 0], "y": x[:, 1], "speed": 3.0, "yaw_rate": 0.5})
     wide.loc[::50, "heading"] = np.arctan2(np.sin(heading[::50]), np.cos(heading[::50]))
-    at = t[10:90:5] + 0.04
-    h = 0.3 + 0.5 * at
-    own = np.column_stack([np.sin(h), -np.cos(h)]) * 6 - np.array([np.sin(0.3), -np.cos(0.3)]) * 6
     gap = np.array([20.0, 5.0]) - own
     azimuth = np.arctan2(gap[:, 1], gap[:, 0])
     body = np.arctan2(np.sin(azimuth - h), np.cos(azimuth - h))

@@ -25,10 +25,8 @@ FEW = {"method": "gnss,kalman,joint,bound", "max_neighbours": "0,2"}
 
 
 def truth(fleet: co.Fleet) -> pd.DataFrame:
-    steps, vehicles = np.indices(fleet.present.shape)
-    frame = pd.DataFrame({"t": fleet.t[steps.ravel()], "vehicle": np.array(fleet.ids)[vehicles.ravel()]})
-    frame[["x", "y", "z"]] = fleet.position.reshape(-1, 3)
-    return frame
+    frame = pd.DataFrame(fleet.position.reshape(-1, 3), columns=[*"xyz"])
+    return frame.assign(t=np.repeat(fleet.t, len(fleet.ids)), vehicle=fleet.ids * len(fleet.t))
 
 
 @pytest.fixture(scope="module")
@@ -132,11 +130,6 @@ def test_a_truth_with_another_clock_is_named(folders: Path, tmp_path: Path) -> N
     assert offsets == pytest.approx([1.0] * len(offsets), abs=0.3)
 
 
-def _changed(frame: pd.DataFrame, kinds: list[str], change: object) -> pd.DataFrame:
-    here = frame["kind"].isin(kinds)
-    return frame.assign(value=np.where(here, change(frame["value"]), frame["value"]))  # type: ignore[operator]
-
-
 WRONG = {
     "speeds in km/h": (["vx", "vy"], lambda v: 3.6 * v, r"fixes travel 0\.2\d times as far.*speed_kmh"),
     "speeds in miles an hour": (
@@ -154,7 +147,8 @@ WRONG = {
 @pytest.mark.parametrize("case", WRONG)
 def test_the_check_says_what_looks_wrong(tmp_path: Path, case: str) -> None:
     kinds, change, message = WRONG[case]
-    frame = _changed(long(observed(drive(4, gap=15.0)), messages=False), kinds, change)
+    frame = long(observed(drive(4, gap=15.0)), messages=False)
+    frame["value"] = frame["value"].mask(frame["kind"].isin(kinds), change(frame["value"]))
     warnings = check(read_log(write(frame, tmp_path / "log.csv"))).warnings
     assert any(pd.Series([warning]).str.contains(message, regex=True)[0] for warning in warnings), warnings
 

@@ -73,6 +73,8 @@ MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
     "ranges alone, in body frames": (RANGES, {"dt": 0.5, "frame": "body"}, "fixes, odometry"),
     "a truth of other vehicles": (GOOD, {"truth": "t,vehicle,x,y\n0,rot,0,0\n1,rot,8,0\n"}, "column vehicle"),
     "a clock of an unknown vehicle": (GOOD, {"clock": {"bleu": 0.1}}, ""),
+    "an antenna of an unknown vehicle": (GOOD, {"antenna": {"bleu": (1, 0, 0)}}, ""),
+    "an antenna of what has no course": (STILL.replace("0.8", "0"), {"antenna": (1, 0, 0)}, "antenna of red"),
     "a misspelt option": (GOOD, {"dts": 0.1}, "option"),
     "steps longer than the log": (GOOD, {"dt": 5.0}, "dt"),
     "one instant": ("t,vehicle,x,y\n3,red,0,0\n3,blue,9,0\n", {}, "log.csv: t"),
@@ -109,7 +111,16 @@ def test_all_unknown_kinds_are_named_at_once(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "option", [{"columns": 3}, {"kinds": [1]}, {"ignore": 3}, {"origin": (1, 2)}, {"any_scale": "x"}, {"dt": "x"}]
+    "option",
+    [
+        {"columns": 3},
+        {"kinds": [1]},
+        {"ignore": 3},
+        {"antenna": (1, 2)},
+        {"origin": (1, 2)},
+        {"any_scale": "x"},
+        {"dt": "x"},
+    ],
 )
 def test_options_of_the_wrong_kind_are_refused(tmp_path: Path, option: dict[str, Any]) -> None:
     (tmp_path / "log.csv").write_text(GOOD)
@@ -277,6 +288,7 @@ def test_options_behind_a_question_mark_are_those_of_python(tmp_path: Path) -> N
     for words, message in (
         ("origin=48.1,11.5", "must be latitude, longitude and height"),
         ("clock=a:soon", "must be vehicle:seconds pairs"),
+        ("antenna=a:1/2", "must be metres forward/left/up"),
         ("kinds=uwb", "must be word:kind pairs"),
         ("dt=x", "must be a number of SI units"),
         ("any_scale=yes", "must be true or false"),

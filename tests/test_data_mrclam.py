@@ -143,8 +143,7 @@ def test_the_study_runs_on_any_set(which: str, other_set: Path, tmp_path: Path) 
     data = FOLDER if which == "set 6" else other_set
     most = 4 if which == "set 6" else 3
     settings: dict[str, Any] = {"data": str(data), "max_neighbours": f"0,{most}", "landmarks": "0,15"}
-    settings["calibrate_s"] = 200.0
-    settings["evaluations"] = 9
+    settings |= {"calibrate_s": 200.0, "evaluations": 9}
     results = co.run_study("real", tmp_path, settings=settings, progress=False)
     assert results.failed == 0
     frame = results.select(method="pose-fleet")

@@ -1,6 +1,6 @@
 """NMEA and ROS bags: logs of receivers and robots, checked against pynmeagps, pymap3d and what the test wrote."""
 
-import builtins
+import sys
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from datetime import UTC, datetime, timedelta
@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 import pandas as pd
+import pymap3d
 import pytest
 from conftest import refused
 from logs import at, bends, drive, outliers, ranges, write
@@ -34,7 +35,6 @@ def degrees(value: float, wide: int) -> str:
 
 def nmea(fleet: co.Fleet, column: int, start: datetime, rmc: bool = True) -> str:
     """A vehicle of a fleet, driven in Munich."""
-    pymap3d = pytest.importorskip("pymap3d")
     lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, column].T, 48.14, 11.58, 560.0)
     lines = []
     for k, t in enumerate(fleet.t - fleet.t[0]):
@@ -63,10 +63,8 @@ def test_nmea_is_fixes_speed_and_course(tmp_path: Path) -> None:
     assert_allclose(rec.velocity[0, 2:], fleet.velocity[2:], atol=0.05)
     assert rec.t[0] == pytest.approx((start - datetime(1970, 1, 1)).total_seconds())
     assert rec.sensors.gnss_std == pytest.approx((0.01, 0.02, 0.05))
-    without = tmp_path / "gga"
-    without.mkdir()
-    (without / "a.nmea").write_text(nmea(fleet, 0, start, rmc=False))
-    rec = read_log(without, origin=(48.14, 11.58, 560.0)).recording
+    (tmp_path / "a.nmea").write_text(nmea(fleet, 0, start, rmc=False))
+    rec = read_log(tmp_path / "a.nmea", origin=(48.14, 11.58, 560.0)).recording
     assert len(rec.t) == 100
     assert np.linalg.norm(rec.velocity[0, 5:-5, 0], axis=-1) == pytest.approx(8.0, abs=0.2)
 
@@ -120,22 +118,15 @@ def test_damaged_sentences_are_counted(tmp_path: Path) -> None:
 def test_without_pynmeagps_the_pip_line_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     (tmp_path / "a.nmea").write_text("x")
     (tmp_path / "a.bag").write_text("x")
-    real = builtins.__import__
-
-    def without(name: str, *rest: Any) -> Any:
-        if name.split(".")[0] in ("pynmeagps", "rosbags"):
-            raise ImportError(name)
-        return real(name, *rest)
-
-    monkeypatch.setattr(builtins, "__import__", without)
-    for file, extra in (("a.nmea", "nmea"), ("a.bag", "ros")):
+    for file, extra, library in (("a.nmea", "nmea", "pynmeagps"), ("a.bag", "ros", "rosbags.highlevel")):
+        monkeypatch.setitem(sys.modules, library, None)
         with pytest.raises(co.MissingLibraryError, match=rf"pip install .*\[{extra}\]'"):
             read_log(tmp_path / file)
 
 
 def test_the_cats_cars_agree_with_pynmeagps_and_pymap3d(shared: Path) -> None:
     """Real data: 100 positions of the first car, parsed and converted by the libraries alone."""
-    pynmeagps, pymap3d = pytest.importorskip("pynmeagps"), pytest.importorskip("pymap3d")
+    pynmeagps = pytest.importorskip("pynmeagps")
     log = read_log(shared / "cats_nmea" / "AV_veh1.nmea", dt=0.1)
     lines = (shared / "cats_nmea" / "AV_veh1.nmea").read_bytes().splitlines()[:100]
     parsed = [pynmeagps.NMEAReader.parse(line + b"\r\n") for line in lines]
@@ -150,10 +141,9 @@ def test_the_cats_cars_agree_with_pynmeagps_and_pymap3d(shared: Path) -> None:
 def test_a_bag_is_read(tmp_path: Path, ros: int) -> None:
     """Written here: fixes, odometry and imu of two vehicles, a truth by PoseStamped, and a topic of another kind."""
     pytest.importorskip("rosbags")
-    pymap3d = pytest.importorskip("pymap3d")
     fleet = drive(2, steps=80, start=1.7e9)
     path = tmp_path / ("drive.bag" if ros == 1 else "drive")
-    write_bag(path, fleet, pymap3d, ros)
+    write_bag(path, fleet, ros)
     log = read_log(path, origin=(48.14, 11.58, 560.0), dt=0.1)
     rec = log.recording
     assert rec.ids == ("car0", "car1")
@@ -171,9 +161,8 @@ def test_a_bag_is_read(tmp_path: Path, ros: int) -> None:
 def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path: Path) -> None:
     """A pose of another program beside fixes in degrees; a simulator's truth by Odometry, whose heading counts."""
     pytest.importorskip("rosbags")
-    pymap3d = pytest.importorskip("pymap3d")
     fleet, path = drive(2, steps=80, start=1.7e9), tmp_path / "drive"
-    write_bag(path, fleet, pymap3d, 2, names={"truth": "pose"})
+    write_bag(path, fleet, 2, names={"truth": "pose"})
     with refused("topics of a bag"):
         read_log(path, dt=0.1)
     without = read_log(path, dt=0.1, ignore=["/car0/pose"])
@@ -196,7 +185,6 @@ def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path: Path) -> None:
 
 def test_topics_as_tables_are_the_bag(tmp_path: Path) -> None:
     """A folder per namespace, a column per field; speeds stay along the vehicle, whose imu has the heading."""
-    pymap3d = pytest.importorskip("pymap3d")
     fleet = drive(2, steps=80, start=1.7e9)
     for k, name in enumerate(fleet.ids):
         lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, k].T, 48.14, 11.58, 560.0)
@@ -227,7 +215,7 @@ def test_topics_as_tables_are_the_bag(tmp_path: Path) -> None:
 def test_times_of_a_bag_are_those_of_its_headers_or_of_its_reception(tmp_path: Path) -> None:
     pytest.importorskip("rosbags")
     fleet = drive(1, steps=60, start=1.7e9)
-    write_bag(tmp_path / "drive", fleet, pytest.importorskip("pymap3d"), 2, late=0.25)
+    write_bag(tmp_path / "drive", fleet, 2, late=0.25)
     by_header, received = (read_log(tmp_path / "drive", dt=0.1, stamps=stamps) for stamps in ("header", "received"))
     assert received.recording.t[0] - by_header.recording.t[0] == pytest.approx(0.25, abs=1e-5)
     assert "times are those of stamps=header; headers are between 0.25 and 0.25 s before" in str(by_header.summary)
@@ -262,7 +250,6 @@ def test_cars_with_receivers_uwb_and_clocks_that_differ(tmp_path: Path) -> None:
 def write_bag(
     path: Path,
     fleet: co.Fleet,
-    pymap3d: Any,
     ros: int,
     names: Mapping[str, str] = MappingProxyType({}),
     late: float = 0.0,

@@ -46,7 +46,7 @@ def test_the_table_of_the_page_is_a_log(tmp_path: Path) -> None:
 @pytest.mark.slow
 def test_every_command_runs(folder: Path) -> None:
     commands = [line for block in blocks("sh") for line in block.splitlines()]
-    assert len(commands) == 8
+    assert len(commands) == 10
     for command in commands[1:]:
         done = ran([*COOPOC, *words(command)[1:]], cwd=folder)
         assert done.returncode == 0, done.stderr
@@ -68,6 +68,7 @@ def test_every_block_of_python_runs(folder: Path) -> None:
     assert done.returncode == 0, done.stderr
     assert "not used" not in done.stdout
     assert "read: 180 fixes, 2700 ranges" in done.stdout
+    assert "29.54 m\n30.0 m" in done.stdout
     error = float(re.findall(r"\[\[([\d.]+)\]\]", done.stdout)[0])
     assert error < 1.0
 

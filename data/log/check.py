@@ -381,7 +381,7 @@ def _of_truth(c: Check) -> list[str]:
     if truth is None:
         return []
     for column, name in enumerate(rec.ids):
-        every = np.asarray(rec.gnss[0, :, column] - truth.position[:, column])
+        every = rec.gnss[0, :, column] - truth.position[:, column]
         both = np.isfinite(every[:, 0])
         gap, velocity = every[both, :2], rec.velocity[0, :, column, :2][both]
         up, sure = _median(every[both, 2]) if len(gap) >= FEW and np.ptp(rec.gnss[0, both, column, 2]) else (0.0, 0.0)
@@ -487,8 +487,8 @@ def _by_pair(c: Check, k: int) -> Iterator[tuple[str, Floats, Floats]]:
 def _outliers(c: Check, k: int, stated: float) -> float:
     """Share of measurements beyond 5 standard deviations of the running median of their pair: errors of the filters
     last longer than that window."""
-    near = [value - pd.Series(value).rolling(WINDOW, 1, center=True).median() for _, value, _ in _by_pair(c, k)]
-    off = np.concatenate(near)
+    near = (value - pd.Series(value).rolling(WINDOW, 1, center=True).median() for _, value, _ in _by_pair(c, k))
+    off = np.concatenate([*near])
     return float(np.mean(np.abs(off) > OUTLYING * max(robust_std(off), 0.2 * stated)))
 
 

@@ -105,14 +105,12 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
     broadcasts = recording.broadcasts
     if not logged:
         still = np.zeros((len(recording.t), len(recording.ids), 3))
-        times = v2x.loss > 0 and recording.runs == 1
-        runs = runs if times else recording.runs
+        runs = runs if v2x.loss > 0 and recording.runs == 1 else recording.runs
         broadcasts, arrival = schedule(Fleet(recording.ids, recording.t, still, still), fewer, v2x, runs, seed)
         parts["arrival"] = np.where(np.isin(fewer.neighbour, marks), -1, arrival)
         broadcasts = broadcasts & np.isfinite(recording.velocity[0, :, :, 0])
         broadcasts[..., marks] = False
-        if times:
-            parts = {name: np.broadcast_to(part, (runs, *part.shape[1:])) for name, part in parts.items()}
+        parts = {name: np.broadcast_to(part, (runs, *part.shape[1:])) for name, part in parts.items()}
     return replace(recording, links=fewer, broadcasts=broadcasts, v2x=v2x, **parts)
 
 

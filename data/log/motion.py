@@ -4,13 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
 
-from coopoc.arrays import Bools, Floats, Ints
+from coopoc.arrays import Bools, Floats, Ints, checked
 from coopoc.errors import InputError
+from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
 
 from ..assemble import SAME, longest_gap, nearest, smooth, steps_of
@@ -23,7 +24,10 @@ STANDS = 0.5
 COURSE_RATE = 0.25
 """Half-power frequency, in fixes, of the smoother that makes velocities of fixes."""
 COURSE = "the heading of {} is the course of the {}: no vehicle slips or reverses"
+ARM = "fixes are those of the reference point, less the arm to the antenna, of {}; none slips or reverses"
 DERIVED = "the velocity of {} is derived from the fixes: their errors depend on each other"
+
+AHEAD: Floats = np.array([1.0, 0.0, 0.0])
 
 HeadingAt = Callable[[Floats], Floats]
 
@@ -109,16 +113,21 @@ def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 
     return Signal(table.index[whole].to_numpy(), table[whole].to_numpy(copy=True))
 
 
-def member(name: str, rows: Rows, steps: Steps) -> Member:
+def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
     """A vehicle, or what stands: a road-side unit, in body frames a landmark, has fixes at one instant and no odometry.
+
+    With an arm a, a fix z becomes that of the reference point, z - R(h) a; h is the heading that was measured, else the
+    course of what moves, turned by the yaw rate in between, at both ends the nearest one.
 
     Args:
         name: its id.
         rows: its own, in SI units and metres.
         steps: of the recording.
+        arm: (3,) m forward, left, up to the antenna; None: fixes are those of the reference point.
 
     Raises:
-        InputError: neither odometry nor two fixes, a speed without a heading; in body frames no speed or yaw rate.
+        InputError: neither odometry nor two fixes, a speed or an arm without a heading; in body frames no speed or yaw
+            rate.
     """
     grid, summary, body = steps.grid, steps.summary, steps.body
     fixes = samples(rows, ("x", "y", "z"), summary, 2 if steps.planar else 3)
@@ -128,10 +137,21 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
     still: Floats = np.zeros((len(grid), 3))
     none: Floats = np.full(len(grid), np.nan)
     if len(fixes.t) == 1 and not in_group(rows, "odometry").any():
-        text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m"
+        text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m{', arm left in' * (arm is not None)}"
         heading = heading_at(measured, None, np.inf) if len(measured.t) and not body else None
         return Member(still + fixes.value[0], still, heading, text, "", True, still[:, 0], none)
     derived = velocity_of_fixes(fixes, steps.gap(fixes.t)) if len(fixes.t) > 1 else None
+    if arm is not None:
+        off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
+        world, ever = samples(rows, ("vx", "vy"), Summary(), 2), steps._replace(max_gap=np.inf)
+        pointing, source = _heading(measured, turn, ((world, "odometry"), (derived, "fixes")), ever)
+        if pointing is None or not np.isfinite(off).all():
+            hint = f"Log heading or compass_deg, or vx and vy; a course counts above {MOVING:g} m/s."
+            raise InputError(f"antenna of {name}", f"{arm} m", "needs numbers, and a heading of the vehicle", hint)
+        by = f"{f'the course of the {source}' if source else 'its heading'}"
+        summary.assume(ARM, f"{name} ({', '.join(map('{:g}'.format, off))} m forward, left, up, by {by})")
+        fixes = Signal(fixes.t, fixes.value - turned(off, pointing(fixes.t)))
+        derived = derived and velocity_of_fixes(fixes, steps.gap(fixes.t))
     if body:
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
             if not len(signal.t):
@@ -142,8 +162,8 @@ def member(name: str, rows: Rows, steps: Steps) -> Member:
         heading = heading_at(measured, turn, np.inf) if len(measured.t) else None
         along, _ = _heading(measured, turn, ((derived, "fixes"),), steps)
         forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
-        carried: Floats = still if along is None else np.nan_to_num(forward * _ahead(along(grid)))
-        velocity: Floats = forward * [1.0, 0.0, 0.0]
+        carried: Floats = still if along is None else np.nan_to_num(forward * turned(AHEAD, along(grid)))
+        velocity: Floats = forward * AHEAD
     else:
         moved, heading, course = _in_world(name, rows, (measured, turn, speed), derived, steps)
         signals, rate = [moved], none
@@ -172,8 +192,7 @@ def _in_world(
     """Velocity at its own times, heading, and whose course the heading is; `body` are heading, yaw rate and speed."""
     summary, (measured, turn, speed) = steps.summary, body
     world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), rows[rows["kind"] == "speed"]
-    rate = turn if len(turn.t) > 1 else None
-    heading, course = _heading(measured, rate, ((world, "odometry"), (derived, "fixes")), steps)
+    heading, course = _heading(measured, turn, ((world, "odometry"), (derived, "fixes")), steps)
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
         return Signal(world.t, np.nan_to_num(world.value)), heading, course
@@ -182,10 +201,10 @@ def _in_world(
         if course:
             summary.assume(COURSE.format("{}", course), name)
         angle = np.full(len(standing), np.nan) if heading is None else heading(speed.t)
-        turned = np.isfinite(angle) | standing
-        summary.refuse("speeds without a heading", speeds[speeds["t"].isin(speed.t[~turned])])
-        velocity = speed.value * np.nan_to_num(_ahead(angle))
-        return Signal(speed.t[turned], velocity[turned]), heading, course
+        known = np.isfinite(angle) | standing
+        summary.refuse("speeds without a heading", speeds[speeds["t"].isin(speed.t[~known])])
+        velocity = speed.value * np.nan_to_num(turned(AHEAD, angle))
+        return Signal(speed.t[known], velocity[known]), heading, course
     if len(speed.t):
         allowed, hint = "needs heading, compass_deg, or fixes of a moving vehicle", "Add one, or give vx and vy."
         raise InputError(f"{place(speeds)}, speed", f"of {name}, which has no heading", allowed, hint)
@@ -197,9 +216,10 @@ def _in_world(
 
 
 def _heading(
-    measured: Signal, rate: Signal | None, moves: Sequence[tuple[Signal | None, str]], steps: Steps
+    measured: Signal, turn: Signal, moves: Sequence[tuple[Signal | None, str]], steps: Steps
 ) -> tuple[HeadingAt | None, str]:
     """Heading that was measured, else the course of the first of `moves` that moves, and whose course it is."""
+    rate = turn if len(turn.t) > 1 else None
     if len(measured.t):
         return heading_at(measured, rate, steps.gap(measured.t)), ""
     for velocity, source in moves:
@@ -207,11 +227,6 @@ def _heading(
             east, north = velocity.value[moving, :2].T
             return heading_at(Signal(velocity.t[moving], np.arctan2(north, east)[:, None]), rate, np.inf), source
     return None, ""
-
-
-def _ahead(heading: Floats) -> Floats:
-    """(M, 3) unit vectors."""
-    return np.column_stack([np.cos(heading), np.sin(heading), 0 * heading])
 
 
 def _longest(there: Bools, grid: Floats) -> str:

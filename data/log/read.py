@@ -15,6 +15,7 @@ from coopoc.errors import InputError, suggestion
 from coopoc.file_names import given_path
 from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
+from coopoc.world.fleet import columns as columns_of
 from coopoc.world.links import wrap
 from coopoc.world.recording import MEASURED, Body, Recording
 from coopoc.world.sensors import Sensors
@@ -109,6 +110,7 @@ def read_log(
     std: Mapping[str, float] | None = None,
     stamps: Stamps = "header",
     clock: Mapping[str, float] | None = None,
+    antenna: Mapping[str, Sequence[float]] | Sequence[float] | None = None,
     origin: Origin | None = None,
     truth: str | Path | None = None,
     sensors: Sensors | None = None,
@@ -136,6 +138,8 @@ def read_log(
         std: kind in SI units -> standard deviation of all its measurements, as {"range": 0.15, "x": 1.5}.
         stamps: times of a bag's messages: those of the headers, or those at which they were "received".
         clock: vehicle -> s by which its clock is ahead; it is subtracted from its stamps.
+        antenna: m forward, left, up from the reference point of all that move to their antennas, or vehicle -> these,
+            as {"car1": (1.2, 0.3, 0.0)}: fixes become those of the reference points (`motion.member`).
         origin: latitude deg, longitude deg, height m of the local frame; None: the first fix.
         truth: file of the truth, if it is not in the folder under that name; topic in a bag.
         sensors: noise that methods may assume; None: the standard deviations in the log, else `Sensors()`.
@@ -196,7 +200,9 @@ def read_log(
     summary.refuse("odometry and headings of vehicles without a position", rows[carried])
     grid = _grid(rows, dt, body, summary)
     steps = Steps(grid, max_gap, not (rows["kind"] == "z").any(), body, summary)
-    members = {name: member(name, rows[rows["vehicle"] == name], steps) for name in ids}
+    arms = antenna if isinstance(antenna, Mapping) else dict.fromkeys(ids, antenna)
+    columns_of("antenna", [*named("antenna", arms, "Give antenna={name: (forward, left, up)}.")], ids)
+    members = {name: member(name, rows[rows["vehicle"] == name], steps, arms.get(name)) for name in ids}
     recording = _recording(rows, members, steps, mutual and not body, sensors)
     fleet = None
     if len(true_rows):
