@@ -41,6 +41,15 @@ def shown(value: object, longest: int = 60) -> str:
         return f"a {type(value).__name__}"
 
 
+def first_line(error: BaseException) -> str:
+    """What an error says, or its class.
+
+    >>> first_line(ValueError("two\\nlines")), first_line(KeyError())
+    ('two', 'KeyError')
+    """
+    return next(iter(str(error).splitlines()), type(error).__name__)[:200]
+
+
 def _cut(value: object) -> str:
     """What a file holds may be of any length, and what a caller gives may have no text."""
     try:

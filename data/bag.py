@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from coopoc.arrays import one_of
-from coopoc.errors import InputError, MissingLibraryError, unknown
+from coopoc.errors import InputError, MissingLibraryError, first_line, unknown
 
 from .cells import numeric
 from .log.units import Rows, Summary, rows_of
@@ -34,7 +34,13 @@ FIELDS = {
     "angular_velocity.z": "yaw_rate",
     **{f"pose.position.{axis}": axis for axis in "xyz"},
 }
-"""Column of a topic -> kind; deviations are given with std=."""
+"""Column of a topic -> kind; deviations of others than fixes are given with std=."""
+VARIANCES = {
+    f"position_covariance{form.format(k)}": f"{kind}_std"
+    for form in ("[{}]", "_{}")
+    for k, kind in ((0, "longitude"), (4, "latitude"), (8, "height"))
+}
+"""Column of a topic, as several programs call it -> deviation; zeros mean unknown."""
 Number = tuple[str, float, float]
 """Kind, value and standard deviation."""
 
@@ -108,8 +114,7 @@ def read_bag(
     except InputError:
         raise
     except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
-        given = next(iter(str(error).splitlines()), type(error).__name__)[:200]
-        raise InputError(path.name, given, "must be a ROS bag", "Record it again, or reindex it.") from None
+        raise InputError(path.name, first_line(error), "must be a ROS bag", "Record it again, or reindex it.") from None
     if behind:
         other = "received" if stamps == "header" else "header"
         spread = f"between {min(behind):.3g} and {max(behind):.3g} s before they were received"
@@ -159,6 +164,9 @@ def of_topic(frame: pd.DataFrame, file: str, summary: Summary, true: bool) -> pd
     if true:
         frame = frame.rename(columns=lambda name: name.replace("pose.pose.", "pose."))
     made |= {kind: numeric(frame, name, file) for name, kind in FIELDS.items() if name in frame}
+    for std, name in ((std, name) for name, std in VARIANCES.items() if name in frame):
+        variance = numeric(frame, name, file)
+        made[std] = np.sqrt(np.where(variance > 0, variance, np.nan))
     turn = "pose.orientation" if true else "orientation"
     if {f"{turn}.{axis}" for axis in "xyzw"} <= {*frame}:
         made["heading"] = _yaw(*(numeric(frame, f"{turn}.{axis}", file) for axis in "xyzw"))

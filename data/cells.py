@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.arrays import Bools, Floats, named, number
-from coopoc.errors import InputError, require, suggestion, unknown
+from coopoc.errors import InputError, first_line, require, suggestion, unknown
 from coopoc.formats.values import LARGEST
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def read_frame(path: Path, *text: str) -> pd.DataFrame:
     except (InputError, ImportError):
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
-        raise _no_table(path, next(iter(str(error).splitlines()), type(error).__name__)[:200]) from None
+        raise _no_table(path, first_line(error)) from None
     frame.columns = pd.Index([str(name).strip() for name in frame.columns])
     _check_header(path, list(frame.columns))
     frame.index += 1

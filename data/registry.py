@@ -15,7 +15,7 @@ from coopoc.file_names import given_path
 from coopoc.one_file import in_file
 from coopoc.plugins import find, names
 from coopoc.world.fleet import Fleet
-from coopoc.world.storage import is_recording, read_recording
+from coopoc.world.storage import read_recording
 
 from .cells import TABLES
 from .fleet_files import read_fcd, read_table, read_tum, tum_files, write_table
@@ -210,10 +210,8 @@ def _real(path: Path, columns: Mapping[str, str] | None = None) -> str:
     """Format of measurements, "" for anything else."""
     if (path / "Barcodes.dat").is_file():
         return "mrclam"
-    if path.suffix == ".npz":
-        return "recording" if is_recording(path) else ""
-    if path.suffix == ".pyfg":
-        return "pyfg"
+    if path.suffix in (".npz", ".pyfg"):
+        return "recording" if path.suffix == ".npz" else "pyfg"
     tum = path.is_dir() and any(path.glob("*.tum"))
     return "log" if not tum and is_log(path, columns) else ""
 

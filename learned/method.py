@@ -14,7 +14,7 @@ from torch import Tensor
 from coopoc.arrays import Floats
 from coopoc.errors import InputError, shown
 from coopoc.methods.stream import Stream
-from coopoc.methods.track import Track, check_options, lost
+from coopoc.methods.track import Track, check_options, lost, silent_track
 from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message
@@ -83,12 +83,7 @@ class LearnedGain:
         fixes, speeds = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
         held = ((fixes == origin) | np.isnan(fixes)).all(axis=(0, 1)) & (speeds == 0.0).all(axis=(0, 1))
         estimates = np.where(held, x0[:, None], estimates)  # a net has no height for a drive in one plane
-        silent = np.zeros((recording.runs, len(columns)))
-        seconds = time.perf_counter() - began
-        notes = lost(estimates, recording, columns, DIVERGED)
-        return Track(
-            recording.t, tuple(columns), estimates, None, silent, silent, seconds, notes=notes, ids=recording.ids
-        )
+        return silent_track(recording, columns, estimates, None, began, lost(estimates, recording, columns, DIVERGED))
 
     def _lanes(self, recording: Recording, columns: list[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Fixes and velocities (R E, T - 1, 3) and starts (R E, 3) for the net, relative to the first fix."""

@@ -100,12 +100,7 @@ def train_all(
     else:
         for group in missing:
             _train(group, fleet, out, worst, progress)
-    return {job.label: _loaded(job, path) for job, path in paths.items()}
-
-
-def _loaded(job: Job, path: Path) -> Checkpoint:
-    """The checkpoint of a job, which names the file of its net."""
-    return load(path, job.recipe.net if in_file(job.recipe.net) else "")
+    return {job.label: load(path, job.recipe.net if in_file(job.recipe.net) else "") for job, path in paths.items()}
 
 
 def _train(group: Sequence[Job], fleet: Drives, out: Path, worst: float, progress: bool) -> None:

@@ -6,6 +6,7 @@ import json
 import re
 import sys
 import time
+import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
@@ -17,7 +18,7 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from coopoc.arrays import number
-from coopoc.errors import InputError, unknown
+from coopoc.errors import InputError, first_line, unknown
 from coopoc.evaluate.scores import scored
 from coopoc.evaluate.statistics import mean_interval, paired_difference
 from coopoc.file_names import given_path
@@ -28,6 +29,7 @@ from coopoc.plugins import find, names
 from coopoc.study.numbers import three
 from coopoc.study.provenance import environment
 
+from .lineup import own
 from .roads import road_row, roads
 from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, VERSION, Task, bound, graph_row, pose_row, recording
 
@@ -103,7 +105,7 @@ def method(name: str) -> Method:
         InputError: an unknown name.
     """
     if in_file(name) or name in names("coopoc.methods"):
-        made: Method = find("coopoc.methods", name)("nominal")
+        made: Method = own(name)
         return made
     from coopoc.learned import load_method
     from coopoc.learned.recipes import shipped_weights
@@ -152,7 +154,7 @@ def measured(name: str, data: Path) -> list[dict[str, Any]]:
         files = tqdm(BEST, desc=name, unit="graph", delay=2.0)
         return [_row(file, partial(graph_row, data, file, name)) for file in files]
     if name in POSES or (in_file(name) and not _on_roads(name)):
-        made: Any = find("coopoc.methods", name)("nominal") if in_file(name) else name
+        made: Any = own(name) if in_file(name) else name
         return [_row(task.name, partial(pose_row, task, data, made)) for task in LOGGED]
     if not (one := method(name)).cooperative:
         return [_row(task, partial(road_row, task, data, one)) for task in roads(data)]
@@ -163,7 +165,8 @@ def _row(task: str, made: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     try:
         return made()
     except Exception as error:  # a failure is a row
-        return {"task": task, "failed": f"{type(error).__name__}: {str(error).splitlines()[0] if str(error) else ''}"}
+        print(f"coopoc: failed: {task}", *traceback.format_exc().splitlines()[-5:], sep="\n  ", file=sys.stderr)
+        return {"task": task, "failed": f"{type(error).__name__}: {first_line(error)}"}
 
 
 def simulated(name: str) -> bool:

@@ -157,12 +157,6 @@ def _rate(results: Results, where: Where, kind: Kind = "payload") -> int | None:
     return None if account is None else round(account.rate(kind))
 
 
-def _trainings(results: Results) -> dict[str, Ledger]:
-    """The ledgers of the trainings that the study has run, by label."""
-    ran = [name for name in TRAINED if present(results, {"method": name})]
-    return {look(name).label: weights.ledger(results.settings, name) for name in ran}
-
-
 def even(results: Results) -> Table | None:
     """Driving time after which online cooperation has moved as many bytes as a training, per method and channel."""
 
@@ -173,7 +167,8 @@ def even(results: Results) -> Table | None:
 
         return column
 
-    trainings = _trainings(results)
+    ran = [name for name in TRAINED if present(results, {"method": name})]
+    trainings = {look(name).label: weights.ledger(results.settings, name) for name in ran}
     once = {f"{name}, {t.per_vehicle('training') / 1e3:,.0f} kB": time(t) for name, t in trainings.items()}
     rows = [row for row in METHODS if row[1]["noise_model"] in ("nominal", "trained")] if once else []
     text = (
@@ -195,10 +190,6 @@ def duration(seconds: float) -> str:
     if not np.isfinite(seconds):
         return "never"
     return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
-def _less(results: Results, where: Where) -> Any:
-    return difference(results, where, {**where, "schedule": SCHEDULES[0]})
 
 
 METHODS = [
@@ -224,7 +215,12 @@ STUDY = lineup.study(
         "schedules": selections(
             ("Cap [B/s]", "Method"),
             [((int(cap), look(pair[0]).label), under(cap, SCHEDULES[0], *pair)) for cap in CAPS for pair in SCHEDULED],
-            {**across(interval, BY_SCHEDULE), "Difference": across(_less, BY_SCHEDULE)[SCHEDULES[1]]},
+            {
+                **across(interval, BY_SCHEDULE),
+                "Difference": across(
+                    lambda rows, where: difference(rows, where, {**where, "schedule": SCHEDULES[0]}), BY_SCHEDULE
+                )[SCHEDULES[1]],
+            },
             "RT-LE [m] when an ego receives no more than the cap, by schedule; differences are paired, with 95 % "
             f"intervals. K = {MOST} at 10 Hz.",
             best="min",

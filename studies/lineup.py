@@ -114,13 +114,29 @@ def methods(p: Params) -> list[tuple[int | None, Method]]:
     if name not in METHODS and weights.is_trained(name):
         models: list[tuple[int, Any]] = [(seed, weights.checkpoint(name, p, seed).model) for seed in weights.seeds(p)]
         return [(seed, model.method(name, first)) for seed, model in models]
-    make = METHODS[name] if name in METHODS else find("coopoc.methods", name)
-    method: Any = make(noise_model(p))
+    method: Any = METHODS[name](noise_model(p)) if name in METHODS else own(name, noise_model(p))
     if isinstance(method, Kalman):
         method = replace(method, x0=first)
     if p["noise_model"] == "fitted" and not scene.is_real(p["data"]) and hasattr(method, "robust"):
         method = replace(method, robust=False)  # fitted to quieter drives: a gate takes the acting noise for wrong
     return [(None, method)]
+
+
+def own(name: str, noise: NoiseModel | str = "nominal") -> Any:
+    """A registered method or "mine.py:NAME" under a noise model.
+
+    Raises:
+        InputError: an unknown name, a class that takes no noise model, or what no study can use.
+    """
+    try:
+        method = find("coopoc.methods", name)(noise)
+    except TypeError as error:
+        hint = "Its first argument is noise_model; docs/extend.md shows one."
+        raise InputError("method", repr(name), f"cannot be made from a noise model: {error}", hint) from error
+    if not (isinstance(method, Method) and isinstance(method.name, str)):
+        allowed = "must have a name (text), cooperative (True or False), a message, and be called with a recording"
+        raise InputError("method", repr(name), allowed, "docs/extend.md shows one.")
+    return method
 
 
 def start(p: Params) -> Floats | None:
@@ -246,24 +262,19 @@ def _ego(
         if tracked.any():
             columns = scored(method, stretch, [ego], truth, quantiles, metric)
         else:
-            columns = _without_truth(method, stretch, ego)
+            track, shape = method(stretch, [ego]), (stretch.runs, 1)
+            near = len(stretch.links.of(stretch.ids.index(ego))) / len(stretch.t)
+            columns = {
+                **innovation_columns(track, stretch),
+                **online_columns(track, stretch, method),
+                "neighbours_mean": np.full(shape, near),
+                "seconds": np.full(shape, track.seconds / stretch.runs),
+            }
         parts.append(columns)
         lengths.append(len(stretch.t))
     if not parts:
         raise InputError("egos", repr(ego), "is never there at two steps in a row, with a fix", "Choose another ego.")
     return {name: _merged(name, [part[name] for part in parts], lengths) for name in parts[0]}
-
-
-def _without_truth(method: Method, recording: Recording, ego: str) -> dict[str, AnyArray]:
-    track = method(recording, [ego])
-    near = len(recording.links.of(recording.ids.index(ego))) / len(recording.t)
-    shape = (recording.runs, 1)
-    return {
-        **innovation_columns(track, recording),
-        **online_columns(track, recording, method),
-        "neighbours_mean": np.full(shape, near),
-        "seconds": np.full(shape, track.seconds / recording.runs),
-    }
 
 
 def _merged(name: str, parts: Sequence[AnyArray], lengths: Sequence[int]) -> AnyArray:

@@ -30,6 +30,7 @@ def views(results: Results, over_time: bool) -> Plot | None:
     if not methods or not scene.is_real(data) or (over_time and not truth.present.any()):
         return None
     egos = scene.egos(data, str(results.settings["egos"]))
+    ends = list[tuple[float, float, str]]()
     rows, height = (len(egos), 0.8 + 1.5 * len(egos)) if over_time else (1, 4.0)
     with canvas(rows, width=7.2, height=height, sharex=True, sharey=True, squeeze=False) as (figure, grid):
         for ego, axes in zip(egos, grid[:, 0] if over_time else [grid[0, 0]] * len(egos), strict=True):
@@ -42,15 +43,21 @@ def views(results: Results, over_time: bool) -> Plot | None:
                 marks = {"marker": ".", "linestyle": "none"} if name == "gnss" and not over_time else {"marker": ""}
                 style = {**strokes({"method": name}), "linewidth": 1.1, "markersize": 2, **marks}
                 axes.plot(*((t, gap) if over_time else x[:, :2].T), **style)
-            frame = "axes fraction" if over_time else "data"
-            axes.annotate(picture(ego), (0.01, 0.9) if over_time else x[-1, :2], xycoords=frame)
+            ends.append((*x[-1, 1::-1], picture(ego)))
             axes.set(ylabel="Error [m]" if over_time else "North [m]")
+            if over_time:
+                axes.annotate(picture(ego), (0.01, 0.9), xycoords="axes fraction")
         axes.set(xlabel="Time [s]" if over_time else "East [m]")
         legend(grid[0, 0], [{"method": name} for name in methods])
         if over_time:
             plain_log(grid[0, 0].yaxis)
         else:
             grid[0, 0].set_aspect("equal", adjustable="datalim")
+            for rank, (north, east, name) in enumerate(sorted(ends)):  # fanned out, as paths may end side by side
+                place = {"xytext": (24, 12 * rank - 6 * len(ends)), "textcoords": "offset points"}
+                axes.annotate(
+                    name, (east, north), **place, arrowprops={"arrowstyle": "-", "lw": 0.5, "relpos": (0, 0.5)}
+                )
     what = "Paths of the vehicles; the truth is grey."
     if over_time:
         what = f"Distance from the truth over time.{' ' + HELD if 'gnss' in methods else ''}"

@@ -154,9 +154,11 @@ def cell(p: Params) -> list[Row]:
             ways = (account.of("online", "on air", way)[0] for way in ("broadcast", "per receiver"))
             moved[:, who], seconds[who] = moved[:, who] + np.stack(list(ways)), seconds[who] + account.seconds
     rows: list[Row] = []
-    for ego, name in enumerate(drive.ids):
-        for number, first in enumerate(range(start, steps - block + 1, block)):
-            found = {what: _reduced(what, score[first : first + block, ego]) for what, score in scores.items()}
+    blocks = max((steps - start) // block, 1)
+    known = np.isfinite(next(iter(scores.values()), np.empty((0, count)))[start : start + blocks * block])
+    for ego, name in enumerate(drive.ids):  # as many blocks for each vehicle, of the steps at which it can be scored
+        for number, part in enumerate(np.array_split(start + np.flatnonzero(known[:, ego]), blocks)):
+            found = {what: _reduced(what, score[part, ego]) for what, score in scores.items()}
             if any(np.isfinite(value) for value in found.values()):
                 sent, received = moved[:, ego] / seconds[ego]
                 more = {"bytes_per_second": received, "sent_bytes": once + sent * driven(p)}

@@ -95,7 +95,8 @@ def _under(log: Log, v2x: V2X, runs: int, seed: int) -> Recording:
 
 @lru_cache(maxsize=4)
 def egos(data: str, wanted: str) -> tuple[str, ...]:
-    """Ids of the egos: a number of vehicles evenly spaced over those present throughout, or ids joined by "+" or ",".
+    """Ids of the egos: a number of vehicles evenly spaced over those present throughout, or ids joined by "+", or by
+    "," where none holds one.
 
     "auto" is five of them, or all where there are fewer. Where not enough are present throughout, they are taken from
     all that are there at two steps in a row; `presence` scores them where they are.
@@ -107,7 +108,7 @@ def egos(data: str, wanted: str) -> tuple[str, ...]:
     if wanted in drive.ids:
         return (wanted,)
     if wanted != "auto" and not wanted.isdigit():
-        return tuple(drive.ids[drive.index(i.strip())] for i in wanted.replace(",", "+").split("+"))
+        return tuple(drive.ids[drive.index(i.strip())] for i in wanted.split("+" if "+" in wanted else ","))
     there = _there(data)
     throughout = [i for column, i in enumerate(drive.ids) if there[:, column].all()]
     somewhere = [i for column, i in enumerate(drive.ids) if (there[1:, column] & there[:-1, column]).any()]

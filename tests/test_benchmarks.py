@@ -3,6 +3,7 @@
 import hashlib
 import importlib
 import json
+import re
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -220,10 +221,13 @@ def test_the_cards_method_is_scored_as_by_hand(short: None, tmp_path: Path) -> N
     assert 0 < abs(other["rt_le_m"][0] - solo["paper"]["rt_le_m"][0]) < 2 * (low + high)
 
 
-def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(short: None, tmp_path: Path) -> None:
+def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(
+    short: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     (tmp_path / "mine.py").write_text(OWN)
     name = f"{tmp_path / 'mine.py'}:Own"
     assert benchmark.benchmark((name,), out=tmp_path) == 1
+    assert re.search(r'mine\.py", line \d+, in __call__\n.*\n +ValueError: neighbours', capsys.readouterr().err)
     (file,) = tmp_path.glob("*.json")
     card = json.loads(file.read_text())
     assert len(card["source"]) == 20

@@ -19,6 +19,7 @@ from coopoc.data.registry import load_fleet
 from coopoc.evaluate.metrics import fix_innovations, innovation_columns, normalised_innovations
 from coopoc.studies import lineup, paths
 from coopoc.study.report import report
+from coopoc.study.results import ego_by_run
 from coopoc.world.storage import digest, read_recording, save_recording
 
 FEW = {"method": "gnss,kalman,joint,bound", "max_neighbours": "0,2"}
@@ -67,6 +68,17 @@ def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> 
     parts = [np.array([[3.0]]), np.array([[4.0]])]
     merged = [lineup._merged(name, parts, (1, 3)).item() for name in ("innovation_m", "nis", "fixes", "max_error_m")]
     assert merged == pytest.approx([np.sqrt(57 / 4), 15 / 4, 7, 4])
+
+
+def test_a_vehicle_that_is_away_keeps_its_blocks_and_a_block_without_a_fix_is_left_out(
+    folders: Path, tmp_path: Path
+) -> None:
+    settings = {"data": str(folders / "with"), "method": "cooperative-filter", "max_neighbours": 0}
+    results = co.run_study("real", tmp_path, settings={**settings, "calibrate_s": 4, "block_s": 4}, progress=False)
+    assert results.values("rt_le_m").shape == (4, 4)
+    rows = results.frame.copy()
+    rows.loc[rows["run"] == 1, "innovation_m"] = np.nan
+    assert ego_by_run(rows, "innovation_m")[0].shape == (4, 3)
 
 
 def test_a_recording_is_stored_bit_by_bit(tmp_path: Path) -> None:

@@ -22,6 +22,7 @@ from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.one_file import from_file
 from coopoc.optimize import MEASUREMENTS, Problem, Status, solve
 from coopoc.plugins import find
+from coopoc.studies.lineup import own
 from coopoc.study.results import Results
 from coopoc.study.run import plan, run_study
 from coopoc.world.channels import channel
@@ -256,8 +257,13 @@ def test_a_method_may_ask_for_the_whole_fleet(tmp_path: Path) -> None:
 
 
 def test_what_is_not_there_is_named(tmp_path: Path) -> None:
-    (tmp_path / "own.py").write_text("import math\nALPHA = 1\n")
-    with refused(r"own\.py:ALPHAS'.* has ALPHA\. Did you mean .*own\.py:ALPHA\?"):
+    (tmp_path / "own.py").write_text(
+        "import math\nALPHA = 1\nclass Mute:\n    def __init__(self, noise):\n        pass\n"
+    )
+    for name, message in (("Mute", "must have a name"), ("math", "cannot be made from a noise model")):
+        with refused(message):
+            own(f"{tmp_path}/own.py:{name}")
+    with refused(r"own\.py:ALPHAS'.* has ALPHA, Mute\. Did you mean .*own\.py:ALPHA\?"):
         from_file(f"{tmp_path}/own.py:ALPHAS")
     with refused(r"method = 'gone\.py:X': names a file that is not there"):
         find("coopoc.methods", "gone.py:X")

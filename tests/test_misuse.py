@@ -203,7 +203,7 @@ def test_functions_refuse_arguments_of_the_wrong_kind() -> None:
     swept(co.LandmarkMeasurement, {"relative": [9.0, 0.1, 1.57], "place": [0.0, 0.0, 0.0]})
     swept(co.bound_rt_le, {"cov": np.eye(3)[None]})
     swept(co.paired_difference, {"a": [1.0, 2.0], "b": [2.0, 4.0]})
-    swept(co.break_even, {"training": None, "online": None, "kind": "payload"})
+    swept(co.break_even, {"training": None, "online": None})
     swept(RECORDING.between, {"start": 0, "stop": 3})
     swept(RECORDING.neighbours, {"ego": 0})
     swept(RECORDING.links.of, {"observer": 0})

@@ -247,6 +247,18 @@ def test_a_covariance_that_is_none_is_named_with_its_method_and_step() -> None:
         scored(Negative(), SEEN, ["a"], FLEET)
 
 
+class Swapped(Negative):
+    """A method that returns its egos in another order."""
+
+    def __call__(self, recording: co.Recording, egos: Any = (0,)) -> co.Track:
+        return co.Kalman()(recording, egos[::-1])
+
+
+def test_estimates_of_other_egos_are_refused() -> None:
+    with refused("must be a Track of a, b, in this order"):
+        scored(Swapped(), SEEN, ["a", "b"], FLEET)
+
+
 @pytest.mark.parametrize("gap", [(0.0, 0.0, 10.0), (1e-9, 0.0, 0.0)], ids=["above", "in one place"])
 @pytest.mark.parametrize("method", [co.JointFilter(), co.FixedLagSmoother(), co.GaussianBeliefPropagation()])
 def test_who_flies_straight_above_or_in_one_place_helps_or_does_no_harm(

@@ -135,14 +135,13 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
     return of_drive(names, seconds, *moved, message, overhead, messages)
 
 
-def break_even(training: Ledger, online: Ledger, kind: Kind = "payload") -> float:
+def break_even(training: Ledger, online: Ledger) -> float:
     """Seconds of driving after which online cooperation has moved as many bytes per vehicle as the training; inf:
     never.
 
     Args:
         training: its bytes are taken.
-        online: its rate is taken.
-        kind: of the bytes in both, counted per receiver.
+        online: its rate is taken, as the bytes of payload per receiver.
 
     Raises:
         InputError: a training without bytes, or a drive of no time.
@@ -153,10 +152,10 @@ def break_even(training: Ledger, online: Ledger, kind: Kind = "payload") -> floa
     """
     instance("training", training, Ledger)
     instance("online", online, Ledger)
-    bytes_ = training.per_vehicle("training", kind)
+    bytes_ = training.per_vehicle("training")
     if not bytes_ > 0:
         raise InputError("training", bytes_, "must have moved some bytes", "Give the ledger of a training.")
-    rate = online.rate(kind)
+    rate = online.rate()
     return bytes_ / rate if rate else np.inf
 
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from ..arrays import AnyArray, Floats
+from ..errors import InputError, shown
 from ..methods.track import Method, Track, far_off
 from ..world.fleet import Fleet
 from ..world.recording import Recording
@@ -66,6 +67,11 @@ def scored(
     seconds, parts, squares = 0.0, list[dict[str, AnyArray]](), list[Floats]()
     for part in slabs(recording, len(egos)):
         track = method(part, egos)
+        if getattr(track, "egos", None) != tuple(map(part.ids.index, egos)):
+            allowed = f"must be a Track of {', '.join(egos)}, in this order"
+            raise InputError(
+                f"estimates of {method.name}", shown(track), allowed, "Take its egos as they were asked for."
+            )
         seconds += track.seconds
         parts.append(_columns(track, part, method, drive, quantiles))
         if metric:

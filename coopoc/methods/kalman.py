@@ -20,7 +20,7 @@ from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NO_VARIANCE, NoiseModel, constant_noise, motion_noise, process_noise, resolve
 from .stream import FilterStream
-from .track import TINY, Checked, Track, check_options, lost
+from .track import TINY, Checked, Track, check_options, lost, silent_track
 
 ASSUMED = Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02)
 """Velocity noise of the paper's training, 10 % per axis, and where the estimate of the fixes' noise starts."""
@@ -190,12 +190,9 @@ def solo_track(
     recording: Recording, columns: Sequence[int], x: Floats, p: Floats, began: float, notes: tuple[str, ...] = ()
 ) -> Track:
     """Track of a solo filter with the variances p (R, T, E, 3) m^2; it receives and sends nothing."""
-    cov, none = np.zeros((*p.shape, 3)), np.zeros((recording.runs, len(columns)))
+    cov = np.zeros((*p.shape, 3))
     np.einsum("...ii->...i", cov)[:] = p
-    notes = (*notes, *lost(x, recording, columns))
-    return Track(
-        recording.t, tuple(columns), x, cov, none, none, time.perf_counter() - began, notes=notes, ids=recording.ids
-    )
+    return silent_track(recording, columns, x, cov, began, (*notes, *lost(x, recording, columns)))
 
 
 def solo_filter(

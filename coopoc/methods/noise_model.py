@@ -207,7 +207,10 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
         why = f"angles of {max(noise.azimuth_std, noise.inclination_std):.2g} rad"
     else:
         fix = float(np.square(noise_model.gnss_std[:2]).mean())
-        often = _ranges_per_fix(recording)
+        links, moving = recording.links, (recording.velocity[0] != 0.0).any(axis=(0, 2))
+        ranges = np.unique(links.observer * len(moving) + links.neighbour, return_counts=True)[1].max()
+        fixes = np.isfinite(recording.gnss[0, :, moving, 0]).sum(axis=1).max(initial=0)
+        often = max(float(ranges / (fixes or ranges)), 1.0)  # of the pair that measures most, to a fix
         arc, why = (
             np.sqrt(2.0 * often) * fix / far,
             f"fixes of {np.sqrt(fix):.2g} m, {often:.0f} ranges of a pair to a fix and no azimuth",
@@ -219,14 +222,6 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
         f"assumes a range std of {std:.2g} m, not {noise.range_std:.2g} m: {why} put what is {far:.3g} m away on an arc"
     )
     return replace(noise_model, sensors=replace(noise, range_std=std), notes=(*notes, text))
-
-
-def _ranges_per_fix(recording: Recording) -> float:
-    """Ranges of the pair that measures most, to a fix of the moving vehicle that has the most; at least 1."""
-    links, moving = recording.links, (recording.velocity[0] != 0.0).any(axis=(0, 2))
-    ranges = np.unique(links.observer * len(moving) + links.neighbour, return_counts=True)[1].max()
-    fixes = np.isfinite(recording.gnss[0, :, moving, 0]).sum(axis=1).max(initial=0)
-    return max(float(ranges / (fixes or ranges)), 1.0)
 
 
 def _resolvable(noise_model: NoiseModel) -> NoiseModel:

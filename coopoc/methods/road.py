@@ -20,7 +20,7 @@ from ..world.recording import Recording, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 from .motion_history import MotionHistory
 from .noise_model import NoiseModel, constant_noise, motion_noise, process_noise, resolve
-from .track import Limits, Track, check_options, lost
+from .track import Limits, Track, check_options, lost, silent_track
 
 LIMITS: Limits = {
     "fix": (1e-6, 1e6, "> 0"),
@@ -120,11 +120,7 @@ class RoadFilter:
         x, cov, errors = self.filtered(recording, columns)
         names = "heading_error", "heading_error_std", "scale_error", "scale_error_std"
         extras = {name: errors[..., i] for i, name in enumerate(names)} if self.assumed(recording).heading else {}
-        none = np.zeros((recording.runs, len(columns)))
-        took, notes = time.perf_counter() - began, lost(x, recording, columns)
-        return Track(
-            recording.t, tuple(columns), x, cov, none, none, took, notes=notes, extras=extras, ids=recording.ids
-        )
+        return silent_track(recording, columns, x, cov, began, lost(x, recording, columns), extras=extras)
 
     def assumed(self, recording: Recording) -> RoadErrors:
         """`errors`, or those that fit the recording."""

@@ -153,9 +153,5 @@ def _behind_arrival_cost(
         yield Estimate(solved.x, solved.covariance, solved.neighbours)
 
     track = follow_egos(method, recording, egos, drive)
-    return replace(track, notes=(*noise_model.notes, *_counted(counts)))
-
-
-def _counted(counts: Counter[str]) -> tuple[str, ...]:
-    """Notes of what was counted."""
-    return tuple(f"{count} {note}" for note, count in counts.items() if count)
+    counted = (f"{count} {note}" for note, count in counts.items() if count)
+    return replace(track, notes=(*noise_model.notes, *counted))

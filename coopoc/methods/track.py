@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from typing import Any, Protocol, runtime_checkable
@@ -129,6 +130,21 @@ def lost(x: Floats, recording: Recording, columns: Sequence[int], limit: float =
     found = far_off(x, recording, columns, limit)
     far = limit * float(np.linalg.norm(recording.sensors.gnss_std))
     return (f"diverged in {found.sum()} of {found.size} runs (over {far:.0f} m from the fix)",) if found.any() else ()
+
+
+def silent_track(
+    recording: Recording,
+    columns: Sequence[int],
+    x: Floats,
+    cov: Floats | None,
+    began: float,
+    notes: tuple[str, ...],
+    **more: Any,
+) -> Track:
+    """Track of a method that receives and sends nothing."""
+    none = np.zeros((recording.runs, len(columns)))
+    took = time.perf_counter() - began
+    return Track(recording.t, tuple(columns), x, cov, none, none, took, notes=notes, ids=recording.ids, **more)
 
 
 @runtime_checkable

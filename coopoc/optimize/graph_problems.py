@@ -83,6 +83,12 @@ def from_graph(
     names = contenders(graph) if start == "auto" else (first,)
     given = _x0(graph, poses, names[0])
     problem = Problem(graph.names, factors, given, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
+    if len(problem.fixed) - len(graph.fixed) > (len(graph.fixed) == 0):
+        at = ", ".join(graph.names[k] for k in problem.fixed[:5])
+        notes = (
+            *notes,
+            f"parts that no measurement joins to each other: fixed are {at}, and nothing places one to another",
+        )
     won = Search(names[0])
     if start == "auto":
         starts = {name: (lambda: given) if name == names[0] else partial(_x0, graph, poses, name) for name in names}
@@ -185,9 +191,7 @@ def rotation_variance(covariance: Floats, d: int) -> Floats:
 def _fixed(graph: Graph) -> tuple[int, ...]:
     """The fixed vertices, and the first pose of each part of the graph that has neither those nor priors."""
     edges = (graph.relative_pose, graph.relative_point, graph.ranges)
-    part = parts(
-        len(graph.names), np.concatenate([each.nodes for each in edges if len(each)] or [np.empty((0, 2), int)])
-    )
+    part = parts(len(graph.names), *(each.nodes for each in edges if len(each)))
     held = [graph.fixed, *(each.nodes[:, 0] for each in (graph.pose_prior, graph.point_prior) if len(each))]
     holding = np.zeros(len(part), dtype=bool)
     holding[part[np.concatenate(held)]] = True

@@ -170,7 +170,9 @@ def curves(
             if panel.ticks or len(panel.x) <= 8:
                 axis.set_xticks(list(panel.ticks or panel.x), list(panel.ticks.values()) or [f"{x:g}" for x in panel.x])
                 axis.minorticks_off()
-        _vertical(axes[0], ylabel, log)
+        axes[0].set(ylabel=ylabel, **({} if log else {"ylim": (0, None)}))
+        if log:
+            plain_log(axes[0].yaxis)
         if any("label" in of for of in every):
             axes[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
         else:
@@ -292,9 +294,3 @@ def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> 
         ends = [point.low for point in bands.values()], [point.high for point in bands.values()]
         name = "_" + str(options["label"]).lstrip("_")
         axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0, label=name)
-
-
-def _vertical(axes: Axes, text: str, log: bool) -> None:
-    axes.set(ylabel=text, **({} if log else {"ylim": (0, None)}))
-    if log:
-        plain_log(axes.yaxis)

@@ -19,7 +19,7 @@ from ..short_repr import short_repr
 from . import store
 from .cell import assignments, parse
 from .manifest import read
-from .style import OWN
+from .style import METHODS, OWN
 
 SEED = "train_seed"
 """Column of the training seed: means are taken over it, and intervals are not."""
@@ -54,7 +54,9 @@ class Results:
 
     def __post_init__(self) -> None:
         if "label" in self.frame:
-            OWN.update(self.frame.dropna(subset=["label"]).groupby("method")["label"].first().astype(str))
+            own = self.frame.dropna(subset=["label"]).groupby("method")["label"].first().astype(str)
+            taken = own.duplicated(keep=False) | own.isin([look.label for look in METHODS.values()])
+            OWN.update(own.mask(taken, own + " (" + own.index + ")"))
 
     @classmethod
     def load(cls, folder: str | Path, names: Collection[str] | None = None) -> Results:
@@ -187,9 +189,12 @@ def _joined(tables: Sequence[pa.Table]) -> pd.DataFrame:
 
 
 def ego_by_run(frame: pd.DataFrame, value: str) -> tuple[Floats, int]:
-    """(E, R) means over training seeds, and how many egos are left out because a run or a seed of theirs is missing."""
+    """(E, R) means over training seeds, and how many egos are left out because a run or a seed of theirs is missing.
+
+    A run that no ego has a number of is no run.
+    """
     frame = frame.assign(**{name: 0 for name in ("ego", "run") if name not in frame}, _value=frame[value].astype(float))
     cells = frame.groupby(["ego", "run"])["_value"]
     table = cells.mean().where(cells.count() == cells.size()).unstack("run")
-    whole = table.dropna()
+    whole = table.dropna(axis="columns", how="all").dropna()
     return whole.to_numpy(dtype=float), len(table) - len(whole) if frame["_value"].notna().any() else 0

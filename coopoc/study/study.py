@@ -28,14 +28,6 @@ if TYPE_CHECKING:
 __all__ = ["Cell", "Params", "Row", "Scalar", "Study", "find_study"]
 
 
-def _nothing_to_prepare(cells: Sequence[Params], jobs: int) -> None:
-    pass
-
-
-def _no_extras(params: Params) -> Mapping[str, Any]:
-    return {}
-
-
 @dataclass(frozen=True, eq=False)
 class Study:
     """A grid of cells, each a pure function of its parameters, and the tables and figures that answer one question.
@@ -81,8 +73,8 @@ class Study:
     cell: Callable[[Params], list[Row]]
     grid: Mapping[str, Sequence[Scalar]] | Sequence[Mapping[str, Scalar]]
     settings: Mapping[str, Any] = field(default_factory=dict)
-    key: Callable[[Params], Mapping[str, Any]] = _no_extras
-    prepare: Callable[[Sequence[Params], int], None] = _nothing_to_prepare
+    key: Callable[[Params], Mapping[str, Any]] = lambda params: {}
+    prepare: Callable[[Sequence[Params], int], None] = lambda cells, jobs: None
     where: Callable[[Params], bool] | None = None
     shares: tuple[str, ...] = ()
     tables: Mapping[str, Callable[[Results], Table | None]] = field(default_factory=dict)

@@ -295,7 +295,9 @@ def check_measurements(gnss: Floats, velocity: Floats, relative: Floats) -> None
         ("relative", relative, FARTHEST),
     ):
         plausible(name, values, limit)
-        if _finite(values):
+        with np.errstate(over="ignore", invalid="ignore"):
+            finite = np.isfinite(values.sum())  # needs no array of its own; one that overflows is looked at again
+        if finite:
             continue
         refuse(name, values, np.isinf(values), "must be finite, or NaN where missing", "Replace it by NaN.")
         missing = np.isnan(values)
@@ -361,9 +363,3 @@ def check_links(
     refuse("links.observer", observer, many, f"must have at most max_neighbours = {most} a step", "Raise it.")
     early = (arrival < links.step) & (arrival != -1)
     refuse("arrival", arrival, early, "must be -1 (lost) or a step no earlier than the link's", "Count steps from 0.")
-
-
-def _finite(values: Floats) -> bool:
-    """Whether all are finite: a sum needs no array of its own; one that overflows is looked at again."""
-    with np.errstate(over="ignore", invalid="ignore"):
-        return bool(np.isfinite(values.sum()))

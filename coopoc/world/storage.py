@@ -16,7 +16,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ..arrays import AnyArray
-from ..errors import InputError
+from ..errors import InputError, first_line
 from ..file_names import given_path
 from .fleet import Fleet
 from .links import Links
@@ -75,15 +75,6 @@ def save_recording(recording: Recording, path: str | Path, truth: Fleet | None =
     np.savez_compressed(path, coopoc_recording=np.array(json.dumps(words)), **arrays)
 
 
-def is_recording(path: str | Path) -> bool:
-    """Whether a file is one that `save_recording` wrote."""
-    try:
-        with zipfile.ZipFile(path) as packed:
-            return "coopoc_recording.npy" in packed.namelist()
-    except (OSError, zipfile.BadZipFile, NotImplementedError):
-        return False
-
-
 def unpacked(path: Path) -> dict[str, AnyArray]:
     """Arrays of an .npz file by name; what is damaged raises one of `DAMAGES`.
 
@@ -125,7 +116,7 @@ def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
     except DAMAGES as error:
         if isinstance(error, InputError) and error.field == path.name:
             raise
-        found = next(iter(str(error).splitlines()), type(error).__name__)
+        found = first_line(error)
     raise InputError(path.name, found, "must be a recording in .npz", "Write it again with save_recording.")
 
 

@@ -429,10 +429,11 @@ def _of_measurements(c: Check) -> list[str]:
             measured = c.world.relative[0, :, 0]
             true = measured - c.relative[:, 0]
             far = measured + true > 2 * FAR * position
-            ratio = float(np.median(measured[far] / np.maximum(true[far], 1e-3))) if far.sum() >= ENOUGH else 1.0
-            wrong |= not 0.8 <= ratio <= 1.25
-            if not 0.4 <= ratio <= 2.5:
-                hint = f"They are {ratio:.3g} times as long; of mm scale=range:0.001 makes m, of feet 0.3048."
+            ratios = measured[far] / np.maximum(true[far], 1e-3)
+            ratio = float(np.median(ratios)) if len(ratios) >= ENOUGH else 1.0
+            wrong |= (other := not 0.8 <= ratio <= 1.25)
+            if other and robust_std(ratios) < 0.2 * ratio:
+                hint = f"They are {ratio:.3g} times as long: scale=range:{1 / ratio:.3g}, of mm 0.001, of feet 0.3048."
         outliers, offsets = row["beyond_5_std"], _offsets(c, list(UNITS).index(name), *2 * [row["stated_std"]])
         if outliers > OUTLIERS:
             sentences.append(

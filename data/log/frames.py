@@ -23,6 +23,8 @@ MOTION = ("vx", "vy", "speed")
 Origin = tuple[float, float, float]
 PERIODS = (86400.0, 604800.0)
 """s, of clocks: a day, a GPS week."""
+SELDOM = 0.02
+"""Share of rows that are earlier than the one before, where a file is else in the order of its stamps."""
 HEADING_STD = 0.05
 """rad, of a compass in body frames whose noise was not logged."""
 
@@ -30,6 +32,7 @@ HEADING_STD = 0.05
 def unwrapped(rows: Rows, summary: Summary) -> Rows:
     """Rows whose stamps go on where those of a vehicle begin anew, at midnight or at the end of a GPS week; those of
     another file, such as the truth, may count on."""
+    back = rows["t"] < rows.groupby(["file", "vehicle", "kind", "partner"], sort=False)["t"].shift()
     last = rows.groupby(["file", "vehicle"], sort=False)["t"].shift()
     for period in PERIODS:
         inside = rows["t"].dropna().between(0, 1.25 * period)
@@ -38,6 +41,11 @@ def unwrapped(rows: Rows, summary: Summary) -> Rows:
             summary.assume(f"stamps begin anew after {period:g} s: those before half of it count on")
             early = {name: rows[name].mask(rows[name] < period / 2, rows[name] + period) for name in ("t", "arrival")}
             return rows.assign(**early)
+    if 0 < back.mean() < SELDOM:
+        who = ", ".join(rows["vehicle"][back].unique())
+        summary.assume(
+            f"stamps of {who} go back (first: {place(rows[back])}); rows are in order of stamps: was a clock set?"
+        )
     return rows
 
 

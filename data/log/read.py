@@ -291,7 +291,13 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
         if not files:
             allowed = f"must hold files in {', '.join(READERS)}"
             raise InputError("path", str(path), allowed, "Point at the folder of the log.")
-        _check_headers(options["columns"], [*files, *true_files], path.name)
+        tables = [file for file in (*files, *true_files) if options["columns"] and file.suffix.lower() in TABLES]
+        names = {header for file in tables for header in headers(file)}
+        for key, header in options["columns"].items():
+            if header not in names:
+                allowed = f"is in no table, which have {', '.join(sorted(names))}"
+                hint = suggestion(header, names, "Name a column of a table.")
+                raise InputError(f"{path.name}: columns[{key!r}]", repr(header), allowed, hint)
         parts = [_read_file(file, path, summary, **options) for file in files]
     if not any(map(len, parts)):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
@@ -320,16 +326,6 @@ def _files(path: Path) -> list[Path]:
     bare = not any(_is_bag(file) or (file.parent == path and file.stem.lower() != TRUTH) for file in every)
     bare = bare and any(map(is_log, every))
     return sorted(file for file in every if bare or file.parent == path or STAMP in headers(file))
-
-
-def _check_headers(columns: Mapping[str, str], files: Sequence[Path], name: str) -> None:
-    """InputError for a name of a column that none of the tables of a log has."""
-    names = {header for file in files if columns and file.suffix.lower() in TABLES for header in headers(file)}
-    for key, header in columns.items():
-        if header not in names:
-            allowed = f"is in no table, which have {', '.join(sorted(names))}"
-            hint = suggestion(header, names, "Name a column of a table.")
-            raise InputError(f"{name}: columns[{key!r}]", repr(header), allowed, hint)
 
 
 def _check_scale(rows: Rows, name: str) -> None:

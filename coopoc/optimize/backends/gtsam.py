@@ -125,11 +125,8 @@ def _poses(d: int, x: Floats) -> Callable[[], Iterable[tuple[Any, ...]]]:
 
 def _position(factor: Factor, W: Floats, d: int) -> Form:
     names: Names = {(POINT,): f"PriorFactorPoint{d}", (POSE,): f"PoseTranslationPrior{d}D"}
+    names[POINT, POINT] = f"BetweenFactorPoint{d}"
     return [Part(names, lambda: zip(factor.z, strict=True), W)]
-
-
-def _displacement(factor: Factor, W: Floats, d: int) -> Form:
-    return [Part({(POINT, POINT): f"BetweenFactorPoint{d}"}, lambda: zip(factor.z, strict=True), W)]
 
 
 def _range(factor: Factor, W: Floats, d: int) -> Form:
@@ -157,10 +154,6 @@ def _bearing(factor: Factor, W: Floats, d: int) -> Form:
 
     names: Names = {(POSE, POINT): f"{name}Factor2D", (POSE, POSE): f"{name}FactorPose2"}
     return [Part(names, arguments, W[:, ::-1, ::-1])]
-
-
-def _relative_position(factor: Factor, W: Floats, d: int) -> Form:
-    return _chord(W, {0: np.arange(d)}, Space(d, has_rotation=True).join(factor.z), d)
 
 
 def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
@@ -242,11 +235,13 @@ def _coupled(W: Floats, d: int) -> bool:
 
 FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
     "position": _position,
-    "displacement": _displacement,
+    "displacement": _position,
     "range": _range,
     "bearing": _bearing,
     "body_spherical": _bearing,
-    "relative_position": _relative_position,
+    "relative_position": lambda factor, W, d: _chord(
+        W, {0: np.arange(d)}, Space(d, has_rotation=True).join(factor.z), d
+    ),
     "relative_pose": _relative_pose,
     "relative_pose_log": _relative_log,
     "relative_pose_chordal": _relative_chordal,

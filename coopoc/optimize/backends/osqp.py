@@ -79,7 +79,12 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     array([1., 8.])
     """
     check_limits(max_iterations, tolerance)
-    limits, layout = _limits(structure) if structure.constraints else None, layout_of(structure)
+    limits, layout = None, layout_of(structure)
+    if structure.constraints:
+        from scipy.sparse import csc_matrix
+
+        rows = constraint_rows(structure, np.zeros((len(structure.names), structure.space.ambient)))
+        limits = _Limits(structure, csc_matrix(rows.matrix), rows.lower, rows.upper)
     moving = np.flatnonzero(layout.entries.number.ravel() >= 0)
     held = Programme(_pattern(layout), limits.matrix[:, moving]) if limits else None
 
@@ -223,13 +228,6 @@ class _Limits:
         parts = [h[bounded(c)] for h, c in zip(linear.residual, constraints, strict=True)]
         value = np.concatenate([np.empty(0), *parts])
         return self.lower - value, self.upper - value
-
-
-def _limits(problem: Problem) -> _Limits:
-    from scipy.sparse import csc_matrix
-
-    rows = constraint_rows(problem, np.zeros((len(problem.names), problem.space.ambient)))
-    return _Limits(problem, csc_matrix(rows.matrix), rows.lower, rows.upper)
 
 
 def _nearest(limits: _Limits, x: Floats) -> tuple[Floats, bool]:

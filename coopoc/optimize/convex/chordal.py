@@ -77,9 +77,7 @@ def chordal_start(problem: Problem) -> Floats:
 def _anchors(problem: Problem) -> Ints:
     """One pose of each part of the problem that nothing joins to the world or, linearly, to another."""
     linear = [factor.nodes for factor in problem.factors if factor.kind in RELAXED]
-    part = parts(
-        len(problem.names), np.concatenate([np.empty((0, 2), np.int64), *(n for n in linear if n.shape[1] == 2)])
-    )
+    part = parts(len(problem.names), *(n for n in linear if n.shape[1] == 2))
     held = part[np.concatenate([np.empty(0, np.int64), *(n[:, 0] for n in linear if n.shape[1] == 1)])]
     poses = np.setdiff1d(problem.poses, np.flatnonzero(np.isin(part, held)))
     return np.asarray(poses[np.unique(part[poses], return_index=True)[1]])

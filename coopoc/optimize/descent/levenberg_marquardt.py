@@ -93,7 +93,11 @@ def arrive(
             counted(cost)
             newton += model == "newton"
             damping = _marquardt(system, undamped[2], mu, LEAST_INFORMATION if bounded else 1.0)
-            taken = step(x, values if damping is None else _damped(system, values, damping), gradient)
+            whole = values
+            if damping is not None:
+                whole = values.astype(np.float64)
+                whole[system.entries.diagonal] += damping
+            taken = step(x, whole, gradient)
             if taken is None:
                 record.append((cost, mu, np.nan))
                 if model == "newton":
@@ -160,12 +164,6 @@ def _marquardt(system: Sparse, values: Floats, mu: float, hold: float) -> Floats
     if not mu and not unmeasured.any():
         return None
     return np.asarray(mu * np.maximum(diagonal, LEAST_INFORMATION) + hold * unmeasured)
-
-
-def _damped(system: Sparse, values: Floats, damping: Floats) -> Floats:
-    whole = values.astype(np.float64)
-    whole[system.entries.diagonal] += damping
-    return whole
 
 
 DELAY = 2.0

@@ -112,10 +112,8 @@ class Factor:
 
     def __post_init__(self, cov: npt.ArrayLike | None) -> None:
         measurement = self.measurement
-        object.__setattr__(self, "kind", measurement.name)
-        object.__setattr__(self, "nodes", check_nodes(measurement, self.nodes))
+        _set_nodes(self, measurement)
         object.__setattr__(self, "z", check_values(measurement, self.z, len(self.nodes)))
-        object.__setattr__(self, "constants", check_constants(measurement, self.constants, len(self.nodes)))
         given = [
             name
             for name, v in (("std", self.std), ("sqrt_information", self.sqrt_information), ("cov", cov))
@@ -172,6 +170,13 @@ class Factor:
 
     def __repr__(self) -> str:
         return f"Factor({self.kind} x {len(self.nodes)})"
+
+
+def _set_nodes(one: Factor | Constraint, measurement: Measurement) -> None:
+    """Kind, nodes and constants, checked."""
+    object.__setattr__(one, "kind", measurement.name)
+    object.__setattr__(one, "nodes", check_nodes(measurement, one.nodes))
+    object.__setattr__(one, "constants", check_constants(measurement, one.constants, len(one.nodes)))
 
 
 def of_checked(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
@@ -272,9 +277,7 @@ class Constraint:
         measurement = self.measurement
         if measurement.compares_poses:
             raise InputError("kind", repr(self.kind), "compares poses and cannot bound them", "Hold the node instead.")
-        object.__setattr__(self, "kind", measurement.name)
-        object.__setattr__(self, "nodes", check_nodes(measurement, self.nodes))
-        object.__setattr__(self, "constants", check_constants(measurement, self.constants, len(self.nodes)))
+        _set_nodes(self, measurement)
         given = {name: numbers(name, getattr(self, name)) for name in ("lower", "upper")}
         sizes = [side.shape[-1] for side in given.values() if side.ndim]
         size = max(sizes, default=measurement.size())

@@ -100,18 +100,15 @@ def check_values(measurement: Measurement, z: npt.ArrayLike, count: int) -> Floa
     if measurement.compares_poses:
         check_rotations(f"z of {measurement.name}", Space(dimension, has_rotation=True).rotation(array))
         return array
-    for k, component in enumerate(measurement.kept(dimension)):
-        _check_component(measurement, measurement.components[component], array[:, k])
+    for column, kept in zip(array.T, measurement.kept(dimension), strict=False):
+        component = measurement.components[kept]
+        if component == "distance" and (column <= 0).any():
+            hint = "Coincident vehicles have no direction: drop the pair."
+            raise InputError(f"z of {measurement.name}", column.min(), "must be a distance > 0 m", hint)
+        if component == "angle" and (np.abs(column) > 2 * np.pi).any():
+            hint = "This looks like degrees: use np.deg2rad."
+            raise InputError(f"z of {measurement.name}", np.abs(column).max(), "must be within 2 pi rad", hint)
     return array
-
-
-def _check_component(measurement: Measurement, component: str, column: Floats) -> None:
-    if component == "distance" and (column <= 0).any():
-        hint = "Coincident vehicles have no direction: drop the pair."
-        raise InputError(f"z of {measurement.name}", column.min(), "must be a distance > 0 m", hint)
-    if component == "angle" and (np.abs(column) > 2 * np.pi).any():
-        hint = "This looks like degrees: use np.deg2rad."
-        raise InputError(f"z of {measurement.name}", np.abs(column).max(), "must be within 2 pi rad", hint)
 
 
 def check_rotations(field: str, rotation: Floats) -> None:

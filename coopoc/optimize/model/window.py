@@ -137,25 +137,19 @@ def recorded_steps(
         links = links[recording.links.step[links] == s]
         members = np.concatenate([[column], recording.links.neighbour[links]])
         previous = np.array([int(np.flatnonzero(before == m)[0]) if m in before else -1 for m in members])
-        steps.append(_recorded(recording, s, members, previous, links, run, noise))
+        fix, velocity = recording.gnss[run, s, members], recording.velocity[run, s, members]
+        if noise is None:
+            fix_std = np.array(recording.sensors.gnss_std)
+            moved_std = recording.dt * recording.sensors.assumed_velocity_std(velocity)
+        else:
+            fix_std = np.sqrt(noise.gnss_variance)
+            variance = np.broadcast_to(noise.process_variance(recording), recording.velocity.shape)
+            moved_std = np.sqrt(variance[run, s, members])
+        fix_std, moved = np.broadcast_to(fix_std, fix.shape), recording.dt * velocity
+        steps.append(WindowStep(previous, fix, fix_std, moved, moved_std, recording.relative[run, links]))
         names += [recording.ids[m] if length == 1 else f"{recording.ids[m]}@{s}" for m in members]
         before = members
     return steps, names
-
-
-def _recorded(
-    recording: Recording, step: int, members: Ints, previous: Ints, links: Ints, run: int, noise: Noise | None
-) -> WindowStep:
-    fix, velocity = recording.gnss[run, step, members], recording.velocity[run, step, members]
-    if noise is None:
-        fix_std = np.array(recording.sensors.gnss_std)
-        moved_std = recording.dt * recording.sensors.assumed_velocity_std(velocity)
-    else:
-        fix_std = np.sqrt(noise.gnss_variance)
-        variance = np.broadcast_to(noise.process_variance(recording), recording.velocity.shape)
-        moved_std = np.sqrt(variance[run, step, members])
-    fix_std = np.broadcast_to(fix_std, fix.shape)
-    return WindowStep(previous, fix, fix_std, recording.dt * velocity, moved_std, recording.relative[run, links])
 
 
 def _check(recording: Recording, step: int, length: int, run: int) -> None:

@@ -132,8 +132,7 @@ class _Search:
         """(n,) the body of each node, HELD or its first pose (if it has none, its first node)."""
         problem = self.problem
         measured = [f.nodes[f.informative] for f in reweigh(problem, self.marked, self.weight, self.x).factors]
-        pairs = [nodes for nodes in measured if nodes.shape[1] == 2]
-        joined = parts(len(problem.names), np.concatenate([np.empty((0, 2), np.int64), *pairs]))
+        joined = parts(len(problem.names), *(nodes for nodes in measured if nodes.shape[1] == 2))
         part = np.unique(joined, return_inverse=True)[1]
         alone = [nodes[:, 0] for nodes in measured if nodes.shape[1] == 1]
         nodes = np.concatenate([problem.poses, np.setdiff1d(np.arange(len(part)), problem.poses)]).astype(np.int64)
@@ -230,7 +229,10 @@ class _Search:
         problem, marked, used = self.problem, self.marked, np.isin(body, bodies)
         rows = problem.rows_among(used)
         part = pinned(problem, body[body == bodies[0]]).restricted(used, self.x, rows)
-        inside, space, tried = _among(marked, rows), problem.space, list[Placement]()
+        number, space, tried = np.cumsum([len(own) > 0 for own in rows]) - 1, problem.space, list[Placement]()
+        kept = np.flatnonzero([r in rows[k] for k, r in zip(marked.factor, marked.row, strict=True)])
+        rank = [np.searchsorted(rows[k], r) for k, r in zip(marked.factor[kept], marked.row[kept], strict=True)]
+        inside = Marked(number[marked.factor[kept]], np.array(rank, dtype=np.int64), marked.group[kept])
         sparse(part)  # is kept as long as the part is, so that all placements share its analysis
         origin = space.join(np.zeros(space.dimension))
         for _ in range(2):  # spread over all, then over what the best leaves
@@ -261,14 +263,6 @@ def pinned(problem: Problem, body: Ints) -> Problem:
     """The problem with the first node of each free body fixed; itself if there is none."""
     first = np.unique(body[body != HELD]).tolist()
     return problem.replace_unchecked(fixed=(*problem.fixed, *first)) if first else problem
-
-
-def _among(marked: Marked, rows: list[Ints]) -> Marked:
-    """The candidates among some rows of each factor, of a problem that has these alone; groups keep their numbers."""
-    number = np.cumsum([len(own) > 0 for own in rows]) - 1
-    kept = np.flatnonzero([r in rows[k] for k, r in zip(marked.factor, marked.row, strict=True)])
-    row = [np.searchsorted(rows[k], r) for k, r in zip(marked.factor[kept], marked.row[kept], strict=True)]
-    return Marked(number[marked.factor[kept]], np.array(row, dtype=np.int64), marked.group[kept])
 
 
 def predicted(problem: Problem, marked: Marked, weight: Floats, x: Floats) -> tuple[Floats, Floats]:

@@ -75,20 +75,15 @@ def walk(n: int, d: int, moves: Moves, roots: Roots) -> tuple[Floats, Floats, Bo
         moved = np.where(forward[used, None], moved, -(back @ moved[..., None])[..., 0])
         place = np.full(n, -1)
         place[reached] = np.arange(len(reached))
-        moved, turn = _from_root(place[before[reached]], moved, turn)
+        before = place[before[reached]]
+        while (on := np.flatnonzero(before >= 0)).size:  # to poses as the root sees them: pointers jump
+            by = before[on]
+            moved[on] = moved[by] + (turn[by] @ moved[on, :, None])[..., 0]
+            turn[on] = turn[by] @ turn[on]
+            before[on] = before[by]
         position[root], rotation[root], known[root] = at, turned, True
         position[reached], rotation[reached], known[reached] = at + moved @ turned.T, turned @ turn, True
     return position, rotation, known
-
-
-def _from_root(before: Ints, position: Floats, rotation: Floats) -> tuple[Floats, Floats]:
-    """Poses of a tree as its root sees them, from each as the one before sees it (-1: the root): pointers jump."""
-    while (on := np.flatnonzero(before >= 0)).size:
-        by = before[on]
-        position[on] = position[by] + (rotation[by] @ position[on, :, None])[..., 0]
-        rotation[on] = rotation[by] @ rotation[on]
-        before[on] = before[by]
-    return position, rotation
 
 
 def along_poses(problem: Problem) -> Floats:
@@ -118,9 +113,9 @@ def along_poses(problem: Problem) -> Floats:
     return np.asarray(x)
 
 
-def parts(n: int, pairs: Ints) -> Ints:
-    """(n,) the first node of the connected component that each is in, by pairs (M, 2) that are joined."""
-    part = np.arange(n)
+def parts(n: int, *joined: Ints) -> Ints:
+    """(n,) the first node of the connected component that each is in, by pairs, (M, 2) each, that are joined."""
+    part, pairs = np.arange(n), np.concatenate([np.empty((0, 2), np.int64), *joined])
     while (apart := part[pairs[:, 0]] != part[pairs[:, 1]]).any():
         ends = part[pairs[apart]]
         np.minimum.at(part, ends.max(axis=1), ends.min(axis=1))
