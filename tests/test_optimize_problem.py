@@ -108,7 +108,7 @@ BAD = {
     "zero range": (lambda: PAIR.add("range", ("a", "b"), 0.0, std=1.0), "Coincident"),
     "unknown node": (lambda: PAIR.add("range", ("a", "c"), 5.0, std=1.0), "one of a, b"),
     "misspelt node": (lambda: Problem(("car", "bus")).add("range", ("car", "buss"), 5.0, std=1.0), "Did you mean bus"),
-    "itself": (lambda: PAIR.add("range", ("a", "a"), 5.0, std=1.0), "two different points"),
+    "itself": (lambda: PAIR.add("range", ("a", "a"), 5.0, std=1.0), "different points"),
     "unknown kind": (lambda: PAIR.add("doppler", ("a", "b"), 5.0, std=1.0), "spherical"),
     "no std": (lambda: PAIR.add("range", ("a", "b"), 5.0), "exactly one of std, cov"),
     "shape of z": (lambda: PAIR.add("spherical", ("a", "b"), [5.0], std=1.0), "must have 2 or 3"),
