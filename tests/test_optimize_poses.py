@@ -171,45 +171,38 @@ def test_a_graph_without_its_gauge_names_what_is_free() -> None:
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "casadi"])
-def test_offsets_and_arms_are_unknowns(backend: str) -> None:
-    """Ranges to anchors that are 2 and -0.4 m too long, an antenna elsewhere: SciPy's minimum and covariance."""
-    rng, steps = np.random.default_rng(4), 80
-    turn = 0.15 * np.arange(steps)
-    x, y = 10 * np.sin(turn), -10 * np.cos(turn)
-    anchors, offset, arm = np.array([[20.0, 5.0], [-8.0, 15.0]]), [2.0, -0.4], np.array([1.2, 0.3])
-    half, which = 0.075, np.arange(steps) % 2
-    z = pose([2 * 10 * np.sin(half) * np.cos(half), 2 * 10 * np.sin(half) ** 2], 0.15)
-
-    def antenna(x: np.ndarray, y: np.ndarray, h: np.ndarray, ahead: float, left: float) -> np.ndarray:
-        return np.array([x + ahead * np.cos(h) - left * np.sin(h), y + ahead * np.sin(h) + left * np.cos(h)])
-
-    def ranges(x: np.ndarray, y: np.ndarray, offset: np.ndarray) -> np.ndarray:
-        return np.hypot(*(anchors[which] - np.stack([x, y], 1)).T) + np.take(offset, which)
-
-    r = ranges(x, y, offset) + 0.1 * rng.normal(size=steps)
-    fixes = antenna(x, y, turn, *arm) + 0.5 * rng.normal(size=(2, steps))
-    own, marks, offsets = ([f"{word}{k}" for k in range(count)] for word, count in (("t", steps), ("m", 2), ("o", 2)))
-    x0 = np.concatenate([pose(np.stack([x, y], 1), turn), pose(anchors), pose(np.zeros((3, 2)))])
-    problem = Problem((*own, *marks, *offsets, "arm"), x0=x0, dimension=2, poses=own, fixed=marks)
-    problem = problem.add("relative_pose", [*pairwise(own)], [z] * (steps - 1), std=[0.05, 0.05, 0.01])
-    seen = [(name, marks[k], offsets[k]) for name, k in zip(own, which, strict=True)]
-    problem = problem.add("range_offset", seen, r, std=0.1).add("position", offsets, np.zeros((2, 2)), std=[3.0, 1.0])
-    found = solve(problem.add("antenna", [(name, "arm") for name in own], fixes.T, std=0.5), backend)
+def test_offsets_that_ranges_share_are_scipys(backend: str) -> None:
+    """Of two anchors, 2 and -0.4 m, with a point per step: minimum and covariance of a residual written here."""
+    rng, steps = np.random.default_rng(4), 120
+    path = np.cumsum(rng.normal(0.0, 2.0, (steps, 2)), axis=0)
+    anchors, which = np.array([[20.0, 5.0], [-8.0, 15.0]]), np.arange(steps) % 2
+    moved = np.diff(path, axis=0) + 0.05 * rng.normal(size=(steps - 1, 2))
+    r = np.linalg.norm(anchors[which] - path, axis=1) + np.take([2.0, -0.4], which) + 0.1 * rng.normal(size=steps)
 
     def residual(u: np.ndarray) -> np.ndarray:
-        (x, y, h), (ahead, left, *offset) = u[:-4].reshape(3, -1), u[-4:]
-        dx, dy, d = np.diff(x), np.diff(y), np.diff(h)
-        c, s, w = np.cos(h[:-1]), np.sin(h[:-1]), d - 0.15
-        moved = np.stack([c * dx + s * dy, -s * dx + c * dy]) - z[:2, None]
-        moved = Rotation.from_euler("z", -0.15).as_matrix()[:2, :2] @ moved
-        parts = [*moved / 0.05, w / 0.01, (ranges(x, y, offset) - r) / 0.1, np.divide(offset, 3.0)]
-        return np.concatenate([*parts, ((antenna(x, y, h, ahead, left) - fixes) / 0.5).ravel()])
+        x, offset = u[:-2].reshape(-1, 2), u[-2:]
+        far = np.linalg.norm(anchors[which] - x, axis=1) + offset[which] - r
+        return np.concatenate([((np.diff(x, axis=0) - moved) / 0.05).ravel(), far / 0.1, offset / 3.0])
 
-    theirs = least_squares(residual, np.concatenate([x, y, turn, np.zeros(4)]) + 1e-3, xtol=1e-14, gtol=1e-12)
-    assert found.cost == pytest.approx(theirs.cost, rel=1e-8)
-    ours = np.array([*found["arm"][:2], found["o0"][0], found["o1"][0]])
-    assert ours == pytest.approx(theirs.x[-4:], abs=1e-5)
-    std = np.sqrt(np.diag(np.linalg.inv(theirs.jac.T @ theirs.jac))[-4:])
-    places = [("arm", 0), ("arm", 1), ("o0", 0), ("o1", 0)]
-    assert [found.covariance[problem.index(n)][k, k] ** 0.5 for n, k in places] == pytest.approx(std, rel=1e-3)
-    assert (np.abs(ours - [*arm, *offset]) < 4 * std).all()
+    theirs = least_squares(residual, np.append(path, [0.0, 0.0]), xtol=1e-14, gtol=1e-12)
+    names = [*map(str, range(steps)), "A", "B", "offset A", "offset B"]
+    x0 = np.concatenate([path, anchors, np.zeros((2, 2))])
+    problem = Problem(names, x0=x0, dimension=2, fixed="AB").add(
+        "displacement", [*pairwise(names[:steps])], moved, 0.05
+    )
+    problem = problem.add(
+        "range_offset", [(names[k], "AB"[k % 2], names[-2 + k % 2]) for k in range(steps)], r, std=0.1
+    )
+    found = solve(problem.add("position", names[-2:], np.zeros((2, 2)), std=[3.0, 1.0]), backend)
+    assert found.cost == pytest.approx(theirs.cost, rel=1e-9)
+    assert found.x[-2:, 0] == pytest.approx(theirs.x[-2:], abs=1e-5)
+    std = np.sqrt(np.diag(np.linalg.inv(theirs.jac.T @ theirs.jac))[-2:])
+    assert np.sqrt(found.covariance[-2:, 0, 0]) == pytest.approx(std, rel=1e-4)
+    assert (np.abs(found.x[-2:, 0] - [2.0, -0.4]) < 4 * std).all()
+
+
+def test_an_antenna_stands_at_the_end_of_its_arm() -> None:
+    turn, at, arm = Rotation.from_rotvec([0.3, -0.2, 2.0]), np.array([5.0, 1.0, -2.0]), np.array([1.5, -0.6, 0.3])
+    x = np.stack([pose(at, turn.as_rotvec()), pose(arm, np.zeros(3))])
+    problem = Problem(("car", "arm"), x0=x, poses=["car"]).add("antenna", ("car", "arm"), np.zeros(3), std=1.0)
+    assert problem.whiten(x)[0] == pytest.approx(at + turn.apply(arm))
