@@ -87,9 +87,8 @@ def test_a_seed_that_diverged_is_not_averaged_away(rows: list[dict[str, Any]]) -
     """The mean over the other seeds would look like a mean over all."""
     one = pd.DataFrame(rows).query("method == 'gnss' and k == 0")
     many = pd.concat([one.assign(train_seed=s) for s in (0, 1)], ignore_index=True)
-    gone = {"train_seed == 1 and ego == 'b' and run == 2": [6, 1], "train_seed == 0 and ego == 'a' and run == 1": [0, 2]}
-    for which, counts in gone.items():
-        many.loc[many.query(which).index, "rt_le_m"] = np.nan
+    for which, counts in (("1 and ego == 'b' and run == 2", [6, 1]), ("0 and ego == 'a' and run == 1", [0, 2])):
+        many.loc[many.query(f"train_seed == {which}").index, "rt_le_m"] = np.nan
         summary = results(many, ("method", "train_seed")).summary(["method"], "rt_le_m")
         assert summary[["n", "missing"]].to_numpy().tolist() == [counts]
 
