@@ -62,7 +62,7 @@ def check_nodes(measurement: Measurement, nodes: npt.ArrayLike) -> Ints:
         hint = "Give one row per measurement."
         raise InputError("nodes", array.shape, f"must have shape (M, {measurement.arity}) for {measurement.name}", hint)
     refuse("nodes", array, array < 0, "must be an index >= 0", "Problem.add takes names; a Factor takes indices.")
-    if (same := (np.diff(np.sort(array)) == 0).any(axis=1)).any():
+    if measurement.arity > 1 and (same := (np.diff(np.sort(array)) == 0).any(axis=1)).any():
         hint = "A vehicle does not measure itself."
         raise InputError("nodes", array[same][0].tolist(), "must be different points", hint)
     return array
