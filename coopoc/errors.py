@@ -79,6 +79,15 @@ def unknown(noun: str, name: object, known: Iterable[str], otherwise: str | None
     return InputError(noun, shown(name), allowed, suggestion(name, known, otherwise))
 
 
+def said(error: Exception) -> str:
+    """The first line of what an error of another library says, else its name.
+
+    >>> said(KeyError())
+    'KeyError'
+    """
+    return next(iter(str(error).splitlines()), type(error).__name__)[:200]
+
+
 class MissingLibraryError(ImportError):
     """An optional library or program is not installed: the message carries the line that installs it."""
 

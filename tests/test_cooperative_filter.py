@@ -135,7 +135,7 @@ def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
     track, box = CooperativeFilter()(seen), inbox(seen, 0, CooperativeFilter().message)
     method = CooperativeFilter(NoiseModel.nominal(sensors))
     streams = {j: StarStream(method, max_age=v2x.max_age) for j in range(len(seen.ids))}
-    sent: dict[tuple[int, int], Broadcast | None] = {}
+    sent, trusted = dict[tuple[int, int], Broadcast | None](), set[bool]()
     for t in range(len(seen.t)):
         here = np.arange(box.start[t], box.start[t + 1])
         for j, stream in streams.items():
@@ -153,6 +153,8 @@ def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
         assert track.covariance is not None
         assert cov is not None
         assert_allclose(cov, track.covariance[0, t, 0], atol=1e-6)
+        trusted |= set(streams[0].trusted.values())
+    assert trusted == {True, False}
 
 
 def newest(seen: Recording, sent: Mapping[tuple[int, int], Any], t: int, s: int, j: int) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -86,6 +87,30 @@ def test_an_offset_of_ranges_is_taken_off(tmp_path: Path) -> None:
     np.testing.assert_array_equal(pair.recording.relative, log.recording.relative)
     with refused("offset = 'uwb': must be one of"):
         read_log(folder, offset={"uwb": 1.0})
+
+
+@pytest.mark.parametrize("truth", [True, False])
+def test_an_antenna_elsewhere_is_found_and_taken_off(tmp_path: Path, truth: bool) -> None:
+    """1.5 m ahead and 0.6 m to the right of a car whose speed changes, with fixes of 0.5 m that come 0.1 s late."""
+    t, arm = 0.02 * np.arange(9000), (1.5, -0.6)
+    ahead, speed = np.exp(2.5j * np.sin(0.1 * t)), 8 + 4 * np.sin(0.21 * t)
+    position, velocity = (
+        np.stack([part.real, part.imag, 0 * t], axis=1)[:, None]
+        for part in (np.cumsum(0.02 * speed * ahead), speed * ahead)
+    )
+    reference = co.Fleet(("car",), t, position, velocity)
+    seen = position[:, 0, :2] @ [1, 1j] + complex(*arm) * ahead - 0.1 * speed * ahead
+    moved = replace(reference, position=np.stack([seen.real, seen.imag, 0 * t], axis=1)[:, None])
+    parts = [fixes(moved, "car", 0.5, 0.5), motion(reference, "car", 0.1, 0.1)]
+    write(pd.concat(parts).drop(columns=["z", "vz"]), tmp_path / "log.csv")
+    if truth:
+        write(fixes(reference, "car", 0.1, 1e-9).drop(columns="z"), tmp_path / "truth.csv")
+    (line,) = [text for text in check(read_log(tmp_path)).warnings if "antenna=" in text]
+    ahead_of, one, left, other, *_ = map(float, re.findall(r"-?\d+\.\d+", line))
+    assert_allclose([ahead_of, left], arm, atol=4 * max(one, other))
+    assert max(one, other) < (0.1 if truth else 0.3)
+    log = load_log(f"{tmp_path}?{line.split()[-4]}")
+    assert "antenna=" not in said(log)
 
 
 def test_a_german_table_is_read_and_its_outliers_are_named(tmp_path: Path) -> None:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ..arrays import AnyArray
-from ..errors import InputError
+from ..errors import InputError, said
 from ..file_names import given_path
 from .fleet import Fleet
 from .links import Links
@@ -125,7 +125,7 @@ def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
     except DAMAGES as error:
         if isinstance(error, InputError) and error.field == path.name:
             raise
-        found = next(iter(str(error).splitlines()), type(error).__name__)
+        found = said(error)
     raise InputError(path.name, found, "must be a recording in .npz", "Write it again with save_recording.")
 
 

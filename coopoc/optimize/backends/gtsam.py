@@ -123,22 +123,18 @@ def _poses(d: int, x: Floats) -> Callable[[], Iterable[tuple[Any, ...]]]:
     return lambda: ((pose_of(d, each),) for each in x)
 
 
-def _position(factor: Factor, W: Floats, d: int) -> Form:
-    names: Names = {(POINT,): f"PriorFactorPoint{d}", (POSE,): f"PoseTranslationPrior{d}D"}
-    return [Part(names, lambda: zip(factor.z, strict=True), W)]
+PLAIN: Mapping[str, Names] = {
+    "position": {(POINT,): "PriorFactorPoint{0}", (POSE,): "PoseTranslationPrior{0}D"},
+    "displacement": {(POINT, POINT): "BetweenFactorPoint{0}"},
+    "range": {(POINT, POINT): "RangeFactor{0}", (POSE, POINT): "RangeFactor{0}D", (POSE, POSE): "RangeFactorPose{0}"},
+}
+"""GTSAM's classes of kinds whose residual is its error."""
 
 
-def _displacement(factor: Factor, W: Floats, d: int) -> Form:
-    return [Part({(POINT, POINT): f"BetweenFactorPoint{d}"}, lambda: zip(factor.z, strict=True), W)]
-
-
-def _range(factor: Factor, W: Floats, d: int) -> Form:
-    names: Names = {
-        (POINT, POINT): f"RangeFactor{d}",
-        (POSE, POINT): f"RangeFactor{d}D",
-        (POSE, POSE): f"RangeFactorPose{d}",
-    }
-    return [Part(names, lambda: zip(factor.z[:, 0], strict=True), W)]
+def _plain(factor: Factor, W: Floats, d: int) -> Form:
+    names = {turning: name.format(d) for turning, name in PLAIN[factor.kind].items()}
+    z = factor.z[:, 0] if factor.kind == "range" else factor.z
+    return [Part(names, lambda: zip(z, strict=True), W)]
 
 
 def _bearing(factor: Factor, W: Floats, d: int) -> Form:
@@ -241,9 +237,7 @@ def _coupled(W: Floats, d: int) -> bool:
 
 
 FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
-    "position": _position,
-    "displacement": _displacement,
-    "range": _range,
+    **dict.fromkeys(PLAIN, _plain),
     "bearing": _bearing,
     "body_spherical": _bearing,
     "relative_position": _relative_position,
