@@ -1,8 +1,8 @@
 """A small net that sets the noise of the road filter, step by step, against the same filter with learned constants: the
 trial of docs/learned.md, "A net that sets the noise".
 
-python examples/learned_noise.py --data ~/measured                 # some 40 minutes of one core
-python examples/learned_noise.py --quick --out runs/quick          # does it run? three minutes, no results
+python examples/learned_noise.py --data ~/measured                 # 18 minutes of one core
+python examples/learned_noise.py --quick --out runs/quick          # does it run? two minutes, no results
 
 The filter is `coopoc.RoadFilter`, written differentiably; without the net both agree to 1e-6, which each run checks.
 What is learned, in the worlds of `coopoc.learned.training.roads`:
