@@ -32,7 +32,6 @@ GAPS = (
     "cooperative-filter",
     "ci",
     "split-ci",
-    "fixed-lag",
     "mhe",
     "gbp",
     "central-filter",

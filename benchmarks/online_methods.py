@@ -7,7 +7,7 @@ White noise of the paper's second scenario, nominal noise model, ideal channel. 
 share of steps whose run-averaged NEES lies in its 99 % band. Milliseconds are per step, run and ego (whole-fleet
 methods: per step, run and vehicle), on whatever this machine was doing.
 
-The rows of `measured` are moving horizons and fixed lags at K = 6, each with its inbox and its Track:
+The rows of `measured` are moving horizons at K = 6, each with its inbox and its Track:
 microseconds per step and run of an ego, and their ratio to the joint filter's. Right means that a run has the digits
 that it has alone.
 """
@@ -32,14 +32,13 @@ ORDER = (
     "split-ci",
     "msmv-r",
     "joint",
-    "fixed-lag",
     "mhe",
     "gbp",
     "central-filter",
     "batch-smoother",
 )
 SENSORS = co.Sensors.paper_scenario2()
-JOBS = ("mhe", "mhe, late", "fixed-lag")
+JOBS = ("mhe", "mhe, late")
 """A method and a word more: messages take 0.3 s."""
 ROUNDS, STEPS, RUNS = 3, 60, 16
 

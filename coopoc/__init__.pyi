@@ -28,6 +28,7 @@ from .methods.joint_filter import JointFilter as JointFilter
 from .methods.kalman import GNSS as GNSS
 from .methods.kalman import AdaptiveKalman as AdaptiveKalman
 from .methods.kalman import Kalman as Kalman
+from .methods.moving_horizon import MovingHorizon as MovingHorizon
 from .methods.noise_model import NoiseModel as NoiseModel
 from .methods.poses.pose_filter import PoseFilter as PoseFilter
 from .methods.poses.pose_start import pose_start as pose_start
@@ -35,8 +36,6 @@ from .methods.poses.pose_stream import LandmarkMeasurement as LandmarkMeasuremen
 from .methods.poses.pose_stream import OwnMeasurement as OwnMeasurement
 from .methods.road import RoadErrors as RoadErrors
 from .methods.road import RoadFilter as RoadFilter
-from .methods.sliding_window import FixedLagSmoother as FixedLagSmoother
-from .methods.sliding_window import MovingHorizon as MovingHorizon
 from .methods.star import stars as stars
 from .methods.star_stream import RelativeMeasurement as RelativeMeasurement
 from .methods.star_stream import StarStream as StarStream

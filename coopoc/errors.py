@@ -41,15 +41,6 @@ def shown(value: object, longest: int = 60) -> str:
         return f"a {type(value).__name__}"
 
 
-def first_line(error: BaseException) -> str:
-    """What an error says, or its class.
-
-    >>> first_line(ValueError("two\\nlines")), first_line(KeyError())
-    ('two', 'KeyError')
-    """
-    return next(iter(str(error).splitlines()), type(error).__name__)[:200]
-
-
 def _cut(value: object) -> str:
     """What a file holds may be of any length, and what a caller gives may have no text."""
     try:
@@ -86,6 +77,15 @@ def unknown(noun: str, name: object, known: Iterable[str], otherwise: str | None
         otherwise = "Use one of these names." if known else "There is none to use."
     allowed = "must be one of " + (", ".join(known) or "(there is none)")
     return InputError(noun, shown(name), allowed, suggestion(name, known, otherwise))
+
+
+def said(error: Exception) -> str:
+    """The first line of what an error of another library says, else its name.
+
+    >>> said(KeyError())
+    'KeyError'
+    """
+    return next(iter(str(error).splitlines()), type(error).__name__)[:200]
 
 
 class MissingLibraryError(ImportError):

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 
 from coopoc.arrays import one_of
-from coopoc.errors import InputError, MissingLibraryError, first_line, unknown
+from coopoc.errors import InputError, MissingLibraryError, said, unknown
 
 from .cells import numeric
 from .log.units import Rows, Summary, rows_of
@@ -114,7 +114,7 @@ def read_bag(
     except InputError:
         raise
     except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
-        raise InputError(path.name, first_line(error), "must be a ROS bag", "Record it again, or reindex it.") from None
+        raise InputError(path.name, said(error), "must be a ROS bag", "Record it again, or reindex it.") from None
     if behind:
         other = "received" if stamps == "header" else "header"
         spread = f"between {min(behind):.3g} and {max(behind):.3g} s before they were received"

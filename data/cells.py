@@ -17,7 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.arrays import Bools, Floats, named, number
-from coopoc.errors import InputError, first_line, require, suggestion, unknown
+from coopoc.errors import InputError, require, said, suggestion, unknown
 from coopoc.formats.values import LARGEST
 
 if TYPE_CHECKING:
@@ -63,7 +63,7 @@ def read_frame(path: Path, *text: str) -> pd.DataFrame:
     except (InputError, ImportError):
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
-        raise _no_table(path, first_line(error)) from None
+        raise _no_table(path, said(error)) from None
     frame.columns = pd.Index([str(name).strip() for name in frame.columns])
     _check_header(path, list(frame.columns))
     frame.index += 1
@@ -212,13 +212,13 @@ def _read_csv(path: Path, text: Sequence[str]) -> pd.DataFrame:
     _check_header(path, header)
     if len(first) > len(header):  # the only row that pandas does not compare with the header
         raise _too_wide(path, 1, len(first), len(header))
-    form: dict[str, Any] = {"sep": separator, "decimal": "." if separator == "," else ",", "names": header}
-    form["converters"] = {name: str.strip for name in header if name.strip() in text}
-    if tuple(int(part) for part in pd.__version__.split(".")[:2]) < (3, 1):
+    form: dict[str, Any] = {"sep": separator, "decimal": "." if separator == "," else ",", "names": header, "header": 0}
+    form |= {"index_col": False, "skipinitialspace": True, "encoding": "utf-8-sig"}
+    if tuple(map(int, pd.__version__.split(".")[:2])) < (3, 1):
         form["float_precision"] = "round_trip"  # the default became exact in 3.1
+    form["converters"] = {name: str.strip for name in header if name.strip() in text}
     try:
-        options = {"header": 0, "index_col": False, "skipinitialspace": True, "encoding": "utf-8-sig", **form}
-        table: pd.DataFrame = pd.read_csv(path, **options)
+        table: pd.DataFrame = pd.read_csv(path, **form)
         return table
     except pd.errors.ParserError as error:
         wide = re.search(r"fields in line (\d+), saw (\d+)", str(error))

@@ -9,7 +9,7 @@ import pandas as pd
 import pymap3d
 
 from coopoc.arrays import Floats
-from coopoc.errors import InputError, first_line
+from coopoc.errors import InputError, said
 
 from .log.units import Rows, Summary, of_kinds
 from .nmea import SLOW
@@ -63,6 +63,7 @@ def _array(path: Path, name: str) -> Floats:
         if not np.isfinite(array).all():
             raise ValueError("numbers that are not finite")
     except Exception as error:  # of NumPy: a damaged file meets them all
-        allowed = "must be an array of numpy.save"
-        raise InputError(f"{path.name}/{name}", first_line(error), allowed, "Copy it again.") from None
+        raise InputError(
+            f"{path.name}/{name}", said(error), "must be an array of numpy.save", "Copy it again."
+        ) from None
     return array

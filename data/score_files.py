@@ -135,9 +135,7 @@ def draw(pairs: Mapping[str, tuple[Path, Path, Path]], path: File) -> None:
     for k, (name, (_, estimate, truth)) in enumerate(pairs.items()):
         ax.plot(*truth.position[:, :2].T, color=INK, lw=1, ls="--")
         ax.plot(*estimate.position[:, :2].T, color=COLORS[k % len(COLORS)], label=picture(name))
-    figure = finish(ax).get_figure(root=True)
-    assert figure is not None
-    figure.savefig(path)
+    finish(ax).figure.savefig(path)  # type: ignore[union-attr]
 
 
 def _plain(value: Any) -> Any:

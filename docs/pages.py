@@ -220,7 +220,6 @@ ORACLES = {
     "msmv-r": "msmv",
     "ci": "covariance_intersection",
     "split-ci": "covariance_intersection",
-    "fixed-lag": "joint",
     "mhe": "moving_horizon",
     "gbp": "gbp",
     "central-filter": "central_filter",

@@ -18,7 +18,7 @@ from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from coopoc.arrays import number
-from coopoc.errors import InputError, first_line, unknown
+from coopoc.errors import InputError, said, unknown
 from coopoc.evaluate.scores import scored
 from coopoc.evaluate.statistics import mean_interval, paired_difference
 from coopoc.file_names import given_path
@@ -166,7 +166,7 @@ def _row(task: str, made: Callable[[], dict[str, Any]]) -> dict[str, Any]:
         return made()
     except Exception as error:  # a failure is a row
         print(f"coopoc: failed: {task}", *traceback.format_exc().splitlines()[-5:], sep="\n  ", file=sys.stderr)
-        return {"task": task, "failed": f"{type(error).__name__}: {first_line(error)}"}
+        return {"task": task, "failed": f"{type(error).__name__}: {said(error)}"}
 
 
 def simulated(name: str) -> bool:

@@ -31,6 +31,13 @@ def refused(match: str) -> Any:
     return pytest.raises(InputError, match=match)
 
 
+def same_minimum(theirs: Any, ours: Any) -> None:
+    """Of two solutions: cost to 1e-9, estimates and covariances to 1e-6."""
+    assert theirs.cost == pytest.approx(ours.cost, rel=1e-9)
+    assert theirs.x == pytest.approx(ours.x, abs=1e-6)
+    assert theirs.covariance == pytest.approx(ours.covariance, abs=1e-6)
+
+
 def textbook(method: Any) -> Any:
     """The method without gates, as its oracle is written."""
     return replace(method, robust=False)

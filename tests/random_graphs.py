@@ -1,9 +1,10 @@
-"""Random factor graphs of robots that drive about: odometry, loops, landmarks, ranges."""
+"""Random factor graphs: robots that drive about with odometry, loops, landmarks and ranges, and stars."""
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
+from coopoc.optimize import Loss, Problem
 
 REACH = 12.0
 """m within which robots see one another and landmarks."""
@@ -120,3 +121,24 @@ def _orientation(rotation: np.ndarray) -> np.ndarray:
     if rotation.shape[-1] == 2:
         return np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])[:, None]
     return Rotation.from_matrix(rotation).as_quat()
+
+
+def star(
+    kind: str,
+    seed: int,
+    neighbours: int = 6,
+    fix_std: float = 2.0,
+    height: float = 0.2,
+    loss: Loss | None = None,
+    wrong: int = 0,
+) -> Problem:
+    """An ego with ranges to, or azimuths of, its neighbours, the first `wrong` 40 m or rad too large, and fixes."""
+    rng = np.random.default_rng(seed)
+    truth = np.concatenate([np.zeros((1, 3)), rng.uniform(-25, 25, (neighbours, 3)) * [1, 1, height]])
+    names = ("ego", *(f"v{j}" for j in range(1, neighbours + 1)))
+    fixes = truth + rng.normal(0, fix_std, truth.shape)
+    problem = Problem(names, separator=(0,)).add("position", names, fixes, std=fix_std)
+    v, std = truth[1:], 0.5 if kind == "range" else 0.05
+    z = np.linalg.norm(v, axis=1) if kind == "range" else np.arctan2(v[:, 1], v[:, 0])
+    z = z + rng.normal(0, std, neighbours) + 40.0 * (np.arange(neighbours) < wrong)
+    return problem.add(kind, [("ego", n) for n in names[1:]], z[:, None], std=std, loss=loss)

@@ -136,14 +136,18 @@ def test_an_estimator_that_is_told_what_is_wrong_has_gtsams_bound_without_it(
     assert bound_rt_le(mean) > 1.1 * bound_rt_le(bound(clean))
 
 
+def near(square: np.ndarray, bound: float) -> None:
+    """Squared errors of 40 runs are not below a bound beyond their interval, and not far above it."""
+    half = stats.t.ppf(0.995, 39) * square.std(ddof=1) / np.sqrt(40)
+    assert square.mean() + half > bound
+    assert square.mean() < 1.15 * bound
+
+
 def test_the_joint_filter_that_is_told_what_is_wrong_reaches_the_bound(formation: Fleet) -> None:
     fleet, v2x = formation.between(0, 200), V2X(max_neighbours=6)
     told = observe(fleet, replace(S2, outliers=WRONG), v2x, runs=40, observers=[0], seed=2, told=True)
     square = (rt_le(JointFilter("nominal")(told, [0]), fleet) ** 2).mean(axis=1)
-    bound = bound_rt_le(posterior_bound(fleet, S2, 0, v2x, recording=told)) ** 2
-    half = stats.t.ppf(0.995, 39) * square.std(ddof=1) / np.sqrt(40)
-    assert square.mean() + half > bound
-    assert square.mean() < 1.15 * bound
+    near(square, bound_rt_le(posterior_bound(fleet, S2, 0, v2x, recording=told)) ** 2)
 
 
 def test_a_recording_of_something_else_is_refused(crossing: Fleet) -> None:
@@ -171,10 +175,7 @@ def test_no_filter_beats_the_bound_of_its_own_information(method, neighbours: in
     v2x = V2X(max_neighbours=neighbours)
     recording = observe(fleet, S2, v2x, runs=40, observers=[0], seed=2)
     square = (rt_le(method(recording, [0]), fleet) ** 2).mean(axis=1)
-    bound = bound_rt_le(posterior_bound(fleet, S2, 0, v2x)) ** 2
-    half = stats.t.ppf(0.995, 39) * square.std(ddof=1) / np.sqrt(40)
-    assert square.mean() + half > bound
-    assert square.mean() < 1.15 * bound
+    near(square, bound_rt_le(posterior_bound(fleet, S2, 0, v2x)) ** 2)
 
 
 def test_exact_fixes_have_no_bound(crossing: Fleet) -> None:

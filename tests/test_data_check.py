@@ -2,6 +2,7 @@
 
 import re
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -88,6 +89,30 @@ def test_an_offset_of_ranges_is_taken_off(tmp_path: Path) -> None:
         read_log(folder, offset={"uwb": 1.0})
 
 
+@pytest.mark.parametrize("truth", [True, False])
+def test_an_antenna_elsewhere_is_found_and_taken_off(tmp_path: Path, truth: bool) -> None:
+    """1.5 m ahead and 0.6 m to the right of a car whose speed changes, with fixes of 0.5 m that come 0.1 s late."""
+    t, arm = 0.02 * np.arange(9000), (1.5, -0.6)
+    ahead, speed = np.exp(2.5j * np.sin(0.1 * t)), 8 + 4 * np.sin(0.21 * t)
+    position, velocity = (
+        np.stack([part.real, part.imag, 0 * t], axis=1)[:, None]
+        for part in (np.cumsum(0.02 * speed * ahead), speed * ahead)
+    )
+    reference = co.Fleet(("car",), t, position, velocity)
+    seen = position[:, 0, :2] @ [1, 1j] + complex(*arm) * ahead - 0.1 * speed * ahead
+    moved = replace(reference, position=np.stack([seen.real, seen.imag, 0 * t], axis=1)[:, None])
+    parts = [fixes(moved, "car", 0.5, 0.5), motion(reference, "car", 0.1, 0.1)]
+    write(pd.concat(parts).drop(columns=["z", "vz"]), tmp_path / "log.csv")
+    if truth:
+        write(fixes(reference, "car", 0.1, 1e-9).drop(columns="z"), tmp_path / "truth.csv")
+    (line,) = [text for text in check(read_log(tmp_path)).warnings if "antenna=" in text]
+    ahead_of, one, left, other, *_ = map(float, re.findall(r"-?\d+\.\d+", line))
+    assert_allclose([ahead_of, left], arm, atol=4 * max(one, other))
+    assert max(one, other) < (0.1 if truth else 0.3)
+    log = load_log(f"{tmp_path}?{line.split()[-4]}")
+    assert "antenna=" not in said(log)
+
+
 def test_a_german_table_is_read_and_its_outliers_are_named(tmp_path: Path) -> None:
     """Semicolons, decimal commas, headers of another language, one wide table."""
     names = {"t": "Zeit", "vehicle": "Fahrzeug", "partner": "Ziel", "x": "Rechtswert", "y": "Hochwert"}
@@ -110,11 +135,11 @@ def test_wrong_ranges_are_named_and_mislead_no_filter(tmp_path: Path) -> None:
     folder = cars(tmp_path / "log", lambda f: f.assign(range=outliers(f["range"], 0.1)))
     log = read_log(folder)
     assert "of the ranges lie beyond 5" in said(log)
-    settings = {"data": str(folder), "method": "kalman,joint,fixed-lag,central-filter", "max_neighbours": "1"}
+    settings = {"data": str(folder), "method": "kalman,joint,mhe,central-filter", "max_neighbours": "1"}
     results = co.run_study("side_by_side", tmp_path / "out", settings=settings, progress=False)
     assert not results.failed
     error = results.frame.groupby("method")["rt_le_m"].mean()
-    for method in ("joint", "fixed-lag", "central-filter"):
+    for method in ("joint", "mhe", "central-filter"):
         assert error[method] < 0.99 * error["kalman"], method
     assert log.truth is not None
     ungated = co.rt_le(co.JointFilter(robust=False)(log.recording, ["car0", "car1"]), log.truth).mean()

@@ -1,6 +1,7 @@
 """Graduated non-convexity: its surrogates, what it finds among all subsets, groups, poses, and what it refuses."""
 
 import itertools
+import pickle
 
 import gtsam
 import numpy as np
@@ -11,7 +12,7 @@ from scipy.stats import chi2
 
 from coopoc import InputError
 from coopoc.optimize import Loss, Problem, SolveError, Status, pose, solve_gnc
-from coopoc.optimize.robust.graduated import SURROGATES
+from coopoc.optimize.robust import graduated
 
 
 def paper_rho(loss: str, r: float, mu: float, c: float = 1.0) -> float:
@@ -23,7 +24,7 @@ def paper_rho(loss: str, r: float, mu: float, c: float = 1.0) -> float:
     return c**2 if r**2 >= (mu + 1) / mu * c**2 else 2 * c * r * np.sqrt(mu * (mu + 1)) - mu * (c**2 + r**2)
 
 
-@pytest.mark.parametrize("loss", SURROGATES)
+@pytest.mark.parametrize("loss", graduated.SURROGATES)
 @pytest.mark.parametrize("mu", [0.05, 1.0, 7.0, 300.0])
 def test_weights_are_those_of_the_surrogate(loss: str, mu: float) -> None:
     """w = d rho_mu / d r^2, and the minimiser of w r^2 + Phi_mu(w), whose minimum is rho_mu (Black and Rangarajan)."""
@@ -32,7 +33,7 @@ def test_weights_are_those_of_the_surrogate(loss: str, mu: float) -> None:
         "geman-mcclure": lambda w: mu * (np.sqrt(w) - 1) ** 2,
     }
     for r in (0.03, 0.4, 0.97, 1.02, 1.5, 4.0):
-        weight = float(SURROGATES[loss].weight(np.array(r**2), mu))
+        weight = float(graduated.SURROGATES[loss].weight(np.array(r**2), mu))
         gradient_ = (paper_rho(loss, np.sqrt(r**2 + 1e-7), mu) - paper_rho(loss, np.sqrt(r**2 - 1e-7), mu)) / 2e-7
         assert weight == pytest.approx(gradient_, abs=1e-6)
         dual = minimize_scalar(lambda w, r=r: w * r**2 + penalties[loss](w), bounds=(0, 1), options={"xatol": 1e-12})
@@ -44,13 +45,13 @@ def test_schedules_end_at_the_losses() -> None:
     """At first no candidate is given up; at last the weights are those of the loss (Remark 5)."""
     s = np.array([[0.1, 0.9, 1.1, 30.0]])
     for loss, last in (("truncated", 1e9), ("geman-mcclure", 1.0)):
-        first = SURROGATES[loss].first(s.max())
+        first = graduated.SURROGATES[loss].first(s.max())
         expected = 1 / (2 * 30 - 1) if loss == "truncated" else 60.0
         assert first == pytest.approx(expected)
-        assert (SURROGATES[loss].weight(s, first) > 0).all()
-        assert SURROGATES[loss].weight(s, last) == pytest.approx(Loss(loss, 1.0).weight(s), abs=1e-6)
-    assert SURROGATES["truncated"].later(2.0) == pytest.approx(2.8)
-    assert SURROGATES["geman-mcclure"].later(2.8) == pytest.approx(2.0)
+        assert (graduated.SURROGATES[loss].weight(s, first) > 0).all()
+        assert graduated.SURROGATES[loss].weight(s, last) == pytest.approx(Loss(loss, 1.0).weight(s), abs=1e-6)
+    assert graduated.SURROGATES["truncated"].later(2.0) == pytest.approx(2.8)
+    assert graduated.SURROGATES["geman-mcclure"].later(2.8) == pytest.approx(2.0)
 
 
 def test_of_all_subsets_it_finds_the_best() -> None:
@@ -154,7 +155,7 @@ def test_gnc_that_rejects_every_fix_is_reported() -> None:
 
 
 @pytest.mark.parametrize("loss", ["truncated", "geman-mcclure"])
-def test_rounds_are_those_of_the_algorithm_as_it_is_printed(loss: str) -> None:
+def test_rounds_are_those_of_the_algorithm_as_it_is_printed(loss: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Algorithm of Yang et al. (section IV, remark 5) for one point, where each round is a weighted mean."""
     rng = np.random.default_rng(11)
     z = np.concatenate([rng.normal(0.0, 2.0, (9, 3)), rng.normal(40.0, 5.0, (4, 3))])
@@ -175,8 +176,12 @@ def test_rounds_are_those_of_the_algorithm_as_it_is_printed(loss: str) -> None:
         x = (w[:, None] * z).sum(axis=0) / w.sum()
         r2 = ((z - x) ** 2).sum(axis=1) / 2.0**2
         mu, rounds = (mu * 1.4 if loss == "truncated" else max(mu / 1.4, 1.0)), rounds + 1
-    problem = Problem(("a",)).add("position", ["a"] * len(z), z, std=2.0)
+    problem = Problem(("a",)).add("position", ["a"] * len(z), z, sqrt_information=np.eye(3) / 2)
     found = solve_gnc(problem, [0], loss, threshold=0.95)
     assert found.extras["rounds"] == rounds
     assert found.extras["mu"] == pytest.approx(mu)
     assert found.extras["weights"] == pytest.approx(w, abs=1e-6)
+    monkeypatch.setattr(graduated, "ROUNDS", 2)
+    with pytest.raises(SolveError) as caught:
+        solve_gnc(problem, [0], loss)
+    assert pickle.loads(pickle.dumps(caught.value)).solution.status is Status.MAX_ITERATIONS

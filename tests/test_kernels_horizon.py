@@ -1,4 +1,4 @@
-"""Compiled moving horizons and fixed-lag smoothers against the dense oracle and numpy.linalg.
+"""Compiled moving horizons against the dense oracle and numpy.linalg.
 
 `test_methods_horizon` holds them against SciPy, filterpy and gtsam.
 """
@@ -8,12 +8,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import textbook
-from oracles.moving_horizon import Drive, fixed_lag, moving_horizon
+from oracles.moving_horizon import Drive, moving_horizon
 
 from coopoc import V2X, Fleet, JointFilter, NoiseModel, Recording, Sensors, observe
-from coopoc.methods import sliding_window as module
+from coopoc.methods import moving_horizon as module
+from coopoc.methods.moving_horizon import MovingHorizon
 from coopoc.methods.noise_model import resolve
-from coopoc.methods.sliding_window import FixedLagSmoother, MovingHorizon
 from coopoc.world.inbox import inbox
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
@@ -32,31 +32,24 @@ METHODS = [
     MovingHorizon(horizon=6, exact=False),
     MovingHorizon(horizon=4, noise_model="identity"),
     MovingHorizon(horizon=4, noise_model=FITTED),
-    FixedLagSmoother(lag=0),
-    FixedLagSmoother(lag=3),
-    FixedLagSmoother(lag=3, exact=False),
-    FixedLagSmoother(lag=2, noise_model="identity"),
 ]
-Smoother = MovingHorizon | FixedLagSmoother
 
 
-def label(method: Smoother) -> str:
+def label(method: MovingHorizon) -> str:
     known = method.noise_model if isinstance(method.noise_model, str) else method.noise_model.name
-    length = method.horizon if isinstance(method, MovingHorizon) else method.lag
-    return f"{method.name}-{length}-{known}{'' if method.exact else '-linear'}"
+    return f"{method.name}-{method.horizon}-{known}{'' if method.exact else '-linear'}"
 
 
-def assert_is_the_oracle(recording: Recording, method: Smoother, ego: int, runs: range, near: float = 1e-7) -> None:
+def assert_is_the_oracle(
+    recording: Recording, method: MovingHorizon, ego: int, runs: range, near: float = 1e-7
+) -> None:
     known, box = resolve(method.noise_model, recording), inbox(recording, ego, FIX_AND_VELOCITY)
     track, exact = textbook(method)(recording, [ego]), method.exact and known.exact_relative
     assert track.covariance is not None
     assert track.neighbours is not None
     for run in runs:
         drive = Drive(recording, box, known, run, ego)
-        if isinstance(method, MovingHorizon):
-            x, cov = moving_horizon(drive, method.horizon + 1, exact, module.REPEATS if exact else 0)
-        else:
-            x, cov = fixed_lag(drive, method.lag, exact)
+        x, cov = moving_horizon(drive, method.horizon + 1, exact, module.REPEATS if exact else 0)
         for t, star in enumerate(drive.star):
             assert track.x[run, t, 0] == pytest.approx(x[ego, t], abs=near)
             assert track.covariance[run, t, 0] == pytest.approx(cov[t], abs=1e-7 * cov[t].max())
@@ -67,7 +60,7 @@ def assert_is_the_oracle(recording: Recording, method: Smoother, ego: int, runs:
 
 @pytest.mark.parametrize("channel", CHANNELS, ids=str)
 @pytest.mark.parametrize("method", METHODS, ids=label)
-def test_the_horizon_is_the_oracle(crossing: Fleet, channel: V2X, method: Smoother) -> None:
+def test_the_horizon_is_the_oracle(crossing: Fleet, channel: V2X, method: MovingHorizon) -> None:
     """Neighbours join and leave, messages are lost, late and rejected."""
     assert_is_the_oracle(observe(crossing.between(0, 12), S2, channel, runs=2), method, 3, range(2))
 
@@ -81,8 +74,7 @@ def test_messages_of_any_age_stand_where_the_oracle_has_them(formation: Fleet, l
     assert_is_the_oracle(recording, method, 0, range(0, 5, 4), 1e-6)
 
 
-@pytest.mark.parametrize("method", [MovingHorizon(horizon=5), FixedLagSmoother(lag=4)], ids=label)
-def test_vehicles_that_appear_and_vanish_and_fixes_that_are_missing(crossing: Fleet, method: Smoother) -> None:
+def test_vehicles_that_appear_and_vanish_and_fixes_that_are_missing(crossing: Fleet) -> None:
     position, velocity = crossing.position.copy(), crossing.velocity.copy()
     position[:4, 2:5], velocity[:4, 2:5] = np.nan, np.nan
     position[8:10, 4:7], velocity[8:10, 4:7] = np.nan, np.nan
@@ -91,7 +83,7 @@ def test_vehicles_that_appear_and_vanish_and_fixes_that_are_missing(crossing: Fl
     gnss, there = recording.gnss.copy(), np.random.default_rng(1).random(recording.gnss.shape[:3]) < 1 / 3
     there[:, 0] = True
     gnss[~there] = np.nan
-    assert_is_the_oracle(replace(recording, gnss=gnss), method, 0, range(3))
+    assert_is_the_oracle(replace(recording, gnss=gnss), MovingHorizon(horizon=5), 0, range(3))
 
 
 def test_a_neighbour_that_is_first_seen_due_north() -> None:
@@ -109,16 +101,13 @@ def test_a_neighbour_that_is_first_seen_due_north() -> None:
     assert_is_the_oracle(replace(seen, gnss=gnss, relative=relative), MovingHorizon(horizon=3), 0, range(2))
 
 
-@pytest.mark.parametrize("make", [MovingHorizon, FixedLagSmoother])
-def test_hardly_any_process_noise_loses_no_digits(crossing: Fleet, make: type) -> None:
+def test_hardly_any_process_noise_loses_no_digits(crossing: Fleet) -> None:
     """What stands still is known to 1e-8 m a step; the linear filter, which filterpy confirms, says the same."""
     recording = observe(crossing.between(0, 20), S2, V2X(max_neighbours=4, loss=0.2), runs=2)
     known = NoiseModel.oracle(S2, crossing.between(0, 20))
     wanted, found = (
-        textbook(JointFilter(known, exact=False))(recording, [1]),
-        textbook(make(known, exact=False, **({"lag": 3} if make is FixedLagSmoother else {"horizon": 3})))(
-            recording, [1]
-        ),
+        textbook(method)(recording, [1])
+        for method in (JointFilter(known, exact=False), MovingHorizon(known, horizon=3, exact=False))
     )
     np.testing.assert_allclose(found.x, wanted.x, atol=1e-8)
     np.testing.assert_allclose(found.covariance, wanted.covariance, atol=1e-8)

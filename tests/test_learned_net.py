@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 from conftest import refused, winding
+from test_learned_engine import batch
 from torch import nn
 
 from coopoc import Fleet, Sensors, observe
 from coopoc.learned import GainNet, LearnedGain
 from coopoc.learned.method import DIVERGED
 from coopoc.learned.nets.gain import Recurrent
-from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.machine import one_core
 from coopoc.methods.track import Method
 
@@ -21,14 +21,6 @@ from coopoc.methods.track import Method
 def _one_core() -> Iterator[None]:
     with one_core():
         yield
-
-
-def batch(models: int, lanes: int, steps: int, dtype: torch.dtype = torch.float64) -> Batch:
-    torch.manual_seed(1)
-    velocity = 5 * torch.randn(1, models, lanes, 3, dtype=dtype).expand(steps, -1, -1, -1)
-    truth = torch.cumsum(0.1 * velocity, 0)
-    noise = torch.randn(2, steps, models, lanes, 3, dtype=dtype)
-    return Batch(truth + noise[0], velocity + noise[1], truth, 0.5 * noise[0, 0], 0.1)
 
 
 @pytest.mark.parametrize(("in_mult", "out_mult", "count"), [(40, 5, 19_938), (5, 40, 23_928), (5, 32, 19_896)])

@@ -87,7 +87,6 @@ METHODS: tuple[Any, ...] = (
     co.LKFSA,
     co.MSMV,
     co.MovingHorizon,
-    co.FixedLagSmoother,
     co.BatchSmoother,
     co.CentralFilter,
     co.CovarianceIntersection,

@@ -6,28 +6,20 @@ import casadi
 import numpy as np
 import pytest
 from conftest import refused
+from random_graphs import star
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
-from coopoc.optimize import Loss, Problem, Status, solve
+from coopoc.optimize import Loss, Status, solve
 from coopoc.optimize.model.derivatives import cayley
 from coopoc.optimize.starts.initial import initial_guess
-
-
-def ranges_only(seed: int) -> Problem:
-    rng = np.random.default_rng(seed)
-    truth = np.concatenate([np.zeros((1, 3)), rng.uniform(-25, 25, (8, 3)) * [1, 1, 0.2]])
-    names = tuple("abcdefghi")
-    problem = Problem(names, separator=(0,)).add("position", names, truth + rng.normal(0, 3, truth.shape), std=3.0)
-    z = np.linalg.norm(truth[1:], axis=1) + rng.normal(0, 0.5, 8)
-    return problem.add("range", [("a", name) for name in names[1:]], z[:, None], std=0.5)
 
 
 @pytest.mark.parametrize("start", [None, 20.0])
 def test_ranges_end_where_scipy_ends(start: float | None) -> None:
     """From the linear start and from 20 m off; SciPy's trust region may go elsewhere from there."""
     for seed in range(12):
-        problem, rng = ranges_only(seed), np.random.default_rng(seed)
+        problem, rng = star("range", seed, 8, 3.0), np.random.default_rng(seed)
         if start is not None:
             problem = replace(problem, x0=problem.factors[0].z + rng.normal(0, start, (9, 3)))
         found = solve(problem, "casadi")
@@ -53,11 +45,11 @@ def test_ranges_end_where_scipy_ends(start: float | None) -> None:
 )
 def test_wrong_options(options: dict[str, object], words: str) -> None:
     with refused(words):
-        solve(ranges_only(0), "casadi", **options)
+        solve(star("range", 0, 8, 3.0), "casadi", **options)
 
 
 def test_a_truncated_loss_is_refused_with_the_way_out() -> None:
-    problem = ranges_only(0)
+    problem = star("range", 0, 8, 3.0)
     doubted = replace(problem, factors=tuple(replace(f, loss=Loss("truncated", 3.0)) for f in problem.factors))
     with refused(r"loss truncated: cannot be solved by casadi, only by .*gauss-newton"):
         solve(doubted, "casadi")

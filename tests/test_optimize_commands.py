@@ -12,7 +12,7 @@ from shell import ran
 
 from coopoc.cli import main
 from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
-from coopoc.optimize import backends
+from coopoc.optimize import backends, solver_commands
 
 ROOT = Path(__file__).resolve().parents[1]
 PYFG = ROOT / "../shared/data/pyfg"
@@ -84,10 +84,15 @@ def test_a_wrong_line_and_an_unknown_backend_are_named(file: Path, capsys: pytes
     assert f"{file.name}: line {len(file.read_text().splitlines())} = vertex L9" in err
 
 
-def test_check_solves_one_problem_with_every_backend(capsys: pytest.CaptureFixture[str]) -> None:
+def test_check_solves_one_problem_with_every_backend(
+    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     status, out, err = run(capsys, "check")
     assert (status, out.count("SOLVED")) == (0, len(backends()))
     assert "0 disagree" in err
+    monkeypatch.setattr(solver_commands, "find_spec", lambda library: None)
+    status, out, err = run(capsys, "check")
+    assert (status, out.count(" needs "), "pip install casadi" in err) == (1, len(backends()), True)
 
 
 @pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")

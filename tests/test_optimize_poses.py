@@ -1,5 +1,6 @@
 """Points and poses in one problem: derivatives against finite differences, minima against SciPy, files."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -35,8 +36,8 @@ def everything(dimension: int, seed: int = 0, noise: float = 0.05) -> tuple[Prob
         if d == 2 and known.plane is None:
             continue
         chosen = [[n] for n in names[:3]] if known.arity == 1 else [list(p) for p in pairs.items()]
-        if known.frame == "relative":
-            chosen = [c for c in chosen if "L0" not in c]
+        if known.frame == "relative" or known.arity == 3:
+            chosen = [[*c, "L0"][: known.arity] for c in chosen if "L0" not in c]
         nodes = [[names.index(n) for n in c] for c in chosen]
         size, constants = known.size(d), [0.5] * known.constants
         if known.compares_poses:
@@ -167,3 +168,41 @@ def test_a_graph_without_its_gauge_names_what_is_free() -> None:
     found = solve(loose, throw=False)
     assert found.status is Status.RANK_DEFICIENT
     assert set(found.unobservable) == set(problem.names)
+
+
+@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "casadi"])
+def test_offsets_that_ranges_share_are_scipys(backend: str) -> None:
+    """Of two anchors, 2 and -0.4 m, with a point per step: minimum and covariance of a residual written here."""
+    rng, steps = np.random.default_rng(4), 120
+    path = np.cumsum(rng.normal(0.0, 2.0, (steps, 2)), axis=0)
+    anchors, which = np.array([[20.0, 5.0], [-8.0, 15.0]]), np.arange(steps) % 2
+    moved = np.diff(path, axis=0) + 0.05 * rng.normal(size=(steps - 1, 2))
+    r = np.linalg.norm(anchors[which] - path, axis=1) + np.take([2.0, -0.4], which) + 0.1 * rng.normal(size=steps)
+
+    def residual(u: np.ndarray) -> np.ndarray:
+        x, offset = u[:-2].reshape(-1, 2), u[-2:]
+        far = np.linalg.norm(anchors[which] - x, axis=1) + offset[which] - r
+        return np.concatenate([((np.diff(x, axis=0) - moved) / 0.05).ravel(), far / 0.1, offset / 3.0])
+
+    theirs = least_squares(residual, np.append(path, [0.0, 0.0]), xtol=1e-14, gtol=1e-12)
+    names = [*map(str, range(steps)), "A", "B", "offset A", "offset B"]
+    x0 = np.concatenate([path, anchors, np.zeros((2, 2))])
+    problem = Problem(names, x0=x0, dimension=2, fixed="AB").add(
+        "displacement", [*pairwise(names[:steps])], moved, 0.05
+    )
+    problem = problem.add(
+        "range_offset", [(names[k], "AB"[k % 2], names[-2 + k % 2]) for k in range(steps)], r, std=0.1
+    )
+    found = solve(problem.add("position", names[-2:], np.zeros((2, 2)), std=[3.0, 1.0]), backend)
+    assert found.cost == pytest.approx(theirs.cost, rel=1e-9)
+    assert found.x[-2:, 0] == pytest.approx(theirs.x[-2:], abs=1e-5)
+    std = np.sqrt(np.diag(np.linalg.inv(theirs.jac.T @ theirs.jac))[-2:])
+    assert np.sqrt(found.covariance[-2:, 0, 0]) == pytest.approx(std, rel=1e-4)
+    assert (np.abs(found.x[-2:, 0] - [2.0, -0.4]) < 4 * std).all()
+
+
+def test_an_antenna_stands_at_the_end_of_its_arm() -> None:
+    turn, at, arm = Rotation.from_rotvec([0.3, -0.2, 2.0]), np.array([5.0, 1.0, -2.0]), np.array([1.5, -0.6, 0.3])
+    x = np.stack([pose(at, turn.as_rotvec()), pose(arm, np.zeros(3))])
+    problem = Problem(("car", "arm"), x0=x, poses=["car"]).add("antenna", ("car", "arm"), np.zeros(3), std=1.0)
+    assert problem.whiten(x)[0] == pytest.approx(at + turn.apply(arm))

@@ -108,7 +108,7 @@ BAD = {
     "zero range": (lambda: PAIR.add("range", ("a", "b"), 0.0, std=1.0), "Coincident"),
     "unknown node": (lambda: PAIR.add("range", ("a", "c"), 5.0, std=1.0), "one of a, b"),
     "misspelt node": (lambda: Problem(("car", "bus")).add("range", ("car", "buss"), 5.0, std=1.0), "Did you mean bus"),
-    "itself": (lambda: PAIR.add("range", ("a", "a"), 5.0, std=1.0), "two different points"),
+    "itself": (lambda: PAIR.add("range", ("a", "a"), 5.0, std=1.0), "different points"),
     "unknown kind": (lambda: PAIR.add("doppler", ("a", "b"), 5.0, std=1.0), "spherical"),
     "no std": (lambda: PAIR.add("range", ("a", "b"), 5.0), "exactly one of std, cov"),
     "shape of z": (lambda: PAIR.add("spherical", ("a", "b"), [5.0], std=1.0), "must have 2 or 3"),
@@ -145,6 +145,11 @@ BAD = {
         lambda: solve(replace(PAIR.add("range", ("a", "b"), 5.0, std=1.0), x0=np.zeros((2, 3)))),
         "a and b coincide",
     ),
+    "coincident, bounded": (
+        lambda: solve(replace(PAIR, x0=np.zeros((2, 3))).constrain("range", ("a", "b"), 4.0, 5.0)),
+        "a and b coincide",
+    ),
+    "nothing to relax": (lambda: quadratic(Problem("a")), "no measurements"),
     "unobservable": (lambda: solve(Problem("ab").add("displacement", ("a", "b"), [5, 0, 0], std=1.0)), "move freely"),
     "two runs": (lambda: Problem("a").add("position", "a", np.zeros((2, 1, 3)), std=1.0), "a problem for each run"),
 }
@@ -234,7 +239,8 @@ def test_a_point_that_can_turn_around_another_is_free(backend: str) -> None:
     for _ in range(20):
         x0 = np.concatenate([[[0, 0, 0], [9, 0, 0]], rng.normal(0, 9, (1, 3))])
         hanging = Problem(("a", "b", "c"), PAIR.factors, x0).add("range", ("b", "c"), 7.3, std=0.3)
-        solution = solve(hanging, backend, throw=False)
+        bounded = hanging.constrain("position", "a", upper=50.0) if backend == "osqp" else hanging
+        solution = solve(bounded, backend, throw=False)
         assert solution.status is Status.RANK_DEFICIENT
         assert solution.unobservable == ("c",)
     assert initial_guess(replace(hanging, x0=None))[2] == pytest.approx([4.5 + 7.3, 0.0, 0.0])

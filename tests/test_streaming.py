@@ -14,7 +14,7 @@ from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from shell import ran
 
-from coopoc import V2X, Fleet, JointFilter, Kalman, NoiseModel, Sensors, StarStream, observe
+from coopoc import V2X, CooperativeFilter, Fleet, JointFilter, Kalman, NoiseModel, Sensors, StarStream, observe
 from coopoc.arrays import Bools, Floats
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF
 from coopoc.methods.kalman import AdaptiveKalman
@@ -273,9 +273,30 @@ def test_bad_starts_are_named() -> None:
     }.items():
         with refused(f"^{field} = "):
             make()
+    robust = StarStream(CooperativeFilter(FITTED))
+    assert robust.broadcast is None
+    with refused("Send stream.broadcast"):
+        robust.step(Z, U, 0.1, neighbours=[RelativeMeasurement("b", [9.0, 0.0, 1.57], Z, U)])
     oracle = Kalman(NoiseModel.oracle(S2, Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))))
     with refused(r"noise_model = 'oracle'.*NoiseModel.nominal"):
         oracle.start()
+
+
+@pytest.mark.parametrize("first", [None, Z + 1.0])
+def test_a_star_from_a_known_place_is_the_kalman_filter(first: Floats | None) -> None:
+    star = StarStream(CooperativeFilter(FITTED, robust=False), Z)
+    alone = textbook(Kalman(FITTED)).start(Z)
+    for z in (first, None, Z + U):
+        (x, cov), (same_x, same_cov) = (stream.step(z, U, 0.1) for stream in (star, alone))
+        assert_allclose(x, same_x, atol=1e-6)
+        assert_allclose(cov, same_cov, atol=1e-6)
+
+
+def test_a_stream_forgets_whom_it_met_long_ago() -> None:
+    stream = StarStream(textbook(JointFilter(FITTED)))
+    for k in range(400):
+        stream.step(Z, U, 0.1, neighbours=[RelativeMeasurement(f"v{k}", [9.0, 0.0, 1.57], Z, U)])
+    assert len(stream._last) < 60
 
 
 @pytest.mark.slow

@@ -87,12 +87,10 @@ def test_a_seed_that_diverged_is_not_averaged_away(rows: list[dict[str, Any]]) -
     """The mean over the other seeds would look like a mean over all."""
     one = pd.DataFrame(rows).query("method == 'gnss' and k == 0")
     many = pd.concat([one.assign(train_seed=s) for s in (0, 1)], ignore_index=True)
-    many.loc[many.query("train_seed == 1 and ego == 'b' and run == 2").index, "rt_le_m"] = np.nan
-    summary = results(many, ("method", "train_seed")).summary(["method"], "rt_le_m")
-    assert summary[["n", "missing"]].to_numpy().tolist() == [[6, 1]]
-    many.loc[many.query("train_seed == 0 and ego == 'a' and run == 1").index, "rt_le_m"] = np.nan
-    summary = results(many, ("method", "train_seed")).summary(["method"], "rt_le_m")
-    assert summary[["n", "missing"]].to_numpy().tolist() == [[0, 2]]
+    for which, counts in (("1 and ego == 'b' and run == 2", [6, 1]), ("0 and ego == 'a' and run == 1", [0, 2])):
+        many.loc[many.query(f"train_seed == {which}").index, "rt_le_m"] = np.nan
+        summary = results(many, ("method", "train_seed")).summary(["method"], "rt_le_m")
+        assert summary[["n", "missing"]].to_numpy().tolist() == [counts]
 
 
 def test_a_metric_that_a_method_does_not_have_is_no_failure(rows: list[dict[str, Any]]) -> None:

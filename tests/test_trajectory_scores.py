@@ -17,6 +17,7 @@ from coopoc.evaluate.trajectory_scores import (
     align,
     associated,
     relative_error,
+    remarks,
     rms,
     rms_interval,
     scores,
@@ -235,6 +236,8 @@ def test_what_cannot_be_scored_is_named(tmp_path: Path) -> None:
     estimates, truths = team()
     with refused(r"vehicle = 'green': has no truth among red, blue"):
         scores({"green": estimates["red"]}, truths)
+    with refused("must be at least one"):
+        scores({}, truths)
     with refused("must be a file"):
         read_paths(str(tmp_path / "nowhere.tum"))
     with refused("must name a file"):
@@ -263,6 +266,7 @@ def test_signs_of_another_unit_or_clock_are_said() -> None:
     assert row.rpe_m is None
     assert "1 of 200 stamps meet" in row.remarks[0]
     assert row.remarks[0].endswith("the estimate looks like ms.")
+    assert remarks((truth.t, 1000 * truth.t), (np.zeros((1, 3)),) * 2, 0.01)[0].endswith("the truth looks like ms.")
     assert row.remarks[1] == "no relative error: the drive is shorter than 1 steps."
     for factor, word in ((100, "divided by 100"), (0.5, "divided by 0.5")):
         (row,) = scores({"a": Track(truth.t, factor * good.position, good.rotation)}, {"a": truth}, aligned="each")

@@ -260,7 +260,7 @@ def test_estimates_of_other_egos_are_refused() -> None:
 
 
 @pytest.mark.parametrize("gap", [(0.0, 0.0, 10.0), (1e-9, 0.0, 0.0)], ids=["above", "in one place"])
-@pytest.mark.parametrize("method", [co.JointFilter(), co.FixedLagSmoother(), co.GaussianBeliefPropagation()])
+@pytest.mark.parametrize("method", [co.JointFilter(), co.MovingHorizon(), co.GaussianBeliefPropagation()])
 def test_who_flies_straight_above_or_in_one_place_helps_or_does_no_harm(
     method: Any, gap: tuple[float, float, float]
 ) -> None:

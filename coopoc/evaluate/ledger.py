@@ -54,7 +54,7 @@ class Ledger:
         for name in ("seconds", "sent", "received"):
             values = checked(name, getattr(self, name))
             refuse(name, values, ~(values >= 0), "must be >= 0", "Give bytes and seconds.")
-            object.__setattr__(self, name, values)
+            self.__dict__[name] = values
         shape = (2, 2, *self.sent.shape[2:3], len(self.names))
         for name, wanted in (("seconds", shape[3:]), ("sent", shape), ("received", shape)):
             found = getattr(self, name).shape

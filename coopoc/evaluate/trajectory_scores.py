@@ -216,7 +216,7 @@ class Path:
         for name, shape in shapes.items():
             if name in ("t", "position") or getattr(self, name) is not None:
                 axes = str(("T", *shape[1:])).replace("'", "")
-                object.__setattr__(self, name, checked(name, getattr(self, name), axes, shape))
+                self.__dict__[name] = checked(name, getattr(self, name), axes, shape)
 
 
 @dataclass(frozen=True)

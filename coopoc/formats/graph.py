@@ -46,7 +46,7 @@ class Edges:
             dtype: Any = np.int64 if field.name == "nodes" else np.float64
             object.__setattr__(self, field.name, frozen(getattr(self, field.name), dtype))
         if not len(self.stamps):
-            object.__setattr__(self, "stamps", frozen(np.full(len(self.nodes), np.nan)))
+            self.__dict__["stamps"] = frozen(np.full(len(self.nodes), np.nan))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -185,17 +185,17 @@ class Graph:
     place: InitVar[Callable[[str, int], str] | None] = None
 
     def __post_init__(self, place: Callable[[str, int], str] | None) -> None:
-        object.__setattr__(self, "names", tuple(self.names))
-        object.__setattr__(self, "is_pose", frozen(self.is_pose, bool))
-        object.__setattr__(self, "fixed", frozen(self.fixed, np.int64))
+        self.__dict__["names"] = tuple(self.names)
+        self.__dict__["is_pose"] = frozen(self.is_pose, bool)
+        self.__dict__["fixed"] = frozen(self.fixed, np.int64)
         for field in ("position", "orientation", "stamps"):
-            object.__setattr__(self, field, frozen(getattr(self, field)))
+            self.__dict__[field] = frozen(getattr(self, field))
         if not len(self.stamps):
-            object.__setattr__(self, "stamps", frozen(np.full(len(self.names), np.nan)))
+            self.__dict__["stamps"] = frozen(np.full(len(self.names), np.nan))
         for field in ENDS:
             if not len(edges := getattr(self, field)):
                 empty = {name: np.zeros(shape) for name, shape in shapes(field, self.dimension, 0).items()}
-                object.__setattr__(self, field, type(edges)(**empty))
+                self.__dict__[field] = type(edges)(**empty)
         check(self, place or (lambda field, row: f"{field}[{row}]"))
 
     @cached_property

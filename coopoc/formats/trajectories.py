@@ -47,7 +47,7 @@ class Trajectory:
 
     def __post_init__(self, place: Callable[[int], str] | None) -> None:
         for field in ("position", "rotation", *(() if self.stamps is None else ("stamps",))):
-            object.__setattr__(self, field, frozen(getattr(self, field)))
+            self.__dict__[field] = frozen(getattr(self, field))
         _check(self, place or "pose {}".format)
 
     def __len__(self) -> int:

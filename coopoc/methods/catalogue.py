@@ -14,8 +14,8 @@ from .covariance_intersection import CovarianceIntersection
 from .decentralised import GaussianBeliefPropagation
 from .joint_filter import JointFilter
 from .kalman import GNSS, AdaptiveKalman, Kalman
+from .moving_horizon import MovingHorizon
 from .road import RoadFilter
-from .sliding_window import FixedLagSmoother, MovingHorizon
 from .track import Method
 
 Factory = Callable[..., Method]
@@ -36,7 +36,6 @@ METHODS: Mapping[str, Factory] = {
     "gbp": GaussianBeliefPropagation,
     "central-filter": CentralFilter,
     "batch-smoother": BatchSmoother,
-    "fixed-lag": FixedLagSmoother,
     "mhe": MovingHorizon,
 }
 """Name -> a function of the noise model, and of options of the method by name."""

@@ -48,7 +48,7 @@ class NoiseModel:
 
     def __post_init__(self) -> None:
         check_texts(self, "name")
-        object.__setattr__(self, "notes", texts("notes", self.notes))
+        self.__dict__["notes"] = texts("notes", self.notes)
         if self.sensors is not None:
             instance("sensors", self.sensors, Sensors)
         if self.fleet is not None:
@@ -58,7 +58,7 @@ class NoiseModel:
                 value = checked(field, getattr(self, field), "(3,)", (3,))
                 if not (np.isfinite(value) & (value > 0)).all():
                     raise InputError(field, value, "must be positive and finite", "Assumed noise may not be zero.")
-                object.__setattr__(self, field, _three(value))
+                self.__dict__[field] = _three(value)
 
     @classmethod
     def identity(cls) -> NoiseModel:

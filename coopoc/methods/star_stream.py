@@ -100,7 +100,7 @@ class RelativeMeasurement:
             row[SPEED:STEP] = three("neighbour's velocity", self.velocity)
         elif math.isfinite(row[SOLO]):
             raise InputError("velocity", None, f"must come with the fix of {self.id}", "Send both in one message.")
-        object.__setattr__(self, "row", row.tobytes())
+        self.__dict__["row"] = row.tobytes()
 
 
 class StarStream:

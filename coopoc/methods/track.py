@@ -64,7 +64,7 @@ class Track:
 
     def __post_init__(self) -> None:
         egos = checked("egos", self.egos, "(E,)", (-1,), int)
-        object.__setattr__(self, "egos", tuple(egos.tolist()))
+        self.__dict__["egos"] = tuple(egos.tolist())
         t, x = checked("t", self.t, "(T,)", (-1,)), checked("x", self.x, "(R, T, E, 3)", (-1, -1, -1, 3))
         runs, steps = x.shape[:2]
         shapes: dict[str, tuple[str, tuple[int, ...]]] = {
@@ -80,10 +80,10 @@ class Track:
         optional = ("covariance", "neighbours", "heading", "heading_covariance")
         for name, (axes, shape) in shapes.items():
             if name not in optional or getattr(self, name) is not None:
-                object.__setattr__(self, name, checked(name, getattr(self, name), axes, shape))
-        object.__setattr__(self, "seconds", number("seconds", self.seconds))
+                self.__dict__[name] = checked(name, getattr(self, name), axes, shape)
+        self.__dict__["seconds"] = number("seconds", self.seconds)
         for name in ("notes", "ids"):
-            object.__setattr__(self, name, texts(name, getattr(self, name)))
+            self.__dict__[name] = texts(name, getattr(self, name))
         if not isinstance(self.extras, Mapping):
             raise InputError("extras", shown(self.extras), "must be name -> (R, T, E)", "Give {} for none.")
         by_link = None if self.neighbours is None else self.neighbours.shape[:2]
@@ -93,7 +93,7 @@ class Track:
             else checked(f"extras[{name}]", v, "(R, T, E)", x.shape[:3])
             for name, v in self.extras.items()
         }
-        object.__setattr__(self, "extras", extras)
+        self.__dict__["extras"] = extras
         if not np.isfinite(self.x).all():
             run, step, ego = np.argwhere(~np.isfinite(self.x).all(axis=-1))[0]
             raise InputError(
@@ -110,7 +110,7 @@ class Track:
 
         if (found := unsound(covariance)) and not any(UNSOUND in note for note in self.notes):
             note = f"{found} of {len(covariance)} {UNSOUND}"
-            object.__setattr__(self, "notes", (*self.notes, note))
+            self.__dict__["notes"] = (*self.notes, note)
 
 
 FAR = 100.0
@@ -218,8 +218,8 @@ def check_options(made: Any, limits: Limits | None = None, kinds: Mapping[str, A
             most = 2**62 if text == "int" else np.inf
             low, high, words = (limits or {}).get(name, (-most, most, "no NaN"))
             value = number(name, value, low, high, kind=NUMBERS[text], allowed=words, hint=hint)
-            object.__setattr__(made, name, value)
+            made.__dict__[name] = value
         elif text == "Floats":
-            object.__setattr__(made, name, checked(name, value))
+            made.__dict__[name] = checked(name, value)
         elif text in types and not isinstance(value, types[text]):
             raise InputError(name, shown(value), f"must be {text}", hint)

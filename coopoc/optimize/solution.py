@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from ..arrays import Floats
-from ..errors import InputError, shown, suggestion
 from ..short_repr import short_repr
+from .model.problem import no_such_node
 from .model.space import Space
 
 
@@ -98,9 +98,7 @@ class Solution:
     def __getitem__(self, point: str) -> Floats:
         """(ambient,) estimate of a node by name; InputError that lists the names if there is none."""
         if not isinstance(point, str) or point not in self.names:
-            known = ", ".join(self.names[:8]) + (", ..." if len(self.names) > 8 else "")
-            hint = suggestion(point, self.names, "See solution.names.")
-            raise InputError("point", shown(point), f"must be one of {known}", hint)
+            raise no_such_node(point, self.names, "See solution.names.")
         where: Floats = self.x[self.names.index(point)]
         return where
 

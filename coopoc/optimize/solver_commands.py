@@ -128,18 +128,8 @@ def misfit(solution: Solution) -> float | None:
 
 def described(solution: Solution) -> dict[str, Any]:
     """Status, cost and times of a solution, without its nodes."""
-    named = [
-        "backend",
-        "cost",
-        "expected",
-        "gradient_norm",
-        "iterations",
-        "build_seconds",
-        "solve_seconds",
-        "check_seconds",
-        "seconds",
-        "notes",
-    ]
+    times = "build_seconds solve_seconds check_seconds seconds"
+    named = f"backend cost expected gradient_norm iterations {times} notes".split()
     found: dict[str, Any] = {"status": solution.status.name, "sentence": solution.status.value}
     found |= {name: getattr(solution, name) for name in named}
     found |= {"start": solution.extras.get("start"), "unobservable": list(solution.unobservable)}

@@ -63,16 +63,16 @@ class Fleet:
     heading: Floats | None = None
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "ids", names(self.ids))
+        self.__dict__["ids"] = names(self.ids)
         check_texts(self, "name", "source", "licence")
-        object.__setattr__(self, "t", clock(self.t))
+        self.__dict__["t"] = clock(self.t)
         for field in ("position", "velocity"):
             values = checked(field, getattr(self, field), "(T, N, 3)", (len(self.t), len(self.ids), 3))
-            object.__setattr__(self, field, values)
+            self.__dict__[field] = values
         if self.heading is not None:
             heading = checked("heading", self.heading, "(T, N)", self.position.shape[:2])
             refuse("heading", heading, np.isinf(heading), "must be finite, or NaN where unknown", "Replace it by NaN.")
-            object.__setattr__(self, "heading", heading)
+            self.__dict__["heading"] = heading
         _check_gaps(self)
         plausible("position", self.position, FARTHEST)
         plausible("velocity", self.velocity, FASTEST)

@@ -37,7 +37,7 @@ class Links:
         for name in ("step", "observer", "neighbour"):
             column = checked(f"links.{name}", getattr(self, name), "(L,)", (size,), int)
             size = len(column)
-            object.__setattr__(self, name, column)
+            self.__dict__[name] = column
             refuse(f"links.{name}", column, column < 0, "must be >= 0", "Count steps and columns from 0.")
         forward, aside = (np.diff(column, prepend=column[:1]) for column in (self.step, self.observer))
         late = (forward < 0) | ((forward == 0) & (aside < 0))

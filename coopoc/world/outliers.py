@@ -33,11 +33,11 @@ class Fault:
 
     def __post_init__(self) -> None:
         hint = "0.05 makes one measurement in twenty wrong."
-        object.__setattr__(self, "rate", number("rate", self.rate, 0, 1, allowed="in [0, 1]", hint=hint))
-        object.__setattr__(self, "size", extent("size", self.size))
+        self.__dict__["rate"] = number("rate", self.rate, 0, 1, allowed="in [0, 1]", hint=hint)
+        self.__dict__["size"] = extent("size", self.size)
         one_of("law", self.law, get_args(Law))
         lasts = number("lasts", self.lasts, allowed=">= 0 s", hint="0 draws every measurement by itself.")
-        object.__setattr__(self, "lasts", lasts)
+        self.__dict__["lasts"] = lasts
 
 
 @dataclass(frozen=True)

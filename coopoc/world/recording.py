@@ -44,7 +44,7 @@ class Body:
             values = checked(name, getattr(self, name), "(R, T, N)", shape)
             shape = values.shape
             refuse(name, values, np.isinf(values), "must be finite, or NaN where missing", "Replace it by NaN.")
-            object.__setattr__(self, name, values)
+            self.__dict__[name] = values
 
     def check(self, velocity: Floats) -> None:
         """InputError unless every vehicle that has a velocity (R, T, N, 3) m/s has a yaw rate."""
@@ -117,9 +117,9 @@ class Recording:
             "notes": texts("notes", self.notes),
         }
         for name, value in found.items():
-            object.__setattr__(self, name, value)
+            self.__dict__[name] = value
         check_measurements(self.gnss, self.velocity, self.relative)
-        object.__setattr__(self, "landmarks", tuple(columns("landmarks", self.landmarks, ids)))
+        self.__dict__["landmarks"] = tuple(columns("landmarks", self.landmarks, ids))
         check_landmarks(self.landmarks, self.gnss, self.velocity)
         vehicles = np.flatnonzero(~np.isin(self.links.neighbour, self.landmarks))
         check_links(self.links, self.observers, self.velocity, self.arrival, self.v2x.max_neighbours, vehicles)

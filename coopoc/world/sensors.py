@@ -88,9 +88,9 @@ class Sensors:
                 given = listed(name, value, "Give metres in a tuple.", f"must be {size} numbers")
                 if len(given) != size:
                     raise InputError(name, value, f"must be {size} numbers", "Give metres in a tuple.")
-                object.__setattr__(self, name, tuple(number(name, v, hint=hint) for v in given))
+                self.__dict__[name] = tuple(number(name, v, hint=hint) for v in given)
             else:
-                object.__setattr__(self, name, number(name, value, hint=hint))
+                self.__dict__[name] = number(name, value, hint=hint)
         if self.gnss_bias[0] > self.gnss_bias[1]:
             raise InputError("gnss_bias", self.gnss_bias, "must be (low, high) with low <= high", "Swap the two.")
         if self.gnss_drift_time <= 0:

@@ -40,7 +40,7 @@ class Spoofing:
         start, ramp = (number(name, getattr(self, name), 0, 1e9, hint=hint) for name in ("start", "ramp"))
         instance("collude", self.collude, bool, "Give True for one offset of all.")
         for name, value in (("share", share), ("offset", offset), ("start", start), ("ramp", ramp)):
-            object.__setattr__(self, name, value)
+            self.__dict__[name] = value
 
     def size(self, t: Floats) -> Floats:
         """(T,) share of the full offset at times t s.

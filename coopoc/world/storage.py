@@ -16,7 +16,7 @@ import numpy as np
 from numpy.lib import format as npy
 
 from ..arrays import AnyArray
-from ..errors import InputError, first_line
+from ..errors import InputError, said
 from ..file_names import given_path
 from .fleet import Fleet
 from .links import Links
@@ -116,7 +116,7 @@ def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
     except DAMAGES as error:
         if isinstance(error, InputError) and error.field == path.name:
             raise
-        found = first_line(error)
+        found = said(error)
     raise InputError(path.name, found, "must be a recording in .npz", "Write it again with save_recording.")
 
 

@@ -56,7 +56,7 @@ class V2X:
             value, kind = getattr(self, name), int if name in ("max_neighbours", "overhead") else float
             if value is not None or name != "rate":
                 hint = "Use 0 for no neighbours." if name == "max_neighbours" else f"Give V2X({name}=...)."
-                object.__setattr__(self, name, number(name, value, low, high, kind=kind, allowed=words, hint=hint))
+                self.__dict__[name] = number(name, value, low, high, kind=kind, allowed=words, hint=hint)
 
     @classmethod
     def ideal(cls, max_neighbours: int = 6) -> V2X:
@@ -124,7 +124,7 @@ class Message:
         check_texts(self, "name")
         for field in ("numbers", "rounds", "opening", "per_neighbour"):
             value = number(field, getattr(self, field), kind=int, allowed=">= 0", hint=f"Give Message({field}=...).")
-            object.__setattr__(self, field, value)
+            self.__dict__[field] = value
 
     @property
     def payload(self) -> int:

@@ -10,7 +10,7 @@ import numpy as np
 import pandas as pd
 import scipy  # its statistics take half a second, and are imported where they are used
 
-from coopoc.arrays import AnyArray, Bools, Floats, robust_std
+from coopoc.arrays import AnyArray, Bools, Floats, Ints, robust_std
 from coopoc.errors import InputError
 from coopoc.evaluate.metrics import dimensions, fix_innovations, normalised_innovations
 from coopoc.methods.kalman import Kalman
@@ -54,6 +54,9 @@ FEW, APART = 5, 1.5
 """Fixes with a truth from which a difference of frames shows; standard deviations of a fix that it must have."""
 SIGMAS = 6.0
 """Standard errors of an offset beyond which it is no chance."""
+ARM, VARIED, NUDGE = 0.2, 0.15, 0.01
+"""m, least arm of an antenna that is worth a word; standard deviation over mean of a speed below which an arm ahead
+and a late clock look alike; m and s by which fixes are moved to see what a filter makes of an arm."""
 OUTLYING, OUTLIERS = 5.0, 0.01
 """Standard deviations beyond which a measurement is an outlier; the share of them that is worth a word."""
 WINDOW, BLOCKS = 9, 10
@@ -374,38 +377,88 @@ def _of_vehicles(c: Check) -> list[str]:
     return sentences
 
 
-def _of_truth(c: Check) -> list[str]:
-    """A sentence where the fixes of a vehicle lie behind its truth along its way, by the same time at any speed, or
-    beside it by more than their noise explains, as they do where the truth has another origin."""
+def _of_fixes(c: Check) -> list[str]:
+    """A sentence where the fixes of a vehicle are those of an antenna elsewhere, lie behind its truth along its way, by
+    the same time at any speed, or beside it by more than their noise explains, as where the truth has another
+    origin."""
     rec, truth, sentences = c.world, c.log.truth, []
-    if truth is None:
-        return []
+    off, causes = _causes(c)
     for column, name in enumerate(rec.ids):
+        known = np.isfinite(off[:, column] + causes[:, :, column].sum(axis=0))
+        for share in ([1, 1, 1], [0, 0, 1]):  # without an arm that is sure a clock may explain it all
+            factor, std = _factors(off[known, column], causes[:, known, column].T * share)
+            sure = np.abs(factor) > SIGMAS * std
+            if (sure & (np.abs(factor) > ARM))[:2].any():
+                sentences.append(
+                    f"{name}: fixes look like those of an antenna {factor[0]:.2f} +- {std[0]:.2f} m ahead and "
+                    f"{factor[1]:.2f} +- {std[1]:.2f} m to the left of its {'odometry' if truth is None else 'truth'}: "
+                    f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
+                )
+                break
+        if truth is None:
+            continue
         every = rec.gnss[0, :, column] - truth.position[:, column]
         both = np.isfinite(every[:, 0])
-        gap, velocity = every[both, :2], rec.velocity[0, :, column, :2][both]
-        up, sure = _median(every[both, 2]) if len(gap) >= FEW and np.ptp(rec.gnss[0, both, column, 2]) else (0.0, 0.0)
-        if abs(up) > max(SIGMAS * sure, rec.sensors.fix_std[2] / 2):
+        if both.sum() < FEW:
+            continue
+        (east, north), (up, spread) = np.median(every[both, :2], axis=0), _median(every[both, 2])
+        if np.ptp(rec.gnss[0, both, column, 2]) and abs(up) > max(SIGMAS * spread, rec.sensors.fix_std[2] / 2):
             sentences.append(
                 f"{name}: fixes lie {up:.3g} m above the truth in the median. Is one of the two above the "
                 "ellipsoid, the other above the geoid, or are antennas elsewhere?"
             )
-        if len(gap) >= ENOUGH and np.ptp(velocity, axis=0).any():
-            line = scipy.stats.linregress((velocity - velocity.mean(0)).ravel(), (gap - np.median(gap, 0)).ravel())
-            if abs(line.slope) >= max(SIGMAS * line.stderr, 0.5 * rec.dt):
-                way = "ahead of" if line.slope > 0 else "behind"
-                sentences.append(
-                    f"{name}: its fixes are {abs(line.slope):.2f} s {way} the truth along its way: the clock "
-                    "of the truth differs, or fixes carry the time at which they arrived."
-                )
-                continue
-        east, north = np.median(gap, axis=0) if len(gap) >= FEW else (0.0, 0.0)
+        if sure[2] and abs(lag := factor[2]) >= 0.5 * rec.dt:
+            way = "ahead of" if lag > 0 else "behind"
+            sentences.append(
+                f"{name}: its fixes are {abs(lag):.2f} s {way} the truth along its way: the clock "
+                "of the truth differs, or fixes carry the time at which they arrived; at one speed an antenna ahead "
+                "looks alike."
+            )
+            continue
         if np.hypot(east, north) >= APART * np.hypot(*rec.sensors.fix_std[:2]):
             sentences.append(
                 f"{name}: fixes lie {east:.3g} m east and {north:.3g} m north of the truth in the median. Has it "
                 "another frame? Fixes in degrees are local at the first: give origin= of the truth, or it in degrees."
             )
     return sentences
+
+
+def _causes(c: Check) -> tuple[AnyArray, AnyArray]:
+    """What fixes are off by, x + iy m (T, N), and what an arm of 1 m ahead, one to the left, and a clock that is 1 s
+    late make of it (3, T, N): against the truth, else against a filter, which is linear in what is added to fixes."""
+    rec, truth = c.world, c.log.truth
+    velocity = (rec.velocity[0] if truth is None else truth.velocity)[..., :2] @ [1, 1j]
+    speed = pd.DataFrame(np.abs(velocity)).where(lambda v: v > MOVING)
+    course = pd.DataFrame(np.angle(velocity)).where(speed > 0).ffill().bfill().to_numpy()
+    ahead = np.nan_to_num(np.exp(1j * course)) * np.array(speed.std() > VARIED * speed.mean())
+    causes = np.stack([ahead, 1j * ahead, velocity])
+    if truth is not None:
+        return (rec.gnss[0] - truth.position)[..., :2] @ [1, 1j], causes
+    for k, cause in enumerate(np.nan_to_num(NUDGE * causes)):
+        gnss = c.log.recording.gnss + np.stack([cause.real, cause.imag, 0 * cause.real], axis=-1)
+        moved = _filtered(replace(c.log, recording=replace(c.log.recording, gnss=gnss)))
+        causes[k] = (moved.fix - c.fix)[..., :2] @ [1, 1j] / NUDGE
+    return c.fix[..., :2] @ [1, 1j], causes
+
+
+def _factors(y: AnyArray, x: AnyArray) -> Floats:
+    """Factors (k,) of causes x (M, k) that explain y (M,) best, means and outliers aside, and their standard errors by
+    parts of the drive that are left out, (2, k); of fewer measurements than enough zeros."""
+    if len(y) < ENOUGH:
+        return np.zeros((2, x.shape[1]))
+    y, x = y - y.mean(), x - x.mean(axis=0)
+
+    def fitted(rows: Ints) -> Floats:
+        for _ in range(3):
+            left, right = (np.concatenate([each[rows].real, each[rows].imag]) for each in (x, y))
+            factor: Floats = np.linalg.lstsq(left, right)[0]
+            gap = np.abs(y - x @ factor)
+            rows = rows[gap[rows] <= OUTLYING * np.median(gap[rows])]
+        return factor
+
+    every = np.arange(len(y))
+    without = [fitted(np.setdiff1d(every, part)) for part in np.array_split(every, BLOCKS)]
+    return np.stack([fitted(every), np.sqrt(BLOCKS - 1.0) * np.std(without, axis=0)])
 
 
 def _of_measurements(c: Check) -> list[str]:
@@ -535,5 +588,5 @@ def less_offsets(log: Log) -> Log:
     return replace(log, recording=replace(rec, relative=relative, notes=tuple(notes)))
 
 
-CHECKS: tuple[Callable[[Check], list[str]], ...] = (_of_rows, _of_vehicles, _of_truth, _of_measurements)
+CHECKS: tuple[Callable[[Check], list[str]], ...] = (_of_rows, _of_vehicles, _of_fixes, _of_measurements)
 """What looks wrong: each takes the filtered log and returns sentences. A new check is one more entry."""

@@ -29,7 +29,5 @@ def draw(result: Check, path: Path) -> Path:
             ax.plot(*truth.position[:, k, :2].T, color=INK, lw=1, ls="--")
     ax.plot(*np.delete(rec.gnss[0, 0, :, :2], moving, axis=0).T, "^", color=INK, ms=8)
     ax.set_title(f"{picture(result.log.summary.name)}: fixes, filters (lines), what stands (triangles), truth (dashed)")
-    figure = finish(ax).get_figure(root=True)
-    assert figure is not None
-    figure.savefig(path)
+    finish(ax).figure.savefig(path)  # type: ignore[union-attr]
     return path

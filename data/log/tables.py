@@ -40,9 +40,9 @@ def read_log_table(
     path: Path,
     summary: Summary,
     *,
-    columns: Mapping[str, str] | None = None,
-    kinds: Mapping[str, str] | None = None,
-    ignore: Sequence[str] = (),
+    columns: Mapping[str, str],
+    kinds: Mapping[str, str],
+    ignore: Sequence[str],
 ) -> Rows:
     """Rows of a CSV or Parquet table, long if it has a column kind, else wide.
 
@@ -57,11 +57,11 @@ def read_log_table(
         InputError: with the row and the column, a cell that is no number, no time or no name, an unknown kind, a kind
             without its partner, a value that belongs to another unit.
     """
-    file, given = path.name, dict(columns or {})
-    frame = read_frame(path, *(given.get(key, key) for key in ("vehicle", "partner", "kind", "arrival")))
+    file = path.name
+    frame = read_frame(path, *(columns.get(key, key) for key in ("vehicle", "partner", "kind", "arrival")))
     if STAMP in frame:
         frame = of_topic(frame, file, summary, path.stem.lower() in TRUTH)
-    frame = named_columns(frame, given, (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS)), (), file)
+    frame = named_columns(frame, columns, (*LONG, *KINDS, *(f"{kind}_std" for kind in KINDS)), (), file)
     if "t" not in frame.columns:
         placed = {"x", "y"} <= set(frame.columns) or {"latitude", "longitude"} <= set(frame.columns)
         if not (placed and "vehicle" in frame.columns and frame["vehicle"].is_unique):
@@ -71,7 +71,7 @@ def read_log_table(
     if "vehicle" not in frame.columns:
         frame = frame.assign(vehicle=path.stem)
     read = _long if "kind" in frame.columns else _wide
-    rows = rows_of(read(frame, file, summary, kinds or {}, ignore), file)
+    rows = rows_of(read(frame, file, summary, kinds, ignore), file)
     if "partner" not in frame.columns and in_group(rows, "relative").any():
         raise missing_column(file, "partner", list(frame.columns), "is needed")
     return rows

@@ -406,14 +406,18 @@ class Oracle:
             b.noise(("common",), life.common * (1 - life.keep**2))
 
     def update_velocity(self, j: int, message: Sent | None, t: int) -> None:
-        """A member whose newest message is not of now gets a velocity; that of a new message is used."""
+        """A member whose newest message is not of now gets a velocity; that of a new message is used, unless the
+        odometer's way from a clone on is known better than a late velocity."""
         s, g, dt = self.state, self.guards, self.seen.dt
         b, tracked = s["belief"], ("v", j) in s["belief"].names
         if not g.acceleration or message is None or (message.step == t and not tracked):
             return
+        late = (0.5 * g.acceleration * ((t - message.step) * dt) ** 2) ** 2
         if not tracked:
             b.add(("v", j), 0.0, 400.0)
-        elif s["sent"].get(j) == message.step:
+            if t - message.step == 1 and t > s["joined"][j] and s["last"].get(j) and s["last"][j].step == message.step:
+                self.clone(j, {}, 0.0)
+        elif s["sent"].get(j) == message.step or (("c", j) in b.names and 3 * late < message.process.sum()):
             return
         s["sent"][j] = message.step
         r = message.process / dt**2 + (g.acceleration * (t - message.step) * dt) ** 2
@@ -423,6 +427,10 @@ class Oracle:
         """The message, its velocity if need be replaced."""
         s, dt = self.state, self.seen.dt
         b = s["belief"]
+        last = s["last"].get(j)
+        if ("v", j) in b.names and message is not None and message.step == t and last and last.step >= t - 1:
+            b.drop(("v", j))
+            b.drop(("c", j))
         self.update_velocity(j, message, t)
         if ("v", j) in b.names:
             b.noise(("v", j), (self.guards.acceleration * dt) ** 2)
@@ -579,11 +587,16 @@ class Oracle:
         alarm = self.use_fix(t, j, rows, before)[1]
         s["last"][j] = message
         if tracked:
-            b.drop(("c", j))
-            b.add(("c", j), 0.0, 0.0)
-            b.transform(("c", j), {("x", j): 1.0, **back})
-            b.noise(("c", j), late + 1e-12)
+            self.clone(j, back, late)
         return alarm
+
+    def clone(self, j: int, back: dict[Any, float], late: float) -> None:
+        """Remember where a member was when it sent its newest message."""
+        b = self.state["belief"]
+        b.drop(("c", j))
+        b.add(("c", j), 0.0, 0.0)
+        b.transform(("c", j), {("x", j): 1.0, **back})
+        b.noise(("c", j), late + 1e-12)
 
     def trust(self) -> None:
         """The surest member first: p(b = 0 | all) / p(b = 0) by Bayes' rule, of Gaussians."""

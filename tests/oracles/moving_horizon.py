@@ -30,21 +30,18 @@ class Drive:
             links = range(box.start[t], box.start[t + 1])
             self.star.append({ego: -1} | {int(recording.links.neighbour[box.link[k]]): k for k in links})
 
-    def gather(self, t: int, now: int, late: bool) -> None:
-        """The message of each member of step t, as known now; `late` puts it at the step at which it was sent."""
+    def gather(self, t: int, now: int) -> None:
+        """The message of each member of step t, as known now, at the step at which it was sent."""
         limit = self.recording.v2x.max_age / self.recording.dt + 1e-9
         for v, k in self.star[t].items():
             sent, fresh = (t, True) if k < 0 else (int(self.box.newest[self.run, k]), bool(self.box.fresh[self.run, k]))
-            before, _, uses = self.sent.get((v, t - 1), (-2, False, 0))
-            if late and k >= 0:
+            before = self.sent.get((v, t - 1), (-2, False, 0))[0]
+            if k >= 0:
                 fresh = 0 <= self.box.arrival[self.run, k] <= now
                 held = self.sent[v, t][0] if (v, t) in self.sent else sent
                 sent = t if fresh else max(held, before if t - before <= limit else -1)
-            uses = uses + 1 if before == sent else 1
-            if late:  # as if it had been there since it was sent
-                joined = next(s for s in range(t, -1, -1) if s == 0 or v not in self.star[s - 1])
-                uses = t - max(sent, joined) + 1
-            self.sent[v, t] = (sent, fresh, uses)
+            joined = next(s for s in range(t, -1, -1) if s == 0 or v not in self.star[s - 1])
+            self.sent[v, t] = (sent, fresh, t - max(sent, joined) + 1)  # as if it had been there since it was sent
 
     def rows(self, t: int, start: Any) -> list[Row]:
         """Fixes, motions and flat priors of step t."""
@@ -94,7 +91,7 @@ class Drive:
         return relative_rows(self.recording, self.box, self.noise_model, self.run, self.ego, x, t)
 
 
-def moving_horizon(drive: Drive, length: int, exact: bool, sweeps: int, late: bool = True) -> Any:
+def moving_horizon(drive: Drive, length: int, exact: bool, sweeps: int) -> Any:
     """Points by (vehicle, step), and the ego's covariances (T, 3, 3), of the newest step.
 
     Args:
@@ -118,11 +115,11 @@ def moving_horizon(drive: Drive, length: int, exact: bool, sweeps: int, late: bo
 
     for now in range(steps):
         window = range(max(0, now - length + 1), now + 1)
-        for t in window if late else (now,):
-            drive.gather(t, now, late)
+        for t in window:
+            drive.gather(t, now)
         drive.expect(now, x)
         start.update({(v, now): x[v, now] for v in drive.star[now]})
-        linear.update({t: drive.rows(t, start) for t in (window if late else (now,))})
+        linear.update({t: drive.rows(t, start) for t in window})
         edges[now] = drive.converted(now, x)
         for count in range(sweeps + 1):
             for t in window if exact else ():
@@ -140,9 +137,3 @@ def moving_horizon(drive: Drive, length: int, exact: bool, sweeps: int, late: bo
         covs[now] = cov[i : i + 3, i : i + 3]
         points.update({(v, now): x[v, now] for v in drive.star[now]})
     return points, covs
-
-
-def fixed_lag(drive: Drive, lag: int, exact: bool) -> Any:
-    """Points by (vehicle, step) and the ego's covariances of the newest step: messages count when they arrive, and each
-    step makes one Gauss-Newton step."""
-    return moving_horizon(drive, lag + 1, exact, 0, late=False)

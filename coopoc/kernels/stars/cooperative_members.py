@@ -7,6 +7,7 @@ import math
 from ...arrays import Floats, Ints
 from ..compiling.compile import inside, part
 from ..dead_reckoning import ROUNDING
+from .cooperative_messages import clone_position
 from .cooperative_state import (
     AGE,
     DT,
@@ -24,6 +25,7 @@ from .cooperative_state import (
     SPEED_VARIANCE,
     STEP,
     TRUSTED,
+    USED,
     Filter,
     Guards,
     Model,
@@ -36,6 +38,7 @@ from .cooperative_state import (
 )
 from .gaussian import (
     ABSENT,
+    CLONE,
     COMMON,
     ERROR,
     KINDS,
@@ -151,12 +154,16 @@ def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, varianc
 
 @inside
 def predict_member(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None:
-    """Move a member by the velocity in the state, if its messages are late, else by that of its newest message.
+    """Move a member by the velocity in the state, if its messages are late, else by that of its newest message; two in
+    time, and the velocity leaves the state.
 
     A velocity that has served for L s and serves for dt more makes an error of (L + dt)^2 - L^2 times its own variance.
     """
     g, row, dt = f.g, f.row[k], f.clock[1]
     first, age, sent = 3 * g.block[k, PLACE], rows[row, AGE], f.clock[0] - rows[row, AGE]
+    if has(g, k, VELOCITY) and 0.0 <= age <= ROUNDING and f.status[f.vehicle[k], USED] > sent - 1.5 * dt:
+        remove(g, k, VELOCITY)
+        remove(g, k, CLONE)
     if late(f, guards, rows, k):
         update_velocity(f, guards, rows, k)
     if has(g, k, VELOCITY):
@@ -188,13 +195,18 @@ def late(f: Filter, guards: Guards, rows: Floats, k: int) -> bool:
 
 @part
 def update_velocity(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
-    """Give a member whose newest message is not of now a velocity in the state, and use that of a new message."""
+    """Give a member whose newest message is not of now a velocity in the state, and use that of a new message, unless
+    its odometer, used from a clone on, will say the same: one step's error is that of both."""
     row, g, h = f.row[k], f.g, f.h
     age = rows[row, AGE]
-    sent = f.clock[0] - age
+    sent, changed = f.clock[0] - age, 0.5 * guards.acceleration * age * age
     if not has(g, k, VELOCITY):
         insert(g, k, VELOCITY, SPEED_VARIANCE)
-    elif abs(f.sent[k] - sent) <= ROUNDING:
+        if age < 1.5 * f.clock[1] and f.joined[k] < f.step[0] and abs(f.status[f.vehicle[k], USED] - sent) <= ROUNDING:
+            clone_position(f, k, 0.0, 0.0)
+    elif abs(f.sent[k] - sent) <= ROUNDING or (
+        has(g, k, CLONE) and 3.0 * changed**2 < rows[row, STEP : STEP + 3].sum()
+    ):
         return
     f.sent[k] = sent
     term(h, 0, g.block[k, VELOCITY], 1.0)

@@ -1,4 +1,4 @@
-"""Moving horizons and fixed-lag smoothers of one ego's star: a window of steps behind an arrival cost.
+"""Moving horizons of one ego's star: a window of steps behind an arrival cost.
 
 A step that leaves the window is solved by itself, given its own past; its Gaussian, predicted, is the arrival cost of
 the next one. LANES runs go side by side.
@@ -77,8 +77,7 @@ class Settings(NamedTuple):
         exact: relative measurements in range and angles, or converted vectors.
         repeats: Gauss-Newton steps after the first, taken where a vector has left its `base` by more than `strayed`.
         strayed: m.
-        age: steps for which a velocity may serve, negative where a message counts when it arrives and not when it was
-            sent.
+        age: steps for which a velocity may serve.
         robust: gate innovations.
     """
 
@@ -103,7 +102,7 @@ def horizons(measurements: Measurements, model: Assumptions, arrival: Ints, sett
     """Estimates at the newest step of all windows of a drive.
 
     Args:
-        measurements: `newest` and `fresh` are overwritten where messages count when they were sent.
+        measurements: `newest` and `fresh` are overwritten.
         model: the noise that is assumed.
         arrival: (R, M) step at which the message of each link arrives, -1 for never.
         settings: of the windows.
@@ -135,14 +134,13 @@ def follow_horizon(
     for t in range(len(measurements.start) - 1):
         span = (max(0, t - settings.length + 1), t)
         enter(window, star, measurements, model, runs, t)
-        if settings.age >= 0.0:
-            for step in range(span[0], t + 1):
-                gather_arrived(window, gates, measurements, model, arrival, settings, runs, step, t)
+        for step in range(span[0], t + 1):
+            gather_arrived(window, gates, measurements, model, arrival, settings, runs, step, t)
         start_points(window, t)
         if settings.robust:
             gate_step(window, gates, model, t)
         link_points(window, model, t)
-        use_new_fixes(window, t if settings.age < 0.0 else span[0], t)
+        use_new_fixes(window, span[0], t)
         if span[0] > 0:
             leave(window, joint, model, span[0] - 1)
         elif t == 0:
@@ -153,8 +151,6 @@ def follow_horizon(
             for lane in range(runs[1] - runs[0] + 1):
                 if system.active[lane] > 0.0:
                     write_lane(window, system.cov, measurements.start[t], (runs[0] + lane, lane), t, estimates)
-            if settings.repeats == 0 and settings.age < 0.0:
-                break
             put(system.most, uint64(0), distance(window, span))
             for lane in range(LANES):
                 system.active[lane] = 1.0 if system.most[lane] > settings.strayed else 0.0

@@ -101,7 +101,7 @@ class PoseFilter:
         number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="4 leaves outliers out.")
         check_spread(self.spread)
         if not self.name:
-            object.__setattr__(self, "name", f"pose-{self.unit if self.fusion == 'joint' else self.fusion}")
+            self.__dict__["name"] = f"pose-{self.unit if self.fusion == 'joint' else self.fusion}"
 
     @property
     def cooperative(self) -> bool:

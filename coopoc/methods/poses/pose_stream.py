@@ -45,7 +45,7 @@ class OwnMeasurement:
             heading = number("heading", self.heading, -np.inf, allowed="finite rad, or None", hint="None: no compass.")
         rate = number("yaw_rate", self.yaw_rate, -np.inf, allowed="finite rad/s", hint="Of one that stands it is 0.")
         row = np.concatenate([fix_or_none(self.gnss, "gnss"), [heading], three("velocity", self.velocity), [rate]])
-        object.__setattr__(self, "row", row)
+        self.__dict__["row"] = row
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +69,7 @@ class LandmarkMeasurement:
             if values.shape != (3,) or np.isinf(values).any() or (name == "place" and np.isnan(values).any()):
                 given, hint = getattr(self, name), "NaN stands for a component of `relative` that is missing."
                 raise InputError(name, given, "must be three numbers", hint)
-            object.__setattr__(self, name, values)
+            self.__dict__[name] = values
 
 
 class PoseEstimate(NamedTuple):

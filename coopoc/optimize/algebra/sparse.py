@@ -6,7 +6,7 @@ import threading
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property, lru_cache
-from itertools import combinations_with_replacement
+from itertools import combinations, combinations_with_replacement
 from typing import Any
 from weakref import WeakValueDictionary
 
@@ -75,7 +75,8 @@ def entries_of(movable: Bools, measured: Sequence[Ints]) -> Entries:
     (n, dof), m = movable.shape, int(movable.sum())
     number = np.where(movable, np.cumsum(movable).reshape(n, dof) - 1, -1)
     keys = [np.arange(n) * (n + 1)]
-    keys += [nodes.max(axis=1) * n + nodes.min(axis=1) for nodes in measured if nodes.shape[1] == 2]
+    for nodes in measured:
+        keys += [high * n + low for low, high in combinations(np.sort(nodes).T, 2)]
     key = np.unique(np.concatenate(keys))
     j, i = np.divmod(key, n)
     row, column = np.broadcast_arrays(number[i][:, :, None], number[j][:, None, :])

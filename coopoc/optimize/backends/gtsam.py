@@ -123,19 +123,18 @@ def _poses(d: int, x: Floats) -> Callable[[], Iterable[tuple[Any, ...]]]:
     return lambda: ((pose_of(d, each),) for each in x)
 
 
-def _position(factor: Factor, W: Floats, d: int) -> Form:
-    names: Names = {(POINT,): f"PriorFactorPoint{d}", (POSE,): f"PoseTranslationPrior{d}D"}
-    names[POINT, POINT] = f"BetweenFactorPoint{d}"
-    return [Part(names, lambda: zip(factor.z, strict=True), W)]
+PLAIN: Mapping[str, Names] = {
+    "position": {(POINT,): "PriorFactorPoint{0}", (POSE,): "PoseTranslationPrior{0}D"},
+    "displacement": {(POINT, POINT): "BetweenFactorPoint{0}"},
+    "range": {(POINT, POINT): "RangeFactor{0}", (POSE, POINT): "RangeFactor{0}D", (POSE, POSE): "RangeFactorPose{0}"},
+}
+"""GTSAM's classes of kinds whose residual is its error."""
 
 
-def _range(factor: Factor, W: Floats, d: int) -> Form:
-    names: Names = {
-        (POINT, POINT): f"RangeFactor{d}",
-        (POSE, POINT): f"RangeFactor{d}D",
-        (POSE, POSE): f"RangeFactorPose{d}",
-    }
-    return [Part(names, lambda: zip(factor.z[:, 0], strict=True), W)]
+def _plain(factor: Factor, W: Floats, d: int) -> Form:
+    names = {turning: name.format(d) for turning, name in PLAIN[factor.kind].items()}
+    z = factor.z[:, 0] if factor.kind == "range" else factor.z
+    return [Part(names, lambda: zip(z, strict=True), W)]
 
 
 def _bearing(factor: Factor, W: Floats, d: int) -> Form:
@@ -154,6 +153,10 @@ def _bearing(factor: Factor, W: Floats, d: int) -> Form:
 
     names: Names = {(POSE, POINT): f"{name}Factor2D", (POSE, POSE): f"{name}FactorPose2"}
     return [Part(names, arguments, W[:, ::-1, ::-1])]
+
+
+def _relative_position(factor: Factor, W: Floats, d: int) -> Form:
+    return _chord(W, {0: np.arange(d)}, Space(d, has_rotation=True).join(factor.z), d)
 
 
 def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
@@ -234,14 +237,10 @@ def _coupled(W: Floats, d: int) -> bool:
 
 
 FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
-    "position": _position,
-    "displacement": _position,
-    "range": _range,
+    **dict.fromkeys(PLAIN, _plain),
     "bearing": _bearing,
     "body_spherical": _bearing,
-    "relative_position": lambda factor, W, d: _chord(
-        W, {0: np.arange(d)}, Space(d, has_rotation=True).join(factor.z), d
-    ),
+    "relative_position": _relative_position,
     "relative_pose": _relative_pose,
     "relative_pose_log": _relative_log,
     "relative_pose_chordal": _relative_chordal,

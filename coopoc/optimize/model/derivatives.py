@@ -152,7 +152,7 @@ def residual_of(kind: Kind, converted: bool = False) -> Residual:
     vectors = converted and is_converted(measurement)
     try:
         local = _local(measurement, places)
-        gap = _converted(local, z) if vectors else _wrapped(measurement, local, z, assumed)
+        gap = _converted(local, z) if vectors else _wrapped(measurement, local, z, assumed, space.dimension)
         size = len(gap)
         if kind.full:
             gap = [sum(weight[size * k + j] * gap[j] for j in range(size)) for k in range(size)]
@@ -214,9 +214,9 @@ def _converted(vector: Numbers, z: Numbers) -> Numbers:
     return [along - d, *across]
 
 
-def _wrapped(measurement: Measurement, local: Numbers, z: Numbers, constants: Numbers) -> Numbers:
+def _wrapped(measurement: Measurement, local: Numbers, z: Numbers, constants: Numbers, dimension: int) -> Numbers:
     """h - z, angles in [-pi, pi]: the derivative of the remainder is 1."""
-    m, dimension = _namespace(), 2 if len(local) in (2, 6) else 3
+    m = _namespace()
     parts = measurement.residual(local, z, constants, m)
     return [
         m.remainder(part, 2.0 * np.pi) if angle else part
@@ -229,17 +229,8 @@ def _namespace() -> Any:
     """CasADi as the namespace of a formula."""
     import casadi as ca
 
-    return SimpleNamespace(
-        sqrt=ca.sqrt,
-        sin=ca.sin,
-        cos=ca.cos,
-        atan2=ca.atan2,
-        log1p=ca.log1p,
-        fabs=ca.fabs,
-        fmax=ca.fmax,
-        where=ca.if_else,
-        remainder=ca.remainder,
-    )
+    same = "sqrt sin cos atan2 log1p fabs fmax remainder"
+    return SimpleNamespace(where=ca.if_else, **{name: getattr(ca, name) for name in same.split()})
 
 
 def _moved(space: Space, node: Numbers, step: Numbers) -> tuple[Numbers, list[Numbers]]:
@@ -271,13 +262,13 @@ def _product(a: list[Numbers], b: list[Numbers]) -> list[Numbers]:
 
 
 def _local(measurement: Measurement, places: list[tuple[Numbers, list[Numbers]]]) -> Numbers:
-    """Inputs of the formula: the vector and, if the frame is relative, the rotation."""
+    """Inputs of the formula: the vector and, if the frame is relative, the rotation; or those of every node."""
     (first, body), (last, other) = places[0], places[-1]
     vector = [b - a for a, b in zip(first, last, strict=True)] if measurement.arity == 2 else last
     if measurement.frame == "world":
         return vector
-    if measurement.arity == 1:
-        return [*vector, *(c for row in body for c in row)]
+    if measurement.frame == "nodes" or measurement.arity == 1:
+        return [c for at, turned in places for row in (at, *turned) for c in row]
     back = [list(column) for column in zip(*body, strict=True)]
     vector = [row[0] for row in _product(back, [[v] for v in vector])]
     return vector if measurement.frame == "body" else [*vector, *(c for row in _product(back, other) for c in row)]

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import InitVar, dataclass, fields
 from functools import cache, cached_property
 from itertools import groupby
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -25,6 +25,7 @@ from .inputs import (
 )
 from .measurements import Measurement, lookup
 
+Made = TypeVar("Made")
 LOSSES: dict[str, tuple[Callable[[Any, float, Any], Any], Callable[[Floats, float], Floats]]] = {
     "huber": (
         lambda s, c, m: m.where(s > c * c, 2.0 * c * m.sqrt(m.fmax(s, c * c)) - c * c, s),
@@ -62,7 +63,7 @@ class Loss:
     def __post_init__(self) -> None:
         one_of("loss", self.name, LOSSES)
         hint, tiny = "It counts standard deviations: 1.5 to 3.", np.finfo(float).tiny
-        object.__setattr__(self, "scale", number("scale", self.scale, tiny, allowed="> 0 and finite", hint=hint))
+        self.__dict__["scale"] = number("scale", self.scale, tiny, allowed="> 0 and finite", hint=hint)
 
     @property
     def redescends(self) -> bool:
@@ -111,9 +112,8 @@ class Factor:
     cov: InitVar[npt.ArrayLike | None] = None
 
     def __post_init__(self, cov: npt.ArrayLike | None) -> None:
-        measurement = self.measurement
-        _set_nodes(self, measurement)
-        object.__setattr__(self, "z", check_values(measurement, self.z, len(self.nodes)))
+        measurement = _checked(self)
+        self.__dict__["z"] = check_values(measurement, self.z, len(self.nodes))
         given = [
             name
             for name, v in (("std", self.std), ("sqrt_information", self.sqrt_information), ("cov", cov))
@@ -124,11 +124,11 @@ class Factor:
             raise InputError("std", " and ".join(given) or "nothing", allowed, "Give std=.")
         shape = len(self.nodes), self.size
         if self.std is not None:
-            object.__setattr__(self, "std", check_std(measurement, self.std, shape))
+            self.__dict__["std"] = check_std(measurement, self.std, shape)
         else:
             root = whitening(measurement.name, cov) if cov is not None else self.sqrt_information
             assert root is not None
-            object.__setattr__(self, "sqrt_information", check_root(measurement, root, shape))
+            self.__dict__["sqrt_information"] = check_root(measurement, root, shape)
         if self.loss is not None:
             instance("loss", self.loss, Loss, 'Give Loss("huber", 2.0), or None.')
 
@@ -160,23 +160,21 @@ class Factor:
     @property
     def root(self) -> Floats:
         """W as (M, size, size)."""
-        size = self.size
-        if self.std is not None:
-            root = np.zeros((len(self.nodes), size * size))
-            root[:, :: size + 1] = 1.0 / self.std
-            return root.reshape(-1, size, size)
-        assert self.sqrt_information is not None
-        return np.broadcast_to(self.sqrt_information, (len(self.nodes), size, size))
+        root = self.sqrt_information if self.std is None else np.eye(self.size) / self.std[:, None]
+        assert root is not None
+        return np.broadcast_to(root, (len(self.nodes), self.size, self.size))
 
     def __repr__(self) -> str:
         return f"Factor({self.kind} x {len(self.nodes)})"
 
 
-def _set_nodes(one: Factor | Constraint, measurement: Measurement) -> None:
-    """Kind, nodes and constants, checked."""
-    object.__setattr__(one, "kind", measurement.name)
-    object.__setattr__(one, "nodes", check_nodes(measurement, one.nodes))
-    object.__setattr__(one, "constants", check_constants(measurement, one.constants, len(one.nodes)))
+def _checked(item: Factor | Constraint) -> Measurement:
+    """The measurement of an item, with its name, nodes and constants checked."""
+    known = item.measurement
+    nodes = check_nodes(known, item.nodes)
+    constants = check_constants(known, item.constants, len(nodes))
+    item.__dict__.update(kind=known.name, nodes=nodes, constants=constants)
+    return known
 
 
 def of_checked(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
@@ -191,17 +189,19 @@ def of_checked(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
     return made
 
 
-def unchecked(factor: Factor, **changes: Any) -> Factor:
-    """The factor with changes that come from checked arrays and need not be checked again."""
-    changed = object.__new__(Factor)
-    kept = factor.__dict__
-    changed.__dict__.update({name: kept[name] for name in _fields()}, **changes)
+def unchecked(made: Made, **changes: Any) -> Made:
+    """A factor, or another dataclass, with changes that come from checked arrays and need not be checked again."""
+    kind: Any = type(made)
+    changed: Made = object.__new__(kind)
+    kept = made.__dict__
+    changed.__dict__.update({name: kept[name] for name in names_of(kind)}, **changes)
     return changed
 
 
 @cache
-def _fields() -> tuple[str, ...]:
-    return tuple(field.name for field in fields(Factor))
+def names_of(kind: Any) -> tuple[str, ...]:
+    """Of the fields of a dataclass."""
+    return tuple(field.name for field in fields(kind))
 
 
 def taken(factor: Factor, rows: Ints) -> Factor:
@@ -274,17 +274,16 @@ class Constraint:
     constants: Floats | None = None
 
     def __post_init__(self) -> None:
-        measurement = self.measurement
+        measurement = _checked(self)
         if measurement.compares_poses:
             raise InputError("kind", repr(self.kind), "compares poses and cannot bound them", "Hold the node instead.")
-        _set_nodes(self, measurement)
         given = {name: numbers(name, getattr(self, name)) for name in ("lower", "upper")}
         sizes = [side.shape[-1] for side in given.values() if side.ndim]
         size = max(sizes, default=measurement.size())
         fitting(measurement, size)
         for name, side in given.items():
             try:
-                object.__setattr__(self, name, frozen(np.broadcast_to(side, (len(self.nodes), size))))
+                self.__dict__[name] = frozen(np.broadcast_to(side, (len(self.nodes), size)))
             except ValueError:
                 allowed = f"must have shape ({len(self.nodes)}, {size}), ({size},) or ()"
                 raise InputError(name, side.shape, allowed, "Give one bound per component.") from None

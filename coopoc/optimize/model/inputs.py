@@ -62,9 +62,9 @@ def check_nodes(measurement: Measurement, nodes: npt.ArrayLike) -> Ints:
         hint = "Give one row per measurement."
         raise InputError("nodes", array.shape, f"must have shape (M, {measurement.arity}) for {measurement.name}", hint)
     refuse("nodes", array, array < 0, "must be an index >= 0", "Problem.add takes names; a Factor takes indices.")
-    if measurement.arity == 2 and (same := array[:, 0] == array[:, 1]).any():
+    if measurement.arity > 1 and (same := (np.diff(np.sort(array)) == 0).any(axis=1)).any():
         hint = "A vehicle does not measure itself."
-        raise InputError("nodes", array[same][0].tolist(), "must be two different points", hint)
+        raise InputError("nodes", array[same][0].tolist(), "must be different points", hint)
     return array
 
 

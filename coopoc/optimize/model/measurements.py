@@ -16,28 +16,28 @@ from ...errors import InputError, unknown
 from ...one_file import in_file
 from ...plugins import find, names
 from ...world.links import spherical as to_spherical
-from ...world.links import wrap
 from .space import Space
 
 Component = Literal["coordinate", "distance", "angle", "turn"]
-Frame = Literal["world", "body", "relative"]
+Frame = Literal["world", "body", "relative", "nodes"]
 Formula = Callable[..., Sequence[Any]]
 
 
 @dataclass(frozen=True, eq=False)
 class Measurement:
-    """A sensor's measurement of one node (arity 1) or of a second node from a first (arity 2).
+    """A sensor's measurement of one node (arity 1), of a second node from a first (arity 2), or of any number of nodes.
 
     Args:
         name: kind of the factors that carry it.
-        arity: 1 or 2 nodes.
+        arity: 1 or 2 nodes, of frame "nodes" any number.
         frame: of the formula's vector. "world": the vector x, y, z of the point, or second - first. "body": that vector
             as the first node, a pose, sees it, R_i^T (p_j - p_i). "relative": it and the 3x3 components of R_i^T R_j;
-            of one node, its own position and rotation.
+            of one node, its own position and rotation. "nodes": no vector, but each node as (x, y, z, R), R of a point
+            the identity, so that unknowns of sensors, such as an offset or an arm, are nodes, too.
         components: nature of each residual: a coordinate, a distance (m, > 0), an angle (rad, residuals wrap) or part
             of a rotation vector (rad).
-        formula: (x, y, z, m) or (x, y, z, R, m), with the `constants` before m -> one number per component; m is a
-            namespace with sqrt, atan2 and where.
+        formula: (x, y, z, m), (x, y, z, R, m) or (node, ..., m), with the `constants` before m -> one number per
+            component; m is a namespace with sqrt, atan2 and where.
         linear: the formula is the world vector itself.
         plane: components that a problem of dimension 2 keeps (z = 0 there); None if it has none of them.
         constants: how many numbers each measurement carries, such as the time between two positions.
@@ -76,45 +76,26 @@ class Measurement:
 
     def predict(self, vector: Floats, constants: Sequence[float] = ()) -> Floats:
         """(..., size) h of vectors (..., d), for kinds that see no rotation."""
-        shape = vector.shape[:-1]
-        nothing = np.zeros((*shape, self.size(vector.shape[-1])))
-        return self.difference(vector, None, nothing, np.broadcast_to(constants, (*shape, len(constants))))
+        parts = self.residual(columns(vector), [0.0] * self.size(vector.shape[-1]), constants, np)
+        return np.stack(np.broadcast_arrays(*parts), axis=-1)
 
     def residual(self, local: Sequence[Any], z: Iterable[Any], constants: Iterable[Any], m: Any) -> list[Any]:
         """h(x) - z in any namespace; angles are not wrapped.
 
         Args:
-            local: x, y[, z] of the vector, then, if the frame is relative, the d^2 components of the rotation.
+            local: x, y[, z] of the vector, then, if the frame is relative, the d^2 components of the rotation; of frame
+                "nodes" the numbers of all nodes.
             z: `given` numbers.
             constants: `constants` numbers.
         """
-        dimension = 2 if len(local) in (2, 6) else 3
-        kept = self.kept(dimension)
-        arguments = embed(local, dimension)
+        own = len(local) // self.arity if self.frame == "nodes" else len(local)
+        dimension = 2 if own in (2, 6) else 3
+        kept, each = self.kept(dimension), [embed(local[k:][:own], dimension) for k in range(0, len(local), own)]
+        arguments = [(*node, np.eye(3).tolist())[:4] for node in each] if self.frame == "nodes" else each[0]
         if self.compares_poses:
             return [self.formula(*arguments, embed([*z], dimension), m)[k] for k in kept]
         predicted = self.formula(*arguments, *constants, m)
         return [predicted[k] - number for k, number in zip(kept, z, strict=True)]
-
-    def difference(self, local: Floats, rotation: Floats | None, z: Floats, constants: Floats) -> Floats:
-        """(..., size) residuals h(x) - z, angles in [-pi, pi).
-
-        Args:
-            local: (..., d) vector.
-            rotation: (..., d, d), or None unless the frame is relative.
-            z: (..., given).
-            constants: (..., constants).
-        """
-        numbers = columns(local)
-        if rotation is not None:
-            numbers += columns(rotation.reshape(*rotation.shape[:-2], -1))
-        parts = self.residual(numbers, columns(z), columns(constants), np)
-        gap: Floats = np.stack(np.broadcast_arrays(*parts), axis=-1)
-        dimension = local.shape[-1]
-        for k, component in enumerate(self.kept(dimension)):
-            if self.components[component] == "angle":
-                gap[..., k] = wrap(gap[..., k])
-        return gap
 
 
 def columns(array: Floats) -> list[Floats]:
@@ -148,21 +129,22 @@ def measurement(
     """Register a formula as a measurement (see Measurement for the arguments); the formula itself is returned.
 
     Raises:
-        InputError: the name is taken, so that nothing is silently overwritten; an arity other than 1 or 2, an unknown
-            component or frame, or `linear` without three coordinates of a world vector.
+        InputError: the name is taken, so that nothing is silently overwritten; an arity that the frame does not have,
+            an unknown component or frame, or `linear` without three coordinates of a world vector.
 
-    >>> MEASUREMENTS["range"].difference(np.array([3.0, 4.0, 0.0]), None, np.array([4.0]), np.empty(0))
-    array([1.])
+    >>> MEASUREMENTS["range"].predict(np.array([3.0, 4.0, 0.0]))
+    array([5.])
     """
 
     instance("name", name, str, 'Give the kind of its factors, such as "range".')
-    if isinstance(arity, bool) or not isinstance(arity, int) or arity not in (1, 2):
-        raise InputError("arity", arity, "must be 1 (a node) or 2 (a pair)", "The formula gets one vector x, y, z.")
+    one_of("frame", frame, get_args(Frame))
+    if isinstance(arity, bool) or not isinstance(arity, int) or not 1 <= arity <= (9 if frame == "nodes" else 2):
+        hint = 'The formula gets one vector x, y, z; frame="nodes" gives it up to nine nodes.'
+        raise InputError("arity", arity, "must be 1 (a node) or 2 (a pair)", hint)
     given = components if isinstance(components, tuple | list) else ()
     if not given or not all(isinstance(component, str) and component in get_args(Component) for component in given):
         hint = "Give one per number that the formula returns."
         raise InputError("components", components, f"must be among {get_args(Component)}", hint)
-    one_of("frame", frame, get_args(Frame))
     constants = number("constants", constants, 0, kind=int, allowed=">= 0", hint="How many numbers each one carries.")
     if instance("linear", linear, bool) and (tuple(components) != ("coordinate",) * 3 or frame != "world"):
         raise InputError(
@@ -207,42 +189,35 @@ def _edited(before: Formula, after: Formula) -> bool:
 
 VECTOR: tuple[Component, ...] = ("coordinate",) * 3
 PLANE = (0, 1)
+SEEN: tuple[Component, ...] = ("distance", "angle", "angle")
 
 
-@measurement("position", arity=1, components=VECTOR, linear=True, plane=PLANE)
-def position(x: Any, y: Any, z: Any, m: Any = np) -> Sequence[Any]:
-    """Where a node is, such as a GNSS fix: m."""
+def vector(x: Any, y: Any, z: Any, m: Any = np) -> Sequence[Any]:
+    """The vector of the frame itself: m."""
     return x, y, z
 
 
-@measurement("displacement", arity=2, components=VECTOR, linear=True, plane=PLANE)
-def displacement(dx: Any, dy: Any, dz: Any, m: Any = np) -> Sequence[Any]:
-    """The world vector from the first node to the second, such as odometry dt u: m."""
-    return dx, dy, dz
+def seen(first: int, end: int) -> Formula:
+    """Of range, azimuth and inclination of the frame's vector those from `first` to before `end`: m, rad."""
+    return lambda x, y, z, m=np: to_spherical(x, y, z, m)[first:end]
 
 
-@measurement("range", arity=2, components=("distance",), plane=(0,))
-def range_(dx: Any, dy: Any, dz: Any, m: Any = np) -> Sequence[Any]:
-    """Distance between two nodes: m."""
-    return to_spherical(dx, dy, dz, m)[:1]
-
-
-@measurement("azimuth", arity=2, components=("angle",), plane=(0,))
-def azimuth(dx: Any, dy: Any, dz: Any, m: Any = np) -> Sequence[Any]:
-    """Angle of the second node as the first sees it, atan2(dy, dx) in the world frame: rad."""
-    return to_spherical(dx, dy, dz, m)[1:2]
-
-
-@measurement("inclination", arity=2, components=("angle",))
-def inclination(dx: Any, dy: Any, dz: Any, m: Any = np) -> Sequence[Any]:
-    """Angle from +z of the second node as the first sees it: rad."""
-    return to_spherical(dx, dy, dz, m)[2:]
-
-
-@measurement("spherical", arity=2, components=("distance", "angle", "angle"), plane=PLANE)
-def spherical(dx: Any, dy: Any, dz: Any, m: Any = np) -> Sequence[Any]:
-    """Range, azimuth and inclination (in the plane: range and azimuth) of the second node from the first: m, rad."""
-    return to_spherical(dx, dy, dz, m)
+for _name, _arity, _frame in (
+    ("position", 1, "world"),  # a GNSS fix
+    ("displacement", 2, "world"),  # such as odometry dt u
+    ("relative_position", 2, "body"),
+):
+    measurement(_name, _arity, VECTOR, _frame, linear=_frame == "world", plane=PLANE)(vector)  # type: ignore[arg-type]
+for _name, _frame, _first, _end in (
+    ("range", "world", 0, 1),
+    ("azimuth", "world", 1, 2),  # atan2(dy, dx)
+    ("inclination", "world", 2, 3),  # from +z
+    ("spherical", "world", 0, 3),
+    ("bearing", "body", 1, 2),  # from the forward axis, anticlockwise about the up axis
+    ("body_spherical", "body", 0, 3),
+):
+    _flat = PLANE[: min(2, _end) - _first] or None  # without the inclination
+    measurement(_name, 2, SEEN[_first:_end], _frame, plane=_flat)(seen(_first, _end))  # type: ignore[arg-type]
 
 
 @measurement("speed", arity=2, components=("distance",), plane=(0,), constants=1)
@@ -251,22 +226,18 @@ def speed(dx: Any, dy: Any, dz: Any, dt: Any, m: Any = np) -> Sequence[Any]:
     return (to_spherical(dx, dy, dz, m)[0] / dt,)
 
 
-@measurement("relative_position", arity=2, components=VECTOR, frame="body", plane=PLANE)
-def relative_position(x: Any, y: Any, z: Any, m: Any = np) -> Sequence[Any]:
-    """The second node in the body frame of the first, R_i^T (p_j - p_i): m."""
-    return x, y, z
+@measurement("range_offset", arity=3, components=("distance",), frame="nodes", plane=(0,))
+def range_offset(a: Any, b: Any, offset: Any, m: Any = np) -> Sequence[Any]:
+    """Distance between two nodes and the first coordinate of a third, an offset that ranges share: m."""
+    x, y, z = (q - p for p, q in zip(a[:3], b[:3], strict=True))
+    return (to_spherical(x, y, z, m)[0] + offset[0],)
 
 
-@measurement("bearing", arity=2, components=("angle",), frame="body", plane=(0,))
-def bearing(x: Any, y: Any, z: Any, m: Any = np) -> Sequence[Any]:
-    """Angle of the second node from the first's forward axis, anticlockwise about its up axis: rad."""
-    return to_spherical(x, y, z, m)[1:2]
-
-
-@measurement("body_spherical", arity=2, components=("distance", "angle", "angle"), frame="body", plane=PLANE)
-def body_spherical(x: Any, y: Any, z: Any, m: Any = np) -> Sequence[Any]:
-    """Range, bearing and inclination (in the plane: range and bearing) in the body frame of the first: m, rad."""
-    return to_spherical(x, y, z, m)
+@measurement("antenna", arity=2, components=VECTOR, frame="nodes", plane=PLANE)
+def antenna(node: Any, arm: Any, m: Any = np) -> Sequence[Any]:
+    """Where the antenna of a node is, p + R l, the arm l (forward, left, up; of a point east, north, up) a node: m."""
+    at, turned = node[:3], node[3]
+    return [at[i] + sum(turned[i][j] * arm[j] for j in range(3)) for i in range(3)]
 
 
 def geodesic(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequence[Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -15,7 +15,7 @@ from ...arrays import Bools, Floats, Ints, frozen, instance, listed
 from ...errors import InputError, shown, suggestion
 from ...world.sensors import Sensors
 from .derivatives import Linear, linearise, sparse_jacobian
-from .factor import Constraint, Factor, taken, unchecked
+from .factor import Constraint, Factor, names_of, taken, unchecked
 from .inputs import check_rotations, numbers
 from .measurements import lookup
 from .space import Space
@@ -103,18 +103,18 @@ class Problem:
     def __post_init__(self) -> None:
         for field in ("names", "factors", "separator", "poses", "fixed", "constraints"):
             if not isinstance(value := getattr(self, field), str | Sequence):
-                object.__setattr__(self, field, tuple(listed(field, value, "Give a tuple, () for none.")))
-        object.__setattr__(self, "names", tuple(str(name) for name in self.names))
+                self.__dict__[field] = tuple(listed(field, value, "Give a tuple, () for none."))
+        self.__dict__["names"] = tuple(str(name) for name in self.names)
         if len(self._place) != len(self.names):
             twice = sorted({n for n in self.names if self.names.count(n) > 1})
             raise InputError("names", twice[:3], "must be unique", "Rename the points that share a name.")
         for field in ("separator", "poses", "fixed"):
-            object.__setattr__(self, field, tuple(self.index(node) for node in getattr(self, field)))
+            self.__dict__[field] = tuple(self.index(node) for node in getattr(self, field))
         if len(set(self.separator)) < len(self.separator):
             raise InputError(
                 "separator", self.separator, "must not name a point twice", "Name each point of the separator once."
             )
-        object.__setattr__(self, "dimension", int(Space(self.dimension).dimension))  # 2 or 3
+        self.__dict__["dimension"] = int(Space(self.dimension).dimension)  # 2 or 3
         items: tuple[object, ...] = (*self.factors, *self.constraints)
         for item in items:
             if not isinstance(item, Factor | Constraint):
@@ -122,7 +122,7 @@ class Problem:
                 raise InputError("factors, constraints", shown(item), "must be Factors and Constraints", hint)
             check_item(item, self.names, self.poses, self.dimension)
         if self.x0 is not None:
-            object.__setattr__(self, "x0", frozen(points(self.space, len(self.names), "x0", self.x0)))
+            self.__dict__["x0"] = frozen(points(self.space, len(self.names), "x0", self.x0))
         if self.fixed and self.x0 is None:
             raise InputError(
                 "fixed", [self.names[k] for k in self.fixed[:3]], "needs an x0 to be fixed at", "Give x0=."
@@ -228,9 +228,7 @@ class Problem:
 
     def replace_unchecked(self, **changes: Any) -> Problem:
         """The problem with changes that come from checked parts and need not be checked again."""
-        changed = object.__new__(Problem)
-        kept = self.__dict__
-        changed.__dict__.update({name: kept[name] for name in _fields()}, **changes)
+        changed, kept = unchecked(self, **changes), self.__dict__
         for name, inputs in DERIVED:
             if name in kept and inputs.isdisjoint(changes):
                 changed.__dict__[name] = kept[name]
@@ -259,7 +257,7 @@ class Problem:
         return [np.flatnonzero(used[factor.nodes].all(axis=1)) for factor in self.factors]
 
     def __getstate__(self) -> dict[str, Any]:
-        return {name: self.__dict__[name] for name in _fields()}
+        return {name: self.__dict__[name] for name in names_of(Problem)}
 
     def linearise(self, x: Floats) -> Linear:
         """Whitened residuals and derivatives at x (n, ambient)."""
@@ -358,11 +356,6 @@ _space = cache(Space)
 """The one space of its kind."""
 
 
-@cache
-def _fields() -> tuple[str, ...]:
-    return tuple(field.name for field in fields(Problem))
-
-
 def indices(index: Callable[[Any], int], kind: str, nodes: Any) -> Ints:
     """Nodes (M, arity) of a kind from one node, a tuple or rows of them, each found by `index`."""
     arity = lookup(kind).arity
@@ -397,18 +390,19 @@ def check_item(item: Factor | Constraint, names: Sequence[str], poses: Collectio
     if item.dimension not in (None, dimension):
         hint = f"Make it with Problem(names, dimension={item.dimension})." if measurement.plane else "Leave it out."
         raise InputError(f"{item.kind}", f"for {item.dimension} dimensions", f"must fit a problem of {dimension}", hint)
-    observers = {"world": nodes[:, :0], "body": nodes[:, :1], "relative": nodes}[measurement.frame]
+    observers = {"body": nodes[:, :1], "relative": nodes}.get(measurement.frame, nodes[:, :0])
     turning = poses if isinstance(poses, frozenset) else frozenset(poses) if observers.size else frozenset()
     if lacking := sorted(set(observers.ravel().tolist()) - turning):
         allowed = "must be a pose: the measurement is in its body frame"
         raise InputError(f"nodes of {item.kind}", names[lacking[0]], allowed, "Name it in Problem(names, poses=[...]).")
 
 
-def no_such_node(node: Any, names: Sequence[str]) -> InputError:
+def no_such_node(
+    node: Any, names: Sequence[str], hint: str = "Give its index, or name the point when the Problem is made."
+) -> InputError:
     """The error for a node that is neither a name nor an index."""
     listed_names = ", ".join(names[:8]) + (", ..." if len(names) > 8 else "")
-    allowed = f"must be an index < {len(names)} or one of {listed_names}"
-    return InputError("node", shown(node), allowed, suggestion(node, names, "Name the point when the Problem is made."))
+    return InputError("node", shown(node), f"must be one of {listed_names}", suggestion(node, names, hint))
 
 
 def points(space: Space, n: int, field: str, x: npt.ArrayLike) -> Floats:

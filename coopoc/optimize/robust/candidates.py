@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Floats, Ints, checked, frozen, instance, plain
+from ...arrays import AnyArray, Floats, Ints, checked, frozen, instance, plain
 from ...errors import InputError, shown
 from ..assess.assess import squared
-from ..model.factor import unchecked
+from ..model.factor import Factor, unchecked
 from ..model.problem import Problem
 
 Candidates = Sequence[int | tuple[int, Sequence[int]]]
@@ -77,20 +77,21 @@ def reweigh(problem: Problem, marked: Marked, weight: Floats, x0: Floats) -> Pro
 
 def squares(problem: Problem, marked: Marked, x: Floats) -> Floats:
     """(G,) r^2 of each group at x (n, ambient)."""
-    found = np.empty(len(marked.row))
-    for k in np.unique(marked.factor):
-        here = marked.factor == k
-        found[here] = squared(problem, problem.factors[k], x)[marked.row[here]]
-    return marked.sums(found)
+    return _sums(problem, marked, lambda factor: squared(problem, factor, x))
 
 
 def bounds(problem: Problem, marked: Marked, threshold: float) -> Floats:
     """(G,) c^2: chi-square quantiles at the degrees of freedom of each group, without infinite stds."""
     from scipy.special import gammaincinv
 
-    freedom = np.empty(len(marked.row))
+    freedom = _sums(problem, marked, lambda factor: (factor.root != 0).any(axis=-1).sum(axis=-1))
+    return np.asarray(2.0 * gammaincinv(0.5 * np.maximum(freedom, 1.0), threshold))
+
+
+def _sums(problem: Problem, marked: Marked, of: Callable[[Factor], AnyArray]) -> Floats:
+    """(G,) sums over each group of what there is of each measurement of a factor."""
+    found = np.empty(len(marked.row))
     for k in np.unique(marked.factor):
-        here, factor = marked.factor == k, problem.factors[k]
-        numbers = (factor.root != 0).any(axis=-1).sum(axis=-1)
-        freedom[here] = np.broadcast_to(numbers, len(factor.nodes))[marked.row[here]]
-    return np.asarray(2.0 * gammaincinv(0.5 * np.maximum(marked.sums(freedom), 1.0), threshold))
+        here = marked.factor == k
+        found[here] = of(problem.factors[k])[marked.row[here]]
+    return marked.sums(found)

@@ -132,7 +132,8 @@ class _Search:
         """(n,) the body of each node, HELD or its first pose (if it has none, its first node)."""
         problem = self.problem
         measured = [f.nodes[f.informative] for f in reweigh(problem, self.marked, self.weight, self.x).factors]
-        joined = parts(len(problem.names), *(nodes for nodes in measured if nodes.shape[1] == 2))
+        pairs = (nodes[:, k : k + 2] for nodes in measured for k in range(nodes.shape[1] - 1))
+        joined = parts(len(problem.names), *pairs)
         part = np.unique(joined, return_inverse=True)[1]
         alone = [nodes[:, 0] for nodes in measured if nodes.shape[1] == 1]
         nodes = np.concatenate([problem.poses, np.setdiff1d(np.arange(len(part)), problem.poses)]).astype(np.int64)
@@ -146,7 +147,7 @@ class _Search:
         found = np.full((len(self.marked.row), 2), HELD)
         for k in np.unique(self.marked.factor):
             here = self.marked.factor == k
-            nodes = self.problem.factors[k].nodes[self.marked.row[here]]
+            nodes = self.problem.factors[k].nodes[self.marked.row[here], :2]
             found[here, 2 - nodes.shape[1] :] = body[nodes]
         return np.sort(found, axis=1)
 

@@ -77,18 +77,22 @@ def race(
             least = min(reached.values())
     name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
     alone = sum(cost <= (1.0 + SAME) * least for cost in reached.values()) == 1
+
+    def better(late: str, start: Floats) -> tuple[str, Floats]:
+        nonlocal taken
+        end = arrive(system, start, MORE, TOLERANCE)
+        taken += end.iterations
+        return (late, end.x) if system.cost(end.x) < (1.0 - SAME) * system.cost(x) else (name, x)
+
     if growing is not None and alone and name not in straight and system.cost(x) > limit:
         end = arrive(system, x, MORE, TOLERANCE)
         x, taken = end.x, taken + end.iterations
         if system.cost(x) > limit:
             grown, steps = growing(problem)
-            end = arrive(system, grown, MORE, TOLERANCE)
-            taken += steps + end.iterations
-            name, x = ("incremental", end.x) if system.cost(end.x) < (1.0 - SAME) * system.cost(x) else (name, x)
+            taken += steps
+            name, x = better("incremental", grown)
     if relaxed is not None and name not in straight and system.cost(x) > limit:
-        end = arrive(system, relaxed(problem.replace_unchecked(x0=frozen(x))), MORE, TOLERANCE)
-        taken += end.iterations
-        name, x = ("relaxed", end.x) if system.cost(end.x) < (1.0 - SAME) * system.cost(x) else (name, x)
+        name, x = better("relaxed", relaxed(problem.replace_unchecked(x0=frozen(x))))
     return problem.replace_unchecked(x0=frozen(x)), Search(name, taken)
 
 

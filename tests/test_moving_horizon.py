@@ -1,4 +1,4 @@
-"""Sliding windows: laws of a cooperative method, closed forms, minima, the linear case, late messages."""
+"""The moving horizon: laws of a cooperative method, closed forms, minima, the linear case, late messages."""
 
 from dataclasses import replace
 
@@ -10,7 +10,6 @@ from scipy.optimize import least_squares
 
 from coopoc import (
     V2X,
-    FixedLagSmoother,
     Fleet,
     JointFilter,
     Kalman,
@@ -27,11 +26,6 @@ from coopoc.world.recording import Recording
 
 S2 = Sensors.paper_scenario2()
 LATE = V2X(max_neighbours=4, loss=0.2, latency=0.2)
-Window = FixedLagSmoother | MovingHorizon
-
-
-def label(method: Window) -> str:
-    return f"{method.name}-{method.noise_model}"
 
 
 @pytest.fixture(scope="module")
@@ -45,30 +39,17 @@ def test_in_a_linear_model_every_window_ends_at_the_filter(v2x: V2X, noise_model
     """The newest point is the filter's; JointFilter is held against filterpy in test_methods."""
     recording = observe(crossing.between(0, 30), S2, v2x, runs=2)
     peer = textbook(JointFilter(noise_model, exact=False))(recording, [0, 3])
-    lags = [textbook(FixedLagSmoother(lag=lag, noise_model=noise_model, exact=False)) for lag in (1, 10)]
-    horizons = [textbook(MovingHorizon(horizon=n, noise_model=noise_model, exact=False)) for n in (1, 5)]
-    for method in (*lags, *horizons):
-        track = method(recording, [0, 3])
+    for n in (1, 5):
+        track = textbook(MovingHorizon(horizon=n, noise_model=noise_model, exact=False))(recording, [0, 3])
         assert track.x == pytest.approx(peer.x, abs=1e-8)
         assert track.covariance == pytest.approx(peer.covariance, abs=1e-8)
         assert track.neighbours == pytest.approx(peer.neighbours, abs=1e-7, nan_ok=True)
 
 
-def test_no_lag_is_the_joint_filter(formation: Fleet) -> None:
-    """Its exact step, too, and over a late channel."""
-    recording = observe(formation.between(0, 60), S2, LATE, runs=3, observers=[0, 3])
-    track, peer = FixedLagSmoother(lag=0)(recording, [0, 3]), JointFilter()(recording, [0, 3])
-    assert track.x == pytest.approx(peer.x, abs=1e-8)
-    assert track.covariance == pytest.approx(peer.covariance, abs=1e-8)
-
-
-@pytest.mark.parametrize(
-    "method", [FixedLagSmoother("identity", lag=3), MovingHorizon("identity", horizon=4)], ids=label
-)
-def test_in_a_linear_model_the_newest_point_is_gtsams_of_the_whole_drive(method: Window, crossing: Fleet) -> None:
+def test_in_a_linear_model_the_newest_point_is_gtsams_of_the_whole_drive(crossing: Fleet) -> None:
     """Independent check: GTSAM solves all steps so far at once; the flat priors weigh 1e-6 of a fix."""
     recording = observe(crossing.between(0, 10), S2, V2X(max_neighbours=3), runs=2)
-    track, known = method(recording, [0]), NoiseModel.identity()
+    track, known = MovingHorizon("identity", horizon=4)(recording, [0]), NoiseModel.identity()
     for run in range(2):
         problem = Problem.from_window(recording, 9, 0, 10, run, known)
         theirs, newest = solve(problem, "gtsam"), problem.separator[-1]
@@ -110,12 +91,11 @@ def test_what_comes_after_the_horizon_is_dropped_and_counted(formation: Fleet) -
     assert MovingHorizon(horizon=5)(recording, [0]).notes == ()
 
 
-@pytest.mark.parametrize("method", [FixedLagSmoother(lag=2), MovingHorizon(horizon=2)], ids=label)
-def test_consistent_and_on_the_bound(method, formation: Fleet) -> None:
+def test_consistent_and_on_the_bound(formation: Fleet) -> None:
     """NEES gate as in test_methods; RT-LE is not below the filtering bound of the star beyond its interval, nor far."""
     sensors = replace(S2, velocity_reading="speed")
     fleet, v2x = formation.select(range(4)).between(0, 100), V2X(max_neighbours=3)
-    track = method(observe(fleet, sensors, v2x, runs=40, seed=1, observers=[0]), [0])
+    track = MovingHorizon(horizon=2)(observe(fleet, sensors, v2x, runs=40, seed=1, observers=[0]), [0])
     assert nees_inside(track, fleet).min() >= 0.95
     bound = bound_rt_le(posterior_bound(fleet, sensors, 0, v2x))
     square = rt_le(track, fleet)[:, 0] ** 2
@@ -127,9 +107,8 @@ def test_consistent_and_on_the_bound(method, formation: Fleet) -> None:
 @pytest.mark.parametrize(
     ("make", "field"),
     [
-        (lambda r: FixedLagSmoother(noise_model="guess")(r, [0]), "noise_model"),
+        (lambda r: MovingHorizon(noise_model="guess")(r, [0]), "noise_model"),
         (lambda r: MovingHorizon()(r, ["missing"]), "egos"),
-        (lambda r: FixedLagSmoother(lag=-1), "lag"),
         (lambda r: MovingHorizon(horizon=0), "horizon"),
     ],
 )
