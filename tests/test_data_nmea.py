@@ -175,6 +175,9 @@ def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path: Path) -> None:
     assert actual.heading is not None
     course = np.arctan2(fleet.velocity[:, 0, 1], fleet.velocity[:, 0, 0])
     assert_allclose(actual.heading[:, 0], course, atol=1e-6)
+    body = read_log(path, dt=0.1, ignore=["/car0/pose", "/car1/imu"], frame="body").recording.body
+    assert body is not None
+    assert np.abs(body.yaw_rate[0]).max(axis=0) == pytest.approx([0.06, 0.0], abs=1e-3)
     stands = read_log(path, dt=0.1, ignore=["/car0/pose"], truth="/car1/odom", origin=(48.14, 11.58, 560.0)).truth
     assert stands is not None
     assert not stands.position[:, 1].any()  # that of its poses, which the test left at zero
@@ -303,7 +306,9 @@ def write_bag(
                 flat = np.zeros(36)
                 flat[0] = 0.01
                 messages = {
-                    "fix": kind[names["fix"]](header(t), status, lat, lon, h, np.diag([0.25, 0.25, 4.0]).ravel(), 2),
+                    "fix": kind[names["fix"]](
+                        header(t), status, lat, lon, h, np.diag([0.25, 0.25, 4.0]).ravel(), 2 - 2 * column
+                    ),
                     "odom": kind[names["odom"]](
                         header(t),
                         "base",

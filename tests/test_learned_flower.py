@@ -16,7 +16,7 @@ import numpy as np
 import pandas as pd
 import pytest
 import torch
-from conftest import refused
+from conftest import refused, winding
 from logs import long, observed, write
 from shell import ran
 from torch import Tensor
@@ -53,11 +53,8 @@ pytestmark = [
 
 
 def drives(vehicles: int = 4, steps: int = 100) -> Fleet:
-    """Vehicles that drive circles of their own."""
-    t = np.arange(steps) / 10
-    wave = t[:, None] / 4 + np.arange(vehicles)
-    velocity = np.stack([9 * np.cos(wave), 9 * np.sin(wave), 0.1 + 0 * wave], axis=-1)
-    return Fleet(tuple(f"c{i}" for i in range(vehicles)), t, np.cumsum(0.1 * velocity, axis=0), velocity)
+    """Vehicles that wind about."""
+    return winding(steps, 9.0, 4.0, vehicles)
 
 
 def in_process(job: Job, fleet: Fleet) -> Federation:
@@ -153,7 +150,7 @@ def test_bad_answers_are_rejected_and_training_goes_on() -> None:
         5: sends("long", torch.cat([theta, theta])),
         6: sends("far", theta + 1e4),
         7: sends("double", theta.double()),
-        8: sends("c1", theta),
+        8: sends("b", theta),
         9: lambda message: Message(RecordDict({"junk": ConfigRecord({"a": 1})}), reply_to=message),
         10: lambda message: Message(Error(0, "out of\nmemory"), reply_to=message),
         11: sends("", theta),
@@ -173,7 +170,7 @@ def test_bad_answers_are_rejected_and_training_goes_on() -> None:
             "weights of shape",
             "changes the weights",
             "weights in float64, must be float32",
-            "claims the name c1 of another node",
+            "claims the name b of another node",
             "malformed answer (KeyError)",
             "out of memory",
             "1 to 200 printable",
@@ -194,8 +191,8 @@ def test_a_silent_client_is_absent_and_welcome_back() -> None:
         return None if number["server-round"] == 2 else honest(job, fleet, 1)(message)
 
     rows, found = deployed(job, nodes | {1: sometimes})
-    assert [sorted(row.training_loss) for row in rows] == [[], ["c0", "c1", "c2"], ["c0", "c2"], ["c0", "c1", "c2"]]
-    assert found.history[2].absent == {"c1": "no answer"}
+    assert [sorted(row.training_loss) for row in rows] == [[], ["a", "b", "c"], ["a", "c"], ["a", "b", "c"]]
+    assert found.history[2].absent == {"b": "no answer"}
     assert found.history[2].validation_loss[1] == found.history[1].validation_loss[1]
 
 
@@ -234,9 +231,9 @@ def test_a_node_must_say_which_drive_is_its_own(tmp_path: Path) -> None:
         with refused(message):
             configured(Context(1, 1, own, RecordDict(), TINY))
         own["data"] = str(tmp_path / "two.csv")
-    own["vehicle"] = "c1"
+    own["vehicle"] = "b"
     client, job = configured(Context(1, 1, own, RecordDict(), TINY))
-    assert (client.name, job) == ("c1", job_of(TINY))
+    assert (client.name, job) == ("b", job_of(TINY))
 
 
 def test_a_node_may_train_on_what_it_measured(tmp_path: Path) -> None:
@@ -252,7 +249,7 @@ def test_a_node_may_train_on_what_it_measured(tmp_path: Path) -> None:
     truth = {"t": fleet.t[there], "vehicle": [fleet.ids[c] for c in column]}
     truth |= dict(zip("xyz", fleet.position[there, column].T, strict=True))
     write(pd.DataFrame(truth), tmp_path / "truth.csv")
-    client, job = configured(Context(1, 1, {"log": str(tmp_path), "vehicle": "c1"}, RecordDict(), TINY))
+    client, job = configured(Context(1, 1, {"log": str(tmp_path), "vehicle": "b"}, RecordDict(), TINY))
     steps = job.recipe.piece + 1
     fixes = recording.gnss[0, :steps, 1]
     np.testing.assert_allclose(client.training.gnss[0], fixes - fixes[0], atol=1e-4)
@@ -316,7 +313,7 @@ def test_train_with_flower_is_train(tmp_path: Path) -> None:
     assert found is not None
     torch.testing.assert_close(found, torch.stack([row.weights for row in expected.history]), rtol=0, atol=1e-5)
     assert str(card["engine"]).startswith("flower 1.")
-    assert (card["clients"], card["fleet"]) == (["c0", "c1"], "two")
+    assert (card["clients"], card["fleet"]) == (["a", "b"], "two")
     assert "train fedkalmannet" in done.stderr
     assert not [word for word in ("INFO", "WARN", "ERROR", "Warning") if word in done.stderr]
     again = train(job, load_fleet(tmp_path / "two.csv"), tmp_path / "weights")

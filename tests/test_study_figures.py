@@ -145,6 +145,11 @@ def test_curves_draw_numbers_of_their_selections(results: Results) -> None:
     assert figures.curves(results, [panel], [{"method": "okf"}], "c") is None
 
 
+def test_multiples_name_methods_and_their_noise(results: Results) -> None:
+    axes = PLOTS["multiples"](results).figure.axes[0]
+    assert [label.get_text() for label in axes.get_yticklabels()] == ["Joint filter, fitted"]
+
+
 def test_one_run_of_one_ego_shows_its_points_without_an_interval(results: Results) -> None:
     one = replace(results, frame=results.select(run=0, method="joint"))
     assert [text for *_, text in figures.sweep(one, "max_neighbours").marks()["points"] if "[" not in text]

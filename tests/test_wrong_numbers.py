@@ -300,7 +300,7 @@ def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes) -> Non
     with zipfile.ZipFile(tmp_path / "good.npz") as good, zipfile.ZipFile(tmp_path / "bad.npz", "w") as bad:
         for name in good.namelist():
             bad.writestr(name, content if name == "relative.npy" else good.read(name))
-    with refused(r"bad.npz = .*must be a recording"):
+    with refused(r"bad.npz = (arrays of shapes|.'EOF).*must be a recording"):
         read_recording(tmp_path / "bad.npz")
 
 

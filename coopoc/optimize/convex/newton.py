@@ -79,8 +79,7 @@ class Reduced:
     @cached_property
     def _inverse(self) -> Cholesky:
         found = cholesky_of(self.gram[self.problem.bound :, self.problem.bound :])
-        if found is None:
-            raise np.linalg.LinAlgError("positions are free whatever the rotations and unit vectors")
+        assert found is not None  # what could be moved as a whole is not among the rows
         return found
 
     @cached_property
@@ -98,8 +97,6 @@ class Reduced:
         bound = self.problem.bound
         if self._small is not None:
             return np.asarray(self._small[1] @ X)
-        if bound == self.gram.shape[0]:
-            return X
         right = -(self._rows[:, bound:].T @ (self._rows[:, :bound] @ X))
         return np.concatenate([X, columns_solved(self._inverse, right)])
 
