@@ -164,9 +164,9 @@ def of_topic(frame: pd.DataFrame, file: str, summary: Summary, true: bool) -> pd
     if true:
         frame = frame.rename(columns=lambda name: name.replace("pose.pose.", "pose."))
     made |= {kind: numeric(frame, name, file) for name, kind in FIELDS.items() if name in frame}
-    for std, name in ((std, name) for name, std in VARIANCES.items() if name in frame):
+    for name in filter(frame.__contains__, VARIANCES):
         variance = numeric(frame, name, file)
-        made[std] = np.sqrt(np.where(variance > 0, variance, np.nan))
+        made[VARIANCES[name]] = np.sqrt(np.where(variance > 0, variance, np.nan))
     turn = "pose.orientation" if true else "orientation"
     if {f"{turn}.{axis}" for axis in "xyzw"} <= {*frame}:
         made["heading"] = _yaw(*(numeric(frame, f"{turn}.{axis}", file) for axis in "xyzw"))

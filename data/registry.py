@@ -212,8 +212,9 @@ def _real(path: Path, columns: Mapping[str, str] | None = None) -> str:
         return "mrclam"
     if path.suffix in (".npz", ".pyfg"):
         return "recording" if path.suffix == ".npz" else "pyfg"
-    tum = path.is_dir() and any(path.glob("*.tum"))
-    return "log" if not tum and is_log(path, columns) else ""
+    if path.is_dir() and any(path.glob("*.tum")):
+        return ""
+    return "log" if is_log(path, columns) else ""
 
 
 def _split(name_or_path: str | Path, options: dict[str, Any]) -> tuple[str, dict[str, Any], dict[str, Any]]:

@@ -128,14 +128,14 @@ def own(name: str, noise: NoiseModel | str = "nominal") -> Any:
     Raises:
         InputError: an unknown name, a class that takes no noise model, or what no study can use.
     """
+    shows = "docs/extend.md shows one; its first argument is noise_model."
     try:
         method = find("coopoc.methods", name)(noise)
     except TypeError as error:
-        hint = "Its first argument is noise_model; docs/extend.md shows one."
-        raise InputError("method", repr(name), f"cannot be made from a noise model: {error}", hint) from error
+        raise InputError("method", repr(name), f"cannot be made from a noise model: {error}", shows) from error
     if not (isinstance(method, Method) and isinstance(method.name, str)):
         allowed = "must have a name (text), cooperative (True or False), a message, and be called with a recording"
-        raise InputError("method", repr(name), allowed, "docs/extend.md shows one.")
+        raise InputError("method", repr(name), allowed, shows)
     return method
 
 

@@ -157,8 +157,8 @@ def cell(p: Params) -> list[Row]:
     blocks = max((steps - start) // block, 1)
     known = np.isfinite(next(iter(scores.values()), np.empty((0, count)))[start : start + blocks * block])
     for ego, name in enumerate(drive.ids):  # as many blocks for each vehicle, of the steps at which it can be scored
-        for number, part in enumerate(np.array_split(start + np.flatnonzero(known[:, ego]), blocks)):
-            found = {what: _reduced(what, score[part, ego]) for what, score in scores.items()}
+        for number, scored in enumerate(np.array_split(start + np.flatnonzero(known[:, ego]), blocks)):
+            found = {what: _reduced(what, score[scored, ego]) for what, score in scores.items()}
             if any(np.isfinite(value) for value in found.values()):
                 sent, received = moved[:, ego] / seconds[ego]
                 more = {"bytes_per_second": received, "sent_bytes": once + sent * driven(p)}

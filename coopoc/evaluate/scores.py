@@ -69,9 +69,7 @@ def scored(
         track = method(part, egos)
         if getattr(track, "egos", None) != tuple(map(part.ids.index, egos)):
             allowed = f"must be a Track of {', '.join(egos)}, in this order"
-            raise InputError(
-                f"estimates of {method.name}", shown(track), allowed, "Take its egos as they were asked for."
-            )
+            raise InputError(f"estimates of {method.name}", shown(track), allowed, "Take egos as they are asked for.")
         seconds += track.seconds
         parts.append(_columns(track, part, method, drive, quantiles))
         if metric:

@@ -170,9 +170,11 @@ def curves(
             if panel.ticks or len(panel.x) <= 8:
                 axis.set_xticks(list(panel.ticks or panel.x), list(panel.ticks.values()) or [f"{x:g}" for x in panel.x])
                 axis.minorticks_off()
-        axes[0].set(ylabel=ylabel, **({} if log else {"ylim": (0, None)}))
+        axes[0].set_ylabel(ylabel)
         if log:
             plain_log(axes[0].yaxis)
+        else:
+            axes[0].set_ylim(0)
         if any("label" in of for of in every):
             axes[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
         else:

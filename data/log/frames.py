@@ -124,9 +124,9 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float) -
     square = (rows["std"] ** 2).groupby(rows["kind"]).mean().dropna()
 
     def of(*names: str, default: float, unit: str) -> float:
-        chosen = rows["kind"].isin(names) & rows["std"].notna()
-        if chosen.any():
-            return float(np.sqrt((rows["std"][chosen] ** 2).mean()))
+        stated = rows["std"][rows["kind"].isin(names)].dropna()
+        if len(stated):
+            return float(np.sqrt((stated**2).mean()))
         if used & set(names):
             summary.assume("standard deviations of {}: none was logged", f"{default:.3g} {unit} ({names[0]})")
         return default
@@ -145,7 +145,7 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float) -
         noise |= {"velocity_reading": "speed", "yaw_rate_std": rate, "compass": "heading" in used}
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of("heading", default=HEADING_STD, unit="rad")
-    if not {*MOTION} & set(square.index):
+    if {*MOTION}.isdisjoint(square.index):
         summary.assume(f"{base.velocity_std_ratio:.0%} of a velocity as its noise, {base.velocity_floor} m/s at least")
         return replace(base, **noise)
     speed = of(*MOTION, default=0.0, unit="m/s")

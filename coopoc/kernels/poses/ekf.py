@@ -86,10 +86,8 @@ def run_filter(
             step(measured, noise, begin, spread, options, poses, pair, run, t)
             for k in range(members):
                 if measured.active[t, k]:
-                    for i in range(d):
-                        x[run, t, k, i] = poses.x[d * k + i]
-                        for j in range(d):
-                            cov[run, t, k, i, j] = poses.cov[d * k + i, d * k + j]
+                    own = slice(d * k, d * k + d)
+                    x[run, t, k], cov[run, t, k] = poses.x[own], poses.cov[own, own]
         cost[run, 0], cost[run, 1] = poses.totals[COST], poses.totals[USED]
     return x, cov, cost
 
@@ -207,8 +205,7 @@ def fuse_pair(
         set_member(pair, 0, poses, observer, d, weight)
         if other >= 0:
             set_member(pair, d, poses, other, d, max(1.0 - weight, LEAST) if tries > 0 else 1.0)
-        for i in range(2 * d):
-            pair.linear[i] = pair.x[i]
+        pair.linear[:] = pair.x
         add_relative(measured, noise, pair, ends, run, k, ZERO)
         settle(pair)
         total = 0.0
