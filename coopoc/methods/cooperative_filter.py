@@ -49,7 +49,7 @@ class CooperativeFilter(Checked):
     r"""Kalman filter of the star {ego} + neighbours that expects wrong numbers: one method for every condition.
 
     The state holds the members' positions and, where they are needed, the error of each receiver's fixes, the error
-    that all fixes share, the error of the ego's compass, and velocities of members whose messages are late:
+    that all fixes share, errors of the ego's compass and ranges, and velocities of members whose messages are late:
 
     $$
     z_j = x_j + b_j + c + w_j, \qquad
