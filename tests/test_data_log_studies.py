@@ -170,7 +170,11 @@ WRONG = {
     "positions in feet": (["x", "y"], lambda v: v / 0.3048, r"fixes travel 3\.\d+ times as far"),
     "positions in km": (["x", "y"], lambda v: v / 1000, r"are positions in km\?"),
     "azimuths clockwise from north": (["azimuth"], lambda v: (np.pi / 2 - v) % (2 * np.pi), r"azimuths miss"),
-    "ranges in feet": (["range"], lambda v: v / 0.3048, r"ranges miss .* 3\.\d+ times as long.*of feet 0\.3048"),
+    "ranges in feet": (
+        ["range"],
+        lambda v: v / 0.3048,
+        r"ranges miss .* 3\.\d+ times as long: scale=range:0\.30\d, .*of feet 0\.3048",
+    ),
 }
 
 
