@@ -183,12 +183,12 @@ def bound_rows(p: Params) -> list[Row]:
     """The bound of each ego over an ideal channel, with the bytes that the ego would receive.
 
     It needs no draws but where there are outliers or an attack: then it is that of an estimator which is told of them,
-    the mean over runs. The noise model of PAST makes it the bound with the past of newcomers. Real data have none: the
-    bound is of sensors that measure at every step.
+    the mean over runs. Newcomers bring their past, unless the noise model is that of BOUND or "star". Real data have
+    none: the bound is of sensors that measure at every step.
     """
     from coopoc.evaluate.bounds import bound_rt_le, past_bound, posterior_bound
 
-    bound = past_bound if (p["method"], p.get("noise_model")) == PAST else posterior_bound
+    bound = posterior_bound if p.get("noise_model") in ("bound", "star") else past_bound
     drive, v2x = scene.fleet(p["data"]), scene.channel(p)
     if scene.is_real(p["data"]):
         return [{"run": 0, "ego": ego} for ego in scene.egos(p["data"], str(p["egos"]))]
