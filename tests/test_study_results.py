@@ -12,6 +12,7 @@ from latex import compiled
 
 from coopoc.evaluate.statistics import Interval
 from coopoc.study.results import Results, parsed
+from coopoc.study.style import look
 from coopoc.study.tables import FORMATS, Table, pivot
 
 
@@ -72,6 +73,12 @@ def test_what_would_be_mixed_is_named(rows: list[dict[str, Any]]) -> None:
         found.interval("rt_le", method="gnss", k=0)
     with refused("k = 7: must be among 0, 4"):
         found.select(k=7)
+
+
+def test_classes_of_one_name_are_told_apart_by_their_files() -> None:
+    names = ["a.py:A", "b.py:A", "c.py:B", "d.py:C"]
+    results(pd.DataFrame({"method": names, "label": ["Mine", "Mine", look("kalman").label, "Other"]}))
+    assert [look(name).label for name in names] == ["Mine (a.py:A)", "Mine (b.py:A)", "KF (c.py:B)", "Other"]
 
 
 def test_an_ego_without_all_its_runs_is_left_out_and_said_so(rows: list[dict[str, Any]]) -> None:

@@ -302,6 +302,9 @@ def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes) -> Non
             bad.writestr(name, content if name == "relative.npy" else good.read(name))
     with refused(r"bad.npz = (arrays of shapes|.'EOF).*must be a recording"):
         read_recording(tmp_path / "bad.npz")
+    (tmp_path / "bad.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:-9])
+    with refused(r"bad.npz = .*must be a recording in \.npz"):
+        co.load_recording(tmp_path / "bad.npz")
 
 
 def test_cooperation_that_changes_nothing_is_said_below_the_table() -> None:
