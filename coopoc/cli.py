@@ -74,8 +74,8 @@ def run(
     if data is not None:
         changes["data"] = data
     study = find_study(name).override(changes)  # a mistake is told before pandas and Arrow are imported
-    for params in points(study)[:1]:
-        study.key({**study.settings, **params})
+    for first in points(study)[:1]:
+        study.key({**study.settings, **first})
     from .study.publish import tables
     from .study.run import plan, run_study, write_tracks
 
