@@ -42,10 +42,10 @@ TOWN: Mapping[str, Any] = {**DRAWN, "scenario": 2, "velocity_ratio": 0.15, "velo
 @lru_cache(maxsize=4)
 def fleet(data: str) -> Fleet:
     """The fleet of a bundled name or a path: of a log its truth, NaN where it is unknown."""
-    from coopoc.data.registry import load_fleet
-
     log = _log(data)
     if log is None:
+        from coopoc.data.registry import load_fleet
+
         return load_fleet(data)
     measurements = log.recording
     nothing = np.full((len(measurements.t), len(measurements.ids), 3), np.nan)
