@@ -291,7 +291,6 @@ def test_what_explains_an_error_far_better_is_said() -> None:
         (axes, 0.0, flat * [1, -1, 1], None, "each"),
         (axes, 0.0, x[:, [1, 0, 2]], None, "none"),
         ("times 0.01, its aligned", 0.0, 100 * x, None, "each"),
-        ("times 2, its aligned", 0.0, 0.5 * x, None, "each"),
         ("aligned by itself (align), its", 0.0, x @ turn[60].as_matrix(), None, "none"),
     ):
         (row,) = scores({"a": Track(truth.t + late, position, rotation)}, {"a": truth}, aligned=aligned)  # type: ignore[arg-type]
