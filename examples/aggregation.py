@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
 from importlib.metadata import version
+from math import ceil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -93,12 +94,22 @@ def noise(p: Params) -> list[Sensors]:
 
 
 def clients(p: Params, seed: int) -> tuple[Client, ...]:
-    """The clients of a condition for one training seed; the one in the middle is the poisoned one."""
-    from coopoc.learned.federation.participation import heterogeneous, poisoned
+    """The clients of a condition for one training seed; the one in the middle is the poisoned one.
 
-    count = int(p["members"])
-    amounts = [SHARES[i % 3] if p["condition"] == "heterogeneous" else 1.0 for i in range(count)]
-    group = list(heterogeneous(members(p), noise(p), amounts, seed=seed, piece=int(p["piece"])))
+    The noise of a vehicle is keyed by its name: it is the same as with its sensors for all. Of the training pieces the
+    first ceil(share n) remain.
+    """
+    from coopoc.learned.federation.participation import poisoned
+    from coopoc.learned.training import clients as training
+
+    count, acting = int(p["members"]), noise(p)
+    shares = [SHARES[i % 3] if p["condition"] == "heterogeneous" else 1.0 for i in range(count)]
+    made = {one: training.clients(members(p), one, seed=seed, piece=int(p["piece"])) for one in dict.fromkeys(acting)}
+    whole = [made[sensors][i] for i, sensors in enumerate(acting)]
+    group = [
+        replace(client, training=client.training.take(range(ceil(share * len(client.training)))))
+        for client, share in zip(whole, shares, strict=True)
+    ]
     if p["condition"] == "poisoned data":
         group[count // 2] = poisoned(group[count // 2], float(p["offset_m"]))
     return tuple(group)

@@ -75,6 +75,25 @@ def test_wrong_ranges_cost_little_and_are_named() -> None:
     assert "correlated by 0.5" in lasting("a", np.repeat(white, 2, axis=1), 1.0)[0]
 
 
+def test_an_offset_of_all_ranges_is_a_state() -> None:
+    """Delays of a radio, the same for a whole run; taken for exact they cost more than cooperation brings."""
+    fleet, told = drive(300), replace(S2, range_offset_std=1.0)
+    seen, longer = (observe(fleet, each, V2X(6), runs=4, observers=[0, 3]) for each in (S2, told))
+    added = (longer.relative - seen.relative)[..., 0]
+    for ego in (0, 3):
+        mine = added[:, seen.links.of(ego)]
+        assert_allclose(mine - mine[:, :1], 0.0, atol=1e-9)
+    assert 0.3 < added[:, [0, -1]].std() < 3.0
+    assert_allclose(longer.relative[..., 1:], seen.relative[..., 1:], atol=0)
+    wrong = replace(seen, relative=seen.relative + np.array([3.0, 0.0, 0.0]))
+    cases = (None, seen), (None, wrong), (NoiseModel.nominal(told), wrong)
+    clean, taken, state = (
+        float(rt_le(CooperativeFilter(model or "nominal")(given), fleet).mean()) for model, given in cases
+    )
+    assert taken > 1.5 * clean
+    assert state < 1.1 * clean
+
+
 def test_a_lost_message_costs_no_more_than_the_message() -> None:
     """Two of a hundred lost, alone and in runs; what was said once counted twice made that 20 % worse, NEES 4.2."""
     fleet = drive(600)
@@ -98,6 +117,8 @@ BAD: dict[str, tuple[Sensors, V2X, Callable[[Recording], Recording]]] = {
     "alone": (S2, CHANNELS["alone"], lambda r: r),
     "missing": (S2, CHANNELS["late"], lambda r: partial(holed(r))),
     "heading": (HEADING, CHANNELS["all"], lambda r: too_long(r, 0.1)),
+    "offset": (replace(HEADING, range_offset_std=2.0), CHANNELS["late"], lambda r: too_long(r, 0.1)),
+    "offset alone": (replace(S2, range_offset_std=1.0), CHANNELS["ideal"], lambda r: partial(r)),
     "lasting": (LASTING, CHANNELS["late"], lambda r: r),
     "attack": (S2, CHANNELS["all"], lambda r: spoofed(r, Spoofing(0.5, start=2.0), seed=3, honest=[0])),
     "all": (

@@ -8,14 +8,14 @@ import pandas as pd
 import pytest
 from conftest import refused
 from filterpy.kalman import KalmanFilter
-from logs import drive, long, observed, write
+from logs import bends, drive, fixes, long, motion, observed, ranges, write
 from numpy.testing import assert_allclose
 
 import coopoc as co
 from coopoc.cli import main
 from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
-from coopoc.data.registry import load_fleet
+from coopoc.data.registry import load_fleet, load_log
 from coopoc.evaluate.metrics import fix_innovations, innovation_columns, normalised_innovations
 from coopoc.studies import lineup, paths
 from coopoc.study.report import report
@@ -68,6 +68,24 @@ def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> 
     parts = [np.array([[3.0]]), np.array([[4.0]])]
     merged = [lineup._merged(name, parts, (1, 3)).item() for name in ("innovation_m", "nis", "fixes", "max_error_m")]
     assert merged == pytest.approx([np.sqrt(57 / 4), 15 / 4, 7, 4])
+
+
+@pytest.mark.parametrize(("options", "offset", "most"), [("", 2.0, 1.0), ("?dt=0.1", 0.0, 0.97), ("", 0.0, 0.93)])
+def test_ranges_help_or_do_no_harm(tmp_path: Path, options: str, offset: float, most: float) -> None:
+    """Radios whose delays nobody calibrated, and steps at half of which nothing is measured."""
+    fleet, parts = bends(4, 2.0), list[pd.DataFrame]()
+    for k, name in enumerate(fleet.ids):
+        parts += [fixes(fleet, name, 1.0, 1.5, 10 * k), motion(fleet, name, 0.1, 0.1, 10 * k + 1)]
+        parts += [ranges(fleet, name, other, 0.2, 0.15, 10 * k + 2) for other in fleet.ids[k + 1 :]]
+    table = pd.concat(parts)
+    path = write(table.assign(range=table["range"] + offset), tmp_path / "cars.csv")
+    log = load_log(f"{path}{options}")
+    true = np.stack([[np.interp(log.recording.t, fleet.t, x) for x in p.T] for p in fleet.position.swapaxes(0, 1)])
+    rms = [
+        float(np.sqrt(np.square(method(log.recording, fleet.ids).x[0] - true.transpose(2, 0, 1))[..., :2].mean()))
+        for method in (co.CooperativeFilter(), co.Kalman())
+    ]
+    assert rms[0] < most * rms[1]
 
 
 def test_a_vehicle_that_is_away_keeps_its_blocks_and_a_block_without_a_fix_is_left_out(
@@ -152,7 +170,11 @@ WRONG = {
     "positions in feet": (["x", "y"], lambda v: v / 0.3048, r"fixes travel 3\.\d+ times as far"),
     "positions in km": (["x", "y"], lambda v: v / 1000, r"are positions in km\?"),
     "azimuths clockwise from north": (["azimuth"], lambda v: (np.pi / 2 - v) % (2 * np.pi), r"azimuths miss"),
-    "ranges in feet": (["range"], lambda v: v / 0.3048, r"ranges miss .* 3\.\d+ times as long.*of feet 0\.3048"),
+    "ranges in feet": (
+        ["range"],
+        lambda v: v / 0.3048,
+        r"ranges miss .* 3\.\d+ times as long: scale=range:0\.30\d, .*of feet 0\.3048",
+    ),
 }
 
 

@@ -139,6 +139,15 @@ def test_the_good_file_is_good(tmp_path: Path) -> None:
         assert not read_log(tmp_path / "log.csv").summary.refused
 
 
+def test_a_row_that_comes_late_changes_nothing_and_is_named(tmp_path: Path) -> None:
+    late = "0.5,red,x,,4.0,1.5,\n"
+    for name, text in (("a.csv", GOOD), ("b.csv", swap(late, "") + late)):
+        (tmp_path / name).write_text(text)
+    a, b = (read_log(tmp_path / name) for name in ("a.csv", "b.csv"))
+    assert same(a.recording, b.recording)
+    assert "stamps of red go back (first: b.csv: row 200)" in str(b.summary)
+
+
 KEPT: dict[str, tuple[Callable[[str], str], str]] = {
     "a partner that is misspelt": (
         lambda text: text.replace("range,blue", "range,bleu", 1),

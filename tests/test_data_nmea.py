@@ -149,7 +149,7 @@ def test_a_bag_is_read(tmp_path: Path, ros: int) -> None:
     assert rec.ids == ("car0", "car1")
     assert_allclose(rec.gnss[0], fleet.position, atol=1e-6)
     assert_allclose(rec.velocity[0, 2:], fleet.velocity[2:], atol=0.05)
-    assert rec.sensors.gnss_std == pytest.approx((0.5, 0.5, 2.0))
+    assert rec.sensors.gnss_std == pytest.approx((0.5, 0.6, 2.0))
     assert log.truth is not None
     assert_allclose(log.truth.position[:, 0], fleet.position[:, 0], atol=1e-6)
     assert np.isnan(log.truth.position[:, 1]).all()
@@ -186,8 +186,12 @@ def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path: Path) -> None:
             read_log(path, dt=0.1, **wrong)
 
 
+COVARIANCE = [[f"position_covariance{form.format(at)}" for at in (0, 4, 8)] for form in ("[{}]", "_{}")]
+
+
 def test_topics_as_tables_are_the_bag(tmp_path: Path) -> None:
-    """A folder per namespace, a column per field; speeds stay along the vehicle, whose imu has the heading."""
+    """A folder per namespace, a column per field, variances as one of two programs names them; speeds stay along the
+    vehicle, whose imu has the heading."""
     fleet = drive(2, steps=80, start=1.7e9)
     for k, name in enumerate(fleet.ids):
         lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, k].T, 48.14, 11.58, 560.0)
@@ -196,9 +200,10 @@ def test_topics_as_tables_are_the_bag(tmp_path: Path) -> None:
         stamp = {"header.stamp.sec": sec, "header.stamp.nanosec": np.rint(1e9 * (fleet.t - sec)).astype(int)}
         status = np.where(np.arange(80) == 40, -1, 0)
         turn = (0, 0, np.sin(yaw / 2), np.cos(yaw / 2))
+        variance = dict(zip(COVARIANCE[k], (k + 1) * np.array([0.25, 0.36, 0]), strict=True))
         turned = {f"orientation.{axis}": value for axis, value in zip("xyzw", turn, strict=True)}
         topics = {
-            "gps/fix": {"status.status": status, "latitude": lat, "longitude": lon, "altitude": h},
+            "gps/fix": {**variance, "status.status": status, "latitude": lat, "longitude": lon, "altitude": h},
             "odom": {"pose.pose.position.x": 0.0, "twist.twist.linear.x": np.hypot(*u[:, :2].T)},
             "imu": {**turned, "angular_velocity.z": np.gradient(np.unwrap(yaw), 0.1)},
         }
@@ -206,13 +211,13 @@ def test_topics_as_tables_are_the_bag(tmp_path: Path) -> None:
             file = tmp_path / "dump" / name / f"{topic}.csv"
             file.parent.mkdir(parents=True, exist_ok=True)
             pd.DataFrame(stamp | columns).to_csv(file, index=False)
-    log = read_log(tmp_path / "dump", origin=(48.14, 11.58, 560.0), std={"x": 1.5, "range": 0.15})
+    log = read_log(tmp_path / "dump", origin=(48.14, 11.58, 560.0), std={"z": 1.5, "range": 0.15})
     assert co.load_recording(tmp_path / "dump").ids == log.recording.ids == ("car0", "car1")
     assert log.summary.refused["fixes that the receiver calls invalid"][0] == 2
     there = np.isfinite(log.recording.gnss[0, :, :, 0])
     assert_allclose(log.recording.gnss[0][there], fleet.position[there], atol=1e-5)
     assert_allclose(log.recording.velocity[0, 2:, :, :2], fleet.velocity[2:, :, :2], atol=0.06)
-    assert log.recording.sensors.gnss_std[0] == 1.5
+    assert log.recording.sensors.gnss_std == pytest.approx(np.sqrt([1.5 * 0.25, 1.5 * 0.36, 2.25]))
 
 
 def test_times_of_a_bag_are_those_of_its_headers_or_of_its_reception(tmp_path: Path) -> None:
@@ -307,7 +312,7 @@ def write_bag(
                 flat[0] = 0.01
                 messages = {
                     "fix": kind[names["fix"]](
-                        header(t), status, lat, lon, h, np.diag([0.25, 0.25, 4.0]).ravel(), 2 - 2 * column
+                        header(t), status, lat, lon, h, np.diag([0.25, 0.36, 4.0]).ravel(), 2 - 2 * column
                     ),
                     "odom": kind[names["odom"]](
                         header(t),

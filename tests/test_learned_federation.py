@@ -22,7 +22,7 @@ from coopoc.learned import Client, GainNet, Schedule, clients, federate
 from coopoc.learned.federation.combine import SERVER, Answer, Standing, combine, screen
 from coopoc.learned.federation.federate import Plan, federate_many
 from coopoc.learned.federation.history import Federation, Round, ledger
-from coopoc.learned.federation.participation import Byzantine, Participation, heterogeneous, poisoned
+from coopoc.learned.federation.participation import Byzantine, Participation, poisoned
 from coopoc.learned.federation.rules import (
     RULES,
     Krum,
@@ -205,26 +205,6 @@ def test_the_ledger_counts_every_byte(four: tuple[Client, ...]) -> None:
     np.testing.assert_array_equal(air.of("training", "on air")[0] - received, [*100 * rounds, 100 * rounds.sum()])
 
 
-def test_clients_may_differ_in_sensors_and_in_amount() -> None:
-    """Each has the noise of its own sensors, its keyed draws, and its part of the pieces."""
-    fleet = drives(3, 2100)
-    good, poor = Sensors(gnss_std=(0.5, 0.5, 0.5)), Sensors(gnss_std=(4, 4, 4), velocity_std_ratio=0.2)
-    found = heterogeneous(fleet, [good, poor, good], [1.0, 0.5, 0.25], piece=20, seed=6)
-    whole = clients(fleet, poor, piece=20, seed=6)
-    assert [len(c.training) for c in found] == [80, 40, 20]
-    assert torch.equal(found[1].training.gnss, whole[1].training.gnss[:40])
-    assert torch.equal(found[1].long.gnss, whole[1].long.gnss)
-    for client, std in zip(found, (0.5, 4.0, 0.5), strict=True):
-        assert float((client.training.gnss - client.training.truth).std()) == pytest.approx(std, rel=0.1)
-    for field, sensors, shares in (
-        ("sensors", [good], [1, 1, 1]),
-        ("shares", [good] * 3, [1, 1]),
-        ("shares", [good] * 3, [1, 1, 0]),
-    ):
-        with refused(field):
-            heterogeneous(fleet, sensors, shares, piece=20)
-
-
 def test_poisoned_data_and_poisoned_updates(four: tuple[Client, ...]) -> None:
     """A moved truth moves the client's minimum by as much; a turned update is the mirror image of the honest one."""
     shifted = poisoned(four[0], 10.0)
@@ -247,7 +227,8 @@ def test_poisoned_data_and_poisoned_updates(four: tuple[Client, ...]) -> None:
 @pytest.mark.parametrize("noise", ["static", "fresh"])
 def test_a_score_does_not_depend_on_who_is_judged_beside(noise: Noise) -> None:
     """Bit for bit, with pieces of different number, and equal to the mean of the pieces' losses on one draw."""
-    group = heterogeneous(drives(3), [Sensors()] * 3, [1.0, 0.5, 0.2], piece=10, noise=noise)
+    whole = clients(drives(3), Sensors(), piece=10, noise=noise)
+    group = [replace(c, training=c.training.take(range(n))) for c, n in zip(whole, (8, 4, 2), strict=True)]
     kinds, theta = [[c.training for c in group], [c.long for c in group]], torch.tensor([[0.2], [0.4], [0.6]])
     theta = theta.repeat(1, 3)
     together = Judge(kinds, Steady())(theta)

@@ -23,11 +23,11 @@ from typing import Any
 import numpy as np
 import pytest
 from shell import ran
+from test_learned_flower import in_process
 
 from coopoc import Fleet
 from coopoc.data.fleet_files import write_table
-from coopoc.learned import federate, load
-from coopoc.learned.federation.history import Federation
+from coopoc.learned import load
 from coopoc.learned.federation.local import local_fit
 from coopoc.learned.flower.job import job_of, local
 from coopoc.learned.recipes import Job, job_clients, untrained
@@ -58,7 +58,7 @@ def each(fleet: Fleet) -> dict[str, Fleet]:
 @pytest.fixture(scope="module", autouse=True)
 def _compiled() -> None:
     """The engine, before four processes compile it side by side."""
-    whole(job_of({"recipe": "fedkalmannet", "rounds": 1, **TINY}), drives(1))
+    in_process(job_of({"recipe": "fedkalmannet", "rounds": 1, **TINY}), drives(1))
 
 
 @pytest.fixture(scope="module")
@@ -103,12 +103,6 @@ def until(true: Callable[[], bool], seconds: float = 300, alive: subprocess.Pope
         assert time.monotonic() < end
         assert alive is None or alive.poll() is None
         time.sleep(0.1)
-
-
-def whole(job: Job, fleet: Fleet) -> Federation:
-    """The federation in this process."""
-    recipe, seed, own = job.recipe, job.setting.seed, job_clients(job, fleet)
-    return federate(untrained(job), own, recipe.rounds, recipe.aggregate, recipe.local_epochs, seed, recipe.schedule)
 
 
 def checked(path: Path, job: Job, fleet: Fleet) -> Mapping[str, Any]:

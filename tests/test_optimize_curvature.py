@@ -2,19 +2,12 @@
 
 from dataclasses import replace
 
-import casadi as ca
 import numpy as np
 import pytest
-from oracles.whitened import whitened
+from oracles.whitened import hessian
 
 from coopoc.optimize import Problem, SolveError, Status, backends, solve
 from coopoc.optimize.assess.assess import newton_decrease
-
-
-def casadis_hessian(problem: Problem, x: np.ndarray) -> np.ndarray:
-    v = ca.SX.sym("x", 3, len(problem.names))
-    cost = 0.5 * ca.sumsqr(whitened(problem, v))
-    return np.asarray(ca.Function("H", [v], [ca.hessian(cost, ca.vec(v))[0]])(x.T))
 
 
 def tangle(seed: int) -> Problem:
@@ -33,7 +26,7 @@ def test_the_sign_of_the_curvature_is_that_of_casadis_hessian() -> None:
     signs = []
     for seed in range(40):
         problem = tangle(seed)
-        lowest = np.linalg.eigvalsh(casadis_hessian(problem, problem.x0)).min()
+        lowest = np.linalg.eigvalsh(hessian(problem, problem.x0)).min()
         assert abs(lowest) > 1e-4
         assert (newton_decrease(problem, problem.x0) is not None) == (lowest > 0)
         signs.append(lowest > 0)
@@ -53,7 +46,7 @@ def test_a_saddle_is_not_solved(backend: str) -> None:
     problem = between_two()
     stuck = solve(problem, backend, throw=False)
     assert stuck.status is Status.SADDLE
-    assert np.linalg.eigvalsh(casadis_hessian(problem, stuck.x)).min() < -0.1
+    assert np.linalg.eigvalsh(hessian(problem, stuck.x)).min() < -0.1
     with pytest.raises(SolveError, match="to the side"):
         solve(problem, backend)
     aside = solve(replace(problem, x0=stuck.x + np.outer([1, 0, 0], [0, 1, 1])), backend)

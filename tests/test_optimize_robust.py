@@ -3,10 +3,10 @@
 import itertools
 from dataclasses import replace
 
-import casadi as ca
 import gtsam
 import numpy as np
 import pytest
+from oracles.whitened import LOSSES, hessian
 from scipy.optimize import approx_fprime, least_squares
 from scipy.stats import chi2
 
@@ -15,7 +15,6 @@ from coopoc.optimize.assess.assess import newton_decrease
 
 M = gtsam.noiseModel.mEstimator
 GTSAMS = {"huber": M.Huber, "cauchy": M.Cauchy, "geman-mcclure": M.GemanMcClure, "truncated": M.TruncatedLeastSquares}
-SMOOTH = ["huber", "cauchy", "geman-mcclure"]
 
 
 @pytest.mark.parametrize("name", GTSAMS)
@@ -99,7 +98,7 @@ def geman_mcclure(s: np.ndarray) -> np.ndarray:
     return np.stack([s / (1 + s), (1 + s) ** -2.0, -2 * (1 + s) ** -3.0])
 
 
-@pytest.mark.parametrize("name", SMOOTH)
+@pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize("seed", range(3))
 def test_scipy_finds_the_same_robust_minimum(name: str, seed: int) -> None:
     """SciPy's own huber and cauchy (elementwise, rho of (r / C)^2 times C^2), its solver and differences."""
@@ -121,29 +120,13 @@ def test_scipy_finds_the_same_robust_minimum(name: str, seed: int) -> None:
     assert ours.x[4:].ravel() == pytest.approx(best.x, abs=1e-5)
 
 
-def casadis_hessian(problem: Problem, x: np.ndarray) -> np.ndarray:
-    v, cost = ca.SX.sym("x", 3, len(problem.names)), 0
-    rho = {
-        "huber": lambda s, c: ca.if_else(s <= c**2, s, 2 * c * ca.sqrt(s) - c**2),
-        "cauchy": lambda s, c: c**2 * ca.log(1 + s / c**2),
-        "geman-mcclure": lambda s, c: s / (1 + s / c**2),
-    }
-    for factor in problem.factors:
-        for k, nodes in enumerate(factor.nodes.tolist()):
-            gap = v[:, nodes[-1]] - (v[:, nodes[0]] if len(nodes) == 2 else 0)
-            h = ca.vertcat(*MEASUREMENTS[factor.kind].formula(gap[0], gap[1], gap[2], ca)) - factor.z[k]
-            square = ca.sumsqr(ca.DM(factor.root[k]) @ h)
-            cost += 0.5 * (rho[factor.loss.name](square, factor.loss.scale) if factor.loss else square)
-    return np.asarray(ca.Function("H", [v], [ca.hessian(cost, ca.vec(v))[0]])(x.T))
-
-
 def test_the_robust_curvature_is_casadis() -> None:
     """At random points, minima of the cost or not: newton_decrease says whether CasADi's Hessian is positive."""
     signs = []
-    for seed, name in itertools.product(range(8), SMOOTH):
+    for seed, name in itertools.product(range(8), LOSSES):
         problem = native(seed, wrong=2, loss=Loss(name, 2.5))
         x = problem.x0 + np.random.default_rng(seed).normal(0, 0.25 + 0.05 * seed, problem.x0.shape)
-        lowest = np.linalg.eigvalsh(casadis_hessian(problem, x)).min()
+        lowest = np.linalg.eigvalsh(hessian(problem, x)).min()
         assert abs(lowest) > 1e-4
         assert (newton_decrease(problem, x) is not None) == (lowest > 0)
         signs.append(lowest > 0)

@@ -198,11 +198,21 @@ def test_a_state_without_process_noise_stays_finite(crossing: Fleet) -> None:
     assert np.abs(track.x[:, -1, 0] - still.position[-1, 1]).mean() < np.abs(mean - still.position[-1, 1]).mean() + 0.5
 
 
+def star_of_four(formation: Fleet) -> tuple[Recording, NoiseModel]:
+    recording = observe(formation.select(range(4)).between(0, 40), S2, V2X(max_neighbours=3), runs=2, observers=[0])
+    return recording, NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+
+
+def begin(peer: KalmanFilter, z: np.ndarray, noise: np.ndarray, at: np.ndarray) -> None:
+    """The first update, in which filterpy's own would lose seven digits to the flat prior."""
+    weight = peer.H.T @ np.linalg.inv(noise)
+    peer.P = np.linalg.inv(np.eye(len(at)) / 1e6 + weight @ peer.H)
+    peer.x = at + peer.P @ weight @ (z - peer.H @ at)
+
+
 def test_the_linear_filter_equals_filterpy(formation: Fleet) -> None:
     """Independent check over the stacked star of a formation that never changes, from its first estimate on."""
-    fleet = formation.select(range(4)).between(0, 40)
-    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=1, observers=[0])
-    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    recording, known = star_of_four(formation)
     track = textbook(JointFilter(known, exact=False))(recording, [0])
     n, order = 12, [0, *recording.links.neighbour[:3]]
     peer = KalmanFilter(dim_x=n, dim_z=n + 9, dim_u=n)
@@ -224,11 +234,8 @@ def test_the_linear_filter_equals_filterpy(formation: Fleet) -> None:
             noise[at, at] = known.relative_cov(np.array(spherical(*ahead[k])))
         if t:
             peer.update(z, R=noise)
-        else:  # filterpy's own update would lose seven digits to the flat prior
-            weight = peer.H.T @ np.linalg.inv(noise)
-            peer.P = np.linalg.inv(np.eye(n) / 1e6 + weight @ peer.H)
-            start = np.concatenate([z[:3], (z[:3] + ahead).ravel()])
-            peer.x = start + peer.P @ weight @ (z - peer.H @ start)
+        else:
+            begin(peer, z, noise, np.concatenate([z[:3], (z[:3] + ahead).ravel()]))
         assert track.x[0, t, 0] == pytest.approx(peer.x[:3], abs=1e-9)
         assert track.covariance is not None
         assert track.covariance[0, t, 0] == pytest.approx(peer.P[:3, :3], rel=1e-9, abs=1e-12)
@@ -241,9 +248,7 @@ def test_the_angle_is_atan2() -> None:
 
 def test_the_laplacian_filter_equals_filterpy(formation: Fleet) -> None:
     """Per axis, over the star of a formation that never changes, from its first estimate on."""
-    fleet = formation.select(range(4)).between(0, 40)
-    recording = observe(fleet, S2, V2X(max_neighbours=3), runs=2, observers=[0])
-    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
+    recording, known = star_of_four(formation)
     track = LKFSA(known)(recording, [0])
     assert track.covariance is not None
     order, laplacian = [0, *recording.links.neighbour[:3]], np.diag([3.0, 1.0, 1.0, 1.0])
@@ -261,10 +266,7 @@ def test_the_laplacian_filter_equals_filterpy(formation: Fleet) -> None:
             if t:
                 peer.predict(u=recording.velocity[1, t, order, c])
                 peer.update(z, R=noise)
-            else:  # filterpy's own update would lose seven digits to the flat prior
-                weight = peer.H.T @ np.linalg.inv(noise)
-                peer.P = np.linalg.inv(np.eye(4) / 1e6 + weight @ peer.H)
-                first = z[4] + np.array([0.0, *z[1:4]])
-                peer.x = first + peer.P @ weight @ (z - peer.H @ first)
+            else:
+                begin(peer, z, noise, z[4] + np.array([0.0, *z[1:4]]))
             assert track.x[1, t, 0, c] == pytest.approx(peer.x[0], abs=1e-9)
             assert track.covariance[1, t, 0, c, c] == pytest.approx(peer.P[0, 0], rel=1e-9)

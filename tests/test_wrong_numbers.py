@@ -294,7 +294,7 @@ BAD = (header((3, 80, 2, 99)), header((10**11,)), header((2**61,)), b"\x93NUMPY\
 
 
 @pytest.mark.parametrize("content", BAD)
-def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes) -> None:
+def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     save_recording(SEEN, tmp_path / "good.npz", FLEET)
     assert read_recording(tmp_path / "good.npz")[0].runs == 3
     with zipfile.ZipFile(tmp_path / "good.npz") as good, zipfile.ZipFile(tmp_path / "bad.npz", "w") as bad:
@@ -302,6 +302,12 @@ def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes) -> Non
             bad.writestr(name, content if name == "relative.npy" else good.read(name))
     with refused(r"bad.npz = (arrays of shapes|.'EOF).*must be a recording"):
         read_recording(tmp_path / "bad.npz")
+    (tmp_path / "bad.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:-9])
+    with refused(r"bad.npz = .*must be a recording in \.npz"):
+        co.load_recording(tmp_path / "bad.npz")
+    monkeypatch.setattr("coopoc.world.storage.LARGEST", 9)
+    with refused("more than 2 GB"):
+        read_recording(tmp_path / "good.npz")
 
 
 def test_cooperation_that_changes_nothing_is_said_below_the_table() -> None:

@@ -49,7 +49,7 @@ class CooperativeFilter(Checked):
     r"""Kalman filter of the star {ego} + neighbours that expects wrong numbers: one method for every condition.
 
     The state holds the members' positions and, where they are needed, the error of each receiver's fixes, the error
-    that all fixes share, the error of the ego's compass, and velocities of members whose messages are late:
+    that all fixes share, errors of the ego's compass and ranges, and velocities of members whose messages are late:
 
     $$
     z_j = x_j + b_j + c + w_j, \qquad
@@ -68,7 +68,7 @@ class CooperativeFilter(Checked):
       were used between two of them follow, so that a lost message loses nothing and no fix counts twice.
 
     Args:
-        noise_model: "identity", "nominal" or a NoiseModel, whose drift and compass errors are estimated along.
+        noise_model: "identity", "nominal" or a NoiseModel, whose errors that last (fixes, compass, ranges) are states.
         robust: False gives the textbook filter, `JointFilter`: all errors white, all members honest. With the identity
             noise model nothing is gated.
         guards: limits of the above; the default was chosen on the validation tasks of CL-Bench.
@@ -175,13 +175,13 @@ def guards_of(method: CooperativeFilter, noise_model: NoiseModel) -> Guards:
 def model_of(noise_model: NoiseModel, robust: bool) -> Model:
     """The noise model of the kernel; of the textbook filter all errors are white."""
     std, least = relative_noise(noise_model)
-    white, own, common, time, bias, heading = np.ones(3), 0.0, 0.0, 1.0, 0.0, 0.0
+    white, own, common, time, bias, heading, offset = np.ones(3), 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
     if robust and noise_model.sensors is not None:
         sensors, std = noise_model.sensors, np.array(std)
-        own, common = sensors.gnss_drift_std**2, sensors.gnss_common_std**2
+        own, common, offset = sensors.gnss_drift_std**2, sensors.gnss_common_std**2, sensors.range_offset_std**2
         white = np.square(sensors.gnss_std) / np.square(sensors.fix_std)
         time = float(sensors.gnss_drift_time)
         heading, bias = (float(value**2) for value in noise_model.compass)
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
     shape = float(least), float(noise_model.exact_relative), FORGOTTEN, ACCELERATION_STD
-    return Model(std, *shape, own, common, time, white, bias, heading, float(robust))
+    return Model(std, *shape, own, common, time, white, bias, heading, offset, float(robust))

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Literal, get_args
 from weakref import WeakValueDictionary
 
@@ -96,7 +96,7 @@ def observe(
         velocity, body = body_measurements(fleet, sensors, runs, seed)
         if sensors.outliers:
             wrong_odometry(velocity, body_motion(fleet)[0], fleet, sensors.outliers, seed, told)
-        relative = in_body(relative, fleet, links, _heading(fleet, links, sensors, runs, seed))
+        relative = in_body(relative, fleet, links, _own_errors(fleet, links, runs, seed, _heading(sensors)))
     wrong = sensors.outliers.notes if sensors.outliers else ()
     notes = tuple(f"{note}{', removed' * told}" for note in wrong)
     return Recording(
@@ -242,7 +242,8 @@ def _relative_measurements(
     vector = fleet.position[links.step, links.neighbour] - fleet.position[links.step, links.observer]
     exact = np.stack(spherical(*vector.T), axis=-1) if len(links) else np.empty((0, 3))
     pairs = [(observer, neighbour, index, links.step[index]) for observer, neighbour, index in _pairs(fleet, links)]
-    relative, turned = np.empty((runs, *exact.shape)), _heading(fleet, links, sensors, runs, seed)
+    relative, turned = np.empty((runs, *exact.shape)), _own_errors(fleet, links, runs, seed, _heading(sensors))
+    longer = _own_errors(fleet, links, runs, seed, {"range_offset": sensors.range_offset_std})
     scratch = np.empty((len(fleet.t), 3))
     for r in range(runs):  # one after the other stays in the cache
         for observer, neighbour, index, step in pairs:
@@ -251,7 +252,7 @@ def _relative_measurements(
             relative[r, index] = draws[step]
         relative[r] *= sensors.relative_std
         relative[r] += exact
-        relative[r, :, 0] = np.abs(relative[r, :, 0])
+        relative[r, :, 0] = np.abs(relative[r, :, 0] + longer[r])
         relative[r, :, 1] = wrap(relative[r, :, 1] + turned[r])
     if sensors.outliers:
         reach = sensors.min_range, v2x.radius
@@ -259,10 +260,15 @@ def _relative_measurements(
     return relative
 
 
-def _heading(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int) -> Floats:
-    """(R, L) rad by which the observer's heading error rotates its measurements."""
+def _heading(sensors: Sensors) -> dict[str, float]:
+    """Standard deviations rad of what the observer's heading rotates its measurements by."""
+    return {"heading": sensors.heading_std, "heading_bias": sensors.heading_bias_std}
+
+
+def _own_errors(fleet: Fleet, links: Links, runs: int, seed: int, stds: Mapping[str, float]) -> Floats:
+    """(R, L) sum of the errors of its observer that are in each measurement; but for "heading" they last."""
     turned = np.zeros((runs, len(links)))
-    for kind, std in (("heading", sensors.heading_std), ("heading_bias", sensors.heading_bias_std)):
+    for kind, std in stds.items():
         for column in np.unique(links.observer) if std > 0 else ():
             mine = links.of(column)
             for r in range(runs):

@@ -51,6 +51,9 @@ class Sensors:
     known."""
     inclination_std: float = float(np.deg2rad(4.0))
     """rad."""
+    range_offset_std: float = 0.0
+    """m, of what all ranges of an observer are too long by for a whole run (delays of radios). The cooperative filter
+    has it as a state; other methods take ranges as calibrated, and a bound knows it."""
     heading_std: float = 0.0
     """rad, noise of the observer's heading, new at every step: it turns all that is seen at the step alike."""
     heading_bias_std: float = 0.0

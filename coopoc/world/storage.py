@@ -77,14 +77,10 @@ def save_recording(recording: Recording, path: str | Path, truth: Fleet | None =
 
 
 def unpacked(path: Path) -> dict[str, AnyArray]:
-    """Arrays of an .npz file by name; what is damaged raises one of `DAMAGES`.
-
-    Raises:
-        InputError: more than `LARGEST` bytes.
-    """
+    """Arrays of an .npz file by name; what is damaged, or larger than `LARGEST`, raises one of `DAMAGES`."""
     with zipfile.ZipFile(path) as packed:
         if sum(part.file_size for part in packed.infolist()) > LARGEST:
-            raise InputError(path.name, "more than 2 GB unpacked", "must be smaller", "Save fewer runs.")
+            raise ValueError("more than 2 GB unpacked (too many runs?)")
         _check_shapes(packed)
     with np.load(path, allow_pickle=False) as stored:
         return dict(stored)
@@ -115,8 +111,6 @@ def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
         arrays = unpacked(path)
         return _recording(json.loads(str(arrays.pop("coopoc_recording"))), arrays)
     except DAMAGES as error:
-        if isinstance(error, InputError) and error.field == path.name:
-            raise
         found = said(error)
     raise InputError(path.name, found, "must be a recording in .npz", "Write it again with save_recording.")
 

@@ -575,6 +575,7 @@ def less_offsets(log: Log) -> Log:
         true, by = c.log.truth.position, "the truth shows"
         residual = _residual(c.world, np.where(np.isfinite(true), true, c.x))[1]
         c = replace(c, relative=residual, variance=0 * c.variance)
+        rec = replace(rec, sensors=replace(rec.sensors, range_offset_std=0.0))
     relative, ends = rec.relative.copy(), np.sort([rec.links.observer, rec.links.neighbour], axis=0)
     found = dict(_offsets(c, 0, rec.sensors.range_std, 0.0))
     for one, other in np.unique(ends, axis=1).T:

@@ -23,6 +23,8 @@ MOTION = ("vx", "vy", "speed")
 Origin = tuple[float, float, float]
 PERIODS = (86400.0, 604800.0)
 """s, of clocks: a day, a GPS week."""
+OFFSET_STD = 1.0
+"""m, assumed of what all ranges of a radio are too long by: a log does not say whether its delays are calibrated."""
 SELDOM = 0.02
 """Share of rows that are earlier than the one before, where a file is else in the order of its stamps."""
 HEADING_STD = 0.05
@@ -136,6 +138,7 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float) -
     noise: dict[str, Any] = {
         "gnss_std": (of("x", default=x, unit="m"), of("y", default=y, unit="m"), up),
         "range_std": of("range", default=base.range_std, unit="m"),
+        "range_offset_std": OFFSET_STD * ("range" in used),
         "azimuth_std": of("azimuth", "bearing", default=base.azimuth_std, unit="rad"),
         "inclination_std": of("inclination", default=PLANE_STD if planar else base.inclination_std, unit="rad"),
         "min_range": 0.0,

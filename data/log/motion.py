@@ -14,7 +14,7 @@ from coopoc.errors import InputError
 from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
 
-from ..assemble import SAME, longest_gap, nearest, smooth, steps_of
+from ..assemble import PER_ROW, SAME, longest_gap, nearest, smooth, steps_of
 from .units import Rows, Summary, in_group, place
 
 MOVING = 1.0
@@ -300,9 +300,9 @@ def velocity_of_fixes(fixes: Signal, gap: float) -> Signal:
     Its errors are those of the fixes: a filter that takes both for independent believes too much.
     """
     t, x = fixes.t, fixes.value
-    step = max(float(np.median(np.diff(t))), SAME)
     velocity = np.zeros_like(x)
     for part in np.split(np.arange(len(t)), np.flatnonzero(np.diff(t) > gap + SAME) + 1):
+        step = float(np.max([np.median(np.diff(t)), SAME, np.ptp(t[part]) / (PER_ROW * len(t))]))
         grid = np.arange(t[part[0]], t[part[-1]] + step / 2, step)
         if len(grid) > 1:
             even = np.column_stack([np.interp(grid, t[part], column) for column in x[part].T])

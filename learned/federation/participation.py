@@ -1,20 +1,16 @@
-"""Participation: the clients that a round asks; heterogeneous, poisoned and Byzantine clients."""
+"""Participation: the clients that a round asks; poisoned and Byzantine clients."""
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import Any
 
 from torch import Tensor
 
-from coopoc.errors import InputError
 from coopoc.methods.track import check_options
-from coopoc.world.fleet import Fleet
-from coopoc.world.sensors import Sensors, stream
+from coopoc.world.sensors import stream
 
-from ..training.clients import Client, Segments, clients
+from ..training.clients import Client, Segments
 from .rules import within
 
 
@@ -86,36 +82,3 @@ def poisoned(client: Client, offset: float) -> Client:
         return replace(pieces, truth=pieces.truth + offset)
 
     return replace(client, training=part(client.training), validation=part(client.validation), long=part(client.long))
-
-
-def heterogeneous(
-    fleet: Fleet, sensors: Sequence[Sensors], shares: Sequence[float], **options: Any
-) -> tuple[Client, ...]:
-    """`clients` of a fleet, each with its own sensors and with a part of its training pieces.
-
-    The noise of a vehicle is keyed by its name: it is the same as with these sensors for all.
-
-    Args:
-        fleet: drives of C vehicles.
-        sensors: (C,) acting sensors.
-        shares: (C,) in (0, 1], of the training pieces: the first ceil(share n) of them remain.
-        options: of `clients` (seed, noise, start, piece, split).
-
-    Raises:
-        InputError: another number of sensors or shares than of vehicles, a share outside (0, 1], and as in `clients`.
-
-    >>> import numpy as np
-    >>> line = Fleet(("a", "b"), np.arange(66) / 10, np.zeros((66, 2, 3)), np.zeros((66, 2, 3)))
-    >>> [len(c.training) for c in heterogeneous(line, [Sensors(), Sensors()], [1, 0.5], piece=10)]
-    [4, 2]
-    """
-    for field, given in (("sensors", sensors), ("shares", shares)):
-        if len(given) != len(fleet.ids):
-            raise InputError(field, f"of {len(given)} clients", f"must be of {len(fleet.ids)}", "Give one per vehicle.")
-    within("shares", list(shares), all(0 < share <= 1 for share in shares), "in (0, 1]", "1 keeps all training pieces.")
-    made = {one: clients(fleet, one, **options) for one in dict.fromkeys(sensors)}
-    whole = [made[one][column] for column, one in enumerate(sensors)]
-    return tuple(
-        replace(client, training=client.training.take(range(math.ceil(share * len(client.training)))))
-        for client, share in zip(whole, shares, strict=True)
-    )

@@ -97,13 +97,15 @@ class Sent(NamedTuple):
 
 
 class Life(NamedTuple):
-    """Parameters of lasting errors: own and common m^2, their correlation of a step, compass bias and noise rad^2."""
+    """Parameters of lasting errors: own and common m^2, their correlation of a step, compass bias and noise rad^2,
+    offset of ranges m^2."""
 
     own: float
     common: float
     keep: float
     bias: float
     heading: float
+    offset: float
 
 
 class Oracle:
@@ -114,7 +116,7 @@ class Oracle:
     ) -> None:
         s, self.alone = known.sensors, alone
         self.seen, self.ego, self.run, self.known, self.guards, self.robust = seen, ego, run, known, guards, robust
-        self.life, self.white = Life(0, 0, 1, 0, 0), np.ones(3)
+        self.life, self.white = Life(0, 0, 1, 0, 0, 0), np.ones(3)
         self.std: Floats = np.ones(3)
         if s is not None:
             self.std = s.relative_std.copy()
@@ -122,7 +124,7 @@ class Oracle:
         if robust and s is not None:
             heading, bias = (float(v**2) for v in known.compass)
             keep = math.exp(-seen.dt / s.gnss_drift_time)
-            self.life = Life(s.gnss_drift_std**2, s.gnss_common_std**2, keep, bias, heading)
+            self.life = Life(s.gnss_drift_std**2, s.gnss_common_std**2, keep, bias, heading, s.range_offset_std**2)
             self.std[1] = math.sqrt(self.std[1] ** 2 - heading - bias)
             self.white = np.square(s.gnss_std) / np.square(s.fix_std)
         shape = seen.gnss.shape
@@ -205,8 +207,8 @@ class Oracle:
             b.add(("x", self.ego), 0.0, 0.0)
             if life.common:
                 b.add(("common",), 0, life.common)
-            if life.bias + life.heading:
-                b.add(("compass",), 0, [life.bias, 0, 0])
+            if life.bias + life.heading + life.offset:
+                b.add(("compass",), 0, [life.bias, 0, life.offset])
             s["slot"][self.ego] = 0
             s["trusted"].add(self.ego)
             again = self.start(t, fix, messages, relative)
@@ -246,9 +248,12 @@ class Oracle:
         alarm = np.isfinite(fix).all() and self.add_fix(t, fix)
         order = sorted(s["members"], key=lambda j: float(np.linalg.norm(at[j] - at[self.ego])))
         if self.robust:
-            self.measure(at, order, relative)
+            at = self.measure(at, order, relative)
         for j in order:
+            vague = j in s["vague"]
             alarm |= self.receive(t, j, messages[j])
+            if self.robust and vague and j not in s["vague"]:
+                self.relate(j, at, relative[j], self.known.exact_relative, s["belief"])
         if not self.robust:
             self.measure(at, order, relative)
         if g.trust:
@@ -471,12 +476,12 @@ class Oracle:
         elif self.life.own:
             b.add(("b", j), 0.0, self.life.own)
 
-    def measure(self, at: dict[int, Floats], order: list[int], relative: dict[int, Floats]) -> None:
-        """At the prediction, forgotten but for the solution; then at that solution."""
+    def measure(self, at: dict[int, Floats], order: list[int], relative: dict[int, Floats]) -> dict[int, Floats]:
+        """At the prediction, forgotten but for the solution, which is returned; then at that solution."""
         s = self.state
         b = s["belief"]
         if not order:
-            return
+            return at
         if ("compass",) in b.names:
             i = b.at(("compass",)).start + 1
             b.x[i], b.p[i], b.p[:, i] = 0.0, 0.0, 0.0
@@ -489,6 +494,7 @@ class Oracle:
                 at, _ = self.geometry(self.first, order, relative)
         for j in order:
             self.relate(j, at, relative[j], exact, b)
+        return at
 
     def geometry(
         self, at: dict[int, Floats], order: list[int], relative: dict[int, Floats]
@@ -533,8 +539,8 @@ class Oracle:
         wrong = False
         for c in range(3):
             terms: dict[Name, Any] = {("x", j): rows[c], ("x", self.ego): -rows[c]}
-            if c == 1 and ("compass",) in b.names:
-                terms[("compass",)] = np.array([turn, turn, 0.0])
+            if c < 2 and ("compass",) in b.names:
+                terms[("compass",)] = np.array([[0, 0, 1], [turn, turn, 0]][c])
             if there[c]:
                 q = b.update(b.row(terms, c), z[c], r[c], 0.0 if vague else g.gate)
                 if not vague:

@@ -205,7 +205,8 @@ def fuse_pair(
         set_member(pair, 0, poses, observer, d, weight)
         if other >= 0:
             set_member(pair, d, poses, other, d, max(1.0 - weight, LEAST) if tries > 0 else 1.0)
-        pair.linear[:] = pair.x
+        for i in range(2 * d):
+            pair.linear[i] = pair.x[i]
         add_relative(measured, noise, pair, ends, run, k, ZERO)
         settle(pair)
         total = 0.0

@@ -209,7 +209,11 @@ def step(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, veh
     if model.estimates > 0.0 and members > 0:
         measure(f, model, guards, rows, members)
     for i in range(members):
-        receive(f, model, guards, rows, f.order[i])
+        k = f.order[i]
+        vague = f.vague[k]
+        receive(f, model, guards, rows, k)
+        if model.estimates > 0.0 and f.vague[k] < vague:  # what is measured of it in part had to wait for a place
+            weigh(f, model, guards, rows, k)
     if model.estimates == 0.0 and members > 0:
         measure(f, model, guards, rows, members)
     if guards.trust > 0.0:
@@ -272,7 +276,7 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
 
     Where they contradict the prediction of most members, it is the ego whose odometer has slipped.
     """
-    g, h = f.g, f.h
+    g = f.g
     if has(g, 0, COMPASS):  # the compass's noise is new at every step
         i = 3 * g.block[0, COMPASS] + 1
         for j in range(3 * g.vectors[0]):
@@ -289,18 +293,25 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
                 for c in range(3):
                     f.at[k, c] = f.trial.x[3 * g.block[k, PLACE] + c]
     for m in range(members):
-        k = f.order[m]
-        if relate(f, model, guards, rows, k, 1 if model.exact > 0.0 else 0):
-            if f.vague[k] > 0.0:
-                settle(g, h, k, f.vague[k])
-                f.vague[k] = f.q[k, 0] = f.q[k, 1] = f.q[k, 2] = 0.0
-                continue
-            innovate(g, h)
-            correct(g, h, 1.0)
-            for c in range(3):
-                if h.used[c]:
-                    f.q[k, c] = h.q[c]
-                    f.hits[k, c] = f.hits[k, c] + 1 if 0.0 < guards.gate < h.q[c] else 0
+        weigh(f, model, guards, rows, f.order[m])
+
+
+@inside
+def weigh(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None:
+    """Update by what is measured of member k, linear at `at`."""
+    g, h = f.g, f.h
+    if not relate(f, model, guards, rows, k, 1 if model.exact > 0.0 else 0):
+        return
+    if f.vague[k] > 0.0:
+        settle(g, h, k, f.vague[k])
+        f.vague[k] = f.q[k, 0] = f.q[k, 1] = f.q[k, 2] = 0.0
+        return
+    innovate(g, h)
+    correct(g, h, 1.0)
+    for c in range(3):
+        if h.used[c]:
+            f.q[k, c] = h.q[c]
+            f.hits[k, c] = f.hits[k, c] + 1 if 0.0 < guards.gate < h.q[c] else 0
 
 
 @inside
@@ -379,7 +390,7 @@ def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int, exact:
     store(h.variance, 0, (a * a, b * b, c * c))
     store(h.weight, 0, w)
     store(h.weight, 1, negate(w))
-    store(h.weight, 2, (0.0, 0.0, 0.0, turn, turn, 0.0, 0.0, 0.0, 0.0))
+    store(h.weight, 2, (0.0, 0.0, 1.0, turn, turn, 0.0, 0.0, 0.0, 0.0))
     for c in range(3):
         h.gate[c] = guards.gate
     h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]

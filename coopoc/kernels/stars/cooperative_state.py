@@ -121,6 +121,7 @@ class Model(NamedTuple):
         white: (3,) share of the variance of a fix, as solo filters assume it, that is white.
         bias: rad^2 of the compass.
         heading: rad^2 of the compass's noise.
+        offset: m^2, of what all the ego's ranges are too long by.
         estimates: 1 if messages hold a solo filter's estimate, 0 if they hold a fix.
     """
 
@@ -135,6 +136,7 @@ class Model(NamedTuple):
     white: Floats
     bias: float
     heading: float
+    offset: float
     estimates: float
 
 
@@ -243,9 +245,9 @@ def begin(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
     insert(f.g, 0, PLACE, 0.0)
     if model.common > 0.0:
         insert(f.g, 0, COMMON, model.common)
-    if model.bias + model.heading > 0.0:
+    if model.bias + model.heading + model.offset > 0.0:
         first = insert(f.g, 0, COMPASS, model.bias)
-        f.g.p[first + 2, first + 2] = 0.0
+        f.g.p[first + 2, first + 2] = model.offset
     start(f, model, guards, own, rows, count)
 
 

@@ -33,8 +33,8 @@ PLACE, ERROR, VELOCITY, CLONE, FRESH = range(5)
 """Kinds of a neighbour's vectors: position m, error of its fixes m, velocity m/s, where it was when it sent its last
 message that was used m, and scratch of `settle`."""
 COMMON, COMPASS = 2, 3
-"""Of the ego in place of velocity and clone: the error m that all fixes share, and (bias, noise of this step, 0) of its
-compass, rad."""
+"""Of the ego in place of velocity and clone: the error m that all fixes share, and (bias, noise of this step) of its
+compass, rad, with the offset m of its ranges."""
 KINDS, TERMS = 5, 5
 ABSENT = -1
 REJECTED = 4.0
