@@ -115,7 +115,7 @@ def _findings(results: Results) -> dict[str, str]:
     texts, each = {}, choices(results)
     for limit in LIMITS:
         best = best_under(each, limit)
-        if best is not None:
+        if best:
             where, k = best.where, best.where["max_neighbours"]
             first = "" if where["schedule"] == SCHEDULES[0] else f", {where['schedule']}"
             at = f", K = {k}{first}, {best.size:.0f} B/s" if k else ""
