@@ -332,6 +332,9 @@ def test_cooperation_that_changes_nothing_is_said_below_the_table() -> None:
         f"{text}no message arrived.",
     ]
     assert STUDY.answers(results)["K = 0"].startswith("K = 0: there is no neighbour")
+    worse = replace(results, frame=results.frame.rename(columns={"sent_bytes_per_second": "sent_bytes"}), settings={})
+    worse.frame.loc[worse.frame["method"] == "joint", "rt_le_m"] += worse.frame["max_neighbours"]
+    assert "Joint filter, K = 2: worse than alone" in " ".join(unused(worse))
 
 
 def test_calls_that_raised_what_is_no_error_of_ours(tmp_path: Path) -> None:
