@@ -5,29 +5,13 @@ from __future__ import annotations
 import re
 import unicodedata
 
-_LATEX = {
-    "\\": r"\textbackslash{}",
-    "&": r"\&",
-    "%": r"\%",
-    "$": r"\$",
-    "#": r"\#",
-    "_": r"\_",
-    "{": r"\{",
-    "}": r"\}",
-    "~": r"\textasciitilde{}",
-    "^": r"\textasciicircum{}",
-    "±": r"$\pm$",
-    "–": "--",
-    "≤": r"$\le$",
-    "≥": r"$\ge$",
-    "×": r"$\times$",
-    "σ": r"$\sigma$",
-    "°": r"$^\circ$",
-    "²": r"$^2$",
-    "<": r"\textless{}",
-    ">": r"\textgreater{}",
-    "|": r"\textbar{}",
-}
+_SPECIAL = "\\&%$#_{}~^±–≤≥×σ°²<>|"
+_COMMANDS = (
+    r"\textbackslash{} \& \% \$ \# \_ \{ \} \textasciitilde{} \textasciicircum{} $\pm$ "
+    r"-- $\le$ $\ge$ $\times$ $\sigma$ $^\circ$ $^2$ \textless{} \textgreater{} \textbar{}"
+)
+_LATEX = dict(zip(_SPECIAL, _COMMANDS.split(), strict=True))
+"""Letter -> what LaTeX shows as it."""
 
 
 def uncontrolled(text: str) -> str:

@@ -25,6 +25,7 @@ def main() -> None:
         status = ended.code
     except KeyboardInterrupt:
         pass
+    threading._shutdown()  # type: ignore[attr-defined]  # as Python does first: what waits in threads tells workers to end
     atexit._run_exitfuncs()
     with suppress(OSError):
         sys.stdout.flush()

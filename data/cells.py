@@ -29,12 +29,12 @@ WHOLE = re.compile(r"^(\d+)\.0$")
 COLUMNS = 5000
 """Most columns of a table."""
 USUAL = {
-    "vehicle": ("observer", "robot", "car", "agent", "sender", "vehicle_id", "robot_id", "id", "name"),
-    "partner": ("neighbour", "neighbor", "to", "target", "subject", "other", "anchor", "receiver", "landmark"),
-    "t": ("time", "timestamp", "stamp", "seconds", "datetime", "utc"),
-    "latitude": ("lat",),
-    "longitude": ("lon", "lng", "long"),
-    "height": ("alt", "altitude"),
+    "vehicle": "observer robot car agent sender vehicle_id robot_id id name",
+    "partner": "neighbour neighbor to target subject other anchor receiver landmark",
+    "t": "time timestamp stamp seconds datetime utc",
+    "latitude": "lat",
+    "longitude": "lon lng long",
+    "height": "alt altitude",
 }
 """Headers that others give to the columns."""
 
@@ -196,7 +196,7 @@ def named_columns(
 def missing_column(file: str, column: str, given: Sequence[str], allowed: str, key: str = "") -> InputError:
     """The error of a table without a column; `key` is our name of it, and the hint a header that may be meant."""
     key = key or column
-    usual = [header for header in given if header.lower() in USUAL.get(key, ())]
+    usual = [header for header in given if header.lower() in USUAL.get(key, "").split()]
     header = usual[0] if usual else "..."
     hint = f'Add it, or pass columns={{"{key}": "{header}"}}; with a command, FILE?columns={key}:{header}.'
     if usual:

@@ -8,9 +8,7 @@ from pathlib import Path
 
 import tyro
 
-from coopoc.errors import InputError, unknown
-from coopoc.one_file import in_file
-from coopoc.plugins import names
+from coopoc.errors import InputError
 
 from .fleet_cards import in_words
 from .registry import DATASETS, LOGS, card, convert, kind_of, list_datasets, load_fleet, load_log
@@ -38,8 +36,6 @@ def show(name: tyro.conf.Positional[str]) -> None:
     if name in DATASETS:
         _print(name, in_words(card(name)))
         return
-    if not Path(split(name)[0]).exists() and not in_file(name) and name not in names("coopoc.datasets"):
-        raise unknown("fleet", name, DATASETS, "Or give the path of a file.")
     if kind_of(name) in LOGS:
         log = load_log(name)
         print(log.summary)

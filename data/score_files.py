@@ -39,8 +39,6 @@ def read_paths(name: str) -> dict[str, Path]:
     """
     word, options = split(name)
     file = File(word)
-    if not file.is_file():
-        raise InputError("file", str(file), "must be a file", "Check the path.")
     if file.suffix.lower() in TABLES:
         return _of_table(file, options.get("columns", {}))
     if len(next(read_words(file), (0, []))[1]) == 12:

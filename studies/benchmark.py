@@ -164,7 +164,7 @@ def measured(name: str, data: Path) -> list[dict[str, Any]]:
 def _row(task: str, made: Callable[[], dict[str, Any]]) -> dict[str, Any]:
     try:
         return made()
-    except Exception as error:  # a failure is a row
+    except (Exception, SystemExit) as error:  # a failure is a row
         print(f"coopoc: failed: {task}", *traceback.format_exc().splitlines()[-5:], sep="\n  ", file=sys.stderr)
         return {"task": task, "failed": f"{type(error).__name__}: {said(error)}"}
 

@@ -32,6 +32,7 @@ from coopoc.world.v2x import V2X
 from . import pose_drives as drives
 from .pose_drives import Drive, thinned
 from .scene import CODE
+from .views import unused
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
@@ -266,7 +267,8 @@ def _table(results: Results, value: str, text: str, **options: Any) -> Table | N
         return None
     numbers = across(partial(interval, value=value), _columns(results))
     texts = f"{text} {BYTES.format(driven(results.settings))}"
-    return crossed(results, HEAD, _rows(results), {"Sent [B]": _sent, **numbers}, _caption(results, texts), **options)
+    columns = {"Sent [B]": _sent, **numbers}
+    return crossed(results, HEAD, _rows(results), columns, _caption(results, texts), notes=unused(results), **options)
 
 
 HEAD = ("K", "Method")

@@ -65,27 +65,38 @@ def table(
     return view
 
 
-ALIKE = 1e-3
-"""m, difference of errors that is none."""
+ALIKE, WORSE = 1e-3, 1.1
+"""m, difference of errors that is none; ratio of the mean error with neighbours to that of a vehicle alone."""
 
 
 def unused(results: Results) -> tuple[str, ...]:
-    """A sentence for each method and K whose errors are those of a vehicle alone, in every run and for every ego."""
+    """A sentence for each method and K whose errors are those of a vehicle alone, in every run and for every ego, or on
+    real data larger."""
     rows, texts, by = results.frame, list[str](), ["method", "max_neighbours"]
     value = "rt_le_m" if "rt_le_m" in rows else "innovation_m"
-    if not {*by, "sent_bytes_per_second", value} <= set(rows):
+    if not {*by, "bytes_per_second", value} <= set(rows):
         return ()
+    real = "sent_bytes" in rows or scene.is_real(str(results.settings["data"]))
+    sent = rows.get("sent_bytes", rows.get("sent_bytes_per_second"))
     keys = [name for name in (*results.axes, "ego", "run", "train_seed") if name in rows and name not in by]
-    for (method, k), part in rows[rows["sent_bytes_per_second"] > 0].groupby(by, sort=False):
+    for (method, k), part in rows[sent > 0].groupby(by, sort=False):
         own = (rows["method"] == method) & (rows["max_neighbours"] == 0)
         both = part.merge(rows[own | (rows["method"] == "kalman") & (rows["max_neighbours"] == k)], on=keys)
-        gap = (both[f"{value}_x"] - both[f"{value}_y"]).abs().groupby([both[key] for key in keys], dropna=False).min()
+        together, alone = (both[f"{value}_{side}"] for side in "xy")
+        gap = (together - alone).abs().groupby([both[key] for key in keys], dropna=False).min()
+        text = f"{look(str(method)).label}, K = {k}:"
         if k and len(gap) == len(part) and gap.max() < ALIKE:
             why = "what was measured lacks what it takes, such as an azimuth"
             if not part["bytes_per_second"].any():
                 why = "no message arrived"
-            text = f"{look(str(method)).label}, K = {k}: equal to solo within {ALIKE:g} m: no neighbour's measurement "
-            texts.append(f"{text}was used, because {why}.")
+            texts.append(
+                f"{text} equal to solo within {ALIKE:g} m: no neighbour's measurement was used, because {why}."
+            )
+        elif k and real and together.mean() > WORSE * alone.mean():
+            texts.append(
+                f"{text} worse than alone, {together.mean():.3g} m for {alone.mean():.3g} m: what was measured of "
+                "neighbours, or its stated noise, is wrong. coopoc data check says what looks so."
+            )
     return tuple(texts)
 
 

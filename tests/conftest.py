@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from coopoc import Fleet, load_fleet
+from coopoc.arrays import Floats
 from coopoc.data.fleet_files import write_table
 from coopoc.errors import InputError
 from coopoc.study.study import Study
@@ -51,6 +52,12 @@ def winding(steps: int = 60, speed: float = 8.0, period: float = 3.0, vehicles: 
     return Fleet(tuple("abcdef"[:vehicles]), t, np.cumsum(0.1 * velocity, axis=0), velocity)
 
 
+def moving(letter: str, t: Floats, position: Floats) -> Fleet:
+    """With backward differences as velocity; the first step has that of the second."""
+    velocity = np.diff(position, axis=0, prepend=2 * position[:1] - position[1:2]) / 0.1
+    return Fleet(tuple(f"{letter}{i}" for i in range(position.shape[1])), t, position, velocity)
+
+
 def formation_fleet(vehicles: int = 11, steps: int = 901, ring: float = 22.0) -> Fleet:
     """Rigid formation within 30 m on a gently sinuous path at 10 m/s: ten on a ring (docs/decisions.md)."""
     t = np.arange(steps) * 0.1
@@ -60,8 +67,7 @@ def formation_fleet(vehicles: int = 11, steps: int = 901, ring: float = 22.0) ->
     gap = np.linspace(ring, ring + 0.1, vehicles - 1)
     offset = np.vstack([np.zeros(3), np.stack([gap * np.cos(around), gap * np.sin(around), 0 * gap], axis=1)])
     position = path[:, None] + offset
-    velocity = np.diff(position, axis=0, prepend=2 * position[:1] - position[1:2]) / 0.1
-    return Fleet(tuple(f"v{i}" for i in range(vehicles)), t, position, velocity)
+    return moving("v", t, position)
 
 
 def crossing_fleet(vehicles: int = 8, steps: int = 60, seed: int = 3) -> Fleet:
@@ -72,8 +78,7 @@ def crossing_fleet(vehicles: int = 8, steps: int = 60, seed: int = 3) -> Fleet:
     speed = rng.normal(0, 6, (vehicles, 3)) * [1, 1, 0.05]
     wobble = np.sin(t[:, None, None] + np.arange(vehicles)[:, None])
     position = start + t[:, None, None] * speed + wobble * [1.0, 0.5, 0.1]
-    velocity = np.diff(position, axis=0, prepend=2 * position[:1] - position[1:2]) / 0.1
-    return Fleet(tuple(f"c{i}" for i in range(vehicles)), t, position, velocity)
+    return moving("c", t, position)
 
 
 def coming_and_going(fleet: Fleet) -> Fleet:

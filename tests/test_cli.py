@@ -18,14 +18,14 @@ COMMAND = [sys.executable, "-m", "coopoc.cli"]
 
 
 def coopoc(*words: str, cwd: Path) -> "subprocess.CompletedProcess[str]":
-    return ran([*COMMAND, *words], cwd=cwd, env=ENV, timeout=120)
+    return ran([*COMMAND, *" ".join(words).split()], cwd=cwd, env=ENV, timeout=120)
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """A folder in which the small study has run."""
     out = tmp_path_factory.mktemp("cli")
-    done = coopoc("run", "small", "--set", "runs=3", "--set", "max_neighbours=0,2", cwd=out)
+    done = coopoc("run small --jobs 2 --set runs=3 --set max_neighbours=0,2", cwd=out)
     assert done.returncode == 0, done.stderr
     assert "\n\n| Neighbours K" in done.stdout  # after its caption
     assert "results are in runs/small" in done.stderr
@@ -54,19 +54,19 @@ def test_help_a_list_and_a_mistake_load_nothing_heavy_and_show_what_others_add(t
 
 NAMES = ("run", "merge", "compare", "table", "report", "list", "reference", "greet")
 MISTAKES = (
-    (["run", "smal"], "study = 'smal': must be one of"),
-    (["rn"], "command = 'rn': must be one of"),
-    (["run", "small", "--set", "max_neighbours=-1"], "max_neighbours = -1: must be >= 0. Use 0 for no neighbours."),
-    (["run", "small", "--set", "runs"], "--set = 'runs': must be key=value"),
-    (["run", "small", "--set", "rums=3"], "Did you mean runs?"),
-    (["run", "small", "--jobs", "0"], "jobs = 0: must be >= 1"),
-    (["run", "small", "--shard", "4/3"], "shard = '4/3': must be i/n with 1 <= i <= n"),
-    (["merge", "nowhere", "--out", "runs"], "folder = nowhere: holds no manifest.json"),
-    (["compare", "nowhere", "nowhere"], "folder = nowhere: holds no manifest.json"),
-    (["table", "nowhere"], "folder = nowhere: holds no views yet"),
-    (["report"], "folders = none"),
+    ("run smal", "study = 'smal': must be one of"),
+    ("rn", "command = 'rn': must be one of"),
+    ("run small --set max_neighbours=-1", "max_neighbours = -1: must be >= 0. Use 0 for no neighbours."),
+    ("run small --set runs", "--set = 'runs': must be key=value"),
+    ("run small --set rums=3", "Did you mean runs?"),
+    ("run small --jobs 0", "jobs = 0: must be >= 1"),
+    ("run small --shard 4/3", "shard = '4/3': must be i/n with 1 <= i <= n"),
+    ("merge nowhere --out runs", "folder = nowhere: holds no manifest.json"),
+    ("compare nowhere nowhere", "folder = nowhere: holds no manifest.json"),
+    ("table nowhere", "folder = nowhere: holds no views yet"),
+    ("report", "folders = none"),
 )
-OF_OTHERS = (["greet", "--name", "x"], ["kin", "greet"], ["kin", "--help"], ["kin", "gret"])
+OF_OTHERS = ("greet --name x", "kin greet", "kin --help", "kin gret")
 ONE_BY_ONE = """
 import contextlib, io, json, sys
 from coopoc.cli import main
@@ -84,7 +84,11 @@ for words in json.loads(sys.argv[1]):
 @pytest.fixture(scope="module")
 def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, ...], list[Any]]:
     """Status, stdout and stderr of commands that do nothing, one after the other in one process: most is its start."""
-    lines = [*([name, "--help"] for name in NAMES), *(words for words, _ in MISTAKES), *OF_OTHERS]
+    lines = [
+        *([name, "--help"] for name in NAMES),
+        *(words.split() for words, _ in MISTAKES),
+        *map(str.split, OF_OTHERS),
+    ]
     command = [sys.executable, "-c", ONE_BY_ONE, json.dumps(lines)]
     cwd = tmp_path_factory.mktemp("answers")
     done = ran(command, cwd=cwd, env=ENV, timeout=120)
@@ -101,7 +105,7 @@ def test_each_command_explains_itself_with_an_example(answers: dict[tuple[str, .
 
 
 def test_tables_on_stdout(folder: Path) -> None:
-    assert coopoc("table", "runs/small", "--format", "latex", cwd=folder).stdout.startswith(r"\begin{table}")
+    assert coopoc("table runs/small --format latex", cwd=folder).stdout.startswith(r"\begin{table}")
     done = coopoc(
         "table",
         "runs/small",
@@ -149,10 +153,8 @@ def test_commands_of_others(answers: dict[tuple[str, ...], list[Any]]) -> None:
 
 
 @pytest.mark.parametrize(("words", "message"), MISTAKES)
-def test_bad_usage_is_one_readable_line(
-    answers: dict[tuple[str, ...], list[Any]], words: list[str], message: str
-) -> None:
-    status, out, err = answers[tuple(words)]
+def test_bad_usage_is_one_readable_line(answers: dict[tuple[str, ...], list[Any]], words: str, message: str) -> None:
+    status, out, err = answers[tuple(words.split())]
     assert status == 2
     assert err.startswith("coopoc: ")
     assert message in err
@@ -172,7 +174,7 @@ def test_ctrl_c_while_libraries_load_ends_without_a_traceback(tmp_path: Path) ->
 
 def test_failed_cells_set_the_status(tmp_path: Path) -> None:
     (tmp_path / "trouble").write_text("raise")
-    done = coopoc("run", "small", "--set", "runs=2", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)
+    done = coopoc("run small --set runs=2", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)
     assert done.returncode == 1
     assert "diverged at step 3 (max_neighbours = 1" in done.stderr
     assert 'small_study.py", line 61, in cell\n' in done.stderr
@@ -215,7 +217,7 @@ def _listen() -> None:
 @pytest.mark.slow
 def test_a_worker_that_is_killed_is_one_readable_line(tmp_path: Path) -> None:
     (tmp_path / "trouble").write_text("kill")
-    done = coopoc("run", "small", "--jobs", "2", "--set", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)
+    done = coopoc("run small --jobs 2 --set", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)
     assert done.returncode == 1
     assert "coopoc: A worker process was killed" in done.stderr
     assert "Traceback" not in done.stderr

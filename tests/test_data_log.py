@@ -78,6 +78,7 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path: Path) -> None:
     free = read_log(tmp_path / "car7.csv", columns=names)
     assert free.origin == pytest.approx((lat[0], lon[0], h[0]))
     assert_allclose(free.recording.gnss[0, 0, 0], 0, atol=1e-9)
+    assert read_log(tmp_path / "car7.csv", columns=names, ignore=["height"]).origin == (lat[0], lon[0], 0.0)
 
 
 def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhere(tmp_path: Path) -> None:

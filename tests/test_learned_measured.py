@@ -11,6 +11,7 @@ import torch
 from conftest import refused
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
+from scipy.optimize import approx_fprime
 
 import coopoc as co
 from coopoc import V2X, Fleet, Recording, Sensors, observe
@@ -106,6 +107,13 @@ def test_steps_without_a_truth_have_no_loss(net: Gain) -> None:
     for ours, theirs in zip(net.loss_and_gradient(theta, masked), net.loss_and_gradient(theta, short), strict=True):
         assert bool(ours.isfinite().all())
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
+
+
+def test_the_gradient_of_road_constants_is_scipys() -> None:
+    net, seen = RoadConstants(), batch()
+    at = flatten([net])[0].double()
+    expected = approx_fprime(at, lambda v: net.losses(torch.tensor(v)[None], seen).mean())
+    assert net.loss_and_gradient(at[None], seen)[1][0].numpy() == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_piece_with_little_truth_counts_as_much_as_another() -> None:

@@ -148,6 +148,12 @@ def gaps(fleet: Fleet, absent: bool, runs: int = 3) -> Recording:
     return replace(recording, gnss=gnss)
 
 
+def series(seen: Recording, q: Floats, r: Floats, *at: int) -> tuple[Floats | float, ...]:
+    """Fixes, velocities and variances of one axis of a vehicle, and dt."""
+    run, n, c = at
+    return *(part[run, :, n, c] for part in (seen.gnss, seen.velocity, q)), r[c], seen.dt
+
+
 @pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("noise", ["nominal", "identity"])
 def test_kalman(crossing: Fleet, noise: str, known: bool) -> None:
@@ -157,8 +163,7 @@ def test_kalman(crossing: Fleet, noise: str, known: bool) -> None:
     start = crossing.position[0] if known else None
     x, p, _ = solo_filter(seen, range(len(seen.ids)), model, FixNoise(r), start)
     for run, n, c in np.ndindex(3, 4, 3):
-        series = (seen.gnss[run, :, n, c], seen.velocity[run, :, n, c], q[run, :, n, c], r[c], seen.dt)
-        mean, variance = oracle.kalman(*series, None if start is None else start[n, c])
+        mean, variance = oracle.kalman(*series(seen, q, r, run, n, c), None if start is None else start[n, c])
         assert_allclose(x[run, :, n, c], mean, rtol=1e-12, atol=1e-12)
         assert_allclose(p[run, :, n, c], variance, rtol=1e-10)
 
@@ -170,17 +175,17 @@ def test_adaptive(crossing: Fleet, runs: int) -> None:
     q, r = model.process_variance(seen), model.gnss_variance
     track, std = method(seen, [2, 0]), method.gnss_std(seen, [2, 0])
     for run, (e, n), c in ((a, b, c) for a in range(runs) for b in enumerate([2, 0]) for c in range(3)):
-        series = (seen.gnss[run, :, n, c], seen.velocity[run, :, n, c], q[run, :, n, c], r[c], seen.dt)
-        mean, noise = oracle.adaptive(*series, 5.0, 20.0)
+        mean, noise = oracle.adaptive(*series(seen, q, r, run, n, c), 5.0, 20.0)
         assert_allclose(track.x[run, :, e, c], mean, rtol=1e-11, atol=1e-11)
         assert_allclose(std[run, :, e, c] ** 2, noise, rtol=1e-10)
 
 
 def test_gnss_holds_the_last_fix(crossing: Fleet) -> None:
     seen = gaps(crossing, absent=False)
-    track = GNSS()(seen, [1])
+    track = GNSS()(seen, [1, 3])
+    assert 0 < track.seconds < 60
     for t in range(len(seen.t)):
         newest = max(k for k in range(t + 1) if np.isfinite(seen.gnss[0, k, 1]).all())
         np.testing.assert_array_equal(track.x[0, t, 0], seen.gnss[0, newest, 1])
-    missing = np.isnan(seen.gnss[:, :, 1, 0]).mean()
+    missing = np.isnan(seen.gnss[:, :, [1, 3], 0]).mean()
     assert track.notes == (f"holds the last fix where there is none: {100 * missing:.0f} % of the steps",)

@@ -233,18 +233,18 @@ def test_order_of_the_paper_under_identity_and_the_honest_order(town10: co.Fleet
 @pytest.mark.parametrize(
     ("arguments", "words"),
     [
-        (["run", "neighbors"], "neighbours"),
-        (["run", "neighbours", "--set", "max_neighbours=-1"], "max_neighbours = -1"),
-        (["run", "neighbours", "--set", "method=magic"], "magic"),
-        (["run", "neighbours", "--set", "egos=nobody"], "nobody"),
-        (["run", "neighbours", "--set", "scenario=3"], "scenario = 3"),
-        (["run", "neighbours", "--data", "nowhere.csv"], "nowhere.csv"),
-        (["run", "error_cdf", "--set", "velocity_reading=both"], "velocity_reading"),
-        (["data", "show", "town11"], "town10"),
+        ("run neighbors", "neighbours"),
+        ("run neighbours --set max_neighbours=-1", "max_neighbours = -1"),
+        ("run neighbours --set method=magic", "magic"),
+        ("run neighbours --set egos=nobody", "nobody"),
+        ("run neighbours --set scenario=3", "scenario = 3"),
+        ("run neighbours --data nowhere.csv", "nowhere.csv"),
+        ("run error_cdf --set velocity_reading=both", "velocity_reading"),
+        ("data show town11", "town10"),
     ],
 )
-def test_mistakes_end_with_a_sentence_and_status_2(arguments: list[str], words: str, tmp_path: Path) -> None:
-    command = [str(Path(sys.executable).with_name("coopoc")), *arguments]
+def test_mistakes_end_with_a_sentence_and_status_2(arguments: str, words: str, tmp_path: Path) -> None:
+    command = [str(Path(sys.executable).with_name("coopoc")), *arguments.split()]
     done = ran(command, cwd=tmp_path)
     assert done.returncode == 2, done.stderr
     assert words in done.stderr

@@ -21,19 +21,19 @@ def results(frame: pd.DataFrame, axes: tuple[str, ...] = ("method", "noise_model
 
 
 @pytest.fixture
-def rows() -> list[dict[str, Any]]:
+def frame() -> pd.DataFrame:
     rng = np.random.default_rng(0)
-    return [
+    rows = [
         {"method": m, "noise_model": kn, "k": k, "ego": ego, "run": run, "rt_le_m": rng.gamma(4.0)}
         for m, kn in (("gnss", "identity"), ("kalman", "identity"), ("kalman", "fitted"), ("bound", "nominal"))
         for k in (0, 4)
         for ego in ("b", "a")
         for run in range(6)
     ]
+    return pd.DataFrame(rows)
 
 
-def test_means_are_those_of_pandas(rows: list[dict[str, Any]]) -> None:
-    frame = pd.DataFrame(rows)
+def test_means_are_those_of_pandas(frame: pd.DataFrame) -> None:
     by = ["method", "noise_model", "k"]
     summary = results(frame).summary(by, "rt_le_m").set_index(by)["mean"]
     expected = frame.groupby(by)["rt_le_m"].mean()
@@ -42,8 +42,7 @@ def test_means_are_those_of_pandas(rows: list[dict[str, Any]]) -> None:
     assert list(dict.fromkeys(summary.index.get_level_values("method"))) == ["gnss", "kalman", "bound"]
 
 
-def test_values_are_paired_by_ego_and_run_whatever_the_order_of_rows(rows: list[dict[str, Any]]) -> None:
-    frame = pd.DataFrame(rows)
+def test_values_are_paired_by_ego_and_run_whatever_the_order_of_rows(frame: pd.DataFrame) -> None:
     where = {"noise_model": "identity", "k": 0}
     straight = results(frame).values("rt_le_m", where, method="gnss")
     mixed = results(frame.sample(frac=1.0, random_state=1)).values("rt_le_m", where, method="gnss")
@@ -53,16 +52,16 @@ def test_values_are_paired_by_ego_and_run_whatever_the_order_of_rows(rows: list[
     np.testing.assert_array_equal(straight[0], first)
 
 
-def test_training_seeds_are_averaged_before_the_interval(rows: list[dict[str, Any]]) -> None:
-    one = pd.DataFrame(rows).query("method == 'gnss'")
+def test_training_seeds_are_averaged_before_the_interval(frame: pd.DataFrame) -> None:
+    one = frame.query("method == 'gnss'")
     many = pd.concat([one.assign(train_seed=s, rt_le_m=one["rt_le_m"] + s) for s in (0, 1, 2)])
     found = results(many, ("method", "noise_model", "k", "train_seed")).interval("rt_le_m", k=0)
     assert found.mean == pytest.approx(one.query("k == 0")["rt_le_m"].mean() + 1)
     assert found.n == 12
 
 
-def test_what_would_be_mixed_is_named(rows: list[dict[str, Any]]) -> None:
-    found = results(pd.DataFrame(rows))
+def test_what_would_be_mixed_is_named(frame: pd.DataFrame) -> None:
+    found = results(frame)
     with refused("noise_model = identity, fitted: would be averaged together"):
         found.interval("rt_le_m", method="kalman", k=0)
     with refused(r"k = 0, 4: would be averaged together\. Name k in where, rows or columns"):
@@ -81,8 +80,7 @@ def test_classes_of_one_name_are_told_apart_by_their_files() -> None:
     assert [look(name).label for name in names] == ["Mine (a.py:A)", "Mine (b.py:A)", "KF (c.py:B)", "Other"]
 
 
-def test_an_ego_without_all_its_runs_is_left_out_and_said_so(rows: list[dict[str, Any]]) -> None:
-    frame = pd.DataFrame(rows)
+def test_an_ego_without_all_its_runs_is_left_out_and_said_so(frame: pd.DataFrame) -> None:
     gone = frame.drop(frame.query("method == 'gnss' and k == 0 and ego == 'b' and run == 3").index)
     summary = results(gone).summary(["method", "noise_model", "k"], "rt_le_m")
     assert summary.query("method == 'gnss' and k == 0")[["n", "missing"]].to_numpy().tolist() == [[6, 1]]
@@ -90,9 +88,9 @@ def test_an_ego_without_all_its_runs_is_left_out_and_said_so(rows: list[dict[str
     assert "1 egos are left out" in table.notes[0]
 
 
-def test_a_seed_that_diverged_is_not_averaged_away(rows: list[dict[str, Any]]) -> None:
+def test_a_seed_that_diverged_is_not_averaged_away(frame: pd.DataFrame) -> None:
     """The mean over the other seeds would look like a mean over all."""
-    one = pd.DataFrame(rows).query("method == 'gnss' and k == 0")
+    one = frame.query("method == 'gnss' and k == 0")
     many = pd.concat([one.assign(train_seed=s) for s in (0, 1)], ignore_index=True)
     for which, counts in (("1 and ego == 'b' and run == 2", [6, 1]), ("0 and ego == 'a' and run == 1", [0, 2])):
         many.loc[many.query(f"train_seed == {which}").index, "rt_le_m"] = np.nan
@@ -100,8 +98,8 @@ def test_a_seed_that_diverged_is_not_averaged_away(rows: list[dict[str, Any]]) -
         assert summary[["n", "missing"]].to_numpy().tolist() == [counts]
 
 
-def test_a_metric_that_a_method_does_not_have_is_no_failure(rows: list[dict[str, Any]]) -> None:
-    frame = pd.DataFrame(rows).query("noise_model == 'identity'").copy()
+def test_a_metric_that_a_method_does_not_have_is_no_failure(frame: pd.DataFrame) -> None:
+    frame = frame.query("noise_model == 'identity'").copy()
     frame["nees"] = np.where(frame["method"] == "gnss", np.nan, 3.0)
     table = pivot(results(frame), "k", "method", "nees")
     assert table.rows[0][1] is None
@@ -110,23 +108,23 @@ def test_a_metric_that_a_method_does_not_have_is_no_failure(rows: list[dict[str,
         results(frame).interval("nees", method="gnss", k=0)
 
 
-def test_selection_from_text(rows: list[dict[str, Any]]) -> None:
-    found = results(pd.DataFrame(rows))
+def test_selection_from_text(frame: pd.DataFrame) -> None:
+    found = results(frame)
     assert parsed([found.frame], ["k=0,4", "method=gnss"]) == {"k": (0, 4), "method": ("gnss",)}
     with refused("k = 'x': must be a whole number"):
         parsed([found.frame], ["k=x"])
 
 
-def test_parquet_holds_every_digit(rows: list[dict[str, Any]], tmp_path: Any) -> None:
-    frame = pd.DataFrame(rows).assign(quantiles=[[0.1, 0.2]] * len(rows))
+def test_parquet_holds_every_digit(frame: pd.DataFrame, tmp_path: Any) -> None:
+    frame = frame.assign(quantiles=[[0.1, 0.2]] * len(frame))
     results(frame).to_parquet(tmp_path / "r.parquet")
     back = pd.read_parquet(tmp_path / "r.parquet")
     np.testing.assert_array_equal(back["rt_le_m"], frame["rt_le_m"])
     assert back["quantiles"].iloc[0].tolist() == [0.1, 0.2]
 
 
-def test_tables_over_several_columns(rows: list[dict[str, Any]]) -> None:
-    frame = pd.DataFrame(rows).query("method == 'kalman'")
+def test_tables_over_several_columns(frame: pd.DataFrame) -> None:
+    frame = frame.query("method == 'kalman'")
     table = pivot(results(frame), "k", ["method", "noise_model"], "rt_le_m", along="column")
     assert table.header == ("K", "KF, identity", "KF, fitted")
     assert table.along == "column"

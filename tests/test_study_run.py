@@ -50,7 +50,7 @@ def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_
 
 def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study: Study, tmp_path: Path) -> None:
     trouble = tmp_path / "trouble"
-    trouble.write_text("raise")
+    trouble.write_text("exit")
     changes = {"trouble": str(trouble), "max_neighbours": 1, "method": "kalman"}
     results = run_study(study, tmp_path, settings=changes, progress=False)
     assert results.frame.empty

@@ -256,7 +256,7 @@ def wandering(count: int = 200) -> Track:
 
 def test_signs_of_another_unit_or_clock_are_said() -> None:
     """Stamps in ms, stamps 3 ms apart at 10 Hz, centimetres, feet, a monocular scale; and nothing where all is well."""
-    truth = wandering()
+    truth, one = wandering(), wandering(1)
     noise = np.random.default_rng(3).normal(0, 0.1, (200, 3))
     good = Track(truth.t, truth.position + noise, truth.rotation)
     (row,) = scores({"a": good}, {"a": truth})
@@ -266,15 +266,35 @@ def test_signs_of_another_unit_or_clock_are_said() -> None:
     assert row.rpe_m is None
     assert "1 of 200 stamps meet" in row.remarks[0]
     assert row.remarks[0].endswith("the estimate looks like ms.")
-    assert remarks((truth.t, 1000 * truth.t), (np.zeros((1, 3)),) * 2, 0.01)[0].endswith("the truth looks like ms.")
+    assert remarks(truth.t, Track(1000 * truth.t, truth.position), (one,) * 3, 0.01)[0].endswith(
+        "the truth looks like ms."
+    )
     assert row.remarks[1] == "no relative error: the drive is shorter than 1 steps."
-    for factor, word in ((100, "divided by 100"), (0.5, "divided by 0.5")):
-        (row,) = scores({"a": Track(truth.t, factor * good.position, good.rotation)}, {"a": truth}, aligned="each")
-        assert word in row.remarks[0]
     dense = Track(np.arange(0, 20, 0.001), np.repeat(truth.position, 100, axis=0))
     (row,) = scores({"a": dense}, {"a": truth})
     assert row.missed == 19800
     assert row.remarks == ()
+
+
+def test_what_explains_an_error_far_better_is_said() -> None:
+    """A clock, leap seconds, quaternions of w first, axes mirrored or swapped, which an alignment hides where all is
+    flat, another frame; nothing where errors are what they are."""
+    made, turn = wandering(600), Rotation.from_euler("z", np.arange(600)[:, None] / 50)
+    first = Rotation.from_quat(np.roll(turn.as_quat(), 1, axis=1)).as_matrix()
+    truth, x, flat = Track(made.t, made.position, turn.as_matrix()), made.position, made.position * [1, 1, 0]
+    axes = "with an axis mirrored, or two swapped, its aligned"
+    for text, late, position, rotation, aligned in (
+        (None, 0.0, x + np.sin(x), turn.as_matrix(), "none"),
+        ("with -0.402 s on its stamps (offset), its", 0.4, x, None, "none"),
+        ("with +18 s on its stamps (offset), its", -18.0, x, None, "none"),
+        ("read with w first, its rotation", 0.0, x, first, "each"),
+        (axes, 0.0, flat * [1, -1, 1], None, "each"),
+        (axes, 0.0, x[:, [1, 0, 2]], None, "none"),
+        ("times 0.01, its aligned", 0.0, 100 * x, None, "each"),
+        ("aligned by itself (align), its", 0.0, x @ turn[60].as_matrix(), None, "none"),
+    ):
+        (row,) = scores({"a": Track(truth.t + late, position, rotation)}, {"a": truth}, aligned=aligned)  # type: ignore[arg-type]
+        assert [remark.partition(" error falls")[0] for remark in row.remarks] == [text] * (text is not None), text
 
 
 def test_a_clock_of_its_own_is_mended_by_an_offset(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -294,7 +294,7 @@ BAD = (header((3, 80, 2, 99)), header((10**11,)), header((2**61,)), b"\x93NUMPY\
 
 
 @pytest.mark.parametrize("content", BAD)
-def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes) -> None:
+def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
     save_recording(SEEN, tmp_path / "good.npz", FLEET)
     assert read_recording(tmp_path / "good.npz")[0].runs == 3
     with zipfile.ZipFile(tmp_path / "good.npz") as good, zipfile.ZipFile(tmp_path / "bad.npz", "w") as bad:
@@ -305,6 +305,9 @@ def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes) -> Non
     (tmp_path / "bad.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:-9])
     with refused(r"bad.npz = .*must be a recording in \.npz"):
         co.load_recording(tmp_path / "bad.npz")
+    monkeypatch.setattr("coopoc.world.storage.LARGEST", 9)
+    with refused("more than 2 GB"):
+        read_recording(tmp_path / "good.npz")
 
 
 def test_cooperation_that_changes_nothing_is_said_below_the_table() -> None:
@@ -329,6 +332,9 @@ def test_cooperation_that_changes_nothing_is_said_below_the_table() -> None:
         f"{text}no message arrived.",
     ]
     assert STUDY.answers(results)["K = 0"].startswith("K = 0: there is no neighbour")
+    worse = replace(results, frame=results.frame.rename(columns={"sent_bytes_per_second": "sent_bytes"}), settings={})
+    worse.frame.loc[worse.frame["method"] == "joint", "rt_le_m"] += worse.frame["max_neighbours"]
+    assert "Joint filter, K = 2: worse than alone" in " ".join(unused(worse))
 
 
 def test_calls_that_raised_what_is_no_error_of_ours(tmp_path: Path) -> None:

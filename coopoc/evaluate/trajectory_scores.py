@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Literal, get_args
+from collections.abc import Iterator, Mapping
+from contextlib import suppress
+from dataclasses import dataclass, replace
+from typing import Any, Literal, get_args
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -17,6 +18,10 @@ from .statistics import Interval, mean_interval
 Unit = Literal["steps", "m"]
 Aligned = Literal["none", "each", "sim3", "team"]
 UNITS = {1e3: "ms", 1e6: "us", 1e9: "ns"}
+LEAST = 1e-3
+"""m or degrees of an error that are worth a remark."""
+LAGS, ENOUGH = (0.3, 0.006), 20
+"""s, steps of a search for a lag, a hundred of them on either side; poses that show what explains an error."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -147,14 +152,11 @@ def ends(x: Floats, delta: float, unit: Unit) -> Ints:
     array([0, 3, 6])
     """
     one_of("unit", unit, get_args(Unit))
-    if unit == "steps":
-        steps = number("delta", delta, 1, allowed="a whole number of steps, >= 1")
-        if steps % 1:
-            raise InputError("delta", delta, "must be a whole number of steps", 'For a length, set unit to "m".')
-        return np.arange(0, len(x), int(steps))
-    delta = number("delta", delta, 1e-12, allowed="> 0")
+    delta, steps = number("delta", delta, 1e-12, allowed="> 0"), unit == "steps"
+    if steps and delta % 1:
+        raise InputError("delta", delta, "must be a whole number of steps", 'For a length, set unit to "m".')
     found, gone = [0], 0.0
-    for k, step in enumerate(np.linalg.norm(np.diff(x, axis=0), axis=1).tolist(), 1):
+    for k, step in enumerate([1.0] * (len(x) - 1) if steps else np.linalg.norm(np.diff(x, axis=0), axis=1), 1):
         gone += step
         if gone >= delta:
             found.append(k)
@@ -294,8 +296,8 @@ def scores(
         raw = np.linalg.norm(estimate.position - truth.position, axis=1)
         error = np.linalg.norm(moved.position - truth.position, axis=1)
         relative = turns = turned = None
-        stamps = estimates[name].t + offset, _truth(name, truths, estimates).t
-        found = remarks(stamps, (estimate.position, truth.position), max_diff)
+        whole = estimates[name].t + offset, _truth(name, truths, estimates)
+        found = remarks(*whole, (estimate, moved, truth), max_diff)
         if len(ends(estimate.position, delta, unit)) < 2:
             found = (*found, f"no relative error: the drive is shorter than {delta:g} {unit}.")
         elif estimate.rotation is not None and truth.rotation is not None:
@@ -322,7 +324,7 @@ def compared(
     for name, path in estimates.items():
         truth = _truth(name, truths, estimates)
         i, j = associated(path.t, truth.t, max_diff, offset)
-        pairs[name] = _at(path, i), _at(truth, j)
+        pairs[name] = _at(replace(path, t=path.t + offset), i), _at(truth, j)
     team = None
     if aligned == "team":
         team = align(*(np.concatenate([pair[k].position for pair in pairs.values()]) for k in (0, 1)))
@@ -406,14 +408,13 @@ def associated(estimate: Floats, truth: Floats, max_diff: float = 0.01, offset: 
     max_diff, x = number("max_diff", max_diff), x + number("offset", offset, -np.inf)
     swap = len(x) > len(y)
     short, long = (y, x) if swap else (x, y)
-    after = np.searchsorted(long, short).clip(max=len(long) - 1)
-    nearest = np.where(np.abs(long[after - 1] - short) <= np.abs(long[after] - short), after - 1, after) % len(long)
+    nearest = np.ceil(np.interp(short, long, np.arange(len(long))) - 0.5).astype(np.int64)
     kept = np.flatnonzero(np.abs(long[nearest] - short) <= max_diff)
     if not len(kept):
         spans = f"{span(x)} and {span(y)}"
         hint = "Check the unit of the stamps, the clocks (offset) and the rates (max_diff)."
         raise InputError("stamps", spans, f"must agree within {max_diff:g} s somewhere", hint)
-    pair = (kept.astype(np.int64), nearest[kept].astype(np.int64))
+    pair = (kept.astype(np.int64), nearest[kept])
     return (pair[1], pair[0]) if swap else pair
 
 
@@ -426,44 +427,74 @@ def span(t: Floats) -> str:
     return f"{t[0].item()!r}..{t[-1].item()!r} s" if len(t) else "no stamps"
 
 
-def remarks(stamps: tuple[Floats, Floats], positions: tuple[Floats, Floats], max_diff: float) -> tuple[str, ...]:
-    """What a reader should know before believing the scores, a sentence each.
+def remarks(stamps: Floats, truth: Path, at: tuple[Path, Path, Path], max_diff: float) -> tuple[str, ...]:
+    """What a reader should know before believing the scores, a sentence each: stamps that hardly meet, and what takes
+    most of an error away, more than half of it.
 
     Args:
-        stamps: (M,), (K,) s of the whole estimate and the whole truth.
-        positions: (n, 3), (n, 3) m of both where they are compared.
+        stamps: (M,) s of the whole estimate.
+        truth: the whole truth.
+        at: estimate, the same aligned, and truth where they are compared.
         max_diff: s, how far stamps that belong together were allowed to be apart.
 
     >>> import numpy as np
-    >>> t = np.arange(9.0)
-    >>> remarks((1000 * t, t), (np.zeros((1, 3)), np.zeros((1, 3))), 0.01)[0]
+    >>> t, one = np.arange(9.0), Path(np.zeros(1), np.zeros((1, 3)))
+    >>> remarks(1000 * t, Path(t, np.zeros((9, 3))), (one, one, one), 0.01)[0]
     '1 of 9 stamps meet within 0.01 s: 0.0..8000.0 s and 0.0..8.0 s; the estimate looks like ms.'
     """
-    return tuple(text for text in (_stamps(stamps, len(positions[0]), max_diff), _scale(*positions)) if text)
+    found = dict[str, str]()
+    for unit, text, before, after in sorted(_explained(truth, *at), key=lambda row: -row[3]):  # the best comes last
+        if after < min(before / 2, before - LEAST):
+            found[unit] = f"{text} error falls from {before:.3g} to {after:.3g} {unit}."
+    return (*_stamps(stamps, truth.t, len(at[0].t), max_diff), *found.values())
 
 
-def _stamps(stamps: tuple[Floats, Floats], met: int, max_diff: float) -> str:
-    count = min(map(len, stamps))
+def _stamps(given: Floats, truth: Floats, met: int, max_diff: float) -> Iterator[str]:
+    count = min(len(given), len(truth))
     if 2 * met >= count:
-        return ""
-    long, true = (float(t[-1] - t[0]) for t in stamps)
-    ratio = long / max(true, 1e-12)
+        return
+    ratio = np.ptp(given) / max(np.ptp(truth), 1e-12)
     looks = "another clock (offset), or rates that do not meet (max_diff)?"
     for factor, unit in UNITS.items():
         if 0.5 < ratio / factor < 2:
             looks = f"the estimate looks like {unit}."
         if 0.5 < ratio * factor < 2:
             looks = f"the truth looks like {unit}."
-    return f"{met} of {count} stamps meet within {max_diff:g} s: {span(stamps[0])} and {span(stamps[1])}; {looks}"
+    yield f"{met} of {count} stamps meet within {max_diff:g} s: {span(given)} and {span(truth)}; {looks}"
 
 
-def _scale(estimate: Floats, truth: Floats) -> str:
-    """A scale that takes most of the error of the best rigid motion away, as a monocular camera or another unit has."""
-    try:
-        factor = float(align(estimate, truth, scale=True).scale)
-    except InputError:  # a straight drive, or a standing one: its frame is open, and so is its scale
-        return ""
-    rigid, free = (float(rms(absolute_error(estimate, truth, scale=scale))) for scale in (False, True))
-    if not factor or abs(factor - 1) < 0.05 or free > rigid / 2:
-        return ""
-    return f"divided by {1 / factor:.3g}, its aligned error falls from {rigid:.3g} to {free:.3g} m: another scale."
+def _explained(truth: Path, estimate: Path, moved: Path, at: Path) -> Iterator[tuple[str, str, Any, Any]]:
+    """What may explain an error, in order: its unit, the explanation, the error without it and with it.
+
+    An alignment hides a mirrored axis where all is flat, so that it is asked for in the plane, too.
+    """
+    x, y = estimate.position, at.position
+    if len(x) < ENOUGH:
+        return
+    error = np.linalg.norm(moved.position - y, axis=1)
+    with suppress(InputError):  # a straight drive, or a standing one: its frame is open, and so is its scale
+        for axes in (2, 3):
+            a, b = x[:, :axes], y[:, :axes]
+            rigid, mirrored = (rms(absolute_error(c, b)) for c in (a, a[:, ::-1]))
+            yield "m", "with an axis mirrored, or two swapped, its aligned", rigid, mirrored
+        free, text = rms(absolute_error(x, y, scale=True)), f"times {align(x, y, scale=True).scale:.3g}, its aligned"
+        yield "m", text, rigid, free
+        yield "m", "aligned by itself (align), its", rms(error), rigid
+    t, x, error = (values[:: 1 + len(error) // 500] for values in (moved.t, moved.position, error))
+
+    def errors(lag: float) -> tuple[Any, Any]:
+        """Without the lag and with it, where the truth reaches then."""
+        there = [np.interp(t + lag, truth.t, axis, np.nan, np.nan) for axis in truth.position.T]
+        gap = np.linalg.norm(x - np.column_stack(there), axis=1)
+        known = np.isfinite(gap)
+        return (rms(error[known]), rms(gap[known])) if known.mean() > 0.5 else (0.0, 0.0)
+
+    best = 0.0
+    for step in LAGS:
+        best = max((best + step * np.arange(-100, 101)).tolist(), key=lambda lag: np.subtract(*errors(lag)))
+    yield "m", f"with {best:+.3g} s on its stamps (offset), its", *errors(best)
+    if estimate.rotation is None or moved.rotation is None or at.rotation is None:
+        return
+    last = np.roll(Rotation.from_matrix(estimate.rotation).as_quat(), -1, axis=1)
+    other = moved.rotation[0] @ estimate.rotation[0].T @ Rotation.from_quat(last).as_matrix()
+    yield "°", "read with w first, its rotation", *(rms(angles(each, at.rotation)) for each in (moved.rotation, other))

@@ -10,15 +10,8 @@ from .records import Grammar, by_tag
 from .values import read_words
 
 TAGS = {
-    2: ("VERTEX_SE2", "VERTEX_XY", "VERTEX_SE2:PRIOR", "VERTEX_XY:PRIOR", "EDGE_SE2", "EDGE_SE2_XY"),
-    3: (
-        "VERTEX_SE3:QUAT",
-        "VERTEX_XYZ",
-        "VERTEX_SE3:QUAT:PRIOR",
-        "VERTEX_XYZ:PRIOR",
-        "EDGE_SE3:QUAT",
-        "EDGE_SE3_XYZ",
-    ),
+    2: "VERTEX_SE2 VERTEX_XY VERTEX_SE2:PRIOR VERTEX_XY:PRIOR EDGE_SE2 EDGE_SE2_XY",
+    3: "VERTEX_SE3:QUAT VERTEX_XYZ VERTEX_SE3:QUAT:PRIOR VERTEX_XYZ:PRIOR EDGE_SE3:QUAT EDGE_SE3_XYZ",
 }
 GRAMMAR = Grammar(
     "PyFG",

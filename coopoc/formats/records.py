@@ -70,12 +70,10 @@ class Record:
         return 1 + len(self.words.split()) + self.triangle
 
 
-def by_tag(
-    tags: Mapping[int, Sequence[str]], stamped: Collection[str] = (), offset: Collection[str] = ()
-) -> dict[str, Record]:
-    """Records of the tags of a format, dimension -> tag of each of KINDS, and of EDGE_RANGE: kinds with a stamp, tags
-    with an offset."""
-    made = {tag: (kind, d) for d, row in tags.items() for kind, tag in zip(KINDS, row, strict=True)}
+def by_tag(tags: Mapping[int, str], stamped: Collection[str] = (), offset: Collection[str] = ()) -> dict[str, Record]:
+    """Records of the tags of a format, dimension -> those of KINDS in one text, and of EDGE_RANGE: kinds with a stamp,
+    tags with an offset."""
+    made = {tag: (kind, d) for d, row in tags.items() for kind, tag in zip(KINDS, row.split(), strict=True)}
     made["EDGE_RANGE"] = "ranges", 0
     return {tag: Record(kind, d, kind in stamped, tag in offset) for tag, (kind, d) in made.items()}
 

@@ -57,6 +57,8 @@ class Change:
 
         >>> Change({}, "rt_le_m", 1.0, 1.2, Interval(0.2, 0.1, 0.3, 30), "lower").verdict
         'worse'
+        >>> Change({}, "rt_le_m", math.nan, 1.2, Interval(0.2, 0.1, 0.3, 30)).verdict
+        'no finite value'
         """
         if self.same:
             return "same"

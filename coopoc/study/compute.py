@@ -95,7 +95,7 @@ def attempt(function: Function, cell: Cell) -> Outcome:
     try:
         with threadpool_limits(limits=1):
             rows = _checked(function(cell.given), cell)
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         reason = f"{type(error).__name__}: {error}"
         return Outcome(cell, None, reason, traceback.format_exc(), time.perf_counter() - start)
     return Outcome(cell, rows, "", "", time.perf_counter() - start)

@@ -24,7 +24,7 @@ import numpy as np
 
 from ..errors import InputError
 
-_LIBRARIES = ("numpy", "scipy", "numba", "torch", "gtsam", "casadi", "cvxpy", "osqp", "pandas", "pyarrow", "joblib")
+_LIBRARIES = "numpy scipy numba torch gtsam casadi cvxpy osqp pandas pyarrow joblib"
 
 
 def environment() -> dict[str, str]:
@@ -36,7 +36,7 @@ def environment() -> dict[str, str]:
         "system": f"{platform.system()} {platform.machine()}",
         "processor": _processor(),
     }
-    for name in _LIBRARIES:
+    for name in _LIBRARIES.split():
         with suppress(metadata.PackageNotFoundError):
             versions[name] = metadata.version(name)
     return {name: value for name, value in versions.items() if value}

@@ -98,6 +98,10 @@ class Outliers:
 
         >>> Outliers.named("urban_canyon+ranges=0.05:2").notes[0]
         '5 % of the ranges 3 to 20 m too long, for 2 s'
+        >>> Outliers.named("ranges")  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ...
+        coopoc.errors.InputError: outliers = 'ranges': must be one of ... Did you mean ranges=RATE?
         """
         found, kinds = cls(), [field.name for field in fields(cls)]
         for part in filter(None, instance("outliers", text, str).split("+")):

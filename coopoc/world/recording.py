@@ -149,6 +149,8 @@ class Recording:
         >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
         >>> observe(fleet, Sensors(), runs=5).of_runs(slice(1, 4)).runs
         3
+        >>> observe(fleet, Sensors(), runs=5).of_runs([4, 0]).runs
+        2
         """
         if not isinstance(runs, slice):
             runs = checked("runs", runs, "(number of runs,)", (-1,), int)

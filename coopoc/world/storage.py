@@ -25,7 +25,8 @@ from .recording import Body, Recording
 from .sensors import Sensors
 from .v2x import V2X
 
-ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers", "landmarks")
+_NAMED = "t gnss velocity relative broadcasts arrival observers landmarks"
+ARRAYS = _NAMED.split()
 LINKS = ("step", "observer", "neighbour")
 BODY = ("yaw_rate", "heading")
 LARGEST = 2**31

@@ -112,7 +112,7 @@ def _wide(
         frame = frame.assign(**{f"{kind}_std": frame["std"] for kind in value}).drop(columns="std")
     used = ["t", "vehicle", "partner", *value.values(), *(f"{kind}_std" for kind in value)]
     for column in frame.columns.difference(used, sort=False):
-        near = next((key for key, usual in USUAL.items() if column.lower() in usual), "")
+        near = next((key for key, usual in USUAL.items() if column.lower() in usual.split()), "")
         like = f"Did you mean {near}?" if near else suggestion(column, (*LONG, *KINDS), "")
         if column == "std":
             like = f"which belongs to no kind (name it {next(iter(value))}_std)"

@@ -32,12 +32,13 @@ ZEROS = 512
 Shapes: TypeAlias = tuple[tuple[str, tuple[int, ...]], ...]
 """Names and shapes of a net's parameters, in the order of theta."""
 
-FIELDS = (
-    *("changes", "corrected", "process_old", "process_x", "process_h", "process_gates", "process", "evolved"),
-    *("prior_old", "prior_x", "prior_h", "prior_gates", "expected", "observed"),
-    *("innovation_old", "innovation_x", "innovation_h", "innovation_gates", "prior", "innovation", "gain"),
-    *("hidden", "prior_copy", "back", "posterior", "residual", "lengths"),
+_NAMED = (
+    "changes corrected process_old process_x process_h process_gates process evolved "
+    "prior_old prior_x prior_h prior_gates expected observed "
+    "innovation_old innovation_x innovation_h innovation_gates prior innovation gain "
+    "hidden prior_copy back posterior residual lengths"
 )
+FIELDS = _NAMED.split()
 """Fields of the tape, in their order: [process, evolved], [expected, observed], [prior, innovation, gain] and
 [prior_copy, back] stand side by side, because layers read two of them at once. `changes` holds the directions of the
 four changes: of the fix, innovation, evolution, update."""
@@ -73,24 +74,25 @@ TOGETHER = ("process", "expected", "prior", "innovation", "prior_copy")
     LENGTHS,
 ) = np.arange(len(FIELDS))
 
-LAYERS = (
-    ("update.weight", "changes", 9, "corrected", True, True),
-    ("evolution.weight", "changes", 6, "evolved", True, True),
-    ("observation.weight", "changes", 0, "observed", True, True),
-    ("process.weight_ih", "corrected", 0, "process_x", False, True),
-    ("process.weight_hh", "process_old", 0, "process_h", False, False),
-    ("prior.weight_ih", "process", 0, "prior_x", False, False),
-    ("prior.weight_hh", "prior_old", 0, "prior_h", False, False),
-    ("prior_to_innovation.weight", "prior", 0, "expected", True, False),
-    ("innovation.weight_ih", "expected", 0, "innovation_x", False, True),
-    ("innovation.weight_hh", "innovation_old", 0, "innovation_h", False, False),
-    ("gain_hidden.weight", "prior", 0, "hidden", True, False),
-    ("gain.weight", "hidden", 0, "gain", False, True),
-    ("posterior_hidden.weight", "innovation", 0, "back", True, False),
-    ("posterior.weight", "prior_copy", 0, "posterior", True, True),
+_ROWS = (
+    "update.weight changes 9 corrected 1 1",
+    "evolution.weight changes 6 evolved 1 1",
+    "observation.weight changes 0 observed 1 1",
+    "process.weight_ih corrected 0 process_x 0 1",
+    "process.weight_hh process_old 0 process_h 0 0",
+    "prior.weight_ih process 0 prior_x 0 0",
+    "prior.weight_hh prior_old 0 prior_h 0 0",
+    "prior_to_innovation.weight prior 0 expected 1 0",
+    "innovation.weight_ih expected 0 innovation_x 0 1",
+    "innovation.weight_hh innovation_old 0 innovation_h 0 0",
+    "gain_hidden.weight prior 0 hidden 1 0",
+    "gain.weight hidden 0 gain 0 1",
+    "posterior_hidden.weight innovation 0 back 1 0",
+    "posterior.weight prior_copy 0 posterior 1 1",
 )
+LAYERS = [row.split() for row in _ROWS]
 """Layers in the order of `L_UPDATE` and the rest: parameter, field and first column of the inputs, field of the
-outputs, whether a ReLU follows, whether backward finds no gradient at the inputs yet."""
+outputs, 1 where a ReLU follows, 1 where backward finds no gradient at the inputs yet."""
 (
     L_UPDATE,
     L_EVOLUTION,
@@ -151,7 +153,18 @@ def plan_of(shapes: Shapes) -> Plan:
         bias = back + outputs * whole(inputs)
         starts = begin[name], begin[name.replace("weight", "bias")]
         rows.append(
-            [*starts, outputs, inputs, size, back, bias, columns[source] + first, columns[target], relu, begins]
+            [
+                *starts,
+                outputs,
+                inputs,
+                size,
+                back,
+                bias,
+                columns[source] + int(first),
+                columns[target],
+                int(relu),
+                int(begins),
+            ]
         )
         size = bias + whole(outputs)
     return Plan(np.array(rows), np.array(list(columns.values())), end, size, at)

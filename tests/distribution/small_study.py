@@ -58,7 +58,9 @@ def cell(p: Params) -> list[Row]:
     if troubled and Path(p["trouble"]).read_text() == "kill":
         os.kill(os.getpid(), signal.SIGKILL)
     if troubled:
-        raise FloatingPointError("the filter diverged at step 3")
+        raise {"exit": SystemExit}.get(Path(p["trouble"]).read_text(), FloatingPointError)(
+            "the filter diverged at step 3"
+        )
     began = time.perf_counter()
     track = METHODS[p["method"]]()(recording(p["max_neighbours"], p["runs"], p["seed"]), egos=p["egos"])
     error, worst = rt_le(track, circle()), max_error(track, circle())

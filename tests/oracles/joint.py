@@ -10,17 +10,16 @@ from coopoc import NoiseModel
 from coopoc.arrays import Floats
 from coopoc.kernels.stars.messages import FORGOTTEN
 from coopoc.world.links import spherical, to_vector, wrap
-from oracles.messages import Member
+from oracles.messages import Member, separate
 
 
 def follow(stars: list[list[Member]], noise_model: NoiseModel, exact: bool) -> tuple[Floats, Floats, list[Floats]]:
     """x (T, 3), covariance (T, 3, 3) and the neighbours (k, 3) at each step."""
     x, p, estimates = np.zeros((0, 3)), np.zeros((0, 0)), []
     for star in stars:
-        x, p = predict(x, p, star)
-        x, p = update(x, p, star, noise_model, exact)
+        x, p = update(*predict(x, p, star), star, noise_model, exact)
         estimates.append((x, p[:3, :3]))
-    return np.array([x[0] for x, _ in estimates]), np.array([p for _, p in estimates]), [x[1:] for x, _ in estimates]
+    return separate(estimates)
 
 
 def predict(x: Floats, p: Floats, star: list[Member]) -> tuple[Floats, Floats]:
