@@ -68,12 +68,14 @@ def run(
         tracks: tum writes the estimates, a TUM file for each ego and run, to FOLDER/NAME/tracks.
     """
     from .study.cell import assignments
-    from .study.study import find_study
+    from .study.study import find_study, points
 
     changes = dict(assignments([text for group in set for text in group]))
     if data is not None:
         changes["data"] = data
-    find_study(name).override(changes)  # a mistake is told before pandas and Arrow are imported
+    study = find_study(name).override(changes)  # a mistake is told before pandas and Arrow are imported
+    for first in points(study)[:1]:
+        study.key({**study.settings, **first})
     from .study.publish import tables
     from .study.run import plan, run_study, write_tracks
 

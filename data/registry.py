@@ -23,7 +23,7 @@ from .graphs import read_graph_log
 from .log.read import Log, is_log, read_log, steps_in_words
 from .log.units import Summary
 from .mrclam import MAX_GAP, read_mrclam
-from .source import AUTO, parted, split
+from .source import AUTO, parted, split, there
 
 FLEETS = Path(__file__).parent / "fleets"
 LISTED = "name map map_licence vehicles steps dt sha256"
@@ -109,12 +109,8 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
             raise InputError("options", sorted(options), f"{name} is bundled and takes none", "Leave them out.")
         made: Fleet = parted(_made(find("coopoc.datasets", name), name), **part)
         return made
+    there(name)
     path = Path(name)
-    if not path.exists():
-        registered = names("coopoc.datasets")
-        allowed = f"must be one of {', '.join(registered)} or the path of a file or folder"
-        hint = suggestion(name, registered, "List the bundled fleets with coopoc data list, or check the path.")
-        raise InputError("data", repr(name), allowed, hint)
     chosen = chosen or detect(path, options.get("columns"))
     readers = {**DRIVES, **LOGS}
     if chosen not in readers:

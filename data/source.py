@@ -11,8 +11,10 @@ from typing import Any
 
 import numpy as np
 
-from coopoc.errors import InputError
+from coopoc.errors import InputError, suggestion
 from coopoc.file_names import given_path
+from coopoc.one_file import in_file
+from coopoc.plugins import names
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 
@@ -48,6 +50,15 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
         except ValueError:
             raise InputError(key, repr(value), f"must be {allowed}", f"Write {key}={example}.") from None
     return name, options
+
+
+def there(name: str) -> None:
+    """InputError for what is neither the name of a data set nor a path."""
+    registered = names("coopoc.datasets")
+    if not (in_file(name) or name in registered or Path(name).exists()):
+        allowed = f"must be one of {', '.join(registered)} or the path of a file or folder"
+        hint = suggestion(name, registered, "List the bundled fleets with coopoc data list, or check the path.")
+        raise InputError("data", repr(name), allowed, hint)
 
 
 def parted(data: Any, since: float | None = None, until: float | None = None) -> Any:

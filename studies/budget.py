@@ -8,9 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 
-from coopoc.evaluate.ledger import Kind, Ledger, break_even
-from coopoc.evaluate.scores import BYTES
-from coopoc.study.numbers import Number, Where, across, difference, interval, listed, mean, present, ratio, rms
+from coopoc.study.numbers import Number, Where, across, difference, interval, mean, present, ratio, rms
 from coopoc.study.style import look
 from coopoc.study.tables import Table
 from coopoc.world.channels import CHANNELS
@@ -20,6 +18,7 @@ from .lineup import PAST
 from .views import of, selections
 
 if TYPE_CHECKING:
+    from coopoc.evaluate.ledger import Kind, Ledger
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
 
@@ -32,8 +31,9 @@ SHARED = (
     ("joint", "fitted"),
     ("joint", "nominal"),
     ("split-ci", "nominal"),
+    ("cooperative-filter", "nominal"),
 )
-SCHEDULED = (("joint", "nominal"), ("split-ci", "nominal"))
+SCHEDULED = SHARED[3:]
 """Which of them run under every schedule."""
 NEIGHBOURS = (1, 2, 4, 10)
 MOST = NEIGHBOURS[-1]
@@ -60,7 +60,7 @@ def under(cap: float, schedule: str, method: str, noise_model: str) -> dict[str,
 
 
 def _grid() -> list[dict[str, Any]]:
-    """Solo methods once; the others at each K over every channel, and over the ideal one under rates and caps; two
+    """Solo methods once; the others at each K over every channel, and over the ideal one under rates and caps; some
     of them under caps with the other schedule."""
     channels = [over(name, k) for name in CHANNELS for k in NEIGHBOURS]
     rates = [over("ideal", MOST, rate_hz=rate) for rate in RATES]
@@ -111,36 +111,27 @@ def best_under(each: Sequence[Choice], limit: float) -> Choice | None:
     return min((choice for choice in each if choice.size <= limit), key=lambda choice: choice.error, default=None)
 
 
-def gap(results: Results, where: Mapping[str, Any]) -> str:
-    """Ratio of a selection to the bound of its K, rms over rms, in words; empty where the bound was not run."""
-    times = ratio(rms(results, where), rms(results, {"method": "bound", "max_neighbours": where["max_neighbours"]}))
-    return f", {times:.2f} times the bound" if times else ""
-
-
 def _findings(results: Results) -> dict[str, str]:
     texts, each = {}, choices(results)
     for limit in LIMITS:
         best = best_under(each, limit)
-        if best is not None:
+        if best:
             where, k = best.where, best.where["max_neighbours"]
             first = "" if where["schedule"] == SCHEDULES[0] else f", {where['schedule']}"
             at = f", K = {k}{first}, {best.size:.0f} B/s" if k else ""
             words = f"At most {limit:g} B/s" if limit else "Without a byte while driving"
             how = f"{look(where['method']).label} ({where['noise_model']}){at}"
-            texts[f"{limit:g} B/s"] = f"{words}: best is {how}, {best.error:.3f} m{gap(results, where)}."
-    for method, model in SCHEDULED:
-        parts = []
-        for cap in CAPS:
-            errors = {name: mean(results, under(cap, name, method, model)) for name in SCHEDULES}
-            if None not in errors.values():
-                parts.append(f"at {cap:g} B/s {listed(errors)}")
-        text = f"Heard first under a cap ({look(method).label}, {model}): {'; '.join(parts)}."
-        texts[f"schedules, {method}"] = text if parts else ""
+            times = ratio(rms(results, where), rms(results, {"method": "bound", "max_neighbours": k}))
+            far = f", {times:.2f} times the bound" if times else ""
+            texts[f"{limit:g} B/s"] = f"{words}: best is {how}, {best.error:.3f} m{far}."
     return texts
 
 
 def _account(results: Results, where: Where) -> Ledger | None:
     """The ledger of one second of the drive; None where the method was not run."""
+    from coopoc.evaluate.ledger import Ledger
+    from coopoc.evaluate.scores import BYTES
+
     kept = present(results, where)
     if kept is None:
         return None
@@ -159,6 +150,7 @@ def _rate(results: Results, where: Where, kind: Kind = "payload") -> int | None:
 
 def even(results: Results) -> Table | None:
     """Driving time after which online cooperation has moved as many bytes as a training, per method and channel."""
+    from coopoc.evaluate.ledger import break_even
 
     def time(total: Ledger) -> Number:
         def column(results: Results, where: Where) -> str | None:
@@ -170,7 +162,7 @@ def even(results: Results) -> Table | None:
     ran = [name for name in TRAINED if present(results, {"method": name})]
     trainings = {look(name).label: weights.ledger(results.settings, name) for name in ran}
     once = {f"{name}, {t.per_vehicle('training') / 1e3:,.0f} kB": time(t) for name, t in trainings.items()}
-    rows = [row for row in METHODS if row[1]["noise_model"] in ("nominal", "trained")] if once else []
+    rows = [row for row in METHODS if row[1]["noise_model"] == "nominal"] if once else []
     text = (
         f"Driving time after which online cooperation (K = {MOST}) has moved as many bytes as each training moved per "
         "vehicle, once: payload, per receiver."

@@ -5,19 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from coopoc.arrays import AnyArray, Floats
 from coopoc.errors import InputError
-from coopoc.evaluate.bounds import bound_rt_le, past_bound, posterior_bound
-from coopoc.evaluate.metrics import innovation_columns
-from coopoc.evaluate.scores import online_columns, rows_of, scored
-from coopoc.methods.catalogue import METHODS
-from coopoc.methods.kalman import Kalman
-from coopoc.methods.noise_model import NoiseModel
-from coopoc.methods.track import Method
 from coopoc.plugins import find
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.fleet import Fleet
@@ -27,6 +20,10 @@ from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
 from . import scene, weights
+
+if TYPE_CHECKING:  # they load numba, for which a mistake in --set need not wait
+    from coopoc.methods.noise_model import NoiseModel
+    from coopoc.methods.track import Method
 
 COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint")
 BOUND = ("bound", "bound")
@@ -77,7 +74,7 @@ def key(p: Params) -> dict[str, str]:
     digests = dict(scene.facts(p))
     if weights.is_trained(p["method"]):
         digests["weights"] = weights.key(p["method"], p)
-    elif p["method"] not in (*METHODS, "bound"):
+    elif p["method"] != "bound":
         find("coopoc.methods", p["method"])
     if p.get("metric"):
         find("coopoc.metrics", p["metric"])
@@ -92,6 +89,8 @@ def noise_model(p: Params) -> NoiseModel | str:
     Raises:
         InputError: an oracle for real data, whose noise is unknown.
     """
+    from coopoc.methods.noise_model import NoiseModel
+
     if p["noise_model"] == "fitted":
         return weights.fitted(p)
     if p["noise_model"] == "oracle":
@@ -111,11 +110,11 @@ def methods(p: Params) -> list[tuple[int | None, Method]]:
         InputError: an unknown name.
     """
     name, first = p["method"], start(p)
-    if name not in METHODS and weights.is_trained(name):
+    if weights.is_trained(name):
         models: list[tuple[int, Any]] = [(seed, weights.checkpoint(name, p, seed).model) for seed in weights.seeds(p)]
         return [(seed, model.method(name, first)) for seed, model in models]
-    method: Any = METHODS[name](noise_model(p)) if name in METHODS else own(name, noise_model(p))
-    if isinstance(method, Kalman):
+    method = own(name, noise_model(p))
+    if hasattr(method, "x0"):
         method = replace(method, x0=first)
     if p["noise_model"] == "fitted" and not scene.is_real(p["data"]) and hasattr(method, "robust"):
         method = replace(method, robust=False)  # fitted to quieter drives: a gate takes the acting noise for wrong
@@ -128,6 +127,8 @@ def own(name: str, noise: NoiseModel | str = "nominal") -> Any:
     Raises:
         InputError: an unknown name, a class that takes no noise model, or what no study can use.
     """
+    from coopoc.methods.track import Method
+
     shows = "docs/extend.md shows one; its first argument is noise_model."
     try:
         method = find("coopoc.methods", name)(noise)
@@ -163,6 +164,9 @@ def rows(
         made: methods and their training seeds, instead of the method that the cell names.
         measured: recording, instead of that of the cell.
     """
+    from coopoc.evaluate.scores import rows_of, scored
+    from coopoc.methods.catalogue import METHODS
+
     recording = measured or scene.recording(p)
     who, drive, metric = scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"]), str(p.get("metric", ""))
     table: list[Row] = []
@@ -179,10 +183,12 @@ def bound_rows(p: Params) -> list[Row]:
     """The bound of each ego over an ideal channel, with the bytes that the ego would receive.
 
     It needs no draws but where there are outliers or an attack: then it is that of an estimator which is told of them,
-    the mean over runs. The noise model of PAST makes it the bound with the past of newcomers. Real data have none: the
-    bound is of sensors that measure at every step.
+    the mean over runs. Newcomers bring their past, unless the noise model is that of BOUND or "star". Real data have
+    none: the bound is of sensors that measure at every step.
     """
-    bound = past_bound if (p["method"], p.get("noise_model")) == PAST else posterior_bound
+    from coopoc.evaluate.bounds import bound_rt_le, past_bound, posterior_bound
+
+    bound = posterior_bound if p.get("noise_model") in ("bound", "star") else past_bound
     drive, v2x = scene.fleet(p["data"]), scene.channel(p)
     if scene.is_real(p["data"]):
         return [{"run": 0, "ego": ego} for ego in scene.egos(p["data"], str(p["egos"]))]
@@ -247,6 +253,9 @@ def scored_where_present(
 def _ego(
     method: Method, recording: Recording, ego: str, drive: Fleet, quantiles: int, metric: str
 ) -> dict[str, AnyArray]:
+    from coopoc.evaluate.metrics import innovation_columns
+    from coopoc.evaluate.scores import online_columns, scored
+
     tracked = drive.present[:, drive.index(ego)]
     parts, lengths = list[Mapping[str, AnyArray]](), list[int]()
     cuts = recording.stretches(ego)

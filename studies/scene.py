@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 import numpy as np
 
 from coopoc.arrays import Bools
-from coopoc.data.source import split
+from coopoc.data.source import split, there
 from coopoc.errors import InputError
-from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.study.provenance import revision
 from coopoc.study.study import Params
 from coopoc.world.channels import channel as channel_of
@@ -43,10 +42,10 @@ TOWN: Mapping[str, Any] = {**DRAWN, "scenario": 2, "velocity_ratio": 0.15, "velo
 @lru_cache(maxsize=4)
 def fleet(data: str) -> Fleet:
     """The fleet of a bundled name or a path: of a log its truth, NaN where it is unknown."""
-    from coopoc.data.registry import load_fleet
-
     log = _log(data)
     if log is None:
+        from coopoc.data.registry import load_fleet
+
         return load_fleet(data)
     measurements = log.recording
     nothing = np.full((len(measurements.t), len(measurements.ids), 3), np.nan)
@@ -62,7 +61,8 @@ def _log(data: str) -> Log | None:
     Raises:
         InputError: one in body frames.
     """
-    from coopoc.data.registry import LOGS, kind_of, load_log  # pandas, which a mistake in --set need not wait for
+    there(split(data)[0])
+    from coopoc.data.registry import LOGS, kind_of, load_log  # pandas, which a mistake need not wait for
 
     if kind_of(data) not in LOGS:
         return None
@@ -313,6 +313,8 @@ def told(p: Params) -> Recording | None:
 
 
 def _attacked(p: Params, told: bool) -> Recording:
+    from coopoc.methods.catalogue import needs_whole_fleet
+
     who, attack = egos(p["data"], str(p["egos"])), attacking(p)
     observers = None if needs_whole_fleet(str(p.get("method"))) else who
     drawn = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers, told)

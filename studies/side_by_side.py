@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
-METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "mhe", "bound")
+METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "mhe", "cooperative-filter", "bound")
 CONDITIONS: dict[str, Any] = {
     "channel": "ideal",
     "rate_hz": 0.0,
@@ -115,7 +115,8 @@ STUDY = lineup.study(
     },
     findings=_findings,
     limitations=(
-        "The bound applies to the rms over runs and assumes an ideal channel, whatever the channel of the cells.",
+        "The bound applies to the rms over runs; it assumes an ideal channel, whatever that of the cells, and that "
+        "newcomers bring their past.",
         "Real data have no bound: it assumes sensors that measure at every step.",
         "Methods without a noise model, learned ones among them, give the same result under every noise model.",
     ),

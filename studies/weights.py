@@ -13,8 +13,8 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 from tyro.conf import Positional, arg
 
 from coopoc.errors import InputError, unknown
-from coopoc.methods.noise_model import NoiseModel
 from coopoc.one_file import file_digest, from_file, in_file
+from coopoc.plugins import find
 from coopoc.study.study import Params
 from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors, VelocityReading
@@ -26,6 +26,7 @@ if TYPE_CHECKING:
     from coopoc.evaluate.ledger import Ledger
     from coopoc.learned.checkpoint import Checkpoint
     from coopoc.learned.training.drives import Drives
+    from coopoc.methods.noise_model import NoiseModel
     from coopoc.study.results import Results
 
 INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
@@ -148,6 +149,8 @@ def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:
 
 @lru_cache
 def _fitted(clients: str, reading: VelocityReading) -> NoiseModel:
+    from coopoc.methods.noise_model import NoiseModel
+
     if is_real(clients):
         from coopoc.data.registry import load_log
 
@@ -224,6 +227,7 @@ def train(
         rounds: number of rounds on Flower, instead of the recipe's.
         worse: save also what errs more than a tenth more than a Kalman filter with fitted noise.
     """
+    find("coopoc.recipes", recipe)  # before torch is loaded
     from coopoc.learned.train import train_all
 
     clients = drives(data)

@@ -115,9 +115,6 @@ def test_schedules_are_compared_on_the_same_egos_and_runs(tight: Results, short_
     for gap, wanted in zip(found[2:], gaps, strict=True):
         assert [gap.mean, gap.low, gap.high] == pytest.approx([wanted.mean, wanted.low, wanted.high])
         assert gap.mean != 0.0
-    said = study.STUDY.answers(tight)["schedules, joint"]
-    for schedule, error in zip(study.SCHEDULES, errors, strict=True):
-        assert f"{schedule} {error.mean():.3g} m" in said
 
 
 @pytest.mark.slow

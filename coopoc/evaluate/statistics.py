@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
-from scipy import special
 
 from ..arrays import AnyArray, Floats, checked, number
 from ..errors import InputError
@@ -87,6 +86,8 @@ def over_seeds(values: AnyArray) -> Interval:
     >>> print(over_seeds(np.array([1.0, 1.2, 1.1])))
     1.1 [0.852, 1.35]
     """
+    from scipy import special  # a fifth of a second, which a mistake on the command line need not wait for
+
     values = checked("values", values)
     if values.ndim < 1 or len(values) < 2 or not np.isfinite(values).all():
         raise InputError("values", values.shape, "need at least two seeds of finite values", "Train more seeds.")
@@ -121,6 +122,8 @@ def _counts(egos: int, runs: int, resamples: int, seed: int) -> AnyArray:
 
 
 def _interval(resampled: Floats, mean: float, values: Floats) -> Interval:
+    from scipy import special
+
     n = values.shape[0] if values.shape[0] > 1 else values.shape[1]
     if n < 2:
         return Interval(mean, math.nan, math.nan, values.size)

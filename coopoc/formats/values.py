@@ -6,7 +6,6 @@ from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
 from ..arrays import Floats, Ints
 from ..errors import InputError
@@ -105,6 +104,8 @@ def to_rotation(orientation: Floats) -> Floats:
     if orientation.shape[-1] == 1:
         c, s = np.cos(orientation[..., 0]), np.sin(orientation[..., 0])
         return np.stack([np.stack([c, -s], -1), np.stack([s, c], -1)], -2)
+    from scipy.spatial.transform import Rotation  # a quarter of a second, which a missing file need not wait for
+
     quaternions = orientation.reshape(-1, 4)
     matrices, known = np.full((len(quaternions), 3, 3), np.nan), np.isfinite(quaternions).all(axis=1)
     matrices[known] = Rotation.from_quat(quaternions[known]).as_matrix()
@@ -125,6 +126,8 @@ def to_orientation(rotation: Floats) -> Floats:
     """
     if rotation.shape[-1] == 2:
         return np.arctan2(rotation[..., 1, 0], rotation[..., 0, 0])[..., None]
+    from scipy.spatial.transform import Rotation
+
     quaternions = Rotation.from_matrix(rotation.reshape(-1, 3, 3)).as_quat(canonical=True)
     return np.asarray(quaternions).reshape(*rotation.shape[:-2], 4)
 

@@ -111,7 +111,7 @@ class Study:
     def cells(self) -> list[Cell]:
         """All cells in the order of the grid, each named by the hash of all that changes its numbers."""
         code = cache(lambda: code_of(self.cell))  # half a second, which a mistake need not wait for
-        cells = [_named(self, params, code) for params in _expand(self)]
+        cells = [_named(self, params, code) for params in points(self)]
         if not cells:
             raise InputError("grid", "no cell", "must have at least one", "Widen an axis, or relax --set.")
         count = Counter(cell.name for cell in cells)
@@ -205,7 +205,8 @@ def _named(study: Study, params: Mapping[str, Scalar], code: Callable[[], str]) 
     return Cell(params, given, digest({**content, "coopoc": metadata.version("coopoc")}))
 
 
-def _expand(study: Study) -> list[Mapping[str, Scalar]]:
+def points(study: Study) -> list[Mapping[str, Scalar]]:
+    """Parameters of each cell, in the order of the grid."""
     grid = study.grid
     if isinstance(grid, Mapping):
         grid = [dict(zip(grid, values, strict=True)) for values in itertools.product(*grid.values())]
@@ -216,7 +217,7 @@ def _check_used(study: Study, name: str) -> None:
     """InputError for a value on an axis that leads to no cell."""
     if study.where is None or not isinstance(study.grid, Mapping):
         return
-    used = {p[name] for p in _expand(study)}
+    used = {p[name] for p in points(study)}
     for value in study.grid[name]:
         if used and value not in used:
             rest = ",".join(map(str, dict.fromkeys(v for v in study.grid[name] if v in used)))

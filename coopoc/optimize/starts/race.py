@@ -30,9 +30,9 @@ MORE = 50
 def race(
     problem: Problem,
     starts: Mapping[str, Callable[[], Floats]],
-    growing: Callable[[Problem], tuple[Floats, int]] | None = None,
-    relaxed: Callable[[Problem], Floats] | None = None,
-    unwound: Callable[[Floats], bool] = lambda x: False,
+    growing: Callable[[Problem], tuple[Floats, int]] | None,
+    relaxed: Callable[[Problem], Floats] | None,
+    unwound: Callable[[Floats], bool],
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
@@ -45,7 +45,7 @@ def race(
     Args:
         problem: at any start.
         starts: name -> x0 (n, ambient), cheapest first.
-        growing: problem -> x0 and iterations of a start that is tried late, "incremental".
+        growing: problem -> x0 and iterations of a start that is tried late, "incremental"; or None.
         relaxed: problem -> x0, "relaxed", of one that is tried last; None where it would take too long.
         unwound: x -> whether no other minimum of a lower cost is to be feared.
     """
