@@ -74,12 +74,12 @@ def unused(results: Results) -> tuple[str, ...]:
     real data larger."""
     rows, texts, by = results.frame, list[str](), ["method", "max_neighbours"]
     value = "rt_le_m" if "rt_le_m" in rows else "innovation_m"
-    if not {*by, "bytes_per_second", value} <= set(rows):
+    sent = "sent_bytes" if "sent_bytes" in rows else "sent_bytes_per_second"
+    if not {*by, sent, value} <= set(rows):
         return ()
-    real = "sent_bytes" in rows or scene.is_real(str(results.settings["data"]))
-    sent = rows.get("sent_bytes", rows.get("sent_bytes_per_second"))
+    real = sent == "sent_bytes" or scene.is_real(str(results.settings["data"]))
     keys = [name for name in (*results.axes, "ego", "run", "train_seed") if name in rows and name not in by]
-    for (method, k), part in rows[sent > 0].groupby(by, sort=False):
+    for (method, k), part in rows[rows[sent] > 0].groupby(by, sort=False):
         own = (rows["method"] == method) & (rows["max_neighbours"] == 0)
         both = part.merge(rows[own | (rows["method"] == "kalman") & (rows["max_neighbours"] == k)], on=keys)
         together, alone = (both[f"{value}_{side}"] for side in "xy")

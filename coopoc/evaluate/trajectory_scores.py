@@ -453,7 +453,7 @@ def _stamps(given: Floats, truth: Floats, met: int, max_diff: float) -> Iterator
     count = min(len(given), len(truth))
     if 2 * met >= count:
         return
-    ratio = np.ptp(given) / max(np.ptp(truth), 1e-12)
+    ratio = float(np.ptp(given)) / max(float(np.ptp(truth)), 1e-12)
     looks = "another clock (offset), or rates that do not meet (max_diff)?"
     for factor, unit in UNITS.items():
         if 0.5 < ratio / factor < 2:
@@ -497,4 +497,5 @@ def _explained(truth: Path, estimate: Path, moved: Path, at: Path) -> Iterator[t
         return
     last = np.roll(Rotation.from_matrix(estimate.rotation).as_quat(), -1, axis=1)
     other = moved.rotation[0] @ estimate.rotation[0].T @ Rotation.from_quat(last).as_matrix()
-    yield "°", "read with w first, its rotation", *(rms(angles(each, at.rotation)) for each in (moved.rotation, other))
+    before, after = (rms(angles(each, at.rotation)) for each in (moved.rotation, other))
+    yield "°", "read with w first, its rotation", before, after
