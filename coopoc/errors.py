@@ -79,7 +79,7 @@ def unknown(noun: str, name: object, known: Iterable[str], otherwise: str | None
     return InputError(noun, shown(name), allowed, suggestion(name, known, otherwise))
 
 
-def said(error: Exception) -> str:
+def said(error: BaseException) -> str:
     """The first line of what an error of another library says, else its name.
 
     >>> said(KeyError())

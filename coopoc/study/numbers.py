@@ -51,12 +51,12 @@ def interval(results: Results, where: Where, value: str = "rt_le_m") -> Interval
     return None if kept is None else results.interval(value, kept)
 
 
-def rms(results: Results, where: Where) -> float | None:
+def rms(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
     """sqrt(mean over runs of RT-LE^2), averaged over egos and training seeds: the quantity that the bound bounds."""
-    kept = present(results, where)
+    kept = present(results, where, value)
     if kept is None:
         return None
-    frame = results.select(kept).assign(square=lambda rows: rows["rt_le_m"] ** 2)
+    frame = results.select(kept).assign(square=lambda rows: rows[value] ** 2)
     seeded = "train_seed" in frame and frame["train_seed"].notna().any()
     return float(np.sqrt(frame.groupby(["ego", *(["train_seed"] if seeded else [])])["square"].mean()).mean())
 
@@ -140,11 +140,11 @@ def per_seed(results: Results, where: Where) -> Floats:
     return np.array([results.values("rt_le_m", {**where, "train_seed": seed}) for seed in seeds])
 
 
-def seed_means(results: Results, where: Where) -> list[float]:
-    """Mean RT-LE for each training seed; of a method that is not trained one, and none if it was not run."""
+def seed_means(results: Results, where: Where, number: Number = mean) -> list[float]:
+    """A number for each training seed; of a method that is not trained one, and none if it was not run."""
     seeds = _seeds(results, where)
     wheres = [{**where, "train_seed": seed} for seed in seeds] or [dict(where)]
-    return [value for each in wheres if (value := mean(results, each)) is not None]
+    return [value for each in wheres if (value := number(results, each)) is not None]
 
 
 def seed_std(results: Results, where: Where) -> float | None:

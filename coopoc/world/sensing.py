@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, Literal, get_args
 from weakref import WeakValueDictionary
 
@@ -96,7 +96,7 @@ def observe(
         velocity, body = body_measurements(fleet, sensors, runs, seed)
         if sensors.outliers:
             wrong_odometry(velocity, body_motion(fleet)[0], fleet, sensors.outliers, seed, told)
-        relative = in_body(relative, fleet, links, _own_errors(fleet, links, runs, seed, _heading(sensors)))
+        relative = in_body(relative, fleet, links, _own_errors(fleet, links, sensors, runs, seed, *HEADING))
     wrong = sensors.outliers.notes if sensors.outliers else ()
     notes = tuple(f"{note}{', removed' * told}" for note in wrong)
     return Recording(
@@ -242,8 +242,8 @@ def _relative_measurements(
     vector = fleet.position[links.step, links.neighbour] - fleet.position[links.step, links.observer]
     exact = np.stack(spherical(*vector.T), axis=-1) if len(links) else np.empty((0, 3))
     pairs = [(observer, neighbour, index, links.step[index]) for observer, neighbour, index in _pairs(fleet, links)]
-    relative, turned = np.empty((runs, *exact.shape)), _own_errors(fleet, links, runs, seed, _heading(sensors))
-    longer = _own_errors(fleet, links, runs, seed, {"range_offset": sensors.range_offset_std})
+    relative, turned = np.empty((runs, *exact.shape)), _own_errors(fleet, links, sensors, runs, seed, *HEADING)
+    longer = _own_errors(fleet, links, sensors, runs, seed, "range_offset")
     scratch = np.empty((len(fleet.t), 3))
     for r in range(runs):  # one after the other stays in the cache
         for observer, neighbour, index, step in pairs:
@@ -260,21 +260,20 @@ def _relative_measurements(
     return relative
 
 
-def _heading(sensors: Sensors) -> dict[str, float]:
-    """Standard deviations rad of what the observer's heading rotates its measurements by."""
-    return {"heading": sensors.heading_std, "heading_bias": sensors.heading_bias_std}
+HEADING = ("heading", "heading_bias")
+"""Errors of an observer that rotate what it measures; the first is new at every step, all others last."""
 
 
-def _own_errors(fleet: Fleet, links: Links, runs: int, seed: int, stds: Mapping[str, float]) -> Floats:
-    """(R, L) sum of the errors of its observer that are in each measurement; but for "heading" they last."""
+def _own_errors(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: int, *kinds: str) -> Floats:
+    """(R, L) sum of such errors of its observer in each measurement."""
     turned = np.zeros((runs, len(links)))
-    for kind, std in stds.items():
+    for kind in kinds:
+        std: float = getattr(sensors, f"{kind}_std")
         for column in np.unique(links.observer) if std > 0 else ():
             mine = links.of(column)
             for r in range(runs):
-                size = len(fleet.t) if kind == "heading" else 1
-                draws = std * stream(seed, kind, r, fleet.ids[column]).standard_normal(size)
-                turned[r, mine] += draws[links.step[mine]] if kind == "heading" else draws[0]
+                normals = stream(seed, kind, r, fleet.ids[column]).standard_normal(len(fleet.t))
+                turned[r, mine] += std * normals[links.step[mine] * (kind == "heading")]
     return turned
 
 

@@ -142,7 +142,7 @@ class PoseFilter:
         elif self.unit == "fleet":
             for k, column in enumerate(columns):
                 box = inbox(recording, column, self.message)
-                moved[..., k] = box.received_bytes, box.sent_bytes
+                moved[0, :, k], moved[1, :, k] = box.received_bytes, box.sent_bytes
         extras: dict[str, Floats] = {}
         for k, name in enumerate(("speed_scale", "yaw_rate_bias") if self.lasting else (), 4):
             extras |= {name: x[..., k], f"{name}_std": np.sqrt(cov[..., k, k])}
