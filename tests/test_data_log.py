@@ -43,7 +43,9 @@ def test_a_recording_comes_back_from_its_rows(tmp_path: Path, suffix: str) -> No
     sent = true.broadcasts[true.links.step, true.links.neighbour]
     wanted = np.where(sent, true.arrival[0], -1)
     np.testing.assert_array_equal(found.arrival[0, back], wanted[order])
-    assert found.sensors == replace(NOISE, min_range=0.0, velocity_floor=found.sensors.velocity_floor)
+    assert found.sensors == replace(
+        NOISE, min_range=0.0, range_offset_std=1.0, velocity_floor=found.sensors.velocity_floor
+    )
     assert found.sensors.velocity_floor == pytest.approx(0.1)
     assert log.messages
     assert not log.summary.refused
