@@ -161,19 +161,24 @@ def find(group: str, name: str) -> Any:
     if not isinstance(name, str):
         raise _unknown(group, name)
     registered = points(group)
-    try:
-        loaded = registered[name].load() if name in registered else None
-    except ModuleNotFoundError as error:
-        raise missing(error, name) from None
+    loaded = _load(registered[name], name) if name in registered else None
     if loaded is not None and not isinstance(loaded, Mapping):
         return loaded
     if in_file(name):
         return from_file(name, GROUPS.get(group, group))
     for point in registered.values():
         written = names_in(point.value)
-        if (written is None or name in written) and name in (members := _members(point)):
+        members = _members(point) if written is None else _load(point, name) if name in written else {}
+        if name in members:
             return members[name]
     raise _unknown(group, name)
+
+
+def _load(point: metadata.EntryPoint, name: str) -> Any:
+    try:
+        return point.load()
+    except ModuleNotFoundError as error:
+        raise missing(error, name) from None
 
 
 def _unknown(group: str, name: object) -> InputError:

@@ -135,8 +135,12 @@ def own(name: str, noise: NoiseModel | str = "nominal") -> Any:
     except TypeError as error:
         raise InputError("method", repr(name), f"cannot be made from a noise model: {error}", shows) from error
     if not (isinstance(method, Method) and isinstance(method.name, str)):
-        allowed = "must have a name (text), cooperative (True or False), a message, and be called with a recording"
-        raise InputError("method", repr(name), allowed, shows)
+        raise InputError(
+            "method",
+            repr(name),
+            "must have a name (text), cooperative (a bool) and a message, and take a recording",
+            shows,
+        )
     return method
 
 

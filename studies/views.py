@@ -86,9 +86,8 @@ def unused(results: Results) -> tuple[str, ...]:
         gap = (together - alone).abs().groupby([both[key] for key in keys], dropna=False).min()
         text = f"{look(str(method)).label}, K = {k}:"
         if k and len(gap) == len(part) and gap.max() < ALIKE:
-            why = "what was measured lacks what it takes, such as an azimuth"
-            if not part["bytes_per_second"].any():
-                why = "no message arrived"
+            lacks = "what was measured lacks what it takes, such as an azimuth"
+            why = lacks if part["bytes_per_second"].any() else "no message arrived"
             texts.append(
                 f"{text} equal to solo within {ALIKE:g} m: no neighbour's measurement was used, because {why}."
             )

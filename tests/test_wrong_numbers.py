@@ -255,7 +255,7 @@ class Swapped(Negative):
 
 
 def test_estimates_of_other_egos_are_refused() -> None:
-    with refused("must be a Track of a, b, in this order"):
+    with refused("must be a Track of a, b. Take egos in this order"):
         scored(Swapped(), SEEN, ["a", "b"], FLEET)
 
 

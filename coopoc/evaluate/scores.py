@@ -68,8 +68,12 @@ def scored(
     for part in slabs(recording, len(egos)):
         track = method(part, egos)
         if getattr(track, "egos", None) != tuple(map(part.ids.index, egos)):
-            allowed = f"must be a Track of {', '.join(egos)}, in this order"
-            raise InputError(f"estimates of {method.name}", shown(track), allowed, "Take egos as they are asked for.")
+            raise InputError(
+                f"estimates of {method.name}",
+                shown(track),
+                f"must be a Track of {', '.join(egos)}",
+                "Take egos in this order.",
+            )
         seconds += track.seconds
         parts.append(_columns(track, part, method, drive, quantiles))
         if metric:

@@ -497,5 +497,5 @@ def _explained(truth: Path, estimate: Path, moved: Path, at: Path) -> Iterator[t
         return
     last = np.roll(Rotation.from_matrix(estimate.rotation).as_quat(), -1, axis=1)
     other = moved.rotation[0] @ estimate.rotation[0].T @ Rotation.from_quat(last).as_matrix()
-    before, after = (rms(angles(each, at.rotation)) for each in (moved.rotation, other))
-    yield "°", "read with w first, its rotation", before, after
+    before = rms(angles(moved.rotation, at.rotation))
+    yield "°", "read with w first, its rotation", before, rms(angles(other, at.rotation))

@@ -175,7 +175,8 @@ def guards_of(method: CooperativeFilter, noise_model: NoiseModel) -> Guards:
 def model_of(noise_model: NoiseModel, robust: bool) -> Model:
     """The noise model of the kernel; of the textbook filter all errors are white."""
     std, least = relative_noise(noise_model)
-    white, own, common, time, bias, heading, offset = np.ones(3), 0.0, 0.0, 1.0, 0.0, 0.0, 0.0
+    white, time = np.ones(3), 1.0
+    own = common = bias = heading = offset = 0.0
     if robust and noise_model.sensors is not None:
         sensors, std = noise_model.sensors, np.array(std)
         own, common, offset = sensors.gnss_drift_std**2, sensors.gnss_common_std**2, sensors.range_offset_std**2

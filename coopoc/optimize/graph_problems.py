@@ -84,11 +84,11 @@ def from_graph(
     given = _x0(graph, poses, names[0])
     problem = Problem(graph.names, factors, given, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
     if len(problem.fixed) - len(graph.fixed) > (not len(graph.fixed)):
-        apart = (
+        notes = (
+            *notes,
             f"no measurement joins all parts: {', '.join(graph.names[k] for k in problem.fixed[:5])} are fixed, "
-            "and nothing places one to another"
+            "and nothing places one to another",
         )
-        notes = (*notes, apart)
     won = Search(names[0])
     if start == "auto":
         starts = {name: (lambda: given) if name == names[0] else partial(_x0, graph, poses, name) for name in names}

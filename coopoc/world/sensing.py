@@ -268,7 +268,7 @@ def _own_errors(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: i
     """(R, L) sum of such errors of its observer in each measurement."""
     turned = np.zeros((runs, len(links)))
     for kind in kinds:
-        std: float = getattr(sensors, f"{kind}_std")
+        std = getattr(sensors, f"{kind}_std")
         for column in np.unique(links.observer) if std > 0 else ():
             mine = links.of(column)
             for r in range(runs):

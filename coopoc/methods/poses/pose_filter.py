@@ -124,7 +124,7 @@ class PoseFilter:
         """
         began, recording = time.perf_counter(), check_recording(recording, body=True)
         columns, links, notes = pose_egos(recording, egos), recording.links, tuple[str, ...]()
-        moved: Floats = np.zeros((2, recording.runs, len(columns)))
+        received, sent = moved = np.zeros((2, recording.runs, len(columns)))
         if self.unit == "solo":
             begin = first_poses(recording, self.begin, columns)
             found = [self.run_filter(recording, [c], to_landmarks(recording, links.of(c)), begin) for c in columns]
@@ -138,11 +138,11 @@ class PoseFilter:
             x, cov = (values[:, :, [members.index(column) for column in columns]] for values in (x, cov))
         if self.unit == "fleet" and self.fusion == "joint":
             met, notes = centre(recording, self.message), (CENTRE,)
-            moved = np.stack([met.received_bytes, met.sent_bytes])[..., columns]
+            moved[:] = met.received_bytes[:, columns], met.sent_bytes[:, columns]
         elif self.unit == "fleet":
             for k, column in enumerate(columns):
                 box = inbox(recording, column, self.message)
-                moved[0, :, k], moved[1, :, k] = box.received_bytes, box.sent_bytes
+                received[:, k], sent[:, k] = box.received_bytes, box.sent_bytes
         extras: dict[str, Floats] = {}
         for k, name in enumerate(("speed_scale", "yaw_rate_bias") if self.lasting else (), 4):
             extras |= {name: x[..., k], f"{name}_std": np.sqrt(cov[..., k, k])}
@@ -151,8 +151,8 @@ class PoseFilter:
             tuple(columns),
             x[..., :3],
             cov[..., :3, :3],
-            moved[0],
-            moved[1],
+            received,
+            sent,
             time.perf_counter() - began,
             notes=notes,
             heading=wrap(x[..., 3]),
