@@ -31,7 +31,7 @@ def scheduler(tmp_path_factory: pytest.TempPathFactory) -> Iterator[str]:
     file = tmp_path_factory.mktemp("scheduler") / "scheduler.json"
     words = ["scheduler", "--host", "127.0.0.1", "--port", "0", "--no-dashboard", "--scheduler-file", str(file)]
     process = dask(words, file.parent)
-    wait_for(file.is_file)
+    wait_for(lambda: file.is_file() and file.read_text().rstrip().endswith("}"))  # it is there before it is written
     yield json.loads(file.read_text())["address"]
     end(process)
 
