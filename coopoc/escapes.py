@@ -5,12 +5,12 @@ from __future__ import annotations
 import re
 import unicodedata
 
-_SPECIAL = "\\&%$#_{}~^±–≤≥×σ°²<>|"
-_COMMANDS = (
-    r"\textbackslash{} \& \% \$ \# \_ \{ \} \textasciitilde{} \textasciicircum{} $\pm$ "
-    r"-- $\le$ $\ge$ $\times$ $\sigma$ $^\circ$ $^2$ \textless{} \textgreater{} \textbar{}"
+_PAIRS = (
+    r"\ \textbackslash{}, & \&, % \%, $ \$, # \#, _ \_, { \{, } \}, ~ \textasciitilde{}, ^ \textasciicircum{}, "
+    r"± $\pm$, – --, ≤ $\le$, ≥ $\ge$, × $\times$, σ $\sigma$, ° $^\circ$, ² $^2$, "
+    r"< \textless{}, > \textgreater{}, | \textbar{}"
 )
-_LATEX = dict(zip(_SPECIAL, _COMMANDS.split(), strict=True))
+_LATEX = dict(pair.split() for pair in _PAIRS.split(", "))
 """Letter -> what LaTeX shows as it."""
 
 

@@ -25,7 +25,7 @@ def main() -> None:
         status = ended.code
     except KeyboardInterrupt:
         pass
-    threading._shutdown()  # type: ignore[attr-defined]  # as Python does first: what waits in threads tells workers to end
+    threading._shutdown()  # type: ignore[attr-defined]  # as Python does first: a thread that waits there ends the workers
     atexit._run_exitfuncs()
     with suppress(OSError):
         sys.stdout.flush()

@@ -72,7 +72,7 @@ def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> 
 
 @pytest.mark.parametrize(("options", "offset", "most"), [("", 2.0, 1.0), ("?dt=0.1", 0.0, 0.97), ("", 0.0, 0.93)])
 def test_ranges_help_or_do_no_harm(tmp_path: Path, options: str, offset: float, most: float) -> None:
-    """Radios whose delays nobody calibrated, and steps at half of which nothing is measured."""
+    """Radios with uncalibrated delays, and steps at half of which nothing is measured."""
     fleet, parts = bends(4, 2.0), list[pd.DataFrame]()
     for k, name in enumerate(fleet.ids):
         parts += [fixes(fleet, name, 1.0, 1.5, 10 * k), motion(fleet, name, 0.1, 0.1, 10 * k + 1)]
