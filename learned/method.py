@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -16,7 +15,7 @@ from coopoc.errors import InputError, shown
 from coopoc.methods.stream import Stream
 from coopoc.methods.track import Track, check_options, lost, silent_track
 from coopoc.short_repr import short_repr
-from coopoc.world.recording import Recording, check_recording
+from coopoc.world.recording import Egos, Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
 from .stream import GainState, SoloGain, StepByStep
@@ -72,7 +71,7 @@ class LearnedGain:
         """
         return Stream(SoloGain(self.model), x0, history)
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Estimates of the egos, all runs at once; `notes` count the runs that diverged from the fixes."""
         began, columns = time.perf_counter(), check_recording(recording).columns(egos)
         x0, origin = self._x0(recording, columns), recording.gnss[:, :1, columns]

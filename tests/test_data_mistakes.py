@@ -1,7 +1,9 @@
 """Typical mistakes in logs: each ends in the message that docs/your_data.md shows, with file, row and column."""
 
+import io
 import re
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -301,9 +303,33 @@ def test_options_behind_a_question_mark_are_those_of_python(tmp_path: Path) -> N
         ("kinds=uwb", "must be word:kind pairs"),
         ("dt=x", "must be a number of SI units"),
         ("any_scale=yes", "must be true or false"),
+        ("clock=a,b:1", "of a name a comma as %2C"),
+        ("std=vx:-1", r"std of vx = -1.0: must be .* > 0"),
+        ("scale=t:-1", r"scale of t = -1.0: must be .* > 0"),
+        ("origin=nan,11.5,510", r"origin\[0\] = nan"),
+        ("since=-5", "since, until"),
+        ("until=nan", "since, until"),
     ):
         with refused(message):
             load_log(f"{tmp_path / 'a.csv'}?{words}")
+
+
+def test_stamps_of_32_bits_are_named(tmp_path: Path) -> None:
+    frame = pd.read_csv(io.StringIO(GOOD))
+    for begin in (0.0, 1e5, 1.7e9):
+        t = (begin + 99.93 * frame["t"]).astype(np.float32)
+        frame.assign(t=t, arrival=np.where(frame["arrival"] > 0, t, np.nan)).to_parquet(tmp_path / "log.parquet")
+        with refused("column t = multiples of 128 s") if begin > 1e9 else nullcontext():
+            summary = str(co.read_log(tmp_path / "log.parquet", origin=(1, 2, 3)).summary)
+            assert ("t is of 32-bit floats, multiples of 0.0078 s" in summary) == (begin == 1e5)
+            assert "origin= has no effect" in summary
+
+
+def test_a_name_with_a_comma_has_a_clock_and_an_offset(tmp_path: Path) -> None:
+    (tmp_path / "log.csv").write_text(GOOD.replace("blue", '"b,l"'))
+    log = load_log(f"{tmp_path / 'log.csv'}?clock=b%2Cl:0.2&offset=red-b%2Cl:0.3")
+    again = co.read_log(tmp_path / "log.csv", clock={"b,l": 0.2}, offset={"red-b,l": 0.3})
+    assert same(log.recording, again.recording)
 
 
 def test_places_need_no_times(tmp_path: Path) -> None:

@@ -107,7 +107,7 @@ def test_a_track_notes_covariances_that_are_none(damage: np.ndarray) -> None:
     covariance = track.covariance.copy()
     covariance[1, 3:5, 0] = damage
     noted = replace(track, covariance=covariance)
-    assert noted.notes[0].startswith(f"2 of {2 * STEPS} covariances are not positive semidefinite")
+    assert noted.notes[0].startswith(f"2 of {2 * STEPS} covariances are not symmetric and positive semidefinite")
     assert replace(noted, seconds=1.0).notes == noted.notes
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
@@ -10,7 +9,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ..arrays import Floats
-from ..world.recording import Recording, check_recording
+from ..world.recording import Egos, Recording, check_recording
 from ..world.v2x import Message
 from .noise_model import NoiseModel
 from .track import TINY, Checked, Track, check_options
@@ -52,7 +51,7 @@ class CentralFilter(Checked):
     cooperative: bool = True
     message: Message = UPLOAD
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
@@ -126,7 +125,7 @@ class BatchSmoother:
         steps = (0, 1e18, "a whole number >= 0, 0 for linear only")
         check_options(self, {"exact_steps": steps, "settle": (TINY, np.inf, "> 0 m, infinity for no further steps")})
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:

@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..kernels.stars.messages import ESTIMATE_GROWTH
 from ..kernels.stars.pseudo_fixes import run_intersection
-from ..world.recording import Recording, check_recording
+from ..world.recording import Egos, Recording, check_recording
 from ..world.v2x import ESTIMATE_AND_COV, Message
 from .baselines import solo_estimates
 from .egos import Estimate, follow_egos, measurements
@@ -52,7 +51,7 @@ class CovarianceIntersection(Checked):
     cooperative: bool = True
     message: Message = ESTIMATE_AND_COV
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Track of the egos and of their neighbours' estimates; InputError if one is unknown or absent.
 
         `age` steps later the velocity's error has come in age + 1 times, once in p_j itself and fully correlated:

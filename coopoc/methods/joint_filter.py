@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..kernels.stars.joint_filter import run_filter
-from ..world.recording import Recording
+from ..world.recording import Egos, Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
@@ -46,7 +45,7 @@ class JointFilter(Checked):
     cooperative: bool = True
     message: Message = FIX_AND_VELOCITY
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)
         assumed, gates = assumptions(recording, known), self.robust and known.exact_relative

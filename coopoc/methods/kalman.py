@@ -15,7 +15,7 @@ from ..kernels.gate import FIX_GATE
 from ..kernels.motion import MotionNoise
 from ..kernels.solo import FixNoise, SoloMeasurements, run_filter
 from ..short_repr import short_repr
-from ..world.recording import Recording, check_recording
+from ..world.recording import Egos, Recording, check_recording
 from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NO_VARIANCE, NoiseModel, constant_noise, motion_noise, process_noise, resolve
@@ -35,7 +35,7 @@ class GNSS:
     cooperative: bool = False
     message: Message = NO_MESSAGE
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
         began = time.perf_counter()
         columns = check_recording(recording).columns(egos)
@@ -74,7 +74,7 @@ class Kalman(Checked):
 
     __repr__ = short_repr
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began = time.perf_counter()
         columns = check_recording(recording).columns(egos)
@@ -152,7 +152,7 @@ class AdaptiveKalman:
         positive = (TINY, np.inf, "> 0, infinity for never")
         check_options(self, {"prior_weight": positive, "window": positive})
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began, columns = time.perf_counter(), check_recording(recording).columns(egos)
         x, p, _ = solo_filter(recording, columns, NoiseModel.nominal(self.assumed), self._fixes, self.x0)
@@ -167,7 +167,7 @@ class AdaptiveKalman:
         """Start the filter for one step at a time, as `Kalman.start`; `state.noise` is the estimated variance."""
         return FilterStream(motion_noise(NoiseModel.nominal(self.assumed), interval), self._fixes, x0, history)
 
-    def gnss_std(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Floats:
+    def gnss_std(self, recording: Recording, egos: Egos = (0,)) -> Floats:
         """(R, T, E, 3) m, the estimated standard deviation of the fixes at every step."""
         columns = check_recording(recording).columns(egos)
         known = NoiseModel.nominal(self.assumed)

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..world.inbox import Inbox
-from ..world.recording import Recording
+from ..world.recording import Egos, Recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
@@ -68,7 +68,7 @@ class MovingHorizon:
     def __post_init__(self) -> None:
         check_options(self, {"horizon": (1, 1e18, "a whole number >= 1, such as 10 to 20 at 10 Hz")})
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         from ..kernels.windows.horizon import Settings, horizons
 

@@ -16,7 +16,7 @@ from ..kernels.road import SCALE, Z_VARIANCE, RoadNoise, RoadState, Z, road_moti
 from ..kernels.solo import SoloMeasurements
 from ..short_repr import short_repr
 from ..world.fleet import Fleet
-from ..world.recording import Recording, check_recording
+from ..world.recording import Egos, Recording, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 from .motion_history import MotionHistory
 from .noise_model import NoiseModel, constant_noise, motion_noise, process_noise, resolve
@@ -113,7 +113,7 @@ class RoadFilter:
     def __post_init__(self) -> None:
         check_options(self, kinds={"errors": RoadErrors})
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Track of the egos, with `extras` heading_error and scale_error; InputError if one is unknown or absent."""
         began = time.perf_counter()
         columns = check_recording(recording).columns(egos)

@@ -12,14 +12,14 @@ import numpy as np
 from ..arrays import Bools, Floats, checked, number, texts
 from ..errors import InputError, shown
 from ..short_repr import short_repr
-from ..world.recording import Recording
+from ..world.recording import Egos, Recording
 from ..world.sensors import Sensors
 from ..world.v2x import Message
 from .noise_model import NoiseModel
 
 UNSOUND = (
-    "covariances are not positive semidefinite: the assumed standard deviations lie too far apart for double "
-    "precision; raise the smallest"
+    "covariances are not symmetric and positive semidefinite: a method of one's own returns others, or the assumed "
+    "standard deviations lie too far apart for double precision; raise the smallest"
 )
 """What a note says of covariances that are no covariances."""
 
@@ -163,7 +163,7 @@ class Method(Protocol):
     def message(self) -> Message:
         """The message that each vehicle broadcasts."""
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Estimates of the egos."""
 
 

@@ -17,6 +17,9 @@ from .links import Links, stretches, told
 from .sensors import Sensors
 from .v2x import V2X
 
+Egos = Sequence[int | str]
+"""Columns or ids of the vehicles that a method follows."""
+
 
 @dataclass(frozen=True, eq=False)
 class Body:
@@ -222,7 +225,7 @@ class Recording:
         (column,) = columns("ego", [ego], self.ids)
         return np.bincount(self.links.step[self.links.of(column)], minlength=len(self.t)).astype(np.int64)
 
-    def observing(self, egos: Sequence[int | str]) -> list[int]:
+    def observing(self, egos: Egos) -> list[int]:
         """Columns of the egos, absent or not; InputError if one is unknown or no observer of this recording."""
         egos = listed("egos", egos, "Give [0] for the first.")
         cols = columns("egos", egos, self.ids)
@@ -234,7 +237,7 @@ class Recording:
                 raise InputError("egos", repr(ego), allowed, "Name it in observe(..., observers=[...]).")
         return cols
 
-    def columns(self, egos: Sequence[int | str]) -> list[int]:
+    def columns(self, egos: Egos) -> list[int]:
         """Columns of the egos; InputError if one is unknown, no observer of this recording, absent at times, or without
         a first fix. Later ones may be missing (NaN)."""
         cols = self.observing(egos)

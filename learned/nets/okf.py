@@ -20,7 +20,7 @@ from coopoc.methods.noise_model import check_interval
 from coopoc.methods.stream import FilterStream
 from coopoc.methods.track import Track, check_options
 from coopoc.short_repr import short_repr
-from coopoc.world.recording import Recording, check_recording
+from coopoc.world.recording import Egos, Recording, check_recording
 from coopoc.world.v2x import NO_MESSAGE, Message
 
 from ..training.clients import Batch, Segments
@@ -80,7 +80,7 @@ class OptimisedKF:
         check_interval(interval)
         return FilterStream(self._motion(float(interval)), FixNoise(np.square(self.gnss_std)), x0, history)
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Estimates and covariances of the egos."""
         began, columns = time.perf_counter(), check_recording(recording).columns(egos)
         fixes = FixNoise(np.square(self.gnss_std))

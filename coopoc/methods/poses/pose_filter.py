@@ -14,7 +14,7 @@ from ...errors import InputError
 from ...short_repr import short_repr
 from ...world.inbox import inbox
 from ...world.links import wrap
-from ...world.recording import Recording, check_recording
+from ...world.recording import Egos, Recording, check_recording
 from ...world.sensors import Sensors
 from ...world.v2x import NO_MESSAGE, Message
 from ..track import Track, check_options
@@ -115,7 +115,7 @@ class PoseFilter:
             return NO_MESSAGE
         return UPLOAD if self.fusion == "joint" else POSE
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
         """Track of the egos.
 
         Raises:
