@@ -65,8 +65,6 @@ FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
     "a body twist as vx, vy": (body_twist, "car0: vx, vy look like a body-frame velocity"),
     "easting and northing": (lambda f: f.rename(columns={"x": "y", "y": "x"}), "car0: axes look swapped"),
     "a mirrored velocity": (lambda f: f.assign(vy=-f["vy"]), "car0: axes look swapped or mirrored: .* at -?0 deg"),
-    "a velocity to the left": (lambda f: f.assign(vx=f["vy"], vy=-f["vx"]), "car1: .* look turned by -90 deg"),
-    "velocities by name": (lambda f: f.rename(columns={"vx": "vy", "vy": "vx"}), "car0: axes look swapped"),
     "a partner without a place": (
         lambda f: pd.concat([f, f[f["range"].notna()].assign(partner="anchor")]),
         r"\d+% of what was logged is not used, first of all \d+ relative measurements of members without a position",

@@ -525,6 +525,7 @@ def _other_angle(c: Check) -> str:
     there = np.isfinite(c.relative[:, 1]) & (np.abs(moves) > MOVING)
     residual, course, measured = c.relative[there, 1], np.angle(moves[there]), c.world.relative[0, there, 1]
     off = float(np.angle(np.exp(1j * residual).sum()))
+    off += float(np.median(wrap(residual - off)))
     for like, turn in (
         ("bearings: name them bearing", course),
         ("azimuths: name them azimuth", -course),
