@@ -364,7 +364,8 @@ def _truth(name: str, truths: Mapping[str, Path], estimates: Mapping[str, Path])
 
 
 def _at(path: Path, k: Ints) -> Path:
-    return Path(**{name: None if value is None else value[k] for name, value in vars(path).items()})
+    parts: dict[str, Any] = {name: None if value is None else value[k] for name, value in vars(path).items()}
+    return Path(**parts)
 
 
 def _moved(path: Path, motion: Alignment) -> Path:

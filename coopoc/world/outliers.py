@@ -58,7 +58,7 @@ class Outliers:
     """Slip: the speed is measured too high or too low by a share of itself; wheels that lock measure none."""
 
     def __post_init__(self) -> None:
-        check_fields(self, **{field.name: Fault for field in fields(self)})
+        check_fields(self, None, **{field.name: Fault for field in fields(self)})
 
     @classmethod
     def uwb_nlos(cls) -> Outliers:
