@@ -80,6 +80,10 @@ class CooperativeFilter(Checked):
 
     >>> CooperativeFilter().message.payload
     56
+    >>> from coopoc import Fleet, Sensors, observe
+    >>> still = Fleet(("a",), np.arange(400), np.zeros((400, 1, 3)), np.zeros((400, 1, 3)))
+    >>> CooperativeFilter()(observe(still, Sensors(gnss_common_std=9.0))).notes  # that errors last is known
+    ()
     """
 
     noise_model: NoiseModel | str = "nominal"

@@ -92,6 +92,8 @@ class Outliers:
         Raises:
             InputError: an unknown preset or kind, a rate outside [0, 1].
 
+        >>> Outliers.named("urban_canyon").notes[-1]
+        '5 % of the fixes missing, for 5 s'
         >>> Outliers.named("urban_canyon+ranges=0.05:2").notes[0]
         '5 % of the ranges 3 to 20 m too long, for 2 s'
         >>> Outliers.named("ranges")  # doctest: +ELLIPSIS
