@@ -100,8 +100,6 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     >>> load_fleet("town10-clients").present.sum(axis=0)
     array([1550, 4600, 1450, 1420])
     """
-    if isinstance(name_or_path, str) and name_or_path in DATASETS and format is None and not options:
-        return DATASETS[name_or_path]()
     name, options, part = _split(name_or_path, {"format": format, **options})
     chosen = options.pop("format", None)
     if chosen is None and (in_file(name) or name in names("coopoc.datasets")):
