@@ -286,4 +286,4 @@ def _blocks(error: Floats, start: int, length: float) -> Floats:
     size = max(int(length), 1)
     parts = [error[first : first + size] for first in range(start, len(error) - size + 1, size)]
     found = np.array([np.sqrt(np.nanmean(part**2, axis=0)) for part in parts if np.isfinite(part).any(axis=0).all()])
-    return np.asarray(found.T)
+    return found.T

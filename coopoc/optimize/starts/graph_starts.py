@@ -110,7 +110,7 @@ def along_poses(problem: Problem) -> Floats:
             rows = np.flatnonzero(on & ~np.isin(f.nodes[:, 1], still))[::-1]  # the first that sees a point places it
             i, j = f.nodes[rows].T
             x[j, :d] = x[i, :d] + np.einsum("mab,mb->ma", space.rotation(x[i]), f.z[rows])
-    return np.asarray(x)
+    return x
 
 
 def parts(n: int, *joined: Ints) -> Ints:
