@@ -114,13 +114,16 @@ def along_poses(problem: Problem) -> Floats:
 
 
 def parts(n: int, *joined: Ints) -> Ints:
-    """(n,) the first node of the connected component that each is in, by pairs, (M, 2) each, that are joined."""
-    part, pairs = np.arange(n), np.concatenate([np.empty((0, 2), np.int64), *joined])
-    while (apart := part[pairs[:, 0]] != part[pairs[:, 1]]).any():
-        ends = part[pairs[apart]]
-        np.minimum.at(part, ends.max(axis=1), ends.min(axis=1))
-        while (part != (up := part[part])).any():
-            part = up
+    """(n,) the connected component that each is in, by pairs, (M, 2) each, that are joined; counted by first nodes.
+
+    >>> parts(4, np.array([[3, 1]])).tolist()
+    [0, 1, 2, 1]
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = np.concatenate([np.empty((0, 2), np.int64), *joined])
+    part: Ints = connected_components(csr_array((np.ones(len(pairs)), pairs.T), (n, n)), directed=False)[1]
     return part
 
 
