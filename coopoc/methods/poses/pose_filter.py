@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Ints, checked, number, one_of
+from ...arrays import Bools, Floats, Ints, checked, number
 from ...errors import InputError
 from ...short_repr import short_repr
 from ...world.inbox import inbox
 from ...world.links import wrap
-from ...world.recording import Recording, check_recording
+from ...world.recording import Recording, Vehicles, check_recording
 from ...world.sensors import Sensors
 from ...world.v2x import NO_MESSAGE, Message
 from ..track import Track, check_options
@@ -93,9 +93,7 @@ class PoseFilter:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_options(self)
-        one_of("unit", self.unit, get_args(Unit))
-        one_of("fusion", self.fusion, get_args(Fusion))
+        check_options(self, unit=Unit, fusion=Fusion)
         if self.fusion != "joint" and self.unit != "fleet":
             raise InputError("fusion", self.fusion, "is for a fleet", 'Take unit="fleet".')
         number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="4 leaves outliers out.")
@@ -115,7 +113,7 @@ class PoseFilter:
             return NO_MESSAGE
         return UPLOAD if self.fusion == "joint" else POSE
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos.
 
         Raises:

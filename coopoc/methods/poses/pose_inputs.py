@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints, checked, listed
 from ...errors import InputError
 from ...kernels.stars.messages import FORGOTTEN
-from ...world.recording import Body, Recording
+from ...world.recording import Body, Recording, Vehicles
 from ...world.sensors import Sensors
 from ...world.v2x import Message
 
@@ -30,7 +30,7 @@ LEAST_HEADING_STD, LEAST_YAW_RATE_STD = 1e-6, 1e-5
 """rad and rad/s: a filter needs some noise, however exact its sensors are."""
 
 
-def pose_egos(recording: Recording, egos: Sequence[int | str]) -> list[int]:
+def pose_egos(recording: Recording, egos: Vehicles) -> list[int]:
     """Columns of egos that are there throughout; InputError for one that is not, and for a landmark."""
     egos = listed("egos", egos, "Give [0] for the first.")
     columns = recording.observing(egos)
