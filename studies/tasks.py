@@ -144,7 +144,7 @@ def bound(task: Task, information: str) -> float:
 
 POSES: Mapping[str, Mapping[str, Any]] = {
     "pose-solo": {"unit": "solo"},
-    "pose-plain": {"unit": "solo", "exact": False, "robust": False},
+    "pose-plain": {"unit": "solo", "exact": False, "robust": False, "lasting": False},
     "pose-fleet": {"unit": "fleet"},
     "pose-intersection": {"unit": "fleet", "fusion": "intersection"},
     "pose-naive": {"unit": "fleet", "fusion": "naive"},
@@ -231,7 +231,7 @@ def pose_row(task: Logged, folder: Path, made: Any) -> dict[str, Any]:
     path = located(folder, task.file)
     recording, fleet, start, known = seen(task, path)
     if isinstance(made, str):
-        made = PoseFilter(**POSES[made], lasting=task.name == "robots", gate=GATE, **known)
+        made = PoseFilter(**{"lasting": task.name != "uwb", **known, **POSES[made]}, gate=GATE)
     elif is_dataclass(made):
         own = {field.name for field in fields(made)}
         made = replace(made, **{name: value for name, value in known.items() if name in own})  # type: ignore[type-var]
