@@ -126,8 +126,10 @@ def _bodies(outer: ast.AST) -> list[ast.stmt]:
 
 MOST_TESTS = 3
 """Files of tests, those that mention the file's names most."""
-LONG = re.compile("test_(study|studies|cli|install|extend|site|examples|reliability|layering)")
-"""Files of tests that run whole studies or look at conventions: they take minutes and see little of a formula."""
+LONG = re.compile("^(?!studies).*test_(study|studies|cli|install|extend|site|examples|reliability|layering)")
+"""Tests of whole studies or of conventions, behind a file that is no study: they take minutes and see little of a
+formula."""
+FOLDERS = ("coopoc", "data", "learned", "studies")
 ORACLE = re.compile(r"^from (oracles|coopoc\.kernels)|callable_part", re.MULTILINE)
 """In tests that compare kernels with an oracle."""
 
@@ -144,7 +146,7 @@ def tests_of(file: str) -> list[str]:
         for test, words in _words().items():
             shared = set(used.stem.split("_")) & set(Path(test).stem.split("_")[1:])
             scores[test] += weight * (sum(words[name] for name in _defined(used)) + 10 * len(shared))
-    tests = [test for test, score in scores.most_common() if score]
+    tests = [test for test, score in scores.most_common() if score and not LONG.search(f"{file} {test}")]
     if file.startswith("coopoc/kernels/"):
         much = scores.most_common(1)[0][1] / 4
         near = [test for test in tests if scores[test] >= much]
@@ -155,24 +157,23 @@ def tests_of(file: str) -> list[str]:
 
 @cache
 def _words() -> dict[str, Counter[str]]:
-    """How often each word stands in each file of tests that is not LONG."""
-    texts = {str(test.relative_to(ROOT)): test.read_text() for test in (ROOT / "tests").glob("test_*.py")}
-    return {test: Counter(re.findall(r"\w+", text)) for test, text in texts.items() if not LONG.search(test)}
+    """How often each word stands in each file of tests."""
+    tests = (ROOT / "tests").glob("test_*.py")
+    return {str(test.relative_to(ROOT)): Counter(re.findall(r"\w+", test.read_text())) for test in tests}
 
 
 @cache
 def _defined(file: Path) -> tuple[str, ...]:
     """Public names of a file that are more than a common word, and its own."""
-    kinds = ast.FunctionDef | ast.ClassDef
-    names = [node.name for node in ast.parse(file.read_text()).body if isinstance(node, kinds)]
+    body = ast.parse(file.read_text()).body
+    names = [node.name for node in body if isinstance(node, ast.FunctionDef | ast.ClassDef)]
     return (file.stem, *(name for name in names if name[0] != "_" and (name != name.lower() or "_" in name)))
 
 
 @cache
 def _importers(file: Path) -> tuple[Path, ...]:
     """Files that import from a file."""
-    folders = (ROOT / "coopoc", ROOT / "learned")
-    every = [other for folder in folders for other in folder.rglob("*.py") if other.name != "__init__.py"]
+    every = [other for folder in FOLDERS for other in (ROOT / folder).rglob("*.py") if other.name != "__init__.py"]
     return tuple(other for other in every if file in _imported(other))
 
 
@@ -183,7 +184,8 @@ def _imported(file: Path) -> frozenset[Path]:
     for node in ast.walk(ast.parse(file.read_bytes())):
         if isinstance(node, ast.ImportFrom):
             above = file.parents[node.level - 1] if node.level else ROOT
-            module = above.joinpath(*(node.module or "").split("."))
+            named = re.sub(r"^coopoc\.(?=data|learned|studies)", "", node.module or "")
+            module = above.joinpath(*named.split("."))
             found |= {module.with_suffix(".py"), *(module / f"{name.name}.py" for name in node.names)}
     return frozenset(found)
 

@@ -108,6 +108,9 @@ def plot_solution(solution: Solution, ax: Axes | None = None, *, problem: Proble
     >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
     >>> plot_solution(solve(problem), problem=problem).get_ylabel()
     'North [m]'
+    >>> problem = problem.add("range", ("a", "b"), 9.0, std=1.0).add("displacement", ("a", "b"), [9, 0, 0], std=1.0)
+    >>> [float(lines.get_linewidth()[0]) for lines in plot_solution(solve(problem), problem=problem).collections]
+    [2.4, 1.2]
     """
     from .optimize.model.problem import Problem
 

@@ -80,7 +80,7 @@ def _seeds(results: Results, where: Where) -> Interval | None:
 def _figure(results: Results) -> Plot | None:
     from coopoc.study import figures
 
-    rounds = sorted(results.frame["round"].unique()) if "round" in results.frame else [0]
+    rounds = sorted(results.frame["round"].unique()) if "round" in results.frame else ()
     ticks = {number: str(number) for number in rounds if number % 5 == 0}
     panel = Panel({number: {"round": number} for number in rounds}, xlabel="Round", ticks=ticks)
     text = (

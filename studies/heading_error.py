@@ -147,13 +147,8 @@ def pose(k: int) -> str:
 
 def _grid() -> list[Row]:
     """All compasses at one speed after a long drive; without a compass all speeds after all times."""
-    cases = [{"speed": SPEED, "after_s": AFTER[-1], "compass": word} for word in COMPASSES]
-    cases += [
-        {"speed": speed, "after_s": after, "compass": NONE}
-        for speed in SPEEDS
-        for after in AFTER
-        if (speed, after) != (SPEED, AFTER[-1])
-    ]
+    cases = [{**DRIVEN, "compass": word} for word in COMPASSES if word != NONE]
+    cases += [{"speed": speed, "after_s": after, "compass": NONE} for speed in SPEEDS for after in AFTER]
     rows = []
     for case in cases:
         for k in NEIGHBOURS:

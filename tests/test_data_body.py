@@ -239,7 +239,7 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path: Path, monkeyp
     assert set(frame["landmarks"]) == {0, 1}
     assert set(frame.loc[frame["method"] == "trained-centralised", "max_neighbours"]) == {0, 2}
     log = load_log(data)
-    alone = co.PoseFilter("solo", gate=5.0)(log.recording, list(CARS))
+    alone = co.PoseFilter("solo", lasting=True, gate=5.0)(log.recording, list(CARS))
     apart = np.linalg.norm(alone.x[0, 100:150, 1] - np.pad(drives()["blue"][0][100:150], ((0, 0), (0, 1))), axis=1)
     found = results.select(method="pose-fleet", max_neighbours=0, landmarks=1, ego="blue", run=0)["rt_le_m"]
     assert found.tolist() == pytest.approx([np.sqrt(np.mean(apart**2))], rel=1e-9)
@@ -249,6 +249,8 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path: Path, monkeyp
     assert "600 bearings" in caption
     assert "then they are thinned" in caption
     assert re.match("K = 1 without a landmark.* with 1 landmark ", real.STUDY.answers(results)["worth, K = 1"])
+    two = replace(results, frame=results.select(method="pose-fleet", landmarks=1, max_neighbours=[0, 1]))
+    assert "over 2 cells" in real.STUDY.answers(two)["nees"]
     monkeypatch.setattr(real.drives, "has_true_poses", lambda _: False)
     assert "No row is trained" in real._caption(results, "")
 

@@ -1,6 +1,7 @@
 """Logs of one's own from file to table and picture: the check, studies, and a Recording as a setting."""
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +18,7 @@ from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
 from coopoc.data.registry import load_fleet, load_log
 from coopoc.evaluate.metrics import fix_innovations, innovation_columns, normalised_innovations
-from coopoc.studies import lineup, paths
+from coopoc.studies import lineup, neighbours, paths, pose_drives, scene
 from coopoc.study.report import report
 from coopoc.study.results import ego_by_run
 from coopoc.world.storage import digest, read_recording, save_recording
@@ -52,6 +53,20 @@ def test_truth_is_read_on_the_steps_of_the_recording(folders: Path) -> None:
     assert co.load_recording(folders / "with").ids == log.recording.ids
     with refused(r"without = no truth: .*truth\.csv"):
         load_fleet(folders / "without")
+    late = log.recording.gnss.copy()
+    late[:, 0] = np.nan
+    for gnss in (late, log.recording.gnss):
+        recording = replace(log.recording, gnss=gnss)
+        assert lineup.complete(recording, ["car0"], log.truth) == (gnss is not late)
+
+
+def test_a_unit_at_the_road_is_no_ego_and_real_data_have_no_bound(tmp_path: Path) -> None:
+    frame = long(observed(drive(3)), messages=False)
+    stands = (frame["vehicle"] == "car2") & frame["kind"].isin(["vx", "vy", "vz"])
+    data = str(write(frame.assign(value=frame["value"].mask(stands, 0.0)), tmp_path / "log.csv"))
+    assert scene.egos(data, "auto") == pose_drives.drive(data, 0.0, co.V2X(2), 3.0).ids == ("car0", "car1")
+    methods = {cell.given["method"] for cell in neighbours.STUDY.override({"data": data}).cells()}
+    assert "bound" not in methods >= {"kalman"}
 
 
 def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> None:
@@ -92,7 +107,10 @@ def test_a_vehicle_that_is_away_keeps_its_blocks_and_a_block_without_a_fix_is_le
     folders: Path, tmp_path: Path
 ) -> None:
     settings = {"data": str(folders / "with"), "method": "cooperative-filter", "max_neighbours": 0}
-    results = co.run_study("real", tmp_path, settings={**settings, "calibrate_s": 4, "block_s": 4}, progress=False)
+    for block, runs in ((0.1, 160), (4, 4)):
+        given = {**settings, "calibrate_s": 4, "block_s": block}
+        results = co.run_study("real", tmp_path / str(block), settings=given, progress=False)
+        assert results.frame["run"].nunique() == runs
     assert results.values("rt_le_m").shape == (4, 4)
     rows = results.frame.copy()
     rows.loc[rows["run"] == 1, "innovation_m"] = np.nan

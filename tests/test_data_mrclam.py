@@ -223,7 +223,7 @@ def small(folder: Path, robots: tuple[int, ...] = (1, 2)) -> Path:
         other = robots[(k + 1) % len(robots)]
         turn = np.pi / 2 if robots.index(other) > k else -np.pi / 2
         seen = "".join(f"{s:.3f} {10 * other} {abs(robots.index(other) - k)}.0 {turn:.5f}\n" for s in t[2:20])
-        (folder / f"Robot{n}_Measurement.dat").write_text("# Time code r b\n" + seen)
+        (folder / f"Robot{n}_Measurement.dat").write_text("# Time code r b\n" + seen + f"{t[20]:.3f} 99 1 0\n")
     return folder
 
 
@@ -269,7 +269,7 @@ def test_a_bad_line_is_named(tmp_path: Path, case: str) -> None:
 
 
 def test_robots_share_an_interval(tmp_path: Path) -> None:
-    small(tmp_path)
+    assert len(read_mrclam(small(tmp_path), dt=3.0).fleet.t) == 2
     for kind in ("Groundtruth", "Odometry"):
         file = tmp_path / f"Robot2_{kind}.dat"
         file.write_text(file.read_text().replace("12482722", "12492722"))

@@ -119,6 +119,8 @@ def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path:
     own, common = value["own"], value["common"]
     assert own[1] < 0.5 * own[0]
     assert common[1] > 0.8 * common[0]
+    where = {**correlated_gnss.CASES["white"], "method": "joint", "max_neighbours": 6}
+    assert not isinstance(correlated_gnss._over_runs(results, where), float)
     found = correlated_gnss.STUDY.answers(results)
     assert list(found) == ["white", "own", "common"]
     assert all(text.startswith(f"{name}: ") for name, text in found.items())

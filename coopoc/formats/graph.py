@@ -301,6 +301,10 @@ def _ends(graph: Graph, field: str, nodes: Ints, place: Place) -> None:
 
 
 def _values(edges: Edges, field: str, place: Place) -> None:
+    """InputError for numbers that no edge may have; what is exact or of the least size may stay.
+
+    >>> _values(PointEdges([[0], [0]], np.zeros((2, 2)), [np.zeros((2, 2)), LEAST * np.eye(2)]), "point_prior", str)
+    """
     for name in [n for n in shapes(field, 2, 0) if n not in ("nodes", "stamps")]:
         values: Floats = getattr(edges, name).reshape(len(edges), -1)
         mend, given = "Mend the number.", f"{name} "

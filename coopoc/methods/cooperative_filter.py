@@ -15,7 +15,7 @@ from ..kernels.stars.cooperative_filter import run_filter
 from ..kernels.stars.cooperative_state import NO_GUARDS, Guards, Model, Sent
 from ..kernels.stars.messages import ACCELERATION_STD, FORGOTTEN
 from ..world.inbox import Inbox, inbox
-from ..world.recording import Egos, Recording, check_recording
+from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
 from .noise_model import NoiseModel, resolve
@@ -80,20 +80,24 @@ class CooperativeFilter(Checked):
 
     >>> CooperativeFilter().message.payload
     56
+    >>> from coopoc import Fleet, Sensors, observe
+    >>> still = Fleet(("a",), np.arange(400), np.zeros((400, 1, 3)), np.zeros((400, 1, 3)))
+    >>> CooperativeFilter()(observe(still, Sensors(gnss_common_std=9.0))).notes  # that errors last is known
+    ()
     """
 
     noise_model: NoiseModel | str = "nominal"
     robust: bool = True
     guards: Guards = Guards()
     name: str = "cooperative-filter"
-    cooperative: bool = True
+    cooperative = True
 
     @property
     def message(self) -> Message:
         """Estimate and odometer; of the textbook filter a fix."""
         return BROADCAST if self.robust else FIX_AND_VELOCITY
 
-    def __call__(self, recording: Recording, egos: Egos = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.
 
         `extras` hold the weights, 1 for a number that was believed, of each ego's "fix" (R, T, E) and by link (R, L) of

@@ -183,7 +183,14 @@ def curves(
 
 
 def _name_alike(axes: Axes, drawn: Sequence[tuple[Where, Any]], log: bool, near: float) -> None:
-    """Name lines together at their ends that coincide in this panel alone."""
+    """Name lines together at their ends that coincide in this panel alone.
+
+    >>> from matplotlib.figure import Figure
+    >>> axes = Figure().subplots()
+    >>> _name_alike(axes, [({"label": name}, {0: 1.0, 7: 2.0}) for name in "AB"], log=False, near=0.1)
+    >>> axes.texts[0].xy
+    (7, 2.0)
+    """
     for group in _coinciding([("", drawn)], log, near):
         if len(group) > 1:
             x, y = list(next(points for of, points in drawn if of is group[0]).items())[-1]
@@ -226,7 +233,11 @@ def _height(shown: Sequence[Any], log: bool) -> float:
 
 
 def _joined(lines: Sequence[Where], models: Collection[str] = ()) -> str:
-    """Labels of lines that are drawn as one: what they begin with once, their noise models where there are several."""
+    """Labels of lines that are drawn as one: what they begin with once, their noise models where there are several.
+
+    >>> _joined([{"label": "Net of three"}, {"label": "Net of two"}])
+    'Net of three, two'
+    """
     first, *others = (str(of.get("label") or look(name_of(of)).label) for of in lines)
     start = first[: first.rfind(" ") + 1]
     if start and all(other.startswith(start) for other in others):

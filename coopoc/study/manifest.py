@@ -158,7 +158,7 @@ def _enter(folder: Path, mine: Manifest, shard: str, stack: ExitStack) -> None:
 
 def _taken(lock: FileLock) -> bool:
     try:
-        lock.acquire(timeout=0)
+        lock.acquire(blocking=False)
     except Timeout:
         return False
     return True

@@ -64,7 +64,13 @@ class Assessment:
 
 
 def assess(problem: Problem, x: Floats, covariance: bool = True) -> Assessment:
-    """Assessment of a problem at x (n, ambient); without constraints the covariance may be left out."""
+    """Assessment of a problem at x (n, ambient); without constraints the covariance may be left out.
+
+    >>> from coopoc.optimize import Problem
+    >>> vague = Problem(("a",)).add("position", ["a"], [[0, 0, 0]], std=1e8)  # known to 1e8 m is not unknown
+    >>> assess(vague.constrain("position", "a", upper=9e9), np.zeros((1, 3))).covariance[0].diagonal()
+    array([1.e+16, 1.e+16, 1.e+16])
+    """
     if not problem.constraints:
         return _unconstrained(problem, sparse(problem), x, covariance)
     linear = problem.linearise(x)
@@ -172,6 +178,10 @@ def _null_rows(J: Any, length: Floats) -> Floats:
     Args:
         J: (m, k) sparse.
         length: (k,) of its columns, > 0.
+
+    >>> from scipy.sparse import csc_array
+    >>> _null_rows(csc_array([[1.0, 0], [0, 1e6]]), np.array([1.0, 1e6])).shape
+    (0, 2)
     """
     from scipy.sparse import diags_array
 
@@ -179,7 +189,7 @@ def _null_rows(J: Any, length: Floats) -> Floats:
     square = unit.T @ unit
     if len(length) <= SMALL:
         values, ways = np.linalg.eigh(square.toarray())
-        return np.asarray(ways[:, values <= 1e-10 * values.max(initial=1.0)].T)
+        return ways[:, values <= 1e-10 * values.max(initial=1.0)].T
     shift, factored = 1e-12, None
     while factored is None:
         factored, shift = cholesky_of(with_still(square, np.full(len(length), shift))), 10.0 * shift

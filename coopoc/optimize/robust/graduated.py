@@ -109,6 +109,13 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
     (n, ambient), or by that of Cauchy's loss, which rejects nothing: the one of the lowest cost; its search names it.
 
     Far from the minimum these losses are flat: every measurement is rejected, and no step is left.
+
+    >>> from coopoc.optimize import Loss, Problem
+    >>> z = [[0, 0, 0], [0, 0, 0], [99, 0, 0]]
+    >>> problem = Problem(("a",)).add("position", ["a"] * 3, z, std=1.0, loss=Loss("truncated", 1.0))
+    >>> problem = problem.replace_unchecked(search=problem.search._replace(start="odometry"))
+    >>> robust_start(problem, np.array([[99.0, 0, 0]])).search.start
+    'graduated'
     """
     if problem.constraints:
         return problem
