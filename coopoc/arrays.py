@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import sys
-from collections.abc import Iterable, Mapping
-from typing import Any, TypeAlias, TypeVar
+from collections.abc import Mapping
+from dataclasses import fields
+from typing import Any, Literal, TypeAlias, TypeVar, get_args, get_origin
 
 import numpy as np
 import numpy.typing as npt
@@ -18,6 +19,12 @@ AnyArray: TypeAlias = npt.NDArray[Any]
 
 KINDS: dict[Any, tuple[str, str]] = {float: ("fiu", "number"), int: ("iu", "whole number"), bool: ("b", "boolean")}
 """Allowed kinds of dtype -> the name of one entry."""
+TYPES: dict[str, Any] = {"int": int, "float": float, "bool": bool | np.bool_, "str": str}
+"""Annotation of a field -> its class."""
+TINY = 5e-324
+"""The least positive number."""
+Limits: TypeAlias = Mapping[str, tuple[float, float, str]]
+"""Field -> least and largest value, and both in words."""
 
 
 def frozen(values: npt.ArrayLike, dtype: Any = np.float64) -> AnyArray:
@@ -69,6 +76,19 @@ def checked(
         allowed = f"must have shape {axes} = {wanted}"
         raise InputError(field, f"shape {given.shape}", allowed, "Give one entry per index of each axis.")
     return frozen(given, dtype)
+
+
+def check_arrays(made: Any, shapes: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:
+    """`checked` arrays in the fields of a dataclass; None stays where the field allows it.
+
+    Args:
+        made: instance of a dataclass, in its `__post_init__`.
+        shapes: field -> its shape in letters and in numbers.
+    """
+    for field in fields(made):
+        value = getattr(made, field.name)
+        if field.name in shapes and (value is not None or not str(field.type).endswith("None")):
+            made.__dict__[field.name] = checked(field.name, value, *shapes[field.name])
 
 
 def plain(values: object) -> AnyArray:
@@ -137,6 +157,12 @@ def number(
     return found
 
 
+def seed_of(value: object) -> int:
+    """A seed of random draws."""
+    hint = "Any whole number from 0 on will do."
+    return int(number("seed", value, 0, 2**63 - 1, kind=int, allowed="in 0..2^63 - 1", hint=hint))
+
+
 def extent(field: str, value: Any, hint: str = "Give (low, high).") -> tuple[float, float]:
     """(low, high), numbers from 0 on.
 
@@ -149,13 +175,13 @@ def extent(field: str, value: Any, hint: str = "Give (low, high).") -> tuple[flo
     return given[0], given[1]
 
 
-def one_of(noun: str, name: object, known: Iterable[str]) -> str:
-    """`name` if it is one of the words; else the error of `unknown`.
+def one_of(noun: str, name: object, known: Any) -> str:
+    """`name` if it is one of the words, a sequence or a Literal of them; else the error of `unknown`.
 
     >>> one_of("frame", "body", ("world", "body"))
     'body'
     """
-    known = tuple(known)
+    known = get_args(known) or tuple(known)
     if not isinstance(name, str) or name not in known:
         raise unknown(noun, name, known)
     return name
@@ -232,3 +258,35 @@ def check_texts(owner: object, *fields: str) -> None:
     for field in fields:
         if not isinstance(value := getattr(owner, field), str):
             raise InputError(field, shown(value), "must be text", "Leave it out, or give a word.")
+
+
+def check_fields(made: Any, limits: Limits | None = None, **kinds: Any) -> None:
+    """InputError for a value of another type than its field of a dataclass has; NumPy's numbers become Python's.
+
+    Args:
+        made: instance of a dataclass, in its `__post_init__`.
+        limits: of numbers; default no NaN.
+        kinds: field=class, or Literal, of those that are no number, array, bool or text.
+
+    >>> from coopoc import V2X
+    >>> V2X(loss=2.0)
+    Traceback (most recent call last):
+    coopoc.errors.InputError: loss = 2.0: must be in [0, 1]. Give V2X(loss=...).
+    """
+    for field in fields(made):
+        name, value, text = field.name, getattr(made, field.name), str(field.type).removesuffix(" | None")
+        if not field.init or (value is None and text != str(field.type)):
+            continue
+        hint, kind = f"Give {type(made).__name__}({name}=...).", kinds.get(name) or TYPES.get(text)
+        if kind is None and isinstance(field.default, str):  # one of some words, which the class lists
+            kind, text = str, "str"
+        if kind in (int, float):
+            most = 2**62 if kind is int else np.inf
+            low, high, words = (limits or {}).get(name, (-most, most, "no NaN"))
+            made.__dict__[name] = number(name, value, low, high, kind=kind, allowed=words, hint=hint)
+        elif text == "Floats":
+            made.__dict__[name] = checked(name, value)
+        elif get_origin(kind) is Literal:
+            one_of(name, value, kind)
+        elif kind is not None and not isinstance(value, kind):
+            raise InputError(name, shown(value), f"must be {text}", hint)

@@ -17,10 +17,9 @@ import safetensors
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from coopoc.arrays import instance
+from coopoc.arrays import check_fields, instance
 from coopoc.errors import InputError, shown
 from coopoc.file_names import given_path, replaceable
-from coopoc.methods.track import check_options
 from coopoc.one_file import in_file, path_of
 from coopoc.plugins import find, points
 from coopoc.seals import UNSEALED, holds, sealed
@@ -46,7 +45,7 @@ class Checkpoint:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_options(self, kinds={"model": Gain, "card": Mapping, "history": Tensor})
+        check_fields(self, model=Gain, card=Mapping, history=Tensor)
 
     def after(self, row: int) -> Gain:
         """The net at row `row` of the history: the round of a federation, the check of a fit; 0 is the start."""

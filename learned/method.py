@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,10 +13,9 @@ from torch import Tensor
 from coopoc.arrays import Floats
 from coopoc.errors import InputError, shown
 from coopoc.methods.stream import Stream
-from coopoc.methods.track import Track, check_options, lost, silent_track
+from coopoc.methods.track import Alone, Track, check_options, lost, silent_track
 from coopoc.short_repr import short_repr
-from coopoc.world.recording import Recording, check_recording
-from coopoc.world.v2x import NO_MESSAGE, Message
+from coopoc.world.recording import Recording, Vehicles, check_recording
 
 from .stream import GainState, SoloGain, StepByStep
 from .training.machine import one_core
@@ -27,7 +25,7 @@ SIZE = 3
 
 
 @dataclass(frozen=True, eq=False)
-class LearnedGain:
+class LearnedGain(Alone):
     """Position from own fixes and velocities with the gain of a net; no messages are exchanged.
 
     x_prior = x + dt u;  x <- x_prior + K (z - x_prior). The track has no covariance. Estimates are relative to the
@@ -49,8 +47,6 @@ class LearnedGain:
     model: StepByStep
     name: str = "fedkalmannet"
     x0: Floats | None = None
-    cooperative: bool = False
-    message: Message = NO_MESSAGE
 
     __repr__ = short_repr
 
@@ -72,7 +68,7 @@ class LearnedGain:
         """
         return Stream(SoloGain(self.model), x0, history)
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Estimates of the egos, all runs at once; `notes` count the runs that diverged from the fixes."""
         began, columns = time.perf_counter(), check_recording(recording).columns(egos)
         x0, origin = self._x0(recording, columns), recording.gnss[:, :1, columns]

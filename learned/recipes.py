@@ -10,10 +10,10 @@ from typing import Any, ClassVar, get_args
 
 import torch
 
-from coopoc.arrays import instance, one_of
+from coopoc.arrays import check_fields, instance, one_of
 from coopoc.errors import InputError, unknown
 from coopoc.file_names import given_path
-from coopoc.methods.track import Method, check_options
+from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
 from coopoc.plugins import find
 from coopoc.world.outliers import Outliers
@@ -78,8 +78,8 @@ class Recipe:
         one_of("kind of recipe", self.kind, KINDS)
         if instance("noise", self.noise, str) not in (*get_args(Noise), ROADS):
             Outliers.named(self.noise)
-        one_of("local_epoch", self.local_epoch, get_args(Epoch))
-        check_options(self, {"rounds": STEPS, "local_epochs": STEPS}, {"schedule": Schedule, "options": tuple})
+        limits = {"rounds": STEPS, "local_epochs": STEPS}
+        check_fields(self, limits, local_epoch=Epoch, schedule=Schedule, options=tuple)
         check_pieces(self.piece, self.split)
 
 
@@ -107,9 +107,7 @@ class Setting:
     reading: VelocityReading = "axis"
 
     def __post_init__(self) -> None:
-        check_options(self, {"seed": (0, 2**63 - 1, "in 0..2^63 - 1")})
-        one_of("start", self.start, get_args(Start))
-        one_of("reading", self.reading, get_args(VelocityReading))
+        check_fields(self, {"seed": (0, 2**63 - 1, "in 0..2^63 - 1")}, start=Start, reading=VelocityReading)
 
 
 @dataclass(frozen=True)

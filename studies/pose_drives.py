@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.data.log.check import GATE, begin_of, together
 from coopoc.data.log.links import under
 from coopoc.data.log.read import Log
+from coopoc.data.log.residuals import GATE, begin_of, together
 from coopoc.data.mrclam import Calibration, MrclamLog, calibrate, pose_recording, read_mrclam, surveyed
 from coopoc.data.registry import kind_of, load_log
 from coopoc.data.source import split
@@ -43,7 +43,7 @@ class Drive:
         recording: with all its landmarks.
         begin: first poses (1, N, 4) m and rad, None where first fixes and compasses give them.
         truth: on the steps of the recording, None if there is none.
-        lasting: whether scale and bias of the odometry are states.
+        lasting: whether scale and bias of the odometry, and the offset of ranges, are states.
         spread: m, m, m and rad of the first poses.
     """
 
@@ -147,7 +147,8 @@ def drive(data: str, until: float, v2x: V2X, gate: float) -> Drive:
     recording = under(log.recording, v2x, logged=log.messages)
     if in_world(data):
         return Drive(recording, None, log.truth, False)
-    lasting = recording.sensors.speed_scale_std > 0 or recording.sensors.yaw_rate_bias_std > 0
+    told = recording.sensors
+    lasting = max(told.speed_scale_std, told.yaw_rate_bias_std, told.range_offset_std) > 0
     begin, where = _begin(data, gate)
     return Drive(recording, begin, log.truth, lasting, SURE if where else SPREAD)
 

@@ -56,7 +56,10 @@ NAMES = ("run", "merge", "compare", "table", "report", "list", "reference", "gre
 MISTAKES = (
     ("run smal", "study = 'smal': must be one of"),
     ("rn", "command = 'rn': must be one of"),
-    ("run small --set max_neighbours=-1", "max_neighbours = -1: must be >= 0. Use 0 for no neighbours."),
+    (
+        "run small --set max_neighbours=-1",
+        "max_neighbours = -1: must be >= 0, 0 for no neighbours. Give V2X(max_neighbours=...).",
+    ),
     ("run small --set runs", "--set = 'runs': must be key=value"),
     ("run small --set rums=3", "Did you mean runs?"),
     ("run small --jobs 0", "jobs = 0: must be >= 1"),

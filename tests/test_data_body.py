@@ -224,7 +224,7 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path: Path, monkeyp
     assert set(frame["landmarks"]) == {0, 1}
     assert set(frame.loc[frame["method"] == "trained-centralised", "max_neighbours"]) == {0, 2}
     log = load_log(data)
-    alone = co.PoseFilter("solo", gate=5.0)(log.recording, list(CARS))
+    alone = co.PoseFilter("solo", lasting=True, gate=5.0)(log.recording, list(CARS))
     apart = np.linalg.norm(alone.x[0, 100:150, 1] - np.pad(drives()["blue"][0][100:150], ((0, 0), (0, 1))), axis=1)
     found = results.select(method="pose-fleet", max_neighbours=0, landmarks=1, ego="blue", run=0)["rt_le_m"]
     assert found.tolist() == pytest.approx([np.sqrt(np.mean(apart**2))], rel=1e-9)

@@ -100,6 +100,20 @@ def test_scale_and_bias_are_found_where_they_act() -> None:
     assert np.abs(co.heading_error(track, fleet)).mean() < np.abs(co.heading_error(ignored, fleet)).mean()
 
 
+def test_ranges_that_are_too_long_cost_little_where_that_is_a_state() -> None:
+    """Closed form: the offsets that were drawn; they are found within their standard deviations."""
+    fleet, told = convoy(3, 400), replace(WHITE, range_offset_std=2.0, range_std=0.1)
+    right, wrong = (observed(fleet, noise, 20) for noise in (replace(told, range_offset_std=0.0), told))
+    drawn = (wrong.relative - right.relative)[:, wrong.links.of(0)[0], 0]
+    states = co.PoseFilter("fleet", lasting=True)
+    track, ideal = states(wrong, [0]), states(right, [0])
+    found, std = (track.extras[name][:, -1, 0] for name in ("range_offset", "range_offset_std"))
+    assert std.max() < 0.5
+    assert np.abs((found - drawn) / std).max() < 4.5
+    error, least, without = (co.rt_le(t, fleet).mean() for t in (track, ideal, co.PoseFilter("fleet")(wrong, [0])))
+    assert error < 1.15 * least < 0.5 * without
+
+
 def test_the_gate_keeps_outliers_out() -> None:
     """Every twentieth range is 20 m too long; without outliers the gate changes next to nothing."""
     fleet = convoy(masts=2)

@@ -5,7 +5,7 @@ One recursion over the steps of a drive with members that come and go serves all
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -18,7 +18,7 @@ from ..kernels.stars.messages import FORGOTTEN
 from ..world.body_frames import body_motion, midway, true_heading, turned
 from ..world.fleet import Fleet, columns
 from ..world.links import Links, spherical
-from ..world.recording import Recording
+from ..world.recording import Recording, Vehicles
 from ..world.sensing import find_links
 from ..world.sensors import Sensors
 from ..world.v2x import V2X
@@ -127,9 +127,7 @@ def fleet_bound(
     return _bound(fleet, sensors, links, [np.flatnonzero(row) for row in fleet.present], smoothing, recording)
 
 
-def pose_bound(
-    fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, landmarks: Sequence[int | str] = ()
-) -> Floats:
+def pose_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, landmarks: Vehicles = ()) -> Floats:
     """Bound covariances of (x, y, z, heading, ...) of all vehicles from all that any measures, filtering.
 
     J_t = (F_t J_{t-1}^-1 F_t^T + G_t Q_t G_t^T)^-1 + H_t^T R^-1 H_t (Tichavsky, Muravchik, Nehorai 1998) with the
@@ -489,4 +487,4 @@ def diagonal(blocks: Floats) -> Floats:
 
 def _numbers(places: Ints, d: int) -> Ints:
     """Places of all numbers of members."""
-    return np.asarray(d * places[:, None] + np.arange(d)).ravel()
+    return (d * places[:, None] + np.arange(d)).ravel()

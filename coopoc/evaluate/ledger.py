@@ -65,8 +65,9 @@ class Ledger:
 
     def of(self, purpose: Purpose, kind: Kind = "payload", way: Way = "per receiver") -> Floats:
         """(R, V) bytes."""
-        for name, value, allowed in (("way", way, Way), ("purpose", purpose, Purpose), ("kind", kind, Kind)):
-            one_of(name, value, get_args(allowed))
+        one_of("way", way, Way)
+        one_of("purpose", purpose, Purpose)
+        one_of("kind", kind, Kind)
         array = self.sent if way == "broadcast" else self.received
         return np.asarray(array[get_args(Purpose).index(purpose), get_args(Kind).index(kind)])
 

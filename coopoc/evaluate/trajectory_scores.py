@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from ..arrays import Floats, Ints, checked, instance, named, number, one_of
+from ..arrays import Floats, Ints, check_arrays, checked, instance, named, number, one_of
 from ..errors import InputError, suggestion
 from ..short_repr import short_repr
 from .statistics import Interval, mean_interval
@@ -151,7 +151,7 @@ def ends(x: Floats, delta: float, unit: Unit) -> Ints:
     >>> ends(np.zeros((7, 3)), 3, "steps")
     array([0, 3, 6])
     """
-    one_of("unit", unit, get_args(Unit))
+    one_of("unit", unit, Unit)
     delta, steps = number("delta", delta, 1e-12, allowed="> 0"), unit == "steps"
     if steps and delta % 1:
         raise InputError("delta", delta, "must be a whole number of steps", 'For a length, set unit to "m".')
@@ -214,11 +214,9 @@ class Path:
 
     def __post_init__(self) -> None:
         count = len(checked("t", self.t, "(T,)", (-1,)))
-        shapes = {"t": (count,), "position": (count, 3), "rotation": (count, 3, 3), "covariance": (count, 3, 3)}
-        for name, shape in shapes.items():
-            if name in ("t", "position") or getattr(self, name) is not None:
-                axes = str(("T", *shape[1:])).replace("'", "")
-                self.__dict__[name] = checked(name, getattr(self, name), axes, shape)
+        matrices = "(T, 3, 3)", (count, 3, 3)
+        shapes = {"t": ("(T,)", (count,)), "position": ("(T, 3)", (count, 3))}
+        check_arrays(self, {**shapes, "rotation": matrices, "covariance": matrices})
 
 
 @dataclass(frozen=True)
@@ -319,7 +317,7 @@ def compared(
 ) -> dict[str, tuple[Path, Path, Path]]:
     """Estimate, the same aligned, and truth of each vehicle at the stamps that belong together, as `scores` compares
     them."""
-    one_of("aligned", aligned, get_args(Aligned))
+    one_of("aligned", aligned, Aligned)
     pairs = {}
     for name, path in estimates.items():
         truth = _truth(name, truths, estimates)
@@ -366,8 +364,8 @@ def _truth(name: str, truths: Mapping[str, Path], estimates: Mapping[str, Path])
 
 
 def _at(path: Path, k: Ints) -> Path:
-    rotation = None if path.rotation is None else path.rotation[k]
-    return Path(path.t[k], path.position[k], rotation, None if path.covariance is None else path.covariance[k])
+    parts: dict[str, Any] = {name: None if value is None else value[k] for name, value in vars(path).items()}
+    return Path(**parts)
 
 
 def _moved(path: Path, motion: Alignment) -> Path:

@@ -11,7 +11,7 @@ from ..arrays import Floats
 from ..kernels.stars.lkf_sa import run_lkf_sa
 from ..kernels.stars.messages import Assumptions
 from ..kernels.stars.pseudo_fixes import run_msmv
-from ..world.recording import Recording, check_recording
+from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements
 from .kalman import fix_noise, solo_filter
@@ -38,10 +38,10 @@ class LKFSA(Checked):
 
     noise_model: NoiseModel | str = "identity"
     name: str = "lkf-sa"
-    cooperative: bool = True
-    message: Message = FIX_AND_VELOCITY
+    cooperative = True
+    message = FIX_AND_VELOCITY
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)
         assumed = assumptions(recording, known)
@@ -74,7 +74,7 @@ class MSMV(Checked):
 
     noise_model: NoiseModel | str = "identity"
     name: str = "msmv-r"
-    cooperative: bool = True
+    cooperative = True
 
     @property
     def message(self) -> Message:
@@ -82,7 +82,7 @@ class MSMV(Checked):
         name = self.noise_model if isinstance(self.noise_model, str) else self.noise_model.name
         return ESTIMATE if name == "identity" else ESTIMATE_AND_COV
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         assumed, own = solo_estimates(recording, known, columns)

@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
 
-from ..arrays import Floats
-from ..world.recording import Recording, check_recording
-from ..world.v2x import Message
+from ..arrays import TINY, Floats
+from ..world.recording import Recording, Vehicles, check_recording
 from .noise_model import NoiseModel
-from .track import TINY, Checked, Track, check_options
+from .track import Checked, Track, check_options
 from .whole_fleet import CENTRE, UPLOAD, Answer, fleet_track
 
 if TYPE_CHECKING:
@@ -49,10 +47,10 @@ class CentralFilter(Checked):
     noise_model: NoiseModel | str = "nominal"
     robust: bool = True
     name: str = "central-filter"
-    cooperative: bool = True
-    message: Message = UPLOAD
+    cooperative = True
+    message = UPLOAD
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
@@ -119,14 +117,14 @@ class BatchSmoother:
     settle: float = 1e-3
     robust: bool = True
     name: str = "batch-smoother"
-    cooperative: bool = True
-    message: Message = UPLOAD
+    cooperative = True
+    message = UPLOAD
 
     def __post_init__(self) -> None:
         steps = (0, 1e18, "a whole number >= 0, 0 for linear only")
         check_options(self, {"exact_steps": steps, "settle": (TINY, np.inf, "> 0 m, infinity for no further steps")})
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:

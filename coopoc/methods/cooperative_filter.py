@@ -15,7 +15,7 @@ from ..kernels.stars.cooperative_filter import run_filter
 from ..kernels.stars.cooperative_state import NO_GUARDS, Guards, Model, Sent
 from ..kernels.stars.messages import ACCELERATION_STD, FORGOTTEN
 from ..world.inbox import Inbox, inbox
-from ..world.recording import Recording, check_recording
+from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
 from .noise_model import NoiseModel, resolve
@@ -90,14 +90,14 @@ class CooperativeFilter(Checked):
     robust: bool = True
     guards: Guards = Guards()
     name: str = "cooperative-filter"
-    cooperative: bool = True
+    cooperative = True
 
     @property
     def message(self) -> Message:
         """Estimate and odometer; of the textbook filter a fix."""
         return BROADCAST if self.robust else FIX_AND_VELOCITY
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.
 
         `extras` hold the weights, 1 for a number that was believed, of each ego's "fix" (R, T, E) and by link (R, L) of

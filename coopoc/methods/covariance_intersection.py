@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..kernels.stars.messages import ESTIMATE_GROWTH
 from ..kernels.stars.pseudo_fixes import run_intersection
-from ..world.recording import Recording, check_recording
-from ..world.v2x import ESTIMATE_AND_COV, Message
+from ..world.recording import Recording, Vehicles, check_recording
+from ..world.v2x import ESTIMATE_AND_COV
 from .baselines import solo_estimates
 from .egos import Estimate, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
@@ -49,10 +48,10 @@ class CovarianceIntersection(Checked):
     split: bool = False
     robust: bool = True
     name: str = "ci"
-    cooperative: bool = True
-    message: Message = ESTIMATE_AND_COV
+    cooperative = True
+    message = ESTIMATE_AND_COV
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of their neighbours' estimates; InputError if one is unknown or absent.
 
         `age` steps later the velocity's error has come in age + 1 times, once in p_j itself and fully correlated:

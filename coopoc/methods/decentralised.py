@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from ..world.recording import Recording
+from ..world.recording import Recording, Vehicles
 from ..world.v2x import Message
 from .noise_model import NoiseModel
 from .track import Track, check_options
@@ -58,7 +57,7 @@ class GaussianBeliefPropagation:
     damping: float = 0.0
     robust: bool = True
     name: str = "gbp"
-    cooperative: bool = True
+    cooperative = True
 
     def __post_init__(self) -> None:
         rounds = (1, 1e18, "a whole number >= 1, 1 for one exchange a step")
@@ -70,7 +69,7 @@ class GaussianBeliefPropagation:
         """The sender's belief, to each vehicle in contact and in every round; its measurement, id and time once."""
         return Message("belief", 9, rounds=self.rounds, opening=5, unicast=True)
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:

@@ -14,7 +14,7 @@ from ..arrays import Floats, Ints
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
 from ..kernels.stars.relative import components
 from ..world.inbox import Inbox, inbox
-from ..world.recording import Recording, check_recording
+from ..world.recording import Recording, Vehicles, check_recording
 from .noise_model import NoiseModel, process_noise
 from .track import Method, Track
 
@@ -38,7 +38,7 @@ class Estimate(NamedTuple):
 def follow_egos(
     method: Method,
     recording: Recording,
-    egos: Sequence[int | str],
+    egos: Vehicles,
     follow: Callable[[int, Inbox], Iterable[Estimate]],
     notes: Sequence[str] = (),
 ) -> Track:

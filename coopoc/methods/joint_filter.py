@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 
 from ..kernels.stars.joint_filter import run_filter
-from ..world.recording import Recording
-from ..world.v2x import FIX_AND_VELOCITY, Message
+from ..world.recording import Recording, Vehicles
+from ..world.v2x import FIX_AND_VELOCITY
 from .egos import Estimate, assumptions, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
 from .track import Checked, Track
@@ -43,10 +42,10 @@ class JointFilter(Checked):
     exact: bool = True
     robust: bool = True
     name: str = "joint"
-    cooperative: bool = True
-    message: Message = FIX_AND_VELOCITY
+    cooperative = True
+    message = FIX_AND_VELOCITY
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)
         assumed, gates = assumptions(recording, known), self.robust and known.exact_relative

@@ -9,33 +9,30 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats
+from ..arrays import TINY, Floats
 from ..errors import InputError
 from ..kernels.gate import FIX_GATE
 from ..kernels.motion import MotionNoise
 from ..kernels.solo import FixNoise, SoloMeasurements, run_filter
 from ..short_repr import short_repr
-from ..world.recording import Recording, check_recording
+from ..world.recording import Recording, Vehicles, check_recording
 from ..world.sensors import Sensors
-from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NO_VARIANCE, NoiseModel, constant_noise, motion_noise, process_noise, resolve
 from .stream import FilterStream
-from .track import TINY, Checked, Track, check_options, lost, silent_track
+from .track import Alone, Checked, Track, check_options, lost, silent_track
 
 ASSUMED = Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02)
 """Velocity noise of the paper's training, 10 % per axis, and where the estimate of the fixes' noise starts."""
 
 
 @dataclass(frozen=True)
-class GNSS:
+class GNSS(Alone):
     r"""The latest fix, $\hat x_t = z_t$, with the assumed GNSS covariance; where there is none, the last one is
     held."""
 
     name: str = "gnss"
-    cooperative: bool = False
-    message: Message = NO_MESSAGE
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
         began = time.perf_counter()
         columns = check_recording(recording).columns(egos)
@@ -49,7 +46,7 @@ class GNSS:
 
 
 @dataclass(frozen=True, eq=False)
-class Kalman(Checked):
+class Kalman(Alone, Checked):
     r"""Kalman filter of $x_t = x_{t-1} + \Delta t \, u_t + w$, $z_t = x_t + n$, with the noise that `noise_model`
     names.
 
@@ -69,12 +66,10 @@ class Kalman(Checked):
     x0: Floats | None = None
     robust: bool = True
     name: str = "kalman"
-    cooperative: bool = False
-    message: Message = NO_MESSAGE
 
     __repr__ = short_repr
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began = time.perf_counter()
         columns = check_recording(recording).columns(egos)
@@ -104,7 +99,7 @@ class Kalman(Checked):
 
 
 @dataclass(frozen=True, eq=False)
-class AdaptiveKalman:
+class AdaptiveKalman(Alone):
     r"""Kalman filter whose GNSS variance r is estimated from its innovations, per axis.
 
     With innovation $\nu$ of variance $p + r$, $p$ that of the prediction,
@@ -143,8 +138,6 @@ class AdaptiveKalman:
     window: float = 100.0
     robust: bool = True
     name: str = "kalman-adaptive"
-    cooperative: bool = False
-    message: Message = NO_MESSAGE
 
     __repr__ = short_repr
 
@@ -152,7 +145,7 @@ class AdaptiveKalman:
         positive = (TINY, np.inf, "> 0, infinity for never")
         check_options(self, {"prior_weight": positive, "window": positive})
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began, columns = time.perf_counter(), check_recording(recording).columns(egos)
         x, p, _ = solo_filter(recording, columns, NoiseModel.nominal(self.assumed), self._fixes, self.x0)
@@ -167,7 +160,7 @@ class AdaptiveKalman:
         """Start the filter for one step at a time, as `Kalman.start`; `state.noise` is the estimated variance."""
         return FilterStream(motion_noise(NoiseModel.nominal(self.assumed), interval), self._fixes, x0, history)
 
-    def gnss_std(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Floats:
+    def gnss_std(self, recording: Recording, egos: Vehicles = (0,)) -> Floats:
         """(R, T, E, 3) m, the estimated standard deviation of the fixes at every step."""
         columns = check_recording(recording).columns(egos)
         known = NoiseModel.nominal(self.assumed)

@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..world.inbox import Inbox
-from ..world.recording import Recording
-from ..world.v2x import FIX_AND_VELOCITY, Message
+from ..world.recording import Recording, Vehicles
+from ..world.v2x import FIX_AND_VELOCITY
 from .egos import Estimate, assumptions, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
 from .track import Track, check_options
@@ -62,13 +62,13 @@ class MovingHorizon:
     exact: bool = True
     robust: bool = True
     name: str = "mhe"
-    cooperative: bool = True
-    message: Message = FIX_AND_VELOCITY
+    cooperative = True
+    message = FIX_AND_VELOCITY
 
     def __post_init__(self) -> None:
         check_options(self, {"horizon": (1, 1e18, "a whole number >= 1, such as 10 to 20 at 10 Hz")})
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         from ..kernels.windows.horizon import Settings, horizons
 

@@ -9,18 +9,17 @@ from dataclasses import astuple, dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, instance
+from ..arrays import Floats, Limits, check_fields, instance
 from ..errors import InputError
 from ..kernels.motion import MotionNoise
 from ..kernels.road import SCALE, Z_VARIANCE, RoadNoise, RoadState, Z, road_motion, road_step, run_road
 from ..kernels.solo import SoloMeasurements
 from ..short_repr import short_repr
 from ..world.fleet import Fleet
-from ..world.recording import Recording, check_recording
-from ..world.v2x import NO_MESSAGE, Message
+from ..world.recording import Recording, Vehicles, check_recording
 from .motion_history import MotionHistory
 from .noise_model import NoiseModel, constant_noise, motion_noise, process_noise, resolve
-from .track import Limits, Track, check_options, lost, silent_track
+from .track import Alone, Track, check_options, lost, silent_track
 
 LIMITS: Limits = {
     "fix": (1e-6, 1e6, "> 0"),
@@ -66,7 +65,7 @@ class RoadErrors:
     least: float = 0.15
 
     def __post_init__(self) -> None:
-        check_options(self, LIMITS)
+        check_fields(self, LIMITS)
 
 
 ROAD = RoadErrors()
@@ -77,7 +76,7 @@ EXACT = RoadErrors(fix=1.0, motion=1.0, correlation=0.0, gate=5.0, heading=0.0, 
 
 
 @dataclass(frozen=True, eq=False)
-class RoadFilter:
+class RoadFilter(Alone):
     r"""Kalman filter of position, heading error b and scale error s of the odometry, robust against wrong fixes.
 
     $$ x_t = x_{t-1} + (1 + s) R(b) \Delta t \, u_t + w, \qquad z_t = x_t + n, \qquad
@@ -105,15 +104,13 @@ class RoadFilter:
     noise_model: NoiseModel | str = "nominal"
     errors: RoadErrors | None = None
     name: str = "road-kalman"
-    cooperative: bool = False
-    message: Message = NO_MESSAGE
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_options(self, kinds={"errors": RoadErrors})
+        check_options(self, errors=RoadErrors)
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos, with `extras` heading_error and scale_error; InputError if one is unknown or absent."""
         began = time.perf_counter()
         columns = check_recording(recording).columns(egos)
@@ -238,7 +235,7 @@ MOST = np.log([1e2, 1e2, 1e3, 20.0, 1.0, 0.5, 1e5, 1e4])
 
 def to_logs(errors: RoadErrors) -> Floats:
     """(8,) logarithms of the numbers that are fitted: all but `least`."""
-    return np.asarray(np.log(astuple(errors)[:-1]))
+    return np.log(astuple(errors)[:-1])
 
 
 def from_logs(logs: Floats, least: float = ROAD.least) -> RoadErrors:

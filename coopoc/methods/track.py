@@ -4,17 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Bools, Floats, checked, number, texts
+from ..arrays import Bools, Floats, Limits, check_arrays, check_fields, checked, number, texts
 from ..errors import InputError, shown
 from ..short_repr import short_repr
-from ..world.recording import Recording
+from ..world.recording import Recording, Vehicles
 from ..world.sensors import Sensors
-from ..world.v2x import Message
+from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NoiseModel
 
 UNSOUND = (
@@ -81,10 +81,7 @@ class Track:
             "heading": ("(R, T, E)", x.shape[:3]),
             "heading_covariance": ("(R, T, E, 4)", (*x.shape[:3], 4)),
         }
-        optional = ("covariance", "neighbours", "heading", "heading_covariance")
-        for name, (axes, shape) in shapes.items():
-            if name not in optional or getattr(self, name) is not None:
-                self.__dict__[name] = checked(name, getattr(self, name), axes, shape)
+        check_arrays(self, shapes)
         self.__dict__["seconds"] = number("seconds", self.seconds)
         for name in ("notes", "ids"):
             self.__dict__[name] = texts(name, getattr(self, name))
@@ -167,24 +164,15 @@ class Method(Protocol):
     def message(self) -> Message:
         """The message that each vehicle broadcasts."""
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Estimates of the egos."""
 
 
-NUMBERS: dict[str, Any] = {"int": int, "float": float}
-TYPES: dict[str, Any] = {
-    "bool": bool | np.bool_,
-    "str": str,
-    "Message": Message,
-    "Sensors": Sensors,
-    "NoiseModel | str": NoiseModel | str,
-}
+class Alone:
+    """A method of one vehicle by itself, which sends and receives nothing."""
 
-
-TINY = 5e-324
-"""The least positive number."""
-Limits = Mapping[str, tuple[float, float, str]]
-"""Option -> least and largest value, and both in words."""
+    cooperative = False
+    message = NO_MESSAGE
 
 
 class Checked:
@@ -194,13 +182,8 @@ class Checked:
         check_options(self)
 
 
-def check_options(made: Any, limits: Limits | None = None, kinds: Mapping[str, Any] | None = None) -> None:
-    """InputError for an option of another type than its field of the dataclass has; NumPy's numbers become Python's.
-
-    Args:
-        made: instance of a dataclass, in its `__post_init__`.
-        limits: of numbers; default no NaN.
-        kinds: option -> its class, where that is none of TYPES.
+def check_options(made: Any, limits: Limits | None = None, **kinds: Any) -> None:
+    """`check_fields` of a method, whose noise may be assumed.
 
     >>> from coopoc import JointFilter
     >>> JointFilter(exact="no")
@@ -208,22 +191,4 @@ def check_options(made: Any, limits: Limits | None = None, kinds: Mapping[str, A
     ...
     coopoc.errors.InputError: exact = 'no': must be bool. Give JointFilter(exact=...).
     """
-    own = {str(f.type).removesuffix(" | None"): kinds[f.name] for f in fields(made) if kinds and f.name in kinds}
-    types = {**TYPES, **own}
-    for option in fields(made):
-        name, text, value = option.name, str(option.type), getattr(made, option.name)
-        if not option.init or (value is None and text.endswith("None")):
-            continue
-        text = text.removesuffix(" | None")
-        if isinstance(option.default, str) and text not in types:  # one of some words, which the method lists
-            text = "str"
-        hint = f"Give {type(made).__name__}({name}=...)."
-        if text in NUMBERS:
-            most = 2**62 if text == "int" else np.inf
-            low, high, words = (limits or {}).get(name, (-most, most, "no NaN"))
-            value = number(name, value, low, high, kind=NUMBERS[text], allowed=words, hint=hint)
-            made.__dict__[name] = value
-        elif text == "Floats":
-            made.__dict__[name] = checked(name, value)
-        elif text in types and not isinstance(value, types[text]):
-            raise InputError(name, shown(value), f"must be {text}", hint)
+    check_fields(made, limits, noise_model=NoiseModel | str, assumed=Sensors, **kinds)

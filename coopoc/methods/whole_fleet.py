@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -11,7 +11,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Ints
 from ..world.exchange import Exchange, exchange
-from ..world.recording import Recording, check_recording
+from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import NO_MESSAGE, Message
 from .egos import contradicted
 from .kalman import fix_noise, solo_filter
@@ -56,7 +56,7 @@ def fleet_track(
     noise_model: NoiseModel | str,
     robust: bool,
     recording: Recording,
-    egos: Sequence[int | str],
+    egos: Vehicles,
     solve: Callable[[Measured, Pairs, Assumed], Answer],
     *,
     central: bool = False,
@@ -163,4 +163,4 @@ def located(recording: Recording) -> Bools:
     before = np.concatenate([np.zeros_like(present[:1]), present[:-1]])
     joined = np.maximum.accumulate(np.where(present & ~before, step, -1))
     fix = np.maximum.accumulate(np.where(np.isfinite(recording.gnss).all(axis=-1), step, -1), axis=1)
-    return np.asarray(present & (fix >= joined))
+    return present & (fix >= joined)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from functools import partial
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
@@ -75,8 +75,8 @@ def from_graph(
     >>> from_graph(Graph(2, ("A0", "L0"), [True, False], [[0, 0], [3, 4]], [[0], [0]], ranges=ranges))
     Problem(2 nodes in the plane; 1 range)
     """
-    for name, value, allowed in (("objective", objective, Objective), ("start", start, Start)):
-        one_of(name, value, get_args(allowed))
+    one_of("objective", objective, Objective)
+    one_of("start", start, Start)
     began, notes, factors = time.perf_counter(), graph.notes, _factors(graph, objective)
     poses, relaxed = tuple(np.flatnonzero(graph.is_pose).tolist()), partial(_relaxed, graph, objective, seconds)
     first = {"incremental": "odometry", "relaxed": "apart"}.get(start, start)

@@ -10,7 +10,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, Floats, check_texts, checked, listed, number, refuse
+from ..arrays import Bools, Floats, check_arrays, check_texts, checked, listed, number, refuse
 from ..errors import InputError, shown, unknown
 
 FARTHEST, FASTEST = 1e8, 1e4
@@ -66,13 +66,12 @@ class Fleet:
         self.__dict__["ids"] = names(self.ids)
         check_texts(self, "name", "source", "licence")
         self.__dict__["t"] = clock(self.t)
-        for field in ("position", "velocity"):
-            values = checked(field, getattr(self, field), "(T, N, 3)", (len(self.t), len(self.ids), 3))
-            self.__dict__[field] = values
+        shape = len(self.t), len(self.ids), 3
+        positions = "(T, N, 3)", shape
+        check_arrays(self, {"position": positions, "velocity": positions, "heading": ("(T, N)", shape[:2])})
         if self.heading is not None:
-            heading = checked("heading", self.heading, "(T, N)", self.position.shape[:2])
-            refuse("heading", heading, np.isinf(heading), "must be finite, or NaN where unknown", "Replace it by NaN.")
-            self.__dict__["heading"] = heading
+            allowed = "must be finite, or NaN where unknown"
+            refuse("heading", self.heading, np.isinf(self.heading), allowed, "Replace it by NaN.")
         _check_gaps(self)
         plausible("position", self.position, FARTHEST)
         plausible("velocity", self.velocity, FASTEST)

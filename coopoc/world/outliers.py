@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Literal, get_args
+from typing import Literal
 
-from ..arrays import extent, instance, number, one_of
+from ..arrays import check_fields, extent, instance
 from ..errors import InputError, unknown
 
 Law = Literal["uniform", "exponential"]
@@ -32,12 +32,9 @@ class Fault:
     """s, time constant of the state; 0: every measurement by itself."""
 
     def __post_init__(self) -> None:
-        hint = "0.05 makes one measurement in twenty wrong."
-        self.__dict__["rate"] = number("rate", self.rate, 0, 1, allowed="in [0, 1]", hint=hint)
+        lasts = (0, 1e18, ">= 0 s, 0 for every measurement by itself")
+        check_fields(self, {"rate": (0, 1, "in [0, 1], 0.05 for one measurement in twenty"), "lasts": lasts}, law=Law)
         self.__dict__["size"] = extent("size", self.size)
-        one_of("law", self.law, get_args(Law))
-        lasts = number("lasts", self.lasts, allowed=">= 0 s", hint="0 draws every measurement by itself.")
-        self.__dict__["lasts"] = lasts
 
 
 @dataclass(frozen=True)
@@ -61,8 +58,7 @@ class Outliers:
     """Slip: the speed is measured too high or too low by a share of itself; wheels that lock measure none."""
 
     def __post_init__(self) -> None:
-        for field in fields(self):
-            instance(field.name, getattr(self, field.name), Fault, "Give Fault(rate=0.05, size=(3.0, 20.0)).")
+        check_fields(self, None, **{field.name: Fault for field in fields(self)})
 
     @classmethod
     def uwb_nlos(cls) -> Outliers:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
@@ -16,6 +16,9 @@ from .fleet import FARTHEST, FASTEST, clock, columns, interval, names, plausible
 from .links import Links, stretches, told
 from .sensors import Sensors
 from .v2x import V2X
+
+Vehicles: TypeAlias = Sequence[int | str]
+"""Columns or ids."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -222,7 +225,7 @@ class Recording:
         (column,) = columns("ego", [ego], self.ids)
         return np.bincount(self.links.step[self.links.of(column)], minlength=len(self.t)).astype(np.int64)
 
-    def observing(self, egos: Sequence[int | str]) -> list[int]:
+    def observing(self, egos: Vehicles) -> list[int]:
         """Columns of the egos, absent or not; InputError if one is unknown or no observer of this recording."""
         egos = listed("egos", egos, "Give [0] for the first.")
         cols = columns("egos", egos, self.ids)
@@ -234,7 +237,7 @@ class Recording:
                 raise InputError("egos", repr(ego), allowed, "Name it in observe(..., observers=[...]).")
         return cols
 
-    def columns(self, egos: Sequence[int | str]) -> list[int]:
+    def columns(self, egos: Vehicles) -> list[int]:
         """Columns of the egos; InputError if one is unknown, no observer of this recording, absent at times, or without
         a first fix. Later ones may be missing (NaN)."""
         cols = self.observing(egos)

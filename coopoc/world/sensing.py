@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 from weakref import WeakValueDictionary
 
 import numpy as np
 
-from ..arrays import AnyArray, Bools, Floats, Ints, instance, number, one_of
+from ..arrays import AnyArray, Bools, Floats, Ints, instance, number, one_of, seed_of
 from ..errors import InputError
 from .body_frames import body_measurements, body_motion, gauss_markov, in_body
 from .channels import lost
 from .faults import PAIRS, wrong_fixes, wrong_odometry, wrong_relative
 from .fleet import Fleet, columns
 from .links import Links, spherical, wrap
-from .recording import Recording
+from .recording import Recording, Vehicles
 from .sensors import Sensors, stream
 from .v2x import V2X
 
@@ -31,10 +31,10 @@ def observe(
     *,
     runs: int = 1,
     seed: int = 0,
-    observers: Sequence[int | str] | None = None,
+    observers: Vehicles | None = None,
     assumed: Sensors | None = None,
     frame: Frame = "world",
-    landmarks: Sequence[int | str] = (),
+    landmarks: Vehicles = (),
     told: bool = False,
 ) -> Recording:
     """Measurements of a drive in `runs` noise realisations.
@@ -69,10 +69,10 @@ def observe(
     fleet, sensors = instance("fleet", fleet, Fleet), instance("sensors", sensors, Sensors)
     v2x = V2X.ideal() if v2x is None else instance("v2x", v2x, V2X)
     runs = number("runs", runs, 1, 2**32, kind=int, allowed=">= 1", hint="Use at least one noise run.")
-    seed = number("seed", seed, 0, 2**63, kind=int, allowed=">= 0", hint="Any whole number from 0 on will do.")
+    seed = seed_of(seed)
     observing = range(len(fleet.ids)) if observers is None else columns("observers", observers, fleet.ids)
     watching = tuple(sorted(set(observing)))
-    one_of("frame", frame, get_args(Frame))
+    one_of("frame", frame, Frame)
     assumed = sensors.known() if assumed is None else instance("assumed", assumed, Sensors)
     standing = columns("landmarks", landmarks, fleet.ids)
     links = find_links(fleet, watching, v2x.max_neighbours, v2x.radius, sensors.min_range, standing)

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import sys
 import zlib
 from dataclasses import dataclass, fields, replace
-from typing import Literal, get_args
+from typing import Literal
 
 import numpy as np
 
-from ..arrays import Floats, instance, listed, number, one_of
-from ..errors import InputError, shown
+from ..arrays import TINY, Floats, Limits, check_fields, extent, listed, number, seed_of
+from ..errors import InputError
 from .outliers import Outliers
 
 BiasMode = Literal["run", "sample"]
@@ -74,39 +75,19 @@ class Sensors:
     """What goes wrong beyond noise. It acts; what methods assume has none unless you say so."""
 
     def __post_init__(self) -> None:
-        words = {"gnss_bias_mode": get_args(BiasMode), "velocity_reading": get_args(VelocityReading)}
-        hint = "Give a standard deviation in SI units."
-        for field in fields(self):
-            name, value = field.name, getattr(self, field.name)
-            if name in words:
-                one_of(name, value, words[name])
-            elif name == "outliers":
-                if value is not None:
-                    instance(name, value, Outliers, "Give Outliers(ranges=Fault(0.05, (3.0, 20.0))).")
-            elif isinstance(field.default, bool):
-                if not isinstance(value, bool):
-                    raise InputError(name, shown(value), "must be True or False", "Say whether there is one.")
-            elif isinstance(field.default, tuple):
-                size = len(field.default)
-                given = listed(name, value, "Give metres in a tuple.", f"must be {size} numbers")
-                if len(given) != size:
-                    raise InputError(name, value, f"must be {size} numbers", "Give metres in a tuple.")
-                self.__dict__[name] = tuple(number(name, v, hint=hint) for v in given)
-            else:
-                self.__dict__[name] = number(name, value, hint=hint)
-        if self.gnss_bias[0] > self.gnss_bias[1]:
-            raise InputError("gnss_bias", self.gnss_bias, "must be (low, high) with low <= high", "Swap the two.")
-        if self.gnss_drift_time <= 0:
-            raise InputError("gnss_drift_time", self.gnss_drift_time, "must be > 0 s", "For white noise set the stds.")
-        if self.odometry_error_time <= 0:
-            raise InputError("odometry_error_time", self.odometry_error_time, "must be > 0 s", "1e6 is constant.")
-        if self.azimuth_std > np.pi or self.inclination_std > np.pi:
-            raise InputError(
-                "azimuth_std/inclination_std",
-                (self.azimuth_std, self.inclination_std),
-                "must be <= pi rad",
-                "Angles are in radians: use np.deg2rad.",
-            )
+        most = sys.float_info.max
+        limits: Limits = {
+            **{field.name: (0.0, most, "finite and >= 0, in SI units") for field in fields(self)},
+            **dict.fromkeys(("gnss_drift_time", "odometry_error_time"), (TINY, most, "finite and > 0 s")),
+            **dict.fromkeys(("azimuth_std", "inclination_std"), (0.0, np.pi, "in 0..pi radians, by np.deg2rad")),
+        }
+        check_fields(self, limits, gnss_bias_mode=BiasMode, velocity_reading=VelocityReading, outliers=Outliers)
+        hint = "Give metres in a tuple."
+        given = listed("gnss_std", self.gnss_std, hint, "must be 3 numbers")
+        if len(given) != 3:
+            raise InputError("gnss_std", self.gnss_std, "must be 3 numbers", hint)
+        self.__dict__["gnss_std"] = tuple(number("gnss_std", std, hint=hint) for std in given)
+        self.__dict__["gnss_bias"] = extent("gnss_bias", self.gnss_bias, hint)
 
     @property
     def relative_std(self) -> Floats:
@@ -195,8 +176,7 @@ def stream(seed: int, sensor: str, run: int, vehicle: str, partner: str = "") ->
     True
     """
     if type(seed) is not int or seed < 0:
-        hint = "Any whole number from 0 on will do."
-        seed = number("seed", seed, 0, 2**63 - 1, kind=int, allowed="in 0..2^63 - 1", hint=hint)
+        seed = seed_of(seed)
     key = (seed, run, *(zlib.crc32(word.encode()) for word in (sensor, vehicle, partner)))
     small = max(seed, run) < 2**32  # then NumPy makes the same words of the key, three times as slowly
     entropy = np.array(key, dtype=np.uint32) if small else key

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats, extent, instance, number
-from .recording import Recording
+from ..arrays import Floats, check_fields, extent, instance, seed_of
+from .recording import Recording, Vehicles
 from .sensors import stream
 
 
@@ -34,13 +33,9 @@ class Spoofing:
     """Whether all spoofed vehicles of a run have the same offset, so that they confirm one another."""
 
     def __post_init__(self) -> None:
-        share = number("share", self.share, 0, 1, allowed="in [0, 1]", hint="0.2 attacks every fifth vehicle.")
-        offset = extent("offset", self.offset, "Give (low, high) in metres: signs are drawn.")
-        hint = "0 is from the first step on, at once."
-        start, ramp = (number(name, getattr(self, name), 0, 1e9, hint=hint) for name in ("start", "ramp"))
-        instance("collude", self.collude, bool, "Give True for one offset of all.")
-        for name, value in (("share", share), ("offset", offset), ("start", start), ("ramp", ramp)):
-            self.__dict__[name] = value
+        seconds = (0, 1e9, "finite and >= 0, 0 from the first step on, at once")
+        check_fields(self, {"share": (0, 1, "in [0, 1]"), "start": seconds, "ramp": seconds})
+        self.__dict__["offset"] = extent("offset", self.offset, "Give (low, high) in metres: signs are drawn.")
 
     def size(self, t: Floats) -> Floats:
         """(T,) share of the full offset at times t s.
@@ -67,7 +62,7 @@ def spoofed(
     recording: Recording,
     attack: Spoofing | float,
     seed: int = 0,
-    honest: Sequence[int | str] = (),
+    honest: Vehicles = (),
     *,
     told: bool = False,
 ) -> Recording:
@@ -95,7 +90,7 @@ def spoofed(
            [ 0. , 14.9]])
     """
     attack = attack if isinstance(attack, Spoofing) else Spoofing(attack)
-    seed = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number from 0 on will do.")
+    seed = seed_of(seed)
     instance("told", told, bool, "Give True to remove false fixes.")
     spared = recording.columns(honest) if np.size(honest) else []
     offset = np.zeros((recording.runs, len(recording.ids), 3))

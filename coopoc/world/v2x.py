@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
-from ..arrays import AnyArray, check_texts, number, one_of
+from ..arrays import AnyArray, check_fields
 
 Schedule = Literal["nearest", "round robin"]
 
@@ -40,9 +40,8 @@ class V2X:
     longest."""
 
     def __post_init__(self) -> None:
-        one_of("schedule", self.schedule, get_args(Schedule))
-        limits: dict[str, tuple[float, float, str]] = {
-            "max_neighbours": (0, 1e6, ">= 0"),
+        limits = {
+            "max_neighbours": (0, 1e6, ">= 0, 0 for no neighbours"),
             "radius": (0, np.inf, ">= 0 m"),
             "rate": (1e-3, 1e4, "> 0 Hz"),
             "latency": (0, 3600, ">= 0 s"),
@@ -52,11 +51,7 @@ class V2X:
             "bytes_per_second": (0, np.inf, ">= 0"),
             "overhead": (0, 1e6, ">= 0 bytes"),
         }
-        for name, (low, high, words) in limits.items():
-            value, kind = getattr(self, name), int if name in ("max_neighbours", "overhead") else float
-            if value is not None or name != "rate":
-                hint = "Use 0 for no neighbours." if name == "max_neighbours" else f"Give V2X({name}=...)."
-                self.__dict__[name] = number(name, value, low, high, kind=kind, allowed=words, hint=hint)
+        check_fields(self, limits, schedule=Schedule)
 
     @classmethod
     def ideal(cls, max_neighbours: int = 6) -> V2X:
@@ -121,10 +116,7 @@ class Message:
     unicast: bool = False
 
     def __post_init__(self) -> None:
-        check_texts(self, "name")
-        for field in ("numbers", "rounds", "opening", "per_neighbour"):
-            value = number(field, getattr(self, field), kind=int, allowed=">= 0", hint=f"Give Message({field}=...).")
-            self.__dict__[field] = value
+        check_fields(self, dict.fromkeys(("numbers", "rounds", "opening", "per_neighbour"), (0, 2**62, ">= 0")))
 
     @property
     def payload(self) -> int:

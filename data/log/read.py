@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import pandas as pd
@@ -163,7 +163,7 @@ def read_log(
     """
     path, body, clock = given_path(path), frame == "body", named("clock", clock or {}, "Give clock={name: s}.")
     summary, offset = Summary(path.name), named("offset", offset or {}, "Give offset={name: number}.")
-    one_of("frame", frame, get_args(Frame))
+    one_of("frame", frame, Frame)
     texts("ignore", ignore)
     for field, flag in {"any_scale": any_scale, "mutual": mutual}.items():
         instance(field, flag, bool, "Give True or False.")
@@ -374,8 +374,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     if span / step < 0.5:
         allowed = f"must be well below the {span:g} s of the log"
         raise InputError("dt", f"{step:g} s", allowed, "Take a shorter dt.")
-    grid: Floats = float(t.min()) + step * np.arange(int(span / step + 1.5))
-    return grid
+    return float(t.min()) + step * np.arange(int(span / step + 1.5))
 
 
 def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -> Fleet:

@@ -7,11 +7,9 @@ import time
 import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
-from typing import get_args
 
-from coopoc.arrays import instance, listed, one_of
+from coopoc.arrays import check_fields, instance, listed
 from coopoc.errors import InputError, shown
-from coopoc.methods.track import check_options
 from coopoc.plugins import find
 
 from ..nets.gain import Gain
@@ -24,8 +22,6 @@ from .history import Federation, Round
 from .local import Group, Work, stacked
 from .participation import Participation
 from .rules import Combine, Rule, rule
-
-KINDS = {"aggregate": object, "schedule": Schedule, "participation": Participation}
 
 
 @dataclass(frozen=True)
@@ -47,8 +43,8 @@ class Plan:
     participation: Participation = field(default_factory=Participation)
 
     def __post_init__(self) -> None:
-        check_options(self, {"rounds": STEPS, "local_epochs": STEPS}, KINDS)
-        one_of("epoch", self.epoch, get_args(Epoch))
+        limits = {"rounds": STEPS, "local_epochs": STEPS}
+        check_fields(self, limits, aggregate=object, epoch=Epoch, schedule=Schedule, participation=Participation)
 
     @property
     def rule(self) -> Rule:

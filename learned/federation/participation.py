@@ -7,11 +7,10 @@ from dataclasses import dataclass, replace
 
 from torch import Tensor
 
-from coopoc.methods.track import check_options
+from coopoc.arrays import TINY, check_fields
 from coopoc.world.sensors import stream
 
 from ..training.clients import Client, Segments
-from .rules import within
 
 
 @dataclass(frozen=True)
@@ -34,8 +33,7 @@ class Participation:
     share: float = 1.0
 
     def __post_init__(self) -> None:
-        check_options(self)
-        within("share", self.share, 0 < self.share <= 1, "in (0, 1]", "1 asks all clients.")
+        check_fields(self, {"share": (TINY, 1, "in (0, 1], 1 for all clients")})
 
     def count(self, clients: int) -> int:
         """Number of clients, of so many, that are asked in a round."""

@@ -11,26 +11,25 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats, checked, instance
+from coopoc.arrays import Floats, checked, instance, seed_of
 from coopoc.errors import InputError
 from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import solo_filter, solo_track
 from coopoc.methods.noise_model import check_interval
 from coopoc.methods.stream import FilterStream
-from coopoc.methods.track import Track, check_options
+from coopoc.methods.track import Alone, Track, check_options
 from coopoc.short_repr import short_repr
-from coopoc.world.recording import Recording, check_recording
-from coopoc.world.v2x import NO_MESSAGE, Message
+from coopoc.world.recording import Recording, Vehicles, check_recording
 
 from ..training.clients import Batch, Segments
 from ..training.machine import one_core
-from .gain import Gain, error, has_truth, over_time, seed_of
+from .gain import Gain, error, has_truth, over_time
 from .stack import flatten
 
 
 @dataclass(frozen=True, eq=False)
-class OptimisedKF:
+class OptimisedKF(Alone):
     """Solo Kalman filter with trained noise: per axis, process variance a^2 + (b dt u)^2 and GNSS variance r^2.
 
     Args:
@@ -52,8 +51,6 @@ class OptimisedKF:
     gnss_std: tuple[float, ...]
     x0: Floats | None = None
     name: str = "okf"
-    cooperative: bool = False
-    message: Message = NO_MESSAGE
 
     __repr__ = short_repr
 
@@ -80,7 +77,7 @@ class OptimisedKF:
         check_interval(interval)
         return FilterStream(self._motion(float(interval)), FixNoise(np.square(self.gnss_std)), x0, history)
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Estimates and covariances of the egos."""
         began, columns = time.perf_counter(), check_recording(recording).columns(egos)
         fixes = FixNoise(np.square(self.gnss_std))

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc.arrays import AnyArray, Floats, instance, number, one_of
+from coopoc.arrays import AnyArray, Floats, check_fields, instance, number, one_of
 from coopoc.errors import InputError, shown
-from coopoc.methods.track import check_options
 from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet
 from coopoc.world.sensing import observe
@@ -67,8 +66,7 @@ class Segments:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_options(self, {"dt": (1e-9, 1e9, "> 0 s")})
-        one_of("noise", self.noise, get_args(Noise))
+        check_fields(self, {"dt": (1e-9, 1e9, "> 0 s")}, noise=Noise)
         for field in fields(self):
             value = getattr(self, field.name)
             shape: tuple[int, ...] = tuple(getattr(self.truth, "shape", ()))
@@ -166,7 +164,7 @@ class Client:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_options(self, kinds={"training": Segments})
+        check_fields(self, training=Segments, validation=Segments, long=Segments)
 
 
 def clients(
@@ -205,8 +203,8 @@ def clients(
     >>> [(len(c.training), len(c.validation)) for c in clients(line)]
     [(2, 1)]
     """
-    for name, value, allowed in (("noise", noise, get_args(Noise)), ("start", start, get_args(Start))):
-        one_of(name, value, allowed)
+    one_of("noise", noise, Noise)
+    one_of("start", start, Start)
     check_pieces(piece, split)
     fleet = instance("fleet", fleet, Fleet)
     sensors = Sensors.paper_training() if sensors is None else instance("sensors", sensors, Sensors)

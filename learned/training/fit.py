@@ -12,9 +12,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc.arrays import Floats, Ints, instance
+from coopoc.arrays import Floats, Ints, check_fields, instance
 from coopoc.errors import InputError
-from coopoc.methods.track import check_options
 from coopoc.short_repr import short_repr
 from coopoc.world.sensors import stream
 
@@ -37,7 +36,7 @@ class Task:
     long: Segments | None = None
 
     def __post_init__(self) -> None:
-        check_options(self, kinds={"model": Gain, "training": Segments, "validation": Segments, "long": Segments})
+        check_fields(self, model=Gain, training=Segments, validation=Segments, long=Segments)
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 import torch
@@ -52,7 +52,7 @@ def measured_clients(
     >>> [(len(c.training), len(c.validation)) for c in measured_clients(MeasuredDrives(observe(line, Sensors()), line))]
     [(2, 1)]
     """
-    one_of("start", start, get_args(Start))
+    one_of("start", start, Start)
     instance("drives", drives, MeasuredDrives)
     check_pieces(piece, split)
     cols = columns("vehicles", drives.ids, drives.recording.ids)

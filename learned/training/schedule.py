@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import sys
 from dataclasses import dataclass
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from coopoc.arrays import Floats, Ints, one_of
-from coopoc.methods.track import Limits, check_options
+from coopoc.arrays import Floats, Ints, Limits, check_fields
 
 from ..engine.optimiser import Moments, Outcome, Update
 from ..engine.optimiser import advance as advanced
@@ -51,8 +50,7 @@ class Schedule:
     kept."""
 
     def __post_init__(self) -> None:
-        check_options(self, LIMITS)
-        one_of("epoch", self.epoch, get_args(Epoch))
+        check_fields(self, LIMITS, epoch=Epoch)
 
     def plan(self, pieces: int, draw: np.random.Generator) -> Ints:
         """(steps, batch) indices of the pieces that each optimiser step sees, without repetition within a pass."""
@@ -79,8 +77,7 @@ def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:
     [1.0, 0.5]
     """
     where = start + (stop - start) * np.arange(steps) / max(steps, 1)
-    factors: Floats = 0.5 * (1.0 + np.cos(np.pi * where))
-    return factors
+    return 0.5 * (1.0 + np.cos(np.pi * where))
 
 
 def advance(

@@ -46,6 +46,7 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
     (steps, members), (ratio, floor, of_speed) = drive.active.shape, noise.velocity
     out, covs = np.zeros((steps, members, d)), np.zeros((steps, members, d, d))
     x, P, lasting = np.zeros((members, d)), np.zeros((members * d,) * 2), np.array(noise.lasting)[: d - 4]
+    grown = (lasting * [1 - noise.keep**2, 1 - noise.keep**2, 0][: d - 4]).tolist()  # an offset stays
     for t in range(steps):
         F, Q = [], []
         for n in range(members):
@@ -56,10 +57,10 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
                 q = np.append(np.maximum(ratio * size, floor) ** 2, noise.yaw_rate)
                 F.append(jacobian(lambda s, u=u: motion(s, u, drive.dt), state))
                 G = jacobian(lambda v, s=state: motion(s, v, drive.dt), u)
-                F[-1][4:] *= noise.keep
-                Q.append(G @ np.diag(q) @ G.T + np.diag(np.append(np.zeros(4), (1 - noise.keep**2) * lasting)))
+                F[-1][4:6] *= noise.keep
+                Q.append(G @ np.diag(q) @ G.T + np.diag([0, 0, 0, 0, *grown]))
                 x[n] = motion(state, u, drive.dt)
-                x[n, 4:] *= noise.keep
+                x[n, 4:6] *= noise.keep
                 continue
             F.append(np.zeros((d, d)))
             wide = np.array([FLAT] * 3 + [UNKNOWN] + list(lasting))
@@ -93,10 +94,11 @@ def relative(x, P, drive, noise, where, passes):  # type: ignore[no-untyped-def]
     def h(s):  # type: ignore[no-untyped-def]
         predicted = []
         for k in links:
-            mine, other = s[d * drive.ends[k, 0] :][:4], drive.place[k]
+            mine, other = s[d * drive.ends[k, 0] :][:d], drive.place[k]
             if drive.ends[k, 1] >= 0:
                 other = s[d * drive.ends[k, 1] :][:3]
-            predicted.append(spherical(mine, other)[np.isfinite(drive.relative[run, k])])
+            longer = np.array([mine[6], 0, 0]) if d > 6 else 0
+            predicted.append((spherical(mine, other) + longer)[np.isfinite(drive.relative[run, k])])
         return np.concatenate(predicted)
 
     z = np.concatenate([drive.relative[run, k][np.isfinite(drive.relative[run, k])] for k in links])

@@ -47,7 +47,7 @@ class PoseOptions(NamedTuple):
     """How members are filtered.
 
     Attributes:
-        d: numbers of a member, 4 or 6.
+        d: numbers of a member, 4, 6 or 7.
         passes: of the relative measurements, each linear at the state that the last one found.
         fusion: JOINT, NAIVE or INTERSECTION.
     """
@@ -167,7 +167,7 @@ def add_relative(
     """Relative measurement k of members at `ends`."""
     place = (measured.place[k, 0], measured.place[k, 1], measured.place[k, 2])
     relative = (measured.relative[run, k, 0], measured.relative[run, k, 1], measured.relative[run, k, 2])
-    return update_relative(poses, ends, place, relative, noise.relative, noise.gate, left_out)
+    return update_relative(poses, ends, place, relative, noise.relative, noise.gate, noise.longer, left_out)
 
 
 @part

@@ -8,7 +8,7 @@ from typing import NamedTuple
 from ...arrays import Floats
 from ..compiling.compile import part
 from ..gate import YOUNG
-from .scalar_update import HEADING, Poses, Three
+from .scalar_update import HEADING, OFFSET, Poses, Three
 
 UNKNOWN_HEADING = math.pi**2 / 3.0
 """rad^2, variance of a heading of which nothing is known: uniform over a turn."""
@@ -24,8 +24,9 @@ class PoseNoise(NamedTuple):
         velocity: noise of the odometer: ratio, least std m/s, 1 for a ratio of the speed on every axis.
         late: share of the last velocity in the mean square that the ratio is of; 1 for its own.
         yaw_rate: rad^2/s^2.
-        lasting: stationary variances of scale error and of yaw-rate bias, rad^2/s^2.
-        keep: share of both that is left after a step.
+        lasting: stationary variances of scale error, of yaw-rate bias, rad^2/s^2, and of the offset of ranges, m^2.
+        longer: 1 where that offset is a state, else 0.
+        keep: share of scale error and bias that is left after a step.
         flat: m^2, prior of a member that joins.
         gate: standard deviations of its innovation beyond which a measurement weighs less.
     """
@@ -36,7 +37,8 @@ class PoseNoise(NamedTuple):
     velocity: Three
     late: float
     yaw_rate: float
-    lasting: tuple[float, float]
+    lasting: Three
+    longer: float
     keep: float
     flat: float
     gate: float
@@ -87,7 +89,7 @@ def predict(poses: Poses, member: int, d: int, velocity: Three, rate: float, dt:
     x[member + 1] += north
     x[member + 2] += up
     x[member + HEADING] += dt * (rate - bias)
-    for i in range(member + 4, member + d):
+    for i in range(member + 4, member + min(d, OFFSET)):
         x[i] *= noise.keep
     move_rows(cov, member, d, (east, north, up), scale, dt, noise.keep)
     move_rows(cov.T, member, d, (east, north, up), scale, dt, noise.keep)
@@ -100,7 +102,7 @@ def predict(poses: Poses, member: int, d: int, velocity: Three, rate: float, dt:
     for i in range(4):
         for j in range(4):
             cov[member + i, member + j] += effect[i] * effect[j] * noise.yaw_rate
-    for i in range(4, d):
+    for i in range(4, min(d, OFFSET)):
         cov[member + i, member + i] += (1.0 - noise.keep * noise.keep) * noise.lasting[i - 4]
 
 

@@ -1,8 +1,9 @@
 """Sequential scalar EKF update of the joint pose state, and the rows of compasses, fixes, ranges and angles.
 
-The state of a member is d = 4 or 6 numbers: position m, heading rad and, of six, the odometer's scale error and the
-yaw rate's bias rad/s. A row is linear in the pose of one member, (a, b, c, h), and at most in the position of another,
-(-a, -b, -c): every measurement here is one of the vector between the two and of the first one's heading.
+The state of a member is d = 4, 6 or 7 numbers: position m, heading rad and, of six, the odometer's scale error and the
+yaw rate's bias rad/s, of seven also what its ranges are too long by, m. A row is linear in the pose of one member and
+that offset, (a, b, c, h, o), and at most in the position of another, (-a, -b, -c): every measurement here is one of the
+vector between the two and of the first one's heading.
 """
 
 from __future__ import annotations
@@ -21,6 +22,8 @@ from ..gate import FIX_GATE, GATE, count, distance, gain_of, inflation
 
 HEADING = 3
 """Index of the heading in a member's state."""
+OFFSET = 6
+"""Index of the offset of its ranges."""
 ROWS = 4
 """Rows that may be pending, so that one pass over the covariance serves them all."""
 NEAREST = 1e-3
@@ -30,7 +33,7 @@ Ends = tuple[int, int]
 ALONE: Any = np.int64(-1)
 ZERO: Any = np.int64(0)
 """Numbers of the type of a variable: a literal would compile a function of ends once more."""
-Row = tuple[float, float, float, float]
+Row = tuple[float, float, float, float, float]
 Three = tuple[float, float, float]
 
 
@@ -84,7 +87,7 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
     Args:
         poses: the state.
         ends: of the row.
-        row: (a, b, c, h).
+        row: (a, b, c, h, o).
         residual: r, at the state.
         variance: of the measurement.
         gate: in standard deviations.
@@ -94,7 +97,7 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
     """
     if poses.totals[PENDING] == ROWS:
         settle(poses)
-    cov, columns, pending, (k, o), (a, b, c, h) = poses.cov, poses.columns, int(poses.totals[PENDING]), ends, row
+    cov, columns, pending, (k, o), (a, b, c, h, e) = poses.cov, poses.columns, int(poses.totals[PENDING]), ends, row
     tiles = len(poses.x) // LANES
     for tile in range(tiles):
         x, y, z = entries(cov, k, tile, tiles), entries(cov, k + 1, tile, tiles), entries(cov, k + 2, tile, tiles)
@@ -102,6 +105,8 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
             x, y = x - entries(cov, o, tile, tiles), y - entries(cov, o + 1, tile, tiles)
             z = z - entries(cov, o + 2, tile, tiles)
         total = plus(plus(plus(h * entries(cov, k + HEADING, tile, tiles), a, x), b, y), c, z)
+        if e != 0.0:
+            total = plus(total, e, entries(cov, k + OFFSET, tile, tiles))
         put(columns, uint64(pending * tiles + tile), total)
     for q in range(pending):
         share = along(columns, q, ends, row) * poses.weights[q]
@@ -136,8 +141,10 @@ def entries(rows: Floats, row: int, tile: int, tiles: int) -> Any:
 @part
 def along(columns: Floats, q: int, ends: Ends, row: Row) -> float:
     """h^T v of a row and a column."""
-    (k, o), (a, b, c, h) = ends, row
+    (k, o), (a, b, c, h, e) = ends, row
     total = a * columns[q, k] + b * columns[q, k + 1] + c * columns[q, k + 2] + h * columns[q, k + HEADING]
+    if e != 0.0:
+        total += e * columns[q, k + OFFSET]
     if o >= 0:
         total -= a * columns[q, o] + b * columns[q, o + 1] + c * columns[q, o + 2]
     return float(total)
@@ -175,7 +182,7 @@ def wrapped(angle: float) -> float:
 def update_heading(poses: Poses, member: int, heading: float, variance: float, gate: float) -> None:
     """A compass heading rad."""
     residual = wrapped(heading - poses.x[member + HEADING])
-    update_row(poses, (member, ALONE), (0.0, 0.0, 0.0, 1.0), residual, variance, gate)
+    update_row(poses, (member, ALONE), (0.0, 0.0, 0.0, 1.0, 0.0), residual, variance, gate)
 
 
 @part
@@ -194,12 +201,14 @@ def update_fix(poses: Poses, member: int, fix: Three, variance: Three, gate: flo
         share = inflation(q, limit, hits[m])
         hits[m] = count(q, limit, hits[m], gain_of(own, variance))
     for axis in range(3 if math.isfinite(share) else 0):
-        row = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0, 0.0)
+        row = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0, 0.0, 0.0)
         update_row(poses, (member, ALONE), row, fix[axis] - poses.x[m + axis], share * variance[axis], math.inf)
 
 
 @part
-def relative_row(linear: Floats, component: int, ends: Ends, place: Three, measured: float) -> tuple[float, Row]:
+def relative_row(
+    linear: Floats, component: int, ends: Ends, place: Three, measured: float, longer: float
+) -> tuple[float, Row]:
     """Residual and row of a range (0), a bearing from the observer's heading (1) or an inclination (2).
 
     Args:
@@ -217,16 +226,16 @@ def relative_row(linear: Floats, component: int, ends: Ends, place: Three, measu
     flat, r2 = math.sqrt(flat2), flat2 + z * z
     if component == 0:
         r = math.sqrt(r2)
-        return measured - r, (-x / r, -y / r, -z / r, 0.0)
+        return measured - r, (-x / r, -y / r, -z / r, 0.0, longer)
     if component == 1:
-        return wrapped(measured - math.atan2(y, x) + linear[k + HEADING]), (y / flat2, -x / flat2, 0.0, -1.0)
-    row = (-x * z / (flat * r2), -y * z / (flat * r2), flat / r2, 0.0)
+        return wrapped(measured - math.atan2(y, x) + linear[k + HEADING]), (y / flat2, -x / flat2, 0.0, -1.0, 0.0)
+    row = (-x * z / (flat * r2), -y * z / (flat * r2), flat / r2, 0.0, 0.0)
     return wrapped(measured - math.atan2(flat, z)), row
 
 
 @part
 def update_relative(
-    poses: Poses, ends: Ends, place: Three, measured: Three, variances: Three, gate: float, left_out: int
+    poses: Poses, ends: Ends, place: Three, measured: Three, variances: Three, gate: float, longer: float, left_out: int
 ) -> int:
     """The components of one relative measurement, linear at `poses.linear`.
 
@@ -237,6 +246,7 @@ def update_relative(
         measured: m, rad, rad, NaN where missing.
         variances: of the three.
         gate: in standard deviations.
+        longer: 1 where the offset of ranges is a state, else 0.
         left_out: a bit for each component that is left out.
 
     Returns:
@@ -246,8 +256,10 @@ def update_relative(
     for component in range(3):
         if math.isnan(measured[component]) or left_out & (1 << component):
             continue
-        residual, row = relative_row(linear, component, ends, place, measured[component])
+        residual, row = relative_row(linear, component, ends, place, measured[component], longer)
         residual -= row[HEADING] * (x[k + HEADING] - linear[k + HEADING])
+        if row[HEADING + 1] != 0.0:
+            residual -= x[k + OFFSET]
         for axis in range(3):
             residual -= row[axis] * (x[k + axis] - linear[k + axis])
             if o >= 0:

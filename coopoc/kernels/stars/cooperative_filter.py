@@ -206,16 +206,16 @@ def step(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, veh
             f.q[k, 3] = math.nan
     members = nearest_first(f)
     add_fix(f, model, guards, own)
-    if model.estimates > 0.0 and members > 0:
-        measure(f, model, guards, rows, members)
-    for i in range(members):
-        k = f.order[i]
-        vague = f.vague[k]
-        receive(f, model, guards, rows, k)
-        if model.estimates > 0.0 and f.vague[k] < vague:  # what is measured of it in part had to wait for a place
-            weigh(f, model, guards, rows, k)
-    if model.estimates == 0.0 and members > 0:
-        measure(f, model, guards, rows, members)
+    for turn in range(2):  # what is copied into a loop is compiled once
+        if (turn == 0) == (model.estimates > 0.0):
+            measure(f, model, guards, rows, members)
+            continue
+        for i in range(members):
+            k = f.order[i]
+            vague = f.vague[k]
+            receive(f, model, guards, rows, k)
+            if model.estimates > 0.0 and f.vague[k] < vague:  # what is measured of it in part had to wait for a place
+                weigh(f, model, guards, rows, k)
     if guards.trust > 0.0:
         trust(f, model, guards)
     f.step[0] += 1
@@ -277,6 +277,8 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
     Where they contradict the prediction of most members, it is the ego whose odometer has slipped.
     """
     g = f.g
+    if members == 0:
+        return
     if has(g, 0, COMPASS):  # the compass's noise is new at every step
         i = 3 * g.block[0, COMPASS] + 1
         for j in range(3 * g.vectors[0]):
@@ -284,10 +286,11 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
             g.p[j, i] = 0.0
         g.x[i], g.p[i, i] = 0.0, model.heading
     if model.exact > 0.0:
-        wrong = first_pass(f, model, guards, rows, members)
-        if guards.slip > 0.0 and wrong >= 3 and 2 * wrong > members:
+        for again in range(2):
+            wrong = first_pass(f, model, guards, rows, members)
+            if again or guards.slip <= 0.0 or wrong < 3 or 2 * wrong <= members:
+                break
             widen(g, 3 * g.block[0, PLACE], (guards.slip * f.clock[1]) ** 2)
-            first_pass(f, model, guards, rows, members)
         for k in range(len(f.vehicle)):
             if f.vehicle[k] >= 0:
                 for c in range(3):

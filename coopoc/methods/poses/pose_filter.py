@@ -9,12 +9,12 @@ from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Ints, checked, number, one_of
+from ...arrays import Bools, Floats, Ints, checked, number
 from ...errors import InputError
 from ...short_repr import short_repr
 from ...world.inbox import inbox
 from ...world.links import wrap
-from ...world.recording import Recording, check_recording
+from ...world.recording import Recording, Vehicles, check_recording
 from ...world.sensors import Sensors
 from ...world.v2x import NO_MESSAGE, Message
 from ..track import Track, check_options
@@ -93,9 +93,7 @@ class PoseFilter:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_options(self)
-        one_of("unit", self.unit, get_args(Unit))
-        one_of("fusion", self.fusion, get_args(Fusion))
+        check_options(self, unit=Unit, fusion=Fusion)
         if self.fusion != "joint" and self.unit != "fleet":
             raise InputError("fusion", self.fusion, "is for a fleet", 'Take unit="fleet".')
         number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="4 leaves outliers out.")
@@ -115,7 +113,7 @@ class PoseFilter:
             return NO_MESSAGE
         return UPLOAD if self.fusion == "joint" else POSE
 
-    def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
+    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos.
 
         Raises:
@@ -144,7 +142,7 @@ class PoseFilter:
                 box = inbox(recording, column, self.message)
                 received[:, k], sent[:, k] = box.received_bytes, box.sent_bytes
         extras: dict[str, Floats] = {}
-        for k, name in enumerate(("speed_scale", "yaw_rate_bias") if self.lasting else (), 4):
+        for k, name in enumerate(("speed_scale", "yaw_rate_bias", "range_offset")[: x.shape[-1] - 4], 4):
             extras |= {name: x[..., k], f"{name}_std": np.sqrt(cov[..., k, k])}
         return Track(
             recording.t,
@@ -183,7 +181,8 @@ class PoseFilter:
         dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")
         first = np.full(4, np.nan) if begin is None else checked("begin", begin, "(4,)", (4,))
         spread = np.array(self.spread, dtype=float)
-        return PoseStream(self.noise(self.assumed, dt), self.options(), first, spread, dt)
+        noise = self.noise(self.assumed, dt)
+        return PoseStream(noise, self.options(noise), first, spread, dt)
 
     def run_filter(
         self,
@@ -207,7 +206,8 @@ class PoseFilter:
         from ...kernels.poses.ekf import run_filter
         from ...kernels.poses.scalar_update import new_poses
 
-        noise, options = self.noise(self.assumed or recording.sensors, recording.dt), self.options()
+        noise = self.noise(self.assumed or recording.sensors, recording.dt)
+        options = self.options(noise)
         measured = pose_measurements(recording, members, links, kept, place)
         memory = new_poses(len(members) * options.d), new_poses(2 * options.d)
         first, spread = np.ascontiguousarray(begin[:, members]), np.array(self.spread, dtype=float)
@@ -216,10 +216,15 @@ class PoseFilter:
     def noise(self, sensors: Sensors, dt: float) -> PoseNoise:
         """What it assumes, as the kernel takes it."""
         found = pose_noise(sensors, dt, self.gate)
+        found = found._replace(longer=found.longer * self.lasting)
         return found if self.robust else found._replace(gate=np.inf, late=1.0)
 
-    def options(self) -> PoseOptions:
+    def options(self, noise: PoseNoise) -> PoseOptions:
         """As the kernel takes them."""
         from ...kernels.poses.ekf import PoseOptions
 
-        return PoseOptions(6 if self.lasting else 4, PASSES if self.exact else 1, get_args(Fusion).index(self.fusion))
+        return PoseOptions(
+            4 + 2 * self.lasting + int(noise.longer),
+            PASSES if self.exact else 1,
+            get_args(Fusion).index(self.fusion),
+        )

@@ -10,7 +10,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints, checked, listed
 from ...errors import InputError
 from ...kernels.stars.messages import FORGOTTEN
-from ...world.recording import Body, Recording
+from ...world.recording import Body, Recording, Vehicles
 from ...world.sensors import Sensors
 from ...world.v2x import Message
 
@@ -30,7 +30,7 @@ LEAST_HEADING_STD, LEAST_YAW_RATE_STD = 1e-6, 1e-5
 """rad and rad/s: a filter needs some noise, however exact its sensors are."""
 
 
-def pose_egos(recording: Recording, egos: Sequence[int | str]) -> list[int]:
+def pose_egos(recording: Recording, egos: Vehicles) -> list[int]:
     """Columns of egos that are there throughout; InputError for one that is not, and for a landmark."""
     egos = listed("egos", egos, "Give [0] for the first.")
     columns = recording.observing(egos)
@@ -118,7 +118,8 @@ def pose_noise(sensors: Sensors, dt: float, gate: float) -> PoseNoise:
         velocity=(sensors.velocity_std_ratio, sensors.velocity_floor, of_speed),
         late=float(-np.expm1(-dt / LATE)),
         yaw_rate=max(sensors.yaw_rate_std, LEAST_YAW_RATE_STD) ** 2,
-        lasting=(sensors.speed_scale_std**2, sensors.yaw_rate_bias_std**2),
+        lasting=(sensors.speed_scale_std**2, sensors.yaw_rate_bias_std**2, sensors.range_offset_std**2),
+        longer=float(sensors.range_offset_std > 0),
         keep=float(np.exp(-dt / sensors.odometry_error_time)),
         flat=FORGOTTEN,
         gate=float(gate),

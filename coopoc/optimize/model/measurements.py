@@ -137,7 +137,7 @@ def measurement(
     """
 
     instance("name", name, str, 'Give the kind of its factors, such as "range".')
-    one_of("frame", frame, get_args(Frame))
+    one_of("frame", frame, Frame)
     if isinstance(arity, bool) or not isinstance(arity, int) or not 1 <= arity <= (9 if frame == "nodes" else 2):
         hint = 'The formula gets one vector x, y, z; frame="nodes" gives it up to nine nodes.'
         raise InputError("arity", arity, "must be 1 (a node) or 2 (a pair)", hint)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 import numpy.typing as npt
@@ -82,7 +82,7 @@ def solve_gnc(
     """
     instance("problem", problem, Problem)
     marked, surrogate = mark(problem, candidates, groups), surrogate_of(loss, threshold)
-    one_of("start", start, get_args(Start))
+    one_of("start", start, Start)
     bound, each, extras = bounds(problem, marked, threshold), list[Solution](), dict[str, Any]()
 
     def inner(weighted: Problem) -> Floats:
