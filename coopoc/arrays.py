@@ -157,6 +157,12 @@ def number(
     return found
 
 
+def seed_of(value: object) -> int:
+    """A seed of random draws."""
+    hint = "Any whole number from 0 on will do."
+    return int(number("seed", value, 0, 2**63 - 1, kind=int, allowed="in 0..2^63 - 1", hint=hint))
+
+
 def extent(field: str, value: Any, hint: str = "Give (low, high).") -> tuple[float, float]:
     """(low, high), numbers from 0 on.
 

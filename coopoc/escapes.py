@@ -5,12 +5,29 @@ from __future__ import annotations
 import re
 import unicodedata
 
-_PAIRS = (
-    r"\ \textbackslash{}, & \&, % \%, $ \$, # \#, _ \_, { \{, } \}, ~ \textasciitilde{}, ^ \textasciicircum{}, "
-    r"± $\pm$, – --, ≤ $\le$, ≥ $\ge$, × $\times$, σ $\sigma$, ° $^\circ$, ² $^2$, "
-    r"< \textless{}, > \textgreater{}, | \textbar{}"
-)
-_LATEX = dict(pair.split() for pair in _PAIRS.split(", "))
+_LATEX = {
+    "\\": r"\textbackslash{}",
+    "&": r"\&",
+    "%": r"\%",
+    "$": r"\$",
+    "#": r"\#",
+    "_": r"\_",
+    "{": r"\{",
+    "}": r"\}",
+    "~": r"\textasciitilde{}",
+    "^": r"\textasciicircum{}",
+    "±": r"$\pm$",
+    "–": "--",
+    "≤": r"$\le$",
+    "≥": r"$\ge$",
+    "×": r"$\times$",
+    "σ": r"$\sigma$",
+    "°": r"$^\circ$",
+    "²": "$^2$",
+    "<": r"\textless{}",
+    ">": r"\textgreater{}",
+    "|": r"\textbar{}",
+}
 """Letter -> what LaTeX shows as it."""
 
 

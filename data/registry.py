@@ -26,7 +26,7 @@ from .mrclam import MAX_GAP, read_mrclam
 from .source import AUTO, parted, split, there
 
 FLEETS = Path(__file__).parent / "fleets"
-LISTED = "name map map_licence vehicles steps dt sha256"
+LISTED = ("name", "map", "map_licence", "vehicles", "steps", "dt", "sha256")
 """Fields of a card in the list of bundled fleets."""
 
 
@@ -100,8 +100,6 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     >>> load_fleet("town10-clients").present.sum(axis=0)
     array([1550, 4600, 1450, 1420])
     """
-    if isinstance(name_or_path, str) and name_or_path in DATASETS and format is None and not options:
-        return DATASETS[name_or_path]()
     name, options, part = _split(name_or_path, {"format": format, **options})
     chosen = options.pop("format", None)
     if chosen is None and (in_file(name) or name in names("coopoc.datasets")):
@@ -180,7 +178,7 @@ def list_datasets() -> list[dict[str, Any]]:
     >>> [row["name"] for row in list_datasets()][:2]
     ['town04', 'town10']
     """
-    return [{column: card(name)[column] for column in LISTED.split()} for name in DATASETS]
+    return [{column: card(name)[column] for column in LISTED} for name in DATASETS]
 
 
 def convert(name_or_path: str | Path, out: str | Path, **options: Any) -> Fleet:

@@ -31,7 +31,7 @@ from coopoc.study.provenance import environment
 
 from .lineup import own
 from .roads import road_row, roads
-from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, VERSION, Task, bound, graph_row, pose_row, recording
+from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, VERSION, Task, bound, graph_row, pose_row, recording, rounded
 
 ROAD = "road-kalman"
 """Of which others are shown to be better or worse on the same blocks of real roads."""
@@ -135,7 +135,7 @@ def tried(name: str, task: Task) -> dict[str, Any]:
     scores = scored(one, seen, [fleet.ids[k] for k in task.columns], fleet)
     level = mean_interval(scores["rt_le_m"].T)
     row: dict[str, Any] = {"task": task.name}
-    row |= {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
+    row |= {"rt_le_m": rounded(level)}
     if held:
         least = bound(task, held)
         rms = float(np.sqrt(np.mean(scores["rt_le_m"] ** 2)))

@@ -10,9 +10,9 @@ from pathlib import Path
 import numpy as np
 
 from coopoc.arrays import Floats
-from coopoc.data.log.check import GATE, begin_of, together
 from coopoc.data.log.links import under
 from coopoc.data.log.read import Log
+from coopoc.data.log.residuals import GATE, begin_of, together
 from coopoc.data.mrclam import Calibration, MrclamLog, calibrate, pose_recording, read_mrclam, surveyed
 from coopoc.data.registry import kind_of, load_log
 from coopoc.data.source import split

@@ -21,7 +21,7 @@ from coopoc.methods.track import Method
 from coopoc.world.recording import MEASURED
 
 from .pose_drives import hashed
-from .tasks import located, planar
+from .tasks import located, planar, rounded
 
 SHARE, BLOCK = 0.4, 30.0
 """Share of a drive that calibrates, and s of a block, a quarter of the rest at most, over which errors are averaged."""
@@ -118,7 +118,7 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> d
         parts = [squares[k : k + size] for k in range(start, len(squares) - size + 1, size)]
         blocks += [float(np.sqrt(np.nanmean(part))) for part in parts if np.isfinite(part).any()]
     level = mean_interval(np.array([blocks]))
-    row: dict[str, Any] = {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
+    row: dict[str, Any] = {"rt_le_m": rounded(level)}
     row["blocks_m"] = [round(value, 4) for value in blocks]
     nees = np.concatenate(ratios)
     row |= {"nees": round(float(np.nanmean(nees)), 2)} if np.isfinite(nees).any() else {}

@@ -29,7 +29,7 @@ from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, past_bound, posterior_bound
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
-from coopoc.evaluate.statistics import mean_interval
+from coopoc.evaluate.statistics import Interval, mean_interval
 from coopoc.methods.track import Track
 from coopoc.world.outliers import Fault, Outliers
 from coopoc.world.spoofing import Spoofing, spoofed
@@ -245,7 +245,7 @@ def pose_row(task: Logged, folder: Path, made: Any) -> dict[str, Any]:
     squares = np.square(_blocks(errors(track, fleet)[0], start, task.block_s / fleet.dt))
     level = mean_interval(np.sqrt(squares))
     row: dict[str, Any] = {"task": task.name, "data": hashed(path)}
-    row |= {"rt_le_m": [round(value, 4) for value in (level.mean, level.low, level.high)]}
+    row |= {"rt_le_m": rounded(level)}
     if fleet.heading is None:
         row |= {"nees": round(float(np.nanmean(planar(track, fleet)[1][start:])), 2)}
     elif track.heading is not None:
@@ -268,6 +268,11 @@ def graph_row(folder: Path, file: str, backend: str) -> dict[str, Any]:
     return row | {"over_best": round(solution.cost / BEST[path.name], 5), "seconds": round(seconds, 3)}
 
 
+def rounded(level: Interval) -> list[float]:
+    """Mean and ends of an interval of metres."""
+    return [round(value, 4) for value in (level.mean, level.low, level.high)]
+
+
 def planar(track: Track, fleet: Fleet) -> tuple[Floats, Floats]:
     """Errors (T, 2) m of a track of one ego in the plane, and their NEES (T,), NaN without a covariance."""
     gap = (track.x[0, :, 0] - fleet.position[:, track.egos[0]])[:, :2]
@@ -281,4 +286,4 @@ def _blocks(error: Floats, start: int, length: float) -> Floats:
     size = max(int(length), 1)
     parts = [error[first : first + size] for first in range(start, len(error) - size + 1, size)]
     found = np.array([np.sqrt(np.nanmean(part**2, axis=0)) for part in parts if np.isfinite(part).any(axis=0).all()])
-    return np.asarray(found.T)
+    return found.T

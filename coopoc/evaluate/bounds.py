@@ -487,4 +487,4 @@ def diagonal(blocks: Floats) -> Floats:
 
 def _numbers(places: Ints, d: int) -> Ints:
     """Places of all numbers of members."""
-    return np.asarray(d * places[:, None] + np.arange(d)).ravel()
+    return (d * places[:, None] + np.arange(d)).ravel()

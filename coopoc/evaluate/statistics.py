@@ -8,7 +8,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import AnyArray, Floats, checked, number
+from ..arrays import AnyArray, Floats, checked, number, seed_of
 from ..errors import InputError
 
 _CHUNK = 4_000_000
@@ -99,7 +99,7 @@ def over_seeds(values: AnyArray) -> Interval:
 def _resampled(values: Floats, resamples: int, seed: int) -> Floats:
     """(resamples,) means; the same draws for any values of one shape, so pairs stay pairs."""
     resamples = number("resamples", resamples, 1, 10**7, kind=int, allowed="in 1..10^7", hint="2000 is the default.")
-    seed = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number from 0 on will do.")
+    seed = seed_of(seed)
     flat, step = values.ravel(), max(1, _CHUNK // values.size)
     counts = _counts(*values.shape, resamples, seed)
     sums = [counts[k : k + step].astype(float) @ flat for k in range(0, resamples, step)]

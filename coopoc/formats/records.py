@@ -229,7 +229,7 @@ class Grammar:
         count = len(record.values.split())
         noise = symmetric(numbers[:, count:], record.size)
         if self.noise == "information":
-            noise = inverse(noise, places.__getitem__, "information", notes)
+            noise = inverse(noise, places.__getitem__, notes)
         return edges_of(record.kind, nodes, numbers[:, :count], noise, stamps)
 
     def _split(self, file: str, rows: _Rows) -> tuple[Floats, list[list[str]], Floats]:

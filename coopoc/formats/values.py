@@ -144,32 +144,25 @@ def symmetric(upper: Floats, size: int) -> Floats:
     return out
 
 
-def upper_triangle(matrices: Floats) -> Floats:
-    """(M, size (size + 1) / 2), the inverse of `symmetric`."""
-    i, j = np.triu_indices(matrices.shape[-1])
-    return np.asarray(matrices[:, i, j])
-
-
 REPAIRED = 1e-6
 """Share of the largest eigenvalue, after scaling, that a repaired matrix has at least: none would have no inverse."""
 
 
-def inverse(matrices: Floats, place: Callable[[int], str], what: str, repairs: list[str] | None = None) -> Floats:
-    """Inverses of M symmetric positive definite matrices, information <-> covariance.
+def inverse(matrices: Floats, place: Callable[[int], str], repairs: list[str] | None = None) -> Floats:
+    """Inverses of M symmetric positive definite matrices of information.
 
     Rows and columns are first scaled by powers of two, which is exact, so that metres beside radians cost no digits.
 
     Args:
         matrices: (M, size, size).
         place: row -> where it stands, for the message.
-        what: "information" or "covariance", for the message.
         repairs: gets a line for each matrix that was not positive definite and whose eigenvalues, scaled to a unit
             diagonal, were raised to REPAIRED of the largest; None: such a matrix is an error.
 
     Raises:
         InputError: a matrix that is singular or not positive, at its place.
 
-    >>> inverse(np.array([[[4.0, 0], [0, 1e8]]]), "line {}".format, "information").tolist()
+    >>> inverse(np.array([[[4.0, 0], [0, 1e8]]]), "line {}".format).tolist()
     [[[0.25, 0.0], [0.0, 1e-08]]]
     """
     diagonal = np.diagonal(matrices, axis1=-2, axis2=-1)
@@ -183,12 +176,12 @@ def inverse(matrices: Floats, place: Callable[[int], str], what: str, repairs: l
         if repairs is None or not own[-1] > 0:
             raise InputError(
                 place(row),
-                f"{what} {upper_triangle(matrices[row : row + 1])[0].tolist()}",
+                f"information {matrices[row][np.triu_indices(len(own))].tolist()}",
                 "must be positive definite: a singular one has no inverse",
-                f"Give every component some {what}, leave the measurement out, or read the file with repair=True "
+                "Give every component some information, leave the measurement out, or read the file with repair=True "
                 "(coopoc solve --repair), which takes the nearest that is.",
             )
         scaled[row] = axes * np.maximum(own, REPAIRED * own[-1]) @ axes.T
-        repairs.append(f"{place(row)}: {what} was not positive definite and was replaced by the nearest that is")
+        repairs.append(f"{place(row)}: information was not positive definite and was replaced by the nearest that is")
     inverses = np.linalg.inv(scaled) * both
     return np.asarray(0.5 * (inverses + inverses.swapaxes(-1, -2)))

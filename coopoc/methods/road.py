@@ -235,7 +235,7 @@ MOST = np.log([1e2, 1e2, 1e3, 20.0, 1.0, 0.5, 1e5, 1e4])
 
 def to_logs(errors: RoadErrors) -> Floats:
     """(8,) logarithms of the numbers that are fitted: all but `least`."""
-    return np.asarray(np.log(astuple(errors)[:-1]))
+    return np.log(astuple(errors)[:-1])
 
 
 def from_logs(logs: Floats, least: float = ROAD.least) -> RoadErrors:

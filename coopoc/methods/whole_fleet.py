@@ -163,4 +163,4 @@ def located(recording: Recording) -> Bools:
     before = np.concatenate([np.zeros_like(present[:1]), present[:-1]])
     joined = np.maximum.accumulate(np.where(present & ~before, step, -1))
     fix = np.maximum.accumulate(np.where(np.isfinite(recording.gnss).all(axis=-1), step, -1), axis=1)
-    return np.asarray(present & (fix >= joined))
+    return present & (fix >= joined)

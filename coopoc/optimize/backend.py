@@ -112,6 +112,7 @@ class Backend:
             if name not in allowed:
                 hint = suggestion(name, allowed, "Leave it out.")
                 raise InputError(name, options[name], f"is no option of {self.name}, which has {allowed}", hint)
+        check_limits(**options)
         if lacking := self.capabilities.lacking(problem):
             able = [b.name for b in backends().values() if not b.capabilities.lacking(problem)]
             allowed_ = f"cannot be solved by {self.name}, only by {able}" if able else "cannot be solved by any backend"
@@ -121,7 +122,7 @@ class Backend:
         return self.prepare(problem, **options)
 
 
-def check_limits(max_iterations: int, tolerance: float) -> None:
+def check_limits(max_iterations: int = MAX_ITERATIONS, tolerance: float = TOLERANCE, **_: Any) -> None:
     """InputError unless max_iterations is a whole number >= 0 and tolerance a number > 0."""
     number("max_iterations", max_iterations, kind=int, allowed="a whole number >= 0", hint="Leave it out for 500.")
     number("tolerance", tolerance, 5e-324, allowed="a number > 0 (m)", hint="Leave it out for 1e-8.")

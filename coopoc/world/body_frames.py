@@ -162,4 +162,4 @@ def gauss_markov(normals: Floats, steps: float) -> Floats:
     error = normals.copy()
     for t in range(1, len(error)):
         error[t] = keep * error[t - 1] + fresh * normals[t]
-    return np.asarray(error)
+    return error

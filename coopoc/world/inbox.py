@@ -96,8 +96,7 @@ def _newest_of_pair(arrival: Ints, sent: Ints, steps: int) -> Ints:
     held = np.full((len(arrival), steps), -1, dtype=np.int64)
     run, k = np.nonzero(arrival >= 0)
     np.maximum.at(held, (run, arrival[run, k]), sent[k])
-    newest: Ints = np.maximum.accumulate(held, axis=1)
-    return newest
+    return np.maximum.accumulate(held, axis=1)
 
 
 def within_cap(arrival: Ints, size: Ints, start: Ints, sender: Ints, recording: Recording) -> Ints:

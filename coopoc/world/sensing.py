@@ -8,7 +8,7 @@ from weakref import WeakValueDictionary
 
 import numpy as np
 
-from ..arrays import AnyArray, Bools, Floats, Ints, instance, number, one_of
+from ..arrays import AnyArray, Bools, Floats, Ints, instance, number, one_of, seed_of
 from ..errors import InputError
 from .body_frames import body_measurements, body_motion, gauss_markov, in_body
 from .channels import lost
@@ -69,7 +69,7 @@ def observe(
     fleet, sensors = instance("fleet", fleet, Fleet), instance("sensors", sensors, Sensors)
     v2x = V2X.ideal() if v2x is None else instance("v2x", v2x, V2X)
     runs = number("runs", runs, 1, 2**32, kind=int, allowed=">= 1", hint="Use at least one noise run.")
-    seed = number("seed", seed, 0, 2**63, kind=int, allowed=">= 0", hint="Any whole number from 0 on will do.")
+    seed = seed_of(seed)
     observing = range(len(fleet.ids)) if observers is None else columns("observers", observers, fleet.ids)
     watching = tuple(sorted(set(observing)))
     one_of("frame", frame, Frame)

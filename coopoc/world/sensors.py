@@ -9,7 +9,7 @@ from typing import Literal
 
 import numpy as np
 
-from ..arrays import TINY, Floats, Limits, check_fields, extent, listed, number
+from ..arrays import TINY, Floats, Limits, check_fields, extent, listed, number, seed_of
 from ..errors import InputError
 from .outliers import Outliers
 
@@ -176,8 +176,7 @@ def stream(seed: int, sensor: str, run: int, vehicle: str, partner: str = "") ->
     True
     """
     if type(seed) is not int or seed < 0:
-        hint = "Any whole number from 0 on will do."
-        seed = number("seed", seed, 0, 2**63 - 1, kind=int, allowed="in 0..2^63 - 1", hint=hint)
+        seed = seed_of(seed)
     key = (seed, run, *(zlib.crc32(word.encode()) for word in (sensor, vehicle, partner)))
     small = max(seed, run) < 2**32  # then NumPy makes the same words of the key, three times as slowly
     entropy = np.array(key, dtype=np.uint32) if small else key

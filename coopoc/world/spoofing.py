@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats, check_fields, extent, instance, number
+from ..arrays import Floats, check_fields, extent, instance, seed_of
 from .recording import Recording, Vehicles
 from .sensors import stream
 
@@ -90,7 +90,7 @@ def spoofed(
            [ 0. , 14.9]])
     """
     attack = attack if isinstance(attack, Spoofing) else Spoofing(attack)
-    seed = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number from 0 on will do.")
+    seed = seed_of(seed)
     instance("told", told, bool, "Give True to remove false fixes.")
     spared = recording.columns(honest) if np.size(honest) else []
     offset = np.zeros((recording.runs, len(recording.ids), 3))

@@ -25,8 +25,7 @@ from .recording import Body, Recording
 from .sensors import Sensors
 from .v2x import V2X
 
-_NAMED = "t gnss velocity relative broadcasts arrival observers landmarks"
-ARRAYS = _NAMED.split()
+ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers", "landmarks")
 LINKS = ("step", "observer", "neighbour")
 BODY = ("yaw_rate", "heading")
 LARGEST = 2**31

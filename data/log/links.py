@@ -202,7 +202,7 @@ def _to_step(table: pd.DataFrame, members: Sequence[Member], steps: Steps) -> Fl
 
     def during(of_step: Floats, column: Ints) -> Floats:
         """(M, ...) means over the step in which each time lies; of the one before where the member is absent then."""
-        return np.asarray(of_step[np.where(np.isnan(velocity[after, column, 0]), step, after), column])
+        return of_step[np.where(np.isnan(velocity[after, column, 0]), step, after), column]
 
     if steps.body:
         return np.where(component == 1, wrap(value + lag * during(rate, observer)), value)

@@ -249,7 +249,7 @@ def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
     left = np.maximum(right - 1, 0)
     between = (at >= t[left] - SAME) & (at <= t[right] + SAME) & (t[right] - t[left] <= gap + SAME)
     near = np.minimum(np.abs(at - t[left]), np.abs(at - t[right])) <= edge + SAME
-    return np.asarray(between | near)
+    return between | near
 
 
 def step_means(signal: Signal, grid: Floats) -> Floats:

@@ -10,7 +10,7 @@ from coopoc.escapes import picture
 from coopoc.plots import plot_recording
 from coopoc.world.pictures import COLORS, INK, finish
 
-from .check import Check
+from .residuals import Check
 
 
 def draw(result: Check, path: Path) -> Path:

@@ -374,8 +374,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     if span / step < 0.5:
         allowed = f"must be well below the {span:g} s of the log"
         raise InputError("dt", f"{step:g} s", allowed, "Take a shorter dt.")
-    grid: Floats = float(t.min()) + step * np.arange(int(span / step + 1.5))
-    return grid
+    return float(t.min()) + step * np.arange(int(span / step + 1.5))
 
 
 def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -> Fleet:

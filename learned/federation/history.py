@@ -24,7 +24,7 @@ AGREEMENT = 0.1
 """Excess of a round's median loss over the least one up to which the round may be selected."""
 
 
-CARD = "training_loss validation_loss sent_bytes received_bytes rejected absent note"
+CARD = ("training_loss", "validation_loss", "sent_bytes", "received_bytes", "rejected", "absent", "note")
 """Fields of a round in the card of a checkpoint."""
 
 
@@ -70,7 +70,7 @@ class Round:
     @property
     def card(self) -> dict[str, Any]:
         """The round in the card of a checkpoint."""
-        return {"round": self.number} | {name: getattr(self, name) for name in CARD.split()}
+        return {"round": self.number} | {name: getattr(self, name) for name in CARD}
 
 
 @dataclass(frozen=True, eq=False)

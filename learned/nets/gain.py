@@ -150,12 +150,6 @@ def size(field: str, value: object) -> int:
     return int(number(field, value, 1, 1024, kind=int, allowed="in 1..1024", hint="The shipped nets have 5 to 40."))
 
 
-def seed_of(value: object) -> int:
-    """Seed of initial weights."""
-    hint = "Any whole number from 0 on will do."
-    return int(number("seed", value, 0, 2**63 - 1, kind=int, allowed="in 0..2^63 - 1", hint=hint))
-
-
 @cache
 def _arguments(kind: type[Gain]) -> tuple[str, ...]:
     return tuple(inspect.signature(kind).parameters)

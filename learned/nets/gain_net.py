@@ -8,13 +8,13 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats, Ints, number
+from coopoc.arrays import Floats, Ints, number, seed_of
 
 from ..engine import rollout as engine
 from ..engine.layers import CELLS, SHORTEST, SIZE
 from ..training.clients import Batch
 from ..training.schedule import Moving, Schedule
-from .gain import Recurrent, seed_of, size
+from .gain import Recurrent, size
 
 
 class Memory(NamedTuple):

@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats, checked, instance
+from coopoc.arrays import Floats, checked, instance, seed_of
 from coopoc.errors import InputError
 from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.solo import FixNoise
@@ -24,7 +24,7 @@ from coopoc.world.recording import Recording, Vehicles, check_recording
 
 from ..training.clients import Batch, Segments
 from ..training.machine import one_core
-from .gain import Gain, error, has_truth, over_time, seed_of
+from .gain import Gain, error, has_truth, over_time
 from .stack import flatten
 
 

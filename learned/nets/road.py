@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, seed_of
 from coopoc.errors import InputError
 from coopoc.kernels.road import run_road
 from coopoc.kernels.solo import SoloMeasurements
@@ -15,7 +15,7 @@ from coopoc.methods.road import RoadErrors, RoadFilter, from_logs, louder, road_
 from coopoc.world.sensors import Sensors
 
 from ..training.clients import Batch
-from .gain import Gain, seed_of
+from .gain import Gain
 from .stack import flatten
 
 START = RoadErrors(fix=1.5, motion=1.0, correlation=2.0, gate=2.0, heading=0.1, scale=0.03, lasts=300.0, window=50.0)

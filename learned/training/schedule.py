@@ -77,8 +77,7 @@ def cosine(steps: int, start: float = 0.0, stop: float = 1.0) -> Floats:
     [1.0, 0.5]
     """
     where = start + (stop - start) * np.arange(steps) / max(steps, 1)
-    factors: Floats = 0.5 * (1.0 + np.cos(np.pi * where))
-    return factors
+    return 0.5 * (1.0 + np.cos(np.pi * where))
 
 
 def advance(

@@ -239,7 +239,7 @@ def marginals(x: Floats, active: Bools, motions: list[Motion], inverses: list[Fl
 
 def both_triangles(lower: Floats) -> Floats:
     """The symmetric matrix of a lower triangle."""
-    return np.asarray(np.tril(lower) + np.tril(lower, -1).T)
+    return np.tril(lower) + np.tril(lower, -1).T
 
 
 def cholesky(matrix: Floats) -> Floats:

@@ -46,7 +46,7 @@ class Cholesky:
         """(u,) squares of L's diagonal."""
         from ...kernels.graphs.multifrontal import places
 
-        return np.asarray(np.square(self._factor[places(self._fronts, self._rank, self._rank)]))
+        return np.square(self._factor[places(self._fronts, self._rank, self._rank)])
 
     def solve(self, rhs: Floats) -> Floats:
         """(u,) A^-1 rhs."""
@@ -100,7 +100,7 @@ class DenseCholesky:
 
     def solve(self, rhs: Floats) -> Floats:
         """(u,) A^-1 rhs."""
-        return np.asarray(self._dpotrs(self._root, rhs)[0]) if self._size else rhs
+        return self._dpotrs(self._root, rhs)[0] if self._size else rhs
 
     def inverse(self, rows: Ints, columns: Ints) -> Floats:
         """A^-1 at pairs of unknowns (K,)."""

@@ -189,7 +189,7 @@ def _null_rows(J: Any, length: Floats) -> Floats:
     square = unit.T @ unit
     if len(length) <= SMALL:
         values, ways = np.linalg.eigh(square.toarray())
-        return np.asarray(ways[:, values <= 1e-10 * values.max(initial=1.0)].T)
+        return ways[:, values <= 1e-10 * values.max(initial=1.0)].T
     shift, factored = 1e-12, None
     while factored is None:
         factored, shift = cholesky_of(with_still(square, np.full(len(length), shift))), 10.0 * shift

@@ -17,7 +17,7 @@ import numpy as np
 from ...arrays import Floats
 from ...errors import InputError
 from ..algebra.sparse import sparse, structure_of
-from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Capabilities, Solver, SolverResult, check_limits
+from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Capabilities, Solver, SolverResult
 from ..model.derivatives import Structure, expressions
 from ..model.factor import steerable
 from ..model.problem import Problem
@@ -63,7 +63,6 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     >>> solve(problem.constrain("range", ("a", "b"), upper=7.0), "casadi").x.round(3)[:, 0]
     array([1., 8.])
     """
-    check_limits(max_iterations, tolerance)
     form, sides = structure_of(structure), _sides(structure)
     equal, moving = int((sides[0] == sides[1]).sum()), int(form.movable.sum())
     if equal > moving:

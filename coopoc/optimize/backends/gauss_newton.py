@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from ...arrays import Floats
 from ..algebra.sparse import sparse
-from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Solver, SolverResult, check_limits
+from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Solver, SolverResult
 from ..descent.levenberg_marquardt import arrive
 from ..model.problem import Problem
 
@@ -17,7 +17,6 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
         max_iterations: of Gauss-Newton steps.
         tolerance: m, largest move of a point in the last step.
     """
-    check_limits(max_iterations, tolerance)
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
         end = arrive(sparse(problem), x, min(1, max_iterations) if problem.linear else max_iterations, tolerance)

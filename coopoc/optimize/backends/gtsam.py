@@ -16,7 +16,7 @@ from typing import Any, NamedTuple, TypeAlias
 import numpy as np
 
 from ...arrays import Floats
-from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Solver, SolverResult, check_limits
+from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Solver, SolverResult
 from ..model.derivatives import linearise
 from ..model.factor import Factor, Loss, unchecked
 from ..model.problem import Problem
@@ -48,7 +48,6 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
         max_iterations: of GTSAM's linear solves that lowered the cost.
         tolerance: m or rad, which GTSAM, that stops by the cost, does not know.
     """
-    check_limits(max_iterations, tolerance)
 
     def solver(problem: Problem, x: Floats) -> SolverResult:
         import gtsam

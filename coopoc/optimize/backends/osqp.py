@@ -22,7 +22,7 @@ import numpy as np
 from ...arrays import Floats
 from ..algebra.sparse import Layout, layout_of, sparse
 from ..assess.active import constraint_rows
-from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Capabilities, Solver, SolverResult, check_limits
+from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Capabilities, Solver, SolverResult
 from ..descent.levenberg_marquardt import arrive
 from ..model.derivatives import linearise
 from ..model.factor import as_factor, bounded
@@ -78,7 +78,6 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
     >>> solve(problem.constrain("displacement", ("a", "b"), upper=[7, 9, 9]), "osqp").x.round(3)[:, 0]
     array([1., 8.])
     """
-    check_limits(max_iterations, tolerance)
     limits, layout = None, layout_of(structure)
     if structure.constraints:
         from scipy.sparse import csc_matrix

@@ -87,4 +87,4 @@ def _anchors(problem: Problem) -> Ints:
     part = parts(len(problem.names), *(n for n in linear if n.shape[1] == 2))
     held = part[np.concatenate([np.empty(0, np.int64), *(n[:, 0] for n in linear if n.shape[1] == 1)])]
     poses = np.setdiff1d(problem.poses, np.flatnonzero(np.isin(part, held)))
-    return np.asarray(poses[np.unique(part[poses], return_index=True)[1]])
+    return poses[np.unique(part[poses], return_index=True)[1]]

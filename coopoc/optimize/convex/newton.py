@@ -96,14 +96,14 @@ class Reduced:
         """The constrained rows X and the free ones where the cost is smallest."""
         bound = self.problem.bound
         if self._small is not None:
-            return np.asarray(self._small[1] @ X)
+            return self._small[1] @ X
         right = -(self._rows[:, bound:].T @ (self._rows[:, :bound] @ X))
         return np.concatenate([X, columns_solved(self._inverse, right)])
 
     def times(self, X: Floats) -> Floats:
         """C X."""
         if self.problem.bound <= DENSE:
-            return np.asarray(self.matrix @ X)
+            return self.matrix @ X
         return np.asarray(self._rows[:, : self.problem.bound].T @ (self._rows @ self._all(X)))
 
     def settle(self, X: Floats) -> Floats:
@@ -119,7 +119,7 @@ class Reduced:
         """C (bound, bound)."""
         small = self._small
         moved = self._rows @ self._all(np.eye(self.problem.bound)) if small is None else small[0] @ small[1]
-        return np.asarray(moved.T @ moved)
+        return moved.T @ moved
 
     @cached_property
     def scale(self) -> float:

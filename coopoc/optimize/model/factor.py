@@ -317,7 +317,7 @@ def as_factor(constraint: Constraint) -> Factor:
 
 def bounded(constraint: Constraint) -> Bools:
     """(M, size) True where a side is finite."""
-    return np.asarray(np.isfinite(constraint.lower) | np.isfinite(constraint.upper))
+    return np.isfinite(constraint.lower) | np.isfinite(constraint.upper)
 
 
 def steerable(constraint: Constraint, movable: Bools | None) -> Bools:
@@ -325,4 +325,4 @@ def steerable(constraint: Constraint, movable: Bools | None) -> Bools:
     if movable is None:
         return bounded(constraint)
     moves = np.asarray(movable[constraint.nodes].any(axis=(1, 2)))
-    return np.asarray(bounded(constraint) & moves[:, None])
+    return bounded(constraint) & moves[:, None]

@@ -35,7 +35,7 @@ def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
         why = f"smallest eigenvalue {least[k]:.3g}" if symmetric[k] else "not symmetric or not finite"
         hint = "Give a covariance, not an information matrix, with no exact direction."
         raise InputError(f"cov of {kind}", f"number {k}: {why}", "must be symmetric positive definite", hint)
-    return np.asarray(np.linalg.inv(np.linalg.cholesky(array)))
+    return np.linalg.inv(np.linalg.cholesky(array))
 
 
 @lru_cache(maxsize=256)

@@ -49,16 +49,14 @@ class Space:
 
     def position(self, x: Floats) -> Floats:
         """(..., d) m of nodes (..., ambient)."""
-        at: Floats = x[..., : self.dimension]
-        return at
+        return x[..., : self.dimension]
 
     def rotation(self, x: Floats) -> Floats:
         """(..., d, d) of nodes (..., ambient)."""
         d = self.dimension
         if not self.has_rotation:
             return np.broadcast_to(np.eye(d), (*x.shape[:-1], d, d))
-        turned: Floats = x[..., d:].reshape(*x.shape[:-1], d, d)
-        return turned
+        return x[..., d:].reshape(*x.shape[:-1], d, d)
 
     def join(self, position: Floats, rotation: Floats | None = None) -> Floats:
         """Nodes (..., ambient) from positions (..., d) and rotations (..., d, d), default the identity."""
@@ -71,7 +69,7 @@ class Space:
     def retract(self, x: Floats, step: Floats) -> Floats:
         """Nodes (..., ambient) after a step (..., dof): p + dp, R Exp(w)."""
         if not self.has_rotation:
-            return np.asarray(x + step)
+            return x + step
         d = self.dimension
         return self.join(x[..., :d] + step[..., :d], self.rotation(x) @ exp(step[..., d:]))
 
@@ -107,8 +105,7 @@ def exp(w: Floats) -> Floats:
     first = np.where(angle > 1e-8, np.sin(safe) / safe, 1.0)
     second = np.where(angle > 1e-8, 2.0 * np.square(np.sin(0.5 * safe) / safe), 0.5)
     turn = cross(w)
-    matrix: Floats = np.eye(3) + first * turn + second * (turn @ turn)
-    return matrix
+    return np.eye(3) + first * turn + second * (turn @ turn)
 
 
 def log(rotation: Floats) -> Floats:

@@ -111,8 +111,7 @@ def relative_std(relative: Floats, sensors: Sensors) -> Floats:
     if (ratio == 1.0).all():
         return sensors.relative_std
     scale = np.stack([np.ones_like(ratio), ratio, ratio], axis=1)
-    inflated: Floats = np.minimum(scale * sensors.relative_std, [np.inf, np.pi, np.pi])
-    return inflated
+    return np.minimum(scale * sensors.relative_std, [np.inf, np.pi, np.pi])
 
 
 def _joined(parts: Sequence[tuple[Floats, Floats]]) -> Iterator[npt.NDArray[np.float64]]:

@@ -133,8 +133,7 @@ class _Search:
         problem = self.problem
         measured = [f.nodes[f.informative] for f in reweigh(problem, self.marked, self.weight, self.x).factors]
         pairs = (nodes[:, k : k + 2] for nodes in measured for k in range(nodes.shape[1] - 1))
-        joined = parts(len(problem.names), *pairs)
-        part = np.unique(joined, return_inverse=True)[1]
+        part = parts(len(problem.names), *pairs)
         alone = [nodes[:, 0] for nodes in measured if nodes.shape[1] == 1]
         nodes = np.concatenate([problem.poses, np.setdiff1d(np.arange(len(part)), problem.poses)]).astype(np.int64)
         first = nodes[np.unique(part[nodes], return_index=True)[1]]

@@ -110,17 +110,20 @@ def along_poses(problem: Problem) -> Floats:
             rows = np.flatnonzero(on & ~np.isin(f.nodes[:, 1], still))[::-1]  # the first that sees a point places it
             i, j = f.nodes[rows].T
             x[j, :d] = x[i, :d] + np.einsum("mab,mb->ma", space.rotation(x[i]), f.z[rows])
-    return np.asarray(x)
+    return x
 
 
 def parts(n: int, *joined: Ints) -> Ints:
-    """(n,) the first node of the connected component that each is in, by pairs, (M, 2) each, that are joined."""
-    part, pairs = np.arange(n), np.concatenate([np.empty((0, 2), np.int64), *joined])
-    while (apart := part[pairs[:, 0]] != part[pairs[:, 1]]).any():
-        ends = part[pairs[apart]]
-        np.minimum.at(part, ends.max(axis=1), ends.min(axis=1))
-        while (part != (up := part[part])).any():
-            part = up
+    """(n,) the connected component that each is in, by pairs, (M, 2) each, that are joined; counted by first nodes.
+
+    >>> parts(4, np.array([[3, 1]])).tolist()
+    [0, 1, 2, 1]
+    """
+    from scipy.sparse import csr_array
+    from scipy.sparse.csgraph import connected_components
+
+    pairs = np.concatenate([np.empty((0, 2), np.int64), *joined])
+    part: Ints = connected_components(csr_array((np.ones(len(pairs)), pairs.T), (n, n)), directed=False)[1]
     return part
 
 

@@ -1,0 +1,160 @@
+"""A log against a filter of each vehicle alone: innovations of fixes, residuals of relative measurements."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from coopoc.arrays import Bools, Floats
+from coopoc.errors import InputError
+from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
+from coopoc.methods.kalman import Kalman
+from coopoc.methods.poses.pose_filter import PoseFilter
+from coopoc.methods.poses.pose_start import pose_start
+from coopoc.world.body_frames import midway, turned
+from coopoc.world.links import spherical, stretches, wrap
+from coopoc.world.recording import Recording
+
+from .read import Log
+
+GATE = 5.0
+"""Of the pose filters that check a log: standard deviations beyond which a measurement is left out."""
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """What the measurements of a log say about each other.
+
+    Args:
+        log: the part that was filtered.
+        span: where that is, in words.
+        world: its recording, in body frames turned into the world by the filter's headings.
+        x: (T, N, 3) m, filter of each vehicle without relative measurements of others, NaN where it is absent.
+        variance: (T, N, 3) m^2.
+        fix: (T, N, 3) m, innovations of the fixes.
+        normalised: (T, N), 1 on average if the assumed noise is right.
+        relative: (L, 3) m, rad, rad: measured less computed from the filters.
+        expected: (L, 3) standard deviations that these should have.
+        vehicles: table, a row per vehicle.
+        measurements: table, a row per kind of relative measurement.
+        warnings: sentences.
+    """
+
+    log: Log
+    span: str
+    world: Recording
+    x: Floats
+    variance: Floats
+    fix: Floats
+    normalised: Floats
+    relative: Floats
+    expected: Floats
+    vehicles: Sequence[Mapping[str, Any]] = ()
+    measurements: Sequence[Mapping[str, Any]] = ()
+    warnings: tuple[str, ...] = ()
+
+
+def together(log: Log) -> tuple[Log, str]:
+    """The longest part of a log in which all its vehicles are there, and where that is in words.
+
+    Raises:
+        InputError: the vehicles share no two steps.
+    """
+    rec = log.recording
+    there: Bools = np.isfinite(rec.velocity[0][:, _moving(rec), 0]).all(axis=1)
+    first, last = max(stretches(there), key=lambda edge: edge[1] - edge[0], default=(0, 0))
+    if last - first < 2 or not _moving(rec):
+        hint = "Raise max_gap, give clock= where stamps differ, or leave out files of vehicles that are hardly there."
+        raise InputError("log", log.summary.name, "must hold steps at which all vehicles are there", hint)
+    t = rec.t - rec.t[0]
+    span = "throughout" if there.all() else f"from {t[first]:.1f} to {t[last - 1]:.1f} s, where all are there"
+    truth = None if log.truth is None else log.truth.between(first, last)
+    return replace(log, recording=rec.between(first, last), truth=truth), span
+
+
+def begin_of(log: Log, gate: float = GATE) -> tuple[Floats | None, str]:
+    """First poses: those of fixes and compasses (None), those found in the first seconds, or the truth's; and which,
+    where it is the last.
+
+    Args:
+        log: in body frames, all vehicles there at its first step.
+        gate: of the filters that find them, standard deviations.
+
+    Raises:
+        InputError: a vehicle that has neither a fix nor sees a landmark in the first seconds, nor a true pose.
+    """
+    rec, truth, moving = log.recording, log.truth, _moving(log.recording)
+    assert rec.body is not None
+    if np.isfinite(np.column_stack([rec.gnss[0, 0], rec.body.heading[0, 0]])[moving]).all():
+        return None, ""
+    try:
+        return pose_start(rec, gate=gate), ""
+    except InputError:
+        if truth is None or truth.heading is None:
+            raise
+        poses = np.column_stack([truth.position[0], truth.heading[0]])
+        if not np.isfinite(poses[moving]).all():
+            raise
+        return poses, ", from the truth's first poses"
+
+
+def _moving(rec: Recording) -> list[int]:
+    return [k for k in range(len(rec.ids)) if k not in rec.landmarks]
+
+
+def filtered(log: Log) -> Check:
+    """The log with a Kalman filter of each vehicle alone, in body frames a pose filter; and the residuals of relative
+    measurements against these filters, with the deviations that they should have."""
+    span, start, body = "", "", log.recording.body is not None
+    if body:
+        log, span = together(log)
+    rec = log.recording.of_runs(slice(0, 1))
+    steps, vehicles, links = len(rec.t), len(rec.ids), rec.links
+    x, variance, fix = (np.full((steps, vehicles, 3), np.nan) for _ in range(3))
+    normalised, heading, heading_variance = np.full((steps, vehicles), np.nan), *np.zeros((2, steps, vehicles))
+    marks = list(rec.landmarks)
+    x[:, marks], variance[:, marks] = rec.gnss[0][:, marks], 0.0
+    if body:
+        begin, start = begin_of(log)
+        parts = [(0, steps, PoseFilter("solo", gate=GATE, begin=begin)(rec, _moving(rec)))]
+    else:
+        stretches = [(column, *stretch) for column in range(vehicles) for stretch in rec.stretches(column)]
+        parts = [
+            (first, last, Kalman(robust=False)(rec.between(first, last), [column])) for column, first, last in stretches
+        ]
+    for first, last, track in parts:
+        there, columns, part = slice(first, last), list(track.egos), rec.between(first, last)
+        squares = normalised_innovations(track, part)
+        assert track.covariance is not None
+        assert squares is not None
+        x[there, columns], fix[there, columns] = track.x[0], fix_innovations(track, part)[0]
+        variance[there, columns] = np.diagonal(track.covariance[0], axis1=-2, axis2=-1)
+        normalised[there, columns] = squares[0]
+        if track.heading is not None and track.heading_covariance is not None:
+            heading[there, columns] = track.heading[0]
+            heading_variance[there, columns] = track.heading_covariance[0, ..., 3]
+    world, noise = rec, rec.sensors
+    if body:
+        relative = rec.relative.copy()
+        relative[..., 1] = wrap(relative[..., 1] + heading[links.step, links.observer])
+        world = replace(rec, body=None, velocity=turned(rec.velocity, midway(heading)), relative=relative)
+    gap, residual = residual_of(world, x)
+    both = (variance[links.step, links.neighbour] + variance[links.step, links.observer])[:, :2].mean(axis=1)
+    flat, distance = (np.maximum(np.linalg.norm(gap[:, :axes], axis=1), 1.0) for axes in (2, 3))
+    expected = np.column_stack([both, both / flat**2, both / distance**2])
+    expected[:, 1] += heading_variance[links.step, links.observer]
+    expected += np.square([noise.range_std, noise.world_azimuth_std, noise.inclination_std])
+    log = replace(log, recording=rec)
+    return Check(log, span + start, world, x, variance, fix, normalised, residual, np.sqrt(expected))
+
+
+def residual_of(world: Recording, x: Floats) -> tuple[Floats, Floats]:
+    """(L, 3) m, from observers to neighbours at positions x (T, N, 3), and measured less computed from these."""
+    links = world.links
+    gap = x[links.step, links.neighbour] - x[links.step, links.observer]
+    residual = world.relative[0] - np.column_stack(spherical(*gap.T))
+    residual[:, 1:] = wrap(residual[:, 1:])
+    return gap, residual
