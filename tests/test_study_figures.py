@@ -190,6 +190,7 @@ def test_no_figure_of_the_gallery_hides_a_line_or_shows_one_below_its_bound(file
         plot = view(results)
         for panel in plot.figure.axes if plot is not None else ():
             panel.figure.draw_without_rendering()
+            assert panel.figure.get_figwidth() < 14.0
             texts = [text.get_text() for text in panel.texts]
             lines = [line for line in panel.lines if len(line.get_xdata()) > 1 and line.get_linestyle() != "None"]
             bounds = [line for line in lines if line.get_color() == "black" and line.get_linestyle() == "--"]

@@ -44,6 +44,10 @@ class Track:
         extras: other numbers by name, (R, T, E), or (R, L) by link; states with their standard deviations under the
             name and "_std".
         ids: of all vehicles of the Recording, so that no other fleet's truth is taken for theirs; () if unknown.
+
+    >>> covariance = np.full((1, 1, 1, 3, 3), 50.0) + 100.0 * np.eye(3)  # correlated, and sound
+    >>> Track([0.0], (0,), np.zeros((1, 1, 1, 3)), covariance, [[0]], [[0]], 0.0).notes
+    ()
     """
 
     t: Floats
