@@ -78,7 +78,10 @@ def _module(path: str, digest: str) -> ModuleType:
     sys.modules[spec.name] = module  # dataclasses look their module up while it runs
     try:
         spec.loader.exec_module(module)
-    except BaseException:
+    except BaseException as error:
         del sys.modules[spec.name]
+        if isinstance(error, SystemExit):
+            hint = 'Put what runs as a script under if __name__ == "__main__".'
+            raise InputError(path, f"exit {error.code!r}", "must not end Python while it loads", hint) from None
         raise
     return module

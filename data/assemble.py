@@ -22,6 +22,8 @@ SLOWEST, FASTEST = 2e-3, 500.0
 """m/s: a car in degrees per second has 0.0003 at most, an airliner in metres 250."""
 LATEST = 1e11
 """s since 1970, the year 5138."""
+COARSE = 1e-3, 64.0
+"""s, between stamps of 32-bit floats: worth a word; of seconds since 1970, or GPS seconds, which tell no steps."""
 CELLS, PER_ROW = 500_000, 200
 """Steps times vehicles that any file may take, and how many more a row of it may."""
 PLANE_STD = 0.01
@@ -215,10 +217,14 @@ metres in a local frame. Give latitude and longitude to co.load_recording, which
         raise InputError(where, given, f"must be below {FASTEST:g} m/s", hint)
 
 
-def check_time(t: Floats, file: str, column: str = "t") -> None:
-    """InputError where times (L,) s are beyond any date.
+def check_time(t: Floats, file: str, column: str = "t") -> float:
+    """InputError where times (L,) s are beyond any date, or those of this century as 32-bit floats have them.
 
-    >>> check_time(np.array([1.7e9]), "drive.csv")
+    Returns:
+        float: s, of which times are multiples where they are 32-bit floats and coarser than 1 ms; else 0.
+
+    >>> check_time(np.array([1.7e9]), "drive.csv"), check_time(np.array([1e5, 1e5 + 1 / 128]), "drive.csv")
+    (0.0, 0.0078125)
     """
     late = t[np.abs(t) > LATEST]
     if len(late):
@@ -226,6 +232,13 @@ def check_time(t: Floats, file: str, column: str = "t") -> None:
         raise InputError(
             f"{file}: column {column}", f"{late[0]:.15g}", allowed, "Divide it by 1e3 or 1e9, or store dates."
         )
+    unit = float(np.spacing(np.float32(np.abs(t).max(initial=0.0))))
+    if unit < COARSE[0] or (t % unit).any() or not (t % (2 * unit)).any():
+        return 0.0
+    if unit >= COARSE[1]:
+        given, allowed = f"multiples of {unit:g} s, as of 32-bit floats", "must be resolved"
+        raise InputError(f"{file}: column {column}", given, allowed, "Write it in 64 bits, or from the first instant.")
+    return unit
 
 
 def check_size(steps: float, vehicles: int, rows: int, dt: float, file: str) -> None:

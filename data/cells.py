@@ -138,11 +138,14 @@ def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
 
 
 def factors(given: Mapping[str, float] | None, names: Collection[str], field: str = "scale") -> dict[str, float]:
-    """Numbers by name; InputError for a name that is none of `names`, and for 0."""
+    """Numbers by name; InputError for a name that is none of `names`, for 0, and for a deviation or a scale of times
+    that is not positive."""
     for name, value in named(field, given or {}, f"Give {field}={{name: number}}.").items():
         if name not in names:
             raise unknown(field, name, names)
-        if not number(f"{field} of {name}", value, -LARGEST, LARGEST):
+        least = 1e-12 if field == "std" or name == "t" else -LARGEST
+        allowed = f"a finite number other than 0{', and > 0' * (least > 0)}"
+        if not number(f"{field} of {name}", value, least, LARGEST, allowed=allowed):
             raise InputError(f"{field} of {name}", value, "must not be 0", "Leave it out.")
     return dict(given or {})
 

@@ -52,7 +52,7 @@ def read_paths(name: str) -> dict[str, Path]:
 
 def _of_table(file: File, columns: dict[str, str]) -> dict[str, Path]:
     frame = read_frame(file, columns.get("id", "id"))
-    allowed = ("id", "t", "x", "y", "z", *QUATERNION, *COVARIANCE)
+    allowed = ("id", "t", *"xyz", *QUATERNION, *COVARIANCE)
     frame = named_columns(frame, columns, allowed, ("t", "x", "y"), file.name)
     frame = frame.assign(t=seconds(frame, "t", file.name), z=frame.get("z", 0.0))
     frame["id"] = words(frame, "id", file.name) if "id" in frame.columns else file.stem
@@ -67,7 +67,7 @@ def _of_table(file: File, columns: dict[str, str]) -> dict[str, Path]:
             np.column_stack([numeric(rows, column, file.name) for column in group])
             if set(group) <= set(frame.columns)
             else None
-            for group in (("x", "y", "z"), QUATERNION, COVARIANCE)
+            for group in ([*"xyz"], QUATERNION, COVARIANCE)
         )
         assert position is not None  # the reader requires x, y and z
         rotation = None if quaternion is None else to_rotation(quaternion)
@@ -147,21 +147,10 @@ def table(rows: list[Score], delta: float, unit: Unit) -> str:
     """The scores as a Markdown table."""
     from tabulate import tabulate
 
-    header = [
-        "vehicle",
-        "poses",
-        "without truth",
-        "RT-LE [m]",
-        "APE [m]",
-        "largest [m]",
-        f"RPE, {delta:g} {unit} [m]",
-        "APE [°]",
-        "RPE [°]",
-        "NEES",
-    ]
+    header = f"vehicle|poses|without truth|RT-LE [m]|APE [m]|largest [m]|RPE, {delta:g} {unit} [m]|APE [°]|RPE [°]|NEES"
     shown = [
         [row.vehicle, row.poses, row.missed, row.rt_le_m, row.ape_m, f"{row.ape_max_m:.3g}"]
         + ["" if value is None else f"{value:.3g}" for value in (row.rpe_m, row.ape_deg, row.rpe_deg, row.nees)]
         for row in rows
     ]
-    return str(tabulate(shown, headers=header, tablefmt="github", disable_numparse=True))
+    return str(tabulate(shown, headers=header.split("|"), tablefmt="github", disable_numparse=True))

@@ -8,6 +8,7 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 
 import numpy as np
 
@@ -48,7 +49,8 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
         try:
             options[key] = read(value)
         except ValueError:
-            raise InputError(key, repr(value), f"must be {allowed}", f"Write {key}={example}.") from None
+            hint = f"Write {key}={example}; of a name a comma as %2C, a colon as %3A, & as %26."
+            raise InputError(key, repr(value), f"must be {allowed}", hint) from None
     return name, options
 
 
@@ -72,9 +74,11 @@ def parted(data: Any, since: float | None = None, until: float | None = None) ->
         return data
     begin, end, t = since or 0.0, np.inf if until is None else until, data.t
     first, last = np.searchsorted(t - t[0], np.array([begin, end]) - ROUNDING * (t[1] - t[0])).tolist()
-    if not last - first >= 2:
+    if not (last - first >= 2 and 0 <= begin < end):
         given, length = f"since {begin:g} s until {end:g} s", f"{t[-1] - t[0]:g} s"
-        raise InputError("since, until", given, f"must leave two steps of the {length}", "Count from the first step.")
+        raise InputError(
+            "since, until", given, f"must leave two steps of the {length}", "Count from the first step, 0 s."
+        )
     part: Fleet | Recording = data.between(first, last)
     if isinstance(part, Recording):
         note = f"from {begin:g} s on" if until is None else f"from {begin:g} s to {end:g} s"
@@ -83,8 +87,8 @@ def parted(data: Any, since: float | None = None, until: float | None = None) ->
 
 
 def pairs(text: str, value: Callable[[str], Any] = str) -> dict[str, Any]:
-    """Names and values, as "t:time,id:car"; ValueError for anything else."""
-    made = [[word.strip() for word in pair.partition(":")] for pair in text.split(",")]
+    """Names and values, as "t:time,id:car", a comma of a name as %2C; ValueError for anything else."""
+    made = [[unquote(word.strip()) for word in pair.partition(":")] for pair in text.split(",")]
     if not all(map(all, made)):
         raise ValueError(text)
     return {name: value(word) for name, _, word in made}

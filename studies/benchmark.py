@@ -7,7 +7,7 @@ import re
 import sys
 import time
 import traceback
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -28,6 +28,7 @@ from coopoc.one_file import file_digest, in_file
 from coopoc.plugins import find, names
 from coopoc.study.numbers import three
 from coopoc.study.provenance import environment
+from coopoc.study.study import Params, Row
 
 from .lineup import own
 from .roads import road_row, roads
@@ -126,7 +127,7 @@ def information(name: str, one: Method) -> str:
     return "fleet" if name in WHOLE_FLEET or needs_whole_fleet(name) else "star"
 
 
-def tried(name: str, task: Task) -> dict[str, Any]:
+def tried(name: str, task: Task) -> Row:
     """A method's row for one task: error with its interval, bound, consistency, bytes and time."""
     one = method(name)
     held = information(name, one)
@@ -134,7 +135,7 @@ def tried(name: str, task: Task) -> dict[str, Any]:
     one(seen.between(0, 3), [task.columns[0]])  # compiles
     scores = scored(one, seen, [fleet.ids[k] for k in task.columns], fleet)
     level = mean_interval(scores["rt_le_m"].T)
-    row: dict[str, Any] = {"task": task.name}
+    row: Row = {"task": task.name}
     row |= {"rt_le_m": rounded(level)}
     if held:
         least = bound(task, held)
@@ -147,7 +148,7 @@ def tried(name: str, task: Task) -> dict[str, Any]:
     return row
 
 
-def measured(name: str, data: Path) -> list[dict[str, Any]]:
+def measured(name: str, data: Path) -> list[Row]:
     """Rows of the tasks of real measurements: graphs of a backend, logs of a pose filter, roads of a solo method; of
     "mine.py:NAME" logs, or roads if it says `roads = True`."""
     if name in names("coopoc.backends"):
@@ -161,7 +162,7 @@ def measured(name: str, data: Path) -> list[dict[str, Any]]:
     return []
 
 
-def _row(task: str, made: Callable[[], dict[str, Any]]) -> dict[str, Any]:
+def _row(task: str, made: Callable[[], Row]) -> Row:
     try:
         return made()
     except (Exception, SystemExit) as error:  # a failure is a row
@@ -179,7 +180,7 @@ def _on_roads(name: str) -> bool:
     return in_file(name) and getattr(find("coopoc.methods", name), "roads", False)
 
 
-def card(name: str, tasks: Iterable[Task], data: Path | None = None) -> dict[str, Any]:
+def card(name: str, tasks: Iterable[Task], data: Path | None = None) -> Row:
     """The card of a method: what it is, with which versions, and a row for each task.
 
     Args:
@@ -197,7 +198,7 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None) -> dict[str
     return {"benchmark": VERSION, "method": name, "source": digest, "versions": versions, "tasks": rows}
 
 
-def page(cards: Iterable[Mapping[str, Any]]) -> str:
+def page(cards: Iterable[Params]) -> str:
     """Markdown tables of cards, of simulated tasks and of logs and graphs where there are any.
 
     Of simulated ones RT-LE in m and, in parentheses, over its bound, the least geometric mean over all tasks first.
@@ -209,7 +210,7 @@ def page(cards: Iterable[Mapping[str, Any]]) -> str:
     return "\n\n".join(tabulate(rows, headers="keys", tablefmt="github", disable_numparse=True) for rows in tables)
 
 
-def _logs(cards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _logs(cards: Sequence[Params]) -> list[Row]:
     """RT-LE, heading error and NEES of pose filters, a row per task and method."""
     rows = []
     simulated_tasks = {task.name for task in TASKS} | set(BEST)
@@ -229,20 +230,20 @@ def _logs(cards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return [shown for _, shown in sorted(rows, key=lambda row: row[0])]
 
 
-def _graphs(cards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _graphs(cards: Sequence[Params]) -> list[Row]:
     """Cost over the least known, status and time of backends, a row per backend."""
-    shown: dict[str, dict[str, Any]] = {}
+    shown: dict[str, Row] = {}
     for one, row in _rows(cards, set(BEST)):
         cell = "failed" if "failed" in row else f"{row['over_best']:.4g} {row['status']}, {row['seconds']:.2g} s"
         shown.setdefault(one, {"backend": one})[row["task"]] = cell
     return list(shown.values())
 
 
-def _rows(cards: Sequence[Mapping[str, Any]], tasks: set[str]) -> list[tuple[str, Mapping[str, Any]]]:
+def _rows(cards: Sequence[Params], tasks: set[str]) -> list[tuple[str, Params]]:
     return [(card["method"], row) for card in cards for row in card["tasks"] if row["task"] in tasks]
 
 
-def _simulated(cards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
+def _simulated(cards: Sequence[Params]) -> list[Row]:
     rows = []
     for one in cards:
         cells = {row["task"]: row for _, row in _rows([one], {task.name for task in TASKS})}
@@ -258,7 +259,7 @@ def _simulated(cards: Sequence[Mapping[str, Any]]) -> list[dict[str, Any]]:
     return [shown for _, shown in sorted(rows, key=lambda row: row[0])]
 
 
-def _cell(row: Mapping[str, Any]) -> str:
+def _cell(row: Params) -> str:
     if "failed" in row:
         return "failed"
     ratio = f" ({row['over_bound']:.2f})" if "over_bound" in row else ""

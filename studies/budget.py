@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -59,7 +59,7 @@ def under(cap: float, schedule: str, method: str, noise_model: str) -> dict[str,
     return of(method, noise_model, **over("ideal", MOST, cap_bytes_per_second=cap, schedule=schedule))
 
 
-def _grid() -> list[dict[str, Any]]:
+def _grid() -> list[Where]:
     """Solo methods once; the others at each K over every channel, and over the ideal one under rates and caps; some
     of them under caps with the other schedule."""
     channels = [over(name, k) for name in CHANNELS for k in NEIGHBOURS]
@@ -92,7 +92,7 @@ class Choice(NamedTuple):
 
     error: float
     size: float
-    where: Mapping[str, Any]
+    where: Where
 
 
 def choices(results: Results) -> list[Choice]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,7 +30,7 @@ NOTE = (
 )
 
 
-def _grid() -> list[dict[str, Any]]:
+def _grid() -> list[Where]:
     pairs = [(name, "nominal") for name in METHODS if name not in SILENT]
     pairs += [(name, "trained") for name in TRAINED]
     pairs += [("kalman", "fitted"), ("joint", "fitted"), ("kalman", "identity"), ("lkf-sa", "identity")]

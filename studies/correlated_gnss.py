@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -43,7 +43,7 @@ NOTE = (
 )
 
 
-def _grid() -> list[dict[str, Any]]:
+def _grid() -> list[Where]:
     """Solo methods at K = 0 only; the cooperative filter there, too, as the solo filter of coloured noise."""
     return [
         of(*line, **case, max_neighbours=k)

@@ -47,12 +47,12 @@ COLUMNS: dict[str, Number] = {
 }
 
 
-def _table(at: dict[str, Any]) -> TableView:
+def _table(at: Params) -> TableView:
     text = "Errors over all steps; maximum: the mean of the largest of each run."
     return selections(HEAD, labelled(LINEUP, **at), COLUMNS, text, at=at)
 
 
-def _cdf(results: Results, at: dict[str, Any]) -> Plot | None:
+def _cdf(results: Results, at: Params) -> Plot | None:
     methods = ["gnss", "kalman", "okf", "fedkalmannet", "centralised", "individual1"]
     models = ["none", "identity", "fitted", "oracle", "trained"]
     where = present(results, {**at, "method": methods, "noise_model": models}, "error_quantiles_m")
@@ -64,7 +64,7 @@ def cdf(results: Results, caption: str, where: Where) -> Plot:
     """Share of the errors below each value, with a marker at the mean of the per-run maxima."""
     from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
 
-    drawn, maxima, places = list[dict[str, Any]](), dict[str, list[str]](), list[tuple[str, str, Any]]()
+    drawn, maxima, places = list[Params](), dict[str, list[str]](), list[tuple[str, str, Any]]()
     with canvas(width=7.8) as (figure, axes):
         for key, frame in results.groups(LINES, where):
             names = dict(zip(LINES, key, strict=True))
@@ -96,7 +96,7 @@ def _worst(texts: Sequence[str]) -> str:
     return f"{same} (max {numbers} m)" if numbers else same
 
 
-def _finding(results: Results, at: dict[str, Any]) -> str:
+def _finding(results: Results, at: Params) -> str:
     """RT-LE in a case, and the verdict on the federated net; nothing where nothing was run."""
     names = {"federated": "fedkalmannet", "centralised": "centralised", "OKF": "okf"}
     means = {words: mean(results, {**at, "method": name}) for words, name in names.items()}

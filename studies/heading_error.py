@@ -145,7 +145,7 @@ def pose(k: int) -> str:
     return "pose-fleet" if k else "pose-solo"
 
 
-def _grid() -> list[dict[str, Any]]:
+def _grid() -> list[Row]:
     """All compasses at one speed after a long drive; without a compass all speeds after all times."""
     cases = [{**DRIVEN, "compass": word} for word in COMPASSES if word != NONE]
     cases += [{"speed": speed, "after_s": after, "compass": NONE} for speed in SPEEDS for after in AFTER]

@@ -33,7 +33,7 @@ NOTE = (
 )
 
 
-def _grid() -> list[dict[str, Any]]:
+def _grid() -> list[Where]:
     """Latency without loss, and loss without latency; the solo filter once."""
     each = [PERFECT, *(channel for _, by in CHANNELS.values() for value, channel in by.items() if value)]
     return [

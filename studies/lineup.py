@@ -32,7 +32,7 @@ PAST = ("bound", "with its past")
 """The bound of a star whose newcomers bring what they did before, as messages with estimates or sums do."""
 
 
-def study(name: str, question: str, settings: Mapping[str, Any], scored: bool = True, **options: Any) -> Study:
+def study(name: str, question: str, settings: Params, scored: bool = True, **options: Any) -> Study:
     """A study of methods: cells, keys, training and reference values as most studies have them, but for the options.
 
     Args:
@@ -149,9 +149,9 @@ def start(p: Params) -> Floats | None:
     if scene.start(p) == "gnss":
         return None
     drive = scene.fleet(p["data"])
-    if not complete(scene.recording(p), scene.egos(p["data"], str(p["egos"])), drive):
+    if not complete(scene.recording(p), scene.egos(p), drive):
         raise InputError("start", "'true'", "needs egos that are there throughout", "Take start=gnss.")
-    return drive.position[0, [drive.index(i) for i in scene.egos(p["data"], str(p["egos"]))]]
+    return drive.position[0, [drive.index(i) for i in scene.egos(p)]]
 
 
 def rows(
@@ -172,7 +172,7 @@ def rows(
     from coopoc.methods.catalogue import METHODS
 
     recording = measured or scene.recording(p)
-    who, drive, metric = scene.egos(p["data"], str(p["egos"])), scene.fleet(p["data"]), str(p.get("metric", ""))
+    who, drive, metric = scene.egos(p), scene.fleet(p["data"]), str(p.get("metric", ""))
     table: list[Row] = []
     strange = not made and p["method"] not in METHODS and not weights.is_trained(p["method"])
     for seed, method in made or methods(p):
@@ -195,10 +195,10 @@ def bound_rows(p: Params) -> list[Row]:
     bound = posterior_bound if p.get("noise_model") in ("bound", "star") else past_bound
     drive, v2x = scene.fleet(p["data"]), scene.channel(p)
     if scene.is_real(p["data"]):
-        return [{"run": 0, "ego": ego} for ego in scene.egos(p["data"], str(p["egos"]))]
+        return [{"run": 0, "ego": ego} for ego in scene.egos(p)]
     acting, rate, told = scene.acting(p), min(v2x.rate or np.inf, 1 / drive.dt), scene.told(p)
     rows_of_egos: list[Row] = []
-    for ego in scene.egos(p["data"], str(p["egos"])):
+    for ego in scene.egos(p):
         column = drive.index(ego)
         level = bound_rt_le(bound(drive, acting, column, v2x, recording=told))
         near = len(find_links(drive, [column], v2x.max_neighbours, v2x.radius, acting.min_range)) / len(drive.t)
@@ -212,7 +212,7 @@ def tracks(p: Params) -> Iterator[tuple[str, Floats, Floats]]:
     """Name, times s and positions m of each ego's path in each run, as the cell's method estimates it."""
     recording = scene.recording(p)
     for seed, method in methods(p) if p["method"] != "bound" else ():
-        for ego in scene.egos(p["data"], str(p["egos"])):
+        for ego in scene.egos(p):
             found = [method(recording.between(*cut), [ego]) for cut in recording.stretches(ego)]
             t = np.concatenate([track.t for track in found])
             for run in range(recording.runs):

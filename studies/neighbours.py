@@ -31,7 +31,7 @@ BUDGETED = ["lkf-sa", "joint"]
 FILTERS = ["kalman", "lkf-sa", "lkf-sa-edge", "msmv-r", "joint"]
 
 
-def _grid() -> list[dict[str, Any]]:
+def _grid() -> list[Params]:
     """Every method at every K over an ideal channel, then the cooperative ones at K = 10 under rates and byte caps."""
     solo = [("gnss", "none"), *((m, "trained") for m in TRAINED), BOUND, *(("kalman", model) for model in MODELS)]
     shared = [(m, model) for m in lineup.COOPERATIVE for model in MODELS]

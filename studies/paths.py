@@ -29,7 +29,7 @@ def views(results: Results, over_time: bool) -> Plot | None:
     truth = scene.fleet(data)
     if not methods or not scene.is_real(data) or (over_time and not truth.present.any()):
         return None
-    egos = scene.egos(data, str(results.settings["egos"]))
+    egos = scene.egos(results.settings)
     ends = list[tuple[float, float, str]]()
     rows, height = (len(egos), 0.8 + 1.5 * len(egos)) if over_time else (1, 4.0)
     with canvas(rows, width=7.2, height=height, sharex=True, sharey=True, squeeze=False) as (figure, grid):

@@ -190,7 +190,7 @@ def _drive(p: Params) -> Drive:
     return drives.drive(str(p["data"]), drives.calibrated(p), channel(p), float(p["gate"]))
 
 
-def _filter(fusion: Mapping[str, Any], k: int, gate: float, drive: Drive) -> PoseFilter:
+def _filter(fusion: Params, k: int, gate: float, drive: Drive) -> PoseFilter:
     unit: Any = "fleet" if k else "solo"
     return PoseFilter(
         unit, **(fusion if k else {}), lasting=drive.lasting, gate=gate, begin=drive.begin, spread=drive.spread

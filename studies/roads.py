@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
@@ -18,6 +17,7 @@ from coopoc.data.source import split
 from coopoc.errors import InputError
 from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.track import Method
+from coopoc.study.study import Row
 from coopoc.world.recording import MEASURED
 
 from .pose_drives import hashed
@@ -79,7 +79,7 @@ def _kitti(odometry: Floats, truth: Floats) -> tuple[Recording, Fleet]:
     return replace(drawn, velocity=measured[None], sensors=Sensors(), notes=(f"odometry: {MEASURED}",)), fleet
 
 
-def road_row(task: str, data: Path, made: Method) -> dict[str, Any]:
+def road_row(task: str, data: Path, made: Method) -> Row:
     """Error of the part that does not calibrate, as the method comes and calibrated on the first part.
 
     Args:
@@ -102,7 +102,7 @@ def road_row(task: str, data: Path, made: Method) -> dict[str, Any]:
     return row | {"received_bytes_per_second": 0}
 
 
-def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> dict[str, Any]:
+def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> Row:
     """RT-LE m in the plane with its interval over vehicles and blocks of time, NEES of (x, y), us of a step."""
     blocks, ratios, seconds = list[float](), list[Floats](), 0.0
     size = max(int(min(BLOCK / recording.dt, (len(recording.t) - start) / 4)), 1)
@@ -118,7 +118,7 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> d
         parts = [squares[k : k + size] for k in range(start, len(squares) - size + 1, size)]
         blocks += [float(np.sqrt(np.nanmean(part))) for part in parts if np.isfinite(part).any()]
     level = mean_interval(np.array([blocks]))
-    row: dict[str, Any] = {"rt_le_m": rounded(level)}
+    row: Row = {"rt_le_m": rounded(level)}
     row["blocks_m"] = [round(value, 4) for value in blocks]
     nees = np.concatenate(ratios)
     row |= {"nees": round(float(np.nanmean(nees)), 2)} if np.isfinite(nees).any() else {}

@@ -32,10 +32,10 @@ if TYPE_CHECKING:
 Start = Literal["gnss", "true"]
 CODE = tuple(f"coopoc.{part}" for part in ("world", "methods", "kernels", "optimize", "evaluate", "learned", "data"))
 """The packages whose code makes the numbers of a cell, beside the cell's own."""
-DRAWN: Mapping[str, Any] = {"data": "town10", "egos": "auto", "seed": 0}
-WEIGHTS: Mapping[str, Any] = {"clients": "town10-clients", "weights": "runs/weights"}
-SOLO: Mapping[str, Any] = {"velocity_reading": "axis", "start": "gnss"}
-TOWN: Mapping[str, Any] = {**DRAWN, "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axis", "radius_m": 30.0}
+DRAWN: Params = {"data": "town10", "egos": "auto", "seed": 0}
+WEIGHTS: Params = {"clients": "town10-clients", "weights": "runs/weights"}
+SOLO: Params = {"velocity_reading": "axis", "start": "gnss"}
+TOWN: Params = {**DRAWN, "scenario": 2, "velocity_ratio": 0.15, "velocity_reading": "axis", "radius_m": 30.0}
 """Settings that studies share: draws; training; filters without neighbours; draws of scenario 2 with neighbours."""
 
 
@@ -93,23 +93,22 @@ def _under(log: Log, v2x: V2X, runs: int, seed: int) -> Recording:
     return under(log.recording, v2x, runs=runs, seed=seed, logged=log.messages)
 
 
-@lru_cache(maxsize=4)
-def egos(data: str, wanted: str) -> tuple[str, ...]:
-    """Ids of the egos: a number of vehicles evenly spaced over those present throughout, or ids joined by "+", or by
-    "," where none holds one.
+def egos(p: Params) -> tuple[str, ...]:
+    """Ids of the egos of a cell: a number of vehicles evenly spaced over those present throughout, or ids joined by
+    "+", or by "," where none holds one.
 
     "auto" is five of them, or all where there are fewer. Where not enough are present throughout, they are taken from
     all that are there at two steps in a row; `presence` scores them where they are.
 
-    >>> egos("town10", "3")
+    >>> egos({"data": "town10", "egos": 3})
     ('town10-00', 'town10-20', 'town10-40')
     """
-    drive = fleet(data)
+    wanted, drive = str(p["egos"]), fleet(p["data"])
     if wanted in drive.ids:
         return (wanted,)
     if wanted != "auto" and not wanted.isdigit():
         return tuple(drive.ids[drive.index(i.strip())] for i in wanted.split("+" if "+" in wanted else ","))
-    there = _there(data)
+    there = _there(p["data"])
     throughout = [i for column, i in enumerate(drive.ids) if there[:, column].all()]
     somewhere = [i for column, i in enumerate(drive.ids) if (there[1:, column] & there[:-1, column]).any()]
     if len(throughout) < (1 if wanted == "auto" else int(wanted)):
@@ -221,7 +220,7 @@ def conditions(p: Params) -> str:
     """Heading and size of a cell, for captions; of real data whose they are."""
     real = measured(p["data"])
     labels = f" ({real.notes[0]})" if real is not None and real.notes else ""
-    who = egos(p["data"], str(p["egos"]))
+    who = egos(p)
     log = _log(p["data"])
     runs = log.recording.runs if log is not None and (log.messages or not channel(p).loss) else p["runs"]
     name, there = Path(split(p["data"])[0]).name, _there(p["data"]).any(axis=0).sum()
@@ -289,7 +288,7 @@ def facts(p: Params) -> Mapping[str, str]:
     Raises:
         InputError: parameters that no cell can be computed with.
     """
-    sensors(p), attacking(p), channel(p), start(p), egos(p["data"], str(p["egos"]))
+    sensors(p), attacking(p), channel(p), start(p), egos(p)
     if int(p.get("runs", 1)) < 1:
         raise InputError("runs", p["runs"], "must be >= 1", "Give the number of noise draws.")
     return {"code": revision(*CODE), **_digests(p["data"])}
@@ -315,7 +314,7 @@ def told(p: Params) -> Recording | None:
 def _attacked(p: Params, told: bool) -> Recording:
     from coopoc.methods.catalogue import needs_whole_fleet
 
-    who, attack = egos(p["data"], str(p["egos"])), attacking(p)
+    who, attack = egos(p), attacking(p)
     observers = None if needs_whole_fleet(str(p.get("method"))) else who
     drawn = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers, told)
     return spoofed(drawn, attack, seed=int(p["seed"]), honest=who, told=told) if attack else drawn
@@ -332,7 +331,7 @@ def attacking(p: Params) -> Spoofing | None:
 
 def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:
     """Recording, egos and fleet of a cell."""
-    return recording(p), egos(p["data"], str(p["egos"])), fleet(p["data"])
+    return recording(p), egos(p), fleet(p["data"])
 
 
 @lru_cache(maxsize=2)

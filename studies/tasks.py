@@ -31,6 +31,7 @@ from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import errors, heading_error, pose_nees
 from coopoc.evaluate.statistics import Interval, mean_interval
 from coopoc.methods.track import Track
+from coopoc.study.study import Row
 from coopoc.world.outliers import Fault, Outliers
 from coopoc.world.spoofing import Spoofing, spoofed
 
@@ -220,7 +221,7 @@ def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, 
     return drive.recording, drive.truth, 0, {"begin": drive.begin, "spread": drive.spread, "assumed": noise}
 
 
-def pose_row(task: Logged, folder: Path, made: Any) -> dict[str, Any]:
+def pose_row(task: Logged, folder: Path, made: Any) -> Row:
     """RT-LE with its interval over robots and blocks of time, heading error, NEES, bytes and time.
 
     Args:
@@ -244,7 +245,7 @@ def pose_row(task: Logged, folder: Path, made: Any) -> dict[str, Any]:
     account = of_track(track, recording, made.message)
     squares = np.square(_blocks(errors(track, fleet)[0], start, task.block_s / fleet.dt))
     level = mean_interval(np.sqrt(squares))
-    row: dict[str, Any] = {"task": task.name, "data": hashed(path)}
+    row: Row = {"task": task.name, "data": hashed(path)}
     row |= {"rt_le_m": rounded(level)}
     if fleet.heading is None:
         row |= {"nees": round(float(np.nanmean(planar(track, fleet)[1][start:])), 2)}
@@ -258,7 +259,7 @@ def pose_row(task: Logged, folder: Path, made: Any) -> dict[str, Any]:
     return row
 
 
-def graph_row(folder: Path, file: str, backend: str) -> dict[str, Any]:
+def graph_row(folder: Path, file: str, backend: str) -> Row:
     """Cost over the least that is known, status and s of a solve, its search for a start included."""
     path = located(folder, file)
     problem = read_graph(path)

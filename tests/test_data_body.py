@@ -169,7 +169,7 @@ def test_the_check_follows_the_fleet_and_finds_mirrored_bearings(tmp_path: Path,
     done = ran(command, cwd=tmp_path, check=True)
     assert "a filter of each vehicle alone, throughout" in done.stdout
     assert "bearing" in done.stdout
-    assert ("check: bearings" in done.stdout) == mirrored
+    assert ("They look like bearings clockwise from the heading" in done.stdout) == mirrored
     assert ("nothing looks wrong" in done.stdout) != mirrored
     assert (tmp_path / "log-check.png").stat().st_size > 20_000
 
@@ -179,6 +179,21 @@ def test_bearings_that_are_called_azimuths_are_named(tmp_path: Path, frame: Any,
     log, _ = table(noise=1.0, compass=frame == "world")
     log.replace({"kind": {"bearing": "azimuth"}}).to_csv(tmp_path / "log.csv", index=False)
     assert hint in "\n".join(check_poses(co.read_log(tmp_path / "log.csv", frame=frame)).warnings)
+
+
+@pytest.mark.parametrize(
+    ("kind", "change", "said"),
+    [
+        ("yaw_rate", (-1, 0), "red: axes look swapped or mirrored"),
+        ("bearing", (1, 1.5), "turned by -1.5. rad: add -1.5"),
+    ],
+)
+def test_axes_that_are_turned_or_flipped_are_named(tmp_path: Path, kind: str, change: Any, said: str) -> None:
+    log, _ = table(noise=1.0, compass=False)
+    own = log["kind"] == kind
+    log.loc[own, "value"] = wrapped(change[0] * log["value"][own] + change[1])
+    log.to_csv(tmp_path / "log.csv", index=False)
+    assert re.search(said, "\n".join(check_poses(co.read_log(tmp_path / "log.csv", frame="body")).warnings))
 
 
 def test_the_check_scores_those_whose_truth_is_known(tmp_path: Path) -> None:

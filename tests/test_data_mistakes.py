@@ -1,7 +1,9 @@
 """Typical mistakes in logs: each ends in the message that docs/your_data.md shows, with file, row and column."""
 
+import io
 import re
 from collections.abc import Callable
+from contextlib import nullcontext
 from pathlib import Path
 from typing import Any
 
@@ -285,12 +287,12 @@ def test_a_header_that_no_table_has_is_named(tmp_path: Path) -> None:
 
 def test_options_behind_a_question_mark_are_those_of_python(tmp_path: Path) -> None:
     text = "t,vehicle,latitude,longitude,height,vx,vy\n" + "".join(
-        f"{k / 10},{name},{48.14 + 1e-5 * k},11.58,500,0,8\n" for k in range(20) for name in "ab"
+        f"{k / 10},{name},{48.14 + 1e-5 * k},11.58,500,0,8\n" for k in range(20) for name in ('"a,"', "b")
     )
     (tmp_path / "a.csv").write_text(text)
-    log = load_log(f"{tmp_path / 'a.csv'}?origin=48.1,11.5,510&clock=a:0.05,b:-0.05&ignore=vx,vy&max_gap=2")
+    log = load_log(f"{tmp_path / 'a.csv'}?origin=48.1,11.5,510&clock=a%2C:0.05,b:-0.05&ignore=vx,vy&max_gap=2")
     again = co.read_log(
-        tmp_path / "a.csv", origin=(48.1, 11.5, 510.0), clock={"a": 0.05, "b": -0.05}, ignore=["vx", "vy"], max_gap=2.0
+        tmp_path / "a.csv", origin=(48.1, 11.5, 510.0), clock={"a,": 0.05, "b": -0.05}, ignore=["vx", "vy"], max_gap=2.0
     )
     assert log.origin == (48.1, 11.5, 510.0)
     assert same(log.recording, again.recording)
@@ -301,9 +303,24 @@ def test_options_behind_a_question_mark_are_those_of_python(tmp_path: Path) -> N
         ("kinds=uwb", "must be word:kind pairs"),
         ("dt=x", "must be a number of SI units"),
         ("any_scale=yes", "must be true or false"),
+        ("clock=a,b:1", "of a name a comma as %2C"),
+        ("std=vx:-1", r"std of vx = -1.0: must be .* > 0"),
+        ("scale=t:-1", r"scale of t = -1.0: must be .* > 0"),
+        ("origin=nan,11.5,510", r"origin\[0\] = nan"),
+        ("since=-5", "since, until"),
     ):
         with refused(message):
             load_log(f"{tmp_path / 'a.csv'}?{words}")
+
+
+@pytest.mark.parametrize("begin", [0.0, 1e5, 1.7e9])
+def test_stamps_of_32_bits_are_named(tmp_path: Path, begin: float) -> None:
+    frame = pd.read_csv(io.StringIO(WIDE))
+    frame.assign(t=(begin + 99.93 * frame["t"]).astype("f4")).to_parquet(tmp_path / "log.parquet")
+    with refused("column t = multiples of 128 s") if begin > 1e9 else nullcontext():
+        summary = str(co.read_log(tmp_path / "log.parquet", origin=(1, 2, 3)).summary)
+        assert ("t is of 32-bit floats, multiples of 0.0078 s" in summary) == (begin == 1e5)
+        assert "origin= has no effect" in summary
 
 
 def test_places_need_no_times(tmp_path: Path) -> None:

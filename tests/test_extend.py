@@ -271,3 +271,6 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
         run_study(f"{tmp_path}/own.py:ALPHA")
     with pytest.raises(TypeError):
         load_fleet(f"{tmp_path}/own.py:ALPHA")
+    (tmp_path / "own.py").write_text("import sys\nsys.exit('a script')\n")
+    with refused("own.py = exit 'a script': must not end Python"):
+        find("coopoc.methods", f"{tmp_path}/own.py:X")

@@ -61,7 +61,7 @@ def at(**where: object) -> dict[str, object]:
 def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: str) -> None:
     """By hand: 32 B at 10 Hz from each of the neighbours that are there; a CAM carries 350 B more."""
     drive = load_fleet(short_town)
-    egos = [drive.index(ego) for ego in scene.egos(short_town, "2")]
+    egos = [drive.index(ego) for ego in scene.egos({"data": short_town, "egos": 2})]
     near = len(find_links(drive, egos, 2, 30.0, 2.0)) / len(egos) / len(drive.t)
     ideal = [numbers.mean(results, at(channel="ideal"), kind) for kind in SIZES]
     assert ideal == pytest.approx([near * 320, near * 320])
@@ -101,7 +101,7 @@ def test_a_channel_that_is_not_there_is_named() -> None:
 def test_schedules_are_compared_on_the_same_egos_and_runs(tight: Results, short_town: str) -> None:
     """The row of a cap, by hand."""
     fleet = load_fleet(short_town)
-    egos, errors = scene.egos(short_town, "2"), []
+    egos, errors = scene.egos({"data": short_town, "egos": 2}), []
     for schedule in study.SCHEDULES:
         channel = V2X(10, bytes_per_second=200.0, schedule=schedule)
         seen = observe(fleet, scene.sensors({**tight.settings}), channel, runs=2, observers=egos)
@@ -120,7 +120,7 @@ def test_schedules_are_compared_on_the_same_egos_and_runs(tight: Results, short_
 @pytest.mark.slow
 def test_the_ledger_puts_training_and_deciding_on_one_axis(tight: Results, short_town: str) -> None:
     """From the card and a track, by hand: 20 rounds of 9 numbers and a loss up and 9 down; a CAM of 350 B and 32 B."""
-    egos = scene.egos(short_town, "2")
+    egos = scene.egos({"data": short_town, "egos": 2})
     channel = scene.channel({"channel": "cam", "max_neighbours": 10})
     seen = observe(load_fleet(short_town), scene.sensors({**tight.settings}), channel, runs=2, observers=egos)
     account = of_track(JointFilter()(seen, egos), seen, JointFilter().message)

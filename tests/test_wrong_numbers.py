@@ -4,6 +4,7 @@ that are none, cooperation that changes nothing."""
 import io
 import zipfile
 from collections.abc import Callable
+from contextlib import nullcontext
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,7 +18,7 @@ from filterpy.kalman import KalmanFilter
 import coopoc as co
 from coopoc import V2X, CooperativeFilter, Kalman, Recording, Sensors, load_fleet, observe
 from coopoc.arrays import Floats, Ints
-from coopoc.evaluate.metrics import neighbour_rt_le
+from coopoc.evaluate.metrics import innovation_columns, neighbour_rt_le
 from coopoc.evaluate.scores import scored
 from coopoc.kernels import gate
 from coopoc.kernels.stars.cooperative_filter import run_filter
@@ -229,22 +230,38 @@ def test_no_truth_of_another_drive_is_taken(use: str, other: str) -> None:
 
 @dataclass(frozen=True)
 class Negative:
-    """A method whose covariance is -I from the fifth step on."""
+    """A method whose covariance is another from the fifth step on."""
 
     name: str = "negative"
+    share: float = 0.0
     cooperative: bool = False
     message: co.Message = co.Kalman().message
 
     def __call__(self, recording: co.Recording, egos: Any = (0,)) -> co.Track:
         track = co.Kalman()(recording, egos)
         covariance = np.array(track.covariance)
-        covariance[:, 5:] = -np.eye(3)
+        covariance[:, 5:] = np.eye(3) + self.share * np.eye(3, k=1) if self.share else -np.eye(3)
         return replace(track, covariance=covariance)
 
 
-def test_a_covariance_that_is_none_is_named_with_its_method_and_step() -> None:
-    with refused(r"at step 5: must be positive semidefinite, and negative returns another"):
-        scored(Negative(), SEEN, ["a"], FLEET)
+@pytest.mark.parametrize("share", [0.0, 1e-7, 1e-5, 0.1])
+def test_a_covariance_that_is_none_is_named_with_its_method_and_step(share: float) -> None:
+    """-I, and an identity whose halves differ by more than rounding: with a truth, and without one."""
+    method = Negative(share=share)
+    with nullcontext() if share == 1e-7 else refused("at step 5: must be symmetric .*, and negative returns another"):
+        scored(method, SEEN, ["a"], FLEET)
+    with nullcontext() if share == 1e-7 else refused("at step 5: must be symmetric"):
+        innovation_columns(method(SEEN, ["a"]), SEEN)
+
+
+def test_nees_is_unknown_with_the_truth_and_of_two_dimensions_in_the_plane() -> None:
+    there = np.where(np.arange(80) < 77, 1.0, np.nan)[:, None, None]
+    part = replace(FLEET, position=there * FLEET.position, velocity=there * FLEET.velocity)
+    assert np.isfinite(co.nees(TRACK, part)).sum() == 3 * 77
+    x, covariance = TRACK.x * [1, 1, 0], np.array(TRACK.covariance)
+    covariance[..., 2, :] = covariance[..., :, 2] = 0
+    flat = [co.nees(replace(TRACK, x=x, covariance=covariance + np.diag([0, 0, v])), FLEET) for v in (0, 1)]
+    np.testing.assert_allclose(*flat)
 
 
 class Swapped(Negative):

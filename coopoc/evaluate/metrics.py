@@ -11,7 +11,7 @@ from scipy import special
 from ..arrays import Floats, checked, instance, number, refuse
 from ..errors import InputError
 from ..kernels.covariances import normalised
-from ..methods.track import Track
+from ..methods.track import UNSOUND, Track
 from ..plugins import find
 from ..world.body_frames import true_heading, turned
 from ..world.fleet import Fleet
@@ -77,9 +77,10 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
 
 
 def nees(track: Track, fleet: Fleet, *, method: str = "the method") -> Floats:
-    r"""Normalised estimation error squared, $e^\top P^{-1} e$, (R, T, E); its mean is 3 for a consistent filter.
+    r"""Normalised estimation error squared, $e^\top P^{-1} e$, (R, T, E); its mean is 3 for a consistent filter,
+    and 2 in the plane, where every height and its estimate are the same.
 
-    NaN where the covariance is zero: at a start that is known, there is nothing to normalise by.
+    NaN where the truth is unknown, or the covariance zero: at a start that is known, there is nothing to normalise by.
 
     Args:
         track: of a method with covariances.
@@ -87,7 +88,8 @@ def nees(track: Track, fleet: Fleet, *, method: str = "the method") -> Floats:
         method: its name, for errors.
 
     Raises:
-        InputError: another fleet, no covariance, or one that is singular or not positive semidefinite.
+        InputError: another fleet, no covariance, or one that is singular (but of a height without error), or not
+            symmetric and positive semidefinite.
     """
     truth = _truth(track, fleet)
     if track.covariance is None:
@@ -95,15 +97,25 @@ def nees(track: Track, fleet: Fleet, *, method: str = "the method") -> Floats:
         raise InputError("covariance", None, "this method claims none", hint)
     arrays = (np.ascontiguousarray(values) for values in (track.x, truth, track.covariance))
     found, sound = normalised(*arrays)
-    if (found < -1e-9).any():
-        run, step, ego = np.argwhere(found < -1e-9)[0]
-        given = f"{track.covariance[run, step, ego].tolist()} of ego {track.egos[ego]} in run {run} at step {step}"
-        allowed = f"must be positive semidefinite, and {method} returns another"
-        raise InputError("covariance", given, allowed, "Its eigenvalues are variances, m^2.")
+    _require_sound(track, track.covariance, found, method)
     if not sound:
         hint = "Assume noise in every direction: no standard deviation may be zero."
         raise InputError("covariance", "singular", "must have an inverse for NEES", hint)
     return found
+
+
+def _require_sound(track: Track, p: Floats, square: Floats, method: str) -> None:
+    """InputError for the first covariance p (R, T, E, 3, 3) that gives a negative square (R, T, E), or is neither
+    symmetric nor positive semidefinite to a share of 1e-6."""
+    wrong = square < -1e-9
+    if any(UNSOUND in note for note in track.notes):
+        own, skew = np.linalg.eigvalsh(np.nan_to_num(p))[..., 0], np.abs(p - np.swapaxes(p, -1, -2)).max(axis=(-1, -2))
+        wrong |= np.minimum(own, -skew) < -1e-6 * np.abs(p).max(axis=(-1, -2))
+    if wrong.any():
+        run, step, ego = np.argwhere(wrong)[0]
+        given = f"{p[run, step, ego].tolist()} of ego {track.egos[ego]} in run {run} at step {step}"
+        allowed = f"must be symmetric and positive semidefinite, and {method} returns another"
+        raise InputError("covariance", given, allowed, "Return (P + P.T) / 2; its eigenvalues are variances, m^2.")
 
 
 def nees_band(runs: int) -> tuple[float, float]:
@@ -264,6 +276,7 @@ def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
     found, d = np.full(innovation.shape[:3], np.nan), innovation[:, 1:]
     square = np.einsum("...i,...i->...", d, np.linalg.solve(covariance, d[..., None])[..., 0])
     found[:, 1:] = square / dimensions(recording)
+    _require_sound(track, track.covariance, found, "the method")
     return found
 
 

@@ -36,7 +36,8 @@ def less(a: Floats, b: Floats) -> tuple[float, float, float]:
 
 @compiled
 def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
-    """e^T P^-1 e (R, T, E) by P = L D L^T, NaN where P is zero, and whether every other P could be inverted."""
+    """e^T P^-1 e (R, T, E) by P = L D L^T, NaN where P is zero or the truth is unknown, and whether every other
+    P could be inverted, but for a height without error."""
     found, sound = np.empty(x.shape[:3]), True
     for run in range(len(x)):
         for t in range(x.shape[1]):
@@ -47,9 +48,9 @@ def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
                 yy, yz, zz = p[1, 1] - first * p[0, 1], p[1, 2] - first * p[0, 2], p[2, 2] - second * p[0, 2]
                 third, b = yz / yy, b - first * a
                 zz, c = zz - third * yz, c - second * a - third * b
-                value = a * a / p[0, 0] + b * b / yy + c * c / zz
+                value = a * a / p[0, 0] + b * b / yy + (c * c / zz if c != 0.0 else 0.0)
                 if not math.isfinite(value):
-                    sound &= not p.any()
+                    sound &= math.isnan(a) or not p.any()
                     value = np.nan
                 found[run, t, e] = value
     return found, sound

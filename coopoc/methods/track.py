@@ -18,8 +18,8 @@ from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NoiseModel
 
 UNSOUND = (
-    "covariances are not positive semidefinite: the assumed standard deviations lie too far apart for double "
-    "precision; raise the smallest"
+    "covariances are not symmetric and positive semidefinite: a method of one's own returns others, or the assumed "
+    "standard deviations lie too far apart for double precision; raise the smallest"
 )
 """What a note says of covariances that are no covariances."""
 

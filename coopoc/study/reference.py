@@ -19,7 +19,7 @@ from ..plugins import names
 from . import store
 from .compare import Change, Direction, change_table, plain
 from .results import SEED, Results, ego_by_run
-from .study import find_study
+from .study import Params, find_study
 from .tables import Table
 
 TOLERANCE, TRAINED = 0.01, 0.05
@@ -55,7 +55,7 @@ class Number:
         better: direction of the metric.
     """
 
-    where: Mapping[str, Any]
+    where: Params
     metric: str
     value: float
     runs: int
@@ -74,7 +74,7 @@ class Reference:
     """The numbers of a study under its settings."""
 
     study: str
-    settings: Mapping[str, Any]
+    settings: Params
     numbers: tuple[Number, ...]
 
     def save(self, path: str | Path) -> None:

@@ -17,7 +17,7 @@ from ..evaluate.statistics import Interval, mean_interval
 from ..file_names import given_path
 from ..short_repr import short_repr
 from . import store
-from .cell import assignments, parse
+from .cell import Params, assignments, parse
 from .manifest import read
 from .style import METHODS, OWN
 
@@ -44,7 +44,7 @@ class Results:
     study: str
     question: str
     axes: tuple[str, ...]
-    settings: Mapping[str, Any]
+    settings: Params
     frame: pd.DataFrame
     failures: pd.DataFrame
     pending: int
@@ -86,7 +86,7 @@ class Results:
         """Number of failed cells."""
         return len(self.failures)
 
-    def select(self, where: Mapping[str, Any] | None = None, **also: Any) -> pd.DataFrame:
+    def select(self, where: Params | None = None, **also: Any) -> pd.DataFrame:
         """Rows where each named column has the value, or one of a list of values.
 
         Raises:
@@ -104,7 +104,7 @@ class Results:
             frame = frame[np.logical_or.reduce([_is(frame[name], v) for v in values])]
         return frame
 
-    def values(self, value: str, where: Mapping[str, Any] | None = None, **also: Any) -> Floats:
+    def values(self, value: str, where: Params | None = None, **also: Any) -> Floats:
         """(E, R) of one metric for paired comparisons, sorted by ego and run, averaged over training seeds."""
         frame = self.select(where, **also)
         self._one_cell(frame, [], value)
@@ -113,13 +113,11 @@ class Results:
             raise InputError(value, "no finite value", "needs an ego with all its runs", "See the failed cells.")
         return grid
 
-    def interval(self, value: str, where: Mapping[str, Any] | None = None, **also: Any) -> Interval:
+    def interval(self, value: str, where: Params | None = None, **also: Any) -> Interval:
         """Mean of one metric over egos and runs with its interval."""
         return mean_interval(self.values(value, where, **also))
 
-    def groups(
-        self, by: Sequence[str], where: Mapping[str, Any] | None = None
-    ) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:
+    def groups(self, by: Sequence[str], where: Params | None = None) -> Iterator[tuple[tuple[Any, ...], pd.DataFrame]]:
         """Rows of each combination of the columns `by`, in the order of the grid; InputError if `where` leaves none."""
         frame = self.select(where)
         if frame.empty and where:
@@ -129,7 +127,7 @@ class Results:
                 raise unknown("column", name, frame.columns)
         yield from frame.groupby(list(by), sort=False, dropna=False)
 
-    def summary(self, by: Sequence[str], value: str, where: Mapping[str, Any] | None = None) -> pd.DataFrame:
+    def summary(self, by: Sequence[str], value: str, where: Params | None = None) -> pd.DataFrame:
         """One row per combination of `by`: mean, low, high (over egos, then runs), n, missing (egos left out).
 
         A metric that a combination does not have at all is NaN with n = 0.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from contextlib import ExitStack, closing
 from pathlib import Path
 from typing import Any
@@ -19,7 +19,7 @@ from ..world.fleet import Fleet
 from ..world.recording import Recording
 from ..world.storage import digest, save_recording
 from . import store
-from .cell import Cell
+from .cell import Cell, Params
 from .cluster import Cluster, connected
 from .compute import compute, part_of, schedule
 from .manifest import Manifest, environments, locked, one_at_a_time
@@ -33,7 +33,7 @@ def run_study(
     study: Study | str,
     out: str | Path = "runs",
     jobs: int = 1,
-    settings: Mapping[str, Any] | None = None,
+    settings: Params | None = None,
     progress: bool = True,
     shard: str = "",
     retry_failed: bool = False,
@@ -88,9 +88,7 @@ def run_study(
         return results
 
 
-def write_tracks(
-    study: Study | str, out: str | Path = "runs", settings: Mapping[str, Any] | None = None, shard: str = ""
-) -> Path:
+def write_tracks(study: Study | str, out: str | Path = "runs", settings: Params | None = None, shard: str = "") -> Path:
     """Estimate again what the cells of a study estimated, and write a TUM file for each ego and run of each cell.
 
     Args:
@@ -120,7 +118,7 @@ def write_tracks(
 def plan(
     study: Study | str,
     out: str | Path = "runs",
-    settings: Mapping[str, Any] | None = None,
+    settings: Params | None = None,
     shard: str = "",
     retry_failed: bool = False,
 ) -> dict[str, Any]:
@@ -196,7 +194,7 @@ def _work(
 
 
 def _resolve(
-    study: Study | str, out: str | Path, settings: Mapping[str, Any] | None, shard: str
+    study: Study | str, out: str | Path, settings: Params | None, shard: str
 ) -> tuple[Study, list[Cell], list[Cell], Path]:
     """The study under its settings, all its cells, those of the shard, and its folder."""
     found = find_study(study) if isinstance(study, str) else instance("study", study, Study)

@@ -72,15 +72,15 @@ class Study:
     question: str
     cell: Callable[[Params], list[Row]]
     grid: Mapping[str, Sequence[Scalar]] | Sequence[Mapping[str, Scalar]]
-    settings: Mapping[str, Any] = field(default_factory=dict)
-    key: Callable[[Params], Mapping[str, Any]] = lambda params: {}
+    settings: Params = field(default_factory=dict)
+    key: Callable[[Params], Params] = lambda params: {}
     prepare: Callable[[Sequence[Params], int], None] = lambda cells, jobs: None
     where: Callable[[Params], bool] | None = None
     shares: tuple[str, ...] = ()
     tables: Mapping[str, Callable[[Results], Table | None]] = field(default_factory=dict)
     figures: Mapping[str, Callable[[Results], Plot | None]] = field(default_factory=dict)
     findings: Callable[[Results], Mapping[str, str]] | None = None
-    recipe: Callable[[Results], Mapping[str, Any]] | None = None
+    recipe: Callable[[Results], Params] | None = None
     idle: Callable[[Results], Collection[str]] | None = None
     limitations: tuple[str, ...] = ()
     metrics: Mapping[str, str | float] = field(default_factory=dict)
@@ -128,7 +128,7 @@ class Study:
         given = self.findings(results) if self.findings else {}
         return {key: text for key, text in given.items() if text}
 
-    def override(self, changes: Mapping[str, Any]) -> Study:
+    def override(self, changes: Params) -> Study:
         """The same study with other settings, or other values on an axis (a list, or words split at commas).
 
         Text is read as the type of the default. On a list of parameter mappings an axis is filtered, not replaced.
@@ -165,7 +165,7 @@ def find_study(name: str) -> Study:
     path, _, attribute = name.rpartition(":")
     code, own = code_of(study.cell), study.key
 
-    def key(params: Params) -> Mapping[str, Any]:
+    def key(params: Params) -> Params:
         return {**own(params), "cell": code}
 
     cell = _FileCell(f"{Path(path).resolve()}:{attribute}", file_digest(name, "study"))

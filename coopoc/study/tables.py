@@ -199,7 +199,7 @@ def pivot(
     rows: str | Sequence[str],
     columns: str | Sequence[str],
     value: str,
-    where: Mapping[str, Any] | None = None,
+    where: Where | None = None,
     caption: str = "",
     best: Best = "min",
     along: Literal["row", "column"] | None = None,
@@ -259,7 +259,7 @@ def _all(column: Any) -> str:
     return f"{words(str(column.name))}: {label(str(column.name), column.iloc[0])}."
 
 
-def lost(results: Results, where: Mapping[str, Any] | None = None) -> list[str]:
+def lost(results: Results, where: Where | None = None) -> list[str]:
     """A sentence for each method whose estimates left the fixes by more than 100 standard deviations."""
     frame = results.select(where or {})
     if "left_fixes" not in frame or "method" not in frame:

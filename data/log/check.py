@@ -12,6 +12,7 @@ import scipy  # its statistics take half a second, and are imported where they a
 
 from coopoc.arrays import AnyArray, Floats, Ints, robust_std
 from coopoc.evaluate.metrics import dimensions
+from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
 from coopoc.world.recording import Recording
 
@@ -148,18 +149,26 @@ def _against_odometry(rec: Recording, column: int) -> tuple[float | None, float 
     return far / length, float(np.angle(np.vdot(driven, moved), deg=True))
 
 
-def _axes(rec: Recording, column: int) -> str:
-    """What is wrong with the axes of velocities that explain the fixes once they are mirrored at the diagonal, or whose
-    direction never changes while that of the fixes does; nothing where they agree."""
+def _axes(c: Check, column: int) -> str:
+    """What is wrong with the axes of velocities that explain the fixes once they are mirrored, or whose direction never
+    changes while that of the fixes does; nothing where they agree. In body frames velocities are turned by the
+    integral of the yaw rate alone."""
+    rec, log = c.world, c.log.recording
+    if log.body is not None:
+        heading = rec.dt * np.cumsum(np.nan_to_num(log.body.yaw_rate), axis=1)
+        rec = replace(rec, velocity=turned(log.velocity, heading))
     moved, driven = _moves(rec, column)
     size = np.linalg.norm(moved) * np.linalg.norm(driven)
     u = rec.velocity[0, np.isfinite(rec.velocity[0, :, column, 0]), column, :2]
-    if not size or rec.body is not None or abs(np.vdot(driven, moved)) > ALIKE * size:
+    if not size or abs(np.vdot(driven, moved)) > ALIKE * size:
         return ""
-    if np.vdot(1j * driven.conj(), moved).real > ALIKE * size:
+    mirror = np.vdot(driven.conj(), moved)
+    if abs(mirror) > ALIKE * size:
         return (
-            "axes look swapped: fixes move as the odometry mirrored at the diagonal. Swap easting and northing, "
-            "latitude and longitude, or vx and vy; headings that are clockwise from north are compass_deg."
+            f"axes look swapped or mirrored: fixes move as odometry mirrored at {np.angle(mirror, deg=True) / 2:.0f}"
+            " deg from +x. At 45, swap easting and northing, latitude and longitude, or vx and vy; headings clockwise "
+            "from north are compass_deg. At 0, change the sign of y or vy; at +-90, of x or vx; in body frames, of the "
+            "yaw rate: it is anticlockwise."
         )
     if np.square(u[:, 1]).mean() < 0.01 * np.square(u[:, 0]).mean():
         return (
@@ -221,7 +230,7 @@ def _of_vehicles(c: Check) -> list[str]:
                 f"{name}: NIS is {nis:.3g}, not 1: the errors of fixes and odometry are {word} than stated, "
                 "or correlated in time. Give std columns or sensors=."
             )
-        if axes := _axes(c.world, column):
+        if axes := _axes(c, column):
             sentences.append(f"{name}: {axes}")
             continue
         if distance is not None and not 0.8 <= distance <= 1.25:
@@ -229,8 +238,9 @@ def _of_vehicles(c: Check) -> list[str]:
             sentences.append(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
         if turn is not None and abs(turn) > 20:
             sentences.append(
-                f"{name}: fixes move {turn:.0f} deg anticlockwise of the odometry. Headings are anticlockwise "
-                "from +x (east) in rad; clockwise from north in degrees is compass_deg."
+                f"{name}: fixes move {turn:.0f} deg anticlockwise of the odometry: its forward axis, or the headings, "
+                f"look turned by {-turn:.0f} deg. Speeds are positive forward, headings anticlockwise from +x (east), "
+                "rad; clockwise from north in degrees is compass_deg."
             )
     return sentences
 
@@ -372,10 +382,17 @@ def _other_angle(c: Check) -> str:
     links = c.world.links
     moves = c.world.velocity[0, links.step, links.observer, :2] @ [1, 1j]
     there = np.isfinite(c.relative[:, 1]) & (np.abs(moves) > MOVING)
-    residual, course = c.relative[there, 1], np.angle(moves[there])
-    for kind, turn in (("bearing", course), ("azimuth", -course)):
+    residual, course, measured = c.relative[there, 1], np.angle(moves[there]), c.world.relative[0, there, 1]
+    off = float(np.angle(np.exp(1j * residual).sum()))
+    off += float(np.median(wrap(residual - off)))
+    for like, turn in (
+        ("bearings: name them bearing", course),
+        ("azimuths: name them azimuth", -course),
+        ("bearings clockwise from the heading: change their sign", 2 * (course - measured)),
+        (f"angles from an axis that is turned by {-off:.3g} rad: add {-off:.3g}", -off),
+    ):
         if len(course) >= ENOUGH and 3 * np.median(np.abs(wrap(residual + turn))) < np.median(np.abs(residual)):
-            return f"They look like {kind}s: name them {kind}."
+            return f"They look like {like}."
     return ""
 
 

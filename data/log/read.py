@@ -10,7 +10,7 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
-from coopoc.arrays import Floats, checked, instance, named, number, one_of, texts
+from coopoc.arrays import Floats, checked, instance, named, number, one_of, refuse, texts
 from coopoc.errors import InputError, suggestion
 from coopoc.file_names import given_path
 from coopoc.short_repr import short_repr
@@ -167,10 +167,15 @@ def read_log(
     texts("ignore", ignore)
     for field, flag in {"any_scale": any_scale, "mutual": mutual}.items():
         instance(field, flag, bool, "Give True or False.")
-    _check_seconds({"dt": dt, "max_gap": max_gap}, 1e-12)
-    _check_seconds({f"clock of {name}": ahead for name, ahead in clock.items()}, -np.inf)
+    clocks = {f"clock of {name}": ahead for name, ahead in clock.items()}
+    for field, value in {"dt": dt, "max_gap": max_gap, **clocks}.items():
+        if value is not None:
+            least = -np.inf if field in clocks else 1e-12
+            number(field, value, least, allowed="a number, of dt and max_gap > 0 s", hint="Give seconds.")
     if origin is not None:
-        checked("origin", origin, "(3,)", (3,))
+        given = checked("origin", origin, "(3,)", (3,))
+        allowed = "must be latitude and longitude in degrees, and height in m"
+        refuse("origin", given, ~(np.abs(given) <= [90.0, 180.0, 1e6]), allowed, "Give origin=(48.14, 11.58, 520.0).")
     options: dict[str, Any] = {
         "columns": named("columns", columns or {}, "Give columns={name: header}."),
         "kinds": named("kinds", kinds or {}, "Give kinds={word: kind}."),
@@ -188,7 +193,11 @@ def read_log(
     rows = unwrapped(rows, summary)
     check_values(rows)
     for column in ("t", "arrival"):
-        check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)
+        unit = check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)
+        if unit:
+            summary.assume(f"{column} is of 32-bit floats, multiples of {unit:.2g} s: write it in 64 bits")
+    if origin is not None and not rows["kind"].isin([*ENU]).any():
+        summary.assume("origin= has no effect: no fix is in degrees")
     rows, true_rows = rows[rows["true"] == 0], rows[rows["true"] == 1]
     rows, origin = local(on_one_clock(rows, clock), origin)
     stated = factors(std, {kind.name for kind in KINDS.values()} - {*ENU, "message"}, "std")
@@ -247,12 +256,6 @@ def _recording(
         body=Body(yaw_rate, compass) if body else None,
         landmarks=tuple(marks),
     )
-
-
-def _check_seconds(given: Mapping[str, float | None], least: float) -> None:
-    for field, value in given.items():
-        if value is not None:
-            number(field, value, least, allowed="a number, of dt and max_gap > 0 s", hint="Give seconds.")
 
 
 def steps_in_words(recording: Recording) -> str:

@@ -154,10 +154,6 @@ def _bearing(factor: Factor, W: Floats, d: int) -> Form:
     return [Part(names, arguments, W[:, ::-1, ::-1])]
 
 
-def _relative_position(factor: Factor, W: Floats, d: int) -> Form:
-    return _chord(W, {0: np.arange(d)}, Space(d, has_rotation=True).join(factor.z), d)
-
-
 def _relative_pose(factor: Factor, W: Floats, d: int) -> Form:
     """GTSAM's chord T_j - T_i Z for the translation, its geodesic for the rotation alone."""
     chord = None if _coupled(W, d) else _chord(W[:, :d, :d], {0: np.arange(d)}, factor.z, d)
@@ -239,7 +235,9 @@ FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
     **dict.fromkeys(PLAIN, _plain),
     "bearing": _bearing,
     "body_spherical": _bearing,
-    "relative_position": _relative_position,
+    "relative_position": lambda factor, W, d: _chord(
+        W, {0: np.arange(d)}, Space(d, has_rotation=True).join(factor.z), d
+    ),
     "relative_pose": _relative_pose,
     "relative_pose_log": _relative_log,
     "relative_pose_chordal": _relative_chordal,

@@ -240,13 +240,17 @@ def antenna(node: Any, arm: Any, m: Any = np) -> Sequence[Any]:
     return [at[i] + sum(turned[i][j] * arm[j] for j in range(3)) for i in range(3)]
 
 
+PLANES = ((1, 2), (2, 0), (0, 1))
+"""Axes about which x, y and z turn."""
+
+
 def geodesic(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Sequence[Any]:
     """Rz^T (t - tz) and Log(Rz^T R), the error of a relative pose (t, R) against a measured (tz, Rz): m, rad."""
     *at, turned = measured
     gap = [x - at[0], y - at[1], z - at[2]]
     moved = [sum(turned[k][i] * gap[k] for k in range(3)) for i in range(3)]
     error = [[sum(turned[k][i] * R[k][j] for k in range(3)) for j in range(3)] for i in range(3)]
-    half = [0.5 * (error[2][1] - error[1][2]), 0.5 * (error[0][2] - error[2][0]), 0.5 * (error[1][0] - error[0][1])]
+    half = [0.5 * (error[j][i] - error[i][j]) for i, j in PLANES]
     sine = half[0] * half[0] + half[1] * half[1] + half[2] * half[2]
     cosine = 0.5 * (error[0][0] + error[1][1] + error[2][2] - 1.0)
     if isinstance(R[2][2], float):  # in the plane one angle suffices
@@ -276,7 +280,7 @@ def logarithm(x: Any, y: Any, z: Any, R: Any, measured: Any, m: Any = np) -> Seq
 
 
 def _cross(a: Sequence[Any], b: Sequence[Any]) -> list[Any]:
-    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+    return [a[i] * b[j] - a[j] * b[i] for i, j in PLANES]
 
 
 def _half_cotangent(square: Any, m: Any) -> Any:
