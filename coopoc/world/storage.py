@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 from numpy.lib import format as npy
 
-from ..arrays import AnyArray
+from ..arrays import AnyArray, instance
 from ..errors import InputError, said
 from ..file_names import given_path
 from .fleet import Fleet
@@ -57,8 +57,9 @@ def save_recording(recording: Recording, path: str | Path, truth: Fleet | None =
         truth: of the same vehicles at the same steps.
 
     Raises:
-        InputError: a truth of other vehicles or steps.
+        InputError: no recording, or a truth of other vehicles or steps.
     """
+    instance("recording", recording, Recording)
     if truth is not None:
         truth.require(recording.ids, recording.t)
     settings = {"sensors": asdict(recording.sensors), "v2x": asdict(recording.v2x)}
