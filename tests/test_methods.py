@@ -160,6 +160,6 @@ def test_nees_is_that_of_numpy_linalg(crossing: Fleet) -> None:
     error = track.x - crossing.position[:, [0, 2]]
     wanted = np.einsum("...i,...i->...", error, np.linalg.solve(track.covariance, error[..., None])[..., 0])
     assert nees(track, crossing) == pytest.approx(wanted, rel=1e-10)
-    flat = replace(track, covariance=track.covariance * [1.0, 1.0, 0.0])
+    flat = replace(track, covariance=track.covariance * np.outer([1, 1, 0], [1, 1, 0]))
     with refused("singular"):
         nees(flat, crossing)
