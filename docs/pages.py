@@ -39,6 +39,7 @@ SECTIONS = {
     "evaluate": ("Evaluation", "Metrics, bounds, statistics."),
     "study": ("Studies", "Grids of cells, results, views."),
     "fleets": ("Files", "Drives, graphs and logs from files."),
+    "formats": ("Trajectory files", "Estimates for other programs."),
     "errors": ("Errors", "What is raised on bad input."),
 }
 
