@@ -39,7 +39,21 @@ def track(runs: int = 2, steps: int = 4, egos: tuple[int, ...] = (2, 0)) -> co.T
 def test_a_track_as_a_table() -> None:
     made = track()
     frame = made.to_frame()
-    assert frame.columns.tolist() == "run step t ego x y z std_x std_y std_z heading std_heading bias".split()
+    assert frame.columns.tolist() == [
+        "run",
+        "step",
+        "t",
+        "ego",
+        "x",
+        "y",
+        "z",
+        "std_x",
+        "std_y",
+        "std_z",
+        "heading",
+        "std_heading",
+        "bias",
+    ]
     assert len(frame) == 2 * 4 * 2
     for row in frame.itertuples():
         at = row.run, row.step, ["blue", "red"].index(row.ego)
@@ -77,7 +91,7 @@ def test_the_table_of_a_fleet_is_read_again_without_the_absent(tmp_path: Path) -
     position[:2, 1] = velocity[:2, 1] = np.nan
     fleet = co.Fleet(IDS, np.arange(5) * 0.1, position, velocity, heading=rng.uniform(-3, 3, (5, 3)))
     frame = fleet.to_frame()
-    assert frame.columns.tolist() == "step t vehicle x y z vx vy vz heading".split()
+    assert frame.columns.tolist() == ["step", "t", "vehicle", "x", "y", "z", "vx", "vy", "vz", "heading"]
     assert len(frame) == 13
     assert not frame.isna().any(axis=None)
     assert frame[frame.vehicle == "green"].step.tolist() == [2, 3, 4]
