@@ -263,9 +263,9 @@ def test_the_registry_is_complete_and_pins_every_address(cache: Path, capsys: py
     for one in public().values():
         assert all((one.what, one.licence, one.citation, one.tried))
         assert one.page.startswith("http")
-        for address, size, digest in one.files.values():
+        for address, size, sha in one.files.values():
             assert size > 0
-            assert re.fullmatch("[0-9a-f]{64}", digest)
+            assert re.fullmatch("[0-9a-f]{64}", sha)
             assert re.search("/[0-9a-f]{40}/", address) or (not address and one.archive.endswith(".zip"))
     for command in (["list"], ["show", "f9k"]):
         assert _status(["data", *command]) == 0
