@@ -13,8 +13,10 @@ from functools import cache, partial
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any
+from urllib.error import HTTPError
 from urllib.parse import quote, urljoin, urlsplit
 
+from coopoc.arrays import number
 from coopoc.errors import InputError, said, suggestion, unknown
 
 TIMEOUT = 20.0
@@ -149,9 +151,10 @@ def fetch(name: str, *, offline: bool = False, timeout: float = TIMEOUT) -> Path
         InputError: an unknown name; no network, a server that does not answer, or bytes of another hash: with the
             address to fetch by hand and the folder where to put it.
     """
-    entry = public().get(name)
+    entry = public().get(name) if isinstance(name, str) else None
     if entry is None:
-        raise unknown("data", name, public(), "Or a path.")
+        raise unknown("data", name, public())
+    number("timeout", timeout, 1e-3, allowed="s, above 0", hint="Give seconds.")
     from filelock import FileLock
 
     folder, mirror = cache_folder() / name, os.environ.get("COOPOC_MIRROR", "")
@@ -159,9 +162,13 @@ def fetch(name: str, *, offline: bool = False, timeout: float = TIMEOUT) -> Path
     if absent and offline:
         raise _offline(entry, folder, absent, mirror)
     if absent:
-        folder.mkdir(parents=True, exist_ok=True)
-        with FileLock(folder / ".lock"):
-            _bring(entry, folder, mirror, timeout)
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with FileLock(folder / ".lock"):
+                _bring(entry, folder, mirror, timeout)
+        except OSError as error:
+            allowed = f"must be a folder that can be written: {said(error)}"
+            raise InputError("COOPOC_DATA", str(folder), allowed, "Set COOPOC_DATA to one.") from None
     return entry.path
 
 
@@ -175,12 +182,13 @@ def _bring(entry: Entry, folder: Path, mirror: str, timeout: float) -> None:
     import pooch
 
     pooch.get_logger().setLevel("WARNING")
-    if entry.archive and not mirror:
+    absent = _absent(entry, folder)  # another process may have brought it meanwhile
+    if absent and entry.archive and not mirror:
         deliver = partial(_deliver, entry=entry, to=folder / ARCHIVE, size=entry.bytes, digest="", timeout=timeout)
         pooch.retrieve(entry.archive, None, ARCHIVE, folder, downloader=deliver)
         _unpack(entry, folder)
         return
-    for file in _absent(entry, folder):
+    for file in absent:
         _, size, digest = entry.files[file]
         deliver = partial(_deliver, entry=entry, to=folder / file, size=size, digest=digest, timeout=timeout)
         pooch.retrieve(_address(entry, file, mirror), f"sha256:{digest}", file, folder, downloader=deliver)
@@ -221,6 +229,11 @@ def _deliver(
             reason = said(error)
             if _size(part) <= begun:
                 raise _by_hand(entry, address, to, reason) from None
+        except HTTPError as error:
+            if error.code != 416 or not begun:  # the server has no byte after those that are here
+                raise _by_hand(entry, address, to, said(error)) from None
+            part.unlink()
+            reason = said(error)
         except TimeoutError:
             raise _by_hand(entry, address, to, f"sent nothing for {timeout:g} s") from None
         except (OSError, HTTPException, ValueError) as error:

@@ -63,6 +63,9 @@ def server() -> Iterator[Server]:
                 self.send_error(404)
                 return
             begin = int(wanted.removeprefix("bytes=").rstrip("-")) if wanted and state.ranges else 0
+            if begin >= len(data):
+                self.send_error(416)
+                return
             body = data[begin:]
             self.send_response(206 if begin else 200)
             self.send_header("Content-Length", str(len(body)))
@@ -210,6 +213,12 @@ def test_no_network_offline_and_a_missing_page_name_address_and_place(
         co.fetch("car")
     with refused("Did you mean car"):
         co.fetch("cra")
+    with refused("timeout"):
+        co.fetch("car", timeout=0.0)
+    file = cache / "car" / ".lock"
+    monkeypatch.setenv("COOPOC_DATA", str(file))
+    with refused("COOPOC_DATA = .*must be a folder that can be written"):
+        co.fetch("car")
     assert _status(["data", "get"]) == 2
 
 
@@ -254,6 +263,10 @@ def test_files_of_an_archive_are_verified_one_by_one(
     server.files["/all.zip"] = b"no archive"
     with refused("not a zip file"):
         co.fetch("zipped")
+    (cache / "zipped" / "archive.zip.part").write_bytes(server.files["/all.zip"])  # whole, and not handed over
+    with refused("not a zip file"):
+        co.fetch("zipped")
+    assert server.asked[-2:] == [("/all.zip", "bytes=10-"), ("/all.zip", "")]
     serve({"else/b.csv": b"t,x\n"})
     assert co.fetch("zipped") == cache / "zipped" / "set"
     assert sorted(path.name for path in (cache / "zipped").rglob("*") if path.is_file()) == [".lock", "a.csv", "b.csv"]
