@@ -190,7 +190,7 @@ def build(out: Path) -> None:
     """Compile every kernel for the processors that a wheel serves, into a folder, in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
         own = {"PYTHONHASHSEED": "0", "PYTHONPYCACHEPREFIX": f"{folder}/python", "OMP_NUM_THREADS": "1"}
-        code = [sys.executable, "-B", "-c", RELATIVE, __file__, "--compiled", f"{folder}/code"]
+        code = [sys.executable, "-B", "-P", "-c", RELATIVE, __file__, "--compiled", f"{folder}/code"]
         subprocess.run(code, env={**os.environ, **own}, check=True)
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)

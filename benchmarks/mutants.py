@@ -223,11 +223,9 @@ def _tested(tests: list[str], limit: int, machine_code: Path) -> int:
     resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
     os.chdir(ROOT)
     os.environ["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR = str(machine_code)
-    from coopoc.kernels.compiling import machine_code
+    from coopoc.kernels.compiling import machine_code as kept
 
-    machine_code.stamp = lambda function: (
-        ""
-    )  # whatever machine code there is holds: what a change makes stale was removed
+    kept.stamp = lambda function: ""  # whatever machine code there is holds: what a change makes stale was removed
     return pytest.main(["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-rfE", *tests])
 
 
