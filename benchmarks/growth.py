@@ -26,12 +26,12 @@ SPACING = 14.0
 IMPORT_SECONDS = 0.3
 
 
-def grid(rows: int, columns: int) -> co.Fleet:
+def grid(rows: int, columns: int, steps: int = STEPS) -> co.Fleet:
     """A block of vehicles that drives on together."""
-    t = np.arange(STEPS) * 0.1
+    t = np.arange(steps) * 0.1
     i, j = np.divmod(np.arange(rows * columns), columns)
     start = SPACING * np.stack([i, j, 0.05 * ((i + j) % 3)], axis=1)
-    velocity = np.broadcast_to([10.0, 0.0, 0.0], (STEPS, len(start), 3))
+    velocity = np.broadcast_to([10.0, 0.0, 0.0], (steps, len(start), 3))
     return co.Fleet(tuple(f"v{k}" for k in range(len(start))), t, start + t[:, None, None] * velocity[:1], velocity)
 
 
