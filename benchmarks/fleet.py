@@ -37,12 +37,11 @@ ROUNDS = 3
 
 
 class Row(NamedTuple):
-    """One way to do the job: its words, the call, and whether its answer is that of its problem; None where it is
-    another answer by construction."""
+    """One way to do the job: its words, the call, and whether its answer is that of its problem."""
 
     words: str
     call: Callable[[], Any]
-    right: bool | None
+    right: bool
 
 
 def town(vehicles: int, steps: int, seed: int = 0) -> co.Fleet:

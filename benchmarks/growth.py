@@ -11,8 +11,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from classical import timed
-from timing import report
+from timing import medians, report, rows_of, timed
 
 import coopoc as co
 from coopoc.methods.catalogue import METHODS
@@ -51,20 +50,15 @@ def methods(fleets: dict[int, tuple[int, int]] = FLEETS, rounds: int = ROUNDS) -
         for call, fleet, recording in zip(calls, drives, recordings, strict=True):
             fixes = np.linalg.norm(recording.gnss - fleet.position, axis=-1).mean()
             right.append(bool(np.mean(co.rt_le(call(), fleet)) < fixes))
-        spent = [
-            [timed(call) / (len(fleet.ids) * STEPS) for call, fleet in zip(calls, drives, strict=True)]
-            for _ in range(rounds)
-        ]
-        medians = np.median(spent, axis=0)
-        out += [
+        names = [f"{name}, {count} vehicles" for count in fleets]
+        spent = medians(
             {
-                "name": f"{name}, {count} vehicles",
-                "us": 1e6 * float(median),
-                "ratio": float(median / medians[0]),
-                "right": good,
-            }
-            for count, median, good in zip(fleets, medians, right, strict=True)
-        ]
+                each: lambda call=call, n=len(fleet.ids): timed(call) / (n * STEPS)
+                for each, call, fleet in zip(names, calls, drives, strict=True)
+            },
+            rounds,
+        )
+        out += rows_of("", spent, names[0], dict(zip(names, right, strict=True)))
     return out
 
 
