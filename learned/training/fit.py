@@ -78,7 +78,7 @@ def fit(
     progress: str | None = None,
     long: Segments | None = None,
 ) -> Fit:
-    """Minimise 1/T sum_t ||xhat_t - x_t||^2 + gamma ||theta||^2 over batches of pieces.
+    """Minimise 1/T sum_t ||xhat_t - x_t||^2 over batches of pieces; weights decay by AdamW.
 
     Args:
         model: the start; it is not changed.
@@ -127,7 +127,8 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
     rates = [schedule.learning_rate * cosine(len(plan)) for plan in plans]
     due = [set(np.linspace(0, len(plan), schedule.checks + 1).round().astype(int).tolist()) for plan in plans]
     draws = [generator(draw) for draw in streams]
-    for step, losses in bar(descend(theta, like, pool, plans, rates, schedule, draws, stopped), plans, progress):
+    steps = descend(theta, like, pool, plans, rates, schedule, draws, stopped)
+    for step, losses in watched(steps, progress, "step", max(map(len, plans))):
         seen.append(losses)
         checked = [row for row in range(len(tasks)) if step in due[row] and row not in stopped]
         if checked:
@@ -219,8 +220,3 @@ def pooled(parts: Sequence[Segments]) -> tuple[Segments, list[Ints]]:
     """All pieces in one, and the indices of each part in it."""
     ends = np.cumsum([len(p) for p in parts])
     return Segments.join(parts), [np.arange(end - len(p), end) for p, end in zip(parts, ends, strict=True)]
-
-
-def bar(steps: Iterator[tuple[int, Tensor]], plans: Sequence[Ints], name: str | None) -> Iterator[tuple[int, Tensor]]:
-    """The same steps with a progress bar of that name on stderr, or without one."""
-    return watched(steps, name, "step", max(map(len, plans)))
