@@ -1,14 +1,14 @@
 """Checkpoints, recipes and train_all: round trips, refusals, resuming."""
 
-import importlib.util
 import json
 from dataclasses import asdict, replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+import shipped_weights as shipped
 import torch
-from conftest import refused
+from conftest import refused, winding
 from safetensors.torch import load_file, save_file
 
 import coopoc.learned.recipes as recipes
@@ -30,20 +30,9 @@ from coopoc.learned.nets.gain import Gain
 from coopoc.learned.nets.road import RoadConstants
 from coopoc.learned.nets.stack import flatten
 
-SPEC = importlib.util.spec_from_file_location(
-    "shipped_weights", Path(__file__).resolve().parents[1] / "benchmarks" / "shipped_weights.py"
-)
-assert SPEC
-assert SPEC.loader
-shipped = importlib.util.module_from_spec(SPEC)
-SPEC.loader.exec_module(shipped)
-
 
 def drives() -> Fleet:
-    t = np.arange(80) / 10
-    wave = t[:, None] / 4 + np.arange(2)
-    velocity = np.stack([9 * np.cos(wave), 9 * np.sin(wave), 0 * wave], axis=-1)
-    return Fleet(("a", "b"), t, np.cumsum(0.1 * velocity, axis=0), velocity, name="pair")
+    return replace(winding(80, 9.0, 4.0, 2), name="pair")
 
 
 @pytest.fixture
