@@ -221,5 +221,5 @@ def _cut(drive: Sequence[Floats], piece: int, dt: float, start: Start) -> Segmen
     begun = np.isfinite(gnss[:, 0, 0])
     origin = truth[begun, :1]
     parts = (gnss[begun] - origin, velocity[begun], truth[begun] - origin)
-    tensors = (torch.tensor(part, dtype=torch.float32) for part in parts)
-    return Segments(*tensors, torch.full((begun.sum(),), start == "true"), dt)
+    fixes, speeds, truths = (torch.tensor(part, dtype=torch.float32) for part in parts)
+    return Segments(fixes, speeds, truths, torch.full((begun.sum(),), start == "true"), dt)
