@@ -1,8 +1,11 @@
 """Fleets that tests share."""
 
 import importlib
+import os
+import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -17,14 +20,32 @@ from coopoc.study.study import Study
 
 collect_ignore = ["fuzz"]
 """Its programs need atheris; what they found is replayed by test_data_fuzz.py."""
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+MEASURED = os.environ.get("COOPOC_TEST_DATA", "")
+"""Folder of measurements of others, with what `coopoc data get` fetches; files are found by name, however deep."""
+ELSEWHERE = {"Town": "BerkeleyLearnVerify/Scenic", "AV": "CATS-Lab (field experiment)"}
+PUBLIC = tomllib.loads((Path(__file__).parents[1] / "data" / "public.toml").read_text())
 
 
-@pytest.fixture(scope="session")
-def shared() -> Path:
-    if not SHARED.is_dir():
-        pytest.skip("the shared data folder is not beside the project")
-    return SHARED
+@cache
+def located(name: str) -> Path | None:
+    """Path of a file or folder of the measurements."""
+    return next(iter(sorted(Path(MEASURED).rglob(name))), None) if MEASURED else None
+
+
+def measured(name: str = "") -> Path:
+    """The same, or the whole folder; skips, and says how to get the file, where it is absent."""
+    if path := located(name) if name else Path(MEASURED):
+        return path
+    gotten = [f"coopoc data get {key}" for key, row in PUBLIC.items() if name in (key, row.get("opens"), *row["files"])]
+    pytest.skip(f"no {name}: {(gotten or ['see'])[0]}, then set COOPOC_TEST_DATA to its folder")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Leave what was skipped, a line a test, for `pytest @.pytest_cache/d/skipped/tests`."""
+    if not hasattr(config, "cache"):
+        return
+    skipped = {report.nodeid for report in terminalreporter.stats.get("skipped", ())}
+    (config.cache.mkdir("skipped") / "tests").write_text("\n".join(sorted(skipped)))
 
 
 def refused(match: str) -> Any:
