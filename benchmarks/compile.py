@@ -1,29 +1,45 @@
-"""CPU seconds of each method's first call, which compiles it once per machine: alone, each in a cache of its own.
+"""CPU seconds until the first answer of each method, solve and stream: everything that a user waits for.
 
-    OMP_NUM_THREADS=1 python benchmarks/compile.py [NAME ...]     # some minutes; a Markdown table on stdout
+    OMP_NUM_THREADS=1 python benchmarks/compile.py [NAME ...]        # some minutes; a Markdown table on stdout
+    python benchmarks/compile.py --into build/machine_code           # compile every kernel, as `make release` does
+    python benchmarks/compile.py --record                            # renew the seconds that a line on stderr names
 
-A name is a method of `coopoc list` or one of `OTHERS`. The last row is all of them in one process and one cache, where
-what they share is compiled once. Seconds are the process's own: those of the call less those of the same call again.
+Each name runs in a process of its own, from its start to its answer, twice: with an empty cache of machine code, and
+again with what the first run has kept. The difference is compiled once per machine; a wheel ships it.
 """
 
 from __future__ import annotations
 
+import argparse
+import importlib
+import json
 import os
+import pkgutil
+import resource
+import shutil
 import subprocess
 import sys
 import tempfile
-import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
 
+import numpy as np
 from tabulate import tabulate
 from unseen_graphs import joined, world
 
 import coopoc as co
 from coopoc.methods.catalogue import METHODS, needs_whole_fleet
 from coopoc.optimize.graph_problems import from_graph
+from coopoc.world.storage import save_recording
 
 Call = Callable[[], object]
-LIMIT = 10.0
+S = co.Sensors.paper_scenario2()
+BODY = co.Sensors(heading_std=0.05, yaw_rate_std=0.02)
+GATED = ("kalman", "joint", "cooperative-filter", "mhe", "batch-smoother", "pose filter, fleet", "solve of a graph")
+"""Rows of the gate."""
+MODULES = ("coopoc.kernels", "coopoc.learned.engine")
+"""Packages that hold compiled functions."""
 
 
 def drive() -> co.Fleet:
@@ -31,76 +47,203 @@ def drive() -> co.Fleet:
     return co.load_fleet("town10").between(0, 12)
 
 
-def method(name: str) -> Call:
-    """A method of the catalogue, with neighbours and losses."""
-    made = METHODS[name]("nominal")
-    whole = needs_whole_fleet(name)
-    v2x = co.V2X(max_neighbours=3, loss=0.1)
-    seen = co.observe(drive(), co.Sensors.paper_scenario2(), v2x, runs=2, observers=None if whole else [24])
-    egos = range(len(seen.ids)) if whole else [24]
-    return lambda: made(seen, egos)
+def method(name: str, stored: bool = False) -> None:
+    """A method of the catalogue, with neighbours and messages that are late or lost; of a stored recording, too."""
+    made, whole, v2x = (
+        METHODS[name]("nominal"),
+        needs_whole_fleet(name),
+        co.V2X(max_neighbours=3, loss=0.1, latency=0.2),
+    )
+    seen = co.observe(drive(), S, v2x, runs=2, observers=None if whole else [24])
+    if stored:
+        with tempfile.TemporaryDirectory() as folder:
+            save_recording(seen, Path(folder) / "seen.npz")
+            seen = co.load_recording(Path(folder) / "seen.npz")
+    track = made(seen, range(len(seen.ids)) if whole else [24])
+    if track.covariance is not None:
+        co.nees(track, drive())
 
 
-def pose(unit: str, **options: object) -> Call:
+def pose(unit: str) -> None:
     """The pose filter of a unit."""
-    sensors = co.Sensors(heading_std=0.05, yaw_rate_std=0.02)
     who = None if unit == "fleet" else [24]
-    seen = co.observe(drive(), sensors, co.V2X(max_neighbours=3), runs=2, observers=who, frame="body")
-    return lambda: co.PoseFilter(unit, **options)(seen, [24])  # type: ignore[arg-type]
+    seen = co.observe(drive(), BODY, co.V2X(max_neighbours=3), runs=2, observers=who, frame="body")
+    co.PoseFilter(unit)(seen, [24])  # type: ignore[arg-type]
 
 
-def graph() -> Call:
-    """A graph of robots that see and range one another and landmarks, solved with its marginals."""
+def graph() -> None:
+    """A graph of robots that see and range one another and landmarks, from its records to the marginals."""
     w = world(0, 2, 2, 60, 4)
     loops, ranges = w.near(20, 8.0), w.ranged(w.to_points(40), 0.3)
-    problem = from_graph(
-        w.graph(relative_pose=joined(w.relative(w.chain(), 0.03, 0.01), w.relative(loops, 0.03, 0.01)), ranges=ranges)
-    )
-    return lambda: co.solve(problem).covariance
+    poses = joined(w.relative(w.chain(), 0.03, 0.01), w.relative(loops, 0.03, 0.01))
+    np.asarray(co.solve(from_graph(w.graph(relative_pose=poses, ranges=ranges))).covariance)
 
 
-OTHERS: dict[str, Callable[[], Call]] = {
-    "pose filter, solo": lambda: pose("solo"),
-    "pose filter, fleet": lambda: pose("fleet"),
+def streams() -> None:
+    """Filters step by step: alone, on roads, with a neighbour, and poses."""
+    noise = co.NoiseModel.nominal(S)
+    for solo in (co.Kalman(noise), co.AdaptiveKalman(), co.RoadFilter(noise)):
+        filter = solo.start(history=1.0)
+        for k in range(3):
+            filter.step([0.9 * k, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, fix_age=0.1 * (k == 2))
+    for star in (co.JointFilter(noise), co.CooperativeFilter(noise)):
+        ego, other = co.StarStream(star), co.StarStream(star)
+        for k in range(3):
+            other.step([12.0 + k, 1.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)
+            heard = other.broadcast if star.name == "cooperative-filter" else ([12.0, 1.0, 0.0], [9.0, 0.0, 0.0])
+            seen = co.RelativeMeasurement("b", [11.8, 0.1, 1.57], *heard, age=0.1)
+            ego.step([0.9 * k, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[seen])
+    robot = co.PoseFilter("solo", assumed=BODY).start(dt=0.1)
+    mast = co.LandmarkMeasurement([20.1, 0.4, 1.4], place=[18.0, 9.0, 3.0])
+    robot.step(co.OwnMeasurement([9.0, 0.0, 0.0], 0.02, gnss=[0.4, 0.2, 0.0], heading=0.1), [mast])
+
+
+def training() -> None:
+    """An epoch of each net's training, and the answer of a net."""
+    from coopoc.learned import GainNet, NoiseParameters, Schedule, clients, fit, load_method
+
+    own = clients(co.load_fleet("town10-clients").between(0, 120), piece=20)[0]
+    for net in (GainNet(), NoiseParameters()):
+        fit(net, own.training, own.validation, Schedule(epochs=1))
+    load_method("fedkalmannet")(co.observe(drive(), S, co.V2X(max_neighbours=0), runs=2, observers=[24]), [24])
+
+
+CALLS: dict[str, Call] = {
+    **{name: lambda name=name: method(name) for name in METHODS},  # type: ignore[misc]
+    **{f"pose filter, {unit}": lambda unit=unit: pose(unit) for unit in ("solo", "fleet")},  # type: ignore[misc]
     "solve of a graph": graph,
+    "streams": streams,
+    "a net": training,
 }
 
 
-def spent(names: list[str]) -> float:
-    """CPU seconds of first calls in this process beyond those of second ones."""
-    total = 0.0
-    for name in names:
-        call = OTHERS[name]() if name in OTHERS else method(name)
-        seconds = []
-        for _ in range(2):
-            begun = time.process_time()
-            call()
-            seconds.append(time.process_time() - begun)
-        total += seconds[0] - seconds[1]
-    return total
+def spent(name: str, folder: str) -> float:
+    """CPU seconds of a process that makes one call with the machine code of a folder."""
+    before = resource.getrusage(resource.RUSAGE_CHILDREN)
+    env = {**os.environ, "NUMBA_CACHE_DIR": folder, "OMP_NUM_THREADS": "1"}
+    subprocess.run([sys.executable, __file__, "--here", name], env=env, check=True, stderr=subprocess.DEVNULL)
+    after = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
 
 
-def anew(names: list[str]) -> float:
-    """The same in a new process with an empty cache."""
-    with tempfile.TemporaryDirectory() as cache:
-        command = [sys.executable, __file__, "--here", *names]
-        env = {**os.environ, "NUMBA_CACHE_DIR": cache, "OMP_NUM_THREADS": "1"}
-        return float(subprocess.run(command, env=env, check=True, stdout=subprocess.PIPE, text=True).stdout)
+def first_and_again(name: str) -> tuple[float, float]:
+    """CPU seconds until the answer with an empty cache, and with what that run has kept."""
+    with tempfile.TemporaryDirectory() as folder:
+        return spent(name, folder), spent(name, folder)
 
 
-def main() -> None:
+def measured() -> list[dict[str, Any]]:
+    """Rows of the gate: first answers over that of the solo filter again, most of which is loading libraries."""
+    seconds = {name: first_and_again(name) for name in GATED}
+    unit = seconds["kalman"][1]
+    return [
+        {"name": f"compiled: {name}, first answer", "us": 1e6 * first, "ratio": first / unit, "right": None}
+        for name, (first, _) in seconds.items()
+    ]
+
+
+def all_kernels() -> list[Any]:
+    """Every compiled function of the package, of modules that no call has imported, too."""
+    from coopoc.kernels.compiling.compile import kernels
+
+    for package in map(importlib.import_module, MODULES):
+        for module in pkgutil.walk_packages(package.__path__, package.__name__ + "."):
+            importlib.import_module(module.name)
+    return kernels
+
+
+def run_all() -> list[Any]:
+    """Make every call; the kernels that then have machine code of this process.
+
+    Raises:
+        SystemExit: a kernel that no call compiles.
+    """
+    for name, call in CALLS.items():
+        print(f"{name} ...", file=sys.stderr)
+        call()
+        if name in METHODS:
+            method(name, stored=True)
+    kernels = all_kernels()
+    if missing := [kernel._cache.name for kernel in kernels if not kernel.signatures]:
+        sys.exit(f"no call compiles {', '.join(missing)}")
+    return kernels
+
+
+RELATIVE = """
+import os, runpy, sys
+from importlib.machinery import SourceFileLoader as Loader
+
+def relative(loader, data, path, plain=Loader.source_to_code, **options):
+    ours = loader.name.partition(".")[0] in ("numba", "coopoc")
+    return plain(loader, data, loader.name.replace(".", "/") + ".py" if ours else path, **options)
+
+Loader.source_to_code = relative
+sys.argv = sys.argv[1:]
+sys.path.insert(0, os.path.dirname(sys.argv[0]))
+runpy.run_path(sys.argv[0], run_name="__main__")
+"""
+"""Start of a process whose functions name their files without the folder of the environment: machine code holds these
+names, and shall be the same wherever it is made."""
+
+
+def build(out: Path) -> None:
+    """Compile every kernel for the processors that a wheel serves, into a folder, in a process of its own."""
+    with tempfile.TemporaryDirectory() as folder:
+        own = {"PYTHONHASHSEED": "0", "PYTHONPYCACHEPREFIX": f"{folder}/python", "OMP_NUM_THREADS": "1"}
+        code = [sys.executable, "-B", "-P", "-c", RELATIVE, __file__, "--compiled", f"{folder}/code"]
+        subprocess.run(code, env={**os.environ, **own}, check=True)
+        shutil.rmtree(out, ignore_errors=True)
+        out.mkdir(parents=True)
+        for file in (*Path(folder).glob("code/*/*.nb?"), *Path(folder).glob("code/about.json")):
+            shutil.copyfile(file, out / file.name)
+
+
+def compile_all(folder: Path) -> None:
+    """Compile every kernel in this process and keep the machine code."""
+    import numba
+
+    from coopoc.kernels.compiling import machine_code
+
+    config: Any = numba.config
+    _, config.CPU_NAME, config.CPU_FEATURES = machine_code.SHIPPED_TARGET
+    config.CACHE_DIR = str(folder)
+    run_all()
+    (folder / "about.json").write_text(json.dumps(machine_code.versions(), indent=1) + "\n")
+
+
+def record() -> None:
+    """Renew the table of the seconds that kernels take to compile."""
+    import numba
+
+    from coopoc.kernels.compiling import compile
+
+    config: Any = numba.config
+    with tempfile.TemporaryDirectory() as config.CACHE_DIR:
+        run_all()
+    table = {name: round(seconds, 1) for name, seconds in sorted(compile.seconds.items()) if seconds > 1}
+    Path(compile.__file__).with_name("usual_seconds.json").write_text(json.dumps(table, indent=1) + "\n")
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
     """Time what is named, or all."""
-    if sys.argv[1:2] == ["--here"]:
-        print(spent(sys.argv[2:]))
-        return
-    names = sys.argv[1:] or [*METHODS, *OTHERS]
-    if unknown := set(names) - {*METHODS, *OTHERS}:
-        sys.exit(f"{', '.join(sorted(unknown))}: must be among {', '.join([*METHODS, *OTHERS])}")
-    rows = [(name, anew([name])) for name in names]
-    rows.append(("all in one process", anew(names)))
-    print(tabulate([(name, f"{s:.1f}") for name, s in rows], ["first call of", "CPU s"], "github"))
-    slow = [name for name, seconds in rows[:-1] if seconds > LIMIT]
-    print(f"over {LIMIT:g} s: {', '.join(slow) or 'none'}", file=sys.stderr)
+    parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
+    parser.add_argument("names", nargs="*", choices=[*CALLS, []], metavar="NAME")
+    parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
+    parser.add_argument("--into", type=Path)
+    parser.add_argument("--compiled", type=Path, help=argparse.SUPPRESS)
+    parser.add_argument("--record", action="store_true")
+    given = parser.parse_args(arguments)
+    if given.here:
+        CALLS[given.names[0]]()
+    elif given.compiled:
+        compile_all(given.compiled)
+    elif given.into:
+        build(given.into)
+    elif given.record:
+        record()
+    else:
+        rows = [(name, *(f"{s:.1f}" for s in first_and_again(name))) for name in given.names or CALLS]
+        print(tabulate(rows, ["CPU s until the first answer of", "first call", "again"], "github"))
 
 
 if __name__ == "__main__":

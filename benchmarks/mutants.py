@@ -223,9 +223,9 @@ def _tested(tests: list[str], limit: int, machine_code: Path) -> int:
     resource.setrlimit(resource.RLIMIT_CPU, (limit, limit))
     os.chdir(ROOT)
     os.environ["NUMBA_CACHE_DIR"] = numba.config.CACHE_DIR = str(machine_code)
-    from coopoc.kernels.compiling import compile
+    from coopoc.kernels.compiling import machine_code as kept
 
-    compile._stamp = lambda module: ()  # whatever machine code there is holds: what a change makes stale was removed
+    kept.stamp = lambda function: ""  # whatever machine code there is holds: what a change makes stale was removed
     return pytest.main(["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-rfE", *tests])
 
 
@@ -237,7 +237,7 @@ def found_by(mutant: Mutant, limit: int, tests: Iterable[str], machine_code: Pat
     with tempfile.TemporaryDirectory(dir=machine_code.parent) as own:
         shutil.copytree(machine_code, own, copy_function=os.link, dirs_exist_ok=True)
         for stem in {"test_*", *(other.stem for other in affected(file))}:
-            for stale in Path(own).rglob(f"{stem}.*.nb[ic]"):
+            for stale in Path(own).rglob(f"*{stem}.*.nb[ic]"):
                 stale.unlink()
         try:
             file.write_text(mutant.text)

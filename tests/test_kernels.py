@@ -1,15 +1,21 @@
 """Machine code: when it is made anew, and that the package imports no numba."""
 
 import importlib
+import json
+import os
 import pickle
+import re
+import shutil
 import sys
+from io import StringIO
 from pathlib import Path
 
 import pytest
 from shell import ran
+from tqdm import tqdm
 
 from coopoc import Sensors
-from coopoc.kernels.compiling import compile as kernels
+from coopoc.kernels.compiling import compile, machine_code
 
 pytest.importorskip("numba")
 S2 = Sensors.paper_scenario2()
@@ -20,26 +26,33 @@ def test_machine_code_is_stale_after_a_change_of_a_file_that_it_imports_and_no_o
 ) -> None:
     """a calls b, which calls c; d is beside them."""
     monkeypatch.syspath_prepend(tmp_path)
-    for name, text in (("a", "from b import x"), ("b", "from c import (\n    x,\n)"), ("c", "x = 1"), ("d", "x = 2")):
+    for name, text in (
+        ("a", "from b import x\ndef f(): ..."),
+        ("b", "from c import (\n    x,\n)"),
+        ("c", "x = 1"),
+        ("d", "x = 2"),
+    ):
         (tmp_path / f"stale_{name}.py").write_text(text.replace("from ", "from stale_") + "\n")
     for name in "ad":
         importlib.import_module(f"stale_{name}")
 
-    def stamp() -> object:
-        return kernels._stamp.__wrapped__("stale_a")
+    def stamp() -> str:
+        machine_code._digest.cache_clear()
+        return machine_code.stamp(sys.modules["stale_a"].f)
 
     before = stamp()
     (tmp_path / "stale_d.py").write_text("x = 33")
+    os.utime(tmp_path / "stale_c.py", (0, 0))
     assert stamp() == before
-    (tmp_path / "stale_c.py").write_text("x = 333")
+    (tmp_path / "stale_c.py").write_text("x = 3")
     assert stamp() != before
 
 
 def test_a_kernel_depends_on_all_kernels_below_it() -> None:
     importlib.import_module("coopoc.kernels.stars.joint_filter")
-    names = {name for name, *_ in kernels._stamp("coopoc.kernels.stars.joint_filter")}
-    assert {"joint.py", "messages.py", "relative.py", "small.py", "compile.py"} <= names
-    assert "horizon.py" not in names
+    names = {name.rpartition(".")[2] for name in machine_code.sources("coopoc.kernels.stars.joint_filter")}
+    assert {"joint", "messages", "relative", "small", "compile"} <= names
+    assert "horizon" not in names
 
 
 def test_importing_the_package_imports_no_numba() -> None:
@@ -65,3 +78,54 @@ def test_machine_code_of_types_that_are_gone_is_made_again(tmp_path: Path) -> No
         version = pickle.load(file)
     index.write_bytes(pickle.dumps(version) + b"cno_such_module\nThing\n.")
     assert (run(), run()) == ("8.0 0\n", "8.0 1\n")
+
+
+def test_a_wheel_ships_machine_code_that_another_folder_loads_and_says_why_it_does_not(tmp_path: Path) -> None:
+    """Compiled for x86-64-v3, copied beside other sources, and loaded where nothing can be written."""
+    code = (
+        "import sys\nfrom pathlib import Path\nimport numba\n"
+        "from coopoc.kernels.compiling import compile, machine_code\n"
+        "machine_code.SHIPPED = Path(sys.argv[1])\ncpu = sys.argv[2:]\n"
+        "if cpu: _, numba.config.CPU_NAME, numba.config.CPU_FEATURES = machine_code.SHIPPED_TARGET\n"
+        "@compile.compiled\ndef twice(x):\n    return 2.0 * x\n"
+        "print(twice(4.0), twice._cache.origin, machine_code.mismatch())\n"
+    )
+    shipped = tmp_path / "shipped"
+    for folder in "ab":
+        (tmp_path / folder).mkdir()
+        (tmp_path / folder / "own.py").write_text(code)
+
+    def run(folder: str, *cpu: str) -> str:
+        return ran([sys.executable, tmp_path / folder / "own.py", shipped, *cpu], check=True).stdout
+
+    assert run("a", "x86-64-v3") == "8.0 compiled -\n"
+    shutil.copytree(tmp_path / "a/__pycache__", shipped)
+    about = shipped / "about.json"
+    about.write_text(json.dumps(machine_code.versions()))
+    assert run("b") == "8.0 shipped \n"
+    assert not (tmp_path / "b/__pycache__").exists() or not list((tmp_path / "b/__pycache__").iterdir())
+    (tmp_path / "b/own.py").write_text(code.replace("2.0", "3.0"))
+    assert run("b") == "12.0 compiled \n"
+    about.write_text(json.dumps(machine_code.versions() | {"numba": "0.1"}))
+    assert "shipped" not in (told := run("a"))
+    assert "machine code is for numba 0.1, this is 0." in told
+
+
+def test_no_progress_bar_counts_the_time_of_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A bar that is open while a kernel compiles begins to count when it has; a line says what and how long."""
+    said = StringIO()
+    monkeypatch.setattr(sys, "stderr", said)
+    with tqdm(total=1, delay=2.0, file=said) as bar:
+        began = bar.start_t
+        compile._hold_bars(5.0)
+        compile._say(compile._line(compile.rooms))
+        assert bar.start_t == began + 5.0
+    assert said.getvalue() == "compiling the compile kernel, once per machine\n"
+
+
+def test_check_says_where_each_kernel_comes_from() -> None:
+    rooms = compile.rooms()
+    assert {"coopoc.kernels.stars", "coopoc.kernels.graphs"} <= set(rooms)
+    assert all(
+        re.fullmatch(r"(\d+ (shipped|compiled here, \S+|not compiled yet)(; )?)+", line) for line in rooms.values()
+    )

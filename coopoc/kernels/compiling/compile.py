@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import gc
+import json
 import os
-import re
 import sys
 import threading
+import time
+from collections import Counter, defaultdict
 from collections.abc import Callable
-from functools import cache, partial
-from importlib.util import resolve_name
+from contextlib import suppress
+from functools import cache
+from importlib import import_module
 from pathlib import Path
+from pkgutil import walk_packages
 from typing import Any, TypeVar, cast
 
 Function = TypeVar("Function", bound=Callable[..., Any])
@@ -19,9 +23,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def compiled(function: Function) -> Function:
     """Compiled at the first call. A product and a sum may become one instruction; nothing is reordered.
 
-    The machine code is kept beside the source, or in the user's cache where that is read-only. It holds what it calls:
-    it is made anew after a change of the function's file, or of a file of the kernels or of its own folder that it
-    imports, directly or through others.
+    A wheel ships the machine code. What is compiled here is kept beside the source, or in the user's cache where that
+    is read-only. It holds what it calls: it is made anew after a change of the function's file, or of a file of the
+    kernels or of its own folder that it imports, directly or through others.
     """
     return _kept(function, {"contract"})
 
@@ -62,12 +66,16 @@ def storage(function: Function) -> Function:
     return cast(Function, _made(function, set(), inline="always"))
 
 
-KERNELS = Path(__file__).resolve().parents[1]
-IMPORT = re.compile(r"^from (\.*[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
+USUAL_SECONDS: dict[str, float] = json.loads((Path(__file__).parent / "usual_seconds.json").read_text())
+"""CPU seconds that a kernel took to compile where `benchmarks/compile.py` was run, of those above a second."""
 PATIENCE = 2.0
 """s of compiling after which a line on stderr reports it."""
 PLAIN = "COOPOC_PLAIN_NJIT"
 """Environment variable: 1 compiles by numba's public interface alone."""
+kernels: list[Any] = []
+"""Every compiled function of the modules that are imported, in order."""
+seconds: dict[str, float] = {}
+"""CPU seconds that kernels took to compile in this process."""
 
 
 @cache
@@ -76,10 +84,10 @@ def _hooks() -> Any:
     if os.environ.get(PLAIN) == "1":
         return None
     try:
-        from . import pipeline
+        from . import machine_code, pipeline
     except (ImportError, AttributeError):
         return None
-    return pipeline
+    return pipeline, machine_code
 
 
 @cache
@@ -90,12 +98,12 @@ def _watch() -> None:
     class Watcher(event.Listener):
         timers: list[threading.Timer] = []  # noqa: RUF012
         collects = True
+        began = used = 0.0
 
         def on_start(self, event: Any) -> None:
-            name = event.data["dispatcher"].py_func.__module__.rpartition(".")[2].replace("_", " ")
-            line = f"compiling the {name} kernel, once per machine\n"
-            self.timers.append(threading.Timer(PATIENCE, sys.stderr.write, [line]))
+            self.timers.append(threading.Timer(PATIENCE, _say, [_line(event.data["dispatcher"].py_func)]))
             if len(self.timers) == 1:
+                self.began, self.used = time.time(), time.process_time()
                 self.timers[0].daemon = True
                 self.timers[0].start()
                 self.collects = gc.isenabled()
@@ -103,10 +111,59 @@ def _watch() -> None:
 
         def on_end(self, event: Any) -> None:
             self.timers.pop().cancel()
+            if not self.timers:
+                seconds[_name(event.data["dispatcher"].py_func)] = time.process_time() - self.used
+                _hold_bars(time.time() - self.began)
             if self.collects and not self.timers:
                 gc.enable()
 
     event.register("numba:compile", Watcher())
+
+
+def rooms() -> dict[str, str]:
+    """Room of kernels -> how many are shipped, compiled here, and when; and why what is shipped is not used."""
+    package = import_module("coopoc.kernels")
+    for module in walk_packages(package.__path__, "coopoc.kernels."):
+        import_module(module.name)
+    kept: dict[str, Counter[str]] = defaultdict(Counter)
+    for kernel in kernels:
+        kept[kernel._cache.name.rpartition(".")[0].rpartition(".")[0]][kernel._cache.kept] += 1
+    lines = {room: "; ".join(f"{n} {how}" for how, n in sorted(hows.items())) for room, hows in sorted(kept.items())}
+    why = (hooks := _hooks()) and hooks[1].mismatch().strip("-")
+    return lines | ({"not used": why} if why else {})
+
+
+def _name(function: Any) -> str:
+    return f"{function.__module__}.{function.__qualname__}"
+
+
+def _line(function: Any) -> str:
+    """What is said of a kernel that compiles for more than PATIENCE."""
+    usual = USUAL_SECONDS.get(_name(function), 0.0)
+    title = function.__module__.rpartition(".")[2].replace("_", " ")
+    often = f", usually {usual:.0f} s on an idle core" if usual > PATIENCE else ""
+    why = (hooks := _hooks()) and hooks[1].mismatch().strip("-")
+    return f"compiling the {title} kernel, once per machine{often}{' (' * bool(why)}{why or ''}{')' * bool(why)}"
+
+
+def _bars() -> list[Any]:
+    """Progress bars that are open."""
+    tqdm = getattr(sys.modules.get("tqdm"), "tqdm", None)
+    return list(getattr(tqdm, "_instances", ()))
+
+
+def _say(line: str) -> None:
+    """Print a line to stderr, above a progress bar that is shown."""
+    if shown := [bar for bar in _bars() if bar.last_print_t > bar.start_t]:
+        shown[0].write(line, file=sys.stderr)
+    else:
+        print(line, file=sys.stderr)
+
+
+def _hold_bars(seconds: float) -> None:
+    """Take the time of compiling out of the progress bars that were open meanwhile."""
+    for bar in _bars():
+        bar.start_t, bar.last_print_t = bar.start_t + seconds, bar.last_print_t + seconds
 
 
 def _made(function: Function, liberties: set[str], part: bool = False, **options: Any) -> Any:
@@ -114,7 +171,7 @@ def _made(function: Function, liberties: set[str], part: bool = False, **options
 
     _watch()
     if hooks := _hooks():
-        options["pipeline_class"] = hooks.Part if part else hooks.Kernel
+        options["pipeline_class"] = hooks[0].Part if part else hooks[0].Kernel
         if part:
             options |= {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": False}
     return numba.njit(nogil=True, error_model="numpy", fastmath=liberties, **options)(function)
@@ -126,46 +183,12 @@ def _within(function: Function, liberties: set[str], **options: bool) -> Functio
 
 def _kept(function: Function, liberties: set[str]) -> Function:
     made = _made(function, liberties)
-    try:
-        made.enable_caching()
-    except RuntimeError:  # neither the source's folder nor the user's can be written: every process compiles
-        return cast(Function, made)
-    if _hooks():
-        file = made._cache._cache_file
-        file._source_stamp = _stamp(function.__module__)
-        file._load_index = partial(_index_or_none, file._load_index)
+    if hooks := _hooks():
+        made._cache = hooks[1].MachineCode(function)
+        kernels.append(made)
+    else:
+        with suppress(
+            RuntimeError
+        ):  # neither the source's folder nor the user's can be written: every process compiles
+            made.enable_caching()
     return cast(Function, made)
-
-
-def _index_or_none(load: Callable[[], Any]) -> Any:
-    """What is on disk; nothing if it names types that have been renamed since."""
-    try:
-        return load()
-    except (ImportError, AttributeError):
-        return {}
-
-
-@cache
-def _stamp(module: str) -> tuple[tuple[str, int, int], ...]:
-    """Name, time and size of every file whose change makes the machine code of a module stale."""
-    names, new = {module}, {module}
-    while new := {other for name in new for other in _imported(name)} - names:
-        names |= new
-    files = [_file(name) for name in sorted(names)]
-    return tuple((file.name, file.stat().st_mtime_ns, file.stat().st_size) for file in files)
-
-
-@cache
-def _imported(module: str) -> set[str]:
-    """Modules of the kernels and of its own folder that a module imports at its top."""
-    file, package = _file(module), sys.modules[module].__package__
-    names = set()
-    for base, parts in IMPORT.findall(file.read_text(encoding="utf-8")):
-        base = resolve_name(base, package)
-        names |= {base, *(f"{base}.{name}" for name in re.findall(r"\w+", parts))}
-    files = {name: _file(name) for name in names if getattr(sys.modules.get(name), "__file__", None)}
-    return {name for name, other in files.items() if other.parent == file.parent or KERNELS in other.parents}
-
-
-def _file(module: str) -> Path:
-    return Path(str(sys.modules[module].__file__)).resolve()
