@@ -14,6 +14,7 @@ from .evaluate.metrics import nees as nees
 from .evaluate.metrics import pose_nees as pose_nees
 from .evaluate.metrics import rt_le as rt_le
 from .evaluate.statistics import paired_difference as paired_difference
+from .fleets import fetch as fetch
 from .fleets import load_fleet as load_fleet
 from .fleets import load_recording as load_recording
 from .fleets import read_log as read_log

@@ -28,6 +28,7 @@ commands:
 {commands}
 
 Options and an example of each command: coopoc COMMAND --help. Example: coopoc run neighbours --jobs 2
+Real measurements: coopoc data get f9k, then coopoc data check f9k
 Tables and JSON go to stdout, progress and messages to stderr.
 Exit status: 0 done, 1 some cells failed, 2 usage, 130 interrupted and resumable."""
 

@@ -1,4 +1,4 @@
-"""load_fleet: a bundled fleet by name, or the user's own file; load_recording: the user's own measurements."""
+"""load_fleet: a fleet by name or file; load_recording: the user's own measurements; fetch: public ones by name."""
 
 from __future__ import annotations
 
@@ -54,3 +54,21 @@ def read_log(path: str | Path, **options: Any) -> Any:
         InputError: as `load_recording`.
     """
     return find("coopoc.readers", "log")(path, **options)
+
+
+def fetch(name: str, *, offline: bool = False, timeout: float = 20.0) -> Path:
+    """Local path of a public data set, downloaded once and verified by SHA-256; see `coopoc.data.fetch.fetch`.
+
+    Args:
+        name: a name that `coopoc data list` shows, such as "plaza1".
+        offline: True asks no server, and verifies what is there.
+        timeout: s without a byte, after which a server is given up.
+
+    Returns:
+        The file or folder that `load_fleet`, `read_log` and `read_graph` take.
+
+    Raises:
+        InputError: an unknown name, no network, other bytes: with the address and where to put the file by hand.
+    """
+    path: Path = find("coopoc.readers", "fetch")(name, offline=offline, timeout=timeout)
+    return path

@@ -1,4 +1,4 @@
-"""coopoc data list | show | check | convert."""
+"""coopoc data list | get | show | check | convert."""
 
 from __future__ import annotations
 
@@ -10,29 +10,60 @@ import tyro
 
 from coopoc.errors import InputError
 
+from .fetch import TIMEOUT, Entry, fetch, public
 from .fleet_cards import in_words
 from .registry import DATASETS, LOGS, card, convert, kind_of, list_datasets, load_fleet, load_log
 from .source import split
 
 
 def list_() -> None:
-    """List the bundled fleets, one line each.
+    """List the bundled fleets, and the public measurements that `coopoc data get` brings, one line each.
 
     Example: coopoc data list
     """
     from tabulate import tabulate
 
-    print(tabulate(list_datasets(), headers="keys", tablefmt="github"))
+    print(tabulate(list_datasets(), headers="keys", tablefmt="github"), end="\n\n")
+    rows = [
+        {
+            "name": name,
+            "fetched": "yes" if entry.fetched else "no",
+            "MB": round(entry.bytes / 1e6, 2),
+            "licence": entry.licence,
+            "what": entry.what,
+        }
+        for name, entry in public().items()
+    ]
+    print(tabulate(rows, headers="keys", tablefmt="github"))
+
+
+def get(names: tyro.conf.Positional[tuple[str, ...]], /, *, offline: bool = False, timeout: float = TIMEOUT) -> None:
+    """Fetch public measurements by name, verify them by SHA-256, and print the paths that --data takes.
+
+    Example: coopoc data get f9k plaza1
+
+    Args:
+        names: as coopoc data list shows them.
+        offline: ask no server; verify what is there.
+        timeout: s without a byte, after which a server is given up.
+    """
+    if not names:
+        raise InputError("names", "()", "must name a data set", "coopoc data list shows them.")
+    for name in names:
+        print(fetch(name, offline=offline, timeout=timeout))
 
 
 def show(name: tyro.conf.Positional[str]) -> None:
-    """Show the card of a bundled fleet, or what a file of drives or a log holds.
+    """Show the card of a bundled fleet or of public measurements, or what a file of drives or a log holds.
 
     Example: coopoc data show town10
 
     Args:
-        name: a bundled fleet, or a path as in --data.
+        name: a bundled fleet, public measurements, or a path as in --data.
     """
+    if name in public() and not Path(name).exists():
+        _print(name, _fields(public()[name]))
+        return
     if name in DATASETS:
         _print(name, in_words(card(name)))
         return
@@ -43,6 +74,21 @@ def show(name: tyro.conf.Positional[str]) -> None:
             return
     fleet = load_fleet(name)
     _print(repr(fleet), {"source": fleet.source or "(not stated)", "licence": fleet.licence or "(not stated)"})
+
+
+def _fields(entry: Entry) -> dict[str, str]:
+    """What a reader has to know of a public data set, to fetch it by hand, too."""
+    stated = {
+        field: getattr(entry, field)
+        for field in ("what", "licence", "citation", "page", "archive")
+        if getattr(entry, field)
+    }
+    files = {
+        f"{file}, {size:,} bytes": f"{address} {digest}".strip()
+        for file, (address, size, digest) in entry.files.items()
+    }
+    fetched = {"fetched": str(entry.path) if entry.fetched else f"no: coopoc data get {entry.name}"}
+    return stated | {"addresses": entry.tried} | fetched | files
 
 
 def _print(name: str, fields: dict[str, str]) -> None:
@@ -96,6 +142,7 @@ def convert_(source: tyro.conf.Positional[str], out: tyro.conf.Positional[Path])
 
 COMMANDS: Mapping[str, Callable[..., None]] = {
     "list": list_,
+    "get": get,
     "show": show,
     "check": check,
     "convert": convert_,

@@ -18,6 +18,7 @@ from coopoc.world.fleet import Fleet
 from coopoc.world.storage import read_recording
 
 from .cells import TABLES
+from .fetch import bring
 from .fleet_files import read_fcd, read_table, read_tum, tum_files, write_table
 from .graphs import read_graph_log
 from .log.read import Log, is_log, read_log, steps_in_words
@@ -126,8 +127,8 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     """Log of a file or folder of measurements.
 
     Args:
-        name_or_path: tables, NMEA and bags (`read_log`), a PyFG file (in body frames), an .npz of `save_recording`;
-            options may stand behind a question mark, as in "drive?dt=0.1".
+        name_or_path: tables, NMEA and bags (`read_log`), a PyFG file (in body frames), an .npz of `save_recording`, a
+            public data set that has been fetched; options may stand behind a question mark, as in "drive?dt=0.1".
         options: of the reader; of all, since and until, s after the first step, of the part that is kept.
 
     Raises:
@@ -228,7 +229,7 @@ def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:
         if name not in accepted:
             raise unknown("option", name, accepted or ["(none)"], suggestion(name, accepted, "Leave it out."))
     if not path.exists():
-        raise InputError("data", str(path), "must be the path of a file or folder", "Check the path.")
+        raise InputError("data", str(path), "must be the path of a file or folder", bring(path, "Check the path."))
     if options.get("offset") != AUTO:
         return read(path, **options)
     from .log.check import less_offsets

@@ -19,6 +19,8 @@ from coopoc.plugins import names
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
 
+from .fetch import bring, local
+
 ROUNDING = 1e-9
 """Share of a step by which a time may miss one."""
 
@@ -26,10 +28,11 @@ ROUNDING = 1e-9
 def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     """Name or path, and the reader's options behind a question mark, which every command with --data takes.
 
-    A path that exists is never split. READ has the options that are more than text.
+    A path that exists is never split. A public data set that has been fetched is its path. READ has the options that
+    are more than text.
 
     Raises:
-        InputError: an option without a value, twice, or with a value of another kind.
+        InputError: an option without a value, twice, or with a value of another kind, a data set that is to be fetched.
 
     >>> split("drive.csv?dt=0.1&columns=t:time,id:car")
     ('drive.csv', {'dt': 0.1, 'columns': {'t': 'time', 'id': 'car'}})
@@ -37,8 +40,11 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     text = name_or_path if isinstance(name_or_path, str) else str(given_path(name_or_path))
     name, mark, query = text.partition("?")
     given_path(name)
-    if not mark or os.path.exists(text):
+    if os.path.exists(text):
         return text, {}
+    name = name if os.path.exists(name) else str(local(name) or name)
+    if not mark:
+        return name, {}
     options: dict[str, Any] = {}
     for part in query.split("&"):
         key, equals, value = part.partition("=")
@@ -59,8 +65,8 @@ def there(name: str) -> None:
     registered = names("coopoc.datasets")
     if not (in_file(name) or name in registered or Path(name).exists()):
         allowed = f"must be one of {', '.join(registered)} or the path of a file or folder"
-        hint = suggestion(name, registered, "List the bundled fleets with coopoc data list, or check the path.")
-        raise InputError("data", repr(name), allowed, hint)
+        hint = bring(name, "List all data sets with coopoc data list, or check the path.")
+        raise InputError("data", repr(name), allowed, suggestion(name, registered, hint))
 
 
 def parted(data: Any, since: float | None = None, until: float | None = None) -> Any:

@@ -52,6 +52,8 @@ def benchmark(
 
     Example: coopoc benchmark joint lkf-sa mine.py:Own
 
+    Example: coopoc benchmark road-kalman --tasks f9k    # after coopoc data get f9k
+
     Example: coopoc benchmark pose-fleet gauss-newton --data ~/measured
 
     Example: coopoc benchmark --table --out benchmarks/cards
@@ -59,8 +61,8 @@ def benchmark(
     Args:
         methods: names of coopoc list, learned gains, FILE.py:NAME; with --data also pose-fleet, ... and backends.
         out: folder of the cards.
-        data: folder with the files of the tasks of real measurements (docs/benchmark.md), or a log of your own with a
-            truth, on which solo methods are run in the same way.
+        data: folder with the files of the tasks of real measurements (docs/benchmark.md), besides those that coopoc
+            data get has fetched, or a log of your own with a truth, on which solo methods are run in the same way.
         validation: run the validation tasks, for choosing parameters; their cards cannot be submitted.
         seed: of other draws, to see whether a card holds on them; these cards cannot be submitted either.
         tasks: run only these tasks.
@@ -70,20 +72,26 @@ def benchmark(
     if seed is not None:
         drawn = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number will do.")
         known = {name: replace(task, seed=drawn) for name, task in known.items()}
+    real = [*BEST, *(task.name for task in LOGGED), *roads(data)]
     for name in tasks:
-        if name not in known:
-            raise InputError("tasks", repr(name), f"must be of {', '.join(known)}", "Leave it out for all.")
+        if name not in (*known, *real):
+            raise unknown("tasks", name, [*known, *real], "Leave it out for all.")
     if not methods and not table:
         raise InputError("methods", "()", "must name a method", "coopoc list shows them; --table prints the cards.")
     for name in methods:
         if simulated(name):
             method(name)
-        elif data is None:
-            raise InputError("data", None, f"must name the folder of measurements for {name}", "Add --data FOLDER.")
+        elif data is None and not tasks:
+            hint = "Add --data FOLDER, or --tasks with what coopoc data get has fetched."
+            raise InputError("data", None, f"must name the folder of measurements for {name}", hint)
+        if tasks and not ((simulated(name) and set(tasks) & {*known}) or set(tasks) & {*measurable(name, data)}):
+            allowed = f"must be of {', '.join([*known][: len(known) * simulated(name)] + measurable(name, data))}"
+            raise InputError(f"tasks of {name}", ", ".join(tasks), allowed, "Name one of these.")
     failed = 0
     for name in methods:
         began = time.perf_counter()
-        made = card(name, [known[task] for task in tasks or known] if simulated(name) else [], data)
+        chosen = [known[task] for task in tasks or known if task in known] if simulated(name) else []
+        made = card(name, chosen, data, [task for task in tasks if task in real] if tasks else None)
         failed += sum("failed" in row for row in made["tasks"])
         folder = out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}")
         folder.mkdir(parents=True, exist_ok=True)
@@ -148,18 +156,29 @@ def tried(name: str, task: Task) -> Row:
     return row
 
 
-def measured(name: str, data: Path) -> list[Row]:
-    """Rows of the tasks of real measurements: graphs of a backend, logs of a pose filter, roads of a solo method; of
-    "mine.py:NAME" logs, or roads if it says `roads = True`."""
+def measurable(name: str, data: Path | None) -> list[str]:
+    """The tasks of real measurements for a name: graphs for a backend, logs for a pose filter, roads for a solo method;
+    of "mine.py:NAME" logs, or roads if it says `roads = True`."""
     if name in names("coopoc.backends"):
-        files = tqdm(BEST, desc=name, unit="graph", delay=2.0)
-        return [_row(file, partial(graph_row, data, file, name)) for file in files]
+        return [*BEST]
     if name in POSES or (in_file(name) and not _on_roads(name)):
-        made: Any = own(name) if in_file(name) else name
-        return [_row(task.name, partial(pose_row, task, data, made)) for task in LOGGED]
-    if not (one := method(name)).cooperative:
-        return [_row(task, partial(road_row, task, data, one)) for task in roads(data)]
-    return []
+        return [task.name for task in LOGGED]
+    return [] if method(name).cooperative else [*roads(data)]
+
+
+def measured(name: str, data: Path | None, tasks: Sequence[str] | None = None) -> list[Row]:
+    """Rows of the tasks of real measurements for a name, or of some of them."""
+    logged: dict[str, Any] = {task.name: task for task in LOGGED}
+    rows = []
+    for task in tqdm([one for one in measurable(name, data) if tasks is None or one in tasks], name, delay=2.0):
+        if task in BEST:
+            made: Callable[[], Row] = partial(graph_row, data, task, name)
+        elif task in logged and task not in roads(data):
+            made = partial(pose_row, logged[task], data, own(name) if in_file(name) else name)
+        else:
+            made = partial(road_row, task, data, method(name))
+        rows.append(_row(task, made))
+    return rows
 
 
 def _row(task: str, made: Callable[[], Row]) -> Row:
@@ -180,19 +199,20 @@ def _on_roads(name: str) -> bool:
     return in_file(name) and getattr(find("coopoc.methods", name), "roads", False)
 
 
-def card(name: str, tasks: Iterable[Task], data: Path | None = None) -> Row:
+def card(name: str, tasks: Iterable[Task], data: Path | None = None, real: Sequence[str] | None = None) -> Row:
     """The card of a method: what it is, with which versions, and a row for each task.
 
     Args:
         name: of a method, a pose filter or a backend, or "mine.py:NAME".
         tasks: simulated ones.
-        data: folder of the real measurements; None leaves these tasks out.
+        data: folder of the real measurements, or None.
+        real: tasks of real measurements; None for all that there are for the name, none without data.
     """
     digest = file_digest(name, "method") if in_file(name) else ""
     rows = [
         _row(task.name, partial(tried, name, task)) for task in tqdm(list(tasks), desc=name, unit="task", delay=2.0)
     ]
-    rows += [] if data is None else measured(name, data)
+    rows += measured(name, data, [] if data is None and real is None else real)
     used = environment()
     versions = {library: used[library] for library in ("coopoc", "numpy", "numba", "torch") if library in used}
     return {"benchmark": VERSION, "method": name, "source": digest, "versions": versions, "tasks": rows}

@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from coopoc.arrays import Floats
+from coopoc.data.fetch import bring
 from coopoc.data.log.links import under
 from coopoc.data.log.read import Log
 from coopoc.data.log.residuals import GATE, begin_of, together
@@ -172,7 +173,7 @@ def digests(data: str) -> dict[str, str]:
     if not isinstance(log, MrclamLog):
         truth = "" if log.truth is None else log.truth.digest
         return {"log": digest(log.recording), "truth": truth}
-    return {"log": hashed(Path(data))}
+    return {"log": hashed(Path(split(data)[0]))}
 
 
 def hashed(*paths: Path) -> str:
@@ -215,7 +216,8 @@ def _log(data: str) -> tuple[MrclamLog | Log, str]:
         return read_mrclam(Path(name)), "throughout"
     if kind not in ("log", "pyfg", "recording"):
         hint = "Check it; a log may hold what vehicles measured (docs/your_data.md), a folder a set of MR.CLAM."
-        raise InputError("data", repr(data), "must be the path of measurements, not only of drives", hint)
+        allowed = "must be the path of measurements, not only of drives"
+        raise InputError("data", repr(data), allowed, hint if Path(name).exists() else bring(name, hint))
     log = load_log(data)
     return (log, "throughout") if log.recording.body is None else together(log)
 

@@ -397,7 +397,7 @@ STUDY = Study(
     cell,
     {"method": EVERY, "max_neighbours": NEIGHBOURS, "landmarks": LANDMARKS},
     settings={
-        "data": "MRCLAM_Dataset6",
+        "data": "mrclam-set6",
         "calibrate_s": None,
         "block_s": None,
         "drive_s": None,

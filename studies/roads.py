@@ -37,14 +37,21 @@ STEP = 0.1
 """s, of comma2k19, whose speeds come every 0.01 s."""
 
 
-def roads(data: Path) -> Mapping[str, tuple[str, ...]]:
-    """The tasks of a folder of data, or the one of a log of one's own."""
+def roads(data: Path | None) -> Mapping[str, tuple[str, ...]]:
+    """The tasks of a folder of data or of what was fetched, or the one of a log of one's own."""
+    if data is None:
+        return ROADS
     path = Path(split(str(data))[0])
-    return {path.stem: ()} if path.exists() and is_log(path) else ROADS
+    return {path.stem: ()} if path.exists() and is_log(path) and not _holds_roads(path) else ROADS
+
+
+def _holds_roads(path: Path) -> bool:
+    """Whether the first file of a task is below a folder, or is the folder."""
+    return any(path.name == files[0] or any(path.rglob(files[0])) for files in ROADS.values())
 
 
 @lru_cache(maxsize=2)
-def seen(task: str, data: Path) -> tuple[Recording, Fleet]:
+def seen(task: str, data: Path | None) -> tuple[Recording, Fleet]:
     """Measurements with thinned fixes, and the truth.
 
     Raises:
@@ -79,12 +86,12 @@ def _kitti(odometry: Floats, truth: Floats) -> tuple[Recording, Fleet]:
     return replace(drawn, velocity=measured[None], sensors=Sensors(), notes=(f"odometry: {MEASURED}",)), fleet
 
 
-def road_row(task: str, data: Path, made: Method) -> Row:
+def road_row(task: str, data: Path | None, made: Method) -> Row:
     """Error of the part that does not calibrate, as the method comes and calibrated on the first part.
 
     Args:
         task: that is run.
-        data: folder of the data, or a log.
+        data: folder of the data, None for those that were fetched, or a log.
         made: solo method; Kalman and road filters can be calibrated, and what has a method `fitted`.
     """
     recording, truth = seen(task, data)

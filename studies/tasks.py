@@ -25,6 +25,7 @@ from coopoc import (
     solve,
 )
 from coopoc.arrays import Floats
+from coopoc.data.fetch import bring, cache_folder, holder, public
 from coopoc.errors import InputError
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, past_bound, posterior_bound
 from coopoc.evaluate.ledger import of_track
@@ -185,16 +186,19 @@ LOGGED = (
 )
 
 
-def located(folder: Path, name: str) -> Path:
-    """The file or folder of that name anywhere below a folder.
+def located(folder: Path | None, name: str) -> Path:
+    """The file or folder of that name anywhere below a folder, else among the fetched data.
 
     Raises:
         InputError: there is none.
     """
-    found = sorted(folder.rglob(name)) if folder.is_dir() else []
+    entry = public().get(holder(name))
+    folders = [] if folder is None else [folder]
+    folders += [cache_folder() / entry.name] if entry and entry.fetched else []
+    found = [path for one in folders if one.is_dir() for path in (one, *sorted(one.rglob(name))) if path.name == name]
     if not found:
-        hint = "docs/benchmark.md names the sources."
-        raise InputError("data", str(folder), f"must hold {name}, however deep", hint)
+        searched = str(folder or cache_folder())
+        raise InputError("data", searched, f"must hold {name}, however deep", bring(name, "Name its folder."))
     return found[0]
 
 
@@ -221,12 +225,12 @@ def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, 
     return drive.recording, drive.truth, 0, {"begin": drive.begin, "spread": drive.spread, "assumed": noise}
 
 
-def pose_row(task: Logged, folder: Path, made: Any) -> Row:
+def pose_row(task: Logged, folder: Path | None, made: Any) -> Row:
     """RT-LE with its interval over robots and blocks of time, heading error, NEES, bytes and time.
 
     Args:
         task: that is run.
-        folder: of the data.
+        folder: of the data, None for those that were fetched.
         made: name in POSES, or a method of one's own; fields `begin`, `spread`, `assumed` are set if it has them.
     """
     path = located(folder, task.file)
@@ -259,7 +263,7 @@ def pose_row(task: Logged, folder: Path, made: Any) -> Row:
     return row
 
 
-def graph_row(folder: Path, file: str, backend: str) -> Row:
+def graph_row(folder: Path | None, file: str, backend: str) -> Row:
     """Cost over the least that is known, status and s of a solve, its search for a start included."""
     path = located(folder, file)
     problem = read_graph(path)

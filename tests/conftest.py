@@ -2,7 +2,6 @@
 
 import importlib
 import os
-import tomllib
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
@@ -14,6 +13,7 @@ import pytest
 
 from coopoc import Fleet, load_fleet
 from coopoc.arrays import Floats
+from coopoc.data.fetch import public
 from coopoc.data.fleet_files import write_table
 from coopoc.errors import InputError
 from coopoc.study.study import Study
@@ -22,30 +22,33 @@ collect_ignore = ["fuzz"]
 """Its programs need atheris; what they found is replayed by test_data_fuzz.py."""
 MEASURED = os.environ.get("COOPOC_TEST_DATA", "")
 """Folder of measurements of others, with what `coopoc data get` fetches; files are found by name, however deep."""
-ELSEWHERE = {"Town": "BerkeleyLearnVerify/Scenic", "AV": "CATS-Lab (field experiment)"}
-PUBLIC = tomllib.loads((Path(__file__).parents[1] / "data" / "public.toml").read_text())
 
 
 @cache
 def located(name: str) -> Path | None:
     """Path of a file or folder of the measurements."""
-    return next(iter(sorted(Path(MEASURED).rglob(name))), None) if MEASURED else None
+    folder = Path(MEASURED)
+    return (folder if name == "." else next(iter(sorted(folder.rglob(name))), None)) if MEASURED else None
 
 
 def measured(name: str = "") -> Path:
-    """The same, or the whole folder; skips, and says how to get the file, where it is absent."""
-    if path := located(name) if name else Path(MEASURED):
+    """The same, or the whole folder; skips, and says how to get them, where they are absent."""
+    if path := located(name or "."):
         return path
-    gotten = [f"coopoc data get {key}" for key, row in PUBLIC.items() if name in (key, row.get("opens"), *row["files"])]
-    pytest.skip(f"no {name}: {(gotten or ['see'])[0]}, then set COOPOC_TEST_DATA to its folder")
+    gets = [
+        f"run coopoc data get {key}"
+        for key, one in public().items()
+        if f"/{name}" in f"/{one.opens} /{' /'.join(one.files)}"
+    ]
+    how = gets[0] if gets and name else "CONTRIBUTING.md says where they are"
+    pytest.skip(f"no {name or 'measurements'}: {how}, then set COOPOC_TEST_DATA to the folder of all")
 
 
 def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
-    """Leave what was skipped, a line a test, for `pytest @.pytest_cache/d/skipped/tests`."""
-    if not hasattr(config, "cache"):
-        return
-    skipped = {report.nodeid for report in terminalreporter.stats.get("skipped", ())}
-    (config.cache.mkdir("skipped") / "tests").write_text("\n".join(sorted(skipped)))
+    """Leave what was skipped, a line a test: `pytest @.pytest_cache/d/skipped/tests` runs that alone."""
+    if cache := getattr(config, "cache", None):
+        skipped = {report.nodeid for report in terminalreporter.stats.get("skipped", ())}
+        (cache.mkdir("skipped") / "tests").write_text("\n".join(sorted(skipped)))
 
 
 def refused(match: str) -> Any:

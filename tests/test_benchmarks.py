@@ -241,7 +241,7 @@ def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(
 def test_wrong_words_are_named(tmp_path: Path) -> None:
     for given, message in (
         (((), {}), "must name a method"),
-        ((("joint",), {"tasks": ("papr",)}), "must be of alone, paper"),
+        ((("joint",), {"tasks": ("papr",)}), "must be one of alone, paper"),
         (((), {"table": True, "out": tmp_path}), "holds no card"),
     ):
         with refused(message):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 from ..errors import InputError, suggestion
 from ..file_names import given_path
+from ..plugins import find
 from .g2o import read_g2o
 from .graph import Graph
 from .jrl import read_jrl
@@ -18,7 +19,7 @@ def load_graph(path: str | Path, repair: bool = False) -> Graph:
     """Graph of a file, .pyfg, .g2o or .jrl.
 
     Args:
-        path: of the file.
+        path: of the file, or the name of a public graph that has been fetched.
         repair: see `read_g2o`, whose matrices are information.
 
     Raises:
@@ -29,6 +30,8 @@ def load_graph(path: str | Path, repair: bool = False) -> Graph:
     coopoc.errors.InputError: path = ring.json: must end in .pyfg or .g2o or .jrl. Rename or convert the file.
     """
     suffix = given_path(path).suffix
+    if suffix not in GRAPHS and (fetched := find("coopoc.readers", "fetched")(str(path))):
+        return load_graph(fetched, repair)
     if suffix not in GRAPHS:
         hint = suggestion(suffix, GRAPHS, "Rename or convert the file.")
         raise InputError("path", Path(path).name, f"must end in {' or '.join(GRAPHS)}", hint)

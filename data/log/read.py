@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -47,8 +48,10 @@ READERS: Mapping[str, Callable[..., Rows]] = {
     ".txt": read_librsf,
 }
 """Ending of a file -> (path, summary, *, columns, kinds, ignore) -> its rows. A new format is one more entry."""
-TRUTH = "truth"
-"""Stem of the file of a folder that holds the truth."""
+TRUTH = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
+"""Stem of a file of a folder that holds a truth, as truth, span_truth, groundtruth or robot_GT."""
+APART = 3600.0
+"""s between the files of a folder, and longer than all of them together: they are of several drives."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -196,6 +199,7 @@ def read_log(
         unit = check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)
         if unit:
             summary.assume(f"{column} is of 32-bit floats, multiples of {unit:.2g} s: write it in 64 bits")
+    _check_one_drive(rows, path)
     if origin is not None and not rows["kind"].isin([*ENU]).any():
         summary.assume("origin= has no effect: no fix is in degrees")
     rows, true_rows = rows[rows["true"] == 0], rows[rows["true"] == 1]
@@ -288,9 +292,12 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
         if true_files and not true_files[0].is_file():
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
         files = _files(path) if path.is_dir() else [path]
+        if segments := [str(p.relative_to(path)) for p in path.rglob("*") if p.is_dir() and is_segment(p)]:
+            allowed = "must be one log; segments of comma2k19 are logs of their own"
+            raise InputError(path.name, ", ".join(sorted(segments)), allowed, "Name one of them, or the other files.")
         summary.refuse("files in folders of a folder with files", len(_every_file(path)) - len(files) * path.is_dir())
-        true_files = true_files or [f for f in files if f.stem.lower() == TRUTH and f != path]
-        files = [f for f in files if f not in true_files and (f.stem.lower() != TRUTH or f == path)]
+        true_files = true_files or [f for f in files if TRUTH.fullmatch(f.stem) and f != path]
+        files = [f for f in files if f not in true_files and (not TRUTH.fullmatch(f.stem) or f == path)]
         if not files:
             allowed = f"must hold files in {', '.join(READERS)}"
             raise InputError("path", str(path), allowed, "Point at the folder of the log.")
@@ -314,8 +321,10 @@ def _read_file(file: Path, path: Path, summary: Summary, **options: Any) -> Rows
     if not _is_bag(file):
         options = {name: value for name, value in options.items() if name not in ("truth", "stamps")}
     rows = READERS.get(file.suffix.lower(), read_log_table)(file, summary, **options)
-    below = path in file.parents and file.parent != path and rows["vehicle"].eq(file.stem).all()
-    return rows.assign(vehicle=file.relative_to(path).parts[0]) if below else rows
+    if path not in file.parents or file.parent == path:
+        return rows
+    rows = rows.assign(file=str(file.relative_to(path)))
+    return rows.assign(vehicle=file.relative_to(path).parts[0]) if rows["vehicle"].eq(file.stem).all() else rows
 
 
 def _every_file(path: Path) -> list[Path]:
@@ -326,9 +335,22 @@ def _files(path: Path) -> list[Path]:
     """Files of a folder; below it topics that were written as tables, and those of a folder per vehicle where it has
     none itself but a truth."""
     every = _every_file(path)
-    bare = not any(_is_bag(file) or (file.parent == path and file.stem.lower() != TRUTH) for file in every)
+    bare = not any(_is_bag(file) or (file.parent == path and not TRUTH.fullmatch(file.stem)) for file in every)
     bare = bare and any(map(is_log, every))
     return sorted(file for file in every if bare or file.parent == path or STAMP in headers(file))
+
+
+def _check_one_drive(rows: Rows, path: Path) -> None:
+    """InputError for files of measurements that are too far apart in time to be of one drive."""
+    spans = rows[rows["true"] == 0].groupby("file", sort=False)["t"].agg(["min", "max"]).dropna().sort_values("min")
+    begins, ends = spans["min"].to_numpy(), np.maximum.accumulate(spans["max"].to_numpy())
+    gaps = begins[1:] - ends[:-1]
+    covered = float(ends[-1] - begins[0] - gaps.clip(0.0).sum()) if len(spans) else 0.0
+    if (gaps <= max(APART, covered)).all():
+        return
+    listed = "; ".join(f"{file}: {begin:.0f} to {end:.0f} s" for file, begin, end in spans.itertuples())
+    allowed = f"must hold the files of one drive; these are up to {gaps.max() / 3600:.3g} h apart"
+    raise InputError(path.name, listed, allowed, "Give each drive a folder of its own, and name that.")
 
 
 def _check_scale(rows: Rows, name: str) -> None:

@@ -1,0 +1,334 @@
+"""Public measurements by name: download, resume, verify by SHA-256, and keep in the user's cache."""
+
+from __future__ import annotations
+
+import os
+import sys
+import tomllib
+import urllib.request
+import zipfile
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cache, partial
+from http.client import HTTPException
+from pathlib import Path
+from typing import Any
+from urllib.error import HTTPError
+from urllib.parse import quote, urljoin, urlsplit
+
+from coopoc.arrays import number
+from coopoc.errors import InputError, said, suggestion, unknown
+
+TIMEOUT = 20.0
+"""s without a byte, after which a server is given up."""
+ATTEMPTS, CHUNK = 3, 1 << 16
+"""Connections for a file, each of which goes on where the last one broke; bytes that are read at once."""
+ARCHIVE = "archive.zip"
+"""Name of an archive in the folder of its data set, until it is unpacked."""
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A public data set.
+
+    Args:
+        name: by which it is fetched.
+        what: it holds, in a few words.
+        licence: as its authors state it.
+        citation: of its paper or page.
+        page: of the project, for whom has to fetch it by hand.
+        tried: what is known of the addresses.
+        files: path below the folder of the name -> (address, bytes, SHA-256).
+        archive: address of a ZIP archive with all files, "" if each has its own.
+        opens: what `fetch` returns, below the folder of the name.
+    """
+
+    name: str
+    what: str
+    licence: str
+    citation: str
+    page: str
+    tried: str
+    files: Mapping[str, tuple[str, int, str]]
+    archive: str = ""
+    opens: str = ""
+
+    @property
+    def path(self) -> Path:
+        """Of the file or folder that readers take."""
+        return cache_folder() / self.name / self.opens
+
+    @property
+    def bytes(self) -> int:
+        """Of all files."""
+        return sum(size for _, size, _ in self.files.values())
+
+    @property
+    def fetched(self) -> bool:
+        """Whether every file is there with its size; `fetch` compares the hashes, too."""
+        return all(_size(cache_folder() / self.name / file) == size for file, (_, size, _) in self.files.items())
+
+
+@cache
+def public() -> Mapping[str, Entry]:
+    """The public data sets by name.
+
+    >>> public()["plaza1"].bytes
+    2349302
+    """
+    written = tomllib.loads(Path(__file__).with_name("public.toml").read_text())
+    return {name: _entry(name, **fields) for name, fields in written.items()}
+
+
+def _entry(name: str, files: Mapping[str, Mapping[str, Any]], base: str = "", **fields: str) -> Entry:
+    found = {
+        file: (urljoin(base, row["from"]) if base else "", int(row["bytes"]), str(row["sha256"]))
+        for file, row in files.items()
+    }
+    return Entry(name, files=found, **fields)
+
+
+def cache_folder() -> Path:
+    """Folder of all fetched data: COOPOC_DATA, else the user's cache."""
+    if chosen := os.environ.get("COOPOC_DATA"):
+        return Path(chosen).expanduser().absolute()
+    import pooch
+
+    return Path(pooch.os_cache("coopoc"))
+
+
+def holder(file: str) -> str:
+    """The data set that brings a file or folder of that name, "" if none does.
+
+    >>> holder("tiers.pyfg"), holder("MRCLAM_Dataset7"), holder("mine.csv")
+    ('tiers', 'mrclam-set7', '')
+    """
+    for name, entry in public().items():
+        if file == name or any(file in Path(part).parts for part in entry.files):
+            return name
+    return ""
+
+
+def bring(path: str | Path, otherwise: str) -> str:
+    """The hint for a file or folder that is missing: the command that brings it, else another hint.
+
+    >>> bring("data/plaza1.pyfg", "Check the path.")
+    'Run coopoc data get plaza1.'
+    """
+    name = holder(Path(path).name)
+    return f"Run coopoc data get {name}." if name else suggestion(str(path), public(), otherwise)
+
+
+def local(name: str) -> Path | None:
+    """Path of a data set that has been fetched, None for what is no name of one.
+
+    Raises:
+        InputError: it has not been fetched.
+    """
+    entry = public().get(name)
+    if entry is None:
+        return None
+    if not entry.fetched:
+        raise InputError("data", repr(name), f"is not in {cache_folder()} yet", f"Run coopoc data get {name}.")
+    return entry.path
+
+
+def fetch(name: str, *, offline: bool = False, timeout: float = TIMEOUT) -> Path:
+    """Local path of a public data set, downloaded once and verified by SHA-256.
+
+    COOPOC_DATA names the folder of all data, else it is the user's cache. COOPOC_MIRROR is a base address at which a
+    copy of that folder is served; it is asked instead of the projects' servers.
+
+    Args:
+        name: a name that `coopoc data list` shows.
+        offline: True asks no server, and verifies what is there.
+        timeout: s without a byte, after which a server is given up.
+
+    Returns:
+        The file or folder that `load_fleet`, `read_log` and `read_graph` take.
+
+    Raises:
+        InputError: an unknown name; no network, a server that does not answer, or bytes of another hash: with the
+            address to fetch by hand and the folder where to put it.
+    """
+    entry = public().get(name) if isinstance(name, str) else None
+    if entry is None:
+        raise unknown("data", name, public())
+    number("timeout", timeout, 1e-3, allowed="s, above 0", hint="Give seconds.")
+    from filelock import FileLock
+
+    folder, mirror = cache_folder() / name, os.environ.get("COOPOC_MIRROR", "")
+    absent = _absent(entry, folder)
+    if absent and offline:
+        raise _offline(entry, folder, absent, mirror)
+    if absent:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            with FileLock(folder / ".lock"):
+                _bring(entry, folder, mirror, timeout)
+        except OSError as error:
+            allowed = f"must be a folder that can be written: {said(error)}"
+            raise InputError("COOPOC_DATA", str(folder), allowed, "Set COOPOC_DATA to one.") from None
+    return entry.path
+
+
+def _absent(entry: Entry, folder: Path) -> list[str]:
+    """Files that are not there, or with other bytes."""
+    return [file for file, (_, _, digest) in entry.files.items() if _digest(folder / file) != digest]
+
+
+def _bring(entry: Entry, folder: Path, mirror: str, timeout: float) -> None:
+    """Download what is absent: each file from its address or the mirror's, else the archive of all."""
+    import pooch
+
+    pooch.get_logger().setLevel("WARNING")
+    absent = _absent(entry, folder)  # another process may have brought it meanwhile
+    if absent and entry.archive and not mirror:
+        deliver = partial(_deliver, entry=entry, to=folder / ARCHIVE, size=entry.bytes, digest="", timeout=timeout)
+        pooch.retrieve(entry.archive, None, ARCHIVE, folder, downloader=deliver)
+        _unpack(entry, folder)
+        return
+    for file in absent:
+        _, size, digest = entry.files[file]
+        deliver = partial(_deliver, entry=entry, to=folder / file, size=size, digest=digest, timeout=timeout)
+        pooch.retrieve(_address(entry, file, mirror), f"sha256:{digest}", file, folder, downloader=deliver)
+
+
+def _address(entry: Entry, file: str, mirror: str) -> str:
+    """Where a file is served; below a mirror as it lies in the folder of all data."""
+    return f"{mirror.rstrip('/')}/{quote(f'{entry.name}/{file}')}" if mirror else entry.files[file][0] or entry.archive
+
+
+def _deliver(
+    address: str, out: str, _: Any, /, *, entry: Entry, to: Path, size: int, digest: str, timeout: float
+) -> None:
+    """Download to a file beside its last place, which an interrupted call leaves to the next one; then hand it over.
+
+    Args:
+        address: asked for.
+        out: path that takes the whole file.
+        entry: that it belongs to.
+        to: its last place.
+        size: bytes of the file; of an archive the most that it may have.
+        digest: SHA-256, "" of an archive.
+        timeout: s without a byte.
+
+    Raises:
+        InputError: what went wrong, and how to fetch it by hand.
+    """
+    part, reason = to.with_name(f"{to.name}.part"), ""
+    for _attempt in range(ATTEMPTS):
+        if _size(part) >= size and _digest(part) != digest:
+            part.unlink()
+        begun = max(_size(part), 0)
+        try:
+            if begun != size:
+                _continue(address, part, size, timeout)
+            break
+        except _Broken as error:
+            reason = said(error)
+            if _size(part) <= begun:
+                raise _by_hand(entry, address, to, reason) from None
+        except HTTPError as error:
+            if error.code != 416 or not begun:  # the server has no byte after those that are here
+                raise _by_hand(entry, address, to, said(error)) from None
+            part.unlink()
+            reason = said(error)
+        except TimeoutError:
+            raise _by_hand(entry, address, to, f"sent nothing for {timeout:g} s") from None
+        except (OSError, HTTPException, ValueError) as error:
+            late = isinstance(getattr(error, "reason", None), TimeoutError)
+            reason = f"sent nothing for {timeout:g} s" if late else said(error)
+            raise _by_hand(entry, address, to, reason) from None
+    else:
+        raise _by_hand(entry, address, to, reason)
+    if digest and (given := _digest(part)) != digest:
+        part.unlink()
+        raise _other_bytes(f"{entry.name}: {to.name}", given, digest, f"It was removed: {address} serves another file.")
+    part.replace(out)
+
+
+class _Broken(Exception):
+    """A connection that closed early."""
+
+
+def _continue(address: str, part: Path, size: int, timeout: float) -> None:
+    """Append to a file what it lacks; from its beginning if the server does not take a Range."""
+    from tqdm import tqdm
+
+    begun = max(_size(part), 0)
+    request = urllib.request.Request(address, headers={"Range": f"bytes={begun}-"} if begun else {})
+    with urllib.request.urlopen(request, timeout=timeout) as answer:
+        if begun and answer.status != 206:
+            print(f"coopoc: {urlsplit(address).netloc} cannot resume: {part.stem} starts again", file=sys.stderr)
+            begun = 0
+        length = answer.headers.get("Content-Length")
+        end = None if length is None else begun + int(length)
+        bar = tqdm(desc=part.stem, total=end, initial=begun, unit="B", unit_scale=True, delay=2.0)
+        with bar, part.open("ab" if begun else "wb") as file:
+            while file.tell() <= size and (chunk := answer.read(CHUNK)):
+                file.write(chunk)
+                bar.update(len(chunk))
+            got = file.tell()
+    if end is not None and got < min(end, size):
+        raise _Broken(f"closed the connection after {got} of {end} bytes")
+
+
+def _unpack(entry: Entry, folder: Path) -> None:
+    """Take the files out of their archive, whichever folder they are in there, and verify each."""
+    try:
+        with zipfile.ZipFile(folder / ARCHIVE) as archive:
+            members = {Path(member.filename).name: member for member in archive.infolist()}
+            for file in _absent(entry, folder):
+                _, size, digest = entry.files[file]
+                member = members.get(Path(file).name)
+                if member is None or member.file_size != size:
+                    given = "is not in it" if member is None else f"has {member.file_size} bytes in it, not {size}"
+                    raise _by_hand(entry, entry.archive, folder / file, f"{Path(file).name} {given}")
+                target = folder / file
+                target.parent.mkdir(parents=True, exist_ok=True)
+                target.write_bytes(archive.read(member))
+                if (given := _digest(target)) != digest:
+                    target.unlink()
+                    hint = f"It was removed: {entry.archive} holds another file."
+                    raise _other_bytes(f"{entry.name}: {target.name}", given, digest, hint)
+    except (zipfile.BadZipFile, OSError) as error:
+        raise _by_hand(entry, entry.archive, folder / ARCHIVE, said(error)) from None
+    finally:
+        (folder / ARCHIVE).unlink(missing_ok=True)
+
+
+def _by_hand(entry: Entry, address: str, to: Path, reason: str) -> InputError:
+    """The error of a download, with the address and the place of the file."""
+    if address == entry.archive:
+        place = f"unpack it in {cache_folder() / entry.name}, so that {next(iter(entry.files))} is below"
+    else:
+        place = f"save it as {to}"
+    hint = f"Fetch it by hand (the project: {entry.page}), {place}, and run coopoc data get {entry.name} again."
+    return InputError(f"{entry.name}: address", address, f"was not fetched: {reason}", hint)
+
+
+def _offline(entry: Entry, folder: Path, absent: list[str], mirror: str) -> InputError:
+    """The error of what is absent and may not be downloaded."""
+    file = folder / absent[0]
+    if file.exists():
+        hint = f"Remove {file}; then run coopoc data get {entry.name} with a network."
+        return _other_bytes(f"{entry.name}: {file.name}", _digest(file), entry.files[absent[0]][2], hint)
+    more = f"offline, and {len(absent)} of {len(entry.files)} files are missing (coopoc data show {entry.name})"
+    return _by_hand(entry, _address(entry, absent[0], mirror), file, more)
+
+
+def _other_bytes(field: str, given: str, digest: str, hint: str) -> InputError:
+    return InputError(field, f"SHA-256 {given}", f"must have SHA-256 {digest}", hint)
+
+
+def _size(path: Path) -> int:
+    """Bytes of a file, -1 without one."""
+    return path.stat().st_size if path.is_file() else -1
+
+
+def _digest(path: Path) -> str:
+    """SHA-256 of a file in hex digits, "" without one."""
+    import pooch
+
+    return str(pooch.file_hash(str(path))) if path.is_file() else ""
