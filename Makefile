@@ -7,7 +7,7 @@
 # make fuzz    every text reader under coverage-guided fuzzing, MINUTES each (default 10); finds go to build/fuzz
 # make docs    the site in build/site, tutorials executed; a warning is an error
 # make benchmark   every benchmark, its ratios against benchmarks/baseline.json
-# make release   wheels (with machine code for each of PYTHONS), sdist, list of what they need (CycloneDX) in dist/, built twice and compared
+# make release   wheels (with machine code for each of PYTHONS), sdist, what they need (CycloneDX; requirements.txt with hashes) in dist/, built twice and compared
 # make clean   forget the environment (results in runs/ stay)
 #
 # TORCH_INDEX: where the package index serves torch's CUDA build (several GB; it works, too), name an index of CPU builds:
@@ -82,6 +82,7 @@ release: $(READY)
 	cd dist && sha256sum * | tee SHA256SUMS && cd ../build/first && sha256sum -c ../../dist/SHA256SUMS
 	$(VENV)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --of JSON \
 		-o dist/coopoc.cdx.json $(VENV)/bin/python
+	.ci/hashes $(VENV)/bin/python dist/requirements.txt
 
 benchmark: $(VENV)/.ready-dev
 	OMP_NUM_THREADS=1 $(VENV)/bin/python benchmarks/run.py --gate
@@ -91,6 +92,7 @@ $(READY): pyproject.toml constraints.txt
 	@test -x $(VENV)/bin/python || $(PYTHON) -m venv $(VENV) || \
 		{ rm -rf $(VENV); echo "No venv module: apt-get install python3-venv, then repeat."; exit 1; }
 	@echo "Installing the pinned packages into $(VENV): some minutes the first time." >&2
+	$(PIP) pip
 	$(PIP) setuptools wheel torch
 	$(PIP) --no-build-isolation --editable '.[learned]'
 	@echo 'import os, sys; "PYTHONPATH" in os.environ or sys.meta_path.sort(key=lambda f: "editable___coopoc" not in getattr(f, "__module__", ""))' > \

@@ -189,12 +189,13 @@ names, and shall be the same wherever it is made."""
 def build(out: Path) -> None:
     """Compile every kernel for the processors that a wheel serves, into a folder, in a process of its own."""
     with tempfile.TemporaryDirectory() as folder:
-        own = {"PYTHONHASHSEED": "0", "PYTHONPYCACHEPREFIX": f"{folder}/python", "OMP_NUM_THREADS": "1"}
-        code = [sys.executable, "-B", "-P", "-c", RELATIVE, __file__, "--compiled", f"{folder}/code"]
-        subprocess.run(code, env={**os.environ, **own}, check=True)
+        code = Path(folder) / "code"
+        own = {"PYTHONHASHSEED": "0", "PYTHONPYCACHEPREFIX": f"{folder}/python", "NUMBA_CACHE_DIR": str(code)}
+        command = [sys.executable, "-B", "-P", "-c", RELATIVE, __file__, "--compiled", code]
+        subprocess.run(command, env={**os.environ, **own, "OMP_NUM_THREADS": "1"}, check=True)
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
-        for file in (*Path(folder).glob("code/*/*.nb?"), *Path(folder).glob("code/about.json")):
+        for file in (*code.glob("*/*.nb?"), code / "about.json"):
             shutil.copyfile(file, out / file.name)
 
 
@@ -206,20 +207,22 @@ def compile_all(folder: Path) -> None:
 
     config: Any = numba.config
     _, config.CPU_NAME, config.CPU_FEATURES = machine_code.SHIPPED_TARGET
-    config.CACHE_DIR = str(folder)
-    run_all()
+    for kernel in run_all():
+        if not any(folder.glob(f"*/{kernel._cache.name}.*.nbc")):
+            sys.exit(f"nothing is kept of {kernel._cache.name}")
     (folder / "about.json").write_text(json.dumps(machine_code.versions(), indent=1) + "\n")
 
 
 def record() -> None:
-    """Renew the table of the seconds that kernels take to compile."""
-    import numba
-
+    """Renew the table of the seconds that kernels take to compile, in a process with an empty cache."""
     from coopoc.kernels.compiling import compile
 
-    config: Any = numba.config
-    with tempfile.TemporaryDirectory() as config.CACHE_DIR:
-        run_all()
+    if "NUMBA_CACHE_DIR" not in os.environ:
+        with tempfile.TemporaryDirectory() as folder:
+            command = [sys.executable, __file__, "--record"]
+            subprocess.run(command, env={**os.environ, "NUMBA_CACHE_DIR": folder, "OMP_NUM_THREADS": "1"}, check=True)
+        return
+    run_all()
     table = {name: round(seconds, 1) for name, seconds in sorted(compile.seconds.items()) if seconds > 1}
     Path(compile.__file__).with_name("usual_seconds.json").write_text(json.dumps(table, indent=1) + "\n")
 

@@ -18,6 +18,8 @@ from .fleets import fetch as fetch
 from .fleets import load_fleet as load_fleet
 from .fleets import load_recording as load_recording
 from .fleets import read_log as read_log
+from .formats.trajectories import write_kitti as write_kitti
+from .formats.trajectories import write_tum as write_tum
 from .methods.baselines import LKFSA as LKFSA
 from .methods.baselines import MSMV as MSMV
 from .methods.centralised import BatchSmoother as BatchSmoother

@@ -29,6 +29,7 @@ from coopoc.study import style
 matplotlib.use("Agg")
 DOCS = Path(__file__).parent
 sys.path.insert(0, str(DOCS))
+from tutorial import notebook  # noqa: E402
 from tutorial import page as tutorial  # noqa: E402
 
 RUNS, EGO, NEIGHBOURS = 10, 24, 4
@@ -39,6 +40,7 @@ SECTIONS = {
     "evaluate": ("Evaluation", "Metrics, bounds, statistics."),
     "study": ("Studies", "Grids of cells, results, views."),
     "fleets": ("Files", "Drives, graphs and logs from files."),
+    "formats": ("Trajectory files", "Estimates for other programs."),
     "errors": ("Errors", "What is raised on bad input."),
 }
 
@@ -82,6 +84,17 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
     }
     _place(config.nav, places)
     return config
+
+
+MADE = {r"\]\(tutorials/(\w+)\.py\)": r"](tutorials/\1.md)", r"\]\(\.\./studies\)": "](gallery.md)"}
+"""Links that lead to a file of the repository -> to the page that is made from it."""
+
+
+def on_page_markdown(markdown: str, **_: Any) -> str:
+    """Lead links to the sources of made pages to these pages: one text serves the repository's view and the site."""
+    for source, page in MADE.items():
+        markdown = re.sub(source, page, markdown)
+    return markdown
 
 
 FORMULA = re.compile(r'<(span|div) class="arithmatex">\\[(\[](.*?)\\[)\]]</\1>', re.DOTALL)
@@ -128,11 +141,16 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
     return files
 
 
+NOTEBOOK = '\n\n[This page as a notebook]({0}.ipynb){{ download="{0}.ipynb" }}\n\n'
+"""Below the title of a tutorial."""
+
+
 def _tutorials() -> Iterator[tuple[str, str | bytes]]:
-    """The tutorials, run, and their pictures."""
+    """The tutorials, run, with their pictures, and as notebooks."""
     for path in sorted((DOCS / "tutorials").glob("*.py")):
         content, pictures = tutorial(path.read_text(), path.stem)
-        yield f"tutorials/{path.stem}.md", content
+        yield f"tutorials/{path.stem}.md", content.replace("\n\n", NOTEBOOK.format(path.stem), 1)
+        yield f"tutorials/{path.stem}.ipynb", notebook(path.read_text())
         yield from ((f"tutorials/{file}", picture) for file, picture in pictures.items())
 
 

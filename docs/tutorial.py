@@ -1,4 +1,4 @@
-"""A tutorial of cells (`# %%`) as a page: its text, its code, and what the code prints, shows and draws."""
+"""A tutorial of cells (`# %%`) as a page, with what its code prints, shows and draws, and as a Jupyter notebook."""
 
 from __future__ import annotations
 
@@ -48,6 +48,27 @@ def page(source: str, name: str) -> tuple[str, dict[str, bytes]]:
             pictures[file := f"{name}-{len(pictures) + 1}.png"] = _png(figure)
             parts.append(f"![What the code above draws]({file})")
     return "\n\n".join(parts), pictures
+
+
+def notebook(source: str) -> str:
+    """The same cells as a notebook, without output: the JSON of a file .ipynb, valid and the same at each build.
+
+    Raises:
+        nbformat.ValidationError: no valid notebook.
+
+    >>> import json
+    >>> [cell["cell_type"] for cell in json.loads(notebook("# %% [markdown]\\n# A sum.\\n\\n# %%\\n1 + 1"))["cells"]]
+    ['markdown', 'code']
+    """
+    import jupytext
+    import nbformat
+
+    made = jupytext.reads(source, fmt="py:percent")
+    made.metadata = {"kernelspec": {"display_name": "Python 3", "language": "python", "name": "python3"}}
+    for number, cell in enumerate(made.cells):
+        cell.id, cell.metadata = f"cell-{number}", {}
+    nbformat.validate(made)
+    return str(nbformat.writes(made))
 
 
 def _run(text: str, names: dict[str, Any]) -> tuple[str, Any, list[Figure]]:

@@ -8,12 +8,13 @@ from pathlib import Path
 from typing import Literal
 
 import numpy as np
+import numpy.typing as npt
 
-from ..arrays import Floats, frozen, one_of
+from ..arrays import Floats, checked, frozen, one_of
 from ..errors import InputError
 from ..file_names import given_path
 from ..short_repr import short_repr
-from .values import UNIT, read_table, to_rotation
+from .values import UNIT, read_table, to_orientation, to_rotation
 
 ORTHONORMAL = 1e-3
 """Largest entry of |R R^T - I| of a matrix that was merely rounded."""
@@ -120,9 +121,63 @@ def read_tum(path: str | Path, *, repeats: Literal["refuse", "drop"] = "refuse")
     return Trajectory(table[:, 0], table[:, 1:4], rotation, place=lambda row: f"{path.name}: line {lines[row]}")
 
 
-def write_tum(path: Path, t: Floats, position: Floats) -> None:
-    """Write a TUM file of times (T,) s and positions (T, 3) m; all point east."""
-    np.savetxt(path, np.column_stack([t, position, np.tile([0, 0, 0, 1], (len(t), 1))]), fmt="%.9f")
+def write_tum(
+    path: str | Path, t: npt.ArrayLike, position: npt.ArrayLike, heading: npt.ArrayLike | None = None
+) -> None:
+    """Write a path as a TUM file, `t x y z qx qy qz qw` by rows, which evo and most SLAM tools read.
+
+    Args:
+        path: of the file, which is replaced.
+        t: (T,) s, increasing.
+        position: (T, 3) m, such as `track.x[run, :, k]` of the k-th ego.
+        heading: (T,) rad from +x, anticlockwise; None where it is unknown: all poses then point along +x.
+
+    Raises:
+        InputError: shapes, numbers that are not finite, stamps that do not increase.
+
+    Source: the tools of the TUM RGB-D benchmark (Sturm et al., IROS 2012).
+
+    >>> import tempfile
+    >>> write_tum(file := Path(tempfile.mkdtemp()) / "a.tum", [0.0, 0.1], [[1, 2, 0], [2, 2, 0]], [0.0, np.pi])
+    >>> read_tum(file).rotation[1].round(6).tolist()
+    [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
+    """
+    stamps = checked("t", t, "(T,)", (-1,))
+    poses = _level(stamps, position, heading)
+    rows = np.column_stack([stamps, poses.position, to_orientation(poses.rotation)])
+    np.savetxt(given_path(path), rows, fmt="%.9f")
+
+
+def write_kitti(path: str | Path, position: npt.ArrayLike, heading: npt.ArrayLike | None = None) -> None:
+    """Write a path as a KITTI file, the 12 numbers of [R | t] by rows; the format has no stamps.
+
+    Args:
+        path: of the file, which is replaced.
+        position: (T, 3) m.
+        heading: (T,) rad, as in `write_tum`.
+
+    Raises:
+        InputError: shapes, numbers that are not finite.
+
+    Source: the KITTI odometry benchmark (Geiger, Lenz, Urtasun, CVPR 2012).
+
+    >>> import tempfile
+    >>> write_kitti(file := Path(tempfile.mkdtemp()) / "a.txt", [[1, 2, 0]])
+    >>> read_kitti(file).position
+    array([[1., 2., 0.]])
+    """
+    poses = _level(None, position, heading)
+    rows = np.dstack([poses.rotation, poses.position]).reshape(len(poses), 12)
+    np.savetxt(given_path(path), rows, fmt="%.9f")
+
+
+def _level(t: Floats | None, position: npt.ArrayLike, heading: npt.ArrayLike | None) -> Trajectory:
+    """Poses whose z axis points up."""
+    where = checked("position", position, "(T, 3)", (-1, 3))
+    course = np.zeros(len(where)) if heading is None else checked("heading", heading, "(T,)", (len(where),))
+    rotation = np.tile(np.eye(3), (len(where), 1, 1))
+    rotation[:, :2, :2] = to_rotation(course[:, None])
+    return Trajectory(t, where, rotation)
 
 
 def read_kitti(path: str | Path, times: str | Path | None = None) -> Trajectory:

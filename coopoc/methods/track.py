@@ -5,17 +5,21 @@ from __future__ import annotations
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Protocol, runtime_checkable
+from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
 from ..arrays import Bools, Floats, Limits, check_arrays, check_fields, checked, number, texts
 from ..errors import InputError, shown
+from ..long_table import long_table
 from ..short_repr import short_repr
 from ..world.recording import Recording, Vehicles
 from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message
 from .noise_model import NoiseModel
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 UNSOUND = (
     "covariances are not symmetric and positive semidefinite: a method of one's own returns others, or the assumed "
@@ -105,6 +109,33 @@ class Track:
             )
         if self.covariance is not None:
             self._note_unsound(self.covariance.reshape(-1, 3, 3))
+
+    def to_frame(self) -> pd.DataFrame:
+        r"""A row per run, step and ego, for pandas.
+
+        Columns: `run`, `step`, `t` s, `ego` (the vehicle's id, or its column in the Recording where the track has no
+        ids), `x`, `y`, `z` m; with a covariance `std_x`, `std_y`, `std_z` m, $\sqrt{P_{ii}}$; with a heading `heading`
+        and `std_heading` rad; then the extras of shape (R, T, E).
+
+        Raises:
+            MissingLibraryError: there is no pandas.
+
+        >>> Track([0.0], (0,), np.ones((1, 1, 1, 3)), None, [[0]], [[0]], 0.0).to_frame().columns.tolist()
+        ['run', 'step', 't', 'ego', 'x', 'y', 'z']
+        """
+        runs, steps = self.x.shape[:2]
+        egos = [self.ids[ego] for ego in self.egos] if self.ids else self.egos
+        index = np.ogrid[:runs, :steps]
+        columns = {"run": index[0][..., None], "step": index[1][..., None], "t": self.t[:, None]}
+        columns |= {"ego": np.array(egos, object if self.ids else int)}
+        columns |= {name: self.x[..., axis] for axis, name in enumerate("xyz")}
+        if self.covariance is not None:
+            columns |= {f"std_{name}": np.sqrt(self.covariance[..., axis, axis]) for axis, name in enumerate("xyz")}
+        if self.heading is not None:
+            columns["heading"] = self.heading
+        if self.heading_covariance is not None:
+            columns["std_heading"] = np.sqrt(self.heading_covariance[..., 3])
+        return long_table("Track.to_frame", columns | {k: v for k, v in self.extras.items() if v.ndim == 3})
 
     def _note_unsound(self, covariance: Floats) -> None:
         from ..kernels.covariances import unsound

@@ -6,12 +6,17 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING
 
 import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Bools, Floats, check_arrays, check_texts, checked, listed, number, refuse
 from ..errors import InputError, shown, unknown
+from ..long_table import long_table
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 FARTHEST, FASTEST = 1e8, 1e4
 """m and m/s: what lies beyond was not measured on Earth, and its square leaves no digits to what stands beside it."""
@@ -122,6 +127,24 @@ those that were recorded. Give the fleet that was observed, its vehicles in the 
         for name, step in (("start", start), ("stop", stop)):
             number(name, step, -(2**62), 2**62, kind=int, allowed="a step", hint="Count steps from 0.")
         return replace(self, t=self.t[start:stop], **{name: getattr(self, name)[start:stop] for name in self._arrays})
+
+    def to_frame(self) -> pd.DataFrame:
+        """A row per step and vehicle that is present, for pandas; a step at which a vehicle is absent has no row.
+
+        Columns: `step`, `t` s, `vehicle` (its id), `x`, `y`, `z` m, `vx`, `vy`, `vz` m/s, and `heading` rad where the
+        fleet has headings.
+
+        Raises:
+            MissingLibraryError: there is no pandas.
+
+        >>> Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)), np.zeros((2, 2, 3))).to_frame().vehicle.tolist()
+        ['a', 'b', 'a', 'b']
+        """
+        columns = {"step": np.arange(len(self.t))[:, None], "t": self.t[:, None], "vehicle": np.array(self.ids, object)}
+        columns |= {name: self.position[..., axis] for axis, name in enumerate("xyz")}
+        columns |= {f"v{name}": self.velocity[..., axis] for axis, name in enumerate("xyz")}
+        columns |= {} if self.heading is None else {"heading": self.heading}
+        return long_table("Fleet.to_frame", columns, self.present)
 
     @property
     def _arrays(self) -> tuple[str, ...]:

@@ -66,6 +66,32 @@ for name in ("Kalman filter, identity", "Kalman filter, nominal", "joint filter,
 co.plot_track(tracks["joint filter, nominal"], fleet=fleet, every=45).figure
 
 # %% [markdown]
+# ## In your own notebook
+#
+# `to_frame` gives a track or a fleet as a long table of pandas, with a row per run, step and vehicle.
+
+# %%
+table = tracks["joint filter, nominal"].to_frame()
+truth = fleet.to_frame().rename(columns={"vehicle": "ego"})
+both = table.merge(truth, on=["step", "t", "ego"], suffixes=("", "_true"))
+both["error"] = sum((both[axis] - both[f"{axis}_true"]) ** 2 for axis in "xyz") ** 0.5
+both.loc[both.run == 0, ["t", "ego", "x", "y", "std_x", "std_y", "error"]].iloc[::180].round(2)
+
+# %% [markdown]
+# `write_tum` and `write_kitti` write the path of one run for other programs, such as evo.
+
+# %%
+import tempfile
+from pathlib import Path
+
+folder, track = Path(tempfile.mkdtemp()), tracks["joint filter, nominal"]
+co.write_tum(folder / "joint.tum", track.t, track.x[0, :, 0])
+co.write_tum(folder / "truth.tum", fleet.t, fleet.position[:, fleet.index(ego)])
+print((folder / "joint.tum").read_text()[:67])
+
+# %% [markdown]
+# `evo_ape tum truth.tum joint.tum` then gives the absolute error of the path.
+#
 # ## Over neighbours, with tables and figures
 #
 # A study does this over a grid, resumes after Ctrl-C, and writes tables and figures for a paper:
