@@ -50,8 +50,8 @@ def home(module: str, name: str) -> str:
     """Module that defines a name of a module."""
     if f"{module}.{name}" in FILES:
         return f"{module}.{name}"
-    package = module in FILES and FILES[module].stem == "__init__"
-    return home(*names(module)[name]) if package and name in names(module) else module
+    above = module in FILES and FILES[module].stem == "__init__" and names(module).get(name)
+    return home(*above) if above else module
 
 
 @cache
@@ -77,7 +77,7 @@ def distance(test: str, goal: set[str]) -> tuple[int, int]:
 
 
 if __name__ == "__main__":
-    wanted, farthest = Path(sys.argv[1]).resolve(), int(sys.argv[2]) if sys.argv[2:] else len(FILES)
+    wanted, farthest = Path(sys.argv[1]).resolve(), int([*sys.argv, 99][2])
     goal = {module for module, path in FILES.items() if wanted in (path, *path.parents)}
     tests = {module: path.relative_to(ROOT) for module, path in FILES.items() if path.match("tests/test_*.py")}
     ranks = sorted((distance(module, goal), str(path)) for module, path in tests.items())
