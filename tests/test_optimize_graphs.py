@@ -8,7 +8,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import measured, refused
 from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import random_graph
 from scipy.optimize import least_squares
@@ -25,9 +25,6 @@ from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import Objective, from_graph, read_graph
 from coopoc.optimize.model.factor import Factor
 from coopoc.optimize.starts.graph_starts import separated, trilaterate
-
-PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
-needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
 
 
 def moved(problem: Problem, x: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -97,12 +94,11 @@ def test_the_automatic_start_undoes_bad_odometry(dimension: int, seed: int) -> N
     assert found.cost <= solve(from_graph(graph, start="file")).cost * (1 + 1e-9)
 
 
-@needs_files
 @pytest.mark.parametrize(
     ("name", "best"), [("mrclam5a", 69.10354), ("mrclam6", 3144.2732), ("plaza1", 1332.7948), ("tiers", 2050.1013)]
 )
 def test_real_graphs_reach_the_best_that_is_known(name: str, best: float) -> None:
-    found = solve(read_graph(PYFG / f"{name}.pyfg"))
+    found = solve(read_graph(measured(f"{name}.pyfg")))
     assert found.status is Status.SOLVED
     assert found.cost == pytest.approx(best, rel=1e-6)
 

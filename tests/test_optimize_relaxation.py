@@ -4,7 +4,6 @@ where tight; a local minimum gets no certificate."""
 import time
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import cvxpy as cp
@@ -12,7 +11,7 @@ import numpy as np
 import pytest
 import range_only
 import tightness
-from conftest import refused
+from conftest import measured, refused
 from random_graphs import random_graph
 from scipy.io import mmread
 from scipy.optimize import least_squares
@@ -24,7 +23,6 @@ from coopoc.optimize.convex.newton import Reduced
 from coopoc.optimize.convex.qcqp import Quadratic, multipliers, quadratic
 from coopoc.optimize.graph_problems import from_graph, read_graph
 
-PYFG = Path(__file__).resolve().parents[2] / "shared" / "data" / "pyfg"
 UP = 0.6
 """Vertical against horizontal std in anisotropic problems."""
 
@@ -112,9 +110,7 @@ def by_hand(problem: Problem) -> float:
 
 def cora(name: str) -> tuple[Quadratic, Problem, Any]:
     """One of CORA's unit cases: our QCQP of it and a reader of its expected matrices."""
-    folder = PYFG / "cora_unit" / name
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
+    folder = measured(f"cora_unit/{name}")
     if name == "single_range":
         problem = Problem(("L0", "L1"), x0=[[11, 19], [11, 21]], dimension=2).add("range", (0, 1), 2.0, 1.0)  # type: ignore[arg-type]
     else:
@@ -251,9 +247,7 @@ def test_the_staircase_climbs_to_shors_bound_from_anywhere(seed: int) -> None:
 @pytest.mark.slow
 def test_robots_that_do_not_know_where_the_others_are() -> None:
     """mrclam5a, every robot starting at the origin: better than the local minimum at 78.2 in the data's README."""
-    if not (PYFG / "mrclam5a.pyfg").exists():
-        pytest.skip(f"{PYFG} is absent")
-    relaxed = staircase(read_graph(PYFG / "mrclam5a.pyfg", start="apart"))
+    relaxed = staircase(read_graph(measured("mrclam5a.pyfg"), start="apart"))
     assert relaxed.solution is not None
     assert 67.8 < relaxed.lower_bound < relaxed.solution.cost < 69.11
     assert relaxed.solution.cost == pytest.approx(69.10, abs=0.01)  # an independent Levenberg-Marquardt from the truth
