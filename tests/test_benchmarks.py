@@ -24,16 +24,14 @@ BASELINE = {"a: ours": {"ratio": 1.0, "tolerance": 1.5}, "b: ours": {"ratio": 0.
 
 
 @pytest.fixture
-def load(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Import a benchmark by name, as its neighbours do."""
-    monkeypatch.syspath_prepend(str(FOLDER))
+def load() -> Any:
+    """Import a benchmark by name; some need libraries."""
     return importlib.import_module
 
 
 @pytest.fixture
-def run(load: Any) -> ModuleType:
-    module: ModuleType = load("run")
-    return module
+def run() -> ModuleType:
+    return importlib.import_module("run")
 
 
 def row(name: str, ratio: float, right: bool | None = True) -> dict[str, Any]:

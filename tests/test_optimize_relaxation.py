@@ -10,6 +10,7 @@ import cvxpy as cp
 import numpy as np
 import pytest
 import range_only
+import tightness
 from conftest import measured, refused
 from random_graphs import random_graph
 from scipy.io import mmread
@@ -291,19 +292,6 @@ def test_a_certificate_takes_the_time_it_is_given() -> None:
         staircase(problem, seconds=0.0)
 
 
-def anchored(seed: int, anchors: int = 4, vehicles: int = 2, d: int = 2, std: float = 0.1) -> Problem:
-    """Surveyed anchors, vehicles without a fix, all ranges to and between vehicles: flips are local minima."""
-    rng = np.random.default_rng(seed)
-    n = anchors + vehicles
-    truth = rng.uniform(-20, 20, (n, d))
-    names = [f"a{i}" for i in range(anchors)] + [f"v{i}" for i in range(vehicles)]
-    problem = Problem(tuple(names), dimension=d)
-    problem = problem.add("position", names[:anchors], truth[:anchors] + 0.3 * rng.standard_normal((anchors, d)), 0.3)
-    pairs = [(i, j) for i in range(n) for j in range(max(i + 1, anchors), n)]
-    ranges = [np.linalg.norm(truth[i] - truth[j]) + std * rng.standard_normal() for i, j in pairs]
-    return problem.add("range", pairs, np.abs(ranges)[:, None], std)
-
-
 def minima(problem: Problem, starts: int = 15) -> list[Solution]:
     """The minima that Gauss-Newton reaches from random starts, the lowest first."""
     rng, found = np.random.default_rng(0), []
@@ -319,7 +307,7 @@ def minima(problem: Problem, starts: int = 15) -> list[Solution]:
 @pytest.mark.parametrize("seed", [1, 2, 6])
 def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed: int) -> None:
     """Gauss-Newton reports SOLVED at both; scipy.optimize.least_squares finds nothing below the certified one."""
-    problem = anchored(seed)
+    problem = tightness.anchored(seed, 4, 2, 2, 0.1)
     best, *others = minima(problem)
     local = [solution for solution in others if solution.cost > best.cost + 1.0]
     assert local
@@ -343,7 +331,7 @@ def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed: int)
 def test_the_eigenvalue_is_that_of_the_whole_matrix() -> None:
     """Schur complement and Q - diag(L, 0) are indefinite together; numpy.linalg.eigvalsh on the latter."""
     for seed in range(4):
-        problem = anchored(seed)
+        problem = tightness.anchored(seed, 4, 2, 2, 0.1)
         form = quadratic(problem)
         for solution in minima(problem, starts=6):
             X = form.lift(solution.x, np.tile(np.eye(2), (6, 1, 1)))

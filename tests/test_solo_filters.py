@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 from oracles import solo as oracle
 from scipy import stats
 
-from coopoc import GNSS, V2X, Fleet, Kalman, NoiseModel, Recording, Sensors, load_fleet, observe
+from coopoc import GNSS, V2X, Fleet, Kalman, NoiseModel, Recording, Sensors, observe
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import nees, nees_inside, rt_le
 from coopoc.kernels.solo import FixNoise
@@ -27,16 +27,11 @@ def test_the_estimate_converges_within_its_chi_square_error() -> None:
     """After T fixes a variance is known to sqrt(2 / T); 60 runs show mean and spread, per axis."""
     std, runs = (1.5, 2.5, 3.5), 60
     found = FOREVER.gnss_std(seen(std, runs))[:, -1, 0] ** 2 / np.square(std)
-    assert_known(found, runs)
-
-
-def assert_known(found: Floats, runs: int, slack: float = 1.1) -> None:
-    """Estimated over true variances (runs, 3) after 900 fixes scatter around 1 as far as chi-square lets them."""
     error = np.sqrt(2 / 900)
     assert found.mean(axis=0) == pytest.approx(np.ones(3), abs=3 * error / np.sqrt(runs) + 5 / 900)
     low, high = np.sqrt(stats.chi2.ppf([0.001, 0.999], runs - 1) / (runs - 1))
     assert (found.std(axis=0, ddof=1) > 0.9 * low * error).all()
-    assert (found.std(axis=0, ddof=1) < slack * high * error).all()
+    assert (found.std(axis=0, ddof=1) < 1.1 * high * error).all()
 
 
 def test_a_jump_of_the_noise_is_followed() -> None:
@@ -60,18 +55,6 @@ def test_one_set_of_defaults_is_as_good_as_knowing_the_noise(std: float) -> None
     assert nees_inside(track, DRIVE)[0] >= 0.95
     assert 2.7 < nees(track, DRIVE).mean() < 3.3
     assert track.notes == ("assumes velocity noise of 10 % of each axis, at least 0.02 m/s",)
-
-
-def test_on_traffic_it_comes_near_the_filter_that_knows() -> None:
-    """Two bundled vehicles in scenario 2, where a filter that believes the 1.5 m of the training is clearly worse."""
-    fleet = load_fleet("town10-validation").select([0, 12])
-    recording = observe(fleet, Sensors.paper_scenario2(0.10), V2X(max_neighbours=0), runs=20)
-    score = [
-        rt_le(m(recording, [0, 1]), fleet).mean()
-        for m in (DEFAULT, Kalman("nominal"), Kalman(NoiseModel.nominal(Sensors())))
-    ]
-    assert score[0] < 1.01 * score[1]
-    assert score[0] < 0.97 * score[2]
 
 
 def test_steps_without_a_fix_teach_nothing() -> None:
