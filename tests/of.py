@@ -15,7 +15,8 @@ PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
 POINTS = PROJECT["project"]["entry-points"].values()
 PLUGINS = {name: value.partition(":")[0] for group in POINTS for name, value in group.items()}
 FILES: dict[str, Path] = {}
-for package, folder in [*PROJECT["tool"]["setuptools"]["package-dir"].items(), ("", "tests"), ("", "examples")]:
+BESIDE = [("", folder) for folder in PROJECT["tool"]["pytest"]["ini_options"]["pythonpath"]]
+for package, folder in [*PROJECT["tool"]["setuptools"]["package-dir"].items(), *BESIDE]:
     for path in (ROOT / folder).rglob("*.py"):
         parts = filter(None, [package, *path.relative_to(ROOT / folder).with_suffix("").parts])
         FILES[".".join(parts).removesuffix(".__init__")] = path
@@ -24,8 +25,8 @@ for package, folder in [*PROJECT["tool"]["setuptools"]["package-dir"].items(), (
 @cache
 def nodes(module: str) -> tuple[ast.AST, ...]:
     """Of a module's text, or of the stub beside it, without imports for types alone."""
-    files = FILES[module].with_suffix(".pyi"), FILES[module]
-    tree = ast.parse(next(file for file in files if file.exists()).read_bytes())
+    stub = FILES[module].with_suffix(".pyi")
+    tree = ast.parse((stub if stub.exists() else FILES[module]).read_bytes())
     for node in ast.walk(tree):
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             node.body = []

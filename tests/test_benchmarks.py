@@ -97,7 +97,7 @@ def test_the_command_prints_writes_and_fails(
 
 def test_stone_soup_ends_where_we_end(load: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its iterated update and its filter; one extended update does not."""
-    pytest.importorskip("stonesoup")
+    pytest.importorskip("stonesoup", reason="pip install stonesoup")
     classical = load("classical")
     monkeypatch.setattr(classical, "RUNS", 2)
     monkeypatch.setattr(classical, "STEPS", 21)

@@ -35,7 +35,7 @@ def test_tum_files_are_what_evo_reads(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "car.tum", np.column_stack([fleet.t[:1550], x, still]), fmt="%.17g")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        file_interface = pytest.importorskip("evo.tools.file_interface")
+        file_interface = pytest.importorskip("evo.tools.file_interface", reason="pip install evo")
         path = file_interface.read_tum_trajectory_file(str(tmp_path / "car.tum"))
     np.testing.assert_array_equal(path.positions_xyz, x)
     assert_allclose(path.timestamps, fleet.t[:1550], atol=1e-9)
