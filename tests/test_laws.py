@@ -8,7 +8,6 @@ from typing import Any
 import numpy as np
 import pytest
 from numpy.testing import assert_allclose
-from test_equivariance import Change, assert_equivariant
 
 import coopoc as co
 from coopoc.data.fleet_files import read_table, write_table
@@ -54,16 +53,6 @@ def x(name: str, recording: co.Recording, egos: Any = ("a",)) -> Any:
 
 
 @FEW
-@given(recordings(), CAUSAL, some.floats(-3.0, 3.0), some.booleans(), NUMBERS, some.randoms(use_true_random=False))
-def test_the_estimate_follows_the_world_and_not_the_names(
-    seen: co.Recording, name: str, angle: float, mirrored: bool, far: float, lots: Any
-) -> None:
-    count = len(seen.ids)
-    change = Change(angle, mirrored, (far, -far, 9.0), tuple(lots.sample(range(count), count)))
-    assert_equivariant(METHODS[name]("nominal"), seen, change, 1e-4, ("a",))
-
-
-@FEW
 @given(recordings(), CAUSAL, some.floats(0, 2e9), some.integers(3, 11))
 def test_the_hour_of_the_day_the_future_and_other_runs_change_nothing(
     seen: co.Recording, name: str, since: float, steps: int
@@ -73,15 +62,6 @@ def test_the_hour_of_the_day_the_future_and_other_runs_change_nothing(
     np.testing.assert_array_equal(x(name, seen.between(0, steps)), whole[:, :steps])
     np.testing.assert_array_equal(x(name, seen.of_runs(slice(0, 1))), whole[:1])
     assert_allclose(x(name, replace(seen, t=seen.t + since)), whole, atol=1e-3)
-
-
-@FEW
-@given(recordings())
-def test_a_stream_is_the_drive(seen: co.Recording) -> None:
-    stream = co.Kalman(co.NoiseModel.nominal(seen.sensors)).start()
-    steps = zip(seen.gnss[0, :, 0], seen.velocity[0, :, 0], strict=True)
-    found = [stream.step(fix, velocity, seen.dt)[0] for fix, velocity in steps]
-    assert_allclose(found, x("kalman", seen)[0, :, 0], atol=1e-9)
 
 
 @FEW

@@ -13,7 +13,7 @@ from scipy.optimize import least_squares
 from coopoc import V2X, Fleet, MissingLibraryError, Sensors, observe
 from coopoc.optimize import Backend, Factor, Problem, SolverResult, Status, backends, solve
 from coopoc.optimize.backends import osqp
-from coopoc.optimize.starts.initial import converted, initial_guess
+from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.recording import Recording
 
 S2 = Sensors.paper_scenario2()
@@ -196,17 +196,6 @@ def test_a_missing_library_says_how_to_install_it(
     assert backends()["gauss-newton"].installed == (backend != "casadi")
     with pytest.raises(MissingLibraryError, match=f"pip install {backend}"):
         solve(Problem.from_snapshot(dense, 0, 0), backend)
-
-
-@pytest.mark.parametrize("backend", [*OTHERS, "cvxpy"])
-def test_every_run_ends_where_gauss_newton_does(dense: Recording, backend: str) -> None:
-    """cvxpy relaxes, so that it takes the converted measurements alone."""
-    for run in range(dense.runs):
-        star = Problem.from_snapshot(dense, 10, 0, run)
-        for problem in (star, converted(star)) if backend != "cvxpy" else (converted(star),):
-            theirs, ours = (solve(problem, name) for name in (backend, "gauss-newton"))
-            assert theirs.x == pytest.approx(ours.x, abs=1e-6)
-            assert theirs.cost == pytest.approx(ours.cost, rel=1e-9)
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])

@@ -27,7 +27,6 @@ from coopoc import (
     rt_le,
     run_study,
 )
-from coopoc.arrays import Floats
 from coopoc.learned import GainNet, LearnedGain
 from coopoc.methods.cooperative_filter import CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
@@ -58,6 +57,7 @@ def holed(recording: Recording, share: float, vehicles: slice = slice(None)) -> 
 def test_kalman_without_fixes_predicts_as_filterpy_does(crossing: Fleet) -> None:
     seen = holed(observe(crossing, Sensors(), V2X(0), runs=1), 0.4)
     track = textbook(Kalman())(seen, [1])
+    assert track.covariance is not None
     q = np.broadcast_to(NoiseModel.nominal(seen.sensors).process_variance(seen), seen.gnss.shape)[0, :, 1]
     kf = KalmanFilter(dim_x=3, dim_z=3)
     kf.x, kf.P, kf.H, kf.R, kf.F, kf.B = (
@@ -73,6 +73,7 @@ def test_kalman_without_fixes_predicts_as_filterpy_does(crossing: Fleet) -> None
         if np.isfinite(seen.gnss[0, t, 1]).all():
             kf.update(seen.gnss[0, t, 1][:, None])
         np.testing.assert_allclose(track.x[0, t, 0], kf.x[:, 0], atol=1e-9)
+        np.testing.assert_allclose(track.covariance[0, t, 0], kf.P, atol=1e-9)
 
 
 @pytest.mark.parametrize("method", [*SOLO, *STARS], ids=lambda m: f"{m.name}{getattr(m, 'exact', '')}")
@@ -82,24 +83,6 @@ def test_missing_fixes_cost_and_do_not_crash(crossing: Fleet, method) -> None:  
     assert np.isfinite(few)
     assert few < 4 * np.sqrt(3)
     assert method.name in ("fedkalmannet", "lkf-sa") or few > some
-
-
-def test_a_missing_fix_is_one_of_boundless_variance(crossing: Fleet) -> None:
-    """And not one at the origin: the joint filter that assumes 10^12 m^2 of those fixes gives the same answer."""
-    whole = observe(crossing, Sensors(), V2X(4, 80.0), runs=2)
-    some, known = holed(whole, 0.5), NoiseModel.nominal(whole.sensors)
-    r = np.where(np.isnan(some.gnss), 1e12, 1.5**2)
-    process = np.broadcast_to(known.process_variance(whole), whole.gnss.shape)
-
-    class Given(NoiseModel):
-        def process_variance(self, recording: Recording) -> Floats:
-            return process
-
-        def fix_variance(self, recording: Recording) -> Floats:
-            return r
-
-    given = Given("given", whole.sensors)
-    np.testing.assert_allclose(JointFilter(known)(some, [0]).x, JointFilter(given)(whole, [0]).x, atol=1e-5)
 
 
 def test_a_drive_starts_with_a_fix(crossing: Fleet) -> None:

@@ -1,6 +1,5 @@
 """Schedules under a cap on bytes: the token bucket, nearest first and round robin."""
 
-import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -101,16 +100,6 @@ def test_nearest_first_and_turns(crossing: Fleet, schedule: Schedule, cap: float
             found = {(int(step[k]), int(neighbour[k])) for k in np.flatnonzero(box.arrival[run] >= 0)}
             assert found == {(t, j) for t, j in wanted if t + 1 < len(seen.t)}
             assert len(found) > 10
-
-
-def test_turns_are_turns() -> None:
-    """Three neighbours, one message a step: 0, 1, 2, 0, 1, 2, ... once the full bucket is spent."""
-    fleet = still([[0, 0, 0], [9, 0, 0], [0, 12, 0], [-15, 0, 0]], 60)
-    seen = observe(fleet, S2, V2X(3, bytes_per_second=320.0, schedule="round robin"))
-    box = inbox(seen, 0, FIX_AND_VELOCITY)
-    received = seen.links.neighbour[box.link][box.arrival[0] >= 0].tolist()
-    assert received == list(itertools.islice(itertools.cycle([1, 2, 3]), len(received)))
-    assert len(received) == 10 + 59
 
 
 def test_schedules_are_paired_and_repeat(crossing: Fleet) -> None:
