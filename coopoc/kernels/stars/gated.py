@@ -17,8 +17,8 @@ from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, add_diagonal, choose_each, load, scale, store, subtract, zeros
 from ..compiling.vectors import LANES, choose
 from ..gate import FIX_GATE, LEAK, YOUNG, distance, gain_of, gated_update, inflation
+from ..geometry import Numbers, axes, direction, incomplete, residuals
 from .messages import BLOCK, POSITION, PROCESS, RELATIVE, ROW, VARIANCE, Star
-from .relative import Numbers, angle, incomplete
 
 STATE = (0.0,) * 13
 
@@ -125,7 +125,7 @@ def gate_components(
     Args:
         gap: m, the predicted vector.
         cov: (9,) m^2, of it.
-        measured: `relative.five`.
+        measured: `geometry.five`.
         std: m, rad, rad; infinite for what was not measured.
         hits: (3,) of these components.
         least: m, least distance at which an angle's error counts.
@@ -133,17 +133,13 @@ def gate_components(
     Returns:
         Covariance, move m, factors of the standard deviations, and hits.
     """
-    x, y, z = gap
-    o = 0.0 * x
-    ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
-    reach = max(far, least)
-    flat = max(ground, 1e-3 * reach)
-    turned = angle(measured[1] * x - measured[2] * y, measured[2] * x + measured[1] * y)
-    raised = angle(measured[3] * z - measured[4] * ground, measured[4] * z + measured[3] * ground)
+    polar = direction(gap[0], gap[1], gap[2])
+    ray, side, up = axes(polar)
+    longer, turned, raised = residuals(measured, polar)
+    reach = max(polar[0], least)
+    flat = max(polar[0] * polar[3], 1e-3 * reach)
     a, b, c = std[0], std[1] * flat, std[2] * reach
-    ray, side = (x / far, y / far, z / far), (-y / flat, x / flat, o)
-    up = scale((x * z, y * z, -ground * ground), 1.0 / (flat * reach))
-    cov, moved, f, first = gated_update(cov, zeros(o, ROW), ray, measured[0] - far, a * a, hits[0])
+    cov, moved, f, first = gated_update(cov, zeros(a, ROW), ray, longer, a * a, hits[0])
     cov, moved, g, second = gated_update(cov, moved, side, turned * flat, b * b, hits[1])
     cov, moved, h, third = gated_update(cov, moved, up, raised * reach, c * c, hits[2])
     return cov, moved, (math.sqrt(f), math.sqrt(g), math.sqrt(h)), (first, second, third)

@@ -10,7 +10,6 @@ i stride + j; those below the diagonal are never read.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -20,9 +19,7 @@ from ..compiling.compile import inner, inside, storage
 from ..compiling.small import (
     add,
     add_diagonal,
-    apply,
     choose_each,
-    from_upper,
     inverse,
     less_applied,
     less_transposed_applied,
@@ -40,8 +37,8 @@ from ..compiling.small import (
     zeros,
 )
 from ..compiling.vectors import LANES, choose
+from ..geometry import Numbers, converted, exact, incomplete, missing, vector, whole
 from .messages import BLOCK, MOVED, NEW, POSITION, PROCESS, RELATIVE, ROW, Star, clear
-from .relative import Numbers, completed, converted, exact, incomplete, vector
 
 LEAST_KNOWN = 1e-4
 """1/m^2, information along x below which nothing is known of where a member is."""
@@ -181,12 +178,11 @@ def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
     measured: Numbers = add(ego, vector(seen))
     if not incomplete(seen):
         return measured
-    lacks = seen[5] + seen[6] + seen[7] - (0.0 * seen[0] + 1e300)
     new = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5
     near = seen[0] + 1.0
     somewhere = add(ego, (near, near, 0.1 * near))
     broadcast = choose_each(new, load(star.motion, 4 * k + POSITION, ROW), somewhere)
-    place: Numbers = choose_each(lacks, broadcast, measured)
+    place: Numbers = choose_each(missing(seen), broadcast, measured)
     return place
 
 
@@ -207,9 +203,7 @@ def place_on_broadcast(star: Star, joint: Joint, n: int) -> None:
 def placed(joint: Joint, k: int, measured: Numbers) -> float:
     """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
     own = load(joint.information, (k - 1) * joint.stride + k - 1, BLOCK)[0]
-    whole = 0.0 * measured[0] + 1e300 - (measured[5] + measured[6] + measured[7])
-    one = 0.0 * own + 1.0
-    share: float = choose(whole, one, choose(own - LEAST_KNOWN, one, 0.0 * own))
+    share: float = max(whole(measured), choose(own - LEAST_KNOWN, 0.0 * own + 1.0, 0.0 * own))
     return share
 
 
@@ -251,26 +245,14 @@ def copy(source: Floats, target: Floats, n: int, stride: int) -> None:
 
 @inside
 def relative_information(star: Star, joint: Joint, k: int, std: Floats, least: float) -> tuple[Numbers, Numbers]:
-    """Information (3, 3) of the converted measurement of member k at the predicted geometry, and what it adds to the
+    """Information of the converted measurement of member k at the predicted geometry, and what it adds to the
     information vector: W and W (measured vector - predicted vector)."""
-    seen = load(star.relative, k, RELATIVE)
-    gap = subtract(load(joint.state, k, ROW), load(joint.state, 0, ROW))
-    x, y, z = gap
-    lacking = incomplete(seen)
-    if len(std) or lacking:
-        deviations = seen[5:]
-        if len(std) == 0:  # 1 m along each
-            flat2 = x * x + y * y
-            deviations = seen[5], seen[6] / math.sqrt(flat2), seen[7] / math.sqrt(flat2 + z * z)
-        weight = converted(x, y, z, deviations, least)
-        if lacking:
-            weight = scale(weight, placed(joint, k, seen))
-    else:
-        o, one = 0.0 * x, 0.0 * x + 1.0
-        weight = one, o, o, one, o, one
-    found = vector(completed(seen, gap)) if lacking else vector(seen)
-    full = from_upper(weight)
-    return full, apply(full, subtract(found, gap))
+    seen, gap = load(star.relative, k, RELATIVE), subtract(load(joint.state, k, ROW), load(joint.state, 0, ROW))
+    weight, eta = converted(gap, seen, len(std) == 0, least)
+    if incomplete(seen):
+        known = placed(joint, k, seen)
+        weight, eta = scale(weight, known), scale(eta, known)
+    return weight, eta
 
 
 @inside
@@ -278,13 +260,12 @@ def exact_information(star: Star, joint: Joint, k: int, n: int, least: float) ->
     """The same of range and angles, linear at the state moved by `move`, as seen from the state."""
     seen = load(star.relative, k, RELATIVE)
     ahead = subtract(load(joint.move, k - 1, ROW), load(joint.move, n - 1, ROW))
-    gap = subtract(load(joint.state, k, ROW), load(joint.state, 0, ROW))
-    x, y, z = add(gap, ahead)
-    found = exact(x, y, z, seen, seen[5:], least)
+    gap = add(subtract(load(joint.state, k, ROW), load(joint.state, 0, ROW)), ahead)
+    weight, eta = exact(gap, seen, least)
     if incomplete(seen):
-        found = scale(found, placed(joint, k, seen))
-    weight = from_upper(found[:6])
-    return weight, plus_applied(found[6:], weight, ahead)
+        known = placed(joint, k, seen)
+        weight, eta = scale(weight, known), scale(eta, known)
+    return weight, plus_applied(eta, weight, ahead)
 
 
 @inside

@@ -5,6 +5,7 @@ from __future__ import annotations
 from ..compiling.compile import as_written, inner, inside
 from ..compiling.small import add, add_diagonal, load, negate, scale, store, subtract, zeros
 from ..compiling.vectors import LANES, choose
+from ..geometry import Numbers, metres, vector, whole
 from .joint import Joint, add_relative, joint_within, move, predict, predict_state, rearrange, solve
 from .joint_filter import add_fixes, write
 from .messages import (
@@ -22,7 +23,6 @@ from .messages import (
     new_estimates,
     star_within,
 )
-from .relative import Numbers, vector
 
 
 @as_written
@@ -70,11 +70,8 @@ def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
         edge, gap = edge_to(star, joint, k)
         count, gaps = count + edge, add(gaps, gap)
         if len(std):
-            d, up = (
-                max(load(star.relative, 8 * k, (0.0,))[0], model.min_range),
-                load(star.relative, 8 * k + 3, (0.0,))[0],
-            )
-            total = total + edge * (std[0] * std[0] + d * d * (std[1] * std[1] * up * up + std[2] * std[2]))
+            a, b, c = metres(load(star.relative, k, RELATIVE), std, model.min_range)
+            total = total + edge * (a * a + b * b + c * c)
     outer = central = o + 1.0
     if len(std):
         outer = choose(count, 3.0 * count / max(total, o + 1e-300), outer)
@@ -95,8 +92,7 @@ def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
 def edge_to(star: Star, joint: Joint, k: int) -> tuple[float, Numbers]:
     """1 if the measurement of member k is complete, else 0; the measured vector less the predicted one m, or 0."""
     seen = load(star.relative, k, RELATIVE)
-    o = 0.0 * seen[0]
-    edge = choose(o + 1e300 - (seen[5] + seen[6] + seen[7]), o + 1.0, o)
+    edge = whole(seen)
     gap = subtract(vector(seen), subtract(load(joint.state, k, ROW), load(joint.state, 0, ROW)))
     return edge, scale(gap, edge)
 

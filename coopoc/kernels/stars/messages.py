@@ -16,6 +16,7 @@ from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, choose_each, load, scale, store
 from ..compiling.vectors import LANES, choose, put, take
+from ..geometry import with_std
 from ..motion import MotionNoise, process_variance
 
 MOVED, PROCESS, POSITION, VARIANCE = range(4)
@@ -35,6 +36,8 @@ NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
 Estimates: TypeAlias = tuple[Floats, Floats, Floats]
 """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
+UNIT = np.ones(3)
+"""Standard deviations m where covariances are unit matrices."""
 ROW, BLOCK, RELATIVE = (0.0,) * 3, (0.0,) * 9, (0.0,) * 8
 NONE = cast(int, np.int64(0))
 """Members before the first star. For a constant of Python's numba would compile the whole step once more."""
@@ -247,16 +250,8 @@ def interpret(star: Star, model: Assumptions, k: int, dt: float) -> None:
 
 @inside
 def measured(relative: Floats, measured: Floats, std: Floats, k: int, lane: int) -> None:
-    """Copy the measurement of member k, of `components`; what is missing points east, its deviation infinite."""
-    d, sa, ca, si, ci = measured[0], measured[1], measured[2], measured[3], measured[4]
-    a, b, c = (std[0], std[1], std[2]) if len(std) else (1.0, 1.0, 1.0)
-    if d < 0.0:
-        d, a = 0.0, math.inf
-    if sa == 0.0 and ca == 0.0:
-        ca, b = 1.0, math.inf
-    if si == 0.0 and ci == 0.0:
-        si, c = 1.0, math.inf
-    put_lane(relative, 8 * k, lane, (d, sa, ca, si, ci, a, b, c))
+    """Copy the measurement of member k, of `components`, with its standard deviations."""
+    put_lane(relative, 8 * k, lane, with_std(measured, std if len(std) else UNIT))
 
 
 @inside

@@ -35,6 +35,7 @@ from ..compiling.small import (
 )
 from ..compiling.vectors import LANES, choose
 from ..gate import FIX_GATE, count, distance, gain_of, inflation
+from ..geometry import Numbers, completed, direction, metres, spread, vector
 from .gated import gate_components, inflated
 from .messages import (
     BLOCK,
@@ -58,7 +59,6 @@ from .messages import (
     new_estimates,
     star_within,
 )
-from .relative import Numbers, completed, direction, vector
 
 ROUNDS, BISECT, TOLERANCE = 60, 20, 1e-8
 """Of Newton's method; after BISECT rounds a step out of the bracket halves it."""
@@ -118,12 +118,12 @@ def fuse_pseudo_fixes(star: Star, model: Assumptions, x: Floats, cov: Floats, n:
 def pseudo_fix(star: Star, model: Assumptions, k: int, at: Numbers) -> tuple[Numbers, Numbers]:
     """Position of the ego by member k's estimate and the measurement of it, and its covariance."""
     theirs, relative = load(star.motion, 4 * k + POSITION, ROW), load(star.relative, k, RELATIVE)
-    seen = completed(relative, subtract(theirs, at))
+    x, y, z = subtract(theirs, at)
+    seen = completed(relative, direction(x, y, z))
     one, o = 0.0 * at[0] + 1.0, 0.0 * at[0]
     cov = from_upper((one, o, o, one, o, one))
     if len(model.relative_std):
-        cov = from_upper(converted_cov(seen, (relative[5], relative[6], relative[7]), model.min_range))
-        cov = add_diagonal(cov, load(star.motion, 4 * k + VARIANCE, ROW))
+        cov = add_diagonal(cov_of(seen, relative, model.min_range), load(star.motion, 4 * k + VARIANCE, ROW))
     return subtract(theirs, vector(seen)), cov
 
 
@@ -243,16 +243,20 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
     for k in range(1, n):
         gap = subtract(load(star.motion, 4 * k + POSITION, ROW), x)
         relative, variance = load(star.relative, k, RELATIVE), load(star.motion, 4 * k + VARIANCE, ROW)
-        noise, theirs, f = one, add_diagonal(zeros(o, BLOCK), variance), o + 1.0
+        polar, noise, theirs, f = (
+            direction(gap[0], gap[1], gap[2]),
+            one,
+            add_diagonal(zeros(o, BLOCK), variance),
+            o + 1.0,
+        )
         if fusion.robust:
             ahead = add(own_cov(fusion), theirs)
             _, _, factor, _ = gate_components(gap, ahead, relative, relative[5:], (o, o, o), model.min_range)
             relative = inflated(relative, factor)
         if len(model.relative_std):
-            std = (relative[5], relative[6], relative[7])
-            noise = from_upper(converted_cov(direction(gap[0], gap[1], gap[2]), std, model.min_range))
+            noise = cov_of(polar, relative, model.min_range)
         held = load(star.status, 5 * k + HELD, (0.0,))[0]
-        gap = subtract(gap, vector(completed(relative, gap)))
+        gap = subtract(gap, vector(completed(relative, polar)))
         if fusion.robust:
             f = inflation(distance(gap, add(ahead, noise)), FIX_GATE, o)
         counts = choose(o + 1e300 - f, held, o)
@@ -350,33 +354,13 @@ def inner_product(a: Numbers, b: Numbers) -> float:
     return total
 
 
-@inner
-def converted_cov(measured: Numbers, std: Numbers, least: float) -> Numbers:
-    """Covariance m^2, upper triangle, of a converted measurement at its own geometry: `vector_cov`.
-
-    Args:
-        measured: range m, sine and cosine of azimuth and of inclination.
-        std: 1e3 at most, so that a missing component has a variance beyond any other.
-    """
-    d, sa, ca, si, ci = measured[0], measured[1], measured[2], measured[3], measured[4]
-    d = max(d, least)
-    a, b, c = min_of(std[0]), min_of(std[1]) * d * si, min_of(std[2]) * d
-    a, b, c = a * a, b * b, c * c
-    flat, cross = a * si * si + c * ci * ci, (a - c) * si * ci
-    return (
-        flat * ca * ca + b * sa * sa,
-        (flat - b) * sa * ca,
-        cross * ca,
-        flat * sa * sa + b * ca * ca,
-        cross * sa,
-        a * ci * ci + c * si * si,
-    )
-
-
 @inside
-def min_of(std: float) -> float:
-    """At most 1e3."""
-    return -max(-std, -1e3)
+def cov_of(polar: Numbers, measured: Numbers, least: float) -> Numbers:
+    """Covariance m^2 of a converted measurement at a geometry; standard deviations count as 1e3 at most, so that a
+    missing component has a variance beyond any other."""
+    std = -max(-measured[5], -1e3), -max(-measured[6], -1e3), -max(-measured[7], -1e3)
+    a, b, c = metres(polar, std, least)
+    return spread(polar, a * a, b * b, c * c)
 
 
 @inner

@@ -17,7 +17,6 @@ from ..compiling.compile import as_written, inner, inside
 from ..compiling.small import (
     add,
     add_diagonal,
-    apply,
     choose_each,
     from_upper,
     load,
@@ -30,6 +29,7 @@ from ..compiling.small import (
     zeros,
 )
 from ..compiling.vectors import LANES, choose, put, take
+from ..geometry import Numbers, completed, converted, direction, exact, vector, whole
 from ..stars.gated import Gates, carry, gate_position, gate_star, gates_within, set_ego
 from ..stars.joint import Joint, add_relative, block_of, joint_within, predict, rearrange, solve
 from ..stars.messages import (
@@ -49,7 +49,6 @@ from ..stars.messages import (
     receive,
     star_within,
 )
-from ..stars.relative import Numbers, completed, converted, exact, vector
 from .chains import System, advance, gap_of, gauss_newton, new_system
 from .window_layout import (
     Window,
@@ -203,7 +202,7 @@ def put_edge(window: Window, model: Assumptions, ego: int, row: int, gap: Any, h
     z = load(window.relative, row, RELATIVE)
     information, eta = edge(gap, z, model.relative_std, model.min_range, how)
     eta = plus_applied(eta, information, subtract(gap, gap_of(window.point, ego, row)))
-    o, used = 0.0 * gap[0], max(take(window.located, uint64(row)), whole_of(window, row)) - 0.5
+    o, used = 0.0 * gap[0], max(take(window.located, uint64(row)), whole(load(window.relative, row, RELATIVE))) - 0.5
     information, eta = choose_each(used, information, zeros(o, BLOCK)), choose_each(used, eta, zeros(o, ROW))
     store(window.edge, row, choose_each(active, information, load(window.edge, row, BLOCK)))
     store(window.eta, row, choose_each(active, eta, load(window.eta, row, ROW)))
@@ -222,16 +221,11 @@ def edge(gap: Numbers, z: Numbers, std: Floats, least: float, how: int) -> tuple
         how: EXACT or AT_GAP.
     """
     z = z if how == AT_GAP else inflated(z, least)
-    x, y, up = gap
-    o, whole = 0.0 * z[0], 1e300 - (z[5] + z[6] + z[7])
     if len(std) == 0:
-        there = choose(whole, o + 1.0, o)
+        there = whole(z)
+        o = 0.0 * there
         return from_upper((there, o, o, there, o, there)), scale(subtract(vector(z), gap), there)
-    if how == EXACT:
-        e = exact(x, y, up, z, z[5:], 0.0)
-        return from_upper(e[:6]), e[6:]
-    information = from_upper(converted(x, y, up, z[5:], least))
-    return information, apply(information, subtract(vector(completed(z, gap)), gap))
+    return exact(gap, z, 0.0) if how == EXACT else converted(gap, z, False, least)
 
 
 @inner
@@ -240,13 +234,6 @@ def inflated(z: Numbers, least: float) -> Numbers:
     wide = choose(1e300 - z[5], max(least / max(z[0], 1e-300), 1.0), 0.0 * z[0] + 1.0)
     s1, s2 = -max(-(wide * z[6]), -math.pi), -max(-(wide * z[7]), -math.pi)
     return z[0], z[1], z[2], z[3], z[4], z[5], max(s1, z[6]), max(s2, z[7])
-
-
-@inner
-def whole_of(window: Window, row: int) -> Any:
-    """1 where all components of a relative measurement were measured, else 0."""
-    z = load(window.relative, row, RELATIVE)
-    return choose(1e300 - (z[5] + z[6] + z[7]), 0.0 * z[0] + 1.0, 0.0 * z[0])
 
 
 @inner
@@ -268,7 +255,7 @@ def start_points(window: Window, t: int) -> None:
     for k in range(count_of(window.sizes, t)):
         row, previous = ego + k, window.previous[ego + k]
         fix, new = load(window.motion, 4 * row + POSITION, ROW), take(window.status, uint64(5 * row + NEW))
-        there = 0.0 * new + 1.0 if k == 0 else max(new, whole_of(window, row))
+        there = 0.0 * new + 1.0 if k == 0 else max(new, whole(load(window.relative, row, RELATIVE)))
         at = fix
         if previous >= 0:
             located = take(window.located, uint64(before + previous))
@@ -280,7 +267,8 @@ def start_points(window: Window, t: int) -> None:
                 locate_before(window, row, t, first, at)
         elif k > 0:
             origin = load(window.point, ego, ROW)
-            at = add(origin, vector(completed(load(window.relative, row, RELATIVE), subtract(fix, origin))))
+            x, y, z = subtract(fix, origin)
+            at = add(origin, vector(completed(load(window.relative, row, RELATIVE), direction(x, y, z))))
         put(window.located, uint64(row), there)
         store(window.point, row, at)
         store(window.start, row, at)
