@@ -26,22 +26,21 @@ from .joint import (
     solve,
 )
 from .messages import (
-    BLOCK,
-    NEW,
     NONE,
-    POSITION,
     RELATIVE,
-    ROW,
-    VARIANCE,
     Assumptions,
     Estimates,
     Measurements,
     Star,
+    block_at,
     clear,
+    fix_information,
     gather,
     largest,
     new_estimates,
+    position_of,
     star_within,
+    vector_at,
 )
 
 
@@ -100,19 +99,17 @@ def step(
     clear(joint.eta)
     add_fixes(star, joint, n)
     update(star, joint, model, refine, n)
-    set_ego(gates, load(joint.scratch, 0, BLOCK))
+    set_ego(gates, block_at(joint.scratch, 0))
 
 
 @inner
 def add_fixes(star: Star, joint: Joint, n: int) -> None:
     """Add every member's position as broadcast."""
     for k in range(n):
-        new = load(star.status, 5 * k + NEW, (0.0,))[0]
-        p, q, r = load(star.motion, 4 * k + VARIANCE, ROW)
-        weight, i = (new / p, new / q, new / r), block_of(k, n)
-        gap, at = subtract(load(star.motion, 4 * k + POSITION, ROW), load(joint.state, k, ROW)), i * joint.stride + i
-        store(joint.information, at, add_diagonal(load(joint.information, at, BLOCK), weight))
-        store(joint.eta, i, add(load(joint.eta, i, ROW), times(weight, gap)))
+        weight, i = fix_information(star, k), block_of(k, n)
+        gap, at = subtract(position_of(star, k), vector_at(joint.state, k)), i * joint.stride + i
+        store(joint.information, at, add_diagonal(block_at(joint.information, at), weight))
+        store(joint.eta, i, add(vector_at(joint.eta, i), times(weight, gap)))
 
 
 @inner
@@ -127,7 +124,7 @@ def update(star: Star, joint: Joint, model: Assumptions, refine: bool, n: int) -
             a, eta = joint.factor, joint.move
             copy(joint.information, a, n, joint.stride)
             for i in range(n):
-                store(eta, i, load(joint.eta, i, ROW))
+                store(eta, i, vector_at(joint.eta, i))
         for k in range(1, n):
             if stage == 1:
                 weight, vector = exact_information(star, joint, k, n, model.min_range)

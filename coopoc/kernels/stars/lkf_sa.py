@@ -12,16 +12,17 @@ from .messages import (
     BLOCK,
     NONE,
     RELATIVE,
-    ROW,
     Assumptions,
     Estimates,
     Measurements,
     Star,
+    block_at,
     clear,
     gather,
     largest,
     new_estimates,
     star_within,
+    vector_at,
 )
 
 
@@ -50,7 +51,7 @@ def step(star: Star, joint: Joint, model: Assumptions, n: int, old: int) -> None
     for k in range(1, n):
         if star.previous[k] < 0:
             measured = vector(load(star.relative, k, RELATIVE))
-            store(joint.state, k, add(load(joint.state, 0, ROW), measured))
+            store(joint.state, k, add(vector_at(joint.state, 0), measured))
     predict(joint.information, old, joint.stride, joint.process, joint.scratch)
     rearrange(star, joint, n, old, (flat, flat, flat))
     clear(joint.eta)
@@ -64,7 +65,7 @@ def step(star: Star, joint: Joint, model: Assumptions, n: int, old: int) -> None
 def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
     """Add L W L and L W (delta - L x), L the Laplacian of the star of complete measurements: W is 1, or the edges'
     information over the degree; that of an edge is the inverse mean variance per axis of the converted vectors."""
-    o, std, stride, e = 0.0 * load(joint.state, 0, ROW)[0], model.relative_std, joint.stride, n - 1
+    o, std, stride, e = 0.0 * vector_at(joint.state, 0)[0], model.relative_std, joint.stride, n - 1
     count, total, gaps = o, o, (o, o, o)
     for k in range(1, n):
         edge, gap = edge_to(star, joint, k)
@@ -82,7 +83,7 @@ def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
         add_relative(joint.information, joint.eta, stride, k, n, weight, scale(gap, outer))
     for i in range(n):
         row = count if i == e else -edge_to(star, joint, i + 1)[0]
-        store(joint.eta, i, subtract(load(joint.eta, i, ROW), scale(gaps, row * central)))
+        store(joint.eta, i, subtract(vector_at(joint.eta, i), scale(gaps, row * central)))
         for j in range(i, n):
             other = count if j == e else -edge_to(star, joint, j + 1)[0]
             add_at(joint, i * stride + j, central * row * other)
@@ -93,12 +94,12 @@ def edge_to(star: Star, joint: Joint, k: int) -> tuple[float, Numbers]:
     """1 if the measurement of member k is complete, else 0; the measured vector less the predicted one m, or 0."""
     seen = load(star.relative, k, RELATIVE)
     edge = whole(seen)
-    gap = subtract(vector(seen), subtract(load(joint.state, k, ROW), load(joint.state, 0, ROW)))
+    gap = subtract(vector(seen), subtract(vector_at(joint.state, k), vector_at(joint.state, 0)))
     return edge, scale(gap, edge)
 
 
 @inside
 def add_at(joint: Joint, at: int, number: float) -> None:
     """Add to the diagonal of a block."""
-    block = load(joint.information, at, BLOCK)
+    block = block_at(joint.information, at)
     store(joint.information, at, add_diagonal(block, (number, number, number)))

@@ -8,15 +8,15 @@ whose position was used before, or has no fix, has new = 0.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import inner, inside, storage
-from ..compiling.small import add, choose_each, load, scale, store
-from ..compiling.vectors import LANES, choose, put, take
-from ..geometry import with_std
+from ..compiling.small import add, choose_each, scale, store
+from ..compiling.vectors import LANES, choose, put, take, unrolled
+from ..geometry import Numbers, with_std
 from ..motion import MotionNoise, process_variance
 
 MOVED, PROCESS, POSITION, VARIANCE = range(4)
@@ -32,6 +32,8 @@ ACCELERATION_STD = 1.0
 FIX_GROWTH, ESTIMATE_GROWTH = (1.0, 0.0), (1.0, 2.0)
 """(a, b): after `age` steps a position has gained age (a age + b) times the variance of one step. A fix that is moved
 with one velocity makes its error age times; an estimate has made that error once before, fully correlated."""
+LEAST_PROCESS = 1e-90
+"""m^2; the cube of its inverse is still a number, and far beyond any digit that counts."""
 NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
 Estimates: TypeAlias = tuple[Floats, Floats, Floats]
@@ -95,6 +97,18 @@ class Assumptions(NamedTuple):
     motion: MotionNoise
 
 
+class InMotion(Protocol):
+    """Memory of members as a `Star` has it."""
+
+    @property
+    def motion(self) -> Floats:
+        """Rows of `Star.motion`."""
+
+    @property
+    def status(self) -> Floats:
+        """Rows of `Star.status`."""
+
+
 class Star(NamedTuple):
     """The members of a star at a step, the ego first, in LANES runs.
 
@@ -116,6 +130,60 @@ class Star(NamedTuple):
     relative: Floats
     last_member: Ints
     last_status: Floats
+
+
+@unrolled
+def vector_at(memory: Any, index: Any) -> Any:
+    """Vector number `index` of those of three numbers that stand in memory one after the other."""
+    return memory.read(index, 3)
+
+
+@unrolled
+def block_at(memory: Any, index: Any) -> Any:
+    """Matrix number `index` of those of 3 x 3 numbers."""
+    return memory.read(index, 9)
+
+
+@inside
+def moved_of(star: InMotion, k: int) -> Numbers:
+    """Motion m of member k since the last step."""
+    row: Numbers = vector_at(star.motion, 4 * k + MOVED)
+    return row
+
+
+@inside
+def process_of(star: InMotion, k: int) -> Numbers:
+    """Its variance m^2."""
+    row: Numbers = vector_at(star.motion, 4 * k + PROCESS)
+    return row
+
+
+@inside
+def position_of(star: InMotion, k: int) -> Numbers:
+    """Position m of member k, as broadcast and brought forward."""
+    row: Numbers = vector_at(star.motion, 4 * k + POSITION)
+    return row
+
+
+@inside
+def variance_of(star: InMotion, k: int) -> Numbers:
+    """Its variance m^2."""
+    row: Numbers = vector_at(star.motion, 4 * k + VARIANCE)
+    return row
+
+
+@inside
+def process_information(star: InMotion, k: int) -> Numbers:
+    """Inverse variance 1/m^2 of the motion of member k."""
+    p, q, r = process_of(star, k)
+    return 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
+
+
+@inside
+def fix_information(star: InMotion, k: int) -> Numbers:
+    """Inverse variance 1/m^2 of the position of member k, 0 where it does not count."""
+    new, (p, q, r) = take(star.status, 5 * k + NEW), variance_of(star, k)
+    return new / p, new / q, new / r
 
 
 @storage
@@ -236,16 +304,16 @@ def interpret(star: Star, model: Assumptions, k: int, dt: float) -> None:
     uses, age = take(star.status, 5 * k + USES), take(star.status, 5 * k + AGE)
     held = take(star.status, 5 * k + HELD)
     late, often = dt * dt * age * model.acceleration, 2.0 * uses - 1.0
-    velocity, late = load(star.motion, 4 * k + MOVED, ROW), late * late
-    one = add(load(star.motion, 4 * k + PROCESS, ROW), process_variance(model.motion, velocity, dt))
+    velocity, late = moved_of(star, k), late * late
+    one = add(process_of(star, k), process_variance(model.motion, velocity, dt))
     one = add(one, (late, late, late))
     moved = scale(velocity, choose(held, dt + 0.0 * age, 0.0 * age))
     flat = 0.0 * age + model.flat
     grown = scale(one, age * (model.growth[0] * age + model.growth[1]))
     store(star.motion, 4 * k + MOVED, moved)
     store(star.motion, 4 * k + PROCESS, choose_each(held, scale(one, often), (flat, flat, flat)))
-    store(star.motion, 4 * k + POSITION, add(load(star.motion, 4 * k + POSITION, ROW), scale(moved, age)))
-    store(star.motion, 4 * k + VARIANCE, add(load(star.motion, 4 * k + VARIANCE, ROW), grown))
+    store(star.motion, 4 * k + POSITION, add(position_of(star, k), scale(moved, age)))
+    store(star.motion, 4 * k + VARIANCE, add(variance_of(star, k), grown))
 
 
 @inside

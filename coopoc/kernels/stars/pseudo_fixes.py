@@ -33,31 +33,35 @@ from ..compiling.small import (
     transpose,
     zeros,
 )
-from ..compiling.vectors import LANES, choose
+from ..compiling.vectors import LANES, choose, take
 from ..gate import FIX_GATE, count, distance, gain_of, inflation
 from ..geometry import Numbers, completed, direction, metres, spread, vector
 from .gated import gate_components, inflated
 from .messages import (
     BLOCK,
     HELD,
-    MOVED,
     NEW,
     NONE,
     NOWHERE,
     POSITION,
-    PROCESS,
     RELATIVE,
-    ROW,
     VARIANCE,
     Assumptions,
     Estimates,
     Measurements,
     Star,
+    block_at,
     clear,
+    fix_information,
     gather,
     largest,
+    moved_of,
     new_estimates,
+    position_of,
+    process_of,
     star_within,
+    variance_of,
+    vector_at,
 )
 
 ROUNDS, BISECT, TOLERANCE = 60, 20, 1e-8
@@ -93,20 +97,19 @@ def run_msmv(measurements: Measurements, model: Assumptions) -> Estimates:
 @inside
 def fuse_pseudo_fixes(star: Star, model: Assumptions, x: Floats, cov: Floats, n: int, old: int) -> None:
     """P^-1 + C_p^-1 + sum_j C_j^-1, and the weighted mean that belongs to it, in place of x and P."""
-    fix = load(star.motion, POSITION, ROW)
+    fix = position_of(star, 0)
     if old == 0:
         at, p = fix, zeros(fix[0], BLOCK)
         flat = 0.0 * fix[0] + model.flat
         p = add_diagonal(p, (flat, flat, flat))
     else:
-        at = add(load(x, 0, ROW), load(star.motion, MOVED, ROW))
-        p = add_diagonal(load(cov, 0, BLOCK), load(star.motion, PROCESS, ROW))
-    weight, variance = load(star.status, NEW, (0.0,))[0], load(star.motion, VARIANCE, ROW)
-    own = weight / variance[0], weight / variance[1], weight / variance[2]
+        at = add(vector_at(x, 0), moved_of(star, 0))
+        p = add_diagonal(block_at(cov, 0), process_of(star, 0))
+    own = fix_information(star, 0)
     information, eta = add_diagonal(inverse(p), own), times(subtract(fix, at), own)
     for k in range(1, n):
         position, variance = pseudo_fix(star, model, k, at)
-        new = load(star.status, 5 * k + NEW, (0.0,))[0]
+        new = take(star.status, 5 * k + NEW)
         weight_k = scale(inverse(variance), new)
         information, eta = add(information, weight_k), add(eta, apply(weight_k, subtract(position, at)))
     p = inverse(information)
@@ -117,13 +120,13 @@ def fuse_pseudo_fixes(star: Star, model: Assumptions, x: Floats, cov: Floats, n:
 @inside
 def pseudo_fix(star: Star, model: Assumptions, k: int, at: Numbers) -> tuple[Numbers, Numbers]:
     """Position of the ego by member k's estimate and the measurement of it, and its covariance."""
-    theirs, relative = load(star.motion, 4 * k + POSITION, ROW), load(star.relative, k, RELATIVE)
+    theirs, relative = position_of(star, k), load(star.relative, k, RELATIVE)
     x, y, z = subtract(theirs, at)
     seen = completed(relative, direction(x, y, z))
     one, o = 0.0 * at[0] + 1.0, 0.0 * at[0]
     cov = from_upper((one, o, o, one, o, one))
     if len(model.relative_std):
-        cov = add_diagonal(cov_of(seen, relative, model.min_range), load(star.motion, 4 * k + VARIANCE, ROW))
+        cov = add_diagonal(cov_of(seen, relative, model.min_range), variance_of(star, k))
     return subtract(theirs, vector(seen)), cov
 
 
@@ -194,19 +197,19 @@ def run_intersection(measurements: Measurements, model: Assumptions, split: bool
 @inner
 def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) -> None:
     """Predict and fuse."""
-    fix, variance = load(star.motion, POSITION, ROW), load(star.motion, VARIANCE, ROW)
+    fix, variance = position_of(star, 0), variance_of(star, 0)
     o = 0.0 * fix[0]
     nothing = zeros(o, BLOCK)
     if old == 0:
         x, fixed, w = fix, nothing, o + 0.5
         add_source(fusion, 0, nothing, add_diagonal(nothing, variance))
     else:
-        new = load(star.status, NEW, (0.0,))[0]
-        x, w = add(load(fusion.x, 0, ROW), load(star.motion, MOVED, ROW)), load(fusion.weight, 0, (0.0,))[0]
-        independent = add_diagonal(load(fusion.independent, 0, BLOCK), load(star.motion, PROCESS, ROW))
-        add_source(fusion, 0, load(fusion.dependent, 0, BLOCK), independent)
+        new = take(star.status, NEW)
+        x, w = add(vector_at(fusion.x, 0), moved_of(star, 0)), take(fusion.weight, 0)
+        independent = add_diagonal(block_at(fusion.independent, 0), process_of(star, 0))
+        add_source(fusion, 0, block_at(fusion.dependent, 0), independent)
         if fusion.robust:
-            own, hits = own_cov(fusion), load(fusion.hits, 0, (0.0,))[0]
+            own, hits = own_cov(fusion), take(fusion.hits, 0)
             q = distance(subtract(fix, x), add_diagonal(own, variance))
             store(fusion.hits, 0, (count(q, FIX_GATE, hits, gain_of(own, variance)),))
             variance = scale(variance, inflation(q, FIX_GATE, hits))
@@ -220,7 +223,7 @@ def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) 
             s = w if k == 0 else 1.0 - w
             information, derivative, _ = source(fusion, k, s)
             total, dependent = add(total, information), add(dependent, scale(derivative, s))
-            eta = add(eta, apply(information, load(fusion.gap, k, ROW)))
+            eta = add(eta, apply(information, vector_at(fusion.gap, k)))
         cov = inverse(total)
         # A weight that is worse than none was lost to rounding, where without a fix all information is small.
         worse = choose(trace(cov), trace(cov) - (1.0 + 1e-9) * trace(alone), o + 1.0)
@@ -241,8 +244,8 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
     o = 0.0 * x[0]
     one = from_upper((o + 1.0, o, o, o + 1.0, o, o + 1.0))
     for k in range(1, n):
-        gap = subtract(load(star.motion, 4 * k + POSITION, ROW), x)
-        relative, variance = load(star.relative, k, RELATIVE), load(star.motion, 4 * k + VARIANCE, ROW)
+        gap = subtract(position_of(star, k), x)
+        relative, variance = load(star.relative, k, RELATIVE), variance_of(star, k)
         polar, noise, theirs, f = (
             direction(gap[0], gap[1], gap[2]),
             one,
@@ -255,7 +258,7 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
             relative = inflated(relative, factor)
         if len(model.relative_std):
             noise = cov_of(polar, relative, model.min_range)
-        held = load(star.status, 5 * k + HELD, (0.0,))[0]
+        held = take(star.status, 5 * k + HELD)
         gap = subtract(gap, vector(completed(relative, polar)))
         if fusion.robust:
             f = inflation(distance(gap, add(ahead, noise)), FIX_GATE, o)
@@ -276,7 +279,7 @@ def trace(a: Numbers) -> float:
 @inside
 def own_cov(fusion: Fusion) -> Numbers:
     """Covariance m^2 of the ego's prediction."""
-    cov: Numbers = add(load(fusion.dependent, 0, BLOCK), load(fusion.independent, 0, BLOCK))
+    cov: Numbers = add(block_at(fusion.dependent, 0), block_at(fusion.independent, 0))
     return cov
 
 
@@ -295,8 +298,8 @@ def source(fusion: Fusion, k: int, s: float) -> tuple[Numbers, Numbers, Numbers]
 
     K I is (1 - K D) / s, which keeps its digits beside an I of 1e8 m^2; if not split it is 0.
     """
-    d, i = load(fusion.dependent, k, BLOCK), load(fusion.independent, k, BLOCK)
-    root = scale(inverse(add(d, scale(i, s))), load(fusion.used, k, (0.0,))[0])
+    d, i = block_at(fusion.dependent, k), block_at(fusion.independent, k)
+    root = scale(inverse(add(d, scale(i, s))), take(fusion.used, k))
     share = product(root, d)
     derivative = product(share, root)
     bend = scale(derivative, 0.0)

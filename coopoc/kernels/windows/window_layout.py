@@ -9,10 +9,18 @@ from numpy import uint64
 
 from ...arrays import AnyArray, Floats, Ints
 from ..compiling.compile import inner, storage
-from ..compiling.small import load, subtract, times
+from ..compiling.small import subtract, times
 from ..compiling.vectors import LANES, put, take
-from ..stars.joint import LEAST_PROCESS
-from ..stars.messages import MOVED, POSITION, PROCESS, ROW, Assumptions, Measurements, Star, gather
+from ..stars.messages import (
+    Assumptions,
+    Measurements,
+    Star,
+    gather,
+    moved_of,
+    position_of,
+    process_information,
+    vector_at,
+)
 
 
 class Window(NamedTuple):
@@ -134,16 +142,15 @@ def any_positive(mask: AnyArray) -> bool:
 @inner
 def fix_gap(window: Window, row: int) -> Any:
     """Measured position less the point, m."""
-    return subtract(load(window.motion, 4 * row + POSITION, ROW), load(window.point, row, ROW))
+    return subtract(position_of(window, row), vector_at(window.point, row))
 
 
 @inner
 def motion(window: Window, here: int, there: int) -> Any:
     """Information 1/m^2 of the motion from a row to the one after, and its eta on the latter's point."""
-    p, q, r = load(window.motion, 4 * there + PROCESS, ROW)
-    process = 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
-    moved = subtract(load(window.point, there, ROW), load(window.point, here, ROW))
-    return process, times(process, subtract(load(window.motion, 4 * there + MOVED, ROW), moved))
+    process = process_information(window, there)
+    moved = subtract(vector_at(window.point, there), vector_at(window.point, here))
+    return process, times(process, subtract(moved_of(window, there), moved))
 
 
 @inner
