@@ -59,9 +59,10 @@ def run_filter(measurements: Measurements, model: Assumptions, refine: bool, rob
     most = largest(measurements.start)
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
-        star, joint, gates = star_within(most), joint_within(most), gates_within(most)
+        star, before, joint, gates = star_within(most), star_within(most), joint_within(most), gates_within(most)
         for t in range(steps):
-            n = gather(star, measurements, model, first, last, t, old)
+            star, before = before, star
+            n = gather(star, before, measurements, model, first, last, t, old)
             step(star, joint, gates, model, refine, robust, n, old)
             write(out, joint, first, last, t, measurements.start[t], n)
             old = n

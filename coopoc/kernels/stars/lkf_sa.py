@@ -34,9 +34,10 @@ def run_lkf_sa(measurements: Measurements, model: Assumptions) -> Estimates:
     most = largest(measurements.start)
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
-        star, joint = star_within(most), joint_within(most)
+        star, before, joint = star_within(most), star_within(most), joint_within(most)
         for t in range(steps):
-            n = gather(star, measurements, model, first, last, t, old)
+            star, before = before, star
+            n = gather(star, before, measurements, model, first, last, t, old)
             step(star, joint, model, n, old)
             write(out, joint, first, last, t, measurements.start[t], n)
             old = n

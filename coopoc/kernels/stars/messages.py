@@ -15,7 +15,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, choose_each, scale, store
-from ..compiling.vectors import LANES, choose, put, take, unrolled
+from ..compiling.vectors import LANES, choose, take, unrolled
 from ..geometry import Numbers, with_std
 from ..motion import MotionNoise, process_variance
 
@@ -119,8 +119,6 @@ class Star(NamedTuple):
         motion: (12 most, LANES).
         relative: (8 most, LANES): range m, sine and cosine of azimuth and of inclination, and three standard
             deviations, infinite where nothing was measured.
-        last_member: of the last star.
-        last_status: of the last star.
     """
 
     member: Ints
@@ -128,8 +126,6 @@ class Star(NamedTuple):
     status: Floats
     motion: Floats
     relative: Floats
-    last_member: Ints
-    last_status: Floats
 
 
 @unrolled
@@ -190,8 +186,7 @@ def fix_information(star: InMotion, k: int) -> Numbers:
 def star_within(most: int) -> Star:
     """Room for `most` members."""
     status, motion, relative = np.zeros((5 * most, LANES)), np.zeros((12 * most, LANES)), np.zeros((8 * most, LANES))
-    member, previous, last = np.zeros(most, np.int64), np.zeros(most, np.int64), np.zeros(most, np.int64)
-    return Star(member, previous, status, motion, relative, last, np.zeros((5 * most, LANES)))
+    return Star(np.zeros(most, np.int64), np.zeros(most, np.int64), status, motion, relative)
 
 
 @storage
@@ -215,11 +210,14 @@ def largest(start: Ints) -> int:
 
 
 @inner
-def gather(star: Star, measurements: Measurements, model: Assumptions, first: int, last: int, t: int, old: int) -> int:
+def gather(
+    star: Star, before: Star, measurements: Measurements, model: Assumptions, first: int, last: int, t: int, old: int
+) -> int:
     """Fill the star of step t for runs first to last, at most LANES, the last one repeated; the number of its members.
 
     Args:
-        star: of the last step, of `old` members.
+        star: memory.
+        before: of the last step, of `old` members.
         measurements: measurements and messages.
         model: noise model.
         first: run.
@@ -228,27 +226,17 @@ def gather(star: Star, measurements: Measurements, model: Assumptions, first: in
         old: members of the last star.
     """
     n = 1 + measurements.start[t + 1] - measurements.start[t]
-    remember(star, old)
     for k in range(n):
         link = measurements.start[t] + k - 1
         star.member[k] = member = measurements.ego if k == 0 else measurements.neighbour[link]
-        star.previous[k] = index_of(member, star.last_member, old)
+        star.previous[k] = index_of(member, before.member, old)
         for lane in range(LANES):
             run = min(first + int(lane), last)
-            receive(star, measurements, model, run, t, link, k, lane)
+            receive(star, before, measurements, model, run, t, link, k, lane)
             if k > 0:
                 measured(star.relative, measurements.relative[run, link], model.relative_std, k, lane)
         interpret(star, model, k, measurements.dt)
     return int(n)
-
-
-@inner
-def remember(star: Star, old: int) -> None:
-    """Make the star the last one."""
-    for k in range(old):
-        star.last_member[k] = star.member[k]
-        for row in (5 * k + SENT, 5 * k + USES):
-            put(star.last_status, row, take(star.status, row))
 
 
 @inside
@@ -270,16 +258,24 @@ def index_of(member: int, members: Ints, count: int) -> int:
 
 @inside
 def receive(
-    star: Star, measurements: Measurements, model: Assumptions, run: int, t: int, link: int, k: int, lane: int
+    star: Star,
+    before: Star,
+    measurements: Measurements,
+    model: Assumptions,
+    run: int,
+    t: int,
+    link: int,
+    k: int,
+    lane: int,
 ) -> None:
     """Copy the last message of member k in one run: velocity, process noise, position, its variance, and its status."""
     previous, status = star.previous[k], 5 * k
-    before = 5 * max(previous, 0)
+    last = 5 * max(previous, 0)
     sent = t if k == 0 else measurements.newest[run, link]
     when = sent if sent >= 0 else t
-    again = previous >= 0 and star.last_status[before + SENT, lane] == sent
+    again = previous >= 0 and before.status[last + SENT, lane] == sent
     star.status[status + SENT, lane] = sent
-    star.status[status + USES, lane] = star.last_status[before + USES, lane] + 1.0 if again else 1.0
+    star.status[status + USES, lane] = before.status[last + USES, lane] + 1.0 if again else 1.0
     star.status[status + AGE, lane] = t - when
     star.status[status + HELD, lane] = 1.0 if sent >= 0 else 0.0
     j = star.member[k]

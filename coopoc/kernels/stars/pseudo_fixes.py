@@ -85,9 +85,10 @@ def run_msmv(measurements: Measurements, model: Assumptions) -> Estimates:
     out = new_estimates(measurements)
     most, x, cov = largest(measurements.start), np.zeros((3, LANES)), np.zeros((9, LANES))
     for first in range(0, runs, LANES):
-        star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
+        star, before, old, last = star_within(most), star_within(most), NONE, min(first + LANES, runs) - 1
         for t in range(steps):
-            n = gather(star, measurements, model, first, last, t, old)
+            star, before = before, star
+            n = gather(star, before, measurements, model, first, last, t, old)
             fuse_pseudo_fixes(star, model, x, cov, n, old)
             write_ego(out, star, x, cov, first, last, t, measurements.start[t], n)
             old = n
@@ -184,10 +185,11 @@ def run_intersection(measurements: Measurements, model: Assumptions, split: bool
         robust,
     )
     for first in range(0, runs, LANES):
-        star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
+        star, before, old, last = star_within(most), star_within(most), NONE, min(first + LANES, runs) - 1
         clear(fusion.hits)
         for t in range(steps):
-            n = gather(star, measurements, model, first, last, t, old)
+            star, before = before, star
+            n = gather(star, before, measurements, model, first, last, t, old)
             intersect(star, model, fusion, n, old)
             write_ego(out, star, fusion.x, fusion.cov, first, last, t, measurements.start[t], n)
             old = n

@@ -48,7 +48,6 @@ from ..stars.messages import (
     moved_of,
     position_of,
     receive,
-    star_within,
     vector_at,
 )
 from .chains import System, advance, gap_of, gauss_newton, new_system
@@ -111,12 +110,12 @@ def horizons(measurements: Measurements, model: Assumptions, arrival: Ints, sett
     (runs, steps), most = measurements.gnss.shape[:2], 1 + int(np.diff(measurements.start).max(initial=0))
     x, cov = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3))
     estimates = Estimates(x, cov, np.empty((runs, len(measurements.neighbour), 3)), np.zeros((runs, steps), np.bool_))
-    window, within = new_window(settings.length, most), cast(Any, (joint_within, star_within, gates_within))
-    joint, star, gates = (make.py_func(most) for make in within)
+    window, within = new_window(settings.length, most), cast(Any, (joint_within, gates_within))
+    joint, gates = (make.py_func(most) for make in within)
     system = new_system(settings.length, most, joint.information)
     for first in range(0, runs, LANES):
         here = first, min(first + LANES, runs) - 1
-        follow_horizon((window, joint, star, system, gates), measurements, model, arrival, settings, here, estimates)
+        follow_horizon((window, joint, system, gates), measurements, model, arrival, settings, here, estimates)
     return estimates
 
 
@@ -131,10 +130,10 @@ def follow_horizon(
     estimates: Estimates,
 ) -> None:
     """Solve the window that ends at each step, in runs first to last."""
-    window, joint, star, system, gates = memory
+    window, joint, system, gates = memory
     for t in range(len(measurements.start) - 1):
         span = (max(0, t - settings.length + 1), t)
-        enter(window, star, measurements, model, runs, t)
+        enter(window, measurements, model, runs, t)
         for step in range(span[0], t + 1):
             gather_arrived(window, gates, measurements, model, arrival, settings, runs, step, t)
         start_points(window, t)
@@ -368,21 +367,22 @@ def gather_arrived(
     """Put the messages that have arrived by now where they belong: the message of a step moves its sender there, or
     the last one before that has arrived and is not too old, as if it had done so since it was sent, and its fix stands
     at the step at which it was sent."""
-    star, here = star_at(window, step), row_of(window.layout, step, 0)
+    star, before = star_at(window, step), star_at(window, step - 1)
+    here = row_of(window.layout, step, 0)
     for k in range(1, count_of(window.sizes, step)):
         link, place, changed = measurements.start[step] + k - 1, window.previous[here + k], step == now
         for run in range(runs[0], runs[1] + 1):
             come = 0 <= arrival[run, link] <= now
             sent = step if come else measurements.newest[run, link]
             if place >= 0 and step > 0:
-                carried = int(star.last_status[5 * place + SENT, run - runs[0]])
+                carried = int(before.status[5 * place + SENT, run - runs[0]])
                 sent = max(sent, carried if step - carried <= settings.age else -1)
             changed |= sent != measurements.newest[run, link] or come != measurements.fresh[run, link]
             measurements.newest[run, link], measurements.fresh[run, link] = sent, come
         if changed:
             for lane in range(uint64(LANES)):
                 run = min(runs[0] + int(lane), runs[1])
-                receive(star, measurements, model, run, step, link, k, lane)
+                receive(star, before, measurements, model, run, step, link, k, lane)
                 used_since = max(measurements.newest[run, link], window.joined[here + k])
                 star.status[5 * k + USES, lane] = step - used_since + 1
             interpret(star, model, k, measurements.dt)
