@@ -34,7 +34,7 @@ from ..compiling.small import (
     zeros,
 )
 from ..compiling.vectors import LANES, choose, take
-from ..gate import FIX_GATE, count, distance, gain_of, inflation
+from ..gate import FIX_GATE, distance, gate_fix, inflation
 from ..geometry import Numbers, completed, direction, metres, spread, vector
 from .gated import gate_components, inflated
 from .messages import (
@@ -212,9 +212,9 @@ def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) 
         add_source(fusion, 0, block_at(fusion.dependent, 0), independent)
         if fusion.robust:
             own, hits = own_cov(fusion), take(fusion.hits, 0)
-            q = distance(subtract(fix, x), add_diagonal(own, variance))
-            store(fusion.hits, 0, (count(q, FIX_GATE, hits, gain_of(own, variance)),))
-            variance = scale(variance, inflation(q, FIX_GATE, hits))
+            share, hits = gate_fix(subtract(fix, x), own, variance, FIX_GATE, hits)
+            store(fusion.hits, 0, (hits,))
+            variance = scale(variance, share)
         fixed = add_diagonal(nothing, (new / variance[0], new / variance[1], new / variance[2]))
     add_neighbours(star, model, fusion, x, n)
     alone = inverse(add(fixed, source(fusion, 0, o + 1.0)[0]))
