@@ -1,6 +1,7 @@
 # make paper   the environment, the training, the studies, the report in runs/paper/
 # make test    the environment, then style and tests
 # make test-quick   a part of the tests, in a minute once the kernels are compiled
+# make test-of   the tests that reach FILE (or a folder), nearest first, within NEAR imports if given; ends at the first failure
 # make test-slow   the tests that make test leaves out: strict types, deployments over TLS, clusters, kills, trainings
 # make test-bounds   the tests of the kernels, compiled with a check of every index, in a cache of their own
 # make test-lower   a part of the tests with the least version of each dependency, without torch, in build/lower
@@ -28,7 +29,7 @@ QUICK := $(patsubst %,tests/test_%.py,world misuse star_filters kernels_vectors 
 
 LOWER := build/lower
 
-.PHONY: paper test test-quick test-slow test-bounds test-lower fuzz docs benchmark release help clean
+.PHONY: paper test test-quick test-of test-slow test-bounds test-lower fuzz docs benchmark release help clean
 
 paper: $(READY)
 	$(VENV)/bin/coopoc paper --out runs/paper --jobs $(JOBS)
@@ -40,6 +41,10 @@ test: $(VENV)/.ready-dev
 
 test-quick: $(VENV)/.ready-dev
 	$(PYTEST) $(QUICK)
+
+test-of: $(VENV)/.ready-dev
+	@tests=$$($(VENV)/bin/python tests/of.py $(FILE) $(NEAR)); test -n "$$tests" || { echo "No test imports FILE=$(FILE)."; exit 1; }; \
+	$(PYTEST) --no-loadscope-reorder -x -m "not slow" $$tests
 
 test-slow: $(VENV)/.ready-dev
 	$(PYTEST) -m slow tests

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import gtsam
@@ -33,39 +32,11 @@ def gtsam_linear(problems: list[Problem]) -> Job:
     def each() -> Any:
         return np.stack([one(*numbers) for numbers in given])
 
-    def custom() -> Any:
-        return np.stack([custom_factors(*numbers) for numbers in given[:4]])
-
     job = "gtsam, snapshot, converted"
     return Job(
         [
             Row(job, "ours, solve() one by one", 4, ours(problems[:4], "gtsam")),
             Row(job, "hand-written", len(given), each),
-            Row(job, "CustomFactors and Levenberg-Marquardt", 4, custom),
         ],
         as_good(problems),
     )
-
-
-def custom_factors(fix: Any, vector: Any, root: Any) -> Any:
-    """The same by Python's callbacks, derivatives by hand."""
-    graph, at, unit = gtsam.NonlinearFactorGraph(), gtsam.Values(), gtsam.noiseModel.Unit.Create(3)
-    model = gtsam.noiseModel.Diagonal.Sigmas(np.array(KNOWN.gnss_std))
-
-    def edge(k: int) -> Callable[..., Any]:
-        def error(factor: Any, found: Any, jacobians: Any) -> Any:
-            if jacobians is not None:
-                jacobians[0], jacobians[1] = -root[k], root[k]
-            return root[k] @ (found.atPoint3(k + 1) - found.atPoint3(0) - vector[k])
-
-        return error
-
-    for k, z in enumerate(fix):
-        graph.add(gtsam.PriorFactorPoint3(k, z, model))
-        at.insert(k, z)
-    for k in range(len(vector)):
-        graph.add(gtsam.CustomFactor(unit, [0, k + 1], edge(k)))
-    params = gtsam.LevenbergMarquardtParams()
-    params.setRelativeErrorTol(1e-12)
-    found = gtsam.LevenbergMarquardtOptimizer(graph, at, params).optimize()
-    return np.stack([found.atPoint3(k) for k in range(len(fix))])

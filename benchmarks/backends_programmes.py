@@ -102,12 +102,8 @@ def osqp_linear(problems: list[Problem]) -> Job:
     }
     nothing = csc_matrix((0, SIZE)), np.empty(0), np.empty(0)
 
-    def workspace(b: int) -> Any:
-        made = osqp.OSQP()
-        made.setup(matrices[b].copy(), gradients[b], *nothing, **settings)
-        return made
-
-    persistent = workspace(0)
+    persistent = osqp.OSQP()
+    persistent.setup(matrices[0].copy(), gradients[0], *nothing, **settings)
 
     def batch() -> Any:
         found = []
@@ -116,26 +112,11 @@ def osqp_linear(problems: list[Problem]) -> Job:
             found.append(persistent.solve(raise_error=False).x)
         return np.stack(found).reshape(runs, -1, 3)
 
-    def bare() -> Any:
-        """By the extension module that osqp's Python class calls."""
-        found, core = [], persistent._solver
-        for matrix, gradient in zip(matrices, gradients, strict=True):
-            core.update_data_vec(gradient, None, None)
-            core.update_data_mat(matrix.data, None, None, None)
-            core.solve()
-            found.append(core.solution.x)
-        return np.stack(found).reshape(runs, -1, 3)
-
-    def setups() -> Any:
-        return np.stack([workspace(b).solve(raise_error=False).x for b in range(10)]).reshape(10, -1, 3)
-
     job = "osqp, snapshot, converted"
     return Job(
         [
             Row(job, "ours, solve() one by one", 4, ours(problems[:4], "osqp")),
             Row(job, "hand-written", runs, batch),
-            Row(job, "hand-written, without osqp's Python class", runs, bare),
-            Row(job, "setup at each solve", 10, setups),
         ],
         as_good(problems),
     )

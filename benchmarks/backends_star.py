@@ -6,10 +6,9 @@ from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
-from classical import KNOWN, NEIGHBOURS, SENSORS
+from classical import KNOWN, NEIGHBOURS, ring
 from scipy.optimize import least_squares
 
-import coopoc as co
 from coopoc.optimize import Problem, solve
 from coopoc.optimize.model.factor import Factor
 from coopoc.world.links import wrap
@@ -36,19 +35,9 @@ class Job(NamedTuple):
     right: Callable[[Any], bool]
 
 
-def stars(runs: int, neighbours: int = NEIGHBOURS) -> list[Problem]:
+def stars(runs: int) -> list[Problem]:
     """An ego with ten neighbours around it, a problem for each realisation."""
-    around = np.linspace(0, 2 * np.pi, neighbours, endpoint=False)
-    gap = np.linspace(12, 25, neighbours)
-    offset = np.vstack([np.zeros(3), np.stack([gap * np.cos(around), gap * np.sin(around), 0.05 * gap], axis=1)])
-    velocity = np.tile([10.0, 0.0, 0.0], (2, neighbours + 1, 1))
-    fleet = co.Fleet(
-        tuple(f"v{i}" for i in range(neighbours + 1)),
-        [0.0, 0.1],
-        np.stack([offset, offset + 0.1 * velocity[0]]),
-        velocity,
-    )
-    recording = co.observe(fleet, SENSORS, co.V2X(max_neighbours=neighbours), runs=runs, observers=[0])
+    recording = ring(NEIGHBOURS, 2, runs)
     return [Problem.from_snapshot(recording, 1, 0, run, KNOWN) for run in range(runs)]
 
 

@@ -40,17 +40,18 @@ class Row(NamedTuple):
     right: bool
 
 
-def ring() -> co.Recording:
-    """An ego that drives with ten neighbours around it."""
-    t = np.arange(STEPS) * 0.1
-    around = np.linspace(0, 2 * np.pi, NEIGHBOURS, endpoint=False)
-    gap = np.linspace(12, 25, NEIGHBOURS)
+def ring(neighbours: int, steps: int, runs: int, sensors: co.Sensors = SENSORS, frame: str = "world") -> co.Recording:
+    """An ego that drives with neighbours around it."""
+    t = np.arange(steps) * 0.1
+    around = np.linspace(0, 2 * np.pi, neighbours, endpoint=False)
+    gap = np.linspace(12, 25, neighbours)
     offset = np.vstack([np.zeros(3), np.stack([gap * np.cos(around), gap * np.sin(around), 0.05 * gap], axis=1)])
     path = np.stack([10 * t, 5 * np.sin(t / 5), 0 * t], axis=1)
     position = path[:, None] + offset
     velocity = np.diff(position, axis=0, prepend=2 * position[:1] - position[1:2]) / 0.1
-    fleet = co.Fleet(tuple(f"v{i}" for i in range(NEIGHBOURS + 1)), t, position, velocity)
-    return co.observe(fleet, SENSORS, co.V2X(max_neighbours=NEIGHBOURS), runs=RUNS, observers=[0])
+    fleet = co.Fleet(tuple(f"v{i}" for i in range(neighbours + 1)), t, position, velocity)
+    v2x = co.V2X(max_neighbours=neighbours)
+    return co.observe(fleet, sensors, v2x, runs=runs, observers=[0], frame=frame)
 
 
 def filter_rows(recording: co.Recording) -> list[Row]:
@@ -142,14 +143,14 @@ def seconds(rows: list[Row]) -> dict[str, float]:
 
 def parts() -> list[tuple[str, str, list[Row]]]:
     """The two jobs, each with the row that it is compared to."""
-    recording = ring()
+    recording = ring(NEIGHBOURS, STEPS, RUNS)
     return [("joint filter", FILTERPY, filter_rows(recording))]
 
 
-def measured(found: list[tuple[str, str, list[Row]]] | None = None) -> list[dict[str, Any]]:
+def measured() -> list[dict[str, Any]]:
     """Per row its name, microseconds, the ratio to the peer's time, and whether its answer is right."""
     out: list[dict[str, Any]] = []
-    for job, peer, rows in parts() if found is None else found:
+    for job, peer, rows in parts():
         out += rows_of(f"{job}: ", seconds(rows), peer, {row.words: row.right for row in rows})
     return out
 

@@ -29,6 +29,7 @@ from tabulate import tabulate
 from unseen_graphs import joined, world
 
 import coopoc as co
+from coopoc.kernels.compiling.machine_code import SHIPPED_TARGET, versions
 from coopoc.methods.catalogue import METHODS, needs_whole_fleet
 from coopoc.optimize.graph_problems import from_graph
 from coopoc.world.storage import save_recording
@@ -191,7 +192,8 @@ def build(out: Path) -> None:
     with tempfile.TemporaryDirectory() as folder:
         code = Path(folder) / "code"
         own = {"PYTHONHASHSEED": "0", "PYTHONPYCACHEPREFIX": f"{folder}/python", "NUMBA_CACHE_DIR": str(code)}
-        command = [sys.executable, "-B", "-P", "-c", RELATIVE, __file__, "--compiled", code]
+        own["NUMBA_CPU_NAME"], own["NUMBA_CPU_FEATURES"] = SHIPPED_TARGET[1:]
+        command = [sys.executable, "-B", "-P", "-c", RELATIVE, __file__, "--compiled", str(code)]
         subprocess.run(command, env={**os.environ, **own, "OMP_NUM_THREADS": "1"}, check=True)
         shutil.rmtree(out, ignore_errors=True)
         out.mkdir(parents=True)
@@ -201,16 +203,12 @@ def build(out: Path) -> None:
 
 def compile_all(folder: Path) -> None:
     """Compile every kernel in this process and keep the machine code."""
-    import numba
-
-    from coopoc.kernels.compiling import machine_code
-
-    config: Any = numba.config
-    _, config.CPU_NAME, config.CPU_FEATURES = machine_code.SHIPPED_TARGET
     for kernel in run_all():
         if not any(folder.glob(f"*/{kernel._cache.name}.*.nbc")):
             sys.exit(f"nothing is kept of {kernel._cache.name}")
-    (folder / "about.json").write_text(json.dumps(machine_code.versions(), indent=1) + "\n")
+        if (target := kernel.targetctx.codegen().magic_tuple()) != SHIPPED_TARGET:
+            sys.exit(f"kernels are for {target}, not for {SHIPPED_TARGET}")
+    (folder / "about.json").write_text(json.dumps(versions(), indent=1) + "\n")
 
 
 def record() -> None:

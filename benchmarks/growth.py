@@ -11,8 +11,7 @@ from functools import partial
 from typing import Any
 
 import numpy as np
-from classical import timed
-from timing import report
+from timing import medians, report, rows_of, timed
 
 import coopoc as co
 from coopoc.methods.catalogue import METHODS
@@ -26,12 +25,12 @@ SPACING = 14.0
 IMPORT_SECONDS = 0.3
 
 
-def grid(rows: int, columns: int) -> co.Fleet:
+def grid(rows: int, columns: int, steps: int = STEPS) -> co.Fleet:
     """A block of vehicles that drives on together."""
-    t = np.arange(STEPS) * 0.1
+    t = np.arange(steps) * 0.1
     i, j = np.divmod(np.arange(rows * columns), columns)
     start = SPACING * np.stack([i, j, 0.05 * ((i + j) % 3)], axis=1)
-    velocity = np.broadcast_to([10.0, 0.0, 0.0], (STEPS, len(start), 3))
+    velocity = np.broadcast_to([10.0, 0.0, 0.0], (steps, len(start), 3))
     return co.Fleet(tuple(f"v{k}" for k in range(len(start))), t, start + t[:, None, None] * velocity[:1], velocity)
 
 
@@ -51,20 +50,15 @@ def methods(fleets: dict[int, tuple[int, int]] = FLEETS, rounds: int = ROUNDS) -
         for call, fleet, recording in zip(calls, drives, recordings, strict=True):
             fixes = np.linalg.norm(recording.gnss - fleet.position, axis=-1).mean()
             right.append(bool(np.mean(co.rt_le(call(), fleet)) < fixes))
-        spent = [
-            [timed(call) / (len(fleet.ids) * STEPS) for call, fleet in zip(calls, drives, strict=True)]
-            for _ in range(rounds)
-        ]
-        medians = np.median(spent, axis=0)
-        out += [
+        names = [f"{name}, {count} vehicles" for count in fleets]
+        spent = medians(
             {
-                "name": f"{name}, {count} vehicles",
-                "us": 1e6 * float(median),
-                "ratio": float(median / medians[0]),
-                "right": good,
-            }
-            for count, median, good in zip(fleets, medians, right, strict=True)
-        ]
+                each: lambda call=call, n=len(fleet.ids): timed(call) / (n * STEPS)
+                for each, call, fleet in zip(names, calls, drives, strict=True)
+            },
+            rounds,
+        )
+        out += rows_of("", spent, names[0], dict(zip(names, right, strict=True)))
     return out
 
 

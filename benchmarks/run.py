@@ -24,6 +24,7 @@ from timing import report
 
 HERE = Path(__file__).parent
 BENCHMARKS = (
+    "compile",
     "classical",
     "networked",
     "cliffs",

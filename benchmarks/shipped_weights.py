@@ -39,7 +39,6 @@ SENSORS = {
 }
 LIMITS = {
     "static": "Trained at 1.5 m and 10 % of each velocity component; at other noise it filters for these.",
-    "fresh": "Trained at 1.5 m and 10 % of each velocity component; at other noise it filters for these.",
     "roads": "Trained where everything errs (training.roads); where odometry is exact a Kalman filter is better.",
 }
 EVERYWHERE = "Four simulated drives on one flat map at 10 Hz."

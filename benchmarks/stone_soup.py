@@ -67,7 +67,7 @@ class RelativeMeasurements(NonLinearGaussianMeasurement):  # type: ignore[misc]
 
 def snapshot() -> Job:
     """All runs at some steps of the ring."""
-    recording = ring()
+    recording = ring(NEIGHBOURS, STEPS, RUNS)
     stars = [Problem.from_snapshot(recording, t, 0, b, KNOWN) for t in range(SHOWN) for b in range(RUNS)]
 
     def ours() -> Any:
@@ -100,7 +100,7 @@ def updated(updater: Any, stars: list[tuple[Any, Any]]) -> Callable[[], Any]:
 
 def joint_filter() -> Job:
     """The ego of two runs, each step a prediction and an update, against filterpy's numbers."""
-    recording = ring()
+    recording = ring(NEIGHBOURS, STEPS, RUNS)
     measured = measurements(recording, 0, inbox(recording, 0, FIX_AND_VELOCITY))
     assumed = assumptions(recording, KNOWN)
     drives = [peer_drive(recording, run) for run in range(2)]

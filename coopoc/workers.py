@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import atexit
+import gc
 import os
 import signal
 import sys
@@ -19,6 +20,7 @@ def main() -> None:
     It ends without the destructors of C++ libraries: one whose thread still runs would call "terminate".
     """
     status: object = 130
+    gc.set_threshold(100_000)  # a tenth of a short command is spent on collecting what libraries make while they load
     try:
         import_module("coopoc.cli").main()
     except SystemExit as ended:

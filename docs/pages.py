@@ -329,9 +329,9 @@ def _gallery() -> str:
 
 
 def _first_finding(page: Path) -> str:
-    """The first sentence of a page that begins in bold."""
-    found = re.search(r"\*\*.+?\*\*.*?\.(?=\s)", page.read_text(), re.DOTALL)
-    return " ".join(found.group(0).split()) if found else ""
+    """The first sentence of a page's first bullet that begins in bold."""
+    found = re.search(r"^- (\*\*.+?\*\*.*?\.)(?=\s)", page.read_text(), re.DOTALL | re.MULTILINE)
+    return " ".join(found[1].split()) if found else ""
 
 
 def _api() -> Iterator[tuple[str, str]]:

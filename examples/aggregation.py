@@ -99,7 +99,6 @@ def clients(p: Params, seed: int) -> tuple[Client, ...]:
     The noise of a vehicle is keyed by its name: it is the same as with its sensors for all. Of the training pieces the
     first ceil(share n) remain.
     """
-    from coopoc.learned.federation.participation import poisoned
     from coopoc.learned.training import clients as training
 
     count, acting = int(p["members"]), noise(p)
@@ -111,8 +110,14 @@ def clients(p: Params, seed: int) -> tuple[Client, ...]:
         for client, share in zip(whole, shares, strict=True)
     ]
     if p["condition"] == "poisoned data":
-        group[count // 2] = poisoned(group[count // 2], float(p["offset_m"]))
+        group[count // 2] = moved(group[count // 2], float(p["offset_m"]))
     return tuple(group)
+
+
+def moved(client: Client, offset: float) -> Client:
+    """The client with its reference drive `offset` m beside the true one on every axis."""
+    parts = {name: getattr(client, name) for name in ("training", "validation", "long")}
+    return replace(client, **{name: replace(part, truth=part.truth + offset) for name, part in parts.items()})
 
 
 def fitted(p: Params) -> NoiseModel:

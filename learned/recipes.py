@@ -6,7 +6,7 @@ import hashlib
 import json
 from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any, ClassVar, get_args
+from typing import Any, ClassVar
 
 import torch
 
@@ -21,16 +21,18 @@ from coopoc.world.sensors import Sensors, VelocityReading
 
 from .checkpoint import load
 from .nets.gain import Gain
-from .training.clients import Client, Noise, Start, check_pieces, clients
+from .training.clients import Client, Start, check_pieces, clients
 from .training.drives import Drives, MeasuredDrives
 from .training.measured import measured_clients
 from .training.roads import PIECE, roads
-from .training.schedule import STEPS, Epoch, Schedule
+from .training.schedule import STEPS, Schedule
 
 REVISION = 7
 """Raised whenever the training code changes what it makes of the same recipe."""
 KINDS = ("federated", "centralised", "individual", "okf")
 """Kinds of training."""
+STATIC, ROADS = "static", "roads"
+"""Noise of recipes: the paper's, and that of vehicles that drive in worlds of their own (`training.roads`)."""
 WEIGHTS = Path(__file__).parent / "weights"
 
 
@@ -42,11 +44,10 @@ class Recipe:
         kind: "federated", "centralised", "individual" (one net per client) or "okf" (all segments at once, no batches).
         schedule: optimiser, the same for all nets.
         rounds: of a federation.
-        local_epochs: of a federation, per round.
-        local_epoch: of a federation, a "pass" through the client's segments or a "step".
+        local_epochs: of a federation, passes through the client's segments per round.
         aggregate: rule of a federation, a name or "mine.py:NAME".
-        noise: of the training drives, "static" or "fresh", where it is simulated; "roads" for worlds as real
-            roads have them (`training.roads`); or outliers by name (`Outliers.named`), added to static noise.
+        noise: of the training drives where it is simulated: "static", the paper's; "roads" for worlds as real roads
+            have them (`training.roads`); or outliers by name (`Outliers.named`), added to the paper's.
         piece: steps of a segment.
         split: share of the segments that train.
         net: the net, an entry point in `coopoc.nets` or "mine.py:NAME".
@@ -66,9 +67,8 @@ class Recipe:
     schedule: Schedule = field(default_factory=Schedule)
     rounds: int = 20
     local_epochs: int = 5
-    local_epoch: Epoch = "pass"
     aggregate: str = "mean"
-    noise: str = "static"
+    noise: str = STATIC
     piece: int = 100
     split: float = 0.8
     net: str = "gain_net"
@@ -76,15 +76,13 @@ class Recipe:
 
     def __post_init__(self) -> None:
         one_of("kind of recipe", self.kind, KINDS)
-        if instance("noise", self.noise, str) not in (*get_args(Noise), ROADS):
+        if instance("noise", self.noise, str) not in (STATIC, ROADS):
             Outliers.named(self.noise)
         limits = {"rounds": STEPS, "local_epochs": STEPS}
-        check_fields(self, limits, local_epoch=Epoch, schedule=Schedule, options=tuple)
+        check_fields(self, limits, schedule=Schedule, options=tuple)
         check_pieces(self.piece, self.split)
 
 
-ROADS = "roads"
-"""Noise of a recipe whose vehicles drive in worlds of their own (`training.roads`)."""
 ROAD = Schedule(epochs=120, batch=24, learning_rate=0.1, weight_decay=0.0, mirror=False)
 RECIPES: dict[str, Recipe] = {
     "fedkalmannet": Recipe("federated"),
@@ -145,7 +143,7 @@ class Job:
 def sensors(job: Job) -> Sensors:
     """The paper's training noise in the setting's reading, with the recipe's outliers."""
     noise = job.recipe.noise
-    outliers = None if noise in (*get_args(Noise), ROADS) else Outliers.named(noise)
+    outliers = None if noise in (STATIC, ROADS) else Outliers.named(noise)
     return replace(Sensors.paper_training(job.setting.reading), outliers=outliers)
 
 
@@ -219,16 +217,7 @@ def job_clients(job: Job, fleet: Drives) -> tuple[Client, ...]:
         fleet, recipe = roads(fleet, setting.seed), replace(recipe, piece=max(recipe.piece, long))
     if isinstance(fleet, MeasuredDrives):
         return measured_clients(fleet, start=setting.start, piece=recipe.piece, split=recipe.split)
-    noise: Any = recipe.noise if recipe.noise in get_args(Noise) else "static"
-    return clients(
-        fleet,
-        sensors(job),
-        seed=setting.seed,
-        noise=noise,
-        start=setting.start,
-        piece=recipe.piece,
-        split=recipe.split,
-    )
+    return clients(fleet, sensors(job), seed=setting.seed, start=setting.start, piece=recipe.piece, split=recipe.split)
 
 
 def untrained(job: Job) -> Gain:

@@ -185,7 +185,7 @@ def _task(job: Job, data: Sequence[Client]) -> Task:
 
 def _federated(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
     recipe, nets = todo[0].recipe, [untrained(job) for job in todo]
-    plan = Plan(recipe.rounds, recipe.aggregate, recipe.local_epochs, recipe.schedule, recipe.local_epoch)
+    plan = Plan(recipe.rounds, recipe.aggregate, recipe.local_epochs, recipe.schedule)
     done = federate_many(nets, [data[j.setting] for j in todo], [j.setting.seed for j in todo], plan, stage)
     models = []
     for job, federation in zip(todo, done, strict=True):

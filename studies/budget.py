@@ -18,7 +18,6 @@ from .lineup import PAST
 from .views import of, selections
 
 if TYPE_CHECKING:
-    from coopoc.evaluate.ledger import Kind, Ledger
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
 
@@ -127,41 +126,24 @@ def _findings(results: Results) -> dict[str, str]:
     return texts
 
 
-def _account(results: Results, where: Where) -> Ledger | None:
-    """The ledger of one second of the drive; None where the method was not run."""
-    from coopoc.evaluate.ledger import Ledger
-    from coopoc.evaluate.scores import BYTES
-
-    kept = present(results, where)
-    if kept is None:
-        return None
-    egos = sorted(results.select(kept)["ego"].unique())
-    rates = {counted: results.values(name, kept).T for name, counted in BYTES.items()}
-    moved = np.zeros((2, 2, 2, *next(iter(rates.values())).shape))
-    for (kind, way), rate in rates.items():
-        moved[int(way == "per receiver"), 1, int(kind == "on air")] = rate
-    return Ledger(tuple(egos), np.ones(len(egos)), moved[0], moved[1])
-
-
-def _rate(results: Results, where: Where, kind: Kind = "payload") -> int | None:
-    account = _account(results, where)
-    return None if account is None else round(account.rate(kind))
+def _rate(results: Results, where: Where, value: str = PAYLOAD) -> int | None:
+    rate = mean(results, where, value)
+    return None if rate is None else round(rate)
 
 
 def even(results: Results) -> Table | None:
     """Driving time after which online cooperation has moved as many bytes as a training, per method and channel."""
-    from coopoc.evaluate.ledger import break_even
 
-    def time(total: Ledger) -> Number:
+    def time(once: float) -> Number:
         def column(results: Results, where: Where) -> str | None:
-            account = _account(results, where)
-            return None if account is None else duration(break_even(total, account))
+            rate = mean(results, where, PAYLOAD)
+            return None if rate is None else duration(once / rate if rate else np.inf)
 
         return column
 
     ran = [name for name in TRAINED if present(results, {"method": name})]
-    trainings = {look(name).label: weights.ledger(results.settings, name) for name in ran}
-    once = {f"{name}, {t.per_vehicle('training') / 1e3:,.0f} kB": time(t) for name, t in trainings.items()}
+    sizes = {look(name).label: weights.ledger(results.settings, name).per_vehicle("training") for name in ran}
+    once = {f"{name}, {size / 1e3:,.0f} kB": time(size) for name, size in sizes.items()}
     rows = [row for row in METHODS if row[1]["noise_model"] == "nominal"] if once else []
     text = (
         f"Driving time after which online cooperation (K = {MOST}) has moved as many bytes as each training moved per "
@@ -199,7 +181,7 @@ STUDY = lineup.study(
         "channels": selections(
             ("Channel", "Method", "Noise model"),
             METHODS,
-            {"RT-LE [m]": mean, "Payload [B/s]": _rate, "On air [B/s]": partial(_rate, kind="on air")},
+            {"RT-LE [m]": mean, "Payload [B/s]": _rate, "On air [B/s]": partial(_rate, value="bytes_per_second")},
             f"K = {MOST} over field channels (CAM, BSM, CPM): rate, latency, bursts of loss, and what a message "
             "carries anyway. Payload is what a method adds.",
             decimals=3,

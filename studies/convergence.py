@@ -15,7 +15,7 @@ from coopoc.study.study import Params, Row
 from coopoc.study.style import Panel
 
 from . import lineup, scene, weights
-from .views import table
+from .views import curves, table
 
 if TYPE_CHECKING:
     from coopoc.study.figures import Plot
@@ -78,8 +78,6 @@ def _seeds(results: Results, where: Where) -> Interval | None:
 
 
 def _figure(results: Results) -> Plot | None:
-    from coopoc.study import figures
-
     rounds = sorted(results.frame["round"].unique()) if "round" in results.frame else ()
     ticks = {number: str(number) for number in rounds if number % 5 == 0}
     panel = Panel({number: {"round": number} for number in rounds}, xlabel="Round", ticks=ticks)
@@ -88,7 +86,7 @@ def _figure(results: Results) -> Plot | None:
         "lowest to the highest); horizontal: the individual nets at their end."
     )
     lines, ends = ([{"method": name} for name in names] for names in (BOTH["method"], weights.INDIVIDUAL))
-    return figures.curves(results, [panel], lines, scene.caption(results, text), _seeds, ends, width=6.4, log=True)
+    return curves([panel], lines, text, number=_seeds, levels=ends, width=6.4, log=True)(results)
 
 
 def _findings(results: Results) -> dict[str, str]:

@@ -29,8 +29,8 @@ ERRORS = {
 CASES = {name: dict(zip(scene.LASTING, shares, strict=True)) for name, shares in ERRORS.items()}
 """Error models as selections."""
 NEIGHBOURS = (0, 2, 6, 10)
-KS = {f"K = {k}": {"max_neighbours": k} for k in NEIGHBOURS}
 X = {k: {"max_neighbours": k} for k in NEIGHBOURS}
+KS = {f"K = {k}": also for k, also in X.items()}
 SOLO = (("gnss", "none"), ("kalman", "nominal"), ("fedkalmannet", "trained"))
 SHARED = (("joint", "nominal"), ("split-ci", "nominal"), ("cooperative-filter", "nominal"))
 """Nominal noise model: all but the last take the whole error of a fix as white, of the same variance."""
@@ -102,10 +102,7 @@ STUDY = lineup.study(
     },
     figures={
         "rms": curves(
-            [
-                Panel({k: {"max_neighbours": k} for k in NEIGHBOURS}, c, name, "Neighbours K")
-                for name, c in CASES.items()
-            ],
+            [Panel(X, case, name, "Neighbours K") for name, case in CASES.items()],
             [of(*line) for line in (*SHARED, STAR, PAST)],
             "rms over runs of RT-LE against the number of neighbours, with 95 % intervals over runs: {runs} draws of "
             "an error that all vehicles share scatter that much about the bound, also below it.",

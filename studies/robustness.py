@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.numbers import Number, Where, across, mean, ratio, seed_means, sentence
+from coopoc.study.numbers import Where, across, mean, ratio, seed_means, sentence
 
 from . import lineup, scene
 from .lineup import BOUND
-from .views import labelled, multiples, of, selections
+from .views import HEAD, labelled, multiples, of, selections
 
 if TYPE_CHECKING:
     from coopoc.study.results import Results
@@ -55,12 +55,6 @@ def _against_clean(results: Results, where: Where) -> list[float]:
     return [now / before for now, before in zip(seed_means(results, where), clean, strict=False)]
 
 
-def _table(results: Results) -> Any:
-    columns: dict[str, Number] = across(mean, CASES)
-    rows = labelled((*METHODS, BOUND))
-    return selections(("Method", "Noise model"), rows, columns, "RT-LE [m].", NOTE, decimals=2)(results)
-
-
 FINDING = (
     "{what}: the joint filter has {joint:.2f} times its error where nothing is wrong, FedKalmanNet {net:.2f} times, "
     "the Kalman filter {solo:.2f} times."
@@ -96,7 +90,9 @@ STUDY = lineup.study(
         "train_seeds": 1,
     },
     shares=tuple(case()),
-    tables={"rt_le": _table},
+    tables={
+        "rt_le": selections(HEAD, labelled((*METHODS, BOUND)), across(mean, CASES), "RT-LE [m].", NOTE, decimals=2)
+    },
     figures={
         "rt_le": multiples(
             METHODS,

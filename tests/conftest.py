@@ -1,8 +1,10 @@
 """Fleets that tests share."""
 
 import importlib
+import os
 from collections.abc import Sequence
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -11,20 +13,42 @@ import pytest
 
 from coopoc import Fleet, load_fleet
 from coopoc.arrays import Floats
+from coopoc.data.fetch import public
 from coopoc.data.fleet_files import write_table
 from coopoc.errors import InputError
 from coopoc.study.study import Study
 
 collect_ignore = ["fuzz"]
 """Its programs need atheris; what they found is replayed by test_data_fuzz.py."""
-SHARED = Path(__file__).resolve().parents[2] / "shared" / "data"
+MEASURED = os.environ.get("COOPOC_TEST_DATA", "")
+"""Folder of measurements of others, with what `coopoc data get` fetches; files are found by name, however deep."""
 
 
-@pytest.fixture(scope="session")
-def shared() -> Path:
-    if not SHARED.is_dir():
-        pytest.skip("the shared data folder is not beside the project")
-    return SHARED
+@cache
+def located(name: str) -> Path | None:
+    """Path of a file or folder of the measurements."""
+    folder = Path(MEASURED)
+    return (folder if name == "." else next(iter(sorted(folder.rglob(name))), None)) if MEASURED else None
+
+
+def measured(name: str = "") -> Path:
+    """The same, or the whole folder; skips, and says how to get them, where they are absent."""
+    if path := located(name or "."):
+        return path
+    gets = [
+        f"run coopoc data get {key}"
+        for key, one in public().items()
+        if f"/{name}" in f"/{one.opens} /{' /'.join(one.files)}"
+    ]
+    how = gets[0] if gets and name else "CONTRIBUTING.md says where they are"
+    pytest.skip(f"no {name or 'measurements'}: {how}, then set COOPOC_TEST_DATA to the folder of all")
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter, config: pytest.Config) -> None:
+    """Leave what was skipped, a line a test: `pytest @.pytest_cache/d/skipped/tests` runs that alone."""
+    if cache := getattr(config, "cache", None):
+        skipped = {report.nodeid for report in terminalreporter.stats.get("skipped", ())}
+        (cache.mkdir("skipped") / "tests").write_text("\n".join(sorted(skipped)))
 
 
 def refused(match: str) -> Any:

@@ -1,4 +1,4 @@
-"""docs/oracles.md from the tests themselves: what was compared with what we did not write, and to which tolerance.
+"""docs/oracles.md from the tests themselves: their independent references and tolerances.
 
 python tests/oracle_page.py        # writes the page; tests/test_reliability.py holds that it is current
 """
@@ -32,37 +32,35 @@ REFERENCES = {
     "published value": r"published",
 }
 TOLERANCE = re.compile(r"\b((?:atol|rtol|rel|abs)=[0-9][0-9.e+-]*)")
-HEAD = """# What was compared with what we did not write
+HEAD = """# Independent references
 
-Generated from the tests by `python tests/oracle_page.py`. Each row is a test that names an independent reference in
-its docstring; the tolerances are those of its assertions (where none stands, the test has a bound or an interval of its
-own). `tests/oracles` holds a dense textbook implementation of every method, and `tests/test_paper_scenario.py`
-reproduces the README's table by a simulation that shares no code with the toolkit.
+Which numbers are checked against software that is not ours? Each row is a test file with its tests that name an
+independent reference, and the tolerances of their assertions (without one, a test has a bound or an interval).
+`tests/oracles` holds a dense textbook implementation of every method, and `tests/test_paper_scenario.py` reproduces
+the README's table without the toolkit. `python tests/oracle_page.py` writes this page.
 
 """
 
 
-def rows() -> Iterator[tuple[str, str, str, str]]:
-    """Subject, references, tolerances and test of every test with an independent reference."""
+def rows() -> Iterator[tuple[str, str]]:
+    """File and tests, with reference and tolerances, of every file with an independent reference."""
     for file in sorted(TESTS.glob("test_*.py")):
-        text = file.read_text()
-        tree = ast.parse(text)
-        for node in tree.body:
+        text, tests = file.read_text(), []
+        for node in ast.parse(text).body:
             if isinstance(node, ast.FunctionDef) and node.name.startswith("test_"):
                 words = " ".join((ast.get_docstring(node) or "").split())
-                source = ast.get_source_segment(text, node) or ""
-                references = [name for name, pattern in REFERENCES.items() if re.search(pattern, words, re.IGNORECASE)]
-                if references:
-                    tolerance = ", ".join(dict.fromkeys(TOLERANCE.findall(source))) or "its own"
-                    subject = node.name.removeprefix("test_").replace("_", " ")
-                    yield subject, ", ".join(references), tolerance, f"{file.stem}::{node.name}"
+                named = [name for name, pattern in REFERENCES.items() if re.search(pattern, words, re.IGNORECASE)]
+                limits = dict.fromkeys(TOLERANCE.findall(ast.get_source_segment(text, node) or ""))
+                held = ": ".join(", ".join(part) for part in (named, limits) if part)
+                tests += [f"`{node.name.removeprefix('test_')}` ({held})"] * bool(named)
+        if tests:
+            yield file.stem, "; ".join(tests)
 
 
 def page() -> str:
     """The whole page."""
-    lines = ["| what | reference | tolerance | test |", "|---|---|---|---|"]
-    lines += [f"| {what} | {reference} | {tolerance} | `{test}` |" for what, reference, tolerance, test in rows()]
-    return HEAD + "\n".join(lines) + "\n"
+    lines = ["| file | tests, with reference and tolerances |", "|---|---|"]
+    return HEAD + "\n".join([*lines, *(f"| `{file}` | {tests} |" for file, tests in rows())]) + "\n"
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import measured, refused
 
 import coopoc as co
 from coopoc.data.registry import load_log
@@ -24,16 +24,14 @@ BASELINE = {"a: ours": {"ratio": 1.0, "tolerance": 1.5}, "b: ours": {"ratio": 0.
 
 
 @pytest.fixture
-def load(monkeypatch: pytest.MonkeyPatch) -> Any:
-    """Import a benchmark by name, as its neighbours do."""
-    monkeypatch.syspath_prepend(str(FOLDER))
+def load() -> Any:
+    """Import a benchmark by name; some need libraries."""
     return importlib.import_module
 
 
 @pytest.fixture
-def run(load: Any) -> ModuleType:
-    module: ModuleType = load("run")
-    return module
+def run() -> ModuleType:
+    return importlib.import_module("run")
 
 
 def row(name: str, ratio: float, right: bool | None = True) -> dict[str, Any]:
@@ -99,7 +97,7 @@ def test_the_command_prints_writes_and_fails(
 
 def test_stone_soup_ends_where_we_end(load: Any, monkeypatch: pytest.MonkeyPatch) -> None:
     """Its iterated update and its filter; one extended update does not."""
-    pytest.importorskip("stonesoup")
+    pytest.importorskip("stonesoup", reason="pip install stonesoup")
     classical = load("classical")
     monkeypatch.setattr(classical, "RUNS", 2)
     monkeypatch.setattr(classical, "STEPS", 21)
@@ -287,17 +285,20 @@ class Own:
 
 
 @pytest.mark.slow
-def test_real_measurements_are_tasks_for_pose_filters(shared: Path, tmp_path: Path) -> None:
+def test_real_measurements_are_tasks_for_pose_filters(tmp_path: Path) -> None:
     """The row's RT-LE is that of a PoseFilter by hand; a method of one's own gets the first poses and the noise."""
     (tmp_path / "mine.py").write_text(OWN_POSES)
+    (tmp_path / "alone").mkdir()
+    (tmp_path / "alone" / "tiers.pyfg").symlink_to(measured("tiers.pyfg"))
+    measured("MRCLAM_Dataset6")
     rows = {}
     for name in ("pose-solo", "pose-fleet", f"{tmp_path / 'mine.py'}:Own"):
-        made = benchmark.card(name, [], shared / "pyfg") if "fleet" in name else None
-        rows[name] = {row["task"]: row for row in (made or benchmark.card(name, [], shared))["tasks"]}
+        made = benchmark.card(name, [], tmp_path / "alone") if "fleet" in name else None
+        rows[name] = {row["task"]: row for row in (made or benchmark.card(name, [], measured()))["tasks"]}
     assert "must hold MRCLAM_Dataset6" in rows["pose-fleet"]["robots"]["failed"]
     solo, whole = rows["pose-solo"]["uwb"], rows["pose-fleet"]["uwb"]
     assert whole["rt_le_m"][2] < solo["rt_le_m"][0]
-    log = load_log(shared / "pyfg" / "tiers.pyfg")
+    log = load_log(measured("tiers.pyfg"))
     assert log.truth is not None
     assert log.truth.heading is not None
     begin = np.column_stack([log.truth.position[0], log.truth.heading[0]])
@@ -319,8 +320,8 @@ def test_real_measurements_are_tasks_for_pose_filters(shared: Path, tmp_path: Pa
     assert own["robots"]["data"] == rows["pose-solo"]["robots"]["data"]
 
 
-def test_graphs_are_tasks_for_backends(shared: Path) -> None:
-    row = tasks.graph_row(shared, "mrclam5a.pyfg", "gauss-newton")
+def test_graphs_are_tasks_for_backends() -> None:
+    row = tasks.graph_row(measured("mrclam5a.pyfg").parent, "mrclam5a.pyfg", "gauss-newton")
     assert row["status"] == "SOLVED"
     assert row["over_best"] == pytest.approx(1.0, abs=1e-4)
     shown = benchmark.page([{"method": "gauss-newton", "tasks": [row]}])

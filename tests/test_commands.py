@@ -15,6 +15,7 @@ from typing import Any
 
 import pytest
 import tyro
+from conftest import located
 from shell import ran
 
 import coopoc as co
@@ -24,14 +25,13 @@ from coopoc.data.fetch import public
 from coopoc.study.cell import assignments
 
 ROOT = Path(__file__).resolve().parents[1]
-DATA = ROOT.parent / "shared" / "data"
 PAGES = [ROOT / "README.md", ROOT / "CONTRIBUTING.md", *sorted((ROOT / "docs").glob("*.md"))]
 PAGES += [*sorted((ROOT / "docs" / "tutorials").glob("*.py")), ROOT / "docs" / "pages.py"]
 WORDS = {"NAME": "neighbours", "FOLDER": "runs/neighbours", "METHOD": "joint", "RECIPE": "okf", "LOG": "mylog"}
 WORDS["$SLURM_ARRAY_TASK_ID"] = "1"
 """What stands for a choice of the reader."""
-FETCHED = {"mrclam-set6": DATA / "mrclam", "tiers": DATA / "pyfg"}
-"""Data that the repository does not hold, and the folder of its files."""
+FETCHED = {"mrclam-set6": "MRCLAM_Dataset6", "tiers": "tiers.pyfg"}
+"""Data that the repository does not hold, and what they open."""
 
 
 def commands(path: Path) -> list[str]:
@@ -103,9 +103,9 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     graph += [f"EDGE_SE2 {k} {k + n} {n} 0 0 9 0 0 9 0 9" for n in (1, 4) for k in range(12 - n)]
     (out / "drive.g2o").write_text("\n".join(graph) + "\n")
     (out / "fetched").mkdir()
-    for name, there in FETCHED.items():
-        if there.exists():
-            (out / "fetched" / name).symlink_to(there)
+    for name, opens in FETCHED.items():
+        if there := located(opens):
+            (out / "fetched" / name).symlink_to(there.parent)
     for name in ("benchmarks", "examples"):
         (out / name).symlink_to(ROOT / name)
     return out

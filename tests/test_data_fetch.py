@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import measured, refused
 
 import coopoc as co
 from coopoc.cli import _status
@@ -289,12 +289,11 @@ def test_the_registry_is_complete_and_pins_every_address(cache: Path, capsys: py
 
 @pytest.mark.parametrize("name", public())
 def test_the_registry_has_the_hashes_of_what_the_pages_were_computed_from(
-    name: str, cache: Path, shared: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    name: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Through a mirror made of the files; what it returns is read by the commands that take it."""
-    for file, (_, size, _) in public()[name].files.items():
-        part = Path("tiers_ros2" if name == "tiers-ros2" else "", *Path(file).parts[-3:])
-        (source,) = (path for path in shared.rglob(part.name) if path.match(str(part)) and path.stat().st_size == size)
+    for file in public()[name].files:
+        source = measured("/".join(Path(file).parts[-3:]))
         copy = tmp_path / "mirror" / name / file
         copy.parent.mkdir(parents=True, exist_ok=True)
         copy.symlink_to(source)
@@ -366,9 +365,10 @@ def test_what_is_missing_names_the_command_that_brings_it(
 
 
 def test_a_task_of_real_measurements_runs_alone(
-    shared: Path, cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+    cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    folder = shared / "road"
+    measured("span_truth.gga")
+    folder = measured("ublox_f9k.nmea").parent
     words = ["benchmark", "road-kalman", "--tasks", "f9k", "--data", str(folder), "--out", str(tmp_path)]
     assert _status(words) == 0
     rows = [line for line in capsys.readouterr().out.splitlines() if "road-kalman" in line]

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import measured, refused
 from scipy import signal
 from scipy.spatial import cKDTree
 
@@ -26,18 +26,16 @@ assert spec.loader is not None
 script = sys.modules["make_fleet"] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(script)
 Recipe, make = script.Recipe, script.make
-MAPS = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "carla_maps"
 TINY = Recipe("tiny", "Town10HD.xodr", vehicles=6, steps=(60, 60, 60, 60, 60, 40), seed=1, platoon=2)
 with_sumo = pytest.mark.skipif(
-    importlib.util.find_spec("sumo") is None or not MAPS.is_dir(),
-    reason="needs eclipse-sumo and CARLA's maps at ../shared/data/carla_maps",
+    importlib.util.find_spec("sumo") is None, reason="eclipse-sumo is not installed: pip install 'coopoc[sumo]'"
 )
 
 
 @with_sumo
 def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path: Path) -> None:
-    one, two = (make(TINY, MAPS, tmp_path / name) for name in ("one", "two"))
-    other = make(replace(TINY, seed=2), MAPS, tmp_path / "other")
+    one, two = (make(TINY, measured("Town10HD.xodr").parent, tmp_path / name) for name in ("one", "two"))
+    other = make(replace(TINY, seed=2), measured("Town10HD.xodr").parent, tmp_path / "other")
     for suffix in ("parquet", "json"):
         assert (tmp_path / "one" / f"tiny.{suffix}").read_bytes() == (tmp_path / "two" / f"tiny.{suffix}").read_bytes()
     assert one == two
@@ -54,16 +52,15 @@ def test_a_bundled_fleet_is_made_again_bit_by_bit(tmp_path: Path) -> None:
     stated = card("town10-clients")
     if version("eclipse-sumo") != stated["sumo"]:
         pytest.skip(f"the bundled fleets were made with eclipse-sumo {stated['sumo']}")
-    made = make("town10-clients", MAPS, tmp_path)
+    made = make("town10-clients", measured("Town10HD.xodr").parent, tmp_path)
     assert {**made, "command": ""} == {**stated, "command": "", "recipe": made["recipe"]}
     assert Recipe(**made["recipe"]) == script.bundled_recipe("town10-clients")
 
 
-@pytest.mark.skipif(not MAPS.is_dir(), reason="needs CARLA's maps at ../shared/data/carla_maps")
 def test_elevation_is_that_of_the_map() -> None:
     """Independent check: elevation polynomials of the OpenDRIVE file at its reference lines, without netconvert."""
     points = []
-    for road in ElementTree.parse(MAPS / "Town04.xodr").getroot().iter("road"):
+    for road in ElementTree.parse(measured("Town04.xodr")).getroot().iter("road"):
         profile = [[float(e.attrib[k]) for k in "sabcd"] for e in road.iter("elevation")]
         for g in road.iter("geometry"):
             start, a, b, c, d = next(row for row in reversed(profile) if row[0] <= float(g.attrib["s"]) + 1e-9)
@@ -111,7 +108,7 @@ def test_without_sumo_the_pip_line_is_shown(monkeypatch: pytest.MonkeyPatch) -> 
 @with_sumo
 def test_what_was_made_is_loaded_and_converted(tmp_path: Path) -> None:
     made = tmp_path / "tiny.parquet"
-    make(TINY, MAPS, tmp_path)
+    make(TINY, measured("Town10HD.xodr").parent, tmp_path)
     fleet = load_fleet(made)
     assert load_fleet(f"{made}?format=table").digest == fleet.digest
     convert(made, tmp_path / "a.csv")

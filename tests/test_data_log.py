@@ -13,6 +13,7 @@ from logs import NOISE, drive, long, observed, write
 from numpy.testing import assert_allclose
 
 import coopoc as co
+from coopoc.data.log.motion import Signal, step_means
 from coopoc.data.log.read import read_log
 from coopoc.evaluate.metrics import nees
 
@@ -273,3 +274,12 @@ def test_bearings_in_body_frames_turn_with_the_car(tmp_path: Path, late: float) 
         place, heading = circle(log.t[step])
         off = relative[1] - np.arctan2(*(far - place)[::-1]) + heading
         assert np.arctan2(np.sin(off), np.cos(off)) == pytest.approx(0, abs=1e-4)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_mean_over_a_step_is_that_over_its_halves(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    signal = Signal(np.cumsum(rng.uniform(0.01, 1.0, 9)), rng.uniform(-1e6, 1e6, (9, 1)))
+    halves = step_means(signal, 0.15 * np.arange(-1, 17))[:, 0]
+    whole = step_means(signal, 0.3 * np.arange(9))[:, 0]
+    assert_allclose(whole, (halves[::2] + halves[1::2]) / 2, atol=1e-6, rtol=1e-9)

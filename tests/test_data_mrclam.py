@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import measured, refused
 from scipy.linalg import lstsq
 
 import coopoc as co
@@ -17,13 +17,12 @@ from coopoc.studies.pose_drives import thinned
 from coopoc.world.body_frames import gauss_markov, midway, turned
 from coopoc.world.links import wrap
 
-FOLDER = Path(__file__).resolve().parents[1].parent / "shared" / "data" / "mrclam" / "MRCLAM_Dataset6"
-present = pytest.mark.skipif(not FOLDER.is_dir(), reason="UTIAS MR.CLAM set 6 is not at ../shared/data/mrclam")
+SET = "MRCLAM_Dataset6"
 
 
 @pytest.fixture(scope="module")
 def log() -> MrclamLog:
-    return read_mrclam(FOLDER)
+    return read_mrclam(measured(SET))
 
 
 @pytest.fixture(scope="module")
@@ -36,24 +35,24 @@ def seen(log: MrclamLog, known: Calibration) -> co.Recording:
     return pose_recording(log, known)
 
 
-@present
 def test_every_line_of_the_files_is_there_or_stands_beside_a_nearer_one(seen: co.Recording) -> None:
     """Counted from the raw text: steps, robots and subjects that were measured, and what was measured there."""
-    barcodes = {int(a[1]): int(a[0]) for a in np.loadtxt(FOLDER / "Barcodes.dat")}
+    folder = measured(SET)
+    barcodes = {int(a[1]): int(a[0]) for a in np.loadtxt(folder / "Barcodes.dat")}
     start = max(
-        np.loadtxt(FOLDER / f"Robot{n}_{what}.dat")[0, 0] for n in range(1, 6) for what in ("Groundtruth", "Odometry")
+        np.loadtxt(folder / f"Robot{n}_{what}.dat")[0, 0] for n in range(1, 6) for what in ("Groundtruth", "Odometry")
     )
     wanted: dict[tuple[int, int, int], list[tuple[float, float]]] = {}
     for robot in range(1, 6):
-        for t, code, reach, bearing in np.loadtxt(FOLDER / f"Robot{robot}_Measurement.dat"):
+        for t, code, reach, bearing in np.loadtxt(folder / f"Robot{robot}_Measurement.dat"):
             subject, step = barcodes.get(int(code), 0), round((t - start) / 0.1)
             if subject and 0 <= step < len(seen.t):
                 wanted.setdefault((step, robot - 1, subject - 1), []).append((reach, bearing))
     links = seen.links
     found = list(zip(links.step.tolist(), links.observer.tolist(), links.neighbour.tolist(), strict=True))
     assert set(found) == set(wanted)
-    for key, measured in zip(found, seen.relative[0, :, :2].tolist(), strict=True):
-        assert tuple(measured) in wanted[key]
+    for key, pair in zip(found, seen.relative[0, :, :2].tolist(), strict=True):
+        assert tuple(pair) in wanted[key]
     assert seen.landmarks == tuple(range(5, 20))
     assert np.isnan(seen.gnss[:, :, :5]).all()
     assert seen.body is not None
@@ -72,7 +71,6 @@ def test_white_noise_keeps_its_standard_deviation_and_errors_that_last_are_widen
     assert grouped(lasting[:, 0], robot, t) == pytest.approx(np.sqrt((1 + c) / (1 - c)), rel=0.06)
 
 
-@present
 def test_odometry_follows_its_log_late_and_slower_in_turns(log: MrclamLog, known: Calibration) -> None:
     """SciPy's correlation and least squares over 5 s of the first 300 s; the rest, which calibrated nothing, moves by
     what it says with half the error of a scale alone."""
@@ -91,7 +89,6 @@ def test_odometry_follows_its_log_late_and_slower_in_turns(log: MrclamLog, known
         calibrate(log, 1e4)
 
 
-@present
 def test_no_landmark_and_one_are_no_worse_than_published_filters_of_the_same_state(
     log: MrclamLog, seen: co.Recording
 ) -> None:
@@ -104,7 +101,6 @@ def test_no_landmark_and_one_are_no_worse_than_published_filters_of_the_same_sta
         assert np.sqrt(np.nanmean(squares.reshape(-1, 300, 5), axis=1)).mean() < most
 
 
-@present
 def test_first_poses_are_found_from_what_is_seen(log: MrclamLog, seen: co.Recording) -> None:
     """Vicon's poses, which the start does not know."""
     begin = co.pose_start(seen)[0, :5]
@@ -121,26 +117,25 @@ def test_first_poses_are_found_from_what_is_seen(log: MrclamLog, seen: co.Record
 @pytest.fixture(scope="module")
 def other_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """Another folder of MR.CLAM: four robots, in another order, 500 s."""
-    folder = tmp_path_factory.mktemp("sets") / "MRCLAM_Dataset0"
+    source, folder = measured(SET), tmp_path_factory.mktemp("sets") / "MRCLAM_Dataset0"
     folder.mkdir()
     order = {3: 1, 1: 2, 5: 3, 2: 4}
-    start = np.loadtxt(FOLDER / "Robot1_Groundtruth.dat")[0, 0] + 100
+    start = np.loadtxt(source / "Robot1_Groundtruth.dat")[0, 0] + 100
     for old, new in order.items():
         for what in ("Groundtruth", "Odometry", "Measurement"):
-            lines = (FOLDER / f"Robot{old}_{what}.dat").read_text().splitlines()
+            lines = (source / f"Robot{old}_{what}.dat").read_text().splitlines()
             kept = [x for x in lines if x.startswith("#") or start <= float(x.split()[0]) < start + 500]
             (folder / f"Robot{new}_{what}.dat").write_text("\n".join(kept) + "\n")
-    rows = np.loadtxt(FOLDER / "Barcodes.dat").astype(int)
+    rows = np.loadtxt(source / "Barcodes.dat").astype(int)
     renamed = [(order.get(subject, subject), code) for subject, code in rows.tolist() if subject != 4]
     (folder / "Barcodes.dat").write_text("\n".join(f"{subject} {code}" for subject, code in renamed) + "\n")
-    shutil.copy(FOLDER / "Landmark_Groundtruth.dat", folder)
+    shutil.copy(source / "Landmark_Groundtruth.dat", folder)
     return folder
 
 
-@present
 @pytest.mark.parametrize("which", [pytest.param("set 6", marks=pytest.mark.slow), "another"])
 def test_the_study_runs_on_any_set(which: str, other_set: Path, tmp_path: Path) -> None:
-    data = FOLDER if which == "set 6" else other_set
+    data = measured(SET) if which == "set 6" else other_set
     most = 4 if which == "set 6" else 3
     settings: dict[str, Any] = {"data": str(data), "max_neighbours": f"0,{most}", "landmarks": "0,15"}
     settings |= {"calibrate_s": 200.0, "evaluations": 9}
@@ -162,7 +157,6 @@ def test_the_study_runs_on_any_set(which: str, other_set: Path, tmp_path: Path) 
     assert all((folder / "figures" / f"{name}.png").stat().st_size > 10_000 for name in ("rt_le", "training"))
 
 
-@present
 def test_folders_that_cannot_be_used_are_named(other_set: Path, tmp_path: Path) -> None:
     bare = tmp_path / "bare"
     shutil.copytree(other_set, bare)
@@ -178,7 +172,6 @@ def test_folders_that_cannot_be_used_are_named(other_set: Path, tmp_path: Path) 
             co.run_study("real", tmp_path / "out", settings={"data": str(data), **more}, progress=False)
 
 
-@present
 def test_real_measurements_have_the_stated_noise(log: MrclamLog) -> None:
     """Published value for this set, found independently of this reader: 0.095 m and 0.007 rad, robust."""
     error = (log.others[:, 3:] - log.true_others)[np.isfinite(log.true_others[:, 0])]
@@ -189,7 +182,6 @@ def test_real_measurements_have_the_stated_noise(log: MrclamLog) -> None:
         assert 0.001 < outliers.mean() < 0.05, "rare"
 
 
-@present
 def test_measurements_are_counted_like_the_description(log: MrclamLog) -> None:
     """Stated for this set: 15383 of landmarks, 6 unknown barcodes, 3906 between robots that have truth."""
     assert (len(log.sightings), log.unknown) == (15383, 6)
@@ -198,9 +190,8 @@ def test_measurements_are_counted_like_the_description(log: MrclamLog) -> None:
     assert not (log.others[:, 2] == log.others[:, 1]).any()
 
 
-@present
 def test_fleet_is_vicon_at_10_hz_with_the_gap_of_robot_4(log: MrclamLog) -> None:
-    fleet = load_fleet(FOLDER)
+    fleet = load_fleet(measured(SET))
     assert fleet.digest == log.fleet.digest
     assert fleet.dt == 0.1
     assert 750 < fleet.t[-1] < 772

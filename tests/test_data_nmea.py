@@ -11,7 +11,7 @@ import numpy as np
 import pandas as pd
 import pymap3d
 import pytest
-from conftest import refused
+from conftest import measured, refused
 from logs import drive
 from numpy.testing import assert_allclose
 
@@ -82,11 +82,10 @@ def test_a_truth_in_nmea_is_of_the_only_car_and_of_its_day(tmp_path: Path) -> No
         read_log(tmp_path)
 
 
-def test_a_real_car_that_stops_keeps_all_its_fixes(shared: Path) -> None:
+def test_a_real_car_that_stops_keeps_all_its_fixes() -> None:
     """1,653 fixes of a u-blox F9K, a third of them at standstill, where it gives no course; and a surveyed truth."""
     pytest.importorskip("pynmeagps")
-    road = shared / "road" / "f9k"
-    log = read_log(road / "ublox_f9k.nmea", truth=road / "span_truth.gga")
+    log = read_log(measured("ublox_f9k.nmea"), truth=measured("span_truth.gga"))
     assert log.summary.read == {"fixes": 1653}
     assert list(log.summary.refused) == ["damaged NMEA sentences"]
     assert log.truth is not None
@@ -123,11 +122,11 @@ def test_without_pynmeagps_the_pip_line_is_shown(tmp_path: Path, monkeypatch: py
             read_log(tmp_path / file)
 
 
-def test_the_cats_cars_agree_with_pynmeagps_and_pymap3d(shared: Path) -> None:
+def test_the_cats_cars_agree_with_pynmeagps_and_pymap3d() -> None:
     """Real data: 100 positions of the first car, parsed and converted by the libraries alone."""
     pynmeagps = pytest.importorskip("pynmeagps")
-    log = read_log(shared / "cats_nmea" / "AV_veh1.nmea", dt=0.1)
-    lines = (shared / "cats_nmea" / "AV_veh1.nmea").read_bytes().splitlines()[:100]
+    log = read_log(measured("AV_veh1.nmea"), dt=0.1)
+    lines = measured("AV_veh1.nmea").read_bytes().splitlines()[:100]
     parsed = [pynmeagps.NMEAReader.parse(line + b"\r\n") for line in lines]
     assert log.origin is not None
     at = np.array([(m.lat, m.lon, float(m.alt) + float(m.sep)) for m in parsed])
@@ -335,11 +334,11 @@ INVISIBLE: dict[str, Callable[[list[str]], list[str]]] = {
 
 
 @pytest.mark.parametrize("mistake", [*NMEA, *INVISIBLE, "none"])
-def test_a_mistake_in_nmea_of_a_receiver(shared: Path, tmp_path: Path, mistake: str) -> None:
+def test_a_mistake_in_nmea_of_a_receiver(tmp_path: Path, mistake: str) -> None:
     """CATS, two receivers, two minutes; checksums are those of the changed sentences."""
     change = NMEA[mistake][0] if mistake in NMEA else INVISIBLE.get(mistake, lambda words: words)
     for name in ("AV_veh1", "AV_veh2"):
-        lines = (shared / "cats_nmea" / f"{name}.nmea").read_text().splitlines()[:1200]
+        lines = measured(f"{name}.nmea").read_text().splitlines()[:1200]
         changed = "".join(sentence(",".join(change(line[1:].partition("*")[0].split(",")))) for line in lines)
         (tmp_path / f"{name}.nmea").write_text(changed)
     if mistake in NMEA:

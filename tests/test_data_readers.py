@@ -8,7 +8,7 @@ import numpy as np
 import pandas as pd
 import pymap3d
 import pytest
-from conftest import refused
+from conftest import measured, refused
 from numpy.testing import assert_allclose
 
 import coopoc as co
@@ -35,7 +35,7 @@ def test_tum_files_are_what_evo_reads(tmp_path: Path) -> None:
     np.savetxt(tmp_path / "car.tum", np.column_stack([fleet.t[:1550], x, still]), fmt="%.17g")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        file_interface = pytest.importorskip("evo.tools.file_interface")
+        file_interface = pytest.importorskip("evo.tools.file_interface", reason="pip install evo")
         path = file_interface.read_tum_trajectory_file(str(tmp_path / "car.tum"))
     np.testing.assert_array_equal(path.positions_xyz, x)
     assert_allclose(path.timestamps, fleet.t[:1550], atol=1e-9)
@@ -289,13 +289,13 @@ def test_a_segment_of_comma2k19(tmp_path: Path) -> None:
     assert_allclose(log.recording.velocity[0, 2:-1, 0], np.diff(true, axis=0)[1:-1] / 0.1, atol=0.05)
 
 
-def test_a_real_segment_of_comma2k19_and_a_real_robot_of_libRSF(shared: Path) -> None:
-    log = co.read_log(shared / "road" / "comma2k19", dt=0.1)
+def test_a_real_segment_of_comma2k19_and_a_real_robot_of_libRSF() -> None:
+    log = co.read_log(measured("comma2k19"), dt=0.1)
     assert log.truth is not None
     gap = (log.recording.gnss[0] - log.truth.position)[:, 0, :2]
     assert np.nanmedian(np.hypot(*gap.T)) < 2.0
     assert log.summary.read == {"fixes": 571}
-    robot = co.read_log(shared / "uwb" / "indoor", frame="body")
+    robot = co.read_log(measured("Indoor_UWB_Input.txt").parent, frame="body")
     assert robot.truth is not None
     assert robot.summary.read == {"ranges": 233}
     ego = robot.recording.ids.index("Indoor_UWB")

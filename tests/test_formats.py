@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import measured
 from graph_files import write_graph
 from numpy.testing import assert_allclose
 from scipy.io import mmread
@@ -89,18 +90,18 @@ COUNTS = {  # poses, points, relative poses, relative points, ranges, robots: by
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_real_pyfg_files_read_whole_and_come_back_bit_by_bit(shared: Path, tmp_path: Path, name: str) -> None:
+def test_real_pyfg_files_read_whole_and_come_back_bit_by_bit(tmp_path: Path, name: str) -> None:
     start = time.process_time()
-    graph = load_graph(shared / "pyfg" / f"{name}.pyfg")
+    graph = load_graph(measured(f"{name}.pyfg"))
     assert time.process_time() - start < 2
     edges = (len(graph.relative_pose), len(graph.relative_point), len(graph.ranges))
     assert (graph.is_pose.sum(), (~graph.is_pose).sum(), *edges, "".join(graph.robots)) == COUNTS[name]
     assert_same(written(graph, tmp_path / "again.pyfg"), graph)
 
 
-def test_pyfg_numbers_are_what_cora_made_of_them(shared: Path) -> None:
+def test_pyfg_numbers_are_what_cora_made_of_them() -> None:
     """CORA's expected matrices: rows of X_gt are R_i^T, then bearings of ranges, then positions."""
-    folder = shared / "pyfg/cora_unit/small_ra_slam_problem"
+    folder = measured("cora_unit/small_ra_slam_problem")
     graph = load_graph(folder / "factor_graph.pyfg")
     x = mmread(folder / "X_gt.mm").toarray()
     assert_allclose(graph.rotation[:6].swapaxes(-1, -2).reshape(12, 2), x[:12], atol=1e-15)
@@ -111,9 +112,9 @@ def test_pyfg_numbers_are_what_cora_made_of_them(shared: Path) -> None:
     np.testing.assert_array_equal(tau, mmread(folder / "OmegaPose.mm").diagonal())
 
 
-def test_relative_poses_and_points_are_in_the_frame_of_the_first(shared: Path) -> None:
+def test_relative_poses_and_points_are_in_the_frame_of_the_first() -> None:
     """MR.CLAM against its own Vicon truth: R_i^T (p_j - p_i) is what was measured, to the noise that it claims."""
-    graph = load_graph(shared / "pyfg/mrclam6.pyfg")
+    graph = load_graph(measured("mrclam6.pyfg"))
     for edges, bound in ((graph.relative_pose, 0.02), (graph.relative_point, 0.2)):
         i, j = edges.nodes.T
         seen = np.einsum("mji,mj->mi", graph.rotation[i], graph.position[j] - graph.position[i])
@@ -239,9 +240,9 @@ def random_trajectory(count: int = 40) -> Trajectory:
     )
 
 
-def test_a_real_kitti_file_is_numpys_table(shared: Path) -> None:
-    poses = read_kitti(shared / "evo_oracle/KITTI_00_ORB.txt")
-    table = np.loadtxt(shared / "evo_oracle/KITTI_00_ORB.txt").reshape(-1, 3, 4)
+def test_a_real_kitti_file_is_numpys_table() -> None:
+    poses = read_kitti(measured("KITTI_00_ORB.txt"))
+    table = np.loadtxt(measured("KITTI_00_ORB.txt")).reshape(-1, 3, 4)
     np.testing.assert_array_equal(np.dstack([poses.rotation, poses.position]), table)
 
 

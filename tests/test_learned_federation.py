@@ -22,7 +22,7 @@ from coopoc.learned import Client, GainNet, Schedule, clients, federate
 from coopoc.learned.federation.combine import SERVER, Answer, Standing, combine, screen
 from coopoc.learned.federation.federate import Plan, federate_many
 from coopoc.learned.federation.history import Federation, Round, ledger
-from coopoc.learned.federation.participation import Byzantine, Participation, poisoned
+from coopoc.learned.federation.participation import Byzantine, Participation
 from coopoc.learned.federation.rules import (
     RULES,
     Krum,
@@ -33,7 +33,7 @@ from coopoc.learned.federation.rules import (
     uniform,
 )
 from coopoc.learned.nets.gain import Gain
-from coopoc.learned.training.clients import Batch, Noise
+from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.fit import Judge
 from coopoc.methods.track import Method
 
@@ -205,16 +205,8 @@ def test_the_ledger_counts_every_byte(four: tuple[Client, ...]) -> None:
     np.testing.assert_array_equal(air.of("training", "on air")[0] - received, [*100 * rounds, 100 * rounds.sum()])
 
 
-def test_poisoned_data_and_poisoned_updates(four: tuple[Client, ...]) -> None:
-    """A moved truth moves the client's minimum by as much; a turned update is the mirror image of the honest one."""
-    shifted = poisoned(four[0], 10.0)
-    torch.testing.assert_close(
-        shifted.training.truth - four[0].training.truth,
-        torch.full_like(shifted.training.truth, 10.0),
-        rtol=0,
-        atol=1e-5,
-    )
-    assert torch.equal(shifted.training.gnss, four[0].training.gnss)
+def test_poisoned_updates(four: tuple[Client, ...]) -> None:
+    """A turned update is the mirror image of the honest one."""
     honest, byzantine = trained(four[:1], 1), trained(four[:1], 1, participation=Byzantine(names=("c0",), scale=-1.0))
     torch.testing.assert_close(byzantine.history[1].weights - 0.3, 0.3 - honest.history[1].weights)
     hurt = trained(four, 6, participation=Byzantine(names=("c0",), scale=-20.0))
@@ -224,10 +216,9 @@ def test_poisoned_data_and_poisoned_updates(four: tuple[Client, ...]) -> None:
     assert losses[0] < losses[1]
 
 
-@pytest.mark.parametrize("noise", ["static", "fresh"])
-def test_a_score_does_not_depend_on_who_is_judged_beside(noise: Noise) -> None:
-    """Bit for bit, with pieces of different number, and equal to the mean of the pieces' losses on one draw."""
-    whole = clients(drives(3), Sensors(), piece=10, noise=noise)
+def test_a_score_does_not_depend_on_who_is_judged_beside() -> None:
+    """Bit for bit, with pieces of different number, and equal to the mean of the pieces' losses."""
+    whole = clients(drives(3), Sensors(), piece=10)
     group = [replace(c, training=c.training.take(range(n))) for c, n in zip(whole, (8, 4, 2), strict=True)]
     kinds, theta = [[c.training for c in group], [c.long for c in group]], torch.tensor([[0.2], [0.4], [0.6]])
     theta = theta.repeat(1, 3)
@@ -237,8 +228,6 @@ def test_a_score_does_not_depend_on_who_is_judged_beside(noise: Noise) -> None:
         assert torch.equal(alone(theta[row : row + 1])[0], together[row])
         by_hand = [Steady().losses(theta[row : row + 1], batch).mean() for batch, _ in alone.batches]
         torch.testing.assert_close(together[row], torch.stack(by_hand).max())
-        off = torch.cat([(batch.gnss - batch.truth).flatten() for batch, _ in alone.batches])
-        assert float(off.std()) == pytest.approx(1.5, rel=0.2)
 
 
 SIZES = torch.tensor([3, 1, 5, 2, 4, 1, 6])
@@ -326,26 +315,6 @@ def test_trimmed_mean_is_that_of_scipy(share: float) -> None:
         weights = answers(count)
         theirs = stats.trim_mean(weights.numpy(), share, axis=0)
         np.testing.assert_allclose(combined(TrimmedMean(share), weights, SIZES[:count]), theirs, rtol=1e-12)
-
-
-@pytest.mark.parametrize("name", sorted(RULES))
-def test_every_rule_keeps_what_all_agree_on(name: str) -> None:
-    """Law: equal answers give themselves."""
-    theta, target = torch.zeros(6), torch.full((6,), 0.5)
-    which = RULES[name]
-    after = which(theta, target.repeat(7, 1), SIZES)
-    torch.testing.assert_close(after, target)
-
-
-@pytest.mark.parametrize("name", ["median", "trimmed_mean", "krum", "multi_krum"])
-def test_robust_rules_ignore_one_byzantine_client(name: str) -> None:
-    """One of seven sends 1e6: the result stays in the hull of the honest, the mean does not."""
-    weights = answers()
-    weights[3] = 1e6
-    honest = weights[[0, 1, 2, 4, 5, 6]]
-    found = combined(RULES[name], weights, torch.ones(7))
-    assert ((found <= honest.max(0).values) & (found >= honest.min(0).values)).all()
-    assert combined(RULES["mean"], weights).max() > 1e4
 
 
 @pytest.mark.parametrize("name", [*RULES, Krum(2)])

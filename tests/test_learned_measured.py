@@ -33,7 +33,6 @@ from coopoc.learned.recipes import RECIPES
 from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.drives import MeasuredDrives
 from coopoc.learned.training.measured import measured_clients
-from coopoc.learned.training.okf_fit import fit_okf
 
 NETS = (GainNet(2, 1), RoadConstants(), NoiseParameters())
 
@@ -148,14 +147,6 @@ def test_the_scan_without_fixes_is_filterpys_prediction() -> None:
         if t % 5 == 0:
             assert_allclose(normalised[t, 0, 0], theirs.y / np.sqrt(np.diag(theirs.S)), atol=1e-9)
     assert bool(normalised[np.arange(steps) % 5 != 0].isnan().all())
-
-
-def test_recovers_known_noise_where_fixes_are_rare() -> None:
-    """0.2 m a step and 1.5 m, with a fix at every fifth step: the numbers that `walk` was made with."""
-    (client,) = measured_clients(MeasuredDrives(*walk(16000, 1, every=5)), piece=40)
-    found = fit_okf([(client.training, client.validation)], steps=100)[0][0].method("okf")
-    assert_allclose(found.process_std, 0.2, rtol=0.15)
-    assert_allclose(found.gnss_std, 1.5, rtol=0.08)
 
 
 def test_what_cannot_be_learned_from_is_refused() -> None:

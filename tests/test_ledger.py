@@ -9,7 +9,7 @@ import pytest
 from conftest import refused
 
 from coopoc import V2X, Fleet, JointFilter, Kalman, Ledger, Sensors, break_even, load_fleet, observe
-from coopoc.evaluate.ledger import of_drive, of_track, of_training
+from coopoc.evaluate.ledger import of_track, of_training
 from coopoc.learned import load as load_weights
 from coopoc.learned.federation.history import card_ledger
 from coopoc.learned.recipes import WEIGHTS
@@ -46,7 +46,8 @@ def test_break_even_of_the_papers_training() -> None:
     assert once.per_vehicle("training") == pytest.approx(3.19e6, rel=1e-3)
     assert once.per_vehicle("training", way="broadcast") == 1.5 * weights
     for rate, minutes in ((900.0, 59.1), (3500.0, 15.2)):
-        drive = of_drive(["a"], 2.0, np.zeros((1, 1)), np.array([[2 * rate]]), NO_MESSAGE, 0)
+        moved = np.multiply.outer([0.0, 2 * rate], np.ones((2, 1, 1)))
+        drive = Ledger(("a",), np.full(1, 2.0), moved, moved)
         assert break_even(once, drive) / 60 == pytest.approx(minutes, abs=0.05)
     with refused("training"):
         break_even(drive, drive)

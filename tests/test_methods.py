@@ -30,10 +30,13 @@ def test_zero_noise_gives_zero_error(name: str, noise: str, crossing: Fleet) -> 
 
 @pytest.mark.parametrize(("name", "noise"), COVARIANCES.values(), ids=COVARIANCES)
 def test_a_run_and_a_step_know_nothing_of_others(name: str, noise: str, crossing: Fleet) -> None:
-    """One run is the first of five, and a short drive the beginning of a long one: estimates are causal."""
+    """One run is the first of five, a short drive the beginning of a long one (estimates are causal), and seconds count
+    from anywhere."""
     method = METHODS[name](noise)
     fleet, channel = crossing.between(0, 40), V2X(max_neighbours=4, loss=0.2, latency=0.1)
-    many = method(observe(fleet, S2, channel, runs=5), [0]).x
+    seen = observe(fleet, S2, channel, runs=5)
+    many = method(seen, [0]).x
+    assert method(replace(seen, t=seen.t + 1.7e9), [0]).x == pytest.approx(many, abs=1e-3)
     assert method(observe(fleet, S2, channel, runs=1), [0]).x == pytest.approx(many[:1], abs=1e-8)
     if name != "batch-smoother":
         short = method(observe(fleet.between(0, 8), S2, channel, runs=5), [0]).x

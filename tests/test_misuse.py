@@ -300,7 +300,7 @@ def test_training_refuses_values_from_elsewhere() -> None:
     swept(learned.fit, {**fit, "progress": None, "long": None}, few)
     federation = {"model": "okf", "clients": [client], "rounds": 1, "local_epochs": 1, "schedule": schedule, "seed": 0}
     more = dict.fromkeys(("progress", "participation"))
-    swept(learned.federate, {**federation, **more, "aggregate": "mean", "epoch": "pass"}, few)
+    swept(learned.federate, {**federation, **more, "aggregate": "mean"}, few)
     swept(learned.ledger, {"federation": learned.federate(**federation), "overhead": 0}, wrong)
     swept(learned.LearnedGain, {"model": learned.GainNet(), "name": "n", "x0": None}, wrong)
     with refused(r"epochs = 1\.5: must be a whole number"):

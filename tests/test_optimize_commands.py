@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from conftest import measured
 from graph_files import write_graph
 from random_graphs import random_graph
 from shell import ran
@@ -15,7 +16,6 @@ from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import backends, solver_commands
 
 ROOT = Path(__file__).resolve().parents[1]
-PYFG = ROOT / "../shared/data/pyfg"
 
 
 @pytest.fixture
@@ -95,10 +95,9 @@ def test_check_solves_one_problem_with_every_backend(
     assert (status, out.count(" needs "), "pip install casadi" in err) == (1, len(backends()), True)
 
 
-@pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
 def test_the_example_draws_a_graph_file(tmp_path: Path) -> None:
     picture, script = tmp_path / "drive.png", ROOT / "examples" / "graph_file.py"
-    command = [sys.executable, "-W", "error", script, PYFG / "mrclam5a.pyfg", picture]
+    command = [sys.executable, "-W", "error", script, measured("mrclam5a.pyfg"), picture]
     out = ran(command, check=True).stdout
     assert "-> 69.10 in" in out
     assert "-> 0.214 m" in out

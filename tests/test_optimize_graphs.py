@@ -8,11 +8,12 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import measured, refused
 from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import random_graph
 from scipy.optimize import least_squares
 from scipy.sparse import csc_array
+from unseen_graphs import drone, range_aided, world
 
 import coopoc as co
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
@@ -24,9 +25,6 @@ from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import Objective, from_graph, read_graph
 from coopoc.optimize.model.factor import Factor
 from coopoc.optimize.starts.graph_starts import separated, trilaterate
-
-PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
-needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
 
 
 def moved(problem: Problem, x: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -96,12 +94,11 @@ def test_the_automatic_start_undoes_bad_odometry(dimension: int, seed: int) -> N
     assert found.cost <= solve(from_graph(graph, start="file")).cost * (1 + 1e-9)
 
 
-@needs_files
 @pytest.mark.parametrize(
     ("name", "best"), [("mrclam5a", 69.10354), ("mrclam6", 3144.2732), ("plaza1", 1332.7948), ("tiers", 2050.1013)]
 )
 def test_real_graphs_reach_the_best_that_is_known(name: str, best: float) -> None:
-    found = solve(read_graph(PYFG / f"{name}.pyfg"))
+    found = solve(read_graph(measured(f"{name}.pyfg")))
     assert found.status is Status.SOLVED
     assert found.cost == pytest.approx(best, rel=1e-6)
 
@@ -196,11 +193,8 @@ def test_no_minimum_lies_above_gtsams(seed: int) -> None:
     assert found.cost <= native.error(theirs.optimize()) * (1 + 1e-9)
 
 
-def test_a_drive_of_thousands_of_poses_needs_few_factorisations(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_drive_of_thousands_of_poses_needs_few_factorisations() -> None:
     """GTSAM's Levenberg-Marquardt from the same chained odometry needs five; damping that begins at 1e-4 needs 50."""
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "benchmarks"))
-    from unseen_graphs import range_aided
-
     problem = from_graph(range_aided(0), start="odometry")
     system = sparse(problem)
     end = arrive(system, problem.x0, 100, 1e-8)
@@ -223,13 +217,8 @@ def test_a_start_that_grows_undoes_drift_that_ranges_alone_correct(seed: int) ->
     assert solve(from_graph(graph, start="odometry"), throw=False).cost > 1.2 * best
 
 
-def test_a_start_whose_steps_went_straight_is_kept_however_badly_noise_is_stated(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
+def test_a_start_whose_steps_went_straight_is_kept_however_badly_noise_is_stated() -> None:
     """Ranges ten times as noisy as stated: a start that grows would end at the same minimum, and is not tried."""
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "benchmarks"))
-    from unseen_graphs import world
-
     drive = world(31, 2, 1, 300, 3)
     ranges = drive.ranged(drive.to_points(300), 1.0)
     stated = replace(ranges, variance=ranges.variance / 100.0)
@@ -374,11 +363,8 @@ def test_the_cost_of_a_minimum_is_what_its_noise_makes_expected(dimension: int) 
     assert np.std(found) == pytest.approx(np.sqrt(variance), rel=0.4)
 
 
-def test_a_start_that_leads_smoothly_to_a_poor_minimum_is_not_believed(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_start_that_leads_smoothly_to_a_poor_minimum_is_not_believed() -> None:
     """The truth leads lower: a robot in space with ranges, whose chained odometry meets no trouble on its way."""
-    monkeypatch.syspath_prepend(str(Path(__file__).resolve().parents[1] / "benchmarks"))
-    from unseen_graphs import drone
-
     graph = drone(51)
     best = solve(from_graph(graph, start="file"), throw=False).cost
     assert solve(from_graph(graph, start="odometry"), throw=False).cost > 1.3 * best

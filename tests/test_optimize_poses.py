@@ -1,11 +1,10 @@
 """Points and poses in one problem: derivatives against finite differences, minima against SciPy, files."""
 
 from itertools import pairwise
-from pathlib import Path
 
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import measured, refused
 from scipy.optimize import least_squares
 from scipy.spatial.transform import Rotation
 
@@ -15,9 +14,6 @@ from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Problem, Status, pose, solve
 from coopoc.optimize.graph_problems import from_graph
 from coopoc.optimize.model.space import Space, exp, log
-
-PYFG = Path(__file__).resolve().parents[1] / "../shared/data/pyfg"
-needs_files = pytest.mark.skipif(not PYFG.is_dir(), reason="../shared/data/pyfg is not here")
 
 
 def everything(dimension: int, seed: int = 0, noise: float = 0.05) -> tuple[Problem, np.ndarray]:
@@ -102,8 +98,6 @@ def test_a_turned_world_turns_the_estimate() -> None:
 
 
 def small() -> Graph:
-    if PYFG.is_dir():
-        return load_graph(PYFG / "factor_graph_small.pyfg")
     moved = PoseEdges([[0, 1], [1, 2]], [[4, 0], [0, 4]], [[0.5], [0.1]], [0.01 * np.eye(3)] * 2)
     ranges = RangeEdges([[0, 3], [1, 3], [2, 3]], [5.0, 4.1, 3.2], [0.01] * 3)
     position, turned = [[0, 0], [4, 0], [4, 4], [3, 4.1]], [[0], [0.5], [0.6], [0]]
@@ -151,19 +145,17 @@ def test_wrong_input_says_what_to_do(case: str) -> None:
         call()
 
 
-@needs_files
 def test_mrclam5a_reaches_the_reference() -> None:
     """An independent Levenberg-Marquardt reached 69.10 and 0.214 m; CORA's log has 75.28."""
-    graph = load_graph(PYFG / "mrclam5a.pyfg")
+    graph = load_graph(measured("mrclam5a.pyfg"))
     found = solve(from_graph(graph))
     assert found.cost <= 69.2
     error = absolute_error(found.position[graph.is_pose], graph.position[graph.is_pose])
     assert float(rms(error)) <= 0.25
 
 
-@needs_files
 def test_a_graph_without_its_gauge_names_what_is_free() -> None:
-    problem = from_graph(load_graph(PYFG / "factor_graph_small.pyfg"))
+    problem = from_graph(load_graph(measured("factor_graph_small.pyfg")))
     loose = Problem(problem.names, problem.factors, problem.x0, dimension=2, poses=problem.poses)
     found = solve(loose, throw=False)
     assert found.status is Status.RANK_DEFICIENT

@@ -167,20 +167,6 @@ def test_a_window_that_does_not_exist(recording: Recording, arguments: tuple[int
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
-def test_no_fix_at_all_is_rank_deficient_and_names_what_is_free(recording: Recording, backend: str) -> None:
-    star = Problem.from_snapshot(recording, 10, 0)
-    floating = replace(star, factors=star.factors[1:])
-    solution = solve(floating, backend, throw=False)
-    assert solution.status is Status.RANK_DEFICIENT
-    assert solution.unobservable == star.names
-    assert np.isnan(solution.covariance).all()
-    one_fixed = floating.add("position", star.names[0], [0, 0, 0], std=1.0)
-    hanging = Problem((*star.names, "stray"), one_fixed.factors)
-    assert solve(one_fixed, backend).status is Status.SOLVED
-    assert solve(hanging, backend, throw=False).unobservable == ("stray",)
-
-
-@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
 def test_the_limit_of_iterations_is_an_error_with_the_solution(backend: str) -> None:
     with pytest.raises(SolveError, match="limit of iterations") as caught:
         solve(mixed(), backend, max_iterations=1)

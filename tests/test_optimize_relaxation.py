@@ -4,14 +4,14 @@ where tight; a local minimum gets no certificate."""
 import time
 from dataclasses import replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import cvxpy as cp
 import numpy as np
 import pytest
 import range_only
-from conftest import refused
+import tightness
+from conftest import measured, refused
 from random_graphs import random_graph
 from scipy.io import mmread
 from scipy.optimize import least_squares
@@ -23,7 +23,6 @@ from coopoc.optimize.convex.newton import Reduced
 from coopoc.optimize.convex.qcqp import Quadratic, multipliers, quadratic
 from coopoc.optimize.graph_problems import from_graph, read_graph
 
-PYFG = Path(__file__).resolve().parents[2] / "shared" / "data" / "pyfg"
 UP = 0.6
 """Vertical against horizontal std in anisotropic problems."""
 
@@ -111,9 +110,7 @@ def by_hand(problem: Problem) -> float:
 
 def cora(name: str) -> tuple[Quadratic, Problem, Any]:
     """One of CORA's unit cases: our QCQP of it and a reader of its expected matrices."""
-    folder = PYFG / "cora_unit" / name
-    if not folder.is_dir():
-        pytest.skip(f"{folder} is absent")
+    folder = measured(f"cora_unit/{name}")
     if name == "single_range":
         problem = Problem(("L0", "L1"), x0=[[11, 19], [11, 21]], dimension=2).add("range", (0, 1), 2.0, 1.0)  # type: ignore[arg-type]
     else:
@@ -250,9 +247,7 @@ def test_the_staircase_climbs_to_shors_bound_from_anywhere(seed: int) -> None:
 @pytest.mark.slow
 def test_robots_that_do_not_know_where_the_others_are() -> None:
     """mrclam5a, every robot starting at the origin: better than the local minimum at 78.2 in the data's README."""
-    if not (PYFG / "mrclam5a.pyfg").exists():
-        pytest.skip(f"{PYFG} is absent")
-    relaxed = staircase(read_graph(PYFG / "mrclam5a.pyfg", start="apart"))
+    relaxed = staircase(read_graph(measured("mrclam5a.pyfg"), start="apart"))
     assert relaxed.solution is not None
     assert 67.8 < relaxed.lower_bound < relaxed.solution.cost < 69.11
     assert relaxed.solution.cost == pytest.approx(69.10, abs=0.01)  # an independent Levenberg-Marquardt from the truth
@@ -297,19 +292,6 @@ def test_a_certificate_takes_the_time_it_is_given() -> None:
         staircase(problem, seconds=0.0)
 
 
-def anchored(seed: int, anchors: int = 4, vehicles: int = 2, d: int = 2, std: float = 0.1) -> Problem:
-    """Surveyed anchors, vehicles without a fix, all ranges to and between vehicles: flips are local minima."""
-    rng = np.random.default_rng(seed)
-    n = anchors + vehicles
-    truth = rng.uniform(-20, 20, (n, d))
-    names = [f"a{i}" for i in range(anchors)] + [f"v{i}" for i in range(vehicles)]
-    problem = Problem(tuple(names), dimension=d)
-    problem = problem.add("position", names[:anchors], truth[:anchors] + 0.3 * rng.standard_normal((anchors, d)), 0.3)
-    pairs = [(i, j) for i in range(n) for j in range(max(i + 1, anchors), n)]
-    ranges = [np.linalg.norm(truth[i] - truth[j]) + std * rng.standard_normal() for i, j in pairs]
-    return problem.add("range", pairs, np.abs(ranges)[:, None], std)
-
-
 def minima(problem: Problem, starts: int = 15) -> list[Solution]:
     """The minima that Gauss-Newton reaches from random starts, the lowest first."""
     rng, found = np.random.default_rng(0), []
@@ -325,7 +307,7 @@ def minima(problem: Problem, starts: int = 15) -> list[Solution]:
 @pytest.mark.parametrize("seed", [1, 2, 6])
 def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed: int) -> None:
     """Gauss-Newton reports SOLVED at both; scipy.optimize.least_squares finds nothing below the certified one."""
-    problem = anchored(seed)
+    problem = tightness.anchored(seed, 4, 2, 2, 0.1)
     best, *others = minima(problem)
     local = [solution for solution in others if solution.cost > best.cost + 1.0]
     assert local
@@ -349,7 +331,7 @@ def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed: int)
 def test_the_eigenvalue_is_that_of_the_whole_matrix() -> None:
     """Schur complement and Q - diag(L, 0) are indefinite together; numpy.linalg.eigvalsh on the latter."""
     for seed in range(4):
-        problem = anchored(seed)
+        problem = tightness.anchored(seed, 4, 2, 2, 0.1)
         form = quadratic(problem)
         for solution in minima(problem, starts=6):
             X = form.lift(solution.x, np.tile(np.eye(2), (6, 1, 1)))

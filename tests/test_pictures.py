@@ -61,7 +61,7 @@ def test_a_recording_shows_its_fixes_and_links(seen: tuple[co.Fleet, co.Recordin
 
 def test_a_notebook_shows_a_picture_without_pyplot(seen: tuple[co.Fleet, co.Recording]) -> None:
     """IPython's own formatter makes a PNG of the figure; a plain Figure gives text alone."""
-    formatters = pytest.importorskip("IPython.core.formatters")
+    formatters = pytest.importorskip("IPython.core.formatters", reason="pip install ipython")
 
     shown, _ = formatters.DisplayFormatter().format(co.plot_recording(seen[1], step=1).figure)
     assert shown["image/png"].startswith(b"\x89PNG")

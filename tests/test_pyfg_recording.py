@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import refused
+from conftest import measured, refused
 from graph_files import write_graph
 from shell import ran
 
@@ -22,8 +22,8 @@ from coopoc.world.body_frames import body_motion
 
 
 @pytest.fixture(scope="module")
-def tiers(shared: Path) -> tuple[co.Recording, co.Fleet]:
-    return graph_recording(read_pyfg(shared / "pyfg" / "tiers.pyfg"))
+def tiers() -> tuple[co.Recording, co.Fleet]:
+    return graph_recording(read_pyfg(measured("tiers.pyfg")))
 
 
 def test_odometry_and_ranges_are_those_of_the_file(tiers: tuple[co.Recording, co.Fleet]) -> None:
@@ -62,8 +62,8 @@ def test_ranges_alone_and_one_anchor_beat_dead_reckoning(tiers: tuple[co.Recordi
     assert together < error(seen, unit="fleet", fusion="intersection") < dead
 
 
-def test_the_command_says_what_was_read(shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    data_check(str(shared / "pyfg" / "tiers.pyfg"), picture=tmp_path / "tiers.png")
+def test_the_command_says_what_was_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    data_check(str(measured("tiers.pyfg")), picture=tmp_path / "tiers.png")
     said = capsys.readouterr().out
     assert "read: 7092 ranges" in said
     assert "innovations against a filter of each vehicle alone, throughout, from the truth's first poses" in said
@@ -88,9 +88,9 @@ def test_graphs_that_are_no_recording_are_named(tmp_path: Path) -> None:
         graph_recording(read_pyfg(file), dt=5.0)
 
 
-def test_points_and_poses_of_others_are_ranges_and_bearings(shared: Path) -> None:
+def test_points_and_poses_of_others_are_ranges_and_bearings() -> None:
     """13,121 points and 3,537 ranges of mrclam6.pyfg, of which the points were left out without a word."""
-    log = load_log(shared / "pyfg" / "mrclam6.pyfg")
+    log = load_log(measured("mrclam6.pyfg"))
     assert log.summary.read == {"ranges": 16381, "bearings": 12905}
     assert sum(number for number, _ in log.summary.refused.values()) == 13121 + 3537 - 16381
 
@@ -116,8 +116,8 @@ def inverted(line: str) -> str:
     return " ".join(words)
 
 
-def test_covariances_for_information_are_named_where_a_graph_is_solved(shared: Path, tmp_path: Path) -> None:
-    write_graph(without_stamps(read_pyfg(shared / "pyfg" / "mrclam5a.pyfg")), tmp_path / "right.g2o")
+def test_covariances_for_information_are_named_where_a_graph_is_solved(tmp_path: Path) -> None:
+    write_graph(without_stamps(read_pyfg(measured("mrclam5a.pyfg"))), tmp_path / "right.g2o")
     lines = (tmp_path / "right.g2o").read_text().splitlines()
     (tmp_path / "wrong.g2o").write_text("\n".join(map(inverted, lines)) + "\n")
     found = {}

@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import refused, winding
+from conftest import measured, refused, winding
 from numpy.testing import assert_allclose
 from oracles.road import road
 
@@ -18,10 +18,9 @@ from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import rt_le
 from coopoc.methods.road import ROAD, from_logs, to_logs
 from coopoc.studies import benchmark
-from coopoc.studies.roads import road_row, roads
+from coopoc.studies.roads import ROADS, road_row, roads
 from coopoc.studies.roads import seen as thinned
 
-ROADS = Path(__file__).parents[2] / "shared" / "data" / "road"
 PLAIN = replace(ROAD, gate=1e9, window=np.inf, correlation=0.0, fix=1.0, motion=1.0, least=1.0)
 """No gate, white errors: an extended Kalman filter."""
 
@@ -73,7 +72,7 @@ def rivals(monkeypatch: pytest.MonkeyPatch) -> Any:
 @pytest.mark.parametrize("name", ["EKF", "StoneSoup"])
 def test_without_a_gate_it_is_the_extended_filter_of_others(rivals: Any, name: str) -> None:
     if name == "StoneSoup":
-        pytest.importorskip("stonesoup")
+        pytest.importorskip("stonesoup", reason="pip install stonesoup")
     recording, _ = seen(runs=1)
     mine, other = RoadFilter(errors=PLAIN)(recording), getattr(rivals, name)()(recording)
     assert mine.covariance is not None
@@ -202,11 +201,12 @@ def test_a_log_of_ones_own_is_a_task(tmp_path: Path) -> None:
     assert f"| {less} " in benchmark.page(cards)
 
 
-@pytest.mark.skipif(not ROADS.is_dir(), reason="the data of ../shared/data are not there")
 @pytest.mark.parametrize("task", ["f9k", "kitti", "comma2k19"])
 def test_calibrated_it_is_the_best_on_real_roads(task: str) -> None:
     """Before Kalman filters, as they come or calibrated; NEES of (x, y) between 1 and 4, as it comes from 0.4 on."""
-    mine, usual, adaptive = (road_row(task, ROADS.parent, m) for m in (RoadFilter(), Kalman(), co.AdaptiveKalman()))
+    for name in ROADS[task]:
+        measured(name)
+    mine, usual, adaptive = (road_row(task, measured(), m) for m in (RoadFilter(), Kalman(), co.AdaptiveKalman()))
     others = usual["rt_le_m"][0], usual["calibrated_m"][0], adaptive["rt_le_m"][0]
     assert mine["calibrated_m"][0] < 0.97 * min(others)
     assert 1.0 < mine["calibrated_nees"] < 4.0

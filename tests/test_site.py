@@ -19,7 +19,7 @@ def test_every_page_has_a_place() -> None:
 
 
 def test_every_study_has_a_finding_and_a_page_that_is_there() -> None:
-    pytest.importorskip("mkdocs")
+    pytest.importorskip("mkdocs", reason="make docs installs it")
     code = "import pages; print(len(pages.names('coopoc.studies')), pages._gallery())"
     out = ran([sys.executable, "-c", code], cwd=ROOT / "docs", check=True)
     title, *studies = out.stdout.split("\n## ")
@@ -66,7 +66,7 @@ def says_what_it_prints(printed: str) -> None:
 
 def test_doctests_and_tutorials_of_pages(capsys: pytest.CaptureFixture[str]) -> None:
     """What the package does not contain: the extension of the API pages, and what a tutorial becomes."""
-    pytest.importorskip("griffe")
+    pytest.importorskip("griffe", reason="make docs installs it")
     sys.path.insert(0, str(ROOT / "docs"))
     try:
         from doctests import fenced
@@ -86,7 +86,7 @@ def test_doctests_and_tutorials_of_pages(capsys: pytest.CaptureFixture[str]) -> 
 
 
 def test_an_unknown_command_of_a_formula_fails_the_build() -> None:
-    pytest.importorskip("mkdocs")
+    pytest.importorskip("mkdocs", reason="make docs installs it")
     code = """
 import pages
 print(pages.on_page_content('<span class="arithmatex">\\\\(\\\\arg\\\\min_x\\\\)</span>').count("argmin"))

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import crossing_fleet, refused, textbook
+from conftest import crossing_fleet, measured, refused, textbook
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from shell import ran
@@ -301,11 +301,10 @@ def test_a_stream_forgets_whom_it_met_long_ago() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("log", ["bundled", "KITTI 00"])
-def test_the_replay_runs(log: str, request: pytest.FixtureRequest) -> None:
+def test_the_replay_runs(log: str) -> None:
     arguments = []
     if log != "bundled":
-        folder = request.getfixturevalue("shared") / "evo_oracle"
-        arguments = [folder / f"KITTI_00_{part}.txt" for part in ("ORB", "gt_times", "gt")]
+        arguments = [measured(f"KITTI_00_{part}.txt") for part in ("ORB", "gt_times", "gt")]
     command = [sys.executable, "-W", "error", ROOT / "examples" / "replay_log.py", *arguments, "--steps", "150"]
     out = ran(command, check=True).stdout
     assert ("No log given" in out) == (log == "bundled")

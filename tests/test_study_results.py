@@ -125,9 +125,8 @@ def test_parquet_holds_every_digit(frame: pd.DataFrame, tmp_path: Any) -> None:
 
 def test_tables_over_several_columns(frame: pd.DataFrame) -> None:
     frame = frame.query("method == 'kalman'")
-    table = pivot(results(frame), "k", ["method", "noise_model"], "rt_le_m", along="column")
+    table = pivot(results(frame), "k", ["method", "noise_model"], "rt_le_m")
     assert table.header == ("K", "KF, identity", "KF, fitted")
-    assert table.along == "column"
     assert table.rows[1][2].mean == pytest.approx(frame.query("k == 4 and noise_model == 'fitted'")["rt_le_m"].mean())
 
 

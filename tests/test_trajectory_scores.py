@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pandas as pd
 import pytest
-from conftest import refused
+from conftest import measured, refused
 from numpy.testing import assert_allclose
 from scipy.spatial.transform import Rotation
 
@@ -29,9 +29,9 @@ EVO = {(1, "steps"): (0.028120377, 4540), (10, "steps"): (0.194007758, 454), (10
 """evo 1.38.1, `metrics.RPE`, translation part, of KITTI 00 and ORB-SLAM: rmse m, and number of pairs."""
 
 
-def test_aligned_error_is_evos(shared: Path) -> None:
+def test_aligned_error_is_evos() -> None:
     """evo's published APE of KITTI 00 and ORB-SLAM, translation part, SE(3) Umeyama alignment (data/README)."""
-    folder = shared / "evo_oracle"
+    folder = measured("KITTI_00_gt.txt").parent
     truth = read_kitti(folder / "KITTI_00_gt.txt", folder / "KITTI_00_gt_times.txt")
     estimate = read_kitti(folder / "KITTI_00_ORB.txt")
     found = absolute_error(estimate.position, truth.position)
@@ -81,9 +81,9 @@ def test_alignment_that_is_open_or_ill_formed_is_refused() -> None:
 
 
 @pytest.mark.parametrize(("delta", "unit"), EVO)
-def test_relative_errors_are_evos(shared: Path, delta: float, unit: str) -> None:
+def test_relative_errors_are_evos(delta: float, unit: str) -> None:
     """Independent check: evo's rmse and pairs, measured with evo 1.38.1."""
-    truth, estimate = (read_kitti(shared / "evo_oracle" / f"KITTI_00_{name}.txt") for name in ("gt", "ORB"))
+    truth, estimate = (read_kitti(measured(f"KITTI_00_{name}.txt")) for name in ("gt", "ORB"))
     paths = (Track(np.arange(len(of)), of.position, of.rotation) for of in (estimate, truth))
     error = relative_error(*paths, delta, unit)[0]  # type: ignore[arg-type]
     rmse, pairs = EVO[delta, unit]
@@ -146,11 +146,9 @@ def test_intervals_over_blocks_hold_the_rms_of_correlated_errors() -> None:
     assert held >= 85
 
 
-def test_the_command_gives_evos_figures_from_files(
-    shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_the_command_gives_evos_figures_from_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """evo's published APE of KITTI 00, aligned, read from KITTI files and from the same poses as TUM and as CSV."""
-    folder = shared / "evo_oracle"
+    folder = measured("KITTI_00_gt.txt").parent
     times = folder / "KITTI_00_gt_times.txt"
     truth = (f"{folder / 'KITTI_00_gt.txt'}?times={times}",)
     poses = read_kitti(folder / "KITTI_00_ORB.txt", times)
@@ -172,11 +170,9 @@ def test_the_command_gives_evos_figures_from_files(
     assert "APE [m]" in capsys.readouterr().out
 
 
-def test_estimates_share_a_truth_and_rotations_are_scored(
-    shared: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_estimates_share_a_truth_and_rotations_are_scored(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     """SciPy's angles; a monocular estimate of half the size is the whole one under sim3."""
-    folder = shared / "evo_oracle"
+    folder = measured("KITTI_00_gt.txt").parent
     times = folder / "KITTI_00_gt_times.txt"
     truth, poses = (read_kitti(folder / f"KITTI_00_{name}.txt", times) for name in ("gt", "ORB"))
     for name, factor in (("whole", 1.0), ("half", 0.5)):

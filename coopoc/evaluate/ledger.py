@@ -130,10 +130,15 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
     >>> of_track(GNSS()(seen, ["a"]), seen, GNSS().message).rate()
     0.0
     """
-    names, overhead = [recording.ids[ego] for ego in track.egos], recording.v2x.overhead
-    messages = np.isfinite(recording.velocity[0, :, track.egos, 0]).sum(axis=1) if message.per_neighbour else None
-    seconds, moved = len(track.t) * recording.dt, (track.sent_bytes, track.received_bytes)
-    return of_drive(names, seconds, *moved, message, overhead, messages)
+    overhead, vehicles = recording.v2x.overhead, len(track.egos)
+    size, moved = message.size(overhead), np.zeros((2, 2, 2, len(track.received_bytes), vehicles))
+    for k, on_air in enumerate((track.sent_bytes, track.received_bytes)):
+        payload = on_air * (message.size() / size if size else 1.0)
+        if message.per_neighbour:
+            payload = on_air - overhead * np.isfinite(recording.velocity[0, :, track.egos, 0]).sum(axis=1)
+        moved[k, 1] = payload, on_air
+    seconds = np.full(vehicles, len(track.t) * recording.dt)
+    return Ledger(tuple(recording.ids[ego] for ego in track.egos), seconds, *moved)
 
 
 def break_even(training: Ledger, online: Ledger) -> float:
@@ -147,8 +152,8 @@ def break_even(training: Ledger, online: Ledger) -> float:
     Raises:
         InputError: a training without bytes, or a drive of no time.
 
-    >>> drive = of_drive(["a"], 10.0, np.array([[320.0]]), np.array([[1280.0]]), Message("fix", 8), 0)
-    >>> break_even(of_training(["a", "b"], [400.0, 0.0], [0.0, 400.0]), drive)
+    >>> moved = np.multiply.outer([0.0, 1280.0], np.ones((2, 1, 1)))
+    >>> break_even(of_training(["a", "b"], [400.0, 0.0], [0.0, 400.0]), Ledger(("a",), [10.0], moved, moved))
     1.5625
     """
     instance("training", training, Ledger)
@@ -158,30 +163,3 @@ def break_even(training: Ledger, online: Ledger) -> float:
         raise InputError("training", bytes_, "must have moved some bytes", "Give the ledger of a training.")
     rate = online.rate()
     return bytes_ / rate if rate else np.inf
-
-
-def of_drive(
-    names: Sequence[str],
-    seconds: npt.ArrayLike,
-    sent: Floats,
-    received: Floats,
-    message: Message,
-    overhead: int,
-    messages: npt.NDArray[np.integer] | None = None,
-) -> Ledger:
-    """The ledger of online cooperation from bytes on air.
-
-    Args:
-        names: of V vehicles.
-        seconds: of driving, one number or (V,).
-        sent: (1 or R, V) bytes.
-        received: (R, V) bytes.
-        message: that they carry.
-        overhead: bytes per message on air.
-        messages: (V,) how many on either way have it, where they have no one size.
-    """
-    size, moved = message.size(overhead), np.zeros((2, 2, 2, len(received), len(names)))
-    for k, on_air in enumerate((sent, received)):
-        payload = on_air * (message.size() / size if size else 1.0)
-        moved[k, 1] = payload if messages is None else on_air - overhead * messages, on_air
-    return Ledger(tuple(names), np.broadcast_to(np.asarray(seconds, float), len(names)), moved[0], moved[1])

@@ -8,9 +8,11 @@ from functools import lru_cache
 
 import numpy as np
 
-from ..arrays import AnyArray, Floats, checked, number, seed_of
+from ..arrays import AnyArray, Floats, checked
 from ..errors import InputError
 
+RESAMPLES = 2000
+"""Of the bootstrap."""
 _CHUNK = 4_000_000
 
 
@@ -33,7 +35,7 @@ class Interval:
         return f"{self.mean:.3g}" + (f" [{self.low:.3g}, {self.high:.3g}]" if math.isfinite(self.low) else "")
 
 
-def mean_interval(values: AnyArray, resamples: int = 2000, seed: int = 0) -> Interval:
+def mean_interval(values: AnyArray) -> Interval:
     """Mean over E egos and R runs with the 95 % interval of a bootstrap over egos, then over the runs of each.
 
     The percentiles are widened to Phi(sqrt(n/(n-1)) t_{n-1}), n = E (or R for one ego): the plain percentile interval
@@ -42,8 +44,6 @@ def mean_interval(values: AnyArray, resamples: int = 2000, seed: int = 0) -> Int
 
     Args:
         values: (E, R) or (R,) of one metric.
-        resamples: of the bootstrap.
-        seed: of its draws.
 
     Raises:
         InputError: a value that is not finite, another shape, or no value.
@@ -52,7 +52,7 @@ def mean_interval(values: AnyArray, resamples: int = 2000, seed: int = 0) -> Int
     Interval(mean=1.0, low=1.0, high=1.0, n=15)
     """
     values = _checked("values", values)
-    return _interval(_resampled(values, resamples, seed), float(values.mean()), values)
+    return _interval(_resampled(values), float(values.mean()), values)
 
 
 def paired_difference(a: AnyArray, b: AnyArray) -> Interval:
@@ -96,20 +96,18 @@ def over_seeds(values: AnyArray) -> Interval:
     return Interval(float(means.mean()), float(means.mean()) - half, float(means.mean()) + half, len(means))
 
 
-def _resampled(values: Floats, resamples: int, seed: int) -> Floats:
-    """(resamples,) means; the same draws for any values of one shape, so pairs stay pairs."""
-    resamples = number("resamples", resamples, 1, 10**7, kind=int, allowed="in 1..10^7", hint="2000 is the default.")
-    seed = seed_of(seed)
+def _resampled(values: Floats) -> Floats:
+    """(RESAMPLES,) means; the same draws for any values of one shape, so pairs stay pairs."""
     flat, step = values.ravel(), max(1, _CHUNK // values.size)
-    counts = _counts(*values.shape, resamples, seed)
-    sums = [counts[k : k + step].astype(float) @ flat for k in range(0, resamples, step)]
+    counts = _counts(*values.shape, RESAMPLES)
+    sums = [counts[k : k + step].astype(float) @ flat for k in range(0, RESAMPLES, step)]
     return np.concatenate(sums) / values.size
 
 
 @lru_cache(maxsize=2)
-def _counts(egos: int, runs: int, resamples: int, seed: int) -> AnyArray:
+def _counts(egos: int, runs: int, resamples: int) -> AnyArray:
     """(resamples, egos x runs) how often each value is drawn: egos, then the runs of each."""
-    size, rng = egos * runs, np.random.default_rng(seed)
+    size, rng = egos * runs, np.random.default_rng(0)
     found = np.empty((resamples, size), dtype=np.uint16 if size < 2**16 else np.uint32)
     step = max(1, _CHUNK // size)
     for start in range(0, resamples, step):

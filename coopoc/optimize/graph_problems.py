@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -12,6 +11,8 @@ import numpy as np
 from ..arrays import Floats, frozen, instance, one_of
 from ..formats import load_graph
 from ..formats.graph import Graph
+from ..kernels.compiling.waiting import clock, load
+from .algebra.sparse import LIBRARIES
 from .convex.chordal import chordal_start
 from .model.factor import Factor
 from .model.problem import Problem, Search
@@ -77,7 +78,8 @@ def from_graph(
     """
     one_of("objective", objective, Objective)
     one_of("start", start, Start)
-    began, notes, factors = time.perf_counter(), graph.notes, _factors(graph, objective)
+    load(*LIBRARIES)
+    began, notes, factors = clock(), graph.notes, _factors(graph, objective)
     poses, relaxed = tuple(np.flatnonzero(graph.is_pose).tolist()), partial(_relaxed, graph, objective, seconds)
     first = {"incremental": "odometry", "relaxed": "apart"}.get(start, start)
     names = contenders(graph) if start == "auto" else (first,)
@@ -102,7 +104,7 @@ def from_graph(
         problem, won = problem.replace_unchecked(x0=frozen(relaxed(problem))), Search(start)
     elif start == "file" and not graph.guess:
         notes = (*notes, "the start is the file's vertices, which may be the truth")
-    return problem.replace_unchecked(search=won._replace(seconds=time.perf_counter() - began, notes=notes))
+    return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=notes))
 
 
 def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:

@@ -47,6 +47,8 @@ class Solution:
         build_seconds: to prepare the solver and the start.
         solve_seconds: to run it, and of the search for a start: extras["start_seconds"] of them.
         check_seconds: to compute what is here from x.
+        load_seconds: beside these, what this process has waited for libraries and machine code until now.
+        compile_seconds: beside these, what it has waited for kernels to compile, once per machine.
         backend: its name.
         names: of the nodes.
         shown: the node that `print` shows.
@@ -74,6 +76,8 @@ class Solution:
     space: Space = field(default_factory=Space)
     violation: float = 0.0
     check_seconds: float = 0.0
+    load_seconds: float = 0.0
+    compile_seconds: float = 0.0
     expected: float = np.nan
     notes: tuple[str, ...] = ()
     extras: dict[str, Any] = field(default_factory=dict)
@@ -82,7 +86,7 @@ class Solution:
 
     @property
     def seconds(self) -> float:
-        """All that was waited for: build, search for a start, solve and checks."""
+        """What solving took: build, search for a start, solve and checks."""
         return self.build_seconds + self.solve_seconds + self.check_seconds
 
     @property

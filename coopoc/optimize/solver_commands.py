@@ -131,7 +131,7 @@ def misfit(solution: Solution) -> float | None:
 
 def described(solution: Solution) -> dict[str, Any]:
     """Status, cost and times of a solution, without its nodes."""
-    times = "build_seconds solve_seconds check_seconds seconds"
+    times = "build_seconds solve_seconds check_seconds seconds load_seconds compile_seconds"
     named = f"backend cost expected gradient_norm iterations {times} notes".split()
     found: dict[str, Any] = {"status": solution.status.name, "sentence": solution.status.value}
     found |= {name: getattr(solution, name) for name in named}

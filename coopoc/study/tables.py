@@ -202,7 +202,6 @@ def pivot(
     where: Where | None = None,
     caption: str = "",
     best: Best = "min",
-    along: Literal["row", "column"] | None = None,
     decimals: int = 2,
     intervals: bool = True,
 ) -> Table:
@@ -215,8 +214,7 @@ def pivot(
         value: the metric.
         where: column -> value or values.
         caption: under the table; default the metric.
-        best: "min", "max" or None.
-        along: where the best is sought; default among the methods.
+        best: "min", "max" or None, sought among the methods.
         decimals: of numbers.
         intervals: show the ends.
 
@@ -247,7 +245,7 @@ def pivot(
         (*(row for row in body if row not in smoothed), *smoothed),
         caption,
         best,
-        along or ("column" if "method" in down else "row"),
+        "column" if "method" in down else "row",
         decimals=decimals,
         intervals=intervals,
         notes=(*gone, *lost(results, where)),

@@ -34,14 +34,14 @@ PRODUCT = 64
 
 
 @compiled
-def descend(moments: Moments, plan: Plan, drives: Drives, target: Floats, outcome: Outcome, update: Update) -> None:
+def descend(moments: Moments, plan: Plan, drives: Drives, truth: Floats, outcome: Outcome, update: Update) -> None:
     """Losses (R,) m^2 and gradients (R, P) of the models `update.rows`, and with step > 0 one step of AdamW.
 
     Args:
         moments: (S, P) weights and moments.
         plan: layers and tape of the nets.
         drives: of the R models.
-        target: (T, R, B, 3) true positions m; with step -1 the gradient with respect to the estimates.
+        truth: (T, R, B, 3) positions m.
         outcome: losses and gradients, written here.
         update: the optimiser step.
     """
@@ -60,12 +60,7 @@ def descend(moments: Moments, plan: Plan, drives: Drives, target: Floats, outcom
             rows = (r, first, min(most, lanes - first))
             follow(net, tape, drives, x, rows, state, 1)
             for lane in range(first, first + rows[2]):
-                if update.step < 0:
-                    for t in range(steps):
-                        for i in range(3):
-                            x[t, r, lane, i] = target[t, r, lane, i]
-                else:
-                    loss += score(x, target, r, lane)
+                loss += score(x, truth, r, lane)
             for field in adjoint:
                 field[:] = 0.0
             for end in range(steps, 0, -together):

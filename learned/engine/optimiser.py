@@ -1,4 +1,4 @@
-"""Compiled optimiser step of many models: penalties, clipping and AdamW in two passes over the weights of each."""
+"""Compiled optimiser step of many models: clipping and AdamW in two passes over the weights of each."""
 
 from __future__ import annotations
 
@@ -19,16 +19,15 @@ class Moments(NamedTuple):
 
 
 class Update(NamedTuple):
-    """An optimiser step of the models `rows` (R,): its number, learning rates (R,), decoupled decay, gamma, clip.
+    """An optimiser step of the models `rows` (R,): its number, learning rates (R,), decoupled decay, clip.
 
-    Step 0 computes losses and gradients only, step -1 gradients only, for a given gradient in the estimates.
+    Step 0 computes losses and gradients only.
     """
 
     rows: Ints
     step: int
     rates: Floats
     decay: float
-    l2: float
     limit: float
 
 
@@ -60,8 +59,7 @@ def advance_row(moments: Moments, outcome: Outcome, update: Update, r: int) -> N
     at, gradient = update.rows[r], outcome.gradient[r]
     theta, first, second = moments.theta[at], moments.first[at], moments.second[at]
     real = theta.dtype.type
-    l2 = real(2.0 * update.l2)
-    square = squared_norm(theta, gradient, l2)
+    square = squared_norm(gradient)
     outcome.finite[r] = np.isfinite(outcome.losses[r]) and not np.isnan(square)
     if not outcome.finite[r]:
         return
@@ -69,19 +67,18 @@ def advance_row(moments: Moments, outcome: Outcome, update: Update, r: int) -> N
     keep = real(1.0 - update.rates[r] * update.decay)
     rate, size = real(-update.rates[r] / (1.0 - 0.9**update.step)), real(1.0 / (1.0 - 0.999**update.step))
     for i in range(len(theta)):
-        g = scale * (gradient[i] + l2 * theta[i])
+        g = scale * gradient[i]
         first[i] += real(0.1) * (g - first[i])
         second[i] += real(0.001) * (g * g - second[i])
         theta[i] = keep * theta[i] + rate * first[i] / (np.sqrt(size * second[i]) + real(1e-8))
 
 
 @summing
-def squared_norm(theta: Floats, gradient: Floats, l2: Any) -> Any:
-    """Squared norm of the gradient of loss and penalty, NaN if the gradient is not finite."""
-    real = theta.dtype.type
+def squared_norm(gradient: Floats) -> Any:
+    """Squared norm of a gradient, NaN if it is not finite."""
+    real = gradient.dtype.type
     square = poisoned = real(0.0)
-    for i in range(len(theta)):
-        g = gradient[i] + l2 * theta[i]
-        square += g * g
+    for i in range(len(gradient)):
+        square += gradient[i] * gradient[i]
         poisoned += gradient[i] * real(0.0)  # NaN of NaN and of infinity
     return square + poisoned

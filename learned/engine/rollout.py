@@ -1,4 +1,4 @@
-"""The compiled engine of GainNet: rollouts of many models as a function of theta that torch can differentiate."""
+"""The compiled engine of GainNet: rollouts of many models, their losses and gradients."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor
-from torch.autograd.function import once_differentiable
 
 from coopoc.arrays import AnyArray, Floats, Ints
 from coopoc.errors import InputError
@@ -19,14 +18,12 @@ from .forward import Drives
 from .layers import Shapes, plan_of
 from .optimiser import Moments, Outcome, Update
 
-_NONE = np.empty(0)
-
 
 def rollout(theta: Tensor, shapes: Shapes, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
     """Estimates x (T, S, B, 3) m of S models with weights theta (S, P): `GainNet.step`, T times, compiled.
 
-    x_t = x_{t-1} + dt u_t + K_t (z_t - x_{t-1} - dt u_t). Differentiable in theta and in nothing else, by explicit
-    backpropagation through time. The numbers of a model do not depend on the others.
+    x_t = x_{t-1} + dt u_t + K_t (z_t - x_{t-1} - dt u_t). The numbers of a model do not depend on the others. It has no
+    gradient for torch: `loss_and_gradient` and `descend` compute that of the squared error.
 
     Args:
         theta: (S, P) weights.
@@ -41,7 +38,6 @@ def rollout(theta: Tensor, shapes: Shapes, gnss: Tensor, velocity: Tensor, x0: T
 
     References:
         arXiv 2411.05847, equations 4-6.
-        Werbos, Proc. IEEE 1990 (backpropagation through time).
 
     >>> from coopoc.learned import GainNet
     >>> still = torch.zeros(5, 1, 2, 3)
@@ -49,23 +45,24 @@ def rollout(theta: Tensor, shapes: Shapes, gnss: Tensor, velocity: Tensor, x0: T
     0.0
     """
     drives = _checked(theta, shapes, len(theta), gnss, velocity, x0, dt)
-    if theta.requires_grad and torch.is_grad_enabled():
-        x: Tensor = _Rollout.apply(theta, shapes, drives)  # type: ignore[no-untyped-call]
-        return x
-    return torch.from_numpy(_forward(theta, shapes, drives))
+    x = np.empty_like(drives.gnss)
+    forward.forward(_array(theta, theta.dtype), plan_of(shapes), drives, x)
+    return torch.from_numpy(x)
 
 
 def loss_and_gradient(theta: Tensor, shapes: Shapes, batch: Batch) -> tuple[Tensor, Tensor]:
     """Squared error (S,) m^2, mean over time and batch, sum over components, and its gradient (S, P); as `rollout`.
 
-    It does without torch's graph, whose bookkeeping takes a fifth as long as one trajectory.
+    References:
+        Werbos, Proc. IEEE 1990 (backpropagation through time).
 
     >>> from coopoc.learned import GainNet
     >>> still = torch.zeros(5, 1, 2, 3)
     >>> loss_and_gradient(torch.zeros(1, 19938), GainNet().shapes, Batch(still, still, still, still[0], 0.1))[0]
     tensor([0.])
     """
-    outcome = _descend(theta, shapes, batch, 0)
+    update = Update(np.arange(len(theta)), 0, np.empty(0), 0.0, 0.0)
+    outcome = _step(theta, shapes, batch, Moments(*[_array(theta, theta.dtype)] * 3), update)
     return torch.from_numpy(outcome.losses), torch.from_numpy(outcome.gradient)
 
 
@@ -76,12 +73,6 @@ def descend(
     moments = Moments(*(a.numpy() for a in moving))
     outcome = _step(moving.theta, shapes, batch, moments, update_of(rows, step, rates, schedule))
     return torch.from_numpy(outcome.losses), torch.from_numpy(outcome.finite)
-
-
-def _descend(theta: Tensor, shapes: Shapes, batch: Batch, step: int) -> Outcome:
-    """Gradients (S, P) without an optimiser step, for step 0 with losses."""
-    update = Update(np.arange(len(theta)), step, _NONE, 0.0, 0.0, 0.0)
-    return _step(theta, shapes, batch, Moments(*[_array(theta, theta.dtype)] * 3), update)
 
 
 def _step(theta: Tensor, shapes: Shapes, batch: Batch, moments: Moments, update: Update) -> Outcome:
@@ -95,31 +86,6 @@ def _step(theta: Tensor, shapes: Shapes, batch: Batch, moments: Moments, update:
     outcome = Outcome(gradient, losses, np.empty(models, np.bool_))
     backward.descend(moments, plan, drives, truth, outcome, update)
     return outcome
-
-
-class _Rollout(torch.autograd.Function):
-    """The kernels as one operation of torch; its backward pass computes the estimates again."""
-
-    @staticmethod
-    def forward(ctx: Any, theta: Tensor, shapes: Shapes, drives: Drives) -> Tensor:
-        ctx.save_for_backward(theta)
-        ctx.shapes, ctx.drives = shapes, drives
-        return torch.from_numpy(_forward(theta, shapes, drives))
-
-    @staticmethod
-    @once_differentiable
-    def backward(ctx: Any, adjoints: Tensor) -> tuple[Tensor, None, None]:
-        (theta,) = ctx.saved_tensors
-        gnss, velocity, x0 = (torch.from_numpy(a) for a in ctx.drives[:3])
-        outcome = _descend(theta, ctx.shapes, Batch(gnss, velocity, adjoints, x0, ctx.drives.dt), -1)
-        return torch.from_numpy(outcome.gradient), None, None
-
-
-def _forward(theta: Tensor, shapes: Shapes, drives: Drives) -> AnyArray:
-    """Estimates (T, S, B, 3)."""
-    x = np.empty_like(drives.gnss)
-    forward.forward(_array(theta, theta.dtype), plan_of(shapes), drives, x)
-    return x
 
 
 def _checked(theta: Tensor, shapes: Shapes, models: int, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: Any) -> Drives:

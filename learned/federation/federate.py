@@ -16,7 +16,7 @@ from ..nets.gain import Gain
 from ..nets.stack import flatten
 from ..training.clients import Client
 from ..training.machine import one_core, watched
-from ..training.schedule import STEPS, Epoch, Schedule
+from ..training.schedule import STEPS, Schedule
 from .combine import FLOAT32, SERVER, Answer, Standing, combine
 from .history import Federation, Round
 from .local import Group, Work, stacked
@@ -39,12 +39,11 @@ class Plan:
     aggregate: str | Rule | Combine = "mean"
     local_epochs: int = 5
     schedule: Schedule = field(default_factory=Schedule)
-    epoch: Epoch = "pass"
     participation: Participation = field(default_factory=Participation)
 
     def __post_init__(self) -> None:
         limits = {"rounds": STEPS, "local_epochs": STEPS}
-        check_fields(self, limits, aggregate=object, epoch=Epoch, schedule=Schedule, participation=Participation)
+        check_fields(self, limits, aggregate=object, schedule=Schedule, participation=Participation)
 
     @property
     def rule(self) -> Rule:
@@ -54,7 +53,7 @@ class Plan:
     @property
     def local(self) -> Schedule:
         """Schedule of a client's round."""
-        return replace(self.schedule, epochs=self.local_epochs, epoch=self.epoch)
+        return replace(self.schedule, epochs=self.local_epochs, epoch="pass")
 
     def check(self, clients: int) -> None:
         """InputError for a rule that needs more clients than a round asks."""
@@ -73,7 +72,6 @@ def federate(
     seed: int = 0,
     schedule: Schedule | None = None,
     progress: str | None = None,
-    epoch: Epoch = "pass",
     *,
     participation: Participation | None = None,
 ) -> Federation:
@@ -93,7 +91,6 @@ def federate(
         seed: of the order of the batches.
         schedule: batch, rate, decay, clip.
         progress: name of the stage for a progress bar on stderr, None for no bar.
-        epoch: "pass" over the client's pieces, or "step", one optimiser step as in KalmanNet's published loop.
         participation: the clients that a round asks; default all.
 
     Raises:
@@ -116,7 +113,7 @@ def federate(
         raise InputError("model", shown(start), "must be a Gain", "Give GainNet(), or its name.")
     optimiser = Schedule() if schedule is None else schedule
     presence = Participation() if participation is None else participation
-    plan = Plan(rounds, aggregate, local_epochs, optimiser, epoch, presence)
+    plan = Plan(rounds, aggregate, local_epochs, optimiser, presence)
     return federate_many([start], [clients], [seed], plan, progress)[0]
 
 

@@ -1,16 +1,14 @@
-"""Participation: the clients that a round asks; poisoned and Byzantine clients."""
+"""Participation: the clients that a round asks; Byzantine clients."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 from torch import Tensor
 
 from coopoc.arrays import TINY, check_fields
 from coopoc.world.sensors import stream
-
-from ..training.clients import Client, Segments
 
 
 @dataclass(frozen=True)
@@ -71,12 +69,3 @@ class Byzantine(Participation):
     def answer(self, name: str, theta: Tensor, weights: Tensor) -> Tensor:
         """Scaled if the client is Byzantine."""
         return theta + self.scale * (weights - theta) if name in self.names else weights
-
-
-def poisoned(client: Client, offset: float) -> Client:
-    """The client with a ground truth that is off by `offset` m on every axis."""
-
-    def part(pieces: Segments) -> Segments:
-        return replace(pieces, truth=pieces.truth + offset)
-
-    return replace(client, training=part(client.training), validation=part(client.validation), long=part(client.long))

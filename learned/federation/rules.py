@@ -45,10 +45,10 @@ class Rule:
         return self.combine(weights, sizes)
 
 
-def within(field: str, value: object, good: bool, allowed: str, hint: str = "The docstring cites its source.") -> None:
+def within(field: str, value: object, good: bool, allowed: str) -> None:
     """InputError for a parameter outside its range."""
     if not good:
-        raise InputError(field, value, f"must be {allowed}", hint)
+        raise InputError(field, value, f"must be {allowed}", "The docstring cites its source.")
 
 
 @dataclass(frozen=True)

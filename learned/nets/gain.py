@@ -74,7 +74,7 @@ class Gain(nn.Module, ABC):
             batch: the segments of these R models.
             step: number of the step, >= 1.
             rates: (R,) learning rates.
-            schedule: decay, penalties, clipping.
+            schedule: decay, clipping.
         """
         losses, gradient = self.loss_and_gradient(moving.theta[rows], batch)
         return losses, advance(moving, gradient, losses, rows, step, rates, schedule)

@@ -38,8 +38,7 @@ class GainNet(Recurrent):
     (40, 5) has 19,938, the paper's "almost 20K". A fix is missing where all of it is NaN: the step only predicts, and
     the GRU states, the last fix and the last prior do not change.
 
-    The default start is a stable closed loop, K near `start_gain` times the identity; torch's own initialisation
-    (`start_gain=None`) is unstable for most seeds.
+    The start is a stable closed loop, K near `start_gain` times the identity; torch's own is unstable for most seeds.
 
     Args:
         in_mult: width of the layers that feed the GRUs.
@@ -59,13 +58,12 @@ class GainNet(Recurrent):
         self,
         in_mult: int = 40,
         out_mult: int = 5,
-        start_gain: float | None = 0.1,
+        start_gain: float = 0.1,
         seed: int = 0,
     ) -> None:
         super().__init__()
         self.in_mult, self.out_mult = size("in_mult", in_mult), size("out_mult", out_mult)
-        if start_gain is not None:
-            start_gain = number("start_gain", start_gain, -np.inf, hint="KalmanNet's own start is None, ours 0.1.")
+        start_gain = number("start_gain", start_gain, -np.inf)
         wide, both = SIZE * in_mult, 2 * CELLS
         with torch.random.fork_rng(devices=[]):
             torch.manual_seed(seed_of(seed))
@@ -81,10 +79,9 @@ class GainNet(Recurrent):
             self.posterior_hidden = nn.Linear(both, CELLS)
             self.posterior = nn.Linear(both, CELLS)
         self.shapes = tuple((name, tuple(parameter.shape)) for name, parameter in self.named_parameters())
-        if start_gain is not None:
-            with torch.no_grad():
-                self.gain.weight.mul_(0.1)
-                self.gain.bias.copy_(start_gain * torch.eye(SIZE).flatten())
+        with torch.no_grad():
+            self.gain.weight.mul_(0.1)
+            self.gain.bias.copy_(start_gain * torch.eye(SIZE).flatten())
 
     def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
         """Loss (S,), the mean over the batch, and its gradient (S, P) at theta (S, P)."""
@@ -129,15 +126,18 @@ class GainNet(Recurrent):
         return after, matrix
 
     def forward(self, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
-        """Estimates (B, T, 3) m as in `Recurrent`; compiled, except for inputs with gradients or on another device."""
-        if any(a.requires_grad or a.device.type != "cpu" for a in (gnss, velocity, x0)):
-            return super().forward(gnss, velocity, x0, dt)
+        """Estimates (B, T, 3) m as in `Recurrent`; compiled where no gradient is wanted, in main memory."""
         theta = nn.utils.parameters_to_vector(self.parameters())
+        wanted = torch.is_grad_enabled() and any(a.requires_grad for a in (theta, gnss, velocity, x0))
+        if wanted or theta.device.type != "cpu":
+            return super().forward(gnss, velocity, x0, dt)
         lanes = gnss.transpose(0, 1).unsqueeze(1), velocity.transpose(0, 1).unsqueeze(1)
         return self.rollout(theta[None], *lanes, x0[None], dt)[:, 0].transpose(0, 1)
 
     def rollout(self, theta: Tensor, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: float | Tensor) -> Tensor:
-        """Estimates (T, S, B, 3) m as in `Recurrent`, compiled."""
+        """Estimates (T, S, B, 3) m as in `Recurrent`; compiled where no gradient is wanted."""
+        if torch.is_grad_enabled() and theta.requires_grad:
+            return super().rollout(theta, gnss, velocity, x0, dt)
         return engine.rollout(theta, self.shapes, gnss, velocity, x0, dt)
 
 

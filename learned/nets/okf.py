@@ -11,7 +11,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats, checked, instance, seed_of
+from coopoc.arrays import Floats, checked, seed_of
 from coopoc.errors import InputError
 from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.solo import FixNoise
@@ -96,7 +96,6 @@ class NoiseParameters(Gain):
     log r per axis as weights. The squared error sees ratios of variances only; `calibrate` sets their common scale.
 
     Args:
-        velocity_part: use b, else b = 0.
         seed: without effect, every net has this argument; the start is the same for each.
 
     References:
@@ -106,20 +105,18 @@ class NoiseParameters(Gain):
     (1.0, 1.0, 1.0)
     """
 
-    def __init__(self, velocity_part: bool = True, seed: int = 0) -> None:
+    def __init__(self, seed: int = 0) -> None:
         super().__init__()
         seed_of(seed)
-        self.velocity_part = instance("velocity_part", velocity_part, bool, "Give True or False.")
         self.logs = nn.Parameter(torch.tensor([0.1, 0.1, 1.0]).log()[:, None].repeat(1, 3))
 
     def stds(self, theta: Tensor) -> Tensor:
         """a m, b, r m per axis (S, 3, 3) of weights (S, 9)."""
-        used = torch.tensor([[1.0], [float(self.velocity_part)], [1.0]], dtype=theta.dtype)
-        return theta.view(-1, 3, 3).exp() * used
+        return theta.view(-1, 3, 3).exp()
 
     def with_logs(self, logs: Tensor) -> NoiseParameters:
         """A filter of this kind with other log a, log b, log r (3, 3)."""
-        made = NoiseParameters(self.velocity_part)
+        made = NoiseParameters()
         with torch.no_grad():
             made.logs.copy_(logs)
         return made
@@ -142,8 +139,7 @@ class NoiseParameters(Gain):
         """
         squares, pieces = torch.zeros(3), sum(map(len, parts))
         for segments in parts:
-            drawn = [torch.Generator().manual_seed(0)]
-            innovation = scan(self.stds(flatten([self])), segments.batch(torch.arange(len(segments))[None], drawn))[1]
+            innovation = scan(self.stds(flatten([self])), segments.batch(torch.arange(len(segments))[None]))[1]
             squares += over_time(innovation.square(), innovation.isfinite()).sum((0, 1))
         return self.with_logs(self.logs + log_scale(squares / pieces))
 

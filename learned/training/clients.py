@@ -19,7 +19,6 @@ from coopoc.world.sensing import observe
 from coopoc.world.sensors import Sensors, stream
 from coopoc.world.v2x import V2X
 
-Noise = Literal["static", "fresh"]
 Start = Literal["gnss", "true"]
 LONG = 9
 """Training pieces that a long piece is as long as: 900 steps, the paper's test drive."""
@@ -45,48 +44,39 @@ class Segments:
         gnss: (n, T + 1, 3) m; sample 0 only starts the filter.
         velocity: (n, T + 1, 3) m/s.
         truth: (n, T + 1, 3) m.
-        true_velocity: (n, T + 1, 3) m/s.
-        gnss_std: (n, T + 1, 3) m of the noise, for new draws.
-        velocity_std: (n, T + 1, 3) m/s of the noise, for new draws.
         true_start: (n,) whether the filter starts at the truth (KalmanNet's published loop) or at the first fix.
         dt: s.
-        noise: "static" was drawn once, or measured; "fresh" is drawn anew at every use.
     """
 
     gnss: Tensor
     velocity: Tensor
     truth: Tensor
-    true_velocity: Tensor
-    gnss_std: Tensor
-    velocity_std: Tensor
     true_start: Tensor
     dt: float
-    noise: Noise = "static"
 
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_fields(self, {"dt": (1e-9, 1e9, "> 0 s")}, noise=Noise)
-        for field in fields(self):
-            value = getattr(self, field.name)
-            shape: tuple[int, ...] = tuple(getattr(self.truth, "shape", ()))
-            if field.type == "Tensor":
-                wanted = shape[:1] if field.name == "true_start" else shape
-                fits = isinstance(value, Tensor) and value.shape == wanted and len(shape) == 3 and shape[2] == 3
-                if not fits:
-                    allowed = "must be a tensor (n, T + 1, 3) as the others are, true_start (n,)"
-                    given = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else shown(value)
-                    raise InputError(field.name, given, allowed, "Make segments with learned.clients(...).")
+        check_fields(self, {"dt": (1e-9, 1e9, "> 0 s")})
+        shape = tuple(getattr(self.truth, "shape", ()))
+        for name, wanted in {
+            "gnss": shape,
+            "velocity": shape,
+            "truth": (*shape[:2], 3),
+            "true_start": shape[:1],
+        }.items():
+            value = getattr(self, name)
+            if not isinstance(value, Tensor) or value.shape != wanted:
+                allowed = "must be a tensor (n, T + 1, 3) as the others are, true_start (n,)"
+                given = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else shown(value)
+                raise InputError(name, given, allowed, "Make segments with learned.clients(...).")
 
     def __len__(self) -> int:
         return len(self.truth)
 
-    def batch(self, index: Tensor, draws: Sequence[torch.Generator] = ()) -> Batch:
-        """Segments `index` (S, B); new noise comes from the S generators `draws`."""
-        if self.noise == "static":
-            drives = torch.from_numpy(self._drives.take(index.numpy(), axis=2))
-        else:
-            drives = torch.stack([*self._drawn(index, draws), self.truth[index]]).permute(0, 3, 1, 2, 4).contiguous()
+    def batch(self, index: Tensor) -> Batch:
+        """Segments `index` (S, B)."""
+        drives = torch.from_numpy(self._drives.take(index.numpy(), axis=2))
         x0, exact = drives[0, 0], None
         if self._any_true_start:
             exact = self.true_start[index]
@@ -104,29 +94,22 @@ class Segments:
         """Whether any piece starts at the truth."""
         return bool(self.true_start.any())
 
-    def _drawn(self, index: Tensor, draws: Sequence[torch.Generator]) -> tuple[Tensor, Tensor]:
-        """gnss and velocity (S, B, T + 1, 3) with new noise."""
-        shape = (2, index.shape[1], *self.truth.shape[1:])
-        normals = torch.stack([torch.randn(shape, generator=draw) for draw in draws], dim=1)
-        gnss, velocity = (self.gnss_std[index] * normals[0], self.velocity_std[index] * normals[1])
-        return self.truth[index] + gnss, self.true_velocity[index] + velocity
-
     def take(self, index: Sequence[int]) -> Segments:
         """The pieces `index`."""
         return self._each(lambda name: getattr(self, name)[list(index)])
 
     @classmethod
     def join(cls, parts: Sequence[Segments]) -> Segments:
-        """All pieces of several parts in their order; the parts agree in length, dt and kind of noise."""
-        if len({(p.truth.shape[1], p.dt, p.noise) for p in parts}) != 1:
-            agreed = [(p.truth.shape[1], p.dt, p.noise) for p in parts]
-            raise InputError("pieces", agreed, "must agree in length, dt and noise", "Cut all clients alike.")
+        """All pieces of several parts in their order; the parts agree in length and dt."""
+        if len({(p.truth.shape[1], p.dt) for p in parts}) != 1:
+            agreed = [(p.truth.shape[1], p.dt) for p in parts]
+            raise InputError("pieces", agreed, "must agree in length and dt", "Cut all clients alike.")
         return parts[0]._each(lambda name: torch.cat([getattr(p, name) for p in parts]))
 
     def _each(self, made: Callable[[str], Tensor]) -> Segments:
         """The same pieces with every tensor field replaced by what `made` gives for its name."""
         tensors = {f.name: made(f.name) for f in fields(self) if isinstance(getattr(self, f.name), Tensor)}
-        return Segments(**tensors, dt=self.dt, noise=self.noise)
+        return Segments(**tensors, dt=self.dt)
 
 
 def mirrored(batch: Batch, draws: Sequence[torch.Generator]) -> Batch:
@@ -172,7 +155,6 @@ def clients(
     sensors: Sensors | None = None,
     *,
     seed: int = 0,
-    noise: Noise = "static",
     start: Start = "gnss",
     piece: int = 100,
     split: float = 0.8,
@@ -181,13 +163,12 @@ def clients(
 
     A piece is `piece` steps after one start sample; the last incomplete one, and one that begins without a fix, are
     dropped. Which pieces validate is drawn
-    once from the seed. Static noise, drawn once as the paper implies, is the default.
+    once from the seed, and so is the noise, as the paper implies.
 
     Args:
         fleet: drives (T, N); a vehicle may leave early.
         sensors: default `Sensors.paper_training()`.
         seed: of noise and split.
-        noise: "static" or "fresh" (new at every use).
         start: "gnss" (first fix) or "true".
         piece: steps of a segment.
         split: share of the segments that train.
@@ -203,34 +184,24 @@ def clients(
     >>> [(len(c.training), len(c.validation)) for c in clients(line)]
     [(2, 1)]
     """
-    one_of("noise", noise, Noise)
     one_of("start", start, Start)
     check_pieces(piece, split)
     fleet = instance("fleet", fleet, Fleet)
     sensors = Sensors.paper_training() if sensors is None else instance("sensors", sensors, Sensors)
-    lasting = (sensors.gnss_bias, sensors.gnss_drift_std, sensors.gnss_common_std, sensors.outliers)
-    if noise != "static" and lasting != ((0.0, 0.0), 0.0, 0.0, None):
-        raise InputError(
-            "gnss_bias, gnss_drift_std, gnss_common_std, outliers",
-            lasting,
-            f"must be zero with {noise} noise",
-            "Train with white noise, or static.",
-        )
     seen = observe(fleet, sensors, V2X(max_neighbours=0, rate=1 / fleet.dt), seed=seed)
     agreed, longest = [], min(LONG * piece, max(int(fleet.present.sum(0).min()) - 1, 1))
     for column, name in enumerate(fleet.ids):
         there = np.flatnonzero(fleet.present[:, column])
         if len(there) and there[-1] - there[0] >= len(there):
             raise InputError("fleet", f"{name} leaves and comes back", "must be one drive", "Cut it with between(...).")
-        arrays = (seen.gnss[0], seen.velocity[0], fleet.position, fleet.velocity)
-        drive = [a[there, column] for a in arrays]
-        pieces = _cut(drive, sensors, piece, fleet.dt, noise, start)
+        drive = [a[there, column] for a in (seen.gnss[0], seen.velocity[0], fleet.position)]
+        pieces = _cut(drive, piece, fleet.dt, start)
         if len(pieces) < 2:
             hint = f"Give it at least {2 * (piece + 1)} steps or shorten the pieces."
             raise InputError("fleet", f"{name} with {len(pieces)} pieces of {piece}", "needs at least two", hint)
         order = stream(seed, "split", 0, name).permutation(len(pieces)).tolist()
         count = min(max(int(split * len(pieces)), 1), len(pieces) - 1)
-        long = _cut(drive, sensors, longest, fleet.dt, noise, start)
+        long = _cut(drive, longest, fleet.dt, start)
         training, validation = pieces.take(sorted(order[:count])), pieces.take(sorted(order[count:]))
         agreed.append(Client(name, training, validation, long))
     return tuple(agreed)
@@ -243,26 +214,12 @@ def check_pieces(piece: int, split: float) -> None:
         raise InputError("split", split, "must be in (0, 1)", "The paper has 0.8.")
 
 
-def _cut(drive: Sequence[Floats], sensors: Sensors, piece: int, dt: float, noise: Noise, start: Start) -> Segments:
-    """Segments of one vehicle's gnss, velocity, truth and true velocity (T, 3)."""
+def _cut(drive: Sequence[Floats], piece: int, dt: float, start: Start) -> Segments:
+    """Segments of one vehicle's gnss, velocity and truth (T, 3)."""
     count = len(drive[0]) // (piece + 1)
-    gnss, velocity, truth, true_velocity = (d[: count * (piece + 1)].reshape(count, piece + 1, 3) for d in drive)
+    gnss, velocity, truth = (d[: count * (piece + 1)].reshape(count, piece + 1, 3) for d in drive)
     begun = np.isfinite(gnss[:, 0, 0])
-    gnss, velocity, truth, true_velocity = (d[begun] for d in (gnss, velocity, truth, true_velocity))
-    origin = truth[:, :1]
-    stds = np.broadcast_to(np.array(sensors.gnss_std), gnss.shape), sensors.velocity_std(true_velocity)
-
-    def tensor(numbers: Floats) -> Tensor:
-        return torch.tensor(numbers, dtype=torch.float32)
-
-    return Segments(
-        tensor(gnss - origin),
-        tensor(velocity),
-        tensor(truth - origin),
-        tensor(true_velocity),
-        tensor(stds[0]),
-        tensor(stds[1]),
-        torch.full((len(gnss),), start == "true"),
-        dt,
-        noise,
-    )
+    origin = truth[begun, :1]
+    parts = (gnss[begun] - origin, velocity[begun], truth[begun] - origin)
+    fixes, speeds, truths = (torch.tensor(part, dtype=torch.float32) for part in parts)
+    return Segments(fixes, speeds, truths, torch.full((begun.sum(),), start == "true"), dt)

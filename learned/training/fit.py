@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import reduce
 
 import numpy as np
@@ -78,7 +78,7 @@ def fit(
     progress: str | None = None,
     long: Segments | None = None,
 ) -> Fit:
-    """Minimise 1/T sum_t ||xhat_t - x_t||^2 + gamma ||theta||^2 over batches of pieces.
+    """Minimise 1/T sum_t ||xhat_t - x_t||^2 over batches of pieces; weights decay by AdamW.
 
     Args:
         model: the start; it is not changed.
@@ -127,7 +127,8 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
     rates = [schedule.learning_rate * cosine(len(plan)) for plan in plans]
     due = [set(np.linspace(0, len(plan), schedule.checks + 1).round().astype(int).tolist()) for plan in plans]
     draws = [generator(draw) for draw in streams]
-    for step, losses in bar(descend(theta, like, pool, plans, rates, schedule, draws, stopped), plans, progress):
+    steps = descend(theta, like, pool, plans, rates, schedule, draws, stopped)
+    for step, losses in watched(steps, progress, "step", max(map(len, plans))):
         seen.append(losses)
         checked = [row for row in range(len(tasks)) if step in due[row] and row not in stopped]
         if checked:
@@ -165,7 +166,7 @@ def descend(
         losses = np.full(len(plans), math.nan, np.float32)
         if rows:
             dice = [draws[r] for r in rows]
-            batch = pool.batch(torch.from_numpy(np.array([plans[r][step] for r in rows])), dice)
+            batch = pool.batch(torch.from_numpy(np.array([plans[r][step] for r in rows])))
             batch = mirrored(batch, dice) if schedule.mirror else batch
             rate = np.array([rates[r][step] for r in rows])
             losses[rows], taken = like.descend(moving, np.array(rows), batch, step + 1, rate, schedule)
@@ -181,7 +182,7 @@ class Judge:
     """Score (S,) m^2 of S models: the larger of the mean losses on each kind of their pieces, infinite if not finite.
 
     The kinds are the validation pieces and, where there are any, the long ones: over a long drive a stable filter is
-    the better for its start being over, so they decide only against weights that drift away. New noise is drawn once.
+    the better for its start being over, so they decide only against weights that drift away.
     A score does not depend on the other models: a model's segments have their own random draws and are summed in order.
     """
 
@@ -198,29 +199,14 @@ class Judge:
 
 def padded(parts: Sequence[Segments]) -> tuple[Batch, Tensor]:
     """All pieces of S models as one batch, and the share (S, B) of each in its model's mean, 0 for padding."""
-    pool, members = pooled([_drawn(part) for part in parts])
+    pool, members = pooled(parts)
     most = max(map(len, members))
     index = torch.from_numpy(np.stack([np.resize(m, most) for m in members]))
     share = torch.tensor([[(i < len(m)) / len(m) for i in range(most)] for m in members])
     return pool.batch(index), share
 
 
-def _drawn(part: Segments) -> Segments:
-    """The same pieces with noise that is drawn once, where it would be new at every use."""
-    if part.noise == "static":
-        return part
-    seen = part.batch(torch.arange(len(part))[None], [generator(stream(0, "validation", 0, ""))])
-    gnss = torch.cat([seen.x0, seen.gnss[:, 0]]).transpose(0, 1)
-    velocity = torch.cat([part.true_velocity[None, :, 0], seen.velocity[:, 0]]).transpose(0, 1)
-    return replace(part, gnss=gnss, velocity=velocity, noise="static")
-
-
 def pooled(parts: Sequence[Segments]) -> tuple[Segments, list[Ints]]:
     """All pieces in one, and the indices of each part in it."""
     ends = np.cumsum([len(p) for p in parts])
     return Segments.join(parts), [np.arange(end - len(p), end) for p, end in zip(parts, ends, strict=True)]
-
-
-def bar(steps: Iterator[tuple[int, Tensor]], plans: Sequence[Ints], name: str | None) -> Iterator[tuple[int, Tensor]]:
-    """The same steps with a progress bar of that name on stderr, or without one."""
-    return watched(steps, name, "step", max(map(len, plans)))

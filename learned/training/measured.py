@@ -108,14 +108,10 @@ def _segments(drives: MeasuredDrives, column: int, cuts: Sequence[Cut], piece: i
         rows = np.stack([values[min(run, len(values) - 1), at : at + piece + 1, column] for run, at in cuts])
         return torch.tensor(rows - origin, dtype=torch.float32)
 
-    shape = (len(cuts), piece + 1, 3)
     return Segments(
         gnss=tensor(seen.gnss, origin),
         velocity=tensor(seen.velocity),
         truth=tensor(target, origin),
-        true_velocity=tensor(truth.velocity[None]),
-        gnss_std=torch.tensor(seen.sensors.fix_std, dtype=torch.float32).expand(shape),
-        velocity_std=tensor(seen.sensors.velocity_std(seen.velocity)),
         true_start=torch.full((len(cuts),), start == "true"),
         dt=seen.dt,
     )

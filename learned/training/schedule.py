@@ -20,7 +20,7 @@ STEPS, SIZE = (1, 10**7, "> 0 and at most 10^7"), (sys.float_info.min, sys.float
 LIMITS: Limits = {
     **dict.fromkeys(("epochs", "batch", "checks"), STEPS),
     **dict.fromkeys(("learning_rate", "clip"), SIZE),
-    **dict.fromkeys(("weight_decay", "l2"), (0.0, sys.float_info.max, ">= 0, and 0 for none")),
+    "weight_decay": (0.0, sys.float_info.max, ">= 0, and 0 for none"),
 }
 """Of a Schedule's numbers."""
 
@@ -39,8 +39,6 @@ class Schedule:
     """Of AdamW, falling to zero as a half cosine. The paper's 0.3 does not train (docs/learned.md)."""
     weight_decay: float = 0.3
     """Decoupled from the gradient (AdamW), the paper's number."""
-    l2: float = 0.0
-    """gamma of the paper's gamma ||theta||^2 in the loss; weaker than the decoupled decay under static noise."""
     clip: float = 1.0
     """Largest norm of a model's gradient."""
     mirror: bool = True
@@ -85,8 +83,8 @@ def advance(
 ) -> Tensor:
     """One optimiser step in place for `rows` of the weights and moments; whether each was taken, (R,) booleans.
 
-    The gradient of the penalty gamma ||theta||^2 is added, the sum clipped, and AdamW
-    (beta 0.9, 0.999) moves the weights; a row whose loss or gradient is not finite does not change.
+    The gradient is clipped and AdamW (beta 0.9, 0.999) moves the weights; a row whose loss or gradient is not finite
+    does not change.
 
     Args:
         moving: weights and moments (S, P).
@@ -95,7 +93,7 @@ def advance(
         rows: (R,) models to move.
         step: number of the step, >= 1.
         rates: (R,) learning rates.
-        schedule: decay, penalty, clipping.
+        schedule: decay, clipping.
 
     References:
         Loshchilov and Hutter, ICLR 2019, algorithm 2.
@@ -107,8 +105,7 @@ def advance(
 
 def update_of(rows: Ints, step: int, rates: Floats, schedule: Schedule) -> Update:
     """The step as the compiled optimiser takes it."""
-    law = schedule.weight_decay, schedule.l2, schedule.clip
-    return Update(rows, step, rates, *map(float, law))
+    return Update(rows, step, rates, float(schedule.weight_decay), float(schedule.clip))
 
 
 def generator(draw: np.random.Generator) -> torch.Generator:

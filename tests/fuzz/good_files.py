@@ -139,4 +139,4 @@ REFERENCE = json.dumps(
     },
     indent=1,
 )
-CARD = json.dumps({"kind": "okf", "net": {"velocity_part": True, "seed": 0}, "history": [], "training_pieces": [3]})
+CARD = json.dumps({"kind": "okf", "net": {"seed": 0}, "history": [], "training_pieces": [3]})

@@ -17,6 +17,8 @@ from pathlib import Path
 from pkgutil import walk_packages
 from typing import Any, TypeVar, cast
 
+from .waiting import clock, spent, waiting
+
 Function = TypeVar("Function", bound=Callable[..., Any])
 
 
@@ -103,7 +105,7 @@ def _watch() -> None:
         def on_start(self, event: Any) -> None:
             self.timers.append(threading.Timer(PATIENCE, _say, [_line(event.data["dispatcher"].py_func)]))
             if len(self.timers) == 1:
-                self.began, self.used = time.time(), time.process_time()
+                self.began, self.used = clock(), time.process_time()
                 self.timers[0].daemon = True
                 self.timers[0].start()
                 self.collects = gc.isenabled()
@@ -113,7 +115,8 @@ def _watch() -> None:
             self.timers.pop().cancel()
             if not self.timers:
                 seconds[_name(event.data["dispatcher"].py_func)] = time.process_time() - self.used
-                _hold_bars(time.time() - self.began)
+                _hold_bars(took := clock() - self.began)
+                spent["compile"] += took
             if self.collects and not self.timers:
                 gc.enable()
 
@@ -167,9 +170,10 @@ def _hold_bars(seconds: float) -> None:
 
 
 def _made(function: Function, liberties: set[str], part: bool = False, **options: Any) -> Any:
-    import numba
+    with waiting("load"):
+        import numba
 
-    _watch()
+        _watch()
     if hooks := _hooks():
         options["pipeline_class"] = hooks[0].Part if part else hooks[0].Kernel
         if part:

@@ -20,6 +20,8 @@ import numba
 from numba.core.caching import IndexDataCacheFile, InTreeCacheLocator, UserProvidedCacheLocator, UserWideCacheLocator
 from numba.core.compiler import CompileResult
 
+from .waiting import waiting
+
 KERNELS = Path(__file__).resolve().parents[1]
 SHIPPED = KERNELS / "shipped"
 """Folder of the machine code that a wheel holds; a clone has none."""
@@ -58,16 +60,17 @@ class MachineCode:
 
     def load_overload(self, signature: Any, context: Any) -> Any:
         """Compiled function for the types of a signature, or None."""
-        context.refresh()
-        for origin, file, target in self._places(context.codegen()):
-            try:
-                data = file.load(self._key(signature, target))
-                made = None if data is None else CompileResult._rebuild(context, *data)
-            except Exception:  # a damaged file, or types that were renamed: any error of pickle or LLVM
-                continue
-            if made is not None:
-                self.origin = origin
-                return made
+        with waiting("load"):
+            context.refresh()
+            for origin, file, target in self._places(context.codegen()):
+                try:
+                    data = file.load(self._key(signature, target))
+                    made = None if data is None else CompileResult._rebuild(context, *data)
+                except Exception:  # a damaged file, or types that were renamed: any error of pickle or LLVM
+                    continue
+                if made is not None:
+                    self.origin = origin
+                    return made
         return None
 
     def save_overload(self, signature: Any, made: Any) -> None:

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from time import perf_counter
 from typing import Any
 
 import numpy as np
 
 from ...arrays import Floats
+from ...kernels.compiling.waiting import clock
 from ..algebra.sparse import Sparse
 from ..model.derivatives import Model
 
@@ -177,12 +177,12 @@ def progress(name: str) -> Iterator[Callable[[float], None]]:
     >>> with progress("solve") as step:
     ...     step(1.5)
     """
-    began, count, bars = perf_counter(), 0, list[Any]()
+    began, count, bars = clock(), 0, list[Any]()
 
     def step(cost: float) -> None:
         nonlocal count
         count += 1
-        if not bars and perf_counter() - began > DELAY:
+        if not bars and clock() - began > DELAY:
             from tqdm import tqdm
 
             bars.append(tqdm(desc=name, unit=" steps", initial=count - 1))
