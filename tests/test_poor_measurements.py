@@ -9,25 +9,40 @@ from conftest import refused, textbook
 from filterpy.kalman import KalmanFilter
 
 from coopoc import (
+    LKFSA,
+    MSMV,
     V2X,
     CentralFilter,
+    CovarianceIntersection,
     Fleet,
     JointFilter,
     Kalman,
     Method,
     MovingHorizon,
     Recording,
+    RoadFilter,
     Sensors,
     nees,
     observe,
     rt_le,
     run_study,
 )
+from coopoc.learned import GainNet, LearnedGain
 from coopoc.methods.cooperative_filter import CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.studies.views import of
 from coopoc.study import numbers
 from coopoc.world.links import wrap
+
+SOLO = (Kalman(), LearnedGain(GainNet(4, 1)), RoadFilter())
+STARS = (
+    JointFilter(),
+    JointFilter(exact=False),
+    LKFSA("nominal"),
+    CooperativeFilter(robust=False),
+    MSMV("nominal"),
+    CovarianceIntersection(split=True),
+)
 
 
 def holed(recording: Recording, share: float, vehicles: slice = slice(None)) -> Recording:
@@ -59,6 +74,15 @@ def test_kalman_without_fixes_predicts_as_filterpy_does(crossing: Fleet) -> None
             kf.update(seen.gnss[0, t, 1][:, None])
         np.testing.assert_allclose(track.x[0, t, 0], kf.x[:, 0], atol=1e-9)
         np.testing.assert_allclose(track.covariance[0, t, 0], kf.P, atol=1e-9)
+
+
+@pytest.mark.parametrize("method", [*SOLO, *STARS], ids=lambda m: f"{m.name}{getattr(m, 'exact', '')}")
+def test_missing_fixes_cost_and_do_not_crash(crossing: Fleet, method) -> None:  # type: ignore[no-untyped-def]
+    whole = observe(crossing, Sensors(gnss_std=(4, 4, 4)), V2X(4, 80.0), runs=6)
+    some, few = (float(rt_le(method(holed(whole, share), [0, 3]), crossing).mean()) for share in (0.0, 0.7))
+    assert np.isfinite(few)
+    assert few < 4 * np.sqrt(3)
+    assert method.name in ("fedkalmannet", "lkf-sa") or few > some
 
 
 def test_a_drive_starts_with_a_fix(crossing: Fleet) -> None:
