@@ -54,8 +54,6 @@ def holed(recording: Recording, share: float, vehicles: slice = slice(None)) -> 
     return replace(recording, gnss=gnss)
 
 
-<<<<<<< HEAD
-=======
 def test_kalman_without_fixes_predicts_as_filterpy_does(crossing: Fleet) -> None:
     seen = holed(observe(crossing, Sensors(), V2X(0), runs=1), 0.4)
     track = textbook(Kalman())(seen, [1])
@@ -78,7 +76,6 @@ def test_kalman_without_fixes_predicts_as_filterpy_does(crossing: Fleet) -> None
         np.testing.assert_allclose(track.covariance[0, t, 0], kf.P, atol=1e-9)
 
 
->>>>>>> h-trim2
 @pytest.mark.parametrize("method", [*SOLO, *STARS], ids=lambda m: f"{m.name}{getattr(m, 'exact', '')}")
 def test_missing_fixes_cost_and_do_not_crash(crossing: Fleet, method) -> None:  # type: ignore[no-untyped-def]
     whole = observe(crossing, Sensors(gnss_std=(4, 4, 4)), V2X(4, 80.0), runs=6)
