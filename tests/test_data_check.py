@@ -113,23 +113,6 @@ def test_an_antenna_elsewhere_is_found_and_taken_off(tmp_path: Path, truth: bool
     assert "antenna=" not in said(log)
 
 
-def test_a_german_table_is_read_and_its_outliers_are_named(tmp_path: Path) -> None:
-    """Semicolons, decimal commas, headers of another language, one wide table."""
-    names = {"t": "Zeit", "vehicle": "Fahrzeug", "partner": "Ziel", "x": "Rechtswert", "y": "Hochwert"}
-    names |= {"range": "Abstand", "speed_kmh": "Tempo", "heading_deg": "Kurs"}
-    frame = pd.read_csv(cars(tmp_path / "log", lambda f: f.assign(range=outliers(f["range"]))) / "log.csv")
-    frame["speed_kmh"] = 3.6 * np.hypot(frame["vx"], frame["vy"])
-    frame["heading_deg"] = np.degrees(np.arctan2(frame["vy"], frame["vx"]))
-    frame = frame.drop(columns=["vx", "vy", "vx_std"]).rename(columns=names)
-    frame.to_csv(tmp_path / "fahrt.csv", sep=";", decimal=",", index=False)
-    log = read_log(tmp_path / "fahrt.csv", columns=names)
-    assert log.recording.ids == ("car0", "car1")
-    assert log.summary.read == {"fixes": 720, "ranges": 900}
-    text = said(log)
-    assert pd.Series([text]).str.contains(r"[45]\.\d% of the ranges lie beyond 5")[0]
-    assert "not read" not in text
-
-
 def test_wrong_ranges_are_named_and_mislead_no_filter(tmp_path: Path) -> None:
     """From the file to the study's rows: with wrong ranges cooperation still helps, without gates it does not."""
     folder = cars(tmp_path / "log", lambda f: f.assign(range=outliers(f["range"], 0.1)))

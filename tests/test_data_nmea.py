@@ -2,8 +2,7 @@
 
 import sys
 from collections.abc import Callable, Mapping
-from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import datetime, timedelta
 from pathlib import Path
 from types import MappingProxyType
 from typing import Any
@@ -13,7 +12,7 @@ import pandas as pd
 import pymap3d
 import pytest
 from conftest import measured, refused
-from logs import at, bends, drive, outliers, ranges, write
+from logs import drive
 from numpy.testing import assert_allclose
 
 import coopoc as co
@@ -226,32 +225,6 @@ def test_times_of_a_bag_are_those_of_its_headers_or_of_its_reception(tmp_path: P
     by_header, received = (read_log(tmp_path / "drive", dt=0.1, stamps=stamps) for stamps in ("header", "received"))
     assert received.recording.t[0] - by_header.recording.t[0] == pytest.approx(0.25, abs=1e-5)
     assert "times are those of stamps=header; headers are between 0.25 and 0.25 s before" in str(by_header.summary)
-
-
-def test_cars_with_receivers_uwb_and_clocks_that_differ(tmp_path: Path) -> None:
-    """NMEA of two cars whose clocks are 0.3 s apart; UWB ranges in mm, one of twenty reflected, beside them."""
-    fleet, start = bends(), datetime(2026, 5, 1, 12, tzinfo=UTC)
-    log = tmp_path / "log"
-    log.mkdir()
-    slow = replace(fleet.between(0, 6000), t=fleet.t[:6000])
-    every = co.Fleet(slow.ids, slow.t[::10], slow.position[::10], slow.velocity[::10])
-    for k, late in enumerate((0.0, 0.3)):
-        (log / f"{every.ids[k]}.nmea").write_text(nmea(every, k, start + timedelta(seconds=late)))
-    uwb = ranges(every, "car0", "car1", 0.2, 0.15)
-    uwb["range"], uwb["t"] = 1000 * outliers(uwb["range"]), 1000 * (uwb["t"] + start.timestamp())
-    write(uwb.drop(columns="range_std"), log / "uwb.csv")
-    options = {"scale": {"range": 1e-3}, "std": {"range": 0.15}}
-    with refused("Divide it by 1e3"):
-        read_log(log, **options)  # type: ignore[arg-type]
-    uwb["t"] /= 1000
-    write(uwb.drop(columns="range_std"), log / "uwb.csv")
-    wrong, right = (read_log(log, clock=clock, **options) for clock in ({}, {"car1": 0.3}))  # type: ignore[arg-type]
-    assert right.recording.sensors.range_std == pytest.approx(0.15)
-    one, other = (at(every, name, right.recording.t - start.timestamp()) for name in every.ids)
-    error = right.recording.relative[0, :, 0] - np.linalg.norm(one - other, axis=1)[right.recording.links.step]
-    assert np.median(np.abs(error)) < 0.15
-    assert any("of the ranges lie beyond 5" in text for text in check(right).warnings)
-    assert float(np.nanmax(np.abs(wrong.recording.gnss[0, 50, 1] - right.recording.gnss[0, 50, 1]))) > 1.0
 
 
 def write_bag(

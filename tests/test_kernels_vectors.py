@@ -86,7 +86,7 @@ def test_angles_side_by_side_are_those_of_atan2() -> None:
     import numba
 
     from coopoc.kernels.compiling.vectors import pack, put, take
-    from coopoc.kernels.stars.relative import angle
+    from coopoc.kernels.geometry import angle
 
     @numba.njit
     def call(sine, cosine, out):  # type: ignore[no-untyped-def]

@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import refused, textbook
-from filterpy.kalman import KalmanFilter
+from conftest import refused
 
 from coopoc import GNSS, V2X, Fleet, JointFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
@@ -60,23 +59,6 @@ def test_without_messages_it_is_the_solo_method(name: str, noise: str, channel: 
     if name not in SNAPSHOTS | OWN:
         assert track.covariance[:, now] == pytest.approx(alone.covariance[:, now], abs=1e-3)
     assert name in WHOLE_FLEET or (track.received_bytes == 0).all()
-
-
-def test_solo_filter_equals_filterpy(crossing: Fleet) -> None:
-    """Independent check: filterpy's KalmanFilter on the same numbers."""
-    recording = observe(crossing, S2, runs=1)
-    known = NoiseModel("fitted", S2, process_std=(0.08, 0.07, 0.01), gnss_std=(3.0, 3.5, 4.0))
-    track = textbook(Kalman(known))(recording, [2])
-    peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
-    peer.B, peer.H = 0.1 * np.eye(3), np.eye(3)
-    peer.Q, peer.R = np.diag(np.square(known.process_std)), np.diag(known.gnss_variance)
-    peer.x, peer.P = recording.gnss[0, 0, 2], peer.R.copy()
-    for t in range(1, 60):
-        peer.predict(u=recording.velocity[0, t, 2])
-        peer.update(recording.gnss[0, t, 2])
-        assert track.x[0, t, 0] == pytest.approx(peer.x, abs=1e-9)
-        assert track.covariance is not None
-        assert track.covariance[0, t, 0] == pytest.approx(peer.P, abs=1e-9)
 
 
 def test_loss_and_delay_cost_accuracy_and_never_break(formation: Fleet) -> None:

@@ -16,7 +16,6 @@ import numpy as np
 import pytest
 from conftest import refused, same_minimum
 from random_graphs import star
-from scipy.optimize import minimize
 
 from coopoc import V2X, Sensors, load_fleet, observe
 from coopoc.optimize import (
@@ -142,22 +141,6 @@ def test_a_tight_relaxation_is_near_before_it_is_refined(name: str) -> None:
     if found.extras["rank_gap"] < 1e-5:
         assert found.cost == pytest.approx(ours.cost, rel=1e-5)
         assert found.x == pytest.approx(ours.x, abs=2e-2)
-
-
-def test_the_active_bound_is_scipys() -> None:
-    problem, found = case("active bound"), reference("active bound")
-    bound = problem.constraints[0].lower[:, 2]
-    floor = [(None, None), (None, None), (bound[0], None)] * 8
-    theirs = minimize(
-        lambda x: problem.cost(x.reshape(8, 3)),
-        found.x.ravel() + 0.1,
-        method="SLSQP",
-        bounds=floor,
-        options={"ftol": 1e-14, "maxiter": 1000},
-    )
-    assert (found.position[:, 2] <= bound + 1e-6).any()
-    assert found.cost == pytest.approx(theirs.fun, rel=1e-8)
-    assert found.x.ravel() == pytest.approx(theirs.x, abs=1e-3)
 
 
 NO_FIX = Problem(("a", "b", "c")).add("range", [("a", "b"), ("b", "c")], [[5.0], [6.0]], std=1.0)

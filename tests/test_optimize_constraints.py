@@ -114,30 +114,6 @@ def test_a_linear_problem_in_a_box_is_scipys(seed: int, backend: str, options: d
         assert solution.iterations == 1
 
 
-@pytest.mark.parametrize("length", [1, 5])
-@pytest.mark.parametrize("seed", range(3))
-def test_an_active_bound_is_the_same_in_all(dense: Recording, length: int, seed: int) -> None:
-    """osqp and ipopt against each other and KKT: the gradient vanishes where nothing pushes, else has its sign."""
-    rng = np.random.default_rng(seed)
-    problem = Problem.from_window(dense, 20, 0, length, seed % 2)
-    free = solve(problem).x
-    middle = free + rng.uniform(-0.8, 0.8, free.shape)
-    lower, upper = middle - 0.4, middle + 0.4
-    upper[0] = lower[0] = free[0] + 0.3  # an equality
-    bound = problem.constrain("position", problem.names, lower, upper)
-    first, *others = [solved(bound, *how) for how in LINEAR]
-    for other in others:
-        same_minimum(other, first)
-    gradient_ = gradient(problem, first.x).reshape(-1, 3)
-    low, high = first.x < lower + 1e-7, first.x > upper - 1e-7
-    assert low[1:].any()
-    assert high[1:].any()
-    assert gradient_[~low & ~high] == pytest.approx(0.0, abs=1e-5)
-    assert (gradient_[low & ~high] > -1e-5).all()
-    assert (gradient_[high & ~low] < 1e-5).all()
-    assert first.gradient_norm < 1e-4
-
-
 @pytest.mark.parametrize(("backend", "options"), LINEAR)
 @pytest.mark.parametrize("length", [1, 5])
 def test_constraints_that_do_not_push_change_nothing(

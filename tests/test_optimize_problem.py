@@ -48,19 +48,6 @@ def test_jacobian_equals_casadis() -> None:
     assert problem.cost(problem.x0) == pytest.approx(0.5 * r @ r)
 
 
-def test_snapshot_holds_the_star_of_its_step(recording: Recording) -> None:
-    problem = Problem.from_snapshot(recording, step=10, ego="c0")
-    links = recording.links.of(0)
-    links = links[recording.links.step[links] == 10]
-    fixes, relative = problem.factors
-    assert problem.names == ("c0", *(recording.ids[n] for n in recording.links.neighbour[links]))
-    assert np.array_equal(fixes.z[1:], recording.gnss[0, 10, recording.links.neighbour[links]])
-    assert np.array_equal(relative.z, recording.relative[0, links])
-    assert np.array_equal(relative.nodes, [[0, k + 1] for k in range(len(links))])
-    assert (fixes.std == 3.5).all()
-    assert relative.std[0] == pytest.approx(S2.relative_std)
-
-
 def test_window_chains_who_stays(recording: Recording) -> None:
     problem = Problem.from_window(recording, step=20, ego=0, length=4)
     moved = next(f for f in problem.factors if f.kind == "displacement")

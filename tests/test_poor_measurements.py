@@ -26,7 +26,6 @@ from coopoc import (
     rt_le,
     run_study,
 )
-from coopoc.arrays import Floats
 from coopoc.learned import GainNet, LearnedGain
 from coopoc.methods.cooperative_filter import CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
@@ -61,24 +60,6 @@ def test_missing_fixes_cost_and_do_not_crash(crossing: Fleet, method) -> None:  
     assert np.isfinite(few)
     assert few < 4 * np.sqrt(3)
     assert method.name in ("fedkalmannet", "lkf-sa") or few > some
-
-
-def test_a_missing_fix_is_one_of_boundless_variance(crossing: Fleet) -> None:
-    """And not one at the origin: the joint filter that assumes 10^12 m^2 of those fixes gives the same answer."""
-    whole = observe(crossing, Sensors(), V2X(4, 80.0), runs=2)
-    some, known = holed(whole, 0.5), NoiseModel.nominal(whole.sensors)
-    r = np.where(np.isnan(some.gnss), 1e12, 1.5**2)
-    process = np.broadcast_to(known.process_variance(whole), whole.gnss.shape)
-
-    class Given(NoiseModel):
-        def process_variance(self, recording: Recording) -> Floats:
-            return process
-
-        def fix_variance(self, recording: Recording) -> Floats:
-            return r
-
-    given = Given("given", whole.sensors)
-    np.testing.assert_allclose(JointFilter(known)(some, [0]).x, JointFilter(given)(whole, [0]).x, atol=1e-5)
 
 
 def test_a_drive_starts_with_a_fix(crossing: Fleet) -> None:

@@ -25,9 +25,9 @@ from coopoc import (
     observe,
     stars,
 )
+from coopoc.kernels.geometry import angle
 from coopoc.kernels.solo import FixNoise
 from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
-from coopoc.kernels.stars.relative import angle
 from coopoc.methods.kalman import solo_filter
 from coopoc.methods.noise_model import resolve
 from coopoc.methods.track import Method

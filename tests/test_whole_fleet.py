@@ -15,7 +15,7 @@ from coopoc import V2X, Fleet, NoiseModel, Recording, Sensors, observe
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound
 from coopoc.evaluate.metrics import nees_inside, rt_le
 from coopoc.kernels.fleets.graph import measurement
-from coopoc.kernels.stars.relative import components
+from coopoc.kernels.geometry import components
 from coopoc.methods.centralised import BatchSmoother, CentralFilter
 from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.world.links import spherical, to_vector, vector_cov, wrap

@@ -71,6 +71,13 @@ def distance(innovation: Vector, cov: Vector) -> float:
 
 
 @inside
+def gate_fix(gap: Vector, cov: Vector, variance: Vector, gate: float, hits: float) -> tuple[float, float]:
+    """Factor of the variance of a fix that is `gap` m away from a position of covariance `cov`, and the next hits."""
+    q = distance(gap, add_diagonal(cov, variance))
+    return inflation(q, gate, hits), count(q, gate, hits, gain_of(cov, variance))
+
+
+@inside
 def gated_update(
     cov: Vector, moved: Vector, h: Vector, innovation: float, variance: float, hits: float
 ) -> tuple[Vector, Vector, float, float]:

@@ -11,8 +11,8 @@ import numpy as np
 from tqdm import tqdm
 
 from ..arrays import Floats, Ints
+from ..kernels.geometry import components
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
-from ..kernels.stars.relative import components
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, Vehicles, check_recording
 from .noise_model import NoiseModel, process_noise

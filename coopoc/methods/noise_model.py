@@ -244,7 +244,7 @@ def constant_noise(noise_model: NoiseModel | str) -> NoiseModel:
     """The noise model of a filter without a recording: "identity" or a NoiseModel of constant noise, which needs
     none."""
     model = noise_model if isinstance(noise_model, NoiseModel) else None
-    if noise_model == "nominal" or (model and (type(model) is not NoiseModel or model.fleet is not None)):
+    if noise_model == "nominal" or (model and model.fleet is not None):
         raise InputError(
             "noise_model",
             repr(model.name if model else noise_model),
@@ -268,8 +268,8 @@ def motion_noise(noise_model: NoiseModel, interval: float | None) -> MotionNoise
 def process_noise(noise_model: NoiseModel, recording: Recording) -> tuple[Floats, MotionNoise]:
     """Process noise of a recording's steps as a sum: m^2 broadcastable to (R, T, N, 3), and that of the velocity.
 
-    It is that of the measured velocity where it is constant or follows it, else `process_variance` alone."""
-    if type(noise_model).process_variance is NoiseModel.process_variance and noise_model.fleet is None:
+    Of an oracle it is `process_variance` alone."""
+    if noise_model.fleet is None:
         return NO_VARIANCE, motion_noise(noise_model, None)
     return np.ascontiguousarray(noise_model.process_variance(recording)), NO_MOTION_NOISE
 

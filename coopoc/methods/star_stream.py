@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ..arrays import Floats, Ints, instance
 from ..errors import InputError
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
+from ..kernels.geometry import components
 from ..kernels.motion import MotionNoise
 from ..kernels.stars.cooperative_state import (
     AGE,
@@ -37,7 +38,6 @@ from ..kernels.stars.cooperative_state import (
     Model,
 )
 from ..kernels.stars.gaussian import ABSENT
-from ..kernels.stars.relative import components
 from ..kernels.stars.streams import (
     INDEX,
     USED_AT,

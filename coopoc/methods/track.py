@@ -11,8 +11,8 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Limits, check_arrays, check_fields, checked, number, texts
 from ..errors import InputError, shown
-from ..long_table import long_table
 from ..short_repr import short_repr
+from ..world.long_table import long_table
 from ..world.recording import Recording, Vehicles
 from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message

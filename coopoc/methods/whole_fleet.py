@@ -129,7 +129,7 @@ def kernel_arguments(
 ) -> tuple[Measured, Pairs, Assumed]:
     """Arguments of the kernels by name; a pair takes part if its messages arrive and both vehicles are active."""
     from ..kernels.fleets.graph import Assumed, Measured, Pairs
-    from ..kernels.stars.relative import components
+    from ..kernels.geometry import components
 
     active = located(recording)
     both = active[:, met.step, met.first] & active[:, met.step, met.second]

@@ -13,7 +13,7 @@ import numpy.typing as npt
 
 from ..arrays import Bools, Floats, check_arrays, check_texts, checked, listed, number, refuse
 from ..errors import InputError, shown, unknown
-from ..long_table import long_table
+from .long_table import long_table
 
 if TYPE_CHECKING:
     import pandas as pd

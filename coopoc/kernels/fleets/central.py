@@ -9,7 +9,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
 from ..compiling.small import add, add_diagonal, load, store, subtract
-from ..gate import FIX_GATE, count, distance, gain_of, inflation
+from ..gate import FIX_GATE, gate_fix
 from .graph import MATRIX, VECTOR, Assumed, Matrix, Measured, Pairs, at, connect, gate_pair, pair_at_agreement
 
 UNKNOWN = 1e6
@@ -117,10 +117,7 @@ def add_fixes(
         noise, fix = load(at(assumed.fix, 0, t, n), 0, VECTOR), measured.gnss[0, t, n]
         gap, share = subtract(load(fix, 0, VECTOR), load(x[0, t, n], 0, VECTOR)), 1.0
         if assumed.robust and together[n] and gap[0] + gap[1] + gap[2] + noise[0] < math.inf:
-            own = block(P, n, n)
-            q = distance(gap, add_diagonal(own, noise))
-            share = inflation(q, FIX_GATE, hits[n])
-            hits[n] = count(q, FIX_GATE, hits[n], gain_of(own, noise))
+            share, hits[n] = gate_fix(gap, block(P, n, n), noise, FIX_GATE, hits[n])
         for c in range(3 if measured.active[0, t, n] else 0):
             row, variance = 3 * n + c, share * noise[c]
             if not before[n]:

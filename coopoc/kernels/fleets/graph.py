@@ -12,21 +12,21 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..compiling.compile import compiled, inner, part, storage
-from ..compiling.small import add, add_diagonal, apply, from_upper, load, plus_applied, scale, store, subtract
+from ..compiling.compile import compiled, part, storage
+from ..compiling.small import add, add_diagonal, apply, load, plus_applied, scale, store, subtract
 from ..gate import FIX_GATE, distance, inflation
+from ..geometry import Numbers, completed, direction, exact, information, with_std
+from ..geometry import vector as to_vector
 from ..stars.gated import gate_components
-from ..stars.relative import Numbers, completed, exact, gram
 
 Vector = tuple[float, float, float]
 Matrix = tuple[float, float, float, float, float, float, float, float, float]
 Measurement = tuple[float, ...]
-Information = tuple[Matrix, Vector]
+Information = tuple[Numbers, Numbers]
 VECTOR: Vector = (0.0, 0.0, 0.0)
 MATRIX: Matrix = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
 """Their lengths are the counts that `load` takes."""
-SEEN, FIVE = (0.0,) * 8, (0.0,) * 5
-UNIT: Matrix = (1.0, 0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 1.0)
+SEEN = (0.0,) * 8
 
 
 class Measured(NamedTuple):
@@ -35,7 +35,7 @@ class Measured(NamedTuple):
     Attributes:
         gnss: (R, T, N, 3) m, NaN for no fix.
         velocity: (R, T, N, 3) m/s.
-        relative: (R, L, 8) `coopoc.kernels.stars.relative.components`, and factors of their three standard deviations,
+        relative: (R, L, 8) `coopoc.kernels.geometry.components`, and factors of their three standard deviations,
             which gates set.
         active: (R, T, N) True from a vehicle's first fix on, while it is present.
         dt: s.
@@ -189,39 +189,21 @@ def own_filters(measured: Measured, assumed: Assumed) -> Floats:
     return x
 
 
-@part
-def filled(measured: Measurement, vector: Vector, std: Vector) -> tuple[Measurement, Vector]:
-    """A missing or rejected range or angle is that of `vector`, with infinite standard deviation."""
-    a, b, c = std
-    a = math.inf if measured[0] < 0.0 else a
-    b = math.inf if measured[1] == 0.0 and measured[2] == 0.0 else b
-    c = math.inf if measured[3] == 0.0 and measured[4] == 0.0 else c
-    if a + b + c == math.inf:
-        measured = completed((measured[0], measured[1], measured[2], measured[3], measured[4], a, b, c), vector)
-    return measured, (a, b, c)
-
-
 @compiled
-def measurement(vector: Vector, measured: Measurement, std: Floats, min_range: float, converted: bool) -> Information:
+def measurement(vector: Vector, measured: Measurement, std: Floats, min_range: float, linear: bool) -> Information:
     """Information J^T J and information vector J^T r of one relative measurement at `vector`.
 
-    J and r belong to the whitened range and angles. A converted measurement is linear in the vector, with J at the
+    J and r belong to the whitened range and angles. One that is `linear` is converted to a vector, with J at the
     measured one.
     """
     unit = len(std) == 0
     a, b, c = (1.0, 1.0, 1.0) if unit else (std[0], std[1], std[2])
-    five = measured[0], measured[1], measured[2], measured[3], measured[4]
-    here, noise = filled(five, vector, (a * measured[5], b * measured[6], c * measured[7]))
-    d, ground = here[0], here[0] * here[3]
-    if not unit and not converted:
-        xx, xy, xz, yy, yz, zz, p, q, r = exact(vector[0], vector[1], vector[2], here, noise, min_range)
-        return from_upper((xx, xy, xz, yy, yz, zz)), (p, q, r)
-    information = UNIT
-    if not unit:
-        information = from_upper(at_measurement(here, noise, min_range))
-    elif noise[0] + noise[1] + noise[2] == math.inf:
-        information = from_upper(at_measurement(here, (noise[0], noise[1] / max(ground, 1e-9), noise[2] / d), 0.0))
-    return information, apply(information, subtract((ground * here[2], ground * here[1], d * here[4]), vector))
+    seen = with_std(measured, (a * measured[5], b * measured[6], c * measured[7]))
+    if not unit and not linear:
+        return exact(vector, seen, min_range)
+    here = completed(seen, direction(vector[0], vector[1], vector[2]))
+    weight = information(here, seen[5:], unit, min_range)
+    return weight, apply(weight, subtract(to_vector(here), vector))
 
 
 @part
@@ -244,15 +226,16 @@ def gate_pair(vector: Vector, cov: Matrix, k: int, pairs: Pairs, relative: Float
     """
     for link, sign in ((pairs.link[k], 1.0), (pairs.link_back[k], -1.0)):
         if link >= 0:
-            s, there = assumed.std, scale(vector, sign)
-            seen, std = filled(load(relative[link], 0, FIVE), there, (s[0], s[1], s[2]))
+            there = scale(vector, sign)
+            seen = with_std(load(relative[link], 0, SEEN), assumed.std)
+            std = seen[5:]
             _, _, factor, _ = gate_components(there, cov, seen, std, VECTOR, assumed.min_range)
-            far, ground, spread = max(seen[0], assumed.min_range), seen[0] * seen[3], 0.0
+            here, extra = completed(seen, direction(there[0], there[1], there[2])), 0.0
             for c in range(3):
-                own = std[c] if c == 0 else std[c] * far
-                spread += own * own if own < math.inf else 0.0
-            gap = subtract((ground * seen[2], ground * seen[1], seen[0] * seen[4]), there)
-            whole = inflation(distance(gap, add_diagonal(cov, (spread, spread, spread))), FIX_GATE, 0.0)
+                own = std[c] if c == 0 else std[c] * max(here[0], assumed.min_range)
+                extra += own * own if own < math.inf else 0.0
+            gap = subtract(to_vector(here), there)
+            whole = inflation(distance(gap, add_diagonal(cov, (extra, extra, extra))), FIX_GATE, 0.0)
             for c in range(3):
                 relative[link, 5 + c] = factor[c] * math.sqrt(whole)
 
@@ -281,13 +264,13 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 @part
-def dot(a: Vector, b: Vector) -> float:
+def dot(a: Numbers, b: Numbers) -> float:
     """a . b."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 @part
-def agreement(cov: Matrix, w: Matrix, eta: Vector) -> Vector:
+def agreement(cov: Matrix, w: Numbers, eta: Numbers) -> Vector:
     """(I + C W)^-1 C eta by Cramer's rule, and once more for the residual: W may be next to singular."""
     a, b, c = apply(cov, (w[0], w[1], w[2])), apply(cov, (w[3], w[4], w[5])), apply(cov, (w[6], w[7], w[8]))
     a, b, c = (a[0] + 1.0, a[1], a[2]), (b[0], b[1] + 1.0, b[2]), (c[0], c[1], c[2] + 1.0)
@@ -407,13 +390,3 @@ def fuse_delayed(latest: Ints, x: Floats, cov: Floats, measured: Measured, assum
                 for u in range(last + 1, t + 1):
                     correct(now[run, t], covariance[run, t], run, u, n, measured, assumed)
     return now, covariance
-
-
-@inner
-def at_measurement(measured: Numbers, std: Numbers, least: float) -> Numbers:
-    """The information of `exact`, upper triangle, at the measured vector itself; its distance is at least `least`."""
-    d, level = max(measured[0], least), max(abs(measured[3]), 1e-3)
-    a, b, c = 1.0 / std[0], measured[3] / (level * level * d * std[1]), 1.0 / (level * d * std[2])
-    tilt = c * measured[3] * measured[4]
-    along = a * measured[3] * measured[2], a * measured[3] * measured[1], a * measured[4]
-    return gram(along, -b * measured[1], b * measured[2], (tilt * measured[2], tilt * measured[1], -c * level * level))

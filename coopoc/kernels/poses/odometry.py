@@ -28,7 +28,7 @@ class PoseNoise(NamedTuple):
         longer: 1 where that offset is a state, else 0.
         keep: share of scale error and bias that is left after a step.
         flat: m^2, prior of a member that joins.
-        gate: standard deviations of its innovation beyond which a measurement weighs less.
+        gate: squared normalised innovation beyond which a measurement weighs less.
     """
 
     fix: Three

@@ -16,9 +16,9 @@ from numpy import uint64
 
 from ...arrays import Floats
 from ..compiling.compile import part
-from ..compiling.small import add_diagonal
 from ..compiling.vectors import LANES, less, plus, put, take
-from ..gate import FIX_GATE, GATE, count, distance, gain_of, inflation
+from ..gate import FIX_GATE, GATE, count, gate_fix, inflation
+from ..geometry import Numbers, axes, direction
 
 HEADING = 3
 """Index of the heading in a member's state."""
@@ -80,7 +80,7 @@ def new_poses(numbers: int) -> Poses:
 
 @part
 def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: float, gate: float) -> bool:
-    """x += P h r / s, P -= P h h^T P / s with s = h^T P h + variance, inflated where r^2 > gate^2 s.
+    """x += P h r / s, P -= P h h^T P / s with s = h^T P h + variance, inflated where r^2 > gate s.
 
     The covariance follows when ROWS rows are pending, or with `settle`; a row sees those that are pending.
 
@@ -90,7 +90,7 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
         row: (a, b, c, h, o).
         residual: r, at the state.
         variance: of the measurement.
-        gate: in standard deviations.
+        gate: on r^2 / s.
 
     Returns:
         Whether the measurement is used.
@@ -114,11 +114,11 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
             left = less(entries(columns, pending, tile, tiles), share, entries(columns, q, tile, tiles))
             put(columns, uint64(pending * tiles + tile), left)
     s = variance + along(columns, pending, ends, row)
-    square, limit, hits = residual * residual / s, gate * gate, poses.hits[k + 1]
-    share = inflation(square, limit, hits)
+    square, hits = residual * residual / s, poses.hits[k + 1]
+    share = inflation(square, gate, hits)
     if math.isfinite(gate):
-        poses.hits[k + 1] = count(square, limit, hits, 1.0 - variance / s)
-    poses.totals[COST] += min(square, limit) + math.log(s)
+        poses.hits[k + 1] = count(square, gate, hits, 1.0 - variance / s)
+    poses.totals[COST] += min(square, gate) + math.log(s)
     if math.isinf(share):
         return False
     weight = 1.0 / (s * share)
@@ -191,46 +191,34 @@ def update_fix(poses: Poses, member: int, fix: Three, variance: Three, gate: flo
     share, m, cov, hits = 1.0, member, poses.cov, poses.hits
     if math.isfinite(gate):
         settle(poses)
-        gap, limit = (
-            (fix[0] - poses.x[m], fix[1] - poses.x[m + 1], fix[2] - poses.x[m + 2]),
-            FIX_GATE * gate * gate / GATE,
-        )
+        gap = fix[0] - poses.x[m], fix[1] - poses.x[m + 1], fix[2] - poses.x[m + 2]
         xy, xz, yz = cov[m, m + 1], cov[m, m + 2], cov[m + 1, m + 2]
         own = cov[m, m], xy, xz, xy, cov[m + 1, m + 1], yz, xz, yz, cov[m + 2, m + 2]
-        q = distance(gap, add_diagonal(own, variance))
-        share = inflation(q, limit, hits[m])
-        hits[m] = count(q, limit, hits[m], gain_of(own, variance))
+        share, hits[m] = gate_fix(gap, own, variance, FIX_GATE / GATE * gate, hits[m])
     for axis in range(3 if math.isfinite(share) else 0):
         row = (1.0 if axis == 0 else 0.0, 1.0 if axis == 1 else 0.0, 1.0 if axis == 2 else 0.0, 0.0, 0.0)
         update_row(poses, (member, ALONE), row, fix[axis] - poses.x[m + axis], share * variance[axis], math.inf)
 
 
 @part
-def relative_row(
-    linear: Floats, component: int, ends: Ends, place: Three, measured: float, longer: float
-) -> tuple[float, Row]:
+def relative_row(polar: Numbers, heading: float, component: int, measured: float, longer: float) -> tuple[float, Row]:
     """Residual and row of a range (0), a bearing from the observer's heading (1) or an inclination (2).
 
     Args:
-        linear: the state at which they are taken.
+        polar: form of the vector to the other, at which they are taken.
+        heading: of the observer, rad.
         component: which of the three.
-        ends: observer, and the other or -1 for a landmark.
-        place: of the landmark, m.
         measured: m or rad.
+        longer: 1 where the offset of ranges is a state, else 0.
     """
-    (k, o), (px, py, pz) = ends, place
-    if o >= 0:
-        px, py, pz = linear[o], linear[o + 1], linear[o + 2]
-    x, y, z = px - linear[k], py - linear[k + 1], pz - linear[k + 2]
-    flat2 = max(x * x + y * y, NEAREST * NEAREST)
-    flat, r2 = math.sqrt(flat2), flat2 + z * z
+    (ray, side, up), d = axes(polar), max(polar[0], NEAREST)
     if component == 0:
-        r = math.sqrt(r2)
-        return measured - r, (-x / r, -y / r, -z / r, 0.0, longer)
+        return measured - d, (-ray[0], -ray[1], -ray[2], 0.0, longer)
     if component == 1:
-        return wrapped(measured - math.atan2(y, x) + linear[k + HEADING]), (y / flat2, -x / flat2, 0.0, -1.0, 0.0)
-    row = (-x * z / (flat * r2), -y * z / (flat * r2), flat / r2, 0.0, 0.0)
-    return wrapped(measured - math.atan2(flat, z)), row
+        flat = max(d * polar[3], NEAREST)
+        residual = wrapped(measured - math.atan2(polar[1], polar[2]) + heading)
+        return residual, (-side[0] / flat, -side[1] / flat, 0.0, -1.0, 0.0)
+    return wrapped(measured - math.atan2(polar[3], polar[4])), (-up[0] / d, -up[1] / d, -up[2] / d, 0.0, 0.0)
 
 
 @part
@@ -245,18 +233,21 @@ def update_relative(
         place: of the landmark, m.
         measured: m, rad, rad, NaN where missing.
         variances: of the three.
-        gate: in standard deviations.
+        gate: on r^2 / s.
         longer: 1 where the offset of ranges is a state, else 0.
         left_out: a bit for each component that is left out.
 
     Returns:
         The bits, and those of the components that are rejected.
     """
-    (k, o), x, linear = ends, poses.x, poses.linear
+    (k, o), (px, py, pz), x, linear = ends, place, poses.x, poses.linear
+    if o >= 0:
+        px, py, pz = linear[o], linear[o + 1], linear[o + 2]
+    polar = direction(px - linear[k], py - linear[k + 1], pz - linear[k + 2])
     for component in range(3):
         if math.isnan(measured[component]) or left_out & (1 << component):
             continue
-        residual, row = relative_row(linear, component, ends, place, measured[component], longer)
+        residual, row = relative_row(polar, linear[k + HEADING], component, measured[component], longer)
         residual -= row[HEADING] * (x[k + HEADING] - linear[k + HEADING])
         if row[HEADING + 1] != 0.0:
             residual -= x[k + OFFSET]

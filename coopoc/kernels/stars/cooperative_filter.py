@@ -14,6 +14,7 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inside
 from ..compiling.small import apply, negate, store
+from ..geometry import angle
 from ..motion import process_variance
 from .cooperative_members import join, leave, place, predict, predict_member, steady
 from .cooperative_messages import fix_terms, receive, trust, use_fix
@@ -59,7 +60,6 @@ from .gaussian import (
     widen,
 )
 from .messages import Assumptions, Measurements, three_of
-from .relative import angle
 
 
 @compiled

@@ -36,7 +36,7 @@ from .gaussian import (
 FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, OWN = 0, 3, 6, 9, 12, 13
 """Of the ego's row: fix m (NaN for none), its variance m^2, motion m, its variance m^2, three each, and dt s."""
 RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
-"""Of a neighbour's row: `relative.five`, and its newest message: age s (-1 for none held), solo estimate m and its
+"""Of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none held), solo estimate m and its
 variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that of a fix as its solo
 filter assumes it m^2."""
 TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, STATUS = 0, 1, 2, 3, 6, 9, 12, 24, 30, 31, 32

@@ -15,10 +15,20 @@ import numpy as np
 from ...arrays import Floats
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, add_diagonal, choose_each, load, scale, store, subtract, zeros
-from ..compiling.vectors import LANES, choose
+from ..compiling.vectors import LANES, choose, take
 from ..gate import FIX_GATE, LEAK, YOUNG, distance, gain_of, gated_update, inflation
-from .messages import BLOCK, POSITION, PROCESS, RELATIVE, ROW, VARIANCE, Star
-from .relative import Numbers, angle, incomplete
+from ..geometry import Numbers, axes, direction, incomplete, residuals
+from .messages import (
+    BLOCK,
+    RELATIVE,
+    ROW,
+    VARIANCE,
+    Star,
+    position_of,
+    process_of,
+    variance_of,
+    vector_at,
+)
 
 STATE = (0.0,) * 13
 
@@ -48,14 +58,14 @@ def carry(star: Star, gates: Gates, flat: float, n: int, old: int) -> None:
     begins at its fix."""
     for k in range(old):
         store(gates.last, k, load(gates.state, k, STATE))
-    own = load(star.motion, PROCESS, ROW)
+    own = process_of(star, 0)
     for k in range(n):
-        place, process = star.previous[k], load(star.motion, 4 * k + PROCESS, ROW)
+        place, process = star.previous[k], process_of(star, k)
         before = load(gates.last, max(place, 0), STATE)
         if place < 0:
             y, f = 0.0 * own[0] + YOUNG, 0.0 * own[0] + flat
             before, process = (*zeros(y, BLOCK), y, y, y, 0.0 * y), (f, f, f)
-            process = load(star.motion, VARIANCE, ROW) if k == 0 else process
+            process = variance_of(star, 0) if k == 0 else process
         elif k > 0:
             process = add(process, own)
         store(gates.state, k, (*add_diagonal(before[:9], process), *before[9:]))
@@ -76,15 +86,15 @@ def gate_star(star: Star, gates: Gates, state: Floats, placed: Floats, least: fl
         placed: (n, LANES) 1 where something is known of where a member is, else 0.
         least: m.
     """
-    origin, ego = load(state, 0, ROW), load(gates.state, 0, STATE)
+    origin, ego = vector_at(state, 0), load(gates.state, 0, STATE)
     o, hits = 0.0 * ego[12], ego[12]
     total = own = gate_position(star, 0, origin, ego[:9], hits)
     for k in range(1, n):
-        at, seen, memory = load(state, k, ROW), load(star.relative, k, RELATIVE), load(gates.state, k, STATE)
+        at, seen, memory = vector_at(state, k), load(star.relative, k, RELATIVE), load(gates.state, k, STATE)
         std = seen[5:]
         if incomplete(seen):
             far = o + math.inf
-            std = choose_each(load(placed, k, (0.0,))[0] - 0.5, std, (far, far, far))
+            std = choose_each(take(placed, k) - 0.5, std, (far, far, far))
         cov, moved, factor, three = gate_components(subtract(at, origin), memory[:9], seen, std, memory[9:12], least)
         store(gates.state, k, (*cov, *three, o))
         store(star.relative, k, inflated(seen, factor))
@@ -108,8 +118,8 @@ def inflated(measured: Numbers, factor: Numbers) -> Numbers:
 @inner
 def gate_position(star: Star, k: int, at: Numbers, cov: Numbers, hits: float) -> float:
     """Inflate the variance of a member's position; the gain that it would have had, less than 0 within the gate."""
-    variance = load(star.motion, 4 * k + VARIANCE, ROW)
-    q = distance(subtract(load(star.motion, 4 * k + POSITION, ROW), at), add_diagonal(cov, variance))
+    variance = variance_of(star, k)
+    q = distance(subtract(position_of(star, k), at), add_diagonal(cov, variance))
     store(star.motion, 4 * k + VARIANCE, scale(variance, inflation(q, FIX_GATE, hits)))
     gain: float = gain_of(cov, variance)
     signed: float = choose(q - FIX_GATE, gain, -gain)
@@ -125,7 +135,7 @@ def gate_components(
     Args:
         gap: m, the predicted vector.
         cov: (9,) m^2, of it.
-        measured: `relative.five`.
+        measured: `geometry.five`.
         std: m, rad, rad; infinite for what was not measured.
         hits: (3,) of these components.
         least: m, least distance at which an angle's error counts.
@@ -133,17 +143,13 @@ def gate_components(
     Returns:
         Covariance, move m, factors of the standard deviations, and hits.
     """
-    x, y, z = gap
-    o = 0.0 * x
-    ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
-    reach = max(far, least)
-    flat = max(ground, 1e-3 * reach)
-    turned = angle(measured[1] * x - measured[2] * y, measured[2] * x + measured[1] * y)
-    raised = angle(measured[3] * z - measured[4] * ground, measured[4] * z + measured[3] * ground)
+    polar = direction(gap[0], gap[1], gap[2])
+    ray, side, up = axes(polar)
+    longer, turned, raised = residuals(measured, polar)
+    reach = max(polar[0], least)
+    flat = max(polar[0] * polar[3], 1e-3 * reach)
     a, b, c = std[0], std[1] * flat, std[2] * reach
-    ray, side = (x / far, y / far, z / far), (-y / flat, x / flat, o)
-    up = scale((x * z, y * z, -ground * ground), 1.0 / (flat * reach))
-    cov, moved, f, first = gated_update(cov, zeros(o, ROW), ray, measured[0] - far, a * a, hits[0])
+    cov, moved, f, first = gated_update(cov, zeros(a, ROW), ray, longer, a * a, hits[0])
     cov, moved, g, second = gated_update(cov, moved, side, turned * flat, b * b, hits[1])
     cov, moved, h, third = gated_update(cov, moved, up, raised * reach, c * c, hits[2])
     return cov, moved, (math.sqrt(f), math.sqrt(g), math.sqrt(h)), (first, second, third)

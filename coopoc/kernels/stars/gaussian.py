@@ -18,7 +18,6 @@ from ..compiling.small import (
     inverse,
     less_applied,
     less_transposed_product,
-    load,
     minus_apply,
     minus_product,
     plus_applied,
@@ -27,7 +26,7 @@ from ..compiling.small import (
     transpose,
 )
 from ..compiling.vectors import LANES, less, plus, put, take
-from .messages import BLOCK, ROW
+from .messages import BLOCK, ROW, block_at, vector_at
 
 PLACE, ERROR, VELOCITY, CLONE, FRESH = range(5)
 """Kinds of a neighbour's vectors: position m, error of its fixes m, velocity m/s, where it was when it sent its last
@@ -257,7 +256,7 @@ def project(g: Gaussian, h: Rows) -> None:
     """Innovations z - H x, H P in place of `gain`, and H P H^T."""
     gain, wide, third = h.gain, len(g.x) // LANES, len(g.x) // 3
     for k in range(h.terms[0]):
-        i, w = 3 * h.block[k] * wide, load(h.weight, k, BLOCK)
+        i, w = 3 * h.block[k] * wide, block_at(h.weight, k)
         for j in range(lanes(g)):
             a, b, c = three_rows(g.p, i + j, wide)
             d, e, f = w[0] * a, w[3] * a, w[6] * a
@@ -266,13 +265,13 @@ def project(g: Gaussian, h: Rows) -> None:
             put(gain, j, plus(plus(d, w[1], b), w[2], c))
             put(gain, wide + j, plus(plus(e, w[4], b), w[5], c))
             put(gain, 2 * wide + j, plus(plus(f, w[7], b), w[8], c))
-    gap, one, two, three = load(h.z, 0, ROW), ROW, ROW, ROW
+    gap, one, two, three = vector_at(h.z, 0), ROW, ROW, ROW
     for k in range(h.terms[0]):
-        b, w = h.block[k], load(h.weight, k, BLOCK)
-        gap = less_applied(gap, w, load(g.x, b, ROW))
-        one = plus_applied(one, w, load(gain, b, ROW))
-        two = plus_applied(two, w, load(gain, third + b, ROW))
-        three = plus_applied(three, w, load(gain, 2 * third + b, ROW))
+        b, w = h.block[k], block_at(h.weight, k)
+        gap = less_applied(gap, w, vector_at(g.x, b))
+        one = plus_applied(one, w, vector_at(gain, b))
+        two = plus_applied(two, w, vector_at(gain, third + b))
+        three = plus_applied(three, w, vector_at(gain, 2 * third + b))
     store(h.gap, 0, gap)
     store(h.cov, 0, (*one, *two, *three))
 
@@ -285,7 +284,7 @@ def innovate(g: Gaussian, h: Rows) -> float:
     exceeds its gate, its variance is multiplied by q / gate, and by 100 more where it exceeds REJECTED times the gate.
     """
     project(g, h)
-    gain, wide, gap, cov = h.gain, len(g.x) // LANES, load(h.gap, 0, ROW), load(h.cov, 0, BLOCK)
+    gain, wide, gap, cov = h.gain, len(g.x) // LANES, vector_at(h.gap, 0), block_at(h.cov, 0)
     x, d = whitened(h, 0, gap[0], h.variance[0] + cov[0])
     s = cov[1] * d
     y, e = whitened(h, 1, gap[1] - s * x, h.variance[1] + cov[4] - s * s)
@@ -325,7 +324,7 @@ def correct(g: Gaussian, h: Rows, share: float) -> None:
 def correct_mean(g: Gaussian, h: Rows, share: float) -> None:
     """x <- x + share U times the whitened innovations."""
     gain, wide = h.gain, len(g.x) // LANES
-    x, y, z = scale(load(h.white, 0, ROW), share)
+    x, y, z = scale(vector_at(h.white, 0), share)
     for j in range(lanes(g)):
         u, v, w = three_rows(gain, j, wide)
         put(g.x, j, plus(plus(plus(take(g.x, j), x, u), y, v), z, w))
@@ -335,8 +334,8 @@ def correct_mean(g: Gaussian, h: Rows, share: float) -> None:
 def correct_rows(g: Gaussian, h: Rows, share: float, k: int) -> None:
     """Three rows of P, those of the k-th vector."""
     p, gain, wide, third = g.p, h.gain, len(g.x) // LANES, len(g.x) // 3
-    i, a = 3 * k * wide, scale(load(gain, k, ROW), share)
-    b, c = scale(load(gain, third + k, ROW), share), scale(load(gain, 2 * third + k, ROW), share)
+    i, a = 3 * k * wide, scale(vector_at(gain, k), share)
+    b, c = scale(vector_at(gain, third + k), share), scale(vector_at(gain, 2 * third + k), share)
     for j in range(lanes(g)):
         u, v, w = three_rows(gain, j, wide)
         for row in range(3):
@@ -354,12 +353,12 @@ def settle(g: Gaussian, h: Rows, member: int, flat: float) -> None:
     place, n, b = g.block[member, PLACE], 3 * g.vectors[0], BLOCK
     for k in range(h.terms[0]):
         if h.block[k] == place:
-            a = load(h.weight, k, BLOCK)
+            a = block_at(h.weight, k)
             b = minus_product(inverse(less_transposed_product(BLOCK, a, a)), transpose(a))
             store(h.weight, k, BLOCK)
     for k in range(h.terms[0]):
-        store(h.weight, k, minus_product(b, load(h.weight, k, BLOCK)))
-    store(h.z, 0, minus_apply(b, load(h.z, 0, ROW)))
+        store(h.weight, k, minus_product(b, block_at(h.weight, k)))
+    store(h.z, 0, minus_apply(b, vector_at(h.z, 0)))
     project(g, h)
     new = insert(g, member, FRESH, 0.0)
     for c in range(3):

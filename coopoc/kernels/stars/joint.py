@@ -10,7 +10,6 @@ i stride + j; those below the diagonal are never read.
 
 from __future__ import annotations
 
-import math
 from typing import NamedTuple
 
 import numpy as np
@@ -20,9 +19,7 @@ from ..compiling.compile import inner, inside, storage
 from ..compiling.small import (
     add,
     add_diagonal,
-    apply,
     choose_each,
-    from_upper,
     inverse,
     less_applied,
     less_transposed_applied,
@@ -39,14 +36,23 @@ from ..compiling.small import (
     transpose,
     zeros,
 )
-from ..compiling.vectors import LANES, choose
-from .messages import BLOCK, MOVED, NEW, POSITION, PROCESS, RELATIVE, ROW, Star, clear
-from .relative import Numbers, completed, converted, exact, incomplete, vector
+from ..compiling.vectors import LANES, choose, take
+from ..geometry import Numbers, converted, exact, incomplete, missing, vector, whole
+from .messages import (
+    BLOCK,
+    NEW,
+    RELATIVE,
+    Star,
+    block_at,
+    clear,
+    moved_of,
+    position_of,
+    process_information,
+    vector_at,
+)
 
 LEAST_KNOWN = 1e-4
 """1/m^2, information along x below which nothing is known of where a member is."""
-LEAST_PROCESS = 1e-90
-"""m^2; the cube of its inverse is still a number, and far beyond any digit that counts."""
 
 
 class Joint(NamedTuple):
@@ -88,24 +94,24 @@ def eliminate(source: Floats, a: Floats, eta: Floats, n: int, stride: int, memor
     Returns the last of them, -Cov of the last block. The next pivot is inverted as soon as its row is ready, while the
     rows below are still worked on. `memory` holds n blocks.
     """
-    p: Numbers = negate(inverse(load(source, 0, BLOCK)))
+    p: Numbers = negate(inverse(block_at(source, 0)))
     for k in range(n):
         first = k * stride
-        v = minus_apply(p, load(eta, k, ROW))
+        v = minus_apply(p, vector_at(eta, k))
         store(eta, k, v)
         store(a, first + k, p)
         for j in range(k + 1, n):
-            one = load(source, first + j, BLOCK)
+            one = block_at(source, first + j)
             store(memory, j, one)
             store(a, first + j, minus_product(p, one))
         for i in range(k + 1, n):
-            left = load(memory, i, BLOCK)
+            left = block_at(memory, i)
             for j in range(i, n):
                 at = i * stride + j
-                store(a, at, less_transposed_product(load(source, at, BLOCK), left, load(a, first + j, BLOCK)))
-            store(eta, i, less_transposed_applied(load(eta, i, ROW), left, v))
+                store(a, at, less_transposed_product(block_at(source, at), left, block_at(a, first + j)))
+            store(eta, i, less_transposed_applied(vector_at(eta, i), left, v))
             if i == k + 1:
-                p = negate(inverse(load(a, i * stride + i, BLOCK)))
+                p = negate(inverse(block_at(a, i * stride + i)))
         source = a
     return p
 
@@ -114,9 +120,9 @@ def eliminate(source: Floats, a: Floats, eta: Floats, n: int, stride: int, memor
 def substitute(factor: Floats, x: Floats, n: int, stride: int) -> None:
     """Solution A^-1 eta in place of what `eliminate` left in eta."""
     for k in range(n - 1, -1, -1):
-        v = load(x, k, ROW)
+        v = vector_at(x, k)
         for j in range(k + 1, n):
-            v = less_applied(v, load(factor, k * stride + j, BLOCK), load(x, j, ROW))
+            v = less_applied(v, block_at(factor, k * stride + j), vector_at(x, j))
         store(x, k, v)
 
 
@@ -129,19 +135,19 @@ def predict(a: Floats, n: int, stride: int, process: Floats, memory: Floats) -> 
     """
     for k in range(n):
         for i in range(k):
-            store(memory, n + i, transpose(load(a, i * stride + k, BLOCK)))
+            store(memory, n + i, transpose(block_at(a, i * stride + k)))
         for j in range(k + 1, n):
-            store(memory, n + j, load(a, k * stride + j, BLOCK))
-        own = mirrored(load(a, k * stride + k, BLOCK))
+            store(memory, n + j, block_at(a, k * stride + j))
+        own = mirrored(block_at(a, k * stride + k))
         store(memory, n + k, own)
-        pivot = negate(inverse(add_diagonal(own, load(process, k, ROW))))
+        pivot = negate(inverse(add_diagonal(own, vector_at(process, k))))
         for j in range(n):
-            store(memory, j, minus_product(pivot, load(memory, n + j, BLOCK)))
+            store(memory, j, minus_product(pivot, block_at(memory, n + j)))
         for i in range(n):
-            left = load(memory, n + i, BLOCK)
+            left = block_at(memory, n + i)
             for j in range(i, n):
                 at = i * stride + j
-                store(a, at, less_transposed_product(load(a, at, BLOCK), left, load(memory, j, BLOCK)))
+                store(a, at, less_transposed_product(block_at(a, at), left, block_at(memory, j)))
 
 
 @inside
@@ -158,20 +164,18 @@ def predict_state(star: Star, joint: Joint, n: int, old: int) -> None:
     Fills the inverse process noise of the positions, in the order of the last star: zero for members that left.
     """
     for k in range(old):
-        store(joint.move, k, load(joint.state, k, ROW))
+        store(joint.move, k, vector_at(joint.state, k))
     clear(joint.process)
     for k in range(n):
-        place, row_of = star.previous[k], 4 * k
+        place = star.previous[k]
         if place >= 0:
-            at = add(load(joint.move, place, ROW), load(star.motion, row_of + MOVED, ROW))
+            at = add(vector_at(joint.move, place), moved_of(star, k))
             store(joint.state, k, at)
-            p, q, r = load(star.motion, row_of + PROCESS, ROW)
-            process = 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
-            store(joint.process, block_of(place, old), process)
+            store(joint.process, block_of(place, old), process_information(star, k))
         elif k == 0:
-            store(joint.state, k, load(star.motion, row_of + POSITION, ROW))
+            store(joint.state, k, position_of(star, k))
         else:
-            store(joint.state, k, first_place(star, k, load(joint.state, 0, ROW)))
+            store(joint.state, k, first_place(star, k, vector_at(joint.state, 0)))
 
 
 @inside
@@ -181,12 +185,11 @@ def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
     measured: Numbers = add(ego, vector(seen))
     if not incomplete(seen):
         return measured
-    lacks = seen[5] + seen[6] + seen[7] - (0.0 * seen[0] + 1e300)
-    new = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5
+    new = take(star.status, 5 * k + NEW) - 0.5
     near = seen[0] + 1.0
     somewhere = add(ego, (near, near, 0.1 * near))
-    broadcast = choose_each(new, load(star.motion, 4 * k + POSITION, ROW), somewhere)
-    place: Numbers = choose_each(lacks, broadcast, measured)
+    broadcast = choose_each(new, position_of(star, k), somewhere)
+    place: Numbers = choose_each(missing(seen), broadcast, measured)
     return place
 
 
@@ -196,20 +199,18 @@ def place_on_broadcast(star: Star, joint: Joint, n: int) -> None:
     is linear there, and not where they were assumed to be until now."""
     for k in range(1, n):
         if star.previous[k] >= 0:
-            at = load(joint.state, k, ROW)
-            own = load(joint.information, (k - 1) * joint.stride + k - 1, BLOCK)[0]
-            new = load(star.status, 5 * k + NEW, (0.0,))[0] - 0.5
-            there = choose_each(new, load(star.motion, 4 * k + POSITION, ROW), at)
+            at = vector_at(joint.state, k)
+            own = block_at(joint.information, (k - 1) * joint.stride + k - 1)[0]
+            new = take(star.status, 5 * k + NEW) - 0.5
+            there = choose_each(new, position_of(star, k), at)
             store(joint.state, k, choose_each(own - LEAST_KNOWN, at, there))
 
 
 @inside
 def placed(joint: Joint, k: int, measured: Numbers) -> float:
     """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
-    own = load(joint.information, (k - 1) * joint.stride + k - 1, BLOCK)[0]
-    whole = 0.0 * measured[0] + 1e300 - (measured[5] + measured[6] + measured[7])
-    one = 0.0 * own + 1.0
-    share: float = choose(whole, one, choose(own - LEAST_KNOWN, one, 0.0 * own))
+    own = block_at(joint.information, (k - 1) * joint.stride + k - 1)[0]
+    share: float = max(whole(measured), choose(own - LEAST_KNOWN, 0.0 * own + 1.0, 0.0 * own))
     return share
 
 
@@ -222,7 +223,7 @@ def rearrange(star: Star, joint: Joint, n: int, old: int, prior: Numbers) -> Non
     if moved == 0:
         return
     stride = joint.stride
-    o = 0.0 * load(joint.information, 0, ROW)[0]
+    o = 0.0 * vector_at(joint.information, 0)[0]
     for k in range(n):
         for j in range(n):
             i, c = block_of(k, n), block_of(j, n)
@@ -235,9 +236,9 @@ def rearrange(star: Star, joint: Joint, n: int, old: int, prior: Numbers) -> Non
                 continue
             p, q = block_of(p, old), block_of(q, old)
             if p <= q:
-                store(joint.factor, i * stride + c, load(joint.information, p * stride + q, BLOCK))
+                store(joint.factor, i * stride + c, block_at(joint.information, p * stride + q))
             else:
-                store(joint.factor, i * stride + c, transpose(load(joint.information, q * stride + p, BLOCK)))
+                store(joint.factor, i * stride + c, transpose(block_at(joint.information, q * stride + p)))
     copy(joint.factor, joint.information, n, stride)
 
 
@@ -246,45 +247,32 @@ def copy(source: Floats, target: Floats, n: int, stride: int) -> None:
     """The blocks on and above the diagonal."""
     for i in range(n):
         for j in range(i, n):
-            store(target, i * stride + j, load(source, i * stride + j, BLOCK))
+            store(target, i * stride + j, block_at(source, i * stride + j))
 
 
 @inside
 def relative_information(star: Star, joint: Joint, k: int, std: Floats, least: float) -> tuple[Numbers, Numbers]:
-    """Information (3, 3) of the converted measurement of member k at the predicted geometry, and what it adds to the
+    """Information of the converted measurement of member k at the predicted geometry, and what it adds to the
     information vector: W and W (measured vector - predicted vector)."""
-    seen = load(star.relative, k, RELATIVE)
-    gap = subtract(load(joint.state, k, ROW), load(joint.state, 0, ROW))
-    x, y, z = gap
-    lacking = incomplete(seen)
-    if len(std) or lacking:
-        deviations = seen[5:]
-        if len(std) == 0:  # 1 m along each
-            flat2 = x * x + y * y
-            deviations = seen[5], seen[6] / math.sqrt(flat2), seen[7] / math.sqrt(flat2 + z * z)
-        weight = converted(x, y, z, deviations, least)
-        if lacking:
-            weight = scale(weight, placed(joint, k, seen))
-    else:
-        o, one = 0.0 * x, 0.0 * x + 1.0
-        weight = one, o, o, one, o, one
-    found = vector(completed(seen, gap)) if lacking else vector(seen)
-    full = from_upper(weight)
-    return full, apply(full, subtract(found, gap))
+    seen, gap = load(star.relative, k, RELATIVE), subtract(vector_at(joint.state, k), vector_at(joint.state, 0))
+    weight, eta = converted(gap, seen, len(std) == 0, least)
+    if incomplete(seen):
+        known = placed(joint, k, seen)
+        weight, eta = scale(weight, known), scale(eta, known)
+    return weight, eta
 
 
 @inside
 def exact_information(star: Star, joint: Joint, k: int, n: int, least: float) -> tuple[Numbers, Numbers]:
     """The same of range and angles, linear at the state moved by `move`, as seen from the state."""
     seen = load(star.relative, k, RELATIVE)
-    ahead = subtract(load(joint.move, k - 1, ROW), load(joint.move, n - 1, ROW))
-    gap = subtract(load(joint.state, k, ROW), load(joint.state, 0, ROW))
-    x, y, z = add(gap, ahead)
-    found = exact(x, y, z, seen, seen[5:], least)
+    ahead = subtract(vector_at(joint.move, k - 1), vector_at(joint.move, n - 1))
+    gap = add(subtract(vector_at(joint.state, k), vector_at(joint.state, 0)), ahead)
+    weight, eta = exact(gap, seen, least)
     if incomplete(seen):
-        found = scale(found, placed(joint, k, seen))
-    weight = from_upper(found[:6])
-    return weight, plus_applied(found[6:], weight, ahead)
+        known = placed(joint, k, seen)
+        weight, eta = scale(weight, known), scale(eta, known)
+    return weight, plus_applied(eta, weight, ahead)
 
 
 @inside
@@ -294,11 +282,11 @@ def add_relative(a: Floats, eta: Floats, stride: int, k: int, n: int, weight: Nu
     i, e = k - 1, n - 1
     for at in (i, e):
         diagonal = at * stride + at
-        store(a, diagonal, add(load(a, diagonal, BLOCK), weight))
+        store(a, diagonal, add(block_at(a, diagonal), weight))
     at = i * stride + e
-    store(a, at, add(load(a, at, BLOCK), negate(weight)))
-    store(eta, i, add(load(eta, i, ROW), vector))
-    store(eta, e, subtract(load(eta, e, ROW), vector))
+    store(a, at, add(block_at(a, at), negate(weight)))
+    store(eta, i, add(vector_at(eta, i), vector))
+    store(eta, e, subtract(vector_at(eta, e), vector))
 
 
 @inside
@@ -313,4 +301,4 @@ def solve(a: Floats, joint: Joint, eta: Floats, n: int) -> Numbers:
 def move(joint: Joint, n: int) -> None:
     """Add the step in `eta` to the state."""
     for k in range(n):
-        store(joint.state, k, add(load(joint.state, k, ROW), load(joint.eta, block_of(k, n), ROW)))
+        store(joint.state, k, add(vector_at(joint.state, k), vector_at(joint.eta, block_of(k, n))))

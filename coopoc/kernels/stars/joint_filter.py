@@ -26,22 +26,21 @@ from .joint import (
     solve,
 )
 from .messages import (
-    BLOCK,
-    NEW,
     NONE,
-    POSITION,
     RELATIVE,
-    ROW,
-    VARIANCE,
     Assumptions,
     Estimates,
     Measurements,
     Star,
+    block_at,
     clear,
+    fix_information,
     gather,
     largest,
     new_estimates,
+    position_of,
     star_within,
+    vector_at,
 )
 
 
@@ -60,9 +59,10 @@ def run_filter(measurements: Measurements, model: Assumptions, refine: bool, rob
     most = largest(measurements.start)
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
-        star, joint, gates = star_within(most), joint_within(most), gates_within(most)
+        star, before, joint, gates = star_within(most), star_within(most), joint_within(most), gates_within(most)
         for t in range(steps):
-            n = gather(star, measurements, model, first, last, t, old)
+            star, before = before, star
+            n = gather(star, before, measurements, model, first, last, t, old)
             step(star, joint, gates, model, refine, robust, n, old)
             write(out, joint, first, last, t, measurements.start[t], n)
             old = n
@@ -100,19 +100,17 @@ def step(
     clear(joint.eta)
     add_fixes(star, joint, n)
     update(star, joint, model, refine, n)
-    set_ego(gates, load(joint.scratch, 0, BLOCK))
+    set_ego(gates, block_at(joint.scratch, 0))
 
 
 @inner
 def add_fixes(star: Star, joint: Joint, n: int) -> None:
     """Add every member's position as broadcast."""
     for k in range(n):
-        new = load(star.status, 5 * k + NEW, (0.0,))[0]
-        p, q, r = load(star.motion, 4 * k + VARIANCE, ROW)
-        weight, i = (new / p, new / q, new / r), block_of(k, n)
-        gap, at = subtract(load(star.motion, 4 * k + POSITION, ROW), load(joint.state, k, ROW)), i * joint.stride + i
-        store(joint.information, at, add_diagonal(load(joint.information, at, BLOCK), weight))
-        store(joint.eta, i, add(load(joint.eta, i, ROW), times(weight, gap)))
+        weight, i = fix_information(star, k), block_of(k, n)
+        gap, at = subtract(position_of(star, k), vector_at(joint.state, k)), i * joint.stride + i
+        store(joint.information, at, add_diagonal(block_at(joint.information, at), weight))
+        store(joint.eta, i, add(vector_at(joint.eta, i), times(weight, gap)))
 
 
 @inner
@@ -127,7 +125,7 @@ def update(star: Star, joint: Joint, model: Assumptions, refine: bool, n: int) -
             a, eta = joint.factor, joint.move
             copy(joint.information, a, n, joint.stride)
             for i in range(n):
-                store(eta, i, load(joint.eta, i, ROW))
+                store(eta, i, vector_at(joint.eta, i))
         for k in range(1, n):
             if stage == 1:
                 weight, vector = exact_information(star, joint, k, n, model.min_range)

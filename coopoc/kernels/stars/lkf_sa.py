@@ -5,24 +5,25 @@ from __future__ import annotations
 from ..compiling.compile import as_written, inner, inside
 from ..compiling.small import add, add_diagonal, load, negate, scale, store, subtract, zeros
 from ..compiling.vectors import LANES, choose
+from ..geometry import Numbers, metres, vector, whole
 from .joint import Joint, add_relative, joint_within, move, predict, predict_state, rearrange, solve
 from .joint_filter import add_fixes, write
 from .messages import (
     BLOCK,
     NONE,
     RELATIVE,
-    ROW,
     Assumptions,
     Estimates,
     Measurements,
     Star,
+    block_at,
     clear,
     gather,
     largest,
     new_estimates,
     star_within,
+    vector_at,
 )
-from .relative import Numbers, vector
 
 
 @as_written
@@ -33,9 +34,10 @@ def run_lkf_sa(measurements: Measurements, model: Assumptions) -> Estimates:
     most = largest(measurements.start)
     for first in range(0, runs, LANES):
         last, old = min(first + LANES, runs) - 1, NONE
-        star, joint = star_within(most), joint_within(most)
+        star, before, joint = star_within(most), star_within(most), joint_within(most)
         for t in range(steps):
-            n = gather(star, measurements, model, first, last, t, old)
+            star, before = before, star
+            n = gather(star, before, measurements, model, first, last, t, old)
             step(star, joint, model, n, old)
             write(out, joint, first, last, t, measurements.start[t], n)
             old = n
@@ -50,7 +52,7 @@ def step(star: Star, joint: Joint, model: Assumptions, n: int, old: int) -> None
     for k in range(1, n):
         if star.previous[k] < 0:
             measured = vector(load(star.relative, k, RELATIVE))
-            store(joint.state, k, add(load(joint.state, 0, ROW), measured))
+            store(joint.state, k, add(vector_at(joint.state, 0), measured))
     predict(joint.information, old, joint.stride, joint.process, joint.scratch)
     rearrange(star, joint, n, old, (flat, flat, flat))
     clear(joint.eta)
@@ -64,17 +66,14 @@ def step(star: Star, joint: Joint, model: Assumptions, n: int, old: int) -> None
 def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
     """Add L W L and L W (delta - L x), L the Laplacian of the star of complete measurements: W is 1, or the edges'
     information over the degree; that of an edge is the inverse mean variance per axis of the converted vectors."""
-    o, std, stride, e = 0.0 * load(joint.state, 0, ROW)[0], model.relative_std, joint.stride, n - 1
+    o, std, stride, e = 0.0 * vector_at(joint.state, 0)[0], model.relative_std, joint.stride, n - 1
     count, total, gaps = o, o, (o, o, o)
     for k in range(1, n):
         edge, gap = edge_to(star, joint, k)
         count, gaps = count + edge, add(gaps, gap)
         if len(std):
-            d, up = (
-                max(load(star.relative, 8 * k, (0.0,))[0], model.min_range),
-                load(star.relative, 8 * k + 3, (0.0,))[0],
-            )
-            total = total + edge * (std[0] * std[0] + d * d * (std[1] * std[1] * up * up + std[2] * std[2]))
+            a, b, c = metres(load(star.relative, k, RELATIVE), std, model.min_range)
+            total = total + edge * (a * a + b * b + c * c)
     outer = central = o + 1.0
     if len(std):
         outer = choose(count, 3.0 * count / max(total, o + 1e-300), outer)
@@ -85,7 +84,7 @@ def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
         add_relative(joint.information, joint.eta, stride, k, n, weight, scale(gap, outer))
     for i in range(n):
         row = count if i == e else -edge_to(star, joint, i + 1)[0]
-        store(joint.eta, i, subtract(load(joint.eta, i, ROW), scale(gaps, row * central)))
+        store(joint.eta, i, subtract(vector_at(joint.eta, i), scale(gaps, row * central)))
         for j in range(i, n):
             other = count if j == e else -edge_to(star, joint, j + 1)[0]
             add_at(joint, i * stride + j, central * row * other)
@@ -95,14 +94,13 @@ def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
 def edge_to(star: Star, joint: Joint, k: int) -> tuple[float, Numbers]:
     """1 if the measurement of member k is complete, else 0; the measured vector less the predicted one m, or 0."""
     seen = load(star.relative, k, RELATIVE)
-    o = 0.0 * seen[0]
-    edge = choose(o + 1e300 - (seen[5] + seen[6] + seen[7]), o + 1.0, o)
-    gap = subtract(vector(seen), subtract(load(joint.state, k, ROW), load(joint.state, 0, ROW)))
+    edge = whole(seen)
+    gap = subtract(vector(seen), subtract(vector_at(joint.state, k), vector_at(joint.state, 0)))
     return edge, scale(gap, edge)
 
 
 @inside
 def add_at(joint: Joint, at: int, number: float) -> None:
     """Add to the diagonal of a block."""
-    block = load(joint.information, at, BLOCK)
+    block = block_at(joint.information, at)
     store(joint.information, at, add_diagonal(block, (number, number, number)))

@@ -8,14 +8,15 @@ whose position was used before, or has no fix, has new = 0.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple, TypeAlias, cast
+from typing import Any, NamedTuple, Protocol, TypeAlias, cast
 
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import inner, inside, storage
-from ..compiling.small import add, choose_each, load, scale, store
-from ..compiling.vectors import LANES, choose, put, take
+from ..compiling.small import add, choose_each, scale, store
+from ..compiling.vectors import LANES, choose, take, unrolled
+from ..geometry import Numbers, with_std
 from ..motion import MotionNoise, process_variance
 
 MOVED, PROCESS, POSITION, VARIANCE = range(4)
@@ -31,10 +32,14 @@ ACCELERATION_STD = 1.0
 FIX_GROWTH, ESTIMATE_GROWTH = (1.0, 0.0), (1.0, 2.0)
 """(a, b): after `age` steps a position has gained age (a age + b) times the variance of one step. A fix that is moved
 with one velocity makes its error age times; an estimate has made that error once before, fully correlated."""
+LEAST_PROCESS = 1e-90
+"""m^2; the cube of its inverse is still a number, and far beyond any digit that counts."""
 NOWHERE = 1e18
 """m^2, variance of a position that is not known."""
 Estimates: TypeAlias = tuple[Floats, Floats, Floats]
 """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m."""
+UNIT = np.ones(3)
+"""Standard deviations m where covariances are unit matrices."""
 ROW, BLOCK, RELATIVE = (0.0,) * 3, (0.0,) * 9, (0.0,) * 8
 NONE = cast(int, np.int64(0))
 """Members before the first star. For a constant of Python's numba would compile the whole step once more."""
@@ -92,6 +97,18 @@ class Assumptions(NamedTuple):
     motion: MotionNoise
 
 
+class InMotion(Protocol):
+    """Memory of members as a `Star` has it."""
+
+    @property
+    def motion(self) -> Floats:
+        """Rows of `Star.motion`."""
+
+    @property
+    def status(self) -> Floats:
+        """Rows of `Star.status`."""
+
+
 class Star(NamedTuple):
     """The members of a star at a step, the ego first, in LANES runs.
 
@@ -102,8 +119,6 @@ class Star(NamedTuple):
         motion: (12 most, LANES).
         relative: (8 most, LANES): range m, sine and cosine of azimuth and of inclination, and three standard
             deviations, infinite where nothing was measured.
-        last_member: of the last star.
-        last_status: of the last star.
     """
 
     member: Ints
@@ -111,16 +126,67 @@ class Star(NamedTuple):
     status: Floats
     motion: Floats
     relative: Floats
-    last_member: Ints
-    last_status: Floats
+
+
+@unrolled
+def vector_at(memory: Any, index: Any) -> Any:
+    """Vector number `index` of those of three numbers that stand in memory one after the other."""
+    return memory.read(index, 3)
+
+
+@unrolled
+def block_at(memory: Any, index: Any) -> Any:
+    """Matrix number `index` of those of 3 x 3 numbers."""
+    return memory.read(index, 9)
+
+
+@inside
+def moved_of(star: InMotion, k: int) -> Numbers:
+    """Motion m of member k since the last step."""
+    row: Numbers = vector_at(star.motion, 4 * k + MOVED)
+    return row
+
+
+@inside
+def process_of(star: InMotion, k: int) -> Numbers:
+    """Its variance m^2."""
+    row: Numbers = vector_at(star.motion, 4 * k + PROCESS)
+    return row
+
+
+@inside
+def position_of(star: InMotion, k: int) -> Numbers:
+    """Position m of member k, as broadcast and brought forward."""
+    row: Numbers = vector_at(star.motion, 4 * k + POSITION)
+    return row
+
+
+@inside
+def variance_of(star: InMotion, k: int) -> Numbers:
+    """Its variance m^2."""
+    row: Numbers = vector_at(star.motion, 4 * k + VARIANCE)
+    return row
+
+
+@inside
+def process_information(star: InMotion, k: int) -> Numbers:
+    """Inverse variance 1/m^2 of the motion of member k."""
+    p, q, r = process_of(star, k)
+    return 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
+
+
+@inside
+def fix_information(star: InMotion, k: int) -> Numbers:
+    """Inverse variance 1/m^2 of the position of member k, 0 where it does not count."""
+    new, (p, q, r) = take(star.status, 5 * k + NEW), variance_of(star, k)
+    return new / p, new / q, new / r
 
 
 @storage
 def star_within(most: int) -> Star:
     """Room for `most` members."""
     status, motion, relative = np.zeros((5 * most, LANES)), np.zeros((12 * most, LANES)), np.zeros((8 * most, LANES))
-    member, previous, last = np.zeros(most, np.int64), np.zeros(most, np.int64), np.zeros(most, np.int64)
-    return Star(member, previous, status, motion, relative, last, np.zeros((5 * most, LANES)))
+    return Star(np.zeros(most, np.int64), np.zeros(most, np.int64), status, motion, relative)
 
 
 @storage
@@ -144,11 +210,14 @@ def largest(start: Ints) -> int:
 
 
 @inner
-def gather(star: Star, measurements: Measurements, model: Assumptions, first: int, last: int, t: int, old: int) -> int:
+def gather(
+    star: Star, before: Star, measurements: Measurements, model: Assumptions, first: int, last: int, t: int, old: int
+) -> int:
     """Fill the star of step t for runs first to last, at most LANES, the last one repeated; the number of its members.
 
     Args:
-        star: of the last step, of `old` members.
+        star: memory.
+        before: of the last step, of `old` members.
         measurements: measurements and messages.
         model: noise model.
         first: run.
@@ -157,27 +226,17 @@ def gather(star: Star, measurements: Measurements, model: Assumptions, first: in
         old: members of the last star.
     """
     n = 1 + measurements.start[t + 1] - measurements.start[t]
-    remember(star, old)
     for k in range(n):
         link = measurements.start[t] + k - 1
         star.member[k] = member = measurements.ego if k == 0 else measurements.neighbour[link]
-        star.previous[k] = index_of(member, star.last_member, old)
+        star.previous[k] = index_of(member, before.member, old)
         for lane in range(LANES):
             run = min(first + int(lane), last)
-            receive(star, measurements, model, run, t, link, k, lane)
+            receive(star, before, measurements, model, run, t, link, k, lane)
             if k > 0:
                 measured(star.relative, measurements.relative[run, link], model.relative_std, k, lane)
         interpret(star, model, k, measurements.dt)
     return int(n)
-
-
-@inner
-def remember(star: Star, old: int) -> None:
-    """Make the star the last one."""
-    for k in range(old):
-        star.last_member[k] = star.member[k]
-        for row in (5 * k + SENT, 5 * k + USES):
-            put(star.last_status, row, take(star.status, row))
 
 
 @inside
@@ -199,16 +258,24 @@ def index_of(member: int, members: Ints, count: int) -> int:
 
 @inside
 def receive(
-    star: Star, measurements: Measurements, model: Assumptions, run: int, t: int, link: int, k: int, lane: int
+    star: Star,
+    before: Star,
+    measurements: Measurements,
+    model: Assumptions,
+    run: int,
+    t: int,
+    link: int,
+    k: int,
+    lane: int,
 ) -> None:
     """Copy the last message of member k in one run: velocity, process noise, position, its variance, and its status."""
     previous, status = star.previous[k], 5 * k
-    before = 5 * max(previous, 0)
+    last = 5 * max(previous, 0)
     sent = t if k == 0 else measurements.newest[run, link]
     when = sent if sent >= 0 else t
-    again = previous >= 0 and star.last_status[before + SENT, lane] == sent
+    again = previous >= 0 and before.status[last + SENT, lane] == sent
     star.status[status + SENT, lane] = sent
-    star.status[status + USES, lane] = star.last_status[before + USES, lane] + 1.0 if again else 1.0
+    star.status[status + USES, lane] = before.status[last + USES, lane] + 1.0 if again else 1.0
     star.status[status + AGE, lane] = t - when
     star.status[status + HELD, lane] = 1.0 if sent >= 0 else 0.0
     j = star.member[k]
@@ -233,30 +300,22 @@ def interpret(star: Star, model: Assumptions, k: int, dt: float) -> None:
     uses, age = take(star.status, 5 * k + USES), take(star.status, 5 * k + AGE)
     held = take(star.status, 5 * k + HELD)
     late, often = dt * dt * age * model.acceleration, 2.0 * uses - 1.0
-    velocity, late = load(star.motion, 4 * k + MOVED, ROW), late * late
-    one = add(load(star.motion, 4 * k + PROCESS, ROW), process_variance(model.motion, velocity, dt))
+    velocity, late = moved_of(star, k), late * late
+    one = add(process_of(star, k), process_variance(model.motion, velocity, dt))
     one = add(one, (late, late, late))
     moved = scale(velocity, choose(held, dt + 0.0 * age, 0.0 * age))
     flat = 0.0 * age + model.flat
     grown = scale(one, age * (model.growth[0] * age + model.growth[1]))
     store(star.motion, 4 * k + MOVED, moved)
     store(star.motion, 4 * k + PROCESS, choose_each(held, scale(one, often), (flat, flat, flat)))
-    store(star.motion, 4 * k + POSITION, add(load(star.motion, 4 * k + POSITION, ROW), scale(moved, age)))
-    store(star.motion, 4 * k + VARIANCE, add(load(star.motion, 4 * k + VARIANCE, ROW), grown))
+    store(star.motion, 4 * k + POSITION, add(position_of(star, k), scale(moved, age)))
+    store(star.motion, 4 * k + VARIANCE, add(variance_of(star, k), grown))
 
 
 @inside
 def measured(relative: Floats, measured: Floats, std: Floats, k: int, lane: int) -> None:
-    """Copy the measurement of member k, of `components`; what is missing points east, its deviation infinite."""
-    d, sa, ca, si, ci = measured[0], measured[1], measured[2], measured[3], measured[4]
-    a, b, c = (std[0], std[1], std[2]) if len(std) else (1.0, 1.0, 1.0)
-    if d < 0.0:
-        d, a = 0.0, math.inf
-    if sa == 0.0 and ca == 0.0:
-        ca, b = 1.0, math.inf
-    if si == 0.0 and ci == 0.0:
-        si, c = 1.0, math.inf
-    put_lane(relative, 8 * k, lane, (d, sa, ca, si, ci, a, b, c))
+    """Copy the measurement of member k, of `components`, with its standard deviations."""
+    put_lane(relative, 8 * k, lane, with_std(measured, std if len(std) else UNIT))
 
 
 @inside

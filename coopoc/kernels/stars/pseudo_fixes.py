@@ -33,32 +33,36 @@ from ..compiling.small import (
     transpose,
     zeros,
 )
-from ..compiling.vectors import LANES, choose
-from ..gate import FIX_GATE, count, distance, gain_of, inflation
+from ..compiling.vectors import LANES, choose, take
+from ..gate import FIX_GATE, distance, gate_fix, inflation
+from ..geometry import Numbers, completed, direction, metres, spread, vector
 from .gated import gate_components, inflated
 from .messages import (
     BLOCK,
     HELD,
-    MOVED,
     NEW,
     NONE,
     NOWHERE,
     POSITION,
-    PROCESS,
     RELATIVE,
-    ROW,
     VARIANCE,
     Assumptions,
     Estimates,
     Measurements,
     Star,
+    block_at,
     clear,
+    fix_information,
     gather,
     largest,
+    moved_of,
     new_estimates,
+    position_of,
+    process_of,
     star_within,
+    variance_of,
+    vector_at,
 )
-from .relative import Numbers, completed, direction, vector
 
 ROUNDS, BISECT, TOLERANCE = 60, 20, 1e-8
 """Of Newton's method; after BISECT rounds a step out of the bracket halves it."""
@@ -81,9 +85,10 @@ def run_msmv(measurements: Measurements, model: Assumptions) -> Estimates:
     out = new_estimates(measurements)
     most, x, cov = largest(measurements.start), np.zeros((3, LANES)), np.zeros((9, LANES))
     for first in range(0, runs, LANES):
-        star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
+        star, before, old, last = star_within(most), star_within(most), NONE, min(first + LANES, runs) - 1
         for t in range(steps):
-            n = gather(star, measurements, model, first, last, t, old)
+            star, before = before, star
+            n = gather(star, before, measurements, model, first, last, t, old)
             fuse_pseudo_fixes(star, model, x, cov, n, old)
             write_ego(out, star, x, cov, first, last, t, measurements.start[t], n)
             old = n
@@ -93,20 +98,19 @@ def run_msmv(measurements: Measurements, model: Assumptions) -> Estimates:
 @inside
 def fuse_pseudo_fixes(star: Star, model: Assumptions, x: Floats, cov: Floats, n: int, old: int) -> None:
     """P^-1 + C_p^-1 + sum_j C_j^-1, and the weighted mean that belongs to it, in place of x and P."""
-    fix = load(star.motion, POSITION, ROW)
+    fix = position_of(star, 0)
     if old == 0:
         at, p = fix, zeros(fix[0], BLOCK)
         flat = 0.0 * fix[0] + model.flat
         p = add_diagonal(p, (flat, flat, flat))
     else:
-        at = add(load(x, 0, ROW), load(star.motion, MOVED, ROW))
-        p = add_diagonal(load(cov, 0, BLOCK), load(star.motion, PROCESS, ROW))
-    weight, variance = load(star.status, NEW, (0.0,))[0], load(star.motion, VARIANCE, ROW)
-    own = weight / variance[0], weight / variance[1], weight / variance[2]
+        at = add(vector_at(x, 0), moved_of(star, 0))
+        p = add_diagonal(block_at(cov, 0), process_of(star, 0))
+    own = fix_information(star, 0)
     information, eta = add_diagonal(inverse(p), own), times(subtract(fix, at), own)
     for k in range(1, n):
         position, variance = pseudo_fix(star, model, k, at)
-        new = load(star.status, 5 * k + NEW, (0.0,))[0]
+        new = take(star.status, 5 * k + NEW)
         weight_k = scale(inverse(variance), new)
         information, eta = add(information, weight_k), add(eta, apply(weight_k, subtract(position, at)))
     p = inverse(information)
@@ -117,13 +121,13 @@ def fuse_pseudo_fixes(star: Star, model: Assumptions, x: Floats, cov: Floats, n:
 @inside
 def pseudo_fix(star: Star, model: Assumptions, k: int, at: Numbers) -> tuple[Numbers, Numbers]:
     """Position of the ego by member k's estimate and the measurement of it, and its covariance."""
-    theirs, relative = load(star.motion, 4 * k + POSITION, ROW), load(star.relative, k, RELATIVE)
-    seen = completed(relative, subtract(theirs, at))
+    theirs, relative = position_of(star, k), load(star.relative, k, RELATIVE)
+    x, y, z = subtract(theirs, at)
+    seen = completed(relative, direction(x, y, z))
     one, o = 0.0 * at[0] + 1.0, 0.0 * at[0]
     cov = from_upper((one, o, o, one, o, one))
     if len(model.relative_std):
-        cov = from_upper(converted_cov(seen, (relative[5], relative[6], relative[7]), model.min_range))
-        cov = add_diagonal(cov, load(star.motion, 4 * k + VARIANCE, ROW))
+        cov = add_diagonal(cov_of(seen, relative, model.min_range), variance_of(star, k))
     return subtract(theirs, vector(seen)), cov
 
 
@@ -181,10 +185,11 @@ def run_intersection(measurements: Measurements, model: Assumptions, split: bool
         robust,
     )
     for first in range(0, runs, LANES):
-        star, old, last = star_within(most), NONE, min(first + LANES, runs) - 1
+        star, before, old, last = star_within(most), star_within(most), NONE, min(first + LANES, runs) - 1
         clear(fusion.hits)
         for t in range(steps):
-            n = gather(star, measurements, model, first, last, t, old)
+            star, before = before, star
+            n = gather(star, before, measurements, model, first, last, t, old)
             intersect(star, model, fusion, n, old)
             write_ego(out, star, fusion.x, fusion.cov, first, last, t, measurements.start[t], n)
             old = n
@@ -194,22 +199,22 @@ def run_intersection(measurements: Measurements, model: Assumptions, split: bool
 @inner
 def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) -> None:
     """Predict and fuse."""
-    fix, variance = load(star.motion, POSITION, ROW), load(star.motion, VARIANCE, ROW)
+    fix, variance = position_of(star, 0), variance_of(star, 0)
     o = 0.0 * fix[0]
     nothing = zeros(o, BLOCK)
     if old == 0:
         x, fixed, w = fix, nothing, o + 0.5
         add_source(fusion, 0, nothing, add_diagonal(nothing, variance))
     else:
-        new = load(star.status, NEW, (0.0,))[0]
-        x, w = add(load(fusion.x, 0, ROW), load(star.motion, MOVED, ROW)), load(fusion.weight, 0, (0.0,))[0]
-        independent = add_diagonal(load(fusion.independent, 0, BLOCK), load(star.motion, PROCESS, ROW))
-        add_source(fusion, 0, load(fusion.dependent, 0, BLOCK), independent)
+        new = take(star.status, NEW)
+        x, w = add(vector_at(fusion.x, 0), moved_of(star, 0)), take(fusion.weight, 0)
+        independent = add_diagonal(block_at(fusion.independent, 0), process_of(star, 0))
+        add_source(fusion, 0, block_at(fusion.dependent, 0), independent)
         if fusion.robust:
-            own, hits = own_cov(fusion), load(fusion.hits, 0, (0.0,))[0]
-            q = distance(subtract(fix, x), add_diagonal(own, variance))
-            store(fusion.hits, 0, (count(q, FIX_GATE, hits, gain_of(own, variance)),))
-            variance = scale(variance, inflation(q, FIX_GATE, hits))
+            own, hits = own_cov(fusion), take(fusion.hits, 0)
+            share, hits = gate_fix(subtract(fix, x), own, variance, FIX_GATE, hits)
+            store(fusion.hits, 0, (hits,))
+            variance = scale(variance, share)
         fixed = add_diagonal(nothing, (new / variance[0], new / variance[1], new / variance[2]))
     add_neighbours(star, model, fusion, x, n)
     alone = inverse(add(fixed, source(fusion, 0, o + 1.0)[0]))
@@ -220,7 +225,7 @@ def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) 
             s = w if k == 0 else 1.0 - w
             information, derivative, _ = source(fusion, k, s)
             total, dependent = add(total, information), add(dependent, scale(derivative, s))
-            eta = add(eta, apply(information, load(fusion.gap, k, ROW)))
+            eta = add(eta, apply(information, vector_at(fusion.gap, k)))
         cov = inverse(total)
         # A weight that is worse than none was lost to rounding, where without a fix all information is small.
         worse = choose(trace(cov), trace(cov) - (1.0 + 1e-9) * trace(alone), o + 1.0)
@@ -241,18 +246,22 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
     o = 0.0 * x[0]
     one = from_upper((o + 1.0, o, o, o + 1.0, o, o + 1.0))
     for k in range(1, n):
-        gap = subtract(load(star.motion, 4 * k + POSITION, ROW), x)
-        relative, variance = load(star.relative, k, RELATIVE), load(star.motion, 4 * k + VARIANCE, ROW)
-        noise, theirs, f = one, add_diagonal(zeros(o, BLOCK), variance), o + 1.0
+        gap = subtract(position_of(star, k), x)
+        relative, variance = load(star.relative, k, RELATIVE), variance_of(star, k)
+        polar, noise, theirs, f = (
+            direction(gap[0], gap[1], gap[2]),
+            one,
+            add_diagonal(zeros(o, BLOCK), variance),
+            o + 1.0,
+        )
         if fusion.robust:
             ahead = add(own_cov(fusion), theirs)
             _, _, factor, _ = gate_components(gap, ahead, relative, relative[5:], (o, o, o), model.min_range)
             relative = inflated(relative, factor)
         if len(model.relative_std):
-            std = (relative[5], relative[6], relative[7])
-            noise = from_upper(converted_cov(direction(gap[0], gap[1], gap[2]), std, model.min_range))
-        held = load(star.status, 5 * k + HELD, (0.0,))[0]
-        gap = subtract(gap, vector(completed(relative, gap)))
+            noise = cov_of(polar, relative, model.min_range)
+        held = take(star.status, 5 * k + HELD)
+        gap = subtract(gap, vector(completed(relative, polar)))
         if fusion.robust:
             f = inflation(distance(gap, add(ahead, noise)), FIX_GATE, o)
         counts = choose(o + 1e300 - f, held, o)
@@ -272,7 +281,7 @@ def trace(a: Numbers) -> float:
 @inside
 def own_cov(fusion: Fusion) -> Numbers:
     """Covariance m^2 of the ego's prediction."""
-    cov: Numbers = add(load(fusion.dependent, 0, BLOCK), load(fusion.independent, 0, BLOCK))
+    cov: Numbers = add(block_at(fusion.dependent, 0), block_at(fusion.independent, 0))
     return cov
 
 
@@ -291,8 +300,8 @@ def source(fusion: Fusion, k: int, s: float) -> tuple[Numbers, Numbers, Numbers]
 
     K I is (1 - K D) / s, which keeps its digits beside an I of 1e8 m^2; if not split it is 0.
     """
-    d, i = load(fusion.dependent, k, BLOCK), load(fusion.independent, k, BLOCK)
-    root = scale(inverse(add(d, scale(i, s))), load(fusion.used, k, (0.0,))[0])
+    d, i = block_at(fusion.dependent, k), block_at(fusion.independent, k)
+    root = scale(inverse(add(d, scale(i, s))), take(fusion.used, k))
     share = product(root, d)
     derivative = product(share, root)
     bend = scale(derivative, 0.0)
@@ -350,33 +359,13 @@ def inner_product(a: Numbers, b: Numbers) -> float:
     return total
 
 
-@inner
-def converted_cov(measured: Numbers, std: Numbers, least: float) -> Numbers:
-    """Covariance m^2, upper triangle, of a converted measurement at its own geometry: `vector_cov`.
-
-    Args:
-        measured: range m, sine and cosine of azimuth and of inclination.
-        std: 1e3 at most, so that a missing component has a variance beyond any other.
-    """
-    d, sa, ca, si, ci = measured[0], measured[1], measured[2], measured[3], measured[4]
-    d = max(d, least)
-    a, b, c = min_of(std[0]), min_of(std[1]) * d * si, min_of(std[2]) * d
-    a, b, c = a * a, b * b, c * c
-    flat, cross = a * si * si + c * ci * ci, (a - c) * si * ci
-    return (
-        flat * ca * ca + b * sa * sa,
-        (flat - b) * sa * ca,
-        cross * ca,
-        flat * sa * sa + b * ca * ca,
-        cross * sa,
-        a * ci * ci + c * si * si,
-    )
-
-
 @inside
-def min_of(std: float) -> float:
-    """At most 1e3."""
-    return -max(-std, -1e3)
+def cov_of(polar: Numbers, measured: Numbers, least: float) -> Numbers:
+    """Covariance m^2 of a converted measurement at a geometry; standard deviations count as 1e3 at most, so that a
+    missing component has a variance beyond any other."""
+    std = -max(-measured[5], -1e3), -max(-measured[6], -1e3), -max(-measured[7], -1e3)
+    a, b, c = metres(polar, std, least)
+    return spread(polar, a * a, b * b, c * c)
 
 
 @inner

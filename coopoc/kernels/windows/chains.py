@@ -23,7 +23,6 @@ from ..compiling.small import (
     less_applied,
     less_transposed_applied,
     less_transposed_product,
-    load,
     minus_apply,
     minus_product,
     mirrored,
@@ -39,7 +38,7 @@ from ..compiling.small import (
 )
 from ..compiling.vectors import LANES, take
 from ..stars.joint import eliminate, substitute
-from ..stars.messages import BLOCK, ROW
+from ..stars.messages import BLOCK, ROW, block_at, vector_at
 from .window_layout import Window, count_of, fix_gap, motion, row_of
 
 
@@ -106,10 +105,10 @@ def gauss_newton(window: Window, span: tuple[int, int], system: System, coupled:
     substitute(system.core, system.vector, size, size)
     for step in range(first, last + 1):
         ego = row_of(window.layout, step, 0)
-        store(system.move, ego, load(system.vector, coupled + step - first, ROW))
+        store(system.move, ego, vector_at(system.vector, coupled + step - first))
         for k in range(1, count_of(window.sizes, step)):
             if step == first:
-                store(system.move, ego + k, load(system.vector, k - 1, ROW))
+                store(system.move, ego + k, vector_at(system.vector, k - 1))
             else:
                 unfold(window, span, step, ego + k, system, coupled)
 
@@ -127,17 +126,17 @@ def assemble_core(window: Window, span: tuple[int, int], system: System, coupled
     add_arrival(window, first, system, coupled + 1, size)
     for s in range(last - first + 1):
         ego, i = row_of(window.layout, first + s, 0), coupled + s
-        own, diagonal = load(window.used, ego, ROW), i * (size + 1)
-        block, eta = add_diagonal(load(system.core, diagonal, BLOCK), own), times(own, fix_gap(window, ego))
-        eta = add(load(system.vector, i, ROW), eta)
+        own, diagonal = vector_at(window.used, ego), i * (size + 1)
+        block, eta = add_diagonal(block_at(system.core, diagonal), own), times(own, fix_gap(window, ego))
+        eta = add(vector_at(system.vector, i), eta)
         if s > 0:
             process, off = motion(window, row_of(window.layout, first + s - 1, 0), ego)
             block, eta, above = add_diagonal(block, process), add(eta, off), diagonal - size - 1
-            store(system.core, above, add_diagonal(load(system.core, above, BLOCK), process))
+            store(system.core, above, add_diagonal(block_at(system.core, above), process))
             store(system.core, above + 1, add_diagonal(nothing, negate(process)))
-            store(system.vector, i - 1, subtract(load(system.vector, i - 1, ROW), off))
+            store(system.vector, i - 1, subtract(vector_at(system.vector, i - 1), off))
         for row in range(ego + 1, ego + count_of(window.sizes, first + s)):
-            block, eta = add(block, load(window.edge, row, BLOCK)), subtract(eta, load(window.eta, row, ROW))
+            block, eta = add(block, block_at(window.edge, row)), subtract(eta, vector_at(window.eta, row))
         store(system.core, diagonal, block)
         store(system.vector, i, eta)
 
@@ -147,14 +146,14 @@ def add_arrival(window: Window, first: int, system: System, n: int, size: int) -
     """Move the arrival cost from where it expects the n points of the first step to the points."""
     for i in range(n):
         away = from_start(window, first, i, n)
-        own = mirrored(load(system.arrival, i * (window.layout[1] + 1), BLOCK))
+        own = mirrored(block_at(system.arrival, i * (window.layout[1] + 1)))
         store(system.core, i * (size + 1), own)
-        eta = plus_applied(load(system.vector, i, ROW), own, away)
+        eta = plus_applied(vector_at(system.vector, i), own, away)
         for j in range(i + 1, n):
-            block = load(system.arrival, i * window.layout[1] + j, BLOCK)
+            block = block_at(system.arrival, i * window.layout[1] + j)
             store(system.core, i * size + j, block)
             eta = plus_applied(eta, block, from_start(window, first, j, n))
-            store(system.vector, j, plus_applied(load(system.vector, j, ROW), transpose(block), away))
+            store(system.vector, j, plus_applied(vector_at(system.vector, j), transpose(block), away))
         store(system.vector, i, eta)
 
 
@@ -162,7 +161,7 @@ def add_arrival(window: Window, first: int, system: System, n: int, size: int) -
 def from_start(window: Window, first: int, i: int, n: int) -> Any:
     """m from the point of block i of the first step to where it was expected."""
     row = row_of(window.layout, first, i + 1 if i < n - 1 else 0)
-    return subtract(load(window.start, row, ROW), load(window.point, row, ROW))
+    return subtract(vector_at(window.start, row), vector_at(window.point, row))
 
 
 @inner
@@ -178,16 +177,16 @@ def fold(
     eta, own, flat = nothing, zeros(nothing[0], BLOCK), nothing[0] + prior
     while True:
         here, arm = step - first, row * h
-        information, fix = load(window.edge, row, BLOCK), load(window.used, row, ROW)
+        information, fix = block_at(window.edge, row), vector_at(window.used, row)
         store(system.arm, arm + here, negate(information))
         own = add_diagonal(add(own, information), fix)
-        eta = add(add(eta, load(window.eta, row, ROW)), times(fix, fix_gap(window, row)))
+        eta = add(add(eta, vector_at(window.eta, row)), times(fix, fix_gap(window, row)))
         if here == 0:
             i = row - row_of(window.layout, first, 1)
             for j in range(end + 1):
                 store(system.core, i * size + coupled + j, add_to(system, i * size + coupled + j, arm + j))
-            store(system.core, i * (size + 1), add(load(system.core, i * (size + 1), BLOCK), own))
-            store(system.vector, i, add(load(system.vector, i, ROW), eta))
+            store(system.core, i * (size + 1), add(block_at(system.core, i * (size + 1)), own))
+            store(system.vector, i, add(vector_at(system.vector, i), eta))
             return
         before = window.previous[row]
         process, off = nothing, nothing
@@ -197,49 +196,49 @@ def fold(
             eta = add(eta, off)
         else:
             own = add_diagonal(own, (flat, flat, flat))
-            eta = add(eta, scale(subtract(load(window.start, row, ROW), load(window.point, row, ROW)), flat))
+            eta = add(eta, scale(subtract(vector_at(window.start, row), vector_at(window.point, row)), flat))
         pivot = negate(inverse(add_diagonal(own, process)))
         solved = minus_apply(pivot, eta)
         store(system.eta, row, eta)
         store(system.pivot, row, pivot)
         system.end[row] = end
         for i in range(here, end + 1):
-            store(system.scratch, i, minus_product(pivot, load(system.arm, arm + i, BLOCK)))
+            store(system.scratch, i, minus_product(pivot, block_at(system.arm, arm + i)))
         for i in range(here, end + 1):
-            left, at = load(system.arm, arm + i, BLOCK), (coupled + i) * size + coupled
+            left, at = block_at(system.arm, arm + i), (coupled + i) * size + coupled
             for j in range(i, end + 1):
-                right = load(system.scratch, j, BLOCK)
-                store(system.core, at + j, less_transposed_product(load(system.core, at + j, BLOCK), left, right))
-            moved = less_transposed_applied(load(system.vector, coupled + i, ROW), left, solved)
+                right = block_at(system.scratch, j)
+                store(system.core, at + j, less_transposed_product(block_at(system.core, at + j), left, right))
+            moved = less_transposed_applied(vector_at(system.vector, coupled + i), left, solved)
             store(system.vector, coupled + i, moved)
         if before < 0:
             return
         own = mirrored(scale_rows(process, minus_product(pivot, own)))
         eta = subtract(times(process, solved), off)
         for i in range(here, end + 1):
-            store(system.arm, before * h + i, scale_rows(process, load(system.scratch, i, BLOCK)))
+            store(system.arm, before * h + i, scale_rows(process, block_at(system.scratch, i)))
         step, row = step - 1, before
 
 
 @inner
 def add_to(system: System, at: int, arm: int) -> Any:
     """A block of the dense matrix and one of a chain."""
-    return add(load(system.core, at, BLOCK), load(system.arm, arm, BLOCK))
+    return add(block_at(system.core, at), block_at(system.arm, arm))
 
 
 @inner
 def unfold(window: Window, span: tuple[int, int], step: int, row: int, system: System, coupled: int) -> None:
     """The step of a point of a chain, those of the ego and of the point before being known."""
     first, last = span
-    h, eta = last - first + 1, load(system.eta, row, ROW)
+    h, eta = last - first + 1, vector_at(system.eta, row)
     for i in range(step - first, system.end[row] + 1):
-        eta = less_applied(eta, load(system.arm, row * h + i, BLOCK), load(system.vector, coupled + i, ROW))
+        eta = less_applied(eta, block_at(system.arm, row * h + i), vector_at(system.vector, coupled + i))
     before = window.previous[row]
     if before >= 0:
         before = row_of(window.layout, step - 1, before)
         process, _ = motion(window, before, row)
-        eta = add(eta, times(process, load(system.move, before, ROW)))
-    store(system.move, row, minus_apply(load(system.pivot, row, BLOCK), eta))
+        eta = add(eta, times(process, vector_at(system.move, before)))
+    store(system.move, row, minus_apply(block_at(system.pivot, row), eta))
 
 
 @inner
@@ -247,17 +246,17 @@ def advance(window: Window, span: tuple[int, int], system: System, share: Any) -
     """Move all points by a share of the step, and the edges' information vectors with them."""
     for step in range(span[0], span[1] + 1):
         ego = row_of(window.layout, step, 0)
-        own = load(system.move, ego, ROW)
+        own = vector_at(system.move, ego)
         for row in range(ego, ego + count_of(window.sizes, step)):
-            moved = load(system.move, row, ROW)
-            store(window.point, row, add(load(window.point, row, ROW), scale(moved, share)))
+            moved = vector_at(system.move, row)
+            store(window.point, row, add(vector_at(window.point, row), scale(moved, share)))
             if row > ego:
                 ahead = scale(subtract(moved, own), share)
-                eta = less_applied(load(window.eta, row, ROW), load(window.edge, row, BLOCK), ahead)
+                eta = less_applied(vector_at(window.eta, row), block_at(window.edge, row), ahead)
                 store(window.eta, row, eta)
 
 
 @inner
 def gap_of(points: AnyArray, ego: int, row: int) -> Any:
     """Vector m from the ego to a neighbour."""
-    return subtract(load(points, row, ROW), load(points, ego, ROW))
+    return subtract(vector_at(points, row), vector_at(points, ego))

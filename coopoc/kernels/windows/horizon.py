@@ -17,7 +17,6 @@ from ..compiling.compile import as_written, inner, inside
 from ..compiling.small import (
     add,
     add_diagonal,
-    apply,
     choose_each,
     from_upper,
     load,
@@ -30,26 +29,27 @@ from ..compiling.small import (
     zeros,
 )
 from ..compiling.vectors import LANES, choose, put, take
+from ..geometry import Numbers, completed, converted, direction, exact, vector, whole
 from ..stars.gated import Gates, carry, gate_position, gate_star, gates_within, set_ego
 from ..stars.joint import Joint, add_relative, block_of, joint_within, predict, rearrange, solve
 from ..stars.messages import (
     BLOCK,
-    MOVED,
     NEW,
-    POSITION,
     RELATIVE,
     ROW,
     SENT,
     USES,
-    VARIANCE,
     Assumptions,
     Measurements,
+    block_at,
     clear,
+    fix_information,
     interpret,
+    moved_of,
+    position_of,
     receive,
-    star_within,
+    vector_at,
 )
-from ..stars.relative import Numbers, completed, converted, exact, vector
 from .chains import System, advance, gap_of, gauss_newton, new_system
 from .window_layout import (
     Window,
@@ -110,12 +110,12 @@ def horizons(measurements: Measurements, model: Assumptions, arrival: Ints, sett
     (runs, steps), most = measurements.gnss.shape[:2], 1 + int(np.diff(measurements.start).max(initial=0))
     x, cov = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3))
     estimates = Estimates(x, cov, np.empty((runs, len(measurements.neighbour), 3)), np.zeros((runs, steps), np.bool_))
-    window, within = new_window(settings.length, most), cast(Any, (joint_within, star_within, gates_within))
-    joint, star, gates = (make.py_func(most) for make in within)
+    window, within = new_window(settings.length, most), cast(Any, (joint_within, gates_within))
+    joint, gates = (make.py_func(most) for make in within)
     system = new_system(settings.length, most, joint.information)
     for first in range(0, runs, LANES):
         here = first, min(first + LANES, runs) - 1
-        follow_horizon((window, joint, star, system, gates), measurements, model, arrival, settings, here, estimates)
+        follow_horizon((window, joint, system, gates), measurements, model, arrival, settings, here, estimates)
     return estimates
 
 
@@ -130,10 +130,10 @@ def follow_horizon(
     estimates: Estimates,
 ) -> None:
     """Solve the window that ends at each step, in runs first to last."""
-    window, joint, star, system, gates = memory
+    window, joint, system, gates = memory
     for t in range(len(measurements.start) - 1):
         span = (max(0, t - settings.length + 1), t)
-        enter(window, star, measurements, model, runs, t)
+        enter(window, measurements, model, runs, t)
         for step in range(span[0], t + 1):
             gather_arrived(window, gates, measurements, model, arrival, settings, runs, step, t)
         start_points(window, t)
@@ -158,7 +158,7 @@ def follow_horizon(
                 estimates.moving[runs[0] + lane, t] = settings.exact and system.active[lane] > 0.0
             if not any_positive(system.active):
                 break
-        set_ego(gates, negate(load(system.cov, 0, BLOCK)))
+        set_ego(gates, negate(block_at(system.cov, 0)))
 
 
 @inner
@@ -203,11 +203,11 @@ def put_edge(window: Window, model: Assumptions, ego: int, row: int, gap: Any, h
     z = load(window.relative, row, RELATIVE)
     information, eta = edge(gap, z, model.relative_std, model.min_range, how)
     eta = plus_applied(eta, information, subtract(gap, gap_of(window.point, ego, row)))
-    o, used = 0.0 * gap[0], max(take(window.located, uint64(row)), whole_of(window, row)) - 0.5
+    o, used = 0.0 * gap[0], max(take(window.located, uint64(row)), whole(load(window.relative, row, RELATIVE))) - 0.5
     information, eta = choose_each(used, information, zeros(o, BLOCK)), choose_each(used, eta, zeros(o, ROW))
-    store(window.edge, row, choose_each(active, information, load(window.edge, row, BLOCK)))
-    store(window.eta, row, choose_each(active, eta, load(window.eta, row, ROW)))
-    store(window.base, row, choose_each(active, gap, load(window.base, row, ROW)))
+    store(window.edge, row, choose_each(active, information, block_at(window.edge, row)))
+    store(window.eta, row, choose_each(active, eta, vector_at(window.eta, row)))
+    store(window.base, row, choose_each(active, gap, vector_at(window.base, row)))
 
 
 @inner
@@ -222,16 +222,11 @@ def edge(gap: Numbers, z: Numbers, std: Floats, least: float, how: int) -> tuple
         how: EXACT or AT_GAP.
     """
     z = z if how == AT_GAP else inflated(z, least)
-    x, y, up = gap
-    o, whole = 0.0 * z[0], 1e300 - (z[5] + z[6] + z[7])
     if len(std) == 0:
-        there = choose(whole, o + 1.0, o)
+        there = whole(z)
+        o = 0.0 * there
         return from_upper((there, o, o, there, o, there)), scale(subtract(vector(z), gap), there)
-    if how == EXACT:
-        e = exact(x, y, up, z, z[5:], 0.0)
-        return from_upper(e[:6]), e[6:]
-    information = from_upper(converted(x, y, up, z[5:], least))
-    return information, apply(information, subtract(vector(completed(z, gap)), gap))
+    return exact(gap, z, 0.0) if how == EXACT else converted(gap, z, False, least)
 
 
 @inner
@@ -243,20 +238,13 @@ def inflated(z: Numbers, least: float) -> Numbers:
 
 
 @inner
-def whole_of(window: Window, row: int) -> Any:
-    """1 where all components of a relative measurement were measured, else 0."""
-    z = load(window.relative, row, RELATIVE)
-    return choose(1e300 - (z[5] + z[6] + z[7]), 0.0 * z[0] + 1.0, 0.0 * z[0])
-
-
-@inner
 def distance(window: Window, span: tuple[int, int]) -> Any:
     """m by which a vector has left the one at which its measurement is linear, the largest along an axis."""
-    most = 0.0 * load(window.point, row_of(window.layout, span[1], 0), ROW)[0]
+    most = 0.0 * vector_at(window.point, row_of(window.layout, span[1], 0))[0]
     for step in range(span[0], span[1] + 1):
         ego = row_of(window.layout, step, 0)
         for row in range(ego + 1, ego + count_of(window.sizes, step)):
-            most = max(most, largest_of(subtract(gap_of(window.point, ego, row), load(window.base, row, ROW))))
+            most = max(most, largest_of(subtract(gap_of(window.point, ego, row), vector_at(window.base, row))))
     return most
 
 
@@ -267,20 +255,21 @@ def start_points(window: Window, t: int) -> None:
     ego, before = row_of(window.layout, t, 0), row_of(window.layout, t - 1, 0)
     for k in range(count_of(window.sizes, t)):
         row, previous = ego + k, window.previous[ego + k]
-        fix, new = load(window.motion, 4 * row + POSITION, ROW), take(window.status, uint64(5 * row + NEW))
-        there = 0.0 * new + 1.0 if k == 0 else max(new, whole_of(window, row))
+        fix, new = position_of(window, row), take(window.status, uint64(5 * row + NEW))
+        there = 0.0 * new + 1.0 if k == 0 else max(new, whole(load(window.relative, row, RELATIVE)))
         at = fix
         if previous >= 0:
             located = take(window.located, uint64(before + previous))
-            at = add(load(window.point, before + previous, ROW), load(window.motion, 4 * row + MOVED, ROW))
+            at = add(vector_at(window.point, before + previous), moved_of(window, row))
             first = new - located - 0.5  # > 0: its first position
             at = choose_each(first, fix, at)
             there = max(there, located)
             if any_above(first):
                 locate_before(window, row, t, first, at)
         elif k > 0:
-            origin = load(window.point, ego, ROW)
-            at = add(origin, vector(completed(load(window.relative, row, RELATIVE), subtract(fix, origin))))
+            origin = vector_at(window.point, ego)
+            x, y, z = subtract(fix, origin)
+            at = add(origin, vector(completed(load(window.relative, row, RELATIVE), direction(x, y, z))))
         put(window.located, uint64(row), there)
         store(window.point, row, at)
         store(window.start, row, at)
@@ -316,10 +305,10 @@ def locate_before(window: Window, row: int, t: int, mask: Any, at: Any) -> None:
     """Bring the earlier points of a member, which nothing had located, to where its first position puts them."""
     here, step = row, t
     while window.previous[here] >= 0 and step > 0 and t - step < len(window.sizes) - 1:
-        at = subtract(at, load(window.motion, 4 * here + MOVED, ROW))
+        at = subtract(at, moved_of(window, here))
         here, step = row_of(window.layout, step - 1, window.previous[here]), step - 1
         lost = choose(mask, 0.5 - take(window.located, uint64(here)), 0.0 * at[0])
-        store(window.point, here, choose_each(lost, at, load(window.point, here, ROW)))
+        store(window.point, here, choose_each(lost, at, vector_at(window.point, here)))
         put(window.located, uint64(here), choose(lost, 0.0 * at[0] + 1.0, take(window.located, uint64(here))))
 
 
@@ -339,18 +328,18 @@ def leave(window: Window, joint: Joint, model: Assumptions, step: int) -> None:
     grown by the process noise, the arrival cost."""
     ego, after, n = row_of(window.layout, step, 0), row_of(window.layout, step + 1, 0), count_of(window.sizes, step)
     for k in range(n):
-        i, row, fix = block_of(k, n), ego + k, load(window.used, ego + k, ROW)
-        at, off = i * (joint.stride + 1), load(window.motion, 4 * row + POSITION, ROW)
-        store(joint.information, at, add_diagonal(load(joint.information, at, BLOCK), fix))
-        store(joint.eta, i, times(fix, subtract(off, load(window.start, row, ROW))))
+        i, row, fix = block_of(k, n), ego + k, vector_at(window.used, ego + k)
+        at, off = i * (joint.stride + 1), position_of(window, row)
+        store(joint.information, at, add_diagonal(block_at(joint.information, at), fix))
+        store(joint.eta, i, times(fix, subtract(off, vector_at(window.start, row))))
         process, later = zeros(fix[0], ROW), window.later[row]
         if later >= 0:
             process, _ = motion(window, row, after + later)
         store(joint.process, i, process)
     for k in range(1, n):
         away = subtract(gap_of(window.point, ego, ego + k), gap_of(window.start, ego, ego + k))
-        information = load(window.edge, ego + k, BLOCK)
-        eta = plus_applied(load(window.eta, ego + k, ROW), information, away)
+        information = block_at(window.edge, ego + k)
+        eta = plus_applied(vector_at(window.eta, ego + k), information, away)
         add_relative(joint.information, joint.eta, joint.stride, k, n, information, eta)
     solve(joint.information, joint, joint.eta, n)
     predict(joint.information, n, joint.stride, joint.process, joint.scratch)
@@ -359,8 +348,8 @@ def leave(window: Window, joint: Joint, model: Assumptions, step: int) -> None:
     for row in range(after, after + m):
         if window.previous[row] >= 0:
             before = ego + window.previous[row]
-            mean = add(load(window.start, before, ROW), load(joint.eta, block_of(window.previous[row], n), ROW))
-            store(window.start, row, add(mean, load(window.motion, 4 * row + MOVED, ROW)))
+            mean = add(vector_at(window.start, before), vector_at(joint.eta, block_of(window.previous[row], n)))
+            store(window.start, row, add(mean, moved_of(window, row)))
 
 
 @inner
@@ -378,26 +367,27 @@ def gather_arrived(
     """Put the messages that have arrived by now where they belong: the message of a step moves its sender there, or
     the last one before that has arrived and is not too old, as if it had done so since it was sent, and its fix stands
     at the step at which it was sent."""
-    star, here = star_at(window, step), row_of(window.layout, step, 0)
+    star, before = star_at(window, step), star_at(window, step - 1)
+    here = row_of(window.layout, step, 0)
     for k in range(1, count_of(window.sizes, step)):
         link, place, changed = measurements.start[step] + k - 1, window.previous[here + k], step == now
         for run in range(runs[0], runs[1] + 1):
             come = 0 <= arrival[run, link] <= now
             sent = step if come else measurements.newest[run, link]
             if place >= 0 and step > 0:
-                carried = int(star.last_status[5 * place + SENT, run - runs[0]])
+                carried = int(before.status[5 * place + SENT, run - runs[0]])
                 sent = max(sent, carried if step - carried <= settings.age else -1)
             changed |= sent != measurements.newest[run, link] or come != measurements.fresh[run, link]
             measurements.newest[run, link], measurements.fresh[run, link] = sent, come
         if changed:
             for lane in range(uint64(LANES)):
                 run = min(runs[0] + int(lane), runs[1])
-                receive(star, measurements, model, run, step, link, k, lane)
+                receive(star, before, measurements, model, run, step, link, k, lane)
                 used_since = max(measurements.newest[run, link], window.joined[here + k])
                 star.status[5 * k + USES, lane] = step - used_since + 1
             interpret(star, model, k, measurements.dt)
             if settings.robust and step < now:
-                point, cov = load(window.point, here + k, ROW), load(gates.state, 0, BLOCK)
+                point, cov = vector_at(window.point, here + k), block_at(gates.state, 0)
                 gate_position(star, k, point, scale(cov, 2.0), 0.0 * point[0])
 
 
@@ -407,9 +397,7 @@ def use_new_fixes(window: Window, first: int, last: int) -> None:
     for step in range(first, last + 1):
         ego = row_of(window.layout, step, 0)
         for row in range(ego, ego + count_of(window.sizes, step)):
-            new = take(window.status, uint64(5 * row + NEW))
-            p, q, r = load(window.motion, 4 * row + VARIANCE, ROW)
-            store(window.used, row, (new / p, new / q, new / r))
+            store(window.used, row, fix_information(window, row))
 
 
 @inner

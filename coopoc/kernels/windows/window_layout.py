@@ -5,14 +5,21 @@ from __future__ import annotations
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy import uint64
 
 from ...arrays import AnyArray, Floats, Ints
 from ..compiling.compile import inner, storage
-from ..compiling.small import load, subtract, times
-from ..compiling.vectors import LANES, put, take
-from ..stars.joint import LEAST_PROCESS
-from ..stars.messages import MOVED, POSITION, PROCESS, ROW, Assumptions, Measurements, Star, gather
+from ..compiling.small import subtract, times
+from ..compiling.vectors import LANES
+from ..stars.messages import (
+    Assumptions,
+    Measurements,
+    Star,
+    gather,
+    moved_of,
+    position_of,
+    process_information,
+    vector_at,
+)
 
 
 class Window(NamedTuple):
@@ -95,31 +102,17 @@ def count_of(sizes: Ints, step: int) -> int:
 
 
 @inner
-def enter(
-    window: Window, star: Star, measurements: Measurements, model: Assumptions, runs: tuple[int, int], t: int
-) -> None:
+def enter(window: Window, measurements: Measurements, model: Assumptions, runs: tuple[int, int], t: int) -> None:
     """Gather what is known of step t into its slot."""
-    old = count_of(window.sizes, t - 1) if t > 0 else 0
-    n = gather(star, measurements, model, runs[0], runs[1], t, old)
+    old, star = count_of(window.sizes, t - 1) if t > 0 else 0, star_at(window, t)
+    n = gather(star, star_at(window, t - 1), measurements, model, runs[0], runs[1], t, old)
     here, before = row_of(window.layout, t, 0), row_of(window.layout, t - 1, 0)
     window.sizes[t % len(window.sizes)] = n
     for k in range(n):
-        row = here + k
-        window.member[row], window.previous[row], window.later[row] = star.member[k], star.previous[k], -1
-        window.joined[row] = t
-        if star.previous[k] >= 0:
-            window.later[before + star.previous[k]] = k
-            window.joined[row] = window.joined[before + star.previous[k]]
-    copy_rows(window.motion, 12 * here, star.motion, 12 * n)
-    copy_rows(window.relative, 8 * here, star.relative, 8 * n)
-    copy_rows(window.status, 5 * here, star.status, 5 * n)
-
-
-@inner
-def copy_rows(out: AnyArray, at: int, source: AnyArray, count: int) -> None:
-    """The first rows of LANES numbers; an assignment of slices would compile the text of its errors."""
-    for row in range(count):
-        put(out, uint64(at + row), take(source, uint64(row)))
+        row, previous = here + k, star.previous[k]
+        window.later[row], window.joined[row] = -1, t
+        if previous >= 0:
+            window.later[before + previous], window.joined[row] = k, window.joined[before + previous]
 
 
 @inner
@@ -134,16 +127,15 @@ def any_positive(mask: AnyArray) -> bool:
 @inner
 def fix_gap(window: Window, row: int) -> Any:
     """Measured position less the point, m."""
-    return subtract(load(window.motion, 4 * row + POSITION, ROW), load(window.point, row, ROW))
+    return subtract(position_of(window, row), vector_at(window.point, row))
 
 
 @inner
 def motion(window: Window, here: int, there: int) -> Any:
     """Information 1/m^2 of the motion from a row to the one after, and its eta on the latter's point."""
-    p, q, r = load(window.motion, 4 * there + PROCESS, ROW)
-    process = 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
-    moved = subtract(load(window.point, there, ROW), load(window.point, here, ROW))
-    return process, times(process, subtract(load(window.motion, 4 * there + MOVED, ROW), moved))
+    process = process_information(window, there)
+    moved = subtract(vector_at(window.point, there), vector_at(window.point, here))
+    return process, times(process, subtract(moved_of(window, there), moved))
 
 
 @inner
@@ -154,14 +146,12 @@ def largest_of(v: Any) -> Any:
 
 @storage
 def star_at(window: Window, step: int) -> Star:
-    """The star of a step, and of the one before it, in the window's own memory."""
-    here, before, n = row_of(window.layout, step, 0), row_of(window.layout, step - 1, 0), window.layout[1]
+    """The star of a step, in the window's own memory."""
+    here, n = row_of(window.layout, step, 0), window.layout[1]
     return Star(
         window.member[here : here + n],
         window.previous[here : here + n],
         window.status[5 * here : 5 * (here + n)],
         window.motion[12 * here : 12 * (here + n)],
         window.relative[8 * here : 8 * (here + n)],
-        window.member[before : before + n],
-        window.status[5 * before : 5 * (before + n)],
     )

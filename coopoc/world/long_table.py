@@ -7,8 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from .arrays import AnyArray, Bools
-from .errors import missing
+from ..arrays import AnyArray, Bools
+from ..errors import missing
 
 if TYPE_CHECKING:
     import pandas as pd
