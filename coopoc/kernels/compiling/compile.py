@@ -187,6 +187,8 @@ def _within(function: Function, liberties: set[str], **options: bool) -> Functio
 
 def _kept(function: Function, liberties: set[str]) -> Function:
     made = _made(function, liberties)
+    if not hasattr(sys.modules[function.__module__], "__file__"):
+        return cast(Function, made)  # typed at a prompt: no file whose content could name its machine code
     if hooks := _hooks():
         made._cache = hooks[1].MachineCode(function)
         kernels.append(made)
