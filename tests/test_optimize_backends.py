@@ -3,15 +3,15 @@
 import sys
 from importlib.util import find_spec
 
-import gtsam
 import numpy as np
 import pytest
 from conftest import refused
+from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import star
 from scipy.optimize import least_squares
 
 from coopoc import V2X, Fleet, MissingLibraryError, Sensors, observe
-from coopoc.optimize import Backend, Factor, Problem, SolverResult, Status, backends, solve
+from coopoc.optimize import Backend, Problem, SolverResult, Status, backends, solve
 from coopoc.optimize.backends import osqp
 from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.recording import Recording
@@ -77,44 +77,13 @@ def test_scipy_finds_the_same_minimum(dense: Recording, crossing_recording: Reco
         assert ours.x == pytest.approx(x, abs=2e-5)  # difference Jacobians stop there
 
 
-def gtsam_marginals(problem: Problem, x: np.ndarray) -> np.ndarray:
-    """GTSAM's Marginals over a graph of its own: priors, betweens, and CustomFactors with difference Jacobians."""
-    graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for i, point in enumerate(x):
-        values.insert(i, point)
-    for factor in problem.factors:
-        for node, z, root in zip(factor.nodes.tolist(), factor.z, factor.root, strict=True):
-            model = gtsam.noiseModel.Gaussian.Covariance(np.linalg.inv(root.T @ root))
-            if factor.kind == "position":
-                graph.add(gtsam.PriorFactorPoint3(*node, z, model))
-            elif factor.kind == "displacement":
-                graph.add(gtsam.BetweenFactorPoint3(*node, z, model))
-            else:
-                graph.add(gtsam.CustomFactor(model, node, custom(factor, node, z)))
-    result = gtsam.Marginals(graph, values)
-    return np.stack([result.marginalCovariance(i) for i in range(len(x))])
-
-
-def custom(factor: Factor, node: list[int], z: np.ndarray):
-    known = factor.measurement
-
-    def error(_, values, jacobians):
-        v = values.atPoint3(node[1]) - values.atPoint3(node[0])
-        if jacobians is not None:
-            step = 1e-5 * np.eye(3)
-            jacobian = [(known.predict(v + d) - known.predict(v - d)) / 2e-5 for d in step]
-            jacobians[0], jacobians[1] = -np.array(jacobian).T, np.array(jacobian).T
-        return np.array(known.residual(v, z, (), np))
-
-    return error
-
-
 @pytest.mark.parametrize("backend", LOCAL)
 @pytest.mark.parametrize("length", [1, 5])
-def test_marginals_equal_gtsams(crossing_recording: Recording, length: int, backend: str) -> None:
+def test_marginals_are_those_of_gtsams_bayes_tree(crossing_recording: Recording, length: int, backend: str) -> None:
     problem = Problem.from_window(crossing_recording, 20, 0, length)
     solution = solve(problem, backend)
-    assert solution.covariance == pytest.approx(gtsam_marginals(problem, solution.x), abs=1e-6)
+    theirs = bayes_tree_marginals(problem.whiten(solution.x)[1], None, len(problem.names), 3)
+    assert solution.covariance == pytest.approx(theirs, abs=1e-6)
 
 
 def chain_of(points: int, separator: tuple[int, ...] = ()) -> Problem:

@@ -5,7 +5,6 @@ from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 
-import gtsam
 import numpy as np
 import pytest
 from conftest import refused
@@ -73,23 +72,6 @@ def test_points_that_a_loss_sets_free_are_told_from_unmeasured_ones() -> None:
     torn = Problem(("a",)).add("position", ["a"] * 2, [[-40, 0, 0], [40, 0, 0]], std=1.0, loss=Loss("truncated", 1.0))
     with refused(r"a can move|truncated loss rejects 2 of 2.*larger scale"):
         solve(torn)
-
-
-def test_gtsam_solves_what_it_lacks_by_custom_factors(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Azimuth in the world frame, robust; every step is GTSAM's: its optimizer is called, and costs what ours costs."""
-    problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 1, 0]], std=2.0)
-    problem = problem.add("spherical", ("a", "b"), [10.0, 0.3, 1.5], std=[0.5, 0.05, 0.05], loss=Loss("cauchy", 1.0))
-    called, own = [], gtsam.LevenbergMarquardtOptimizer
-
-    def spy(graph: gtsam.NonlinearFactorGraph, values: gtsam.Values, params: gtsam.LevenbergMarquardtParams) -> object:
-        called.append(graph.error(values))
-        return own(graph, values, params)
-
-    monkeypatch.setattr(gtsam, "LevenbergMarquardtOptimizer", spy)
-    found = solve(problem, "gtsam")
-    assert found.extras["custom_factors"] == 1
-    assert called[-1] == pytest.approx(problem.cost(found.x), rel=1e-9)
-    assert found.x == pytest.approx(solve(problem).x, abs=1e-6)
 
 
 def test_edges_alone_are_read_and_solved_as_with_vertices(tmp_path: Path) -> None:

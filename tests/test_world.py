@@ -147,7 +147,7 @@ def test_gilbert_elliott_share_and_burst() -> None:
     assert bad.sum() / starts == pytest.approx(5.0, rel=0.03)
 
 
-def test_loss_delay_rate_and_cap_act_on_messages(formation: Fleet) -> None:
+def test_loss_delay_and_rate_act_on_messages(formation: Fleet) -> None:
     fleet = formation.between(0, 200)
     ideal = observe(fleet, S2, V2X(max_neighbours=4), runs=6, observers=[0])
     box = inbox(ideal, 0, FIX_AND_VELOCITY)
@@ -164,12 +164,6 @@ def test_loss_delay_rate_and_cap_act_on_messages(formation: Fleet) -> None:
     slow = inbox(observe(fleet, S2, V2X(max_neighbours=4, rate=2.0), runs=1, observers=[0]), 0, FIX_AND_VELOCITY)
     assert slow.received_bytes[0] == pytest.approx(200 * 4 * 32 / 5, rel=0.05)
     assert slow.fresh.mean() == pytest.approx(0.2, abs=0.02)
-    cap = observe(fleet, S2, V2X(max_neighbours=4, bytes_per_second=640), runs=1, observers=[0])
-    capped = inbox(cap, 0, FIX_AND_VELOCITY)
-    assert capped.received_bytes[0] == 640 * (19.9 + 1)  # 199 steps, and the bucket that was full
-    received = [capped.fresh[0, cap.links.neighbour[capped.link] == j].mean() for j in np.unique(cap.links.neighbour)]
-    assert max(received) > 0.9  # the nearest is heard, the farthest pays
-    assert min(received) < 0.1
 
 
 def test_recording_holds_no_truth(crossing: Fleet) -> None:

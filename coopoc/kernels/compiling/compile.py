@@ -187,6 +187,8 @@ def _within(function: Function, liberties: set[str], **options: bool) -> Functio
 
 def _kept(function: Function, liberties: set[str]) -> Function:
     made = _made(function, liberties)
+    if not getattr(sys.modules.get(function.__module__), "__file__", None):  # typed in: there is no source to go by
+        return cast(Function, made)
     if hooks := _hooks():
         made._cache = hooks[1].MachineCode(function)
         kernels.append(made)

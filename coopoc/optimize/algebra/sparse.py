@@ -19,7 +19,7 @@ from ..model.problem import Problem
 from ..model.space import Space
 from .cholesky import Cholesky, DenseCholesky
 
-LIBRARIES = ("casadi", "scipy.sparse", "coopoc.kernels.graphs.graph_tape", "coopoc.kernels.graphs.multifrontal")
+LIBRARIES = ("scipy.sparse", "coopoc.kernels.graphs.graph_tape", "coopoc.kernels.graphs.multifrontal")
 """What every solve imports late, so that `import coopoc` stays quick."""
 DENSE = 200
 """Unknowns up to which one dense matrix is as fast."""
