@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple
@@ -11,6 +10,7 @@ import numpy as np
 from tqdm import tqdm
 
 from ..arrays import Floats, Ints
+from ..kernels.compiling.waiting import clock
 from ..kernels.geometry import components
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
 from ..world.inbox import Inbox, inbox
@@ -50,7 +50,7 @@ def follow_egos(
     Raises:
         InputError: an ego that is unknown, no observer of this recording, absent at times, or without a first fix.
     """
-    began = time.perf_counter()
+    began = clock()
     columns = check_recording(recording).columns(egos)
     shape = (recording.runs, len(recording.t), len(columns), 3)
     x, cov = np.empty(shape), np.empty((*shape, 3))
@@ -72,7 +72,7 @@ def follow_egos(
     notes = (*notes, *contradicted(x, recording, columns))
     for array in (x, cov, neighbours):
         array.flags.writeable = False  # so that the Track need not copy them
-    seconds = time.perf_counter() - began
+    seconds = clock() - began
     whole = {name: np.concatenate(values, axis=-1) for name, values in extras.items()}
     return Track(
         recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, notes, extras=whole, ids=recording.ids

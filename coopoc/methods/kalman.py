@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -11,6 +10,7 @@ import numpy.typing as npt
 
 from ..arrays import TINY, Floats
 from ..errors import InputError
+from ..kernels.compiling.waiting import clock
 from ..kernels.gate import FIX_GATE
 from ..kernels.motion import MotionNoise
 from ..kernels.solo import FixNoise, SoloMeasurements, run_filter
@@ -34,7 +34,7 @@ class GNSS(Alone):
 
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
-        began = time.perf_counter()
+        began = clock()
         columns = check_recording(recording).columns(egos)
         fixes = recording.gnss[:, :, columns]
         there = np.isfinite(fixes).all(axis=-1, keepdims=True)
@@ -71,7 +71,7 @@ class Kalman(Alone, Checked):
 
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
-        began = time.perf_counter()
+        began = clock()
         columns = check_recording(recording).columns(egos)
         known = resolve(self.noise_model, recording, relative=False)
         x, p, _ = solo_filter(recording, columns, known, fix_noise(known, self.robust), self.x0)
@@ -147,7 +147,7 @@ class AdaptiveKalman(Alone):
 
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
-        began, columns = time.perf_counter(), check_recording(recording).columns(egos)
+        began, columns = clock(), check_recording(recording).columns(egos)
         x, p, _ = solo_filter(recording, columns, NoiseModel.nominal(self.assumed), self._fixes, self.x0)
         of = "each axis" if self.assumed.velocity_reading == "axis" else "the speed"
         share, floor = 100 * self.assumed.velocity_std_ratio, self.assumed.velocity_floor

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, replace
 
@@ -11,6 +10,7 @@ import numpy.typing as npt
 
 from ..arrays import Floats, Limits, check_fields, instance
 from ..errors import InputError
+from ..kernels.compiling.waiting import clock
 from ..kernels.motion import MotionNoise
 from ..kernels.road import SCALE, Z_VARIANCE, RoadNoise, RoadState, Z, road_motion, road_step, run_road
 from ..kernels.solo import SoloMeasurements
@@ -112,7 +112,7 @@ class RoadFilter(Alone):
 
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos, with `extras` heading_error and scale_error; InputError if one is unknown or absent."""
-        began = time.perf_counter()
+        began = clock()
         columns = check_recording(recording).columns(egos)
         x, cov, errors = self.filtered(recording, columns)
         names = "heading_error", "heading_error_std", "scale_error", "scale_error_std"

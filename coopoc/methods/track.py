@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
@@ -11,6 +10,7 @@ import numpy as np
 
 from ..arrays import Bools, Floats, Limits, check_arrays, check_fields, checked, number, texts
 from ..errors import InputError, shown
+from ..kernels.compiling.waiting import clock
 from ..short_repr import short_repr
 from ..world.long_table import long_table
 from ..world.recording import Recording, Vehicles
@@ -39,7 +39,7 @@ class Track:
         covariance: (R, T, E, 3, 3) m^2, or None if the method claims none.
         received_bytes: (R, E) bytes over the drive, payload and overhead.
         sent_bytes: (R, E) bytes over the drive, payload and overhead.
-        seconds: wall time of the method.
+        seconds: wall time of the method, without loading libraries and compiling.
         neighbours: (R, L, 3) m estimate of each link's neighbour at the link's step, NaN where there is none; or None.
             The links are those of the egos, `recording.links.of(ego)` ego by ego, and no others of the fleet.
         notes: labels for tables and figures, such as "reconstruction".
@@ -175,7 +175,7 @@ def silent_track(
 ) -> Track:
     """Track of a method that receives and sends nothing."""
     none = np.zeros((recording.runs, len(columns)))
-    took = time.perf_counter() - began
+    took = clock() - began
     return Track(recording.t, tuple(columns), x, cov, none, none, took, notes=notes, ids=recording.ids, **more)
 
 

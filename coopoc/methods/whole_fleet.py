@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable
 from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, NamedTuple
 import numpy as np
 
 from ..arrays import Bools, Floats, Ints
+from ..kernels.compiling.waiting import clock
 from ..world.exchange import Exchange, exchange
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import NO_MESSAGE, Message
@@ -79,7 +79,7 @@ def fleet_track(
     """
     from ..kernels.fleets.graph import fuse_delayed, latest_available
 
-    began = time.perf_counter()
+    began = clock()
     columns = check_recording(recording).columns(egos)
     model = resolve(noise_model, recording)
     met = centre(recording, method.message) if central else exchange(recording, method.message)
@@ -107,7 +107,7 @@ def fleet_track(
         cov.reshape(*shape, 3, 3),
         met.received_bytes[:, columns],
         met.sent_bytes[:, columns],
-        time.perf_counter() - began,
+        clock() - began,
         notes=model.notes + answer.notes + contradicted(x, recording, columns),
         ids=recording.ids,
     )

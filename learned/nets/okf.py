@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,6 +12,7 @@ from torch import Tensor, nn
 
 from coopoc.arrays import Floats, checked, seed_of
 from coopoc.errors import InputError
+from coopoc.kernels.compiling.waiting import clock
 from coopoc.kernels.motion import MotionNoise
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import solo_filter, solo_track
@@ -79,7 +79,7 @@ class OptimisedKF(Alone):
 
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Estimates and covariances of the egos."""
-        began, columns = time.perf_counter(), check_recording(recording).columns(egos)
+        began, columns = clock(), check_recording(recording).columns(egos)
         fixes = FixNoise(np.square(self.gnss_std))
         x, variance, _ = solo_filter(recording, columns, self._motion(0.0), fixes, self.x0)
         return solo_track(recording, columns, x, variance, began)

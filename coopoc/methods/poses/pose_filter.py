@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
@@ -11,6 +10,7 @@ import numpy as np
 
 from ...arrays import Bools, Floats, Ints, checked, number
 from ...errors import InputError
+from ...kernels.compiling.waiting import clock
 from ...short_repr import short_repr
 from ...world.inbox import inbox
 from ...world.links import wrap
@@ -120,7 +120,7 @@ class PoseFilter:
             InputError: a recording in the world frame, an ego that is unknown, absent at times or a landmark, or one
                 whose first pose is not known.
         """
-        began, recording = time.perf_counter(), check_recording(recording, body=True)
+        began, recording = clock(), check_recording(recording, body=True)
         columns, links, notes = pose_egos(recording, egos), recording.links, tuple[str, ...]()
         received, sent = moved = np.zeros((2, recording.runs, len(columns)))
         if self.unit == "solo":
@@ -151,7 +151,7 @@ class PoseFilter:
             cov[..., :3, :3],
             received,
             sent,
-            time.perf_counter() - began,
+            clock() - began,
             notes=notes,
             heading=wrap(x[..., 3]),
             heading_covariance=cov[..., 3, :4],
