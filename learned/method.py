@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +11,7 @@ from torch import Tensor
 
 from coopoc.arrays import Floats
 from coopoc.errors import InputError, shown
+from coopoc.kernels.compiling.waiting import clock
 from coopoc.methods.stream import Stream
 from coopoc.methods.track import Alone, Track, check_options, lost, silent_track
 from coopoc.short_repr import short_repr
@@ -70,7 +70,7 @@ class LearnedGain(Alone):
 
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Estimates of the egos, all runs at once; `notes` count the runs that diverged from the fixes."""
-        began, columns = time.perf_counter(), check_recording(recording).columns(egos)
+        began, columns = clock(), check_recording(recording).columns(egos)
         x0, origin = self._x0(recording, columns), recording.gnss[:, :1, columns]
         with one_core(), torch.inference_mode():
             moved = self.model(*self._lanes(recording, columns), recording.dt).numpy().astype(np.float64)

@@ -116,7 +116,7 @@ def test_the_baseline_names_rows_that_the_benchmarks_have(load: Any, monkeypatch
     baseline = json.loads((FOLDER / "baseline.json").read_text())
     growth = load("growth")
     found = {f"growth: {name}, {count} vehicles" for name in growth.METHOD_NAMES for count in growth.FLEETS}
-    found |= {"growth: import coopoc"}
+    found |= {"growth: import coopoc", *(f"compile: compiled: {name}, first answer" for name in load("compile").GATED)}
     for module in ("networked", "online_methods"):
         found |= {f"{module}: {name}, {word}" for name in load(module).JOBS for word in ("compiled",)}
     for name in ("gtsam", "casadi", "osqp", "cvxpy", "filterpy"):
