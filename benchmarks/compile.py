@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import itertools
 import json
 import os
 import pkgutil
@@ -204,6 +205,10 @@ def build(out: Path) -> None:
 
 def compile_all(folder: Path) -> None:
     """Compile every kernel in this process and keep the machine code."""
+    from numba.np.ufunc import array_exprs
+
+    names: Any = array_exprs  # numba names an expression of arrays by its address, which differs from run to run
+    names.hash = lambda expression, count=itertools.count(): next(count)
     for kernel in run_all():
         if not any(folder.glob(f"*/{kernel._cache.name}.*.nbc")):
             sys.exit(f"nothing is kept of {kernel._cache.name}")
