@@ -19,7 +19,7 @@ from coopoc.arrays import Floats, number
 from coopoc.errors import InputError
 from coopoc.evaluate.metrics import nees, rt_le
 from coopoc.evaluate.statistics import mean_interval
-from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
+from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
 from coopoc.study.cell import Cell
@@ -41,20 +41,17 @@ WORSE = 1.1
 """Ratio of errors from which on a method is worse."""
 BAND = special.chdtri(3, [0.975, 0.025])
 """In which 95 % of the NEES of a consistent filter are, of three degrees of freedom."""
+EXACT = 1e-9
+"""Least ratio that counts in a geometric mean."""
 WORST = 10
 NONE = "nothing wrong"
 
 
 @lru_cache
 def _compiled(name: str) -> Method:
-    one, first = named_method(name), world(0, everyone=_whole(name))
+    one, first = named_method(name), world(0, everyone=needs_whole_fleet(name))
     one(first.recording.between(0, 3), list(first.egos))
     return one
-
-
-def _whole(name: str) -> bool:
-    """Whether a method needs what all vehicles measure."""
-    return name in WHOLE_FLEET or needs_whole_fleet(name)
 
 
 def world_row(name: str, split: Split, given: Params) -> list[Row]:
@@ -68,14 +65,14 @@ def world_row(name: str, split: Split, given: Params) -> list[Row]:
     Raises:
         InputError: estimates that are not finite.
     """
-    drawn = world(given["seed"], split, everyone=_whole(name))
+    drawn = world(given["seed"], split, everyone=needs_whole_fleet(name))
     egos = list(drawn.egos)
     tracks = {each: _compiled(each)(drawn.recording, egos) for each in {name: "", JOINT: "", ALONE: ""}}
     level = {each: float(rt_le(track, drawn.fleet).mean()) for each, track in tracks.items()}
     if not np.isfinite(level[name]):
         raise InputError("estimates", level[name], "must be finite", "Estimate every ego at every step.")
     track = tracks[name]
-    row: Row = {"kinds": "; ".join(drawn.kinds), "rt_le_m": level[name]}
+    row: Row = {"kinds": "; ".join(drawn.kinds), "noted": float(bool(track.notes)), "rt_le_m": level[name]}
     row |= {"joint_m": level[JOINT], "alone_m": level[ALONE], "nees_inside": np.nan, "nees_median": np.nan}
     if track.covariance is not None:
         each = nees(track, drawn.fleet, method=name)
@@ -163,7 +160,7 @@ def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", job
             continue
         reason = outcome.reason.partition("\n")[0][:200]
         print(f"coopoc: failed: world {at}: {reason}", file=sys.stderr)
-        blank = dict.fromkeys(("rt_le_m", "joint_m", "alone_m", "nees_inside", "nees_median"), np.nan)
+        blank = dict.fromkeys(("rt_le_m", "joint_m", "alone_m", "nees_inside", "nees_median"), np.nan) | {"noted": 1.0}
         kinds = "; ".join(world(at, split).kinds)
         rows.append({"seed": at, "kinds": kinds, **blank, "microseconds_per_step": np.nan, "failed": reason})
     rows.sort(key=lambda row: row["seed"])
@@ -177,7 +174,7 @@ def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", job
         "by_kind": {kind: summary(_only(found, kind)) for kind in _kinds(columns)},
         "worst": _worst(name, split, found),
         "failed": failed,
-        "worlds": columns,
+        "worlds": {key: values for key, values in columns.items() if key not in ("kinds", "microseconds_per_step")},
     }
 
 
@@ -228,9 +225,12 @@ def summary(found: Mapping[str, Any]) -> dict[str, Any]:
     made: dict[str, Any] = {"worlds": len(sound), "failed": int((~sound).sum())}
     made["worse_than_alone"] = _interval(100.0 * (found["over_alone"] > WORSE))
     made["worse_than_better"] = _interval(100.0 * (found["over_better"] > WORSE))
+    made["worse_unnoted"] = _interval(100.0 * ((found["over_better"] > WORSE) & (found["noted"] == 0.0)))
     for key in ("over_joint", "over_better"):
         if sound.any():
-            made[key] = [_short(float(np.exp(value))) for value in _interval(np.log(found[key][sound]))]
+            made[key] = [
+                _short(float(np.exp(value))) for value in _interval(np.log(np.maximum(found[key][sound], EXACT)))
+            ]
     made["percentile_95"] = _short(float(np.quantile(found["over_better"], 0.95, method="higher")))
     if np.isfinite(found["nees_inside"]).any():
         made["nees_inside"] = _interval(found["nees_inside"][np.isfinite(found["nees_inside"])])
@@ -296,7 +296,8 @@ def _shown(head: str, name: str, found: Params) -> Row:
         head: name,
         "worlds": f"{found['worlds']}" + f" ({found['failed']} failed)" * (found["failed"] > 0),
         "worse than alone [%]": _level(found["worse_than_alone"]),
-        "worse than both [%]": _level(found["worse_than_better"]),
+        "worse than the better [%]": _level(found["worse_than_better"]),
+        "without a note [%]": _level(found["worse_unnoted"]),
         "over joint": _level(found.get("over_joint")),
         "over the better": _level(found.get("over_better")),
         "95th percentile": _of(found["percentile_95"]),
