@@ -268,7 +268,8 @@ def card_text(card: Params) -> str:
 
 def overview(cards: Sequence[Params]) -> str:
     """Markdown table of cards, least share of worlds that are worse than the better of both first."""
-    return _table([_shown("method", card["method"], card["summary"]) for card in sorted(cards, key=_order)])
+    rows = [_shown("method", card["method"], card["summary"]) for card in sorted(cards, key=_order)]
+    return _table(rows, drop=("over the better", "us/step"))
 
 
 def _order(card: Params) -> tuple[float, float]:

@@ -275,3 +275,12 @@ def test_nees_and_ratios_are_as_by_hand() -> None:
     inside = ((square > 0.2158) & (square < 9.3484)).mean()
     assert card["summary"]["nees_inside"][0] == pytest.approx(inside, abs=1e-3)
     assert math.isclose(card["summary"]["nees_median"], np.median(square), rel_tol=1e-4)
+
+
+def test_the_page_shows_the_committed_cards() -> None:
+    """`coopoc benchmark --table --out benchmarks/cards` prints the table."""
+    root = Path(__file__).resolve().parents[1]
+    cards = [json.loads(file.read_text()) for file in (root / "benchmarks" / "cards" / "worlds").glob("*.json")]
+    assert worlds_card.overview(cards) in (root / "docs" / "benchmark.md").read_text()
+    for card in cards:
+        assert (card["split"], card["worlds"]["seed"]) == ("test", [*range(200)])
