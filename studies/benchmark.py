@@ -27,8 +27,9 @@ from coopoc.plugins import find, names
 from coopoc.study.numbers import three
 from coopoc.study.study import Params, Row
 
+from .convoys import CONVOYS, convoy_row
 from .lineup import named_method, own
-from .roads import road_row, roads
+from .roads import ROADS, road_row, roads
 from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, Task, bound, graph_row, pose_row, recording, rounded
 from .worlds_card import card_file, card_head, overview, run_worlds
 
@@ -82,7 +83,7 @@ def benchmark(
     if seed is not None:
         drawn = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number will do.")
         known = {name: replace(task, seed=drawn) for name, task in known.items()}
-    real = [*BEST, *(task.name for task in LOGGED), *roads(data)]
+    real = [*BEST, *(task.name for task in LOGGED), *roads(data), *CONVOYS]
     for name in tasks:
         if name not in (*known, *real):
             raise unknown("tasks", name, [*known, *real], "Leave it out for all.")
@@ -152,13 +153,14 @@ def tried(name: str, task: Task) -> Row:
 
 
 def measurable(name: str, data: Path | None) -> list[str]:
-    """The tasks of real measurements for a name: graphs for a backend, logs for a pose filter, roads for a solo method;
-    of "mine.py:NAME" logs, or roads if it says `roads = True`."""
+    """The tasks of real measurements for a name: graphs for a backend, logs for a pose filter, roads for a solo method,
+    convoys for any other; of "mine.py:NAME" logs, or roads if it says `roads = True`."""
     if name in names("coopoc.backends"):
         return [*BEST]
     if name in POSES or (in_file(name) and not _on_roads(name)):
         return [task.name for task in LOGGED]
-    return [] if named_method(name).cooperative else [*roads(data)]
+    found = [] if named_method(name).cooperative else [*roads(data)]
+    return found + [*CONVOYS] * (roads(data) is ROADS)
 
 
 def measured(name: str, data: Path | None, tasks: Sequence[str] | None = None) -> list[Row]:
@@ -170,6 +172,8 @@ def measured(name: str, data: Path | None, tasks: Sequence[str] | None = None) -
             made: Callable[[], Row] = partial(graph_row, data, task, name)
         elif task in logged and task not in roads(data):
             made = partial(pose_row, logged[task], data, own(name) if in_file(name) else name)
+        elif task in CONVOYS:
+            made = partial(convoy_row, task, data, named_method(name))
         else:
             made = partial(road_row, task, data, named_method(name))
         rows.append(_row(task, made))
