@@ -99,7 +99,7 @@ def run_worlds(
     Raises:
         InputError: no method, an unknown one, less than one world or process.
     """
-    number("worlds", count, 1, 2**20, kind=int, allowed=">= 1", hint="200 are what cards are made of.")
+    number("worlds", count, 1, 2**20, kind=int, allowed=">= 1", hint="Cards that are submitted have 1000.")
     number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1", hint="Give the number of worker processes.")
     first = number("seed", seed or 0, 0, 2**29, kind=int, allowed="in 0..2^29", hint="Count worlds from 0.")
     if not methods:
@@ -174,7 +174,7 @@ def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", job
         "by_kind": {kind: summary(_only(found, kind)) for kind in _kinds(columns)},
         "worst": _worst(name, split, found),
         "failed": failed,
-        "worlds": {key: values for key, values in columns.items() if key not in ("kinds", "microseconds_per_step")},
+        "worlds": {key: columns[key] for key in ("seed", "rt_le_m", "joint_m", "alone_m")},
     }
 
 

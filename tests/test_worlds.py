@@ -283,4 +283,4 @@ def test_the_page_shows_the_committed_cards() -> None:
     cards = [json.loads(file.read_text()) for file in (root / "benchmarks" / "cards" / "worlds").glob("*.json")]
     assert worlds_card.overview(cards) in (root / "docs" / "benchmark.md").read_text()
     for card in cards:
-        assert (card["split"], card["worlds"]["seed"]) == ("test", [*range(200)])
+        assert (card["split"], card["worlds"]["seed"]) == ("test", [*range(1000)])
