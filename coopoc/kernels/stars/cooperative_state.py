@@ -235,7 +235,7 @@ def copy_filter(source: Filter, target: Filter) -> None:
             target.hits[k, c] = source.hits[k, c]
     for j in range(len(source.slot)):
         target.slot[j] = source.slot[j]
-        target.revoked[j] = source.revoked[j]
+        target.revoked[j, 0], target.revoked[j, 1] = source.revoked[j, 0], source.revoked[j, 1]
     for i in range(len(source.slot) * STATUS // LANES):
         put(target.status, i, take(source.status, i))
 
