@@ -3,8 +3,8 @@
 from coopoc.errors import MissingLibraryError
 
 try:
-    import safetensors as safetensors
-    import torch as torch
+    import torch as torch  # the larger one is named first
+    import safetensors as safetensors  # isort: skip
 except ModuleNotFoundError as error:
     if error.name not in ("safetensors", "torch"):
         raise

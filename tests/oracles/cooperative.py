@@ -147,7 +147,7 @@ class Oracle:
         }
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.guards.trust else {self.ego}
-        levels = {"level": np.zeros(5), "learned": np.zeros(5), "information": np.zeros(5), "made": np.zeros(3)}
+        levels = {"level": np.zeros(5), "learned": np.zeros(5), "information": np.zeros(5), "made": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
     def loop(self) -> tuple[Floats, Floats, list[Floats]]:
@@ -181,19 +181,19 @@ class Oracle:
         velocity, q = self.seen.velocity[self.run, s, j], math.exp(self.state["level"][4]) * self.q[s, j]
         return Sent(s, self.position[s, j], self.variance[s, j], self.odometer[s, j], velocity, q)
 
-    def learn(self, kind: int, q: float, share: float) -> None:
-        """What an innovation shows of a level: derivative and information of its log-likelihood."""
-        self.state["learned"][kind] += 0.5 * share * (min(q, SUDDEN) - USUAL)
-        self.state["information"][kind] += 0.5 * share**2
+    def learn(self, kind: int, more: float, share: float, numbers: int = 1) -> None:
+        """What innovations show of a level: derivative and information of their log-likelihood."""
+        self.state["learned"][kind] += 0.5 * numbers * share * more
+        self.state["information"][kind] += 0.5 * numbers * share**2
 
     def own_variance(self) -> Any:
         at = self.state["belief"].at(("x", self.ego))
-        return np.diag(self.state["belief"].p)[at].copy()
+        return np.diag(self.state["belief"].p)[at].sum()
 
     def corrected(self) -> None:
         """What the level of motion makes of the ego's variance, after an update."""
         s, now = self.state, self.own_variance()
-        s["made"] = np.minimum(s["made"] * (now / self.before) ** 2, now)
+        s["made"] = min(s["made"] * (now / self.before) ** 2, now)
         self.before = now
 
     def step(self, t: int) -> None:
@@ -234,7 +234,7 @@ class Oracle:
         u, q = self.steady(t, self.ego, self.seen.velocity[self.run, t, self.ego], louder * self.q[t, self.ego])
         if t > s["joined"][self.ego]:
             self.predict(dt * u, q)
-        s["made"] = s["made"] + q
+        s["made"] = s["made"] + q.sum()
         self.before = self.own_variance()
         for j in s["members"]:
             messages[j] = self.predict_member(t, j, messages[j])
@@ -274,9 +274,10 @@ class Oracle:
         rows = [(self.fix_terms(self.ego), fix[c], louder * self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
         if self.ego not in s["vague"]:
             _, gap, cov, r = self.mahalanobis(s["belief"], rows)
-            for c, total in enumerate(np.diag(cov) + r):
-                self.learn(3, gap[c] ** 2 / total, r[c] / total)
-                self.learn(4, gap[c] ** 2 / total, s["made"][c] / total)
+            total = np.trace(cov) + r.sum()
+            more = min(gap @ gap / total, SUDDEN) - 1.0
+            self.learn(3, more, r.sum() / total, 3)
+            self.learn(4, more, s["made"] / total, 3)
         q = self.use_fix(t, self.ego, rows, True)
         s["hits"]["fix"] = s["hits"]["fix"] + 1 if g.fix_gate and q > g.fix_gate else 0
         self.corrected()
@@ -541,8 +542,8 @@ class Oracle:
             q = b.update(h[c], z[c], r[c], 0.0 if vague else g.gate)
             if not vague:
                 hits[c] = hits[c] + 1 if g.gate and q > g.gate else 0
-                self.learn(c, q, r[c] / total[c])
-                self.learn(4, q, rows[c] ** 2 @ s["made"] / total[c])
+                self.learn(c, min(q, SUDDEN) - USUAL, r[c] / total[c])
+                self.learn(4, min(q, SUDDEN) - USUAL, rows[c] @ rows[c] * s["made"] / 3 / total[c])
         s["vague"].discard(j)
 
     def receive(self, t: int, j: int, message: Sent | None) -> None:

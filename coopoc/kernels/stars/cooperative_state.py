@@ -165,7 +165,7 @@ class Filter(NamedTuple):
         clock: (2,) s, now, and since the last step.
         revoked: (vehicles, 2) how often a vehicle lost trust, and when it last did s.
         level: (3, 5) by kind of number: logarithm of the level, sum of its derivatives in this step, and information.
-        made: (2, 3) of the ego's variance m^2 by axis: what the level of motion makes, and the whole then.
+        made: (2,) of the ego's variance m^2, axes together: what the level of motion makes, and the whole then.
     """
 
     g: Gaussian
@@ -214,7 +214,7 @@ def new_filter(slots: int, vehicles: int) -> Filter:
         np.zeros(2),
         np.zeros((vehicles, 2)),
         np.zeros((3, KINDS_OF_NUMBERS)),
-        np.zeros((2, 3)),
+        np.zeros(2),
     )
 
 
@@ -226,8 +226,7 @@ def copy_filter(source: Filter, target: Filter) -> None:
     for kind in range(KINDS_OF_NUMBERS):
         for i in range(3):
             target.level[i, kind] = source.level[i, kind]
-    for c in range(3):
-        target.made[0, c], target.made[1, c] = source.made[0, c], source.made[1, c]
+    target.made[0], target.made[1] = source.made[0], source.made[1]
     for k in range(len(source.vehicle)):
         target.vehicle[k], target.row[k], target.joined[k] = source.vehicle[k], source.row[k], source.joined[k]
         target.serves[k], target.sent[k], target.vague[k] = source.serves[k], source.sent[k], source.vague[k]

@@ -19,7 +19,7 @@ from .cooperative_state import FIXES, KINDS_OF_NUMBERS, MOTION_VARIANCE, MOTIONS
 from .gaussian import PLACE
 
 SUDDEN, USUAL = 5.0, 0.95
-"""Most of a squared normalised innovation that counts, and the mean of what counts where all is as assumed."""
+"""Most of a squared normalised innovation that counts, and the mean of what counts of one number that is as assumed."""
 QUIETEST, LOUDEST, FASTEST = -2.0, 3.5, 0.5
 """Least and most logarithm of a level, and the most that it changes in a step."""
 PRIOR = 10.0
@@ -38,50 +38,56 @@ def louder(f: Filter, own: Floats, rows: Floats, count: int) -> None:
 
 @part
 def moved(f: Filter, own: Floats) -> None:
-    """After the ego's prediction: D + q."""
-    first = 3 * f.g.block[0, PLACE]
-    for c in range(3):
-        f.made[0, c] += own[MOTION_VARIANCE + c]
-        f.made[1, c] = f.g.p[first + c, first + c]
+    """After the ego's prediction: D + q, both of the three axes together, so that no axis of the world counts."""
+    f.made[0] += own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
+    f.made[1] = ego_variance(f)
 
 
 @part
 def corrected(f: Filter) -> None:
     """After an update of the ego: D (P+ / P-)^2."""
-    first = 3 * f.g.block[0, PLACE]
-    for c in range(3):
-        p, before = f.g.p[first + c, first + c], f.made[1, c]
-        f.made[0, c] = min(f.made[0, c] * (p / before) ** 2, p) if before > 0.0 else 0.0
-        f.made[1, c] = p
+    p, before = ego_variance(f), f.made[1]
+    f.made[0] = min(f.made[0] * (p / before) ** 2, p) if before > 0.0 else 0.0
+    f.made[1] = p
 
 
 @part
-def learn(f: Filter, kind: int, q: float, share: float) -> None:
-    """Count a squared normalised innovation of which a level makes that share of the variance."""
-    f.level[1, kind] += 0.5 * share * (min(q, SUDDEN) - USUAL)
-    f.level[2, kind] += 0.5 * share * share
+def ego_variance(f: Filter) -> float:
+    """m^2, of the three axes together."""
+    first = 3 * f.g.block[0, PLACE]
+    total: float = f.g.p[first, first] + f.g.p[first + 1, first + 1] + f.g.p[first + 2, first + 2]
+    return total
+
+
+@part
+def learn(f: Filter, kind: int, more: float, share: float, numbers: float) -> None:
+    """Count by how much squared normalised innovations are more than usual, of which a level makes that share."""
+    f.level[1, kind] += 0.5 * numbers * share * more
+    f.level[2, kind] += 0.5 * numbers * share * share
 
 
 @part
 def learn_fix(f: Filter) -> None:
-    """Count the innovations of the ego's fix, axis by axis."""
-    h = f.h
+    """Count the innovation of the ego's fix."""
+    h, square, r, s = f.h, 0.0, 0.0, 0.0
     for c in range(3):
-        s = h.variance[c] + h.cov[4 * c]
-        q = h.gap[c] * h.gap[c] / s
-        learn(f, FIXES, q, h.variance[c] / s)
-        learn(f, MOTIONS, q, f.made[0, c] / s)
+        square += h.gap[c] * h.gap[c]
+        r += h.variance[c]
+        s += h.variance[c] + h.cov[4 * c]
+    more = min(square / s, SUDDEN) - 1.0
+    learn(f, FIXES, more, r / s, 3.0)
+    learn(f, MOTIONS, more, f.made[0] / s, 3.0)
 
 
 @part
 def learn_relative(f: Filter, c: int) -> None:
     """Count the innovation of a component of a relative measurement."""
     h, along = f.h, 0.0
-    s = h.variance[c] + h.cov[4 * c]
+    s, more = h.variance[c] + h.cov[4 * c], min(h.q[c], SUDDEN) - USUAL
     for i in range(3):
-        along += h.weight[3 * c + i] ** 2 * f.made[0, i]
-    learn(f, c, h.q[c], h.variance[c] / s)
-    learn(f, MOTIONS, h.q[c], along / s)
+        along += h.weight[3 * c + i] ** 2 * f.made[0] / 3.0
+    learn(f, c, more, h.variance[c] / s, 1.0)
+    learn(f, MOTIONS, more, along / s, 1.0)
 
 
 @part
