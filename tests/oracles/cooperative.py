@@ -13,6 +13,7 @@ import numpy as np
 
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
+from coopoc.kernels.gate import SLIP
 from coopoc.kernels.stars.cooperative_messages import CLIP
 from coopoc.kernels.stars.cooperative_state import Guards
 from coopoc.kernels.stars.levels import FASTEST, LOUDEST, PRIOR, QUIETEST, SUDDEN, USUAL
@@ -75,10 +76,12 @@ class Belief:
         """One number; its squared normalised innovation."""
         return self.updates(h[None], np.array([z]), np.array([r]), gate)
 
-    def updates(self, h: Floats, z: Floats, r: Floats, gate: float = 0.0, far: float = 100.0) -> float:
+    def updates(
+        self, h: Floats, z: Floats, r: Floats, gate: float = 0.0, far: float = 100.0, square: float | None = None
+    ) -> float:
         """Several numbers with one gate; their squared Mahalanobis distance."""
         gap, s = z - h @ self.x, h @ self.p @ h.T + np.diag(r)
-        q = float(gap @ np.linalg.solve(s, gap))
+        q = float(gap @ np.linalg.solve(s, gap)) if square is None else square
         if gate and q > gate:
             s = s * (q / gate * (far if q > 4 * gate else 1.0))
         gain = np.linalg.solve(s, h @ self.p).T
@@ -306,7 +309,10 @@ class Oracle:
                 self.revoked[j] = [self.revoked.get(j, [0, 0])[0] + 1, t]
             self.doubt(j)
             return self.gone
-        return b.updates(h, z, r, g.fix_gate, 1.0)
+        gap = z - h @ b.x
+        q = min(float(gap @ np.linalg.solve(h @ b.p @ h.T + np.diag(r), gap)), float(gap @ gap) / SLIP)
+        b.updates(h, z, r, g.fix_gate, 1.0, q)
+        return q
 
     def wrong_on_average(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """The clipped mean innovation, beside what another error of the fixes would make of it."""

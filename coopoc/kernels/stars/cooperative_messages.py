@@ -6,6 +6,7 @@ import math
 
 from ...arrays import Floats
 from ..compiling.compile import inside, part
+from ..gate import SLIP
 from .cooperative_state import (
     AGE,
     COUNT,
@@ -57,7 +58,7 @@ CLIP = 12.0
 @inside
 def fix_weight(q: float, gate: float) -> float:
     """Share of its information that a fix keeps: gate / q beyond the gate. One far beyond still counts, for it may be
-    the estimate that is far off."""
+    the estimate that is far off; and however precise fixes are, wheels may slip by a metre."""
     return 1.0 + 0.0 * q if gate == 0.0 or not q > gate else gate / q
 
 
@@ -125,6 +126,7 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
             f.revoked[j, 0], f.revoked[j, 1] = f.revoked[j, 0] + 1.0, f.clock[0]
         doubt(f, model, guards, j)
         return q
+    q = min(q, (h.gap[0] * h.gap[0] + h.gap[1] * h.gap[1] + h.gap[2] * h.gap[2]) / SLIP)
     correct(g, h, fix_weight(q, guards.fix_gate))
     return q
 
