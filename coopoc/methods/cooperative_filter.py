@@ -22,6 +22,17 @@ from .noise_model import NoiseModel, resolve
 from .track import Checked, Track
 
 NOTHING = np.zeros((1, 1, 1, 3))
+FOUND = (
+    "heading_error",
+    "scale_error",
+    "compass_error",
+    "range_offset",
+    "range_level",
+    "azimuth_level",
+    "inclination_level",
+    "fix_level",
+    "motion_level",
+)
 KINDS = ("range", "azimuth", "inclination", "message", "trusted")
 
 
@@ -91,6 +102,7 @@ class CooperativeFilter(Checked):
     noise_model: NoiseModel | str = "nominal"
     robust: bool = True
     guards: Guards = Guards()
+    trial: tuple[float, ...] = (0.0, 0.0, 300.0, -np.inf, 0.0, 0.0)
     name: str = "cooperative-filter"
     cooperative = True
 
@@ -106,7 +118,7 @@ class CooperativeFilter(Checked):
         "range", "azimuth", "inclination" and "message", NaN where there was none, and whether it is "trusted".
         """
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
-        model, guards = model_of(known, self.robust), guards_of(self, known)
+        model, guards = model_of(known, self.robust, self.trial), guards_of(self, known)
         assumed, notes = assumptions(recording, known), list(known.notes)
 
         @cache
@@ -118,8 +130,9 @@ class CooperativeFilter(Checked):
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
             seen = measurements(recording, ego, box)
-            x, cov, neighbours, fixes, weights = run_filter(seen, assumed, sent(), model, guards)
+            x, cov, neighbours, fixes, weights, found = run_filter(seen, assumed, sent(), model, guards)
             extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate(KINDS)}
+            extras |= {name: found[..., i, None] for i, name in enumerate(FOUND)}
             mine = recording.ids[ego]
             notes.extend(rejected(f"fixes, {mine}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
             if model.own + model.common == 0.0 and guards.fix_gate:
@@ -178,7 +191,7 @@ def guards_of(method: CooperativeFilter, noise_model: NoiseModel) -> Guards:
     return guards._replace(lost=guards.lost / 2) if sensors.gnss_drift_std > 0.0 else guards
 
 
-def model_of(noise_model: NoiseModel, robust: bool) -> Model:
+def model_of(noise_model: NoiseModel, robust: bool, trial: tuple[float, ...] = (0, 0, 300.0, -np.inf, 0, 0)) -> Model:
     """The noise model of the kernel; of the textbook filter all errors are white."""
     std, least = relative_noise(noise_model)
     white, time = np.ones(3), 1.0
@@ -190,5 +203,11 @@ def model_of(noise_model: NoiseModel, robust: bool) -> Model:
         time = float(sensors.gnss_drift_time)
         heading, bias = (float(value**2) for value in noise_model.compass)
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
+    more: tuple[Floats, float, float, Floats] = np.zeros(2), 300.0, -np.inf, np.zeros(2)
+    if robust and noise_model.sensors is not None:
+        b, s, lasts, odds, wrong, long = trial
+        off = np.array([bias == 0.0 and wrong > 0, offset == 0.0 and long > 0], float)
+        bias, offset = bias or wrong**2, offset or long**2
+        more = np.array([b * b, s * s], float), lasts, odds, off
     shape = float(least), float(noise_model.exact_relative), FORGOTTEN, ACCELERATION_STD
-    return Model(std, *shape, own, common, time, white, bias, heading, offset, float(robust))
+    return Model(std, *shape, own, common, time, white, bias, heading, offset, float(robust), *more)

@@ -25,6 +25,7 @@ from .cooperative_state import (
     FIX,
     FIX_VARIANCE,
     FIXES,
+    FOUND,
     INCLINATIONS,
     MOTION,
     MOTION_VARIANCE,
@@ -42,10 +43,12 @@ from .cooperative_state import (
     Guards,
     Model,
     Sent,
+    average,
     begin,
     measured_whole,
     new_filter,
     pause,
+    tell,
 )
 from .gaussian import (
     COMPASS,
@@ -68,7 +71,7 @@ from .messages import Assumptions, Measurements, three_of
 @compiled
 def run_filter(
     measurements: Measurements, assumed: Assumptions, sent: Sent, model: Model, guards: Guards
-) -> tuple[Floats, Floats, Floats, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; weights of the ego's fix (R, T), and by link
     (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the neighbour is trusted.
 
@@ -87,6 +90,7 @@ def run_filter(
         most = max(most, measurements.start[t + 1] - measurements.start[t])
     x, cov, fixes = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, steps))
     neighbours, notes = np.empty((runs, links, 3)), np.empty((runs, links, 5))
+    found = np.zeros((runs, steps, FOUND))
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
     for run in range(runs):
         f = new_filter(1 + most, vehicles)
@@ -104,19 +108,21 @@ def run_filter(
             if f.g.vectors[0] == 0:
                 begin(f, model, guards, own, rows, count, measurements.ego)
             step(f, model, guards, own, rows, who, count)
+            average(f, model)
+            tell(f, found[run, t])
             fixes[run, t] = fix_weight(f.q[0, 3], guards.fix_gate)
             for c in range(3):
-                x[run, t, c] = f.g.x[c]
+                x[run, t, c] = f.trial.x[c]
                 for d in range(3):
-                    cov[run, t, c, d] = f.g.p[c, d]
+                    cov[run, t, c, d] = f.trial.p[c, d]
             for i in range(count):
                 k = f.slot[who[i]]
                 for c in range(3):
-                    neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c]
+                    neighbours[run, first + i, c] = f.trial.x[3 * f.g.block[k, PLACE] + c]
                     notes[run, first + i, c] = weight(f.q[k, c], guards.gate)
                 notes[run, first + i, 3] = fix_weight(f.q[k, 3], guards.fix_gate)
                 notes[run, first + i, 4] = f.status[who[i], TRUSTED]
-    return x, cov, neighbours, fixes, notes
+    return x, cov, neighbours, fixes, notes, found
 
 
 @inside
@@ -187,7 +193,9 @@ def step(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, veh
             if k > 0:
                 place(f, rows, k)
             for c in range(3):
-                f.at[k, c] = f.g.x[first + c]
+                if f.joined[k] == f.step[0]:
+                    f.moved[k, c] = f.moved[0, c] if f.step[0] > 0 else 0.0
+                f.at[k, c] = f.g.x[first + c] + f.moved[k, c]
                 f.q[k, c] = math.nan
             f.q[k, 3] = math.nan
     members = nearest_first(f)
@@ -267,7 +275,7 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
         for k in range(len(f.vehicle)):
             if f.vehicle[k] >= 0:
                 for c in range(3):
-                    f.at[k, c] = f.trial.x[3 * g.block[k, PLACE] + c]
+                    f.at[k, c] = f.trial.x[3 * g.block[k, PLACE] + c] + f.moved[k, c]
     for m in range(members):
         weigh(f, model, guards, rows, f.order[m])
 

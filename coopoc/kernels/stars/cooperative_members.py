@@ -7,7 +7,7 @@ import math
 from ...arrays import Floats, Ints
 from ..compiling.compile import inside, part
 from ..dead_reckoning import ROUNDING
-from .cooperative_messages import clone_position
+from .cooperative_messages import clone_position, odometry_term
 from .cooperative_state import (
     AGE,
     DT,
@@ -31,6 +31,9 @@ from .cooperative_state import (
     Model,
     across,
     doubt,
+    drive,
+    fade,
+    insert_turn,
     lost,
     measured_whole,
     start,
@@ -43,6 +46,7 @@ from .gaussian import (
     ERROR,
     KINDS,
     PLACE,
+    TURN,
     VELOCITY,
     expect,
     has,
@@ -109,8 +113,9 @@ def predict(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
     g, first = f.g, 3 * f.g.block[0, PLACE]
     keep = math.exp(-own[DT] / model.time) if model.own + model.common > 0.0 else 1.0
     fades = 1.0 - keep * keep
+    drive(f, 0, (own[MOTION], own[MOTION + 1], own[MOTION + 2]))
+    fade(g, model, 0, own[DT])
     for c in range(3):
-        g.x[first + c] += own[MOTION + c]
         g.p[first + c, first + c] += own[MOTION_VARIANCE + c]
     for k in range(len(f.vehicle)):
         if f.vehicle[k] >= 0 and has(g, k, ERROR):
@@ -160,6 +165,7 @@ def predict_member(f: Filter, model: Model, guards: Guards, rows: Floats, k: int
     A velocity that has served for L s and serves for dt more makes an error of (L + dt)^2 - L^2 times its own variance.
     """
     g, row, dt = f.g, f.row[k], f.clock[1]
+    fade(g, model, k, dt)
     first, age, sent = 3 * g.block[k, PLACE], rows[row, AGE], f.clock[0] - rows[row, AGE]
     if has(g, k, VELOCITY) and 0.0 <= age <= ROUNDING and f.status[f.vehicle[k], USED] > sent - 1.5 * dt:
         remove(g, k, VELOCITY)
@@ -181,8 +187,8 @@ def predict_member(f: Filter, model: Model, guards: Guards, rows: Floats, k: int
         f.serves[k] = 0.0
     often, changed = 1.0 + 2.0 * f.serves[k] / dt, (dt * age * model.acceleration) ** 2
     f.sent[k], f.serves[k] = sent, f.serves[k] + dt
+    drive(f, k, (dt * rows[row, SPEED], dt * rows[row, SPEED + 1], dt * rows[row, SPEED + 2]))
     for c in range(3):
-        g.x[first + c] += dt * rows[row, SPEED + c]
         g.p[first + c, first + c] += often * (rows[row, STEP + c] + changed)
 
 
@@ -209,9 +215,11 @@ def update_velocity(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
     ):
         return
     f.sent[k] = sent
+    way = odometry_term(f, k, 1, (rows[row, SPEED], rows[row, SPEED + 1], rows[row, SPEED + 2]))
     term(h, 0, g.block[k, VELOCITY], 1.0)
+    h.terms[0] = 2 if has(g, k, TURN) else 1
     for c in range(3):
-        expect(h, c, rows[row, SPEED + c], rows[row, STEP + c] / f.clock[1] ** 2 + (guards.acceleration * age) ** 2)
+        expect(h, c, way[c], rows[row, STEP + c] / f.clock[1] ** 2 + (guards.acceleration * age) ** 2)
     update(g, h, guards.fix_gate)
 
 
@@ -232,6 +240,7 @@ def join(f: Filter, model: Model, guards: Guards, rows: Floats, vehicle: int, ro
         g.x[first + c] = g.x[ego + c] + (across(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
     if late(f, guards, rows, k):
         update_velocity(f, guards, rows, k)
+    insert_turn(g, model, k)
     if f.status[vehicle, TRUSTED] == 0.0:
         error = insert(g, k, ERROR, 0.0)
         for c in range(3):

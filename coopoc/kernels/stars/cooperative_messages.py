@@ -24,6 +24,7 @@ from .cooperative_state import (
     Guards,
     Model,
     doubt,
+    turned,
     unused,
 )
 from .gaussian import (
@@ -32,6 +33,7 @@ from .gaussian import (
     COMMON,
     ERROR,
     PLACE,
+    TURN,
     VELOCITY,
     correct,
     distance,
@@ -229,10 +231,31 @@ def use_odometer(f: Filter, guards: Guards, rows: Floats, k: int, back: float, c
     term(h, 0, g.block[k, PLACE], 1.0)
     term(h, 1, g.block[k, VELOCITY], back)
     term(h, 2, g.block[k, CLONE], -1.0)
+    moved = (
+        rows[row, ODOMETER] - f.status[j, LAST + 6],
+        rows[row, ODOMETER + 1] - f.status[j, LAST + 7],
+        rows[row, ODOMETER + 2] - f.status[j, LAST + 8],
+    )
+    way = odometry_term(f, k, 3, moved)
     for c in range(3):
         spent = 0.5 * steps * (rows[row, STEP + c] + f.status[j, LAST + 9 + c])
-        expect(h, c, rows[row, ODOMETER + c] - f.status[j, LAST + 6 + c], spent + changed)
+        expect(h, c, way[c], spent + changed)
     update(g, h, guards.fix_gate)
+
+
+@part
+def odometry_term(f: Filter, k: int, at: int, moved: tuple[float, float, float]) -> tuple[float, float, float]:
+    """Let term `at` be the error of a motion by odometry; what was driven, were there none."""
+    g, h = f.g, f.h
+    way = turned(g, k, moved, h.turn)
+    if not has(g, k, TURN):
+        return way
+    i, w = 3 * g.block[k, TURN], h.turn
+    h.block[at], h.terms[0] = g.block[k, TURN], at + 1
+    for n in range(9):
+        h.weight[9 * at + n] = -w[n]
+    b, s = g.x[i], g.x[i + 1]
+    return way[0] - w[0] * b - w[1] * s, way[1] - w[3] * b - w[4] * s, way[2]
 
 
 @part

@@ -22,14 +22,18 @@ from .gaussian import (
     ERROR,
     KINDS,
     PLACE,
+    TURN,
     Gaussian,
     Rows,
     clear,
     copy_gaussian,
+    copy_moments,
+    has,
     insert,
     new_gaussian,
     new_rows,
     remove,
+    shift,
     widen,
 )
 
@@ -89,7 +93,7 @@ class Guards(NamedTuple):
 
 NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, trust=0.0, forget=0.0, acceleration=0.0)
 RANGES, AZIMUTHS, INCLINATIONS, FIXES, MOTIONS = range(5)
-KINDS_OF_NUMBERS = 5
+KINDS_OF_NUMBERS, FOUND = 5, 9
 """Kinds of numbers that have a level."""
 
 
@@ -124,6 +128,10 @@ class Model(NamedTuple):
         heading: rad^2 of the compass's noise.
         offset: m^2, of what all the ego's ranges are too long by.
         estimates: 1 if messages hold a solo filter's estimate, 0 if they hold a fix.
+        turn: (2,) rad^2 and 1, of the errors of heading and scale of an odometry; zeros for none.
+        lasts: s, their correlation time.
+        odds: logarithm of the prior odds that such an error is not there; -inf where it is known to be.
+        off: (2,) whether the compass's bias and the offset of ranges may not be there, either: 1, else 0.
     """
 
     std: Floats
@@ -139,6 +147,10 @@ class Model(NamedTuple):
     heading: float
     offset: float
     estimates: float
+    turn: Floats
+    lasts: float
+    odds: float
+    off: Floats
 
 
 class Filter(NamedTuple):
@@ -165,6 +177,7 @@ class Filter(NamedTuple):
         clock: (2,) s, now, and since the last step.
         revoked: (vehicles, 2) how often a vehicle lost trust, and when it last did s.
         level: (3, 5) by kind of number: logarithm of the level, sum of its derivatives in this step, and information.
+        moved: (slots, 3) m, what `average` moves each position by.
         made: (2,) of the ego's variance m^2, axes together: what the level of motion makes, and the whole then.
     """
 
@@ -188,6 +201,7 @@ class Filter(NamedTuple):
     revoked: Floats
     level: Floats
     made: Floats
+    moved: Floats
 
 
 @storage
@@ -215,6 +229,7 @@ def new_filter(slots: int, vehicles: int) -> Filter:
         np.zeros((vehicles, 2)),
         np.zeros((3, KINDS_OF_NUMBERS)),
         np.zeros(2),
+        np.zeros((slots, 3)),
     )
 
 
@@ -256,7 +271,123 @@ def begin(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
     if model.bias + model.heading + model.offset > 0.0:
         first = insert(f.g, 0, COMPASS, model.bias)
         f.g.p[first + 2, first + 2] = model.offset
+    insert_turn(f.g, model, 0)
     start(f, model, guards, own, rows, count)
+
+
+@part
+def insert_turn(g: Gaussian, model: Model, k: int) -> None:
+    """Give a member errors of heading and scale of its odometry, where there are any."""
+    if model.turn[0] + model.turn[1] > 0.0:
+        i = insert(g, k, TURN, 0.0)
+        g.p[i, i], g.p[i + 1, i + 1] = model.turn[0], model.turn[1]
+
+
+@part
+def turned(g: Gaussian, k: int, moved: tuple[float, float, float], w: Floats) -> tuple[float, float, float]:
+    """(1 + s) R(b) m, and its derivatives by b and s in w (9,); m itself where odometry does not err."""
+    for i in range(9):
+        w[i] = 0.0
+    if not has(g, k, TURN):
+        return moved
+    i = 3 * g.block[k, TURN]
+    c, s, scale = math.cos(g.x[i]), math.sin(g.x[i]), 1.0 + g.x[i + 1]
+    east, north = c * moved[0] - s * moved[1], s * moved[0] + c * moved[1]
+    w[0], w[3], w[1], w[4] = -scale * north, scale * east, east, north
+    return scale * east, scale * north, moved[2]
+
+
+@part
+def drive(f: Filter, k: int, moved: tuple[float, float, float]) -> None:
+    """Move a member by its odometry."""
+    g = f.g
+    first, w = 3 * g.block[k, PLACE], f.h.turn
+    way = turned(g, k, moved, w)
+    for c in range(3):
+        g.x[first + c] += way[c]
+    if not has(g, k, TURN):
+        return
+    i, n = 3 * g.block[k, TURN], 3 * g.vectors[0]
+    for c in range(2):
+        for j in range(n):
+            g.p[first + c, j] += w[3 * c] * g.p[i, j] + w[3 * c + 1] * g.p[i + 1, j]
+    for j in range(n):
+        for c in range(2):
+            g.p[j, first + c] += w[3 * c] * g.p[j, i] + w[3 * c + 1] * g.p[j, i + 1]
+
+
+@part
+def fade(g: Gaussian, model: Model, k: int, dt: float) -> None:
+    """Errors of odometry decay."""
+    if not has(g, k, TURN):
+        return
+    i, keep = 3 * g.block[k, TURN], math.exp(-dt / model.lasts)
+    shift(g, i, i, keep - 1.0)
+    for c in range(2):
+        g.p[i + c, i + c] += (1.0 - keep * keep) * model.turn[c]
+
+
+@part
+def average(f: Filter, model: Model) -> None:
+    """Put into `trial` the mixture of whether each error that lasts is there or not, by Bayes' rule.
+
+    Of a scalar b ~ N(0, W) with the posterior N(m, p) the odds of b = 0 are those of the prior times
+    sqrt(W / p) exp(-m^2 / 2 p).
+    """
+    g, source = f.trial, f.g
+    copy_moments(source, g)
+    if has(g, 0, COMPASS) and model.odds > -math.inf:
+        i = 3 * g.block[0, COMPASS]
+        if model.off[0] > 0.0:
+            collapse(g, i, model.bias, model.odds)
+        if model.off[1] > 0.0:
+            collapse(g, i + 2, model.offset, model.odds)
+    for k in range(len(f.vehicle)):
+        if f.vehicle[k] >= 0 and has(g, k, TURN) and model.odds > -math.inf:
+            i = 3 * g.block[k, TURN]
+            collapse(g, i, model.turn[0], model.odds)
+            collapse(g, i + 1, model.turn[1], model.odds)
+    for k in range(len(f.vehicle)):
+        if f.vehicle[k] >= 0:
+            for c in range(3):
+                i = 3 * g.block[k, PLACE] + c
+                f.moved[k, c] = g.x[i] - source.x[i]
+
+
+@part
+def tell(f: Filter, out: Floats) -> None:
+    """What the filter has found to be otherwise than assumed, after `average`: errors that last, factors of standard
+    deviations."""
+    g = f.trial
+    if has(g, 0, TURN):
+        i = 3 * g.block[0, TURN]
+        out[0], out[1] = g.x[i], g.x[i + 1]
+    if has(g, 0, COMPASS):
+        i = 3 * g.block[0, COMPASS]
+        out[2], out[3] = g.x[i], g.x[i + 2]
+    for kind in range(KINDS_OF_NUMBERS):
+        out[4 + kind] = math.exp(0.5 * f.level[0, kind])
+
+
+@part
+def collapse(g: Gaussian, i: int, prior: float, odds: float) -> None:
+    """Let the number i be 0 with the probability that it is."""
+    p, m, n = g.p[i, i], g.x[i], 3 * g.vectors[0]
+    if not p > 0.0 or not prior > 0.0:
+        return
+    there = 1.0 / (1.0 + math.exp(min(odds + 0.5 * math.log(prior / p) - 0.5 * m * m / p, 700.0)))
+    mean, change = (there - 1.0) * m / p, (there * p + there * (1.0 - there) * m * m - p) / (p * p)
+    for j in range(n):
+        g.x[j] += mean * g.p[i, j]
+        f = change * g.p[i, j]
+        if j != i:
+            for k in range(n):
+                if k != i:
+                    g.p[j, k] += f * g.p[i, k]
+    share = 1.0 + change * p
+    for j in range(n):
+        g.p[i, j] *= share
+        g.p[j, i] *= share if j != i else 1.0
 
 
 @part

@@ -28,13 +28,13 @@ from ..compiling.small import (
 from ..compiling.vectors import LANES, less, plus, put, take
 from .messages import BLOCK, ROW, block_at, vector_at
 
-PLACE, ERROR, VELOCITY, CLONE, FRESH = range(5)
+PLACE, ERROR, VELOCITY, CLONE, FRESH, TURN = range(6)
 """Kinds of a neighbour's vectors: position m, error of its fixes m, velocity m/s, where it was when it sent its last
-message that was used m, and scratch of `settle`."""
+message that was used m, scratch of `settle`, and (heading rad, scale, nothing) by which its odometry errs."""
 COMMON, COMPASS = 2, 3
 """Of the ego in place of velocity and clone: the error m that all fixes share, and (bias, noise of this step) of its
 compass, rad, with the offset m of its ranges."""
-KINDS, TERMS = 5, 5
+KINDS, TERMS = 6, 6
 ABSENT = -1
 REJECTED = 4.0
 """Times the gate: from there on a number is not only down-weighted."""
@@ -75,6 +75,7 @@ class Rows(NamedTuple):
         gain: (3 size,) out: columns of the square root of what the update takes from P.
         white: (3,) out: whitened innovations.
         square: (3, 3) scratch.
+        turn: (9,) scratch.
     """
 
     z: Floats
@@ -90,6 +91,7 @@ class Rows(NamedTuple):
     gain: Floats
     white: Floats
     square: Floats
+    turn: Floats
 
 
 @storage
@@ -118,6 +120,7 @@ def new_rows(members: int) -> Rows:
         np.zeros(36 * (1 + KINDS * members // 4)),
         np.zeros(3),
         np.zeros((3, 3)),
+        np.zeros(9),
     )
 
 

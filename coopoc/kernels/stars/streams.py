@@ -30,6 +30,7 @@ from .cooperative_state import (
     Filter,
     Guards,
     Model,
+    average,
     begin,
     copy_filter,
     new_filter,
@@ -201,12 +202,13 @@ def stream_step(
             for c in range(3):
                 f.g.x[c] = start[c]
     step(f, model, guards, own, rows, vehicles, len(vehicles))
+    average(f, model)
     for c in range(3):
-        answer[c] = f.g.x[c]
+        answer[c] = f.trial.x[c]
         for d in range(3):
-            answer[3 + 3 * c + d] = f.g.p[c, d]
+            answer[3 + 3 * c + d] = f.trial.p[c, d]
         for i in range(len(vehicles)):
-            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[f.slot[vehicles[i]], PLACE] + c]
+            answer[12 + 3 * i + c] = f.trial.x[3 * f.g.block[f.slot[vehicles[i]], PLACE] + c]
 
 
 @compiled
