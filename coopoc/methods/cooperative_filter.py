@@ -120,11 +120,12 @@ class CooperativeFilter(Checked):
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         model, guards = model_of(known, self.robust, self.trial), guards_of(self, known)
         assumed, notes = assumptions(recording, known), list(known.notes)
+        assumed = assumed._replace(fixes=assumed.fixes * (*self.trial, 1.0, 1.0)[7])
 
         @cache
         def sent() -> Sent:
             if self.robust:
-                return broadcasts(recording, known, columns, guards)
+                return broadcasts(recording, known, columns, guards, (*self.trial, 1.0, 1.0)[7])
             fixes, variance = (np.moveaxis(a, 2, 0).copy() for a in (recording.gnss, assumed.fixes))
             return Sent(fixes, variance, NOTHING)
 
@@ -148,9 +149,10 @@ class CooperativeFilter(Checked):
         return follow_egos(self, recording, egos, run, notes)
 
 
-def broadcasts(recording: Recording, noise_model: NoiseModel, egos: Sequence[int], guards: Guards) -> Sent:
+def broadcasts(recording: Recording, noise_model: NoiseModel, egos: Sequence[int], guards: Guards, scale: float) -> Sent:
     """Messages of the vehicles in the stars of some egos, each filtered alone until it is in none any more."""
     links, assumed, model = recording.links, assumptions(recording, noise_model), model_of(noise_model, robust=False)
+    assumed = assumed._replace(fixes=assumed.fixes * scale)
     x, variance, moved = np.zeros((3, *np.moveaxis(recording.gnss, 2, 0).shape))
     none, nothing = Sent(NOTHING, NOTHING, NOTHING), inbox(recording, egos[0], FIX_AND_VELOCITY)
     seen, here = measurements(recording, egos[0], nothing), np.isin(links.observer, egos)
@@ -203,11 +205,11 @@ def model_of(noise_model: NoiseModel, robust: bool, trial: tuple[float, ...] = (
         time = float(sensors.gnss_drift_time)
         heading, bias = (float(value**2) for value in noise_model.compass)
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
-    more: tuple[Floats, float, float, Floats] = np.zeros(2), 300.0, -np.inf, np.zeros(2)
+    more: tuple[Floats, float, float, Floats, float] = np.zeros(2), 300.0, -np.inf, np.zeros(2), 1.0
     if robust and noise_model.sensors is not None:
-        b, s, lasts, odds, wrong, long = trial
+        b, s, lasts, odds, wrong, long, teach = (*trial, 1.0)[:7]
         off = np.array([bias == 0.0 and wrong > 0, offset == 0.0 and long > 0], float)
         bias, offset = bias or wrong**2, offset or long**2
-        more = np.array([b * b, s * s], float), lasts, odds, off
+        more = np.array([b * b, s * s], float), lasts, odds, off, teach
     shape = float(least), float(noise_model.exact_relative), FORGOTTEN, ACCELERATION_STD
     return Model(std, *shape, own, common, time, white, bias, heading, offset, float(robust), *more)

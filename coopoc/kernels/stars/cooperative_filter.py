@@ -45,6 +45,7 @@ from .cooperative_state import (
     Sent,
     average,
     begin,
+    hold,
     measured_whole,
     new_filter,
     pause,
@@ -292,6 +293,7 @@ def weigh(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None
         return
     innovate(g, h)
     correct(g, h, 1.0)
+    hold(f, 1.0, model.teach)
     for c in range(3):
         if h.used[c]:
             f.q[k, c] = h.q[c]

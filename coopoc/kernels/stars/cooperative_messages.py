@@ -24,6 +24,7 @@ from .cooperative_state import (
     Guards,
     Model,
     doubt,
+    hold,
     turned,
     unused,
 )
@@ -129,7 +130,9 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
         doubt(f, model, guards, j)
         return q
     q = min(q, (h.gap[0] * h.gap[0] + h.gap[1] * h.gap[1] + h.gap[2] * h.gap[2]) / SLIP)
-    correct(g, h, fix_weight(q, guards.fix_gate))
+    share = fix_weight(q, guards.fix_gate)
+    correct(g, h, share)
+    hold(f, share, share)
     return q
 
 

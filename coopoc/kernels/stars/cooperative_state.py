@@ -151,6 +151,7 @@ class Model(NamedTuple):
     lasts: float
     odds: float
     off: Floats
+    teach: float
 
 
 class Filter(NamedTuple):
@@ -314,6 +315,30 @@ def drive(f: Filter, k: int, moved: tuple[float, float, float]) -> None:
     for j in range(n):
         for c in range(2):
             g.p[j, first + c] += w[3 * c] * g.p[j, i] + w[3 * c + 1] * g.p[j, i + 1]
+
+
+@part
+def hold(f: Filter, share: float, learned: float) -> None:
+    """After an update by `correct`: errors of odometry have learned that part of it only, as with a gain of that part.
+
+    P' = P - K S K^T + (1 - learned)^2 K_o S K_o^T in the block of these errors o.
+    """
+    g, h, wide = f.g, f.h, len(f.g.x)
+    if learned >= 1.0:
+        return
+    less = (1.0 - learned) ** 2 * share
+    for a in range(len(f.vehicle)):
+        if f.vehicle[a] < 0 or not has(g, a, TURN):
+            continue
+        for i in range(3 * g.block[a, TURN], 3 * g.block[a, TURN] + 2):
+            for c in range(3):
+                g.x[i] -= (1.0 - learned) * share * h.gain[c * wide + i] * h.white[c]
+            for b in range(len(f.vehicle)):
+                if f.vehicle[b] < 0 or not has(g, b, TURN):
+                    continue
+                for j in range(3 * g.block[b, TURN], 3 * g.block[b, TURN] + 2):
+                    for c in range(3):
+                        g.p[i, j] += less * h.gain[c * wide + i] * h.gain[c * wide + j]
 
 
 @part
