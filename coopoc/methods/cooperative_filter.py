@@ -55,6 +55,10 @@ class Broadcast(NamedTuple):
 BROADCAST = Message("estimate, odometer and velocity", 3 * len(Broadcast._fields) + 2)
 
 
+def full(t: tuple[float, ...]) -> tuple[float, ...]:
+    return (*t, *(0.0, 0.0, 300.0, -np.inf, 0.0, 0.0, 1.0, 1.0, 0.0, 3.0, 300.0, 1.0)[len(t) :])
+
+
 @dataclass(frozen=True, eq=False)
 class CooperativeFilter(Checked):
     r"""Kalman filter of the star {ego} + neighbours that expects wrong numbers: one method for every condition.
@@ -120,12 +124,12 @@ class CooperativeFilter(Checked):
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         model, guards = model_of(known, self.robust, self.trial), guards_of(self, known)
         assumed, notes = assumptions(recording, known), list(known.notes)
-        assumed = assumed._replace(fixes=assumed.fixes * (*self.trial, 1.0, 1.0)[7])
+        assumed = assumed._replace(fixes=assumed.fixes * full(self.trial)[7])
 
         @cache
         def sent() -> Sent:
             if self.robust:
-                return broadcasts(recording, known, columns, guards, (*self.trial, 1.0, 1.0)[7])
+                return broadcasts(recording, known, columns, guards, full(self.trial)[7])
             fixes, variance = (np.moveaxis(a, 2, 0).copy() for a in (recording.gnss, assumed.fixes))
             return Sent(fixes, variance, NOTHING)
 
@@ -205,11 +209,11 @@ def model_of(noise_model: NoiseModel, robust: bool, trial: tuple[float, ...] = (
         time = float(sensors.gnss_drift_time)
         heading, bias = (float(value**2) for value in noise_model.compass)
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
-    more: tuple[Floats, float, float, Floats, float] = np.zeros(2), 300.0, -np.inf, np.zeros(2), 1.0
+    more: tuple[Floats, float, float, Floats, float, float, float, float, float] = np.zeros(2), 300.0, -np.inf, np.zeros(2), 1.0, 0.0, 3.0, 300.0, 1.0
     if robust and noise_model.sensors is not None:
-        b, s, lasts, odds, wrong, long, teach = (*trial, 1.0)[:7]
+        b, s, lasts, odds, wrong, long, teach = full(trial)[:7]
         off = np.array([bias == 0.0 and wrong > 0, offset == 0.0 and long > 0], float)
         bias, offset = bias or wrong**2, offset or long**2
-        more = np.array([b * b, s * s], float), lasts, odds, off, teach
+        more = np.array([b * b, s * s], float), lasts, odds, off, teach, *full(trial)[-4:]
     shape = float(least), float(noise_model.exact_relative), FORGOTTEN, ACCELERATION_STD
     return Model(std, *shape, own, common, time, white, bias, heading, offset, float(robust), *more)

@@ -45,10 +45,12 @@ from .cooperative_state import (
     Sent,
     average,
     begin,
+    copy_filter,
     hold,
     measured_whole,
     new_filter,
     pause,
+    score,
     tell,
 )
 from .gaussian import (
@@ -95,6 +97,8 @@ def run_filter(
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
     for run in range(runs):
         f = new_filter(1 + most, vehicles)
+        before, first_one = new_filter(1 + most, vehicles), new_filter(1 + most, vehicles)
+        own_copy, rows_copy = own.copy(), rows.copy()
         for t in range(steps):
             first = measurements.start[t]
             count = measurements.start[t + 1] - first
@@ -108,7 +112,7 @@ def run_filter(
                 continue
             if f.g.vectors[0] == 0:
                 begin(f, model, guards, own, rows, count, measurements.ego)
-            step(f, model, guards, own, rows, who, count)
+            attempts(f, before, first_one, own_copy, rows_copy, model, guards, own, rows, who, count)
             average(f, model)
             tell(f, found[run, t])
             fixes[run, t] = fix_weight(f.q[0, 3], guards.fix_gate)
@@ -158,6 +162,59 @@ def gather_neighbour(
     for c in range(3):
         rows[i, SOLO + c], rows[i, SOLO_VARIANCE + c], rows[i, ODOMETER + c] = x[c], p[c], s[c]
         rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c] + more[c], fix[c]
+
+
+@inside
+def attempts(
+    f: Filter,
+    before: Filter,
+    first: Filter,
+    own_copy: Floats,
+    rows_copy: Floats,
+    model: Model,
+    guards: Guards,
+    own: Floats,
+    rows: Floats,
+    vehicles: Ints,
+    count: int,
+) -> None:
+    """A step, and where its numbers surprise the same step of an ego that slips: the likelier one."""
+    speed, dt = 0.0, own[DT]
+    for c in range(3):
+        speed += (own[MOTION + c] / dt) ** 2
+    f.slip[1] = max(math.sqrt(speed), f.slip[1] * math.exp(-dt / 10.0))
+    likely, was = 0.0, f.slip[0]
+    if model.slip > 0.0:
+        copy_filter(f, before)
+        for i in range(len(own)):
+            own_copy[i] = own[i]
+        for i in range(count):
+            for j in range(WIDTH):
+                rows_copy[i, j] = rows[i, j]
+    for attempt in range(2):
+        f.slip[2], f.slip[3], f.slip[4], f.slip[5] = attempt, 0.0, 0.0, 0.0
+        step(f, model, guards, own, rows, vehicles, count)
+        if model.slip == 0.0:
+            return
+        if attempt == 0:
+            likely = f.slip[3]
+            n, more = f.slip[4], f.slip[5]
+            if was == 0.0 and more < n + model.slip_surprise * math.sqrt(2.0 * n):
+                return
+            copy_filter(f, first)
+            copy_filter(before, f)
+            for i in range(len(own)):
+                own[i] = own_copy[i]
+            for i in range(count):
+                for j in range(WIDTH):
+                    rows[i, j] = rows_copy[i, j]
+    stays = math.exp(-dt / model.slip_lasts)
+    chance = stays if was > 0.0 else dt / model.slip_rare
+    if f.slip[3] - likely + math.log(chance / (1.0 - chance)) > 0.0:
+        f.slip[0] = 1.0
+    else:
+        copy_filter(first, f)
+        f.slip[0] = 0.0
 
 
 @inside
@@ -292,6 +349,7 @@ def weigh(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None
         f.vague[k] = f.q[k, 0] = f.q[k, 1] = f.q[k, 2] = 0.0
         return
     innovate(g, h)
+    score(f, h, 9.0)
     correct(g, h, 1.0)
     hold(f, 1.0, model.teach)
     for c in range(3):

@@ -117,6 +117,8 @@ def predict(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
     fade(g, model, 0, own[DT])
     for c in range(3):
         g.p[first + c, first + c] += own[MOTION_VARIANCE + c]
+        if f.slip[2] > 0.0:
+            g.p[first + c, first + c] += (model.slip * f.slip[1] * own[DT]) ** 2
     for k in range(len(f.vehicle)):
         if f.vehicle[k] >= 0 and has(g, k, ERROR):
             i, trusted = 3 * g.block[k, ERROR], f.status[f.vehicle[k], TRUSTED] > 0.0
@@ -230,6 +232,7 @@ def join(f: Filter, model: Model, guards: Guards, rows: Floats, vehicle: int, ro
     while f.vehicle[k] >= 0:
         k += 1
     f.vehicle[k], f.slot[vehicle], f.row[k] = vehicle, k, row
+    f.locked[k] = 0.0
     f.joined[k], f.serves[k], f.vague[k] = f.step[0], f.clock[1], model.flat
     f.sent[k] = f.clock[0] - rows[row, AGE] if rows[row, AGE] >= 0.0 else -math.inf
     for c in range(3):

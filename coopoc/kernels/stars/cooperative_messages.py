@@ -6,7 +6,7 @@ import math
 
 from ...arrays import Floats
 from ..compiling.compile import inside, part
-from ..gate import SLIP
+from ..gate import SLIP, count, inflation
 from .cooperative_state import (
     AGE,
     COUNT,
@@ -25,6 +25,7 @@ from .cooperative_state import (
     Model,
     doubt,
     hold,
+    score,
     turned,
     unused,
 )
@@ -55,6 +56,7 @@ JITTER = 1e-12
 NOTHING_NEW = 1e-9
 """Least weight of new fixes in an estimate."""
 CLIP = 12.0
+SCORED = 9.0
 """Largest squared Mahalanobis distance of an innovation in a mean."""
 
 
@@ -130,7 +132,13 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
         doubt(f, model, guards, j)
         return q
     q = min(q, (h.gap[0] * h.gap[0] + h.gap[1] * h.gap[1] + h.gap[2] * h.gap[2]) / SLIP)
-    share = fix_weight(q, guards.fix_gate)
+    share, own, noise = fix_weight(q, guards.fix_gate), 0.0, 0.0
+    if guards.acceleration != 6.0 and guards.fix_gate > 0.0:
+        for c in range(3):
+            own, noise = own + h.cov[4 * c], noise + h.variance[c]
+        share = 1.0 / inflation(q, guards.fix_gate, f.locked[k])
+        f.locked[k] = count(q, guards.fix_gate, f.locked[k], own / (own + noise))
+    score(f, h, SCORED)
     correct(g, h, share)
     hold(f, share, share)
     return q

@@ -28,12 +28,17 @@ from .gaussian import (
     clear,
     copy_gaussian,
     copy_moments,
+    correct,
+    expect,
     has,
+    innovate,
     insert,
     new_gaussian,
     new_rows,
     remove,
     shift,
+    spread,
+    term,
     widen,
 )
 
@@ -152,6 +157,10 @@ class Model(NamedTuple):
     odds: float
     off: Floats
     teach: float
+    slip: float
+    slip_lasts: float
+    slip_rare: float
+    slip_surprise: float
 
 
 class Filter(NamedTuple):
@@ -179,6 +188,8 @@ class Filter(NamedTuple):
         revoked: (vehicles, 2) how often a vehicle lost trust, and when it last did s.
         level: (3, 5) by kind of number: logarithm of the level, sum of its derivatives in this step, and information.
         moved: (slots, 3) m, what `average` moves each position by.
+        locked: (slots,) `gate.count` of its fixes.
+        slip: (5,) whether the ego slipped, its late speed m/s, whether it is assumed to slip now, logarithm of the likelihood of a step's numbers, and how many.
         made: (2,) of the ego's variance m^2, axes together: what the level of motion makes, and the whole then.
     """
 
@@ -203,6 +214,8 @@ class Filter(NamedTuple):
     level: Floats
     made: Floats
     moved: Floats
+    locked: Floats
+    slip: Floats
 
 
 @storage
@@ -231,6 +244,8 @@ def new_filter(slots: int, vehicles: int) -> Filter:
         np.zeros((3, KINDS_OF_NUMBERS)),
         np.zeros(2),
         np.zeros((slots, 3)),
+        np.zeros(slots),
+        np.zeros(6),
     )
 
 
@@ -243,11 +258,15 @@ def copy_filter(source: Filter, target: Filter) -> None:
         for i in range(3):
             target.level[i, kind] = source.level[i, kind]
     target.made[0], target.made[1] = source.made[0], source.made[1]
+    for c in range(6):
+        target.slip[c] = source.slip[c]
     for k in range(len(source.vehicle)):
         target.vehicle[k], target.row[k], target.joined[k] = source.vehicle[k], source.row[k], source.joined[k]
         target.serves[k], target.sent[k], target.vague[k] = source.serves[k], source.sent[k], source.vague[k]
+        target.locked[k] = source.locked[k]
         for c in range(3):
             target.hits[k, c] = source.hits[k, c]
+            target.moved[k, c] = source.moved[k, c]
     for j in range(len(source.slot)):
         target.slot[j] = source.slot[j]
         target.revoked[j, 0], target.revoked[j, 1] = source.revoked[j, 0], source.revoked[j, 1]
@@ -282,6 +301,17 @@ def insert_turn(g: Gaussian, model: Model, k: int) -> None:
     if model.turn[0] + model.turn[1] > 0.0:
         i = insert(g, k, TURN, 0.0)
         g.p[i, i], g.p[i + 1, i + 1] = model.turn[0], model.turn[1]
+
+
+@part
+def score(f: Filter, h: Rows, gate: float) -> None:
+    """Add the logarithm of the likelihood of the rows of an update; of what is far beyond the gate it falls slowly."""
+    for c in range(3):
+        if h.used[c] and h.schur[c] > 0.0:
+            q = h.q[c]
+            f.slip[3] -= 0.5 * (math.log(h.schur[c]) + (q if q < gate else gate * (1.0 + math.log(q / gate))))
+            f.slip[4] += 1.0
+            f.slip[5] += min(q, gate)
 
 
 @part
@@ -364,14 +394,14 @@ def average(f: Filter, model: Model) -> None:
     if has(g, 0, COMPASS) and model.odds > -math.inf:
         i = 3 * g.block[0, COMPASS]
         if model.off[0] > 0.0:
-            collapse(g, i, model.bias, model.odds)
+            collapse(g, f.h, i // 3, 0, model.bias, model.odds)
         if model.off[1] > 0.0:
-            collapse(g, i + 2, model.offset, model.odds)
+            collapse(g, f.h, i // 3, 2, model.offset, model.odds)
     for k in range(len(f.vehicle)):
         if f.vehicle[k] >= 0 and has(g, k, TURN) and model.odds > -math.inf:
             i = 3 * g.block[k, TURN]
-            collapse(g, i, model.turn[0], model.odds)
-            collapse(g, i + 1, model.turn[1], model.odds)
+            collapse(g, f.h, i // 3, 0, model.turn[0], model.odds)
+            collapse(g, f.h, i // 3, 1, model.turn[1], model.odds)
     for k in range(len(f.vehicle)):
         if f.vehicle[k] >= 0:
             for c in range(3):
@@ -395,24 +425,27 @@ def tell(f: Filter, out: Floats) -> None:
 
 
 @part
-def collapse(g: Gaussian, i: int, prior: float, odds: float) -> None:
-    """Let the number i be 0 with the probability that it is."""
-    p, m, n = g.p[i, i], g.x[i], 3 * g.vectors[0]
-    if not p > 0.0 or not prior > 0.0:
-        return
-    there = 1.0 / (1.0 + math.exp(min(odds + 0.5 * math.log(prior / p) - 0.5 * m * m / p, 700.0)))
-    mean, change = (there - 1.0) * m / p, (there * p + there * (1.0 - there) * m * m - p) / (p * p)
-    for j in range(n):
-        g.x[j] += mean * g.p[i, j]
-        f = change * g.p[i, j]
-        if j != i:
-            for k in range(n):
-                if k != i:
-                    g.p[j, k] += f * g.p[i, k]
-    share = 1.0 + change * p
-    for j in range(n):
-        g.p[i, j] *= share
-        g.p[j, i] *= share if j != i else 1.0
+def collapse(g: Gaussian, h: Rows, block: int, c: int, prior: float, odds: float) -> float:
+    """Let the number c of a vector, or all three if c is -1, be 0 with the probability that it is; that it is not.
+
+    Of b ~ N(0, W) with the posterior N(m, P) the odds of b = 0 are those of the prior times
+    sqrt(|W| / |P|) exp(-m^T P^-1 m / 2); the two are averaged, moments matched.
+    """
+    term(h, 0, block, 1.0)
+    for i in range(3):
+        expect(h, i, 0.0, 0.0)
+        h.used[i] = c < 0 or c == i
+        if h.used[i] and not g.p[3 * block + i, 3 * block + i] > 1e-12:
+            return 0.0
+    q = innovate(g, h)
+    det = 1.0
+    for i in range(3):
+        if h.used[i]:
+            det *= prior / h.schur[i]
+    there = 1.0 / (1.0 + math.exp(min(odds + 0.5 * math.log(det) - 0.5 * q, 700.0)))
+    correct(g, h, 1.0 - there)
+    spread(g, h, there * (1.0 - there))
+    return there
 
 
 @part
@@ -437,6 +470,7 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
     if mine < max(heard, 2) and f.status[ego, TRUSTED] == 0.0 and f.clock[0] <= soon:
         return False
     f.vague[0], f.joined[0], f.hits[0, 0] = model.flat, f.step[0], 0
+    f.locked[0] = 0.0
     clear(g, 0)
     f.status[ego, TRUSTED], f.status[ego, COUNT] = 1.0, 0.0
     remove(g, 0, ERROR)

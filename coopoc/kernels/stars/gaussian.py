@@ -74,6 +74,7 @@ class Rows(NamedTuple):
         cov: (9,) out: H P H^T.
         gain: (3 size,) out: columns of the square root of what the update takes from P.
         white: (3,) out: whitened innovations.
+        schur: (3,) out: their variances.
         square: (3, 3) scratch.
         turn: (9,) scratch.
     """
@@ -90,6 +91,7 @@ class Rows(NamedTuple):
     cov: Floats
     gain: Floats
     white: Floats
+    schur: Floats
     square: Floats
     turn: Floats
 
@@ -118,6 +120,7 @@ def new_rows(members: int) -> Rows:
         np.zeros(3),
         np.zeros(9),
         np.zeros(36 * (1 + KINDS * members // 4)),
+        np.zeros(3),
         np.zeros(3),
         np.zeros((3, 3)),
         np.zeros(9),
@@ -310,6 +313,7 @@ def whitened(h: Rows, c: int, innovation: float, variance: float) -> tuple[float
     if not h.used[c]:
         h.q[c] = h.gap[c] = 0.0
         return 0.0, 0.0
+    h.schur[c] = variance
     h.q[c] = q = innovation * innovation / variance
     scale = math.sqrt(weight(q, h.gate[c]) / variance)
     return innovation * scale, scale
@@ -344,6 +348,17 @@ def correct_rows(g: Gaussian, h: Rows, share: float, k: int) -> None:
         for row in range(3):
             at = i + row * wide + j
             put(p, at, less(less(less(take(p, at), a[row], u), b[row], v), c[row], w))
+
+
+@part
+def spread(g: Gaussian, h: Rows, share: float) -> None:
+    """Add `share` d d^T to P, with d what the whole update would move x by."""
+    gain, wide, n = h.gain, len(g.x), 3 * g.vectors[0]
+    for i in range(n):
+        d = gain[i] * h.white[0] + gain[wide + i] * h.white[1] + gain[2 * wide + i] * h.white[2]
+        for j in range(n):
+            e = gain[j] * h.white[0] + gain[wide + j] * h.white[1] + gain[2 * wide + j] * h.white[2]
+            g.p[i, j] += share * d * e
 
 
 @part
