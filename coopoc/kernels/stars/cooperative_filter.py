@@ -349,7 +349,7 @@ def weigh(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None
         f.vague[k] = f.q[k, 0] = f.q[k, 1] = f.q[k, 2] = 0.0
         return
     innovate(g, h)
-    score(f, h, 9.0)
+    score(f, h, 9.0, False)
     correct(g, h, 1.0)
     hold(f, 1.0, model.teach)
     for c in range(3):

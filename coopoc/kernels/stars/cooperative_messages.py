@@ -56,7 +56,7 @@ JITTER = 1e-12
 NOTHING_NEW = 1e-9
 """Least weight of new fixes in an estimate."""
 CLIP = 12.0
-SCORED = 9.0
+SCORED = 16.0
 """Largest squared Mahalanobis distance of an innovation in a mean."""
 
 
@@ -138,7 +138,7 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
             own, noise = own + h.cov[4 * c], noise + h.variance[c]
         share = 1.0 / inflation(q, guards.fix_gate, f.locked[k])
         f.locked[k] = count(q, guards.fix_gate, f.locked[k], own / (own + noise))
-    score(f, h, SCORED)
+    score(f, h, SCORED, True)
     correct(g, h, share)
     hold(f, share, share)
     return q

@@ -304,14 +304,18 @@ def insert_turn(g: Gaussian, model: Model, k: int) -> None:
 
 
 @part
-def score(f: Filter, h: Rows, gate: float) -> None:
-    """Add the logarithm of the likelihood of the rows of an update; of what is far beyond the gate it falls slowly."""
+def score(f: Filter, h: Rows, gate: float, whole: bool) -> None:
+    """Add the logarithm of the likelihood of the rows of an update, each or as a whole; beyond the gate no more."""
+    square = 0.0
     for c in range(3):
         if h.used[c] and h.schur[c] > 0.0:
-            q = h.q[c]
-            f.slip[3] -= 0.5 * (math.log(h.schur[c]) + (q if q < gate else gate * (1.0 + math.log(q / gate))))
+            q = h.q[c] if whole or h.q[c] < gate else gate * (1.0 + math.log(h.q[c] / gate))
+            square += q
+            f.slip[3] -= 0.5 * math.log(h.schur[c])
             f.slip[4] += 1.0
-            f.slip[5] += min(q, gate)
+    square = min(square, gate) if whole else square
+    f.slip[3] -= 0.5 * square
+    f.slip[5] += square
 
 
 @part
