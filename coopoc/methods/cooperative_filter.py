@@ -12,7 +12,7 @@ import numpy.typing as npt
 
 from ..arrays import Floats
 from ..kernels.stars.cooperative_filter import run_filter
-from ..kernels.stars.cooperative_state import NO_GUARDS, Guards, Model, Sent
+from ..kernels.stars.cooperative_state import NO_GUARDS, ON_ROADS, Guards, Model, Sent
 from ..kernels.stars.messages import ACCELERATION_STD, FORGOTTEN
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, Vehicles, check_recording
@@ -27,6 +27,7 @@ FOUND = (
     "scale_error",
     "compass_error",
     "range_offset",
+    "slips",
     "range_level",
     "azimuth_level",
     "inclination_level",
@@ -53,10 +54,6 @@ class Broadcast(NamedTuple):
 
 
 BROADCAST = Message("estimate, odometer and velocity", 3 * len(Broadcast._fields) + 2)
-
-
-def full(t: tuple[float, ...]) -> tuple[float, ...]:
-    return (*t, *(0.0, 0.0, 300.0, -np.inf, 0.0, 0.0, 1.0, 1.0, 0.0, 3.0, 300.0, 1.0)[len(t) :])
 
 
 @dataclass(frozen=True, eq=False)
@@ -106,7 +103,6 @@ class CooperativeFilter(Checked):
     noise_model: NoiseModel | str = "nominal"
     robust: bool = True
     guards: Guards = Guards()
-    trial: tuple[float, ...] = (0.0, 0.0, 300.0, -np.inf, 0.0, 0.0)
     name: str = "cooperative-filter"
     cooperative = True
 
@@ -122,14 +118,15 @@ class CooperativeFilter(Checked):
         "range", "azimuth", "inclination" and "message", NaN where there was none, and whether it is "trusted".
         """
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
-        model, guards = model_of(known, self.robust, self.trial), guards_of(self, known)
+        guards = guards_of(self, known, recording.measured)
+        model = model_of(known, self.robust, guards)
         assumed, notes = assumptions(recording, known), list(known.notes)
-        assumed = assumed._replace(fixes=assumed.fixes * full(self.trial)[7])
+        assumed = assumed._replace(fixes=guards.fix**2 * assumed.fixes)
 
         @cache
         def sent() -> Sent:
             if self.robust:
-                return broadcasts(recording, known, columns, guards, full(self.trial)[7])
+                return broadcasts(recording, known, columns, guards)
             fixes, variance = (np.moveaxis(a, 2, 0).copy() for a in (recording.gnss, assumed.fixes))
             return Sent(fixes, variance, NOTHING)
 
@@ -153,10 +150,14 @@ class CooperativeFilter(Checked):
         return follow_egos(self, recording, egos, run, notes)
 
 
-def broadcasts(recording: Recording, noise_model: NoiseModel, egos: Sequence[int], guards: Guards, scale: float) -> Sent:
+def broadcasts(recording: Recording, noise_model: NoiseModel, egos: Sequence[int], guards: Guards) -> Sent:
     """Messages of the vehicles in the stars of some egos, each filtered alone until it is in none any more."""
-    links, assumed, model = recording.links, assumptions(recording, noise_model), model_of(noise_model, robust=False)
-    assumed = assumed._replace(fixes=assumed.fixes * scale)
+    links, assumed, model = (
+        recording.links,
+        assumptions(recording, noise_model),
+        model_of(noise_model, False, NO_GUARDS),
+    )
+    assumed = assumed._replace(fixes=guards.fix**2 * assumed.fixes)
     x, variance, moved = np.zeros((3, *np.moveaxis(recording.gnss, 2, 0).shape))
     none, nothing = Sent(NOTHING, NOTHING, NOTHING), inbox(recording, egos[0], FIX_AND_VELOCITY)
     seen, here = measurements(recording, egos[0], nothing), np.isin(links.observer, egos)
@@ -188,20 +189,24 @@ def lasting(ego: str, residual: Floats, dt: float) -> list[str]:
     return [f"fixes, {ego}: errors a second apart are correlated by {found:.2f}; give Sensors(gnss_drift_std=...)"]
 
 
-def guards_of(method: CooperativeFilter, noise_model: NoiseModel) -> Guards:
-    """The method's own, which wait half as long where errors of fixes last; none of the textbook filter, nor where no
-    noise is stated that an innovation could exceed."""
+def guards_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool = False) -> Guards:
+    """The method's own, which wait half as long where errors of fixes last, and if they are the usual ones those of
+    real roads where measurements are real; none of the textbook filter, nor where no noise is stated that an innovation
+    could exceed."""
     guards, sensors = method.guards, noise_model.sensors
     if not method.robust or sensors is None:
         return NO_GUARDS
+    if measured and guards == Guards():
+        guards = ON_ROADS
     return guards._replace(lost=guards.lost / 2) if sensors.gnss_drift_std > 0.0 else guards
 
 
-def model_of(noise_model: NoiseModel, robust: bool, trial: tuple[float, ...] = (0, 0, 300.0, -np.inf, 0, 0)) -> Model:
+def model_of(noise_model: NoiseModel, robust: bool, guards: Guards) -> Model:
     """The noise model of the kernel; of the textbook filter all errors are white."""
     std, least = relative_noise(noise_model)
-    white, time = np.ones(3), 1.0
+    white, time, absent = np.ones(3), 1.0, np.full(4, guards.absent)
     own = common = bias = heading = offset = 0.0
+    turn, lasts = np.array([guards.heading, guards.scale]), guards.lasts
     if robust and noise_model.sensors is not None:
         sensors, std = noise_model.sensors, np.array(std)
         own, common, offset = sensors.gnss_drift_std**2, sensors.gnss_common_std**2, sensors.range_offset_std**2
@@ -209,11 +214,8 @@ def model_of(noise_model: NoiseModel, robust: bool, trial: tuple[float, ...] = (
         time = float(sensors.gnss_drift_time)
         heading, bias = (float(value**2) for value in noise_model.compass)
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
-    more: tuple[Floats, float, float, Floats, float, float, float, float, float] = np.zeros(2), 300.0, -np.inf, np.zeros(2), 1.0, 0.0, 3.0, 300.0, 1.0
-    if robust and noise_model.sensors is not None:
-        b, s, lasts, odds, wrong, long, teach = full(trial)[:7]
-        off = np.array([bias == 0.0 and wrong > 0, offset == 0.0 and long > 0], float)
-        bias, offset = bias or wrong**2, offset or long**2
-        more = np.array([b * b, s * s], float), lasts, odds, off, teach, *full(trial)[-4:]
+        absent[2:][np.array([bias, offset]) > 0.0] = -np.inf
+        bias, offset = bias or guards.compass**2, offset or guards.offset**2
     shape = float(least), float(noise_model.exact_relative), FORGOTTEN, ACCELERATION_STD
-    return Model(std, *shape, own, common, time, white, bias, heading, offset, float(robust), *more)
+    lasting = own, common, time, white, bias, heading, offset
+    return Model(std, *shape, *lasting, float(robust), np.square(turn), lasts, absent, guards.slip)

@@ -152,9 +152,10 @@ class StarStream:
         self._alone: Robust | None = None
         self._guards = NO_GUARDS
         if isinstance(filter, CooperativeFilter):
-            model, self._guards = model_of(known, robust=True), guards_of(filter, known)
+            self._guards = guards_of(filter, known)
+            model = model_of(known, True, self._guards)
             self._star, self._white = Robust(model, self._guards, start), model.white
-            self._alone = Robust(model_of(known, robust=False), self._guards, start)
+            self._alone = Robust(model_of(known, False, NO_GUARDS), self._guards, start)
         else:
             self._star = Joint(known, filter.exact, filter.robust, start)
         self._motion: MotionNoise = motion_noise(known, interval)
@@ -321,17 +322,18 @@ class Robust:
 
     def __init__(self, model: Model, guards: Guards, start: Floats) -> None:
         self.model, self.guards, self.start = model, guards, start
-        self.filters = [make_filter(1, 1)]
+        f, self.tries = make_filter(1, 1)
+        self.filters = [f]
 
     def reserve(self, slots: int, vehicles: int) -> None:
         """Room for a star of that many members, of that many vehicles."""
         (f,) = self.filters
         if slots > len(f.vehicle) or vehicles > len(f.slot):
-            self.filters = [make_filter(max(len(f.vehicle), 2 * slots), vehicles)]
+            self.filters[0], self.tries = make_filter(max(len(f.vehicle), 2 * slots), vehicles)
             restore(f, self.filters[0])
 
     def step(self, own: Floats, rows: Floats, vehicles: Ints, last: Floats) -> Floats:
         """Answer of `stream_step`."""
         answer = np.empty(12 + 3 * len(vehicles))
-        stream_step(self.filters[0], self.model, self.guards, own, rows, vehicles, self.start, answer)
+        stream_step(self.filters[0], self.tries, self.model, self.guards, own, rows, vehicles, self.start, answer)
         return answer

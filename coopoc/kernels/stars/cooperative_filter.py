@@ -12,12 +12,13 @@ import math
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ..compiling.compile import compiled, inside
+from ..compiling.compile import compiled, inside, part
 from ..compiling.small import apply, negate, store
+from ..gate import GATE
 from ..geometry import angle
 from ..motion import process_variance
 from .cooperative_members import join, leave, place, predict, predict_member, steady
-from .cooperative_messages import fix_terms, fix_weight, receive, trust, use_fix
+from .cooperative_messages import fix_terms, receive, trust, use_fix
 from .cooperative_state import (
     AGE,
     AZIMUTHS,
@@ -43,15 +44,11 @@ from .cooperative_state import (
     Guards,
     Model,
     Sent,
-    average,
     begin,
     copy_filter,
-    hold,
     measured_whole,
     new_filter,
     pause,
-    score,
-    tell,
 )
 from .gaussian import (
     COMPASS,
@@ -67,8 +64,10 @@ from .gaussian import (
     weight,
     widen,
 )
+from .lasting import average
 from .levels import adapt, corrected, learn_fix, learn_relative, louder, moved
 from .messages import Assumptions, Measurements, three_of
+from .slip import LIKELY, NOW, NUMBERS, SLIPPED, SQUARES, Tries, likelier, new_tries, remember_speed, score, surprised
 
 
 @compiled
@@ -97,8 +96,7 @@ def run_filter(
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
     for run in range(runs):
         f = new_filter(1 + most, vehicles)
-        before, first_one = new_filter(1 + most, vehicles), new_filter(1 + most, vehicles)
-        own_copy, rows_copy = own.copy(), rows.copy()
+        tries = new_tries(1 + most, vehicles)
         for t in range(steps):
             first = measurements.start[t]
             count = measurements.start[t + 1] - first
@@ -112,20 +110,18 @@ def run_filter(
                 continue
             if f.g.vectors[0] == 0:
                 begin(f, model, guards, own, rows, count, measurements.ego)
-            attempts(f, before, first_one, own_copy, rows_copy, model, guards, own, rows, who, count)
-            average(f, model)
-            tell(f, found[run, t])
-            fixes[run, t] = fix_weight(f.q[0, 3], guards.fix_gate)
+            step(f, tries, model, guards, own, rows, who, count)
+            fixes[run, t], found[run, t] = f.q[0, 3], f.told
             for c in range(3):
-                x[run, t, c] = f.trial.x[c]
+                x[run, t, c] = f.answer[c]
                 for d in range(3):
-                    cov[run, t, c, d] = f.trial.p[c, d]
+                    cov[run, t, c, d] = f.answer[3 + 3 * c + d]
             for i in range(count):
                 k = f.slot[who[i]]
                 for c in range(3):
-                    neighbours[run, first + i, c] = f.trial.x[3 * f.g.block[k, PLACE] + c]
+                    neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c]
                     notes[run, first + i, c] = weight(f.q[k, c], guards.gate)
-                notes[run, first + i, 3] = fix_weight(f.q[k, 3], guards.fix_gate)
+                notes[run, first + i, 3] = f.q[k, 3]
                 notes[run, first + i, 4] = f.status[who[i], TRUSTED]
     return x, cov, neighbours, fixes, notes, found
 
@@ -165,12 +161,9 @@ def gather_neighbour(
 
 
 @inside
-def attempts(
+def step(
     f: Filter,
-    before: Filter,
-    first: Filter,
-    own_copy: Floats,
-    rows_copy: Floats,
+    tries: Tries,
     model: Model,
     guards: Guards,
     own: Floats,
@@ -178,51 +171,11 @@ def attempts(
     vehicles: Ints,
     count: int,
 ) -> None:
-    """A step, and where its numbers surprise the same step of an ego that slips: the likelier one."""
-    speed, dt = 0.0, own[DT]
-    for c in range(3):
-        speed += (own[MOTION + c] / dt) ** 2
-    f.slip[1] = max(math.sqrt(speed), f.slip[1] * math.exp(-dt / 10.0))
-    likely, was = 0.0, f.slip[0]
-    if model.slip > 0.0:
-        copy_filter(f, before)
-        for i in range(len(own)):
-            own_copy[i] = own[i]
-        for i in range(count):
-            for j in range(WIDTH):
-                rows_copy[i, j] = rows[i, j]
-    for attempt in range(2):
-        f.slip[2], f.slip[3], f.slip[4], f.slip[5] = attempt, 0.0, 0.0, 0.0
-        step(f, model, guards, own, rows, vehicles, count)
-        if model.slip == 0.0:
-            return
-        if attempt == 0:
-            likely = f.slip[3]
-            n, more = f.slip[4], f.slip[5]
-            if was == 0.0 and more < n + model.slip_surprise * math.sqrt(2.0 * n):
-                return
-            copy_filter(f, first)
-            copy_filter(before, f)
-            for i in range(len(own)):
-                own[i] = own_copy[i]
-            for i in range(count):
-                for j in range(WIDTH):
-                    rows[i, j] = rows_copy[i, j]
-    stays = math.exp(-dt / model.slip_lasts)
-    chance = stays if was > 0.0 else dt / model.slip_rare
-    if f.slip[3] - likely + math.log(chance / (1.0 - chance)) > 0.0:
-        f.slip[0] = 1.0
-    else:
-        copy_filter(first, f)
-        f.slip[0] = 0.0
-
-
-@inside
-def step(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
-    """Predict and update.
+    """A step; where its numbers surprise, the likelier of two: of an ego that slips, and of one that does not.
 
     Args:
         f: filter, after `begin`.
+        tries: memory.
         model: noise model.
         guards: against what may be wrong.
         own: (OWN,) the ego's row; the motion of the first step is not used.
@@ -230,6 +183,41 @@ def step(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, veh
         vehicles: (count,) which they are.
         count: of them.
     """
+    slips, dt = model.slip > 0.0, own[DT]
+    remember_speed(f, own)
+    if slips:
+        copy_filter(f, tries.before)
+        copy_rows(own, rows, tries.own, tries.rows, count)
+    for now in range(2):  # what is copied into a loop is compiled once
+        f.slip[NOW], f.slip[LIKELY], f.slip[NUMBERS], f.slip[SQUARES] = now, 0.0, 0.0, 0.0
+        attempt(f, model, guards, own, rows, vehicles, count)
+        if not slips or (now == 0 and not surprised(f)):
+            break
+        if now == 0:
+            copy_filter(f, tries.first)
+            copy_filter(tries.before, f)
+            copy_rows(tries.own, tries.rows, own, rows, count)
+        elif likelier(f, tries.first, dt):
+            f.slip[SLIPPED] = 1.0
+        else:
+            copy_filter(tries.first, f)
+            f.slip[SLIPPED] = 0.0
+    average(f, model)
+
+
+@part
+def copy_rows(own: Floats, rows: Floats, to: Floats, to_rows: Floats, count: int) -> None:
+    """Copy a step's numbers, which trying it changes."""
+    for i in range(OWN):
+        to[i] = own[i]
+    for i in range(count):
+        for j in range(WIDTH):
+            to_rows[i, j] = rows[i, j]
+
+
+@inside
+def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+    """Predict and update."""
     leave(f, model, guards, own, rows, vehicles, count)
     louder(f, own, rows, count)
     f.clock[1] = own[DT]
@@ -251,9 +239,7 @@ def step(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, veh
             if k > 0:
                 place(f, rows, k)
             for c in range(3):
-                if f.joined[k] == f.step[0]:
-                    f.moved[k, c] = f.moved[0, c] if f.step[0] > 0 else 0.0
-                f.at[k, c] = f.g.x[first + c] + f.moved[k, c]
+                f.at[k, c] = f.g.x[first + c]
                 f.q[k, c] = math.nan
             f.q[k, 3] = math.nan
     members = nearest_first(f)
@@ -311,8 +297,8 @@ def add_fix(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
     q = innovate(f.g, f.h)
     if f.vague[0] == 0.0:
         learn_fix(f)
-    f.q[0, 3] = q = use_fix(f, model, guards, 0, True, q)
-    f.hits[0, 0] = f.hits[0, 0] + 1 if 0.0 < guards.fix_gate < q else 0
+    f.q[0, 3] = share = use_fix(f, model, guards, 0, True, q)
+    f.hits[0, 0] = f.hits[0, 0] + 1 if share < 1.0 else 0
     corrected(f)
 
 
@@ -333,7 +319,7 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
         for k in range(len(f.vehicle)):
             if f.vehicle[k] >= 0:
                 for c in range(3):
-                    f.at[k, c] = f.trial.x[3 * g.block[k, PLACE] + c] + f.moved[k, c]
+                    f.at[k, c] = f.trial.x[3 * g.block[k, PLACE] + c]
     for m in range(members):
         weigh(f, model, guards, rows, f.order[m])
 
@@ -349,9 +335,8 @@ def weigh(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None
         f.vague[k] = f.q[k, 0] = f.q[k, 1] = f.q[k, 2] = 0.0
         return
     innovate(g, h)
-    score(f, h, 9.0, False)
+    score(f, h, GATE, False)
     correct(g, h, 1.0)
-    hold(f, 1.0, model.teach)
     for c in range(3):
         if h.used[c]:
             f.q[k, c] = h.q[c]

@@ -31,8 +31,6 @@ from .cooperative_state import (
     Model,
     across,
     doubt,
-    drive,
-    fade,
     insert_turn,
     lost,
     measured_whole,
@@ -57,6 +55,8 @@ from .gaussian import (
     update,
     widen,
 )
+from .lasting import drive
+from .slip import slip_variance
 
 
 @inside
@@ -113,12 +113,9 @@ def predict(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
     g, first = f.g, 3 * f.g.block[0, PLACE]
     keep = math.exp(-own[DT] / model.time) if model.own + model.common > 0.0 else 1.0
     fades = 1.0 - keep * keep
-    drive(f, 0, (own[MOTION], own[MOTION + 1], own[MOTION + 2]))
-    fade(g, model, 0, own[DT])
+    drive(f, model, 0, (own[MOTION], own[MOTION + 1], own[MOTION + 2]), own[DT])
     for c in range(3):
-        g.p[first + c, first + c] += own[MOTION_VARIANCE + c]
-        if f.slip[2] > 0.0:
-            g.p[first + c, first + c] += (model.slip * f.slip[1] * own[DT]) ** 2
+        g.p[first + c, first + c] += own[MOTION_VARIANCE + c] + slip_variance(f, model, own[DT])
     for k in range(len(f.vehicle)):
         if f.vehicle[k] >= 0 and has(g, k, ERROR):
             i, trusted = 3 * g.block[k, ERROR], f.status[f.vehicle[k], TRUSTED] > 0.0
@@ -167,7 +164,6 @@ def predict_member(f: Filter, model: Model, guards: Guards, rows: Floats, k: int
     A velocity that has served for L s and serves for dt more makes an error of (L + dt)^2 - L^2 times its own variance.
     """
     g, row, dt = f.g, f.row[k], f.clock[1]
-    fade(g, model, k, dt)
     first, age, sent = 3 * g.block[k, PLACE], rows[row, AGE], f.clock[0] - rows[row, AGE]
     if has(g, k, VELOCITY) and 0.0 <= age <= ROUNDING and f.status[f.vehicle[k], USED] > sent - 1.5 * dt:
         remove(g, k, VELOCITY)
@@ -189,7 +185,7 @@ def predict_member(f: Filter, model: Model, guards: Guards, rows: Floats, k: int
         f.serves[k] = 0.0
     often, changed = 1.0 + 2.0 * f.serves[k] / dt, (dt * age * model.acceleration) ** 2
     f.sent[k], f.serves[k] = sent, f.serves[k] + dt
-    drive(f, k, (dt * rows[row, SPEED], dt * rows[row, SPEED + 1], dt * rows[row, SPEED + 2]))
+    drive(f, model, k, (dt * rows[row, SPEED], dt * rows[row, SPEED + 1], dt * rows[row, SPEED + 2]), dt)
     for c in range(3):
         g.p[first + c, first + c] += often * (rows[row, STEP + c] + changed)
 

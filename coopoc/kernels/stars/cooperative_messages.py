@@ -24,9 +24,6 @@ from .cooperative_state import (
     Guards,
     Model,
     doubt,
-    hold,
-    score,
-    turned,
     unused,
 )
 from .gaussian import (
@@ -50,21 +47,17 @@ from .gaussian import (
     update,
     widen,
 )
+from .lasting import hold, turned
+from .slip import score
 
 JITTER = 1e-12
 """m^2 that keeps a clone from being the very number it was cloned of."""
 NOTHING_NEW = 1e-9
 """Least weight of new fixes in an estimate."""
 CLIP = 12.0
-SCORED = 16.0
+FIX_SCORE = 16.0
+"""Most of a squared Mahalanobis distance of a fix that tells of a slip."""
 """Largest squared Mahalanobis distance of an innovation in a mean."""
-
-
-@inside
-def fix_weight(q: float, gate: float) -> float:
-    """Share of its information that a fix keeps: gate / q beyond the gate. One far beyond still counts, for it may be
-    the estimate that is far off; and however precise fixes are, wheels may slip by a metre."""
-    return 1.0 + 0.0 * q if gate == 0.0 or not q > gate else gate / q
 
 
 @inside
@@ -108,8 +101,8 @@ def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> No
 
 @inside
 def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: float) -> float:
-    """Update by the rows of a vehicle's fix, unless its receiver errs otherwise than is assumed; squared Mahalanobis
-    distance.
+    """Update by the rows of a vehicle's fix, unless its receiver errs otherwise than is assumed; the share of its
+    information that it keeps.
 
     Args:
         f: filter.
@@ -125,23 +118,24 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
     if f.vague[k] > 0.0 and used == 3:
         settle(g, h, k, f.vague[k])
         f.vague[k] = 0.0
-        return 0.0
+        return 1.0
     if guards.trust > 0.0 and again and used == 3 and q > 0.0 and wrong_on_average(f, model, guards, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.revoked[j, 0], f.revoked[j, 1] = f.revoked[j, 0] + 1.0, f.clock[0]
         doubt(f, model, guards, j)
-        return q
+        return 0.0
     q = min(q, (h.gap[0] * h.gap[0] + h.gap[1] * h.gap[1] + h.gap[2] * h.gap[2]) / SLIP)
-    share, own, noise = fix_weight(q, guards.fix_gate), 0.0, 0.0
-    if guards.acceleration != 6.0 and guards.fix_gate > 0.0:
-        for c in range(3):
-            own, noise = own + h.cov[4 * c], noise + h.variance[c]
+    own, noise = 1e-12, 0.0
+    for c in range(3):
+        own, noise = own + h.cov[4 * c], noise + h.variance[c]
+    share = 1.0
+    if guards.fix_gate > 0.0:
         share = 1.0 / inflation(q, guards.fix_gate, f.locked[k])
         f.locked[k] = count(q, guards.fix_gate, f.locked[k], own / (own + noise))
-    score(f, h, SCORED, True)
+    score(f, h, FIX_SCORE, True)
     correct(g, h, share)
-    hold(f, share, share)
-    return q
+    hold(f, share)
+    return share
 
 
 @inside

@@ -27,18 +27,10 @@ from .gaussian import (
     Rows,
     clear,
     copy_gaussian,
-    copy_moments,
-    correct,
-    expect,
-    has,
-    innovate,
     insert,
     new_gaussian,
     new_rows,
     remove,
-    shift,
-    spread,
-    term,
     widen,
 )
 
@@ -78,6 +70,14 @@ class Guards(NamedTuple):
         lost: s without trust in its receiver after which an ego is lost; if alone twice that, half where errors last.
         forget: s, in which what innovations have shown of levels is forgotten.
         acceleration: m/s^2, of a member whose messages are late; 0: it goes on with its last velocity.
+        heading: rad, and
+        scale: standard deviations of errors of odometry that last.
+        lasts: s, for which they do.
+        compass: rad, and
+        offset: m, of such errors of a compass and of ranges, where none is stated.
+        absent: log odds that each of these is not there, before anything was measured.
+        slip: an ego that slips errs by that share of its late speed.
+        fix: factor of the assumed standard deviation of fixes, which err together for a while.
     """
 
     gate: float = 9.0
@@ -94,11 +94,21 @@ class Guards(NamedTuple):
     lost: float = 20.0
     forget: float = 10.0
     acceleration: float = 6.0
+    heading: float = 0.1
+    scale: float = 0.1
+    lasts: float = 1e5
+    compass: float = 0.05
+    offset: float = 0.15
+    absent: float = 8.0
+    slip: float = 0.7
+    fix: float = 1.0
 
 
-NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, trust=0.0, forget=0.0, acceleration=0.0)
+NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, trust=0.0, forget=0.0, acceleration=0.0, heading=0.0, scale=0.0, slip=0.0)
+ON_ROADS = Guards(fix_gate=4.0, scale=0.03, lasts=1e4, compass=0.0, offset=0.0, absent=-math.inf, fix=2.0)
+"""Of measurements that are not simulated: no odometry is without such errors."""
 RANGES, AZIMUTHS, INCLINATIONS, FIXES, MOTIONS = range(5)
-KINDS_OF_NUMBERS, FOUND = 5, 9
+KINDS_OF_NUMBERS, FOUND = 5, 10
 """Kinds of numbers that have a level."""
 
 
@@ -133,10 +143,10 @@ class Model(NamedTuple):
         heading: rad^2 of the compass's noise.
         offset: m^2, of what all the ego's ranges are too long by.
         estimates: 1 if messages hold a solo filter's estimate, 0 if they hold a fix.
-        turn: (2,) rad^2 and 1, of the errors of heading and scale of an odometry; zeros for none.
+        turn: (2,) rad^2 and 1, of errors of heading and scale of an odometry; zeros for none.
         lasts: s, their correlation time.
-        odds: logarithm of the prior odds that such an error is not there; -inf where it is known to be.
-        off: (2,) whether the compass's bias and the offset of ranges may not be there, either: 1, else 0.
+        absent: (4,) log odds that an error of heading, scale, compass or range is not there.
+        slip: share of the late speed.
     """
 
     std: Floats
@@ -154,13 +164,8 @@ class Model(NamedTuple):
     estimates: float
     turn: Floats
     lasts: float
-    odds: float
-    off: Floats
-    teach: float
+    absent: Floats
     slip: float
-    slip_lasts: float
-    slip_rare: float
-    slip_surprise: float
 
 
 class Filter(NamedTuple):
@@ -187,9 +192,12 @@ class Filter(NamedTuple):
         clock: (2,) s, now, and since the last step.
         revoked: (vehicles, 2) how often a vehicle lost trust, and when it last did s.
         level: (3, 5) by kind of number: logarithm of the level, sum of its derivatives in this step, and information.
-        moved: (slots, 3) m, what `average` moves each position by.
-        locked: (slots,) `gate.count` of its fixes.
-        slip: (5,) whether the ego slipped, its late speed m/s, whether it is assumed to slip now, logarithm of the likelihood of a step's numbers, and how many.
+        locked: (slots,) `gate.count` of fixes.
+        slip: (6,) of `slip`.
+        told: (FOUND,) out: what is otherwise than assumed, of `lasting.average`.
+        answer: (12,) out: position m and covariance m^2 of the ego.
+        few: (2 slots + 5, 2 slots + 3) memory.
+        which: (2 slots + 5,) memory.
         made: (2,) of the ego's variance m^2, axes together: what the level of motion makes, and the whole then.
     """
 
@@ -213,9 +221,12 @@ class Filter(NamedTuple):
     revoked: Floats
     level: Floats
     made: Floats
-    moved: Floats
     locked: Floats
     slip: Floats
+    told: Floats
+    answer: Floats
+    few: Floats
+    which: Ints
 
 
 @storage
@@ -243,9 +254,12 @@ def new_filter(slots: int, vehicles: int) -> Filter:
         np.zeros((vehicles, 2)),
         np.zeros((3, KINDS_OF_NUMBERS)),
         np.zeros(2),
-        np.zeros((slots, 3)),
         np.zeros(slots),
         np.zeros(6),
+        np.zeros(FOUND),
+        np.zeros(12),
+        np.zeros((2 * slots + 5, 2 * slots + 3)),
+        np.zeros(2 * slots + 5, np.int64),
     )
 
 
@@ -264,9 +278,10 @@ def copy_filter(source: Filter, target: Filter) -> None:
         target.vehicle[k], target.row[k], target.joined[k] = source.vehicle[k], source.row[k], source.joined[k]
         target.serves[k], target.sent[k], target.vague[k] = source.serves[k], source.sent[k], source.vague[k]
         target.locked[k] = source.locked[k]
+        for c in range(4):
+            target.q[k, c] = source.q[k, c]
         for c in range(3):
             target.hits[k, c] = source.hits[k, c]
-            target.moved[k, c] = source.moved[k, c]
     for j in range(len(source.slot)):
         target.slot[j] = source.slot[j]
         target.revoked[j, 0], target.revoked[j, 1] = source.revoked[j, 0], source.revoked[j, 1]
@@ -301,155 +316,6 @@ def insert_turn(g: Gaussian, model: Model, k: int) -> None:
     if model.turn[0] + model.turn[1] > 0.0:
         i = insert(g, k, TURN, 0.0)
         g.p[i, i], g.p[i + 1, i + 1] = model.turn[0], model.turn[1]
-
-
-@part
-def score(f: Filter, h: Rows, gate: float, whole: bool) -> None:
-    """Add the logarithm of the likelihood of the rows of an update, each or as a whole; beyond the gate no more."""
-    square = 0.0
-    for c in range(3):
-        if h.used[c] and h.schur[c] > 0.0:
-            q = h.q[c] if whole or h.q[c] < gate else gate * (1.0 + math.log(h.q[c] / gate))
-            square += q
-            f.slip[3] -= 0.5 * math.log(h.schur[c])
-            f.slip[4] += 1.0
-    square = min(square, gate) if whole else square
-    f.slip[3] -= 0.5 * square
-    f.slip[5] += square
-
-
-@part
-def turned(g: Gaussian, k: int, moved: tuple[float, float, float], w: Floats) -> tuple[float, float, float]:
-    """(1 + s) R(b) m, and its derivatives by b and s in w (9,); m itself where odometry does not err."""
-    for i in range(9):
-        w[i] = 0.0
-    if not has(g, k, TURN):
-        return moved
-    i = 3 * g.block[k, TURN]
-    c, s, scale = math.cos(g.x[i]), math.sin(g.x[i]), 1.0 + g.x[i + 1]
-    east, north = c * moved[0] - s * moved[1], s * moved[0] + c * moved[1]
-    w[0], w[3], w[1], w[4] = -scale * north, scale * east, east, north
-    return scale * east, scale * north, moved[2]
-
-
-@part
-def drive(f: Filter, k: int, moved: tuple[float, float, float]) -> None:
-    """Move a member by its odometry."""
-    g = f.g
-    first, w = 3 * g.block[k, PLACE], f.h.turn
-    way = turned(g, k, moved, w)
-    for c in range(3):
-        g.x[first + c] += way[c]
-    if not has(g, k, TURN):
-        return
-    i, n = 3 * g.block[k, TURN], 3 * g.vectors[0]
-    for c in range(2):
-        for j in range(n):
-            g.p[first + c, j] += w[3 * c] * g.p[i, j] + w[3 * c + 1] * g.p[i + 1, j]
-    for j in range(n):
-        for c in range(2):
-            g.p[j, first + c] += w[3 * c] * g.p[j, i] + w[3 * c + 1] * g.p[j, i + 1]
-
-
-@part
-def hold(f: Filter, share: float, learned: float) -> None:
-    """After an update by `correct`: errors of odometry have learned that part of it only, as with a gain of that part.
-
-    P' = P - K S K^T + (1 - learned)^2 K_o S K_o^T in the block of these errors o.
-    """
-    g, h, wide = f.g, f.h, len(f.g.x)
-    if learned >= 1.0:
-        return
-    less = (1.0 - learned) ** 2 * share
-    for a in range(len(f.vehicle)):
-        if f.vehicle[a] < 0 or not has(g, a, TURN):
-            continue
-        for i in range(3 * g.block[a, TURN], 3 * g.block[a, TURN] + 2):
-            for c in range(3):
-                g.x[i] -= (1.0 - learned) * share * h.gain[c * wide + i] * h.white[c]
-            for b in range(len(f.vehicle)):
-                if f.vehicle[b] < 0 or not has(g, b, TURN):
-                    continue
-                for j in range(3 * g.block[b, TURN], 3 * g.block[b, TURN] + 2):
-                    for c in range(3):
-                        g.p[i, j] += less * h.gain[c * wide + i] * h.gain[c * wide + j]
-
-
-@part
-def fade(g: Gaussian, model: Model, k: int, dt: float) -> None:
-    """Errors of odometry decay."""
-    if not has(g, k, TURN):
-        return
-    i, keep = 3 * g.block[k, TURN], math.exp(-dt / model.lasts)
-    shift(g, i, i, keep - 1.0)
-    for c in range(2):
-        g.p[i + c, i + c] += (1.0 - keep * keep) * model.turn[c]
-
-
-@part
-def average(f: Filter, model: Model) -> None:
-    """Put into `trial` the mixture of whether each error that lasts is there or not, by Bayes' rule.
-
-    Of a scalar b ~ N(0, W) with the posterior N(m, p) the odds of b = 0 are those of the prior times
-    sqrt(W / p) exp(-m^2 / 2 p).
-    """
-    g, source = f.trial, f.g
-    copy_moments(source, g)
-    if has(g, 0, COMPASS) and model.odds > -math.inf:
-        i = 3 * g.block[0, COMPASS]
-        if model.off[0] > 0.0:
-            collapse(g, f.h, i // 3, 0, model.bias, model.odds)
-        if model.off[1] > 0.0:
-            collapse(g, f.h, i // 3, 2, model.offset, model.odds)
-    for k in range(len(f.vehicle)):
-        if f.vehicle[k] >= 0 and has(g, k, TURN) and model.odds > -math.inf:
-            i = 3 * g.block[k, TURN]
-            collapse(g, f.h, i // 3, 0, model.turn[0], model.odds)
-            collapse(g, f.h, i // 3, 1, model.turn[1], model.odds)
-    for k in range(len(f.vehicle)):
-        if f.vehicle[k] >= 0:
-            for c in range(3):
-                i = 3 * g.block[k, PLACE] + c
-                f.moved[k, c] = g.x[i] - source.x[i]
-
-
-@part
-def tell(f: Filter, out: Floats) -> None:
-    """What the filter has found to be otherwise than assumed, after `average`: errors that last, factors of standard
-    deviations."""
-    g = f.trial
-    if has(g, 0, TURN):
-        i = 3 * g.block[0, TURN]
-        out[0], out[1] = g.x[i], g.x[i + 1]
-    if has(g, 0, COMPASS):
-        i = 3 * g.block[0, COMPASS]
-        out[2], out[3] = g.x[i], g.x[i + 2]
-    for kind in range(KINDS_OF_NUMBERS):
-        out[4 + kind] = math.exp(0.5 * f.level[0, kind])
-
-
-@part
-def collapse(g: Gaussian, h: Rows, block: int, c: int, prior: float, odds: float) -> float:
-    """Let the number c of a vector, or all three if c is -1, be 0 with the probability that it is; that it is not.
-
-    Of b ~ N(0, W) with the posterior N(m, P) the odds of b = 0 are those of the prior times
-    sqrt(|W| / |P|) exp(-m^T P^-1 m / 2); the two are averaged, moments matched.
-    """
-    term(h, 0, block, 1.0)
-    for i in range(3):
-        expect(h, i, 0.0, 0.0)
-        h.used[i] = c < 0 or c == i
-        if h.used[i] and not g.p[3 * block + i, 3 * block + i] > 1e-12:
-            return 0.0
-    q = innovate(g, h)
-    det = 1.0
-    for i in range(3):
-        if h.used[i]:
-            det *= prior / h.schur[i]
-    there = 1.0 / (1.0 + math.exp(min(odds + 0.5 * math.log(det) - 0.5 * q, 700.0)))
-    correct(g, h, 1.0 - there)
-    spread(g, h, there * (1.0 - there))
-    return there
 
 
 @part

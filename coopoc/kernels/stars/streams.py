@@ -30,7 +30,6 @@ from .cooperative_state import (
     Filter,
     Guards,
     Model,
-    average,
     begin,
     copy_filter,
     new_filter,
@@ -49,6 +48,7 @@ from .messages import (
     measured,
     star_within,
 )
+from .slip import Tries, new_tries
 
 INDEX, SERVES, USED_AT = range(3)
 """Of a vehicle's newest message: its index in the last star of the joint filter (-1 for none; the ego's is that of the
@@ -181,12 +181,21 @@ def joint_step(
 
 @compiled
 def stream_step(
-    f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, start: Floats, answer: Floats
+    f: Filter,
+    tries: Tries,
+    model: Model,
+    guards: Guards,
+    own: Floats,
+    rows: Floats,
+    vehicles: Ints,
+    start: Floats,
+    answer: Floats,
 ) -> None:
     """One step.
 
     Args:
         f: filter.
+        tries: memory of the same size.
         model: noise model.
         guards: against what may be wrong.
         own: (OWN,).
@@ -201,20 +210,19 @@ def stream_step(
             f.step[0], f.vague[0] = 1, 0.0
             for c in range(3):
                 f.g.x[c] = start[c]
-    step(f, model, guards, own, rows, vehicles, len(vehicles))
-    average(f, model)
+    step(f, tries, model, guards, own, rows, vehicles, len(vehicles))
     for c in range(3):
-        answer[c] = f.trial.x[c]
+        answer[c] = f.answer[c]
         for d in range(3):
-            answer[3 + 3 * c + d] = f.trial.p[c, d]
+            answer[3 + 3 * c + d] = f.answer[3 + 3 * c + d]
         for i in range(len(vehicles)):
-            answer[12 + 3 * i + c] = f.trial.x[3 * f.g.block[f.slot[vehicles[i]], PLACE] + c]
+            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[f.slot[vehicles[i]], PLACE] + c]
 
 
 @compiled
-def make_filter(slots: int, vehicles: int) -> Filter:
-    """A filter before its first step, for Python."""
-    return new_filter(slots, vehicles)
+def make_filter(slots: int, vehicles: int) -> tuple[Filter, Tries]:
+    """A filter before its first step, and its memory, for Python."""
+    return new_filter(slots, vehicles), new_tries(slots, vehicles)
 
 
 @compiled
