@@ -2,7 +2,8 @@
 
 State: named vectors, ("x", j) position, ("b", j) error of fixes, ("v", j) velocity and ("c", j) clone of vehicle j,
 ("common",) and ("compass",). Numbers z = H x + noise beyond their gate have their innovations' covariance multiplied
-by q / gate, of relative ones by 100 more beyond four times the gate. What is vague has a variance of FLAT m^2.
+by q / gate, of relative ones by 100 more beyond four times the gate, of fixes as `kernels.gate` says. What is vague has
+a variance of FLAT m^2. ("o", j) are errors of odometry.
 """
 
 import copy
@@ -13,10 +14,11 @@ import numpy as np
 
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
-from coopoc.kernels.gate import SLIP
-from coopoc.kernels.stars.cooperative_messages import CLIP
+from coopoc.kernels.gate import GATE, LEAK, PATIENCE, REJECTED, SLIP
+from coopoc.kernels.stars.cooperative_messages import CLIP, FIX_SCORE
 from coopoc.kernels.stars.cooperative_state import Guards
 from coopoc.kernels.stars.levels import FASTEST, LOUDEST, PRIOR, QUIETEST, SUDDEN, USUAL
+from coopoc.kernels.stars.slip import LASTS, LATE, RARE
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector, wrap
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -67,7 +69,7 @@ class Belief:
         h = np.zeros(len(self.x))
         for name, factor in terms.items():
             if np.ndim(factor):
-                h[self.at(name)] = factor
+                h[self.at(name)] = np.atleast_2d(factor)[axis if np.ndim(factor) == 2 else 0]
             else:
                 h[self.at(name).start + axis] = factor
         return h
@@ -76,17 +78,35 @@ class Belief:
         """One number; its squared normalised innovation."""
         return self.updates(h[None], np.array([z]), np.array([r]), gate)
 
-    def updates(
-        self, h: Floats, z: Floats, r: Floats, gate: float = 0.0, far: float = 100.0, square: float | None = None
-    ) -> float:
+    def updates(self, h: Floats, z: Floats, r: Floats, gate: float = 0.0) -> float:
         """Several numbers with one gate; their squared Mahalanobis distance."""
         gap, s = z - h @ self.x, h @ self.p @ h.T + np.diag(r)
-        q = float(gap @ np.linalg.solve(s, gap)) if square is None else square
+        q = float(gap @ np.linalg.solve(s, gap))
         if gate and q > gate:
-            s = s * (q / gate * (far if q > 4 * gate else 1.0))
+            s = s * (q / gate * (100.0 if q > 4 * gate else 1.0))
         gain = np.linalg.solve(s, h @ self.p).T
         self.x, self.p = self.x + gain @ gap, self.p - gain @ s @ gain.T
         return q
+
+    def learn(self, h: Floats, z: Floats, r: Floats, share: float) -> None:
+        """Take a share of numbers' information, and of that the same share for errors of odometry."""
+        gap, s = z - h @ self.x, (h @ self.p @ h.T + np.diag(r)) / share
+        gain = np.linalg.solve(s, h @ self.p).T
+        slow = [self.at(name) for name in self.names if name[0] == "o"]
+        for at in slow:
+            gain[at] *= share
+        less = gain @ h @ self.p
+        self.x, self.p = self.x + gain @ gap, self.p - less - less.T + gain @ s @ gain.T
+
+    def average(self, i: int, prior: float, odds: float) -> None:
+        """Number i is 0 or N(0, prior)."""
+        p, m = self.p[i, i], self.x[i]
+        if p <= 0 or odds == -math.inf:
+            return
+        there = 1 / (1 + math.exp(min(odds + 0.5 * math.log(prior / p) - 0.5 * m * m / p, 700)))
+        k = self.p[:, i] / p
+        self.x = self.x + k * (there * m - m)
+        self.p = self.p + np.outer(k, k) * (there * p + there * (1 - there) * m * m - p)
 
 
 class Sent(NamedTuple):
@@ -102,7 +122,7 @@ class Sent(NamedTuple):
 
 class Life(NamedTuple):
     """Parameters of lasting errors: own and common m^2, their correlation of a step, compass bias and noise rad^2,
-    offset of ranges m^2."""
+    offset of ranges m^2, heading and scale of odometry, their correlation of a step, log odds that there is none."""
 
     own: float
     common: float
@@ -110,6 +130,9 @@ class Life(NamedTuple):
     bias: float
     heading: float
     offset: float
+    turn: Floats
+    holds: float
+    absent: Floats
 
 
 class Oracle:
@@ -120,16 +143,22 @@ class Oracle:
     ) -> None:
         s, self.alone = known.sensors, alone
         self.seen, self.ego, self.run, self.known, self.guards, self.robust = seen, ego, run, known, guards, robust
-        self.life, self.white = Life(0, 0, 1, 0, 0, 0), np.ones(3)
+        self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(2), 1, np.zeros(4)), np.ones(3)
         self.std: Floats = np.ones(3)
         if s is not None:
             self.std = s.relative_std.copy()
             self.guards = guards._replace(lost=guards.lost / (1 + (s.gnss_drift_std > 0)))
         if robust and s is not None:
             heading, bias = (float(v**2) for v in known.compass)
-            keep = math.exp(-seen.dt / s.gnss_drift_time)
-            self.life = Life(s.gnss_drift_std**2, s.gnss_common_std**2, keep, bias, heading, s.range_offset_std**2)
             self.std[1] = math.sqrt(self.std[1] ** 2 - heading - bias)
+            keep = math.exp(-seen.dt / s.gnss_drift_time)
+            offset, absent = s.range_offset_std**2, np.full(4, guards.absent)
+            absent[2:][[bias > 0, offset > 0]] = -math.inf
+            bias, offset = bias or guards.compass**2, offset or guards.offset**2
+            holds, turn = math.exp(-seen.dt / guards.lasts), np.square([guards.heading, guards.scale])
+            self.life = Life(
+                s.gnss_drift_std**2, s.gnss_common_std**2, keep, bias, heading, offset, turn, holds, absent
+            )
             self.white = np.square(s.gnss_std) / np.square(s.fix_std)
         shape = seen.gnss.shape
         self.q = np.broadcast_to(known.process_variance(seen), shape)[run]
@@ -146,11 +175,12 @@ class Oracle:
 
     def blank(self) -> dict[str, Any]:
         empty: dict[str, Any] = {
-            name: {} for name in ("last", "serves", "sent", "joined", "hits", "mean", "kept", "slot", "pace")
+            name: {} for name in ("last", "serves", "sent", "joined", "hits", "mean", "kept", "slot", "pace", "locked")
         }
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.guards.trust else {self.ego}
         levels = {"level": np.zeros(5), "learned": np.zeros(5), "information": np.zeros(5), "made": 0.0}
+        levels |= {"slips": False, "speed": 0.0, "score": 0.0, "numbers": 0, "squares": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
     def loop(self) -> tuple[Floats, Floats, list[Floats]]:
@@ -162,12 +192,47 @@ class Oracle:
                 self.state, self.revoked = self.blank(), {}
                 found.append((np.full(3, np.nan), np.full((3, 3), np.nan), []))
                 continue
-            self.step(t)
-            b = self.state["belief"]
+            self.tries(t)
+            true = self.state["belief"]
+            b = copy.deepcopy(true)
+            self.average(b)
             x = b.at(("x", self.ego))
-            found.append(copy.deepcopy((b.x[x], b.p[x, x], [b.x[b.at(("x", j))] for j in self.neighbours(t)[1]])))
+            found.append((b.x[x], b.p[x, x], [true.x[true.at(("x", j))].copy() for j in self.neighbours(t)[1]]))
         others = [np.array(o).reshape(-1, 3) for *_, o in found]
         return np.array([x for x, *_ in found]), np.array([p for _, p, _ in found]), others
+
+    def average(self, b: Belief) -> None:
+        life, slot = self.life, self.state["slot"]
+        for j in sorted((self.ego, *self.state["members"]), key=lambda j: -slot[j]):
+            for i in range(2 * (("o", j) in b.names)):
+                b.average(b.at(("o", j)).start + i, life.turn[i], life.absent[i])
+        if ("compass",) in b.names:
+            b.average(b.at(("compass",)).start, life.bias, life.absent[2])
+            b.average(b.at(("compass",)).start + 2, life.offset, life.absent[3])
+
+    def tries(self, t: int) -> None:
+        """A step, and perhaps one that slips."""
+        share, dt = self.guards.slip * (self.robust and self.known.sensors is not None), self.seen.dt
+        speed = float(np.linalg.norm(self.seen.velocity[self.run, t, self.ego]))
+        self.state["speed"] = max(speed, self.state["speed"] * math.exp(-dt / LATE))
+        before = copy.deepcopy((self.state, self.revoked)) if share else None
+        self.step(t, 0.0)
+        n = self.state["numbers"]
+        if before is None or not (before[0]["slips"] or self.state["squares"] > n + math.sqrt(2 * n)):
+            return
+        first, (self.state, self.revoked) = (self.state, self.revoked), before
+        chance = math.exp(-dt / LASTS) if first[0]["slips"] else min(dt / RARE, 0.5)
+        self.step(t, (share * self.state["speed"] * dt) ** 2)
+        slips = self.state["score"] - first[0]["score"] + math.log(chance / (1 - chance)) > 0
+        if not slips:
+            self.state, self.revoked = first
+        self.state["slips"] = slips
+
+    def count(self, q: float, log: float, numbers: int) -> None:
+        """What the numbers of an update say of a slip."""
+        self.state["score"] -= 0.5 * (q + log)
+        self.state["numbers"] += numbers
+        self.state["squares"] += q
 
     def neighbours(self, t: int) -> tuple[Any, list[int]]:
         """Links of a step, and the columns that they join."""
@@ -199,7 +264,8 @@ class Oracle:
         s["made"] = min(s["made"] * (now / self.before) ** 2, now)
         self.before = now
 
-    def step(self, t: int) -> None:
+    def step(self, t: int, slip: float) -> None:
+        self.state |= {"score": 0.0, "numbers": 0, "squares": 0.0}
         s, g, b, life = self.state, self.guards, self.state["belief"], self.life
         here, others = self.neighbours(t)
         louder = math.exp(s["level"][4])
@@ -213,6 +279,7 @@ class Oracle:
                 b.add(("common",), 0, life.common)
             if life.bias + life.heading + life.offset:
                 b.add(("compass",), 0, [life.bias, 0, life.offset])
+            self.add_turn(self.ego)
             s["slot"][self.ego] = 0
             s["trusted"].add(self.ego)
             again = self.start(t, fix, messages, relative)
@@ -230,13 +297,14 @@ class Oracle:
                 if ("b", j) in b.names:
                     at = b.at(("b", j))
                     s["kept"][j] = b.x[at].copy(), np.maximum(np.diag(b.p)[at], 0.01)
-                for kind in "xbvc":
+                for kind in "xbvco":
                     b.drop((kind, j))
                 s["members"].remove(j)
         dt = self.seen.dt
         u, q = self.steady(t, self.ego, self.seen.velocity[self.run, t, self.ego], louder * self.q[t, self.ego])
         if t > s["joined"][self.ego]:
             self.predict(dt * u, q)
+            b.noise(("x", self.ego), slip)
         s["made"] = s["made"] + q.sum()
         self.before = self.own_variance()
         for j in s["members"]:
@@ -273,7 +341,7 @@ class Oracle:
         s["information"] = s["information"] * (math.exp(-dt / g.forget) if g.forget else 1.0)
 
     def add_fix(self, t: int, fix: Floats) -> None:
-        s, g, louder = self.state, self.guards, math.exp(self.state["level"][3])
+        s, louder = self.state, math.exp(self.state["level"][3])
         rows = [(self.fix_terms(self.ego), fix[c], louder * self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
         if self.ego not in s["vague"]:
             _, gap, cov, r = self.mahalanobis(s["belief"], rows)
@@ -281,8 +349,8 @@ class Oracle:
             more = min(gap @ gap / total, SUDDEN) - 1.0
             self.learn(3, more, r.sum() / total, 3)
             self.learn(4, more, s["made"] / total, 3)
-        q = self.use_fix(t, self.ego, rows, True)
-        s["hits"]["fix"] = s["hits"]["fix"] + 1 if g.fix_gate and q > g.fix_gate else 0
+        share = self.use_fix(t, self.ego, rows, True)
+        s["hits"]["fix"] = s["hits"]["fix"] + 1 if share < 1 else 0
         self.corrected()
 
     def mahalanobis(self, b: Belief, rows: list[Any]) -> tuple[float, Floats, Floats, Floats]:
@@ -293,30 +361,38 @@ class Oracle:
         return float(gap @ np.linalg.solve(cov + np.diag(r), gap)), gap, cov, r
 
     def use_fix(self, t: int, j: int, rows: list[Any], again: bool) -> float:
-        """Squared Mahalanobis distance; trust may be revoked."""
+        """The share of its information that is used; trust may be revoked."""
         s, g, b = self.state, self.guards, self.state["belief"]
         used = [c for c, row in enumerate(rows) if row is not None]
         h = np.array([b.row(rows[c][0], c) for c in used])
         z, r = (np.array([rows[c][i] for c in used]) for i in (1, 2))
         if not used:
-            return 0.0
+            return 1.0
         if j in s["vague"] and len(used) == 3:
             b.updates(h, z, r)
             s["vague"].discard(j)
-            return 0.0
+            return 1.0
         if g.trust and again and len(used) == 3 and self.wrong_on_average(j, *self.mahalanobis(b, rows)):
             if j in s["trusted"]:
                 self.revoked[j] = [self.revoked.get(j, [0, 0])[0] + 1, t]
             self.doubt(j)
-            return self.gone
-        gap = z - h @ b.x
-        q = min(float(gap @ np.linalg.solve(h @ b.p @ h.T + np.diag(r), gap)), float(gap @ gap) / SLIP)
-        b.updates(h, z, r, g.fix_gate, 1.0, q)
-        return q
+            return 0.0
+        gap, own = z - h @ b.x, h @ b.p @ h.T
+        square = float(gap @ np.linalg.solve(own + np.diag(r), gap))
+        self.count(min(square, FIX_SCORE), np.linalg.slogdet(own + np.diag(r))[1], len(used))
+        q, gain, locked = min(square, float(gap @ gap) / SLIP), np.trace(own) / (np.trace(own) + r.sum()), s["locked"]
+        share, hits = 1.0, locked.get(j, 0.0)
+        if g.fix_gate:
+            if q > g.fix_gate and hits < PATIENCE:
+                share = g.fix_gate / q if q < REJECTED * g.fix_gate else 0.0
+            locked[j] = hits + gain if q > g.fix_gate else max(hits - LEAK * gain, 0.0)
+        if share:
+            b.learn(h, z, r, share)
+        return share
 
     def wrong_on_average(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """The clipped mean innovation, beside what another error of the fixes would make of it."""
-        s, g, self.gone = self.state, self.guards, q
+        s, g = self.state, self.guards
         count, mean = s["mean"].get(j, (0.0, np.zeros(3)))
         count = min(count + 1, g.window)
         s["mean"][j] = count, mean
@@ -360,6 +436,7 @@ class Oracle:
         b.noise(("x", self.ego), FLAT)
         b.x[b.at(("x", self.ego))] = places[best if votes[0] <= 1 else 0][0]
         s["joined"][self.ego], s["hits"]["fix"] = t, 0
+        s["locked"].pop(self.ego, None)
         s["trusted"].add(self.ego)
         s["mean"].pop(self.ego, None)
         s["vague"].add(self.ego)
@@ -401,7 +478,7 @@ class Oracle:
 
     def predict(self, moved: Floats, q: Floats) -> None:
         b, life = self.state["belief"], self.life
-        b.x[b.at(("x", self.ego))] += moved
+        self.drive(self.ego, moved)
         b.noise(("x", self.ego), q)
         for name in b.names:
             if name[0] == "b" and name[1] not in self.state["trusted"]:
@@ -413,6 +490,37 @@ class Oracle:
         if life.common:
             b.transform(("common",), {("common",): life.keep})
             b.noise(("common",), life.common * (1 - life.keep**2))
+
+    def add_turn(self, j: int) -> None:
+        if self.life.turn.any():
+            self.state["belief"].add(("o", j), 0.0, [*self.life.turn, 0.0])
+
+    def turned(self, j: int, moved: Floats) -> tuple[Floats, Floats]:
+        """A motion by odometry, corrected, and its derivatives by the errors of it."""
+        b, by = self.state["belief"], np.zeros((3, 3))
+        if ("o", j) not in b.names:
+            return moved, by
+        turn, scale, _ = b.x[b.at(("o", j))]
+        c, s = math.cos(turn), math.sin(turn)
+        way = (1 + scale) * np.array([[c, -s], [s, c]]) @ moved[:2]
+        by[:2, 0], by[:2, 1] = [-way[1], way[0]], way / (1 + scale)
+        return np.append(way, moved[2]), by
+
+    def drive(self, j: int, moved: Floats) -> None:
+        b, (way, by) = self.state["belief"], self.turned(j, moved)
+        b.x[b.at(("x", j))] += way
+        if ("o", j) not in b.names:
+            return
+        x, o, f, holds = b.at(("x", j)), b.at(("o", j)), np.eye(len(b.x)), self.life.holds
+        f[x, o], f[o, o] = by, holds * np.eye(3)
+        b.p = f @ b.p @ f.T
+        b.x[o] *= holds
+        b.noise(("o", j), [*((1 - holds**2) * self.life.turn), 0.0])
+
+    def errors_of(self, j: int, moved: Floats) -> tuple[Floats, dict[Name, Any]]:
+        """A motion as a measurement: what is measured, and the terms of it beside what is driven."""
+        b, (way, by) = self.state["belief"], self.turned(j, moved)
+        return (way - by @ b.x[b.at(("o", j))], {("o", j): -by}) if ("o", j) in b.names else (way, {})
 
     def update_velocity(self, j: int, message: Sent | None, t: int) -> None:
         """A member whose newest message is not of now gets a velocity; that of a new message is used, unless the
@@ -430,7 +538,8 @@ class Oracle:
             return
         s["sent"][j] = message.step
         r = message.process / dt**2 + (g.acceleration * (t - message.step) * dt) ** 2
-        b.updates(np.array([b.row({("v", j): 1.0}, c) for c in range(3)]), message.velocity, r, g.fix_gate)
+        way, terms = self.errors_of(j, message.velocity)
+        b.updates(np.array([b.row({("v", j): 1.0, **terms}, c) for c in range(3)]), way, r, g.fix_gate)
 
     def predict_member(self, t: int, j: int, message: Sent | None) -> Sent | None:
         """The message, its velocity if need be replaced."""
@@ -456,7 +565,7 @@ class Oracle:
         before, times = s["serves"][j]
         times = times + 1 if before == message.step else 1
         s["serves"][j] = message.step, times
-        b.x[b.at(("x", j))] += dt * message.velocity
+        self.drive(j, dt * message.velocity)
         b.noise(("x", j), (2 * times - 1) * (message.process + (dt**2 * (t - message.step)) ** 2))
         return message
 
@@ -473,7 +582,9 @@ class Oracle:
         b.add(("x", j), b.x[b.at(("x", self.ego))] + gap, FLAT)
         s["vague"].add(j)
         s["sent"].pop(j, None)
+        s["locked"].pop(j, None)
         self.update_velocity(j, message, t)
+        self.add_turn(j)
         if j not in s["trusted"]:
             mean, variance = s["kept"].get(j, (np.zeros(3), np.full(3, self.guards.tau**2)))
             b.add(("b", j), mean, variance + self.life.own)
@@ -530,12 +641,12 @@ class Oracle:
             )
             residual = relative - expected
             residual[1:] = wrap(residual[1:])
-            z, r, turn = residual + rows @ gap, self.std**2, 1.0
+            z, r, turn, size = residual + rows @ gap, self.std**2, 1.0, np.array([1.0, flat, reach])
         else:
             rows = np.array([[ca * si, sa * si, ci], [-sa, ca, 0], [ca * ci, sa * ci, -si]])
             z = rows @ to_vector(np.where(there, relative, expected))
             r = np.ones(3) if unit else (self.std * [1.0, reach * ground / far, reach]) ** 2
-            turn = ground
+            turn, size = ground, np.ones(3)
         r = r * np.exp(s["level"][:3])
         h = []
         for c in range(3):
@@ -545,8 +656,10 @@ class Oracle:
             h.append(b.row(terms, c))
         total = np.einsum("ci,ij,cj->c", h, b.p, h) + r
         for c in np.flatnonzero(there):
+            log = math.log((float(h[c] @ b.p @ h[c]) + r[c]) * size[c] ** 2)
             q = b.update(h[c], z[c], r[c], 0.0 if vague else g.gate)
             if not vague:
+                self.count(q if q < GATE else GATE * (1 + math.log(q / GATE)), log, 1)
                 hits[c] = hits[c] + 1 if g.gate and q > g.gate else 0
                 self.learn(c, min(q, SUDDEN) - USUAL, r[c] / total[c])
                 self.learn(4, min(q, SUDDEN) - USUAL, rows[c] @ rows[c] * s["made"] / 3 / total[c])
@@ -568,8 +681,9 @@ class Oracle:
         spent = 0.5 * steps * (message.process + last.process) if before else np.zeros(3)
         back = {("v", j): -age * dt} if tracked else {}
         if clone:
-            h = np.array([b.row({("x", j): 1.0, **back, ("c", j): -1.0}, c) for c in range(3)])
-            b.updates(h, moved, spent + late, g.fix_gate)
+            way, errors = self.errors_of(j, moved)
+            h = np.array([b.row({("x", j): 1.0, **back, ("c", j): -1.0, **errors}, c) for c in range(3)])
+            b.updates(h, way, spent + late, g.fix_gate)
         rows: list[Any] = []
         for c in range(3):
             m, r, middle, terms = message.estimate[c], message.variance[c], 1.0, dict(self.fix_terms(j)) | back

@@ -127,7 +127,8 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
     q = min(q, (h.gap[0] * h.gap[0] + h.gap[1] * h.gap[1] + h.gap[2] * h.gap[2]) / SLIP)
     own, noise = 1e-12, 0.0
     for c in range(3):
-        own, noise = own + h.cov[4 * c], noise + h.variance[c]
+        if h.used[c]:
+            own, noise = own + h.cov[4 * c], noise + h.variance[c]
     share = 1.0
     if guards.fix_gate > 0.0:
         share = 1.0 / inflation(q, guards.fix_gate, f.locked[k])

@@ -105,7 +105,7 @@ class Guards(NamedTuple):
 
 
 NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, trust=0.0, forget=0.0, acceleration=0.0, heading=0.0, scale=0.0, slip=0.0)
-ON_ROADS = Guards(fix_gate=4.0, scale=0.03, lasts=1e4, compass=0.0, offset=0.0, absent=-math.inf, fix=2.0)
+ON_ROADS = Guards(fix_gate=3.5, scale=0.03, lasts=1e4, compass=0.0, offset=0.0, absent=-math.inf, fix=2.0)
 """Of measurements that are not simulated: no odometry is without such errors."""
 RANGES, AZIMUTHS, INCLINATIONS, FIXES, MOTIONS = range(5)
 KINDS_OF_NUMBERS, FOUND = 5, 10
@@ -377,7 +377,7 @@ def pause(f: Filter, dt: float) -> None:
     """The ego is absent: it starts anew at its next fix."""
     for k in range(f.g.vectors[0]):
         clear(f.g, 3 * k)
-    f.g.vectors[0], f.hits[0, 0] = 0, 0
+    f.g.vectors[0], f.hits[0, 0], f.slip[:] = 0, 0, 0.0
     for kind in range(KINDS):
         f.g.block[0, kind] = ABSENT
     for j in range(len(f.slot)):

@@ -132,7 +132,11 @@ def collapse(f: Filter, i: int, n: int, prior: float, odds: float) -> None:
         x[c] += mean * few[c, i - 3]
         for d in range(3):
             x[3 + 3 * c + d] += change * few[c, i - 3] * few[d, i - 3]
-    for j in range(3, n):
-        few[j, width] += mean * few[j, i - 3] if j != i else (there - 1.0) * m
-        for k in range(i + 1, n):
-            few[j, k - 3] += change * few[j, i - 3] * few[i, k - 3]
+    for j in range(n):
+        if j != i:
+            few[j, width] += mean * few[j, i - 3]
+            for k in range(i + 1, n):
+                few[j, k - 3] += change * few[j, i - 3] * few[i, k - 3]
+    few[i, width] = there * m
+    for k in range(i + 1, n):
+        few[i, k - 3] *= 1.0 + change * p
