@@ -142,8 +142,8 @@ def test_the_filter_is_its_oracle(crossing: Fleet, case: str, robust: bool) -> N
     assert track.neighbours is not None
     for run in range(2):
         x, cov, others = Oracle(seen, 0, run, known, Guards() if robust else NO_GUARDS, robust).loop()
-        assert_allclose(track.x[run, :, 0], x, atol=2e-5)
-        assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=2e-5)
+        assert_allclose(track.x[run, :, 0], x, atol=1e-6)
+        assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=1e-6)
         if len(track.neighbours[run]):
             assert_allclose(track.neighbours[run], np.concatenate(others), atol=1e-5)
 

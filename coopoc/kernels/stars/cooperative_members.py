@@ -164,12 +164,13 @@ def predict_member(f: Filter, model: Model, guards: Guards, rows: Floats, k: int
     A velocity that has served for L s and serves for dt more makes an error of (L + dt)^2 - L^2 times its own variance.
     """
     g, row, dt = f.g, f.row[k], f.clock[1]
-    first, age, sent = 3 * g.block[k, PLACE], rows[row, AGE], f.clock[0] - rows[row, AGE]
+    age, sent = rows[row, AGE], f.clock[0] - rows[row, AGE]
     if has(g, k, VELOCITY) and 0.0 <= age <= ROUNDING and f.status[f.vehicle[k], USED] > sent - 1.5 * dt:
         remove(g, k, VELOCITY)
         remove(g, k, CLONE)
     if late(f, guards, rows, k):
         update_velocity(f, guards, rows, k)
+    first = 3 * g.block[k, PLACE]
     if has(g, k, VELOCITY):
         v = 3 * g.block[k, VELOCITY]
         widen(g, v, (guards.acceleration * dt) ** 2)
