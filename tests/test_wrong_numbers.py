@@ -115,7 +115,7 @@ def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Flo
     if kind in ("position", "odometer"):
         getattr(sent, kind)[sender, run, step] += error
     seen = measurements(given, EGO, inbox(given, EGO, method.message))
-    x, cov = run_filter(seen, assumptions(given, known), sent, model_of(known, True), method.guards)[:2]
+    x, cov = run_filter(seen, assumptions(given, known), sent, model_of(known, True, method.guards), method.guards)[:2]
     return x, np.sqrt(np.trace(cov, axis1=-2, axis2=-1))
 
 
@@ -157,16 +157,19 @@ def wild_fixes(steps: int) -> tuple[co.Recording, np.ndarray, KalmanFilter]:
 
 
 def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() -> None:
-    """filterpy, its R such that S is q / gate times as large where q = y' S^-1 y exceeds the gate. The flat prior
-    weighs 1e-6 of a fix."""
-    (drive, process, peer), method = wild_fixes(200), CooperativeFilter(guards=Guards(forget=0.0))
-    track, gate = method(drive, [0]), method.guards.fix_gate
+    """filterpy, its R such that S is q / limit times as large where q = y' S^-1 y exceeds the limit, and beyond REJECTED
+    limits left out. The flat prior weighs 1e-6 of a fix."""
+    alone = Guards(forget=0.0, heading=0.0, scale=0.0, slip=0.0)
+    (drive, process, peer), method = wild_fixes(200), CooperativeFilter(guards=alone)
+    track, limit, hits = method(drive, [0]), method.guards.fix_gate, 0.0
     for t in range(1, 200):
         peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
         innovation, S = drive.gnss[0, t, 0] - peer.x, peer.P + 12.25 * np.eye(3)
         q = innovation @ np.linalg.solve(S, innovation)
-        share = max(q / gate, 1.0)
-        peer.update(drive.gnss[0, t, 0], R=12.25 * np.eye(3) + (share - 1.0) * S)
+        gain, share = 1 - 3 * 12.25 / np.trace(S), max(q / limit, 1.0) if hits < gate.PATIENCE else 1.0
+        hits = hits + gain if q > limit else max(hits - gate.LEAK * gain, 0.0)
+        if share < gate.REJECTED:
+            peer.update(drive.gnss[0, t, 0], R=12.25 * np.eye(3) + (share - 1.0) * S)
         assert track.x[0, t, 0] == pytest.approx(peer.x, abs=1e-3), t
 
 
