@@ -41,7 +41,7 @@ def test_textbook_is_the_joint_filter(channel: str, change: Callable[[Recording]
 
 
 def test_alone_it_is_the_kalman_filter() -> None:
-    """With hypotheses off, but for the prior of the start, 1e6 m^2 beside a fix of 12 m^2; no fix is beyond the gate."""
+    """With nothing assumed to be wrong; the prior of the start is 1e6 m^2, a fix 12 m^2, and none beyond its gate."""
     seen = observe(drive(), replace(S2, gnss_std=(1.0,) * 3), V2X(0), observers=[0], assumed=S2)
     ours, kalman = CooperativeFilter(guards=Guards(forget=0.0, heading=0.0, scale=0.0, slip=0.0))(seen), Kalman()(seen)
     assert_allclose(ours.x, kalman.x, atol=1e-3)
@@ -142,8 +142,8 @@ def test_the_filter_is_its_oracle(crossing: Fleet, case: str, robust: bool) -> N
     assert track.neighbours is not None
     for run in range(2):
         x, cov, others = Oracle(seen, 0, run, known, Guards() if robust else NO_GUARDS, robust).loop()
-        assert_allclose(track.x[run, :, 0], x, atol=1e-6)
-        assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=1e-6)
+        assert_allclose(track.x[run, :, 0], x, atol=2e-5)
+        assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=2e-5)
         if len(track.neighbours[run]):
             assert_allclose(track.neighbours[run], np.concatenate(others), atol=1e-5)
 

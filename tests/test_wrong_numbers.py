@@ -157,8 +157,8 @@ def wild_fixes(steps: int) -> tuple[co.Recording, np.ndarray, KalmanFilter]:
 
 
 def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() -> None:
-    """filterpy, its R such that S is q / limit times as large where q = y' S^-1 y exceeds the limit, and beyond REJECTED
-    limits left out. The flat prior weighs 1e-6 of a fix."""
+    """filterpy, its R such that S is q / limit times as large where q = y' S^-1 y exceeds the limit; beyond REJECTED
+    limits the fix is left out. The flat prior weighs 1e-6 of a fix."""
     alone = Guards(forget=0.0, heading=0.0, scale=0.0, slip=0.0)
     (drive, process, peer), method = wild_fixes(200), CooperativeFilter(guards=alone)
     track, limit, hits = method(drive, [0]), method.guards.fix_gate, 0.0

@@ -217,5 +217,5 @@ def model_of(noise_model: NoiseModel, robust: bool, guards: Guards) -> Model:
         absent[2:][np.array([bias, offset]) > 0.0] = -np.inf
         bias, offset = bias or guards.compass**2, offset or guards.offset**2
     shape = float(least), float(noise_model.exact_relative), FORGOTTEN, ACCELERATION_STD
-    lasting = own, common, time, white, bias, heading, offset
-    return Model(std, *shape, *lasting, float(robust), np.square(turn), lasts, absent, guards.slip)
+    more = float(robust), np.square(turn), lasts, absent, guards.slip
+    return Model(std, *shape, own, common, time, white, bias, heading, offset, *more)

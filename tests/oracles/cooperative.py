@@ -380,7 +380,9 @@ class Oracle:
         gap, own = z - h @ b.x, h @ b.p @ h.T
         square = float(gap @ np.linalg.solve(own + np.diag(r), gap))
         self.count(min(square, FIX_SCORE), np.linalg.slogdet(own + np.diag(r))[1], len(used))
-        q, gain, locked = min(square, float(gap @ gap) / SLIP), np.trace(own) / (np.trace(own) + r.sum()), s["locked"]
+        quiet = math.exp(-min(s["level"][3], 0.0)) if j == self.ego else 1.0
+        total, gain, locked = np.trace(own) + r.sum(), np.trace(own) / (np.trace(own) + r.sum()), s["locked"]
+        q = min(square, float(gap @ gap) / SLIP) * total / (np.trace(own) + quiet * r.sum())
         share, hits = 1.0, locked.get(j, 0.0)
         if g.fix_gate:
             if q > g.fix_gate and hits < PATIENCE:

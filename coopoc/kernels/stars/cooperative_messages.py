@@ -10,6 +10,7 @@ from ..gate import SLIP, count, inflation
 from .cooperative_state import (
     AGE,
     COUNT,
+    FIXES,
     LAST,
     MEAN,
     ODOMETER,
@@ -130,6 +131,8 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
         if h.used[c]:
             own, noise = own + h.cov[4 * c], noise + h.variance[c]
     share = 1.0
+    quiet = math.exp(-min(f.level[0, FIXES], 0.0)) if k == 0 else 1.0
+    q *= (own + noise) / (own + quiet * noise)  # fixes that agree better than is assumed are as wrong as any, together
     if guards.fix_gate > 0.0:
         share = 1.0 / inflation(q, guards.fix_gate, f.locked[k])
         f.locked[k] = count(q, guards.fix_gate, f.locked[k], own / (own + noise))

@@ -105,7 +105,7 @@ class Guards(NamedTuple):
 
 
 NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, trust=0.0, forget=0.0, acceleration=0.0, heading=0.0, scale=0.0, slip=0.0)
-ON_ROADS = Guards(fix_gate=3.5, scale=0.03, lasts=1e4, compass=0.0, offset=0.0, absent=-math.inf, fix=2.0)
+ON_ROADS = Guards(fix_gate=3.5, heading=0.03, scale=0.03, lasts=1e4, compass=0.0, offset=0.0, absent=-math.inf, fix=2.0)
 """Of measurements that are not simulated: no odometry is without such errors."""
 RANGES, AZIMUTHS, INCLINATIONS, FIXES, MOTIONS = range(5)
 KINDS_OF_NUMBERS, FOUND = 5, 10

@@ -51,7 +51,8 @@ def remember_speed(f: Filter, own: Floats) -> None:
 @part
 def slip_variance(f: Filter, model: Model, dt: float) -> float:
     """m^2, of the ego's motion in a step, if it is assumed to slip."""
-    return f.slip[NOW] * (model.slip * f.slip[SPEED_OF_LATE] * dt) ** 2
+    variance: float = f.slip[NOW] * (model.slip * f.slip[SPEED_OF_LATE] * dt) ** 2
+    return variance
 
 
 @part
