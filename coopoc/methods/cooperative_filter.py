@@ -22,18 +22,18 @@ from .noise_model import NoiseModel, resolve
 from .track import Checked, Track
 
 NOTHING = np.zeros((1, 1, 1, 3))
-FOUND = (
-    "heading_error",
-    "scale_error",
-    "compass_error",
-    "range_offset",
-    "slips",
-    "range_level",
-    "azimuth_level",
-    "inclination_level",
-    "fix_level",
-    "motion_level",
-)
+FOUND = {
+    "heading error": "rad",
+    "scale error": "",
+    "compass error": "rad",
+    "range offset": "m",
+    "slips": "of the steps",
+}
+LEVELS = ("range", "azimuth", "inclination", "fix", "motion")
+NOTED = (0.01, 0.01, 0.01, 0.1, 0.01)
+"""Least of what is found that is worth a note."""
+LOUD = 1.5
+"""Level that is worth a note, or less than its inverse."""
 KINDS = ("range", "azimuth", "inclination", "message", "trusted")
 
 
@@ -72,11 +72,17 @@ class CooperativeFilter(Checked):
       $p(b_j = 0 \mid \text{all}) / p(b_j = 0)$ allow, $b_j$ is set to 0, the surest first, and all its fixes count in
       retrospect. A mean innovation that has become unlikely revokes the trust, in the ego's own receiver, too.
     - *Gates*: where the squared Mahalanobis distance $q$ of a fix, or of a component of a relative measurement,
-      exceeds its gate, the innovation's covariance is multiplied by $q / \mathrm{gate}$, that of a component far beyond
-      it by 100 more. A member that is contradicted for too long joins anew; an ego that rests on nothing that is
-      trusted starts anew. Velocities that no vehicle can have reached are replaced by the last ones.
+      exceeds its gate, the innovation's covariance is multiplied by $q / \mathrm{gate}$; that of a component far beyond
+      it by 100 more, and a fix far beyond it is left out, until many were (`kernels.gate`). A member that is
+      contradicted for too long joins anew; an ego that rests on nothing that is trusted starts anew. Velocities that
+      no vehicle can have reached are replaced by the last ones.
     - *Levels*: the variances of fixes, ranges, azimuths, inclinations and motions follow their innovations, between
       0.14 and 33 times what is assumed, by recursive maximum likelihood (`kernels.stars.levels`).
+    - *Errors that last and may not be there*: of heading $b$ and scale $s$ of each odometry,
+      $x_t = x_{t-1} + (1 + s) R(b) \Delta t \, u$, of the ego's compass and of its ranges. Each is a state with a wide
+      prior, and the estimate is the average over whether it is 0, by Bayes' rule (`kernels.stars.lasting`).
+    - *Slips*: a step whose numbers surprise is tried again with a motion that is not known, and the likelier of both
+      is kept (`kernels.stars.slip`).
     - *Messages* hold the estimate of the same filter alone, its variance, the odometer and the velocity. The fixes that
       were used between two of them follow, so that a lost message loses nothing and no fix counts twice.
 
@@ -84,7 +90,9 @@ class CooperativeFilter(Checked):
         noise_model: "identity", "nominal" or a NoiseModel, whose errors that last (fixes, compass, ranges) are states.
         robust: False gives the textbook filter, `JointFilter`: all errors white, all members honest. With the identity
             noise model nothing is gated.
-        guards: limits of the above; the default was chosen on development worlds and validation tasks of CL-Bench.
+        guards: limits of the above; the default was chosen on development worlds and validation tasks of CL-Bench, and
+            is `kernels.stars.cooperative_state.ON_ROADS` where measurements are not simulated: there errors of
+            odometry are always assumed, and fixes to err twice as far as is stated, together for a while.
 
     References:
         Ljung, Soderstrom, Theory and Practice of Recursive Identification, MIT Press, 1983;
@@ -114,8 +122,11 @@ class CooperativeFilter(Checked):
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.
 
-        `extras` hold the weights, 1 for a number that was believed, of each ego's "fix" (R, T, E) and by link (R, L) of
-        "range", "azimuth", "inclination" and "message", NaN where there was none, and whether it is "trusted".
+        `extras` hold what is found to be otherwise than assumed, (R, T, E) each: the ego's "heading_error" and
+        "compass_error" rad, "scale_error" and "range_offset" m; whether it "slips"; "range_level" and so on, factors of
+        standard deviations. And the weights, 1 for a number that was believed, of each ego's "fix" (R, T, E) and by
+        link (R, L) of "range", "azimuth", "inclination" and "message", NaN where there was none, and whether it is
+        "trusted".
         """
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         guards = guards_of(self, known, recording.measured)
@@ -134,8 +145,10 @@ class CooperativeFilter(Checked):
             seen = measurements(recording, ego, box)
             x, cov, neighbours, fixes, weights, found = run_filter(seen, assumed, sent(), model, guards)
             extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate(KINDS)}
-            extras |= {name: found[..., i, None] for i, name in enumerate(FOUND)}
+            names = (*(name.replace(" ", "_") for name in FOUND), *(f"{kind}_level" for kind in LEVELS))
+            extras |= {name: found[..., i, None] for i, name in enumerate(names)}
             mine = recording.ids[ego]
+            notes.extend(otherwise(mine, found) if guards.trust else ())
             notes.extend(rejected(f"fixes, {mine}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
             if model.own + model.common == 0.0 and guards.fix_gate:
                 notes.extend(lasting(mine, recording.gnss[:, :, ego] - x, recording.dt))
@@ -168,6 +181,32 @@ def broadcasts(recording: Recording, noise_model: NoiseModel, egos: Sequence[int
         variance[j, :, :last] = np.diagonal(cov, axis1=-2, axis2=-1)
         np.nancumsum(recording.dt * recording.velocity[:, :last, j], axis=1, out=moved[j, :, :last])
     return Sent(x, variance, moved)
+
+
+def otherwise(ego: str, found: Floats) -> list[str]:
+    """Notes of what is otherwise than assumed in the second half of a drive, mean squares over runs and steps.
+
+    Args:
+        ego: its name.
+        found: (R, T, 10) errors that last, whether it slips, and levels.
+
+    >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0]]]))
+    ['scale error, a: 0.02', 'fix level, a: 3 times the assumed deviation']
+    """
+    late = found[:, found.shape[1] // 2 :]
+    usual = np.sqrt(np.nanmean(np.square(late), axis=(0, 1)))
+    usual[4] = np.nanmean(found[..., 4])
+    notes = [
+        f"{name}, {ego}: {value:.2g} {unit}".rstrip()
+        for (name, unit), value, least in zip(FOUND.items(), usual, NOTED, strict=False)
+        if value > least
+    ]
+    levels = zip(LEVELS, usual[len(FOUND) :], strict=True)
+    return notes + [
+        f"{kind} level, {ego}: {value:.2g} times the assumed deviation"
+        for kind, value in levels
+        if not 1 / LOUD < value < LOUD
+    ]
 
 
 def rejected(what: str, count: int, measured: int, share: float = 0.05) -> list[str]:
@@ -217,5 +256,7 @@ def model_of(noise_model: NoiseModel, robust: bool, guards: Guards) -> Model:
         absent[2:][np.array([bias, offset]) > 0.0] = -np.inf
         bias, offset = bias or guards.compass**2, offset or guards.offset**2
     shape = float(least), float(noise_model.exact_relative), FORGOTTEN, ACCELERATION_STD
-    more = float(robust), np.square(turn), lasts, absent, guards.slip
-    return Model(std, *shape, own, common, time, white, bias, heading, offset, *more)
+    turns = np.square(turn)
+    return Model(
+        std, *shape, own, common, time, white, bias, heading, offset, float(robust), turns, lasts, absent, guards.slip
+    )
