@@ -113,8 +113,9 @@ def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Flo
     sent = broadcasts(given, known, [EGO], method.guards)
     if kind in ("position", "odometer"):
         getattr(sent, kind)[sender, run, step] += error
-    seen = measurements(given, EGO, inbox(given, EGO, method.message))
-    x, cov = run_filter(seen, assumptions(given, known), sent, model_of(known, True), method.guards)[:2]
+    box = inbox(given, EGO, method.message)
+    seen, assumed = measurements(given, EGO, box), assumptions(given, known, EGO, box)
+    x, cov = run_filter(seen, assumed, sent, model_of(known, True), method.guards)[:2]
     return x, np.sqrt(np.trace(cov, axis1=-2, axis2=-1))
 
 
@@ -152,7 +153,7 @@ def wild_fixes(steps: int) -> tuple[co.Recording, np.ndarray, KalmanFilter]:
     gnss[0, wild, 0] += rng.choice([-1, 1], (wild.sum(), 3)) * 10.0 ** rng.uniform(0.5, 4, (wild.sum(), 3))
     peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
     peer.x, peer.P, peer.B, peer.H, peer.R = gnss[0, 0, 0], 12.25 * np.eye(3), 0.1 * np.eye(3), np.eye(3), np.eye(3)
-    return replace(drive, gnss=gnss), (0.1 * S2.assumed_velocity_std(drive.velocity[0, :, 0])) ** 2, peer
+    return replace(drive, gnss=gnss), (0.1 * S2.assumed_velocity_std(drive.velocity, 0.1)[0, :, 0]) ** 2, peer
 
 
 def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() -> None:

@@ -125,13 +125,18 @@ def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats |
     )
 
 
-def assumptions(recording: Recording, noise_model: NoiseModel) -> Assumptions:
-    """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a
-    velocity."""
-    process, motion = process_noise(noise_model, recording)
+def assumptions(recording: Recording, noise_model: NoiseModel, ego: int, box: Inbox | None = None) -> Assumptions:
+    """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a velocity.
+
+    Args:
+        recording: of all vehicles.
+        noise_model: of the filter.
+        ego: column.
+        box: its messages; None where it is alone.
+    """
+    process = process_noise(noise_model, recording, [ego], box=box)
     fixes = np.ascontiguousarray(noise_model.fix_variance(recording))
-    noise = relative_noise(noise_model)
-    return Assumptions(process, fixes, fixes, FIX_GROWTH, *noise, FORGOTTEN, ACCELERATION_STD, motion)
+    return Assumptions(process, fixes, fixes, FIX_GROWTH, *relative_noise(noise_model), FORGOTTEN, ACCELERATION_STD)
 
 
 def relative_noise(noise_model: NoiseModel) -> tuple[Floats, float]:

@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from ..arrays import Floats, number, plain
 from ..errors import InputError, shown
-from ..kernels.dead_reckoning import ROUNDING, push, since
+from ..kernels.dead_reckoning import ROUNDING, SQUARE, push, since
 
 
 class MotionHistory:
-    """The newest motions of a vehicle, `span` seconds or what there has been, for fixes that come late.
+    """The newest motions of a vehicle, `span` seconds or what there has been, for fixes that come late, and its pace.
 
     Args:
         span: s.
@@ -23,7 +23,7 @@ class MotionHistory:
 
     def __init__(self, span: float) -> None:
         self.rows: Floats = np.zeros((65, 7))
-        self.rows[0, 3] = seconds("history", span)
+        self.rows[0, 3], self.rows[0, SQUARE] = seconds("history", span), np.nan
 
     def __len__(self) -> int:
         return int(self.rows[0, 1])

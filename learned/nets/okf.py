@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -13,7 +14,7 @@ from torch import Tensor, nn
 from coopoc.arrays import Floats, checked, seed_of
 from coopoc.errors import InputError
 from coopoc.kernels.compiling.waiting import clock
-from coopoc.kernels.motion import MotionNoise
+from coopoc.kernels.motion import PACE, MotionNoise
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import solo_filter, solo_track
 from coopoc.methods.noise_model import check_interval
@@ -92,8 +93,9 @@ class OptimisedKF(Alone):
 class NoiseParameters(Gain):
     """The nine parameters of an OptimisedKF as a net: a federation of Kalman filters exchanges 36 bytes.
 
-    p = s + a^2 + (b dt u)^2;  k = p / (p + r^2);  x <- x + dt u + k (z - x - dt u);  s = (1 - k) p, with log a, log b,
-    log r per axis as weights. The squared error sees ratios of variances only; `calibrate` sets their common scale.
+    p = s + a^2 + (b dt v)^2 at the pace v;  k = p / (p + r^2);  x <- x + dt u + k (z - x - dt u);  s = (1 - k) p, with
+    log a, log b, log r per axis as weights. The squared error sees ratios of variances only; `calibrate` sets their
+    common scale.
 
     Args:
         seed: without effect, every net has this argument; the start is the same for each.
@@ -160,9 +162,10 @@ def scan(stds: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     noise, x = gnss_std.square(), batch.x0
     variance = noise if batch.exact is None else noise * (~batch.exact)[..., None]
     estimates, normalised = [], []
-    motions = process.square() + (ratio * batch.dt * batch.velocity).square()
-    for fix, speed, motion in zip(batch.gnss.unbind(), batch.velocity.unbind(), motions.unbind(), strict=True):
-        variance = variance + motion
+    square, share = batch.velocity[0].square(), -math.expm1(-batch.dt / PACE)
+    for fix, speed in zip(batch.gnss.unbind(), batch.velocity.unbind(), strict=True):
+        variance = variance + process.square() + (ratio * batch.dt).square() * square
+        square = square + share * (speed.square() - square)
         there = fix.isfinite()
         gain = torch.where(there, variance / (variance + noise), 0.0)
         innovation = fix - x - batch.dt * speed
