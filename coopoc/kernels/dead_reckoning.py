@@ -79,7 +79,7 @@ def dead_reckon(
     if missing == 0 and not -ROUNDING <= age <= history[0, 2] + ROUNDING:
         history[0, 0], history[0, 1], history[0, 2] = first, count, seen
         return BAD_INPUT
-    keep_pace(square, given[VELOCITY], forgotten(dt))
+    keep_pace(square, given[VELOCITY], dt, forgotten(dt))
     if missing > 0:
         return NO_FIX_YET
     since(history, age, since_fix, late)

@@ -13,6 +13,8 @@ from .compiling.compile import compiled, inside
 
 PACE = 0.5
 """s, time constant with which the pace forgets velocities."""
+SWIFT = 10.0
+"""m/s^2, beyond what vehicles accelerate."""
 
 
 class MotionNoise(NamedTuple):
@@ -64,10 +66,15 @@ def begin_pace(square: Floats, velocity: Floats) -> None:
 
 
 @inside
-def keep_pace(square: Floats, velocity: Floats, share: float) -> None:
-    """The pace after a velocity m/s, which has replaced that share of it."""
+def keep_pace(square: Floats, velocity: Floats, seconds: float, share: float) -> None:
+    """The pace after a velocity m/s has stood for some seconds, and has replaced that share of it.
+
+    One beyond twice the pace counts as no more than that and what SWIFT allows: a wrong velocity would leave all later
+    ones without weight.
+    """
     for c in range(3):
-        square[c] += share * (velocity[c] * velocity[c] - square[c])
+        own, most = velocity[c] * velocity[c], 4.0 * square[c] + (SWIFT * seconds) * (SWIFT * seconds)
+        square[c] += share * ((most if own > most else own) - square[c])
 
 
 @inside
@@ -97,7 +104,7 @@ def own_variances(noise: MotionNoise, velocity: Floats, columns: Ints, first: in
                 u, q = velocity[run, t, columns[e]], variance[run, t, e]
                 begin_pace(square[e], u)
                 q[0], q[1], q[2] = process_variance(noise, square[e], dt)
-                keep_pace(square[e], u, share)
+                keep_pace(square[e], u, dt, share)
     return variance
 
 
@@ -137,7 +144,7 @@ def received_variances(
             u, q = velocity[run, t, ego], variance[run, t, ego]
             begin_pace(square[ego], u)
             q[0], q[1], q[2] = process_variance(noise, square[ego], dt)
-            keep_pace(square[ego], u, share)
+            keep_pace(square[ego], u, dt, share)
         for link in range(len(step)):
             if newest[run, link] >= 0:
                 variance[run, newest[run, link], neighbour[link], 0] = -1.0
@@ -150,7 +157,7 @@ def received_variances(
             if held[j] < 0 or gap * dt > oldest + 1e-9:
                 own[:] = math.nan
             else:
-                keep_pace(own, velocity[run, held[j], j], share if gap == 1 else forgotten(gap * dt))
+                keep_pace(own, velocity[run, held[j], j], gap * dt, share if gap == 1 else forgotten(gap * dt))
             begin_pace(own, u)
             if q[0] < 0.0:
                 square[j], held[j] = own, t

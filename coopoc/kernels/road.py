@@ -175,7 +175,7 @@ def road_motion(motion: MotionNoise, square: Floats, velocity: Floats, dt: float
     """Write a step's motion m and its variance m^2 (3,), and keep the pace."""
     begin_pace(square, velocity)
     variance = process_variance(motion, square, dt)
-    keep_pace(square, velocity, forgotten(dt))
+    keep_pace(square, velocity, dt, forgotten(dt))
     for c in range(3):
         moved[c], q[c] = dt * velocity[c], variance[c]
 

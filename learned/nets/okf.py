@@ -14,7 +14,7 @@ from torch import Tensor, nn
 from coopoc.arrays import Floats, checked, seed_of
 from coopoc.errors import InputError
 from coopoc.kernels.compiling.waiting import clock
-from coopoc.kernels.motion import PACE, MotionNoise
+from coopoc.kernels.motion import PACE, SWIFT, MotionNoise
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import solo_filter, solo_track
 from coopoc.methods.noise_model import check_interval
@@ -165,7 +165,8 @@ def scan(stds: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     square, share = batch.velocity[0].square(), -math.expm1(-batch.dt / PACE)
     for fix, speed in zip(batch.gnss.unbind(), batch.velocity.unbind(), strict=True):
         variance = variance + process.square() + (ratio * batch.dt).square() * square
-        square = square + share * (speed.square() - square)
+        most = 4.0 * square + (SWIFT * batch.dt) ** 2
+        square = square + share * (torch.minimum(speed.square(), most) - square)
         there = fix.isfinite()
         gain = torch.where(there, variance / (variance + noise), 0.0)
         innovation = fix - x - batch.dt * speed

@@ -11,7 +11,8 @@ from coopoc.world.recording import Recording
 
 
 def heard(recording: Recording, box: Inbox | None, known: NoiseModel, run: int, ego: int) -> Floats:
-    """(T, N, 3) m^2. Of a neighbour the velocities count that were the newest ones held, each until the next one."""
+    """(T, N, 3) m^2. Of a neighbour the velocities count that were the newest ones held, each until the next one; none
+    beyond twice the pace and 10 m/s^2."""
     u, dt = recording.velocity[run], recording.dt
     noise = known.sensors
     if known.process_std is not None or known.fleet is not None or noise is None:
@@ -30,7 +31,8 @@ def heard(recording: Recording, box: Inbox | None, known: NoiseModel, run: int, 
                 square[t, j] = u[t, j] ** 2
             else:
                 keep = math.exp(-(t - last) * dt / 0.5)
-                square[t, j] = keep * square[last, j] + (1 - keep) * u[last, j] ** 2
+                most = 4 * square[last, j] + (10 * (t - last) * dt) ** 2
+                square[t, j] = keep * square[last, j] + (1 - keep) * np.fmin(u[last, j] ** 2, most)
             if np.isnan(u[t, j]).any():
                 square[t, j] = np.nan
             last = t if t in held else last

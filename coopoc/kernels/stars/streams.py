@@ -99,7 +99,7 @@ def stream_rows(
             if not gap <= max_age + ROUNDING:
                 square[:] = math.nan
             elif gap > ROUNDING:
-                keep_pace(square, newest[SPEED:STEP], forgotten(gap))
+                keep_pace(square, newest[SPEED:STEP], gap, forgotten(gap))
             begin_pace(square, row[SPEED:STEP])
             newest[SOLO:STEP], newest[AGE] = row[SOLO:STEP], sent
         age = max(time - newest[AGE], 0.0)
