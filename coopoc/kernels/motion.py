@@ -66,7 +66,7 @@ def begin_pace(square: Floats, velocity: Floats) -> None:
 
 
 @inside
-def keep_pace(square: Floats, velocity: Floats, seconds: float, share: float) -> None:
+def keep_pace(square: Floats, velocity: Sequence[float] | Floats, seconds: float, share: float) -> None:
     """The pace after a velocity m/s has stood for some seconds, and has replaced that share of it.
 
     One beyond twice the pace counts as no more than that and what SWIFT allows: a wrong velocity would leave all later

@@ -46,6 +46,7 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
     (steps, members), (ratio, floor, of_speed) = drive.active.shape, noise.velocity
     out, covs = np.zeros((steps, members, d)), np.zeros((steps, members, d, d))
     x, P, lasting = np.zeros((members, d)), np.zeros((members * d,) * 2), np.array(noise.lasting)[: d - 4]
+    pace = np.zeros((members, 3))
     grown = (lasting * [1 - noise.keep**2, 1 - noise.keep**2, 0][: d - 4]).tolist()  # an offset stays
     for t in range(steps):
         F, Q = [], []
@@ -53,7 +54,10 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
             own = drive.own[run, t, n]
             if t and drive.active[t - 1, n] and drive.active[t, n]:
                 u, state = own[4:], x[n].copy()
-                size = np.full(3, np.linalg.norm(u[:3])) if of_speed else np.abs(u[:3])
+                size = np.full(3, np.sqrt(pace[n].sum())) if of_speed else np.sqrt(pace[n])
+                pace[n] += -np.expm1(-drive.dt / 0.5) * (
+                    np.fmin(u[:3] ** 2, 4 * pace[n] + (10 * drive.dt) ** 2) - pace[n]
+                )
                 q = np.append(np.maximum(ratio * size, floor) ** 2, noise.yaw_rate)
                 F.append(jacobian(lambda s, u=u: motion(s, u, drive.dt), state))
                 G = jacobian(lambda v, s=state: motion(s, v, drive.dt), u)
@@ -63,6 +67,7 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
                 x[n, 4:6] *= noise.keep
                 continue
             F.append(np.zeros((d, d)))
+            pace[n] = own[4:7] ** 2
             wide = np.array([FLAT] * 3 + [UNKNOWN] + list(lasting))
             x[n] = np.append(np.nan_to_num(own[:4]), np.zeros(d - 4))
             if t == 0:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 from ...arrays import Floats
 from ..compiling.compile import part
 from ..gate import YOUNG
+from ..motion import forgotten, keep_pace
 from .scalar_update import HEADING, OFFSET, Poses, Three
 
 UNKNOWN_HEADING = math.pi**2 / 3.0
@@ -22,7 +23,6 @@ class PoseNoise(NamedTuple):
         heading: rad^2, of a compass.
         relative: three variances, m^2, rad^2, rad^2.
         velocity: noise of the odometer: ratio, least std m/s, 1 for a ratio of the speed on every axis.
-        late: share of the last velocity in the mean square that the ratio is of; 1 for its own.
         yaw_rate: rad^2/s^2.
         lasting: stationary variances of scale error, of yaw-rate bias, rad^2/s^2, and of the offset of ranges, m^2.
         longer: 1 where that offset is a state, else 0.
@@ -35,7 +35,6 @@ class PoseNoise(NamedTuple):
     heading: float
     relative: Three
     velocity: Three
-    late: float
     yaw_rate: float
     lasting: Three
     longer: float
@@ -45,16 +44,11 @@ class PoseNoise(NamedTuple):
 
 
 @part
-def velocity_variances(poses: Poses, member: int, u: Three, noise: PoseNoise) -> Three:
-    """Variance (m/s)^2 of each component of a measured velocity, forward, left and up.
-
-    It follows the mean square of late velocities: a share of a measured one is small where the error makes it slow, and
-    of a fleet that holds together the slow ones would count more.
-    """
+def velocity_variances(poses: Poses, member: int, u: Three, dt: float, noise: PoseNoise) -> Three:
+    """Variance (m/s)^2 of each component of a measured velocity, forward, left and up, by the pace before it."""
     ratio, floor, of_speed = noise.velocity
-    for i in range(3):
-        poses.level[member + i] += noise.late * (u[i] * u[i] - poses.level[member + i])
     a, b, c = poses.level[member], poses.level[member + 1], poses.level[member + 2]
+    keep_pace(poses.level[member : member + 3], u, dt, forgotten(dt))
     if of_speed > 0.0:
         a = b = c = a + b + c
     least, square = floor * floor, ratio * ratio
@@ -78,7 +72,7 @@ def predict(poses: Poses, member: int, d: int, velocity: Three, rate: float, dt:
         noise: that is assumed.
     """
     x, cov, (forward, left, up) = poses.x, poses.cov, velocity
-    qf, ql, qu = velocity_variances(poses, member, velocity, noise)
+    qf, ql, qu = velocity_variances(poses, member, velocity, dt, noise)
     scale, bias = 1.0, 0.0
     if d > 4:
         scale, bias = 1.0 / (1.0 + x[member + 4]), x[member + 5]

@@ -50,7 +50,7 @@ class Poses(NamedTuple):
         gains: (ROWS, size) P h / s of these.
         weights: (ROWS,) 1 / s of these.
         hits: (size,) of `coopoc.kernels.gate`: of fixes at a member's first number, of its other rows at the second.
-        level: (size,) mean square (m/s)^2 of late velocities, forward, left and up, at each member's first numbers.
+        level: (size,) square (m/s)^2 of the pace forward, left and up, at each member's first numbers.
         totals: (3,) sum of r^2 / s + log s, number of rows that were used, and of those that are pending.
     """
 
