@@ -3,8 +3,9 @@
 from coopoc.errors import MissingLibraryError
 
 try:
-    import torch as torch
+    import torch as torch  # the larger one is named first
+    import safetensors as safetensors  # isort: skip
 except ModuleNotFoundError as error:
-    if error.name != "torch":
+    if error.name not in ("safetensors", "torch"):
         raise
-    raise MissingLibraryError("torch", "a learned gain", "'coopoc[learned]'") from None
+    raise MissingLibraryError(error.name, "a learned gain", "'coopoc[learned]'") from None

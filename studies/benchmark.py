@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import re
 import sys
 import time
 import traceback
@@ -21,18 +20,18 @@ from coopoc.arrays import number
 from coopoc.errors import InputError, said, unknown
 from coopoc.evaluate.scores import scored
 from coopoc.evaluate.statistics import mean_interval, paired_difference
-from coopoc.file_names import given_path
 from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
 from coopoc.methods.track import Method
-from coopoc.one_file import file_digest, in_file
+from coopoc.one_file import in_file
 from coopoc.plugins import find, names
 from coopoc.study.numbers import three
-from coopoc.study.provenance import environment
 from coopoc.study.study import Params, Row
 
-from .lineup import own
-from .roads import road_row, roads
-from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, VERSION, Task, bound, graph_row, pose_row, recording, rounded
+from .convoys import CONVOYS, convoy_row
+from .lineup import named_method, own
+from .roads import ROADS, road_row, roads
+from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, Task, bound, graph_row, pose_row, recording, rounded
+from .worlds_card import card_file, card_head, overview, run_worlds
 
 ROAD = "road-kalman"
 """Of which others are shown to be better or worse on the same blocks of real roads."""
@@ -46,9 +45,13 @@ def benchmark(
     validation: bool = False,
     seed: int | None = None,
     tasks: Annotated[tuple[str, ...], arg(metavar="TASK")] = (),
+    worlds: int = 0,
+    jobs: int = 1,
     table: bool = False,
 ) -> int:
-    """Run CL-Bench on methods: fixed tasks, seeds, egos and scores; one JSON card per method, and their table.
+    """Run CL-Bench on methods: drawn worlds, or fixed tasks; one JSON card per method, and their table.
+
+    Example: coopoc benchmark joint mine.py:Own --worlds 200
 
     Example: coopoc benchmark joint lkf-sa mine.py:Own
 
@@ -63,16 +66,24 @@ def benchmark(
         out: folder of the cards.
         data: folder with the files of the tasks of real measurements (docs/benchmark.md), besides those that coopoc
             data get has fetched, or a log of your own with a truth, on which solo methods are run in the same way.
-        validation: run the validation tasks, for choosing parameters; their cards cannot be submitted.
-        seed: of other draws, to see whether a card holds on them; these cards cannot be submitted either.
+        validation: run the validation tasks or worlds, for choosing parameters; their cards cannot be submitted.
+        seed: of other draws, to see whether a card holds on them; these cards cannot be submitted either. Of worlds
+            the first: --seed 7 --worlds 3 are 7, 8 and 9.
         tasks: run only these tasks.
+        worlds: number of worlds, of which each seed draws one, instead of tasks.
+        jobs: processes that run worlds.
         table: print the table of all cards in the folder, best first.
     """
+    if worlds:
+        if tasks or data:
+            allowed = "must stand without --tasks and --data"
+            raise InputError("worlds", worlds, allowed, "Run worlds and tasks one after the other.")
+        return run_worlds(methods, out / "worlds", worlds, seed, validation, jobs)
     known = {task.name: task for task in (VALIDATION if validation else TASKS)}
     if seed is not None:
         drawn = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number will do.")
         known = {name: replace(task, seed=drawn) for name, task in known.items()}
-    real = [*BEST, *(task.name for task in LOGGED), *roads(data)]
+    real = [*BEST, *(task.name for task in LOGGED), *roads(data), *CONVOYS]
     for name in tasks:
         if name not in (*known, *real):
             raise unknown("tasks", name, [*known, *real], "Leave it out for all.")
@@ -80,7 +91,7 @@ def benchmark(
         raise InputError("methods", "()", "must name a method", "coopoc list shows them; --table prints the cards.")
     for name in methods:
         if simulated(name):
-            method(name)
+            named_method(name)
         elif data is None and not tasks:
             hint = "Add --data FOLDER, or --tasks with what coopoc data get has fetched."
             raise InputError("data", None, f"must name the folder of measurements for {name}", hint)
@@ -95,33 +106,18 @@ def benchmark(
         failed += sum("failed" in row for row in made["tasks"])
         folder = out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}")
         folder.mkdir(parents=True, exist_ok=True)
-        file = folder / f"{re.sub(r'[^A-Za-z0-9-]+', '_', name).strip('_')}.json"
+        file = folder / card_file(name)
         file.write_text(json.dumps(made, indent=1) + "\n")
         print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
         print(page([made]))
     if table:
-        cards = [json.loads(file.read_text()) for file in sorted(out.glob("*.json"))]
-        if not cards:
+        drawn_worlds, cards = (
+            [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))] for folder in (out / "worlds", out)
+        )
+        if not cards and not drawn_worlds:
             raise InputError("out", str(out), "holds no card", "Run coopoc benchmark METHOD first.")
-        print(page(cards))
+        print(*filter(None, (overview(drawn_worlds), page(cards))), sep="\n\n")
     return int(failed > 0)
-
-
-def method(name: str) -> Method:
-    """A registered method under the nominal noise model, a shipped learned gain, or "mine.py:NAME".
-
-    Raises:
-        InputError: an unknown name.
-    """
-    if in_file(name) or name in names("coopoc.methods"):
-        made: Method = own(name)
-        return made
-    from coopoc.learned import load_method
-    from coopoc.learned.recipes import shipped_weights
-
-    if name not in shipped_weights() and not given_path(name).is_file():
-        raise unknown("method", name, [*names("coopoc.methods"), *shipped_weights()])
-    return load_method(name)
 
 
 def information(name: str, one: Method) -> str:
@@ -137,7 +133,7 @@ def information(name: str, one: Method) -> str:
 
 def tried(name: str, task: Task) -> Row:
     """A method's row for one task: error with its interval, bound, consistency, bytes and time."""
-    one = method(name)
+    one = named_method(name)
     held = information(name, one)
     seen, fleet = recording(task, held in ("", "fleet"))
     one(seen.between(0, 3), [task.columns[0]])  # compiles
@@ -157,13 +153,14 @@ def tried(name: str, task: Task) -> Row:
 
 
 def measurable(name: str, data: Path | None) -> list[str]:
-    """The tasks of real measurements for a name: graphs for a backend, logs for a pose filter, roads for a solo method;
-    of "mine.py:NAME" logs, or roads if it says `roads = True`."""
+    """The tasks of real measurements for a name: graphs for a backend, logs for a pose filter, roads for a solo method,
+    convoys for any other; of "mine.py:NAME" logs, or roads if it says `roads = True`."""
     if name in names("coopoc.backends"):
         return [*BEST]
     if name in POSES or (in_file(name) and not _on_roads(name)):
         return [task.name for task in LOGGED]
-    return [] if method(name).cooperative else [*roads(data)]
+    found = [] if named_method(name).cooperative else [*roads(data)]
+    return found + [*CONVOYS] * (roads(data) is ROADS)
 
 
 def measured(name: str, data: Path | None, tasks: Sequence[str] | None = None) -> list[Row]:
@@ -175,8 +172,10 @@ def measured(name: str, data: Path | None, tasks: Sequence[str] | None = None) -
             made: Callable[[], Row] = partial(graph_row, data, task, name)
         elif task in logged and task not in roads(data):
             made = partial(pose_row, logged[task], data, own(name) if in_file(name) else name)
+        elif task in CONVOYS:
+            made = partial(convoy_row, task, data, named_method(name))
         else:
-            made = partial(road_row, task, data, method(name))
+            made = partial(road_row, task, data, named_method(name))
         rows.append(_row(task, made))
     return rows
 
@@ -208,14 +207,11 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None, real: Seque
         data: folder of the real measurements, or None.
         real: tasks of real measurements; None for all that there are for the name, none without data.
     """
-    digest = file_digest(name, "method") if in_file(name) else ""
     rows = [
         _row(task.name, partial(tried, name, task)) for task in tqdm(list(tasks), desc=name, unit="task", delay=2.0)
     ]
     rows += measured(name, data, [] if data is None and real is None else real)
-    used = environment()
-    versions = {library: used[library] for library in ("coopoc", "numpy", "numba", "torch") if library in used}
-    return {"benchmark": VERSION, "method": name, "source": digest, "versions": versions, "tasks": rows}
+    return {**card_head(name), "tasks": rows}
 
 
 def page(cards: Iterable[Params]) -> str:

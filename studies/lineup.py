@@ -10,8 +10,10 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc.arrays import AnyArray, Floats
-from coopoc.errors import InputError
-from coopoc.plugins import find
+from coopoc.errors import InputError, unknown
+from coopoc.file_names import given_path
+from coopoc.one_file import in_file
+from coopoc.plugins import find, names
 from coopoc.study.study import Params, Row, Study
 from coopoc.world.fleet import Fleet
 from coopoc.world.links import stretches
@@ -142,6 +144,23 @@ def own(name: str, noise: NoiseModel | str = "nominal") -> Any:
             shows,
         )
     return method
+
+
+def named_method(name: str) -> Method:
+    """A registered method under the nominal noise model, a shipped learned gain, or "mine.py:NAME".
+
+    Raises:
+        InputError: an unknown name.
+    """
+    if in_file(name) or name in names("coopoc.methods"):
+        made: Method = own(name)
+        return made
+    from coopoc.learned import load_method
+    from coopoc.learned.recipes import shipped_weights
+
+    if name not in shipped_weights() and not given_path(name).is_file():
+        raise unknown("method", name, [*names("coopoc.methods"), *shipped_weights()])
+    return load_method(name)
 
 
 def start(p: Params) -> Floats | None:

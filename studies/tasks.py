@@ -247,14 +247,14 @@ def pose_row(task: Logged, folder: Path | None, made: Any) -> Row:
     track = made(recording, ids)
     seconds = time.perf_counter() - began
     account = of_track(track, recording, made.message)
-    squares = np.square(_blocks(errors(track, fleet)[0], start, task.block_s / fleet.dt))
+    squares = np.square(blocks_of(errors(track, fleet)[0], start, task.block_s / fleet.dt))
     level = mean_interval(np.sqrt(squares))
     row: Row = {"task": task.name, "data": hashed(path)}
     row |= {"rt_le_m": rounded(level)}
     if fleet.heading is None:
         row |= {"nees": round(float(np.nanmean(planar(track, fleet)[1][start:])), 2)}
     elif track.heading is not None:
-        turned = np.rad2deg(_blocks(heading_error(track, fleet)[0], start, task.block_s / fleet.dt))
+        turned = np.rad2deg(blocks_of(heading_error(track, fleet)[0], start, task.block_s / fleet.dt))
         row |= {"heading_deg": round(float(np.nanmean(turned)), 3)}
         row |= {"nees": round(float(np.nanmean(pose_nees(track, fleet)[0, start:])), 2)}
     received = account.of("online", "on air", "per receiver") / account.seconds
@@ -286,7 +286,7 @@ def planar(track: Track, fleet: Fleet) -> tuple[Floats, Floats]:
     return gap, np.einsum("ti,tij,tj->t", gap, np.linalg.inv(track.covariance[0, :, 0, :2, :2]), gap)
 
 
-def _blocks(error: Floats, start: int, length: float) -> Floats:
+def blocks_of(error: Floats, start: int, length: float) -> Floats:
     """(E, B) root mean square of errors (T, E) over blocks of steps from the start on, of those without a gap."""
     size = max(int(length), 1)
     parts = [error[first : first + size] for first in range(start, len(error) - size + 1, size)]

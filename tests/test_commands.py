@@ -133,9 +133,10 @@ def test_a_command_parses_and_names_what_exists(
     if name == "train" and given:
         assert plugins.find("coopoc.recipes", given["recipe"])
     if name == "benchmark":
-        from coopoc.studies.benchmark import method, simulated
+        from coopoc.studies.benchmark import simulated
+        from coopoc.studies.lineup import named_method
 
-        assert all(method(one) for one in given.get("methods", ()) if simulated(one))
+        assert all(named_method(one) for one in given.get("methods", ()) if simulated(one))
 
 
 CHEAP = [

@@ -41,9 +41,9 @@ def test_textbook_is_the_joint_filter(channel: str, change: Callable[[Recording]
 
 
 def test_alone_it_is_the_kalman_filter() -> None:
-    """But for the prior of the start, 1e6 m^2 beside a fix of 12 m^2; no fix is beyond the gate here."""
+    """But for levels, and the prior of the start, 1e6 m^2 beside a fix of 12 m^2; no fix is beyond the gate here."""
     seen = observe(drive(), replace(S2, gnss_std=(1.0,) * 3), V2X(0), observers=[0], assumed=S2)
-    ours, kalman = CooperativeFilter()(seen), Kalman()(seen)
+    ours, kalman = CooperativeFilter(guards=Guards(forget=0.0))(seen), Kalman()(seen)
     assert_allclose(ours.x, kalman.x, atol=1e-3)
     assert ours.covariance is not None
     assert kalman.covariance is not None

@@ -1,5 +1,6 @@
 """The engine: resume, failures, processes. The study is a real one that is installed as a third party's."""
 
+import sys
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +10,7 @@ from conftest import refused
 from small_runs import files, numbers
 
 from coopoc.study import store
-from coopoc.study.compute import WorkerDiedError, schedule
+from coopoc.study.compute import WorkerDiedError, compute, schedule
 from coopoc.study.publish import views
 from coopoc.study.run import plan, run_study
 from coopoc.study.study import Cell, Study
@@ -17,6 +18,9 @@ from coopoc.study.study import Cell, Study
 
 def test_two_processes_compute_what_one_computes(study: Study, tmp_path: Path) -> None:
     one = run_study(study, tmp_path / "one", jobs=1, progress=False)
+    with pytest.MonkeyPatch.context() as before:  # workers that are left over know not where the study is
+        before.setattr(sys, "path", [place for place in sys.path if not place.endswith("distribution")])
+        assert len(list(compute(repr, [Cell({}, {}, "a"), Cell({}, {}, "b")], 2))) == 2  # type: ignore[arg-type]
     two = run_study(study, tmp_path / "two", jobs=2, progress=False)
     pd.testing.assert_frame_equal(numbers(one.frame), numbers(two.frame), check_exact=True)
     for name in ("tables/rt_le.csv", "tables/rt_le.tex", "figures/rt_le.pdf", "figures/rt_le.png", "figures/rt_le.svg"):

@@ -22,6 +22,7 @@ from coopoc.evaluate.metrics import innovation_columns, neighbour_rt_le
 from coopoc.evaluate.scores import scored
 from coopoc.kernels import gate
 from coopoc.kernels.stars.cooperative_filter import run_filter
+from coopoc.kernels.stars.cooperative_state import Guards
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
 from coopoc.methods.cooperative_filter import broadcasts, model_of
 from coopoc.methods.egos import assumptions, measurements
@@ -157,15 +158,15 @@ def wild_fixes(steps: int) -> tuple[co.Recording, np.ndarray, KalmanFilter]:
 
 
 def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() -> None:
-    """filterpy, its R such that S is q / gate times as large where q = y' S^-1 y exceeds the gate, and a hundred times
-    that beyond four gates. The flat prior weighs 1e-6 of a fix."""
-    (drive, process, peer), method = wild_fixes(200), CooperativeFilter()
+    """filterpy, its R such that S is q / gate times as large where q = y' S^-1 y exceeds the gate. The flat prior
+    weighs 1e-6 of a fix."""
+    (drive, process, peer), method = wild_fixes(200), CooperativeFilter(guards=Guards(forget=0.0))
     track, gate = method(drive, [0]), method.guards.fix_gate
     for t in range(1, 200):
         peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
         innovation, S = drive.gnss[0, t, 0] - peer.x, peer.P + 12.25 * np.eye(3)
         q = innovation @ np.linalg.solve(S, innovation)
-        share = q / gate * (100.0 if q > 4.0 * gate else 1.0) if q > gate else 1.0
+        share = max(q / gate, 1.0)
         peer.update(drive.gnss[0, t, 0], R=12.25 * np.eye(3) + (share - 1.0) * S)
         assert track.x[0, t, 0] == pytest.approx(peer.x, abs=1e-3), t
 

@@ -58,12 +58,13 @@ class CooperativeFilter(Checked):
 
     - *Trust*: the fixes of a vehicle that is new have an unknown offset $b_j \sim N(0, \tau^2)$. When the odds
       $p(b_j = 0 \mid \text{all}) / p(b_j = 0)$ allow, $b_j$ is set to 0, the surest first, and all its fixes count in
-      retrospect. A mean innovation that has become unlikely revokes the trust, in the ego's own receiver, too: the
-      filter takes the last seconds again without these fixes.
+      retrospect. A mean innovation that has become unlikely revokes the trust, in the ego's own receiver, too.
     - *Gates*: where the squared Mahalanobis distance $q$ of a fix, or of a component of a relative measurement,
-      exceeds its gate, the innovation's covariance is multiplied by $q / \mathrm{gate}$, far beyond it by 100 more. A
-      member that is contradicted for too long joins anew; an ego that rests on nothing that is trusted starts anew.
-      Velocities that no vehicle can have reached are replaced by the last ones.
+      exceeds its gate, the innovation's covariance is multiplied by $q / \mathrm{gate}$, that of a component far beyond
+      it by 100 more. A member that is contradicted for too long joins anew; an ego that rests on nothing that is
+      trusted starts anew. Velocities that no vehicle can have reached are replaced by the last ones.
+    - *Levels*: the variances of fixes, ranges, azimuths, inclinations and motions follow their innovations, between
+      0.14 and 33 times what is assumed, by recursive maximum likelihood (`kernels.stars.levels`).
     - *Messages* hold the estimate of the same filter alone, its variance, the odometer and the velocity. The fixes that
       were used between two of them follow, so that a lost message loses nothing and no fix counts twice.
 
@@ -71,9 +72,10 @@ class CooperativeFilter(Checked):
         noise_model: "identity", "nominal" or a NoiseModel, whose errors that last (fixes, compass, ranges) are states.
         robust: False gives the textbook filter, `JointFilter`: all errors white, all members honest. With the identity
             noise model nothing is gated.
-        guards: limits of the above; the default was chosen on the validation tasks of CL-Bench.
+        guards: limits of the above; the default was chosen on development worlds and validation tasks of CL-Bench.
 
     References:
+        Ljung, Soderstrom, Theory and Practice of Recursive Identification, MIT Press, 1983;
         Chang, Robust Kalman filtering based on Mahalanobis distance as outlier judging criterion, J. Geodesy 88, 2014;
         Friedland, Treatment of bias in recursive filtering, IEEE TAC 14(4), 1969; Roumeliotis, Burdick, Stochastic
         cloning, IEEE ICRA, 2002.

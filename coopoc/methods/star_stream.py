@@ -148,13 +148,13 @@ class StarStream:
             filter = JointFilter(filter.noise_model, robust=False)
         known = constant_noise(filter.noise_model)
         start = np.full(3, np.nan) if x0 is None else three("x0", x0)
-        self._star: Joint | Recalled
-        self._alone: Recalled | None = None
+        self._star: Joint | Robust
+        self._alone: Robust | None = None
         self._guards = NO_GUARDS
         if isinstance(filter, CooperativeFilter):
             model, self._guards = model_of(known, robust=True), guards_of(filter, known)
-            self._star, self._white = Recalled(model, self._guards, start), model.white
-            self._alone = Recalled(model_of(known, robust=False), self._guards, start)
+            self._star, self._white = Robust(model, self._guards, start), model.white
+            self._alone = Robust(model_of(known, robust=False), self._guards, start)
         else:
             self._star = Joint(known, filter.exact, filter.robust, start)
         self._motion: MotionNoise = motion_noise(known, interval)
@@ -266,7 +266,7 @@ class StarStream:
 
 
 class Joint:
-    """The joint filter, step by step: `reserve` and `step` as those of `Recalled`.
+    """The joint filter, step by step: `reserve` and `step` as those of `Robust`.
 
     Args:
         known: noise model.
@@ -310,8 +310,8 @@ class Joint:
         return answer
 
 
-class Recalled:
-    """A filter that goes back and takes its last steps again where a vehicle has lost trust.
+class Robust:
+    """The cooperative filter, step by step.
 
     Args:
         model: noise model.
@@ -320,43 +320,18 @@ class Recalled:
     """
 
     def __init__(self, model: Model, guards: Guards, start: Floats) -> None:
-        self.model, self.guards, self.start, self.steps = model, guards, start, 0
-        self.filters = [make_filter(1, 1) for _ in range(3)]
-        self._inputs: list[tuple[Floats, Floats, Ints]] = []
+        self.model, self.guards, self.start = model, guards, start
+        self.filters = [make_filter(1, 1)]
 
     def reserve(self, slots: int, vehicles: int) -> None:
         """Room for a star of that many members, of that many vehicles."""
-        f = self.filters[0]
+        (f,) = self.filters
         if slots > len(f.vehicle) or vehicles > len(f.slot):
-            self.filters = [self._grown(f, max(len(f.vehicle), 2 * slots), vehicles) for f in self.filters]
-
-    def _grown(self, f: Filter, slots: int, vehicles: int) -> Filter:
-        larger = make_filter(slots, vehicles)
-        restore(f, larger, self.model, self.guards)
-        larger.revoked[: len(f.revoked)] = f.revoked
-        return larger
+            self.filters = [make_filter(max(len(f.vehicle), 2 * slots), vehicles)]
+            restore(f, self.filters[0])
 
     def step(self, own: Floats, rows: Floats, vehicles: Ints, last: Floats) -> Floats:
-        """Answer of `stream_step`; its arguments are kept."""
-        f, older, newer = self.filters
-        memory = int(self.guards.memory)
-        if memory and self.steps and self.steps % memory == 0:
-            restore(newer, older, self.model, self.guards)
-            restore(f, newer, self.model, self.guards)
-            del self._inputs[:-memory]
-        self.steps += 1
+        """Answer of `stream_step`."""
         answer = np.empty(12 + 3 * len(vehicles))
-        alarm = stream_step(f, self.model, self.guards, own, rows, vehicles, self.start, answer)
-        if not memory:
-            return answer
-        self._inputs.append((own, rows, vehicles))
-        while alarm:
-            restore(older, f, self.model, self.guards)
-            for k, (mine, theirs, who) in enumerate(self._inputs):
-                if k == len(self._inputs) - 1 - (self.steps - 1) % memory:
-                    restore(f, newer, self.model, self.guards)
-                answer = np.empty(12 + 3 * len(who))
-                alarm = stream_step(f, self.model, self.guards, mine, theirs, who, self.start, answer)
-                if alarm:
-                    break
+        stream_step(self.filters[0], self.model, self.guards, own, rows, vehicles, self.start, answer)
         return answer

@@ -9,13 +9,13 @@ import sys
 import time
 import traceback
 from collections.abc import Callable, Generator, Sequence
-from concurrent.futures.process import BrokenProcessPool
 from dataclasses import dataclass
 from typing import Any, TypeAlias
 
 import pyarrow as pa
 from joblib import Parallel, delayed, parallel_config
 from joblib.externals.loky import process_executor
+from joblib.externals.loky.process_executor import TerminatedWorkerError
 from threadpoolctl import threadpool_limits
 
 from ..errors import InputError
@@ -108,15 +108,21 @@ def compute(function: Function, cells: Sequence[Cell], jobs: int) -> Generator[O
         return
     for name, value in OF_WORKERS.items():
         os.environ.setdefault(name, value)
-    with parallel_config(backend="loky", inner_max_num_threads=1):
+    places = {"initializer": _import_from, "initargs": (tuple(sys.path),)}  # of others no worker is taken over
+    with parallel_config(backend="loky", inner_max_num_threads=1, **places):
         workers = Parallel(n_jobs=jobs, return_as="generator_unordered", batch_size=1, max_nbytes=None)
         try:
             yield from workers(delayed(_in_worker)(function, cell, os.getpid()) for cell in cells)
-        except BrokenProcessPool as error:
+        except TerminatedWorkerError as error:
             raise WorkerDiedError(
                 "A worker process was killed, mostly for want of memory. Finished cells are kept: "
                 "repeat the command to resume, with fewer --jobs."
             ) from error
+
+
+def _import_from(places: tuple[str, ...]) -> None:
+    """Import modules from where the process that started this one does."""
+    sys.path[:] = places
 
 
 def _in_worker(function: Function, cell: Cell, parent: int) -> Outcome:

@@ -2,7 +2,7 @@
 
 State: named vectors, ("x", j) position, ("b", j) error of fixes, ("v", j) velocity and ("c", j) clone of vehicle j,
 ("common",) and ("compass",). Numbers z = H x + noise beyond their gate have their innovations' covariance multiplied
-by q / gate, and by 100 more beyond four times the gate. What is vague has a variance of FLAT m^2.
+by q / gate, of relative ones by 100 more beyond four times the gate. What is vague has a variance of FLAT m^2.
 """
 
 import copy
@@ -13,8 +13,10 @@ import numpy as np
 
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
+from coopoc.kernels.gate import SLIP
 from coopoc.kernels.stars.cooperative_messages import CLIP
 from coopoc.kernels.stars.cooperative_state import Guards
+from coopoc.kernels.stars.levels import FASTEST, LOUDEST, PRIOR, QUIETEST, SUDDEN, USUAL
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector, wrap
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -75,12 +77,14 @@ class Belief:
         """One number; its squared normalised innovation."""
         return self.updates(h[None], np.array([z]), np.array([r]), gate)
 
-    def updates(self, h: Floats, z: Floats, r: Floats, gate: float = 0.0) -> float:
+    def updates(
+        self, h: Floats, z: Floats, r: Floats, gate: float = 0.0, far: float = 100.0, square: float | None = None
+    ) -> float:
         """Several numbers with one gate; their squared Mahalanobis distance."""
         gap, s = z - h @ self.x, h @ self.p @ h.T + np.diag(r)
-        q = float(gap @ np.linalg.solve(s, gap))
+        q = float(gap @ np.linalg.solve(s, gap)) if square is None else square
         if gate and q > gate:
-            s = s * (q / gate * (100.0 if q > 4 * gate else 1.0))
+            s = s * (q / gate * (far if q > 4 * gate else 1.0))
         gain = np.linalg.solve(s, h @ self.p).T
         self.x, self.p = self.x + gain @ gap, self.p - gain @ s @ gain.T
         return q
@@ -110,7 +114,7 @@ class Life(NamedTuple):
 
 
 class Oracle:
-    """The filter of one ego in one run; `loop` goes back where a member has lost trust."""
+    """The filter of one ego in one run."""
 
     def __init__(
         self, seen: Recording, ego: int, run: int, known: NoiseModel, guards: Guards, robust: bool, alone: bool = False
@@ -147,38 +151,22 @@ class Oracle:
         }
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.guards.trust else {self.ego}
-        return empty | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
+        levels = {"level": np.zeros(5), "learned": np.zeros(5), "information": np.zeros(5), "made": 0.0}
+        return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
     def loop(self) -> tuple[Floats, Floats, list[Floats]]:
         """x (T, 3), covariance (T, 3, 3), neighbours (k, 3) of each step."""
-        memory, steps = int(self.guards.memory), len(self.seen.t)
-        older = newer = (0, copy.deepcopy(self.state))
         found: list[Any] = []
-        t = 0
-        while t < steps:
+        for t in range(len(self.seen.t)):
             fix, u = self.seen.gnss[self.run, t, self.ego], self.seen.velocity[self.run, t, self.ego]
             if np.isnan(u[0]) or (not self.state["belief"].names and np.isnan(fix[0])):
                 self.state, self.revoked = self.blank(), {}
                 found.append((np.full(3, np.nan), np.full((3, 3), np.nan), []))
-                t += 1
-                older = newer = t, copy.deepcopy(self.state)
                 continue
-            if memory and t % memory == 0:
-                older = newer if t == len(found) else older
-                newer = t, copy.deepcopy(self.state)
-            alarm = self.step(t)
-            if alarm and memory:
-                t, self.state = older[0], copy.deepcopy(older[1])
-                newer = older
-                for j, (_, until) in self.revoked.items():
-                    if until >= t and j in self.state["trusted"]:
-                        self.doubt(j)
-                continue
-            if t == len(found):
-                b = self.state["belief"]
-                x = b.at(("x", self.ego))
-                found.append(copy.deepcopy((b.x[x], b.p[x, x], [b.x[b.at(("x", j))] for j in self.neighbours(t)[1]])))
-            t += 1
+            self.step(t)
+            b = self.state["belief"]
+            x = b.at(("x", self.ego))
+            found.append(copy.deepcopy((b.x[x], b.p[x, x], [b.x[b.at(("x", j))] for j in self.neighbours(t)[1]])))
         others = [np.array(o).reshape(-1, 3) for *_, o in found]
         return np.array([x for x, *_ in found]), np.array([p for _, p, _ in found]), others
 
@@ -194,12 +182,28 @@ class Oracle:
         s = int(self.box.newest[self.run, link])
         if s < 0:
             return None
-        velocity = self.seen.velocity[self.run, s, j]
-        return Sent(s, self.position[s, j], self.variance[s, j], self.odometer[s, j], velocity, self.q[s, j])
+        velocity, q = self.seen.velocity[self.run, s, j], math.exp(self.state["level"][4]) * self.q[s, j]
+        return Sent(s, self.position[s, j], self.variance[s, j], self.odometer[s, j], velocity, q)
 
-    def step(self, t: int) -> bool:
+    def learn(self, kind: int, more: float, share: float, numbers: int = 1) -> None:
+        """What innovations show of a level: derivative and information of their log-likelihood."""
+        self.state["learned"][kind] += 0.5 * numbers * share * more
+        self.state["information"][kind] += 0.5 * numbers * share**2
+
+    def own_variance(self) -> Any:
+        at = self.state["belief"].at(("x", self.ego))
+        return np.diag(self.state["belief"].p)[at].sum()
+
+    def corrected(self) -> None:
+        """What the level of motion makes of the ego's variance, after an update."""
+        s, now = self.state, self.own_variance()
+        s["made"] = min(s["made"] * (now / self.before) ** 2, now)
+        self.before = now
+
+    def step(self, t: int) -> None:
         s, g, b, life = self.state, self.guards, self.state["belief"], self.life
         here, others = self.neighbours(t)
+        louder = math.exp(s["level"][4])
         links = dict(zip(others, here.tolist(), strict=True))
         messages = {j: self.message(link, j) for j, link in links.items()}
         relative = {j: self.seen.relative[self.run, self.box.link[link]] for j, link in links.items()}
@@ -231,9 +235,11 @@ class Oracle:
                     b.drop((kind, j))
                 s["members"].remove(j)
         dt = self.seen.dt
-        u, q = self.steady(t, self.ego, self.seen.velocity[self.run, t, self.ego], self.q[t, self.ego])
+        u, q = self.steady(t, self.ego, self.seen.velocity[self.run, t, self.ego], louder * self.q[t, self.ego])
         if t > s["joined"][self.ego]:
             self.predict(dt * u, q)
+        s["made"] = s["made"] + q.sum()
+        self.before = self.own_variance()
         for j in s["members"]:
             messages[j] = self.predict_member(t, j, messages[j])
         for j in [j for j in others if j not in s["members"]]:
@@ -246,34 +252,39 @@ class Oracle:
             if message and new and (s["joined"][j] < t or not np.isfinite(relative[j]).all()):
                 b.x[b.at(("x", j))] = message.estimate + (t - message.step) * dt * message.velocity
         at = {j: b.x[b.at(("x", j))].copy() for j in (self.ego, *others)}
-        alarm = np.isfinite(fix).all() and self.add_fix(t, fix)
+        if np.isfinite(fix).all():
+            self.add_fix(t, fix)
         order = sorted(s["members"], key=lambda j: float(np.linalg.norm(at[j] - at[self.ego])))
         if self.robust:
             at = self.measure(at, order, relative)
         for j in order:
             vague = j in s["vague"]
-            alarm |= self.receive(t, j, messages[j])
+            self.receive(t, j, messages[j])
             if self.robust and vague and j not in s["vague"]:
-                self.relate(j, at, relative[j], self.known.exact_relative, s["belief"])
+                self.relate(j, at, relative[j], self.known.exact_relative)
         if not self.robust:
             self.measure(at, order, relative)
         if g.trust:
             self.trust()
-        return bool(alarm)
+        self.corrected()
+        if g.forget:
+            step = np.clip(s["learned"] / (s["information"] + PRIOR), -FASTEST, FASTEST)
+            s["level"] = np.clip(s["level"] + step, QUIETEST, LOUDEST)
+        s["learned"] = np.zeros(5)
+        s["information"] = s["information"] * (math.exp(-dt / g.forget) if g.forget else 1.0)
 
-    def add_fix(self, t: int, fix: Floats) -> bool:
-        """A slip of the odometer explains an innovation beyond the gate that is far smaller beside its variance."""
-        s, g, slip = self.state, self.guards, (self.guards.slip * self.seen.dt) ** 2
-        rows = [(self.fix_terms(self.ego), fix[c], self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
-        if slip and self.ego not in s["vague"]:
-            slipped = copy.deepcopy(s["belief"])
-            slipped.noise(("x", self.ego), slip)
-            q, less = (self.mahalanobis(b, rows)[0] for b in (s["belief"], slipped))
-            if q > g.fix_gate and less <= g.fix_gate and 4 * less <= q:
-                s["belief"] = slipped
-        q, alarm = self.use_fix(t, self.ego, rows, True)
+    def add_fix(self, t: int, fix: Floats) -> None:
+        s, g, louder = self.state, self.guards, math.exp(self.state["level"][3])
+        rows = [(self.fix_terms(self.ego), fix[c], louder * self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
+        if self.ego not in s["vague"]:
+            _, gap, cov, r = self.mahalanobis(s["belief"], rows)
+            total = np.trace(cov) + r.sum()
+            more = min(gap @ gap / total, SUDDEN) - 1.0
+            self.learn(3, more, r.sum() / total, 3)
+            self.learn(4, more, s["made"] / total, 3)
+        q = self.use_fix(t, self.ego, rows, True)
         s["hits"]["fix"] = s["hits"]["fix"] + 1 if g.fix_gate and q > g.fix_gate else 0
-        return alarm
+        self.corrected()
 
     def mahalanobis(self, b: Belief, rows: list[Any]) -> tuple[float, Floats, Floats, Floats]:
         """Squared distance and innovations of rows, their covariance without noise, and the noise's variance."""
@@ -282,32 +293,27 @@ class Oracle:
         cov = h @ b.p @ h.T
         return float(gap @ np.linalg.solve(cov + np.diag(r), gap)), gap, cov, r
 
-    def use_fix(self, t: int, j: int, rows: list[Any], again: bool) -> tuple[float, bool]:
-        """Squared Mahalanobis distance, and whether trust is revoked."""
+    def use_fix(self, t: int, j: int, rows: list[Any], again: bool) -> float:
+        """Squared Mahalanobis distance; trust may be revoked."""
         s, g, b = self.state, self.guards, self.state["belief"]
         used = [c for c, row in enumerate(rows) if row is not None]
         h = np.array([b.row(rows[c][0], c) for c in used])
         z, r = (np.array([rows[c][i] for c in used]) for i in (1, 2))
         if not used:
-            return 0.0, False
+            return 0.0
         if j in s["vague"] and len(used) == 3:
             b.updates(h, z, r)
             s["vague"].discard(j)
-            return 0.0, False
+            return 0.0
         if g.trust and again and len(used) == 3 and self.wrong_on_average(j, *self.mahalanobis(b, rows)):
-            if j not in s["trusted"]:
-                self.doubt(j)
-                return self.gone, False
-            self.revoked[j] = [self.revoked.get(j, [0, 0])[0] + 1, t]
-            return self.gone, True
-        if j in self.revoked and t <= self.revoked[j][1]:
-            return float(self.distance(h, z, r)), False
-        return b.updates(h, z, r, g.fix_gate), False
-
-    def distance(self, h: Floats, z: Floats, r: Floats) -> Any:
-        b = self.state["belief"]
+            if j in s["trusted"]:
+                self.revoked[j] = [self.revoked.get(j, [0, 0])[0] + 1, t]
+            self.doubt(j)
+            return self.gone
         gap = z - h @ b.x
-        return gap @ np.linalg.solve(h @ b.p @ h.T + np.diag(r), gap)
+        q = min(float(gap @ np.linalg.solve(h @ b.p @ h.T + np.diag(r), gap)), float(gap @ gap) / SLIP)
+        b.updates(h, z, r, g.fix_gate, 1.0, q)
+        return q
 
     def wrong_on_average(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """The clipped mean innovation, beside what another error of the fixes would make of it."""
@@ -361,8 +367,6 @@ class Oracle:
         if votes[0] <= 1 and max(votes) >= 2:
             fix[:] = np.nan
             s["vague"].discard(self.ego)
-        if self.ego in self.revoked and self.revoked[self.ego][1] >= t:
-            self.doubt(self.ego)
         return True
 
     def lost(self, t: int) -> bool:
@@ -487,33 +491,29 @@ class Oracle:
             i = b.at(("compass",)).start + 1
             b.x[i], b.p[i], b.p[:, i] = 0.0, 0.0, 0.0
             b.p[i, i] = self.life.heading
-        exact, slip = self.known.exact_relative, (self.guards.slip * self.seen.dt) ** 2
+        exact = self.known.exact_relative
         if exact:
-            at, wrong = self.geometry(at, order, relative)
-            if slip and sum(wrong) >= 3 and 2 * sum(wrong) > len(order):
-                b.noise(("x", self.ego), slip)
-                at, _ = self.geometry(self.first, order, relative)
+            at = self.geometry(at, order, relative)
         for j in order:
-            self.relate(j, at, relative[j], exact, b)
+            self.relate(j, at, relative[j], exact)
         return at
 
-    def geometry(
-        self, at: dict[int, Floats], order: list[int], relative: dict[int, Floats]
-    ) -> tuple[dict[int, Floats], list[bool]]:
-        """Positions after a linear update that is forgotten, and whether each measured member is beyond a gate."""
-        s, self.first = self.state, at
-        kept = s["belief"], s["hits"], s["vague"]
-        s["belief"], s["hits"], s["vague"] = copy.deepcopy(kept)
-        found = [self.relate(j, at, relative[j], False, kept[0]) for j in order]
-        b = s["belief"]
-        s["belief"], s["hits"], s["vague"] = kept
-        return {j: b.x[b.at(("x", j))].copy() for j in (self.ego, *order)}, [one for one in found if one is not None]
+    def geometry(self, at: dict[int, Floats], order: list[int], relative: dict[int, Floats]) -> dict[int, Floats]:
+        """Positions after a linear update that is forgotten."""
+        s, kept = self.state, self.state
+        self.state = s | copy.deepcopy(
+            {name: s[name] for name in ("belief", "hits", "vague", "learned", "information")}
+        )
+        for j in order:
+            self.relate(j, at, relative[j], False)
+        b, self.state = self.state["belief"], kept
+        return {j: b.x[b.at(("x", j))].copy() for j in (self.ego, *order)}
 
-    def relate(self, j: int, at: dict[int, Floats], relative: Floats, exact: bool, before: Belief) -> bool | None:
+    def relate(self, j: int, at: dict[int, Floats], relative: Floats, exact: bool) -> None:
         s, g, there = self.state, self.guards, np.isfinite(relative)
         b, vague, hits = s["belief"], j in s["vague"], s["hits"][("relative", j)]
         if not there.all() and vague:
-            return None
+            return
         gap, unit = at[j] - at[self.ego], self.known.sensors is None
         expected = np.array(spherical(*gap))
         far, azimuth, inclination = expected
@@ -537,25 +537,28 @@ class Oracle:
             z = rows @ to_vector(np.where(there, relative, expected))
             r = np.ones(3) if unit else (self.std * [1.0, reach * ground / far, reach]) ** 2
             turn = ground
-        wrong = False
+        r = r * np.exp(s["level"][:3])
+        h = []
         for c in range(3):
             terms: dict[Name, Any] = {("x", j): rows[c], ("x", self.ego): -rows[c]}
             if c < 2 and ("compass",) in b.names:
                 terms[("compass",)] = np.array([[0, 0, 1], [turn, turn, 0]][c])
-            if there[c]:
-                q = b.update(b.row(terms, c), z[c], r[c], 0.0 if vague else g.gate)
-                if not vague:
-                    hits[c] = hits[c] + 1 if g.gate and q > g.gate else 0
-                    wrong = wrong or q > g.gate
+            h.append(b.row(terms, c))
+        total = np.einsum("ci,ij,cj->c", h, b.p, h) + r
+        for c in np.flatnonzero(there):
+            q = b.update(h[c], z[c], r[c], 0.0 if vague else g.gate)
+            if not vague:
+                hits[c] = hits[c] + 1 if g.gate and q > g.gate else 0
+                self.learn(c, min(q, SUDDEN) - USUAL, r[c] / total[c])
+                self.learn(4, min(q, SUDDEN) - USUAL, rows[c] @ rows[c] * s["made"] / 3 / total[c])
         s["vague"].discard(j)
-        return wrong
 
-    def receive(self, t: int, j: int, message: Sent | None) -> bool:
+    def receive(self, t: int, j: int, message: Sent | None) -> None:
         s, g, dt = self.state, self.guards, self.seen.dt
         b = s["belief"]
         last = s["last"].get(j)
         if message is None or (last and message.step <= last.step) or not np.isfinite(message.estimate).all():
-            return False
+            return
         age = t - message.step
         tracked, before = ("v", j) in b.names, self.robust and last is not None
         clone, late = before and ("c", j) in b.names, 0.0
@@ -591,11 +594,10 @@ class Oracle:
                 m += age * dt * message.velocity[c]
                 r += age**2 * (message.process[c] + (dt**2 * age) ** 2)
             rows.append((terms, m, r + late))
-        alarm = self.use_fix(t, j, rows, before)[1]
+        self.use_fix(t, j, rows, before)
         s["last"][j] = message
         if tracked:
             self.clone(j, back, late)
-        return alarm
 
     def clone(self, j: int, back: dict[Any, float], late: float) -> None:
         """Remember where a member was when it sent its newest message."""

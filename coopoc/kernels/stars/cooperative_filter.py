@@ -16,16 +16,20 @@ from ..compiling.compile import compiled, inside
 from ..compiling.small import apply, negate, store
 from ..geometry import angle
 from .cooperative_members import join, leave, place, predict, predict_member, steady
-from .cooperative_messages import fix_terms, receive, trust, use_fix
+from .cooperative_messages import fix_terms, fix_weight, receive, trust, use_fix
 from .cooperative_state import (
     AGE,
+    AZIMUTHS,
     DT,
     FIX,
     FIX_VARIANCE,
+    FIXES,
+    INCLINATIONS,
     MOTION,
     MOTION_VARIANCE,
     ODOMETER,
     OWN,
+    RANGES,
     SOLO,
     SOLO_VARIANCE,
     SPEED,
@@ -38,8 +42,6 @@ from .cooperative_state import (
     Model,
     Sent,
     begin,
-    copy_filter,
-    distrust,
     measured_whole,
     new_filter,
     pause,
@@ -58,6 +60,7 @@ from .gaussian import (
     weight,
     widen,
 )
+from .levels import adapt, corrected, learn_fix, learn_relative, louder, moved
 from .messages import Assumptions, Measurements, three_of
 
 
@@ -68,8 +71,7 @@ def run_filter(
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; weights of the ego's fix (R, T), and by link
     (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the neighbour is trusted.
 
-    Fixes of a vehicle that loses trust may have misled the filter for a while: it takes the last `memory` to twice as
-    many steps again, without them. A vehicle that is absent (a velocity of NaN) starts anew.
+    A vehicle that is absent (a velocity of NaN) starts anew.
 
     Args:
         measurements: measurements and messages of the ego.
@@ -79,16 +81,15 @@ def run_filter(
         guards: against what may be wrong.
     """
     runs, steps, vehicles = measurements.gnss.shape[0], len(measurements.start) - 1, measurements.gnss.shape[2]
-    links, most, memory = measurements.relative.shape[1], 0, int(guards.memory)
+    links, most = measurements.relative.shape[1], 0
     for t in range(steps):
         most = max(most, measurements.start[t + 1] - measurements.start[t])
     x, cov, fixes = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, steps))
     neighbours, notes = np.empty((runs, links, 3)), np.empty((runs, links, 5))
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
     for run in range(runs):
-        f, older, newer = new_filter(1 + most, vehicles), new_filter(1 + most, vehicles), new_filter(1 + most, vehicles)
-        t = newest = 0
-        while t < steps:
+        f = new_filter(1 + most, vehicles)
+        for t in range(steps):
             first = measurements.start[t]
             count = measurements.start[t + 1] - first
             gather_own(own, measurements, assumed, model.white, run, t)
@@ -97,40 +98,23 @@ def run_filter(
                 gather_neighbour(rows, measurements, assumed, sent, run, t, first + i, i)
             if math.isnan(own[MOTION]) or (f.g.vectors[0] == 0 and math.isnan(own[FIX])):
                 pause(f, own[DT])
-                copy_filter(f, older)
-                copy_filter(f, newer)
                 x[run, t], cov[run, t] = math.nan, math.nan
-                newest, t = t + 1, t + 1
                 continue
-            if memory > 0 and t % memory == 0:
-                if t == newest:
-                    copy_filter(newer if t > 0 else f, older)
-                copy_filter(f, newer)
             if f.g.vectors[0] == 0:
                 begin(f, model, guards, own, rows, count, measurements.ego)
             step(f, model, guards, own, rows, who, count)
-            if f.alarm[0] > 0 and memory > 0:
-                f.alarm[0] = 0
-                copy_filter(older, newer)
-                copy_filter(older, f)
-                distrust(f, model, guards)
-                t = f.step[0]
-                continue
-            if t == newest:
-                fixes[run, t] = weight(f.q[0, 3], guards.fix_gate)
-                newest += 1
+            fixes[run, t] = fix_weight(f.q[0, 3], guards.fix_gate)
+            for c in range(3):
+                x[run, t, c] = f.g.x[c]
+                for d in range(3):
+                    cov[run, t, c, d] = f.g.p[c, d]
+            for i in range(count):
+                k = f.slot[who[i]]
                 for c in range(3):
-                    x[run, t, c] = f.g.x[c]
-                    for d in range(3):
-                        cov[run, t, c, d] = f.g.p[c, d]
-                for i in range(count):
-                    k = f.slot[who[i]]
-                    for c in range(3):
-                        neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c]
-                    for c in range(4):
-                        notes[run, first + i, c] = weight(f.q[k, c], guards.gate if c < 3 else guards.fix_gate)
-                    notes[run, first + i, 4] = f.status[who[i], TRUSTED]
-            t += 1
+                    neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c]
+                    notes[run, first + i, c] = weight(f.q[k, c], guards.gate)
+                notes[run, first + i, 3] = fix_weight(f.q[k, 3], guards.fix_gate)
+                notes[run, first + i, 4] = f.status[who[i], TRUSTED]
     return x, cov, neighbours, fixes, notes
 
 
@@ -181,12 +165,14 @@ def step(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, veh
         count: of them.
     """
     leave(f, model, guards, own, rows, vehicles, count)
+    louder(f, own, rows, count)
     f.clock[1] = own[DT]
     if f.step[0] > 0:
         f.clock[0] += own[DT]
     steady(f, guards, f.vehicle[0], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
     if f.step[0] > f.joined[0]:
         predict(f, model, guards, own)
+    moved(f, own)
     for k in range(1, len(f.vehicle)):
         if f.vehicle[k] >= 0:
             predict_member(f, model, guards, rows, k)
@@ -217,6 +203,8 @@ def step(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, veh
     if guards.trust > 0.0:
         trust(f, model, guards)
     f.step[0] += 1
+    corrected(f)
+    adapt(f, guards)
 
 
 @inside
@@ -245,35 +233,24 @@ def gap2(f: Filter, k: int) -> float:
 
 @inside
 def add_fix(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
-    """The ego's fix: its position, the error of its receiver, and the one that all share.
-
-    An innovation beyond the gate that an odometer's slip explains is one: it is far smaller beside the slip's variance.
-    """
-    g, h, slip, first = f.g, f.h, (guards.slip * own[DT]) ** 2, 3 * f.g.block[0, PLACE]
+    """The ego's fix: its position, the error of its receiver, and the one that all share."""
+    level = math.exp(f.level[0, FIXES])
     if math.isnan(own[FIX]):
         return
     fix_terms(f, 0)
     for c in range(3):
-        expect(h, c, own[FIX + c], own[FIX_VARIANCE + c])
-    q = innovate(g, h)
-    if f.vague[0] == 0.0 and slip > 0.0 and q > guards.fix_gate:
-        widen(g, first, slip)
-        slipped = innovate(g, h)
-        if slipped > guards.fix_gate or 4.0 * slipped > q:
-            widen(g, first, -slip)
-            innovate(g, h)
-        else:
-            q = slipped
+        expect(f.h, c, own[FIX + c], level * own[FIX_VARIANCE + c])
+    q = innovate(f.g, f.h)
+    if f.vague[0] == 0.0:
+        learn_fix(f)
     f.q[0, 3] = q = use_fix(f, model, guards, 0, True, q)
     f.hits[0, 0] = f.hits[0, 0] + 1 if 0.0 < guards.fix_gate < q else 0
+    corrected(f)
 
 
 @inside
 def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int) -> None:
-    """The relative measurements: linear at the prediction, then at that solution.
-
-    Where they contradict the prediction of most members, it is the ego whose odometer has slipped.
-    """
+    """The relative measurements: linear at the prediction, then at that solution."""
     g = f.g
     if members == 0:
         return
@@ -284,11 +261,7 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
             g.p[j, i] = 0.0
         g.x[i], g.p[i, i] = 0.0, model.heading
     if model.exact > 0.0:
-        for again in range(2):
-            wrong = first_pass(f, model, guards, rows, members)
-            if again or guards.slip <= 0.0 or wrong < 3 or 2 * wrong <= members:
-                break
-            widen(g, 3 * g.block[0, PLACE], (guards.slip * f.clock[1]) ** 2)
+        first_pass(f, model, guards, rows, members)
         for k in range(len(f.vehicle)):
             if f.vehicle[k] >= 0:
                 for c in range(3):
@@ -312,16 +285,17 @@ def weigh(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None
     for c in range(3):
         if h.used[c]:
             f.q[k, c] = h.q[c]
+            learn_relative(f, c)
             f.hits[k, c] = f.hits[k, c] + 1 if 0.0 < guards.gate < h.q[c] else 0
 
 
 @inside
-def first_pass(f: Filter, model: Model, guards: Guards, rows: Floats, members: int) -> int:
-    """Update `trial` by the measurements linear at the prediction; how many members are beyond a gate.
+def first_pass(f: Filter, model: Model, guards: Guards, rows: Floats, members: int) -> None:
+    """Update `trial` by the measurements linear at the prediction.
 
     Of its covariance only the rows that a later member's measurement needs are kept up to date.
     """
-    g, h, wrong = f.trial, f.h, 0
+    g, h = f.trial, f.h
     copy_moments(f.g, g)
     for m in range(members):
         k = f.order[m]
@@ -336,8 +310,6 @@ def first_pass(f: Filter, model: Model, guards: Guards, rows: Floats, members: i
                 correct_rows(g, h, 1.0, g.block[k, PLACE])
             for term in range(1, h.terms[0]):
                 correct_rows(g, h, 1.0, h.block[term])
-            wrong += vague == 0.0 and max(h.q[0], h.q[1], h.q[2]) > guards.gate
-    return wrong
 
 
 @inside
@@ -388,7 +360,15 @@ def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int, exact:
         store(h.z, 0, (d, turned * flat + b, raised * reach + c))
         turn = azimuth_std = flat
     a, b, c = (std[0], std[1] * azimuth_std, std[2] * reach) if len(std) else (1.0, 1.0, 1.0)
-    store(h.variance, 0, (a * a, b * b, c * c))
+    store(
+        h.variance,
+        0,
+        (
+            a * a * math.exp(f.level[0, RANGES]),
+            b * b * math.exp(f.level[0, AZIMUTHS]),
+            c * c * math.exp(f.level[0, INCLINATIONS]),
+        ),
+    )
     store(h.weight, 0, w)
     store(h.weight, 1, negate(w))
     store(h.weight, 2, (0.0, 0.0, 1.0, turn, turn, 0.0, 0.0, 0.0, 0.0))

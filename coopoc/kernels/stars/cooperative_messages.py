@@ -6,6 +6,7 @@ import math
 
 from ...arrays import Floats
 from ..compiling.compile import inside, part
+from ..gate import SLIP
 from .cooperative_state import (
     AGE,
     COUNT,
@@ -43,7 +44,6 @@ from .gaussian import (
     shift,
     term,
     update,
-    weight,
     widen,
 )
 
@@ -53,6 +53,13 @@ NOTHING_NEW = 1e-9
 """Least weight of new fixes in an estimate."""
 CLIP = 12.0
 """Largest squared Mahalanobis distance of an innovation in a mean."""
+
+
+@inside
+def fix_weight(q: float, gate: float) -> float:
+    """Share of its information that a fix keeps: gate / q beyond the gate. One far beyond still counts, for it may be
+    the estimate that is far off; and however precise fixes are, wheels may slip by a metre."""
+    return 1.0 + 0.0 * q if gate == 0.0 or not q > gate else gate / q
 
 
 @inside
@@ -116,12 +123,11 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
         return 0.0
     if guards.trust > 0.0 and again and used == 3 and q > 0.0 and wrong_on_average(f, model, guards, k, q):
         if f.status[j, TRUSTED] > 0.0:
-            f.revoked[j, 0], f.revoked[j, 1], f.alarm[0] = f.revoked[j, 0] + 1.0, f.clock[0], 1
-        else:
-            doubt(f, model, guards, j)
+            f.revoked[j, 0], f.revoked[j, 1] = f.revoked[j, 0] + 1.0, f.clock[0]
+        doubt(f, model, guards, j)
         return q
-    if f.revoked[j, 0] == 0.0 or f.clock[0] > f.revoked[j, 1]:
-        correct(g, h, weight(q, guards.fix_gate))
+    q = min(q, (h.gap[0] * h.gap[0] + h.gap[1] * h.gap[1] + h.gap[2] * h.gap[2]) / SLIP)
+    correct(g, h, fix_weight(q, guards.fix_gate))
     return q
 
 

@@ -58,7 +58,6 @@ class Guards(NamedTuple):
         fix_gate: squared Mahalanobis distance of a fix, of the fixes in a message, and of its odometer and velocity.
         patience: a member whose component exceeds its gate that many times in a row, or as often as it did not before,
             joins anew.
-        slip: m/s, error of an odometer that slips.
         trust: 1 if the fixes of a vehicle that is new have an unknown error until they are trusted.
         tau: m, standard deviation of that error.
         share: prior share of vehicles with such an error.
@@ -68,14 +67,13 @@ class Guards(NamedTuple):
         window: fixes in the mean innovation of a vehicle.
         revoke: log odds from which trust ends.
         lost: s without trust in its receiver after which an ego is lost; if alone twice that, half where errors last.
-        memory: steps after which a state is kept to go back to.
+        forget: s, in which what innovations have shown of levels is forgotten.
         acceleration: m/s^2, of a member whose messages are late; 0: it goes on with its last velocity.
     """
 
     gate: float = 9.0
     fix_gate: float = 16.0
     patience: float = 30.0
-    slip: float = 10.0
     trust: float = 1.0
     tau: float = 20.0
     share: float = 0.1
@@ -85,11 +83,14 @@ class Guards(NamedTuple):
     window: float = 30.0
     revoke: float = 3.0
     lost: float = 20.0
-    memory: float = 30.0
+    forget: float = 10.0
     acceleration: float = 6.0
 
 
-NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, slip=0.0, trust=0.0, memory=0.0, acceleration=0.0)
+NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, trust=0.0, forget=0.0, acceleration=0.0)
+RANGES, AZIMUTHS, INCLINATIONS, FIXES, MOTIONS = range(5)
+KINDS_OF_NUMBERS = 5
+"""Kinds of numbers that have a level."""
 
 
 class Sent(NamedTuple):
@@ -162,9 +163,9 @@ class Filter(NamedTuple):
             distance of the message, NaN where nothing was used; the ego's are those of its fix.
         step: (1,) number of the step.
         clock: (2,) s, now, and since the last step.
-        revoked: (vehicles, 2) how often a vehicle lost trust, and when it last did s: until then its fixes do not
-            count; not part of what is restored.
-        alarm: (1,) out: whether a vehicle lost it now.
+        revoked: (vehicles, 2) how often a vehicle lost trust, and when it last did s.
+        level: (3, 5) by kind of number: logarithm of the level, sum of its derivatives in this step, and information.
+        made: (2,) of the ego's variance m^2, axes together: what the level of motion makes, and the whole then.
     """
 
     g: Gaussian
@@ -185,7 +186,8 @@ class Filter(NamedTuple):
     step: Ints
     clock: Floats
     revoked: Floats
-    alarm: Ints
+    level: Floats
+    made: Floats
 
 
 @storage
@@ -211,15 +213,20 @@ def new_filter(slots: int, vehicles: int) -> Filter:
         np.zeros(1, np.int64),
         np.zeros(2),
         np.zeros((vehicles, 2)),
-        np.zeros(1, np.int64),
+        np.zeros((3, KINDS_OF_NUMBERS)),
+        np.zeros(2),
     )
 
 
 @part
 def copy_filter(source: Filter, target: Filter) -> None:
-    """Copy the state, but not which vehicles have lost trust."""
+    """Copy the state."""
     copy_gaussian(source.g, target.g)
     target.step[0], target.clock[0] = source.step[0], source.clock[0]
+    for kind in range(KINDS_OF_NUMBERS):
+        for i in range(3):
+            target.level[i, kind] = source.level[i, kind]
+    target.made[0], target.made[1] = source.made[0], source.made[1]
     for k in range(len(source.vehicle)):
         target.vehicle[k], target.row[k], target.joined[k] = source.vehicle[k], source.row[k], source.joined[k]
         target.serves[k], target.sent[k], target.vague[k] = source.serves[k], source.sent[k], source.vague[k]
@@ -227,6 +234,7 @@ def copy_filter(source: Filter, target: Filter) -> None:
             target.hits[k, c] = source.hits[k, c]
     for j in range(len(source.slot)):
         target.slot[j] = source.slot[j]
+        target.revoked[j, 0], target.revoked[j, 1] = source.revoked[j, 0], source.revoked[j, 1]
     for i in range(len(source.slot) * STATUS // LANES):
         put(target.status, i, take(source.status, i))
 
@@ -285,7 +293,6 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
         for c in range(3):
             g.x[c], own[FIX + c] = rows[best, SOLO + c] - across(rows, best, c), math.nan
         widen(g, 0, model.flat)
-    distrust(f, model, guards)
     return True
 
 
@@ -317,14 +324,6 @@ def pause(f: Filter, dt: float) -> None:
         f.revoked[j, 0] = 0.0
     f.step[0] += 1
     f.clock[0] += dt
-
-
-@part
-def distrust(f: Filter, model: Model, guards: Guards) -> None:
-    """In a state of before, revoke the trust that vehicles have lost since."""
-    for j in range(len(f.slot)):
-        if f.revoked[j, 0] > 0.0 and f.revoked[j, 1] >= f.clock[0] and f.status[j, TRUSTED] > 0.0:
-            doubt(f, model, guards, j)
 
 
 @part

@@ -32,7 +32,6 @@ from .cooperative_state import (
     Model,
     begin,
     copy_filter,
-    distrust,
     new_filter,
 )
 from .gated import Gates, gates_within
@@ -187,8 +186,8 @@ def joint_step(
 @compiled
 def stream_step(
     f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, start: Floats, answer: Floats
-) -> int:
-    """One step; 1 if a vehicle has lost trust.
+) -> None:
+    """One step.
 
     Args:
         f: filter.
@@ -206,7 +205,6 @@ def stream_step(
             f.step[0], f.vague[0] = 1, 0.0
             for c in range(3):
                 f.g.x[c] = start[c]
-    f.alarm[0] = 0
     step(f, model, guards, own, rows, vehicles, len(vehicles))
     for c in range(3):
         answer[c] = f.g.x[c]
@@ -214,7 +212,6 @@ def stream_step(
             answer[3 + 3 * c + d] = f.g.p[c, d]
         for i in range(len(vehicles)):
             answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[f.slot[vehicles[i]], PLACE] + c]
-    return int(f.alarm[0])
 
 
 @compiled
@@ -224,7 +221,6 @@ def make_filter(slots: int, vehicles: int) -> Filter:
 
 
 @compiled
-def restore(source: Filter, target: Filter, model: Model, guards: Guards) -> None:
-    """Copy a state; trust is revoked in those who have lost it in the target since."""
+def restore(source: Filter, target: Filter) -> None:
+    """Copy a state."""
     copy_filter(source, target)
-    distrust(target, model, guards)

@@ -1,0 +1,118 @@
+"""CL-Bench's convoys: errors of one real drive, cut into pieces, of vehicles that drive together; ranges are drawn."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+
+from coopoc import V2X, Fleet, Recording, observe
+from coopoc.arrays import AnyArray, Floats
+from coopoc.evaluate.ledger import of_track
+from coopoc.evaluate.statistics import mean_interval
+from coopoc.methods.track import Method
+from coopoc.study.study import Row
+from coopoc.world.recording import MEASURED
+
+from .pose_drives import hashed
+from .roads import BLOCK, ROADS, seen
+from .tasks import blocks_of, located, rounded
+
+CONVOYS: Mapping[str, str] = {f"convoy-{road}": road for road in ROADS}
+"""Task -> road whose drive is cut."""
+PIECES, SHORTEST, SPREAD, RUNS, SEED = 4, 25.0, 25.0, 4, 2026
+"""Vehicles at most; s of a piece at least; m within which they start; draws of ranges and angles, and their seed."""
+SLOW = 1.0
+"""m/s, below which a course is noise: the odometry errs as it did before."""
+
+
+@lru_cache(maxsize=2)
+def convoy(task: str, data: Path | None) -> tuple[Recording, Fleet]:
+    """Measurements and truth of vehicles on the route of the first piece, side by side, as far apart as they start.
+
+    A vehicle's fixes err by as many metres east and north as those of its piece, its odometry by the same factor and
+    turn of the motion, $u' = (u_{measured} / u_{true}) u_{route}$ in complex numbers. All runs have the same fixes and
+    odometry; ranges and angles are drawn.
+
+    Args:
+        task: one of CONVOYS.
+        data: folder of the data, None for those that were fetched.
+
+    Raises:
+        InputError: a file that is missing.
+    """
+    recording, truth = seen(CONVOYS[task], data)
+    column, dt = recording.observers[0], recording.dt
+    starts, length = _pieces(recording, column)
+    there = np.isfinite(truth.position[:, column, 0])
+    now = np.arange(len(there))
+    path = np.interp(now, now[there], truth.position[there, column] @ [1, 1j, 0])
+    motion = np.diff(path, prepend=path[0])
+    ratio = _ratio(recording.velocity[0, :, column] @ np.array([1, 1j, 0]) * dt, motion, SLOW * dt)
+    error = recording.gnss[0, :, column] @ np.array([1, 1j, 0]) - path
+    route, rows = slice(starts[0], starts[0] + length), np.array(starts) + np.arange(length)[:, None]
+    offset = SPREAD * np.random.default_rng(SEED).uniform(-1, 1, (len(starts), 2)) @ [1, 1j] / np.sqrt(2)
+    true = (path[route] - path[starts[0]])[:, None] + offset
+    driven = np.repeat(motion[route, None], len(starts), axis=1)
+    ids, t = tuple(f"v{k}" for k in range(len(starts))), recording.t[:length] - recording.t[0]
+    fleet = Fleet(ids, t, _plane(true), _plane(driven) / dt, name=task)
+    v2x = V2X(max_neighbours=6, radius=150.0)
+    drawn = observe(fleet, recording.sensors, v2x, runs=RUNS, seed=SEED)
+    gnss, velocity = (
+        np.tile(each, (RUNS, 1, 1, 1)) for each in (_plane(true + error[rows]), _plane(ratio[rows] * driven) / dt)
+    )
+    return replace(drawn, gnss=gnss, velocity=velocity, notes=(f"errors of fixes and odometry: {MEASURED}",)), fleet
+
+
+def _pieces(recording: Recording, column: int) -> tuple[list[int], int]:
+    """First steps of pieces, each with a fix, and their length in steps: as many as PIECES of SHORTEST s at least."""
+    fixes = np.flatnonzero(np.isfinite(recording.gnss[0, :, column, 0]))
+    count = int(np.clip((len(recording.t) - fixes[0]) * recording.dt / SHORTEST, 1, PIECES))
+    wanted = np.linspace(fixes[0], len(recording.t), count + 1)[:-1]
+    starts = [int(fixes[np.searchsorted(fixes, np.ceil(first))]) for first in wanted]
+    ends = [*starts[1:], len(recording.t)]
+    return starts, min(end - start for start, end in zip(starts, ends, strict=True))
+
+
+def _ratio(measured: AnyArray, true: AnyArray, slow: float) -> AnyArray:
+    """(T,) complex factor of the odometry's motion over the true one, as before where the vehicle is slow."""
+    fast = (np.abs(true) > slow) & np.isfinite(measured)
+    last = np.maximum.accumulate(np.where(fast, np.arange(len(true)), np.argmax(fast)))
+    found = (np.where(fast, measured, 1.0) / np.where(fast, true, 1.0))[last]
+    ratio: AnyArray = np.clip(np.abs(found), 0.5, 2.0) * np.exp(1j * np.clip(np.angle(found), -0.5, 0.5))
+    return ratio
+
+
+def _plane(values: AnyArray) -> Floats:
+    """(..., 3) of complex numbers east + i north, NaN in the height, too, where there is none."""
+    return np.stack([values.real, values.imag, 0.0 * values.real], axis=-1)
+
+
+def convoy_row(task: str, data: Path | None, method: Method) -> Row:
+    """RT-LE m in the plane with its interval over vehicles and blocks of time, NEES of (x, y), bytes and us of a step.
+
+    Args:
+        task: that is run.
+        data: folder of the data, None for those that were fetched.
+        method: any of positions, alone or cooperative.
+    """
+    recording, fleet = convoy(task, data)
+    egos = list(range(len(recording.ids)))
+    method(recording.between(0, 3), egos)  # compiles
+    track = method(recording, egos)
+    gap = (track.x - fleet.position)[..., :2]
+    size = min(BLOCK, len(recording.t) * recording.dt / 4) / recording.dt
+    blocks = blocks_of(np.sqrt(np.square(gap).sum(axis=-1).mean(axis=0)), 0, size)
+    level = mean_interval(blocks)
+    row: Row = {"task": task, "data": hashed(*(located(data, name) for name in ROADS[CONVOYS[task]]))}
+    row |= {"rt_le_m": rounded(level), "blocks_m": [round(float(value), 4) for value in blocks.ravel()]}
+    if track.covariance is not None:
+        nees = np.einsum("rtei,rteij,rtej->rte", gap, np.linalg.inv(track.covariance[..., :2, :2]), gap)
+        row["nees"] = round(float(np.nanmean(nees)), 2)
+    account = of_track(track, recording, method.message)
+    received = account.of("online", "on air", "per receiver") / account.seconds
+    row["received_bytes_per_second"] = round(float(received.mean()))
+    return row | {"microseconds_per_step": round(1e6 * track.seconds / track.x[..., 0].size, 2)}

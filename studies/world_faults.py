@@ -1,0 +1,333 @@
+"""What may be wrong in a world: kinds of fault, each of which makes another scene of a scene."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import TypeAlias
+
+import numpy as np
+
+from coopoc import V2X, Fleet, Recording, Sensors
+from coopoc.arrays import Bools, Floats, Ints
+from coopoc.world.body_frames import turned
+from coopoc.world.outliers import Fault, Outliers
+from coopoc.world.sensors import stream
+from coopoc.world.spoofing import Spoofing, spoofed
+
+RUNS, EGOS = 4, 2
+"""Noise draws and egos of a world."""
+Edit: TypeAlias = Callable[[Recording], Recording]
+Draws: TypeAlias = np.random.Generator
+
+
+@dataclass(frozen=True, eq=False)
+class Scene:
+    """A world before its recording: each kind of fault returns another scene.
+
+    Attributes:
+        fleet: that drives.
+        egos: two columns.
+        acting: sensors as they are.
+        assumed: sensors as methods know them.
+        v2x: neighbourhood and channel.
+        seed: of the noise.
+        edits: what happens to the recording, in this order.
+        words: of each fault.
+    """
+
+    fleet: Fleet
+    egos: tuple[int, ...]
+    acting: Sensors
+    assumed: Sensors
+    v2x: V2X
+    seed: int
+    edits: tuple[Edit, ...] = ()
+    words: tuple[str, ...] = ()
+
+    def edited(self, edit: Edit, words: str) -> Scene:
+        """The same with one more edit."""
+        return replace(self, edits=(*self.edits, edit), words=(*self.words, words))
+
+    def sensing(self, words: str, told: bool = False, **more: object) -> Scene:
+        """The same with other sensors, of which methods are told or not."""
+        acting = replace(self.acting, **more)  # type: ignore[arg-type]
+        assumed = replace(self.assumed, **more) if told else self.assumed  # type: ignore[arg-type]
+        return replace(self, acting=acting, assumed=assumed, words=(*self.words, words))
+
+    def outliers(self, words: str, **more: Fault) -> Scene:
+        """The same with more outliers."""
+        return self.sensing(words, outliers=replace(self.acting.outliers or Outliers(), **more))
+
+    @property
+    def others(self) -> Ints:
+        """Columns that are no egos."""
+        return np.setdiff1d(np.arange(len(self.fleet.ids)), self.egos)
+
+    def interval(self, rng: Draws, low: float, high: float) -> tuple[Bools, str]:
+        """(T,) True during an interval of low to high s that begins after 5 s, and its words."""
+        length, t = rng.uniform(low, high), self.fleet.t
+        start = rng.uniform(5.0, max(t[-1] - length, 5.0))
+        return (t >= start) & (t < start + max(length, self.fleet.dt)), f"{start:.0f} to {start + length:.0f} s"
+
+
+def log_uniform(rng: Draws, low: float, high: float) -> float:
+    """A log-uniform draw."""
+    return float(np.exp(rng.uniform(np.log(low), np.log(high))))
+
+
+def _levels(scene: Scene, rng: Draws) -> Scene:
+    fix, speed, distance, angle = np.where(
+        rng.uniform(size=4) < 0.3, 1.0, [log_uniform(rng, 0.3, 4.0) for _ in range(4)]
+    )
+    known = scene.acting
+    return scene.sensing(
+        f"fixes {fix:.2g}, velocities {speed:.2g}, ranges {distance:.2g}, angles {angle:.2g} times what is assumed",
+        gnss_std=tuple(float(fix) * std for std in known.gnss_std),
+        velocity_std_ratio=float(speed) * known.velocity_std_ratio,
+        range_std=float(distance) * known.range_std,
+        azimuth_std=float(angle) * known.azimuth_std,
+        inclination_std=float(angle) * known.inclination_std,
+    )
+
+
+def _drift(scene: Scene, rng: Draws, told: bool) -> Scene:
+    own, common, lasts = log_uniform(rng, 1.0, 5.0), log_uniform(rng, 0.3, 3.0), log_uniform(rng, 15.0, 120.0)
+    words = f"{own:.2g} m, {common:.2g} m in common, for {lasts:.0f} s"
+    return scene.sensing(words, told, gnss_drift_std=own, gnss_common_std=common, gnss_drift_time=lasts)
+
+
+def _compass(scene: Scene, rng: Draws, told: bool) -> Scene:
+    """Headings turn what is measured and where odometry leads by one angle a vehicle and run."""
+    std = float(np.deg2rad(log_uniform(rng, 1.0, 8.0)))
+
+    def edit(recording: Recording) -> Recording:
+        angle = std * _normals(recording, scene.seed, "heading_bias")  # the draw of the azimuths
+        return replace(recording, velocity=turned(recording.velocity, angle[:, None]))
+
+    made = scene.sensing(f"{np.rad2deg(std):.2g}°", told, heading_bias_std=std)
+    return replace(made, edits=(*made.edits, edit))
+
+
+def _scale(scene: Scene, rng: Draws, told: bool) -> Scene:
+    std = log_uniform(rng, 0.01, 0.1)
+
+    def edit(recording: Recording) -> Recording:
+        scale = 1.0 + std * _normals(recording, scene.seed, "speed_scale")
+        return replace(recording, velocity=recording.velocity * scale[:, None, :, None])
+
+    made = scene.edited(edit, f"{100 * std:.2g} %")
+    return replace(made, assumed=replace(made.assumed, speed_scale_std=std)) if told else made
+
+
+def _normals(recording: Recording, seed: int, sensor: str) -> Floats:
+    """(R, N) standard normals, the first of each stream."""
+    return np.array([[stream(seed, sensor, r, name).normal() for name in recording.ids] for r in range(RUNS)])
+
+
+def _slip(scene: Scene, rng: Draws) -> Scene:
+    """Wheels of the egos and of a third of the others, twice as fast or still."""
+    (when, words), factor = scene.interval(rng, 2.0, 10.0), float(rng.choice((0.0, 2.0)))
+    who = np.union1d(scene.egos, scene.others[rng.uniform(size=len(scene.others)) < 1 / 3])
+
+    def edit(recording: Recording) -> Recording:
+        velocity = recording.velocity.copy()
+        velocity[:, when[:, None] & np.isin(np.arange(velocity.shape[2]), who)] *= factor
+        return replace(recording, velocity=velocity)
+
+    return scene.edited(edit, f"velocities times {factor:g}, {words}")
+
+
+def _outage(scene: Scene, rng: Draws, start: bool) -> Scene:
+    """No fix of the egos; from the start on all but the first, which filters begin with, or one in the middle."""
+    when, words = scene.interval(rng, 5.0, 30.0)
+    if start:
+        until = rng.uniform(10.0, 40.0)
+        when, words = (scene.fleet.t > 0) & (scene.fleet.t < until), f"until {until:.0f} s"
+
+    def edit(recording: Recording) -> Recording:
+        gnss = recording.gnss.copy()
+        gnss[:, when[:, None] & np.isin(np.arange(gnss.shape[2]), scene.egos)] = np.nan
+        return replace(recording, gnss=gnss)
+
+    return scene.edited(edit, words)
+
+
+def _receiver(scene: Scene, rng: Draws, ramp: tuple[float, float], start: float | None) -> Scene:
+    """The fixes of the egos are off, each in a direction of its own."""
+    size, length = log_uniform(rng, 5.0, 60.0), rng.uniform(*ramp)
+    attack = Spoofing(1.0, start=rng.uniform(5.0, 25.0) if start is None else start, ramp=length)
+    toward = rng.normal(size=(RUNS, EGOS, 3)) * [1.0, 1.0, 0.3]
+    offset = size * toward / np.linalg.norm(toward, axis=-1, keepdims=True)
+
+    def edit(recording: Recording) -> Recording:
+        gnss = recording.gnss.copy()
+        gnss[:, :, list(scene.egos)] += attack.size(recording.t)[:, None, None] * offset[:, None]
+        return replace(recording, gnss=gnss)
+
+    return scene.edited(edit, f"{size:.0f} m from {attack.start:.0f} s on" + f" over {length:.0f} s" * (length > 0))
+
+
+def _multipath(scene: Scene, rng: Draws) -> Scene:
+    rate, far, lasts = log_uniform(rng, 0.02, 0.3), log_uniform(rng, 10.0, 80.0), log_uniform(rng, 1.0, 15.0)
+    words = f"{100 * rate:.0f} % of the fixes up to {far:.0f} m off for {lasts:.0f} s"
+    return scene.outliers(words, fixes=Fault(rate, (far / 5, far), lasts=lasts))
+
+
+def _nlos(scene: Scene, rng: Draws) -> Scene:
+    rate, far, lasts = log_uniform(rng, 0.03, 0.5), log_uniform(rng, 1.0, 30.0), float(rng.choice((0.0, 1.0, 5.0)))
+    words = f"{100 * rate:.0f} % of the ranges up to {far:.2g} m too long for {lasts:g} s"
+    return scene.outliers(words, ranges=Fault(rate, (far / 5, far), lasts=lasts))
+
+
+def _mistaken(scene: Scene, rng: Draws) -> Scene:
+    rate, lasts = log_uniform(rng, 0.01, 0.2), float(rng.choice((0.0, 1.0)))
+    return scene.outliers(f"{100 * rate:.0f} % for {lasts:g} s", angles=Fault(rate, lasts=lasts))
+
+
+def _long(scene: Scene, rng: Draws, told: bool) -> Scene:
+    std = log_uniform(rng, 0.5, 5.0)
+    return scene.sensing(f"{std:.2g} m", told, range_offset_std=std)
+
+
+def _only(scene: Scene, _: Draws, columns: tuple[int, ...]) -> Scene:
+    def edit(recording: Recording) -> Recording:
+        return replace(recording, relative=np.where(np.isin(range(3), columns), recording.relative, np.nan))
+
+    return scene.edited(edit, "in the whole drive")
+
+
+def _late(scene: Scene, rng: Draws) -> Scene:
+    latency = rng.uniform(0.05, 0.8)
+    return replace(scene, v2x=replace(scene.v2x, latency=latency), words=(*scene.words, f"{latency:.2f} s"))
+
+
+def _lost(scene: Scene, rng: Draws) -> Scene:
+    loss, burst, rate = (
+        rng.uniform(0.1, 0.7),
+        log_uniform(rng, 1.0, 20.0),
+        float(rng.choice((1.0, 2.0, 5.0, 10.0, 20.0))),
+    )
+    rate = min(rate, 1.0 / scene.fleet.dt)
+    words = f"{100 * loss:.0f} %, {burst:.0f} at once, at {rate:g} Hz"
+    v2x = replace(scene.v2x, loss=loss, burst=burst, rate=rate)
+    return replace(scene, v2x=v2x, words=(*scene.words, words))
+
+
+def _clocks(scene: Scene, rng: Draws) -> Scene:
+    """Messages of some hold what was a while before the time that they state."""
+    who, steps = _some(scene, rng), max(1, round(rng.uniform(0.1, 1.0) / scene.fleet.dt))
+    text = f"{len(who)} are {steps * scene.fleet.dt:.2g} s late"
+    return scene.edited(lambda recording: _behind(recording, who, steps, 0), text)
+
+
+def _replay(scene: Scene, rng: Draws) -> Scene:
+    """From an instant on, messages of some are repeated with new times."""
+    who, seconds, begin = _some(scene, rng), rng.uniform(3.0, 20.0), rng.uniform(0.0, 25.0)
+    steps, start = round(seconds / scene.fleet.dt), round(begin / scene.fleet.dt)
+    words = f"{len(who)} repeat those of {seconds:.0f} s before, from {begin:.0f} s on"
+    return scene.edited(lambda recording: _behind(recording, who, steps, start), words)
+
+
+def _some(scene: Scene, rng: Draws) -> Ints:
+    """Columns of a tenth to a half of the others, one at least."""
+    count = max(1, round(rng.uniform(0.1, 0.5) * len(scene.others)))
+    return np.sort(rng.permutation(scene.others)[:count])
+
+
+def _behind(recording: Recording, who: Ints, steps: int, start: int) -> Recording:
+    """Fixes and velocities of some as they were so many steps ago, from a step on, wherever they were there then."""
+    now = np.arange(len(recording.t))
+    then = np.where(now >= start, np.maximum(now - steps, 0), now)
+    gnss, velocity = recording.gnss.copy(), recording.velocity.copy()
+    there = np.isfinite(velocity[:1, now][:, :, who]) & np.isfinite(velocity[:1, then][:, :, who])
+    for values in (gnss, velocity):
+        values[:, :, who] = np.where(there, values[:, then][:, :, who], values[:, :, who])
+    return replace(recording, gnss=gnss, velocity=velocity)
+
+
+def _liars(scene: Scene, rng: Draws, ramp: tuple[float, float] = (0.0, 0.0), collude: bool = False) -> Scene:
+    far, begins = log_uniform(rng, 4.0, 60.0), rng.uniform(0.0, 25.0) * rng.integers(0, 2)
+    attack = Spoofing(rng.uniform(0.1, 0.5), (far / 4, far), begins, rng.uniform(*ramp), collude)
+    words = f"{100 * attack.share:.0f} % up to {far:.0f} m off on each axis, from {begins:.0f} s on"
+    words += f" over {attack.ramp:.0f} s" * (attack.ramp > 0)
+    return scene.edited(lambda recording: spoofed(recording, attack, scene.seed, scene.egos), words)
+
+
+def _sybil(scene: Scene, rng: Draws) -> Scene:
+    """One vehicle beside an ego sends as several: all are measured where it is, and claim to be elsewhere together."""
+    fleet, count = scene.fleet, int(rng.integers(1, 5))
+    gap = np.linalg.norm(fleet.position[:, scene.others] - fleet.position[:, scene.egos[:1]], axis=-1)
+    liar = int(scene.others[np.argmin(gap.mean(axis=0))])
+    toward, start = rng.uniform(-1.0, 1.0, (RUNS, 3)), rng.uniform(0.0, 25.0)
+    offset = log_uniform(rng, 5.0, 40.0) * toward
+    columns = [liar, *range(len(fleet.ids), len(fleet.ids) + count)]
+    antennas = rng.normal(0.0, 0.3, (count, 3))
+    who = replace(
+        fleet,
+        ids=(*fleet.ids, *(f"ghost{k}" for k in range(count))),
+        position=np.append(fleet.position, fleet.position[:, [liar] * count] + antennas, axis=1),
+        velocity=np.append(fleet.velocity, fleet.velocity[:, [liar] * count], axis=1),
+    )
+
+    def edit(recording: Recording) -> Recording:
+        gnss = recording.gnss.copy()
+        gnss[:, :, columns] += (recording.t >= start)[:, None, None] * offset[:, None, None]
+        return replace(recording, gnss=gnss)
+
+    return replace(scene, fleet=who).edited(edit, f"one as {count + 1}, from {start:.0f} s on")
+
+
+def _come_and_go(scene: Scene, rng: Draws) -> Scene:
+    """Two thirds of the others are there during a part of the drive only, or away during it."""
+    position, velocity, t = scene.fleet.position.copy(), scene.fleet.velocity.copy(), scene.fleet.t
+    who = scene.others[rng.uniform(size=len(scene.others)) < 2 / 3]
+    for column in who:
+        start, stop = np.sort(rng.uniform(0.0, t[-1], 2))
+        away = (t < start) | (t >= stop) if rng.uniform() < 0.5 else (t >= start) & (t < stop)
+        away[-1] &= not away.all()
+        position[away, column] = velocity[away, column] = np.nan
+    fleet = replace(scene.fleet, position=position, velocity=velocity)
+    return replace(scene, fleet=fleet, words=(*scene.words, f"{len(who)} of {len(scene.others)}"))
+
+
+KINDS: Mapping[str, Callable[[Scene, Draws], Scene]] = {
+    "noise levels": _levels,
+    "drift, told": lambda scene, rng: _drift(scene, rng, True),
+    "drift, not told": lambda scene, rng: _drift(scene, rng, False),
+    "compass, told": lambda scene, rng: _compass(scene, rng, True),
+    "compass, not told": lambda scene, rng: _compass(scene, rng, False),
+    "odometer scale, told": lambda scene, rng: _scale(scene, rng, True),
+    "odometer scale, not told": lambda scene, rng: _scale(scene, rng, False),
+    "odometer slip": _slip,
+    "no fixes": lambda scene, rng: _outage(scene, rng, False),
+    "no fixes, at first": lambda scene, rng: _outage(scene, rng, True),
+    "own receiver, jump": lambda scene, rng: _receiver(scene, rng, (0.0, 0.0), None),
+    "own receiver, creep": lambda scene, rng: _receiver(scene, rng, (5.0, 30.0), None),
+    "own receiver, from the start": lambda scene, rng: _receiver(scene, rng, (0.0, 0.0), 0.0),
+    "multipath": _multipath,
+    "NLOS": _nlos,
+    "mistaken angles": _mistaken,
+    "range offset, told": lambda scene, rng: _long(scene, rng, True),
+    "range offset, not told": lambda scene, rng: _long(scene, rng, False),
+    "measured, ranges only": lambda scene, rng: _only(scene, rng, (0,)),
+    "measured, angles only": lambda scene, rng: _only(scene, rng, (1, 2)),
+    "measured, inclinations only": lambda scene, rng: _only(scene, rng, (2,)),
+    "measured, nothing": lambda scene, rng: _only(scene, rng, ()),
+    "late messages": _late,
+    "lost messages": _lost,
+    "come and go": _come_and_go,
+    "clock offsets": _clocks,
+    "liars, jump": _liars,
+    "liars, creep": lambda scene, rng: _liars(scene, rng, (5.0, 30.0)),
+    "liars, collusion": lambda scene, rng: _liars(scene, rng, collude=True),
+    "liars, replay": _replay,
+    "liars, Sybil": _sybil,
+}
+"""Kind of fault -> what it makes of a scene; edits happen in this order. Of kinds with the same words before the comma
+a world has one at most."""
+WEIGHTS = {"noise levels": 10.0}
+"""Of a kind among those that are drawn, 1 by default."""
+OF_MOTION = {"odometer scale, told", "odometer scale, not told", "odometer slip"}
+OF_NEIGHBOURS = {*[*KINDS][[*KINDS].index("NLOS") :]}
+"""Kinds that change nothing for a fleet that stands, or without neighbours."""

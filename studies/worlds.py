@@ -1,0 +1,220 @@
+"""Worlds: random draws of fleets, sensors, channels and faults, on which a cooperative filter is judged."""
+
+from __future__ import annotations
+
+import zlib
+from collections.abc import Callable, Collection, Mapping
+from dataclasses import dataclass, replace
+from functools import lru_cache
+from typing import Literal
+
+import numpy as np
+
+from coopoc import V2X, Fleet, Recording, Sensors, load_fleet, observe
+from coopoc.arrays import Floats, number, one_of
+from coopoc.errors import unknown
+from coopoc.world.body_frames import turned
+
+from .world_faults import EGOS, KINDS, OF_MOTION, OF_NEIGHBOURS, RUNS, WEIGHTS, Draws, Scene, log_uniform
+
+Split = Literal["test", "validation", "development"]
+SPLITS: tuple[Split, ...] = ("test", "validation", "development")
+STEPS = (0.05, 0.1, 0.1, 0.2, 0.5, 1.0)
+"""s between two steps, each as probable as it stands here."""
+COUNTS = (0.2, 0.3, 0.3, 0.2)
+"""Probability of zero to three kinds of fault."""
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A draw of all that a method may meet in a drive of 40 to 60 s.
+
+    Attributes:
+        seed: of the draw within its split.
+        recording: what methods see, in four noise draws; it names no fault.
+        fleet: the truth.
+        egos: two columns, whose own estimates are scored.
+        kinds: of fault, in words; none where all is as it is assumed to be.
+        text: the world in one line.
+    """
+
+    seed: int
+    recording: Recording
+    fleet: Fleet
+    egos: tuple[int, ...]
+    kinds: tuple[str, ...]
+    text: str
+
+
+def world(seed: int, split: Split = "test", *, without: Collection[str] = (), everyone: bool = False) -> World:
+    """The world of a seed, the same in every process.
+
+    Args:
+        seed: 0, 1, ...
+        split: "test"; "validation", on which parameters are chosen; "development", which may be looked at. No two
+            splits share a draw, and the first shares no town with the others.
+        without: kinds of fault that are left out; all other draws stay as they are.
+        everyone: whether all vehicles observe, as methods need that estimate a whole fleet; the egos alone else.
+
+    Raises:
+        InputError: a seed below 0, another split, an unknown kind.
+
+    >>> found = world(1, "development")
+    >>> found.recording.runs, len(found.egos)
+    (4, 2)
+    """
+    seed = number("seed", seed, 0, 2**30, kind=int, allowed="in 0..2^30", hint="Count worlds from 0.")
+    key = 3 * seed + SPLITS.index(one_of("split", split, Split))
+    for kind in without:
+        if kind not in KINDS:
+            raise unknown("without", kind, KINDS)
+    scene = _nominal(key, split)
+    kinds = [kind for kind in _kinds(_rng(key, "kinds"), scene) if kind not in without]
+    text = _text(scene)
+    for kind in kinds:
+        scene = KINDS[kind](scene, _rng(key, kind))
+    recording = observe(
+        scene.fleet,
+        scene.acting,
+        scene.v2x,
+        runs=RUNS,
+        seed=key,
+        observers=None if everyone else scene.egos,
+        assumed=scene.assumed,
+    )
+    for edit in scene.edits:
+        recording = edit(recording)
+    text = "; ".join((text, *(f"{kind}: {words}" for kind, words in zip(kinds, scene.words, strict=True))))
+    return World(seed, replace(recording, notes=()), scene.fleet, scene.egos, tuple(kinds), text)
+
+
+def _rng(key: int, *words: str) -> Draws:
+    return np.random.default_rng([key, *(zlib.crc32(word.encode()) for word in words)])
+
+
+def _kinds(rng: Draws, scene: Scene) -> list[str]:
+    """Kinds of fault in the order of KINDS, no two alternatives ("drift, told" and "drift, not told") at once."""
+    possible = [kind for kind in KINDS if not (scene.v2x.max_neighbours == 0 and kind in OF_NEIGHBOURS)]
+    if scene.fleet.name == "standing":
+        possible = [kind for kind in possible if kind not in OF_MOTION]
+    weights = np.array([WEIGHTS.get(kind, 1.0) for kind in possible])
+    order = rng.choice(len(possible), len(possible), replace=False, p=weights / weights.sum())
+    chosen = dict[str, str]()
+    for kind in (possible[k] for k in order):
+        chosen.setdefault(kind.split(",")[0], kind)
+    count = rng.choice(len(COUNTS), p=COUNTS)
+    return sorted([*chosen.values()][:count], key=[*KINDS].index)
+
+
+def _nominal(key: int, split: Split) -> Scene:
+    """Fleet, egos, levels that are assumed and act, and an ideal channel."""
+    rng = _rng(key, "scene")
+    dt, seconds = float(rng.choice(STEPS)), rng.uniform(40.0, 60.0)
+    t = dt * np.arange(round(seconds / dt) + 1)
+    name = str(rng.choice([*DRIVES]))
+    before = DRIVES[name](rng, np.append(-dt, t), split)
+    ids = tuple(f"v{k}" for k in range(before.shape[1]))
+    fleet = Fleet(ids, t, before[1:], np.diff(before, axis=0) / dt, name=name)
+    egos = tuple(sorted(rng.choice(len(ids), EGOS, replace=False).tolist()))
+    angle = float(np.deg2rad(log_uniform(rng, 0.5, 6.0)))
+    sensors = Sensors(
+        gnss_std=(log_uniform(rng, 0.5, 5.0),) * 3,
+        velocity_std_ratio=log_uniform(rng, 0.02, 0.2),
+        range_std=log_uniform(rng, 0.1, 2.0),
+        azimuth_std=angle,
+        inclination_std=angle,
+    )
+    v2x = V2X(max_neighbours=int(rng.integers(0, 11)), radius=float(rng.choice((30.0, 30.0, 60.0, 100.0))))
+    return Scene(fleet, egos, sensors, sensors, v2x, key)
+
+
+def _text(scene: Scene) -> str:
+    known, fleet = scene.assumed, scene.fleet
+    return (
+        f"{fleet.name}, {len(fleet.ids)} vehicles, {fleet.t[-1]:.0f} s in steps of {fleet.dt:g} s, "
+        f"K = {scene.v2x.max_neighbours} within {scene.v2x.radius:g} m, fixes {known.gnss_std[0]:.2g} m, velocities "
+        f"{100 * known.velocity_std_ratio:.2g} %, ranges {known.range_std:.2g} m, "
+        f"angles {np.rad2deg(known.azimuth_std):.2g}°"
+    )
+
+
+# Drives: positions (T, N, 3) m at times t s
+
+
+def _town(rng: Draws, t: Floats, split: Split) -> Floats:
+    name = str(rng.choice(("town10", "town04"))) if split == "test" else "town10-validation"
+    town = _loaded(name)
+    place = (rng.uniform(1.5, town.t[-1] - t[-1] - town.dt) + t) / town.dt
+    step = place.astype(int)
+    share = (place - step)[:, None, None]
+    position: Floats = (1.0 - share) * town.position[step] + share * town.position[step + 1]
+    return position
+
+
+@lru_cache
+def _loaded(name: str) -> Fleet:
+    return load_fleet(name)
+
+
+def _column(rng: Draws, travelled: Floats, gap: tuple[float, float]) -> Floats:
+    """Vehicles behind one another on a straight road of two lanes in any direction, from distances (T, N) m."""
+    count = travelled.shape[1]
+    along = travelled - np.cumsum(rng.uniform(*gap, count))
+    across = 3.5 * rng.integers(0, 2, count) + 0.3 * np.sin(along / 40.0 + rng.uniform(0, 6, count))
+    slope = rng.uniform(-0.04, 0.04)
+    road = np.stack([along, across, slope * along], axis=-1)
+    return turned(road, np.array(rng.uniform(-np.pi, np.pi)))
+
+
+def _platoon(rng: Draws, t: Floats, _: Split) -> Floats:
+    count, speed, period = int(rng.integers(4, 11)), rng.uniform(6.0, 30.0), rng.uniform(15.0, 40.0)
+    phase = 2 * np.pi * (t[:, None] / period + 0.03 * np.arange(count))
+    wave = 0.2 * speed * period / (2 * np.pi) * np.sin(phase)
+    return _column(rng, speed * t[:, None] + wave, (8.0, 25.0))
+
+
+def _stop_and_go(rng: Draws, t: Floats, _: Split) -> Floats:
+    count, speed, period = int(rng.integers(4, 11)), rng.uniform(4.0, 14.0), rng.uniform(12.0, 30.0)
+    fine = np.linspace(t[0] - 30.0, t[-1], 4000)
+    share = np.clip(0.5 + 1.2 * np.sin(2 * np.pi * fine / period), 0.0, 1.0)
+    travelled = np.append(0.0, np.cumsum(share[1:])) * speed * (fine[1] - fine[0])
+    reacts = rng.uniform(0.5, 2.0) * np.arange(count)  # the wave runs backwards
+    return _column(rng, np.interp(t[:, None] - reacts, fine, travelled), (8.0, 20.0))
+
+
+def _circle(rng: Draws, t: Floats, _: Split) -> Floats:
+    count, radius, speed = int(rng.integers(4, 11)), rng.uniform(12.0, 45.0), rng.uniform(3.0, 12.0)
+    ring = radius + rng.uniform(-3.0, 3.0, count)
+    angle = speed / radius * t[:, None] + 2 * np.pi * (np.arange(count) + rng.uniform(-0.2, 0.2, count)) / count
+    return np.stack(
+        [ring * np.cos(angle), ring * np.sin(angle), np.broadcast_to(_heights(rng, count), angle.shape)], -1
+    )
+
+
+def _crossing(rng: Draws, t: Floats, _: Split) -> Floats:
+    count = int(rng.integers(8, 17))
+    speed, passes = rng.uniform(4.0, 12.0, count), np.sort(rng.uniform(0.0, t[-1], count))
+    along, side = speed * (t[:, None] - passes), np.broadcast_to(rng.uniform(2.0, 6.0, count), (len(t), count))
+    lane = np.stack([along, side, np.broadcast_to(_heights(rng, count), along.shape)], axis=-1)
+    return turned(lane, np.broadcast_to(np.pi / 2 * rng.integers(0, 4, count), along.shape))
+
+
+def _standing(rng: Draws, t: Floats, _: Split) -> Floats:
+    count = int(rng.integers(3, 11))
+    grid = np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2)
+    place = rng.uniform(5.0, 9.0) * rng.permutation(grid)[:count] + rng.uniform(-1.0, 1.0, (count, 2))
+    return np.tile(np.column_stack([place, _heights(rng, count)]), (len(t), 1, 1))
+
+
+def _heights(rng: Draws, count: int) -> Floats:
+    return rng.uniform(-2.0, 2.0, count)
+
+
+DRIVES: Mapping[str, Callable[[Draws, Floats, Split], Floats]] = {
+    "town": _town,
+    "platoon": _platoon,
+    "circle": _circle,
+    "stop and go": _stop_and_go,
+    "crossing": _crossing,
+    "standing": _standing,
+}

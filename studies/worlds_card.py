@@ -1,0 +1,341 @@
+"""Score card of a method on worlds: how often and by how much it is worse than being alone or a textbook filter."""
+
+from __future__ import annotations
+
+import json
+import re
+import sys
+import time
+from collections.abc import Mapping, Sequence
+from functools import lru_cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from scipy import special
+from tqdm import tqdm
+
+from coopoc.arrays import Floats, number
+from coopoc.errors import InputError
+from coopoc.evaluate.metrics import nees, rt_le
+from coopoc.evaluate.statistics import mean_interval
+from coopoc.methods.catalogue import needs_whole_fleet
+from coopoc.methods.track import Method
+from coopoc.one_file import file_digest, in_file
+from coopoc.study.cell import Cell
+from coopoc.study.compute import compute
+from coopoc.study.numbers import three
+from coopoc.study.provenance import environment
+from coopoc.study.study import Params, Row
+
+from .lineup import named_method
+from .tasks import VERSION
+from .worlds import Split, world
+
+if TYPE_CHECKING:
+    from coopoc.study.plot import Plot
+
+JOINT, ALONE = "joint", "kalman"
+"""What a method is compared with on the same draws: the textbook filter, and being alone."""
+WORSE = 1.1
+"""Ratio of errors from which on a method is worse."""
+BAND = special.chdtri(3, [0.975, 0.025])
+"""In which 95 % of the NEES of a consistent filter are, of three degrees of freedom."""
+EXACT = 1e-9
+"""Least ratio that counts in a geometric mean."""
+WORST = 10
+NONE = "nothing wrong"
+
+
+@lru_cache
+def _compiled(name: str) -> Method:
+    one, first = named_method(name), world(0, everyone=needs_whole_fleet(name))
+    one(first.recording.between(0, 3), list(first.egos))
+    return one
+
+
+def world_row(name: str, split: Split, given: Params) -> list[Row]:
+    """RT-LE m of a method in one world, of the textbook filter and alone, on the same draws; its NEES and time.
+
+    Args:
+        name: of the method.
+        split: of the worlds.
+        given: with the seed.
+
+    Raises:
+        InputError: estimates that are not finite.
+    """
+    drawn = world(given["seed"], split, everyone=needs_whole_fleet(name))
+    egos = list(drawn.egos)
+    tracks = {each: _compiled(each)(drawn.recording, egos) for each in {name: "", JOINT: "", ALONE: ""}}
+    level = {each: float(rt_le(track, drawn.fleet).mean()) for each, track in tracks.items()}
+    if not np.isfinite(level[name]):
+        raise InputError("estimates", level[name], "must be finite", "Estimate every ego at every step.")
+    track = tracks[name]
+    row: Row = {"kinds": "; ".join(drawn.kinds), "noted": float(bool(track.notes)), "rt_le_m": level[name]}
+    row |= {"joint_m": level[JOINT], "alone_m": level[ALONE], "nees_inside": np.nan, "nees_median": np.nan}
+    if track.covariance is not None:
+        each = nees(track, drawn.fleet, method=name)
+        each = each[np.isfinite(each)]
+        row["nees_inside"] = float(np.mean((each >= BAND[0]) & (each <= BAND[1])))
+        row["nees_median"] = float(np.median(each))
+    row["microseconds_per_step"] = 1e6 * track.seconds / track.x[..., 0].size
+    return [row]
+
+
+def run_worlds(
+    methods: Sequence[str], out: Path, count: int, seed: int | None = None, validation: bool = False, jobs: int = 1
+) -> int:
+    """Write and print the cards of methods, and draw those of the folder on the same worlds; 1 if a world failed.
+
+    Args:
+        methods: names of cooperative or solo methods.
+        out: folder of the cards.
+        count: number of worlds.
+        seed: of the first; None for 0 and a card that can be submitted.
+        validation: whether worlds are those on which parameters are chosen.
+        jobs: processes.
+
+    Raises:
+        InputError: no method, an unknown one, less than one world or process.
+    """
+    number("worlds", count, 1, 2**20, kind=int, allowed=">= 1", hint="Cards that are submitted have 1000.")
+    number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1", hint="Give the number of worker processes.")
+    first = number("seed", seed or 0, 0, 2**29, kind=int, allowed="in 0..2^29", hint="Count worlds from 0.")
+    if not methods:
+        raise InputError("methods", "()", "must name a method", "coopoc list shows them.")
+    for name in methods:
+        named_method(name)
+    folder = out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}")
+    cards = list[dict[str, Any]]()
+    for name in methods:
+        began = time.perf_counter()
+        cards.append(worlds_card(name, count, first, "validation" if validation else "test", jobs))
+        folder.mkdir(parents=True, exist_ok=True)
+        (folder / card_file(name)).write_text(card_text(cards[-1]))
+        print(details(cards[-1]), end="\n\n")
+        print(f"coopoc: {folder / card_file(name)}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
+    print(overview(cards))
+    beside = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
+    distribution([card for card in beside if card["worlds"]["seed"] == cards[0]["worlds"]["seed"]]).save(
+        folder / "worlds"
+    )
+    return int(any(card["failed"] for card in cards))
+
+
+def card_file(name: str) -> str:
+    """Name of the file of a method's card.
+
+    >>> card_file("mine.py:Own")
+    'mine_py_Own.json'
+    """
+    return f"{re.sub(r'[^A-Za-z0-9-]+', '_', name).strip('_')}.json"
+
+
+def card_head(name: str) -> Row:
+    """What a method of a card is, and with which versions it was run."""
+    used = environment()
+    versions = {library: used[library] for library in ("coopoc", "numpy", "numba", "torch") if library in used}
+    source = file_digest(name, "method") if in_file(name) else ""
+    return {"benchmark": VERSION, "method": name, "source": source, "versions": versions}
+
+
+def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", jobs: int = 1) -> dict[str, Any]:
+    """The card of a method on worlds seed..seed+count-1: columns of all worlds, and what they amount to.
+
+    Args:
+        name: of a method, or "mine.py:NAME".
+        count: number of worlds.
+        seed: of the first.
+        split: of the worlds.
+        jobs: processes.
+    """
+    cells = [Cell({"seed": k}, {"seed": k}, str(k)) for k in range(seed, seed + count)]
+    rows = list[Row]()
+    done = tqdm(compute(partial(world_row, name, split), cells, jobs), name, count, unit="world", delay=2.0)
+    for outcome in done:
+        at = outcome.cell.given["seed"]
+        if outcome.rows is not None:
+            rows += [{"seed": at, **row} for row in outcome.rows.to_pylist()]
+            continue
+        reason = outcome.reason.partition("\n")[0][:200]
+        print(f"coopoc: failed: world {at}: {reason}", file=sys.stderr)
+        blank = dict.fromkeys(("rt_le_m", "joint_m", "alone_m", "nees_inside", "nees_median"), np.nan) | {"noted": 1.0}
+        kinds = "; ".join(world(at, split).kinds)
+        rows.append({"seed": at, "kinds": kinds, **blank, "microseconds_per_step": np.nan, "failed": reason})
+    rows.sort(key=lambda row: row["seed"])
+    columns = {key: [_short(row[key]) for row in rows] for key in rows[0] if key != "failed"}
+    failed = {str(row["seed"]): row["failed"] for row in rows if "failed" in row}
+    found = _arrays(columns)
+    return {
+        **card_head(name),
+        "split": split,
+        "summary": summary(found),
+        "by_kind": {kind: summary(_only(found, kind)) for kind in _kinds(columns)},
+        "worst": _worst(name, split, found),
+        "failed": failed,
+        "worlds": {key: columns[key] for key in ("seed", "rt_le_m", "joint_m", "alone_m")},
+    }
+
+
+def _short(value: Any) -> Any:
+    """Five digits, so that cards stay small; None for what is not finite, which JSON has no number for."""
+    if not isinstance(value, float):
+        return value
+    return float(f"{value:.5g}") if np.isfinite(value) else None
+
+
+def _arrays(columns: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
+    """Columns as arrays, with the ratios to the textbook filter, to being alone and to the better of both; infinite
+    where the method failed."""
+    found: dict[str, Any] = {
+        key: np.array(values, dtype=object if key == "kinds" else int if key == "seed" else float)
+        for key, values in columns.items()
+    }
+    own_m, joint, alone = (found[key] for key in ("rt_le_m", "joint_m", "alone_m"))
+    for key, other in (("over_joint", joint), ("over_alone", alone), ("over_better", np.fmin(joint, alone))):
+        found[key] = np.nan_to_num(own_m / other, nan=np.inf, posinf=np.inf)
+    return found
+
+
+def ratios(card: Params) -> Floats:
+    """(W,) sorted ratios of RT-LE to the better of the textbook filter and being alone."""
+    found: Floats = np.sort(_arrays(card["worlds"])["over_better"])
+    return found
+
+
+def _kinds(columns: Mapping[str, Sequence[Any]]) -> list[str]:
+    """Kinds of fault that occur, and none of them."""
+    return sorted({kind or NONE for each in columns["kinds"] for kind in each.split("; ")})
+
+
+def _only(found: Mapping[str, Any], kind: str) -> dict[str, Any]:
+    """The worlds with a kind of fault, alone or among others."""
+    mine = np.array([kind in each.split("; ") if kind != NONE else not each for each in found["kinds"]])
+    return {key: values[mine] for key, values in found.items()}
+
+
+def summary(found: Mapping[str, Any]) -> dict[str, Any]:
+    """Shares and means over worlds with 95 % bootstrap intervals, percentile, NEES and time.
+
+    Args:
+        found: columns of worlds.
+    """
+    sound = np.isfinite(found["over_better"])
+    made: dict[str, Any] = {"worlds": len(sound), "failed": int((~sound).sum())}
+    made["worse_than_alone"] = _interval(100.0 * (found["over_alone"] > WORSE))
+    made["worse_than_better"] = _interval(100.0 * (found["over_better"] > WORSE))
+    made["worse_unnoted"] = _interval(100.0 * ((found["over_better"] > WORSE) & (found["noted"] == 0.0)))
+    for key in ("over_joint", "over_better"):
+        if sound.any():
+            made[key] = [
+                _short(float(np.exp(value))) for value in _interval(np.log(np.maximum(found[key][sound], EXACT)))
+            ]
+    made["percentile_95"] = _short(float(np.quantile(found["over_better"], 0.95, method="higher")))
+    if np.isfinite(found["nees_inside"]).any():
+        made["nees_inside"] = _interval(found["nees_inside"][np.isfinite(found["nees_inside"])])
+        made["nees_median"] = _short(float(np.nanmedian(found["nees_median"])))
+    if sound.any():
+        made["microseconds_per_step"] = _short(float(np.nanmedian(found["microseconds_per_step"])))
+    return made
+
+
+def _interval(values: Floats) -> list[float]:
+    """Mean and ends of its interval; of one world without ends."""
+    level = mean_interval(values)
+    return [_short(end) for end in (level.mean, level.low, level.high) if np.isfinite(end)]
+
+
+def _worst(name: str, split: Split, found: Mapping[str, Any]) -> list[Row]:
+    """Worlds with the largest ratios, what is in them, and the command that runs each again."""
+    order = np.argsort(-found["over_better"], kind="stable")[:WORST]
+    return [
+        {
+            "ratio": _short(float(found["over_better"][k])),
+            **{key: _short(float(found[key][k])) for key in ("rt_le_m", "joint_m", "alone_m")},
+            "text": world(int(found["seed"][k]), split).text,
+            "command": f"coopoc benchmark {name} --worlds 1 --seed {found['seed'][k]}"
+            + " --validation" * (split == "validation"),
+        }
+        for k in order
+    ]
+
+
+def card_text(card: Params) -> str:
+    """JSON with a line for each part: a card is read by people and kept in a repository."""
+    return "{\n" + ",\n".join(f" {json.dumps(key)}: {json.dumps(value)}" for key, value in card.items()) + "\n}\n"
+
+
+def overview(cards: Sequence[Params]) -> str:
+    """Markdown table of cards, least share of worlds that are worse than the better of both first."""
+    rows = [_shown("method", card["method"], card["summary"]) for card in sorted(cards, key=_order)]
+    return _table(rows, drop=("over the better", "us/step"))
+
+
+def _order(card: Params) -> tuple[float, float]:
+    return card["summary"]["worse_than_better"][0], card["summary"].get("over_joint", [np.inf])[0]
+
+
+def details(card: Params) -> str:
+    """Markdown table of a card by kind of fault, and its worst worlds with the commands that run them."""
+    kinds = sorted(card["by_kind"].items(), key=lambda item: -item[1]["worse_than_better"][0])
+    table = _table([_shown("kind of fault", kind, each) for kind, each in kinds], drop=("95th percentile", "us/step"))
+    lines = [
+        f"{_of(row['ratio'])} ({_of(row['rt_le_m'])} m; {JOINT} {_of(row['joint_m'])} m, {ALONE} "
+        f"{_of(row['alone_m'])} m): {row['text']}\n    {row['command']}"
+        for row in card["worst"]
+    ]
+    return f"{table}\n\nLargest ratios to the better of {JOINT} and {ALONE}:\n\n" + "\n".join(lines)
+
+
+def _of(value: float | None) -> str:
+    return "failed" if value is None else three(value)
+
+
+def _shown(head: str, name: str, found: Params) -> Row:
+    return {
+        head: name,
+        "worlds": f"{found['worlds']}" + f" ({found['failed']} failed)" * (found["failed"] > 0),
+        "worse than alone [%]": _level(found["worse_than_alone"]),
+        "worse than the better [%]": _level(found["worse_than_better"]),
+        "without a note [%]": _level(found["worse_unnoted"]),
+        "over joint": _level(found.get("over_joint")),
+        "over the better": _level(found.get("over_better")),
+        "95th percentile": _of(found["percentile_95"]),
+        "NEES inside": _level(found.get("nees_inside")),
+        "median NEES": _of(found["nees_median"]) if "nees_median" in found else "",
+        "us/step": _of(found.get("microseconds_per_step")),
+    }
+
+
+def _level(values: Sequence[float] | None) -> str:
+    if not values:
+        return ""
+    ends = ", ".join(f"{value:.3g}" for value in values[1:])
+    return f"{values[0]:.3g}" + f" [{ends}]" * bool(ends)
+
+
+def _table(rows: Sequence[Row], drop: Sequence[str] = ()) -> str:
+    from tabulate import tabulate
+
+    kept = [{key: value for key, value in row.items() if key not in drop} for row in rows]
+    return tabulate(kept, headers="keys", tablefmt="github", disable_numparse=True)
+
+
+def distribution(cards: Sequence[Params]) -> Plot:
+    """Share of worlds in which the ratio to the better of the textbook filter and being alone is below each value."""
+    from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
+
+    with canvas(width=7.0) as (figure, axes):
+        ordered = sorted(cards, key=_order)
+        for card in ordered:
+            values = ratios(card)
+            share = np.arange(1, len(values) + 1) / len(values)
+            axes.step(values, 100 * share, where="post", **{**strokes({"method": card["method"]}), "marker": None})
+        axes.axvline(WORSE, color="#555555", linewidth=0.8, linestyle=":")
+        axes.set(xlabel="RT-LE over the better of joint filter and KF", ylabel="Share of worlds [%]", ylim=(0, 101))
+        plain_log(axes.xaxis)
+        axes.set_xlim(0.1, 20.0)
+        legend(axes, [{"method": card["method"]} for card in ordered])
+    count, split = cards[0]["summary"]["worlds"], cards[0]["split"]
+    return Plot(figure, f"Distribution over {count} {split} worlds; dotted: {WORSE:g} times the better of both.")

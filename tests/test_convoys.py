@@ -1,0 +1,61 @@
+"""Convoys: pieces of one real drive side by side keep its errors; star filters get rows on them."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from conftest import measured, refused
+
+import coopoc as co
+from coopoc.studies import benchmark, convoys, roads
+
+TASKS = ("convoy-kitti", "convoy-f9k", "convoy-comma2k19")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_vehicles_err_as_the_pieces_of_the_drive(task: str) -> None:
+    for name in roads.ROADS[convoys.CONVOYS[task]]:
+        measured(name)
+    recording, fleet = convoys.convoy(task, measured())
+    drive, truth = roads.seen(convoys.CONVOYS[task], measured())
+    column, count, length = drive.observers[0], len(fleet.ids), len(fleet.t)
+    assert count == (2 if task == "convoy-comma2k19" else 4)
+    assert count * length <= len(drive.t)
+    assert np.isfinite(recording.gnss[:, 0]).all()
+    start = np.linalg.norm(fleet.position[0] - fleet.position[0].mean(axis=0), axis=-1)
+    assert start.max() < 2 * convoys.SPREAD
+    error = (recording.gnss[0] - fleet.position)[..., :2]
+    real = (drive.gnss[0, :, column] - truth.position[:, column])[:, :2]
+    begins = convoys._pieces(drive, column)[0]
+    for k, begin in enumerate(begins):
+        piece = real[begin : begin + length]
+        known = np.isfinite(piece[:, 0])
+        assert known.sum() > 2
+        assert error[known, k] == pytest.approx(piece[known], abs=1e-6)
+        assert (np.isfinite(error[:, k, 0]) >= known).all()
+    speed, true = (np.linalg.norm(values, axis=-1) for values in (recording.velocity[0], fleet.velocity))
+    fast = true[:, 0] > 2.0
+    assert fast.any()
+    assert speed[fast, 0] == pytest.approx(
+        np.linalg.norm(drive.velocity[0, begins[0] :][:length, column], axis=-1)[fast], rel=0.02
+    )
+    assert np.array_equal(recording.gnss[0], recording.gnss[1], equal_nan=True)
+    assert not np.array_equal(recording.relative[0], recording.relative[1])
+
+
+def test_star_filters_get_rows_on_convoys(tmp_path: Path) -> None:
+    measured("KITTI_00_gt.txt")
+    assert benchmark.benchmark(("joint", "road-kalman"), data=measured(), tasks=("convoy-kitti",), out=tmp_path) == 0
+    joint, alone = (
+        json.loads((tmp_path / f"{name}.json").read_text())["tasks"][0] for name in ("joint", "road-kalman")
+    )
+    recording, fleet = convoys.convoy("convoy-kitti", measured())
+    track = co.JointFilter("nominal")(recording, recording.ids)
+    gap = (track.x - fleet.position)[..., :2]
+    assert joint["rt_le_m"][0] == pytest.approx(np.sqrt(np.square(gap).sum(-1).mean()), rel=0.15)  # a mean over blocks
+    assert joint["rt_le_m"][0] < alone["rt_le_m"][0]
+    assert (joint["received_bytes_per_second"] > 0, alone["received_bytes_per_second"]) == (True, 0)
+    assert len(joint["blocks_m"]) == len(alone["blocks_m"])
+    with refused("must name the|must be of|must hold"):
+        benchmark.benchmark(("pose-solo",), data=measured(), tasks=("convoy-kitti",), out=tmp_path)

@@ -1,0 +1,286 @@
+"""Worlds: what they draw, which fault changes what, and the cards of methods on them."""
+
+import json
+import math
+import re
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import refused
+
+import coopoc as co
+from coopoc.cli import _status
+from coopoc.studies import benchmark, worlds_card
+from coopoc.studies.world_faults import KINDS
+from coopoc.studies.worlds import SPLITS, World, world
+
+CHANGES = {
+    "noise levels": {"fixes of egos", "fixes of others", "velocities", "range", "azimuth", "inclination"},
+    "drift, told": {"fixes of egos", "fixes of others", "sensors"},
+    "drift, not told": {"fixes of egos", "fixes of others"},
+    "compass, told": {"velocities", "azimuth", "sensors"},
+    "compass, not told": {"velocities", "azimuth"},
+    "odometer scale, told": {"velocities", "sensors"},
+    "odometer scale, not told": {"velocities"},
+    "odometer slip": {"velocities"},
+    "no fixes": {"fixes of egos"},
+    "no fixes, at first": {"fixes of egos"},
+    "own receiver, jump": {"fixes of egos"},
+    "own receiver, creep": {"fixes of egos"},
+    "own receiver, from the start": {"fixes of egos"},
+    "multipath": {"fixes of egos", "fixes of others"},
+    "NLOS": {"range"},
+    "mistaken angles": {"azimuth", "inclination"},
+    "range offset, told": {"range", "sensors"},
+    "range offset, not told": {"range"},
+    "measured, ranges only": {"azimuth", "inclination"},
+    "measured, angles only": {"range"},
+    "measured, inclinations only": {"range", "azimuth"},
+    "measured, nothing": {"range", "azimuth", "inclination"},
+    "late messages": {"messages", "channel"},
+    "lost messages": {"messages", "channel"},
+    "come and go": {"members", "fixes of others", "velocities"},
+    "clock offsets": {"fixes of others", "velocities"},
+    "liars, jump": {"fixes of others"},
+    "liars, creep": {"fixes of others"},
+    "liars, collusion": {"fixes of others"},
+    "liars, replay": {"fixes of others", "velocities"},
+    "liars, Sybil": {"members", "fixes of others"},
+}
+"""Kind of fault -> all that may differ from the world without it, and does in some worlds."""
+
+
+@lru_cache
+def drawn() -> tuple[World, ...]:
+    return tuple(world(seed) for seed in range(300))
+
+
+def with_kind(kind: str) -> list[World]:
+    found = [one for one in drawn() if kind in one.kinds]
+    assert found, kind
+    return found
+
+
+def parts(one: World) -> dict[str, Any]:
+    """What methods see, in parts; those of links are None where the links themselves may differ."""
+    seen = one.recording
+    others = np.setdiff1d([k for k, name in enumerate(seen.ids) if not name.startswith("ghost")], one.egos)
+    return {
+        "fixes of egos": seen.gnss[:, :, list(one.egos)],
+        "fixes of others": seen.gnss[:, :, others],
+        "velocities": seen.velocity[:, :, : others.size + len(one.egos)],
+        "range": seen.relative[..., 0],
+        "azimuth": seen.relative[..., 1],
+        "inclination": seen.relative[..., 2],
+        "messages": np.append(seen.arrival.ravel(), seen.broadcasts),
+        "members": np.array([*seen.ids, seen.links.neighbour.tobytes()]),
+        "sensors": repr(seen.sensors),
+        "channel": repr(seen.v2x),
+    }
+
+
+def different(one: World, other: World) -> set[str]:
+    first, second = parts(one), parts(other)
+    of_links = {"range", "azimuth", "inclination", "messages"}
+    same_links = np.array_equal(first["members"], second["members"])
+    return {
+        name
+        for name, value in first.items()
+        if (same_links or name not in of_links)
+        and not (
+            value == second[name]
+            if isinstance(value, str)
+            else np.array_equal(value, second[name], equal_nan=value.dtype.kind == "f")
+        )
+    }
+
+
+def test_a_world_is_the_same_whenever_it_is_drawn() -> None:
+    np.random.seed(1)  # noqa: NPY002
+    again = world(11)
+    assert not different(again, drawn()[11])
+    assert (again.text, again.kinds, again.egos) == (drawn()[11].text, drawn()[11].kinds, drawn()[11].egos)
+    assert again.fleet.digest == drawn()[11].fleet.digest
+
+
+def test_splits_share_no_draw() -> None:
+    first = [one.recording.gnss[0, 0, 0, 0] for split in SPLITS for one in (world(k, split) for k in range(20))]
+    assert len({*first}) == 60
+    towns = {split: {one.fleet.position[0, 0, 0] for one in (world(k, split) for k in range(20))} for split in SPLITS}
+    assert not towns["test"] & (towns["validation"] | towns["development"])
+
+
+def test_a_fifth_of_the_worlds_has_no_fault_and_no_world_more_than_three() -> None:
+    counts = np.bincount([len(one.kinds) for one in drawn()], minlength=4)
+    assert len(counts) == 4
+    assert 0.15 < counts[0] / 300 < 0.3
+    assert all(one.recording.notes == () for one in drawn())
+    for one in drawn():
+        assert one.recording.runs == 4
+        assert 39 < one.fleet.t[-1] < 61
+        assert one.recording.columns(one.egos) == [*one.egos]
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_fault_changes_what_it_says_and_nothing_else(kind: str) -> None:
+    found = set[str]()
+    for one in with_kind(kind):
+        changed = different(one, world(one.seed, without=[kind]))
+        assert changed <= CHANGES[kind], one.text
+        found |= changed
+    assert found == CHANGES[kind]
+
+
+def test_a_slip_alters_the_velocities_of_its_interval_alone() -> None:
+    for one in with_kind("odometer slip"):
+        right = world(one.seed, without=["odometer slip"]).recording.velocity[:, :, list(one.egos)]
+        wrong = one.recording.velocity[:, :, list(one.egos)]
+        factor, start, stop = map(float, re.findall(r"velocities times (\S+), (\d+) to (\d+) s", one.text)[0])
+        t, dt = one.recording.t, one.recording.dt
+        inside, outside = (t > start + 1) & (t < stop - 1), (t < start - 1) | (t > stop + dt + 1)
+        assert np.array_equal(wrong[:, outside], right[:, outside])
+        assert np.array_equal(wrong[:, inside], factor * right[:, inside])
+
+
+def test_wrong_receivers_are_off_by_what_the_text_says() -> None:
+    for one in with_kind("own receiver, from the start"):
+        gap = one.recording.gnss - world(one.seed, without=["own receiver, from the start"]).recording.gnss
+        size = np.linalg.norm(gap[:, 0][:, list(one.egos)], axis=-1)
+        assert size == pytest.approx(float(re.findall(r"from the start: (\d+) m", one.text)[0]), abs=0.51)
+
+
+def test_late_clocks_repeat_what_was_before() -> None:
+    """Where another fault acts on the same messages later, it is left out."""
+    for one in with_kind("clock offsets"):
+        seconds = float(re.findall(r"clock offsets: \d+ are (\S+) s late", one.text)[0])
+        late = [kind for kind in one.kinds if [*KINDS].index(kind) > [*KINDS].index("clock offsets")]
+        gnss = world(one.seed, without=late).recording.gnss
+        before = world(one.seed, without=[*late, "clock offsets"]).recording.gnss
+        (who,) = np.nonzero(~np.isclose(gnss, before, equal_nan=True).all(axis=(0, 1, 3)))
+        steps = round(seconds / one.recording.dt)
+        there = np.isfinite(before[:, steps:, who]) & np.isfinite(before[:, :-steps, who])
+        assert there.any()
+        assert np.array_equal(gnss[:, steps:, who][there], before[:, :-steps, who][there])
+
+
+def test_wrong_words_are_named() -> None:
+    for given, more, message in (
+        (-1, {}, "seed = -1"),
+        (0, {"split": "train"}, "split = 'train'"),
+        (0, {"without": ["slip"]}, "without = 'slip'"),
+    ):
+        with refused(message):
+            world(given, **more)  # type: ignore[arg-type]
+    for methods, more, message in (
+        ((), {"worlds": 1}, "must name a method"),
+        (("jiont",), {"worlds": 1}, "Did you mean joint"),
+        (("joint",), {"worlds": -1}, "worlds = -1"),
+        (("joint",), {"worlds": 1, "tasks": ("paper",)}, "without --tasks"),
+    ):
+        with refused(message):
+            benchmark.benchmark(methods, **more)  # type: ignore[arg-type]
+
+
+OWN = """
+from dataclasses import replace
+import numpy as np
+import coopoc as co
+from coopoc.studies.worlds import world
+
+class Same(co.JointFilter):
+    pass
+
+class Truth(co.Kalman):
+    def __call__(self, recording, egos=(0,)):
+        track = super().__call__(recording, egos)
+        fixes = recording.gnss[:, 0]
+        (one,) = (one for one in map(world, range(4)) if np.array_equal(one.recording.gnss[:, 0], fixes, True))
+        truth = one.fleet.position[: len(track.t), list(egos)]
+        return replace(track, x=np.broadcast_to(truth, track.x.shape))
+
+class Fails(co.Kalman):
+    def __call__(self, recording, egos=(0,)):
+        if len(recording.t) > 3 and recording.v2x.max_neighbours > 2:
+            raise ValueError("too many neighbours")
+        return super().__call__(recording, egos)
+"""
+
+
+def own(folder: Path, name: str) -> str:
+    (folder / "mine.py").write_text(OWN)
+    return f"{folder / 'mine.py'}:{name}"
+
+
+def test_the_textbook_filter_in_another_name_has_a_ratio_of_one(tmp_path: Path) -> None:
+    card = worlds_card.worlds_card(own(tmp_path, "Same"), 4)
+    assert card["summary"]["over_joint"] == [1.0, 1.0, 1.0]
+    assert len(card["source"]) == 20
+    alone = np.array(card["worlds"]["rt_le_m"]) > 1.1 * np.array(card["worlds"]["alone_m"])
+    assert card["summary"]["worse_than_better"][0] == card["summary"]["worse_than_alone"][0] == 100 * alone.mean()
+
+
+def test_the_truth_is_nowhere_worse(tmp_path: Path) -> None:
+    summary = worlds_card.worlds_card(own(tmp_path, "Truth"), 4)["summary"]
+    assert summary["worse_than_alone"] == summary["worse_than_better"] == [0.0, 0.0, 0.0]
+    assert summary["percentile_95"] == 0.0
+
+
+def test_a_failed_world_is_worse_and_has_its_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    name = own(tmp_path, "Fails")
+    assert benchmark.benchmark((name,), worlds=4, out=tmp_path) == 1
+    (file,) = (tmp_path / "worlds").glob("*.json")
+    card = json.loads(file.read_text())
+    many = [str(seed) for seed in range(4) if world(seed).recording.v2x.max_neighbours > 2]
+    assert 0 < len(many) < 4
+    assert card["failed"] == dict.fromkeys(many, "ValueError: too many neighbours")
+    assert card["summary"]["worse_than_alone"][0] == 25 * len(many)
+    assert card["summary"]["percentile_95"] is None
+    printed = capsys.readouterr()
+    assert f"4 ({len(many)} failed)" in printed.out
+    assert f"failed: world {many[0]}: ValueError: too many" in printed.err
+    assert {one.suffix for one in (tmp_path / "worlds").glob("worlds.*")} == {".pdf", ".png", ".svg"}
+
+
+def test_the_command_of_a_worst_world_repeats_its_number(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    assert benchmark.benchmark(("lkf-sa",), worlds=6, validation=True, jobs=2) == 0
+    worst = json.loads(Path("runs/benchmark/worlds/validation/lkf-sa.json").read_text())["worst"][0]
+    assert worst["ratio"] > 1.0
+    assert worst["command"] in capsys.readouterr().out
+    assert _status(worst["command"].split()[1:]) == 0
+    (file,) = Path("runs/benchmark/worlds/validation").glob("seed-*/lkf-sa.json")
+    assert json.loads(file.read_text())["worst"] == [worst]
+
+
+def test_help_shows_how_to_run_worlds(capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        _status(["benchmark", "--help"])
+    assert "coopoc benchmark joint mine.py:Own --worlds 200" in capsys.readouterr().out
+
+
+def test_nees_and_ratios_are_as_by_hand() -> None:
+    card = worlds_card.worlds_card("joint", 1, seed=2)
+    one = world(2)
+    tracks = [method(one.recording, list(one.egos)) for method in (co.JointFilter("nominal"), co.Kalman("nominal"))]
+    joint, alone = (co.rt_le(track, one.fleet).mean() for track in tracks)
+    (ratio,) = card["summary"]["over_better"]
+    assert ratio == pytest.approx(joint / min(joint, alone), rel=1e-4)
+    gap = tracks[0].x - one.fleet.position[None, :, list(one.egos)]
+    square = np.einsum("rtei,rteij,rtej->rte", gap, np.linalg.inv(tracks[0].covariance), gap)
+    inside = ((square > 0.2158) & (square < 9.3484)).mean()
+    assert card["summary"]["nees_inside"][0] == pytest.approx(inside, abs=1e-3)
+    assert math.isclose(card["summary"]["nees_median"], np.median(square), rel_tol=1e-4)
+
+
+def test_the_page_shows_the_committed_cards() -> None:
+    """`coopoc benchmark --table --out benchmarks/cards` prints the table."""
+    root = Path(__file__).resolve().parents[1]
+    cards = [json.loads(file.read_text()) for file in (root / "benchmarks" / "cards" / "worlds").glob("*.json")]
+    assert worlds_card.overview(cards) in (root / "docs" / "benchmark.md").read_text()
+    for card in cards:
+        assert (card["split"], card["worlds"]["seed"]) == ("test", [*range(1000)])
