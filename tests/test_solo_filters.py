@@ -73,8 +73,8 @@ def test_steps_without_a_fix_teach_nothing() -> None:
     np.testing.assert_array_equal(after.weight, before.weight)
     assert_allclose(x, before.x + np.array([4.5, 0.0, 0.0]))
     grown = np.diag(cov) - (before.share * before.noise + before.motion)
-    std = ASSUMED.assumed_velocity_std(np.array(20 * [[0.0, 0.0, 0.0]] + 5 * [[9.0, 0.0, 0.0]])[None, :, None], 0.1)
-    assert_allclose(grown, ((0.1 * std[0, 20:, 0]) ** 2).sum(axis=0))
+    std = ASSUMED.motion_std(np.array(20 * [[0.0, 0.0, 0.0]] + 5 * [[9.0, 0.0, 0.0]])[None, :, None], 0.1)
+    assert_allclose(grown, (std[0, 20:, 0] ** 2).sum(axis=0))
 
 
 def test_late_fixes_do_not_count_as_noisy() -> None:

@@ -154,7 +154,7 @@ def wild_fixes(steps: int) -> tuple[co.Recording, np.ndarray, KalmanFilter]:
     gnss[0, wild, 0] += rng.choice([-1, 1], (wild.sum(), 3)) * 10.0 ** rng.uniform(0.5, 4, (wild.sum(), 3))
     peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
     peer.x, peer.P, peer.B, peer.H, peer.R = gnss[0, 0, 0], 12.25 * np.eye(3), 0.1 * np.eye(3), np.eye(3), np.eye(3)
-    return replace(drive, gnss=gnss), (0.1 * S2.assumed_velocity_std(drive.velocity, 0.1)[0, :, 0]) ** 2, peer
+    return replace(drive, gnss=gnss), S2.motion_std(drive.velocity, 0.1)[0, :, 0] ** 2, peer
 
 
 def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() -> None:

@@ -6,7 +6,7 @@ import math
 
 from ..arrays import Floats
 from .compiling.compile import compiled, part
-from .motion import MotionNoise, begin_pace, forgotten, keep_pace, process_variance
+from .motion import MotionNoise, keep_pace, process_variance
 
 ROUNDING = 1e-9
 """s, by how much sums of time steps may miss a time."""
@@ -70,16 +70,17 @@ def dead_reckon(
     if not (dt > 0.0 and math.isfinite(dt)) or missing % 3 != 0:
         return BAD_INPUT
     square = history[0, SQUARE]
-    begin_pace(square, given[VELOCITY])
-    variance = process_variance(motion, square, dt)
+    process_variance(motion, square, given[VELOCITY], dt, q)
     for c in range(3):
-        q[c], moved[c] = variance[c], dt * given[3 + c]
+        moved[c] = dt * given[3 + c]
     first, count, seen = history[0, 0], history[0, 1], history[0, 2]
     push(history, dt, moved[:3], q)
     if missing == 0 and not -ROUNDING <= age <= history[0, 2] + ROUNDING:
         history[0, 0], history[0, 1], history[0, 2] = first, count, seen
+        if count == 0.0:
+            square[:] = math.nan
         return BAD_INPUT
-    keep_pace(square, given[VELOCITY], dt, forgotten(dt))
+    keep_pace(square, given[VELOCITY], dt)
     if missing > 0:
         return NO_FIX_YET
     since(history, age, since_fix, late)

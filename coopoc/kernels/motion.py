@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import AnyArray, Floats
 from .compiling.compile import compiled, inside
 
+Vector: TypeAlias = Sequence[float] | Floats
 PACE = 0.5
 """s, time constant with which the pace forgets velocities."""
 SWIFT = 10.0
@@ -43,123 +44,75 @@ class MotionNoise(NamedTuple):
 
 
 @inside
-def process_variance(noise: MotionNoise, square: Sequence[float] | Floats, dt: float) -> tuple[float, float, float]:
-    """Variances m^2 of dt u on the three axes, at the squares (3,) m^2/s^2 of the pace."""
-    a, b, c, base, ratio = square[0], square[1], square[2], noise.base, noise.ratio
-    if noise.of_speed > 0.0:
-        a = b = c = a + b + c
-    interval = noise.interval if noise.interval > 0.0 else dt
-    share, whole, least = dt / interval, interval * interval, noise.floor * noise.floor
-    return (
-        share * (base[0] * base[0] + whole * max(ratio[0] * ratio[0] * a, least)),
-        share * (base[1] * base[1] + whole * max(ratio[1] * ratio[1] * b, least)),
-        share * (base[2] * base[2] + whole * max(ratio[2] * ratio[2] * c, least)),
-    )
+def process_variance(noise: MotionNoise, square: Floats, velocity: Vector, dt: float, q: Floats) -> None:
+    """Write the variances (3,) m^2 of dt u on the three axes.
 
-
-@inside
-def begin_pace(square: Floats, velocity: Floats) -> None:
-    """The pace at a first velocity m/s is its own; NaN before."""
+    Args:
+        noise: of the motion.
+        square: (3,) m^2/s^2, of the pace; NaN before the first velocity, whose own it becomes.
+        velocity: u, m/s.
+        dt: s.
+        q: out.
+    """
     for c in range(3):
         if math.isnan(square[c]):
             square[c] = velocity[c] * velocity[c]
+    speed, interval = square[0] + square[1] + square[2], noise.interval if noise.interval > 0.0 else dt
+    for c in range(3):
+        std = noise.ratio[c] * interval
+        moved = std * std * (speed if noise.of_speed > 0.0 else square[c])
+        q[c] = dt / interval * (noise.base[c] ** 2 + max(moved, (interval * noise.floor) ** 2))
 
 
 @inside
-def keep_pace(square: Floats, velocity: Sequence[float] | Floats, seconds: float, share: float) -> None:
-    """The pace after a velocity m/s has stood for some seconds, and has replaced that share of it.
+def keep_pace(square: Floats, velocity: Vector, dt: float) -> None:
+    """The pace after a velocity m/s has stood for dt s.
 
     One beyond twice the pace counts as no more than that and what SWIFT allows: a wrong velocity would leave all later
     ones without weight.
     """
+    size = velocity[0] ** 2 + velocity[1] ** 2 + velocity[2] ** 2
+    most = 4.0 * (square[0] + square[1] + square[2]) + (SWIFT * dt) ** 2
     for c in range(3):
-        own, most = velocity[c] * velocity[c], 4.0 * square[c] + (SWIFT * seconds) * (SWIFT * seconds)
-        square[c] += share * ((most if own > most else own) - square[c])
+        own = velocity[c] ** 2 * (most / size if size > most else 1.0)
+        square[c] += dt / (dt + PACE) * (own - square[c])
 
 
-@inside
-def forgotten(seconds: float) -> float:
-    """Share of the pace that is forgotten in that time."""
-    return -math.expm1(-seconds / PACE)
+UNUSED, RECEIVED, HELD = range(3)
+"""Velocities: of no message, of one that arrives, of one that is the newest until the next."""
 
 
-@compiled
-def own_variances(noise: MotionNoise, velocity: Floats, columns: Ints, first: int, dt: float) -> Floats:
-    """Process noise (R, T, E, 3) m^2 of each step of some vehicles.
-
-    Args:
-        noise: of the motion.
-        velocity: (R, T, N, 3) m/s, NaN for an absent vehicle, which begins anew.
-        columns: (E,) of the vehicles.
-        first: step at which they begin; what was before is not known.
-        dt: s.
-    """
-    (runs, steps), vehicles = velocity.shape[:2], len(columns)
-    variance, square, share = np.empty((runs, steps, vehicles, 3)), np.empty((vehicles, 3)), forgotten(dt)
-    for run in range(runs):
-        for t in range(steps):
-            for e in range(vehicles):
-                if t <= first:
-                    square[e] = math.nan
-                u, q = velocity[run, t, columns[e]], variance[run, t, e]
-                begin_pace(square[e], u)
-                q[0], q[1], q[2] = process_variance(noise, square[e], dt)
-                keep_pace(square[e], u, dt, share)
-    return variance
+def own_variances(noise: MotionNoise, velocity: Floats, dt: float, first: int = 0) -> Floats:
+    """Process noise (R, T, N, 3) m^2 of steps of dt s with velocities (R, T, N, 3) m/s, for a filter that begins at
+    step `first`."""
+    use = np.full(velocity.shape[:3], HELD, np.uint8)
+    use[:, :first] = RECEIVED
+    return process_variances(noise, np.ascontiguousarray(velocity), use, math.inf, dt)
 
 
 @compiled
-def received_variances(
-    noise: MotionNoise,
-    velocity: Floats,
-    ego: int,
-    step: Ints,
-    neighbour: Ints,
-    arrival: Ints,
-    newest: Ints,
-    oldest: float,
-    dt: float,
-) -> Floats:
-    """Process noise (R, T, N, 3) m^2 of the ego, and of each message at the step at which it was sent.
-
-    The pace of a neighbour is that of the messages that the ego has held: each velocity stands until the next one.
+def process_variances(noise: MotionNoise, velocity: Floats, use: AnyArray, longest: float, dt: float) -> Floats:
+    """Process noise (R, T, N, 3) m^2 of vehicles, by those velocities of each that one vehicle knows; 0 of UNUSED ones.
 
     Args:
         noise: of the motion.
-        velocity: (R, T, N, 3) m/s.
-        ego: column.
-        step: (M,) of each link of the ego.
-        neighbour: (M,) column.
-        arrival: (R, M) step at which the message of the link arrives, -1 for never.
-        newest: (R, M) step of the newest message held, -1 for none.
-        oldest: s between messages of a neighbour, after which its pace begins anew.
+        velocity: (R, T, N, 3) m/s, each until the next; NaN for an absent vehicle, which begins anew.
+        use: (R, T, N) UNUSED, RECEIVED or HELD.
+        longest: s without a velocity, after which the pace begins anew.
         dt: s.
     """
-    runs, steps, vehicles = velocity.shape[:3]
-    variance, square, share = np.zeros(velocity.shape), np.empty((vehicles, 3)), forgotten(dt)
-    held, own = np.empty(vehicles, np.int64), np.empty(3)
-    for run in range(runs):
-        square[:], held[:] = math.nan, -1
-        for t in range(steps):
-            u, q = velocity[run, t, ego], variance[run, t, ego]
-            begin_pace(square[ego], u)
-            q[0], q[1], q[2] = process_variance(noise, square[ego], dt)
-            keep_pace(square[ego], u, dt, share)
-        for link in range(len(step)):
-            if newest[run, link] >= 0:
-                variance[run, newest[run, link], neighbour[link], 0] = -1.0
-        for link in range(len(step)):
-            t, j = step[link], neighbour[link]
-            if arrival[run, link] < 0:
-                continue
-            u, q, gap = velocity[run, t, j], variance[run, t, j], t - held[j]
-            own[:] = square[j]
-            if held[j] < 0 or gap * dt > oldest + 1e-9:
-                own[:] = math.nan
-            else:
-                keep_pace(own, velocity[run, held[j], j], gap * dt, share if gap == 1 else forgotten(gap * dt))
-            begin_pace(own, u)
-            if q[0] < 0.0:
-                square[j], held[j] = own, t
-            q[0], q[1], q[2] = process_variance(noise, own, dt)
+    variance, square, own = np.zeros(velocity.shape), np.empty(velocity.shape[2:]), np.empty(3)
+    last = np.zeros(len(square), np.int64)
+    for run, t, n in np.ndindex(use.shape):
+        if t == 0:
+            square[n], last[n] = math.nan, 0
+        if use[run, t, n] == UNUSED:
+            continue
+        own[:], since = square[n], (t - last[n]) * dt
+        if since > longest + 1e-9:
+            own[:] = math.nan
+        keep_pace(own, velocity[run, last[n], n], since)
+        process_variance(noise, own, velocity[run, t, n], dt, variance[run, t, n])
+        if use[run, t, n] == HELD:
+            square[n], last[n] = own, t
     return variance

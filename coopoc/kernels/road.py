@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import Floats
 from .compiling.compile import compiled, part
-from .motion import MotionNoise, begin_pace, forgotten, keep_pace, process_variance
+from .motion import MotionNoise, keep_pace, process_variance
 from .solo import SoloMeasurements
 
 Z, Z_VARIANCE, SINCE, LEVEL, SCALE, FIXES = range(6)
@@ -173,11 +173,10 @@ def road_step(
 @compiled
 def road_motion(motion: MotionNoise, square: Floats, velocity: Floats, dt: float, moved: Floats, q: Floats) -> None:
     """Write a step's motion m and its variance m^2 (3,), and keep the pace."""
-    begin_pace(square, velocity)
-    variance = process_variance(motion, square, dt)
-    keep_pace(square, velocity, dt, forgotten(dt))
+    process_variance(motion, square, velocity, dt, q)
+    keep_pace(square, velocity, dt)
     for c in range(3):
-        moved[c], q[c] = dt * velocity[c], variance[c]
+        moved[c] = dt * velocity[c]
 
 
 @compiled

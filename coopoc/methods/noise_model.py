@@ -10,7 +10,7 @@ import numpy as np
 
 from ..arrays import Floats, Ints, check_texts, checked, instance, number, texts
 from ..errors import InputError, suggestion
-from ..kernels.motion import MotionNoise, own_variances, received_variances
+from ..kernels.motion import HELD, RECEIVED, MotionNoise, own_variances, process_variances
 from ..short_repr import short_repr
 from ..world.fleet import Fleet
 from ..world.inbox import Inbox
@@ -284,14 +284,16 @@ def process_noise(
         if noise.process_std is not None:
             return np.square(noise.process_std)[None, None, None]
         noise = motion_noise(noise, None)
-    velocity = np.ascontiguousarray(recording.velocity)
-    columns = np.arange(len(recording.ids)) if columns is None else np.asarray(columns)
     if box is None:
-        return own_variances(noise, velocity, columns, first, recording.dt)
+        velocity = recording.velocity if columns is None else recording.velocity[:, :, columns]
+        return own_variances(noise, velocity, recording.dt, first)
     step, neighbour = (values[box.link] for values in (recording.links.step, recording.links.neighbour))
-    arrived = np.ascontiguousarray(box.arrival), np.ascontiguousarray(box.newest)
-    oldest = min(recording.v2x.max_age, 1e18)
-    return received_variances(noise, velocity, int(columns[0]), step, neighbour, *arrived, oldest, recording.dt)
+    use = np.zeros(recording.velocity.shape[:3], np.uint8)
+    use[:, step, neighbour] = RECEIVED * (box.arrival >= 0)
+    use[np.arange(len(use))[:, None], box.newest, neighbour] = HELD  # -1, of none: the last step is before no other
+    use[:, :, columns] = HELD
+    longest = min(recording.v2x.max_age, 1e18)
+    return process_variances(noise, np.ascontiguousarray(recording.velocity), use, longest, recording.dt)
 
 
 def check_interval(interval: float) -> float:

@@ -125,18 +125,12 @@ class Sensors:
         ratio, of_speed = np.full(3, self.velocity_std_ratio), self.velocity_reading == "speed"
         return MotionNoise(np.zeros(3), ratio, float(self.velocity_floor), float(of_speed), interval)
 
-    def assumed_velocity_std(self, velocity: Floats, dt: float) -> Floats:
-        """Noise std (R, T, N, 3) m/s that a method assumes of *measured* velocities, at the pace before each.
-
-        Args:
-            velocity: (R, T, N, 3) m/s.
-            dt: s.
-        """
+    def motion_std(self, velocity: Floats, dt: float) -> Floats:
+        """Noise std (R, T, N, 3) m that a method assumes of motions of dt s with *measured* velocities (R, T, N, 3)
+        m/s, by the pace before each."""
         from ..kernels.motion import own_variances
 
-        columns = np.arange(velocity.shape[2])
-        variance = own_variances(self.motion_noise(), np.ascontiguousarray(velocity), columns, 0, dt)
-        return np.sqrt(variance) / dt
+        return np.sqrt(own_variances(self.motion_noise(), velocity, dt))
 
     def known(self) -> Sensors:
         """The same sensors as a method may know them: it knows neither the bias nor the outliers."""

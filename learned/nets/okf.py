@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -14,7 +13,7 @@ from torch import Tensor, nn
 from coopoc.arrays import Floats, checked, seed_of
 from coopoc.errors import InputError
 from coopoc.kernels.compiling.waiting import clock
-from coopoc.kernels.motion import PACE, SWIFT, MotionNoise
+from coopoc.kernels.motion import MotionNoise, own_variances
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import solo_filter, solo_track
 from coopoc.methods.noise_model import check_interval
@@ -155,6 +154,10 @@ def log_scale(squares: Tensor) -> Tensor:
     return 0.5 * torch.where(squares > 0.0, squares, 1.0).log()
 
 
+OF_PACE = MotionNoise(np.zeros(3), np.ones(3), 0.0, 0.0, 0.0)
+"""Its variance is the square of dt times the pace."""
+
+
 def scan(stds: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     """Estimates m and normalised innovations (T, S, B, 3) of filters with a, b, r (S, 3 kinds, 3 axes); where a fix is
     missing the filter predicts, and the innovation is NaN."""
@@ -162,11 +165,10 @@ def scan(stds: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     noise, x = gnss_std.square(), batch.x0
     variance = noise if batch.exact is None else noise * (~batch.exact)[..., None]
     estimates, normalised = [], []
-    square, share = batch.velocity[0].square(), -math.expm1(-batch.dt / PACE)
-    for fix, speed in zip(batch.gnss.unbind(), batch.velocity.unbind(), strict=True):
-        variance = variance + process.square() + (ratio * batch.dt).square() * square
-        most = 4.0 * square + (SWIFT * batch.dt) ** 2
-        square = square + share * (torch.minimum(speed.square(), most) - square)
+    paces = own_variances(OF_PACE, batch.velocity.transpose(0, 1).double().numpy(), batch.dt)
+    motions = process.square() + ratio.square() * torch.from_numpy(paces).transpose(0, 1).to(ratio)
+    for fix, speed, motion in zip(batch.gnss.unbind(), batch.velocity.unbind(), motions.unbind(), strict=True):
+        variance = variance + motion
         there = fix.isfinite()
         gain = torch.where(there, variance / (variance + noise), 0.0)
         innovation = fix - x - batch.dt * speed

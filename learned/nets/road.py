@@ -54,9 +54,8 @@ class RoadConstants(Gain):
         for s, logs in enumerate(theta.detach().double().numpy()):
             gnss, speed = (np.ascontiguousarray(part[:, s].swapaxes(0, 1))[:, :, None] for part in (fixes, velocity))
             errors, motion = from_logs(logs, 1.0), motion_noise(KNOWN, None)
-            columns = np.array([0])
-            process = own_variances(louder(motion, errors), speed, columns, 0, batch.dt)
-            seen = SoloMeasurements(gnss, speed, process, columns, batch.dt)
+            process = own_variances(louder(motion, errors), speed, batch.dt)
+            seen = SoloMeasurements(gnss, speed, process, np.array([0]), batch.dt)
             x, cov, lasting = (np.empty((*gnss.shape[:3], *size)) for size in ((3,), (3, 3), (4,)))
             run_road(seen, road_noise(KNOWN, errors), x, cov, lasting)
             found[s] = true_cost(x[:, 1:, 0], cov[:, 1:, 0], truth[:, s].swapaxes(0, 1))

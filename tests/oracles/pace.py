@@ -10,9 +10,16 @@ from coopoc.world.inbox import Inbox
 from coopoc.world.recording import Recording
 
 
+def after(square: Floats, u: Floats, seconds: float) -> Floats:
+    """(..., 3) m^2/s^2: a first-order lag of 0.5 s, of a velocity at most twice the pace and 10 m/s^2 beyond."""
+    most = 4 * square.sum(axis=-1, keepdims=True) + (10 * seconds) ** 2
+    size = (u**2).sum(axis=-1, keepdims=True)
+    own: Floats = u**2 * np.fmin(1.0, most / np.fmax(size, 1e-300))
+    return square + seconds / (seconds + 0.5) * (own - square)
+
+
 def heard(recording: Recording, box: Inbox | None, known: NoiseModel, run: int, ego: int) -> Floats:
-    """(T, N, 3) m^2. Of a neighbour the velocities count that were the newest ones held, each until the next one; none
-    beyond twice the pace and 10 m/s^2."""
+    """(T, N, 3) m^2. Of a neighbour the velocities count that were the newest ones held, each until the next one."""
     u, dt = recording.velocity[run], recording.dt
     noise = known.sensors
     if known.process_std is not None or known.fleet is not None or noise is None:
@@ -30,9 +37,7 @@ def heard(recording: Recording, box: Inbox | None, known: NoiseModel, run: int, 
             if last < 0 or np.isnan(square[last, j]).any() or (t - last) * dt > longest + 1e-9:
                 square[t, j] = u[t, j] ** 2
             else:
-                keep = math.exp(-(t - last) * dt / 0.5)
-                most = 4 * square[last, j] + (10 * (t - last) * dt) ** 2
-                square[t, j] = keep * square[last, j] + (1 - keep) * np.fmin(u[last, j] ** 2, most)
+                square[t, j] = after(square[last, j], u[last, j], (t - last) * dt)
             if np.isnan(u[t, j]).any():
                 square[t, j] = np.nan
             last = t if t in held else last

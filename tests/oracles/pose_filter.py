@@ -3,6 +3,8 @@
 import numpy as np
 from scipy.linalg import block_diag
 
+from oracles.pace import after
+
 FLAT, UNKNOWN = 1e6, np.pi**2 / 3
 
 
@@ -43,7 +45,7 @@ def update(x, P, h, z, variance, angle, passes=1):  # type: ignore[no-untyped-de
 
 def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped-def]
     """States (T, n, d) and covariances (T, n, d, d) of one run in one state, any numbers for members that are away."""
-    (steps, members), (ratio, floor, of_speed) = drive.active.shape, noise.velocity
+    (steps, members), odometer = drive.active.shape, noise.odometer
     out, covs = np.zeros((steps, members, d)), np.zeros((steps, members, d, d))
     x, P, lasting = np.zeros((members, d)), np.zeros((members * d,) * 2), np.array(noise.lasting)[: d - 4]
     pace = np.zeros((members, 3))
@@ -54,11 +56,9 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
             own = drive.own[run, t, n]
             if t and drive.active[t - 1, n] and drive.active[t, n]:
                 u, state = own[4:], x[n].copy()
-                size = np.full(3, np.sqrt(pace[n].sum())) if of_speed else np.sqrt(pace[n])
-                pace[n] += -np.expm1(-drive.dt / 0.5) * (
-                    np.fmin(u[:3] ** 2, 4 * pace[n] + (10 * drive.dt) ** 2) - pace[n]
-                )
-                q = np.append(np.maximum(ratio * size, floor) ** 2, noise.yaw_rate)
+                size = np.sqrt(pace[n].sum() if odometer.of_speed else pace[n])
+                pace[n] = after(pace[n], u[:3], drive.dt)
+                q = np.append(np.maximum(odometer.ratio * size, odometer.floor) ** 2, noise.yaw_rate)
                 F.append(jacobian(lambda s, u=u: motion(s, u, drive.dt), state))
                 G = jacobian(lambda v, s=state: motion(s, v, drive.dt), u)
                 F[-1][4:6] *= noise.keep

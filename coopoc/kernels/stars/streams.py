@@ -14,7 +14,7 @@ from ...arrays import Floats, Ints
 from ..compiling.compile import as_written, compiled
 from ..compiling.vectors import LANES
 from ..dead_reckoning import BAD_INPUT, ROUNDING, dead_reckon
-from ..motion import MotionNoise, begin_pace, forgotten, keep_pace, process_variance
+from ..motion import MotionNoise, keep_pace, process_variance
 from .cooperative_filter import step
 from .cooperative_state import (
     AGE,
@@ -94,19 +94,18 @@ def stream_rows(
     for i in range(len(rows)):
         row, newest, sent = rows[i], last[vehicles[i]], time - rows[i, AGE]
         if math.isfinite(row[SPEED]) and sent >= newest[AGE] - ROUNDING:
-            square, gap = newest[STEP:TYPICAL], sent - newest[AGE]
-            if not gap <= max_age + ROUNDING:
-                square[:] = math.nan
-            elif gap > ROUNDING:
-                keep_pace(square, newest[SPEED:STEP], gap, forgotten(gap))
-            begin_pace(square, row[SPEED:STEP])
+            gap = sent - newest[AGE]
+            if gap > max_age + ROUNDING:
+                newest[STEP:TYPICAL] = math.nan
+            else:
+                keep_pace(newest[STEP:TYPICAL], newest[SPEED:STEP], gap)
             newest[SOLO:STEP], newest[AGE] = row[SOLO:STEP], sent
         age = max(time - newest[AGE], 0.0)
         row[AGE] = -1.0 if age > max_age + ROUNDING else age if age > ROUNDING else 0.0
         row[SOLO:STEP] = newest[SOLO:STEP]
-        q = process_variance(motion, newest[STEP:TYPICAL], interval)
+        process_variance(motion, newest[STEP:TYPICAL], newest[SPEED:STEP], interval, row[STEP:TYPICAL])
         for c in range(3):
-            row[STEP + c], row[TYPICAL + c] = q[c] * (dt / interval) ** 2, fix[c]
+            row[STEP + c], row[TYPICAL + c] = row[STEP + c] * (dt / interval) ** 2, fix[c]
     return int(outcome)
 
 

@@ -108,12 +108,11 @@ def pose_noise(sensors: Sensors, dt: float, gate: float) -> PoseNoise:
     x, y, z = (float(std * std) for std in sensors.fix_std)
     compass = max(float(np.hypot(sensors.heading_std, sensors.heading_bias_std)), LEAST_HEADING_STD)
     a, b, c = (float(std * std) for std in sensors.relative_std)
-    of_speed = float(sensors.velocity_reading == "speed")
     return PoseNoise(
         fix=(x, y, z),
         heading=compass**2,
         relative=(a, b, c),
-        velocity=(sensors.velocity_std_ratio, sensors.velocity_floor, of_speed),
+        odometer=sensors.motion_noise(1.0),
         yaw_rate=max(sensors.yaw_rate_std, LEAST_YAW_RATE_STD) ** 2,
         lasting=(sensors.speed_scale_std**2, sensors.yaw_rate_bias_std**2, sensors.range_offset_std**2),
         longer=float(sensors.range_offset_std > 0),

@@ -133,9 +133,7 @@ def recorded_steps(
     steps, names, before = [], [], np.empty(0, np.int64)
     if noise is None:
         gnss_std = np.array(recording.sensors.gnss_std)
-        motion_std = (
-            recording.dt * recording.sensors.assumed_velocity_std(recording.velocity[run : run + 1], recording.dt)[0]
-        )
+        motion_std = recording.sensors.motion_std(recording.velocity[[run]], recording.dt)[0]
     else:
         gnss_std = np.sqrt(noise.gnss_variance)
         variance = np.broadcast_to(noise.process_variance(recording), recording.velocity.shape)
