@@ -11,7 +11,6 @@ from oracles.pace import heard
 
 from coopoc import V2X, AdaptiveKalman, Fleet, Kalman, NoiseModel, Recording, Sensors, observe
 from coopoc.methods.catalogue import METHODS
-from coopoc.methods.noise_model import process_noise
 from coopoc.methods.track import Method
 from coopoc.world.inbox import inbox
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -58,7 +57,7 @@ def test_a_receiver_knows_the_pace_of_what_it_has_received(crossing: Fleet, v2x:
     """Neighbours come and go; textbook: `oracles.pace`. Where nothing is lost it is the sender's own."""
     seen = observe(crossing, Sensors(velocity_reading=reading), v2x, runs=2, observers=[0])
     box, known = inbox(seen, 0, FIX_AND_VELOCITY), NoiseModel.nominal(seen.sensors)
-    found, own = process_noise(known, seen, [0], box=box), known.process_variance(seen)
+    found, own = known.process_variance(seen, [0], box), known.process_variance(seen)
     for run in range(2):
         wanted = heard(seen, box, known, run, 0)
         assert_allclose(found[run, :, 0], wanted[:, 0], rtol=1e-12)
@@ -69,7 +68,7 @@ def test_a_receiver_knows_the_pace_of_what_it_has_received(crossing: Fleet, v2x:
         assert_allclose(found[run, step, neighbour], wanted[step, neighbour], rtol=1e-12)
     always = observe(road()[0], NOISY, V2X(3, radius=100.0), runs=2)
     known, box = NoiseModel.nominal(NOISY), inbox(always, 0, FIX_AND_VELOCITY)
-    assert_allclose(process_noise(known, always, [0], box=box), known.process_variance(always), rtol=1e-12)
+    assert_allclose(known.process_variance(always, [0], box), known.process_variance(always), rtol=1e-12)
 
 
 def test_the_pace_of_a_step_does_not_know_its_velocity() -> None:

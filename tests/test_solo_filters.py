@@ -14,7 +14,6 @@ from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import nees, nees_inside, rt_le
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import ASSUMED, AdaptiveKalman, solo_filter
-from coopoc.methods.noise_model import process_noise
 
 DRIVE = winding(900, 10.0, 7.0)
 DEFAULT, FOREVER = AdaptiveKalman(), AdaptiveKalman(window=np.inf)
@@ -144,7 +143,7 @@ def series(seen: Recording, q: Floats, r: Floats, *at: int) -> tuple[Floats | fl
 def test_kalman(crossing: Fleet, noise: str, known: bool) -> None:
     seen = gaps(crossing, absent=True)
     model = NoiseModel.identity() if noise == "identity" else NoiseModel.nominal(S2)
-    q, r = np.broadcast_to(process_noise(model, seen, first=int(known)), seen.gnss.shape), model.gnss_variance
+    q, r = np.broadcast_to(model.process_variance(seen, first=int(known)), seen.gnss.shape), model.gnss_variance
     start = crossing.position[0] if known else None
     x, p, _ = solo_filter(seen, range(len(seen.ids)), model, FixNoise(r), start)
     for run, n, c in np.ndindex(3, 4, 3):

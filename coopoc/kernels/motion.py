@@ -103,16 +103,18 @@ def process_variances(noise: MotionNoise, velocity: Floats, use: AnyArray, longe
     """
     variance, square, own = np.zeros(velocity.shape), np.empty(velocity.shape[2:]), np.empty(3)
     last = np.zeros(len(square), np.int64)
-    for run, t, n in np.ndindex(use.shape):
-        if t == 0:
-            square[n], last[n] = math.nan, 0
-        if use[run, t, n] == UNUSED:
-            continue
-        own[:], since = square[n], (t - last[n]) * dt
-        if since > longest + 1e-9:
-            own[:] = math.nan
-        keep_pace(own, velocity[run, last[n], n], since)
-        process_variance(noise, own, velocity[run, t, n], dt, variance[run, t, n])
-        if use[run, t, n] == HELD:
-            square[n], last[n] = own, t
+    runs, steps, vehicles = use.shape
+    for run in range(runs):
+        square[:], last[:] = math.nan, 0
+        for t in range(steps):
+            for n in range(vehicles):
+                if use[run, t, n] == UNUSED:
+                    continue
+                own[:], since = square[n], (t - last[n]) * dt
+                if since > longest + 1e-9:
+                    own[:] = math.nan
+                keep_pace(own, velocity[run, last[n], n], since)
+                process_variance(noise, own, velocity[run, t, n], dt, variance[run, t, n])
+                if use[run, t, n] == HELD:
+                    square[n], last[n] = own, t
     return variance

@@ -15,7 +15,7 @@ from ..kernels.geometry import components
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, Vehicles, check_recording
-from .noise_model import NoiseModel, process_noise
+from .noise_model import NoiseModel
 from .track import Method, Track
 
 BEYOND = 10.0
@@ -134,7 +134,7 @@ def assumptions(recording: Recording, noise_model: NoiseModel, ego: int, box: In
         ego: column.
         box: its messages; None where it is alone.
     """
-    process = process_noise(noise_model, recording, [ego], box=box)
+    process = noise_model.process_variance(recording, [ego], box)
     fixes = np.ascontiguousarray(noise_model.fix_variance(recording))
     return Assumptions(process, fixes, fixes, FIX_GROWTH, *relative_noise(noise_model), FORGOTTEN, ACCELERATION_STD)
 

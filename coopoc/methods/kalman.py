@@ -12,12 +12,12 @@ from ..arrays import TINY, Floats
 from ..errors import InputError
 from ..kernels.compiling.waiting import clock
 from ..kernels.gate import FIX_GATE
-from ..kernels.motion import MotionNoise
+from ..kernels.motion import MotionNoise, own_variances
 from ..kernels.solo import FixNoise, SoloMeasurements, run_filter
 from ..short_repr import short_repr
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.sensors import Sensors
-from .noise_model import NoiseModel, constant_noise, motion_noise, process_noise, resolve
+from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
 from .stream import FilterStream
 from .track import Alone, Checked, Track, check_options, lost, silent_track
 
@@ -217,7 +217,11 @@ def solo_filter(
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     columns = np.asarray(columns)
     shape = *gnss.shape[:2], len(columns), 3
-    process = process_noise(noise, recording, columns, first=int(x0 is not None))
+    first = int(x0 is not None)
+    if isinstance(noise, MotionNoise):
+        process = own_variances(noise, velocity[:, :, columns], recording.dt, first)
+    else:
+        process = noise.process_variance(recording, columns, first=first)
     seen = SoloMeasurements(gnss, velocity, np.broadcast_to(process, shape), columns, recording.dt)
     if x0 is not None and np.shape(x0)[-2:] != shape[2:]:
         raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {shape[2:]}", "One start per ego.")

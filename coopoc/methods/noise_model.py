@@ -102,12 +102,44 @@ class NoiseModel:
         gnss = np.where(gnss > 0, gnss, recording.sensors.gnss_std)
         return cls("fitted", recording.sensors, _three(process), _three(gnss))
 
-    def process_variance(self, recording: Recording) -> Floats:
-        """Per-axis variance of x_t given x_{t-1}, m^2, broadcastable to (R, T, N, 3).
+    def process_variance(
+        self,
+        recording: Recording,
+        columns: Sequence[int] | Ints | None = None,
+        box: Inbox | None = None,
+        first: int = 0,
+    ) -> Floats:
+        """Per-axis variance of x_t given x_{t-1}, m^2, broadcastable to (R, T, E, 3).
 
         Where it follows the velocity it is (dt max(ratio s, floor))^2, with s the pace: of past velocities
-        (`kernels.motion.MotionNoise`)."""
-        return process_noise(self, recording)
+        (`kernels.motion.MotionNoise`).
+
+        Args:
+            recording: with the velocities.
+            columns: (E,) of the vehicles; None for all.
+            box: of the one vehicle; then of all (R, T, N, 3) by what it knows, at the steps of messages that arrive.
+            first: step at which the filter begins.
+        """
+        if self.process_std is not None:
+            return np.square(self.process_std)[None, None, None]
+        assert self.sensors is not None
+        velocity, links = recording.velocity, recording.links
+        if self.fleet is not None:
+            self.fleet.require(recording.ids, recording.t)
+            velocity = self.fleet.velocity[None]
+        if columns is not None and box is None:
+            velocity = velocity[:, :, columns]
+        if self.fleet is not None:
+            found: Floats = np.square(recording.dt * self.sensors.velocity_std(velocity, 1e-6))
+            return found
+        if box is None:
+            return own_variances(self.sensors.motion_noise(), velocity, recording.dt, first)
+        use, neighbour = np.zeros(velocity.shape[:3], np.uint8), links.neighbour[box.link]
+        use[:, links.step[box.link], neighbour] = RECEIVED * (box.arrival >= 0)
+        use[np.arange(len(use))[:, None], box.newest, neighbour] = HELD  # -1, of none: the last step is before no other
+        use[:, :, columns] = HELD
+        velocity, longest = np.ascontiguousarray(velocity), recording.v2x.max_age
+        return process_variances(self.sensors.motion_noise(), velocity, use, longest, recording.dt)
 
     def fix_variance(self, recording: Recording) -> Floats:
         """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""
@@ -255,45 +287,6 @@ def motion_noise(noise_model: NoiseModel, interval: float | None) -> MotionNoise
         return MotionNoise(np.array(noise_model.process_std, dtype=float), np.zeros(3), 0.0, 0.0, interval)
     assert noise_model.sensors is not None
     return noise_model.sensors.motion_noise(interval)
-
-
-def process_noise(
-    noise: NoiseModel | MotionNoise,
-    recording: Recording,
-    columns: Sequence[int] | Ints | None = None,
-    *,
-    box: Inbox | None = None,
-    first: int = 0,
-) -> Floats:
-    """Process noise of a recording's steps, m^2 broadcastable to (R, T, E, 3).
-
-    Args:
-        noise: of the motion.
-        recording: its velocities.
-        columns: (E,) of the vehicles; None for all.
-        box: of the one vehicle; then of all (R, T, N, 3) that it knows, at the steps of messages that it receives.
-        first: step at which the filter begins.
-    """
-    if isinstance(noise, NoiseModel):
-        if noise.fleet is not None:
-            assert noise.sensors is not None
-            noise.fleet.require(recording.ids, recording.t)
-            std = recording.dt * noise.sensors.velocity_std(noise.fleet.velocity[None], 1e-6)
-            found: Floats = np.square(std if box is not None or columns is None else std[:, :, columns])
-            return found
-        if noise.process_std is not None:
-            return np.square(noise.process_std)[None, None, None]
-        noise = motion_noise(noise, None)
-    if box is None:
-        velocity = recording.velocity if columns is None else recording.velocity[:, :, columns]
-        return own_variances(noise, velocity, recording.dt, first)
-    step, neighbour = (values[box.link] for values in (recording.links.step, recording.links.neighbour))
-    use = np.zeros(recording.velocity.shape[:3], np.uint8)
-    use[:, step, neighbour] = RECEIVED * (box.arrival >= 0)
-    use[np.arange(len(use))[:, None], box.newest, neighbour] = HELD  # -1, of none: the last step is before no other
-    use[:, :, columns] = HELD
-    longest = min(recording.v2x.max_age, 1e18)
-    return process_variances(noise, np.ascontiguousarray(recording.velocity), use, longest, recording.dt)
 
 
 def check_interval(interval: float) -> float:

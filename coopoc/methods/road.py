@@ -19,7 +19,7 @@ from ..short_repr import short_repr
 from ..world.fleet import Fleet
 from ..world.recording import Recording, Vehicles, check_recording
 from .motion_history import MotionHistory
-from .noise_model import NoiseModel, constant_noise, motion_noise, process_noise, resolve
+from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
 from .track import Alone, Track, check_options, lost, silent_track
 
 LIMITS: Limits = {
@@ -135,7 +135,7 @@ class RoadFilter(Alone):
         known, noise = self._noise(recording)
         gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
         shape = *gnss.shape[:2], len(columns)
-        process = self.assumed(recording).motion ** 2 * process_noise(known, recording, columns)
+        process = self.assumed(recording).motion ** 2 * known.process_variance(recording, columns)
         seen = SoloMeasurements(gnss, velocity, np.broadcast_to(process, (*shape, 3)), np.array(columns), recording.dt)
         x, cov, lasting = (np.empty((*shape, *size)) for size in ((3,), (3, 3), (4,)))
         run_road(seen, noise, x, cov, lasting)

@@ -12,7 +12,7 @@ from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN
 from ..world.inbox import inbox
 from ..world.recording import Recording, check_recording
 from ..world.v2x import FIX_AND_VELOCITY, Message
-from .noise_model import NoiseModel, process_noise, resolve
+from .noise_model import NoiseModel, resolve
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,7 +77,7 @@ def stars(
     """
     known, ego = resolve(noise_model, recording), check_recording(recording).columns([ego])[0]
     box, shape, dt = inbox(recording, ego, message), recording.gnss.shape, recording.dt
-    q = np.broadcast_to(process_noise(known, recording, [ego], box=box), shape)
+    q = np.broadcast_to(known.process_variance(recording, [ego], box), shape)
     r = np.broadcast_to(known.fix_variance(recording), shape)
     fixes, variances = sent or (recording.gnss, r)
     variances = np.broadcast_to(variances, shape)
