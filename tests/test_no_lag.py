@@ -17,8 +17,9 @@ from coopoc.world.v2x import FIX_AND_VELOCITY
 
 NOISY = Sensors(gnss_std=(3.5,) * 3, velocity_std_ratio=0.15)
 SPEED, RUNS = 15.0, 100
-MOST = {"batch-smoother": 0.01, "kalman": 0.15, "kalman-adaptive": 0.15, "road-kalman": 0.15}
-"""m behind, at most: readings of 2.3 m a step. A smoother sees the road from both sides."""
+MOST, SMOOTHED = 0.11, 0.01
+"""m behind, at most, where readings are wrong by 2.3 m a step: the pace of late readings knows what has brought the
+estimate forward. A smoother sees the road from both sides."""
 
 
 @cache
@@ -34,8 +35,8 @@ def road(vehicles: int = 3, steps: int = 60) -> tuple[Fleet, Recording]:
 
 @pytest.mark.parametrize("name", sorted(METHODS.keys() - {"gnss"}))
 def test_no_method_falls_behind(name: str) -> None:
-    """Along the road, within three standard errors of where it is with the true speed, or within MOST: what the mean
-    of few velocities leaves. With the variance of each reading it was 0.19 m (kalman) to 0.55 m (central-filter)."""
+    """Along the road, within three standard errors of where it is with the true speed, or within MOST. With the
+    variance of each reading it was 0.19 m (kalman) to 0.55 m (central-filter)."""
     fleet, seen = road()
 
     def ahead(method: Method) -> np.ndarray:
@@ -48,7 +49,8 @@ def test_no_method_falls_behind(name: str) -> None:
     else:
         models = NoiseModel.nominal(NOISY), NoiseModel.oracle(NOISY, fleet)
         found = np.subtract(*(ahead(METHODS[name](known)) for known in models))
-    assert abs(found.mean()) < max(3 * found.std() / np.sqrt(RUNS), MOST.get(name, 0.13))
+    most = SMOOTHED if name == "batch-smoother" else MOST
+    assert abs(found.mean()) < max(3 * found.std() / np.sqrt(RUNS), most)
 
 
 @pytest.mark.parametrize("reading", ["axis", "speed"])

@@ -69,17 +69,13 @@ def dead_reckon(
             return BAD_INPUT
     if not (dt > 0.0 and math.isfinite(dt)) or missing % 3 != 0:
         return BAD_INPUT
+    if missing == 0 and not -ROUNDING <= age <= min(history[0, 2] + dt, history[0, 3]) + ROUNDING:
+        return BAD_INPUT
     square = history[0, SQUARE]
     process_variance(motion, square, given[VELOCITY], dt, q)
     for c in range(3):
         moved[c] = dt * given[3 + c]
-    first, count, seen = history[0, 0], history[0, 1], history[0, 2]
     push(history, dt, moved[:3], q)
-    if missing == 0 and not -ROUNDING <= age <= history[0, 2] + ROUNDING:
-        history[0, 0], history[0, 1], history[0, 2] = first, count, seen
-        if count == 0.0:
-            square[:] = math.nan
-        return BAD_INPUT
     keep_pace(square, given[VELOCITY], dt)
     if missing > 0:
         return NO_FIX_YET

@@ -86,7 +86,7 @@ def own_variances(noise: MotionNoise, velocity: Floats, dt: float, first: int = 
     """Process noise (R, T, N, 3) m^2 of steps of dt s with velocities (R, T, N, 3) m/s, for a filter that begins at
     step `first`."""
     use = np.full(velocity.shape[:3], HELD, np.uint8)
-    use[:, :first] = RECEIVED
+    use[:, :first] = UNUSED
     return process_variances(noise, np.ascontiguousarray(velocity), use, math.inf, dt)
 
 

@@ -56,10 +56,7 @@ class MotionHistory:
         three("velocity", velocity)
         if np.isnan(fix_or_none(gnss)).all():
             return
-        later = MotionHistory(0.0)
-        later.rows = self.reserve().copy()
-        later.push(dt, np.zeros(3), np.zeros(3))
-        kept = later.rows[0, 2]
+        kept = min(self.rows[0, 2] + float(dt), self.rows[0, 3])
         hint, allowed = "Leave such a fix out (None), or keep more: start(..., history=).", f"in 0..{kept:g} s"
         number("fix_age", fix_age, -ROUNDING, kept + ROUNDING, allowed=f"{allowed}, the motion that is kept", hint=hint)
 
