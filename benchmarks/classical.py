@@ -57,7 +57,7 @@ def ring(neighbours: int, steps: int, runs: int, sensors: co.Sensors = SENSORS, 
 def filter_rows(recording: co.Recording) -> list[Row]:
     """The linear filter against filterpy's, run by run, and what the exact one costs more."""
     box = inbox(recording, 0, FIX_AND_VELOCITY)
-    measured, assumed = measurements(recording, 0, box), assumptions(recording, KNOWN)
+    measured, assumed = measurements(recording, 0, box), assumptions(recording, KNOWN, 0, box)
     linear, exact = (co.JointFilter(KNOWN, exact=wish, robust=False) for wish in (False, True))  # as filterpy's
     drives = [peer_drive(recording, run) for run in range(2)]
     peer = np.stack([filterpy_drive(d) for d in drives])

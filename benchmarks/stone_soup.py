@@ -101,8 +101,8 @@ def updated(updater: Any, stars: list[tuple[Any, Any]]) -> Callable[[], Any]:
 def joint_filter() -> Job:
     """The ego of two runs, each step a prediction and an update, against filterpy's numbers."""
     recording = ring(NEIGHBOURS, STEPS, RUNS)
-    measured = measurements(recording, 0, inbox(recording, 0, FIX_AND_VELOCITY))
-    assumed = assumptions(recording, KNOWN)
+    box = inbox(recording, 0, FIX_AND_VELOCITY)
+    measured, assumed = measurements(recording, 0, box), assumptions(recording, KNOWN, 0, box)
     drives = [peer_drive(recording, run) for run in range(2)]
     wanted = np.stack([filterpy_drive(drive) for drive in drives])
 

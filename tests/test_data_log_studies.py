@@ -141,7 +141,7 @@ def test_innovations_are_filterpys(folders: Path) -> None:
     track = co.Kalman()(rec, ["car0"])
     found, squares = fix_innovations(track, rec), normalised_innovations(track, rec)
     assert squares is not None
-    q = (rec.dt * rec.sensors.assumed_velocity_std(rec.velocity[0, :, 0])) ** 2
+    q = rec.sensors.motion_std(rec.velocity, rec.dt)[0, :, 0] ** 2
     kf = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
     kf.x, kf.F, kf.H, kf.B = rec.gnss[0, 0, 0], np.eye(3), np.eye(3), rec.dt * np.eye(3)
     kf.R = np.diag(np.square(rec.sensors.gnss_std))

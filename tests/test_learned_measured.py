@@ -11,6 +11,7 @@ import torch
 from conftest import refused
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
+from oracles.pace import after
 from scipy.optimize import approx_fprime
 
 import coopoc as co
@@ -139,9 +140,10 @@ def test_the_scan_without_fixes_is_filterpys_prediction() -> None:
     ours, normalised = scan(stds, given)
     theirs = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
     theirs.P, theirs.H, theirs.R, theirs.B = 1.21 * np.eye(3), np.eye(3), 1.21 * np.eye(3), 0.1 * np.eye(3)
-    theirs.x = np.zeros(3)
+    theirs.x, square, before = np.zeros(3), speeds[0] ** 2, speeds[0]
     for t in range(steps):
-        theirs.predict(u=speeds[t], Q=np.diag(0.09 + (0.02 * speeds[t]) ** 2))
+        square, before = after(square, before, 0.1) if t else square, speeds[t]
+        theirs.predict(u=speeds[t], Q=np.diag(0.09 + 0.02**2 * square))
         theirs.update(None if np.isnan(fixes[t, 0]) else fixes[t])
         assert_allclose(ours[t, 0, 0], theirs.x, atol=1e-9)
         if t % 5 == 0:

@@ -7,6 +7,7 @@ import pytest
 from conftest import refused
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
+from oracles.pace import after
 
 from coopoc import Fleet, Sensors, observe
 from coopoc.evaluate.metrics import nees
@@ -54,9 +55,11 @@ def test_equals_filterpy() -> None:
     theirs = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
     theirs.x, theirs.P = rec.gnss[0, 0, 0].copy(), np.diag(np.square(method.gnss_std))
     theirs.H, theirs.R, theirs.B = np.eye(3), np.diag(np.square(method.gnss_std)), 0.1 * np.eye(3)
+    before, square = rec.velocity[0, 0, 0], rec.velocity[0, 0, 0] ** 2
     for step in range(1, 50):
         u = rec.velocity[0, step, 0]
-        moved = 0.1 * np.array(method.velocity_ratio) * u
+        square, before = after(square, before, 0.1), u
+        moved = 0.1 * np.array(method.velocity_ratio) * np.sqrt(square)
         theirs.predict(u=u, Q=np.diag(np.square(method.process_std) + moved**2))
         theirs.update(rec.gnss[0, step, 0])
         assert_allclose(track.x[0, step, 0], theirs.x, atol=1e-10)

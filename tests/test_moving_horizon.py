@@ -64,7 +64,7 @@ def test_the_horizon_is_at_its_minimum(formation: Fleet) -> None:
     track, order = textbook(MovingHorizon(horizon=6))(recording, [0]), [0, *recording.links.neighbour[:3]]
     for run in range(2):
         moved = recording.dt * recording.velocity[run][:, order]
-        std = recording.dt * S2.assumed_velocity_std(recording.velocity[run][:, order])
+        std = S2.motion_std(recording.velocity, recording.dt)[run][:, order]
         seen = recording.relative[run].reshape(6, 3, 3)
 
         def whitened(x: np.ndarray, run=run, moved=moved, std=std, seen=seen) -> np.ndarray:

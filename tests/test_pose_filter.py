@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from conftest import refused, textbook
 from oracles import pose_filter as oracle
+from oracles.pace import heard
 from shell import ran
 
 import coopoc as co
@@ -103,6 +104,7 @@ def test_a_fleet_is_filterpys_extended_kalman_filter(formation: co.Fleet) -> Non
     seen = co.observe(drive, noise, co.V2X(max_neighbours=3, radius=1e3), frame="body")
     track = textbook(co.PoseFilter("fleet", exact=False))(seen)
     packed = pose_measurements(seen, range(4), np.arange(len(seen.links)))
+    motion = heard(seen, None, co.NoiseModel.nominal(noise), 0, 0) / seen.dt**2
     ekf = filterpy.ExtendedKalmanFilter(16, 1)
     ekf.x = packed.own[0, 0, :, :4].flatten()
     ekf.P = np.diag([1e6, 1e6, 1e6, np.pi**2 / 3] * 4)
@@ -114,7 +116,7 @@ def test_a_fleet_is_filterpys_extended_kalman_filter(formation: co.Fleet) -> Non
                 state = ekf.x[b].copy()
                 F[b, b] = oracle.jacobian(lambda s, u=u: oracle.motion(s, u, seen.dt), state)
                 G = oracle.jacobian(lambda v, s=state: oracle.motion(s, v, seen.dt), u)
-                q = np.append(np.maximum(0.1 * np.abs(u[:3]), 0.05) ** 2, 0.02**2)
+                q = np.append(motion[t, k], 0.02**2)
                 Q[b, b], ekf.x[b] = G @ np.diag(q) @ G.T, oracle.motion(state, u, seen.dt)
             ekf.P = F @ ekf.P @ F.T + Q
         for k in range(4):
@@ -201,7 +203,7 @@ def test_a_solo_filter_moves_and_updates_covariances_as_gtsam() -> None:
     cov = turned(before).T @ wanted[0] @ turned(before)
     ekf = gtsam.InvariantEKFPose2(before, cov)
     G = oracle.jacobian(lambda v: oracle.motion(state, v, 0.1), np.append(u, w))[[0, 1, 3]]
-    q = np.append(np.maximum(0.1 * np.abs(u), 0.05) ** 2, 0.02**2)
+    q = np.append(heard(seen, None, co.NoiseModel.nominal(seen.sensors), 0, 0)[1, 0] / 0.1**2, 0.02**2)
     T = turned(then)
     ekf.predict(before.between(then), T.T @ G @ np.diag(q) @ G.T @ T)
     wanted.append(update(ekf, seen.relative[0, 1, :2]))

@@ -72,7 +72,8 @@ def test_steps_without_a_fix_teach_nothing() -> None:
     np.testing.assert_array_equal(after.weight, before.weight)
     assert_allclose(x, before.x + np.array([4.5, 0.0, 0.0]))
     grown = np.diag(cov) - (before.share * before.noise + before.motion)
-    assert_allclose(grown, 5 * (0.1 * ASSUMED.assumed_velocity_std(np.array([9.0, 0, 0]))) ** 2)
+    std = ASSUMED.motion_std(np.array(20 * [[0.0, 0.0, 0.0]] + 5 * [[9.0, 0.0, 0.0]])[None, :, None], 0.1)
+    assert_allclose(grown, (std[0, 20:, 0] ** 2).sum(axis=0))
 
 
 def test_late_fixes_do_not_count_as_noisy() -> None:
@@ -142,7 +143,7 @@ def series(seen: Recording, q: Floats, r: Floats, *at: int) -> tuple[Floats | fl
 def test_kalman(crossing: Fleet, noise: str, known: bool) -> None:
     seen = gaps(crossing, absent=True)
     model = NoiseModel.identity() if noise == "identity" else NoiseModel.nominal(S2)
-    q, r = np.broadcast_to(model.process_variance(seen), seen.gnss.shape), model.gnss_variance
+    q, r = np.broadcast_to(model.process_variance(seen, first=int(known)), seen.gnss.shape), model.gnss_variance
     start = crossing.position[0] if known else None
     x, p, _ = solo_filter(seen, range(len(seen.ids)), model, FixNoise(r), start)
     for run, n, c in np.ndindex(3, 4, 3):

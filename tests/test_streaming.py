@@ -188,7 +188,7 @@ def test_nothing_is_known_before_the_first_fix(name: str) -> None:
     x, cov = stream.step(Z, U, 0.1, fix_age=0.3)
     assert_allclose(x, Z + 0.3 * U, atol=1e-5)
     if name == "nominal":
-        variance = np.square(S2.gnss_std) + 3 * (0.1 * S2.assumed_velocity_std(U)) ** 2
+        variance = np.square(S2.gnss_std) + 3 * S2.motion_std(U[None, None, None], 0.1)[0, 0, 0] ** 2
         assert_allclose(np.diag(cov), variance)
 
 

@@ -116,7 +116,7 @@ def test_velocity_readings() -> None:
     velocity = np.array([3.0, 4.0, 0.0])
     assert Sensors(velocity_reading="axis").velocity_std(velocity) == pytest.approx([0.3, 0.4, 0.0])
     assert Sensors(velocity_reading="speed").velocity_std(velocity) == pytest.approx([0.5, 0.5, 0.5])
-    assert Sensors().assumed_velocity_std(velocity)[2] == 0.05
+    assert Sensors().motion_std(velocity[None, None, None], 0.1)[0, 0, 0, 2] == pytest.approx(0.005)
 
 
 def test_links_are_the_nearest_within_the_radius(crossing: Fleet) -> None:

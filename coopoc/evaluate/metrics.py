@@ -265,7 +265,8 @@ def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
     innovation = fix_innovations(track, recording)
     u, angle = recording.velocity[:, 1:, egos], _halfway(track, recording)
     axes = turned(np.eye(3), angle[..., None])  # rows: the axes of sigma_u
-    moving = recording.dt * np.nan_to_num(noise.assumed_velocity_std(u))[..., None] * axes
+    std = noise.motion_std(recording.velocity[:, :, egos], recording.dt)[:, 1:]
+    moving = np.nan_to_num(std)[..., None] * axes
     covariance = track.covariance[:, :-1] + np.einsum("...ki,...kj->...ij", moving, moving)
     covariance[..., range(3), range(3)] += np.square(noise.fix_std)
     if track.heading_covariance is not None:

@@ -6,7 +6,7 @@ import math
 
 from ..arrays import Floats
 from .compiling.compile import compiled, part
-from .motion import MotionNoise, process_variance
+from .motion import MotionNoise, keep_pace, process_variance
 
 ROUNDING = 1e-9
 """s, by how much sums of time steps may miss a time."""
@@ -14,10 +14,12 @@ ESTIMATE, NO_FIX_YET, BAD_INPUT = 0, 1, 2
 """What a step of a stream returns."""
 VELOCITY, DT, FIX_AGE = slice(3, 6), 6, 7
 """Where the input of a stream's step stands in its array, behind the fix."""
+SQUARE = slice(4, 7)
+"""Where the square of the pace stands in row 0 of a history."""
 
 
 # A history is one array (1 + capacity, 7), a ring. Row 0: first row in use, rows in use, seconds they span, seconds
-# asked for. Each other row is a step: dt s, motion (3,) m, its variance (3,) m^2.
+# asked for, square of the pace. Each other row is a step: dt s, motion (3,) m, its variance (3,) m^2.
 
 
 @compiled
@@ -67,15 +69,15 @@ def dead_reckon(
             return BAD_INPUT
     if not (dt > 0.0 and math.isfinite(dt)) or missing % 3 != 0:
         return BAD_INPUT
-    variance = process_variance(motion, given[VELOCITY], dt)
+    if missing == 0 and not -ROUNDING <= age <= min(history[0, 2] + dt, history[0, 3]) + ROUNDING:
+        return BAD_INPUT
+    square = history[0, SQUARE]
+    process_variance(motion, square, given[VELOCITY], dt, q)
     for c in range(3):
-        q[c], moved[c] = variance[c], dt * given[3 + c]
-    first, count, seen = history[0, 0], history[0, 1], history[0, 2]
+        moved[c] = dt * given[3 + c]
     push(history, dt, moved[:3], q)
+    keep_pace(square, given[VELOCITY], dt)
     if missing > 0:
         return NO_FIX_YET
-    if not -ROUNDING <= age <= history[0, 2] + ROUNDING:
-        history[0, 0], history[0, 1], history[0, 2] = first, count, seen
-        return BAD_INPUT
     since(history, age, since_fix, late)
     return ESTIMATE

@@ -13,7 +13,7 @@ import numpy as np
 
 from ..arrays import Floats
 from .compiling.compile import compiled, part
-from .motion import MotionNoise, process_variance
+from .motion import MotionNoise, keep_pace, process_variance
 from .solo import SoloMeasurements
 
 Z, Z_VARIANCE, SINCE, LEVEL, SCALE, FIXES = range(6)
@@ -171,11 +171,12 @@ def road_step(
 
 
 @compiled
-def road_motion(motion: MotionNoise, velocity: Floats, dt: float, moved: Floats, q: Floats) -> None:
-    """Write a step's motion m and its variance m^2 (3,)."""
-    variance = process_variance(motion, velocity, dt)
+def road_motion(motion: MotionNoise, square: Floats, velocity: Floats, dt: float, moved: Floats, q: Floats) -> None:
+    """Write a step's motion m and its variance m^2 (3,), and keep the pace."""
+    process_variance(motion, square, velocity, dt, q)
+    keep_pace(square, velocity, dt)
     for c in range(3):
-        moved[c], q[c] = dt * velocity[c], variance[c]
+        moved[c] = dt * velocity[c]
 
 
 @compiled
@@ -198,10 +199,9 @@ def run_road(measurements: SoloMeasurements, noise: RoadNoise, x: Floats, cov: F
             n = measurements.columns[e]
             state.x[0] = math.nan
             for t in range(steps):
-                motion = process_variance(measurements.motion, measurements.velocity[run, t, n], measurements.dt)
                 for c in range(3):
                     moved[c] = measurements.dt * measurements.velocity[run, t, n, c]
-                    q[c] = motion[c] + measurements.process[run, t, n, c]
+                    q[c] = measurements.process[run, t, e, c]
                 road_step(state, noise, moved, q, measurements.dt, measurements.gnss[run, t, n], late)
                 scale = state.more[SCALE]
                 x[run, t, e, 0], x[run, t, e, 1], x[run, t, e, 2] = state.x[0], state.x[1], state.more[Z]

@@ -18,7 +18,7 @@ from .compiling.compile import compiled, inside, part
 from .compiling.small import load, store
 from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
 from .gate import REJECTED, SLIP, count, inflation
-from .motion import MotionNoise, process_variance
+from .motion import MotionNoise
 
 LEAST = 1e-4
 """m^2, least variance of a fix: 1 cm."""
@@ -52,8 +52,7 @@ class SoloMeasurements(NamedTuple):
     Attributes:
         gnss: (R, T, N, 3) m, NaN for no fix and for an absent vehicle.
         velocity: (R, T, N, 3) m/s, NaN for an absent vehicle.
-        process: (R, T, N, 3) m^2, variance of a step's motion beside that of `motion`.
-        motion: process noise that follows the measured velocity.
+        process: (R, T, E, 3) m^2, variance of a step's motion.
         columns: (E,) of the vehicles.
         dt: s.
     """
@@ -61,7 +60,6 @@ class SoloMeasurements(NamedTuple):
     gnss: Floats
     velocity: Floats
     process: Floats
-    motion: MotionNoise
     columns: Ints
     dt: float
 
@@ -165,13 +163,8 @@ def filter_runs(
         for t in range(measurements.gnss.shape[1]):
             for e in range(len(measurements.columns)):
                 n, at = measurements.columns[e], index[e]
-                q = process_variance(measurements.motion, measurements.velocity[run, t, n], measurements.dt)
-                u, more, fix = (
-                    measurements.velocity[run, t, n],
-                    measurements.process[run, t, n],
-                    three(measurements.gnss[run, t, n]),
-                )
-                q = more[0] + q[0], more[1] + q[1], more[2] + q[2]
+                u, q = measurements.velocity[run, t, n], three(measurements.process[run, t, e])
+                fix = three(measurements.gnss[run, t, n])
                 moved = measurements.dt * u[0], measurements.dt * u[1], measurements.dt * u[2]
                 gated = gate_fix(states[e], moved, q, fix, NEVER, rule.gate if t > 0 else 0.0)
                 for c in range(3):

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
 from ..arrays import Floats
 from ..kernels.stars.lkf_sa import run_lkf_sa
-from ..kernels.stars.messages import Assumptions
 from ..kernels.stars.pseudo_fixes import run_msmv
+from ..world.inbox import Inbox
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements
@@ -44,12 +44,13 @@ class LKFSA(Checked):
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)
-        assumed = assumptions(recording, known)
         return follow_egos(
             self,
             recording,
             egos,
-            lambda ego, box: [Estimate(*run_lkf_sa(measurements(recording, ego, box), assumed))],
+            lambda ego, box: [
+                Estimate(*run_lkf_sa(measurements(recording, ego, box), assumptions(recording, known, ego, box)))
+            ],
             known.notes,
         )
 
@@ -85,23 +86,21 @@ class MSMV(Checked):
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
-        assumed, own = solo_estimates(recording, known, columns)
-        assumed = assumed._replace(growth=(0.0, 1.0), acceleration=0.0)
-        return follow_egos(
-            self,
-            recording,
-            egos,
-            lambda ego, box: [Estimate(*run_msmv(measurements(recording, ego, box, own), assumed))],
-            (*known.notes, RECONSTRUCTION),
-        )
+        x, p = solo_estimates(recording, known, columns)
+
+        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
+            assumed = assumptions(recording, known, ego, box)
+            assumed = assumed._replace(broadcast=p, growth=(0.0, 1.0), acceleration=0.0)
+            yield Estimate(*run_msmv(measurements(recording, ego, box, x), assumed))
+
+        return follow_egos(self, recording, egos, run, (*known.notes, RECONSTRUCTION))
 
 
 def solo_estimates(
     recording: Recording, noise_model: NoiseModel, egos: Sequence[int], robust: bool = False
-) -> tuple[Assumptions, Floats]:
-    """What a filter assumes whose messages hold solo estimates, and these, (R, T, N, 3) m of all vehicles in the stars
-    of some egos (columns); `robust` as of Kalman."""
+) -> tuple[Floats, Floats]:
+    """Solo estimates (R, T, N, 3) m of all vehicles in the stars of some egos (columns), and their variances m^2;
+    `robust` as of Kalman."""
     links = recording.links
     members = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
-    x, p, _ = solo_filter(recording, members, noise_model, fix_noise(noise_model, robust), in_place=True)
-    return assumptions(recording, noise_model)._replace(broadcast=p), x
+    return solo_filter(recording, members, noise_model, fix_noise(noise_model, robust), in_place=True)[:2]

@@ -130,19 +130,18 @@ class CooperativeFilter(Checked):
         """
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         guards = guards_of(self, known, recording.measured)
-        model = model_of(known, self.robust, guards)
-        assumed, notes = assumptions(recording, known), list(known.notes)
-        assumed = assumed._replace(fixes=guards.fix**2 * assumed.fixes)
+        model, notes = model_of(known, self.robust, guards), list(known.notes)
 
         @cache
         def sent() -> Sent:
             if self.robust:
                 return broadcasts(recording, known, columns, guards)
-            fixes, variance = (np.moveaxis(a, 2, 0).copy() for a in (recording.gnss, assumed.fixes))
-            return Sent(fixes, variance, NOTHING)
+            fixes, variance = (np.moveaxis(a, 2, 0) for a in (recording.gnss, known.fix_variance(recording)))
+            return Sent(fixes.copy(), variance.copy(), NOTHING)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            seen = measurements(recording, ego, box)
+            seen, assumed = measurements(recording, ego, box), assumptions(recording, known, ego, box)
+            assumed = assumed._replace(fixes=guards.fix**2 * assumed.fixes)
             x, cov, neighbours, fixes, weights, found = run_filter(seen, assumed, sent(), model, guards)
             extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate(KINDS)}
             names = (*(name.replace(" ", "_") for name in FOUND), *(f"{kind}_level" for kind in LEVELS))
@@ -165,18 +164,15 @@ class CooperativeFilter(Checked):
 
 def broadcasts(recording: Recording, noise_model: NoiseModel, egos: Sequence[int], guards: Guards) -> Sent:
     """Messages of the vehicles in the stars of some egos, each filtered alone until it is in none any more."""
-    links, assumed, model = (
-        recording.links,
-        assumptions(recording, noise_model),
-        model_of(noise_model, False, NO_GUARDS),
-    )
-    assumed = assumed._replace(fixes=guards.fix**2 * assumed.fixes)
+    links, model = recording.links, model_of(noise_model, False, NO_GUARDS)
     x, variance, moved = np.zeros((3, *np.moveaxis(recording.gnss, 2, 0).shape))
     none, nothing = Sent(NOTHING, NOTHING, NOTHING), inbox(recording, egos[0], FIX_AND_VELOCITY)
     seen, here = measurements(recording, egos[0], nothing), np.isin(links.observer, egos)
     for j in np.unique(links.neighbour[here]):
         last = int(links.step[here & (links.neighbour == j)].max()) + 1
         alone = seen._replace(ego=int(j), start=np.zeros(last + 1, np.int64))
+        assumed = assumptions(recording, noise_model, int(j))
+        assumed = assumed._replace(fixes=guards.fix**2 * assumed.fixes)
         x[j, :, :last], cov = run_filter(alone, assumed, none, model, guards)[:2]
         variance[j, :, :last] = np.diagonal(cov, axis1=-2, axis2=-1)
         np.nancumsum(recording.dt * recording.velocity[:, :last, j], axis=1, out=moved[j, :, :last])

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 from ..kernels.stars.messages import ESTIMATE_GROWTH
 from ..kernels.stars.pseudo_fixes import run_intersection
+from ..world.inbox import Inbox
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import ESTIMATE_AND_COV
 from .baselines import solo_estimates
-from .egos import Estimate, follow_egos, measurements
+from .egos import Estimate, assumptions, follow_egos, measurements
 from .noise_model import NoiseModel, resolve
 from .track import Checked, Track
 
@@ -60,14 +62,10 @@ class CovarianceIntersection(Checked):
         """
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         gates = self.robust and known.exact_relative
-        assumed, own = solo_estimates(recording, known, columns, gates)
-        assumed = assumed._replace(growth=ESTIMATE_GROWTH)
-        return follow_egos(
-            self,
-            recording,
-            egos,
-            lambda ego, box: [
-                Estimate(*run_intersection(measurements(recording, ego, box, own), assumed, self.split, gates))
-            ],
-            known.notes,
-        )
+        x, p = solo_estimates(recording, known, columns, gates)
+
+        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
+            assumed = assumptions(recording, known, ego, box)._replace(broadcast=p, growth=ESTIMATE_GROWTH)
+            yield Estimate(*run_intersection(measurements(recording, ego, box, x), assumed, self.split, gates))
+
+        return follow_egos(self, recording, egos, run, known.notes)

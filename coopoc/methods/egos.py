@@ -15,7 +15,7 @@ from ..kernels.geometry import components
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, Vehicles, check_recording
-from .noise_model import NoiseModel, process_noise
+from .noise_model import NoiseModel
 from .track import Method, Track
 
 BEYOND = 10.0
@@ -125,13 +125,18 @@ def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats |
     )
 
 
-def assumptions(recording: Recording, noise_model: NoiseModel) -> Assumptions:
-    """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a
-    velocity."""
-    process, motion = process_noise(noise_model, recording)
+def assumptions(recording: Recording, noise_model: NoiseModel, ego: int, box: Inbox | None = None) -> Assumptions:
+    """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a velocity.
+
+    Args:
+        recording: of all vehicles.
+        noise_model: of the filter.
+        ego: column.
+        box: its messages; None where it is alone.
+    """
+    process = noise_model.process_variance(recording, [ego], box)
     fixes = np.ascontiguousarray(noise_model.fix_variance(recording))
-    noise = relative_noise(noise_model)
-    return Assumptions(process, fixes, fixes, FIX_GROWTH, *noise, FORGOTTEN, ACCELERATION_STD, motion)
+    return Assumptions(process, fixes, fixes, FIX_GROWTH, *relative_noise(noise_model), FORGOTTEN, ACCELERATION_STD)
 
 
 def relative_noise(noise_model: NoiseModel) -> tuple[Floats, float]:

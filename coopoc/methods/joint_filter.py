@@ -48,12 +48,17 @@ class JointFilter(Checked):
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)
-        assumed, gates = assumptions(recording, known), self.robust and known.exact_relative
-        refine = self.exact and known.exact_relative
+        refine, gates = (wish and known.exact_relative for wish in (self.exact, self.robust))
         return follow_egos(
             self,
             recording,
             egos,
-            lambda ego, box: [Estimate(*run_filter(measurements(recording, ego, box), assumed, refine, gates))],
+            lambda ego, box: [
+                Estimate(
+                    *run_filter(
+                        measurements(recording, ego, box), assumptions(recording, known, ego, box), refine, gates
+                    )
+                )
+            ],
             known.notes,
         )

@@ -12,12 +12,12 @@ from ..arrays import TINY, Floats
 from ..errors import InputError
 from ..kernels.compiling.waiting import clock
 from ..kernels.gate import FIX_GATE
-from ..kernels.motion import MotionNoise
+from ..kernels.motion import MotionNoise, own_variances
 from ..kernels.solo import FixNoise, SoloMeasurements, run_filter
 from ..short_repr import short_repr
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.sensors import Sensors
-from .noise_model import NO_VARIANCE, NoiseModel, constant_noise, motion_noise, process_noise, resolve
+from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
 from .stream import FilterStream
 from .track import Alone, Checked, Track, check_options, lost, silent_track
 
@@ -107,7 +107,7 @@ class AdaptiveKalman(Alone):
     $$ r \leftarrow r + (\nu^2 - p - r) / n, \qquad n \leftarrow \min(n + 1, \mathrm{window}). $$
 
     So $r$ is the mean of $\nu^2 - p$ over all fixes and `prior_weight` fixes of the assumed variance, and once there
-    are `window` it forgets exponentially. The process noise follows the measured velocity as in NoiseModel.nominal. A
+    are `window` it forgets exponentially. The process noise follows the pace as in NoiseModel.nominal. A
     bias that is there from the first fix on does not show in innovations.
 
     A position is a mean of past fixes moved forward. Joseph's form splits its variance into a part that is linear in r
@@ -214,11 +214,15 @@ def solo_filter(
     Raises:
         InputError: x0 of another shape.
     """
-    process, motion = (NO_VARIANCE, noise) if isinstance(noise, MotionNoise) else process_noise(noise, recording)
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     columns = np.asarray(columns)
-    seen = SoloMeasurements(gnss, velocity, np.broadcast_to(process, gnss.shape), motion, columns, recording.dt)
     shape = *gnss.shape[:2], len(columns), 3
+    first = int(x0 is not None)
+    if isinstance(noise, MotionNoise):
+        process = own_variances(noise, velocity[:, :, columns], recording.dt, first)
+    else:
+        process = noise.process_variance(recording, columns, first=first)
+    seen = SoloMeasurements(gnss, velocity, np.broadcast_to(process, shape), columns, recording.dt)
     if x0 is not None and np.shape(x0)[-2:] != shape[2:]:
         raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {shape[2:]}", "One start per ego.")
     index, size = (columns, gnss.shape) if in_place else (np.arange(len(columns)), shape)

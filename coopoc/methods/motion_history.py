@@ -11,11 +11,11 @@ import numpy.typing as npt
 
 from ..arrays import Floats, number, plain
 from ..errors import InputError, shown
-from ..kernels.dead_reckoning import ROUNDING, push, since
+from ..kernels.dead_reckoning import ROUNDING, SQUARE, push, since
 
 
 class MotionHistory:
-    """The newest motions of a vehicle, `span` seconds or what there has been, for fixes that come late.
+    """The newest motions of a vehicle, `span` seconds or what there has been, for fixes that come late, and its pace.
 
     Args:
         span: s.
@@ -23,7 +23,7 @@ class MotionHistory:
 
     def __init__(self, span: float) -> None:
         self.rows: Floats = np.zeros((65, 7))
-        self.rows[0, 3] = seconds("history", span)
+        self.rows[0, 3], self.rows[0, SQUARE] = seconds("history", span), np.nan
 
     def __len__(self) -> int:
         return int(self.rows[0, 1])
@@ -56,10 +56,7 @@ class MotionHistory:
         three("velocity", velocity)
         if np.isnan(fix_or_none(gnss)).all():
             return
-        later = MotionHistory(0.0)
-        later.rows = self.reserve().copy()
-        later.push(dt, np.zeros(3), np.zeros(3))
-        kept = later.rows[0, 2]
+        kept = min(self.rows[0, 2] + float(dt), self.rows[0, 3])
         hint, allowed = "Leave such a fix out (None), or keep more: start(..., history=).", f"in 0..{kept:g} s"
         number("fix_age", fix_age, -ROUNDING, kept + ROUNDING, allowed=f"{allowed}, the motion that is kept", hint=hint)
 

@@ -78,7 +78,7 @@ class MovingHorizon:
         settings = Settings(self.horizon + 1, exact, REPEATS if exact else 0, STRAYED, age, robust)
 
         def drive(ego: int, box: Inbox) -> Iterator[Estimate]:
-            seen, assumed = measurements(recording, ego, box), assumptions(recording, noise_model)
+            seen, assumed = measurements(recording, ego, box), assumptions(recording, noise_model, ego, box)
             seen = seen._replace(newest=seen.newest.copy(), fresh=np.zeros_like(box.fresh))
             counts[DROPPED] += int((box.arrival - recording.links.step[box.link] > self.horizon).sum())
             solved = horizons(seen, assumed, np.ascontiguousarray(box.arrival), settings)

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats, check_texts, checked, instance, number, texts
+from ..arrays import Floats, Ints, check_texts, checked, instance, number, texts
 from ..errors import InputError, suggestion
-from ..kernels.motion import NO_MOTION_NOISE, MotionNoise
+from ..kernels.motion import HELD, RECEIVED, MotionNoise, own_variances, process_variances
 from ..short_repr import short_repr
 from ..world.fleet import Fleet
+from ..world.inbox import Inbox
 from ..world.links import vector_cov
 from ..world.recording import Recording, check_recording
 from ..world.sensors import Sensors
@@ -29,7 +31,7 @@ class NoiseModel:
     Args:
         name: one of the above.
         sensors: relative and velocity noise; None for identity.
-        process_std: (3,) m per step, constant; None to follow the velocity.
+        process_std: (3,) m per step, constant; None to follow the pace.
         gnss_std: (3,) m.
         fleet: whose true velocity is known, for the oracle only.
         compass: (2,) rad, noise and constant error of the heading, both of which are within the azimuth's std.
@@ -67,7 +69,7 @@ class NoiseModel:
 
     @classmethod
     def nominal(cls, sensors: Sensors) -> NoiseModel:
-        """The standard deviations of `sensors`, process noise from the measured velocity; all of the error of a fix or
+        """The standard deviations of `sensors`, process noise from the measured pace; all of the error of a fix or
         an azimuth as if it were white and its own."""
         sensors = instance("sensors", sensors, Sensors).check_assumed().known()
         compass = sensors.heading_std, sensors.heading_bias_std
@@ -100,19 +102,44 @@ class NoiseModel:
         gnss = np.where(gnss > 0, gnss, recording.sensors.gnss_std)
         return cls("fitted", recording.sensors, _three(process), _three(gnss))
 
-    def process_variance(self, recording: Recording) -> Floats:
-        """Per-axis variance of x_t given x_{t-1}, m^2, broadcastable to (R, T, N, 3)."""
+    def process_variance(
+        self,
+        recording: Recording,
+        columns: Sequence[int] | Ints | None = None,
+        box: Inbox | None = None,
+        first: int = 0,
+    ) -> Floats:
+        """Per-axis variance of x_t given x_{t-1}, m^2, broadcastable to (R, T, E, 3).
+
+        Where it follows the velocity it is (dt max(ratio s, floor))^2, with s the pace: of past velocities
+        (`kernels.motion.MotionNoise`).
+
+        Args:
+            recording: with the velocities.
+            columns: (E,) of the vehicles; None for all.
+            box: of the one vehicle; then of all (R, T, N, 3) by what it knows, at the steps of messages that arrive.
+            first: step at which the filter begins.
+        """
         if self.process_std is not None:
             return np.square(self.process_std)[None, None, None]
         assert self.sensors is not None
-        velocity, floor = recording.velocity, self.sensors.velocity_floor
+        velocity, links = recording.velocity, recording.links
         if self.fleet is not None:
             self.fleet.require(recording.ids, recording.t)
-            velocity, floor = self.fleet.velocity[None], 1e-6
-        variance = np.empty(velocity.shape)
-        for run, one in enumerate(velocity):  # a run at a time stays in the cache
-            np.square(recording.dt * self.sensors.velocity_std(one, floor), out=variance[run])
-        return variance
+            velocity = self.fleet.velocity[None]
+        if columns is not None and box is None:
+            velocity = velocity[:, :, columns]
+        if self.fleet is not None:
+            found: Floats = np.square(recording.dt * self.sensors.velocity_std(velocity, 1e-6))
+            return found
+        if box is None:
+            return own_variances(self.sensors.motion_noise(), velocity, recording.dt, first)
+        use, neighbour = np.zeros(velocity.shape[:3], np.uint8), links.neighbour[box.link]
+        use[:, links.step[box.link], neighbour] = RECEIVED * (box.arrival >= 0)
+        use[np.arange(len(use))[:, None], box.newest, neighbour] = HELD  # -1, of none: the last step is before no other
+        use[:, :, columns] = HELD
+        velocity, longest = np.ascontiguousarray(velocity), recording.v2x.max_age
+        return process_variances(self.sensors.motion_noise(), velocity, use, longest, recording.dt)
 
     def fix_variance(self, recording: Recording) -> Floats:
         """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""
@@ -135,7 +162,6 @@ class NoiseModel:
         return vector_cov(relative, self.sensors.relative_std, self.sensors.min_range)
 
 
-NO_VARIANCE: Floats = np.zeros((1, 1, 1, 3))
 FINEST = 1e-5
 """Least std that is assumed of a relative measurement, over the largest of a fix: information of 1 / FINEST^2 = 1e10
 beside 1 leaves the fixes six of double precision's sixteen digits."""
@@ -259,19 +285,8 @@ def motion_noise(noise_model: NoiseModel, interval: float | None) -> MotionNoise
     interval = 0.0 if interval is None else check_interval(interval)
     if noise_model.process_std is not None:
         return MotionNoise(np.array(noise_model.process_std, dtype=float), np.zeros(3), 0.0, 0.0, interval)
-    sensors = noise_model.sensors
-    assert sensors is not None
-    ratio, of_speed = np.full(3, sensors.velocity_std_ratio), sensors.velocity_reading == "speed"
-    return MotionNoise(np.zeros(3), ratio, float(sensors.velocity_floor), float(of_speed), interval)
-
-
-def process_noise(noise_model: NoiseModel, recording: Recording) -> tuple[Floats, MotionNoise]:
-    """Process noise of a recording's steps as a sum: m^2 broadcastable to (R, T, N, 3), and that of the velocity.
-
-    Of an oracle it is `process_variance` alone."""
-    if noise_model.fleet is None:
-        return NO_VARIANCE, motion_noise(noise_model, None)
-    return np.ascontiguousarray(noise_model.process_variance(recording)), NO_MOTION_NOISE
+    assert noise_model.sensors is not None
+    return noise_model.sensors.motion_noise(interval)
 
 
 def check_interval(interval: float) -> float:

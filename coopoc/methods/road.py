@@ -11,6 +11,7 @@ import numpy.typing as npt
 from ..arrays import Floats, Limits, check_fields, instance
 from ..errors import InputError
 from ..kernels.compiling.waiting import clock
+from ..kernels.dead_reckoning import SQUARE
 from ..kernels.motion import MotionNoise
 from ..kernels.road import SCALE, Z_VARIANCE, RoadNoise, RoadState, Z, road_motion, road_step, run_road
 from ..kernels.solo import SoloMeasurements
@@ -18,7 +19,7 @@ from ..short_repr import short_repr
 from ..world.fleet import Fleet
 from ..world.recording import Recording, Vehicles, check_recording
 from .motion_history import MotionHistory
-from .noise_model import NoiseModel, constant_noise, motion_noise, process_noise, resolve
+from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
 from .track import Alone, Track, check_options, lost, silent_track
 
 LIMITS: Limits = {
@@ -131,11 +132,11 @@ class RoadFilter(Alone):
 
     def filtered(self, recording: Recording, columns: Sequence[int]) -> tuple[Floats, Floats, Floats]:
         """Position m and covariance m^2, and errors that last, as `kernels.road.run_road` writes them."""
-        process, noise, motion = self._noise(recording)
+        known, noise = self._noise(recording)
         gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
-        process = np.broadcast_to(process, gnss.shape)
-        seen = SoloMeasurements(gnss, velocity, process, motion, np.array(columns), recording.dt)
         shape = *gnss.shape[:2], len(columns)
+        process = self.assumed(recording).motion ** 2 * known.process_variance(recording, columns)
+        seen = SoloMeasurements(gnss, velocity, np.broadcast_to(process, (*shape, 3)), np.array(columns), recording.dt)
         x, cov, lasting = (np.empty((*shape, *size)) for size in ((3,), (3, 3), (4,)))
         run_road(seen, noise, x, cov, lasting)
         return x, cov, lasting
@@ -212,13 +213,12 @@ class RoadFilter(Alone):
         found = minimize(cost, first[free], method="Nelder-Mead", options={"maxfev": 400, "initial_simplex": simplex})
         return cls(noise_model, from_logs(at(found.x), 1.0))
 
-    def _noise(self, recording: Recording) -> tuple[Floats, RoadNoise, MotionNoise]:
-        """Variance m^2 of each step beside that of the motion, noise of fixes and errors, noise of the motion."""
+    def _noise(self, recording: Recording) -> tuple[NoiseModel, RoadNoise]:
+        """Noise of the motion, and of fixes and errors."""
         known, errors = resolve(self.noise_model, recording, relative=False), self.assumed(recording)
         if known.sensors is None and self.errors is None:  # no noise is stated that a gate could measure by
             errors = replace(errors, gate=np.inf)
-        process, motion = process_noise(known, recording)
-        return errors.motion**2 * process, road_noise(known, errors), louder(motion, errors)
+        return known, road_noise(known, errors)
 
 
 SHORTEST, HELD = 20, 5.0
@@ -300,7 +300,7 @@ class RoadStream:
         self.history.check(gnss, velocity, dt, fix_age)
         speed = np.array(velocity, dtype=float)
         moved, q = np.empty(3), np.empty(3)
-        road_motion(self._motion, speed, float(dt), moved, q)
+        road_motion(self._motion, self.history.rows[0, SQUARE], speed, float(dt), moved, q)
         self.history.push(dt, moved, q)
         fix, late = self.history.forward(gnss, fix_age)
         state = self.state

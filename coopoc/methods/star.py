@@ -77,7 +77,7 @@ def stars(
     """
     known, ego = resolve(noise_model, recording), check_recording(recording).columns([ego])[0]
     box, shape, dt = inbox(recording, ego, message), recording.gnss.shape, recording.dt
-    q = np.broadcast_to(known.process_variance(recording), shape)
+    q = np.broadcast_to(known.process_variance(recording, [ego], box), shape)
     r = np.broadcast_to(known.fix_variance(recording), shape)
     fixes, variances = sent or (recording.gnss, r)
     variances = np.broadcast_to(variances, shape)

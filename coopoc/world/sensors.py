@@ -5,13 +5,16 @@ from __future__ import annotations
 import sys
 import zlib
 from dataclasses import dataclass, fields, replace
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 
 from ..arrays import TINY, Floats, Limits, check_fields, extent, listed, number, seed_of
 from ..errors import InputError
 from .outliers import Outliers
+
+if TYPE_CHECKING:
+    from ..kernels.motion import MotionNoise
 
 BiasMode = Literal["run", "sample"]
 VelocityReading = Literal["axis", "speed"]
@@ -115,9 +118,19 @@ class Sensors:
         std: Floats = self.velocity_std_ratio * size
         return np.maximum(std, floor or 0.0, out=std)
 
-    def assumed_velocity_std(self, velocity: Floats) -> Floats:
-        """Noise std (..., 3) m/s that a method assumes at a *measured* velocity: never below `velocity_floor`."""
-        return self.velocity_std(velocity, self.velocity_floor)
+    def motion_noise(self, interval: float = 0.0) -> MotionNoise:
+        """Noise of a motion that a method assumes, never below `velocity_floor`; `interval` s as of MotionNoise."""
+        from ..kernels.motion import MotionNoise
+
+        ratio, of_speed = np.full(3, self.velocity_std_ratio), self.velocity_reading == "speed"
+        return MotionNoise(np.zeros(3), ratio, float(self.velocity_floor), float(of_speed), interval)
+
+    def motion_std(self, velocity: Floats, dt: float) -> Floats:
+        """Noise std (R, T, N, 3) m that a method assumes of motions of dt s with *measured* velocities (R, T, N, 3)
+        m/s, by the pace before each."""
+        from ..kernels.motion import own_variances
+
+        return np.sqrt(own_variances(self.motion_noise(), velocity, dt))
 
     def known(self) -> Sensors:
         """The same sensors as a method may know them: it knows neither the bias nor the outliers."""

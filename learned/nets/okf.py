@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from coopoc.arrays import Floats, checked, seed_of
 from coopoc.errors import InputError
 from coopoc.kernels.compiling.waiting import clock
-from coopoc.kernels.motion import MotionNoise
+from coopoc.kernels.motion import MotionNoise, own_variances
 from coopoc.kernels.solo import FixNoise
 from coopoc.methods.kalman import solo_filter, solo_track
 from coopoc.methods.noise_model import check_interval
@@ -92,8 +92,9 @@ class OptimisedKF(Alone):
 class NoiseParameters(Gain):
     """The nine parameters of an OptimisedKF as a net: a federation of Kalman filters exchanges 36 bytes.
 
-    p = s + a^2 + (b dt u)^2;  k = p / (p + r^2);  x <- x + dt u + k (z - x - dt u);  s = (1 - k) p, with log a, log b,
-    log r per axis as weights. The squared error sees ratios of variances only; `calibrate` sets their common scale.
+    p = s + a^2 + (b dt v)^2 at the pace v;  k = p / (p + r^2);  x <- x + dt u + k (z - x - dt u);  s = (1 - k) p, with
+    log a, log b, log r per axis as weights. The squared error sees ratios of variances only; `calibrate` sets their
+    common scale.
 
     Args:
         seed: without effect, every net has this argument; the start is the same for each.
@@ -153,6 +154,10 @@ def log_scale(squares: Tensor) -> Tensor:
     return 0.5 * torch.where(squares > 0.0, squares, 1.0).log()
 
 
+OF_PACE = MotionNoise(np.zeros(3), np.ones(3), 0.0, 0.0, 0.0)
+"""Its variance is the square of dt times the pace."""
+
+
 def scan(stds: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     """Estimates m and normalised innovations (T, S, B, 3) of filters with a, b, r (S, 3 kinds, 3 axes); where a fix is
     missing the filter predicts, and the innovation is NaN."""
@@ -160,7 +165,8 @@ def scan(stds: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
     noise, x = gnss_std.square(), batch.x0
     variance = noise if batch.exact is None else noise * (~batch.exact)[..., None]
     estimates, normalised = [], []
-    motions = process.square() + (ratio * batch.dt * batch.velocity).square()
+    paces = own_variances(OF_PACE, batch.velocity.transpose(0, 1).double().numpy(), batch.dt)
+    motions = process.square() + ratio.square() * torch.from_numpy(paces).transpose(0, 1).to(ratio)
     for fix, speed, motion in zip(batch.gnss.unbind(), batch.velocity.unbind(), motions.unbind(), strict=True):
         variance = variance + motion
         there = fix.isfinite()

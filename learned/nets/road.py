@@ -8,6 +8,7 @@ from torch import Tensor, nn
 
 from coopoc.arrays import Floats, seed_of
 from coopoc.errors import InputError
+from coopoc.kernels.motion import own_variances
 from coopoc.kernels.road import run_road
 from coopoc.kernels.solo import SoloMeasurements
 from coopoc.methods.noise_model import NoiseModel, motion_noise
@@ -53,8 +54,8 @@ class RoadConstants(Gain):
         for s, logs in enumerate(theta.detach().double().numpy()):
             gnss, speed = (np.ascontiguousarray(part[:, s].swapaxes(0, 1))[:, :, None] for part in (fixes, velocity))
             errors, motion = from_logs(logs, 1.0), motion_noise(KNOWN, None)
-            no_process = np.broadcast_to(0.0, gnss.shape)
-            seen = SoloMeasurements(gnss, speed, no_process, louder(motion, errors), np.array([0]), batch.dt)
+            process = own_variances(louder(motion, errors), speed, batch.dt)
+            seen = SoloMeasurements(gnss, speed, process, np.array([0]), batch.dt)
             x, cov, lasting = (np.empty((*gnss.shape[:3], *size)) for size in ((3,), (3, 3), (4,)))
             run_road(seen, road_noise(KNOWN, errors), x, cov, lasting)
             found[s] = true_cost(x[:, 1:, 0], cov[:, 1:, 0], truth[:, s].swapaxes(0, 1))

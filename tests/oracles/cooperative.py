@@ -22,6 +22,7 @@ from coopoc.kernels.stars.slip import LASTS, LATE, RARE
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector, wrap
 from coopoc.world.v2x import FIX_AND_VELOCITY
+from oracles.pace import heard
 
 FLAT = 1e6
 Name = tuple[Any, ...]
@@ -161,7 +162,6 @@ class Oracle:
             )
             self.white = np.square(s.gnss_std) / np.square(s.fix_std)
         shape = seen.gnss.shape
-        self.q = np.broadcast_to(known.process_variance(seen), shape)[run]
         self.r = np.broadcast_to(known.fix_variance(seen), shape)[run]
         self.position, self.variance = seen.gnss[run].copy(), self.r.copy()
         if robust:
@@ -171,6 +171,7 @@ class Oracle:
         self.odometer = np.cumsum(np.nan_to_num(seen.dt * seen.velocity[run]), axis=0)
         self.revoked: dict[int, list[float]] = {}
         self.box = inbox(seen, ego, FIX_AND_VELOCITY)
+        self.q = heard(seen, self.box, known, run, ego)
         self.state = self.blank()
 
     def blank(self) -> dict[str, Any]:

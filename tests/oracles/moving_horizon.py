@@ -13,6 +13,7 @@ from coopoc.methods.noise_model import NoiseModel
 from coopoc.world.inbox import Inbox
 from coopoc.world.links import spherical, to_vector
 from coopoc.world.recording import Recording
+from oracles.pace import heard
 from oracles.window import UNKNOWN, Row, message, relative_rows, solve_rows
 
 FLAT, STRAYED = 1e6, 0.03
@@ -24,6 +25,7 @@ class Drive:
 
     def __init__(self, recording: Recording, box: Inbox, noise_model: NoiseModel, run: int, ego: int) -> None:
         self.recording, self.box, self.noise_model, self.run, self.ego = recording, box, noise_model, run, ego
+        self.process = heard(recording, box, noise_model, run, ego)
         self.star: list[dict[int, int]] = []
         self.sent: dict[Any, tuple[int, bool, int]] = {}
         for t in range(len(recording.t)):
@@ -49,7 +51,7 @@ class Drive:
         for v in self.star[t]:
             sent, fresh, uses = self.sent[v, t]
             fix, variance, moved, step_variance = message(
-                self.recording, self.noise_model, self.run, v, t, sent if sent >= 0 else t
+                self.recording, self.noise_model, self.process, self.run, v, t, sent if sent >= 0 else t
             )
             if sent >= 0 and fresh and np.isfinite(self.recording.gnss[self.run, sent, v]).all():
                 rows.append(({(v, t): np.diag(variance**-0.5)}, fix * variance**-0.5, v))

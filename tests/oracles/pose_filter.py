@@ -3,6 +3,8 @@
 import numpy as np
 from scipy.linalg import block_diag
 
+from oracles.pace import after
+
 FLAT, UNKNOWN = 1e6, np.pi**2 / 3
 
 
@@ -43,9 +45,10 @@ def update(x, P, h, z, variance, angle, passes=1):  # type: ignore[no-untyped-de
 
 def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped-def]
     """States (T, n, d) and covariances (T, n, d, d) of one run in one state, any numbers for members that are away."""
-    (steps, members), (ratio, floor, of_speed) = drive.active.shape, noise.velocity
+    (steps, members), odometer = drive.active.shape, noise.odometer
     out, covs = np.zeros((steps, members, d)), np.zeros((steps, members, d, d))
     x, P, lasting = np.zeros((members, d)), np.zeros((members * d,) * 2), np.array(noise.lasting)[: d - 4]
+    pace = np.zeros((members, 3))
     grown = (lasting * [1 - noise.keep**2, 1 - noise.keep**2, 0][: d - 4]).tolist()  # an offset stays
     for t in range(steps):
         F, Q = [], []
@@ -53,8 +56,9 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
             own = drive.own[run, t, n]
             if t and drive.active[t - 1, n] and drive.active[t, n]:
                 u, state = own[4:], x[n].copy()
-                size = np.full(3, np.linalg.norm(u[:3])) if of_speed else np.abs(u[:3])
-                q = np.append(np.maximum(ratio * size, floor) ** 2, noise.yaw_rate)
+                size = np.sqrt(pace[n].sum() if odometer.of_speed else pace[n])
+                pace[n] = after(pace[n], u[:3], drive.dt)
+                q = np.append(np.maximum(odometer.ratio * size, odometer.floor) ** 2, noise.yaw_rate)
                 F.append(jacobian(lambda s, u=u: motion(s, u, drive.dt), state))
                 G = jacobian(lambda v, s=state: motion(s, v, drive.dt), u)
                 F[-1][4:6] *= noise.keep
@@ -63,6 +67,7 @@ def pose_filter(drive, noise, begin, d, passes, run):  # type: ignore[no-untyped
                 x[n, 4:6] *= noise.keep
                 continue
             F.append(np.zeros((d, d)))
+            pace[n] = own[4:7] ** 2
             wide = np.array([FLAT] * 3 + [UNKNOWN] + list(lasting))
             x[n] = np.append(np.nan_to_num(own[:4]), np.zeros(d - 4))
             if t == 0:

@@ -21,16 +21,15 @@ ACCELERATION_STD, UNKNOWN = 1.0, 1e6
 
 
 def message(
-    recording: Recording, noise_model: NoiseModel, run: int, vehicle: int, t: int, sent: int
+    recording: Recording, noise_model: NoiseModel, process: Floats, run: int, vehicle: int, t: int, sent: int
 ) -> tuple[Floats, ...]:
     """Fix brought forward from step `sent`, its variance, motion of one step, and its variance without repetition."""
     dt, age = recording.dt, t - sent
     u = recording.velocity[run, sent, vehicle]
-    process = np.broadcast_to(noise_model.process_variance(recording), recording.velocity.shape)
-    step_variance = process[run, sent, vehicle] + (dt**2 * age * ACCELERATION_STD) ** 2
+    step_variance = process[sent, vehicle] + (dt**2 * age * ACCELERATION_STD) ** 2
     s, moved, grown = sent, np.zeros(3), np.zeros(3)
     while s > 0 and np.isnan(recording.gnss[run, s, vehicle]).any():  # dead reckoning of the sender since its last fix
-        moved, grown, s = moved + dt * recording.velocity[run, s, vehicle], grown + process[run, s, vehicle], s - 1
+        moved, grown, s = moved + dt * recording.velocity[run, s, vehicle], grown + process[s, vehicle], s - 1
     fix = recording.gnss[run, s, vehicle] + moved + age * dt * u
     return fix, noise_model.gnss_variance + grown + age**2 * step_variance, dt * u, step_variance
 

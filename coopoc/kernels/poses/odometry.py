@@ -8,6 +8,7 @@ from typing import NamedTuple
 from ...arrays import Floats
 from ..compiling.compile import part
 from ..gate import YOUNG
+from ..motion import MotionNoise, keep_pace, process_variance
 from .scalar_update import HEADING, OFFSET, Poses, Three
 
 UNKNOWN_HEADING = math.pi**2 / 3.0
@@ -21,8 +22,7 @@ class PoseNoise(NamedTuple):
         fix: three variances, m^2.
         heading: rad^2, of a compass.
         relative: three variances, m^2, rad^2, rad^2.
-        velocity: noise of the odometer: ratio, least std m/s, 1 for a ratio of the speed on every axis.
-        late: share of the last velocity in the mean square that the ratio is of; 1 for its own.
+        odometer: of a velocity, as of the motion of 1 s.
         yaw_rate: rad^2/s^2.
         lasting: stationary variances of scale error, of yaw-rate bias, rad^2/s^2, and of the offset of ranges, m^2.
         longer: 1 where that offset is a state, else 0.
@@ -34,31 +34,13 @@ class PoseNoise(NamedTuple):
     fix: Three
     heading: float
     relative: Three
-    velocity: Three
-    late: float
+    odometer: MotionNoise
     yaw_rate: float
     lasting: Three
     longer: float
     keep: float
     flat: float
     gate: float
-
-
-@part
-def velocity_variances(poses: Poses, member: int, u: Three, noise: PoseNoise) -> Three:
-    """Variance (m/s)^2 of each component of a measured velocity, forward, left and up.
-
-    It follows the mean square of late velocities: a share of a measured one is small where the error makes it slow, and
-    of a fleet that holds together the slow ones would count more.
-    """
-    ratio, floor, of_speed = noise.velocity
-    for i in range(3):
-        poses.level[member + i] += noise.late * (u[i] * u[i] - poses.level[member + i])
-    a, b, c = poses.level[member], poses.level[member + 1], poses.level[member + 2]
-    if of_speed > 0.0:
-        a = b = c = a + b + c
-    least, square = floor * floor, ratio * ratio
-    return max(square * a, least), max(square * b, least), max(square * c, least)
 
 
 @part
@@ -78,7 +60,9 @@ def predict(poses: Poses, member: int, d: int, velocity: Three, rate: float, dt:
         noise: that is assumed.
     """
     x, cov, (forward, left, up) = poses.x, poses.cov, velocity
-    qf, ql, qu = velocity_variances(poses, member, velocity, noise)
+    square, q = poses.pace[0, member : member + 3], poses.pace[1, member : member + 3]
+    process_variance(noise.odometer, square, velocity, 1.0, q)
+    keep_pace(square, velocity, dt)
     scale, bias = 1.0, 0.0
     if d > 4:
         scale, bias = 1.0 / (1.0 + x[member + 4]), x[member + 5]
@@ -93,11 +77,11 @@ def predict(poses: Poses, member: int, d: int, velocity: Three, rate: float, dt:
         x[i] *= noise.keep
     move_rows(cov, member, d, (east, north, up), scale, dt, noise.keep)
     move_rows(cov.T, member, d, (east, north, up), scale, dt, noise.keep)
-    cov[member, member] += cos * cos * qf + sin * sin * ql
-    cov[member + 1, member + 1] += sin * sin * qf + cos * cos * ql
-    cov[member, member + 1] += cos * sin * (qf - ql)
-    cov[member + 1, member] += cos * sin * (qf - ql)
-    cov[member + 2, member + 2] += (dt * scale) * (dt * scale) * qu
+    cov[member, member] += cos * cos * q[0] + sin * sin * q[1]
+    cov[member + 1, member + 1] += sin * sin * q[0] + cos * cos * q[1]
+    cov[member, member + 1] += cos * sin * (q[0] - q[1])
+    cov[member + 1, member] += cos * sin * (q[0] - q[1])
+    cov[member + 2, member + 2] += (dt * scale) * (dt * scale) * q[2]
     effect = (-0.5 * dt * north, 0.5 * dt * east, 0.0, dt)
     for i in range(4):
         for j in range(4):
@@ -143,7 +127,7 @@ def join(poses: Poses, member: int, d: int, own: Floats, noise: PoseNoise) -> No
             poses.cov[i, j] = poses.cov[j, i] = 0.0
         poses.x[i] = 0.0
     for i in range(3):
-        poses.level[member + i] = own[4 + i] * own[4 + i]
+        poses.pace[0, member + i] = own[4 + i] * own[4 + i]
     for i in range(4):
         poses.x[member + i] = 0.0 if math.isnan(own[i]) else own[i]
         poses.cov[member + i, member + i] = noise.flat if i < HEADING else UNKNOWN_HEADING

@@ -50,7 +50,8 @@ class Poses(NamedTuple):
         gains: (ROWS, size) P h / s of these.
         weights: (ROWS,) 1 / s of these.
         hits: (size,) of `coopoc.kernels.gate`: of fixes at a member's first number, of its other rows at the second.
-        level: (size,) mean square (m/s)^2 of late velocities, forward, left and up, at each member's first numbers.
+        pace: (2, size) its square (m/s)^2 forward, left and up, at each member's first numbers, and the variance of a
+            velocity by it.
         totals: (3,) sum of r^2 / s + log s, number of rows that were used, and of those that are pending.
     """
 
@@ -63,7 +64,7 @@ class Poses(NamedTuple):
     gains: Floats
     weights: Floats
     hits: Floats
-    level: Floats
+    pace: Floats
     totals: Floats
 
 
@@ -73,9 +74,10 @@ COST, USED, PENDING = range(3)
 def new_poses(numbers: int) -> Poses:
     """Room for so many numbers."""
     size = -(-numbers // LANES) * LANES
-    (x, linear, prior_x, hits, level), (cov, prior_cov) = np.zeros((5, size)), np.zeros((2, size, size))
+    (x, linear, prior_x, hits), (cov, prior_cov) = np.zeros((4, size)), np.zeros((2, size, size))
     columns, gains = np.zeros((2, ROWS, size))
-    return Poses(x, cov, linear, prior_x, prior_cov, columns, gains, np.zeros(ROWS), hits, level, np.zeros(3))
+    weights, pace = np.zeros(ROWS), np.zeros((2, size))
+    return Poses(x, cov, linear, prior_x, prior_cov, columns, gains, weights, hits, pace, np.zeros(3))
 
 
 @part

@@ -16,7 +16,6 @@ from ..compiling.compile import compiled, inside, part
 from ..compiling.small import apply, negate, store
 from ..gate import GATE
 from ..geometry import angle
-from ..motion import process_variance
 from .cooperative_members import join, leave, place, predict, predict_member, steady
 from .cooperative_messages import fix_terms, receive, trust, use_fix
 from .cooperative_state import (
@@ -130,11 +129,10 @@ def run_filter(
 def gather_own(own: Floats, measurements: Measurements, assumed: Assumptions, white: Floats, run: int, t: int) -> None:
     """The ego's fix and motion at a step."""
     u, r = measurements.velocity[run, t, measurements.ego], three_of(assumed.fixes, run, t, measurements.ego)
-    q, more = process_variance(assumed.motion, u, measurements.dt), three_of(assumed.process, run, t, measurements.ego)
-    own[DT] = measurements.dt
+    q, own[DT] = three_of(assumed.process, run, t, measurements.ego), measurements.dt
     for c in range(3):
         own[FIX + c], own[FIX_VARIANCE + c] = measurements.gnss[run, t, measurements.ego, c], r[c] * white[c]
-        own[MOTION + c], own[MOTION_VARIANCE + c] = measurements.dt * u[c], q[c] + more[c]
+        own[MOTION + c], own[MOTION_VARIANCE + c] = measurements.dt * u[c], q[c]
 
 
 @inside
@@ -148,8 +146,8 @@ def gather_neighbour(
     rows[i, AGE] = (t - when) * measurements.dt if when >= 0 else -1.0
     if when < 0:
         return
-    u, fix = measurements.velocity[run, when, j], three_of(assumed.fixes, run, when, j)
-    q, more = process_variance(assumed.motion, u, measurements.dt), three_of(assumed.process, run, when, j)
+    u, q = measurements.velocity[run, when, j], three_of(assumed.process, run, when, j)
+    fix = three_of(assumed.fixes, run, when, j)
     x, p, s = (
         three_of(sent.position, j, run, when),
         three_of(sent.variance, j, run, when),
@@ -157,7 +155,7 @@ def gather_neighbour(
     )
     for c in range(3):
         rows[i, SOLO + c], rows[i, SOLO_VARIANCE + c], rows[i, ODOMETER + c] = x[c], p[c], s[c]
-        rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c] + more[c], fix[c]
+        rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c], fix[c]
 
 
 @inside

@@ -17,7 +17,6 @@ from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, choose_each, scale, store
 from ..compiling.vectors import LANES, choose, take, unrolled
 from ..geometry import Numbers, with_std
-from ..motion import MotionNoise, process_variance
 
 MOVED, PROCESS, POSITION, VARIANCE = range(4)
 """Rows of a member in `Star.motion`, three numbers each: motion m and its variance m^2 since the last step, position m
@@ -75,7 +74,7 @@ class Assumptions(NamedTuple):
     """Noise model of a star filter; arrays are broadcastable to (R, T, N, 3) m^2.
 
     Attributes:
-        process: of one step.
+        process: of one step, at the step at which its velocity was measured.
         fixes: of the ego's fixes.
         broadcast: of positions in messages.
         growth: variance of a position of age a: that of one step times a (growth[0] a + growth[1]).
@@ -83,7 +82,6 @@ class Assumptions(NamedTuple):
         min_range: m.
         flat: m^2, prior of a member that joins.
         acceleration: m/s^2, change of a velocity since it was sent.
-        motion: of one step, by the measured velocity, beside `process`.
     """
 
     process: Floats
@@ -94,7 +92,6 @@ class Assumptions(NamedTuple):
     min_range: float
     flat: float
     acceleration: float
-    motion: MotionNoise
 
 
 class InMotion(Protocol):
@@ -301,8 +298,7 @@ def interpret(star: Star, model: Assumptions, k: int, dt: float) -> None:
     held = take(star.status, 5 * k + HELD)
     late, often = dt * dt * age * model.acceleration, 2.0 * uses - 1.0
     velocity, late = moved_of(star, k), late * late
-    one = add(process_of(star, k), process_variance(model.motion, velocity, dt))
-    one = add(one, (late, late, late))
+    one = add(process_of(star, k), (late, late, late))
     moved = scale(velocity, choose(held, dt + 0.0 * age, 0.0 * age))
     flat = 0.0 * age + model.flat
     grown = scale(one, age * (model.growth[0] * age + model.growth[1]))

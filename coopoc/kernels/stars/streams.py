@@ -14,7 +14,7 @@ from ...arrays import Floats, Ints
 from ..compiling.compile import as_written, compiled
 from ..compiling.vectors import LANES
 from ..dead_reckoning import BAD_INPUT, ROUNDING, dead_reckon
-from ..motion import MotionNoise, process_variance
+from ..motion import MotionNoise, keep_pace, process_variance
 from .cooperative_filter import step
 from .cooperative_state import (
     AGE,
@@ -81,7 +81,7 @@ def stream_rows(
         own: (OWN,) out.
         rows: (k, WIDTH) measurements and new messages with their age, NaN for none; then with the newest message.
         vehicles: (k,) which they are; the ego is vehicle 0.
-        last: (vehicles, WIDTH) newest message of each, AGE the time when it was sent s.
+        last: (vehicles, WIDTH) newest message of each, AGE the time when it was sent s, the square of its pace in STEP.
         time: s, of the step.
         max_age: s, of the oldest message that counts.
     """
@@ -95,13 +95,18 @@ def stream_rows(
     for i in range(len(rows)):
         row, newest, sent = rows[i], last[vehicles[i]], time - rows[i, AGE]
         if math.isfinite(row[SPEED]) and sent >= newest[AGE] - ROUNDING:
+            gap = sent - newest[AGE]
+            if gap > max_age + ROUNDING:
+                newest[STEP:TYPICAL] = math.nan
+            else:
+                keep_pace(newest[STEP:TYPICAL], newest[SPEED:STEP], gap)
             newest[SOLO:STEP], newest[AGE] = row[SOLO:STEP], sent
         age = max(time - newest[AGE], 0.0)
         row[AGE] = -1.0 if age > max_age + ROUNDING else age if age > ROUNDING else 0.0
         row[SOLO:STEP] = newest[SOLO:STEP]
-        q = process_variance(motion, row[SPEED:STEP], interval)
+        process_variance(motion, newest[STEP:TYPICAL], newest[SPEED:STEP], interval, row[STEP:TYPICAL])
         for c in range(3):
-            row[STEP + c], row[TYPICAL + c] = q[c] * (dt / interval) ** 2, fix[c]
+            row[STEP + c], row[TYPICAL + c] = row[STEP + c] * (dt / interval) ** 2, fix[c]
     return int(outcome)
 
 
@@ -141,8 +146,7 @@ def joint_step(
         answer: (12 + 3 k,) out.
     """
     n, old, zero = 1 + len(rows), int(last[0, INDEX]) + 1, np.zeros((1, 1, 1, 3))
-    star, still = star_within(n), MotionNoise(zero[0, 0, 0], zero[0, 0, 0], 0.0, 0.0, 0.0)
-    known = Assumptions(zero, zero, zero, FIX_GROWTH, std, least, FORGOTTEN, ACCELERATION_STD, still)
+    star, known = star_within(n), Assumptions(zero, zero, zero, FIX_GROWTH, std, least, FORGOTTEN, ACCELERATION_STD)
     for k in range(n):
         j, row, at, age, dt = 0, own, OF_EGO, 0.0, 1.0
         if k > 0:

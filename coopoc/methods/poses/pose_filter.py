@@ -59,8 +59,7 @@ class PoseFilter:
         lasting: estimate the odometer's scale error and the yaw rate's bias, too (`Track.extras`).
         exact: False is the plain extended Kalman filter.
         robust: a component beyond its gate weighs less, far beyond it nothing, unless many are
-            (`coopoc.kernels.gate`), and noise that is a share of a velocity is one of the mean of a second; False
-            believes every number.
+            (`coopoc.kernels.gate`); False believes every number.
         gate: standard deviations of an innovation.
         begin: (N, 4) or (R, N, 4) m and rad, poses at the first step; None or NaN: the first fix and compass.
         spread: (4,) standard deviations of these.
@@ -217,7 +216,7 @@ class PoseFilter:
         """What it assumes, as the kernel takes it."""
         found = pose_noise(sensors, dt, self.gate)
         found = found._replace(longer=found.longer * self.lasting)
-        return found if self.robust else found._replace(gate=np.inf, late=1.0)
+        return found if self.robust else found._replace(gate=np.inf)
 
     def options(self, noise: PoseNoise) -> PoseOptions:
         """As the kernel takes them."""

@@ -24,8 +24,6 @@ UPLOAD = Message("fix, compass, odometry and relative measurements", 10, per_nei
 """Fix (3), compass (1), velocity (3), yaw rate (1), id and time (2); of each other vehicle range, angles and id (4)."""
 SPREAD = (1.0, 1.0, 1.0, 0.2)
 """m and rad, standard deviations of poses at the first step that are given."""
-LATE = 1.0
-"""s, over which velocities are averaged whose share is their noise."""
 LEAST_HEADING_STD, LEAST_YAW_RATE_STD = 1e-6, 1e-5
 """rad and rad/s: a filter needs some noise, however exact its sensors are."""
 
@@ -110,13 +108,11 @@ def pose_noise(sensors: Sensors, dt: float, gate: float) -> PoseNoise:
     x, y, z = (float(std * std) for std in sensors.fix_std)
     compass = max(float(np.hypot(sensors.heading_std, sensors.heading_bias_std)), LEAST_HEADING_STD)
     a, b, c = (float(std * std) for std in sensors.relative_std)
-    of_speed = float(sensors.velocity_reading == "speed")
     return PoseNoise(
         fix=(x, y, z),
         heading=compass**2,
         relative=(a, b, c),
-        velocity=(sensors.velocity_std_ratio, sensors.velocity_floor, of_speed),
-        late=float(-np.expm1(-dt / LATE)),
+        odometer=sensors.motion_noise(1.0),
         yaw_rate=max(sensors.yaw_rate_std, LEAST_YAW_RATE_STD) ** 2,
         lasting=(sensors.speed_scale_std**2, sensors.yaw_rate_bias_std**2, sensors.range_offset_std**2),
         longer=float(sensors.range_offset_std > 0),

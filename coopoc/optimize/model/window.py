@@ -131,20 +131,21 @@ def recorded_steps(
         raise InputError("noise", shown(noise), "must be a noise model", "Give NoiseModel.nominal(sensors).")
     _check(recording, step, length, run)
     steps, names, before = [], [], np.empty(0, np.int64)
+    if noise is None:
+        gnss_std = np.array(recording.sensors.gnss_std)
+        motion_std = recording.sensors.motion_std(recording.velocity[[run]], recording.dt)[0]
+    else:
+        gnss_std = np.sqrt(noise.gnss_variance)
+        variance = np.broadcast_to(noise.process_variance(recording), recording.velocity.shape)
+        motion_std = np.sqrt(variance[run])
     for s in range(step - length + 1, step + 1):
         links = recording.links.of(column)
         links = links[recording.links.step[links] == s]
         members = np.concatenate([[column], recording.links.neighbour[links]])
         previous = np.array([int(np.flatnonzero(before == m)[0]) if m in before else -1 for m in members])
         fix, velocity = recording.gnss[run, s, members], recording.velocity[run, s, members]
-        if noise is None:
-            fix_std = np.array(recording.sensors.gnss_std)
-            moved_std = recording.dt * recording.sensors.assumed_velocity_std(velocity)
-        else:
-            fix_std = np.sqrt(noise.gnss_variance)
-            variance = np.broadcast_to(noise.process_variance(recording), recording.velocity.shape)
-            moved_std = np.sqrt(variance[run, s, members])
-        fix_std, moved = np.broadcast_to(fix_std, fix.shape), recording.dt * velocity
+        moved_std = motion_std[s, members]
+        fix_std, moved = np.broadcast_to(gnss_std, fix.shape), recording.dt * velocity
         steps.append(WindowStep(previous, fix, fix_std, moved, moved_std, recording.relative[run, links]))
         names += [recording.ids[m] if length == 1 else f"{recording.ids[m]}@{s}" for m in members]
         before = members
