@@ -18,7 +18,7 @@ from coopoc.kernels.gate import GATE, LEAK, PATIENCE, REJECTED, SLIP
 from coopoc.kernels.stars.cooperative_messages import CLIP, FIX_SCORE
 from coopoc.kernels.stars.cooperative_state import Guards
 from coopoc.kernels.stars.levels import FASTEST, LOUDEST, PRIOR, QUIETEST, SUDDEN, USUAL
-from coopoc.kernels.stars.slip import LASTS, LATE, RARE
+from coopoc.kernels.stars.slip import LASTS, LATE, RARE, UNSEEN
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector, wrap
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -181,7 +181,7 @@ class Oracle:
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.guards.trust else {self.ego}
         levels = {"level": np.zeros(5), "learned": np.zeros(5), "information": np.zeros(5), "made": 0.0}
-        levels |= {"slips": False, "speed": 0.0, "score": 0.0, "numbers": 0, "squares": 0.0}
+        levels |= {"slips": 0.0, "speed": 0.0, "score": 0.0, "numbers": 0, "squares": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
     def loop(self) -> tuple[Floats, Floats, list[Floats]]:
@@ -218,16 +218,17 @@ class Oracle:
         self.state["speed"] = max(speed, self.state["speed"] * math.exp(-dt / LATE))
         before = copy.deepcopy((self.state, self.revoked)) if share else None
         self.step(t, 0.0)
-        n = self.state["numbers"]
-        if before is None or not (before[0]["slips"] or self.state["squares"] > n + math.sqrt(2 * n)):
+        n, p = self.state["numbers"], self.state["slips"]
+        if before is None or not (p > 0.1 or self.state["squares"] > n + math.sqrt(2 * n)):
+            self.state["slips"] = 0.0
             return
         first, (self.state, self.revoked) = (self.state, self.revoked), before
-        chance = math.exp(-dt / LASTS) if first[0]["slips"] else min(dt / RARE, 0.5)
-        self.step(t, (share * self.state["speed"] * dt) ** 2)
-        slips = self.state["score"] - first[0]["score"] + math.log(chance / (1 - chance)) > 0
-        if not slips:
+        self.step(t, (share * self.state["speed"] * (dt if p > 0.5 else max(dt, UNSEEN))) ** 2)
+        prior = p * math.exp(-dt / LASTS) + (1 - p) * min(dt / RARE, 0.5)
+        odds = self.state["score"] - first[0]["score"] + math.log(prior / (1 - prior))
+        if odds < 0:
             self.state, self.revoked = first
-        self.state["slips"] = slips
+        self.state["slips"] = 1 / (1 + math.exp(min(-odds, 700)))
 
     def count(self, q: float, log: float, numbers: int) -> None:
         """What the numbers of an update say of a slip."""

@@ -66,7 +66,7 @@ from .gaussian import (
 from .lasting import average
 from .levels import adapt, corrected, learn_fix, learn_relative, louder, moved
 from .messages import Assumptions, Measurements, three_of
-from .slip import LIKELY, NOW, NUMBERS, SLIPPED, SQUARES, Tries, likelier, new_tries, remember_speed, score, surprised
+from .slip import LIKELY, NOW, NUMBERS, SLIPPED, SQUARES, Tries, chance, new_tries, remember_speed, score, surprised
 
 
 @compiled
@@ -169,7 +169,7 @@ def step(
     vehicles: Ints,
     count: int,
 ) -> None:
-    """A step; where its numbers surprise, the likelier of two: of an ego that slips, and of one that does not.
+    """A step; where its numbers surprise, the chance of two: of an ego that slips, and of one that does not.
 
     Args:
         f: filter, after `begin`.
@@ -189,17 +189,18 @@ def step(
     for now in range(2):  # what is copied into a loop is compiled once
         f.slip[NOW], f.slip[LIKELY], f.slip[NUMBERS], f.slip[SQUARES] = now, 0.0, 0.0, 0.0
         attempt(f, model, guards, own, rows, vehicles, count)
-        if not slips or (now == 0 and not surprised(f)):
+        if now == 0 and not (slips and surprised(f)):
+            f.slip[SLIPPED] = 0.0
             break
         if now == 0:
             copy_filter(f, tries.first)
             copy_filter(tries.before, f)
             copy_rows(tries.own, tries.rows, own, rows, count)
-        elif likelier(f, tries.first, dt):
-            f.slip[SLIPPED] = 1.0
         else:
-            copy_filter(tries.first, f)
-            f.slip[SLIPPED] = 0.0
+            probably = chance(f, tries.first, dt)
+            if probably < 0.5:
+                copy_filter(tries.first, f)
+            f.slip[SLIPPED] = probably
     average(f, model)
 
 

@@ -18,10 +18,10 @@ from .cooperative_state import DT, MOTION, OWN, WIDTH, Filter, Model, new_filter
 from .gaussian import Rows
 
 SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES = range(6)
-"""Of `Filter.slip`: whether the ego slipped, its late speed m/s, whether this try assumes so, and of the step's numbers
-the logarithm of their likelihood, how many there are, and their squared normalised innovations."""
-LASTS, RARE, LATE = 3.0, 3000.0, 10.0
-"""s: how long a slip lasts, how long none does, and for which a speed is remembered."""
+"""Of `Filter.slip`: probability that the ego slips, its late speed m/s, whether this try assumes so, and of the step's
+numbers the logarithm of their likelihood, how many there are, and their squared normalised innovations."""
+LASTS, RARE, LATE, UNSEEN = 3.0, 3000.0, 10.0, 1.0
+"""s: how long a slip lasts, how long none does, for which a speed is remembered, and until a slip shows."""
 
 
 class Tries(NamedTuple):
@@ -50,8 +50,9 @@ def remember_speed(f: Filter, own: Floats) -> None:
 
 @part
 def slip_variance(f: Filter, model: Model, dt: float) -> float:
-    """m^2, of the ego's motion in a step, if it is assumed to slip."""
-    variance: float = f.slip[NOW] * (model.slip * f.slip[SPEED_OF_LATE] * dt) ** 2
+    """m^2, of the ego's motion in a step, if it is assumed to slip; one that begins now may have for UNSEEN s."""
+    seconds = dt if f.slip[SLIPPED] > 0.5 else max(dt, UNSEEN)
+    variance: float = f.slip[NOW] * (model.slip * f.slip[SPEED_OF_LATE] * seconds) ** 2
     return variance
 
 
@@ -72,13 +73,15 @@ def score(f: Filter, h: Rows, gate: float, whole: bool) -> None:
 
 @part
 def surprised(f: Filter) -> bool:
-    """Whether the first try's numbers are worse than usual by a standard deviation, or the ego slipped before."""
+    """Whether the first try's numbers are worse than usual by a standard deviation, or the ego may have slipped."""
     n = f.slip[NUMBERS]
-    return bool(f.slip[SLIPPED] > 0.0 or f.slip[SQUARES] > n + math.sqrt(2.0 * n))
+    return bool(f.slip[SLIPPED] > 0.1 or f.slip[SQUARES] > n + math.sqrt(2.0 * n))
 
 
 @part
-def likelier(f: Filter, first: Filter, dt: float) -> bool:
-    """Whether a slip explains the step better than `first` does."""
-    chance = math.exp(-dt / LASTS) if first.slip[SLIPPED] > 0.0 else min(dt / RARE, 0.5)
-    return bool(f.slip[LIKELY] - first.slip[LIKELY] + math.log(chance / (1.0 - chance)) > 0.0)
+def chance(f: Filter, first: Filter, dt: float) -> float:
+    """Probability of a slip, after both tries of a step, by that before it."""
+    stays, begins = math.exp(-dt / LASTS), min(dt / RARE, 0.5)
+    before = first.slip[SLIPPED] * stays + (1.0 - first.slip[SLIPPED]) * begins
+    odds = f.slip[LIKELY] - first.slip[LIKELY] + math.log(before / (1.0 - before))
+    return 1.0 / (1.0 + math.exp(min(-odds, 700.0)))

@@ -1,0 +1,87 @@
+"""Errors of odometry that may be there or not, and slips; the reference is filterpy, with its likelihoods."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from numpy.testing import assert_allclose
+
+import coopoc as co
+from coopoc import V2X, CooperativeFilter, Fleet, Recording, observe
+from coopoc.kernels.stars.cooperative_state import Guards
+from coopoc.world.body_frames import turned
+
+S2 = co.Sensors.paper_scenario2()
+ONLY_SCALE = Guards(forget=0.0, heading=0.0, slip=0.0, lasts=1e12)
+
+
+@pytest.fixture(scope="module")
+def town() -> Fleet:
+    return co.load_fleet("town10").between(0, 300)
+
+
+def rms(recording: Recording, fleet: Fleet, **guards: float) -> tuple[float, co.Track]:
+    track = CooperativeFilter(guards=Guards()._replace(**guards))(recording, [3, 8])
+    return float(np.sqrt(np.square(track.x - fleet.position[:, [3, 8]]).sum(axis=-1).mean())), track
+
+
+@pytest.mark.parametrize("scale", [0.0, 0.02, 0.05])
+def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale: float) -> None:
+    """filterpy: of the positions along a straight road one filter knows no scale error, one has it as a state; their
+    estimates by Bayes' rule."""
+    t = 0.5 * np.arange(120)
+    position = np.stack([8.0 * t, 0 * t, 0 * t], axis=-1)[:, None]
+    fleet = Fleet(("a",), t, position, np.broadcast_to([8.0, 0, 0], position.shape))
+    seen = observe(fleet, replace(S2, gnss_std=(1.0,) * 3), V2X(0), observers=[0], assumed=S2)
+    seen = replace(seen, velocity=seen.velocity * (1 + scale))
+    track = CooperativeFilter(guards=ONLY_SCALE)(seen, [0])
+    process = co.NoiseModel.nominal(S2).process_variance(seen)[0, :, 0, 0]
+    filters, likely = [], np.array([ONLY_SCALE.absent, 0.0])
+    for n in (1, 2):
+        peer = KalmanFilter(dim_x=n, dim_z=1)
+        peer.x, peer.P = np.array([[seen.gnss[0, 0, 0, 0]], [0.0]])[:n], np.diag([12.25, 0.01])[:n, :n]
+        peer.H, peer.R = np.eye(1, n), np.array([[12.25]])
+        filters.append(peer)
+    for k in range(1, len(t)):
+        moved = 0.5 * seen.velocity[0, k, 0, 0]
+        for i, peer in enumerate(filters):
+            peer.F = np.array([[1.0, moved], [0.0, 1.0]])[: i + 1, : i + 1]
+            peer.predict(Q=np.diag([process[k], 0.0])[: i + 1, : i + 1])
+            peer.x[0] += moved
+            peer.update(np.array([[seen.gnss[0, k, 0, 0]]]))
+            likely[i] += peer.log_likelihood
+        there = 1.0 / (1.0 + np.exp(likely[0] - likely[1]))
+        mean = (1 - there) * filters[0].x[0, 0] + there * filters[1].x[0, 0]
+        assert_allclose(track.x[0, k, 0, 0], mean, atol=2e-3)
+    assert track.extras["scale_error"][0, -1, 0] == pytest.approx(there * filters[1].x[1, 0], abs=1e-4)
+
+
+def test_odometry_that_errs_is_found_and_said(town: Fleet) -> None:
+    """All headings 4 degrees off, and all scales 3 %: half the error; where nothing errs, it costs next to nothing."""
+    seen = observe(town, S2, V2X(4), runs=3, observers=[3, 8])
+    wrong = replace(seen, velocity=turned(1.03 * seen.velocity, np.full(seen.velocity.shape[:3], 0.07)))
+    (found, track), (without, _) = rms(wrong, town), rms(wrong, town, heading=0.0, scale=0.0)
+    assert found < 0.6 * without
+    assert_allclose(track.extras["heading_error"][:, -1], -0.07, atol=0.025)
+    assert any(note.startswith("heading error, ") for note in track.notes)
+    (found, track), (without, _) = rms(seen, town), rms(seen, town, heading=0.0, scale=0.0)
+    assert found < 1.01 * without
+    assert not any("error" in note for note in track.notes)
+
+
+def test_a_slip_is_found_and_ends(town: Fleet) -> None:
+    """Wheels of the egos are locked for three seconds, beside three neighbours or one."""
+    seen = observe(town, S2, V2X(6), runs=3, observers=[3, 8])
+    velocity = seen.velocity.copy()
+    velocity[:, 120:150, [3, 8]] = 0.0
+    slips = replace(seen, velocity=velocity)
+    (found, track), (without, _) = rms(slips, town), rms(slips, town, slip=0.0)
+    assert found < 0.3 * without
+    said = track.extras["slips"].mean(axis=(0, 2))
+    assert said[128:150].mean() > 0.5
+    assert said[:115].max() < 0.1
+    assert said[165:].mean() < 0.1
+    assert any(note.startswith("slips, ") for note in track.notes)
+    _, clean = rms(seen, town)
+    assert clean.extras["slips"].mean() < 0.01
