@@ -378,6 +378,9 @@ class Oracle:
             if j in s["trusted"]:
                 self.revoked[j] = [self.revoked.get(j, [0, 0])[0] + 1, t]
             self.doubt(j)
+            if j == self.ego:
+                h = np.array([b.row(self.fix_terms(j), c) for c in used])
+                b.updates(h, z, r)
             return 0.0
         gap, own = z - h @ b.x, h @ b.p @ h.T
         square = float(gap @ np.linalg.solve(own + np.diag(r), gap))

@@ -124,6 +124,10 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
         if f.status[j, TRUSTED] > 0.0:
             f.revoked[j, 0], f.revoked[j, 1] = f.revoked[j, 0] + 1.0, f.clock[0]
         doubt(f, model, guards, j)
+        if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
+            fix_terms(f, 0)
+            innovate(g, h)
+            correct(g, h, 1.0)
         return 0.0
     q = min(q, (h.gap[0] * h.gap[0] + h.gap[1] * h.gap[1] + h.gap[2] * h.gap[2]) / SLIP)
     own, noise = 1e-12, 0.0
