@@ -666,7 +666,7 @@ class Oracle:
             log = math.log((float(h[c] @ b.p @ h[c]) + r[c]) * size[c] ** 2)
             q = b.update(h[c], z[c], r[c], 0.0 if vague else g.gate)
             if not vague:
-                self.count(q if q < GATE else GATE * (1 + math.log(q / GATE)), log, 1)
+                self.count(min(q, GATE), log, 1)
                 hits[c] = hits[c] + 1 if g.gate and q > g.gate else 0
                 self.learn(c, min(q, SUDDEN) - USUAL, r[c] / total[c])
                 self.learn(4, min(q, SUDDEN) - USUAL, rows[c] @ rows[c] * s["made"] / 3 / total[c])

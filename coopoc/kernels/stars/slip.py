@@ -1,8 +1,8 @@
 """Whether the ego slips in a step: the step is tried once more, with a motion that is not known, and the likelier of
 both is kept.
 
-Numbers far beyond their gate count with the logarithm of their square, so that a single one explains nothing, and fixes
-with no more than their gate: a receiver that jumps is no slip.
+Numbers beyond their gate count with no more than it, a fix as one: a range that is too long, or a receiver that jumps,
+is no slip.
 """
 
 from __future__ import annotations
@@ -58,12 +58,12 @@ def slip_variance(f: Filter, model: Model, dt: float) -> float:
 
 @part
 def score(f: Filter, h: Rows, gate: float, whole: bool) -> None:
-    """Count the rows of an update, each, or as the fix that they are."""
+    """Count the rows of an update, each, or as the fix that they are; beyond the gate no more."""
     square = 0.0
     for c in range(3):
         if h.used[c] and h.schur[c] > 0.0:
             q = h.q[c]
-            square += q if whole or q < gate else gate * (1.0 + math.log(q / gate))
+            square += q if whole else min(q, gate)
             f.slip[LIKELY] -= 0.5 * math.log(h.schur[c])
             f.slip[NUMBERS] += 1.0
     square = min(square, gate) if whole else square
