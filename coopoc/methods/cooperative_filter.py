@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from dataclasses import dataclass
-from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -12,16 +11,16 @@ import numpy.typing as npt
 
 from ..arrays import Floats
 from ..kernels.stars.cooperative_filter import run_filter
+from ..kernels.stars.cooperative_messages import fading_memory
 from ..kernels.stars.cooperative_state import NO_GUARDS, ON_ROADS, Guards, Model, Sent
-from ..kernels.stars.messages import ACCELERATION_STD, FORGOTTEN
-from ..world.inbox import Inbox, inbox
+from ..kernels.stars.messages import FORGOTTEN
+from ..world.inbox import Inbox
 from ..world.recording import Recording, Vehicles, check_recording
-from ..world.v2x import FIX_AND_VELOCITY, Message
+from ..world.v2x import Message
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
 from .noise_model import NoiseModel, resolve
 from .track import Checked, Track
 
-NOTHING = np.zeros((1, 1, 1, 3))
 FOUND = {
     "heading error": "rad",
     "scale error": "",
@@ -38,12 +37,12 @@ KINDS = ("range", "azimuth", "inclination", "message", "trusted")
 
 
 class Broadcast(NamedTuple):
-    """What a vehicle with a robust filter broadcasts, with its id and the time.
+    """What a vehicle with a cooperative filter broadcasts, with its id and the time.
 
     Attributes:
-        position: (3,) m, estimate of the same filter alone, without neighbours and lasting errors.
+        position: (3,) m, mean of its fixes, moved by the odometer, each with the weight exp(-age / 10 s) / variance.
         velocity: (3,) m/s.
-        variance: (3,) m^2 of the estimate.
+        variance: (3,) m^2, 1 over the sum of these weights.
         odometer: (3,) m, sum of all its motions.
     """
 
@@ -61,7 +60,7 @@ class CooperativeFilter(Checked):
     r"""Kalman filter of the star {ego} + neighbours that expects wrong numbers: one method for every condition.
 
     The state holds the members' positions and, where they are needed, the error of each receiver's fixes, the error
-    that all fixes share, errors of the ego's compass and ranges, and velocities of members whose messages are late:
+    that all fixes share, and errors of odometries and of the ego's compass and ranges:
 
     $$
     z_j = x_j + b_j + c + w_j, \qquad
@@ -83,13 +82,11 @@ class CooperativeFilter(Checked):
       prior, and the estimate is the average over whether it is 0, by Bayes' rule (`kernels.stars.lasting`).
     - *Slips*: a step whose numbers surprise is tried again with a motion that is not known, and the likelier of both
       is kept (`kernels.stars.slip`).
-    - *Messages* hold the estimate of the same filter alone, its variance, the odometer and the velocity. The fixes that
-      were used between two of them follow, so that a lost message loses nothing and no fix counts twice.
+    - *Messages* hold a fading mean of the sender's fixes, its weight, the odometer and the velocity. The mean of the
+      fixes between any two of them follows: a lost message loses nothing, and no fix counts twice.
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel, whose errors that last (fixes, compass, ranges) are states.
-        robust: False gives the textbook filter, `JointFilter`: all errors white, all members honest. With the identity
-            noise model nothing is gated.
         guards: limits of the above; the default was chosen on development worlds and validation tasks of CL-Bench, and
             is `kernels.stars.cooperative_state.ON_ROADS` where measurements are not simulated: there errors of
             odometry are always assumed, and fixes to err twice as far as is stated, together for a while.
@@ -97,8 +94,8 @@ class CooperativeFilter(Checked):
     References:
         Ljung, Soderstrom, Theory and Practice of Recursive Identification, MIT Press, 1983;
         Chang, Robust Kalman filtering based on Mahalanobis distance as outlier judging criterion, J. Geodesy 88, 2014;
-        Friedland, Treatment of bias in recursive filtering, IEEE TAC 14(4), 1969; Roumeliotis, Burdick, Stochastic
-        cloning, IEEE ICRA, 2002.
+        Friedland, Treatment of bias in recursive filtering, IEEE TAC 14(4), 1969; Sorenson, Sacks, Recursive fading
+        memory filtering, Information Sciences 3, 1971.
 
     >>> CooperativeFilter().message.payload
     56
@@ -109,15 +106,14 @@ class CooperativeFilter(Checked):
     """
 
     noise_model: NoiseModel | str = "nominal"
-    robust: bool = True
     guards: Guards = Guards()
     name: str = "cooperative-filter"
     cooperative = True
 
     @property
     def message(self) -> Message:
-        """Estimate and odometer; of the textbook filter a fix."""
-        return BROADCAST if self.robust else FIX_AND_VELOCITY
+        """Mean of fixes, odometer and velocity."""
+        return BROADCAST
 
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.
@@ -128,21 +124,16 @@ class CooperativeFilter(Checked):
         link (R, L) of "range", "azimuth", "inclination" and "message", NaN where there was none, and whether it is
         "trusted".
         """
-        known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
+        known = resolve(self.noise_model, check_recording(recording))
         guards = guards_of(self, known, recording.measured)
-        model, notes = model_of(known, self.robust, guards), list(known.notes)
-
-        @cache
-        def sent() -> Sent:
-            if self.robust:
-                return broadcasts(recording, known, columns, guards)
-            fixes, variance = (np.moveaxis(a, 2, 0) for a in (recording.gnss, known.fix_variance(recording)))
-            return Sent(fixes.copy(), variance.copy(), NOTHING)
+        model, notes = model_of(known, guards), list(known.notes)
+        variance = guards.fix**2 * np.asarray(known.fix_variance(recording))
+        sent = Sent(*fading_memory(recording.gnss, recording.velocity, variance, recording.dt))
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
             seen, assumed = measurements(recording, ego, box), assumptions(recording, known, ego, box)
-            assumed = assumed._replace(fixes=guards.fix**2 * assumed.fixes)
-            x, cov, neighbours, fixes, weights, found = run_filter(seen, assumed, sent(), model, guards)
+            assumed = assumed._replace(fixes=variance)
+            x, cov, neighbours, fixes, weights, found = run_filter(seen, assumed, sent, model, guards)
             extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate(KINDS)}
             names = (*(name.replace(" ", "_") for name in FOUND), *(f"{kind}_level" for kind in LEVELS))
             extras |= {name: found[..., i, None] for i, name in enumerate(names)}
@@ -160,23 +151,6 @@ class CooperativeFilter(Checked):
             yield Estimate(x, cov, neighbours, extras=extras)
 
         return follow_egos(self, recording, egos, run, notes)
-
-
-def broadcasts(recording: Recording, noise_model: NoiseModel, egos: Sequence[int], guards: Guards) -> Sent:
-    """Messages of the vehicles in the stars of some egos, each filtered alone until it is in none any more."""
-    links, model = recording.links, model_of(noise_model, False, NO_GUARDS)
-    x, variance, moved = np.zeros((3, *np.moveaxis(recording.gnss, 2, 0).shape))
-    none, nothing = Sent(NOTHING, NOTHING, NOTHING), inbox(recording, egos[0], FIX_AND_VELOCITY)
-    seen, here = measurements(recording, egos[0], nothing), np.isin(links.observer, egos)
-    for j in np.unique(links.neighbour[here]):
-        last = int(links.step[here & (links.neighbour == j)].max()) + 1
-        alone = seen._replace(ego=int(j), start=np.zeros(last + 1, np.int64))
-        assumed = assumptions(recording, noise_model, int(j))
-        assumed = assumed._replace(fixes=guards.fix**2 * assumed.fixes)
-        x[j, :, :last], cov = run_filter(alone, assumed, none, model, guards)[:2]
-        variance[j, :, :last] = np.diagonal(cov, axis1=-2, axis2=-1)
-        np.nancumsum(recording.dt * recording.velocity[:, :last, j], axis=1, out=moved[j, :, :last])
-    return Sent(x, variance, moved)
 
 
 def otherwise(ego: str, found: Floats) -> list[str]:
@@ -226,23 +200,22 @@ def lasting(ego: str, residual: Floats, dt: float) -> list[str]:
 
 def guards_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool = False) -> Guards:
     """The method's own, which wait half as long where errors of fixes last, and if they are the usual ones those of
-    real roads where measurements are real; none of the textbook filter, nor where no noise is stated that an innovation
-    could exceed."""
+    real roads where measurements are real; none where no noise is stated that an innovation could exceed."""
     guards, sensors = method.guards, noise_model.sensors
-    if not method.robust or sensors is None:
+    if sensors is None:
         return NO_GUARDS
     if measured and guards == Guards():
         guards = ON_ROADS
     return guards._replace(lost=guards.lost / 2) if sensors.gnss_drift_std > 0.0 else guards
 
 
-def model_of(noise_model: NoiseModel, robust: bool, guards: Guards) -> Model:
-    """The noise model of the kernel; of the textbook filter all errors are white."""
+def model_of(noise_model: NoiseModel, guards: Guards) -> Model:
+    """The noise model of the kernel."""
     std, least = relative_noise(noise_model)
     white, time, absent = np.ones(3), 1.0, np.full(4, guards.absent)
     own = common = bias = heading = offset = 0.0
     turn, lasts = np.array([guards.heading, guards.scale]), guards.lasts
-    if robust and noise_model.sensors is not None:
+    if noise_model.sensors is not None:
         sensors, std = noise_model.sensors, np.array(std)
         own, common, offset = sensors.gnss_drift_std**2, sensors.gnss_common_std**2, sensors.range_offset_std**2
         white = np.square(sensors.gnss_std) / np.square(sensors.fix_std)
@@ -251,8 +224,8 @@ def model_of(noise_model: NoiseModel, robust: bool, guards: Guards) -> Model:
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
         absent[2:][np.array([bias, offset]) > 0.0] = -np.inf
         bias, offset = bias or guards.compass**2, offset or guards.offset**2
-    shape = float(least), float(noise_model.exact_relative), FORGOTTEN, ACCELERATION_STD
+    shape = float(least), float(noise_model.exact_relative), FORGOTTEN
     turns = np.square(turn)
     return Model(
-        std, *shape, own, common, time, white, bias, heading, offset, float(robust), turns, lasts, absent, guards.slip
+        std, *shape, own, common, time, white, bias, heading, offset, turns, lasts, absent, guards.slip
     )

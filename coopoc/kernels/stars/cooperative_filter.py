@@ -1,8 +1,8 @@
 """The cooperative filter: sequential EKF of a star, in which any measurement, message or member may be wrong.
 
-The order of a step: members leave, all that stay move, members join, then the ego's fix, the relative measurements
-(once at the prediction, once more at that solution), the messages, and at last who is trusted. A drive and a stream
-call the same `step`.
+The order of a step: members leave, the ego moves, members join, then the ego's fix, the messages, the relative
+measurements (once at the prediction, once more at that solution), and at last who is trusted. A member stands where it
+was when it sent its newest message. A drive and a stream call the same `step`.
 """
 
 from __future__ import annotations
@@ -13,11 +13,12 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inside, part
-from ..compiling.small import apply, negate, store
+from ..compiling.small import apply, negate, scale, store
+from ..dead_reckoning import ROUNDING
 from ..gate import GATE
 from ..geometry import angle
-from .cooperative_members import join, leave, place, predict, predict_member, steady
-from .cooperative_messages import fix_terms, receive, trust, use_fix
+from .cooperative_members import join, leave, predict, steady
+from .cooperative_messages import fix_terms, goes_on, receive, trust, use_fix
 from .cooperative_state import (
     AGE,
     AZIMUTHS,
@@ -52,6 +53,8 @@ from .cooperative_state import (
 from .gaussian import (
     COMPASS,
     PLACE,
+    TURN,
+    Gaussian,
     copy_moments,
     correct,
     correct_mean,
@@ -63,7 +66,7 @@ from .gaussian import (
     weight,
     widen,
 )
-from .lasting import average
+from .lasting import average, turned
 from .levels import adapt, corrected, learn_fix, learn_relative, louder, moved
 from .messages import Assumptions, Measurements, three_of
 from .slip import LIKELY, NOW, NUMBERS, SLIPPED, SQUARES, Tries, chance, new_tries, remember_speed, score, surprised
@@ -118,7 +121,7 @@ def run_filter(
             for i in range(count):
                 k = f.slot[who[i]]
                 for c in range(3):
-                    neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c]
+                    neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.way[k, c]
                     notes[run, first + i, c] = weight(f.q[k, c], guards.gate)
                 notes[run, first + i, 3] = f.q[k, 3]
                 notes[run, first + i, 4] = f.status[who[i], TRUSTED]
@@ -226,38 +229,34 @@ def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, 
     if f.step[0] > f.joined[0]:
         predict(f, model, guards, own)
     moved(f, own)
-    for k in range(1, len(f.vehicle)):
-        if f.vehicle[k] >= 0:
-            predict_member(f, model, guards, rows, k)
     for i in range(count):
         if f.slot[vehicles[i]] < 0:
             join(f, model, guards, rows, vehicles[i], i)
     for k in range(len(f.vehicle)):
-        if f.vehicle[k] >= 0:
-            first = 3 * f.g.block[k, PLACE]
-            if k > 0:
-                place(f, rows, k)
-            for c in range(3):
-                f.at[k, c] = f.g.x[first + c]
-                f.q[k, c] = math.nan
-            f.q[k, 3] = math.nan
-    members = nearest_first(f)
+        for c in range(4):
+            f.q[k, c] = math.nan
     add_fix(f, model, guards, own)
-    for turn in range(2):  # what is copied into a loop is compiled once
-        if (turn == 0) == (model.estimates > 0.0):
-            measure(f, model, guards, rows, members)
-            continue
-        for i in range(members):
-            k = f.order[i]
-            vague = f.vague[k]
+    for k in range(1, len(f.vehicle)):
+        if f.vehicle[k] >= 0:
             receive(f, model, guards, rows, k)
-            if model.estimates > 0.0 and f.vague[k] < vague:  # what is measured of it in part had to wait for a place
-                weigh(f, model, guards, rows, k)
+            goes_on(f, rows, k)
+    locate(f, f.g)
+    members = nearest_first(f)
+    measure(f, model, guards, rows, members)
     if guards.trust > 0.0:
         trust(f, model, guards)
     f.step[0] += 1
     corrected(f)
     adapt(f, guards)
+
+
+@part
+def locate(f: Filter, g: Gaussian) -> None:
+    """Relative measurements are linear where the members are now."""
+    for k in range(len(f.vehicle)):
+        if f.vehicle[k] >= 0:
+            for c in range(3):
+                f.at[k, c] = g.x[3 * g.block[k, PLACE] + c] + f.way[k, c]
 
 
 @inside
@@ -315,10 +314,7 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
         g.x[i], g.p[i, i] = 0.0, model.heading
     if model.exact > 0.0:
         first_pass(f, model, guards, rows, members)
-        for k in range(len(f.vehicle)):
-            if f.vehicle[k] >= 0:
-                for c in range(3):
-                    f.at[k, c] = f.trial.x[3 * g.block[k, PLACE] + c]
+        locate(f, f.trial)
     for m in range(members):
         weigh(f, model, guards, rows, f.order[m])
 
@@ -430,4 +426,29 @@ def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int, exact:
         h.gate[c] = guards.gate
     h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]
     h.terms[0] = 3 if has(g, 0, COMPASS) else 2
+    age = f.clock[0] - f.since[k]
+    if age > ROUNDING:
+        add_way(f, guards, rows, k, age)
     return True
+
+
+@part
+def add_way(f: Filter, guards: Guards, rows: Floats, k: int, age: float) -> None:
+    """Rows of a member that has moved since it was at its position, with the velocity of its newest message."""
+    g, h, row, w, n = f.g, f.h, f.row[k], f.h.weight, f.h.terms[0]
+    u = rows[row, SPEED], rows[row, SPEED + 1], rows[row, SPEED + 2]
+    way, changed = turned(g, k, scale(u, age), h.turn), (0.5 * guards.acceleration * age * age) ** 2
+    often = (age / f.clock[1]) ** 2
+    for c in range(3):
+        i = 3 * c
+        h.z[c] -= w[i] * way[0] + w[i + 1] * way[1] + w[i + 2] * way[2]
+        for d in range(3):
+            h.variance[c] += w[i + d] ** 2 * (often * rows[row, STEP + d] + changed)
+    if has(g, k, TURN):
+        t, first = h.turn, 3 * g.block[k, TURN]
+        h.block[n], h.terms[0] = g.block[k, TURN], n + 1
+        for c in range(3):
+            for d in range(3):
+                by = w[3 * c] * t[d] + w[3 * c + 1] * t[3 + d] + w[3 * c + 2] * t[6 + d]
+                w[9 * n + 3 * c + d] = by
+                h.z[c] += by * g.x[first + d]

@@ -1,19 +1,26 @@
-"""Fixes of a star's vehicles: those behind two solo estimates, odometers, and which receivers are trusted."""
+"""What the vehicles of a star send, and what their fixes say: a fading memory of fixes, and whose are trusted."""
 
 from __future__ import annotations
 
 import math
 
+import numpy as np
+
 from ...arrays import Floats
-from ..compiling.compile import inside, part
+from ..compiling.compile import compiled, inside, part
+from ..compiling.small import scale, store
+from ..dead_reckoning import ROUNDING
 from ..gate import SLIP, count, inflation
+from .cooperative_members import steady
 from .cooperative_state import (
     AGE,
     COUNT,
     FIXES,
     LAST,
     MEAN,
+    NO_POSITION,
     ODOMETER,
+    SLIPS,
     SOLO,
     SOLO_VARIANCE,
     SPEED,
@@ -25,40 +32,34 @@ from .cooperative_state import (
     Guards,
     Model,
     doubt,
-    unused,
 )
 from .gaussian import (
     ABSENT,
-    CLONE,
     COMMON,
     ERROR,
     PLACE,
-    TURN,
-    VELOCITY,
     correct,
     distance,
     expect,
     has,
     innovate,
-    insert,
     remove,
     settle,
-    shift,
     term,
     update,
-    widen,
 )
-from .lasting import hold, turned
+from .lasting import drive, hold, turned
+from .messages import three_of
 from .slip import score
 
-JITTER = 1e-12
-"""m^2 that keeps a clone from being the very number it was cloned of."""
+FADES = 10.0
+"""s, after which a fix weighs 1 / e in the mean that is sent."""
 NOTHING_NEW = 1e-9
-"""Least weight of new fixes in an estimate."""
+"""Least share of new fixes in a sum."""
 CLIP = 12.0
+"""Largest squared Mahalanobis distance of an innovation in a mean."""
 FIX_SCORE = 16.0
 """Most of a squared Mahalanobis distance of a fix that tells of a slip."""
-"""Largest squared Mahalanobis distance of an innovation in a mean."""
 
 
 @inside
@@ -73,31 +74,125 @@ def fix_terms(f: Filter, k: int) -> None:
         term(f.h, n, g.block[0, COMMON], 1.0)
 
 
+@compiled
+def fading_memory(gnss: Floats, velocity: Floats, variance: Floats, dt: float) -> tuple[Floats, Floats, Floats]:
+    """What vehicles send: (N, R, T, 3) mean of fixes m, its variance m^2, and odometer m, as `remember` writes them.
+
+    Args:
+        gnss: (R, T, N, 3) m, NaN for none.
+        velocity: (R, T, N, 3) m/s, NaN where a vehicle is absent: it begins anew.
+        variance: m^2, broadcastable, as is assumed of a fix.
+        dt: s.
+    """
+    runs, steps, vehicles = gnss.shape[:3]
+    shape = vehicles, runs, steps, 3
+    position, spread, odometer = np.zeros(shape), np.zeros(shape), np.zeros(shape)
+    memory, moved, r = np.zeros(9), np.zeros(3), np.zeros(3)
+    for j in range(vehicles):
+        for run in range(runs):
+            memory[:] = 0.0
+            for t in range(steps):
+                for c in range(3):
+                    moved[c], r[c] = dt * velocity[run, t, j, c], three_of(variance, run, t, j)[c]
+                if math.isnan(moved[0]):
+                    memory[3:6], moved[:] = 0.0, 0.0
+                remember(memory, moved, gnss[run, t, j], r, dt)
+                for c in range(3):
+                    position[j, run, t, c], odometer[j, run, t, c] = memory[c], memory[6 + c]
+                    spread[j, run, t, c] = 1.0 / max(memory[3 + c], 1e-300)
+    return position, spread, odometer
+
+
+@inside
+def remember(memory: Floats, moved: Floats, fix: Floats, variance: Floats, dt: float) -> None:
+    """Move the mean of a vehicle's fixes, each of which weighs exp(-age / FADES) / variance, and take a new one.
+
+    Args:
+        memory: (9,) mean m, sum of the weights 1/m^2, odometer m.
+        moved: (3,) m, in this step.
+        fix: (3,) m, NaN for none.
+        variance: (3,) m^2, of the fix.
+        dt: s.
+    """
+    for c in range(3):
+        memory[c] += moved[c]
+        memory[3 + c] *= math.exp(-dt / FADES)
+        memory[6 + c] += moved[c]
+        if not math.isnan(fix[c]):
+            memory[3 + c] += 1.0 / variance[c]
+            memory[c] += (fix[c] - memory[c]) / (variance[c] * memory[3 + c])
+
+
 @inside
 def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None:
-    """Use the newest message of member k, if it has not been used."""
-    g, j, row = f.g, f.vehicle[k], f.row[k]
-    age = rows[row, AGE]
+    """Move member k to where it was when it sent its newest message, and use what its fixes have said until then.
+
+    The mean error that the odometer makes of n fixes since the last message is that of the middle of the way: they are
+    used there.
+    """
+    g, j, row, dt = f.g, f.vehicle[k], f.row[k], f.clock[1]
+    status, age = f.status[j], rows[row, AGE]
     sent = f.clock[0] - age
-    if not unused(f, rows, k):
+    if age < 0.0:  # nothing is known of its motion
+        f.since[k] = f.clock[0]
+        f.vague[k] += model.flat
+    if age < 0.0 or sent <= status[USED] + ROUNDING:
         return
-    velocity, back, changed = has(g, k, VELOCITY), -age, 0.0
-    before = model.estimates > 0.0 and f.status[j, USED] > -math.inf
-    clone = before and has(g, k, CLONE)
-    if velocity:
-        changed = (0.5 * guards.acceleration * back * back) ** 2
-        if clone:
-            use_odometer(f, guards, rows, k, back, changed)
-    believed = content(f, model, rows, k, changed, clone, before)
-    f.q[k, 3] = use_fix(f, model, guards, k, before and believed, innovate(g, f.h))
-    f.status[j, USED] = sent
+    gap, again, first = sent - f.since[k], status[USED] > -math.inf, 3 * g.block[k, PLACE]
+    steps = max(1.0, math.floor((sent - status[USED]) / dt + 0.5)) if again else 1.0
+    follows = again and abs(f.since[k] - status[USED]) <= ROUNDING
     for c in range(3):
-        f.status[j, LAST + c] = rows[row, SOLO + c]
-        f.status[j, LAST + 3 + c] = rows[row, SOLO_VARIANCE + c]
-        f.status[j, LAST + 6 + c] = rows[row, ODOMETER + c]
-        f.status[j, LAST + 9 + c] = rows[row, STEP + c]
-    if velocity:
-        clone_position(f, k, back, changed)
+        f.way[k, c], status[LAST + 6 + c] = rows[row, ODOMETER + c] - status[LAST + 6 + c], rows[row, ODOMETER + c]
+        rows[row, ODOMETER + c] = f.way[k, c] / gap if follows else rows[row, SPEED + c]
+    steady(f, guards, j, rows[row], ODOMETER, STEP, 1.0)
+    u = rows[row, ODOMETER], rows[row, ODOMETER + 1], rows[row, ODOMETER + 2]
+    if status[SLIPS] > 0.0:
+        store(rows[row], SPEED, u)
+    drive(f, model, k, scale(u, gap), gap)
+    half, often = 0.5 * (1.0 + 1.0 / steps), steps if follows else (gap / dt) ** 2
+    for c in range(3):
+        g.p[first + c, first + c] += half * often * rows[row, STEP + c]
+    if content(f, model, rows, k, sent, steps, again):
+        f.q[k, 3] = use_fix(f, model, guards, k, again, innovate(g, f.h))
+    for c in range(3):
+        g.p[first + c, first + c] += (1.0 - half) * often * rows[row, STEP + c]
+        status[LAST + c], status[LAST + 3 + c] = rows[row, SOLO + c], rows[row, SOLO_VARIANCE + c]
+    status[USED] = f.since[k] = sent
+
+
+@inside
+def content(f: Filter, model: Model, rows: Floats, k: int, sent: float, steps: float, again: bool) -> bool:
+    """Rows of the fixes that member k has taken since its last message; False if there are none.
+
+    Of sums of weighted fixes, that of the new ones is the new sum less what is left of the last one.
+    """
+    h, status, row, any_new = f.h, f.status[f.vehicle[k]], f.row[k], False
+    keep = math.exp((status[USED] - sent) / FADES) if again else 0.0
+    fix_terms(f, k)
+    for c in range(3):
+        weight, r, one = 1.0 / rows[row, SOLO_VARIANCE + c], rows[row, TYPICAL + c], rows[row, STEP + c]
+        old = keep / status[LAST + 3 + c] if again else 0.0
+        if weight < (1.0 - NOTHING_NEW) * old:  # the sender has begun anew
+            old = 0.0
+        new = weight - old
+        there = new > NOTHING_NEW * weight and weight * NO_POSITION > 1.0
+        way = one * (steps - 1.0 / steps) / 12.0
+        if old == 0.0:  # of a long past
+            way = 0.5 * one * FADES / f.clock[1] * max(0.0, 1.0 - 1.0 / (weight * r))
+        carried = status[LAST + c] + f.way[k, c]
+        z = rows[row, SOLO + c] if old == 0.0 else carried + (rows[row, SOLO + c] - carried) * weight / new
+        expect(h, c, z if there else 0.0, model.white[c] / new + way if there else 1.0)
+        h.used[c] = there
+        any_new = any_new or there
+    return any_new
+
+
+@part
+def goes_on(f: Filter, rows: Floats, k: int) -> None:
+    """How far member k has moved since it sent its newest message."""
+    age, row = f.clock[0] - f.since[k], f.row[k]
+    u = rows[row, SPEED], rows[row, SPEED + 1], rows[row, SPEED + 2]
+    store(f.way[k], 0, turned(f.g, k, scale(u, age), f.h.turn) if age > ROUNDING else (0.0, 0.0, 0.0))
 
 
 @inside
@@ -144,142 +239,6 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
     correct(g, h, share)
     hold(f, share)
     return share
-
-
-@inside
-def content(f: Filter, model: Model, rows: Floats, k: int, changed: float, clone: bool, before: bool) -> bool:
-    """Rows of what the message of member k says of its position when it was sent.
-
-    The odometer's error of the fixes since the last message is `middle` times that of the whole way, so that they are
-    seen as middle y + (1 - middle) c, y the position now and c its clone. True unless the sender disbelieved them.
-    """
-    believed = True
-    g, h, j, row = f.g, f.h, f.vehicle[k], f.row[k]
-    velocity, age, steps = has(g, k, VELOCITY), rows[row, AGE], steps_between(f, rows, k)
-    back, old, terms = -age, age / f.clock[1], 1 + (1 if has(g, k, ERROR) else 0) + (1 if has(g, 0, COMMON) else 0)
-    fix_terms(f, k)
-    if velocity:
-        term(h, terms, g.block[k, VELOCITY], back)
-    if clone:
-        term(h, terms + 1, g.block[k, CLONE], 0.0)
-    for c in range(3):
-        one, used = rows[row, STEP + c], True
-        m, r = rows[row, SOLO + c], rows[row, SOLO_VARIANCE + c]
-        if before:
-            moved = rows[row, ODOMETER + c] - f.status[j, LAST + 6 + c]
-            spent = one + 0.5 * (steps - 1.0) * (one + f.status[j, LAST + 9 + c])
-            carried, p0 = f.status[j, LAST + c] + moved, f.status[j, LAST + 3 + c]
-            m, r, walk, middle = fixes_between(m, r, carried, p0, spent, steps, rows[row, TYPICAL + c])
-            used, believed = r > 0.0, believed and r < 4.0 * rows[row, TYPICAL + c]
-            r = r * model.white[c] + walk
-            if clone:
-                m += (middle - 1.0) * moved
-                h.weight[4 * c], h.weight[9 * terms + 4 * c] = middle, middle * back
-                h.weight[9 * terms + 9 + 4 * c] = 1.0 - middle
-            else:
-                r += (1.0 - middle) ** 2 * spent
-        if not velocity:
-            m += age * rows[row, SPEED + c]
-            r += old * old * (one + (f.clock[1] * age * model.acceleration) ** 2)
-        expect(h, c, m, r + changed)
-        h.used[c] = used
-    return believed
-
-
-@inside
-def steps_between(f: Filter, rows: Floats, k: int) -> float:
-    """Steps between the last two messages of member k."""
-    since = f.clock[0] - rows[f.row[k], AGE] - f.status[f.vehicle[k], USED]
-    return float(max(1.0, math.floor(since / f.clock[1] + 0.5)))
-
-
-@part
-def fixes_between(
-    now: float, p: float, carried: float, p0: float, spent: float, steps: float, fix: float
-) -> tuple[float, float, float, float]:
-    """What the fixes say that a solo filter took between two of its estimates, on one axis.
-
-    An estimate is keep carried + (1 - keep) m, m the weighted mean of the new fixes brought forward, and
-    keep = prod(1 - K_i). From p_i = (1 - K_i) (p_{i-1} + q) the gains follow from the variances alone, of those
-    between two messages from a line: a fix that was missing or that the sender did not believe has no weight here.
-
-    Args:
-        now: m, estimate.
-        p: m^2, its variance.
-        carried: m, the last estimate moved by the odometer.
-        p0: m^2, variance of the last estimate.
-        spent: m^2, variance of the odometer since.
-        steps: since.
-
-    Returns:
-        m; its variance from white noise, 0 if there is nothing new; its variance from the odometer, were the whole way
-        known; and the share of the way's error that m has.
-    """
-    if p > p0 + 2.0 * spent + 1e-9:  # the sender has started anew
-        return now, p, 0.0, 1.0
-    p0 = max(p0, 1e-12)
-    if steps == 1.0:
-        new = 1.0 - p / (p0 + spent)
-        return (now, 0.0, 0.0, 1.0) if new < NOTHING_NEW else (carried + (now - carried) / new, p / new, 0.0, 1.0)
-    start, mean = p0 + 0.5 * (p - p0) * (1.0 - 1.0 / steps), p0 + 0.5 * (p - p0) * (1.0 + 1.0 / steps)
-    taken = max(math.log(p0 / p) + steps * math.log(1.0 + spent / steps / start), 0.0)
-    usual = -steps * math.log(max(1.0 - mean / fix, 1e-3))
-    if 2.0 * taken > usual:
-        taken = usual
-    new = 1.0 - math.exp(-taken)
-    if new < NOTHING_NEW:
-        return now, 0.0, 0.0, 1.0
-    keep, k = 1.0 - new, 1.0 - math.exp(-taken / steps)
-    white = mean / (2.0 - k) * (1.0 + keep) / new
-    middle = 1.0 / new - (1.0 - k) / (k * steps)
-    walk = spent * (steps - 1.0 / steps) / (12.0 * steps)
-    return carried + (now - carried) / new, white, walk, min(max(middle, 0.5), 1.0)
-
-
-@part
-def use_odometer(f: Filter, guards: Guards, rows: Floats, k: int, back: float, changed: float) -> None:
-    """How far member k has moved between its last two messages."""
-    g, h, j, row = f.g, f.h, f.vehicle[k], f.row[k]
-    steps = steps_between(f, rows, k)
-    term(h, 0, g.block[k, PLACE], 1.0)
-    term(h, 1, g.block[k, VELOCITY], back)
-    term(h, 2, g.block[k, CLONE], -1.0)
-    moved = (
-        rows[row, ODOMETER] - f.status[j, LAST + 6],
-        rows[row, ODOMETER + 1] - f.status[j, LAST + 7],
-        rows[row, ODOMETER + 2] - f.status[j, LAST + 8],
-    )
-    way = odometry_term(f, k, 3, moved)
-    for c in range(3):
-        spent = 0.5 * steps * (rows[row, STEP + c] + f.status[j, LAST + 9 + c])
-        expect(h, c, way[c], spent + changed)
-    update(g, h, guards.fix_gate)
-
-
-@part
-def odometry_term(f: Filter, k: int, at: int, moved: tuple[float, float, float]) -> tuple[float, float, float]:
-    """Let term `at` be the error of a motion by odometry; what was driven, were there none."""
-    g, h = f.g, f.h
-    way = turned(g, k, moved, h.turn)
-    if not has(g, k, TURN):
-        return way
-    i, w = 3 * g.block[k, TURN], h.turn
-    h.block[at], h.terms[0] = g.block[k, TURN], at + 1
-    for n in range(9):
-        h.weight[9 * at + n] = -w[n]
-    b, s = g.x[i], g.x[i + 1]
-    return way[0] - w[0] * b - w[1] * s, way[1] - w[3] * b - w[4] * s, way[2]
-
-
-@part
-def clone_position(f: Filter, k: int, back: float, changed: float) -> None:
-    """Remember, in the state, where member k was when it sent its newest message."""
-    g = f.g
-    remove(g, k, CLONE)
-    clone, first, v = insert(g, k, CLONE, 0.0), 3 * g.block[k, PLACE], 3 * g.block[k, VELOCITY]
-    shift(g, clone, first, 1.0)
-    shift(g, clone, v, back)
-    widen(g, clone, changed + JITTER)
 
 
 @inside

@@ -14,7 +14,6 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import inside, part, storage
 from ..compiling.vectors import LANES, put, take
-from ..dead_reckoning import ROUNDING
 from .gaussian import (
     ABSENT,
     COMMON,
@@ -37,20 +36,17 @@ from .gaussian import (
 FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, OWN = 0, 3, 6, 9, 12, 13
 """Of the ego's row: fix m (NaN for none), its variance m^2, motion m, its variance m^2, three each, and dt s."""
 RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
-"""Of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none held), solo estimate m and its
-variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that of a fix as its solo
-filter assumes it m^2."""
-TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, STATUS = 0, 1, 2, 3, 6, 9, 12, 24, 30, 31, 32
+"""Of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none held), mean of its fixes m and its
+variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that of a fix m^2."""
+TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, STATUS = 0, 1, 2, 3, 6, 9, 12, 21, 27, 28, 32
 """Of a vehicle's status: whether its fixes are assumed to be right, fixes in the mean innovation, when its last message
 that was used was sent s (-inf for none), mean innovation m, error of its fixes when it left m and its variance m^2, and
-SOLO, SOLO_VARIANCE, ODOMETER and STEP of that message; its last plausible velocity m/s, the variance of one step's
+SOLO, SOLO_VARIANCE and ODOMETER of that message; its last plausible velocity m/s, the variance of one step's
 motion with it m^2, when that was s (-inf for never), and how many in a row were not."""
+NO_POSITION = 1e200
+"""m^2, variance of the mean of no fixes."""
 SLIPPED = 5.0
 """Implausible velocities in a row after which one counts again."""
-SPEED_VARIANCE = 400.0
-"""(m/s)^2, prior of a member's velocity."""
-
-
 class Guards(NamedTuple):
     """What is expected to go wrong, and from when on it is believed; 0 switches a guard off.
 
@@ -69,7 +65,7 @@ class Guards(NamedTuple):
         revoke: log odds from which trust ends.
         lost: s without trust in its receiver after which an ego is lost; if alone twice that, half where errors last.
         forget: s, in which what innovations have shown of levels is forgotten.
-        acceleration: m/s^2, of a member whose messages are late; 0: it goes on with its last velocity.
+        acceleration: m/s^2, of a member since it sent its newest message.
         heading: rad, and
         scale: standard deviations of errors of odometry that last.
         lasts: s, for which they do.
@@ -104,7 +100,9 @@ class Guards(NamedTuple):
     fix: float = 1.0
 
 
-NO_GUARDS = Guards(gate=0.0, fix_gate=0.0, trust=0.0, forget=0.0, acceleration=0.0, heading=0.0, scale=0.0, slip=0.0)
+NO_GUARDS = Guards(
+    gate=0.0, fix_gate=0.0, trust=0.0, forget=0.0, heading=0.0, scale=0.0, compass=0.0, offset=0.0, slip=0.0
+)
 ON_ROADS = Guards(fix_gate=3.5, heading=0.03, scale=0.03, lasts=1e4, compass=0.0, offset=0.0, absent=-math.inf, fix=2.0)
 """Of measurements that are not simulated: no odometry is without such errors."""
 RANGES, AZIMUTHS, INCLINATIONS, FIXES, MOTIONS = range(5)
@@ -116,8 +114,8 @@ class Sent(NamedTuple):
     """What is in the messages; arrays are broadcastable to (N, R, T, 3), the vehicles first.
 
     Attributes:
-        position: m.
-        variance: m^2.
+        position: m, and
+        variance: m^2, as `fading_memory` writes them.
         odometer: m, sum of all motions until each step.
     """
 
@@ -134,7 +132,6 @@ class Model(NamedTuple):
         min_range: m.
         exact: 1 for a second pass on range and angles themselves.
         flat: m^2, prior of a member that joins.
-        acceleration: m/s^2, change of a velocity since it was sent, where members have no velocity in the state.
         own: m^2 of the error of a receiver that lasts, 0 for none.
         common: m^2 of the one that all share.
         time: s, their correlation time.
@@ -142,7 +139,6 @@ class Model(NamedTuple):
         bias: rad^2 of the compass.
         heading: rad^2 of the compass's noise.
         offset: m^2, of what all the ego's ranges are too long by.
-        estimates: 1 if messages hold a solo filter's estimate, 0 if they hold a fix.
         turn: (2,) rad^2 and 1, of errors of heading and scale of an odometry; zeros for none.
         lasts: s, their correlation time.
         absent: (4,) log odds that an error of heading, scale, compass or range is not there.
@@ -153,7 +149,6 @@ class Model(NamedTuple):
     min_range: float
     exact: float
     flat: float
-    acceleration: float
     own: float
     common: float
     time: float
@@ -161,7 +156,6 @@ class Model(NamedTuple):
     bias: float
     heading: float
     offset: float
-    estimates: float
     turn: Floats
     lasts: float
     absent: Floats
@@ -180,8 +174,8 @@ class Filter(NamedTuple):
         row: (slots,) of the step's input, ABSENT for none.
         order: (slots,) members, nearest first: a gate depends on what was used before, not on how members are numbered.
         joined: (slots,) step at which the member joined.
-        serves: (slots,) s for which a message's velocity has served.
-        sent: (slots,) s when that message was sent.
+        since: (slots,) s, when the member was at its position: when it sent its newest message.
+        way: (slots, 3) m that it has moved since.
         vague: (slots,) m^2, variance of a position beyond that in P: next to nothing is known of it; 0 once it is.
         hits: (slots, 3) how often in a row a component exceeded its gate; the ego's first counts its fixes.
         status: (vehicles, STATUS).
@@ -209,8 +203,8 @@ class Filter(NamedTuple):
     row: Ints
     order: Ints
     joined: Ints
-    serves: Floats
-    sent: Floats
+    since: Floats
+    way: Floats
     vague: Floats
     hits: Ints
     status: Floats
@@ -243,7 +237,7 @@ def new_filter(slots: int, vehicles: int) -> Filter:
         np.zeros(slots, np.int64),
         np.zeros(slots, np.int64),
         np.zeros(slots),
-        np.full(slots, -1.0),
+        np.zeros((slots, 3)),
         np.zeros(slots),
         np.zeros((slots, 3), np.int64),
         np.zeros((vehicles, STATUS)),
@@ -276,12 +270,12 @@ def copy_filter(source: Filter, target: Filter) -> None:
         target.slip[c] = source.slip[c]
     for k in range(len(source.vehicle)):
         target.vehicle[k], target.row[k], target.joined[k] = source.vehicle[k], source.row[k], source.joined[k]
-        target.serves[k], target.sent[k], target.vague[k] = source.serves[k], source.sent[k], source.vague[k]
+        target.since[k], target.vague[k] = source.since[k], source.vague[k]
         target.locked[k] = source.locked[k]
         for c in range(4):
             target.q[k, c] = source.q[k, c]
         for c in range(3):
-            target.hits[k, c] = source.hits[k, c]
+            target.hits[k, c], target.way[k, c] = source.hits[k, c], source.way[k, c]
     for j in range(len(source.slot)):
         target.slot[j] = source.slot[j]
         target.revoked[j, 0], target.revoked[j, 1] = source.revoked[j, 0], source.revoked[j, 1]
@@ -351,7 +345,7 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
     if mine <= 1 and best >= 0:
         f.vague[0] = 0.0
         for c in range(3):
-            g.x[c], own[FIX + c] = rows[best, SOLO + c] - across(rows, best, c), math.nan
+            g.x[c], own[FIX + c] = seen_from(rows, best, c), math.nan
         widen(g, 0, model.flat)
     return True
 
@@ -411,10 +405,17 @@ def apart(own: Floats, rows: Floats, i: int, j: int) -> float:
             elif rows[k, AGE] < 0.0 or not measured_whole(rows, k):
                 return math.inf
             else:
-                gap += sign * (rows[k, SOLO + c] - across(rows, k, c))
+                gap += sign * seen_from(rows, k, c)
                 variance += rows[k, SOLO_VARIANCE + c] + 1.0
         total += gap * gap / variance
     return total if math.isfinite(total) else math.inf
+
+
+@part
+def seen_from(rows: Floats, row: int, c: int) -> float:
+    """Component c m of where the ego is by a neighbour's message; NaN if that has no position."""
+    position = rows[row, SOLO + c] + rows[row, AGE] * rows[row, SPEED + c] - across(rows, row, c)
+    return float(position if rows[row, SOLO_VARIANCE + c] < NO_POSITION else math.nan)
 
 
 @part
@@ -422,14 +423,6 @@ def across(rows: Floats, row: int, c: int) -> float:
     """Component c of the measured vector to a neighbour, m."""
     d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
     return float(d * ci if c == 2 else d * si * (ca if c == 0 else sa))
-
-
-@inside
-def unused(f: Filter, rows: Floats, k: int) -> bool:
-    """Whether member k has sent a message with a position since the last one that was used."""
-    row = f.row[k]
-    new = f.clock[0] - rows[row, AGE] > f.status[f.vehicle[k], USED] + ROUNDING
-    return bool(rows[row, AGE] >= 0.0 and new and math.isfinite(rows[row, SOLO]))
 
 
 @inside

@@ -28,13 +28,11 @@ from ..compiling.small import (
 from ..compiling.vectors import LANES, less, plus, put, take
 from .messages import BLOCK, ROW, block_at, vector_at
 
-PLACE, ERROR, VELOCITY, CLONE, FRESH, TURN = range(6)
-"""Kinds of a neighbour's vectors: position m, error of its fixes m, velocity m/s, where it was when it sent its last
-message that was used m, scratch of `settle`, and (heading rad, scale, nothing) by which its odometry errs."""
-COMMON, COMPASS = 2, 3
-"""Of the ego in place of velocity and clone: the error m that all fixes share, and (bias, noise of this step) of its
-compass, rad, with the offset m of its ranges."""
-KINDS, TERMS = 6, 6
+PLACE, ERROR, TURN, FRESH, COMMON, COMPASS = range(6)
+"""Kinds of vectors: position m, error of its fixes m, (heading rad, scale, nothing) by which its odometry errs, and
+scratch of `settle`; of the ego the error m that all fixes share, and (bias, noise of this step) of its compass, rad,
+with the offset m of its ranges."""
+KINDS, TERMS = 6, 4
 ABSENT = -1
 REJECTED = 4.0
 """Times the gate: from there on a number is not only down-weighted."""
@@ -348,17 +346,6 @@ def correct_rows(g: Gaussian, h: Rows, share: float, k: int) -> None:
         for row in range(3):
             at = i + row * wide + j
             put(p, at, less(less(less(take(p, at), a[row], u), b[row], v), c[row], w))
-
-
-@part
-def spread(g: Gaussian, h: Rows, share: float) -> None:
-    """Add `share` d d^T to P, with d what the whole update would move x by."""
-    gain, wide, n = h.gain, len(g.x), 3 * g.vectors[0]
-    for i in range(n):
-        d = gain[i] * h.white[0] + gain[wide + i] * h.white[1] + gain[2 * wide + i] * h.white[2]
-        for j in range(n):
-            e = gain[j] * h.white[0] + gain[wide + j] * h.white[1] + gain[2 * wide + j] * h.white[2]
-            g.p[i, j] += share * d * e
 
 
 @part
