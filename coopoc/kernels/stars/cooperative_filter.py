@@ -238,11 +238,14 @@ def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, 
     add_fix(f, model, guards, own)
     for k in range(1, len(f.vehicle)):
         if f.vehicle[k] >= 0:
-            receive(f, model, guards, rows, k)
+            if f.vague[k] == 0.0 or not measured_whole(rows, f.row[k]):
+                receive(f, model, guards, rows, k)
             goes_on(f, rows, k)
     locate(f, f.g)
     members = nearest_first(f)
     measure(f, model, guards, rows, members)
+    for i in range(members):
+        receive(f, model, guards, rows, f.order[i])
     if guards.trust > 0.0:
         trust(f, model, guards)
     f.step[0] += 1

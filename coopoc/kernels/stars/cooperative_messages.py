@@ -52,7 +52,7 @@ from .lasting import drive, hold, turned
 from .messages import three_of
 from .slip import score
 
-FADES = 10.0
+FADES = 5.0
 """s, after which a fix weighs 1 / e in the mean that is sent."""
 NOTHING_NEW = 1e-9
 """Least share of new fixes in a sum."""
@@ -133,7 +133,7 @@ def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> No
     g, j, row, dt = f.g, f.vehicle[k], f.row[k], f.clock[1]
     status, age = f.status[j], rows[row, AGE]
     sent = f.clock[0] - age
-    if age < 0.0:  # nothing is known of its motion
+    if age < 0.0 and f.since[k] < f.clock[0]:  # nothing is known of its motion
         f.since[k] = f.clock[0]
         f.vague[k] += model.flat
     if age < 0.0 or sent <= status[USED] + ROUNDING:
@@ -147,12 +147,12 @@ def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> No
     steady(f, guards, j, rows[row], ODOMETER, STEP, 1.0)
     u = rows[row, ODOMETER], rows[row, ODOMETER + 1], rows[row, ODOMETER + 2]
     if status[SLIPS] > 0.0:
-        store(rows[row], SPEED, u)
+        rows[row, SPEED], rows[row, SPEED + 1], rows[row, SPEED + 2] = u
     drive(f, model, k, scale(u, gap), gap)
     half, often = 0.5 * (1.0 + 1.0 / steps), steps if follows else (gap / dt) ** 2
     for c in range(3):
         g.p[first + c, first + c] += half * often * rows[row, STEP + c]
-    if content(f, model, rows, k, sent, steps, again):
+    if content(f, model, rows, k, sent, steps, again, follows):
         f.q[k, 3] = use_fix(f, model, guards, k, again, innovate(g, f.h))
     for c in range(3):
         g.p[first + c, first + c] += (1.0 - half) * often * rows[row, STEP + c]
@@ -161,27 +161,31 @@ def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> No
 
 
 @inside
-def content(f: Filter, model: Model, rows: Floats, k: int, sent: float, steps: float, again: bool) -> bool:
+def content(f: Filter, model: Model, rows: Floats, k: int, sent: float, steps: float, again: bool, follows: bool) -> bool:
     """Rows of the fixes that member k has taken since its last message; False if there are none.
 
     Of sums of weighted fixes, that of the new ones is the new sum less what is left of the last one.
     """
     h, status, row, any_new = f.h, f.status[f.vehicle[k]], f.row[k], False
     keep = math.exp((status[USED] - sent) / FADES) if again else 0.0
+    fade = math.exp(-f.clock[1] / FADES)
+    long = 1.0 / (1.0 - fade * fade)
+    way = (steps - 1.0 / steps) / 12.0 if follows else min((steps - 1.0) * (2.0 * steps - 1.0) / (6.0 * steps), long)
     fix_terms(f, k)
     for c in range(3):
-        weight, r, one = 1.0 / rows[row, SOLO_VARIANCE + c], rows[row, TYPICAL + c], rows[row, STEP + c]
+        weight, r, carried = 1.0 / rows[row, SOLO_VARIANCE + c], rows[row, TYPICAL + c], status[LAST + c] + f.way[k, c]
         old = keep / status[LAST + 3 + c] if again else 0.0
         if weight < (1.0 - NOTHING_NEW) * old:  # the sender has begun anew
             old = 0.0
-        new = weight - old
+        new, z = weight - old, rows[row, SOLO + c]
+        white = model.white[c] / new
+        if old > 0.0:
+            z = carried + (z - carried) * weight / new
+        else:
+            white *= (2.0 - min(weight * r * (1.0 - fade), 1.0)) / (1.0 + fade)
+            way = long * max(0.0, 1.0 - 1.0 / (weight * r))
         there = new > NOTHING_NEW * weight and weight * NO_POSITION > 1.0
-        way = one * (steps - 1.0 / steps) / 12.0
-        if old == 0.0:  # of a long past
-            way = 0.5 * one * FADES / f.clock[1] * max(0.0, 1.0 - 1.0 / (weight * r))
-        carried = status[LAST + c] + f.way[k, c]
-        z = rows[row, SOLO + c] if old == 0.0 else carried + (rows[row, SOLO + c] - carried) * weight / new
-        expect(h, c, z if there else 0.0, model.white[c] / new + way if there else 1.0)
+        expect(h, c, z if there else 0.0, white + way * rows[row, STEP + c] if there else 1.0)
         h.used[c] = there
         any_new = any_new or there
     return any_new
