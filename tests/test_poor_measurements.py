@@ -28,6 +28,7 @@ from coopoc import (
     run_study,
 )
 from coopoc.learned import GainNet, LearnedGain
+from coopoc.kernels.stars.cooperative_state import NO_GUARDS
 from coopoc.methods.cooperative_filter import CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.studies.views import of
@@ -39,7 +40,7 @@ STARS = (
     JointFilter(),
     JointFilter(exact=False),
     LKFSA("nominal"),
-    CooperativeFilter(robust=False),
+    CooperativeFilter(guards=NO_GUARDS),
     MSMV("nominal"),
     CovarianceIntersection(split=True),
 )
@@ -118,7 +119,7 @@ def ranged() -> tuple[Fleet, Recording]:
     [
         JointFilter(),
         JointFilter(exact=False),
-        CooperativeFilter(robust=False),
+        CooperativeFilter(guards=NO_GUARDS),
         MovingHorizon(horizon=5),
     ],
     ids=lambda method: f"{method.name}-{getattr(method, 'exact', '')}",

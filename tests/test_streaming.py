@@ -284,7 +284,7 @@ def test_bad_starts_are_named() -> None:
 
 @pytest.mark.parametrize("first", [None, Z + 1.0])
 def test_a_star_from_a_known_place_is_the_kalman_filter(first: Floats | None) -> None:
-    star = StarStream(CooperativeFilter(FITTED, robust=False), Z)
+    star = StarStream(CooperativeFilter(FITTED, NO_GUARDS), Z)
     alone = textbook(Kalman(FITTED)).start(Z)
     for z in (first, None, Z + U):
         (x, cov), (same_x, same_cov) = (stream.step(z, U, 0.1) for stream in (star, alone))

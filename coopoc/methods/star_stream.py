@@ -56,6 +56,8 @@ from .motion_history import MotionHistory, fix_or_none, names_of, numbers, secon
 from .noise_model import NoiseModel, constant_noise, motion_noise
 
 FIRST = np.zeros(1, np.int64)
+KNOWN = 0.01
+"""m^2, of a start that is known, as it is sent."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,18 +146,15 @@ class StarStream:
     ) -> None:
         if not isinstance(filter, CooperativeFilter):
             filter = instance("filter", filter, JointFilter)
-        elif not filter.robust:
-            filter = JointFilter(filter.noise_model, robust=False)
         known = constant_noise(filter.noise_model)
         start = np.full(3, np.nan) if x0 is None else three("x0", x0)
         self._star: Joint | Robust
-        self._alone: Robust | None = None
+        self._robust = isinstance(filter, CooperativeFilter)
         self._guards = NO_GUARDS
         if isinstance(filter, CooperativeFilter):
             self._guards = guards_of(filter, known)
-            model = model_of(known, True, self._guards)
+            model = model_of(known, self._guards)
             self._star, self._white = Robust(model, self._guards, start), model.white
-            self._alone = Robust(model_of(known, False, NO_GUARDS), self._guards, start)
         else:
             self._star = Joint(known, filter.exact, filter.robust, start)
         self._motion: MotionNoise = motion_noise(known, interval)
@@ -166,7 +165,9 @@ class StarStream:
         self._last: Floats = np.full((1, WIDTH), np.nan)
         self._last[0, INDEX] = -1.0
         self._answer: Floats = np.full(12, np.nan)
-        self._odometer, self._estimate = np.zeros(3), self._answer
+        self._memory: Floats = np.zeros(9)
+        if x0 is not None:
+            self._memory[:6] = *start, *np.full(3, 1.0 / KNOWN)
 
     @property
     def neighbours(self) -> dict[str, Floats]:
@@ -176,9 +177,10 @@ class StarStream:
     @property
     def broadcast(self) -> Broadcast | None:
         """What this vehicle sends now; None before its first fix, and of a filter that is not robust."""
-        if np.isnan(self._estimate[0]):
+        mean, weight, odometer = self._memory.reshape(3, 3)
+        if not self._robust or not weight.all():
             return None
-        return Broadcast(self._estimate[:3], self._given[3:6].copy(), self._estimate[3::4], self._odometer.copy())
+        return Broadcast(mean.copy(), self._given[3:6].copy(), 1.0 / weight, odometer.copy())
 
     @property
     def trusted(self) -> dict[str, bool]:
@@ -208,22 +210,21 @@ class StarStream:
                 that is no `Broadcast`. The filter is then as it was before.
         """
         names = names_of("neighbours", neighbours, RelativeMeasurement)
-        if self._alone is not None:
+        if self._robust:
             self._check(neighbours)
         self.history.write(self._given, gnss, velocity, dt, fix_age)
         columns, time, motion, fix = self._columns(names), self._time + float(dt), self._motion, self._fix
         rows: Floats = np.frombuffer(bytearray().join([each.row for each in neighbours])).reshape(len(names), WIDTH)
         own, history, last = np.empty(OWN), self.history.reserve(), self._last
-        outcome = stream_rows(self._given, history, motion, fix, own, rows, columns, last, time, self.max_age)
+        own_memory, oldest = self._memory, self.max_age
+        outcome = stream_rows(self._given, history, motion, fix, own, rows, columns, last, time, oldest, own_memory)
         if outcome not in (ESTIMATE, NO_FIX_YET):
             self.history.check(gnss, velocity, dt, fix_age)
         self._time = time
         self._begun |= outcome == ESTIMATE
         if not self._begun:
             return np.full(3, np.nan), None
-        if self._alone is not None:
-            self._odometer += self._given[3:6] * own[DT]
-            self._estimate = self._alone.step(own.copy(), rows[:0], columns[:0], last)
+        if self._robust:
             own[FIX_VARIANCE:MOTION] -= (1.0 - self._white) * self._fix
         self._names, self._answer = names, self._star.step(own, rows, columns, last)
         return self._answer[:3], self._answer[3:12].reshape(3, 3)
@@ -232,7 +233,7 @@ class StarStream:
         for each in neighbours:
             if each.velocity is not None and not np.isfinite(np.frombuffer(each.row)[SOLO:SPEED]).all():
                 allowed = "must hold position, variance and odometer for a robust filter"
-                raise InputError("neighbours", each.id, allowed, "Send stream.broadcast, or start with robust=False.")
+                raise InputError("neighbours", each.id, allowed, "Send stream.broadcast, or take a JointFilter.")
 
     def _columns(self, names: list[str]) -> Ints:
         """Numbers of the vehicles, 1 and up; the filter has room for them."""

@@ -238,7 +238,7 @@ def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, 
     add_fix(f, model, guards, own)
     for k in range(1, len(f.vehicle)):
         if f.vehicle[k] >= 0:
-            if f.vague[k] == 0.0 or not measured_whole(rows, f.row[k]):
+            if f.vague[k] == 0.0 or guards.trust == 0.0 or not measured_whole(rows, f.row[k]):
                 receive(f, model, guards, rows, k)
             goes_on(f, rows, k)
     locate(f, f.g)

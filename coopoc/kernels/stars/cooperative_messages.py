@@ -161,7 +161,9 @@ def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> No
 
 
 @inside
-def content(f: Filter, model: Model, rows: Floats, k: int, sent: float, steps: float, again: bool, follows: bool) -> bool:
+def content(
+    f: Filter, model: Model, rows: Floats, k: int, sent: float, steps: float, again: bool, follows: bool
+) -> bool:
     """Rows of the fixes that member k has taken since its last message; False if there are none.
 
     Of sums of weighted fixes, that of the new ones is the new sum less what is left of the last one.
@@ -177,17 +179,17 @@ def content(f: Filter, model: Model, rows: Floats, k: int, sent: float, steps: f
         old = keep / status[LAST + 3 + c] if again else 0.0
         if weight < (1.0 - NOTHING_NEW) * old:  # the sender has begun anew
             old = 0.0
-        new, z = weight - old, rows[row, SOLO + c]
+        new, z, h.used[c] = weight - old, rows[row, SOLO + c], False
+        if new < NOTHING_NEW * weight or weight * NO_POSITION < 1.0:
+            continue
         white = model.white[c] / new
         if old > 0.0:
             z = carried + (z - carried) * weight / new
         else:
             white *= (2.0 - min(weight * r * (1.0 - fade), 1.0)) / (1.0 + fade)
             way = long * max(0.0, 1.0 - 1.0 / (weight * r))
-        there = new > NOTHING_NEW * weight and weight * NO_POSITION > 1.0
-        expect(h, c, z if there else 0.0, white + way * rows[row, STEP + c] if there else 1.0)
-        h.used[c] = there
-        any_new = any_new or there
+        expect(h, c, z, white + way * rows[row, STEP + c])
+        any_new = True
     return any_new
 
 
@@ -209,7 +211,7 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
         model: noise model.
         guards: against what may be wrong.
         k: slot.
-        again: whether it is not the vehicle's first one, and one that the vehicle believes.
+        again: whether it is not the vehicle's first one.
         q: of `innovate`.
     """
     g, h, j, used = f.g, f.h, f.vehicle[k], 0

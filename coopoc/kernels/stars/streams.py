@@ -16,6 +16,7 @@ from ..compiling.vectors import LANES
 from ..dead_reckoning import BAD_INPUT, ROUNDING, dead_reckon
 from ..motion import MotionNoise, keep_pace, process_variance
 from .cooperative_filter import step
+from .cooperative_messages import remember
 from .cooperative_state import (
     AGE,
     DT,
@@ -69,6 +70,7 @@ def stream_rows(
     last: Floats,
     time: float,
     max_age: float,
+    memory: Floats,
 ) -> int:
     """Rows of a step: the ego's by dead reckoning, a fix of some age brought forward, and those of its neighbours with
     the newest message of each. `kernels.dead_reckoning` says when it is NO_FIX_YET or BAD_INPUT; then nothing changes.
@@ -84,6 +86,7 @@ def stream_rows(
         last: (vehicles, WIDTH) newest message of each, AGE the time when it was sent s, the square of its pace in STEP.
         time: s, of the step.
         max_age: s, of the oldest message that counts.
+        memory: of `remember`, of the ego.
     """
     since, late, dt = np.zeros(3), np.zeros(3), given[6]
     outcome = dead_reckon(given, history, motion, own[MOTION:MOTION_VARIANCE], own[MOTION_VARIANCE:DT], since, late)
@@ -92,6 +95,7 @@ def stream_rows(
     own[DT], interval = dt, motion.interval if motion.interval > 0.0 else dt
     for c in range(3):
         own[FIX + c], own[FIX_VARIANCE + c] = given[c] + since[c], fix[c] + late[c]
+    remember(memory, own[MOTION:MOTION_VARIANCE], own[FIX:FIX_VARIANCE], own[FIX_VARIANCE:MOTION], dt)
     for i in range(len(rows)):
         row, newest, sent = rows[i], last[vehicles[i]], time - rows[i, AGE]
         if math.isfinite(row[SPEED]) and sent >= newest[AGE] - ROUNDING:
@@ -220,7 +224,8 @@ def stream_step(
         for d in range(3):
             answer[3 + 3 * c + d] = f.answer[3 + 3 * c + d]
         for i in range(len(vehicles)):
-            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[f.slot[vehicles[i]], PLACE] + c]
+            k = f.slot[vehicles[i]]
+            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.way[k, c]
 
 
 @compiled
