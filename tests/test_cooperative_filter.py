@@ -132,23 +132,22 @@ BAD: dict[str, tuple[Sensors, V2X, Callable[[Recording], Recording]]] = {
 }
 
 
-@pytest.mark.parametrize("robust", [True, False])
+@pytest.mark.parametrize("guards", [Guards(), NO_GUARDS], ids=["guarded", "open"])
 @pytest.mark.parametrize("case", BAD)
-def test_the_filter_is_its_oracle(crossing: Fleet, case: str, robust: bool) -> None:
+def test_the_filter_is_its_oracle(crossing: Fleet, case: str, guards: Guards) -> None:
     """Against dense matrices, one number at a time; members come, go and lose trust."""
     sensors, v2x, change = BAD[case]
     fleet = gappy(crossing)
     seen = change(observe(fleet, sensors, v2x, runs=2, observers=[0]))
-    method = CooperativeFilter(robust=robust)
-    track, known = method(seen), resolve("nominal", seen)
+    track, known = CooperativeFilter(guards=guards)(seen), resolve("nominal", seen)
     assert track.covariance is not None
     assert track.neighbours is not None
     for run in range(2):
-        x, cov, others = Oracle(seen, 0, run, known, Guards() if robust else NO_GUARDS, robust).loop()
-        assert_allclose(track.x[run, :, 0], x, atol=2e-5)
-        assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=2e-5)
+        x, cov, others = Oracle(seen, 0, run, known, guards).loop()
+        assert_allclose(track.x[run, :, 0], x, atol=1e-6)
+        assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=1e-6)
         if len(track.neighbours[run]):
-            assert_allclose(track.neighbours[run], np.concatenate(others), atol=5e-5)
+            assert_allclose(track.neighbours[run], np.concatenate(others), atol=2e-6)
 
 
 @pytest.mark.parametrize("case", ["late", "lost", "attack"])

@@ -226,6 +226,4 @@ def model_of(noise_model: NoiseModel, guards: Guards) -> Model:
         bias, offset = bias or guards.compass**2, offset or guards.offset**2
     shape = float(least), float(noise_model.exact_relative), FORGOTTEN
     turns = np.square(turn)
-    return Model(
-        std, *shape, own, common, time, white, bias, heading, offset, turns, lasts, absent, guards.slip
-    )
+    return Model(std, *shape, own, common, time, white, bias, heading, offset, turns, lasts, absent, guards.slip)

@@ -1,9 +1,9 @@
 """The cooperative filter with dense matrices and one number at a time, one run.
 
-State: named vectors, ("x", j) position, ("b", j) error of fixes, ("v", j) velocity and ("c", j) clone of vehicle j,
+State: named vectors, ("x", j) position and ("b", j) error of fixes of vehicle j, ("o", j) error of its odometry,
 ("common",) and ("compass",). Numbers z = H x + noise beyond their gate have their innovations' covariance multiplied
 by q / gate, of relative ones by 100 more beyond four times the gate, of fixes as `kernels.gate` says. What is vague has
-a variance of FLAT m^2. ("o", j) are errors of odometry.
+a variance of FLAT m^2.
 """
 
 import copy
@@ -15,7 +15,7 @@ import numpy as np
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
 from coopoc.kernels.gate import GATE, LEAK, PATIENCE, REJECTED, SLIP
-from coopoc.kernels.stars.cooperative_messages import CLIP, FIX_SCORE
+from coopoc.kernels.stars.cooperative_messages import CLIP, FADES, FIX_SCORE
 from coopoc.kernels.stars.cooperative_state import Guards
 from coopoc.kernels.stars.levels import FASTEST, LOUDEST, PRIOR, QUIETEST, SUDDEN, USUAL
 from coopoc.kernels.stars.slip import LASTS, LATE, RARE, UNSEEN
@@ -111,11 +111,11 @@ class Belief:
 
 
 class Sent(NamedTuple):
-    """A message: step, position, its variance, odometer, velocity, variance of one step's motion; (3,) each."""
+    """A message: step, mean of fixes, its weight, odometer, velocity, variance of one step's motion; (3,) each."""
 
     step: int
-    estimate: Floats
-    variance: Floats
+    mean: Floats
+    weight: Floats
     odometer: Floats
     velocity: Floats
     process: Floats
@@ -139,17 +139,15 @@ class Life(NamedTuple):
 class Oracle:
     """The filter of one ego in one run."""
 
-    def __init__(
-        self, seen: Recording, ego: int, run: int, known: NoiseModel, guards: Guards, robust: bool, alone: bool = False
-    ) -> None:
-        s, self.alone = known.sensors, alone
-        self.seen, self.ego, self.run, self.known, self.guards, self.robust = seen, ego, run, known, guards, robust
+    def __init__(self, seen: Recording, ego: int, run: int, known: NoiseModel, guards: Guards) -> None:
+        s = known.sensors
+        self.seen, self.ego, self.run, self.known, self.guards = seen, ego, run, known, guards
         self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(2), 1, np.zeros(4)), np.ones(3)
         self.std: Floats = np.ones(3)
         if s is not None:
             self.std = s.relative_std.copy()
             self.guards = guards._replace(lost=guards.lost / (1 + (s.gnss_drift_std > 0)))
-        if robust and s is not None:
+        if s is not None:
             heading, bias = (float(v**2) for v in known.compass)
             self.std[1] = math.sqrt(self.std[1] ** 2 - heading - bias)
             keep = math.exp(-seen.dt / s.gnss_drift_time)
@@ -163,20 +161,26 @@ class Oracle:
             self.white = np.square(s.gnss_std) / np.square(s.fix_std)
         shape = seen.gnss.shape
         self.r = np.broadcast_to(known.fix_variance(seen), shape)[run]
-        self.position, self.variance = seen.gnss[run].copy(), self.r.copy()
-        if robust:
-            for j in range(shape[2]):
-                x, cov, _ = Oracle(seen, j, run, known, guards, False, alone=True).loop()
-                self.position[:, j], self.variance[:, j] = x, np.diagonal(cov, axis1=1, axis2=2)
-        self.odometer = np.cumsum(np.nan_to_num(seen.dt * seen.velocity[run]), axis=0)
+        self.remember(seen.gnss[run], seen.velocity[run])
         self.revoked: dict[int, list[float]] = {}
         self.box = inbox(seen, ego, FIX_AND_VELOCITY)
         self.q = heard(seen, self.box, known, run, ego)
         self.state = self.blank()
 
+    def remember(self, gnss: Floats, velocity: Floats) -> None:
+        """What every vehicle sends: a mean of its fixes, each of which fades with its age."""
+        self.mean, self.weight, self.odometer = (np.zeros(gnss.shape) for _ in range(3))
+        m, w, o = np.zeros((3, *gnss.shape[1:]))
+        for t, (z, u) in enumerate(zip(gnss, velocity, strict=True)):
+            moved, there = np.nan_to_num(self.seen.dt * u), np.isfinite(z)
+            w = np.where(np.isnan(u), 0.0, w * math.exp(-self.seen.dt / FADES)) + there / self.r[t]
+            m, o = m + moved, o + moved
+            m = np.where(there, m + (z - m) / np.where(there, self.r[t] * w, 1.0), m)
+            self.mean[t], self.weight[t], self.odometer[t] = m, w, o
+
     def blank(self) -> dict[str, Any]:
         empty: dict[str, Any] = {
-            name: {} for name in ("last", "serves", "sent", "joined", "hits", "mean", "kept", "slot", "pace", "locked")
+            name: {} for name in ("last", "since", "way", "joined", "hits", "mean", "kept", "slot", "pace", "locked")
         }
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.guards.trust else {self.ego}
@@ -198,7 +202,7 @@ class Oracle:
             b = copy.deepcopy(true)
             self.average(b)
             x = b.at(("x", self.ego))
-            found.append((b.x[x], b.p[x, x], [true.x[true.at(("x", j))].copy() for j in self.neighbours(t)[1]]))
+            found.append((b.x[x], b.p[x, x], [true.x[true.at(("x", j))] + self.state["way"][j] for j in self.neighbours(t)[1]]))
         others = [np.array(o).reshape(-1, 3) for *_, o in found]
         return np.array([x for x, *_ in found]), np.array([p for _, p, _ in found]), others
 
@@ -213,7 +217,7 @@ class Oracle:
 
     def tries(self, t: int) -> None:
         """A step, and perhaps one that slips."""
-        share, dt = self.guards.slip * (self.robust and self.known.sensors is not None), self.seen.dt
+        share, dt = self.guards.slip * (self.known.sensors is not None), self.seen.dt
         speed = float(np.linalg.norm(self.seen.velocity[self.run, t, self.ego]))
         self.state["speed"] = max(speed, self.state["speed"] * math.exp(-dt / LATE))
         before = copy.deepcopy((self.state, self.revoked)) if share else None
@@ -238,8 +242,6 @@ class Oracle:
 
     def neighbours(self, t: int) -> tuple[Any, list[int]]:
         """Links of a step, and the columns that they join."""
-        if self.alone:
-            return np.arange(0), []
         here = np.arange(self.box.start[t], self.box.start[t + 1])
         return here, self.seen.links.neighbour[self.box.link[here]].tolist()
 
@@ -249,7 +251,7 @@ class Oracle:
         if s < 0:
             return None
         velocity, q = self.seen.velocity[self.run, s, j], math.exp(self.state["level"][4]) * self.q[s, j]
-        return Sent(s, self.position[s, j], self.variance[s, j], self.odometer[s, j], velocity, q)
+        return Sent(s, self.mean[s, j], self.weight[s, j], self.odometer[s, j], velocity, q)
 
     def learn(self, kind: int, more: float, share: float, numbers: int = 1) -> None:
         """What innovations show of a level: derivative and information of their log-likelihood."""
@@ -299,7 +301,7 @@ class Oracle:
                 if ("b", j) in b.names:
                     at = b.at(("b", j))
                     s["kept"][j] = b.x[at].copy(), np.maximum(np.diag(b.p)[at], 0.01)
-                for kind in "xbvco":
+                for kind in "xbo":
                     b.drop((kind, j))
                 s["members"].remove(j)
         dt = self.seen.dt
@@ -309,30 +311,21 @@ class Oracle:
             b.noise(("x", self.ego), slip)
         s["made"] = s["made"] + q.sum()
         self.before = self.own_variance()
-        for j in s["members"]:
-            messages[j] = self.predict_member(t, j, messages[j])
         for j in [j for j in others if j not in s["members"]]:
             self.join(t, j, messages[j], relative[j])
-        for j in s["vague"].intersection(others):
-            message, last = messages[j], s["last"].get(j)
-            new = (
-                message is not None and np.isfinite(message.estimate).all() and not (last and message.step <= last.step)
-            )
-            if message and new and (s["joined"][j] < t or not np.isfinite(relative[j]).all()):
-                b.x[b.at(("x", j))] = message.estimate + (t - message.step) * dt * message.velocity
-        at = {j: b.x[b.at(("x", j))].copy() for j in (self.ego, *others)}
         if np.isfinite(fix).all():
             self.add_fix(t, fix)
+        for j in sorted(s["members"], key=lambda j: int(s["slot"][j])):
+            new = j in s["vague"] and messages[j] is not None
+            if not (new and g.trust and np.isfinite(relative[j]).all()):
+                messages[j] = self.receive(t, j, messages[j])
+            s["way"][j] = self.goes_on(t, j, messages[j])[0]
+        at = {j: b.x[b.at(("x", j))] + s["way"].get(j, 0.0) for j in (self.ego, *s["members"])}
         order = sorted(s["members"], key=lambda j: float(np.linalg.norm(at[j] - at[self.ego])))
-        if self.robust:
-            at = self.measure(at, order, relative)
+        self.measure(t, at, order, relative, messages)
         for j in order:
-            vague = j in s["vague"]
-            self.receive(t, j, messages[j])
-            if self.robust and vague and j not in s["vague"]:
-                self.relate(j, at, relative[j], self.known.exact_relative)
-        if not self.robust:
-            self.measure(at, order, relative)
+            messages[j] = self.receive(t, j, messages[j])
+            s["way"][j] = self.goes_on(t, j, messages[j])[0]
         if g.trust:
             self.trust()
         self.corrected()
@@ -428,7 +421,9 @@ class Oracle:
         places = [(fix.copy(), self.r[t, self.ego])]
         for j, message in messages.items():
             if message is not None and np.isfinite(relative[j]).all():
-                places.append((message.estimate - to_vector(relative[j]), message.variance + 1))
+                late = (t - message.step) * self.seen.dt * message.velocity
+                if message.weight.all():
+                    places.append((message.mean + late - to_vector(relative[j]), 1 / message.weight + 1))
         votes = [1]
         if g.fix_gate:
             votes = [sum(((x - y) ** 2 / (p + q)).sum() <= g.fix_gate for y, q in places) for x, p in places]
@@ -502,79 +497,32 @@ class Oracle:
         if self.life.turn.any():
             self.state["belief"].add(("o", j), 0.0, [*self.life.turn, 0.0])
 
+    def turn(self, j: int) -> Floats:
+        """Errors of an odometry, where they are linear."""
+        b: Belief = self.state.get("linear", self.state["belief"])
+        return b.x[b.at(("o", j))]
+
     def turned(self, j: int, moved: Floats) -> tuple[Floats, Floats]:
         """A motion by odometry, corrected, and its derivatives by the errors of it."""
         b, by = self.state["belief"], np.zeros((3, 3))
         if ("o", j) not in b.names:
             return moved, by
-        turn, scale, _ = b.x[b.at(("o", j))]
+        turn, scale, _ = self.turn(j)
         c, s = math.cos(turn), math.sin(turn)
         way = (1 + scale) * np.array([[c, -s], [s, c]]) @ moved[:2]
         by[:2, 0], by[:2, 1] = [-way[1], way[0]], way / (1 + scale)
         return np.append(way, moved[2]), by
 
-    def drive(self, j: int, moved: Floats) -> None:
+    def drive(self, j: int, moved: Floats, steps: int = 1) -> None:
         b, (way, by) = self.state["belief"], self.turned(j, moved)
         b.x[b.at(("x", j))] += way
         if ("o", j) not in b.names:
             return
-        x, o, f, holds = b.at(("x", j)), b.at(("o", j)), np.eye(len(b.x)), self.life.holds
+        x, o, f, holds = b.at(("x", j)), b.at(("o", j)), np.eye(len(b.x)), self.life.holds**steps
         f[x, o], f[o, o] = by, holds * np.eye(3)
         b.p = f @ b.p @ f.T
         b.x[o] *= holds
         b.noise(("o", j), [*((1 - holds**2) * self.life.turn), 0.0])
-
-    def errors_of(self, j: int, moved: Floats) -> tuple[Floats, dict[Name, Any]]:
-        """A motion as a measurement: what is measured, and the terms of it beside what is driven."""
-        b, (way, by) = self.state["belief"], self.turned(j, moved)
-        return (way - by @ b.x[b.at(("o", j))], {("o", j): -by}) if ("o", j) in b.names else (way, {})
-
-    def update_velocity(self, j: int, message: Sent | None, t: int) -> None:
-        """A member whose newest message is not of now gets a velocity; that of a new message is used, unless the
-        odometer's way from a clone on is known better than a late velocity."""
-        s, g, dt = self.state, self.guards, self.seen.dt
-        b, tracked = s["belief"], ("v", j) in s["belief"].names
-        if not g.acceleration or message is None or (message.step == t and not tracked):
-            return
-        late = (0.5 * g.acceleration * ((t - message.step) * dt) ** 2) ** 2
-        if not tracked:
-            b.add(("v", j), 0.0, 400.0)
-            if t - message.step == 1 and t > s["joined"][j] and s["last"].get(j) and s["last"][j].step == message.step:
-                self.clone(j, {}, 0.0)
-        elif s["sent"].get(j) == message.step or (("c", j) in b.names and 3 * late < message.process.sum()):
-            return
-        s["sent"][j] = message.step
-        r = message.process / dt**2 + (g.acceleration * (t - message.step) * dt) ** 2
-        way, terms = self.errors_of(j, message.velocity)
-        b.updates(np.array([b.row({("v", j): 1.0, **terms}, c) for c in range(3)]), way, r, g.fix_gate)
-
-    def predict_member(self, t: int, j: int, message: Sent | None) -> Sent | None:
-        """The message, its velocity if need be replaced."""
-        s, dt = self.state, self.seen.dt
-        b = s["belief"]
-        last = s["last"].get(j)
-        if ("v", j) in b.names and message is not None and message.step == t and last and last.step >= t - 1:
-            b.drop(("v", j))
-            b.drop(("c", j))
-        self.update_velocity(j, message, t)
-        if ("v", j) in b.names:
-            b.noise(("v", j), (self.guards.acceleration * dt) ** 2)
-            b.transform(("x", j), {("x", j): 1.0, ("v", j): dt})
-            return message
-        if message is None:
-            s["serves"][j] = -1, 0
-            b.noise(("x", j), FLAT)
-            s["vague"].add(j)
-            return None
-        if message.step == t:
-            u, q = self.steady(t, j, message.velocity, message.process)
-            message = message._replace(velocity=u, process=q)
-        before, times = s["serves"][j]
-        times = times + 1 if before == message.step else 1
-        s["serves"][j] = message.step, times
-        self.drive(j, dt * message.velocity)
-        b.noise(("x", j), (2 * times - 1) * (message.process + (dt**2 * (t - message.step)) ** 2))
-        return message
 
     def join(self, t: int, j: int, message: Sent | None, relative: Floats) -> None:
         s = self.state
@@ -583,14 +531,14 @@ class Oracle:
         s["slot"][j] = next(k for k in range(1, 10**6) if k not in taken)
         s["members"].append(j)
         s["joined"][j], s["hits"][("relative", j)] = t, [0, 0, 0]
-        s["serves"][j] = (-1 if message is None else message.step), 1
+        s["since"][j] = t if message is None else message.step
         near = 1 + (0.0 if np.isnan(relative[0]) else relative[0])
         gap = to_vector(relative) if np.isfinite(relative).all() else np.array([near, near, 0.1 * near])
         b.add(("x", j), b.x[b.at(("x", self.ego))] + gap, FLAT)
+        if message is not None:
+            b.x[b.at(("x", j))] -= (t - message.step) * self.seen.dt * message.velocity
         s["vague"].add(j)
-        s["sent"].pop(j, None)
         s["locked"].pop(j, None)
-        self.update_velocity(j, message, t)
         self.add_turn(j)
         if j not in s["trusted"]:
             mean, variance = s["kept"].get(j, (np.zeros(3), np.full(3, self.guards.tau**2)))
@@ -598,35 +546,25 @@ class Oracle:
         elif self.life.own:
             b.add(("b", j), 0.0, self.life.own)
 
-    def measure(self, at: dict[int, Floats], order: list[int], relative: dict[int, Floats]) -> dict[int, Floats]:
-        """At the prediction, forgotten but for the solution, which is returned; then at that solution."""
-        s = self.state
+    def measure(self, t: int, at: dict[int, Floats], order: list[int], relative: Any, messages: Any) -> None:
+        """At the prediction, forgotten but for the solution; then at that solution."""
+        s, exact = self.state, self.known.exact_relative
         b = s["belief"]
-        if not order:
-            return at
-        if ("compass",) in b.names:
+        if order and ("compass",) in b.names:
             i = b.at(("compass",)).start + 1
             b.x[i], b.p[i], b.p[:, i] = 0.0, 0.0, 0.0
             b.p[i, i] = self.life.heading
-        exact = self.known.exact_relative
         if exact:
-            at = self.geometry(at, order, relative)
+            names = "belief", "hits", "vague", "learned", "information"
+            self.state = s | copy.deepcopy({name: s[name] for name in names}) | {"linear": b}
+            for j in order:
+                self.relate(t, j, at, relative[j], messages[j], False)
+            trial, self.state = self.state["belief"], s
+            at = {j: trial.x[trial.at(("x", j))] + s["way"].get(j, 0.0) for j in (self.ego, *order)}
         for j in order:
-            self.relate(j, at, relative[j], exact)
-        return at
+            self.relate(t, j, at, relative[j], messages[j], exact)
 
-    def geometry(self, at: dict[int, Floats], order: list[int], relative: dict[int, Floats]) -> dict[int, Floats]:
-        """Positions after a linear update that is forgotten."""
-        s, kept = self.state, self.state
-        self.state = s | copy.deepcopy(
-            {name: s[name] for name in ("belief", "hits", "vague", "learned", "information")}
-        )
-        for j in order:
-            self.relate(j, at, relative[j], False)
-        b, self.state = self.state["belief"], kept
-        return {j: b.x[b.at(("x", j))].copy() for j in (self.ego, *order)}
-
-    def relate(self, j: int, at: dict[int, Floats], relative: Floats, exact: bool) -> None:
+    def relate(self, t: int, j: int, at: dict[int, Floats], relative: Floats, message: Any, exact: bool) -> None:
         s, g, there = self.state, self.guards, np.isfinite(relative)
         b, vague, hits = s["belief"], j in s["vague"], s["hits"][("relative", j)]
         if not there.all() and vague:
@@ -654,10 +592,17 @@ class Oracle:
             z = rows @ to_vector(np.where(there, relative, expected))
             r = np.ones(3) if unit else (self.std * [1.0, reach * ground / far, reach]) ** 2
             turn, size = ground, np.ones(3)
-        r = r * np.exp(s["level"][:3])
+        r, age = r * np.exp(s["level"][:3]), (t - s["since"][j]) * self.seen.dt
+        s["way"][j], by = self.goes_on(t, j, message)
+        z = z - rows @ s["way"][j]
+        if age:
+            r = r + rows**2 @ ((age / self.seen.dt) ** 2 * message.process + (g.acceleration * age**2 / 2) ** 2)
         h = []
         for c in range(3):
             terms: dict[Name, Any] = {("x", j): rows[c], ("x", self.ego): -rows[c]}
+            if ("o", j) in b.names:
+                terms[("o", j)] = rows[c] @ by
+                z[c] += rows[c] @ by @ self.turn(j)
             if c < 2 and ("compass",) in b.names:
                 terms[("compass",)] = np.array([[0, 0, 1], [turn, turn, 0]][c])
             h.append(b.row(terms, c))
@@ -672,60 +617,54 @@ class Oracle:
                 self.learn(4, min(q, SUDDEN) - USUAL, rows[c] @ rows[c] * s["made"] / 3 / total[c])
         s["vague"].discard(j)
 
-    def receive(self, t: int, j: int, message: Sent | None) -> None:
-        s, g, dt = self.state, self.guards, self.seen.dt
-        b = s["belief"]
-        last = s["last"].get(j)
-        if message is None or (last and message.step <= last.step) or not np.isfinite(message.estimate).all():
-            return
-        age = t - message.step
-        tracked, before = ("v", j) in b.names, self.robust and last is not None
-        clone, late = before and ("c", j) in b.names, 0.0
-        if tracked:
-            late = (0.5 * g.acceleration * (age * dt) ** 2) ** 2
-        steps = message.step - last.step if before else 0
-        moved = message.odometer - last.odometer if before else np.zeros(3)
-        spent = 0.5 * steps * (message.process + last.process) if before else np.zeros(3)
-        back = {("v", j): -age * dt} if tracked else {}
-        if clone:
-            way, errors = self.errors_of(j, moved)
-            h = np.array([b.row({("x", j): 1.0, **back, ("c", j): -1.0, **errors}, c) for c in range(3)])
-            b.updates(h, way, spent + late, g.fix_gate)
-        rows: list[Any] = []
-        for c in range(3):
-            m, r, middle, terms = message.estimate[c], message.variance[c], 1.0, dict(self.fix_terms(j)) | back
-            if before:
-                way = message.process[c] + 0.5 * (steps - 1) * (message.process[c] + last.process[c])
-                said = between(
-                    m, r, last.estimate[c] + moved[c], last.variance[c], way, steps, self.r[message.step, j, c]
-                )
-                if said is None:
-                    rows.append(None)
-                    continue
-                m, r, walk, middle = said
-                r = r * self.white[c] + walk
-                if clone:
-                    m += (middle - 1) * moved[c]
-                    terms |= {("x", j): middle, ("c", j): 1 - middle}
-                    terms |= {name: middle * factor for name, factor in back.items()}
-                else:
-                    r += (1 - middle) ** 2 * way
-            if not tracked:
-                m += age * dt * message.velocity[c]
-                r += age**2 * (message.process[c] + (dt**2 * age) ** 2)
-            rows.append((terms, m, r + late))
-        self.use_fix(t, j, rows, before)
-        s["last"][j] = message
-        if tracked:
-            self.clone(j, back, late)
+    def receive(self, t: int, j: int, message: Sent | None) -> Sent | None:
+        """Move to where the newest message was sent, use the fixes since the last one; the message as it is used."""
+        s, dt, last = self.state, self.seen.dt, self.state["last"].get(j)
+        b, since = s["belief"], s["since"][j]
+        if message is None and since < t:
+            s["since"][j] = t
+            s["vague"].add(j)
+            b.noise(("x", j), FLAT)
+        if message is None or (last and message.step <= last.step):
+            return message
+        gap, steps = message.step - since, message.step - last.step if last else 1
+        follows, moved = bool(last and since == last.step), message.odometer - (last.odometer if last else 0.0)
+        u, q = self.steady(t, j, moved / (gap * dt) if follows else message.velocity, message.process)
+        self.drive(j, gap * dt * u, gap)
+        half, spent = (1 + 1 / steps) / 2, (steps if follows else gap**2) * q
+        b.noise(("x", j), half * spent)
+        self.use_fix(
+            t, j, [self.said(message, last, j, q, moved, steps, follows, c) for c in range(3)], last is not None
+        )
+        b.noise(("x", j), (1 - half) * spent)
+        s["last"][j], s["since"][j] = message, message.step
+        return message._replace(process=q)
 
-    def clone(self, j: int, back: dict[Any, float], late: float) -> None:
-        """Remember where a member was when it sent its newest message."""
-        b = self.state["belief"]
-        b.drop(("c", j))
-        b.add(("c", j), 0.0, 0.0)
-        b.transform(("c", j), {("x", j): 1.0, **back})
-        b.noise(("c", j), late + 1e-12)
+    def said(self, new: Sent, last: Any, j: int, q: Any, moved: Any, steps: int, follows: bool, c: int) -> Any:
+        """Terms, number and variance of the mean of the fixes since the last message, None for none."""
+        fade, weight, z = math.exp(-self.seen.dt / FADES), new.weight[c], new.mean[c]
+        old = fade**steps * last.weight[c] if last else 0.0
+        old = old if weight > old * (1 - 1e-9) else 0.0
+        if weight - old <= 1e-9 * weight or not weight:
+            return None
+        white, long = self.white[c] / (weight - old), 1 / (1 - fade**2)
+        if old:
+            before = last.mean[c] + moved[c]
+            z = before + (z - before) * weight / (weight - old)
+            full = (steps - 1) * (2 * steps - 1) / (6 * steps)
+            way = (steps - 1 / steps) / 12 if follows else min(full, long)
+        else:
+            n = weight * self.r[new.step, j, c]
+            white *= (2 - min(n * (1 - fade), 1)) / (1 + fade)
+            way = long * max(0, 1 - 1 / n)
+        return self.fix_terms(j), z, white + way * q[c]
+
+    def goes_on(self, t: int, j: int, message: Sent | None) -> tuple[Floats, Floats]:
+        """The way since the newest message, and its derivatives by the errors of odometry."""
+        *_, slips = self.state["pace"].get(j, [0])
+        age = (t - self.state["since"][j]) * self.seen.dt
+        u = np.zeros(3) if message is None else self.state["pace"][j][0] if slips else message.velocity
+        return self.turned(j, age * u)
 
     def trust(self) -> None:
         """The surest member first: p(b = 0 | all) / p(b = 0) by Bayes' rule, of Gaussians."""
@@ -758,24 +697,3 @@ class Oracle:
 def normal(x: Floats, cov: Floats) -> float:
     """Logarithm of the density of N(0, cov)."""
     return float(-0.5 * (np.linalg.slogdet(2 * math.pi * cov)[1] + x @ np.linalg.solve(cov, x)))
-
-
-def between(
-    now: float, p: float, carried: float, p0: float, spent: float, steps: int, fix: float
-) -> tuple[float, float, float, float] | None:
-    """The fixes between two estimates of a Kalman filter, as one: estimate = keep carried + (1 - keep) m with
-    keep = prod (1 - K_i)."""
-    if p > p0 + 2 * spent + 1e-9:
-        return now, p, 0.0, 1.0
-    p0 = max(p0, 1e-12)
-    before, mean = ((p0 + p) / 2 - sign * (p - p0) / (2 * steps) for sign in (1, -1))
-    taken = max(math.log(p0 / p) + steps * math.log(1 + spent / steps / before), 0.0)
-    usual = -steps * math.log(max(1 - mean / fix, 1e-3))
-    if steps > 1 and 2 * taken > usual:
-        taken = usual
-    new, k = 1 - math.exp(-taken), 1 - math.exp(-taken / steps)
-    if new < 1e-9:
-        return None
-    white = mean / (2 - k) * (2 - new) / new
-    middle = min(max(1 / new - (1 - k) / (k * steps), 0.5), 1.0) if steps > 1 else 1.0
-    return carried + (now - carried) / new, white, spent * (steps - 1 / steps) / (12 * steps), middle

@@ -13,8 +13,7 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inside, part
-from ..compiling.small import apply, negate, scale, store
-from ..dead_reckoning import ROUNDING
+from ..compiling.small import apply, negate, store
 from ..gate import GATE
 from ..geometry import angle
 from .cooperative_members import join, leave, predict, steady
@@ -66,7 +65,7 @@ from .gaussian import (
     weight,
     widen,
 )
-from .lasting import average, turned
+from .lasting import average
 from .levels import adapt, corrected, learn_fix, learn_relative, louder, moved
 from .messages import Assumptions, Measurements, three_of
 from .slip import LIKELY, NOW, NUMBERS, SLIPPED, SQUARES, Tries, chance, new_tries, remember_speed, score, surprised
@@ -238,7 +237,8 @@ def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, 
     add_fix(f, model, guards, own)
     for k in range(1, len(f.vehicle)):
         if f.vehicle[k] >= 0:
-            if f.vague[k] == 0.0 or guards.trust == 0.0 or not measured_whole(rows, f.row[k]):
+            new = f.vague[k] > 0.0 and rows[f.row[k], AGE] >= 0.0
+            if not (new and guards.trust > 0.0 and measured_whole(rows, f.row[k])):
                 receive(f, model, guards, rows, k)
             goes_on(f, rows, k)
     locate(f, f.g)
@@ -246,6 +246,7 @@ def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, 
     measure(f, model, guards, rows, members)
     for i in range(members):
         receive(f, model, guards, rows, f.order[i])
+        goes_on(f, rows, f.order[i])
     if guards.trust > 0.0:
         trust(f, model, guards)
     f.step[0] += 1
@@ -361,6 +362,8 @@ def first_pass(f: Filter, model: Model, guards: Guards, rows: Floats, members: i
             correct_mean(g, h, 1.0)
             for k in f.order[m + 1 : members]:
                 correct_rows(g, h, 1.0, g.block[k, PLACE])
+                if f.since[k] < f.clock[0] and has(g, k, TURN):
+                    correct_rows(g, h, 1.0, g.block[k, TURN])
             for term in range(1, h.terms[0]):
                 correct_rows(g, h, 1.0, h.block[term])
 
@@ -429,29 +432,23 @@ def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int, exact:
         h.gate[c] = guards.gate
     h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]
     h.terms[0] = 3 if has(g, 0, COMPASS) else 2
-    age = f.clock[0] - f.since[k]
-    if age > ROUNDING:
-        add_way(f, guards, rows, k, age)
+    if goes_on(f, rows, k):
+        add_way(f, guards, rows, k)
     return True
 
 
 @part
-def add_way(f: Filter, guards: Guards, rows: Floats, k: int, age: float) -> None:
-    """Rows of a member that has moved since it was at its position, with the velocity of its newest message."""
-    g, h, row, w, n = f.g, f.h, f.row[k], f.h.weight, f.h.terms[0]
-    u = rows[row, SPEED], rows[row, SPEED + 1], rows[row, SPEED + 2]
-    way, changed = turned(g, k, scale(u, age), h.turn), (0.5 * guards.acceleration * age * age) ** 2
-    often = (age / f.clock[1]) ** 2
+def add_way(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
+    """Rows of a member that has moved since it was at its position."""
+    g, h, w, t, n, age = f.g, f.h, f.h.weight, f.h.turn, f.h.terms[0], f.clock[0] - f.since[k]
+    often, changed = (age / f.clock[1]) ** 2, (0.5 * guards.acceleration * age * age) ** 2
+    first = 3 * g.block[k, TURN]
+    h.block[n], h.terms[0] = g.block[k, TURN], n + 1 if has(g, k, TURN) else n
     for c in range(3):
-        i = 3 * c
-        h.z[c] -= w[i] * way[0] + w[i + 1] * way[1] + w[i + 2] * way[2]
         for d in range(3):
-            h.variance[c] += w[i + d] ** 2 * (often * rows[row, STEP + d] + changed)
-    if has(g, k, TURN):
-        t, first = h.turn, 3 * g.block[k, TURN]
-        h.block[n], h.terms[0] = g.block[k, TURN], n + 1
-        for c in range(3):
-            for d in range(3):
-                by = w[3 * c] * t[d] + w[3 * c + 1] * t[3 + d] + w[3 * c + 2] * t[6 + d]
-                w[9 * n + 3 * c + d] = by
-                h.z[c] += by * g.x[first + d]
+            a = w[3 * c + d]
+            h.z[c] -= a * f.way[k, d]
+            h.variance[c] += a * a * (often * rows[f.row[k], STEP + d] + changed)
+            by = w[3 * c] * t[d] + w[3 * c + 1] * t[3 + d] + w[3 * c + 2] * t[6 + d]
+            w[9 * n + 3 * c + d] = by
+            h.z[c] += by * g.x[first + d] if h.terms[0] > n else 0.0

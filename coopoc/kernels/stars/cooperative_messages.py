@@ -20,6 +20,7 @@ from .cooperative_state import (
     MEAN,
     NO_POSITION,
     ODOMETER,
+    PACE,
     SLIPS,
     SOLO,
     SOLO_VARIANCE,
@@ -146,8 +147,6 @@ def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> No
         rows[row, ODOMETER + c] = f.way[k, c] / gap if follows else rows[row, SPEED + c]
     steady(f, guards, j, rows[row], ODOMETER, STEP, 1.0)
     u = rows[row, ODOMETER], rows[row, ODOMETER + 1], rows[row, ODOMETER + 2]
-    if status[SLIPS] > 0.0:
-        rows[row, SPEED], rows[row, SPEED + 1], rows[row, SPEED + 2] = u
     drive(f, model, k, scale(u, gap), gap)
     half, often = 0.5 * (1.0 + 1.0 / steps), steps if follows else (gap / dt) ** 2
     for c in range(3):
@@ -194,11 +193,15 @@ def content(
 
 
 @part
-def goes_on(f: Filter, rows: Floats, k: int) -> None:
-    """How far member k has moved since it sent its newest message."""
-    age, row = f.clock[0] - f.since[k], f.row[k]
-    u = rows[row, SPEED], rows[row, SPEED + 1], rows[row, SPEED + 2]
+def goes_on(f: Filter, rows: Floats, k: int) -> bool:
+    """How far member k has moved since it sent its newest message, by the velocity in that if it is plausible, and the
+    derivatives of the way; False if the message is of now."""
+    age, row, status = f.clock[0] - f.since[k], f.row[k], f.status[f.vehicle[k]]
+    u = status[PACE], status[PACE + 1], status[PACE + 2]
+    if status[SLIPS] == 0.0:
+        u = rows[row, SPEED], rows[row, SPEED + 1], rows[row, SPEED + 2]
     store(f.way[k], 0, turned(f.g, k, scale(u, age), f.h.turn) if age > ROUNDING else (0.0, 0.0, 0.0))
+    return bool(age > ROUNDING)
 
 
 @inside

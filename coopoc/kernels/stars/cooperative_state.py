@@ -47,6 +47,8 @@ NO_POSITION = 1e200
 """m^2, variance of the mean of no fixes."""
 SLIPPED = 5.0
 """Implausible velocities in a row after which one counts again."""
+
+
 class Guards(NamedTuple):
     """What is expected to go wrong, and from when on it is believed; 0 switches a guard off.
 
