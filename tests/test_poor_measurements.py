@@ -27,8 +27,8 @@ from coopoc import (
     rt_le,
     run_study,
 )
-from coopoc.learned import GainNet, LearnedGain
 from coopoc.kernels.stars.cooperative_state import NO_GUARDS
+from coopoc.learned import GainNet, LearnedGain
 from coopoc.methods.cooperative_filter import CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.studies.views import of

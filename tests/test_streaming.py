@@ -16,8 +16,8 @@ from shell import ran
 
 from coopoc import V2X, CooperativeFilter, Fleet, JointFilter, Kalman, NoiseModel, Sensors, StarStream, observe
 from coopoc.arrays import Bools, Floats
-from coopoc.learned import GainNet, LearnedGain, OptimisedKF
 from coopoc.kernels.stars.cooperative_state import NO_GUARDS
+from coopoc.learned import GainNet, LearnedGain, OptimisedKF
 from coopoc.methods.kalman import AdaptiveKalman
 from coopoc.methods.motion_history import MotionHistory
 from coopoc.methods.star_stream import RelativeMeasurement

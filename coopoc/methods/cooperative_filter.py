@@ -127,8 +127,7 @@ class CooperativeFilter(Checked):
         known = resolve(self.noise_model, check_recording(recording))
         guards = guards_of(self, known, recording.measured)
         model, notes = model_of(known, guards), list(known.notes)
-        variance = guards.fix**2 * np.asarray(known.fix_variance(recording))
-        sent = Sent(*fading_memory(recording.gnss, recording.velocity, variance, recording.dt))
+        variance, sent = guards.fix**2 * known.fix_variance(recording), broadcasts(recording, known, guards)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
             seen, assumed = measurements(recording, ego, box), assumptions(recording, known, ego, box)
@@ -151,6 +150,12 @@ class CooperativeFilter(Checked):
             yield Estimate(x, cov, neighbours, extras=extras)
 
         return follow_egos(self, recording, egos, run, notes)
+
+
+def broadcasts(recording: Recording, noise_model: NoiseModel, guards: Guards) -> Sent:
+    """Messages of all vehicles."""
+    variance = guards.fix**2 * noise_model.fix_variance(recording)
+    return Sent(*fading_memory(recording.gnss, recording.velocity, variance, recording.dt))
 
 
 def otherwise(ego: str, found: Floats) -> list[str]:

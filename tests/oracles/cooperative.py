@@ -202,9 +202,10 @@ class Oracle:
             b = copy.deepcopy(true)
             self.average(b)
             x = b.at(("x", self.ego))
-            found.append((b.x[x], b.p[x, x], [true.x[true.at(("x", j))] + self.state["way"][j] for j in self.neighbours(t)[1]]))
-        others = [np.array(o).reshape(-1, 3) for *_, o in found]
-        return np.array([x for x, *_ in found]), np.array([p for _, p, _ in found]), others
+            others = [true.x[true.at(("x", j))] + self.state["way"][j] for j in self.neighbours(t)[1]]
+            found.append((b.x[x], b.p[x, x], others))
+        neighbours = [np.array(o).reshape(-1, 3) for *_, o in found]
+        return np.array([x for x, *_ in found]), np.array([p for _, p, _ in found]), neighbours
 
     def average(self, b: Belief) -> None:
         life, slot = self.life, self.state["slot"]
@@ -315,7 +316,8 @@ class Oracle:
             self.join(t, j, messages[j], relative[j])
         if np.isfinite(fix).all():
             self.add_fix(t, fix)
-        for j in sorted(s["members"], key=lambda j: int(s["slot"][j])):
+        at = {j: b.x[b.at(("x", j))] + s["way"].get(j, 0.0) for j in (self.ego, *s["members"])}
+        for j in sorted(s["members"], key=lambda j: float(np.linalg.norm(at[j] - at[self.ego]))):
             new = j in s["vague"] and messages[j] is not None
             if not (new and g.trust and np.isfinite(relative[j]).all()):
                 messages[j] = self.receive(t, j, messages[j])
@@ -539,6 +541,7 @@ class Oracle:
             b.x[b.at(("x", j))] -= (t - message.step) * self.seen.dt * message.velocity
         s["vague"].add(j)
         s["locked"].pop(j, None)
+        s["way"].pop(j, None)
         self.add_turn(j)
         if j not in s["trusted"]:
             mean, variance = s["kept"].get(j, (np.zeros(3), np.full(3, self.guards.tau**2)))
@@ -629,7 +632,7 @@ class Oracle:
             return message
         gap, steps = message.step - since, message.step - last.step if last else 1
         follows, moved = bool(last and since == last.step), message.odometer - (last.odometer if last else 0.0)
-        u, q = self.steady(t, j, moved / (gap * dt) if follows else message.velocity, message.process)
+        u, q = self.steady(t, j, moved / (gap * dt) if follows and steps > 1 else message.velocity, message.process)
         self.drive(j, gap * dt * u, gap)
         half, spent = (1 + 1 / steps) / 2, (steps if follows else gap**2) * q
         b.noise(("x", j), half * spent)

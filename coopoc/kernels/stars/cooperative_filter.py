@@ -235,12 +235,14 @@ def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, 
         for c in range(4):
             f.q[k, c] = math.nan
     add_fix(f, model, guards, own)
-    for k in range(1, len(f.vehicle)):
-        if f.vehicle[k] >= 0:
-            new = f.vague[k] > 0.0 and rows[f.row[k], AGE] >= 0.0
-            if not (new and guards.trust > 0.0 and measured_whole(rows, f.row[k])):
-                receive(f, model, guards, rows, k)
-            goes_on(f, rows, k)
+    locate(f, f.g)
+    members = nearest_first(f)
+    for i in range(members):
+        k = f.order[i]
+        new = f.vague[k] > 0.0 and rows[f.row[k], AGE] >= 0.0
+        if not (new and guards.trust > 0.0 and measured_whole(rows, f.row[k])):
+            receive(f, model, guards, rows, k)
+        goes_on(f, rows, k)
     locate(f, f.g)
     members = nearest_first(f)
     measure(f, model, guards, rows, members)

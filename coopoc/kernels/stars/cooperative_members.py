@@ -143,7 +143,7 @@ def join(f: Filter, model: Model, guards: Guards, rows: Floats, vehicle: int, ro
     f.joined[k], f.vague[k], age = f.step[0], model.flat, max(rows[row, AGE], 0.0)
     f.since[k] = f.clock[0] - age
     for c in range(3):
-        f.hits[k, c] = 0
+        f.hits[k, c], f.way[k, c] = 0, 0.0
     ego, first = 3 * g.block[0, PLACE], insert(g, k, PLACE, 0.0)
     near, whole = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row)
     for c in range(3):

@@ -144,7 +144,7 @@ def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> No
     follows = again and abs(f.since[k] - status[USED]) <= ROUNDING
     for c in range(3):
         f.way[k, c], status[LAST + 6 + c] = rows[row, ODOMETER + c] - status[LAST + 6 + c], rows[row, ODOMETER + c]
-        rows[row, ODOMETER + c] = f.way[k, c] / gap if follows else rows[row, SPEED + c]
+        rows[row, ODOMETER + c] = f.way[k, c] / gap if follows and steps > 1.0 else rows[row, SPEED + c]
     steady(f, guards, j, rows[row], ODOMETER, STEP, 1.0)
     u = rows[row, ODOMETER], rows[row, ODOMETER + 1], rows[row, ODOMETER + 2]
     drive(f, model, k, scale(u, gap), gap)

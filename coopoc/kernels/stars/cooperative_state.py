@@ -96,7 +96,7 @@ class Guards(NamedTuple):
     scale: float = 0.1
     lasts: float = 1e5
     compass: float = 0.05
-    offset: float = 0.05
+    offset: float = 0.15
     absent: float = 8.0
     slip: float = 0.7
     fix: float = 1.0
