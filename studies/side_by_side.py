@@ -102,6 +102,9 @@ STUDY = lineup.study(
     tables={
         "rt_le": _table("RT-LE [m] against K.", "rt_le_m"),
         "nees": _table("NEES against K (3 is consistent; 2 in the plane).", "nees", best=None, intervals=False),
+        "in_band": _table(
+            "Share of steps whose run-averaged NEES is in its 99 % band.", "nees_inside", best=None, intervals=False
+        ),
         "innovation": _table(
             "RMS innovation of the fixes [m] against K: how well a method predicts the next fix.", "innovation_m"
         ),
