@@ -1,4 +1,4 @@
-"""Accuracy against bytes, sent once for a training or in every second of a drive, and the break-even of the two."""
+"""Accuracy against bytes, sent once for a training or in every second of a drive."""
 
 from __future__ import annotations
 
@@ -6,14 +6,11 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
-import numpy as np
-
-from coopoc.study.numbers import Number, Where, across, difference, interval, mean, present, ratio, rms
+from coopoc.study.numbers import Where, across, difference, interval, mean, present, ratio, rms
 from coopoc.study.style import look
-from coopoc.study.tables import Table
 from coopoc.world.channels import CHANNELS
 
-from . import lineup, scene, weights
+from . import lineup, scene
 from .lineup import PAST
 from .views import of, selections
 
@@ -131,41 +128,6 @@ def _rate(results: Results, where: Where, value: str = PAYLOAD) -> int | None:
     return None if rate is None else round(rate)
 
 
-def even(results: Results) -> Table | None:
-    """Driving time after which online cooperation has moved as many bytes as a training, per method and channel."""
-
-    def time(once: float) -> Number:
-        def column(results: Results, where: Where) -> str | None:
-            rate = mean(results, where, PAYLOAD)
-            return None if rate is None else duration(once / rate if rate else np.inf)
-
-        return column
-
-    ran = [name for name in TRAINED if present(results, {"method": name})]
-    sizes = {look(name).label: weights.ledger(results.settings, name).per_vehicle("training") for name in ran}
-    once = {f"{name}, {size / 1e3:,.0f} kB": time(size) for name, size in sizes.items()}
-    rows = [row for row in METHODS if row[1]["noise_model"] == "nominal"] if once else []
-    text = (
-        f"Driving time after which online cooperation (K = {MOST}) has moved as many bytes as each training moved per "
-        "vehicle, once: payload, per receiver."
-    )
-    head = ("Channel", "Online", "Noise model")
-    return selections(head, rows, {"Payload [B/s]": _rate, **once}, text)(results)
-
-
-def duration(seconds: float) -> str:
-    """Seconds in a unit that suits them.
-
-    >>> duration(0.3), duration(5), duration(600), duration(7300), duration(float("inf"))
-    ('< 1 s', '5 s', '10 min', '2.0 h', 'never')
-    """
-    if seconds < 60:
-        return f"{seconds:.0f} s" if seconds >= 1 else "< 1 s"
-    if not np.isfinite(seconds):
-        return "never"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
-
-
 METHODS = [
     ((WORDS[name], look(pair[0]).label, pair[1]), of(*pair, **over(name, MOST))) for name in CHANNELS for pair in SHARED
 ]
@@ -201,7 +163,6 @@ STUDY = lineup.study(
             unranked=("Difference",),
             decimals=3,
         ),
-        "break_even": even,
     },
     figures={"pareto": _figure},
     findings=_findings,

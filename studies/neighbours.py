@@ -1,4 +1,4 @@
-"""Collaborative training against collaborative decision: RT-LE against neighbours and rates (paper, Fig. 5)."""
+"""Collaborative training against collaborative decision: RT-LE against neighbours (paper, Fig. 5)."""
 
 from __future__ import annotations
 
@@ -20,25 +20,17 @@ if TYPE_CHECKING:
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
 
-IDEAL: dict[str, Any] = {"rate_hz": 10.0, "cap_bytes_per_second": 0.0}
-"""The channel that passes a message at every step."""
 NEIGHBOURS = (0, 1, 2, 3, 4, 6, 8, 10)
-LIMITS = [{**IDEAL, "rate_hz": rate} for rate in (5.0, 2.0, 1.0)]
-LIMITS += [{**IDEAL, "cap_bytes_per_second": cap} for cap in (300.0, 600.0, 1200.0)]
 TRAINED = ("okf", "fedkalmannet", "centralised")
 MODELS = ["identity", "nominal", "fitted"]
-BUDGETED = ["lkf-sa", "joint"]
 FILTERS = ["kalman", "lkf-sa", "lkf-sa-edge", "msmv-r", "joint"]
 
 
 def _grid() -> list[Params]:
-    """Every method at every K over an ideal channel, then the cooperative ones at K = 10 under rates and byte caps."""
+    """Every method at every K."""
     solo = [("gnss", "none"), *((m, "trained") for m in TRAINED), BOUND, *(("kalman", model) for model in MODELS)]
     shared = [(m, model) for m in lineup.COOPERATIVE for model in MODELS]
-    return [
-        *(of(*pair, max_neighbours=k, **IDEAL) for k in NEIGHBOURS for pair in (*solo, *shared)),
-        *(of(*pair, max_neighbours=10, **limit) for limit in LIMITS for pair in shared if pair[0] in BUDGETED),
-    ]
+    return [of(*pair, max_neighbours=k) for k in NEIGHBOURS for pair in (*solo, *shared)]
 
 
 def _meaningful(p: Params) -> bool:
@@ -52,8 +44,8 @@ def _meaningful(p: Params) -> bool:
 
 
 def _under(*noise_model: str, **more: Any) -> dict[str, Any]:
-    """Cells over the ideal channel with these noise models, and those of methods that have none."""
-    return {"noise_model": [*noise_model, "none", "trained", "bound"], **IDEAL, **more}
+    """Cells with these noise models, and those of methods that have none."""
+    return {"noise_model": [*noise_model, "none", "trained", "bound"], **more}
 
 
 BOUND_NOTE = "The bound is for the rms over runs of causal estimates, over an ideal channel and without the bias."
@@ -64,7 +56,7 @@ def _sides(results: Results) -> Plot | None:
     """Training against cooperation: identity covariances on the left, fitted ones on the right."""
     x = {k: {"max_neighbours": k} for k in NEIGHBOURS}
     panels = [
-        Panel(x, {**IDEAL, "noise_model": model}, f"{model.capitalize()} covariances", "Neighbours K")
+        Panel(x, {"noise_model": model}, f"{model.capitalize()} covariances", "Neighbours K")
         for model in ("identity", "fitted")
     ]
     solo = [of("gnss", "none"), *(of(name, "trained") for name in ("fedkalmannet", "centralised", "okf"))]
@@ -108,12 +100,12 @@ def _answer(results: Results) -> str:
 
 
 def _at(method: str, noise_model: str, k: int) -> dict[str, Any]:
-    return of(method, noise_model, **IDEAL, max_neighbours=k)
+    return of(method, noise_model, max_neighbours=k)
 
 
 def _steps(results: Results, noise_model: str, *methods: str) -> list[int]:
     """The K >= 1 at which one of the methods was run with this noise model."""
-    where = present(results, {"method": list(methods), "noise_model": noise_model, **IDEAL})
+    where = present(results, {"method": list(methods), "noise_model": noise_model})
     return sorted(int(k) for k in results.select(where)["max_neighbours"].unique() if k) if where else []
 
 
@@ -173,19 +165,18 @@ STUDY = lineup.study(
     "What does another neighbour bring online, at what cost, and can collaborative training replace it?",
     grid=_grid(),
     where=_meaningful,
-    settings={**scene.TOWN, **scene.WEIGHTS, "runs": 30, "train_seeds": 5},
-    shares=("max_neighbours", "rate_hz", "cap_bytes_per_second"),
+    settings={
+        **scene.TOWN,
+        **scene.WEIGHTS,
+        "runs": 30,
+        "train_seeds": 5,
+    },
+    shares=("max_neighbours",),
     tables={
         **{
             f"rt_le_{model}": k_table(f"RT-LE [m] against K, {model} noise model.", BOUND_NOTE, where=_under(model))
             for model in ("identity", "fitted", "nominal")
         },
-        "budget": k_table(
-            "RT-LE [m] at K = 10 under rates and caps (0: no cap).",
-            rows=["rate_hz", "cap_bytes_per_second"],
-            columns=["method", "noise_model"],
-            where={"method": BUDGETED, "max_neighbours": 10, "noise_model": MODELS},
-        ),
         "nees": k_table(
             "NEES against K (3 is consistent), nominal noise model.",
             value="nees",

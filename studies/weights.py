@@ -23,7 +23,6 @@ from coopoc.world.v2x import V2X
 from .scene import Start, fleet, is_real, start
 
 if TYPE_CHECKING:
-    from coopoc.evaluate.ledger import Ledger
     from coopoc.learned.checkpoint import Checkpoint
     from coopoc.learned.training.drives import Drives
     from coopoc.methods.noise_model import NoiseModel
@@ -163,13 +162,6 @@ def trained(results: Results) -> list[str]:
     """The trained methods that a study has run."""
     ran = results.frame["method"].unique() if "method" in results.frame else ()
     return sorted((name for name in ran if is_trained(name)), key=lambda name: (*LEARNED, name).index(name))
-
-
-def ledger(p: Params, name: str) -> Ledger:
-    """The bytes of a training, from the card of the first seed."""
-    from coopoc.learned.federation.history import card_ledger
-
-    return card_ledger(checkpoint(name, p, 0).card, fleet(p["clients"]))
 
 
 def described(results: Results) -> Mapping[str, str]:
