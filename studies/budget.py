@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-from coopoc.study.numbers import Where, across, difference, interval, mean, present, ratio, rms
+from coopoc.study.numbers import Where, across, difference, interval, mean, present
 from coopoc.study.style import look
 from coopoc.world.channels import CHANNELS
 
@@ -15,6 +14,8 @@ from .lineup import PAST
 from .views import of, selections
 
 if TYPE_CHECKING:
+    import pandas as pd
+
     from coopoc.study.figures import Plot
     from coopoc.study.results import Results
 
@@ -83,43 +84,25 @@ def _figure(results: Results) -> Plot | None:
     return figures.pareto(results, scene.caption(results, text), PAYLOAD, where=where)
 
 
-class Choice(NamedTuple):
-    """RT-LE in metres, payload bytes per second, and the selection that has them."""
-
-    error: float
-    size: float
-    where: Where
-
-
-def choices(results: Results) -> list[Choice]:
-    """All methods that were run over an ideal channel."""
-    names, each = [*AXES, "method", "noise_model"], list[Choice]()
-    for key, _ in results.frame.groupby(names, sort=False) if set(names) <= set(results.frame) else ():
-        where = dict(zip(names, key, strict=True))
-        error = mean(results, where) if where["channel"] == "ideal" and where["method"] != "bound" else None
-        if error is not None:
-            each.append(Choice(error, mean(results, where, PAYLOAD) or 0.0, where))
-    return each
-
-
-def best_under(each: Sequence[Choice], limit: float) -> Choice | None:
-    """The best method of them within `limit` bytes per second."""
-    return min((choice for choice in each if choice.size <= limit), key=lambda choice: choice.error, default=None)
+def choices(results: Results) -> pd.DataFrame:
+    """Mean RT-LE m and payload B/s of all methods that were run over an ideal channel, indexed by their selection."""
+    rows, names = results.frame, [*AXES, "method", "noise_model"]
+    if not {*names, PAYLOAD} <= set(rows):
+        return rows.iloc[:0]
+    ideal = rows[(rows["channel"] == "ideal") & (rows["method"] != "bound")].fillna({PAYLOAD: 0.0})
+    return ideal.groupby(names, sort=False)[["rt_le_m", PAYLOAD]].mean()
 
 
 def _findings(results: Results) -> dict[str, str]:
     texts, each = {}, choices(results)
     for limit in LIMITS:
-        best = best_under(each, limit)
-        if best:
-            where, k = best.where, best.where["max_neighbours"]
-            first = "" if where["schedule"] == SCHEDULES[0] else f", {where['schedule']}"
-            at = f", K = {k}{first}, {best.size:.0f} B/s" if k else ""
+        if not (within := each[each[PAYLOAD] <= limit] if len(each) else each).empty:
+            where = dict(zip(within.index.names, within["rt_le_m"].idxmin(), strict=True))
+            error, size = within["rt_le_m"].min(), within.loc[tuple(where.values()), PAYLOAD]
+            at = f", K = {where['max_neighbours']}, {where['schedule']}, {size:.0f} B/s" if size else ""
             words = f"At most {limit:g} B/s" if limit else "Without a byte while driving"
-            how = f"{look(where['method']).label} ({where['noise_model']}){at}"
-            times = ratio(rms(results, where), rms(results, {"method": "bound", "max_neighbours": k}))
-            far = f", {times:.2f} times the bound" if times else ""
-            texts[f"{limit:g} B/s"] = f"{words}: best is {how}, {best.error:.3f} m{far}."
+            best = f"{look(where['method']).label} ({where['noise_model']}){at}"
+            texts[f"{limit:g} B/s"] = f"{words}: best is {best}, {error:.3f} m."
     return texts
 
 

@@ -183,12 +183,6 @@ STUDY = lineup.study(
             where=_under("nominal", method=FILTERS),
             best=None,
         ),
-        "neighbours_errors": k_table(
-            "Error of what the egos think of their neighbours [m].",
-            value="neighbour_rt_le_m",
-            rows=("method", "noise_model"),
-            where=_under("identity", "fitted", method=FILTERS[1:], max_neighbours=list(NEIGHBOURS[1:])),
-        ),
     },
     figures={"rt_le": _sides},
     findings=findings,
