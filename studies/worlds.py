@@ -70,9 +70,10 @@ def world(seed: int, split: Split = "test", *, without: Collection[str] = (), ev
             raise unknown("without", kind, KINDS)
     scene = _nominal(key, split)
     kinds = [kind for kind in _kinds(_rng(key, "kinds"), scene) if kind not in without]
-    text = _text(scene)
+    texts = [_text(scene)]
     for kind in kinds:
-        scene = KINDS[kind](scene, _rng(key, kind))
+        scene, words = KINDS[kind](scene, _rng(key, kind))
+        texts.append(f"{kind}: {words}")
     recording = observe(
         scene.fleet,
         scene.acting,
@@ -84,8 +85,7 @@ def world(seed: int, split: Split = "test", *, without: Collection[str] = (), ev
     )
     for edit in scene.edits:
         recording = edit(recording)
-    text = "; ".join((text, *(f"{kind}: {words}" for kind, words in zip(kinds, scene.words, strict=True))))
-    return World(seed, replace(recording, notes=()), scene.fleet, scene.egos, tuple(kinds), text)
+    return World(seed, replace(recording, notes=()), scene.fleet, scene.egos, tuple(kinds), "; ".join(texts))
 
 
 def _rng(key: int, *words: str) -> Draws:
