@@ -57,9 +57,7 @@ class Drive:
     @property
     def ids(self) -> tuple[str, ...]:
         """Of those that move."""
-        rec = self.recording
-        stand = np.flatnonzero(np.nansum(np.abs(rec.velocity), axis=(0, 1, 3)) == 0.0) if rec.body is None else ()
-        return tuple(name for k, name in enumerate(rec.ids) if k not in rec.landmarks and k not in stand)
+        return tuple(name for k, name in enumerate(self.recording.ids) if k not in self.recording.landmarks)
 
 
 def calibrated(p: Params) -> float:
@@ -104,12 +102,6 @@ def has_true_poses(data: str) -> bool:
     return isinstance(log, MrclamLog) or (log.truth is not None and log.truth.heading is not None)
 
 
-def in_world(data: str) -> bool:
-    """Whether velocities are those of the world's frame: there are no headings to be estimated."""
-    log = _part(data)
-    return isinstance(log, Log) and log.recording.body is None
-
-
 def check(data: str, until: float, gate: float) -> None:
     """Read all that cells share.
 
@@ -124,7 +116,7 @@ def check(data: str, until: float, gate: float) -> None:
     log = _part(data)
     if isinstance(log, MrclamLog):
         surveyed(log), _calibration(data, until)
-    elif not in_world(data):
+    else:
         _begin(data, gate)
 
 
@@ -146,8 +138,6 @@ def drive(data: str, until: float, v2x: V2X, gate: float) -> Drive:
         recording = under(pose_recording(log, _calibration(data, until)), v2x, logged=False)
         return Drive(recording, pose_start(recording, gate=gate), log.fleet, True)
     recording = under(log.recording, v2x, logged=log.messages)
-    if in_world(data):
-        return Drive(recording, None, log.truth, False)
     told = recording.sensors
     lasting = max(told.speed_scale_std, told.yaw_rate_bias_std, told.range_offset_std) > 0
     begin, where = _begin(data, gate)
@@ -161,10 +151,8 @@ def described(data: str) -> str:
         return "Wheel odometry, ranges and bearings of {}; no fix, no compass. The first {:.3g} s calibrate the noise."
     read = ", ".join(f"{number} {what}" for what, number in log.summary.read.items() if number)
     where = "" if (span := _log(data)[1]) == "throughout" else f" {span},"
-    begin = "" if in_world(data) else _begin(data, GATE)[1]
-    return (
-        f"What {{}} holds ({read}),{where} with the noise that it states{begin}; the first {{:.3g}} s are not scored."
-    )
+    noise = f"with the noise that it states{_begin(data, GATE)[1]}; the first {{:.3g}} s are not scored."
+    return f"What {{}} holds ({read}),{where} {noise}"
 
 
 def digests(data: str) -> dict[str, str]:
@@ -219,7 +207,10 @@ def _log(data: str) -> tuple[MrclamLog | Log, str]:
         allowed = "must be the path of measurements, not only of drives"
         raise InputError("data", repr(data), allowed, hint if Path(name).exists() else bring(name, hint))
     log = load_log(data)
-    return (log, "throughout") if log.recording.body is None else together(log)
+    if log.recording.body is None:
+        hint = f"Take coopoc run side_by_side --data {data!r}."
+        raise InputError("data", repr(data), "is a log in the world's frame, and filters here estimate headings", hint)
+    return together(log)
 
 
 @lru_cache(maxsize=2)
