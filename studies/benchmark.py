@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from tqdm import tqdm
@@ -31,7 +31,7 @@ from .convoys import CONVOYS, convoy_row
 from .lineup import named_method, own
 from .roads import ROADS, road_row, roads
 from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, Task, bound, graph_row, pose_row, recording, rounded
-from .worlds_card import card_file, card_head, overview, run_worlds
+from .worlds_card import card_file, card_head, markdown, overview, run_worlds
 
 ROAD = "road-kalman"
 """Of which others are shown to be better or worse on the same blocks of real roads."""
@@ -95,9 +95,9 @@ def benchmark(
         elif data is None and not tasks:
             hint = "Add --data FOLDER, or --tasks with what coopoc data get has fetched."
             raise InputError("data", None, f"must name the folder of measurements for {name}", hint)
-        if tasks and not ((simulated(name) and set(tasks) & {*known}) or set(tasks) & {*measurable(name, data)}):
-            allowed = f"must be of {', '.join([*known][: len(known) * simulated(name)] + measurable(name, data))}"
-            raise InputError(f"tasks of {name}", ", ".join(tasks), allowed, "Name one of these.")
+        own_tasks = [*(known if simulated(name) else ()), *measurable(name, data)]
+        if tasks and not set(tasks) & {*own_tasks}:
+            raise InputError(f"tasks of {name}", ", ".join(tasks), f"must be of {', '.join(own_tasks)}", "Name one.")
     failed = 0
     for name in methods:
         began = time.perf_counter()
@@ -152,32 +152,19 @@ def tried(name: str, task: Task) -> Row:
     return row
 
 
-def measurable(name: str, data: Path | None) -> list[str]:
-    """The tasks of real measurements for a name: graphs for a backend, logs for a pose filter, roads for a solo method,
-    convoys for any other; of "mine.py:NAME" logs, or roads if it says `roads = True`."""
+def measurable(name: str, data: Path | None) -> dict[str, Callable[[], Row]]:
+    """The tasks of real measurements for a name, and what runs each: graphs for a backend, logs for a pose filter,
+    roads for a solo method, convoys for any other; of "mine.py:NAME" logs, or roads if it says `roads = True`."""
     if name in names("coopoc.backends"):
-        return [*BEST]
+        return {file: partial(graph_row, data, file, name) for file in BEST}
     if name in POSES or (in_file(name) and not _on_roads(name)):
-        return [task.name for task in LOGGED]
-    found = [] if named_method(name).cooperative else [*roads(data)]
-    return found + [*CONVOYS] * (roads(data) is ROADS)
-
-
-def measured(name: str, data: Path | None, tasks: Sequence[str] | None = None) -> list[Row]:
-    """Rows of the tasks of real measurements for a name, or of some of them."""
-    logged: dict[str, Any] = {task.name: task for task in LOGGED}
-    rows = []
-    for task in tqdm([one for one in measurable(name, data) if tasks is None or one in tasks], name, delay=2.0):
-        if task in BEST:
-            made: Callable[[], Row] = partial(graph_row, data, task, name)
-        elif task in logged and task not in roads(data):
-            made = partial(pose_row, logged[task], data, own(name) if in_file(name) else name)
-        elif task in CONVOYS:
-            made = partial(convoy_row, task, data, named_method(name))
-        else:
-            made = partial(road_row, task, data, named_method(name))
-        rows.append(_row(task, made))
-    return rows
+        made = own(name) if in_file(name) else name
+        return {task.name: partial(pose_row, task, data, made) for task in LOGGED}
+    method, places = named_method(name), roads(data)
+    found = {} if method.cooperative else {task: partial(road_row, task, data, method) for task in places}
+    if places is ROADS:
+        found |= {task: partial(convoy_row, task, data, method) for task in CONVOYS}
+    return found
 
 
 def _row(task: str, made: Callable[[], Row]) -> Row:
@@ -210,7 +197,9 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None, real: Seque
     rows = [
         _row(task.name, partial(tried, name, task)) for task in tqdm(list(tasks), desc=name, unit="task", delay=2.0)
     ]
-    rows += measured(name, data, [] if data is None and real is None else real)
+    if data or real is not None:
+        for task, run in tqdm(measurable(name, data).items(), name, delay=2.0):
+            rows += [_row(task, run)] if real is None or task in real else []
     return {**card_head(name), "tasks": rows}
 
 
@@ -219,11 +208,8 @@ def page(cards: Iterable[Params]) -> str:
 
     Of simulated ones RT-LE in m and, in parentheses, over its bound, the least geometric mean over all tasks first.
     """
-    from tabulate import tabulate
-
     given = list(cards)
-    tables = [rows for rows in (_simulated(given), _logs(given), _graphs(given)) if rows]
-    return "\n\n".join(tabulate(rows, headers="keys", tablefmt="github", disable_numparse=True) for rows in tables)
+    return "\n\n".join(markdown(rows) for rows in (_simulated(given), _logs(given), _graphs(given)) if rows)
 
 
 def _logs(cards: Sequence[Params]) -> list[Row]:

@@ -100,8 +100,6 @@ def noise_model(p: Params) -> NoiseModel | str:
             hint = "Take nominal or fitted on real data."
             raise InputError("noise_model", "'oracle'", "is for simulated noise", hint)
         return NoiseModel.oracle(scene.sensors(p), scene.fleet(p["data"]))
-    if p["noise_model"] == "heading taken as exact":
-        return NoiseModel.nominal(replace(scene.sensors(p), heading_std=0.0, heading_bias_std=0.0))
     return str(p["noise_model"])
 
 

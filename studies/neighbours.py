@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from coopoc.study.numbers import Where, difference, interval, listed, mean, present, ran, rms, three
+from coopoc.study.numbers import Number, Where, interval, listed, mean, present, rms
 from coopoc.study.study import Params
 from coopoc.study.style import Panel
 
@@ -73,21 +71,46 @@ def _interval(results: Results, where: Where) -> Any:
     return (mean if where["method"] == "bound" else interval)(results, where)
 
 
+LISTED: Mapping[str, tuple[str, Number, Mapping[str, tuple[str, str]]]] = {
+    "identity": (
+        "Identity covariances, as the paper's baselines, K = {k}",
+        mean,
+        {"federated": ("fedkalmannet", "trained"), "LKF-SA": ("lkf-sa", "identity"), "GNSS": ("gnss", "none")},
+    ),
+    "fitted": (
+        "Fitted covariances, K = {k}",
+        mean,
+        {
+            "FedKalmanNet": ("fedkalmannet", "trained"),
+            "KF alone": ("kalman", "fitted"),
+            "LKF-SA": ("lkf-sa", "fitted"),
+            "joint filter": ("joint", "fitted"),
+        },
+    ),
+    "nominal": (
+        "Known covariances, K = {k}, rms over runs",
+        rms,
+        {"KF alone": ("kalman", "nominal"), "joint filter": ("joint", "nominal"), "bound": BOUND},
+    ),
+}
+"""Noise model -> what is compared under it at the largest K; the bound is for the rms over runs."""
+
+
 def findings(results: Results) -> dict[str, str]:
-    """The paper's order under identity covariances, and orders under fitted and nominal ones."""
-    return {
-        "answer": _answer(results),
-        "identity": _identity(results),
-        "fitted": _fitted(results),
-        "nominal": _nominal(results),
-    }
+    """Errors under each noise model, and which of training and cooperation is better."""
+    texts = {"answer": _answer(results)}
+    for model, (words, number, pairs) in LISTED.items():
+        if k := _most(results, model):
+            each = {name: number(results, of(*pair, max_neighbours=k)) for name, pair in pairs.items()}
+            texts[model] = f"{words.format(k=k)}: {listed(each)}." if listed(each) else ""
+    return texts
 
 
 def _answer(results: Results) -> str:
     """Which of the two is better at the largest K, with fitted covariances and with the paper's."""
-    k = max(_steps(results, "fitted", "joint"), default=0)
+    k = _most(results, "fitted")
     fed, joint, paper = (
-        mean(results, _at(*pair, k))
+        mean(results, of(*pair, max_neighbours=k))
         for pair in (("fedkalmannet", "trained"), ("joint", "fitted"), ("lkf-sa", "identity"))
     )
     if fed is None or joint is None or paper is None:
@@ -99,65 +122,10 @@ def _answer(results: Results) -> str:
     )
 
 
-def _at(method: str, noise_model: str, k: int) -> dict[str, Any]:
-    return of(method, noise_model, max_neighbours=k)
-
-
-def _steps(results: Results, noise_model: str, *methods: str) -> list[int]:
-    """The K >= 1 at which one of the methods was run with this noise model."""
-    where = present(results, {"method": list(methods), "noise_model": noise_model})
-    return sorted(int(k) for k in results.select(where)["max_neighbours"].unique() if k) if where else []
-
-
-def _identity(results: Results) -> str:
-    steps = _steps(results, "identity", "lkf-sa")
-    if not steps:
-        return ""
-    lkf = {k: results.interval("rt_le_m", _at("lkf-sa", "identity", k)).mean for k in steps}
-    fed, gnss = (mean(results, _at(m, k, steps[0])) for m, k in (("fedkalmannet", "trained"), ("gnss", "none")))
-    ends = {f"LKF-SA ({ks([k])})": lkf[k] for k in (steps[0], steps[-1])}
-    text = f"Identity covariances, as the paper's baselines: {listed({'federated': fed, **ends, 'GNSS': gnss})}."
-    if fed is not None and gnss is not None:
-        holds = [k for k in steps if fed < lkf[k] < gnss]
-        parts = {"holds": holds, "does NOT hold": [k for k in steps if k not in holds]}
-        verdicts = " and ".join(f"{verb} at {ks(which)}" for verb, which in parts.items() if which)
-        text += f" The paper's order, federated < LKF-SA < GNSS, {verdicts}."
-    gap = difference(results, *(_at("lkf-sa", "identity", k) for k in (steps[-1], steps[0])))
-    if len(steps) > 1 and gap is not None:
-        claim = "falls" if gap.high < 0 else "does NOT fall for certain"
-        interval = f", 95 % [{gap.low:+.3g}, {gap.high:+.3g}]" if np.isfinite(gap.high) else " of one ego and run"
-        text += f" LKF-SA {claim} from K = {steps[0]} to {steps[-1]}: paired difference {gap.mean:+.3g} m{interval}."
-    return text
-
-
-def _fitted(results: Results) -> str:
-    steps = _steps(results, "fitted", *lineup.COOPERATIVE)
-    if not steps:
-        return ""
-    names = {
-        "FedKalmanNet": ("fedkalmannet", "trained"),
-        "fitted KF": ("kalman", "fitted"),
-        "fitted joint filter": ("joint", "fitted"),
-        "fitted LKF-SA": ("lkf-sa", "fitted"),
-    }
-    means = ran({words: mean(results, _at(*pair, steps[-1])) for words, pair in names.items()})
-    order = " < ".join(f"{words} {three(value)} m" for value, words in sorted((v, w) for w, v in means.items()))
-    return f"Fitted covariances, K = {steps[-1]}: {order}."
-
-
-def _nominal(results: Results) -> str:
-    """With the bound, which is for the rms over runs."""
-    steps = _steps(results, "nominal", *lineup.COOPERATIVE)
-    if not steps:
-        return ""
-    names = {"KF alone": ("kalman", "nominal"), "joint filter": ("joint", "nominal"), "bound": BOUND}
-    each = ran({words: rms(results, _at(*pair, steps[-1])) for words, pair in names.items()})
-    return f"Known covariances, K = {steps[-1]}, rms over runs: {listed(each)}." if each else ""
-
-
-def ks(steps: Iterable[int]) -> str:
-    """[1, 2] as "K = 1, 2"."""
-    return "K = " + ", ".join(str(k) for k in sorted(steps))
+def _most(results: Results, noise_model: str) -> int:
+    """The largest K at which a cooperative method was run with this noise model; 0 for none."""
+    where = present(results, {"method": list(lineup.COOPERATIVE), "noise_model": noise_model})
+    return int(results.select(where)["max_neighbours"].max()) if where else 0
 
 
 STUDY = lineup.study(
