@@ -23,14 +23,14 @@ from coopoc.evaluate.statistics import mean_interval, paired_difference
 from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
 from coopoc.methods.track import Method
 from coopoc.one_file import in_file
-from coopoc.plugins import find, names
+from coopoc.plugins import find
 from coopoc.study.numbers import three
 from coopoc.study.study import Params, Row
 
 from .convoys import CONVOYS, convoy_row
 from .lineup import named_method, own
 from .roads import ROADS, road_row, roads
-from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, Task, bound, graph_row, pose_row, recording, rounded
+from .tasks import LOGGED, POSES, TASKS, VALIDATION, Task, bound, pose_row, recording, rounded
 from .worlds_card import card_file, card_head, markdown, overview, run_worlds
 
 ROAD = "road-kalman"
@@ -57,12 +57,12 @@ def benchmark(
 
     Example: coopoc benchmark road-kalman --tasks f9k    # after coopoc data get f9k
 
-    Example: coopoc benchmark pose-fleet gauss-newton --data ~/measured
+    Example: coopoc benchmark pose-fleet --data ~/measured
 
     Example: coopoc benchmark --table --out benchmarks/cards
 
     Args:
-        methods: names of coopoc list, learned gains, FILE.py:NAME; with --data also pose-fleet, ... and backends.
+        methods: names of coopoc list, learned gains, FILE.py:NAME; with --data also pose-fleet, ...
         out: folder of the cards.
         data: folder with the files of the tasks of real measurements (docs/benchmark.md), besides those that coopoc
             data get has fetched, or a log of your own with a truth, on which solo methods are run in the same way.
@@ -83,7 +83,7 @@ def benchmark(
     if seed is not None:
         drawn = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number will do.")
         known = {name: replace(task, seed=drawn) for name, task in known.items()}
-    real = [*BEST, *(task.name for task in LOGGED), *roads(data), *CONVOYS]
+    real = [*(task.name for task in LOGGED), *roads(data), *CONVOYS]
     for name in tasks:
         if name not in (*known, *real):
             raise unknown("tasks", name, [*known, *real], "Leave it out for all.")
@@ -153,10 +153,8 @@ def tried(name: str, task: Task) -> Row:
 
 
 def measurable(name: str, data: Path | None) -> dict[str, Callable[[], Row]]:
-    """The tasks of real measurements for a name, and what runs each: graphs for a backend, logs for a pose filter,
-    roads for a solo method, convoys for any other; of "mine.py:NAME" logs, or roads if it says `roads = True`."""
-    if name in names("coopoc.backends"):
-        return {file: partial(graph_row, data, file, name) for file in BEST}
+    """The tasks of real measurements for a name, and what runs each: logs for a pose filter, roads for a solo method,
+    convoys for any other; of "mine.py:NAME" logs, or roads if it says `roads = True`."""
     if name in POSES or (in_file(name) and not _on_roads(name)):
         made = own(name) if in_file(name) else name
         return {task.name: partial(pose_row, task, data, made) for task in LOGGED}
@@ -176,9 +174,8 @@ def _row(task: str, made: Callable[[], Row]) -> Row:
 
 
 def simulated(name: str) -> bool:
-    """Whether the simulated tasks are for a name: those of backends, of pose filters and of what says `roads` are real
-    ones."""
-    return name not in POSES and name not in names("coopoc.backends") and not _on_roads(name)
+    """Whether the simulated tasks are for a name: those of pose filters and of what says `roads` are real ones."""
+    return name not in POSES and not _on_roads(name)
 
 
 def _on_roads(name: str) -> bool:
@@ -189,7 +186,7 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None, real: Seque
     """The card of a method: what it is, with which versions, and a row for each task.
 
     Args:
-        name: of a method, a pose filter or a backend, or "mine.py:NAME".
+        name: of a method or a pose filter, or "mine.py:NAME".
         tasks: simulated ones.
         data: folder of the real measurements, or None.
         real: tasks of real measurements; None for all that there are for the name, none without data.
@@ -204,18 +201,18 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None, real: Seque
 
 
 def page(cards: Iterable[Params]) -> str:
-    """Markdown tables of cards, of simulated tasks and of logs and graphs where there are any.
+    """Markdown tables of cards, of simulated tasks and of logs where there are any.
 
     Of simulated ones RT-LE in m and, in parentheses, over its bound, the least geometric mean over all tasks first.
     """
     given = list(cards)
-    return "\n\n".join(markdown(rows) for rows in (_simulated(given), _logs(given), _graphs(given)) if rows)
+    return "\n\n".join(markdown(rows) for rows in (_simulated(given), _logs(given)) if rows)
 
 
 def _logs(cards: Sequence[Params]) -> list[Row]:
     """RT-LE, heading error and NEES of pose filters, a row per task and method."""
     rows = []
-    simulated_tasks = {task.name for task in TASKS} | set(BEST)
+    simulated_tasks = {task.name for task in TASKS}
     for one, row in _rows(cards, {row["task"] for card in cards for row in card["tasks"]} - simulated_tasks):
         shown = {"task": row["task"], "method": one, "RT-LE [m]": "failed"}
         if "failed" not in row:
@@ -230,15 +227,6 @@ def _logs(cards: Sequence[Params]) -> list[Row]:
             shown |= {"B/s": row["received_bytes_per_second"], "us/step": row["microseconds_per_step"]}
         rows.append(((row["task"], row.get("rt_le_m", [np.inf])[0]), shown))
     return [shown for _, shown in sorted(rows, key=lambda row: row[0])]
-
-
-def _graphs(cards: Sequence[Params]) -> list[Row]:
-    """Cost over the least known, status and time of backends, a row per backend."""
-    shown: dict[str, Row] = {}
-    for one, row in _rows(cards, set(BEST)):
-        cell = "failed" if "failed" in row else f"{row['over_best']:.4g} {row['status']}, {row['seconds']:.2g} s"
-        shown.setdefault(one, {"backend": one})[row["task"]] = cell
-    return list(shown.values())
 
 
 def _rows(cards: Sequence[Params], tasks: set[str]) -> list[tuple[str, Params]]:

@@ -315,10 +315,6 @@ def _merged(name: str, parts: Sequence[AnyArray], lengths: Sequence[int]) -> Any
     if name in SUMS:
         return np.asarray(np.sum(parts, axis=0))
     power = 2 if name in RMS else 1
-    values, weights = np.stack(parts).astype(float) ** power, np.array(lengths, dtype=float)
-    weights = weights.reshape(-1, *[1] * (values.ndim - 1)) * np.isfinite(values)
-    total = weights.sum(axis=0)
-    mean = np.divide(
-        (np.nan_to_num(values) * weights).sum(axis=0), total, out=np.full(total.shape, np.nan), where=total > 0
-    )
-    return np.asarray(mean ** (1 / power))
+    values = np.ma.masked_invalid(np.stack(parts).astype(float) ** power)
+    mean = np.ma.average(values, axis=0, weights=lengths)
+    return np.asarray(np.ma.filled(mean, np.nan) ** (1 / power))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -22,11 +21,6 @@ PAPER: Mapping[str, tuple[str, ...]] = {
     "neighbours": ("nominal",),
 }
 """Studies of the paper, and the keys of the findings that answer their questions."""
-EVIDENCE = re.compile(
-    r" \(paired[^)]*\)|, (centralised [\d.]+ m, )?OKF [\d.]+ m|, oracle KF [\d.]+ m"
-    r"|; (the )?federated (net|is) [^.(]*(\(paired[^)]*\))?"
-)
-"""What the first screen leaves to the sections."""
 LEAD = "After “Federated Data-Driven Kalman Filtering for State Estimation” (arXiv 2411.05847), on {where}."
 
 
@@ -56,9 +50,7 @@ def paper(
         study = find("coopoc.studies", name)
         results[name] = run_study(study, out=out, jobs=jobs, settings=given, retry_failed=True)
     print(f"coopoc: stage {len(PAPER) + 1} of {len(PAPER) + 1}: report", file=sys.stderr)
-    texts = {
-        results[name].question: EVIDENCE.sub("", reported(name, results[name], keys)) for name, keys in PAPER.items()
-    }
+    texts = {results[name].question: reported(name, results[name], keys) for name, keys in PAPER.items()}
     bundled = [name for name in dict.fromkeys((data, "town10-clients")) if name in DATASETS]
     place = "our fleets" if data in DATASETS else f"{Path(data).name} after training on ours"
     page = report(

@@ -296,26 +296,6 @@ def _trade(results: Results) -> Plot | None:
     return figures.curves(results, panels, lines, caption, error, log=True, logx=True)
 
 
-def _figure(results: Results) -> Plot | None:
-    """Over the landmarks, a line per K and, at the largest, per way of fusion."""
-    from matplotlib import colormaps
-
-    from coopoc.study import figures
-
-    ks, marks = _numbers(results)
-    if len(marks) < 2:
-        return None
-    places = {float(np.log1p(n)): {"landmarks": n} for n in marks}
-    ticks = {place: str(also["landmarks"]) for place, also in places.items()}
-    colors, base = {k: colormaps["viridis"](k / 4.6) for k in ks}, BASE
-    lines = [{**base, "max_neighbours": k, "label": f"One state, K = {k}", "color": colors[k]} for k in ks]
-    names = [*METHODS][1:] if ks[-1] else []
-    lines += [{"method": name, "label": look(name).label, "max_neighbours": ks[-1]} for name in names]
-    panel = Panel(places, xlabel=words("landmarks"), ticks=ticks)
-    caption = _caption(results, f"RT-LE against landmarks; the ways of fusion at K = {ks[-1]}; bands: 95 % intervals.")
-    return figures.curves(results, [panel], lines, caption, number=interval, width=6.6, log=True)
-
-
 def _findings(results: Results) -> dict[str, str]:
     """Key and sentence of what the cells show; a finding whose cells are missing is left out."""
 
@@ -377,7 +357,7 @@ STUDY = Study(
         "nees": partial(_table, value="nees", text="NEES of a pose (3 is consistent).", decimals=1),
         "difference": _gains,
     },
-    figures={"rt_le": _figure, "training": _trade},
+    figures={"training": _trade},
     findings=_findings,
     limitations=(
         "The truth is used on the first part alone: noise, scales and lag of MR.CLAM's odometry are calibrated "

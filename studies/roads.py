@@ -120,8 +120,8 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> R
                 continue
             track = method(recording.between(begin, stop), [column])
             gap, nees = planar(track, truth.between(begin, stop))
-            squares[begin:stop], seconds = np.square(gap).sum(axis=-1), seconds + track.seconds
-            ratios.append(nees[max(start - begin, 0) :])
+            squares[begin:stop], seconds = np.square(gap[0, :, 0]).sum(axis=-1), seconds + track.seconds
+            ratios.append(nees[0, max(start - begin, 0) :, 0])
         parts = [squares[k : k + size] for k in range(start, len(squares) - size + 1, size)]
         blocks += [float(np.sqrt(np.nanmean(part))) for part in parts if np.isfinite(part).any()]
     level = mean_interval(np.array([blocks]))

@@ -20,9 +20,7 @@ from coopoc import (
     load_fleet,
     observe,
     pose_start,
-    read_graph,
     read_log,
-    solve,
 )
 from coopoc.arrays import Floats
 from coopoc.data.fetch import bring, cache_folder, holder, public
@@ -35,6 +33,7 @@ from coopoc.methods.track import Track
 from coopoc.study.study import Row
 from coopoc.world.outliers import Fault, Outliers
 from coopoc.world.spoofing import Spoofing, spoofed
+from coopoc.world.v2x import Message
 
 from . import pose_drives
 from .pose_drives import hashed
@@ -155,13 +154,6 @@ POSES: Mapping[str, Mapping[str, Any]] = {
 GATE = 5.0
 RANGE_STD = 0.3
 """m assumed of a UWB range, whose errors last: the file's 0.04 m is the error of one."""
-BEST: Mapping[str, float] = {
-    "mrclam5a.pyfg": 69.10353,
-    "mrclam6.pyfg": 3144.2650,
-    "plaza1.pyfg": 1332.7850,
-    "tiers.pyfg": 2050.1000,
-}
-"""Graph -> least cost that is known of its chordal objective."""
 
 
 @dataclass(frozen=True)
@@ -246,31 +238,19 @@ def pose_row(task: Logged, folder: Path | None, made: Any) -> Row:
     began = time.perf_counter()
     track = made(recording, ids)
     seconds = time.perf_counter() - began
-    account = of_track(track, recording, made.message)
     squares = np.square(blocks_of(errors(track, fleet)[0], start, task.block_s / fleet.dt))
     level = mean_interval(np.sqrt(squares))
     row: Row = {"task": task.name, "data": hashed(path)}
     row |= {"rt_le_m": rounded(level)}
     if fleet.heading is None:
-        row |= {"nees": round(float(np.nanmean(planar(track, fleet)[1][start:])), 2)}
+        row |= {"nees": round(float(np.nanmean(planar(track, fleet)[1][:, start:])), 2)}
     elif track.heading is not None:
         turned = np.rad2deg(blocks_of(heading_error(track, fleet)[0], start, task.block_s / fleet.dt))
         row |= {"heading_deg": round(float(np.nanmean(turned)), 3)}
         row |= {"nees": round(float(np.nanmean(pose_nees(track, fleet)[0, start:])), 2)}
-    received = account.of("online", "on air", "per receiver") / account.seconds
-    row["received_bytes_per_second"] = round(float(received.mean()))
+    row["received_bytes_per_second"] = received(track, recording, made.message)
     row["microseconds_per_step"] = round(1e6 * seconds / len(recording.t) / len(who), 2)
     return row
-
-
-def graph_row(folder: Path | None, file: str, backend: str) -> Row:
-    """Cost over the least that is known, status and s of a solve, its search for a start included."""
-    path = located(folder, file)
-    problem = read_graph(path)
-    solution = solve(problem, backend, throw=False)
-    seconds = solution.build_seconds + solution.solve_seconds
-    row = {"task": path.name, "data": hashed(path), "status": solution.status.name, "cost": round(solution.cost, 4)}
-    return row | {"over_best": round(solution.cost / BEST[path.name], 5), "seconds": round(seconds, 3)}
 
 
 def rounded(level: Interval) -> list[float]:
@@ -279,11 +259,17 @@ def rounded(level: Interval) -> list[float]:
 
 
 def planar(track: Track, fleet: Fleet) -> tuple[Floats, Floats]:
-    """Errors (T, 2) m of a track of one ego in the plane, and their NEES (T,), NaN without a covariance."""
-    gap = (track.x[0, :, 0] - fleet.position[:, track.egos[0]])[:, :2]
+    """Errors (R, T, E, 2) m of a track in the plane, and their NEES (R, T, E), NaN without a covariance."""
+    gap = (track.x - fleet.position[:, list(track.egos)])[..., :2]
     if track.covariance is None:
-        return gap, np.full(len(gap), np.nan)
-    return gap, np.einsum("ti,tij,tj->t", gap, np.linalg.inv(track.covariance[0, :, 0, :2, :2]), gap)
+        return gap, np.full(gap.shape[:-1], np.nan)
+    return gap, np.einsum("rtei,rteij,rtej->rte", gap, np.linalg.inv(track.covariance[..., :2, :2]), gap)
+
+
+def received(track: Track, recording: Recording, message: Message | None) -> int:
+    """B/s on air that an ego receives."""
+    account = of_track(track, recording, message)
+    return round(float((account.of("online", "on air", "per receiver") / account.seconds).mean()))
 
 
 def blocks_of(error: Floats, start: int, length: float) -> Floats:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 
-from coopoc.evaluate.statistics import Interval, over_seeds, paired_difference
+from coopoc.evaluate.statistics import over_seeds, paired_difference
 from coopoc.study.numbers import Number, Where, per_seed, present
 from coopoc.study.style import Panel, look
 from coopoc.study.tables import Entry, Table, crossed, pivot
@@ -148,34 +148,6 @@ def curves(
     return view
 
 
-def multiples(
-    pairs: Iterable[tuple[str, str]],
-    cases: Mapping[str, Where],
-    number: Callable[[Results, Where], Sequence[float]],
-    *texts: str,
-    target: Mapping[str, float] | None = None,
-    at: Where | None = None,
-) -> FigureView:
-    """Multiples of a reference, a row per method and a panel per case, as `coopoc.study.figures.multiples`.
-
-    Args:
-        pairs: methods and noise models.
-        cases: title -> selection.
-        number: multiples of a selection; none where it was not run.
-        texts: of the caption.
-        target: title -> upper end of the band.
-        at: parameters that the caption names beside the settings.
-    """
-
-    def view(results: Results) -> Plot | None:
-        from coopoc.study import figures
-
-        rows = {p: {title: number(results, of(*p, **case)) for title, case in cases.items()} for p in pairs}
-        return figures.multiples(rows, scene.caption(results, *texts, **(at or {})), target)
-
-    return view
-
-
 def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
     """Sentence on the RT-LE of `trained`, against `other`, which needs no training, with the evidence.
 
@@ -186,23 +158,13 @@ def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
         name: of the other, for the sentence.
     """
     base, each = results.values("rt_le_m", other), per_seed(results, trained)
-    gaps = [paired_difference(each.mean(axis=0), base)]
-    text = f"paired difference {gaps[0].mean:+.3f} m; 95 % {_ends(gaps[0])} over egos and runs, "
+    gaps = {"over egos and runs": paired_difference(each.mean(axis=0), base)}
     if len(each) > 1:
-        gaps.append(over_seeds(each - base))
-        text += f"{_ends(gaps[1])} over {len(each)} training seeds"
-    else:
-        text += "of one training seed, whose spread is unknown"
-    if not all(np.isfinite([gap.low, gap.high]).all() for gap in gaps):
-        claim = f"cannot be judged against {name}: too few seeds, egos or runs"
-    elif all(gap.high < 0 for gap in gaps):
-        claim = f"beats {name}"
-    elif all(gap.low > 0 for gap in gaps):
-        claim = f"is worse than {name}"
-    else:
-        claim = f"cannot be distinguished from {name}"
-    return f"{claim} ({text})"
-
-
-def _ends(gap: Interval) -> str:
-    return f"[{gap.low:+.3f}, {gap.high:+.3f}]"
+        gaps[f"over {len(each)} training seeds"] = over_seeds(each - base)
+    ends = np.array([(gap.low, gap.high) for gap in gaps.values()])
+    claim = "beats" if (ends < 0).all() else "is worse than" if (ends > 0).all() else "cannot be distinguished from"
+    evidence = ", ".join(
+        f"{gap.mean:+.3f} m, 95 % [{gap.low:+.3f}, {gap.high:+.3f}] {over}" for over, gap in gaps.items()
+    )
+    one = " of one training seed, whose spread is unknown" * (len(each) == 1)
+    return f"{claim} {name} (paired difference {evidence}{one})"

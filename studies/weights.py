@@ -174,11 +174,9 @@ def described(results: Results) -> Mapping[str, str]:
         if plan["kind"] == "federated":
             steps = f"{plan['rounds']} rounds of {plan['local_epochs']} passes through each client's pieces"
         texts[name] = (
-            f"{steps}; {card['parameters']} parameters, AdamW at {how['learning_rate']:g}, decoupled decay "
-            f"{how['weight_decay']:g}, batch {how['batch']}, pieces of {plan['piece']} steps "
-            f"{'mirrored' if how['mirror'] else 'as they are'}, {plan['noise']} noise; {len(seeds(results.settings))} "
-            f"training seeds; clients {', '.join(card['clients'])}; {card['seconds']:.0f} s per net; key "
-            f"{card['key'][:12]}"
+            f"{steps}; {card['parameters']} parameters, AdamW at {how['learning_rate']:g}, {plan['noise']} noise; "
+            f"{len(seeds(results.settings))} training seeds; clients {', '.join(card['clients'])}; "
+            f"key {card['key'][:12]}"
         )
     return texts
 

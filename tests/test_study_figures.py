@@ -202,4 +202,4 @@ def test_no_figure_of_the_gallery_hides_a_line(file: Path) -> None:
                     gaps = np.abs(np.interp(at, *a.T) - np.interp(at, *b.T))
                     apart = max(gaps, default=np.inf) * 72 / panel.figure.dpi > first.get_linewidth() / 2
                     assert apart or any(" = " in text for text in texts), (first.get_color(), second.get_color())
-    assert lines_seen
+    assert lines_seen or not find("coopoc.studies", file.stem).figures
