@@ -251,16 +251,28 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
 
 
 def _multiples(results: Results) -> Plot | None:
-    from coopoc.study import figures
+    """Multiples of each rule under each condition as dots, one per training seed; a line marks the mean under iid."""
+    from coopoc.study.plot import Plot, canvas, plain_log, strokes
 
-    rows = {
-        (rule, "none"): {
-            name.capitalize(): _multiple(results, of(rule, "none", scenario=2, condition=name)) for name in CONDITIONS
-        }
-        for rule in RULES
-    }
+    where = {name: {"scenario": 2, "condition": name} for name in CONDITIONS}
+    drawn = {(rule, name): _multiple(results, of(rule, "none", **at)) for name, at in where.items() for rule in RULES}
+    if not any(map(len, drawn.values())):
+        return None
+    with canvas(1, len(CONDITIONS), sharex=True, sharey=True, squeeze=False, width=11.0, height=2.4) as (
+        figure,
+        (axes,),
+    ):
+        for panel, name in zip(axes, CONDITIONS, strict=True):
+            panel.axvline(1.0, color="black", linewidth=0.9)
+            for row, rule in enumerate(RULES):
+                style = {**strokes({"method": rule}), "linestyle": "none", "markersize": 4}
+                panel.plot(values := drawn[rule, name], np.full(len(values), row), **style)
+            panel.set(title=name.capitalize(), xlabel="× mean under iid")
+            plain_log(panel.xaxis)
+        axes[0].set(yticks=range(len(RULES)), yticklabels=[look(rule).label for rule in RULES])
+        axes[0].invert_yaxis()
     text = "RT-LE of the kept weights as a multiple of the mean's under iid, a dot per training seed."
-    return figures.multiples(rows, scene.caption(results, text, scenario=2))
+    return Plot(figure, scene.caption(results, text, scenario=2))
 
 
 STUDY = Study(

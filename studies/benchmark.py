@@ -16,12 +16,12 @@ import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
+from coopoc import InputError, Method, paired_difference
 from coopoc.arrays import number
-from coopoc.errors import InputError, said, unknown
+from coopoc.errors import said, unknown
 from coopoc.evaluate.scores import scored
-from coopoc.evaluate.statistics import mean_interval, paired_difference
+from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
-from coopoc.methods.track import Method
 from coopoc.one_file import in_file
 from coopoc.plugins import find
 from coopoc.study.numbers import three

@@ -16,8 +16,8 @@ from .views import of, selections
 if TYPE_CHECKING:
     import pandas as pd
 
+    from coopoc import Results
     from coopoc.study.figures import Plot
-    from coopoc.study.results import Results
 
 TRAINED = ("fedokf", "fedkalmannet")
 """Trained by federation, in the order of their bytes."""

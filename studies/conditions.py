@@ -7,8 +7,8 @@ from functools import partial
 from operator import itemgetter
 from typing import TYPE_CHECKING, Any
 
+from coopoc import Study
 from coopoc.study.numbers import Number, Where, across, listed, mean, ran, rms
-from coopoc.study.study import Study
 from coopoc.study.style import Panel, look
 
 from . import lineup, scene
@@ -16,7 +16,7 @@ from .lineup import BOUND, PAST
 from .views import curves, of, selections
 
 if TYPE_CHECKING:
-    from coopoc.study.results import Results
+    from coopoc import Results
 
 KALMAN, NET = ("kalman", "nominal"), ("fedkalmannet", "trained")
 COOPERATIVE, JOINT, SPLIT, LKF = ((m, "nominal") for m in ("cooperative-filter", "joint", "split-ci", "lkf-sa"))

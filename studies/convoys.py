@@ -9,10 +9,9 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc import V2X, Fleet, Recording, observe
+from coopoc import V2X, Fleet, Method, Recording, observe
 from coopoc.arrays import AnyArray, Floats
 from coopoc.evaluate.statistics import mean_interval
-from coopoc.methods.track import Method
 from coopoc.study.study import Row
 from coopoc.world.recording import MEASURED
 

@@ -7,15 +7,15 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopoc.study.numbers import Number, Where, interval, listed, mean, present, seed_std
+from coopoc.study.numbers import Number, Where, interval, listed, mean, quantile, seed_std, verdict
 from coopoc.study.study import Params
 from coopoc.study.style import Panel
 
 from . import lineup, scene, weights
-from .views import HEAD, FigureView, TableView, curves, labelled, of, selections, verdict
+from .views import HEAD, FigureView, TableView, curves, labelled, of, selections
 
 if TYPE_CHECKING:
-    from coopoc.study.results import Results
+    from coopoc import Results
 
 CASES = ((1, 0.15), (2, 0.10), (2, 0.15))
 """Scenario and velocity noise: scenario 2 does not state it, so both of the paper's figures are shown."""
@@ -48,14 +48,6 @@ COLUMNS: dict[str, Number] = {
 def _table(at: Params) -> TableView:
     text = "Errors over all steps; maximum: the mean of the largest of each run."
     return selections(HEAD, labelled(LINEUP, **at), COLUMNS, text, at=at)
-
-
-def quantile(results: Results, where: Where) -> float | None:
-    """Error m below which a share of all steps lies; `where` holds the share beside the selection."""
-    kept = present(results, {name: value for name, value in where.items() if name != "share"}, "error_quantiles_m")
-    if kept is None:
-        return None
-    return float(np.quantile(np.concatenate(results.select(kept)["error_quantiles_m"].to_list()), where["share"]))
 
 
 def _cdf(at: Where) -> FigureView:

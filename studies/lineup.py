@@ -9,23 +9,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coopoc import Fleet, InputError, Recording, Study
 from coopoc.arrays import AnyArray, Floats
-from coopoc.errors import InputError, unknown
+from coopoc.errors import unknown
 from coopoc.file_names import given_path
 from coopoc.one_file import in_file
 from coopoc.plugins import find, names
-from coopoc.study.study import Params, Row, Study
-from coopoc.world.fleet import Fleet
+from coopoc.study.study import Params, Row
 from coopoc.world.links import stretches
-from coopoc.world.recording import Recording
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
 from . import scene, weights
 
 if TYPE_CHECKING:  # they load numba, for which a mistake in --set need not wait
-    from coopoc.methods.noise_model import NoiseModel
-    from coopoc.methods.track import Method
+    from coopoc import Method, NoiseModel
 
 COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint")
 BOUND = ("bound", "bound")
@@ -91,7 +89,7 @@ def noise_model(p: Params) -> NoiseModel | str:
     Raises:
         InputError: an oracle for real data, whose noise is unknown.
     """
-    from coopoc.methods.noise_model import NoiseModel
+    from coopoc import NoiseModel
 
     if p["noise_model"] == "fitted":
         return weights.fitted(p)
@@ -127,7 +125,7 @@ def own(name: str, noise: NoiseModel | str = "nominal") -> Any:
     Raises:
         InputError: an unknown name, a class that takes no noise model, or what no study can use.
     """
-    from coopoc.methods.track import Method
+    from coopoc import Method
 
     shows = "docs/extend.md shows one; its first argument is noise_model."
     try:
@@ -207,7 +205,8 @@ def bound_rows(p: Params) -> list[Row]:
     the mean over runs. Newcomers bring their past, unless the noise model is that of BOUND or "star". Real data have
     none: the bound is of sensors that measure at every step.
     """
-    from coopoc.evaluate.bounds import bound_rt_le, past_bound, posterior_bound
+    from coopoc import bound_rt_le, posterior_bound
+    from coopoc.evaluate.bounds import past_bound
 
     bound = posterior_bound if p.get("noise_model") in ("bound", "star") else past_bound
     drive, v2x = scene.fleet(p["data"]), scene.channel(p)

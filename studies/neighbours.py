@@ -15,8 +15,8 @@ from .lineup import BOUND
 from .views import curves, of, table
 
 if TYPE_CHECKING:
+    from coopoc import Results
     from coopoc.study.figures import Plot
-    from coopoc.study.results import Results
 
 NEIGHBOURS = (0, 1, 2, 3, 4, 6, 8, 10)
 TRAINED = ("okf", "fedkalmannet", "centralised")

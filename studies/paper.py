@@ -13,7 +13,7 @@ from tyro.conf import arg
 from coopoc.plugins import find
 
 if TYPE_CHECKING:
-    from coopoc.study.results import Results
+    from coopoc import Results
 
 PAPER: Mapping[str, tuple[str, ...]] = {
     "convergence": ("centralised",),
@@ -38,11 +38,10 @@ def paper(
         jobs: number of worker processes.
         data: fleet to test on, a name or a path.
     """
+    from coopoc import Results, run_study
     from coopoc.data.fleet_cards import in_words
     from coopoc.data.registry import DATASETS, card
     from coopoc.study.report import report
-    from coopoc.study.results import Results
-    from coopoc.study.run import run_study
 
     began, results, given = time.perf_counter(), dict[str, Results](), {"weights": str(out / "weights"), "data": data}
     for number, name in enumerate(PAPER, start=1):

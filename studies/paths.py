@@ -13,8 +13,8 @@ from coopoc.study.numbers import present
 from . import lineup, scene
 
 if TYPE_CHECKING:
+    from coopoc import Results
     from coopoc.study.plot import Plot
-    from coopoc.study.results import Results
 
 DRAWN = ("gnss", "kalman", "joint", "cooperative-filter")
 """Methods that are drawn, those of them that were run."""

@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
+from coopoc import V2X, Fleet, InputError, Links, Recording, pose_start
 from coopoc.arrays import Floats
 from coopoc.data.fetch import bring
 from coopoc.data.log.links import under
@@ -17,15 +18,9 @@ from coopoc.data.log.residuals import GATE, begin_of, together
 from coopoc.data.mrclam import Calibration, MrclamLog, calibrate, pose_recording, read_mrclam, surveyed
 from coopoc.data.registry import kind_of, load_log
 from coopoc.data.source import split
-from coopoc.errors import InputError
 from coopoc.methods.poses.pose_inputs import SPREAD
-from coopoc.methods.poses.pose_start import pose_start
 from coopoc.study.study import Params
-from coopoc.world.fleet import Fleet
-from coopoc.world.links import Links
-from coopoc.world.recording import Recording
 from coopoc.world.storage import digest
-from coopoc.world.v2x import V2X
 
 LONGEST, SHARE = 300.0, 0.4
 """s, and share of the drive, that calibrate where the settings leave it open."""

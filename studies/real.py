@@ -10,22 +10,16 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coopoc import V2X, Fleet, InputError, PoseFilter, Recording, Sensors, Study, Track, heading_error, pose_nees
 from coopoc.arrays import Floats
 from coopoc.data.source import split
-from coopoc.errors import InputError
 from coopoc.evaluate.ledger import of_track
-from coopoc.evaluate.metrics import errors, fix_innovations, heading_error, pose_nees
-from coopoc.methods.poses.pose_filter import PoseFilter
-from coopoc.methods.track import Track
+from coopoc.evaluate.metrics import errors, fix_innovations
 from coopoc.study.numbers import Where, across, difference, interval, mean, present, ran
 from coopoc.study.provenance import revision
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.study import Params, Row
 from coopoc.study.style import Panel, look, words
 from coopoc.study.tables import Table, crossed
-from coopoc.world.fleet import Fleet
-from coopoc.world.recording import Recording
-from coopoc.world.sensors import Sensors
-from coopoc.world.v2x import V2X
 
 from . import pose_drives as drives
 from .pose_drives import Drive, thinned
@@ -33,8 +27,8 @@ from .scene import CODE
 from .views import unused
 
 if TYPE_CHECKING:
+    from coopoc import Results
     from coopoc.study.figures import Plot
-    from coopoc.study.results import Results
 
 METHODS: Mapping[str, Mapping[str, Any]] = {
     "pose-fleet": {},
@@ -311,18 +305,12 @@ def _findings(results: Results) -> dict[str, str]:
         together = of(k, 0)
         if not k or together is None or 0 not in alone:
             continue
-        few = max((n for n in alone if 0 < n <= FEW), default=0)
-        text = f"K = {k} without a landmark: {together:.2f} m; alone {alone[0]:.2f} m"
-        text += f", with {_landmarks(few)} {alone[few]:.2f} m." if few else "."
-        better = [n for n, value in alone.items() if value < together]
-        worth = f"It replaces fewer than {_landmarks(min(better))}." if better else "It replaces more than all of them."
-        texts[f"worth, K = {k}"] = text if len(alone) == 1 else f"{text} {worth}"
+        each = ", ".join(f"with {_landmarks(n)} {value:.3g} m" for n, value in alone.items())
+        texts[f"worth, K = {k}"] = f"K = {k} without a landmark: {together:.3g} m; alone {each}."
     nees = list(ran({(k, n): of(k, n, "nees") for k in ks for n in marks}).values())
     if nees:
-        inside = sum(2 <= value <= 5 for value in nees)
-        text = f"Mean NEES of a pose (3 is consistent): {np.mean(nees):.1f}"
-        more = f" over {len(nees)} cells, {inside} of them in 2..5, the largest {max(nees):.1f}"
-        texts["nees"] = text + (more if len(nees) > 1 else "") + "."
+        text = f"Mean NEES of a pose (3 is consistent): {np.mean(nees):.1f} over {len(nees)} cells"
+        texts["nees"] = f"{text}, {max(nees):.1f} at most."
         if min(nees) > UNFIT:
             doubt = "Units, axes or stated noise do not fit the drive"
             texts["nees"] += f" {doubt}: coopoc data check shows the residuals of each kind."

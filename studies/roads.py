@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc import V2X, Fleet, Kalman, NoiseModel, Recording, Sensors, observe, read_log
+from coopoc import V2X, Fleet, InputError, Kalman, Method, NoiseModel, Recording, Sensors, observe, read_log
 from coopoc.arrays import Floats
 from coopoc.data.log.read import is_log
 from coopoc.data.registry import load_log
 from coopoc.data.source import split
-from coopoc.errors import InputError
 from coopoc.evaluate.statistics import mean_interval
-from coopoc.methods.track import Method
 from coopoc.study.study import Row
 from coopoc.world.recording import MEASURED
 

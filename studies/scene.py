@@ -10,24 +10,18 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
+from coopoc import V2X, Fleet, InputError, Outliers, Recording, Sensors, observe
 from coopoc.arrays import Bools
 from coopoc.data.source import split, there
-from coopoc.errors import InputError
 from coopoc.study.provenance import revision
 from coopoc.study.study import Params
 from coopoc.world.channels import channel as channel_of
-from coopoc.world.fleet import Fleet
-from coopoc.world.outliers import Outliers
-from coopoc.world.recording import Recording
-from coopoc.world.sensing import observe
-from coopoc.world.sensors import Sensors
 from coopoc.world.spoofing import Spoofing, spoofed
 from coopoc.world.storage import digest
-from coopoc.world.v2x import V2X
 
 if TYPE_CHECKING:
+    from coopoc import Results
     from coopoc.data.log.read import Log
-    from coopoc.study.results import Results
 
 Start = Literal["gnss", "true"]
 CODE = tuple(f"coopoc.{part}" for part in ("world", "methods", "kernels", "optimize", "evaluate", "learned", "data"))

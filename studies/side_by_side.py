@@ -12,8 +12,8 @@ from . import lineup, paths, scene
 from .views import TableView, of, table
 
 if TYPE_CHECKING:
+    from coopoc import Results
     from coopoc.study.figures import Plot
-    from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
 METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "mhe", "cooperative-filter", "bound")

@@ -13,27 +13,33 @@ import numpy as np
 
 from coopoc import (
     V2X,
+    Fault,
     Fleet,
+    InputError,
+    Message,
+    Outliers,
     PoseFilter,
     Recording,
     Sensors,
+    Track,
+    bound_rt_le,
+    fleet_bound,
+    heading_error,
     load_fleet,
     observe,
+    pose_nees,
     pose_start,
+    posterior_bound,
     read_log,
 )
 from coopoc.arrays import Floats
 from coopoc.data.fetch import bring, cache_folder, holder, public
-from coopoc.errors import InputError
-from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, past_bound, posterior_bound
+from coopoc.evaluate.bounds import past_bound
 from coopoc.evaluate.ledger import of_track
-from coopoc.evaluate.metrics import errors, heading_error, pose_nees
+from coopoc.evaluate.metrics import errors
 from coopoc.evaluate.statistics import Interval, mean_interval
-from coopoc.methods.track import Track
 from coopoc.study.study import Row
-from coopoc.world.outliers import Fault, Outliers
 from coopoc.world.spoofing import Spoofing, spoofed
-from coopoc.world.v2x import Message
 
 from . import pose_drives
 from .pose_drives import hashed
@@ -131,15 +137,13 @@ def bound(task: Task, information: str) -> float:
     runs = FEW if information in ("past", "fleet") else task.runs
     told = recording(replace(task, v2x=v2x, runs=runs), information == "fleet", told=True)[0] if wrong else None
     if information == "fleet":
-        whole = fleet_bound(fleet, sensors, v2x, recording=told)
-        bounds: list[Floats] = [whole[:, ego] for ego in task.columns]
-    elif information == "past":
-        bounds = [past_bound(fleet, sensors, ego, v2x, recording=told) for ego in task.columns]
+        bounds = [*np.moveaxis(fleet_bound(fleet, sensors, v2x, recording=told)[:, list(task.columns)], 1, 0)]
     else:
-        bounds = [
-            posterior_bound(fleet, sensors, ego, v2x if information == "star" else V2X(0), recording=told)
-            for ego in task.columns
-        ]
+        of_ego, near = (
+            past_bound if information == "past" else posterior_bound,
+            V2X(0) if information == "solo" else v2x,
+        )
+        bounds = [of_ego(fleet, sensors, ego, near, recording=told) for ego in task.columns]
     return float(np.sqrt(np.mean([bound_rt_le(cov) ** 2 for cov in bounds])))
 
 

@@ -6,18 +6,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import numpy as np
-
-from coopoc.evaluate.statistics import over_seeds, paired_difference
-from coopoc.study.numbers import Number, Where, per_seed, present
+from coopoc.study.numbers import Number, Where, present
 from coopoc.study.style import Panel, look
 from coopoc.study.tables import Entry, Table, crossed, pivot
 
 from . import scene
 
 if TYPE_CHECKING:
+    from coopoc import Results
     from coopoc.study.plot import Plot
-    from coopoc.study.results import Results
 
 TableView: TypeAlias = Callable[["Results"], Table | None]
 FigureView: TypeAlias = "Callable[[Results], Plot | None]"
@@ -146,25 +143,3 @@ def curves(
         return figures.curves(results, panels, lines, scene.caption(results, *texts, **(at or {})), **options)
 
     return view
-
-
-def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
-    """Sentence on the RT-LE of `trained`, against `other`, which needs no training, with the evidence.
-
-    Args:
-        results: of the study.
-        trained: selection of one method.
-        other: selection of another method, over the same egos and runs.
-        name: of the other, for the sentence.
-    """
-    base, each = results.values("rt_le_m", other), per_seed(results, trained)
-    gaps = {"over egos and runs": paired_difference(each.mean(axis=0), base)}
-    if len(each) > 1:
-        gaps[f"over {len(each)} training seeds"] = over_seeds(each - base)
-    ends = np.array([(gap.low, gap.high) for gap in gaps.values()])
-    claim = "beats" if (ends < 0).all() else "is worse than" if (ends > 0).all() else "cannot be distinguished from"
-    evidence = ", ".join(
-        f"{gap.mean:+.3f} m, 95 % [{gap.low:+.3f}, {gap.high:+.3f}] {over}" for over, gap in gaps.items()
-    )
-    one = " of one training seed, whose spread is unknown" * (len(each) == 1)
-    return f"{claim} {name} (paired difference {evidence}{one})"

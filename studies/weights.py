@@ -12,21 +12,19 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 from tyro.conf import Positional, arg
 
-from coopoc.errors import InputError, unknown
+from coopoc import V2X, InputError, Sensors, observe
+from coopoc.errors import unknown
 from coopoc.one_file import file_digest, from_file, in_file
 from coopoc.plugins import find
 from coopoc.study.study import Params
-from coopoc.world.sensing import observe
-from coopoc.world.sensors import Sensors, VelocityReading
-from coopoc.world.v2x import V2X
+from coopoc.world.sensors import VelocityReading
 
 from .scene import Start, fleet, is_real, start
 
 if TYPE_CHECKING:
+    from coopoc import NoiseModel, Results
     from coopoc.learned.checkpoint import Checkpoint
     from coopoc.learned.training.drives import Drives
-    from coopoc.methods.noise_model import NoiseModel
-    from coopoc.study.results import Results
 
 INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
 """Nets of single clients, one per client, at most six."""
@@ -148,7 +146,7 @@ def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:
 
 @lru_cache
 def _fitted(clients: str, reading: VelocityReading) -> NoiseModel:
-    from coopoc.methods.noise_model import NoiseModel
+    from coopoc import NoiseModel
 
     if is_real(clients):
         from coopoc.data.registry import load_log

@@ -9,10 +9,9 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from coopoc import V2X, Fleet, Recording, Sensors
+from coopoc import V2X, Fault, Fleet, Outliers, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints
 from coopoc.world.body_frames import turned
-from coopoc.world.outliers import Fault, Outliers
 from coopoc.world.sensors import stream
 from coopoc.world.spoofing import Spoofing, spoofed
 

@@ -15,12 +15,10 @@ import numpy as np
 from scipy import special
 from tqdm import tqdm
 
+from coopoc import InputError, Method, nees, rt_le
 from coopoc.arrays import Floats, number
-from coopoc.errors import InputError
-from coopoc.evaluate.metrics import nees, rt_le
 from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.catalogue import needs_whole_fleet
-from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
 from coopoc.study.cell import Cell
 from coopoc.study.compute import compute

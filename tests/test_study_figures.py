@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 
 from coopoc.plugins import find
-from coopoc.studies import error_cdf
 from coopoc.study import figures
+from coopoc.study.numbers import quantile
 from coopoc.study.results import Results
 from coopoc.study.style import METHODS, Panel, look
 
@@ -58,7 +58,6 @@ PLOTS: dict[str, Callable[[Results], Any]] = {
     "sweep": lambda results: figures.sweep(results, "max_neighbours", log=True),
     "pareto": lambda results: figures.pareto(results, "c"),
     "curves": lambda results: figures.curves(results, [Panel({k: {"max_neighbours": k} for k in (0, 2)})], LINES, "c"),
-    "multiples": lambda _: figures.multiples({("joint", "fitted"): {"a": [0.9, 1.1]}}, "c"),
 }
 
 
@@ -99,10 +98,10 @@ def test_a_sweep_draws_the_means_in_the_method_colour(results: Results) -> None:
 def test_a_distribution_is_that_of_all_steps(results: Results) -> None:
     where = {"max_neighbours": 2, "method": "joint"}
     errors = np.concatenate(results.select(where)["error_quantiles_m"].to_list())
-    found = error_cdf.quantile(results, {**where, "share": 0.9})
+    found = quantile(results, {**where, "share": 0.9})
     assert found is not None
     assert np.mean(errors <= found) == pytest.approx(0.9, abs=1 / len(errors))
-    assert error_cdf.quantile(results, {**where, "method": "okf", "share": 0.9}) is None
+    assert quantile(results, {**where, "method": "okf", "share": 0.9}) is None
 
 
 @pytest.mark.parametrize("suffix", ["svg", "png"])
@@ -137,11 +136,6 @@ def test_curves_draw_numbers_of_their_selections(results: Results) -> None:
     np.testing.assert_allclose(joint.get_ydata(), expected.to_numpy())
     assert level.get_ydata()[0] == pytest.approx(results.select(GNSS)["rt_le_m"].mean())
     assert figures.curves(results, [panel], [{"method": "okf"}], "c") is None
-
-
-def test_multiples_name_methods_and_their_noise(results: Results) -> None:
-    axes = PLOTS["multiples"](results).figure.axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["Joint filter, fitted"]
 
 
 def test_one_run_of_one_ego_shows_its_points_without_an_interval(results: Results) -> None:

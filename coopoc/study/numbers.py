@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from ..arrays import Floats
-from ..evaluate.statistics import Interval, paired_difference
+from ..evaluate.statistics import Interval, over_seeds, paired_difference
 
 if TYPE_CHECKING:
     from .results import Results
@@ -151,3 +151,33 @@ def seed_std(results: Results, where: Where) -> float | None:
     """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
     each = per_seed(results, where)
     return float(each.mean(axis=(1, 2)).std(ddof=1)) if len(each) > 1 else None
+
+
+def quantile(results: Results, where: Where) -> float | None:
+    """Error m below which a share of all steps lies; `where` holds the share beside the selection."""
+    kept = present(results, {name: value for name, value in where.items() if name != "share"}, "error_quantiles_m")
+    if kept is None:
+        return None
+    return float(np.quantile(np.concatenate(results.select(kept)["error_quantiles_m"].to_list()), where["share"]))
+
+
+def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
+    """Sentence on the RT-LE of `trained`, against `other`, which needs no training, with the evidence.
+
+    Args:
+        results: of the study.
+        trained: selection of one method.
+        other: selection of another method, over the same egos and runs.
+        name: of the other, for the sentence.
+    """
+    base, each = results.values("rt_le_m", other), per_seed(results, trained)
+    gaps = {"over egos and runs": paired_difference(each.mean(axis=0), base)}
+    if len(each) > 1:
+        gaps[f"over {len(each)} training seeds"] = over_seeds(each - base)
+    ends = np.array([(gap.low, gap.high) for gap in gaps.values()])
+    claim = "beats" if (ends < 0).all() else "is worse than" if (ends > 0).all() else "cannot be distinguished from"
+    evidence = ", ".join(
+        f"{gap.mean:+.3f} m, 95 % [{gap.low:+.3f}, {gap.high:+.3f}] {over}" for over, gap in gaps.items()
+    )
+    one = " of one training seed, whose spread is unknown" * (len(each) == 1)
+    return f"{claim} {name} (paired difference {evidence}{one})"
