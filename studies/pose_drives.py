@@ -97,13 +97,12 @@ def has_true_poses(data: str) -> bool:
     return isinstance(log, MrclamLog) or (log.truth is not None and log.truth.heading is not None)
 
 
-def check(data: str, until: float, gate: float) -> None:
+def check(data: str, until: float) -> None:
     """Read all that cells share.
 
     Args:
         data: as of `drive`.
         until: as of `drive`.
-        gate: as of `drive`.
 
     Raises:
         InputError: as of `drive`.
@@ -112,18 +111,17 @@ def check(data: str, until: float, gate: float) -> None:
     if isinstance(log, MrclamLog):
         surveyed(log), _calibration(data, until)
     else:
-        _begin(data, gate)
+        _begin(data)
 
 
 @lru_cache(maxsize=2)
-def drive(data: str, until: float, v2x: V2X, gate: float) -> Drive:
+def drive(data: str, until: float, v2x: V2X) -> Drive:
     """All that was measured, under a channel.
 
     Args:
         data: a folder of MR.CLAM, whose first part calibrates its sensors, or a log in body frames, which states them.
         until: s, of that part.
         v2x: K, radius and channel.
-        gate: of the filters that find first poses.
 
     Raises:
         InputError: a log that cannot be followed.
@@ -131,11 +129,11 @@ def drive(data: str, until: float, v2x: V2X, gate: float) -> Drive:
     log = _part(data)
     if isinstance(log, MrclamLog):
         recording = under(pose_recording(log, _calibration(data, until)), v2x, logged=False)
-        return Drive(recording, pose_start(recording, gate=gate), log.fleet, True)
+        return Drive(recording, pose_start(recording, gate=GATE), log.fleet, True)
     recording = under(log.recording, v2x, logged=log.messages)
     told = recording.sensors
     lasting = max(told.speed_scale_std, told.yaw_rate_bias_std, told.range_offset_std) > 0
-    begin, where = _begin(data, gate)
+    begin, where = _begin(data)
     return Drive(recording, begin, log.truth, lasting, SURE if where else SPREAD)
 
 
@@ -146,7 +144,7 @@ def described(data: str) -> str:
         return "Wheel odometry, ranges and bearings of {}; no fix, no compass. The first {:.3g} s calibrate the noise."
     read = ", ".join(f"{number} {what}" for what, number in log.summary.read.items() if number)
     where = "" if (span := _log(data)[1]) == "throughout" else f" {span},"
-    noise = f"with the noise that it states{_begin(data, GATE)[1]}; the first {{:.3g}} s are not scored."
+    noise = f"with the noise that it states{_begin(data)[1]}; the first {{:.3g}} s are not scored."
     return f"What {{}} holds ({read}),{where} {noise}"
 
 
@@ -216,7 +214,7 @@ def _calibration(data: str, until: float) -> Calibration:
 
 
 @lru_cache(maxsize=2)
-def _begin(data: str, gate: float) -> tuple[Floats | None, str]:
+def _begin(data: str) -> tuple[Floats | None, str]:
     log = _part(data)
     assert isinstance(log, Log)
-    return begin_of(log, gate)
+    return begin_of(log)

@@ -48,14 +48,14 @@ TRAINING, SETTLED = (1, 4, 15), 30.0
 
 
 @lru_cache(maxsize=1)
-def trained(data: str, until: float, gate: float, evaluations: int) -> dict[str, tuple[list[Any], float]]:
+def trained(data: str, until: float, evaluations: int) -> dict[str, tuple[list[Any], float]]:
     """Noise learned on the part that calibrates, by way, one for all or one for each vehicle, and bytes that a vehicle
     sends for it: federated its constants once and as many for the answer, centralised 4 B for each number that it
     measured in the plane. The centralised one is learned alone and together."""
     from coopoc.learned.pose_noise import PoseTask, averaged, fit_pose_noise  # torch, which a mistake need not wait for
 
     vehicles, marks = drives.counts(data)
-    alone = drives.drive(data, until, near(0), gate)
+    alone = drives.drive(data, until, near(0))
     steps, settled = (int(s / alone.recording.dt) for s in (until, min(SETTLED, until / 10)))
     assert alone.truth is not None
     first, truth = alone.recording.between(0, steps), alone.truth.between(0, steps)
@@ -63,10 +63,10 @@ def trained(data: str, until: float, gate: float, evaluations: int) -> dict[str,
     def fitted(egos: tuple[str, ...], *ends: int) -> Sensors:
         tasks = []
         for k in dict.fromkeys(ends):
-            drive = drives.drive(data, until, near(k), gate)
+            drive = drives.drive(data, until, near(k))
             for landmarks in dict.fromkeys(min(n, marks) for n in TRAINING):
                 part = thinned(drive.recording, landmarks, settled).between(0, steps)
-                tasks.append(PoseTask(part, truth, egos, _filter({}, k, gate, drive), settled))
+                tasks.append(PoseTask(part, truth, egos, _filter({}, k, drive), settled))
         return fit_pose_noise(tasks, first.sensors, evaluations)
 
     own, whole = [fitted((name,), 0) for name in alone.ids], fitted(alone.ids, *_ends(vehicles))
@@ -95,7 +95,7 @@ def key(p: Params) -> dict[str, str]:
     """
     if p["method"] not in EVERY:
         raise InputError("method", p["method"], f"must be among {list(EVERY)}", "Name one of them.")
-    drives.check(str(p["data"]), drives.calibrated(p), float(p["gate"]))
+    drives.check(str(p["data"]), drives.calibrated(p))
     channel(p)
     return {"code": revision(*CODE), **drives.digests(str(p["data"]))}
 
@@ -121,7 +121,7 @@ def _ends(vehicles: int) -> tuple[int, int]:
 def cell(p: Params) -> list[Row]:
     """Rows of one number of neighbours and landmarks: a vehicle and a block of time each."""
     until = drives.calibrated(p)
-    drive = drives.drive(str(p["data"]), until, channel(p), float(p["gate"]))
+    drive = drives.drive(str(p["data"]), until, channel(p))
     dt, (filters, once) = drive.recording.dt, _filters(p, drive)
     start, block = int(until / dt), max(int(drives.block(p) / dt), 1)
     recording = thinned(drive.recording, int(p["landmarks"]), start)
@@ -152,17 +152,17 @@ def driven(p: Params) -> float:
 
 def _filters(p: Params, drive: Drive) -> tuple[list[PoseFilter], float]:
     """One filter for all vehicles or one for each, and bytes that a vehicle sent for its training."""
-    given = str(p["data"]), drives.calibrated(p), float(p["gate"]), int(p["evaluations"])
+    given = str(p["data"]), drives.calibrated(p), int(p["evaluations"])
     name, k = str(p["method"]), int(p["max_neighbours"])
     constants, once = trained(*given)[name] if name in TRAINED else ([None], 0.0)
-    made = _filter(METHODS.get(name, {}), k, given[2], drive)
+    made = _filter(METHODS.get(name, {}), k, drive)
     return [replace(made, assumed=one) for one in constants], once
 
 
-def _filter(fusion: Params, k: int, gate: float, drive: Drive) -> PoseFilter:
+def _filter(fusion: Params, k: int, drive: Drive) -> PoseFilter:
     unit: Any = "fleet" if k else "solo"
     return PoseFilter(
-        unit, **(fusion if k else {}), lasting=drive.lasting, gate=gate, begin=drive.begin, spread=drive.spread
+        unit, **(fusion if k else {}), lasting=drive.lasting, gate=drives.GATE, begin=drive.begin, spread=drive.spread
     )
 
 
@@ -331,7 +331,6 @@ STUDY = Study(
         "calibrate_s": None,
         "block_s": None,
         "drive_s": None,
-        "gate": 5.0,
         "loss": 0.0,
         "evaluations": 150,
     },

@@ -42,7 +42,7 @@ from coopoc.study.study import Row
 from coopoc.world.spoofing import Spoofing, spoofed
 
 from . import pose_drives
-from .pose_drives import hashed
+from .pose_drives import GATE, hashed
 
 VERSION = "2"
 """Another set of tasks, seeds, egos or scores is another version."""
@@ -155,7 +155,6 @@ POSES: Mapping[str, Mapping[str, Any]] = {
     "pose-naive": {"unit": "fleet", "fusion": "naive"},
 }
 """Pose filters by name: their options."""
-GATE = 5.0
 RANGE_STD = 0.3
 """m assumed of a UWB range, whose errors last: the file's 0.04 m is the error of one."""
 
@@ -203,7 +202,7 @@ def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, 
     """Measurements, truth, first step that is scored, and what is known of the start and the noise."""
     if task.name == "robots":
         until, v2x = 300.0, V2X(max_neighbours=4, radius=float("inf"))
-        drive = pose_drives.drive(str(path), until, v2x, GATE)
+        drive = pose_drives.drive(str(path), until, v2x)
         assert drive.truth is not None
         start = int(until / drive.truth.dt)
         return pose_drives.thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
@@ -214,7 +213,7 @@ def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, 
         noise = replace(log.recording.sensors, range_std=RANGE_STD)
         begin = pose_start(replace(log.recording.between(0, start), sensors=noise), gate=GATE)
         return log.recording, log.truth, start, {"begin": begin, "assumed": noise}
-    drive = pose_drives.drive(str(path), 0.0, V2X(max_neighbours=3, radius=float("inf")), GATE)
+    drive = pose_drives.drive(str(path), 0.0, V2X(max_neighbours=3, radius=float("inf")))
     if drive.truth is None or drive.truth.heading is None:
         raise InputError("data", str(path), "must hold true poses", "Take the file as it was published.")
     noise = replace(drive.recording.sensors, range_std=RANGE_STD)

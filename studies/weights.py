@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
@@ -19,7 +19,7 @@ from coopoc.plugins import find
 from coopoc.study.study import Params
 from coopoc.world.sensors import VelocityReading
 
-from .scene import Start, fleet, is_real, start
+from .scene import fleet, is_real, start
 
 if TYPE_CHECKING:
     from coopoc import NoiseModel, Results
@@ -34,14 +34,6 @@ LEARNED = (*PAPER, "fedokf", "road", "fedroad")
 """Methods that are trained."""
 WORST = 1.1
 """Times the error of a Kalman filter with fitted noise, above which the command saves no weights."""
-
-
-class Setting(NamedTuple):
-    """Training seed, start of the filter, reading of "10 % of the velocity"."""
-
-    seed: int
-    start: Start
-    reading: VelocityReading
 
 
 def seeds(p: Params) -> range:
@@ -85,18 +77,17 @@ def _job(name: str, p: Params, seed: int) -> tuple[str, str]:
     if not is_trained(name) or not trainable({**p, "method": name}):
         raise unknown("trained method", name, LEARNED)
     digest = file_digest(name) if in_file(name) else ""
-    jobs = _jobs(_recipe(name), digest, p["clients"], Setting(seed, start(p), p["velocity_reading"]))
+    jobs = _jobs(_recipe(name), digest, p["clients"], seed, start(p), p["velocity_reading"])
     return jobs[INDIVIDUAL.index(name) if name in INDIVIDUAL else 0]
 
 
 @lru_cache
-def _jobs(recipe: str, digest: str, clients: str, setting: Setting) -> list[tuple[str, str]]:
+def _jobs(recipe: str, digest: str, clients: str, *setting: Any) -> list[tuple[str, str]]:
     """Labels and keys of the checkpoints of a recipe; `digest` is that of its file."""
-    from coopoc.learned.recipes import Setting as Trained
-    from coopoc.learned.recipes import jobs_of
+    from coopoc.learned.recipes import Setting, jobs_of
 
     data = drives(clients)
-    return [(job.label, job.key(data)) for job in jobs_of(recipe, Trained(*setting), data)]
+    return [(job.label, job.key(data)) for job in jobs_of(recipe, Setting(*setting), data)]
 
 
 def prepare(cells: Iterable[Params], jobs: int = 1) -> None:

@@ -16,7 +16,7 @@ from scipy import special
 from tqdm import tqdm
 
 from coopoc import InputError, Method, nees, rt_le
-from coopoc.arrays import Floats, number
+from coopoc.arrays import number
 from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.one_file import file_digest, in_file
@@ -33,7 +33,6 @@ from .worlds import Split, world
 if TYPE_CHECKING:
     import pandas as pd
 
-    from coopoc.study.plot import Plot
 
 JOINT, ALONE = "joint", "kalman"
 """What a method is compared with on the same draws: the textbook filter, and being alone."""
@@ -86,7 +85,7 @@ def world_row(name: str, split: Split, given: Params) -> list[Row]:
 def run_worlds(
     methods: Sequence[str], out: Path, count: int, seed: int | None = None, validation: bool = False, jobs: int = 1
 ) -> int:
-    """Write and print the cards of methods, and draw those of the folder on the same worlds; 1 if a world failed.
+    """Write and print the cards of methods; 1 if a world failed.
 
     Args:
         methods: names of cooperative or solo methods.
@@ -116,10 +115,6 @@ def run_worlds(
         print(details(cards[-1]), end="\n\n")
         print(f"coopoc: {folder / card_file(name)}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
     print(overview(cards))
-    beside = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
-    distribution([card for card in beside if card["worlds"]["seed"] == cards[0]["worlds"]["seed"]]).save(
-        folder / "worlds"
-    )
     return int(any(card["failed"] for card in cards))
 
 
@@ -197,12 +192,6 @@ def _frame(columns: Mapping[str, Sequence[Any]]) -> pd.DataFrame:
     better = found[["joint_m", "alone_m"]].min(axis=1)
     for key, other in (("over_joint", found["joint_m"]), ("over_alone", found["alone_m"]), ("over_better", better)):
         found[key] = (found["rt_le_m"] / other).fillna(np.inf)
-    return found
-
-
-def ratios(card: Params) -> Floats:
-    """(W,) sorted ratios of RT-LE to the better of the textbook filter and being alone."""
-    found: Floats = np.sort(_frame(card["worlds"])["over_better"])
     return found
 
 
@@ -308,22 +297,3 @@ def markdown(rows: Sequence[Row], drop: Sequence[str] = ()) -> str:
 
     kept = [{key: value for key, value in row.items() if key not in drop} for row in rows]
     return tabulate(kept, headers="keys", tablefmt="github", disable_numparse=True)
-
-
-def distribution(cards: Sequence[Params]) -> Plot:
-    """Share of worlds in which the ratio to the better of the textbook filter and being alone is below each value."""
-    from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
-
-    with canvas(width=7.0) as (figure, axes):
-        ordered = sorted(cards, key=_order)
-        for card in ordered:
-            values = ratios(card)
-            share = np.arange(1, len(values) + 1) / len(values)
-            axes.step(values, 100 * share, where="post", **{**strokes({"method": card["method"]}), "marker": None})
-        axes.axvline(WORSE, color="#555555", linewidth=0.8, linestyle=":")
-        axes.set(xlabel="RT-LE over the better of joint filter and KF", ylabel="Share of worlds [%]", ylim=(0, 101))
-        plain_log(axes.xaxis)
-        axes.set_xlim(0.1, 20.0)
-        legend(axes, [{"method": card["method"]} for card in ordered])
-    count, split = cards[0]["summary"]["worlds"], cards[0]["split"]
-    return Plot(figure, f"Distribution over {count} {split} worlds; dotted: {WORSE:g} times the better of both.")

@@ -181,3 +181,9 @@ def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
     )
     one = " of one training seed, whose spread is unknown" * (len(each) == 1)
     return f"{claim} {name} (paired difference {evidence}{one})"
+
+
+def seed_range(results: Results, where: Where) -> Interval | None:
+    """Mean over training seeds, with the lowest and the highest of them."""
+    each = seed_means(results, where)
+    return Interval(sum(each) / len(each), min(each), max(each), len(each)) if each else None
