@@ -83,7 +83,7 @@ def benchmark(
     if seed is not None:
         drawn = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number will do.")
         known = {name: replace(task, seed=drawn) for name, task in known.items()}
-    real = [*(task.name for task in LOGGED), *roads(data), *CONVOYS]
+    real = [*LOGGED, *roads(data), *CONVOYS]
     for name in tasks:
         if name not in (*known, *real):
             raise unknown("tasks", name, [*known, *real], "Leave it out for all.")
@@ -121,13 +121,10 @@ def benchmark(
 
 
 def information(name: str, one: Method) -> str:
-    """Information set whose bound a method is held against."""
-    if name == "batch-smoother":  # it sees the whole drive
-        return ""
-    if not one.cooperative:
-        return "solo"
-    if name == "cooperative-filter":  # newcomers bring what they did before
-        return "past"
+    """Information set whose bound a method is held against; none of a smoother, which sees the whole drive."""
+    special = {"batch-smoother": "", "cooperative-filter": "past"}  # its newcomers bring what they did before
+    if not one.cooperative or name in special:
+        return special.get(name, "solo")
     return "fleet" if name in WHOLE_FLEET or needs_whole_fleet(name) else "star"
 
 
@@ -157,9 +154,11 @@ def measurable(name: str, data: Path | None) -> dict[str, Callable[[], Row]]:
     convoys for any other; of "mine.py:NAME" logs, or roads if it says `roads = True`."""
     if name in POSES or (in_file(name) and not _on_roads(name)):
         made = own(name) if in_file(name) else name
-        return {task.name: partial(pose_row, task, data, made) for task in LOGGED}
+        return {task: partial(pose_row, task, data, made) for task in LOGGED}
     method, places = named_method(name), roads(data)
-    found = {} if method.cooperative else {task: partial(road_row, task, data, method) for task in places}
+    found: dict[str, Callable[[], Row]] = (
+        {} if method.cooperative else {task: partial(road_row, task, data, method) for task in places}
+    )
     if places is ROADS:
         found |= {task: partial(convoy_row, task, data, method) for task in CONVOYS}
     return found

@@ -85,24 +85,23 @@ def _figure(results: Results) -> Plot | None:
 
 
 def choices(results: Results) -> pd.DataFrame:
-    """Mean RT-LE m and payload B/s of all methods that were run over an ideal channel, indexed by their selection."""
+    """Mean RT-LE m and payload B/s of all methods that were run over an ideal channel."""
     rows, names = results.frame, [*AXES, "method", "noise_model"]
     if not {*names, PAYLOAD} <= set(rows):
         return rows.iloc[:0]
     ideal = rows[(rows["channel"] == "ideal") & (rows["method"] != "bound")].fillna({PAYLOAD: 0.0})
-    return ideal.groupby(names, sort=False)[["rt_le_m", PAYLOAD]].mean()
+    return ideal.groupby(names, sort=False)[["rt_le_m", PAYLOAD]].mean().reset_index()
 
 
 def _findings(results: Results) -> dict[str, str]:
     texts, each = {}, choices(results)
-    for limit in LIMITS:
-        if not (within := each[each[PAYLOAD] <= limit] if len(each) else each).empty:
-            where = dict(zip(within.index.names, within["rt_le_m"].idxmin(), strict=True))
-            error, size = within["rt_le_m"].min(), within.loc[tuple(where.values()), PAYLOAD]
-            at = f", K = {where['max_neighbours']}, {where['schedule']}, {size:.0f} B/s" if size else ""
+    for limit in LIMITS if len(each) else ():
+        if len(within := each[each[PAYLOAD] <= limit]):
+            best = within.loc[within["rt_le_m"].idxmin()]
+            at = f", K = {best['max_neighbours']}, {best['schedule']}, {best[PAYLOAD]:.0f} B/s" if best[PAYLOAD] else ""
             words = f"At most {limit:g} B/s" if limit else "Without a byte while driving"
-            best = f"{look(where['method']).label} ({where['noise_model']}){at}"
-            texts[f"{limit:g} B/s"] = f"{words}: best is {best}, {error:.3f} m."
+            name = f"{look(best['method']).label} ({best['noise_model']})"
+            texts[f"{limit:g} B/s"] = f"{words}: best is {name}{at}, {best['rt_le_m']:.3f} m."
     return texts
 
 

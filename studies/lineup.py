@@ -169,29 +169,21 @@ def start(p: Params) -> Floats | None:
     return drive.position[0, [drive.index(i) for i in scene.egos(p)]]
 
 
-def rows(
-    p: Params,
-    quantiles: int = 0,
-    made: Sequence[tuple[int | None, Method]] = (),
-    measured: Recording | None = None,
-) -> list[Row]:
+def rows(p: Params, quantiles: int = 0) -> list[Row]:
     """Rows of a cell, one per training seed, ego and run: errors, consistency, bytes, neighbours' errors.
 
     Args:
         p: parameters of the cell.
         quantiles: number of quantiles of the distances in each row.
-        made: methods and their training seeds, instead of the method that the cell names.
-        measured: recording, instead of that of the cell.
     """
     from coopoc.evaluate.scores import rows_of, scored
     from coopoc.methods.catalogue import METHODS
 
-    recording = measured or scene.recording(p)
-    who, drive, metric = scene.egos(p), scene.fleet(p["data"]), str(p.get("metric", ""))
+    (recording, who, drive), metric = scene.trial(p), str(p.get("metric", ""))
     table: list[Row] = []
-    strange = not made and p["method"] not in METHODS and not weights.is_trained(p["method"])
-    for seed, method in made or methods(p):
-        score = scored if complete(recording, who, drive) else scored_where_present
+    strange = p["method"] not in METHODS and not weights.is_trained(p["method"])
+    score = scored if complete(recording, who, drive) else scored_where_present
+    for seed, method in methods(p):
         columns = score(method, recording, who, drive, quantiles, metric)
         more = ({} if seed is None else {"train_seed": seed}) | ({"label": method.name} if strange else {})
         table += rows_of(columns, who, **more)

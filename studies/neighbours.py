@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from coopoc.study.numbers import Number, Where, interval, listed, mean, present, rms
+from coopoc.study.numbers import Where, interval, listed, mean, present, rms
 from coopoc.study.study import Params
 from coopoc.study.style import Panel
 
@@ -70,39 +69,13 @@ def _interval(results: Results, where: Where) -> Any:
     return (mean if where["method"] == "bound" else interval)(results, where)
 
 
-LISTED: Mapping[str, tuple[str, Number, Mapping[str, tuple[str, str]]]] = {
-    "identity": (
-        "Identity covariances, as the paper's baselines, K = {k}",
-        mean,
-        {"federated": ("fedkalmannet", "trained"), "LKF-SA": ("lkf-sa", "identity"), "GNSS": ("gnss", "none")},
-    ),
-    "fitted": (
-        "Fitted covariances, K = {k}",
-        mean,
-        {
-            "FedKalmanNet": ("fedkalmannet", "trained"),
-            "KF alone": ("kalman", "fitted"),
-            "LKF-SA": ("lkf-sa", "fitted"),
-            "joint filter": ("joint", "fitted"),
-        },
-    ),
-    "nominal": (
-        "Known covariances, K = {k}, rms over runs",
-        rms,
-        {"KF alone": ("kalman", "nominal"), "joint filter": ("joint", "nominal"), "bound": BOUND},
-    ),
-}
-"""Noise model -> what is compared under it at the largest K; the bound is for the rms over runs."""
-
-
 def findings(results: Results) -> dict[str, str]:
-    """Errors under each noise model, and which of training and cooperation is better."""
-    texts = {"answer": _answer(results)}
-    for model, (words, number, pairs) in LISTED.items():
-        if k := _most(results, model):
-            each = {name: number(results, of(*pair, max_neighbours=k)) for name, pair in pairs.items()}
-            texts[model] = f"{words.format(k=k)}: {listed(each)}." if listed(each) else ""
-    return texts
+    """Which of training and cooperation is better, and the errors under known covariances beside the bound."""
+    k = _most(results, "nominal")
+    pairs = {"KF alone": ("kalman", "nominal"), "joint filter": ("joint", "nominal"), "bound": BOUND}
+    each = listed({name: rms(results, of(*pair, max_neighbours=k)) for name, pair in pairs.items()} if k else {})
+    text = f"Known covariances, K = {k}, rms over runs: {each}."
+    return {"answer": _answer(results), "nominal": text if each else ""}
 
 
 def _answer(results: Results) -> str:

@@ -14,7 +14,7 @@ from coopoc.arrays import Floats
 from coopoc.data.fetch import bring
 from coopoc.data.log.links import under
 from coopoc.data.log.read import Log
-from coopoc.data.log.residuals import GATE, begin_of, together
+from coopoc.data.log.residuals import begin_of, together
 from coopoc.data.mrclam import Calibration, MrclamLog, calibrate, pose_recording, read_mrclam, surveyed
 from coopoc.data.registry import kind_of, load_log
 from coopoc.data.source import split
@@ -27,6 +27,8 @@ LONGEST, SHARE = 300.0, 0.4
 BLOCK, BLOCKS = 30.0, 4
 """s of a block of time, and the least number of blocks, where the settings leave it open."""
 
+GATE = 5.0
+"""Standard deviations, of all pose filters."""
 SURE = (0.05, 0.05, 0.01, 0.05)
 """m, m, m and rad of first poses that are the truth's."""
 
@@ -217,4 +219,4 @@ def _calibration(data: str, until: float) -> Calibration:
 def _begin(data: str) -> tuple[Floats | None, str]:
     log = _part(data)
     assert isinstance(log, Log)
-    return begin_of(log)
+    return begin_of(log, GATE)

@@ -27,7 +27,6 @@ CONDITIONS: dict[str, Any] = {
     "outliers": "",
     "spoofed_share": 0.0,
     "spoofed_from_s": 0.0,
-    "spoofed_ramp_s": 0.0,
     "spoofed_collude": False,
     "own_share": 0.0,
     "common_share": 0.0,
@@ -85,10 +84,7 @@ def _findings(results: Results) -> dict[str, str]:
             value, (method, model) = ranked[0]
             gap = f", {value / bound:.2f} times the bound" if bound else ""
             named = f" ({model})" if len({model for _, model in each} - {"bound"}) > 1 else ""
-            who = f"{look(method).label}{named} has the lowest rms of the filters"
-            if not k:
-                who = "there is no neighbour, and the lowest rms is that of a vehicle alone"
-            texts[f"K = {k}"] = f"K = {k}: {who}, {value:.3g} m{gap}."
+            texts[f"K = {k}"] = f"K = {k}: {look(method).label}{named} has the lowest rms, {value:.3g} m{gap}."
     return texts
 
 

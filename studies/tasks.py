@@ -159,26 +159,12 @@ RANGE_STD = 0.3
 """m assumed of a UWB range, whose errors last: the file's 0.04 m is the error of one."""
 
 
-@dataclass(frozen=True)
-class Logged:
-    """What pose filters are tried on.
-
-    Args:
-        name: of the task.
-        file: file or folder below the folder of data.
-        block_s: s of a block of time, over which errors are averaged.
-    """
-
-    name: str
-    file: str
-    block_s: float
-
-
-LOGGED = (
-    Logged("robots", "MRCLAM_Dataset6", 30.0),
-    Logged("uwb", "tiers.pyfg", 10.0),
-    Logged("indoor", "Indoor_UWB_Input.txt", 3.0),
-)
+LOGGED: Mapping[str, tuple[str, float]] = {
+    "robots": ("MRCLAM_Dataset6", 30.0),
+    "uwb": ("tiers.pyfg", 10.0),
+    "indoor": ("Indoor_UWB_Input.txt", 3.0),
+}
+"""What pose filters are tried on: file or folder below that of the data, and s of a block that errors are means of."""
 
 
 def located(folder: Path | None, name: str) -> Path:
@@ -198,15 +184,15 @@ def located(folder: Path | None, name: str) -> Path:
 
 
 @lru_cache(maxsize=2)
-def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any]]:
+def seen(task: str, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any]]:
     """Measurements, truth, first step that is scored, and what is known of the start and the noise."""
-    if task.name == "robots":
+    if task == "robots":
         until, v2x = 300.0, V2X(max_neighbours=4, radius=float("inf"))
         drive = pose_drives.drive(str(path), until, v2x)
         assert drive.truth is not None
         start = int(until / drive.truth.dt)
         return pose_drives.thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
-    if task.name == "indoor":
+    if task == "indoor":
         log = read_log(path, truth=path.with_name("Indoor_UWB_GT.txt"), frame="body")
         assert log.truth is not None
         start = int(0.4 * len(log.recording.t))
@@ -220,7 +206,7 @@ def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, 
     return drive.recording, drive.truth, 0, {"begin": drive.begin, "spread": drive.spread, "assumed": noise}
 
 
-def pose_row(task: Logged, folder: Path | None, made: Any) -> Row:
+def pose_row(task: str, folder: Path | None, made: Any) -> Row:
     """RT-LE with its interval over robots and blocks of time, heading error, NEES, bytes and time.
 
     Args:
@@ -228,10 +214,11 @@ def pose_row(task: Logged, folder: Path | None, made: Any) -> Row:
         folder: of the data, None for those that were fetched.
         made: name in POSES, or a method of one's own; fields `begin`, `spread`, `assumed` are set if it has them.
     """
-    path = located(folder, task.file)
+    file, block_s = LOGGED[task]
+    path = located(folder, file)
     recording, fleet, start, known = seen(task, path)
     if isinstance(made, str):
-        made = PoseFilter(**{"lasting": task.name != "uwb", **known, **POSES[made]}, gate=GATE)
+        made = PoseFilter(**{"lasting": task != "uwb", **known, **POSES[made]}, gate=GATE)
     elif is_dataclass(made):
         own = {field.name for field in fields(made)}
         made = replace(made, **{name: value for name, value in known.items() if name in own})  # type: ignore[type-var]
@@ -241,14 +228,14 @@ def pose_row(task: Logged, folder: Path | None, made: Any) -> Row:
     began = time.perf_counter()
     track = made(recording, ids)
     seconds = time.perf_counter() - began
-    squares = np.square(blocks_of(errors(track, fleet)[0], start, task.block_s / fleet.dt))
+    squares = np.square(blocks_of(errors(track, fleet)[0], start, block_s / fleet.dt))
     level = mean_interval(np.sqrt(squares))
-    row: Row = {"task": task.name, "data": hashed(path)}
+    row: Row = {"task": task, "data": hashed(path)}
     row |= {"rt_le_m": rounded(level)}
     if fleet.heading is None:
         row |= {"nees": round(float(np.nanmean(planar(track, fleet)[1][:, start:])), 2)}
     elif track.heading is not None:
-        turned = np.rad2deg(blocks_of(heading_error(track, fleet)[0], start, task.block_s / fleet.dt))
+        turned = np.rad2deg(blocks_of(heading_error(track, fleet)[0], start, block_s / fleet.dt))
         row |= {"heading_deg": round(float(np.nanmean(turned)), 3)}
         row |= {"nees": round(float(np.nanmean(pose_nees(track, fleet)[0, start:])), 2)}
     row["received_bytes_per_second"] = received(track, recording, made.message)
@@ -269,7 +256,7 @@ def planar(track: Track, fleet: Fleet) -> tuple[Floats, Floats]:
     return gap, np.einsum("rtei,rteij,rtej->rte", gap, np.linalg.inv(track.covariance[..., :2, :2]), gap)
 
 
-def received(track: Track, recording: Recording, message: Message | None) -> int:
+def received(track: Track, recording: Recording, message: Message) -> int:
     """B/s on air that an ego receives."""
     account = of_track(track, recording, message)
     return round(float((account.of("online", "on air", "per receiver") / account.seconds).mean()))
