@@ -9,7 +9,8 @@ from typing import TYPE_CHECKING
 from coopoc import rt_le
 from coopoc.arrays import Floats
 from coopoc.evaluate.scores import rows_of
-from coopoc.study.numbers import present, seed_range
+from coopoc.evaluate.statistics import Interval
+from coopoc.study.numbers import Where, present, seed_means
 from coopoc.study.study import Params, Row
 from coopoc.study.style import Panel
 
@@ -70,6 +71,12 @@ def _curve(results: Results, method: str) -> list[float]:
     return [results.interval("rt_le_m", method=method, round=number).mean for number in rounds]
 
 
+def _seeds(results: Results, where: Where) -> Interval | None:
+    """Mean over training seeds, with the lowest and the highest of them."""
+    each = seed_means(results, where)
+    return Interval(sum(each) / len(each), min(each), max(each), len(each)) if each else None
+
+
 def _figure(results: Results) -> Plot | None:
     rounds = sorted(results.frame["round"].unique()) if "round" in results.frame else ()
     ticks = {number: str(number) for number in rounds if number % 5 == 0}
@@ -79,7 +86,7 @@ def _figure(results: Results) -> Plot | None:
         "lowest to the highest); horizontal: the individual nets at their end."
     )
     lines, ends = ([{"method": name} for name in names] for names in (BOTH["method"], weights.INDIVIDUAL))
-    return curves([panel], lines, text, number=seed_range, levels=ends, width=6.4, log=True)(results)
+    return curves([panel], lines, text, number=_seeds, levels=ends, width=6.4, log=True)(results)
 
 
 def _findings(results: Results) -> dict[str, str]:

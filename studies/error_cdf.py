@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopoc.study.numbers import Number, Where, interval, listed, mean, quantile, seed_std, verdict
+from coopoc.study.numbers import Number, Where, interval, listed, mean, present, seed_std, verdict
 from coopoc.study.study import Params
 from coopoc.study.style import Panel
 
@@ -48,6 +48,14 @@ COLUMNS: dict[str, Number] = {
 def _table(at: Params) -> TableView:
     text = "Errors over all steps; maximum: the mean of the largest of each run."
     return selections(HEAD, labelled(LINEUP, **at), COLUMNS, text, at=at)
+
+
+def quantile(results: Results, where: Where) -> float | None:
+    """Error m below which a share of all steps lies; `where` holds the share beside the selection."""
+    kept = present(results, {name: value for name, value in where.items() if name != "share"}, "error_quantiles_m")
+    if kept is None:
+        return None
+    return float(np.quantile(np.concatenate(results.select(kept)["error_quantiles_m"].to_list()), where["share"]))
 
 
 def _cdf(at: Where) -> FigureView:

@@ -19,12 +19,11 @@ from coopoc.study.numbers import Where, across, difference, interval, mean, pres
 from coopoc.study.provenance import revision
 from coopoc.study.study import Params, Row
 from coopoc.study.style import Panel, look, words
-from coopoc.study.tables import Table, crossed
+from coopoc.study.tables import Table, crossed, unused
 
 from . import pose_drives as drives
 from .pose_drives import Drive, thinned
 from .scene import CODE
-from .views import unused
 
 if TYPE_CHECKING:
     from coopoc import Results
@@ -229,7 +228,9 @@ def _table(results: Results, value: str, text: str, **options: Any) -> Table | N
     numbers = across(partial(interval, value=value), _columns(results))
     texts = f"{text} {BYTES.format(driven(results.settings))}"
     columns = {"Sent [B]": _sent, **numbers}
-    return crossed(results, HEAD, _rows(results), columns, _caption(results, texts), notes=unused(results), **options)
+    return crossed(
+        results, HEAD, _rows(results), columns, _caption(results, texts), notes=unused(results, True), **options
+    )
 
 
 HEAD = ("K", "Method")

@@ -12,8 +12,8 @@ import pandas as pd
 import pytest
 
 from coopoc.plugins import find
+from coopoc.studies.error_cdf import quantile
 from coopoc.study import figures
-from coopoc.study.numbers import quantile
 from coopoc.study.results import Results
 from coopoc.study.style import METHODS, Panel, look
 

@@ -110,24 +110,6 @@ def listed(numbers: Mapping[str, float | None]) -> str:
     return ", ".join(f"{name} {three(value)} m" for name, value in ran(numbers).items())
 
 
-def sentence(template: str, **numbers: Any) -> str:
-    """The template with its numbers; nothing if one of them was not run.
-
-    >>> sentence("{error:.1f} m", error=2.0), sentence("{error:.1f} m", error=None)
-    ('2.0 m', '')
-    """
-    return "" if None in numbers.values() else template.format(**numbers)
-
-
-def ratio(value: float | None, base: float | None) -> float | None:
-    """value / base; None if either was not run.
-
-    >>> ratio(3.0, 2.0), ratio(None, 2.0)
-    (1.5, None)
-    """
-    return value / base if value is not None and base else None
-
-
 def _seeds(results: Results, where: Where) -> list[Any]:
     kept = present(results, where)
     frame = results.select(kept) if kept else results.frame.iloc[:0]
@@ -140,25 +122,17 @@ def per_seed(results: Results, where: Where) -> Floats:
     return np.array([results.values("rt_le_m", {**where, "train_seed": seed}) for seed in seeds])
 
 
-def seed_means(results: Results, where: Where, number: Number = mean) -> list[float]:
-    """A number for each training seed; of a method that is not trained one, and none if it was not run."""
+def seed_means(results: Results, where: Where) -> list[float]:
+    """Mean RT-LE for each training seed, m; of a method that is not trained one, and none if it was not run."""
     seeds = _seeds(results, where)
     wheres = [{**where, "train_seed": seed} for seed in seeds] or [dict(where)]
-    return [value for each in wheres if (value := number(results, each)) is not None]
+    return [value for each in wheres if (value := mean(results, each)) is not None]
 
 
 def seed_std(results: Results, where: Where) -> float | None:
     """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
     each = per_seed(results, where)
     return float(each.mean(axis=(1, 2)).std(ddof=1)) if len(each) > 1 else None
-
-
-def quantile(results: Results, where: Where) -> float | None:
-    """Error m below which a share of all steps lies; `where` holds the share beside the selection."""
-    kept = present(results, {name: value for name, value in where.items() if name != "share"}, "error_quantiles_m")
-    if kept is None:
-        return None
-    return float(np.quantile(np.concatenate(results.select(kept)["error_quantiles_m"].to_list()), where["share"]))
 
 
 def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
@@ -181,9 +155,3 @@ def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
     )
     one = " of one training seed, whose spread is unknown" * (len(each) == 1)
     return f"{claim} {name} (paired difference {evidence}{one})"
-
-
-def seed_range(results: Results, where: Where) -> Interval | None:
-    """Mean over training seeds, with the lowest and the highest of them."""
-    each = seed_means(results, where)
-    return Interval(sum(each) / len(each), min(each), max(each), len(each)) if each else None
