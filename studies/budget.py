@@ -97,7 +97,7 @@ def _findings(results: Results) -> dict[str, str]:
     texts, each = {}, choices(results)
     for limit in LIMITS if len(each) else ():
         if len(within := each[each[PAYLOAD] <= limit]):
-            best = within.loc[within["rt_le_m"].idxmin()]
+            best = within.sort_values("rt_le_m", kind="stable").iloc[0]
             at = f", K = {best['max_neighbours']}, {best['schedule']}, {best[PAYLOAD]:.0f} B/s" if best[PAYLOAD] else ""
             words = f"At most {limit:g} B/s" if limit else "Without a byte while driving"
             name = f"{look(best['method']).label} ({best['noise_model']})"
