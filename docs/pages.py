@@ -55,11 +55,6 @@ FOUND = {
         "**A fitted Kalman filter is as good as the net**: 1.41 and 1.42 m in scenario 1, 0.89 and 0.94 m in "
         "scenario 2.",
     ),
-    "learned_gains": (
-        "learned.md#one-set-of-weights-four-noises",
-        "**Nine trained numbers beat the paper's nets, and adaptive filters beat both**: 1.12, 1.31 and 0.997 times the"
-        " bound in scenario 2.",
-    ),
     "neighbours": (
         "index.md",
         "**With identity covariances the federated net alone beats cooperative filters; with fitted covariances it "

@@ -26,7 +26,7 @@ from coopoc.methods.kalman import Kalman
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.methods.track import Method
 from coopoc.studies import lineup, scene
-from coopoc.studies.views import TableView, multiples, selections
+from coopoc.studies.views import TableView, of, selections
 from coopoc.study.numbers import Where, across, interval, listed, mean, per_seed, present, seed_means
 from coopoc.study.study import Params, Row, Study
 from coopoc.study.style import look
@@ -38,6 +38,7 @@ from coopoc.world.v2x import V2X
 
 if TYPE_CHECKING:
     from coopoc.learned.training.clients import Client
+    from coopoc.study.plot import Plot
     from coopoc.study.results import Results
 
 RULES = ("mean", "uniform", "median", "trimmed_mean", "krum", "multi_krum")
@@ -249,6 +250,31 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
     )
 
 
+def _multiples(results: Results) -> Plot | None:
+    """Multiples of each rule under each condition as dots, one per training seed; a line marks the mean under iid."""
+    from coopoc.study.plot import Plot, canvas, plain_log, strokes
+
+    where = {name: {"scenario": 2, "condition": name} for name in CONDITIONS}
+    drawn = {(rule, name): _multiple(results, of(rule, "none", **at)) for name, at in where.items() for rule in RULES}
+    if not any(map(len, drawn.values())):
+        return None
+    with canvas(1, len(CONDITIONS), sharex=True, sharey=True, squeeze=False, width=11.0, height=2.4) as (
+        figure,
+        (axes,),
+    ):
+        for panel, name in zip(axes, CONDITIONS, strict=True):
+            panel.axvline(1.0, color="black", linewidth=0.9)
+            for row, rule in enumerate(RULES):
+                style = {**strokes({"method": rule}), "linestyle": "none", "markersize": 4}
+                panel.plot(values := drawn[rule, name], np.full(len(values), row), **style)
+            panel.set(title=name.capitalize(), xlabel="× mean under iid")
+            plain_log(panel.xaxis)
+        axes[0].set(yticks=range(len(RULES)), yticklabels=[look(rule).label for rule in RULES])
+        axes[0].invert_yaxis()
+    text = "RT-LE of the kept weights as a multiple of the mean's under iid, a dot per training seed."
+    return Plot(figure, scene.caption(results, text, scenario=2))
+
+
 STUDY = Study(
     "aggregation",
     "Which rule should combine the clients' nets when clients are alike, heterogeneous, poisoned or absent?",
@@ -279,13 +305,7 @@ STUDY = Study(
         "scenario2": _table(2),
     },
     figures={
-        "multiples": multiples(
-            [(rule, "none") for rule in RULES],
-            {name.capitalize(): {"scenario": 2, "condition": name} for name in CONDITIONS},
-            _multiple,
-            "RT-LE of the kept weights as a multiple of the mean's under iid, a dot per training seed.",
-            at={"scenario": 2},
-        )
+        "multiples": _multiples,
     },
     findings=lambda results: {
         f"scenario {s}, {c}": _finding(results, {"scenario": s, "condition": c}) for s in (1, 2) for c in CONDITIONS

@@ -10,28 +10,28 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 from tqdm import tqdm
 from tyro.conf import Positional, arg
 
+from coopoc import InputError, Method, paired_difference
 from coopoc.arrays import number
-from coopoc.errors import InputError, said, unknown
+from coopoc.errors import said, unknown
 from coopoc.evaluate.scores import scored
-from coopoc.evaluate.statistics import mean_interval, paired_difference
+from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
-from coopoc.methods.track import Method
 from coopoc.one_file import in_file
-from coopoc.plugins import find, names
+from coopoc.plugins import find
 from coopoc.study.numbers import three
 from coopoc.study.study import Params, Row
 
 from .convoys import CONVOYS, convoy_row
 from .lineup import named_method, own
 from .roads import ROADS, road_row, roads
-from .tasks import BEST, LOGGED, POSES, TASKS, VALIDATION, Task, bound, graph_row, pose_row, recording, rounded
-from .worlds_card import card_file, card_head, overview, run_worlds
+from .tasks import LOGGED, POSES, TASKS, VALIDATION, Task, bound, pose_row, recording, rounded
+from .worlds_card import card_file, card_head, markdown, overview, run_worlds
 
 ROAD = "road-kalman"
 """Of which others are shown to be better or worse on the same blocks of real roads."""
@@ -57,12 +57,12 @@ def benchmark(
 
     Example: coopoc benchmark road-kalman --tasks f9k    # after coopoc data get f9k
 
-    Example: coopoc benchmark pose-fleet gauss-newton --data ~/measured
+    Example: coopoc benchmark pose-fleet --data ~/measured
 
     Example: coopoc benchmark --table --out benchmarks/cards
 
     Args:
-        methods: names of coopoc list, learned gains, FILE.py:NAME; with --data also pose-fleet, ... and backends.
+        methods: names of coopoc list, learned gains, FILE.py:NAME; with --data also pose-fleet, ...
         out: folder of the cards.
         data: folder with the files of the tasks of real measurements (docs/benchmark.md), besides those that coopoc
             data get has fetched, or a log of your own with a truth, on which solo methods are run in the same way.
@@ -83,7 +83,7 @@ def benchmark(
     if seed is not None:
         drawn = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number will do.")
         known = {name: replace(task, seed=drawn) for name, task in known.items()}
-    real = [*BEST, *(task.name for task in LOGGED), *roads(data), *CONVOYS]
+    real = [*LOGGED, *roads(data), *CONVOYS]
     for name in tasks:
         if name not in (*known, *real):
             raise unknown("tasks", name, [*known, *real], "Leave it out for all.")
@@ -95,9 +95,9 @@ def benchmark(
         elif data is None and not tasks:
             hint = "Add --data FOLDER, or --tasks with what coopoc data get has fetched."
             raise InputError("data", None, f"must name the folder of measurements for {name}", hint)
-        if tasks and not ((simulated(name) and set(tasks) & {*known}) or set(tasks) & {*measurable(name, data)}):
-            allowed = f"must be of {', '.join([*known][: len(known) * simulated(name)] + measurable(name, data))}"
-            raise InputError(f"tasks of {name}", ", ".join(tasks), allowed, "Name one of these.")
+        own_tasks = [*(known if simulated(name) else ()), *measurable(name, data)]
+        if tasks and not set(tasks) & {*own_tasks}:
+            raise InputError(f"tasks of {name}", ", ".join(tasks), f"must be of {', '.join(own_tasks)}", "Name one.")
     failed = 0
     for name in methods:
         began = time.perf_counter()
@@ -121,13 +121,10 @@ def benchmark(
 
 
 def information(name: str, one: Method) -> str:
-    """Information set whose bound a method is held against."""
-    if name == "batch-smoother":  # it sees the whole drive
-        return ""
-    if not one.cooperative:
-        return "solo"
-    if name == "cooperative-filter":  # newcomers bring what they did before
-        return "past"
+    """Information set whose bound a method is held against; none of a smoother, which sees the whole drive."""
+    special = {"batch-smoother": "", "cooperative-filter": "past"}  # its newcomers bring what they did before
+    if not one.cooperative or name in special:
+        return special.get(name, "solo")
     return "fleet" if name in WHOLE_FLEET or needs_whole_fleet(name) else "star"
 
 
@@ -152,32 +149,19 @@ def tried(name: str, task: Task) -> Row:
     return row
 
 
-def measurable(name: str, data: Path | None) -> list[str]:
-    """The tasks of real measurements for a name: graphs for a backend, logs for a pose filter, roads for a solo method,
+def measurable(name: str, data: Path | None) -> dict[str, Callable[[], Row]]:
+    """The tasks of real measurements for a name, and what runs each: logs for a pose filter, roads for a solo method,
     convoys for any other; of "mine.py:NAME" logs, or roads if it says `roads = True`."""
-    if name in names("coopoc.backends"):
-        return [*BEST]
     if name in POSES or (in_file(name) and not _on_roads(name)):
-        return [task.name for task in LOGGED]
-    found = [] if named_method(name).cooperative else [*roads(data)]
-    return found + [*CONVOYS] * (roads(data) is ROADS)
-
-
-def measured(name: str, data: Path | None, tasks: Sequence[str] | None = None) -> list[Row]:
-    """Rows of the tasks of real measurements for a name, or of some of them."""
-    logged: dict[str, Any] = {task.name: task for task in LOGGED}
-    rows = []
-    for task in tqdm([one for one in measurable(name, data) if tasks is None or one in tasks], name, delay=2.0):
-        if task in BEST:
-            made: Callable[[], Row] = partial(graph_row, data, task, name)
-        elif task in logged and task not in roads(data):
-            made = partial(pose_row, logged[task], data, own(name) if in_file(name) else name)
-        elif task in CONVOYS:
-            made = partial(convoy_row, task, data, named_method(name))
-        else:
-            made = partial(road_row, task, data, named_method(name))
-        rows.append(_row(task, made))
-    return rows
+        made = own(name) if in_file(name) else name
+        return {task: partial(pose_row, task, data, made) for task in LOGGED}
+    method, places = named_method(name), roads(data)
+    found: dict[str, Callable[[], Row]] = (
+        {} if method.cooperative else {task: partial(road_row, task, data, method) for task in places}
+    )
+    if places is ROADS:
+        found |= {task: partial(convoy_row, task, data, method) for task in CONVOYS}
+    return found
 
 
 def _row(task: str, made: Callable[[], Row]) -> Row:
@@ -189,9 +173,8 @@ def _row(task: str, made: Callable[[], Row]) -> Row:
 
 
 def simulated(name: str) -> bool:
-    """Whether the simulated tasks are for a name: those of backends, of pose filters and of what says `roads` are real
-    ones."""
-    return name not in POSES and name not in names("coopoc.backends") and not _on_roads(name)
+    """Whether the simulated tasks are for a name: those of pose filters and of what says `roads` are real ones."""
+    return name not in POSES and not _on_roads(name)
 
 
 def _on_roads(name: str) -> bool:
@@ -202,7 +185,7 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None, real: Seque
     """The card of a method: what it is, with which versions, and a row for each task.
 
     Args:
-        name: of a method, a pose filter or a backend, or "mine.py:NAME".
+        name: of a method or a pose filter, or "mine.py:NAME".
         tasks: simulated ones.
         data: folder of the real measurements, or None.
         real: tasks of real measurements; None for all that there are for the name, none without data.
@@ -210,26 +193,25 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None, real: Seque
     rows = [
         _row(task.name, partial(tried, name, task)) for task in tqdm(list(tasks), desc=name, unit="task", delay=2.0)
     ]
-    rows += measured(name, data, [] if data is None and real is None else real)
+    if data or real is not None:
+        for task, run in tqdm(measurable(name, data).items(), name, delay=2.0):
+            rows += [_row(task, run)] if real is None or task in real else []
     return {**card_head(name), "tasks": rows}
 
 
 def page(cards: Iterable[Params]) -> str:
-    """Markdown tables of cards, of simulated tasks and of logs and graphs where there are any.
+    """Markdown tables of cards, of simulated tasks and of logs where there are any.
 
     Of simulated ones RT-LE in m and, in parentheses, over its bound, the least geometric mean over all tasks first.
     """
-    from tabulate import tabulate
-
     given = list(cards)
-    tables = [rows for rows in (_simulated(given), _logs(given), _graphs(given)) if rows]
-    return "\n\n".join(tabulate(rows, headers="keys", tablefmt="github", disable_numparse=True) for rows in tables)
+    return "\n\n".join(markdown(rows) for rows in (_simulated(given), _logs(given)) if rows)
 
 
 def _logs(cards: Sequence[Params]) -> list[Row]:
     """RT-LE, heading error and NEES of pose filters, a row per task and method."""
     rows = []
-    simulated_tasks = {task.name for task in TASKS} | set(BEST)
+    simulated_tasks = {task.name for task in TASKS}
     for one, row in _rows(cards, {row["task"] for card in cards for row in card["tasks"]} - simulated_tasks):
         shown = {"task": row["task"], "method": one, "RT-LE [m]": "failed"}
         if "failed" not in row:
@@ -244,15 +226,6 @@ def _logs(cards: Sequence[Params]) -> list[Row]:
             shown |= {"B/s": row["received_bytes_per_second"], "us/step": row["microseconds_per_step"]}
         rows.append(((row["task"], row.get("rt_le_m", [np.inf])[0]), shown))
     return [shown for _, shown in sorted(rows, key=lambda row: row[0])]
-
-
-def _graphs(cards: Sequence[Params]) -> list[Row]:
-    """Cost over the least known, status and time of backends, a row per backend."""
-    shown: dict[str, Row] = {}
-    for one, row in _rows(cards, set(BEST)):
-        cell = "failed" if "failed" in row else f"{row['over_best']:.4g} {row['status']}, {row['seconds']:.2g} s"
-        shown.setdefault(one, {"backend": one})[row["task"]] = cell
-    return list(shown.values())
 
 
 def _rows(cards: Sequence[Params], tasks: set[str]) -> list[tuple[str, Params]]:

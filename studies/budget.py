@@ -1,25 +1,23 @@
-"""Accuracy against bytes, sent once for a training or in every second of a drive, and the break-even of the two."""
+"""Accuracy against bytes, sent once for a training or in every second of a drive."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
-import numpy as np
-
-from coopoc.study.numbers import Number, Where, across, difference, interval, mean, present, ratio, rms
+from coopoc.study.numbers import Where, across, difference, interval, mean, present
 from coopoc.study.style import look
-from coopoc.study.tables import Table
 from coopoc.world.channels import CHANNELS
 
-from . import lineup, scene, weights
+from . import lineup, scene
 from .lineup import PAST
 from .views import of, selections
 
 if TYPE_CHECKING:
+    import pandas as pd
+
+    from coopoc import Results
     from coopoc.study.figures import Plot
-    from coopoc.study.results import Results
 
 TRAINED = ("fedokf", "fedkalmannet")
 """Trained by federation, in the order of their bytes."""
@@ -86,84 +84,30 @@ def _figure(results: Results) -> Plot | None:
     return figures.pareto(results, scene.caption(results, text), PAYLOAD, where=where)
 
 
-class Choice(NamedTuple):
-    """RT-LE in metres, payload bytes per second, and the selection that has them."""
-
-    error: float
-    size: float
-    where: Where
-
-
-def choices(results: Results) -> list[Choice]:
-    """All methods that were run over an ideal channel."""
-    names, each = [*AXES, "method", "noise_model"], list[Choice]()
-    for key, _ in results.frame.groupby(names, sort=False) if set(names) <= set(results.frame) else ():
-        where = dict(zip(names, key, strict=True))
-        error = mean(results, where) if where["channel"] == "ideal" and where["method"] != "bound" else None
-        if error is not None:
-            each.append(Choice(error, mean(results, where, PAYLOAD) or 0.0, where))
-    return each
-
-
-def best_under(each: Sequence[Choice], limit: float) -> Choice | None:
-    """The best method of them within `limit` bytes per second."""
-    return min((choice for choice in each if choice.size <= limit), key=lambda choice: choice.error, default=None)
+def choices(results: Results) -> pd.DataFrame:
+    """Mean RT-LE m and payload B/s of all methods that were run over an ideal channel."""
+    rows, names = results.frame, [*AXES, "method", "noise_model"]
+    if not {*names, PAYLOAD} <= set(rows):
+        return rows.iloc[:0]
+    ideal = rows[(rows["channel"] == "ideal") & (rows["method"] != "bound")].fillna({PAYLOAD: 0.0})
+    return ideal.groupby(names, sort=False)[["rt_le_m", PAYLOAD]].mean().reset_index()
 
 
 def _findings(results: Results) -> dict[str, str]:
     texts, each = {}, choices(results)
-    for limit in LIMITS:
-        best = best_under(each, limit)
-        if best:
-            where, k = best.where, best.where["max_neighbours"]
-            first = "" if where["schedule"] == SCHEDULES[0] else f", {where['schedule']}"
-            at = f", K = {k}{first}, {best.size:.0f} B/s" if k else ""
+    for limit in LIMITS if len(each) else ():
+        if len(within := each[each[PAYLOAD] <= limit]):
+            best = within.sort_values("rt_le_m", kind="stable").iloc[0]
+            at = f", K = {best['max_neighbours']}, {best['schedule']}, {best[PAYLOAD]:.0f} B/s" if best[PAYLOAD] else ""
             words = f"At most {limit:g} B/s" if limit else "Without a byte while driving"
-            how = f"{look(where['method']).label} ({where['noise_model']}){at}"
-            times = ratio(rms(results, where), rms(results, {"method": "bound", "max_neighbours": k}))
-            far = f", {times:.2f} times the bound" if times else ""
-            texts[f"{limit:g} B/s"] = f"{words}: best is {how}, {best.error:.3f} m{far}."
+            name = f"{look(best['method']).label} ({best['noise_model']})"
+            texts[f"{limit:g} B/s"] = f"{words}: best is {name}{at}, {best['rt_le_m']:.3f} m."
     return texts
 
 
 def _rate(results: Results, where: Where, value: str = PAYLOAD) -> int | None:
     rate = mean(results, where, value)
     return None if rate is None else round(rate)
-
-
-def even(results: Results) -> Table | None:
-    """Driving time after which online cooperation has moved as many bytes as a training, per method and channel."""
-
-    def time(once: float) -> Number:
-        def column(results: Results, where: Where) -> str | None:
-            rate = mean(results, where, PAYLOAD)
-            return None if rate is None else duration(once / rate if rate else np.inf)
-
-        return column
-
-    ran = [name for name in TRAINED if present(results, {"method": name})]
-    sizes = {look(name).label: weights.ledger(results.settings, name).per_vehicle("training") for name in ran}
-    once = {f"{name}, {size / 1e3:,.0f} kB": time(size) for name, size in sizes.items()}
-    rows = [row for row in METHODS if row[1]["noise_model"] == "nominal"] if once else []
-    text = (
-        f"Driving time after which online cooperation (K = {MOST}) has moved as many bytes as each training moved per "
-        "vehicle, once: payload, per receiver."
-    )
-    head = ("Channel", "Online", "Noise model")
-    return selections(head, rows, {"Payload [B/s]": _rate, **once}, text)(results)
-
-
-def duration(seconds: float) -> str:
-    """Seconds in a unit that suits them.
-
-    >>> duration(0.3), duration(5), duration(600), duration(7300), duration(float("inf"))
-    ('< 1 s', '5 s', '10 min', '2.0 h', 'never')
-    """
-    if seconds < 60:
-        return f"{seconds:.0f} s" if seconds >= 1 else "< 1 s"
-    if not np.isfinite(seconds):
-        return "never"
-    return f"{seconds / 60:.0f} min" if seconds < 5400 else f"{seconds / 3600:.1f} h"
 
 
 METHODS = [
@@ -201,7 +145,6 @@ STUDY = lineup.study(
             unranked=("Difference",),
             decimals=3,
         ),
-        "break_even": even,
     },
     figures={"pareto": _figure},
     findings=_findings,

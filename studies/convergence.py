@@ -6,8 +6,8 @@ from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING
 
+from coopoc import rt_le
 from coopoc.arrays import Floats
-from coopoc.evaluate.metrics import rt_le
 from coopoc.evaluate.scores import rows_of
 from coopoc.evaluate.statistics import Interval
 from coopoc.study.numbers import Where, present, seed_means
@@ -18,8 +18,8 @@ from . import lineup, scene, weights
 from .views import curves, table
 
 if TYPE_CHECKING:
+    from coopoc import Results
     from coopoc.study.figures import Plot
-    from coopoc.study.results import Results
 
 FEDERATED, CENTRALISED = "fedkalmannet", "centralised"
 BOTH = {"method": [FEDERATED, CENTRALISED]}

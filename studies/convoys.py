@@ -9,17 +9,15 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc import V2X, Fleet, Recording, observe
+from coopoc import V2X, Fleet, Method, Recording, observe
 from coopoc.arrays import AnyArray, Floats
-from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.statistics import mean_interval
-from coopoc.methods.track import Method
 from coopoc.study.study import Row
 from coopoc.world.recording import MEASURED
 
 from .pose_drives import hashed
 from .roads import BLOCK, ROADS, seen
-from .tasks import blocks_of, located, rounded
+from .tasks import blocks_of, located, planar, received, rounded
 
 CONVOYS: Mapping[str, str] = {f"convoy-{road}": road for road in ROADS}
 """Task -> road whose drive is cut."""
@@ -103,16 +101,13 @@ def convoy_row(task: str, data: Path | None, method: Method) -> Row:
     egos = list(range(len(recording.ids)))
     method(recording.between(0, 3), egos)  # compiles
     track = method(recording, egos)
-    gap = (track.x - fleet.position)[..., :2]
+    gap, nees = planar(track, fleet)
     size = min(BLOCK, len(recording.t) * recording.dt / 4) / recording.dt
     blocks = blocks_of(np.sqrt(np.square(gap).sum(axis=-1).mean(axis=0)), 0, size)
     level = mean_interval(blocks)
     row: Row = {"task": task, "data": hashed(*(located(data, name) for name in ROADS[CONVOYS[task]]))}
     row |= {"rt_le_m": rounded(level), "blocks_m": [round(float(value), 4) for value in blocks.ravel()]}
     if track.covariance is not None:
-        nees = np.einsum("rtei,rteij,rtej->rte", gap, np.linalg.inv(track.covariance[..., :2, :2]), gap)
         row["nees"] = round(float(np.nanmean(nees)), 2)
-    account = of_track(track, recording, method.message)
-    received = account.of("online", "on air", "per receiver") / account.seconds
-    row["received_bytes_per_second"] = round(float(received.mean()))
+    row["received_bytes_per_second"] = received(track, recording, method.message)
     return row | {"microseconds_per_step": round(1e6 * track.seconds / track.x[..., 0].size, 2)}

@@ -2,30 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopoc.study.numbers import Number, Where, interval, listed, mean, present, seed_std
+from coopoc.study.numbers import Number, Where, interval, listed, mean, present, seed_std, verdict
 from coopoc.study.study import Params
-from coopoc.study.style import look
+from coopoc.study.style import Panel
 
 from . import lineup, scene, weights
-from .views import HEAD, TableView, labelled, of, selections, verdict
+from .views import HEAD, FigureView, TableView, curves, labelled, of, selections
 
 if TYPE_CHECKING:
-    from coopoc.study.plot import Plot
-    from coopoc.study.results import Results
+    from coopoc import Results
 
 CASES = ((1, 0.15), (2, 0.10), (2, 0.15))
 """Scenario and velocity noise: scenario 2 does not state it, so both of the paper's figures are shown."""
 CLASSIC = (("gnss", "none"), ("kalman", "identity"), ("kalman", "fitted"), ("kalman", "nominal"), ("kalman", "oracle"))
-LINES = ("method", "noise_model")
-NEAR = 0.03
-"""Difference of the logarithms of two distributions, a line's width, up to which they are drawn as one."""
 LINEUP = (*CLASSIC, *((name, "trained") for name in weights.PAPER))
+DRAWN = [pair for pair in LINEUP if pair[1] != "nominal" and pair[0] not in weights.INDIVIDUAL[1:]]
+SHARES = (0.05, *np.linspace(0.1, 0.9, 9).tolist(), 0.95, 0.99)
+"""Of the time steps, at which the distributions are drawn."""
 
 
 def meaningful(p: Params) -> bool:
@@ -52,48 +50,21 @@ def _table(at: Params) -> TableView:
     return selections(HEAD, labelled(LINEUP, **at), COLUMNS, text, at=at)
 
 
-def _cdf(results: Results, at: Params) -> Plot | None:
-    methods = ["gnss", "kalman", "okf", "fedkalmannet", "centralised", "individual1"]
-    models = ["none", "identity", "fitted", "oracle", "trained"]
-    where = present(results, {**at, "method": methods, "noise_model": models}, "error_quantiles_m")
-    text = "Distribution of the error over all steps; markers: mean of the per-run maxima."
-    return cdf(results, scene.caption(results, text, **at), where) if where else None
+def quantile(results: Results, where: Where) -> float | None:
+    """Error m below which a share of all steps lies; `where` holds the share beside the selection."""
+    kept = present(results, {name: value for name, value in where.items() if name != "share"}, "error_quantiles_m")
+    if kept is None:
+        return None
+    return float(np.quantile(np.concatenate(results.select(kept)["error_quantiles_m"].to_list()), where["share"]))
 
 
-def cdf(results: Results, caption: str, where: Where) -> Plot:
-    """Share of the errors below each value, with a marker at the mean of the per-run maxima."""
-    from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
-
-    drawn, maxima, places = list[Params](), dict[str, list[str]](), list[tuple[str, str, Any]]()
-    with canvas(width=7.8) as (figure, axes):
-        for key, frame in results.groups(LINES, where):
-            names = dict(zip(LINES, key, strict=True))
-            method, model = map(str, key)
-            errors = np.sort(np.concatenate(frame["error_quantiles_m"].to_list()))
-            share = np.arange(1, len(errors) + 1) / len(errors)
-            worst = float(np.mean([np.max(q) for q in frame["error_quantiles_m"]]))
-            at = np.log(np.quantile(errors, np.linspace(0.05, 0.95, 19)))
-            near = (f"{look(m).label} {k}" for m, k, x in places if m != method and np.abs(at - x).max() < NEAR)
-            drawn.append(names)
-            if twin := next(near, ""):  # it would be hidden
-                maxima.setdefault(method, []).append(f" = {twin.removesuffix(' trained')}")
-                continue
-            places.append((method, model, at))
-            axes.plot(errors, share, **{**strokes(names), "marker": None})
-            axes.plot(worst, np.interp(worst, errors, share), **{**strokes(names), "linestyle": "none"}, zorder=3)
-            maxima.setdefault(method, []).append(f"{worst:.1f}")
-        axes.set(xlabel="Error [m]", ylabel="Share of time steps below", ylim=(0, 1.02))
-        plain_log(axes.xaxis)
-        axes.set_xlim(left=0.1)
-        legend(axes, drawn, {method: _worst(each) for method, each in maxima.items()})
-    return Plot(figure, caption)
-
-
-def _worst(texts: Sequence[str]) -> str:
-    """Methods that are drawn as one, and the maxima of all noise models."""
-    numbers = " / ".join(text for text in texts if text[0].isdigit())
-    same = "".join(text for text in texts if text[0] == " ")
-    return f"{same} (max {numbers} m)" if numbers else same
+def _cdf(at: Where) -> FigureView:
+    """Error against the share of the steps that it covers."""
+    panel = Panel({100 * share: {"share": share} for share in SHARES}, at, xlabel="Share of time steps [%]")
+    text = "Error that a share of all steps does not exceed."
+    return curves(
+        [panel], [of(*pair) for pair in DRAWN], text, at=at, number=quantile, ylabel="Error [m]", width=8.4, log=True
+    )
 
 
 def _finding(results: Results, at: Params) -> str:
@@ -120,7 +91,7 @@ STUDY = lineup.study(
     where=meaningful,
     shares=("scenario", "velocity_ratio"),
     tables={f"scenario{s}_{100 * r:g}": _table(case(s, r)) for s, r in CASES},
-    figures={f"cdf_scenario{s}_{100 * r:g}": partial(_cdf, at=case(s, r)) for s, r in CASES},
+    figures={f"cdf_scenario{s}_{100 * r:g}": _cdf(case(s, r)) for s, r in CASES},
     findings=lambda results: {f"scenario {s}": _finding(results, case(s, r)) for s, r in CASES[:2]},
     limitations=("The nets and the fitted noise model come from drives with 1.5 m and 10 %; the test noise differs.",),
     metrics={"rt_le_m": "lower"},

@@ -9,23 +9,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from coopoc import Fleet, InputError, Recording, Study
 from coopoc.arrays import AnyArray, Floats
-from coopoc.errors import InputError, unknown
+from coopoc.errors import unknown
 from coopoc.file_names import given_path
 from coopoc.one_file import in_file
 from coopoc.plugins import find, names
-from coopoc.study.study import Params, Row, Study
-from coopoc.world.fleet import Fleet
+from coopoc.study.study import Params, Row
 from coopoc.world.links import stretches
-from coopoc.world.recording import Recording
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
 from . import scene, weights
 
 if TYPE_CHECKING:  # they load numba, for which a mistake in --set need not wait
-    from coopoc.methods.noise_model import NoiseModel
-    from coopoc.methods.track import Method
+    from coopoc import Method, NoiseModel
 
 COOPERATIVE = ("lkf-sa", "lkf-sa-edge", "msmv-r", "joint")
 BOUND = ("bound", "bound")
@@ -91,7 +89,7 @@ def noise_model(p: Params) -> NoiseModel | str:
     Raises:
         InputError: an oracle for real data, whose noise is unknown.
     """
-    from coopoc.methods.noise_model import NoiseModel
+    from coopoc import NoiseModel
 
     if p["noise_model"] == "fitted":
         return weights.fitted(p)
@@ -100,8 +98,6 @@ def noise_model(p: Params) -> NoiseModel | str:
             hint = "Take nominal or fitted on real data."
             raise InputError("noise_model", "'oracle'", "is for simulated noise", hint)
         return NoiseModel.oracle(scene.sensors(p), scene.fleet(p["data"]))
-    if p["noise_model"] == "heading taken as exact":
-        return NoiseModel.nominal(replace(scene.sensors(p), heading_std=0.0, heading_bias_std=0.0))
     return str(p["noise_model"])
 
 
@@ -129,7 +125,7 @@ def own(name: str, noise: NoiseModel | str = "nominal") -> Any:
     Raises:
         InputError: an unknown name, a class that takes no noise model, or what no study can use.
     """
-    from coopoc.methods.track import Method
+    from coopoc import Method
 
     shows = "docs/extend.md shows one; its first argument is noise_model."
     try:
@@ -173,29 +169,21 @@ def start(p: Params) -> Floats | None:
     return drive.position[0, [drive.index(i) for i in scene.egos(p)]]
 
 
-def rows(
-    p: Params,
-    quantiles: int = 0,
-    made: Sequence[tuple[int | None, Method]] = (),
-    measured: Recording | None = None,
-) -> list[Row]:
+def rows(p: Params, quantiles: int = 0) -> list[Row]:
     """Rows of a cell, one per training seed, ego and run: errors, consistency, bytes, neighbours' errors.
 
     Args:
         p: parameters of the cell.
         quantiles: number of quantiles of the distances in each row.
-        made: methods and their training seeds, instead of the method that the cell names.
-        measured: recording, instead of that of the cell.
     """
     from coopoc.evaluate.scores import rows_of, scored
     from coopoc.methods.catalogue import METHODS
 
-    recording = measured or scene.recording(p)
-    who, drive, metric = scene.egos(p), scene.fleet(p["data"]), str(p.get("metric", ""))
+    (recording, who, drive), metric = scene.trial(p), str(p.get("metric", ""))
     table: list[Row] = []
-    strange = not made and p["method"] not in METHODS and not weights.is_trained(p["method"])
-    for seed, method in made or methods(p):
-        score = scored if complete(recording, who, drive) else scored_where_present
+    strange = p["method"] not in METHODS and not weights.is_trained(p["method"])
+    score = scored if complete(recording, who, drive) else scored_where_present
+    for seed, method in methods(p):
         columns = score(method, recording, who, drive, quantiles, metric)
         more = ({} if seed is None else {"train_seed": seed}) | ({"label": method.name} if strange else {})
         table += rows_of(columns, who, **more)
@@ -209,7 +197,8 @@ def bound_rows(p: Params) -> list[Row]:
     the mean over runs. Newcomers bring their past, unless the noise model is that of BOUND or "star". Real data have
     none: the bound is of sensors that measure at every step.
     """
-    from coopoc.evaluate.bounds import bound_rt_le, past_bound, posterior_bound
+    from coopoc import bound_rt_le, posterior_bound
+    from coopoc.evaluate.bounds import past_bound
 
     bound = posterior_bound if p.get("noise_model") in ("bound", "star") else past_bound
     drive, v2x = scene.fleet(p["data"]), scene.channel(p)
@@ -317,10 +306,6 @@ def _merged(name: str, parts: Sequence[AnyArray], lengths: Sequence[int]) -> Any
     if name in SUMS:
         return np.asarray(np.sum(parts, axis=0))
     power = 2 if name in RMS else 1
-    values, weights = np.stack(parts).astype(float) ** power, np.array(lengths, dtype=float)
-    weights = weights.reshape(-1, *[1] * (values.ndim - 1)) * np.isfinite(values)
-    total = weights.sum(axis=0)
-    mean = np.divide(
-        (np.nan_to_num(values) * weights).sum(axis=0), total, out=np.full(total.shape, np.nan), where=total > 0
-    )
-    return np.asarray(mean ** (1 / power))
+    values = np.ma.masked_invalid(np.stack(parts).astype(float) ** power)
+    mean = np.ma.average(values, axis=0, weights=lengths)
+    return np.asarray(np.ma.filled(mean, np.nan) ** (1 / power))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -14,7 +13,7 @@ from tyro.conf import arg
 from coopoc.plugins import find
 
 if TYPE_CHECKING:
-    from coopoc.study.results import Results
+    from coopoc import Results
 
 PAPER: Mapping[str, tuple[str, ...]] = {
     "convergence": ("centralised",),
@@ -22,11 +21,6 @@ PAPER: Mapping[str, tuple[str, ...]] = {
     "neighbours": ("nominal",),
 }
 """Studies of the paper, and the keys of the findings that answer their questions."""
-EVIDENCE = re.compile(
-    r" \(paired[^)]*\)|, (centralised [\d.]+ m, )?OKF [\d.]+ m|, oracle KF [\d.]+ m"
-    r"|; (the )?federated (net|is) [^.(]*(\(paired[^)]*\))?"
-)
-"""What the first screen leaves to the sections."""
 LEAD = "After “Federated Data-Driven Kalman Filtering for State Estimation” (arXiv 2411.05847), on {where}."
 
 
@@ -44,11 +38,10 @@ def paper(
         jobs: number of worker processes.
         data: fleet to test on, a name or a path.
     """
+    from coopoc import Results, run_study
     from coopoc.data.fleet_cards import in_words
     from coopoc.data.registry import DATASETS, card
     from coopoc.study.report import report
-    from coopoc.study.results import Results
-    from coopoc.study.run import run_study
 
     began, results, given = time.perf_counter(), dict[str, Results](), {"weights": str(out / "weights"), "data": data}
     for number, name in enumerate(PAPER, start=1):
@@ -56,9 +49,7 @@ def paper(
         study = find("coopoc.studies", name)
         results[name] = run_study(study, out=out, jobs=jobs, settings=given, retry_failed=True)
     print(f"coopoc: stage {len(PAPER) + 1} of {len(PAPER) + 1}: report", file=sys.stderr)
-    texts = {
-        results[name].question: EVIDENCE.sub("", reported(name, results[name], keys)) for name, keys in PAPER.items()
-    }
+    texts = {results[name].question: reported(name, results[name], keys) for name, keys in PAPER.items()}
     bundled = [name for name in dict.fromkeys((data, "town10-clients")) if name in DATASETS]
     place = "our fleets" if data in DATASETS else f"{Path(data).name} after training on ours"
     page = report(

@@ -13,11 +13,12 @@ from coopoc.study.numbers import present
 from . import lineup, scene
 
 if TYPE_CHECKING:
+    from coopoc import Results
     from coopoc.study.plot import Plot
-    from coopoc.study.results import Results
 
 DRAWN = ("gnss", "kalman", "joint", "cooperative-filter")
 """Methods that are drawn, those of them that were run."""
+MAP = "Paths of the vehicles; the truth is grey."
 HELD = "GNSS repeats a fix until the next one, and errs by the way driven since."
 
 
@@ -30,7 +31,6 @@ def views(results: Results, over_time: bool) -> Plot | None:
     if not methods or not scene.is_real(data) or (over_time and not truth.present.any()):
         return None
     egos = scene.egos(results.settings)
-    ends = list[tuple[float, float, str]]()
     rows, height = (len(egos), 0.8 + 1.5 * len(egos)) if over_time else (1, 4.0)
     with canvas(rows, width=7.2, height=height, sharex=True, sharey=True, squeeze=False) as (figure, grid):
         for ego, axes in zip(egos, grid[:, 0] if over_time else [grid[0, 0]] * len(egos), strict=True):
@@ -43,26 +43,18 @@ def views(results: Results, over_time: bool) -> Plot | None:
                 marks = {"marker": ".", "linestyle": "none"} if name == "gnss" and not over_time else {"marker": ""}
                 style = {**strokes({"method": name}), "linewidth": 1.1, "markersize": 2, **marks}
                 axes.plot(*((t, gap) if over_time else x[:, :2].T), **style)
-            ends.append((*x[-1, 1::-1], picture(ego)))
+            where = {"xy": (0.01, 0.9), "xycoords": "axes fraction"} if over_time else {"xy": x[-1, :2]}
+            axes.annotate(picture(ego), **where)
             axes.set(ylabel="Error [m]" if over_time else "North [m]")
-            if over_time:
-                axes.annotate(picture(ego), (0.01, 0.9), xycoords="axes fraction")
         axes.set(xlabel="Time [s]" if over_time else "East [m]")
         legend(grid[0, 0], [{"method": name} for name in methods])
         if over_time:
             plain_log(grid[0, 0].yaxis)
         else:
             grid[0, 0].set_aspect("equal", adjustable="datalim")
-            for rank, (north, east, name) in enumerate(sorted(ends)):  # fanned out, as paths may end side by side
-                place = {"xytext": (24, 12 * rank - 6 * len(ends)), "textcoords": "offset points"}
-                axes.annotate(
-                    name, (east, north), **place, arrowprops={"arrowstyle": "-", "lw": 0.5, "relpos": (0, 0.5)}
-                )
-    what = "Paths of the vehicles; the truth is grey."
-    if over_time:
-        what = f"Distance from the truth over time.{' ' + HELD if 'gnss' in methods else ''}"
+    what = f"Distance from the truth over time. {HELD * ('gnss' in methods)}" if over_time else MAP
     most = results.frame["max_neighbours"].max()
-    return Plot(figure, scene.caption(results, f"{what} Filters with K = {most}."))
+    return Plot(figure, scene.caption(results, f"{what.strip()} Filters with K = {most}."))
 
 
 def _path(results: Results, name: str, ego: str) -> tuple[Floats, Floats]:

@@ -9,29 +9,26 @@ from pathlib import Path
 
 import numpy as np
 
+from coopoc import V2X, Fleet, InputError, Links, Recording, pose_start
 from coopoc.arrays import Floats
 from coopoc.data.fetch import bring
 from coopoc.data.log.links import under
 from coopoc.data.log.read import Log
-from coopoc.data.log.residuals import GATE, begin_of, together
+from coopoc.data.log.residuals import begin_of, together
 from coopoc.data.mrclam import Calibration, MrclamLog, calibrate, pose_recording, read_mrclam, surveyed
 from coopoc.data.registry import kind_of, load_log
 from coopoc.data.source import split
-from coopoc.errors import InputError
 from coopoc.methods.poses.pose_inputs import SPREAD
-from coopoc.methods.poses.pose_start import pose_start
 from coopoc.study.study import Params
-from coopoc.world.fleet import Fleet
-from coopoc.world.links import Links
-from coopoc.world.recording import Recording
 from coopoc.world.storage import digest
-from coopoc.world.v2x import V2X
 
 LONGEST, SHARE = 300.0, 0.4
 """s, and share of the drive, that calibrate where the settings leave it open."""
 BLOCK, BLOCKS = 30.0, 4
 """s of a block of time, and the least number of blocks, where the settings leave it open."""
 
+GATE = 5.0
+"""Standard deviations, of all pose filters."""
 SURE = (0.05, 0.05, 0.01, 0.05)
 """m, m, m and rad of first poses that are the truth's."""
 
@@ -57,9 +54,7 @@ class Drive:
     @property
     def ids(self) -> tuple[str, ...]:
         """Of those that move."""
-        rec = self.recording
-        stand = np.flatnonzero(np.nansum(np.abs(rec.velocity), axis=(0, 1, 3)) == 0.0) if rec.body is None else ()
-        return tuple(name for k, name in enumerate(rec.ids) if k not in rec.landmarks and k not in stand)
+        return tuple(name for k, name in enumerate(self.recording.ids) if k not in self.recording.landmarks)
 
 
 def calibrated(p: Params) -> float:
@@ -104,19 +99,12 @@ def has_true_poses(data: str) -> bool:
     return isinstance(log, MrclamLog) or (log.truth is not None and log.truth.heading is not None)
 
 
-def in_world(data: str) -> bool:
-    """Whether velocities are those of the world's frame: there are no headings to be estimated."""
-    log = _part(data)
-    return isinstance(log, Log) and log.recording.body is None
-
-
-def check(data: str, until: float, gate: float) -> None:
+def check(data: str, until: float) -> None:
     """Read all that cells share.
 
     Args:
         data: as of `drive`.
         until: as of `drive`.
-        gate: as of `drive`.
 
     Raises:
         InputError: as of `drive`.
@@ -124,19 +112,18 @@ def check(data: str, until: float, gate: float) -> None:
     log = _part(data)
     if isinstance(log, MrclamLog):
         surveyed(log), _calibration(data, until)
-    elif not in_world(data):
-        _begin(data, gate)
+    else:
+        _begin(data)
 
 
 @lru_cache(maxsize=2)
-def drive(data: str, until: float, v2x: V2X, gate: float) -> Drive:
+def drive(data: str, until: float, v2x: V2X) -> Drive:
     """All that was measured, under a channel.
 
     Args:
         data: a folder of MR.CLAM, whose first part calibrates its sensors, or a log in body frames, which states them.
         until: s, of that part.
         v2x: K, radius and channel.
-        gate: of the filters that find first poses.
 
     Raises:
         InputError: a log that cannot be followed.
@@ -144,13 +131,11 @@ def drive(data: str, until: float, v2x: V2X, gate: float) -> Drive:
     log = _part(data)
     if isinstance(log, MrclamLog):
         recording = under(pose_recording(log, _calibration(data, until)), v2x, logged=False)
-        return Drive(recording, pose_start(recording, gate=gate), log.fleet, True)
+        return Drive(recording, pose_start(recording, gate=GATE), log.fleet, True)
     recording = under(log.recording, v2x, logged=log.messages)
-    if in_world(data):
-        return Drive(recording, None, log.truth, False)
     told = recording.sensors
     lasting = max(told.speed_scale_std, told.yaw_rate_bias_std, told.range_offset_std) > 0
-    begin, where = _begin(data, gate)
+    begin, where = _begin(data)
     return Drive(recording, begin, log.truth, lasting, SURE if where else SPREAD)
 
 
@@ -161,10 +146,8 @@ def described(data: str) -> str:
         return "Wheel odometry, ranges and bearings of {}; no fix, no compass. The first {:.3g} s calibrate the noise."
     read = ", ".join(f"{number} {what}" for what, number in log.summary.read.items() if number)
     where = "" if (span := _log(data)[1]) == "throughout" else f" {span},"
-    begin = "" if in_world(data) else _begin(data, GATE)[1]
-    return (
-        f"What {{}} holds ({read}),{where} with the noise that it states{begin}; the first {{:.3g}} s are not scored."
-    )
+    noise = f"with the noise that it states{_begin(data)[1]}; the first {{:.3g}} s are not scored."
+    return f"What {{}} holds ({read}),{where} {noise}"
 
 
 def digests(data: str) -> dict[str, str]:
@@ -219,7 +202,10 @@ def _log(data: str) -> tuple[MrclamLog | Log, str]:
         allowed = "must be the path of measurements, not only of drives"
         raise InputError("data", repr(data), allowed, hint if Path(name).exists() else bring(name, hint))
     log = load_log(data)
-    return (log, "throughout") if log.recording.body is None else together(log)
+    if log.recording.body is None:
+        hint = f"Take coopoc run side_by_side --data {data!r}."
+        raise InputError("data", repr(data), "is a log in the world's frame, and filters here estimate headings", hint)
+    return together(log)
 
 
 @lru_cache(maxsize=2)
@@ -230,7 +216,7 @@ def _calibration(data: str, until: float) -> Calibration:
 
 
 @lru_cache(maxsize=2)
-def _begin(data: str, gate: float) -> tuple[Floats | None, str]:
+def _begin(data: str) -> tuple[Floats | None, str]:
     log = _part(data)
     assert isinstance(log, Log)
-    return begin_of(log, gate)
+    return begin_of(log, GATE)

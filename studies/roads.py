@@ -9,14 +9,12 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc import V2X, Fleet, Kalman, NoiseModel, Recording, Sensors, observe, read_log
+from coopoc import V2X, Fleet, InputError, Kalman, Method, NoiseModel, Recording, Sensors, observe, read_log
 from coopoc.arrays import Floats
 from coopoc.data.log.read import is_log
 from coopoc.data.registry import load_log
 from coopoc.data.source import split
-from coopoc.errors import InputError
 from coopoc.evaluate.statistics import mean_interval
-from coopoc.methods.track import Method
 from coopoc.study.study import Row
 from coopoc.world.recording import MEASURED
 
@@ -120,8 +118,8 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> R
                 continue
             track = method(recording.between(begin, stop), [column])
             gap, nees = planar(track, truth.between(begin, stop))
-            squares[begin:stop], seconds = np.square(gap).sum(axis=-1), seconds + track.seconds
-            ratios.append(nees[max(start - begin, 0) :])
+            squares[begin:stop], seconds = np.square(gap[0, :, 0]).sum(axis=-1), seconds + track.seconds
+            ratios.append(nees[0, max(start - begin, 0) :, 0])
         parts = [squares[k : k + size] for k in range(start, len(squares) - size + 1, size)]
         blocks += [float(np.sqrt(np.nanmean(part))) for part in parts if np.isfinite(part).any()]
     level = mean_interval(np.array([blocks]))

@@ -10,24 +10,18 @@ from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 
+from coopoc import V2X, Fleet, InputError, Outliers, Recording, Sensors, observe
 from coopoc.arrays import Bools
 from coopoc.data.source import split, there
-from coopoc.errors import InputError
 from coopoc.study.provenance import revision
 from coopoc.study.study import Params
 from coopoc.world.channels import channel as channel_of
-from coopoc.world.fleet import Fleet
-from coopoc.world.outliers import Outliers
-from coopoc.world.recording import Recording
-from coopoc.world.sensing import observe
-from coopoc.world.sensors import Sensors
 from coopoc.world.spoofing import Spoofing, spoofed
 from coopoc.world.storage import digest
-from coopoc.world.v2x import V2X
 
 if TYPE_CHECKING:
+    from coopoc import Results
     from coopoc.data.log.read import Log
-    from coopoc.study.results import Results
 
 Start = Literal["gnss", "true"]
 CODE = tuple(f"coopoc.{part}" for part in ("world", "methods", "kernels", "optimize", "evaluate", "learned", "data"))
@@ -156,23 +150,15 @@ def sensors(p: Params) -> Sensors:
 
 
 def lasting(noise: Sensors, own: float, common: float) -> Sensors:
-    """The same variance of a fix, with its shares `own` and `common` time-correlated (`Sensors.gnss_drift_std`).
+    """The same variance of a fix, alike on all axes, of which shares are time-correlated: `own` and `common`.
 
     >>> lasting(Sensors(), 0.36, 0.0).gnss_drift_std.__round__(3)
     0.9
     """
     if not (own >= 0 and common >= 0 and own + common < 1):
         raise InputError(", ".join(LASTING), (own, common), "must be >= 0 and below 1 together", "0.5 is half of it.")
-    std = np.array(noise.gnss_std)
-    if own + common and not np.allclose(std, std[0]):
-        raise InputError("gnss_std", noise.gnss_std, "must be the same on every axis here", "Use Sensors directly.")
-    white = tuple((std * np.sqrt(1.0 - own - common)).tolist())
-    return replace(
-        noise,
-        gnss_std=white,
-        gnss_drift_std=float(std[0] * np.sqrt(own)),
-        gnss_common_std=float(std[0] * np.sqrt(common)),
-    )
+    white, drift, shared = (noise.gnss_std[0] * float(np.sqrt(share)) for share in (1.0 - own - common, own, common))
+    return replace(noise, gnss_std=(white,) * 3, gnss_drift_std=drift, gnss_common_std=shared)
 
 
 def acting(p: Params) -> Sensors:
@@ -198,7 +184,8 @@ def heading(p: Params) -> str:
     noise = acting(p)
     low, high = noise.gnss_bias
     bias = f", bias U[{low:g}, {high:g}] m per run and axis" if high else ""
-    near = f", {relative(noise)}, radius {channel(p).radius:g} m" if "radius_m" in p else ""
+    between = f"range {noise.range_std:.2g} m, angles {np.rad2deg(noise.azimuth_std):.2g}°"
+    near = f", {between}, radius {channel(p).radius:g} m" if "radius_m" in p else ""
     wrong = "".join(f", {note}" for note in noise.outliers.notes) if noise.outliers else ""
     return (
         f"Scenario {p['scenario']}: GNSS {noise.fix_std[0]:.3g} m per axis{bias}, velocity "
@@ -209,11 +196,6 @@ def heading(p: Params) -> str:
 def decimals(p: Params) -> int:
     """Digits of RT-LE in tables: one more where errors are centimetres."""
     return 3 if is_real(p["data"]) else 2
-
-
-def relative(noise: Sensors) -> str:
-    """Noise of range and angles in words."""
-    return f"range {noise.range_std:.2g} m, angles {np.rad2deg(noise.azimuth_std):.2g}°"
 
 
 def conditions(p: Params) -> str:
@@ -324,9 +306,7 @@ def attacking(p: Params) -> Spoofing | None:
     """The attack of the cell, if there is one."""
     if not (share := float(p.get("spoofed_share", 0.0))):
         return None
-    start, ramp = (float(p.get(name, 0.0)) for name in ("spoofed_from_s", "spoofed_ramp_s"))
-    collude = bool(p.get("spoofed_collude", False))
-    return Spoofing(share, start=start, ramp=ramp, collude=collude)
+    return Spoofing(share, start=float(p.get("spoofed_from_s", 0.0)), collude=bool(p.get("spoofed_collude", False)))
 
 
 def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:

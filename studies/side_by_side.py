@@ -12,8 +12,8 @@ from . import lineup, paths, scene
 from .views import TableView, of, table
 
 if TYPE_CHECKING:
+    from coopoc import Results
     from coopoc.study.figures import Plot
-    from coopoc.study.results import Results
     from coopoc.study.tables import Table
 
 METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "mhe", "cooperative-filter", "bound")
@@ -27,7 +27,6 @@ CONDITIONS: dict[str, Any] = {
     "outliers": "",
     "spoofed_share": 0.0,
     "spoofed_from_s": 0.0,
-    "spoofed_ramp_s": 0.0,
     "spoofed_collude": False,
     "own_share": 0.0,
     "common_share": 0.0,
@@ -85,10 +84,7 @@ def _findings(results: Results) -> dict[str, str]:
             value, (method, model) = ranked[0]
             gap = f", {value / bound:.2f} times the bound" if bound else ""
             named = f" ({model})" if len({model for _, model in each} - {"bound"}) > 1 else ""
-            who = f"{look(method).label}{named} has the lowest rms of the filters"
-            if not k:
-                who = "there is no neighbour, and the lowest rms is that of a vehicle alone"
-            texts[f"K = {k}"] = f"K = {k}: {who}, {value:.3g} m{gap}."
+            texts[f"K = {k}"] = f"K = {k}: {look(method).label}{named} has the lowest rms, {value:.3g} m{gap}."
     return texts
 
 
@@ -102,6 +98,9 @@ STUDY = lineup.study(
     tables={
         "rt_le": _table("RT-LE [m] against K.", "rt_le_m"),
         "nees": _table("NEES against K (3 is consistent; 2 in the plane).", "nees", best=None, intervals=False),
+        "in_band": _table(
+            "Share of steps whose run-averaged NEES is in its 99 % band.", "nees_inside", best=None, intervals=False
+        ),
         "innovation": _table(
             "RMS innovation of the fixes [m] against K: how well a method predicts the next fix.", "innovation_m"
         ),

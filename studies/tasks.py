@@ -13,31 +13,36 @@ import numpy as np
 
 from coopoc import (
     V2X,
+    Fault,
     Fleet,
+    InputError,
+    Message,
+    Outliers,
     PoseFilter,
     Recording,
     Sensors,
+    Track,
+    bound_rt_le,
+    fleet_bound,
+    heading_error,
     load_fleet,
     observe,
+    pose_nees,
     pose_start,
-    read_graph,
+    posterior_bound,
     read_log,
-    solve,
 )
 from coopoc.arrays import Floats
 from coopoc.data.fetch import bring, cache_folder, holder, public
-from coopoc.errors import InputError
-from coopoc.evaluate.bounds import bound_rt_le, fleet_bound, past_bound, posterior_bound
+from coopoc.evaluate.bounds import past_bound
 from coopoc.evaluate.ledger import of_track
-from coopoc.evaluate.metrics import errors, heading_error, pose_nees
+from coopoc.evaluate.metrics import errors
 from coopoc.evaluate.statistics import Interval, mean_interval
-from coopoc.methods.track import Track
 from coopoc.study.study import Row
-from coopoc.world.outliers import Fault, Outliers
 from coopoc.world.spoofing import Spoofing, spoofed
 
 from . import pose_drives
-from .pose_drives import hashed
+from .pose_drives import GATE, hashed
 
 VERSION = "2"
 """Another set of tasks, seeds, egos or scores is another version."""
@@ -132,15 +137,13 @@ def bound(task: Task, information: str) -> float:
     runs = FEW if information in ("past", "fleet") else task.runs
     told = recording(replace(task, v2x=v2x, runs=runs), information == "fleet", told=True)[0] if wrong else None
     if information == "fleet":
-        whole = fleet_bound(fleet, sensors, v2x, recording=told)
-        bounds: list[Floats] = [whole[:, ego] for ego in task.columns]
-    elif information == "past":
-        bounds = [past_bound(fleet, sensors, ego, v2x, recording=told) for ego in task.columns]
+        bounds = [*np.moveaxis(fleet_bound(fleet, sensors, v2x, recording=told)[:, list(task.columns)], 1, 0)]
     else:
-        bounds = [
-            posterior_bound(fleet, sensors, ego, v2x if information == "star" else V2X(0), recording=told)
-            for ego in task.columns
-        ]
+        of_ego, near = (
+            past_bound if information == "past" else posterior_bound,
+            V2X(0) if information == "solo" else v2x,
+        )
+        bounds = [of_ego(fleet, sensors, ego, near, recording=told) for ego in task.columns]
     return float(np.sqrt(np.mean([bound_rt_le(cov) ** 2 for cov in bounds])))
 
 
@@ -152,38 +155,16 @@ POSES: Mapping[str, Mapping[str, Any]] = {
     "pose-naive": {"unit": "fleet", "fusion": "naive"},
 }
 """Pose filters by name: their options."""
-GATE = 5.0
 RANGE_STD = 0.3
 """m assumed of a UWB range, whose errors last: the file's 0.04 m is the error of one."""
-BEST: Mapping[str, float] = {
-    "mrclam5a.pyfg": 69.10353,
-    "mrclam6.pyfg": 3144.2650,
-    "plaza1.pyfg": 1332.7850,
-    "tiers.pyfg": 2050.1000,
+
+
+LOGGED: Mapping[str, tuple[str, float]] = {
+    "robots": ("MRCLAM_Dataset6", 30.0),
+    "uwb": ("tiers.pyfg", 10.0),
+    "indoor": ("Indoor_UWB_Input.txt", 3.0),
 }
-"""Graph -> least cost that is known of its chordal objective."""
-
-
-@dataclass(frozen=True)
-class Logged:
-    """What pose filters are tried on.
-
-    Args:
-        name: of the task.
-        file: file or folder below the folder of data.
-        block_s: s of a block of time, over which errors are averaged.
-    """
-
-    name: str
-    file: str
-    block_s: float
-
-
-LOGGED = (
-    Logged("robots", "MRCLAM_Dataset6", 30.0),
-    Logged("uwb", "tiers.pyfg", 10.0),
-    Logged("indoor", "Indoor_UWB_Input.txt", 3.0),
-)
+"""What pose filters are tried on: file or folder below that of the data, and s of a block that errors are means of."""
 
 
 def located(folder: Path | None, name: str) -> Path:
@@ -203,29 +184,29 @@ def located(folder: Path | None, name: str) -> Path:
 
 
 @lru_cache(maxsize=2)
-def seen(task: Logged, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any]]:
+def seen(task: str, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any]]:
     """Measurements, truth, first step that is scored, and what is known of the start and the noise."""
-    if task.name == "robots":
+    if task == "robots":
         until, v2x = 300.0, V2X(max_neighbours=4, radius=float("inf"))
-        drive = pose_drives.drive(str(path), until, v2x, GATE)
+        drive = pose_drives.drive(str(path), until, v2x)
         assert drive.truth is not None
         start = int(until / drive.truth.dt)
         return pose_drives.thinned(drive.recording, 2, start), drive.truth, start, {"begin": drive.begin}
-    if task.name == "indoor":
+    if task == "indoor":
         log = read_log(path, truth=path.with_name("Indoor_UWB_GT.txt"), frame="body")
         assert log.truth is not None
         start = int(0.4 * len(log.recording.t))
         noise = replace(log.recording.sensors, range_std=RANGE_STD)
         begin = pose_start(replace(log.recording.between(0, start), sensors=noise), gate=GATE)
         return log.recording, log.truth, start, {"begin": begin, "assumed": noise}
-    drive = pose_drives.drive(str(path), 0.0, V2X(max_neighbours=3, radius=float("inf")), GATE)
+    drive = pose_drives.drive(str(path), 0.0, V2X(max_neighbours=3, radius=float("inf")))
     if drive.truth is None or drive.truth.heading is None:
         raise InputError("data", str(path), "must hold true poses", "Take the file as it was published.")
     noise = replace(drive.recording.sensors, range_std=RANGE_STD)
     return drive.recording, drive.truth, 0, {"begin": drive.begin, "spread": drive.spread, "assumed": noise}
 
 
-def pose_row(task: Logged, folder: Path | None, made: Any) -> Row:
+def pose_row(task: str, folder: Path | None, made: Any) -> Row:
     """RT-LE with its interval over robots and blocks of time, heading error, NEES, bytes and time.
 
     Args:
@@ -233,10 +214,11 @@ def pose_row(task: Logged, folder: Path | None, made: Any) -> Row:
         folder: of the data, None for those that were fetched.
         made: name in POSES, or a method of one's own; fields `begin`, `spread`, `assumed` are set if it has them.
     """
-    path = located(folder, task.file)
+    file, block_s = LOGGED[task]
+    path = located(folder, file)
     recording, fleet, start, known = seen(task, path)
     if isinstance(made, str):
-        made = PoseFilter(**{"lasting": task.name != "uwb", **known, **POSES[made]}, gate=GATE)
+        made = PoseFilter(**{"lasting": task != "uwb", **known, **POSES[made]}, gate=GATE)
     elif is_dataclass(made):
         own = {field.name for field in fields(made)}
         made = replace(made, **{name: value for name, value in known.items() if name in own})  # type: ignore[type-var]
@@ -246,31 +228,19 @@ def pose_row(task: Logged, folder: Path | None, made: Any) -> Row:
     began = time.perf_counter()
     track = made(recording, ids)
     seconds = time.perf_counter() - began
-    account = of_track(track, recording, made.message)
-    squares = np.square(blocks_of(errors(track, fleet)[0], start, task.block_s / fleet.dt))
+    squares = np.square(blocks_of(errors(track, fleet)[0], start, block_s / fleet.dt))
     level = mean_interval(np.sqrt(squares))
-    row: Row = {"task": task.name, "data": hashed(path)}
+    row: Row = {"task": task, "data": hashed(path)}
     row |= {"rt_le_m": rounded(level)}
     if fleet.heading is None:
-        row |= {"nees": round(float(np.nanmean(planar(track, fleet)[1][start:])), 2)}
+        row |= {"nees": round(float(np.nanmean(planar(track, fleet)[1][:, start:])), 2)}
     elif track.heading is not None:
-        turned = np.rad2deg(blocks_of(heading_error(track, fleet)[0], start, task.block_s / fleet.dt))
+        turned = np.rad2deg(blocks_of(heading_error(track, fleet)[0], start, block_s / fleet.dt))
         row |= {"heading_deg": round(float(np.nanmean(turned)), 3)}
         row |= {"nees": round(float(np.nanmean(pose_nees(track, fleet)[0, start:])), 2)}
-    received = account.of("online", "on air", "per receiver") / account.seconds
-    row["received_bytes_per_second"] = round(float(received.mean()))
+    row["received_bytes_per_second"] = received(track, recording, made.message)
     row["microseconds_per_step"] = round(1e6 * seconds / len(recording.t) / len(who), 2)
     return row
-
-
-def graph_row(folder: Path | None, file: str, backend: str) -> Row:
-    """Cost over the least that is known, status and s of a solve, its search for a start included."""
-    path = located(folder, file)
-    problem = read_graph(path)
-    solution = solve(problem, backend, throw=False)
-    seconds = solution.build_seconds + solution.solve_seconds
-    row = {"task": path.name, "data": hashed(path), "status": solution.status.name, "cost": round(solution.cost, 4)}
-    return row | {"over_best": round(solution.cost / BEST[path.name], 5), "seconds": round(seconds, 3)}
 
 
 def rounded(level: Interval) -> list[float]:
@@ -279,11 +249,17 @@ def rounded(level: Interval) -> list[float]:
 
 
 def planar(track: Track, fleet: Fleet) -> tuple[Floats, Floats]:
-    """Errors (T, 2) m of a track of one ego in the plane, and their NEES (T,), NaN without a covariance."""
-    gap = (track.x[0, :, 0] - fleet.position[:, track.egos[0]])[:, :2]
+    """Errors (R, T, E, 2) m of a track in the plane, and their NEES (R, T, E), NaN without a covariance."""
+    gap = (track.x - fleet.position[:, list(track.egos)])[..., :2]
     if track.covariance is None:
-        return gap, np.full(len(gap), np.nan)
-    return gap, np.einsum("ti,tij,tj->t", gap, np.linalg.inv(track.covariance[0, :, 0, :2, :2]), gap)
+        return gap, np.full(gap.shape[:-1], np.nan)
+    return gap, np.einsum("rtei,rteij,rtej->rte", gap, np.linalg.inv(track.covariance[..., :2, :2]), gap)
+
+
+def received(track: Track, recording: Recording, message: Message) -> int:
+    """B/s on air that an ego receives."""
+    account = of_track(track, recording, message)
+    return round(float((account.of("online", "on air", "per receiver") / account.seconds).mean()))
 
 
 def blocks_of(error: Floats, start: int, length: float) -> Floats:

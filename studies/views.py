@@ -6,18 +6,15 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-import numpy as np
-
-from coopoc.evaluate.statistics import Interval, over_seeds, paired_difference
-from coopoc.study.numbers import Number, Where, per_seed, present
+from coopoc.study.numbers import Number, Where, present
 from coopoc.study.style import Panel, look
-from coopoc.study.tables import Entry, Table, crossed, pivot
+from coopoc.study.tables import Entry, Table, crossed, pivot, unused
 
 from . import scene
 
 if TYPE_CHECKING:
+    from coopoc import Results
     from coopoc.study.plot import Plot
-    from coopoc.study.results import Results
 
 TableView: TypeAlias = Callable[["Results"], Table | None]
 FigureView: TypeAlias = "Callable[[Results], Plot | None]"
@@ -60,43 +57,9 @@ def table(
             return None
         shown = {"decimals": scene.decimals(results.settings), **options}
         made = pivot(results, rows, columns, value, kept, scene.caption(results, *texts), **shown)
-        return replace(made, notes=(*made.notes, *unused(results)))
+        return replace(made, notes=(*made.notes, *unused(results, scene.is_real(str(results.settings["data"])))))
 
     return view
-
-
-ALIKE, WORSE = 1e-3, 1.1
-"""m, difference of errors that is none; ratio of the mean error with neighbours to that of a vehicle alone."""
-
-
-def unused(results: Results) -> tuple[str, ...]:
-    """A sentence for each method and K whose errors are those of a vehicle alone, in every run and for every ego, or on
-    real data larger."""
-    rows, texts, by = results.frame, list[str](), ["method", "max_neighbours"]
-    value = "rt_le_m" if "rt_le_m" in rows else "innovation_m"
-    sent = "sent_bytes" if "sent_bytes" in rows else "sent_bytes_per_second"
-    if not {*by, sent, value} <= set(rows):
-        return ()
-    real = sent == "sent_bytes" or scene.is_real(str(results.settings["data"]))
-    keys = [name for name in (*results.axes, "ego", "run", "train_seed") if name in rows and name not in by]
-    for (method, k), part in rows[rows[sent] > 0].groupby(by, sort=False):
-        own = (rows["method"] == method) & (rows["max_neighbours"] == 0)
-        both = part.merge(rows[own | (rows["method"] == "kalman") & (rows["max_neighbours"] == k)], on=keys)
-        together, alone = (both[f"{value}_{side}"] for side in "xy")
-        gap = (together - alone).abs().groupby([both[key] for key in keys], dropna=False).min()
-        text = f"{look(str(method)).label}, K = {k}:"
-        if k and len(gap) == len(part) and gap.max() < ALIKE:
-            lacks = "what was measured lacks what it takes, such as an azimuth"
-            why = lacks if part["bytes_per_second"].any() else "no message arrived"
-            texts.append(
-                f"{text} equal to solo within {ALIKE:g} m: no neighbour's measurement was used, because {why}."
-            )
-        elif k and real and together.mean() > WORSE * alone.mean():
-            texts.append(
-                f"{text} worse than alone, {together.mean():.3g} m for {alone.mean():.3g} m: what was measured of "
-                "neighbours, or its stated noise, is wrong. coopoc data check says what looks so."
-            )
-    return tuple(texts)
 
 
 def selections(
@@ -146,63 +109,3 @@ def curves(
         return figures.curves(results, panels, lines, scene.caption(results, *texts, **(at or {})), **options)
 
     return view
-
-
-def multiples(
-    pairs: Iterable[tuple[str, str]],
-    cases: Mapping[str, Where],
-    number: Callable[[Results, Where], Sequence[float]],
-    *texts: str,
-    target: Mapping[str, float] | None = None,
-    at: Where | None = None,
-) -> FigureView:
-    """Multiples of a reference, a row per method and a panel per case, as `coopoc.study.figures.multiples`.
-
-    Args:
-        pairs: methods and noise models.
-        cases: title -> selection.
-        number: multiples of a selection; none where it was not run.
-        texts: of the caption.
-        target: title -> upper end of the band.
-        at: parameters that the caption names beside the settings.
-    """
-
-    def view(results: Results) -> Plot | None:
-        from coopoc.study import figures
-
-        rows = {p: {title: number(results, of(*p, **case)) for title, case in cases.items()} for p in pairs}
-        return figures.multiples(rows, scene.caption(results, *texts, **(at or {})), target)
-
-    return view
-
-
-def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
-    """Sentence on the RT-LE of `trained`, against `other`, which needs no training, with the evidence.
-
-    Args:
-        results: of the study.
-        trained: selection of one method.
-        other: selection of another method, over the same egos and runs.
-        name: of the other, for the sentence.
-    """
-    base, each = results.values("rt_le_m", other), per_seed(results, trained)
-    gaps = [paired_difference(each.mean(axis=0), base)]
-    text = f"paired difference {gaps[0].mean:+.3f} m; 95 % {_ends(gaps[0])} over egos and runs, "
-    if len(each) > 1:
-        gaps.append(over_seeds(each - base))
-        text += f"{_ends(gaps[1])} over {len(each)} training seeds"
-    else:
-        text += "of one training seed, whose spread is unknown"
-    if not all(np.isfinite([gap.low, gap.high]).all() for gap in gaps):
-        claim = f"cannot be judged against {name}: too few seeds, egos or runs"
-    elif all(gap.high < 0 for gap in gaps):
-        claim = f"beats {name}"
-    elif all(gap.low > 0 for gap in gaps):
-        claim = f"is worse than {name}"
-    else:
-        claim = f"cannot be distinguished from {name}"
-    return f"{claim} ({text})"
-
-
-def _ends(gap: Interval) -> str:
-    return f"[{gap.low:+.3f}, {gap.high:+.3f}]"

@@ -8,26 +8,23 @@ import sys
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from tyro.conf import Positional, arg
 
-from coopoc.errors import InputError, unknown
+from coopoc import V2X, InputError, Sensors, observe
+from coopoc.errors import unknown
 from coopoc.one_file import file_digest, from_file, in_file
 from coopoc.plugins import find
 from coopoc.study.study import Params
-from coopoc.world.sensing import observe
-from coopoc.world.sensors import Sensors, VelocityReading
-from coopoc.world.v2x import V2X
+from coopoc.world.sensors import VelocityReading
 
-from .scene import Start, fleet, is_real, start
+from .scene import fleet, is_real, start
 
 if TYPE_CHECKING:
-    from coopoc.evaluate.ledger import Ledger
+    from coopoc import NoiseModel, Results
     from coopoc.learned.checkpoint import Checkpoint
     from coopoc.learned.training.drives import Drives
-    from coopoc.methods.noise_model import NoiseModel
-    from coopoc.study.results import Results
 
 INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
 """Nets of single clients, one per client, at most six."""
@@ -37,14 +34,6 @@ LEARNED = (*PAPER, "fedokf", "road", "fedroad")
 """Methods that are trained."""
 WORST = 1.1
 """Times the error of a Kalman filter with fitted noise, above which the command saves no weights."""
-
-
-class Setting(NamedTuple):
-    """Training seed, start of the filter, reading of "10 % of the velocity"."""
-
-    seed: int
-    start: Start
-    reading: VelocityReading
 
 
 def seeds(p: Params) -> range:
@@ -88,18 +77,17 @@ def _job(name: str, p: Params, seed: int) -> tuple[str, str]:
     if not is_trained(name) or not trainable({**p, "method": name}):
         raise unknown("trained method", name, LEARNED)
     digest = file_digest(name) if in_file(name) else ""
-    jobs = _jobs(_recipe(name), digest, p["clients"], Setting(seed, start(p), p["velocity_reading"]))
+    jobs = _jobs(_recipe(name), digest, p["clients"], seed, start(p), p["velocity_reading"])
     return jobs[INDIVIDUAL.index(name) if name in INDIVIDUAL else 0]
 
 
 @lru_cache
-def _jobs(recipe: str, digest: str, clients: str, setting: Setting) -> list[tuple[str, str]]:
+def _jobs(recipe: str, digest: str, clients: str, *setting: Any) -> list[tuple[str, str]]:
     """Labels and keys of the checkpoints of a recipe; `digest` is that of its file."""
-    from coopoc.learned.recipes import Setting as Trained
-    from coopoc.learned.recipes import jobs_of
+    from coopoc.learned.recipes import Setting, jobs_of
 
     data = drives(clients)
-    return [(job.label, job.key(data)) for job in jobs_of(recipe, Trained(*setting), data)]
+    return [(job.label, job.key(data)) for job in jobs_of(recipe, Setting(*setting), data)]
 
 
 def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
@@ -149,7 +137,7 @@ def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:
 
 @lru_cache
 def _fitted(clients: str, reading: VelocityReading) -> NoiseModel:
-    from coopoc.methods.noise_model import NoiseModel
+    from coopoc import NoiseModel
 
     if is_real(clients):
         from coopoc.data.registry import load_log
@@ -165,13 +153,6 @@ def trained(results: Results) -> list[str]:
     return sorted((name for name in ran if is_trained(name)), key=lambda name: (*LEARNED, name).index(name))
 
 
-def ledger(p: Params, name: str) -> Ledger:
-    """The bytes of a training, from the card of the first seed."""
-    from coopoc.learned.federation.history import card_ledger
-
-    return card_ledger(checkpoint(name, p, 0).card, fleet(p["clients"]))
-
-
 def described(results: Results) -> Mapping[str, str]:
     """Descriptions of the training of the methods that were run, from the cards of the first seed."""
     texts = {}
@@ -182,11 +163,9 @@ def described(results: Results) -> Mapping[str, str]:
         if plan["kind"] == "federated":
             steps = f"{plan['rounds']} rounds of {plan['local_epochs']} passes through each client's pieces"
         texts[name] = (
-            f"{steps}; {card['parameters']} parameters, AdamW at {how['learning_rate']:g}, decoupled decay "
-            f"{how['weight_decay']:g}, batch {how['batch']}, pieces of {plan['piece']} steps "
-            f"{'mirrored' if how['mirror'] else 'as they are'}, {plan['noise']} noise; {len(seeds(results.settings))} "
-            f"training seeds; clients {', '.join(card['clients'])}; {card['seconds']:.0f} s per net; key "
-            f"{card['key'][:12]}"
+            f"{steps}; {card['parameters']} parameters, AdamW at {how['learning_rate']:g}, {plan['noise']} noise; "
+            f"{len(seeds(results.settings))} training seeds; clients {', '.join(card['clients'])}; "
+            f"key {card['key'][:12]}"
         )
     return texts
 

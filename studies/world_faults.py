@@ -4,14 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from functools import partial
+from typing import Any, TypeAlias
 
 import numpy as np
 
-from coopoc import V2X, Fleet, Recording, Sensors
+from coopoc import V2X, Fault, Fleet, Outliers, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints
 from coopoc.world.body_frames import turned
-from coopoc.world.outliers import Fault, Outliers
 from coopoc.world.sensors import stream
 from coopoc.world.spoofing import Spoofing, spoofed
 
@@ -23,7 +23,7 @@ Draws: TypeAlias = np.random.Generator
 
 @dataclass(frozen=True, eq=False)
 class Scene:
-    """A world before its recording: each kind of fault returns another scene.
+    """A world before its recording: each kind of fault returns another scene, and words for it.
 
     Attributes:
         fleet: that drives.
@@ -33,7 +33,6 @@ class Scene:
         v2x: neighbourhood and channel.
         seed: of the noise.
         edits: what happens to the recording, in this order.
-        words: of each fault.
     """
 
     fleet: Fleet
@@ -43,21 +42,19 @@ class Scene:
     v2x: V2X
     seed: int
     edits: tuple[Edit, ...] = ()
-    words: tuple[str, ...] = ()
 
-    def edited(self, edit: Edit, words: str) -> Scene:
+    def edited(self, edit: Edit) -> Scene:
         """The same with one more edit."""
-        return replace(self, edits=(*self.edits, edit), words=(*self.words, words))
+        return replace(self, edits=(*self.edits, edit))
 
-    def sensing(self, words: str, told: bool = False, **more: object) -> Scene:
+    def sensing(self, told: bool = False, **more: Any) -> Scene:
         """The same with other sensors, of which methods are told or not."""
-        acting = replace(self.acting, **more)  # type: ignore[arg-type]
-        assumed = replace(self.assumed, **more) if told else self.assumed  # type: ignore[arg-type]
-        return replace(self, acting=acting, assumed=assumed, words=(*self.words, words))
+        assumed = replace(self.assumed, **more) if told else self.assumed
+        return replace(self, acting=replace(self.acting, **more), assumed=assumed)
 
-    def outliers(self, words: str, **more: Fault) -> Scene:
+    def outliers(self, **more: Fault) -> Scene:
         """The same with more outliers."""
-        return self.sensing(words, outliers=replace(self.acting.outliers or Outliers(), **more))
+        return self.sensing(outliers=replace(self.acting.outliers or Outliers(), **more))
 
     @property
     def others(self) -> Ints:
@@ -71,33 +68,37 @@ class Scene:
         return (t >= start) & (t < start + max(length, self.fleet.dt)), f"{start:.0f} to {start + length:.0f} s"
 
 
+Made: TypeAlias = tuple[Scene, str]
+
+
 def log_uniform(rng: Draws, low: float, high: float) -> float:
     """A log-uniform draw."""
     return float(np.exp(rng.uniform(np.log(low), np.log(high))))
 
 
-def _levels(scene: Scene, rng: Draws) -> Scene:
+def _levels(scene: Scene, rng: Draws) -> Made:
     fix, speed, distance, angle = np.where(
         rng.uniform(size=4) < 0.3, 1.0, [log_uniform(rng, 0.3, 4.0) for _ in range(4)]
-    )
+    ).tolist()
     known = scene.acting
-    return scene.sensing(
-        f"fixes {fix:.2g}, velocities {speed:.2g}, ranges {distance:.2g}, angles {angle:.2g} times what is assumed",
-        gnss_std=tuple(float(fix) * std for std in known.gnss_std),
-        velocity_std_ratio=float(speed) * known.velocity_std_ratio,
-        range_std=float(distance) * known.range_std,
-        azimuth_std=float(angle) * known.azimuth_std,
-        inclination_std=float(angle) * known.inclination_std,
+    made = scene.sensing(
+        gnss_std=tuple(fix * std for std in known.gnss_std),
+        velocity_std_ratio=speed * known.velocity_std_ratio,
+        range_std=distance * known.range_std,
+        azimuth_std=angle * known.azimuth_std,
+        inclination_std=angle * known.inclination_std,
     )
+    words = f"fixes {fix:.2g}, velocities {speed:.2g}, ranges {distance:.2g}, angles {angle:.2g}"
+    return made, f"{words} times what is assumed"
 
 
-def _drift(scene: Scene, rng: Draws, told: bool) -> Scene:
+def _drift(scene: Scene, rng: Draws, told: bool) -> Made:
     own, common, lasts = log_uniform(rng, 1.0, 5.0), log_uniform(rng, 0.3, 3.0), log_uniform(rng, 15.0, 120.0)
-    words = f"{own:.2g} m, {common:.2g} m in common, for {lasts:.0f} s"
-    return scene.sensing(words, told, gnss_drift_std=own, gnss_common_std=common, gnss_drift_time=lasts)
+    made = scene.sensing(told, gnss_drift_std=own, gnss_common_std=common, gnss_drift_time=lasts)
+    return made, f"{own:.2g} m, {common:.2g} m in common, for {lasts:.0f} s"
 
 
-def _compass(scene: Scene, rng: Draws, told: bool) -> Scene:
+def _compass(scene: Scene, rng: Draws, told: bool) -> Made:
     """Headings turn what is measured and where odometry leads by one angle a vehicle and run."""
     std = float(np.deg2rad(log_uniform(rng, 1.0, 8.0)))
 
@@ -105,19 +106,18 @@ def _compass(scene: Scene, rng: Draws, told: bool) -> Scene:
         angle = std * _normals(recording, scene.seed, "heading_bias")  # the draw of the azimuths
         return replace(recording, velocity=turned(recording.velocity, angle[:, None]))
 
-    made = scene.sensing(f"{np.rad2deg(std):.2g}°", told, heading_bias_std=std)
-    return replace(made, edits=(*made.edits, edit))
+    return scene.sensing(told, heading_bias_std=std).edited(edit), f"{np.rad2deg(std):.2g}°"
 
 
-def _scale(scene: Scene, rng: Draws, told: bool) -> Scene:
+def _scale(scene: Scene, rng: Draws, told: bool) -> Made:
     std = log_uniform(rng, 0.01, 0.1)
 
     def edit(recording: Recording) -> Recording:
         scale = 1.0 + std * _normals(recording, scene.seed, "speed_scale")
         return replace(recording, velocity=recording.velocity * scale[:, None, :, None])
 
-    made = scene.edited(edit, f"{100 * std:.2g} %")
-    return replace(made, assumed=replace(made.assumed, speed_scale_std=std)) if told else made
+    known = replace(scene.assumed, speed_scale_std=std) if told else scene.assumed
+    return replace(scene, assumed=known).edited(edit), f"{100 * std:.2g} %"
 
 
 def _normals(recording: Recording, seed: int, sensor: str) -> Floats:
@@ -125,20 +125,24 @@ def _normals(recording: Recording, seed: int, sensor: str) -> Floats:
     return np.array([[stream(seed, sensor, r, name).normal() for name in recording.ids] for r in range(RUNS)])
 
 
-def _slip(scene: Scene, rng: Draws) -> Scene:
+def _slip(scene: Scene, rng: Draws) -> Made:
     """Wheels of the egos and of a third of the others, twice as fast or still."""
     (when, words), factor = scene.interval(rng, 2.0, 10.0), float(rng.choice((0.0, 2.0)))
     who = np.union1d(scene.egos, scene.others[rng.uniform(size=len(scene.others)) < 1 / 3])
 
     def edit(recording: Recording) -> Recording:
-        velocity = recording.velocity.copy()
-        velocity[:, when[:, None] & np.isin(np.arange(velocity.shape[2]), who)] *= factor
-        return replace(recording, velocity=velocity)
+        return replace(recording, velocity=np.where(_during(recording, when, who), factor, 1.0) * recording.velocity)
 
-    return scene.edited(edit, f"velocities times {factor:g}, {words}")
+    return scene.edited(edit), f"velocities times {factor:g}, {words}"
 
 
-def _outage(scene: Scene, rng: Draws, start: bool) -> Scene:
+def _during(recording: Recording, when: Bools, columns: Ints | tuple[int, ...]) -> Bools:
+    """(T, N, 1) True of some vehicles at some steps."""
+    found: Bools = (when[:, None] & np.isin(np.arange(len(recording.ids)), columns))[..., None]
+    return found
+
+
+def _outage(scene: Scene, rng: Draws, start: bool) -> Made:
     """No fix of the egos; from the start on all but the first, which filters begin with, or one in the middle."""
     when, words = scene.interval(rng, 5.0, 30.0)
     if start:
@@ -146,87 +150,81 @@ def _outage(scene: Scene, rng: Draws, start: bool) -> Scene:
         when, words = (scene.fleet.t > 0) & (scene.fleet.t < until), f"until {until:.0f} s"
 
     def edit(recording: Recording) -> Recording:
-        gnss = recording.gnss.copy()
-        gnss[:, when[:, None] & np.isin(np.arange(gnss.shape[2]), scene.egos)] = np.nan
-        return replace(recording, gnss=gnss)
+        return replace(recording, gnss=np.where(_during(recording, when, scene.egos), np.nan, recording.gnss))
 
-    return scene.edited(edit, words)
+    return scene.edited(edit), words
 
 
-def _receiver(scene: Scene, rng: Draws, ramp: tuple[float, float], start: float | None) -> Scene:
+def _receiver(scene: Scene, rng: Draws, ramp: tuple[float, float] = (0.0, 0.0), start: float | None = None) -> Made:
     """The fixes of the egos are off, each in a direction of its own."""
     size, length = log_uniform(rng, 5.0, 60.0), rng.uniform(*ramp)
     attack = Spoofing(1.0, start=rng.uniform(5.0, 25.0) if start is None else start, ramp=length)
     toward = rng.normal(size=(RUNS, EGOS, 3)) * [1.0, 1.0, 0.3]
     offset = size * toward / np.linalg.norm(toward, axis=-1, keepdims=True)
-
-    def edit(recording: Recording) -> Recording:
-        gnss = recording.gnss.copy()
-        gnss[:, :, list(scene.egos)] += attack.size(recording.t)[:, None, None] * offset[:, None]
-        return replace(recording, gnss=gnss)
-
-    return scene.edited(edit, f"{size:.0f} m from {attack.start:.0f} s on" + f" over {length:.0f} s" * (length > 0))
+    moved = attack.size(scene.fleet.t)[:, None, None] * offset[:, None]
+    words = f"{size:.0f} m from {attack.start:.0f} s on" + f" over {length:.0f} s" * (length > 0)
+    return scene.edited(partial(_shifted, columns=list(scene.egos), offset=moved)), words
 
 
-def _multipath(scene: Scene, rng: Draws) -> Scene:
+def _shifted(recording: Recording, columns: list[int], offset: Floats) -> Recording:
+    """Fixes of some vehicles, all off by as much."""
+    gnss = recording.gnss.copy()
+    gnss[:, :, columns] += offset
+    return replace(recording, gnss=gnss)
+
+
+def _multipath(scene: Scene, rng: Draws) -> Made:
     rate, far, lasts = log_uniform(rng, 0.02, 0.3), log_uniform(rng, 10.0, 80.0), log_uniform(rng, 1.0, 15.0)
     words = f"{100 * rate:.0f} % of the fixes up to {far:.0f} m off for {lasts:.0f} s"
-    return scene.outliers(words, fixes=Fault(rate, (far / 5, far), lasts=lasts))
+    return scene.outliers(fixes=Fault(rate, (far / 5, far), lasts=lasts)), words
 
 
-def _nlos(scene: Scene, rng: Draws) -> Scene:
+def _nlos(scene: Scene, rng: Draws) -> Made:
     rate, far, lasts = log_uniform(rng, 0.03, 0.5), log_uniform(rng, 1.0, 30.0), float(rng.choice((0.0, 1.0, 5.0)))
     words = f"{100 * rate:.0f} % of the ranges up to {far:.2g} m too long for {lasts:g} s"
-    return scene.outliers(words, ranges=Fault(rate, (far / 5, far), lasts=lasts))
+    return scene.outliers(ranges=Fault(rate, (far / 5, far), lasts=lasts)), words
 
 
-def _mistaken(scene: Scene, rng: Draws) -> Scene:
+def _mistaken(scene: Scene, rng: Draws) -> Made:
     rate, lasts = log_uniform(rng, 0.01, 0.2), float(rng.choice((0.0, 1.0)))
-    return scene.outliers(f"{100 * rate:.0f} % for {lasts:g} s", angles=Fault(rate, lasts=lasts))
+    return scene.outliers(angles=Fault(rate, lasts=lasts)), f"{100 * rate:.0f} % for {lasts:g} s"
 
 
-def _long(scene: Scene, rng: Draws, told: bool) -> Scene:
+def _long(scene: Scene, rng: Draws, told: bool) -> Made:
     std = log_uniform(rng, 0.5, 5.0)
-    return scene.sensing(f"{std:.2g} m", told, range_offset_std=std)
+    return scene.sensing(told, range_offset_std=std), f"{std:.2g} m"
 
 
-def _only(scene: Scene, _: Draws, columns: tuple[int, ...]) -> Scene:
-    def edit(recording: Recording) -> Recording:
-        return replace(recording, relative=np.where(np.isin(range(3), columns), recording.relative, np.nan))
-
-    return scene.edited(edit, "in the whole drive")
+def _only(scene: Scene, _: Draws, columns: tuple[int, ...]) -> Made:
+    left = np.where(np.isin(range(3), columns), 1.0, np.nan)
+    return scene.edited(lambda seen: replace(seen, relative=left * seen.relative)), "in the whole drive"
 
 
-def _late(scene: Scene, rng: Draws) -> Scene:
+def _late(scene: Scene, rng: Draws) -> Made:
     latency = rng.uniform(0.05, 0.8)
-    return replace(scene, v2x=replace(scene.v2x, latency=latency), words=(*scene.words, f"{latency:.2f} s"))
+    return replace(scene, v2x=replace(scene.v2x, latency=latency)), f"{latency:.2f} s"
 
 
-def _lost(scene: Scene, rng: Draws) -> Scene:
-    loss, burst, rate = (
-        rng.uniform(0.1, 0.7),
-        log_uniform(rng, 1.0, 20.0),
-        float(rng.choice((1.0, 2.0, 5.0, 10.0, 20.0))),
-    )
-    rate = min(rate, 1.0 / scene.fleet.dt)
-    words = f"{100 * loss:.0f} %, {burst:.0f} at once, at {rate:g} Hz"
+def _lost(scene: Scene, rng: Draws) -> Made:
+    loss, burst = rng.uniform(0.1, 0.7), log_uniform(rng, 1.0, 20.0)
+    rate = min(float(rng.choice((1.0, 2.0, 5.0, 10.0, 20.0))), 1.0 / scene.fleet.dt)
     v2x = replace(scene.v2x, loss=loss, burst=burst, rate=rate)
-    return replace(scene, v2x=v2x, words=(*scene.words, words))
+    return replace(scene, v2x=v2x), f"{100 * loss:.0f} %, {burst:.0f} at once, at {rate:g} Hz"
 
 
-def _clocks(scene: Scene, rng: Draws) -> Scene:
+def _clocks(scene: Scene, rng: Draws) -> Made:
     """Messages of some hold what was a while before the time that they state."""
     who, steps = _some(scene, rng), max(1, round(rng.uniform(0.1, 1.0) / scene.fleet.dt))
-    text = f"{len(who)} are {steps * scene.fleet.dt:.2g} s late"
-    return scene.edited(lambda recording: _behind(recording, who, steps, 0), text)
+    words = f"{len(who)} are {steps * scene.fleet.dt:.2g} s late"
+    return scene.edited(partial(_behind, who=who, steps=steps, start=0)), words
 
 
-def _replay(scene: Scene, rng: Draws) -> Scene:
+def _replay(scene: Scene, rng: Draws) -> Made:
     """From an instant on, messages of some are repeated with new times."""
     who, seconds, begin = _some(scene, rng), rng.uniform(3.0, 20.0), rng.uniform(0.0, 25.0)
     steps, start = round(seconds / scene.fleet.dt), round(begin / scene.fleet.dt)
     words = f"{len(who)} repeat those of {seconds:.0f} s before, from {begin:.0f} s on"
-    return scene.edited(lambda recording: _behind(recording, who, steps, start), words)
+    return scene.edited(partial(_behind, who=who, steps=steps, start=start)), words
 
 
 def _some(scene: Scene, rng: Draws) -> Ints:
@@ -240,21 +238,21 @@ def _behind(recording: Recording, who: Ints, steps: int, start: int) -> Recordin
     now = np.arange(len(recording.t))
     then = np.where(now >= start, np.maximum(now - steps, 0), now)
     gnss, velocity = recording.gnss.copy(), recording.velocity.copy()
-    there = np.isfinite(velocity[:1, now][:, :, who]) & np.isfinite(velocity[:1, then][:, :, who])
+    there = np.isfinite(velocity[:1, :, who]) & np.isfinite(velocity[:1, then][:, :, who])
     for values in (gnss, velocity):
         values[:, :, who] = np.where(there, values[:, then][:, :, who], values[:, :, who])
     return replace(recording, gnss=gnss, velocity=velocity)
 
 
-def _liars(scene: Scene, rng: Draws, ramp: tuple[float, float] = (0.0, 0.0), collude: bool = False) -> Scene:
+def _liars(scene: Scene, rng: Draws, ramp: tuple[float, float] = (0.0, 0.0), collude: bool = False) -> Made:
     far, begins = log_uniform(rng, 4.0, 60.0), rng.uniform(0.0, 25.0) * rng.integers(0, 2)
     attack = Spoofing(rng.uniform(0.1, 0.5), (far / 4, far), begins, rng.uniform(*ramp), collude)
     words = f"{100 * attack.share:.0f} % up to {far:.0f} m off on each axis, from {begins:.0f} s on"
     words += f" over {attack.ramp:.0f} s" * (attack.ramp > 0)
-    return scene.edited(lambda recording: spoofed(recording, attack, scene.seed, scene.egos), words)
+    return scene.edited(lambda recording: spoofed(recording, attack, scene.seed, scene.egos)), words
 
 
-def _sybil(scene: Scene, rng: Draws) -> Scene:
+def _sybil(scene: Scene, rng: Draws) -> Made:
     """One vehicle beside an ego sends as several: all are measured where it is, and claim to be elsewhere together."""
     fleet, count = scene.fleet, int(rng.integers(1, 5))
     gap = np.linalg.norm(fleet.position[:, scene.others] - fleet.position[:, scene.egos[:1]], axis=-1)
@@ -269,16 +267,12 @@ def _sybil(scene: Scene, rng: Draws) -> Scene:
         position=np.append(fleet.position, fleet.position[:, [liar] * count] + antennas, axis=1),
         velocity=np.append(fleet.velocity, fleet.velocity[:, [liar] * count], axis=1),
     )
-
-    def edit(recording: Recording) -> Recording:
-        gnss = recording.gnss.copy()
-        gnss[:, :, columns] += (recording.t >= start)[:, None, None] * offset[:, None, None]
-        return replace(recording, gnss=gnss)
-
-    return replace(scene, fleet=who).edited(edit, f"one as {count + 1}, from {start:.0f} s on")
+    moved = (fleet.t >= start)[:, None, None] * offset[:, None, None]
+    made = replace(scene, fleet=who).edited(partial(_shifted, columns=columns, offset=moved))
+    return made, f"one as {count + 1}, from {start:.0f} s on"
 
 
-def _come_and_go(scene: Scene, rng: Draws) -> Scene:
+def _come_and_go(scene: Scene, rng: Draws) -> Made:
     """Two thirds of the others are there during a part of the drive only, or away during it."""
     position, velocity, t = scene.fleet.position.copy(), scene.fleet.velocity.copy(), scene.fleet.t
     who = scene.others[rng.uniform(size=len(scene.others)) < 2 / 3]
@@ -288,39 +282,41 @@ def _come_and_go(scene: Scene, rng: Draws) -> Scene:
         away[-1] &= not away.all()
         position[away, column] = velocity[away, column] = np.nan
     fleet = replace(scene.fleet, position=position, velocity=velocity)
-    return replace(scene, fleet=fleet, words=(*scene.words, f"{len(who)} of {len(scene.others)}"))
+    return replace(scene, fleet=fleet), f"{len(who)} of {len(scene.others)}"
 
 
-KINDS: Mapping[str, Callable[[Scene, Draws], Scene]] = {
+CREEP = (5.0, 30.0)
+"""s, over which an error grows that does not jump."""
+KINDS: Mapping[str, Callable[[Scene, Draws], Made]] = {
     "noise levels": _levels,
-    "drift, told": lambda scene, rng: _drift(scene, rng, True),
-    "drift, not told": lambda scene, rng: _drift(scene, rng, False),
-    "compass, told": lambda scene, rng: _compass(scene, rng, True),
-    "compass, not told": lambda scene, rng: _compass(scene, rng, False),
-    "odometer scale, told": lambda scene, rng: _scale(scene, rng, True),
-    "odometer scale, not told": lambda scene, rng: _scale(scene, rng, False),
+    "drift, told": partial(_drift, told=True),
+    "drift, not told": partial(_drift, told=False),
+    "compass, told": partial(_compass, told=True),
+    "compass, not told": partial(_compass, told=False),
+    "odometer scale, told": partial(_scale, told=True),
+    "odometer scale, not told": partial(_scale, told=False),
     "odometer slip": _slip,
-    "no fixes": lambda scene, rng: _outage(scene, rng, False),
-    "no fixes, at first": lambda scene, rng: _outage(scene, rng, True),
-    "own receiver, jump": lambda scene, rng: _receiver(scene, rng, (0.0, 0.0), None),
-    "own receiver, creep": lambda scene, rng: _receiver(scene, rng, (5.0, 30.0), None),
-    "own receiver, from the start": lambda scene, rng: _receiver(scene, rng, (0.0, 0.0), 0.0),
+    "no fixes": partial(_outage, start=False),
+    "no fixes, at first": partial(_outage, start=True),
+    "own receiver, jump": _receiver,
+    "own receiver, creep": partial(_receiver, ramp=CREEP),
+    "own receiver, from the start": partial(_receiver, start=0.0),
     "multipath": _multipath,
     "NLOS": _nlos,
     "mistaken angles": _mistaken,
-    "range offset, told": lambda scene, rng: _long(scene, rng, True),
-    "range offset, not told": lambda scene, rng: _long(scene, rng, False),
-    "measured, ranges only": lambda scene, rng: _only(scene, rng, (0,)),
-    "measured, angles only": lambda scene, rng: _only(scene, rng, (1, 2)),
-    "measured, inclinations only": lambda scene, rng: _only(scene, rng, (2,)),
-    "measured, nothing": lambda scene, rng: _only(scene, rng, ()),
+    "range offset, told": partial(_long, told=True),
+    "range offset, not told": partial(_long, told=False),
+    "measured, ranges only": partial(_only, columns=(0,)),
+    "measured, angles only": partial(_only, columns=(1, 2)),
+    "measured, inclinations only": partial(_only, columns=(2,)),
+    "measured, nothing": partial(_only, columns=()),
     "late messages": _late,
     "lost messages": _lost,
     "come and go": _come_and_go,
     "clock offsets": _clocks,
     "liars, jump": _liars,
-    "liars, creep": lambda scene, rng: _liars(scene, rng, (5.0, 30.0)),
-    "liars, collusion": lambda scene, rng: _liars(scene, rng, collude=True),
+    "liars, creep": partial(_liars, ramp=CREEP),
+    "liars, collusion": partial(_liars, collude=True),
     "liars, replay": _replay,
     "liars, Sybil": _sybil,
 }

@@ -70,9 +70,10 @@ def world(seed: int, split: Split = "test", *, without: Collection[str] = (), ev
             raise unknown("without", kind, KINDS)
     scene = _nominal(key, split)
     kinds = [kind for kind in _kinds(_rng(key, "kinds"), scene) if kind not in without]
-    text = _text(scene)
+    texts = [_text(scene)]
     for kind in kinds:
-        scene = KINDS[kind](scene, _rng(key, kind))
+        scene, words = KINDS[kind](scene, _rng(key, kind))
+        texts.append(f"{kind}: {words}")
     recording = observe(
         scene.fleet,
         scene.acting,
@@ -84,8 +85,7 @@ def world(seed: int, split: Split = "test", *, without: Collection[str] = (), ev
     )
     for edit in scene.edits:
         recording = edit(recording)
-    text = "; ".join((text, *(f"{kind}: {words}" for kind, words in zip(kinds, scene.words, strict=True))))
-    return World(seed, replace(recording, notes=()), scene.fleet, scene.egos, tuple(kinds), text)
+    return World(seed, replace(recording, notes=()), scene.fleet, scene.egos, tuple(kinds), "; ".join(texts))
 
 
 def _rng(key: int, *words: str) -> Draws:
@@ -186,16 +186,14 @@ def _circle(rng: Draws, t: Floats, _: Split) -> Floats:
     count, radius, speed = int(rng.integers(4, 11)), rng.uniform(12.0, 45.0), rng.uniform(3.0, 12.0)
     ring = radius + rng.uniform(-3.0, 3.0, count)
     angle = speed / radius * t[:, None] + 2 * np.pi * (np.arange(count) + rng.uniform(-0.2, 0.2, count)) / count
-    return np.stack(
-        [ring * np.cos(angle), ring * np.sin(angle), np.broadcast_to(_heights(rng, count), angle.shape)], -1
-    )
+    return _points(ring * np.cos(angle), ring * np.sin(angle), _heights(rng, count))
 
 
 def _crossing(rng: Draws, t: Floats, _: Split) -> Floats:
     count = int(rng.integers(8, 17))
     speed, passes = rng.uniform(4.0, 12.0, count), np.sort(rng.uniform(0.0, t[-1], count))
-    along, side = speed * (t[:, None] - passes), np.broadcast_to(rng.uniform(2.0, 6.0, count), (len(t), count))
-    lane = np.stack([along, side, np.broadcast_to(_heights(rng, count), along.shape)], axis=-1)
+    along, side = speed * (t[:, None] - passes), rng.uniform(2.0, 6.0, count)
+    lane = _points(along, side, _heights(rng, count))
     return turned(lane, np.broadcast_to(np.pi / 2 * rng.integers(0, 4, count), along.shape))
 
 
@@ -204,6 +202,11 @@ def _standing(rng: Draws, t: Floats, _: Split) -> Floats:
     grid = np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2)
     place = rng.uniform(5.0, 9.0) * rng.permutation(grid)[:count] + rng.uniform(-1.0, 1.0, (count, 2))
     return np.tile(np.column_stack([place, _heights(rng, count)]), (len(t), 1, 1))
+
+
+def _points(*axes: Floats) -> Floats:
+    """(T, N, 3) of coordinates that broadcast."""
+    return np.stack(np.broadcast_arrays(*axes), axis=-1)
 
 
 def _heights(rng: Draws, count: int) -> Floats:

@@ -15,12 +15,10 @@ import numpy as np
 from scipy import special
 from tqdm import tqdm
 
-from coopoc.arrays import Floats, number
-from coopoc.errors import InputError
-from coopoc.evaluate.metrics import nees, rt_le
+from coopoc import InputError, Method, nees, rt_le
+from coopoc.arrays import number
 from coopoc.evaluate.statistics import mean_interval
 from coopoc.methods.catalogue import needs_whole_fleet
-from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
 from coopoc.study.cell import Cell
 from coopoc.study.compute import compute
@@ -33,7 +31,8 @@ from .tasks import VERSION
 from .worlds import Split, world
 
 if TYPE_CHECKING:
-    from coopoc.study.plot import Plot
+    import pandas as pd
+
 
 JOINT, ALONE = "joint", "kalman"
 """What a method is compared with on the same draws: the textbook filter, and being alone."""
@@ -86,7 +85,7 @@ def world_row(name: str, split: Split, given: Params) -> list[Row]:
 def run_worlds(
     methods: Sequence[str], out: Path, count: int, seed: int | None = None, validation: bool = False, jobs: int = 1
 ) -> int:
-    """Write and print the cards of methods, and draw those of the folder on the same worlds; 1 if a world failed.
+    """Write and print the cards of methods; 1 if a world failed.
 
     Args:
         methods: names of cooperative or solo methods.
@@ -116,10 +115,6 @@ def run_worlds(
         print(details(cards[-1]), end="\n\n")
         print(f"coopoc: {folder / card_file(name)}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
     print(overview(cards))
-    beside = [json.loads(file.read_text()) for file in sorted(folder.glob("*.json"))]
-    distribution([card for card in beside if card["worlds"]["seed"] == cards[0]["worlds"]["seed"]]).save(
-        folder / "worlds"
-    )
     return int(any(card["failed"] for card in cards))
 
 
@@ -166,12 +161,13 @@ def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", job
     rows.sort(key=lambda row: row["seed"])
     columns = {key: [_short(row[key]) for row in rows] for key in rows[0] if key != "failed"}
     failed = {str(row["seed"]): row["failed"] for row in rows if "failed" in row}
-    found = _arrays(columns)
+    found = _frame(columns)
+    each_kind = found.assign(kind=found["kinds"].replace("", NONE).str.split("; ")).explode("kind")
     return {
         **card_head(name),
         "split": split,
         "summary": summary(found),
-        "by_kind": {kind: summary(_only(found, kind)) for kind in _kinds(columns)},
+        "by_kind": {str(kind): summary(part) for kind, part in each_kind.groupby("kind")},
         "worst": _worst(name, split, found),
         "failed": failed,
         "worlds": {key: columns[key] for key in ("seed", "rt_le_m", "joint_m", "alone_m")},
@@ -185,79 +181,59 @@ def _short(value: Any) -> Any:
     return float(f"{value:.5g}") if np.isfinite(value) else None
 
 
-def _arrays(columns: Mapping[str, Sequence[Any]]) -> dict[str, Any]:
-    """Columns as arrays, with the ratios to the textbook filter, to being alone and to the better of both; infinite
-    where the method failed."""
-    found: dict[str, Any] = {
-        key: np.array(values, dtype=object if key == "kinds" else int if key == "seed" else float)
-        for key, values in columns.items()
-    }
-    own_m, joint, alone = (found[key] for key in ("rt_le_m", "joint_m", "alone_m"))
-    for key, other in (("over_joint", joint), ("over_alone", alone), ("over_better", np.fmin(joint, alone))):
-        found[key] = np.nan_to_num(own_m / other, nan=np.inf, posinf=np.inf)
+def _frame(columns: Mapping[str, Sequence[Any]]) -> pd.DataFrame:
+    """Worlds with the ratios to the textbook filter, to being alone and to the better of both; infinite where the
+    method failed."""
+    import pandas as pd
+
+    found = pd.DataFrame(columns)
+    for key in found.columns.difference(["seed", "kinds"]):
+        found[key] = found[key].astype(float)
+    better = found[["joint_m", "alone_m"]].min(axis=1)
+    for key, other in (("over_joint", found["joint_m"]), ("over_alone", found["alone_m"]), ("over_better", better)):
+        found[key] = (found["rt_le_m"] / other).fillna(np.inf)
     return found
 
 
-def ratios(card: Params) -> Floats:
-    """(W,) sorted ratios of RT-LE to the better of the textbook filter and being alone."""
-    found: Floats = np.sort(_arrays(card["worlds"])["over_better"])
-    return found
-
-
-def _kinds(columns: Mapping[str, Sequence[Any]]) -> list[str]:
-    """Kinds of fault that occur, and none of them."""
-    return sorted({kind or NONE for each in columns["kinds"] for kind in each.split("; ")})
-
-
-def _only(found: Mapping[str, Any], kind: str) -> dict[str, Any]:
-    """The worlds with a kind of fault, alone or among others."""
-    mine = np.array([kind in each.split("; ") if kind != NONE else not each for each in found["kinds"]])
-    return {key: values[mine] for key, values in found.items()}
-
-
-def summary(found: Mapping[str, Any]) -> dict[str, Any]:
+def summary(found: pd.DataFrame) -> dict[str, Any]:
     """Shares and means over worlds with 95 % bootstrap intervals, percentile, NEES and time.
 
     Args:
-        found: columns of worlds.
+        found: worlds and their ratios.
     """
-    sound = np.isfinite(found["over_better"])
-    made: dict[str, Any] = {"worlds": len(sound), "failed": int((~sound).sum())}
+    sound, worse = found[np.isfinite(found["over_better"])], found["over_better"] > WORSE
+    made: dict[str, Any] = {"worlds": len(found), "failed": len(found) - len(sound)}
     made["worse_than_alone"] = _interval(100.0 * (found["over_alone"] > WORSE))
-    made["worse_than_better"] = _interval(100.0 * (found["over_better"] > WORSE))
-    made["worse_unnoted"] = _interval(100.0 * ((found["over_better"] > WORSE) & (found["noted"] == 0.0)))
-    for key in ("over_joint", "over_better"):
-        if sound.any():
-            made[key] = [
-                _short(float(np.exp(value))) for value in _interval(np.log(np.maximum(found[key][sound], EXACT)))
-            ]
+    made["worse_than_better"] = _interval(100.0 * worse)
+    made["worse_unnoted"] = _interval(100.0 * (worse & (found["noted"] == 0.0)))
+    if len(sound):
+        for key in ("over_joint", "over_better"):
+            made[key] = [_short(float(np.exp(value))) for value in _interval(np.log(sound[key].clip(EXACT)))]
     made["percentile_95"] = _short(float(np.quantile(found["over_better"], 0.95, method="higher")))
-    if np.isfinite(found["nees_inside"]).any():
-        made["nees_inside"] = _interval(found["nees_inside"][np.isfinite(found["nees_inside"])])
-        made["nees_median"] = _short(float(np.nanmedian(found["nees_median"])))
-    if sound.any():
-        made["microseconds_per_step"] = _short(float(np.nanmedian(found["microseconds_per_step"])))
+    if len(inside := found["nees_inside"].dropna()):
+        made |= {"nees_inside": _interval(inside), "nees_median": _short(float(found["nees_median"].median()))}
+    if len(sound):
+        made["microseconds_per_step"] = _short(float(found["microseconds_per_step"].median()))
     return made
 
 
-def _interval(values: Floats) -> list[float]:
+def _interval(values: pd.Series[float]) -> list[float]:
     """Mean and ends of its interval; of one world without ends."""
-    level = mean_interval(values)
+    level = mean_interval(values.to_numpy())
     return [_short(end) for end in (level.mean, level.low, level.high) if np.isfinite(end)]
 
 
-def _worst(name: str, split: Split, found: Mapping[str, Any]) -> list[Row]:
+def _worst(name: str, split: Split, found: pd.DataFrame) -> list[Row]:
     """Worlds with the largest ratios, what is in them, and the command that runs each again."""
-    order = np.argsort(-found["over_better"], kind="stable")[:WORST]
+    more = " --validation" * (split == "validation")
     return [
         {
-            "ratio": _short(float(found["over_better"][k])),
-            **{key: _short(float(found[key][k])) for key in ("rt_le_m", "joint_m", "alone_m")},
-            "text": world(int(found["seed"][k]), split).text,
-            "command": f"coopoc benchmark {name} --worlds 1 --seed {found['seed'][k]}"
-            + " --validation" * (split == "validation"),
+            "ratio": _short(one["over_better"]),
+            **{key: _short(one[key]) for key in ("rt_le_m", "joint_m", "alone_m")},
+            "text": world(one["seed"], split).text,
+            "command": f"coopoc benchmark {name} --worlds 1 --seed {one['seed']}{more}",
         }
-        for k in order
+        for one in found.sort_values("over_better", ascending=False, kind="stable").head(WORST).to_dict("records")
     ]
 
 
@@ -269,7 +245,7 @@ def card_text(card: Params) -> str:
 def overview(cards: Sequence[Params]) -> str:
     """Markdown table of cards, least share of worlds that are worse than the better of both first."""
     rows = [_shown("method", card["method"], card["summary"]) for card in sorted(cards, key=_order)]
-    return _table(rows, drop=("over the better", "us/step"))
+    return markdown(rows, drop=("over the better", "us/step"))
 
 
 def _order(card: Params) -> tuple[float, float]:
@@ -279,7 +255,7 @@ def _order(card: Params) -> tuple[float, float]:
 def details(card: Params) -> str:
     """Markdown table of a card by kind of fault, and its worst worlds with the commands that run them."""
     kinds = sorted(card["by_kind"].items(), key=lambda item: -item[1]["worse_than_better"][0])
-    table = _table([_shown("kind of fault", kind, each) for kind, each in kinds], drop=("95th percentile", "us/step"))
+    table = markdown([_shown("kind of fault", kind, each) for kind, each in kinds], drop=("95th percentile", "us/step"))
     lines = [
         f"{_of(row['ratio'])} ({_of(row['rt_le_m'])} m; {JOINT} {_of(row['joint_m'])} m, {ALONE} "
         f"{_of(row['alone_m'])} m): {row['text']}\n    {row['command']}"
@@ -315,27 +291,9 @@ def _level(values: Sequence[float] | None) -> str:
     return f"{values[0]:.3g}" + f" [{ends}]" * bool(ends)
 
 
-def _table(rows: Sequence[Row], drop: Sequence[str] = ()) -> str:
+def markdown(rows: Sequence[Row], drop: Sequence[str] = ()) -> str:
+    """Rows as a Markdown table without some of their columns."""
     from tabulate import tabulate
 
     kept = [{key: value for key, value in row.items() if key not in drop} for row in rows]
     return tabulate(kept, headers="keys", tablefmt="github", disable_numparse=True)
-
-
-def distribution(cards: Sequence[Params]) -> Plot:
-    """Share of worlds in which the ratio to the better of the textbook filter and being alone is below each value."""
-    from coopoc.study.plot import Plot, canvas, legend, plain_log, strokes
-
-    with canvas(width=7.0) as (figure, axes):
-        ordered = sorted(cards, key=_order)
-        for card in ordered:
-            values = ratios(card)
-            share = np.arange(1, len(values) + 1) / len(values)
-            axes.step(values, 100 * share, where="post", **{**strokes({"method": card["method"]}), "marker": None})
-        axes.axvline(WORSE, color="#555555", linewidth=0.8, linestyle=":")
-        axes.set(xlabel="RT-LE over the better of joint filter and KF", ylabel="Share of worlds [%]", ylim=(0, 101))
-        plain_log(axes.xaxis)
-        axes.set_xlim(0.1, 20.0)
-        legend(axes, [{"method": card["method"]} for card in ordered])
-    count, split = cards[0]["summary"]["worlds"], cards[0]["split"]
-    return Plot(figure, f"Distribution over {count} {split} worlds; dotted: {WORSE:g} times the better of both.")

@@ -320,16 +320,6 @@ def test_real_measurements_are_tasks_for_pose_filters(tmp_path: Path) -> None:
     assert own["robots"]["data"] == rows["pose-solo"]["robots"]["data"]
 
 
-def test_graphs_are_tasks_for_backends() -> None:
-    row = tasks.graph_row(measured("mrclam5a.pyfg").parent, "mrclam5a.pyfg", "gauss-newton")
-    assert row["status"] == "SOLVED"
-    assert row["over_best"] == pytest.approx(1.0, abs=1e-4)
-    shown = benchmark.page([{"method": "gauss-newton", "tasks": [row]}])
-    assert "1 SOLVED" in shown
-    with refused("must name the folder of measurements for gauss-newton"):
-        benchmark.benchmark(("gauss-newton",))
-
-
 def test_unknown_methods_are_named_before_anything_runs(tmp_path: Path) -> None:
     for name, words in (("jointt", "Did you mean joint"), ("mine.py:Own", "is not there"), ("pose-solo", "--data")):
         with refused(words):

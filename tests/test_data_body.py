@@ -255,29 +255,12 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path: Path, monkeyp
     assert "No row is trained" in real._caption(results, "")
 
 
-def test_the_study_trains_and_cooperates_on_a_log_in_the_world(tmp_path: Path) -> None:
-    """A road filter fitted by hand is the study's row; federated, eight numbers of 4 B go up and come back."""
-    data = str(written(tmp_path / "log", noise=1.0))
-    settings = {"data": data, "calibrate_s": 20.0, "block_s": 5.0, "drive_s": 100.0, "max_neighbours": "0,2"}
-    results = co.run_study("real", tmp_path, settings=settings, progress=False)
-    assert results.failed == 0
-    log = load_log(data)
-    assert log.truth is not None
-    start, stop = (int(seconds / log.recording.dt) for seconds in (20.0, 25.0))
-    made = co.RoadFilter.fitted(log.recording.between(0, start), log.truth.between(0, start))
-    track = made(log.recording, ["blue"])
-    apart = np.linalg.norm(track.x[0, :, 0] - log.truth.position[:, log.truth.index("blue")], axis=1)[start:stop]
-    found = results.select(method="trained-centralised", ego="blue", run=0)
-    assert found["rt_le_m"].tolist() == pytest.approx([np.sqrt(np.mean(apart**2))], rel=1e-6)
-    assert set(results.select(method="trained-federated")["sent_bytes"]) == {64.0}
-    assert (results.select(method="cooperative-filter", max_neighbours=2)["sent_bytes"] > 1000).all()
-    assert "Trained alone" in (tmp_path / "real" / "tables" / "rt_le.md").read_text()
-
-
 def test_studies_say_where_a_log_belongs(tmp_path: Path) -> None:
     folder = written(tmp_path / "log")
     with refused("Take coopoc run real"):
         co.run_study("side_by_side", tmp_path, settings={"data": f"{folder}?frame=body"}, progress=False)
+    with refused("Take coopoc run side_by_side"):
+        co.run_study("real", tmp_path, settings={"data": str(folder)}, progress=False)
 
 
 def librsf(folder: Path, wheels: bool) -> tuple[Any, Any]:

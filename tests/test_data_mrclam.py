@@ -154,7 +154,7 @@ def test_the_study_runs_on_any_set(which: str, other_set: Path, tmp_path: Path) 
     folder = tmp_path / "real"
     tables = {file.stem for file in (folder / "tables").glob("*.md")}
     assert tables == {"rt_le", "heading", "nees", "difference"}
-    assert all((folder / "figures" / f"{name}.png").stat().st_size > 10_000 for name in ("rt_le", "training"))
+    assert (folder / "figures" / "training.png").stat().st_size > 10_000
 
 
 def test_folders_that_cannot_be_used_are_named(other_set: Path, tmp_path: Path) -> None:

@@ -11,7 +11,7 @@ from shell import ran
 
 ROOT = Path(__file__).resolve().parents[1]
 HERE = ["README", "index", "methods", "optimize", "streaming", "studies", "learned"]
-HERE += ["federation", "budget", "robustness"]
+HERE += ["federation", "budget", "robustness", "heading_error"]
 ELSEWHERE = {"extend": "test_extend.py", "your_data": "test_your_data.py"}
 """Pages whose blocks are files and commands, too."""
 NUMBER = re.compile(r"([-+]?\d+(?:\.\d*)?(?:e[-+]?\d+)?)")

@@ -1,7 +1,6 @@
 """Poor measurements: fixes that are missing or late, ranges without directions, headings that are wrong."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -25,14 +24,11 @@ from coopoc import (
     nees,
     observe,
     rt_le,
-    run_study,
 )
 from coopoc.kernels.stars.cooperative_state import NO_GUARDS
 from coopoc.learned import GainNet, LearnedGain
 from coopoc.methods.cooperative_filter import CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
-from coopoc.studies.views import of
-from coopoc.study import numbers
 from coopoc.world.links import wrap
 
 SOLO = (Kalman(), LearnedGain(GainNet(4, 1)), RoadFilter())
@@ -160,26 +156,3 @@ def test_nominal_knowledge_adds_the_heading_to_the_azimuth() -> None:
     assert known.sensors is not None
     assert known.sensors.azimuth_std == pytest.approx(0.13)
     assert NoiseModel.nominal(Sensors()).sensors == Sensors()
-
-
-@pytest.mark.slow
-def test_the_study_shows_what_a_heading_costs(tmp_path: Path) -> None:
-    wanted = {"runs": 4, "speed": "0.0,10.0", "after_s": "3.0,30.0", "max_neighbours": "0,2", "compass": "exact,3,none"}
-    results = run_study("heading_error", tmp_path, settings=wanted, progress=False)
-    pose, first, joint = ("pose-fleet", "nominal"), ("pose-fleet", "first compass"), ("joint", "nominal")
-    at = {"speed": 10.0, "after_s": 30.0, "max_neighbours": 2}
-    exact, estimated, noise, once, turned = (
-        numbers.mean(results, of(*line, **at, compass=compass)) or np.nan
-        for line, compass in ((pose, "exact"), (pose, "none"), (pose, "3"), (first, "3"), (joint, "3"))
-    )
-    assert exact < estimated < noise < turned
-    assert once < noise
-    for k, method, least, most in ((0, "pose-solo", 60.0, 180.0), (2, "pose-fleet", 0.3, 4.0), (2, "bound", 0.3, 4.0)):
-        still = numbers.rms(
-            results,
-            {"method": method, "max_neighbours": k, "compass": "none", "speed": 0.0, "after_s": 3.0},
-            "heading_deg",
-        )
-        assert still is not None
-        assert least < still < most
-    assert "Position filter" in (tmp_path / "heading_error" / "tables" / "compass.md").read_text()

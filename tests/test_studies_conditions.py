@@ -13,7 +13,8 @@ from conftest import formation_fleet, refused
 import coopoc as co
 from coopoc import Sensors, run_study
 from coopoc.evaluate.bounds import past_bound, posterior_bound
-from coopoc.studies import correlated_gnss, latency_loss, robustness, scene
+from coopoc.studies import conditions as study
+from coopoc.studies import scene
 from coopoc.study import numbers
 
 FILES = sorted((Path(__file__).resolve().parents[1] / "studies" / "reference").glob("*.json"))
@@ -47,7 +48,7 @@ def test_no_mark_lies_below_its_bound(file: Path) -> None:
 
 def test_most_studies_show_a_bound() -> None:
     shown = {file.stem for file in FILES for _, marks in conditions(file) if any(m == "bound" for m, _ in marks)}
-    assert {"budget", "correlated_gnss", "neighbours", "learned_gains", "heading_error"} <= shown
+    assert {"budget", "correlated_gnss", "neighbours"} <= shown
 
 
 def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path, short_town: str) -> None:
@@ -61,7 +62,7 @@ def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path, short
     }
     results = run_study("latency_loss", tmp_path, settings=wanted, progress=False)
     perfect, late, lossy = (
-        numbers.mean(results, {**latency_loss.PERFECT, "method": "joint", **change}) or np.nan
+        numbers.mean(results, {**study.PERFECT, "method": "joint", **change}) or np.nan
         for change in ({}, {"latency_s": 0.3}, {"loss": 0.6})
     )
     assert perfect < late
@@ -85,7 +86,7 @@ def test_what_is_wrong_harms_those_who_use_it(tmp_path: Path, short_town: str) -
     results = run_study("robustness", tmp_path, settings=wanted, progress=False)
     clean, wild, spoofed = "nothing wrong", "5 % wild fixes", "20 % spoofed"
     error = {
-        (method, case): np.array(numbers.mean(results, {"method": method, **robustness.CASES[case]}))
+        (method, case): np.array(numbers.mean(results, {"method": method, **study.WRONG[case]}))
         for method in str(wanted["method"]).split(",")
         for case in (clean, wild, spoofed)
     }
@@ -102,7 +103,7 @@ def test_what_is_wrong_harms_those_who_use_it(tmp_path: Path, short_town: str) -
     assert "told what is wrong" in (tmp_path / "robustness" / "tables" / "rt_le.md").read_text()
 
 
-QUICK = {"method": "kalman,joint,cooperative-filter,bound", "max_neighbours": "0,6", "runs": 3, "egos": "2"}
+QUICK = {"method": "kalman,joint,cooperative-filter,bound", "max_neighbours": "0,6,10", "runs": 3, "egos": "2"}
 
 
 def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path: Path, short_town: str) -> None:
@@ -110,8 +111,7 @@ def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path:
     results = run_study("correlated_gnss", tmp_path, settings={**QUICK, **wanted, "data": short_town}, progress=False)
     value = {
         name: [
-            numbers.rms(results, {**correlated_gnss.CASES[name], "method": "cooperative-filter", "max_neighbours": k})
-            or np.nan
+            numbers.rms(results, {**study.LASTING[f"{name}, K = {k}"], "method": "cooperative-filter"}) or np.nan
             for k in (0, 6)
         ]
         for name in ("white", "own", "common")
@@ -119,13 +119,11 @@ def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path:
     own, common = value["own"], value["common"]
     assert own[1] < 0.5 * own[0]
     assert common[1] > 0.8 * common[0]
-    where = {**correlated_gnss.CASES["white"], "method": "joint", "max_neighbours": 6}
-    assert not isinstance(correlated_gnss._over_runs(results, where), float)
-    found = correlated_gnss.STUDY.answers(results)
-    assert list(found) == ["white", "own", "common"]
+    found = study.CORRELATED_GNSS.answers(results)
+    assert list(found) == [f"{name}, K = 10" for name in ("white", "own", "common")]
     assert all(text.startswith(f"{name}: ") for name, text in found.items())
     folder = tmp_path / "correlated_gnss"
-    assert "Cramér-Rao bound" in (folder / "tables" / "rms.md").read_text()
+    assert "Cramér-Rao bound, star" in (folder / "tables" / "rt_le.md").read_text()
     assert (folder / "figures" / "rms.pdf").stat().st_size > 5_000
 
 
@@ -136,25 +134,6 @@ def test_shares_keep_the_variance_of_a_fix() -> None:
     for own, common in ((0.6, 0.4), (-0.1, 0.0)):
         with refused("own_share"):
             scene.lasting(Sensors(), own, common)
-
-
-def test_a_consistent_filter_is_told_from_one_that_is_not(tmp_path: Path, short_town: str) -> None:
-    wanted = {
-        "data": short_town,
-        "runs": 4,
-        "egos": "2",
-        "method": "kalman,joint,lkf-sa",
-        "noise_model": "nominal,identity",
-    }
-    results = run_study("consistency", tmp_path, settings=wanted, progress=False)
-    table = (tmp_path / "consistency" / "tables" / "nees.md").read_text()
-    good = numbers.mean(results, {"method": "joint", "noise_model": "nominal"}, "nees_inside")
-    bad = numbers.mean(results, {"method": "lkf-sa", "noise_model": "identity"}, "nees_inside")
-    assert good is not None
-    assert bad is not None
-    assert good > 0.9 > 0.1 > bad
-    rows = [[cell.strip() for cell in line.split("|")[1:3]] for line in table.splitlines()]
-    assert rows.index(["Joint filter", "nominal"]) < rows.index(["LKF-SA", "identity"])  # the most credible first
 
 
 def test_bound_with_the_past_is_the_stars_where_nobody_comes_or_goes() -> None:

@@ -12,7 +12,7 @@ import pandas as pd
 import pytest
 
 from coopoc.plugins import find
-from coopoc.studies import error_cdf
+from coopoc.studies.error_cdf import quantile
 from coopoc.study import figures
 from coopoc.study.results import Results
 from coopoc.study.style import METHODS, Panel, look
@@ -58,8 +58,6 @@ PLOTS: dict[str, Callable[[Results], Any]] = {
     "sweep": lambda results: figures.sweep(results, "max_neighbours", log=True),
     "pareto": lambda results: figures.pareto(results, "c"),
     "curves": lambda results: figures.curves(results, [Panel({k: {"max_neighbours": k} for k in (0, 2)})], LINES, "c"),
-    "multiples": lambda _: figures.multiples({("joint", "fitted"): {"a": [0.9, 1.1]}}, "c"),
-    "cdf": lambda results: error_cdf.cdf(results, "c", where={"max_neighbours": 2}),
 }
 
 
@@ -97,22 +95,19 @@ def test_a_sweep_draws_the_means_in_the_method_colour(results: Results) -> None:
     assert (one.get_text(), other.get_text()) == ("identity", "fitted / trained")
 
 
-def test_a_cdf_marks_the_mean_of_the_maxima(results: Results) -> None:
-    axes = error_cdf.cdf(results, "c", where={"max_neighbours": 2, "method": "joint"}).figure.axes[0]
-    curve, mark = axes.lines
-    quantiles = results.select(max_neighbours=2, method="joint")["error_quantiles_m"]
-    assert float(mark.get_xdata()[0]) == pytest.approx(np.mean([q[-1] for q in quantiles]))
-    assert curve.get_xdata()[-1] == pytest.approx(max(q[-1] for q in quantiles))
-    share = curve.get_ydata()
-    assert share[0] > 0
-    assert share[-1] == 1.0
-    assert np.all(np.diff(share) > 0)
+def test_a_distribution_is_that_of_all_steps(results: Results) -> None:
+    where = {"max_neighbours": 2, "method": "joint"}
+    errors = np.concatenate(results.select(where)["error_quantiles_m"].to_list())
+    found = quantile(results, {**where, "share": 0.9})
+    assert found is not None
+    assert np.mean(errors <= found) == pytest.approx(0.9, abs=1 / len(errors))
+    assert quantile(results, {**where, "method": "okf", "share": 0.9}) is None
 
 
 @pytest.mark.parametrize("suffix", ["svg", "png"])
 def test_no_letter_of_the_legend_is_cut_off(results: Results, tmp_path: Path, suffix: str) -> None:
     """Letters are hinted wider at the 72 dpi of PDF and SVG than at others, and the legend must fit in all of them."""
-    plot = error_cdf.cdf(results, "c", where={"max_neighbours": 2})
+    plot = PLOTS["curves"](results)
     plot.save(tmp_path / "a")
     plot.figure.set_dpi({"svg": 72, "png": 200}[suffix])
     plot.figure.draw_without_rendering()
@@ -141,11 +136,6 @@ def test_curves_draw_numbers_of_their_selections(results: Results) -> None:
     np.testing.assert_allclose(joint.get_ydata(), expected.to_numpy())
     assert level.get_ydata()[0] == pytest.approx(results.select(GNSS)["rt_le_m"].mean())
     assert figures.curves(results, [panel], [{"method": "okf"}], "c") is None
-
-
-def test_multiples_name_methods_and_their_noise(results: Results) -> None:
-    axes = PLOTS["multiples"](results).figure.axes[0]
-    assert [label.get_text() for label in axes.get_yticklabels()] == ["Joint filter, fitted"]
 
 
 def test_one_run_of_one_ego_shows_its_points_without_an_interval(results: Results) -> None:
@@ -206,8 +196,4 @@ def test_no_figure_of_the_gallery_hides_a_line(file: Path) -> None:
                     gaps = np.abs(np.interp(at, *a.T) - np.interp(at, *b.T))
                     apart = max(gaps, default=np.inf) * 72 / panel.figure.dpi > first.get_linewidth() / 2
                     assert apart or any(" = " in text for text in texts), (first.get_color(), second.get_color())
-    assert lines_seen or file.stem in WITHOUT_LINES
-
-
-WITHOUT_LINES = ("consistency", "learned_gains")
-"""Studies whose figures show points in a row for each method."""
+    assert lines_seen or not find("coopoc.studies", file.stem).figures

@@ -241,7 +241,6 @@ def test_a_failed_world_is_worse_and_has_its_reason(tmp_path: Path, capsys: pyte
     printed = capsys.readouterr()
     assert f"4 ({len(many)} failed)" in printed.out
     assert f"failed: world {many[0]}: ValueError: too many" in printed.err
-    assert {one.suffix for one in (tmp_path / "worlds").glob("worlds.*")} == {".pdf", ".png", ".svg"}
 
 
 def test_the_command_of_a_worst_world_repeats_its_number(

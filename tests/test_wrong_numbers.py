@@ -338,7 +338,7 @@ def test_cooperation_that_changes_nothing_is_said_below_the_table() -> None:
     """LKF-SA where only ranges were measured receives, and is the filter alone; the joint filter is helped."""
     pytest.importorskip("coopoc.studies")
     from coopoc.studies.side_by_side import STUDY
-    from coopoc.studies.views import unused
+    from coopoc.study.tables import unused
 
     each = {"kalman": (0.5, 0, 0), "lkf-sa": (0.5004, 90, 90), "joint": (0.4, 90, 90), "mhe": (0.5, 0, 90)}
     rows = [
@@ -351,14 +351,14 @@ def test_cooperation_that_changes_nothing_is_said_below_the_table() -> None:
     rows = [{**row, "rt_le_m": 0.5} if row["max_neighbours"] == 0 else row for row in rows]
     results = Results("s", "?", STUDY.axes, STUDY.settings, pd.DataFrame(rows), pd.DataFrame(), 0, {})
     text = "K = 2: equal to solo within 0.001 m: no neighbour's measurement was used, because "
-    assert [note.partition(", ")[2] for note in unused(results)] == [
+    assert [note.partition(", ")[2] for note in unused(results, False)] == [
         f"{text}what was measured lacks what it takes, such as an azimuth.",
         f"{text}no message arrived.",
     ]
-    assert STUDY.answers(results)["K = 0"].startswith("K = 0: there is no neighbour")
+    assert STUDY.answers(results)["K = 0"].startswith("K = 0: ")
     worse = replace(results, frame=results.frame.rename(columns={"sent_bytes_per_second": "sent_bytes"}), settings={})
     worse.frame.loc[worse.frame["method"] == "joint", "rt_le_m"] += worse.frame["max_neighbours"]
-    assert "Joint filter, K = 2: worse than alone" in " ".join(unused(worse))
+    assert "Joint filter, K = 2: worse than alone" in " ".join(unused(worse, True))
 
 
 def test_calls_that_raised_what_is_no_error_of_ours(tmp_path: Path) -> None:

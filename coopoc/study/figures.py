@@ -1,4 +1,4 @@
-"""Figures of a study: a metric over an axis, its bytes, and methods over a case."""
+"""Figures of a study: a metric over an axis, and its bytes."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from ..escapes import picture
 from ..evaluate.statistics import Interval
 from .numbers import Number, Where, interval, mean, ran
 from .plot import Plot, canvas, legend, name_of, plain_log, strokes
-from .style import NEUTRAL, Panel, look, words
+from .style import Panel, look, words
 
 if TYPE_CHECKING:
     from .results import Results
 
-__all__ = ["Plot", "curves", "multiples", "pareto", "sweep"]
+__all__ = ["Plot", "curves", "pareto", "sweep"]
 
 
 def sweep(results: Results, x: str, where: Where | None = None, caption: str = "", log: bool = False) -> Plot:
@@ -245,44 +245,6 @@ def _joined(lines: Sequence[Where], models: Collection[str] = ()) -> str:
     named = [str(of.get("noise_model")) for of in lines[1:]]
     shown = [f"{n}, {m}" if len(models) > 1 and m in models else n for n, m in zip(others, named, strict=True)]
     return " = ".join([first, *shown])
-
-
-def multiples(
-    rows: Mapping[tuple[str, str], Mapping[str, Sequence[float]]],
-    caption: str,
-    target: Mapping[str, float] | None = None,
-) -> Plot | None:
-    """Plot value / reference of each method in each case as dots; a line marks 1, a band ends at the case's target.
-
-    Args:
-        rows: (method, noise model) -> case -> multiples, one per training seed.
-        caption: under the figure.
-        target: case -> upper end of the band.
-
-    Returns:
-        None if there is nothing to draw.
-    """
-    rows = {pair: {case: values for case, values in each.items() if len(values)} for pair, each in rows.items()}
-    rows = {pair: each for pair, each in rows.items() if each}
-    cases = list(dict.fromkeys(case for each in rows.values() for case in each))
-    if not cases:
-        return None
-    size = {"width": 1.9 + 1.75 * len(cases), "height": 0.9 + 0.21 * len(rows)}
-    with canvas(1, len(cases), sharex=True, sharey=True, squeeze=False, **size) as (figure, (axes,)):
-        for panel, case in zip(axes, cases, strict=True):
-            if target and case in target:
-                band = panel.axvspan(1.0, target[case], color=NEUTRAL, alpha=0.35, linewidth=0, label="target")
-                axes[-1].legend(handles=[band], loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
-            panel.axvline(1.0, color="black", linewidth=0.9)
-            for row, ((method, _), each) in enumerate(rows.items()):
-                values = each.get(case, ())
-                style = {**strokes({"method": method}), "linestyle": "none", "markersize": 4, "alpha": 0.8}
-                panel.plot(values, np.full(len(values), row), **style)
-            panel.set(title=case, xlabel="× reference")
-            plain_log(panel.xaxis)
-        labels = [look(m).label + ("" if model in ("trained", "none") else f", {model}") for m, model in rows]
-        axes[0].set(yticks=range(len(rows)), yticklabels=labels, ylim=(len(rows) - 0.4, -0.6))
-    return Plot(figure, caption)
 
 
 def _line_names(results: Results, *across: str) -> list[str]:

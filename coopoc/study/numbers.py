@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 import numpy as np
 
 from ..arrays import Floats
-from ..evaluate.statistics import Interval, paired_difference
+from ..evaluate.statistics import Interval, over_seeds, paired_difference
 
 if TYPE_CHECKING:
     from .results import Results
@@ -110,24 +110,6 @@ def listed(numbers: Mapping[str, float | None]) -> str:
     return ", ".join(f"{name} {three(value)} m" for name, value in ran(numbers).items())
 
 
-def sentence(template: str, **numbers: Any) -> str:
-    """The template with its numbers; nothing if one of them was not run.
-
-    >>> sentence("{error:.1f} m", error=2.0), sentence("{error:.1f} m", error=None)
-    ('2.0 m', '')
-    """
-    return "" if None in numbers.values() else template.format(**numbers)
-
-
-def ratio(value: float | None, base: float | None) -> float | None:
-    """value / base; None if either was not run.
-
-    >>> ratio(3.0, 2.0), ratio(None, 2.0)
-    (1.5, None)
-    """
-    return value / base if value is not None and base else None
-
-
 def _seeds(results: Results, where: Where) -> list[Any]:
     kept = present(results, where)
     frame = results.select(kept) if kept else results.frame.iloc[:0]
@@ -140,14 +122,36 @@ def per_seed(results: Results, where: Where) -> Floats:
     return np.array([results.values("rt_le_m", {**where, "train_seed": seed}) for seed in seeds])
 
 
-def seed_means(results: Results, where: Where, number: Number = mean) -> list[float]:
-    """A number for each training seed; of a method that is not trained one, and none if it was not run."""
+def seed_means(results: Results, where: Where) -> list[float]:
+    """Mean RT-LE for each training seed, m; of a method that is not trained one, and none if it was not run."""
     seeds = _seeds(results, where)
     wheres = [{**where, "train_seed": seed} for seed in seeds] or [dict(where)]
-    return [value for each in wheres if (value := number(results, each)) is not None]
+    return [value for each in wheres if (value := mean(results, each)) is not None]
 
 
 def seed_std(results: Results, where: Where) -> float | None:
     """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
     each = per_seed(results, where)
     return float(each.mean(axis=(1, 2)).std(ddof=1)) if len(each) > 1 else None
+
+
+def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
+    """Sentence on the RT-LE of `trained`, against `other`, which needs no training, with the evidence.
+
+    Args:
+        results: of the study.
+        trained: selection of one method.
+        other: selection of another method, over the same egos and runs.
+        name: of the other, for the sentence.
+    """
+    base, each = results.values("rt_le_m", other), per_seed(results, trained)
+    gaps = {"over egos and runs": paired_difference(each.mean(axis=0), base)}
+    if len(each) > 1:
+        gaps[f"over {len(each)} training seeds"] = over_seeds(each - base)
+    ends = np.array([(gap.low, gap.high) for gap in gaps.values()])
+    claim = "beats" if (ends < 0).all() else "is worse than" if (ends > 0).all() else "cannot be distinguished from"
+    evidence = ", ".join(
+        f"{gap.mean:+.3f} m, 95 % [{gap.low:+.3f}, {gap.high:+.3f}] {over}" for over, gap in gaps.items()
+    )
+    one = " of one training seed, whose spread is unknown" * (len(each) == 1)
+    return f"{claim} {name} (paired difference {evidence}{one})"

@@ -38,9 +38,6 @@ class Panel:
     ticks: Mapping[Any, str] = field(default_factory=dict)
 
 
-NEUTRAL = "#9DB0C3"
-"""Colour of anything that belongs to no method."""
-
 DATA = tomllib.loads((Path(__file__).parent / "style.toml").read_text())
 METHODS = {name: Look(*each) for name, each in DATA["methods"].items()}
 UNITS = {column: tuple(each) for column, each in DATA["columns"].items()}

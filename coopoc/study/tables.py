@@ -267,6 +267,38 @@ def lost(results: Results, where: Where | None = None) -> list[str]:
     return [text.format(label("method", name), count) for name, count in runs.items() if count]
 
 
+ALIKE, WORSE = 1e-3, 1.1
+"""m, difference of errors that is none; ratio of the mean error with neighbours to that of a vehicle alone."""
+
+
+def unused(results: Results, real: bool) -> list[str]:
+    """A sentence for each method and K whose errors are those of a vehicle alone, in every run and for every ego, or on
+    real data larger."""
+    rows, texts, by = results.frame, list[str](), ["method", "max_neighbours"]
+    value = "rt_le_m" if "rt_le_m" in rows else "innovation_m"
+    sent = "sent_bytes" if "sent_bytes" in rows else "sent_bytes_per_second"
+    if not {*by, sent, value} <= set(rows):
+        return []
+    keys = [name for name in (*results.axes, "ego", "run", "train_seed") if name in rows and name not in by]
+    for (method, k), part in rows[rows[sent] > 0].groupby(by, sort=False):
+        own = (rows["method"] == method) & (rows["max_neighbours"] == 0)
+        both = part.merge(rows[own | (rows["method"] == "kalman") & (rows["max_neighbours"] == k)], on=keys)
+        together, alone = (both[f"{value}_{side}"] for side in "xy")
+        gap = (together - alone).abs().groupby([both[key] for key in keys], dropna=False).min()
+        text = f"{label('method', method)}, K = {k}:"
+        if k and len(gap) == len(part) and gap.max() < ALIKE:
+            lacks = "what was measured lacks what it takes, such as an azimuth"
+            why = lacks if part["bytes_per_second"].any() else "no message arrived"
+            text += f" equal to solo within {ALIKE:g} m: no neighbour's measurement was used, because {why}."
+        elif k and real and together.mean() > WORSE * alone.mean():
+            text += f" worse than alone, {together.mean():.3g} m for {alone.mean():.3g} m: what was measured of "
+            text += "neighbours, or its stated noise, is wrong. coopoc data check says what looks so."
+        else:
+            continue
+        texts.append(text)
+    return texts
+
+
 def crossed(
     results: Results,
     head: Sequence[str],
