@@ -2,7 +2,7 @@
 # make test    the environment, then style and tests
 # make test-quick   a part of the tests, in a minute once the kernels are compiled
 # make test-of   the tests that reach FILE (or a folder), nearest first, within NEAR imports if given; ends at the first failure
-# make test-slow   the tests that make test leaves out: strict types, deployments over TLS, clusters, kills, trainings
+# make test-slow   the tests that make test leaves out: strict types, deployments over TLS, kills, trainings
 # make test-bounds   the tests of the kernels, compiled with a check of every index, in a cache of their own
 # make test-lower   a part of the tests with the least version of each dependency, without torch, in build/lower
 # make fuzz    every text reader under coverage-guided fuzzing, MINUTES each (default 10); finds go to build/fuzz
@@ -106,7 +106,7 @@ $(READY): pyproject.toml constraints.txt
 
 $(VENV)/.ready-dev: $(READY)
 	@echo "Installing the tools of the tests." >&2
-	$(PIP) --no-build-isolation --editable '.[dev,sumo,nmea,ros,flower,export,cluster]'
+	$(PIP) --no-build-isolation --editable '.[dev,sumo,nmea,ros,flower,export]'
 	@touch $@
 
 $(VENV)/.ready-fuzz: $(VENV)/.ready-dev

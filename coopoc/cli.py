@@ -47,7 +47,6 @@ def run(
     jobs: Annotated[int, arg(metavar="N")] = 1,
     set: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(metavar="KEY=VALUE ...")] = (),
     shard: Annotated[str, arg(metavar="I/N")] = "",
-    cluster: Annotated[str, arg(metavar="tcp://HOST:PORT")] = "",
     retry_failed: bool = False,
     dry_run: bool = False,
     tracks: Literal["none", "tum"] = "none",
@@ -63,7 +62,6 @@ def run(
         jobs: number of worker processes; results do not depend on it.
         set: settings or axes of the study; commas separate the values of a list.
         shard: compute only part I of N; a run without --shard completes and publishes them.
-        cluster: address of a Dask scheduler whose workers compute the cells.
         retry_failed: repeat failed cells.
         dry_run: print which cells would be kept, repeated and computed, then stop.
         tracks: tum writes the estimates, a TUM file for each ego and run, to FOLDER/NAME/tracks.
@@ -83,7 +81,7 @@ def run(
     if dry_run:
         print(json.dumps(plan(name, out, changes, shard, retry_failed), indent=1, default=str))
         return 0
-    results = run_study(name, out, jobs, changes, shard=shard, retry_failed=retry_failed, cluster=cluster)
+    results = run_study(name, out, jobs, changes, shard=shard, retry_failed=retry_failed)
     folder = out / results.study
     for text in () if shard else tables(folder):
         print(text, end="\n\n")

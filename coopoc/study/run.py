@@ -20,9 +20,8 @@ from ..world.recording import Recording
 from ..world.storage import digest, save_recording
 from . import store
 from .cell import Cell, Params
-from .cluster import Cluster, connected
 from .compute import compute, part_of, schedule
-from .manifest import Manifest, environments, locked, one_at_a_time
+from .manifest import Manifest, locked, one_at_a_time
 from .provenance import environment
 from .publish import publish
 from .results import Results
@@ -37,7 +36,6 @@ def run_study(
     progress: bool = True,
     shard: str = "",
     retry_failed: bool = False,
-    cluster: str = "",
 ) -> Results:
     """Compute the results of a study in `jobs` processes; finished cells in `out/<study.name>` are not computed again.
 
@@ -55,29 +53,22 @@ def run_study(
         shard: "i/n" computes the i-th of n parts and publishes nothing, see `part_of`. Shards of the same settings may
             share a folder at the same time. A run without it completes and publishes what they have computed.
         retry_failed: compute failed cells once more.
-        cluster: address of a Dask scheduler, whose workers compute instead of processes here. `study.prepare` still
-            runs here, in `jobs` processes: the workers must see its files.
 
     Returns:
         Results of all cells, or of those of the shard.
 
     Raises:
         InputError: an unknown study or setting, jobs < 1, an invalid shard, a folder that cannot be written or that
-            another run uses or from which finished cells vanish, a cluster that cannot compute, see
-            `cluster.connected`, or an error of `study.key`.
-        MissingLibraryError: `cluster` without Dask.
-        WorkerDiedError: a worker process was killed, mostly for want of memory, or no worker of a cluster is left;
-            finished cells are kept.
+            another run uses or from which finished cells vanish, or an error of `study.key`.
+        WorkerDiedError: a worker process was killed, mostly for want of memory; finished cells are kept.
     """
     study, cells, part, folder = _resolve(study, out, settings, shard)
     number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1", hint="Give the number of worker processes.")
     with ExitStack() as stack:
-        workers = stack.enter_context(connected(cluster, study.cell)) if cluster else None
-        used = environments([environment(), *(workers.environments.values() if workers else ())])
         params = {cell.name: dict(cell.params) for cell in cells}
-        manifest = Manifest(study.name, study.question, study.axes, dict(study.settings), params, used)
+        manifest = Manifest(study.name, study.question, study.axes, dict(study.settings), params, environment())
         stack.enter_context(locked(folder, manifest.as_stored(), shard))
-        _work(study, part, folder, jobs, progress, retry_failed, workers)
+        _work(study, part, folder, jobs, progress, retry_failed)
         if shard:
             return Results.load(folder, {cell.name for cell in part})
         results = Results.load(folder)
@@ -166,7 +157,6 @@ def _work(
     jobs: int,
     progress: bool,
     retry_failed: bool,
-    workers: Cluster | None,
 ) -> None:
     new, before = _unfinished(cells, folder)
     todo = [*new, *(cell for cell, _ in before if retry_failed)]
@@ -174,9 +164,9 @@ def _work(
         wait = f"coopoc: {study.name}: waits for a shard that prepares shared files"
         with one_at_a_time(folder, lambda: tqdm.write(wait, file=sys.stderr) if progress else None):
             study.prepare([cell.given for cell in todo], jobs)
-    todo = schedule(todo, study.shares, workers.jobs if workers else jobs)
+    todo = schedule(todo, study.shares, jobs)
     failed = 0 if retry_failed else len(before)
-    outcomes = workers.compute(study.cell, todo) if workers else compute(study.cell, todo, jobs)
+    outcomes = compute(study.cell, todo, jobs)
     total, done = len(cells), len(cells) - len(todo)
     with (
         tqdm(total=total, initial=done, desc=study.name, unit="cell", smoothing=0.05, disable=not progress) as bar,
