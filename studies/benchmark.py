@@ -135,7 +135,7 @@ def tried(name: str, task: Task) -> Row:
     seen, fleet = recording(task, held in ("", "fleet"))
     one(seen.between(0, 3), [task.columns[0]])  # compiles
     scores = scored(one, seen, [fleet.ids[k] for k in task.columns], fleet)
-    level = mean_interval(scores["rt_le_m"].T)
+    level = mean_interval(scores["rt_le_m"])
     row: Row = {"task": task.name}
     row |= {"rt_le_m": rounded(level)}
     if held:

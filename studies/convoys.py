@@ -104,7 +104,7 @@ def convoy_row(task: str, data: Path | None, method: Method) -> Row:
     gap, nees = planar(track, fleet)
     size = min(BLOCK, len(recording.t) * recording.dt / 4) / recording.dt
     blocks = blocks_of(np.sqrt(np.square(gap).sum(axis=-1).mean(axis=0)), 0, size)
-    level = mean_interval(blocks)
+    level = mean_interval(blocks.T)
     row: Row = {"task": task, "data": hashed(*(located(data, name) for name in ROADS[CONVOYS[task]]))}
     row |= {"rt_le_m": rounded(level), "blocks_m": [round(float(value), 4) for value in blocks.ravel()]}
     if track.covariance is not None:

@@ -122,7 +122,7 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> R
             ratios.append(nees[0, max(start - begin, 0) :, 0])
         parts = [squares[k : k + size] for k in range(start, len(squares) - size + 1, size)]
         blocks += [float(np.sqrt(np.nanmean(part))) for part in parts if np.isfinite(part).any()]
-    level = mean_interval(np.array([blocks]))
+    level = mean_interval(np.array(blocks))
     row: Row = {"rt_le_m": rounded(level)}
     row["blocks_m"] = [round(value, 4) for value in blocks]
     nees = np.concatenate(ratios)

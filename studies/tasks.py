@@ -229,7 +229,7 @@ def pose_row(task: str, folder: Path | None, made: Any) -> Row:
     track = made(recording, ids)
     seconds = time.perf_counter() - began
     squares = np.square(blocks_of(errors(track, fleet)[0], start, block_s / fleet.dt))
-    level = mean_interval(np.sqrt(squares))
+    level = mean_interval(np.sqrt(squares).T)
     row: Row = {"task": task, "data": hashed(path)}
     row |= {"rt_le_m": rounded(level)}
     if fleet.heading is None:

@@ -5,6 +5,7 @@ import pytest
 from conftest import refused
 from scipy import stats
 
+from coopoc import V2X, JointFilter, Kalman, Sensors, load_fleet, observe, rt_le
 from coopoc.evaluate import statistics
 from coopoc.evaluate.statistics import mean_interval, over_seeds, paired_difference
 
@@ -23,7 +24,7 @@ def test_one_ego_agrees_with_scipy_bootstrap(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_pairing_cancels_what_both_share() -> None:
     rng = np.random.default_rng(3)
-    shared = rng.normal(5, 2, (4, 50))
+    shared = rng.normal(5, 2, (50, 4))
     a, b = shared + 0.1 + rng.normal(0, 0.05, shared.shape), shared
     difference = paired_difference(a, b)
     assert 0.05 < difference.low < difference.mean < difference.high < 0.15
@@ -36,20 +37,32 @@ def test_intervals_hold_the_mean_as_often_as_they_promise(egos: int, runs: int, 
     rng = np.random.default_rng(4)
     hits = 0
     for _ in range(300):
-        values = between * rng.normal(size=(egos, 1)) + rng.normal(size=(egos, runs))
+        values = between * rng.normal(size=egos) + rng.normal(size=(runs, egos))
         found = mean_interval(values)
         hits += found.low <= 0 <= found.high
     assert low < hits / 300 < 0.98
 
 
+def test_scores_go_in_as_they_come_out() -> None:
+    """A difference that all runs share and egos do not: over egos, whose interval is wide."""
+    fleet = load_fleet("town10-validation").between(0, 40)
+    seen = observe(fleet, Sensors.paper_scenario2(), V2X(4), runs=20, observers=[0, 3, 5])
+    a, b = (rt_le(method(seen, [0, 3, 5]), fleet) for method in (Kalman(), JointFilter()))
+    ours = paired_difference(a, b)
+    per_ego = (a - b).mean(axis=0)
+    half = stats.t.ppf(0.975, 2) * per_ego.std(ddof=1) / np.sqrt(3)
+    assert ours.mean == pytest.approx(per_ego.mean())
+    assert 0.5 * half < ours.high - ours.mean < 2.0 * half
+
+
 def test_few_egos_that_differ_give_a_wider_interval_than_pooled_runs() -> None:
-    values = np.array([[1.0], [2.0], [3.0]]) + 0.01 * np.random.default_rng(5).normal(size=(3, 100))
+    values = np.array([1.0, 2.0, 3.0]) + 0.01 * np.random.default_rng(5).normal(size=(100, 3))
     nested, pooled = mean_interval(values), mean_interval(values.ravel())
     assert nested.high - nested.low > 4 * (pooled.high - pooled.low)
 
 
 def test_seeds_agree_with_scipy_t_interval() -> None:
-    values = np.random.default_rng(7).normal(1.1, 0.1, (5, 3, 40))
+    values = np.random.default_rng(7).normal(1.1, 0.1, (5, 40, 3))
     found = over_seeds(values)
     means = values.mean(axis=(1, 2))
     expected = stats.ttest_1samp(means, 0.0).confidence_interval(0.95)
@@ -70,5 +83,7 @@ def test_what_cannot_be_averaged_is_named() -> None:
         mean_interval(np.empty((0, 3)))
     with refused("must have the shape of a"):
         paired_difference(np.ones((2, 3)), np.ones((3, 2)))
+    with refused(r"a = \(2, 3, 4\): must have shape \(R, E\)"):
+        paired_difference(np.ones((2, 3, 4)), np.ones((2, 3, 4)))
     with refused("at least two seeds"):
         over_seeds(np.ones((1, 3)))

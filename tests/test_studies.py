@@ -62,7 +62,7 @@ def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:
     said = "\n".join(shown["findings"].values())
     assert "federated" not in said  # there is no net to compare with
     rms = np.sqrt(
-        (results.values("rt_le_m", method="joint", noise_model="nominal", max_neighbours=6) ** 2).mean(1)
+        (results.values("rt_le_m", method="joint", noise_model="nominal", max_neighbours=6) ** 2).mean(0)
     ).mean()
     assert "K = 6, rms over runs: KF alone" in said
     assert f"joint filter {rms:.3g} m, bound {bound[-1]:.3g} m." in said

@@ -46,10 +46,10 @@ def test_values_are_paired_by_ego_and_run_whatever_the_order_of_rows(frame: pd.D
     where = {"noise_model": "identity", "k": 0}
     straight = results(frame).values("rt_le_m", where, method="gnss")
     mixed = results(frame.sample(frac=1.0, random_state=1)).values("rt_le_m", where, method="gnss")
-    assert straight.shape == (2, 6)
+    assert straight.shape == (6, 2)
     np.testing.assert_array_equal(straight, mixed)
     first = frame.query("method == 'gnss' and k == 0 and ego == 'a'").sort_values("run")["rt_le_m"]
-    np.testing.assert_array_equal(straight[0], first)
+    np.testing.assert_array_equal(straight[:, 0], first)
 
 
 def test_training_seeds_are_averaged_before_the_interval(frame: pd.DataFrame) -> None:

@@ -43,7 +43,7 @@ def mean_interval(values: AnyArray) -> Interval:
     runs of equal variance, 95 % intervals hold the mean in 87, 93 and 93 % of trials for 3, 5 and 8 egos, 94 % for one.
 
     Args:
-        values: (E, R) or (R,) of one metric.
+        values: (R, E) or (R,) of one metric, runs first, as `rt_le` and `nees` give them.
 
     Raises:
         InputError: a value that is not finite, another shape, or no value.
@@ -59,7 +59,7 @@ def paired_difference(a: AnyArray, b: AnyArray) -> Interval:
     """Mean of a - b on the same egos and runs, with its interval: common noise cancels.
 
     Args:
-        a: (E, R) or (R,) of one metric, the same draws in the same places.
+        a: (R, E) or (R,) of one metric, runs first, the same draws in the same places.
         b: as `a`.
 
     Raises:
@@ -70,15 +70,15 @@ def paired_difference(a: AnyArray, b: AnyArray) -> Interval:
     """
     first, second = _checked("a", a), _checked("b", b)
     if first.shape != second.shape:
-        raise InputError("b", second.shape, f"must have the shape of a, {first.shape}", "Pair the same egos and runs.")
-    return mean_interval(first - second)
+        raise InputError("b", np.shape(b), f"must have the shape of a, {np.shape(a)}", "Pair the same runs and egos.")
+    return mean_interval((first - second).T)
 
 
 def over_seeds(values: AnyArray) -> Interval:
     """Mean over training seeds with its 95 % interval, apart from noise: of S means mean +- t_{S-1} s / sqrt(S).
 
     Args:
-        values: (S, E, R) or (S, R) or (S,) of one metric, seeds first.
+        values: (S, R, E) or (S, R) or (S,) of one metric, seeds first.
 
     Raises:
         InputError: fewer than two seeds, or a value that is not finite.
@@ -131,9 +131,10 @@ def _interval(resampled: Floats, mean: float, values: Floats) -> Interval:
 
 
 def _checked(name: str, values: AnyArray) -> Floats:
-    array: Floats = np.atleast_2d(checked(name, values))
+    """(E, R), egos first."""
+    array: Floats = np.atleast_2d(checked(name, values).T)
     if array.ndim != 2 or array.size == 0:
-        raise InputError(name, array.shape, "must have shape (E, R) or (R,)", "Egos first, then runs.")
+        raise InputError(name, array.T.shape, "must have shape (R, E) or (R,)", "Runs first, then egos.")
     if not np.isfinite(array).all():
         raise InputError(name, "not finite", "must be finite", "Leave out failed cells before you average.")
     return array

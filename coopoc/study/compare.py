@@ -180,7 +180,7 @@ def _change(at: Mapping[str, Any], a: pd.DataFrame, b: pd.DataFrame, value: str)
     if not first.size:
         return Change(at, value, math.nan, math.nan, NOTHING)
     same = bool(np.allclose(first, second, rtol=SAME, atol=0))
-    gap = paired_difference(second, first)
+    gap = paired_difference(second.T, first.T)
     return Change(at, value, float(first.mean()), float(second.mean()), gap, same=same, missing=missing)
 
 

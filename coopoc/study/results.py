@@ -105,13 +105,13 @@ class Results:
         return frame
 
     def values(self, value: str, where: Params | None = None, **also: Any) -> Floats:
-        """(E, R) of one metric for paired comparisons, sorted by ego and run, averaged over training seeds."""
+        """(R, E) of one metric for paired comparisons, sorted by run and ego, averaged over training seeds."""
         frame = self.select(where, **also)
         self._one_cell(frame, [], value)
         grid = ego_by_run(frame, value)[0]
         if grid.size == 0:
             raise InputError(value, "no finite value", "needs an ego with all its runs", "See the failed cells.")
-        return grid
+        return grid.T
 
     def interval(self, value: str, where: Params | None = None, **also: Any) -> Interval:
         """Mean of one metric over egos and runs with its interval."""
@@ -139,7 +139,7 @@ class Results:
         for names, frame in self.groups(by, where):
             self._one_cell(frame, by, value)
             grid, missing = ego_by_run(frame, value)
-            each = mean_interval(grid) if grid.size else NOTHING
+            each = mean_interval(grid.T) if grid.size else NOTHING
             rows.append([*names, each.mean, each.low, each.high, each.n, missing])
         return pd.DataFrame(rows, columns=[*by, "mean", "low", "high", "n", "missing"])
 

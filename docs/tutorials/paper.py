@@ -127,7 +127,7 @@ plt.show()
 
 # %%
 for name, k in (("LKF-SA, identity", 10), ("Kalman filter, fitted", 0), ("LKF-SA, fitted", 10)):
-    gap = co.paired_difference(error[name, k].T, error["FedKalmanNet", 0].T)
+    gap = co.paired_difference(error[name, k], error["FedKalmanNet", 0])
     print(f"{name}, K = {k}, minus FedKalmanNet: {gap.mean:+.2f} m [{gap.low:+.2f}, {gap.high:+.2f}]")
 
 # %% [markdown]
