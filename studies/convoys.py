@@ -27,8 +27,8 @@ SLOW = 1.0
 """m/s, below which a course is noise: the odometry errs as it did before."""
 
 
-@lru_cache(maxsize=2)
-def convoy(task: str, data: Path | None) -> tuple[Recording, Fleet]:
+@lru_cache(maxsize=4)
+def convoy(task: str, data: Path | None, neighbours: int = 6) -> tuple[Recording, Fleet]:
     """Measurements and truth of vehicles on the route of the first piece, side by side, as far apart as they start.
 
     A vehicle's fixes err by as many metres east and north as those of its piece, its odometry by the same factor and
@@ -38,6 +38,7 @@ def convoy(task: str, data: Path | None) -> tuple[Recording, Fleet]:
     Args:
         task: one of CONVOYS.
         data: folder of the data, None for those that were fetched.
+        neighbours: that a vehicle measures at most.
 
     Raises:
         InputError: a file that is missing.
@@ -57,7 +58,7 @@ def convoy(task: str, data: Path | None) -> tuple[Recording, Fleet]:
     driven = np.repeat(motion[route, None], len(starts), axis=1)
     ids, t = tuple(f"v{k}" for k in range(len(starts))), recording.t[:length] - recording.t[0]
     fleet = Fleet(ids, t, _plane(true), _plane(driven) / dt, name=task)
-    v2x = V2X(max_neighbours=6, radius=150.0)
+    v2x = V2X(max_neighbours=neighbours, radius=150.0)
     drawn = observe(fleet, recording.sensors, v2x, runs=RUNS, seed=SEED)
     gnss, velocity = (
         np.tile(each, (RUNS, 1, 1, 1)) for each in (_plane(true + error[rows]), _plane(ratio[rows] * driven) / dt)
