@@ -1,7 +1,9 @@
 """The cooperative filter: equal to the joint filter with everything off, and best of all where numbers are wrong."""
 
+import pickle
 from collections.abc import Callable, Mapping
 from dataclasses import replace
+from functools import partial as partial_of
 from typing import Any
 
 import numpy as np
@@ -13,11 +15,12 @@ from test_star_filters import CHANNELS, gappy, holed, partial
 
 from coopoc import V2X, Fleet, JointFilter, Kalman, Recording, Sensors, load_fleet, nees, observe, rt_le
 from coopoc.arrays import Floats
-from coopoc.kernels.stars.cooperative_state import NO_GUARDS, Guards
+from coopoc.kernels.stars.cooperative_state import NO_GUARDS, ON_ROADS, Guards
 from coopoc.methods.cooperative_filter import Broadcast, CooperativeFilter, lasting
 from coopoc.methods.noise_model import NoiseModel, resolve
 from coopoc.methods.star_stream import RelativeMeasurement, StarStream
 from coopoc.world.inbox import inbox
+from coopoc.world.recording import MEASURED
 from coopoc.world.spoofing import Spoofing, spoofed
 
 S2 = Sensors.paper_scenario2()
@@ -117,6 +120,7 @@ BAD: dict[str, tuple[Sensors, V2X, Callable[[Recording], Recording]]] = {
     "ranges": (S2, CHANNELS["ideal"], lambda r: too_long(r, 0.2)),
     "late": (S2, CHANNELS["slow"], lambda r: r),
     "lost": (S2, V2X(6, loss=0.3), lambda r: r),
+    "measured": (S2, V2X(6, loss=0.1, latency=0.1), lambda r: replace(r, notes=(f"fixes: {MEASURED}",))),
     "alone": (S2, CHANNELS["alone"], lambda r: r),
     "missing": (S2, CHANNELS["late"], lambda r: partial(holed(r))),
     "heading": (HEADING, CHANNELS["all"], lambda r: too_long(r, 0.1)),
@@ -142,22 +146,25 @@ def test_the_filter_is_its_oracle(crossing: Fleet, case: str, guards: Guards) ->
     track, known = CooperativeFilter(guards=guards)(seen), resolve("nominal", seen)
     assert track.covariance is not None
     assert track.neighbours is not None
+    assumed = ON_ROADS if seen.measured and guards == Guards() else guards
     for run in range(2):
-        x, cov, others = Oracle(seen, 0, run, known, guards).loop()
+        x, cov, others = Oracle(seen, 0, run, known, assumed).loop()
         assert_allclose(track.x[run, :, 0], x, atol=1e-6)
         assert_allclose(track.covariance[run, :, 0], cov, rtol=1e-6, atol=1e-6)
         if len(track.neighbours[run]):
             assert_allclose(track.neighbours[run], np.concatenate(others), atol=2e-6)
 
 
-@pytest.mark.parametrize("case", ["late", "lost", "attack"])
+@pytest.mark.parametrize("case", ["late", "lost", "attack", "measured"])
 def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
     """A stream has no recording: each vehicle's broadcast of a step is that of a stream of its own."""
     sensors, v2x, change = BAD[case]
     seen = change(observe(gappy(crossing), sensors, v2x, runs=1, observers=[0]))
     track, box = CooperativeFilter()(seen), inbox(seen, 0, CooperativeFilter().message)
-    method = CooperativeFilter(NoiseModel.nominal(sensors))
-    streams = {j: StarStream(method, max_age=v2x.max_age) for j in range(len(seen.ids))}
+    start = partial_of(
+        StarStream, CooperativeFilter(NoiseModel.nominal(sensors)), max_age=v2x.max_age, measured=seen.measured
+    )
+    streams = {j: start() for j in range(len(seen.ids))}
     sent, trusted = dict[tuple[int, int], Broadcast | None](), set[bool]()
     for t in range(len(seen.t)):
         here = np.arange(box.start[t], box.start[t + 1])
@@ -166,11 +173,12 @@ def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
                 stream.step(seen.gnss[0, t, j], seen.velocity[0, t, j], seen.dt)
                 sent[j, t] = stream.broadcast
             elif j:
-                streams[j] = StarStream(method, max_age=v2x.max_age)
+                streams[j] = start()
         given = [
             RelativeMeasurement(seen.ids[j], seen.relative[0, box.link[link]], **newest(seen, sent, t, int(s), int(j)))
             for link, j, s in zip(here, seen.links.neighbour[box.link[here]], box.newest[0, here], strict=True)
         ]
+        streams[0] = pickle.loads(pickle.dumps(streams[0]))
         x, cov = streams[0].step(seen.gnss[0, t, 0], seen.velocity[0, t, 0], seen.dt, neighbours=given)
         assert_allclose(x, track.x[0, t, 0], atol=1e-6)
         assert track.covariance is not None

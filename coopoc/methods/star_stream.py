@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
@@ -123,6 +124,7 @@ class StarStream:
             variance. None: every step is one, with the error of one measured velocity, as in a recording.
         history: s, how old a delayed fix may be.
         max_age: s, older messages of neighbours are not used.
+        measured: True where measurements are not simulated: then the settings are those of such a Recording.
 
     Raises:
         InputError: a noise model that needs a recording, a time that is negative or not finite.
@@ -143,6 +145,7 @@ class StarStream:
         interval: float | None = None,
         history: float = 10.0,
         max_age: float = 1.0,
+        measured: bool = False,
     ) -> None:
         if not isinstance(filter, CooperativeFilter):
             filter = instance("filter", filter, JointFilter)
@@ -152,13 +155,13 @@ class StarStream:
         self._robust = isinstance(filter, CooperativeFilter)
         self._guards = NO_GUARDS
         if isinstance(filter, CooperativeFilter):
-            self._guards = guards_of(filter, known)
+            self._guards = guards_of(filter, known, measured)
             model = model_of(known, self._guards)
             self._star, self._white = Robust(model, self._guards, start), model.white
         else:
             self._star = Joint(known, filter.exact, filter.robust, start)
         self._motion: MotionNoise = motion_noise(known, interval)
-        self._fix = np.array(known.gnss_variance)
+        self._fix = self._guards.fix**2 * np.array(known.gnss_variance)
         self.max_age, self.history = seconds("max_age", max_age), MotionHistory(history)
         self._given, self._time, self._begun = np.zeros(8), 0.0, x0 is not None
         self._numbers, self._names = dict[str, int](), list[str]()
@@ -330,8 +333,17 @@ class Robust:
         """Room for a star of that many members, of that many vehicles."""
         (f,) = self.filters
         if slots > len(f.vehicle) or vehicles > len(f.slot):
-            self.filters[0], self.tries = make_filter(max(len(f.vehicle), 2 * slots), vehicles)
-            restore(f, self.filters[0])
+            self._copy(max(len(f.vehicle), 2 * slots), vehicles)
+
+    def _copy(self, slots: int, vehicles: int) -> None:
+        (f,) = self.filters
+        self.filters[0], self.tries = make_filter(slots, vehicles)
+        restore(f, self.filters[0])
+
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Arrays that share memory have come apart in the pickle."""
+        self.__dict__.update(state)
+        self._copy(len(self.filters[0].vehicle), len(self.filters[0].slot))
 
     def step(self, own: Floats, rows: Floats, vehicles: Ints, last: Floats) -> Floats:
         """Answer of `stream_step`."""

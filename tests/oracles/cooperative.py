@@ -160,7 +160,7 @@ class Oracle:
             )
             self.white = np.square(s.gnss_std) / np.square(s.fix_std)
         shape = seen.gnss.shape
-        self.r = np.broadcast_to(known.fix_variance(seen), shape)[run]
+        self.r = guards.fix**2 * np.broadcast_to(known.fix_variance(seen), shape)[run]
         self.remember(seen.gnss[run], seen.velocity[run])
         self.revoked: dict[int, list[float]] = {}
         self.box = inbox(seen, ego, FIX_AND_VELOCITY)
