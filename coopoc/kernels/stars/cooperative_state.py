@@ -91,7 +91,7 @@ class Guards(NamedTuple):
     revoke: float = 3.0
     lost: float = 20.0
     forget: float = 10.0
-    acceleration: float = 6.0
+    acceleration: float = 3.0
     heading: float = 0.1
     scale: float = 0.1
     lasts: float = 1e5
