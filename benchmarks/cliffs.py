@@ -32,7 +32,6 @@ GAPS = (
     "cooperative-filter",
     "ci",
     "split-ci",
-    "mhe",
     "gbp",
     "central-filter",
     "batch-smoother",

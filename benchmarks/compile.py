@@ -38,7 +38,7 @@ from coopoc.world.storage import save_recording
 Call = Callable[[], object]
 S = co.Sensors.paper_scenario2()
 BODY = co.Sensors(heading_std=0.05, yaw_rate_std=0.02)
-GATED = ("kalman", "joint", "cooperative-filter", "mhe", "batch-smoother", "pose filter, fleet", "solve of a graph")
+GATED = ("kalman", "joint", "cooperative-filter", "batch-smoother", "pose filter, fleet", "solve of a graph")
 """Rows of the gate."""
 MODULES = ("coopoc.kernels", "coopoc.learned.engine")
 """Packages that hold compiled functions."""

@@ -6,17 +6,11 @@ Run:  python benchmarks/online_methods.py                         (town10, K = 1
 White noise of the paper's second scenario, nominal noise model, ideal channel. NEES of 3 is consistent; inside is the
 share of steps whose run-averaged NEES lies in its 99 % band. Milliseconds are per step, run and ego (whole-fleet
 methods: per step, run and vehicle), on whatever this machine was doing.
-
-The rows of `measured` are moving horizons at K = 6, each with its inbox and its Track:
-microseconds per step and run of an ego, and their ratio to the joint filter's. Right means that a run has the digits
-that it has alone.
 """
 
 from __future__ import annotations
 
 import argparse
-from functools import partial
-from typing import Any
 
 import numpy as np
 from tabulate import tabulate
@@ -32,15 +26,11 @@ ORDER = (
     "split-ci",
     "msmv-r",
     "joint",
-    "mhe",
     "gbp",
     "central-filter",
     "batch-smoother",
 )
 SENSORS = co.Sensors.paper_scenario2()
-JOBS = ("mhe", "mhe, late")
-"""A method and a word more: messages take 0.3 s."""
-ROUNDS, STEPS, RUNS = 3, 60, 16
 
 
 def row(name: str, fleet: co.Fleet, recording: co.Recording, egos: tuple[int, ...]) -> list[object]:
@@ -73,34 +63,6 @@ def bounds(fleet: co.Fleet, egos: tuple[int, ...], v2x: co.V2X) -> list[list[obj
         whole = co.fleet_bound(fleet, SENSORS, v2x, smoothing=smoothing)
         found.append([f"bound, whole fleet, {kind}", float(np.mean([co.bound_rt_le(whole[:, ego]) for ego in egos]))])
     return found
-
-
-def recorded(job: str, steps: int, runs: int) -> co.Recording:
-    """Measurements and messages of a job's ego."""
-    channel = co.V2X(max_neighbours=6, latency=0.3 if "late" in job else 0.0)
-    return co.observe(co.load_fleet("town10").between(0, steps), SENSORS, channel, runs=runs, observers=[0])
-
-
-def measured(rounds: int = ROUNDS, steps: int = STEPS, runs: int = RUNS) -> list[dict[str, Any]]:
-    """Per job: microseconds, their ratio to the joint filter's, and whether the runs are those of each alone."""
-    from classical import timed
-
-    out: list[dict[str, Any]] = []
-    for job in JOBS:
-        method, recording = METHODS[job.partition(",")[0]]("nominal"), recorded(job, steps, runs)
-        calls = [partial(each, recording, [0]) for each in (METHODS["joint"]("nominal"), method)]
-        alone = method(recording.of_runs(slice(1, 2)), [0]).x
-        away = float(np.abs(calls[1]().x[1:2] - alone).max())
-        joint, spent = (float(np.median([timed(call) for _ in range(rounds)])) for call in calls)
-        out.append(
-            {
-                "name": f"{job}, compiled",
-                "us": 1e6 * spent / (steps * runs),
-                "ratio": spent / joint,
-                "right": away < 1e-9,
-            }
-        )
-    return out
 
 
 def main() -> None:

@@ -28,7 +28,6 @@ BENCHMARKS = (
     "classical",
     "networked",
     "cliffs",
-    "online_methods",
     "learned_gain",
     "backends",
     "building",

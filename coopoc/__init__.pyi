@@ -31,7 +31,6 @@ from .methods.joint_filter import JointFilter as JointFilter
 from .methods.kalman import GNSS as GNSS
 from .methods.kalman import AdaptiveKalman as AdaptiveKalman
 from .methods.kalman import Kalman as Kalman
-from .methods.moving_horizon import MovingHorizon as MovingHorizon
 from .methods.noise_model import NoiseModel as NoiseModel
 from .methods.poses.pose_filter import PoseFilter as PoseFilter
 from .methods.poses.pose_start import pose_start as pose_start

@@ -233,7 +233,6 @@ ORACLES = {
     "msmv-r": "msmv",
     "ci": "covariance_intersection",
     "split-ci": "covariance_intersection",
-    "mhe": "moving_horizon",
     "gbp": "gbp",
     "central-filter": "central_filter",
     "batch-smoother": "batch_smoother",

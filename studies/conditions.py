@@ -91,15 +91,14 @@ CHANNELS = {
     "in time": PERFECT,
     **{f"{how}, {x:g} {unit}": at for how, (unit, by) in MESSAGES.items() for x, at in by.items()},
 }
-HORIZON = ("mhe", "nominal")
-SENT = (LKF, JOINT, SPLIT, HORIZON, COOPERATIVE)
+SENT = (LKF, JOINT, SPLIT, COOPERATIVE)
 LATENCY_LOSS = study(
     "latency_loss",
     "How much of the benefit of cooperation remains when messages are late or lost?",
     CHANNELS,
     (KALMAN, *SENT, PAST),
-    "K = 6. The moving horizon puts a late message at its true time; the others bring it forward with the velocity "
-    "that came with it. What is older than 1 s is forgotten.",
+    "K = 6. Late messages are brought forward with the velocity that came with them. What is older than 1 s is "
+    "forgotten.",
     ("late, 1 s", "lost one by one, 90 %", "lost in runs of 10, 90 %"),
     grid=[
         of(*KALMAN, **PERFECT, max_neighbours=0),

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from coopoc.study.figures import Plot
     from coopoc.study.tables import Table
 
-METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "mhe", "cooperative-filter", "bound")
+METHODS = ("gnss", "kalman", "lkf-sa", "split-ci", "joint", "cooperative-filter", "bound")
 CONDITIONS: dict[str, Any] = {
     "channel": "ideal",
     "rate_hz": 0.0,

@@ -117,7 +117,7 @@ def test_the_baseline_names_rows_that_the_benchmarks_have(load: Any, monkeypatch
     growth = load("growth")
     found = {f"growth: {name}, {count} vehicles" for name in growth.METHOD_NAMES for count in growth.FLEETS}
     found |= {"growth: import coopoc", *(f"compile: compiled: {name}, first answer" for name in load("compile").GATED)}
-    for module in ("networked", "online_methods"):
+    for module in ("networked",):
         found |= {f"{module}: {name}, {word}" for name in load(module).JOBS for word in ("compiled",)}
     for name in ("gtsam", "casadi", "osqp", "cvxpy", "filterpy"):
         pytest.importorskip(name)

@@ -52,7 +52,7 @@ def test_a_kernel_depends_on_all_kernels_below_it() -> None:
     importlib.import_module("coopoc.kernels.stars.joint_filter")
     names = {name.rpartition(".")[2] for name in machine_code.sources("coopoc.kernels.stars.joint_filter")}
     assert {"joint", "messages", "geometry", "small", "compile"} <= names
-    assert "horizon" not in names
+    assert "smoother" not in names
 
 
 def test_importing_the_package_imports_no_numba() -> None:

@@ -49,7 +49,7 @@ ROOMS = {
         "convex",
         "backends",
     ],
-    "kernels": ["compiling", "graphs", "stars", "windows", "poses", "fleets"],
+    "kernels": ["compiling", "graphs", "stars", "poses", "fleets"],
 }
 """Folders of a floor, each of which imports those before it only; modules beside them stand above or below all."""
 

@@ -86,7 +86,6 @@ METHODS: tuple[Any, ...] = (
     co.JointFilter,
     co.LKFSA,
     co.MSMV,
-    co.MovingHorizon,
     co.BatchSmoother,
     co.CentralFilter,
     co.CovarianceIntersection,

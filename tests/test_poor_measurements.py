@@ -17,7 +17,6 @@ from coopoc import (
     JointFilter,
     Kalman,
     Method,
-    MovingHorizon,
     Recording,
     RoadFilter,
     Sensors,
@@ -116,7 +115,6 @@ def ranged() -> tuple[Fleet, Recording]:
         JointFilter(),
         JointFilter(exact=False),
         CooperativeFilter(guards=NO_GUARDS),
-        MovingHorizon(horizon=5),
     ],
     ids=lambda method: f"{method.name}-{getattr(method, 'exact', '')}",
 )

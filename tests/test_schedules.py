@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import refused
 
-from coopoc import V2X, Fleet, JointFilter, MovingHorizon, Recording, Sensors, observe
+from coopoc import LKFSA, V2X, Fleet, JointFilter, Recording, Sensors, observe
 from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox, within_cap
 from coopoc.world.v2x import FIX_AND_VELOCITY, Message, Schedule
@@ -111,7 +111,7 @@ def test_schedules_are_paired_and_repeat(crossing: Fleet) -> None:
     nearest = inbox(observe(crossing, S2, replace(channel, schedule="nearest"), runs=4), 2, FIX_AND_VELOCITY)
     assert not np.array_equal(nearest.arrival, many.arrival)
     assert np.abs(nearest.received_bytes - many.received_bytes).max() <= 32 * 5
-    for method in (JointFilter(), MovingHorizon(horizon=2)):
+    for method in (JointFilter(), LKFSA()):
         track = method(observe(crossing, S2, channel, runs=2), [2])
         assert np.array_equal(track.received_bytes[:, 0], few.received_bytes)
 

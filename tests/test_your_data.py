@@ -57,7 +57,7 @@ def test_every_command_runs(folder: Path) -> None:
     assert (folder / "coarse.png").is_file()
     rows = pd.read_parquet(folder / "runs" / "side_by_side" / "results.parquet")
     level = rows.groupby(["method", "max_neighbours"])["rt_le_m"].mean()
-    assert level["mhe", 3] < level["kalman", 3] < level["gnss", 3]
+    assert level["joint", 3] < level["kalman", 3] < level["gnss", 3]
 
 
 def test_every_block_of_python_runs(folder: Path) -> None:

@@ -14,7 +14,6 @@ from .covariance_intersection import CovarianceIntersection
 from .decentralised import GaussianBeliefPropagation
 from .joint_filter import JointFilter
 from .kalman import GNSS, AdaptiveKalman, Kalman
-from .moving_horizon import MovingHorizon
 from .road import RoadFilter
 from .track import Method
 
@@ -36,7 +35,6 @@ METHODS: Mapping[str, Factory] = {
     "gbp": GaussianBeliefPropagation,
     "central-filter": CentralFilter,
     "batch-smoother": BatchSmoother,
-    "mhe": MovingHorizon,
 }
 """Name -> a function of the noise model, and of options of the method by name."""
 

@@ -89,12 +89,6 @@ def zeros(number: Any, like: Any) -> Any:
 
 
 @unrolled
-def scale_rows(v: Any, a: Any) -> Any:
-    """diag(v) A."""
-    return [v[i] * a[i * len(v) + j] for i, j in _entries(len(v))]
-
-
-@unrolled
 def choose_each(sign: Any, a: Any, b: Any) -> Any:
     """a_i where the number `sign` is positive, else b_i."""
     return [sign.choose(x, y) for x, y in zip(a, b, strict=True)]

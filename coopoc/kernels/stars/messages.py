@@ -8,7 +8,7 @@ whose position was used before, or has no fix, has new = 0.
 from __future__ import annotations
 
 import math
-from typing import Any, NamedTuple, Protocol, TypeAlias, cast
+from typing import Any, NamedTuple, TypeAlias, cast
 
 import numpy as np
 
@@ -94,18 +94,6 @@ class Assumptions(NamedTuple):
     acceleration: float
 
 
-class InMotion(Protocol):
-    """Memory of members as a `Star` has it."""
-
-    @property
-    def motion(self) -> Floats:
-        """Rows of `Star.motion`."""
-
-    @property
-    def status(self) -> Floats:
-        """Rows of `Star.status`."""
-
-
 class Star(NamedTuple):
     """The members of a star at a step, the ego first, in LANES runs.
 
@@ -138,42 +126,42 @@ def block_at(memory: Any, index: Any) -> Any:
 
 
 @inside
-def moved_of(star: InMotion, k: int) -> Numbers:
+def moved_of(star: Star, k: int) -> Numbers:
     """Motion m of member k since the last step."""
     row: Numbers = vector_at(star.motion, 4 * k + MOVED)
     return row
 
 
 @inside
-def process_of(star: InMotion, k: int) -> Numbers:
+def process_of(star: Star, k: int) -> Numbers:
     """Its variance m^2."""
     row: Numbers = vector_at(star.motion, 4 * k + PROCESS)
     return row
 
 
 @inside
-def position_of(star: InMotion, k: int) -> Numbers:
+def position_of(star: Star, k: int) -> Numbers:
     """Position m of member k, as broadcast and brought forward."""
     row: Numbers = vector_at(star.motion, 4 * k + POSITION)
     return row
 
 
 @inside
-def variance_of(star: InMotion, k: int) -> Numbers:
+def variance_of(star: Star, k: int) -> Numbers:
     """Its variance m^2."""
     row: Numbers = vector_at(star.motion, 4 * k + VARIANCE)
     return row
 
 
 @inside
-def process_information(star: InMotion, k: int) -> Numbers:
+def process_information(star: Star, k: int) -> Numbers:
     """Inverse variance 1/m^2 of the motion of member k."""
     p, q, r = process_of(star, k)
     return 1.0 / max(p, LEAST_PROCESS), 1.0 / max(q, LEAST_PROCESS), 1.0 / max(r, LEAST_PROCESS)
 
 
 @inside
-def fix_information(star: InMotion, k: int) -> Numbers:
+def fix_information(star: Star, k: int) -> Numbers:
     """Inverse variance 1/m^2 of the position of member k, 0 where it does not count."""
     new, (p, q, r) = take(star.status, 5 * k + NEW), variance_of(star, k)
     return new / p, new / q, new / r

@@ -1,1 +1,0 @@
-"""Windows of a star's last steps, solved anew at every step."""
