@@ -98,7 +98,6 @@ def method_cases() -> Iterator[Case]:
             "joint, plain",
         ),
         "kalman-adaptive": (co.AdaptiveKalman(), recording, "kalman, plain"),
-        "road-kalman": (co.RoadFilter(), recording, "kalman, plain"),
     }
     for name, (method, measured_by, plain) in others.items():
         yield case(name, plain, method, measured_by, False)

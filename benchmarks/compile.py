@@ -82,9 +82,9 @@ def graph() -> None:
 
 
 def streams() -> None:
-    """Filters step by step: alone, on roads, with a neighbour, and poses."""
+    """Filters step by step: alone, with a neighbour, and poses."""
     noise = co.NoiseModel.nominal(S)
-    for solo in (co.Kalman(noise), co.AdaptiveKalman(), co.RoadFilter(noise)):
+    for solo in (co.Kalman(noise), co.AdaptiveKalman()):
         filter = solo.start(history=1.0)
         for k in range(3):
             filter.step([0.9 * k, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, fix_age=0.1 * (k == 2))

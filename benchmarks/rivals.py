@@ -1,38 +1,47 @@
-"""Rivals on CL-Bench's real roads: filters and a smoother of other libraries, on the road filter's state.
+"""Rivals on CL-Bench's real roads: filters and a smoother of other libraries.
 
 coopoc benchmark benchmarks/rivals.py:EKF benchmarks/rivals.py:FixedLag --data ~/measured
 
-Position, heading error and scale error of the odometry, with the noise that the recording states and the road filter's
-usual errors of heading and scale; `fitted` finds these numbers on the first part of a drive as the road filter's are
-found: the same cost, prior and search. `Gated` leaves out fixes beyond a Mahalanobis distance of 3.4 (99.7 % of those
-in the plane), as robot_localization does by its rejection threshold (Moore, Stouch, IAS-13, 2014). `FixedLag` is
-GTSAM's incremental smoother of the last 30 s (Kaess et al., IJRR 31(2), 2012) with Geman and McClure's kernel.
+The state is position, heading error and scale error of the odometry, with the noise that the recording states;
+`fitted` finds their numbers as `coopoc.methods.calibration` does for our filters. `Gated` leaves out fixes beyond a
+Mahalanobis distance of 3.4 (99.7 % of those in the plane), as robot_localization does by its rejection threshold
+(Moore, Stouch, IAS-13, 2014). `FixedLag` is GTSAM's incremental smoother of the last 30 s (Kaess et al., IJRR 31(2),
+2012) with Geman and McClure's kernel.
 """
 
 from __future__ import annotations
 
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from datetime import datetime, timedelta
-from typing import Any
+from typing import Any, NamedTuple
 
 import gtsam
 import numpy as np
 from filterpy.kalman import ExtendedKalmanFilter, MerweScaledSigmaPoints, UnscentedKalmanFilter
-from scipy.optimize import minimize
 
-from coopoc import Fleet, NoiseModel, Recording, RoadErrors, Track
+from coopoc import Fleet, NoiseModel, Recording, Track
 from coopoc.arrays import Floats
-from coopoc.methods.road import PRIOR, SHORTEST, true_cost
+from coopoc.methods.calibration import calibrated
 from coopoc.world.v2x import NO_MESSAGE, Message
 
-WHITE = RoadErrors(fix=1.0, correlation=0.0, gate=np.inf, window=np.inf, least=1.0)
-"""Numbers of a rival: `fix` and `motion` are factors of stated deviations; what is 0 or infinite it does not have."""
+
+class Known(NamedTuple):
+    """Numbers of a rival: factors of the stated deviations of fixes and motion; standard deviations from which a fix is
+    left out; deviations of heading rad and scale, and s for which they last."""
+
+    fix: float = 1.0
+    motion: float = 1.0
+    gate: float = np.inf
+    heading: float = 0.1
+    scale: float = 0.03
+    lasts: float = 300.0
+
+
+WHITE = Known()
 LAG, KERNEL = 30.0, 3.0
 """s of the smoother; whitened residual at which Geman and McClure's weight is a quarter."""
-EVALUATIONS = 200
-"""Of the search, at most."""
 
 
 def moved(x: Floats, dt: float, velocity: Floats, lasts: float) -> Floats:
@@ -53,7 +62,7 @@ def slope(x: Floats, dt: float, velocity: Floats, lasts: float) -> Floats:
 class Extended(ExtendedKalmanFilter):  # type: ignore[misc]
     """filterpy's: `ahead` predicts, `see` updates."""
 
-    def __init__(self, x: Floats, cov: Floats, fix: Floats, dt: float, known: RoadErrors) -> None:
+    def __init__(self, x: Floats, cov: Floats, fix: Floats, dt: float, known: Known) -> None:
         super().__init__(4, 2)
         self.x, self.P, self.R, self.dt, self.known = x, cov, fix, dt, known
 
@@ -70,7 +79,7 @@ class Extended(ExtendedKalmanFilter):  # type: ignore[misc]
 class Unscented(UnscentedKalmanFilter):  # type: ignore[misc]
     """filterpy's."""
 
-    def __init__(self, x: Floats, cov: Floats, fix: Floats, dt: float, known: RoadErrors) -> None:
+    def __init__(self, x: Floats, cov: Floats, fix: Floats, dt: float, known: Known) -> None:
         points = MerweScaledSigmaPoints(4, 0.1, 2.0, -1.0)
         super().__init__(4, 2, dt, lambda x: x[:2], moved, points)
         self.x, self.P, self.R, self.known = x, cov, fix, known
@@ -93,7 +102,7 @@ def flat(state: Any) -> Floats:
 class Soup:
     """Stone Soup's extended predictor and updater."""
 
-    def __init__(self, x: Floats, cov: Floats, fix: Floats, dt: float, known: RoadErrors) -> None:
+    def __init__(self, x: Floats, cov: Floats, fix: Floats, dt: float, known: Known) -> None:
         from stonesoup.models.measurement.linear import LinearGaussian
         from stonesoup.models.transition.base import TransitionModel
         from stonesoup.predictor.kalman import ExtendedKalmanPredictor
@@ -148,7 +157,7 @@ class Soup:
 class Smoother(Extended):
     """GTSAM's incremental fixed-lag smoother: a node at each fix, odometry summed up between."""
 
-    def __init__(self, x: Floats, cov: Floats, fix: Floats, dt: float, known: RoadErrors) -> None:
+    def __init__(self, x: Floats, cov: Floats, fix: Floats, dt: float, known: Known) -> None:
         super().__init__(x, cov, fix, dt, known)
         often = gtsam.ISAM2Params()
         often.relinearizeSkip = 1
@@ -201,7 +210,7 @@ class Rival:
 
     name: str
     engine: type[Any]
-    known: RoadErrors = WHITE
+    known: Known = WHITE
     cooperative: bool = False
     message: Message = NO_MESSAGE
 
@@ -238,32 +247,12 @@ class Calibrated(Rival):
 
     def fitted(self, recording: Recording, truth: Fleet) -> Rival:
         """The rival with the numbers that cost least on a drive with a truth."""
-        (column,) = recording.observers
-        cuts = recording.stretches(column, SHORTEST)
-        parts = [recording.between(*cut) for cut in cuts]
-        truths = [truth.position[None, slice(*cut), column] for cut in cuts]
-        usual = {name: value for name, value in asdict(self.known).items() if 0 < value < np.inf and name != "least"}
-        first = np.log([*usual.values()])
+        usual = {name: value for name, value in self.known._asdict().items() if 0 < value < np.inf}
 
-        def of(logs: Floats) -> Rival:
-            numbers = dict(zip(usual, np.exp(logs).tolist(), strict=True))
-            return replace(self, known=replace(self.known, **numbers))
+        def make(numbers: Mapping[str, float]) -> Rival:
+            return replace(self, known=self.known._replace(**numbers))
 
-        def cost(logs: Floats) -> float:
-            try:
-                tracks = [of(logs)(part, [column]) for part in parts]
-            except (ValueError, RuntimeError):  # numbers out of range, a matrix that is not positive definite
-                return 1e6
-            each = [
-                true_cost(made.x[:, :, 0], made.covariance[:, :, 0], true)[0]
-                for made, true in zip(tracks, truths, strict=True)
-            ]
-            steps = [np.isfinite(true[..., 0]).sum() for true in truths]
-            return float(np.average(each, weights=steps)) + PRIOR * float(np.square(logs - first).sum())
-
-        simplex = first + np.vstack([np.zeros(len(first)), 0.7 * np.eye(len(first))])
-        found = minimize(cost, first, method="Nelder-Mead", options={"maxfev": EVALUATIONS, "initial_simplex": simplex})
-        return of(found.x)
+        return calibrated(make, usual, recording, truth)[0]
 
 
 @dataclass(frozen=True)
@@ -308,8 +297,8 @@ class Entry:
 
 
 EKF = Entry(Calibrated("filterpy EKF", Extended))
-Gated = Entry(Calibrated("filterpy EKF, gated", Extended, replace(WHITE, gate=3.4)))
+Gated = Entry(Calibrated("filterpy EKF, gated", Extended, Known(gate=3.4)))
 UKF = Entry(Rival("filterpy UKF", Unscented))
 StoneSoup = Entry(Rival("Stone Soup EKF", Soup))
-FixedLag = Entry(Calibrated("GTSAM fixed-lag", Smoother, replace(WHITE, gate=KERNEL)))
+FixedLag = Entry(Calibrated("GTSAM fixed-lag", Smoother, Known(gate=KERNEL)))
 KalmanNet = Entry(Net())

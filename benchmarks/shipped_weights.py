@@ -1,6 +1,6 @@
 """Shipped weights: made from their recipes with their cards, and made again to see that they are the same.
 
-python benchmarks/shipped_weights.py fedokf road           # largest difference of each from training again
+python benchmarks/shipped_weights.py fedokf okf            # largest difference of each from training again
 """
 
 from __future__ import annotations
@@ -39,10 +39,8 @@ SENSORS = {
 }
 LIMITS = {
     "static": "Trained at 1.5 m and 10 % of each velocity component; at other noise it filters for these.",
-    "roads": "Trained where everything errs (training.roads); where odometry is exact a Kalman filter is better.",
 }
 EVERYWHERE = "Four simulated drives on one flat map at 10 Hz."
-DRAWN = {"roads": "24 worlds whose errors are drawn, not measured."}
 WHITE = "White noise without a bias; no outliers and no missing fixes in training."
 
 
@@ -61,7 +59,7 @@ def ship(recipes: Sequence[str] = tuple(RECIPES), out: Path = WEIGHTS, progress:
                 "sha256": digest(checkpoint),
                 "machine": machine(),
                 "metrics": metrics(checkpoint.model.method(name)),
-                "limits": [LIMITS[kind := RECIPES[recipe].noise], EVERYWHERE, DRAWN.get(kind, WHITE)],
+                "limits": [LIMITS[RECIPES[recipe].noise], EVERYWHERE, WHITE],
             }
             paths.append(save(out / f"{name}.safetensors", Checkpoint(checkpoint.model, card)))
     return paths

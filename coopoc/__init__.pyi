@@ -36,8 +36,6 @@ from .methods.poses.pose_filter import PoseFilter as PoseFilter
 from .methods.poses.pose_start import pose_start as pose_start
 from .methods.poses.pose_stream import LandmarkMeasurement as LandmarkMeasurement
 from .methods.poses.pose_stream import OwnMeasurement as OwnMeasurement
-from .methods.road import RoadErrors as RoadErrors
-from .methods.road import RoadFilter as RoadFilter
 from .methods.star import stars as stars
 from .methods.star_stream import RelativeMeasurement as RelativeMeasurement
 from .methods.star_stream import StarStream as StarStream

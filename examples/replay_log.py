@@ -106,8 +106,6 @@ def replay(filter: Any, drive: Iterable[Tick]) -> tuple[float, float]:
 
 AXIS, SPEED = (replace(ASSUMED, velocity_reading=reading) for reading in ("axis", "speed"))
 """Velocity noise of 10 %, of each axis as in the training, or of the speed on every axis: odometry that also turns."""
-WHITE = co.RoadErrors(fix=1.0, correlation=0.0)
-"""Fixes that err as simulated here, not as real ones do."""
 FILTERS: dict[str, Callable[[], Any]] = {
     "Kalman, GNSS known, 10 % of axis": lambda: co.Kalman(noise_model(AXIS)).start(),
     "Kalman, GNSS known, 10 % of speed": lambda: co.Kalman(noise_model(SPEED)).start(),
@@ -115,7 +113,7 @@ FILTERS: dict[str, Callable[[], Any]] = {
     "adaptive, 10 % of speed": lambda: co.AdaptiveKalman(SPEED).start(),
     "OKF": lambda: load_method("okf").start(),
     "FedKalmanNet": lambda: load_method("fedkalmannet").start(),
-    "Road filter, 10 % of speed": lambda: co.RoadFilter(noise_model(SPEED), WHITE).start(),
+    "cooperative, 10 % of speed": lambda: co.StarStream(co.CooperativeFilter(noise_model(SPEED)), measured=True),
 }
 WAYS: dict[str, dict[str, bool]] = {
     "as recorded": {"jitter": False, "drop": False, "late": False},

@@ -9,14 +9,12 @@ from .method import LearnedGain
 from .nets.gain import Gain, Recurrent
 from .nets.gain_net import GainNet
 from .nets.okf import NoiseParameters, OptimisedKF
-from .nets.road import RoadConstants
 from .recipes import RECIPES, Recipe, Setting, load_method
 from .train import train_all
 from .training.clients import Client, Segments, clients
 from .training.drives import MeasuredDrives
 from .training.fit import Fit, fit
 from .training.measured import measured_clients
-from .training.roads import roads
 from .training.schedule import Schedule
 
 __all__ = [
@@ -34,7 +32,6 @@ __all__ = [
     "Participation",
     "Recipe",
     "Recurrent",
-    "RoadConstants",
     "Schedule",
     "Segments",
     "Setting",
@@ -45,7 +42,6 @@ __all__ = [
     "load",
     "load_method",
     "measured_clients",
-    "roads",
     "save",
     "train_all",
 ]

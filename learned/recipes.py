@@ -24,15 +24,14 @@ from .nets.gain import Gain
 from .training.clients import Client, Start, check_pieces, clients
 from .training.drives import Drives, MeasuredDrives
 from .training.measured import measured_clients
-from .training.roads import PIECE, roads
 from .training.schedule import STEPS, Schedule
 
 REVISION = 7
 """Raised whenever the training code changes what it makes of the same recipe."""
 KINDS = ("federated", "centralised", "individual", "okf")
 """Kinds of training."""
-STATIC, ROADS = "static", "roads"
-"""Noise of recipes: the paper's, and that of vehicles that drive in worlds of their own (`training.roads`)."""
+STATIC = "static"
+"""Noise of recipes: the paper's."""
 WEIGHTS = Path(__file__).parent / "weights"
 
 
@@ -46,8 +45,8 @@ class Recipe:
         rounds: of a federation.
         local_epochs: of a federation, passes through the client's segments per round.
         aggregate: rule of a federation, a name or "mine.py:NAME".
-        noise: of the training drives where it is simulated: "static", the paper's; "roads" for worlds as real roads
-            have them (`training.roads`); or outliers by name (`Outliers.named`), added to the paper's.
+        noise: of the training drives where it is simulated: "static", the paper's; or outliers by name
+            (`Outliers.named`), added to the paper's.
         piece: steps of a segment.
         split: share of the segments that train.
         net: the net, an entry point in `coopoc.nets` or "mine.py:NAME".
@@ -76,22 +75,19 @@ class Recipe:
 
     def __post_init__(self) -> None:
         one_of("kind of recipe", self.kind, KINDS)
-        if instance("noise", self.noise, str) not in (STATIC, ROADS):
+        if instance("noise", self.noise, str) != STATIC:
             Outliers.named(self.noise)
         limits = {"rounds": STEPS, "local_epochs": STEPS}
         check_fields(self, limits, schedule=Schedule, options=tuple)
         check_pieces(self.piece, self.split)
 
 
-ROAD = Schedule(epochs=120, batch=24, learning_rate=0.1, weight_decay=0.0, mirror=False)
 RECIPES: dict[str, Recipe] = {
     "fedkalmannet": Recipe("federated"),
     "centralised": Recipe("centralised", Schedule(epochs=1500)),
     "individual": Recipe("individual", Schedule(epochs=500)),
     "okf": Recipe("okf", Schedule(epochs=300), net="okf"),
     "fedokf": Recipe("federated", Schedule(batch=12, learning_rate=0.05, weight_decay=0.0, mirror=False), net="okf"),
-    "road": Recipe("centralised", ROAD, noise=ROADS, piece=300, net="road"),
-    "fedroad": Recipe("federated", ROAD, noise=ROADS, piece=300, net="road"),
 }
 
 
@@ -142,8 +138,7 @@ class Job:
 
 def sensors(job: Job) -> Sensors:
     """The paper's training noise in the setting's reading, with the recipe's outliers."""
-    noise = job.recipe.noise
-    outliers = None if noise in (STATIC, ROADS) else Outliers.named(noise)
+    outliers = None if job.recipe.noise == STATIC else Outliers.named(job.recipe.noise)
     return replace(Sensors.paper_training(job.setting.reading), outliers=outliers)
 
 
@@ -212,9 +207,6 @@ def job_clients(job: Job, fleet: Drives) -> tuple[Client, ...]:
     """The vehicles of a fleet as clients, with the noise, the split and the start of the job; of measured drives with
     what they measured: then the recipe's noise has no effect."""
     recipe, setting = job.recipe, job.setting
-    if recipe.noise == ROADS and not isinstance(fleet, MeasuredDrives):
-        long = min(PIECE, len(fleet.t) // 3)  # errors last, and a drive holds two pieces at least
-        fleet, recipe = roads(fleet, setting.seed), replace(recipe, piece=max(recipe.piece, long))
     if isinstance(fleet, MeasuredDrives):
         return measured_clients(fleet, start=setting.start, piece=recipe.piece, split=recipe.split)
     return clients(fleet, sensors(job), seed=setting.seed, start=setting.start, piece=recipe.piece, split=recipe.split)

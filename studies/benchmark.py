@@ -33,8 +33,8 @@ from .roads import ROADS, road_row, roads
 from .tasks import LOGGED, POSES, TASKS, VALIDATION, Task, bound, pose_row, recording, rounded
 from .worlds_card import card_file, card_head, markdown, overview, run_worlds
 
-ROAD = "road-kalman"
-"""Of which others are shown to be better or worse on the same blocks of real roads."""
+USUAL = "cooperative-filter"
+"""Of which others are shown to be better or worse on the same blocks of real measurements."""
 
 
 def benchmark(
@@ -55,7 +55,7 @@ def benchmark(
 
     Example: coopoc benchmark joint lkf-sa mine.py:Own
 
-    Example: coopoc benchmark road-kalman --tasks f9k    # after coopoc data get f9k
+    Example: coopoc benchmark cooperative-filter --tasks f9k    # after coopoc data get f9k
 
     Example: coopoc benchmark pose-fleet --data ~/measured
 
@@ -150,15 +150,13 @@ def tried(name: str, task: Task) -> Row:
 
 
 def measurable(name: str, data: Path | None) -> dict[str, Callable[[], Row]]:
-    """The tasks of real measurements for a name, and what runs each: logs for a pose filter, roads for a solo method,
+    """The tasks of real measurements for a name, and what runs each: logs for a pose filter, roads and
     convoys for any other; of "mine.py:NAME" logs, or roads if it says `roads = True`."""
     if name in POSES or (in_file(name) and not _on_roads(name)):
         made = own(name) if in_file(name) else name
         return {task: partial(pose_row, task, data, made) for task in LOGGED}
     method, places = named_method(name), roads(data)
-    found: dict[str, Callable[[], Row]] = (
-        {} if method.cooperative else {task: partial(road_row, task, data, method) for task in places}
-    )
+    found: dict[str, Callable[[], Row]] = {task: partial(road_row, task, data, method) for task in places}
     if places is ROADS:
         found |= {task: partial(convoy_row, task, data, method) for task in CONVOYS}
     return found
@@ -218,10 +216,10 @@ def _logs(cards: Sequence[Params]) -> list[Row]:
             shown["RT-LE [m]"] = "{} [{}, {}]".format(*map(three, row["rt_le_m"]))
             if own := row.get("calibrated_m"):
                 shown["calibrated [m]"] = "{} [{}, {}]".format(*map(three, own))
-            rival = next((held for _, held in _rows([c for c in cards if c["method"] == ROAD], {row["task"]})), {})
+            rival = next((held for _, held in _rows([c for c in cards if c["method"] == USUAL], {row["task"]})), {})
             for key, word in (("blocks_m", ""), ("calibrated_blocks_m", ", calibrated")):
-                if one != ROAD and len(row.get(key, ())) == len(rival.get(key, "-")):
-                    shown[f"less {ROAD}{word} [m]"] = str(paired_difference(np.array(row[key]), np.array(rival[key])))
+                if one != USUAL and len(row.get(key, ())) == len(rival.get(key, "-")):
+                    shown[f"less {USUAL}{word} [m]"] = str(paired_difference(np.array(row[key]), np.array(rival[key])))
             shown |= {"heading [°]": row.get("heading_deg", ""), "NEES": row.get("nees", "")}
             shown |= {"B/s": row["received_bytes_per_second"], "us/step": row["microseconds_per_step"]}
         rows.append(((row["task"], row.get("rt_le_m", [np.inf])[0]), shown))

@@ -1,4 +1,4 @@
-"""CL-Bench's real roads: solo methods on a log with a truth, whose fixes are thinned and cut off alike for all."""
+"""CL-Bench's real roads: methods alone on a log with a truth, whose fixes are thinned and cut off alike for all."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path
 
 import numpy as np
 
-from coopoc import V2X, Fleet, InputError, Kalman, Method, NoiseModel, Recording, Sensors, observe, read_log
+from coopoc import V2X, Fleet, InputError, Method, Recording, Sensors, observe, read_log
 from coopoc.arrays import Floats
 from coopoc.data.log.read import is_log
 from coopoc.data.registry import load_log
@@ -90,7 +90,7 @@ def road_row(task: str, data: Path | None, made: Method) -> Row:
     Args:
         task: that is run.
         data: folder of the data, None for those that were fetched, or a log.
-        made: solo method; Kalman and road filters can be calibrated, and what has a method `fitted`.
+        made: a method, which is calibrated if it has a method `fitted`.
     """
     recording, truth = seen(task, data)
     start, column = int(SHARE * len(recording.t)), recording.observers[0]
@@ -98,10 +98,8 @@ def road_row(task: str, data: Path | None, made: Method) -> Row:
     made(recording.between(begin, begin + 3), [column])  # compiles
     row = {"task": task, "data": hashed(*(located(data, name) for name in roads(data)[task]))}
     row |= _scored(made, recording, truth, start)
-    if isinstance(made, Kalman) or (hasattr(made, "fitted") and not getattr(made, "errors", None)):
-        first = recording.between(0, start), truth.between(0, start)
-        fitted = Kalman(NoiseModel.fitted(*first)) if isinstance(made, Kalman) else made.fitted(*first)
-        own = _scored(fitted, recording, truth, start)
+    if hasattr(made, "fitted"):
+        own = _scored(made.fitted(recording.between(0, start), truth.between(0, start)), recording, truth, start)
         row |= {f"calibrated_{name}": own[name] for name in ("blocks_m", "nees") if name in own}
         row["calibrated_m"] = own["rt_le_m"]
     return row | {"received_bytes_per_second": 0}

@@ -30,7 +30,7 @@ INDIVIDUAL = tuple(f"individual{client}" for client in range(1, 7))
 """Nets of single clients, one per client, at most six."""
 PAPER = ("fedkalmannet", "centralised", *INDIVIDUAL, "okf")
 """Methods that the paper trains, and the optimised Kalman filter."""
-LEARNED = (*PAPER, "fedokf", "road", "fedroad")
+LEARNED = (*PAPER, "fedokf")
 """Methods that are trained."""
 WORST = 1.1
 """Times the error of a Kalman filter with fitted noise, above which the command saves no weights."""

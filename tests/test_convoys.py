@@ -46,10 +46,8 @@ def test_vehicles_err_as_the_pieces_of_the_drive(task: str) -> None:
 
 def test_star_filters_get_rows_on_convoys(tmp_path: Path) -> None:
     measured("KITTI_00_gt.txt")
-    assert benchmark.benchmark(("joint", "road-kalman"), data=measured(), tasks=("convoy-kitti",), out=tmp_path) == 0
-    joint, alone = (
-        json.loads((tmp_path / f"{name}.json").read_text())["tasks"][0] for name in ("joint", "road-kalman")
-    )
+    assert benchmark.benchmark(("joint", "kalman"), data=measured(), tasks=("convoy-kitti",), out=tmp_path) == 0
+    joint, alone = (json.loads((tmp_path / f"{name}.json").read_text())["tasks"][0] for name in ("joint", "kalman"))
     recording, fleet = convoys.convoy("convoy-kitti", measured())
     track = co.JointFilter("nominal")(recording, recording.ids)
     gap = (track.x - fleet.position)[..., :2]

@@ -355,12 +355,12 @@ def test_what_is_missing_names_the_command_that_brings_it(
     }.items():
         assert _status(words.split()) == 2, words
         assert f"Run coopoc data get {name}." in capsys.readouterr().err
-    for method, tasks in {"road-kalman": "f9k kitti comma2k19", "pose-solo": "robots uwb indoor"}.items():
+    for method, tasks in {"cooperative-filter": "f9k kitti comma2k19", "pose-solo": "robots uwb indoor"}.items():
         assert _status(["benchmark", method, "--tasks", *tasks.split()]) == 1
         told = capsys.readouterr().err
-        names = ("f9k", "kitti00", "comma2k19") if method == "road-kalman" else ("mrclam-set6", "tiers", "labyrinth")
+        names = ("f9k", "kitti00", "comma2k19") if "filter" in method else ("mrclam-set6", "tiers", "labyrinth")
         assert all(f"Run coopoc data get {name}." in told for name in names)
-    assert _status(["benchmark", "road-kalman", "--tasks", "robots"]) == 2
+    assert _status(["benchmark", "cooperative-filter", "--tasks", "robots"]) == 2
     assert "f9k, kitti, comma2k19" in capsys.readouterr().err
 
 
@@ -369,9 +369,9 @@ def test_a_task_of_real_measurements_runs_alone(
 ) -> None:
     measured("span_truth.gga")
     folder = measured("ublox_f9k.nmea").parent
-    words = ["benchmark", "road-kalman", "--tasks", "f9k", "--data", str(folder), "--out", str(tmp_path)]
+    words = ["benchmark", "cooperative-filter", "--tasks", "f9k", "--data", str(folder), "--out", str(tmp_path)]
     assert _status(words) == 0
-    rows = [line for line in capsys.readouterr().out.splitlines() if "road-kalman" in line]
+    rows = [line for line in capsys.readouterr().out.splitlines() if "cooperative-filter" in line]
     assert len(rows) == 1
     assert "| f9k " in rows[0]
     assert "0.638 [0.573, 0.709]" in rows[0]  # docs/benchmark.md

@@ -58,5 +58,5 @@ def test_what_is_neither_recipe_nor_net_is_refused(folder: Path) -> None:
     assert recipe_of(NET).net == NET
     with refused("no Recipe and no net"):
         recipe_of("constant_gain.py:nn")
-    with refused("Did you mean fedroad"):
-        recipe_of("fedroads")
+    with refused("Did you mean fedokf"):
+        recipe_of("fedokfs")

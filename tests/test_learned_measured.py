@@ -12,7 +12,6 @@ from conftest import refused
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from oracles.pace import after
-from scipy.optimize import approx_fprime
 
 import coopoc as co
 from coopoc import V2X, Fleet, Recording, Sensors, observe
@@ -20,7 +19,6 @@ from coopoc.cli import main
 from coopoc.learned import (
     GainNet,
     NoiseParameters,
-    RoadConstants,
     Schedule,
     Segments,
     load_method,
@@ -35,7 +33,7 @@ from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.drives import MeasuredDrives
 from coopoc.learned.training.measured import measured_clients
 
-NETS = (GainNet(2, 1), RoadConstants(), NoiseParameters())
+NETS = (GainNet(2, 1), NoiseParameters())
 
 
 def walk(steps: int = 400, vehicles: int = 2, seed: int = 0, every: int = 1) -> tuple[Recording, Fleet]:
@@ -107,13 +105,6 @@ def test_steps_without_a_truth_have_no_loss(net: Gain) -> None:
     for ours, theirs in zip(net.loss_and_gradient(theta, masked), net.loss_and_gradient(theta, short), strict=True):
         assert bool(ours.isfinite().all())
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
-
-
-def test_the_gradient_of_road_constants_is_scipys() -> None:
-    net, seen = RoadConstants(), batch()
-    at = flatten([net])[0].double()
-    expected = approx_fprime(at, lambda v: net.losses(torch.tensor(v)[None], seen).mean())
-    assert net.loss_and_gradient(at[None], seen)[1][0].numpy() == pytest.approx(expected, abs=1e-3)
 
 
 def test_a_piece_with_little_truth_counts_as_much_as_another() -> None:

@@ -18,7 +18,6 @@ from coopoc import (
     Kalman,
     Method,
     Recording,
-    RoadFilter,
     Sensors,
     nees,
     observe,
@@ -30,7 +29,7 @@ from coopoc.methods.cooperative_filter import CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.world.links import wrap
 
-SOLO = (Kalman(), LearnedGain(GainNet(4, 1)), RoadFilter())
+SOLO = (Kalman(), LearnedGain(GainNet(4, 1)))
 STARS = (
     JointFilter(),
     JointFilter(exact=False),

@@ -77,7 +77,7 @@ def damaged(recording: Recording, kind: str, links: Ints) -> Recording:
     return replace(recording, gnss=gnss, relative=relative)
 
 
-@pytest.mark.parametrize("name", sorted({*METHODS} - {"road-kalman"}))
+@pytest.mark.parametrize("name", sorted(METHODS))
 def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(
     name: str, recording: Recording, links: Ints
 ) -> None:

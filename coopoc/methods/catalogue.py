@@ -14,7 +14,6 @@ from .covariance_intersection import CovarianceIntersection
 from .decentralised import GaussianBeliefPropagation
 from .joint_filter import JointFilter
 from .kalman import GNSS, AdaptiveKalman, Kalman
-from .road import RoadFilter
 from .track import Method
 
 Factory = Callable[..., Method]
@@ -24,7 +23,6 @@ METHODS: Mapping[str, Factory] = {
     "gnss": lambda noise_model: GNSS(),
     "kalman": Kalman,
     "kalman-adaptive": lambda noise_model: AdaptiveKalman(),
-    "road-kalman": RoadFilter,
     "lkf-sa": LKFSA,
     "lkf-sa-edge": partial(JointFilter, exact=False, robust=False, name="lkf-sa-edge"),
     "msmv-r": MSMV,

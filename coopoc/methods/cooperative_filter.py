@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from dataclasses import dataclass
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
@@ -14,9 +14,11 @@ from ..kernels.stars.cooperative_filter import run_filter
 from ..kernels.stars.cooperative_messages import fading_memory
 from ..kernels.stars.cooperative_state import NO_GUARDS, ON_ROADS, Guards, Model, Sent
 from ..kernels.stars.messages import FORGOTTEN
+from ..world.fleet import Fleet
 from ..world.inbox import Inbox
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import Message
+from .calibration import calibrated, scaled
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
 from .noise_model import NoiseModel, resolve
 from .track import Checked, Track
@@ -90,6 +92,7 @@ class CooperativeFilter(Checked):
         guards: limits of the above; the default was chosen on development worlds and validation tasks of CL-Bench, and
             is `kernels.stars.cooperative_state.ON_ROADS` where measurements are not simulated: there errors of
             odometry are always assumed, and fixes to err twice as far as is stated, together for a while.
+        calibration: what `fitted` has found, a note of its Tracks.
 
     References:
         Ljung, Soderstrom, Theory and Practice of Recursive Identification, MIT Press, 1983;
@@ -108,6 +111,7 @@ class CooperativeFilter(Checked):
     noise_model: NoiseModel | str = "nominal"
     guards: Guards = Guards()
     name: str = "cooperative-filter"
+    calibration: str = ""
     cooperative = True
 
     @property
@@ -126,7 +130,7 @@ class CooperativeFilter(Checked):
         """
         known = resolve(self.noise_model, check_recording(recording))
         guards = guards_of(self, known, recording.measured)
-        model, notes = model_of(known, guards), list(known.notes)
+        model, notes = model_of(known, guards), [*known.notes, *filter(None, [self.calibration])]
         variance, sent = guards.fix**2 * known.fix_variance(recording), broadcasts(recording, known, guards)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
@@ -150,6 +154,34 @@ class CooperativeFilter(Checked):
             yield Estimate(x, cov, neighbours, extras=extras)
 
         return follow_egos(self, recording, egos, run, notes)
+
+    @classmethod
+    def fitted(cls, recording: Recording, truth: Fleet | None = None) -> CooperativeFilter:
+        """The filter calibrated on a drive by itself: factors of the deviations of fixes and motion, and deviations of
+        the errors of heading and scale and how long they last, by `calibration.calibrated`. Its gates stay. Innovations
+        do not show errors that fixes share for longer: without a truth their factor stays, too.
+
+        Args:
+            recording: of a drive, or of the first part of one.
+            truth: of the same vehicles and times, NaN where there is none.
+
+        Raises:
+            InputError: no vehicle that drives from a fix on; a truth of other vehicles or times.
+        """
+        sensors, guards = check_recording(recording).sensors, ON_ROADS if recording.measured else Guards()
+        usual = {name: getattr(guards, name) for name in ("fix", "heading", "scale", "lasts")} | {"motion": 1.0}
+        if truth is None:
+            del usual["fix"]
+
+        def make(numbers: Mapping[str, float]) -> CooperativeFilter:
+            if numbers == usual:
+                return cls()
+            own = dict(numbers)
+            noise_model = NoiseModel.nominal(scaled(sensors, 1.0, own.pop("motion")))
+            return cls(noise_model, guards._replace(**own))
+
+        method, found = calibrated(make, usual, recording, truth)
+        return replace(method, calibration=found)
 
 
 def broadcasts(recording: Recording, noise_model: NoiseModel, guards: Guards) -> Sent:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -15,8 +15,10 @@ from ..kernels.gate import FIX_GATE
 from ..kernels.motion import MotionNoise, own_variances
 from ..kernels.solo import FixNoise, SoloMeasurements, run_filter
 from ..short_repr import short_repr
+from ..world.fleet import Fleet
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.sensors import Sensors
+from .calibration import calibrated, scaled
 from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
 from .stream import FilterStream
 from .track import Alone, Checked, Track, check_options, lost, silent_track
@@ -96,6 +98,23 @@ class Kalman(Alone, Checked):
         """
         known = constant_noise(self.noise_model)
         return FilterStream(motion_noise(known, interval), fix_noise(known, self.robust), x0, history)
+
+    @classmethod
+    def fitted(cls, recording: Recording, truth: Fleet | None = None) -> Kalman:
+        """The filter with factors of the deviations of fixes and motion calibrated on a drive; without a truth that of
+        the motion alone.
+
+        Raises:
+            InputError: as `calibration.calibrated`.
+        """
+        sensors = check_recording(recording).sensors
+        usual = {"motion": 1.0} | ({} if truth is None else {"fix": 1.0})
+
+        def make(numbers: Mapping[str, float]) -> Kalman:
+            by = numbers.get("fix", 1.0), numbers["motion"]
+            return cls() if numbers == usual else cls(NoiseModel.nominal(scaled(sensors, *by)))
+
+        return calibrated(make, usual, recording, truth)[0]
 
 
 @dataclass(frozen=True, eq=False)

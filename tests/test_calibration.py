@@ -1,0 +1,160 @@
+"""Filters alone on roads and their calibration: filterpy's and Stone Soup's extended filters, real cars, logs of one's
+own; what is fitted must be better on what was held out."""
+
+import importlib
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from conftest import measured, refused, winding
+from numpy.testing import assert_allclose
+
+import coopoc as co
+from coopoc import V2X, CooperativeFilter, Fleet, Kalman, Recording, Sensors, observe
+from coopoc.evaluate.metrics import rt_le
+from coopoc.kernels.stars.cooperative_state import NO_GUARDS, ON_ROADS
+from coopoc.studies import benchmark
+from coopoc.studies.roads import ROADS, road_row, roads
+from coopoc.studies.roads import seen as thinned
+
+TURNS = NO_GUARDS._replace(heading=0.1, scale=0.03, lasts=300.0, absent=-np.inf)
+"""Errors of heading and scale, and no guard: the rivals' extended Kalman filter."""
+
+
+def turned(recording: Recording, angle: float, scale: float) -> Recording:
+    """With odometry whose heading errs by `angle` rad and whose speeds by a share."""
+    c, s = np.cos(angle), np.sin(angle)
+    velocity = recording.velocity @ np.array([[c, s, 0], [-s, c, 0], [0, 0, 1.0]])
+    return replace(recording, velocity=(1 + scale) * velocity)
+
+
+def seen(steps: int = 300, runs: int = 2, **noise: Any) -> tuple[Recording, Fleet]:
+    """A winding drive with gaps, missing fixes and some 30 m off."""
+    fleet = winding(steps, 10.0, 7.0)
+    recording = observe(fleet, Sensors(**noise), V2X(max_neighbours=0), runs=runs, seed=3)
+    gnss = recording.gnss.copy()
+    gnss[:, 40:80] = np.nan
+    gnss[:, 100::3] = np.nan
+    gnss[:, 121:140, :, 0] += 30.0
+    return turned(replace(recording, gnss=gnss), 0.15, 0.05), fleet
+
+
+@pytest.fixture
+def rivals(monkeypatch: pytest.MonkeyPatch) -> Any:
+    """benchmarks/rivals.py."""
+    monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
+    return importlib.import_module("rivals")
+
+
+@pytest.mark.parametrize("name", ["EKF", "StoneSoup"])
+def test_without_guards_it_is_the_extended_filter_of_others(rivals: Any, name: str) -> None:
+    if name == "StoneSoup":
+        pytest.importorskip("stonesoup", reason="pip install stonesoup")
+    recording, _ = seen(runs=1)
+    mine, other = CooperativeFilter(guards=TURNS)(recording), getattr(rivals, name)()(recording)
+    assert mine.covariance is not None
+    assert_allclose(mine.x[..., :2], other.x[..., :2], atol=1e-5)  # its first fix meets a prior of 1e6 m^2
+    assert_allclose(mine.covariance[..., :2, :2], other.covariance[..., :2, :2], rtol=1e-4, atol=1e-5)
+
+
+def test_rivals_do_what_they_are_for(rivals: Any) -> None:
+    """The smoother is better where fixes jump, and the filter with a wide kernel; calibrated a rival is better."""
+    recording, fleet = seen(600, runs=1)
+    wrong = rt_le(rivals.EKF()(recording), fleet)
+    assert rt_le(rivals.FixedLag()(recording), fleet) < 0.8 * wrong
+    unmoved = replace(rivals.FixedLag(), known=rivals.Known(gate=1e4))(recording)
+    assert rt_le(unmoved, fleet) == pytest.approx(wrong, rel=0.05)
+
+
+def test_heading_and_scale_are_found() -> None:
+    """-0.15 rad turns the odometry back and 1 / 1.05 its scale; the errors cost a Kalman filter twice as much."""
+    recording, fleet = seen(900, runs=10, gnss_std=(1.0, 1.0, 1.0))
+    track = CooperativeFilter(guards=ON_ROADS._replace(heading=0.1))(recording)
+    assert track.extras["heading_error"][:, -1].mean() == pytest.approx(-0.15, abs=0.03)
+    assert track.extras["scale_error"][:, -1].mean() == pytest.approx(1 / 1.05 - 1, abs=0.02)
+    assert 2 * rt_le(track, fleet).mean() < rt_le(Kalman()(recording), fleet).mean()
+
+
+def drive(seed: int, motion: float, fix: float) -> tuple[Recording, Fleet]:
+    """Odometry and fixes whose noise is a multiple of what is assumed."""
+    fleet = winding(1800, 10.0, 7.0)
+    acting = Sensors(gnss_std=(1.5 * fix,) * 3, velocity_std_ratio=0.1 * motion, velocity_floor=0.05 * motion)
+    recording = observe(fleet, acting, V2X(max_neighbours=0), assumed=Sensors(), seed=seed)
+    return replace(recording, notes=("nothing is simulated",)), fleet
+
+
+@pytest.mark.parametrize("method", [Kalman, CooperativeFilter])
+def test_calibration_helps_where_deviations_are_wrong(method: Any) -> None:
+    """Odometry ten times worse than assumed and fixes three times better, on a drive that it did not see."""
+    recording, fleet = drive(0, 10.0, 1 / 3)
+    fitted = method.fitted(recording.between(0, 900), fleet.between(0, 900))
+    rest, truth = recording.between(900, 1800), fleet.between(900, 1800)
+    assert rt_le(fitted(rest), truth) < 0.8 * rt_le(method()(rest), truth)
+    blind = method.fitted(recording.between(0, 900))
+    assert rt_le(blind(rest), truth) < 0.9 * rt_le(method()(rest), truth)
+
+
+@pytest.mark.parametrize("with_truth", [False, True])
+def test_calibration_harms_no_drive(with_truth: bool) -> None:
+    """Deviations as assumed, or other ones on the rest than where it was fitted: no worse than the usual numbers by
+    more than a few percent, and the Track says what was done."""
+    for seed in range(4):
+        recording, fleet = drive(seed, 1.0, 1.0)
+        fitted = CooperativeFilter.fitted(recording.between(0, 600), fleet.between(0, 600) if with_truth else None)
+        rest, truth = recording.between(600, 1800), fleet.between(600, 1800)
+        track = fitted(rest)
+        assert rt_le(track, truth) < 1.05 * rt_le(CooperativeFilter()(rest), truth)
+        assert any("calibrat" in note and "+-" in note for note in track.notes)
+        assert fitted.guards.fix_gate in (ON_ROADS.fix_gate, CooperativeFilter().guards.fix_gate)
+
+
+def test_what_cannot_be_calibrated_is_refused() -> None:
+    recording, fleet = drive(0, 1.0, 1.0)
+    with refused("ids and times differ"):
+        CooperativeFilter.fitted(recording, fleet.between(0, 20))
+    with refused("ids and times differ"):
+        Kalman.fitted(recording, replace(fleet, ids=("other",)))
+    with refused("without a break"):
+        CooperativeFilter.fitted(recording.between(0, 10))
+
+
+def test_a_log_of_ones_own_is_a_task(tmp_path: Path) -> None:
+    """Odometry turned by 0.15 rad: the cooperative filter alone is better as it comes, and no worse calibrated."""
+    recording, fleet = seen(6000, runs=1)
+    rows = ["t,vehicle,x,y,vx,vy"]
+    for t, fix, u in zip(recording.t, recording.gnss[0, :, 0], recording.velocity[0, :, 0], strict=True):
+        rows.append(f"{t},a,{fix[0]},{fix[1]},{u[0]},{u[1]}".replace("nan", ""))
+    true = [f"{t},a,{x},{y}" for t, (x, y, _) in zip(fleet.t, fleet.position[:, 0], strict=True)]
+    data = tmp_path / "own"
+    data.mkdir()
+    (data / "car.csv").write_text("\n".join(rows))
+    (data / "truth.csv").write_text("\n".join(["t,vehicle,x,y", *true]))
+    assert list(roads(data)) == ["own"]
+    kept = np.isfinite(thinned("own", data)[0].gnss[0, :, 0, 0])
+    assert 0.05 < kept.sum() / np.isfinite(recording.gnss[0, :, 0, 0]).sum() < 0.1
+    assert not kept[recording.t % 180.0 >= 150.0].any()
+    mine, usual = (road_row("own", data, method) for method in (CooperativeFilter(), Kalman()))
+    assert mine["rt_le_m"][0] < 0.7 * usual["rt_le_m"][0]
+    assert mine["calibrated_m"][0] < 1.02 * mine["rt_le_m"][0]
+    assert mine["nees"] < usual["nees"]
+    assert np.mean(mine["calibrated_blocks_m"]) == pytest.approx(mine["calibrated_m"][0], abs=1e-4)
+    cards = [{"method": name, "tasks": [row]} for name, row in (("cooperative-filter", mine), ("kalman", usual))]
+    less = co.paired_difference(np.array(usual["blocks_m"]), np.array(mine["blocks_m"]))
+    assert f"| {less} " in benchmark.page(cards)
+
+
+@pytest.mark.parametrize("task", ["f9k", "kitti", "comma2k19"])
+def test_alone_it_is_the_best_on_real_roads(task: str) -> None:
+    """Before Kalman filters, as they come or calibrated; calibration makes nothing worse by more than its interval."""
+    for name in ROADS[task]:
+        measured(name)
+    mine, usual, adaptive = (
+        road_row(task, measured(), m) for m in (CooperativeFilter(), Kalman(), co.AdaptiveKalman())
+    )
+    others = usual["rt_le_m"][0], usual["calibrated_m"][0], adaptive["rt_le_m"][0]
+    assert mine["rt_le_m"][0] < min(others)
+    assert 0.35 < mine["nees"] < 4.0
+    for row in (mine, usual):
+        assert row["calibrated_m"][0] <= row["rt_le_m"][2]
