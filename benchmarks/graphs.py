@@ -29,7 +29,7 @@ from tabulate import tabulate
 from unseen_graphs import FAMILIES
 
 from coopoc.errors import InputError
-from coopoc.evaluate.trajectory_scores import absolute_error, rms
+from coopoc.evaluate.metrics import alignment_error
 from coopoc.formats import GRAPHS, load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Problem, solve
@@ -85,10 +85,7 @@ def error(graph: Graph, position: np.ndarray) -> float:
     truth = graph.position[graph.is_pose]
     if len(truth) <= graph.dimension or not np.isfinite(truth).all():
         return np.nan
-    try:
-        return float(rms(absolute_error(position[graph.is_pose], truth)))
-    except InputError:
-        return np.nan
+    return alignment_error(position[graph.is_pose], truth)
 
 
 def row(name: str, graph: Graph) -> list[object]:

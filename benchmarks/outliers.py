@@ -18,7 +18,7 @@ import numpy as np
 from tabulate import tabulate
 from unseen_graphs import joined, manhattan, world
 
-from coopoc.evaluate.trajectory_scores import absolute_error, rms
+from coopoc.evaluate.metrics import alignment_error
 from coopoc.formats.graph import Graph
 from coopoc.optimize import solve_gnc
 from coopoc.optimize.graph_problems import from_graph, loop_closures
@@ -66,7 +66,7 @@ def rows(share: float, ways: list[str]) -> list[list[object]]:
             solution = solve_gnc(problem, [(factor, loops)], start=way, throw=False)
             weights, position = solution.extras["weights"], solution.position
         spent, out = time.process_time() - began, weights < 0.5
-        error = float(rms(absolute_error(position, graph.position)))
+        error = alignment_error(position, graph.position)
         found.append([share, int(wrong.sum()), way, int((wrong & ~out).sum()), int((~wrong & out).sum()), error, spent])
     return found
 
@@ -85,7 +85,7 @@ def fleet(seed: int, d: int, robots: int, share: float) -> list[object]:
     began = time.process_time()
     solution = solve_gnc(problem, loop_closures(problem), start="known", throw=False)
     out = solution.extras["weights"] < 0.5
-    error = float(rms(absolute_error(solution.position, drives.position)))
+    error = alignment_error(solution.position, drives.position)
     spent = time.process_time() - began
     return [
         f"{d}-D, {robots} robots",

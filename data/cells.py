@@ -1,6 +1,6 @@
 """Reading a table once: CSV or Parquet as a frame of named columns, whose numbers, times and names are checked.
 
-Every table is read here; fleets (`fleet_files`), logs (`log.tables`) and trajectories (`score_files`) are its uses. The
+Every table is read here; fleets (`fleet_files`) and logs (`log.tables`) are its uses. The
 index of a frame is the row in the file, from 1, so that an error names it whatever part of the frame is at hand.
 """
 

@@ -14,7 +14,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from coopoc.evaluate.trajectory_scores import absolute_error, align, rms
+from coopoc.evaluate.metrics import alignment_error
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Solution, solve
@@ -25,12 +25,12 @@ def main(path: str, picture: str | None = None) -> Solution:
     """Solve the file, say how good it is, and draw it if a file name is given."""
     graph = load_graph(path)
     problem = from_graph(graph)
-    before = absolute_error(problem.x0[graph.is_pose, :2], graph.position[graph.is_pose])
+    before = alignment_error(problem.x0[graph.is_pose, :2], graph.position[graph.is_pose])
     solution = solve(problem)
-    after = absolute_error(solution.position[graph.is_pose], graph.position[graph.is_pose])
+    after = alignment_error(solution.position[graph.is_pose], graph.position[graph.is_pose])
     print(problem)
     print(f"cost {problem.cost(problem.x0):.1f} -> {solution.cost:.2f} in {solution.solve_seconds:.1f} s")
-    print(f"ATE {float(rms(before)):.3f} m (odometry) -> {float(rms(after)):.3f} m")
+    print(f"ATE {before:.3f} m (odometry) -> {after:.3f} m")
     if picture is not None:
         draw(graph, solution, Path(picture))
     return solution
@@ -41,9 +41,8 @@ def draw(graph: Graph, solution: Solution, picture: Path) -> None:
     matplotlib.use("Agg")
     import matplotlib.pyplot as plt
 
-    aligned = align(solution.position[graph.is_pose], graph.position[graph.is_pose])
     where = np.full_like(graph.position, np.nan)
-    where[graph.is_pose] = aligned.apply(solution.position[graph.is_pose])
+    where[graph.is_pose] = aligned(solution.position[graph.is_pose], graph.position[graph.is_pose])
     figure, axes = plt.subplots(figsize=(6.0, 5.0), layout="constrained")
     for colour, (robot, places) in zip(plt.cm.tab10.colors, graph.robots.items(), strict=False):
         axes.plot(*graph.position[places].T, color="0.75", lw=2.5, zorder=1)

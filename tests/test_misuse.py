@@ -14,8 +14,6 @@ from conftest import refused
 import coopoc as co
 from coopoc import optimize
 from coopoc.errors import shown
-from coopoc.evaluate.trajectory_scores import Path as Path_
-from coopoc.evaluate.trajectory_scores import scores
 from coopoc.formats import load_graph, read_g2o, read_jrl, read_pyfg
 from coopoc.study.merge import merge
 from coopoc.study.publish import views
@@ -275,13 +273,6 @@ def test_a_duration_and_a_mask_are_no_numbers() -> None:
         co.Kalman("identity").start().step([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], np.timedelta64(300, "ms"))  # type: ignore[arg-type]
     with refused("a = dtype object"):  # numbers behind a mask are none
         co.paired_difference(np.ma.masked_array([1.0, 2.0], [True, False]), np.ones(2))
-
-
-def test_trajectory_scores_refuse_arguments_of_the_wrong_kind() -> None:
-    path = {"t": np.arange(30.0), "position": np.zeros((30, 3)), "rotation": None, "covariance": None}
-    swept(lambda **one: scores({"a": Path_(**one)}, {"a": Path_(**path)}), path, HOSTILE)
-    both = {"estimates": {"a": Path_(**path)}, "truths": {"a": Path_(**path)}, "aligned": "none", "unit": "steps"}
-    swept(scores, {**both, "max_diff": 0.1, "offset": 0.0, "delta": 1.0}, HOSTILE)
 
 
 def test_training_refuses_values_from_elsewhere() -> None:

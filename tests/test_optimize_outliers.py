@@ -12,7 +12,7 @@ from graph_files import write_graph
 
 import coopoc as co
 from coopoc.arrays import Bools, Floats, Ints
-from coopoc.evaluate.trajectory_scores import absolute_error, rms
+from coopoc.evaluate.metrics import alignment_error
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges
 from coopoc.formats.values import to_orientation
 from coopoc.optimize import Problem, Status, pose, solve_gnc
@@ -209,10 +209,7 @@ def judged(fleet: Fleet, graph: Graph, bad: Bools) -> tuple[int, int, float, flo
     kept, edges = np.concatenate([np.arange(count), count + np.flatnonzero(~bad)]), graph.relative_pose
     right = replace(edges, **{field.name: getattr(edges, field.name)[kept] for field in fields(edges)})
     clean = co.solve(from_graph(replace(graph, relative_pose=right), start="tree"))
-    errors = [
-        float(rms(absolute_error(x[: len(fleet.position)], fleet.position)))
-        for x in (solution.position, clean.position)
-    ]
+    errors = [alignment_error(x[: len(fleet.position)], fleet.position) for x in (solution.position, clean.position)]
     return int((bad & ~rejected).sum()), int((~bad & rejected).sum()), *errors, solution  # type: ignore[return-value]
 
 

@@ -7,6 +7,7 @@ from itertools import pairwise
 
 import numpy as np
 from scipy import special
+from scipy.spatial.transform import Rotation
 
 from ..arrays import Floats, checked, instance, number, refuse
 from ..errors import InputError
@@ -310,3 +311,23 @@ def innovation_columns(track: Track, recording: Recording) -> dict[str, Floats]:
         if normalised_square is not None:
             found["nis"] = np.nansum(normalised_square, axis=1) / count
     return found
+
+
+def aligned(estimate: Floats, truth: Floats) -> Floats:
+    """Positions (T, d) m after the motion of SE(d), d = 2 or 3, that brings them nearest to the truth (Kabsch's).
+
+    >>> x = np.array([[0.0, 0], [1, 0], [2, 1]])
+    >>> aligned(x[:, ::-1] * [-1, 1] + 5.0, x).round(9).tolist()
+    [[0.0, 0.0], [1.0, 0.0], [2.0, 1.0]]
+    """
+    x, y = estimate - estimate.mean(axis=0), truth - truth.mean(axis=0)
+    if x.shape[1] == 2:
+        turn = np.vdot(x @ [1, 1j], y @ [1, 1j])
+        turned = (x @ [1, 1j]) * turn / np.abs(turn)
+        return np.stack([turned.real, turned.imag], axis=-1) + truth.mean(axis=0)
+    return np.asarray(Rotation.align_vectors(y, x)[0].apply(x) + truth.mean(axis=0))
+
+
+def alignment_error(estimate: Floats, truth: Floats) -> float:
+    """Root mean square m of what is left after `aligned` (ATE; evo's APE of the translation)."""
+    return float(np.sqrt(np.square(aligned(estimate, truth) - truth).sum(axis=-1).mean()))
