@@ -14,7 +14,7 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 
-from coopoc.evaluate.metrics import alignment_error
+from coopoc.evaluate.metrics import aligned, alignment_error
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph
 from coopoc.optimize import Solution, solve
