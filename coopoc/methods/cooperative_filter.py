@@ -243,7 +243,7 @@ def guards_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool
         return NO_GUARDS
     if measured and guards == Guards():
         guards = ON_ROADS
-    return guards._replace(lost=guards.lost / 2) if sensors.gnss_drift_std > 0.0 else guards
+    return guards
 
 
 def model_of(noise_model: NoiseModel, guards: Guards) -> Model:

@@ -264,7 +264,7 @@ class StarStream:
             self._numbers[name] = number
             self._last[number], self._last[number, [INDEX, USED_AT, AGE]] = np.nan, (-1.0, -math.inf, -math.inf)
             for f in self._star.filters:
-                f.status[number], f.revoked[number] = 0.0, 0.0
+                f.status[number] = 0.0
                 f.status[number, TRUSTED] = float(self._guards.trust == 0.0)
                 f.status[number, USED] = f.status[number, SINCE] = -math.inf
                 f.status[number, KEPT_VARIANCE : KEPT_VARIANCE + 3] = self._guards.tau**2

@@ -146,8 +146,6 @@ class Oracle:
         self.std: Floats = np.ones(3)
         if s is not None:
             self.std = s.relative_std.copy()
-            self.guards = guards._replace(lost=guards.lost / (1 + (s.gnss_drift_std > 0)))
-        if s is not None:
             heading, bias = (float(v**2) for v in known.compass)
             self.std[1] = math.sqrt(self.std[1] ** 2 - heading - bias)
             keep = math.exp(-seen.dt / s.gnss_drift_time)
@@ -162,7 +160,7 @@ class Oracle:
         shape = seen.gnss.shape
         self.r = guards.fix**2 * np.broadcast_to(known.fix_variance(seen), shape)[run]
         self.remember(seen.gnss[run], seen.velocity[run])
-        self.revoked: dict[int, list[float]] = {}
+        self.revoked: dict[int, int] = {}
         self.box = inbox(seen, ego, FIX_AND_VELOCITY)
         self.q = heard(seen, self.box, known, run, ego)
         self.state = self.blank()
@@ -293,7 +291,7 @@ class Oracle:
             again = bool(g.trust and np.isfinite(fix).all() and self.lost(t))
             again = again and self.start(t, fix, messages, relative)
             if again and young:
-                self.revoked[self.ego] = [self.revoked.get(self.ego, [0, 0])[0] + 1, t]
+                self.revoked[self.ego] = self.revoked.get(self.ego, 0) + 1
                 self.doubt(self.ego)
         for j in list(s["members"]):
             if j not in others or again or self.contradicted(t, j):
@@ -371,7 +369,7 @@ class Oracle:
             return 1.0
         if g.trust and again and len(used) == 3 and self.wrong_on_average(j, *self.mahalanobis(b, rows)):
             if j in s["trusted"]:
-                self.revoked[j] = [self.revoked.get(j, [0, 0])[0] + 1, t]
+                self.revoked[j] = self.revoked.get(j, 0) + 1
             self.doubt(j)
             if j == self.ego:
                 h = np.array([b.row(self.fix_terms(j), c) for c in used])
@@ -430,8 +428,7 @@ class Oracle:
         if g.fix_gate:
             votes = [sum(((x - y) ** 2 / (p + q)).sum() <= g.fix_gate for y, q in places) for x, p in places]
         best = int(np.argmax(votes))
-        late = (t - self.revoked.get(self.ego, [0, 0])[1]) * self.seen.dt > 2 * g.lost
-        if self.ego not in s["trusted"] and votes[0] < max(len(votes), 2) and not late:
+        if self.ego not in s["trusted"] and votes[0] < max(len(votes), 2):
             return False
         b.drop(("b", self.ego))
         b.transform(("x", self.ego), {})
@@ -456,8 +453,7 @@ class Oracle:
             return False
         if self.ego in s["trusted"]:
             return bool(s["hits"]["fix"] >= 2 and t - s["joined"][self.ego] - s["hits"]["fix"] <= 1)
-        patience = 0.0 if len(held) >= 2 else self.guards.lost
-        return bool((t - self.revoked[self.ego][1]) * self.seen.dt > patience)
+        return len(held) >= 2
 
     def contradicted(self, t: int, j: int) -> bool:
         hits, since = self.state["hits"][("relative", j)], t - self.state["joined"][j]
@@ -485,8 +481,6 @@ class Oracle:
         self.drive(self.ego, moved)
         b.noise(("x", self.ego), q)
         for name in b.names:
-            if name[0] == "b" and name[1] not in self.state["trusted"]:
-                b.noise(name, self.guards.walk**2 * self.seen.dt)
             if name[0] == "b" and life.own:
                 if name[1] in self.state["trusted"]:
                     b.transform(name, {name: life.keep})
@@ -681,7 +675,7 @@ class Oracle:
                     continue
                 at = b.at(("b", j))
                 x, p = b.x[at], b.p[at, at]
-                odds[j] = math.log((1 - g.share) / g.share) - g.penalty * self.revoked.get(j, [0, 0])[0]
+                odds[j] = math.log((1 - g.share) / g.share) - g.penalty * self.revoked.get(j, 0)
                 if own:
                     odds[j] += normal(x, narrow * np.eye(3) + p) + 1.5 * math.log(2 * math.pi * wide / own * narrow)
                 else:

@@ -15,6 +15,7 @@ from .cooperative_state import (
     MOTION,
     MOTION_VARIANCE,
     PACE,
+    REVOKED,
     SINCE,
     SLIPPED,
     SLIPS,
@@ -47,13 +48,12 @@ def leave(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, ve
     for i in range(count):
         if f.slot[vehicles[i]] >= 0:
             f.row[f.slot[vehicles[i]]] = i
-    ego = f.vehicle[0]
+    ego, again = f.vehicle[0], guards.trust > 0.0 and f.step[0] > 0 and not math.isnan(own[FIX]) and lost(f)
     young = f.status[ego, TRUSTED] > 0.0
-    again = guards.trust > 0.0 and f.step[0] > 0 and not math.isnan(own[FIX]) and lost(f, guards)
     again = again and start(f, model, guards, own, rows, count)
     if again and young:
-        f.revoked[ego, 0], f.revoked[ego, 1] = f.revoked[ego, 0] + 1.0, f.clock[0]
         doubt(f, model, guards, ego)
+        f.status[ego, REVOKED] += 1.0
     for k in range(1, len(f.vehicle)):
         j = f.vehicle[k]
         if j < 0 or (f.row[k] >= 0 and not again and not contradicted(f, guards, k)):
@@ -97,7 +97,7 @@ def predict(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
             i, trusted = 3 * g.block[k, ERROR], f.status[f.vehicle[k], TRUSTED] > 0.0
             if trusted:
                 shift(g, i, i, keep - 1.0)
-            widen(g, i, model.own * fades + (0.0 if trusted else guards.walk**2 * own[DT]))
+            widen(g, i, model.own * fades)
     if model.common > 0.0:
         i = 3 * g.block[0, COMMON]
         shift(g, i, i, keep - 1.0)

@@ -21,6 +21,7 @@ from .cooperative_state import (
     NO_POSITION,
     ODOMETER,
     PACE,
+    REVOKED,
     SLIPS,
     SOLO,
     SOLO_VARIANCE,
@@ -226,7 +227,7 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
         return 1.0
     if guards.trust > 0.0 and again and used == 3 and q > 0.0 and wrong_on_average(f, model, guards, k, q):
         if f.status[j, TRUSTED] > 0.0:
-            f.revoked[j, 0], f.revoked[j, 1] = f.revoked[j, 0] + 1.0, f.clock[0]
+            f.status[j, REVOKED] += 1.0
         doubt(f, model, guards, j)
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
             fix_terms(f, 0)
@@ -298,7 +299,7 @@ def trust(f: Filter, model: Model, guards: Guards) -> None:
                 for d in range(3):
                     s[c, d] = g.p[first + c, first + d] + (narrow if c == d else 0.0)
             q, det = distance(s, x)
-            odds = math.log((1.0 - guards.share) / guards.share) - guards.penalty * f.revoked[j, 0]
+            odds = math.log((1.0 - guards.share) / guards.share) - guards.penalty * f.status[j, REVOKED]
             odds += 0.5 * math.log(unit**3 / det) - 0.5 * q
             if odds > most:
                 best, most = k, odds

@@ -38,11 +38,25 @@ FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, OWN = 0, 3, 6, 9, 12, 13
 RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
 """Of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none held), mean of its fixes m and its
 variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that of a fix m^2."""
-TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, STATUS = 0, 1, 2, 3, 6, 9, 12, 21, 27, 28, 32
+TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, REVOKED, STATUS = (
+    0,
+    1,
+    2,
+    3,
+    6,
+    9,
+    12,
+    21,
+    27,
+    28,
+    29,
+    32,
+)
 """Of a vehicle's status: whether its fixes are assumed to be right, fixes in the mean innovation, when its last message
 that was used was sent s (-inf for none), mean innovation m, error of its fixes when it left m and its variance m^2, and
 SOLO, SOLO_VARIANCE and ODOMETER of that message; its last plausible velocity m/s, the variance of one step's
-motion with it m^2, when that was s (-inf for never), and how many in a row were not."""
+motion with it m^2, when that was s (-inf for never), how many in a row were not, and how
+often it lost trust."""
 NO_POSITION = 1e200
 """m^2, variance of the mean of no fixes."""
 SLIPPED = 5.0
@@ -62,12 +76,10 @@ class Guards(NamedTuple):
         share: prior share of vehicles with such an error.
         sure: log odds from which a member is trusted.
         penalty: log odds that each revocation costs.
-        walk: m, change of the error in a second.
         window: fixes in the mean innovation of a vehicle.
         revoke: log odds from which trust ends.
-        lost: s without trust in its receiver after which an ego is lost; if alone twice that, half where errors last.
         forget: s, in which what innovations have shown of levels is forgotten.
-        acceleration: m/s^2, of a member since it sent its newest message.
+        acceleration: m/s^2, of a vehicle at most, and of a member since it sent its newest message.
         heading: rad, and
         scale: standard deviations of errors of odometry that last.
         lasts: s, for which they do.
@@ -86,12 +98,10 @@ class Guards(NamedTuple):
     share: float = 0.1
     sure: float = 2.0
     penalty: float = 4.0
-    walk: float = 0.5
     window: float = 30.0
     revoke: float = 3.0
-    lost: float = 20.0
     forget: float = 10.0
-    acceleration: float = 3.0
+    acceleration: float = 5.0
     heading: float = 0.1
     scale: float = 0.1
     lasts: float = 1e5
@@ -186,7 +196,6 @@ class Filter(NamedTuple):
             distance of the message, NaN where nothing was used; the ego's are those of its fix.
         step: (1,) number of the step.
         clock: (2,) s, now, and since the last step.
-        revoked: (vehicles, 2) how often a vehicle lost trust, and when it last did s.
         level: (3, 5) by kind of number: logarithm of the level, sum of its derivatives in this step, and information.
         locked: (slots,) `gate.count` of fixes.
         slip: (6,) of `slip`.
@@ -214,7 +223,6 @@ class Filter(NamedTuple):
     q: Floats
     step: Ints
     clock: Floats
-    revoked: Floats
     level: Floats
     made: Floats
     locked: Floats
@@ -247,7 +255,6 @@ def new_filter(slots: int, vehicles: int) -> Filter:
         np.zeros((slots, 4)),
         np.zeros(1, np.int64),
         np.zeros(2),
-        np.zeros((vehicles, 2)),
         np.zeros((3, KINDS_OF_NUMBERS)),
         np.zeros(2),
         np.zeros(slots),
@@ -280,7 +287,6 @@ def copy_filter(source: Filter, target: Filter) -> None:
             target.hits[k, c], target.way[k, c] = source.hits[k, c], source.way[k, c]
     for j in range(len(source.slot)):
         target.slot[j] = source.slot[j]
-        target.revoked[j, 0], target.revoked[j, 1] = source.revoked[j, 0], source.revoked[j, 1]
     for i in range(len(source.slot) * STATUS // LANES):
         put(target.status, i, take(source.status, i))
 
@@ -319,8 +325,8 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
     """The ego stands somewhere near its fix, which is trusted.
 
     Where no other position, of a message less its vector, agrees with the fix, but two or more do with one another, the
-    fix is not used. Of an ego that is not trusted, but has been until a while ago, all must agree with the fix: two
-    that multipath displaced do so by chance; else nothing is changed, and False returned.
+    fix is not used. Of an ego that is not trusted all must agree with the fix: two that multipath displaced do so by
+    chance; else nothing is changed, and False returned.
     """
     best, most, heard, mine, g, ego = ABSENT, 1, 0, 0, f.g, f.vehicle[0]
     for i in range(-1, count if guards.fix_gate > 0.0 else -1):
@@ -332,13 +338,11 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
             mine = agree
         if agree > most:
             best, most = i, agree
-    soon = f.revoked[ego, 1] + 2.0 * guards.lost
-    if mine < max(heard, 2) and f.status[ego, TRUSTED] == 0.0 and f.clock[0] <= soon:
+    if mine < max(heard, 2) and f.status[ego, TRUSTED] == 0.0:
         return False
-    f.vague[0], f.joined[0], f.hits[0, 0] = model.flat, f.step[0], 0
-    f.locked[0] = 0.0
-    clear(g, 0)
+    f.vague[0], f.joined[0], f.hits[0, 0], f.locked[0] = model.flat, f.step[0], 0, 0.0
     f.status[ego, TRUSTED], f.status[ego, COUNT] = 1.0, 0.0
+    clear(g, 0)
     remove(g, 0, ERROR)
     if model.own > 0.0:
         insert(g, 0, ERROR, model.own)
@@ -352,10 +356,10 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
     return True
 
 
-@inside
-def lost(f: Filter, guards: Guards) -> bool:
+@part
+def lost(f: Filter) -> bool:
     """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either all fixes but the first
-    contradict it, or its receiver is not trusted any more, for long or beside others that are not."""
+    contradict it, or its receiver is not trusted beside others that are not."""
     ego, others = f.vehicle[0], 0
     for k in range(1, len(f.vehicle)):
         j = f.vehicle[k]
@@ -363,9 +367,9 @@ def lost(f: Filter, guards: Guards) -> bool:
             if f.status[j, TRUSTED] > 0.0:
                 return False
             others += 1
-    if f.status[ego, TRUSTED] > 0.0:
-        return bool(f.hits[0, 0] >= 2 and f.step[0] - f.joined[0] - f.hits[0, 0] <= 1)
-    return bool(f.clock[0] > f.revoked[ego, 1] + (0.0 if others >= 2 else guards.lost))
+    hits = f.hits[0, 0]
+    young = hits >= 2 and f.step[0] - f.joined[0] - hits <= 1
+    return bool(young if f.status[ego, TRUSTED] > 0.0 else others >= 2)
 
 
 @part
@@ -376,8 +380,6 @@ def pause(f: Filter, dt: float) -> None:
     f.g.vectors[0], f.hits[0, 0], f.slip[:] = 0, 0, 0.0
     for kind in range(KINDS):
         f.g.block[0, kind] = ABSENT
-    for j in range(len(f.slot)):
-        f.revoked[j, 0] = 0.0
     f.step[0] += 1
     f.clock[0] += dt
 
