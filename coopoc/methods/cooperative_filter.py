@@ -261,6 +261,7 @@ def model_of(noise_model: NoiseModel, guards: Guards) -> Model:
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
         absent[2:][np.array([bias, offset]) > 0.0] = -np.inf
         bias, offset = bias or guards.compass**2, offset or guards.offset**2
-    shape = float(least), float(noise_model.exact_relative), FORGOTTEN
     turns = np.square(turn)
-    return Model(std, *shape, own, common, time, white, bias, heading, offset, turns, lasts, absent, guards.slip)
+    return Model(
+        std, float(least), FORGOTTEN, own, common, time, white, bias, heading, offset, turns, lasts, absent, guards.slip
+    )

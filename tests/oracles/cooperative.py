@@ -544,51 +544,36 @@ class Oracle:
             b.add(("b", j), 0.0, self.life.own)
 
     def measure(self, t: int, at: dict[int, Floats], order: list[int], relative: Any, messages: Any) -> None:
-        """At the prediction, forgotten but for the solution; then at that solution."""
-        s, exact = self.state, self.known.exact_relative
-        b = s["belief"]
+        """Linear at the prediction."""
+        b = self.state["belief"]
         if order and ("compass",) in b.names:
             i = b.at(("compass",)).start + 1
             b.x[i], b.p[i], b.p[:, i] = 0.0, 0.0, 0.0
             b.p[i, i] = self.life.heading
-        if exact:
-            names = "belief", "hits", "vague", "learned", "information"
-            self.state = s | copy.deepcopy({name: s[name] for name in names}) | {"linear": b}
-            for j in order:
-                self.relate(t, j, at, relative[j], messages[j], False)
-            trial, self.state = self.state["belief"], s
-            at = {j: trial.x[trial.at(("x", j))] + s["way"].get(j, 0.0) for j in (self.ego, *order)}
         for j in order:
-            self.relate(t, j, at, relative[j], messages[j], exact)
+            self.relate(t, j, at, relative[j], messages[j])
 
-    def relate(self, t: int, j: int, at: dict[int, Floats], relative: Floats, message: Any, exact: bool) -> None:
+    def relate(self, t: int, j: int, at: dict[int, Floats], relative: Floats, message: Any) -> None:
         s, g, there = self.state, self.guards, np.isfinite(relative)
         b, vague, hits = s["belief"], j in s["vague"], s["hits"][("relative", j)]
         if not there.all() and vague:
             return
         gap, unit = at[j] - at[self.ego], self.known.sensors is None
         expected = np.array(spherical(*gap))
-        far, azimuth, inclination = expected
+        far = expected[0]
         ground, least = math.hypot(gap[0], gap[1]), 0.0 if unit else self.known.sensors.min_range  # type: ignore[union-attr]
         reach = max(far, least)
         flat = max(ground, 1e-3 * reach)
-        sa, ca, si, ci = math.sin(azimuth), math.cos(azimuth), math.sin(inclination), math.cos(inclination)
-        if exact:
-            rows = np.array(
-                [
-                    gap / far,
-                    [-gap[1] / flat**2, gap[0] / flat**2, 0],
-                    [gap[0] * gap[2] / (flat * reach**2), gap[1] * gap[2] / (flat * reach**2), -flat / reach**2],
-                ]
-            )
-            residual = relative - expected
-            residual[1:] = wrap(residual[1:])
-            z, r, turn, size = residual + rows @ gap, self.std**2, 1.0, np.array([1.0, flat, reach])
-        else:
-            rows = np.array([[ca * si, sa * si, ci], [-sa, ca, 0], [ca * ci, sa * ci, -si]])
-            z = rows @ to_vector(np.where(there, relative, expected))
-            r = np.ones(3) if unit else (self.std * [1.0, reach * ground / far, reach]) ** 2
-            turn, size = ground, np.ones(3)
+        rows = np.array(
+            [
+                gap / far,
+                [-gap[1] / flat**2, gap[0] / flat**2, 0],
+                [gap[0] * gap[2] / (flat * reach**2), gap[1] * gap[2] / (flat * reach**2), -flat / reach**2],
+            ]
+        )
+        residual, size = relative - expected, np.array([1.0, flat, reach])
+        residual[1:] = wrap(residual[1:])
+        z, r = residual + rows @ gap, 1 / size**2 if unit else self.std**2
         r, age = r * np.exp(s["level"][:3]), (t - s["since"][j]) * self.seen.dt
         s["way"][j], by = self.goes_on(t, j, message)
         z = z - rows @ s["way"][j]
@@ -601,7 +586,7 @@ class Oracle:
                 terms[("o", j)] = rows[c] @ by
                 z[c] += rows[c] @ by @ self.turn(j)
             if c < 2 and ("compass",) in b.names:
-                terms[("compass",)] = np.array([[0, 0, 1], [turn, turn, 0]][c])
+                terms[("compass",)] = np.array([[0, 0, 1], [1, 1, 0]][c])
             h.append(b.row(terms, c))
         total = np.einsum("ci,ij,cj->c", h, b.p, h) + r
         for c in np.flatnonzero(there):

@@ -1,7 +1,7 @@
 """The cooperative filter: sequential EKF of a star, in which any measurement, message or member may be wrong.
 
 The order of a step: members leave, the ego moves, members join, then the ego's fix, the messages, the relative
-measurements (once at the prediction, once more at that solution), and at last who is trusted. A member stands where it
+measurements, and at last who is trusted. A member stands where it
 was when it sent its newest message. A drive and a stream call the same `step`.
 """
 
@@ -53,17 +53,12 @@ from .gaussian import (
     COMPASS,
     PLACE,
     TURN,
-    Gaussian,
-    copy_moments,
     correct,
-    correct_mean,
-    correct_rows,
     expect,
     has,
     innovate,
     settle,
     weight,
-    widen,
 )
 from .lasting import average
 from .levels import adapt, corrected, learn_fix, learn_relative, louder, moved
@@ -235,7 +230,7 @@ def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, 
         for c in range(4):
             f.q[k, c] = math.nan
     add_fix(f, model, guards, own)
-    locate(f, f.g)
+    locate(f)
     members = nearest_first(f)
     for i in range(members):
         k = f.order[i]
@@ -243,7 +238,7 @@ def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, 
         if not (new and guards.trust > 0.0 and measured_whole(rows, f.row[k])):
             receive(f, model, guards, rows, k)
         goes_on(f, rows, k)
-    locate(f, f.g)
+    locate(f)
     members = nearest_first(f)
     measure(f, model, guards, rows, members)
     for i in range(members):
@@ -257,8 +252,9 @@ def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, 
 
 
 @part
-def locate(f: Filter, g: Gaussian) -> None:
+def locate(f: Filter) -> None:
     """Relative measurements are linear where the members are now."""
+    g = f.g
     for k in range(len(f.vehicle)):
         if f.vehicle[k] >= 0:
             for c in range(3):
@@ -308,7 +304,7 @@ def add_fix(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
 
 @inside
 def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int) -> None:
-    """The relative measurements: linear at the prediction, then at that solution."""
+    """The relative measurements, linear at the prediction."""
     g = f.g
     if members == 0:
         return
@@ -318,18 +314,15 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
             g.p[i, j] = 0.0
             g.p[j, i] = 0.0
         g.x[i], g.p[i, i] = 0.0, model.heading
-    if model.exact > 0.0:
-        first_pass(f, model, guards, rows, members)
-        locate(f, f.trial)
     for m in range(members):
         weigh(f, model, guards, rows, f.order[m])
 
 
 @inside
 def weigh(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None:
-    """Update by what is measured of member k, linear at `at`."""
+    """Update by what is measured of member k."""
     g, h = f.g, f.h
-    if not relate(f, model, guards, rows, k, 1 if model.exact > 0.0 else 0):
+    if not relate(f, model, guards, rows, k):
         return
     if f.vague[k] > 0.0:
         settle(g, h, k, f.vague[k])
@@ -346,42 +339,9 @@ def weigh(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None
 
 
 @inside
-def first_pass(f: Filter, model: Model, guards: Guards, rows: Floats, members: int) -> None:
-    """Update `trial` by the measurements linear at the prediction.
-
-    Of its covariance only the rows that a later member's measurement needs are kept up to date.
-    """
-    g, h = f.trial, f.h
-    copy_moments(f.g, g)
-    for m in range(members):
-        k = f.order[m]
-        vague = f.vague[k]
-        if relate(f, model, guards, rows, k, 0):
-            for c in range(3):
-                h.gate[c] = 0.0 if vague > 0.0 else guards.gate
-            widen(g, 3 * g.block[k, PLACE], vague)
-            innovate(g, h)
-            correct_mean(g, h, 1.0)
-            for k in f.order[m + 1 : members]:
-                correct_rows(g, h, 1.0, g.block[k, PLACE])
-                if f.since[k] < f.clock[0] and has(g, k, TURN):
-                    correct_rows(g, h, 1.0, g.block[k, TURN])
-            for term in range(1, h.terms[0]):
-                correct_rows(g, h, 1.0, h.block[term])
-
-
-@inside
-def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int, exact: int) -> bool:
-    """Rows of range, azimuth and inclination of member k, in metres; False if its geometry is not known.
-
-    Args:
-        f: filter; the rows are linear at `at`.
-        model: noise model.
-        guards: for their gate.
-        rows: measurements.
-        k: slot.
-        exact: 1 for range and angles themselves, 0 for the measured vector along their directions.
-    """
+def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> bool:
+    """Rows of range, azimuth and inclination of member k in metres, linear at `at`; False if its geometry is not
+    known."""
     g, h, row, std = f.g, f.h, f.row[k], model.std
     if not measured_whole(rows, row) and f.vague[k] > 0.0:
         return False
@@ -391,7 +351,6 @@ def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int, exact:
     reach = max(far, model.min_range)
     flat = max(ground, 1e-3 * reach)
     h.used[0], h.used[1], h.used[2] = d >= 0.0, sa != 0.0 or ca != 0.0, si != 0.0 or ci != 0.0
-    length = far if exact == 0 else reach
     w = (
         x / far,
         y / far,
@@ -399,25 +358,15 @@ def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int, exact:
         -y / flat,
         x / flat,
         0.0,
-        x * z / (flat * length),
-        y * z / (flat * length),
-        -flat / length,
+        x * z / (flat * reach),
+        y * z / (flat * reach),
+        -flat / reach,
     )
-    if exact == 0:
-        d = d if h.used[0] else far
-        if not h.used[1]:
-            sa, ca = y / flat, x / flat
-        if not h.used[2]:
-            si, ci = ground / far, z / far
-        store(h.z, 0, apply(w, (d * si * ca, d * si * sa, d * ci)))
-        turn, azimuth_std = ground, reach * ground / far
-    else:
-        turned = angle(sa * x - ca * y, ca * x + sa * y)
-        raised = angle(si * z - ci * ground, ci * z + si * ground)
-        _, b, c = apply(w, (x, y, z))
-        store(h.z, 0, (d, turned * flat + b, raised * reach + c))
-        turn = azimuth_std = flat
-    a, b, c = (std[0], std[1] * azimuth_std, std[2] * reach) if len(std) else (1.0, 1.0, 1.0)
+    turned = angle(sa * x - ca * y, ca * x + sa * y)
+    raised = angle(si * z - ci * ground, ci * z + si * ground)
+    _, b, c = apply(w, (x, y, z))
+    store(h.z, 0, (d, turned * flat + b, raised * reach + c))
+    a, b, c = (std[0], std[1] * flat, std[2] * reach) if len(std) else (1.0, 1.0, 1.0)
     store(
         h.variance,
         0,
@@ -429,7 +378,7 @@ def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int, exact:
     )
     store(h.weight, 0, w)
     store(h.weight, 1, negate(w))
-    store(h.weight, 2, (0.0, 0.0, 1.0, turn, turn, 0.0, 0.0, 0.0, 0.0))
+    store(h.weight, 2, (0.0, 0.0, 1.0, flat, flat, 0.0, 0.0, 0.0, 0.0))
     for c in range(3):
         h.gate[c] = guards.gate
     h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]

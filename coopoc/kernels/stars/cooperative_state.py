@@ -142,7 +142,6 @@ class Model(NamedTuple):
     Attributes:
         std: (3,) m, rad, rad of relative measurements; of no length for unit covariances.
         min_range: m.
-        exact: 1 for a second pass on range and angles themselves.
         flat: m^2, prior of a member that joins.
         own: m^2 of the error of a receiver that lasts, 0 for none.
         common: m^2 of the one that all share.
@@ -159,7 +158,6 @@ class Model(NamedTuple):
 
     std: Floats
     min_range: float
-    exact: float
     flat: float
     own: float
     common: float
@@ -179,7 +177,6 @@ class Filter(NamedTuple):
 
     Attributes:
         g: Gaussian.
-        trial: x and P of a first pass.
         h: rows of an update.
         vehicle: (slots,) in each slot, ABSENT for none.
         slot: (vehicles,) of each vehicle, ABSENT for none.
@@ -207,7 +204,6 @@ class Filter(NamedTuple):
     """
 
     g: Gaussian
-    trial: Gaussian
     h: Rows
     vehicle: Ints
     slot: Ints
@@ -236,10 +232,8 @@ class Filter(NamedTuple):
 @storage
 def new_filter(slots: int, vehicles: int) -> Filter:
     """A filter before its first step; vehicle 0 .. vehicles - 1."""
-    g, trial = new_gaussian(slots), new_gaussian(slots)
     return Filter(
-        g,
-        Gaussian(trial.x, trial.p, g.block, g.owner, g.vectors),
+        new_gaussian(slots),
         new_rows(slots),
         np.full(slots, ABSENT),
         np.full(vehicles, ABSENT),

@@ -197,16 +197,6 @@ def copy_gaussian(source: Gaussian, target: Gaussian) -> None:
         target.block[i // KINDS, i % KINDS] = source.block[i // KINDS, i % KINDS]
 
 
-@inside
-def copy_moments(source: Gaussian, target: Gaussian) -> None:
-    """Copy x and P into arrays of the same size."""
-    wide = len(source.x) // LANES
-    for j in range(lanes(source)):
-        put(target.x, j, take(source.x, j))
-        for i in range(j, 3 * source.vectors[0] * wide, wide):
-            put(target.p, i, take(source.p, i))
-
-
 @part
 def shift(g: Gaussian, i: int, j: int, factor: float) -> None:
     """x_i += factor x_j of two vectors by their first numbers; of one vector x_i *= 1 + factor."""
@@ -319,33 +309,21 @@ def whitened(h: Rows, c: int, innovation: float, variance: float) -> tuple[float
 
 @inside
 def correct(g: Gaussian, h: Rows, share: float) -> None:
-    """P <- P - share U U^T: the innovation's covariance is that of `innovate` over `share`."""
-    correct_mean(g, h, share)
-    for k in range(g.vectors[0]):
-        correct_rows(g, h, share, k)
-
-
-@inside
-def correct_mean(g: Gaussian, h: Rows, share: float) -> None:
-    """x <- x + share U times the whitened innovations."""
-    gain, wide = h.gain, len(g.x) // LANES
+    """x <- x + share U times the whitened innovations, P <- P - share U U^T: the innovation's covariance is that of
+    `innovate` over `share`."""
+    p, gain, wide, third = g.p, h.gain, len(g.x) // LANES, len(g.x) // 3
     x, y, z = scale(vector_at(h.white, 0), share)
     for j in range(lanes(g)):
         u, v, w = three_rows(gain, j, wide)
         put(g.x, j, plus(plus(plus(take(g.x, j), x, u), y, v), z, w))
-
-
-@inside
-def correct_rows(g: Gaussian, h: Rows, share: float, k: int) -> None:
-    """Three rows of P, those of the k-th vector."""
-    p, gain, wide, third = g.p, h.gain, len(g.x) // LANES, len(g.x) // 3
-    i, a = 3 * k * wide, scale(vector_at(gain, k), share)
-    b, c = scale(vector_at(gain, third + k), share), scale(vector_at(gain, 2 * third + k), share)
-    for j in range(lanes(g)):
-        u, v, w = three_rows(gain, j, wide)
-        for row in range(3):
-            at = i + row * wide + j
-            put(p, at, less(less(less(take(p, at), a[row], u), b[row], v), c[row], w))
+    for k in range(g.vectors[0]):
+        i, a = 3 * k * wide, scale(vector_at(gain, k), share)
+        b, c = scale(vector_at(gain, third + k), share), scale(vector_at(gain, 2 * third + k), share)
+        for j in range(lanes(g)):
+            u, v, w = three_rows(gain, j, wide)
+            for row in range(3):
+                at = i + row * wide + j
+                put(p, at, less(less(less(take(p, at), a[row], u), b[row], v), c[row], w))
 
 
 @part
