@@ -51,7 +51,7 @@ def test_machine_code_is_stale_after_a_change_of_a_file_that_it_imports_and_no_o
 def test_a_kernel_depends_on_all_kernels_below_it() -> None:
     importlib.import_module("coopoc.kernels.stars.joint_filter")
     names = {name.rpartition(".")[2] for name in machine_code.sources("coopoc.kernels.stars.joint_filter")}
-    assert {"joint", "messages", "geometry", "small", "compile"} <= names
+    assert {"messages", "geometry", "small", "compile"} <= names
     assert "smoother" not in names
 
 

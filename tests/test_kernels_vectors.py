@@ -12,7 +12,7 @@ from coopoc.arrays import Floats
 from coopoc.kernels.compiling.compile import as_written
 from coopoc.kernels.compiling.small import store
 from coopoc.kernels.compiling.vectors import LANES
-from coopoc.kernels.stars.joint import eliminate, predict, substitute
+from coopoc.kernels.stars.joint_filter import eliminate, predict, substitute
 
 BLOCKS = 4
 

@@ -78,12 +78,12 @@ class CooperativeFilter(Checked):
       contradicted for too long joins anew; an ego that rests on nothing that is trusted starts anew. Velocities that
       no vehicle can have reached are replaced by the last ones.
     - *Levels*: the variances of fixes, ranges, azimuths, inclinations and motions follow their innovations, between
-      0.14 and 33 times what is assumed, by recursive maximum likelihood (`kernels.stars.levels`).
+      0.14 and 33 times what is assumed, by recursive maximum likelihood (`kernels.stars.otherwise`).
     - *Errors that last and may not be there*: of heading $b$ and scale $s$ of each odometry,
       $x_t = x_{t-1} + (1 + s) R(b) \Delta t \, u$, of the ego's compass and of its ranges. Each is a state with a wide
-      prior, and the estimate is the average over whether it is 0, by Bayes' rule (`kernels.stars.lasting`).
+      prior, and the estimate is the average over whether it is 0, by Bayes' rule (`kernels.stars.otherwise`).
     - *Slips*: a step whose numbers surprise is tried again with a motion that is not known, and the likelier of both
-      is kept (`kernels.stars.slip`).
+      is kept (`kernels.stars.otherwise`).
     - *Messages* hold a fading mean of the sender's fixes, its weight, the odometer and the velocity. The mean of the
       fixes between any two of them follows: a lost message loses nothing, and no fix counts twice.
 

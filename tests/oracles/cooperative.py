@@ -17,8 +17,7 @@ from coopoc.arrays import Floats
 from coopoc.kernels.gate import GATE, LEAK, PATIENCE, REJECTED, SLIP
 from coopoc.kernels.stars.cooperative_messages import CLIP, FADES, FIX_SCORE
 from coopoc.kernels.stars.cooperative_state import Guards
-from coopoc.kernels.stars.levels import FASTEST, LOUDEST, PRIOR, QUIETEST, SUDDEN, USUAL
-from coopoc.kernels.stars.slip import LASTS, LATE, RARE, UNSEEN
+from coopoc.kernels.stars.otherwise import FASTEST, LASTS, LATE, LOUDEST, PRIOR, QUIETEST, RARE, SUDDEN, UNSEEN, USUAL
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector, wrap
 from coopoc.world.v2x import FIX_AND_VELOCITY

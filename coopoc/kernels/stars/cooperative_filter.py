@@ -60,10 +60,27 @@ from .gaussian import (
     settle,
     weight,
 )
-from .lasting import average
-from .levels import adapt, corrected, learn_fix, learn_relative, louder, moved
 from .messages import Assumptions, Measurements, three_of
-from .slip import LIKELY, NOW, NUMBERS, SLIPPED, SQUARES, Tries, chance, new_tries, remember_speed, score, surprised
+from .otherwise import (
+    LIKELY,
+    NOW,
+    NUMBERS,
+    SLIPPED,
+    SQUARES,
+    Tries,
+    adapt,
+    average,
+    chance,
+    corrected,
+    learn_fix,
+    learn_relative,
+    louder,
+    moved,
+    new_tries,
+    remember_speed,
+    score,
+    surprised,
+)
 
 
 @compiled

@@ -32,8 +32,7 @@ from .cooperative_state import (
     start,
 )
 from .gaussian import ABSENT, COMMON, ERROR, KINDS, PLACE, has, insert, remove, shift, widen
-from .lasting import drive
-from .slip import slip_variance
+from .otherwise import drive, slip_variance
 
 
 @inside

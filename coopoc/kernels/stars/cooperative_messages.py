@@ -50,9 +50,8 @@ from .gaussian import (
     term,
     update,
 )
-from .lasting import drive, hold, turned
 from .messages import three_of
-from .slip import score
+from .otherwise import drive, hold, score, turned
 
 FADES = 5.0
 """s, after which a fix weighs 1 / e in the mean that is sent."""

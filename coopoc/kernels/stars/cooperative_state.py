@@ -195,8 +195,8 @@ class Filter(NamedTuple):
         clock: (2,) s, now, and since the last step.
         level: (3, 5) by kind of number: logarithm of the level, sum of its derivatives in this step, and information.
         locked: (slots,) `gate.count` of fixes.
-        slip: (6,) of `slip`.
-        told: (FOUND,) out: what is otherwise than assumed, of `lasting.average`.
+        slip: (6,) of `otherwise`.
+        told: (FOUND,) out: what is otherwise than assumed, of `otherwise.average`.
         answer: (12,) out: position m and covariance m^2 of the ego.
         few: (2 slots + 5, 2 slots + 3) memory.
         which: (2 slots + 5,) memory.

@@ -1,31 +1,49 @@
-"""The joint filter of a star: predict in information form, add fixes, then relative measurements by Gauss-Newton.
+"""The joint filter of a star, a Gaussian in information form: predict, add fixes, then relative measurements by
+Gauss-Newton, and eliminate in 3 x 3 blocks. No matrix is ever inverted as a whole.
 
-No matrix is ever inverted as a whole.
+The position of member k is tuple k; its block is k - 1, and the ego's is the last, so that elimination ends with the
+ego's covariance. A filter calls, step by step, `gather` of `coopoc.kernels.stars.messages`, `predict_state`, `predict`,
+`rearrange`, its own fixes, `add_relative`, and `solve`.
+
+A matrix of n x n blocks stands in memory as `compiling.small` keeps it: block (i, j), j >= i, is tuple number
+i stride + j; those below the diagonal are never read.
 """
 
 from __future__ import annotations
 
-from ..compiling.compile import as_written, inner
-from ..compiling.small import add, add_diagonal, load, negate, store, subtract, times
-from ..compiling.vectors import LANES
-from .gated import Gates, carry, gate_star, gates_within, set_ego
-from .joint import (
-    Joint,
-    add_relative,
-    block_of,
-    copy,
-    exact_information,
-    joint_within,
-    move,
-    place_on_broadcast,
-    placed,
-    predict,
-    predict_state,
-    rearrange,
-    relative_information,
-    solve,
+from typing import NamedTuple
+
+import numpy as np
+
+from ...arrays import Floats
+from ..compiling.compile import as_written, inner, inside, storage
+from ..compiling.small import (
+    add,
+    add_diagonal,
+    choose_each,
+    inverse,
+    less_applied,
+    less_transposed_applied,
+    less_transposed_product,
+    load,
+    minus_apply,
+    minus_product,
+    mirrored,
+    negate,
+    plus_applied,
+    scale,
+    store,
+    subtract,
+    times,
+    transpose,
+    zeros,
 )
+from ..compiling.vectors import LANES, choose, take
+from ..geometry import Numbers, converted, exact, incomplete, missing, vector, whole
+from .gated import Gates, carry, gate_star, gates_within, set_ego
 from .messages import (
+    BLOCK,
+    NEW,
     NONE,
     RELATIVE,
     Assumptions,
@@ -37,11 +55,265 @@ from .messages import (
     fix_information,
     gather,
     largest,
+    moved_of,
     new_estimates,
     position_of,
+    process_information,
     star_within,
     vector_at,
 )
+
+LEAST_KNOWN = 1e-4
+"""1/m^2, information along x below which nothing is known of where a member is."""
+
+
+class Joint(NamedTuple):
+    """A Gaussian of the members' states in information form, and scratch memory; arrays are (., LANES).
+
+    Attributes:
+        state: (3 most,).
+        information: (9 most^2,).
+        factor: (9 most^2,).
+        eta: (3 most,) information vector.
+        move: (3 most,) step of the state.
+        process: (3 most,) process information, the inverse of the process noise.
+        scratch: (18 most,).
+        stride: blocks in a row.
+    """
+
+    state: Floats
+    information: Floats
+    factor: Floats
+    eta: Floats
+    move: Floats
+    process: Floats
+    scratch: Floats
+    stride: int
+
+
+@storage
+def joint_within(most: int) -> Joint:
+    """Room for `most` members."""
+    a, b = np.zeros((4, 3 * most, LANES)), np.zeros((2, 9 * most * most, LANES))
+    return Joint(a[0], b[0], b[1], a[1], a[2], a[3], np.zeros((18 * most, LANES)), most)
+
+
+@inner
+def eliminate(source: Floats, a: Floats, eta: Floats, n: int, stride: int, memory: Floats) -> Numbers:
+    """Factorise A = R^T D R: D^-1 R in `a` (which may be `source`), minus the inverse pivots on its diagonal, and
+    D^-1 R^-T eta in place of eta.
+
+    Returns the last of them, -Cov of the last block. The next pivot is inverted as soon as its row is ready, while the
+    rows below are still worked on. `memory` holds n blocks.
+    """
+    p: Numbers = negate(inverse(block_at(source, 0)))
+    for k in range(n):
+        first = k * stride
+        v = minus_apply(p, vector_at(eta, k))
+        store(eta, k, v)
+        store(a, first + k, p)
+        for j in range(k + 1, n):
+            one = block_at(source, first + j)
+            store(memory, j, one)
+            store(a, first + j, minus_product(p, one))
+        for i in range(k + 1, n):
+            left = block_at(memory, i)
+            for j in range(i, n):
+                at = i * stride + j
+                store(a, at, less_transposed_product(block_at(source, at), left, block_at(a, first + j)))
+            store(eta, i, less_transposed_applied(vector_at(eta, i), left, v))
+            if i == k + 1:
+                p = negate(inverse(block_at(a, i * stride + i)))
+        source = a
+    return p
+
+
+@inner
+def substitute(factor: Floats, x: Floats, n: int, stride: int) -> None:
+    """Solution A^-1 eta in place of what `eliminate` left in eta."""
+    for k in range(n - 1, -1, -1):
+        v = vector_at(x, k)
+        for j in range(k + 1, n):
+            v = less_applied(v, block_at(factor, k * stride + j), vector_at(x, j))
+        store(x, k, v)
+
+
+@inner
+def predict(a: Floats, n: int, stride: int, process: Floats, memory: Floats) -> None:
+    """Information (A^-1 + Q)^-1 in place of A, Q^-1 = diag(process): with infinite process noise (0) a block is
+    forgotten, one after the other as a rank-3 update. `memory` holds 2 n blocks.
+
+    With E_k the columns of block k and W_k = Q_k^-1, A <- A - A E_k (E_k^T A E_k + W_k)^-1 E_k^T A.
+    """
+    for k in range(n):
+        for i in range(k):
+            store(memory, n + i, transpose(block_at(a, i * stride + k)))
+        for j in range(k + 1, n):
+            store(memory, n + j, block_at(a, k * stride + j))
+        own = mirrored(block_at(a, k * stride + k))
+        store(memory, n + k, own)
+        pivot = negate(inverse(add_diagonal(own, vector_at(process, k))))
+        for j in range(n):
+            store(memory, j, minus_product(pivot, block_at(memory, n + j)))
+        for i in range(n):
+            left = block_at(memory, n + i)
+            for j in range(i, n):
+                at = i * stride + j
+                store(a, at, less_transposed_product(block_at(a, at), left, block_at(memory, j)))
+
+
+@inside
+def block_of(k: int, n: int) -> int:
+    """Block of member k among n."""
+    return k - 1 if k > 0 else n - 1
+
+
+@inner
+def predict_state(star: Star, joint: Joint, n: int, old: int) -> None:
+    """Move the members that stay; the ego starts where its first fix is, one that joins where the ego measures it, or,
+    if the ego does not measure all three components, where its own message puts it.
+
+    Fills the inverse process noise of the positions, in the order of the last star: zero for members that left.
+    """
+    for k in range(old):
+        store(joint.move, k, vector_at(joint.state, k))
+    clear(joint.process)
+    for k in range(n):
+        place = star.previous[k]
+        if place >= 0:
+            at = add(vector_at(joint.move, place), moved_of(star, k))
+            store(joint.state, k, at)
+            store(joint.process, block_of(place, old), process_information(star, k))
+        elif k == 0:
+            store(joint.state, k, position_of(star, k))
+        else:
+            store(joint.state, k, first_place(star, k, vector_at(joint.state, 0)))
+
+
+@inside
+def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
+    """Position of a member that joins: as measured, else as broadcast, else somewhere near the ego."""
+    seen = load(star.relative, k, RELATIVE)
+    measured: Numbers = add(ego, vector(seen))
+    if not incomplete(seen):
+        return measured
+    new = take(star.status, 5 * k + NEW) - 0.5
+    near = seen[0] + 1.0
+    somewhere = add(ego, (near, near, 0.1 * near))
+    broadcast = choose_each(new, position_of(star, k), somewhere)
+    place: Numbers = choose_each(missing(seen), broadcast, measured)
+    return place
+
+
+@inner
+def place_on_broadcast(star: Star, joint: Joint, n: int) -> None:
+    """Put members of which nothing was known where their first message with a position does: what was measured of them
+    is linear there, and not where they were assumed to be until now."""
+    for k in range(1, n):
+        if star.previous[k] >= 0:
+            at = vector_at(joint.state, k)
+            own = block_at(joint.information, (k - 1) * joint.stride + k - 1)[0]
+            new = take(star.status, 5 * k + NEW) - 0.5
+            there = choose_each(new, position_of(star, k), at)
+            store(joint.state, k, choose_each(own - LEAST_KNOWN, at, there))
+
+
+@inside
+def placed(joint: Joint, k: int, measured: Numbers) -> float:
+    """1 where the geometry of an incomplete measurement of member k is known, or all of it was measured; else 0."""
+    own = block_at(joint.information, (k - 1) * joint.stride + k - 1)[0]
+    share: float = max(whole(measured), choose(own - LEAST_KNOWN, 0.0 * own + 1.0, 0.0 * own))
+    return share
+
+
+@inner
+def rearrange(star: Star, joint: Joint, n: int, old: int, prior: Numbers) -> None:
+    """Information in the order of the new star; that of a member that joins is diagonal, the tuple `prior`."""
+    moved = int(n != old)
+    for k in range(n):
+        moved += star.previous[k] != k
+    if moved == 0:
+        return
+    stride = joint.stride
+    o = 0.0 * vector_at(joint.information, 0)[0]
+    for k in range(n):
+        for j in range(n):
+            i, c = block_of(k, n), block_of(j, n)
+            if c < i:
+                continue
+            p, q = star.previous[k], star.previous[j]
+            if p < 0 or q < 0:
+                nothing = zeros(o, BLOCK)
+                store(joint.factor, i * stride + c, add_diagonal(nothing, prior) if k == j else nothing)
+                continue
+            p, q = block_of(p, old), block_of(q, old)
+            if p <= q:
+                store(joint.factor, i * stride + c, block_at(joint.information, p * stride + q))
+            else:
+                store(joint.factor, i * stride + c, transpose(block_at(joint.information, q * stride + p)))
+    copy(joint.factor, joint.information, n, stride)
+
+
+@inner
+def copy(source: Floats, target: Floats, n: int, stride: int) -> None:
+    """The blocks on and above the diagonal."""
+    for i in range(n):
+        for j in range(i, n):
+            store(target, i * stride + j, block_at(source, i * stride + j))
+
+
+@inside
+def relative_information(star: Star, joint: Joint, k: int, std: Floats, least: float) -> tuple[Numbers, Numbers]:
+    """Information of the converted measurement of member k at the predicted geometry, and what it adds to the
+    information vector: W and W (measured vector - predicted vector)."""
+    seen, gap = load(star.relative, k, RELATIVE), subtract(vector_at(joint.state, k), vector_at(joint.state, 0))
+    weight, eta = converted(gap, seen, len(std) == 0, least)
+    if incomplete(seen):
+        known = placed(joint, k, seen)
+        weight, eta = scale(weight, known), scale(eta, known)
+    return weight, eta
+
+
+@inside
+def exact_information(star: Star, joint: Joint, k: int, n: int, least: float) -> tuple[Numbers, Numbers]:
+    """The same of range and angles, linear at the state moved by `move`, as seen from the state."""
+    seen = load(star.relative, k, RELATIVE)
+    ahead = subtract(vector_at(joint.move, k - 1), vector_at(joint.move, n - 1))
+    gap = add(subtract(vector_at(joint.state, k), vector_at(joint.state, 0)), ahead)
+    weight, eta = exact(gap, seen, least)
+    if incomplete(seen):
+        known = placed(joint, k, seen)
+        weight, eta = scale(weight, known), scale(eta, known)
+    return weight, plus_applied(eta, weight, ahead)
+
+
+@inside
+def add_relative(a: Floats, eta: Floats, stride: int, k: int, n: int, weight: Numbers, vector: Numbers) -> None:
+    """Add information (weight, vector) about the position of member k of n less that of the ego, to matrix and
+    vector."""
+    i, e = k - 1, n - 1
+    for at in (i, e):
+        diagonal = at * stride + at
+        store(a, diagonal, add(block_at(a, diagonal), weight))
+    at = i * stride + e
+    store(a, at, add(block_at(a, at), negate(weight)))
+    store(eta, i, add(vector_at(eta, i), vector))
+    store(eta, e, subtract(vector_at(eta, e), vector))
+
+
+@inside
+def solve(a: Floats, joint: Joint, eta: Floats, n: int) -> Numbers:
+    """Step A^-1 eta of the state in place of eta; minus the covariance of the ego."""
+    cov = eliminate(a, joint.factor, eta, n, joint.stride, joint.scratch)
+    substitute(joint.factor, eta, n, joint.stride)
+    return cov
+
+
+@inside
+def move(joint: Joint, n: int) -> None:
+    """Add the step in `eta` to the state."""
+    for k in range(n):
+        store(joint.state, k, add(vector_at(joint.state, k), vector_at(joint.eta, block_of(k, n))))
 
 
 @as_written

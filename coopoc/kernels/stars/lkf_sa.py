@@ -6,8 +6,18 @@ from ..compiling.compile import as_written, inner, inside
 from ..compiling.small import add, add_diagonal, load, negate, scale, store, subtract, zeros
 from ..compiling.vectors import LANES, choose
 from ..geometry import Numbers, metres, vector, whole
-from .joint import Joint, add_relative, joint_within, move, predict, predict_state, rearrange, solve
-from .joint_filter import add_fixes, write
+from .joint_filter import (
+    Joint,
+    add_fixes,
+    add_relative,
+    joint_within,
+    move,
+    predict,
+    predict_state,
+    rearrange,
+    solve,
+    write,
+)
 from .messages import (
     BLOCK,
     NONE,

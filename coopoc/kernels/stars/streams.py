@@ -37,7 +37,7 @@ from .cooperative_state import (
 )
 from .gated import Gates, gates_within
 from .gaussian import PLACE
-from .joint import Joint, joint_within
+from .joint_filter import Joint, joint_within
 from .joint_filter import step as step_joint
 from .messages import (
     ACCELERATION_STD,
@@ -49,7 +49,7 @@ from .messages import (
     measured,
     star_within,
 )
-from .slip import Tries, new_tries
+from .otherwise import Tries, new_tries
 
 INDEX, SERVES, USED_AT = range(3)
 """Of a vehicle's newest message: its index in the last star of the joint filter (-1 for none; the ego's is that of the

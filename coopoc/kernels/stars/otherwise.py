@@ -1,0 +1,325 @@
+"""What is otherwise than assumed: errors that last and may not be there, an ego that slips, and levels of noise.
+
+*Errors* of heading and scale of an odometry, of a compass, of ranges are states with a wide prior N(0, W), and the
+estimate is the average over whether each is there. Of a scalar error b with the posterior N(m, p) the odds of b = 0
+are, by Bayes' rule, those of the prior times sqrt(W / p) exp(-m^2 / 2 p), and what is conditional on b = 0 is the
+filter without that state. So one filter stands for all hypotheses, as long as an error stays what it is.
+
+*Slips*: a step is tried once more, with a motion that is not known, and the likelier of both is kept. Numbers beyond
+their gate count with no more than it, a fix as one: a range that is too long, or a receiver that jumps, is no slip.
+
+*Levels*: by how much the variance of each kind of number differs from what is assumed, as its innovations show. The
+log-likelihood of an innovation v ~ N(0, S) has the derivative s (v^2 / S - 1) / 2 by the logarithm of a level, with s
+the share of S that the level makes, and the information s^2 / 2. Each step moves a level by the sum of its derivatives
+over their information, which is forgotten in `Guards.forget` s. Of the ego's motion the share is D = dP / d log level,
+which a step of prediction makes D + q, and an update D (P+ / P-)^2.
+
+References:
+    Friedland, Treatment of bias in recursive filtering, IEEE TAC 14(4), 1969; Mitchell, Beauchamp, Bayesian variable
+    selection in linear regression, JASA 83, 1988 (spike and slab); Ljung, Soderstrom, Theory and Practice of Recursive
+    Identification, MIT Press, 1983, chapter 3.
+"""
+
+from __future__ import annotations
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+
+from ...arrays import Floats
+from ..compiling.compile import part, storage
+from .cooperative_state import (
+    DT,
+    FIXES,
+    KINDS_OF_NUMBERS,
+    MOTION,
+    MOTION_VARIANCE,
+    MOTIONS,
+    OWN,
+    STEP,
+    WIDTH,
+    Filter,
+    Guards,
+    Model,
+    new_filter,
+)
+from .gaussian import COMPASS, PLACE, TURN, Gaussian, Rows, has, shift
+
+HEADING, SCALE, OF_COMPASS, OF_RANGE, SLIPS, LEVELS = range(6)
+"""Places in `Filter.told`: the ego's errors, rad, 1, rad, m, whether it slips, and the factors of standard
+deviations."""
+
+
+@part
+def turned(g: Gaussian, k: int, moved: tuple[float, float, float], w: Floats) -> tuple[float, float, float]:
+    """(1 + s) R(b) m, and its derivatives by b and s in w (9,); m itself where odometry does not err."""
+    for i in range(9):
+        w[i] = 0.0
+    if not has(g, k, TURN):
+        return moved
+    i = 3 * g.block[k, TURN]
+    c, s, scale = math.cos(g.x[i]), math.sin(g.x[i]), 1.0 + g.x[i + 1]
+    east, north = c * moved[0] - s * moved[1], s * moved[0] + c * moved[1]
+    w[0], w[3], w[1], w[4] = -scale * north, scale * east, east, north
+    return scale * east, scale * north, moved[2]
+
+
+@part
+def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt: float) -> None:
+    """Move a member by its odometry, whose errors decay."""
+    g, w = f.g, f.h.turn
+    first, way = 3 * g.block[k, PLACE], turned(g, k, moved, w)
+    for c in range(3):
+        g.x[first + c] += way[c]
+    if not has(g, k, TURN):
+        return
+    i, n, keep = 3 * g.block[k, TURN], 3 * g.vectors[0], math.exp(-dt / model.lasts)
+    for c in range(2):
+        for j in range(n):
+            g.p[first + c, j] += w[3 * c] * g.p[i, j] + w[3 * c + 1] * g.p[i + 1, j]
+    for j in range(n):
+        for c in range(2):
+            g.p[j, first + c] += w[3 * c] * g.p[j, i] + w[3 * c + 1] * g.p[j, i + 1]
+    shift(g, i, i, keep - 1.0)
+    for c in range(2):
+        g.p[i + c, i + c] += (1.0 - keep * keep) * model.turn[c]
+
+
+@part
+def hold(f: Filter, share: float) -> None:
+    """After `correct` with that share of a fix: errors of odometry learn the share of what it says of them.
+
+    P' = P - K S K^T + (1 - share)^2 K_o S K_o^T in the block of these errors o.
+    """
+    g, h, wide = f.g, f.h, len(f.g.x)
+    if share >= 1.0:
+        return
+    for a in range(len(f.vehicle)):
+        if f.vehicle[a] < 0 or not has(g, a, TURN):
+            continue
+        for i in range(3 * g.block[a, TURN], 3 * g.block[a, TURN] + 2):
+            for c in range(3):
+                g.x[i] -= (1.0 - share) * share * h.gain[c * wide + i] * h.white[c]
+            for b in range(len(f.vehicle)):
+                if f.vehicle[b] < 0 or not has(g, b, TURN):
+                    continue
+                for j in range(3 * g.block[b, TURN], 3 * g.block[b, TURN] + 2):
+                    for c in range(3):
+                        g.p[i, j] += (1.0 - share) ** 2 * share * h.gain[c * wide + i] * h.gain[c * wide + j]
+
+
+@part
+def average(f: Filter, model: Model) -> None:
+    """Write the ego's position and covariance, averaged over which errors are there, to `answer`, and these to `told`.
+
+    `few` has a row for each number of the position and each error, and a column for each error: their covariances.
+    """
+    g, few, which, x = f.g, f.few, f.which, f.answer
+    first, n, width = 3 * g.block[0, PLACE], 3, len(f.few[0]) - 1
+    for c in range(3):
+        which[c], x[c] = first + c, g.x[first + c]
+        for d in range(3):
+            x[3 + 3 * c + d] = g.p[first + c, first + d]
+    for k in range(len(f.vehicle) - 1, -1, -1):
+        if f.vehicle[k] >= 0 and has(g, k, TURN):
+            which[n], which[n + 1] = 3 * g.block[k, TURN], 3 * g.block[k, TURN] + 1
+            n += 2
+    own = n
+    if has(g, 0, COMPASS):
+        which[n], which[n + 1] = 3 * g.block[0, COMPASS], 3 * g.block[0, COMPASS] + 2
+        n += 2
+    for i in range(n):
+        few[i, width] = g.x[which[i]]
+        for j in range(3, n):
+            few[i, j - 3] = g.p[which[i], which[j]]
+    for i in range(3, n):
+        kind = (2 + i - own) if i >= own else (i - 3) % 2
+        prior = model.turn[kind] if kind < 2 else model.bias if kind == 2 else model.offset
+        collapse(f, i, n, prior, model.absent[kind])
+    for kind in range(4):
+        i = own + kind - 2
+        there = n > own if kind >= 2 else own > 3
+        f.told[kind] = few[i, width] if there else 0.0
+    f.told[SLIPS] = f.slip[0]
+    for kind in range(KINDS_OF_NUMBERS):
+        f.told[LEVELS + kind] = math.exp(0.5 * f.level[0, kind])
+
+
+@part
+def collapse(f: Filter, i: int, n: int, prior: float, odds: float) -> None:
+    """Average over whether the error of row i is there: moments are matched."""
+    few, x, width = f.few, f.answer, len(f.few[0]) - 1
+    p, m = few[i, i - 3], few[i, width]
+    if odds == -math.inf or not p > 0.0:
+        return
+    there = 1.0 / (1.0 + math.exp(min(odds + 0.5 * math.log(prior / p) - 0.5 * m * m / p, 700.0)))
+    mean, change = (there - 1.0) * m / p, (there * p + there * (1.0 - there) * m * m - p) / (p * p)
+    for c in range(3):
+        x[c] += mean * few[c, i - 3]
+        for d in range(3):
+            x[3 + 3 * c + d] += change * few[c, i - 3] * few[d, i - 3]
+    for j in range(n):
+        if j != i:
+            few[j, width] += mean * few[j, i - 3]
+            for k in range(i + 1, n):
+                few[j, k - 3] += change * few[j, i - 3] * few[i, k - 3]
+    few[i, width] = there * m
+    for k in range(i + 1, n):
+        few[i, k - 3] *= 1.0 + change * p
+
+
+SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES = range(6)
+"""Of `Filter.slip`: probability that the ego slips, its late speed m/s, whether this try assumes so, and of the step's
+numbers the logarithm of their likelihood, how many there are, and their squared normalised innovations."""
+LASTS, RARE, LATE, UNSEEN = 3.0, 3000.0, 10.0, 1.0
+"""s: how long a slip lasts, how long none does, for which a speed is remembered, and until a slip shows."""
+
+
+class Tries(NamedTuple):
+    """A filter before a step and after its first try, and the step's rows."""
+
+    before: Filter
+    first: Filter
+    own: Floats
+    rows: Floats
+
+
+@storage
+def new_tries(slots: int, vehicles: int) -> Tries:
+    """Memory for as many members and vehicles."""
+    return Tries(new_filter(slots, vehicles), new_filter(slots, vehicles), np.zeros(OWN), np.zeros((slots, WIDTH)))
+
+
+@part
+def remember_speed(f: Filter, own: Floats) -> None:
+    """The most of late speeds: wheels that are locked measure none."""
+    square = 0.0
+    for c in range(3):
+        square += (own[MOTION + c] / own[DT]) ** 2
+    f.slip[SPEED_OF_LATE] = max(math.sqrt(square), f.slip[SPEED_OF_LATE] * math.exp(-own[DT] / LATE))
+
+
+@part
+def slip_variance(f: Filter, model: Model, dt: float) -> float:
+    """m^2, of the ego's motion in a step, if it is assumed to slip; one that begins now may have for UNSEEN s."""
+    seconds = dt if f.slip[SLIPPED] > 0.5 else max(dt, UNSEEN)
+    variance: float = f.slip[NOW] * (model.slip * f.slip[SPEED_OF_LATE] * seconds) ** 2
+    return variance
+
+
+@part
+def score(f: Filter, h: Rows, gate: float, whole: bool) -> None:
+    """Count the rows of an update, each, or as the fix that they are; beyond the gate no more."""
+    square = 0.0
+    for c in range(3):
+        if h.used[c] and h.schur[c] > 0.0:
+            q = h.q[c]
+            square += q if whole else min(q, gate)
+            f.slip[LIKELY] -= 0.5 * math.log(h.schur[c])
+            f.slip[NUMBERS] += 1.0
+    square = min(square, gate) if whole else square
+    f.slip[LIKELY] -= 0.5 * square
+    f.slip[SQUARES] += square
+
+
+@part
+def surprised(f: Filter) -> bool:
+    """Whether the first try's numbers are worse than usual by a standard deviation, or the ego may have slipped."""
+    n = f.slip[NUMBERS]
+    return bool(f.slip[SLIPPED] > 0.1 or f.slip[SQUARES] > n + math.sqrt(2.0 * n))
+
+
+@part
+def chance(f: Filter, first: Filter, dt: float) -> float:
+    """Probability of a slip, after both tries of a step, by that before it."""
+    stays, begins = math.exp(-dt / LASTS), min(dt / RARE, 0.5)
+    before = first.slip[SLIPPED] * stays + (1.0 - first.slip[SLIPPED]) * begins
+    odds = f.slip[LIKELY] - first.slip[LIKELY] + math.log(before / (1.0 - before))
+    return 1.0 / (1.0 + math.exp(min(-odds, 700.0)))
+
+
+SUDDEN, USUAL = 5.0, 0.95
+"""Most of a squared normalised innovation that counts, and the mean of what counts of one number that is as assumed."""
+QUIETEST, LOUDEST, FASTEST = -2.0, 3.5, 0.5
+"""Least and most logarithm of a level, and the most that it changes in a step."""
+PRIOR = 10.0
+"""Information that the assumed level counts as: that of twenty numbers."""
+
+
+@part
+def louder(f: Filter, own: Floats, rows: Floats, count: int) -> None:
+    """Multiply the variances of a step's motions by their level."""
+    level = math.exp(f.level[0, MOTIONS])
+    for c in range(3):
+        own[MOTION_VARIANCE + c] *= level
+        for i in range(count):
+            rows[i, STEP + c] *= level
+
+
+@part
+def moved(f: Filter, own: Floats) -> None:
+    """After the ego's prediction: D + q, both of the three axes together, so that no axis of the world counts."""
+    f.made[0] += own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
+    f.made[1] = ego_variance(f)
+
+
+@part
+def corrected(f: Filter) -> None:
+    """After an update of the ego: D (P+ / P-)^2."""
+    p, before = ego_variance(f), f.made[1]
+    f.made[0] = min(f.made[0] * (p / before) ** 2, p) if before > 0.0 else 0.0
+    f.made[1] = p
+
+
+@part
+def ego_variance(f: Filter) -> float:
+    """m^2, of the three axes together."""
+    first = 3 * f.g.block[0, PLACE]
+    total: float = f.g.p[first, first] + f.g.p[first + 1, first + 1] + f.g.p[first + 2, first + 2]
+    return total
+
+
+@part
+def learn(f: Filter, kind: int, more: float, share: float, numbers: float) -> None:
+    """Count by how much squared normalised innovations are more than usual, of which a level makes that share."""
+    f.level[1, kind] += 0.5 * numbers * share * more
+    f.level[2, kind] += 0.5 * numbers * share * share
+
+
+@part
+def learn_fix(f: Filter) -> None:
+    """Count the innovation of the ego's fix."""
+    h, square, r, s = f.h, 0.0, 0.0, 0.0
+    for c in range(3):
+        square += h.gap[c] * h.gap[c]
+        r += h.variance[c]
+        s += h.variance[c] + h.cov[4 * c]
+    more = min(square / s, SUDDEN) - 1.0
+    learn(f, FIXES, more, r / s, 3.0)
+    learn(f, MOTIONS, more, f.made[0] / s, 3.0)
+
+
+@part
+def learn_relative(f: Filter, c: int) -> None:
+    """Count the innovation of a component of a relative measurement."""
+    h, along = f.h, 0.0
+    s, more = h.variance[c] + h.cov[4 * c], min(h.q[c], SUDDEN) - USUAL
+    for i in range(3):
+        along += h.weight[3 * c + i] ** 2 * f.made[0] / 3.0
+    learn(f, c, more, h.variance[c] / s, 1.0)
+    learn(f, MOTIONS, more, along / s, 1.0)
+
+
+@part
+def adapt(f: Filter, guards: Guards) -> None:
+    """Move the levels by what this step has shown."""
+    if guards.forget == 0.0:
+        return
+    keep = math.exp(-f.clock[1] / guards.forget)
+    for kind in range(KINDS_OF_NUMBERS):
+        change = f.level[1, kind] / (f.level[2, kind] + PRIOR)
+        level = f.level[0, kind] + min(max(change, -FASTEST), FASTEST)
+        f.level[0, kind] = min(max(level, QUIETEST), LOUDEST)
+        f.level[1, kind] = 0.0
+        f.level[2, kind] *= keep
