@@ -2,7 +2,7 @@
 
 Run:  python benchmarks/graphs.py                            (every PyFG file in ../shared/data/pyfg, if it is there)
       python benchmarks/graphs.py ../shared/data/pyfg mrclam5a           (one)
-      python benchmarks/graphs.py folder --hard              (any folder of PyFG, g2o and JRL files, with hard variants)
+      python benchmarks/graphs.py folder --hard              (any folder of PyFG and g2o files, with hard variants)
       python benchmarks/graphs.py --unseen 1                 (kinds of graphs that no file holds; so many seeds)
 
 GTSAM gets what a user would write: Pose2 or Pose3 variables, FrobeniusBetweenFactor, RangeFactor, Levenberg-Marquardt
@@ -143,7 +143,7 @@ def rows(files: list[Path], hard: bool) -> Iterator[list[object]]:
 def main() -> None:
     """Print the table, and the totals."""
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
-    parser.add_argument("folder", nargs="?", type=Path, default=FOLDER, help="of .pyfg, .g2o and .jrl files")
+    parser.add_argument("folder", nargs="?", type=Path, default=FOLDER, help="of .pyfg and .g2o files")
     parser.add_argument("names", nargs="*", help="files, without their suffixes; all of them by default")
     parser.add_argument("--hard", action="store_true", help="worse variants of each file, too")
     parser.add_argument("--unseen", type=int, metavar="SEEDS", help="graphs that no file holds, of so many seeds")

@@ -14,7 +14,7 @@ from conftest import refused
 import coopoc as co
 from coopoc import optimize
 from coopoc.errors import shown
-from coopoc.formats import load_graph, read_g2o, read_jrl, read_pyfg
+from coopoc.formats import load_graph, read_g2o, read_pyfg
 from coopoc.study.merge import merge
 from coopoc.study.publish import views
 from coopoc.study.reference import Reference
@@ -254,7 +254,6 @@ def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path: Path) ->
         co.read_graph,
         load_graph,
         read_g2o,
-        read_jrl,
         read_pyfg,
         co.load_fleet,
         co.load_recording,

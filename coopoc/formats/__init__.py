@@ -1,4 +1,4 @@
-"""Files of graphs and trajectories: graphs in PyFG, g2o and JRL, trajectories in TUM and KITTI."""
+"""Files of graphs and trajectories: graphs in PyFG and g2o, trajectories in TUM and KITTI."""
 
 from __future__ import annotations
 
@@ -9,25 +9,24 @@ from ..file_names import given_path
 from ..plugins import find
 from .g2o import read_g2o
 from .graph import Graph
-from .jrl import read_jrl
 from .pyfg import read_pyfg
 
-GRAPHS = {".pyfg": read_pyfg, ".g2o": read_g2o, ".jrl": read_jrl}
+GRAPHS = {".pyfg": read_pyfg, ".g2o": read_g2o}
 
 
 def load_graph(path: str | Path, repair: bool = False) -> Graph:
-    """Graph of a file, .pyfg, .g2o or .jrl.
+    """Graph of a file, .pyfg or .g2o.
 
     Args:
         path: of the file, or the name of a public graph that has been fetched.
         repair: see `read_g2o`, whose matrices are information.
 
     Raises:
-        InputError: another suffix, or what `read_pyfg`, `read_g2o` and `read_jrl` raise.
+        InputError: another suffix, or what `read_pyfg` and `read_g2o` raise.
 
     >>> load_graph("ring.json")
     Traceback (most recent call last):
-    coopoc.errors.InputError: path = ring.json: must end in .pyfg or .g2o or .jrl. Rename or convert the file.
+    coopoc.errors.InputError: path = ring.json: must end in .pyfg or .g2o. Rename or convert the file.
     """
     suffix = given_path(path).suffix
     if suffix not in GRAPHS and (fetched := find("coopoc.readers", "fetched")(str(path))):

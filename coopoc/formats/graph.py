@@ -1,4 +1,4 @@
-"""Graph: the vertices and measurements of a PyFG, g2o or JRL file, and the rules that they keep."""
+"""Graph: the vertices and measurements of a PyFG or g2o file, and the rules that they keep."""
 
 from __future__ import annotations
 

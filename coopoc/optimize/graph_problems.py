@@ -36,7 +36,7 @@ RELAXED = 400
 def read_graph(
     path: str | Path, objective: Objective = "chordal", start: Start = "auto", repair: bool = False
 ) -> Problem:
-    """The problem of a PyFG, g2o or JRL file; see `from_graph` and, of `repair`, `coopoc.formats.load_graph`.
+    """The problem of a PyFG or g2o file; see `from_graph` and, of `repair`, `coopoc.formats.load_graph`.
 
     Raises:
         InputError: a line that is wrong, with file and number; an unknown suffix, objective or start.

@@ -47,12 +47,12 @@ def solve_file(
     repair: bool = False,
     covariance: bool = False,
 ) -> int:
-    """Solve the factor graph of a PyFG, g2o or JRL file.
+    """Solve the factor graph of a PyFG or g2o file.
 
     Example: coopoc solve drive.pyfg --backend gtsam --output solution.json
 
     Args:
-        file: graph in .pyfg, .g2o or .jrl.
+        file: graph in .pyfg or .g2o.
         backend: solver (see coopoc check).
         objective: chordal (quadratic, can be certified), or geodesic with the full covariances.
         start: point where the solve begins, see docs/optimize.md; auto takes the lowest cost of all.
