@@ -30,7 +30,7 @@ FOUND = {
     "range offset": "m",
     "slips": "of the steps",
 }
-LEVELS = ("range", "azimuth", "inclination", "fix", "motion")
+LEVELS = ("range", "azimuth", "inclination", "fix", "motion", "message")
 NOTED = (0.01, 0.01, 0.01, 0.1, 0.01)
 """Least of what is found that is worth a note."""
 LOUD = 1.5

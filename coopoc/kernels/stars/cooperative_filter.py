@@ -313,7 +313,7 @@ def add_fix(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
         expect(f.h, c, own[FIX + c], level * own[FIX_VARIANCE + c])
     q = innovate(f.g, f.h)
     if f.vague[0] == 0.0:
-        learn_fix(f)
+        learn_fix(f, FIXES)
     f.q[0, 3] = share = use_fix(f, model, guards, 0, True, q)
     f.hits[0, 0] = f.hits[0, 0] + 1 if share < 1.0 else 0
     corrected(f)

@@ -17,6 +17,7 @@ from .cooperative_state import (
     COUNT,
     FIXES,
     LAST,
+    MESSAGES,
     MEAN,
     NO_POSITION,
     ODOMETER,
@@ -51,7 +52,7 @@ from .gaussian import (
     update,
 )
 from .messages import three_of
-from .otherwise import drive, hold, score, turned
+from .otherwise import drive, hold, learn_fix, score, turned
 
 FADES = 5.0
 """s, after which a fix weighs 1 / e in the mean that is sent."""
@@ -152,7 +153,10 @@ def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> No
     for c in range(3):
         g.p[first + c, first + c] += half * often * rows[row, STEP + c]
     if content(f, model, rows, k, sent, steps, again, follows):
-        f.q[k, 3] = use_fix(f, model, guards, k, again, innovate(g, f.h))
+        q = innovate(g, f.h)
+        if again and f.vague[k] == 0.0 and status[TRUSTED] > 0.0 and f.h.used[0] and f.h.used[1] and f.h.used[2]:
+            learn_fix(f, MESSAGES)
+        f.q[k, 3] = use_fix(f, model, guards, k, again, q)
     for c in range(3):
         g.p[first + c, first + c] += (1.0 - half) * often * rows[row, STEP + c]
         status[LAST + c], status[LAST + 3 + c] = rows[row, SOLO + c], rows[row, SOLO_VARIANCE + c]
@@ -181,7 +185,7 @@ def content(
         new, z, h.used[c] = weight - old, rows[row, SOLO + c], False
         if new < NOTHING_NEW * weight or weight * NO_POSITION < 1.0:
             continue
-        white = model.white[c] / new
+        white = model.white[c] / new * math.exp(f.level[0, MESSAGES])
         if old > 0.0:
             z = carried + (z - carried) * weight / new
         else:
@@ -239,7 +243,7 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
         if h.used[c]:
             own, noise = own + h.cov[4 * c], noise + h.variance[c]
     share = 1.0
-    quiet = math.exp(-min(f.level[0, FIXES], 0.0)) if k == 0 else 1.0
+    quiet = math.exp(-min(f.level[0, FIXES if k == 0 else MESSAGES], 0.0))
     q *= (own + noise) / (own + quiet * noise)  # fixes that agree better than is assumed are as wrong as any, together
     if guards.fix_gate > 0.0:
         share = 1.0 / inflation(q, guards.fix_gate, f.locked[k])

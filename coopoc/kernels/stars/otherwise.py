@@ -288,16 +288,17 @@ def learn(f: Filter, kind: int, more: float, share: float, numbers: float) -> No
 
 
 @part
-def learn_fix(f: Filter) -> None:
-    """Count the innovation of the ego's fix."""
+def learn_fix(f: Filter, kind: int) -> None:
+    """Count the innovation of a fix."""
     h, square, r, s = f.h, 0.0, 0.0, 0.0
     for c in range(3):
         square += h.gap[c] * h.gap[c]
         r += h.variance[c]
         s += h.variance[c] + h.cov[4 * c]
     more = min(square / s, SUDDEN) - 1.0
-    learn(f, FIXES, more, r / s, 3.0)
-    learn(f, MOTIONS, more, f.made[0] / s, 3.0)
+    learn(f, kind, more, r / s, 3.0)
+    if kind == FIXES:
+        learn(f, MOTIONS, more, f.made[0] / s, 3.0)
 
 
 @part
