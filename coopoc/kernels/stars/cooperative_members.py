@@ -15,7 +15,6 @@ from .cooperative_state import (
     MOTION,
     MOTION_VARIANCE,
     PACE,
-    REVOKED,
     SINCE,
     SLIPPED,
     SLIPS,
@@ -47,12 +46,8 @@ def leave(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, ve
     for i in range(count):
         if f.slot[vehicles[i]] >= 0:
             f.row[f.slot[vehicles[i]]] = i
-    ego, again = f.vehicle[0], guards.trust > 0.0 and f.step[0] > 0 and not math.isnan(own[FIX]) and lost(f)
-    young = f.status[ego, TRUSTED] > 0.0
+    again = guards.trust > 0.0 and f.step[0] > 0 and not math.isnan(own[FIX]) and lost(f)
     again = again and start(f, model, guards, own, rows, count)
-    if again and young:
-        doubt(f, model, guards, ego)
-        f.status[ego, REVOKED] += 1.0
     for k in range(1, len(f.vehicle)):
         j = f.vehicle[k]
         if j < 0 or (f.row[k] >= 0 and not again and not contradicted(f, guards, k)):
