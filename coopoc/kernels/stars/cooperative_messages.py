@@ -249,7 +249,7 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
     if guards.fix_gate > 0.0:
         share = 1.0 / inflation(q, guards.fix_gate, f.locked[k])
         f.locked[k] = count(q, guards.fix_gate, f.locked[k], own / (own + noise))
-    score(f, h, FIX_SCORE, True)
+    score(f, h, FIX_SCORE / math.sqrt(1.0 + f.hits[0, 0]) if k == 0 else FIX_SCORE, True)
     correct(g, h, share)
     hold(f, share)
     return share

@@ -100,14 +100,14 @@ class Guards(NamedTuple):
     sure: float = 2.0
     penalty: float = 4.0
     window: float = 30.0
-    revoke: float = 3.0
+    revoke: float = 2.0
     forget: float = 10.0
     acceleration: float = 5.0
     heading: float = 0.1
     scale: float = 0.1
     lasts: float = 1e5
     compass: float = 0.05
-    offset: float = 0.15
+    offset: float = 0.5
     absent: float = 8.0
     slip: float = 0.7
     fix: float = 1.0
