@@ -82,7 +82,7 @@ def test_wrong_ranges_cost_little_and_are_named() -> None:
 
 
 def test_an_offset_of_all_ranges_is_a_state() -> None:
-    """Delays of a radio, the same for a whole run; taken for exact they cost more than cooperation brings."""
+    """Delays of a radio, the same for a whole run, are estimated; less well where nobody states that there are any."""
     fleet, told = drive(300), replace(S2, range_offset_std=1.0)
     seen, longer = (observe(fleet, each, V2X(6), runs=4, observers=[0, 3]) for each in (S2, told))
     added = (longer.relative - seen.relative)[..., 0]
@@ -96,8 +96,8 @@ def test_an_offset_of_all_ranges_is_a_state() -> None:
     clean, taken, state = (
         float(rt_le(CooperativeFilter(model or "nominal")(given), fleet).mean()) for model, given in cases
     )
-    assert taken > 1.5 * clean
-    assert state < 1.1 * clean
+    assert taken < 1.15 * clean
+    assert state < 1.05 * clean
 
 
 def test_a_lost_message_costs_no_more_than_the_message() -> None:

@@ -181,7 +181,7 @@ class Oracle:
         }
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.guards.trust else {self.ego}
-        levels = {"level": np.zeros(5), "learned": np.zeros(5), "information": np.zeros(5), "made": 0.0}
+        levels = {"level": np.zeros(6), "learned": np.zeros(6), "information": np.zeros(6), "made": 0.0}
         levels |= {"slips": 0.0, "speed": 0.0, "score": 0.0, "numbers": 0, "squares": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
@@ -286,12 +286,8 @@ class Oracle:
             s["trusted"].add(self.ego)
             again = self.start(t, fix, messages, relative)
         else:
-            young = self.ego in s["trusted"]
             again = bool(g.trust and np.isfinite(fix).all() and self.lost(t))
             again = again and self.start(t, fix, messages, relative)
-            if again and young:
-                self.revoked[self.ego] = self.revoked.get(self.ego, 0) + 1
-                self.doubt(self.ego)
         for j in list(s["members"]):
             if j not in others or again or self.contradicted(t, j):
                 if j in others and j not in s["trusted"]:
@@ -331,21 +327,25 @@ class Oracle:
         if g.forget:
             step = np.clip(s["learned"] / (s["information"] + PRIOR), -FASTEST, FASTEST)
             s["level"] = np.clip(s["level"] + step, QUIETEST, LOUDEST)
-        s["learned"] = np.zeros(5)
+        s["learned"] = np.zeros(6)
         s["information"] = s["information"] * (math.exp(-dt / g.forget) if g.forget else 1.0)
 
     def add_fix(self, t: int, fix: Floats) -> None:
         s, louder = self.state, math.exp(self.state["level"][3])
         rows = [(self.fix_terms(self.ego), fix[c], louder * self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
         if self.ego not in s["vague"]:
-            _, gap, cov, r = self.mahalanobis(s["belief"], rows)
-            total = np.trace(cov) + r.sum()
-            more = min(gap @ gap / total, SUDDEN) - 1.0
-            self.learn(3, more, r.sum() / total, 3)
-            self.learn(4, more, s["made"] / total, 3)
+            self.learn_fix(3, rows)
         share = self.use_fix(t, self.ego, rows, True)
         s["hits"]["fix"] = s["hits"]["fix"] + 1 if share < 1 else 0
         self.corrected()
+
+    def learn_fix(self, kind: int, rows: list[Any]) -> None:
+        _, gap, cov, r = self.mahalanobis(self.state["belief"], rows)
+        total = np.trace(cov) + r.sum()
+        more = min(gap @ gap / total, SUDDEN) - 1.0
+        self.learn(kind, more, r.sum() / total, 3)
+        if kind == 3:
+            self.learn(4, more, self.state["made"] / total, 3)
 
     def mahalanobis(self, b: Belief, rows: list[Any]) -> tuple[float, Floats, Floats, Floats]:
         """Squared distance and innovations of rows, their covariance without noise, and the noise's variance."""
@@ -376,8 +376,9 @@ class Oracle:
             return 0.0
         gap, own = z - h @ b.x, h @ b.p @ h.T
         square = float(gap @ np.linalg.solve(own + np.diag(r), gap))
-        self.count(min(square, FIX_SCORE), np.linalg.slogdet(own + np.diag(r))[1], len(used))
-        quiet = math.exp(-min(s["level"][3], 0.0)) if j == self.ego else 1.0
+        before = s["hits"]["fix"] if j == self.ego else 0
+        self.count(min(square, FIX_SCORE / math.sqrt(1 + before)), np.linalg.slogdet(own + np.diag(r))[1], len(used))
+        quiet = math.exp(-min(s["level"][3 if j == self.ego else 5], 0.0))
         total, gain, locked = np.trace(own) + r.sum(), np.trace(own) / (np.trace(own) + r.sum()), s["locked"]
         q = min(square, float(gap @ gap) / SLIP) * total / (np.trace(own) + quiet * r.sum())
         share, hits = 1.0, locked.get(j, 0.0)
@@ -614,9 +615,10 @@ class Oracle:
         self.drive(j, gap * dt * u, gap)
         half, spent = (1 + 1 / steps) / 2, (steps if follows else gap**2) * q
         b.noise(("x", j), half * spent)
-        self.use_fix(
-            t, j, [self.said(message, last, j, q, moved, steps, follows, c) for c in range(3)], last is not None
-        )
+        rows = [self.said(message, last, j, q, moved, steps, follows, c) for c in range(3)]
+        if last and j not in s["vague"] and j in s["trusted"] and None not in rows:
+            self.learn_fix(5, rows)
+        self.use_fix(t, j, rows, last is not None)
         b.noise(("x", j), (1 - half) * spent)
         s["last"][j], s["since"][j] = message, message.step
         return message._replace(process=q)
@@ -628,7 +630,8 @@ class Oracle:
         old = old if weight > old * (1 - 1e-9) else 0.0
         if weight - old <= 1e-9 * weight or not weight:
             return None
-        white, long = self.white[c] / (weight - old), 1 / (1 - fade**2)
+        louder, long = math.exp(self.state["level"][5]), 1 / (1 - fade**2)
+        white = louder * self.white[c] / (weight - old)
         if old:
             before = last.mean[c] + moved[c]
             z = before + (z - before) * weight / (weight - old)

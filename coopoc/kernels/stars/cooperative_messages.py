@@ -23,7 +23,6 @@ from .cooperative_state import (
     ODOMETER,
     PACE,
     REVOKED,
-    SCATTER,
     SLIPS,
     SOLO,
     SOLO_VARIANCE,
@@ -264,17 +263,12 @@ def wrong_on_average(f: Filter, model: Model, guards: Guards, k: int, q: float) 
     status[j, COUNT] = count = min(status[j, COUNT] + 1.0, guards.window)
     if status[j, TRUSTED] == 0.0 and q > guards.fix_gate:
         return True
-    clip, square, size = math.sqrt(CLIP / q) if q > CLIP else 1.0, 0.0, 0.0
+    clip = math.sqrt(CLIP / q) if q > CLIP else 1.0
     for c in range(3):
-        square += (clip * h.gap[c]) ** 2
         mean[c] += (clip * h.gap[c] - mean[c]) / count
-        size += mean[c] ** 2
-    status[j, SCATTER] += (square - status[j, SCATTER]) / count
-    scatter = (status[j, SCATTER] - size) / 3.0 * count / max(count - 1.0, 1.0)
-    for c in range(3):
         for d in range(3):
             s[c, d] = h.cov[3 * c + d]
-        s[c, c] += max(h.variance[c], scatter) / count + (1.0 if model.own > 0.0 else 0.0)
+        s[c, c] += h.variance[c] / count + (1.0 if model.own > 0.0 else 0.0)
     odds = math.log((1.0 - guards.share) / guards.share)
     near, narrow = distance(s, mean)
     if count < 3.0 or near < 2.0 * (odds + guards.revoke):

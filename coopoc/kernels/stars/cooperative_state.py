@@ -38,7 +38,7 @@ FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, OWN = 0, 3, 6, 9, 12, 13
 RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
 """Of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none held), mean of its fixes m and its
 variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that of a fix m^2."""
-TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, REVOKED, SCATTER, STATUS = (
+TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, REVOKED, STATUS = (
     0,
     1,
     2,
@@ -50,7 +50,6 @@ TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, REVOK
     27,
     28,
     29,
-    30,
     32,
 )
 """Of a vehicle's status: whether its fixes are assumed to be right, fixes in the mean innovation, when its last message
