@@ -84,7 +84,7 @@ release: $(READY)
 		--group=0 --numeric-owner --format=ustar -cf - $$name | gzip -9n > $$name.tar.gz && rm -r $$name && cd $(CURDIR) && \
 		$(VENV)/bin/python .ci/wheels.py $$out $(PYTHONS) || exit 1; \
 	done
-	cd dist && sha256sum * | tee SHA256SUMS && cd ../build/first && sha256sum -c ../../dist/SHA256SUMS
+	cd dist && sha256sum coopoc-* | tee SHA256SUMS && cd ../build/first && sha256sum -c ../../dist/SHA256SUMS
 	$(VENV)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --of JSON \
 		-o dist/coopoc.cdx.json $(VENV)/bin/python
 	.ci/hashes $(VENV)/bin/python dist/requirements.txt

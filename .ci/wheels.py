@@ -26,7 +26,7 @@ def run(*command: object) -> None:
 
 def environment(interpreter: str, pure: Path) -> Path:
     """Python of an environment with the wheel and what it needs, pinned."""
-    python = ROOT / "build" / "wheels" / Path(interpreter).name / "bin" / "python"
+    python = ROOT / "build" / "wheels" / interpreter.replace("/", "_") / "bin" / "python"
     if not python.exists():
         run(interpreter, "-m", "venv", python.parents[1])
     install = python, "-m", "pip", "install", "--quiet", "--disable-pip-version-check", "-c", "constraints.txt"
