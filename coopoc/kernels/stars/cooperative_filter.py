@@ -130,38 +130,59 @@ def run_filter(
     neighbours, notes = np.empty((runs, links, 3)), np.empty((runs, links, 5))
     found = np.zeros((runs, steps, FOUND))
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
+    out = x, cov, neighbours, fixes, notes, found
     for run in range(runs):
-        f = new_filter(1 + most, vehicles)
-        tries = new_tries(1 + most, vehicles)
-        for t in range(steps):
-            first = measurements.start[t]
-            count = measurements.start[t + 1] - first
-            gather_own(own, measurements, assumed, model.white, run, t)
-            for i in range(count):
-                who[i] = measurements.neighbour[first + i]
-                gather_neighbour(rows, measurements, assumed, sent, run, t, first + i, i)
-            if math.isnan(own[MOTION]) or (f.g.vectors[0] == 0 and math.isnan(own[FIX])):
-                pause(f, own[DT])
-                x[run, t], cov[run, t] = math.nan, math.nan
-                continue
-            if f.g.vectors[0] == 0:
-                begin(f, model, guards, own, rows, count, measurements.ego)
-            step(f, tries, model, guards, own, rows, who, count)
-            fixes[run, t] = f.member[0, OUT + 3]
-            for i in range(FOUND):
-                found[run, t, i] = f.ego[TOLD + i]
+        f, tries = new_filter(1 + most, vehicles), new_tries(1 + most, vehicles)
+        filter_run(f, tries, measurements, assumed, sent, model, guards, own, rows, who, run, out)
+    return out
+
+
+@part
+def filter_run(
+    f: Filter,
+    tries: Tries,
+    measurements: Measurements,
+    assumed: Assumptions,
+    sent: Sent,
+    model: Model,
+    guards: Guards,
+    own: Floats,
+    rows: Floats,
+    who: Ints,
+    run: int,
+    out: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
+) -> None:
+    """One run, from a filter before its first step; the arguments of `run_filter`, memory of a step, and what it
+    returns."""
+    x, cov, neighbours, fixes, notes, found = out
+    for t in range(len(measurements.start) - 1):
+        first = measurements.start[t]
+        count = measurements.start[t + 1] - first
+        gather_own(own, measurements, assumed, model.white, run, t)
+        for i in range(count):
+            who[i] = measurements.neighbour[first + i]
+            gather_neighbour(rows, measurements, assumed, sent, run, t, first + i, i)
+        if math.isnan(own[MOTION]) or (f.g.vectors[0] == 0 and math.isnan(own[FIX])):
+            pause(f, own[DT])
+            x[run, t], cov[run, t] = math.nan, math.nan
+            continue
+        if f.g.vectors[0] == 0:
+            begin(f, model, guards, own, rows, count, measurements.ego)
+        step(f, tries, model, guards, own, rows, who, count)
+        fixes[run, t] = f.member[0, OUT + 3]
+        for i in range(FOUND):
+            found[run, t, i] = f.ego[TOLD + i]
+        for c in range(3):
+            x[run, t, c] = f.ego[ANSWER + c]
+            for d in range(3):
+                cov[run, t, c, d] = f.ego[ANSWER + 3 + 3 * c + d]
+        for i in range(count):
+            k = f.slot[who[i]]
             for c in range(3):
-                x[run, t, c] = f.ego[ANSWER + c]
-                for d in range(3):
-                    cov[run, t, c, d] = f.ego[ANSWER + 3 + 3 * c + d]
-            for i in range(count):
-                k = f.slot[who[i]]
-                for c in range(3):
-                    neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c]
-                    notes[run, first + i, c] = weight(f.member[k, OUT + c], guards.gate)
-                notes[run, first + i, 3] = f.member[k, OUT + 3]
-                notes[run, first + i, 4] = f.status[who[i], TRUSTED]
-    return x, cov, neighbours, fixes, notes, found
+                neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c]
+                notes[run, first + i, c] = weight(f.member[k, OUT + c], guards.gate)
+            notes[run, first + i, 3] = f.member[k, OUT + 3]
+            notes[run, first + i, 4] = f.status[who[i], TRUSTED]
 
 
 @inside

@@ -7,7 +7,7 @@ import math
 import numpy as np
 
 from ...arrays import Floats
-from ..compiling.compile import compiled, inside, part
+from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import add_diagonal, scale
 from ..dead_reckoning import ROUNDING
 from ..gate import SLIP, count, inflation
@@ -139,7 +139,7 @@ def remember(memory: Floats, moved: Floats, fix: Floats, variance: Floats, dt: f
             memory[c] += (fix[c] - memory[c]) / (variance[c] * memory[3 + c])
 
 
-@inside
+@inner
 def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None:
     """Move member k to where it was when it sent its newest message, and use what its fixes have said until then.
 
@@ -222,7 +222,7 @@ def goes_on(f: Filter, rows: Floats, k: int) -> bool:
     return bool(age > ROUNDING)
 
 
-@inside
+@inner
 def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: float) -> float:
     """Update by the rows of a vehicle's fix, unless its receiver errs otherwise than is assumed; the share of its
     information that it keeps.
