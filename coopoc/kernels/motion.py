@@ -110,11 +110,13 @@ def process_variances(noise: MotionNoise, velocity: Floats, use: AnyArray, longe
             for n in range(vehicles):
                 if use[run, t, n] == UNUSED:
                     continue
-                own[:], since = square[n], (t - last[n]) * dt
-                if since > longest + 1e-9:
-                    own[:] = math.nan
+                since = (t - last[n]) * dt
+                for c in range(3):
+                    own[c] = square[n, c] if since <= longest + 1e-9 else math.nan
                 keep_pace(own, velocity[run, last[n], n], since)
                 process_variance(noise, own, velocity[run, t, n], dt, variance[run, t, n])
                 if use[run, t, n] == HELD:
-                    square[n], last[n] = own, t
+                    last[n] = t
+                    for c in range(3):
+                        square[n, c] = own[c]
     return variance

@@ -332,8 +332,8 @@ class Robust:
     def reserve(self, slots: int, vehicles: int) -> None:
         """Room for a star of that many members, of that many vehicles."""
         (f,) = self.filters
-        if slots > len(f.vehicle) or vehicles > len(f.slot):
-            self._copy(max(len(f.vehicle), 2 * slots), vehicles)
+        if slots > len(f.who) or vehicles > len(f.slot):
+            self._copy(max(len(f.who), 2 * slots), vehicles)
 
     def _copy(self, slots: int, vehicles: int) -> None:
         (f,) = self.filters
@@ -343,7 +343,7 @@ class Robust:
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Arrays that share memory have come apart in the pickle."""
         self.__dict__.update(state)
-        self._copy(len(self.filters[0].vehicle), len(self.filters[0].slot))
+        self._copy(len(self.filters[0].who), len(self.filters[0].slot))
 
     def step(self, own: Floats, rows: Floats, vehicles: Ints, last: Floats) -> Floats:
         """Answer of `stream_step`."""

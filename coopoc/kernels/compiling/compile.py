@@ -182,7 +182,10 @@ def _made(function: Function, liberties: set[str], part: bool = False, **options
 
 
 def _within(function: Function, liberties: set[str], **options: bool) -> Function:
-    return cast(Function, _made(function, liberties, True, **options))
+    made = _made(function, liberties, True, **options)
+    if hooks := _hooks():
+        hooks[0].for_any_number(made)
+    return cast(Function, made)
 
 
 def _kept(function: Function, liberties: set[str]) -> Function:

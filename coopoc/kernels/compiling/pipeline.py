@@ -3,6 +3,7 @@
 from typing import Any
 
 from numba._dynfunc import make_function
+from numba.core import types
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import CompilerBase, DefaultPassBuilder, Flags
 
@@ -57,3 +58,11 @@ class Kernel(CompilerBase):
 
 
 Part: Any = type("Part", (Kernel,), {"is_part": True})
+
+
+def for_any_number(part: Any) -> None:
+    """Compile a part once for all integers and truth values, not once more for each constant that a caller gives."""
+    typed = part.get_call_template
+    part.get_call_template = lambda args, kws: typed(
+        [types.unliteral(kind) for kind in args], {name: types.unliteral(kind) for name, kind in kws.items()}
+    )

@@ -20,24 +20,40 @@ from .cooperative_members import join, leave, predict, steady
 from .cooperative_messages import fix_terms, goes_on, receive, trust, use_fix
 from .cooperative_state import (
     AGE,
+    ANSWER,
+    AT,
     AZIMUTHS,
+    CLOCK,
     DT,
     FIX,
     FIX_VARIANCE,
     FIXES,
     FOUND,
+    HITS,
     INCLINATIONS,
+    INPUT,
+    JOINED,
+    LEVEL,
     MOTION,
     MOTION_VARIANCE,
     ODOMETER,
+    ORDER,
+    OUT,
     OWN,
     RANGES,
     SOLO,
     SOLO_VARIANCE,
+    SPAN,
     SPEED,
     STEP,
+    STEPS,
+    TOLD,
     TRUSTED,
     TYPICAL,
+    VAGUE,
+    VEHICLE,
+    WAY,
+    WHEN,
     WIDTH,
     Filter,
     Guards,
@@ -51,8 +67,15 @@ from .cooperative_state import (
 )
 from .gaussian import (
     COMPASS,
+    LIMIT,
+    MEASURED,
     PLACE,
+    TERMS,
     TURN,
+    TURNED,
+    VARIANCE,
+    Q,
+    Z,
     correct,
     expect,
     has,
@@ -107,36 +130,59 @@ def run_filter(
     neighbours, notes = np.empty((runs, links, 3)), np.empty((runs, links, 5))
     found = np.zeros((runs, steps, FOUND))
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
+    out = x, cov, neighbours, fixes, notes, found
     for run in range(runs):
-        f = new_filter(1 + most, vehicles)
-        tries = new_tries(1 + most, vehicles)
-        for t in range(steps):
-            first = measurements.start[t]
-            count = measurements.start[t + 1] - first
-            gather_own(own, measurements, assumed, model.white, run, t)
-            for i in range(count):
-                who[i] = measurements.neighbour[first + i]
-                gather_neighbour(rows, measurements, assumed, sent, run, t, first + i, i)
-            if math.isnan(own[MOTION]) or (f.g.vectors[0] == 0 and math.isnan(own[FIX])):
-                pause(f, own[DT])
-                x[run, t], cov[run, t] = math.nan, math.nan
-                continue
-            if f.g.vectors[0] == 0:
-                begin(f, model, guards, own, rows, count, measurements.ego)
-            step(f, tries, model, guards, own, rows, who, count)
-            fixes[run, t], found[run, t] = f.q[0, 3], f.told
+        f, tries = new_filter(1 + most, vehicles), new_tries(1 + most, vehicles)
+        filter_run(f, tries, measurements, assumed, sent, model, guards, own, rows, who, run, out)
+    return out
+
+
+@part
+def filter_run(
+    f: Filter,
+    tries: Tries,
+    measurements: Measurements,
+    assumed: Assumptions,
+    sent: Sent,
+    model: Model,
+    guards: Guards,
+    own: Floats,
+    rows: Floats,
+    who: Ints,
+    run: int,
+    out: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
+) -> None:
+    """One run, from a filter before its first step; the arguments of `run_filter`, memory of a step, and what it
+    returns."""
+    x, cov, neighbours, fixes, notes, found = out
+    for t in range(len(measurements.start) - 1):
+        first = measurements.start[t]
+        count = measurements.start[t + 1] - first
+        gather_own(own, measurements, assumed, model.white, run, t)
+        for i in range(count):
+            who[i] = measurements.neighbour[first + i]
+            gather_neighbour(rows, measurements, assumed, sent, run, t, first + i, i)
+        if math.isnan(own[MOTION]) or (f.g.vectors[0] == 0 and math.isnan(own[FIX])):
+            pause(f, own[DT])
+            x[run, t], cov[run, t] = math.nan, math.nan
+            continue
+        if f.g.vectors[0] == 0:
+            begin(f, model, guards, own, rows, count, measurements.ego)
+        step(f, tries, model, guards, own, rows, who, count)
+        fixes[run, t] = f.member[0, OUT + 3]
+        for i in range(FOUND):
+            found[run, t, i] = f.ego[TOLD + i]
+        for c in range(3):
+            x[run, t, c] = f.ego[ANSWER + c]
+            for d in range(3):
+                cov[run, t, c, d] = f.ego[ANSWER + 3 + 3 * c + d]
+        for i in range(count):
+            k = f.slot[who[i]]
             for c in range(3):
-                x[run, t, c] = f.answer[c]
-                for d in range(3):
-                    cov[run, t, c, d] = f.answer[3 + 3 * c + d]
-            for i in range(count):
-                k = f.slot[who[i]]
-                for c in range(3):
-                    neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.way[k, c]
-                    notes[run, first + i, c] = weight(f.q[k, c], guards.gate)
-                notes[run, first + i, 3] = f.q[k, 3]
-                notes[run, first + i, 4] = f.status[who[i], TRUSTED]
-    return x, cov, neighbours, fixes, notes, found
+                neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c]
+                notes[run, first + i, c] = weight(f.member[k, OUT + c], guards.gate)
+            notes[run, first + i, 3] = f.member[k, OUT + 3]
+            notes[run, first + i, 4] = f.status[who[i], TRUSTED]
 
 
 @inside
@@ -201,10 +247,10 @@ def step(
         copy_filter(f, tries.before)
         copy_rows(own, rows, tries.own, tries.rows, count)
     for now in range(2):  # what is copied into a loop is compiled once
-        f.slip[NOW], f.slip[LIKELY], f.slip[NUMBERS], f.slip[SQUARES] = now, 0.0, 0.0, 0.0
+        f.ego[NOW], f.ego[LIKELY], f.ego[NUMBERS], f.ego[SQUARES] = now, 0.0, 0.0, 0.0
         attempt(f, model, guards, own, rows, vehicles, count)
         if now == 0 and not (slips and surprised(f)):
-            f.slip[SLIPPED] = 0.0
+            f.ego[SLIPPED] = 0.0
             break
         if now == 0:
             copy_filter(f, tries.first)
@@ -214,7 +260,7 @@ def step(
             probably = chance(f, tries.first, dt)
             if probably < 0.5:
                 copy_filter(tries.first, f)
-            f.slip[SLIPPED] = probably
+            f.ego[SLIPPED] = probably
     average(f, model)
 
 
@@ -233,37 +279,37 @@ def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, 
     """Predict and update."""
     leave(f, model, guards, own, rows, vehicles, count)
     louder(f, own, rows, count)
-    f.clock[1] = own[DT]
-    if f.step[0] > 0:
-        f.clock[0] += own[DT]
-    steady(f, guards, f.vehicle[0], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
-    if f.step[0] > f.joined[0]:
+    f.ego[SPAN] = own[DT]
+    if f.ego[STEPS] > 0:
+        f.ego[CLOCK] += own[DT]
+    steady(f, guards, f.who[0, VEHICLE], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
+    if f.ego[STEPS] > f.member[0, JOINED]:
         predict(f, model, guards, own)
     moved(f, own)
     for i in range(count):
         if f.slot[vehicles[i]] < 0:
             join(f, model, guards, rows, vehicles[i], i)
-    for k in range(len(f.vehicle)):
+    for k in range(len(f.who)):
         for c in range(4):
-            f.q[k, c] = math.nan
+            f.member[k, OUT + c] = math.nan
     add_fix(f, model, guards, own)
     locate(f)
     members = nearest_first(f)
     for i in range(members):
-        k = f.order[i]
-        new = f.vague[k] > 0.0 and rows[f.row[k], AGE] >= 0.0
-        if not (new and guards.trust > 0.0 and measured_whole(rows, f.row[k])):
+        k = f.who[i, ORDER]
+        new = f.member[k, VAGUE] > 0.0 and rows[f.who[k, INPUT], AGE] >= 0.0
+        if not (new and guards.trust > 0.0 and measured_whole(rows, f.who[k, INPUT])):
             receive(f, model, guards, rows, k)
         goes_on(f, rows, k)
     locate(f)
     members = nearest_first(f)
     measure(f, model, guards, rows, members)
     for i in range(members):
-        receive(f, model, guards, rows, f.order[i])
-        goes_on(f, rows, f.order[i])
+        receive(f, model, guards, rows, f.who[i, ORDER])
+        goes_on(f, rows, f.who[i, ORDER])
     if guards.trust > 0.0:
         trust(f, model, guards)
-    f.step[0] += 1
+    f.ego[STEPS] += 1
     corrected(f)
     adapt(f, guards)
 
@@ -272,23 +318,23 @@ def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, 
 def locate(f: Filter) -> None:
     """Relative measurements are linear where the members are now."""
     g = f.g
-    for k in range(len(f.vehicle)):
-        if f.vehicle[k] >= 0:
+    for k in range(len(f.who)):
+        if f.who[k, VEHICLE] >= 0:
             for c in range(3):
-                f.at[k, c] = g.x[3 * g.block[k, PLACE] + c] + f.way[k, c]
+                f.member[k, AT + c] = g.x[3 * g.block[k, PLACE] + c] + f.member[k, WAY + c]
 
 
 @inside
 def nearest_first(f: Filter) -> int:
     """Sort the members by their distance; how many there are."""
     members = 0
-    for k in range(1, len(f.vehicle)):
-        if f.vehicle[k] >= 0:
+    for k in range(1, len(f.who)):
+        if f.who[k, VEHICLE] >= 0:
             i = members
-            while i > 0 and gap2(f, f.order[i - 1]) > gap2(f, k):
-                f.order[i] = f.order[i - 1]
+            while i > 0 and gap2(f, f.who[i - 1, ORDER]) > gap2(f, k):
+                f.who[i, ORDER] = f.who[i - 1, ORDER]
                 i -= 1
-            f.order[i] = k
+            f.who[i, ORDER] = k
             members += 1
     return members
 
@@ -298,24 +344,24 @@ def gap2(f: Filter, k: int) -> float:
     """Squared distance of a member, m^2."""
     total = 0.0
     for c in range(3):
-        total += (f.at[k, c] - f.at[0, c]) ** 2
+        total += (f.member[k, AT + c] - f.member[0, AT + c]) ** 2
     return total
 
 
 @inside
 def add_fix(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
     """The ego's fix: its position, the error of its receiver, and the one that all share."""
-    level = math.exp(f.level[0, FIXES])
+    level = math.exp(f.ego[LEVEL + FIXES])
     if math.isnan(own[FIX]):
         return
     fix_terms(f, 0)
     for c in range(3):
         expect(f.h, c, own[FIX + c], level * own[FIX_VARIANCE + c])
     q = innovate(f.g, f.h)
-    if f.vague[0] == 0.0:
+    if f.member[0, VAGUE] == 0.0:
         learn_fix(f, FIXES)
-    f.q[0, 3] = share = use_fix(f, model, guards, 0, True, q)
-    f.hits[0, 0] = f.hits[0, 0] + 1 if share < 1.0 else 0
+    f.member[0, OUT + 3] = share = use_fix(f, model, guards, 0, True, q)
+    f.who[0, HITS] = f.who[0, HITS] + 1 if share < 1.0 else 0
     corrected(f)
 
 
@@ -332,7 +378,7 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
             g.p[j, i] = 0.0
         g.x[i], g.p[i, i] = 0.0, model.heading
     for m in range(members):
-        weigh(f, model, guards, rows, f.order[m])
+        weigh(f, model, guards, rows, f.who[m, ORDER])
 
 
 @inside
@@ -341,33 +387,35 @@ def weigh(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None
     g, h = f.g, f.h
     if not relate(f, model, guards, rows, k):
         return
-    if f.vague[k] > 0.0:
-        settle(g, h, k, f.vague[k])
-        f.vague[k] = f.q[k, 0] = f.q[k, 1] = f.q[k, 2] = 0.0
+    if f.member[k, VAGUE] > 0.0:
+        settle(g, h, k, f.member[k, VAGUE])
+        f.member[k, VAGUE] = f.member[k, OUT] = f.member[k, OUT + 1] = f.member[k, OUT + 2] = 0.0
         return
     innovate(g, h)
     score(f, h, GATE, False)
     correct(g, h, 1.0)
     for c in range(3):
-        if h.used[c]:
-            f.q[k, c] = h.q[c]
+        if h.block[MEASURED + c]:
+            f.member[k, OUT + c] = h.three[Q + c]
             learn_relative(f, c)
-            f.hits[k, c] = f.hits[k, c] + 1 if 0.0 < guards.gate < h.q[c] else 0
+            f.who[k, HITS + c] = f.who[k, HITS + c] + 1 if 0.0 < guards.gate < h.three[Q + c] else 0
 
 
 @inside
 def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> bool:
     """Rows of range, azimuth and inclination of member k in metres, linear at `at`; False if its geometry is not
     known."""
-    g, h, row, std = f.g, f.h, f.row[k], model.std
-    if not measured_whole(rows, row) and f.vague[k] > 0.0:
+    g, h, row, std = f.g, f.h, f.who[k, INPUT], model.std
+    if not measured_whole(rows, row) and f.member[k, VAGUE] > 0.0:
         return False
-    x, y, z = f.at[k, 0] - f.at[0, 0], f.at[k, 1] - f.at[0, 1], f.at[k, 2] - f.at[0, 2]
+    here, there = f.member[0], f.member[k]
+    x, y, z = there[AT] - here[AT], there[AT + 1] - here[AT + 1], there[AT + 2] - here[AT + 2]
     d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
     ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
     reach = max(far, model.min_range)
     flat = max(ground, 1e-3 * reach)
-    h.used[0], h.used[1], h.used[2] = d >= 0.0, sa != 0.0 or ca != 0.0, si != 0.0 or ci != 0.0
+    h.block[MEASURED], h.block[MEASURED + 1] = d >= 0.0, sa != 0.0 or ca != 0.0
+    h.block[MEASURED + 2] = si != 0.0 or ci != 0.0
     w = (
         x / far,
         y / far,
@@ -382,24 +430,24 @@ def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> boo
     turned = angle(sa * x - ca * y, ca * x + sa * y)
     raised = angle(si * z - ci * ground, ci * z + si * ground)
     _, b, c = apply(w, (x, y, z))
-    store(h.z, 0, (d, turned * flat + b, raised * reach + c))
+    store(h.three, Z // 3, (d, turned * flat + b, raised * reach + c))
     a, b, c = (std[0], std[1] * flat, std[2] * reach) if len(std) else (1.0, 1.0, 1.0)
     store(
-        h.variance,
-        0,
+        h.three,
+        VARIANCE // 3,
         (
-            a * a * math.exp(f.level[0, RANGES]),
-            b * b * math.exp(f.level[0, AZIMUTHS]),
-            c * c * math.exp(f.level[0, INCLINATIONS]),
+            a * a * math.exp(f.ego[LEVEL + RANGES]),
+            b * b * math.exp(f.ego[LEVEL + AZIMUTHS]),
+            c * c * math.exp(f.ego[LEVEL + INCLINATIONS]),
         ),
     )
-    store(h.weight, 0, w)
-    store(h.weight, 1, negate(w))
-    store(h.weight, 2, (0.0, 0.0, 1.0, flat, flat, 0.0, 0.0, 0.0, 0.0))
+    store(h.matrix, 0, w)
+    store(h.matrix, 1, negate(w))
+    store(h.matrix, 2, (0.0, 0.0, 1.0, flat, flat, 0.0, 0.0, 0.0, 0.0))
     for c in range(3):
-        h.gate[c] = guards.gate
+        h.three[LIMIT + c] = guards.gate
     h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]
-    h.terms[0] = 3 if has(g, 0, COMPASS) else 2
+    h.block[TERMS] = 3 if has(g, 0, COMPASS) else 2
     if goes_on(f, rows, k):
         add_way(f, guards, rows, k)
     return True
@@ -408,15 +456,15 @@ def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> boo
 @part
 def add_way(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
     """Rows of a member that has moved since it was at its position."""
-    g, h, w, t, n, age = f.g, f.h, f.h.weight, f.h.turn, f.h.terms[0], f.clock[0] - f.since[k]
-    often, changed = (age / f.clock[1]) ** 2, (0.5 * guards.acceleration * age * age) ** 2
+    g, h, w, n, age = f.g, f.h, f.h.matrix, f.h.block[TERMS], f.ego[CLOCK] - f.member[k, WHEN]
+    often, changed = (age / f.ego[SPAN]) ** 2, (0.5 * guards.acceleration * age * age) ** 2
     first = 3 * g.block[k, TURN]
-    h.block[n], h.terms[0] = g.block[k, TURN], n + 1 if has(g, k, TURN) else n
+    h.block[n], h.block[TERMS] = g.block[k, TURN], n + 1 if has(g, k, TURN) else n
     for c in range(3):
         for d in range(3):
             a = w[3 * c + d]
-            h.z[c] -= a * f.way[k, d]
-            h.variance[c] += a * a * (often * rows[f.row[k], STEP + d] + changed)
-            by = w[3 * c] * t[d] + w[3 * c + 1] * t[3 + d] + w[3 * c + 2] * t[6 + d]
+            h.three[Z + c] -= a * f.member[k, WAY + d]
+            h.three[VARIANCE + c] += a * a * (often * rows[f.who[k, INPUT], STEP + d] + changed)
+            by = w[3 * c] * w[TURNED + d] + w[3 * c + 1] * w[TURNED + 3 + d] + w[3 * c + 2] * w[TURNED + 6 + d]
             w[9 * n + 3 * c + d] = by
-            h.z[c] += by * g.x[first + d] if h.terms[0] > n else 0.0
+            h.three[Z + c] += by * g.x[first + d] if h.block[TERMS] > n else 0.0

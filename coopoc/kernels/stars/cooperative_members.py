@@ -8,18 +8,29 @@ from ...arrays import Floats, Ints
 from ..compiling.compile import inside, part
 from .cooperative_state import (
     AGE,
+    CLOCK,
     DT,
     FIX,
+    HITS,
+    INPUT,
+    JOINED,
     KEPT,
     KEPT_VARIANCE,
+    LOCKED,
     MOTION,
     MOTION_VARIANCE,
     PACE,
     SINCE,
     SLIPPED,
     SLIPS,
+    SPAN,
     SPEED,
+    STEPS,
     TRUSTED,
+    VAGUE,
+    VEHICLE,
+    WAY,
+    WHEN,
     Filter,
     Guards,
     Model,
@@ -38,21 +49,20 @@ from .otherwise import drive, slip_variance
 def leave(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Find each member's row; marginalise out those that have none, and remember the error of their fixes.
 
-    A member that the ego's measurements contradict joins anew; where the ego is lost, it starts anew, and all join. Of
-    fixes of which all but the first contradict that one, either may be wrong: they are not trusted until others agree.
+    A member that the ego's measurements contradict joins anew; where the ego is lost, it starts anew, and all join.
     """
-    for k in range(len(f.row)):
-        f.row[k] = ABSENT
+    for k in range(len(f.who)):
+        f.who[k, INPUT] = ABSENT
     for i in range(count):
         if f.slot[vehicles[i]] >= 0:
-            f.row[f.slot[vehicles[i]]] = i
-    again = guards.trust > 0.0 and f.step[0] > 0 and not math.isnan(own[FIX]) and lost(f)
+            f.who[f.slot[vehicles[i]], INPUT] = i
+    again = guards.trust > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX]) and lost(f)
     again = again and start(f, model, guards, own, rows, count)
-    for k in range(1, len(f.vehicle)):
-        j = f.vehicle[k]
-        if j < 0 or (f.row[k] >= 0 and not again and not contradicted(f, guards, k)):
+    for k in range(1, len(f.who)):
+        j = f.who[k, VEHICLE]
+        if j < 0 or (f.who[k, INPUT] >= 0 and not again and not contradicted(f, guards, k)):
             continue
-        if f.row[k] >= 0 and f.status[j, TRUSTED] == 0.0:  # the error was estimated beside a wrong position
+        if f.who[k, INPUT] >= 0 and f.status[j, TRUSTED] == 0.0:  # the error was estimated beside a wrong position
             doubt(f, model, guards, j)
         if has(f.g, k, ERROR):
             first = 3 * f.g.block[k, ERROR]
@@ -61,16 +71,16 @@ def leave(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, ve
                 f.status[j, KEPT_VARIANCE + c] = max(f.g.p[first + c, first + c], 0.01)
         for kind in range(KINDS):
             remove(f.g, k, kind)
-        f.slot[j], f.vehicle[k] = ABSENT, ABSENT
+        f.slot[j], f.who[k, VEHICLE] = ABSENT, ABSENT
 
 
 @inside
 def contradicted(f: Filter, guards: Guards, k: int) -> bool:
     """Whether the ego's measurements of a member have contradicted its position for too long: two components three
     times in a row, or one as often as it agreed before, at most `patience` times."""
-    several, since = 0, f.step[0] - f.joined[k]
+    several, since = 0, f.ego[STEPS] - f.member[k, JOINED]
     for c in range(3):
-        hits = f.hits[k, c]
+        hits = f.who[k, HITS + c]
         several += hits >= 3
         if hits >= min(guards.patience, max(2, since - hits)):
             return True
@@ -86,9 +96,9 @@ def predict(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
     drive(f, model, 0, (own[MOTION], own[MOTION + 1], own[MOTION + 2]), own[DT])
     for c in range(3):
         g.p[first + c, first + c] += own[MOTION_VARIANCE + c] + slip_variance(f, model, own[DT])
-    for k in range(len(f.vehicle)):
-        if f.vehicle[k] >= 0 and has(g, k, ERROR):
-            i, trusted = 3 * g.block[k, ERROR], f.status[f.vehicle[k], TRUSTED] > 0.0
+    for k in range(len(f.who)):
+        if f.who[k, VEHICLE] >= 0 and has(g, k, ERROR):
+            i, trusted = 3 * g.block[k, ERROR], f.status[f.who[k, VEHICLE], TRUSTED] > 0.0
             if trusted:
                 shift(g, i, i, keep - 1.0)
             widen(g, i, model.own * fades)
@@ -111,8 +121,8 @@ def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, varianc
         variance: of one step's motion in the row.
         unit: m/s of what the row holds.
     """
-    dt, status, q = f.clock[1], f.status[j], 0.0
-    changed = (guards.acceleration * max(f.clock[0] - status[SINCE], dt)) ** 2
+    dt, status, q = f.ego[SPAN], f.status[j], 0.0
+    changed = (guards.acceleration * max(f.ego[CLOCK] - status[SINCE], dt)) ** 2
     for c in range(3):
         gap = unit * given[first + c] - status[PACE + c]
         q += gap * gap / ((given[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
@@ -121,7 +131,7 @@ def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, varianc
         for c in range(3):
             given[first + c], given[variance + c] = status[PACE + c] / unit, status[PACE + 3 + c] + changed * dt * dt
         return
-    status[SINCE], status[SLIPS] = f.clock[0], 0.0
+    status[SINCE], status[SLIPS] = f.ego[CLOCK], 0.0
     for c in range(3):
         status[PACE + c], status[PACE + 3 + c] = unit * given[first + c], given[variance + c]
 
@@ -130,14 +140,14 @@ def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, varianc
 def join(f: Filter, model: Model, guards: Guards, rows: Floats, vehicle: int, row: int) -> None:
     """Insert a member where the ego measures it, or, where a component is missing, somewhere near."""
     g, k = f.g, 1
-    while f.vehicle[k] >= 0:
+    while f.who[k, VEHICLE] >= 0:
         k += 1
-    f.vehicle[k], f.slot[vehicle], f.row[k] = vehicle, k, row
-    f.locked[k] = 0.0
-    f.joined[k], f.vague[k], age = f.step[0], model.flat, max(rows[row, AGE], 0.0)
-    f.since[k] = f.clock[0] - age
+    f.who[k, VEHICLE], f.slot[vehicle], f.who[k, INPUT] = vehicle, k, row
+    f.member[k, LOCKED] = 0.0
+    f.member[k, JOINED], f.member[k, VAGUE], age = f.ego[STEPS], model.flat, max(rows[row, AGE], 0.0)
+    f.member[k, WHEN] = f.ego[CLOCK] - age
     for c in range(3):
-        f.hits[k, c], f.way[k, c] = 0, 0.0
+        f.who[k, HITS + c], f.member[k, WAY + c] = 0, 0.0
     ego, first = 3 * g.block[0, PLACE], insert(g, k, PLACE, 0.0)
     near, whole = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row)
     for c in range(3):

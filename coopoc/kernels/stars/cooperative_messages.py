@@ -7,30 +7,41 @@ import math
 import numpy as np
 
 from ...arrays import Floats
-from ..compiling.compile import compiled, inside, part
-from ..compiling.small import scale, store
+from ..compiling.compile import compiled, inner, inside, part
+from ..compiling.small import add_diagonal, scale
 from ..dead_reckoning import ROUNDING
 from ..gate import SLIP, count, inflation
 from .cooperative_members import steady
 from .cooperative_state import (
     AGE,
+    CLOCK,
     COUNT,
     FIXES,
+    HITS,
+    INPUT,
     LAST,
-    MESSAGES,
+    LEVEL,
+    LOCKED,
     MEAN,
+    MESSAGES,
     NO_POSITION,
     ODOMETER,
+    OUT,
     PACE,
     REVOKED,
     SLIPS,
     SOLO,
     SOLO_VARIANCE,
+    SPAN,
     SPEED,
     STEP,
     TRUSTED,
     TYPICAL,
     USED,
+    VAGUE,
+    VEHICLE,
+    WAY,
+    WHEN,
     Filter,
     Guards,
     Model,
@@ -39,8 +50,13 @@ from .cooperative_state import (
 from .gaussian import (
     ABSENT,
     COMMON,
+    COV,
     ERROR,
+    GAP,
+    MEASURED,
     PLACE,
+    SQUARE,
+    VARIANCE,
     correct,
     distance,
     expect,
@@ -51,7 +67,7 @@ from .gaussian import (
     term,
     update,
 )
-from .messages import three_of
+from .messages import block_at, three_of, vector_at
 from .otherwise import drive, hold, learn_fix, score, turned
 
 FADES = 5.0
@@ -125,27 +141,28 @@ def remember(memory: Floats, moved: Floats, fix: Floats, variance: Floats, dt: f
             memory[c] += (fix[c] - memory[c]) / (variance[c] * memory[3 + c])
 
 
-@inside
+@inner
 def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None:
     """Move member k to where it was when it sent its newest message, and use what its fixes have said until then.
 
     The mean error that the odometer makes of n fixes since the last message is that of the middle of the way: they are
     used there.
     """
-    g, j, row, dt = f.g, f.vehicle[k], f.row[k], f.clock[1]
+    g, j, row, dt = f.g, f.who[k, VEHICLE], f.who[k, INPUT], f.ego[SPAN]
     status, age = f.status[j], rows[row, AGE]
-    sent = f.clock[0] - age
-    if age < 0.0 and f.since[k] < f.clock[0]:  # nothing is known of its motion
-        f.since[k] = f.clock[0]
-        f.vague[k] += model.flat
+    sent = f.ego[CLOCK] - age
+    if age < 0.0 and f.member[k, WHEN] < f.ego[CLOCK]:  # nothing is known of its motion
+        f.member[k, WHEN] = f.ego[CLOCK]
+        f.member[k, VAGUE] += model.flat
     if age < 0.0 or sent <= status[USED] + ROUNDING:
         return
-    gap, again, first = sent - f.since[k], status[USED] > -math.inf, 3 * g.block[k, PLACE]
+    gap, again, first = sent - f.member[k, WHEN], status[USED] > -math.inf, 3 * g.block[k, PLACE]
     steps = max(1.0, math.floor((sent - status[USED]) / dt + 0.5)) if again else 1.0
-    follows = again and abs(f.since[k] - status[USED]) <= ROUNDING
+    follows = again and abs(f.member[k, WHEN] - status[USED]) <= ROUNDING
     for c in range(3):
-        f.way[k, c], status[LAST + 6 + c] = rows[row, ODOMETER + c] - status[LAST + 6 + c], rows[row, ODOMETER + c]
-        rows[row, ODOMETER + c] = f.way[k, c] / gap if follows and steps > 1.0 else rows[row, SPEED + c]
+        f.member[k, WAY + c] = rows[row, ODOMETER + c] - status[LAST + 6 + c]
+        status[LAST + 6 + c] = rows[row, ODOMETER + c]
+        rows[row, ODOMETER + c] = f.member[k, WAY + c] / gap if follows and steps > 1.0 else rows[row, SPEED + c]
     steady(f, guards, j, rows[row], ODOMETER, STEP, 1.0)
     u = rows[row, ODOMETER], rows[row, ODOMETER + 1], rows[row, ODOMETER + 2]
     drive(f, model, k, scale(u, gap), gap)
@@ -154,13 +171,14 @@ def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> No
         g.p[first + c, first + c] += half * often * rows[row, STEP + c]
     if content(f, model, rows, k, sent, steps, again, follows):
         q = innovate(g, f.h)
-        if again and f.vague[k] == 0.0 and status[TRUSTED] > 0.0 and f.h.used[0] and f.h.used[1] and f.h.used[2]:
+        whole = f.h.block[MEASURED] + f.h.block[MEASURED + 1] + f.h.block[MEASURED + 2] == 3
+        if again and f.member[k, VAGUE] == 0.0 and status[TRUSTED] > 0.0 and whole:
             learn_fix(f, MESSAGES)
-        f.q[k, 3] = use_fix(f, model, guards, k, again, q)
+        f.member[k, OUT + 3] = use_fix(f, model, guards, k, again, q)
     for c in range(3):
         g.p[first + c, first + c] += (1.0 - half) * often * rows[row, STEP + c]
         status[LAST + c], status[LAST + 3 + c] = rows[row, SOLO + c], rows[row, SOLO_VARIANCE + c]
-    status[USED] = f.since[k] = sent
+    status[USED] = f.member[k, WHEN] = sent
 
 
 @inside
@@ -171,22 +189,23 @@ def content(
 
     Of sums of weighted fixes, that of the new ones is the new sum less what is left of the last one.
     """
-    h, status, row, any_new = f.h, f.status[f.vehicle[k]], f.row[k], False
+    h, status, row, any_new = f.h, f.status[f.who[k, VEHICLE]], f.who[k, INPUT], False
     keep = math.exp((status[USED] - sent) / FADES) if again else 0.0
-    fade = math.exp(-f.clock[1] / FADES)
+    fade = math.exp(-f.ego[SPAN] / FADES)
     long = 1.0 / (1.0 - fade * fade)
     way = (steps - 1.0 / steps) / 12.0 if follows else min((steps - 1.0) * (2.0 * steps - 1.0) / (6.0 * steps), long)
     fix_terms(f, k)
     for c in range(3):
-        weight, r, carried = 1.0 / rows[row, SOLO_VARIANCE + c], rows[row, TYPICAL + c], status[LAST + c] + f.way[k, c]
+        weight, r = 1.0 / rows[row, SOLO_VARIANCE + c], rows[row, TYPICAL + c]
         old = keep / status[LAST + 3 + c] if again else 0.0
         if weight < (1.0 - NOTHING_NEW) * old:  # the sender has begun anew
             old = 0.0
-        new, z, h.used[c] = weight - old, rows[row, SOLO + c], False
+        new, z, h.block[MEASURED + c] = weight - old, rows[row, SOLO + c], False
         if new < NOTHING_NEW * weight or weight * NO_POSITION < 1.0:
             continue
-        white = model.white[c] / new * math.exp(f.level[0, MESSAGES])
+        white = model.white[c] / new * math.exp(f.ego[LEVEL + MESSAGES])
         if old > 0.0:
+            carried = status[LAST + c] + f.member[k, WAY + c]
             z = carried + (z - carried) * weight / new
         else:
             white *= (2.0 - min(weight * r * (1.0 - fade), 1.0)) / (1.0 + fade)
@@ -200,15 +219,16 @@ def content(
 def goes_on(f: Filter, rows: Floats, k: int) -> bool:
     """How far member k has moved since it sent its newest message, by the velocity in that if it is plausible, and the
     derivatives of the way; False if the message is of now."""
-    age, row, status = f.clock[0] - f.since[k], f.row[k], f.status[f.vehicle[k]]
+    age, row, status = f.ego[CLOCK] - f.member[k, WHEN], f.who[k, INPUT], f.status[f.who[k, VEHICLE]]
     u = status[PACE], status[PACE + 1], status[PACE + 2]
     if status[SLIPS] == 0.0:
         u = rows[row, SPEED], rows[row, SPEED + 1], rows[row, SPEED + 2]
-    store(f.way[k], 0, turned(f.g, k, scale(u, age), f.h.turn) if age > ROUNDING else (0.0, 0.0, 0.0))
+    way = turned(f, k, scale(u, age)) if age > ROUNDING else (0.0, 0.0, 0.0)
+    f.member[k, WAY], f.member[k, WAY + 1], f.member[k, WAY + 2] = way
     return bool(age > ROUNDING)
 
 
-@inside
+@inner
 def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: float) -> float:
     """Update by the rows of a vehicle's fix, unless its receiver errs otherwise than is assumed; the share of its
     information that it keeps.
@@ -221,12 +241,12 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
         again: whether it is not the vehicle's first one.
         q: of `innovate`.
     """
-    g, h, j, used = f.g, f.h, f.vehicle[k], 0
+    g, h, j, used = f.g, f.h, f.who[k, VEHICLE], 0
     for c in range(3):
-        used += h.used[c]
-    if f.vague[k] > 0.0 and used == 3:
-        settle(g, h, k, f.vague[k])
-        f.vague[k] = 0.0
+        used += h.block[MEASURED + c]
+    if f.member[k, VAGUE] > 0.0 and used == 3:
+        settle(g, h, k, f.member[k, VAGUE])
+        f.member[k, VAGUE] = 0.0
         return 1.0
     if guards.trust > 0.0 and again and used == 3 and q > 0.0 and wrong_on_average(f, model, guards, k, q):
         if f.status[j, TRUSTED] > 0.0:
@@ -237,18 +257,19 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
             innovate(g, h)
             correct(g, h, 1.0)
         return 0.0
-    q = min(q, (h.gap[0] * h.gap[0] + h.gap[1] * h.gap[1] + h.gap[2] * h.gap[2]) / SLIP)
+    x, y, z = vector_at(h.three, GAP // 3)
+    q = min(q, (x * x + y * y + z * z) / SLIP)
     own, noise = 1e-12, 0.0
     for c in range(3):
-        if h.used[c]:
-            own, noise = own + h.cov[4 * c], noise + h.variance[c]
+        if h.block[MEASURED + c]:
+            own, noise = own + h.matrix[COV + 4 * c], noise + h.three[VARIANCE + c]
     share = 1.0
-    quiet = math.exp(-min(f.level[0, FIXES if k == 0 else MESSAGES], 0.0))
+    quiet = math.exp(-min(f.ego[LEVEL + (FIXES if k == 0 else MESSAGES)], 0.0))
     q *= (own + noise) / (own + quiet * noise)  # fixes that agree better than is assumed are as wrong as any, together
     if guards.fix_gate > 0.0:
-        share = 1.0 / inflation(q, guards.fix_gate, f.locked[k])
-        f.locked[k] = count(q, guards.fix_gate, f.locked[k], own / (own + noise))
-    score(f, h, FIX_SCORE / math.sqrt(1.0 + f.hits[0, 0]) if k == 0 else FIX_SCORE, True)
+        share = 1.0 / inflation(q, guards.fix_gate, f.member[k, LOCKED])
+        f.member[k, LOCKED] = count(q, guards.fix_gate, f.member[k, LOCKED], own / (own + noise))
+    score(f, h, FIX_SCORE / math.sqrt(1.0 + f.who[0, HITS]) if k == 0 else FIX_SCORE, True)
     correct(g, h, share)
     hold(f, share)
     return share
@@ -258,24 +279,22 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
 def wrong_on_average(f: Filter, model: Model, guards: Guards, k: int, q: float) -> bool:
     """Whether the mean of a vehicle's innovations, each clipped, is likelier with another error of its fixes than is
     assumed; or, where that error is being estimated, with the last one alone."""
-    h, status, j = f.h, f.status, f.vehicle[k]
-    mean, s = status[j, MEAN : MEAN + 3], h.square
+    h, status, j = f.h, f.status, f.who[k, VEHICLE]
     status[j, COUNT] = count = min(status[j, COUNT] + 1.0, guards.window)
     if status[j, TRUSTED] == 0.0 and q > guards.fix_gate:
         return True
     clip = math.sqrt(CLIP / q) if q > CLIP else 1.0
     for c in range(3):
-        mean[c] += (clip * h.gap[c] - mean[c]) / count
-        for d in range(3):
-            s[c, d] = h.cov[3 * c + d]
-        s[c, c] += h.variance[c] / count + (1.0 if model.own > 0.0 else 0.0)
+        status[j, MEAN + c] += (clip * h.three[GAP + c] - status[j, MEAN + c]) / count
+    mean, (p, q, r) = (status[j, MEAN], status[j, MEAN + 1], status[j, MEAN + 2]), vector_at(h.three, VARIANCE // 3)
+    more = 1.0 if model.own > 0.0 else 0.0
+    s = add_diagonal(block_at(h.matrix, COV // 9), (p / count + more, q / count + more, r / count + more))
     odds = math.log((1.0 - guards.share) / guards.share)
     near, narrow = distance(s, mean)
     if count < 3.0 or near < 2.0 * (odds + guards.revoke):
         return False
-    for c in range(3):
-        s[c, c] += guards.tau**2
-    far, wide = distance(s, mean)
+    tau2 = guards.tau**2
+    far, wide = distance(add_diagonal(s, (tau2, tau2, tau2)), mean)
     return bool(odds + 0.5 * math.log(wide / narrow) + 0.5 * (far - near) < -guards.revoke)
 
 
@@ -285,30 +304,29 @@ def trust(f: Filter, model: Model, guards: Guards) -> None:
 
     The odds p(b = 0 | all) / p(b = 0) of a Gaussian b are by Bayes' rule those of the two hypotheses.
     """
-    g, h, s, x = f.g, f.h, f.h.square, f.h.gap
+    g, h = f.g, f.h
     wide, narrow, unit = guards.tau**2 + model.own, 0.0, guards.tau**2
     if model.own > 0.0:
         narrow = 1.0 / (1.0 / model.own - 1.0 / wide)
         unit = wide / model.own * narrow
     while True:
         best, most = ABSENT, guards.sure
-        for k in range(len(f.vehicle)):
-            j = f.vehicle[k]
+        for k in range(len(f.who)):
+            j = f.who[k, VEHICLE]
             if j < 0 or f.status[j, TRUSTED] > 0.0 or (k > 0 and f.status[j, USED] == -math.inf):
                 continue
             first = 3 * g.block[k, ERROR]
             for c in range(3):
-                x[c] = g.x[first + c]
                 for d in range(3):
-                    s[c, d] = g.p[first + c, first + d] + (narrow if c == d else 0.0)
-            q, det = distance(s, x)
+                    h.matrix[SQUARE + 3 * c + d] = g.p[first + c, first + d] + (narrow if c == d else 0.0)
+            q, det = distance(block_at(h.matrix, SQUARE // 9), vector_at(g.x, first // 3))
             odds = math.log((1.0 - guards.share) / guards.share) - guards.penalty * f.status[j, REVOKED]
             odds += 0.5 * math.log(unit**3 / det) - 0.5 * q
             if odds > most:
                 best, most = k, odds
         if best < 0:
             return
-        j = f.vehicle[best]
+        j = f.who[best, VEHICLE]
         f.status[j, TRUSTED], f.status[j, COUNT] = 1.0, 0.0
         term(h, 0, g.block[best, ERROR], 1.0)
         for c in range(3):

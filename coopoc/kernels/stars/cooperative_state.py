@@ -172,61 +172,47 @@ class Model(NamedTuple):
     slip: float
 
 
+VEHICLE, INPUT, ORDER, HITS, WHO = 0, 1, 2, 3, 6
+"""Of a slot: its vehicle, ABSENT for none, its row of the step's input, ABSENT for none, and how often in a row each of
+three components exceeded its gate; the ego's first counts its fixes. ORDER lists the slots of the members, nearest
+first: a gate depends on what was used before, not on how members are numbered."""
+WHEN, JOINED, VAGUE, LOCKED, WAY, AT, OUT, MEMBER = 0, 1, 2, 3, 4, 7, 10, 14
+"""Of a member: when it was at its position, s, which is when it sent its newest message; the step at which it joined;
+variance of its position beyond that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of its
+fixes; the way m that it has moved since; where relative measurements are linear m; and, out, the squared normalised
+innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing was: the
+ego's are those of its fix."""
+STEPS, CLOCK, SPAN, MADE, SLIPPING, LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, EGO = 0, 1, 2, 3, 5, 11, 17, 23, 29, 40, 52
+"""Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
+of motion makes, and the whole then; six numbers of `otherwise` on slips; by kind of number the logarithm of its level,
+the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what is
+otherwise than assumed; and position m and covariance m^2."""
+
+
 class Filter(NamedTuple):
     """The state of the filter; slot 0 is the ego's, each neighbour has one of the others.
+
+    Each array that a function gets takes time to compile: what is of one thing is in one.
 
     Attributes:
         g: Gaussian.
         h: rows of an update.
-        vehicle: (slots,) in each slot, ABSENT for none.
+        who: (slots, WHO).
+        member: (slots, MEMBER).
         slot: (vehicles,) of each vehicle, ABSENT for none.
-        row: (slots,) of the step's input, ABSENT for none.
-        order: (slots,) members, nearest first: a gate depends on what was used before, not on how members are numbered.
-        joined: (slots,) step at which the member joined.
-        since: (slots,) s, when the member was at its position: when it sent its newest message.
-        way: (slots, 3) m that it has moved since.
-        vague: (slots,) m^2, variance of a position beyond that in P: next to nothing is known of it; 0 once it is.
-        hits: (slots, 3) how often in a row a component exceeded its gate; the ego's first counts its fixes.
         status: (vehicles, STATUS).
-        at: (slots, 3) m, where relative measurements are linear.
-        q: (slots, 4) out: squared normalised innovations of range, azimuth and inclination and squared Mahalanobis
-            distance of the message, NaN where nothing was used; the ego's are those of its fix.
-        step: (1,) number of the step.
-        clock: (2,) s, now, and since the last step.
-        level: (3, 5) by kind of number: logarithm of the level, sum of its derivatives in this step, and information.
-        locked: (slots,) `gate.count` of fixes.
-        slip: (6,) of `otherwise`.
-        told: (FOUND,) out: what is otherwise than assumed, of `otherwise.average`.
-        answer: (12,) out: position m and covariance m^2 of the ego.
-        few: (2 slots + 5, 2 slots + 3) memory.
-        which: (2 slots + 5,) memory.
-        made: (2,) of the ego's variance m^2, axes together: what the level of motion makes, and the whole then.
+        ego: (EGO,).
+        few: (2 slots + 5, 2 slots + 4) memory.
     """
 
     g: Gaussian
     h: Rows
-    vehicle: Ints
+    who: Ints
+    member: Floats
     slot: Ints
-    row: Ints
-    order: Ints
-    joined: Ints
-    since: Floats
-    way: Floats
-    vague: Floats
-    hits: Ints
     status: Floats
-    at: Floats
-    q: Floats
-    step: Ints
-    clock: Floats
-    level: Floats
-    made: Floats
-    locked: Floats
-    slip: Floats
-    told: Floats
-    answer: Floats
+    ego: Floats
     few: Floats
-    which: Ints
 
 
 @storage
@@ -235,28 +221,12 @@ def new_filter(slots: int, vehicles: int) -> Filter:
     return Filter(
         new_gaussian(slots),
         new_rows(slots),
-        np.full(slots, ABSENT),
+        np.full((slots, WHO), ABSENT),
+        np.zeros((slots, MEMBER)),
         np.full(vehicles, ABSENT),
-        np.full(slots, ABSENT),
-        np.zeros(slots, np.int64),
-        np.zeros(slots, np.int64),
-        np.zeros(slots),
-        np.zeros((slots, 3)),
-        np.zeros(slots),
-        np.zeros((slots, 3), np.int64),
         np.zeros((vehicles, STATUS)),
-        np.zeros((slots, 3)),
-        np.zeros((slots, 4)),
-        np.zeros(1, np.int64),
-        np.zeros(2),
-        np.zeros((3, KINDS_OF_NUMBERS)),
-        np.zeros(2),
-        np.zeros(slots),
-        np.zeros(6),
-        np.zeros(FOUND),
-        np.zeros(12),
-        np.zeros((2 * slots + 5, 2 * slots + 3)),
-        np.zeros(2 * slots + 5, np.int64),
+        np.zeros(EGO),
+        np.zeros((2 * slots + 5, 2 * slots + 4)),
     )
 
 
@@ -264,21 +234,13 @@ def new_filter(slots: int, vehicles: int) -> Filter:
 def copy_filter(source: Filter, target: Filter) -> None:
     """Copy the state."""
     copy_gaussian(source.g, target.g)
-    target.step[0], target.clock[0] = source.step[0], source.clock[0]
-    for kind in range(KINDS_OF_NUMBERS):
-        for i in range(3):
-            target.level[i, kind] = source.level[i, kind]
-    target.made[0], target.made[1] = source.made[0], source.made[1]
-    for c in range(6):
-        target.slip[c] = source.slip[c]
-    for k in range(len(source.vehicle)):
-        target.vehicle[k], target.row[k], target.joined[k] = source.vehicle[k], source.row[k], source.joined[k]
-        target.since[k], target.vague[k] = source.since[k], source.vague[k]
-        target.locked[k] = source.locked[k]
-        for c in range(4):
-            target.q[k, c] = source.q[k, c]
-        for c in range(3):
-            target.hits[k, c], target.way[k, c] = source.hits[k, c], source.way[k, c]
+    for i in range(EGO):
+        target.ego[i] = source.ego[i]
+    for k in range(len(source.who)):
+        for i in range(WHO):
+            target.who[k, i] = source.who[k, i]
+        for i in range(MEMBER):
+            target.member[k, i] = source.member[k, i]
     for j in range(len(source.slot)):
         target.slot[j] = source.slot[j]
     for i in range(len(source.slot) * STATUS // LANES):
@@ -295,7 +257,7 @@ def begin(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
         f.status[j, USED] = f.status[j, SINCE] = -math.inf
         for c in range(3):
             f.status[j, KEPT_VARIANCE + c] = guards.tau**2
-    f.vehicle[0], f.slot[ego] = ego, 0
+    f.who[0, VEHICLE], f.slot[ego] = ego, 0
     insert(f.g, 0, PLACE, 0.0)
     if model.common > 0.0:
         insert(f.g, 0, COMMON, model.common)
@@ -322,7 +284,7 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
     fix is not used. Of an ego that is not trusted all must agree with the fix: two that multipath displaced do so by
     chance; else nothing is changed, and False returned.
     """
-    best, most, heard, mine, g, ego = ABSENT, 1, 0, 0, f.g, f.vehicle[0]
+    best, most, heard, mine, g, ego = ABSENT, 1, 0, 0, f.g, f.who[0, VEHICLE]
     for i in range(-1, count if guards.fix_gate > 0.0 else -1):
         agree = 0
         for j in range(-1, count):
@@ -334,7 +296,7 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
             best, most = i, agree
     if mine < max(heard, 2) and f.status[ego, TRUSTED] == 0.0:
         return False
-    f.vague[0], f.joined[0], f.hits[0, 0], f.locked[0] = model.flat, f.step[0], 0, 0.0
+    f.member[0, VAGUE], f.member[0, JOINED], f.who[0, HITS], f.member[0, LOCKED] = model.flat, f.ego[STEPS], 0, 0.0
     f.status[ego, TRUSTED], f.status[ego, COUNT] = 1.0, 0.0
     clear(g, 0)
     remove(g, 0, ERROR)
@@ -343,7 +305,7 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
     for c in range(3):
         g.x[c], f.status[ego, MEAN + c] = own[FIX + c], 0.0
     if mine <= 1 and best >= 0:
-        f.vague[0] = 0.0
+        f.member[0, VAGUE] = 0.0
         for c in range(3):
             g.x[c], own[FIX + c] = seen_from(rows, best, c), math.nan
         widen(g, 0, model.flat)
@@ -354,15 +316,15 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
 def lost(f: Filter) -> bool:
     """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either all fixes but the first
     contradict it, or its receiver is not trusted beside others that are not."""
-    ego, others = f.vehicle[0], 0
-    for k in range(1, len(f.vehicle)):
-        j = f.vehicle[k]
+    ego, others = f.who[0, VEHICLE], 0
+    for k in range(1, len(f.who)):
+        j = f.who[k, VEHICLE]
         if j >= 0 and f.status[j, USED] > -math.inf:
             if f.status[j, TRUSTED] > 0.0:
                 return False
             others += 1
-    hits = f.hits[0, 0]
-    young = hits >= 2 and f.step[0] - f.joined[0] - hits <= 1
+    hits = f.who[0, HITS]
+    young = hits >= 2 and f.ego[STEPS] - f.member[0, JOINED] - hits <= 1
     return bool(young if f.status[ego, TRUSTED] > 0.0 else others >= 2)
 
 
@@ -371,11 +333,13 @@ def pause(f: Filter, dt: float) -> None:
     """The ego is absent: it starts anew at its next fix."""
     for k in range(f.g.vectors[0]):
         clear(f.g, 3 * k)
-    f.g.vectors[0], f.hits[0, 0], f.slip[:] = 0, 0, 0.0
+    f.g.vectors[0], f.who[0, HITS] = 0, 0
+    for c in range(6):
+        f.ego[SLIPPING + c] = 0.0
     for kind in range(KINDS):
         f.g.block[0, kind] = ABSENT
-    f.step[0] += 1
-    f.clock[0] += dt
+    f.ego[STEPS] += 1
+    f.ego[CLOCK] += dt
 
 
 @part

@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Ints
+from ...arrays import Floats, Ints
 from ..compiling.compile import inside, part, storage
 from ..compiling.small import (
     inverse,
@@ -45,53 +45,38 @@ class Gaussian(NamedTuple):
         x: (size,), a multiple of 12.
         p: (size, size).
         block: (members, KINDS) index of each vector, ABSENT for none.
-        owner: (members KINDS,) member KINDS + kind of each vector.
-        vectors: (1,) how many are in use.
+        vectors: (1 + members KINDS,) how many are in use, and member KINDS + kind of each.
     """
 
     x: Floats
     p: Floats
     block: Ints
-    owner: Ints
     vectors: Ints
+
+
+Z, VARIANCE, LIMIT, GAP, Q, WHITE, SCHUR, THREE = range(0, 24, 3)
+"""Of three measured numbers: what was measured and its variance; the gate on each squared normalised innovation, 0 for
+none; and, out, innovations, these squared and normalised, 0 where nothing was measured, whitened innovations, and their
+variances."""
+MEASURED = TERMS + 1
+COV, SQUARE, TURNED = 9 * TERMS, 9 * TERMS + 9, 9 * TERMS + 18
+"""Behind the matrices of the terms: H P H^T, out, scratch, and derivatives of `otherwise.turned`."""
 
 
 class Rows(NamedTuple):
     """Up to three measured numbers z = sum_k W_k v_k + N(0, diag(variance)) of vectors v_k, and what came of them.
 
     Attributes:
-        z: (3,).
-        variance: (3,).
-        used: (3,) False where nothing was measured.
-        gate: (3,) on the squared normalised innovation of each number, 0 for none.
-        block: (TERMS,) indices of the vectors.
-        weight: (9 TERMS,) the matrices W_k.
-        terms: (1,) terms in use.
-        gap: (3,) out: innovations.
-        q: (3,) out: squared normalised innovation, 0 where nothing was measured.
-        cov: (9,) out: H P H^T.
+        three: (THREE,).
+        matrix: (9 (TERMS + 3),) the matrices W_k, and those behind them.
+        block: (TERMS + 4,) indices of the vectors, how many are in use, and whether each number was measured.
         gain: (3 size,) out: columns of the square root of what the update takes from P.
-        white: (3,) out: whitened innovations.
-        schur: (3,) out: their variances.
-        square: (3, 3) scratch.
-        turn: (9,) scratch.
     """
 
-    z: Floats
-    variance: Floats
-    used: Bools
-    gate: Floats
+    three: Floats
+    matrix: Floats
     block: Ints
-    weight: Floats
-    terms: Ints
-    gap: Floats
-    q: Floats
-    cov: Floats
     gain: Floats
-    white: Floats
-    schur: Floats
-    square: Floats
-    turn: Floats
 
 
 @storage
@@ -99,30 +84,14 @@ def new_gaussian(members: int) -> Gaussian:
     """Room for all vectors of that many members."""
     size = 12 * (1 + KINDS * members // 4)
     block = np.full((members, KINDS), ABSENT)
-    owner = np.zeros(KINDS * members, np.int64)
-    return Gaussian(np.zeros(size), np.zeros((size, size)), block, owner, np.zeros(1, np.int64))
+    return Gaussian(np.zeros(size), np.zeros((size, size)), block, np.zeros(1 + KINDS * members, np.int64))
 
 
 @storage
 def new_rows(members: int) -> Rows:
     """Room for three numbers."""
-    return Rows(
-        np.zeros(3),
-        np.zeros(3),
-        np.zeros(3, np.bool_),
-        np.zeros(3),
-        np.zeros(TERMS, np.int64),
-        np.zeros(9 * TERMS),
-        np.zeros(1, np.int64),
-        np.zeros(3),
-        np.zeros(3),
-        np.zeros(9),
-        np.zeros(36 * (1 + KINDS * members // 4)),
-        np.zeros(3),
-        np.zeros(3),
-        np.zeros((3, 3)),
-        np.zeros(9),
-    )
+    size = 12 * (1 + KINDS * members // 4)
+    return Rows(np.zeros(THREE), np.zeros(9 * (TERMS + 3)), np.zeros(MEASURED + 3, np.int64), np.zeros(3 * size))
 
 
 @inside
@@ -148,7 +117,7 @@ def insert(g: Gaussian, member: int, kind: int, variance: float) -> int:
     """Put a vector of mean 0 and of that variance behind the others; index of its first number."""
     b = g.vectors[0]
     g.vectors[0] = b + 1
-    g.block[member, kind], g.owner[b] = b, member * KINDS + kind
+    g.block[member, kind], g.vectors[1 + b] = b, member * KINDS + kind
     widen(g, 3 * b, variance)
     return int(3 * b)
 
@@ -176,8 +145,8 @@ def remove(g: Gaussian, member: int, kind: int) -> None:
         for c in range(3):
             g.p[j, 3 * b + c] = g.p[j, 3 * last + c]
     clear(g, 3 * last)
-    moved = g.owner[last]
-    g.owner[b] = moved
+    moved = g.vectors[1 + last]
+    g.vectors[1 + b] = moved
     g.block[moved // KINDS, moved % KINDS] = b
     g.block[member, kind] = ABSENT
     g.vectors[0] = last
@@ -191,10 +160,11 @@ def copy_gaussian(source: Gaussian, target: Gaussian) -> None:
         target.x[i] = source.x[i]
         for j in range(n):
             target.p[i, j] = source.p[i, j]
-    target.vectors[0] = source.vectors[0]
-    for i in range(len(source.owner)):
-        target.owner[i] = source.owner[i]
-        target.block[i // KINDS, i % KINDS] = source.block[i // KINDS, i % KINDS]
+    for i in range(len(source.vectors)):
+        target.vectors[i] = source.vectors[i]
+    for k in range(len(source.block)):
+        for kind in range(KINDS):
+            target.block[k, kind] = source.block[k, kind]
 
 
 @part
@@ -221,14 +191,14 @@ def widen(g: Gaussian, i: int, variance: float) -> None:
 def term(h: Rows, k: int, block: int, weight: float) -> None:
     """Let the k-th term of the rows be `weight` times a vector, and the last one."""
     h.block[k], o = block, 0.0
-    store(h.weight, k, (weight, o, o, o, weight, o, o, o, weight))
-    h.terms[0] = k + 1
+    store(h.matrix, k, (weight, o, o, o, weight, o, o, o, weight))
+    h.block[TERMS] = k + 1
 
 
 @inside
 def expect(h: Rows, c: int, z: float, variance: float) -> None:
     """Row c measured z with that variance, and has no gate of its own."""
-    h.z[c], h.variance[c], h.used[c], h.gate[c] = z, variance, True, 0.0
+    h.three[Z + c], h.three[VARIANCE + c], h.block[MEASURED + c], h.three[LIMIT + c] = z, variance, True, 0.0
 
 
 @inside
@@ -249,8 +219,8 @@ def update(g: Gaussian, h: Rows, gate: float) -> None:
 def project(g: Gaussian, h: Rows) -> None:
     """Innovations z - H x, H P in place of `gain`, and H P H^T."""
     gain, wide, third = h.gain, len(g.x) // LANES, len(g.x) // 3
-    for k in range(h.terms[0]):
-        i, w = 3 * h.block[k] * wide, block_at(h.weight, k)
+    for k in range(h.block[TERMS]):
+        i, w = 3 * h.block[k] * wide, block_at(h.matrix, k)
         for j in range(lanes(g)):
             a, b, c = three_rows(g.p, i + j, wide)
             d, e, f = w[0] * a, w[3] * a, w[6] * a
@@ -259,15 +229,15 @@ def project(g: Gaussian, h: Rows) -> None:
             put(gain, j, plus(plus(d, w[1], b), w[2], c))
             put(gain, wide + j, plus(plus(e, w[4], b), w[5], c))
             put(gain, 2 * wide + j, plus(plus(f, w[7], b), w[8], c))
-    gap, one, two, three = vector_at(h.z, 0), ROW, ROW, ROW
-    for k in range(h.terms[0]):
-        b, w = h.block[k], block_at(h.weight, k)
+    gap, one, two, three = vector_at(h.three, Z // 3), ROW, ROW, ROW
+    for k in range(h.block[TERMS]):
+        b, w = h.block[k], block_at(h.matrix, k)
         gap = less_applied(gap, w, vector_at(g.x, b))
         one = plus_applied(one, w, vector_at(gain, b))
         two = plus_applied(two, w, vector_at(gain, third + b))
         three = plus_applied(three, w, vector_at(gain, 2 * third + b))
-    store(h.gap, 0, gap)
-    store(h.cov, 0, (*one, *two, *three))
+    store(h.three, GAP // 3, gap)
+    store(h.matrix, COV // 9, (*one, *two, *three))
 
 
 @inside
@@ -278,15 +248,15 @@ def innovate(g: Gaussian, h: Rows) -> float:
     exceeds its gate, its variance is multiplied by q / gate, and by 100 more where it exceeds REJECTED times the gate.
     """
     project(g, h)
-    gain, wide, gap, cov = h.gain, len(g.x) // LANES, vector_at(h.gap, 0), block_at(h.cov, 0)
-    x, d = whitened(h, 0, gap[0], h.variance[0] + cov[0])
+    gain, wide, gap, cov = h.gain, len(g.x) // LANES, vector_at(h.three, GAP // 3), block_at(h.matrix, COV // 9)
+    x, d = whitened(h, 0, gap[0], h.three[VARIANCE] + cov[0])
     s = cov[1] * d
-    y, e = whitened(h, 1, gap[1] - s * x, h.variance[1] + cov[4] - s * s)
+    y, e = whitened(h, 1, gap[1] - s * x, h.three[VARIANCE + 1] + cov[4] - s * s)
     a = -e * s * d
     s, t = cov[2] * d, cov[5] * e + cov[2] * a
-    z, f = whitened(h, 2, gap[2] - s * x - t * y, h.variance[2] + cov[8] - s * s - t * t)
+    z, f = whitened(h, 2, gap[2] - s * x - t * y, h.three[VARIANCE + 2] + cov[8] - s * s - t * t)
     b, c = -f * (s * d + t * a), -f * t * e
-    store(h.white, 0, (x, y, z))
+    store(h.three, WHITE // 3, (x, y, z))
     for j in range(lanes(g)):
         p, q, r = three_rows(gain, j, wide)
         put(gain, j, d * p)
@@ -298,12 +268,12 @@ def innovate(g: Gaussian, h: Rows) -> float:
 @inside
 def whitened(h: Rows, c: int, innovation: float, variance: float) -> tuple[float, float]:
     """Innovation of row c over its gated standard deviation, and 1 over that; 0 where nothing was measured."""
-    if not h.used[c]:
-        h.q[c] = h.gap[c] = 0.0
+    if not h.block[MEASURED + c]:
+        h.three[Q + c] = h.three[GAP + c] = 0.0
         return 0.0, 0.0
-    h.schur[c] = variance
-    h.q[c] = q = innovation * innovation / variance
-    scale = math.sqrt(weight(q, h.gate[c]) / variance)
+    h.three[SCHUR + c] = variance
+    h.three[Q + c] = q = innovation * innovation / variance
+    scale = math.sqrt(weight(q, h.three[LIMIT + c]) / variance)
     return innovation * scale, scale
 
 
@@ -312,7 +282,7 @@ def correct(g: Gaussian, h: Rows, share: float) -> None:
     """x <- x + share U times the whitened innovations, P <- P - share U U^T: the innovation's covariance is that of
     `innovate` over `share`."""
     p, gain, wide, third = g.p, h.gain, len(g.x) // LANES, len(g.x) // 3
-    x, y, z = scale(vector_at(h.white, 0), share)
+    x, y, z = scale(vector_at(h.three, WHITE // 3), share)
     for j in range(lanes(g)):
         u, v, w = three_rows(gain, j, wide)
         put(g.x, j, plus(plus(plus(take(g.x, j), x, u), y, v), z, w))
@@ -334,39 +304,39 @@ def settle(g: Gaussian, h: Rows, member: int, flat: float) -> None:
     are the same but for N(0, flat) is then the measurement, and the vector replaces the position.
     """
     place, n, b = g.block[member, PLACE], 3 * g.vectors[0], BLOCK
-    for k in range(h.terms[0]):
+    for k in range(h.block[TERMS]):
         if h.block[k] == place:
-            a = block_at(h.weight, k)
+            a = block_at(h.matrix, k)
             b = minus_product(inverse(less_transposed_product(BLOCK, a, a)), transpose(a))
-            store(h.weight, k, BLOCK)
-    for k in range(h.terms[0]):
-        store(h.weight, k, minus_product(b, block_at(h.weight, k)))
-    store(h.z, 0, minus_apply(b, vector_at(h.z, 0)))
+            store(h.matrix, k, BLOCK)
+    for k in range(h.block[TERMS]):
+        store(h.matrix, k, minus_product(b, block_at(h.matrix, k)))
+    store(h.three, Z // 3, minus_apply(b, vector_at(h.three, Z // 3)))
     project(g, h)
     new = insert(g, member, FRESH, 0.0)
     for c in range(3):
-        g.x[new + c] = -h.gap[c]
+        g.x[new + c] = -h.three[GAP + c]
         for j in range(n):
             g.p[new + c, j] = g.p[j, new + c] = h.gain[c * len(g.x) + j]
         for d in range(3):
-            g.p[new + c, new + d] = h.cov[3 * c + d]
+            g.p[new + c, new + d] = h.matrix[COV + 3 * c + d]
             for k in range(3):
-                g.p[new + c, new + d] += b[3 * c + k] * h.variance[k] * b[3 * d + k]
+                g.p[new + c, new + d] += b[3 * c + k] * h.three[VARIANCE + k] * b[3 * d + k]
     term(h, 0, new // 3, 1.0)
     term(h, 1, place, -1.0)
     for c in range(3):
         expect(h, c, 0.0, flat)
     update(g, h, 0.0)
     remove(g, member, PLACE)
-    g.block[member, PLACE], g.owner[place], g.block[member, FRESH] = place, member * KINDS + PLACE, ABSENT
+    g.block[member, PLACE], g.vectors[1 + place], g.block[member, FRESH] = place, member * KINDS + PLACE, ABSENT
 
 
 @part
-def distance(s: Floats, x: Floats) -> tuple[float, float]:
-    """x^T S^-1 x of a symmetric S (3, 3), and its determinant."""
-    a, b = s[1, 0] / s[0, 0], s[2, 0] / s[0, 0]
-    d, cross = s[1, 1] - a * s[1, 0], s[2, 1] - b * s[1, 0]
+def distance(s: tuple[float, ...], x: tuple[float, ...]) -> tuple[float, float]:
+    """x^T S^-1 x of a symmetric 3 x 3 matrix S, and its determinant."""
+    a, b = s[3] / s[0], s[6] / s[0]
+    d, cross = s[4] - a * s[3], s[7] - b * s[3]
     c = cross / d
-    e, y = s[2, 2] - b * s[2, 0] - c * cross, x[1] - a * x[0]
+    e, y = s[8] - b * s[6] - c * cross, x[1] - a * x[0]
     z = x[2] - b * x[0] - c * y
-    return x[0] * x[0] / s[0, 0] + y * y / d + z * z / e, s[0, 0] * d * e
+    return x[0] * x[0] / s[0] + y * y / d + z * z / e, s[0] * d * e

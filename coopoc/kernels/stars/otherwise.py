@@ -30,57 +30,84 @@ import numpy as np
 from ...arrays import Floats
 from ..compiling.compile import part, storage
 from .cooperative_state import (
+    ANSWER,
     DT,
     FIXES,
+    INFORMATION,
     KINDS_OF_NUMBERS,
+    LEVEL,
+    MADE,
     MOTION,
     MOTION_VARIANCE,
     MOTIONS,
     OWN,
+    SLIPPING,
+    SLOPE,
+    SPAN,
     STEP,
+    TOLD,
+    VEHICLE,
     WIDTH,
     Filter,
     Guards,
     Model,
     new_filter,
 )
-from .gaussian import COMPASS, PLACE, TURN, Gaussian, Rows, has, shift
+from .gaussian import (
+    COMPASS,
+    COV,
+    GAP,
+    MEASURED,
+    PLACE,
+    SCHUR,
+    TURN,
+    TURNED,
+    VARIANCE,
+    WHITE,
+    Q,
+    Rows,
+    has,
+    shift,
+)
 
 HEADING, SCALE, OF_COMPASS, OF_RANGE, SLIPS, LEVELS = range(6)
-"""Places in `Filter.told`: the ego's errors, rad, 1, rad, m, whether it slips, and the factors of standard
+"""Places in TOLD: the ego's errors, rad, 1, rad, m, whether it slips, and the factors of standard
 deviations."""
 
 
 @part
-def turned(g: Gaussian, k: int, moved: tuple[float, float, float], w: Floats) -> tuple[float, float, float]:
-    """(1 + s) R(b) m, and its derivatives by b and s in w (9,); m itself where odometry does not err."""
+def turned(f: Filter, k: int, moved: tuple[float, float, float]) -> tuple[float, float, float]:
+    """(1 + s) R(b) m, and its derivatives by b and s in TURNED; m itself where odometry does not err."""
+    g, w = f.g, f.h.matrix
     for i in range(9):
-        w[i] = 0.0
+        w[TURNED + i] = 0.0
     if not has(g, k, TURN):
         return moved
     i = 3 * g.block[k, TURN]
     c, s, scale = math.cos(g.x[i]), math.sin(g.x[i]), 1.0 + g.x[i + 1]
     east, north = c * moved[0] - s * moved[1], s * moved[0] + c * moved[1]
-    w[0], w[3], w[1], w[4] = -scale * north, scale * east, east, north
+    w[TURNED], w[TURNED + 1], w[TURNED + 3], w[TURNED + 4] = -scale * north, east, scale * east, north
     return scale * east, scale * north, moved[2]
 
 
 @part
 def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt: float) -> None:
     """Move a member by its odometry, whose errors decay."""
-    g, w = f.g, f.h.turn
-    first, way = 3 * g.block[k, PLACE], turned(g, k, moved, w)
+    g, w = f.g, f.h.matrix
+    first, way = 3 * g.block[k, PLACE], turned(f, k, moved)
     for c in range(3):
         g.x[first + c] += way[c]
     if not has(g, k, TURN):
         return
     i, n, keep = 3 * g.block[k, TURN], 3 * g.vectors[0], math.exp(-dt / model.lasts)
     for c in range(2):
+        by = TURNED + 3 * c
         for j in range(n):
-            g.p[first + c, j] += w[3 * c] * g.p[i, j] + w[3 * c + 1] * g.p[i + 1, j]
+            g.p[first + c, j] += w[by] * g.p[i, j] + w[by + 1] * g.p[i + 1, j]
     for j in range(n):
         for c in range(2):
-            g.p[j, first + c] += w[3 * c] * g.p[j, i] + w[3 * c + 1] * g.p[j, i + 1]
+            by = TURNED + 3 * c
+            g.p[j, first + c] += w[by] * g.p[j, i] + w[by + 1] * g.p[j, i + 1]
     shift(g, i, i, keep - 1.0)
     for c in range(2):
         g.p[i + c, i + c] += (1.0 - keep * keep) * model.turn[c]
@@ -95,14 +122,14 @@ def hold(f: Filter, share: float) -> None:
     g, h, wide = f.g, f.h, len(f.g.x)
     if share >= 1.0:
         return
-    for a in range(len(f.vehicle)):
-        if f.vehicle[a] < 0 or not has(g, a, TURN):
+    for a in range(len(f.who)):
+        if f.who[a, VEHICLE] < 0 or not has(g, a, TURN):
             continue
         for i in range(3 * g.block[a, TURN], 3 * g.block[a, TURN] + 2):
             for c in range(3):
-                g.x[i] -= (1.0 - share) * share * h.gain[c * wide + i] * h.white[c]
-            for b in range(len(f.vehicle)):
-                if f.vehicle[b] < 0 or not has(g, b, TURN):
+                g.x[i] -= (1.0 - share) * share * h.gain[c * wide + i] * h.three[WHITE + c]
+            for b in range(len(f.who)):
+                if f.who[b, VEHICLE] < 0 or not has(g, b, TURN):
                     continue
                 for j in range(3 * g.block[b, TURN], 3 * g.block[b, TURN] + 2):
                     for c in range(3):
@@ -111,28 +138,30 @@ def hold(f: Filter, share: float) -> None:
 
 @part
 def average(f: Filter, model: Model) -> None:
-    """Write the ego's position and covariance, averaged over which errors are there, to `answer`, and these to `told`.
+    """Write the ego's position and covariance, averaged over which errors are there, to ANSWER, and these to TOLD.
 
-    `few` has a row for each number of the position and each error, and a column for each error: their covariances.
+    `few` has a row for each number of the position and each error, and a column for each error: their covariances; the
+    last two hold their means, and where they are in the state.
     """
-    g, few, which, x = f.g, f.few, f.which, f.answer
-    first, n, width = 3 * g.block[0, PLACE], 3, len(f.few[0]) - 1
+    g, few = f.g, f.few
+    first, n, width = 3 * g.block[0, PLACE], 3, len(f.few[0]) - 2
     for c in range(3):
-        which[c], x[c] = first + c, g.x[first + c]
+        few[c, width + 1], f.ego[ANSWER + c] = first + c, g.x[first + c]
         for d in range(3):
-            x[3 + 3 * c + d] = g.p[first + c, first + d]
-    for k in range(len(f.vehicle) - 1, -1, -1):
-        if f.vehicle[k] >= 0 and has(g, k, TURN):
-            which[n], which[n + 1] = 3 * g.block[k, TURN], 3 * g.block[k, TURN] + 1
+            f.ego[ANSWER + 3 + 3 * c + d] = g.p[first + c, first + d]
+    for k in range(len(f.who) - 1, -1, -1):
+        if f.who[k, VEHICLE] >= 0 and has(g, k, TURN):
+            few[n, width + 1], few[n + 1, width + 1] = 3 * g.block[k, TURN], 3 * g.block[k, TURN] + 1
             n += 2
     own = n
     if has(g, 0, COMPASS):
-        which[n], which[n + 1] = 3 * g.block[0, COMPASS], 3 * g.block[0, COMPASS] + 2
+        few[n, width + 1], few[n + 1, width + 1] = 3 * g.block[0, COMPASS], 3 * g.block[0, COMPASS] + 2
         n += 2
     for i in range(n):
-        few[i, width] = g.x[which[i]]
+        at = int(few[i, width + 1])
+        few[i, width] = g.x[at]
         for j in range(3, n):
-            few[i, j - 3] = g.p[which[i], which[j]]
+            few[i, j - 3] = g.p[at, int(few[j, width + 1])]
     for i in range(3, n):
         kind = (2 + i - own) if i >= own else (i - 3) % 2
         prior = model.turn[kind] if kind < 2 else model.bias if kind == 2 else model.offset
@@ -140,25 +169,25 @@ def average(f: Filter, model: Model) -> None:
     for kind in range(4):
         i = own + kind - 2
         there = n > own if kind >= 2 else own > 3
-        f.told[kind] = few[i, width] if there else 0.0
-    f.told[SLIPS] = f.slip[0]
+        f.ego[TOLD + kind] = few[i, width] if there else 0.0
+    f.ego[TOLD + SLIPS] = f.ego[SLIPPED]
     for kind in range(KINDS_OF_NUMBERS):
-        f.told[LEVELS + kind] = math.exp(0.5 * f.level[0, kind])
+        f.ego[TOLD + LEVELS + kind] = math.exp(0.5 * f.ego[LEVEL + kind])
 
 
 @part
 def collapse(f: Filter, i: int, n: int, prior: float, odds: float) -> None:
     """Average over whether the error of row i is there: moments are matched."""
-    few, x, width = f.few, f.answer, len(f.few[0]) - 1
+    few, ego, width = f.few, f.ego, len(f.few[0]) - 2
     p, m = few[i, i - 3], few[i, width]
     if odds == -math.inf or not p > 0.0:
         return
     there = 1.0 / (1.0 + math.exp(min(odds + 0.5 * math.log(prior / p) - 0.5 * m * m / p, 700.0)))
     mean, change = (there - 1.0) * m / p, (there * p + there * (1.0 - there) * m * m - p) / (p * p)
     for c in range(3):
-        x[c] += mean * few[c, i - 3]
+        ego[ANSWER + c] += mean * few[c, i - 3]
         for d in range(3):
-            x[3 + 3 * c + d] += change * few[c, i - 3] * few[d, i - 3]
+            ego[ANSWER + 3 + 3 * c + d] += change * few[c, i - 3] * few[d, i - 3]
     for j in range(n):
         if j != i:
             few[j, width] += mean * few[j, i - 3]
@@ -169,8 +198,8 @@ def collapse(f: Filter, i: int, n: int, prior: float, odds: float) -> None:
         few[i, k - 3] *= 1.0 + change * p
 
 
-SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES = range(6)
-"""Of `Filter.slip`: probability that the ego slips, its late speed m/s, whether this try assumes so, and of the step's
+SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES = range(SLIPPING, SLIPPING + 6)
+"""Of the ego: probability that the ego slips, its late speed m/s, whether this try assumes so, and of the step's
 numbers the logarithm of their likelihood, how many there are, and their squared normalised innovations."""
 LASTS, RARE, LATE, UNSEEN = 3.0, 3000.0, 10.0, 1.0
 """s: how long a slip lasts, how long none does, for which a speed is remembered, and until a slip shows."""
@@ -197,14 +226,14 @@ def remember_speed(f: Filter, own: Floats) -> None:
     square = 0.0
     for c in range(3):
         square += (own[MOTION + c] / own[DT]) ** 2
-    f.slip[SPEED_OF_LATE] = max(math.sqrt(square), f.slip[SPEED_OF_LATE] * math.exp(-own[DT] / LATE))
+    f.ego[SPEED_OF_LATE] = max(math.sqrt(square), f.ego[SPEED_OF_LATE] * math.exp(-own[DT] / LATE))
 
 
 @part
 def slip_variance(f: Filter, model: Model, dt: float) -> float:
     """m^2, of the ego's motion in a step, if it is assumed to slip; one that begins now may have for UNSEEN s."""
-    seconds = dt if f.slip[SLIPPED] > 0.5 else max(dt, UNSEEN)
-    variance: float = f.slip[NOW] * (model.slip * f.slip[SPEED_OF_LATE] * seconds) ** 2
+    seconds = dt if f.ego[SLIPPED] > 0.5 else max(dt, UNSEEN)
+    variance: float = f.ego[NOW] * (model.slip * f.ego[SPEED_OF_LATE] * seconds) ** 2
     return variance
 
 
@@ -213,29 +242,29 @@ def score(f: Filter, h: Rows, gate: float, whole: bool) -> None:
     """Count the rows of an update, each, or as the fix that they are; beyond the gate no more."""
     square = 0.0
     for c in range(3):
-        if h.used[c] and h.schur[c] > 0.0:
-            q = h.q[c]
+        if h.block[MEASURED + c] and h.three[SCHUR + c] > 0.0:
+            q = h.three[Q + c]
             square += q if whole else min(q, gate)
-            f.slip[LIKELY] -= 0.5 * math.log(h.schur[c])
-            f.slip[NUMBERS] += 1.0
+            f.ego[LIKELY] -= 0.5 * math.log(h.three[SCHUR + c])
+            f.ego[NUMBERS] += 1.0
     square = min(square, gate) if whole else square
-    f.slip[LIKELY] -= 0.5 * square
-    f.slip[SQUARES] += square
+    f.ego[LIKELY] -= 0.5 * square
+    f.ego[SQUARES] += square
 
 
 @part
 def surprised(f: Filter) -> bool:
     """Whether the first try's numbers are worse than usual by a standard deviation, or the ego may have slipped."""
-    n = f.slip[NUMBERS]
-    return bool(f.slip[SLIPPED] > 0.1 or f.slip[SQUARES] > n + math.sqrt(2.0 * n))
+    n = f.ego[NUMBERS]
+    return bool(f.ego[SLIPPED] > 0.1 or f.ego[SQUARES] > n + math.sqrt(2.0 * n))
 
 
 @part
 def chance(f: Filter, first: Filter, dt: float) -> float:
     """Probability of a slip, after both tries of a step, by that before it."""
     stays, begins = math.exp(-dt / LASTS), min(dt / RARE, 0.5)
-    before = first.slip[SLIPPED] * stays + (1.0 - first.slip[SLIPPED]) * begins
-    odds = f.slip[LIKELY] - first.slip[LIKELY] + math.log(before / (1.0 - before))
+    before = first.ego[SLIPPED] * stays + (1.0 - first.ego[SLIPPED]) * begins
+    odds = f.ego[LIKELY] - first.ego[LIKELY] + math.log(before / (1.0 - before))
     return 1.0 / (1.0 + math.exp(min(-odds, 700.0)))
 
 
@@ -250,7 +279,7 @@ PRIOR = 10.0
 @part
 def louder(f: Filter, own: Floats, rows: Floats, count: int) -> None:
     """Multiply the variances of a step's motions by their level."""
-    level = math.exp(f.level[0, MOTIONS])
+    level = math.exp(f.ego[LEVEL + MOTIONS])
     for c in range(3):
         own[MOTION_VARIANCE + c] *= level
         for i in range(count):
@@ -260,16 +289,16 @@ def louder(f: Filter, own: Floats, rows: Floats, count: int) -> None:
 @part
 def moved(f: Filter, own: Floats) -> None:
     """After the ego's prediction: D + q, both of the three axes together, so that no axis of the world counts."""
-    f.made[0] += own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
-    f.made[1] = ego_variance(f)
+    f.ego[MADE] += own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
+    f.ego[MADE + 1] = ego_variance(f)
 
 
 @part
 def corrected(f: Filter) -> None:
     """After an update of the ego: D (P+ / P-)^2."""
-    p, before = ego_variance(f), f.made[1]
-    f.made[0] = min(f.made[0] * (p / before) ** 2, p) if before > 0.0 else 0.0
-    f.made[1] = p
+    p, before = ego_variance(f), f.ego[MADE + 1]
+    f.ego[MADE] = min(f.ego[MADE] * (p / before) ** 2, p) if before > 0.0 else 0.0
+    f.ego[MADE + 1] = p
 
 
 @part
@@ -283,8 +312,8 @@ def ego_variance(f: Filter) -> float:
 @part
 def learn(f: Filter, kind: int, more: float, share: float, numbers: float) -> None:
     """Count by how much squared normalised innovations are more than usual, of which a level makes that share."""
-    f.level[1, kind] += 0.5 * numbers * share * more
-    f.level[2, kind] += 0.5 * numbers * share * share
+    f.ego[SLOPE + kind] += 0.5 * numbers * share * more
+    f.ego[INFORMATION + kind] += 0.5 * numbers * share * share
 
 
 @part
@@ -292,23 +321,23 @@ def learn_fix(f: Filter, kind: int) -> None:
     """Count the innovation of a fix."""
     h, square, r, s = f.h, 0.0, 0.0, 0.0
     for c in range(3):
-        square += h.gap[c] * h.gap[c]
-        r += h.variance[c]
-        s += h.variance[c] + h.cov[4 * c]
+        square += h.three[GAP + c] * h.three[GAP + c]
+        r += h.three[VARIANCE + c]
+        s += h.three[VARIANCE + c] + h.matrix[COV + 4 * c]
     more = min(square / s, SUDDEN) - 1.0
     learn(f, kind, more, r / s, 3.0)
     if kind == FIXES:
-        learn(f, MOTIONS, more, f.made[0] / s, 3.0)
+        learn(f, MOTIONS, more, f.ego[MADE] / s, 3.0)
 
 
 @part
 def learn_relative(f: Filter, c: int) -> None:
     """Count the innovation of a component of a relative measurement."""
     h, along = f.h, 0.0
-    s, more = h.variance[c] + h.cov[4 * c], min(h.q[c], SUDDEN) - USUAL
+    s, more = h.three[VARIANCE + c] + h.matrix[COV + 4 * c], min(h.three[Q + c], SUDDEN) - USUAL
     for i in range(3):
-        along += h.weight[3 * c + i] ** 2 * f.made[0] / 3.0
-    learn(f, c, more, h.variance[c] / s, 1.0)
+        along += h.matrix[3 * c + i] ** 2 * f.ego[MADE] / 3.0
+    learn(f, c, more, h.three[VARIANCE + c] / s, 1.0)
     learn(f, MOTIONS, more, along / s, 1.0)
 
 
@@ -317,10 +346,10 @@ def adapt(f: Filter, guards: Guards) -> None:
     """Move the levels by what this step has shown."""
     if guards.forget == 0.0:
         return
-    keep = math.exp(-f.clock[1] / guards.forget)
+    keep = math.exp(-f.ego[SPAN] / guards.forget)
     for kind in range(KINDS_OF_NUMBERS):
-        change = f.level[1, kind] / (f.level[2, kind] + PRIOR)
-        level = f.level[0, kind] + min(max(change, -FASTEST), FASTEST)
-        f.level[0, kind] = min(max(level, QUIETEST), LOUDEST)
-        f.level[1, kind] = 0.0
-        f.level[2, kind] *= keep
+        change = f.ego[SLOPE + kind] / (f.ego[INFORMATION + kind] + PRIOR)
+        level = f.ego[LEVEL + kind] + min(max(change, -FASTEST), FASTEST)
+        f.ego[LEVEL + kind] = min(max(level, QUIETEST), LOUDEST)
+        f.ego[SLOPE + kind] = 0.0
+        f.ego[INFORMATION + kind] *= keep

@@ -19,6 +19,7 @@ from .cooperative_filter import step
 from .cooperative_messages import remember
 from .cooperative_state import (
     AGE,
+    ANSWER,
     DT,
     FIX,
     FIX_VARIANCE,
@@ -27,7 +28,10 @@ from .cooperative_state import (
     SOLO,
     SPEED,
     STEP,
+    STEPS,
     TYPICAL,
+    VAGUE,
+    WAY,
     Filter,
     Guards,
     Model,
@@ -215,17 +219,17 @@ def stream_step(
     if f.g.vectors[0] == 0:
         begin(f, model, guards, own, rows, len(vehicles), 0)
         if math.isfinite(start[0]):
-            f.step[0], f.vague[0] = 1, 0.0
+            f.ego[STEPS], f.member[0, VAGUE] = 1, 0.0
             for c in range(3):
                 f.g.x[c] = start[c]
     step(f, tries, model, guards, own, rows, vehicles, len(vehicles))
     for c in range(3):
-        answer[c] = f.answer[c]
+        answer[c] = f.ego[ANSWER + c]
         for d in range(3):
-            answer[3 + 3 * c + d] = f.answer[3 + 3 * c + d]
+            answer[3 + 3 * c + d] = f.ego[ANSWER + 3 + 3 * c + d]
         for i in range(len(vehicles)):
             k = f.slot[vehicles[i]]
-            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.way[k, c]
+            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c]
 
 
 @compiled
