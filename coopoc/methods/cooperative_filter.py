@@ -77,7 +77,7 @@ class CooperativeFilter(Checked):
       it by 100 more, and a fix far beyond it is left out, until many were (`kernels.gate`). A member that is
       contradicted for too long joins anew; an ego that rests on nothing that is trusted starts anew. Velocities that
       no vehicle can have reached are replaced by the last ones.
-    - *Levels*: the variances of fixes, ranges, azimuths, inclinations and motions follow their innovations, between
+    - *Levels*: the variances of fixes, ranges, azimuths, inclinations, motions and neighbours' fixes follow their innovations, between
       0.14 and 33 times what is assumed, by recursive maximum likelihood (`kernels.stars.otherwise`).
     - *Errors that last and may not be there*: of heading $b$ and scale $s$ of each odometry,
       $x_t = x_{t-1} + (1 + s) R(b) \Delta t \, u$, of the ego's compass and of its ranges. Each is a state with a wide
@@ -195,9 +195,9 @@ def otherwise(ego: str, found: Floats) -> list[str]:
 
     Args:
         ego: its name.
-        found: (R, T, 10) errors that last, whether it slips, and levels.
+        found: (R, T, 11) errors that last, whether it slips, and levels.
 
-    >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0]]]))
+    >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0, 1.0]]]))
     ['scale error, a: 0.02', 'fix level, a: 3 times the assumed deviation']
     """
     late = found[:, found.shape[1] // 2 :]

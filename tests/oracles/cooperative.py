@@ -366,7 +366,8 @@ class Oracle:
             b.updates(h, z, r)
             s["vague"].discard(j)
             return 1.0
-        if g.trust and again and len(used) == 3 and self.wrong_on_average(j, *self.mahalanobis(b, rows)):
+        judged = j != self.ego or s["members"]
+        if g.trust and judged and again and len(used) == 3 and self.wrong_on_average(j, *self.mahalanobis(b, rows)):
             if j in s["trusted"]:
                 self.revoked[j] = self.revoked.get(j, 0) + 1
             self.doubt(j)
@@ -376,8 +377,7 @@ class Oracle:
             return 0.0
         gap, own = z - h @ b.x, h @ b.p @ h.T
         square = float(gap @ np.linalg.solve(own + np.diag(r), gap))
-        before = s["hits"]["fix"] if j == self.ego else 0
-        self.count(min(square, FIX_SCORE / math.sqrt(1 + before)), np.linalg.slogdet(own + np.diag(r))[1], len(used))
+        self.count(min(square, FIX_SCORE), np.linalg.slogdet(own + np.diag(r))[1], len(used))
         quiet = math.exp(-min(s["level"][3 if j == self.ego else 5], 0.0))
         total, gain, locked = np.trace(own) + r.sum(), np.trace(own) / (np.trace(own) + r.sum()), s["locked"]
         q = min(square, float(gap @ gap) / SLIP) * total / (np.trace(own) + quiet * r.sum())

@@ -17,7 +17,6 @@ from .cooperative_state import (
     CLOCK,
     COUNT,
     FIXES,
-    HITS,
     INPUT,
     LAST,
     LEVEL,
@@ -248,7 +247,8 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
         settle(g, h, k, f.member[k, VAGUE])
         f.member[k, VAGUE] = 0.0
         return 1.0
-    if guards.trust > 0.0 and again and used == 3 and q > 0.0 and wrong_on_average(f, model, guards, k, q):
+    judged = k > 0 or members(f) > 0  # alone nothing tells a receiver that errs from an odometer that does
+    if guards.trust > 0.0 and judged and again and used == 3 and q > 0.0 and wrong_on_average(f, model, guards, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
         doubt(f, model, guards, j)
@@ -269,10 +269,19 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
     if guards.fix_gate > 0.0:
         share = 1.0 / inflation(q, guards.fix_gate, f.member[k, LOCKED])
         f.member[k, LOCKED] = count(q, guards.fix_gate, f.member[k, LOCKED], own / (own + noise))
-    score(f, h, FIX_SCORE / math.sqrt(1.0 + f.who[0, HITS]) if k == 0 else FIX_SCORE, True)
+    score(f, h, FIX_SCORE, True)
     correct(g, h, share)
     hold(f, share)
     return share
+
+
+@part
+def members(f: Filter) -> int:
+    """How many neighbours are in the star."""
+    count = 0
+    for k in range(1, len(f.who)):
+        count += f.who[k, VEHICLE] >= 0
+    return count
 
 
 @inside
