@@ -16,9 +16,9 @@ NOISE = co.Sensors(
     gnss_std=(1.5, 1.5, 2.5), velocity_reading="speed", azimuth_std=0.05, inclination_std=0.05, yaw_rate_std=0.02
 )
 CHANNEL = co.V2X(max_neighbours=4, radius=60.0, loss=0.2, latency=0.1)
-NEAR = {"cooperative-filter": 2e-5}
+NEAR = {"cooperative-filter": 5e-5}
 """m, where an iteration or a cone solver stops at its own tolerance, of 0.1 mm and less, or of a state of which little
-is known beside much; 1e-6 elsewhere."""
+is known beside much, or of an average over hypotheses, whose odds magnify rounding; 1e-6 elsewhere."""
 AXIS = ("kalman-adaptive",)
 """Methods that estimate a variance for each axis, and so know directions."""
 

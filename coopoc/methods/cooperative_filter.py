@@ -71,14 +71,16 @@ class CooperativeFilter(Checked):
 
     - *Trust*: the fixes of a vehicle that is new have an unknown offset $b_j \sim N(0, \tau^2)$. When the odds
       $p(b_j = 0 \mid \text{all}) / p(b_j = 0)$ allow, $b_j$ is set to 0, the surest first, and all its fixes count in
-      retrospect. A mean innovation that has become unlikely revokes the trust, in the ego's own receiver, too.
+      retrospect. A mean innovation that has become unlikely revokes the trust; in the
+      ego's own receiver, too, where there are neighbours.
     - *Gates*: where the squared Mahalanobis distance $q$ of a fix, or of a component of a relative measurement,
       exceeds its gate, the innovation's covariance is multiplied by $q / \mathrm{gate}$; that of a component far beyond
       it by 100 more, and a fix far beyond it is left out, until many were (`kernels.gate`). A member that is
       contradicted for too long joins anew; an ego that rests on nothing that is trusted starts anew. Velocities that
       no vehicle can have reached are replaced by the last ones.
-    - *Levels*: the variances of fixes, ranges, azimuths, inclinations, motions and neighbours' fixes follow their innovations, between
-      0.14 and 33 times what is assumed, by recursive maximum likelihood (`kernels.stars.otherwise`).
+    - *Levels*: the variances of the ego's fixes, its neighbours' fixes, ranges, azimuths, inclinations and motions
+      follow their innovations, between 0.14 and 33 times what is assumed, by recursive maximum likelihood
+      (`kernels.stars.otherwise`).
     - *Errors that last and may not be there*: of heading $b$ and scale $s$ of each odometry,
       $x_t = x_{t-1} + (1 + s) R(b) \Delta t \, u$, of the ego's compass and of its ranges. Each is a state with a wide
       prior, and the estimate is the average over whether it is 0, by Bayes' rule (`kernels.stars.otherwise`).
