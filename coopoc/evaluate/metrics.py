@@ -324,7 +324,7 @@ def aligned(estimate: Floats, truth: Floats) -> Floats:
     if x.shape[1] == 2:
         turn = np.vdot(x @ [1, 1j], y @ [1, 1j])
         turned = (x @ [1, 1j]) * turn / np.abs(turn)
-        return np.stack([turned.real, turned.imag], axis=-1) + truth.mean(axis=0)
+        return np.asarray(np.stack([turned.real, turned.imag], axis=-1) + truth.mean(axis=0))
     return np.asarray(Rotation.align_vectors(y, x)[0].apply(x) + truth.mean(axis=0))
 
 

@@ -92,7 +92,7 @@ def parts_of(recording: Recording, truth: Fleet | None) -> list[Part]:
     parts = []
     for column in recording.observers:
         for start, stop in recording.stretches(column, SHORTEST):
-            part, variance = recording.between(start, stop), 0.0
+            part, variance = recording.between(start, stop), np.zeros(2)
             if truth is None:
                 target, variance = part.gnss[:, :, column], np.square(recording.sensors.gnss_std[:2])
                 fixed = part.t[np.isfinite(target[0, :, 0])]
@@ -146,7 +146,7 @@ def held_out(method: Method, usual: Method, parts: Sequence[Part], since: float)
             gap = (one(part.recording, [part.column]).x[:, :, 0] - part.target)[:, part.recording.t >= since, :2]
             blocks = np.array_split(np.linalg.norm(gap, axis=-1), max(1, BLOCKS // len(parts)), axis=1)
             found += [float(np.sqrt(np.nanmean(b**2))) for b in blocks if np.isfinite(b).any()]
-    change, n = np.subtract(*errors), len(errors[0])
+    change, n = np.array(errors[0]) - errors[1], len(errors[0])
     half = t.ppf(0.975, n - 1) * change.std(ddof=1) / np.sqrt(n) if n > 1 else np.inf
     return float(change.mean()), float(half)
 
