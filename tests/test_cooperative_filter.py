@@ -82,7 +82,7 @@ def test_wrong_ranges_cost_little_and_are_named() -> None:
 
 
 def test_an_offset_of_all_ranges_is_a_state() -> None:
-    """Delays of a radio, the same for a whole run, are estimated; less well where nobody states that there are any."""
+    """Delays of a radio, the same for a whole run, are estimated; less well where none is stated."""
     fleet, told = drive(300), replace(S2, range_offset_std=1.0)
     seen, longer = (observe(fleet, each, V2X(6), runs=4, observers=[0, 3]) for each in (S2, told))
     added = (longer.relative - seen.relative)[..., 0]

@@ -247,7 +247,7 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
         settle(g, h, k, f.member[k, VAGUE])
         f.member[k, VAGUE] = 0.0
         return 1.0
-    judged = k > 0 or members(f) > 0  # alone nothing tells a receiver that errs from an odometer that does
+    judged = k > 0 or members(f) > 0  # alone, errors of the receiver and of the odometer cannot be separated
     if guards.trust > 0.0 and judged and again and used == 3 and q > 0.0 and wrong_on_average(f, model, guards, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
