@@ -63,6 +63,4 @@ Part: Any = type("Part", (Kernel,), {"is_part": True})
 def for_any_number(part: Any) -> None:
     """Compile a part once for all integers and truth values, not once more for each constant that a caller gives."""
     typed = part.get_call_template
-    part.get_call_template = lambda args, kws: typed(
-        [types.unliteral(kind) for kind in args], {name: types.unliteral(kind) for name, kind in kws.items()}
-    )
+    part.get_call_template = lambda args, kws: typed(tuple(map(types.unliteral, args)), kws)

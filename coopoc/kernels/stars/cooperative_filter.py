@@ -13,7 +13,7 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inside, part
-from ..compiling.small import apply, negate, store
+from ..compiling.small import apply, negate, store, subtract
 from ..gate import GATE
 from ..geometry import angle
 from .cooperative_members import join, leave, predict, steady
@@ -22,15 +22,14 @@ from .cooperative_state import (
     AGE,
     ANSWER,
     AT,
-    AZIMUTHS,
     CLOCK,
+    COVARIANCE,
     DT,
     FIX,
     FIX_VARIANCE,
     FIXES,
     FOUND,
     HITS,
-    INCLINATIONS,
     INPUT,
     JOINED,
     LEVEL,
@@ -40,7 +39,6 @@ from .cooperative_state import (
     ORDER,
     OUT,
     OWN,
-    RANGES,
     SOLO,
     SOLO_VARIANCE,
     SPAN,
@@ -83,7 +81,7 @@ from .gaussian import (
     settle,
     weight,
 )
-from .messages import Assumptions, Measurements, three_of
+from .messages import Assumptions, Measurements, three_of, vector_at
 from .otherwise import (
     LIKELY,
     NOW,
@@ -130,59 +128,37 @@ def run_filter(
     neighbours, notes = np.empty((runs, links, 3)), np.empty((runs, links, 5))
     found = np.zeros((runs, steps, FOUND))
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
-    out = x, cov, neighbours, fixes, notes, found
     for run in range(runs):
         f, tries = new_filter(1 + most, vehicles), new_tries(1 + most, vehicles)
-        filter_run(f, tries, measurements, assumed, sent, model, guards, own, rows, who, run, out)
-    return out
-
-
-@part
-def filter_run(
-    f: Filter,
-    tries: Tries,
-    measurements: Measurements,
-    assumed: Assumptions,
-    sent: Sent,
-    model: Model,
-    guards: Guards,
-    own: Floats,
-    rows: Floats,
-    who: Ints,
-    run: int,
-    out: tuple[Floats, Floats, Floats, Floats, Floats, Floats],
-) -> None:
-    """One run, from a filter before its first step; the arguments of `run_filter`, memory of a step, and what it
-    returns."""
-    x, cov, neighbours, fixes, notes, found = out
-    for t in range(len(measurements.start) - 1):
-        first = measurements.start[t]
-        count = measurements.start[t + 1] - first
-        gather_own(own, measurements, assumed, model.white, run, t)
-        for i in range(count):
-            who[i] = measurements.neighbour[first + i]
-            gather_neighbour(rows, measurements, assumed, sent, run, t, first + i, i)
-        if math.isnan(own[MOTION]) or (f.g.vectors[0] == 0 and math.isnan(own[FIX])):
-            pause(f, own[DT])
-            x[run, t], cov[run, t] = math.nan, math.nan
-            continue
-        if f.g.vectors[0] == 0:
-            begin(f, model, guards, own, rows, count, measurements.ego)
-        step(f, tries, model, guards, own, rows, who, count)
-        fixes[run, t] = f.member[0, OUT + 3]
-        for i in range(FOUND):
-            found[run, t, i] = f.ego[TOLD + i]
-        for c in range(3):
-            x[run, t, c] = f.ego[ANSWER + c]
-            for d in range(3):
-                cov[run, t, c, d] = f.ego[ANSWER + 3 + 3 * c + d]
-        for i in range(count):
-            k = f.slot[who[i]]
+        for t in range(steps):
+            first = measurements.start[t]
+            count = measurements.start[t + 1] - first
+            gather_own(own, measurements, assumed, model.white, run, t)
+            for i in range(count):
+                who[i] = measurements.neighbour[first + i]
+                gather_neighbour(rows, measurements, assumed, sent, run, t, first + i, i)
+            if math.isnan(own[MOTION]) or (f.g.vectors[0] == 0 and math.isnan(own[FIX])):
+                pause(f, own[DT])
+                x[run, t], cov[run, t] = math.nan, math.nan
+                continue
+            if f.g.vectors[0] == 0:
+                begin(f, model, guards, own, rows, count, measurements.ego)
+            step(f, tries, model, guards, own, rows, who, count)
+            fixes[run, t] = f.member[0, OUT + 3]
+            for i in range(FOUND):
+                found[run, t, i] = f.ego[TOLD + i]
             for c in range(3):
-                neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c]
-                notes[run, first + i, c] = weight(f.member[k, OUT + c], guards.gate)
-            notes[run, first + i, 3] = f.member[k, OUT + 3]
-            notes[run, first + i, 4] = f.status[who[i], TRUSTED]
+                x[run, t, c] = f.ego[ANSWER + c]
+                for d in range(3):
+                    cov[run, t, c, d] = f.ego[COVARIANCE + 3 * c + d]
+            for i in range(count):
+                k = f.slot[who[i]]
+                for c in range(3):
+                    neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c]
+                    notes[run, first + i, c] = weight(f.member[k, OUT + c], guards.gate)
+                notes[run, first + i, 3] = f.member[k, OUT + 3]
+                notes[run, first + i, 4] = f.status[who[i], TRUSTED]
+    return x, cov, neighbours, fixes, notes, found
 
 
 @inside
@@ -247,7 +223,7 @@ def step(
         copy_filter(f, tries.before)
         copy_rows(own, rows, tries.own, tries.rows, count)
     for now in range(2):  # what is copied into a loop is compiled once
-        f.ego[NOW], f.ego[LIKELY], f.ego[NUMBERS], f.ego[SQUARES] = now, 0.0, 0.0, 0.0
+        f.ego[NOW] = now
         attempt(f, model, guards, own, rows, vehicles, count)
         if now == 0 and not (slips and surprised(f)):
             f.ego[SLIPPED] = 0.0
@@ -276,7 +252,8 @@ def copy_rows(own: Floats, rows: Floats, to: Floats, to_rows: Floats, count: int
 
 @inside
 def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
-    """Predict and update."""
+    """Predict and update, and count what that says of a slip."""
+    f.ego[LIKELY] = f.ego[NUMBERS] = f.ego[SQUARES] = 0.0
     leave(f, model, guards, own, rows, vehicles, count)
     louder(f, own, rows, count)
     f.ego[SPAN] = own[DT]
@@ -403,13 +380,12 @@ def weigh(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None
 
 @inside
 def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> bool:
-    """Rows of range, azimuth and inclination of member k in metres, linear at `at`; False if its geometry is not
+    """Rows of range, azimuth and inclination of member k in metres, linear at AT; False if its geometry is not
     known."""
     g, h, row, std = f.g, f.h, f.who[k, INPUT], model.std
     if not measured_whole(rows, row) and f.member[k, VAGUE] > 0.0:
         return False
-    here, there = f.member[0], f.member[k]
-    x, y, z = there[AT] - here[AT], there[AT + 1] - here[AT + 1], there[AT + 2] - here[AT + 2]
+    x, y, z = subtract(vector_at(f.member[k], AT // 3), vector_at(f.member[0], AT // 3))
     d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
     ground, far = math.sqrt(x * x + y * y), math.sqrt(x * x + y * y + z * z)
     reach = max(far, model.min_range)
@@ -432,19 +408,12 @@ def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> boo
     _, b, c = apply(w, (x, y, z))
     store(h.three, Z // 3, (d, turned * flat + b, raised * reach + c))
     a, b, c = (std[0], std[1] * flat, std[2] * reach) if len(std) else (1.0, 1.0, 1.0)
-    store(
-        h.three,
-        VARIANCE // 3,
-        (
-            a * a * math.exp(f.ego[LEVEL + RANGES]),
-            b * b * math.exp(f.ego[LEVEL + AZIMUTHS]),
-            c * c * math.exp(f.ego[LEVEL + INCLINATIONS]),
-        ),
-    )
+    store(h.three, VARIANCE // 3, (a * a, b * b, c * c))
     store(h.matrix, 0, w)
     store(h.matrix, 1, negate(w))
     store(h.matrix, 2, (0.0, 0.0, 1.0, flat, flat, 0.0, 0.0, 0.0, 0.0))
     for c in range(3):
+        h.three[VARIANCE + c] *= math.exp(f.ego[LEVEL + c])
         h.three[LIMIT + c] = guards.gate
     h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]
     h.block[TERMS] = 3 if has(g, 0, COMPASS) else 2
@@ -465,6 +434,6 @@ def add_way(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
             a = w[3 * c + d]
             h.three[Z + c] -= a * f.member[k, WAY + d]
             h.three[VARIANCE + c] += a * a * (often * rows[f.who[k, INPUT], STEP + d] + changed)
-            by = w[3 * c] * w[TURNED + d] + w[3 * c + 1] * w[TURNED + 3 + d] + w[3 * c + 2] * w[TURNED + 6 + d]
+            by = w[3 * c] * w[TURNED + d] + w[3 * c + 1] * w[TURNED + 3 + d]
             w[9 * n + 3 * c + d] = by
             h.three[Z + c] += by * g.x[first + d] if h.block[TERMS] > n else 0.0

@@ -42,6 +42,7 @@ from .cooperative_state import (
     start,
 )
 from .gaussian import ABSENT, COMMON, ERROR, KINDS, PLACE, has, insert, remove, shift, widen
+from .messages import vector_at
 from .otherwise import drive, slip_variance
 
 
@@ -93,7 +94,7 @@ def predict(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
     g, first = f.g, 3 * f.g.block[0, PLACE]
     keep = math.exp(-own[DT] / model.time) if model.own + model.common > 0.0 else 1.0
     fades = 1.0 - keep * keep
-    drive(f, model, 0, (own[MOTION], own[MOTION + 1], own[MOTION + 2]), own[DT])
+    drive(f, model, 0, vector_at(own, MOTION // 3), own[DT])
     for c in range(3):
         g.p[first + c, first + c] += own[MOTION_VARIANCE + c] + slip_variance(f, model, own[DT])
     for k in range(len(f.who)):

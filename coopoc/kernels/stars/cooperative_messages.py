@@ -8,7 +8,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import compiled, inner, inside, part
-from ..compiling.small import add_diagonal, scale
+from ..compiling.small import add_diagonal, scale, store
 from ..dead_reckoning import ROUNDING
 from ..gate import SLIP, count, inflation
 from .cooperative_members import steady
@@ -163,8 +163,7 @@ def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> No
         status[LAST + 6 + c] = rows[row, ODOMETER + c]
         rows[row, ODOMETER + c] = f.member[k, WAY + c] / gap if follows and steps > 1.0 else rows[row, SPEED + c]
     steady(f, guards, j, rows[row], ODOMETER, STEP, 1.0)
-    u = rows[row, ODOMETER], rows[row, ODOMETER + 1], rows[row, ODOMETER + 2]
-    drive(f, model, k, scale(u, gap), gap)
+    drive(f, model, k, scale(vector_at(rows[row], ODOMETER // 3), gap), gap)
     half, often = 0.5 * (1.0 + 1.0 / steps), steps if follows else (gap / dt) ** 2
     for c in range(3):
         g.p[first + c, first + c] += half * often * rows[row, STEP + c]
@@ -219,11 +218,8 @@ def goes_on(f: Filter, rows: Floats, k: int) -> bool:
     """How far member k has moved since it sent its newest message, by the velocity in that if it is plausible, and the
     derivatives of the way; False if the message is of now."""
     age, row, status = f.ego[CLOCK] - f.member[k, WHEN], f.who[k, INPUT], f.status[f.who[k, VEHICLE]]
-    u = status[PACE], status[PACE + 1], status[PACE + 2]
-    if status[SLIPS] == 0.0:
-        u = rows[row, SPEED], rows[row, SPEED + 1], rows[row, SPEED + 2]
-    way = turned(f, k, scale(u, age)) if age > ROUNDING else (0.0, 0.0, 0.0)
-    f.member[k, WAY], f.member[k, WAY + 1], f.member[k, WAY + 2] = way
+    u = vector_at(rows[row], SPEED // 3) if status[SLIPS] == 0.0 else vector_at(status, PACE // 3)
+    store(f.member[k], WAY // 3, turned(f, k, scale(u, age)) if age > ROUNDING else (0.0, 0.0, 0.0))
     return bool(age > ROUNDING)
 
 
@@ -288,14 +284,14 @@ def members(f: Filter) -> int:
 def wrong_on_average(f: Filter, model: Model, guards: Guards, k: int, q: float) -> bool:
     """Whether the mean of a vehicle's innovations, each clipped, is likelier with another error of its fixes than is
     assumed; or, where that error is being estimated, with the last one alone."""
-    h, status, j = f.h, f.status, f.who[k, VEHICLE]
-    status[j, COUNT] = count = min(status[j, COUNT] + 1.0, guards.window)
-    if status[j, TRUSTED] == 0.0 and q > guards.fix_gate:
+    h, status = f.h, f.status[f.who[k, VEHICLE]]
+    status[COUNT] = count = min(status[COUNT] + 1.0, guards.window)
+    if status[TRUSTED] == 0.0 and q > guards.fix_gate:
         return True
     clip = math.sqrt(CLIP / q) if q > CLIP else 1.0
     for c in range(3):
-        status[j, MEAN + c] += (clip * h.three[GAP + c] - status[j, MEAN + c]) / count
-    mean, (p, q, r) = (status[j, MEAN], status[j, MEAN + 1], status[j, MEAN + 2]), vector_at(h.three, VARIANCE // 3)
+        status[MEAN + c] += (clip * h.three[GAP + c] - status[MEAN + c]) / count
+    mean, (p, q, r) = vector_at(status, MEAN // 3), vector_at(h.three, VARIANCE // 3)
     more = 1.0 if model.own > 0.0 else 0.0
     s = add_diagonal(block_at(h.matrix, COV // 9), (p / count + more, q / count + more, r / count + more))
     odds = math.log((1.0 - guards.share) / guards.share)

@@ -25,7 +25,6 @@ from .gaussian import (
     Gaussian,
     Rows,
     clear,
-    copy_gaussian,
     insert,
     new_gaussian,
     new_rows,
@@ -176,13 +175,14 @@ VEHICLE, INPUT, ORDER, HITS, WHO = 0, 1, 2, 3, 6
 """Of a slot: its vehicle, ABSENT for none, its row of the step's input, ABSENT for none, and how often in a row each of
 three components exceeded its gate; the ego's first counts its fixes. ORDER lists the slots of the members, nearest
 first: a gate depends on what was used before, not on how members are numbered."""
-WHEN, JOINED, VAGUE, LOCKED, WAY, AT, OUT, MEMBER = 0, 1, 2, 3, 4, 7, 10, 14
-"""Of a member: when it was at its position, s, which is when it sent its newest message; the step at which it joined;
-variance of its position beyond that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of its
-fixes; the way m that it has moved since; where relative measurements are linear m; and, out, the squared normalised
-innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing was: the
-ego's are those of its fix."""
-STEPS, CLOCK, SPAN, MADE, SLIPPING, LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, EGO = 0, 1, 2, 3, 5, 11, 17, 23, 29, 40, 52
+WAY, AT, WHEN, JOINED, VAGUE, LOCKED, OUT, MEMBER = 0, 3, 6, 7, 8, 9, 10, 14
+"""Of a member: the way m that it has moved since it was at its position; where relative measurements are linear m; when
+it was there, s, which is when it sent its newest message; the step at which it joined; variance of its position beyond
+that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of its fixes; and, out, the squared
+normalised innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing
+was: the ego's are those of its fix."""
+STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
+LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, EGO = 11, 17, 23, 29, 40, 43, 52
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
 of motion makes, and the whole then; six numbers of `otherwise` on slips; by kind of number the logarithm of its level,
 the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what is
@@ -232,8 +232,14 @@ def new_filter(slots: int, vehicles: int) -> Filter:
 
 @part
 def copy_filter(source: Filter, target: Filter) -> None:
-    """Copy the state."""
-    copy_gaussian(source.g, target.g)
+    """Copy the state; the target has room for as many members and vehicles or more."""
+    n = 3 * max(source.g.vectors[0], target.g.vectors[0])
+    for i in range(n):
+        target.g.x[i] = source.g.x[i]
+        for j in range(n):
+            target.g.p[i, j] = source.g.p[i, j]
+    for i in range(len(source.g.vectors)):
+        target.g.vectors[i] = source.g.vectors[i]
     for i in range(EGO):
         target.ego[i] = source.ego[i]
     for k in range(len(source.who)):
@@ -241,6 +247,8 @@ def copy_filter(source: Filter, target: Filter) -> None:
             target.who[k, i] = source.who[k, i]
         for i in range(MEMBER):
             target.member[k, i] = source.member[k, i]
+        for i in range(KINDS):
+            target.g.block[k, i] = source.g.block[k, i]
     for j in range(len(source.slot)):
         target.slot[j] = source.slot[j]
     for i in range(len(source.slot) * STATUS // LANES):

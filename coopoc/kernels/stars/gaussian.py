@@ -90,8 +90,8 @@ def new_gaussian(members: int) -> Gaussian:
 @storage
 def new_rows(members: int) -> Rows:
     """Room for three numbers."""
-    size = 12 * (1 + KINDS * members // 4)
-    return Rows(np.zeros(THREE), np.zeros(9 * (TERMS + 3)), np.zeros(MEASURED + 3, np.int64), np.zeros(3 * size))
+    gain = np.zeros(36 * (1 + KINDS * members // 4))
+    return Rows(np.zeros(THREE), np.zeros(9 * (TERMS + 3)), np.zeros(MEASURED + 3, np.int64), gain)
 
 
 @inside
@@ -150,21 +150,6 @@ def remove(g: Gaussian, member: int, kind: int) -> None:
     g.block[moved // KINDS, moved % KINDS] = b
     g.block[member, kind] = ABSENT
     g.vectors[0] = last
-
-
-@part
-def copy_gaussian(source: Gaussian, target: Gaussian) -> None:
-    """Copy the vectors; the target has room for as many members or more."""
-    n = 3 * max(source.vectors[0], target.vectors[0])
-    for i in range(n):
-        target.x[i] = source.x[i]
-        for j in range(n):
-            target.p[i, j] = source.p[i, j]
-    for i in range(len(source.vectors)):
-        target.vectors[i] = source.vectors[i]
-    for k in range(len(source.block)):
-        for kind in range(KINDS):
-            target.block[k, kind] = source.block[k, kind]
 
 
 @part

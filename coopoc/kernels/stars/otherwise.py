@@ -31,6 +31,7 @@ from ...arrays import Floats
 from ..compiling.compile import part, storage
 from .cooperative_state import (
     ANSWER,
+    COVARIANCE,
     DT,
     FIXES,
     INFORMATION,
@@ -47,6 +48,7 @@ from .cooperative_state import (
     STEP,
     TOLD,
     VEHICLE,
+    WHOLE,
     WIDTH,
     Filter,
     Guards,
@@ -78,22 +80,22 @@ deviations."""
 @part
 def turned(f: Filter, k: int, moved: tuple[float, float, float]) -> tuple[float, float, float]:
     """(1 + s) R(b) m, and its derivatives by b and s in TURNED; m itself where odometry does not err."""
-    g, w = f.g, f.h.matrix
-    for i in range(9):
-        w[TURNED + i] = 0.0
+    g, w = f.g, f.h.matrix[TURNED:]
+    for i in range(6):
+        w[i] = 0.0
     if not has(g, k, TURN):
         return moved
     i = 3 * g.block[k, TURN]
     c, s, scale = math.cos(g.x[i]), math.sin(g.x[i]), 1.0 + g.x[i + 1]
     east, north = c * moved[0] - s * moved[1], s * moved[0] + c * moved[1]
-    w[TURNED], w[TURNED + 1], w[TURNED + 3], w[TURNED + 4] = -scale * north, east, scale * east, north
+    w[0], w[3], w[1], w[4] = -scale * north, scale * east, east, north
     return scale * east, scale * north, moved[2]
 
 
 @part
 def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt: float) -> None:
     """Move a member by its odometry, whose errors decay."""
-    g, w = f.g, f.h.matrix
+    g, w = f.g, f.h.matrix[TURNED:]
     first, way = 3 * g.block[k, PLACE], turned(f, k, moved)
     for c in range(3):
         g.x[first + c] += way[c]
@@ -101,13 +103,11 @@ def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt
         return
     i, n, keep = 3 * g.block[k, TURN], 3 * g.vectors[0], math.exp(-dt / model.lasts)
     for c in range(2):
-        by = TURNED + 3 * c
         for j in range(n):
-            g.p[first + c, j] += w[by] * g.p[i, j] + w[by + 1] * g.p[i + 1, j]
+            g.p[first + c, j] += w[3 * c] * g.p[i, j] + w[3 * c + 1] * g.p[i + 1, j]
     for j in range(n):
         for c in range(2):
-            by = TURNED + 3 * c
-            g.p[j, first + c] += w[by] * g.p[j, i] + w[by + 1] * g.p[j, i + 1]
+            g.p[j, first + c] += w[3 * c] * g.p[j, i] + w[3 * c + 1] * g.p[j, i + 1]
     shift(g, i, i, keep - 1.0)
     for c in range(2):
         g.p[i + c, i + c] += (1.0 - keep * keep) * model.turn[c]
@@ -144,24 +144,24 @@ def average(f: Filter, model: Model) -> None:
     last two hold their means, and where they are in the state.
     """
     g, few = f.g, f.few
-    first, n, width = 3 * g.block[0, PLACE], 3, len(f.few[0]) - 2
+    first, n, where = 3 * g.block[0, PLACE], 3, len(f.few[0]) - 1
     for c in range(3):
-        few[c, width + 1], f.ego[ANSWER + c] = first + c, g.x[first + c]
+        few[c, where], f.ego[ANSWER + c] = first + c, g.x[first + c]
         for d in range(3):
-            f.ego[ANSWER + 3 + 3 * c + d] = g.p[first + c, first + d]
+            f.ego[COVARIANCE + 3 * c + d] = g.p[first + c, first + d]
     for k in range(len(f.who) - 1, -1, -1):
         if f.who[k, VEHICLE] >= 0 and has(g, k, TURN):
-            few[n, width + 1], few[n + 1, width + 1] = 3 * g.block[k, TURN], 3 * g.block[k, TURN] + 1
+            few[n, where], few[n + 1, where] = 3 * g.block[k, TURN], 3 * g.block[k, TURN] + 1
             n += 2
     own = n
     if has(g, 0, COMPASS):
-        few[n, width + 1], few[n + 1, width + 1] = 3 * g.block[0, COMPASS], 3 * g.block[0, COMPASS] + 2
+        few[n, where], few[n + 1, where] = 3 * g.block[0, COMPASS], 3 * g.block[0, COMPASS] + 2
         n += 2
     for i in range(n):
-        at = int(few[i, width + 1])
-        few[i, width] = g.x[at]
+        at = int(few[i, where])
+        few[i, where - 1] = g.x[at]
         for j in range(3, n):
-            few[i, j - 3] = g.p[at, int(few[j, width + 1])]
+            few[i, j - 3] = g.p[at, int(few[j, where])]
     for i in range(3, n):
         kind = (2 + i - own) if i >= own else (i - 3) % 2
         prior = model.turn[kind] if kind < 2 else model.bias if kind == 2 else model.offset
@@ -169,7 +169,7 @@ def average(f: Filter, model: Model) -> None:
     for kind in range(4):
         i = own + kind - 2
         there = n > own if kind >= 2 else own > 3
-        f.ego[TOLD + kind] = few[i, width] if there else 0.0
+        f.ego[TOLD + kind] = few[i, where - 1] if there else 0.0
     f.ego[TOLD + SLIPS] = f.ego[SLIPPED]
     for kind in range(KINDS_OF_NUMBERS):
         f.ego[TOLD + LEVELS + kind] = math.exp(0.5 * f.ego[LEVEL + kind])
@@ -187,7 +187,7 @@ def collapse(f: Filter, i: int, n: int, prior: float, odds: float) -> None:
     for c in range(3):
         ego[ANSWER + c] += mean * few[c, i - 3]
         for d in range(3):
-            ego[ANSWER + 3 + 3 * c + d] += change * few[c, i - 3] * few[d, i - 3]
+            ego[COVARIANCE + 3 * c + d] += change * few[c, i - 3] * few[d, i - 3]
     for j in range(n):
         if j != i:
             few[j, width] += mean * few[j, i - 3]
@@ -290,15 +290,15 @@ def louder(f: Filter, own: Floats, rows: Floats, count: int) -> None:
 def moved(f: Filter, own: Floats) -> None:
     """After the ego's prediction: D + q, both of the three axes together, so that no axis of the world counts."""
     f.ego[MADE] += own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
-    f.ego[MADE + 1] = ego_variance(f)
+    f.ego[WHOLE] = ego_variance(f)
 
 
 @part
 def corrected(f: Filter) -> None:
     """After an update of the ego: D (P+ / P-)^2."""
-    p, before = ego_variance(f), f.ego[MADE + 1]
+    p, before = ego_variance(f), f.ego[WHOLE]
     f.ego[MADE] = min(f.ego[MADE] * (p / before) ** 2, p) if before > 0.0 else 0.0
-    f.ego[MADE + 1] = p
+    f.ego[WHOLE] = p
 
 
 @part

@@ -223,12 +223,11 @@ def stream_step(
             for c in range(3):
                 f.g.x[c] = start[c]
     step(f, tries, model, guards, own, rows, vehicles, len(vehicles))
-    for c in range(3):
-        answer[c] = f.ego[ANSWER + c]
-        for d in range(3):
-            answer[3 + 3 * c + d] = f.ego[ANSWER + 3 + 3 * c + d]
-        for i in range(len(vehicles)):
-            k = f.slot[vehicles[i]]
+    for i in range(12):
+        answer[i] = f.ego[ANSWER + i]
+    for i in range(len(vehicles)):
+        k = f.slot[vehicles[i]]
+        for c in range(3):
             answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c]
 
 
