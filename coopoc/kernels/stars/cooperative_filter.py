@@ -12,7 +12,7 @@ import math
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ..compiling.compile import compiled, inside, part
+from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import apply, negate, store, subtract
 from ..gate import GATE
 from ..geometry import angle
@@ -194,7 +194,7 @@ def gather_neighbour(
         rows[i, SPEED + c], rows[i, STEP + c], rows[i, TYPICAL + c] = u[c], q[c], fix[c]
 
 
-@inside
+@inner
 def step(
     f: Filter,
     tries: Tries,
@@ -217,40 +217,36 @@ def step(
         vehicles: (count,) which they are.
         count: of them.
     """
-    slips, dt = model.slip > 0.0, own[DT]
+    slips, other = model.slip > 0.0, tries.other
+    f.ego[NOW] = 0.0
     remember_speed(f, own)
     if slips:
-        copy_filter(f, tries.before)
-        copy_rows(own, rows, tries.own, tries.rows, count)
-    for now in range(2):  # what is copied into a loop is compiled once
-        f.ego[NOW] = now
-        attempt(f, model, guards, own, rows, vehicles, count)
-        if now == 0 and not (slips and surprised(f)):
-            f.ego[SLIPPED] = 0.0
-            break
-        if now == 0:
-            copy_filter(f, tries.first)
-            copy_filter(tries.before, f)
-            copy_rows(tries.own, tries.rows, own, rows, count)
-        else:
-            probably = chance(f, tries.first, dt)
-            if probably < 0.5:
-                copy_filter(tries.first, f)
-            f.ego[SLIPPED] = probably
+        copy_filter(f, other)
+        copy_rows(own, rows, tries, count)
+    attempt(f, model, guards, own, rows, vehicles, count)
+    if slips and surprised(f):
+        other.ego[NOW] = 1.0
+        attempt(other, model, guards, tries.own, tries.rows, vehicles, count)
+        probably = chance(other, f, own[DT])
+        if probably >= 0.5:
+            copy_filter(other, f)
+        f.ego[SLIPPED] = probably
+    else:
+        f.ego[SLIPPED] = 0.0
     average(f, model)
 
 
 @part
-def copy_rows(own: Floats, rows: Floats, to: Floats, to_rows: Floats, count: int) -> None:
+def copy_rows(own: Floats, rows: Floats, tries: Tries, count: int) -> None:
     """Copy a step's numbers, which trying it changes."""
     for i in range(OWN):
-        to[i] = own[i]
+        tries.own[i] = own[i]
     for i in range(count):
         for j in range(WIDTH):
-            to_rows[i, j] = rows[i, j]
+            tries.rows[i, j] = rows[i, j]
 
 
-@inside
+@inner
 def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Predict and update, and count what that says of a slip."""
     f.ego[LIKELY] = f.ego[NUMBERS] = f.ego[SQUARES] = 0.0

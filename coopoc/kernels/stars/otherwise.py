@@ -206,10 +206,9 @@ LASTS, RARE, LATE, UNSEEN = 3.0, 3000.0, 10.0, 1.0
 
 
 class Tries(NamedTuple):
-    """A filter before a step and after its first try, and the step's rows."""
+    """The filter before a step, for the second try, and the step's rows."""
 
-    before: Filter
-    first: Filter
+    other: Filter
     own: Floats
     rows: Floats
 
@@ -217,7 +216,7 @@ class Tries(NamedTuple):
 @storage
 def new_tries(slots: int, vehicles: int) -> Tries:
     """Memory for as many members and vehicles."""
-    return Tries(new_filter(slots, vehicles), new_filter(slots, vehicles), np.zeros(OWN), np.zeros((slots, WIDTH)))
+    return Tries(new_filter(slots, vehicles), np.zeros(OWN), np.zeros((slots, WIDTH)))
 
 
 @part
