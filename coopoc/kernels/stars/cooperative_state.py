@@ -116,9 +116,8 @@ NO_GUARDS = Guards(
 )
 ON_ROADS = Guards(fix_gate=3.5, heading=0.03, scale=0.03, lasts=1e4, compass=0.0, offset=0.0, absent=-math.inf, fix=2.0)
 """Of measurements that are not simulated: no odometry is without such errors."""
-RANGES, AZIMUTHS, INCLINATIONS, FIXES, MOTIONS, MESSAGES = range(6)
-KINDS_OF_NUMBERS, FOUND = 6, 11
-"""Kinds of numbers that have a level."""
+FIXES, MOTIONS, MESSAGES, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 6, 11
+"""Kinds of numbers that have a level, behind ranges, azimuths and inclinations; how many, and how much is found."""
 
 
 class Sent(NamedTuple):

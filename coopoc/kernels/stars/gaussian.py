@@ -59,7 +59,7 @@ Z, VARIANCE, LIMIT, GAP, Q, WHITE, SCHUR, THREE = range(0, 24, 3)
 none; and, out, innovations, these squared and normalised, 0 where nothing was measured, whitened innovations, and their
 variances."""
 MEASURED = TERMS + 1
-COV, SQUARE, TURNED = 9 * TERMS, 9 * TERMS + 9, 9 * TERMS + 18
+COV, SQUARE, TURNED, MATRIX = range(9 * TERMS, 9 * TERMS + 36, 9)
 """Behind the matrices of the terms: H P H^T, out, scratch, and derivatives of `otherwise.turned`."""
 
 
@@ -68,7 +68,7 @@ class Rows(NamedTuple):
 
     Attributes:
         three: (THREE,).
-        matrix: (9 (TERMS + 3),) the matrices W_k, and those behind them.
+        matrix: (MATRIX,) the matrices W_k, and those behind them.
         block: (TERMS + 4,) indices of the vectors, how many are in use, and whether each number was measured.
         gain: (3 size,) out: columns of the square root of what the update takes from P.
     """
@@ -91,7 +91,7 @@ def new_gaussian(members: int) -> Gaussian:
 def new_rows(members: int) -> Rows:
     """Room for three numbers."""
     gain = np.zeros(36 * (1 + KINDS * members // 4))
-    return Rows(np.zeros(THREE), np.zeros(9 * (TERMS + 3)), np.zeros(MEASURED + 3, np.int64), gain)
+    return Rows(np.zeros(THREE), np.zeros(MATRIX), np.zeros(MEASURED + 3, np.int64), gain)
 
 
 @inside
