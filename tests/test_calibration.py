@@ -14,12 +14,12 @@ from numpy.testing import assert_allclose
 import coopoc as co
 from coopoc import V2X, CooperativeFilter, Fleet, Kalman, Recording, Sensors, observe
 from coopoc.evaluate.metrics import rt_le
-from coopoc.kernels.stars.cooperative_state import NO_GUARDS, ON_ROADS
+from coopoc.methods.cooperative_filter import AS_STATED, ON_ROADS
 from coopoc.studies import benchmark
 from coopoc.studies.roads import ROADS, road_row, roads
 from coopoc.studies.roads import seen as thinned
 
-TURNS = NO_GUARDS._replace(heading=0.1, scale=0.03, lasts=300.0, absent=-np.inf)
+TURNS = AS_STATED._replace(heading=0.1, scale=0.03, lasts=300.0, absent=-np.inf)
 """Errors of heading and scale, and no guard: the rivals' extended Kalman filter."""
 
 
@@ -49,11 +49,11 @@ def rivals(monkeypatch: pytest.MonkeyPatch) -> Any:
 
 
 @pytest.mark.parametrize("name", ["EKF", "StoneSoup"])
-def test_without_guards_it_is_the_extended_filter_of_others(rivals: Any, name: str) -> None:
+def test_without_priors_it_is_the_extended_filter_of_others(rivals: Any, name: str) -> None:
     if name == "StoneSoup":
         pytest.importorskip("stonesoup", reason="pip install stonesoup")
     recording, _ = seen(runs=1)
-    mine, other = CooperativeFilter(guards=TURNS)(recording), getattr(rivals, name)()(recording)
+    mine, other = CooperativeFilter(priors=TURNS)(recording), getattr(rivals, name)()(recording)
     assert mine.covariance is not None
     assert_allclose(mine.x[..., :2], other.x[..., :2], atol=1e-5)  # its first fix meets a prior of 1e6 m^2
     assert_allclose(mine.covariance[..., :2, :2], other.covariance[..., :2, :2], rtol=1e-4, atol=1e-5)
@@ -71,7 +71,7 @@ def test_rivals_do_what_they_are_for(rivals: Any) -> None:
 def test_heading_and_scale_are_found() -> None:
     """-0.15 rad turns the odometry back and 1 / 1.05 its scale; the errors cost a Kalman filter twice as much."""
     recording, fleet = seen(900, runs=10, gnss_std=(1.0, 1.0, 1.0))
-    track = CooperativeFilter(guards=ON_ROADS._replace(heading=0.1))(recording)
+    track = CooperativeFilter(priors=ON_ROADS._replace(heading=0.1))(recording)
     assert track.extras["heading_error"][:, -1].mean() == pytest.approx(-0.15, abs=0.03)
     assert track.extras["scale_error"][:, -1].mean() == pytest.approx(1 / 1.05 - 1, abs=0.02)
     assert 2 * rt_le(track, fleet).mean() < rt_le(Kalman()(recording), fleet).mean()
@@ -107,7 +107,7 @@ def test_calibration_harms_no_drive(with_truth: bool) -> None:
         track = fitted(rest)
         assert rt_le(track, truth) < 1.05 * rt_le(CooperativeFilter()(rest), truth)
         assert any("calibrat" in note and "+-" in note for note in track.notes)
-        assert fitted.guards.fix_gate in (ON_ROADS.fix_gate, CooperativeFilter().guards.fix_gate)
+        assert fitted.priors.fix_gate in (ON_ROADS.fix_gate, CooperativeFilter().priors.fix_gate)
 
 
 def test_what_cannot_be_calibrated_is_refused() -> None:

@@ -15,8 +15,7 @@ from test_star_filters import CHANNELS, gappy, holed, partial
 
 from coopoc import V2X, Fleet, JointFilter, Kalman, Recording, Sensors, load_fleet, nees, observe, rt_le
 from coopoc.arrays import Floats
-from coopoc.kernels.stars.cooperative_state import NO_GUARDS, ON_ROADS, Guards
-from coopoc.methods.cooperative_filter import Broadcast, CooperativeFilter, lasting
+from coopoc.methods.cooperative_filter import AS_STATED, ON_ROADS, Broadcast, CooperativeFilter, Priors, lasting
 from coopoc.methods.noise_model import NoiseModel, resolve
 from coopoc.methods.star_stream import RelativeMeasurement, StarStream
 from coopoc.world.inbox import inbox
@@ -39,7 +38,7 @@ def test_with_everything_off_it_is_the_joint_filter(change: Callable[[Recording]
     fine = replace(fine, azimuth_std=0.002, inclination_std=0.002)
     apart = replace(fleet, position=fleet.position + np.arange(5.0)[:, None] * [20.0, 10.0, 0.4])
     seen = change(observe(apart, fine, V2X(20, radius=1e4), runs=2, observers=[0, 3]))
-    ours, joint = CooperativeFilter(guards=NO_GUARDS)(seen, [0, 3]), textbook(JointFilter())(seen, [0, 3])
+    ours, joint = CooperativeFilter(priors=AS_STATED)(seen, [0, 3]), textbook(JointFilter())(seen, [0, 3])
     assert_allclose(ours.x, joint.x, atol=2e-5)
     assert ours.covariance is not None
     assert joint.covariance is not None
@@ -49,7 +48,7 @@ def test_with_everything_off_it_is_the_joint_filter(change: Callable[[Recording]
 def test_alone_it_is_the_kalman_filter() -> None:
     """With nothing assumed to be wrong; the prior of the start is 1e6 m^2, a fix 12 m^2, and none beyond its gate."""
     seen = observe(drive(), replace(S2, gnss_std=(1.0,) * 3), V2X(0), observers=[0], assumed=S2)
-    ours, kalman = CooperativeFilter(guards=Guards(forget=0.0, heading=0.0, scale=0.0, slip=0.0))(seen), Kalman()(seen)
+    ours, kalman = CooperativeFilter(priors=Priors(forget=0.0, heading=0.0, scale=0.0, slip=0.0))(seen), Kalman()(seen)
     assert_allclose(ours.x, kalman.x, atol=1e-3)
     assert ours.covariance is not None
     assert kalman.covariance is not None
@@ -136,17 +135,17 @@ BAD: dict[str, tuple[Sensors, V2X, Callable[[Recording], Recording]]] = {
 }
 
 
-@pytest.mark.parametrize("guards", [Guards(), NO_GUARDS], ids=["guarded", "open"])
+@pytest.mark.parametrize("priors", [Priors(), AS_STATED], ids=["guarded", "open"])
 @pytest.mark.parametrize("case", BAD)
-def test_the_filter_is_its_oracle(crossing: Fleet, case: str, guards: Guards) -> None:
+def test_the_filter_is_its_oracle(crossing: Fleet, case: str, priors: Priors) -> None:
     """Against dense matrices, one number at a time; members come, go and lose trust."""
     sensors, v2x, change = BAD[case]
     fleet = gappy(crossing)
     seen = change(observe(fleet, sensors, v2x, runs=2, observers=[0]))
-    track, known = CooperativeFilter(guards=guards)(seen), resolve("nominal", seen)
+    track, known = CooperativeFilter(priors=priors)(seen), resolve("nominal", seen)
     assert track.covariance is not None
     assert track.neighbours is not None
-    assumed = ON_ROADS if seen.measured and guards == Guards() else guards
+    assumed = ON_ROADS if seen.measured and priors == Priors() else priors
     for run in range(2):
         x, cov, others = Oracle(seen, 0, run, known, assumed).loop()
         assert_allclose(track.x[run, :, 0], x, atol=1e-6)

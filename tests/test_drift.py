@@ -19,8 +19,7 @@ from coopoc import (
     posterior_bound,
     rt_le,
 )
-from coopoc.kernels.stars.cooperative_state import NO_GUARDS
-from coopoc.methods.cooperative_filter import CooperativeFilter
+from coopoc.methods.cooperative_filter import AS_STATED, CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.world.body_frames import gauss_markov
 
@@ -63,7 +62,7 @@ def test_alone_it_is_filterpys_augmented_filter() -> None:
     """filterpy with state (x, drift, common) per axis, from the first fix with a vague position."""
     fleet = convoy(1)
     seen = observe(fleet, BOTH, V2X(0), runs=1, seed=3)
-    track, keep = CooperativeFilter(guards=NO_GUARDS)(seen, [0]), np.exp(-0.1 / 5.0)
+    track, keep = CooperativeFilter(priors=AS_STATED)(seen, [0]), np.exp(-0.1 / 5.0)
     q = NoiseModel.nominal(BOTH).process_variance(seen)[0, :, 0]
     for axis in range(3):
         kf = KalmanFilter(dim_x=3, dim_z=1)
@@ -92,7 +91,7 @@ def test_rms_and_nees_agree_with_the_bound() -> None:
     fleet, v2x = convoy(), V2X(3, 25.0)
     for sensors in (OWN, COMMON, BOTH):
         seen = observe(fleet, sensors, v2x, runs=60, observers=[0])
-        track = CooperativeFilter(guards=NO_GUARDS)(seen, [0])
+        track = CooperativeFilter(priors=AS_STATED)(seen, [0])
         rms = float(np.sqrt(np.mean(rt_le(track, fleet) ** 2)))
         assert rms == pytest.approx(bound_rt_le(posterior_bound(fleet, sensors, 0, v2x)), rel=0.12)
         assert np.nanmean(nees(track, fleet)) == pytest.approx(3.0, abs=0.45)

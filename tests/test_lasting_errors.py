@@ -9,11 +9,11 @@ from numpy.testing import assert_allclose
 
 import coopoc as co
 from coopoc import V2X, CooperativeFilter, Fleet, Recording, observe
-from coopoc.kernels.stars.cooperative_state import Guards
+from coopoc.methods.cooperative_filter import Priors
 from coopoc.world.body_frames import turned
 
 S2 = co.Sensors.paper_scenario2()
-ONLY_SCALE = Guards(forget=0.0, heading=0.0, slip=0.0, lasts=1e12)
+ONLY_SCALE = Priors(forget=0.0, heading=0.0, slip=0.0, lasts=1e12)
 
 
 @pytest.fixture(scope="module")
@@ -21,8 +21,8 @@ def town() -> Fleet:
     return co.load_fleet("town10").between(0, 300)
 
 
-def rms(recording: Recording, fleet: Fleet, **guards: float) -> tuple[float, co.Track]:
-    track = CooperativeFilter(guards=Guards()._replace(**guards))(recording, [3, 8])
+def rms(recording: Recording, fleet: Fleet, **priors: float) -> tuple[float, co.Track]:
+    track = CooperativeFilter(priors=Priors()._replace(**priors))(recording, [3, 8])
     return float(np.sqrt(np.square(track.x - fleet.position[:, [3, 8]]).sum(axis=-1).mean())), track
 
 
@@ -35,7 +35,7 @@ def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale: float) -
     fleet = Fleet(("a",), t, position, np.broadcast_to([8.0, 0, 0], position.shape))
     seen = observe(fleet, replace(S2, gnss_std=(1.0,) * 3), V2X(0), observers=[0], assumed=S2)
     seen = replace(seen, velocity=seen.velocity * (1 + scale))
-    track = CooperativeFilter(guards=ONLY_SCALE)(seen, [0])
+    track = CooperativeFilter(priors=ONLY_SCALE)(seen, [0])
     process = co.NoiseModel.nominal(S2).process_variance(seen)[0, :, 0, 0]
     filters, likely = [], np.array([ONLY_SCALE.absent, 0.0])
     for n in (1, 2):

@@ -8,8 +8,8 @@ from conftest import refused
 
 from coopoc import GNSS, V2X, Fleet, JointFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside
-from coopoc.kernels.stars.cooperative_state import Guards
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.methods.cooperative_filter import Priors
 from coopoc.methods.noise_model import resolve
 
 S2 = Sensors.paper_scenario2()
@@ -51,7 +51,7 @@ def test_without_messages_it_is_the_solo_method(name: str, noise: str, channel: 
     cooperative filter assumes that nothing is wrong."""
     method = METHODS[name](noise)
     if name == "cooperative-filter":
-        method = replace(method, guards=Guards(forget=0.0, heading=0.0, scale=0.0, slip=0.0))
+        method = replace(method, priors=Priors(forget=0.0, heading=0.0, scale=0.0, slip=0.0))
     recording = observe(crossing.between(0, 40), S2, channel, runs=3)
     track = method(recording, [0, 1])
     gates = name != "cooperative-filter" and getattr(method, "robust", False)  # whose gate of a fix is another one

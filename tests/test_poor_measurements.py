@@ -23,9 +23,8 @@ from coopoc import (
     observe,
     rt_le,
 )
-from coopoc.kernels.stars.cooperative_state import NO_GUARDS
 from coopoc.learned import GainNet, LearnedGain
-from coopoc.methods.cooperative_filter import CooperativeFilter
+from coopoc.methods.cooperative_filter import AS_STATED, CooperativeFilter
 from coopoc.methods.noise_model import NoiseModel
 from coopoc.world.links import wrap
 
@@ -34,7 +33,7 @@ STARS = (
     JointFilter(),
     JointFilter(exact=False),
     LKFSA("nominal"),
-    CooperativeFilter(guards=NO_GUARDS),
+    CooperativeFilter(priors=AS_STATED),
     MSMV("nominal"),
     CovarianceIntersection(split=True),
 )
@@ -113,7 +112,7 @@ def ranged() -> tuple[Fleet, Recording]:
     [
         JointFilter(),
         JointFilter(exact=False),
-        CooperativeFilter(guards=NO_GUARDS),
+        CooperativeFilter(priors=AS_STATED),
     ],
     ids=lambda method: f"{method.name}-{getattr(method, 'exact', '')}",
 )

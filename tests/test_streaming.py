@@ -16,8 +16,8 @@ from shell import ran
 
 from coopoc import V2X, CooperativeFilter, Fleet, JointFilter, Kalman, NoiseModel, Sensors, StarStream, observe
 from coopoc.arrays import Bools, Floats
-from coopoc.kernels.stars.cooperative_state import NO_GUARDS
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF
+from coopoc.methods.cooperative_filter import AS_STATED
 from coopoc.methods.kalman import AdaptiveKalman
 from coopoc.methods.motion_history import MotionHistory
 from coopoc.methods.star_stream import RelativeMeasurement
@@ -285,7 +285,7 @@ def test_bad_starts_are_named() -> None:
 
 @pytest.mark.parametrize("first", [None, Z + 1.0])
 def test_a_star_from_a_known_place_is_the_kalman_filter(first: Floats | None) -> None:
-    star = StarStream(CooperativeFilter(FITTED, NO_GUARDS), Z)
+    star = StarStream(CooperativeFilter(FITTED, AS_STATED), Z)
     alone = textbook(Kalman(FITTED)).start(Z)
     for z in (first, None, Z + U):
         (x, cov), (same_x, same_cov) = (stream.step(z, U, 0.1) for stream in (star, alone))

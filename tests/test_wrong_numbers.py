@@ -22,9 +22,8 @@ from coopoc.evaluate.metrics import innovation_columns, neighbour_rt_le
 from coopoc.evaluate.scores import scored
 from coopoc.kernels import gate
 from coopoc.kernels.stars.cooperative_filter import run_filter
-from coopoc.kernels.stars.cooperative_state import Guards
 from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
-from coopoc.methods.cooperative_filter import broadcasts, model_of
+from coopoc.methods.cooperative_filter import Priors, broadcasts, model_of
 from coopoc.methods.egos import assumptions, measurements
 from coopoc.methods.noise_model import resolve
 from coopoc.study.results import Results
@@ -111,12 +110,12 @@ def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Flo
         velocity[run, step, sender] += 5e-3 * error
     given = replace(damaged(recording, kind, links), velocity=velocity) if kind else recording
     known = resolve("nominal", given)
-    sent = broadcasts(given, known, method.guards)
+    sent = broadcasts(given, known, method.priors)
     if kind in ("position", "odometer"):
         getattr(sent, kind)[sender, run, step] += error
     box = inbox(given, EGO, method.message)
     seen, assumed = measurements(given, EGO, box), assumptions(given, known, EGO, box)
-    x, cov = run_filter(seen, assumed, sent, model_of(known, method.guards), method.guards)[:2]
+    x, cov = run_filter(seen, assumed, sent, model_of(known, method.priors))[:2]
     return x, np.sqrt(np.trace(cov, axis1=-2, axis2=-1))
 
 
@@ -160,9 +159,9 @@ def wild_fixes(steps: int) -> tuple[co.Recording, np.ndarray, KalmanFilter]:
 def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() -> None:
     """filterpy, its R such that S is q / limit times as large where q = y' S^-1 y exceeds the limit; beyond REJECTED
     limits the fix is left out. The flat prior weighs 1e-6 of a fix."""
-    alone = Guards(forget=0.0, heading=0.0, scale=0.0, slip=0.0)
-    (drive, process, peer), method = wild_fixes(200), CooperativeFilter(guards=alone)
-    track, limit, hits = method(drive, [0]), method.guards.fix_gate, 0.0
+    alone = Priors(forget=0.0, heading=0.0, scale=0.0, slip=0.0)
+    (drive, process, peer), method = wild_fixes(200), CooperativeFilter(priors=alone)
+    track, limit, hits = method(drive, [0]), method.priors.fix_gate, 0.0
     for t in range(1, 200):
         peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
         innovation, S = drive.gnss[0, t, 0] - peer.x, peer.P + 12.25 * np.eye(3)

@@ -10,9 +10,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ..arrays import Floats
+from ..kernels.gate import GATE
 from ..kernels.stars.cooperative_filter import run_filter
 from ..kernels.stars.cooperative_messages import fading_memory
-from ..kernels.stars.cooperative_state import NO_GUARDS, ON_ROADS, Guards, Model, Sent
+from ..kernels.stars.cooperative_state import Model, Sent
 from ..kernels.stars.messages import FORGOTTEN
 from ..world.fleet import Fleet
 from ..world.inbox import Inbox
@@ -36,6 +37,40 @@ NOTED = (0.01, 0.01, 0.01, 0.1, 0.01)
 LOUD = 1.5
 """Level that is worth a note, or less than its inverse."""
 KINDS = ("range", "azimuth", "inclination", "message", "trusted")
+
+
+class Priors(NamedTuple):
+    """What may be otherwise than sensors state; 0 for what is not.
+
+    Attributes:
+        heading: rad, and
+        scale: standard deviations of errors of odometry that last.
+        lasts: s, for which they do.
+        compass: rad, and
+        offset: m, of such errors of the ego's compass and ranges, where none is stated.
+        absent: log odds that each of these is not there, before anything was measured.
+        slip: an ego that slips errs by that share of its late speed.
+        fix: factor of the assumed standard deviation of fixes, which err together for a while.
+        fix_gate: squared Mahalanobis distance from which the fixes of a step weigh less; 0 if no number is doubted.
+        forget: s, in which what innovations have shown of levels is forgotten; 0 for levels that stay.
+    """
+
+    heading: float = 0.1
+    scale: float = 0.1
+    lasts: float = 1e5
+    compass: float = 0.05
+    offset: float = 0.5
+    absent: float = 8.0
+    slip: float = 0.7
+    fix: float = 1.0
+    fix_gate: float = 16.0
+    forget: float = 10.0
+
+
+AS_STATED = Priors(heading=0.0, scale=0.0, compass=0.0, offset=0.0, slip=0.0, fix_gate=0.0, forget=0.0)
+"""Nothing is otherwise: the textbook's filter."""
+ON_ROADS = Priors(heading=0.03, scale=0.03, lasts=1e4, compass=0.0, offset=0.0, absent=-np.inf, fix=2.0, fix_gate=3.5)
+"""Of measurements that are not simulated: no odometry is without such errors."""
 
 
 class Broadcast(NamedTuple):
@@ -91,9 +126,9 @@ class CooperativeFilter(Checked):
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel, whose errors that last (fixes, compass, ranges) are states.
-        guards: limits of the above; the default was chosen on development worlds and validation tasks of CL-Bench, and
-            is `kernels.stars.cooperative_state.ON_ROADS` where measurements are not simulated: there errors of
-            odometry are always assumed, and fixes to err twice as far as is stated, together for a while.
+        priors: of errors; the default was chosen on development worlds and validation tasks of CL-Bench, and is
+            ON_ROADS where measurements are not simulated: there errors of odometry are always assumed, and fixes to
+            err twice as far as is stated, together for a while.
         calibration: what `fitted` has found, a note of its Tracks.
 
     References:
@@ -111,7 +146,7 @@ class CooperativeFilter(Checked):
     """
 
     noise_model: NoiseModel | str = "nominal"
-    guards: Guards = Guards()
+    priors: Priors = Priors()
     name: str = "cooperative-filter"
     calibration: str = ""
     cooperative = True
@@ -131,21 +166,21 @@ class CooperativeFilter(Checked):
         "trusted".
         """
         known = resolve(self.noise_model, check_recording(recording))
-        guards = guards_of(self, known, recording.measured)
-        model, notes = model_of(known, guards), [*known.notes, *filter(None, [self.calibration])]
-        variance, sent = guards.fix**2 * known.fix_variance(recording), broadcasts(recording, known, guards)
+        priors = priors_of(self, known, recording.measured)
+        model, notes = model_of(known, priors), [*known.notes, *filter(None, [self.calibration])]
+        variance, sent = priors.fix**2 * known.fix_variance(recording), broadcasts(recording, known, priors)
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
             seen, assumed = measurements(recording, ego, box), assumptions(recording, known, ego, box)
             assumed = assumed._replace(fixes=variance)
-            x, cov, neighbours, fixes, weights, found = run_filter(seen, assumed, sent, model, guards)
+            x, cov, neighbours, fixes, weights, found = run_filter(seen, assumed, sent, model)
             extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate(KINDS)}
             names = (*(name.replace(" ", "_") for name in FOUND), *(f"{kind}_level" for kind in LEVELS))
             extras |= {name: found[..., i, None] for i, name in enumerate(names)}
             mine = recording.ids[ego]
-            notes.extend(otherwise(mine, found) if guards.trust else ())
+            notes.extend(otherwise(mine, found) if priors.fix_gate else ())
             notes.extend(rejected(f"fixes, {mine}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
-            if model.own + model.common == 0.0 and guards.fix_gate:
+            if model.own + model.common == 0.0 and priors.fix_gate:
                 notes.extend(lasting(mine, recording.gnss[:, :, ego] - x, recording.dt))
             low, measured = (weights < 0.1).sum(axis=0), np.isfinite(weights).sum(axis=0)
             for j in np.unique(seen.neighbour):
@@ -170,8 +205,8 @@ class CooperativeFilter(Checked):
         Raises:
             InputError: no vehicle that drives from a fix on; a truth of other vehicles or times.
         """
-        sensors, guards = check_recording(recording).sensors, ON_ROADS if recording.measured else Guards()
-        usual = {name: getattr(guards, name) for name in ("fix", "heading", "scale", "lasts")} | {"motion": 1.0}
+        sensors, priors = check_recording(recording).sensors, ON_ROADS if recording.measured else Priors()
+        usual = {name: getattr(priors, name) for name in ("fix", "heading", "scale", "lasts")} | {"motion": 1.0}
         if truth is None:
             del usual["fix"]
 
@@ -180,15 +215,15 @@ class CooperativeFilter(Checked):
                 return cls()
             own = dict(numbers)
             noise_model = NoiseModel.nominal(scaled(sensors, 1.0, own.pop("motion")))
-            return cls(noise_model, guards._replace(**own))
+            return cls(noise_model, priors._replace(**own))
 
         method, found = calibrated(make, usual, recording, truth)
         return replace(method, calibration=found)
 
 
-def broadcasts(recording: Recording, noise_model: NoiseModel, guards: Guards) -> Sent:
+def broadcasts(recording: Recording, noise_model: NoiseModel, priors: Priors) -> Sent:
     """Messages of all vehicles."""
-    variance = guards.fix**2 * noise_model.fix_variance(recording)
+    variance = priors.fix**2 * noise_model.fix_variance(recording)
     return Sent(*fading_memory(recording.gnss, recording.velocity, variance, recording.dt))
 
 
@@ -237,23 +272,23 @@ def lasting(ego: str, residual: Floats, dt: float) -> list[str]:
     return [f"fixes, {ego}: errors a second apart are correlated by {found:.2f}; give Sensors(gnss_drift_std=...)"]
 
 
-def guards_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool = False) -> Guards:
-    """The method's own, which wait half as long where errors of fixes last, and if they are the usual ones those of
-    real roads where measurements are real; none where no noise is stated that an innovation could exceed."""
-    guards, sensors = method.guards, noise_model.sensors
+def priors_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool = False) -> Priors:
+    """The method's own, and if they are the usual ones those of real roads where measurements are real; none where no
+    noise is stated that an innovation could exceed."""
+    priors, sensors = method.priors, noise_model.sensors
     if sensors is None:
-        return NO_GUARDS
-    if measured and guards == Guards():
-        guards = ON_ROADS
-    return guards
+        return AS_STATED
+    if measured and priors == Priors():
+        priors = ON_ROADS
+    return priors
 
 
-def model_of(noise_model: NoiseModel, guards: Guards) -> Model:
+def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
     """The noise model of the kernel."""
     std, least = relative_noise(noise_model)
-    white, time, absent = np.ones(3), 1.0, np.full(4, guards.absent)
+    white, time, absent = np.ones(3), 1.0, np.full(4, priors.absent)
     own = common = bias = heading = offset = 0.0
-    turn, lasts = np.array([guards.heading, guards.scale]), guards.lasts
+    turn, lasts = np.array([priors.heading, priors.scale]), priors.lasts
     if noise_model.sensors is not None:
         sensors, std = noise_model.sensors, np.array(std)
         own, common, offset = sensors.gnss_drift_std**2, sensors.gnss_common_std**2, sensors.range_offset_std**2
@@ -262,8 +297,7 @@ def model_of(noise_model: NoiseModel, guards: Guards) -> Model:
         heading, bias = (float(value**2) for value in noise_model.compass)
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
         absent[2:][np.array([bias, offset]) > 0.0] = -np.inf
-        bias, offset = bias or guards.compass**2, offset or guards.offset**2
-    turns = np.square(turn)
-    return Model(
-        std, float(least), FORGOTTEN, own, common, time, white, bias, heading, offset, turns, lasts, absent, guards.slip
-    )
+        bias, offset = bias or priors.compass**2, offset or priors.offset**2
+    judged = GATE if priors.fix_gate else 0.0, priors.fix_gate, priors.forget
+    lasting = own, common, time, white, bias, heading, offset, np.square(turn), lasts, absent
+    return Model(std, float(least), FORGOTTEN, *lasting, priors.slip, *judged)

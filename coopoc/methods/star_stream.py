@@ -23,7 +23,6 @@ from ..kernels.stars.cooperative_state import (
     KEPT_VARIANCE,
     MOTION,
     MOTION_VARIANCE,
-    NO_GUARDS,
     ODOMETER,
     OWN,
     SINCE,
@@ -31,11 +30,11 @@ from ..kernels.stars.cooperative_state import (
     SOLO_VARIANCE,
     SPEED,
     STEP,
+    TAU,
     TRUSTED,
     USED,
     WIDTH,
     Filter,
-    Guards,
     Model,
 )
 from ..kernels.stars.gaussian import ABSENT
@@ -50,7 +49,7 @@ from ..kernels.stars.streams import (
     stream_step,
 )
 from ..world.links import told
-from .cooperative_filter import Broadcast, CooperativeFilter, guards_of, model_of
+from .cooperative_filter import Broadcast, CooperativeFilter, model_of, priors_of
 from .egos import relative_noise
 from .joint_filter import JointFilter
 from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
@@ -153,15 +152,16 @@ class StarStream:
         start = np.full(3, np.nan) if x0 is None else three("x0", x0)
         self._star: Joint | Robust
         self._robust = isinstance(filter, CooperativeFilter)
-        self._guards = NO_GUARDS
+        factor = self._trusted = 1.0
         if isinstance(filter, CooperativeFilter):
-            self._guards = guards_of(filter, known, measured)
-            model = model_of(known, self._guards)
-            self._star, self._white = Robust(model, self._guards, start), model.white
+            priors = priors_of(filter, known, measured)
+            factor, self._trusted = priors.fix, float(priors.fix_gate == 0.0)
+            model = model_of(known, priors)
+            self._star, self._white = Robust(model, start), model.white
         else:
             self._star = Joint(known, filter.exact, filter.robust, start)
         self._motion: MotionNoise = motion_noise(known, interval)
-        self._fix = self._guards.fix**2 * np.array(known.gnss_variance)
+        self._fix = factor**2 * np.array(known.gnss_variance)
         self.max_age, self.history = seconds("max_age", max_age), MotionHistory(history)
         self._given, self._time, self._begun = np.zeros(8), 0.0, x0 is not None
         self._numbers, self._names = dict[str, int](), list[str]()
@@ -265,9 +265,9 @@ class StarStream:
             self._last[number], self._last[number, [INDEX, USED_AT, AGE]] = np.nan, (-1.0, -math.inf, -math.inf)
             for f in self._star.filters:
                 f.status[number] = 0.0
-                f.status[number, TRUSTED] = float(self._guards.trust == 0.0)
+                f.status[number, TRUSTED] = self._trusted
                 f.status[number, USED] = f.status[number, SINCE] = -math.inf
-                f.status[number, KEPT_VARIANCE : KEPT_VARIANCE + 3] = self._guards.tau**2
+                f.status[number, KEPT_VARIANCE : KEPT_VARIANCE + 3] = TAU**2
 
 
 class Joint:
@@ -320,12 +320,11 @@ class Robust:
 
     Args:
         model: noise model.
-        guards: against what may be wrong.
         start: (3,) m, known before the first step, NaN for none.
     """
 
-    def __init__(self, model: Model, guards: Guards, start: Floats) -> None:
-        self.model, self.guards, self.start = model, guards, start
+    def __init__(self, model: Model, start: Floats) -> None:
+        self.model, self.start = model, start
         f, self.tries = make_filter(1, 1)
         self.filters = [f]
 
@@ -348,5 +347,5 @@ class Robust:
     def step(self, own: Floats, rows: Floats, vehicles: Ints, last: Floats) -> Floats:
         """Answer of `stream_step`."""
         answer = np.empty(12 + 3 * len(vehicles))
-        stream_step(self.filters[0], self.tries, self.model, self.guards, own, rows, vehicles, self.start, answer)
+        stream_step(self.filters[0], self.tries, self.model, own, rows, vehicles, self.start, answer)
         return answer

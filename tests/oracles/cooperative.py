@@ -16,8 +16,18 @@ from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
 from coopoc.kernels.gate import GATE, LEAK, PATIENCE, REJECTED, SLIP
 from coopoc.kernels.stars.cooperative_messages import CLIP, FADES, FIX_SCORE
-from coopoc.kernels.stars.cooperative_state import Guards
+from coopoc.kernels.stars.cooperative_state import (
+    ACCELERATION,
+    CONTRADICTED,
+    PENALTY,
+    REVOKE,
+    SHARE,
+    SURE,
+    TAU,
+    WINDOW,
+)
 from coopoc.kernels.stars.otherwise import FASTEST, LASTS, LATE, LOUDEST, PRIOR, QUIETEST, RARE, SUDDEN, UNSEEN, USUAL
+from coopoc.methods.cooperative_filter import Priors
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector, wrap
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -138,9 +148,9 @@ class Life(NamedTuple):
 class Oracle:
     """The filter of one ego in one run."""
 
-    def __init__(self, seen: Recording, ego: int, run: int, known: NoiseModel, guards: Guards) -> None:
+    def __init__(self, seen: Recording, ego: int, run: int, known: NoiseModel, priors: Priors) -> None:
         s = known.sensors
-        self.seen, self.ego, self.run, self.known, self.guards = seen, ego, run, known, guards
+        self.seen, self.ego, self.run, self.known, self.priors = seen, ego, run, known, priors
         self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(2), 1, np.zeros(4)), np.ones(3)
         self.std: Floats = np.ones(3)
         if s is not None:
@@ -148,16 +158,16 @@ class Oracle:
             heading, bias = (float(v**2) for v in known.compass)
             self.std[1] = math.sqrt(self.std[1] ** 2 - heading - bias)
             keep = math.exp(-seen.dt / s.gnss_drift_time)
-            offset, absent = s.range_offset_std**2, np.full(4, guards.absent)
+            offset, absent = s.range_offset_std**2, np.full(4, priors.absent)
             absent[2:][[bias > 0, offset > 0]] = -math.inf
-            bias, offset = bias or guards.compass**2, offset or guards.offset**2
-            holds, turn = math.exp(-seen.dt / guards.lasts), np.square([guards.heading, guards.scale])
+            bias, offset = bias or priors.compass**2, offset or priors.offset**2
+            holds, turn = math.exp(-seen.dt / priors.lasts), np.square([priors.heading, priors.scale])
             self.life = Life(
                 s.gnss_drift_std**2, s.gnss_common_std**2, keep, bias, heading, offset, turn, holds, absent
             )
             self.white = np.square(s.gnss_std) / np.square(s.fix_std)
         shape = seen.gnss.shape
-        self.r = guards.fix**2 * np.broadcast_to(known.fix_variance(seen), shape)[run]
+        self.r = priors.fix**2 * np.broadcast_to(known.fix_variance(seen), shape)[run]
         self.remember(seen.gnss[run], seen.velocity[run])
         self.revoked: dict[int, int] = {}
         self.box = inbox(seen, ego, FIX_AND_VELOCITY)
@@ -180,7 +190,7 @@ class Oracle:
             name: {} for name in ("last", "since", "way", "joined", "hits", "mean", "kept", "slot", "pace", "locked")
         }
         everyone = set(range(self.seen.gnss.shape[2]))
-        trusted = everyone if not self.guards.trust else {self.ego}
+        trusted = everyone if not self.priors.fix_gate else {self.ego}
         levels = {"level": np.zeros(6), "learned": np.zeros(6), "information": np.zeros(6), "made": 0.0}
         levels |= {"slips": 0.0, "speed": 0.0, "score": 0.0, "numbers": 0, "squares": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
@@ -215,7 +225,7 @@ class Oracle:
 
     def tries(self, t: int) -> None:
         """A step, and perhaps one that slips."""
-        share, dt = self.guards.slip * (self.known.sensors is not None), self.seen.dt
+        share, dt = self.priors.slip * (self.known.sensors is not None), self.seen.dt
         speed = float(np.linalg.norm(self.seen.velocity[self.run, t, self.ego]))
         self.state["speed"] = max(speed, self.state["speed"] * math.exp(-dt / LATE))
         before = copy.deepcopy((self.state, self.revoked)) if share else None
@@ -268,7 +278,7 @@ class Oracle:
 
     def step(self, t: int, slip: float) -> None:
         self.state |= {"score": 0.0, "numbers": 0, "squares": 0.0}
-        s, g, b, life = self.state, self.guards, self.state["belief"], self.life
+        s, g, b, life = self.state, self.priors, self.state["belief"], self.life
         here, others = self.neighbours(t)
         louder = math.exp(s["level"][4])
         links = dict(zip(others, here.tolist(), strict=True))
@@ -286,7 +296,7 @@ class Oracle:
             s["trusted"].add(self.ego)
             again = self.start(t, fix, messages, relative)
         else:
-            again = bool(g.trust and np.isfinite(fix).all() and self.lost(t))
+            again = bool(g.fix_gate and np.isfinite(fix).all() and self.lost(t))
             again = again and self.start(t, fix, messages, relative)
         for j in list(s["members"]):
             if j not in others or again or self.contradicted(t, j):
@@ -312,7 +322,7 @@ class Oracle:
         at = {j: b.x[b.at(("x", j))] + s["way"].get(j, 0.0) for j in (self.ego, *s["members"])}
         for j in sorted(s["members"], key=lambda j: float(np.linalg.norm(at[j] - at[self.ego]))):
             new = j in s["vague"] and messages[j] is not None
-            if not (new and g.trust and np.isfinite(relative[j]).all()):
+            if not (new and g.fix_gate and np.isfinite(relative[j]).all()):
                 messages[j] = self.receive(t, j, messages[j])
             s["way"][j] = self.goes_on(t, j, messages[j])[0]
         at = {j: b.x[b.at(("x", j))] + s["way"].get(j, 0.0) for j in (self.ego, *s["members"])}
@@ -321,7 +331,7 @@ class Oracle:
         for j in order:
             messages[j] = self.receive(t, j, messages[j])
             s["way"][j] = self.goes_on(t, j, messages[j])[0]
-        if g.trust:
+        if g.fix_gate:
             self.trust()
         self.corrected()
         if g.forget:
@@ -356,7 +366,7 @@ class Oracle:
 
     def use_fix(self, t: int, j: int, rows: list[Any], again: bool) -> float:
         """The share of its information that is used; trust may be revoked."""
-        s, g, b = self.state, self.guards, self.state["belief"]
+        s, g, b = self.state, self.priors, self.state["belief"]
         used = [c for c, row in enumerate(rows) if row is not None]
         h = np.array([b.row(rows[c][0], c) for c in used])
         z, r = (np.array([rows[c][i] for c in used]) for i in (1, 2))
@@ -367,7 +377,7 @@ class Oracle:
             s["vague"].discard(j)
             return 1.0
         judged = j != self.ego or s["members"]
-        if g.trust and judged and again and len(used) == 3 and self.wrong_on_average(j, *self.mahalanobis(b, rows)):
+        if g.fix_gate and judged and again and len(used) == 3 and self.wrong_on_average(j, *self.mahalanobis(b, rows)):
             if j in s["trusted"]:
                 self.revoked[j] = self.revoked.get(j, 0) + 1
             self.doubt(j)
@@ -392,19 +402,19 @@ class Oracle:
 
     def wrong_on_average(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """The clipped mean innovation, beside what another error of the fixes would make of it."""
-        s, g = self.state, self.guards
+        s, g = self.state, self.priors
         count, mean = s["mean"].get(j, (0.0, np.zeros(3)))
-        count = min(count + 1, g.window)
+        count = min(count + 1, WINDOW)
         s["mean"][j] = count, mean
         if j not in s["trusted"] and q > g.fix_gate:
             return True
         mean = mean + (gap * min(1.0, math.sqrt(CLIP / q)) - mean) / count
         s["mean"][j] = count, mean
         v = cov + np.diag(r) / count + (1.0 if self.life.own else 0.0) * np.eye(3)
-        odds = math.log((1 - g.share) / g.share) + normal(mean, v) - normal(mean, v + g.tau**2 * np.eye(3))
+        odds = math.log((1 - SHARE) / SHARE) + normal(mean, v) - normal(mean, v + TAU**2 * np.eye(3))
         near = mean @ np.linalg.solve(v, mean)
-        enough = near >= 2 * (math.log((1 - g.share) / g.share) + g.revoke)
-        return bool(count >= 3 and enough and odds < -g.revoke)
+        enough = near >= 2 * (math.log((1 - SHARE) / SHARE) + REVOKE)
+        return bool(count >= 3 and enough and odds < -REVOKE)
 
     def doubt(self, j: int) -> None:
         s = self.state
@@ -413,11 +423,11 @@ class Oracle:
         s["kept"].pop(j, None)
         if ("x", j) in s["belief"].names:
             s["belief"].drop(("b", j))
-            s["belief"].add(("b", j), 0.0, self.guards.tau**2 + self.life.own)
+            s["belief"].add(("b", j), 0.0, TAU**2 + self.life.own)
 
     def start(self, t: int, fix: Floats, messages: dict[int, Any], relative: dict[int, Floats]) -> bool:
         """The ego at its fix, or where two messages put it that contradict the fix."""
-        s, g, b = self.state, self.guards, self.state["belief"]
+        s, g, b = self.state, self.priors, self.state["belief"]
         places = [(fix.copy(), self.r[t, self.ego])]
         for j, message in messages.items():
             if message is not None and np.isfinite(relative[j]).all():
@@ -458,7 +468,7 @@ class Oracle:
     def contradicted(self, t: int, j: int) -> bool:
         hits, since = self.state["hits"][("relative", j)], t - self.state["joined"][j]
         most = max(hits)
-        return bool(most >= min(self.guards.patience, max(2, since - most)) or sum(n >= 3 for n in hits) >= 2)
+        return bool(most >= min(CONTRADICTED, max(2, since - most)) or sum(n >= 3 for n in hits) >= 2)
 
     def fix_terms(self, j: int) -> dict[Name, float]:
         names = [("x", j), ("b", j), ("common",)]
@@ -466,10 +476,10 @@ class Oracle:
 
     def steady(self, t: int, j: int, u: Floats, q: Floats) -> tuple[Floats, Floats]:
         """Velocity and variance of a step's motion, or the last ones where no vehicle can have changed that fast."""
-        g, dt, before = self.guards, self.seen.dt, self.state["pace"].get(j)
+        g, dt, before = self.priors, self.seen.dt, self.state["pace"].get(j)
         if g.fix_gate and before is not None:
             last, since, variance, slips = before
-            changed = (g.acceleration * max(t - since, 1) * dt) ** 2
+            changed = (ACCELERATION * max(t - since, 1) * dt) ** 2
             if ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum() > 2 * g.fix_gate and slips < 5:
                 self.state["pace"][j] = last, since, variance, slips + 1
                 return last, variance + changed * dt**2
@@ -538,7 +548,7 @@ class Oracle:
         s["way"].pop(j, None)
         self.add_turn(j)
         if j not in s["trusted"]:
-            mean, variance = s["kept"].get(j, (np.zeros(3), np.full(3, self.guards.tau**2)))
+            mean, variance = s["kept"].get(j, (np.zeros(3), np.full(3, TAU**2)))
             b.add(("b", j), mean, variance + self.life.own)
         elif self.life.own:
             b.add(("b", j), 0.0, self.life.own)
@@ -554,7 +564,7 @@ class Oracle:
             self.relate(t, j, at, relative[j], messages[j])
 
     def relate(self, t: int, j: int, at: dict[int, Floats], relative: Floats, message: Any) -> None:
-        s, g, there = self.state, self.guards, np.isfinite(relative)
+        s, g, there = self.state, self.priors, np.isfinite(relative)
         b, vague, hits = s["belief"], j in s["vague"], s["hits"][("relative", j)]
         if not there.all() and vague:
             return
@@ -578,7 +588,7 @@ class Oracle:
         s["way"][j], by = self.goes_on(t, j, message)
         z = z - rows @ s["way"][j]
         if age:
-            r = r + rows**2 @ ((age / self.seen.dt) ** 2 * message.process + (g.acceleration * age**2 / 2) ** 2)
+            r = r + rows**2 @ ((age / self.seen.dt) ** 2 * message.process + (ACCELERATION * age**2 / 2) ** 2)
         h = []
         for c in range(3):
             terms: dict[Name, Any] = {("x", j): rows[c], ("x", self.ego): -rows[c]}
@@ -591,10 +601,10 @@ class Oracle:
         total = np.einsum("ci,ij,cj->c", h, b.p, h) + r
         for c in np.flatnonzero(there):
             log = math.log((float(h[c] @ b.p @ h[c]) + r[c]) * size[c] ** 2)
-            q = b.update(h[c], z[c], r[c], 0.0 if vague else g.gate)
+            q = b.update(h[c], z[c], r[c], 0.0 if vague or not g.fix_gate else GATE)
             if not vague:
                 self.count(min(q, GATE), log, 1)
-                hits[c] = hits[c] + 1 if g.gate and q > g.gate else 0
+                hits[c] = hits[c] + 1 if g.fix_gate and q > GATE else 0
                 self.learn(c, min(q, SUDDEN) - USUAL, r[c] / total[c])
                 self.learn(4, min(q, SUDDEN) - USUAL, rows[c] @ rows[c] * s["made"] / 3 / total[c])
         s["vague"].discard(j)
@@ -652,8 +662,8 @@ class Oracle:
 
     def trust(self) -> None:
         """The surest member first: p(b = 0 | all) / p(b = 0) by Bayes' rule, of Gaussians."""
-        s, g, own = self.state, self.guards, self.life.own
-        b, wide = s["belief"], g.tau**2 + own
+        s, own = self.state, self.life.own
+        b, wide = s["belief"], TAU**2 + own
         narrow = 1 / (1 / own - 1 / wide) if own else 1e-6
         while True:
             odds = {}
@@ -662,13 +672,13 @@ class Oracle:
                     continue
                 at = b.at(("b", j))
                 x, p = b.x[at], b.p[at, at]
-                odds[j] = math.log((1 - g.share) / g.share) - g.penalty * self.revoked.get(j, 0)
+                odds[j] = math.log((1 - SHARE) / SHARE) - PENALTY * self.revoked.get(j, 0)
                 if own:
                     odds[j] += normal(x, narrow * np.eye(3) + p) + 1.5 * math.log(2 * math.pi * wide / own * narrow)
                 else:
-                    odds[j] += normal(x, p) - normal(0 * x, g.tau**2 * np.eye(3))
+                    odds[j] += normal(x, p) - normal(0 * x, TAU**2 * np.eye(3))
             best = max(odds, key=lambda j: (odds[j], -s["slot"][j]), default=-1)
-            if best < 0 or odds[best] <= g.sure:
+            if best < 0 or odds[best] <= SURE:
                 return
             s["trusted"].add(best)
             s["mean"].pop(best, None)

@@ -19,6 +19,7 @@ from ..geometry import angle
 from .cooperative_members import join, leave, predict, steady
 from .cooperative_messages import fix_terms, goes_on, receive, trust, use_fix
 from .cooperative_state import (
+    ACCELERATION,
     AGE,
     ANSWER,
     AT,
@@ -54,7 +55,6 @@ from .cooperative_state import (
     WHEN,
     WIDTH,
     Filter,
-    Guards,
     Model,
     Sent,
     begin,
@@ -106,7 +106,7 @@ from .otherwise import (
 
 @compiled
 def run_filter(
-    measurements: Measurements, assumed: Assumptions, sent: Sent, model: Model, guards: Guards
+    measurements: Measurements, assumed: Assumptions, sent: Sent, model: Model
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; weights of the ego's fix (R, T), and by link
     (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the neighbour is trusted.
@@ -118,7 +118,6 @@ def run_filter(
         assumed: process noise, and the variance of fixes.
         sent: in messages.
         model: noise model.
-        guards: against what may be wrong.
     """
     runs, steps, vehicles = measurements.gnss.shape[0], len(measurements.start) - 1, measurements.gnss.shape[2]
     links, most = measurements.relative.shape[1], 0
@@ -142,8 +141,8 @@ def run_filter(
                 x[run, t], cov[run, t] = math.nan, math.nan
                 continue
             if f.g.vectors[0] == 0:
-                begin(f, model, guards, own, rows, count, measurements.ego)
-            step(f, tries, model, guards, own, rows, who, count)
+                begin(f, model, own, rows, count, measurements.ego)
+            step(f, tries, model, own, rows, who, count)
             fixes[run, t] = f.member[0, OUT + 3]
             for i in range(FOUND):
                 found[run, t, i] = f.ego[TOLD + i]
@@ -155,7 +154,7 @@ def run_filter(
                 k = f.slot[who[i]]
                 for c in range(3):
                     neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c]
-                    notes[run, first + i, c] = weight(f.member[k, OUT + c], guards.gate)
+                    notes[run, first + i, c] = weight(f.member[k, OUT + c], model.gate)
                 notes[run, first + i, 3] = f.member[k, OUT + 3]
                 notes[run, first + i, 4] = f.status[who[i], TRUSTED]
     return x, cov, neighbours, fixes, notes, found
@@ -199,7 +198,6 @@ def step(
     f: Filter,
     tries: Tries,
     model: Model,
-    guards: Guards,
     own: Floats,
     rows: Floats,
     vehicles: Ints,
@@ -211,7 +209,6 @@ def step(
         f: filter, after `begin`.
         tries: memory.
         model: noise model.
-        guards: against what may be wrong.
         own: (OWN,) the ego's row; the motion of the first step is not used.
         rows: (count, WIDTH) of the neighbours that are measured now.
         vehicles: (count,) which they are.
@@ -223,10 +220,10 @@ def step(
     if slips:
         copy_filter(f, other)
         copy_rows(own, rows, tries, count)
-    attempt(f, model, guards, own, rows, vehicles, count)
+    attempt(f, model, own, rows, vehicles, count)
     if slips and surprised(f):
         other.ego[NOW] = 1.0
-        attempt(other, model, guards, tries.own, tries.rows, vehicles, count)
+        attempt(other, model, tries.own, tries.rows, vehicles, count)
         probably = chance(other, f, own[DT])
         if probably >= 0.5:
             copy_filter(other, f)
@@ -247,44 +244,44 @@ def copy_rows(own: Floats, rows: Floats, tries: Tries, count: int) -> None:
 
 
 @inner
-def attempt(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Predict and update, and count what that says of a slip."""
     f.ego[LIKELY] = f.ego[NUMBERS] = f.ego[SQUARES] = 0.0
-    leave(f, model, guards, own, rows, vehicles, count)
+    leave(f, model, own, rows, vehicles, count)
     louder(f, own, rows, count)
     f.ego[SPAN] = own[DT]
     if f.ego[STEPS] > 0:
         f.ego[CLOCK] += own[DT]
-    steady(f, guards, f.who[0, VEHICLE], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
+    steady(f, model, f.who[0, VEHICLE], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
     if f.ego[STEPS] > f.member[0, JOINED]:
-        predict(f, model, guards, own)
+        predict(f, model, own)
     moved(f, own)
     for i in range(count):
         if f.slot[vehicles[i]] < 0:
-            join(f, model, guards, rows, vehicles[i], i)
+            join(f, model, rows, vehicles[i], i)
     for k in range(len(f.who)):
         for c in range(4):
             f.member[k, OUT + c] = math.nan
-    add_fix(f, model, guards, own)
+    add_fix(f, model, own)
     locate(f)
     members = nearest_first(f)
     for i in range(members):
         k = f.who[i, ORDER]
         new = f.member[k, VAGUE] > 0.0 and rows[f.who[k, INPUT], AGE] >= 0.0
-        if not (new and guards.trust > 0.0 and measured_whole(rows, f.who[k, INPUT])):
-            receive(f, model, guards, rows, k)
+        if not (new and model.fix_gate > 0.0 and measured_whole(rows, f.who[k, INPUT])):
+            receive(f, model, rows, k)
         goes_on(f, rows, k)
     locate(f)
     members = nearest_first(f)
-    measure(f, model, guards, rows, members)
+    measure(f, model, rows, members)
     for i in range(members):
-        receive(f, model, guards, rows, f.who[i, ORDER])
+        receive(f, model, rows, f.who[i, ORDER])
         goes_on(f, rows, f.who[i, ORDER])
-    if guards.trust > 0.0:
-        trust(f, model, guards)
+    if model.fix_gate > 0.0:
+        trust(f, model)
     f.ego[STEPS] += 1
     corrected(f)
-    adapt(f, guards)
+    adapt(f, model)
 
 
 @part
@@ -322,7 +319,7 @@ def gap2(f: Filter, k: int) -> float:
 
 
 @inside
-def add_fix(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
+def add_fix(f: Filter, model: Model, own: Floats) -> None:
     """The ego's fix: its position, the error of its receiver, and the one that all share."""
     level = math.exp(f.ego[LEVEL + FIXES])
     if math.isnan(own[FIX]):
@@ -333,13 +330,13 @@ def add_fix(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
     q = innovate(f.g, f.h)
     if f.member[0, VAGUE] == 0.0:
         learn_fix(f, FIXES)
-    f.member[0, OUT + 3] = share = use_fix(f, model, guards, 0, True, q)
+    f.member[0, OUT + 3] = share = use_fix(f, model, 0, True, q)
     f.who[0, HITS] = f.who[0, HITS] + 1 if share < 1.0 else 0
     corrected(f)
 
 
 @inside
-def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int) -> None:
+def measure(f: Filter, model: Model, rows: Floats, members: int) -> None:
     """The relative measurements, linear at the prediction."""
     g = f.g
     if members == 0:
@@ -351,14 +348,14 @@ def measure(f: Filter, model: Model, guards: Guards, rows: Floats, members: int)
             g.p[j, i] = 0.0
         g.x[i], g.p[i, i] = 0.0, model.heading
     for m in range(members):
-        weigh(f, model, guards, rows, f.who[m, ORDER])
+        weigh(f, model, rows, f.who[m, ORDER])
 
 
 @inside
-def weigh(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None:
+def weigh(f: Filter, model: Model, rows: Floats, k: int) -> None:
     """Update by what is measured of member k."""
     g, h = f.g, f.h
-    if not relate(f, model, guards, rows, k):
+    if not relate(f, model, rows, k):
         return
     if f.member[k, VAGUE] > 0.0:
         settle(g, h, k, f.member[k, VAGUE])
@@ -371,11 +368,11 @@ def weigh(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None
         if h.block[MEASURED + c]:
             f.member[k, OUT + c] = h.three[Q + c]
             learn_relative(f, c)
-            f.who[k, HITS + c] = f.who[k, HITS + c] + 1 if 0.0 < guards.gate < h.three[Q + c] else 0
+            f.who[k, HITS + c] = f.who[k, HITS + c] + 1 if 0.0 < model.gate < h.three[Q + c] else 0
 
 
 @inside
-def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> bool:
+def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
     """Rows of range, azimuth and inclination of member k in metres, linear at AT; False if its geometry is not
     known."""
     g, h, row, std = f.g, f.h, f.who[k, INPUT], model.std
@@ -410,19 +407,19 @@ def relate(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> boo
     store(h.matrix, 2, (0.0, 0.0, 1.0, flat, flat, 0.0, 0.0, 0.0, 0.0))
     for c in range(3):
         h.three[VARIANCE + c] *= math.exp(f.ego[LEVEL + c])
-        h.three[LIMIT + c] = guards.gate
+        h.three[LIMIT + c] = model.gate
     h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]
     h.block[TERMS] = 3 if has(g, 0, COMPASS) else 2
     if goes_on(f, rows, k):
-        add_way(f, guards, rows, k)
+        add_way(f, rows, k)
     return True
 
 
 @part
-def add_way(f: Filter, guards: Guards, rows: Floats, k: int) -> None:
+def add_way(f: Filter, rows: Floats, k: int) -> None:
     """Rows of a member that has moved since it was at its position."""
     g, h, w, n, age = f.g, f.h, f.h.matrix, f.h.block[TERMS], f.ego[CLOCK] - f.member[k, WHEN]
-    often, changed = (age / f.ego[SPAN]) ** 2, (0.5 * guards.acceleration * age * age) ** 2
+    often, changed = (age / f.ego[SPAN]) ** 2, (0.5 * ACCELERATION * age * age) ** 2
     first = 3 * g.block[k, TURN]
     h.block[n], h.block[TERMS] = g.block[k, TURN], n + 1 if has(g, k, TURN) else n
     for c in range(3):

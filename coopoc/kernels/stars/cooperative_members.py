@@ -7,8 +7,10 @@ import math
 from ...arrays import Floats, Ints
 from ..compiling.compile import inside, part
 from .cooperative_state import (
+    ACCELERATION,
     AGE,
     CLOCK,
+    CONTRADICTED,
     DT,
     FIX,
     HITS,
@@ -32,7 +34,6 @@ from .cooperative_state import (
     WAY,
     WHEN,
     Filter,
-    Guards,
     Model,
     across,
     doubt,
@@ -47,7 +48,7 @@ from .otherwise import drive, slip_variance
 
 
 @inside
-def leave(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Find each member's row; marginalise out those that have none, and remember the error of their fixes.
 
     A member that the ego's measurements contradict joins anew; where the ego is lost, it starts anew, and all join.
@@ -57,14 +58,14 @@ def leave(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, ve
     for i in range(count):
         if f.slot[vehicles[i]] >= 0:
             f.who[f.slot[vehicles[i]], INPUT] = i
-    again = guards.trust > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX]) and lost(f)
-    again = again and start(f, model, guards, own, rows, count)
+    again = model.fix_gate > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX]) and lost(f)
+    again = again and start(f, model, own, rows, count)
     for k in range(1, len(f.who)):
         j = f.who[k, VEHICLE]
-        if j < 0 or (f.who[k, INPUT] >= 0 and not again and not contradicted(f, guards, k)):
+        if j < 0 or (f.who[k, INPUT] >= 0 and not again and not contradicted(f, k)):
             continue
         if f.who[k, INPUT] >= 0 and f.status[j, TRUSTED] == 0.0:  # the error was estimated beside a wrong position
-            doubt(f, model, guards, j)
+            doubt(f, model, j)
         if has(f.g, k, ERROR):
             first = 3 * f.g.block[k, ERROR]
             for c in range(3):
@@ -76,20 +77,20 @@ def leave(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, ve
 
 
 @inside
-def contradicted(f: Filter, guards: Guards, k: int) -> bool:
+def contradicted(f: Filter, k: int) -> bool:
     """Whether the ego's measurements of a member have contradicted its position for too long: two components three
     times in a row, or one as often as it agreed before, at most `patience` times."""
     several, since = 0, f.ego[STEPS] - f.member[k, JOINED]
     for c in range(3):
         hits = f.who[k, HITS + c]
         several += hits >= 3
-        if hits >= min(guards.patience, max(2, since - hits)):
+        if hits >= min(CONTRADICTED, max(2, since - hits)):
             return True
     return bool(several >= 2)
 
 
 @inside
-def predict(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
+def predict(f: Filter, model: Model, own: Floats) -> None:
     """Move the ego; errors that last decay, errors of which nothing is known change."""
     g, first = f.g, 3 * f.g.block[0, PLACE]
     keep = math.exp(-own[DT] / model.time) if model.own + model.common > 0.0 else 1.0
@@ -110,12 +111,12 @@ def predict(f: Filter, model: Model, guards: Guards, own: Floats) -> None:
 
 
 @inside
-def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, variance: int, unit: float) -> None:
+def steady(f: Filter, model: Model, j: int, given: Floats, first: int, variance: int, unit: float) -> None:
     """Put vehicle j's last velocity in place of one that no vehicle can have reached since.
 
     Args:
         f: filter.
-        guards: against what may be wrong.
+        model: noise model.
         j: vehicle.
         given: row of the input.
         first: of its velocity or motion in the row.
@@ -123,11 +124,11 @@ def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, varianc
         unit: m/s of what the row holds.
     """
     dt, status, q = f.ego[SPAN], f.status[j], 0.0
-    changed = (guards.acceleration * max(f.ego[CLOCK] - status[SINCE], dt)) ** 2
+    changed = (ACCELERATION * max(f.ego[CLOCK] - status[SINCE], dt)) ** 2
     for c in range(3):
         gap = unit * given[first + c] - status[PACE + c]
         q += gap * gap / ((given[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
-    if 0.0 < 2.0 * guards.fix_gate < q and status[SLIPS] < SLIPPED:
+    if 0.0 < 2.0 * model.fix_gate < q and status[SLIPS] < SLIPPED:
         status[SLIPS] += 1.0
         for c in range(3):
             given[first + c], given[variance + c] = status[PACE + c] / unit, status[PACE + 3 + c] + changed * dt * dt
@@ -138,7 +139,7 @@ def steady(f: Filter, guards: Guards, j: int, given: Floats, first: int, varianc
 
 
 @part
-def join(f: Filter, model: Model, guards: Guards, rows: Floats, vehicle: int, row: int) -> None:
+def join(f: Filter, model: Model, rows: Floats, vehicle: int, row: int) -> None:
     """Insert a member where the ego measures it, or, where a component is missing, somewhere near."""
     g, k = f.g, 1
     while f.who[k, VEHICLE] >= 0:

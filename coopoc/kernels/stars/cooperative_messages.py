@@ -27,13 +27,18 @@ from .cooperative_state import (
     ODOMETER,
     OUT,
     PACE,
+    PENALTY,
+    REVOKE,
     REVOKED,
+    SHARE,
     SLIPS,
     SOLO,
     SOLO_VARIANCE,
     SPAN,
     SPEED,
     STEP,
+    SURE,
+    TAU,
     TRUSTED,
     TYPICAL,
     USED,
@@ -41,8 +46,8 @@ from .cooperative_state import (
     VEHICLE,
     WAY,
     WHEN,
+    WINDOW,
     Filter,
-    Guards,
     Model,
     doubt,
 )
@@ -141,7 +146,7 @@ def remember(memory: Floats, moved: Floats, fix: Floats, variance: Floats, dt: f
 
 
 @inner
-def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> None:
+def receive(f: Filter, model: Model, rows: Floats, k: int) -> None:
     """Move member k to where it was when it sent its newest message, and use what its fixes have said until then.
 
     The mean error that the odometer makes of n fixes since the last message is that of the middle of the way: they are
@@ -162,7 +167,7 @@ def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> No
         f.member[k, WAY + c] = rows[row, ODOMETER + c] - status[LAST + 6 + c]
         status[LAST + 6 + c] = rows[row, ODOMETER + c]
         rows[row, ODOMETER + c] = f.member[k, WAY + c] / gap if follows and steps > 1.0 else rows[row, SPEED + c]
-    steady(f, guards, j, rows[row], ODOMETER, STEP, 1.0)
+    steady(f, model, j, rows[row], ODOMETER, STEP, 1.0)
     drive(f, model, k, scale(vector_at(rows[row], ODOMETER // 3), gap), gap)
     half, often = 0.5 * (1.0 + 1.0 / steps), steps if follows else (gap / dt) ** 2
     for c in range(3):
@@ -172,7 +177,7 @@ def receive(f: Filter, model: Model, guards: Guards, rows: Floats, k: int) -> No
         whole = f.h.block[MEASURED] + f.h.block[MEASURED + 1] + f.h.block[MEASURED + 2] == 3
         if again and f.member[k, VAGUE] == 0.0 and status[TRUSTED] > 0.0 and whole:
             learn_fix(f, MESSAGES)
-        f.member[k, OUT + 3] = use_fix(f, model, guards, k, again, q)
+        f.member[k, OUT + 3] = use_fix(f, model, k, again, q)
     for c in range(3):
         g.p[first + c, first + c] += (1.0 - half) * often * rows[row, STEP + c]
         status[LAST + c], status[LAST + 3 + c] = rows[row, SOLO + c], rows[row, SOLO_VARIANCE + c]
@@ -224,14 +229,13 @@ def goes_on(f: Filter, rows: Floats, k: int) -> bool:
 
 
 @inner
-def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: float) -> float:
+def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
     """Update by the rows of a vehicle's fix, unless its receiver errs otherwise than is assumed; the share of its
     information that it keeps.
 
     Args:
         f: filter.
         model: noise model.
-        guards: against what may be wrong.
         k: slot.
         again: whether it is not the vehicle's first one.
         q: of `innovate`.
@@ -244,10 +248,10 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
         f.member[k, VAGUE] = 0.0
         return 1.0
     judged = k > 0 or members(f) > 0  # alone, errors of the receiver and of the odometer cannot be separated
-    if guards.trust > 0.0 and judged and again and used == 3 and q > 0.0 and wrong_on_average(f, model, guards, k, q):
+    if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong_on_average(f, model, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
-        doubt(f, model, guards, j)
+        doubt(f, model, j)
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
             fix_terms(f, 0)
             innovate(g, h)
@@ -262,9 +266,9 @@ def use_fix(f: Filter, model: Model, guards: Guards, k: int, again: bool, q: flo
     share = 1.0
     quiet = math.exp(-min(f.ego[LEVEL + (FIXES if k == 0 else MESSAGES)], 0.0))
     q *= (own + noise) / (own + quiet * noise)  # fixes that agree better than is assumed are as wrong as any, together
-    if guards.fix_gate > 0.0:
-        share = 1.0 / inflation(q, guards.fix_gate, f.member[k, LOCKED])
-        f.member[k, LOCKED] = count(q, guards.fix_gate, f.member[k, LOCKED], own / (own + noise))
+    if model.fix_gate > 0.0:
+        share = 1.0 / inflation(q, model.fix_gate, f.member[k, LOCKED])
+        f.member[k, LOCKED] = count(q, model.fix_gate, f.member[k, LOCKED], own / (own + noise))
     score(f, h, FIX_SCORE, True)
     correct(g, h, share)
     hold(f, share)
@@ -281,12 +285,12 @@ def members(f: Filter) -> int:
 
 
 @inside
-def wrong_on_average(f: Filter, model: Model, guards: Guards, k: int, q: float) -> bool:
+def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
     """Whether the mean of a vehicle's innovations, each clipped, is likelier with another error of its fixes than is
     assumed; or, where that error is being estimated, with the last one alone."""
     h, status = f.h, f.status[f.who[k, VEHICLE]]
-    status[COUNT] = count = min(status[COUNT] + 1.0, guards.window)
-    if status[TRUSTED] == 0.0 and q > guards.fix_gate:
+    status[COUNT] = count = min(status[COUNT] + 1.0, WINDOW)
+    if status[TRUSTED] == 0.0 and q > model.fix_gate:
         return True
     clip = math.sqrt(CLIP / q) if q > CLIP else 1.0
     for c in range(3):
@@ -294,28 +298,28 @@ def wrong_on_average(f: Filter, model: Model, guards: Guards, k: int, q: float) 
     mean, (p, q, r) = vector_at(status, MEAN // 3), vector_at(h.three, VARIANCE // 3)
     more = 1.0 if model.own > 0.0 else 0.0
     s = add_diagonal(block_at(h.matrix, COV // 9), (p / count + more, q / count + more, r / count + more))
-    odds = math.log((1.0 - guards.share) / guards.share)
+    odds = math.log((1.0 - SHARE) / SHARE)
     near, narrow = distance(s, mean)
-    if count < 3.0 or near < 2.0 * (odds + guards.revoke):
+    if count < 3.0 or near < 2.0 * (odds + REVOKE):
         return False
-    tau2 = guards.tau**2
+    tau2 = TAU**2
     far, wide = distance(add_diagonal(s, (tau2, tau2, tau2)), mean)
-    return bool(odds + 0.5 * math.log(wide / narrow) + 0.5 * (far - near) < -guards.revoke)
+    return bool(odds + 0.5 * math.log(wide / narrow) + 0.5 * (far - near) < -REVOKE)
 
 
 @part
-def trust(f: Filter, model: Model, guards: Guards) -> None:
+def trust(f: Filter, model: Model) -> None:
     """Set the error of fixes to zero, or to what drifts, while that is likelier than any other: the surest first.
 
     The odds p(b = 0 | all) / p(b = 0) of a Gaussian b are by Bayes' rule those of the two hypotheses.
     """
     g, h = f.g, f.h
-    wide, narrow, unit = guards.tau**2 + model.own, 0.0, guards.tau**2
+    wide, narrow, unit = TAU**2 + model.own, 0.0, TAU**2
     if model.own > 0.0:
         narrow = 1.0 / (1.0 / model.own - 1.0 / wide)
         unit = wide / model.own * narrow
     while True:
-        best, most = ABSENT, guards.sure
+        best, most = ABSENT, SURE
         for k in range(len(f.who)):
             j = f.who[k, VEHICLE]
             if j < 0 or f.status[j, TRUSTED] > 0.0 or (k > 0 and f.status[j, USED] == -math.inf):
@@ -325,7 +329,7 @@ def trust(f: Filter, model: Model, guards: Guards) -> None:
                 for d in range(3):
                     h.matrix[SQUARE + 3 * c + d] = g.p[first + c, first + d] + (narrow if c == d else 0.0)
             q, det = distance(block_at(h.matrix, SQUARE // 9), vector_at(g.x, first // 3))
-            odds = math.log((1.0 - guards.share) / guards.share) - guards.penalty * f.status[j, REVOKED]
+            odds = math.log((1.0 - SHARE) / SHARE) - PENALTY * f.status[j, REVOKED]
             odds += 0.5 * math.log(unit**3 / det) - 0.5 * q
             if odds > most:
                 best, most = k, odds

@@ -1,4 +1,4 @@
-"""State, noise model and guards of the cooperative filter, and who is in the star: members leave, move and join.
+"""State and noise model of the cooperative filter, and who is in the star: members leave, move and join.
 
 A member is in one of the slots while the ego measures it; slot 0 is the ego's. What is remembered of a vehicle, in the
 star or not, is its status.
@@ -62,60 +62,16 @@ SLIPPED = 5.0
 """Implausible velocities in a row after which one counts again."""
 
 
-class Guards(NamedTuple):
-    """What is expected to go wrong, and from when on it is believed; 0 switches a guard off.
-
-    Attributes:
-        gate: squared normalised innovation of a component of a relative measurement.
-        fix_gate: squared Mahalanobis distance of a fix, of the fixes in a message, and of its odometer and velocity.
-        patience: a member whose component exceeds its gate that many times in a row, or as often as it did not before,
-            joins anew.
-        trust: 1 if the fixes of a vehicle that is new have an unknown error until they are trusted.
-        tau: m, standard deviation of that error.
-        share: prior share of vehicles with such an error.
-        sure: log odds from which a member is trusted.
-        penalty: log odds that each revocation costs.
-        window: fixes in the mean innovation of a vehicle.
-        revoke: log odds from which trust ends.
-        forget: s, in which what innovations have shown of levels is forgotten.
-        acceleration: m/s^2, of a vehicle at most, and of a member since it sent its newest message.
-        heading: rad, and
-        scale: standard deviations of errors of odometry that last.
-        lasts: s, for which they do.
-        compass: rad, and
-        offset: m, of such errors of a compass and of ranges, where none is stated.
-        absent: log odds that each of these is not there, before anything was measured.
-        slip: an ego that slips errs by that share of its late speed.
-        fix: factor of the assumed standard deviation of fixes, which err together for a while.
-    """
-
-    gate: float = 9.0
-    fix_gate: float = 16.0
-    patience: float = 30.0
-    trust: float = 1.0
-    tau: float = 20.0
-    share: float = 0.1
-    sure: float = 2.0
-    penalty: float = 4.0
-    window: float = 30.0
-    revoke: float = 2.0
-    forget: float = 10.0
-    acceleration: float = 5.0
-    heading: float = 0.1
-    scale: float = 0.1
-    lasts: float = 1e5
-    compass: float = 0.05
-    offset: float = 0.5
-    absent: float = 8.0
-    slip: float = 0.7
-    fix: float = 1.0
-
-
-NO_GUARDS = Guards(
-    gate=0.0, fix_gate=0.0, trust=0.0, forget=0.0, heading=0.0, scale=0.0, compass=0.0, offset=0.0, slip=0.0
-)
-ON_ROADS = Guards(fix_gate=3.5, heading=0.03, scale=0.03, lasts=1e4, compass=0.0, offset=0.0, absent=-math.inf, fix=2.0)
-"""Of measurements that are not simulated: no odometry is without such errors."""
+TAU, SHARE = 20.0, 0.1
+"""m, standard deviation of an error of a receiver of which nothing is known, and the prior share of vehicles with one:
+of 0.05 to 0.3 no world is told apart."""
+SURE, PENALTY, REVOKE = 2.0, 4.0, 2.0
+"""Log odds from which a vehicle's fixes are trusted, what each revocation costs, and from which trust ends."""
+WINDOW, CONTRADICTED = 30.0, 30.0
+"""Fixes in the mean innovation of a vehicle; steps in a row at most after which a member that is contradicted joins
+anew."""
+ACCELERATION = 5.0
+"""m/s^2, of a vehicle at most, and of a member since it sent its newest message."""
 FIXES, MOTIONS, MESSAGES, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 6, 11
 """Kinds of numbers that have a level, behind ranges, azimuths and inclinations; how many, and how much is found."""
 
@@ -152,6 +108,10 @@ class Model(NamedTuple):
         lasts: s, their correlation time.
         absent: (4,) log odds that an error of heading, scale, compass or range is not there.
         slip: share of the late speed.
+        gate: squared normalised innovation of a component of a relative measurement, 0 for none.
+        fix_gate: squared Mahalanobis distance of a fix, of the fixes in a message, and of its odometer and velocity; 0
+            where nothing is doubted.
+        forget: s, in which what innovations have shown of levels is forgotten; 0 for levels that stay.
     """
 
     std: Floats
@@ -168,6 +128,9 @@ class Model(NamedTuple):
     lasts: float
     absent: Floats
     slip: float
+    gate: float
+    fix_gate: float
+    forget: float
 
 
 VEHICLE, INPUT, ORDER, HITS, WHO = 0, 1, 2, 3, 6
@@ -255,15 +218,15 @@ def copy_filter(source: Filter, target: Filter) -> None:
 
 
 @part
-def begin(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, count: int, ego: int) -> None:
+def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: int) -> None:
     """The first step: no vehicle has been met."""
     for j in range(len(f.slot)):
         for c in range(STATUS):
             f.status[j, c] = 0.0
-        f.status[j, TRUSTED] = 1.0 if guards.trust == 0.0 or j == ego else 0.0
+        f.status[j, TRUSTED] = 1.0 if model.fix_gate == 0.0 or j == ego else 0.0
         f.status[j, USED] = f.status[j, SINCE] = -math.inf
         for c in range(3):
-            f.status[j, KEPT_VARIANCE + c] = guards.tau**2
+            f.status[j, KEPT_VARIANCE + c] = TAU**2
     f.who[0, VEHICLE], f.slot[ego] = ego, 0
     insert(f.g, 0, PLACE, 0.0)
     if model.common > 0.0:
@@ -272,7 +235,7 @@ def begin(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
         first = insert(f.g, 0, COMPASS, model.bias)
         f.g.p[first + 2, first + 2] = model.offset
     insert_turn(f.g, model, 0)
-    start(f, model, guards, own, rows, count)
+    start(f, model, own, rows, count)
 
 
 @part
@@ -284,7 +247,7 @@ def insert_turn(g: Gaussian, model: Model, k: int) -> None:
 
 
 @part
-def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, count: int) -> bool:
+def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> bool:
     """The ego stands somewhere near its fix, which is trusted.
 
     Where no other position, of a message less its vector, agrees with the fix, but two or more do with one another, the
@@ -292,10 +255,10 @@ def start(f: Filter, model: Model, guards: Guards, own: Floats, rows: Floats, co
     chance; else nothing is changed, and False returned.
     """
     best, most, heard, mine, g, ego = ABSENT, 1, 0, 0, f.g, f.who[0, VEHICLE]
-    for i in range(-1, count if guards.fix_gate > 0.0 else -1):
+    for i in range(-1, count if model.fix_gate > 0.0 else -1):
         agree = 0
         for j in range(-1, count):
-            agree += apart(own, rows, i, j) <= guards.fix_gate
+            agree += apart(own, rows, i, j) <= model.fix_gate
         heard += agree > 0
         if i < 0:
             mine = agree
@@ -350,15 +313,15 @@ def pause(f: Filter, dt: float) -> None:
 
 
 @part
-def doubt(f: Filter, model: Model, guards: Guards, j: int) -> None:
+def doubt(f: Filter, model: Model, j: int) -> None:
     """The fixes of vehicle j have an error of which nothing is known."""
     f.status[j, TRUSTED] = f.status[j, COUNT] = 0.0
     for c in range(3):
         f.status[j, MEAN + c] = f.status[j, KEPT + c] = 0.0
-        f.status[j, KEPT_VARIANCE + c] = guards.tau**2
+        f.status[j, KEPT_VARIANCE + c] = TAU**2
     if f.slot[j] >= 0:
         remove(f.g, f.slot[j], ERROR)
-        insert(f.g, f.slot[j], ERROR, guards.tau**2 + model.own)
+        insert(f.g, f.slot[j], ERROR, TAU**2 + model.own)
 
 
 @part

@@ -11,7 +11,7 @@ their gate count with no more than it, a fix as one: a range that is too long, o
 *Levels*: by how much the variance of each kind of number differs from what is assumed, as its innovations show. The
 log-likelihood of an innovation v ~ N(0, S) has the derivative s (v^2 / S - 1) / 2 by the logarithm of a level, with s
 the share of S that the level makes, and the information s^2 / 2. Each step moves a level by the sum of its derivatives
-over their information, which is forgotten in `Guards.forget` s. Of the ego's motion the share is D = dP / d log level,
+over their information, which is forgotten in `Model.forget` s. Of the ego's motion the share is D = dP / d log level,
 which a step of prediction makes D + q, and an update D (P+ / P-)^2.
 
 References:
@@ -51,7 +51,6 @@ from .cooperative_state import (
     WHOLE,
     WIDTH,
     Filter,
-    Guards,
     Model,
     new_filter,
 )
@@ -341,11 +340,11 @@ def learn_relative(f: Filter, c: int) -> None:
 
 
 @part
-def adapt(f: Filter, guards: Guards) -> None:
+def adapt(f: Filter, model: Model) -> None:
     """Move the levels by what this step has shown."""
-    if guards.forget == 0.0:
+    if model.forget == 0.0:
         return
-    keep = math.exp(-f.ego[SPAN] / guards.forget)
+    keep = math.exp(-f.ego[SPAN] / model.forget)
     for kind in range(KINDS_OF_NUMBERS):
         change = f.ego[SLOPE + kind] / (f.ego[INFORMATION + kind] + PRIOR)
         level = f.ego[LEVEL + kind] + min(max(change, -FASTEST), FASTEST)

@@ -33,7 +33,6 @@ from .cooperative_state import (
     VAGUE,
     WAY,
     Filter,
-    Guards,
     Model,
     begin,
     copy_filter,
@@ -196,7 +195,6 @@ def stream_step(
     f: Filter,
     tries: Tries,
     model: Model,
-    guards: Guards,
     own: Floats,
     rows: Floats,
     vehicles: Ints,
@@ -209,7 +207,6 @@ def stream_step(
         f: filter.
         tries: memory of the same size.
         model: noise model.
-        guards: against what may be wrong.
         own: (OWN,).
         rows: (k, WIDTH) of the neighbours that are measured now.
         vehicles: (k,) which they are; the ego is vehicle 0.
@@ -217,12 +214,12 @@ def stream_step(
         answer: (12 + 3 k,) out: position m, covariance m^2, positions of the neighbours m.
     """
     if f.g.vectors[0] == 0:
-        begin(f, model, guards, own, rows, len(vehicles), 0)
+        begin(f, model, own, rows, len(vehicles), 0)
         if math.isfinite(start[0]):
             f.ego[STEPS], f.member[0, VAGUE] = 1, 0.0
             for c in range(3):
                 f.g.x[c] = start[c]
-    step(f, tries, model, guards, own, rows, vehicles, len(vehicles))
+    step(f, tries, model, own, rows, vehicles, len(vehicles))
     for i in range(12):
         answer[i] = f.ego[ANSWER + i]
     for i in range(len(vehicles)):
