@@ -71,6 +71,8 @@ AS_STATED = Priors(heading=0.0, scale=0.0, compass=0.0, offset=0.0, slip=0.0, fi
 """Nothing is otherwise: the textbook's filter."""
 ON_ROADS = Priors(heading=0.03, scale=0.03, lasts=1e4, compass=0.0, offset=0.0, absent=-np.inf, fix=2.0, fix_gate=3.5)
 """Of measurements that are not simulated: no odometry is without such errors."""
+NO_ODOMETRY = Priors(heading=0.0, scale=0.0, compass=0.0, offset=0.0, slip=0.0)
+"""Of velocities that fixes have shown."""
 
 
 class Broadcast(NamedTuple):
@@ -279,7 +281,7 @@ def priors_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool
     if sensors is None:
         return AS_STATED
     if measured and priors == Priors():
-        priors = ON_ROADS
+        priors = NO_ODOMETRY if sensors.velocity_reading == "fixes" else ON_ROADS
     return priors
 
 

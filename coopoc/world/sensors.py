@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from ..kernels.motion import MotionNoise
 
 BiasMode = Literal["run", "sample"]
-VelocityReading = Literal["axis", "speed"]
+VelocityReading = Literal["axis", "speed", "fixes"]
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,8 @@ class Sensors:
     """Velocity noise over true velocity: the paper's 10 % (training) and 15 % (test)."""
     velocity_reading: VelocityReading = "axis"
     """"axis": ratio times each component (default, as in the authors' public code: no noise on an axis with zero
-    velocity). "speed": ratio times the speed, on every axis."""
+    velocity). "speed": ratio times the speed, on every axis. "fixes": as "axis", of velocities that fixes have shown,
+    since a log holds no odometry: there is none that could slip or be turned."""
     velocity_floor: float = 0.05
     """m/s, the least velocity std that a method assumes; it never acts. Without it "axis" is singular."""
     range_std: float = 1.0

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -110,7 +110,9 @@ def local(rows: Rows, origin: Origin | None) -> tuple[Rows, Origin | None]:
     return rows.assign(value=value, kind=rows["kind"].replace(ENU))[value.notna() | ~geodetic], origin
 
 
-def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float) -> Sensors:
+def assumed(
+    rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, wanders: Sequence[float] = ()
+) -> Sensors:
     """Sensors of a log: the root mean square of the logged standard deviations of each kind.
 
     A Recording holds one standard deviation per kind; what is not logged is that of `Sensors()`, and reported.
@@ -121,6 +123,8 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float) -
         body: whether the recording is in body frames.
         summary: takes what is assumed.
         dt: s, of the recording.
+        wanders: m^2/s, of each member, as `motion.Member` has it: without odometry that is the noise of velocities, of
+            all of them the largest.
     """
     base, used = Sensors(), set(rows["kind"])
     square = (rows["std"] ** 2).groupby(rows["kind"]).mean().dropna()
@@ -148,6 +152,12 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float) -
         noise |= {"velocity_reading": "speed", "yaw_rate_std": rate, "compass": "heading" in used}
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of("heading", default=HEADING_STD, unit="rad")
+    if (drifts := max(wanders, default=0.0)) > 0.0:
+        known = of(*MOTION, default=base.velocity_floor, unit="m/s")
+        floor = max(float(np.sqrt(drifts / dt)), known)
+        summary.assume(f"{floor:.2g} m/s as the noise of a velocity, as the fixes of what has no odometry show it")
+        noise |= {"velocity_reading": "fixes", "velocity_std_ratio": 0.0, "velocity_floor": floor}
+        return replace(base, **noise)
     if {*MOTION}.isdisjoint(square.index):
         summary.assume(f"{base.velocity_std_ratio:.0%} of a velocity as its noise, {base.velocity_floor} m/s at least")
         return replace(base, **noise)

@@ -2,41 +2,44 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
-import scipy
+import pandas as pd
 
 from coopoc.arrays import Bools, Floats, Ints, checked
 from coopoc.errors import InputError
+from coopoc.kernels.constant_velocity import BANK, constant_velocity
 from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
+from coopoc.world.sensors import Sensors
 
-from ..assemble import PER_ROW, SAME, longest_gap, nearest, smooth, steps_of
+from ..assemble import SAME, longest_gap, nearest, steps_of
+from .heading import (
+    HeadingAt,
+    Signal,
+    covered,
+    heading_at,
+    heading_of_courses,
+    heading_of_gyro,
+    held,
+    integral,
+)
 from .units import Rows, Summary, in_group, place
 
 MOVING = 1.0
 """m/s, least speed at which a course is a heading."""
 STANDS = 0.5
 """m/s, a speed below which what has no heading is taken to stand."""
-COURSE_RATE = 0.25
-"""Half-power frequency, in fixes, of the smoother that makes velocities of fixes."""
+UNKNOWN_SPEED = 10.0
+"""m/s, standard deviation of a velocity before fixes have shown it."""
 COURSE = "the heading of {} is the course of the {}: no vehicle slips or reverses"
 ARM = "fixes are those of the reference point, less the arm to the antenna, of {}; none slips or reverses"
-DERIVED = "the velocity of {} is derived from the fixes: their errors depend on each other"
+DERIVED = "no odometry of {}: a nearly constant velocity is assumed, which its fixes until then have shown"
 
 AHEAD: Floats = np.array([1.0, 0.0, 0.0])
-
-HeadingAt = Callable[[Floats], Floats]
-
-
-class Signal(NamedTuple):
-    """Samples of a vehicle at their own times: (M,) s, increasing, and (M, C)."""
-
-    t: Floats
-    value: Floats
 
 
 class Steps(NamedTuple):
@@ -84,6 +87,7 @@ class Member:
         stands: whether it stands, as a road-side unit does.
         yaw_rate: (T,) rad/s as velocity, of body frames.
         compass: (T,) rad, NaN without a heading, of body frames.
+        wanders: m^2/s, variance of a velocity that fixes have shown, by its time; 0 for odometry.
     """
 
     gnss: Floats
@@ -94,6 +98,7 @@ class Member:
     stands: bool
     yaw_rate: Floats
     compass: Floats
+    wanders: float = 0.0
 
 
 def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 1) -> Signal:
@@ -117,7 +122,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
     """A vehicle, or what stands: a road-side unit, in body frames a landmark, has fixes at one instant and no odometry.
 
     With an arm a, a fix z becomes that of the reference point, z - R(h) a; h is the heading that was measured, else the
-    course of what moves, turned by the yaw rate in between, at both ends the nearest one.
+    course of what moves until then, turned by the yaw rate; before there is one, the first.
 
     Args:
         name: its id.
@@ -135,12 +140,14 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         fixes.value[:, 2] = 0.0
     measured, turn, speed = (samples(rows, (kind,), summary) for kind in ("heading", "yaw_rate", "speed"))
     still: Floats = np.zeros((len(grid), 3))
+    wanders = 0.0
     none: Floats = np.full(len(grid), np.nan)
     if len(fixes.t) == 1 and not in_group(rows, "odometry").any():
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m{', arm left in' * (arm is not None)}"
         heading = heading_at(measured, None, np.inf) if len(measured.t) and not body else None
         return Member(still + fixes.value[0], still, heading, text, "", True, still[:, 0], none)
-    derived = velocity_of_fixes(fixes, steps.gap(fixes.t)) if len(fixes.t) > 1 else None
+    std = fix_std(rows)
+    derived = velocity_of_fixes(fixes, steps.gap(fixes.t), std)[0] if len(fixes.t) > 1 else None
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
         world, ever = samples(rows, ("vx", "vy"), Summary(), 2), steps._replace(max_gap=np.inf)
@@ -150,8 +157,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
             raise InputError(f"antenna of {name}", f"{arm} m", "needs numbers, and a heading of the vehicle", hint)
         by = f"{f'the course of the {source}' if source else 'its heading'}"
         summary.assume(ARM, f"{name} ({', '.join(map('{:g}'.format, off))} m forward, left, up, by {by})")
-        fixes = Signal(fixes.t, fixes.value - turned(off, pointing(fixes.t)))
-        derived = derived and velocity_of_fixes(fixes, steps.gap(fixes.t))
+        angle = pd.Series(pointing(fixes.t)).ffill().bfill().to_numpy()
+        fixes = Signal(fixes.t, fixes.value - turned(off, angle))
     if body:
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
             if not len(signal.t):
@@ -160,15 +167,20 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         summary.refuse("world velocities in body frames", rows[rows["kind"].isin(["vx", "vy", "vz"])])
         signals, course = [speed, turn], ""
         heading = heading_at(measured, turn, np.inf) if len(measured.t) else None
-        along, _ = _heading(measured, turn, ((derived, "fixes"),), steps)
+        along, _ = _heading(measured, turn, ((derived, "fixes"),), steps, (fixes, speed, std))
         forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
         carried: Floats = still if along is None else np.nan_to_num(forward * turned(AHEAD, along(grid)))
         velocity: Floats = forward * AHEAD
     else:
-        moved, heading, course = _in_world(name, rows, (measured, turn, speed), derived, steps)
-        signals, rate = [moved], none
-        velocity = carried = step_means(moved, grid)
-    there = np.ones(len(grid), dtype=bool)
+        moved, heading, course = _in_world(name, rows, (measured, turn, speed), (fixes, derived, std), steps)
+        signals, rate = [moved or fixes], none
+        if moved is None:
+            derived, wanders = velocity_of_fixes(fixes, steps.gap(fixes.t), std)
+            velocity = carried = held(derived, grid - 0.5 * steps.dt)
+        else:
+            velocity = carried = step_means(moved, grid)
+    there = np.isfinite(velocity[:, 0])
+    velocity = np.nan_to_num(velocity)
     for signal in signals:
         interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
         there &= covered(signal.t, grid, steps.gap(signal.t), max(steps.dt, 0.6 * interval))
@@ -178,21 +190,27 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         summary.refuse(f"steps of {name} before its first fix", int((there & ~fixed).sum()))
         there &= fixed
     span = "throughout" if there.all() else f"{there.mean():.0%} of the time{_longest(there, grid)}"
-    text = f"{len(fixes.t)} fixes, {len(signals[0].t)} samples of odometry, {len(measured.t)} headings, {span}"
+    text = f"{len(fixes.t)} fixes, {0 if wanders else len(signals[0].t)} samples of odometry, "
+    text += f"{len(measured.t)} headings, {span}"
     absent, compass = np.where(there, 0.0, np.nan), none
     if body:
         kept, step, lag = _nearest_of_each(measured, there, steps)
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
-    return Member(gnss, velocity + absent[:, None], heading, text, course, False, rate + absent, compass)
+    return Member(gnss, velocity + absent[:, None], heading, text, course, False, rate + absent, compass, wanders)
 
 
 def _in_world(
-    name: str, rows: Rows, body: tuple[Signal, Signal, Signal], derived: Signal | None, steps: Steps
-) -> tuple[Signal, HeadingAt | None, str]:
-    """Velocity at its own times, heading, and whose course the heading is; `body` are heading, yaw rate and speed."""
-    summary, (measured, turn, speed) = steps.summary, body
+    name: str,
+    rows: Rows,
+    body: tuple[Signal, Signal, Signal],
+    placed: tuple[Signal, Signal | None, float],
+    steps: Steps,
+) -> tuple[Signal | None, HeadingAt | None, str]:
+    """Velocity at its own times, None where the fixes have to show it; heading, and whose course that is; `body` are
+    heading, yaw rate and speed."""
+    summary, (measured, turn, speed), (fixes, derived, std) = steps.summary, body, placed
     world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), rows[rows["kind"] == "speed"]
-    heading, course = _heading(measured, turn, ((world, "odometry"), (derived, "fixes")), steps)
+    heading, course = _heading(measured, turn, ((world, "odometry"), (derived, "fixes")), steps, (fixes, speed, std))
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
         return Signal(world.t, np.nan_to_num(world.value)), heading, course
@@ -212,20 +230,28 @@ def _in_world(
         hint = "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z."
         raise InputError(f"vehicle {name}", "no odometry, and less than two fixes", "cannot be placed", hint)
     summary.assume(DERIVED, name)
-    return derived, heading, course
+    return None, heading, course
 
 
 def _heading(
-    measured: Signal, turn: Signal, moves: Sequence[tuple[Signal | None, str]], steps: Steps
+    measured: Signal,
+    turn: Signal,
+    moves: Sequence[tuple[Signal | None, str]],
+    steps: Steps,
+    gyro: tuple[Signal, Signal, float] | None = None,
 ) -> tuple[HeadingAt | None, str]:
-    """Heading that was measured, else the course of the first of `moves` that moves, and whose course it is."""
+    """Heading that was measured, else by `gyro` (fixes, speed, their standard deviation) and the yaw rate, else the
+    course of the first of `moves` that moves; and what it was derived from."""
     rate = turn if len(turn.t) > 1 else None
     if len(measured.t):
         return heading_at(measured, rate, steps.gap(measured.t)), ""
+    if gyro is not None and rate is not None and len(gyro[1].t) > 1:
+        fixes, speed, std = gyro
+        if (found := heading_of_gyro(fixes, speed, rate, std)) is not None:
+            return found, "fixes"
     for velocity, source in moves:
         if velocity is not None and (moving := np.hypot(*velocity.value[:, :2].T) > MOVING).any():
-            east, north = velocity.value[moving, :2].T
-            return heading_at(Signal(velocity.t[moving], np.arctan2(north, east)[:, None]), rate, np.inf), source
+            return heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate), source
     return None, ""
 
 
@@ -239,19 +265,6 @@ def _longest(there: Bools, grid: Floats) -> str:
     return f", longest gap {gaps[k]:.1f} s from {grid[at[k]] - grid[0]:.1f} s on"
 
 
-def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
-    """True between samples at most `gap` apart, and up to `edge` beyond a sample.
-
-    >>> covered(np.array([0.0, 1, 5]), np.array([0.5, 2, 4.8]), 2.0, 0.3).tolist()
-    [True, False, True]
-    """
-    right = np.clip(np.searchsorted(t, at), min(1, len(t) - 1), len(t) - 1)
-    left = np.maximum(right - 1, 0)
-    between = (at >= t[left] - SAME) & (at <= t[right] + SAME) & (t[right] - t[left] <= gap + SAME)
-    near = np.minimum(np.abs(at - t[left]), np.abs(at - t[right])) <= edge + SAME
-    return between | near
-
-
 def step_means(signal: Signal, grid: Floats) -> Floats:
     """(T, C) mean over the step that ends at each instant, of the samples joined by straight lines.
 
@@ -260,55 +273,31 @@ def step_means(signal: Signal, grid: Floats) -> Floats:
     [0.0, 0.5, 1.5]
     """
     dt = grid[1] - grid[0]
-    means: Floats = np.diff(_integral(signal, np.append(grid[0] - dt, grid)), axis=0) / dt
+    means: Floats = np.diff(integral(signal, np.append(grid[0] - dt, grid)), axis=0) / dt
     return means
 
 
-def _integral(signal: Signal, at: Floats) -> Floats:
-    """(G, C) integral from the first sample, which holds before it, as the last one does behind it."""
-    start = signal.t[0]
-    ends = np.append(at, signal.t) - start
-    t = np.concatenate([[ends.min() - 1], signal.t - start, [ends.max() + 1]])
-    path = scipy.interpolate.make_interp_spline(t, np.pad(signal.value, ((1, 1), (0, 0)), "edge"), k=1).antiderivative()
-    return np.asarray(path(at - start) - path(0.0))
+def fix_std(rows: Rows) -> float:
+    """m, of a fix on an axis of the plane as it was logged, else as it is assumed."""
+    stated = rows["std"][rows["kind"].isin(["x", "y"])].dropna()
+    return float(np.sqrt((stated**2).mean())) if len(stated) else Sensors().gnss_std[0]
 
 
-def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingAt:
-    """Function from times (G,) s to headings (G,) rad, NaN where unknown.
+def velocity_of_fixes(fixes: Signal, gap: float, std: float) -> tuple[Signal, float]:
+    """Velocity (M, 3) m/s at the times of the fixes, by these and those before (`kernels.constant_velocity`); and how
+    fast a position predicted with the last one becomes uncertain, m^2/s, if fixes have that standard deviation m.
 
-    Between measured headings h_j it is W(t) + the line through h_j - W(t_j), with the integral W of the yaw rate, which
-    is zero where there is none. Without a yaw rate, gaps longer than `gap` are unknown.
-
-    >>> heading = heading_at(Signal(np.array([0.0, 1]), np.array([[3.0], [-3.1]])), None, 2.0)
-    >>> heading(np.array([0.5, 9.0])).round(3).tolist()
-    [3.092, nan]
+    >>> t = np.arange(40.0)
+    >>> velocity, _ = velocity_of_fixes(Signal(t, np.outer(t, [3.0, 4.0, 0.0])), 5.0, 1.0)
+    >>> velocity.value[-1].round(6).tolist()
+    [3.0, 4.0, 0.0]
     """
-    turned = (lambda at: _integral(yaw_rate, at)[:, 0]) if yaw_rate is not None else np.zeros_like
-    offset = np.unwrap(heading.value[:, 0] - turned(heading.t))
-    sampled = heading.t if yaw_rate is None else yaw_rate.t
-
-    def at(times: Floats) -> Floats:
-        angle = wrap(np.interp(times, heading.t, offset) + turned(times))
-        return np.where(covered(sampled, times, gap, gap / 2), angle, np.nan)
-
-    return at
-
-
-def velocity_of_fixes(fixes: Signal, gap: float) -> Signal:
-    """Velocity (M, 3) m/s at the times of the fixes, from a smooth curve through each stretch without a gap.
-
-    Its errors are those of the fixes: a filter that takes both for independent believes too much.
-    """
-    t, x = fixes.t, fixes.value
-    velocity = np.zeros_like(x)
-    for part in np.split(np.arange(len(t)), np.flatnonzero(np.diff(t) > gap + SAME) + 1):
-        step = float(np.max([np.median(np.diff(t)), SAME, np.ptp(t[part]) / (PER_ROW * len(t))]))
-        grid = np.arange(t[part[0]], t[part[-1]] + step / 2, step)
-        if len(grid) > 1:
-            even = np.column_stack([np.interp(grid, t[part], column) for column in x[part].T])
-            slope = np.gradient(smooth(even, step, COURSE_RATE / step), step, axis=0)
-            velocity[part] = np.column_stack([np.interp(t[part], grid, column) for column in slope.T])
-    return Signal(t, velocity)
+    interval = float(np.median(np.diff(fixes.t)))
+    spread = (UNKNOWN_SPEED / std) ** 2
+    velocity, growth = constant_velocity(fixes.t, fixes.value, interval, gap + SAME, spread, BANK)
+    known = np.isfinite(growth)
+    velocity[~known] = np.nan  # of one fix alone
+    return Signal(fixes.t, velocity), float(std**2 * np.median(growth[known]) / interval) if known.any() else 0.0
 
 
 def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, Ints, Floats]:

@@ -243,7 +243,9 @@ def _recording(
         np.stack([getattr(part, name) for part in members.values()], axis=1)[None]
         for name in ("gnss", "velocity", "yaw_rate", "compass")
     )
-    sensors = sensors or assumed(rows, steps.planar, body, summary, steps.dt)
+    sensors = sensors or assumed(
+        rows, steps.planar, body, summary, steps.dt, [part.wanders for part in members.values()]
+    )
     return Recording(
         ids=ids,
         t=steps.grid,

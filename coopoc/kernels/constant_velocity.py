@@ -1,0 +1,90 @@
+"""Velocity from fixes alone: a Kalman filter of a nearly constant velocity, whose noise follows its innovations.
+
+Of fixes with the variance R, and a white acceleration of the density (w / T)^4 R, T the usual interval of fixes, the
+gains depend on w alone. So a bank of filters, one for each w, needs neither R nor the density: the likelihood of each,
+with R put at its best value, says which w has predicted best of late.
+
+References:
+    Bar-Shalom, Li, Kirubarajan, Estimation with applications to tracking and navigation, Wiley 2001, 6.2.2 (white
+    acceleration) and 11.6 (static multiple models).
+"""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+
+from ..arrays import Floats
+from .compiling.compile import compiled
+
+BANK = 0.02 * 1.6 ** np.arange(12)
+"""w, from a straight road at a steady speed to fixes that tell next to nothing of each other."""
+FIRST = 6
+"""Which of them holds before anything was seen."""
+REMEMBERS = 30.0
+"""s, in which what filters have predicted is forgotten."""
+PRIOR = 6.0
+"""Numbers that R, as it is stated, counts as."""
+BEYOND = 3.0
+"""Standard deviations at which an innovation is clipped."""
+
+
+@compiled
+def constant_velocity(
+    t: Floats, fixes: Floats, interval: float, gap: float, spread: float, bank: Floats
+) -> tuple[Floats, Floats]:
+    """(M, 3) velocity m/s after each fix, by this and those before; (M,) by how much a position's variance grows from
+    the last fix to this one, as a share of R, in the filter that has predicted best.
+
+    Args:
+        t: (M,) s, increasing.
+        fixes: (M, 3) m, 0 on an axis that was not measured.
+        interval: s, usual one of the fixes.
+        gap: s, after which it begins anew.
+        spread: 1/s^2, variance of a velocity of which nothing is known, over R as it is stated.
+        bank: (F,) w.
+    """
+    count, models = len(t), len(bank)
+    velocity, growth = np.zeros((count, 3)), np.zeros(count)
+    x, u = np.zeros((models, 3)), np.zeros((models, 3))
+    p, score = np.zeros((models, 3)), np.zeros((models, 3))
+    v = np.zeros(3)
+    for j in range(count):
+        dt = t[j] - t[j - 1] if j > 0 else math.inf
+        if dt > gap:
+            for m in range(models):
+                p[m, 0], p[m, 1], p[m, 2] = 1.0, 0.0, spread
+                for c in range(3):
+                    x[m, c], u[m, c] = fixes[j, c], 0.0
+            if j == 0:
+                best = FIRST
+                for m in range(models):
+                    score[m, 0], score[m, 1], score[m, 2] = PRIOR, PRIOR, 0.0
+            growth[j] = math.nan
+            continue
+        keep, most = math.exp(-dt / REMEMBERS), -math.inf
+        for m in range(models):
+            q, before = (bank[m] / interval) ** 4, p[m, 0]
+            a = p[m, 0] + 2.0 * dt * p[m, 1] + dt * dt * p[m, 2] + q * dt**3 / 3.0
+            b, d = p[m, 1] + dt * p[m, 2] + q * dt * dt / 2.0, p[m, 2] + q * dt
+            s, square = a + 1.0, 0.0
+            for c in range(3):
+                x[m, c] += dt * u[m, c]
+                v[c] = fixes[j, c] - x[m, c]
+                square += v[c] * v[c]
+            limit = 3.0 * BEYOND**2 * score[m, 1] / score[m, 0] * s
+            clip = math.sqrt(limit / square) if square > limit else 1.0
+            for c in range(3):
+                x[m, c] += clip * a / s * v[c]
+                u[m, c] += clip * b / s * v[c]
+            p[m, 0], p[m, 1], p[m, 2] = a / s, b / s, d - b * b / s
+            score[m, 0] = keep * score[m, 0] + (1.0 - keep) * PRIOR + 3.0
+            score[m, 1] = keep * score[m, 1] + (1.0 - keep) * PRIOR + min(square, limit) / s
+            score[m, 2] = keep * score[m, 2] + 3.0 * math.log(s)
+            likely = -0.5 * (score[m, 0] * math.log(score[m, 1] / score[m, 0]) + score[m, 2])
+            if likely > most:
+                best, most, growth[j] = m, likely, a - before
+        for c in range(3):
+            velocity[j, c] = u[best, c]
+    return velocity, growth

@@ -1,0 +1,141 @@
+"""Headings of a member of a log: as they were measured, or by its course, or by gyro, odometer and fixes."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from coopoc.arrays import Bools, Floats
+from coopoc.world.links import wrap
+
+from ..assemble import SAME
+
+BASELINE = 10.0
+"""Standard deviations of a fix, by which two must be apart to show a direction: to 0.14 rad."""
+GYRO_BIAS, GYRO_LASTS, GYRO_WALK = 0.02, 600.0, 0.01
+"""rad/s, bias of a yaw rate, and s, for which it lasts; rad in a root of a second, by which its integral wanders."""
+
+HeadingAt = Callable[[Floats], Floats]
+
+
+class Signal(NamedTuple):
+    """Samples of a vehicle at their own times: (M,) s, increasing, and (M, C)."""
+
+    t: Floats
+    value: Floats
+
+
+def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingAt:
+    """Function from times (G,) s to headings (G,) rad, NaN where unknown.
+
+    Between measured headings h_j it is W(t) + the line through h_j - W(t_j), with the integral W of the yaw rate, which
+    is zero where there is none. Without a yaw rate, gaps longer than `gap` are unknown.
+
+    >>> heading = heading_at(Signal(np.array([0.0, 1]), np.array([[3.0], [-3.1]])), None, 2.0)
+    >>> heading(np.array([0.5, 9.0])).round(3).tolist()
+    [3.092, nan]
+    """
+    turned = (lambda at: integral(yaw_rate, at)[:, 0]) if yaw_rate is not None else np.zeros_like
+    offset = np.unwrap(heading.value[:, 0] - turned(heading.t))
+    sampled = heading.t if yaw_rate is None else yaw_rate.t
+
+    def at(times: Floats) -> Floats:
+        angle = wrap(np.interp(times, heading.t, offset) + turned(times))
+        return np.where(covered(sampled, times, gap, gap / 2), angle, np.nan)
+
+    return at
+
+
+def heading_of_courses(velocity: Signal, yaw_rate: Signal | None) -> HeadingAt:
+    """Function from times (G,) s to headings (G,) rad: the last course before, turned by the yaw rate since then; NaN
+    before the first.
+
+    >>> heading = heading_of_courses(Signal(np.array([1.0, 2]), np.array([[2.0, 0, 0], [0, 2, 0]])), None)
+    >>> heading(np.array([0.0, 1, 1.9, 2])).round(3).tolist()
+    [nan, 0.0, 0.0, 1.571]
+    """
+    turned = (lambda at: integral(yaw_rate, at)[:, 0]) if yaw_rate is not None else np.zeros_like
+    east, north = velocity.value[:, :2].T
+    offset = Signal(velocity.t, (np.arctan2(north, east) - turned(velocity.t))[:, None])
+    return lambda at: wrap(held(offset, at)[:, 0] + turned(at))
+
+
+def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -> HeadingAt | None:
+    """Function from times (G,) s to headings (G,) rad of what measures speed and yaw rate alone: a Kalman filter of the
+    heading at the start and of the yaw rate's bias; NaN before the first, None if nothing moves far.
+
+    Fixes that are BASELINE standard deviations apart measure the angle by which the way between them is turned from
+    that of dead reckoning, in the middle of it; where angles scatter more than fixes explain, they weigh less.
+
+    Args:
+        fixes: m, on two axes at least.
+        speed: m/s.
+        yaw_rate: rad/s.
+        std: m, of a fix on an axis.
+    """
+    turned, t = integral(yaw_rate, speed.t), fixes.t
+    way = speed.value * np.column_stack([np.cos(turned), np.sin(turned)])
+    path, place = integral(Signal(speed.t, way), t) @ [1, 1j], fixes.value[:, :2] @ [1, 1j]
+    state, cov, level, last, known = np.zeros(2), np.zeros((2, 2)), 1.0, 0, list[tuple[float, float, float]]()
+    for j in range(1, len(t)):
+        moved, driven = place[j] - place[last], path[j] - path[last]
+        if min(abs(moved), abs(driven)) < BASELINE * std:
+            continue
+        angle, variance = float(np.angle(moved / driven)), 2 * std**2 / abs(driven) ** 2
+        h = np.array([1.0, 0.5 * (t[last] - t[j])])
+        if not known:
+            state, cov = np.array([angle, 0.0]), np.diag([variance, GYRO_BIAS**2])
+        else:
+            ahead = np.array([[1.0, t[j] - known[-1][0]], [0.0, 1.0]])
+            state, cov = ahead @ state, ahead @ cov @ ahead.T
+            cov += (t[j] - known[-1][0]) * np.diag([GYRO_WALK**2, GYRO_BIAS**2 / GYRO_LASTS])
+            gap = float(wrap(np.array(angle - h @ state)))
+            level += (max(gap**2 / (h @ cov @ h + variance), 0.5) - level) / 10
+            gain = cov @ h / (h @ cov @ h + max(level, 1.0) * variance)
+            state, cov = state + gain * gap, cov - np.outer(gain, cov @ h)
+        known.append((float(t[j]), state[0], state[1]))
+        last = j
+    if not known:
+        return None
+    since = Signal(np.array([k[0] for k in known]), np.array(known))
+
+    def at(times: Floats) -> Floats:
+        begun, offset, bias = held(since, times).T
+        return wrap(offset + bias * (times - begun) + integral(yaw_rate, times)[:, 0])
+
+    return at
+
+
+def held(signal: Signal, at: Floats) -> Floats:
+    """(G, C) the last sample at or before each time (G,) s, NaN before the first.
+
+    >>> held(Signal(np.array([0.0, 1]), np.array([[5.0], [6]])), np.array([-1.0, 0, 0.9, 1])).ravel().tolist()
+    [nan, 5.0, 5.0, 6.0]
+    """
+    last = np.searchsorted(signal.t, at + SAME, side="right") - 1
+    return np.where(last[:, None] >= 0, signal.value[np.maximum(last, 0)], np.nan)
+
+
+def covered(t: Floats, at: Floats, gap: float, edge: float) -> Bools:
+    """True between samples at most `gap` apart, and up to `edge` beyond a sample.
+
+    >>> covered(np.array([0.0, 1, 5]), np.array([0.5, 2, 4.8]), 2.0, 0.3).tolist()
+    [True, False, True]
+    """
+    right = np.clip(np.searchsorted(t, at), min(1, len(t) - 1), len(t) - 1)
+    left = np.maximum(right - 1, 0)
+    between = (at >= t[left] - SAME) & (at <= t[right] + SAME) & (t[right] - t[left] <= gap + SAME)
+    near = np.minimum(np.abs(at - t[left]), np.abs(at - t[right])) <= edge + SAME
+    return between | near
+
+
+def integral(signal: Signal, at: Floats) -> Floats:
+    """(G, C) integral from the first sample, which holds before it, as the last one does behind it."""
+    start = signal.t[0]
+    ends = np.append(at, signal.t) - start
+    t = np.concatenate([[ends.min() - 1], signal.t - start, [ends.max() + 1]])
+    path = scipy.interpolate.make_interp_spline(t, np.pad(signal.value, ((1, 1), (0, 0)), "edge"), k=1).antiderivative()
+    return np.asarray(path(at - start) - path(0.0))
