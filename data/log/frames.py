@@ -155,7 +155,9 @@ def assumed(
     if (drifts := max(wanders, default=0.0)) > 0.0:
         known = of(*MOTION, default=base.velocity_floor, unit="m/s")
         floor = max(float(np.sqrt(drifts / dt)), known)
-        summary.assume(f"{floor:.2g} m/s as the noise of a velocity, as the fixes of what has no odometry show it")
+        summary.assume(
+            f"{floor:.2g} m/s as the noise of a velocity, as fixes show it of what has no odometry or heading"
+        )
         noise |= {"velocity_reading": "fixes", "velocity_std_ratio": 0.0, "velocity_floor": floor}
         return replace(base, **noise)
     if {*MOTION}.isdisjoint(square.index):

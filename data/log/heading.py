@@ -63,9 +63,10 @@ def heading_of_courses(velocity: Signal, yaw_rate: Signal | None) -> HeadingAt:
     return lambda at: wrap(held(offset, at)[:, 0] + turned(at))
 
 
-def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -> HeadingAt | None:
+def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -> tuple[HeadingAt, float] | None:
     """Function from times (G,) s to headings (G,) rad of what measures speed and yaw rate alone: a Kalman filter of the
-    heading at the start and of the yaw rate's bias; NaN before the first, None if nothing moves far.
+    heading at the start and of the yaw rate's bias, NaN before the first; and m^2/s, by which a position that is
+    predicted with it becomes uncertain. None if nothing moves far.
 
     Fixes that are BASELINE standard deviations apart measure the angle by which the way between them is turned from
     that of dead reckoning, in the middle of it; where angles scatter more than fixes explain, they weigh less.
@@ -79,7 +80,7 @@ def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) 
     turned, t = integral(yaw_rate, speed.t), fixes.t
     way = speed.value * np.column_stack([np.cos(turned), np.sin(turned)])
     path, place = integral(Signal(speed.t, way), t) @ [1, 1j], fixes.value[:, :2] @ [1, 1j]
-    state, cov, level, last, known = np.zeros(2), np.zeros((2, 2)), 1.0, 0, list[tuple[float, float, float]]()
+    state, cov, level, last, known = np.zeros(2), np.zeros((2, 2)), 1.0, 0, list[tuple[float, ...]]()
     for j in range(1, len(t)):
         moved, driven = place[j] - place[last], path[j] - path[last]
         if min(abs(moved), abs(driven)) < BASELINE * std:
@@ -96,17 +97,18 @@ def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) 
             level += (max(gap**2 / (h @ cov @ h + variance), 0.5) - level) / 10
             gain = cov @ h / (h @ cov @ h + max(level, 1.0) * variance)
             state, cov = state + gain * gap, cov - np.outer(gain, cov @ h)
-        known.append((float(t[j]), state[0], state[1]))
+        pace = abs(driven) / (t[j] - t[last])
+        known.append((float(t[j]), *state, cov[0, 0] * pace**2, t[j] - t[last]))
         last = j
     if not known:
         return None
     since = Signal(np.array([k[0] for k in known]), np.array(known))
 
     def at(times: Floats) -> Floats:
-        begun, offset, bias = held(since, times).T
+        begun, offset, bias = held(since, times).T[:3]
         return wrap(offset + bias * (times - begun) + integral(yaw_rate, times)[:, 0])
 
-    return at
+    return at, float(np.prod(np.median(since.value[:, 3:], axis=0)))
 
 
 def held(signal: Signal, at: Floats) -> Floats:

@@ -151,7 +151,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
         world, ever = samples(rows, ("vx", "vy"), Summary(), 2), steps._replace(max_gap=np.inf)
-        pointing, source = _heading(measured, turn, ((world, "odometry"), (derived, "fixes")), ever)
+        pointing, source, _ = _heading(measured, turn, ((world, "odometry"), (derived, "fixes")), ever)
         if pointing is None or not np.isfinite(off).all():
             hint = f"Log heading or compass_deg, or vx and vy; a course counts above {MOVING:g} m/s."
             raise InputError(f"antenna of {name}", f"{arm} m", "needs numbers, and a heading of the vehicle", hint)
@@ -167,12 +167,12 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         summary.refuse("world velocities in body frames", rows[rows["kind"].isin(["vx", "vy", "vz"])])
         signals, course = [speed, turn], ""
         heading = heading_at(measured, turn, np.inf) if len(measured.t) else None
-        along, _ = _heading(measured, turn, ((derived, "fixes"),), steps, (fixes, speed, std))
+        along, *_ = _heading(measured, turn, ((derived, "fixes"),), steps, (fixes, speed, std))
         forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
         carried: Floats = still if along is None else np.nan_to_num(forward * turned(AHEAD, along(grid)))
         velocity: Floats = forward * AHEAD
     else:
-        moved, heading, course = _in_world(name, rows, (measured, turn, speed), (fixes, derived, std), steps)
+        moved, heading, course, wanders = _in_world(name, rows, (measured, turn, speed), (fixes, derived, std), steps)
         signals, rate = [moved or fixes], none
         if moved is None:
             derived, wanders = velocity_of_fixes(fixes, steps.gap(fixes.t), std)
@@ -190,7 +190,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         summary.refuse(f"steps of {name} before its first fix", int((there & ~fixed).sum()))
         there &= fixed
     span = "throughout" if there.all() else f"{there.mean():.0%} of the time{_longest(there, grid)}"
-    text = f"{len(fixes.t)} fixes, {0 if wanders else len(signals[0].t)} samples of odometry, "
+    text = f"{len(fixes.t)} fixes, {len(signals[0].t) * (signals[0] is not fixes)} samples of odometry, "
     text += f"{len(measured.t)} headings, {span}"
     absent, compass = np.where(there, 0.0, np.nan), none
     if body:
@@ -205,15 +205,18 @@ def _in_world(
     body: tuple[Signal, Signal, Signal],
     placed: tuple[Signal, Signal | None, float],
     steps: Steps,
-) -> tuple[Signal | None, HeadingAt | None, str]:
-    """Velocity at its own times, None where the fixes have to show it; heading, and whose course that is; `body` are
-    heading, yaw rate and speed."""
+) -> tuple[Signal | None, HeadingAt | None, str, float]:
+    """Velocity at its own times, None where the fixes have to show it; heading, whose course that is, and m^2/s by which
+    that makes a position uncertain; `body` are heading, yaw rate and speed."""
     summary, (measured, turn, speed), (fixes, derived, std) = steps.summary, body, placed
     world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), rows[rows["kind"] == "speed"]
-    heading, course = _heading(measured, turn, ((world, "odometry"), (derived, "fixes")), steps, (fixes, speed, std))
+    moves, gyro = ((world, "odometry"), (derived, "fixes")), (fixes, speed, std)
+    heading, course, wanders = _heading(measured, turn, moves, steps, gyro)
+    if course == "fixes" and not wanders:
+        wanders = velocity_of_fixes(fixes, steps.gap(fixes.t), std)[1]
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
-        return Signal(world.t, np.nan_to_num(world.value)), heading, course
+        return Signal(world.t, np.nan_to_num(world.value)), heading, course, 0.0
     standing = np.abs(speed.value[:, 0]) < STANDS
     if len(speed.t) and (heading is not None or standing.all()):
         if course:
@@ -222,7 +225,7 @@ def _in_world(
         known = np.isfinite(angle) | standing
         summary.refuse("speeds without a heading", speeds[speeds["t"].isin(speed.t[~known])])
         velocity = speed.value * np.nan_to_num(turned(AHEAD, angle))
-        return Signal(speed.t[known], velocity[known]), heading, course
+        return Signal(speed.t[known], velocity[known]), heading, course, wanders
     if len(speed.t):
         allowed, hint = "needs heading, compass_deg, or fixes of a moving vehicle", "Add one, or give vx and vy."
         raise InputError(f"{place(speeds)}, speed", f"of {name}, which has no heading", allowed, hint)
@@ -230,7 +233,7 @@ def _in_world(
         hint = "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z."
         raise InputError(f"vehicle {name}", "no odometry, and less than two fixes", "cannot be placed", hint)
     summary.assume(DERIVED, name)
-    return None, heading, course
+    return None, heading, course, 0.0
 
 
 def _heading(
@@ -239,20 +242,21 @@ def _heading(
     moves: Sequence[tuple[Signal | None, str]],
     steps: Steps,
     gyro: tuple[Signal, Signal, float] | None = None,
-) -> tuple[HeadingAt | None, str]:
+) -> tuple[HeadingAt | None, str, float]:
     """Heading that was measured, else by `gyro` (fixes, speed, their standard deviation) and the yaw rate, else the
-    course of the first of `moves` that moves; and what it was derived from."""
+    course of the first of `moves` that moves; what it was derived from, and m^2/s as of
+    `heading_of_gyro`."""
     rate = turn if len(turn.t) > 1 else None
     if len(measured.t):
-        return heading_at(measured, rate, steps.gap(measured.t)), ""
+        return heading_at(measured, rate, steps.gap(measured.t)), "", 0.0
     if gyro is not None and rate is not None and len(gyro[1].t) > 1:
         fixes, speed, std = gyro
         if (found := heading_of_gyro(fixes, speed, rate, std)) is not None:
-            return found, "fixes"
+            return found[0], "fixes", found[1]
     for velocity, source in moves:
         if velocity is not None and (moving := np.hypot(*velocity.value[:, :2].T) > MOVING).any():
-            return heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate), source
-    return None, ""
+            return heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate), source, 0.0
+    return None, "", 0.0
 
 
 def _longest(there: Bools, grid: Floats) -> str:
