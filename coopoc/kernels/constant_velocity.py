@@ -26,13 +26,15 @@ REMEMBERS = 30.0
 """s, in which what filters have predicted is forgotten."""
 PRIOR = 6.0
 """Numbers that R, as it is stated, counts as."""
+TINY = 1e-12
+"""m^2, least R."""
 BEYOND = 3.0
 """Standard deviations at which an innovation is clipped."""
 
 
 @compiled
 def constant_velocity(
-    t: Floats, fixes: Floats, interval: float, gap: float, spread: float, bank: Floats
+    t: Floats, fixes: Floats, interval: float, gap: float, variance: float, speed: float, bank: Floats
 ) -> tuple[Floats, Floats]:
     """(M, 3) velocity m/s after each fix, by this and those before; (M,) by how much a position's variance grows from
     the last fix to this one, as a share of R, in the filter that has predicted best.
@@ -42,7 +44,8 @@ def constant_velocity(
         fixes: (M, 3) m, 0 on an axis that was not measured.
         interval: s, usual one of the fixes.
         gap: s, after which it begins anew.
-        spread: 1/s^2, variance of a velocity of which nothing is known, over R as it is stated.
+        variance: m^2, R as it is stated, of a fix on an axis.
+        speed: m/s, standard deviation of a velocity of which nothing is known.
         bank: (F,) w.
     """
     count, models = len(t), len(bank)
@@ -54,13 +57,13 @@ def constant_velocity(
         dt = t[j] - t[j - 1] if j > 0 else math.inf
         if dt > gap:
             for m in range(models):
-                p[m, 0], p[m, 1], p[m, 2] = 1.0, 0.0, spread
+                p[m, 0], p[m, 1], p[m, 2] = 1.0, 0.0, speed * speed / variance
                 for c in range(3):
                     x[m, c], u[m, c] = fixes[j, c], 0.0
             if j == 0:
                 best = FIRST
                 for m in range(models):
-                    score[m, 0], score[m, 1], score[m, 2] = PRIOR, PRIOR, 0.0
+                    score[m, 0], score[m, 1], score[m, 2] = PRIOR, PRIOR * variance, 0.0
             growth[j] = math.nan
             continue
         keep, most = math.exp(-dt / REMEMBERS), -math.inf
@@ -73,16 +76,16 @@ def constant_velocity(
                 x[m, c] += dt * u[m, c]
                 v[c] = fixes[j, c] - x[m, c]
                 square += v[c] * v[c]
-            limit = 3.0 * BEYOND**2 * score[m, 1] / score[m, 0] * s
+            limit = 3.0 * BEYOND**2 * max(score[m, 1] / score[m, 0], TINY) * s
             clip = math.sqrt(limit / square) if square > limit else 1.0
             for c in range(3):
                 x[m, c] += clip * a / s * v[c]
                 u[m, c] += clip * b / s * v[c]
             p[m, 0], p[m, 1], p[m, 2] = a / s, b / s, d - b * b / s
-            score[m, 0] = keep * score[m, 0] + (1.0 - keep) * PRIOR + 3.0
-            score[m, 1] = keep * score[m, 1] + (1.0 - keep) * PRIOR + min(square, limit) / s
+            score[m, 0] = keep * score[m, 0] + 3.0
+            score[m, 1] = keep * score[m, 1] + min(square, limit) / s
             score[m, 2] = keep * score[m, 2] + 3.0 * math.log(s)
-            likely = -0.5 * (score[m, 0] * math.log(score[m, 1] / score[m, 0]) + score[m, 2])
+            likely = -0.5 * (score[m, 0] * math.log(max(score[m, 1] / score[m, 0], TINY)) + score[m, 2])
             if likely > most:
                 best, most, growth[j] = m, likely, a - before
         for c in range(3):

@@ -156,7 +156,7 @@ def assumed(
         known = of(*MOTION, default=base.velocity_floor, unit="m/s")
         floor = max(float(np.sqrt(drifts / dt)), known)
         summary.assume(
-            f"{floor:.2g} m/s as the noise of a velocity, as fixes show it of what has no odometry or heading"
+            f"{floor:.2g} m/s as the noise of a velocity, as the fixes of what has none, or no heading, show it"
         )
         noise |= {"velocity_reading": "fixes", "velocity_std_ratio": 0.0, "velocity_floor": floor}
         return replace(base, **noise)

@@ -147,11 +147,12 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         heading = heading_at(measured, None, np.inf) if len(measured.t) and not body else None
         return Member(still + fixes.value[0], still, heading, text, "", True, still[:, 0], none)
     std = fix_std(rows)
+    gyro = fixes, speed, std
     derived = velocity_of_fixes(fixes, steps.gap(fixes.t), std)[0] if len(fixes.t) > 1 else None
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
         world, ever = samples(rows, ("vx", "vy"), Summary(), 2), steps._replace(max_gap=np.inf)
-        pointing, source, _ = _heading(measured, turn, ((world, "odometry"), (derived, "fixes")), ever)
+        pointing, source, _ = _heading(measured, turn, ((world, "odometry"), (derived, "fixes")), ever, gyro)
         if pointing is None or not np.isfinite(off).all():
             hint = f"Log heading or compass_deg, or vx and vy; a course counts above {MOVING:g} m/s."
             raise InputError(f"antenna of {name}", f"{arm} m", "needs numbers, and a heading of the vehicle", hint)
@@ -167,7 +168,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         summary.refuse("world velocities in body frames", rows[rows["kind"].isin(["vx", "vy", "vz"])])
         signals, course = [speed, turn], ""
         heading = heading_at(measured, turn, np.inf) if len(measured.t) else None
-        along, *_ = _heading(measured, turn, ((derived, "fixes"),), steps, (fixes, speed, std))
+        along, *_ = _heading(measured, turn, ((derived, "fixes"),), steps, gyro)
         forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
         carried: Floats = still if along is None else np.nan_to_num(forward * turned(AHEAD, along(grid)))
         velocity: Floats = forward * AHEAD
@@ -176,11 +177,10 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         signals, rate = [moved or fixes], none
         if moved is None:
             derived, wanders = velocity_of_fixes(fixes, steps.gap(fixes.t), std)
-            velocity = carried = held(derived, grid - 0.5 * steps.dt)
+            velocity = carried = _shown(fixes, derived, steps)
         else:
             velocity = carried = step_means(moved, grid)
-    there = np.isfinite(velocity[:, 0])
-    velocity = np.nan_to_num(velocity)
+    there = np.ones(len(grid), dtype=bool)
     for signal in signals:
         interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
         there &= covered(signal.t, grid, steps.gap(signal.t), max(steps.dt, 0.6 * interval))
@@ -206,8 +206,8 @@ def _in_world(
     placed: tuple[Signal, Signal | None, float],
     steps: Steps,
 ) -> tuple[Signal | None, HeadingAt | None, str, float]:
-    """Velocity at its own times, None where the fixes have to show it; heading, whose course that is, and m^2/s by which
-    that makes a position uncertain; `body` are heading, yaw rate and speed."""
+    """Velocity at its own times, None where the fixes have to show it; heading, whose course that is, and m^2/s by
+    which that makes a position uncertain; `body` are heading, yaw rate and speed."""
     summary, (measured, turn, speed), (fixes, derived, std) = steps.summary, body, placed
     world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), rows[rows["kind"] == "speed"]
     moves, gyro = ((world, "odometry"), (derived, "fixes")), (fixes, speed, std)
@@ -297,11 +297,21 @@ def velocity_of_fixes(fixes: Signal, gap: float, std: float) -> tuple[Signal, fl
     [3.0, 4.0, 0.0]
     """
     interval = float(np.median(np.diff(fixes.t)))
-    spread = (UNKNOWN_SPEED / std) ** 2
-    velocity, growth = constant_velocity(fixes.t, fixes.value, interval, gap + SAME, spread, BANK)
+    velocity, growth = constant_velocity(fixes.t, fixes.value, interval, gap + SAME, std**2, UNKNOWN_SPEED, BANK)
     known = np.isfinite(growth)
     velocity[~known] = np.nan  # of one fix alone
     return Signal(fixes.t, velocity), float(std**2 * np.median(growth[known]) / interval) if known.any() else 0.0
+
+
+def _shown(fixes: Signal, velocity: Signal, steps: Steps) -> Floats:
+    """(T, 3) m/s at each step, as fixes of the steps before have shown it; between the first two their difference if
+    they are a step apart, else 0."""
+    found = held(velocity, steps.grid - 0.5 * steps.dt)
+    last = np.searchsorted(fixes.t, steps.grid + 0.5 * steps.dt - SAME) - 1
+    before = np.maximum(last - 1, 0)
+    apart = np.maximum(fixes.t[last] - fixes.t[before], SAME)[:, None]
+    first = np.where(apart < 1.5 * steps.dt, (fixes.value[last] - fixes.value[before]) / apart, 0.0)
+    return np.where(np.isnan(found), np.where(last[:, None] > 0, first, 0.0), found)
 
 
 def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, Ints, Floats]:
