@@ -12,6 +12,7 @@ from torch import Tensor
 from coopoc.arrays import Floats
 from coopoc.errors import InputError, shown
 from coopoc.kernels.compiling.waiting import clock
+from coopoc.methods.gaps import in_stretches
 from coopoc.methods.stream import Stream
 from coopoc.methods.track import Alone, Track, check_options, lost, silent_track
 from coopoc.short_repr import short_repr
@@ -68,6 +69,7 @@ class LearnedGain(Alone):
         """
         return Stream(SoloGain(self.model), x0, history)
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Estimates of the egos, all runs at once; `notes` count the runs that diverged from the fixes."""
         began, columns = clock(), check_recording(recording).columns(egos)

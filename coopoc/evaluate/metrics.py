@@ -42,7 +42,7 @@ def rt_le(track: Track, fleet: Fleet) -> Floats:
 
     $$ \mathrm{RTLE} = \sqrt{\tfrac{1}{T} \sum_t \lVert \hat x_t - x_t \rVert^2} $$
 
-    The mean is over the steps at which the truth of an ego is known; NaN where it never is.
+    The mean is over the steps at which an ego is there and its truth known; NaN where it never is.
 
     >>> from coopoc import GNSS, Sensors, observe
     >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
@@ -50,13 +50,14 @@ def rt_le(track: Track, fleet: Fleet) -> Floats:
     (5, 1)
     """
     squares, present = errors(track, fleet) ** 2, fleet.present[:, list(track.egos)]
+    present = present if track.absent is None else present & ~track.absent
     with np.errstate(invalid="ignore"):
         return np.asarray(np.sqrt(np.sum(squares, axis=1, where=present) / present.sum(axis=0)))
 
 
 def max_error(track: Track, fleet: Fleet) -> Floats:
     """Largest error over time of each run and ego, (R, E) m; a reported maximum is the mean of these over runs."""
-    return np.asarray(errors(track, fleet).max(axis=1))
+    return np.asarray(np.fmax.reduce(errors(track, fleet), axis=1))
 
 
 def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
@@ -96,9 +97,12 @@ def nees(track: Track, fleet: Fleet, *, method: str = "the method") -> Floats:
     if track.covariance is None:
         hint = "NEES needs a method that reports a covariance."
         raise InputError("covariance", None, "this method claims none", hint)
-    arrays = (np.ascontiguousarray(values) for values in (track.x, truth, track.covariance))
+    covariance = track.covariance
+    if track.absent is not None:
+        covariance = np.where(track.absent[..., None, None], np.eye(3), covariance)
+    arrays = (np.ascontiguousarray(values) for values in (track.x, truth, covariance))
     found, sound = normalised(*arrays)
-    _require_sound(track, track.covariance, found, method)
+    _require_sound(track, covariance, found, method)
     if not sound:
         hint = "Assume noise in every direction: no standard deviation may be zero."
         raise InputError("covariance", "singular", "must have an inverse for NEES", hint)

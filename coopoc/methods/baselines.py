@@ -14,6 +14,7 @@ from ..world.inbox import Inbox
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
 from .egos import Estimate, assumptions, follow_egos, measurements
+from .gaps import in_stretches
 from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel, resolve
 from .track import Checked, Track
@@ -41,6 +42,7 @@ class LKFSA(Checked):
     cooperative = True
     message = FIX_AND_VELOCITY
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)
@@ -83,6 +85,7 @@ class MSMV(Checked):
         name = self.noise_model if isinstance(self.noise_model, str) else self.noise_model.name
         return ESTIMATE if name == "identity" else ESTIMATE_AND_COV
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
         known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)

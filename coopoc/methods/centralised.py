@@ -10,6 +10,7 @@ from tqdm import tqdm
 
 from ..arrays import TINY, Floats
 from ..world.recording import Recording, Vehicles, check_recording
+from .gaps import in_stretches
 from .noise_model import NoiseModel
 from .track import Checked, Track, check_options
 from .whole_fleet import CENTRE, UPLOAD, Answer, fleet_track
@@ -50,6 +51,7 @@ class CentralFilter(Checked):
     cooperative = True
     message = UPLOAD
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
@@ -124,6 +126,7 @@ class BatchSmoother:
         steps = (0, 1e18, "a whole number >= 0, 0 for linear only")
         check_options(self, {"exact_steps": steps, "settle": (TINY, np.inf, "> 0 m, infinity for no further steps")})
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 

@@ -21,6 +21,7 @@ from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import Message
 from .calibration import calibrated, scaled
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
+from .gaps import in_stretches
 from .noise_model import NoiseModel, resolve
 from .track import Checked, Track
 
@@ -158,6 +159,7 @@ class CooperativeFilter(Checked):
         """Mean of fixes, odometer and velocity."""
         return BROADCAST
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.
 

@@ -12,6 +12,7 @@ from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import ESTIMATE_AND_COV
 from .baselines import solo_estimates
 from .egos import Estimate, assumptions, follow_egos, measurements
+from .gaps import in_stretches
 from .noise_model import NoiseModel, resolve
 from .track import Checked, Track
 
@@ -53,6 +54,7 @@ class CovarianceIntersection(Checked):
     cooperative = True
     message = ESTIMATE_AND_COV
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of their neighbours' estimates; InputError if one is unknown or absent.
 

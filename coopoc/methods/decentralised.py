@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from ..world.recording import Recording, Vehicles
 from ..world.v2x import Message
+from .gaps import in_stretches
 from .noise_model import NoiseModel
 from .track import Track, check_options
 from .whole_fleet import Answer, fleet_track
@@ -69,6 +70,7 @@ class GaussianBeliefPropagation:
         """The sender's belief, to each vehicle in contact and in every round; its measurement, id and time once."""
         return Message("belief", 9, rounds=self.rounds, opening=5, unicast=True)
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 

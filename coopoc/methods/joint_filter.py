@@ -8,6 +8,7 @@ from ..kernels.stars.joint_filter import run_filter
 from ..world.recording import Recording, Vehicles
 from ..world.v2x import FIX_AND_VELOCITY
 from .egos import Estimate, assumptions, follow_egos, measurements
+from .gaps import in_stretches
 from .noise_model import NoiseModel, resolve
 from .track import Checked, Track
 
@@ -45,6 +46,7 @@ class JointFilter(Checked):
     cooperative = True
     message = FIX_AND_VELOCITY
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         known = resolve(self.noise_model, recording)

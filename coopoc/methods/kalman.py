@@ -19,6 +19,7 @@ from ..world.fleet import Fleet
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.sensors import Sensors
 from .calibration import calibrated, scaled
+from .gaps import in_stretches
 from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
 from .stream import FilterStream
 from .track import Alone, Checked, Track, check_options, lost, silent_track
@@ -34,6 +35,7 @@ class GNSS(Alone):
 
     name: str = "gnss"
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
         began = clock()
@@ -71,6 +73,7 @@ class Kalman(Alone, Checked):
 
     __repr__ = short_repr
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began = clock()
@@ -164,6 +167,7 @@ class AdaptiveKalman(Alone):
         positive = (TINY, np.inf, "> 0, infinity for never")
         check_options(self, {"prior_weight": positive, "window": positive})
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began, columns = clock(), check_recording(recording).columns(egos)

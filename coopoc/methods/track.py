@@ -48,6 +48,7 @@ class Track:
         extras: other numbers by name, (R, T, E), or (R, L) by link; states with their standard deviations under the
             name and "_std".
         ids: of all vehicles of the Recording, so that no other fleet's truth is taken for theirs; () if unknown.
+        absent: (T, E) True where an ego was not there, and its estimates are NaN; None: it always was.
 
     >>> covariance = np.full((1, 1, 1, 3, 3), 50.0) + 100.0 * np.eye(3)  # correlated, and sound
     >>> Track([0.0], (0,), np.zeros((1, 1, 1, 3)), covariance, [[0]], [[0]], 0.0).notes
@@ -67,6 +68,7 @@ class Track:
     heading_covariance: Floats | None = None
     extras: Mapping[str, Floats] = field(default_factory=dict)
     ids: tuple[str, ...] = ()
+    absent: Bools | None = None
 
     __repr__ = short_repr
 
@@ -99,8 +101,11 @@ class Track:
             for name, v in self.extras.items()
         }
         self.__dict__["extras"] = extras
-        if not np.isfinite(self.x).all():
-            run, step, ego = np.argwhere(~np.isfinite(self.x).all(axis=-1))[0]
+        if self.absent is not None:
+            self.__dict__["absent"] = checked("absent", self.absent, "(T, E)", x.shape[1:3], bool)
+        there = np.ones(x.shape[1:3], bool) if self.absent is None else ~self.absent
+        if not np.isfinite(self.x.sum(axis=-1)).all(where=there):
+            run, step, ego = np.argwhere(~np.isfinite(self.x).all(axis=-1) & there)[0]
             raise InputError(
                 "x",
                 f"not finite in run {run} at step {step} of ego {self.egos[ego]}",
@@ -108,7 +113,8 @@ class Track:
                 "The method diverged: lower its gain, or check the assumed standard deviations.",
             )
         if self.covariance is not None:
-            self._note_unsound(self.covariance.reshape(-1, 3, 3))
+            known = self.covariance if self.absent is None else self.covariance[:, there]
+            self._note_unsound(known.reshape(-1, 3, 3))
 
     def to_frame(self) -> pd.DataFrame:
         r"""A row per run, step and ego, for pandas.

@@ -293,7 +293,7 @@ def velocity_of_fixes(fixes: Signal, gap: float, std: float) -> tuple[Signal, fl
 
     >>> t = np.arange(40.0)
     >>> velocity, _ = velocity_of_fixes(Signal(t, np.outer(t, [3.0, 4.0, 0.0])), 5.0, 1.0)
-    >>> velocity.value[-1].round(6).tolist()
+    >>> velocity.value[-1].round(3).tolist()
     [3.0, 4.0, 0.0]
     """
     interval = float(np.median(np.diff(fixes.t)))

@@ -39,6 +39,8 @@ Frame = Literal["world", "body"]
 Stamps = Literal["header", "received"]
 DAY = 86400.0
 """s."""
+LOST = 0.02
+"""Most of the fixes that may fall on a step that has one."""
 LONGEST, PAIR = 1.0, ("vehicle", "partner")
 """s, of a step that is not given; what names a pair."""
 READERS: Mapping[str, Callable[..., Rows]] = {
@@ -397,6 +399,17 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         seldom = float(f"{min(pairs, fixes, LONGEST):.3g}")
         summary.assume(f"steps of {seldom:g} s, as fixes and pairs are measured; odometry every {step:g} s is averaged")
         step = seldom
+    if dt is None:
+        at = rows[rows["kind"] == "x"].drop_duplicates(["vehicle", "t"])
+
+        def lost(step: float) -> float:
+            steps = at.assign(t=((at["t"] - t.min()) / step).round())
+            return float(steps.duplicated(["vehicle", "t"]).mean()) if len(at) else 0.0
+
+        parts = next((n for n in (1, 2, 3, 4, 5) if lost(step / n) <= LOST), 1)
+        if parts > 1:
+            step = float(f"{step / parts:.3g}")
+            summary.assume(f"steps of {step:g} s, since fixes come at two rates or more")
     check_size(span / step + 1.5, rows["vehicle"].nunique(), len(rows), step, summary.name)
     if span / step < 0.5:
         allowed = f"must be well below the {span:g} s of the log"

@@ -15,6 +15,7 @@ from coopoc.errors import InputError
 from coopoc.kernels.compiling.waiting import clock
 from coopoc.kernels.motion import MotionNoise, own_variances
 from coopoc.kernels.solo import FixNoise
+from coopoc.methods.gaps import in_stretches
 from coopoc.methods.kalman import solo_filter, solo_track
 from coopoc.methods.noise_model import check_interval
 from coopoc.methods.stream import FilterStream
@@ -77,6 +78,7 @@ class OptimisedKF(Alone):
         check_interval(interval)
         return FilterStream(self._motion(float(interval)), FixNoise(np.square(self.gnss_std)), x0, history)
 
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Estimates and covariances of the egos."""
         began, columns = clock(), check_recording(recording).columns(egos)

@@ -1,0 +1,94 @@
+"""Methods across gaps: an ego that is absent for a while, or has no fix at first, is followed stretch by stretch."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import wraps
+from typing import Any
+
+import numpy as np
+
+from ..world.recording import Recording, Vehicles, check_recording
+from .track import Track
+
+
+def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
+    """A method's `__call__` that begins anew after each gap of an ego; its estimate is NaN where there is none.
+
+    A position x0 that is known at first holds for a stretch that begins there.
+
+    >>> from coopoc import Fleet, Kalman, Sensors, observe
+    >>> fleet = Fleet(("a",), np.arange(6) / 10, np.zeros((6, 1, 3)), np.zeros((6, 1, 3)))
+    >>> seen = observe(fleet, Sensors())
+    >>> u = seen.velocity.copy()
+    >>> u[:, 2] = np.nan
+    >>> Kalman()(replace(seen, velocity=u)).absent.ravel().tolist()
+    [False, False, True, False, False, False]
+    """
+
+    @wraps(call)
+    def across(self: Any, recording: Recording, egos: Vehicles = (0,)) -> Track:
+        columns = check_recording(recording).observing(egos)
+        whole = (0, len(recording.t))
+        cuts = {column: recording.stretches(column, 1) for column in columns}
+        if all(found in ((), (whole,)) for found in cuts.values()):
+            return call(self, recording, egos)
+        parts = {
+            (column, cut): call(_from(self, cut[0]), recording.between(*cut), [recording.ids[column]])
+            for column in columns
+            for cut in cuts[column]
+        }
+        return _joined(recording, columns, parts)
+
+    return across
+
+
+def _from(method: Any, start: int) -> Any:
+    """The method at a later start, where a first position is not known."""
+    return replace(method, x0=None) if start > 0 and getattr(method, "x0", None) is not None else method
+
+
+def _joined(recording: Recording, columns: list[int], parts: dict[tuple[int, tuple[int, int]], Track]) -> Track:
+    """Tracks of one ego each, in stretches of the recording, as one of all."""
+    shape = recording.runs, len(recording.t), len(columns)
+    some, links = [*parts.values()], recording.links
+    mine = [links.of(column) for column in columns]
+    ends = np.cumsum([0, *map(len, mine)])
+    absent, notes = np.ones(shape[1:], bool), dict[str, None]()
+    made: dict[str, Any] = {"neighbours": None if some[0].neighbours is None else (shape[0], ends[-1], 3)}
+    for name in ("x", "covariance", "heading", "heading_covariance"):
+        first = getattr(some[0], name)
+        made[name] = None if first is None else (*shape, *first.shape[3:])
+    made = {name: size and np.full(size, np.nan) for name, size in made.items()}
+    extras = {
+        name: np.full(shape if v.ndim == 3 else (shape[0], ends[-1]), np.nan) for name, v in some[0].extras.items()
+    }
+    received, sent = np.zeros((2, shape[0], len(columns)))
+    for (column, (start, stop)), track in parts.items():
+        e = columns.index(column)
+        absent[start:stop, e] = False
+        received[:, e] += track.received_bytes[:, 0]
+        sent[:, e] += track.sent_bytes[:, 0]
+        here = ends[e] + np.flatnonzero((links.step[mine[e]] >= start) & (links.step[mine[e]] < stop))
+        for name, values in (*((k, getattr(track, k)) for k in made), *track.extras.items()):
+            of = made.get(name, extras.get(name))
+            if of is not None and of.shape[1] == shape[1] and name != "neighbours" and values.ndim > 2:
+                of[:, start:stop, e] = values[:, :, 0]
+            elif of is not None:
+                of[:, here] = values
+        notes |= dict.fromkeys(track.notes)
+    gaps = f"absent, or without a first fix, at {absent.sum()} of {absent.size} steps: no estimate there"
+    seconds = sum(track.seconds for track in some)
+    return Track(
+        recording.t,
+        tuple(columns),
+        received_bytes=received,
+        sent_bytes=sent,
+        seconds=seconds,
+        notes=(*notes, gaps),
+        extras=extras,
+        ids=recording.ids,
+        absent=absent,
+        **made,
+    )

@@ -1,0 +1,165 @@
+"""Logs that hold less than motion: no odometry, no heading, gaps, two rates. References are filterpy's filter of a
+constant velocity with the density that is best by the truth, and filters that are told what a log does not hold."""
+
+from collections.abc import Sequence
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pandas as pd
+import pytest
+from filterpy.common import Q_continuous_white_noise
+from filterpy.kalman import KalmanFilter
+from numpy.testing import assert_allclose
+
+import coopoc as co
+from coopoc.arrays import Floats
+from coopoc.data.log.read import Log
+from coopoc.kernels.constant_velocity import constant_velocity
+
+T = np.round(np.arange(0, 180, 0.1), 1)
+
+
+def path(name: str) -> Floats:
+    """(T, 3) m: a car that stops, goes and turns; a drone; a slow robot."""
+    if name == "drone":
+        return np.stack([3 * np.sin(T / 2.5), 3 * np.sin(T / 1.7 + 1), 1 + 0.5 * np.sin(T / 4)], axis=1)
+    if name == "robot":
+        return np.stack([0.2 * T + np.sin(T / 20), np.cos(T / 11), 0 * T], axis=1)
+    speed, course = car()
+    return np.cumsum(0.1 * np.stack([speed * np.cos(course), speed * np.sin(course), 0 * T], axis=1), axis=0)
+
+
+def car() -> tuple[Floats, Floats]:
+    """m/s and rad."""
+    return 8 + 6 * np.sin(T / 17), np.cumsum(0.1 * 0.25 * np.sin(T / 9) * np.sin(T / 40))
+
+
+def log(
+    folder: Path, name: str, std: float, every: int, seed: int = 0, steps: Sequence[int] = (), **more: Floats
+) -> tuple[Log, Floats, Floats]:
+    """A log of noisy fixes at some of the steps, and of what else is measured at all of them; times and fixes."""
+    x, rng = path(name), np.random.default_rng(seed)
+    k = np.array(steps) if len(steps) else np.arange(0, len(T), every)
+    z = np.full_like(x, np.nan)
+    z[k] = x[k] + rng.normal(0, std, (len(k), 3))
+    frame = {"t": T, "vehicle": "a"} | {c: z[:, i] for i, c in enumerate("xyz")} | more
+    frame |= {f"{c}_std": np.where(np.isfinite(z[:, 0]), std, np.nan) for c in "xyz"}
+    drive = pd.DataFrame(frame)
+    folder.mkdir(parents=True, exist_ok=True)
+    drive[drive[["x", *more]].notna().any(axis=1)].to_csv(folder / "a.csv", index=False)
+    truth = {"t": T, "vehicle": "a"} | {c: x[:, i] for i, c in enumerate("xyz")}
+    pd.DataFrame(truth).to_csv(folder / "truth.csv", index=False)
+    return co.read_log(folder), T[k], z[k]
+
+
+def error(read: Log, method: co.Method) -> float:
+    assert read.truth is not None
+    return float(co.rt_le(method(read.recording), read.truth)[0, 0])
+
+
+def filtered(t: Floats, z: Floats, std: float, density: float, spread: float = 10.0) -> tuple[Floats, Floats]:
+    """filterpy's positions (M, 3) m and velocities m/s after each fix."""
+    kf, x, u = KalmanFilter(dim_x=2, dim_z=1), np.empty_like(z), np.empty_like(z)
+    for c in range(3):
+        kf.x, kf.P = np.array([[z[0, c]], [0.0]]), np.diag([std**2, spread**2])
+        kf.R, kf.H = np.array([[std**2]]), np.array([[1.0, 0.0]])
+        for k in range(len(t)):
+            if k > 0:
+                kf.F = np.array([[1.0, t[k] - t[k - 1]], [0.0, 1.0]])
+                kf.Q = Q_continuous_white_noise(2, t[k] - t[k - 1], density)
+                kf.predict()
+                kf.update(z[k, c])
+            x[k, c], u[k, c] = kf.x[:, 0]
+    return x, u
+
+
+def test_one_filter_of_the_bank_is_filterpys() -> None:
+    rng = np.random.default_rng(3)
+    t, w, std = np.cumsum(rng.uniform(0.2, 0.6, 60)), 0.4, 1.5
+    z = np.stack([3 * t, 0.2 * t**2, 0 * t], axis=1) + rng.normal(0, 0.1, (60, 3))  # no innovation is clipped
+    interval = float(np.median(np.diff(t)))
+    velocity, _ = constant_velocity(t, z, interval, 9.0, std**2, 10.0, np.full(7, w))
+    assert_allclose(velocity, filtered(t, z, std, (w / interval) ** 4 * std**2)[1], atol=1e-9)
+
+
+CASES = [("car", 1.5, 10), ("car", 1.5, 1), ("drone", 0.1, 1), ("robot", 0.3, 2)]
+
+
+@pytest.mark.parametrize(("name", "std", "every"), CASES)
+def test_fixes_alone_are_filtered_as_by_the_best_constant_velocity(
+    tmp_path: Path, name: str, std: float, every: int
+) -> None:
+    read, t, z = log(tmp_path, name, std, every)
+    assert "no odometry of a" in " ".join(read.recording.notes)
+    x = path(name)[np.searchsorted(T, t)]
+    densities = 10.0 ** np.arange(-3, 3.1, 0.5)
+    best = min(np.sqrt(np.square(filtered(t, z, std, q)[0] - x).sum(axis=1).mean()) for q in densities)
+    for method in (co.Kalman(), co.CooperativeFilter(), co.JointFilter()):
+        assert error(read, method) < 1.15 * best
+
+
+@pytest.mark.parametrize(("std", "bias"), [(1.5, 0.0), (1.5, 0.01), (15.0, 0.003)])
+def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path: Path, std: float, bias: float) -> None:
+    """Beside the same log with a compass of 1 degree; without a gyro beside fixes alone."""
+    rng, (speed, course) = np.random.default_rng(1), car()
+    odometry = {"speed": 1.01 * speed + rng.normal(0, 0.1, len(T))}
+    gyro = {"yaw_rate": np.gradient(course, 0.1) + bias + rng.normal(0, 0.01, len(T))}
+    compass = {"heading": course + rng.normal(0, np.radians(1.0), len(T))}
+    alone = error(log(tmp_path / "fixes", "car", std, 10)[0], co.Kalman())
+    known = error(log(tmp_path / "known", "car", std, 10, **odometry, **compass)[0], co.Kalman())
+    turning = log(tmp_path / "gyro", "car", std, 10, **odometry, **gyro)[0]
+    course_of_fixes = log(tmp_path / "course", "car", std, 10, **odometry)[0]
+    for method in (co.Kalman(), co.CooperativeFilter()):
+        assert error(turning, method) < max(0.85 * alone, 1.3 * known)
+        assert error(course_of_fixes, method) < 1.3 * alone
+
+
+@pytest.mark.parametrize("given", ["", "speed", "speed,yaw_rate"])
+def test_nothing_looks_ahead(tmp_path: Path, given: str) -> None:
+    """A fix at 120 s that is 40 m off changes no estimate before it."""
+    speed, course = car()
+    every = {"speed": speed, "yaw_rate": np.gradient(course, 0.1)}
+    more = {name: every[name] for name in given.split(",") if name}
+    read = log(tmp_path / "as it was", "car", 1.0, 10, **more)[0]
+    rows = pd.read_csv(tmp_path / "as it was" / "a.csv")
+    rows.loc[rows["t"] == 120.0, "x"] += 40.0
+    (tmp_path / "moved").mkdir()
+    rows.to_csv(tmp_path / "moved" / "a.csv", index=False)
+    moved = co.read_log(tmp_path / "moved").recording
+    moved = replace(moved, sensors=read.recording.sensors)
+    before = read.recording.t < 119.99
+    for method in (co.Kalman(), co.CooperativeFilter()):
+        one, other = method(read.recording).x[:, before], method(moved).x[:, before]
+        assert_allclose(one, other, atol=1e-9)
+
+
+def test_a_gap_splits_a_drive_in_every_method(tmp_path: Path) -> None:
+    """Law: beyond a gap a method is what it is on the drive behind it alone."""
+    read = log(tmp_path, "car", 1.5, 10, steps=[k for k in range(0, len(T), 10) if not 600 < k < 900])[0]
+    rec, truth = read.recording, read.truth
+    assert truth is not None
+    (first, _), second = rec.stretches("a")
+    assert first == 0
+    for method in (co.GNSS(), co.Kalman(), co.AdaptiveKalman(), co.JointFilter(), co.CooperativeFilter(), co.MSMV()):
+        track = method(rec)
+        assert track.absent is not None
+        assert 20 < track.absent.sum() < 32
+        assert np.isnan(track.x[:, track.absent[:, 0]]).all()
+        behind = method(rec.between(*second))
+        assert_allclose(track.x[:, slice(*second)], behind.x)
+        assert np.isfinite(co.rt_le(track, truth)).all()
+        assert np.isfinite(co.max_error(track, truth)).all()
+        assert any("no estimate there" in note for note in track.notes)
+
+
+def test_a_vehicle_that_is_never_there_is_refused(tmp_path: Path) -> None:
+    rec = log(tmp_path, "car", 1.5, 10)[0].recording
+    with pytest.raises(co.InputError, match="absent"):
+        co.Kalman()(replace(rec, velocity=np.full_like(rec.velocity, np.nan)))
+
+
+def test_stamps_at_two_rates_are_kept(tmp_path: Path) -> None:
+    steps = np.cumsum(np.tile([2, 3], 300))
+    read, t, _ = log(tmp_path, "car", 1.5, 1, steps=steps[steps < len(T)].tolist())
+    assert np.isfinite(read.recording.gnss[0, :, 0, 0]).sum() == len(t)
