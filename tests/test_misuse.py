@@ -14,6 +14,8 @@ from conftest import refused
 import coopoc as co
 from coopoc import optimize
 from coopoc.errors import shown
+from coopoc.evaluate.ledger import of_track
+from coopoc.evaluate.metrics import fix_innovations
 from coopoc.formats import load_graph, read_g2o, read_pyfg
 from coopoc.study.merge import merge
 from coopoc.study.publish import views
@@ -105,7 +107,7 @@ def ours(call: Callable[[], object], what: str) -> None:
         pytest.fail(f"{what}: {type(error).__name__}: {error}")
 
 
-BARE = replace(TRACK, covariance=None)
+BARE, OTHER = replace(TRACK, covariance=None), replace(RECORDING, ids=("e", "f", "g", "h"))
 
 
 @pytest.mark.parametrize(
@@ -114,11 +116,28 @@ BARE = replace(TRACK, covariance=None)
         (lambda: co.nees(BARE, FLEET), "this method claims none"),
         (lambda: replace(TRACK, x=np.nan * TRACK.x), "not finite in run 0 at step 0"),
         (lambda: co.Kalman()(replace(RECORDING, gnss=np.nan * RECORDING.gnss), [0]), "has no fix at step 0"),
+        (lambda: replace(TRACK, egos=(-1, -2)), r"egos\[0\] = -1: must be >= 0"),
+        (lambda: replace(TRACK, egos=(0, 9)), "egos = 9: must be an index in 0..3"),
+        (lambda: replace(TRACK, t=np.where(TRACK.t > 0.3, np.nan, TRACK.t)), r"t\[4\] = nan: must be finite"),
+        (lambda: replace(TRACK, t=TRACK.t[::-1]), r"t\[1\] = 0.4: must increase"),
+        (lambda: co.NoiseModel("m"), "process_std = None: must be given"),
+        (lambda: of_track(TRACK, OTHER, co.Kalman().message), "ids and times differ from those that were recorded"),
+        (lambda: of_track(TRACK, RECORDING.of_runs([0, 0]), co.Kalman().message), "track = 1 runs: must have 2"),
+        (lambda: fix_innovations(TRACK, OTHER), "ids and times differ from those that were recorded"),
     ],
 )
 def test_what_cannot_be_computed_says_why(call: Callable[[], object], words: str) -> None:
     with refused(words):
         call()
+
+
+def test_a_noun_keeps_no_array_that_its_owner_can_change() -> None:
+    whole = np.arange(6) / 10
+    part = whole.view()
+    part.flags.writeable = False
+    fleet = replace(FLEET, t=part)
+    whole[3] = 99.0
+    assert fleet.t[3] == 0.3
 
 
 def swept(make: Callable[..., object], given: dict[str, Any], wrong: tuple[Any, ...] = ALL) -> None:

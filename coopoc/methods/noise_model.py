@@ -55,6 +55,9 @@ class NoiseModel:
             instance("sensors", self.sensors, Sensors)
         if self.fleet is not None:
             instance("fleet", self.fleet, Fleet)
+        if self.process_std is None and self.sensors is None:
+            hint = "Give process_std=(1.0, 1.0, 1.0), or sensors=Sensors(), whose noise follows the speed."
+            raise InputError("process_std", None, "must be given where there are no sensors", hint)
         for field in ("process_std", "gnss_std"):
             if field == "gnss_std" or self.process_std is not None:
                 value = checked(field, getattr(self, field), "(3,)", (3,))

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Limits, check_arrays, check_fields, checked, number, texts
+from ..arrays import Bools, Floats, Limits, check_arrays, check_fields, checked, instance, number, refuse, texts
 from ..errors import InputError, shown
 from ..kernels.compiling.waiting import clock
 from ..short_repr import short_repr
+from ..world.fleet import columns, same_drive
 from ..world.long_table import long_table
 from ..world.recording import Recording, Vehicles
 from ..world.sensors import Sensors
@@ -72,6 +73,7 @@ class Track:
 
     def __post_init__(self) -> None:
         egos = checked("egos", self.egos, "(E,)", (-1,), int)
+        refuse("egos", egos, egos < 0, "must be >= 0", "Give columns of the recording, from 0 on.")
         self.__dict__["egos"] = tuple(egos.tolist())
         t, x = checked("t", self.t, "(T,)", (-1,)), checked("x", self.x, "(R, T, E, 3)", (-1, -1, -1, 3))
         runs, steps = x.shape[:2]
@@ -86,9 +88,13 @@ class Track:
             "heading_covariance": ("(R, T, E, 4)", (*x.shape[:3], 4)),
         }
         check_arrays(self, shapes)
+        refuse("t", t, ~np.isfinite(t), "must be finite", "Give seconds for every step.")
+        refuse("t", t, np.append(True, np.diff(t) > 0)[: len(t)] == 0, "must increase", "Sort the steps by time.")
         self.__dict__["seconds"] = number("seconds", self.seconds)
         for name in ("notes", "ids"):
             self.__dict__[name] = texts(name, getattr(self, name))
+        if self.ids:
+            columns("egos", self.egos, self.ids)
         if not isinstance(self.extras, Mapping):
             raise InputError("extras", shown(self.extras), "must be name -> (R, T, E)", "Give {} for none.")
         by_link = None if self.neighbours is None else self.neighbours.shape[:2]
@@ -143,6 +149,15 @@ class Track:
         if (found := unsound(covariance)) and not any(UNSOUND in note for note in self.notes):
             note = f"{found} of {len(covariance)} {UNSOUND}"
             self.__dict__["notes"] = (*self.notes, note)
+
+
+def of_recording(track: Track, recording: Recording) -> None:
+    """InputError unless a track is one of this recording: of its runs, times and vehicles."""
+    recording = instance("recording", recording, Recording, "The track stands before its recording.")
+    same_drive(recording, instance("track", track, Track).ids or recording.ids, track.t)
+    columns("egos", track.egos, recording.ids)
+    if len(track.x) != recording.runs:
+        raise InputError("track", f"{len(track.x)} runs", f"must have {recording.runs}", "Take recording.of_runs(...).")
 
 
 FAR = 100.0

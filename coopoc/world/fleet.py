@@ -6,7 +6,7 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
@@ -108,9 +108,7 @@ class Fleet:
         coopoc.errors.InputError: fleet = Fleet(unnamed: 1 vehicles x 2 steps, dt 0.1 s): ids and times differ from \
 those that were recorded. Give the fleet that was observed, its vehicles in the same order.
         """
-        if tuple(ids) != self.ids or len(t) != len(self.t) or np.abs(t - self.t).max() > 0.01 * self.dt:
-            hint = "Give the fleet that was observed, its vehicles in the same order."
-            raise InputError("fleet", repr(self), "ids and times differ from those that were recorded", hint)
+        same_drive(self, ids, t)
 
     def index(self, vehicle: str | int) -> int:
         """Column of a vehicle given by its id or its index; InputError if there is none."""
@@ -165,6 +163,14 @@ def _check_gaps(fleet: Fleet) -> None:
             "must be finite, or NaN in all six numbers where the vehicle is absent",
             "Interpolate the gap or drop the row.",
         )
+
+
+def same_drive(noun: Any, ids: Sequence[str], t: Floats) -> None:
+    """InputError unless a Fleet or Recording has these vehicles in this order, and its steps are at times t (T,) s."""
+    if tuple(ids) != noun.ids or len(t) != len(noun.t) or np.abs(t - noun.t).max() > 0.01 * noun.dt:
+        kind = type(noun).__name__.lower()
+        hint = f"Give the {kind} that was observed, its vehicles in the same order."
+        raise InputError(kind, repr(noun), "ids and times differ from those that were recorded", hint)
 
 
 def names(ids: Iterable[object]) -> tuple[str, ...]:

@@ -96,8 +96,8 @@ def unpacked(path: Path) -> dict[str, AnyArray]:
 
 
 def _check_shapes(packed: zipfile.ZipFile) -> None:
-    """ValueError for arrays of other names, for more numbers than a member holds, and for arrays larger than a recording
-    with these fixes and links has, by their headers alone."""
+    """ValueError for arrays of other names, for more numbers than their bytes hold, and for arrays larger than those of
+    a recording with these fixes and links, by their headers alone."""
     shapes = {}
     for part in packed.infolist():
         with packed.open(part) as file:
