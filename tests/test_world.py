@@ -55,7 +55,7 @@ def test_unknown_vehicle_lists_the_known(crossing: Fleet) -> None:
         (lambda: Sensors(gnss_std=(1, -1, 1)), "gnss_std"),
         (lambda: Sensors(gnss_std=3.5), "gnss_std = 3.5: must be 3 numbers"),  # type: ignore[arg-type]
         (lambda: Sensors(gnss_bias=(1.0, 0.5)), "low <= high"),
-        (lambda: Sensors(azimuth_std=4.0), "radians"),
+        (lambda: Sensors(azimuth_std=4.0), "0..pi rad"),
         (lambda: Sensors(gnss_bias_mode="daily"), "gnss_bias_mode"),
         (lambda: Sensors(velocity_std_ratio=float("nan")), "velocity_std_ratio"),
     ],

@@ -190,7 +190,7 @@ def silent_track(
 ) -> Track:
     """Track of a method that receives and sends nothing."""
     none = np.zeros((recording.runs, len(columns)))
-    took = clock() - began
+    took, notes = clock() - began, notes + recording.doubts
     return Track(recording.t, tuple(columns), x, cov, none, none, took, notes=notes, ids=recording.ids, **more)
 
 

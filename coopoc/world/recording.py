@@ -12,8 +12,9 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, refuse, texts
 from ..errors import InputError, shown
 from ..short_repr import short_repr
-from .fleet import FARTHEST, FASTEST, clock, columns, interval, names, plausible
+from .fleet import clock, columns, interval, names
 from .links import Links, stretches, told
+from .plausible import FARTHEST, FASTEST, FASTEST_TURN, UNLIKELY, headings, plausible, radians, unlikely
 from .sensors import Sensors
 from .v2x import V2X
 
@@ -30,7 +31,7 @@ class Body:
         heading: (R, T, N) rad from +x, anticlockwise, of a compass; NaN where there is none.
 
     Raises:
-        InputError: arrays of other shapes, infinite numbers.
+        InputError: arrays of other shapes, or in degrees.
 
     >>> Body(np.zeros((1, 2, 1)), np.full((1, 2, 1), np.nan)).yaw_rate.shape
     (1, 2, 1)
@@ -44,10 +45,10 @@ class Body:
     def __post_init__(self) -> None:
         shape: tuple[int, ...] = (-1, -1, -1)
         for name in ("yaw_rate", "heading"):
-            values = checked(name, getattr(self, name), "(R, T, N)", shape)
-            shape = values.shape
-            refuse(name, values, np.isinf(values), "must be finite, or NaN where missing", "Replace it by NaN.")
-            self.__dict__[name] = values
+            self.__dict__[name] = checked(name, getattr(self, name), "(R, T, N)", shape)
+            shape = self.yaw_rate.shape
+        radians("yaw_rate", self.yaw_rate, FASTEST_TURN)
+        headings(self.heading)
 
     def check(self, velocity: Floats) -> None:
         """InputError unless every vehicle that has a velocity (R, T, N, 3) m/s has a yaw rate."""
@@ -129,6 +130,7 @@ class Recording:
         if self.body is not None:
             instance("body", self.body, Body).check(self.velocity)
         self.sensors.check_assumed()
+        self.__dict__["notes"] = (*(note for note in self.notes if UNLIKELY not in note), *unlikely(self))
 
     @property
     def dt(self) -> float:
@@ -139,6 +141,11 @@ class Recording:
     def measured(self) -> bool:
         """Whether the notes say that nothing is simulated."""
         return any(MEASURED in note for note in self.notes)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """The notes on what is unlikely, which every track of this recording has, too."""
+        return tuple(note for note in self.notes if UNLIKELY in note)
 
     @property
     def runs(self) -> int:
@@ -311,6 +318,7 @@ def check_measurements(gnss: Floats, velocity: Floats, relative: Floats) -> None
             refuse(name, values, partly, "must be NaN on all axes or on none", "Set all three to NaN.")
         if name == "velocity":
             refuse(name, values, missing != missing[:1], "must be NaN in all runs or in none", "Absence is no noise.")
+    radians("relative angles", relative[..., 1:])
     refuse(
         "relative",
         relative[..., 0],

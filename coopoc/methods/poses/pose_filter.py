@@ -151,7 +151,7 @@ class PoseFilter:
             received,
             sent,
             clock() - began,
-            notes=notes,
+            notes=notes + recording.doubts,
             heading=wrap(x[..., 3]),
             heading_covariance=cov[..., 3, :4],
             extras=extras,

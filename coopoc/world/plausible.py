@@ -1,0 +1,123 @@
+"""Plausibility: what nothing measures is refused; what is unlikely, as odometry that fixes contradict, is noted."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING, TypeAlias
+
+import numpy as np
+
+from ..arrays import AnyArray, Floats, refuse
+from .links import wrap
+
+if TYPE_CHECKING:
+    from .recording import Recording
+
+FARTHEST, FASTEST, FASTEST_TURN = 1e8, 1e4, 35.0
+"""m, m/s and rad/s (2000 °/s): what lies beyond was not measured on Earth, and its square leaves no digits to what
+stands beside it."""
+TWO_TURNS, UNWRAPPED = 4 * np.pi, 1e6
+"""rad, beyond which an angle is in degrees or unwrapped; and beyond which an unwrapped one has lost its digits."""
+COARSE = 0.01
+"""m, of the resolution of float32 that matters."""
+WIDE = 0.6
+"""rad, of a standard deviation that is rather one in degrees."""
+UNLIKELY = "unlikely: "
+"""First word of a note on what a recording holds."""
+LAG, LONG, APART, SHARE = 10.0, 6.0, 0.4, 0.25
+"""s between the fixes whose distance is compared with the odometry's; standard deviations of a fix that one of the two
+must be long; share of both lengths by which they contradict each other; and share of such pairs, of all."""
+Motion: TypeAlias = tuple[AnyArray, AnyArray, AnyArray]
+"""Velocity x + iy m/s, heading rad and yaw rate rad/s, (T, N) each."""
+CAUSES: Mapping[str, Callable[[AnyArray, AnyArray, AnyArray], Motion]] = {
+    "velocities in km/h": lambda u, h, w: (u / 3.6, h, w),
+    "vy to the right": lambda u, h, w: (u.conj(), h, w),
+    "headings in degrees": lambda u, h, w: (u, np.deg2rad(h), w),
+    "yaw rates in degrees/s": lambda u, h, w: (u, h, np.deg2rad(w)),
+    "headings clockwise from north": lambda u, h, w: (u, np.pi / 2 - h, w),
+}
+"""Mistake -> the motion without it."""
+
+
+def plausible(field: str, values: Floats, limit: float, hint: str = "Is it in another unit?") -> None:
+    """InputError for the first number beyond the limit, and for positions that float32 has rounded; NaN is missing.
+
+    >>> plausible("velocity", np.array([3.0, -1e9]), FASTEST)
+    Traceback (most recent call last):
+    coopoc.errors.InputError: velocity[1] = -1000000000.0: must be within +-10000 in SI units. Is it in another unit?
+    """
+    if not values.size:
+        return
+    largest = max(np.fmax.reduce(values, axis=None), -np.fmin.reduce(values, axis=None))
+    if largest > limit:
+        refuse(field, values, np.abs(values) > limit, f"must be within +-{limit:g} in SI units", hint)
+    if (step := float(np.spacing(np.float32(largest)))) > COARSE and limit == FARTHEST:
+        there = values[np.isfinite(values)]
+        rounded = np.full(values.shape, bool((there == there.astype(np.float32)).all() and (there % 1).any()))
+        allowed = f"must have more digits than those of float32, which are {step:g} m apart there"
+        refuse(field, values, rounded, allowed, "Subtract a local origin before you convert to float32.")
+
+
+def radians(field: str, values: Floats, limit: float = TWO_TURNS) -> None:
+    """InputError for the first angle that is in degrees; NaN is missing.
+
+    >>> radians("azimuth", np.array([90.0]))
+    Traceback (most recent call last):
+    coopoc.errors.InputError: azimuth[0] = 90.0: must be within +-12.5664 in SI units. Convert degrees by \
+np.deg2rad, and wrap what is unwrapped.
+    """
+    plausible(field, values, limit, "Convert degrees by np.deg2rad, and wrap what is unwrapped.")
+
+
+def headings(values: Floats, velocity: Floats | None = None) -> None:
+    """InputError for headings (..., T, N) in degrees. They may be unwrapped, but do not jump by more than two turns, as
+    degrees do at 360, and beyond two turns are no courses of velocities (T, N, 3) m/s once they are converted."""
+    radians("heading", values, UNWRAPPED)
+    wrong, far = np.abs(np.diff(values, axis=-2, prepend=values[..., :1, :])) > TWO_TURNS, np.abs(values) > TWO_TURNS
+    if velocity is not None and far.any():
+        moving = far & (np.abs(velocity[..., :2]).max(axis=-1) > 1.0)
+        course = np.arctan2(velocity[..., 1], velocity[..., 0])
+        off = [np.abs(wrap(turn - course))[moving] for turn in (values, np.deg2rad(values))]
+        wrong |= moving & bool(moving.any() and np.median(off[1]) < min(0.2, np.median(off[0])))
+    refuse("heading", values, wrong, "must be in radians", "Convert degrees by np.deg2rad.")
+
+
+def unlikely(recording: Recording) -> tuple[str, ...]:
+    """Notes on a recording whose settings or measurements are rather in other units, or contradict each other."""
+    sensors, v2x = recording.sensors, recording.v2x
+    found = [
+        f"{name} is {std:.3g} rad, which is {np.rad2deg(std):.0f}°"
+        for name in ("azimuth_std", "inclination_std", "heading_std", "heading_bias_std")
+        if (std := getattr(sensors, name)) > WIDE
+    ]
+    if v2x.latency > v2x.max_age and len(recording.links):
+        found.append(f"no message is used: latency is {v2x.latency:g} s, max_age {v2x.max_age:g} s")
+    if share := _contradicting(recording, lambda *motion: motion):
+        causes = [cause for cause, mended in CAUSES.items() if not _contradicting(recording, mended)]
+        why = f", as {' or '.join(causes)} would" if causes else ""
+        found.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive{why}")
+    return tuple(UNLIKELY + text for text in found)
+
+
+def _contradicting(recording: Recording, mended: Callable[[AnyArray, AnyArray, AnyArray], Motion]) -> float:
+    """Share of the pairs of fixes of the first run, `LAG` s apart, that contradict the odometry between them; 0 below
+    `SHARE`, and where too little moves. Without a heading only the lengths are compared."""
+    body, dt, steps = recording.body, recording.dt, len(recording.t)
+    fixes, u = (values[0, ..., :2] @ [1, 1j] for values in (recording.gnss, recording.velocity))
+    none: Floats = np.zeros(u.shape)
+    u, heading, rate = mended(u, *((none, none) if body is None else (body.heading[0], body.yaw_rate[0])))
+    turned = np.cumsum(np.nan_to_num(rate), axis=0) * dt
+    path = np.cumsum(np.nan_to_num(u * np.exp(1j * (turned - rate * dt / 2))) * dt, axis=0)
+    gaps = np.cumsum(np.isnan(u), axis=0)
+    newest = np.maximum.accumulate(np.where(np.isfinite(fixes), np.arange(steps)[:, None], -1), axis=0)
+    lag = max(1, min(steps - 1, round(LAG / dt)))
+    first, last = newest[: steps - lag : lag], newest[lag::lag]
+    column = np.broadcast_to(np.arange(u.shape[1]), first.shape)
+    moved, driven = (values[last, column] - values[first, column] for values in (fixes, path))
+    turn = (heading - turned)[first, column]
+    driven *= np.exp(1j * np.where(np.isnan(turn), np.angle(moved) - np.angle(driven), turn))
+    far = np.fmax(np.abs(moved), np.abs(driven)) > LONG * np.hypot(*recording.sensors.fix_std[:2])
+    far &= (first >= 0) & (first < last) & (gaps[first, column] == gaps[last, column])
+    apart = far & (np.abs(moved - driven) > APART * (np.abs(moved) + np.abs(driven)))
+    share = float(apart.sum() / max(far.sum(), 1))
+    return share if share > SHARE and far.sum() > 2 else 0.0
