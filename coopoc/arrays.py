@@ -231,7 +231,7 @@ def refuse(field: str, values: AnyArray, wrong: npt.ArrayLike, allowed: str, hin
     """
     if np.any(wrong):
         place = tuple(np.argwhere(wrong)[0].tolist())
-        raise InputError(f"{field}[{', '.join(map(str, place))}]", values[place], allowed, hint)
+        raise InputError(f"{field}{[*place] or ''}", values[place], allowed, hint)
 
 
 def texts(field: str, values: object) -> tuple[str, ...]:

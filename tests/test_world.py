@@ -8,7 +8,22 @@ import pytest
 from conftest import refused
 from scipy import stats
 
-from coopoc import V2X, Fleet, InputError, Sensors, observe
+from coopoc import (
+    V2X,
+    Body,
+    Fleet,
+    InputError,
+    JointFilter,
+    Kalman,
+    LandmarkMeasurement,
+    OwnMeasurement,
+    PoseFilter,
+    RelativeMeasurement,
+    Sensors,
+    load_fleet,
+    observe,
+)
+from coopoc.world.body_frames import true_heading
 from coopoc.world.channels import lost
 from coopoc.world.inbox import inbox
 from coopoc.world.links import to_vector, vector_cov
@@ -58,11 +73,73 @@ def test_unknown_vehicle_lists_the_known(crossing: Fleet) -> None:
         (lambda: Sensors(azimuth_std=4.0), "0..pi rad"),
         (lambda: Sensors(gnss_bias_mode="daily"), "gnss_bias_mode"),
         (lambda: Sensors(velocity_std_ratio=float("nan")), "velocity_std_ratio"),
+        (lambda: Sensors(velocity_std_ratio=15), "velocity_std_ratio = 15: must be in .0, 1., 0.15 for 15 %"),
+        (lambda: Sensors(heading_std=5), "heading_std = 5: must be in 0..pi rad"),
+        (lambda: Sensors(yaw_rate_std=5), "yaw_rate_std = 5: must be in 0..pi rad"),
+        (lambda: RelativeMeasurement("b", [9.0, 45.0, 90.0]), r"relative angles\[0\] = 45"),
+        (lambda: LandmarkMeasurement([9.0, 45.0, 90.0], [0, 0, 0]), r"relative angles\[0\] = 45"),
+        (lambda: OwnMeasurement([9.0, 0.0, 0.0], 40.0), "yaw_rate = 40"),
+        (lambda: PoseFilter("solo", assumed=S2).start(0.1, np.array([0, 0, 0, 90.0])), "begin.0. = 90"),
     ],
 )
 def test_bad_configuration_is_named(build, words: str) -> None:
     with refused(words):
         build()
+
+
+def test_degrees_and_float32_are_refused_and_unwrapped_headings_are_not() -> None:
+    """Headings of the town in degrees, also where they never jump; vehicles that circle for four turns are right."""
+    town, t = load_fleet("town10").between(0, 300), np.arange(300) / 10
+    course, seen = true_heading(town), observe(town, S2, V2X(2))
+    for wrong in (np.rad2deg(course), np.rad2deg((course + np.pi) % (2 * np.pi))):
+        with refused("must be in radians. Convert degrees by np.deg2rad"):
+            replace(town, heading=wrong)
+    with refused(r"relative angles.*must be within \+-12.5664"):
+        replace(seen, relative=np.concatenate([seen.relative[..., :1], np.rad2deg(seen.relative[..., 1:])], axis=-1))
+    with refused("must be in radians"):
+        Body(np.zeros((1, 300, 60)), np.rad2deg((course + np.pi) % (2 * np.pi))[None])
+    with refused(r"position.*float32, which are 0.5 m apart.*Subtract a local origin"):
+        replace(town, position=(town.position + np.array([5e5, 5.8e6, 0])).astype(np.float32))
+    turn = np.stack([t, -t], axis=1)
+    circles = np.stack([9 * np.sin(turn), -9 * np.cos(turn), 0 * turn], axis=2) * [[1], [-1]] + [[[0], [50]]]
+    velocity = np.gradient(circles, 0.1, axis=0)
+    fleet = Fleet(("a", "b"), t, circles, velocity, heading=turn)
+    late = observe(fleet, S2, V2X(2), frame="body").between(200, 300)
+    body = late.body
+    assert body is not None
+    unwrapped = replace(late, body=Body(body.yaw_rate, np.unwrap(body.heading, axis=1) + 12 * np.pi))
+    assert not late.doubts + unwrapped.doubts
+    stream = PoseFilter("solo", assumed=S2).start(0.1)
+    for step, heading in enumerate(turn[:, 0]):
+        given = {"gnss": circles[step, 0], "heading": float(heading)}
+        stream.step(OwnMeasurement([9.0, 0.0, 0.0], 1.0, **given))  # type: ignore[arg-type]
+    with refused("heading = 90.0: must be within"):
+        stream.step(OwnMeasurement([9.0, 0.0, 0.0], 1.0, heading=90.0))
+
+
+def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track() -> None:
+    town = load_fleet("town10").between(0, 600)
+    world, body = (observe(town, S2, V2X(2), frame=frame, observers=[8]) for frame in ("world", "body"))
+    for right in (world, body, observe(town, replace(S2, heading_std=0.1, yaw_rate_bias_std=0.02), frame="body")):
+        assert not right.doubts
+    own = body.body
+    assert own is not None
+    rates = np.clip(np.rad2deg(own.yaw_rate), -35, 35)
+    wrong = {
+        "as velocities in km/h would": replace(world, velocity=3.6 * world.velocity),
+        "as vy to the right would": replace(world, velocity=world.velocity * [1, -1, 1]),
+        "in 99 % of the drive, as velocities in km/h would": replace(body, velocity=3.6 * body.velocity),
+        "as headings clockwise from north would": replace(body, body=Body(own.yaw_rate, np.pi / 2 - own.heading)),
+        "as yaw rates in degrees/s would": replace(body, body=Body(rates, own.heading)),
+        "latency is 20 s, max_age 1 s": observe(town, S2, V2X(2, latency=20.0), observers=[8]),
+        "azimuth_std is 2 rad, which is 115°": observe(town, replace(S2, azimuth_std=2.0), V2X(2), observers=[8]),
+    }
+    for note, recording in wrong.items():
+        assert [note in doubt and doubt in recording.notes for doubt in recording.doubts] == [True]
+        method = JointFilter() if recording.body is None else PoseFilter("solo")
+        assert recording.doubts[0] in method(recording, [8]).notes
+    mended = replace(wrong["as velocities in km/h would"], velocity=world.velocity)
+    assert not (*mended.notes, *Kalman()(mended, [8]).notes)
 
 
 def test_zero_noise_may_act_but_not_be_assumed(crossing: Fleet) -> None:

@@ -50,6 +50,7 @@ from ..kernels.stars.streams import (
     stream_step,
 )
 from ..world.links import told
+from ..world.plausible import radians
 from .cooperative_filter import Broadcast, CooperativeFilter, guards_of, model_of
 from .egos import relative_noise
 from .joint_filter import JointFilter
@@ -93,6 +94,7 @@ class RelativeMeasurement:
         if relative.shape != (3,) or not named or not (0.0 < relative[0] < math.inf or math.isnan(relative[0])):
             text = "must have a name and three numbers, the range first and > 0"
             raise InputError("relative", (self.id, self.relative), text, "Give NaN for what was not measured.")
+        radians("relative angles", relative[1:])
         row[:AGE], row[AGE] = components(told(relative)[None, None], FIRST)[0, 0], seconds("age", self.age)
         row[SOLO:SOLO_VARIANCE] = fix_or_none(self.gnss, "neighbour's gnss")
         if self.variance is not None:
