@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked, instance, number, one_of, refuse
+from ..arrays import Floats, checked, instance, number, one_of, refuse, texts
 from ..errors import InputError
 from ..methods.track import Track, of_recording
 from ..short_repr import short_repr
@@ -51,9 +51,13 @@ class Ledger:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
+        for name in ("names", "servers"):
+            self.__dict__[name] = texts(name, getattr(self, name))
         for name in ("seconds", "sent", "received"):
             values = checked(name, getattr(self, name))
-            refuse(name, values, ~(values >= 0), "must be >= 0", "Give bytes and seconds.")
+            refuse(
+                name, values, ~(values >= 0) | np.isinf(values), "must be finite and >= 0", "Give bytes and seconds."
+            )
             self.__dict__[name] = values
         shape = (2, 2, *self.sent.shape[2:3], len(self.names))
         for name, wanted in (("seconds", shape[3:]), ("sent", shape), ("received", shape)):

@@ -89,6 +89,9 @@ class Track:
         }
         check_arrays(self, shapes)
         refuse("t", t, ~np.isfinite(t), "must be finite", "Give seconds for every step.")
+        for name in ("received_bytes", "sent_bytes"):
+            moved = getattr(self, name)
+            refuse(name, moved, ~(moved >= 0) | np.isinf(moved), "must be finite and >= 0", "Give 0 for none.")
         refuse("t", t, np.append(True, np.diff(t) > 0)[: len(t)] == 0, "must increase", "Sort the steps by time.")
         self.__dict__["seconds"] = number("seconds", self.seconds)
         for name in ("notes", "ids"):

@@ -20,7 +20,7 @@ TWO_TURNS, UNWRAPPED = 4 * np.pi, 1e6
 """rad, beyond which an angle is in degrees or unwrapped; and beyond which an unwrapped one has lost its digits."""
 COARSE = 0.01
 """m, of the resolution of float32 that matters."""
-WIDE = 0.6
+WIDE = 0.5
 """rad, of a standard deviation that is rather one in degrees."""
 UNLIKELY = "unlikely: "
 """First word of a note on what a recording holds."""
@@ -87,7 +87,7 @@ def unlikely(recording: Recording) -> tuple[str, ...]:
     sensors, v2x = recording.sensors, recording.v2x
     found = [
         f"{name} is {std:.3g} rad, which is {np.rad2deg(std):.0f}°"
-        for name in ("azimuth_std", "inclination_std", "heading_std", "heading_bias_std")
+        for name in ("azimuth_std", "inclination_std", "heading_std", "heading_bias_std", "yaw_rate_std")
         if (std := getattr(sensors, name)) > WIDE
     ]
     if v2x.latency > v2x.max_age and len(recording.links):

@@ -120,7 +120,7 @@ def pose_noise(sensors: Sensors, dt: float, gate: float) -> PoseNoise:
         longer=float(sensors.range_offset_std > 0),
         keep=float(np.exp(-dt / sensors.odometry_error_time)),
         flat=FORGOTTEN,
-        gate=float(gate) ** 2,
+        gate=float(gate) * float(gate),
     )
 
 

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from ...arrays import Floats, instance, number
 from ...errors import InputError
 from ...world.links import wrap
-from ...world.plausible import FASTEST_TURN, UNWRAPPED, radians
+from ...world.plausible import FARTHEST, FASTEST_TURN, UNWRAPPED, radians
 from ..motion_history import fix_or_none, numbers, three
 
 if TYPE_CHECKING:
@@ -69,7 +69,11 @@ class LandmarkMeasurement:
     def __post_init__(self) -> None:
         for name in ("relative", "place"):
             values = numbers(getattr(self, name))
-            if values.shape != (3,) or np.isinf(values).any() or (name == "place" and np.isnan(values).any()):
+            if (
+                values.shape != (3,)
+                or (np.abs(values) > FARTHEST).any()
+                or (name == "place" and np.isnan(values).any())
+            ):
                 given, hint = getattr(self, name), "NaN stands for a component of `relative` that is missing."
                 raise InputError(name, given, "must be three numbers", hint)
             self.__dict__[name] = values
