@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from typing import TYPE_CHECKING, TypeAlias
+from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ..arrays import AnyArray, Floats, refuse
+from ..arrays import Floats, refuse
 from .links import wrap
 
 if TYPE_CHECKING:
@@ -23,20 +22,11 @@ COARSE = 0.01
 WIDE = 0.5
 """rad, of a standard deviation that is rather one in degrees."""
 UNLIKELY = "unlikely: "
-"""First word of a note on what a recording holds."""
+UNITS = "velocities are in m/s, headings and yaw rates in radians and anticlockwise, headings from east"
+"""First word of a note on what a recording holds, and what may be wrong with odometry."""
 LAG, LONG, APART, SHARE = 10.0, 6.0, 0.4, 0.25
 """s between the fixes whose distance is compared with the odometry's; standard deviations of a fix that one of the two
 must be long; share of both lengths by which they contradict each other; and share of such pairs, of all."""
-Motion: TypeAlias = tuple[AnyArray, AnyArray, AnyArray]
-"""Velocity x + iy m/s, heading rad and yaw rate rad/s, (T, N) each."""
-CAUSES: Mapping[str, Callable[[AnyArray, AnyArray, AnyArray], Motion]] = {
-    "velocities in km/h": lambda u, h, w: (u / 3.6, h, w),
-    "vy to the right": lambda u, h, w: (u.conj(), h, w),
-    "headings in degrees": lambda u, h, w: (u, np.deg2rad(h), w),
-    "yaw rates in degrees/s": lambda u, h, w: (u, h, np.deg2rad(w)),
-    "headings clockwise from north": lambda u, h, w: (u, np.pi / 2 - h, w),
-}
-"""Mistake -> the motion without it."""
 
 
 def plausible(field: str, values: Floats, limit: float, hint: str = "Is it in another unit?") -> None:
@@ -92,32 +82,29 @@ def unlikely(recording: Recording) -> tuple[str, ...]:
     ]
     if v2x.latency > v2x.max_age and len(recording.links):
         found.append(f"no message is used: latency is {v2x.latency:g} s, max_age {v2x.max_age:g} s")
-    if share := _contradicting(recording, lambda *motion: motion):
-        causes = [cause for cause, mended in CAUSES.items() if not _contradicting(recording, mended)]
-        why = f", as {' or '.join(causes)} would" if causes else ""
-        found.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive{why}")
+    if share := _contradicting(recording):
+        found.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive: {UNITS}")
     return tuple(UNLIKELY + text for text in found)
 
 
-def _contradicting(recording: Recording, mended: Callable[[AnyArray, AnyArray, AnyArray], Motion]) -> float:
+def _contradicting(recording: Recording) -> float:
     """Share of the pairs of fixes of the first run, `LAG` s apart, that contradict the odometry between them; 0 below
     `SHARE`, and where too little moves. Without a heading only the lengths are compared."""
-    body, dt, steps = recording.body, recording.dt, len(recording.t)
+    body, lag = recording.body, max(1, min(len(recording.t) - 1, round(LAG / recording.dt)))
     fixes, u = (values[0, ..., :2] @ [1, 1j] for values in (recording.gnss, recording.velocity))
-    none: Floats = np.zeros(u.shape)
-    u, heading, rate = mended(u, *((none, none) if body is None else (body.heading[0], body.yaw_rate[0])))
-    turned = np.cumsum(np.nan_to_num(rate), axis=0) * dt
-    path = np.cumsum(np.nan_to_num(u * np.exp(1j * (turned - rate * dt / 2))) * dt, axis=0)
-    gaps = np.cumsum(np.isnan(u), axis=0)
-    newest = np.maximum.accumulate(np.where(np.isfinite(fixes), np.arange(steps)[:, None], -1), axis=0)
-    lag = max(1, min(steps - 1, round(LAG / dt)))
-    first, last = newest[: steps - lag : lag], newest[lag::lag]
-    column = np.broadcast_to(np.arange(u.shape[1]), first.shape)
-    moved, driven = (values[last, column] - values[first, column] for values in (fixes, path))
-    turn = (heading - turned)[first, column]
-    driven *= np.exp(1j * np.where(np.isnan(turn), np.angle(moved) - np.angle(driven), turn))
+    heading: Floats = np.zeros(u.shape)
+    turned = heading
+    if body is not None:
+        heading, turned = body.heading[0], np.cumsum(np.nan_to_num(body.yaw_rate[0]), axis=0) * recording.dt
+    path = np.cumsum(np.nan_to_num(u * np.exp(1j * turned)), axis=0) * recording.dt
+    steps = np.where(np.isfinite(fixes), np.arange(len(u))[:, None], -1)
+    newest, column = np.maximum.accumulate(steps, axis=0)[::lag], np.arange(u.shape[1])
+    ends = (values[newest, column] for values in (fixes, path, np.cumsum(np.isnan(u), axis=0)))
+    moved, driven, gaps = (np.diff(values, axis=0) for values in ends)
+    turn = np.exp(1j * (heading - turned))[newest[:-1], column]
+    moved, driven = np.where(np.isnan(turn), (np.abs(moved), np.abs(driven)), (moved, driven * turn))
     far = np.fmax(np.abs(moved), np.abs(driven)) > LONG * np.hypot(*recording.sensors.fix_std[:2])
-    far &= (first >= 0) & (first < last) & (gaps[first, column] == gaps[last, column])
+    far &= (newest[:-1] >= 0) & (np.diff(newest, axis=0) > 0) & (gaps == 0)
     apart = far & (np.abs(moved - driven) > APART * (np.abs(moved) + np.abs(driven)))
     share = float(apart.sum() / max(far.sum(), 1))
     return share if share > SHARE and far.sum() > 2 else 0.0
