@@ -93,7 +93,7 @@ def test_degrees_and_float32_are_refused_and_unwrapped_headings_are_not() -> Non
     town, t = load_fleet("town10").between(0, 300), np.arange(300) / 10
     course, seen = true_heading(town), observe(town, S2, V2X(2))
     for wrong in (np.rad2deg(course), np.rad2deg((course + np.pi) % (2 * np.pi))):
-        with refused("must be in radians. Convert degrees by np.deg2rad"):
+        with refused("must be in radians.*Convert degrees by np.deg2rad"):
             replace(town, heading=wrong)
     with refused(r"relative angles.*must be within \+-12.5664"):
         replace(seen, relative=np.concatenate([seen.relative[..., :1], np.rad2deg(seen.relative[..., 1:])], axis=-1))

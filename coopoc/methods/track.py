@@ -75,11 +75,11 @@ class Track:
         egos = checked("egos", self.egos, "(E,)", (-1,), int)
         refuse("egos", egos, egos < 0, "must be >= 0", "Give columns of the recording, from 0 on.")
         self.__dict__["egos"] = tuple(egos.tolist())
-        t, x = checked("t", self.t, "(T,)", (-1,)), checked("x", self.x, "(R, T, E, 3)", (-1, -1, -1, 3))
+        x = checked("x", self.x, "(R, T, E, 3)", (-1, -1, -1, 3))
         runs, steps = x.shape[:2]
         shapes: dict[str, tuple[str, tuple[int, ...]]] = {
             "t": ("(T,)", (steps,)),
-            "x": ("(R, T, E, 3)", (runs, len(t), len(egos), 3)),
+            "x": ("(R, T, E, 3)", (runs, steps, len(egos), 3)),
             "covariance": ("(R, T, E, 3, 3)", (*x.shape, 3)),
             "received_bytes": ("(R, E)", (runs, len(egos))),
             "sent_bytes": ("(R, E)", (runs, len(egos))),
@@ -88,11 +88,11 @@ class Track:
             "heading_covariance": ("(R, T, E, 4)", (*x.shape[:3], 4)),
         }
         check_arrays(self, shapes)
-        refuse("t", t, ~np.isfinite(t), "must be finite", "Give seconds for every step.")
+        late = np.append(True, np.diff(np.nan_to_num(self.t)) > 0)[:steps] == 0
+        refuse("t", self.t, late | ~np.isfinite(self.t), "must be finite and increase", "Give seconds for every step.")
         for name in ("received_bytes", "sent_bytes"):
             moved = getattr(self, name)
             refuse(name, moved, ~(moved >= 0) | np.isinf(moved), "must be finite and >= 0", "Give 0 for none.")
-        refuse("t", t, np.append(True, np.diff(t) > 0)[: len(t)] == 0, "must increase", "Sort the steps by time.")
         self.__dict__["seconds"] = number("seconds", self.seconds)
         for name in ("notes", "ids"):
             self.__dict__[name] = texts(name, getattr(self, name))
@@ -100,12 +100,11 @@ class Track:
             columns("egos", self.egos, self.ids)
         if not isinstance(self.extras, Mapping):
             raise InputError("extras", shown(self.extras), "must be name -> (R, T, E)", "Give {} for none.")
-        by_link = None if self.neighbours is None else self.neighbours.shape[:2]
+        each, by_link = ("(R, T, E)", x.shape[:3]), dict[int, tuple[str, tuple[int, ...]]]()
+        if self.neighbours is not None:
+            by_link[2] = "(R, L)", self.neighbours.shape[:2]
         extras = {
-            name: checked(f"extras[{name}]", v, "(R, L)", by_link)
-            if np.ndim(v) == 2 and by_link
-            else checked(f"extras[{name}]", v, "(R, T, E)", x.shape[:3])
-            for name, v in self.extras.items()
+            name: checked(f"extras[{name}]", v, *by_link.get(np.ndim(v), each)) for name, v in self.extras.items()
         }
         self.__dict__["extras"] = extras
         if not np.isfinite(self.x).all():

@@ -69,7 +69,13 @@ def headings(values: Floats, velocity: Floats | None = None) -> None:
         course = np.arctan2(velocity[..., 1], velocity[..., 0])
         off = [np.abs(wrap(turn - course))[moving] for turn in (values, np.deg2rad(values))]
         wrong |= moving & bool(moving.any() and np.median(off[1]) < min(0.2, np.median(off[0])))
-    refuse("heading", values, wrong, "must be in radians", "Convert degrees by np.deg2rad.")
+    refuse(
+        "heading",
+        values,
+        wrong,
+        "must be in radians, and jump by less than two turns",
+        "Convert degrees by np.deg2rad.",
+    )
 
 
 def unlikely(recording: Recording) -> tuple[str, ...]:

@@ -109,19 +109,16 @@ class Recording:
                 raise InputError(name, given, allowed, f"Give {kind.__name__}(...).")
         ids, t, links = names(self.ids), clock(self.t), len(self.links)
         gnss = checked("gnss", self.gnss, "(R, T, N, 3)", (-1, len(t), len(ids), 3))
-        found = {
-            "ids": ids,
-            "t": t,
-            "gnss": gnss,
-            "velocity": checked("velocity", self.velocity, "(R, T, N, 3)", gnss.shape),
-            "relative": checked("relative", self.relative, "(R, L, 3)", (len(gnss), links, 3)),
-            "broadcasts": checked("broadcasts", self.broadcasts, "(T, N)", gnss.shape[1:3], bool),
-            "arrival": checked("arrival", self.arrival, "(R, L)", (len(gnss), links), int),
-            "observers": tuple(checked("observers", self.observers, "(O,)", (-1,), int).tolist()),
-            "notes": texts("notes", self.notes),
+        shapes: dict[str, tuple[str, tuple[int, ...], Any]] = {
+            "velocity": ("(R, T, N, 3)", gnss.shape, float),
+            "relative": ("(R, L, 3)", (len(gnss), links, 3), float),
+            "broadcasts": ("(T, N)", gnss.shape[1:3], bool),
+            "arrival": ("(R, L)", (len(gnss), links), int),
+            "observers": ("(O,)", (-1,), int),
         }
-        for name, value in found.items():
-            self.__dict__[name] = value
+        self.__dict__.update(ids=ids, t=t, gnss=gnss, notes=texts("notes", self.notes))
+        self.__dict__.update({name: checked(name, getattr(self, name), *shape) for name, shape in shapes.items()})
+        self.__dict__["observers"] = tuple(np.asarray(self.observers).tolist())
         check_measurements(self.gnss, self.velocity, self.relative)
         self.__dict__["landmarks"] = tuple(columns("landmarks", self.landmarks, ids))
         check_landmarks(self.landmarks, self.gnss, self.velocity)
@@ -301,17 +298,11 @@ def check_measurements(gnss: Floats, velocity: Floats, relative: Floats) -> None
     """
     if not len(gnss):
         raise InputError("gnss", "no run", "must have at least one", "Use observe(..., runs=1).")
-    for name, values, limit in (
-        ("gnss", gnss, FARTHEST),
-        ("velocity", velocity, FASTEST),
-        ("relative", relative, FARTHEST),
-    ):
+    arrays = {"gnss": (gnss, FARTHEST), "velocity": (velocity, FASTEST), "relative": (relative, FARTHEST)}
+    for name, (values, limit) in arrays.items():
         plausible(name, values, limit)
-        with np.errstate(over="ignore", invalid="ignore"):
-            finite = np.isfinite(values.sum())  # needs no array of its own; one that overflows is looked at again
-        if finite:
+        if np.isfinite(values.sum()):  # which needs no array of its own
             continue
-        refuse(name, values, np.isinf(values), "must be finite, or NaN where missing", "Replace it by NaN.")
         missing = np.isnan(values)
         if name != "relative":
             partly = missing != missing[..., :1]
@@ -319,13 +310,8 @@ def check_measurements(gnss: Floats, velocity: Floats, relative: Floats) -> None
         if name == "velocity":
             refuse(name, values, missing != missing[:1], "must be NaN in all runs or in none", "Absence is no noise.")
     radians("relative angles", relative[..., 1:])
-    refuse(
-        "relative",
-        relative[..., 0],
-        relative[..., 0] <= 0,
-        "must be a range > 0 m",
-        "Make it NaN: no direction is seen in one place.",
-    )
+    hint, ranges = "Make it NaN: no direction is seen in one place.", relative[..., 0]
+    refuse("relative", ranges, ranges <= 0, "must be a range > 0 m", hint)
 
 
 def check_landmarks(landmarks: tuple[int, ...], gnss: Floats, velocity: Floats) -> None:
