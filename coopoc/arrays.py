@@ -37,10 +37,10 @@ def frozen(values: npt.ArrayLike, dtype: Any = np.float64) -> AnyArray:
     array = np.array(given, dtype, order="C", copy=None)
     if not array.flags.aligned:
         array = array.copy()
-    if array.flags.writeable:
-        if array is given and not isinstance(values, list | tuple):
-            array = array.copy()  # the caller may go on writing to its own
-        array.flags.writeable = False
+    owners = (array, array.base) if array is given and not isinstance(values, list | tuple) else ()
+    if any(isinstance(owner, np.ndarray) and owner.flags.writeable for owner in owners):
+        array = array.copy()  # the caller may go on writing to its own, or to what it shows a part of
+    array.flags.writeable = False
     return array
 
 
@@ -231,7 +231,7 @@ def refuse(field: str, values: AnyArray, wrong: npt.ArrayLike, allowed: str, hin
     """
     if np.any(wrong):
         place = tuple(np.argwhere(wrong)[0].tolist())
-        raise InputError(f"{field}[{', '.join(map(str, place))}]", values[place], allowed, hint)
+        raise InputError(f"{field}{[*place] or ''}", values[place], allowed, hint)
 
 
 def texts(field: str, values: object) -> tuple[str, ...]:

@@ -253,7 +253,7 @@ def channel(p: Params) -> V2X:
     most = int(p.get("max_neighbours", 0))
     usual = channel_of(str(p["channel"]), most) if "channel" in p else V2X.ideal(most)
     losses = {"loss": p.get("loss"), "burst": p.get("burst"), "latency": p.get("latency_s")}
-    given: dict[str, Any] = {field: float(value) for field, value in losses.items() if value is not None}
+    given: dict[str, Any] = {field: value for field, value in losses.items() if value is not None}
     return replace(
         usual,
         radius=float(p.get("radius_m", 30.0)) or (float("inf") if is_real(str(p["data"])) else 30.0),

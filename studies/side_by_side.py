@@ -40,9 +40,11 @@ errors, errors of the heading, the start."""
 
 
 def _changed(results: Results) -> str:
-    kept = results.settings
-    differs = [f"{name} {kept[name]}" for name, usual in CONDITIONS.items() if kept[name] != usual]
-    return f"With {', '.join(differs)}." if differs else ""
+    kept, idle = results.settings, scene.idle(results)
+    changed = [name for name, usual in CONDITIONS.items() if kept[name] != usual]
+    acting, others = [f"{n} {kept[n]}" for n in changed if n not in idle], [n for n in changed if n in idle and kept[n]]
+    words = {"With": acting, "Without effect on a log:": others}
+    return " ".join(f"{word} {', '.join(names)}." for word, names in words.items() if names)
 
 
 def _table(text: str, value: str, **options: Any) -> TableView:

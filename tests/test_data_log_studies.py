@@ -19,6 +19,7 @@ from coopoc.data.log.read import read_log
 from coopoc.data.registry import load_fleet, load_log
 from coopoc.evaluate.metrics import fix_innovations, innovation_columns, normalised_innovations
 from coopoc.studies import lineup, neighbours, paths, scene
+from coopoc.study.publish import views
 from coopoc.study.report import report
 from coopoc.world.storage import digest, read_recording, save_recording
 
@@ -66,6 +67,16 @@ def test_a_unit_at_the_road_is_no_ego_and_real_data_have_no_bound(tmp_path: Path
     assert scene.egos({"data": data, "egos": "auto"}) == ("car0", "car1")
     methods = {cell.given["method"] for cell in neighbours.STUDY.override({"data": data}).cells()}
     assert "bound" not in methods >= {"kalman"}
+
+
+def test_settings_of_simulated_noise_do_nothing_on_a_log_and_the_caption_says_so(folders: Path, tmp_path: Path) -> None:
+    more = {"heading_bias_deg": 3.0, "own_share": 0.3, "spoofed_share": 0.5, "egos": "car2", "loss": 0.1}
+    settings = {**FEW, "data": str(folders / "without"), **more}
+    assert not co.run_study("side_by_side", tmp_path, settings=settings, progress=False).failed
+    (table,) = (view["caption"] for view in views(tmp_path / "side_by_side")["tables"] if view["name"] == "bytes")
+    assert "With loss 0.1, spoofed_share 0.5. Without effect on a log: own_share, heading_bias_deg." in table
+    with refused("loss = 'x': must be a number"):
+        scene.channel({**more, "data": "town10", "loss": "x"})
 
 
 def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> None:

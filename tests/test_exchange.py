@@ -1,5 +1,6 @@
 """Links and exchange of a fleet: neighbours by brute force, draws, bytes in closed form, caps and losses."""
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -115,3 +116,7 @@ def test_loss_is_that_of_the_channel(formation: Fleet) -> None:
     met = exchange(lossy, GaussianBeliefPropagation().message)
     assert (met.at_first >= 0).mean() == pytest.approx(0.7, abs=0.02)
     assert (met.both >= 0).mean() == pytest.approx(0.49, abs=0.02)
+    own = [lossy.arrival[:, lossy.links.of(column)] for column in range(len(lossy.ids))]  # all see all: one a link
+    heard = np.stack([((arrival >= 0) & (arrival < 200)).sum(axis=1) for arrival in own], axis=1)
+    word = exchange(replace(lossy, v2x=V2X(max_neighbours=10, overhead=7)), Message("word", 25))
+    assert (word.received_bytes == 107 * heard).all()

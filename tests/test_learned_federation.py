@@ -372,6 +372,12 @@ def test_the_guard_remembers_what_is_usual() -> None:
     assert screen(theta, {"a": honest, "b": wrong})[0] == {}
     assert set(screen(theta, {"a": honest, "b": wrong}, usual=10.0)[0]) == {"b"}
     assert screen(theta, {}, usual=10.0) == ({}, 10.0)
+    for start, most in ((torch.full((4,), 3.0), 6.0), (torch.full((4,), 0.1), 1.0)):  # at first |theta|, at least 1
+        assert screen(start, {"a": start + 0.499 * most}) == ({}, pytest.approx(0.998 * most))
+        assert set(screen(start, {"a": start + 0.501 * most})[0]) == {"a"}
+    for far, out in ((199.0, set()), (201.0, {"c"})):  # of three answers the median decides, 2
+        steps = {"a": 1.0, "b": 2.0, "c": far}
+        assert set(screen(theta[:1], {name: theta[:1] + step for name, step in steps.items()})[0]) == out
 
 
 def test_the_guard_lets_a_change_in_where_most_changed_nothing() -> None:

@@ -121,7 +121,7 @@ def test_the_rounds_are_those_of_federate(rule: str) -> None:
 
 
 def sends(name: str, weights: Tensor, **changes: object) -> Node:
-    """A node that answers with these weights, and with a record, a key and a value of its own."""
+    """A node that answers with these weights, and with values of its own."""
     from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 
     def node(message: Message) -> Message:
@@ -129,7 +129,9 @@ def sends(name: str, weights: Tensor, **changes: object) -> Node:
         metrics: dict[str, Any] = {"num-examples": 3, loss: 1.0}
         about: dict[str, Any] = {"name": name, "version": version("coopoc")}
         for key, value in changes.items():
-            (metrics if key.replace("_", "-") in metrics else about)[key.replace("_", "-")] = value
+            for entries in (metrics, about):
+                if (entry := key.replace("_", "-")) in entries:
+                    entries[entry] = value
         content = RecordDict({"metrics": MetricRecord(metrics), "client": ConfigRecord(about)})
         if message.metadata.message_type == "train":
             content["arrays"] = ArrayRecord({"theta": Array(weights.numpy())})
@@ -150,7 +152,7 @@ def test_bad_answers_are_rejected_and_training_goes_on() -> None:
         5: sends("long", torch.cat([theta, theta])),
         6: sends("far", theta + 1e4),
         7: sends("double", theta.double()),
-        8: sends("b", theta),
+        8: sends(8, theta),  # type: ignore[arg-type]
         9: lambda message: Message(RecordDict({"junk": ConfigRecord({"a": 1})}), reply_to=message),
         10: lambda message: Message(Error(0, "out of\nmemory"), reply_to=message),
         11: sends("", theta),
@@ -170,16 +172,86 @@ def test_bad_answers_are_rejected_and_training_goes_on() -> None:
             "weights of shape",
             "changes the weights",
             "weights in float64, must be float32",
-            "claims the name b of another node",
-            "malformed answer (KeyError)",
+            "malformed answer (TypeError)",
+            "other records than were asked for",
             "out of memory",
             "1 to 200 printable",
             "a training-loss of -1 m^2, must be in [0, 1e+12]",
             "number of pieces",
             "another version",
-            "claims the name server",
+            "or the server's",
         ):
-            assert any(reason in found for found in row.rejected.values()), reason
+            assert any(reason in found for found in row.rejected.values()), (reason, row.rejected)
+
+
+def test_an_extra_record_or_array_is_rejected_and_ends_nothing() -> None:
+    """Flower's own strategies raise InconsistentMessageReplies for all where one reply holds more than the others."""
+    from flwr.app import Array, ArrayRecord, ConfigRecord
+
+    job, fleet = job_of(TINY), drives(3)
+
+    def more(change: Callable[[Any], object]) -> Node:
+        def node(message: Message) -> Message:
+            reply = honest(job, fleet, 2)(message)
+            assert reply is not None
+            change(reply.content)
+            return reply
+
+        return node
+
+    array = Array(np.ones(1, np.float32))
+    changes: list[Callable[[Any], object]] = [
+        lambda content: content["arrays"].update(extra=array) if "arrays" in content else None,
+        lambda content: content.update(more=ArrayRecord({"theta": array})),
+        lambda content: content.update(more=ConfigRecord({"a": 1})),
+        lambda content: content["client"].update(more=1),
+        lambda content: content["metrics"].update(more=1.0),
+    ]
+    for change in changes:
+        rows, _ = deployed(job, {0: honest(job, fleet, 0), 1: honest(job, fleet, 1), 2: more(change)})
+        assert [sorted(row.training_loss) for row in rows[1:]] == [["a", "b"]] * 3
+        assert set(rows[1].rejected.values()) == {"other records than were asked for"}
+
+
+def test_no_node_answers_in_place_of_another() -> None:
+    """Every honest vehicle takes part, whoever claims its name, when, and with whatever number of its node."""
+    job, fleet, known = job_of(TINY), drives(3), dict[int, str]()
+    theta = in_process(job, fleet).history[0].weights
+    late: Node = lambda message: None if message.content["config"]["server-round"] == 1 else sends("a", theta)(message)  # noqa: E731
+    nodes = {i + 10: honest(job, fleet, i) for i in range(3)} | {8: late, 11: sends("a", theta)}
+    rows: list[Row] = []
+    rounds(room(nodes), job, 3, 5.0, rows.append, known)
+    assert known == {8: "a, node 8", 10: "a", 11: "a, node 11", 12: "c"}
+    assert all(not row.rejected and {"a", "c"} <= set(row.training_loss) for row in rows[1:])
+    names = iter("abab" * 9)
+    two = {1: lambda message: sends(next(names), theta)(message), 2: honest(job, fleet, 2)}
+    assert "calls itself b" in str(deployed(job, two)[0][2].rejected)
+
+
+def test_a_claimed_number_of_pieces_counts_ten_times_the_median_at_most() -> None:
+    job, fleet = job_of(TINY), drives(3)
+    theta = in_process(job, fleet).history[0].weights
+    rows, found = deployed(
+        job, {i: honest(job, fleet, i) for i in range(3)} | {3: sends("d", theta, num_examples=2**30)}
+    )
+    pieces = rows[1].pieces
+    assert pieces["d"] == 10 * int(np.median([pieces["a"], pieces["b"], pieces["c"], 2**30]))
+    assert found.history[1].note == f"d claims {2**30} pieces and counts with {pieces['d']}"
+
+
+@pytest.mark.parametrize(("aggregate", "least"), [("krum", 5), ("trimmed_mean", 4)])
+def test_rules_take_the_same_number_of_clients_in_both_paths(aggregate: str, least: int) -> None:
+    """Refused at the start; where too few answers are accepted later, the weights stay, and the round says so."""
+    job, fleet = job_of(TINY | {"aggregate": aggregate}), drives(least)
+    few = {i: honest(job, fleet, i) for i in range(least - 1)}
+    with refused(f"takes at least {least}"):
+        deployed(job, few)
+    with refused(f"takes at least {least}"):
+        in_process(job, drives(least - 1))
+    theta = in_process(job, fleet).history[0].weights
+    rows, found = deployed(job, few | {least: sends("bad", theta * torch.nan)})
+    assert all(torch.equal(row.weights, theta) for row in rows)
+    assert "weights unchanged" in found.history[1].note
 
 
 def test_a_silent_client_is_absent_and_welcome_back() -> None:
@@ -319,3 +391,17 @@ def test_train_with_flower_is_train(tmp_path: Path) -> None:
     again = train(job, load_fleet(tmp_path / "two.csv"), tmp_path / "weights")
     assert path.stat().st_mtime_ns == stamp
     assert list(again) == [path.stem]
+
+
+def test_a_new_run_keeps_the_names_of_the_nodes(tmp_path: Path) -> None:
+    """They are in the card of the checkpoint that the killed server left."""
+    from flwr.app import Context, RecordDict
+
+    from coopoc.learned.flower.server import configured
+
+    config, fleet = TINY | {"nodes": 1, "timeout": 5.0, "out": str(tmp_path / "net.safetensors")}, drives(1)
+    job = job_of(config)
+    theta = in_process(job, fleet).history[0].weights
+    for nodes in ({9: honest(job, fleet, 0)}, {8: sends("a", theta), 9: honest(job, fleet, 0)}):
+        configured(room(nodes), Context(1, 1, {}, RecordDict(), config))
+    assert load(tmp_path / "net.safetensors").card["nodes"] == {"9": "a", "8": "a, node 8"}

@@ -56,7 +56,7 @@ def test_an_attack_moves_the_fixes_of_some_by_a_constant(crossing: Fleet, clean:
     [
         ({"attack": 1.2}, "share"),
         ({"attack": 0.1, "seed": -1}, "seed"),
-        ({"attack": 0.1, "honest": ["missing"]}, "egos"),
+        ({"attack": 0.1, "honest": ["missing"]}, "honest"),
         ({"attack": 0.1, "told": 1}, "told"),
         ({"offset": (9.0, 5.0)}, "offset"),
         ({"offset": 3.0}, "offset"),

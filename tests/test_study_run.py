@@ -61,6 +61,18 @@ def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study: Study, 
     assert set(views(tmp_path / "small")["missing"]) == {"rt_le", "findings"}
 
 
+def test_a_view_that_fails_is_raised_and_named_beside_the_others(study: Study, tmp_path: Path) -> None:
+    def broken(results: object) -> None:
+        raise ZeroDivisionError("of the study")
+
+    wrong = replace(study, figures={"broken": broken, **study.figures})
+    with pytest.raises(ZeroDivisionError, match="of the study"):
+        run_study(wrong, tmp_path, settings={"max_neighbours": 0, "method": "kalman"}, progress=False)
+    found = views(tmp_path / "small")
+    assert found["missing"] == {"broken": "ZeroDivisionError: of the study"}
+    assert len(found["tables"]) == len(study.tables)
+
+
 def test_a_worker_that_is_killed_is_an_error_and_the_run_resumes(study: Study, tmp_path: Path) -> None:
     trouble = tmp_path / "trouble"
     trouble.write_text("kill")

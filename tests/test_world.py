@@ -1,5 +1,6 @@
 """The world: fleets that cannot be used, noise keys, links, messages."""
 
+import re
 import zlib
 from dataclasses import replace
 
@@ -8,7 +9,19 @@ import pytest
 from conftest import refused
 from scipy import stats
 
-from coopoc import V2X, Fleet, InputError, Sensors, observe
+from coopoc import (
+    V2X,
+    Body,
+    Fleet,
+    InputError,
+    JointFilter,
+    Kalman,
+    OwnMeasurement,
+    PoseFilter,
+    Sensors,
+    load_fleet,
+    observe,
+)
 from coopoc.world.channels import lost
 from coopoc.world.inbox import inbox
 from coopoc.world.links import to_vector, vector_cov
@@ -55,14 +68,62 @@ def test_unknown_vehicle_lists_the_known(crossing: Fleet) -> None:
         (lambda: Sensors(gnss_std=(1, -1, 1)), "gnss_std"),
         (lambda: Sensors(gnss_std=3.5), "gnss_std = 3.5: must be 3 numbers"),  # type: ignore[arg-type]
         (lambda: Sensors(gnss_bias=(1.0, 0.5)), "low <= high"),
-        (lambda: Sensors(azimuth_std=4.0), "radians"),
+        (lambda: Sensors(azimuth_std=4.0), "0..pi rad"),
         (lambda: Sensors(gnss_bias_mode="daily"), "gnss_bias_mode"),
         (lambda: Sensors(velocity_std_ratio=float("nan")), "velocity_std_ratio"),
+        (lambda: Sensors(velocity_std_ratio=15), "velocity_std_ratio = 15: must be in .0, 1., 0.15 for 15 %"),
+        (lambda: PoseFilter("solo", assumed=S2).start(0.1, np.array([0, 0, 0, 90.0])), "begin.0. = 90"),
     ],
 )
 def test_bad_configuration_is_named(build, words: str) -> None:
     with refused(words):
         build()
+
+
+def test_float32_is_refused_and_unwrapped_headings_are_not() -> None:
+    """Two vehicles that circle for nearly five turns; degrees are refused with all other mistakes (test_misuse)."""
+    t = np.arange(300) / 10
+    turn = np.stack([t, -t], axis=1)
+    circles = np.stack([9 * np.sin(turn), -9 * np.cos(turn), 0 * turn], axis=2)
+    fleet = Fleet(("a", "b"), t, circles, np.gradient(circles, 0.1, axis=0), heading=turn + np.array([0, np.pi]))
+    with refused(r"position.*float32, which are 0.5 m apart.*Subtract a local origin"):
+        replace(fleet, position=(circles + np.array([5e5, 5.8e6, 0])).astype(np.float32))
+    late = observe(fleet, S2, V2X(2), frame="body").between(200, 300)
+    body = late.body
+    assert body is not None
+    unwrapped = replace(late, body=Body(body.yaw_rate, np.unwrap(body.heading, axis=1) + 12 * np.pi))
+    assert not late.doubts + unwrapped.doubts
+    stream = PoseFilter("solo", assumed=S2).start(0.1)
+    for heading, fix in zip(t.tolist(), circles[:, 0], strict=True):
+        stream.step(OwnMeasurement([9.0, 0.0, 0.0], 1.0, fix, heading))
+    with refused("heading = 90.0: must be within"):
+        stream.step(OwnMeasurement([9.0, 0.0, 0.0], 1.0, heading=90.0))
+
+
+def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track() -> None:
+    town = load_fleet("town10").between(0, 600)
+    world, body = (observe(town, S2, V2X(2), frame=frame, observers=[8]) for frame in ("world", "body"))
+    for right in (world, body, observe(town, replace(S2, heading_std=0.1, yaw_rate_bias_std=0.02), frame="body")):
+        assert not right.doubts
+    own = body.body
+    assert own is not None
+    motions = r"contradict each other in \d+ % of the drive: velocities are in m/s"
+    wrong = [
+        (motions, replace(world, velocity=3.6 * world.velocity)),
+        (motions, replace(world, velocity=world.velocity * [1, -1, 1])),
+        (motions, replace(body, body=Body(own.yaw_rate, np.pi / 2 - own.heading))),
+        (motions, replace(body, body=Body(np.clip(np.rad2deg(own.yaw_rate), -35, 35), own.heading))),
+        (motions, replace(body, velocity=3.6 * body.velocity, body=Body(own.yaw_rate, np.nan * own.heading))),
+        ("latency is 20 s, max_age 1 s", observe(town, S2, V2X(2, latency=20.0), observers=[8])),
+        ("azimuth_std is 2 rad, which is 115°", replace(world, sensors=replace(S2, azimuth_std=2.0))),
+    ]
+    for note, recording in wrong:
+        (doubt,) = recording.doubts
+        assert re.search(note, doubt)
+        method = JointFilter() if recording.body is None else PoseFilter("solo", begin=np.zeros((60, 4)))
+        assert {*recording.notes} & {*method(recording, [8]).notes} == {doubt}
+    mended = replace(recording, sensors=S2)
+    assert not (*mended.notes, *Kalman()(mended, [8]).notes)
 
 
 def test_zero_noise_may_act_but_not_be_assumed(crossing: Fleet) -> None:

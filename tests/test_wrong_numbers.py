@@ -2,6 +2,7 @@
 that are none, cooperation that changes nothing."""
 
 import io
+import tracemalloc
 import zipfile
 from collections.abc import Callable
 from contextlib import nullcontext
@@ -304,10 +305,10 @@ def test_plausible_limits_hold_where_a_noun_is_made() -> None:
         replace(FLEET, ids=("a", "b\r=1+1"))
 
 
-def header(shape: tuple[int, ...]) -> bytes:
+def header(shape: tuple[int, ...], dtype: str = "<f8") -> bytes:
     """An array of that shape by its header, without its numbers."""
     file = io.BytesIO()
-    np.lib.format.write_array_header_1_0(file, {"descr": "<f8", "fortran_order": False, "shape": shape})
+    np.lib.format.write_array_header_1_0(file, {"descr": dtype, "fortran_order": False, "shape": shape})
     return file.getvalue()
 
 
@@ -323,7 +324,7 @@ def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes, monkey
     with zipfile.ZipFile(tmp_path / "good.npz") as good, zipfile.ZipFile(tmp_path / "bad.npz", "w") as bad:
         for name in good.namelist():
             bad.writestr(name, content if name == "relative.npy" else good.read(name))
-    with refused(r"bad.npz = (arrays of shapes|.'EOF).*must be a recording"):
+    with refused(r"bad.npz = (an array relative of shape|.'EOF).*must be a recording"):
         read_recording(tmp_path / "bad.npz")
     (tmp_path / "bad.npz").write_bytes((tmp_path / "good.npz").read_bytes()[:-9])
     with refused(r"bad.npz = .*must be a recording in \.npz"):
@@ -331,6 +332,34 @@ def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes, monkey
     monkeypatch.setattr("coopoc.world.storage.LARGEST", 9)
     with refused("more than 2 GB"):
         read_recording(tmp_path / "good.npz")
+
+
+@pytest.mark.parametrize(
+    ("member", "content"),
+    [
+        ("zz", header((), "|V1500000000")),
+        ("coopoc_recording", header((), "<U400000000")),
+        ("t", header((80,), "|V90000000")),
+        ("gnss", header((3, 80, 2, 3))),
+    ],
+)
+def test_a_small_file_takes_no_memory(tmp_path: Path, member: str, content: bytes) -> None:
+    """Measured by tracemalloc: a file of some kB whose headers claim GB, or with a member that no recording has."""
+    save_recording(SEEN, tmp_path / "good.npz")
+    with zipfile.ZipFile(tmp_path / "good.npz") as good:
+        parts = {name: good.read(name) for name in good.namelist()} | {f"{member}.npy": content}
+    with zipfile.ZipFile(tmp_path / "bad.npz", "w", zipfile.ZIP_DEFLATED) as bad:
+        for name, part in parts.items():
+            bad.writestr(name, part)
+        if member == "gnss":  # in the list of members it has the size that its header claims, and more
+            bad.getinfo("gnss.npy").file_size = 2 * 10**9
+    tracemalloc.start()
+    try:
+        with refused(f"an array {member} of shape|more than 1032 times"):
+            read_recording(tmp_path / "bad.npz")
+        assert tracemalloc.get_traced_memory()[1] < 2e7
+    finally:
+        tracemalloc.stop()
 
 
 def test_cooperation_that_changes_nothing_is_said_below_the_table() -> None:

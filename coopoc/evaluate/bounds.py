@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from tqdm import tqdm
 
-from ..arrays import Bools, Floats, Ints, checked, instance
+from ..arrays import Bools, Floats, Ints, checked, instance, refuse
 from ..errors import InputError
 from ..kernels.stars.messages import FORGOTTEN
 from ..world.body_frames import body_motion, midway, true_heading, turned
@@ -161,8 +161,14 @@ def pose_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, landma
 
 
 def bound_rt_le(cov: Floats) -> float:
-    """RT-LE that belongs to a bound (T, 3, 3), sqrt(mean_t trace P_t), m."""
-    return float(np.sqrt(np.trace(checked("cov", cov, "(T, 3, 3)", (-1, 3, 3)), axis1=-2, axis2=-1).mean()))
+    """RT-LE that belongs to a bound (T, 3, 3), sqrt(mean_t trace P_t), m.
+
+    Raises:
+        InputError: another shape, or numbers that are not finite.
+    """
+    cov = checked("cov", cov, "(T, 3, 3)", (-1, 3, 3))
+    refuse("cov", cov, ~np.isfinite(cov), "must be finite", "Take the steps at which the ego is there.")
+    return float(np.sqrt(np.trace(cov, axis1=-2, axis2=-1).mean()))
 
 
 def checked_noise(fleet: Fleet, sensors: Sensors, v2x: V2X | None, landmarks: bool = False) -> V2X:

@@ -10,9 +10,9 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked, instance, number, one_of, refuse
+from ..arrays import Floats, checked, instance, number, one_of, refuse, texts
 from ..errors import InputError
-from ..methods.track import Track
+from ..methods.track import Track, of_recording
 from ..short_repr import short_repr
 from ..world.recording import Recording
 from ..world.v2x import Message
@@ -51,9 +51,13 @@ class Ledger:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
+        for name in ("names", "servers"):
+            self.__dict__[name] = texts(name, getattr(self, name))
         for name in ("seconds", "sent", "received"):
             values = checked(name, getattr(self, name))
-            refuse(name, values, ~(values >= 0), "must be >= 0", "Give bytes and seconds.")
+            refuse(
+                name, values, ~(values >= 0) | np.isinf(values), "must be finite and >= 0", "Give bytes and seconds."
+            )
             self.__dict__[name] = values
         shape = (2, 2, *self.sent.shape[2:3], len(self.names))
         for name, wanted in (("seconds", shape[3:]), ("sent", shape), ("received", shape)):
@@ -124,12 +128,16 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
         recording: that the track is of.
         message: of the method.
 
+    Raises:
+        InputError: a track of another recording.
+
     >>> from coopoc import Fleet, GNSS, Sensors, observe
     >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
     >>> seen = observe(fleet, Sensors())
     >>> of_track(GNSS()(seen, ["a"]), seen, GNSS().message).rate()
     0.0
     """
+    of_recording(track, recording)
     overhead, vehicles = recording.v2x.overhead, len(track.egos)
     size, moved = message.size(overhead), np.zeros((2, 2, 2, len(track.received_bytes), vehicles))
     for k, on_air in enumerate((track.sent_bytes, track.received_bytes)):

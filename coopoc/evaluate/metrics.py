@@ -12,7 +12,7 @@ from scipy.spatial.transform import Rotation
 from ..arrays import Floats, checked, instance, number, refuse
 from ..errors import InputError
 from ..kernels.covariances import normalised
-from ..methods.track import UNSOUND, Track
+from ..methods.track import UNSOUND, Track, of_recording
 from ..plugins import find
 from ..world.body_frames import true_heading, turned
 from ..world.fleet import Fleet
@@ -65,6 +65,7 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
 
     NaN where an ego has no neighbour or the method does not estimate them.
     """
+    of_recording(track, recording)
     fleet.require(recording.ids, recording.t)
     if track.neighbours is None:
         return np.full((len(track.x), len(track.egos)), np.nan)
@@ -245,8 +246,8 @@ def fix_innovations(track: Track, recording: Recording) -> Floats:
     >>> fix_innovations(GNSS()(seen), seen).shape
     (5, 2, 1, 3)
     """
-    egos = list(track.egos)
-    found = np.full(track.x.shape, np.nan)
+    of_recording(track, recording)
+    egos, found = list(track.egos), np.full(track.x.shape, np.nan)
     moved = recording.dt * turned(recording.velocity[:, 1:, egos], _halfway(track, recording))
     found[:, 1:] = recording.gnss[:, 1:, egos] - (track.x[:, :-1] + moved)
     return found

@@ -69,7 +69,7 @@ def follow_egos(
                 for name, values in found.extras.items():
                     extras.setdefault(name, []).append(values)
                 bar.update(1 if isinstance(found.step, int) else len(recording.t[found.step]))
-    notes = (*notes, *contradicted(x, recording, columns))
+    notes = (*notes, *contradicted(x, recording, columns), *recording.doubts)
     for array in (x, cov, neighbours):
         array.flags.writeable = False  # so that the Track need not copy them
     seconds = clock() - began

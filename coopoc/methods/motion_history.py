@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ..arrays import Floats, number, plain
 from ..errors import InputError, shown
 from ..kernels.dead_reckoning import ROUNDING, SQUARE, push, since
+from ..world.plausible import FARTHEST
 
 
 class MotionHistory:
@@ -52,7 +53,14 @@ class MotionHistory:
 
     def check(self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float) -> None:
         """InputError if a stream cannot take this step."""
-        number("dt", dt, sys.float_info.min, allowed="finite and > 0", hint="Give the seconds since the last step.")
+        number(
+            "dt",
+            dt,
+            sys.float_info.min,
+            FARTHEST,
+            allowed="finite and > 0",
+            hint="Give the seconds since the last step.",
+        )
         three("velocity", velocity)
         if np.isnan(fix_or_none(gnss)).all():
             return
@@ -69,6 +77,8 @@ class MotionHistory:
             if not simple or np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
                 self.check(gnss, velocity, dt, fix_age)
             given[:3], given[3:6], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
+            if any(abs(number) > FARTHEST for number in given.tolist()):
+                self.check(gnss, velocity, dt, fix_age)
         except Exception:  # a class from elsewhere may raise anything
             self.check(gnss, velocity, dt, fix_age)
             raise
@@ -78,8 +88,8 @@ PLAIN = frozenset({list, tuple, np.ndarray, type(None)})
 """What a stream takes as it is; anything else, such as an array with a mask, is checked first."""
 
 
-def three(field: str, value: npt.ArrayLike) -> Floats:
-    """(3,) finite numbers; InputError naming the field if they are not.
+def three(field: str, value: npt.ArrayLike, limit: float = FARTHEST) -> Floats:
+    """(3,) numbers within the limit; InputError naming the field if they are not.
 
     >>> three("velocity", [1, 2])
     Traceback (most recent call last):
@@ -87,7 +97,7 @@ def three(field: str, value: npt.ArrayLike) -> Floats:
     coopoc.errors.InputError: velocity = [1, 2]: must be three finite numbers. Give east, north, up.
     """
     array = numbers(value)
-    if array.shape != (3,) or not np.isfinite(array).all():
+    if array.shape != (3,) or not (np.abs(array) <= limit).all():
         raise InputError(field, value, "must be three finite numbers", "Give east, north, up.")
     return array
 

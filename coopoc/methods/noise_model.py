@@ -8,8 +8,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..arrays import Floats, Ints, check_texts, checked, instance, number, texts
-from ..errors import InputError, suggestion
+from ..arrays import Floats, Ints, check_texts, checked, instance, number, refuse, texts
+from ..errors import InputError, shown, suggestion
 from ..kernels.motion import HELD, RECEIVED, MotionNoise, own_variances, process_variances
 from ..short_repr import short_repr
 from ..world.fleet import Fleet
@@ -55,6 +55,12 @@ class NoiseModel:
             instance("sensors", self.sensors, Sensors)
         if self.fleet is not None:
             instance("fleet", self.fleet, Fleet)
+        if self.process_std is None and self.sensors is None:
+            hint = "Give process_std=(1.0, 1.0, 1.0), or sensors=Sensors(), whose noise follows the speed."
+            raise InputError("process_std", None, "must be given where there are no sensors", hint)
+        compass = checked("compass", self.compass, "(2,)", (2,))
+        refuse("compass", compass, ~((compass >= 0) & (compass <= np.pi)), "must be in 0..pi rad", "Use np.deg2rad.")
+        self.__dict__["compass"] = tuple(compass.tolist())
         for field in ("process_std", "gnss_std"):
             if field == "gnss_std" or self.process_std is not None:
                 value = checked(field, getattr(self, field), "(3,)", (3,))
@@ -188,13 +194,13 @@ def resolve(noise_model: NoiseModel | str, recording: Recording | None, relative
     """
     if isinstance(noise_model, NoiseModel):
         return _resolvable(_with_range_floor(noise_model, recording)) if relative else noise_model
-    if noise_model == "identity":
+    if (name := noise_model if isinstance(noise_model, str) else "") == "identity":
         return NoiseModel.identity()
-    if noise_model == "nominal":
+    if name == "nominal":
         return resolve(NoiseModel.nominal(check_recording(recording).sensors), recording, relative)
     raise InputError(
         "noise_model",
-        repr(noise_model),
+        shown(noise_model),
         "must be 'identity', 'nominal' or a NoiseModel",
         suggestion(
             noise_model,

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, Ints, instance
+from ..arrays import Floats, Ints, instance, refuse
 from ..errors import InputError
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.geometry import components
@@ -49,6 +49,7 @@ from ..kernels.stars.streams import (
     stream_step,
 )
 from ..world.links import told
+from ..world.plausible import FARTHEST, radians
 from .cooperative_filter import Broadcast, CooperativeFilter, model_of, priors_of
 from .egos import relative_noise
 from .joint_filter import JointFilter
@@ -89,13 +90,15 @@ class RelativeMeasurement:
     def __post_init__(self) -> None:
         row = np.full(WIDTH, np.nan)
         relative, named = numbers(self.relative), isinstance(self.id, str) and self.id
-        if relative.shape != (3,) or not named or not (0.0 < relative[0] < math.inf or math.isnan(relative[0])):
+        if relative.shape != (3,) or not named or not (0.0 < relative[0] < FARTHEST or math.isnan(relative[0])):
             text = "must have a name and three numbers, the range first and > 0"
             raise InputError("relative", (self.id, self.relative), text, "Give NaN for what was not measured.")
+        radians("relative angles", relative[1:])
         row[:AGE], row[AGE] = components(told(relative)[None, None], FIRST)[0, 0], seconds("age", self.age)
         row[SOLO:SOLO_VARIANCE] = fix_or_none(self.gnss, "neighbour's gnss")
         if self.variance is not None:
-            row[SOLO_VARIANCE:ODOMETER] = three("neighbour's variance", self.variance)
+            row[SOLO_VARIANCE:ODOMETER] = variance = three("neighbour's variance", self.variance, FARTHEST**2)
+            refuse("neighbour's variance", variance, variance <= 0, "must be > 0 m^2", "Send stream.broadcast.")
         if self.odometer is not None:
             row[ODOMETER:SPEED] = three("neighbour's odometer", self.odometer)
         if self.velocity is not None:

@@ -8,10 +8,11 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Limits, check_arrays, check_fields, checked, number, texts
+from ..arrays import Bools, Floats, Limits, check_arrays, check_fields, checked, instance, number, refuse, texts
 from ..errors import InputError, shown
 from ..kernels.compiling.waiting import clock
 from ..short_repr import short_repr
+from ..world.fleet import columns, same_drive
 from ..world.long_table import long_table
 from ..world.recording import Recording, Vehicles
 from ..world.sensors import Sensors
@@ -74,12 +75,13 @@ class Track:
 
     def __post_init__(self) -> None:
         egos = checked("egos", self.egos, "(E,)", (-1,), int)
+        refuse("egos", egos, egos < 0, "must be >= 0", "Give columns of the recording, from 0 on.")
         self.__dict__["egos"] = tuple(egos.tolist())
-        t, x = checked("t", self.t, "(T,)", (-1,)), checked("x", self.x, "(R, T, E, 3)", (-1, -1, -1, 3))
+        x = checked("x", self.x, "(R, T, E, 3)", (-1, -1, -1, 3))
         runs, steps = x.shape[:2]
         shapes: dict[str, tuple[str, tuple[int, ...]]] = {
             "t": ("(T,)", (steps,)),
-            "x": ("(R, T, E, 3)", (runs, len(t), len(egos), 3)),
+            "x": ("(R, T, E, 3)", (runs, steps, len(egos), 3)),
             "covariance": ("(R, T, E, 3, 3)", (*x.shape, 3)),
             "received_bytes": ("(R, E)", (runs, len(egos))),
             "sent_bytes": ("(R, E)", (runs, len(egos))),
@@ -88,17 +90,23 @@ class Track:
             "heading_covariance": ("(R, T, E, 4)", (*x.shape[:3], 4)),
         }
         check_arrays(self, shapes)
+        late = np.append(True, np.diff(np.nan_to_num(self.t)) > 0)[:steps] == 0
+        refuse("t", self.t, late | ~np.isfinite(self.t), "must be finite and increase", "Give seconds for every step.")
+        for name in ("received_bytes", "sent_bytes"):
+            moved = getattr(self, name)
+            refuse(name, moved, ~(moved >= 0) | np.isinf(moved), "must be finite and >= 0", "Give 0 for none.")
         self.__dict__["seconds"] = number("seconds", self.seconds)
         for name in ("notes", "ids"):
             self.__dict__[name] = texts(name, getattr(self, name))
+        if self.ids:
+            columns("egos", self.egos, self.ids)
         if not isinstance(self.extras, Mapping):
             raise InputError("extras", shown(self.extras), "must be name -> (R, T, E)", "Give {} for none.")
-        by_link = None if self.neighbours is None else self.neighbours.shape[:2]
+        each, by_link = ("(R, T, E)", x.shape[:3]), dict[int, tuple[str, tuple[int, ...]]]()
+        if self.neighbours is not None:
+            by_link[2] = "(R, L)", self.neighbours.shape[:2]
         extras = {
-            name: checked(f"extras[{name}]", v, "(R, L)", by_link)
-            if np.ndim(v) == 2 and by_link
-            else checked(f"extras[{name}]", v, "(R, T, E)", x.shape[:3])
-            for name, v in self.extras.items()
+            name: checked(f"extras[{name}]", v, *by_link.get(np.ndim(v), each)) for name, v in self.extras.items()
         }
         self.__dict__["extras"] = extras
         if self.absent is not None:
@@ -151,6 +159,15 @@ class Track:
             self.__dict__["notes"] = (*self.notes, note)
 
 
+def of_recording(track: Track, recording: Recording) -> None:
+    """InputError unless a track is one of this recording: of its runs, times and vehicles."""
+    recording = instance("recording", recording, Recording, "The track stands before its recording.")
+    same_drive(recording, instance("track", track, Track).ids or recording.ids, track.t)
+    columns("egos", track.egos, recording.ids)
+    if len(track.x) != recording.runs:
+        raise InputError("track", f"{len(track.x)} runs", f"must have {recording.runs}", "Take recording.of_runs(...).")
+
+
 FAR = 100.0
 """Standard deviations (norm of that of the fixes) between an estimate and a fix, beyond which a method is lost."""
 
@@ -181,7 +198,7 @@ def silent_track(
 ) -> Track:
     """Track of a method that receives and sends nothing."""
     none = np.zeros((recording.runs, len(columns)))
-    took = clock() - began
+    took, notes = clock() - began, notes + recording.doubts
     return Track(recording.t, tuple(columns), x, cov, none, none, took, notes=notes, ids=recording.ids, **more)
 
 

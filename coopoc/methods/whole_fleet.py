@@ -108,7 +108,7 @@ def fleet_track(
         met.received_bytes[:, columns],
         met.sent_bytes[:, columns],
         clock() - began,
-        notes=model.notes + answer.notes + contradicted(x, recording, columns),
+        notes=model.notes + answer.notes + contradicted(x, recording, columns) + recording.doubts,
         ids=recording.ids,
     )
 

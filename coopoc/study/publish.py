@@ -32,8 +32,8 @@ _FIELDS = {
 def publish(study: Study, results: Results, folder: str | Path, progress: bool = True) -> None:
     """Write results.parquet, tables/*.{md,csv,tex,html}, figures/*.{pdf,png,svg} and views.json into a folder.
 
-    Views of an earlier run that this one does not make are removed. If cells have failed, a view that cannot be made
-    without them is named with its reason; otherwise its error is the study's own and is raised.
+    Views of an earlier run that this one does not make are removed. A view that cannot be made is named with its
+    reason; where no cell failed, the error is the study's own and is raised once all others are written.
 
     Args:
         study: whose views are made.
@@ -43,15 +43,14 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
     """
     folder = given_path(folder)
     results.to_parquet(folder / "results.parquet")
-    missing: dict[str, str] = {}
+    missing, errors = dict[str, str](), list[Exception]()
 
     def made(name: str, view: Callable[[Results], Any] | None) -> Any:
         try:
             return view(results) if view else None
         except Exception as error:
-            if not results.failed:
-                raise
             missing[name] = f"{type(error).__name__}: {error}"
+            errors.append(error)
             return None
 
     shown: dict[str, list[dict[str, Any]]] = {"tables": [], "figures": []}
@@ -84,6 +83,8 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
         "limitations": list(study.limitations),
     }
     store.write(folder / VIEWS, json.dumps(content, indent=1, default=_data, ensure_ascii=False) + "\n")
+    if errors and not results.failed:
+        raise errors[0]
 
 
 def views(folder: str | Path) -> Mapping[str, Any]:

@@ -6,32 +6,18 @@ import hashlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Bools, Floats, check_arrays, check_texts, checked, listed, number, refuse
+from ..arrays import Bools, Floats, check_arrays, check_texts, checked, listed, number
 from ..errors import InputError, shown, unknown
 from .long_table import long_table
+from .plausible import FARTHEST, FASTEST, headings, plausible
 
 if TYPE_CHECKING:
     import pandas as pd
-
-FARTHEST, FASTEST = 1e8, 1e4
-"""m and m/s: what lies beyond was not measured on Earth, and its square leaves no digits to what stands beside it."""
-
-
-def plausible(field: str, values: Floats, limit: float) -> None:
-    """InputError for the first number beyond the limit; NaN stands for what is missing.
-
-    >>> plausible("velocity", np.array([3.0, -1e9]), FASTEST)
-    Traceback (most recent call last):
-    coopoc.errors.InputError: velocity[1] = -1000000000.0: must be within +-10000 in SI units. Is it in another unit?
-    """
-    if values.size and max(np.fmax.reduce(values, axis=None), -np.fmin.reduce(values, axis=None)) > limit:
-        wrong = np.abs(values) > limit
-        refuse(field, values, wrong, f"must be within +-{limit:g} in SI units", "Is it in another unit?")
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,8 +61,7 @@ class Fleet:
         positions = "(T, N, 3)", shape
         check_arrays(self, {"position": positions, "velocity": positions, "heading": ("(T, N)", shape[:2])})
         if self.heading is not None:
-            allowed = "must be finite, or NaN where unknown"
-            refuse("heading", self.heading, np.isinf(self.heading), allowed, "Replace it by NaN.")
+            headings(self.heading, self.velocity)
         _check_gaps(self)
         plausible("position", self.position, FARTHEST)
         plausible("velocity", self.velocity, FASTEST)
@@ -108,9 +93,7 @@ class Fleet:
         coopoc.errors.InputError: fleet = Fleet(unnamed: 1 vehicles x 2 steps, dt 0.1 s): ids and times differ from \
 those that were recorded. Give the fleet that was observed, its vehicles in the same order.
         """
-        if tuple(ids) != self.ids or len(t) != len(self.t) or np.abs(t - self.t).max() > 0.01 * self.dt:
-            hint = "Give the fleet that was observed, its vehicles in the same order."
-            raise InputError("fleet", repr(self), "ids and times differ from those that were recorded", hint)
+        same_drive(self, ids, t)
 
     def index(self, vehicle: str | int) -> int:
         """Column of a vehicle given by its id or its index; InputError if there is none."""
@@ -165,6 +148,14 @@ def _check_gaps(fleet: Fleet) -> None:
             "must be finite, or NaN in all six numbers where the vehicle is absent",
             "Interpolate the gap or drop the row.",
         )
+
+
+def same_drive(noun: Any, ids: Sequence[str], t: Floats) -> None:
+    """InputError unless a Fleet or Recording has these vehicles in this order, and its steps are at times t (T,) s."""
+    if tuple(ids) != noun.ids or len(t) != len(noun.t) or np.abs(t - noun.t).max() > 0.01 * noun.dt:
+        kind = type(noun).__name__.lower()
+        hint = f"Give the {kind} that was observed, its vehicles in the same order."
+        raise InputError(kind, repr(noun), "ids and times differ from those that were recorded", hint)
 
 
 def names(ids: Iterable[object]) -> tuple[str, ...]:

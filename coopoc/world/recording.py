@@ -12,8 +12,9 @@ import numpy as np
 from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, refuse, texts
 from ..errors import InputError, shown
 from ..short_repr import short_repr
-from .fleet import FARTHEST, FASTEST, clock, columns, interval, names, plausible
+from .fleet import clock, columns, interval, names
 from .links import Links, stretches, told
+from .plausible import FARTHEST, FASTEST, FASTEST_TURN, UNLIKELY, headings, plausible, radians, unlikely
 from .sensors import Sensors
 from .v2x import V2X
 
@@ -30,7 +31,7 @@ class Body:
         heading: (R, T, N) rad from +x, anticlockwise, of a compass; NaN where there is none.
 
     Raises:
-        InputError: arrays of other shapes, infinite numbers.
+        InputError: arrays of other shapes, or in degrees.
 
     >>> Body(np.zeros((1, 2, 1)), np.full((1, 2, 1), np.nan)).yaw_rate.shape
     (1, 2, 1)
@@ -44,10 +45,10 @@ class Body:
     def __post_init__(self) -> None:
         shape: tuple[int, ...] = (-1, -1, -1)
         for name in ("yaw_rate", "heading"):
-            values = checked(name, getattr(self, name), "(R, T, N)", shape)
-            shape = values.shape
-            refuse(name, values, np.isinf(values), "must be finite, or NaN where missing", "Replace it by NaN.")
-            self.__dict__[name] = values
+            self.__dict__[name] = checked(name, getattr(self, name), "(R, T, N)", shape)
+            shape = self.yaw_rate.shape
+        radians("yaw_rate", self.yaw_rate, FASTEST_TURN)
+        headings(self.heading)
 
     def check(self, velocity: Floats) -> None:
         """InputError unless every vehicle that has a velocity (R, T, N, 3) m/s has a yaw rate."""
@@ -108,19 +109,16 @@ class Recording:
                 raise InputError(name, given, allowed, f"Give {kind.__name__}(...).")
         ids, t, links = names(self.ids), clock(self.t), len(self.links)
         gnss = checked("gnss", self.gnss, "(R, T, N, 3)", (-1, len(t), len(ids), 3))
-        found = {
-            "ids": ids,
-            "t": t,
-            "gnss": gnss,
-            "velocity": checked("velocity", self.velocity, "(R, T, N, 3)", gnss.shape),
-            "relative": checked("relative", self.relative, "(R, L, 3)", (len(gnss), links, 3)),
-            "broadcasts": checked("broadcasts", self.broadcasts, "(T, N)", gnss.shape[1:3], bool),
-            "arrival": checked("arrival", self.arrival, "(R, L)", (len(gnss), links), int),
-            "observers": tuple(checked("observers", self.observers, "(O,)", (-1,), int).tolist()),
-            "notes": texts("notes", self.notes),
+        shapes: dict[str, tuple[str, tuple[int, ...], Any]] = {
+            "velocity": ("(R, T, N, 3)", gnss.shape, float),
+            "relative": ("(R, L, 3)", (len(gnss), links, 3), float),
+            "broadcasts": ("(T, N)", gnss.shape[1:3], bool),
+            "arrival": ("(R, L)", (len(gnss), links), int),
+            "observers": ("(O,)", (-1,), int),
         }
-        for name, value in found.items():
-            self.__dict__[name] = value
+        self.__dict__.update(ids=ids, t=t, gnss=gnss, notes=texts("notes", self.notes))
+        self.__dict__.update({name: checked(name, getattr(self, name), *shape) for name, shape in shapes.items()})
+        self.__dict__["observers"] = tuple(np.asarray(self.observers).tolist())
         check_measurements(self.gnss, self.velocity, self.relative)
         self.__dict__["landmarks"] = tuple(columns("landmarks", self.landmarks, ids))
         check_landmarks(self.landmarks, self.gnss, self.velocity)
@@ -129,6 +127,7 @@ class Recording:
         if self.body is not None:
             instance("body", self.body, Body).check(self.velocity)
         self.sensors.check_assumed()
+        self.__dict__["notes"] = (*(note for note in self.notes if UNLIKELY not in note), *unlikely(self))
 
     @property
     def dt(self) -> float:
@@ -139,6 +138,11 @@ class Recording:
     def measured(self) -> bool:
         """Whether the notes say that nothing is simulated."""
         return any(MEASURED in note for note in self.notes)
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """The notes on what is unlikely, which every track of this recording has, too."""
+        return tuple(note for note in self.notes if UNLIKELY in note)
 
     @property
     def runs(self) -> int:
@@ -294,30 +298,20 @@ def check_measurements(gnss: Floats, velocity: Floats, relative: Floats) -> None
     """
     if not len(gnss):
         raise InputError("gnss", "no run", "must have at least one", "Use observe(..., runs=1).")
-    for name, values, limit in (
-        ("gnss", gnss, FARTHEST),
-        ("velocity", velocity, FASTEST),
-        ("relative", relative, FARTHEST),
-    ):
+    arrays = {"gnss": (gnss, FARTHEST), "velocity": (velocity, FASTEST), "relative": (relative, FARTHEST)}
+    for name, (values, limit) in arrays.items():
         plausible(name, values, limit)
-        with np.errstate(over="ignore", invalid="ignore"):
-            finite = np.isfinite(values.sum())  # needs no array of its own; one that overflows is looked at again
-        if finite:
+        if np.isfinite(values.sum()):  # which needs no array of its own
             continue
-        refuse(name, values, np.isinf(values), "must be finite, or NaN where missing", "Replace it by NaN.")
         missing = np.isnan(values)
         if name != "relative":
             partly = missing != missing[..., :1]
             refuse(name, values, partly, "must be NaN on all axes or on none", "Set all three to NaN.")
         if name == "velocity":
             refuse(name, values, missing != missing[:1], "must be NaN in all runs or in none", "Absence is no noise.")
-    refuse(
-        "relative",
-        relative[..., 0],
-        relative[..., 0] <= 0,
-        "must be a range > 0 m",
-        "Make it NaN: no direction is seen in one place.",
-    )
+    radians("relative angles", relative[..., 1:])
+    hint, ranges = "Make it NaN: no direction is seen in one place.", relative[..., 0]
+    refuse("relative", ranges, ranges <= 0, "must be a range > 0 m", hint)
 
 
 def check_landmarks(landmarks: tuple[int, ...], gnss: Floats, velocity: Floats) -> None:

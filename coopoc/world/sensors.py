@@ -18,6 +18,7 @@ if TYPE_CHECKING:
 
 BiasMode = Literal["run", "sample"]
 VelocityReading = Literal["axis", "speed", "fixes"]
+ANGULAR = "azimuth_std", "inclination_std", "heading_std", "heading_bias_std", "yaw_rate_std", "yaw_rate_bias_std"
 
 
 @dataclass(frozen=True)
@@ -83,7 +84,8 @@ class Sensors:
         limits: Limits = {
             **{field.name: (0.0, most, "finite and >= 0, in SI units") for field in fields(self)},
             **dict.fromkeys(("gnss_drift_time", "odometry_error_time"), (TINY, most, "finite and > 0 s")),
-            **dict.fromkeys(("azimuth_std", "inclination_std"), (0.0, np.pi, "in 0..pi radians, by np.deg2rad")),
+            **dict.fromkeys(ANGULAR, (0.0, np.pi, "in 0..pi rad or rad/s, by np.deg2rad")),
+            **dict.fromkeys(("velocity_std_ratio", "speed_scale_std"), (0.0, 1.0, "in [0, 1], 0.15 for 15 %")),
         }
         check_fields(self, limits, gnss_bias_mode=BiasMode, velocity_reading=VelocityReading, outliers=Outliers)
         hint = "Give metres in a tuple."

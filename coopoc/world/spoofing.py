@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..arrays import Floats, check_fields, extent, instance, seed_of
+from .fleet import columns
 from .recording import Recording, Vehicles
 from .sensors import stream
 
@@ -80,7 +81,7 @@ def spoofed(
         told: whether false fixes are missing (NaN) instead, as for an estimator which is told of the attack.
 
     Raises:
-        InputError: a share outside [0, 1], seed < 0, an honest vehicle that is no ego.
+        InputError: a share outside [0, 1], seed < 0, an honest vehicle that is none of the recording.
 
     >>> from coopoc import Fleet, Sensors, observe
     >>> fleet = Fleet(("a", "b"), [0, 0.1], np.zeros((2, 2, 3)) + [[[0, 0, 0], [9, 0, 0]]], np.zeros((2, 2, 3)))
@@ -92,7 +93,7 @@ def spoofed(
     attack = attack if isinstance(attack, Spoofing) else Spoofing(attack)
     seed = seed_of(seed)
     instance("told", told, bool, "Give True to remove false fixes.")
-    spared = recording.columns(honest) if np.size(honest) else []
+    spared = columns("honest", honest, recording.ids)
     offset = np.zeros((recording.runs, len(recording.ids), 3))
     for run in range(recording.runs):
         common = _offset(stream(seed, "attack", run, ""), attack)

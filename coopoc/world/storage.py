@@ -28,8 +28,15 @@ from .v2x import V2X
 ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers", "landmarks")
 LINKS = ("step", "observer", "neighbour")
 BODY = ("yaw_rate", "heading")
-LARGEST = 2**31
-"""Bytes of one unpacked file."""
+WORDS = "coopoc_recording"
+NAMES = (
+    *ARRAYS,
+    *BODY,
+    *(f"links_{name}" for name in LINKS),
+    *(f"truth_{n}" for n in ("position", "velocity", BODY[1])),
+)
+LARGEST, DENSEST = 2**31, 1032
+"""Bytes of one unpacked file, and of each of its own: no deflated stream unpacks to more."""
 DAMAGES = (
     OSError,
     EOFError,
@@ -73,27 +80,34 @@ def save_recording(recording: Recording, path: str | Path, truth: Fleet | None =
         arrays |= {"truth_position": truth.position, "truth_velocity": truth.velocity}
         if truth.heading is not None:
             arrays["truth_heading"] = truth.heading
-    np.savez_compressed(path, coopoc_recording=np.array(json.dumps(words)), **arrays)
+    np.savez_compressed(path, **{WORDS: np.array(json.dumps(words)), **arrays})
 
 
 def unpacked(path: Path) -> dict[str, AnyArray]:
     """Arrays of an .npz file by name; what is damaged, or larger than `LARGEST`, raises one of `DAMAGES`."""
     with zipfile.ZipFile(path) as packed:
-        if sum(part.file_size for part in packed.infolist()) > LARGEST:
+        if (size := sum(part.file_size for part in packed.infolist())) > LARGEST:
             raise ValueError("more than 2 GB unpacked (too many runs?)")
+        if size > DENSEST * path.stat().st_size:
+            raise ValueError(f"{size} bytes unpacked, more than {DENSEST} times those of the file")
         _check_shapes(packed)
     with np.load(path, allow_pickle=False) as stored:
         return dict(stored)
 
 
 def _check_shapes(packed: zipfile.ZipFile) -> None:
-    """ValueError for arrays larger than a recording with these fixes and links has, by their headers alone."""
+    """ValueError for arrays of other names, for more numbers than their bytes hold, and for arrays larger than those of
+    a recording with these fixes and links, by their headers alone."""
     shapes = {}
-    for name in packed.namelist():
-        with packed.open(name) as part:
-            major, _ = npy.read_magic(part)
+    for part in packed.infolist():
+        with packed.open(part) as file:
+            major, _ = npy.read_magic(file)
             read = npy.read_array_header_1_0 if major == 1 else npy.read_array_header_2_0
-            shapes[name.removesuffix(".npy")] = read(part)[0]
+            shape, _, dtype = read(file)
+        name = part.filename.removesuffix(".npy")
+        if name in shapes or name not in (WORDS, *NAMES) or math.prod(shape) * dtype.itemsize > part.file_size:
+            raise ValueError(f"an array {name[:60]} of shape {shape} and dtype {dtype}")
+        shapes[name] = shape
     runs, steps, vehicles, _ = shapes["gnss"]
     most = 3 * runs * max(steps * vehicles, *shapes["links_step"])
     if shapes["t"] != (steps,) or any(math.prod(shape) > most for shape in shapes.values()):
@@ -109,7 +123,7 @@ def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
     path = given_path(path)
     try:
         arrays = unpacked(path)
-        return _recording(json.loads(str(arrays.pop("coopoc_recording"))), arrays)
+        return _recording(json.loads(str(arrays.pop(WORDS))), arrays)
     except DAMAGES as error:
         found = said(error)
     raise InputError(path.name, found, "must be a recording in .npz", "Write it again with save_recording.")

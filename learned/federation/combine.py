@@ -78,6 +78,13 @@ def screen(
     return reasons, median(accepted) if accepted else usual
 
 
+def too_few(rule: Rule, accepted: int) -> str:
+    """Why a rule cannot combine so many answers, "" if it can."""
+    if accepted >= rule.least:
+        return ""
+    return f"{accepted} answers accepted, {rule.name} takes at least {rule.least}: weights unchanged"
+
+
 def combine(rule: Rule, standing: Standing, answers: Mapping[str, Answer]) -> tuple[Standing, dict[str, str], str]:
     """Screen the answers, then combine the accepted ones, in the order of the clients' names.
 
@@ -105,8 +112,7 @@ def combine(rule: Rule, standing: Standing, answers: Mapping[str, Answer]) -> tu
     unchanged, accepted = standing._replace(usual=usual), [answers[name] for name in sorted(answers.keys() - rejected)]
     if not answers:
         return unchanged, rejected, "no client answered: weights unchanged"
-    if len(accepted) < rule.least:
-        note = f"{len(accepted)} answers accepted, {rule.name} takes at least {rule.least}: weights unchanged"
+    if note := too_few(rule, len(accepted)):
         return unchanged, rejected, note
     weights, sizes = torch.stack([a.weights for a in accepted]), torch.tensor([a.size for a in accepted])
     combined = rule(theta, weights, sizes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -124,6 +125,11 @@ class TrimmedMean(Rule):
 
     def __post_init__(self) -> None:
         within("share", self.share, 0 <= self.share < 0.5, "in [0, 0.5)")
+
+    @property
+    def least(self) -> int:
+        """The first number of clients of which one is left out at either end."""
+        return math.ceil(1 / self.share) if self.share else 1
 
     def tolerated(self, clients: int) -> int:
         """As many as are left out at either end."""

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import asdict, replace
 from importlib.metadata import version
+from statistics import median
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
@@ -18,9 +19,11 @@ from coopoc.errors import InputError
 from coopoc.escapes import visible
 from coopoc.file_names import given_path
 
-from ..checkpoint import Checkpoint, save
-from ..federation.combine import SERVER, screen
+from ..checkpoint import Checkpoint, read_card, save
+from ..federation.combine import SERVER, screen, too_few
+from ..federation.federate import Plan
 from ..federation.history import Federation, Round
+from ..federation.rules import rule
 from ..nets.gain import Gain
 from ..nets.stack import flatten
 from ..recipes import Job, sensors, untrained
@@ -42,10 +45,12 @@ LARGEST_LOSS = 1e12
 """m^2, the largest plausible loss: an error of 1,000 km."""
 LONGEST = 200
 """Characters of a name or a reason in an answer."""
+MOST_PIECES = 10
+"""Times the median of a round: the largest number of pieces with which a client counts, since nobody can verify it."""
 
 
 class Row(NamedTuple):
-    """A round: number, weights (P,), losses m^2 and pieces by client, reasons of rejection and absence."""
+    """A round: number, weights (P,), losses m^2 and pieces by client, reasons of rejection, and a note."""
 
     number: int
     weights: Tensor
@@ -53,6 +58,7 @@ class Row(NamedTuple):
     validation_loss: dict[str, float]
     pieces: dict[str, int]
     rejected: dict[str, str]
+    note: str = ""
 
     @property
     def line(self) -> str:
@@ -60,7 +66,7 @@ class Row(NamedTuple):
         total = sum(self.pieces[name] for name in self.validation_loss)
         losses = [self.pieces[name] * loss for name, loss in self.validation_loss.items()]
         mean, missing = sum(losses) / total if total else math.nan, self.rejected.items()
-        why = "".join(f"; {name}: {reason}" for name, reason in missing)
+        why = "".join(f"; {name}: {reason}" for name, reason in missing) + f"; {self.note}" * bool(self.note)
         return f"round {self.number}: validation {mean:.4f} m^2 over {len(losses)} clients{why}"
 
 
@@ -83,29 +89,41 @@ def server_app(main: Callable[[Grid, Context], None] | None = None) -> ServerApp
 
 
 def configured(grid: Grid, context: Context) -> None:
-    """All rounds by the run's configuration; the checkpoint is written after each of them.
+    """All rounds by the run's configuration; the checkpoint is written after each of them, with the names of the nodes,
+    which a new run with the same `out` keeps.
 
     Raises:
         InputError: a net that is calibrated on the clients' segments, which stay with them.
     """
     given: Any = context.run_config
-    job, began, rows = job_of(given), time.perf_counter(), list[Row]()
+    job, began, rows, names = job_of(given), time.perf_counter(), list[Row](), dict[int, str]()
     nodes = arrays.number("nodes", given["nodes"], 1, 10**6, kind=int, allowed=">= 1", hint="Of clients, to wait for.")
     out = given_path(given["out"])
     if type(untrained(job)).calibrate is not Gain.calibrate:
         allowed = "must be a net that needs no calibration on the clients' segments"
         raise InputError("recipe", job.name, allowed, "Train it in one process, or with coopoc train --flower.")
 
+    if out.is_file():
+        names |= {int(node): str(name) for node, name in read_card(out).get("nodes", {}).items()}
+
     def keep(row: Row) -> None:
         rows.append(row)
-        save(out, checkpoint(rows, job, time.perf_counter() - began))
+        made = checkpoint(rows, job, time.perf_counter() - began)
+        save(out, replace(made, card={**made.card, "nodes": {str(node): name for node, name in names.items()}}))
         print(row.line, flush=True)
 
-    rounds(grid, job, nodes, given["timeout"], keep)
+    rounds(grid, job, nodes, given["timeout"], keep, names)
     print(out, flush=True)
 
 
-def rounds(grid: Grid, job: Job, nodes: int, timeout: float, keep: Callable[[Row], object]) -> None:
+def rounds(
+    grid: Grid,
+    job: Job,
+    nodes: int,
+    timeout: float,
+    keep: Callable[[Row], object],
+    names: dict[int, str] | None = None,
+) -> None:
     """The rounds of a federation over a grid, by the Flower strategy of the recipe's rule.
 
     A round asks every online node and ends when all have answered, after `timeout` s at the latest.
@@ -116,15 +134,19 @@ def rounds(grid: Grid, job: Job, nodes: int, timeout: float, keep: Callable[[Row
         nodes: number that must be online before the first round, within `timeout` s.
         timeout: s, of a round.
         keep: called with every round once the clients have validated its weights.
+        names: of nodes that are known from an earlier run; those of new nodes are added.
 
     Raises:
-        InputError: a rule that Flower has no strategy for.
+        InputError: a rule that Flower has no strategy for, or that needs more nodes.
         TimeoutError: too few nodes came online in time.
     """
     from flwr.app import Array, ArrayRecord
 
     (theta,) = flatten([untrained(job)])
-    strategy, until = _strategy(job.recipe.aggregate, theta, keep), time.monotonic() + timeout
+    one_of("aggregate", job.recipe.aggregate, tuple(STRATEGIES))
+    Plan(aggregate=job.recipe.aggregate).check(nodes)
+    known = {} if names is None else names
+    strategy, until = _strategy(job.recipe.aggregate, theta, keep, known), time.monotonic() + timeout
     while (online := len(list(grid.get_node_ids()))) < nodes:
         if time.monotonic() > until:
             state = f"only {online} came online in {timeout:g} s"
@@ -133,36 +155,39 @@ def rounds(grid: Grid, job: Job, nodes: int, timeout: float, keep: Callable[[Row
     strategy.start(grid, ArrayRecord({"theta": Array(theta.numpy())}), job.recipe.rounds, timeout)
 
 
-def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object]) -> Any:
+def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object], names: dict[int, str]) -> Any:
     """Flower's strategy of a rule, which gets screened answers only and hands each round to `keep`."""
     import flwr.serverapp.strategy as strategies
 
-    kind, options = STRATEGIES[one_of("aggregate", aggregate, tuple(STRATEGIES))]
+    kind, options = STRATEGIES[aggregate]
     base: Any = getattr(strategies, kind)
 
     class Screened(base):  # type: ignore[misc]
         def __init__(self) -> None:
             super().__init__(min_train_nodes=1, min_evaluate_nodes=1, min_available_nodes=1, **options)
-            self.row, self.names = Row(0, theta, {}, {}, {}, {}), dict[int, str]()
+            self.row = Row(0, theta, {}, {}, {}, {})
             self.usual: float | None = None
             keep(self.row)
 
         def aggregate_train(self, server_round: int, replies: Iterable[Message]) -> tuple[Any, Any]:
-            answers, rejected = read(replies, self.names, "training-loss")
+            answers, rejected, note = read(replies, names, "training-loss")
             weights = {name: _theta(reply) for name, reply in answers.items()}
             refused, self.usual = screen(self.row.weights, weights, self.usual)
             rejected |= refused
             good = {name: reply for name, reply in answers.items() if name not in rejected}
             pieces, losses = _numbers(good, "num-examples"), _numbers(good, "training-loss")
-            combined, metrics = super().aggregate_train(server_round, list(good.values()))
-            now = self.row.weights
+            combined, metrics, now = None, None, self.row.weights
+            if few := too_few(rule(aggregate), len(good)):
+                note = f"{note}; {few}".lstrip("; ")
+            else:
+                combined, metrics = super().aggregate_train(server_round, list(good.values()))
             if combined is not None:
                 now = torch.from_numpy(combined["theta"].numpy().copy()).to(theta.dtype)
-            self.row = Row(server_round, now, losses, {}, {n: int(k) for n, k in pieces.items()}, rejected)
+            self.row = Row(server_round, now, losses, {}, {n: int(k) for n, k in pieces.items()}, rejected, note)
             return combined, metrics
 
         def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> Any:
-            answers, rejected = read(replies, self.names, "validation-loss")
+            answers, rejected, _ = read(replies, names, "validation-loss")
             losses, counts = _numbers(answers, "validation-loss"), _numbers(answers, "num-examples")
             pieces = {name: int(count) for name, count in counts.items()}
             row = self.row._replace(validation_loss=losses, pieces=pieces, rejected=self.row.rejected | rejected)
@@ -172,12 +197,18 @@ def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object]) -> A
     return Screened()
 
 
-def read(replies: Iterable[Message], names: dict[int, str], loss: str) -> tuple[dict[str, Message], dict[str, str]]:
-    """Readable answers by client name, in the order of the names, and reasons of the others.
+def read(
+    replies: Iterable[Message], names: dict[int, str], loss: str
+) -> tuple[dict[str, Message], dict[str, str], str]:
+    """Readable answers by client name, in the order of the names, reasons of the others, and a note.
+
+    A client is its node, which Flower knows by its key. The name that it gives is a label, and belongs to the node that
+    first had it: another node with this name has its number behind it, so that none can answer in place of another.
+    Claimed numbers of pieces beyond `MOST_PIECES` times their median count as that; the note names them.
 
     Args:
         replies: of the nodes, in any order.
-        names: of the nodes, as first reported; a node cannot change its own.
+        names: of the nodes, from their first answers on; a node cannot change its own.
         loss: the loss that an answer must hold.
     """
     right: dict[str, Message] = {}
@@ -190,37 +221,46 @@ def read(replies: Iterable[Message], names: dict[int, str], loss: str) -> tuple[
             continue
         try:
             content: Any = reply.content
-            name, problem = content["client"]["name"], _problem(content, loss)
+            problem = _problem(content, loss)
         except Exception as error:  # a client may send anything
-            rejected[who] = f"malformed answer ({type(error).__name__})"
-            continue
-        if problem or names.get(node, name) != name or name in (SERVER, *right):
-            rejected[who] = problem or f"claims the name {name} of another node"
-            continue
-        names[node], right[name] = name, reply
-    return dict(sorted(right.items())), rejected
+            problem = f"malformed answer ({type(error).__name__})"
+        if not problem:
+            name = content["client"]["name"]
+            labels = name, f"{name}, node {node}"
+            label = names.setdefault(node, labels[name in names.values()])
+            problem = "" if label in labels else f"calls itself {name}"
+        if problem:
+            rejected[who] = problem
+        else:
+            right[label] = reply
+    claimed, notes = _numbers(right, "num-examples"), list[str]()
+    most = int(MOST_PIECES * median(claimed.values())) if claimed else 0
+    for name, pieces in claimed.items():
+        if pieces > most:
+            metrics: Any = right[name].content["metrics"]
+            metrics["num-examples"] = most
+            notes.append(f"{name} claims {pieces:.0f} pieces and counts with {most}")
+    return dict(sorted(right.items())), rejected, "; ".join(notes)
 
 
 def _problem(content: Any, loss: str) -> str:
-    """Why an answer cannot be used, "" if it can."""
-    name, pieces, value, theirs = (
-        content["client"]["name"],
-        content["metrics"]["num-examples"],
-        float(content["metrics"][loss]),
-        content["client"]["version"],
-    )
-    if {*content["metrics"]} != {"num-examples", loss} or len(content.metric_records) + len(content.array_records) > 2:
+    """Why an answer cannot be used, "" if it can: it holds what was asked for, and nothing else."""
+    asked = {"metrics": {"num-examples", loss}, "client": {"name", "version"}}
+    asked |= {"arrays": {"theta"}} if loss == "training-loss" else {}
+    if {record: {*content[record]} for record in content} != asked:
         return "other records than were asked for"
-    if not (0 < len(name) <= LONGEST and name.isprintable()):
-        return f"a name that is not 1 to {LONGEST} printable characters"
+    name, theirs = (content["client"][key] for key in ("name", "version"))
+    pieces, value = content["metrics"]["num-examples"], float(content["metrics"][loss])
+    if not (0 < len(name) <= LONGEST and name.isprintable() and name != SERVER):
+        return f"a name that is not 1 to {LONGEST} printable characters, or the server's"
     if not (isinstance(pieces, int) and 1 <= pieces < 2**31):
         return "a number of pieces that is not in 1..2^31 - 1"
     if not 0 <= value <= LARGEST_LOSS:
         return f"a {loss} of {value:g} m^2, must be in [0, {LARGEST_LOSS:g}]"
     if theirs != version("coopoc"):
         return f"made by another version of coopoc, the server has {version('coopoc')}: install the same"
-    if loss == "training-loss" and content["arrays"]["theta"].numpy().dtype != "float32":
-        return f"weights in {content['arrays']['theta'].numpy().dtype}, must be float32"
+    if loss == "training-loss" and (kind := content["arrays"]["theta"].numpy().dtype) != "float32":
+        return f"weights in {kind}, must be float32"
     return ""
 
 
@@ -251,6 +291,7 @@ def federation(rows: Sequence[Row], job: Job, seconds: float) -> Federation:
                 dict.fromkeys(row.training_loss, size),
                 row.rejected,
                 dict.fromkeys(absent, "no answer") if row.number else {},
+                row.note,
             )
         )
     made = Federation(untrained(job), tuple(history), tuple(sizes[name] for name in names), seconds, tuple(names))

@@ -14,6 +14,7 @@ from ...kernels.compiling.waiting import clock
 from ...short_repr import short_repr
 from ...world.inbox import inbox
 from ...world.links import wrap
+from ...world.plausible import radians
 from ...world.recording import Recording, Vehicles, check_recording
 from ...world.sensors import Sensors
 from ...world.v2x import NO_MESSAGE, Message
@@ -151,7 +152,7 @@ class PoseFilter:
             received,
             sent,
             clock() - began,
-            notes=notes,
+            notes=notes + recording.doubts,
             heading=wrap(x[..., 3]),
             heading_covariance=cov[..., 3, :4],
             extras=extras,
@@ -179,6 +180,7 @@ class PoseFilter:
             raise InputError("assumed", None, "is needed: a stream has no recording", "Give assumed=Sensors(...).")
         dt = number("dt", dt, 1e-6, 3600.0, allowed="> 0 s", hint="0.1 is 10 Hz.")
         first = np.full(4, np.nan) if begin is None else checked("begin", begin, "(4,)", (4,))
+        radians("headings of begin", first[3:])
         spread = np.array(self.spread, dtype=float)
         noise = self.noise(self.assumed, dt)
         return PoseStream(noise, self.options(noise), first, spread, dt)

@@ -10,6 +10,7 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints, checked, listed
 from ...errors import InputError
 from ...kernels.stars.messages import FORGOTTEN
+from ...world.plausible import radians
 from ...world.recording import Body, Recording, Vehicles
 from ...world.sensors import Sensors
 from ...world.v2x import Message
@@ -84,6 +85,7 @@ def first_poses(recording: Recording, begin: Floats | None, columns: Sequence[in
     given = np.full(shape[1:], np.nan) if begin is None else checked("begin", begin)
     if given.shape not in (shape, shape[1:]):
         raise InputError("begin", f"shape {given.shape}", f"must have shape {shape[1:]} or {shape}", "One pose each.")
+    radians("headings of begin", given[..., 3])
     poses = np.ascontiguousarray(np.broadcast_to(given, shape))
     first = np.concatenate([recording.gnss[:, 0], body_of(recording).heading[:, 0, :, None]], axis=2)
     lacking = np.isnan(first) & np.isnan(poses) & np.isfinite(recording.velocity[:, 0, :, :1])
@@ -118,7 +120,7 @@ def pose_noise(sensors: Sensors, dt: float, gate: float) -> PoseNoise:
         longer=float(sensors.range_offset_std > 0),
         keep=float(np.exp(-dt / sensors.odometry_error_time)),
         flat=FORGOTTEN,
-        gate=float(gate) ** 2,
+        gate=float(gate) * float(gate),
     )
 
 

@@ -12,6 +12,7 @@ import numpy.typing as npt
 from ...arrays import Floats, instance, number
 from ...errors import InputError
 from ...world.links import wrap
+from ...world.plausible import FARTHEST, FASTEST_TURN, UNWRAPPED, radians
 from ..motion_history import fix_or_none, numbers, three
 
 if TYPE_CHECKING:
@@ -44,6 +45,8 @@ class OwnMeasurement:
         if self.heading is not None and not (isinstance(self.heading, float) and np.isnan(self.heading)):
             heading = number("heading", self.heading, -np.inf, allowed="finite rad, or None", hint="None: no compass.")
         rate = number("yaw_rate", self.yaw_rate, -np.inf, allowed="finite rad/s", hint="Of one that stands it is 0.")
+        radians("heading", np.array(heading), UNWRAPPED)
+        radians("yaw_rate", np.array(rate), FASTEST_TURN)
         row = np.concatenate([fix_or_none(self.gnss, "gnss"), [heading], three("velocity", self.velocity), [rate]])
         self.__dict__["row"] = row
 
@@ -66,10 +69,15 @@ class LandmarkMeasurement:
     def __post_init__(self) -> None:
         for name in ("relative", "place"):
             values = numbers(getattr(self, name))
-            if values.shape != (3,) or np.isinf(values).any() or (name == "place" and np.isnan(values).any()):
+            if (
+                values.shape != (3,)
+                or (np.abs(values) > FARTHEST).any()
+                or (name == "place" and np.isnan(values).any())
+            ):
                 given, hint = getattr(self, name), "NaN stands for a component of `relative` that is missing."
                 raise InputError(name, given, "must be three numbers", hint)
             self.__dict__[name] = values
+        radians("relative angles", self.relative[1:])  # type: ignore[index, arg-type]
 
 
 class PoseEstimate(NamedTuple):
@@ -99,7 +107,7 @@ class PoseStream:
         from ...kernels.poses.scalar_update import new_poses
 
         self._noise, self._options, self._spread, self._dt = noise, options, spread, dt
-        self._begin, self._later = begin[None, None], False
+        self._begin, self._later, self._heading = begin[None, None], False, np.nan
         self._poses, self._pair = new_poses(options.d), new_poses(2 * options.d)
 
     def step(self, own: OwnMeasurement, landmarks: Sequence[LandmarkMeasurement] = ()) -> PoseEstimate:
@@ -110,10 +118,15 @@ class PoseStream:
             landmarks: that it measures, the nearest first as in a recording.
 
         Raises:
-            InputError: a first step without fix and compass where `begin` does not give them.
+            InputError: a first step without fix and compass where `begin` does not give them; a heading beyond two
+                turns that does not follow the one before.
         """
         from ...kernels.poses.ekf import PoseMeasurements, step
 
+        heading = own.row[3]
+        if not abs(heading - self._heading) < np.pi:
+            radians("heading", heading)
+        self._heading = self._heading if np.isnan(heading) else heading
         marks = [instance("landmarks", mark, LandmarkMeasurement) for mark in landmarks]
         if not self._later and np.isnan(np.where(np.isnan(self._begin), own.row[:4], self._begin)).any():
             what = "must give what the first fix and compass do not"
