@@ -99,7 +99,7 @@ def gate_fix(states: Floats, moved: Vector, process: Vector, fix: Vector, late: 
             gain += p / (3.0 * (p + states[c, 3] + late[c]))
     what, evidence, since = remember(q, other, gate, gain, apart, spread, states[0, 8], states[0, 9])
     if what == BACK:
-        return other, inflation(other, gate, 0.0), 0.0, what, 0.0, 0.0
+        return other, 1.0, 0.0, what, 0.0, 0.0
     return q, inflation(q, gate, hits), count(q, gate, hits, gain), what, evidence, since
 
 

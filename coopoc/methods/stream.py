@@ -86,7 +86,11 @@ class FilterStream:
 
     def __init__(self, motion: MotionNoise, fixes: FixNoise, x0: npt.ArrayLike | None, history: float) -> None:
         self.history = MotionHistory(history)
-        self._state, self._given, self._noise = np.full((3, len(STATE)), np.nan), np.zeros(8), np.hstack((*motion, *fixes))
+        self._state, self._given, self._noise = (
+            np.full((3, len(STATE)), np.nan),
+            np.zeros(8),
+            np.hstack((*motion, *fixes)),
+        )
         if x0 is not None:
             self._state[:] = STATE
             self._state[:, 0], self._state[:, 3], self._state[:, 4] = three("x0", x0), fixes.variance, fixes.weight
