@@ -1,4 +1,5 @@
-"""NEES of a track, e^T P^-1 e by P = L D L^T, and covariances that are none, in one pass each."""
+"""NEES of a track, e^T P^-1 e by P = L D L^T, covariances that are none, and what contradicts a track, in one pass
+each."""
 
 from __future__ import annotations
 
@@ -6,11 +7,17 @@ import math
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
+from .geometry import direction, five, metres, residuals, with_std
 
 LIMIT = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
+TOGETHER, BEYOND, DOUBT = 5, 24.0, 36.0
+"""Numbers that are judged together; the squared normalised residual that each of them exceeds where all are far; and
+the square of their normalised mean, of three degrees of freedom, that chance does not reach."""
+FAR, SURE, SLIPS = 1, 2, 4
+"""Marks of steps: numbers are far from estimates, contradict their covariances, or contradict the odometer."""
 
 
 @compiled
@@ -54,3 +61,127 @@ def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
                     value = np.nan
                 found[run, t, e] = value
     return found, sound
+
+
+@compiled
+def mark_fixes(
+    gnss: Floats,
+    velocity: Floats,
+    x: Floats,
+    cov: Floats,
+    columns: Ints,
+    noise: Floats,
+    every: int,
+    dt: float,
+    marks: Ints,
+) -> None:
+    """Mark where TOGETHER fixes, one after the other, contradict estimates (R, T, E, 3) m or the odometer.
+
+    Args:
+        gnss: (R, T, N, 3) m, NaN for no fix.
+        velocity: (R, T, N, 3) m/s in the same frame, or of no length.
+        x: estimates.
+        cov: (R, T, E, 3, 3) m^2, or of no length.
+        columns: (E,) of the vehicles.
+        noise: (3, 3) variances of a fix m^2, what is white and what lasts, and of a velocity, relative and least.
+        every: steps from one fix to the next, at least.
+        dt: s.
+        marks: (E, T) out, sums of FAR, SURE and SLIPS.
+    """
+    moved, r, p, e, last = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
+    for run in range(gnss.shape[0]):
+        for k in range(len(columns)):
+            at, before, count, far, total, walk, first, begin, t = columns[k], -1, 0, 0, 0.0, 0.0, 0, -1, 0
+            moved[:], r[:], p[:], e[:] = 0.0, 0.0, 0.0, 0.0
+            while t < gnss.shape[1]:
+                if math.isnan(gnss[run, t, at, 0]):
+                    t += 1
+                    continue
+                if count == 0:
+                    first = t
+                q, span, middle = 0.0, dt * (t - before), (before + 1 + t) // 2
+                for c in range(3):
+                    if before >= 0 and len(velocity) > 0:
+                        u = span * velocity[run, middle, at, c]
+                        moved[c] += u
+                        walk += noise[2, 0] * u * u + span * span * noise[2, 1]
+                    gap, own = gnss[run, t, at, c] - x[run, t, k, c], cov[run, t, k, c, c] if len(cov) > 0 else 0.0
+                    r[c], p[c], e[c] = r[c] + gap, p[c] + own, e[c] + gnss[run, t, at, c] - moved[c]
+                    q += gap * gap / (noise[0, c] + noise[1, c] + own)
+                before, count, far, total, t = t, count + 1, far + int(q > BEYOND), total + q, t + every
+                if count < TOGETHER:
+                    continue
+                mean, slip = 0.0, 0.0
+                for c in range(3):
+                    variance = noise[0, c] / TOGETHER + noise[1, c]
+                    mean += (r[c] / TOGETHER) ** 2 / (p[c] / TOGETHER + variance)
+                    slip += ((e[c] - last[c]) / TOGETHER) ** 2 / (2.0 * variance + walk)
+                    last[c], r[c], p[c], e[c] = e[c], 0.0, 0.0, 0.0
+                mark = FAR if far == TOGETHER else 0
+                if far < TOGETHER and len(cov) > 0 and max(mean, 2.0 * total / TOGETHER) > DOUBT:
+                    mark = SURE
+                if begin >= 0 and slip > DOUBT:
+                    mark |= SLIPS
+                for i in range(begin if mark >= SLIPS else first, before + 1 if mark > 0 else 0):
+                    marks[k, i] |= mark
+                begin, count, far, total, walk = first, 0, 0, 0.0, 0.0
+
+
+@compiled
+def mark_neighbours(
+    gnss: Floats,
+    relative: Floats,
+    estimates: Floats,
+    cov: Floats,
+    neighbours: Floats,
+    links: Ints,
+    fix: Floats,
+    std: Floats,
+    every: int,
+    marks: Ints,
+) -> None:
+    """Mark where TOGETHER messages or relative measurements of a neighbour are all far from estimates.
+
+    Args:
+        gnss: (R, T, N, 3) m.
+        relative: (R, L, 3) m, rad, rad, NaN for none.
+        estimates: (R, T, 3) m of the ego.
+        cov: (R, T, 3, 3) m^2.
+        neighbours: (R, M, 3) m, estimates by link of the ego.
+        links: (M, 3) in time order: index among all L, step and neighbour of each.
+        fix: (3,) m^2, variance.
+        std: (3,) m, rad, rad.
+        every: steps from one to the next, at least.
+        marks: (2, N, T) out, FAR: messages, relative measurements.
+    """
+    seen = np.zeros((gnss.shape[2], 5), np.int64)
+    for run in range(gnss.shape[0]):
+        seen[:, 0], seen[:, 1] = -every, 0
+        for i in range(len(links)):
+            link, t, j = links[i]
+            x, y, z = less(neighbours[run, i], estimates[run, t])
+            if t < seen[j, 0] + every or math.isnan(x):
+                continue
+            if seen[j, 1] == 0:
+                seen[j, 2:] = t, 0, 0
+            polar, p = direction(x, y, z), cov[run, t]
+            measured = with_std(five(relative[run, link, 0], relative[run, link, 1], relative[run, link, 2]), std)
+            gap, size, own = (
+                residuals(measured, polar),
+                metres(polar, measured[5:], 0.0),
+                (p[0, 0] + p[1, 1] + p[2, 2]) / 3.0,
+            )
+            q, message = gap[0] * gap[0] / (size[0] * size[0] + own), 0.0
+            q += (polar[0] * polar[3] * gap[1]) ** 2 / (size[1] * size[1] + own)
+            q += (polar[0] * gap[2]) ** 2 / (size[2] * size[2] + own)
+            own += std[0] * std[0] + (polar[0] * std[1]) ** 2
+            for c in range(3):
+                message += (gnss[run, t, j, c] - neighbours[run, i, c]) ** 2 / (fix[c] + own)
+            seen[j, 0], seen[j, 1] = t, seen[j, 1] + 1
+            seen[j, 3] += message > BEYOND
+            seen[j, 4] += q > BEYOND
+            if seen[j, 1] == TOGETHER:
+                for kind in range(2):
+                    for k in range(seen[j, 2], t + 1 if seen[j, 3 + kind] == TOGETHER else 0):
+                        marks[kind, j, k] = FAR
+                seen[j, 1] = 0

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Limits, check_arrays, check_fields, checked, number, texts
+from ..arrays import Bools, Floats, Ints, Limits, check_arrays, check_fields, checked, number, texts
 from ..errors import InputError, shown
 from ..kernels.compiling.waiting import clock
 from ..short_repr import short_repr
@@ -157,11 +157,96 @@ def far_off(x: Floats, recording: Recording, columns: Sequence[int], limit: floa
     return np.asarray(far.any(axis=1))
 
 
-def lost(x: Floats, recording: Recording, columns: Sequence[int], limit: float = FAR) -> tuple[str, ...]:
-    """A note of the runs whose estimates are `far_off`; none if none is."""
-    found = far_off(x, recording, columns, limit)
-    far = limit * float(np.linalg.norm(recording.sensors.gnss_std))
-    return (f"diverged in {found.sum()} of {found.size} runs (over {far:.0f} m from the fix)",) if found.any() else ()
+SECOND = 1.0
+"""s between two numbers that are judged together, at least."""
+
+
+def doubts(
+    recording: Recording,
+    columns: Sequence[int],
+    x: Floats,
+    cov: Floats | None = None,
+    noise_model: NoiseModel | str = "nominal",
+    neighbours: Floats | None = None,
+) -> tuple[str, ...]:
+    """Notes of what contradicts the estimates of some vehicles in any run, and when: five fixes one after the other.
+
+    Receivers that are rejected or filters that are lost: all are farther off than five standard deviations.
+    Covariances: the mean residual, or a single one in the mean square, is beyond what chance allows. Odometers: the
+    fixes move otherwise, again beyond chance. Neighbours: as receivers, of their messages and relative measurements.
+
+    Args:
+        recording: of all vehicles, with the noise that methods know.
+        columns: (E,) of the vehicles.
+        x: (R, T, E, 3) m.
+        cov: (R, T, E, 3, 3) m^2; None if none is claimed.
+        noise_model: of the method; covariances and neighbours are not judged where it states no noise.
+        neighbours: (R, L, 3) m as of Track; None for none.
+
+    >>> from coopoc import Fleet, Sensors, observe
+    >>> fleet = Fleet(("a",), np.arange(9), np.zeros((9, 1, 3)), np.zeros((9, 1, 3)))
+    >>> doubts(observe(fleet, Sensors()), [0], np.full((1, 9, 1, 3), 1e3))
+    ('fixes, a: far from its estimates from 0 to 4 s; it is lost, or rejects them',)
+    """
+    from ..kernels.covariances import FAR, SLIPS, SURE, mark_fixes, mark_neighbours
+
+    stated = noise_model.sensors if isinstance(noise_model, NoiseModel) else noise_model != "identity"
+    cov = cov if stated else None
+    sensors, links, ids, notes = recording.sensors, recording.links, recording.ids, list[str]()
+    white, velocity = (
+        np.square(sensors.gnss_std),
+        recording.velocity if recording.body is None else np.zeros((0,) * 4),
+    )
+    lasting = np.square(sensors.fix_std) - white + sensors.gnss_bias[1] ** 2
+    turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
+    motion = sensors.velocity_std_ratio**2 + 5.0 * turn, sensors.velocity_floor**2, 0.0
+    every, marks = max(round(SECOND / recording.dt), 1), np.zeros((len(columns), len(recording.t)), np.int64)
+    claimed, noise = np.zeros((0,) * 5) if cov is None else cov, np.array([white, lasting, motion])
+    egos = np.asarray(columns, dtype=np.int64)
+    mark_fixes(recording.gnss, velocity, x, claimed, egos, noise, every, recording.dt, marks)
+    for k in np.flatnonzero(marks.any(axis=1)).tolist():
+        for mark, text in (
+            (FAR, "fixes, {}: far from its estimates{}; it is lost, or rejects them"),
+            (SURE, "covariances, {}: contradicted by fixes{}"),
+            (SLIPS, "odometer, {}: contradicted by fixes{}; it slips, or they jump"),
+        ):
+            notes += [text.format(ids[egos[k]], when) for when in spans(recording.t, marks[k] & mark)]
+    if cov is None or neighbours is None:
+        return tuple(notes)
+    first = 0
+    for k, ego in enumerate(columns):
+        own = links.of(ego)
+        last, far = first + len(own), np.zeros((2, len(ids), len(recording.t)), np.int64)
+        rows = np.stack([own, links.step[own], links.neighbour[own]], axis=1)
+        mark_neighbours(
+            recording.gnss,
+            recording.relative,
+            x[:, :, k],
+            cov[:, :, k],
+            neighbours[:, first:last],
+            rows,
+            white + lasting,
+            np.array([sensors.range_std, sensors.world_azimuth_std, sensors.inclination_std]),
+            every,
+            far,
+        )
+        for kind, j in np.argwhere(far.any(axis=2)).tolist():
+            text = f"{('messages', 'relative measurements')[kind]}, {ids[ego]} and {ids[j]}: far from estimates"
+            notes += [text + when for when in spans(recording.t, far[kind, j])]
+        first = last
+    return tuple(notes)
+
+
+def spans(t: Floats, marked: Ints) -> list[str]:
+    """The times t (T,) s of marked steps in words, or nothing.
+
+    >>> spans(np.arange(9.0), np.array([0, 1, 1, 0, 0, 1, 0, 0, 0]))
+    [' from 1 to 2, 5 to 5 s']
+    """
+    edges = np.flatnonzero(np.diff(marked != 0, prepend=False, append=False))
+    words = [f"{t[a]:.10g} to {t[b - 1]:.10g}" for a, b in zip(edges[::2], edges[1::2], strict=True)]
+    more = f" and {len(words) - 3} times more" if len(words) > 3 else ""
+    return [f" from {', '.join(words[:3])} s{more}"] if words else []
 
 
 def silent_track(
