@@ -91,7 +91,8 @@ def mark_fixes(
     moved, r, p, e, last = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     for run in range(gnss.shape[0]):
         for k in range(len(columns)):
-            at, before, count, far, total, walk, first, begin, t = columns[k], -1, 0, 0, 0.0, 0.0, 0, -1, 0
+            at, before, count, far, total, first, begin, t = columns[k], -1, 0, 0, 0.0, 0, -1, 0
+            walk, old = 0.0, 0.0
             moved[:], r[:], p[:], e[:] = 0.0, 0.0, 0.0, 0.0
             while t < gnss.shape[1]:
                 if math.isnan(gnss[run, t, at, 0]):
@@ -99,10 +100,14 @@ def mark_fixes(
                     continue
                 if count == 0:
                     first = t
-                q, span, middle = 0.0, dt * (t - before), (before + 1 + t) // 2
+                q, span, middle = 0.0, dt * (t - before), (before + t) // 2
                 for c in range(3):
                     if before >= 0 and len(velocity) > 0:
-                        u = span * velocity[run, middle, at, c]
+                        u = (
+                            0.5
+                            * span
+                            * (velocity[run, middle + (before + t) % 2, at, c] + velocity[run, middle + 1, at, c])
+                        )
                         moved[c] += u
                         walk += noise[2, 0] * u * u + span * span * noise[2, 1]
                     gap, own = gnss[run, t, at, c] - x[run, t, k, c], cov[run, t, k, c, c] if len(cov) > 0 else 0.0
@@ -115,7 +120,7 @@ def mark_fixes(
                 for c in range(3):
                     variance = noise[0, c] / TOGETHER + noise[1, c]
                     mean += (r[c] / TOGETHER) ** 2 / (p[c] / TOGETHER + variance)
-                    slip += ((e[c] - last[c]) / TOGETHER) ** 2 / (2.0 * variance + walk)
+                    slip += ((e[c] - last[c]) / TOGETHER) ** 2 / (2.0 * variance + walk + old)
                     last[c], r[c], p[c], e[c] = e[c], 0.0, 0.0, 0.0
                 mark = FAR if far == TOGETHER else 0
                 if far < TOGETHER and len(cov) > 0 and max(mean, 2.0 * total / TOGETHER) > DOUBT:
@@ -124,7 +129,7 @@ def mark_fixes(
                     mark |= SLIPS
                 for i in range(begin if mark >= SLIPS else first, before + 1 if mark > 0 else 0):
                     marks[k, i] |= mark
-                begin, count, far, total, walk = first, 0, 0, 0.0, 0.0
+                begin, count, far, total, walk, old = first, 0, 0, 0.0, 0.0, walk
 
 
 @compiled
@@ -136,6 +141,7 @@ def mark_neighbours(
     neighbours: Floats,
     links: Ints,
     fix: Floats,
+    lasts: float,
     std: Floats,
     every: int,
     marks: Ints,
@@ -150,6 +156,7 @@ def mark_neighbours(
         neighbours: (R, M, 3) m, estimates by link of the ego.
         links: (M, 3) in time order: index among all L, step and neighbour of each.
         fix: (3,) m^2, variance.
+        lasts: m^2, what of it lasts.
         std: (3,) m, rad, rad.
         every: steps from one to the next, at least.
         marks: (2, N, T) out, FAR: messages, relative measurements.
@@ -169,7 +176,7 @@ def mark_neighbours(
             gap, size, own = (
                 residuals(measured, polar),
                 metres(polar, measured[5:], 0.0),
-                (p[0, 0] + p[1, 1] + p[2, 2]) / 3.0,
+                (p[0, 0] + p[1, 1] + p[2, 2]) / 3.0 + lasts,
             )
             q, message = gap[0] * gap[0] / (size[0] * size[0] + own), 0.0
             q += (polar[0] * polar[3] * gap[1]) ** 2 / (size[1] * size[1] + own)

@@ -226,8 +226,9 @@ def doubts(
             neighbours[:, first:last],
             rows,
             white + lasting,
+            float(lasting.mean()),
             np.array([sensors.range_std, sensors.world_azimuth_std, sensors.inclination_std]),
-            every,
+            2 * every,
             far,
         )
         for kind, j in np.argwhere(far.any(axis=2)).tolist():
