@@ -95,25 +95,22 @@ def mark_fixes(
             walk, old = 0.0, 0.0
             moved[:], r[:], p[:], e[:] = 0.0, 0.0, 0.0, 0.0
             while t < gnss.shape[1]:
-                if math.isnan(gnss[run, t, at, 0]):
-                    t += 1
-                    continue
-                if count == 0:
+                there, q, span, middle = not math.isnan(gnss[run, t, at, 0]), 0.0, dt * (t - before), (before + t) // 2
+                if there and count == 0:
                     first = t
-                q, span, middle = 0.0, dt * (t - before), (before + t) // 2
                 for c in range(3):
                     if before >= 0 and len(velocity) > 0:
-                        u = (
-                            0.5
-                            * span
-                            * (velocity[run, middle + (before + t) % 2, at, c] + velocity[run, middle + 1, at, c])
-                        )
-                        moved[c] += u
-                        walk += noise[2, 0] * u * u + span * span * noise[2, 1]
-                    gap, own = gnss[run, t, at, c] - x[run, t, k, c], cov[run, t, k, c, c] if len(cov) > 0 else 0.0
-                    r[c], p[c], e[c] = r[c] + gap, p[c] + own, e[c] + gnss[run, t, at, c] - moved[c]
-                    q += gap * gap / (noise[0, c] + noise[1, c] + own)
-                before, count, far, total, t = t, count + 1, far + int(q > BEYOND), total + q, t + every
+                        u = velocity[run, middle + (before + t) % 2, at, c] + velocity[run, middle + 1, at, c]
+                        moved[c] += 0.5 * span * u
+                        walk += span * span * (0.25 * noise[2, 0] * u * u + noise[2, 1])
+                    if there:
+                        gap, own = gnss[run, t, at, c] - x[run, t, k, c], cov[run, t, k, c, c] if len(cov) > 0 else 0.0
+                        r[c], p[c], e[c] = r[c] + gap, p[c] + own, e[c] + gnss[run, t, at, c] - moved[c]
+                        q += gap * gap / (noise[0, c] + noise[1, c] + own)
+                before, t = t, t + (every if there else 1)
+                if not there:
+                    continue
+                count, far, total = count + 1, far + int(q > BEYOND), total + q
                 if count < TOGETHER:
                     continue
                 mean, slip = 0.0, 0.0
