@@ -63,6 +63,17 @@ def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
     return found, sound
 
 
+@part
+def travel(velocity: Floats, first: int, stop: int, moved: Floats) -> float:
+    """Add the velocities (T, 3) of some steps; the sum of their squares."""
+    x, y, z, square = 0.0, 0.0, 0.0, 0.0
+    for t in range(first, stop):
+        u, v, w = velocity[t, 0], velocity[t, 1], velocity[t, 2]
+        x, y, z, square = x + u, y + v, z + w, square + u * u + v * v + w * w
+    moved[0], moved[1], moved[2] = moved[0] + x, moved[1] + y, moved[2] + z
+    return square
+
+
 @compiled
 def mark_fixes(
     gnss: Floats,
@@ -73,6 +84,7 @@ def mark_fixes(
     noise: Floats,
     every: int,
     dt: float,
+    thorough: bool,
     marks: Ints,
 ) -> None:
     """Mark where TOGETHER fixes, one after the other, contradict estimates (R, T, E, 3) m or the odometer.
@@ -83,50 +95,49 @@ def mark_fixes(
         x: estimates.
         cov: (R, T, E, 3, 3) m^2, or of no length.
         columns: (E,) of the vehicles.
-        noise: (3, 3) variances of a fix m^2, what is white and what lasts, and of a velocity, relative and least.
+        noise: (3, 3) variances of a fix m^2, what is white and what lasts; of a step's motion, relative, what of that
+            lasts, and least m^2.
         every: steps from one fix to the next, at least.
         dt: s.
+        thorough: False looks at the odometer of those alone whose estimates are doubtful.
         marks: (E, T) out, sums of FAR, SURE and SLIPS.
     """
     moved, r, p, e, last = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
     for run in range(gnss.shape[0]):
         for k in range(len(columns)):
-            at, before, count, far, total, first, begin, t = columns[k], -1, 0, 0, 0.0, 0, -1, 0
-            walk, old = 0.0, 0.0
-            moved[:], r[:], p[:], e[:] = 0.0, 0.0, 0.0, 0.0
-            while t < gnss.shape[1]:
-                there, q, span, middle = not math.isnan(gnss[run, t, at, 0]), 0.0, dt * (t - before), (before + t) // 2
-                if there and count == 0:
-                    first = t
-                for c in range(3):
-                    if before >= 0 and len(velocity) > 0:
-                        u = velocity[run, middle + (before + t) % 2, at, c] + velocity[run, middle + 1, at, c]
-                        moved[c] += 0.5 * span * u
-                        walk += span * span * (0.25 * noise[2, 0] * u * u + noise[2, 1])
-                    if there:
-                        gap, own = gnss[run, t, at, c] - x[run, t, k, c], cov[run, t, k, c, c] if len(cov) > 0 else 0.0
-                        r[c], p[c], e[c] = r[c] + gap, p[c] + own, e[c] + gnss[run, t, at, c] - moved[c]
+            stage, worst = int(thorough), 0.0
+            while stage < 2:
+                at, count, far, total, first, begin, square, old = columns[k], 0, 0, 0.0, 0, -1, 0.0, 0.0
+                moved[:], r[:], p[:], e[:], t, before = 0.0, 0.0, 0.0, 0.0, 0, 0
+                while t < gnss.shape[1]:
+                    now, t = t, t + 1
+                    if math.isnan(gnss[run, now, at, 0]):
+                        continue
+                    if stage == 1 and len(velocity) > 0:
+                        square += dt * dt * travel(velocity[run, :, at], before + 1, t, moved)
+                    q, first, before, t = 0.0, now if count == 0 else first, now, now + every
+                    for c in range(3):
+                        z, own = gnss[run, now, at, c], cov[run, now, k, c, c] if len(cov) > 0 else 0.0
+                        gap = z - x[run, now, k, c]
+                        r[c], p[c], e[c] = r[c] + gap, p[c] + own, e[c] + z - dt * moved[c]
                         q += gap * gap / (noise[0, c] + noise[1, c] + own)
-                before, t = t, t + (every if there else 1)
-                if not there:
-                    continue
-                count, far, total = count + 1, far + int(q > BEYOND), total + q
-                if count < TOGETHER:
-                    continue
-                mean, slip = 0.0, 0.0
-                for c in range(3):
-                    variance = noise[0, c] / TOGETHER + noise[1, c]
-                    mean += (r[c] / TOGETHER) ** 2 / (p[c] / TOGETHER + variance)
-                    slip += ((e[c] - last[c]) / TOGETHER) ** 2 / (2.0 * variance + walk + old)
-                    last[c], r[c], p[c], e[c] = e[c], 0.0, 0.0, 0.0
-                mark = FAR if far == TOGETHER else 0
-                if far < TOGETHER and len(cov) > 0 and max(mean, 2.0 * total / TOGETHER) > DOUBT:
-                    mark = SURE
-                if begin >= 0 and slip > DOUBT:
-                    mark |= SLIPS
-                for i in range(begin if mark >= SLIPS else first, before + 1 if mark > 0 else 0):
-                    marks[k, i] |= mark
-                begin, count, far, total, walk, old = first, 0, 0, 0.0, 0.0, walk
+                    count, far, total = count + 1, far + int(q > BEYOND), total + q
+                    if count < TOGETHER:
+                        continue
+                    mean, slip, steps = 0.0, 0.0, now - begin
+                    walk = (noise[2, 0] + steps * noise[2, 1]) * (square + old) + steps * noise[2, 2]
+                    for c in range(3):
+                        variance = noise[0, c] / TOGETHER + noise[1, c]
+                        mean += (r[c] / TOGETHER) ** 2 / (p[c] / TOGETHER + variance)
+                        slip += ((e[c] - last[c]) / TOGETHER) ** 2 / (2.0 * variance + walk)
+                        last[c], r[c], p[c], e[c] = e[c], 0.0, 0.0, 0.0
+                    mean = max(mean, 2.0 * total / TOGETHER)
+                    mark = FAR if far == TOGETHER else SURE if len(cov) > 0 and mean > DOUBT else 0
+                    mark += SLIPS if begin >= 0 and slip > DOUBT else 0
+                    for i in range(begin if mark >= SLIPS else first, now + 1 if mark > 0 and stage == 1 else 0):
+                        marks[k, i] |= mark
+                    worst, begin, count, far, total, square, old = max(worst, mean), first, 0, 0, 0.0, 0.0, square
+                stage += 1 if worst > DOUBT / 3 else 2
 
 
 @compiled

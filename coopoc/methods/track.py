@@ -199,11 +199,12 @@ def doubts(
     )
     lasting = np.square(sensors.fix_std) - white + sensors.gnss_bias[1] ** 2
     turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
-    motion = sensors.velocity_std_ratio**2 + 5.0 * turn, sensors.velocity_floor**2, 0.0
-    every, marks = max(round(SECOND / recording.dt), 1), np.zeros((len(columns), len(recording.t)), np.int64)
+    motion = sensors.velocity_std_ratio**2, turn, (recording.dt * sensors.velocity_floor) ** 2
+    steps = len(recording.t)
+    every, marks = max(min(round(SECOND / recording.dt), steps // 5), 1), np.zeros((len(columns), steps), np.int64)
     claimed, noise = np.zeros((0,) * 5) if cov is None else cov, np.array([white, lasting, motion])
     egos = np.asarray(columns, dtype=np.int64)
-    mark_fixes(recording.gnss, velocity, x, claimed, egos, noise, every, recording.dt, marks)
+    mark_fixes(recording.gnss, velocity, x, claimed, egos, noise, every, recording.dt, neighbours is not None, marks)
     for k in np.flatnonzero(marks.any(axis=1)).tolist():
         for mark, text in (
             (FAR, "fixes, {}: far from its estimates{}; it is lost, or rejects them"),
@@ -216,7 +217,7 @@ def doubts(
     first = 0
     for k, ego in enumerate(columns):
         own = links.of(ego)
-        last, far = first + len(own), np.zeros((2, len(ids), len(recording.t)), np.int64)
+        last, far = first + len(own), np.zeros((2, len(ids), steps), np.int64)
         rows = np.stack([own, links.step[own], links.neighbour[own]], axis=1)
         mark_neighbours(
             recording.gnss,
