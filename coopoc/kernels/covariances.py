@@ -9,13 +9,14 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
+from .gate import FIX_GATE
 from .geometry import direction, five, metres, residuals, with_std
 
 LIMIT = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
-TOGETHER, BEYOND, DOUBT = 5, 24.0, 36.0
-"""Numbers that are judged together; the squared normalised residual that each of them exceeds where all are far; and
-the square of their normalised mean, of three degrees of freedom, that chance does not reach."""
+TOGETHER, DOUBT = 5, 36.0
+"""Numbers that are judged together, which are far where all are beyond FIX_GATE; and the square of their normalised
+mean, of three degrees of freedom, that chance does not reach."""
 FAR, SURE, SLIPS = 1, 2, 4
 """Marks of steps: numbers are far from estimates, contradict their covariances, or contradict the odometer."""
 
@@ -121,7 +122,7 @@ def mark_fixes(
                         gap = z - x[run, now, k, c]
                         r[c], p[c], e[c] = r[c] + gap, p[c] + own, e[c] + z - dt * moved[c]
                         q += gap * gap / (noise[0, c] + noise[1, c] + own)
-                    count, far, total = count + 1, far + int(q > BEYOND), total + q
+                    count, far, total = count + 1, far + int(q > FIX_GATE), total + q
                     if count < TOGETHER:
                         continue
                     mean, slip, steps = 0.0, 0.0, now - begin
@@ -133,9 +134,11 @@ def mark_fixes(
                         last[c], r[c], p[c], e[c] = e[c], 0.0, 0.0, 0.0
                     mean = max(mean, 2.0 * total / TOGETHER)
                     mark = FAR if far == TOGETHER else SURE if len(cov) > 0 and mean > DOUBT else 0
-                    mark += SLIPS if begin >= 0 and slip > DOUBT else 0
-                    for i in range(begin if mark >= SLIPS else first, now + 1 if mark > 0 and stage == 1 else 0):
+                    stop = min(t, gnss.shape[1]) if stage == 1 else 0
+                    for i in range(first, stop if mark > 0 else 0):
                         marks[k, i] |= mark
+                    for i in range(max(begin, 0), stop if begin >= 0 and slip > DOUBT else 0):
+                        marks[k, i] |= SLIPS
                     worst, begin, count, far, total, square, old = max(worst, mean), first, 0, 0, 0.0, 0.0, square
                 stage += 1 if worst > DOUBT / 3 else 2
 
@@ -193,10 +196,12 @@ def mark_neighbours(
             for c in range(3):
                 message += (gnss[run, t, j, c] - neighbours[run, i, c]) ** 2 / (fix[c] + own)
             seen[j, 0], seen[j, 1] = t, seen[j, 1] + 1
-            seen[j, 3] += message > BEYOND
-            seen[j, 4] += q > BEYOND
+            seen[j, 3] += message > FIX_GATE
+            seen[j, 4] += q > FIX_GATE
             if seen[j, 1] == TOGETHER:
                 for kind in range(2):
-                    for k in range(seen[j, 2], t + 1 if seen[j, 3 + kind] == TOGETHER else 0):
+                    for k in range(
+                        seen[j, 2], min(t + every, len(estimates[run])) if seen[j, 3 + kind] == TOGETHER else 0
+                    ):
                         marks[kind, j, k] = FAR
                 seen[j, 1] = 0

@@ -171,7 +171,7 @@ def doubts(
 ) -> tuple[str, ...]:
     """Notes of what contradicts the estimates of some vehicles in any run, and when: five fixes one after the other.
 
-    Receivers that are rejected or filters that are lost: all are farther off than five standard deviations.
+    Receivers that are rejected or filters that are lost: all are beyond the gate of `kernels.gate`.
     Covariances: the mean residual, or a single one in the mean square, is beyond what chance allows. Odometers: the
     fixes move otherwise, again beyond chance. Neighbours: as receivers, of their messages and relative measurements.
 
