@@ -105,7 +105,7 @@ def faulty(kind: str) -> Recording:
     elif kind == "messages":
         gnss[:, when, 3] += [60.0, 0.0, 0.0]
     elif kind == "relative measurements":
-        relative[:, when[links.step] & (links.neighbour == 3), 0] += 30.0
+        relative[:, when[links.step] & (links.neighbour == 3), 0] += 45.0
     return replace(RING, gnss=gnss, velocity=velocity, relative=relative)
 
 

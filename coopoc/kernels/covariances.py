@@ -9,14 +9,14 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
-from .gate import FIX_GATE
+from .gate import FIX_GATE, REJECTED
 from .geometry import direction, five, metres, residuals, with_std
 
 LIMIT = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
 TOGETHER, DOUBT = 5, 36.0
-"""Numbers that are judged together, which are far where all are beyond FIX_GATE; and the square of their normalised
-mean, of three degrees of freedom, that chance does not reach."""
+"""Numbers that are judged together: they are far where all are beyond FIX_GATE, those of neighbours beyond REJECTED of
+it; and the square of their normalised mean, of three degrees of freedom, that chance does not reach."""
 FAR, SURE, SLIPS = 1, 2, 4
 """Marks of steps: numbers are far from estimates, contradict their covariances, or contradict the odometer."""
 
@@ -137,7 +137,7 @@ def mark_fixes(
                     stop = min(t, gnss.shape[1]) if stage == 1 else 0
                     for i in range(first, stop if mark > 0 else 0):
                         marks[k, i] |= mark
-                    for i in range(max(begin, 0), stop if begin >= 0 and slip > DOUBT else 0):
+                    for i in range(max(begin, 0), stop if begin >= 0 and slip > DOUBT and len(velocity) > 0 else 0):
                         marks[k, i] |= SLIPS
                     worst, begin, count, far, total, square, old = max(worst, mean), first, 0, 0, 0.0, 0.0, square
                 stage += 1 if worst > DOUBT / 3 else 2
@@ -196,8 +196,8 @@ def mark_neighbours(
             for c in range(3):
                 message += (gnss[run, t, j, c] - neighbours[run, i, c]) ** 2 / (fix[c] + own)
             seen[j, 0], seen[j, 1] = t, seen[j, 1] + 1
-            seen[j, 3] += message > FIX_GATE
-            seen[j, 4] += q > FIX_GATE
+            seen[j, 3] += message > REJECTED * FIX_GATE
+            seen[j, 4] += q > REJECTED * FIX_GATE
             if seen[j, 1] == TOGETHER:
                 for kind in range(2):
                     for k in range(
