@@ -10,15 +10,13 @@ import numpy as np
 from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
 from .gate import FIX_GATE, REJECTED
-from .geometry import direction, five, metres, residuals, with_std
+from .geometry import direction, five, residuals, with_std
 
 LIMIT = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
 TOGETHER, DOUBT = 5, 36.0
 """Numbers that are judged together: they are far where all are beyond FIX_GATE, those of neighbours beyond REJECTED of
 it; and the square of their normalised mean, of three degrees of freedom, that chance does not reach."""
-FAR, SURE, SLIPS = 1, 2, 4
-"""Marks of steps: numbers are far from estimates, contradict their covariances, or contradict the odometer."""
 
 
 @compiled
@@ -64,95 +62,105 @@ def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
     return found, sound
 
 
-@part
-def travel(velocity: Floats, first: int, stop: int, moved: Floats) -> float:
-    """Add the velocities (T, 3) of some steps; the sum of their squares."""
-    x, y, z, square = 0.0, 0.0, 0.0, 0.0
-    for t in range(first, stop):
-        u, v, w = velocity[t, 0], velocity[t, 1], velocity[t, 2]
-        x, y, z, square = x + u, y + v, z + w, square + u * u + v * v + w * w
-    moved[0], moved[1], moved[2] = moved[0] + x, moved[1] + y, moved[2] + z
-    return square
-
-
 @compiled
-def mark_fixes(
-    gnss: Floats,
-    velocity: Floats,
-    x: Floats,
-    cov: Floats,
-    columns: Ints,
-    noise: Floats,
-    every: int,
-    dt: float,
-    thorough: bool,
-    marks: Ints,
-) -> None:
-    """Mark where TOGETHER fixes, one after the other, contradict estimates (R, T, E, 3) m or the odometer.
+def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Floats, every: int, marks: Ints) -> Floats:
+    """Mark where TOGETHER fixes, one after the other, contradict estimates; the worst square of each vehicle (R, E).
 
     Args:
         gnss: (R, T, N, 3) m, NaN for no fix.
-        velocity: (R, T, N, 3) m/s in the same frame, or of no length.
-        x: estimates.
+        x: (R, T, E, 3) m.
         cov: (R, T, E, 3, 3) m^2, or of no length.
         columns: (E,) of the vehicles.
-        noise: (3, 3) variances of a fix m^2, what is white and what lasts; of a step's motion, relative, what of that
-            lasts, and least m^2.
+        fix: (2, 3) m^2, variances of a fix, what is white and what lasts.
         every: steps from one fix to the next, at least.
-        dt: s.
-        thorough: False looks at the odometer of those alone whose estimates are doubtful.
-        marks: (E, T) out, sums of FAR, SURE and SLIPS.
+        marks: (3, E, T) out, 1 where fixes are far, or else contradict covariances.
     """
-    moved, r, p, e, last = np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3), np.zeros(3)
-    for run in range(gnss.shape[0]):
+    runs, steps = gnss.shape[:2]
+    worst, r, p = np.zeros((runs, len(columns))), np.zeros(3), np.zeros(3)
+    for run in range(runs):
         for k in range(len(columns)):
-            stage, worst = int(thorough), 0.0
-            while stage < 2:
-                at, count, far, total, first, begin, square, old = columns[k], 0, 0, 0.0, 0, -1, 0.0, 0.0
-                moved[:], r[:], p[:], e[:], t, before = 0.0, 0.0, 0.0, 0.0, 0, 0
-                while t < gnss.shape[1]:
-                    now, t = t, t + 1
-                    if math.isnan(gnss[run, now, at, 0]):
-                        continue
-                    if stage == 1 and len(velocity) > 0:
-                        square += dt * dt * travel(velocity[run, :, at], before + 1, t, moved)
-                    q, first, before, t = 0.0, now if count == 0 else first, now, now + every
-                    for c in range(3):
-                        z, own = gnss[run, now, at, c], cov[run, now, k, c, c] if len(cov) > 0 else 0.0
-                        gap = z - x[run, now, k, c]
-                        r[c], p[c], e[c] = r[c] + gap, p[c] + own, e[c] + z - dt * moved[c]
-                        q += gap * gap / (noise[0, c] + noise[1, c] + own)
-                    count, far, total = count + 1, far + int(q > FIX_GATE), total + q
-                    if count < TOGETHER:
-                        continue
-                    mean, slip, steps = 0.0, 0.0, now - begin
-                    walk = (noise[2, 0] + steps * noise[2, 1]) * (square + old) + steps * noise[2, 2]
-                    for c in range(3):
-                        variance = noise[0, c] / TOGETHER + noise[1, c]
-                        mean += (r[c] / TOGETHER) ** 2 / (p[c] / TOGETHER + variance)
-                        slip += ((e[c] - last[c]) / TOGETHER) ** 2 / (2.0 * variance + walk)
-                        last[c], r[c], p[c], e[c] = e[c], 0.0, 0.0, 0.0
-                    mean = max(mean, 2.0 * total / TOGETHER)
-                    mark = FAR if far == TOGETHER else SURE if len(cov) > 0 and mean > DOUBT else 0
-                    stop = min(t, gnss.shape[1]) if stage == 1 else 0
-                    for i in range(first, stop if mark > 0 else 0):
-                        marks[k, i] |= mark
-                    for i in range(max(begin, 0), stop if begin >= 0 and slip > DOUBT and len(velocity) > 0 else 0):
-                        marks[k, i] |= SLIPS
-                    worst, begin, count, far, total, square, old = max(worst, mean), first, 0, 0, 0.0, 0.0, square
-                stage += 1 if worst > DOUBT / 3 else 2
+            count, far, mean, first, t = 0, 0, 0.0, 0, 0
+            r[:], p[:] = 0.0, 0.0
+            while t < steps:
+                now, t, q, square = t, t + 1, 0.0, 0.0
+                if math.isnan(gnss[run, now, columns[k], 0]):
+                    continue
+                first, t = now if count == 0 else first, now + every
+                for c in range(3):
+                    gap = gnss[run, now, columns[k], c] - x[run, now, k, c]
+                    own = cov[run, now, k, c, c] if len(cov) > 0 else 0.0
+                    r[c], p[c], q = r[c] + gap, p[c] + own, q + gap * gap / (fix[0, c] + fix[1, c] + own)
+                count, far, mean = count + 1, far + int(q > FIX_GATE), mean + 2.0 * q / TOGETHER
+                if count < TOGETHER:
+                    continue
+                for c in range(3):
+                    square += r[c] * r[c] / (TOGETHER * (p[c] + fix[0, c] + TOGETHER * fix[1, c]))
+                    r[c] = p[c] = 0.0
+                worst[run, k] = max(worst[run, k], mean, square)
+                kind = int(far < TOGETHER)
+                if kind == 0 or (len(cov) > 0 and max(mean, square) > DOUBT):
+                    for i in range(first, min(t, steps)):
+                        marks[kind, k, i] = 1
+                count, far, mean = 0, 0, 0.0
+    return worst
+
+
+@compiled
+def mark_odometers(
+    gnss: Floats,
+    velocity: Floats,
+    columns: Ints,
+    doubtful: Floats,
+    fix: Floats,
+    motion: tuple[float, float, float],
+    every: int,
+    dt: float,
+    marks: Ints,
+) -> None:
+    """Mark where the way between the means of TOGETHER fixes and of the next ones is not the odometer's.
+
+    Args:
+        gnss: as of `mark_estimates`; columns, fix, every, marks: too.
+        velocity: (R, T, N, 3) m/s in the same frame.
+        doubtful: (R, E), of those above a third of DOUBT it is looked at.
+        motion: variances of a velocity: relative, what of that lasts, and least (m/s)^2.
+        dt: s.
+    """
+    e, last = np.zeros(3), np.zeros(3)
+    for run in range(len(gnss)):
+        for k in range(len(columns)):
+            count, first, begin, after, square, old = 0, 0, -1, 0, 0.0, 0.0
+            moved = np.zeros(3)
+            e[:] = 0.0
+            for t in range(gnss.shape[1] if doubtful[run, k] > DOUBT / 3.0 else 0):
+                z, u, slip = gnss[run, t, columns[k]], velocity[run, t, columns[k]], 0.0
+                for c in range(3 if t > 0 else 0):
+                    moved[c], square = moved[c] + dt * u[c], square + dt * dt * u[c] * u[c]
+                if t < after or math.isnan(z[0]):
+                    continue
+                first, count, after, steps = t if count == 0 else first, count + 1, t + every, t - begin
+                for c in range(3):
+                    e[c] += (z[c] - moved[c]) / TOGETHER
+                if count < TOGETHER:
+                    continue
+                walk = (motion[0] + steps * motion[1]) * (square + old) + steps * dt * dt * motion[2]
+                for c in range(3):
+                    slip += (e[c] - last[c]) ** 2 / (2.0 * (fix[0, c] / TOGETHER + fix[1, c]) + walk)
+                    last[c], e[c] = e[c], 0.0
+                for i in range(max(begin, 0), t + 1 if begin >= 0 and slip > DOUBT else 0):
+                    marks[2, k, i] = 1
+                begin, count, square, old = first, 0, 0.0, square
 
 
 @compiled
 def mark_neighbours(
     gnss: Floats,
     relative: Floats,
-    estimates: Floats,
+    x: Floats,
     cov: Floats,
     neighbours: Floats,
     links: Ints,
     fix: Floats,
-    lasts: float,
     std: Floats,
     every: int,
     marks: Ints,
@@ -162,46 +170,38 @@ def mark_neighbours(
     Args:
         gnss: (R, T, N, 3) m.
         relative: (R, L, 3) m, rad, rad, NaN for none.
-        estimates: (R, T, 3) m of the ego.
+        x: (R, T, 3) m, estimates of the ego.
         cov: (R, T, 3, 3) m^2.
         neighbours: (R, M, 3) m, estimates by link of the ego.
         links: (M, 3) in time order: index among all L, step and neighbour of each.
-        fix: (3,) m^2, variance.
-        lasts: m^2, what of it lasts.
+        fix: (2, 3) m^2, as of `mark_estimates`.
         std: (3,) m, rad, rad.
         every: steps from one to the next, at least.
-        marks: (2, N, T) out, FAR: messages, relative measurements.
+        marks: (2, N, T) out, 1 where they are far: messages, relative measurements.
     """
-    seen = np.zeros((gnss.shape[2], 5), np.int64)
-    for run in range(gnss.shape[0]):
-        seen[:, 0], seen[:, 1] = -every, 0
+    for run in range(len(gnss)):
+        seen = np.zeros((gnss.shape[2], 5), np.int64)
         for i in range(len(links)):
             link, t, j = links[i]
-            x, y, z = less(neighbours[run, i], estimates[run, t])
-            if t < seen[j, 0] + every or math.isnan(x):
+            dx, dy, dz = less(neighbours[run, i], x[run, t])
+            if t < seen[j, 0] or math.isnan(dx):
                 continue
-            if seen[j, 1] == 0:
-                seen[j, 2:] = t, 0, 0
-            polar, p = direction(x, y, z), cov[run, t]
-            measured = with_std(five(relative[run, link, 0], relative[run, link, 1], relative[run, link, 2]), std)
-            gap, size, own = (
-                residuals(measured, polar),
-                metres(polar, measured[5:], 0.0),
-                (p[0, 0] + p[1, 1] + p[2, 2]) / 3.0 + lasts,
-            )
-            q, message = gap[0] * gap[0] / (size[0] * size[0] + own), 0.0
-            q += (polar[0] * polar[3] * gap[1]) ** 2 / (size[1] * size[1] + own)
-            q += (polar[0] * gap[2]) ** 2 / (size[2] * size[2] + own)
-            own += std[0] * std[0] + (polar[0] * std[1]) ** 2
+            d, a, b = relative[run, link]
+            polar, p, message = direction(dx, dy, dz), cov[run, t], 0.0
+            measured, own = with_std(five(d, a, b), std), (p[0, 0] + p[1, 1] + p[2, 2]) / 3.0 + fix[1].mean()
+            gap, reach = residuals(measured, polar), polar[0] * polar[3]
+            q = gap[0] ** 2 / (measured[5] ** 2 + own) + (gap[1] * reach) ** 2 / ((measured[6] * reach) ** 2 + own)
+            q += (gap[2] * polar[0]) ** 2 / ((measured[7] * polar[0]) ** 2 + own)
+            own += std[0] ** 2 + (polar[0] * std[1]) ** 2
             for c in range(3):
-                message += (gnss[run, t, j, c] - neighbours[run, i, c]) ** 2 / (fix[c] + own)
-            seen[j, 0], seen[j, 1] = t, seen[j, 1] + 1
+                message += (gnss[run, t, j, c] - neighbours[run, i, c]) ** 2 / (fix[0, c] + fix[1, c] + own)
+            seen[j, 2] = t if seen[j, 1] == 0 else seen[j, 2]
+            seen[j, 0], seen[j, 1] = t + every, seen[j, 1] + 1
             seen[j, 3] += message > REJECTED * FIX_GATE
             seen[j, 4] += q > REJECTED * FIX_GATE
             if seen[j, 1] == TOGETHER:
                 for kind in range(2):
-                    for k in range(
-                        seen[j, 2], min(t + every, len(estimates[run])) if seen[j, 3 + kind] == TOGETHER else 0
-                    ):
-                        marks[kind, j, k] = FAR
+                    for k in range(seen[j, 2], min(t + every, len(cov[run])) if seen[j, 3 + kind] == TOGETHER else 0):
+                        marks[kind, j, k] = 1
+                    seen[j, 3 + kind] = 0
                 seen[j, 1] = 0

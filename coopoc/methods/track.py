@@ -159,6 +159,12 @@ def far_off(x: Floats, recording: Recording, columns: Sequence[int], limit: floa
 
 SECOND = 1.0
 """s between two numbers that are judged together, at least."""
+DOUBTS = (
+    "fixes, {}: far from its estimates {}; it is lost, or rejects them",
+    "covariances, {}: contradicted by fixes {}",
+    "odometer, {}: contradicted by fixes {}; it slips, or they jump",
+)
+NEIGHBOURS = "messages, {} and {}: far from estimates {}", "relative measurements, {} and {}: far from estimates {}"
 
 
 def doubts(
@@ -188,67 +194,48 @@ def doubts(
     >>> doubts(observe(fleet, Sensors()), [0], np.full((1, 9, 1, 3), 1e3))
     ('fixes, a: far from its estimates from 0 to 4 s; it is lost, or rejects them',)
     """
-    from ..kernels.covariances import FAR, SLIPS, SURE, mark_fixes, mark_neighbours
+    from ..kernels.covariances import DOUBT, mark_estimates, mark_neighbours, mark_odometers
 
     stated = noise_model.sensors if isinstance(noise_model, NoiseModel) else noise_model != "identity"
-    cov = cov if stated else None
-    sensors, links, ids, notes = recording.sensors, recording.links, recording.ids, list[str]()
-    white, velocity = (
-        np.square(sensors.gnss_std),
-        recording.velocity if recording.body is None else np.zeros((0,) * 4),
-    )
-    lasting = np.square(sensors.fix_std) - white + sensors.gnss_bias[1] ** 2
-    turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
-    motion = sensors.velocity_std_ratio**2, turn, (recording.dt * sensors.velocity_floor) ** 2
-    steps = len(recording.t)
-    every, marks = max(min(round(SECOND / recording.dt), steps // 5), 1), np.zeros((len(columns), steps), np.int64)
-    claimed, noise = np.zeros((0,) * 5) if cov is None else cov, np.array([white, lasting, motion])
-    egos = np.asarray(columns, dtype=np.int64)
-    mark_fixes(recording.gnss, velocity, x, claimed, egos, noise, every, recording.dt, neighbours is not None, marks)
-    for k in np.flatnonzero(marks.any(axis=1)).tolist():
-        for mark, text in (
-            (FAR, "fixes, {}: far from its estimates{}; it is lost, or rejects them"),
-            (SURE, "covariances, {}: contradicted by fixes{}"),
-            (SLIPS, "odometer, {}: contradicted by fixes{}; it slips, or they jump"),
-        ):
-            notes += [text.format(ids[egos[k]], when) for when in spans(recording.t, marks[k] & mark)]
-    if cov is None or neighbours is None:
-        return tuple(notes)
+    sensors, egos, steps, dt = recording.sensors, np.asarray(columns, dtype=np.int64), len(recording.t), recording.dt
+    claimed = cov if cov is not None and stated else np.zeros((0,) * 5)
+    fix = np.square([sensors.gnss_std, (sensors.gnss_drift_std, sensors.gnss_common_std, sensors.gnss_bias[1])])
+    fix[1], ids = fix[1].sum(), recording.ids
+    every, marks = max(min(round(SECOND / dt), steps // 5), 1), np.zeros((3, len(egos), steps), np.int64)
+    worst = mark_estimates(recording.gnss, x, claimed, egos, fix, every, marks)
+    if recording.body is None:
+        turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
+        motion = sensors.velocity_std_ratio**2, turn, sensors.velocity_floor**2
+        worst = worst if neighbours is None else np.maximum(worst, DOUBT)
+        mark_odometers(recording.gnss, recording.velocity, egos, worst, fix, motion, every, dt, marks)
+    notes = [DOUBTS[kind].format(ids[egos[k]], when) for kind, k, when in spans(recording.t, marks)]
     first = 0
     for k, ego in enumerate(columns):
-        own = links.of(ego)
-        last, far = first + len(own), np.zeros((2, len(ids), steps), np.int64)
-        rows = np.stack([own, links.step[own], links.neighbour[own]], axis=1)
-        mark_neighbours(
-            recording.gnss,
-            recording.relative,
-            x[:, :, k],
-            cov[:, :, k],
-            neighbours[:, first:last],
-            rows,
-            white + lasting,
-            float(lasting.mean()),
-            np.array([sensors.range_std, sensors.world_azimuth_std, sensors.inclination_std]),
-            2 * every,
-            far,
-        )
-        for kind, j in np.argwhere(far.any(axis=2)).tolist():
-            text = f"{('messages', 'relative measurements')[kind]}, {ids[ego]} and {ids[j]}: far from estimates"
-            notes += [text + when for when in spans(recording.t, far[kind, j])]
-        first = last
+        if neighbours is None or cov is None or not stated:
+            break
+        own, far = recording.links.of(ego), np.zeros((2, len(ids), steps), np.int64)
+        links = np.stack([own, recording.links.step[own], recording.links.neighbour[own]], axis=1)
+        std = np.array([sensors.range_std, sensors.world_azimuth_std, sensors.inclination_std])
+        theirs, first = neighbours[:, first : first + len(own)], first + len(own)
+        arguments = recording.gnss, recording.relative, x[:, :, k], cov[:, :, k], theirs, links, fix, std, 2 * every
+        mark_neighbours(*arguments, far)
+        notes += [NEIGHBOURS[kind].format(ids[ego], ids[j], when) for kind, j, when in spans(recording.t, far)]
     return tuple(notes)
 
 
-def spans(t: Floats, marked: Ints) -> list[str]:
-    """The times t (T,) s of marked steps in words, or nothing.
+def spans(t: Floats, marks: Ints) -> list[tuple[int, int, str]]:
+    """Kind, row and the times t (T,) s in words of all that is marked in (kinds, rows, T).
 
-    >>> spans(np.arange(9.0), np.array([0, 1, 1, 0, 0, 1, 0, 0, 0]))
-    [' from 1 to 2, 5 to 5 s']
+    >>> spans(np.arange(9.0), np.array([[[0, 1, 1, 0, 0, 1, 0, 0, 0]]]))
+    [(0, 0, 'from 1 to 2, 5 to 5 s')]
     """
-    edges = np.flatnonzero(np.diff(marked != 0, prepend=False, append=False))
-    words = [f"{t[a]:.10g} to {t[b - 1]:.10g}" for a, b in zip(edges[::2], edges[1::2], strict=True)]
-    more = f" and {len(words) - 3} times more" if len(words) > 3 else ""
-    return [f" from {', '.join(words[:3])} s{more}"] if words else []
+    found = list[tuple[int, int, str]]()
+    for kind, row in np.argwhere(marks.any(axis=2)).tolist():
+        edges = np.flatnonzero(np.diff(marks[kind, row], prepend=0, append=0))
+        words = [f"{t[a]:.10g} to {t[b - 1]:.10g}" for a, b in zip(edges[::2], edges[1::2], strict=True)]
+        more = f" and {len(words) - 3} times more" if len(words) > 3 else ""
+        found.append((kind, row, f"from {', '.join(words[:3])} s{more}"))
+    return found
 
 
 def silent_track(
