@@ -12,8 +12,9 @@ from torch import Tensor
 from coopoc.arrays import Floats
 from coopoc.errors import InputError, shown
 from coopoc.kernels.compiling.waiting import clock
+from coopoc.methods.doubts import doubts
 from coopoc.methods.stream import Stream
-from coopoc.methods.track import Alone, Track, check_options, doubts, silent_track
+from coopoc.methods.track import Alone, Track, check_options, silent_track
 from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, Vehicles, check_recording
 

@@ -19,7 +19,8 @@ from coopoc.learned import GainNet, LearnedGain, recipes, train_all
 from coopoc.learned.recipes import Recipe
 from coopoc.learned.training.schedule import Schedule
 from coopoc.methods.catalogue import METHODS
-from coopoc.methods.track import doubts, far_off
+from coopoc.methods.doubts import doubts
+from coopoc.methods.track import far_off
 from coopoc.study.tables import lost
 
 FLEET = winding(300, 10.0, 7.0)
@@ -38,7 +39,7 @@ def test_a_filter_that_leaves_the_fixes_says_so_in_its_notes_and_in_the_table() 
     far = np.linalg.norm(track.x - fast.gnss, axis=-1).max() / np.linalg.norm(fast.sensors.gnss_std)
     assert far > 100
     assert far_off(track.x, fast, [0]).all()
-    assert track.notes[0].startswith("fixes, a: far from its estimates from ")
+    assert track.notes[0].startswith("fixes, a: far from its estimates; ")
     assert not far_off(Kalman()(recording).x, recording, [0]).any()
     assert Kalman()(recording).notes == ()
     columns = scored(blind, fast, FLEET.ids, FLEET)
@@ -122,7 +123,7 @@ def faulty(kind: str) -> Recording:
 def test_what_contradicts_a_filter_is_noted_with_its_vehicle_and_time(kind: str, note: str, names: str) -> None:
     for name in names.split():
         (found,) = [each for each in METHODS[name]("nominal")(faulty(kind), [0]).notes if each.startswith(note)]
-        begin, end = re.findall(r"from ([0-9.]+) to .*?([0-9.]+) s", found)[0]
+        begin, end = re.findall(r"\(([0-9.]+) to .*?([0-9.]+) s", found)[0]
         assert 14.0 <= float(begin) <= 31.0, (name, found)
         assert float(end) <= 46.0, (name, found)
 

@@ -130,6 +130,6 @@ def test_divergence_is_reported_and_nan_is_refused() -> None:
     rec = observe(winding(200), Sensors(), runs=2)
     assert LearnedGain(constant(0.1 * np.eye(3)))(rec).notes == ()
     (note,) = LearnedGain(constant(2.05 * np.eye(3)))(rec).notes
-    assert note.startswith("fixes, a: far from its estimates from ")
+    assert note.startswith("fixes, a: far from its estimates; ")
     with refused("not finite in run 0"):
         LearnedGain(constant(1e30 * np.eye(3)))(rec)

@@ -15,8 +15,9 @@ from ..kernels.geometry import components
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, Vehicles, check_recording
+from .doubts import doubts
 from .noise_model import NoiseModel
-from .track import Method, Track, doubts
+from .track import Method, Track
 
 
 class Estimate(NamedTuple):

@@ -19,9 +19,10 @@ from ..world.fleet import Fleet
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.sensors import Sensors
 from .calibration import calibrated, scaled
+from .doubts import doubts
 from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
 from .stream import FilterStream
-from .track import Alone, Checked, Track, check_options, doubts, silent_track
+from .track import Alone, Checked, Track, check_options, silent_track
 
 ASSUMED = Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02)
 """Velocity noise of the paper's training, 10 % per axis, and where the estimate of the fixes' noise starts."""

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints, Limits, check_arrays, check_fields, checked, number, texts
+from ..arrays import Bools, Floats, Limits, check_arrays, check_fields, checked, number, texts
 from ..errors import InputError, shown
 from ..kernels.compiling.waiting import clock
 from ..short_repr import short_repr
@@ -155,87 +155,6 @@ def far_off(x: Floats, recording: Recording, columns: Sequence[int], limit: floa
     gap -= x
     far = np.einsum("...c,...c->...", gap, gap) > limit**2 * np.square(recording.sensors.gnss_std).sum()
     return np.asarray(far.any(axis=1))
-
-
-SECOND = 1.0
-"""s between two numbers that are judged together, at least."""
-DOUBTS = (
-    "fixes, {}: far from its estimates {}; it is lost, or rejects them",
-    "covariances, {}: contradicted by fixes {}",
-    "odometer, {}: contradicted by fixes {}; it slips, or they jump",
-)
-NEIGHBOURS = "messages, {} and {}: far from estimates {}", "relative measurements, {} and {}: far from estimates {}"
-
-
-def doubts(
-    recording: Recording,
-    columns: Sequence[int],
-    x: Floats,
-    cov: Floats | None = None,
-    noise_model: NoiseModel | str = "nominal",
-    neighbours: Floats | None = None,
-) -> tuple[str, ...]:
-    """Notes of what contradicts the estimates of some vehicles in any run, and when: five fixes one after the other.
-
-    Receivers that are rejected or filters that are lost: all are beyond the gate of `kernels.gate`.
-    Covariances: the mean residual, or a single one in the mean square, is beyond what chance allows. Odometers: the
-    fixes move otherwise, again beyond chance. Neighbours: as receivers, of their messages and relative measurements.
-
-    Args:
-        recording: of all vehicles, with the noise that methods know.
-        columns: (E,) of the vehicles.
-        x: (R, T, E, 3) m.
-        cov: (R, T, E, 3, 3) m^2; None if none is claimed.
-        noise_model: of the method; covariances and neighbours are not judged where it states no noise.
-        neighbours: (R, L, 3) m as of Track; None for none.
-
-    >>> from coopoc import Fleet, Sensors, observe
-    >>> fleet = Fleet(("a",), np.arange(9), np.zeros((9, 1, 3)), np.zeros((9, 1, 3)))
-    >>> doubts(observe(fleet, Sensors()), [0], np.full((1, 9, 1, 3), 1e3))
-    ('fixes, a: far from its estimates from 0 to 4 s; it is lost, or rejects them',)
-    """
-    from ..kernels.covariances import DOUBT, mark_estimates, mark_neighbours, mark_odometers
-
-    stated = noise_model.sensors if isinstance(noise_model, NoiseModel) else noise_model != "identity"
-    sensors, egos, steps, dt = recording.sensors, np.asarray(columns, dtype=np.int64), len(recording.t), recording.dt
-    claimed = cov if cov is not None and stated else np.zeros((0,) * 5)
-    fix = np.square([sensors.gnss_std, (sensors.gnss_drift_std, sensors.gnss_common_std, sensors.gnss_bias[1])])
-    fix[1], ids = fix[1].sum(), recording.ids
-    every, marks = max(min(round(SECOND / dt), steps // 5), 1), np.zeros((3, len(egos), steps), np.int64)
-    worst = mark_estimates(recording.gnss, x, claimed, egos, fix, every, marks)
-    if recording.body is None:
-        turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
-        motion = sensors.velocity_std_ratio**2, turn, sensors.velocity_floor**2
-        worst = worst if neighbours is None else np.maximum(worst, DOUBT)
-        mark_odometers(recording.gnss, recording.velocity, egos, worst, fix, motion, every, dt, marks)
-    notes = [DOUBTS[kind].format(ids[egos[k]], when) for kind, k, when in spans(recording.t, marks)]
-    first = 0
-    for k, ego in enumerate(columns):
-        if neighbours is None or cov is None or not stated:
-            break
-        own, far = recording.links.of(ego), np.zeros((2, len(ids), steps), np.int64)
-        links = np.stack([own, recording.links.step[own], recording.links.neighbour[own]], axis=1)
-        std = np.array([sensors.range_std, sensors.world_azimuth_std, sensors.inclination_std])
-        theirs, first = neighbours[:, first : first + len(own)], first + len(own)
-        arguments = recording.gnss, recording.relative, x[:, :, k], cov[:, :, k], theirs, links, fix, std, 2 * every
-        mark_neighbours(*arguments, far)
-        notes += [NEIGHBOURS[kind].format(ids[ego], ids[j], when) for kind, j, when in spans(recording.t, far)]
-    return tuple(notes)
-
-
-def spans(t: Floats, marks: Ints) -> list[tuple[int, int, str]]:
-    """Kind, row and the times t (T,) s in words of all that is marked in (kinds, rows, T).
-
-    >>> spans(np.arange(9.0), np.array([[[0, 1, 1, 0, 0, 1, 0, 0, 0]]]))
-    [(0, 0, 'from 1 to 2, 5 to 5 s')]
-    """
-    found = list[tuple[int, int, str]]()
-    for kind, row in np.argwhere(marks.any(axis=2)).tolist():
-        edges = np.flatnonzero(np.diff(marks[kind, row], prepend=0, append=0))
-        words = [f"{t[a]:.10g} to {t[b - 1]:.10g}" for a, b in zip(edges[::2], edges[1::2], strict=True)]
-        more = f" and {len(words) - 3} times more" if len(words) > 3 else ""
-        found.append((kind, row, f"from {', '.join(words[:3])} s{more}"))
-    return found
 
 
 def silent_track(

@@ -13,9 +13,10 @@ from ..kernels.compiling.waiting import clock
 from ..world.exchange import Exchange, exchange
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import NO_MESSAGE, Message
+from .doubts import doubts
 from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel, resolve
-from .track import Method, Track, doubts
+from .track import Method, Track
 
 if TYPE_CHECKING:
     from ..kernels.fleets.graph import Assumed, Measured, Pairs

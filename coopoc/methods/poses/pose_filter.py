@@ -17,7 +17,8 @@ from ...world.links import wrap
 from ...world.recording import Recording, Vehicles, check_recording
 from ...world.sensors import Sensors
 from ...world.v2x import NO_MESSAGE, Message
-from ..track import Track, check_options, doubts
+from ..doubts import doubts
+from ..track import Track, check_options
 from ..whole_fleet import CENTRE, centre
 from .pose_inputs import (
     POSE,
