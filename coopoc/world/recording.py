@@ -149,7 +149,7 @@ class Recording:
         return any(MEASURED in note for note in self.notes)
 
     @property
-    def doubts(self) -> tuple[str, ...]:
+    def unlikely(self) -> tuple[str, ...]:
         """The notes on what is unlikely, which every track of this recording has, too."""
         return tuple(note for note in self.notes if UNLIKELY in note)
 
