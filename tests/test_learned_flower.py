@@ -185,7 +185,7 @@ def test_bad_answers_are_rejected_and_training_goes_on() -> None:
 
 
 def test_an_extra_record_or_array_is_rejected_and_ends_nothing() -> None:
-    """Flower's own strategies raise InconsistentMessageReplies for all where one reply holds more than the others."""
+    """Where one reply holds more than the others, strategies raise InconsistentMessageReplies for all."""
     from flwr.app import Array, ArrayRecord, ConfigRecord
 
     job, fleet = job_of(TINY), drives(3)
