@@ -175,9 +175,9 @@ def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() ->
 
 
 def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
-    """A fix beyond the gate has q / gate times its variance, one beyond REJECTED gates is left out, until the gains
-    that they would have had, less LEAK of the others', sum to PATIENCE. After 120 fixes that were 60 m off it goes back
-    to a copy of filterpy's state before them, which has only been predicted since."""
+    """As filterpy: a fix beyond the gate has q / gate times its variance, one beyond REJECTED gates is left out, until
+    the gains that they would have had, less LEAK of the others', sum to PATIENCE. After 120 fixes that were 60 m off it
+    goes back to a copy of filterpy's state before them, which has only been predicted since."""
     drive, process, peer = wild_fixes(300)
     gnss = drive.gnss.copy()
     gnss[0, 150:270] += 60.0
