@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -79,7 +80,7 @@ def from_graph(
     one_of("objective", objective, Objective)
     one_of("start", start, Start)
     load(*LIBRARIES)
-    began, notes, factors = clock(), graph.notes, _factors(graph, objective)
+    began, notes, factors = clock(), _counted(graph.notes), _factors(graph, objective)
     poses, relaxed = tuple(np.flatnonzero(graph.is_pose).tolist()), partial(_relaxed, graph, objective, seconds)
     first = {"incremental": "odometry", "relaxed": "apart"}.get(start, start)
     names = contenders(graph) if start == "auto" else (first,)
@@ -105,6 +106,20 @@ def from_graph(
     elif start == "file" and not graph.guess:
         notes = (*notes, "the start is the file's vertices, which may be the truth")
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=notes))
+
+
+def _counted(notes: Sequence[str]) -> tuple[str, ...]:
+    """Notes "place: what" with one for all places of which the same is said.
+
+    >>> _counted(["line 1: was repaired", "line 2: was repaired"])
+    ('2 times, first in line 1: was repaired',)
+    """
+    places: dict[str, list[str]] = {}
+    for note in notes:
+        place, _, what = note.rpartition(": ")
+        places.setdefault(what, []).append(place)
+    first = {what: f"{own[0]}: {what}" if own[0] else what for what, own in places.items()}
+    return tuple(f"{n} times, first in {first[w]}" if (n := len(own)) > 1 else first[w] for w, own in places.items())
 
 
 def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:

@@ -107,7 +107,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     status = Status.INFEASIBLE if infeasible else _status(problem, x, truth)
     if status is Status.FAILED and iterations >= options.get("max_iterations", MAX_ITERATIONS):
         status = Status.MAX_ITERATIONS
-    expected, notes = judged(problem, x, truth.cost)
+    expected, notes = judged(problem, x, truth)
     return Solution(
         x=x,
         covariance=truth.covariance,
@@ -171,6 +171,8 @@ def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:
     """Status of x, by its assessment alone."""
     if truth.violation > FEASIBLE:
         return Status.INFEASIBLE
+    if not np.isfinite(truth.cost):
+        return Status.FAILED
     if truth.unobservable:
         return Status.RANK_DEFICIENT
     still = truth.remaining <= POSITION_TOLERANCE
