@@ -19,7 +19,7 @@ from .model.factor import Factor
 from .model.problem import Problem, Search
 from .model.space import Space
 from .starts.graph_starts import STARTS, chained, contenders, incremental_start, parts, separated, unwound
-from .starts.race import race
+from .starts.race import eased, race
 
 Objective = Literal["chordal", "geodesic"]
 KINDS = {
@@ -64,8 +64,7 @@ def from_graph(
             follows loop closures and measurements between robots, too; "linear" relaxes rotations
             (`convex/chordal.py`); "incremental" solves the first poses of all robots, then more with them
             (`starts/graph_starts.py`); "relaxed" rounds a convex relaxation (`convex/relaxation.py`); "auto" tries all
-            that the graph offers, "file" only where vertices are no truth, and keeps the one that leads lowest
-            (`starts/race.py`). Landmarks are put at their priors, or where the first
+            that the graph offers and keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their priors, or where the first
             pose that measures them sees them, or by ranges. The Solution names the start in extras["start"].
         seconds: limit of the relaxation.
 
@@ -95,15 +94,16 @@ def from_graph(
     won = Search(names[0])
     if start == "auto":
         starts = {name: (lambda: given) if name == names[0] else partial(_x0, graph, poses, name) for name in names}
-        growing = partial(incremental_start, graph) if poses else None
-        last = relaxed if len(graph.names) <= RELAXED else None
-        problem, won = race(problem, starts, growing, last, partial(unwound, graph))
+        late: dict[str, Any] = {"eased": lambda at: eased(at, given)} if poses and len(graph.ranges) else {}
+        late |= {"incremental": lambda _: incremental_start(graph, problem)} if poses else {}
+        late |= {"relaxed": lambda at: (relaxed(at), 0)} if len(graph.names) <= RELAXED else {}
+        problem, won = race(problem, starts, late, partial(unwound, graph))
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
         problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
     elif start == "relaxed":
         problem, won = problem.replace_unchecked(x0=frozen(relaxed(problem))), Search(start)
-    elif start == "file" and not graph.guess:
+    if won.start.startswith("file") and not graph.guess:
         notes = (*notes, "the start is the file's vertices, which may be the truth")
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=notes))
 

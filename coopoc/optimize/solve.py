@@ -44,8 +44,8 @@ def solve(
     """The most probable positions: a minimum of the problem's cost, by the named backend.
 
     Cost, gradient, covariance, status and times are computed here from x alone, independently of the solver; what makes
-    the answer doubtful is in `Solution.notes`. Losses that reject measurements, truncated and Geman-McClure, start by
-    graduated non-convexity where that leads lower than x0.
+    the answer doubtful is in `Solution.notes`. Losses that are not convex start where several
+    lead lowest (`robust/graduated.py`).
 
     Args:
         problem: what to solve.
@@ -94,7 +94,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     solver = backend.solver(problem, options)
     start = _start(problem)
     built, earlier = clock(), problem.search.seconds
-    if any(f.loss is not None and f.loss.redescends for f in problem.factors):
+    if any(f.loss is not None and not f.loss.convex for f in problem.factors):
         problem = robust_start(problem, start)
         assert problem.x0 is not None
         start = problem.x0

@@ -33,6 +33,8 @@ REST = 1e-6
 """m or rad, a step within which a point is stationary."""
 TAIL = 1e-6
 """Probability below which a cost, or one above it, is not explained by the noise that is stated."""
+MANY = 0.25
+"""Share of measurements whose rejection casts doubt on the minimum."""
 REJECTED = 0.5
 """Weight rho' below which a robust loss rejects a measurement."""
 
@@ -341,7 +343,7 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
     """
     unknowns = len(x) * problem.space.dof if problem.movable is None else int(np.count_nonzero(problem.movable))
     robust = [factor for factor in problem.factors if factor.loss is not None]
-    notes, spent, out, pushing = list[str](), 0.0, 0, 0
+    notes, spent, out, pushing, rejected = list[str](), 0.0, 0, 0, list[tuple[str, int, int, str]]()
     if not np.isfinite(truth.cost):
         return np.nan, ("the cost overflows: z, x0 or 1/std is too large",)
     if truth.curved:
@@ -355,8 +357,9 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
         beyond = np.asarray(factor.loss.weight(square)) < REJECTED
         spent, out = spent + 0.5 * float(factor.loss.cost(square[beyond]).sum()), out + factor.size * int(beyond.sum())
         if beyond.any():
-            notes.append(f"{factor.loss.name} loss rejects {beyond.sum()} of {len(square)} measurements {factor.kind}")
+            rejected.append((f"{factor.loss.name} loss", int(beyond.sum()), len(square), f"measurements {factor.kind}"))
     mean, variance = expected(problem, unknowns + out)
+    notes += [rejection(*each, truth.cost - spent, mean) for each in rejected]
     most, spread = expected(problem, out) if pushing else (mean, variance)
     if implausible(truth.cost - spent, most, spread):
         why = "a local minimum (try other x0, or certify it)"
@@ -367,6 +370,16 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
             f"{why}, outliers, or noise that is stated too small"
         )
     return mean + spent, tuple(notes)
+
+
+def rejection(what: str, out: int, of: int, which: str, cost: float, mean: float) -> str:
+    """The note on measurements that are rejected, and on what remains; it begins louder from MANY of them on.
+
+    >>> rejection("GNC", 4, 9, "candidates", 2.5, 3.0)
+    'DOUBTFUL: GNC rejects 4 of 9 candidates; the rest costs 2.5 where the stated noise explains 3'
+    """
+    loud = "DOUBTFUL: " if out >= MANY * of else ""
+    return f"{loud}{what} rejects {out} of {of} {which}; the rest costs {cost:.4g} where the stated noise explains {mean:.3g}"
 
 
 def squared(problem: Problem, factor: Factor, x: Floats) -> Floats:

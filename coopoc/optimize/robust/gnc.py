@@ -9,12 +9,15 @@ import numpy as np
 import numpy.typing as npt
 
 from ...arrays import Floats, instance, one_of
+from ..algebra.sparse import sparse
+from ..assess.assess import REJECTED, rejection
 from ..backend import Backend
 from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status
 from ..solve import solve
+from ..starts.initial import initial_guess
 from .candidates import Candidates, bounds, mark, reweigh, squares
-from .graduated import graduate, surrogate_of
+from .graduated import Graduation, contest, graduate, surrogate_of
 from .loop_closures import known_start
 
 Start = Literal["all", "known"]
@@ -40,8 +43,9 @@ def solve_gnc(
         truncated: w = sqrt(mu (mu + 1)) c/|r| - mu within [0, 1], mu from c^2 / (2 r_max^2 - c^2) up by 1.4 a round
         geman-mcclure: w = (mu c^2 / (r^2 + mu c^2))^2, mu from 2 r_max^2 / c^2 down to 1
 
-    until the weights no longer change, truncated ones at 0 or 1. It needs no good start, but inlier groups that agree
-    better than the others: a majority of consistent outliers wins, and so does an error that all share.
+    until the weights no longer change, truncated ones at 0 or 1. That races with other starts where it rejects any
+    (`graduated.py`), and the least cost wins. Inlier groups must agree better than the others: a majority of consistent
+    outliers wins, and so does an error that all share.
 
     start="known" begins with the known inliers alone, which candidates join where they are predicted
     (`loop_closures.py`), and then alternates with rho itself. Long drives with wrong loop closures need that: the first
@@ -89,20 +93,31 @@ def solve_gnc(
         each.append(solve(weighted, backend, throw=False, covariance=False, **options))
         return each[-1].x
 
+    def finish(at: Floats) -> Graduation:
+        return graduate(problem, marked, bound, surrogate, inner, at, np.ones(len(bound)), surrogate.last)
+
+    def cost(at: Floats) -> float:
+        s = squares(problem, marked, at) / bound
+        spent = np.minimum(s, 1.0) if loss == "truncated" else s / (1.0 + s)
+        return sparse(reweigh(problem, marked, np.zeros(len(bound)), at)).cost(at) + 0.5 * float(bound @ spent)
+
     if start == "known":
         known = known_start(problem, marked, bound, inner)
-        x, weight, before, mu = known.x, known.weight, known.rounds, surrogate.last
+        before, end = known.rounds, graduate(problem, marked, bound, surrogate, inner, known.x, known.weight, surrogate.last)
         extras |= {"joined": known.joined} if known.joined else {}
     else:
-        x, weight, before = inner(problem), np.ones(len(bound)), 0
-        mu = surrogate.first(float((squares(problem, marked, x) / bound).max()))
-    end = graduate(problem, marked, bound, surrogate, inner, x, weight, mu)
+        first = initial_guess(problem)
+        best, x, end = contest(problem, marked, bound, surrogate, inner, first, lambda at: finish(at).x, cost)
+        before, extras["start"] = 0, best
+        end = end if best == "graduated" else finish(x)
     final = solve(reweigh(problem, marked, end.weight, end.x), backend, throw=throw and end.settled, **options)
     extras |= {"weights": end.weight[marked.group], "rounds": before + end.rounds, "mu": float(end.mu)}
     names = ("iterations", "build_seconds", "solve_seconds", "check_seconds")
     work = {name: sum(getattr(s, name) for s in (*each, final)) for name in names}
     status = final.status if end.settled else Status.MAX_ITERATIONS
-    solution = replace(final, extras=final.extras | extras, status=status, **work)
+    out = int((end.weight < REJECTED).sum())
+    notes = (rejection("GNC", out, len(bound), "candidates", final.cost, final.expected),) if out else ()
+    solution = replace(final, extras=final.extras | extras, status=status, notes=(*notes, *final.notes), **work)
     if throw and not end.settled:
         raise SolveError(solution)
     return solution
