@@ -19,7 +19,7 @@ from .model.factor import Factor
 from .model.problem import Problem, Search
 from .model.space import Space
 from .starts.graph_starts import STARTS, chained, contenders, incremental_start, parts, separated, unwound
-from .starts.race import eased, race
+from .starts.race import RELAXED, eased, race
 
 Objective = Literal["chordal", "geodesic"]
 KINDS = {
@@ -30,8 +30,6 @@ KINDS = {
 }
 """Of measurements, by the name of a graph's edges."""
 Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "relaxed", "auto"]
-RELAXED = 400
-"""Nodes up to which "auto" solves a relaxation where no other start leads to a cost that the noise explains."""
 
 
 def read_graph(
@@ -105,7 +103,7 @@ def from_graph(
         problem, won = problem.replace_unchecked(x0=frozen(relaxed(problem))), Search(start)
     if won.start.startswith("file") and not graph.guess:
         notes = (*notes, "the start is the file's vertices, which may be the truth")
-    return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=notes))
+    return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=(*notes, *won.notes)))
 
 
 def _counted(notes: Sequence[str]) -> tuple[str, ...]:

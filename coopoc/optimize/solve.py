@@ -18,7 +18,8 @@ from .model.factor import fused
 from .model.problem import Problem
 from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
-from .starts.initial import initial_guess, somewhere
+from .starts.initial import guessed, somewhere
+from .starts.race import unplaced
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
@@ -44,7 +45,8 @@ def solve(
     """The most probable positions: a minimum of the problem's cost, by the named backend.
 
     Cost, gradient, covariance, status and times are computed here from x alone, independently of the solver; what makes
-    the answer doubtful is in `Solution.notes`. Losses that are not convex start where several
+    the answer doubtful is in `Solution.notes`. Where neither an x0 nor a measurement with a direction places a node,
+    several starts race, and extras["start"] names the one that won. Losses that are not convex start where several
     lead lowest (`robust/graduated.py`).
 
     Args:
@@ -92,7 +94,11 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     load(*LIBRARIES)
     began = clock()
     solver = backend.solver(problem, options)
-    start = _start(problem)
+    start, placed = _start(problem)
+    if not placed and not problem.constraints:
+        problem = unplaced(problem, start)
+        assert problem.x0 is not None
+        start = problem.x0
     built, earlier = clock(), problem.search.seconds
     if any(f.loss is not None and not f.loss.convex for f in problem.factors):
         problem = robust_start(problem, start)
@@ -132,13 +138,14 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     )
 
 
-def _start(problem: Problem) -> Floats:
-    """(n, ambient); InputError if a measurement or a constraint has no derivative there."""
+def _start(problem: Problem) -> tuple[Floats, bool]:
+    """(n, ambient), and whether anything places every node in it; InputError if a measurement or a constraint has no
+    derivative there."""
     if problem.linear and not problem.constraints:
-        return somewhere(problem)
-    start = initial_guess(problem)
+        return somewhere(problem), True
+    start, placed = guessed(problem)
     if not problem.constraints and np.isfinite(sparse(problem).quadratic(start, "gauss-newton")[1]).all():
-        return start
+        return start, placed
     with np.errstate(all="ignore"):
         linear = problem.linearise(start)
     for factor, residual, jacobian in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
@@ -154,7 +161,7 @@ def _start(problem: Problem) -> Floats:
         if bad.any():
             k, row, _ = rows.place[np.flatnonzero(bad)[0]]
             raise _without_direction(problem, problem.constraints[k].kind, problem.constraints[k].nodes[row])
-    return start
+    return start, placed
 
 
 def _without_direction(problem: Problem, kind: str, nodes: Ints) -> InputError:

@@ -9,9 +9,11 @@ import numpy as np
 import numpy.typing as npt
 
 from ...arrays import Floats, instance, one_of
+from ...kernels.compiling.waiting import clock
 from ..algebra.sparse import sparse
 from ..assess.assess import REJECTED, rejection
-from ..backend import Backend
+from ..backend import MAX_ITERATIONS, TOLERANCE, Backend
+from ..descent.levenberg_marquardt import arrive
 from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status
 from ..solve import solve
@@ -59,7 +61,7 @@ def solve_gnc(
         threshold: probability that the residual of an inlier group is within c.
         groups: (M,) labels; measurements with one label share one weight, such as the fixes of one neighbour. Default:
             each on its own.
-        backend: of `solve`, which solves every round.
+        backend: of `solve`, for the last problem, and with constraints for every round.
         throw: as in `solve`.
         start: "all" with full weights, or "known" inliers.
         options: of the backend.
@@ -87,14 +89,20 @@ def solve_gnc(
     instance("problem", problem, Problem)
     marked, surrogate = mark(problem, candidates, groups), surrogate_of(loss, threshold)
     one_of("start", start, Start)
-    bound, each, extras = bounds(problem, marked, threshold), list[Solution](), dict[str, Any]()
+    bound, each, extras, began = bounds(problem, marked, threshold), list[int](), dict[str, Any](), clock()
 
-    def inner(weighted: Problem) -> Floats:
-        each.append(solve(weighted, backend, throw=False, covariance=False, **options))
-        return each[-1].x
+    def inner(part: Problem) -> Floats:
+        if problem.constraints:
+            found = solve(part, backend, throw=False, covariance=False, **options)
+            each.append(found.iterations)
+            return found.x
+        end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, TOLERANCE)
+        each.append(end.iterations)
+        return end.x
 
-    def finish(at: Floats) -> Graduation:
-        return graduate(problem, marked, bound, surrogate, inner, at, np.ones(len(bound)), surrogate.last)
+    def finish(at: Floats, weight: Floats | None = None) -> Graduation:
+        weight = np.ones(len(bound)) if weight is None else weight
+        return graduate(problem, marked, bound, surrogate, inner, at, weight, surrogate.last)
 
     def cost(at: Floats) -> float:
         s = squares(problem, marked, at) / bound
@@ -103,7 +111,7 @@ def solve_gnc(
 
     if start == "known":
         known = known_start(problem, marked, bound, inner)
-        before, end = known.rounds, graduate(problem, marked, bound, surrogate, inner, known.x, known.weight, surrogate.last)
+        before, end = known.rounds, finish(known.x, known.weight)
         extras |= {"joined": known.joined} if known.joined else {}
     else:
         first = initial_guess(problem)
@@ -112,8 +120,8 @@ def solve_gnc(
         end = end if best == "graduated" else finish(x)
     final = solve(reweigh(problem, marked, end.weight, end.x), backend, throw=throw and end.settled, **options)
     extras |= {"weights": end.weight[marked.group], "rounds": before + end.rounds, "mu": float(end.mu)}
-    names = ("iterations", "build_seconds", "solve_seconds", "check_seconds")
-    work = {name: sum(getattr(s, name) for s in (*each, final)) for name in names}
+    spent = clock() - began - final.build_seconds - final.check_seconds
+    work = {"iterations": sum(each) + final.iterations, "solve_seconds": spent}
     status = final.status if end.settled else Status.MAX_ITERATIONS
     out = int((end.weight < REJECTED).sum())
     notes = (rejection("GNC", out, len(bound), "candidates", final.cost, final.expected),) if out else ()

@@ -179,9 +179,9 @@ def _moves(problem: Problem, seen: Ranges, x: Floats, loose: list[Ints]) -> Iter
 
 def across(
     problem: Problem, x: Floats, descend: Callable[[Floats], Floats], cost: Callable[[Floats], float]
-) -> tuple[Floats, int]:
-    """The lowest end (n, ambient) of descents from x and from mirror images of what ranges alone place, and how many
-    moves led down.
+) -> tuple[Floats, int, list[float]]:
+    """The lowest end (n, ambient) of descents from x and from mirror images of what ranges alone place, how many
+    moves led down, and the costs of the other ends.
 
     Args:
         problem: whose ranges, and their losses, place the bodies.
@@ -192,12 +192,15 @@ def across(
     seen, loose, least, count = ranges_of(problem), bodies(problem), cost(x), 0
     if len(loose) == len(problem.names) or not len(seen.nodes):  # nothing to mirror at
         loose = loose if len(loose) > 1 else []
+    rivals = list[float]()
     while count < ROUNDS:
+        rivals = []
         for start in _moves(problem, seen, x, loose):
             end = descend(start)
             if (now := cost(end)) < (1.0 - SAME) * least - 1e-9:
                 x, least, count = end, now, count + 1
                 break
+            rivals.append(now)
         else:
             break
-    return x, count
+    return x, count, rivals

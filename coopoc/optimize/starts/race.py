@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 
 import numpy as np
 
 from ...arrays import Floats, frozen
+from ...errors import InputError
+from ...kernels.compiling.waiting import clock
 from ..algebra.sparse import sparse
 from ..assess.assess import expected
 from ..descent.levenberg_marquardt import Arrival, arrive
 from ..model.factor import Factor, unchecked
 from ..model.problem import Problem, Search
-from .mirrors import across
+from .mirrors import across, scaled
 
 STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
@@ -27,6 +30,10 @@ EXCESS = 5.0
 """Standard deviations above its mean, under the noise that is assumed, from which a cost is not believed."""
 MORE = 50
 """Steps before it is judged."""
+RIVAL = 10.0
+"""Cost by which another minimum may be higher and still be the truth's: 1e-5 of chi-square with one degree."""
+RELAXED = 400
+"""Nodes up to which the convex relaxation of a problem is solved."""
 EASED = (30.0, 10.0, 3.0, 1.0)
 """Times as large standard deviations of ranges."""
 
@@ -54,18 +61,21 @@ def race(
     """
     system, tried, taken, calm = sparse(problem), {}, 0, list[float]()
     mean, variance = expected(problem, system.size)
-    limit, straight = mean + EXCESS * np.sqrt(variance), set[str]()
+    limit, straight, arrived = mean + EXCESS * np.sqrt(variance), set[str](), True
+    minima = list[float]()
 
     def descend(x: Floats) -> Floats:
-        nonlocal taken
+        nonlocal taken, arrived
         end = arrive(system, x, MORE, TOLERANCE)
-        taken += end.iterations
+        taken, arrived = taken + end.iterations, end.converged
         return end.x
 
     def ended(name: str, x: Floats) -> tuple[Problem, Search]:
-        x, moves = across(problem, x, descend, system.cost)
-        name += ", mirrored" if moves else ""
-        return problem.replace_unchecked(x0=frozen(x)), Search(name, taken)
+        x, moves, rivals = across(problem, x, descend, system.cost)
+        name, cost = name + ", mirrored" * (moves > 0), system.cost(x)
+        near = [each for each in (*rivals, *minima) if (1.0 + SAME) * cost < each < cost + RIVAL]
+        notes = (f"another minimum costs {min(near) - cost:.3g} more: noise may decide between them",) if near else ()
+        return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
 
     for name, start in starts.items():
         x = start()
@@ -89,18 +99,39 @@ def race(
             tried = {name: (system.cost(end.x), end.x) for name, end in ends.items()}
             taken += sum(end.iterations for end in ends.values())
             reached |= {name: cost for name, (cost, _) in tried.items()}
+            minima = [cost for name, (cost, _) in tried.items() if ends[name].converged]
             least = min(reached.values())
     name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
     if name not in straight and system.cost(x) > limit and sum(c <= (1.0 + SAME) * least for c in reached.values()) == 1:
         x = descend(x)
         for other, start in late.items():
-            if system.cost(x) <= limit:
+            if arrived and system.cost(x) <= limit:
                 break
             began, steps = start(problem.replace_unchecked(x0=frozen(x)))
             taken += steps
-            end = descend(began)
-            name, x = (other, end) if system.cost(end) < (1.0 - SAME) * system.cost(x) else (name, x)
+            ends = {name: x, other: descend(began)}
+            costs = {each: system.cost(end) for each, end in ends.items()}
+            if max(costs.values()) <= ROUNDS[0][0] * min(costs.values()):
+                ends = {each: descend(end) for each, end in ends.items()}
+            name = other if system.cost(ends[other]) < (1.0 - SAME) * system.cost(ends[name]) else name
+            x = ends[name]
     return ended(name, x)
+
+
+def unplaced(problem: Problem, start: Floats) -> Problem:
+    """A problem of points without an x0 from where its converted measurements (n, d), multidimensional scaling or, if
+    it is small, its convex relaxation leads lowest."""
+    from ..convex.qcqp import TERMS, quadratic
+    from ..convex.relaxation import staircase
+
+    starts = {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}
+    if len(problem.names) <= RELAXED and all(f.kind in TERMS and f.loss is None for f in problem.factors):
+        with suppress(InputError):  # weights that differ between axes
+            quadratic(problem)
+            starts["relaxed"] = lambda: staircase(problem, refine=False).x
+    began = clock()
+    problem, won = race(problem, starts, {}, lambda x: False)
+    return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 
 def eased(problem: Problem, start: Floats) -> tuple[Floats, int]:
