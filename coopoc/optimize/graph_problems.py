@@ -62,8 +62,9 @@ def from_graph(
             follows loop closures and measurements between robots, too; "linear" relaxes rotations
             (`convex/chordal.py`); "incremental" solves the first poses of all robots, then more with them
             (`starts/graph_starts.py`); "relaxed" rounds a convex relaxation (`convex/relaxation.py`); "auto" tries all
-            that the graph offers and keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their priors, or where the first
-            pose that measures them sees them, or by ranges. The Solution names the start in extras["start"].
+            that the graph offers and keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their
+            priors, or where the first pose that measures them sees them, or by ranges. The Solution names the start in
+            extras["start"].
         seconds: limit of the relaxation.
 
     Raises:
@@ -92,7 +93,10 @@ def from_graph(
     won = Search(names[0])
     if start == "auto":
         starts = {name: (lambda: given) if name == names[0] else partial(_x0, graph, poses, name) for name in names}
-        late: dict[str, Any] = {"eased": lambda at: eased(at, given)} if poses and len(graph.ranges) else {}
+        late: dict[str, Any] = {}
+        if not graph.guess and np.isfinite(graph.position).all():
+            late["file"] = lambda _: (_x0(graph, poses, "file"), 0)
+        late |= {"eased": lambda at: eased(at, given)} if poses and len(graph.ranges) else {}
         late |= {"incremental": lambda _: incremental_start(graph, problem)} if poses else {}
         late |= {"relaxed": lambda at: (relaxed(at), 0)} if len(graph.names) <= RELAXED else {}
         problem, won = race(problem, starts, late, partial(unwound, graph))

@@ -379,7 +379,8 @@ def rejection(what: str, out: int, of: int, which: str, cost: float, mean: float
     'DOUBTFUL: GNC rejects 4 of 9 candidates; the rest costs 2.5 where the stated noise explains 3'
     """
     loud = "DOUBTFUL: " if out >= MANY * of else ""
-    return f"{loud}{what} rejects {out} of {of} {which}; the rest costs {cost:.4g} where the stated noise explains {mean:.3g}"
+    rest = f"the rest costs {cost:.4g} where the stated noise explains {mean:.3g}"
+    return f"{loud}{what} rejects {out} of {of} {which}; {rest}"
 
 
 def squared(problem: Problem, factor: Factor, x: Floats) -> Floats:

@@ -120,8 +120,8 @@ def solve_gnc(
         end = end if best == "graduated" else finish(x)
     final = solve(reweigh(problem, marked, end.weight, end.x), backend, throw=throw and end.settled, **options)
     extras |= {"weights": end.weight[marked.group], "rounds": before + end.rounds, "mu": float(end.mu)}
-    spent = clock() - began - final.build_seconds - final.check_seconds
-    work = {"iterations": sum(each) + final.iterations, "solve_seconds": spent}
+    work: dict[str, Any] = {"iterations": sum(each) + final.iterations}
+    work["solve_seconds"] = clock() - began - final.build_seconds - final.check_seconds
     status = final.status if end.settled else Status.MAX_ITERATIONS
     out = int((end.weight < REJECTED).sum())
     notes = (rejection("GNC", out, len(bound), "candidates", final.cost, final.expected),) if out else ()

@@ -142,7 +142,7 @@ def contest(
     ends = {name: finish(at) for name, at in starts.items()}
     costs = {name: np.nan_to_num(cost(at), nan=np.inf) for name, at in ends.items()}
     best = min(ends, key=costs.__getitem__)
-    found, moves, _ = across(cauchy, ends[best], lambda at: finish(soft(at)), cost)
+    found, moves, *_ = across(cauchy, ends[best], lambda at: finish(soft(at)), cost)
     return best + ", mirrored" * (moves > 0), found, graduation
 
 

@@ -206,16 +206,17 @@ STARTS: dict[str, Callable[[Graph], Floats]] = {
 
 
 def contenders(graph: Graph) -> tuple[str, ...]:
-    """The starts that may differ on a graph, cheapest first, and the file's vertices, late where they may be the truth:
-    without loops all are chained odometry."""
-    given = ("file",) if np.isfinite(graph.position).all() else ()
+    """The starts that may differ on a graph, cheapest first: without loops all are chained odometry, but the file's
+    vertices where they are a guess and not the truth."""
+    given = ("file",) if graph.guess and np.isfinite(graph.position).all() else ()
     edges = graph.relative_pose.nodes
     loops = len(edges) + len(graph.relative_point) + len(graph.point_prior) + len(graph.pose_prior)
     moved = len(graph.names) - len(np.setdiff1d(np.flatnonzero(~graph.is_pose), graph.relative_point.nodes[:, -1]))
+    if loops <= moved - 1:
+        return ("odometry", *given)
     own = int(_own(graph).sum())
     closed = len(edges) > own or own > int(graph.is_pose.sum()) - len(graph.robots)
-    others = () if loops <= moved - 1 else ("tree", "linear") if closed else ("linear",)
-    return ("odometry", *given, *others) if graph.guess else ("odometry", *others, *given)
+    return ("odometry", *given, "tree", "linear") if closed else ("odometry", *given, "linear")
 
 
 def unwound(graph: Graph, x: Floats) -> bool:

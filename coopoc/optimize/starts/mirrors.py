@@ -17,8 +17,8 @@ LARGEST = 2000
 """Nodes up to which all shortest paths are taken."""
 SUBSETS = 60
 """Of the ranges of a point, whose spheres are cut."""
-TRIED = 8
-"""Moves that are followed by descents, the most promising first."""
+TRIED = 32
+"""Moves that are followed by descents, of few bodies and the most promising first."""
 NEAR = 10.0
 """Cost, and as many times the cost of its ranges, that a move may add before the others have given way."""
 ROUNDS = 15
@@ -138,7 +138,7 @@ def _elsewhere(problem: Problem, seen: Ranges, x: Floats, body: Ints) -> tuple[f
     own, other = (np.where(side, *seen.nodes[rows].T) for side in (first, ~first))
     places, at = space.position(x[other]), space.position(x[body])
     middle = places.mean(axis=0)
-    normal = np.linalg.svd(places - middle)[2][-1]
+    normal = np.linalg.eigh((places - middle).T @ (places - middle))[1][:, 0]
     flipped = at - 2.0 * np.outer((at - middle) @ normal, normal)
     there = x[body].copy()
     if len(body) == 1:
@@ -159,29 +159,33 @@ def _elsewhere(problem: Problem, seen: Ranges, x: Floats, body: Ints) -> tuple[f
     return float(after - before), there
 
 
-def _moves(problem: Problem, seen: Ranges, x: Floats, loose: list[Ints]) -> Iterator[Floats]:
-    """Points (n, ambient) to descend from: all bodies where they cost less, one after the other, then one at a time."""
-    y, better = x.copy(), 0
-    for body in loose:
-        move = _elsewhere(problem, seen, y, body)
-        if move is not None and move[0] < 0:
-            y[body], better = move[1], better + 1
-    if better:
-        yield y
-    single = [(move, body) for body in loose if (move := _elsewhere(problem, seen, x, body)) is not None]
-    for (adds, there), body in sorted(single, key=lambda each: each[0][0])[:TRIED]:
-        if adds > NEAR * (1.0 + len(seen.nodes) / len(x)):
-            break
+Move = tuple[float, Floats, Ints]
+"""What it adds to the cost of the ranges of a body, its nodes there, and the body."""
+
+
+def _moves(problem: Problem, seen: Ranges, x: Floats, single: list[Move]) -> Iterator[Floats]:
+    """Points (n, ambient) to descend from: all bodies where they cost less, one after the other, then one at a time,
+    and several together."""
+    if any(adds < 0 for adds, _, _ in single):
         y = x.copy()
-        y[body] = there
+        for *_, body in single:
+            if (move := _elsewhere(problem, seen, y, body)) is not None and move[0] < 0:
+                y[body] = move[1]
+        yield y
+    near = [move for move in single if move[0] <= NEAR * (1.0 + len(seen.nodes) / len(x))][:TRIED]
+    together = (chosen for size in range(1, len(near) + 1) for chosen in combinations(near, size))
+    for chosen in islice(together, TRIED):
+        y = x.copy()
+        for _, there, body in chosen:
+            y[body] = there
         yield y
 
 
 def across(
     problem: Problem, x: Floats, descend: Callable[[Floats], Floats], cost: Callable[[Floats], float]
-) -> tuple[Floats, int, list[float]]:
+) -> tuple[Floats, int, list[float], list[Ints]]:
     """The lowest end (n, ambient) of descents from x and from mirror images of what ranges alone place, how many
-    moves led down, and the costs of the other ends.
+    moves led down, the costs of the other ends, and the bodies whose ranges alone hardly tell them from elsewhere.
 
     Args:
         problem: whose ranges, and their losses, place the bodies.
@@ -192,10 +196,12 @@ def across(
     seen, loose, least, count = ranges_of(problem), bodies(problem), cost(x), 0
     if len(loose) == len(problem.names) or not len(seen.nodes):  # nothing to mirror at
         loose = loose if len(loose) > 1 else []
-    rivals = list[float]()
+    rivals, single = list[float](), list[Move]()
     while count < ROUNDS:
+        found = ((_elsewhere(problem, seen, x, body), body) for body in loose)
+        single = sorted(((*move, body) for move, body in found if move is not None), key=lambda move: move[0])
         rivals = []
-        for start in _moves(problem, seen, x, loose):
+        for start in _moves(problem, seen, x, single):
             end = descend(start)
             if (now := cost(end)) < (1.0 - SAME) * least - 1e-9:
                 x, least, count = end, now, count + 1
@@ -203,4 +209,4 @@ def across(
             rivals.append(now)
         else:
             break
-    return x, count, rivals
+    return x, count, rivals, [body for adds, _, body in single if adds <= NEAR]

@@ -71,10 +71,13 @@ def race(
         return end.x
 
     def ended(name: str, x: Floats) -> tuple[Problem, Search]:
-        x, moves, rivals = across(problem, x, descend, system.cost)
+        x, moves, rivals, doubtful = across(problem, x, descend, system.cost)
         name, cost = name + ", mirrored" * (moves > 0), system.cost(x)
         near = [each for each in (*rivals, *minima) if (1.0 + SAME) * cost < each < cost + RIVAL]
         notes = (f"another minimum costs {min(near) - cost:.3g} more: noise may decide between them",) if near else ()
+        if doubtful and not near:
+            names = ", ".join(problem.names[body[0]] for body in doubtful[:5])
+            notes = (f"ranges hardly tell {names} from a mirror image: a lower minimum may exist",)
         return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
 
     for name, start in starts.items():
@@ -85,7 +88,7 @@ def race(
             cost, calm = tried[name][0], [*calm, tried[name][0]]
             alike = sum(abs(cost - other) <= SAME * cost for other in calm) > 1
             if cost <= limit and (alike or unwound(end.x)):
-                return ended(name, end.x)
+                return ended(*next((each, x) for each, (c, x) in tried.items() if abs(c - cost) <= SAME * cost))
             straight |= {name} if end.converged else set()
     reached = {name: cost for name, (cost, _) in tried.items()}
     least = min(reached.values())
@@ -102,19 +105,22 @@ def race(
             minima = [cost for name, (cost, _) in tried.items() if ends[name].converged]
             least = min(reached.values())
     name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
-    if name not in straight and system.cost(x) > limit and sum(c <= (1.0 + SAME) * least for c in reached.values()) == 1:
+    if (
+        name not in straight
+        and system.cost(x) > limit
+        and sum(c <= (1.0 + SAME) * least for c in reached.values()) == 1
+    ):
         x = descend(x)
-        for other, start in late.items():
+        for other, made in late.items():
             if arrived and system.cost(x) <= limit:
                 break
-            began, steps = start(problem.replace_unchecked(x0=frozen(x)))
+            y, steps = made(problem.replace_unchecked(x0=frozen(x)))
             taken += steps
-            ends = {name: x, other: descend(began)}
-            costs = {each: system.cost(end) for each, end in ends.items()}
-            if max(costs.values()) <= ROUNDS[0][0] * min(costs.values()):
-                ends = {each: descend(end) for each, end in ends.items()}
-            name = other if system.cost(ends[other]) < (1.0 - SAME) * system.cost(ends[name]) else name
-            x = ends[name]
+            y = descend(y)
+            costs = system.cost(x), system.cost(y)
+            if max(costs) <= ROUNDS[0][0] * min(costs):
+                x, y = descend(x), descend(y)
+            name, x = (other, y) if system.cost(y) < (1.0 - SAME) * system.cost(x) else (name, x)
     return ended(name, x)
 
 
