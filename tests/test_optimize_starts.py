@@ -58,8 +58,8 @@ def test_ranges_that_are_eased_lead_from_bad_odometry() -> None:
     """As low as from the truth, which the graph does not hold."""
     w, rng = world(2, 2, 2, 250), np.random.default_rng(2)
     pairs = np.sort(rng.integers(0, 500, (500, 2)), axis=1)
-    ranges = w.ranged(pairs[pairs[:, 0] < pairs[:, 1]], 0.2)
-    graph = w.graph(relative_pose=w.relative(w.chain(), 0.3, 0.15), ranges=ranges)
+    moved = w.relative(w.chain(), 0.3, 0.15)
+    graph = w.graph(relative_pose=moved, ranges=w.ranged(pairs[pairs[:, 0] < pairs[:, 1]], 0.2))
     truth = solve(from_graph(graph, start="file"), covariance=False)
     found = solve(from_graph(replace(graph, position=np.full_like(graph.position, np.nan))), covariance=False)
     assert found.extras["start"] == "eased"
