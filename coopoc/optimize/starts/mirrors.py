@@ -75,7 +75,6 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     References:
         Shang, Ruml, Zhang, Fromherz, Localization from mere connectivity, MobiHoc 2003 (MDS-MAP).
     """
-    from scipy.sparse import csr_array
     from scipy.sparse.csgraph import shortest_path
 
     seen, n, d = ranges_of(problem), len(x), x.shape[1]
@@ -83,15 +82,14 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     known = np.setdiff1d(np.arange(n), loose)
     if n > LARGEST or not len(loose):
         return x
-    pairs = np.array([*combinations(known[:50].tolist(), 2)], dtype=np.int64).reshape(-1, 2)
-    moved = [f for f in problem.factors if f.kind == "displacement"]
-    row, column = np.concatenate([seen.nodes, pairs, *(f.nodes for f in moved)]).T
-    gap = [np.linalg.norm(f.z, axis=1) for f in moved]
-    length = np.concatenate([seen.distance, np.linalg.norm(x[pairs[:, 0]] - x[pairs[:, 1]], axis=1), *gap])
-    order = np.argsort(-length, kind="stable")  # of parallel measurements the last, which is the shortest, stays
-    table = np.zeros((n, n))
-    table[row[order], column[order]] = table[column[order], row[order]] = np.maximum(length[order], 1e-9)
-    square = np.square(shortest_path(csr_array(table), directed=False))
+    table, (row, column) = np.full((n, n), np.inf), seen.nodes.T
+    np.minimum.at(table, (row, column), seen.distance)
+    for f in problem.factors:
+        if f.kind == "displacement":
+            np.minimum.at(table, tuple(f.nodes.T), np.linalg.norm(f.z, axis=1))
+    apart = np.linalg.norm(x[known, None] - x[known], axis=2)
+    table[np.ix_(known, known)] = np.where(apart > 0, apart, np.inf)
+    square = np.square(shortest_path(np.minimum(table, table.T), directed=False))
     if not np.isfinite(square).all():
         return x
     square -= square.mean(axis=0)
