@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Floats, Ints, instance
-from ..errors import InputError
+from ..errors import InputError, MissingLibraryError
 from ..kernels.compiling.waiting import clock, load, spent
 from .algebra.sparse import LIBRARIES, sparse
 from .assess.active import constraint_rows
@@ -19,7 +20,8 @@ from .model.problem import Problem
 from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
 from .starts.initial import guessed, somewhere
-from .starts.race import unplaced
+from .starts.mirrors import scaled
+from .starts.race import race
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
@@ -96,7 +98,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     solver = backend.solver(problem, options)
     start, placed = _start(problem)
     if not placed and not problem.constraints:
-        problem = unplaced(problem, start)
+        problem = _unplaced(problem, start)
         assert problem.x0 is not None
         start = problem.x0
     built, earlier = clock(), problem.search.seconds
@@ -136,6 +138,21 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         notes=(*search.notes, *notes),
         extras=found.extras | violated | (search.extras if search.start else {}),
     )
+
+
+def _unplaced(problem: Problem, start: Floats) -> Problem:
+    """A problem of points without an x0 from where its converted measurements (n, d), multidimensional scaling or, where
+    noise does not explain its cost, a small convex relaxation leads lowest."""
+
+    def relaxed(at: Problem) -> tuple[Floats, int]:
+        with suppress(InputError, MissingLibraryError):  # too large, or no such relaxation
+            return require_backend("cvxpy").solver(at, {"refine": False})(at, start).x, 0
+        return start, 0
+
+    starts = {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}
+    began = clock()
+    problem, won = race(problem, starts, {"relaxed": relaxed}, lambda x: False)
+    return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 
 def _start(problem: Problem) -> tuple[Floats, bool]:

@@ -3,19 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from contextlib import suppress
 
 import numpy as np
 
 from ...arrays import Floats, frozen
-from ...errors import InputError
-from ...kernels.compiling.waiting import clock
 from ..algebra.sparse import sparse
 from ..assess.assess import expected
 from ..descent.levenberg_marquardt import Arrival, arrive
 from ..model.factor import Factor, unchecked
 from ..model.problem import Problem, Search
-from .mirrors import across, scaled
+from .mirrors import across
 
 STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
@@ -122,22 +119,6 @@ def race(
                 x, y = descend(x), descend(y)
             name, x = (other, y) if system.cost(y) < (1.0 - SAME) * system.cost(x) else (name, x)
     return ended(name, x)
-
-
-def unplaced(problem: Problem, start: Floats) -> Problem:
-    """A problem of points without an x0 from where its converted measurements (n, d), multidimensional scaling or, if
-    it is small, its convex relaxation leads lowest."""
-    from ..convex.qcqp import TERMS, quadratic
-    from ..convex.relaxation import staircase
-
-    starts = {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}
-    if len(problem.names) <= RELAXED and all(f.kind in TERMS and f.loss is None for f in problem.factors):
-        with suppress(InputError):  # weights that differ between axes
-            quadratic(problem)
-            starts["relaxed"] = lambda: staircase(problem, refine=False).x
-    began = clock()
-    problem, won = race(problem, starts, {}, lambda x: False)
-    return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 
 def eased(problem: Problem, start: Floats) -> tuple[Floats, int]:
