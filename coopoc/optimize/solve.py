@@ -141,8 +141,8 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
 
 
 def _unplaced(problem: Problem, start: Floats) -> Problem:
-    """A problem of points without an x0 from where its converted measurements (n, d), multidimensional scaling or, where
-    noise does not explain its cost, a small convex relaxation leads lowest."""
+    """A problem of points without an x0 from where its converted measurements (n, d) or multidimensional scaling leads
+    lowest, or, where noise does not explain the cost, a small convex relaxation."""
 
     def relaxed(at: Problem) -> tuple[Floats, int]:
         with suppress(InputError, MissingLibraryError):  # too large, or no such relaxation
