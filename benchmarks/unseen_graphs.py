@@ -1,7 +1,12 @@
-"""Graphs that no file holds: kinds of problems that users bring, drawn anew for every seed."""
+"""Graphs that no file holds: kinds of problems that users bring, drawn anew for every seed.
+
+Run:  python benchmarks/unseen_graphs.py 1000 100     (small graphs of so many seeds from the first on, by `solve` and
+                                                      from 50 random starts each)
+"""
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -10,6 +15,10 @@ from hard_graphs import worse_odometry
 
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
 from coopoc.formats.values import to_orientation
+from coopoc.optimize import solve
+from coopoc.optimize.algebra.sparse import sparse
+from coopoc.optimize.descent.levenberg_marquardt import arrive
+from coopoc.optimize.graph_problems import from_graph
 from coopoc.optimize.model.space import exp
 
 
@@ -304,3 +313,51 @@ FAMILIES: dict[str, Callable[[int], Graph]] = {
     "seen once": seen_once,
 }
 """Name -> seed -> graph."""
+
+
+def ranged_drives(seed: int) -> Graph:
+    """Small drives, in the plane or nearly so in space, of one to three robots, whose landmarks are ranged."""
+    rng = np.random.default_rng(seed)
+    d, robots, steps = int(rng.integers(2, 4)), int(rng.integers(1, 4)), int(rng.integers(15, 50))
+    w = world(seed, d, robots, steps, int(rng.integers(1, 5)), size=20.0)
+    if d == 3:
+        w = replace(w, position=w.position * np.r_[1.0, 1.0, 10.0 ** rng.uniform(-2, 0)])
+    drift, noise = 10.0 ** rng.uniform(-2, -0.7), 10.0 ** rng.uniform(-1, 0)
+    pairs = w.to_points(int(rng.integers(8, 60)))
+    if robots > 1:
+        pairs = np.concatenate([pairs, w.near(60, 25.0, others=True)])
+    return w.graph(relative_pose=w.relative(w.chain(), drift, 0.5 * drift), ranges=w.ranged(pairs, noise))
+
+
+def restarted(graph: Graph, restarts: int = 50, seed: int = 0) -> tuple[float, float, tuple[str, ...]]:
+    """The cost of `solve` from the automatic start, the least of descents from random starts, and the notes."""
+    problem = from_graph(graph)
+    found = solve(problem, throw=False)
+    rng, system, space, x0 = np.random.default_rng(seed), sparse(problem), problem.space, np.asarray(problem.x0)
+    wide, costs = 2.0 * np.ptp(graph.position, axis=0).max(), list[float]()
+    for k in range(restarts):
+        x = x0.copy()
+        if k % 2:  # robots where odometry leads, and only landmarks anywhere
+            rows = np.flatnonzero(~graph.is_pose)
+            x[rows, : graph.dimension] = rng.uniform(-wide, wide, (len(rows), graph.dimension))
+        else:
+            turned = exp(np.pi * rng.normal(size=(len(x), 1 if graph.dimension == 2 else 3)))
+            x = space.join(rng.uniform(-wide, wide, (len(x), graph.dimension)), turned)
+            x[list(problem.fixed)] = x0[list(problem.fixed)]
+        costs.append(system.cost(arrive(system, x, 200, 1e-8).x))
+    return found.cost, min(costs), found.notes
+
+
+def main() -> None:
+    """Print how many small graphs end within 1e-4 of the best of random restarts, with and without a note."""
+    first, count = (int(each) for each in (*sys.argv[1:], "1000", "100")[:2])
+    rows = [(seed, *restarted(ranged_drives(seed))) for seed in range(first, first + count)]
+    worse = [row for row in rows if row[1] > row[2] * (1 + 1e-4) + 1e-9]
+    for seed, cost, best, notes in worse:
+        print(f"seed {seed}: {cost:.6g}, and {best:.6g} from a random start: {'; '.join(notes) or 'WITHOUT A NOTE'}")
+    silent = sum(not notes for *_, notes in worse)
+    print(f"{count - len(worse)} of {count} as good, {len(worse) - silent} worse with a note, {silent} without one")
+
+
+if __name__ == "__main__":
+    main()

@@ -12,9 +12,10 @@ from torch import Tensor
 from coopoc.arrays import Floats
 from coopoc.errors import InputError, shown
 from coopoc.kernels.compiling.waiting import clock
+from coopoc.methods.doubts import doubts
 from coopoc.methods.gaps import in_stretches
 from coopoc.methods.stream import Stream
-from coopoc.methods.track import Alone, Track, check_options, lost, silent_track
+from coopoc.methods.track import Alone, Track, check_options, silent_track
 from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, Vehicles, check_recording
 
@@ -71,7 +72,7 @@ class LearnedGain(Alone):
 
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
-        """Estimates of the egos, all runs at once; `notes` count the runs that diverged from the fixes."""
+        """Estimates of the egos, all runs at once; `notes` say where fixes contradict them."""
         began, columns = clock(), check_recording(recording).columns(egos)
         x0, origin = self._x0(recording, columns), recording.gnss[:, :1, columns]
         with one_core(), torch.inference_mode():
@@ -81,7 +82,7 @@ class LearnedGain(Alone):
         fixes, speeds = recording.gnss[:, :, columns], recording.velocity[:, :, columns]
         held = ((fixes == origin) | np.isnan(fixes)).all(axis=(0, 1)) & (speeds == 0.0).all(axis=(0, 1))
         estimates = np.where(held, x0[:, None], estimates)  # a net has no height for a drive in one plane
-        return silent_track(recording, columns, estimates, None, began, lost(estimates, recording, columns, DIVERGED))
+        return silent_track(recording, columns, estimates, None, began, doubts(recording, columns, estimates))
 
     def _lanes(self, recording: Recording, columns: list[int]) -> tuple[Tensor, Tensor, Tensor]:
         """Fixes and velocities (R E, T - 1, 3) and starts (R E, 3) for the net, relative to the first fix."""
@@ -103,7 +104,3 @@ class LearnedGain(Alone):
             allowed = f"must be (R, E, 3) = {fixes.shape} or (E, 3)"
             raise InputError("x0", f"shape {np.shape(self.x0)}", allowed, "Give one position per ego.")
         return np.broadcast_to(self.x0, fixes.shape)
-
-
-DIVERGED = 10.0
-"""Standard deviations, as of `far_off`, beyond which a run of a net without a covariance counts as diverged."""

@@ -141,8 +141,10 @@ def sends(name: str, weights: Tensor, **changes: object) -> Node:
 
 
 def test_bad_answers_are_rejected_and_training_goes_on() -> None:
-    """The rest trains as if the Byzantine clients were not there; the history has the reason for each. Flower's own
-    strategies raise InconsistentMessageReplies for all where one reply holds more than the others."""
+    """The rest trains as if the Byzantine clients were not there; the history has the reason for each.
+
+    Where one reply holds more than the others, strategies raise InconsistentMessageReplies for all.
+    """
     from flwr.app import Array, ArrayRecord, ConfigRecord, Error, Message, RecordDict
 
     job, fleet = job_of(TINY), drives()
@@ -167,6 +169,7 @@ def test_bad_answers_are_rejected_and_training_goes_on() -> None:
     more: list[Callable[[Any], object]] = [
         lambda content: content["arrays"].update(extra=array) if "arrays" in content else None,
         lambda content: content.update(more=ArrayRecord({"theta": array})),
+        lambda content: content.update(more=ConfigRecord({"a": 1})),
         lambda content: content["client"].update(more=1),
         lambda content: content["metrics"].update(more=1.0),
     ]

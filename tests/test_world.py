@@ -88,7 +88,7 @@ def test_float32_is_refused_and_unwrapped_headings_are_not() -> None:
     body = late.body
     assert body is not None
     unwrapped = replace(late, body=Body(body.yaw_rate, np.unwrap(body.heading, axis=1) + 12 * np.pi))
-    assert not late.doubts + unwrapped.doubts
+    assert not late.unlikely + unwrapped.unlikely
     stream = PoseFilter("solo", assumed=S2).start(0.1)
     for heading, fix in zip(t.tolist(), circles[:, 0], strict=True):
         stream.step(OwnMeasurement([9.0, 0.0, 0.0], 1.0, fix, heading))
@@ -100,7 +100,7 @@ def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track() -> None:
     town = load_fleet("town10").between(0, 600)
     world, body = (observe(town, S2, V2X(2), frame=frame, observers=[8]) for frame in ("world", "body"))
     for right in (world, body, observe(town, replace(S2, heading_std=0.1, yaw_rate_bias_std=0.02), frame="body")):
-        assert not right.doubts
+        assert not right.unlikely
     own = body.body
     assert own is not None
     motions = r"contradict each other in \d+ % of the drive: velocities are in m/s"
@@ -114,7 +114,7 @@ def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track() -> None:
         ("azimuth_std is 2 rad, which is 115°", replace(world, sensors=replace(S2, azimuth_std=2.0))),
     ]
     for note, recording in wrong:
-        (doubt,) = recording.doubts
+        (doubt,) = recording.unlikely
         assert re.search(note, doubt)
         method = JointFilter() if recording.body is None else PoseFilter("solo", begin=np.zeros((60, 4)))
         assert {*recording.notes} & {*method(recording, [8]).notes} == {doubt}

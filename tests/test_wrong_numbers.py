@@ -175,24 +175,43 @@ def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() ->
 
 
 def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
-    """A fix beyond the gate has q / gate times its variance, one beyond REJECTED gates is left out, until the gains
-    that they would have had, less LEAK of the others', sum to PATIENCE."""
+    """As filterpy: a fix beyond the gate has q / gate times its variance, one beyond REJECTED gates is left out, until
+    the gains that they would have had, less LEAK of the others', sum to PATIENCE. After 120 fixes that were 60 m off it
+    goes back to a copy of filterpy's state before them, which has only been predicted since."""
     drive, process, peer = wild_fixes(300)
     gnss = drive.gnss.copy()
     gnss[0, 150:270] += 60.0
-    track, hits, used = Kalman()(replace(drive, gnss=gnss), [0]), 0.0, 0
+    track, hits, used, r = Kalman()(replace(drive, gnss=gnss), [0]), 0.0, 0, 12.25
+    copy, evidence, since, returns = None, 0.0, 0.0, list[int]()
     for t in range(1, 300):
-        peer.predict(u=drive.velocity[0, t, 0], Q=np.diag(process[t]))
-        gap, variance = gnss[0, t, 0] - peer.x, np.diag(peer.P)
-        q = float((gap**2 / (variance + 12.25 + gate.SLIP)).sum())
+        z, moved = gnss[0, t, 0], drive.velocity[0, t, 0]
+        peer.predict(u=moved, Q=np.diag(process[t]))
+        gap, variance = z - peer.x, np.diag(peer.P)
+        q = float((gap**2 / (variance + r + gate.SLIP)).sum())
+        gain = float((variance / (variance + r)).mean())
+        since = 0.0 if q > gate.FIX_GATE else since + gain
+        if copy is not None:
+            x, p = copy[0] + 0.1 * moved, copy[1] + process[t]
+            copy, vague = (x, p), p.sum() >= ((x - peer.x) ** 2).sum()
+            other = float(((z - x) ** 2 / (p + r + gate.SLIP)).sum())
+            more = min(q, gate.REJECTED * gate.FIX_GATE) - other
+            evidence = max(evidence + more, 0.0) if other <= gate.FIX_GATE else 0.0
+            if evidence > gate.EVIDENCE * gate.REJECTED * gate.FIX_GATE and not vague:
+                peer.x, peer.P, copy, q, hits = x, np.diag(p), None, other, 0.0
+                returns.append(t)
+            elif q <= gate.FIX_GATE and vague and since > gate.AWAY:
+                copy = None
+        elif q > gate.FIX_GATE:
+            copy, evidence = (peer.x.copy(), variance.copy()), 0.0
         share = max(q / gate.FIX_GATE, 1.0) if hits < gate.PATIENCE else 1.0
-        gain = float((variance / (variance + 12.25)).mean())
         hits = hits + gain if q > gate.FIX_GATE else max(hits - gate.LEAK * gain, 0.0)
         if share <= gate.REJECTED:
             used += share > 1.0 or q > gate.FIX_GATE
-            peer.update(gnss[0, t, 0], R=12.25 * share)
+            peer.update(z, R=r * share)
         np.testing.assert_allclose(track.x[0, t, 0], peer.x, atol=1e-9)
     assert used > 10
+    assert [t for t in returns if t >= 270] == returns[-1:]
+    assert returns[-1] < 285
 
 
 S = co.Sensors(min_range=0.0)

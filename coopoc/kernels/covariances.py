@@ -1,4 +1,5 @@
-"""NEES of a track, e^T P^-1 e by P = L D L^T, and covariances that are none, in one pass each."""
+"""NEES of a track, e^T P^-1 e by P = L D L^T, covariances that are none, and what contradicts a track, in one pass
+each."""
 
 from __future__ import annotations
 
@@ -6,11 +7,16 @@ import math
 
 import numpy as np
 
-from ..arrays import Floats
+from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
+from .gate import FIX_GATE, REJECTED
+from .geometry import direction, five, residuals, with_std
 
 LIMIT = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
+TOGETHER, DOUBT = 5, 36.0
+"""Numbers that are judged together: they are far where all are beyond FIX_GATE, those of neighbours beyond REJECTED of
+it; and the square of their normalised mean, of three degrees of freedom, that chance does not reach."""
 
 
 @compiled
@@ -54,3 +60,148 @@ def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
                     value = np.nan
                 found[run, t, e] = value
     return found, sound
+
+
+@compiled
+def mark_estimates(gnss: Floats, x: Floats, cov: Floats, columns: Ints, fix: Floats, every: int, marks: Ints) -> Floats:
+    """Mark where TOGETHER fixes, one after the other, contradict estimates; the worst square of each vehicle (R, E).
+
+    Args:
+        gnss: (R, T, N, 3) m, NaN for no fix.
+        x: (R, T, E, 3) m.
+        cov: (R, T, E, 3, 3) m^2, or of no length.
+        columns: (E,) of the vehicles.
+        fix: (2, 3) m^2, variances of a fix, what is white and what lasts.
+        every: steps from one fix to the next, at least.
+        marks: (3, E, T) out, 1 where fixes are far, or else contradict covariances.
+    """
+    runs, steps = gnss.shape[:2]
+    worst, r, p = np.zeros((runs, len(columns))), np.zeros(3), np.zeros(3)
+    for run in range(runs):
+        for k in range(len(columns)):
+            count, far, mean, first, t = 0, 0, 0.0, 0, 0
+            r[:], p[:] = 0.0, 0.0
+            while t < steps:
+                now, t, q, square = t, t + 1, 0.0, 0.0
+                if math.isnan(gnss[run, now, columns[k], 0]):
+                    continue
+                first, t = now if count == 0 else first, now + every
+                for c in range(3):
+                    gap = gnss[run, now, columns[k], c] - x[run, now, k, c]
+                    own = cov[run, now, k, c, c] if len(cov) > 0 else 0.0
+                    r[c], p[c], q = r[c] + gap, p[c] + own, q + gap * gap / (fix[0, c] + fix[1, c] + own)
+                count, far, mean = count + 1, far + int(q > FIX_GATE), mean + 2.0 * q / TOGETHER
+                if count < TOGETHER:
+                    continue
+                for c in range(3):
+                    square += r[c] * r[c] / (TOGETHER * (p[c] + fix[0, c] + TOGETHER * fix[1, c]))
+                    r[c] = p[c] = 0.0
+                worst[run, k] = max(worst[run, k], mean, square)
+                kind = int(far < TOGETHER)
+                if kind == 0 or (len(cov) > 0 and max(mean, square) > DOUBT):
+                    for i in range(first, min(t, steps)):
+                        marks[kind, k, i] = 1
+                count, far, mean = 0, 0, 0.0
+    return worst
+
+
+@compiled
+def mark_odometers(
+    gnss: Floats,
+    velocity: Floats,
+    columns: Ints,
+    doubtful: Floats,
+    fix: Floats,
+    motion: tuple[float, float, float],
+    every: int,
+    dt: float,
+    marks: Ints,
+) -> None:
+    """Mark where the way between the means of TOGETHER fixes and of the next ones is not the odometer's.
+
+    Args:
+        gnss: as of `mark_estimates`; columns, fix, every, marks: too.
+        velocity: (R, T, N, 3) m/s in the same frame.
+        doubtful: (R, E), of those above a third of DOUBT it is looked at.
+        motion: variances of a velocity: relative, what of that lasts, and least (m/s)^2.
+        dt: s.
+    """
+    e, last = np.zeros(3), np.zeros(3)
+    for run in range(len(gnss)):
+        for k in range(len(columns)):
+            count, first, begin, after, square, old = 0, 0, -1, 0, 0.0, 0.0
+            moved = np.zeros(3)
+            e[:] = 0.0
+            for t in range(gnss.shape[1] if doubtful[run, k] > DOUBT / 3.0 else 0):
+                z, u, slip = gnss[run, t, columns[k]], velocity[run, t, columns[k]], 0.0
+                for c in range(3 if t > 0 else 0):
+                    moved[c], square = moved[c] + dt * u[c], square + dt * dt * u[c] * u[c]
+                if t < after or math.isnan(z[0]):
+                    continue
+                first, count, after, steps = t if count == 0 else first, count + 1, t + every, t - begin
+                for c in range(3):
+                    e[c] += (z[c] - moved[c]) / TOGETHER
+                if count < TOGETHER:
+                    continue
+                walk = (motion[0] + steps * motion[1]) * (square + old) + steps * dt * dt * motion[2]
+                for c in range(3):
+                    slip += (e[c] - last[c]) ** 2 / (2.0 * (fix[0, c] / TOGETHER + fix[1, c]) + walk)
+                    last[c], e[c] = e[c], 0.0
+                for i in range(max(begin, 0), t + 1 if begin >= 0 and slip > DOUBT else 0):
+                    marks[2, k, i] = 1
+                begin, count, square, old = first, 0, 0.0, square
+
+
+@compiled
+def mark_neighbours(
+    gnss: Floats,
+    relative: Floats,
+    x: Floats,
+    cov: Floats,
+    neighbours: Floats,
+    links: Ints,
+    fix: Floats,
+    std: Floats,
+    every: int,
+    marks: Ints,
+) -> None:
+    """Mark where TOGETHER messages or relative measurements of a neighbour are all far from estimates.
+
+    Args:
+        gnss: (R, T, N, 3) m.
+        relative: (R, L, 3) m, rad, rad, NaN for none.
+        x: (R, T, 3) m, estimates of the ego.
+        cov: (R, T, 3, 3) m^2.
+        neighbours: (R, M, 3) m, estimates by link of the ego.
+        links: (M, 3) in time order: index among all L, step and neighbour of each.
+        fix: (2, 3) m^2, as of `mark_estimates`.
+        std: (3,) m, rad, rad.
+        every: steps from one to the next, at least.
+        marks: (2, N, T) out, 1 where they are far: messages, relative measurements.
+    """
+    for run in range(len(gnss)):
+        seen = np.zeros((gnss.shape[2], 5), np.int64)
+        for i in range(len(links)):
+            link, t, j = links[i]
+            dx, dy, dz = less(neighbours[run, i], x[run, t])
+            if t < seen[j, 0] or math.isnan(dx):
+                continue
+            d, a, b = relative[run, link]
+            polar, p, message = direction(dx, dy, dz), cov[run, t], 0.0
+            measured, own = with_std(five(d, a, b), std), (p[0, 0] + p[1, 1] + p[2, 2]) / 3.0 + fix[1].mean()
+            gap, reach = residuals(measured, polar), polar[0] * polar[3]
+            q = gap[0] ** 2 / (measured[5] ** 2 + own) + (gap[1] * reach) ** 2 / ((measured[6] * reach) ** 2 + own)
+            q += (gap[2] * polar[0]) ** 2 / ((measured[7] * polar[0]) ** 2 + own)
+            own += std[0] ** 2 + (polar[0] * std[1]) ** 2
+            for c in range(3):
+                message += (gnss[run, t, j, c] - neighbours[run, i, c]) ** 2 / (fix[0, c] + fix[1, c] + own)
+            seen[j, 2] = t if seen[j, 1] == 0 else seen[j, 2]
+            seen[j, 0], seen[j, 1] = t + every, seen[j, 1] + 1
+            seen[j, 3] += message > REJECTED * FIX_GATE
+            seen[j, 4] += q > REJECTED * FIX_GATE
+            if seen[j, 1] == TOGETHER:
+                for kind in range(2):
+                    for k in range(seen[j, 2], min(t + every, len(cov[run])) if seen[j, 3 + kind] == TOGETHER else 0):
+                        marks[kind, j, k] = 1
+                    seen[j, 3 + kind] = 0
+                seen[j, 1] = 0

@@ -1,10 +1,15 @@
-"""Innovation gating: a redescending weight of the normalised innovation squared, and release after lock-out.
+"""Innovation gating: a redescending weight of the normalised innovation squared, release after lock-out, and the way
+back.
 
 Many are as many as hold, together, more information than the prediction that contradicts them: the sum of the gains
 that they would have had. A filter that is sure of itself stays so for long, one that has just begun does not.
 
+Whether a receiver or its filter is wrong, no fix tells. So a position is remembered as it was before the first fix that
+contradicted it, moved by the odometer alone; when fixes agree with it again, and no longer with the filter, it is the
+filter's.
+
 A number, or LANES runs side by side. Filters call it where a measurement becomes information; blocks of the
-cooperative filter (`stars.gaussian.weight`) and fixes on roads (`road.correct`) have shapes of their own.
+cooperative filter (`stars.gaussian.weight`) have a shape of their own.
 """
 
 from __future__ import annotations
@@ -30,6 +35,16 @@ placed: the next ones that contradict it are believed. Of a position it is 0, si
 SLIP = 0.25
 """m^2, what wheels that slip, or a speed that was measured too low, may add to an error on each axis: however precise
 fixes are, less is no sign of a wrong one."""
+AWAY = 0.5
+"""Sum of the gains of fixes within the gate from which a filter has gone wherever fixes draw it: a position that is
+remembered as less far away than it is uncertain is then forgotten."""
+EVIDENCE = 2.0
+"""Rejected fixes that it takes to go back: by how much more the squared normalised innovations of the filter are, none
+more than that of a fix that is just rejected, than those of the position that is remembered."""
+NOTHING = 1e30
+"""m^2, variance of a position that is not remembered."""
+FORGET, KEEP, BEGIN, BACK = -1.0, 0.0, 1.0, 2.0
+"""What `remember` returns."""
 Vector = tuple[float, ...]
 
 
@@ -49,6 +64,33 @@ def count(q: float, gate: float, hits: float, gain: float) -> float:
     """Next value of the lock-out counter: the gains of measurements beyond the gate, less LEAK of those within."""
     more: float = choose(q - gate, hits + gain, max(hits - LEAK * gain, 0.0))
     return more
+
+
+@inside
+def remember(
+    q: float, other: float, gate: float, gain: float, apart: float, spread: float, evidence: float, since: float
+) -> tuple[float, float, float]:
+    """What becomes of the position that is remembered, and the next `evidence` and `since`.
+
+    Args:
+        q: squared normalised innovation of a fix; of none 0, and so the next two.
+        other: the same at the position that is remembered.
+        gate: of a fix.
+        gain: that the fix would have had.
+        apart: m^2, squared distance of the two positions.
+        spread: m^2, trace of the covariance of the one that is remembered, NOTHING at least if none is.
+        evidence: for it.
+        since: sum of the gains of fixes since the last beyond the gate.
+    """
+    none, most = 0.0 * q, REJECTED * gate
+    since = choose(q - gate, none, since + gain)
+    evidence = choose(other - gate, none, max(evidence + choose(q - most, most + none, q) - other, none))
+    vague = spread - apart
+    back = choose(vague, KEEP + none, choose(evidence - EVIDENCE * most, BACK + none, KEEP + none))
+    what = choose(vague, choose(since - AWAY, FORGET + none, back), back)
+    begin = choose(q - gate, spread - 0.5 * NOTHING, none)
+    evidence = choose(begin, none, evidence)
+    return choose(begin, BEGIN + none, choose(q - gate, back, what)), evidence, since
 
 
 @inside

@@ -1,8 +1,9 @@
 """Solo Kalman filters on position, axis by axis, with known or adaptively estimated noise of the fixes.
 
-The state of an axis is (x, share, motion, noise, weight, hits): its position m, whose variance is share * noise +
-motion m^2, where `noise` m^2 is the variance of a fix as it is estimated now and `weight` the number of fixes behind
-that estimate; `hits` are those of fixes beyond the gate, the same on all axes.
+The state of an axis is (x, share, motion, noise, weight, hits, before, spread, evidence, since): its position m, whose
+variance is share * noise + motion m^2, where `noise` m^2 is the variance of a fix as it is estimated now and `weight`
+the number of fixes behind that estimate; `hits` are those of fixes beyond the gate, and the rest is the position that
+`gate.remember` is about, m, its variance m^2, and the memory of that; all but these two are the same on all axes.
 With an infinite weight the noise is known, and the filter is the Kalman filter, whose variance is all in `motion`.
 """
 
@@ -17,17 +18,18 @@ from ..arrays import Floats, Ints
 from .compiling.compile import compiled, inside, part
 from .compiling.small import load, store
 from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
-from .gate import REJECTED, SLIP, count, inflation
+from .gate import BACK, BEGIN, KEEP, NOTHING, REJECTED, SLIP, count, inflation, remember
 from .motion import MotionNoise
 
 LEAST = 1e-4
 """m^2, least variance of a fix: 1 cm."""
 NEVER = (0.0, 0.0, 0.0)
 """m^2, what fixes that are not late have more."""
-AxisState: TypeAlias = tuple[float, float, float, float, float, float]
-STATE: AxisState = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
-"""Its length is the count that `load` takes."""
+AxisState: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
+STATE: AxisState = (0.0,) * 7 + (NOTHING, 0.0, 0.0)
+"""Before the first fix; its length is the count that `load` takes."""
 Vector: TypeAlias = tuple[float, float, float]
+Gated: TypeAlias = tuple[float, float, float, float, float, float]
 
 
 class FixNoise(NamedTuple):
@@ -68,35 +70,42 @@ class SoloMeasurements(NamedTuple):
 def start_state(x: float, late: float, exact: bool, variance: float, weight: float) -> AxisState:
     """State at a position that is known exactly, or as uncertain as a fix."""
     if exact:
-        return x, 0.0, 0.0, variance, weight, 0.0
-    if math.isinf(weight):
-        return x, 0.0, variance + late, variance, weight, 0.0
-    return x, 1.0, late, variance, weight, 0.0
+        return x, 0.0, 0.0, variance, weight, 0.0, 0.0, NOTHING, 0.0, 0.0
+    share = 0.0 if math.isinf(weight) else 1.0
+    return x, share, (1.0 - share) * variance + late, variance, weight, 0.0, 0.0, NOTHING, 0.0, 0.0
 
 
 @inside
-def gate_fix(states: Floats, moved: Vector, process: Vector, fix: Vector, late: Vector, gate: float) -> Vector:
-    """Squared normalised innovation of the axes' fix, its factor of their noise, and the hits that follow."""
-    q, gain, hits = 0.0, 0.0, states[0, 5]
+def gate_fix(states: Floats, moved: Vector, process: Vector, fix: Vector, late: Vector, gate: float) -> Gated:
+    """Squared normalised innovation of the axes' fix, its factor of their noise, and the hits that follow; what becomes
+    of the position that is remembered, and its evidence and time."""
+    q, other, gain, apart, spread, hits = 0.0, 0.0, 0.0, 0.0, 0.0, states[0, 5]
     if gate == 0.0:
-        return q, 1.0, hits
+        return q, 1.0, hits, KEEP, 0.0, 0.0
     for c in range(3):
         innovation = fix[c] - states[c, 0] - moved[c]
         if not math.isnan(innovation):
             s = (states[c, 1] + 1.0) * states[c, 3] + states[c, 2] + process[c] + late[c]
             q += innovation * innovation / (s + SLIP)
-    if q <= gate and hits == 0.0:
-        return q, 1.0, 0.0
+    if q <= gate and hits == 0.0 and states[0, 7] >= NOTHING:
+        return q, 1.0, 0.0, KEEP, 0.0, 0.0
     for c in range(3):
+        gap, p = states[c, 6] - states[c, 0], states[c, 7] + process[c]
+        apart, spread = apart + gap * gap, spread + p
         if not math.isnan(fix[c]):
+            innovation = fix[c] - states[c, 6] - moved[c]
+            other += innovation * innovation / (p + states[c, 3] + late[c] + SLIP)
             p = states[c, 1] * states[c, 3] + states[c, 2] + process[c]
             gain += p / (3.0 * (p + states[c, 3] + late[c]))
-    return q, inflation(q, gate, hits), count(q, gate, hits, gain)
+    what, evidence, since = remember(q, other, gate, gain, apart, spread, states[0, 8], states[0, 9])
+    if what == BACK:
+        return other, 1.0, 0.0, what, 0.0, 0.0
+    return q, inflation(q, gate, hits), count(q, gate, hits, gain), what, evidence, since
 
 
 @inside
 def step(
-    state: AxisState, moved: float, process: float, fix: float, late: float, rule: FixNoise, gated: Vector
+    state: AxisState, moved: float, process: float, fix: float, late: float, rule: FixNoise, gated: Gated
 ) -> AxisState:
     """Predict x += dt u, p += q; where there is a fix z, estimate its noise r and update in Joseph's form.
 
@@ -105,23 +114,30 @@ def step(
     one that is not.
     x += k (z - x), k = p / (p + f r), p = (1 - k)^2 p + k^2 f r.
     """
-    (x, share, motion, noise, weight, _), (q, f, hits) = state, gated
-    x, motion = x + moved, motion + process
-    if math.isnan(fix):
-        return x, share, motion, noise, weight, hits
-    p, innovation = share * noise + motion, fix - x
-    if math.isfinite(weight):
-        weight = min(weight + 1.0, rule.window)
-        within = min(1.0, REJECTED * rule.gate / q) if f > 1.0 else 1.0
-        noise = max(noise + (within * innovation * innovation - p - noise) / weight, LEAST)
-        p = share * noise + motion
-    if math.isinf(f):
-        return x, share, motion, noise, weight, hits
-    k = p / (p + f * (noise + late))
-    x, rest, own = x + k * innovation, (1.0 - k) * (1.0 - k), k * k * f
-    if math.isinf(weight):
-        return x, 0.0, rest * p + own * (noise + late), noise, weight, hits
-    return x, rest * share + own, rest * motion + own * late, noise, weight, hits
+    (x, share, motion, noise, weight, _, before, spread, _, _), (q, f, hits, what, evidence, since) = state, gated
+    x, motion, before, spread = x + moved, motion + process, before + moved, spread + process
+    if what == BEGIN:
+        before, spread = x, share * noise + motion
+    elif what != KEEP:
+        if what == BACK:
+            x, share, motion = before, 0.0, spread
+        spread = NOTHING
+    known = math.isinf(weight)
+    if not math.isnan(fix):
+        p, innovation = share * noise + motion, fix - x
+        if not known:
+            weight = min(weight + 1.0, rule.window)
+            within = min(1.0, REJECTED * rule.gate / q) if f > 1.0 else 1.0
+            noise = max(noise + (within * innovation * innovation - p - noise) / weight, LEAST)
+            p = share * noise + motion
+        if not math.isinf(f):
+            k = p / (p + f * (noise + late))
+            x, rest, own = x + k * innovation, (1.0 - k) * (1.0 - k), k * k * f
+            if known:
+                motion = rest * p + own * (noise + late)
+            else:
+                share, motion = rest * share + own, rest * motion + own * late
+    return x, share, motion, noise, weight, hits, before, spread, evidence, since
 
 
 @compiled
@@ -141,7 +157,7 @@ def run_filter(
         p: the same.
     """
     varies = math.isfinite(rule.weight) or rule.gate > 0.0
-    noise, states = np.empty(x.shape if varies else (0, 0, 0, 3)), np.empty((len(measurements.columns), 3, 6))
+    noise, states = np.empty(x.shape if varies else (0, 0, 0, 3)), np.empty((len(measurements.columns), 3, len(STATE)))
     filter_runs(measurements, rule, exact, index, states, x, p, noise)
     return noise
 
@@ -188,7 +204,7 @@ def stream_step(given: Floats, state: Floats, history: Floats, noise: Floats, an
 
     Args:
         given: (8,) fix m, velocity m/s, dt s, age of the fix s.
-        state: (3, 6).
+        state: (3, 10).
         history: of `motion`.
         noise: (15,) the numbers of a MotionNoise and a FixNoise: to hand over tuples takes longer than the step.
         answer: (12,) position m, covariance m^2.

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..arrays import Floats
 from ..kernels.stars.lkf_sa import run_lkf_sa
-from ..kernels.stars.pseudo_fixes import run_msmv
+from ..kernels.stars.pseudo_fixes import run_intersection
 from ..world.inbox import Inbox
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import ESTIMATE, ESTIMATE_AND_COV, FIX_AND_VELOCITY, Message
@@ -94,7 +94,7 @@ class MSMV(Checked):
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
             assumed = assumptions(recording, known, ego, box)
             assumed = assumed._replace(broadcast=p, growth=(0.0, 1.0), acceleration=0.0)
-            yield Estimate(*run_msmv(measurements(recording, ego, box, x), assumed))
+            yield Estimate(*run_intersection(measurements(recording, ego, box, x), assumed, False, False, True))
 
         return follow_egos(self, recording, egos, run, (*known.notes, RECONSTRUCTION))
 

@@ -68,6 +68,6 @@ class CovarianceIntersection(Checked):
 
         def run(ego: int, box: Inbox) -> Iterator[Estimate]:
             assumed = assumptions(recording, known, ego, box)._replace(broadcast=p, growth=ESTIMATE_GROWTH)
-            yield Estimate(*run_intersection(measurements(recording, ego, box, x), assumed, self.split, gates))
+            yield Estimate(*run_intersection(measurements(recording, ego, box, x), assumed, self.split, gates, False))
 
         return follow_egos(self, recording, egos, run, known.notes)

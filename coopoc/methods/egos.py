@@ -15,11 +15,9 @@ from ..kernels.geometry import components
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, Vehicles, check_recording
+from .doubts import doubts
 from .noise_model import NoiseModel
 from .track import Method, Track
-
-BEYOND = 10.0
-"""Standard deviations of a fix (norm of its axes) that no estimate is away from it at half of the steps."""
 
 
 class Estimate(NamedTuple):
@@ -69,7 +67,8 @@ def follow_egos(
                 for name, values in found.extras.items():
                     extras.setdefault(name, []).append(values)
                 bar.update(1 if isinstance(found.step, int) else len(recording.t[found.step]))
-    notes = (*notes, *contradicted(x, recording, columns), *recording.doubts)
+    stated = getattr(method, "noise_model", "nominal")
+    notes = (*notes, *doubts(recording, columns, x, cov, stated, neighbours))
     for array in (x, cov, neighbours):
         array.flags.writeable = False  # so that the Track need not copy them
     seconds = clock() - began
@@ -77,24 +76,6 @@ def follow_egos(
     return Track(
         recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, notes, extras=whole, ids=recording.ids
     )
-
-
-def contradicted(x: Floats, recording: Recording, columns: Sequence[int]) -> tuple[str, ...]:
-    """A note if estimates (R, T, E, 3) m lie far from the egos' fixes at half of the steps that have one.
-
-    >>> from coopoc import Fleet, Sensors, observe
-    >>> fleet = Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))
-    >>> contradicted(np.full((1, 2, 1, 3), 1e3), observe(fleet, Sensors()), [0])[0][:58]
-    'estimates are over 26 m from most fixes in 1 of 1 runs: di'
-    """
-    noise = recording.sensors
-    limit = BEYOND * (float(np.linalg.norm(noise.fix_std)) + noise.gnss_bias[1])
-    gap = np.square(recording.gnss[:, :, columns] - x).sum(axis=-1)
-    far, known = (gap > limit**2).sum(axis=1), np.isfinite(gap).sum(axis=1)
-    if not (lost := int((2 * far > known).sum())):
-        return ()
-    why = "diverged, or fixes are worse than stated; covariances say nothing there"
-    return (f"estimates are over {limit:.2g} m from most fixes in {lost} of {far.size} runs: {why}",)
 
 
 def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats | None = None) -> Measurements:

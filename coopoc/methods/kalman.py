@@ -19,10 +19,11 @@ from ..world.fleet import Fleet
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.sensors import Sensors
 from .calibration import calibrated, scaled
+from .doubts import doubts
 from .gaps import in_stretches
 from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
 from .stream import FilterStream
-from .track import Alone, Checked, Track, check_options, lost, silent_track
+from .track import Alone, Checked, Track, check_options, silent_track
 
 ASSUMED = Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02)
 """Velocity noise of the paper's training, 10 % per axis, and where the estimate of the fixes' noise starts."""
@@ -80,7 +81,7 @@ class Kalman(Alone, Checked):
         columns = check_recording(recording).columns(egos)
         known = resolve(self.noise_model, recording, relative=False)
         x, p, _ = solo_filter(recording, columns, known, fix_noise(known, self.robust), self.x0)
-        return solo_track(recording, columns, x, p, began)
+        return solo_track(recording, columns, x, p, began, noise_model=known)
 
     def start(
         self, x0: npt.ArrayLike | None = None, *, interval: float | None = None, history: float = 10.0
@@ -203,12 +204,19 @@ def fix_noise(noise_model: NoiseModel, robust: bool) -> FixNoise:
 
 
 def solo_track(
-    recording: Recording, columns: Sequence[int], x: Floats, p: Floats, began: float, notes: tuple[str, ...] = ()
+    recording: Recording,
+    columns: Sequence[int],
+    x: Floats,
+    p: Floats,
+    began: float,
+    notes: tuple[str, ...] = (),
+    noise_model: NoiseModel | str = "nominal",
 ) -> Track:
     """Track of a solo filter with the variances p (R, T, E, 3) m^2; it receives and sends nothing."""
     cov = np.zeros((*p.shape, 3))
     np.einsum("...ii->...i", cov)[:] = p
-    return silent_track(recording, columns, x, cov, began, (*notes, *lost(x, recording, columns)))
+    notes = (*notes, *doubts(recording, columns, x, cov, noise_model))
+    return silent_track(recording, columns, x, cov, began, notes)
 
 
 def solo_filter(

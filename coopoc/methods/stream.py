@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ..arrays import Floats
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.motion import MotionNoise
-from ..kernels.solo import FixNoise, stream_step
+from ..kernels.solo import STATE, FixNoise, stream_step
 from .motion_history import MotionHistory, three
 
 State = TypeVar("State")
@@ -86,10 +86,14 @@ class FilterStream:
 
     def __init__(self, motion: MotionNoise, fixes: FixNoise, x0: npt.ArrayLike | None, history: float) -> None:
         self.history = MotionHistory(history)
-        self._state, self._given, self._noise = np.full((3, 6), np.nan), np.zeros(8), np.hstack((*motion, *fixes))
+        self._state, self._given, self._noise = (
+            np.full((3, len(STATE)), np.nan),
+            np.zeros(8),
+            np.hstack((*motion, *fixes)),
+        )
         if x0 is not None:
-            zero, weight = np.zeros(3), np.full(3, fixes.weight)
-            self._state[:] = np.stack([three("x0", x0), zero, zero, fixes.variance, weight, zero], axis=1)
+            self._state[:] = STATE
+            self._state[:, 0], self._state[:, 3], self._state[:, 4] = three("x0", x0), fixes.variance, fixes.weight
 
     @property
     def state(self) -> AxisStates | None:

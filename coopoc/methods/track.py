@@ -180,13 +180,6 @@ def far_off(x: Floats, recording: Recording, columns: Sequence[int], limit: floa
     return np.asarray(far.any(axis=1))
 
 
-def lost(x: Floats, recording: Recording, columns: Sequence[int], limit: float = FAR) -> tuple[str, ...]:
-    """A note of the runs whose estimates are `far_off`; none if none is."""
-    found = far_off(x, recording, columns, limit)
-    far = limit * float(np.linalg.norm(recording.sensors.gnss_std))
-    return (f"diverged in {found.sum()} of {found.size} runs (over {far:.0f} m from the fix)",) if found.any() else ()
-
-
 def silent_track(
     recording: Recording,
     columns: Sequence[int],
@@ -198,7 +191,7 @@ def silent_track(
 ) -> Track:
     """Track of a method that receives and sends nothing."""
     none = np.zeros((recording.runs, len(columns)))
-    took, notes = clock() - began, notes + recording.doubts
+    took, notes = clock() - began, (*dict.fromkeys(notes + recording.unlikely),)
     return Track(recording.t, tuple(columns), x, cov, none, none, took, notes=notes, ids=recording.ids, **more)
 
 

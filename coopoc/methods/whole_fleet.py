@@ -13,7 +13,7 @@ from ..kernels.compiling.waiting import clock
 from ..world.exchange import Exchange, exchange
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.v2x import NO_MESSAGE, Message
-from .egos import contradicted
+from .doubts import doubts
 from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel, resolve
 from .track import Method, Track
@@ -99,16 +99,16 @@ def fleet_track(
         )
         assumed = assumed._replace(process=process, fix=fix)
         x, cov = fuse_delayed(latest, x.reshape(*shape[:2], -1), cov.reshape(*shape[:2], -1), own, assumed)
-    x = x.reshape(*shape, 3)
+    x, cov = x.reshape(*shape, 3), cov.reshape(*shape, 3, 3)
     return Track(
         recording.t,
         tuple(columns),
         x,
-        cov.reshape(*shape, 3, 3),
+        cov,
         met.received_bytes[:, columns],
         met.sent_bytes[:, columns],
         clock() - began,
-        notes=model.notes + answer.notes + contradicted(x, recording, columns) + recording.doubts,
+        notes=model.notes + answer.notes + doubts(recording, columns, x, cov, model),
         ids=recording.ids,
     )
 

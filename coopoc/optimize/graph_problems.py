@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -18,7 +19,7 @@ from .model.factor import Factor
 from .model.problem import Problem, Search
 from .model.space import Space
 from .starts.graph_starts import STARTS, chained, contenders, incremental_start, parts, separated, unwound
-from .starts.race import race
+from .starts.race import RELAXED, eased, race
 
 Objective = Literal["chordal", "geodesic"]
 KINDS = {
@@ -29,8 +30,6 @@ KINDS = {
 }
 """Of measurements, by the name of a graph's edges."""
 Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "relaxed", "auto"]
-RELAXED = 400
-"""Nodes up to which "auto" solves a relaxation where no other start leads to a cost that the noise explains."""
 
 
 def read_graph(
@@ -63,9 +62,9 @@ def from_graph(
             follows loop closures and measurements between robots, too; "linear" relaxes rotations
             (`convex/chordal.py`); "incremental" solves the first poses of all robots, then more with them
             (`starts/graph_starts.py`); "relaxed" rounds a convex relaxation (`convex/relaxation.py`); "auto" tries all
-            that the graph offers, "file" only where vertices are no truth, and keeps the one that leads lowest
-            (`starts/race.py`). Landmarks are put at their priors, or where the first
-            pose that measures them sees them, or by ranges. The Solution names the start in extras["start"].
+            that the graph offers and keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their
+            priors, or where the first pose that measures them sees them, or by ranges. The Solution names the start in
+            extras["start"].
         seconds: limit of the relaxation.
 
     Raises:
@@ -79,7 +78,7 @@ def from_graph(
     one_of("objective", objective, Objective)
     one_of("start", start, Start)
     load(*LIBRARIES)
-    began, notes, factors = clock(), graph.notes, _factors(graph, objective)
+    began, notes, factors = clock(), _counted(graph.notes), _factors(graph, objective)
     poses, relaxed = tuple(np.flatnonzero(graph.is_pose).tolist()), partial(_relaxed, graph, objective, seconds)
     first = {"incremental": "odometry", "relaxed": "apart"}.get(start, start)
     names = contenders(graph) if start == "auto" else (first,)
@@ -94,17 +93,35 @@ def from_graph(
     won = Search(names[0])
     if start == "auto":
         starts = {name: (lambda: given) if name == names[0] else partial(_x0, graph, poses, name) for name in names}
-        growing = partial(incremental_start, graph) if poses else None
-        last = relaxed if len(graph.names) <= RELAXED else None
-        problem, won = race(problem, starts, growing, last, partial(unwound, graph))
+        late: dict[str, Any] = {}
+        if not graph.guess and np.isfinite(graph.position).all():
+            late["file"] = lambda _: (_x0(graph, poses, "file"), 0)
+        late |= {"eased": lambda at: eased(at, given)} if poses and len(graph.ranges) else {}
+        late |= {"incremental": lambda _: incremental_start(graph, problem)} if poses else {}
+        late |= {"relaxed": lambda at: (relaxed(at), 0)} if len(graph.names) <= RELAXED else {}
+        problem, won = race(problem, starts, late, partial(unwound, graph))
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
         problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
     elif start == "relaxed":
         problem, won = problem.replace_unchecked(x0=frozen(relaxed(problem))), Search(start)
-    elif start == "file" and not graph.guess:
+    if won.start.startswith("file") and not graph.guess:
         notes = (*notes, "the start is the file's vertices, which may be the truth")
-    return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=notes))
+    return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=(*notes, *won.notes)))
+
+
+def _counted(notes: Sequence[str]) -> tuple[str, ...]:
+    """Notes "place: what" with one for all places of which the same is said.
+
+    >>> _counted(["line 1: was repaired", "line 2: was repaired"])
+    ('2 times, first in line 1: was repaired',)
+    """
+    places: dict[str, list[str]] = {}
+    for note in notes:
+        place, _, what = note.rpartition(": ")
+        places.setdefault(what, []).append(place)
+    first = {what: f"{own[0]}: {what}" if own[0] else what for what, own in places.items()}
+    return tuple(f"{n} times, first in {first[w]}" if (n := len(own)) > 1 else first[w] for w, own in places.items())
 
 
 def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:

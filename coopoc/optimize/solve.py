@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import replace
 from typing import Any
 
 import numpy as np
 
 from ..arrays import Floats, Ints, instance
-from ..errors import InputError
+from ..errors import InputError, MissingLibraryError
 from ..kernels.compiling.waiting import clock, load, spent
 from .algebra.sparse import LIBRARIES, sparse
 from .assess.active import constraint_rows
@@ -18,7 +19,9 @@ from .model.factor import fused
 from .model.problem import Problem
 from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
-from .starts.initial import initial_guess, somewhere
+from .starts.initial import guessed, somewhere
+from .starts.mirrors import scaled
+from .starts.race import race
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
@@ -44,8 +47,9 @@ def solve(
     """The most probable positions: a minimum of the problem's cost, by the named backend.
 
     Cost, gradient, covariance, status and times are computed here from x alone, independently of the solver; what makes
-    the answer doubtful is in `Solution.notes`. Losses that reject measurements, truncated and Geman-McClure, start by
-    graduated non-convexity where that leads lower than x0.
+    the answer doubtful is in `Solution.notes`. Where neither an x0 nor a measurement with a direction places a node,
+    several starts race, and extras["start"] names the one that won. Losses that are not convex start where several
+    lead lowest (`robust/graduated.py`).
 
     Args:
         problem: what to solve.
@@ -92,9 +96,13 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     load(*LIBRARIES)
     began = clock()
     solver = backend.solver(problem, options)
-    start = _start(problem)
+    start, placed = _start(problem)
+    if not placed and not problem.constraints:
+        problem = _unplaced(problem, start)
+        assert problem.x0 is not None
+        start = problem.x0
     built, earlier = clock(), problem.search.seconds
-    if any(f.loss is not None and f.loss.redescends for f in problem.factors):
+    if any(f.loss is not None and not f.loss.convex for f in problem.factors):
         problem = robust_start(problem, start)
         assert problem.x0 is not None
         start = problem.x0
@@ -107,7 +115,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     status = Status.INFEASIBLE if infeasible else _status(problem, x, truth)
     if status is Status.FAILED and iterations >= options.get("max_iterations", MAX_ITERATIONS):
         status = Status.MAX_ITERATIONS
-    expected, notes = judged(problem, x, truth.cost)
+    expected, notes = judged(problem, x, truth)
     return Solution(
         x=x,
         covariance=truth.covariance,
@@ -132,13 +140,29 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     )
 
 
-def _start(problem: Problem) -> Floats:
-    """(n, ambient); InputError if a measurement or a constraint has no derivative there."""
+def _unplaced(problem: Problem, start: Floats) -> Problem:
+    """A problem of points without an x0 from where its converted measurements (n, d) or multidimensional scaling leads
+    lowest, or, where noise does not explain the cost, a small convex relaxation."""
+
+    def relaxed(at: Problem) -> tuple[Floats, int]:
+        with suppress(InputError, MissingLibraryError):  # too large, or no such relaxation
+            return require_backend("cvxpy").solver(at, {"refine": False})(at, start).x, 0
+        return start, 0
+
+    starts = {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}
+    began = clock()
+    problem, won = race(problem, starts, {"relaxed": relaxed}, lambda x: False)
+    return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
+
+
+def _start(problem: Problem) -> tuple[Floats, bool]:
+    """(n, ambient), and whether anything places every node in it; InputError if a measurement or a constraint has no
+    derivative there."""
     if problem.linear and not problem.constraints:
-        return somewhere(problem)
-    start = initial_guess(problem)
+        return somewhere(problem), True
+    start, placed = guessed(problem)
     if not problem.constraints and np.isfinite(sparse(problem).quadratic(start, "gauss-newton")[1]).all():
-        return start
+        return start, placed
     with np.errstate(all="ignore"):
         linear = problem.linearise(start)
     for factor, residual, jacobian in zip(problem.factors, linear.residual, linear.jacobian, strict=True):
@@ -154,7 +178,7 @@ def _start(problem: Problem) -> Floats:
         if bad.any():
             k, row, _ = rows.place[np.flatnonzero(bad)[0]]
             raise _without_direction(problem, problem.constraints[k].kind, problem.constraints[k].nodes[row])
-    return start
+    return start, placed
 
 
 def _without_direction(problem: Problem, kind: str, nodes: Ints) -> InputError:
@@ -171,6 +195,8 @@ def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:
     """Status of x, by its assessment alone."""
     if truth.violation > FEASIBLE:
         return Status.INFEASIBLE
+    if not np.isfinite(truth.cost):
+        return Status.FAILED
     if truth.unobservable:
         return Status.RANK_DEFICIENT
     still = truth.remaining <= POSITION_TOLERANCE

@@ -14,7 +14,7 @@ from ..errors import InputError, shown
 from ..short_repr import short_repr
 from .fleet import clock, columns, interval, names
 from .links import Links, stretches, told
-from .plausible import FARTHEST, FASTEST, FASTEST_TURN, UNLIKELY, headings, plausible, radians, unlikely
+from .plausible import FARTHEST, FASTEST, FASTEST_TURN, headings, plausible, radians
 from .sensors import Sensors
 from .v2x import V2X
 
@@ -57,6 +57,15 @@ class Body:
         refuse("yaw_rate", rate, np.isnan(rate) != np.isnan(velocity[..., 0]), allowed, "A vehicle that stands has 0.")
 
 
+WIDE = 0.5
+"""rad, of a standard deviation that is rather one in degrees."""
+UNLIKELY = "unlikely: "
+UNITS = "velocities are in m/s, headings and yaw rates in radians and anticlockwise, headings from east"
+"""First word of a note on what a recording holds, and what may be wrong with odometry."""
+LAG, LONG, APART, SHARE = 10.0, 6.0, 0.4, 0.3
+"""s between the fixes whose distance is compared with the odometry's; standard deviations of a fix, stated and as they
+scatter, that the longer of the two must have (the shorter one: one); share of both lengths by which they contradict
+each other; share of such pairs, of all."""
 MEASURED = "nothing is simulated"
 """Words in the notes of a recording that holds measurements as they were logged."""
 
@@ -140,7 +149,7 @@ class Recording:
         return any(MEASURED in note for note in self.notes)
 
     @property
-    def doubts(self) -> tuple[str, ...]:
+    def unlikely(self) -> tuple[str, ...]:
         """The notes on what is unlikely, which every track of this recording has, too."""
         return tuple(note for note in self.notes if UNLIKELY in note)
 
@@ -362,3 +371,45 @@ def check_links(
     refuse("links.observer", observer, many, f"must have at most max_neighbours = {most} a step", "Raise it.")
     early = (arrival < links.step) & (arrival != -1)
     refuse("arrival", arrival, early, "must be -1 (lost) or a step no earlier than the link's", "Count steps from 0.")
+
+
+def unlikely(recording: Recording) -> tuple[str, ...]:
+    """Notes on a recording whose settings or measurements are rather in other units, or contradict each other."""
+    sensors, v2x = recording.sensors, recording.v2x
+    found = [
+        f"{name} is {std:.3g} rad, which is {np.rad2deg(std):.0f}°"
+        for name in ("azimuth_std", "inclination_std", "heading_std", "heading_bias_std", "yaw_rate_std")
+        if (std := getattr(sensors, name)) > WIDE
+    ]
+    if v2x.latency > v2x.max_age and len(recording.links):
+        found.append(f"no message is used: latency is {v2x.latency:g} s, max_age {v2x.max_age:g} s")
+    if share := _contradicting(recording):
+        found.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive: {UNITS}")
+    return tuple(UNLIKELY + text for text in found)
+
+
+def _contradicting(recording: Recording) -> float:
+    """Share of the pairs of fixes of the first run, `LAG` s apart, that contradict the odometry between them; 0 below
+    `SHARE`, and where too little moves. Without a heading only the lengths are compared."""
+    body, stated = recording.body, float(np.hypot(*recording.sensors.fix_std[:2]))
+    lag = max(1, min(len(recording.t) - 1, round(LAG / recording.dt)))
+    fixes, u = (values[0, ..., :2] @ [1, 1j] for values in (recording.gnss, recording.velocity))
+    heading: Floats = np.zeros(u.shape)
+    turned = heading
+    if body is not None:
+        heading, turned = body.heading[0], np.cumsum(np.nan_to_num(body.yaw_rate[0]), axis=0) * recording.dt
+    path = np.cumsum(np.nan_to_num(u * np.exp(1j * turned)), axis=0) * recording.dt
+    steps = np.where(np.isfinite(fixes), np.arange(len(u))[:, None], -1)
+    newest, column = np.maximum.accumulate(steps, axis=0)[::lag], np.arange(u.shape[1])
+    ends = (values[newest, column] for values in (fixes, path, np.cumsum(np.isnan(u), axis=0)))
+    moved, driven, gaps = (np.diff(values, axis=0) for values in ends)
+    turn = np.exp(1j * (heading - turned))[newest[:-1], column]
+    moved, driven = np.where(np.isnan(turn), (np.abs(moved), np.abs(driven)), (moved, driven * turn))
+    rough = np.abs(np.diff(fixes, 2, axis=0))  # of white noise sqrt(6) times a fix's
+    noise = max(np.median(rough[np.isfinite(rough)]) / 2.0 if np.isfinite(rough).any() else 0.0, stated)
+    short, long = np.sort([np.abs(moved), np.abs(driven)], axis=0)
+    far = (long > LONG * noise) & (short > noise)
+    far &= (newest[:-1] >= 0) & (np.diff(newest, axis=0) > 0) & (gaps == 0)
+    apart = far & (np.abs(moved - driven) > APART * (np.abs(moved) + np.abs(driven)))
+    share = float(apart.sum() / max(far.sum(), 1))
+    return share if share > SHARE and far.sum() > 2 else 0.0

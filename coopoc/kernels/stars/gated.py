@@ -14,9 +14,9 @@ import numpy as np
 
 from ...arrays import Floats
 from ..compiling.compile import inner, inside, storage
-from ..compiling.small import add, add_diagonal, choose_each, load, scale, store, subtract, zeros
+from ..compiling.small import add, add_diagonal, choose_each, load, scale, store, subtract, times, zeros
 from ..compiling.vectors import LANES, choose, take
-from ..gate import FIX_GATE, LEAK, YOUNG, distance, gain_of, gated_update, inflation
+from ..gate import FIX_GATE, LEAK, NOTHING, YOUNG, distance, gain_of, gated_update, inflation, remember, total
 from ..geometry import Numbers, axes, direction, incomplete, residuals
 from .messages import (
     BLOCK,
@@ -24,13 +24,14 @@ from .messages import (
     ROW,
     VARIANCE,
     Star,
+    moved_of,
     position_of,
     process_of,
     variance_of,
     vector_at,
 )
 
-STATE = (0.0,) * 13
+STATE, BEFORE = (0.0,) * 13, (0.0,) * 14
 
 
 class Gates(NamedTuple):
@@ -40,16 +41,21 @@ class Gates(NamedTuple):
         state: (13 most,) of each member 9 m^2, the bound of the covariance of its vector from the ego (of the ego, its
             covariance), and the hits of range, azimuth, inclination and position.
         last: of the last star.
+        before: (14,) where the ego was before fixes contradicted it m, covariance m^2, and the evidence and time of
+            `gate.remember`.
     """
 
     state: Floats
     last: Floats
+    before: Floats
 
 
 @storage
 def gates_within(most: int) -> Gates:
     """Room for `most` members."""
-    return Gates(np.zeros((13 * most, LANES)), np.zeros((13 * most, LANES)))
+    before = np.zeros((len(BEFORE), LANES))
+    before[3:12:4] = NOTHING
+    return Gates(np.zeros((13 * most, LANES)), np.zeros((13 * most, LANES)), before)
 
 
 @inner
@@ -58,7 +64,9 @@ def carry(star: Star, gates: Gates, flat: float, n: int, old: int) -> None:
     begins at its fix."""
     for k in range(old):
         store(gates.last, k, load(gates.state, k, STATE))
-    own = process_of(star, 0)
+    own, memory = process_of(star, 0), load(gates.before, 0, BEFORE)
+    there, spread = add(memory[:3], moved_of(star, 0)), add_diagonal(memory[3:12], own)
+    store(gates.before, 0, (*there, *spread, *memory[12:]))
     for k in range(n):
         place, process = star.previous[k], process_of(star, k)
         before = load(gates.last, max(place, 0), STATE)
@@ -69,6 +77,27 @@ def carry(star: Star, gates: Gates, flat: float, n: int, old: int) -> None:
         elif k > 0:
             process = add(process, own)
         store(gates.state, k, (*add_diagonal(before[:9], process), *before[9:]))
+
+
+@inner
+def go_back(star: Star, gates: Gates, state: Floats) -> float:
+    """Above 0 where the ego goes back to where it was before fixes contradicted it: its state and covariance are."""
+    at, ego, memory = vector_at(state, 0), load(gates.state, 0, STATE), load(gates.before, 0, BEFORE)
+    fix, variance, there, spread = position_of(star, 0), variance_of(star, 0), memory[:3], memory[3:12]
+    q = distance(subtract(fix, at), add_diagonal(ego[:9], variance))
+    o = 0.0 * q
+    if q <= o + FIX_GATE and o + NOTHING <= spread[0]:
+        return o
+    gap, other = subtract(there, at), distance(subtract(fix, there), add_diagonal(spread, variance))
+    apart, wide, gain = total(times(gap, gap)), spread[0] + spread[4] + spread[8], gain_of(ego[:9], variance)
+    what, evidence, since = remember(q, other, FIX_GATE, gain, apart, wide, memory[12], memory[13])
+    begins, back, flat = what - 0.5, what - 1.5, o + NOTHING
+    nothing = add_diagonal(zeros(o, BLOCK), (flat, flat, flat))
+    kept = choose_each(back, nothing, choose_each(begins, ego[:9], choose_each(what + 0.5, spread, nothing)))
+    store(gates.before, 0, (*choose_each(begins, at, there), *kept, evidence, since))
+    store(gates.state, 0, (*choose_each(back, spread, ego[:9]), *ego[9:12], choose(back, o, ego[12])))
+    store(state, 0, choose_each(back, there, at))
+    return back
 
 
 @inner

@@ -40,7 +40,7 @@ from ..compiling.small import (
 )
 from ..compiling.vectors import LANES, choose, take
 from ..geometry import Numbers, converted, exact, incomplete, missing, vector, whole
-from .gated import Gates, carry, gate_star, gates_within, set_ego
+from .gated import Gates, carry, gate_star, gates_within, go_back, set_ego
 from .messages import (
     BLOCK,
     NEW,
@@ -65,6 +65,9 @@ from .messages import (
 
 LEAST_KNOWN = 1e-4
 """1/m^2, information along x below which nothing is known of where a member is."""
+
+UNMOVED = 1e30
+"""1/m^2, process information of a member that stays where it is."""
 
 
 class Joint(NamedTuple):
@@ -146,20 +149,26 @@ def predict(a: Floats, n: int, stride: int, process: Floats, memory: Floats) -> 
     With E_k the columns of block k and W_k = Q_k^-1, A <- A - A E_k (E_k^T A E_k + W_k)^-1 E_k^T A.
     """
     for k in range(n):
-        for i in range(k):
-            store(memory, n + i, transpose(block_at(a, i * stride + k)))
-        for j in range(k + 1, n):
-            store(memory, n + j, block_at(a, k * stride + j))
-        own = mirrored(block_at(a, k * stride + k))
-        store(memory, n + k, own)
-        pivot = negate(inverse(add_diagonal(own, vector_at(process, k))))
-        for j in range(n):
-            store(memory, j, minus_product(pivot, block_at(memory, n + j)))
-        for i in range(n):
-            left = block_at(memory, n + i)
-            for j in range(i, n):
-                at = i * stride + j
-                store(a, at, less_transposed_product(block_at(a, at), left, block_at(memory, j)))
+        predict_block(a, k, n, stride, vector_at(process, k), memory)
+
+
+@inner
+def predict_block(a: Floats, k: int, n: int, stride: int, process: Numbers, memory: Floats) -> None:
+    """`predict` of one block."""
+    for i in range(k):
+        store(memory, n + i, transpose(block_at(a, i * stride + k)))
+    for j in range(k + 1, n):
+        store(memory, n + j, block_at(a, k * stride + j))
+    own = mirrored(block_at(a, k * stride + k))
+    store(memory, n + k, own)
+    pivot = negate(inverse(add_diagonal(own, process)))
+    for j in range(n):
+        store(memory, j, minus_product(pivot, block_at(memory, n + j)))
+    for i in range(n):
+        left = block_at(memory, n + i)
+        for j in range(i, n):
+            at = i * stride + j
+            store(a, at, less_transposed_product(block_at(a, at), left, block_at(memory, j)))
 
 
 @inside
@@ -368,11 +377,23 @@ def step(
         carry(star, gates, model.flat, n, old)
         for k in range(1, n):
             store(joint.move, k, (placed(joint, k, load(star.relative, k, RELATIVE)),))
+        back = go_back(star, gates, joint.state)
+        if not back <= 0.0 * back:
+            place_ego(joint, back, block_at(gates.state, 0), n)
         gate_star(star, gates, joint.state, joint.move, model.min_range, n)
     clear(joint.eta)
     add_fixes(star, joint, n)
     update(star, joint, model, refine, n)
     set_ego(gates, block_at(joint.scratch, 0))
+
+
+@inner
+def place_ego(joint: Joint, where: float, cov: Numbers, n: int) -> None:
+    """Replace what is known of the ego by a covariance m^2, where a number is above 0."""
+    o, at = 0.0 * where, (n - 1) * joint.stride + n - 1
+    process = choose(where, o, o + UNMOVED)
+    predict_block(joint.information, n - 1, n, joint.stride, (process, process, process), joint.scratch)
+    store(joint.information, at, choose_each(where, inverse(cov), block_at(joint.information, at)))
 
 
 @inner

@@ -52,7 +52,6 @@ from .messages import (
     Star,
     block_at,
     clear,
-    fix_information,
     gather,
     largest,
     moved_of,
@@ -73,64 +72,6 @@ MOST = 1.0 - 1e-6
 D / I = 1e-8, and Newton's steps there are shorter than TOLERANCE without a minimum."""
 
 
-@as_written
-def run_msmv(measurements: Measurements, model: Assumptions) -> Estimates:
-    """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, and the neighbours' own estimates (R, M, 3) m, NaN for none.
-
-    Args:
-        measurements: `broadcast` holds every vehicle's own estimate.
-        model: `broadcast` its variance m^2.
-    """
-    runs, steps = measurements.gnss.shape[:2]
-    out = new_estimates(measurements)
-    most, x, cov = largest(measurements.start), np.zeros((3, LANES)), np.zeros((9, LANES))
-    for first in range(0, runs, LANES):
-        star, before, old, last = star_within(most), star_within(most), NONE, min(first + LANES, runs) - 1
-        for t in range(steps):
-            star, before = before, star
-            n = gather(star, before, measurements, model, first, last, t, old)
-            fuse_pseudo_fixes(star, model, x, cov, n, old)
-            write_ego(out, star, x, cov, first, last, t, measurements.start[t], n)
-            old = n
-    return out
-
-
-@inside
-def fuse_pseudo_fixes(star: Star, model: Assumptions, x: Floats, cov: Floats, n: int, old: int) -> None:
-    """P^-1 + C_p^-1 + sum_j C_j^-1, and the weighted mean that belongs to it, in place of x and P."""
-    fix = position_of(star, 0)
-    if old == 0:
-        at, p = fix, zeros(fix[0], BLOCK)
-        flat = 0.0 * fix[0] + model.flat
-        p = add_diagonal(p, (flat, flat, flat))
-    else:
-        at = add(vector_at(x, 0), moved_of(star, 0))
-        p = add_diagonal(block_at(cov, 0), process_of(star, 0))
-    own = fix_information(star, 0)
-    information, eta = add_diagonal(inverse(p), own), times(subtract(fix, at), own)
-    for k in range(1, n):
-        position, variance = pseudo_fix(star, model, k, at)
-        new = take(star.status, 5 * k + NEW)
-        weight_k = scale(inverse(variance), new)
-        information, eta = add(information, weight_k), add(eta, apply(weight_k, subtract(position, at)))
-    p = inverse(information)
-    store(x, 0, add(at, apply(p, eta)))
-    store(cov, 0, p)
-
-
-@inside
-def pseudo_fix(star: Star, model: Assumptions, k: int, at: Numbers) -> tuple[Numbers, Numbers]:
-    """Position of the ego by member k's estimate and the measurement of it, and its covariance."""
-    theirs, relative = position_of(star, k), load(star.relative, k, RELATIVE)
-    x, y, z = subtract(theirs, at)
-    seen = completed(relative, direction(x, y, z))
-    one, o = 0.0 * at[0] + 1.0, 0.0 * at[0]
-    cov = from_upper((one, o, o, one, o, one))
-    if len(model.relative_std):
-        cov = add_diagonal(cov_of(seen, relative, model.min_range), variance_of(star, k))
-    return subtract(theirs, vector(seen)), cov
-
-
 class Fusion(NamedTuple):
     """The estimate of the ego and what is fused with it at a step.
 
@@ -145,6 +86,7 @@ class Fusion(NamedTuple):
         hits: (1, LANES) of the ego's fixes.
         split: keep independent errors apart.
         robust: gate fixes and pseudo-fixes.
+        naive: take all errors as independent, measurements at the measured geometry, and each message once: MSMV.
     """
 
     x: Floats
@@ -157,10 +99,13 @@ class Fusion(NamedTuple):
     hits: Floats
     split: bool
     robust: bool
+    naive: bool
 
 
 @as_written
-def run_intersection(measurements: Measurements, model: Assumptions, split: bool, robust: bool) -> Estimates:
+def run_intersection(
+    measurements: Measurements, model: Assumptions, split: bool, robust: bool, naive: bool
+) -> Estimates:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, and the neighbours' own estimates (R, M, 3) m, NaN for none.
 
     Args:
@@ -168,6 +113,7 @@ def run_intersection(measurements: Measurements, model: Assumptions, split: bool
         model: `broadcast` its variance m^2.
         split: keep independent errors apart.
         robust: gate fixes and pseudo-fixes.
+        naive: MSMV, as of `Fusion`.
     """
     runs, steps = measurements.gnss.shape[:2]
     out = new_estimates(measurements)
@@ -183,6 +129,7 @@ def run_intersection(measurements: Measurements, model: Assumptions, split: bool
         np.zeros((1, LANES)),
         split,
         robust,
+        naive,
     )
     for first in range(0, runs, LANES):
         star, before, old, last = star_within(most), star_within(most), NONE, min(first + LANES, runs) - 1
@@ -200,13 +147,12 @@ def run_intersection(measurements: Measurements, model: Assumptions, split: bool
 def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) -> None:
     """Predict and fuse."""
     fix, variance = position_of(star, 0), variance_of(star, 0)
-    o = 0.0 * fix[0]
-    nothing = zeros(o, BLOCK)
+    o, new = 0.0 * fix[0], take(star.status, NEW)
+    nothing, flat = zeros(o, BLOCK), o + model.flat
     if old == 0:
-        x, fixed, w = fix, nothing, o + 0.5
-        add_source(fusion, 0, nothing, add_diagonal(nothing, variance))
+        x, w, new = fix, o + 0.5, new if fusion.naive else o
+        add_source(fusion, 0, nothing, add_diagonal(nothing, (flat, flat, flat) if fusion.naive else variance))
     else:
-        new = take(star.status, NEW)
         x, w = add(vector_at(fusion.x, 0), moved_of(star, 0)), take(fusion.weight, 0)
         independent = add_diagonal(block_at(fusion.independent, 0), process_of(star, 0))
         add_source(fusion, 0, block_at(fusion.dependent, 0), independent)
@@ -215,10 +161,10 @@ def intersect(star: Star, model: Assumptions, fusion: Fusion, n: int, old: int) 
             share, hits = gate_fix(subtract(fix, x), own, variance, FIX_GATE, hits)
             store(fusion.hits, 0, (hits,))
             variance = scale(variance, share)
-        fixed = add_diagonal(nothing, (new / variance[0], new / variance[1], new / variance[2]))
+    fixed = add_diagonal(nothing, (new / variance[0], new / variance[1], new / variance[2]))
     add_neighbours(star, model, fusion, x, n)
     alone = inverse(add(fixed, source(fusion, 0, o + 1.0)[0]))
-    w = best_weight(fusion, fixed, n, w)
+    w = o + 0.5 if fusion.naive else best_weight(fusion, fixed, n, w)
     for _ in range(2):
         total, eta, dependent = fixed, apply(fixed, subtract(fix, x)), nothing
         for k in range(n):
@@ -258,10 +204,13 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
             ahead = add(own_cov(fusion), theirs)
             _, _, factor, _ = gate_components(gap, ahead, relative, relative[5:], (o, o, o), model.min_range)
             relative = inflated(relative, factor)
+        seen = completed(relative, polar)
         if len(model.relative_std):
-            noise = cov_of(polar, relative, model.min_range)
-        held = take(star.status, 5 * k + HELD)
-        gap = subtract(gap, vector(completed(relative, polar)))
+            noise = cov_of(seen if fusion.naive else polar, relative, model.min_range)
+        elif fusion.naive:
+            theirs = scale(theirs, 0.0)
+        held = take(star.status, 5 * k + (NEW if fusion.naive else HELD))
+        gap = subtract(gap, vector(seen))
         if fusion.robust:
             f = inflation(distance(gap, add(ahead, noise)), FIX_GATE, o)
         counts = choose(o + 1e300 - f, held, o)
@@ -287,8 +236,10 @@ def own_cov(fusion: Fusion) -> Numbers:
 
 @inside
 def add_source(fusion: Fusion, k: int, dependent: Numbers, independent: Numbers) -> None:
-    """Set a source; plain covariance intersection takes all of its error as dependent."""
-    if not fusion.split:
+    """Set a source; plain covariance intersection takes all of its error as dependent, MSMV none."""
+    if fusion.naive:
+        dependent, independent = scale(dependent, 0.0), add(dependent, independent)
+    elif not fusion.split:
         dependent, independent = add(dependent, independent), scale(independent, 0.0)
     store(fusion.dependent, k, dependent)
     store(fusion.independent, k, independent)

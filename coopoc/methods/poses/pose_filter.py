@@ -18,6 +18,7 @@ from ...world.plausible import radians
 from ...world.recording import Recording, Vehicles, check_recording
 from ...world.sensors import Sensors
 from ...world.v2x import NO_MESSAGE, Message
+from ..doubts import doubts
 from ..track import Track, check_options
 from ..whole_fleet import CENTRE, centre
 from .pose_inputs import (
@@ -125,8 +126,8 @@ class PoseFilter:
         received, sent = moved = np.zeros((2, recording.runs, len(columns)))
         if self.unit == "solo":
             begin = first_poses(recording, self.begin, columns)
-            found = [self.run_filter(recording, [c], to_landmarks(recording, links.of(c)), begin) for c in columns]
-            x, cov = (np.concatenate(parts, axis=2) for parts in list(zip(*found, strict=True))[:2])
+            alone = [self.run_filter(recording, [c], to_landmarks(recording, links.of(c)), begin) for c in columns]
+            x, cov = (np.concatenate(parts, axis=2) for parts in list(zip(*alone, strict=True))[:2])
         else:
             members = fleet_members(recording)
             begin = first_poses(recording, self.begin, members)
@@ -141,18 +142,19 @@ class PoseFilter:
             for k, column in enumerate(columns):
                 box = inbox(recording, column, self.message)
                 received[:, k], sent[:, k] = box.received_bytes, box.sent_bytes
+        found = np.ascontiguousarray(x[..., :3]), np.ascontiguousarray(cov[..., :3, :3])
+        notes += doubts(recording, columns, *found)
         extras: dict[str, Floats] = {}
         for k, name in enumerate(("speed_scale", "yaw_rate_bias", "range_offset")[: x.shape[-1] - 4], 4):
             extras |= {name: x[..., k], f"{name}_std": np.sqrt(cov[..., k, k])}
         return Track(
             recording.t,
             tuple(columns),
-            x[..., :3],
-            cov[..., :3, :3],
+            *found,
             received,
             sent,
             clock() - began,
-            notes=notes + recording.doubts,
+            notes=notes,
             heading=wrap(x[..., 3]),
             heading_covariance=cov[..., 3, :4],
             extras=extras,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,7 @@ import numpy as np
 from ...arrays import Bools, Floats, checked, instance
 from ...errors import InputError
 from ..algebra.cholesky import cholesky_of, columns_solved, with_still
-from ..algebra.sparse import Sparse, shared_layout, sparse, structure_of
+from ..algebra.sparse import Entries, Sparse, shared_layout, sparse, structure_of
 from ..model.derivatives import linearise, numbers_of
 from ..model.factor import Factor, as_factor, unchecked
 from ..model.problem import Problem, several
@@ -29,8 +29,12 @@ SMALL = 200
 SLACK = 1e-6
 """Share of the diagonal of J^T J by which the curvature may be negative: a flat minimum is one, whatever the
 rounding."""
+REST = 1e-6
+"""m or rad, a step within which a point is stationary."""
 TAIL = 1e-6
 """Probability below which a cost, or one above it, is not explained by the noise that is stated."""
+MANY = 0.25
+"""Share of measurements whose rejection casts doubt on the minimum."""
 REJECTED = 0.5
 """Weight rho' below which a robust loss rejects a measurement."""
 
@@ -47,6 +51,7 @@ class Assessment:
         unobservable: names of nodes that can move without changing the cost.
         active: what holds x, None without constraints.
         promised: decrease of the cost that this step promises; infinite where constraints hold it.
+        curved: J^T J hardly sees some direction, and the exact Hessian, which does, stands in for it.
     """
 
     cost: float
@@ -56,6 +61,7 @@ class Assessment:
     unobservable: tuple[str, ...] = ()
     active: Active | None = None
     promised: float = np.inf
+    curved: bool = False
 
     @property
     def violation(self) -> float:
@@ -97,29 +103,64 @@ def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool
     A pivot is the information of an unknown with those before it eliminated and those after it given, so that its
     inverse is no larger than the variance: along a free direction one is rounding.
     """
-    cholesky = system.cholesky
+    cholesky, entries = system.cholesky, system.entries
     cost, gradient, values = system.quadratic(x, "gauss-newton")
-    cov = np.full((len(x), *(problem.space.dof,) * 2), np.nan)
-    size = float(np.sqrt(gradient @ gradient))
-    unknown = Assessment(cost, size, cov, np.nan)
-    if not np.isfinite(values).all():
+    size, none = float(np.sqrt(gradient @ gradient)), np.full((len(x), *(problem.space.dof,) * 2), np.nan)
+    unknown = Assessment(cost, size, none, np.nan)
+    if not (np.isfinite(values).all() and np.isfinite(cost)):
         return unknown
-    dx: Floats = np.zeros(0)
-    inflation: Floats = np.full(1, np.inf)
-    if cholesky.factor(values):
-        dx, own = -cholesky.solve(gradient), values[system.entries.diagonal]
-        inflation = own / cholesky.pivots
-        if covariance or not (inflation < INFLATION).all():
-            free, rows, columns = system.entries.own
-            found, cov = cholesky.inverse(rows, columns), np.zeros(free.shape)
-            cov[free] = found
-            inflation = found[rows == columns] * own
-    if not (inflation < INFLATION).all():
-        nodes = _unobservable(problem, problem.whiten(x)[1], None)
-        if nodes or not len(dx):
-            return Assessment(cost, size, unknown.covariance, np.nan, nodes)
-    promised = -0.5 * float(gradient @ dx)
-    return Assessment(cost, size, cov, float(np.abs(dx).max(initial=0.0)), promised=promised)
+
+    def ended(cov: Floats, dx: Floats, curved: bool = False) -> Assessment:
+        far = float(np.abs(dx).max(initial=0.0))
+        return Assessment(cost, size, cov, far, promised=0.5 * abs(float(gradient @ dx)), curved=curved)
+
+    own, cov = _largest(problem, entries, values), none
+    step = variance = np.full(entries.size, np.inf)
+    if held := cholesky.factor(values):
+        step, variance = cholesky.solve(gradient), 1.0 / cholesky.pivots
+        if covariance or not (variance * own < INFLATION).all():
+            cov, variance = _inverse(system)
+        if (variance * own < INFLATION).all():
+            return ended(cov, step)
+    eased, exact = values.copy(), None
+    eased[entries.diagonal] += SLACK * own + (own == 0)
+    calm = cholesky.solve(gradient) if cholesky.factor(eased) else step
+    if not problem.linear and np.abs(calm).max(initial=0.0) <= REST:
+        exact = system.quadratic(x, "newton")[2]
+    bent = None if exact is None else (_symmetric(entries, exact), np.sqrt(own + (own == 0)))
+    if nodes := _unobservable(problem, problem.whiten(x)[1], None, bent):
+        return replace(unknown, unobservable=nodes)
+    if exact is None:
+        return ended(cov, step) if held else unknown
+    if not cholesky.factor(exact):
+        return ended(none, calm)
+    found, less = _inverse(system)
+    return ended(found, cholesky.solve(gradient), True) if (2.0 * less < variance).any() else ended(cov, step)
+
+
+def _largest(problem: Problem, entries: Entries, values: Floats) -> Floats:
+    """(m,) the largest entry on the diagonal among the positions, or the turns, of the node of each unknown."""
+    number, d = entries.number, problem.dimension
+    table = np.append(values[entries.diagonal], 0.0)[number]
+    for part in (table[:, :d], table[:, d:]):
+        part[:] = part.max(axis=1, initial=0.0, keepdims=True)
+    return np.asarray(table[number >= 0])
+
+
+def _inverse(system: Sparse) -> tuple[Floats, Floats]:
+    """Marginals (n, dof, dof) by the factor that is at hand, and their diagonal (m,)."""
+    free, rows, columns = system.entries.own
+    found, cov = system.cholesky.inverse(rows, columns), np.zeros(free.shape)
+    cov[free] = found
+    return cov, found[rows == columns]
+
+
+def _symmetric(entries: Entries, values: Floats) -> Any:
+    """(m, m) sparse Hessian from its upper triangle."""
+    from scipy.sparse import csc_array, triu
+
+    half = csc_array((values, entries.indices, entries.indptr), shape=(entries.size,) * 2)
+    return half + triu(half, 1).T
 
 
 def _marginals(hessian: Any, gradient: Floats, shape: tuple[int, int], active: Active) -> tuple[Floats, Floats, bool]:
@@ -156,18 +197,37 @@ def _within(hessian: Any, ways: Any) -> tuple[Callable[[Floats], Floats], Floats
     return lambda rhs: ways @ factored.solve(ways.T @ rhs), (ways @ reduced @ ways.T).diagonal()
 
 
-def _unobservable(problem: Problem, J: Any, active: Active | None) -> tuple[str, ...]:
-    """Nodes that take part in a direction which no measurement sees: the null space of J with unit columns."""
+def _unobservable(
+    problem: Problem, J: Any, active: Active | None, bent: tuple[Any, Floats] | None = None
+) -> tuple[str, ...]:
+    """Nodes that take part in a direction which no measurement sees: the null space of J with unit columns.
+
+    Where `bent` has the exact Hessian H (m, m) at a stationary point and scales D^1/2 (m,) of the unknowns, only along
+    which D^-1/2 H D^-1/2 is flat, too: between two anchors that are too close together, a node is held across their
+    line by the curvature of ranges that are too short, and pushed off it by longer ones.
+    """
     from scipy.sparse import eye_array
 
     ways = eye_array(J.shape[1], format="csc") if active is None else active.exact
     J = (J @ ways).tocsc()
     length = np.sqrt(np.asarray(J.multiply(J).sum(axis=0)).ravel())
     measured = length > 0
-    null = _null_rows(J[:, measured], length[measured]) @ ways[:, measured].T
-    moves = np.square(null).sum(axis=0) + np.asarray(ways[:, ~measured].power(2).sum(axis=1)).ravel()
-    if problem.movable is not None:
-        moves = moves * problem.movable.ravel()
+    null = _null_rows(J[:, measured], length[measured])
+    if bent is None:
+        null = null @ ways[:, measured].T
+        moves = np.square(null).sum(axis=0) + np.asarray(ways[:, ~measured].power(2).sum(axis=1)).ravel()
+        moves = moves if problem.movable is None else moves * problem.movable.ravel()
+    else:
+        hessian, scale = bent
+        moving = np.arange(J.shape[1]) if problem.movable is None else np.flatnonzero(problem.movable)
+        lost, curved = ~measured[moving], np.asarray(abs(hessian).sum(axis=0)).ravel() > 0
+        every = np.zeros((J.shape[1], len(null)))
+        every[measured] = null.T / length[measured, None]
+        own = np.eye(len(moving))[:, lost & curved] if (lost & curved).any() else np.zeros((len(moving), 0))
+        basis = np.linalg.qr(np.hstack([scale[:, None] * every[moving], own]))[0]
+        values, turned = np.linalg.eigh(basis.T @ (hessian @ (basis / scale[:, None]) / scale[:, None]))
+        moves = np.zeros(J.shape[1])
+        moves[moving] = np.square(basis @ turned[:, np.abs(values) <= SLACK]).sum(axis=1) + (lost & ~curved)
     moves = moves.reshape(len(problem.names), -1).sum(axis=1)
     return tuple(name for name, m in zip(problem.names, moves, strict=True) if m > 1e-6)
 
@@ -255,7 +315,7 @@ def is_constrained_minimum(problem: Problem, x: Floats, active: Active) -> bool:
 def _lagrangian(problem: Problem, x: Floats, active: Active) -> Any:
     """(n dof, n dof) sparse exact Hessian of the Lagrangian at x (n, ambient), eased by SLACK, 1 for what cannot
     move."""
-    from scipy.sparse import csc_array, csr_array, triu
+    from scipy.sparse import csr_array
 
     system, structure, place = sparse(problem), structure_of(problem), constraint_rows(problem, x).place
     terms, numbers = list(structure.factors), list(system.numbers)
@@ -269,35 +329,58 @@ def _lagrangian(problem: Problem, x: Floats, active: Active) -> Any:
     entries, size = layout.entries, system.size
     values = layout.total("newton", x, numbers)[size + 1 : -1]
     values[entries.diagonal] += SLACK * system.quadratic(x, "gauss-newton")[2][system.entries.diagonal]
-    half = csc_array((values, entries.indices, entries.indptr), shape=(size, size))
     moving = np.flatnonzero(entries.number.ravel() >= 0)
     into = csr_array((np.ones(size), (moving, np.arange(size))), shape=(entries.number.size, size))
     still = None if problem.movable is None else ~problem.movable
-    return with_still(into @ (half + triu(half, 1).T) @ into.T, still)
+    return with_still(into @ _symmetric(entries, values) @ into.T, still)
 
 
-def judged(problem: Problem, x: Floats, cost: float) -> tuple[float, tuple[str, ...]]:
+def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple[str, ...]]:
     """Expected cost at a minimum x (n, ambient) by the chi-square law, and notes on one that is far from it.
 
-    Measurements that a robust loss rejects count neither in the cost nor in what is expected.
+    Measurements that a robust loss rejects count neither in the cost nor in what is expected. Where inequalities push,
+    the cost is no more than that of the truth, which all that is measured adds to.
     """
     unknowns = len(x) * problem.space.dof if problem.movable is None else int(np.count_nonzero(problem.movable))
     robust = [factor for factor in problem.factors if factor.loss is not None]
-    notes, spent, out = list[str](), 0.0, 0
+    notes, spent, out, pushing, rejected = list[str](), 0.0, 0, 0, list[tuple[str, int, int, str]]()
+    if not np.isfinite(truth.cost):
+        return np.nan, ("the cost overflows: z, x0 or 1/std is too large",)
+    if truth.curved:
+        notes.append("J^T J is singular at this minimum, whose covariance is that of the exact Hessian")
+    if truth.active is not None:
+        free, along, exact = truth.active.along.shape[0], truth.active.along.shape[1], truth.active.exact.shape[1]
+        unknowns, pushing = unknowns - free + along, exact - along
     for factor in robust:
         square = squared(problem, factor, x)
         assert factor.loss is not None
         beyond = np.asarray(factor.loss.weight(square)) < REJECTED
         spent, out = spent + 0.5 * float(factor.loss.cost(square[beyond]).sum()), out + factor.size * int(beyond.sum())
         if beyond.any():
-            notes.append(f"{factor.loss.name} loss rejects {beyond.sum()} of {len(square)} measurements {factor.kind}")
+            rejected.append((f"{factor.loss.name} loss", int(beyond.sum()), len(square), f"measurements {factor.kind}"))
     mean, variance = expected(problem, unknowns + out)
-    if implausible(cost - spent, mean, variance):
+    notes += [rejection(*each, truth.cost - spent, mean) for each in rejected]
+    most, spread = expected(problem, out) if pushing else (mean, variance)
+    if implausible(truth.cost - spent, most, spread):
+        why = "a local minimum (try other x0, or certify it)"
+        if pushing:
+            why = f"{pushing} bounds that push contradict the measurements"
         notes.append(
-            f"cost {cost - spent:.4g} where the stated noise explains {mean:.3g} +- {np.sqrt(variance):.2g}: a local "
-            "minimum (try other x0, or certify it), outliers, or noise that is stated too small"
+            f"cost {truth.cost - spent:.4g} where the stated noise explains {most:.3g} +- {np.sqrt(spread):.2g}: "
+            f"{why}, outliers, or noise that is stated too small"
         )
     return mean + spent, tuple(notes)
+
+
+def rejection(what: str, out: int, of: int, which: str, cost: float, mean: float) -> str:
+    """The note on measurements that are rejected, and on what remains; it begins louder from MANY of them on.
+
+    >>> rejection("GNC", 4, 9, "candidates", 2.5, 3.0)
+    'DOUBTFUL: GNC rejects 4 of 9 candidates; the rest costs 2.5 where the stated noise explains 3'
+    """
+    loud = "DOUBTFUL: " if out >= MANY * of else ""
+    rest = f"the rest costs {cost:.4g} where the stated noise explains {mean:.3g}"
+    return f"{loud}{what} rejects {out} of {of} {which}; {rest}"
 
 
 def squared(problem: Problem, factor: Factor, x: Floats) -> Floats:
@@ -320,7 +403,7 @@ def implausible(cost: float, mean: float, variance: float) -> bool:
 def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
     """Mean and variance of the cost at its minimum under the noise that it assumes.
 
-    Each number that is measured or held by a constraint beyond the unknowns adds 1/2 to both. The entries of a rotation
+    Each number that is measured beyond the unknowns adds 1/2 to both. The entries of a rotation
     matrix count as the angles that they hold; in the plane kappa |R_j - R_i R_ij|_F^2 is twice the square of the
     angle's error over its variance, and adds 1 and 2.
     """
@@ -331,7 +414,6 @@ def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
         - (d * d - angles) * matrices
         - unknowns
     )
-    spare += sum(int(np.isfinite(side).sum()) for c in problem.constraints for side in (c.lower, c.upper))
     turns = matrices - len({*problem.poses} - {*problem.fixed}) if matrices and d == 2 else 0
     mean = 0.5 * (max(spare, 0) + max(turns, 0))
     return mean, mean + max(turns, 0)

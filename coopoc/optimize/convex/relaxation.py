@@ -49,6 +49,8 @@ ROUNDING = 1e-12
 """Of the mean diagonal, by which a factorisation may be off."""
 STALL = 1e-9
 """Share of the cost (at least of 1) that one more column must save to be followed by another."""
+ALIKE = 1e-2
+"""Sum of squares below which two points are one: what is this near, the curvature at a minimum decides."""
 GAP = 1e-6
 """Largest gap of a certified solution, as a share of its cost (at least of 1, the cost of two residuals of one std)."""
 
@@ -218,7 +220,7 @@ def _climb(reduced: Reduced, Y: Floats, most: int, deadline: float) -> tuple[Sta
     with tqdm(desc="staircase", unit=" steps", delay=2.0) as bar:
         while True:
             found = minimise(reduced, Y, deadline=deadline, tick=bar.update)
-            proved, smallest, vector = reduced.lower_bound(found.multipliers)
+            proved, (smallest,), vector = reduced.lower_bound(found.multipliers)
             bound, size = max(bound, proved), max(found.cost, 1.0)
             if reduced.problem.bound > DENSE and found.cost - proved > FAR * size:
                 bound = max(bound, scaled_bound(reduced, found.multipliers))
@@ -270,6 +272,8 @@ class Certificate:
         cost: of the solution.
         lower_bound: no point has a smaller cost.
         smallest_eigenvalue: of C - L.
+        unique: no other point costs as little, up to a motion of all: 2 gap / lambda_{d + 1} of C - L bounds the sum of
+            squares by which unit vectors and rotations of such a point leave the span of the solution's.
     """
 
     certified: bool
@@ -277,6 +281,7 @@ class Certificate:
     cost: float
     lower_bound: float
     smallest_eigenvalue: float
+    unique: bool = False
 
     @property
     def gap(self) -> float:
@@ -310,22 +315,24 @@ def certify(problem: Problem, solution: Solution, seconds: float = 0.0) -> Certi
     >>> fixes = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
     >>> problem = fixes.add("range", ("a", "b"), 5.0, std=0.5)
     >>> print(certify(problem, solve(problem)))
-    certified global optimum of Problem(2 points; 2 position, 1 range)
+    certified global optimum of Problem(2 points; 2 position, 1 range), and no other point costs as little
     """
     form = quadratic(problem)
     x = solution.x
     X = form.lift(problem.space.position(x), problem.space.rotation(x))[: form.bound]
     reduced = Reduced(form)
-    bound, smallest, _ = reduced.lower_bound(multipliers(form, X, reduced.times(X)))
+    bound, values, _ = reduced.lower_bound(multipliers(form, X, reduced.times(X)), form.columns + 1)
     if seconds > 0 and solution.cost - bound > GAP * max(solution.cost, 1.0):
         bound = max(bound, staircase(replace(problem, x0=x), refine=False, seconds=seconds).lower_bound)
-    certified = solution.cost - bound <= GAP * max(solution.cost, 1.0)
+    gap, smallest = solution.cost - bound, float(values[0])
+    certified = gap <= GAP * max(solution.cost, 1.0)
+    framed = form.stiefel.size and len(values) > form.columns
+    unique = certified and bool(framed and 2.0 * max(gap, 0.0) < ALIKE * values[-1])
+    other = "no other point costs as little" if unique else "another, such as a mirror image, may cost as little"
     sentence = (
-        f"certified global optimum of {problem!r}"
+        f"certified global optimum of {problem!r}, and {other}"
         if certified
-        else (
-            f"not certified: cost {solution.cost:.6g}, no point of {problem!r} costs less than {max(bound, 0.0):.6g} "
-            f"(smallest eigenvalue {smallest:.1e}); a local minimum, or the relaxation is not tight"
-        )
+        else f"not certified: cost {solution.cost:.6g}, no point of {problem!r} costs less than {max(bound, 0.0):.6g} "
+        f"(smallest eigenvalue {smallest:.1e}); a local minimum, or the relaxation is not tight"
     )
-    return Certificate(certified, sentence, solution.cost, max(bound, 0.0), smallest)
+    return Certificate(certified, sentence, solution.cost, max(bound, 0.0), smallest, unique)

@@ -88,7 +88,7 @@ def arrive(
     record: list[tuple[float, float, float]] = []
     newton, converged, last, still = 0, False, np.inf, 0
     cost, gradient, values = undamped = system.quadratic(x, "gauss-newton")
-    with progress("solve") as counted:
+    with progress("solve") as counted, np.errstate(over="ignore", invalid="ignore"):
         while len(record) < max_iterations and not converged and mu < GIVE_UP:
             counted(cost)
             newton += model == "newton"

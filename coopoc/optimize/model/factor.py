@@ -66,9 +66,9 @@ class Loss:
         self.__dict__["scale"] = number("scale", self.scale, tiny, allowed="> 0 and finite", hint=hint)
 
     @property
-    def redescends(self) -> bool:
-        """True if the weight of a large residual falls so fast that its cost is bounded."""
-        return self.name in ("truncated", "geman-mcclure")
+    def convex(self) -> bool:
+        """True if the loss adds no minima to those of least squares."""
+        return self.name == "huber"
 
     def cost(self, square: Floats) -> Floats:
         """rho(s)."""

@@ -9,12 +9,17 @@ import numpy as np
 import numpy.typing as npt
 
 from ...arrays import Floats, instance, one_of
-from ..backend import Backend
+from ...kernels.compiling.waiting import clock
+from ..algebra.sparse import sparse
+from ..assess.assess import REJECTED, rejection
+from ..backend import MAX_ITERATIONS, TOLERANCE, Backend
+from ..descent.levenberg_marquardt import arrive
 from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status
 from ..solve import solve
+from ..starts.initial import initial_guess
 from .candidates import Candidates, bounds, mark, reweigh, squares
-from .graduated import graduate, surrogate_of
+from .graduated import Graduation, contest, graduate, surrogate_of
 from .loop_closures import known_start
 
 Start = Literal["all", "known"]
@@ -40,8 +45,9 @@ def solve_gnc(
         truncated: w = sqrt(mu (mu + 1)) c/|r| - mu within [0, 1], mu from c^2 / (2 r_max^2 - c^2) up by 1.4 a round
         geman-mcclure: w = (mu c^2 / (r^2 + mu c^2))^2, mu from 2 r_max^2 / c^2 down to 1
 
-    until the weights no longer change, truncated ones at 0 or 1. It needs no good start, but inlier groups that agree
-    better than the others: a majority of consistent outliers wins, and so does an error that all share.
+    until the weights no longer change, truncated ones at 0 or 1. That races with other starts where it rejects any
+    (`graduated.py`), and the least cost wins. Inlier groups must agree better than the others: a majority of consistent
+    outliers wins, and so does an error that all share.
 
     start="known" begins with the known inliers alone, which candidates join where they are predicted
     (`loop_closures.py`), and then alternates with rho itself. Long drives with wrong loop closures need that: the first
@@ -55,7 +61,7 @@ def solve_gnc(
         threshold: probability that the residual of an inlier group is within c.
         groups: (M,) labels; measurements with one label share one weight, such as the fixes of one neighbour. Default:
             each on its own.
-        backend: of `solve`, which solves every round.
+        backend: of `solve`, for the last problem, and with constraints for every round.
         throw: as in `solve`.
         start: "all" with full weights, or "known" inliers.
         options: of the backend.
@@ -83,26 +89,43 @@ def solve_gnc(
     instance("problem", problem, Problem)
     marked, surrogate = mark(problem, candidates, groups), surrogate_of(loss, threshold)
     one_of("start", start, Start)
-    bound, each, extras = bounds(problem, marked, threshold), list[Solution](), dict[str, Any]()
+    bound, each, extras, began = bounds(problem, marked, threshold), list[int](), dict[str, Any](), clock()
 
-    def inner(weighted: Problem) -> Floats:
-        each.append(solve(weighted, backend, throw=False, covariance=False, **options))
-        return each[-1].x
+    def inner(part: Problem) -> Floats:
+        if problem.constraints:
+            found = solve(part, backend, throw=False, covariance=False, **options)
+            each.append(found.iterations)
+            return found.x
+        end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, TOLERANCE)
+        each.append(end.iterations)
+        return end.x
+
+    def finish(at: Floats, weight: Floats | None = None) -> Graduation:
+        weight = np.ones(len(bound)) if weight is None else weight
+        return graduate(problem, marked, bound, surrogate, inner, at, weight, surrogate.last)
+
+    def cost(at: Floats) -> float:
+        s = squares(problem, marked, at) / bound
+        spent = np.minimum(s, 1.0) if loss == "truncated" else s / (1.0 + s)
+        return sparse(reweigh(problem, marked, np.zeros(len(bound)), at)).cost(at) + 0.5 * float(bound @ spent)
 
     if start == "known":
         known = known_start(problem, marked, bound, inner)
-        x, weight, before, mu = known.x, known.weight, known.rounds, surrogate.last
+        before, end = known.rounds, finish(known.x, known.weight)
         extras |= {"joined": known.joined} if known.joined else {}
     else:
-        x, weight, before = inner(problem), np.ones(len(bound)), 0
-        mu = surrogate.first(float((squares(problem, marked, x) / bound).max()))
-    end = graduate(problem, marked, bound, surrogate, inner, x, weight, mu)
+        first = initial_guess(problem)
+        best, x, end = contest(problem, marked, bound, surrogate, inner, first, lambda at: finish(at).x, cost)
+        before, extras["start"] = 0, best
+        end = end if best == "graduated" else finish(x)
     final = solve(reweigh(problem, marked, end.weight, end.x), backend, throw=throw and end.settled, **options)
     extras |= {"weights": end.weight[marked.group], "rounds": before + end.rounds, "mu": float(end.mu)}
-    names = ("iterations", "build_seconds", "solve_seconds", "check_seconds")
-    work = {name: sum(getattr(s, name) for s in (*each, final)) for name in names}
+    work: dict[str, Any] = {"iterations": sum(each) + final.iterations}
+    work["solve_seconds"] = clock() - began - final.build_seconds - final.check_seconds
     status = final.status if end.settled else Status.MAX_ITERATIONS
-    solution = replace(final, extras=final.extras | extras, status=status, **work)
+    out = int((end.weight < REJECTED).sum())
+    notes = (rejection("GNC", out, len(bound), "candidates", final.cost, final.expected),) if out else ()
+    solution = replace(final, extras=final.extras | extras, status=status, notes=(*notes, *final.notes), **work)
     if throw and not end.settled:
         raise SolveError(solution)
     return solution

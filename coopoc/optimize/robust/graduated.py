@@ -13,8 +13,9 @@ from ...errors import InputError
 from ..algebra.sparse import sparse
 from ..backend import MAX_ITERATIONS, TOLERANCE
 from ..descent.levenberg_marquardt import arrive
-from ..model.factor import Loss, unchecked
+from ..model.factor import Factor, Loss, taken, unchecked
 from ..model.problem import Problem
+from ..starts.mirrors import across
 from .candidates import Marked, mark, reweigh, squares
 
 ROUNDS = 300
@@ -104,11 +105,67 @@ def graduate(
     return Graduation(x, weight, ROUNDS, mu, False)
 
 
-def robust_start(problem: Problem, start: Floats) -> Problem:
-    """The problem from where its truncated and Geman-McClure losses lead by graduation, by descent from the start
-    (n, ambient), or by that of Cauchy's loss, which rejects nothing: the one of the lowest cost; its search names it.
+def contest(
+    problem: Problem,
+    marked: Marked,
+    bound: Floats,
+    surrogate: Surrogate,
+    inner: Callable[[Problem], Floats],
+    start: Floats,
+    finish: Callable[[Floats], Floats],
+    cost: Callable[[Floats], float],
+) -> tuple[str, Floats, Graduation]:
+    """The start of least cost after `finish`, its end (n, ambient), and the graduation from the convex surrogate.
 
-    Far from the minimum these losses are flat: every measurement is rejected, and no step is left.
+    That graduation races with the start itself and with descents of Huber's and Cauchy's losses, which reject nothing.
+    What ranges alone place is then put where Cauchy's loss likes it better.
+
+    Args:
+        problem: whose candidates have no loss.
+        inner: solves a problem from its x0.
+        start: (n, ambient).
+        finish: from where a start leads to a minimum of the cost.
+        cost: that is to be least.
+    """
+    x = inner(reweigh(problem, marked, np.ones(len(bound)), start))
+    mu = surrogate.first(float((squares(problem, marked, x) / bound).max()))
+    graduation = graduate(problem, marked, bound, surrogate, inner, x, np.ones(len(bound)), mu)
+    if bool((graduation.weight == 1.0).all()):
+        return "graduated", finish(graduation.x), graduation
+    huber, cauchy = (softened(problem, marked, bound, name) for name in ("huber", "cauchy"))
+
+    def soft(at: Floats) -> Floats:
+        return inner(cauchy.replace_unchecked(x0=frozen(at)))
+
+    starts = {"graduated": graduation.x, "x0": start, "cauchy": soft(start)}
+    starts["huber"] = soft(inner(huber.replace_unchecked(x0=frozen(start))))
+    ends = {name: finish(at) for name, at in starts.items()}
+    costs = {name: np.nan_to_num(cost(at), nan=np.inf) for name, at in ends.items()}
+    best = min(ends, key=costs.__getitem__)
+    found, moves, *_ = across(cauchy, ends[best], lambda at: finish(soft(at)), cost)
+    return best + ", mirrored" * (moves > 0), found, graduation
+
+
+def softened(problem: Problem, marked: Marked, bound: Floats, loss: str) -> Problem:
+    """The problem with a loss on its candidates (their rows are factors of their own), each of the scale of its
+    group."""
+    factors = list[Factor]()
+    for k, factor in enumerate(problem.factors):
+        here = marked.factor == k
+        rows, scale = marked.row[here], np.sqrt(bound[marked.group[here]])
+        rest = np.setdiff1d(np.arange(len(factor.nodes)), rows)
+        factors += [taken(factor, rest)] if len(rest) else []
+        factors += [
+            unchecked(taken(factor, rows[scale == each]), loss=Loss(loss, float(each))) for each in np.unique(scale)
+        ]
+    return problem.replace_unchecked(factors=tuple(factors))
+
+
+def robust_start(problem: Problem, start: Floats) -> Problem:
+    """The problem from where its losses that are not convex lead lowest: see `contest`; its search names the start.
+
+    Far from the minimum truncated and Geman-McClure losses are flat: every measurement is rejected, and no step is
+    left. Cauchy's has a minimum for each subset that agrees.
 
     >>> from coopoc.optimize import Loss, Problem
     >>> z = [[0, 0, 0], [0, 0, 0], [99, 0, 0]]
@@ -119,33 +176,31 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
     """
     if problem.constraints:
         return problem
-    taken, factors = 0, problem.factors
-    robust = {k: f.loss for k, f in enumerate(factors) if f.loss is not None and f.loss.redescends}
-    bare = problem.replace_unchecked(factors=tuple(unchecked(f, loss=None) for f in factors))
-    marked = mark(bare, list(robust))
+    steps, factors = 0, problem.factors
+    robust = {k: f.loss for k, f in enumerate(factors) if f.loss is not None and not f.loss.convex}
+    bare = tuple(unchecked(f, loss=None) if k in robust else f for k, f in enumerate(factors))
+    marked = mark(problem.replace_unchecked(factors=bare), list(robust))
     bound = np.array([robust[k].scale ** 2 for k in marked.factor.tolist()])
 
     def inner(part: Problem) -> Floats:
-        nonlocal taken
+        nonlocal steps
         end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, TOLERANCE)
-        taken += end.iterations
+        steps += end.iterations
         return end.x
 
-    surrogate, weight = SURROGATES[next(iter(robust.values())).name], np.ones(len(bound))
-    x = inner(reweigh(problem, marked, weight, start))
-    mu = surrogate.first(float((squares(problem, marked, x) / bound).max()))
-    losses = [None if f.loss is None else Loss("cauchy", f.loss.scale) for f in factors]
-    softer = tuple(unchecked(f, loss=loss) for f, loss in zip(factors, losses, strict=True))
-    starts = {
-        "graduated": graduate(problem, marked, bound, surrogate, inner, x, weight, mu).x,
-        "x0": start,
-        "cauchy": inner(problem.replace_unchecked(factors=softer, x0=start)),
-    }
-    ends = {name: inner(problem.replace_unchecked(x0=at)) for name, at in starts.items()}
-    cost = {name: np.nan_to_num(sparse(problem).cost(at), nan=np.inf) for name, at in ends.items()}
-    best, search = min(ends, key=cost.__getitem__), problem.search
-    search = search._replace(
-        start=search.start if best == "x0" and search.start else best,
-        iterations=search.iterations + taken,
+    surrogate = SURROGATES.get(next(iter(robust.values())).name, SURROGATES["truncated"])
+    best, x, _ = contest(
+        problem.replace_unchecked(factors=bare),
+        marked,
+        bound,
+        surrogate,
+        inner,
+        start,
+        lambda at: inner(problem.replace_unchecked(x0=frozen(at))),
+        sparse(problem).cost,
     )
-    return problem.replace_unchecked(x0=frozen(ends[best]), search=search)
+    search = problem.search
+    name = search.start if best == "x0" and search.start else best
+    return problem.replace_unchecked(
+        x0=frozen(x), search=search._replace(start=name, iterations=search.iterations + steps)
+    )

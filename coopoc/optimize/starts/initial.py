@@ -32,12 +32,17 @@ def initial_guess(problem: Problem) -> Floats:
     Raises:
         InputError: poses without an x0.
     """
+    return guessed(problem)[0]
+
+
+def guessed(problem: Problem) -> tuple[Floats, bool]:
+    """`initial_guess`, and whether anything places every node in it."""
     if problem.x0 is not None:
-        return problem.x0.copy()
+        return problem.x0.copy(), True
     if problem.poses:
         raise InputError("x0", "none", "is needed where there are poses", "Give poses: coopoc.optimize.pose, or chain.")
     x, touched = _solution(sparse(problem), "converted")
-    return x if touched else _apart(problem, x)
+    return (x if touched else _apart(problem, x)), touched
 
 
 def _solution(system: Sparse, model: Model) -> tuple[Floats, bool]:

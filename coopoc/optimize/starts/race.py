@@ -10,7 +10,9 @@ from ...arrays import Floats, frozen
 from ..algebra.sparse import sparse
 from ..assess.assess import expected
 from ..descent.levenberg_marquardt import Arrival, arrive
+from ..model.factor import Factor, unchecked
 from ..model.problem import Problem, Search
+from .mirrors import across
 
 STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
@@ -25,13 +27,18 @@ EXCESS = 5.0
 """Standard deviations above its mean, under the noise that is assumed, from which a cost is not believed."""
 MORE = 50
 """Steps before it is judged."""
+RIVAL = 10.0
+"""Cost by which another minimum may be higher and still be the truth's: 1e-5 of chi-square with one degree."""
+RELAXED = 400
+"""Nodes up to which the convex relaxation of a problem is solved."""
+EASED = (30.0, 10.0, 3.0, 1.0)
+"""Times as large standard deviations of ranges."""
 
 
 def race(
     problem: Problem,
     starts: Mapping[str, Callable[[], Floats]],
-    growing: Callable[[Problem], tuple[Floats, int]] | None,
-    relaxed: Callable[[Problem], Floats] | None,
+    late: Mapping[str, Callable[[Problem], tuple[Floats, int]]],
     unwound: Callable[[Floats], bool],
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
@@ -39,19 +46,37 @@ def race(
     All starts are tried, and those whose costs are near the least go on (ROUNDS), unless one leads by steps of which
     none was refused and whose promises came true by half and more, to a cost which the assumed noise explains, and to
     an end that is `unwound` or to which another led as smoothly. Where the noise does not explain the end and the steps
-    to it had trouble, the growing start is tried, too, unless a second start led there, and then the relaxation. Where
-    the steps went straight the noise is taken as stated too small, which a note of the Solution leaves open.
+    to it had trouble, the late starts are tried, one after the other, unless a second start led there. Where the steps
+    went straight the noise is taken as stated too small, which a note of the Solution leaves open. What ranges alone
+    place is mirrored at last.
 
     Args:
         problem: at any start.
         starts: name -> x0 (n, ambient), cheapest first.
-        growing: problem -> x0 and iterations of a start that is tried late, "incremental"; or None.
-        relaxed: problem -> x0, "relaxed", of one that is tried last; None where it would take too long.
+        late: name -> a function of the problem at the best end so far, of x0 and the iterations that it took.
         unwound: x -> whether no other minimum of a lower cost is to be feared.
     """
     system, tried, taken, calm = sparse(problem), {}, 0, list[float]()
     mean, variance = expected(problem, system.size)
-    limit, straight = mean + EXCESS * np.sqrt(variance), set[str]()
+    limit, straight, arrived = mean + EXCESS * np.sqrt(variance), set[str](), True
+    minima = list[float]()
+
+    def descend(x: Floats) -> Floats:
+        nonlocal taken, arrived
+        end = arrive(system, x, MORE, TOLERANCE)
+        taken, arrived = taken + end.iterations, end.converged
+        return end.x
+
+    def ended(name: str, x: Floats) -> tuple[Problem, Search]:
+        x, moves, rivals, doubtful = across(problem, x, descend, system.cost)
+        name, cost = name + ", mirrored" * (moves > 0), system.cost(x)
+        near = [each for each in (*rivals, *minima) if (1.0 + SAME) * cost < each < cost + RIVAL]
+        notes = (f"another minimum costs {min(near) - cost:.3g} more: noise may decide between them",) if near else ()
+        if doubtful and not near:
+            names = ", ".join(problem.names[body[0]] for body in doubtful[:5])
+            notes = (f"ranges hardly tell {names} from a mirror image: a lower minimum may exist",)
+        return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
+
     for name, start in starts.items():
         x = start()
         end = arrive(system, x, STEPS, TOLERANCE)
@@ -60,7 +85,7 @@ def race(
             cost, calm = tried[name][0], [*calm, tried[name][0]]
             alike = sum(abs(cost - other) <= SAME * cost for other in calm) > 1
             if cost <= limit and (alike or unwound(end.x)):
-                return problem.replace_unchecked(x0=frozen(end.x)), Search(name, taken)
+                return ended(*next((each, x) for each, (c, x) in tried.items() if abs(c - cost) <= SAME * cost))
             straight |= {name} if end.converged else set()
     reached = {name: cost for name, (cost, _) in tried.items()}
     least = min(reached.values())
@@ -74,26 +99,46 @@ def race(
             tried = {name: (system.cost(end.x), end.x) for name, end in ends.items()}
             taken += sum(end.iterations for end in ends.values())
             reached |= {name: cost for name, (cost, _) in tried.items()}
+            minima = [cost for name, (cost, _) in tried.items() if ends[name].converged]
             least = min(reached.values())
     name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
-    alone = sum(cost <= (1.0 + SAME) * least for cost in reached.values()) == 1
-
-    def better(late: str, start: Floats) -> tuple[str, Floats]:
-        nonlocal taken
-        end = arrive(system, start, MORE, TOLERANCE)
-        taken += end.iterations
-        return (late, end.x) if system.cost(end.x) < (1.0 - SAME) * system.cost(x) else (name, x)
-
-    if growing is not None and alone and name not in straight and system.cost(x) > limit:
-        end = arrive(system, x, MORE, TOLERANCE)
-        x, taken = end.x, taken + end.iterations
-        if system.cost(x) > limit:
-            grown, steps = growing(problem)
+    if (
+        name not in straight
+        and system.cost(x) > limit
+        and sum(c <= (1.0 + SAME) * least for c in reached.values()) == 1
+    ):
+        x = descend(x)
+        for other, made in late.items():
+            if arrived and system.cost(x) <= limit:
+                break
+            y, steps = made(problem.replace_unchecked(x0=frozen(x)))
             taken += steps
-            name, x = better("incremental", grown)
-    if relaxed is not None and name not in straight and system.cost(x) > limit:
-        name, x = better("relaxed", relaxed(problem.replace_unchecked(x0=frozen(x))))
-    return problem.replace_unchecked(x0=frozen(x)), Search(name, taken)
+            y = descend(y)
+            costs = system.cost(x), system.cost(y)
+            if max(costs) <= ROUNDS[0][0] * min(costs):
+                x, y = descend(x), descend(y)
+            name, x = (other, y) if system.cost(y) < (1.0 - SAME) * system.cost(x) else (name, x)
+    return ended(name, x)
+
+
+def eased(problem: Problem, start: Floats) -> tuple[Floats, int]:
+    """Nodes (n, ambient) and iterations from where ranges with larger standard deviations lead, and then smaller ones:
+    at first odometry decides."""
+    x, taken = start, 0
+    for times in EASED:
+        part = problem.replace_unchecked(
+            factors=tuple(weaker(f, times) if f.kind == "range" else f for f in problem.factors)
+        )
+        end = arrive(sparse(part), x, STEPS, TOLERANCE)
+        x, taken = end.x, taken + end.iterations
+    return x, taken
+
+
+def weaker(factor: Factor, times: float) -> Factor:
+    """A factor with standard deviations that are `times` as large."""
+    if factor.std is not None:
+        return unchecked(factor, std=factor.std * times)
+    return unchecked(factor, sqrt_information=np.asarray(factor.sqrt_information) / times)
 
 
 def _distinct(tried: dict[str, tuple[float, Floats]]) -> dict[str, tuple[float, Floats]]:

@@ -1,0 +1,83 @@
+"""What contradicts the estimates of a track: fixes, the odometer, and what is had of neighbours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from ..arrays import Floats, Ints
+from ..kernels.covariances import DOUBT, TOGETHER, mark_estimates, mark_neighbours, mark_odometers
+from ..world.links import stretches
+from ..world.recording import Recording
+from .noise_model import NoiseModel
+
+SECOND = 1.0
+"""s between two fixes that are judged together, at least; twice that between two numbers of a neighbour."""
+DOUBTS = (
+    "fixes, {}: far from its estimates; it is lost, or rejects them",
+    "covariances, {}: contradicted by fixes",
+    "odometer, {}: contradicted by fixes; it slips, or they jump",
+)
+NEIGHBOURS = "messages, {} and {}: far from estimates", "relative measurements, {} and {}: far from estimates"
+
+
+def doubts(
+    recording: Recording,
+    columns: Sequence[int],
+    x: Floats,
+    cov: Floats | None = None,
+    noise_model: NoiseModel | str = "nominal",
+    neighbours: Floats | None = None,
+) -> tuple[str, ...]:
+    """Notes of what contradicts the estimates of some vehicles in any run, and when: TOGETHER numbers in a row.
+
+    Receivers that are rejected or filters that are lost: all fixes are beyond their gate. Covariances: the fixes' mean,
+    or their mean square, is farther off than chance allows. Odometers: the fixes move otherwise, again beyond chance.
+    Neighbours: all messages, or relative measurements, are beyond REJECTED gates.
+
+    Args:
+        recording: of all vehicles, with the noise that methods know.
+        columns: (E,) of the vehicles.
+        x: (R, T, E, 3) m.
+        cov: (R, T, E, 3, 3) m^2; None if none is claimed.
+        noise_model: of the method; covariances and neighbours are not judged where it states no noise.
+        neighbours: (R, L, 3) m as of Track; None for none.
+
+    >>> from coopoc import Fleet, Sensors, observe
+    >>> fleet = Fleet(("a",), np.arange(9), np.zeros((9, 1, 3)), np.zeros((9, 1, 3)))
+    >>> doubts(observe(fleet, Sensors()), [0], np.full((1, 9, 1, 3), 1e3))
+    ('fixes, a: far from its estimates; it is lost, or rejects them (0 to 4 s)',)
+    """
+    stated = noise_model.sensors if isinstance(noise_model, NoiseModel) else noise_model != "identity"
+    sensors, links, steps, notes = recording.sensors, recording.links, len(recording.t), [*recording.unlikely]
+    egos, claimed = np.asarray(columns, dtype=np.int64), cov if cov is not None and stated else np.zeros((0,) * 5)
+    fix = np.square([sensors.gnss_std, (sensors.gnss_drift_std, sensors.gnss_common_std, sensors.gnss_bias[1])])
+    fix[1] = fix[1].sum()
+    every, marks = max(min(round(SECOND / recording.dt), steps // TOGETHER), 1), np.zeros((3, len(egos), steps), int)
+    doubtful = mark_estimates(recording.gnss, x, claimed, egos, fix, every, marks) + DOUBT * (neighbours is not None)
+    if recording.body is None:
+        turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
+        motion = sensors.velocity_std_ratio**2, turn, sensors.velocity_floor**2
+        mark_odometers(recording.gnss, recording.velocity, egos, doubtful, fix, motion, every, recording.dt, marks)
+
+    def add(text: str, marked: Ints, *names: int) -> None:
+        times = [f"{recording.t[a]:.10g} to {recording.t[b - 1]:.10g}" for a, b in stretches(marked > 0)]
+        if times:
+            more = f", and {len(times) - 3} times more" * (len(times) > 3)
+            notes.append(f"{text.format(*(recording.ids[name] for name in names))} ({', '.join(times[:3])} s{more})")
+
+    first = 0
+    for k, ego in enumerate(columns):
+        for text, marked in zip(DOUBTS, marks[:, k], strict=True):
+            add(text, marked, ego)
+        if neighbours is not None and len(claimed):
+            own, far = links.of(ego), np.zeros((2, len(recording.ids), steps), int)
+            theirs, first = neighbours[:, first : first + len(own)], first + len(own)
+            rows = np.stack([own, links.step[own], links.neighbour[own]], axis=1)
+            std = np.array([sensors.range_std, sensors.world_azimuth_std, sensors.inclination_std])
+            star = recording.gnss, recording.relative, x[:, :, k], claimed[:, :, k], theirs, rows
+            mark_neighbours(*star, fix, std, 2 * every, far)
+            for kind, j in np.argwhere(far.any(axis=2)).tolist():
+                add(NEIGHBOURS[kind], far[kind, j], ego, j)
+    return tuple(notes)

@@ -1,0 +1,210 @@
+"""Mirror images of what ranges alone place: multidimensional scaling, and moves across planes to lower minima."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from itertools import combinations, islice
+from typing import NamedTuple
+
+import numpy as np
+
+from ...arrays import Bools, Floats, Ints
+from ..model.factor import Loss
+from ..model.problem import Problem
+from .graph_starts import parts
+
+LARGEST = 2000
+"""Nodes up to which all shortest paths are taken."""
+SUBSETS = 60
+"""Of the ranges of a point, whose spheres are cut."""
+TRIED = 32
+"""Moves that are followed by descents, of few bodies and the most promising first."""
+NEAR = 10.0
+"""Cost, and as many times the cost of its ranges, that a move may add before the others have given way."""
+ROUNDS = 15
+"""Of moves, of which three are usual."""
+SAME = 1e-6
+"""Share of the cost that a move must save."""
+
+
+class Ranges(NamedTuple):
+    """M ranges: nodes (M, 2), distance (M,) m, weight (M,) 1/m and the loss of each, None for least squares."""
+
+    nodes: Ints
+    distance: Floats
+    weight: Floats
+    losses: tuple[tuple[Bools, Loss | None], ...]
+
+    def cost(self, length: Floats, rows: Ints) -> Floats:
+        """(C,) cost of some ranges (K,) where they are `length` (K, C)."""
+        square = np.square((length - self.distance[rows, None]) * self.weight[rows, None])
+        for own, loss in self.losses:
+            if loss is not None and (here := own[rows]).any():
+                square[here] = loss.cost(square[here])
+        return np.asarray(0.5 * square.sum(axis=0))
+
+
+def ranges_of(problem: Problem) -> Ranges:
+    """All ranges of a problem that have weight."""
+    factors = [f for f in problem.factors if f.kind == "range"]
+    own = np.repeat(np.arange(len(factors)), [len(f.nodes) for f in factors])
+    nodes = np.concatenate([np.empty((0, 2), np.int64), *(f.nodes for f in factors)])
+    distance, weight = (
+        np.concatenate([np.empty(0), *parts_])
+        for parts_ in ([f.z[:, 0] for f in factors], [f.root[:, 0, 0] for f in factors])
+    )
+    return Ranges(nodes, distance, weight, tuple((own == k, f.loss) for k, f in enumerate(factors)))
+
+
+def bodies(problem: Problem) -> list[Ints]:
+    """Nodes that ranges alone place, as what else is measured joins them: landmarks, points, robots with their
+    odometry."""
+    others = [f.nodes[f.informative] for f in problem.factors if f.kind != "range"]
+    part = parts(len(problem.names), *(n[:, k : k + 2] for n in others for k in range(n.shape[1] - 1)))
+    held = np.concatenate([np.array(problem.fixed, np.int64), *(n[:, 0] for n in others if n.shape[1] == 1)])
+    loose = np.setdiff1d(part, part[held])
+    order = np.argsort(part, kind="stable")
+    groups = np.split(order, np.flatnonzero(np.diff(part[order])) + 1)
+    return [group for group in groups if part[group[0]] in loose]
+
+
+def scaled(problem: Problem, x: Floats) -> Floats:
+    """Points x (n, d) with what ranges alone place by classical multidimensional scaling of shortest paths, turned and
+    mirrored onto the other points; x itself where that is too large or does not hang together.
+
+    References:
+        Shang, Ruml, Zhang, Fromherz, Localization from mere connectivity, MobiHoc 2003 (MDS-MAP).
+    """
+    from scipy.sparse.csgraph import shortest_path
+
+    seen, n, d = ranges_of(problem), len(x), x.shape[1]
+    loose = np.concatenate([np.empty(0, np.int64), *bodies(problem)])
+    known = np.setdiff1d(np.arange(n), loose)
+    if n > LARGEST or not len(loose):
+        return x
+    table, (row, column) = np.full((n, n), np.inf), seen.nodes.T
+    np.minimum.at(table, (row, column), seen.distance)
+    for f in problem.factors:
+        if f.kind == "displacement":
+            np.minimum.at(table, tuple(f.nodes.T), np.linalg.norm(f.z, axis=1))
+    apart = np.linalg.norm(x[known, None] - x[known], axis=2)
+    table[np.ix_(known, known)] = np.where(apart > 0, apart, np.inf)
+    square = np.square(shortest_path(np.minimum(table, table.T), directed=False))
+    if not np.isfinite(square).all():
+        return x
+    square -= square.mean(axis=0)
+    values, vectors = np.linalg.eigh(-0.5 * (square - square.mean(axis=1, keepdims=True)))
+    y = vectors[:, -d:] * np.sqrt(np.maximum(values[-d:], 0.0))
+    if len(known):
+        middle, origin = x[known].mean(axis=0), y[known].mean(axis=0)
+        left, _, right = np.linalg.svd((x[known] - middle).T @ (y[known] - origin))
+        y = (y - origin) @ (left @ right).T + middle
+    y[known] = x[known]
+    return np.asarray(y)
+
+
+def crossings(places: Floats, ranges: Floats) -> Floats:
+    """(C, d) points where d of the spheres of `ranges` (K,) around `places` (K, d) meet, or come nearest to it.
+
+    >>> crossings(np.array([[0.0, 0], [8, 0]]), np.array([5.0, 5])).round(6)
+    array([[ 4., -3.],
+           [ 4.,  3.]])
+    """
+    d = places.shape[1]
+    chosen = np.array([*islice(combinations(range(len(places)), d), 10 * SUBSETS)])
+    chosen = chosen[:: -(-len(chosen) // SUBSETS)]
+    p, r = places[chosen], ranges[chosen]
+    gap = p[:, 1:] - p[:, :1]
+    right = 0.5 * (np.square(gap).sum(axis=2) - np.square(r[:, 1:]) + np.square(r[:, :1]))
+    foot = (np.linalg.pinv(gap) @ right[..., None])[..., 0]
+    height = np.sqrt(np.maximum(np.square(r[:, 0]) - np.square(foot).sum(axis=1), 0.0))
+    up = height[:, None] * np.linalg.svd(gap)[2][:, -1]
+    return np.asarray(np.stack([p[:, 0] + foot - up, p[:, 0] + foot + up], axis=1).reshape(-1, d))
+
+
+def _elsewhere(problem: Problem, seen: Ranges, x: Floats, body: Ints) -> tuple[float, Floats] | None:
+    """What the best other place of a body adds to the cost of its ranges, and its nodes there; None if it has none.
+
+    It is reflected at the best-fit plane of what ranges it, keeping its handedness, and a point is also put where its
+    spheres cross.
+    """
+    space, d, inside = problem.space, problem.dimension, np.isin(seen.nodes, body)
+    rows = np.flatnonzero(inside.any(axis=1) & ~inside.all(axis=1) & (seen.weight > 0))
+    if len(rows) < 2:
+        return None
+    first = inside[rows, 0]
+    own, other = (np.where(side, *seen.nodes[rows].T) for side in (first, ~first))
+    places, at = space.position(x[other]), space.position(x[body])
+    middle = places.mean(axis=0)
+    normal = np.linalg.eigh((places - middle).T @ (places - middle))[1][:, 0]
+    flipped = at - 2.0 * np.outer((at - middle) @ normal, normal)
+    there = x[body].copy()
+    if len(body) == 1:
+        options = np.concatenate([at, flipped, *([crossings(places, seen.distance[rows])] if len(rows) >= d else [])])
+        costs = seen.cost(np.linalg.norm(options - places[:, None], axis=2), rows)
+        far = np.linalg.norm(options - at, axis=1) > 0.05 * seen.distance[rows].mean()
+        if not far.any():
+            return None
+        best = int(np.where(far, costs, np.inf).argmin())
+        there[0, :d] = options[best]
+        return float(costs[best] - costs[0]), there
+    left, _, right = np.linalg.svd((flipped - flipped.mean(axis=0)).T @ (at - at.mean(axis=0)))
+    turn = left @ np.diag([*np.ones(d - 1), np.linalg.det(left @ right)]) @ right
+    moved = (at - at.mean(axis=0)) @ turn.T + flipped.mean(axis=0)
+    there = space.join(moved, turn @ space.rotation(x[body])) if space.has_rotation else moved
+    index = np.searchsorted(body, own)
+    before, after = (seen.cost(np.linalg.norm(p[index] - places, axis=1)[:, None], rows)[0] for p in (at, moved))
+    return float(after - before), there
+
+
+Move = tuple[float, Floats, Ints]
+"""What it adds to the cost of the ranges of a body, its nodes there, and the body."""
+
+
+def _moves(problem: Problem, seen: Ranges, x: Floats, single: list[Move]) -> Iterator[Floats]:
+    """Points (n, ambient) to descend from: all bodies where they cost less, one after the other, then one at a time,
+    and several together."""
+    if any(adds < 0 for adds, _, _ in single):
+        y = x.copy()
+        for *_, body in single:
+            if (move := _elsewhere(problem, seen, y, body)) is not None and move[0] < 0:
+                y[body] = move[1]
+        yield y
+    near = [move for move in single if move[0] <= NEAR * (1.0 + len(seen.nodes) / len(x))][:TRIED]
+    together = (chosen for size in range(1, len(near) + 1) for chosen in combinations(near, size))
+    for chosen in islice(together, TRIED):
+        y = x.copy()
+        for _, there, body in chosen:
+            y[body] = there
+        yield y
+
+
+def across(
+    problem: Problem, x: Floats, descend: Callable[[Floats], Floats], cost: Callable[[Floats], float]
+) -> tuple[Floats, int, list[float], list[Ints]]:
+    """The lowest end (n, ambient) of descents from x and from mirror images of what ranges alone place, how many
+    moves led down, the costs of the other ends, and the bodies whose ranges alone hardly tell them from elsewhere.
+
+    Args:
+        problem: whose ranges, and their losses, place the bodies.
+        x: (n, ambient) a minimum.
+        descend: from a point to a minimum.
+        cost: of a point.
+    """
+    seen, loose, least, count = ranges_of(problem), bodies(problem), cost(x), 0
+    if len(loose) == len(problem.names) or not len(seen.nodes):  # nothing to mirror at
+        loose = loose if len(loose) > 1 else []
+    rivals, single = list[float](), list[Move]()
+    while count < ROUNDS:
+        found = ((_elsewhere(problem, seen, x, body), body) for body in loose)
+        single = sorted(((*move, body) for move, body in found if move is not None), key=lambda move: move[0])
+        rivals = []
+        for start in _moves(problem, seen, x, single):
+            end = descend(start)
+            if (now := cost(end)) < (1.0 - SAME) * least - 1e-9:
+                x, least, count = end, now, count + 1
+                break
+            rivals.append(now)
+        else:
+            break
+    return x, count, rivals, [body for adds, _, body in single if adds <= NEAR]

@@ -1,0 +1,108 @@
+"""What is said of an end: infinite costs, singular J^T J, saddles, mirror images, bounds; against SciPy and closed
+forms."""
+
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from scipy.optimize import least_squares
+
+from coopoc.arrays import Floats
+from coopoc.optimize import Problem, Solution, Status, solve
+from coopoc.optimize.convex import certify
+from coopoc.optimize.graph_problems import _counted
+
+
+def ranged(anchors: Floats, start: Floats, ranges: Floats, std: float) -> Problem:
+    """A robot that ranges anchors in the plane."""
+    count = len(anchors)
+    problem = Problem((*map(str, range(count)), "r"), x0=np.vstack([anchors, start]), fixed=range(count), dimension=2)
+    return problem.add("range", [(k, "r") for k in range(count)], ranges, std=std)
+
+
+@pytest.mark.parametrize(("z", "std"), [(1e308, 1.0), (1.0, 1e-160)])
+def test_an_infinite_cost_is_no_minimum(z: float, std: float) -> None:
+    found = solve(
+        ranged(np.zeros((1, 2)), np.ones(2), np.array([z]), std).add("position", "r", [1, 1], 1.0), throw=False
+    )
+    assert found.status is Status.FAILED
+    assert "overflows" in found.notes[-1]
+
+
+@pytest.mark.parametrize("seed", range(12))
+def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed: int) -> None:
+    """SciPy's curvature by differences of its own cost is the inverse of the covariance."""
+    rng = np.random.default_rng(seed)
+    angle = rng.uniform(0, np.pi)
+    along = np.array([np.cos(angle), np.sin(angle)])
+    anchors, truth = np.outer([0, 10, 25.0], along), along * rng.uniform(2, 20)
+    ranges = np.linalg.norm(anchors - truth, axis=1) + np.array([0.4, -0.4, -0.1])
+    problem = ranged(anchors, truth + rng.normal(0, 1, 2), ranges, 0.3)
+    found = solve(problem)
+    theirs = least_squares(lambda p: (np.linalg.norm(anchors - p, axis=1) - ranges) / 0.3, problem.x0[3], xtol=1e-15)
+    assert found.cost == pytest.approx(theirs.cost, rel=1e-6)
+    cost = lambda p: 0.5 * np.square((np.linalg.norm(anchors - p, axis=1) - ranges) / 0.3).sum()  # noqa: E731
+    h, x = 1e-3 * np.eye(2), found.x[3]
+    hessian = [[cost(x + a + b) - cost(x + a - b) - cost(x - a + b) + cost(x - a - b) for a in h] for b in h]
+    singular = "J^T J is singular at this minimum, whose covariance is that of the exact Hessian" in found.notes
+    across = np.array([-along[1], along[0]])
+    assert singular == (abs((x - truth) @ across) < 1e-4)
+    if singular:
+        assert found.covariance[3] == pytest.approx(np.linalg.inv(np.array(hessian) / 4e-6), rel=1e-3)
+
+
+def test_a_saddle_between_two_anchors_is_one() -> None:
+    """Closed form: ranges of 15 m to anchors 10 m apart are met 14.1 m off their line."""
+    problem = ranged(np.array([[0, 0], [10, 0.0]]), np.array([5, 0.0]), np.full(2, 15.0), 1.0)
+    assert solve(problem, throw=False).status is Status.SADDLE
+    unknown = ranged(np.zeros((1, 2)), np.array([3, 4.0]), np.array([5.0]), 1.0)
+    assert solve(unknown, throw=False).status is Status.RANK_DEFICIENT
+
+
+def test_a_certified_mirror_image_is_not_unique() -> None:
+    anchors = np.array([[0, 0], [10, 0.0]])
+    pair = ranged(anchors, np.array([5, 1.0]), np.array([7, 8.0]), 1.0)
+    verdict = certify(pair, solve(pair))
+    assert (verdict.certified, verdict.unique) == (True, False)
+    assert "mirror image" in str(verdict)
+    fixed = pair.add("position", "r", [5, 5], std=1.0)
+    verdict = certify(fixed, solve(fixed))
+    assert (verdict.certified, verdict.unique) == (True, True)
+
+
+@pytest.mark.parametrize("seed", range(8))
+def test_a_lower_bound_is_below_the_cost(seed: int) -> None:
+    """Closed form: the least cost of a chain of fixes by elimination in exact fractions."""
+    rng = np.random.default_rng(seed)
+    z, u = 1e4 * rng.normal(size=6), rng.normal(size=5)
+    s, t = 10.0 ** rng.uniform(-3, 0, 2)
+    fix, chain = np.zeros((6, 3)), np.zeros((5, 3))
+    fix[:, 0], chain[:, 0] = z, u
+    problem = Problem(tuple("abcdef")).add("position", list("abcdef"), fix, std=s)
+    problem = problem.add("displacement", list(zip("abcde", "bcdef", strict=True)), chain, std=t)
+    a, b = 1 / Fraction(s) ** 2, 1 / Fraction(t) ** 2
+    weight, mean, least = a, Fraction(z[0]), Fraction(0)
+    for moved, fixed in zip(u, z[1:], strict=True):
+        carried, at = weight * b / (weight + b), mean + Fraction(moved)
+        least += carried * a / (carried + a) * (at - Fraction(fixed)) ** 2 / 2
+        weight, mean = carried + a, (carried * at + a * Fraction(fixed)) / (carried + a)
+    verdict = certify(problem, solve(problem))
+    assert verdict.certified
+    assert verdict.lower_bound <= float(least)
+
+
+def held(lower: float) -> Solution:
+    return solve(Problem(("a",)).add("position", "a", [0, 0, 0], std=1.0).constrain("position", "a", lower=lower))
+
+
+def test_bounds_that_push_are_no_local_minimum() -> None:
+    """Closed form: each bound at b costs b^2 / 2."""
+    assert not any("cost" in note for note in held(1.5).notes)
+    (note,) = (note for note in held(9.0).notes if "cost" in note)
+    assert "3 bounds that push" in note
+    assert "local minimum" not in note
+    assert held(-1.0).expected == 0
+
+
+def test_what_is_said_of_many_lines_is_said_once() -> None:
+    assert _counted([f"line {k}: repaired" for k in range(5021)]) == ("5021 times, first in line 0: repaired",)
