@@ -19,6 +19,11 @@ from . import plugins
 from .errors import InputError, MissingLibraryError, missing, unknown
 
 Command: TypeAlias = Callable[..., int | None] | Mapping[str, Any] | EntryPoint
+Folder: TypeAlias = Annotated[Path, arg(metavar="FOLDER")]
+Folders: TypeAlias = Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER ...")]
+Metric: TypeAlias = Annotated[str, arg(metavar="METRIC")]
+Chosen: TypeAlias = Annotated[tuple[str, ...], arg(metavar="KEY=VALUE ...")]
+Format: TypeAlias = Literal["markdown", "csv", "latex", "html"]
 
 _ABOUT = """usage: coopoc COMMAND [options]
 
@@ -43,7 +48,7 @@ def run(
     name: Annotated[Positional[str], arg(metavar="NAME")],
     /,
     data: Annotated[str | None, arg(metavar="NAME_OR_PATH")] = None,
-    out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs"),
+    out: Folder = Path("runs"),
     jobs: Annotated[int, arg(metavar="N")] = 1,
     set: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(metavar="KEY=VALUE ...")] = (),
     shard: Annotated[str, arg(metavar="I/N")] = "",
@@ -99,9 +104,9 @@ def run(
 
 
 def merge(
-    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER ...")],
+    folders: Folders,
     /,
-    out: Annotated[Path, arg(metavar="FOLDER")],
+    out: Folder,
 ) -> int:
     """Merge folders of one study that several machines have computed.
 
@@ -124,10 +129,10 @@ def compare(
     run_a: Annotated[Positional[Path], arg(metavar="RUN_A")],
     run_b: Annotated[Positional[Path], arg(metavar="RUN_B")],
     /,
-    value: Annotated[str, arg(metavar="METRIC")] = "rt_le_m",
+    value: Metric = "rt_le_m",
     by: Annotated[tuple[str, ...], arg(metavar="COLUMN ...")] = (),
-    where: Annotated[tuple[str, ...], arg(metavar="KEY=VALUE ...")] = (),
-    format: Literal["markdown", "csv", "latex", "html"] = "markdown",
+    where: Chosen = (),
+    format: Format = "markdown",
 ) -> None:
     """Show the changes beyond noise between two runs of one study.
 
@@ -149,12 +154,12 @@ def compare(
 def table(
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")],
     /,
-    format: Literal["markdown", "csv", "latex", "html"] = "markdown",
+    format: Format = "markdown",
     name: Annotated[str | None, arg(metavar="NAME")] = None,
     rows: Annotated[str | None, arg(metavar="AXIS")] = None,
     columns: Annotated[str, arg(metavar="AXIS")] = "method",
-    value: Annotated[str, arg(metavar="METRIC")] = "rt_le_m",
-    where: Annotated[tuple[str, ...], arg(metavar="KEY=VALUE ...")] = (),
+    value: Metric = "rt_le_m",
+    where: Chosen = (),
 ) -> None:
     """Print the tables of a study, or with --rows any other table of its results.
 
@@ -182,7 +187,7 @@ def table(
 
 
 def report(
-    folders: Annotated[Positional[tuple[Path, ...]], arg(metavar="FOLDER ...")],
+    folders: Folders,
     /,
     out: Annotated[Path | None, arg(metavar="FILE")] = None,
     title: Annotated[str, arg(metavar="TEXT")] = "",

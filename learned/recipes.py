@@ -120,6 +120,12 @@ class Job:
         name = f"{Path(path).stem}.{held}" if path else held
         return f"{name}{self.client or ''}-{self.setting.start}-{self.setting.reading}-{self.setting.seed}"
 
+    @property
+    def card(self) -> dict[str, Any]:
+        """The job in the card of its checkpoint, with the noise of simulated drives."""
+        noise = {"noise": asdict(sensors(self)), "client": self.client}
+        return {"recipe": self.name, "settings": asdict(self.recipe) | asdict(self.setting), **noise}
+
     def key(self, fleet: Drives) -> str:
         """Hash of everything that changes the weights."""
         facts = {

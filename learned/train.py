@@ -6,7 +6,7 @@ import math
 import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ProcessPoolExecutor
-from dataclasses import asdict, replace
+from dataclasses import replace
 from itertools import starmap
 from multiprocessing import get_context
 from pathlib import Path
@@ -31,10 +31,10 @@ from coopoc.world.v2x import V2X
 from .checkpoint import Checkpoint, load, read_card, save
 from .federation.federate import Plan, federate_many
 from .nets.gain import Gain
-from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, sensors, untrained
+from .recipes import RECIPES, Job, Setting, job_clients, jobs_of, untrained
 from .training.clients import Client, Segments, Start
 from .training.drives import Drives, Logged, MeasuredDrives, drives_of
-from .training.fit import Fit, Task, fit_many
+from .training.fit import Task, fit_many
 from .training.machine import reporting_on
 from .training.okf_fit import fit_okf
 
@@ -161,11 +161,9 @@ def _made(path: Path, key: str) -> bool:
 def _card(job: Job, fleet: Drives, data: Sequence[Client]) -> dict[str, Any]:
     used = [c for i, c in enumerate(data) if job.client in (None, i + 1)]
     return {
+        **job.card,
         "key": job.key(fleet),
-        "recipe": job.name,
-        "settings": asdict(job.recipe) | asdict(job.setting),
-        "noise": "measured" if isinstance(fleet, MeasuredDrives) else asdict(sensors(job)),
-        "client": job.client,
+        **({"noise": "measured"} if isinstance(fleet, MeasuredDrives) else {}),
         "fleet": fleet.name,
         "digest": fleet.digest,
         "clients": [c.name for c in used],
@@ -187,27 +185,19 @@ def _federated(todo: Sequence[Job], data: Data, stage: str | None) -> list[Check
     recipe, nets = todo[0].recipe, [untrained(job) for job in todo]
     plan = Plan(recipe.rounds, recipe.aggregate, recipe.local_epochs, recipe.schedule)
     done = federate_many(nets, [data[j.setting] for j in todo], [j.setting.seed for j in todo], plan, stage)
-    models = []
-    for job, federation in zip(todo, done, strict=True):
-        rows = [row.card for row in federation.history]
-        weights = torch.stack([r.weights for r in federation.history])
-        card = {"history": rows, "best": federation.best.number, "seconds": federation.seconds}
-        model = federation.model.calibrate([client.training for client in data[job.setting]])
-        models.append(Checkpoint(model, card, weights))
-    return models
+    parts = [[client.training for client in data[job.setting]] for job in todo]
+    return [Checkpoint(fed.model.calibrate(own), fed.card, fed.weights) for fed, own in zip(done, parts, strict=True)]
 
 
 def _fitted(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:
-    fits = fit_many([_task(job, data[job.setting]) for job in todo], todo[0].recipe.schedule, stage)
-    return [_of_fit(fit) for fit in fits]
-
-
-def _of_fit(fit: Fit) -> Checkpoint:
-    rows = [
-        {"step": r.step, "training_loss": r.training_loss, "validation_loss": r.validation_loss} for r in fit.history
-    ]
-    card = {"history": rows, "best": fit.best.step, "stopped": fit.stopped, "seconds": fit.seconds}
-    return Checkpoint(fit.model, card, torch.stack([r.weights for r in fit.history]))
+    made = []
+    for fit in fit_many([_task(job, data[job.setting]) for job in todo], todo[0].recipe.schedule, stage):
+        rows = [
+            {name: getattr(row, name) for name in ("step", "training_loss", "validation_loss")} for row in fit.history
+        ]
+        card = {"history": rows, "best": fit.best.step, "stopped": fit.stopped, "seconds": fit.seconds}
+        made.append(Checkpoint(fit.model, card, torch.stack([row.weights for row in fit.history])))
+    return made
 
 
 def _okf(todo: Sequence[Job], data: Data, stage: str | None) -> list[Checkpoint]:

@@ -31,7 +31,7 @@ from .convoys import CONVOYS, convoy_row
 from .lineup import named_method, own
 from .roads import ROADS, road_row, roads
 from .tasks import LOGGED, POSES, TASKS, VALIDATION, Task, bound, pose_row, recording, rounded
-from .worlds_card import card_file, card_head, markdown, overview, run_worlds
+from .worlds_card import card_file, card_folder, card_head, markdown, overview, run_worlds
 
 USUAL = "cooperative-filter"
 """Of which others are shown to be better or worse on the same blocks of real measurements."""
@@ -104,9 +104,7 @@ def benchmark(
         chosen = [known[task] for task in tasks or known if task in known] if simulated(name) else []
         made = card(name, chosen, data, [task for task in tasks if task in real] if tasks else None)
         failed += sum("failed" in row for row in made["tasks"])
-        folder = out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}")
-        folder.mkdir(parents=True, exist_ok=True)
-        file = folder / card_file(name)
+        file = card_folder(out, seed, validation) / card_file(name)
         file.write_text(json.dumps(made, indent=1) + "\n")
         print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
         print(page([made]))

@@ -8,7 +8,7 @@ import sys
 from collections.abc import Iterable, Mapping
 from functools import lru_cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any
 
 from tyro.conf import Positional, arg
 
@@ -19,7 +19,7 @@ from coopoc.plugins import find
 from coopoc.study.study import Params
 from coopoc.world.sensors import VelocityReading
 
-from .scene import fleet, is_real, start
+from .scene import Start, fleet, is_real, start
 
 if TYPE_CHECKING:
     from coopoc import NoiseModel, Results
@@ -181,8 +181,8 @@ def train(
     data: Annotated[str, arg(metavar="NAME_OR_PATH")] = "town10-clients",
     out: Annotated[Path, arg(metavar="FOLDER")] = Path("runs/weights"),
     seed: Annotated[int, arg(metavar="N")] = 0,
-    start: Literal["gnss", "true"] = "gnss",
-    reading: Literal["axis", "speed"] = "axis",
+    start: Start = "gnss",
+    reading: VelocityReading = "axis",
     aggregate: Annotated[str | None, arg(metavar="RULE")] = None,
     flower: bool = False,
     rounds: Annotated[int | None, arg(metavar="N")] = None,

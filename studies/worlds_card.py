@@ -105,17 +105,23 @@ def run_worlds(
         raise InputError("methods", "()", "must name a method", "coopoc list shows them.")
     for name in methods:
         named_method(name)
-    folder = out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}")
     cards = list[dict[str, Any]]()
     for name in methods:
         began = time.perf_counter()
         cards.append(worlds_card(name, count, first, "validation" if validation else "test", jobs))
-        folder.mkdir(parents=True, exist_ok=True)
-        (folder / card_file(name)).write_text(card_text(cards[-1]))
+        file = card_folder(out, seed, validation) / card_file(name)
+        file.write_text(card_text(cards[-1]))
         print(details(cards[-1]), end="\n\n")
-        print(f"coopoc: {folder / card_file(name)}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
+        print(f"coopoc: {file}, {time.perf_counter() - began:.1f} s", file=sys.stderr)
     print(overview(cards))
     return int(any(card["failed"] for card in cards))
+
+
+def card_folder(out: Path, seed: int | None, validation: bool) -> Path:
+    """Folder of cards: apart those of other draws and of validation, which cannot be submitted."""
+    folder = out / ("validation" if validation else "") / ("" if seed is None else f"seed-{seed}")
+    folder.mkdir(parents=True, exist_ok=True)
+    return folder
 
 
 def card_file(name: str) -> str:

@@ -11,7 +11,7 @@ from typing import Any, cast
 import numpy as np
 import pytest
 
-from coopoc import Fleet, load_fleet
+from coopoc import Fleet, Recording, load_fleet
 from coopoc.arrays import Floats
 from coopoc.data.fetch import public
 from coopoc.data.fleet_files import write_table
@@ -73,7 +73,7 @@ def winding(steps: int = 60, speed: float = 8.0, period: float = 3.0, vehicles: 
     t = np.arange(steps) / 10
     wave = t[:, None] / period + np.arange(vehicles)
     velocity = speed * np.stack([np.cos(wave), np.sin(wave), 0.03 * np.cos(wave)], axis=-1)
-    return Fleet(tuple("abcdef"[:vehicles]), t, np.cumsum(0.1 * velocity, axis=0), velocity)
+    return Fleet(tuple("abcdefgh"[:vehicles]), t, np.cumsum(0.1 * velocity, axis=0), velocity)
 
 
 def moving(letter: str, t: Floats, position: Floats) -> Fleet:
@@ -118,6 +118,15 @@ def standing(position: Sequence[Sequence[float]], steps: int = 2) -> Fleet:
     """Vehicles that stand."""
     where = np.repeat(np.array(position, dtype=float)[None], steps, axis=0)
     return Fleet(tuple(f"s{i}" for i in range(len(position))), np.arange(steps) * 0.1, where, np.zeros_like(where))
+
+
+def holed(recording: Recording, share: float = 0.3, vehicles: slice = slice(None)) -> Recording:
+    """The recording without a share of the fixes; the first ones stay."""
+    gnss = recording.gnss.copy()
+    gone = np.random.default_rng(5).uniform(size=gnss.shape[:3]) < share
+    gone[:, 0] = False
+    gnss[:, :, vehicles][gone[:, :, vehicles]] = np.nan
+    return replace(recording, gnss=gnss)
 
 
 @pytest.fixture

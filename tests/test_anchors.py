@@ -51,13 +51,6 @@ def test_solo_anchors(method, ratio: float, expected: float, formation: Fleet) -
     assert score(method, fixture(formation, 0, ratio), formation) == pytest.approx(expected, rel=0.05)
 
 
-def test_identity_filter_closed_form(formation: Fleet) -> None:
-    """3.5 sqrt(3) sqrt(k / (2 - k)) = 4.05 with the golden-ratio gain k."""
-    k = (np.sqrt(5) - 1) / 2
-    closed = 3.5 * np.sqrt(3) * np.sqrt(k / (2 - k))
-    assert score(Kalman("identity"), fixture(formation, 0), formation) == pytest.approx(closed, rel=0.02)
-
-
 @pytest.mark.parametrize(
     ("neighbours", "identity", "weighted"),
     [

@@ -110,54 +110,6 @@ def test_stone_soup_ends_where_we_end(load: Any, monkeypatch: pytest.MonkeyPatch
     assert all(joint.right(row.call()) for row in joint.rows)
 
 
-@pytest.mark.slow
-def test_the_baseline_names_rows_that_the_benchmarks_have(load: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """The jobs are built small and none is timed."""
-    baseline = json.loads((FOLDER / "baseline.json").read_text())
-    growth = load("growth")
-    found = {f"growth: {name}, {count} vehicles" for name in growth.METHOD_NAMES for count in growth.FLEETS}
-    found |= {"growth: import coopoc", *(f"compile: compiled: {name}, first answer" for name in load("compile").GATED)}
-    for module in ("networked",):
-        found |= {f"{module}: {name}, {word}" for name in load(module).JOBS for word in ("compiled",)}
-    for name in ("gtsam", "casadi", "osqp", "cvxpy", "filterpy"):
-        pytest.importorskip(name)
-    backends, classical, fleet = load("backends"), load("classical"), load("fleet")
-    found |= {f"backends: {each.job}: {each.words}" for job in backends.jobs(22) for each in job.rows}
-    monkeypatch.setattr(classical, "RUNS", 2)
-    monkeypatch.setattr(classical, "STEPS", 21)
-    found |= {f"classical: {job}: {each.words}" for job, _, rows in classical.parts() for each in rows}
-    monkeypatch.setattr(fleet, "VEHICLES", 20)
-    monkeypatch.setattr(fleet, "SHORT", 12)
-    found |= {f"fleet: {job}: {each.words}" for job, _, rows in fleet.parts() for each in rows}
-    found |= {f"fleet: neighbours, {vehicles} vehicles" for vehicles, _ in fleet.SEARCHED}
-    found |= {f"poses: poses, K = {neighbours}: compiled" for neighbours in load("poses").NEIGHBOURS}
-    found |= {f"building: {row['name']}" for row in load("building").measured(rounds=1, count=20) if row["right"]}
-    cliffs = load("cliffs")
-    monkeypatch.setattr(cliffs, "STEPS", 4)
-    monkeypatch.setattr(cliffs, "RUNS", 1)
-    found |= {f"cliffs: {case.name}" for case in (*cliffs.method_cases(), *cliffs.stream_cases())}
-    named = {name for name in baseline if not name.startswith("learned_gain: ")}
-    assert named <= found
-    assert {name for name in found if name.endswith((": ours", ", compiled"))} <= named
-
-
-def test_the_baseline_names_rows_that_training_and_inference_have(load: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    """A small net that is neither trained nor timed: names only."""
-    learned = load("learned_gain")
-    from torch import zeros
-
-    from coopoc.learned.nets.gain_net import GainNet
-
-    _, pieces, drive = learned.parts()
-    monkeypatch.setattr(learned, "plain_training", lambda *_: zeros(1))
-    monkeypatch.setattr(learned, "our_training", lambda *_: zeros(1))
-    monkeypatch.setattr(learned, "seconds", lambda rows: {each.words: 1.0 for each in rows})
-    rows = learned.measured((GainNet(in_mult=2, out_mult=1), pieces.take(range(36)), drive))
-    baseline = json.loads((FOLDER / "baseline.json").read_text())
-    named = {name for name in baseline if name.startswith("learned_gain: ")}
-    assert named == {f"learned_gain: {each['name']}" for each in rows if "engine" in each["name"]}
-
-
 ROOT = Path(__file__).resolve().parents[1]
 CARDS = sorted((ROOT / "benchmarks" / "cards").glob("*.json"))
 PAPER = next(task for task in TASKS if task.name == "paper")
@@ -240,10 +192,14 @@ def test_wrong_words_are_named(tmp_path: Path) -> None:
     for given, message in (
         (((), {}), "must name a method"),
         ((("joint",), {"tasks": ("papr",)}), "must be one of alone, paper"),
-        (((), {"table": True, "out": tmp_path}), "holds no card"),
+        (((), {"table": True}), "holds no card"),
+        ((("jointt",), {}), "Did you mean joint"),
+        ((("mine.py:Own",), {}), "is not there"),
+        ((("pose-solo",), {}), "--data"),
     ):
         with refused(message):
-            benchmark.benchmark(given[0], **given[1])  # type: ignore[arg-type]
+            benchmark.benchmark(given[0], **{"out": tmp_path, **given[1]})  # type: ignore[arg-type]
+    assert not list(tmp_path.iterdir())
 
 
 def test_no_committed_card_lies_below_its_bound() -> None:
@@ -318,10 +274,3 @@ def test_real_measurements_are_tasks_for_pose_filters(tmp_path: Path) -> None:
     assert own["uwb"]["rt_le_m"][0] == pytest.approx(by_hand(mine), abs=2e-4)
     assert own["robots"]["rt_le_m"][0] > rows["pose-solo"]["robots"]["rt_le_m"][0] / 2
     assert own["robots"]["data"] == rows["pose-solo"]["robots"]["data"]
-
-
-def test_unknown_methods_are_named_before_anything_runs(tmp_path: Path) -> None:
-    for name, words in (("jointt", "Did you mean joint"), ("mine.py:Own", "is not there"), ("pose-solo", "--data")):
-        with refused(words):
-            benchmark.benchmark((name,), out=tmp_path)
-    assert not list(tmp_path.iterdir())

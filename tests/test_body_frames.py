@@ -7,7 +7,7 @@ import pytest
 from conftest import refused
 
 import coopoc as co
-from coopoc.world.body_frames import body_motion, in_world, true_heading, turned
+from coopoc.world.body_frames import body_motion, in_world, true_heading
 from coopoc.world.storage import read_recording, save_recording
 
 NOISE = co.Sensors(heading_std=0.02, heading_bias_std=0.03, velocity_reading="speed")
@@ -95,10 +95,6 @@ def test_a_recording_in_body_frames_is_cut_and_stored_as_any(body: co.Recording,
     part = body.between(10, 20).of_runs(slice(1, 3))
     assert part.body is not None
     assert np.array_equal(part.body.heading, body.body.heading[1:3, 10:20])
-
-
-def test_turning_is_a_rotation() -> None:
-    assert np.allclose(turned(np.array([3.0, 4.0, 1.0]), np.array(np.pi)), [-3.0, -4.0, 1.0])
 
 
 def test_a_cap_acts_in_body_frames(crossing: co.Fleet) -> None:

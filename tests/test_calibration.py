@@ -59,15 +59,6 @@ def test_without_priors_it_is_the_extended_filter_of_others(rivals: Any, name: s
     assert_allclose(mine.covariance[..., :2, :2], other.covariance[..., :2, :2], rtol=1e-4, atol=1e-5)
 
 
-def test_rivals_do_what_they_are_for(rivals: Any) -> None:
-    """The smoother is better where fixes jump, and the filter with a wide kernel; calibrated a rival is better."""
-    recording, fleet = seen(600, runs=1)
-    wrong = rt_le(rivals.EKF()(recording), fleet)
-    assert rt_le(rivals.FixedLag()(recording), fleet) < 0.8 * wrong
-    unmoved = replace(rivals.FixedLag(), known=rivals.Known(gate=1e4))(recording)
-    assert rt_le(unmoved, fleet) == pytest.approx(wrong, rel=0.05)
-
-
 def test_heading_and_scale_are_found() -> None:
     """-0.15 rad turns the odometry back and 1 / 1.05 its scale; the errors cost a Kalman filter twice as much."""
     recording, fleet = seen(900, runs=10, gnss_std=(1.0, 1.0, 1.0))

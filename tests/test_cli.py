@@ -109,19 +109,8 @@ def test_each_command_explains_itself_with_an_example(answers: dict[tuple[str, .
 
 def test_tables_on_stdout(folder: Path) -> None:
     assert coopoc("table runs/small --format latex", cwd=folder).stdout.startswith(r"\begin{table}")
-    done = coopoc(
-        "table",
-        "runs/small",
-        "--rows",
-        "max_neighbours",
-        "--value",
-        "max_error_m",
-        "--where",
-        "method=kalman,joint",
-        "--format",
-        "csv",
-        cwd=folder,
-    )
+    more = "--rows max_neighbours --value max_error_m --where method=kalman,joint --format csv"
+    done = coopoc("table runs/small", more, cwd=folder)
     header, *rows = done.stdout.splitlines()
     assert header == "Neighbours K,KF,KF low,KF high,Joint filter,Joint filter low,Joint filter high"
     assert len(rows) == 2
@@ -215,12 +204,3 @@ def test_an_interrupted_run_says_so_and_resumes(tmp_path: Path, jobs: str) -> No
 def _listen() -> None:
     """Hear Ctrl-C even where the tests run in the background of a shell, which makes its jobs ignore it."""
     signal.signal(signal.SIGINT, signal.SIG_DFL)
-
-
-@pytest.mark.slow
-def test_a_worker_that_is_killed_is_one_readable_line(tmp_path: Path) -> None:
-    (tmp_path / "trouble").write_text("kill")
-    done = coopoc("run small --jobs 2 --set", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)
-    assert done.returncode == 1
-    assert "coopoc: A worker process was killed" in done.stderr
-    assert "Traceback" not in done.stderr

@@ -13,7 +13,7 @@ from numpy.testing import assert_allclose
 from oracles.cooperative import Oracle
 from test_star_filters import CHANNELS, gappy, holed, partial
 
-from coopoc import V2X, Fleet, JointFilter, Kalman, Recording, Sensors, load_fleet, nees, observe, rt_le
+from coopoc import V2X, Fleet, JointFilter, Recording, Sensors, load_fleet, nees, observe, rt_le
 from coopoc.arrays import Floats
 from coopoc.methods.cooperative_filter import AS_STATED, ON_ROADS, Broadcast, CooperativeFilter, Priors, lasting
 from coopoc.methods.noise_model import NoiseModel, resolve
@@ -43,16 +43,6 @@ def test_with_everything_off_it_is_the_joint_filter(change: Callable[[Recording]
     assert ours.covariance is not None
     assert joint.covariance is not None
     assert_allclose(ours.covariance[:, 1:], joint.covariance[:, 1:], rtol=2e-3, atol=1e-8)
-
-
-def test_alone_it_is_the_kalman_filter() -> None:
-    """With nothing assumed to be wrong; the prior of the start is 1e6 m^2, a fix 12 m^2, and none beyond its gate."""
-    seen = observe(drive(), replace(S2, gnss_std=(1.0,) * 3), V2X(0), observers=[0], assumed=S2)
-    ours, kalman = CooperativeFilter(priors=Priors(forget=0.0, heading=0.0, scale=0.0, slip=0.0))(seen), Kalman()(seen)
-    assert_allclose(ours.x, kalman.x, atol=1e-3)
-    assert ours.covariance is not None
-    assert kalman.covariance is not None
-    assert_allclose(ours.covariance, kalman.covariance, rtol=1e-4)
 
 
 def too_long(seen: Recording, share: float = 0.05) -> Recording:

@@ -13,7 +13,6 @@ from coopoc import (
     Fleet,
     Sensors,
     bound_rt_le,
-    fleet_bound,
     nees,
     observe,
     posterior_bound,
@@ -95,18 +94,6 @@ def test_rms_and_nees_agree_with_the_bound() -> None:
         rms = float(np.sqrt(np.mean(rt_le(track, fleet) ** 2)))
         assert rms == pytest.approx(bound_rt_le(posterior_bound(fleet, sensors, 0, v2x)), rel=0.12)
         assert np.nanmean(nees(track, fleet)) == pytest.approx(3.0, abs=0.45)
-
-
-def test_neighbours_help_against_what_they_do_not_share() -> None:
-    """The bound: own drifts average out over neighbours, the common one cannot."""
-    fleet = convoy()
-    alone, together = (
-        {s: bound_rt_le(posterior_bound(fleet, s, 0, V2X(k, 60.0))) for s in (OWN, COMMON)} for k in (0, 3)
-    )
-    assert together[OWN] < 0.75 * alone[OWN]
-    assert together[COMMON] > 0.9 * alone[COMMON]
-    whole = fleet_bound(fleet, COMMON, V2X(3, 60.0))[:, 0]
-    assert bound_rt_le(whole) <= together[COMMON] * (1 + 1e-9)
 
 
 def test_what_cannot_be_is_refused() -> None:

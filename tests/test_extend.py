@@ -24,7 +24,7 @@ from coopoc.optimize import MEASUREMENTS, Problem, Status, solve
 from coopoc.plugins import find
 from coopoc.studies.lineup import own
 from coopoc.study.results import Results
-from coopoc.study.run import plan, run_study
+from coopoc.study.run import run_study
 from coopoc.world.channels import channel
 
 PAGE = Path(__file__).resolve().parents[1] / "docs" / "extend.md"
@@ -235,21 +235,6 @@ def test_entry_points_give_names(folder: Path, tmp_path: Path) -> None:
     assert "egos of ring" in shell(ran, tmp_path, **env)
 
 
-def test_cells_follow_the_contents_of_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(tmp_path)
-    text = (
-        "import coopoc as co\nSCALE = 1\ndef cell(p):\n"
-        "    return [{'run': 0, 'ego': 'a', 'rt_le_m': SCALE * p['x']}]\n"
-        "STUDY = co.Study('own', 'What?', cell, {'x': (1.0, 2.0)})\n"
-    )
-    (tmp_path / "own.py").write_text(text)
-    assert run_study("own.py:STUDY", progress=False).frame["rt_le_m"].sum() == 3.0
-    assert plan("own.py:STUDY")["to_compute"] == 0
-    (tmp_path / "own.py").write_text(text.replace("SCALE = 1", "SCALE = 5"))
-    assert plan("own.py:STUDY")["to_compute"] == 2
-    assert run_study("own.py:STUDY", progress=False).frame["rt_le_m"].sum() == 15.0
-
-
 def test_a_method_may_ask_for_the_whole_fleet(tmp_path: Path) -> None:
     (tmp_path / "own.py").write_text("class All:\n    whole_fleet = True\nclass Some:\n    pass\n")
     assert needs_whole_fleet(f"{tmp_path}/own.py:All")
@@ -263,10 +248,6 @@ def test_what_is_not_there_is_named(tmp_path: Path) -> None:
     for name, message in (("Mute", "must have a name"), ("math", "cannot be made from a noise model")):
         with refused(message):
             own(f"{tmp_path}/own.py:{name}")
-    with refused(r"own\.py:ALPHAS'.* has ALPHA, Mute\. Did you mean .*own\.py:ALPHA\?"):
-        from_file(f"{tmp_path}/own.py:ALPHAS")
-    with refused(r"method = 'gone\.py:X': names a file that is not there"):
-        find("coopoc.methods", "gone.py:X")
     with refused(r"is a int, no Study"):
         run_study(f"{tmp_path}/own.py:ALPHA")
     with pytest.raises(TypeError):

@@ -41,19 +41,6 @@ def test_weights_are_those_of_the_surrogate(loss: str, mu: float) -> None:
         assert weight == pytest.approx(dual.x, abs=2e-3)
 
 
-def test_schedules_end_at_the_losses() -> None:
-    """At first no candidate is given up; at last the weights are those of the loss (Remark 5)."""
-    s = np.array([[0.1, 0.9, 1.1, 30.0]])
-    for loss, last in (("truncated", 1e9), ("geman-mcclure", 1.0)):
-        first = graduated.SURROGATES[loss].first(s.max())
-        expected = 1 / (2 * 30 - 1) if loss == "truncated" else 60.0
-        assert first == pytest.approx(expected)
-        assert (graduated.SURROGATES[loss].weight(s, first) > 0).all()
-        assert graduated.SURROGATES[loss].weight(s, last) == pytest.approx(Loss(loss, 1.0).weight(s), abs=1e-6)
-    assert graduated.SURROGATES["truncated"].later(2.0) == pytest.approx(2.8)
-    assert graduated.SURROGATES["geman-mcclure"].later(2.8) == pytest.approx(2.0)
-
-
 def test_of_all_subsets_it_finds_the_best() -> None:
     """Truncated least squares of one point is a choice among 2^9 subsets; each is a weighted mean."""
     found = 0

@@ -15,11 +15,9 @@ from conftest import refused
 from export_onnx import AGREE, INPUTS, OUTPUTS, STEPS, agree, first_inputs, to_onnx
 from shell import ran
 
-from coopoc import V2X, Sensors, load_fleet, observe
-from coopoc.arrays import AnyArray, Floats
+from coopoc.arrays import AnyArray
 from coopoc.errors import MissingLibraryError
-from coopoc.learned import GainNet, LearnedGain, OptimisedKF, checkpoint
-from coopoc.learned.nets.gain import Recurrent
+from coopoc.learned import GainNet, OptimisedKF, checkpoint
 from coopoc.learned.recipes import WEIGHTS
 
 onnx, onnxruntime = pytest.importorskip("onnx"), pytest.importorskip("onnxruntime")
@@ -41,41 +39,6 @@ def steps(file: Path) -> Step:
     """The step of an exported file."""
     session = onnxruntime.InferenceSession(file, providers=["CPUExecutionProvider"])
     return lambda arrays: session.run(list(OUTPUTS), dict(zip(INPUTS, arrays, strict=True)))
-
-
-def rolled(step: Step, net: GainNet, gnss: Floats, velocity: Floats, dt: float) -> Floats:
-    """(T, B, 3) estimates from the first fix of lanes (T, B, 3)."""
-    inputs = first_inputs(net, gnss[0].tolist())
-    found = [gnss[0]]
-    for fix, speed in zip(gnss[1:], velocity[1:], strict=True):
-        given = [a.astype(np.float32) for a in (fix, speed, np.array(dt))]
-        inputs = [*list(step([*inputs[:-3], *given]))[:-1], *given]
-        found.append(inputs[3].astype(float))
-    return np.stack(found)
-
-
-@pytest.mark.slow
-def test_a_whole_drive_has_the_error_of_the_net(file: Path, shipped: checkpoint.Checkpoint) -> None:
-    """900 steps of four vehicles and two runs as eight lanes at once: RT-LE within 1e-4 m of torch's own steps."""
-    fleet = load_fleet("town10").select([0, 12, 24, 36])
-    seen = observe(fleet, Sensors.paper_scenario2(), V2X(max_neighbours=0), runs=2)
-    net, origin = shipped.model, np.tile(fleet.position[0], (2, 1))
-    assert isinstance(net, GainNet)
-    gnss, velocity = (np.moveaxis(a, 1, 0).reshape(900, 8, 3) for a in (seen.gnss, seen.velocity))
-    found = rolled(steps(file), net, gnss - origin, velocity, seen.dt) + origin
-    near, speed = (torch.tensor(a, dtype=torch.float32).transpose(0, 1) for a in (gnss - origin, velocity))
-    with torch.no_grad():
-        own = (
-            Recurrent.forward(net, near[:, 1:], speed[:, 1:], near[:, 0], seen.dt).transpose(0, 1).double().numpy()
-            + origin
-        )
-    truth = np.concatenate([fleet.position, fleet.position], axis=1)
-    score = [np.sqrt(np.mean(((x - truth[1:]) ** 2).sum(-1), axis=0)) for x in (found[1:], own)]
-    np.testing.assert_allclose(score[0], score[1], atol=1e-4)
-    stream, alone = LearnedGain(net).start(), []
-    for t in range(900):
-        alone.append(stream.step(seen.gnss[1, t, 2], seen.velocity[1, t, 2], seen.dt)[0])
-    assert np.sqrt(np.mean(((np.array(alone)[1:] - truth[1:, 6]) ** 2).sum(-1))) == pytest.approx(score[0][6], abs=1e-4)
 
 
 @pytest.mark.parametrize("lanes", [1, 7])

@@ -22,6 +22,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+from conftest import winding
 from shell import ran
 from test_learned_flower import in_process
 
@@ -43,14 +44,6 @@ pytestmark = [
 ]
 
 
-def drives(vehicles: int, steps: int = 100) -> Fleet:
-    """Vehicles that drive circles of their own at 4 m/s."""
-    t = np.arange(steps) / 10
-    wave = t[:, None] / 4 + np.arange(vehicles)
-    velocity = np.stack([4 * np.cos(wave), 4 * np.sin(wave), 0.1 + 0 * wave], axis=-1)
-    return Fleet(tuple(f"c{i}" for i in range(vehicles)), t, np.cumsum(0.1 * velocity, axis=0), velocity)
-
-
 def each(fleet: Fleet) -> dict[str, Fleet]:
     return {vehicle: fleet.select([vehicle]) for vehicle in fleet.ids}
 
@@ -58,7 +51,7 @@ def each(fleet: Fleet) -> dict[str, Fleet]:
 @pytest.fixture(scope="module", autouse=True)
 def _compiled() -> None:
     """The engine, before four processes compile it side by side."""
-    in_process(job_of({"recipe": "fedkalmannet", "rounds": 1, **TINY}), drives(1))
+    in_process(job_of({"recipe": "fedkalmannet", "rounds": 1, **TINY}), winding(100, 4.0, 4.0))
 
 
 @pytest.fixture(scope="module")
@@ -130,22 +123,22 @@ def script(folder: Path, *options: object) -> list[str]:
 
 def test_the_script_survives_the_death_of_a_node(tmp_path: Path, mark: str) -> None:
     """Four vehicles, TLS, keys, three rounds; the second vehicle is killed in the second."""
-    fleet = drives(4)
+    fleet = winding(100, 4.0, 4.0, 4)
     write_table(fleet, tmp_path / "four.parquet")
     command = script(tmp_path / "site", "--data", tmp_path / "four.parquet", "--kill", 2, "--change", CHANGE)
     done = ran(command, timeout=600)
     assert done.returncode == 0, done.stderr
     job = job_of({"recipe": "fedkalmannet", "rounds": 3, **TINY})
     card = checked(tmp_path / "site" / "fedkalmannet.safetensors", job, fleet)
-    assert card["clients"] == ["c0", "c1", "c2", "c3"]
-    assert [("c1" in row["absent"]) for row in card["history"][2:]] == [True, True]
+    assert card["clients"] == ["a", "b", "c", "d"]
+    assert [("b" in row["absent"]) for row in card["history"][2:]] == [True, True]
     assert "killed node-2" in done.stdout
     assert len(re.findall(r"^ +\d ", done.stdout, flags=re.MULTILINE)) == 4
 
 
 def test_a_run_that_fails_ends_the_script_with_an_error(tmp_path: Path, mark: str) -> None:
     """Flower has no strategy for the rule: the ServerApp raises, and the exit status is not zero."""
-    write_table(drives(1), tmp_path / "one.parquet")
+    write_table(winding(100, 4.0, 4.0), tmp_path / "one.parquet")
     command = script(tmp_path / "site", "--data", tmp_path / "one.parquet", "--change", f"aggregate=uniform {CHANGE}")
     done = ran(command, timeout=600)
     assert done.returncode != 0
@@ -163,7 +156,7 @@ def test_the_script_stops_everything_on_ctrl_c(tmp_path: Path, mark: str) -> Non
 
 def test_only_registered_keys_over_tls_come_in(tmp_path: Path, mark: str, example: Any) -> None:
     """Two known nodes make the weights of `federate`; those who lack the key, TLS or the right server stay out."""
-    fleet = drives(2)
+    fleet = winding(100, 4.0, 4.0, 2)
     with example.deployment(tmp_path) as site:
         example.join(site, each(fleet))
         others = {name: site.folder / name for name in ("stranger", "keyless", "plain", "misled")}
@@ -194,4 +187,4 @@ def test_only_registered_keys_over_tls_come_in(tmp_path: Path, mark: str, exampl
         assert example.log(site, "superlink").count("Activated node_id") == 2
     card = checked(out, job_of({"recipe": "fedkalmannet", "rounds": 2, **TINY}), fleet)
     assert [row["absent"] | row["rejected"] for row in card["history"]] == [{}, {}, {}]
-    assert card["clients"] == ["c0", "c1"]
+    assert card["clients"] == ["a", "b"]

@@ -9,9 +9,7 @@ import pandas as pd
 import pytest
 import torch
 from conftest import refused
-from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
-from oracles.pace import after
 
 import coopoc as co
 from coopoc import V2X, Fleet, Recording, Sensors, observe
@@ -26,7 +24,6 @@ from coopoc.learned import (
 )
 from coopoc.learned.checkpoint import read_card
 from coopoc.learned.nets.gain import Gain
-from coopoc.learned.nets.okf import scan
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import RECIPES
 from coopoc.learned.training.clients import Batch
@@ -116,30 +113,6 @@ def test_a_piece_with_little_truth_counts_as_much_as_another() -> None:
     squares = (x - truth.double()).square().sum(-1)[:, 0]
     loss, _ = net.float().loss_and_gradient(flatten([net]), seen._replace(truth=truth))
     assert float(loss) == pytest.approx(float(squares.nanmean(0).mean()), rel=1e-5)
-
-
-def test_the_scan_without_fixes_is_filterpys_prediction() -> None:
-    """Estimates and normalised innovations of nine parameters where four fixes in five are missing."""
-    stds, steps = torch.tensor([[0.3, 0.2, 1.1]], dtype=torch.float64)[..., None].repeat(1, 1, 3), 40
-    drawn = np.random.default_rng(3)
-    fixes, speeds = drawn.normal(0, 3, (steps, 3)), drawn.normal(0, 5, (steps, 3))
-    fixes[np.arange(steps) % 5 != 0] = np.nan
-    shape = (steps, 1, 1, 3)
-    given = Batch(
-        torch.tensor(fixes).view(shape), torch.tensor(speeds).view(shape), torch.zeros(shape), torch.zeros(1, 1, 3), 0.1
-    )
-    ours, normalised = scan(stds, given)
-    theirs = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
-    theirs.P, theirs.H, theirs.R, theirs.B = 1.21 * np.eye(3), np.eye(3), 1.21 * np.eye(3), 0.1 * np.eye(3)
-    theirs.x, square, before = np.zeros(3), speeds[0] ** 2, speeds[0]
-    for t in range(steps):
-        square, before = after(square, before, 0.1) if t else square, speeds[t]
-        theirs.predict(u=speeds[t], Q=np.diag(0.09 + 0.02**2 * square))
-        theirs.update(None if np.isnan(fixes[t, 0]) else fixes[t])
-        assert_allclose(ours[t, 0, 0], theirs.x, atol=1e-9)
-        if t % 5 == 0:
-            assert_allclose(normalised[t, 0, 0], theirs.y / np.sqrt(np.diag(theirs.S)), atol=1e-9)
-    assert bool(normalised[np.arange(steps) % 5 != 0].isnan().all())
 
 
 def test_what_cannot_be_learned_from_is_refused() -> None:

@@ -4,7 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import refused
+import torch
+from conftest import holed, refused
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from oracles.pace import after
@@ -12,6 +13,8 @@ from oracles.pace import after
 from coopoc import Fleet, Sensors, observe
 from coopoc.evaluate.metrics import nees
 from coopoc.learned import OptimisedKF, Segments, clients
+from coopoc.learned.nets.okf import scan
+from coopoc.learned.training.clients import Batch
 from coopoc.learned.training.okf_fit import fit_okf
 
 
@@ -47,11 +50,16 @@ def test_recovers_the_share_of_the_velocity() -> None:
 
 
 def test_equals_filterpy() -> None:
+    """Where fixes are missing, too; so do the estimates and innovations that are trained."""
     method = OptimisedKF((0.1, 0.2, 0.05), (0.1, 0.05, 0.0), (1.5, 2.0, 0.7))
     velocity = np.random.default_rng(0).normal(0, 8, (50, 1, 3))
     fleet = Fleet(("a",), np.arange(50) / 10, np.cumsum(0.1 * velocity, axis=0), velocity)
-    rec = observe(fleet, Sensors(), runs=1)
+    rec = holed(observe(fleet, Sensors(), runs=1), 0.5)
+    rec = replace(rec, velocity=rec.velocity[:, [0, 0, *range(2, 50)]])  # the pace of a piece begins at its first step
     track = method(rec)
+    given = (torch.tensor(a[0, 1:, None]) for a in (rec.gnss, rec.velocity, rec.gnss))
+    stds = torch.tensor([[method.process_std, method.velocity_ratio, method.gnss_std]], dtype=torch.float64)
+    ours, normalised = scan(stds, Batch(*given, torch.tensor(rec.gnss[:, :1, 0]), 0.1))
     theirs = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
     theirs.x, theirs.P = rec.gnss[0, 0, 0].copy(), np.diag(np.square(method.gnss_std))
     theirs.H, theirs.R, theirs.B = np.eye(3), np.diag(np.square(method.gnss_std)), 0.1 * np.eye(3)
@@ -61,10 +69,15 @@ def test_equals_filterpy() -> None:
         square, before = after(square, before, 0.1), u
         moved = 0.1 * np.array(method.velocity_ratio) * np.sqrt(square)
         theirs.predict(u=u, Q=np.diag(np.square(method.process_std) + moved**2))
-        theirs.update(rec.gnss[0, step, 0])
+        fix = rec.gnss[0, step, 0]
+        theirs.update(None if np.isnan(fix[0]) else fix)
         assert_allclose(track.x[0, step, 0], theirs.x, atol=1e-10)
         assert track.covariance is not None
         assert_allclose(track.covariance[0, step, 0], theirs.P, atol=1e-10)
+        assert_allclose(ours[step - 1, 0, 0], theirs.x, atol=1e-9)
+        if np.isfinite(fix[0]):
+            assert_allclose(normalised[step - 1, 0, 0], theirs.y / np.sqrt(np.diag(theirs.S)), atol=1e-9)
+    assert bool((normalised[:, 0, 0].isnan() == torch.tensor(np.isnan(rec.gnss[0, 1:, 0]))).all())
 
 
 @pytest.mark.slow

@@ -12,7 +12,7 @@ from conftest import refused, winding
 from safetensors.torch import load_file, save_file
 
 import coopoc.learned.recipes as recipes
-from coopoc import GNSS, V2X, Fleet, Kalman, Outliers, Sensors, load_fleet, observe
+from coopoc import GNSS, V2X, Fleet, Outliers, Sensors, load_fleet, observe
 from coopoc.evaluate.metrics import rt_le
 from coopoc.learned import (
     Checkpoint,
@@ -125,7 +125,7 @@ def test_what_changes_the_weights_changes_the_key(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_recipe_names_what_is_wrong_in_its_drives(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recipe_names_what_is_wrong_in_its_drives(monkeypatch: pytest.MonkeyPatch) -> None:
     """Jumps and gaps reach the clients' pieces, none of which begins in a gap."""
     plain, text = recipes.RECIPES["fedkalmannet"], "fixes=0.2:1+outages=0.3:1"
     monkeypatch.setitem(recipes.RECIPES, "fedkalmannet", replace(plain, noise=text, piece=10))
@@ -138,10 +138,6 @@ def test_a_recipe_names_what_is_wrong_in_its_drives(tmp_path: Path, monkeypatch:
     assert any(bool(torch.isnan(fix).any()) for fix in fixes)
     gaps = [torch.nan_to_num(fix - part.truth.reshape(-1, 11, 3)) for fix, part in zip(fixes, pieces, strict=True)]
     assert max(float(gap.abs().max()) for gap in gaps) > 8
-    made = train_all(drives(), tmp_path, seeds=[0], recipes=["fedkalmannet"], progress=False)
-    (card,) = (checkpoint.card for checkpoint in made.values())
-    assert card["noise"]["outliers"]["outages"]["rate"] == 0.3
-    assert bool(torch.isfinite(flatten([made["fedkalmannet-gnss-axis-0"].model])).all())  # type: ignore[list-item]
     with refused("fogg"):
         replace(plain, noise="fogg")
 
@@ -153,11 +149,6 @@ def test_a_trained_net_is_a_method(tmp_path: Path) -> None:
     assert isinstance(method, LearnedGain)
     assert method.name == "individual"
     assert method(observe(drives(), Sensors(), runs=2), [1]).x.shape == (2, 80, 1, 3)
-
-
-def test_unknown_recipe_is_refused(tmp_path: Path) -> None:
-    with refused("recipe = 'magic'"):
-        train_all(drives(), tmp_path, recipes=["magic"])
 
 
 def test_recipes_follow_the_paper() -> None:
@@ -209,18 +200,6 @@ def test_shipped_weights_are_made_again_from_their_recipe(name: str) -> None:
     card = read_card(recipes.WEIGHTS / f"{name}.safetensors")
     same = card["environment"]["torch"] == torch.__version__ and card["machine"] == shipped.machine()
     assert shipped.differences(name, progress=False)[name] < (1e-5 if same else 0.3)
-
-
-def test_metrics_are_those_of_the_validation_fleet() -> None:
-    """The oracle filter of the metrics, from outside by its nominal twin: Kalman with the acting noise is near 1."""
-    found = shipped.metrics(Kalman("nominal"), runs=2)
-    assert all(0.99 < row["times_oracle"] < 1.1 for row in found.values())
-    assert found["scenario 2, 10 %"]["rt_le_m"] < found["scenario 2, 15 %"]["rt_le_m"]
-
-
-def test_weights_that_are_not_shipped_cannot_be_made_again() -> None:
-    with refused("weights = 'individual9'"):
-        shipped.differences("individual9")
 
 
 def test_every_flipped_bit_of_a_checkpoint_is_noticed(tmp_path: Path) -> None:

@@ -1,8 +1,6 @@
 """The ledger: training and online cooperation on one axis, as payload and on air, sent once and per receiver."""
 
-import re
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -67,16 +65,6 @@ def test_the_card_of_a_training_names_the_bytes_it_moved() -> None:
     up = 24 * drives.present.sum(axis=0)
     assert raw.of("training", way="broadcast")[0].tolist() == [*up, 4 * pooled["parameters"]]
     assert raw.per_vehicle("training") == pytest.approx(up.mean() + 4 * pooled["parameters"])
-
-
-def test_the_page_of_the_budget_runs() -> None:
-    (block,) = re.findall(r"```python\n(.*?)```", (ROOT / "docs" / "budget.md").read_text(), flags=re.DOTALL)
-    account: dict[str, Any] = {}
-    exec(block, account)
-    rate, once = account["drive"].rate("on air", "broadcast"), account["training"].per_vehicle("training")
-    seconds = break_even(account["training"], account["drive"])
-    assert seconds == once / account["drive"].rate()
-    assert rate == pytest.approx(2.2 * 382, rel=0.02)  # what the ego itself broadcasts
 
 
 def test_a_ledger_refuses_what_does_not_fit() -> None:

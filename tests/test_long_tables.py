@@ -38,21 +38,8 @@ def track(runs: int = 2, steps: int = 4, egos: tuple[int, ...] = (2, 0)) -> co.T
 def test_a_track_as_a_table() -> None:
     made = track()
     frame = made.to_frame()
-    assert frame.columns.tolist() == [
-        "run",
-        "step",
-        "t",
-        "ego",
-        "x",
-        "y",
-        "z",
-        "std_x",
-        "std_y",
-        "std_z",
-        "heading",
-        "std_heading",
-        "bias",
-    ]
+    wanted = "run step t ego x y z std_x std_y std_z heading std_heading bias"
+    assert frame.columns.tolist() == wanted.split()
     assert len(frame) == 2 * 4 * 2
     for row in frame.itertuples():
         at = row.run, row.step, ["blue", "red"].index(row.ego)

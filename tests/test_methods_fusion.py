@@ -10,7 +10,7 @@ from scipy.optimize import least_squares
 
 import coopoc as co
 from coopoc import V2X, Fleet, NoiseModel, Sensors, observe
-from coopoc.evaluate.metrics import errors, nees
+from coopoc.evaluate.metrics import nees
 from coopoc.kernels.solo import FixNoise
 from coopoc.kernels.stars.messages import ESTIMATE_GROWTH
 from coopoc.methods.covariance_intersection import CovarianceIntersection
@@ -128,16 +128,3 @@ def test_what_has_not_arrived_is_not_used(method, crossing: Fleet) -> None:
     relative[:, (links.observer > 0) & secret[links.step, links.observer]] += [50.0, 5.0, 5.0]
     poisoned = replace(recording, gnss=gnss, relative=relative)
     assert method(poisoned, [0]).x == pytest.approx(method(recording, [0]).x, abs=1e-7)
-
-
-@pytest.mark.parametrize("method", [QCQPRelaxation()])
-def test_snapshots_bring_the_last_fix_forward(method, crossing: Fleet) -> None:
-    """Fixes once in five steps and a tenth of the ranges missing: the notes say so, and errors stay those of a fix."""
-    fleet = brief(method, crossing)
-    recording = observe(fleet, S2, V2X(max_neighbours=4), runs=2)
-    gnss, relative = recording.gnss.copy(), recording.relative.copy()
-    gnss[:, np.arange(len(fleet.t)) % 5 > 0] = np.nan
-    relative[np.random.default_rng(0).uniform(size=relative.shape) < 0.1] = np.nan
-    track = method(replace(recording, gnss=gnss, relative=relative), [0, 3])
-    assert errors(track, fleet).mean() < 1.3 * errors(method(recording, [0, 3]), fleet).mean() + 2.0
-    assert track.notes[-1].endswith("brought forward with the velocity")

@@ -393,14 +393,6 @@ def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
     swept(lambda **given: optimize.measurement(**given), {**named, "constants": 0})
 
 
-def test_training_refuses_arguments_of_the_wrong_kind() -> None:
-    learned = pytest.importorskip("coopoc.learned", exc_type=ImportError)
-    wrong = (*ALL, RECORDING)
-    drive = co.load_fleet("town10").between(0, 24).select([0])
-    given = {"fleet": drive, "sensors": None, "seed": 0, "piece": 10, "split": 0.5}
-    swept(lambda fleet, **options: learned.clients(fleet, **options), given, wrong)
-
-
 def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path: Path) -> None:
     for read in (
         co.read_graph,
@@ -434,6 +426,8 @@ def test_training_refuses_values_from_elsewhere() -> None:
     for made in (schedule, learned.Participation(), learned.Setting(), learned.Recipe("okf"), client):
         swept(type(made), init(made), wrong)
     swept(learned.Segments, init(client.training), HOSTILE)
+    given = {"fleet": drive, "sensors": None, "seed": 0, "piece": 10, "split": 0.5}
+    swept(learned.clients, given, (*ALL, RECORDING))
     swept(learned.OptimisedKF, {"process_std": (1, 1, 1), "velocity_ratio": (1, 1, 1), "gnss_std": (1, 1, 1)}, wrong)
     few = (None, -1, 1.5, "x", [], *HOSTILE)
     net = learned.NoiseParameters()

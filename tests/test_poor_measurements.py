@@ -4,8 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import refused, textbook
-from filterpy.kalman import KalmanFilter
+from conftest import holed, refused
 
 from coopoc import (
     LKFSA,
@@ -37,37 +36,6 @@ STARS = (
     MSMV("nominal"),
     CovarianceIntersection(split=True),
 )
-
-
-def holed(recording: Recording, share: float, vehicles: slice = slice(None)) -> Recording:
-    """The recording without a share of the fixes; the first ones stay."""
-    gnss = recording.gnss.copy()
-    gone = np.random.default_rng(5).uniform(size=gnss.shape[:3]) < share
-    gone[:, 0] = False
-    gnss[:, :, vehicles][gone[:, :, vehicles]] = np.nan
-    return replace(recording, gnss=gnss)
-
-
-def test_kalman_without_fixes_predicts_as_filterpy_does(crossing: Fleet) -> None:
-    seen = holed(observe(crossing, Sensors(), V2X(0), runs=1), 0.4)
-    track = textbook(Kalman())(seen, [1])
-    assert track.covariance is not None
-    q = np.broadcast_to(NoiseModel.nominal(seen.sensors).process_variance(seen), seen.gnss.shape)[0, :, 1]
-    kf = KalmanFilter(dim_x=3, dim_z=3)
-    kf.x, kf.P, kf.H, kf.R, kf.F, kf.B = (
-        seen.gnss[0, 0, 1][:, None],
-        2.25 * np.eye(3),
-        np.eye(3),
-        2.25 * np.eye(3),
-        np.eye(3),
-        0.1 * np.eye(3),
-    )
-    for t in range(1, len(crossing.t)):
-        kf.predict(u=seen.velocity[0, t, 1][:, None], Q=np.diag(q[t]))
-        if np.isfinite(seen.gnss[0, t, 1]).all():
-            kf.update(seen.gnss[0, t, 1][:, None])
-        np.testing.assert_allclose(track.x[0, t, 0], kf.x[:, 0], atol=1e-9)
-        np.testing.assert_allclose(track.covariance[0, t, 0], kf.P, atol=1e-9)
 
 
 @pytest.mark.parametrize("method", [*SOLO, *STARS], ids=lambda m: f"{m.name}{getattr(m, 'exact', '')}")

@@ -258,10 +258,6 @@ def test_a_known_start_needs_no_compass() -> None:
         (lambda: co.PoseFilter("solo", assumed=NOISE).start(0.0), "dt"),
         (lambda: co.PoseFilter("solo", assumed=NOISE).start(0.1, np.zeros(3)), "begin"),
         (lambda: co.PoseFilter("solo", assumed=NOISE).start(0.1).step(co.OwnMeasurement([1, 0, 0], 0.0)), "begin"),
-        (lambda: co.LandmarkMeasurement([9.0, 0], [0.0, 0, 0]), "relative"),
-        (lambda: co.LandmarkMeasurement([9.0, 0, 1.5], [0.0, np.nan, 0]), "place"),
-        (lambda: co.OwnMeasurement([1.0, 0], 0.0), "velocity"),
-        (lambda: co.OwnMeasurement([1.0, 0, 0], np.nan), "yaw_rate"),
     ],
 )
 def test_mistakes_of_streams_are_named(make: Any, words: str) -> None:

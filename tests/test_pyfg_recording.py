@@ -43,25 +43,6 @@ def test_odometry_and_ranges_are_those_of_the_file(tiers: tuple[co.Recording, co
     assert np.corrcoef(seen.body.yaw_rate[0, 1:, :4].ravel(), rate[1:, :4].ravel())[0, 1] > 0.5
 
 
-def test_ranges_alone_and_one_anchor_beat_dead_reckoning(tiers: tuple[co.Recording, co.Fleet]) -> None:
-    """The vertices' truth, from which the first poses are. Ranges err alike for a while, so that 0.3 m is assumed."""
-    seen, fleet = tiers
-    begin = np.full((5, 4), np.nan)
-    assert fleet.heading is not None
-    begin[:4] = np.column_stack([fleet.position[0, :4], fleet.heading[0, :4]])
-    noise, spread = replace(seen.sensors, range_std=0.3), (0.05, 0.05, 0.01, 0.05)
-    alone = replace(seen, relative=np.full(seen.relative.shape, np.nan))
-
-    def error(recording: co.Recording, **how: str) -> float:
-        method = co.PoseFilter(**how, gate=5.0, begin=begin, spread=spread, assumed=noise)  # type: ignore[arg-type]
-        return float(co.rt_le(method(recording, range(4)), fleet).mean())
-
-    together, dead = error(seen, unit="fleet"), error(alone, unit="solo")
-    assert together < 0.5 * dead
-    assert together < error(seen, unit="solo") < dead
-    assert together < error(seen, unit="fleet", fusion="intersection") < dead
-
-
 def test_the_command_says_what_was_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     data_check(str(measured("tiers.pyfg")), picture=tmp_path / "tiers.png")
     said = capsys.readouterr().out

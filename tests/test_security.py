@@ -6,14 +6,13 @@ import json
 import os
 from collections.abc import Callable
 from dataclasses import replace
-from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 from conftest import refused
-from latex import compiled
+from test_report import Page
 
 from coopoc.cli import main
 from coopoc.errors import InputError
@@ -21,6 +20,7 @@ from coopoc.study import store
 from coopoc.study.compare import compare
 from coopoc.study.merge import merge
 from coopoc.study.publish import tables, views
+from coopoc.study.reference import Reference
 from coopoc.study.report import report
 from coopoc.study.results import Results
 from coopoc.study.run import run_study
@@ -115,18 +115,25 @@ def test_a_study_of_ones_own_is_named_again_for_its_reference(
     (tmp_path / "mine.py").write_text(
         "from coopoc.study.study import Study\n"
         "def cell(p):\n    return [{'run': 0, 'ego': 'a', 'rt_le_m': p['x']}]\n"
-        "STUDY = Study('mine', '?', cell, {'x': (1.0, 2.0)}, metrics={'rt_le_m': 'lower'})\n"
-        "OTHER = Study('other', '?', cell, {'x': (1.0,)}, metrics={'rt_le_m': 'lower'})\n"
+        f"known = dict(metrics={{'rt_le_m': 'lower'}}, reference={str(tmp_path / 'known.json')!r})\n"
+        "STUDY = Study('mine', '?', cell, {'x': (1.0, 2.0)}, **known)\n"
+        "OTHER = Study('other', '?', cell, {'x': (1.0,)}, **known)\n"
     )
     mine, out = f"{tmp_path / 'mine.py'}:STUDY", str(tmp_path / "mine")
     run_study(mine, tmp_path, progress=False)
-    given = ["reference", out, "--file", str(tmp_path / "known.json")]
+    given = ["reference", out]
     assert status(*given, "--write") == 2
     assert "is not installed. If it is a file of your own, name it: coopoc reference" in capsys.readouterr().err
     assert status(*given, "--study", mine.replace("STUDY", "OTHER")) == 2
     assert status(*given, "--write", "--study", mine) == 0
     assert status(*given, "--study", mine) == 0
     assert "2 of 2 reference numbers hold." in capsys.readouterr().out
+    run_study(mine, tmp_path, progress=False)
+    assert "2 of 2 reference numbers hold" in (tmp_path / "mine" / "views.json").read_text()
+    known = Reference.load(tmp_path / "known.json")
+    replace(known, numbers=tuple(replace(n, value=0.5 * n.value) for n in known.numbers)).save(tmp_path / "lower.json")
+    assert status(*given, "--study", mine, "--file", str(tmp_path / "lower.json")) == 1
+    assert "2 worse" in capsys.readouterr().out
 
 
 @pytest.mark.parametrize("name", ["../out", "/tmp/coopoc-out", "a/b", "..", "", "CON", "a\nb", 3, None])
@@ -163,22 +170,6 @@ def test_merge_follows_no_link_out_of_its_folder(folder: Path, tmp_path: Path) -
     with refused(r"leads out of .* by a symbolic link"):
         merge([folder], tmp_path / "all")
     assert not files(tmp_path / "elsewhere")
-
-
-class Page(HTMLParser):
-    """Tags and text of a page."""
-
-    def __init__(self, text: str) -> None:
-        super().__init__()
-        self.tags: list[str] = []
-        self.text = ""
-        self.feed(text)
-
-    def handle_starttag(self, tag: str, attrs: list[tuple[str, str | None]]) -> None:
-        self.tags.append(tag)
-
-    def handle_data(self, data: str) -> None:
-        self.text += data
 
 
 def test_a_report_embeds_no_html_of_the_disk_and_escapes_all_text(folder: Path) -> None:
@@ -250,18 +241,6 @@ def test_no_text_of_a_csv_is_a_formula() -> None:
 def test_no_text_of_a_csv_starts_a_row_or_reaches_the_terminal() -> None:
     text = Table(("a\x1b[31m", "b"), (("x\r=1+1", 1),), "").to_csv()
     assert text == "a [31m,b\nx =1+1,1\n"
-
-
-def test_no_text_of_a_latex_table_is_a_command(tmp_path: Path) -> None:
-    (tmp_path / "secret.tex").write_text("SECRET")
-    text = r"\input{secret.tex}"
-    made = Table(
-        (text, "^^5cinput"), ((text, "a\n\nb"), (r"\write18{touch ran}", "$x$ %")), text, notes=(text, "x\n\ny")
-    )
-    assert "\\input" not in made.to_latex()
-    assert "\\write" not in made.to_latex()
-    assert "Output written" in compiled(made.to_latex(), tmp_path)
-    assert not (tmp_path / "ran").exists()
 
 
 def test_no_text_of_a_markdown_table_is_a_tag_or_ends_a_row() -> None:

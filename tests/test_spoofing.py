@@ -1,6 +1,5 @@
 """Spoofed neighbours: the attack itself, the window estimate that sees through it, and the example."""
 
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -10,7 +9,6 @@ from conftest import refused
 
 import coopoc as co
 from coopoc import V2X, Fleet, Sensors, observe
-from coopoc.optimize import Problem, solve, solve_gnc
 from coopoc.world.recording import Recording
 from coopoc.world.spoofing import Spoofing, spoofed
 
@@ -88,43 +86,6 @@ def test_an_estimator_that_is_told_of_an_attack_lacks_the_false_fixes(clean: Rec
     told = spoofed(clean, Spoofing(0.4, start=1.0), seed=2, honest=[0], told=True)
     assert np.array_equal(told.gnss, np.where(false.gnss == clean.gnss, clean.gnss, np.nan), equal_nan=True)
     assert told.notes[-1].endswith("removed")
-
-
-def test_a_vehicle_that_returns_is_one_suspect() -> None:
-    """Two vehicles are the nearest in turn; one false fix may pass where those of its vehicle together do not."""
-    t, weave = 0.1 * np.arange(30), (-1.0) ** np.arange(30)
-    position = np.zeros((30, 3, 3))
-    position[:, 1, 0], position[:, 2, 1] = 10 + weave, 10 - weave
-    fleet = Fleet(("ego", "b", "c"), t, position, np.gradient(position, 0.1, axis=0))
-    recording = spoofed(observe(fleet, S2, V2X(max_neighbours=1)), Spoofing(1.0, (5.0, 7.0)), honest=["ego", "b"])
-    apart = 0
-    for step in range(5, 30, 4):
-        problem = Problem.from_window(recording, step, 0, 6)
-        rows = [k for k in range(len(problem.names)) if k not in problem.separator]
-        together = solve_gnc(problem, [(0, rows)], groups=[problem.names[k].split("@")[0] for k in rows])
-        each = solve_gnc(problem, [(0, rows)])
-        apart += not np.array_equal(each.extras["weights"], together.extras["weights"])
-    assert apart >= 2
-
-
-@pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
-def test_graduation_over_a_window_finds_wrong_ranges(crossing: Fleet, backend: str) -> None:
-    """Ranges 20 m too long among right ones, in a window of six steps: their weights are 0, and the estimate is near
-    that without them."""
-    recording = observe(crossing, S2, V2X(max_neighbours=4))
-    problem = Problem.from_window(recording, 20, 0, 6)
-    kind = next(k for k, factor in enumerate(problem.factors) if factor.kind == "spherical")
-    z = problem.factors[kind].z.copy()
-    wrong = np.arange(0, len(z), 5)
-    z[wrong, 0] += 20.0
-    factors = list(problem.factors)
-    factors[kind] = replace(factors[kind], z=z)
-    harmed = replace(problem, factors=tuple(factors))
-    robust = solve_gnc(harmed, [kind], backend=backend)
-    assert np.flatnonzero(robust.extras["weights"] < 0.5).tolist() == wrong.tolist()
-    ego = problem.separator[-1]
-    right = solve(problem).x[ego]
-    assert np.linalg.norm(robust.x[ego] - right) < 0.5 < np.linalg.norm(solve(harmed).x[ego] - right)
 
 
 def test_the_example_prints_its_table(capsys: pytest.CaptureFixture[str]) -> None:

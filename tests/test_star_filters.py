@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import textbook
+from conftest import holed, textbook
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from oracles import covariance_intersection, joint, lkf_sa, messages, msmv
@@ -43,15 +43,6 @@ CHANNELS = {
     "capped": V2X(max_neighbours=5, bytes_per_second=1000.0),
     "alone": V2X(max_neighbours=0),
 }
-
-
-def holed(recording: Recording) -> Recording:
-    """The recording without a third of the fixes; the first ones stay."""
-    gnss = recording.gnss.copy()
-    gone = np.random.default_rng(5).uniform(size=gnss.shape[:3]) < 0.3
-    gone[:, 0] = False
-    gnss[gone] = np.nan
-    return replace(recording, gnss=gnss)
 
 
 def slow_fixes(recording: Recording, every: int = 10) -> Recording:

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import crossing_fleet, measured, refused, textbook
+from conftest import crossing_fleet, holed, measured, refused, textbook
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from shell import ran
@@ -56,9 +56,9 @@ def play(stream: Any, recording: Recording, ego: int, run: int, first: int = 0) 
 @pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("name", SOLO)
 def test_step_by_step_is_the_track(name: str, known: bool, crossing: Fleet) -> None:
-    """From the first fix, and from a known start, whose own step is no step of the stream."""
+    """From the first fix, and from a known start, whose own step is no step of the stream; a third has no fix."""
     method, start = SOLO[name]
-    recording, x0 = observe(crossing, S2, V2X(max_neighbours=0), runs=2), crossing.position[0, 3]
+    recording, x0 = holed(observe(crossing, S2, V2X(max_neighbours=0), runs=2)), crossing.position[0, 3]
     track = (replace(method, x0=x0[None]) if known else method)(recording, [3])
     x, cov = play(start(x0) if known else start(), recording, 3, run=1, first=int(known))
     assert_allclose(x, track.x[1, known:, 0], atol=1e-12)

@@ -9,7 +9,6 @@ from typing import Any
 import pytest
 from conftest import refused
 
-from coopoc.cli import main
 from coopoc.plugins import find, names
 from coopoc.study.reference import Reference, check, differing, measure, table
 from coopoc.study.results import Results
@@ -111,25 +110,6 @@ def test_numbers_of_other_settings_are_refused(results: Results, tmp_path: Path)
     assert differing(other, known) == ["scale"]
     with refused(r"is not the reference's in scale\. Run it with its own settings"):
         check(other, known)
-
-
-def test_the_command_says_what_is_worse(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    few = {"method": "joint", "latency_s": "0.3", "runs": "2"}
-    run_study("latency_loss", tmp_path, settings=few, progress=False)
-    folder, file = str(tmp_path / "latency_loss"), str(tmp_path / "own.json")
-    assert "reference numbers hold" in (tmp_path / "latency_loss" / "views.json").read_text()
-    for more in (["--write"], []):
-        with pytest.raises(SystemExit) as ended:
-            main(["reference", folder, "--file", file, *more])
-        assert ended.value.code == 0
-    assert "1 of 1 reference numbers hold." in capsys.readouterr().out
-    known = Reference.load(file)
-    lower = replace(known, numbers=tuple(replace(n, value=0.5 * n.value) for n in known.numbers[:1]))
-    lower.save(file)
-    with pytest.raises(SystemExit) as ended:
-        main(["reference", folder, "--file", file])
-    assert ended.value.code == 1
-    assert "worse" in capsys.readouterr().out
 
 
 @pytest.mark.slow

@@ -27,39 +27,15 @@ LINEAR = NoiseModel("unit", None, process_std=(0.3, 0.4, 0.2), gnss_std=(2.0, 1.
 """Relative vectors of unit covariance: all methods are then linear, and numpy.linalg.lstsq says what is right."""
 
 
-def dense(
-    recording: Recording, known: NoiseModel, last: dict[int, int]
-) -> tuple[dict[tuple[int, int], int], np.ndarray, np.ndarray]:
-    """Least squares of vehicle i's steps up to last[i] by numpy.linalg.lstsq: index of (t, i), solution, covariance."""
-    present = np.isfinite(recording.gnss[0, :, :, 0])
-    index = {key: k for k, key in enumerate((t, i) for t, i in np.argwhere(present).tolist() if t <= last[i])}
-    rows, right = [], []
-
-    def add(terms: dict[tuple[int, int], float], value: np.ndarray, std: np.ndarray) -> None:
-        for axis in range(3):
-            row = np.zeros(3 * len(index))
-            for key, sign in terms.items():
-                row[3 * index[key] + axis] = sign / std[axis]
-            rows.append(row)
-            right.append(value[axis] / std[axis])
-
-    for t, i in index:
-        add({(t, i): 1.0}, recording.gnss[0, t, i], np.array(known.gnss_std))
-        if (t - 1, i) in index:
-            moved = 0.1 * recording.velocity[0, t, i]
-            add({(t, i): 1.0, (t - 1, i): -1.0}, moved, np.array(known.process_std))
-    links = recording.links
-    for k in range(len(links)):
-        pair = [(int(links.step[k]), int(v)) for v in (links.observer[k], links.neighbour[k])]
-        if all(key in index for key in pair) and links.step[k] <= min(last.values()):
-            add({pair[0]: -1.0, pair[1]: 1.0}, to_vector(recording.relative[0, k]), np.ones(3))
-    matrix = np.array(rows)
-    x = np.linalg.lstsq(matrix, np.array(right), rcond=None)[0]
-    return index, x.reshape(-1, 3), np.linalg.inv(matrix.T @ matrix)
-
-
-def block(cov: np.ndarray, k: int) -> np.ndarray:
-    return cov[3 * k : 3 * k + 3, 3 * k : 3 * k + 3]
+def dense(recording: Recording, known: NoiseModel) -> tuple[np.ndarray, np.ndarray]:
+    """Least squares of the first step by numpy.linalg.lstsq: positions (N, 3) and covariances (N, 3, 3)."""
+    now, unit = recording.links.step == 0, np.eye(len(recording.ids))
+    incidence = unit[recording.links.neighbour[now]] - unit[recording.links.observer[now]]
+    rows = np.vstack([np.kron(unit, np.diag(1 / np.array(known.gnss_std))), np.kron(incidence, np.eye(3))])
+    right = np.vstack([recording.gnss[0, 0] / known.gnss_std, to_vector(recording.relative[0, now])])
+    x = np.linalg.lstsq(rows, right.ravel(), rcond=None)[0]
+    cov = np.linalg.inv(rows.T @ rows).reshape(len(unit), 3, len(unit), 3)
+    return x.reshape(-1, 3), np.stack([cov[k, :, k] for k in range(len(unit))])
 
 
 @pytest.mark.parametrize("distance", [0.02, 0.5, 2.5, 11.0])
@@ -89,9 +65,9 @@ def test_gbp_on_a_tree_is_the_dense_least_squares(damping: float) -> None:
     rounds = 4 if damping == 0 else 60
     track = GaussianBeliefPropagation(LINEAR, rounds=rounds, damping=damping)(recording, range(5))
     assert track.covariance is not None
-    _, x, cov = dense(recording, LINEAR, dict.fromkeys(range(5), 0))
+    x, cov = dense(recording, LINEAR)
     assert track.x[0, 0] == pytest.approx(x, abs=1e-9)
-    assert track.covariance[0, 0] == pytest.approx(np.stack([block(cov, k) for k in range(5)]), abs=1e-9)
+    assert track.covariance[0, 0] == pytest.approx(cov, abs=1e-9)
     short = GaussianBeliefPropagation(LINEAR, rounds=3, damping=damping)(recording, [0])
     assert np.abs(short.x[0, 0, 0] - x[0]).max() > 1e-6
 
@@ -99,11 +75,11 @@ def test_gbp_on_a_tree_is_the_dense_least_squares(damping: float) -> None:
 def test_on_loops_means_are_exact_and_gbp_is_too_sure(crossing: Fleet) -> None:
     """Independent check: lstsq of the first step, where no vehicle has a past."""
     recording = observe(crossing.between(0, 2), S2, V2X(max_neighbours=4))
-    _, x, cov = dense(recording, LINEAR, dict.fromkeys(range(8), 0))
+    x, cov = dense(recording, LINEAR)
     gbp = GaussianBeliefPropagation(LINEAR, rounds=800)(recording, range(8))
     assert gbp.covariance is not None
     assert gbp.x[0, 0] == pytest.approx(x, abs=1e-9)
-    exact = np.array([np.trace(block(cov, k)) for k in range(8)])
+    exact = np.trace(cov, axis1=1, axis2=2)
     claimed = np.trace(gbp.covariance[0, 0], axis1=1, axis2=2)
     assert (claimed < exact + 1e-12).all()
     assert claimed.mean() < 0.9 * exact.mean()

@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from coopoc.arrays import instance
@@ -96,13 +97,26 @@ class Federation:
     __repr__ = short_repr
 
     @property
+    def card(self) -> dict[str, Any]:
+        """The rounds in the card of a checkpoint."""
+        return {"history": [row.card for row in self.history], "best": self.best.number, "seconds": self.seconds}
+
+    @property
+    def weights(self) -> Tensor:
+        """(rounds + 1, P) of the server."""
+        return torch.stack([row.weights for row in self.history])
+
+    @property
     def best(self) -> Round:
         """The selected round: the least `validation_loss` among the rounds on which most clients agree.
 
         These are the rounds whose median loss over the clients exceeds the least such median by at most `AGREEMENT`
         times its size (a likelihood's loss may be negative), so that no minority of false reports can select a round
-        that the other clients find poor. One or two reports have no majority: then all rounds compete.
+        that the other clients find poor. One or two reports have no majority: then all rounds compete. Without any
+        client it is the start.
         """
+        if not self.sizes:
+            return self.history[0]
         typical = [np.median([_or_infinite(loss) for _, loss in self._reports(row)]) for row in self.history]
         most = min(typical) + AGREEMENT * abs(min(typical)) if len(self._reports(self.history[0])) > 2 else math.inf
         agreed = [row for row, middle in zip(self.history, typical, strict=True) if middle <= most]

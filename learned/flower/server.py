@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from importlib.metadata import version
 from statistics import median
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -26,7 +26,7 @@ from ..federation.history import Federation, Round
 from ..federation.rules import rule
 from ..nets.gain import Gain
 from ..nets.stack import flatten
-from ..recipes import Job, sensors, untrained
+from ..recipes import Job, untrained
 from .client import require_flower
 from .job import job_of
 
@@ -295,22 +295,11 @@ def federation(rows: Sequence[Row], job: Job, seconds: float) -> Federation:
             )
         )
     made = Federation(untrained(job), tuple(history), tuple(sizes[name] for name in names), seconds, tuple(names))
-    return replace(made, model=made.after(made.best.number)) if names else made
+    return replace(made, model=made.after(made.best.number))
 
 
 def checkpoint(rows: Sequence[Row], job: Job, seconds: float) -> Checkpoint:
     """The selected weights, those of every round, and a card that names Flower as the engine."""
     made = federation(rows, job, seconds)
-    card: dict[str, Any] = {
-        "recipe": job.name,
-        "settings": asdict(job.recipe) | asdict(job.setting),
-        "noise": asdict(sensors(job)),
-        "client": None,
-        "clients": list(made.names),
-        "training_pieces": list(made.sizes),
-        "history": [row.card for row in made.history],
-        "best": made.best.number if made.names else 0,
-        "seconds": seconds,
-        "engine": f"flower {version('flwr')}",
-    }
-    return Checkpoint(made.model, card, torch.stack([row.weights for row in made.history]))
+    who = {"clients": list(made.names), "training_pieces": list(made.sizes), "engine": f"flower {version('flwr')}"}
+    return Checkpoint(made.model, job.card | made.card | who, made.weights)

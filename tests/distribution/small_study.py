@@ -41,16 +41,6 @@ def recording(max_neighbours: int, runs: int, seed: int) -> Recording:
     return observe(circle(), Sensors.paper_scenario2(), V2X(max_neighbours, radius=50.0), runs=runs, seed=seed)
 
 
-HELD: list[np.ndarray] = []
-
-
-def grow(p: Params) -> list[Row]:
-    """Hold 320 MB from the second call of a process on, and last as long as loky leaves between two looks."""
-    HELD.append(np.ones(40_000_000 if len(HELD) == 1 else 1))
-    time.sleep(1.1)
-    return [{"process": os.getpid()}]
-
-
 def cell(p: Params) -> list[Row]:
     """Rows of one method at one number of neighbours; `trouble` makes a cell fail while the file it names exists."""
     time.sleep(p["pause"])
