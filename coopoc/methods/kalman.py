@@ -216,6 +216,7 @@ def solo_track(
     cov = np.zeros((*p.shape, 3))
     np.einsum("...ii->...i", cov)[:] = p
     notes = (*notes, *doubts(recording, columns, x, cov, noise_model))
+    x.flags.writeable = cov.flags.writeable = False  # so that the Track need not copy them
     return silent_track(recording, columns, x, cov, began, notes)
 
 
