@@ -166,8 +166,8 @@ def swept(make: Callable[..., object], given: dict[str, Any], wrong: tuple[Any, 
 
 
 def init(instance: Any) -> dict[str, Any]:
-    """The arguments that a dataclass was made with; guards are of the kernels, which check nothing."""
-    return {f.name: getattr(instance, f.name) for f in fields(instance) if f.init and f.name != "guards"}
+    """The arguments that a dataclass was made with; priors are checked one by one."""
+    return {f.name: getattr(instance, f.name) for f in fields(instance) if f.init and f.name != "priors"}
 
 
 def test_a_stream_that_refused_a_step_is_as_before() -> None:

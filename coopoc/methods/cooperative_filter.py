@@ -9,7 +9,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats
+from ..arrays import Floats, number
 from ..kernels.gate import GATE
 from ..kernels.stars.cooperative_filter import run_filter
 from ..kernels.stars.cooperative_messages import fading_memory
@@ -23,7 +23,7 @@ from .calibration import calibrated, scaled
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
 from .gaps import in_stretches
 from .noise_model import NoiseModel, resolve
-from .track import Checked, Track
+from .track import Checked, Track, check_options
 
 FOUND = {
     "heading error": "rad",
@@ -153,6 +153,12 @@ class CooperativeFilter(Checked):
     name: str = "cooperative-filter"
     calibration: str = ""
     cooperative = True
+
+    def __post_init__(self) -> None:
+        check_options(self, priors=Priors)
+        for name, value in self.priors._asdict().items():
+            least = -np.inf if name == "absent" else 0.0
+            number(f"priors.{name}", value, least, allowed="a number, not negative", hint="Give Priors()._replace(...).")
 
     @property
     def message(self) -> Message:
