@@ -118,15 +118,16 @@ def test_a_bad_noise_model_is_named(crossing: Fleet) -> None:
         Kalman("nominal", x0=np.zeros((2, 3)))(recording, [0])
 
 
-def test_absent_neighbour_is_left_out_and_absent_ego_refused(crossing: Fleet) -> None:
+def test_absent_neighbour_is_left_out_and_absent_ego_not_estimated(crossing: Fleet) -> None:
     position, velocity = crossing.position.copy(), crossing.velocity.copy()
     position[20:40, 1] = velocity[20:40, 1] = np.nan
     gappy = replace(crossing, position=position, velocity=velocity).between(18, 42)
     recording = observe(gappy, S2, V2X(max_neighbours=7), runs=2)
     for make in METHODS.values():
         assert np.isfinite(make("nominal")(recording, [0]).x).all()
-    with refused("absent"):
-        Kalman()(recording, [1])
+    absent = Kalman()(recording, [1]).absent
+    assert absent is not None
+    np.testing.assert_array_equal(absent[:, 0], np.isnan(recording.velocity[0, :, 1, 0]))
 
 
 def test_nees_of_a_singular_covariance_is_refused(crossing: Fleet) -> None:

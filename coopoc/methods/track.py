@@ -112,7 +112,7 @@ class Track:
         if self.absent is not None:
             self.__dict__["absent"] = checked("absent", self.absent, "(T, E)", x.shape[1:3], bool)
         there = np.ones(x.shape[1:3], bool) if self.absent is None else ~self.absent
-        if not np.isfinite(self.x.sum(axis=-1)).all(where=there):
+        if not np.isfinite(self.x).all(axis=-1).all(where=there):
             run, step, ego = np.argwhere(~np.isfinite(self.x).all(axis=-1) & there)[0]
             raise InputError(
                 "x",

@@ -106,7 +106,8 @@ def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) 
 
     def at(times: Floats) -> Floats:
         begun, offset, bias = held(since, times).T[:3]
-        return wrap(offset + bias * (times - begun) + integral(yaw_rate, times)[:, 0])
+        heading: Floats = wrap(offset + bias * (times - begun) + integral(yaw_rate, times)[:, 0])
+        return heading
 
     return at, float(np.prod(np.median(since.value[:, 3:], axis=0)))
 
