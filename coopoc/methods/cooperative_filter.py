@@ -158,7 +158,9 @@ class CooperativeFilter(Checked):
         check_options(self, priors=Priors)
         for name, value in self.priors._asdict().items():
             least = -np.inf if name == "absent" else 0.0
-            number(f"priors.{name}", value, least, allowed="a number, not negative", hint="Give Priors()._replace(...).")
+            number(
+                f"priors.{name}", value, least, allowed="a number, not negative", hint="Give Priors()._replace(...)."
+            )
 
     @property
     def message(self) -> Message:
