@@ -81,6 +81,14 @@ def graph() -> None:
     np.asarray(co.solve(from_graph(w.graph(relative_pose=poses, ranges=ranges))).covariance)
 
 
+def log() -> None:
+    """Fixes alone, whose velocity a log does not hold."""
+    with tempfile.TemporaryDirectory() as folder:
+        rows = "".join(f"{k},a,{9 * k},0\n" for k in range(9))
+        (Path(folder) / "fixes.csv").write_text(f"t,vehicle,x,y\n{rows}")
+        co.read_log(Path(folder) / "fixes.csv")
+
+
 def streams() -> None:
     """Filters step by step: alone, with a neighbour, and poses."""
     noise = co.NoiseModel.nominal(S)
@@ -115,6 +123,7 @@ CALLS: dict[str, Call] = {
     **{f"pose filter, {unit}": lambda unit=unit: pose(unit) for unit in ("solo", "fleet")},  # type: ignore[misc]
     "solve of a graph": graph,
     "streams": streams,
+    "a log": log,
     "a net": training,
 }
 
