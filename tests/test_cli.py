@@ -169,7 +169,7 @@ def test_failed_cells_set_the_status(tmp_path: Path) -> None:
     done = coopoc("run small --set runs=2", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)
     assert done.returncode == 1
     assert "diverged at step 3 (max_neighbours = 1" in done.stderr
-    assert 'small_study.py", line 61, in cell\n' in done.stderr
+    assert re.search(r'small_study.py", line \d+, in cell\n', done.stderr)
     assert "cells failed: 1, try them again with --retry-failed" in done.stderr
 
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from conftest import holed, refused
+from conftest import holed
 
 from coopoc import (
     LKFSA,
@@ -51,8 +51,9 @@ def test_a_drive_starts_with_a_fix(crossing: Fleet) -> None:
     seen = observe(crossing, Sensors(), V2X(0), runs=1)
     gnss = seen.gnss.copy()
     gnss[:, 0] = np.nan
-    with refused("no fix at step 0"):
-        Kalman()(replace(seen, gnss=gnss), [0])
+    absent = Kalman()(replace(seen, gnss=gnss), [0]).absent
+    assert absent is not None
+    assert np.flatnonzero(absent).tolist() == [0]
 
 
 RUNS = 10
