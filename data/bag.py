@@ -80,7 +80,7 @@ def read_bag(
         hint = 'Leave out a topic or a kind by ignore=["/car/pose"]; name the truth\'s by truth="/car/pose".'
         raise InputError("columns, kinds", path.name, "are of tables, and this is a bag", hint)
     try:
-        from rosbags.highlevel import AnyReader, AnyReaderError
+        from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
     except ImportError:
         raise MissingLibraryError("rosbags", "reading a ROS bag", "'coopoc[ros]'") from None
@@ -113,7 +113,7 @@ def read_bag(
                         rows.append((true, t, name, kind, value, std if std > 0 else np.nan))
     except InputError:
         raise
-    except (AnyReaderError, OSError, ValueError, KeyError, AssertionError) as error:
+    except Exception as error:  # of rosbags: a damaged file meets them all
         raise InputError(path.name, said(error), "must be a ROS bag", "Record it again, or reindex it.") from None
     if behind:
         other = "received" if stamps == "header" else "header"

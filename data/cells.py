@@ -39,6 +39,10 @@ USUAL = {
 """Headers that others give to the columns."""
 
 
+LARGEST_TABLE = 2**27
+"""Cells of a Parquet table: 1 GB of numbers."""
+
+
 def read_frame(path: Path, *text: str) -> pd.DataFrame:
     """Table of a .parquet, .jsonl or (any other ending) CSV file.
 
@@ -55,6 +59,12 @@ def read_frame(path: Path, *text: str) -> pd.DataFrame:
     try:
         if parquet := path.suffix.lower() == ".parquet":
             require("pyarrow", "a Parquet table")
+            from pyarrow.parquet import read_metadata
+
+            size = read_metadata(path)  # a column of one value takes no room in the file
+            if size.num_rows * size.num_columns > LARGEST_TABLE:
+                given = f"{size.num_rows} rows of {size.num_columns} columns"
+                raise InputError(path.name, given, f"must hold at most {LARGEST_TABLE} cells", "Split the drive.")
         if path.suffix.lower() == ".jsonl":
             lines = path.read_text("utf-8-sig").splitlines()
             frame = pd.DataFrame([json.loads(line) for line in lines if line.strip()])

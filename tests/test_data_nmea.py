@@ -1,7 +1,9 @@
 """NMEA and ROS bags: logs of receivers and robots, checked against pynmeagps, pymap3d and what the test wrote."""
 
+import re
 import sys
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from datetime import datetime, timedelta
 from pathlib import Path
 from types import MappingProxyType
@@ -318,6 +320,30 @@ def test_what_is_no_bag_is_named(tmp_path: Path) -> None:
     (tmp_path / "a.bag").write_bytes(b"no bag")
     with refused(r"a\.bag = .*must be a ROS bag"):
         read_log(tmp_path / "a.bag")
+
+
+@pytest.mark.parametrize("ros", [1, 2])
+def test_a_damaged_bag_is_named(tmp_path: Path, ros: int) -> None:
+    """Each of 60 bags with a few wrong bytes is read, or refused with an error of ours."""
+    pytest.importorskip("rosbags")
+    path = tmp_path / ("drive.bag" if ros == 1 else "drive")
+    write_bag(path, drive(2).between(0, 12), ros)
+    rng = np.random.default_rng(0)
+    for file in [path] if ros == 1 else sorted(path.iterdir()):
+        good = file.read_bytes()
+        for _ in range(60):
+            bad = bytearray(good)
+            for place in rng.integers(len(bad), size=rng.integers(1, 9)):
+                bad[place] = rng.integers(256)
+            file.write_bytes(bad)
+            with suppress(co.InputError):
+                read_log(path, dt=0.1)
+        file.write_bytes(good)
+    if ros == 2:
+        text = (path / "metadata.yaml").read_text()
+        (path / "metadata.yaml").write_text(re.sub(r"nanoseconds: \d+", "nanoseconds: .inf", text))
+        with suppress(co.InputError):
+            read_log(path, dt=0.1)
 
 
 FOOT = 0.3048

@@ -327,3 +327,12 @@ def test_a_damaged_array_of_comma2k19_is_named(tmp_path: Path, name: str, wrong:
             np.save(out, wrong, allow_pickle=True)  # type: ignore[arg-type]
     with refused(thing):
         co.read_log(tmp_path / "drive")
+
+
+def test_a_parquet_table_is_refused_by_its_metadata(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A column of one value takes 3 kB for any number of rows."""
+    pd.DataFrame({"id": 0.0, "t": 0.0}, index=range(100)).to_parquet(tmp_path / "a.parquet")
+    monkeypatch.setattr("coopoc.data.cells.LARGEST_TABLE", 150)
+    monkeypatch.setattr(pd, "read_parquet", None)
+    with refused("a.parquet = 100 rows of 2 columns: must hold at most 150 cells"):
+        load_fleet(tmp_path / "a.parquet")
