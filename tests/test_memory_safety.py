@@ -50,14 +50,14 @@ def program(*given: str, **env: str) -> str:
     """What tests/corrupted.py complains about, in a process that may crash."""
     command = [sys.executable, str(Path(corrupted.__file__)), *given]
     done = ran(command, env={**os.environ, **env})
-    assert done.returncode == 0, f"{given}: ended with {done.returncode}\n{done.stderr[-2000:]}"
+    assert done.returncode in (0, 1), f"{given}: ended by signal {-done.returncode}\n{done.stderr[-2000:]}"
     return done.stdout
 
 
 @pytest.mark.slow
 def test_every_method_reads_any_memory_layout_and_survives_odd_recordings() -> None:
     """Views, Fortran order, unaligned and swapped bytes give the digits of the valid recording; none crashes."""
-    assert program(*KERNELS) == ""
+    assert program("odd", *KERNELS) == ""
 
 
 def test_what_is_held_cannot_be_written_to() -> None:
