@@ -15,6 +15,7 @@ from test_star_filters import CHANNELS, gappy, holed, partial
 
 from coopoc import V2X, Fleet, JointFilter, Recording, Sensors, load_fleet, nees, observe, rt_le
 from coopoc.arrays import Floats
+from coopoc.evaluate.metrics import neighbour_rt_le
 from coopoc.methods.cooperative_filter import AS_STATED, ON_ROADS, Broadcast, CooperativeFilter, Priors, lasting
 from coopoc.methods.noise_model import NoiseModel, resolve
 from coopoc.methods.star_stream import RelativeMeasurement, StarStream
@@ -189,3 +190,16 @@ def newest(seen: Recording, sent: Mapping[tuple[int, int], Any], t: int, s: int,
         "odometer": odometer,
         "age": (t - s) * seen.dt,
     }
+
+
+def test_neighbours_that_are_silent_for_seconds_stand_where_they_are_measured() -> None:
+    """White noise as assumed, steps of 1 s, a third of the messages lost: not worse than the textbook's filter."""
+    town = load_fleet("town10-validation")
+    fleet = Fleet(town.ids, town.t[::10], town.position[::10], town.velocity[::10]).select(range(0, 30))
+    there = np.flatnonzero(np.isfinite(fleet.position[..., 0]).all(axis=0))
+    moving = replace(fleet.select(there), velocity=np.gradient(fleet.select(there).position, fleet.dt, axis=0))
+    seen = observe(moving, S2, V2X(4, radius=60.0, loss=0.35), runs=4, observers=[0, 1, 2])
+    ours, joint = (
+        neighbour_rt_le(method(seen, [0, 1, 2]), seen, moving) for method in (CooperativeFilter(), JointFilter())
+    )
+    assert np.sqrt(np.nanmean(ours**2)) < 1.1 * np.sqrt(np.nanmean(joint**2))

@@ -323,13 +323,13 @@ class Oracle:
         for j in sorted(s["members"], key=lambda j: float(np.linalg.norm(at[j] - at[self.ego]))):
             new = j in s["vague"] and messages[j] is not None
             if not (new and g.fix_gate and np.isfinite(relative[j]).all()):
-                messages[j] = self.receive(t, j, messages[j])
+                messages[j] = self.receive(t, j, messages[j], relative[j])
             s["way"][j] = self.goes_on(t, j, messages[j])[0]
         at = {j: b.x[b.at(("x", j))] + s["way"].get(j, 0.0) for j in (self.ego, *s["members"])}
         order = sorted(s["members"], key=lambda j: float(np.linalg.norm(at[j] - at[self.ego])))
         self.measure(t, at, order, relative, messages)
         for j in order:
-            messages[j] = self.receive(t, j, messages[j])
+            messages[j] = self.receive(t, j, messages[j], relative[j])
             s["way"][j] = self.goes_on(t, j, messages[j])[0]
         if g.fix_gate:
             self.trust()
@@ -530,6 +530,13 @@ class Oracle:
         b.x[o] *= holds
         b.noise(("o", j), [*((1 - holds**2) * self.life.turn), 0.0])
 
+    def near(self, relative: Floats) -> Floats:
+        """Where the ego measures a vehicle."""
+        b, far = self.state["belief"], 1 + (0.0 if np.isnan(relative[0]) else relative[0])
+        gap = to_vector(relative) if np.isfinite(relative).all() else np.array([far, far, 0.1 * far])
+        near: Floats = b.x[b.at(("x", self.ego))] + gap
+        return near
+
     def join(self, t: int, j: int, message: Sent | None, relative: Floats) -> None:
         s = self.state
         b = s["belief"]
@@ -538,9 +545,7 @@ class Oracle:
         s["members"].append(j)
         s["joined"][j], s["hits"][("relative", j)] = t, [0, 0, 0]
         s["since"][j] = t if message is None else message.step
-        near = 1 + (0.0 if np.isnan(relative[0]) else relative[0])
-        gap = to_vector(relative) if np.isfinite(relative).all() else np.array([near, near, 0.1 * near])
-        b.add(("x", j), b.x[b.at(("x", self.ego))] + gap, FLAT)
+        b.add(("x", j), self.near(relative), FLAT)
         if message is not None:
             b.x[b.at(("x", j))] -= (t - message.step) * self.seen.dt * message.velocity
         s["vague"].add(j)
@@ -609,7 +614,7 @@ class Oracle:
                 self.learn(4, min(q, SUDDEN) - USUAL, rows[c] @ rows[c] * s["made"] / 3 / total[c])
         s["vague"].discard(j)
 
-    def receive(self, t: int, j: int, message: Sent | None) -> Sent | None:
+    def receive(self, t: int, j: int, message: Sent | None, relative: Floats) -> Sent | None:
         """Move to where the newest message was sent, use the fixes since the last one; the message as it is used."""
         s, dt, last = self.state, self.seen.dt, self.state["last"].get(j)
         b, since = s["belief"], s["since"][j]
@@ -617,6 +622,7 @@ class Oracle:
             s["since"][j] = t
             s["vague"].add(j)
             b.noise(("x", j), FLAT)
+            b.x[b.at(("x", j))] = self.near(relative)
         if message is None or (last and message.step <= last.step):
             return message
         gap, steps = message.step - since, message.step - last.step if last else 1

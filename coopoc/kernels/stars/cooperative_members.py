@@ -139,8 +139,19 @@ def steady(f: Filter, model: Model, j: int, given: Floats, first: int, variance:
 
 
 @part
+def stand(f: Filter, rows: Floats, k: int) -> None:
+    """Move a member of whose position nothing is known to where the ego measures it, or, where a component is missing,
+    somewhere near: its measurement is linear there."""
+    g, row = f.g, f.who[k, INPUT]
+    ego, first = 3 * g.block[0, PLACE], 3 * g.block[k, PLACE]
+    near, whole = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row)
+    for c in range(3):
+        g.x[first + c] = g.x[ego + c] + (across(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
+
+
+@part
 def join(f: Filter, model: Model, rows: Floats, vehicle: int, row: int) -> None:
-    """Insert a member where the ego measures it, or, where a component is missing, somewhere near."""
+    """Insert a member where the ego measures it."""
     g, k = f.g, 1
     while f.who[k, VEHICLE] >= 0:
         k += 1
@@ -150,11 +161,10 @@ def join(f: Filter, model: Model, rows: Floats, vehicle: int, row: int) -> None:
     f.member[k, WHEN] = f.ego[CLOCK] - age
     for c in range(3):
         f.who[k, HITS + c], f.member[k, WAY + c] = 0, 0.0
-    ego, first = 3 * g.block[0, PLACE], insert(g, k, PLACE, 0.0)
-    near, whole = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row)
-    for c in range(3):
-        g.x[first + c] = g.x[ego + c] + (across(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
-        if age > 0.0:
+    first = insert(g, k, PLACE, 0.0)
+    stand(f, rows, k)
+    if age > 0.0:
+        for c in range(3):
             g.x[first + c] -= age * rows[row, SPEED + c]
     insert_turn(g, model, k)
     if f.status[vehicle, TRUSTED] == 0.0:

@@ -11,7 +11,7 @@ from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import add_diagonal, scale, store
 from ..dead_reckoning import ROUNDING
 from ..gate import SLIP, count, inflation
-from .cooperative_members import steady
+from .cooperative_members import stand, steady
 from .cooperative_state import (
     AGE,
     CLOCK,
@@ -158,6 +158,7 @@ def receive(f: Filter, model: Model, rows: Floats, k: int) -> None:
     if age < 0.0 and f.member[k, WHEN] < f.ego[CLOCK]:  # nothing is known of its motion
         f.member[k, WHEN] = f.ego[CLOCK]
         f.member[k, VAGUE] += model.flat
+        stand(f, rows, k)
     if age < 0.0 or sent <= status[USED] + ROUNDING:
         return
     gap, again, first = sent - f.member[k, WHEN], status[USED] > -math.inf, 3 * g.block[k, PLACE]
