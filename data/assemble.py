@@ -110,12 +110,12 @@ def assemble(
 
 def longest_gap(t: Floats, dt: float, max_gap: float | None) -> float:
     """s, the longest gap between times (L,) s that is bridged: max_gap, or the largest of 5 dt, 0.5 s and 1.5 times the
-    median interval.
+    interval that nine of ten do not exceed.
 
     >>> longest_gap(np.arange(4.0), 0.1, None)
     1.5
     """
-    return max_gap or max(5 * dt, 0.5, 1.5 * float(np.median(np.diff(t))) if len(t) > 1 else 0.0)
+    return max_gap or max(5 * dt, 0.5, 1.5 * float(np.quantile(np.diff(t), 0.9)) if len(t) > 1 else 0.0)
 
 
 def backward_difference(t: Floats, position: Floats, ids: Sequence[str], file: str = "rows") -> Floats:

@@ -79,7 +79,7 @@ def test_one_filter_of_the_bank_is_filterpys() -> None:
     t, w, std = np.cumsum(rng.uniform(0.2, 0.6, 60)), 0.4, 1.5
     z = np.stack([3 * t, 0.2 * t**2, 0 * t], axis=1) + rng.normal(0, 0.1, (60, 3))  # no innovation is clipped
     interval = float(np.median(np.diff(t)))
-    velocity, _ = constant_velocity(t, z, interval, 9.0, std**2, 10.0, np.full(7, w))
+    velocity, *_ = constant_velocity(t, z, interval, 9.0, std**2, 10.0, np.full(7, w))
     assert_allclose(velocity, filtered(t, z, std, (w / interval) ** 4 * std**2)[1], atol=1e-9)
 
 
@@ -163,3 +163,25 @@ def test_stamps_at_two_rates_are_kept(tmp_path: Path) -> None:
     steps = np.cumsum(np.tile([2, 3], 300))
     read, t, _ = log(tmp_path, "car", 1.5, 1, steps=steps[steps < len(T)].tolist())
     assert np.isfinite(read.recording.gnss[0, :, 0, 0]).sum() == len(t)
+
+
+STRANGE = {
+    "stands, without noise": (0.0, np.arange(60.0)),
+    "two fixes": (8.0, np.arange(2.0)),
+    "bursts": (20.0, np.sort(np.ravel(np.arange(60.0)[:, None] + [0.0, 0.05, 0.9]))),
+    "a train": (80.0, 0.1 * np.arange(60)),
+}
+"""Name -> m/s and the times of fixes, s."""
+
+
+@pytest.mark.parametrize("name", STRANGE)
+def test_fixes_of_another_kind_are_followed_throughout(tmp_path: Path, name: str) -> None:
+    """Without noise: no estimate is farther from a fix than its standard deviation once there have been four."""
+    speed, t = STRANGE[name]
+    pd.DataFrame({"t": t, "vehicle": "a", "x": speed * t, "y": 0.0}).to_csv(tmp_path / "a.csv", index=False)
+    rec = co.read_log(tmp_path / "a.csv").recording
+    known = np.flatnonzero(np.isfinite(rec.gnss[0, :, 0, 0]))
+    assert len(known) == len(t)
+    for method in (co.Kalman(), co.JointFilter(), co.CooperativeFilter()):
+        far = np.linalg.norm((method(rec).x - rec.gnss)[0, known, 0], axis=-1)
+        assert (far[4:] < 2.6).all()

@@ -35,9 +35,9 @@ BEYOND = 3.0
 @compiled
 def constant_velocity(
     t: Floats, fixes: Floats, interval: float, gap: float, variance: float, speed: float, bank: Floats
-) -> tuple[Floats, Floats]:
-    """(M, 3) velocity m/s after each fix, by this and those before; (M,) by how much a position's variance grows from
-    the last fix to this one, as a share of R, in the filter that has predicted best.
+) -> tuple[Floats, Floats, Floats]:
+    """(M, 3) velocity m/s after each fix, by this and those before; of the filter that has predicted best (M,) by how
+    much a position's variance grows from the last fix to this one, and 1/s^2 the variance of the velocity, shares of R.
 
     Args:
         t: (M,) s, increasing.
@@ -49,7 +49,7 @@ def constant_velocity(
         bank: (F,) w.
     """
     count, models = len(t), len(bank)
-    velocity, growth = np.zeros((count, 3)), np.zeros(count)
+    velocity, growth, known = np.zeros((count, 3)), np.zeros(count), np.zeros(count)
     x, u = np.zeros((models, 3)), np.zeros((models, 3))
     p, score = np.zeros((models, 3)), np.zeros((models, 3))
     v = np.zeros(3)
@@ -90,4 +90,5 @@ def constant_velocity(
                 best, most, growth[j] = m, likely, a - before
         for c in range(3):
             velocity[j, c] = u[best, c]
-    return velocity, growth
+        known[j] = p[best, 2]
+    return velocity, growth, known

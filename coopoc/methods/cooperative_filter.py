@@ -277,8 +277,8 @@ def rejected(what: str, count: int, measured: int, share: float = 0.05) -> list[
 def lasting(ego: str, residual: Floats, dt: float) -> list[str]:
     """A note if the residuals (R, T, 3) m of an ego's fixes are correlated over a second: their errors last."""
     lag = max(round(1.0 / dt), 1)
-    product = residual[:, lag:] * residual[:, :-lag]
-    found = float(np.nanmean(product) / np.nanmean(residual**2)) if np.isfinite(product).any() else 0.0
+    product, square = residual[:, lag:] * residual[:, :-lag], np.nansum(residual**2)
+    found = float(np.nanmean(product) / np.nanmean(residual**2)) if square > 0.0 and np.isfinite(product).any() else 0.0
     if found < 0.1 + 4.0 / np.sqrt(max(np.isfinite(product).sum(), 1)):
         return []
     return [f"fixes, {ego}: errors a second apart are correlated by {found:.2f}; give Sensors(gnss_drift_std=...)"]

@@ -31,7 +31,7 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
     def across(self: Any, recording: Recording, egos: Vehicles = (0,)) -> Track:
         columns = check_recording(recording).observing(egos)
         whole = (0, len(recording.t))
-        cuts = {column: recording.stretches(column, 1) for column in columns}
+        cuts = {column: recording.stretches(column) for column in columns}
         if all(found in ((), (whole,)) for found in cuts.values()):
             return call(self, recording, egos)
         parts = {

@@ -383,7 +383,7 @@ def unlikely(recording: Recording) -> tuple[str, ...]:
     ]
     if v2x.latency > v2x.max_age and len(recording.links):
         found.append(f"no message is used: latency is {v2x.latency:g} s, max_age {v2x.max_age:g} s")
-    if share := _contradicting(recording):
+    if sensors.velocity_reading != "fixes" and (share := _contradicting(recording)):
         found.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive: {UNITS}")
     return tuple(UNLIKELY + text for text in found)
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -17,6 +17,9 @@ from coopoc.world.sensors import Sensors
 
 from ..assemble import PLANE_STD
 from .units import ANGLES, KINDS, Rows, Summary, place
+
+if TYPE_CHECKING:
+    from .motion import Member
 
 ENU = {"longitude": "x", "latitude": "y", "height": "z"}
 MOTION = ("vx", "vy", "speed")
@@ -110,9 +113,7 @@ def local(rows: Rows, origin: Origin | None) -> tuple[Rows, Origin | None]:
     return rows.assign(value=value, kind=rows["kind"].replace(ENU))[value.notna() | ~geodetic], origin
 
 
-def assumed(
-    rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, wanders: Sequence[float] = ()
-) -> Sensors:
+def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, members: Sequence[Member]) -> Sensors:
     """Sensors of a log: the root mean square of the logged standard deviations of each kind.
 
     A Recording holds one standard deviation per kind; what is not logged is that of `Sensors()`, and reported.
@@ -123,8 +124,7 @@ def assumed(
         body: whether the recording is in body frames.
         summary: takes what is assumed.
         dt: s, of the recording.
-        wanders: m^2/s, of each member, as `motion.Member` has it: without odometry that is the noise of velocities, of
-            all of them the largest.
+        members: of the log; where fixes have shown a velocity, the one that wanders most gives the noise of all.
     """
     base, used = Sensors(), set(rows["kind"])
     square = (rows["std"] ** 2).groupby(rows["kind"]).mean().dropna()
@@ -152,13 +152,15 @@ def assumed(
         noise |= {"velocity_reading": "speed", "yaw_rate_std": rate, "compass": "heading" in used}
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of("heading", default=HEADING_STD, unit="rad")
-    if (drifts := max(wanders, default=0.0)) > 0.0:
+    if (drifts := max((member.wanders for member in members), default=0.0)) > 0.0:
         known = of(*MOTION, default=base.velocity_floor, unit="m/s")
         floor = max(float(np.sqrt(drifts / dt)), known)
         summary.assume(
             f"{floor:.2g} m/s as the noise of a velocity, as the fixes of what has none, or no heading, show it"
         )
-        noise |= {"velocity_reading": "fixes", "velocity_std_ratio": 0.0, "velocity_floor": floor}
+        noise |= {"velocity_std_ratio": 0.0, "velocity_floor": floor}
+        if any(member.shown for member in members):
+            noise["velocity_reading"] = "fixes"
         return replace(base, **noise)
     if {*MOTION}.isdisjoint(square.index):
         summary.assume(f"{base.velocity_std_ratio:.0%} of a velocity as its noise, {base.velocity_floor} m/s at least")

@@ -24,7 +24,6 @@ from .heading import (
     heading_at,
     heading_of_courses,
     heading_of_gyro,
-    held,
     integral,
 )
 from .units import Rows, Summary, in_group, place
@@ -33,7 +32,7 @@ MOVING = 1.0
 """m/s, least speed at which a course is a heading."""
 STANDS = 0.5
 """m/s, a speed below which what has no heading is taken to stand."""
-UNKNOWN_SPEED = 10.0
+UNKNOWN_SPEED = 30.0
 """m/s, standard deviation of a velocity before fixes have shown it."""
 COURSE = "the heading of {} is the course of the {}: no vehicle slips or reverses"
 ARM = "fixes are those of the reference point, less the arm to the antenna, of {}; none slips or reverses"
@@ -87,7 +86,8 @@ class Member:
         stands: whether it stands, as a road-side unit does.
         yaw_rate: (T,) rad/s as velocity, of body frames.
         compass: (T,) rad, NaN without a heading, of body frames.
-        wanders: m^2/s, variance of a velocity that fixes have shown, by its time; 0 for odometry.
+        wanders: m^2/s, variance of a velocity or direction that fixes have shown, by its time; 0 for odometry.
+        shown: whether they alone have, without a gyro.
     """
 
     gnss: Floats
@@ -99,6 +99,7 @@ class Member:
     yaw_rate: Floats
     compass: Floats
     wanders: float = 0.0
+    shown: bool = False
 
 
 def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 1) -> Signal:
@@ -176,8 +177,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         moved, heading, course, wanders = _in_world(name, rows, (measured, turn, speed), (fixes, derived, std), steps)
         signals, rate = [moved or fixes], none
         if moved is None:
-            derived, wanders = velocity_of_fixes(fixes, steps.gap(fixes.t), std)
-            velocity = carried = _shown(fixes, derived, steps)
+            derived, known, wanders = velocity_of_fixes(fixes, steps.gap(fixes.t), std)
+            velocity = carried = _shown(fixes, derived, known, steps)
         else:
             velocity = carried = step_means(moved, grid)
     there = np.ones(len(grid), dtype=bool)
@@ -196,7 +197,9 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
     if body:
         kept, step, lag = _nearest_of_each(measured, there, steps)
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
-    return Member(gnss, velocity + absent[:, None], heading, text, course, False, rate + absent, compass, wanders)
+    shown = wanders > 0.0 and (signals[0] is fixes or len(turn.t) < 2)
+    velocity = velocity + absent[:, None]
+    return Member(gnss, velocity, heading, text, course, False, rate + absent, compass, wanders, shown)
 
 
 def _in_world(
@@ -213,7 +216,7 @@ def _in_world(
     moves, gyro = ((world, "odometry"), (derived, "fixes")), (fixes, speed, std)
     heading, course, wanders = _heading(measured, turn, moves, steps, gyro)
     if course == "fixes" and not wanders:
-        wanders = velocity_of_fixes(fixes, steps.gap(fixes.t), std)[1]
+        wanders = velocity_of_fixes(fixes, steps.gap(fixes.t), std)[2]
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
         return Signal(world.t, np.nan_to_num(world.value)), heading, course, 0.0
@@ -287,31 +290,35 @@ def fix_std(rows: Rows) -> float:
     return float(np.sqrt((stated**2).mean())) if len(stated) else Sensors().gnss_std[0]
 
 
-def velocity_of_fixes(fixes: Signal, gap: float, std: float) -> tuple[Signal, float]:
-    """Velocity (M, 3) m/s at the times of the fixes, by these and those before (`kernels.constant_velocity`); and how
-    fast a position predicted with the last one becomes uncertain, m^2/s, if fixes have that standard deviation m.
+def velocity_of_fixes(fixes: Signal, gap: float, std: float) -> tuple[Signal, Bools, float]:
+    """Velocity (M, 3) m/s at the times of fixes, by these and those before (`kernels.constant_velocity`); whether it
+    is known, by four fixes at the latest, or as well as by two that are as far apart as nine in ten; and how fast a
+    position predicted with the last one becomes uncertain, m^2/s, if fixes have that standard deviation m.
 
     >>> t = np.arange(40.0)
-    >>> velocity, _ = velocity_of_fixes(Signal(t, np.outer(t, [3.0, 4.0, 0.0])), 5.0, 1.0)
+    >>> velocity, *_ = velocity_of_fixes(Signal(t, np.outer(t, [3.0, 4.0, 0.0])), 5.0, 1.0)
     >>> velocity.value[-1].round(3).tolist()
     [3.0, 4.0, 0.0]
     """
-    interval = float(np.median(np.diff(fixes.t)))
-    velocity, growth = constant_velocity(fixes.t, fixes.value, interval, gap + SAME, std**2, UNKNOWN_SPEED, BANK)
-    known = np.isfinite(growth)
-    velocity[~known] = np.nan  # of one fix alone
-    return Signal(fixes.t, velocity), float(std**2 * np.median(growth[known]) / interval) if known.any() else 0.0
+    between = np.diff(fixes.t)
+    interval, longest = float(np.median(between)), float(np.quantile(between, 0.9))
+    velocity, growth, spread = constant_velocity(
+        fixes.t, fixes.value, interval, gap + SAME, std**2, UNKNOWN_SPEED, BANK
+    )
+    seen = np.isfinite(growth)
+    wanders = float(std**2 * np.median(growth[seen]) / interval) if seen.any() else 0.0
+    order = np.arange(len(seen))
+    since = order - np.maximum.accumulate(np.where(seen, 0, order))
+    return Signal(fixes.t, velocity), (since > 3) | (seen & (spread * longest**2 < 2.0)), wanders
 
 
-def _shown(fixes: Signal, velocity: Signal, steps: Steps) -> Floats:
-    """(T, 3) m/s at each step, as fixes of the steps before have shown it; between the first two their difference if
-    they are a step apart, else 0."""
-    found = held(velocity, steps.grid - 0.5 * steps.dt)
-    last = np.searchsorted(fixes.t, steps.grid + 0.5 * steps.dt - SAME) - 1
-    before = np.maximum(last - 1, 0)
-    apart = np.maximum(fixes.t[last] - fixes.t[before], SAME)[:, None]
-    first = np.where(apart < 1.5 * steps.dt, (fixes.value[last] - fixes.value[before]) / apart, 0.0)
-    return np.where(np.isnan(found), np.where(last[:, None] > 0, first, 0.0), found)
+def _shown(fixes: Signal, velocity: Signal, known: Bools, steps: Steps) -> Floats:
+    """(T, 3) m/s at each step, as fixes of the steps before have shown it; until then it leads from fix to fix."""
+    arrived = np.searchsorted(fixes.t, steps.grid + 0.5 * steps.dt - SAME) - 1
+    last = np.append(-1, arrived[:-1])
+    new = (last >= 0) & (arrived > last)
+    leads = np.where(new[:, None], (fixes.value[arrived] - fixes.value[last]) / steps.dt, 0.0)
+    return np.where(((last >= 0) & known[last])[:, None], velocity.value[last], leads)
 
 
 def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, Ints, Floats]:

@@ -132,7 +132,7 @@ def read_log(
         dt: s, steps of the recording; None: the median interval of the densest odometry (else fixes), or in the world,
             where it is longer, that at which a pair is measured, 1 s at most.
         max_gap: s, the longest gap of a vehicle's odometry that is bridged; it is absent in longer ones. None: the
-            largest of 5 dt, 0.5 s and 1.5 times its own median interval.
+            largest of 5 dt, 0.5 s and 1.5 times the interval that nine of ten do not exceed.
         columns: names in the files, as {"t": "timestamp", "vehicle": "car"}.
         kinds: names in a column kind, as {"uwb": "range"}.
         ignore: kinds that are left out; topics of a bag.
@@ -245,9 +245,7 @@ def _recording(
         np.stack([getattr(part, name) for part in members.values()], axis=1)[None]
         for name in ("gnss", "velocity", "yaw_rate", "compass")
     )
-    sensors = sensors or assumed(
-        rows, steps.planar, body, summary, steps.dt, [part.wanders for part in members.values()]
-    )
+    sensors = sensors or assumed(rows, steps.planar, body, summary, steps.dt, [*members.values()])
     return Recording(
         ids=ids,
         t=steps.grid,

@@ -477,7 +477,7 @@ class Oracle:
     def steady(self, t: int, j: int, u: Floats, q: Floats) -> tuple[Floats, Floats]:
         """Velocity and variance of a step's motion, or the last ones where no vehicle can have changed that fast."""
         g, dt, before = self.priors, self.seen.dt, self.state["pace"].get(j)
-        if g.fix_gate and before is not None:
+        if g.fix_gate and g.slip and before is not None:
             last, since, variance, slips = before
             changed = (ACCELERATION * max(t - since, 1) * dt) ** 2
             if ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum() > 2 * g.fix_gate and slips < 5:

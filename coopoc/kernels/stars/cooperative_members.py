@@ -112,7 +112,7 @@ def predict(f: Filter, model: Model, own: Floats) -> None:
 
 @inside
 def steady(f: Filter, model: Model, j: int, given: Floats, first: int, variance: int, unit: float) -> None:
-    """Put vehicle j's last velocity in place of one that no vehicle can have reached since.
+    """Put vehicle j's last velocity in place of one that no vehicle can have reached since, if odometers may slip.
 
     Args:
         f: filter.
@@ -128,7 +128,7 @@ def steady(f: Filter, model: Model, j: int, given: Floats, first: int, variance:
     for c in range(3):
         gap = unit * given[first + c] - status[PACE + c]
         q += gap * gap / ((given[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
-    if 0.0 < 2.0 * model.fix_gate < q and status[SLIPS] < SLIPPED:
+    if model.slip > 0.0 and 0.0 < 2.0 * model.fix_gate < q and status[SLIPS] < SLIPPED:
         status[SLIPS] += 1.0
         for c in range(3):
             given[first + c], given[variance + c] = status[PACE + c] / unit, status[PACE + 3 + c] + changed * dt * dt
