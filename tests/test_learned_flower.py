@@ -204,7 +204,7 @@ def test_bad_answers_are_rejected_and_training_goes_on() -> None:
 
 
 def test_no_node_answers_in_place_of_another() -> None:
-    """Every honest vehicle takes part, whoever claims its name, when, and with whatever number of its node."""
+    """Every honest vehicle takes part, whichever client claims its name, whenever, and with any node number."""
     job, fleet, known = job_of(TINY), drives(3), dict[int, str]()
     theta = in_process(job, fleet).history[0].weights
     late: Node = lambda message: None if message.content["config"]["server-round"] == 1 else sends("a", theta)(message)  # noqa: E731
@@ -231,7 +231,7 @@ def test_a_claimed_number_of_pieces_counts_ten_times_the_median_at_most() -> Non
 
 @pytest.mark.parametrize(("aggregate", "least"), [("krum", 5), ("trimmed_mean", 4)])
 def test_rules_take_the_same_number_of_clients_in_both_paths(aggregate: str, least: int) -> None:
-    """Refused at the start; where too few answers are accepted later, the weights stay, and the round says so."""
+    """Refused at the start; where too few answers are accepted later, the weights stay, and the round has a note."""
     job, fleet = job_of(TINY | {"aggregate": aggregate}), drives(least)
     few = {i: honest(job, fleet, i) for i in range(least - 1)}
     with refused(f"takes at least {least}"):

@@ -19,7 +19,7 @@ from ..arrays import Floats
 from .compiling.compile import compiled
 
 BANK = 0.02 * 1.6 ** np.arange(12)
-"""w, from a straight road at a steady speed to fixes that tell next to nothing of each other."""
+"""w, from a straight road at a steady speed to fixes that hardly depend on each other."""
 FIRST = 6
 """Which of them holds before anything was seen."""
 REMEMBERS = 30.0

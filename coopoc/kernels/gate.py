@@ -4,9 +4,9 @@ back.
 Many are as many as hold, together, more information than the prediction that contradicts them: the sum of the gains
 that they would have had. A filter that is sure of itself stays so for long, one that has just begun does not.
 
-Whether a receiver or its filter is wrong, no fix tells. So a position is remembered as it was before the first fix that
-contradicted it, moved by the odometer alone; when fixes agree with it again, and no longer with the filter, it is the
-filter's.
+A fix that is rejected does not show whether the receiver or the filter is wrong. So a position is remembered as it was
+before the first fix that contradicted it, moved by the odometer alone; when fixes agree with it again, and no longer
+with the filter, it is the filter's.
 
 A number, or LANES runs side by side. Filters call it where a measurement becomes information; blocks of the
 cooperative filter (`stars.gaussian.weight`) have a shape of their own.

@@ -183,7 +183,7 @@ def across(
     problem: Problem, x: Floats, descend: Callable[[Floats], Floats], cost: Callable[[Floats], float]
 ) -> tuple[Floats, int, list[float], list[Ints]]:
     """The lowest end (n, ambient) of descents from x and from mirror images of what ranges alone place, how many
-    moves led down, the costs of the other ends, and the bodies whose ranges alone hardly tell them from elsewhere.
+    moves led down, the costs of the other ends, and the bodies that ranges alone hardly distinguish from elsewhere.
 
     Args:
         problem: whose ranges, and their losses, place the bodies.

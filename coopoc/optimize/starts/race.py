@@ -74,7 +74,7 @@ def race(
         notes = (f"another minimum costs {min(near) - cost:.3g} more: noise may decide between them",) if near else ()
         if doubtful and not near:
             names = ", ".join(problem.names[body[0]] for body in doubtful[:5])
-            notes = (f"ranges hardly tell {names} from a mirror image: a lower minimum may exist",)
+            notes = (f"ranges hardly distinguish {names} from a mirror image: a lower minimum may exist",)
         return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
 
     for name, start in starts.items():
