@@ -46,7 +46,8 @@ LARGEST_LOSS = 1e12
 LONGEST = 200
 """Characters of a name or a reason in an answer."""
 MOST_PIECES = 10
-"""Times the median of a round: the largest number of pieces with which a client counts: a claimed number cannot be verified."""
+"""Times the median of a round: the largest number of pieces with which a client counts. What it claims
+cannot be verified."""
 
 
 class Row(NamedTuple):
