@@ -41,6 +41,20 @@ DERIVED = "no odometry of {}: a nearly constant velocity is assumed, which its f
 AHEAD: Floats = np.array([1.0, 0.0, 0.0])
 
 
+class Shown(NamedTuple):
+    """What fixes show of a velocity.
+
+    Attributes:
+        velocity: (M, 3) m/s at the times of fixes, by these and those before.
+        known: (M,) whether they show it.
+        wanders: m^2/s, by which a position that is predicted with the last one becomes uncertain.
+    """
+
+    velocity: Signal
+    known: Bools
+    wanders: float
+
+
 class Steps(NamedTuple):
     """How a log is brought to steps.
 
@@ -148,12 +162,11 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         heading = heading_at(measured, None, np.inf) if len(measured.t) and not body else None
         return Member(still + fixes.value[0], still, heading, text, "", True, still[:, 0], none)
     std = fix_std(rows)
-    gyro = fixes, speed, std
-    derived = velocity_of_fixes(fixes, steps.gap(fixes.t), std)[0] if len(fixes.t) > 1 else None
+    shown, gyro = velocity_of_fixes(fixes, steps, std), (fixes, speed, std)
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
         world, ever = samples(rows, ("vx", "vy"), Summary(), 2), steps._replace(max_gap=np.inf)
-        pointing, source, _ = _heading(measured, turn, ((world, "odometry"), (derived, "fixes")), ever, gyro)
+        pointing, source, _ = _heading(measured, turn, ((world, "odometry"), (shown, "fixes")), ever, gyro)
         if pointing is None or not np.isfinite(off).all():
             hint = f"Log heading or compass_deg, or vx and vy; a course counts above {MOVING:g} m/s."
             raise InputError(f"antenna of {name}", f"{arm} m", "needs numbers, and a heading of the vehicle", hint)
@@ -161,6 +174,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         summary.assume(ARM, f"{name} ({', '.join(map('{:g}'.format, off))} m forward, left, up, by {by})")
         angle = pd.Series(pointing(fixes.t)).ffill().bfill().to_numpy()
         fixes = Signal(fixes.t, fixes.value - turned(off, angle))
+        shown, gyro = velocity_of_fixes(fixes, steps, std), (fixes, speed, std)
     if body:
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
             if not len(signal.t):
@@ -169,18 +183,14 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         summary.refuse("world velocities in body frames", rows[rows["kind"].isin(["vx", "vy", "vz"])])
         signals, course = [speed, turn], ""
         heading = heading_at(measured, turn, np.inf) if len(measured.t) else None
-        along, *_ = _heading(measured, turn, ((derived, "fixes"),), steps, gyro)
+        along, *_ = _heading(measured, turn, ((shown, "fixes"),), steps, gyro)
         forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
         carried: Floats = still if along is None else np.nan_to_num(forward * turned(AHEAD, along(grid)))
         velocity: Floats = forward * AHEAD
     else:
-        moved, heading, course, wanders = _in_world(name, rows, (measured, turn, speed), (fixes, derived, std), steps)
+        moved, heading, course, wanders = _in_world(name, rows, (measured, turn), shown, gyro, steps)
         signals, rate = [moved or fixes], none
-        if moved is None:
-            derived, known, wanders = velocity_of_fixes(fixes, steps.gap(fixes.t), std)
-            velocity = carried = _shown(fixes, derived, known, steps)
-        else:
-            velocity = carried = step_means(moved, grid)
+        velocity = carried = _by_fixes(fixes, shown, steps) if moved is None else step_means(moved, grid)
     there = np.ones(len(grid), dtype=bool)
     for signal in signals:
         interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
@@ -197,26 +207,24 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
     if body:
         kept, step, lag = _nearest_of_each(measured, there, steps)
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
-    shown = wanders > 0.0 and (signals[0] is fixes or len(turn.t) < 2)
+    alone = wanders > 0.0 and (signals[0] is fixes or len(turn.t) < 2)
     velocity = velocity + absent[:, None]
-    return Member(gnss, velocity, heading, text, course, False, rate + absent, compass, wanders, shown)
+    return Member(gnss, velocity, heading, text, course, False, rate + absent, compass, wanders, alone)
 
 
 def _in_world(
     name: str,
     rows: Rows,
-    body: tuple[Signal, Signal, Signal],
-    placed: tuple[Signal, Signal | None, float],
+    turning: tuple[Signal, Signal],
+    shown: Shown,
+    gyro: tuple[Signal, Signal, float],
     steps: Steps,
 ) -> tuple[Signal | None, HeadingAt | None, str, float]:
     """Velocity at its own times, None where the fixes have to show it; heading, whose course that is, and m^2/s by
-    which that makes a position uncertain; `body` are heading, yaw rate and speed."""
-    summary, (measured, turn, speed), (fixes, derived, std) = steps.summary, body, placed
+    which that makes a position uncertain; `turning` are heading and yaw rate, `gyro` as of `_heading`."""
+    summary, (measured, turn), (fixes, speed, _) = steps.summary, turning, gyro
     world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), rows[rows["kind"] == "speed"]
-    moves, gyro = ((world, "odometry"), (derived, "fixes")), (fixes, speed, std)
-    heading, course, wanders = _heading(measured, turn, moves, steps, gyro)
-    if course == "fixes" and not wanders:
-        wanders = velocity_of_fixes(fixes, steps.gap(fixes.t), std)[2]
+    heading, course, wanders = _heading(measured, turn, ((world, "odometry"), (shown, "fixes")), steps, gyro)
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
         return Signal(world.t, np.nan_to_num(world.value)), heading, course, 0.0
@@ -232,17 +240,17 @@ def _in_world(
     if len(speed.t):
         allowed, hint = "needs heading, compass_deg, or fixes of a moving vehicle", "Add one, or give vx and vy."
         raise InputError(f"{place(speeds)}, speed", f"of {name}, which has no heading", allowed, hint)
-    if derived is None:
+    if len(fixes.t) < 2:
         hint = "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z."
         raise InputError(f"vehicle {name}", "no odometry, and less than two fixes", "cannot be placed", hint)
     summary.assume(DERIVED, name)
-    return None, heading, course, 0.0
+    return None, heading, course, shown.wanders
 
 
 def _heading(
     measured: Signal,
     turn: Signal,
-    moves: Sequence[tuple[Signal | None, str]],
+    moves: Sequence[tuple[Signal | Shown, str]],
     steps: Steps,
     gyro: tuple[Signal, Signal, float] | None = None,
 ) -> tuple[HeadingAt | None, str, float]:
@@ -256,9 +264,10 @@ def _heading(
         fixes, speed, std = gyro
         if (found := heading_of_gyro(fixes, speed, rate, std)) is not None:
             return found[0], "fixes", found[1]
-    for velocity, source in moves:
-        if velocity is not None and (moving := np.hypot(*velocity.value[:, :2].T) > MOVING).any():
-            return heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate), source, 0.0
+    for move, source in moves:
+        velocity, wanders = (move.velocity, move.wanders) if isinstance(move, Shown) else (move, 0.0)
+        if (moving := np.hypot(*velocity.value[:, :2].T) > MOVING).any():
+            return heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate), source, wanders
     return None, "", 0.0
 
 
@@ -290,35 +299,29 @@ def fix_std(rows: Rows) -> float:
     return float(np.sqrt((stated**2).mean())) if len(stated) else Sensors().gnss_std[0]
 
 
-def velocity_of_fixes(fixes: Signal, gap: float, std: float) -> tuple[Signal, Bools, float]:
-    """Velocity (M, 3) m/s at the times of fixes, by these and those before (`kernels.constant_velocity`); whether it
-    is known, by four fixes at the latest, or as well as by two that are as far apart as nine in ten; and how fast a
-    position predicted with the last one becomes uncertain, m^2/s, if fixes have that standard deviation m.
-
-    >>> t = np.arange(40.0)
-    >>> velocity, *_ = velocity_of_fixes(Signal(t, np.outer(t, [3.0, 4.0, 0.0])), 5.0, 1.0)
-    >>> velocity.value[-1].round(3).tolist()
-    [3.0, 4.0, 0.0]
-    """
+def velocity_of_fixes(fixes: Signal, steps: Steps, std: float) -> Shown:
+    """Velocity by fixes of that standard deviation m, by a Kalman filter (`kernels.constant_velocity`). It is known by
+    four of them at the latest, or as well as by two that are as far apart as nine in ten."""
+    if len(fixes.t) < 2:
+        return Shown(Signal(fixes.t, np.zeros_like(fixes.value)), np.zeros(len(fixes.t), bool), 0.0)
     between = np.diff(fixes.t)
     interval, longest = float(np.median(between)), float(np.quantile(between, 0.9))
     velocity, growth, spread = constant_velocity(
-        fixes.t, fixes.value, interval, gap + SAME, std**2, UNKNOWN_SPEED, BANK
+        fixes.t, fixes.value, interval, steps.gap(fixes.t) + SAME, std**2, UNKNOWN_SPEED, BANK
     )
-    seen = np.isfinite(growth)
-    wanders = float(std**2 * np.median(growth[seen]) / interval) if seen.any() else 0.0
-    order = np.arange(len(seen))
+    seen, order = np.isfinite(growth), np.arange(len(growth))
     since = order - np.maximum.accumulate(np.where(seen, 0, order))
-    return Signal(fixes.t, velocity), (since > 3) | (seen & (spread * longest**2 < 2.0)), wanders
+    wanders = float(std**2 * np.median(growth[seen]) / interval) if seen.any() else 0.0
+    return Shown(Signal(fixes.t, velocity), (since > 3) | (seen & (spread * longest**2 < 2.0)), wanders)
 
 
-def _shown(fixes: Signal, velocity: Signal, known: Bools, steps: Steps) -> Floats:
+def _by_fixes(fixes: Signal, shown: Shown, steps: Steps) -> Floats:
     """(T, 3) m/s at each step, as fixes of the steps before have shown it; until then it leads from fix to fix."""
     arrived = np.searchsorted(fixes.t, steps.grid + 0.5 * steps.dt - SAME) - 1
     last = np.append(-1, arrived[:-1])
     new = (last >= 0) & (arrived > last)
     leads = np.where(new[:, None], (fixes.value[arrived] - fixes.value[last]) / steps.dt, 0.0)
-    return np.where(((last >= 0) & known[last])[:, None], velocity.value[last], leads)
+    return np.where(((last >= 0) & shown.known[last])[:, None], shown.velocity.value[last], leads)
 
 
 def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, Ints, Floats]:

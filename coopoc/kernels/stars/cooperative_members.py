@@ -79,7 +79,7 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, co
 @inside
 def contradicted(f: Filter, k: int) -> bool:
     """Whether the ego's measurements of a member have contradicted its position for too long: two components three
-    times in a row, or one as often as it agreed before, at most `patience` times."""
+    times in a row, or one as often as it agreed before, at most CONTRADICTED times."""
     several, since = 0, f.ego[STEPS] - f.member[k, JOINED]
     for c in range(3):
         hits = f.who[k, HITS + c]
