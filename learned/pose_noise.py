@@ -16,10 +16,12 @@ from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.methods.track import Track
 from coopoc.world.fleet import Fleet
 from coopoc.world.recording import Recording
-from coopoc.world.sensors import Sensors
+from coopoc.world.sensors import ANGULAR, Sensors
 
 LEARNED = "velocity_std_ratio velocity_floor yaw_rate_std range_std azimuth_std speed_scale_std yaw_rate_bias_std"
 """Numbers of Sensors that are learned where they are positive."""
+MOST = {"velocity_std_ratio": 1.0, "speed_scale_std": 1.0, **dict.fromkeys(ANGULAR, np.pi)}
+"""What Sensors allow: above it a measurement means nothing, and the score is flat."""
 STEP = 0.5
 """Of the first simplex, in logarithms."""
 
@@ -77,9 +79,7 @@ def fit_pose_noise(tasks: Sequence[PoseTask], start: Sensors, evaluations: int =
 
     def sensors(x: Floats) -> Sensors:
         stds = dict(zip(names, np.exp(x).tolist(), strict=True))
-        if "azimuth_std" in stds:  # of a drive without bearings it means nothing
-            stds["azimuth_std"] = min(stds["azimuth_std"], np.pi)
-        return replace(start, **stds)
+        return replace(start, **{name: min(std, MOST.get(name, np.inf)) for name, std in stds.items()})
 
     def loss(x: Floats) -> float:
         assumed = sensors(x)

@@ -46,3 +46,14 @@ def test_noise_that_acts_is_learned_from_a_wrong_start() -> None:
         assert abs(np.log(getattr(learned, name) / getattr(acting, name))) < within
     with refused("tasks"):
         fit_pose_noise([], wrong)
+
+
+def test_odometry_that_means_nothing_is_learned_to_mean_nothing() -> None:
+    """Speeds of another drive: the likelihood rises with their noise up to what Sensors allow, and no further."""
+    fleet = convoy(2, 60)
+    seen = observed(fleet, replace(WHITE, velocity_reading="speed", velocity_floor=0.01), runs=1)
+    rng = np.random.default_rng(5)
+    seen = replace(seen, velocity=seen.velocity * rng.uniform(-5.0, 5.0, (*seen.velocity.shape[:-1], 1)))
+    start = replace(seen.sensors, velocity_std_ratio=0.8, azimuth_std=3.0)
+    task = PoseTask(seen, fleet, fleet.ids, co.PoseFilter("fleet", exact=False), 5)
+    assert fit_pose_noise([task], start, evaluations=60).velocity_std_ratio == 1.0
