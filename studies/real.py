@@ -284,7 +284,8 @@ def _trade(results: Results) -> Plot | None:
     panels = [Panel(places, {"landmarks": n}, _landmarks(n), "Sent [B]", ticks) for n in marks]
     looks = ("Cooperating", "#0072B2", "s"), ("Training", "#D55E00", "o"), ("Both", "#009E73", "D")
     lines = [
-        {"kind": k, "label": label, "color": color, "marker": mark} for k, (label, color, mark) in enumerate(looks)
+        {"kind": k, "label": label, "color": color, "marker": mark, "linestyle": "none"}
+        for k, (label, color, mark) in enumerate(looks)
     ]
     text = f"RT-LE against the bytes that a vehicle sends; what sends none is at the left. {BYTES}"
     caption = _caption(results, text.format(driven(results.settings)))

@@ -258,7 +258,8 @@ def _mean(point: Any) -> float:
 
 
 def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> None:
-    """Draw a line through points, an Interval with its band, or a number across the panel."""
+    """Draw a line through points, an Interval with its band, or with a bar where no line joins them; or a number across
+    the panel."""
     options = {**strokes(names), **(style or {})}
     if not isinstance(points, Mapping):
         axes.axhline(_mean(points), **{**options, "marker": ""})
@@ -268,4 +269,7 @@ def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> 
     if bands:
         ends = [point.low for point in bands.values()], [point.high for point in bands.values()]
         name = "_" + str(options["label"]).lstrip("_")
+        if options["linestyle"] == "none":
+            axes.vlines(list(bands), *ends, alpha=0.6, color=options["color"], linewidth=1.2, label=name)
+            return
         axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0, label=name)
