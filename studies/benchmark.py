@@ -29,7 +29,7 @@ from coopoc.study.study import Params, Row
 
 from .convoys import CONVOYS, convoy_row
 from .lineup import named_method, own
-from .roads import ROADS, road_row, roads
+from .roads import PUBLISHED, ROADS, holds, road_row, roads
 from .tasks import LOGGED, POSES, TASKS, VALIDATION, Task, bound, pose_row, recording, rounded
 from .worlds_card import card_file, card_folder, card_head, markdown, overview, run_worlds
 
@@ -155,7 +155,7 @@ def measurable(name: str, data: Path | None) -> dict[str, Callable[[], Row]]:
         return {task: partial(pose_row, task, data, made) for task in LOGGED}
     method, places = named_method(name), roads(data)
     found: dict[str, Callable[[], Row]] = {task: partial(road_row, task, data, method) for task in places}
-    if places is ROADS:
+    if places.keys() >= ROADS.keys():
         found |= {task: partial(convoy_row, task, data, method) for task in CONVOYS}
     return found
 
@@ -191,6 +191,9 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None, real: Seque
     ]
     if data or real is not None:
         for task, run in tqdm(measurable(name, data).items(), name, delay=2.0):
+            if real is None and data and task in PUBLISHED and not holds(data, task):
+                print(f"coopoc: {task} is left out: no {PUBLISHED[task][0]} below {data}", file=sys.stderr)
+                continue
             rows += [_row(task, run)] if real is None or task in real else []
     return {**card_head(name), "tasks": rows}
 

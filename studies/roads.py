@@ -31,21 +31,27 @@ ROADS: Mapping[str, tuple[str, ...]] = {
     "comma2k19": ("comma2k19",),
 }
 """Task -> files of the measurements and of the truth, or a folder of both."""
+PUBLISHED: Mapping[str, tuple[str, ...]] = {"nclt": ("test.pt", "val.pt"), "nclt-val": ("val.pt",)}
+"""Task of drives that a net was published with -> the file that is scored, with all its fixes and steps, and the one
+that calibrates."""
 STEP = 0.1
 """s, of comma2k19, whose speeds come every 0.01 s."""
 
 
 def roads(data: Path | None) -> Mapping[str, tuple[str, ...]]:
     """The tasks of a folder of data or of what was fetched, or the one of a log of one's own."""
+    every = {**ROADS, **PUBLISHED}
     if data is None:
-        return ROADS
+        return every
     path = Path(split(str(data))[0])
-    return {path.stem: ()} if path.exists() and is_log(path) and not _holds_roads(path) else ROADS
+    own = path.exists() and is_log(path) and not any(holds(path, task) for task in every)
+    return {path.stem: ()} if own else every
 
 
-def _holds_roads(path: Path) -> bool:
+def holds(path: Path, task: str) -> bool:
     """Whether the first file of a task is below a folder, or is the folder."""
-    return any(path.name == files[0] or any(path.rglob(files[0])) for files in ROADS.values())
+    first = {**ROADS, **PUBLISHED}[task][0]
+    return path.name == first or any(path.rglob(first))
 
 
 @lru_cache(maxsize=2)
@@ -56,6 +62,8 @@ def seen(task: str, data: Path | None) -> tuple[Recording, Fleet]:
         InputError: a file that is missing, a log without a truth.
     """
     files = [located(data, name) for name in roads(data)[task]]
+    if task in PUBLISHED:
+        return published(files[0])
     if task == "kitti":
         recording, truth = _kitti(*map(np.loadtxt, files))
     else:
@@ -73,6 +81,13 @@ def seen(task: str, data: Path | None) -> tuple[Recording, Fleet]:
         gone = np.setdiff1d(np.arange(len(clock)), [*kept[clock[kept] < PERIOD - OUTAGE], *starts])
         gnss[:, gone, column] = np.nan
     return replace(recording, gnss=gnss), truth
+
+
+def published(file: Path) -> tuple[Recording, Fleet]:
+    """Drives with all their fixes, and their truth."""
+    log = read_log(file)
+    assert log.truth is not None
+    return log.recording, log.truth
 
 
 def _kitti(odometry: Floats, truth: Floats) -> tuple[Recording, Fleet]:
@@ -93,21 +108,27 @@ def road_row(task: str, data: Path | None, made: Method) -> Row:
         made: a method, which is calibrated if it has a method `fitted`.
     """
     recording, truth = seen(task, data)
-    start, column = int(SHARE * len(recording.t)), recording.observers[0]
+    start, column = int(SHARE * len(recording.t)) * (task not in PUBLISHED), recording.observers[0]
     begin, _ = recording.stretches(column)[0]
     made(recording.between(begin, begin + 3), [column])  # compiles
-    row = {"task": task, "data": hashed(*(located(data, name) for name in roads(data)[task]))}
+    files = [located(data, name) for name in roads(data)[task]]
+    row = {"task": task, "data": hashed(*files)}
     row |= _scored(made, recording, truth, start)
-    if hasattr(made, "fitted"):
-        own = _scored(made.fitted(recording.between(0, start), truth.between(0, start)), recording, truth, start)
-        row |= {f"calibrated_{name}": own[name] for name in ("blocks_m", "nees") if name in own}
+    if task in PUBLISHED:
+        first = published(files[1]) if files[1:] else ()
+    else:
+        first = recording.between(0, start), truth.between(0, start)
+    if first and hasattr(made, "fitted"):
+        own = _scored(made.fitted(*first), recording, truth, start)
+        row |= {f"calibrated_{name}": own[name] for name in ("blocks_m", "axis_rms_m", "nees") if name in own}
         row["calibrated_m"] = own["rt_le_m"]
     return row | {"received_bytes_per_second": 0}
 
 
 def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> Row:
-    """RT-LE m in the plane with its interval over vehicles and blocks of time, NEES of (x, y), us of a step."""
-    blocks, ratios, seconds = list[float](), list[Floats](), 0.0
+    """RT-LE m in the plane with its interval over vehicles and blocks of time, root mean square of an axis m of each
+    vehicle, NEES of (x, y), us of a step."""
+    blocks, ratios, seconds, axis = list[float](), list[Floats](), 0.0, dict[str, float]()
     size = max(int(min(BLOCK / recording.dt, (len(recording.t) - start) / 4)), 1)
     for column in recording.observers:
         squares = np.full(len(recording.t), np.nan)
@@ -120,8 +141,9 @@ def _scored(method: Method, recording: Recording, truth: Fleet, start: int) -> R
             ratios.append(nees[0, max(start - begin, 0) :, 0])
         parts = [squares[k : k + size] for k in range(start, len(squares) - size + 1, size)]
         blocks += [float(np.sqrt(np.nanmean(part))) for part in parts if np.isfinite(part).any()]
+        axis[recording.ids[column]] = round(float(np.sqrt(np.nanmean(squares[start:]) / 2)), 4)
     level = mean_interval(np.array(blocks))
-    row: Row = {"rt_le_m": rounded(level)}
+    row: Row = {"rt_le_m": rounded(level), "axis_rms_m": axis}
     row["blocks_m"] = [round(value, 4) for value in blocks]
     nees = np.concatenate(ratios)
     row |= {"nees": round(float(np.nanmean(nees)), 2)} if np.isfinite(nees).any() else {}

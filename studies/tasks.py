@@ -161,6 +161,7 @@ RANGE_STD = 0.3
 
 LOGGED: Mapping[str, tuple[str, float]] = {
     "robots": ("MRCLAM_Dataset6", 30.0),
+    "robots-7": ("MRCLAM_Dataset7", 30.0),
     "uwb": ("tiers.pyfg", 10.0),
     "indoor": ("Indoor_UWB_Input.txt", 3.0),
 }
@@ -186,7 +187,7 @@ def located(folder: Path | None, name: str) -> Path:
 @lru_cache(maxsize=2)
 def seen(task: str, path: Path) -> tuple[Recording, Fleet, int, Mapping[str, Any]]:
     """Measurements, truth, first step that is scored, and what is known of the start and the noise."""
-    if task == "robots":
+    if task.startswith("robots"):
         until, v2x = 300.0, V2X(max_neighbours=4, radius=float("inf"))
         drive = pose_drives.drive(str(path), until, v2x)
         assert drive.truth is not None

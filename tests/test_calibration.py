@@ -101,6 +101,18 @@ def test_calibration_harms_no_drive(with_truth: bool) -> None:
         assert fitted.priors.fix_gate in (ON_ROADS.fix_gate, CooperativeFilter().priors.fix_gate)
 
 
+@pytest.mark.parametrize(("motion", "fix"), [(0.1, 1.0), (0.3, 3.0)])
+def test_a_drive_whose_odometry_is_right_blinds_no_filter(motion: float, fix: float) -> None:
+    """Of heading and scale a drive holds one error: calibrated where both are 0, the filter still finds a turn of 6
+    degrees and a scale of 5 % in another drive."""
+    recording, fleet = drive(0, motion, fix)
+    fitted = CooperativeFilter.fitted(recording.between(0, 1200), fleet.between(0, 1200))
+    assert "calibrated:" in fitted.calibration
+    other, truth = drive(1, motion, fix)
+    other = turned(other, 0.1, 0.05)
+    assert rt_le(fitted(other), truth) < rt_le(CooperativeFilter()(other), truth)
+
+
 def test_what_cannot_be_calibrated_is_refused() -> None:
     recording, fleet = drive(0, 1.0, 1.0)
     with refused("ids and times differ"):

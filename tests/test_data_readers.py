@@ -16,6 +16,7 @@ from coopoc.data.assemble import interpolate
 from coopoc.data.fleet_files import write_table
 from coopoc.data.registry import convert, load_fleet
 from coopoc.errors import InputError
+from coopoc.studies.roads import road_row
 
 GOOD = "id,t,x,y,z\na,0.0,0,0,0\nb,0.0,5,0,0\na,0.1,1,0,0\nb,0.1,5,1,0\na,0.2,2,0,0\nb,0.2,5,2,0\n"
 
@@ -296,6 +297,32 @@ def test_a_real_robot_of_libRSF() -> None:
     ego = robot.recording.ids.index("Indoor_UWB")
     track = co.PoseFilter("solo", begin=co.pose_start(robot.recording), gate=5.0)(robot.recording, [ego])
     assert np.sqrt(np.nanmean(np.square((track.x[0, :, 0] - robot.truth.position[:, ego])[:, :2]).sum(1))) < 0.2
+
+
+def test_tensors_of_nclt_are_read_and_scored_as_published(tmp_path: Path) -> None:
+    """NumPy: mean of both wheels along either heading, the rms of an axis, all fixes; val.pt calibrates."""
+    torch, rng, drives = pytest.importorskip("torch"), np.random.default_rng(3), []
+    for date, steps in (("2013-01-10", 90), ("2013-02-23", 60)):
+        heading = np.linspace(0.0, 3.0, steps)
+        way = np.cumsum(1.2 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+        gps = way + rng.normal(0.0, 3.0, way.shape)
+        gps[20:25] = np.nan
+        imu = np.column_stack([0 * heading, 0 * heading, heading + 0.1, 0 * heading])
+        arrays = {"filtered_gps": gps, "filtered_wheel": np.tile([1.1, 1.3], (steps, 1)), "imu_sensor": imu}
+        arrays |= {"theta_gt": heading[:, None], "ground_truth": way, "initial_state": np.zeros(6)}
+        drives.append({name: torch.tensor(array) for name, array in arrays.items()} | {"data_date": date})
+    torch.save(drives[1:], tmp_path / "test.pt"), torch.save(drives, tmp_path / "val.pt")
+    log = co.read_log(tmp_path / "val.pt")
+    assert log.recording.ids == ("2013-01-10", "2013-01-10-true-heading", "2013-02-23", "2013-02-23-true-heading")
+    own = np.linspace(0.0, 3.0, 90)[4:6].mean() + 0.1  # of the middle of a step
+    assert_allclose(log.recording.velocity[0, 5, 0, :2], [1.2 * np.cos(own), 1.2 * np.sin(own)], rtol=1e-3)
+    row = road_row("nclt", tmp_path, co.GNSS())
+    held = pd.DataFrame(drives[1]["filtered_gps"].numpy()).ffill().to_numpy() - drives[1]["ground_truth"].numpy()
+    assert row["axis_rms_m"]["2013-02-23"] == pytest.approx(np.sqrt((held**2).mean()), abs=1e-3)
+    assert "calibrated_m" in road_row("nclt", tmp_path, co.Kalman())
+    torch.save({"weights": torch.zeros(3)}, tmp_path / "val.pt")
+    with refused("must be a list of drives"):
+        co.read_log(tmp_path / "val.pt")
 
 
 @pytest.mark.parametrize(

@@ -22,6 +22,8 @@ FITTED, BLOCKS = 2 / 3, 8
 """Share of a drive that is fitted; blocks of time of the rest, over which errors are compared."""
 PRIOR = 0.002
 """Weight of squared logarithms of the factors between fitted and usual numbers, beside a mean over the drive."""
+SINGLE = frozenset(("heading", "scale"))
+"""Deviations of errors of which a drive holds one draw: it can show that they are larger, not that they are smaller."""
 LIKELIHOOD = 0.1
 """Weight of minus the log likelihood of a true position, beside the logarithm of RT-LE."""
 M = TypeVar("M", bound=Method)
@@ -114,9 +116,10 @@ def fit(
     from scipy.optimize import minimize
 
     first = np.log([*usual.values()])
+    least = np.where([name in SINGLE for name in usual], first, -np.inf)
 
     def named(logs: Floats) -> dict[str, float]:
-        return dict(zip(usual, np.exp(logs).tolist(), strict=True))
+        return dict(zip(usual, np.exp(np.maximum(logs, least)).tolist(), strict=True))
 
     def total(logs: Floats) -> float:
         weights, costs = list[int](), list[float]()

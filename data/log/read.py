@@ -27,6 +27,7 @@ from ..bag import STAMP, read_bag
 from ..cells import TABLES, factors, headers
 from ..comma import is_segment, read_segment
 from ..librsf import is_librsf, read_librsf
+from ..nclt import is_nclt, read_nclt
 from ..nmea import read_nmea
 from ..source import parted
 from .frames import ENU, Origin, assumed, local, on_one_clock, unwrapped
@@ -48,6 +49,7 @@ READERS: Mapping[str, Callable[..., Rows]] = {
     **dict.fromkeys((".nmea", ".nme", ".gga"), read_nmea),
     **dict.fromkeys((".bag", ".mcap", ".db3"), read_bag),
     ".txt": read_librsf,
+    ".pt": read_nclt,
 }
 """Ending of a file -> (path, summary, *, columns, kinds, ignore) -> its rows. A new format is one more entry."""
 TRUTH = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
@@ -87,8 +89,8 @@ class Log:
 
 
 def is_log(path: Path, columns: Mapping[str, str] | None = None) -> bool:
-    """Whether a path is a log: a bag, NMEA, libRSF's text, a segment of comma2k19, a folder of such files, or a
-    table with a column of a log.
+    """Whether a path is a log: a bag, NMEA, libRSF's text, tensors of NCLT, a segment of comma2k19, a folder of such
+    files, or a table with a column of a log.
 
     Args:
         path: of a file or folder.
@@ -276,6 +278,8 @@ def _is_bag(path: Path) -> bool:
 
 def _is_read(file: Path) -> bool:
     ending = file.suffix.lower()
+    if ending == ".pt":
+        return is_nclt(file)
     return is_librsf(file) if ending == ".txt" and file.is_file() else ending in READERS
 
 

@@ -1,0 +1,71 @@
+"""Drives of the NCLT Segway as KalmanNet4SensorFusion publishes them (tensors of torch) as rows of a log."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from coopoc.errors import InputError, MissingLibraryError, said
+
+from .log.units import Rows, Summary, of_kinds
+
+NAMES = ("train.pt", "val.pt", "test.pt")
+"""Of its files."""
+FIELDS = {"filtered_gps": 2, "filtered_wheel": 2, "imu_sensor": 3, "theta_gt": 1, "ground_truth": 2}
+"""Field of a drive, a row for each second -> columns that are read."""
+
+
+def is_nclt(path: Path) -> bool:
+    """Whether a file has the name of one of these."""
+    return path.name in NAMES
+
+
+def read_nclt(path: Path, summary: Summary, **_: Any) -> Rows:
+    """Rows of two vehicles for each drive: fixes (x, y), speed as the mean of both wheels, the truth, and the heading:
+    that of the inertial unit, or the true one, DATE and DATE-true-heading. Every drive begins at 0 s.
+
+    Args:
+        path: of the file.
+        summary: takes what is assumed.
+
+    Raises:
+        InputError: another file, a field that is missing or of another shape.
+        MissingLibraryError: torch is not installed.
+
+    References:
+        Song et al., KalmanNet for sensor fusion, IEEE Signal Processing Letters, 2024 (their files); Carlevaris-Bianco,
+        Ushani, Eustice, University of Michigan North Campus long-term vision and lidar dataset, IJRR 35(9), 2016.
+    """
+    try:
+        import torch
+    except ImportError:
+        raise MissingLibraryError("torch", "reading tensors", "'coopoc[learned]'") from None
+    try:
+        drives = [
+            {name: np.asarray(drive[name], dtype=float)[:, :n] for name, n in FIELDS.items()}
+            | {"date": drive["data_date"]}
+            for drive in torch.load(path, map_location="cpu", weights_only=True)
+        ]
+        tables = [
+            pd.DataFrame({"t": np.arange(len(gps)), "x": gps[:, 0], "y": gps[:, 1], "speed": wheel.mean(axis=1)})
+            for gps, wheel in ((drive["filtered_gps"], drive["filtered_wheel"]) for drive in drives)
+        ]
+    except Exception as error:  # of torch and NumPy: another file meets them all
+        allowed = f"must be a list of drives with {', '.join(FIELDS)} and data_date"
+        raise InputError(path.name, said(error), allowed, "Take the file as it was published.") from None
+    summary.assume("speed: the mean of both wheels; each drive twice, with its own and with its true heading")
+    parts = []
+    for drive, table in zip(drives, tables, strict=True):
+        x, y = drive["ground_truth"].T
+        for name, heading in (
+            (drive["date"], drive["imu_sensor"][:, 2]),
+            (f"{drive['date']}-true-heading", drive["theta_gt"][:, 0]),
+        ):
+            parts += [
+                table.assign(heading=heading, vehicle=name),
+                table[["t"]].assign(x=x, y=y, true=1.0, vehicle=name),
+            ]
+    return of_kinds(pd.concat(parts, ignore_index=True).sort_values("t", kind="stable"), path.name)
