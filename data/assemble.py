@@ -20,6 +20,8 @@ SAME = 1e-6
 """s, stamps this close are one instant: the digits that a double keeps of seconds since 1970."""
 SLOWEST, FASTEST = 2e-3, 500.0
 """m/s: a car in degrees per second has 0.0003 at most, an airliner in metres 250."""
+REGION = 2.0
+"""Degrees that a fleet spans at most; robots that stand in a room, and tremble in motion capture, are metres apart."""
 LATEST = 1e11
 """s since 1970, the year 5138."""
 COARSE = 1e-3, 64.0
@@ -204,7 +206,8 @@ metres in a local frame. Give latitude and longitude to co.load_recording, which
         each = np.linalg.norm(np.diff(position[rows, :2], axis=0), axis=1) / np.diff(t[rows])
         speed = max(speed, float(np.median(each[each > 0])) if (each > 0).any() else 0.0)
     (west, east), (south, north) = ((float(v.min()), float(v.max())) for v in position[:, :2].T)
-    if 0 < speed < SLOWEST and max(-west, east) <= 360 and max(-south, north) <= 180:
+    near = max(east - west, north - south) < REGION
+    if 0 < speed < SLOWEST and near and max(-west, east) <= 360 and max(-south, north) <= 180:
         given = f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}"
         hint = "Give latitude and longitude to co.load_recording, which converts them, or pass any_scale=True."
         raise InputError(f"{file}: columns x, y", given, "look like degrees, must be metres in a local frame", hint)

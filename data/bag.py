@@ -1,7 +1,8 @@
-"""ROS 1 and 2 bags as rows of a log: NavSatFix, Odometry, Imu and PoseStamped, one namespace per vehicle."""
+"""ROS 1 and 2 bags as rows of a log: NavSatFix, Odometry, Imu, PoseStamped and Range, one namespace per vehicle."""
 
 from __future__ import annotations
 
+import re
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -20,6 +21,11 @@ READ = {
     "nav_msgs/msg/Odometry": "odometry",
     "sensor_msgs/msg/Imu": "imu",
     "geometry_msgs/msg/PoseStamped": "pose",
+    "sensor_msgs/msg/Range": "range",
+}
+INVALID = {
+    "fix": "fixes that the receiver calls invalid",
+    "range": "ranges outside of what the sensor says it can measure",
 }
 TRUTH = ("truth", "ground_truth", "groundtruth")
 WHEELS = "yaw_rate of odometry"
@@ -57,11 +63,14 @@ def read_bag(
 ) -> Rows:
     """Rows of the measurements in a bag.
 
-    The first part of a topic names the vehicle (/car1/fix), the bag's own name where there is only one part. NavSatFix
+    The first part of a topic names the vehicle (/car1/fix), the bag's own name where there is only one part; of several
+    topics of PoseStamped the first part that differs, as in /vrpn_client_node/robot1/pose of motion capture. NavSatFix
     gives latitude, longitude, height; Odometry the speed and yaw rate of its twist (its pose has a frame of its own and
     is not used); Imu the yaw of its orientation as heading and the yaw rate, which goes before that of Odometry;
-    PoseStamped x, y, z in the frame of the map. The truth is the poses of PoseStamped or Odometry where the topic is
-    `truth`, or a part of it is truth or ground_truth. Deviations are those of the covariances.
+    PoseStamped x, y, z in the frame of the map; Range, of topics that differ in two parts, the range from the first to
+    the second (/uwb/n_1/n_2/distance), which are the vehicles of the same numbers where none has their names. The truth
+    is the poses of PoseStamped or Odometry where the topic is `truth`, or a part of it is truth or ground_truth.
+    Deviations are those of the covariances.
 
     Args:
         path: of the bag.
@@ -94,23 +103,22 @@ def read_bag(
                 if topic not in topics:
                     raise unknown(f"{path.name}: topic", topic, sorted(topics))
             wanted = [c for c in reader.connections if topics[c.topic]]
+            of = _vehicles({c.topic: READ[c.msgtype] for c in wanted}, truth, path.stem)
             for c in reader.connections:
                 if not topics[c.topic]:
                     summary.leave(f"{path.name}: topic {c.topic} ({c.msgtype})", c.msgcount)
             for c, received, raw in reader.messages(connections=wanted) if wanted else ():
-                parts = c.topic.strip("/").split("/")
-                true = c.topic == truth or any(part.lower() in TRUTH for part in parts)
+                (name, partner), true = of[c.topic]
                 message: Any = reader.deserialize(raw, c.msgtype)
                 numbers = _numbers(READ[c.msgtype], message, true)
-                if not numbers and READ[c.msgtype] == "fix":
-                    summary.refuse("fixes that the receiver calls invalid", 1, f"{path.name}: {c.topic}")
+                if not numbers and (what := READ[c.msgtype]) in INVALID:
+                    summary.refuse(INVALID[what], 1, f"{path.name}: {c.topic}")
                 t, late = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9, received * 1e-9
                 behind.append(late - t)
                 t = t if stamps == "header" else late
-                name = parts[0] if len(parts) > 1 else path.stem
                 for kind, value, std in numbers:
                     if kind.partition(" of ")[0] not in ignore:
-                        rows.append((true, t, name, kind, value, std if std > 0 else np.nan))
+                        rows.append((true, t, name, partner, kind, value, std if std > 0 else np.nan))
     except InputError:
         raise
     except Exception as error:  # of rosbags: a damaged file meets them all
@@ -119,14 +127,50 @@ def read_bag(
         other = "received" if stamps == "header" else "header"
         spread = f"between {min(behind):.3g} and {max(behind):.3g} s before they were received"
         summary.assume(f"times are those of stamps={stamps}; headers are {spread} (stamps={other}: by the other)")
-    gyros = {row[2] for row in rows if row[3] == "yaw_rate"}
-    rows = [row for row in rows if row[3] != WHEELS or row[2] not in gyros]
-    frame = pd.DataFrame(rows, columns=["true", "t", "vehicle", "kind", "value", "std"]).replace({WHEELS: "yaw_rate"})
+    frame = pd.DataFrame(rows, columns=["true", "t", "vehicle", "partner", "kind", "value", "std"])
+    gyros = frame["vehicle"][frame["kind"] == "yaw_rate"]
+    frame = frame[(frame["kind"] != WHEELS) | ~frame["vehicle"].isin(gyros)].replace({WHEELS: "yaw_rate"})
+    frame = _by_number(frame, summary)
     if frame["true"].all():
         kinds_read = ", ".join(kind.rpartition("/")[2] for kind in READ)
         raise InputError(path.name, "0 messages", f"must hold {kinds_read}", "Check the topics with: ros2 bag info.")
     frame.index = frame.groupby("true").cumcount() + 1
     return rows_of(frame, path.name)
+
+
+def _vehicles(kinds: Mapping[str, str], truth: str, bag: str) -> dict[str, tuple[tuple[str, str], bool]]:
+    """Topic -> the vehicle and the partner that it names, and whether it is of the truth.
+
+    >>> topics = {"/mocap/red/pose": "pose", "/mocap/blue/pose": "pose", "/red/odom": "odometry"}
+    >>> [names for names, _ in _vehicles(topics, "", "drive").values()]
+    [('red', ''), ('blue', ''), ('red', '')]
+    """
+    parts = {topic: topic.strip("/").split("/") for topic in kinds}
+    true = {topic: topic == truth or any(part.lower() in TRUTH for part in of) for topic, of in parts.items()}
+    names = {}
+    for topic, of in parts.items():
+        kind = kinds[topic]
+        alike = [parts[other] for other in parts if (kinds[other], true[other]) == (kind, true[topic])]
+        differ = [k for k, part in enumerate(zip(*alike, strict=False)) if len(set(part)) > 1]
+        if kind == "range":
+            ends = (of[differ[0]], of[differ[1]]) if len(differ) > 1 else (of[0], of[-1])
+        else:
+            ends = of[differ[0] if differ and kind == "pose" else 0] if len(of) > 1 else bag, ""
+        names[topic] = ends, true[topic]
+    return names
+
+
+def _by_number(frame: pd.DataFrame, summary: Summary) -> pd.DataFrame:
+    """Rows whose ranges are between vehicles of the same numbers where none has the names of their ends."""
+    ranges = frame["kind"] == "range"
+    numbered = {re.sub(r"\D", "", name): name for name in frame["vehicle"][~ranges].unique()}
+    ends = {*frame["vehicle"][ranges], *frame["partner"][ranges]} - {*numbered.values()}
+    same = {
+        name: numbered[number] for name in sorted(ends) if (number := re.sub(r"\D", "", name)) in numbered and number
+    }
+    if same:
+        summary.assume(f"ends of ranges by their numbers: {', '.join(f'{a} is {b}' for a, b in same.items())}")
+    return frame.replace({"vehicle": same, "partner": same})
 
 
 def _numbers(kind: str, m: Any, true: bool) -> list[Number]:
@@ -144,6 +188,10 @@ def _numbers(kind: str, m: Any, true: bool) -> list[Number]:
     if kind == "odometry":
         std, twist = _deviations(m.twist.covariance, 6), m.twist.twist
         return [("speed", float(twist.linear.x), std[0]), (WHEELS, float(twist.angular.z), std[5])]
+    if kind == "range":
+        most = m.max_range if m.max_range > 0 else np.finfo(float).max  # 0: not stated
+        valid = max(m.min_range, 0.0) <= m.range <= most
+        return [("range", float(m.range), np.nan)] if valid else []
     numbers = []
     if m.angular_velocity_covariance[0] >= 0:
         numbers.append(("yaw_rate", float(m.angular_velocity.z), _deviations(m.angular_velocity_covariance, 3)[2]))
@@ -158,7 +206,7 @@ def of_topic(frame: pd.DataFrame, file: str, summary: Summary, true: bool) -> pd
     t = numeric(frame, STAMP, file) + (1e-9 * numeric(frame, nano, file) if nano else 0.0)
     if "status.status" in frame:
         invalid = numeric(frame, "status.status", file) < 0
-        summary.refuse("fixes that the receiver calls invalid", int(invalid.sum()), file)
+        summary.refuse(INVALID["fix"], int(invalid.sum()), file)
         frame, t = frame[~invalid], t[~invalid]
     made = {"t": t}
     if true:
