@@ -32,7 +32,6 @@ GAPS = (
     "cooperative-filter",
     "ci",
     "split-ci",
-    "gbp",
     "central-filter",
     "batch-smoother",
 )

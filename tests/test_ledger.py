@@ -12,7 +12,6 @@ from coopoc.learned import load as load_weights
 from coopoc.learned.federation.history import card_ledger
 from coopoc.learned.recipes import WEIGHTS
 from coopoc.methods.centralised import CentralFilter
-from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.world.v2x import NO_MESSAGE
 
 S2 = Sensors.paper_scenario2()
@@ -20,9 +19,9 @@ ROOT = Path(__file__).parent.parent
 
 
 def test_the_ledger_of_a_track_is_its_bytes(crossing: Fleet) -> None:
-    """Payload by hand: 32 of 132 B; of beliefs 3 x 36 + 20 of 3 x 136 + 20 B; to a centre as many as were measured."""
+    """Payload by hand: 32 of 132 B; to a centre as many as were measured."""
     seen, plain = (observe(crossing, S2, V2X(3, overhead=size), runs=2) for size in (100, 0))
-    for method in (JointFilter(), GaussianBeliefPropagation(rounds=3), CentralFilter()):
+    for method in (JointFilter(), CentralFilter()):
         track, bare = method(seen, [1, 4]), method(plain, [1, 4])
         account = of_track(track, seen, method.message)
         assert account.names == ("c1", "c4")

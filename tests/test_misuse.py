@@ -90,7 +90,6 @@ METHODS: tuple[Any, ...] = (
     co.BatchSmoother,
     co.CentralFilter,
     co.CovarianceIntersection,
-    co.GaussianBeliefPropagation,
 )
 FLEET = co.load_fleet("town10").between(0, 6).select([0, 1, 2, 3])
 SENSORS, CHANNEL = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=3)
@@ -269,7 +268,7 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         {**MESSAGE, "variance": [1.0, 1.0, 1.0], "odometer": [0.0, 1.0, 2.0]},
     ),
     "StarStream": (joint, {**MESSAGE, "dt": 0.1, "fix_age": 0.0}),
-    "Message": (co.Message, {"name": "m", "numbers": 6, "rounds": 1, "opening": 0, "per_neighbour": 0}),
+    "Message": (co.Message, {"name": "m", "numbers": 6, "rounds": 1, "per_neighbour": 0}),
     "Loss": (co.Loss, {"name": "huber", "scale": 1.0}),
     "Problem": (
         least_squares,

@@ -160,7 +160,7 @@ def test_a_fine_range_in_a_coarse_direction_is_not_taken_for_exact(range_std: fl
         fleet = replace(fleet, position=fleet.position + place)
         sensors = co.Sensors((1.5, 1.5, 1.5), range_std=range_std, azimuth_std=angle_std, inclination_std=angle_std)
         drives.append((fleet, observed(fleet, sensors, 6, seed)))
-    names = "kalman lkf-sa-edge joint ci split-ci gbp batch-smoother"
+    names = "kalman lkf-sa-edge joint ci split-ci batch-smoother"
     error = errors_of(names, " rad put what is ", drives)
     assert all(each < 4.0 * error["kalman"] for each in error.values()), error
 
@@ -184,7 +184,7 @@ def test_fine_ranges_alone_bend_as_fixes_are_uncertain() -> None:
         fleet = co.Fleet(tuple("abcd"), t, position, velocity)
         seen = co.observe(fleet, sensors, co.V2X(5, radius=200.0), runs=3, seed=seed)
         drives.append((fleet, without_azimuth(seen)))
-    names = "kalman joint lkf-sa-edge central-filter gbp batch-smoother"
+    names = "kalman joint lkf-sa-edge central-filter batch-smoother"
     error = errors_of(names, "no azimuth put what is", drives)
     assert all(each < 1.05 * error["kalman"] for each in error.values()), error
 

@@ -6,7 +6,7 @@ from typing import Any
 import gtsam
 import numpy as np
 import pytest
-from conftest import coming_and_going, refused, standing, textbook
+from conftest import coming_and_going, refused, textbook
 from oracles.whole_fleet import rows
 from scipy import optimize, stats
 from scipy.optimize import least_squares
@@ -17,25 +17,11 @@ from coopoc.evaluate.metrics import nees_inside, rt_le
 from coopoc.kernels.fleets.graph import measurement
 from coopoc.kernels.geometry import components
 from coopoc.methods.centralised import BatchSmoother, CentralFilter
-from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.world.links import spherical, to_vector, vector_cov, wrap
 from coopoc.world.v2x import Message
 
 S2 = Sensors.paper_scenario2()
 SPEED = replace(S2, velocity_reading="speed")
-LINEAR = NoiseModel("unit", None, process_std=(0.3, 0.4, 0.2), gnss_std=(2.0, 1.0, 3.0))
-"""Relative vectors of unit covariance: all methods are then linear, and numpy.linalg.lstsq says what is right."""
-
-
-def dense(recording: Recording, known: NoiseModel) -> tuple[np.ndarray, np.ndarray]:
-    """Least squares of the first step by numpy.linalg.lstsq: positions (N, 3) and covariances (N, 3, 3)."""
-    now, unit = recording.links.step == 0, np.eye(len(recording.ids))
-    incidence = unit[recording.links.neighbour[now]] - unit[recording.links.observer[now]]
-    rows = np.vstack([np.kron(unit, np.diag(1 / np.array(known.gnss_std))), np.kron(incidence, np.eye(3))])
-    right = np.vstack([recording.gnss[0, 0] / known.gnss_std, to_vector(recording.relative[0, now])])
-    x = np.linalg.lstsq(rows, right.ravel(), rcond=None)[0]
-    cov = np.linalg.inv(rows.T @ rows).reshape(len(unit), 3, len(unit), 3)
-    return x.reshape(-1, 3), np.stack([cov[k, :, k] for k in range(len(unit))])
 
 
 @pytest.mark.parametrize("distance", [0.02, 0.5, 2.5, 11.0])
@@ -52,37 +38,6 @@ def test_the_linearised_measurement_is_the_spherical_measurement(distance: float
     cov = np.linalg.inv(np.reshape(weight, (3, 3)))
     assert cov == pytest.approx(vector_cov(relative, S2.relative_std, S2.min_range), rel=1e-9)
     assert eta == pytest.approx(np.zeros(3), abs=1e-9)
-
-
-CHAIN = standing([[20.0 * i, 3.0 * (i % 2), 0.5 * i] for i in range(5)])
-"""Each sees only the next ones: a tree."""
-
-
-@pytest.mark.parametrize("damping", [0.0, 0.5])
-def test_gbp_on_a_tree_is_the_dense_least_squares(damping: float) -> None:
-    """Independent check: lstsq. Means and covariances, exact after as many rounds as the tree is wide."""
-    recording = observe(CHAIN, S2, V2X(max_neighbours=2, radius=25.0))
-    rounds = 4 if damping == 0 else 60
-    track = GaussianBeliefPropagation(LINEAR, rounds=rounds, damping=damping)(recording, range(5))
-    assert track.covariance is not None
-    x, cov = dense(recording, LINEAR)
-    assert track.x[0, 0] == pytest.approx(x, abs=1e-9)
-    assert track.covariance[0, 0] == pytest.approx(cov, abs=1e-9)
-    short = GaussianBeliefPropagation(LINEAR, rounds=3, damping=damping)(recording, [0])
-    assert np.abs(short.x[0, 0, 0] - x[0]).max() > 1e-6
-
-
-def test_on_loops_means_are_exact_and_gbp_is_too_sure(crossing: Fleet) -> None:
-    """Independent check: lstsq of the first step, where no vehicle has a past."""
-    recording = observe(crossing.between(0, 2), S2, V2X(max_neighbours=4))
-    x, cov = dense(recording, LINEAR)
-    gbp = GaussianBeliefPropagation(LINEAR, rounds=800)(recording, range(8))
-    assert gbp.covariance is not None
-    assert gbp.x[0, 0] == pytest.approx(x, abs=1e-9)
-    exact = np.trace(cov, axis1=1, axis2=2)
-    claimed = np.trace(gbp.covariance[0, 0], axis1=1, axis2=2)
-    assert (claimed < exact + 1e-12).all()
-    assert claimed.mean() < 0.9 * exact.mean()
 
 
 @pytest.fixture(scope="module")
@@ -116,9 +71,6 @@ def test_bad_settings_and_egos_are_named(crossing: Fleet) -> None:
     with refused("observers"):
         CentralFilter()(observe(crossing, S2, observers=[0, 3]), [0])
     for method, bad in (
-        (GaussianBeliefPropagation, {"rounds": 0}),
-        (GaussianBeliefPropagation, {"damping": 1.0}),
-        (GaussianBeliefPropagation, {"rounds": 1.5}),
         (BatchSmoother, {"exact_steps": -1}),
         (BatchSmoother, {"settle": 0.0}),
         (Message, {"name": "x", "numbers": -1}),

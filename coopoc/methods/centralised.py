@@ -65,12 +65,12 @@ class CentralFilter(Checked):
             for run in tqdm(range(0, runs, together), desc=self.name, unit="run", delay=2.0):
                 some = slice(run, run + together)
                 x[some], cov[some] = run_filter(*of_runs(measured, pairs, assumed, some))
-            return Answer(x, cov, None, notes)
+            return Answer(x, cov, True, notes)
 
         relative = check_recording(recording).relative[0]
         alone = np.isnan(relative[:, 0]) & np.isfinite(relative[:, 1])
         notes = (CENTRE, BEARINGS) if 2 * alone.sum() > len(alone) else (CENTRE,)
-        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve, central=True)
+        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve)
 
 
 def share_covariance(measured: Measured, pairs: Pairs, assumed: Assumed) -> bool:
@@ -143,6 +143,6 @@ class BatchSmoother:
                     x[run], cov[run], small = smooth(x[run], factors, steps, self.settle, bar.update)
                     lost += not small
             note = (f"{lost} of {len(x)} runs did not settle within {self.settle:g} m",) if lost else ()
-            return Answer(x, cov, 0, (NOT_CAUSAL, CENTRE, *note))
+            return Answer(x, cov, False, (NOT_CAUSAL, CENTRE, *note))
 
-        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve, central=True)
+        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve)
