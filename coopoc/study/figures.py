@@ -267,5 +267,4 @@ def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> 
     axes.plot(list(points), list(map(_mean, points.values())), **options)
     if bands:
         ends = [point.low for point in bands.values()], [point.high for point in bands.values()]
-        name = "_" + str(options["label"]).lstrip("_")
-        axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0, label=name)
+        axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0)
