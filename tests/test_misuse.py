@@ -17,7 +17,6 @@ from coopoc.errors import shown
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import fix_innovations
 from coopoc.formats import load_graph, read_g2o, read_pyfg
-from coopoc.study.merge import merge
 from coopoc.study.publish import views
 from coopoc.study.reference import Reference
 from coopoc.study.report import report
@@ -446,7 +445,7 @@ def test_paths_that_no_file_system_holds_are_refused(tmp_path: Path, path: Any) 
     learned = pytest.importorskip("coopoc.learned")
     checkpoint = learned.Checkpoint(learned.NoiseParameters(), {})
     reads = (co.read_graph, co.load_fleet, co.load_recording, co.read_log, co.Results.load, learned.load, views)
-    others = (lambda p: learned.save(p, checkpoint), lambda p: merge([p], tmp_path), lambda p: report([p], tmp_path))
+    others = (lambda p: learned.save(p, checkpoint), lambda p: report([p], tmp_path))
     for call in (*reads, learned.load_method, Reference.load, *others):
         with pytest.raises(co.InputError):
             call(path)
