@@ -258,6 +258,3 @@ def test_a_report_of_a_log_shows_its_paths_and_no_settings_of_simulated_noise(fo
     assert_allclose(drawn[: end - begin, 1], expected)
     assert np.isnan(drawn[end - begin, 1])
     assert drawn[end - begin + 1, 0] == log.recording.t[again]
-    texts = re.findall(r"<title>(KF: RT-LE .*?)</title>", page)
-    mean = results.interval("rt_le_m", method="kalman", max_neighbours=2)
-    assert f"KF: RT-LE {mean.mean:.3g} m [{mean.low:.3g}, {mean.high:.3g}]; Neighbours K 2" in texts
