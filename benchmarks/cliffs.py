@@ -33,7 +33,6 @@ GAPS = (
     "ci",
     "split-ci",
     "central-filter",
-    "batch-smoother",
 )
 """Methods that are tried with missing fixes and with vehicles that come and go."""
 NOISE = co.Sensors.paper_scenario2()

@@ -20,7 +20,7 @@ STILL = NoiseModel("fitted", S2, (1e-6, 1e-6, 1e-6))
 KNOWN = {"nominal": "nominal", "identity": "identity", "fitted": NoiseModel("fitted", S2, (0.3, 0.2, 0.01))}
 METHODS = {
     "central-filter": CentralFilter,
-    "batch-smoother": lambda known: BatchSmoother(known, exact_steps=12, settle=1e-9),
+    "batch-smoother": BatchSmoother,
 }
 CHANNELS = {
     "plain": V2X(max_neighbours=3),

@@ -386,7 +386,6 @@ def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
     swept(PROBLEM.constrain, {"kind": "range", "nodes": ("a", "b"), "lower": 1.0, "upper": 9.0})
     window = {"recording": RECORDING, "step": 2, "ego": 0, "length": 2, "run": 0, "noise": None}
     swept(co.Problem.from_window, window)
-    swept(co.Problem.from_steps, {"steps": [], "sensors": SENSORS, "names": None})
     named = {"name": "misused", "arity": 1, "components": ("coordinate",), "frame": "world", "linear": False}
     swept(lambda **given: optimize.measurement(**given), {**named, "constants": 0})
 

@@ -9,8 +9,6 @@ from conftest import textbook
 from logs import NOISE, drive
 
 import coopoc as co
-from coopoc.kernels.fleets.graph import Assumed, Pairs
-from coopoc.kernels.fleets.smoother import RunFactors, descended
 from coopoc.methods.catalogue import METHODS
 
 STEPS = 15
@@ -124,18 +122,6 @@ def test_the_smoother_descends_where_whole_steps_lead_away() -> None:
     settled = co.BatchSmoother("nominal")(recording, [0]).x
     error = np.linalg.norm(settled[:, :, 0] - fleet.position[:, 0], axis=-1)
     assert error.max() < 3.0 * np.abs(recording.gnss[:, :, 0] - fleet.position[:, 0]).max()
-
-
-def test_a_step_of_the_smoother_that_raises_the_cost_is_halved() -> None:
-    """Closed form, one fix at 0: at -1.01 the cost is 2 % above that at 1, and half of the way is -0.005."""
-    one, no = np.ones((1, 1, 3)), np.zeros(0, dtype=np.int64)
-    pairs = Pairs(no, no, no, no, np.zeros(2, dtype=np.int64), np.ones((1, 0), dtype=bool))
-    still, assumed = 0.0 * one, Assumed(one, one, np.ones(3), 0.0, False)
-    there = one[..., 0] > 0
-    factors = RunFactors(there, no, pairs, np.empty((0, 8)), assumed, one, still, still, still)
-    x, whole = descended(one, -1.01 * one, factors)
-    assert not whole
-    np.testing.assert_allclose(x, -0.005 * one, atol=1e-15)
 
 
 def errors_of(names: str, words: str, drives: Iterable[tuple[co.Fleet, co.Recording]]) -> dict[str, float]:

@@ -63,7 +63,7 @@ def fleet_track(
     robust: bool,
     recording: Recording,
     egos: Vehicles,
-    solve: Callable[[Measured, Pairs, Assumed], Answer],
+    solve: Callable[[Measured, Pairs, Assumed, NoiseModel], Answer],
 ) -> Track:
     """Track of the egos from the whole fleet's estimates.
 
@@ -86,7 +86,7 @@ def fleet_track(
     model = resolve(noise_model, recording)
     met = exchange(recording)
     measured, pairs, assumed = kernel_arguments(recording, met, model, robust)
-    answer = solve(measured, pairs, assumed)
+    answer = solve(measured, pairs, assumed, model)
     shape = (recording.runs, len(recording.t), len(columns))
     x = answer.x.reshape(recording.gnss.shape).take(columns, axis=2)
     cov = answer.covariance.reshape(*recording.gnss.shape[:3], 9).take(columns, axis=2)

@@ -1,1 +1,1 @@
-"""Whole fleets: filters and smoothers."""
+"""Whole fleets: filters."""

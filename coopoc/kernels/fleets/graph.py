@@ -149,30 +149,6 @@ def begin_at_fix(x: Floats, cov: Floats, run: int, t: int, n: int, measured: Mea
         x[3 * n + c], cov[9 * n + 4 * c] = measured.gnss[run, t, n, c], r[c]
 
 
-@part
-def advance(run: int, t: int, x: Floats, own: Floats, measured: Measured, assumed: Assumed) -> None:
-    """Positions x[t] (3 N) m and covariances own (9 N) m^2 of each vehicle from its own sensors; NaN m if inactive."""
-    for n in range(measured.active.shape[2]):
-        if not measured.active[run, t, n]:
-            store(x[t], n, (math.nan, math.nan, math.nan))
-        elif t > 0 and measured.active[run, t - 1, n]:
-            store(x[t], n, load(x[t - 1], n, VECTOR))
-            correct(x[t], own, run, t, n, measured, assumed)
-        else:
-            begin_at_fix(x[t], own, run, t, n, measured, assumed)
-
-
-@compiled
-def own_filters(measured: Measured, assumed: Assumed) -> Floats:
-    """Positions (R, T, 3 N) m of each vehicle's own filter, NaN where inactive."""
-    runs, steps, vehicles = measured.active.shape
-    x, own = np.empty((runs, steps, 3 * vehicles)), np.zeros(9 * vehicles)
-    for run in range(runs):
-        for t in range(steps):
-            advance(run, t, x[run], own, measured, assumed)
-    return x
-
-
 @compiled
 def measurement(vector: Vector, measured: Measurement, std: Floats, min_range: float, linear: bool) -> Information:
     """Information J^T J and information vector J^T r of one relative measurement at `vector`.
