@@ -7,18 +7,16 @@ a start from which to refine.
 
 from __future__ import annotations
 
-import importlib
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import lru_cache
 
 import numpy as np
-from scipy.sparse import csc_matrix
 from tqdm import tqdm
 
 from ...arrays import Floats
-from ...errors import InputError, require
+from ...errors import InputError, require, said
 from ...short_repr import short_repr
 from ..algebra.cholesky import cholesky_of
 from ..model.problem import Problem
@@ -31,11 +29,7 @@ LARGEST = 60
 """Constrained rows up to which `shor` takes seconds at most; from some 30 rows on `staircase` is the faster one."""
 TIGHT = 1e-6
 """Gap of a tight relaxation, as a share of the cost (at least of 1)."""
-SOLVER = {
-    **dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), 1e-9),
-    **dict.fromkeys(("verbose", "presolve_enable", "chordal_decomposition_enable"), False),
-    "max_threads": 1,
-}
+SOLVER = {**dict.fromkeys(("tol_gap_abs", "tol_gap_rel", "tol_feas"), 1e-9), "max_threads": 1}
 """Settings of Clarabel."""
 START = 2
 """Columns beyond d at a random start: with none to spare the first steps end in local minima."""
@@ -90,7 +84,7 @@ class Relaxation:
 
 
 def shor(problem: Problem, refine: bool = True) -> Relaxation:
-    """Shor's semidefinite relaxation by Clarabel, rounded and refined.
+    """Shor's semidefinite relaxation by CVXPY and Clarabel, rounded and refined.
 
     minimise 1/2 <C, Z> over Z >= 0 with Z_BB = I on Stiefel blocks, tr Z_BB = 1 on spheres. For scalar weights Z has
     d + m rows with m ranges, and the same value as with the d m + 1 rows of [1; vec s][1; vec s]^T. Tight (rank d) in
@@ -102,7 +96,7 @@ def shor(problem: Problem, refine: bool = True) -> Relaxation:
         refine: follow by `solve` from the rounded point.
 
     Raises:
-        InputError: as `quadratic`, or more than LARGEST constrained rows. MissingLibraryError: Clarabel.
+        InputError: as `quadratic`, or more than LARGEST constrained rows. MissingLibraryError: CVXPY.
 
     >>> problem = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [4, 0, 0]], std=1.0)
     >>> relaxed = shor(problem.add("range", ("a", "b"), 6.0, std=1.0))
@@ -125,37 +119,31 @@ def shor(problem: Problem, refine: bool = True) -> Relaxation:
 def semidefinite(
     stiefel: tuple[int, int], sphere: tuple[int, int]
 ) -> Callable[[Floats], tuple[Floats, Floats, Floats]]:
-    """Solver of max 1/2 tr L over block-diagonal L with C - L >= 0, the dual of min 1/2 <C, Z>, built once per shape.
+    """Solver of min 1/2 <C, Z>, whose dual is max 1/2 tr L over block-diagonal L with C - L >= 0, built once per shape.
 
-    Clarabel solves min q'x, A x + s = b, s in a cone; a new C is a new b. It takes C (bound, bound) and returns the
-    multipliers of Stiefel blocks (n, k, k) and of spheres (m,), and Z.
+    It takes C (bound, bound) and returns the multipliers of Stiefel blocks (n, k, k) and of spheres (m,), and Z.
     """
-    require("clarabel", "a convex relaxation")
-    clarabel = importlib.import_module("clarabel")
-    (n, k), (m, q) = stiefel, sphere
-    size, pairs = n * k + m * q, k * (k + 1) // 2
-    (j, i), (high, low) = np.tril_indices(size), np.tril_indices(k)  # upper triangles, column by column
-    entry = np.zeros((size, size), dtype=np.int64)
-    entry[i, j] = np.arange(len(i))
-    first = k * np.arange(n)[:, None]
-    row = np.concatenate([entry[first + low, first + high].ravel(), entry.diagonal()[n * k :]])
-    column = np.concatenate([np.arange(n * pairs), n * pairs + np.repeat(np.arange(m), q)])
-    stretch = np.where(i == j, 1.0, np.sqrt(2.0))
-    A = csc_matrix((stretch[row], (row, column)), shape=(len(i), n * pairs + m))
-    goal = np.concatenate([np.tile((low == high).astype(float), n), np.ones(m)])
-    settings, cone = clarabel.DefaultSettings(), clarabel.PSDTriangleConeT(size)
-    for name, value in SOLVER.items():
-        setattr(settings, name, value)
-    solver = clarabel.DefaultSolver(csc_matrix((len(goal),) * 2), -goal, A, np.zeros(len(i)), [cone], settings)
+    require("cvxpy", "a convex relaxation")
+    import cvxpy
 
-    def run(C: Floats) -> tuple[Floats, Floats, Floats]:
-        scale = max(float(np.trace(C)) / size, 1e-300)
-        solver.update(b=stretch * C[i, j] / scale)
-        answer = solver.solve()
-        values, block, Z = scale * np.array(answer.x), np.zeros((n, k, k)), np.zeros((size, size))
-        Z[i, j] = Z[j, i] = np.array(answer.z) / stretch
-        block[:, low, high] = block[:, high, low] = values[: n * pairs].reshape(n, pairs)
-        return block, values[n * pairs :], Z
+    (n, k), (m, q) = stiefel, sphere
+    size = n * k + m * q
+    Z, C = cvxpy.Variable((size, size), PSD=True), cvxpy.Parameter((size, size), symmetric=True)
+    spans = [slice(k * i, k * i + k) for i in range(n)], [slice(n * k + q * j, n * k + q * j + q) for j in range(m)]
+    turns = [Z[at, at] == np.eye(k) for at in spans[0]]
+    units = [cvxpy.trace(Z[at, at]) == 1 for at in spans[1]]
+    programme = cvxpy.Problem(cvxpy.Minimize(cvxpy.trace(C @ Z)), [*turns, *units])
+
+    def run(matrix: Floats) -> tuple[Floats, Floats, Floats]:
+        scale = max(float(np.trace(matrix)) / size, 1e-300)
+        C.value = (matrix + matrix.T) / (2.0 * scale)
+        try:
+            programme.solve(solver=cvxpy.CLARABEL, **SOLVER)
+        except cvxpy.SolverError as error:
+            hint = "Use staircase(problem): the same relaxation by low-rank factors."
+            raise InputError("problem", said(error), "must be one that Clarabel solves", hint) from None
+        block = -scale * np.array([each.dual_value for each in turns]).reshape(n, k, k)
+        return (block + block.swapaxes(1, 2)) / 2, -scale * np.array([each.dual_value for each in units]), Z.value
 
     return run
 
