@@ -6,11 +6,8 @@ import numpy as np
 import pytest
 from conftest import refused
 
-from coopoc import V2X, Fleet, JointFilter, Kalman, Ledger, Sensors, break_even, load_fleet, observe
+from coopoc import V2X, Fleet, JointFilter, Kalman, Ledger, Sensors, break_even, observe
 from coopoc.evaluate.ledger import of_track, of_training
-from coopoc.learned import load as load_weights
-from coopoc.learned.federation.history import card_ledger
-from coopoc.learned.recipes import WEIGHTS
 from coopoc.methods.centralised import CentralFilter
 from coopoc.world.v2x import NO_MESSAGE
 
@@ -50,20 +47,6 @@ def test_break_even_of_the_papers_training() -> None:
         break_even(drive, drive)
     with refused("seconds"):
         break_even(once, once)
-
-
-def test_the_card_of_a_training_names_the_bytes_it_moved() -> None:
-    """By hand: 20 rounds of 12 numbers down, 12 and a loss up; drives of six numbers a step, and weights back once."""
-    drives = load_fleet("town10-clients")
-    fed, pooled = (load_weights(WEIGHTS / f"{name}.safetensors").card for name in ("fedkalmannet", "okf"))
-    account, count = card_ledger(fed, drives), len(fed["clients"])
-    rounds, size = len(fed["history"]) - 1, 4 * fed["parameters"]
-    assert account.of("training")[0].tolist() == [rounds * size] * count + [rounds * (size + 4) * count]
-    assert account.of("training", way="broadcast")[0].tolist() == [rounds * (size + 4)] * count + [rounds * size]
-    raw = card_ledger(pooled, drives)
-    up = 24 * drives.present.sum(axis=0)
-    assert raw.of("training", way="broadcast")[0].tolist() == [*up, 4 * pooled["parameters"]]
-    assert raw.per_vehicle("training") == pytest.approx(up.mean() + 4 * pooled["parameters"])
 
 
 def test_a_ledger_refuses_what_does_not_fit() -> None:
