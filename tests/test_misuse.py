@@ -201,9 +201,9 @@ def solo(x0: Any, interval: Any, history: Any, **step: Any) -> Any:
     return co.Kalman("identity").start(x0, interval=interval, history=history).step(**step)
 
 
-def joint(gnss: Any, velocity: Any, dt: Any, fix_age: Any, **neighbour: Any) -> Any:
-    stream = co.StarStream(co.JointFilter("identity"), [0.0, 0.0, 0.0])
-    return stream.step(gnss, velocity, dt, fix_age, [co.RelativeMeasurement(**neighbour)])
+def star(gnss: Any, velocity: Any, dt: Any, fix_age: Any, **neighbour: Any) -> Any:
+    stream = co.StarStream(co.CooperativeFilter(co.NoiseModel.nominal(SENSORS)), [0.0, 0.0, 0.0])
+    return stream.step(gnss, velocity, dt, fix_age, [co.RelativeMeasurement(gnss=gnss, velocity=velocity, **neighbour)])
 
 
 def least_squares(nodes: Any, z: Any, std: Any, x0: Any) -> Any:
@@ -213,6 +213,7 @@ def least_squares(nodes: Any, z: Any, std: Any, x0: Any) -> Any:
 FOLLOWED: dict[str, Any] = {"recording": SEEN, "egos": [0, 1]}
 MEASURED: dict[str, Any] = {"gnss": [0.0, 0.0, 0.0], "velocity": [9.0, 0.0, 0.0]}
 MESSAGE: dict[str, Any] = {"id": "b", "relative": [9.0, 0.7, 1.57], "age": 0.1, **MEASURED}
+MESSAGE |= {"variance": [1.0, 1.0, 1.0], "odometer": [0.0, 1.0, 2.0]}
 BOUND: dict[str, Any] = {"fleet": TOWN, "sensors": NOISE, "v2x": CHANNEL}
 PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     **{
@@ -262,11 +263,8 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "pose_start": (co.pose_start, {"recording": BODY, "seconds": 3.0, "gate": 5.0}),
     "OwnMeasurement": (own, {**MEASURED, "yaw_rate": 0.7, "heading": 0.7, "gate": 5.0}),
     "LandmarkMeasurement": (co.LandmarkMeasurement, {"relative": [9.0, 0.7, 1.57], "place": [1.0, 2.0, 3.0]}),
-    "RelativeMeasurement": (
-        co.RelativeMeasurement,
-        {**MESSAGE, "variance": [1.0, 1.0, 1.0], "odometer": [0.0, 1.0, 2.0]},
-    ),
-    "StarStream": (joint, {**MESSAGE, "dt": 0.1, "fix_age": 0.0}),
+    "RelativeMeasurement": (co.RelativeMeasurement, MESSAGE),
+    "StarStream": (star, {**MESSAGE, "dt": 0.1, "fix_age": 0.0}),
     "Message": (co.Message, {"name": "m", "numbers": 6, "rounds": 1, "per_neighbour": 0}),
     "Loss": (co.Loss, {"name": "huber", "scale": 1.0}),
     "Problem": (
