@@ -63,29 +63,16 @@ class CentralFilter(Checked):
 
         def solve(measured: Measured, pairs: Pairs, assumed: Assumed, _: NoiseModel) -> Answer:
             from ..kernels.fleets.central import run_filter
-            from ..kernels.fleets.graph import of_runs
 
-            runs = len(measured.active)
-            together = runs if share_covariance(measured, pairs, assumed) else 1
             x, cov = np.empty(measured.gnss.shape), np.empty((*measured.gnss.shape, 3))
-            for run in tqdm(range(0, runs, together), desc=self.name, unit="run", delay=2.0):
-                some = slice(run, run + together)
-                x[some], cov[some] = run_filter(*of_runs(measured, pairs, assumed, some))
+            for run in tqdm(range(len(x)), desc=self.name, unit="run", delay=2.0):
+                x[run], cov[run] = run_filter(measured, pairs, assumed, run)
             return Answer(x, cov, True, notes)
 
         relative = check_recording(recording).relative[0]
         alone = np.isnan(relative[:, 0]) & np.isfinite(relative[:, 1])
         notes = (CENTRE, BEARINGS) if 2 * alone.sum() > len(alone) else (CENTRE,)
         return fleet_track(self, self.noise_model, self.robust, recording, egos, solve)
-
-
-def share_covariance(measured: Measured, pairs: Pairs, assumed: Assumed) -> bool:
-    """Whether the covariance is the same in all runs: unit noise, and the same measurements and messages."""
-    constant = len(assumed.std) == 0 and len(assumed.process) == len(assumed.fix) == 1
-    if not constant or (measured.relative[..., 0] < 0).any() or (measured.relative[..., 1:] == 0).any():
-        return False
-    alike = (measured.active, pairs.alive, np.isnan(measured.gnss))
-    return all(bool((each == each[:1]).all()) for each in alike)
 
 
 @dataclass(frozen=True, eq=False)

@@ -86,17 +86,6 @@ class Assumed(NamedTuple):
     robust: bool
 
 
-def of_runs(measured: Measured, pairs: Pairs, assumed: Assumed, runs: slice) -> tuple[Measured, Pairs, Assumed]:
-    """The arguments of some runs."""
-    gnss, velocity, relative = (values[runs] for values in (measured.gnss, measured.velocity, measured.relative))
-    process, fix = (values[runs] if len(values) > 1 else values for values in (assumed.process, assumed.fix))
-    return (
-        Measured(gnss, velocity, relative, measured.active[runs], measured.dt),
-        pairs._replace(alive=pairs.alive[runs]),
-        assumed._replace(process=process, fix=fix),
-    )
-
-
 @storage
 def at(values: Floats, run: int, t: int, n: int) -> Floats:
     """Row (3,) of an array that is broadcastable to (R, T, N, 3)."""
