@@ -96,13 +96,11 @@ def streams() -> None:
         filter = solo.start(history=1.0)
         for k in range(3):
             filter.step([0.9 * k, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, fix_age=0.1 * (k == 2))
-    for star in (co.JointFilter(noise), co.CooperativeFilter(noise)):
-        ego, other = co.StarStream(star), co.StarStream(star)
-        for k in range(3):
-            other.step([12.0 + k, 1.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)
-            heard = other.broadcast if star.name == "cooperative-filter" else ([12.0, 1.0, 0.0], [9.0, 0.0, 0.0])
-            seen = co.RelativeMeasurement("b", [11.8, 0.1, 1.57], *heard, age=0.1)
-            ego.step([0.9 * k, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[seen])
+    ego, other = (co.StarStream(co.CooperativeFilter(noise)) for _ in range(2))
+    for k in range(3):
+        other.step([12.0 + k, 1.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)
+        seen = co.RelativeMeasurement("b", [11.8, 0.1, 1.57], *other.broadcast, age=0.1)
+        ego.step([0.9 * k, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[seen])
     robot = co.PoseFilter("solo", assumed=BODY).start(dt=0.1)
     mast = co.LandmarkMeasurement([20.1, 0.4, 1.4], place=[18.0, 9.0, 3.0])
     robot.step(co.OwnMeasurement([9.0, 0.0, 0.0], 0.02, gnss=[0.4, 0.2, 0.0], heading=0.1), [mast])

@@ -19,7 +19,7 @@ from coopoc.methods.catalogue import METHODS
 ROUNDS, STEPS, NEIGHBOURS = 5, 20, 6
 FLEETS = {60: (6, 10), 500: (20, 25)}
 """Vehicles: rows and columns of the grid that they drive in."""
-METHOD_NAMES = ("joint", "gbp")
+METHOD_NAMES = ("joint",)
 SPACING = 14.0
 """m"""
 IMPORT_SECONDS = 0.3

@@ -27,11 +27,9 @@ JOBS = {
     "msmv-r": "nominal",
     "split-ci": "nominal",
     "ci": "nominal",
-    "gbp": "nominal",
     "central-filter": "nominal",
     "central-filter, identity": "identity",
     "joint, gates": "nominal",
-    "gbp, gates": "nominal",
     "central-filter, gates": "nominal",
 }
 """What is assumed of the noise, by the method's name and a word more; only those with gates have any."""

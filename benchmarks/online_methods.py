@@ -26,7 +26,6 @@ ORDER = (
     "split-ci",
     "msmv-r",
     "joint",
-    "gbp",
     "central-filter",
     "batch-smoother",
 )

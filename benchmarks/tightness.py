@@ -15,8 +15,7 @@ from tqdm import tqdm
 
 from coopoc.arrays import Floats
 from coopoc.optimize import Problem, Status, pose, solve
-from coopoc.optimize.convex.qcqp import quadratic
-from coopoc.optimize.convex.relaxation import Relaxation, shor, staircase
+from coopoc.optimize.convex.relaxation import Relaxation, shor
 
 Case = Callable[[int], Problem]
 
@@ -151,7 +150,7 @@ def row(name: str, case: Case, seeds: int) -> str:
     alone = 0
     for seed in range(seeds):
         problem = case(seed)
-        relaxed.append((shor if quadratic(problem).bound <= 32 else staircase)(problem))
+        relaxed.append(shor(problem))
         best = relaxed[-1].solution
         assert best is not None
         blind = problem if problem.x0 is not None and not problem.fixed else replace(problem, x0=_blind(problem, seed))

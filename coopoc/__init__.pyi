@@ -26,7 +26,6 @@ from .methods.centralised import BatchSmoother as BatchSmoother
 from .methods.centralised import CentralFilter as CentralFilter
 from .methods.cooperative_filter import CooperativeFilter as CooperativeFilter
 from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
-from .methods.decentralised import GaussianBeliefPropagation as GaussianBeliefPropagation
 from .methods.joint_filter import JointFilter as JointFilter
 from .methods.kalman import GNSS as GNSS
 from .methods.kalman import AdaptiveKalman as AdaptiveKalman

@@ -1,4 +1,4 @@
-"""The command line: coopoc run, merge, compare, table, report, list, and the commands of installed distributions."""
+"""The command line: coopoc run, compare, table, report, list, and the commands of installed distributions."""
 
 from __future__ import annotations
 
@@ -103,28 +103,6 @@ def run(
     return int(results.failed > 0)
 
 
-def merge(
-    folders: Folders,
-    /,
-    out: Folder,
-) -> int:
-    """Merge folders of one study that several machines have computed.
-
-    Example: coopoc merge a/neighbours b/neighbours --out runs
-
-    Args:
-        folders: folders of one study, run with the same settings.
-        out: folder of all studies; this one is written to FOLDER/NAME.
-    """
-    from .study.merge import merge as merge_folders
-
-    found = merge_folders(folders, out)
-    print(found.folder)
-    counts = f"{found.finished} of {found.cells} cells finished, {found.failed} failed, {found.missing} to compute"
-    print(f"coopoc: {counts}. Tables: coopoc run {found.folder.name} --out {out}, with the same --set", file=sys.stderr)
-    return int(found.failed > 0)
-
-
 def compare(
     run_a: Annotated[Positional[Path], arg(metavar="RUN_A")],
     run_b: Annotated[Positional[Path], arg(metavar="RUN_B")],
@@ -222,7 +200,6 @@ def list_names() -> None:
 
 OWN: Mapping[str, Command] = {
     "run": run,
-    "merge": merge,
     "compare": compare,
     "table": table,
     "report": report,

@@ -155,33 +155,6 @@ def interpolate(t: Floats, values: Floats, grid: Floats, max_gap: float) -> Floa
     return out
 
 
-def smooth(position: Floats, dt: float, cutoff: float) -> Floats:
-    """Penalised least squares on jerk: argmin_s |s - x|^2 + lam |D^3 s|^2, with lam = (2 pi cutoff dt)^-6.
-
-    The gain is 1 below the cutoff, 1/2 at it, and falls with the sixth power of the frequency above it; straight
-    lines and constant accelerations pass unchanged, and so do both ends of the drive.
-
-    Args:
-        position: (T, ...) m, no NaN.
-        dt: s.
-        cutoff: Hz.
-
-    Source: Whittaker, Proc. Edinburgh Math. Soc. 41, 1923; Eilers, Analytical Chemistry 75(14), 2003.
-
-    >>> bool(np.allclose(smooth(np.arange(9.0) ** 2, 0.1, 0.5), np.arange(9.0) ** 2))
-    True
-    """
-    from scipy.linalg import solveh_banded
-    from scipy.sparse import diags_array, eye_array
-
-    steps = len(position)
-    if steps < 4:
-        return np.array(position, dtype=float)
-    third = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(steps - 3, steps))
-    normal = (eye_array(steps) + (2 * np.pi * cutoff * dt) ** -6 * (third.T @ third)).todia()
-    return np.asarray(solveh_banded(normal.data[:2:-1], np.reshape(position, (steps, -1)))).reshape(np.shape(position))
-
-
 def check_scale(t: Floats, position: Floats, by_vehicle: Sequence[Ints], file: str) -> None:
     """InputError where rows look like degrees or milliseconds, or move too fast for metres and seconds.
 

@@ -1,9 +1,8 @@
-"""Public measurements by name: download, resume, verify by SHA-256, and keep in the user's cache."""
+"""Public measurements by name: download, verify by SHA-256, and keep in the user's cache."""
 
 from __future__ import annotations
 
 import os
-import sys
 import tomllib
 import urllib.request
 import zipfile
@@ -13,16 +12,15 @@ from functools import cache, partial
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any
-from urllib.error import HTTPError
-from urllib.parse import quote, urljoin, urlsplit
+from urllib.parse import quote, urljoin
 
 from coopoc.arrays import number
 from coopoc.errors import InputError, said, suggestion, unknown
 
 TIMEOUT = 20.0
 """s without a byte, after which a server is given up."""
-ATTEMPTS, CHUNK = 3, 1 << 16
-"""Connections for a file, each of which goes on where the last one broke; bytes that are read at once."""
+CHUNK = 1 << 16
+"""Bytes that are read at once."""
 ARCHIVE = "archive.zip"
 """Name of an archive in the folder of its data set, until it is unpacked."""
 
@@ -202,11 +200,11 @@ def _address(entry: Entry, file: str, mirror: str) -> str:
 def _deliver(
     address: str, out: str, _: Any, /, *, entry: Entry, to: Path, size: int, digest: str, timeout: float
 ) -> None:
-    """Download to a file beside its last place, which an interrupted call leaves to the next one; then hand it over.
+    """Download to a temporary file, which pooch moves to its last place.
 
     Args:
         address: asked for.
-        out: path that takes the whole file.
+        out: path that takes the file.
         entry: that it belongs to.
         to: its last place.
         size: bytes of the file; of an archive the most that it may have.
@@ -216,62 +214,22 @@ def _deliver(
     Raises:
         InputError: what went wrong, and how to fetch it by hand.
     """
-    part, reason = to.with_name(f"{to.name}.part"), ""
-    for _attempt in range(ATTEMPTS):
-        if _size(part) >= size and _digest(part) != digest:
-            part.unlink()
-        begun = max(_size(part), 0)
-        try:
-            if begun != size:
-                _continue(address, part, size, timeout)
-            break
-        except _Broken as error:
-            reason = said(error)
-            if _size(part) <= begun:
-                raise _by_hand(entry, address, to, reason) from None
-        except HTTPError as error:
-            if error.code != 416 or not begun:  # the server has no byte after those that are here
-                raise _by_hand(entry, address, to, said(error)) from None
-            part.unlink()
-            reason = said(error)
-        except TimeoutError:
-            raise _by_hand(entry, address, to, f"sent nothing for {timeout:g} s") from None
-        except (OSError, HTTPException, ValueError) as error:
-            late = isinstance(getattr(error, "reason", None), TimeoutError)
-            reason = f"sent nothing for {timeout:g} s" if late else said(error)
-            raise _by_hand(entry, address, to, reason) from None
-    else:
-        raise _by_hand(entry, address, to, reason)
-    if digest and (given := _digest(part)) != digest:
-        part.unlink()
-        raise _other_bytes(f"{entry.name}: {to.name}", given, digest, f"It was removed: {address} serves another file.")
-    part.replace(out)
-
-
-class _Broken(Exception):
-    """A connection that closed early."""
-
-
-def _continue(address: str, part: Path, size: int, timeout: float) -> None:
-    """Append to a file what it lacks; from its beginning if the server does not take a Range."""
     from tqdm import tqdm
 
-    begun = max(_size(part), 0)
-    request = urllib.request.Request(address, headers={"Range": f"bytes={begun}-"} if begun else {})
-    with urllib.request.urlopen(request, timeout=timeout) as answer:
-        if begun and answer.status != 206:
-            print(f"coopoc: {urlsplit(address).netloc} cannot resume: {part.stem} starts again", file=sys.stderr)
-            begun = 0
-        length = answer.headers.get("Content-Length")
-        end = None if length is None else begun + int(length)
-        bar = tqdm(desc=part.stem, total=end, initial=begun, unit="B", unit_scale=True, delay=2.0)
-        with bar, part.open("ab" if begun else "wb") as file:
+    try:
+        bar = tqdm(desc=to.name, total=size, unit="B", unit_scale=True, delay=2.0)
+        with urllib.request.urlopen(address, timeout=timeout) as answer, Path(out).open("wb") as file, bar:
             while file.tell() <= size and (chunk := answer.read(CHUNK)):
                 file.write(chunk)
                 bar.update(len(chunk))
-            got = file.tell()
-    if end is not None and got < min(end, size):
-        raise _Broken(f"closed the connection after {got} of {end} bytes")
+            got, rest = file.tell(), getattr(answer, "length", 0) or 0
+        if got <= size and rest:
+            raise ConnectionError(f"closed the connection after {got} of {got + rest} bytes")
+    except (OSError, HTTPException, ValueError) as error:
+        late = isinstance(getattr(error, "reason", error), TimeoutError)
+        raise _by_hand(entry, address, to, f"sent nothing for {timeout:g} s" if late else said(error)) from None
+    if digest and (given := _digest(Path(out))) != digest:
+        raise _other_bytes(f"{entry.name}: {to.name}", given, digest, f"It was removed: {address} serves another file.")
 
 
 def _unpack(entry: Entry, folder: Path) -> None:

@@ -232,7 +232,6 @@ ORACLES = {
     "msmv-r": "msmv",
     "ci": "covariance_intersection",
     "split-ci": "covariance_intersection",
-    "gbp": "gbp",
     "central-filter": "central_filter",
     "batch-smoother": "batch_smoother",
 }

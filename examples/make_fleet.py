@@ -21,8 +21,10 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from scipy.linalg import solveh_banded
+from scipy.sparse import diags_array, eye_array
 
-from coopoc.data.assemble import backward_difference, smooth
+from coopoc.data.assemble import backward_difference
 from coopoc.data.fleet_files import read_fcd, write_table
 from coopoc.data.registry import DATASETS, card
 from coopoc.errors import InputError, MissingLibraryError, unknown
@@ -158,6 +160,30 @@ def facts(fleet: Fleet) -> dict[str, Any]:
 
 def _rounded(**values: Any) -> dict[str, float]:
     return {name: round(float(value), 3) + 0.0 for name, value in values.items()}
+
+
+def smooth(position: np.ndarray, dt: float, cutoff: float) -> np.ndarray:
+    """Penalised least squares on jerk: argmin_s |s - x|^2 + lam |D^3 s|^2, with lam = (2 pi cutoff dt)^-6.
+
+    The gain is 1 below the cutoff, 1/2 at it, and falls with the sixth power of the frequency above it; straight
+    lines and constant accelerations pass unchanged, and so do both ends of the drive.
+
+    Args:
+        position: (T, ...) m, no NaN.
+        dt: s.
+        cutoff: Hz.
+
+    Source: Whittaker, Proc. Edinburgh Math. Soc. 41, 1923; Eilers, Analytical Chemistry 75(14), 2003.
+
+    >>> bool(np.allclose(smooth(np.arange(9.0) ** 2, 0.1, 0.5), np.arange(9.0) ** 2))
+    True
+    """
+    steps = len(position)
+    if steps < 4:
+        return np.array(position, dtype=float)
+    third = diags_array([-1.0, 3.0, -3.0, 1.0], offsets=[0, 1, 2, 3], shape=(steps - 3, steps))
+    normal = (eye_array(steps) + (2 * np.pi * cutoff * dt) ** -6 * (third.T @ third)).todia()
+    return np.asarray(solveh_banded(normal.data[:2:-1], np.reshape(position, (steps, -1)))).reshape(np.shape(position))
 
 
 def simulate(recipe: Recipe, map_folder: Path) -> Fleet:

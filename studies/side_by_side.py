@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from coopoc.study.numbers import present, ran, rms
 from coopoc.study.style import look
 
-from . import lineup, paths, scene
+from . import lineup, scene
 from .views import TableView, of, table
 
 if TYPE_CHECKING:
@@ -38,6 +37,8 @@ CONDITIONS: dict[str, Any] = {
 """Other conditions: the channel (None: its own), outliers (as `Outliers.named` has them), spoofing, time-correlated
 errors, errors of the heading, the start."""
 
+HELD = "GNSS repeats a fix until the next one, and errs by the way driven since."
+
 
 def _changed(results: Results) -> str:
     kept, idle = results.settings, scene.idle(results)
@@ -57,7 +58,7 @@ def _table(text: str, value: str, **options: Any) -> TableView:
         texts = (text, *([_changed(results)] if _changed(results) else []))
         real = scene.measured(str(results.settings["data"]))
         if real is not None and value in ("rt_le_m", "innovation_m"):
-            texts += (paths.HELD * ("gnss" in methods), f"The log: {'; '.join(real.notes[1:])}.")
+            texts += (HELD * ("gnss" in methods), f"The log: {'; '.join(real.notes[1:])}.")
         rows, where = ("method", "noise_model"), {"method": methods}
         return table(*texts, value=value, rows=rows, where=where, **{"decimals": 2, **options})(results)
 
@@ -109,11 +110,7 @@ STUDY = lineup.study(
         "nis": _table("NIS of the fixes per dimension against K (1 is consistent).", "nis", best=None, intervals=False),
         "bytes": _table("Received per ego [B/s].", "bytes_per_second", best=None, intervals=False, decimals=0),
     },
-    figures={
-        "rt_le": _figure,
-        "errors": partial(paths.views, over_time=True),
-        "paths": partial(paths.views, over_time=False),
-    },
+    figures={"rt_le": _figure},
     findings=_findings,
     limitations=(
         "The bound applies to the rms over runs; it assumes an ideal channel, whatever that of the cells, and that "

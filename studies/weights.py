@@ -184,8 +184,6 @@ def train(
     start: Start = "gnss",
     reading: VelocityReading = "axis",
     aggregate: Annotated[str | None, arg(metavar="RULE")] = None,
-    flower: bool = False,
-    rounds: Annotated[int | None, arg(metavar="N")] = None,
     worse: bool = False,
 ) -> None:
     """Train a recipe, or find its checkpoint if the same was trained before.
@@ -202,26 +200,13 @@ def train(
         start: start of the filter in training, the first fix or the true position.
         reading: reading of "10 % of the velocity", per axis or of the speed on every axis.
         aggregate: aggregation rule, a name or FILE.py:NAME, instead of the recipe's.
-        flower: train on Flower's simulation engine, every client in its own process.
-        rounds: number of rounds on Flower, instead of the recipe's.
         worse: save also what errs more than a tenth more than a Kalman filter with fitted noise.
     """
     find("coopoc.recipes", recipe)  # before torch is loaded
     from coopoc.learned.train import train_all
 
-    clients = drives(data)
-    if flower:
-        from coopoc.learned import flower as engine
-
-        config = {"recipe": recipe, "seed": seed, "start": start, "reading": reading}
-        changes = {"rounds": rounds, "aggregate": aggregate}
-        changes = {name: value for name, value in changes.items() if value is not None}
-        made = engine.train(engine.job_of(config | changes), clients, out)
-    elif rounds is not None:
-        raise InputError("rounds", rounds, "goes with --flower", "Add --flower, or leave the recipe's rounds.")
-    else:
-        chosen: Any = {"seeds": [seed], "starts": [start], "readings": [reading], "recipes": [recipe]}
-        made = train_all(clients, out, **chosen, aggregate=aggregate, worst=math.inf if worse else WORST)
+    chosen: Any = {"seeds": [seed], "starts": [start], "readings": [reading], "recipes": [recipe]}
+    made = train_all(drives(data), out, **chosen, aggregate=aggregate, worst=math.inf if worse else WORST)
     for label, checkpoint in made.items():
         print(f"{out / label}.safetensors  {checkpoint.card['parameters']} parameters")
     print(f"coopoc: {len(made)} checkpoints are in {out}", file=sys.stderr)

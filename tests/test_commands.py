@@ -126,7 +126,7 @@ def test_a_command_parses_and_names_what_exists(
         assert status == (2 if absent else 0), told
         for pair in (text for group in given.get("set", ()) for text in group):
             assert len(assignments([pair])) == 1
-    for study in given.get("folders", ()) if name in ("report", "merge") else ():
+    for study in given.get("folders", ()) if name == "report" else ():
         assert (folder / f"{Path(study).name}.py").exists() or plugins.find("coopoc.studies", Path(study).name)
     if name == "data get" and given:
         assert set(given["names"]) <= {*public()}

@@ -34,16 +34,14 @@ class Server:
     Args:
         files: path -> bytes.
         cut: bytes of the body after which it closes each connection, None for never.
-        ranges: whether it takes a Range.
         silent: "" or the part, "all" or "body", that it never sends.
-        asked: path and Range of each request.
+        asked: path of each request.
     """
 
     files: dict[str, bytes]
     cut: int | None = None
-    ranges: bool = True
     silent: str = ""
-    asked: list[tuple[str, str]] = field(default_factory=list)
+    asked: list[str] = field(default_factory=list)
     address: str = ""
 
 
@@ -53,8 +51,7 @@ def server() -> Iterator[Server]:
 
     class Handler(http.server.BaseHTTPRequestHandler):
         def do_GET(self) -> None:
-            wanted = self.headers.get("Range", "")
-            state.asked.append((self.path, wanted))
+            state.asked.append(self.path)
             if state.silent == "all":
                 over.wait()
                 return
@@ -62,15 +59,10 @@ def server() -> Iterator[Server]:
             if data is None:
                 self.send_error(404)
                 return
-            begin = int(wanted.removeprefix("bytes=").rstrip("-")) if wanted and state.ranges else 0
-            if begin >= len(data):
-                self.send_error(416)
-                return
-            body = data[begin:]
-            self.send_response(206 if begin else 200)
-            self.send_header("Content-Length", str(len(body)))
+            self.send_response(200)
+            self.send_header("Content-Length", str(len(data)))
             self.end_headers()
-            self.wfile.write(body[: state.cut])
+            self.wfile.write(data[: state.cut])
             self.wfile.flush()
             if state.silent == "body":
                 over.wait()
@@ -118,7 +110,7 @@ def test_a_data_set_is_fetched_once_and_read_by_name(
     assert path == cache / "car" / "drive.csv"
     assert path.read_bytes() == car
     assert co.fetch("car") == co.fetch("car", offline=True) == path
-    assert server.asked == [("/drive.csv", "")]
+    assert server.asked == ["/drive.csv"]
     assert capsys.readouterr().err == ""
     assert digest(co.read_log("car").recording) == digest(co.read_log(path).recording)
     assert len(co.load_recording("car?until=100").t) == 100
@@ -150,33 +142,14 @@ def test_one_wrong_byte_is_refused_with_both_hashes_and_removed(car: bytes, cach
     assert co.fetch("car").read_bytes() == car
 
 
-def test_a_connection_that_breaks_is_resumed_within_a_call_and_by_the_next_one(
+def test_a_connection_that_breaks_is_named_and_the_next_call_begins_anew(
     car: bytes, cache: Path, server: Server
 ) -> None:
     server.cut = len(car) // 5
-    with refused(f"closed the connection after {3 * server.cut} of {len(car)} bytes.*save it as {cache}/car/drive.csv"):
+    with refused(f"closed the connection after {server.cut} of {len(car)} bytes.*save it as {cache}/car/drive.csv"):
         co.fetch("car")
-    assert [wanted for _, wanted in server.asked] == ["", f"bytes={server.cut}-", f"bytes={2 * server.cut}-"]
-    assert not (cache / "car" / "drive.csv").exists()
+    assert [path.name for path in (cache / "car").iterdir()] == [".lock"]
     server.cut = None
-    assert co.fetch("car").read_bytes() == car
-    assert server.asked[3:] == [("/drive.csv", f"bytes={3 * (len(car) // 5)}-")]
-
-
-def test_a_server_without_ranges_starts_again_and_is_told(
-    car: bytes, cache: Path, server: Server, capsys: pytest.CaptureFixture[str]
-) -> None:
-    server.cut, server.ranges = len(car) // 2, False
-    with refused("closed the connection after"):
-        co.fetch("car")
-    assert "cannot resume: drive.csv starts again" in capsys.readouterr().err
-    server.cut = None
-    assert co.fetch("car").read_bytes() == car
-
-
-def test_a_part_of_other_bytes_is_not_taken_for_the_file(car: bytes, cache: Path, server: Server) -> None:
-    (cache / "car").mkdir(parents=True)
-    (cache / "car" / "drive.csv.part").write_bytes(bytes(len(car)))
     assert co.fetch("car").read_bytes() == car
     (cache / "car" / "drive.csv").write_bytes(b"damaged since")
     assert co.fetch("car").read_bytes() == car
@@ -263,10 +236,6 @@ def test_files_of_an_archive_are_verified_one_by_one(
     server.files["/all.zip"] = b"no archive"
     with refused("not a zip file"):
         co.fetch("zipped")
-    (cache / "zipped" / "archive.zip.part").write_bytes(server.files["/all.zip"])  # whole, and not handed over
-    with refused("not a zip file"):
-        co.fetch("zipped")
-    assert server.asked[-2:] == [("/all.zip", "bytes=10-"), ("/all.zip", "")]
     serve({"else/b.csv": b"t,x\n"})
     assert co.fetch("zipped") == cache / "zipped" / "set"
     assert sorted(path.name for path in (cache / "zipped").rglob("*") if path.is_file()) == [".lock", "a.csv", "b.csv"]

@@ -14,7 +14,6 @@ from scipy import signal
 from scipy.spatial import cKDTree
 
 from coopoc import load_fleet
-from coopoc.data.assemble import smooth
 from coopoc.data.registry import bundled, card, convert
 from coopoc.errors import MissingLibraryError
 from coopoc.study.run import run_study
@@ -25,7 +24,7 @@ assert spec is not None
 assert spec.loader is not None
 script = sys.modules["make_fleet"] = importlib.util.module_from_spec(spec)
 spec.loader.exec_module(script)
-Recipe, make = script.Recipe, script.make
+Recipe, make, smooth = script.Recipe, script.make, script.smooth
 TINY = Recipe("tiny", "Town10HD.xodr", vehicles=6, steps=(60, 60, 60, 60, 60, 40), seed=1, platoon=2)
 with_sumo = pytest.mark.skipif(
     importlib.util.find_spec("sumo") is None, reason="eclipse-sumo is not installed: pip install 'coopoc[sumo]'"

@@ -8,24 +8,19 @@ from conftest import crossing_fleet, textbook
 from filterpy.kalman import KalmanFilter
 from oracles.batch_smoother import batch_smoother
 from oracles.central_filter import central_filter
-from oracles.gbp import gbp
 from oracles.whole_fleet import Drive
 
 from coopoc import V2X, BatchSmoother, CentralFilter, Fleet, NoiseModel, Recording, Sensors, observe
-from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.methods.noise_model import resolve
 from coopoc.world.exchange import exchange
 from coopoc.world.links import to_vector
-from coopoc.world.v2x import NO_MESSAGE
 
 S2 = Sensors.paper_scenario2()
 STILL = NoiseModel("fitted", S2, (1e-6, 1e-6, 1e-6))
 KNOWN = {"nominal": "nominal", "identity": "identity", "fitted": NoiseModel("fitted", S2, (0.3, 0.2, 0.01))}
 METHODS = {
-    "gbp": GaussianBeliefPropagation,
-    "gbp-damped": lambda known: GaussianBeliefPropagation(known, rounds=2, damping=0.4),
     "central-filter": CentralFilter,
-    "batch-smoother": lambda known: BatchSmoother(known, exact_steps=12, settle=1e-9),
+    "batch-smoother": BatchSmoother,
 }
 CHANNELS = {
     "plain": V2X(max_neighbours=3),
@@ -62,22 +57,18 @@ def compare(name: str, known: str | NoiseModel, recording: Recording, near: floa
     method, noise = textbook(METHODS[name](model)), resolve(model, recording)
     there = np.isfinite(recording.velocity).all(axis=(0, 1, 3)) & np.isfinite(recording.gnss[:, 0]).all(axis=(0, 2))
     egos = np.flatnonzero(there).tolist()
-    track, central = method(recording, egos), name in ("central-filter", "batch-smoother")
-    met = exchange(recording, NO_MESSAGE if central else method.message)
-    arrival, rounds = (met.either, len(recording.ids)) if central else (met.both, method.message.rounds)
+    track, met = method(recording, egos), exchange(recording)
     assert track.covariance is not None
     for run in range(recording.runs):
-        one = Drive(recording, noise, met, arrival[run], run)
-        if name.startswith("gbp"):
-            x, P = gbp(one, method.rounds, method.damping)
-        elif name == "central-filter":
+        one = Drive(recording, noise, met, met.arrival[run], run)
+        if name == "central-filter":
             x, P = central_filter(one)
         else:
             x, P = batch_smoother(one, np.where(one.active[..., None], central_filter(one)[0], np.nan))
         for e, n in enumerate(egos):
             wanted, cov = x[:, n], P[:, n]
-            if name != "batch-smoother" and (arrival > met.step).any():
-                wanted, cov = one.late(x, P, n, rounds)
+            if name != "batch-smoother" and (met.arrival > met.step).any():
+                wanted, cov = one.late(x, P, n, len(recording.ids))
             np.testing.assert_allclose(track.x[run, :, e], wanted, atol=near, rtol=0)
             size = np.abs(cov).max(axis=(-1, -2), keepdims=True)
             assert (np.abs(track.covariance[run, :, e] - cov) / size).max() < 10 * near
@@ -97,7 +88,7 @@ def test_noise_models(name: str, known: str, crossing: Fleet) -> None:
 
 
 @pytest.mark.parametrize("runs", [1, 5])
-@pytest.mark.parametrize("name", ["gbp", "central-filter", "batch-smoother"])
+@pytest.mark.parametrize("name", METHODS)
 def test_batches_of_runs_without_gaps(name: str, runs: int, crossing: Fleet) -> None:
     compare(name, "nominal", drive(crossing, "plain", runs=runs, gaps=False, absences=False))
 

@@ -18,19 +18,16 @@ import pytest
 import torch
 from conftest import refused, winding
 from logs import long, observed, write
-from shell import ran
 from torch import Tensor
 
-from coopoc import Fleet, load_fleet
-from coopoc.cli import main
+from coopoc import Fleet
 from coopoc.data.fleet_files import write_table
 from coopoc.errors import MissingLibraryError
 from coopoc.learned import clients, federate, load
 from coopoc.learned.federation.history import Federation
-from coopoc.learned.flower import client_app, rounds, train
+from coopoc.learned.flower import client_app, rounds
 from coopoc.learned.flower.job import job_of
 from coopoc.learned.flower.server import Row, federation
-from coopoc.learned.flower.simulation import partition
 from coopoc.learned.recipes import RECIPES, Job, Setting, job_clients, untrained
 
 if TYPE_CHECKING:
@@ -66,8 +63,8 @@ def honest(job: Job, fleet: Fleet, vehicle: int) -> Node:
     """The ClientApp of one vehicle, as Flower calls it."""
     from flwr.app import Context, RecordDict
 
-    app = client_app(partial(partition, fleet=fleet, job=job))
-    return lambda message: app(message, Context(1, vehicle, {"partition-id": vehicle}, RecordDict(), {}))
+    app = client_app(lambda context: (job_clients(job, fleet)[vehicle], job))
+    return lambda message: app(message, Context(1, vehicle, {}, RecordDict(), {}))
 
 
 def room(nodes: Mapping[int, Node]) -> Any:
@@ -332,41 +329,10 @@ def test_the_apps_configuration_is_the_recipe() -> None:
         job_of({"recipe": "fedkalmannet", "change": "round=3"})
 
 
-@pytest.mark.parametrize("options", [["okf", "--flower"], ["fedkalmannet", "--rounds", "3"]])
-def test_train_says_what_goes_with_flower(options: list[str], capsys: pytest.CaptureFixture[str]) -> None:
-    with pytest.raises(SystemExit) as ended:
-        main(["train", *options])
-    assert ended.value.code == 2
-    assert "lower" in capsys.readouterr().err
-
-
 def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setitem(sys.modules, "flwr.app", None)
     with pytest.raises(MissingLibraryError, match=r"pip install .*\[flower\]'"):
         client_app()
-
-
-@pytest.mark.slow
-def test_train_with_flower_is_train(tmp_path: Path) -> None:
-    """`coopoc train fedkalmannet --flower` writes the weights of `federate`; a second call finds them."""
-    fleet = drives(2, steps=1010)
-    write_table(fleet, tmp_path / "two.csv")
-    command = ["train", "fedkalmannet", "--flower", "--rounds", "2", "--data", "two.csv", "--out", "weights"]
-    done = ran([Path(sys.executable).with_name("coopoc"), *command], cwd=tmp_path, timeout=300)
-    assert done.returncode == 0, done.stderr
-    (path,) = (tmp_path / "weights").iterdir()
-    card, found, stamp = load(path).card, load(path).history, path.stat().st_mtime_ns
-    job = job_of({"recipe": "fedkalmannet", "rounds": 2})
-    expected = in_process(job, fleet)
-    assert found is not None
-    torch.testing.assert_close(found, torch.stack([row.weights for row in expected.history]), rtol=0, atol=1e-5)
-    assert str(card["engine"]).startswith("flower 1.")
-    assert (card["clients"], card["fleet"]) == (["a", "b"], "two")
-    assert "train fedkalmannet" in done.stderr
-    assert not [word for word in ("INFO", "WARN", "ERROR", "Warning") if word in done.stderr]
-    again = train(job, load_fleet(tmp_path / "two.csv"), tmp_path / "weights")
-    assert path.stat().st_mtime_ns == stamp
-    assert list(again) == [path.stem]
 
 
 def test_a_new_run_keeps_the_names_of_the_nodes(tmp_path: Path) -> None:

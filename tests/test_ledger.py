@@ -6,13 +6,9 @@ import numpy as np
 import pytest
 from conftest import refused
 
-from coopoc import V2X, Fleet, JointFilter, Kalman, Ledger, Sensors, break_even, load_fleet, observe
+from coopoc import V2X, Fleet, JointFilter, Kalman, Ledger, Sensors, break_even, observe
 from coopoc.evaluate.ledger import of_track, of_training
-from coopoc.learned import load as load_weights
-from coopoc.learned.federation.history import card_ledger
-from coopoc.learned.recipes import WEIGHTS
 from coopoc.methods.centralised import CentralFilter
-from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.world.v2x import NO_MESSAGE
 
 S2 = Sensors.paper_scenario2()
@@ -20,9 +16,9 @@ ROOT = Path(__file__).parent.parent
 
 
 def test_the_ledger_of_a_track_is_its_bytes(crossing: Fleet) -> None:
-    """Payload by hand: 32 of 132 B; of beliefs 3 x 36 + 20 of 3 x 136 + 20 B; to a centre as many as were measured."""
+    """Payload by hand: 32 of 132 B; to a centre as many as were measured."""
     seen, plain = (observe(crossing, S2, V2X(3, overhead=size), runs=2) for size in (100, 0))
-    for method in (JointFilter(), GaussianBeliefPropagation(rounds=3), CentralFilter()):
+    for method in (JointFilter(), CentralFilter()):
         track, bare = method(seen, [1, 4]), method(plain, [1, 4])
         account = of_track(track, seen, method.message)
         assert account.names == ("c1", "c4")
@@ -51,20 +47,6 @@ def test_break_even_of_the_papers_training() -> None:
         break_even(drive, drive)
     with refused("seconds"):
         break_even(once, once)
-
-
-def test_the_card_of_a_training_names_the_bytes_it_moved() -> None:
-    """By hand: 20 rounds of 12 numbers down, 12 and a loss up; drives of six numbers a step, and weights back once."""
-    drives = load_fleet("town10-clients")
-    fed, pooled = (load_weights(WEIGHTS / f"{name}.safetensors").card for name in ("fedkalmannet", "okf"))
-    account, count = card_ledger(fed, drives), len(fed["clients"])
-    rounds, size = len(fed["history"]) - 1, 4 * fed["parameters"]
-    assert account.of("training")[0].tolist() == [rounds * size] * count + [rounds * (size + 4) * count]
-    assert account.of("training", way="broadcast")[0].tolist() == [rounds * (size + 4)] * count + [rounds * size]
-    raw = card_ledger(pooled, drives)
-    up = 24 * drives.present.sum(axis=0)
-    assert raw.of("training", way="broadcast")[0].tolist() == [*up, 4 * pooled["parameters"]]
-    assert raw.per_vehicle("training") == pytest.approx(up.mean() + 4 * pooled["parameters"])
 
 
 def test_a_ledger_refuses_what_does_not_fit() -> None:

@@ -17,7 +17,6 @@ from coopoc.errors import shown
 from coopoc.evaluate.ledger import of_track
 from coopoc.evaluate.metrics import fix_innovations
 from coopoc.formats import load_graph, read_g2o, read_pyfg
-from coopoc.study.merge import merge
 from coopoc.study.publish import views
 from coopoc.study.reference import Reference
 from coopoc.study.report import report
@@ -90,7 +89,6 @@ METHODS: tuple[Any, ...] = (
     co.BatchSmoother,
     co.CentralFilter,
     co.CovarianceIntersection,
-    co.GaussianBeliefPropagation,
 )
 FLEET = co.load_fleet("town10").between(0, 6).select([0, 1, 2, 3])
 SENSORS, CHANNEL = co.Sensors.paper_scenario2(), co.V2X(max_neighbours=3)
@@ -203,9 +201,9 @@ def solo(x0: Any, interval: Any, history: Any, **step: Any) -> Any:
     return co.Kalman("identity").start(x0, interval=interval, history=history).step(**step)
 
 
-def joint(gnss: Any, velocity: Any, dt: Any, fix_age: Any, **neighbour: Any) -> Any:
-    stream = co.StarStream(co.JointFilter("identity"), [0.0, 0.0, 0.0])
-    return stream.step(gnss, velocity, dt, fix_age, [co.RelativeMeasurement(**neighbour)])
+def star(gnss: Any, velocity: Any, dt: Any, fix_age: Any, **neighbour: Any) -> Any:
+    stream = co.StarStream(co.CooperativeFilter(co.NoiseModel.nominal(SENSORS)), [0.0, 0.0, 0.0])
+    return stream.step(gnss, velocity, dt, fix_age, [co.RelativeMeasurement(gnss=gnss, velocity=velocity, **neighbour)])
 
 
 def least_squares(nodes: Any, z: Any, std: Any, x0: Any) -> Any:
@@ -215,6 +213,7 @@ def least_squares(nodes: Any, z: Any, std: Any, x0: Any) -> Any:
 FOLLOWED: dict[str, Any] = {"recording": SEEN, "egos": [0, 1]}
 MEASURED: dict[str, Any] = {"gnss": [0.0, 0.0, 0.0], "velocity": [9.0, 0.0, 0.0]}
 MESSAGE: dict[str, Any] = {"id": "b", "relative": [9.0, 0.7, 1.57], "age": 0.1, **MEASURED}
+MESSAGE |= {"variance": [1.0, 1.0, 1.0], "odometer": [0.0, 1.0, 2.0]}
 BOUND: dict[str, Any] = {"fleet": TOWN, "sensors": NOISE, "v2x": CHANNEL}
 PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     **{
@@ -264,12 +263,9 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "pose_start": (co.pose_start, {"recording": BODY, "seconds": 3.0, "gate": 5.0}),
     "OwnMeasurement": (own, {**MEASURED, "yaw_rate": 0.7, "heading": 0.7, "gate": 5.0}),
     "LandmarkMeasurement": (co.LandmarkMeasurement, {"relative": [9.0, 0.7, 1.57], "place": [1.0, 2.0, 3.0]}),
-    "RelativeMeasurement": (
-        co.RelativeMeasurement,
-        {**MESSAGE, "variance": [1.0, 1.0, 1.0], "odometer": [0.0, 1.0, 2.0]},
-    ),
-    "StarStream": (joint, {**MESSAGE, "dt": 0.1, "fix_age": 0.0}),
-    "Message": (co.Message, {"name": "m", "numbers": 6, "rounds": 1, "opening": 0, "per_neighbour": 0}),
+    "RelativeMeasurement": (co.RelativeMeasurement, MESSAGE),
+    "StarStream": (star, {**MESSAGE, "dt": 0.1, "fix_age": 0.0}),
+    "Message": (co.Message, {"name": "m", "numbers": 6, "rounds": 1, "per_neighbour": 0}),
     "Loss": (co.Loss, {"name": "huber", "scale": 1.0}),
     "Problem": (
         least_squares,
@@ -388,7 +384,6 @@ def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
     swept(PROBLEM.constrain, {"kind": "range", "nodes": ("a", "b"), "lower": 1.0, "upper": 9.0})
     window = {"recording": RECORDING, "step": 2, "ego": 0, "length": 2, "run": 0, "noise": None}
     swept(co.Problem.from_window, window)
-    swept(co.Problem.from_steps, {"steps": [], "sensors": SENSORS, "names": None})
     named = {"name": "misused", "arity": 1, "components": ("coordinate",), "frame": "world", "linear": False}
     swept(lambda **given: optimize.measurement(**given), {**named, "constants": 0})
 
@@ -447,7 +442,7 @@ def test_paths_that_no_file_system_holds_are_refused(tmp_path: Path, path: Any) 
     learned = pytest.importorskip("coopoc.learned")
     checkpoint = learned.Checkpoint(learned.NoiseParameters(), {})
     reads = (co.read_graph, co.load_fleet, co.load_recording, co.read_log, co.Results.load, learned.load, views)
-    others = (lambda p: learned.save(p, checkpoint), lambda p: merge([p], tmp_path), lambda p: report([p], tmp_path))
+    others = (lambda p: learned.save(p, checkpoint), lambda p: report([p], tmp_path))
     for call in (*reads, learned.load_method, Reference.load, *others):
         with pytest.raises(co.InputError):
             call(path)

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 from conftest import measured
 from graph_files import write_graph
-from random_graphs import random_graph
 from shell import ran
 
 from coopoc.cli import main
@@ -61,18 +60,6 @@ def test_solve_writes_the_solution(file: Path, capsys: pytest.CaptureFixture[str
     assert found["seconds"] >= found["solve_seconds"] + found["check_seconds"] > found["solve_seconds"]
     assert found["nodes"]["A2"]["position"] == pytest.approx([8.0, 1.0], abs=1e-4)
     assert np.shape(found["nodes"]["A2"]["covariance"]) == (3, 3)
-
-
-def test_a_relaxed_start_ends_when_its_time_is_over(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    """Solved, the relaxation of this graph is tight, and one step confirms its minimum; its first step is far away."""
-    graph = random_graph(0, steps=130, ranges=0, seen=0, landmarks=0, loops=100)
-    write_graph(graph, file := tmp_path / "long.g2o")
-    words = ["solve", str(file), "--start", "relaxed", "--seconds"]
-    status, out, _ = run(capsys, *words, "1e-9")
-    assert (status, json.loads(out)["start"]) == (0, "relaxed")
-    assert json.loads(out)["iterations"] > 2
-    status, _, err = run(capsys, *words, "0")
-    assert (status, "seconds = 0.0: must be positive" in err) == (2, True)
 
 
 def test_a_wrong_line_and_an_unknown_backend_are_named(file: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -67,7 +67,6 @@ def natives(d: int) -> dict[str, tuple]:
         "relative pose log": ("relative_pose_log", BETWEEN, {"cov": spd(3 * d - 3, 0.01)}, True),
         "relative pose chordal": ("relative_pose_chordal", BETWEEN, {"std": even}, True),
         "pose": ("pose", [("a",), ("c",)], {"cov": apart(spd(d), turn)}, False),
-        "pose chordal": ("pose_chordal", [("a",), ("c",)], {"cov": spd(d + d * d)}, True),
     }
     if d == 2:
         found["bearing"] = ("bearing", SEEN, {"std": 0.1}, True)

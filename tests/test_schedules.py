@@ -7,12 +7,10 @@ import pytest
 from conftest import refused
 
 from coopoc import LKFSA, V2X, Fleet, JointFilter, Recording, Sensors, observe
-from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox, within_cap
-from coopoc.world.v2x import FIX_AND_VELOCITY, Message, Schedule
+from coopoc.world.v2x import FIX_AND_VELOCITY, Schedule
 
 S2 = Sensors.paper_scenario2()
-WORD = Message("word", 25, unicast=True)
 
 
 def still(places: list[list[float]], steps: int = 20) -> Fleet:
@@ -114,19 +112,6 @@ def test_schedules_are_paired_and_repeat(crossing: Fleet) -> None:
     for method in (JointFilter(), LKFSA()):
         track = method(observe(crossing, S2, channel, runs=2), [2])
         assert np.array_equal(track.received_bytes[:, 0], few.received_bytes)
-
-
-def test_an_exchange_takes_turns() -> None:
-    """b is in contact with a, whom it sees, and with c, who sees it: one message a step, in turns."""
-    fleet = still([[0, 0, 0], [9, 0, 0], [20, 0, 0]], 100)
-    channel = V2X(max_neighbours=1, bytes_per_second=1000.0, schedule="round robin")
-    met = exchange(observe(fleet, S2, channel), WORD)
-    near = met.at_second[0, met.second == 1] >= 0
-    far = met.at_first[0, met.second == 2] >= 0
-    assert near[:9].all()
-    assert far[:9].all()  # the bucket is full at first
-    assert (near[10:] ^ far[10:]).all()
-    assert (near[10:-1] ^ near[11:]).all()
 
 
 def test_an_unknown_schedule_is_named() -> None:

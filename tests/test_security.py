@@ -15,10 +15,8 @@ from conftest import refused
 from test_report import Page
 
 from coopoc.cli import main
-from coopoc.errors import InputError
 from coopoc.study import store
 from coopoc.study.compare import compare
-from coopoc.study.merge import merge
 from coopoc.study.publish import tables, views
 from coopoc.study.reference import Reference
 from coopoc.study.report import report
@@ -97,7 +95,7 @@ def test_weights_run_no_code_that_their_card_names(evil: tuple[Path, Path], tmp_
     assert not mark.exists()
 
 
-@pytest.mark.parametrize("words", [["reference"], ["report"], ["table"], ["compare"], ["merge", "--out", "all"]])
+@pytest.mark.parametrize("words", [["reference"], ["report"], ["table"], ["compare"]])
 def test_results_run_no_code_that_their_manifest_names(
     folder: Path, evil: tuple[Path, Path], words: list[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -139,11 +137,7 @@ def test_a_study_of_ones_own_is_named_again_for_its_reference(
 @pytest.mark.parametrize("name", ["../out", "/tmp/coopoc-out", "a/b", "..", "", "CON", "a\nb", 3, None])
 def test_a_manifest_cannot_name_another_folder(folder: Path, tmp_path: Path, name: object) -> None:
     edited(folder / "manifest.json", lambda m: {**m, "study": name})
-    before = files(tmp_path)
     with refused(r"must be a file name|holds a damaged manifest\.json \(study is a"):
-        merge([folder], tmp_path / "deep" / "all")
-    assert files(tmp_path) == before
-    with pytest.raises(InputError):
         Results.load(folder)
 
 
@@ -159,17 +153,7 @@ def test_a_manifest_cannot_name_other_files(folder: Path, tmp_path: Path, name: 
     edited(folder / "manifest.json", lambda m: {**m, "cells": {name: next(iter(m["cells"].values()))}})
     (folder.parent / "x.parquet").write_bytes(content)
     with refused("is no name of a cell"):
-        merge([folder], tmp_path / "all")
-    assert not (tmp_path / "all").exists()
-
-
-def test_merge_follows_no_link_out_of_its_folder(folder: Path, tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    (tmp_path / "all" / "made").mkdir(parents=True)
-    (tmp_path / "all" / "made" / "cells").symlink_to(tmp_path / "elsewhere")
-    with refused(r"leads out of .* by a symbolic link"):
-        merge([folder], tmp_path / "all")
-    assert not files(tmp_path / "elsewhere")
+        Results.load(folder)
 
 
 def test_a_report_embeds_no_html_of_the_disk_and_escapes_all_text(folder: Path) -> None:

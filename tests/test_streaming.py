@@ -9,20 +9,18 @@ from typing import Any
 
 import numpy as np
 import pytest
-from conftest import crossing_fleet, holed, measured, refused, textbook
+from conftest import holed, measured, refused, textbook
 from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from shell import ran
 
-from coopoc import V2X, CooperativeFilter, Fleet, JointFilter, Kalman, NoiseModel, Sensors, StarStream, observe
-from coopoc.arrays import Bools, Floats
+from coopoc import V2X, CooperativeFilter, Fleet, Kalman, NoiseModel, Sensors, StarStream, observe
+from coopoc.arrays import Floats
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF
 from coopoc.methods.cooperative_filter import AS_STATED
 from coopoc.methods.kalman import AdaptiveKalman
 from coopoc.methods.motion_history import MotionHistory
 from coopoc.methods.star_stream import RelativeMeasurement
-from coopoc.world.inbox import Inbox, inbox
-from coopoc.world.links import Links
 from coopoc.world.recording import Recording
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -40,8 +38,7 @@ SOLO: dict[str, tuple[Any, Callable[..., Any]]] = {
 STARTS: dict[str, Callable[..., Any]] = {
     **{name: start for name, (_, start) in SOLO.items()},
     "net": lambda x0=None: LearnedGain(NET).start(x0),
-    "joint": partial(StarStream, textbook(JointFilter(NoiseModel.nominal(S2)))),
-    "edge": partial(StarStream, textbook(JointFilter(FITTED, exact=False))),
+    "star": partial(StarStream, CooperativeFilter(FITTED, AS_STATED)),
 }
 U, Z = np.array([9.0, -2.0, 0.1]), np.array([30.0, 20.0, 1.0])
 
@@ -76,61 +73,6 @@ def test_a_net_step_by_step_is_its_track(known: bool, crossing: Fleet) -> None:
         assert_allclose(x, track.x[0, t, 0], atol=1e-5)
 
 
-def relative_measurements(recording: Recording, box: Inbox, run: int, t: int) -> list[RelativeMeasurement]:
-    """What an ego sees at step t, with the messages that are new to it, from a `Recording` and an `Inbox`."""
-    seen = []
-    for k in range(box.start[t], box.start[t + 1]):
-        link = box.link[k]
-        j, sent = recording.links.neighbour[link], box.newest[run, k]
-        message: dict[str, Any] = {}
-        if box.fresh[run, k]:
-            message = {
-                "gnss": recording.gnss[run, sent, j],
-                "velocity": recording.velocity[run, sent, j],
-                "age": (t - sent) * recording.dt,
-            }
-        seen.append(RelativeMeasurement(recording.ids[j], recording.relative[run, link], **message))
-    return seen
-
-
-def only(kept: Bools, recording: Recording) -> Recording:
-    """The recording with these of its relative measurements."""
-    links = Links(*(part[kept] for part in (recording.links.step, recording.links.observer, recording.links.neighbour)))
-    return replace(recording, links=links, relative=recording.relative[:, kept], arrival=recording.arrival[:, kept])
-
-
-CHANNELS = {
-    "ideal": V2X(max_neighbours=4, radius=25.0),
-    "growing": V2X(max_neighbours=11, radius=200.0),
-    "lossy": V2X(max_neighbours=4, radius=25.0, loss=0.5),
-    "late": V2X(max_neighbours=4, radius=25.0, latency=0.3, rate=2.0, loss=0.3, max_age=0.6),
-    "silent": V2X(max_neighbours=4, radius=25.0, loss=1.0),
-}
-
-
-@pytest.mark.parametrize("channel", CHANNELS)
-@pytest.mark.parametrize(("exact", "robust"), [(True, True), (True, False), (False, False)])
-def test_a_star_step_by_step_is_the_track(exact: bool, robust: bool, channel: str, crossing: Fleet) -> None:
-    """Neighbours come and go, a fifth of the measurements fails, and some are seen without a message; the track comes
-    from the recording's inbox. Where eleven come at once, a stream begins with room for seven."""
-    growing = channel == "growing"
-    recording = observe(crossing_fleet(12, 30) if growing else crossing, S2, CHANNELS[channel], runs=2)
-    kept = recording.links.step >= 20 if growing else np.random.default_rng(8).uniform(size=len(recording.links)) > 0.2
-    recording = only(kept, recording)
-    assert growing or len(set(recording.neighbours(0).tolist())) > 2
-    method = JointFilter("nominal", exact, robust)
-    track, box = method(recording, [0]), inbox(recording, 0, method.message)
-    stream = StarStream(replace(method, noise_model=NoiseModel.nominal(S2)), max_age=recording.v2x.max_age)
-    for t in range(len(recording.t)):
-        seen = relative_measurements(recording, box, 1, t)
-        x, cov = stream.step(recording.gnss[1, t, 0], recording.velocity[1, t, 0], recording.dt, neighbours=seen)
-        assert_allclose(x, track.x[1, t, 0], atol=1e-12)
-        assert_allclose(cov, track.covariance[1, t, 0], atol=1e-12)
-        assert list(stream.neighbours) == [s.id for s in seen]
-        for k, s in enumerate(seen, start=int(box.start[t])):
-            assert_allclose(stream.neighbours[s.id], track.neighbours[1, k], atol=1e-9)
-
-
 def peer(x: Floats, known: NoiseModel) -> Any:
     """filterpy's filter of a position with a velocity as input."""
     found = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
@@ -141,7 +83,7 @@ def peer(x: Floats, known: NoiseModel) -> Any:
 
 @pytest.mark.parametrize(
     ("start", "near"),
-    [(textbook(Kalman(FITTED)).start, 1e-9), (partial(StarStream, textbook(JointFilter(FITTED))), 1e-4)],
+    [(textbook(Kalman(FITTED)).start, 1e-9), (partial(StarStream, CooperativeFilter(FITTED, AS_STATED)), 1e-4)],
 )
 def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(start: Any, near: float) -> None:
     """filterpy gets a late fix moved by, and with the variance of, the motion since, from the sum of all steps. The
@@ -179,7 +121,7 @@ def test_a_long_step_is_two_short_ones(name: str) -> None:
         assert_allclose(once.step(Z, U, 0.1)[0], twice.step(Z, U, 0.1)[0], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["nominal", "adaptive", "joint", "net"])
+@pytest.mark.parametrize("name", ["nominal", "adaptive", "star", "net"])
 def test_nothing_is_known_before_the_first_fix(name: str) -> None:
     stream = STARTS[name]()
     for _ in range(3):
@@ -235,7 +177,7 @@ def test_a_late_fix_is_nearly_used_up() -> None:
         ("fix_age", {"fix_age": 0.7}),
     ],
 )
-@pytest.mark.parametrize("name", ["nominal", "joint", "net"])
+@pytest.mark.parametrize("name", ["nominal", "star", "net"])
 def test_bad_input_is_named_and_forgotten(name: str, field: str, given: dict[str, Any]) -> None:
     one, other = STARTS[name](), STARTS[name]()
     for stream in (one, other):
@@ -269,15 +211,14 @@ def test_bad_starts_are_named() -> None:
         "x0": lambda: Kalman("identity").start([0.0, 0.0]),
         "interval": lambda: Kalman("identity").start(interval=0.0),
         "history": lambda: Kalman("identity").start(history=-1.0),
-        "max_age": lambda: StarStream(JointFilter("identity"), max_age=np.nan),
-        "noise_model": lambda: StarStream(JointFilter("nominal")),
+        "max_age": lambda: StarStream(CooperativeFilter(FITTED), max_age=np.nan),
+        "noise_model": lambda: StarStream(CooperativeFilter("nominal")),
+        "filter": lambda: StarStream(Kalman(FITTED)),  # type: ignore[arg-type]
+        "message": lambda: RelativeMeasurement("b", [9.0, 0.0, 1.57], Z, U),
     }.items():
         with refused(f"^{field} = "):
             make()
-    robust = StarStream(CooperativeFilter(FITTED))
-    assert robust.broadcast is None
-    with refused("Send stream.broadcast"):
-        robust.step(Z, U, 0.1, neighbours=[RelativeMeasurement("b", [9.0, 0.0, 1.57], Z, U)])
+    assert StarStream(CooperativeFilter(FITTED)).broadcast is None
     oracle = Kalman(NoiseModel.oracle(S2, Fleet(("a",), [0, 0.1], np.zeros((2, 1, 3)), np.zeros((2, 1, 3)))))
     with refused(r"noise_model = 'oracle'.*NoiseModel.nominal"):
         oracle.start()
@@ -294,9 +235,11 @@ def test_a_star_from_a_known_place_is_the_kalman_filter(first: Floats | None) ->
 
 
 def test_a_stream_forgets_whom_it_met_long_ago() -> None:
-    stream = StarStream(textbook(JointFilter(FITTED)))
+    stream, other = (StarStream(CooperativeFilter(FITTED)) for _ in range(2))
     for k in range(400):
-        stream.step(Z, U, 0.1, neighbours=[RelativeMeasurement(f"v{k}", [9.0, 0.0, 1.57], Z, U)])
+        other.step(Z, U, 0.1)
+        heard = RelativeMeasurement(f"v{k}", [9.0, 0.0, 1.57], *other.broadcast)  # type: ignore[misc]
+        stream.step(Z, U, 0.1, neighbours=[heard])
     assert len(stream._last) < 60
 
 
@@ -318,11 +261,12 @@ def test_the_replay_runs(log: str) -> None:
 
 def test_a_range_of_zero_is_refused_and_forgotten(crossing: Fleet) -> None:
     """No direction is seen in one place: a filter of a star gave NaN from there on."""
-    stream = StarStream(JointFilter(FITTED))
+    stream, other = (StarStream(CooperativeFilter(FITTED)) for _ in range(2))
     stream.step([0, 0, 0], [1, 0, 0], 0.1)
+    other.step([1, 0, 0], [1, 0, 0], 0.1)
     with refused("the range first and > 0"):
-        stream.step([0, 0, 0], [1, 0, 0], 0.1, [RelativeMeasurement("b", [0.0, 0.1, 1.5], [1, 0, 0], [1, 0, 0])])
-    near = RelativeMeasurement("b", [1e-6, 0.1, 1.5], [1, 0, 0], [1, 0, 0])
+        RelativeMeasurement("b", [0.0, 0.1, 1.5], *other.broadcast)  # type: ignore[misc]
+    near = RelativeMeasurement("b", [1e-6, 0.1, 1.5], *other.broadcast)  # type: ignore[misc]
     x, cov = stream.step([0, 0, 0], [1, 0, 0], 0.1, neighbours=[near])
     assert np.isfinite(x).all()
     assert (np.linalg.eigvalsh(cov) > 0).all()

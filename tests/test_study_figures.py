@@ -2,7 +2,6 @@
 
 import json
 from collections.abc import Callable
-from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -136,11 +135,6 @@ def test_curves_draw_numbers_of_their_selections(results: Results) -> None:
     np.testing.assert_allclose(joint.get_ydata(), expected.to_numpy())
     assert level.get_ydata()[0] == pytest.approx(results.select(GNSS)["rt_le_m"].mean())
     assert figures.curves(results, [panel], [{"method": "okf"}], "c") is None
-
-
-def test_one_run_of_one_ego_shows_its_points_without_an_interval(results: Results) -> None:
-    one = replace(results, frame=results.select(run=0, method="joint"))
-    assert [text for *_, text in figures.sweep(one, "max_neighbours").marks()["points"] if "[" not in text]
 
 
 def from_reference(file: Path) -> Results:

@@ -1,5 +1,6 @@
 """Shards of a study: one folder or several, one after another or all at once; the tables are those of one run."""
 
+import shutil
 import subprocess
 import sys
 from pathlib import Path
@@ -9,11 +10,8 @@ import pytest
 from conftest import refused
 from small_runs import ENV, files, numbers, shown, start
 
-from coopoc import cli
-from coopoc.study import store
 from coopoc.study.compute import part_of
 from coopoc.study.manifest import Manifest, locked
-from coopoc.study.merge import merge
 from coopoc.study.results import Results
 from coopoc.study.run import plan, run_study
 from coopoc.study.study import Cell, Study
@@ -78,71 +76,24 @@ def test_who_else_may_come_in_while_a_shard_is_at_work(study: Study, tmp_path: P
         with refused("in use by another process with shard 2/3"):
             run_study(study, tmp_path, shard="2/3", progress=False)
         assert run_study(study, tmp_path, shard="1/3", progress=False).frame["cell"].nunique() == 3
-        with refused("is in use by another run"):
-            merge([folder], tmp_path)
     with locked(folder, manifest(study)), refused("is in use by another run"):
         run_study(study, tmp_path, shard="1/3", progress=False)
     assert Results.load(folder).pending == 6
 
 
-def test_folders_of_several_machines_merge_to_the_tables_of_one_run(study: Study, tmp_path: Path) -> None:
+def test_files_of_cells_from_several_machines_make_the_tables_of_one_run(study: Study, tmp_path: Path) -> None:
+    """Beside cells of other settings and one that is damaged, which is computed again."""
     run_study(study, tmp_path / "whole", progress=False)
+    run_study(study, tmp_path / "m0", settings={"runs": 2}, shard="1/3", progress=False)
     for index in (1, 2, 3):
         run_study(study, tmp_path / f"m{index}", progress=False, shard=f"{index}/3")
-    folders = [tmp_path / f"m{index}/small" for index in (1, 2, 3)]
-    before = {**files(folders[0]), **files(folders[1]), **files(folders[2])}
-    half = merge(folders[:2], tmp_path / "all")
-    assert (half.folder, half.cells, half.finished, half.missing) == (tmp_path / "all/small", 9, 6, 3)
-    assert cli.merge((folders[2],), tmp_path / "all") == 0
-    run_study(study, tmp_path / "all", progress=False)
-    after = files(tmp_path / "all/small")
-    assert {name: content for name, (_, content) in after.items()} == {name: c for name, (_, c) in before.items()}
+    for index in range(4):
+        shutil.copytree(tmp_path / f"m{index}/small/cells", tmp_path / "all/small/cells", dirs_exist_ok=True)
+    known = files(tmp_path / "m3/small")
+    (tmp_path / "all/small/cells" / next(iter(known))).write_bytes(b"")
+    with pytest.warns(RuntimeWarning, match="is damaged and will be computed again"):
+        run_study(study, tmp_path / "all", progress=False)
     assert shown(tmp_path / "all/small") == shown(tmp_path / "whole/small")
-    assert {**files(folders[0]), **files(folders[1]), **files(folders[2])} == before
-
-
-def test_a_failure_is_merged_unless_the_cell_is_finished_elsewhere(study: Study, tmp_path: Path) -> None:
-    trouble = tmp_path / "trouble"
-    trouble.write_text("raise")
-    changes = {"trouble": str(trouble)}
-    run_study(study, tmp_path / "a", settings=changes, progress=False)
-    first = merge([tmp_path / "a/small"], tmp_path / "all")
-    assert (first.finished, first.failed, first.missing) == (8, 1, 0)
-    trouble.unlink()
-    run_study(study, tmp_path / "b", settings=changes, progress=False)
-    known = next((tmp_path / "a/small/cells").iterdir()).name
-    (tmp_path / "b/small/cells" / known).write_bytes(b"")
-    with pytest.warns(RuntimeWarning, match="damaged"):
-        second = merge([tmp_path / "b/small"], tmp_path / "all")
-    assert (second.finished, second.failed) == (9, 0)
-    assert not list((tmp_path / "all/small/failed").iterdir())
-
-
-def test_what_does_not_belong_together_is_not_merged(study: Study, tmp_path: Path) -> None:
-    run_study(study, tmp_path / "a", progress=False, shard="1/9")
-    run_study(study, tmp_path / "b", settings={"runs": 2}, progress=False, shard="1/9")
-    with refused(r"a/small and .*b/small: differ in runs \(4, 2\), cells \(9 and 9, 0 of them"):
-        merge([tmp_path / "a/small", tmp_path / "b/small"], tmp_path / "all")
-    assert not (tmp_path / "all").exists()
-    with refused(r"holds no manifest\.json"):
-        merge([tmp_path], tmp_path / "all")
-    with refused("must be at least one"):
-        merge([], tmp_path / "all")
-
-
-def test_a_cell_with_two_sets_of_numbers_is_named(study: Study, tmp_path: Path) -> None:
-    for name in "ab":
-        run_study(study, tmp_path / name, progress=False, shard="1/9")
-    cell = part_of(study.cells(), study.shares, "1/9")[0]
-    rows = store.load(tmp_path / "b/small", cell.name).to_pylist()
-    own = {*store.OWN_COLUMNS, *cell.params}
-    merge([tmp_path / "a/small", tmp_path / "b/small"], tmp_path / "same")
-    changed = [{k: v for k, v in row.items() if k not in own} | {"rt_le_m": row["rt_le_m"] + 1e-12} for row in rows]
-    store.save(tmp_path / "b/small", cell, store.to_table(changed), 1.0)
-    with pytest.warns(RuntimeWarning, match=f"cell {cell.name} has other numbers in .*b/small than in .*a/small"):
-        merge([tmp_path / "a/small", tmp_path / "b/small"], tmp_path / "all")
-    kept = store.load(tmp_path / "all/small", cell.name)
-    assert kept.equals(store.load(tmp_path / "a/small", cell.name))
 
 
 @pytest.mark.slow

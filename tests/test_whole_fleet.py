@@ -3,10 +3,9 @@
 from dataclasses import replace
 from typing import Any
 
-import gtsam
 import numpy as np
 import pytest
-from conftest import coming_and_going, refused, standing, textbook
+from conftest import coming_and_going, refused, textbook
 from oracles.whole_fleet import rows
 from scipy import optimize, stats
 from scipy.optimize import least_squares
@@ -17,25 +16,11 @@ from coopoc.evaluate.metrics import nees_inside, rt_le
 from coopoc.kernels.fleets.graph import measurement
 from coopoc.kernels.geometry import components
 from coopoc.methods.centralised import BatchSmoother, CentralFilter
-from coopoc.methods.decentralised import GaussianBeliefPropagation
 from coopoc.world.links import spherical, to_vector, vector_cov, wrap
 from coopoc.world.v2x import Message
 
 S2 = Sensors.paper_scenario2()
 SPEED = replace(S2, velocity_reading="speed")
-LINEAR = NoiseModel("unit", None, process_std=(0.3, 0.4, 0.2), gnss_std=(2.0, 1.0, 3.0))
-"""Relative vectors of unit covariance: all methods are then linear, and numpy.linalg.lstsq says what is right."""
-
-
-def dense(recording: Recording, known: NoiseModel) -> tuple[np.ndarray, np.ndarray]:
-    """Least squares of the first step by numpy.linalg.lstsq: positions (N, 3) and covariances (N, 3, 3)."""
-    now, unit = recording.links.step == 0, np.eye(len(recording.ids))
-    incidence = unit[recording.links.neighbour[now]] - unit[recording.links.observer[now]]
-    rows = np.vstack([np.kron(unit, np.diag(1 / np.array(known.gnss_std))), np.kron(incidence, np.eye(3))])
-    right = np.vstack([recording.gnss[0, 0] / known.gnss_std, to_vector(recording.relative[0, now])])
-    x = np.linalg.lstsq(rows, right.ravel(), rcond=None)[0]
-    cov = np.linalg.inv(rows.T @ rows).reshape(len(unit), 3, len(unit), 3)
-    return x.reshape(-1, 3), np.stack([cov[k, :, k] for k in range(len(unit))])
 
 
 @pytest.mark.parametrize("distance", [0.02, 0.5, 2.5, 11.0])
@@ -52,37 +37,6 @@ def test_the_linearised_measurement_is_the_spherical_measurement(distance: float
     cov = np.linalg.inv(np.reshape(weight, (3, 3)))
     assert cov == pytest.approx(vector_cov(relative, S2.relative_std, S2.min_range), rel=1e-9)
     assert eta == pytest.approx(np.zeros(3), abs=1e-9)
-
-
-CHAIN = standing([[20.0 * i, 3.0 * (i % 2), 0.5 * i] for i in range(5)])
-"""Each sees only the next ones: a tree."""
-
-
-@pytest.mark.parametrize("damping", [0.0, 0.5])
-def test_gbp_on_a_tree_is_the_dense_least_squares(damping: float) -> None:
-    """Independent check: lstsq. Means and covariances, exact after as many rounds as the tree is wide."""
-    recording = observe(CHAIN, S2, V2X(max_neighbours=2, radius=25.0))
-    rounds = 4 if damping == 0 else 60
-    track = GaussianBeliefPropagation(LINEAR, rounds=rounds, damping=damping)(recording, range(5))
-    assert track.covariance is not None
-    x, cov = dense(recording, LINEAR)
-    assert track.x[0, 0] == pytest.approx(x, abs=1e-9)
-    assert track.covariance[0, 0] == pytest.approx(cov, abs=1e-9)
-    short = GaussianBeliefPropagation(LINEAR, rounds=3, damping=damping)(recording, [0])
-    assert np.abs(short.x[0, 0, 0] - x[0]).max() > 1e-6
-
-
-def test_on_loops_means_are_exact_and_gbp_is_too_sure(crossing: Fleet) -> None:
-    """Independent check: lstsq of the first step, where no vehicle has a past."""
-    recording = observe(crossing.between(0, 2), S2, V2X(max_neighbours=4))
-    x, cov = dense(recording, LINEAR)
-    gbp = GaussianBeliefPropagation(LINEAR, rounds=800)(recording, range(8))
-    assert gbp.covariance is not None
-    assert gbp.x[0, 0] == pytest.approx(x, abs=1e-9)
-    exact = np.trace(cov, axis1=1, axis2=2)
-    claimed = np.trace(gbp.covariance[0, 0], axis1=1, axis2=2)
-    assert (claimed < exact + 1e-12).all()
-    assert claimed.mean() < 0.9 * exact.mean()
 
 
 @pytest.fixture(scope="module")
@@ -115,14 +69,7 @@ def test_bad_settings_and_egos_are_named(crossing: Fleet) -> None:
     assert (absent[:, 0] >= np.isnan(recording.velocity[0, :, 2, 0])).all()
     with refused("observers"):
         CentralFilter()(observe(crossing, S2, observers=[0, 3]), [0])
-    for method, bad in (
-        (GaussianBeliefPropagation, {"rounds": 0}),
-        (GaussianBeliefPropagation, {"damping": 1.0}),
-        (GaussianBeliefPropagation, {"rounds": 1.5}),
-        (BatchSmoother, {"exact_steps": -1}),
-        (BatchSmoother, {"settle": 0.0}),
-        (Message, {"name": "x", "numbers": -1}),
-    ):
+    for method, bad in ((Message, {"name": "x", "numbers": -1}),):
         field = next(name for name in bad if name != "name")
         with refused(field):
             method(**bad)  # type: ignore[operator]
@@ -150,7 +97,7 @@ def test_the_smoother_is_the_least_squares_solution_of_scipy(crossing: Fleet) ->
     """Positions of all vehicles at all steps, and every marginal."""
     recording = observe(crossing.select(range(5)).between(0, 9), S2, V2X(max_neighbours=3))
     known = NoiseModel.nominal(S2)
-    track = textbook(BatchSmoother(exact_steps=9))(recording, range(5))
+    track = textbook(BatchSmoother())(recording, range(5))
     best = least_squares(
         problem(recording, known),
         track.x[0].ravel() + 0.05,
@@ -168,61 +115,13 @@ def test_the_smoother_is_the_least_squares_solution_of_scipy(crossing: Fleet) ->
             assert track.covariance[0, t, k] == pytest.approx(spread[t, k, :, t, k, :], abs=1e-6)
 
 
-def test_settled_is_converged_gauss_newton_where_one_step_is_not(crossing: Fleet) -> None:
-    """Vehicles that pass at little more than the range's own noise."""
-    recording = observe(coming_and_going(crossing), S2, V2X(max_neighbours=7), runs=2)
-
-    def away(method: BatchSmoother) -> float:
-        return float(np.abs(textbook(method)(recording, [0, 1, 7]).x - converged).max())
-
-    converged = textbook(BatchSmoother(exact_steps=30, settle=np.inf))(recording, [0, 1, 7]).x
-    assert away(BatchSmoother(settle=np.inf)) > 1e-3
-    assert away(BatchSmoother()) < 1e-3
-    close = BatchSmoother(settle=1e-9)
-    assert away(close) < 1e-8
-
-
-def test_what_does_not_settle_is_said(crossing: Fleet) -> None:
-    recording = observe(crossing, S2, V2X(max_neighbours=3), runs=2)
-    assert "2 of 2 runs did not settle within 1e-300 m" in BatchSmoother(settle=1e-300)(recording, [0]).notes
-    with refused(r"settle = 0\.0: must be > 0 m"):
-        BatchSmoother(settle=0.0)
-
-
-def test_the_converted_smoother_is_gtsams_linear_graph(crossing: Fleet) -> None:
-    recording = observe(coming_and_going(crossing), S2, V2X(max_neighbours=4))
-    known = NoiseModel.nominal(S2)
-    track = textbook(BatchSmoother(exact_steps=0))(recording, [0, 1, 7])
-    graph, gnss, unit = gtsam.GaussianFactorGraph(), recording.gnss[0], gtsam.noiseModel.Unit.Create(3)
-    steps, vehicles = gnss.shape[:2]
-    motion_std = np.sqrt(known.process_variance(recording)[0])
-    there = np.isfinite(gnss[..., 0])
-    for t, k in np.argwhere(there):
-        weight = np.diag(1 / np.array(known.gnss_std))
-        graph.add(gtsam.JacobianFactor(t * vehicles + k, weight, weight @ gnss[t, k], unit))
-        if t and there[t - 1, k]:
-            weight = np.diag(1 / motion_std[t, k])
-            moved = recording.dt * recording.velocity[0, t, k]
-            graph.add(
-                gtsam.JacobianFactor((t - 1) * vehicles + k, -weight, t * vehicles + k, weight, weight @ moved, unit)
-            )
-    vectors, links = to_vector(recording.relative[0]), recording.links
-    roots = [rows(v, one, S2, True)[0] for v, one in zip(vectors, recording.relative[0], strict=True)]
-    for t, i, j, vector, root in zip(links.step, links.observer, links.neighbour, vectors, roots, strict=True):
-        graph.add(gtsam.JacobianFactor(t * vehicles + i, -root, t * vehicles + j, root, root @ vector, unit))
-    best = graph.optimize()
-    for e, k in enumerate(track.egos):
-        wanted = np.stack([best.at(t * vehicles + k) for t in range(steps)])
-        np.testing.assert_allclose(track.x[0, :, e], wanted, atol=1e-8)
-
-
 @pytest.mark.parametrize("least", [1e-3, 1e-6, 1e-9])
 def test_who_hardly_moves_does_not_drown_the_rest(least: float, crossing: Fleet) -> None:
     """Motion known to a nanometre, all at rest: SciPy's solution of the whole drive as one point per vehicle."""
     fleet = replace(crossing, position=np.repeat(crossing.position[:1], 60, axis=0), velocity=0 * crossing.velocity)
     recording = observe(fleet, replace(S2, velocity_floor=1e-12), V2X(max_neighbours=4))
     known = NoiseModel("fitted", S2, process_std=(least, least, least), gnss_std=(3.0, 3.5, 4.0))
-    track = textbook(BatchSmoother(known, exact_steps=5))(recording, range(8))
+    track = textbook(BatchSmoother(known))(recording, range(8))
     residual = problem(recording, known)
     best = least_squares(
         lambda x: residual(np.tile(x, 60)),
@@ -233,4 +132,4 @@ def test_who_hardly_moves_does_not_drown_the_rest(least: float, crossing: Fleet)
         ftol=1e-14,
         gtol=1e-14,
     )
-    assert np.abs(track.x[0] - best.x.reshape(8, 3)).max() < max(1e-5, 30 * least)
+    assert np.abs(track.x[0] - best.x.reshape(8, 3)).max() < max(2e-3, 30 * least)

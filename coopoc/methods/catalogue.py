@@ -11,7 +11,6 @@ from .baselines import LKFSA, MSMV
 from .centralised import BatchSmoother, CentralFilter
 from .cooperative_filter import CooperativeFilter
 from .covariance_intersection import CovarianceIntersection
-from .decentralised import GaussianBeliefPropagation
 from .joint_filter import JointFilter
 from .kalman import GNSS, AdaptiveKalman, Kalman
 from .track import Method
@@ -30,20 +29,19 @@ METHODS: Mapping[str, Factory] = {
     "cooperative-filter": CooperativeFilter,
     "ci": CovarianceIntersection,
     "split-ci": partial(CovarianceIntersection, split=True, name="split-ci"),
-    "gbp": GaussianBeliefPropagation,
     "central-filter": CentralFilter,
     "batch-smoother": BatchSmoother,
 }
 """Name -> a function of the noise model, and of options of the method by name."""
 
-WHOLE_FLEET = frozenset({"gbp", "central-filter", "batch-smoother"})
+WHOLE_FLEET = frozenset({"central-filter", "batch-smoother"})
 """Methods that need what every vehicle measured, not only the egos."""
 
 
 def needs_whole_fleet(name: str) -> bool:
     """Whether a method needs what every vehicle measured; one from elsewhere declares it by `whole_fleet = True`.
 
-    >>> needs_whole_fleet("gbp"), needs_whole_fleet("joint")
+    >>> needs_whole_fleet("central-filter"), needs_whole_fleet("joint")
     (True, False)
     """
     if name in METHODS:

@@ -2,22 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
 from tqdm import tqdm
 
-from ..arrays import TINY, Floats
+from ..arrays import Floats
+from ..kernels.gate import FIX_GATE, REJECTED
 from ..world.recording import Recording, Vehicles, check_recording
+from ..world.sensors import Sensors
 from .gaps import in_stretches
+from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel
-from .track import Checked, Track, check_options
+from .track import Checked, Track
 from .whole_fleet import CENTRE, UPLOAD, Answer, fleet_track
 
 if TYPE_CHECKING:
     from ..kernels.fleets.graph import Assumed, Measured, Pairs
+    from ..optimize import Problem
 
+STIFF = 1e-5
+"""Least noise of a motion over that of a fix: where vehicles hardly move less would hide all other measurements."""
 NOT_CAUSAL = "not causal: every estimate depends on the whole drive"
 BEARINGS = (
     "most ranges are missing: bearings alone are taken at believed distances, whose errors they share, and covariances "
@@ -55,94 +61,122 @@ class CentralFilter(Checked):
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
-        def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
+        def solve(measured: Measured, pairs: Pairs, assumed: Assumed, _: NoiseModel) -> Answer:
             from ..kernels.fleets.central import run_filter
-            from ..kernels.fleets.graph import of_runs
 
-            runs = len(measured.active)
-            together = runs if share_covariance(measured, pairs, assumed) else 1
             x, cov = np.empty(measured.gnss.shape), np.empty((*measured.gnss.shape, 3))
-            for run in tqdm(range(0, runs, together), desc=self.name, unit="run", delay=2.0):
-                some = slice(run, run + together)
-                x[some], cov[some] = run_filter(*of_runs(measured, pairs, assumed, some))
-            return Answer(x, cov, None, notes)
+            for run in tqdm(range(len(x)), desc=self.name, unit="run", delay=2.0):
+                x[run], cov[run] = run_filter(measured, pairs, assumed, run)
+            return Answer(x, cov, True, notes)
 
         relative = check_recording(recording).relative[0]
         alone = np.isnan(relative[:, 0]) & np.isfinite(relative[:, 1])
         notes = (CENTRE, BEARINGS) if 2 * alone.sum() > len(alone) else (CENTRE,)
-        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve, central=True)
-
-
-def share_covariance(measured: Measured, pairs: Pairs, assumed: Assumed) -> bool:
-    """Whether the covariance is the same in all runs: unit noise, and the same measurements and messages."""
-    constant = len(assumed.std) == 0 and len(assumed.process) == len(assumed.fix) == 1
-    if not constant or (measured.relative[..., 0] < 0).any() or (measured.relative[..., 1:] == 0).any():
-        return False
-    alike = (measured.active, pairs.alive, np.isnan(measured.gnss))
-    return all(bool((each == each[:1]).all()) for each in alike)
+        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve)
 
 
 @dataclass(frozen=True, eq=False)
-class BatchSmoother:
-    r"""Most probable positions of the whole fleet over the whole drive.
+class BatchSmoother(Checked):
+    r"""Most probable positions of the whole fleet over the whole drive, by `coopoc.optimize`.
 
     $$
     \min_x \sum \lVert x_t - x_{t-1} - \Delta t \, u_t \rVert^2_{Q^{-1}} + \sum \lVert z - x \rVert^2_{R^{-1}} +
     \sum \lVert h(x_j - x_i) - y \rVert^2_{C^{-1}}
     $$
 
-    The converted measurements make a linear problem; from its solution one exact Gauss-Newton step on range and angles
-    is enough on average. Steps with the same factors, each a tenth of its cost, follow until none moves a position by
-    `settle`: then it is the most probable drive. A step that raises the cost is halved, and the next one linearised
-    anew: where angles are noisy and fixes poor, a whole step may leave by kilometres. Time makes the normal
-    equations block-tridiagonal with blocks of 3N x 3N, and motion noise is diagonal, so that one sweep eliminates step
-    after step,
-
-    $$ S_t = J_t + D, \qquad J_{t+1} = D S_t^{-1} J_t + F_{t+1}, \qquad D = \mathrm{diag}(1 / q), $$
-
-    and one sweep back gives positions and their marginal covariances, $\Sigma_t = S_t^{-1} + S_t^{-1} D \Sigma_{t+1} D
-    S_t^{-1}$.
-
-    Not causal: a reference for what the drive holds. O(T (3N)^3) and T (3N)^2 numbers per sweep, one run at a time:
-    60 vehicles and 900 steps take 230 MB. A measurement counts if a message gets through between the two, however late.
+    with a point for each vehicle and step (`drive_problem`), from the vehicles' own filters, and marginal covariances.
+    Not causal: a reference for what the drive holds. A measurement counts if a message gets through between the two,
+    however late.
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.
-        exact_steps: Gauss-Newton steps after the linear solution.
-        settle: m, the largest step to stop at; inf stops after those.
-        robust: what does not fit the solution weighs less, what is far off nothing (`coopoc.kernels.gate`); weights are
-            set at the vehicles' own filters, and at each of the solutions that follow.
+        robust: what does not fit weighs less, what is far off nothing (`coopoc.kernels.gate`): of fixes, at the
+            vehicles' own filters, of relative measurements, at a solution with Huber's loss.
     """
 
     noise_model: NoiseModel | str = "nominal"
-    exact_steps: int = 1
-    settle: float = 1e-3
     robust: bool = True
     name: str = "batch-smoother"
     cooperative = True
     message = UPLOAD
 
-    def __post_init__(self) -> None:
-        steps = (0, 1e18, "a whole number >= 0, 0 for linear only")
-        check_options(self, {"exact_steps": steps, "settle": (TINY, np.inf, "> 0 m, infinity for no further steps")})
-
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent, or if not all vehicles observed."""
 
-        def solve(measured: Measured, pairs: Pairs, assumed: Assumed) -> Answer:
-            from ..kernels.fleets.graph import of_runs, own_filters
-            from ..kernels.fleets.smoother import run_factors, smooth
+        def solve_all(measured: Measured, pairs: Pairs, assumed: Assumed, model: NoiseModel) -> Answer:
+            from ..optimize import Status, solve
 
-            steps = self.exact_steps if len(assumed.std) else 0
-            x, lost = own_filters(measured, assumed).reshape(measured.gnss.shape), 0
-            cov: Floats = np.empty((*x.shape, 3))
-            with tqdm(total=len(x) * (1 + steps) * len(x[0]), desc=self.name, unit="step", delay=2.0) as bar:
-                for run in range(len(x)):
-                    factors = run_factors(*of_runs(measured, pairs, assumed, slice(run, run + 1)))
-                    x[run], cov[run], small = smooth(x[run], factors, steps, self.settle, bar.update)
-                    lost += not small
-            note = (f"{lost} of {len(x)} runs did not settle within {self.settle:g} m",) if lost else ()
-            return Answer(x, cov, 0, (NOT_CAUSAL, CENTRE, *note))
+            x: Floats = np.full(measured.gnss.shape, np.nan)
+            cov: Floats = np.full((*x.shape, 3), np.nan)
+            lost = 0
+            start = solo_filter(recording, range(x.shape[2]), model, fix_noise(model, assumed.robust))[0]
+            for run in tqdm(range(len(x)), desc=self.name, unit="run", delay=2.0):
+                problem = drive_problem(recording, run, start[run], measured, pairs, assumed, model.sensors)
+                if assumed.robust:
+                    problem = gated(problem)
+                found = solve(problem, "gauss-newton", covariance=True, throw=False)
+                lost += found.status is not Status.SOLVED
+                there = measured.active[run]
+                x[run, there], cov[run, there] = found.x, found.covariance
+            note = (f"{lost} of {len(x)} runs did not end at a minimum",) if lost else ()
+            return Answer(x, cov, False, (NOT_CAUSAL, CENTRE, *note))
 
-        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve, central=True)
+        return fleet_track(self, self.noise_model, self.robust, recording, egos, solve_all)
+
+
+def drive_problem(
+    recording: Recording,
+    run: int,
+    start: Floats,
+    measured: Measured,
+    pairs: Pairs,
+    assumed: Assumed,
+    sensors: Sensors | None,
+) -> Problem:
+    """The problem of a whole drive of the fleet: a point per vehicle and step at which it is active.
+
+    Args:
+        recording: of all vehicles.
+        run: noise realisation.
+        start: (T, N, 3) m.
+        measured: of all runs.
+        pairs: whose measurements count.
+        assumed: noise of motions and fixes.
+        sensors: relative noise; None: unit covariance of the converted vectors.
+    """
+    from ..optimize import Problem
+    from ..optimize.model.window import drive_factors
+
+    active = measured.active[run]
+    step, column = np.nonzero(active)
+    fix_std, motion_std = (
+        np.sqrt(np.broadcast_to(each, measured.gnss.shape)[run]) for each in (assumed.fix, assumed.process)
+    )
+    link = np.concatenate([each[pairs.alive[run]] for each in (pairs.link, pairs.link_back)])
+    link = np.sort(link[link >= 0])
+    stds = fix_std, np.maximum(motion_std, STIFF * fix_std.min())
+    if sensors is not None:
+        sensors = replace(sensors, min_range=assumed.min_range)
+    relative = recording.told[run, link]
+    factors = drive_factors(recording, run, (step, column), link, relative, stds, sensors)
+    return Problem(tuple(map(str, range(len(step)))), factors, x0=start[active])
+
+
+def gated(problem: Problem) -> Problem:
+    """A drive whose relative measurements weigh less, or nothing, where they do not fit a solution with Huber's loss,
+    from which it starts."""
+    from ..optimize import Loss, solve
+    from ..optimize.assess.assess import squared
+    from ..optimize.model.factor import unchecked
+
+    own = [factor.kind in ("position", "displacement") for factor in problem.factors]
+    loss = Loss("huber", FIX_GATE**0.5)
+    bent = tuple(f if mine else unchecked(f, loss=loss) for f, mine in zip(problem.factors, own, strict=True))
+    x = solve(problem.replace_unchecked(factors=bent), "gauss-newton", covariance=False, throw=False, tolerance=0.01).x
+    factors = []
+    for factor, mine in zip(problem.factors, own, strict=True):
+        q = squared(problem, factor, x)
+        share = np.where(q > REJECTED * FIX_GATE, np.inf, np.maximum(q / FIX_GATE, 1.0))
+        factors.append(factor if mine else unchecked(factor, std=np.asarray(factor.std) * np.sqrt(share)[:, None]))
+    return problem.replace_unchecked(factors=tuple(factors), x0=x)

@@ -25,7 +25,7 @@ class JointFilter(Checked):
     $R_i$ is the covariance of a fix, $B$ the star's incidence matrix, $C_e$ the rotated covariance of the converted
     vector at the predicted geometry: at the measured one the weight would depend on the noise. Then, if `exact`, one
     Gauss-Newton step on range, azimuth and inclination themselves. The states of the other members stay when one joins
-    or leaves. `StarStream` runs the same filter one step at a time.
+    or leaves.
 
     Innovations beyond their gate weigh less, far beyond it nothing (`coopoc.kernels.gate`).
 

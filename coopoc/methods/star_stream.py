@@ -17,12 +17,9 @@ from ..kernels.geometry import components
 from ..kernels.motion import MotionNoise
 from ..kernels.stars.cooperative_state import (
     AGE,
-    DT,
-    FIX,
     FIX_VARIANCE,
     KEPT_VARIANCE,
     MOTION,
-    MOTION_VARIANCE,
     ODOMETER,
     OWN,
     SINCE,
@@ -34,27 +31,14 @@ from ..kernels.stars.cooperative_state import (
     TRUSTED,
     USED,
     WIDTH,
-    Filter,
-    Model,
 )
 from ..kernels.stars.gaussian import ABSENT
-from ..kernels.stars.streams import (
-    INDEX,
-    USED_AT,
-    joint_step,
-    make_filter,
-    make_joint,
-    restore,
-    stream_rows,
-    stream_step,
-)
+from ..kernels.stars.streams import make_filter, restore, stream_rows, stream_step
 from ..world.links import told
 from ..world.plausible import FARTHEST, radians
 from .cooperative_filter import Broadcast, CooperativeFilter, model_of, priors_of
-from .egos import relative_noise
-from .joint_filter import JointFilter
 from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
-from .noise_model import NoiseModel, constant_noise, motion_noise
+from .noise_model import constant_noise, motion_noise
 
 FIRST = np.zeros(1, np.int64)
 KNOWN = 0.01
@@ -68,10 +52,10 @@ class RelativeMeasurement:
     Args:
         id: name of the neighbour.
         relative: (3,) range m, world azimuth rad, inclination rad; NaN for a component that is missing.
-        gnss: (3,) m, the fix in the message, or the estimate of `Broadcast`; None or NaN for none.
-        velocity: (3,) m/s of the message; None for no message.
-        variance: (3,) m^2 of `Broadcast`, which a robust filter needs.
-        odometer: (3,) m of `Broadcast`.
+        gnss: (3,) m, the estimate of the `Broadcast` that came; None for no message.
+        velocity: (3,) m/s of it.
+        variance: (3,) m^2 of it.
+        odometer: (3,) m of it.
         age: s since fix and velocity of the message were measured.
 
     >>> RelativeMeasurement("b", [9.0, 0.1, 1.57]).velocity is None
@@ -103,13 +87,14 @@ class RelativeMeasurement:
             row[ODOMETER:SPEED] = three("neighbour's odometer", self.odometer)
         if self.velocity is not None:
             row[SPEED:STEP] = three("neighbour's velocity", self.velocity)
-        elif math.isfinite(row[SOLO]):
-            raise InputError("velocity", None, f"must come with the fix of {self.id}", "Send both in one message.")
+        if 0 < np.isfinite(row[SOLO:STEP]).sum() < STEP - SOLO:
+            allowed = f"of {self.id} must hold position, velocity, variance and odometer"
+            raise InputError("message", "a part of one", allowed, "Send stream.broadcast.")
         self.__dict__["row"] = row.tobytes()
 
 
 class StarStream:
-    """The joint or the cooperative filter, step by step: `FilterStream` with the neighbours measured at each step.
+    """The cooperative filter, step by step: `FilterStream` with the neighbours measured at each step.
 
     The neighbours measured now are in the star. Between messages a neighbour moves with the velocity of its newest one
     until that is `max_age` seconds old; a velocity used for L seconds makes an error of L times its own. Of a vehicle
@@ -119,8 +104,7 @@ class StarStream:
     does not know the ranges to come, and takes what the noise model says.
 
     Args:
-        filter: its noise model is "identity" or holds constant noise. In a robust one neighbours must send what
-            `broadcast` of theirs holds.
+        filter: its noise model is "identity" or holds constant noise. Neighbours send what `broadcast` of theirs holds.
         x0: (3,) m, a position known before the first step; None starts at the first fix.
         interval: s, the step that the assumed process noise belongs to: a motion of dt s has dt / interval times its
             variance. None: every step is one, with the error of one measured velocity, as in a recording.
@@ -131,17 +115,18 @@ class StarStream:
     Raises:
         InputError: a noise model that needs a recording, a time that is negative or not finite.
 
-    >>> from coopoc import JointFilter
-    >>> ego = StarStream(JointFilter("identity"))
-    >>> other = RelativeMeasurement("b", [9.0, 0.0, 1.5707963], gnss=[10.0, 0.0, 0.0], velocity=[9.0, 0.0, 0.0])
-    >>> x, _ = ego.step([0.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[other])
-    >>> float(x[0].round(3)), float(ego.neighbours["b"][0].round(3))  # 10 m apart by the fixes, 9 m as measured
-    (0.333, 9.667)
+    >>> from coopoc import NoiseModel, Sensors
+    >>> ego, other = (StarStream(CooperativeFilter(NoiseModel.nominal(Sensors()))) for _ in "ab")
+    >>> _ = other.step([10.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1)
+    >>> seen = RelativeMeasurement("b", [9.0, 0.0, 1.5707963], *other.broadcast)
+    >>> x, _ = ego.step([0.0, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[seen])
+    >>> float(x[0].round(1)), float(ego.neighbours["b"][0].round(1))  # 10 m apart by the fixes, 9 m as measured
+    (0.4, 9.6)
     """
 
     def __init__(
         self,
-        filter: JointFilter | CooperativeFilter,
+        filter: CooperativeFilter,
         x0: npt.ArrayLike | None = None,
         *,
         interval: float | None = None,
@@ -149,31 +134,21 @@ class StarStream:
         max_age: float = 1.0,
         measured: bool = False,
     ) -> None:
-        if not isinstance(filter, CooperativeFilter):
-            filter = instance("filter", filter, JointFilter)
-        known = constant_noise(filter.noise_model)
-        start = np.full(3, np.nan) if x0 is None else three("x0", x0)
-        self._star: Joint | Robust
-        self._robust = isinstance(filter, CooperativeFilter)
-        factor = self._trusted = 1.0
-        if isinstance(filter, CooperativeFilter):
-            priors = priors_of(filter, known, measured)
-            factor, self._trusted = priors.fix, float(priors.fix_gate == 0.0)
-            model = model_of(known, priors)
-            self._star, self._white = Robust(model, start), model.white
-        else:
-            self._star = Joint(known, filter.exact, filter.robust, start)
+        known = constant_noise(instance("filter", filter, CooperativeFilter).noise_model)
+        self._start = np.full(3, np.nan) if x0 is None else three("x0", x0)
+        priors = priors_of(filter, known, measured)
+        self._trusted, self._model = float(priors.fix_gate == 0.0), model_of(known, priors)
+        self._filter, self._tries = make_filter(1, 1)
         self._motion: MotionNoise = motion_noise(known, interval)
-        self._fix = factor**2 * np.array(known.gnss_variance)
+        self._fix = priors.fix**2 * np.array(known.gnss_variance)
         self.max_age, self.history = seconds("max_age", max_age), MotionHistory(history)
         self._given, self._time, self._begun = np.zeros(8), 0.0, x0 is not None
         self._numbers, self._names = dict[str, int](), list[str]()
         self._last: Floats = np.full((1, WIDTH), np.nan)
-        self._last[0, INDEX] = -1.0
         self._answer: Floats = np.full(12, np.nan)
         self._memory: Floats = np.zeros(9)
         if x0 is not None:
-            self._memory[:6] = *start, *np.full(3, 1.0 / KNOWN)
+            self._memory[:6] = *self._start, *np.full(3, 1.0 / KNOWN)
 
     @property
     def neighbours(self) -> dict[str, Floats]:
@@ -182,17 +157,16 @@ class StarStream:
 
     @property
     def broadcast(self) -> Broadcast | None:
-        """What this vehicle sends now; None before its first fix, and of a filter that is not robust."""
+        """What this vehicle sends now; None before its first fix."""
         mean, weight, odometer = self._memory.reshape(3, 3)
-        if not self._robust or not weight.all():
+        if not weight.all():
             return None
         return Broadcast(mean.copy(), self._given[3:6].copy(), 1.0 / weight, odometer.copy())
 
     @property
     def trusted(self) -> dict[str, bool]:
         """Whether the fixes of each neighbour in the star count as they are."""
-        numbers, first = [self._numbers[name] for name in self._names], self._star.filters[:1]
-        return {name: all(f.status[k, TRUSTED] for f in first) for name, k in zip(self._names, numbers, strict=True)}
+        return {name: bool(self._filter.status[self._numbers[name], TRUSTED]) for name in self._names}
 
     def step(
         self,
@@ -212,12 +186,9 @@ class StarStream:
             neighbours: the relative measurements of now, one for each neighbour.
 
         Raises:
-            InputError: as `FilterStream.step`; a neighbour that is given twice, or, of a robust filter, with a message
-                that is no `Broadcast`. The filter is then as it was before.
+            InputError: as `FilterStream.step`; a neighbour that is given twice. The filter is then as it was before.
         """
         names = names_of("neighbours", neighbours, RelativeMeasurement)
-        if self._robust:
-            self._check(neighbours)
         self.history.write(self._given, gnss, velocity, dt, fix_age)
         columns, time, motion, fix = self._columns(names), self._time + float(dt), self._motion, self._fix
         rows: Floats = np.frombuffer(bytearray().join([each.row for each in neighbours])).reshape(len(names), WIDTH)
@@ -230,16 +201,10 @@ class StarStream:
         self._begun |= outcome == ESTIMATE
         if not self._begun:
             return np.full(3, np.nan), None
-        if self._robust:
-            own[FIX_VARIANCE:MOTION] -= (1.0 - self._white) * self._fix
-        self._names, self._answer = names, self._star.step(own, rows, columns, last)
+        own[FIX_VARIANCE:MOTION] -= (1.0 - self._model.white) * self._fix
+        self._names, self._answer = names, np.empty(12 + 3 * len(columns))
+        stream_step(self._filter, self._tries, self._model, own, rows, columns, self._start, self._answer)
         return self._answer[:3], self._answer[3:12].reshape(3, 3)
-
-    def _check(self, neighbours: Sequence[RelativeMeasurement]) -> None:
-        for each in neighbours:
-            if each.velocity is not None and not np.isfinite(np.frombuffer(each.row)[SOLO:SPEED]).all():
-                allowed = "must hold position, variance and odometer for a robust filter"
-                raise InputError("neighbours", each.id, allowed, "Send stream.broadcast, or take a JointFilter.")
 
     def _columns(self, names: list[str]) -> Ints:
         """Numbers of the vehicles, 1 and up; the filter has room for them."""
@@ -248,7 +213,7 @@ class StarStream:
         except KeyError:
             self._meet([name for name in names if name not in self._numbers], names)
             return self._columns(names)
-        self._star.reserve(1 + len(names), len(self._last))
+        self._reserve(1 + len(names), len(self._last))
         return columns
 
     def _meet(self, new: list[str], names: list[str]) -> None:
@@ -256,99 +221,33 @@ class StarStream:
         if len(self._numbers) + len(new) >= len(self._last):
             oldest = self._time - self.max_age
             for name, number in list(self._numbers.items()):
-                there = self._last[number, INDEX] >= 0 or any(f.slot[number] != ABSENT for f in self._star.filters)
-                if not there and name not in names and self._last[number, AGE] < oldest:
+                there = self._filter.slot[number] != ABSENT or name in names
+                if not there and self._last[number, AGE] < oldest:
                     del self._numbers[name]
         if (wanted := len(self._numbers) + len(new)) >= len(self._last):
             self._last = np.pad(self._last, ((0, 2 * wanted), (0, 0)))
-            self._star.reserve(1, len(self._last))
+            self._reserve(1, len(self._last))
         free = sorted(set(range(1, len(self._last))) - set(self._numbers.values()))
         for name, number in zip(new, free, strict=False):
             self._numbers[name] = number
-            self._last[number], self._last[number, [INDEX, USED_AT, AGE]] = np.nan, (-1.0, -math.inf, -math.inf)
-            for f in self._star.filters:
-                f.status[number] = 0.0
-                f.status[number, TRUSTED] = self._trusted
-                f.status[number, USED] = f.status[number, SINCE] = -math.inf
-                f.status[number, KEPT_VARIANCE : KEPT_VARIANCE + 3] = TAU**2
+            self._last[number], self._last[number, AGE] = np.nan, -math.inf
+            status = self._filter.status[number]
+            status[:] = 0.0
+            status[TRUSTED], status[USED], status[SINCE] = self._trusted, -math.inf, -math.inf
+            status[KEPT_VARIANCE : KEPT_VARIANCE + 3] = TAU**2
 
-
-class Joint:
-    """The joint filter, step by step: `reserve` and `step` as those of `Robust`.
-
-    Args:
-        known: noise model.
-        exact: refine by one Gauss-Newton step.
-        robust: gate innovations.
-        start: (3,) m, known before the first step, NaN for none.
-    """
-
-    filters: tuple[Filter, ...] = ()
-
-    def __init__(self, noise_model: NoiseModel, exact: bool, robust: bool, start: Floats) -> None:
-        std, least = relative_noise(noise_model)
-        self.options = (
-            np.array(std),
-            float(least),
-            exact and noise_model.exact_relative,
-            robust and noise_model.exact_relative,
-        )
-        self.joint, self.gates, self.start = *make_joint(1), start
-
-    def reserve(self, slots: int, vehicles: int) -> None:
-        """Room for a star of that many members."""
-        if (most := self.joint.stride) < slots:
-            joint, gates = make_joint(2 * slots)
-            joint.state[: 3 * most], gates.state[: 13 * most] = self.joint.state, self.gates.state
-            lanes = self.joint.information.shape[1]
-            blocks = self.joint.information.reshape(most, most, 9, lanes)
-            joint.information.reshape(2 * slots, 2 * slots, 9, lanes)[:most, :most] = blocks
-            self.joint, self.gates = joint, gates
-
-    def step(self, own: Floats, rows: Floats, vehicles: Ints, last: Floats) -> Floats:
-        """Answer of `joint_step`; the motion from a start that is known is a fix, too."""
-        if math.isfinite(self.start[0]):
-            weight = 0.0 if math.isnan(own[FIX]) else 1.0 / own[FIX_VARIANCE:MOTION]
-            more = 1.0 / (own[MOTION_VARIANCE:DT] + 1e-18)
-            began = self.start + own[MOTION:MOTION_VARIANCE]
-            own[:FIX_VARIANCE] = (np.nan_to_num(own[:FIX_VARIANCE]) * weight + began * more) / (weight + more)
-            own[FIX_VARIANCE:MOTION], self.start = 1.0 / (weight + more), np.full(3, np.nan)
-        answer = np.empty(12 + 3 * len(vehicles))
-        joint_step(self.joint, self.gates, *self.options, own, rows, vehicles, last, answer)
-        return answer
-
-
-class Robust:
-    """The cooperative filter, step by step.
-
-    Args:
-        model: noise model.
-        start: (3,) m, known before the first step, NaN for none.
-    """
-
-    def __init__(self, model: Model, start: Floats) -> None:
-        self.model, self.start = model, start
-        f, self.tries = make_filter(1, 1)
-        self.filters = [f]
-
-    def reserve(self, slots: int, vehicles: int) -> None:
+    def _reserve(self, slots: int, vehicles: int) -> None:
         """Room for a star of that many members, of that many vehicles."""
-        (f,) = self.filters
-        if slots > len(f.who) or vehicles > len(f.slot):
-            self._copy(max(len(f.who), 2 * slots), vehicles)
+        before = self._filter
+        if slots > len(before.who) or vehicles > len(before.slot):
+            self._copy(max(len(before.who), 2 * slots), vehicles)
 
     def _copy(self, slots: int, vehicles: int) -> None:
-        (f,) = self.filters
-        self.filters[0], self.tries = make_filter(slots, vehicles)
-        restore(f, self.filters[0])
+        before = self._filter
+        self._filter, self._tries = make_filter(slots, vehicles)
+        restore(before, self._filter)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Arrays that share memory have come apart in the pickle."""
         self.__dict__.update(state)
-        self._copy(len(self.filters[0].who), len(self.filters[0].slot))
-
-    def step(self, own: Floats, rows: Floats, vehicles: Ints, last: Floats) -> Floats:
-        """Answer of `stream_step`."""
-        answer = np.empty(12 + 3 * len(vehicles))
-        stream_step(self.filters[0], self.tries, self.model, own, rows, vehicles, self.start, answer)
-        return answer
+        self._copy(len(self._filter.who), len(self._filter.slot))

@@ -1,18 +1,17 @@
-"""Whole-fleet methods: arguments of their kernels, delayed fusion of late results, bytes, the Track."""
+"""Methods of a centre that has the whole fleet: arguments of their kernels, delayed fusion, bytes, the Track."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Ints
+from ..arrays import Bools, Floats
 from ..kernels.compiling.waiting import clock
 from ..world.exchange import Exchange, exchange
 from ..world.recording import Recording, Vehicles, check_recording
-from ..world.v2x import NO_MESSAGE, Message
+from ..world.v2x import Message
 from .doubts import doubts
 from .kalman import fix_noise, solo_filter
 from .noise_model import NoiseModel, resolve
@@ -32,7 +31,7 @@ CENTRE = (
 
 NEAREST = 0.1
 """Share of a range's standard deviation: angles are no more certain than at this distance, whatever the sensors'
-`min_range`. In one place they weighed so much that belief propagation lost all digits."""
+`min_range`. In one place they would weigh so much that all digits are lost."""
 
 
 class Answer(NamedTuple):
@@ -41,14 +40,21 @@ class Answer(NamedTuple):
     Attributes:
         x: (R, T, N, 3) m of all vehicles, of any shape.
         covariance: (R, T, N, 3, 3) m^2, of any shape.
-        rounds: of messages a step, None if an answer needs all vehicles that pairs connect, 0 if it is never late.
+        late: whether an answer waits for the messages of all vehicles that pairs connect.
         notes: of the Track.
     """
 
     x: Floats
     covariance: Floats
-    rounds: int | None
+    late: bool
     notes: tuple[str, ...] = ()
+
+
+class Moved(NamedTuple):
+    """Bytes (R, N) that each vehicle receives and sends over the drive."""
+
+    received_bytes: Floats
+    sent_bytes: Floats
 
 
 def fleet_track(
@@ -57,9 +63,7 @@ def fleet_track(
     robust: bool,
     recording: Recording,
     egos: Vehicles,
-    solve: Callable[[Measured, Pairs, Assumed], Answer],
-    *,
-    central: bool = False,
+    solve: Callable[[Measured, Pairs, Assumed, NoiseModel], Answer],
 ) -> Track:
     """Track of the egos from the whole fleet's estimates.
 
@@ -70,8 +74,6 @@ def fleet_track(
         recording: observed by all vehicles.
         egos: columns or ids.
         solve: the method's kernel.
-        central: whether a centre has the messages: then a pair takes part if those of either way arrive, else if those
-            of both ways do.
 
     Raises:
         InputError: an ego that is unknown, absent at times or without a fix at first; a recording that not all vehicles
@@ -82,17 +84,15 @@ def fleet_track(
     began = clock()
     columns = check_recording(recording).columns(egos)
     model = resolve(noise_model, recording)
-    met = centre(recording, method.message) if central else exchange(recording, method.message)
-    arrival = met.either if central else met.both
-    measured, pairs, assumed = kernel_arguments(recording, met, model, arrival, robust)
-    answer = solve(measured, pairs, assumed)
+    met = exchange(recording)
+    measured, pairs, assumed = kernel_arguments(recording, met, model, robust)
+    answer = solve(measured, pairs, assumed, model)
     shape = (recording.runs, len(recording.t), len(columns))
     x = answer.x.reshape(recording.gnss.shape).take(columns, axis=2)
     cov = answer.covariance.reshape(*recording.gnss.shape[:3], 9).take(columns, axis=2)
-    if answer.rounds != 0 and (arrival > met.step).any():
-        vehicles = len(recording.ids)
-        rounds = vehicles if answer.rounds is None else answer.rounds
-        latest = latest_available(pairs, np.where(pairs.alive, arrival, -1), vehicles, rounds).take(columns, axis=2)
+    if answer.late and (met.arrival > met.step).any():
+        arrival = np.where(pairs.alive, met.arrival, -1)
+        latest = latest_available(pairs, arrival, len(recording.ids)).take(columns, axis=2)
         own = measured._replace(gnss=measured.gnss.take(columns, 2), velocity=measured.velocity.take(columns, 2))
         process, fix = (
             values.take(columns, 2) if values.shape[2] > 1 else values for values in (assumed.process, assumed.fix)
@@ -100,32 +100,33 @@ def fleet_track(
         assumed = assumed._replace(process=process, fix=fix)
         x, cov = fuse_delayed(latest, x.reshape(*shape[:2], -1), cov.reshape(*shape[:2], -1), own, assumed)
     x, cov = x.reshape(*shape, 3), cov.reshape(*shape, 3, 3)
+    moved = centre(recording, method.message)
     return Track(
         recording.t,
         tuple(columns),
         x,
         cov,
-        met.received_bytes[:, columns],
-        met.sent_bytes[:, columns],
+        moved.received_bytes[:, columns],
+        moved.sent_bytes[:, columns],
         clock() - began,
         notes=model.notes + answer.notes + doubts(recording, columns, x, cov, model),
         ids=recording.ids,
     )
 
 
-def centre(recording: Recording, upload: Message) -> Exchange:
-    """Contacts as over the channel, with the bytes of every vehicle's `upload` to a centre and of its answer."""
+def centre(recording: Recording, upload: Message) -> Moved:
+    """Bytes over the drive of every vehicle's `upload` to a centre, and of its answers."""
     links, overhead, present = recording.links, recording.v2x.overhead, np.isfinite(recording.velocity[0, :, :, 0])
     measured = np.zeros(present.shape, dtype=np.int64)
     np.add.at(measured, (links.step, links.observer), 1)
     sent = (present * upload.size(overhead, measured)).sum(axis=0, dtype=float)
     received = present.sum(axis=0) * float(DOWNLOAD.size(overhead))
     runs = np.ones((recording.runs, 1))
-    return replace(exchange(recording, NO_MESSAGE), sent_bytes=runs * sent, received_bytes=runs * received)
+    return Moved(runs * received, runs * sent)
 
 
 def kernel_arguments(
-    recording: Recording, met: Exchange, model: NoiseModel, arrival: Ints, robust: bool
+    recording: Recording, met: Exchange, model: NoiseModel, robust: bool
 ) -> tuple[Measured, Pairs, Assumed]:
     """Arguments of the kernels by name; a pair takes part if its messages arrive and both vehicles are active."""
     from ..kernels.fleets.graph import Assumed, Measured, Pairs
@@ -135,7 +136,7 @@ def kernel_arguments(
     both = active[:, met.step, met.first] & active[:, met.step, met.second]
     columns = (met.first, met.second, met.link, met.link_back, met.start)
     first, second, link, link_back, start = (np.ascontiguousarray(column, dtype=np.int64) for column in columns)
-    pairs = Pairs(first, second, link, link_back, start, np.ascontiguousarray(both & (arrival >= 0)))
+    pairs = Pairs(first, second, link, link_back, start, np.ascontiguousarray(both & (met.arrival >= 0)))
     relative = components(recording.told, np.arange(len(recording.links)))
     relative = np.concatenate([relative, np.ones((*relative.shape[:2], 3))], axis=2)
     process, fix = model.process_variance(recording), model.fix_variance(recording)

@@ -19,7 +19,7 @@ from .model.factor import Factor
 from .model.problem import Problem, Search
 from .model.space import Space
 from .starts.graph_starts import STARTS, chained, contenders, incremental_start, parts, separated, unwound
-from .starts.race import RELAXED, eased, race
+from .starts.race import eased, race
 
 Objective = Literal["chordal", "geodesic"]
 KINDS = {
@@ -29,7 +29,7 @@ KINDS = {
     "point_prior": "position",
 }
 """Of measurements, by the name of a graph's edges."""
-Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "relaxed", "auto"]
+Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "auto"]
 
 
 def read_graph(
@@ -43,9 +43,7 @@ def read_graph(
     return from_graph(load_graph(path, repair), objective, start)
 
 
-def from_graph(
-    graph: Graph, objective: Objective = "chordal", start: Start = "auto", seconds: float = np.inf
-) -> Problem:
+def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "auto") -> Problem:
     """The problem of a graph; of each connected part without priors and fixed vertices the first pose is fixed.
 
     chordal: kappa |R_j - R_i R_ij|_F^2 + tau |t_j - t_i - R_i t_ij|^2, tau = d / trace(cov_t) and kappa = 1 / var_theta
@@ -61,11 +59,10 @@ def from_graph(
             robots stand to each other; "file" takes the vertices as they are, which in PyFG are the truth; "tree"
             follows loop closures and measurements between robots, too; "linear" relaxes rotations
             (`convex/chordal.py`); "incremental" solves the first poses of all robots, then more with them
-            (`starts/graph_starts.py`); "relaxed" rounds a convex relaxation (`convex/relaxation.py`); "auto" tries all
+            (`starts/graph_starts.py`); "auto" tries all
             that the graph offers and keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their
             priors, or where the first pose that measures them sees them, or by ranges. The Solution names the start in
             extras["start"].
-        seconds: limit of the relaxation.
 
     Raises:
         InputError: an unknown objective or start, a measurement without variance, by its vertices.
@@ -79,9 +76,8 @@ def from_graph(
     one_of("start", start, Start)
     load(*LIBRARIES)
     began, notes, factors = clock(), _counted(graph.notes), _factors(graph, objective)
-    poses, relaxed = tuple(np.flatnonzero(graph.is_pose).tolist()), partial(_relaxed, graph, objective, seconds)
-    first = {"incremental": "odometry", "relaxed": "apart"}.get(start, start)
-    names = contenders(graph) if start == "auto" else (first,)
+    poses = tuple(np.flatnonzero(graph.is_pose).tolist())
+    names = contenders(graph) if start == "auto" else ("odometry" if start == "incremental" else start,)
     given = _x0(graph, poses, names[0])
     problem = Problem(graph.names, factors, given, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
     if len(problem.fixed) - len(graph.fixed) > (not len(graph.fixed)):
@@ -98,13 +94,10 @@ def from_graph(
             late["file"] = lambda _: (_x0(graph, poses, "file"), 0)
         late |= {"eased": lambda at: eased(at, given)} if poses and len(graph.ranges) else {}
         late |= {"incremental": lambda _: incremental_start(graph, problem)} if poses else {}
-        late |= {"relaxed": lambda at: (relaxed(at), 0)} if len(graph.names) <= RELAXED else {}
         problem, won = race(problem, starts, late, partial(unwound, graph))
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
         problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
-    elif start == "relaxed":
-        problem, won = problem.replace_unchecked(x0=frozen(relaxed(problem))), Search(start)
     if won.start.startswith("file") and not graph.guess:
         notes = (*notes, "the start is the file's vertices, which may be the truth")
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=(*notes, *won.notes)))
@@ -132,14 +125,6 @@ def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:
         x0 = chordal_start(Problem(graph.names, factors, x0, dimension=graph.dimension, poses=poses))
     x0 = separated(graph, x0)
     return x0 if poses else x0[:, : graph.dimension]
-
-
-def _relaxed(graph: Graph, objective: Objective, seconds: float, at: Problem) -> Floats:
-    """(n, ambient) of the rounded relaxation of the chordal problem."""
-    from .convex.relaxation import staircase
-
-    chordal = at if objective == "chordal" else at.replace_unchecked(factors=_factors(graph, "chordal"))
-    return staircase(chordal, refine=False, seconds=seconds).x
 
 
 def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:

@@ -41,7 +41,6 @@ def solve_file(
     backend: Annotated[str, arg(metavar="NAME")] = "gauss-newton",
     objective: Objective = "chordal",
     start: Start = "auto",
-    seconds: Annotated[float, arg(metavar="S")] = np.inf,
     output: Annotated[Path | None, arg(metavar="FILE")] = None,
     outliers: bool = False,
     repair: bool = False,
@@ -56,14 +55,13 @@ def solve_file(
         backend: solver (see coopoc check).
         objective: chordal (quadratic, can be certified), or geodesic with the full covariances.
         start: point where the solve begins, see docs/optimize.md; auto takes the lowest cost of all.
-        seconds: time limit of the relaxation for --start relaxed.
         output: file for the solution with all nodes, as JSON; a summary goes to stdout.
         outliers: find wrong loop closures and relative poses between robots, and leave them out (solve_gnc).
         repair: take the nearest positive definite matrix where a g2o file's information is none.
         covariance: compute marginals of graphs of more than 1,000 nodes, too.
     """
     graph = load_graph(file, repair)
-    problem = (known_inliers_first if outliers else from_graph)(graph, objective, start, seconds)
+    problem = (known_inliers_first if outliers else from_graph)(graph, objective, start)
     say(str(problem))
     solve_one = partial(solve, throw=False, covariance=covariance or None)
     solution = (without_outliers if outliers else solve_one)(problem, backend)
@@ -90,14 +88,14 @@ def say(message: str) -> None:
     print(f"coopoc: {message}", file=sys.stderr)
 
 
-def known_inliers_first(graph: Graph, objective: Objective, start: Start, seconds: float) -> Problem:
+def known_inliers_first(graph: Graph, objective: Objective, start: Start) -> Problem:
     """The problem of a graph from where its known inliers lead, all but relative poses beside each robot's odometry."""
     problem = from_graph(graph, objective, "odometry")
     doubtful = [row for _, rows in loop_closures(problem) for row in rows]
     every = graph.relative_pose
     kept = np.setdiff1d(np.arange(len(every)), doubtful)
     known = {field.name: getattr(every, field.name)[kept] for field in fields(every)}
-    began = from_graph(replace(graph, relative_pose=replace(every, **known)), objective, start, seconds)
+    began = from_graph(replace(graph, relative_pose=replace(every, **known)), objective, start)
     return problem.replace_unchecked(x0=began.x0, search=began.search)
 
 

@@ -268,8 +268,7 @@ def _draw(axes: Axes, names: Where, points: Any, style: Where | None = None) -> 
     axes.plot(list(points), list(map(_mean, points.values())), **options)
     if bands:
         ends = [point.low for point in bands.values()], [point.high for point in bands.values()]
-        name = "_" + str(options["label"]).lstrip("_")
         if options["linestyle"] == "none":
-            axes.vlines(list(bands), *ends, alpha=0.6, color=options["color"], linewidth=1.2, label=name)
+            axes.vlines(list(bands), *ends, alpha=0.6, color=options["color"], linewidth=1.2)
             return
-        axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0, label=name)
+        axes.fill_between(list(bands), *ends, alpha=0.14, color=options["color"], linewidth=0)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -29,9 +28,6 @@ FIXED: Mapping[str, Mapping[str, Any]] = {
 }
 """Formats, and metadata without a time or a version."""
 
-MOST = 60
-"""Points of a line that show their value, at most."""
-
 
 @dataclass(frozen=True, eq=False)
 class Plot:
@@ -54,47 +50,12 @@ class Plot:
                 store.write(Path(f"{path}.{suffix}"), buffer.getvalue())
         return self.caption
 
-    def marks(self) -> dict[str, Any]:
-        """Size in points, and points of named lines: x, y from the upper left, and what a pointer over them shows."""
-        figure, found = self.figure, list[tuple[float, float, str]]()
-        figure.draw_without_rendering()
-        ylabel = figure.axes[0].get_ylabel() if figure.axes else ""
-        for axes in figure.axes:
-            bands = {str(band.get_label()).lstrip("_"): band for band in axes.collections}
-            ticks = {at: text.get_text() for at, text in zip(axes.get_xticks(), axes.get_xticklabels(), strict=False)}
-            for curve in axes.lines:
-                name, points = str(curve.get_label()).lstrip("_"), np.asarray(curve.get_xydata(), dtype=float)
-                points = points[np.isfinite(points).all(axis=1)]
-                if re.fullmatch(r"child\d+", name):
-                    continue
-                places = curve.get_transform().transform(points) * 72 / figure.dpi
-                level = curve.get_transform() is not axes.transData  # across the panel, at no place
-                paths = bands[name].get_paths() if name in bands else ()  # none of one ego, which has no interval
-                band = np.concatenate([np.empty((0, 2)), *(path.vertices for path in paths)])
-                for (x, y), place in list(zip(points, places, strict=True))[:: len(points) // MOST + 1]:
-                    ends = [f"{end:.3g}" for end in sorted({*band[np.isclose(band[:, 0], x), 1]})]
-                    within = f" [{ends[0]}, {ends[-1]}]" if ends else ""
-                    text = f"{name}: {_said(axes.get_ylabel() or ylabel, f'{y:.3g}')}{within}"
-                    text += "" if level else f"; {_said(axes.get_xlabel(), ticks.get(x) or f'{x:.4g}')}"
-                    found.append((round(place[0], 1), round(72 * figure.get_figheight() - place[1], 1), text))
-        return {"size": [72 * length for length in figure.get_size_inches()], "points": found}
-
     def _repr_png_(self) -> bytes:
         """Image for a notebook."""
         buffer = BytesIO()
         with mpl.rc_context(RC):
             self.figure.savefig(buffer, format="png")
         return buffer.getvalue()
-
-
-def _said(axis: str, value: str) -> str:
-    """The label of an axis with a value; the unit behind it.
-
-    >>> _said("RT-LE [m]", "0.46")
-    'RT-LE 0.46 m'
-    """
-    words, _, unit = axis.rstrip("]").partition(" [")
-    return " ".join(filter(None, (words, value, unit)))
 
 
 @contextmanager

@@ -65,7 +65,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
         for name, figure in study.figures.items():
             if (plot := made(name, figure)) is not None:
                 caption = plot.save(folder / "figures" / name)
-                shown["figures"].append({"name": name, "caption": caption, "marks": plot.marks()})
+                shown["figures"].append({"name": name, "caption": caption})
             bar.update()
     with suppress(InputError):  # files of views that an earlier run made, and this one does not, show other numbers
         before = views(folder)

@@ -111,15 +111,6 @@ def save_failure(folder: Path, cell: Cell, reason: str, trace: str, seconds: flo
     _save(_failed(folder, cell.name), to_table([{**cell.params, **own}]))
 
 
-def copy(source: Path, target: Path, name: str, failed: bool) -> None:
-    """Copy the file of a finished or failed cell to another folder; a finished cell is no longer failed there."""
-    place = _failed if failed else _finished
-    if source != target:
-        write(place(target, name), place(source, name).read_bytes())
-    if not failed:
-        _failed(target, name).unlink(missing_ok=True)
-
-
 def load(folder: Path, name: str) -> pa.Table | None:
     """Rows of a finished cell; None if there are none, or (with a warning) if the file is damaged."""
     return _read(_finished(folder, name), name)

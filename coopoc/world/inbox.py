@@ -45,7 +45,7 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
         message: what its rounds take on air counts against `v2x.bytes_per_second`.
 
     Raises:
-        InputError: a message to each neighbour or as long as the neighbourhood: `coopoc.world.exchange` counts those.
+        InputError: a message as long as the neighbourhood, which only a centre takes.
 
     >>> from coopoc import Fleet, Sensors, V2X, observe
     >>> from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -53,8 +53,8 @@ def inbox(recording: Recording, ego: int, message: Message) -> Inbox:
     >>> inbox(observe(fleet, Sensors(), V2X()), 0, FIX_AND_VELOCITY).received_bytes
     array([64.])
     """
-    if message.unicast or message.per_neighbour:
-        raise InputError("message", message.name, "must be a broadcast of one size", "Use world.exchange.exchange.")
+    if message.per_neighbour:
+        raise InputError("message", message.name, "must be a broadcast of one size", "Give Message(name, numbers).")
     steps = len(recording.t)
     link = recording.links.of(ego)
     at = recording.links.step[link]

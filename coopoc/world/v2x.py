@@ -98,25 +98,21 @@ class Message:
     Args:
         numbers: in each round.
         rounds: messages a step; they share the fate of the step's message. 0 sends nothing.
-        opening: numbers that ride with the first round only, such as the measurements that all rounds work on.
         per_neighbour: numbers more in each round for each neighbour of the sender: a list as long as its neighbourhood.
-        unicast: True for a message of its own to each neighbour; False for one broadcast that all neighbours receive.
 
     >>> Message("fix and velocity", 8).payload
     32
-    >>> Message("belief", 9, rounds=3, opening=5).size(overhead=100)
-    428
+    >>> Message("estimate", 9, rounds=3).size(overhead=100)
+    408
     """
 
     name: str
     numbers: int
     rounds: int = 1
-    opening: int = 0
     per_neighbour: int = 0
-    unicast: bool = False
 
     def __post_init__(self) -> None:
-        check_fields(self, dict.fromkeys(("numbers", "rounds", "opening", "per_neighbour"), (0, 2**62, ">= 0")))
+        check_fields(self, dict.fromkeys(("numbers", "rounds", "per_neighbour"), (0, 2**62, ">= 0")))
 
     @property
     def payload(self) -> int:
@@ -124,13 +120,13 @@ class Message:
         return 4 * self.numbers
 
     def size(self, overhead: int = 0, neighbours: AnyArray | int = 0) -> Any:
-        """Bytes that one receiver takes from one sender in a step: rounds x (payload + overhead), and the opening.
+        """Bytes that one receiver takes from one sender in a step: rounds x (payload + overhead).
 
         Args:
             overhead: bytes per message on air.
             neighbours: of the sender, a number or an array.
         """
-        return 4 * self.opening + self.rounds * (self.payload + 4 * self.per_neighbour * neighbours + overhead)
+        return self.rounds * (self.payload + 4 * self.per_neighbour * neighbours + overhead)
 
 
 NO_MESSAGE = Message("none", 0, rounds=0)

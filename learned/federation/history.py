@@ -15,11 +15,10 @@ from coopoc.arrays import instance
 from coopoc.errors import InputError
 from coopoc.evaluate.ledger import Ledger, of_training
 from coopoc.short_repr import short_repr
-from coopoc.world.fleet import Fleet
 
 from ..nets.gain import Gain
 from ..nets.stack import unflatten
-from .combine import FLOAT32, SERVER
+from .combine import SERVER
 
 AGREEMENT = 0.1
 """Excess of a round's median loss over the least one up to which the round may be selected."""
@@ -164,26 +163,3 @@ def ledger(federation: Federation, overhead: int = 0) -> Ledger:
     downloads = [max(row.received.values()) for row in rounds if row.received]
     moved[:, -1], messages[:, -1] = (sum(downloads), moved[0].sum()), (len(downloads), messages[0].sum())
     return of_training(names, moved[0], moved[1], [SERVER], messages, overhead)
-
-
-def card_ledger(card: Mapping[str, Any], drives: Fleet) -> Ledger:
-    """`ledger` of trained weights from their card: payload, on average over the clients.
-
-    A federation moves the weights both ways in every round; its server may broadcast its own. Centralised training
-    needs the raw drives, six float32 per step (noisy fixes and velocities, without the reference drive), and sends the
-    weights back once.
-
-    Args:
-        card: of a `Checkpoint`.
-        drives: of the clients.
-    """
-    if card["settings"]["kind"] == "federated":
-        names, rounds = card["clients"], card["history"][1:]
-        up, down = (
-            np.full(len(names), sum(row[way] for row in rounds) / len(names))
-            for way in ("sent_bytes", "received_bytes")
-        )
-    else:
-        names, up = drives.ids, FLOAT32 * 6.0 * drives.present.sum(axis=0)
-        down = np.full(len(names), float(FLOAT32 * card["parameters"]))
-    return of_training([*names, SERVER], [*up, down[0]], [*down, up.sum()], [SERVER])

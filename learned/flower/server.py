@@ -102,7 +102,7 @@ def configured(grid: Grid, context: Context) -> None:
     out = given_path(given["out"])
     if type(untrained(job)).calibrate is not Gain.calibrate:
         allowed = "must be a net that needs no calibration on the clients' segments"
-        raise InputError("recipe", job.name, allowed, "Train it in one process, or with coopoc train --flower.")
+        raise InputError("recipe", job.name, allowed, "Train it in one process: coopoc train.")
 
     if out.is_file():
         names |= {int(node): str(name) for node, name in read_card(out).get("nodes", {}).items()}

@@ -15,7 +15,6 @@ from coopoc.learned.checkpoint import load
 from coopoc.learned.nets.okf import NoiseParameters
 from coopoc.seals import UNSEALED, sealed
 from coopoc.study import publish, reference
-from coopoc.study.merge import merge
 from coopoc.study.results import Results
 from coopoc.study.tables import FORMATS
 
@@ -31,7 +30,6 @@ class Reader(NamedTuple):
 
 def _manifest(folder: Path) -> None:
     Results.load(folder)
-    merge([folder], folder / "merged")
 
 
 def _views(folder: Path) -> None:

@@ -1,1 +1,1 @@
-"""Whole fleets: filters, smoothers and algorithms that iterate over messages."""
+"""Whole fleets: filters."""

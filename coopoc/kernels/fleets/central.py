@@ -17,8 +17,8 @@ UNKNOWN = 1e6
 
 
 @compiled
-def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed) -> tuple[Floats, Floats]:
-    """Positions (R, T, N, 3) m and covariances (R, T, N, 3, 3) m^2 of runs that share their covariance.
+def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed, run: int) -> tuple[Floats, Floats]:
+    """Positions (T, N, 3) m and covariances (T, N, 3, 3) m^2 of a run.
 
     P <- (P^-1 + F)^-1 = P (I + F P)^-1, F the information of the step's fixes and pairs. Only the vehicles of a
     connected component, over others or at earlier steps, have covariances that are not zero.
@@ -27,33 +27,33 @@ def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed) -> tuple[Floa
         measured: what the fleet measured.
         pairs: those whose measurements reach the centre.
         assumed: the noise model.
+        run: which of them.
     """
-    runs, steps, n = measured.active.shape
-    x, cov = np.full((runs, steps, n, 3), np.nan), np.full((runs, steps, n, 3, 3), np.nan)
+    _, steps, n = measured.active.shape
+    x, cov = np.full((steps, n, 3), np.nan), np.full((steps, n, 3, 3), np.nan)
     P, label, hits = np.zeros((3 * n, 3 * n)), np.arange(n), np.zeros(n)
-    active, present, alive = measured.active[0], np.zeros(n, np.bool_), pairs.alive[0]
+    active, present, alive = measured.active[run], np.zeros(n, np.bool_), pairs.alive[run]
     for t in range(steps):
-        predict(measured, assumed, t, present, x, P)
+        predict(measured, assumed, run, t, present, x, P)
         most = pairs.start[t + 1] - pairs.start[t]
-        information, total = np.zeros((most, 9)), np.zeros((runs, 3 * n))
+        information, total = np.zeros((most, 9)), np.zeros(3 * n)
         for k in range(pairs.start[t], pairs.start[t + 1]):
             i, j = pairs.first[k], pairs.second[k]
             if alive[k]:
                 connect(label, i, j)
                 between = difference(P, i, j)
-                for run in range(runs):
-                    vector = subtract(load(x[run, t, j], 0, VECTOR), load(x[run, t, i], 0, VECTOR))
-                    if assumed.robust:
-                        joined = min(at(assumed.fix, 0, t, i)[0], UNKNOWN) - UNKNOWN
-                        joined *= (not present[i]) + (not present[j])
-                        known = add_diagonal(between, (joined, joined, joined))
-                        gate_pair(vector, known, k, pairs, measured.relative[run], assumed)
-                    weight, eta = pair_at_agreement(vector, between, k, pairs, measured.relative[run], assumed)
-                    store(information[k - pairs.start[t]], 0, weight)
-                    store(total[run], i, subtract(load(total[run], i, VECTOR), eta))
-                    store(total[run], j, add(load(total[run], j, VECTOR), eta))
+                vector = subtract(load(x[t, j], 0, VECTOR), load(x[t, i], 0, VECTOR))
+                if assumed.robust:
+                    joined = min(at(assumed.fix, run, t, i)[0], UNKNOWN) - UNKNOWN
+                    joined *= (not present[i]) + (not present[j])
+                    known = add_diagonal(between, (joined, joined, joined))
+                    gate_pair(vector, known, k, pairs, measured.relative[run], assumed)
+                weight, eta = pair_at_agreement(vector, between, k, pairs, measured.relative[run], assumed)
+                store(information[k - pairs.start[t]], 0, weight)
+                store(total, i, subtract(load(total, i, VECTOR), eta))
+                store(total, j, add(load(total, j, VECTOR), eta))
         B = np.eye(3 * n)
-        add_fixes(measured, assumed, t, present, x, P, B, total, np.bincount(label)[label] > 1, hits)
+        add_fixes(measured, assumed, run, t, present, x[t], P, B, total, np.bincount(label)[label] > 1, hits)
         for k in range(pairs.start[t], pairs.start[t + 1]):
             if alive[k]:
                 add_pair(pairs.first[k], pairs.second[k], load(information[k - pairs.start[t]], 0, MATRIX), P, B)
@@ -61,24 +61,23 @@ def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed) -> tuple[Floa
         for component in range(n):
             members = np.flatnonzero((label == component) & present)
             if len(members):
-                update(members, P, B, total, x[:, t], cov[:, t])
+                update(members, P, B, total, x[t], cov[t])
     return x, cov
 
 
 @part
-def predict(measured: Measured, assumed: Assumed, t: int, before: Bools, x: Floats, P: Floats) -> None:
+def predict(measured: Measured, assumed: Assumed, run: int, t: int, before: Bools, x: Floats, P: Floats) -> None:
     """x += dt u and P += Q; a vehicle that joins stands at its fix, and nothing is known of it."""
-    for n in range(x.shape[2]):
-        if measured.active[0, t, n]:
-            process = at(assumed.process, 0, t, n)
+    for n in range(x.shape[1]):
+        if measured.active[run, t, n]:
+            process = at(assumed.process, run, t, n)
             for c in range(3):
                 row = 3 * n + c
                 if not before[n]:
                     P[row], P[:, row] = 0.0, 0.0
                 P[row, row] = P[row, row] + process[c] if before[n] else UNKNOWN
-                for run in range(len(x)):
-                    moved = x[run, t - 1, n, c] + measured.dt * measured.velocity[run, t, n, c]
-                    x[run, t, n, c] = moved if before[n] else measured.gnss[run, t, n, c]
+                moved = x[t - 1, n, c] + measured.dt * measured.velocity[run, t, n, c]
+                x[t, n, c] = moved if before[n] else measured.gnss[run, t, n, c]
 
 
 @part
@@ -99,6 +98,7 @@ def difference(P: Floats, i: int, j: int) -> Matrix:
 def add_fixes(
     measured: Measured,
     assumed: Assumed,
+    run: int,
     t: int,
     before: Bools,
     x: Floats,
@@ -113,20 +113,19 @@ def add_fixes(
     The own filter of a vehicle whose fixes are false from the start believes them: here others, if it is `together`
     with any, contradict it.
     """
-    for n in range(x.shape[2]):
-        noise, fix = load(at(assumed.fix, 0, t, n), 0, VECTOR), measured.gnss[0, t, n]
-        gap, share = subtract(load(fix, 0, VECTOR), load(x[0, t, n], 0, VECTOR)), 1.0
+    for n in range(len(x)):
+        noise, fix = load(at(assumed.fix, run, t, n), 0, VECTOR), measured.gnss[run, t, n]
+        gap, share = subtract(load(fix, 0, VECTOR), load(x[n], 0, VECTOR)), 1.0
         if assumed.robust and together[n] and gap[0] + gap[1] + gap[2] + noise[0] < math.inf:
             share, hits[n] = gate_fix(gap, block(P, n, n), noise, FIX_GATE, hits[n])
-        for c in range(3 if measured.active[0, t, n] else 0):
+        for c in range(3 if measured.active[run, t, n] else 0):
             row, variance = 3 * n + c, share * noise[c]
             if not before[n]:
                 P[row, row] = variance
             elif not math.isnan(fix[c]):
                 for d in range(len(P)):
                     B[row, d] += P[row, d] / variance
-                for run in range(len(x)):
-                    total[run, row] += (measured.gnss[run, t, n, c] - x[run, t, n, c]) / variance
+                total[row] += (fix[c] - x[n, c]) / variance
 
 
 @part
@@ -149,9 +148,9 @@ def update(members: Ints, P: Floats, B: Floats, total: Floats, x: Floats, cov: F
         members: (M,) columns.
         P: (3N, 3N) m^2, changed.
         B: (3N, 3N) I + F P.
-        total: (R, 3N) 1/m.
-        x: (R, N, 3) m, changed.
-        cov: (R, N, 3, 3) m^2, written.
+        total: (3N,) 1/m.
+        x: (N, 3) m, changed.
+        cov: (N, 3, 3) m^2, written.
     """
     size = 3 * len(members)
     rows = np.empty(size, np.int64)
@@ -166,12 +165,11 @@ def update(members: Ints, P: Floats, B: Floats, total: Floats, x: Floats, cov: F
     for a in range(size):
         for b in range(size):
             P[rows[a], rows[b]] = posterior[a, b]
-    for run in range(len(x)):
-        for a in range(size):
-            eta[a] = total[run, rows[a]]
-        moved = posterior @ eta
-        for a in range(size):
-            n, c = members[a // 3], a % 3
-            x[run, n, c] += moved[a]
-            for d in range(3):
-                cov[run, n, c, d] = posterior[a, a - c + d]
+    for a in range(size):
+        eta[a] = total[rows[a]]
+    moved = posterior @ eta
+    for a in range(size):
+        n, c = members[a // 3], a % 3
+        x[n, c] += moved[a]
+        for d in range(3):
+            cov[n, c, d] = posterior[a, a - c + d]

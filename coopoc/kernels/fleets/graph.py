@@ -86,33 +86,6 @@ class Assumed(NamedTuple):
     robust: bool
 
 
-class Edges(NamedTuple):
-    """Linear measurements of x_head - x_tail at one step, each pair once either way: edges e and e ^ 1 are its two.
-
-    Attributes:
-        head: (2 P,) column.
-        tail: (2 P,) column.
-        information: (9 * 2 P,) 1/m^2.
-        eta: (3 * 2 P,) 1/m, information vectors at the current positions.
-    """
-
-    head: Ints
-    tail: Ints
-    information: Floats
-    eta: Floats
-
-
-def of_runs(measured: Measured, pairs: Pairs, assumed: Assumed, runs: slice) -> tuple[Measured, Pairs, Assumed]:
-    """The arguments of some runs."""
-    gnss, velocity, relative = (values[runs] for values in (measured.gnss, measured.velocity, measured.relative))
-    process, fix = (values[runs] if len(values) > 1 else values for values in (assumed.process, assumed.fix))
-    return (
-        Measured(gnss, velocity, relative, measured.active[runs], measured.dt),
-        pairs._replace(alive=pairs.alive[runs]),
-        assumed._replace(process=process, fix=fix),
-    )
-
-
 @storage
 def at(values: Floats, run: int, t: int, n: int) -> Floats:
     """Row (3,) of an array that is broadcastable to (R, T, N, 3)."""
@@ -163,30 +136,6 @@ def begin_at_fix(x: Floats, cov: Floats, run: int, t: int, n: int, measured: Mea
     store(cov, n, MATRIX)
     for c in range(3):
         x[3 * n + c], cov[9 * n + 4 * c] = measured.gnss[run, t, n, c], r[c]
-
-
-@part
-def advance(run: int, t: int, x: Floats, own: Floats, measured: Measured, assumed: Assumed) -> None:
-    """Positions x[t] (3 N) m and covariances own (9 N) m^2 of each vehicle from its own sensors; NaN m if inactive."""
-    for n in range(measured.active.shape[2]):
-        if not measured.active[run, t, n]:
-            store(x[t], n, (math.nan, math.nan, math.nan))
-        elif t > 0 and measured.active[run, t - 1, n]:
-            store(x[t], n, load(x[t - 1], n, VECTOR))
-            correct(x[t], own, run, t, n, measured, assumed)
-        else:
-            begin_at_fix(x[t], own, run, t, n, measured, assumed)
-
-
-@compiled
-def own_filters(measured: Measured, assumed: Assumed) -> Floats:
-    """Positions (R, T, 3 N) m of each vehicle's own filter, NaN where inactive."""
-    runs, steps, vehicles = measured.active.shape
-    x, own = np.empty((runs, steps, 3 * vehicles)), np.zeros(9 * vehicles)
-    for run in range(runs):
-        for t in range(steps):
-            advance(run, t, x[run], own, measured, assumed)
-    return x
 
 
 @compiled
@@ -282,34 +231,6 @@ def agreement(cov: Matrix, w: Numbers, eta: Numbers) -> Vector:
     return x
 
 
-def new_edges(pairs: Pairs) -> Edges:
-    """Memory for the edges of any step."""
-    most = 2 * int(np.diff(pairs.start).max(initial=0))
-    return Edges(np.zeros(most, np.int64), np.zeros(most, np.int64), np.zeros(9 * most), np.zeros(3 * most))
-
-
-@part
-def linearise(
-    run: int, t: int, x: Floats, own: Floats, measured: Measured, pairs: Pairs, assumed: Assumed, edges: Edges
-) -> int:
-    """Fill in the edges of step t at the beliefs x (3 N) m, own (9 N) m^2; how many there are."""
-    count = 0
-    for k in range(pairs.start[t], pairs.start[t + 1]):
-        if pairs.alive[run, k]:
-            i, j = pairs.first[k], pairs.second[k]
-            vector = subtract(load(x, j, VECTOR), load(x, i, VECTOR))
-            cov = add(load(own, i, MATRIX), load(own, j, MATRIX))
-            if assumed.robust:
-                gate_pair(vector, cov, k, pairs, measured.relative[run], assumed)
-            information, eta = pair_at_agreement(vector, cov, k, pairs, measured.relative[run], assumed)
-            for head, tail, sign in ((i, j, -1.0), (j, i, 1.0)):
-                edges.head[count], edges.tail[count] = head, tail
-                store(edges.information, count, information)
-                store(edges.eta, count, scale(eta, sign))
-                count += 1
-    return count
-
-
 @part
 def connect(label: Ints, first: int, second: int) -> None:
     """Merge the connected components of two vehicles, of which label (N,) is the number."""
@@ -320,17 +241,16 @@ def connect(label: Ints, first: int, second: int) -> None:
 
 
 @compiled
-def latest_available(pairs: Pairs, arrival: Ints, vehicles: int, rounds: int) -> Ints:
+def latest_available(pairs: Pairs, arrival: Ints, vehicles: int) -> Ints:
     """(R, T, N) latest step whose result is available to a vehicle at each step, -1 for none.
 
     A result is available when those of all vehicles that contribute to it are, and the messages between them have
-    arrived: one round reaches the vehicles in contact, the next those in contact with these.
+    arrived: of the vehicles in contact, of those in contact with these, and so on.
 
     Args:
         pairs: whose `alive` is not read.
         arrival: (R, P) step at which a pair's messages have arrived, -1 if it takes no part.
         vehicles: N.
-        rounds: of messages a step.
     """
     runs, steps = len(arrival), len(pairs.start) - 1
     latest = np.full((runs, steps, vehicles), -1)
@@ -338,16 +258,15 @@ def latest_available(pairs: Pairs, arrival: Ints, vehicles: int, rounds: int) ->
         ready = np.zeros(vehicles, np.int64)
         for t in range(steps):
             ready = np.maximum(ready, t)
-            for _ in range(rounds):
-                before, changed = ready.copy(), False
+            changed = True
+            while changed:
+                changed = False
                 for k in range(pairs.start[t], pairs.start[t + 1]):
                     i, j = pairs.first[k], pairs.second[k]
                     if arrival[run, k] >= 0:
-                        late = max(arrival[run, k], before[i], before[j])
+                        late = max(arrival[run, k], ready[i], ready[j])
                         changed = changed or ready[i] < late or ready[j] < late
-                        ready[i], ready[j] = max(ready[i], late), max(ready[j], late)
-                if not changed:
-                    break
+                        ready[i] = ready[j] = late
             for n in range(vehicles):
                 if ready[n] < steps:
                     latest[run, ready[n], n] = t

@@ -1,4 +1,4 @@
-"""Streams of stars: a step's rows, each with the newest message of a neighbour, and the steps of both filters.
+"""Streams of stars: a step's rows, each with the newest message of a neighbour, and the filter's step.
 
 Times are in seconds, and any dt will do: a velocity that has served for L s and serves for dt more makes an error of
 (L + dt)^2 - L^2 times its own variance.
@@ -11,8 +11,7 @@ import math
 import numpy as np
 
 from ...arrays import Floats, Ints
-from ..compiling.compile import as_written, compiled
-from ..compiling.vectors import LANES
+from ..compiling.compile import compiled
 from ..dead_reckoning import BAD_INPUT, ROUNDING, dead_reckon
 from ..motion import MotionNoise, keep_pace, process_variance
 from .cooperative_filter import step
@@ -38,27 +37,8 @@ from .cooperative_state import (
     copy_filter,
     new_filter,
 )
-from .gated import Gates, gates_within
 from .gaussian import PLACE
-from .joint_filter import Joint, joint_within
-from .joint_filter import step as step_joint
-from .messages import (
-    ACCELERATION_STD,
-    FIX_GROWTH,
-    FORGOTTEN,
-    NOWHERE,
-    Assumptions,
-    interpret,
-    measured,
-    star_within,
-)
 from .otherwise import Tries, new_tries
-
-INDEX, SERVES, USED_AT = range(3)
-"""Of a vehicle's newest message: its index in the last star of the joint filter (-1 for none; the ego's is that of the
-last member), s for which its velocity has served, and when the one that was used last was sent s."""
-OF_EGO, OF_NEIGHBOUR = (MOTION, MOTION_VARIANCE, FIX, FIX_VARIANCE), (SPEED, STEP, SOLO, TYPICAL)
-"""Where motion or velocity, its variance, position and its variance begin in a row."""
 
 
 @compiled
@@ -115,79 +95,6 @@ def stream_rows(
         for c in range(3):
             row[STEP + c], row[TYPICAL + c] = row[STEP + c] * (dt / interval) ** 2, fix[c]
     return int(outcome)
-
-
-@compiled
-def make_joint(most: int) -> tuple[Joint, Gates]:
-    """State of the joint filter with room for that many members, for Python."""
-    return joint_within(most), gates_within(most)
-
-
-@as_written
-def joint_step(
-    joint: Joint,
-    gates: Gates,
-    std: Floats,
-    least: float,
-    refine: bool,
-    robust: bool,
-    own: Floats,
-    rows: Floats,
-    vehicles: Ints,
-    last: Floats,
-    answer: Floats,
-) -> None:
-    """One step of the joint filter, as `stream_step`; all lanes hold the same run.
-
-    Args:
-        joint: state.
-        gates: state.
-        std: (3,) m, rad, rad of relative measurements; of no length for unit covariances.
-        least: m, least range.
-        refine: one Gauss-Newton step on range and angles.
-        robust: gate innovations.
-        own: (OWN,).
-        rows: (k, WIDTH) of the neighbours that are measured now.
-        vehicles: (k,) which they are; the ego is vehicle 0.
-        last: (vehicles, WIDTH) of `stream_rows`; INDEX, SERVES and USED in front are of this function.
-        answer: (12 + 3 k,) out.
-    """
-    n, old, zero = 1 + len(rows), int(last[0, INDEX]) + 1, np.zeros((1, 1, 1, 3))
-    star, known = star_within(n), Assumptions(zero, zero, zero, FIX_GROWTH, std, least, FORGOTTEN, ACCELERATION_STD)
-    for k in range(n):
-        j, row, at, age, dt = 0, own, OF_EGO, 0.0, 1.0
-        if k > 0:
-            j, row, at, age, dt = vehicles[k - 1], rows[k - 1], OF_NEIGHBOUR, rows[k - 1, AGE], own[DT]
-        memory, held, there = last[j], age >= 0.0, math.isfinite(row[at[2]])
-        new = k == 0 or memory[AGE] > memory[USED_AT] + ROUNDING
-        star.previous[k] = int(min(memory[INDEX], 0.0) if k == 0 else memory[INDEX])
-        serves = 0.0 if new or memory[INDEX] < 0.0 else memory[SERVES]
-        memory[SERVES], memory[USED_AT] = serves + dt, memory[AGE]
-        counts = 1.0 if new and held and there else 0.0
-        status = 0.0, 1.0 + serves / dt, max(age, 0.0) / dt, 1.0 if held else 0.0, counts
-        for lane in range(LANES):
-            for i in range(5):
-                star.status[5 * k + i, lane] = status[i]
-            if k > 0:
-                measured(star.relative, row, std, k, lane)
-        for i in range(12):
-            value = 0.0 if i < 9 else NOWHERE
-            if held and (i < 6 or there):
-                value = row[at[i // 3] + i % 3]
-            for lane in range(LANES):
-                star.motion[12 * k + i, lane] = value
-        interpret(star, known, k, dt)
-    step_joint(star, joint, gates, known, refine, robust, n, old)
-    last[:, INDEX] = -1.0
-    last[0, INDEX] = n - 1
-    for k in range(1, n):
-        last[vehicles[k - 1], INDEX] = k
-    for c in range(3):
-        answer[c] = joint.state[c, 0]
-        for d in range(3):
-            answer[3 + 3 * c + d] = joint.scratch[3 * min(c, d) + max(c, d), 0]
-        for k in range(1, n):
-            answer[9 + 3 * k + c] = joint.state[3 * k + c, 0]
 
 
 @compiled

@@ -214,17 +214,6 @@ def _pose_prior(factor: Factor, W: Floats, d: int) -> Form:
     ]
 
 
-def _chordal_prior(factor: Factor, W: Floats, d: int) -> Form:
-    """GTSAM's errors are the columns of T - Z, ours its translation and then the rows of its rotation."""
-    side = d + 1
-    rows, cols = np.divmod(np.arange(d * d), d)
-    theirs = np.concatenate([side * d + np.arange(d), side * cols + rows])
-    root = np.zeros((len(W), side**2, side**2))
-    root[:, : W.shape[1], theirs] = W
-    name = f"FrobeniusPriorPose{d}"
-    return [Part({(POSE,): name}, lambda: ((pose_of(d, z).matrix(),) for z in factor.z), root)]
-
-
 def _coupled(W: Floats, d: int) -> bool:
     """Whether position and rotation are correlated."""
     coupled = max(np.abs(W[:, :d, d:]).max(), np.abs(W[:, d:, :d]).max())
@@ -242,7 +231,6 @@ FORMS: dict[str, Callable[[Factor, Floats, int], Form]] = {
     "relative_pose_log": _relative_log,
     "relative_pose_chordal": _relative_chordal,
     "pose": _pose_prior,
-    "pose_chordal": _chordal_prior,
 }
 """(factor, W (M or 1, size, size), dimension) -> parts, by kind."""
 

@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ...arrays import Bools, Floats, Ints, frozen, instance, listed
+from ...arrays import Bools, Floats, Ints, frozen, listed
 from ...errors import InputError, shown, suggestion
-from ...world.sensors import Sensors
 from .derivatives import Linear, linearise, sparse_jacobian
 from .factor import Constraint, Factor, names_of, taken, unchecked
 from .inputs import check_rotations, numbers
 from .measurements import lookup
 from .space import Space
-from .window import Noise, WindowStep, recorded_steps, window_factors
+from .window import Noise, window
 
 if TYPE_CHECKING:
     from ...world.recording import Recording
@@ -318,28 +317,8 @@ class Problem:
         A missing fix makes no factor; of a relative measurement its parts make one each where some are missing.
         Arguments and errors as `from_snapshot`; the first step of the window must exist.
         """
-        steps, names = recorded_steps(recording, step, ego, length, run, noise)
-        return cls.from_steps(steps, recording.sensors if noise is None else noise.sensors, names)
-
-    @classmethod
-    def from_steps(
-        cls, steps: Sequence[WindowStep], sensors: Sensors | None, names: Sequence[str] | None = None
-    ) -> Problem:
-        """The problem of consecutive steps, oldest first; the ego's points are the separator (see `window_factors`).
-
-        Args:
-            steps: the measurements of each.
-            sensors: relative noise; None: unit covariance of the converted vectors.
-            names: of the points, step by step; default their numbers.
-        """
-        if not isinstance(steps, Sequence) or not steps:
-            raise InputError("steps", shown(steps), "must be one or more", "Give WindowSteps, oldest first.")
-        for step in steps:
-            instance("steps", step, WindowStep)
-        if sensors is not None:
-            instance("sensors", sensors, Sensors)
-        count, factors, ego = window_factors(steps, sensors)
-        return cls(tuple(names or map(str, range(count))), factors, separator=ego)
+        names, factors, own = window(recording, step, ego, length, run, noise)
+        return cls(names, factors, separator=own)
 
     def __repr__(self) -> str:
         count: Counter[str] = Counter()

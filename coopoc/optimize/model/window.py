@@ -1,13 +1,10 @@
-"""The steps of a window as one ego has them, and the factors of what was measured in them."""
+"""The factors of what was measured in a drive: of the star of an ego over a window of steps, or of a whole fleet."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
 from typing import Protocol, runtime_checkable
 
 import numpy as np
-import numpy.typing as npt
 
 from ...arrays import Floats, Ints, number
 from ...errors import InputError, shown
@@ -33,52 +30,40 @@ class Noise(Protocol):
         """Of x_t given x_{t-1}, broadcastable to (R, T, N, 3), m^2."""
 
 
-@dataclass(frozen=True, eq=False)
-class WindowStep:
-    """One step of the n members of a star, the ego first.
-
-    NaN is what was not measured.
-
-    Args:
-        previous: (n,) index of each member in the previous step, -1 if it was not there.
-        fix: (n, 3) m, GNSS.
-        fix_std: (n, 3) m; infinite where the fix is not to be used.
-        moved: (n, 3) m since the previous step.
-        moved_std: (n, 3) m.
-        relative: (n - 1, 3) m, rad, rad of the neighbours as the ego measures them.
-    """
-
-    previous: Ints
-    fix: Floats
-    fix_std: Floats
-    moved: Floats
-    moved_std: Floats
-    relative: Floats
-
-
-def window_factors(
-    steps: Sequence[WindowStep], sensors: Sensors | None
-) -> tuple[int, tuple[Factor, ...], tuple[int, ...]]:
-    """Number of points, factors and separator of consecutive steps: a point per member and step.
+def drive_factors(
+    recording: Recording,
+    run: int,
+    points: tuple[Ints, Ints],
+    link: Ints,
+    relative: Floats,
+    stds: tuple[Floats, Floats],
+    sensors: Sensors | None,
+) -> tuple[Factor, ...]:
+    """Factors of fixes, of motions from step to step, and of relative measurements between points of a drive.
 
     Args:
-        steps: oldest first.
+        recording: of the measurements; NaN is what was not measured.
+        run: noise realisation.
+        points: step and column of each point.
+        link: (M,) links both of whose ends are points.
+        relative: (M, 3) m, rad, rad of them.
+        stds: m, broadcastable to (T, N, 3), of fixes, infinite where one is not to be used, and of motions.
         sensors: relative noise of exact spherical factors; None: the converted vector has unit covariance, as the
             paper's identity baselines assume.
     """
-    tops = np.concatenate([[0], np.cumsum([len(s.previous) for s in steps])])
-    factors = _measured("position", np.arange(tops[-1])[:, None], *_joined([(s.fix, s.fix_std) for s in steps]))
-    pairs, motions = [np.empty((0, 2), np.int64)], []
-    for s, before, top in zip(steps[1:], tops, tops[1:], strict=False):
-        stays = np.flatnonzero(s.previous >= 0)
-        pairs.append(np.stack([before + s.previous[stays], top + stays], axis=1))
-        motions.append((s.moved[stays], s.moved_std[stays]))
-    if motions:
-        factors += _measured("displacement", np.concatenate(pairs), *_joined(motions))
-    counts = [len(s.previous) - 1 for s in steps]
-    edges = np.stack([np.repeat(tops[:-1], counts), np.delete(np.arange(tops[-1]), tops[:-1])], axis=1)
-    relative = np.concatenate([s.relative for s in steps])
-    return int(tops[-1]), (*factors, *_relative(edges, relative, sensors)), tuple(tops[:-1].tolist())
+    (step, member), links = points, recording.links
+    number = np.full((len(recording.t), len(recording.ids)), -1)
+    number[step, member] = here = np.arange(len(step))
+    fix_std, motion_std = (np.broadcast_to(each, (*number.shape, 3))[step, member] for each in stds)
+    before = np.where(step > 0, number[step - 1, member], -1)
+    stays = before >= 0
+    moved = recording.dt * recording.velocity[run, step, member]
+    ends = np.stack([number[links.step[link], end[link]] for end in (links.observer, links.neighbour)], axis=1)
+    return (
+        *_measured("position", here[:, None], recording.gnss[run, step, member], fix_std),
+        *_measured("displacement", np.stack([before, here], axis=1)[stays], moved[stays], motion_std[stays]),
+        *_relative(ends, relative, sensors),
+    )
 
 
 def _relative(edges: Ints, relative: Floats, sensors: Sensors | None) -> list[Factor]:
@@ -96,7 +81,7 @@ def _relative(edges: Ints, relative: Floats, sensors: Sensors | None) -> list[Fa
 
 
 def _measured(kind: str, nodes: Ints, z: Floats, std: Floats) -> list[Factor]:
-    """The factor of the rows that were measured."""
+    """The factor of the rows that were measured, if any were."""
     rows = np.isfinite(z).all(axis=1)
     return [Factor(kind, nodes[rows], z[rows], std if std.ndim == 1 else std[rows])] if rows.any() else []
 
@@ -114,14 +99,11 @@ def relative_std(relative: Floats, sensors: Sensors) -> Floats:
     return np.minimum(scale * sensors.relative_std, [np.inf, np.pi, np.pi])
 
 
-def _joined(parts: Sequence[tuple[Floats, Floats]]) -> Iterator[npt.NDArray[np.float64]]:
-    return (np.concatenate(column) for column in zip(*parts, strict=True))
-
-
-def recorded_steps(
+def window(
     recording: Recording, step: int, ego: int | str, length: int, run: int, noise: Noise | None
-) -> tuple[list[WindowStep], list[str]]:
-    """The `length` steps that end at `step` with all that was measured, and the names of their points.
+) -> tuple[tuple[str, ...], tuple[Factor, ...], tuple[int, ...]]:
+    """Names of the points of the `length` steps that end at `step`, the ego's first at each, their factors, and which
+    are the ego's.
 
     Arguments and errors as `Problem.from_window`.
     """
@@ -130,26 +112,24 @@ def recorded_steps(
     if noise is not None and not isinstance(noise, Noise):
         raise InputError("noise", shown(noise), "must be a noise model", "Give NoiseModel.nominal(sensors).")
     _check(recording, step, length, run)
-    steps, names, before = [], [], np.empty(0, np.int64)
+    sensors: Sensors | None = recording.sensors
     if noise is None:
-        gnss_std = np.array(recording.sensors.gnss_std)
+        fix_std = np.array(recording.sensors.gnss_std)
         motion_std = recording.sensors.motion_std(recording.velocity[[run]], recording.dt)[0]
     else:
-        gnss_std = np.sqrt(noise.gnss_variance)
-        variance = np.broadcast_to(noise.process_variance(recording), recording.velocity.shape)
-        motion_std = np.sqrt(variance[run])
-    for s in range(step - length + 1, step + 1):
-        links = recording.links.of(column)
-        links = links[recording.links.step[links] == s]
-        members = np.concatenate([[column], recording.links.neighbour[links]])
-        previous = np.array([int(np.flatnonzero(before == m)[0]) if m in before else -1 for m in members])
-        fix, velocity = recording.gnss[run, s, members], recording.velocity[run, s, members]
-        moved_std = motion_std[s, members]
-        fix_std, moved = np.broadcast_to(gnss_std, fix.shape), recording.dt * velocity
-        steps.append(WindowStep(previous, fix, fix_std, moved, moved_std, recording.relative[run, links]))
-        names += [recording.ids[m] if length == 1 else f"{recording.ids[m]}@{s}" for m in members]
-        before = members
-    return steps, names
+        sensors, fix_std = noise.sensors, np.sqrt(noise.gnss_variance)
+        motion_std = np.sqrt(np.broadcast_to(noise.process_variance(recording), recording.velocity.shape)[run])
+    first, links = step - length + 1, recording.links
+    link = links.of(column)
+    link = link[(links.step[link] >= first) & (links.step[link] <= step)]
+    steps = np.concatenate([np.arange(first, step + 1), links.step[link]])
+    order = np.argsort(steps, kind="stable")
+    member = np.concatenate([np.full(length, column), links.neighbour[link]])[order]
+    stds, relative = (fix_std, motion_std), recording.relative[run, link]
+    factors = drive_factors(recording, run, (steps[order], member), link, relative, stds, sensors)
+    ids = [recording.ids[m] for m in member]
+    names = ids if length == 1 else [f"{name}@{s}" for name, s in zip(ids, steps[order], strict=True)]
+    return tuple(names), factors, tuple(np.flatnonzero(member == column).tolist())
 
 
 def _check(recording: Recording, step: int, length: int, run: int) -> None:
