@@ -13,6 +13,7 @@ from coopoc.errors import InputError
 from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.poses.pose_filter import PoseFilter
+from coopoc.methods.poses.pose_inputs import SPREAD
 from coopoc.methods.poses.pose_start import pose_start
 from coopoc.world.body_frames import midway, turned
 from coopoc.world.links import spherical, stretches, wrap
@@ -20,6 +21,8 @@ from coopoc.world.recording import Recording
 
 from .read import Log
 
+SURE = (0.05, 0.05, 0.01, 0.05)
+"""m and rad, of first poses that the truth gives."""
 GATE = 5.0
 """Of the pose filters that check a log: standard deviations beyond which a measurement is left out."""
 
@@ -75,9 +78,9 @@ def together(log: Log) -> tuple[Log, str]:
     return replace(log, recording=rec.between(first, last), truth=truth), span
 
 
-def begin_of(log: Log, gate: float = GATE) -> tuple[Floats | None, str]:
-    """First poses: those of fixes and compasses (None), those found in the first seconds, or the truth's; and which,
-    where it is the last.
+def begin_of(log: Log, gate: float = GATE) -> tuple[Floats | None, tuple[float, ...], str]:
+    """First poses: those of fixes and compasses (None), those found in the first seconds, or the truth's; their
+    standard deviations; and which, where it is the last.
 
     Args:
         log: in body frames, all vehicles there at its first step.
@@ -89,16 +92,16 @@ def begin_of(log: Log, gate: float = GATE) -> tuple[Floats | None, str]:
     rec, truth, moving = log.recording, log.truth, _moving(log.recording)
     assert rec.body is not None
     if np.isfinite(np.column_stack([rec.gnss[0, 0], rec.body.heading[0, 0]])[moving]).all():
-        return None, ""
+        return None, SPREAD, ""
     try:
-        return pose_start(rec, gate=gate), ""
+        return pose_start(rec, gate=gate), SPREAD, ""
     except InputError:
         if truth is None or truth.heading is None:
             raise
         poses = np.column_stack([truth.position[0], truth.heading[0]])
         if not np.isfinite(poses[moving]).all():
             raise
-        return poses, ", from the truth's first poses"
+        return poses, SURE, ", from the truth's first poses"
 
 
 def _moving(rec: Recording) -> list[int]:
@@ -118,8 +121,9 @@ def filtered(log: Log) -> Check:
     marks = list(rec.landmarks)
     x[:, marks], variance[:, marks] = rec.gnss[0][:, marks], 0.0
     if body:
-        begin, start = begin_of(log)
-        parts = [(0, steps, PoseFilter("solo", gate=GATE, begin=begin)(rec, _moving(rec)))]
+        begin, spread, start = begin_of(log)
+        filter_ = PoseFilter("solo", gate=GATE, begin=begin, spread=spread)
+        parts = [(0, steps, filter_(rec, _moving(rec)))]
     else:
         stretches = [(column, *stretch) for column in range(vehicles) for stretch in rec.stretches(column)]
         parts = [
