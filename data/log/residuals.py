@@ -41,9 +41,13 @@ class Check:
         normalised: (T, N), 1 on average if the assumed noise is right.
         relative: (L, 3) m, rad, rad: measured less computed from the filters.
         expected: (L, 3) standard deviations that these should have.
+        lasting: (2, N, 2) scale error of speeds and bias of yaw rates rad/s as the filters end, and their deviations.
+        ahead: (N,) s, of clocks, 0 where none is sure.
+        unsure: (N,) s, standard errors of these.
         vehicles: table, a row per vehicle.
         measurements: table, a row per kind of relative measurement.
         warnings: sentences.
+        unseen: what could not be seen.
     """
 
     log: Log
@@ -55,9 +59,13 @@ class Check:
     normalised: Floats
     relative: Floats
     expected: Floats
+    lasting: Floats
+    ahead: Floats
+    unsure: Floats
     vehicles: Sequence[Mapping[str, Any]] = ()
     measurements: Sequence[Mapping[str, Any]] = ()
     warnings: tuple[str, ...] = ()
+    unseen: tuple[str, ...] = ()
 
 
 def together(log: Log) -> tuple[Log, str]:
@@ -118,7 +126,7 @@ def filtered(log: Log) -> Check:
     steps, vehicles, links = len(rec.t), len(rec.ids), rec.links
     x, variance, fix = (np.full((steps, vehicles, 3), np.nan) for _ in range(3))
     normalised, heading, heading_variance = np.full((steps, vehicles), np.nan), *np.zeros((2, steps, vehicles))
-    marks = list(rec.landmarks)
+    marks, lasting = list(rec.landmarks), np.full((2, vehicles, 2), np.inf)
     x[:, marks], variance[:, marks] = rec.gnss[0][:, marks], 0.0
     if body:
         begin, spread, start = begin_of(log)
@@ -137,6 +145,8 @@ def filtered(log: Log) -> Check:
         x[there, columns], fix[there, columns] = track.x[0], fix_innovations(track, part)[0]
         variance[there, columns] = np.diagonal(track.covariance[0], axis1=-2, axis2=-1)
         normalised[there, columns] = squares[0]
+        for k, name in enumerate(("speed_scale", "yaw_rate_bias") if track.extras else ()):
+            lasting[:, columns, k] = track.extras[name][0, -1], track.extras[f"{name}_std"][0, -1]
         if track.heading is not None and track.heading_covariance is not None:
             heading[there, columns] = track.heading[0]
             heading_variance[there, columns] = track.heading_covariance[0, ..., 3]
@@ -152,7 +162,9 @@ def filtered(log: Log) -> Check:
     expected[:, 1] += heading_variance[links.step, links.observer]
     expected += np.square([noise.range_std, noise.world_azimuth_std, noise.inclination_std])
     log = replace(log, recording=rec)
-    return Check(log, span + start, world, x, variance, fix, normalised, residual, np.sqrt(expected))
+    none, known = np.zeros(vehicles), np.full(vehicles, np.inf)
+    expected = np.sqrt(expected)
+    return Check(log, span + start, world, x, variance, fix, normalised, residual, expected, lasting, none, known)
 
 
 def residual_of(world: Recording, x: Floats) -> tuple[Floats, Floats]:

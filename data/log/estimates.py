@@ -1,0 +1,211 @@
+"""Errors of a log's clocks, odometry, antennas and pairs, with standard errors by parts of the drive."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+
+from coopoc.arrays import AnyArray, Floats, Ints
+from coopoc.world.links import wrap
+from coopoc.world.recording import Recording
+
+from .motion import MOVING
+from .residuals import Check, filtered, residual_of
+
+SURELY = 4.0
+"""Standard errors beyond which an estimate is no chance: one of hundreds that a few logs ask for lies beyond three."""
+ENOUGH = 20
+"""Measurements from which a statistic is worth a word."""
+FAR = 10.0
+"""Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
+OUTLYING, BLOCKS = 5.0, 10
+"""Medians of the residuals beyond which one is left out; parts of a drive that show how sure an estimate is."""
+VARIED, NUDGE = 0.15, 0.01
+"""Standard deviation over mean of a speed below which an arm ahead and a late clock look alike; m and s by which fixes
+are moved to see what a filter makes of an arm."""
+
+
+class Estimate(NamedTuple):
+    """Numbers (k,) and their standard errors, infinite where nothing shows them."""
+
+    value: Floats
+    error: Floats
+
+
+def factors(y: AnyArray, x: AnyArray, groups: Ints | None = None, reference: int | None = None) -> Estimate:
+    """Factors of causes x (M, k) that explain y (M,) best, outliers aside, with standard errors by parts that are left
+    out; less the means of groups (M,), and less the factor of a reference if any.
+
+    >>> time = np.arange(40.0)
+    >>> factors(3 * time + 7, time[:, None], np.zeros(40, int)).value.round(6).tolist()
+    [3.0]
+    """
+    none = Estimate(np.zeros(x.shape[1]), np.full(x.shape[1], np.inf))
+    if len(y) < ENOUGH:
+        return none
+    if groups is not None:
+        both = pd.DataFrame(np.column_stack([y, x]))
+        both = both - both.groupby(groups).transform("mean")
+        y, x = both[0].to_numpy(), both.to_numpy()[:, 1:]
+
+    def fitted(rows: Ints) -> Floats:
+        for _ in range(3):
+            left, right = (np.concatenate([each[rows].real, each[rows].imag]) for each in (x, y))
+            factor: Floats = np.linalg.lstsq(left, right)[0]
+            gap = np.abs(y - x @ factor)
+            rows = rows[gap[rows] <= OUTLYING * np.median(gap[rows])]
+        return factor - (0.0 if reference is None else factor[reference])
+
+    every = np.arange(len(y))
+    without = [fitted(np.setdiff1d(every, part)) for part in np.array_split(every, BLOCKS)]
+    error = np.sqrt(BLOCKS - 1.0) * np.std(without, axis=0)
+    return Estimate(fitted(every), np.where(np.any(x, axis=0), error, np.inf))
+
+
+def causes(c: Check) -> tuple[AnyArray, AnyArray]:
+    """What fixes are off by, x + iy m (T, N), and what an arm of 1 m ahead, one to the left, and a clock that is 1 s
+    late make of it (3, T, N): against the truth, else against a filter, which is linear in what is added to fixes."""
+    rec, truth = c.world, c.log.truth
+    velocity = (rec.velocity[0] if truth is None else truth.velocity)[..., :2] @ [1, 1j]
+    speed = pd.DataFrame(np.abs(velocity)).where(lambda v: v > MOVING)
+    course = pd.DataFrame(np.angle(velocity)).where(speed > 0).ffill().bfill().to_numpy()
+    ahead = np.nan_to_num(np.exp(1j * course)) * np.array(speed.std() > VARIED * speed.mean())
+    made = np.stack([ahead, 1j * ahead, velocity])
+    if truth is not None:
+        return (rec.gnss[0] - truth.position)[..., :2] @ [1, 1j], made
+    for k, cause in enumerate(np.nan_to_num(NUDGE * made)):
+        gnss = c.log.recording.gnss + np.stack([cause.real, cause.imag, 0 * cause.real], axis=-1)
+        moved = filtered(replace(c.log, recording=replace(c.log.recording, gnss=gnss)))
+        made[k] = (moved.fix - c.fix)[..., :2] @ [1, 1j] / NUDGE
+    return c.fix[..., :2] @ [1, 1j], made
+
+
+def moves(rec: Recording, column: int) -> tuple[AnyArray, AnyArray]:
+    """Displacements (M,) m, x + iy, of the fixes and of the odometry over the same spans, in which the odometry (if
+    that stands still, the fixes) moves far; none where too little moves."""
+    fixes, velocity = rec.gnss[0, :, column, :2] @ [1, 1j], rec.velocity[0, :, column, :2] @ [1, 1j]
+    path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
+    for places, far in ((path, FAR), (fixes, 2 * FAR)):
+        pairs, last = [], -1
+        for step in np.flatnonzero(np.isfinite(fixes)).tolist():
+            if last < 0 or gaps[step] != gaps[last]:
+                last = step
+            elif abs(places[step] - places[last]) > far * np.hypot(*rec.sensors.fix_std[:2]):
+                pairs.append((last, step))
+                last = step
+        if len(pairs) >= 3:
+            a, b = np.array(pairs).T
+            return fixes[b] - fixes[a], path[b] - path[a]
+    return np.empty(0), np.empty(0)
+
+
+def odometry(c: Check, column: int) -> Estimate:
+    """By what share a vehicle's speeds are too large, and by what its directions are turned, rad; in body frames what
+    its yaw rates are too large by, rad/s: against the truth, else the fixes, in body frames else the filter."""
+    rec, truth, body = c.world, c.log.truth, c.log.recording.body
+    if rec.sensors.velocity_reading == "fixes":
+        return Estimate(np.zeros(2), np.full(2, np.inf))
+    if truth is None and body is not None:
+        return Estimate(*c.lasting[:, column])
+    if truth is None:
+        moved, driven = moves(rec, column)
+        found = factors(driven, np.stack([moved, 1j * moved], axis=1))
+        return Estimate(_polar(found.value), found.error)
+    true = truth.velocity[:, column, :2] @ [1, 1j]
+    odometer = rec.velocity[0, :, column, :2] @ [1, 1j]
+    if body is not None:
+        odometer = c.log.recording.velocity[0, :, column, 0].astype(complex)
+        heading = None if truth.heading is None else truth.heading[:, column]
+        true = (np.abs(true) if heading is None else (true * np.exp(-1j * heading)).real).astype(complex)
+    x = np.stack([true, 1j * true, np.gradient(true, rec.dt)], axis=1)
+    known = np.isfinite(odometer + x.sum(axis=1)) & (np.arange(len(true)) > 0)
+    found = factors(odometer[known], x[known])
+    value, error = _polar(found.value), found.error[:2]
+    if body is not None:
+        error[1] = np.inf
+        if truth.heading is not None:
+            gap = body.yaw_rate[0, 1:, column] - wrap(np.diff(truth.heading[:, column])) / rec.dt
+            value[1], error[1] = median(gap[np.isfinite(gap)])
+    return Estimate(value, error)
+
+
+def _polar(factor: Floats) -> Floats:
+    """Excess of the size of factor[0] + i factor[1], and its angle, rad."""
+    turned = complex(*factor[:2])
+    return np.array([abs(turned) - 1.0, np.angle(turned)]) if turned else np.zeros(2)
+
+
+def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
+    """By what each vehicle's clock is ahead of that of a reference, by default of the one in the middle, s (N,), and
+    what a range or direction misses for 1 s of each (L, 2, N).
+
+    Where i measures j, whose stamps are d s ahead of i's, it is u v_j d longer than between the filters, u being the
+    unit vector from i to j.
+    """
+    links, size = c.world.links, len(c.world.ids)
+    gap, _ = residual_of(c.world, c.x)
+    flat = np.maximum(np.linalg.norm(gap[:, :2], axis=1), 1.0)
+    velocity = np.nan_to_num(c.world.velocity[0, links.step, links.neighbour])
+    along = (gap * velocity).sum(axis=1) / np.maximum(np.linalg.norm(gap, axis=1), 1.0)
+    across = (gap[:, 0] * velocity[:, 1] - gap[:, 1] * velocity[:, 0]) / flat**2
+    ends = np.eye(size)[links.neighbour] - np.eye(size)[links.observer]
+    made = np.stack([along, across], axis=1)[..., None] * ends[:, None]
+    there = np.isfinite(c.relative[:, 0] + along)
+    pairs = np.sort([links.observer, links.neighbour], axis=0)
+    given = c.relative[there, 0], made[there, 0], (pairs[0] * size + pairs[1])[there]
+    found = factors(*given)
+    seen = np.flatnonzero(np.isfinite(found.error))
+    if reference is None and len(seen):
+        reference = int(seen[np.argmin(np.abs(found.value[seen] - np.median(found.value[seen])))])
+    return factors(*given, reference), made
+
+
+def median(values: Floats) -> tuple[float, float]:
+    """Median, and its standard error by the medians of parts of the drive; infinite of too few."""
+    if len(values) < ENOUGH:
+        return 0.0, np.inf
+    parts = [np.median(part) for part in np.array_split(values, BLOCKS)]
+    return float(np.median(values)), float(np.std(parts) / np.sqrt(BLOCKS - 1.0))
+
+
+def by_pair(c: Check, k: int) -> Iterator[tuple[str, Floats, Floats]]:
+    """Names of a pair, its residuals of one kind in order of time, and what they should scatter by."""
+    links, ids = c.world.links, c.world.ids
+    there = np.isfinite(c.relative[:, k])
+    ends = np.column_stack([links.observer, links.neighbour])[there]
+    pairs, index = np.unique(ends if k else np.sort(ends), axis=0, return_inverse=True)
+    for number, (observer, neighbour) in enumerate(pairs.tolist()):
+        mine = np.flatnonzero(there)[index.reshape(-1) == number]
+        yield f"{ids[observer]} {'to' if k else 'and'} {ids[neighbour]}", c.relative[mine, k], c.expected[mine, k]
+
+
+def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
+    """Pairs -> the median of their residuals of one kind, and its standard error: by parts of the drive, and by the
+    errors of the filters, which last for some time."""
+    made, fixes, noise = {}, np.isfinite(c.normalised).sum(axis=0), float(np.square(c.world.sensors.fix_std[:2]).mean())
+    there = np.isfinite(c.variance[..., 0]).sum(axis=0)
+    variance = np.nansum(c.variance[..., :2], axis=(0, 2)) / np.maximum(2 * there, 1)
+    share = 2 * np.nanmax((variance + noise) / np.maximum(variance * fixes, 1e-12), where=variance > 0, initial=0.0)
+    for pair, value, expected in by_pair(c, k):
+        (offset, error), position = median(value), max(float(np.mean(expected**2)) - stated**2, 0.0)
+        lasting = stated**2 / len(value) + position * min(share, 1.0)
+        made[pair] = offset, float(np.sqrt(error**2 + lasting))
+    return made
+
+
+def against_truth(c: Check) -> Check:
+    """The same, with ranges against the truth where both ends have one, or one stands as a landmark."""
+    truth, noise = c.log.truth, c.world.sensors
+    if truth is None:
+        return c
+    marks = np.isin(np.arange(len(c.world.ids)), c.world.landmarks)
+    x = np.where(marks[:, None], c.x, truth.position)
+    residual = residual_of(c.world, x)[1][:, 0]
+    known = np.isfinite(residual)
+    relative, expected = c.relative.copy(), c.expected.copy()
+    relative[known, 0], expected[known, 0] = residual[known], noise.range_std
+    return replace(c, relative=relative, expected=expected)
