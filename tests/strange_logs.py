@@ -49,7 +49,8 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
         values = values + noise.normal(0, std, values.shape)
         columns = dict(zip(kinds, values.T, strict=True)) | {f"{one}_std": stated * std for one in kinds}
         now = times + fault.get("clocks", {}).get(name, 0.0)
-        tables.append(pd.DataFrame({"t": now, "vehicle": name, **columns, **more}))
+        frame = pd.DataFrame({"t": now, "vehicle": name, **columns, **more})
+        tables.append(frame[frame[kinds[0]].gt(0) | (kinds[0] != "range")])
 
     for k, name in enumerate(names):
         fixed, moved, ranged = (np.arange(1 + 0.01 * k, seconds - 1, 1 / hertz / rate) for hertz in rates)
@@ -67,7 +68,7 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
             add(name, moved, ["yaw_rate"], turn, 0.01)
         if cars:
             add(name, moved, ["heading"], at(course[name], moved), 0.01)
-        for other in names[k - 1 : k] if cars else place.keys() - {name}:
+        for other in names[k - 1 : k] if cars else [one for one in place if one != name]:
             gap = at(place[other], ranged) - at(place[name], ranged)
             pairs, unit = fault.get("pairs", {}), fault.get("unit", 1.0)
             far = np.linalg.norm(gap, axis=1, keepdims=True) + pairs.get((name, other), pairs.get((other, name), 0.0))

@@ -116,7 +116,8 @@ def _on_time(c: Check) -> Check:
     ahead = np.where((np.abs(found.value) > np.maximum(SURELY * found.error, LATE)), found.value, 0.0)
     relative = c.relative.copy()
     relative[:, :2] -= np.nan_to_num(made @ ahead)
-    return replace(c, relative=relative, ahead=ahead, unsure=found.error)
+    slack = np.nan_to_num(made * np.where(ahead, found.error, 0.0))
+    return replace(c, relative=relative, ahead=ahead, unsure=found.error, slack=slack)
 
 
 def _vehicles(c: Check) -> list[dict[str, Any]]:
@@ -231,7 +232,7 @@ def _measurements(c: Check) -> list[dict[str, Any]]:
         if not there.any() or np.ptp(c.log.recording.relative[0, there, k]) == 0:
             continue
         named = {pair: offset for pair, offset, _ in _named(c, k, float(c.world.sensors.relative_std[k]))}
-        less = np.concatenate([value - named.get(pair, 0.0) for pair, value, _ in by_pair(c, k)])
+        less = np.concatenate([value - named.get(pair, 0.0) for pair, value, *_ in by_pair(c, k)])
         std, median = robust_std(less), float(np.median(residual))
         row: dict[str, Any] = {"measurement": name, "unit": unit, "number": len(residual), "median": median}
         row |= {"robust_std": std, "stated_std": float(c.world.sensors.relative_std[k])}
@@ -260,8 +261,9 @@ def _of_rows(c: Check) -> list[str]:
 def _of_errors(c: Check) -> list[str]:
     """Vehicles whose filter errs by more than it states."""
     return [
-        f"{row['vehicle']}: its filter errs by {row['error_per_std']:.1f} times what it states in the tenth of the drive "
-        f"from {row['worst_at_s']:.3g} s on, by {row['error_m']:.3g} m in all: by what is named below, or noise is not as stated."
+        f"{row['vehicle']}: its filter errs by {row['error_per_std']:.1f} times what it states in the tenth of the "
+        f"drive from {row['worst_at_s']:.3g} s on, by {row['error_m']:.3g} m in all: by what is named below, or by "
+        "noise that is not as stated."
         for row in sorted(c.vehicles, key=lambda row: -(row.get("error_per_std") or 0.0))
         if (row.get("error_per_std") or 0.0) > CONFIDENT
     ]
@@ -326,8 +328,9 @@ def _beyond(row: Mapping[str, Any], name: str, least: float) -> bool:
 def _of_clocks(c: Check) -> list[str]:
     """Vehicles whose clocks differ from that of the others, by their relative measurements."""
     return [
-        f"{name}: its clock is {abs(ahead):.3f} +- {error:.3f} s {'ahead of' if ahead > 0 else 'behind'} the others' by "
-        f"relative measurements, or its fixes are {'late' if ahead > 0 else 'early'}. clock={name}:{ahead:.3f} mends it."
+        f"{name}: its clock is {abs(ahead):.3f} +- {error:.3f} s {'ahead of' if ahead > 0 else 'behind'} the others' "
+        f"by relative measurements, or its fixes are {'late' if ahead > 0 else 'early'}. "
+        f"clock={name}:{ahead:.3f} mends it."
         for name, ahead, error in zip(c.world.ids, c.ahead, c.unsure, strict=True)
         if ahead
     ]
@@ -352,7 +355,9 @@ def _of_fixes(c: Check) -> list[str]:
                     f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
                 )
                 break
-        if sure[2] and abs(lag := factor[2]) >= LATE and not c.ahead[column]:
+        if c.ahead[column]:
+            continue
+        if sure[2] and abs(lag := factor[2]) >= LATE:
             way = "ahead of" if lag > 0 else "behind"
             sentences.append(
                 f"{name}: its fixes are {abs(lag):.2f} s {way} the {'odometry' if truth is None else 'truth'} along "
@@ -468,7 +473,7 @@ def _other_angle(c: Check) -> str:
 def _scatter(c: Check, k: int, stated: float) -> dict[str, float]:
     """Standard deviation of measurements about the running median of their pair, and the share beyond 5 of them: errors
     of the filters last longer than that window."""
-    near = (value - pd.Series(value).rolling(WINDOW, 1, center=True).median() for _, value, _ in by_pair(c, k))
+    near = (value - pd.Series(value).rolling(WINDOW, 1, center=True).median() for _, value, *_ in by_pair(c, k))
     off = np.concatenate([*near])
     noise = robust_std(off)
     return {"noise": noise, "beyond_5_std": float(np.mean(np.abs(off) > OUTLYING * max(noise, 0.2 * stated)))}

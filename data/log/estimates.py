@@ -8,8 +8,9 @@ from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy  # its signals take half a second, and are imported where they are used
 
-from coopoc.arrays import AnyArray, Floats, Ints
+from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.world.links import wrap
 from coopoc.world.recording import Recording
 
@@ -113,8 +114,11 @@ def odometry(c: Check, column: int) -> Estimate:
         return Estimate(*c.lasting[:, column])
     if truth is None:
         moved, driven = moves(rec, column)
-        found = factors(driven, np.stack([moved, 1j * moved], axis=1))
-        return Estimate(_polar(found.value), found.error)
+        found = factors(moved, np.stack([driven, 1j * driven], axis=1))
+        noise = rec.sensors.velocity_std(rec.velocity[0, :, column, :2], rec.sensors.velocity_floor) * rec.dt
+        flatter = 1.0 + float(np.nansum(noise**2)) / max(float(np.square(np.abs(driven)).sum()), 1e-12)
+        value = complex(*found.value) * flatter  # noise of a cause makes its factor smaller
+        return Estimate(_polar(np.array([(1 / value).real, (1 / value).imag])) if value else found.value, found.error)
     true = truth.velocity[:, column, :2] @ [1, 1j]
     odometer = rec.velocity[0, :, column, :2] @ [1, 1j]
     if body is not None:
@@ -161,7 +165,34 @@ def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
     seen = np.flatnonzero(np.isfinite(found.error))
     if reference is None and len(seen):
         reference = int(seen[np.argmin(np.abs(found.value[seen] - np.median(found.value[seen])))])
-    return factors(*given, reference), made
+    found = factors(*given, reference)
+    return found._replace(error=np.hypot(found.error, _of_filters(c, there, *given[1:], reference))), made
+
+
+def _of_filters(c: Check, there: Bools, x: Floats, pairs: Ints, reference: int | None) -> Floats:
+    """Standard errors (N,) of factors of causes x (M, N), less means of pairs (M,), by errors of the filters that decay
+    in the time that a fix is remembered."""
+    x = x - pd.DataFrame(x).groupby(pairs).transform("mean").to_numpy()
+    gain = x @ np.linalg.pinv(x.T @ x)
+    gain = gain if reference is None else gain - gain[:, [reference]]
+    keep = np.exp(-2.0 / max(share(c) * len(c.world.t), 1e-9))
+    position = np.maximum(c.expected[there, 0] ** 2 - c.world.sensors.range_std**2, 0.0)
+    variance = np.zeros(x.shape[1])
+    for pair in np.unique(pairs):
+        mine = pairs == pair
+        line = np.zeros((len(c.world.t), x.shape[1]))
+        np.add.at(line, c.world.links.step[there][mine], gain[mine] * np.sqrt(position[mine, None]))
+        variance += (2 * line * scipy.signal.lfilter([1.0], [1.0, -keep], line, axis=0) - line**2).sum(axis=0)
+    return np.sqrt(np.maximum(variance, 0.0))
+
+
+def share(c: Check) -> float:
+    """Share of the variance of filters that the mean over the drive keeps: their errors last for some time."""
+    fixes, noise = np.isfinite(c.normalised).sum(axis=0), float(np.square(c.world.sensors.fix_std[:2]).mean())
+    there = np.isfinite(c.variance[..., 0]).sum(axis=0)
+    variance = np.nansum(c.variance[..., :2], axis=(0, 2)) / np.maximum(2 * there, 1)
+    ratio = (variance + noise) / np.maximum(variance * fixes, 1e-12)
+    return min(2 * float(np.nanmax(ratio, where=variance > 0, initial=0.0)), 1.0)
 
 
 def median(values: Floats) -> tuple[float, float]:
@@ -172,40 +203,45 @@ def median(values: Floats) -> tuple[float, float]:
     return float(np.median(values)), float(np.std(parts) / np.sqrt(BLOCKS - 1.0))
 
 
-def by_pair(c: Check, k: int) -> Iterator[tuple[str, Floats, Floats]]:
-    """Names of a pair, its residuals of one kind in order of time, and what they should scatter by."""
+def by_pair(c: Check, k: int) -> Iterator[tuple[str, Floats, Floats, Floats]]:
+    """Names of a pair, its residuals of one kind in order of time, what they should scatter by, and what a standard
+    error of each clock that was taken off makes of them (M, N)."""
     links, ids = c.world.links, c.world.ids
     there = np.isfinite(c.relative[:, k])
     ends = np.column_stack([links.observer, links.neighbour])[there]
     pairs, index = np.unique(ends if k else np.sort(ends), axis=0, return_inverse=True)
     for number, (observer, neighbour) in enumerate(pairs.tolist()):
         mine = np.flatnonzero(there)[index.reshape(-1) == number]
-        yield f"{ids[observer]} {'to' if k else 'and'} {ids[neighbour]}", c.relative[mine, k], c.expected[mine, k]
+        yield (
+            f"{ids[observer]} {'to' if k else 'and'} {ids[neighbour]}",
+            c.relative[mine, k],
+            c.expected[mine, k],
+            c.slack[mine, min(k, 1)],
+        )
 
 
 def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
     """Pairs -> the median of their residuals of one kind, and its standard error: by parts of the drive, and by the
-    errors of the filters, which last for some time."""
-    made, fixes, noise = {}, np.isfinite(c.normalised).sum(axis=0), float(np.square(c.world.sensors.fix_std[:2]).mean())
-    there = np.isfinite(c.variance[..., 0]).sum(axis=0)
-    variance = np.nansum(c.variance[..., :2], axis=(0, 2)) / np.maximum(2 * there, 1)
-    share = 2 * np.nanmax((variance + noise) / np.maximum(variance * fixes, 1e-12), where=variance > 0, initial=0.0)
-    for pair, value, expected in by_pair(c, k):
+    errors of the filters and of the clocks that were taken off, which last."""
+    made, lasts = {}, share(c)
+    for pair, value, expected, slack in by_pair(c, k):
         (offset, error), position = median(value), max(float(np.mean(expected**2)) - stated**2, 0.0)
-        lasting = stated**2 / len(value) + position * min(share, 1.0)
+        lasting = (
+            stated**2 / len(value) + position * lasts + float(np.abs(slack.mean(axis=0)) @ np.abs(slack.mean(axis=0)))
+        )
         made[pair] = offset, float(np.sqrt(error**2 + lasting))
     return made
 
 
 def against_truth(c: Check) -> Check:
-    """The same, with ranges against the truth where both ends have one, or one stands as a landmark."""
+    """The same, with ranges, and in the world directions, against the truth where both ends have one, or one stands as
+    a landmark."""
     truth, noise = c.log.truth, c.world.sensors
     if truth is None:
         return c
     marks = np.isin(np.arange(len(c.world.ids)), c.world.landmarks)
     x = np.where(marks[:, None], c.x, truth.position)
-    residual = residual_of(c.world, x)[1][:, 0]
-    known = np.isfinite(residual)
-    relative, expected = c.relative.copy(), c.expected.copy()
-    relative[known, 0], expected[known, 0] = residual[known], noise.range_std
+    residual, stated = residual_of(c.world, x)[1], [noise.range_std, noise.world_azimuth_std, noise.inclination_std]
+    known = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)
+    relative, expected = (np.where(known, new, old) for new, old in ((residual, c.relative), (stated, c.expected)))
     return replace(c, relative=relative, expected=expected)

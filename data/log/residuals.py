@@ -44,6 +44,7 @@ class Check:
         lasting: (2, N, 2) scale error of speeds and bias of yaw rates rad/s as the filters end, and their deviations.
         ahead: (N,) s, of clocks, 0 where none is sure.
         unsure: (N,) s, standard errors of these.
+        slack: (L, 2, N) m and rad, of ranges and directions, that a standard error of each clock taken off makes.
         vehicles: table, a row per vehicle.
         measurements: table, a row per kind of relative measurement.
         warnings: sentences.
@@ -62,6 +63,7 @@ class Check:
     lasting: Floats
     ahead: Floats
     unsure: Floats
+    slack: Floats
     vehicles: Sequence[Mapping[str, Any]] = ()
     measurements: Sequence[Mapping[str, Any]] = ()
     warnings: tuple[str, ...] = ()
@@ -164,7 +166,10 @@ def filtered(log: Log) -> Check:
     log = replace(log, recording=rec)
     none, known = np.zeros(vehicles), np.full(vehicles, np.inf)
     expected = np.sqrt(expected)
-    return Check(log, span + start, world, x, variance, fix, normalised, residual, expected, lasting, none, known)
+    slack = np.zeros((len(links), 2, vehicles))
+    return Check(
+        log, span + start, world, x, variance, fix, normalised, residual, expected, lasting, none, known, slack
+    )
 
 
 def residual_of(world: Recording, x: Floats) -> tuple[Floats, Floats]:
