@@ -99,7 +99,12 @@ def check(log: Log) -> Check:
     result = _on_time(filtered(log))
     if not any(result.ahead):
         result = against_truth(result)
-    result = replace(result, vehicles=_vehicles(result), measurements=_measurements(result))
+    result = replace(result, vehicles=_vehicles(result))
+    if log.truth is None or any(result.ahead):  # what errs itself says nothing about whom it measures
+        errs = [result.world.ids.index(row["vehicle"]) for row in result.vehicles if _off(row)]
+        ends = np.isin([result.world.links.observer, result.world.links.neighbour], errs).any(axis=0)
+        result = replace(result, relative=np.where(ends[:, None], np.nan, result.relative))
+    result = replace(result, measurements=_measurements(result))
     sentences = [sentence for rule in CHECKS for sentence in rule(result)]
     return replace(result, warnings=tuple(sentences), unseen=tuple(_unseen(result)))
 
@@ -141,12 +146,13 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
             "turned_deg": turn,
             **_with_error("speed_excess", wheels, 0),
             **_with_error("turned" if c.log.recording.body is None else "yaw_rate_bias", wheels, 1),
+            **(_with_error("late_s", wheels, 2) if truth is not None else {}),
             "clock_s": float(c.ahead[column]) if np.isfinite(c.unsure[column]) else None,
             "std_m": _rms(np.sqrt(c.variance[:, column])),
         }
         if truth is not None:
             row["fix_error_m"] = _rms(rec.gnss[0, :, column] - truth.position[:, column])
-            row["error_m"] = _rms(c.x[:, column] - truth.position[:, column])
+            row["error_m"] = _rms(c.scored[0][:, column] - truth.position[:, column])
             row["error_per_std"], row["worst_at_s"] = _worst(c, column)
         rows.append(row)
     return rows
@@ -165,8 +171,8 @@ def _worst(c: Check, column: int) -> tuple[float | None, float]:
     begins, s."""
     assert c.log.truth is not None
     size, t = dimensions(c.world), c.world.t
-    square = np.square(c.x - c.log.truth.position)[:, column, :size]
-    stated = np.where(np.isfinite(square), c.variance[:, column, :size], np.nan)
+    square, stated = np.square(c.scored[0] - c.log.truth.position)[:, column, :size], c.scored[1][:, column, :size]
+    stated = np.where(np.isfinite(square), stated, np.nan)
     worst, when = None, 0.0
     for part in np.array_split(np.arange(len(t)), BLOCKS):
         if np.isfinite(square[part]).any() and (all_of := np.nansum(stated[part])) > 0:
@@ -325,6 +331,11 @@ def _beyond(row: Mapping[str, Any], name: str, least: float) -> bool:
     return abs(row.get(name) or 0.0) > max(least, SURELY * (row.get(f"{name}_error") or 0.0))
 
 
+def _off(row: Mapping[str, Any]) -> bool:
+    """Whether the odometry of a row errs."""
+    return any(_beyond(row, *one) for one in (("speed_excess", SCALE), ("turned", TURNED), ("yaw_rate_bias", DRIFT)))
+
+
 def _of_clocks(c: Check) -> list[str]:
     """Vehicles whose clocks differ from that of the others, by their relative measurements."""
     return [
@@ -333,6 +344,11 @@ def _of_clocks(c: Check) -> list[str]:
         f"clock={name}:{ahead:.3f} mends it."
         for name, ahead, error in zip(c.world.ids, c.ahead, c.unsure, strict=True)
         if ahead
+    ] + [
+        f"{row['vehicle']}: its odometry is {row['late_s']:.3f} +- {row['late_s_error']:.3f} s later than the truth: "
+        f"its clock differs from that of the truth. clock={row['vehicle']}:{row['late_s']:.3f} mends it."
+        for row in c.vehicles
+        if _beyond(row, "late_s", LATE) and not c.ahead[c.world.ids.index(row["vehicle"])]
     ]
 
 
@@ -355,7 +371,8 @@ def _of_fixes(c: Check) -> list[str]:
                     f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
                 )
                 break
-        if c.ahead[column]:
+        late = next((row for row in c.vehicles if row["vehicle"] == name and _beyond(row, "late_s", LATE)), {})
+        if c.ahead[column] or late:
             continue
         if sure[2] and abs(lag := factor[2]) >= LATE:
             way = "ahead of" if lag > 0 else "behind"
@@ -491,7 +508,8 @@ def _unseen(c: Check) -> list[str]:
         errors = {row["vehicle"]: SURELY * row.get(f"{name}_error", np.inf) for row in c.vehicles}
         if blind := _below(errors, 2 * least):
             sentences.append(f"errors, {what} of {blind}")
-    if blind := _below({who: SURELY * c.unsure[c.world.ids.index(who)] for who in every}, 2 * LATE):
+    late = {row["vehicle"]: row.get("late_s_error", np.inf) for row in c.vehicles}
+    if blind := _below({who: SURELY * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LATE):
         sentences.append(f"errors, s, of the clocks of {blind}")
     known = np.isfinite(c.fix[..., 0]).sum(axis=0)
     if blind := [who for who in every if known[c.world.ids.index(who)] < ENOUGH]:

@@ -19,6 +19,8 @@ from .residuals import Check, filtered, residual_of
 
 SURELY = 4.0
 """Standard errors beyond which an estimate is no chance: one of hundreds that a few logs ask for lies beyond three."""
+ALIKE = 0.02
+"""s, of clocks that agree."""
 ENOUGH = 20
 """Measurements from which a statistic is worth a word."""
 FAR = 10.0
@@ -106,10 +108,11 @@ def moves(rec: Recording, column: int) -> tuple[AnyArray, AnyArray]:
 
 def odometry(c: Check, column: int) -> Estimate:
     """By what share a vehicle's speeds are too large, and by what its directions are turned, rad; in body frames what
-    its yaw rates are too large by, rad/s: against the truth, else the fixes, in body frames else the filter."""
+    its yaw rates are too large by, rad/s; and by what it is later than a truth, s: against the truth, else the fixes,
+    in body frames else the filter."""
     rec, truth, body = c.world, c.log.truth, c.log.recording.body
     if rec.sensors.velocity_reading == "fixes":
-        return Estimate(np.zeros(2), np.full(2, np.inf))
+        return Estimate(np.zeros(3), np.full(3, np.inf))
     if truth is None and body is not None:
         return Estimate(*c.lasting[:, column])
     if truth is None:
@@ -128,7 +131,7 @@ def odometry(c: Check, column: int) -> Estimate:
     x = np.stack([true, 1j * true, np.gradient(true, rec.dt)], axis=1)
     known = np.isfinite(odometer + x.sum(axis=1)) & (np.arange(len(true)) > 0)
     found = factors(odometer[known], x[known])
-    value, error = _polar(found.value), found.error[:2]
+    value, error = np.append(_polar(found.value), -found.value[2] / max(found.value[0], 0.1)), found.error
     if body is not None:
         error[1] = np.inf
         if truth.heading is not None:
@@ -144,7 +147,7 @@ def _polar(factor: Floats) -> Floats:
 
 
 def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
-    """By what each vehicle's clock is ahead of that of a reference, by default of the one in the middle, s (N,), and
+    """By what each vehicle's clock is ahead of that of a reference, by default of one that most agree with, s (N,), and
     what a range or direction misses for 1 s of each (L, 2, N).
 
     Where i measures j, whose stamps are d s ahead of i's, it is u v_j d longer than between the filters, u being the
@@ -164,7 +167,8 @@ def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
     found = factors(*given)
     seen = np.flatnonzero(np.isfinite(found.error))
     if reference is None and len(seen):
-        reference = int(seen[np.argmin(np.abs(found.value[seen] - np.median(found.value[seen])))])
+        apart = np.abs(np.subtract.outer(found.value[seen], found.value[seen]))
+        reference = int(seen[np.argmin((np.minimum(apart, ALIKE) + 1e-3 * apart).sum(axis=1))])
     found = factors(*given, reference)
     return found._replace(error=np.hypot(found.error, _of_filters(c, there, *given[1:], reference))), made
 

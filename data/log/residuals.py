@@ -45,6 +45,8 @@ class Check:
         ahead: (N,) s, of clocks, 0 where none is sure.
         unsure: (N,) s, standard errors of these.
         slack: (L, 2, N) m and rad, of ranges and directions, that a standard error of each clock taken off makes.
+        scored: x and variance that are held against the truth: in body frames those of the whole fleet's filter, since
+            one anchor alone leaves a vehicle's states open.
         vehicles: table, a row per vehicle.
         measurements: table, a row per kind of relative measurement.
         warnings: sentences.
@@ -64,6 +66,7 @@ class Check:
     ahead: Floats
     unsure: Floats
     slack: Floats
+    scored: tuple[Floats, Floats]
     vehicles: Sequence[Mapping[str, Any]] = ()
     measurements: Sequence[Mapping[str, Any]] = ()
     warnings: tuple[str, ...] = ()
@@ -130,10 +133,17 @@ def filtered(log: Log) -> Check:
     normalised, heading, heading_variance = np.full((steps, vehicles), np.nan), *np.zeros((2, steps, vehicles))
     marks, lasting = list(rec.landmarks), np.full((2, vehicles, 2), np.inf)
     x[:, marks], variance[:, marks] = rec.gnss[0][:, marks], 0.0
+    scored = x, variance
     if body:
         begin, spread, start = begin_of(log)
         filter_ = PoseFilter("solo", gate=GATE, begin=begin, spread=spread)
         parts = [(0, steps, filter_(rec, _moving(rec)))]
+        if log.truth is not None:
+            track = replace(filter_, unit="fleet")(rec, _moving(rec))
+            assert track.covariance is not None
+            scored = x.copy(), variance.copy()
+            scored[0][:, list(track.egos)] = track.x[0]
+            scored[1][:, list(track.egos)] = np.diagonal(track.covariance[0], axis1=-2, axis2=-1)
     else:
         stretches = [(column, *stretch) for column in range(vehicles) for stretch in rec.stretches(column)]
         parts = [
@@ -165,11 +175,8 @@ def filtered(log: Log) -> Check:
     expected += np.square([noise.range_std, noise.world_azimuth_std, noise.inclination_std])
     log = replace(log, recording=rec)
     none, known = np.zeros(vehicles), np.full(vehicles, np.inf)
-    expected = np.sqrt(expected)
-    slack = np.zeros((len(links), 2, vehicles))
-    return Check(
-        log, span + start, world, x, variance, fix, normalised, residual, expected, lasting, none, known, slack
-    )
+    stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting
+    return Check(log, span + start, world, *stats, none, known, np.zeros((len(links), 2, vehicles)), scored)
 
 
 def residual_of(world: Recording, x: Floats) -> tuple[Floats, Floats]:
