@@ -100,7 +100,7 @@ def check(log: Log) -> Check:
     if not any(result.ahead):
         result = against_truth(result)
     result = replace(result, vehicles=_vehicles(result))
-    if log.truth is None or any(result.ahead):  # what errs itself says nothing about whom it measures
+    if log.recording.body is None and (log.truth is None or any(result.ahead)):  # what errs says nothing of others
         errs = [result.world.ids.index(row["vehicle"]) for row in result.vehicles if _off(row)]
         ends = np.isin([result.world.links.observer, result.world.links.neighbour], errs).any(axis=0)
         result = replace(result, relative=np.where(ends[:, None], np.nan, result.relative))

@@ -237,14 +237,25 @@ def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
     return made
 
 
+def _beside(off: AnyArray, velocity: AnyArray) -> float:
+    """By what fixes that are off by (T,) m lie beside the truth, m, whatever they are late by; 0 where there are none."""
+    known = np.isfinite(off + velocity)
+    if not known.any():
+        return 0.0
+    x = np.column_stack([np.ones(known.sum()), velocity[known]])
+    return float(abs(np.linalg.lstsq(x, off[known])[0][0]))
+
+
 def against_truth(c: Check) -> Check:
-    """The same, with ranges, and in the world directions, against the truth where both ends have one, or one stands as
-    a landmark."""
+    """The same, with ranges, and in the world directions, against the truth where both ends have one that
+    their fixes fit, or one stands as a landmark."""
     truth, noise = c.log.truth, c.world.sensors
     if truth is None:
         return c
     marks = np.isin(np.arange(len(c.world.ids)), c.world.landmarks)
-    x = np.where(marks[:, None], c.x, truth.position)
+    off, (_, _, velocity) = causes(c)
+    fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * np.hypot(*noise.fix_std[:2])
+    x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
     residual, stated = residual_of(c.world, x)[1], [noise.range_std, noise.world_azimuth_std, noise.inclination_std]
     known = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)
     relative, expected = (np.where(known, new, old) for new, old in ((residual, c.relative), (stated, c.expected)))
