@@ -97,10 +97,10 @@ def check(log: Log) -> Check:
         InputError: in body frames, vehicles that share no two steps, or first poses that are not known.
     """
     result = _on_time(filtered(log))
-    if not any(result.ahead):
+    if not result.ahead.any():
         result = against_truth(result)
     result = replace(result, vehicles=_vehicles(result))
-    if log.recording.body is None and (log.truth is None or any(result.ahead)):  # what errs says nothing of others
+    if log.recording.body is None and (log.truth is None or result.ahead.any()):  # what errs says nothing of others
         errs = [result.world.ids.index(row["vehicle"]) for row in result.vehicles if _off(row)]
         ends = np.isin([result.world.links.observer, result.world.links.neighbour], errs).any(axis=0)
         result = replace(result, relative=np.where(ends[:, None], np.nan, result.relative))
@@ -328,7 +328,7 @@ def _of_vehicles(c: Check) -> list[str]:
 
 def _beyond(row: Mapping[str, Any], name: str, least: float) -> bool:
     """Whether an estimate of a row is larger than that, and than chance."""
-    return abs(row.get(name) or 0.0) > max(least, SURELY * (row.get(f"{name}_error") or 0.0))
+    return float(abs(row.get(name) or 0.0)) > max(least, SURELY * (row.get(f"{name}_error") or 0.0))
 
 
 def _off(row: Mapping[str, Any]) -> bool:
@@ -512,8 +512,8 @@ def _unseen(c: Check) -> list[str]:
     if blind := _below({who: SURELY * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LATE):
         sentences.append(f"errors, s, of the clocks of {blind}")
     known = np.isfinite(c.fix[..., 0]).sum(axis=0)
-    if blind := [who for who in every if known[c.world.ids.index(who)] < ENOUGH]:
-        sentences.append(f"late fixes of {', '.join(blind)}, and whether their deviations are right: too few fixes")
+    if few := [who for who in every if known[c.world.ids.index(who)] < ENOUGH]:
+        sentences.append(f"late fixes of {', '.join(few)}, and whether their deviations are right: too few fixes")
     sensors = c.world.sensors
     stated = {"fixes": sensors.gnss_std[0], "ranges": sensors.range_std}
     if near := [f"{name} ({std:.2g})" for name, std in stated.items() if 0.7 < std < 1.4]:
@@ -537,7 +537,7 @@ def less_offsets(log: Log) -> Log:
     """
     rec, until, by = log.recording, FIRST * float(np.ptp(log.recording.t)), "filters of each vehicle alone show"
     c = _on_time(filtered(log.part(until=until)))
-    if c.log.truth is not None and not any(c.ahead):
+    if c.log.truth is not None and not c.ahead.any():
         c, by = replace(against_truth(c), variance=0 * c.variance), "the truth shows"
         rec = replace(rec, sensors=replace(rec.sensors, range_offset_std=0.0))
     relative, ends = rec.relative.copy(), np.sort([rec.links.observer, rec.links.neighbour], axis=0)

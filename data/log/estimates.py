@@ -120,8 +120,8 @@ def odometry(c: Check, column: int) -> Estimate:
         found = factors(moved, np.stack([driven, 1j * driven], axis=1))
         noise = rec.sensors.velocity_std(rec.velocity[0, :, column, :2], rec.sensors.velocity_floor) * rec.dt
         flatter = 1.0 + float(np.nansum(noise**2)) / max(float(np.square(np.abs(driven)).sum()), 1e-12)
-        value = complex(*found.value) * flatter  # noise of a cause makes its factor smaller
-        return Estimate(_polar(np.array([(1 / value).real, (1 / value).imag])) if value else found.value, found.error)
+        turned = complex(*found.value) * flatter  # noise of a cause makes its factor smaller
+        return Estimate(_polar(1 / turned) if turned else found.value, found.error)
     true = truth.velocity[:, column, :2] @ [1, 1j]
     odometer = rec.velocity[0, :, column, :2] @ [1, 1j]
     if body is not None:
@@ -131,7 +131,7 @@ def odometry(c: Check, column: int) -> Estimate:
     x = np.stack([true, 1j * true, np.gradient(true, rec.dt)], axis=1)
     known = np.isfinite(odometer + x.sum(axis=1)) & (np.arange(len(true)) > 0)
     found = factors(odometer[known], x[known])
-    value, error = np.append(_polar(found.value), -found.value[2] / max(found.value[0], 0.1)), found.error
+    value, error = np.append(_polar(complex(*found.value[:2])), -found.value[2] / max(found.value[0], 0.1)), found.error
     if body is not None:
         error[1] = np.inf
         if truth.heading is not None:
@@ -140,9 +140,8 @@ def odometry(c: Check, column: int) -> Estimate:
     return Estimate(value, error)
 
 
-def _polar(factor: Floats) -> Floats:
-    """Excess of the size of factor[0] + i factor[1], and its angle, rad."""
-    turned = complex(*factor[:2])
+def _polar(turned: complex) -> Floats:
+    """Excess of its size over 1, and its angle, rad."""
     return np.array([abs(turned) - 1.0, np.angle(turned)]) if turned else np.zeros(2)
 
 
@@ -230,15 +229,13 @@ def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
     made, lasts = {}, share(c)
     for pair, value, expected, slack in by_pair(c, k):
         (offset, error), position = median(value), max(float(np.mean(expected**2)) - stated**2, 0.0)
-        lasting = (
-            stated**2 / len(value) + position * lasts + float(np.abs(slack.mean(axis=0)) @ np.abs(slack.mean(axis=0)))
-        )
+        lasting = stated**2 / len(value) + position * lasts + float(np.square(slack.mean(axis=0)).sum())
         made[pair] = offset, float(np.sqrt(error**2 + lasting))
     return made
 
 
 def _beside(off: AnyArray, velocity: AnyArray) -> float:
-    """By what fixes that are off by (T,) m lie beside the truth, m, whatever they are late by; 0 where there are none."""
+    """By what fixes that are off by (T,) m lie beside the truth, m, however late they are; 0 where there are none."""
     known = np.isfinite(off + velocity)
     if not known.any():
         return 0.0
