@@ -102,7 +102,8 @@ def check(log: Log) -> Check:
     result = replace(result, vehicles=_vehicles(result))
     if log.recording.body is None and (log.truth is None or result.ahead.any()):  # what errs says nothing of others
         errs = [result.world.ids.index(row["vehicle"]) for row in result.vehicles if _off(row)]
-        ends = np.isin([result.world.links.observer, result.world.links.neighbour], errs).any(axis=0)
+        links = result.world.links
+        ends = np.isin(links.observer, errs) | np.isin(links.neighbour, errs)
         result = replace(result, relative=np.where(ends[:, None], np.nan, result.relative))
     result = replace(result, measurements=_measurements(result))
     sentences = [sentence for rule in CHECKS for sentence in rule(result)]
@@ -348,7 +349,7 @@ def _of_clocks(c: Check) -> list[str]:
         f"{row['vehicle']}: its odometry is {row['late_s']:.3f} +- {row['late_s_error']:.3f} s later than the truth: "
         f"its clock differs from that of the truth. clock={row['vehicle']}:{row['late_s']:.3f} mends it."
         for row in c.vehicles
-        if _beyond(row, "late_s", LATE) and not c.ahead[c.world.ids.index(row["vehicle"])]
+        if _beyond(row, "late_s", max(LATE, 0.5 * c.world.dt)) and not c.ahead[c.world.ids.index(row["vehicle"])]
     ]
 
 
@@ -371,7 +372,14 @@ def _of_fixes(c: Check) -> list[str]:
                     f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
                 )
                 break
-        late = next((row for row in c.vehicles if row["vehicle"] == name and _beyond(row, "late_s", LATE)), {})
+        late = next(
+            (
+                row
+                for row in c.vehicles
+                if row["vehicle"] == name and _beyond(row, "late_s", max(LATE, 0.5 * c.world.dt))
+            ),
+            {},
+        )
         if c.ahead[column] or late:
             continue
         if sure[2] and abs(lag := factor[2]) >= LATE:
