@@ -18,10 +18,14 @@ from coopoc.world.recording import Recording
 
 from .estimates import (
     BLOCKS,
+    DRIFT,
     ENOUGH,
     FAR,
+    LATE,
     OUTLYING,
+    SCALE,
     SURELY,
+    TURNED,
     Estimate,
     against_truth,
     by_pair,
@@ -36,6 +40,7 @@ from .estimates import median as median_of
 from .motion import MOVING
 from .read import Log
 from .residuals import Check, filtered
+from .unseen import unseen
 
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
 WIDE, NARROW = 2.0, 0.4
@@ -62,10 +67,8 @@ FEW, APART = 5, 1.5
 """Fixes with a truth from which a difference of frames shows; standard deviations of a fix that it must have."""
 SIGMAS = 6.0
 """Standard errors of an offset beyond which it is no chance."""
-ARM, LATE = 0.2, 0.02
-"""m and s, least arm of an antenna and least error of a clock that are worth a word."""
-SCALE, TURNED, DRIFT = 0.01, 0.02, 2e-3
-"""Least errors of odometry that are worth a word: share of a speed, rad, rad/s."""
+ARM = 0.2
+"""m, least arm of an antenna that is worth a word."""
 CONFIDENT = 3.0
 """Errors over the deviations that a filter states, in a part of the drive, from which it is wrong."""
 OUTLIERS = 0.01
@@ -107,7 +110,7 @@ def check(log: Log) -> Check:
         result = replace(result, relative=np.where(ends[:, None], np.nan, result.relative))
     result = replace(result, measurements=_measurements(result))
     sentences = [sentence for rule in CHECKS for sentence in rule(result)]
-    return replace(result, warnings=tuple(sentences), unseen=tuple(_unseen(result)))
+    return replace(result, warnings=tuple(sentences), unseen=tuple(unseen(result)))
 
 
 def _on_time(c: Check) -> Check:
@@ -382,7 +385,8 @@ def _of_fixes(c: Check) -> list[str]:
         )
         if c.ahead[column] or late:
             continue
-        if sure[2] and abs(lag := factor[2]) >= LATE:
+        derived = truth is None and rec.sensors.velocity_reading == "fixes"
+        if sure[2] and abs(lag := factor[2]) >= LATE and not derived:
             way = "ahead of" if lag > 0 else "behind"
             sentences.append(
                 f"{name}: its fixes are {abs(lag):.2f} s {way} the {'odometry' if truth is None else 'truth'} along "
@@ -502,37 +506,6 @@ def _scatter(c: Check, k: int, stated: float) -> dict[str, float]:
     off = np.concatenate([*near])
     noise = robust_std(off)
     return {"noise": noise, "beyond_5_std": float(np.mean(np.abs(off) > OUTLYING * max(noise, 0.2 * stated)))}
-
-
-def _unseen(c: Check) -> list[str]:
-    """What the check could not see, and of whom."""
-    sentences, every = [], [row["vehicle"] for row in c.vehicles]
-    if c.log.truth is None:
-        sentences.append("errors that all sensors share, and a clock that is wrong for all alike: there is no truth")
-    turns = ("turned", TURNED, "rad, of the direction of the odometry")
-    if c.log.recording.body is not None:
-        turns = ("yaw_rate_bias", DRIFT, "rad/s, of the yaw rates")
-    for name, least, what in (("speed_excess", SCALE, "as a share, of the speeds"), turns):
-        errors = {row["vehicle"]: SURELY * row.get(f"{name}_error", np.inf) for row in c.vehicles}
-        if blind := _below(errors, 2 * least):
-            sentences.append(f"errors, {what} of {blind}")
-    late = {row["vehicle"]: row.get("late_s_error", np.inf) for row in c.vehicles}
-    if blind := _below({who: SURELY * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LATE):
-        sentences.append(f"errors, s, of the clocks of {blind}")
-    known = np.isfinite(c.fix[..., 0]).sum(axis=0)
-    if few := [who for who in every if known[c.world.ids.index(who)] < ENOUGH]:
-        sentences.append(f"late fixes of {', '.join(few)}, and whether their deviations are right: too few fixes")
-    sensors = c.world.sensors
-    stated = {"fixes": sensors.gnss_std[0], "ranges": sensors.range_std}
-    if near := [f"{name} ({std:.2g})" for name, std in stated.items() if 0.7 < std < 1.4]:
-        sentences.append(f"whether deviations of {', '.join(near)} are variances: both are near 1")
-    return sentences
-
-
-def _below(errors: Mapping[str, float], enough: float) -> str:
-    """Names of what is not known as well as enough, with what stays hidden."""
-    blind = {name: error for name, error in errors.items() if error > enough}
-    return ", ".join(f"{name} (below {error:.2g})" if np.isfinite(error) else name for name, error in blind.items())
 
 
 def less_offsets(log: Log) -> Log:

@@ -19,8 +19,8 @@ from .residuals import Check, filtered, residual_of
 
 SURELY = 4.0
 """Standard errors beyond which an estimate is no chance: one of hundreds that a few logs ask for lies beyond three."""
-ALIKE = 0.02
-"""s, of clocks that agree."""
+LATE, SCALE, TURNED, DRIFT = 0.02, 0.01, 0.02, 2e-3
+"""Least errors that are worth a word: of a clock, s; of odometry, share of a speed, rad, rad/s."""
 ENOUGH = 20
 """Measurements from which a statistic is worth a word."""
 FAR = 10.0
@@ -167,7 +167,7 @@ def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
     seen = np.flatnonzero(np.isfinite(found.error))
     if reference is None and len(seen):
         apart = np.abs(np.subtract.outer(found.value[seen], found.value[seen]))
-        reference = int(seen[np.argmin((np.minimum(apart, ALIKE) + 1e-3 * apart).sum(axis=1))])
+        reference = int(seen[np.argmin((np.minimum(apart, LATE) + 1e-3 * apart).sum(axis=1))])
     found = factors(*given, reference)
     return found._replace(error=np.hypot(found.error, _of_filters(c, there, *given[1:], reference))), made
 
