@@ -17,7 +17,6 @@ from coopoc.world.links import wrap
 from coopoc.world.recording import Recording
 
 from .estimates import (
-    BLOCKS,
     DRIFT,
     ENOUGH,
     FAR,
@@ -30,11 +29,12 @@ from .estimates import (
     against_truth,
     by_pair,
     causes,
-    clocks,
     factors,
     moves,
     odometry,
     offsets,
+    on_time,
+    worst,
 )
 from .estimates import median as median_of
 from .motion import MOVING
@@ -99,7 +99,7 @@ def check(log: Log) -> Check:
     Raises:
         InputError: in body frames, vehicles that share no two steps, or first poses that are not known.
     """
-    result = _on_time(filtered(log))
+    result = on_time(filtered(log))
     if not result.ahead.any():
         result = against_truth(result)
     result = replace(result, vehicles=_vehicles(result))
@@ -111,22 +111,6 @@ def check(log: Log) -> Check:
     result = replace(result, measurements=_measurements(result))
     sentences = [sentence for rule in CHECKS for sentence in rule(result)]
     return replace(result, warnings=tuple(sentences), unseen=tuple(unseen(result)))
-
-
-def _on_time(c: Check) -> Check:
-    """The same with what its relative measurements say about clocks, and less what wrong ones explain."""
-    reference = None
-    if c.log.truth is not None:
-        off, (_, _, velocity) = causes(c)
-        seconds = np.nansum((off * velocity.conj()).real, axis=0) / np.maximum(np.isfinite(off).sum(axis=0), 1e-12)
-        seen = np.isfinite(off).any(axis=0) & (c.variance[..., 0] > 0).any(axis=0)
-        reference = int(np.argmin(np.where(seen, np.abs(seconds), np.inf))) if seen.any() else None
-    found, made = clocks(c, reference)
-    ahead = np.where((np.abs(found.value) > np.maximum(SURELY * found.error, LATE)), found.value, 0.0)
-    relative = c.relative.copy()
-    relative[:, :2] -= np.nan_to_num(made @ ahead)
-    slack = np.nan_to_num(made * np.where(ahead, found.error, 0.0))
-    return replace(c, relative=relative, ahead=ahead, unsure=found.error, slack=slack)
 
 
 def _vehicles(c: Check) -> list[dict[str, Any]]:
@@ -157,7 +141,7 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
         if truth is not None:
             row["fix_error_m"] = _rms(rec.gnss[0, :, column] - truth.position[:, column])
             row["error_m"] = _rms(c.scored[0][:, column] - truth.position[:, column])
-            row["error_per_std"], row["worst_at_s"] = _worst(c, column)
+            row["error_per_std"], row["worst_at_s"] = worst(c, column)
         rows.append(row)
     return rows
 
@@ -168,21 +152,6 @@ def _with_error(name: str, found: Estimate, k: int) -> dict[str, float | None]:
     return (
         dict(zip((name, f"{name}_error"), map(float, (found.value[k], found.error[k])), strict=True)) if known else {}
     )
-
-
-def _worst(c: Check, column: int) -> tuple[float | None, float]:
-    """Error of a vehicle's filter over the deviation that it states, in the worst tenth of the drive, and when that
-    begins, s."""
-    assert c.log.truth is not None
-    size, t = dimensions(c.world), c.world.t
-    square, stated = np.square(c.scored[0] - c.log.truth.position)[:, column, :size], c.scored[1][:, column, :size]
-    stated = np.where(np.isfinite(square), stated, np.nan)
-    worst, when = None, 0.0
-    for part in np.array_split(np.arange(len(t)), BLOCKS):
-        if np.isfinite(square[part]).any() and (all_of := np.nansum(stated[part])) > 0:
-            ratio = float(np.sqrt(np.nansum(square[part]) / all_of))
-            worst, when = (ratio, float(t[part[0]] - t[0])) if ratio > (worst or 0.0) else (worst, when)
-    return worst, when
 
 
 def _rms(vectors: Floats) -> float | None:
@@ -517,7 +486,7 @@ def less_offsets(log: Log) -> Log:
         InputError: as `check`.
     """
     rec, until, by = log.recording, FIRST * float(np.ptp(log.recording.t)), "filters of each vehicle alone show"
-    c = _on_time(filtered(log.part(until=until)))
+    c = on_time(filtered(log.part(until=until)))
     if c.log.truth is not None and not c.ahead.any():
         c, by = replace(against_truth(c), variance=0 * c.variance), "the truth shows"
         rec = replace(rec, sensors=replace(rec.sensors, range_offset_std=0.0))

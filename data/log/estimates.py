@@ -11,6 +11,7 @@ import pandas as pd
 import scipy  # its signals take half a second, and are imported where they are used
 
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
+from coopoc.evaluate.metrics import dimensions
 from coopoc.world.links import wrap
 from coopoc.world.recording import Recording
 
@@ -257,3 +258,34 @@ def against_truth(c: Check) -> Check:
     known = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)
     relative, expected = (np.where(known, new, old) for new, old in ((residual, c.relative), (stated, c.expected)))
     return replace(c, relative=relative, expected=expected)
+
+
+def on_time(c: Check) -> Check:
+    """The same with what its relative measurements say about clocks, and less what wrong ones explain."""
+    reference = None
+    if c.log.truth is not None:
+        off, (_, _, velocity) = causes(c)
+        seconds = np.nansum((off * velocity.conj()).real, axis=0) / np.maximum(np.isfinite(off).sum(axis=0), 1e-12)
+        seen = np.isfinite(off).any(axis=0) & (c.variance[..., 0] > 0).any(axis=0)
+        reference = int(np.argmin(np.where(seen, np.abs(seconds), np.inf))) if seen.any() else None
+    found, made = clocks(c, reference)
+    ahead = np.where((np.abs(found.value) > np.maximum(SURELY * found.error, LATE)), found.value, 0.0)
+    relative = c.relative.copy()
+    relative[:, :2] -= np.nan_to_num(made @ ahead)
+    slack = np.nan_to_num(made * np.where(ahead, found.error, 0.0))
+    return replace(c, relative=relative, ahead=ahead, unsure=found.error, slack=slack)
+
+
+def worst(c: Check, column: int) -> tuple[float | None, float]:
+    """Error of a vehicle's filter over the deviation that it states, in the worst tenth of the drive, and when that
+    begins, s."""
+    assert c.log.truth is not None
+    size, t = dimensions(c.world), c.world.t
+    square, stated = np.square(c.scored[0] - c.log.truth.position)[:, column, :size], c.scored[1][:, column, :size]
+    stated = np.where(np.isfinite(square), stated, np.nan)
+    worst, when = None, 0.0
+    for part in np.array_split(np.arange(len(t)), BLOCKS):
+        if np.isfinite(square[part]).any() and (all_of := np.nansum(stated[part])) > 0:
+            ratio = float(np.sqrt(np.nansum(square[part]) / all_of))
+            worst, when = (ratio, float(t[part[0]] - t[0])) if ratio > (worst or 0.0) else (worst, when)
+    return worst, when
