@@ -124,6 +124,8 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
     print()
     for warning in result.warnings or ("nothing looks wrong",):
         print(f"check: {warning}")
+    for what in result.unseen:
+        print(f"not seen: {what}")
     out = picture or Path(f"{Path(split(path)[0]).resolve().stem}-check.png")
     print(f"picture: {draw(result, out)}", file=sys.stderr)
 

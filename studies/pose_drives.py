@@ -29,8 +29,6 @@ BLOCK, BLOCKS = 30.0, 4
 
 GATE = 5.0
 """Standard deviations, of all pose filters."""
-SURE = (0.05, 0.05, 0.01, 0.05)
-"""m, m, m and rad of first poses that are the truth's."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,8 +133,8 @@ def drive(data: str, until: float, v2x: V2X) -> Drive:
     recording = under(log.recording, v2x, logged=log.messages)
     told = recording.sensors
     lasting = max(told.speed_scale_std, told.yaw_rate_bias_std, told.range_offset_std) > 0
-    begin, where = _begin(data)
-    return Drive(recording, begin, log.truth, lasting, SURE if where else SPREAD)
+    begin, spread, _ = _begin(data)
+    return Drive(recording, begin, log.truth, lasting, spread)
 
 
 def described(data: str) -> str:
@@ -146,7 +144,7 @@ def described(data: str) -> str:
         return "Wheel odometry, ranges and bearings of {}; no fix, no compass. The first {:.3g} s calibrate the noise."
     read = ", ".join(f"{number} {what}" for what, number in log.summary.read.items() if number)
     where = "" if (span := _log(data)[1]) == "throughout" else f" {span},"
-    noise = f"with the noise that it states{_begin(data)[1]}; the first {{:.3g}} s are not scored."
+    noise = f"with the noise that it states{_begin(data)[2]}; the first {{:.3g}} s are not scored."
     return f"What {{}} holds ({read}),{where} {noise}"
 
 
@@ -216,7 +214,7 @@ def _calibration(data: str, until: float) -> Calibration:
 
 
 @lru_cache(maxsize=2)
-def _begin(data: str) -> tuple[Floats | None, str]:
+def _begin(data: str) -> tuple[Floats | None, tuple[float, ...], str]:
     log = _part(data)
     assert isinstance(log, Log)
     return begin_of(log, GATE)

@@ -15,8 +15,9 @@ import pytest
 from conftest import measured, refused
 
 import coopoc as co
+from coopoc.data.log.residuals import SURE
 from coopoc.data.registry import load_log
-from coopoc.studies import benchmark, pose_drives, tasks
+from coopoc.studies import benchmark, tasks
 from coopoc.studies.tasks import TASKS, VALIDATION, VERSION
 
 FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
@@ -267,7 +268,7 @@ def test_real_measurements_are_tasks_for_pose_filters(tmp_path: Path) -> None:
         first = range(0, len(error) - size + 1, size)
         return float(np.mean([np.sqrt(np.mean(error[k : k + size] ** 2, axis=0)) for k in first]))
 
-    fleet = co.PoseFilter("fleet", gate=5.0, begin=begin, spread=pose_drives.SURE, assumed=noise)
+    fleet = co.PoseFilter("fleet", gate=5.0, begin=begin, spread=SURE, assumed=noise)
     assert whole["rt_le_m"][0] == pytest.approx(by_hand(fleet), abs=2e-4)
     own = rows[f"{tmp_path / 'mine.py'}:Own"]
     mine = co.PoseFilter("solo", begin=begin, assumed=noise)

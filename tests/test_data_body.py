@@ -12,9 +12,11 @@ import pytest
 from conftest import refused
 from numpy.testing import assert_allclose
 from shell import ran
+from strange_logs import strange
 
 import coopoc as co
 from coopoc.data.log.check import check as check_poses
+from coopoc.data.log.residuals import begin_of, together
 from coopoc.data.registry import load_log
 from coopoc.evaluate.metrics import innovation_columns
 from coopoc.studies import real
@@ -204,7 +206,9 @@ def test_the_check_scores_those_whose_truth_is_known(tmp_path: Path) -> None:
     assert [row["error_m"] is not None for row in found.vehicles] == [
         row["vehicle"] == "blue" for row in found.vehicles
     ]
-    assert ["blue: fixes lie -5" in warning for warning in found.warnings] == [True]
+    assert all(warning.startswith("blue: ") for warning in found.warnings)
+    assert "blue: its filter errs by" in found.warnings[0]
+    assert ["blue: fixes lie -5" in warning for warning in found.warnings] == [False, True]
 
 
 def test_what_no_filter_can_follow_is_still_summarised(tmp_path: Path) -> None:
@@ -314,3 +318,23 @@ def test_two_anchors_leave_the_side_open(tmp_path: Path) -> None:
     file.write_text("\n".join(line for line in file.read_text().split("\n") if not line.endswith(("102 0", "103 0"))))
     with refused("or three ranges"):
         co.pose_start(co.read_log(file, frame="body").recording)
+
+
+@pytest.mark.parametrize("share", [0.03, -0.05])
+def test_wheels_of_another_size_cost_little_from_a_known_pose(tmp_path: Path, share: float) -> None:
+    """The references are the same filter with right wheels, and one that takes wheels as right."""
+    found = {}
+    for wheels in (0.0, share):
+        folder = strange(tmp_path / f"{wheels}", "robot", wheels={"robot0": wheels, "robot1": wheels})
+        log = together(co.read_log(folder, frame="body"))[0]
+        begin, spread, where = begin_of(log)
+        assert "truth" in where
+        assert log.truth is not None
+        made = co.PoseFilter("fleet", begin=begin, spread=spread)
+        told = replace(log.recording.sensors, speed_scale_std=0.0, yaw_rate_bias_std=0.0, range_offset_std=0.0)
+        both = ["robot0", "robot1"]
+        tracks = made(log.recording, both), replace(made, assumed=told)(log.recording, both)
+        found[wheels] = [float(co.rt_le(track, log.truth).mean()) for track in tracks]
+        scale, std = (tracks[0].extras[name][0, -1] for name in ("speed_scale", "speed_scale_std"))
+        assert (np.abs(scale - wheels) < 4 * std).all()
+    assert found[share][0] < 1.3 * found[0.0][0] < 0.5 * found[share][1]

@@ -52,11 +52,11 @@ def body_twist(frame: pd.DataFrame) -> pd.DataFrame:
 
 
 FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
-    "one range of twenty": (lambda f: f.assign(range=outliers(f["range"])), r"[45]\.\d% of the ranges lie beyond 5"),
+    "one range of twenty": (lambda f: f.assign(range=outliers(f["range"])), r"[345]\.\d% of the ranges lie beyond 5"),
     "one fix of twenty": (in_fixes, r"car0: [45]\.\d% of the fixes lie beyond 5"),
     "two metres on every range": (
         lambda f: f.assign(range=f["range"] + 2),
-        r"ranges of car0 and car1 by \+[12]\.\S* m are off in the median, with 0\.3 m stated",
+        r"ranges of car0 and car1 by \+[12]\.\S* \+- \S* m are off in the median, with 0\.3 m stated",
     ),
     "stamps without their fraction": (
         lambda f: f.assign(t=np.floor(f["t"])),
@@ -199,9 +199,10 @@ def three(log: Path, **offsets: float) -> Path:
 def test_an_offset_of_the_ranges_of_one_is_named(tmp_path: Path, who: str, offset: float) -> None:
     log = three(tmp_path / "log", car0_car2=offset, car1_car2=offset)
     text = said(read_log(log, std=None if who == "logged" else {"range": 1.0}))
-    assert ("car0 and car2 by +" in text and "car1 and car2 by +" in text) == (who == "logged")
+    assert "car0 and car2 by +" in text
+    assert "car1 and car2 by +" in text
     assert "car0 and car1" not in text
-    assert ("offset=car" in text) == (who == "logged")
+    assert "offset=car" in text
 
 
 @pytest.mark.parametrize("known", [True, False])
@@ -211,8 +212,13 @@ def test_offsets_of_pairs_are_found_on_the_first_part(tmp_path: Path, known: boo
     if known:
         write(pd.concat([fixes(fleet, name, 0.1, 1e-9) for name in fleet.ids]), path / "truth.csv")
     log, right = load_log(f"{path}?offset=auto&since=80"), load_log(f"{three(tmp_path / 'right')}?since=80")
-    found = {pair: float(by) for by, pair in re.findall(r"(\S+) m of (car\d and car\d)", " ".join(log.recording.notes))}
-    assert found == pytest.approx({"car0 and car1": 0.5, "car0 and car2": -0.3}, abs=0.03 if known else 0.1)
+    found = {
+        pair: float(by)
+        for by, pair in re.findall(r"(\S+) \+- \S+ m of (car\d and car\d)", " ".join(log.recording.notes))
+    }
+    assert found == pytest.approx(
+        {"car0 and car1": 0.5, "car0 and car2": -0.3, "car1 and car2": 0.0}, abs=0.03 if known else 0.1
+    )
     off, links = (log.recording.relative - right.recording.relative)[0, :, 0], log.recording.links
     for other, added in (("car1", 0.5), ("car2", -0.3)):
         pair = links.observer + links.neighbour == int(other[-1])

@@ -11,10 +11,12 @@ import pytest
 from conftest import refused
 from logs import NOISE, drive, long, observed, write
 from numpy.testing import assert_allclose
+from strange_logs import strange
 
 import coopoc as co
 from coopoc.data.log.motion import Signal, step_means
 from coopoc.data.log.read import read_log
+from coopoc.data.registry import load_log
 from coopoc.evaluate.metrics import nees
 
 
@@ -283,3 +285,18 @@ def test_the_mean_over_a_step_is_that_over_its_halves(seed: int) -> None:
     halves = step_means(signal, 0.15 * np.arange(-1, 17))[:, 0]
     whole = step_means(signal, 0.3 * np.arange(9))[:, 0]
     assert_allclose(whole, (halves[::2] + halves[1::2]) / 2, atol=1e-6, rtol=1e-9)
+
+
+def test_deviations_are_stated_in_any_unit(tmp_path: Path) -> None:
+    """The closed form: 3.6 km/h are 1 m/s, and those of a latitude are m."""
+    rows = "t,vehicle,latitude,longitude,height,speed_kmh,compass_deg\n"
+    rows += "".join(f"{k},a,48,{11 + 1e-5 * k},1,3,90\n" for k in range(9))
+    (tmp_path / "a.csv").write_text(rows)
+    found = load_log(f"{tmp_path}?std=latitude:2,longitude:1,height:3,speed_kmh:3.6").recording.sensors
+    assert (found.gnss_std, found.velocity_floor) == ((1.0, 2.0, 3.0), pytest.approx(1.0))
+
+
+def test_a_radars_range_is_not_known_to_its_partner(tmp_path: Path) -> None:
+    log = read_log(strange(tmp_path, "car", seconds=30.0))
+    assert (log.recording.links.observer > log.recording.links.neighbour).all()
+    assert "ranges beside a direction count for who measured them alone" in str(log.summary)

@@ -95,7 +95,7 @@ def test_scale_and_bias_are_found_where_they_act() -> None:
     assert std.max() < 0.01
     assert np.abs((found - bias) / std).max() < 4.5
     assert co.pose_nees(track, fleet).mean() == pytest.approx(3.0, abs=0.5)
-    ignored = co.PoseFilter("solo")(seen, [0])
+    ignored = co.PoseFilter("solo", lasting=False)(seen, [0])
     assert co.pose_nees(ignored, fleet).mean() > 4.0
     assert np.abs(co.heading_error(track, fleet)).mean() < np.abs(co.heading_error(ignored, fleet)).mean()
 
@@ -110,7 +110,9 @@ def test_ranges_that_are_too_long_cost_little_where_that_is_a_state() -> None:
     found, std = (track.extras[name][:, -1, 0] for name in ("range_offset", "range_offset_std"))
     assert std.max() < 0.5
     assert np.abs((found - drawn) / std).max() < 4.5
-    error, least, without = (co.rt_le(t, fleet).mean() for t in (track, ideal, co.PoseFilter("fleet")(wrong, [0])))
+    error, least, without = (
+        co.rt_le(t, fleet).mean() for t in (track, ideal, co.PoseFilter("fleet", lasting=False)(wrong, [0]))
+    )
     assert error < 1.15 * least < 0.5 * without
 
 

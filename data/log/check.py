@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any
 
@@ -10,25 +10,43 @@ import numpy as np
 import pandas as pd
 import scipy  # its statistics take half a second, and are imported where they are used
 
-from coopoc.arrays import AnyArray, Floats, Ints, robust_std
+from coopoc.arrays import Floats, robust_std
 from coopoc.evaluate.metrics import dimensions
 from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
 from coopoc.world.recording import Recording
 
+from .estimates import (
+    DRIFT,
+    ENOUGH,
+    FAR,
+    LATE,
+    OUTLYING,
+    SCALE,
+    SURELY,
+    TURNED,
+    Estimate,
+    against_truth,
+    by_pair,
+    causes,
+    factors,
+    moves,
+    odometry,
+    offsets,
+    on_time,
+    worst,
+)
+from .estimates import median as median_of
 from .motion import MOVING
 from .read import Log
-from .residuals import Check, filtered, residual_of
+from .residuals import Check, filtered
+from .unseen import unseen
 
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
 WIDE, NARROW = 2.0, 0.4
 """Ratios of a measured to a stated standard deviation at which something is wrong."""
-FAR = 10.0
-"""Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
 ALIKE = 0.97
 """Correlation of the displacements of fixes and odometry that noise alone does not bring about."""
-ENOUGH = 20
-"""Measurements from which a statistic is worth a word."""
 COARSE = 0.5
 """rad: no sensor's angles scatter as much about positions that are better known."""
 HINTS = {
@@ -49,13 +67,14 @@ FEW, APART = 5, 1.5
 """Fixes with a truth from which a difference of frames shows; standard deviations of a fix that it must have."""
 SIGMAS = 6.0
 """Standard errors of an offset beyond which it is no chance."""
-ARM, VARIED, NUDGE = 0.2, 0.15, 0.01
-"""m, least arm of an antenna that is worth a word; standard deviation over mean of a speed below which an arm ahead
-and a late clock look alike; m and s by which fixes are moved to see what a filter makes of an arm."""
-OUTLYING, OUTLIERS = 5.0, 0.01
-"""Standard deviations beyond which a measurement is an outlier; the share of them that is worth a word."""
-WINDOW, BLOCKS = 9, 10
-"""Measurements of a pair whose median is taken off to count outliers; parts of a drive that show how sure it is."""
+ARM = 0.2
+"""m, least arm of an antenna that is worth a word."""
+CONFIDENT = 3.0
+"""Errors over the deviations that a filter states, in a part of the drive, from which it is wrong."""
+OUTLIERS = 0.01
+"""Share of measurements beyond 5 standard deviations that is worth a word."""
+WINDOW = 9
+"""Measurements of a pair whose median is taken off to count outliers."""
 FIRST = 0.4
 """Share of a log that shows by what its ranges are too long."""
 UNUSED = 0.05
@@ -80,9 +99,18 @@ def check(log: Log) -> Check:
     Raises:
         InputError: in body frames, vehicles that share no two steps, or first poses that are not known.
     """
-    result = filtered(log)
-    result = replace(result, vehicles=_vehicles(result), measurements=_measurements(result))
-    return replace(result, warnings=tuple(sentence for rule in CHECKS for sentence in rule(result)))
+    result = on_time(filtered(log))
+    if not result.ahead.any():
+        result = against_truth(result)
+    result = replace(result, vehicles=_vehicles(result))
+    if log.recording.body is None and (log.truth is None or result.ahead.any()):  # what errs says nothing of others
+        errs = [result.world.ids.index(row["vehicle"]) for row in result.vehicles if _off(row)]
+        links = result.world.links
+        ends = np.isin(links.observer, errs) | np.isin(links.neighbour, errs)
+        result = replace(result, relative=np.where(ends[:, None], np.nan, result.relative))
+    result = replace(result, measurements=_measurements(result))
+    sentences = [sentence for rule in CHECKS for sentence in rule(result)]
+    return replace(result, warnings=tuple(sentences), unseen=tuple(unseen(result)))
 
 
 def _vehicles(c: Check) -> list[dict[str, Any]]:
@@ -93,6 +121,9 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
         if not np.nanmax(speed, initial=0.0) > 0:
             continue
         distance, turn = _against_odometry(rec, column)
+        wheels = odometry(c, column)
+        if distance is None and np.isfinite(wheels.error[0]):
+            distance = 1.0 / (1.0 + wheels.value[0])
         row: dict[str, Any] = {
             "vehicle": name,
             "fixes": int(np.isfinite(rec.gnss[0, :, column, 0]).sum()),
@@ -101,13 +132,26 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
             "nis": float(c.normalised[fixed, column].mean()) if fixed.any() else None,
             "fixes_per_odometry": distance,
             "turned_deg": turn,
+            **_with_error("speed_excess", wheels, 0),
+            **_with_error("turned" if c.log.recording.body is None else "yaw_rate_bias", wheels, 1),
+            **(_with_error("late_s", wheels, 2) if truth is not None else {}),
+            "clock_s": float(c.ahead[column]) if np.isfinite(c.unsure[column]) else None,
             "std_m": _rms(np.sqrt(c.variance[:, column])),
         }
         if truth is not None:
             row["fix_error_m"] = _rms(rec.gnss[0, :, column] - truth.position[:, column])
-            row["error_m"] = _rms(c.x[:, column] - truth.position[:, column])
+            row["error_m"] = _rms(c.scored[0][:, column] - truth.position[:, column])
+            row["error_per_std"], row["worst_at_s"] = worst(c, column)
         rows.append(row)
     return rows
+
+
+def _with_error(name: str, found: Estimate, k: int) -> dict[str, float | None]:
+    """Two columns of a table: an estimate and its standard error."""
+    known = bool(np.isfinite(found.error[k]))
+    return (
+        dict(zip((name, f"{name}_error"), map(float, (found.value[k], found.error[k])), strict=True)) if known else {}
+    )
 
 
 def _rms(vectors: Floats) -> float | None:
@@ -116,29 +160,10 @@ def _rms(vectors: Floats) -> float | None:
     return float(np.sqrt(np.nanmean(square))) if np.isfinite(square).any() else None
 
 
-def _moves(rec: Recording, column: int) -> tuple[AnyArray, AnyArray]:
-    """Displacements (M,) m, x + iy, of the fixes and of the odometry over the same spans, in which the odometry (if
-    that stands still, the fixes) moves far; none where too little moves."""
-    fixes, velocity = rec.gnss[0, :, column, :2] @ [1, 1j], rec.velocity[0, :, column, :2] @ [1, 1j]
-    path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
-    for moves, far in ((path, FAR), (fixes, 2 * FAR)):
-        pairs, last = [], -1
-        for step in np.flatnonzero(np.isfinite(fixes)).tolist():
-            if last < 0 or gaps[step] != gaps[last]:
-                last = step
-            elif abs(moves[step] - moves[last]) > far * np.hypot(*rec.sensors.fix_std[:2]):
-                pairs.append((last, step))
-                last = step
-        if len(pairs) >= 3:
-            a, b = np.array(pairs).T
-            return fixes[b] - fixes[a], path[b] - path[a]
-    return np.empty(0), np.empty(0)
-
-
 def _against_odometry(rec: Recording, column: int) -> tuple[float | None, float | None]:
     """Distance of fixes over distance of odometry, with the fixes' noise taken off; and the angle between the two, deg.
     None where too little moves."""
-    moved, driven = _moves(rec, column)
+    moved, driven = moves(rec, column)
     if not len(moved):
         return None, None
     variance = 2 * len(moved) * float(np.square(rec.sensors.fix_std[:2]).sum())
@@ -157,7 +182,7 @@ def _axes(c: Check, column: int) -> str:
     if log.body is not None:
         heading = rec.dt * np.cumsum(np.nan_to_num(log.body.yaw_rate), axis=1)
         rec = replace(rec, velocity=turned(log.velocity, heading))
-    moved, driven = _moves(rec, column)
+    moved, driven = moves(rec, column)
     size = np.linalg.norm(moved) * np.linalg.norm(driven)
     u = rec.velocity[0, np.isfinite(rec.velocity[0, :, column, 0]), column, :2]
     if not size or abs(np.vdot(driven, moved)) > ALIKE * size:
@@ -185,11 +210,13 @@ def _measurements(c: Check) -> list[dict[str, Any]]:
         residual = c.relative[there, k]
         if not there.any() or np.ptp(c.log.recording.relative[0, there, k]) == 0:
             continue
-        std, median = robust_std(residual), float(np.median(residual))
+        named = {pair: offset for pair, offset, _ in _named(c, k, float(c.world.sensors.relative_std[k]))}
+        less = np.concatenate([value - named.get(pair, 0.0) for pair, value, *_ in by_pair(c, k)])
+        std, median = robust_std(less), float(np.median(residual))
         row: dict[str, Any] = {"measurement": name, "unit": unit, "number": len(residual), "median": median}
         row |= {"robust_std": std, "stated_std": float(c.world.sensors.relative_std[k])}
         row["expected_std"] = float(np.sqrt(np.mean(c.expected[there, k] ** 2)))
-        rows.append(row | {"beyond_5_std": _outliers(c, k, row["stated_std"])})
+        rows.append(row | _scatter(c, k, row["stated_std"]))
     return rows
 
 
@@ -208,6 +235,17 @@ def _of_rows(c: Check) -> list[str]:
             + f". {hint}".rstrip(" ")
         )
     return [*sentences, *filter(None, [summary.unread])]
+
+
+def _of_errors(c: Check) -> list[str]:
+    """Vehicles whose filter errs by more than it states."""
+    return [
+        f"{row['vehicle']}: its filter errs by {row['error_per_std']:.1f} times what it states in the tenth of the "
+        f"drive from {row['worst_at_s']:.3g} s on, by {row['error_m']:.3g} m in all: by what is named below, or by "
+        "noise that is not as stated."
+        for row in sorted(c.vehicles, key=lambda row: -(row.get("error_per_std") or 0.0))
+        if (row.get("error_per_std") or 0.0) > CONFIDENT
+    ]
 
 
 def _of_vehicles(c: Check) -> list[str]:
@@ -236,6 +274,22 @@ def _of_vehicles(c: Check) -> list[str]:
         if distance is not None and not 0.8 <= distance <= 1.25:
             unit = next((hint for low, high, hint in MISTAKEN if low < distance < high), "Check the units of both.")
             sentences.append(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
+        elif row.get("speed_excess") is not None and _beyond(row, "speed_excess", SCALE):
+            sentences.append(
+                f"{name}: its odometry is too fast by {100 * row['speed_excess']:.2f} +- "
+                f"{100 * row['speed_excess_error']:.2f} %: multiply its speeds by "
+                f"{1 / (1 + row['speed_excess']):.4g}, or take a pose filter, which estimates it."
+            )
+        if _beyond(row, "yaw_rate_bias", DRIFT):
+            sentences.append(
+                f"{name}: its yaw rates are too large by {row['yaw_rate_bias']:.2g} +- "
+                f"{row['yaw_rate_bias_error']:.2g} rad/s: a pose filter estimates it."
+            )
+        if turn is not None and abs(turn) <= 20 and _beyond(row, "turned", TURNED):
+            sentences.append(
+                f"{name}: its odometry is turned by {np.rad2deg(row['turned']):.2f} +- "
+                f"{np.rad2deg(row['turned_error']):.2f} deg anticlockwise: headings, or the mounting of a sensor."
+            )
         if turn is not None and abs(turn) > 20:
             sentences.append(
                 f"{name}: fixes move {turn:.0f} deg anticlockwise of the odometry: its forward axis, or the headings, "
@@ -245,16 +299,43 @@ def _of_vehicles(c: Check) -> list[str]:
     return sentences
 
 
+def _beyond(row: Mapping[str, Any], name: str, least: float) -> bool:
+    """Whether an estimate of a row is larger than that, and than chance."""
+    return float(abs(row.get(name) or 0.0)) > max(least, SURELY * (row.get(f"{name}_error") or 0.0))
+
+
+def _off(row: Mapping[str, Any]) -> bool:
+    """Whether the odometry of a row errs."""
+    return any(_beyond(row, *one) for one in (("speed_excess", SCALE), ("turned", TURNED), ("yaw_rate_bias", DRIFT)))
+
+
+def _of_clocks(c: Check) -> list[str]:
+    """Vehicles whose clocks differ from that of the others, by their relative measurements."""
+    return [
+        f"{name}: its clock is {abs(ahead):.3f} +- {error:.3f} s {'ahead of' if ahead > 0 else 'behind'} the others' "
+        f"by relative measurements, or its fixes are {'late' if ahead > 0 else 'early'}. "
+        f"clock={name}:{ahead:.3f} mends it."
+        for name, ahead, error in zip(c.world.ids, c.ahead, c.unsure, strict=True)
+        if ahead
+    ] + [
+        f"{row['vehicle']}: its odometry is {row['late_s']:.3f} +- {row['late_s_error']:.3f} s later than the truth: "
+        f"its clock differs from that of the truth. clock={row['vehicle']}:{row['late_s']:.3f} mends it."
+        for row in c.vehicles
+        if _beyond(row, "late_s", max(LATE, 0.5 * c.world.dt)) and not c.ahead[c.world.ids.index(row["vehicle"])]
+    ]
+
+
 def _of_fixes(c: Check) -> list[str]:
     """A sentence where the fixes of a vehicle are those of an antenna elsewhere, lie behind its truth along its way, by
     the same time at any speed, or beside it by more than their noise explains, as where the truth has another
     origin."""
     rec, truth, sentences = c.world, c.log.truth, []
-    off, causes = _causes(c)
+    off, made = causes(c)
     for column, name in enumerate(rec.ids):
-        known = np.isfinite(off[:, column] + causes[:, :, column].sum(axis=0))
+        known = np.isfinite(off[:, column] + made[:, :, column].sum(axis=0))
+        every_one = np.zeros(known.sum(), int)
         for share in ([1, 1, 1], [0, 0, 1]):  # without an arm that is sure a clock may explain it all
-            factor, std = _factors(off[known, column], causes[:, known, column].T * share)
+            factor, std = factors(off[known, column], made[:, known, column].T * share, every_one)
             sure = np.abs(factor) > SIGMAS * std
             if (sure & (np.abs(factor) > ARM))[:2].any():
                 sentences.append(
@@ -263,70 +344,43 @@ def _of_fixes(c: Check) -> list[str]:
                     f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
                 )
                 break
+        late = next(
+            (
+                row
+                for row in c.vehicles
+                if row["vehicle"] == name and _beyond(row, "late_s", max(LATE, 0.5 * c.world.dt))
+            ),
+            {},
+        )
+        if c.ahead[column] or late:
+            continue
+        derived = truth is None and rec.sensors.velocity_reading == "fixes"
+        if sure[2] and abs(lag := factor[2]) >= LATE and not derived:
+            way = "ahead of" if lag > 0 else "behind"
+            sentences.append(
+                f"{name}: its fixes are {abs(lag):.2f} s {way} the {'odometry' if truth is None else 'truth'} along "
+                "its way: clocks differ, or fixes carry the time at which they arrived; at one speed an antenna ahead "
+                "looks alike."
+            )
+            continue
         if truth is None:
             continue
         every = rec.gnss[0, :, column] - truth.position[:, column]
         both = np.isfinite(every[:, 0])
         if both.sum() < FEW:
             continue
-        (east, north), (up, spread) = np.median(every[both, :2], axis=0), _median(every[both, 2])
+        (east, north), (up, spread) = np.median(every[both, :2], axis=0), median_of(every[both, 2])
         if np.ptp(rec.gnss[0, both, column, 2]) and abs(up) > max(SIGMAS * spread, rec.sensors.fix_std[2] / 2):
             sentences.append(
                 f"{name}: fixes lie {up:.3g} m above the truth in the median. Is one of the two above the "
                 "ellipsoid, the other above the geoid, or are antennas elsewhere?"
             )
-        if sure[2] and abs(lag := factor[2]) >= 0.5 * rec.dt:
-            way = "ahead of" if lag > 0 else "behind"
-            sentences.append(
-                f"{name}: its fixes are {abs(lag):.2f} s {way} the truth along its way: the clock "
-                "of the truth differs, or fixes carry the time at which they arrived; at one speed an antenna ahead "
-                "looks alike."
-            )
-            continue
         if np.hypot(east, north) >= APART * np.hypot(*rec.sensors.fix_std[:2]):
             sentences.append(
                 f"{name}: fixes lie {east:.3g} m east and {north:.3g} m north of the truth in the median. Has it "
                 "another frame? Fixes in degrees are local at the first: give origin= of the truth, or it in degrees."
             )
     return sentences
-
-
-def _causes(c: Check) -> tuple[AnyArray, AnyArray]:
-    """What fixes are off by, x + iy m (T, N), and what an arm of 1 m ahead, one to the left, and a clock that is 1 s
-    late make of it (3, T, N): against the truth, else against a filter, which is linear in what is added to fixes."""
-    rec, truth = c.world, c.log.truth
-    velocity = (rec.velocity[0] if truth is None else truth.velocity)[..., :2] @ [1, 1j]
-    speed = pd.DataFrame(np.abs(velocity)).where(lambda v: v > MOVING)
-    course = pd.DataFrame(np.angle(velocity)).where(speed > 0).ffill().bfill().to_numpy()
-    ahead = np.nan_to_num(np.exp(1j * course)) * np.array(speed.std() > VARIED * speed.mean())
-    causes = np.stack([ahead, 1j * ahead, velocity])
-    if truth is not None:
-        return (rec.gnss[0] - truth.position)[..., :2] @ [1, 1j], causes
-    for k, cause in enumerate(np.nan_to_num(NUDGE * causes)):
-        gnss = c.log.recording.gnss + np.stack([cause.real, cause.imag, 0 * cause.real], axis=-1)
-        moved = filtered(replace(c.log, recording=replace(c.log.recording, gnss=gnss)))
-        causes[k] = (moved.fix - c.fix)[..., :2] @ [1, 1j] / NUDGE
-    return c.fix[..., :2] @ [1, 1j], causes
-
-
-def _factors(y: AnyArray, x: AnyArray) -> Floats:
-    """Factors (k,) of causes x (M, k) that explain y (M,) best, means and outliers aside, and their standard errors by
-    parts of the drive that are left out, (2, k); of fewer measurements than enough zeros."""
-    if len(y) < ENOUGH:
-        return np.zeros((2, x.shape[1]))
-    y, x = y - y.mean(), x - x.mean(axis=0)
-
-    def fitted(rows: Ints) -> Floats:
-        for _ in range(3):
-            left, right = (np.concatenate([each[rows].real, each[rows].imag]) for each in (x, y))
-            factor: Floats = np.linalg.lstsq(left, right)[0]
-            gap = np.abs(y - x @ factor)
-            rows = rows[gap[rows] <= OUTLYING * np.median(gap[rows])]
-        return factor
-
-    every = np.arange(len(y))
-    without = [fitted(np.setdiff1d(every, part)) for part in np.array_split(every, BLOCKS)]
-    return np.stack([fitted(every), np.sqrt(BLOCKS - 1.0) * np.std(without, axis=0)])
 
 
 def _of_measurements(c: Check) -> list[str]:
@@ -343,6 +397,7 @@ def _of_measurements(c: Check) -> list[str]:
         stated = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
         position = float(np.sqrt(max(should**2 - row["stated_std"] ** 2, 0.0)))
         wrong = std > WIDE * should or (name == "azimuth" and std > COARSE > 3 * position)
+        scaled = False
         if name != "range":
             wrong |= abs(median) > 3 * should
             hint = (_other_angle(c) if name == "azimuth" else "") or hint
@@ -353,28 +408,45 @@ def _of_measurements(c: Check) -> list[str]:
             ratios = measured[far] / np.maximum(true[far], 1e-3)
             ratio = float(np.median(ratios)) if len(ratios) >= ENOUGH else 1.0
             wrong |= (other := not 0.8 <= ratio <= 1.25)
-            if other and robust_std(ratios) < 0.2 * ratio:
-                hint = f"They are {ratio:.3g} times as long: scale=range:{1 / ratio:.3g}, of mm 0.001, of feet 0.3048."
-        outliers, offsets = row["beyond_5_std"], _offsets(c, list(UNITS).index(name), *2 * [row["stated_std"]])
-        if outliers > OUTLIERS:
+            if scaled := other and robust_std(ratios) < 0.2 * ratio:
+                power = round(np.log10(ratio))
+                unit_of = 10.0**-power if power and abs(np.log10(ratio) - power) < 0.1 else 1 / ratio
+                hint = (
+                    f"They are {ratio:.3g} times as long: scale=range:{unit_of:.3g} first, of mm 0.001, of feet 0.3048."
+                )
+        outliers, pairs = row["beyond_5_std"], _named(c, list(UNITS).index(name), row["stated_std"])
+        if outliers > OUTLIERS and not scaled:
             sentences.append(
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
                 "as of reflections. Drop them, or take a method with a gate or a robust loss."
             )
         if wrong:
             sentences.append(f"{word}s miss the positions by {stated}. {hint}")
-        if offsets and (not wrong or hint == HINTS["range"]):
-            shown = ", ".join(f"{pair} by {offset:+.3g} {unit}" for pair, offset in offsets[:4])
-            more = f" and {len(offsets) - 4} pairs more" if len(offsets) > 4 else ""
-            given = ",".join(f"{pair.replace(' and ', '-')}:{offset:.3g}" for pair, offset in offsets)
+        if pairs and (not wrong or hint == HINTS["range"]):
+            shown = ", ".join(f"{pair} by {offset:+.3g} +- {error:.2g} {unit}" for pair, offset, error in pairs)
+            given = ",".join(f"{pair.replace(' and ', '-')}:{offset:.3g}" for pair, offset, _ in pairs)
             sentences.append(
-                f"{word}s of {shown}{more} are off in the median, with {row['stated_std']:.3g} {unit} stated: an "
+                f"{word}s of {shown} are off in the median, with {row['stated_std']:.3g} {unit} stated: an "
                 "offset of the sensors, of antennas, or of fixes or heights of one of the two; "
                 + (f"offset={given} takes it off." if word == "range" else "offset= takes it off.")
             )
-        elif not wrong and std < NARROW * should and row["stated_std"] > 2 * std:
-            sentences.append(f"{word}s are better than stated: {stated}.")
+        noise, least = row["noise"], row["stated_std"]
+        if not wrong and not NARROW * least < noise < WIDE * np.hypot(least, position):
+            size = "less" if noise < least else "more"
+            sentences.append(
+                f"{word}s scatter {size} than stated, by {noise:.2g} {unit} from one to the next, {least:.2g} {unit} "
+                f"stated: std={word}:{noise:.2g}. Were variances given as deviations?"
+            )
     return sentences
+
+
+def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
+    """Pairs whose measurements of one kind are off by more than chance and a quarter of their noise, with their offsets
+    and standard errors, largest first."""
+    found = [(pair, *found) for pair, found in offsets(c, k, stated).items()]
+    return sorted(
+        (row for row in found if abs(row[1]) > max(SURELY * row[2], 0.25 * stated)), key=lambda row: -abs(row[1])
+    )
 
 
 def _other_angle(c: Check) -> str:
@@ -396,44 +468,13 @@ def _other_angle(c: Check) -> str:
     return ""
 
 
-def _median(values: Floats) -> tuple[float, float]:
-    """Median, and its standard error by the medians of parts of the drive."""
-    parts = [np.median(part) for part in np.array_split(values, BLOCKS) if len(part)]
-    return float(np.median(values)), float(np.std(parts) / np.sqrt(len(parts)))
-
-
-def _by_pair(c: Check, k: int) -> Iterator[tuple[str, Floats, Floats]]:
-    """Names of a pair, its residuals of one kind in order of time, and what they should scatter by."""
-    links, ids = c.world.links, c.world.ids
-    there = np.isfinite(c.relative[:, k])
-    ends = np.column_stack([links.observer, links.neighbour])[there]
-    pairs, index = np.unique(ends if k else np.sort(ends), axis=0, return_inverse=True)
-    for number, (observer, neighbour) in enumerate(pairs.tolist()):
-        mine = np.flatnonzero(there)[index.reshape(-1) == number]
-        yield f"{ids[observer]} {'to' if k else 'and'} {ids[neighbour]}", c.relative[mine, k], c.expected[mine, k]
-
-
-def _outliers(c: Check, k: int, stated: float) -> float:
-    """Share of measurements beyond 5 standard deviations of the running median of their pair: errors of the filters
-    last longer than that window."""
-    near = (value - pd.Series(value).rolling(WINDOW, 1, center=True).median() for _, value, _ in _by_pair(c, k))
+def _scatter(c: Check, k: int, stated: float) -> dict[str, float]:
+    """Standard deviation of measurements about the running median of their pair, and the share beyond 5 of them: errors
+    of the filters last longer than that window."""
+    near = (value - pd.Series(value).rolling(WINDOW, 1, center=True).median() for _, value, *_ in by_pair(c, k))
     off = np.concatenate([*near])
-    return float(np.mean(np.abs(off) > OUTLYING * max(robust_std(off), 0.2 * stated)))
-
-
-def _offsets(c: Check, k: int, stated: float, least: float) -> list[tuple[str, float]]:
-    """Pairs whose residuals have a median above `least`, and above what the errors of the filters
-    explain, which last for some time; largest first."""
-    made, fixes, noise = [], np.isfinite(c.normalised).sum(axis=0), float(np.square(c.world.sensors.fix_std[:2]).mean())
-    there = np.isfinite(c.variance[..., 0]).sum(axis=0)
-    variance = np.nansum(c.variance[..., :2], axis=(0, 2)) / np.maximum(2 * there, 1)
-    share = 2 * np.nanmax((variance + noise) / np.maximum(variance * fixes, 1e-12), where=variance > 0, initial=0.0)
-    for pair, value, expected in _by_pair(c, k):
-        (offset, error), position = _median(value), max(float(np.mean(expected**2)) - stated**2, 0.0)
-        lasting = np.sqrt(stated**2 / len(value) + position * min(share, 1.0))
-        if len(value) >= ENOUGH and abs(offset) > max(least, 3 * lasting, SIGMAS * error):
-            made.append((pair, offset))
-    return sorted(made, key=lambda row: -abs(row[1]))
+    noise = robust_std(off)
+    return {"noise": noise, "beyond_5_std": float(np.mean(np.abs(off) > OUTLYING * max(noise, 0.2 * stated)))}
 
 
 def less_offsets(log: Log) -> Log:
@@ -445,24 +486,33 @@ def less_offsets(log: Log) -> Log:
         InputError: as `check`.
     """
     rec, until, by = log.recording, FIRST * float(np.ptp(log.recording.t)), "filters of each vehicle alone show"
-    c = filtered(log.part(until=until))
-    if c.log.truth is not None:
-        true, by = c.log.truth.position, "the truth shows"
-        residual = residual_of(c.world, np.where(np.isfinite(true), true, c.x))[1]
-        c = replace(c, relative=residual, variance=0 * c.variance)
+    c = on_time(filtered(log.part(until=until)))
+    if c.log.truth is not None and not c.ahead.any():
+        c, by = replace(against_truth(c), variance=0 * c.variance), "the truth shows"
         rec = replace(rec, sensors=replace(rec.sensors, range_offset_std=0.0))
     relative, ends = rec.relative.copy(), np.sort([rec.links.observer, rec.links.neighbour], axis=0)
-    found = dict(_offsets(c, 0, rec.sensors.range_std, 0.0))
+    found = offsets(c, 0, rec.sensors.range_std)
     for one, other in np.unique(ends, axis=1).T:
         pair = f"{rec.ids[one]} and {rec.ids[other]}"
-        if offset := found.get(pair, 0.0):
-            log.summary.assume(
-                f"ranges are less what {by} in the first {until:.3g} s: {{}}", f"{offset:+.3g} m of {pair}"
-            )
-            relative[:, (ends[0] == one) & (ends[1] == other), 0] -= offset
+        offset, error = found.get(pair, (0.0, np.inf))
+        sure = abs(offset) > 2 * error
+        text = (
+            f"ranges are less what {by} in the first {until:.3g} s"
+            if sure
+            else "ranges are left as they are, too few or not off for sure"
+        )
+        log.summary.assume(f"{text}: {{}}", f"{offset:+.3g} +- {error:.2g} m of {pair}")
+        relative[:, (ends[0] == one) & (ends[1] == other), 0] -= offset * sure
     notes = dict.fromkeys((*rec.notes, *log.summary.sentences))
     return replace(log, recording=replace(rec, relative=relative, notes=tuple(notes)))
 
 
-CHECKS: tuple[Callable[[Check], list[str]], ...] = (_of_rows, _of_vehicles, _of_fixes, _of_measurements)
+CHECKS: tuple[Callable[[Check], list[str]], ...] = (
+    _of_errors,
+    _of_rows,
+    _of_clocks,
+    _of_vehicles,
+    _of_fixes,
+    _of_measurements,
+)
 """What looks wrong: each takes the filtered log and returns sentences. A new check is one more entry."""

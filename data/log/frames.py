@@ -26,6 +26,8 @@ MOTION = ("vx", "vy", "speed")
 Origin = tuple[float, float, float]
 PERIODS = (86400.0, 604800.0)
 """s, of clocks: a day, a GPS week."""
+SCALE_STD, RATE_BIAS_STD = 0.03, 0.005
+"""Of wheels and gyros, which a log in body frames does not state: share of a speed, and rad/s."""
 OFFSET_STD = 1.0
 """m, assumed of what all ranges of a radio are too long by: a log does not say whether its delays are calibrated."""
 SELDOM = 0.02
@@ -150,6 +152,7 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
     if body:
         rate = of("yaw_rate", default=base.yaw_rate_std, unit="rad/s")
         noise |= {"velocity_reading": "speed", "yaw_rate_std": rate, "compass": "heading" in used}
+        noise |= {"speed_scale_std": SCALE_STD, "yaw_rate_bias_std": RATE_BIAS_STD}
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of("heading", default=HEADING_STD, unit="rad")
     if (drifts := max((member.wanders for member in members), default=0.0)) > 0.0:

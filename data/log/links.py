@@ -24,6 +24,7 @@ COMPONENTS: Mapping[str, int] = {"range": 0, "azimuth": 1, "bearing": 1, "inclin
 PAIR = ["step", "observer", "neighbour"]
 NEAR = 10.0
 """Distances, over what the two move until the step, below which the direction is not known well enough."""
+RADAR = "{} ranges beside a direction count for who measured them alone: a radar's partner does not know them"
 TWO_WAY = "{} ranges count for the other end, too: two-way ranging is known to both ends (else mutual=False)"
 
 
@@ -48,7 +49,8 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
 
     A bearing becomes an azimuth by the heading of its observer at its own time; in body frames an azimuth becomes a
     bearing by the heading that was measured. Then all are brought to the step. Of several measurements of a kind of one
-    pair at a step the nearest in time is kept; a `mutual` range is one of the other end, too, if that has none. Where
+    pair at a step the nearest in time is kept; a `mutual` range without a
+    direction is one of the other end, too, if that has none. Where
     heights are all 0, an inclination that was not measured is pi/2 beside a range and a direction. A message at a step
     without a measurement is a link without one. Where no message was logged at all, every vehicle sends at every step
     and all arrives at once.
@@ -58,7 +60,12 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
     measured = _measured(rows[in_group(rows, "relative")], members, there, steps)
     if mutual:
         stands = np.array([member.stands for member in members.values()])
-        back = measured[(measured["component"] == 0) & ~stands[measured["neighbour"]]]
+        far = measured[(measured["component"] == 0) & ~stands[measured["neighbour"]]]
+        aimed = measured.loc[measured["component"] == 1, PAIR]
+        seen = pd.MultiIndex.from_frame(far[PAIR]).isin(pd.MultiIndex.from_frame(aimed))
+        if seen.any():
+            summary.assume(RADAR, str(int(seen.sum())))
+        back = far[~seen]
         both = pd.concat([measured, back.rename(columns={"observer": "neighbour", "neighbour": "observer"})])
         both = both.drop_duplicates([*PAIR, "component"])
         if len(both) > len(measured):

@@ -142,7 +142,8 @@ def read_log(
         offset: kind, or pair, in its unit here -> what all its measurements, or the pair's ranges, are too large by, as
             {"range": 0.4, "red-blue": 0.3} of radios whose delays are not calibrated; `check.less_offsets` finds
             those of the pairs.
-        std: kind in SI units -> standard deviation of all its measurements, as {"range": 0.15, "x": 1.5}.
+        std: kind -> standard deviation of all its measurements in its unit (m for degrees of latitude), as
+            {"range": 0.15, "latitude": 1.5, "speed_kmh": 0.4}.
         stamps: times of a bag's messages: those of the headers, or those at which they were "received".
         clock: vehicle -> s by which its clock is ahead; it is subtracted from its stamps.
         antenna: m forward, left, up from the reference point of all that move to their antennas, or vehicle -> these,
@@ -208,7 +209,8 @@ def read_log(
         summary.assume("origin= has no effect: no fix is in degrees")
     rows, true_rows = rows[rows["true"] == 0], rows[rows["true"] == 1]
     rows, origin = local(on_one_clock(rows, clock), origin)
-    stated = factors(std, {kind.name for kind in KINDS.values()} - {*ENU, "message"}, "std")
+    given = factors(std, KINDS.keys() - {"message"}, "std")
+    stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * std for kind, std in given.items()}
     rows = distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary)
     if not any_scale:
         _check_scale(rows, path.name)

@@ -13,6 +13,7 @@ from coopoc.errors import InputError
 from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
 from coopoc.methods.kalman import Kalman
 from coopoc.methods.poses.pose_filter import PoseFilter
+from coopoc.methods.poses.pose_inputs import SPREAD
 from coopoc.methods.poses.pose_start import pose_start
 from coopoc.world.body_frames import midway, turned
 from coopoc.world.links import spherical, stretches, wrap
@@ -20,6 +21,8 @@ from coopoc.world.recording import Recording
 
 from .read import Log
 
+SURE = (0.05, 0.05, 0.01, 0.05)
+"""m and rad, of first poses that the truth gives."""
 GATE = 5.0
 """Of the pose filters that check a log: standard deviations beyond which a measurement is left out."""
 
@@ -38,9 +41,16 @@ class Check:
         normalised: (T, N), 1 on average if the assumed noise is right.
         relative: (L, 3) m, rad, rad: measured less computed from the filters.
         expected: (L, 3) standard deviations that these should have.
+        lasting: (2, N, 2) scale error of speeds and bias of yaw rates rad/s as the filters end, and their deviations.
+        ahead: (N,) s, of clocks, 0 where none is sure.
+        unsure: (N,) s, standard errors of these.
+        slack: (L, 2, N) m and rad, of ranges and directions, that a standard error of each clock taken off makes.
+        scored: x and variance that are held against the truth: in body frames those of the whole fleet's filter, since
+            one anchor alone leaves a vehicle's states open.
         vehicles: table, a row per vehicle.
         measurements: table, a row per kind of relative measurement.
         warnings: sentences.
+        unseen: what could not be seen.
     """
 
     log: Log
@@ -52,9 +62,15 @@ class Check:
     normalised: Floats
     relative: Floats
     expected: Floats
+    lasting: Floats
+    ahead: Floats
+    unsure: Floats
+    slack: Floats
+    scored: tuple[Floats, Floats]
     vehicles: Sequence[Mapping[str, Any]] = ()
     measurements: Sequence[Mapping[str, Any]] = ()
     warnings: tuple[str, ...] = ()
+    unseen: tuple[str, ...] = ()
 
 
 def together(log: Log) -> tuple[Log, str]:
@@ -75,9 +91,9 @@ def together(log: Log) -> tuple[Log, str]:
     return replace(log, recording=rec.between(first, last), truth=truth), span
 
 
-def begin_of(log: Log, gate: float = GATE) -> tuple[Floats | None, str]:
-    """First poses: those of fixes and compasses (None), those found in the first seconds, or the truth's; and which,
-    where it is the last.
+def begin_of(log: Log, gate: float = GATE) -> tuple[Floats | None, tuple[float, ...], str]:
+    """First poses: those of fixes and compasses (None), those found in the first seconds, or the truth's; their
+    standard deviations; and which, where it is the last.
 
     Args:
         log: in body frames, all vehicles there at its first step.
@@ -89,16 +105,16 @@ def begin_of(log: Log, gate: float = GATE) -> tuple[Floats | None, str]:
     rec, truth, moving = log.recording, log.truth, _moving(log.recording)
     assert rec.body is not None
     if np.isfinite(np.column_stack([rec.gnss[0, 0], rec.body.heading[0, 0]])[moving]).all():
-        return None, ""
+        return None, SPREAD, ""
     try:
-        return pose_start(rec, gate=gate), ""
+        return pose_start(rec, gate=gate), SPREAD, ""
     except InputError:
         if truth is None or truth.heading is None:
             raise
         poses = np.column_stack([truth.position[0], truth.heading[0]])
         if not np.isfinite(poses[moving]).all():
             raise
-        return poses, ", from the truth's first poses"
+        return poses, SURE, ", from the truth's first poses"
 
 
 def _moving(rec: Recording) -> list[int]:
@@ -115,11 +131,19 @@ def filtered(log: Log) -> Check:
     steps, vehicles, links = len(rec.t), len(rec.ids), rec.links
     x, variance, fix = (np.full((steps, vehicles, 3), np.nan) for _ in range(3))
     normalised, heading, heading_variance = np.full((steps, vehicles), np.nan), *np.zeros((2, steps, vehicles))
-    marks = list(rec.landmarks)
+    marks, lasting = list(rec.landmarks), np.full((2, vehicles, 2), np.inf)
     x[:, marks], variance[:, marks] = rec.gnss[0][:, marks], 0.0
+    scored = x, variance
     if body:
-        begin, start = begin_of(log)
-        parts = [(0, steps, PoseFilter("solo", gate=GATE, begin=begin)(rec, _moving(rec)))]
+        begin, spread, start = begin_of(log)
+        filter_ = PoseFilter("solo", gate=GATE, begin=begin, spread=spread)
+        parts = [(0, steps, filter_(rec, _moving(rec)))]
+        if log.truth is not None:
+            track = replace(filter_, unit="fleet")(rec, _moving(rec))
+            assert track.covariance is not None
+            scored = x.copy(), variance.copy()
+            scored[0][:, list(track.egos)] = track.x[0]
+            scored[1][:, list(track.egos)] = np.diagonal(track.covariance[0], axis1=-2, axis2=-1)
     else:
         stretches = [(column, *stretch) for column in range(vehicles) for stretch in rec.stretches(column)]
         parts = [
@@ -133,6 +157,8 @@ def filtered(log: Log) -> Check:
         x[there, columns], fix[there, columns] = track.x[0], fix_innovations(track, part)[0]
         variance[there, columns] = np.diagonal(track.covariance[0], axis1=-2, axis2=-1)
         normalised[there, columns] = squares[0]
+        for k, name in enumerate(("speed_scale", "yaw_rate_bias") if track.extras else ()):
+            lasting[:, columns, k] = track.extras[name][0, -1], track.extras[f"{name}_std"][0, -1]
         if track.heading is not None and track.heading_covariance is not None:
             heading[there, columns] = track.heading[0]
             heading_variance[there, columns] = track.heading_covariance[0, ..., 3]
@@ -148,7 +174,9 @@ def filtered(log: Log) -> Check:
     expected[:, 1] += heading_variance[links.step, links.observer]
     expected += np.square([noise.range_std, noise.world_azimuth_std, noise.inclination_std])
     log = replace(log, recording=rec)
-    return Check(log, span + start, world, x, variance, fix, normalised, residual, np.sqrt(expected))
+    none, known = np.zeros(vehicles), np.full(vehicles, np.inf)
+    stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting
+    return Check(log, span + start, world, *stats, none, known, np.zeros((len(links), 2, vehicles)), scored)
 
 
 def residual_of(world: Recording, x: Floats) -> tuple[Floats, Floats]:

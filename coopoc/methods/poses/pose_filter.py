@@ -58,7 +58,8 @@ class PoseFilter:
         fusion: of a fleet. "joint": one state with all cross-covariances, at a centre, the optimum. Decentralised, each
             vehicle fuses the estimates that reach it in time: "naive" as if their errors were independent;
             "intersection" by covariance intersection.
-        lasting: estimate the odometer's scale error and the yaw rate's bias, too (`Track.extras`).
+        lasting: estimate the odometer's scale error, the yaw rate's bias and, if assumed, an offset of ranges, too
+            (`Track.extras`); None where the noise has any of them, as that of a log.
         exact: False is the plain extended Kalman filter.
         robust: a component beyond its gate weighs less, far beyond it nothing, unless many are
             (`coopoc.kernels.gate`); False believes every number.
@@ -82,7 +83,7 @@ class PoseFilter:
 
     unit: Unit = "fleet"
     fusion: Fusion = "joint"
-    lasting: bool = False
+    lasting: bool | None = None
     exact: bool = True
     robust: bool = True
     gate: float = 3.0
@@ -219,7 +220,8 @@ class PoseFilter:
     def noise(self, sensors: Sensors, dt: float) -> PoseNoise:
         """What it assumes, as the kernel takes it."""
         found = pose_noise(sensors, dt, self.gate)
-        found = found._replace(longer=found.longer * self.lasting)
+        lasting = any(found.lasting) if self.lasting is None else self.lasting
+        found = found if lasting else found._replace(longer=0.0, lasting=(0.0, 0.0, 0.0))
         return found if self.robust else found._replace(gate=np.inf)
 
     def options(self, noise: PoseNoise) -> PoseOptions:
@@ -227,7 +229,7 @@ class PoseFilter:
         from ...kernels.poses.ekf import PoseOptions
 
         return PoseOptions(
-            4 + 2 * self.lasting + int(noise.longer),
+            4 + 2 * (self.lasting is True or any(noise.lasting)) + int(noise.longer),
             PASSES if self.exact else 1,
             get_args(Fusion).index(self.fusion),
         )

@@ -52,7 +52,7 @@ def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0
     steps = int(min(number("seconds", seconds, hint="30 is the default.") / recording.dt + 1.0, len(recording.t)))
     part = recording.between(0, max(steps, 2))
     spread = (*_spread(recording.sensors), np.pi / HEADINGS)
-    filter_ = PoseFilter("solo", gate=gate, spread=spread)
+    filter_ = PoseFilter("solo", lasting=False, gate=gate, spread=spread)
     begin = np.full((recording.runs, len(recording.ids), 4), np.nan)
     for run in range(recording.runs):
         known = np.full((len(part.t), len(part.ids), 3), np.nan)

@@ -1,0 +1,291 @@
+"""Errors of a log's clocks, odometry, antennas and pairs, with standard errors by parts of the drive."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+from typing import NamedTuple
+
+import numpy as np
+import pandas as pd
+import scipy  # its signals take half a second, and are imported where they are used
+
+from coopoc.arrays import AnyArray, Bools, Floats, Ints
+from coopoc.evaluate.metrics import dimensions
+from coopoc.world.links import wrap
+from coopoc.world.recording import Recording
+
+from .motion import MOVING
+from .residuals import Check, filtered, residual_of
+
+SURELY = 4.0
+"""Standard errors beyond which an estimate is no chance: one of hundreds that a few logs ask for lies beyond three."""
+LATE, SCALE, TURNED, DRIFT = 0.02, 0.01, 0.02, 2e-3
+"""Least errors that are worth a word: of a clock, s; of odometry, share of a speed, rad, rad/s."""
+ENOUGH = 20
+"""Measurements from which a statistic is worth a word."""
+FAR = 10.0
+"""Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
+OUTLYING, BLOCKS = 5.0, 10
+"""Medians of the residuals beyond which one is left out; parts of a drive that show how sure an estimate is."""
+VARIED, NUDGE = 0.15, 0.01
+"""Standard deviation over mean of a speed below which an arm ahead and a late clock look alike; m and s by which fixes
+are moved to see what a filter makes of an arm."""
+
+
+class Estimate(NamedTuple):
+    """Numbers (k,) and their standard errors, infinite where nothing shows them."""
+
+    value: Floats
+    error: Floats
+
+
+def factors(y: AnyArray, x: AnyArray, groups: Ints | None = None, reference: int | None = None) -> Estimate:
+    """Factors of causes x (M, k) that explain y (M,) best, outliers aside, with standard errors by parts that are left
+    out; less the means of groups (M,), and less the factor of a reference if any.
+
+    >>> time = np.arange(40.0)
+    >>> factors(3 * time + 7, time[:, None], np.zeros(40, int)).value.round(6).tolist()
+    [3.0]
+    """
+    none = Estimate(np.zeros(x.shape[1]), np.full(x.shape[1], np.inf))
+    if len(y) < ENOUGH:
+        return none
+    if groups is not None:
+        both = pd.DataFrame(np.column_stack([y, x]))
+        both = both - both.groupby(groups).transform("mean")
+        y, x = both[0].to_numpy(), both.to_numpy()[:, 1:]
+
+    def fitted(rows: Ints) -> Floats:
+        for _ in range(3):
+            left, right = (np.concatenate([each[rows].real, each[rows].imag]) for each in (x, y))
+            factor: Floats = np.linalg.lstsq(left, right)[0]
+            gap = np.abs(y - x @ factor)
+            rows = rows[gap[rows] <= OUTLYING * np.median(gap[rows])]
+        return factor - (0.0 if reference is None else factor[reference])
+
+    every = np.arange(len(y))
+    without = [fitted(np.setdiff1d(every, part)) for part in np.array_split(every, BLOCKS)]
+    error = np.sqrt(BLOCKS - 1.0) * np.std(without, axis=0)
+    return Estimate(fitted(every), np.where(np.any(x, axis=0), error, np.inf))
+
+
+def causes(c: Check) -> tuple[AnyArray, AnyArray]:
+    """What fixes are off by, x + iy m (T, N), and what an arm of 1 m ahead, one to the left, and a clock that is 1 s
+    late make of it (3, T, N): against the truth, else against a filter, which is linear in what is added to fixes."""
+    rec, truth = c.world, c.log.truth
+    velocity = (rec.velocity[0] if truth is None else truth.velocity)[..., :2] @ [1, 1j]
+    speed = pd.DataFrame(np.abs(velocity)).where(lambda v: v > MOVING)
+    course = pd.DataFrame(np.angle(velocity)).where(speed > 0).ffill().bfill().to_numpy()
+    ahead = np.nan_to_num(np.exp(1j * course)) * np.array(speed.std() > VARIED * speed.mean())
+    made = np.stack([ahead, 1j * ahead, velocity])
+    if truth is not None:
+        return (rec.gnss[0] - truth.position)[..., :2] @ [1, 1j], made
+    for k, cause in enumerate(np.nan_to_num(NUDGE * made)):
+        gnss = c.log.recording.gnss + np.stack([cause.real, cause.imag, 0 * cause.real], axis=-1)
+        moved = filtered(replace(c.log, recording=replace(c.log.recording, gnss=gnss)))
+        made[k] = (moved.fix - c.fix)[..., :2] @ [1, 1j] / NUDGE
+    return c.fix[..., :2] @ [1, 1j], made
+
+
+def moves(rec: Recording, column: int) -> tuple[AnyArray, AnyArray]:
+    """Displacements (M,) m, x + iy, of the fixes and of the odometry over the same spans, in which the odometry (if
+    that stands still, the fixes) moves far; none where too little moves."""
+    fixes, velocity = rec.gnss[0, :, column, :2] @ [1, 1j], rec.velocity[0, :, column, :2] @ [1, 1j]
+    path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
+    for places, far in ((path, FAR), (fixes, 2 * FAR)):
+        pairs, last = [], -1
+        for step in np.flatnonzero(np.isfinite(fixes)).tolist():
+            if last < 0 or gaps[step] != gaps[last]:
+                last = step
+            elif abs(places[step] - places[last]) > far * np.hypot(*rec.sensors.fix_std[:2]):
+                pairs.append((last, step))
+                last = step
+        if len(pairs) >= 3:
+            a, b = np.array(pairs).T
+            return fixes[b] - fixes[a], path[b] - path[a]
+    return np.empty(0), np.empty(0)
+
+
+def odometry(c: Check, column: int) -> Estimate:
+    """By what share a vehicle's speeds are too large, and by what its directions are turned, rad; in body frames what
+    its yaw rates are too large by, rad/s; and by what it is later than a truth, s: against the truth, else the fixes,
+    in body frames else the filter."""
+    rec, truth, body = c.world, c.log.truth, c.log.recording.body
+    if rec.sensors.velocity_reading == "fixes":
+        return Estimate(np.zeros(3), np.full(3, np.inf))
+    if truth is None and body is not None:
+        return Estimate(*c.lasting[:, column])
+    if truth is None:
+        moved, driven = moves(rec, column)
+        found = factors(moved, np.stack([driven, 1j * driven], axis=1))
+        noise = rec.sensors.velocity_std(rec.velocity[0, :, column, :2], rec.sensors.velocity_floor) * rec.dt
+        flatter = 1.0 + float(np.nansum(noise**2)) / max(float(np.square(np.abs(driven)).sum()), 1e-12)
+        turned = complex(*found.value) * flatter  # noise of a cause makes its factor smaller
+        return Estimate(_polar(1 / turned) if turned else found.value, found.error)
+    true = truth.velocity[:, column, :2] @ [1, 1j]
+    odometer = rec.velocity[0, :, column, :2] @ [1, 1j]
+    if body is not None:
+        odometer = c.log.recording.velocity[0, :, column, 0].astype(complex)
+        heading = None if truth.heading is None else truth.heading[:, column]
+        true = (np.abs(true) if heading is None else (true * np.exp(-1j * heading)).real).astype(complex)
+    x = np.stack([true, 1j * true, np.gradient(true, rec.dt)], axis=1)
+    known = np.isfinite(odometer + x.sum(axis=1)) & (np.arange(len(true)) > 0)
+    found = factors(odometer[known], x[known])
+    value, error = np.append(_polar(complex(*found.value[:2])), -found.value[2] / max(found.value[0], 0.1)), found.error
+    if body is not None:
+        error[1] = np.inf
+        if truth.heading is not None:
+            gap = body.yaw_rate[0, 1:, column] - wrap(np.diff(truth.heading[:, column])) / rec.dt
+            value[1], error[1] = median(gap[np.isfinite(gap)])
+    return Estimate(value, error)
+
+
+def _polar(turned: complex) -> Floats:
+    """Excess of its size over 1, and its angle, rad."""
+    return np.array([abs(turned) - 1.0, np.angle(turned)]) if turned else np.zeros(2)
+
+
+def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
+    """By what each vehicle's clock is ahead of that of a reference, by default of one that most agree with, s (N,), and
+    what a range or direction misses for 1 s of each (L, 2, N).
+
+    Where i measures j, whose stamps are d s ahead of i's, it is u v_j d longer than between the filters, u being the
+    unit vector from i to j.
+    """
+    links, size = c.world.links, len(c.world.ids)
+    gap, _ = residual_of(c.world, c.x)
+    flat = np.maximum(np.linalg.norm(gap[:, :2], axis=1), 1.0)
+    velocity = np.nan_to_num(c.world.velocity[0, links.step, links.neighbour])
+    along = (gap * velocity).sum(axis=1) / np.maximum(np.linalg.norm(gap, axis=1), 1.0)
+    across = (gap[:, 0] * velocity[:, 1] - gap[:, 1] * velocity[:, 0]) / flat**2
+    ends = np.eye(size)[links.neighbour] - np.eye(size)[links.observer]
+    made = np.stack([along, across], axis=1)[..., None] * ends[:, None]
+    there = np.isfinite(c.relative[:, 0] + along)
+    pairs = np.sort([links.observer, links.neighbour], axis=0)
+    given = c.relative[there, 0], made[there, 0], (pairs[0] * size + pairs[1])[there]
+    found = factors(*given)
+    seen = np.flatnonzero(np.isfinite(found.error))
+    if reference is None and len(seen):
+        apart = np.abs(np.subtract.outer(found.value[seen], found.value[seen]))
+        reference = int(seen[np.argmin((np.minimum(apart, LATE) + 1e-3 * apart).sum(axis=1))])
+    found = factors(*given, reference)
+    return found._replace(error=np.hypot(found.error, _of_filters(c, there, *given[1:], reference))), made
+
+
+def _of_filters(c: Check, there: Bools, x: Floats, pairs: Ints, reference: int | None) -> Floats:
+    """Standard errors (N,) of factors of causes x (M, N), less means of pairs (M,), by errors of the filters that decay
+    in the time that a fix is remembered."""
+    x = x - pd.DataFrame(x).groupby(pairs).transform("mean").to_numpy()
+    gain = x @ np.linalg.pinv(x.T @ x)
+    gain = gain if reference is None else gain - gain[:, [reference]]
+    keep = np.exp(-2.0 / max(share(c) * len(c.world.t), 1e-9))
+    position = np.maximum(c.expected[there, 0] ** 2 - c.world.sensors.range_std**2, 0.0)
+    variance = np.zeros(x.shape[1])
+    for pair in np.unique(pairs):
+        mine = pairs == pair
+        line = np.zeros((len(c.world.t), x.shape[1]))
+        np.add.at(line, c.world.links.step[there][mine], gain[mine] * np.sqrt(position[mine, None]))
+        variance += (2 * line * scipy.signal.lfilter([1.0], [1.0, -keep], line, axis=0) - line**2).sum(axis=0)
+    return np.sqrt(np.maximum(variance, 0.0))
+
+
+def share(c: Check) -> float:
+    """Share of the variance of filters that the mean over the drive keeps: their errors last for some time."""
+    fixes, noise = np.isfinite(c.normalised).sum(axis=0), float(np.square(c.world.sensors.fix_std[:2]).mean())
+    there = np.isfinite(c.variance[..., 0]).sum(axis=0)
+    variance = np.nansum(c.variance[..., :2], axis=(0, 2)) / np.maximum(2 * there, 1)
+    ratio = (variance + noise) / np.maximum(variance * fixes, 1e-12)
+    return min(2 * float(np.nanmax(ratio, where=variance > 0, initial=0.0)), 1.0)
+
+
+def median(values: Floats) -> tuple[float, float]:
+    """Median, and its standard error by the medians of parts of the drive; infinite of too few."""
+    if len(values) < ENOUGH:
+        return 0.0, np.inf
+    parts = [np.median(part) for part in np.array_split(values, BLOCKS)]
+    return float(np.median(values)), float(np.std(parts) / np.sqrt(BLOCKS - 1.0))
+
+
+def by_pair(c: Check, k: int) -> Iterator[tuple[str, Floats, Floats, Floats]]:
+    """Names of a pair, its residuals of one kind in order of time, what they should scatter by, and what a standard
+    error of each clock that was taken off makes of them (M, N)."""
+    links, ids = c.world.links, c.world.ids
+    there = np.isfinite(c.relative[:, k])
+    ends = np.column_stack([links.observer, links.neighbour])[there]
+    pairs, index = np.unique(ends if k else np.sort(ends), axis=0, return_inverse=True)
+    for number, (observer, neighbour) in enumerate(pairs.tolist()):
+        mine = np.flatnonzero(there)[index.reshape(-1) == number]
+        yield (
+            f"{ids[observer]} {'to' if k else 'and'} {ids[neighbour]}",
+            c.relative[mine, k],
+            c.expected[mine, k],
+            c.slack[mine, min(k, 1)],
+        )
+
+
+def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
+    """Pairs -> the median of their residuals of one kind, and its standard error: by parts of the drive, and by the
+    errors of the filters and of the clocks that were taken off, which last."""
+    made, lasts = {}, share(c)
+    for pair, value, expected, slack in by_pair(c, k):
+        (offset, error), position = median(value), max(float(np.mean(expected**2)) - stated**2, 0.0)
+        lasting = stated**2 / len(value) + position * lasts + float(np.square(slack.mean(axis=0)).sum())
+        made[pair] = offset, float(np.sqrt(error**2 + lasting))
+    return made
+
+
+def _beside(off: AnyArray, velocity: AnyArray) -> float:
+    """By what fixes that are off by (T,) m lie beside the truth, m, however late they are; 0 where there are none."""
+    known = np.isfinite(off + velocity)
+    if not known.any():
+        return 0.0
+    x = np.column_stack([np.ones(known.sum()), velocity[known]])
+    return float(abs(np.linalg.lstsq(x, off[known])[0][0]))
+
+
+def against_truth(c: Check) -> Check:
+    """The same, with ranges, and in the world directions, against the truth where both ends have one that
+    their fixes fit, or one stands as a landmark."""
+    truth, noise = c.log.truth, c.world.sensors
+    if truth is None:
+        return c
+    marks = np.isin(np.arange(len(c.world.ids)), c.world.landmarks)
+    off, (_, _, velocity) = causes(c)
+    fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * np.hypot(*noise.fix_std[:2])
+    x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
+    residual, stated = residual_of(c.world, x)[1], [noise.range_std, noise.world_azimuth_std, noise.inclination_std]
+    known = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)
+    relative, expected = (np.where(known, new, old) for new, old in ((residual, c.relative), (stated, c.expected)))
+    return replace(c, relative=relative, expected=expected)
+
+
+def on_time(c: Check) -> Check:
+    """The same with what its relative measurements say about clocks, and less what wrong ones explain."""
+    reference = None
+    if c.log.truth is not None:
+        off, (_, _, velocity) = causes(c)
+        seconds = np.nansum((off * velocity.conj()).real, axis=0) / np.maximum(np.isfinite(off).sum(axis=0), 1e-12)
+        seen = np.isfinite(off).any(axis=0) & (c.variance[..., 0] > 0).any(axis=0)
+        reference = int(np.argmin(np.where(seen, np.abs(seconds), np.inf))) if seen.any() else None
+    found, made = clocks(c, reference)
+    ahead = np.where((np.abs(found.value) > np.maximum(SURELY * found.error, LATE)), found.value, 0.0)
+    relative = c.relative.copy()
+    relative[:, :2] -= np.nan_to_num(made @ ahead)
+    slack = np.nan_to_num(made * np.where(ahead, found.error, 0.0))
+    return replace(c, relative=relative, ahead=ahead, unsure=found.error, slack=slack)
+
+
+def worst(c: Check, column: int) -> tuple[float | None, float]:
+    """Error of a vehicle's filter over the deviation that it states, in the worst tenth of the drive, and when that
+    begins, s."""
+    assert c.log.truth is not None
+    size, t = dimensions(c.world), c.world.t
+    square, stated = np.square(c.scored[0] - c.log.truth.position)[:, column, :size], c.scored[1][:, column, :size]
+    stated = np.where(np.isfinite(square), stated, np.nan)
+    worst, when = None, 0.0
+    for part in np.array_split(np.arange(len(t)), BLOCKS):
+        if np.isfinite(square[part]).any() and (all_of := np.nansum(stated[part])) > 0:
+            ratio = float(np.sqrt(np.nansum(square[part]) / all_of))
+            worst, when = (ratio, float(t[part[0]] - t[0])) if ratio > (worst or 0.0) else (worst, when)
+    return worst, when

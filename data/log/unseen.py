@@ -1,0 +1,39 @@
+"""What the check of a log could not see, and of whom."""
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from .estimates import DRIFT, ENOUGH, LATE, SCALE, SURELY, TURNED
+from .residuals import Check
+
+
+def unseen(c: Check) -> list[str]:
+    """What the check could not see, and of whom."""
+    sentences, every = [], [row["vehicle"] for row in c.vehicles]
+    if c.log.truth is None:
+        sentences.append("errors that all sensors share, and a clock that is wrong for all alike: there is no truth")
+    turns = ("turned", TURNED, "rad, of the direction of the odometry")
+    if c.log.recording.body is not None:
+        turns = ("yaw_rate_bias", DRIFT, "rad/s, of the yaw rates")
+    for name, least, what in (("speed_excess", SCALE, "as a share, of the speeds"), turns):
+        errors = {row["vehicle"]: SURELY * row.get(f"{name}_error", np.inf) for row in c.vehicles}
+        if blind := _below(errors, 2 * least):
+            sentences.append(f"errors, {what} of {blind}")
+    late = {row["vehicle"]: row.get("late_s_error", np.inf) for row in c.vehicles}
+    if blind := _below({who: SURELY * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LATE):
+        sentences.append(f"errors, s, of the clocks of {blind}")
+    known = np.isfinite(c.fix[..., 0]).sum(axis=0)
+    if few := [who for who in every if known[c.world.ids.index(who)] < ENOUGH]:
+        sentences.append(f"late fixes of {', '.join(few)}, and whether their deviations are right: too few fixes")
+    sensors = c.world.sensors
+    stated = {"fixes": sensors.gnss_std[0]} | {f"{row['measurement']}s": row["stated_std"] for row in c.measurements}
+    if near := [f"{name} ({std:.2g})" for name, std in stated.items() if 0.7 < std < 1.4]:
+        sentences.append(f"whether deviations of {', '.join(near)} are variances: both are near 1")
+    return sentences
+
+
+def _below(errors: Mapping[str, float], enough: float) -> str:
+    """Names of what is not known as well as enough, with what stays hidden."""
+    blind = {name: error for name, error in errors.items() if error > enough}
+    return ", ".join(f"{name} (below {error:.2g})" if np.isfinite(error) else name for name, error in blind.items())

@@ -1,0 +1,87 @@
+"""Logs of drones, cars and robots with a truth, clean or with faults that are planted in them."""
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+KINDS: dict[str, tuple[int, float, float, float, float, float, tuple[float, ...]]] = {
+    "drone": (4, 5.0, 15.0, 8.0, 0.5, 0.1, (5.0, 10.0, 5.0)),
+    "car": (4, 15.0, 25.0, 0.0, 1.0, 0.3, (1.0, 10.0, 10.0)),
+    "robot": (2, 0.8, 3.0, 0.0, 0.0, 0.1, (1.0, 10.0, 5.0)),
+}
+"""Vehicles, m/s, m apart, m of climb, standard deviations m of fixes and ranges, Hz of fixes, odometry and ranges."""
+
+
+def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate: float = 1.0, **fault: Any) -> Path:
+    """A log and its truth: drones that range each other, cars with a radar to the one ahead, robots with an anchor.
+
+    Args:
+        folder: is made.
+        kind: of vehicles.
+        seed: of paths and noise.
+        seconds: of the drive.
+        rate: factor of all rates.
+        fault: `pairs` (a, b) -> m, `clocks` s and `wheels` (share of the speed) of vehicles, `late` fixes s, `unit` of
+            ranges, `tunnel` (from, to) s without fixes, `stated` factor of the deviations of fixes.
+    """
+    count, pace, apart, climb, fix, reach, rates = KINDS[kind]
+    rng, noise, t = np.random.default_rng(seed), np.random.default_rng([seed, 1]), 0.02 * np.arange(int(seconds * 50))
+    drones, cars, robots = (kind == name for name in KINDS)
+    names, axes = [f"{kind}{k}" for k in range(count)], list("xyz" if drones else "xy")
+    begin, end = fault.get("tunnel", (-1, -1))
+    place, speed, course, tables = {}, {}, {}, []
+    shape = rng.uniform(0.6, 1.4, (count, 3))
+    for k, name in enumerate(names):
+        s, (a, b, c) = t - k * apart / pace * cars, shape[0 if cars else k]
+        course[name] = 0.15 * s * robots * (-1) ** k + 1.6 * a * np.sin(0.08 * b * s + 2 * k * drones)
+        speed[name] = pace * (1 + 0.3 * np.sin(0.15 * c * s))
+        path = np.cumsum(0.02 * speed[name] * np.exp(1j * course[name]))
+        path += -k * apart if cars else apart * np.exp(1.9j * k) * (k > 0)
+        place[name] = np.column_stack([path.real, path.imag, climb * np.sin(0.1 * t + k)])
+    place |= {"anchor": 0 * place[names[0]] + [2.0, -1.0, 0.0]} if robots else {}
+
+    def at(values: Any, times: Any) -> Any:
+        return np.column_stack([np.interp(times, t, axis) for axis in np.atleast_2d(values.T)])
+
+    def add(name: str, times: Any, kinds: list[str], values: Any, std: float, stated: float = 1.0, **more: Any) -> None:
+        values = values + noise.normal(0, std, values.shape)
+        columns = dict(zip(kinds, values.T, strict=True)) | {f"{one}_std": stated * std for one in kinds}
+        now = times + fault.get("clocks", {}).get(name, 0.0)
+        frame = pd.DataFrame({"t": now, "vehicle": name, **columns, **more})
+        tables.append(frame[frame[kinds[0]].gt(0) | (kinds[0] != "range")])
+
+    for k, name in enumerate(names):
+        fixed, moved, ranged = (np.arange(1 + 0.01 * k, seconds - 1, 1 / hertz / rate) for hertz in rates)
+        fixed = fixed[(fixed < begin) | (fixed > end)]
+        scale, late = 1 + fault.get("wheels", {}).get(name, 0.0), fault.get("late", 0.0)
+        if not robots:
+            fixes = at(place[name], fixed)[:, : len(axes)]
+            add(name, fixed + late, axes, fixes, fix, fault.get("stated", 1.0))
+        if drones:
+            u = (at(place[name], moved + 0.05) - at(place[name], moved - 0.05)) / 0.1
+            add(name, moved, ["vx", "vy", "vz"], scale * u, 0.1)
+        else:
+            turn = (at(course[name], moved + 0.05) - at(course[name], moved - 0.05)) / 0.1
+            add(name, moved, ["speed"], scale * at(speed[name], moved), 0.02 if robots else 0.1)
+            add(name, moved, ["yaw_rate"], turn, 0.01)
+        if cars:
+            add(name, moved, ["heading"], at(course[name], moved), 0.01)
+        for other in names[k - 1 : k] if cars else [one for one in place if one != name]:
+            gap = at(place[other], ranged) - at(place[name], ranged)
+            pairs, unit = fault.get("pairs", {}), fault.get("unit", 1.0)
+            far = np.linalg.norm(gap, axis=1, keepdims=True) + pairs.get((name, other), pairs.get((other, name), 0.0))
+            add(name, ranged, ["range"], far / unit, reach / unit, partner=other)
+            if cars:
+                side = np.arctan2(gap[:, 1:2], gap[:, :1]) - at(course[name], ranged)
+                add(name, ranged, ["bearing"], np.angle(np.exp(1j * side)), 0.02, partner=other)
+    tables += [pd.DataFrame({"t": [1.0], "vehicle": "anchor", "x": [2.0], "y": [-1.0]})] * robots
+    folder.mkdir(parents=True, exist_ok=True)
+    pd.concat(tables).sort_values("t", kind="stable").to_csv(folder / "log.csv", index=False)
+    for name in names:
+        heading = np.angle(np.exp(1j * course[name]))
+        true = dict(zip(axes, place[name].T, strict=False))
+        tables.append(pd.DataFrame({"t": t, "vehicle": name, **true, "heading": heading})[::5])
+    pd.concat(tables[-count:]).to_csv(folder / "truth.csv", index=False)
+    return folder

@@ -1,0 +1,76 @@
+"""What `coopoc data check` names in logs with several faults at once, and that it names nothing in clean ones."""
+
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from strange_logs import strange
+
+import coopoc as co
+from coopoc.data.log.check import check
+from coopoc.data.registry import load_log
+
+PAIRS = {("drone0", "drone1"): 0.45, ("drone1", "drone3"): -0.25, ("drone0", "drone2"): 0.6}
+DRONES: dict[str, Any] = {"pairs": PAIRS, "clocks": {"drone1": 0.3, "drone3": -0.12}}
+CONVOY: dict[str, Any] = {"wheels": {"car2": 0.03}, "tunnel": (60, 100), "pairs": {("car0", "car1"): 1.2}}
+ROBOTS: dict[str, Any] = {"wheels": {"robot0": 0.03, "robot1": 0.03}, "unit": 1e-3}
+
+
+def said(folder: Path, options: str = "") -> str:
+    return "\n".join(check(load_log(f"{folder}?{options}" if options else str(folder))).warnings)
+
+
+@pytest.mark.parametrize("truth", [True, False])
+@pytest.mark.parametrize("seed", [1, 2])
+def test_offsets_of_drones_and_both_clocks_are_named(tmp_path: Path, seed: int, truth: bool) -> None:
+    folder = strange(tmp_path / "log", "drone", seed, rate=seed, **DRONES)
+    if not truth:
+        (folder / "truth.csv").unlink()
+    text = said(folder)
+    found = {name: float(late) for name, late in re.findall(r"clock=(\w+):(-?[\d.]+\d)", text)}
+    assert found == pytest.approx(DRONES["clocks"], abs=0.02)
+    offsets = {frozenset(pair): float(by) for *pair, by in re.findall(r"(\w+) and (\w+) by (\S+) ", text)}
+    assert offsets == pytest.approx({frozenset(pair): by for pair, by in PAIRS.items()}, abs=0.15)
+    assert text.startswith("drone1: its filter errs by") == truth
+    clocks = ",".join(f"{name}:{late}" for name, late in found.items())
+    log = load_log(f"{folder}?clock={clocks}&offset=auto")
+    for pair, by in PAIRS.items():
+        (taken,) = re.findall(
+            rf"(\S+) \+- \S+ m of (?:{pair[0]} and {pair[1]}|{pair[1]} and {pair[0]})", str(log.summary)
+        )
+        assert float(taken) == pytest.approx(by, abs=0.15)
+    assert "clock=" not in "\n".join(check(log).warnings)
+
+
+@pytest.mark.parametrize("late", [0.0, 0.4])
+def test_faults_of_a_convoy_are_named(tmp_path: Path, late: float) -> None:
+    text = said(strange(tmp_path / "log", "car", 3, late=late, **CONVOY))
+    assert text.startswith("car2: its filter errs by")
+    assert re.findall(r"(\w+): its odometry is too fast by (\d)", text) in ([("car2", "3")], [("car2", "2")])
+    assert "ranges of car0 and car1 by +1.2" in text.replace("+1.1", "+1.2")
+    assert "azimuths" not in text
+    assert len(re.findall(r"fixes are 0\.[34]\d s behind the truth", text)) == 4 * (late > 0)
+
+
+def test_millimetres_and_wheels_of_robots_are_named(tmp_path: Path) -> None:
+    folder = strange(tmp_path / "log", "robot", 4, **ROBOTS)
+    text = said(folder, "frame=body")
+    assert "scale=range:0.001 first" in text
+    assert re.findall(r"(\w+): its odometry is too fast by 3\.0|2\.9", text)
+    text = said(folder, "frame=body&scale=range:0.001")
+    assert set(re.findall(r"(\w+): its odometry is too fast by", text)) == {"robot0", "robot1"}
+    assert "ranges" not in text
+
+
+@pytest.mark.parametrize("kind", ["drone", "car", "robot"])
+def test_nothing_is_named_in_clean_logs(tmp_path: Path, kind: str) -> None:
+    rng, named = np.random.default_rng(len(kind)), []
+    for seed in rng.integers(1000, size=3).tolist():
+        options = {"rate": float(rng.choice([0.5, 1.0, 2.0])), "seconds": float(rng.choice([90, 180]))}
+        folder = strange(tmp_path / f"{seed}", kind, seed, **options)
+        result = check(co.read_log(folder, frame="body" if kind == "robot" else "world"))
+        named += result.warnings
+        assert ("robot0" in str(result.unseen)) == (kind == "robot")
+    assert not named
