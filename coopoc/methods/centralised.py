@@ -6,9 +6,9 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tqdm import tqdm
 
 from ..arrays import TINY, Floats
+from ..workers import progress_bar
 from ..world.recording import Recording, Vehicles, check_recording
 from .gaps import in_stretches
 from .noise_model import NoiseModel
@@ -62,7 +62,7 @@ class CentralFilter(Checked):
             runs = len(measured.active)
             together = runs if share_covariance(measured, pairs, assumed) else 1
             x, cov = np.empty(measured.gnss.shape), np.empty((*measured.gnss.shape, 3))
-            for run in tqdm(range(0, runs, together), desc=self.name, unit="run", delay=2.0):
+            for run in progress_bar(range(0, runs, together), desc=self.name, unit="run", delay=2.0):
                 some = slice(run, run + together)
                 x[some], cov[some] = run_filter(*of_runs(measured, pairs, assumed, some))
             return Answer(x, cov, None, notes)
@@ -137,7 +137,7 @@ class BatchSmoother:
             steps = self.exact_steps if len(assumed.std) else 0
             x, lost = own_filters(measured, assumed).reshape(measured.gnss.shape), 0
             cov: Floats = np.empty((*x.shape, 3))
-            with tqdm(total=len(x) * (1 + steps) * len(x[0]), desc=self.name, unit="step", delay=2.0) as bar:
+            with progress_bar(total=len(x) * (1 + steps) * len(x[0]), desc=self.name, unit="step", delay=2.0) as bar:
                 for run in range(len(x)):
                     factors = run_factors(*of_runs(measured, pairs, assumed, slice(run, run + 1)))
                     x[run], cov[run], small = smooth(x[run], factors, steps, self.settle, bar.update)

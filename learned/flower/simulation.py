@@ -13,10 +13,9 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from tqdm import tqdm
-
 from coopoc.errors import MissingLibraryError
 from coopoc.file_names import given_path
+from coopoc.workers import progress_bar
 
 from ..checkpoint import Checkpoint, load, read_card, save
 from ..recipes import Job, job_clients
@@ -75,7 +74,7 @@ def simulate(job: Job, fleet: Drives, progress: str | None = None, processes: in
     """
     require_flower("training with --flower")
     rows, began, fleet_size = list[Row](), time.perf_counter(), len(fleet.ids)
-    bar = tqdm(total=job.recipe.rounds + 1, desc=progress, unit="round", disable=progress is None)
+    bar = progress_bar(total=job.recipe.rounds + 1, desc=progress, unit="round", disable=progress is None)
 
     def keep(row: Row) -> None:
         rows.append(row)

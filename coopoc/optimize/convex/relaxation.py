@@ -15,11 +15,11 @@ from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import csc_matrix
-from tqdm import tqdm
 
 from ...arrays import Floats
 from ...errors import InputError, require
 from ...short_repr import short_repr
+from ...workers import progress_bar
 from ..algebra.cholesky import cholesky_of
 from ..model.problem import Problem
 from ..solution import Solution
@@ -217,7 +217,7 @@ def _climb(reduced: Reduced, Y: Floats, most: int, deadline: float) -> tuple[Sta
     """A stationary point and the best bound on the way; the two agree, unless `most` columns, rounding or the time
     (time.perf_counter() of the `deadline`) stop it."""
     bound, before = -np.inf, np.inf
-    with tqdm(desc="staircase", unit=" steps", delay=2.0) as bar:
+    with progress_bar(desc="staircase", unit=" steps", delay=2.0) as bar:
         while True:
             found = minimise(reduced, Y, deadline=deadline, tick=bar.update)
             proved, (smallest,), vector = reduced.lower_bound(found.multipliers)
