@@ -12,9 +12,9 @@ from coopoc.evaluate.scores import rows_of
 from coopoc.evaluate.statistics import Interval
 from coopoc.study.numbers import Where, present, seed_means
 from coopoc.study.study import Params, Row
-from coopoc.study.style import Panel
+from coopoc.study.style import Panel, look
 
-from . import lineup, scene, weights
+from . import drawings, lineup, scene, weights
 from .views import curves, table
 
 if TYPE_CHECKING:
@@ -85,7 +85,11 @@ def _figure(results: Results) -> Plot | None:
         "RT-LE after every round with the weights that validated best so far (mean over training seeds, band from the "
         "lowest to the highest); horizontal: the individual nets at their end."
     )
-    lines, ends = ([{"method": name} for name in names] for names in (BOTH["method"], weights.INDIVIDUAL))
+    lines = [{"method": name, "label": look(name).label} for name in BOTH["method"]]
+    ends = [
+        {"method": name, "label": look(name).label, "linestyle": ("-", "--", ":", "-.")[k % 4]}
+        for k, name in enumerate(weights.INDIVIDUAL)
+    ]
     return curves([panel], lines, text, number=_seeds, levels=ends, width=6.4, log=True)(results)
 
 
@@ -138,7 +142,7 @@ STUDY = lineup.study(
             "RT-LE [m] after every round.", rows="round", columns="method", where=BOTH, decimals=3, intervals=False
         )
     },
-    figures={"rounds": _figure},
+    figures={"rounds": _figure, "clients": drawings.clients, "net": drawings.architecture},
     findings=_findings,
     limitations=("The centralised net has no rounds: its schedule is divided into as many equal parts.",),
     metrics={"rt_le_m": "lower"},

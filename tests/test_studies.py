@@ -20,7 +20,7 @@ from coopoc.learned.nets.gain_net import GainNet
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import Setting, jobs_of, load_method
 from coopoc.plugins import find
-from coopoc.studies import convergence, error_cdf, lineup, scene, weights
+from coopoc.studies import convergence, drawings, error_cdf, lineup, scene, weights
 from coopoc.studies.paper import reported
 from coopoc.study.numbers import seed_std
 from coopoc.study.publish import views as published
@@ -45,6 +45,24 @@ def study(name: str, **changes: object) -> Study:
 def drawn(name: str, frame: pd.DataFrame, *axes: str, **settings: object) -> Results:
     """Results of a study whose rows are given: what may be said of them is known beforehand."""
     return Results(name, "", axes, {**study(name).settings, **settings}, frame, pd.DataFrame(), 0, {})
+
+
+def test_the_clients_and_the_net_are_drawn_from_themselves(tmp_path: Path) -> None:
+    """The net by hand: shapes of its weights, and the paper's order of three GRUs (section II.B)."""
+    results = drawn("convergence", pd.DataFrame(), weights=str(tmp_path))
+    fleet, plot = co.load_fleet("town10-clients"), drawings.clients(results)
+    for k, panel in enumerate(plot.figure.axes):
+        np.testing.assert_array_equal(panel.lines[0].get_xydata(), fleet.position[fleet.present[:, k], k, :2])
+    assert plot.figure.axes[2].get_title() == "Client 3: 1450 steps\n0.4 to 10.8 m/s"
+    assert "19,938 parameters" in drawings.architecture(results).caption
+    for net in (GainNet(in_mult=2), GainNet()):
+        made, takes, kept = drawings.layers(net)
+        assert set(made) == {name.partition(".")[0] for name, _ in net.named_parameters()}
+        grus = [name for name, layer in made.items() if hasattr(layer, "hidden_size")]
+        assert grus == ["process", "prior", "innovation"]
+        assert takes["gain_hidden"] == ["prior", "innovation"]
+        assert kept == {"process": "process", "prior": "posterior", "innovation": "innovation"}
+        assert (made["update"].out_features, made["process"].input_size) == (3 * net.in_mult,) * 2
 
 
 def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:

@@ -139,7 +139,8 @@ def curves(
             points = {x: number(results, {**panel.where, **also, **columns}) for x, also in panel.x.items()}
             drawn += [(of, ran(points))] if ran(points) else []
         if drawn or len(panels) == 1:
-            flat = [(of, number(results, {**panel.where, **of})) for of in levels]
+            plain = [{name: value for name, value in of.items() if name not in STYLE} for of in levels]
+            flat = [(of, number(results, {**panel.where, **at})) for of, at in zip(levels, plain, strict=True)]
             shown.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
     if not any(drawn for _, drawn in shown):
         return None
