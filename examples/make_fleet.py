@@ -35,8 +35,8 @@ DRIVER = 'sigmaStep="1" speedFactor="1" speedDev="0" accel="2" decel="3.5" tau="
 """Krauss' model: m/s^2, s and m as in dense city traffic; dawdling changes once a second, not at every 0.1 s."""
 JUMP = 8.0
 """m/s^2, less than the grip of a dry road."""
-RADIUS, CAP, FEW = 30.0, 10, 6
-"""m and number of the neighbours that a card counts; vehicles up to which it has the speeds of each."""
+RADIUS, CAP = 30.0, 10
+"""m and number of the neighbours that a card counts."""
 DT, WARMUP = 0.1, 60.0
 """s: the sampling interval, and what is driven before the first step that is kept."""
 CUTOFF = 0.5
@@ -152,7 +152,7 @@ def facts(fleet: Fleet) -> dict[str, Any]:
         "steps": lengths[0] if len(lengths) == 1 else f"{lengths[0]}..{lengths[-1]}",
         "dt": fleet.dt,
         "speed": _rounded(min=speed.min(), mean=speed.mean(), max=speed.max(), standing=np.mean(speed < 0.1)),
-        **({"speeds": ranges} if len(ranges) <= FEW else {}),
+        **({"speeds": ranges} if len(lengths) > 1 else {}),
         "neighbours": _rounded(radius=RADIUS, cap=CAP, mean=counts.mean(), any=np.mean(counts > 0)),
         "height": [round(float(z.min()), 3), round(float(z.max()), 3)],
         "acceleration": round(float(np.nanmax(change, initial=0.0)) / fleet.dt, 3),

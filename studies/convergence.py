@@ -142,7 +142,7 @@ STUDY = lineup.study(
             "RT-LE [m] after every round.", rows="round", columns="method", where=BOTH, decimals=3, intervals=False
         )
     },
-    figures={"rounds": _figure, "clients": drawings.clients, "net": drawings.architecture},
+    figures={"rounds": _figure, "clients": drawings.clients},
     findings=_findings,
     limitations=("The centralised net has no rounds: its schedule is divided into as many equal parts.",),
     metrics={"rt_le_m": "lower"},

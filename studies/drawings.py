@@ -1,4 +1,4 @@
-"""What the paper shows beside numbers: the drives of the clients, and the net, drawn from itself."""
+"""The drives of the clients in a figure."""
 
 from __future__ import annotations
 
@@ -6,148 +6,28 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopoc.plugins import find
 from coopoc.study.plot import Plot, canvas
-from coopoc.study.style import CLIENTS, look
+from coopoc.study.style import CLIENTS
 
 from . import weights
 
 if TYPE_CHECKING:
     from coopoc import Results
-    from coopoc.learned.nets.gain import Recurrent
-
-ACROSS = 4
-"""Panels in a row, at most."""
-HALF = 0.31
-"""Half of the height of a layer's box."""
 
 
 def clients(results: Results) -> Plot:
     """The path of each client on one scale, with its number of steps and its range of speeds (paper, Fig. 2)."""
-    drives = weights.drives(str(results.settings["clients"]))
-    truth, names = getattr(drives, "truth", drives), drives.ids
-    rows, columns = -(-len(names) // ACROSS), min(len(names), ACROSS)
-    size = {"width": 2.0 * columns + 0.4, "height": 2.4 * rows + 0.2}
-    with canvas(rows, columns, **size, squeeze=False, sharex=True, sharey=True) as (figure, panels):
-        for panel in panels.flat[len(names) :]:
-            panel.remove()
-        for k, (name, panel) in enumerate(zip(names, panels.flat, strict=False)):
-            there = truth.present[:, truth.index(name)]
-            x = truth.position[there, truth.index(name)]
-            speed = np.linalg.norm(truth.velocity[there, truth.index(name)], axis=1)
-            panel.plot(*x[:, :2].T, color=CLIENTS[k % len(CLIENTS)], lw=1.2)
-            panel.plot(*x[0, :2], "o", color="black", ms=3)
-            panel.set_title(f"Client {k + 1}: {len(x)} steps\n{speed.min():.1f} to {speed.max():.1f} m/s")
-            panel.set_aspect("equal", adjustable="box")
-        for panel in panels[:, 0]:
-            panel.set_ylabel("North [m]")
-        for panel in panels.flat[max(len(names) - columns, 0) : len(names)]:
-            panel.set_xlabel("East [m]")
-    return Plot(
-        figure, f"Paths of the clients of {truth.name} from the dot on, steps of {truth.dt:g} s, and their speeds."
-    )
-
-
-def layers(net: Recurrent) -> tuple[dict[str, Any], dict[str, list[str]], dict[str, str]]:
-    """Layers of a net in the order of a step, what each takes, and the layer that each field of the memory comes from.
-
-    The step is traced, so that the picture shows the net that runs. What a layer takes are names of layers, of fields
-    of the memory, and of measurements.
-
-    >>> from coopoc.learned import GainNet
-    >>> layers(GainNet())[1]["prior"]
-    ['process', 'evolution', 'memory.prior']
-    """
-    import torch
-    from torch import fx, nn
-
-    class Step(nn.Module):
-        def __init__(self) -> None:
-            super().__init__()
-            self.net = net
-
-        def forward(self, memory: Any, fix: Any, velocity: Any, dt: Any) -> Any:
-            return self.net.step(memory, fix, velocity, dt)
-
-    memory = net.start(torch.zeros(1, 3))
-    held = type(memory)(*[fx.PH] * len(memory))
-    graph = fx.Tracer().trace(Step(), concrete_args={"memory": held})
-    fields = iter(f"memory.{field}" for field in memory._fields)
-    names = {node: next(fields, node.name) for node in graph.nodes if node.op == "placeholder"}
-    names |= {node: str(node.target).removeprefix("net.") for node in graph.nodes if node.op == "call_module"}
-
-    def sources(node: fx.Node) -> list[str]:
-        found = ([names[one]] if one in names else sources(one) for one in node.all_input_nodes)
-        return list(dict.fromkeys(name for each in found for name in each))
-
-    made = {name: net.get_submodule(name) for node, name in names.items() if node.op == "call_module"}
-    (end,) = (node for node in graph.nodes if node.op == "output")
-    after = zip(memory._fields, end.args[0], strict=False)
-    kept = {field: [name for name in sources(node) if name in made][-1:] for field, node in after}
-    takes = {name: sources(node) for node, name in names.items() if name in made}
-    return made, takes, {field: name[0] for field, name in kept.items() if name and field not in net.positions}
-
-
-def architecture(_: Results, name: str = "fedkalmannet") -> Plot:
-    """The layers of the net of a recipe with their sizes, and what each takes, drawn from the net itself (Fig. 1).
-
-    Args:
-        name: of the recipe.
-    """
-    from coopoc.learned.recipes import RECIPES
-
-    recipe = RECIPES[name]
-    net: Any = find("coopoc.nets", recipe.net)(**dict(recipe.options))
-    made, takes, kept = layers(net)
-    chain = [name for name in made if any(source in made for source in takes[name]) or f"memory.{name}" in takes[name]]
-    place = {name: (1.45 * k, 0.0) for k, name in enumerate(chain)}
-    for name in made.keys() - place.keys():  # a layer of features stands above the one that it feeds
-        place[name] = (place[next(one for one in chain if name in takes[one])][0], 1.3)
-    with canvas(width=9.2, height=3.4) as (figure, panel):
-        for name, layer in made.items():
-            x, y = place[name]
-            recurrent = hasattr(layer, "hidden_size")
-            size = (layer.input_size, layer.hidden_size) if recurrent else (layer.in_features, layer.out_features)
-            shown = f"{name.replace('_', chr(10))}\n{'GRU' if recurrent else 'Linear'} {size[0]} \u2192 {size[1]}"
-            box = {
-                "boxstyle": "round,pad=0.35",
-                "facecolor": "#F2D9E6" if recurrent else "white",
-                "edgecolor": "#555555",
-            }
-            panel.text(x, y, shown, ha="center", va="center", fontsize=7, bbox=box, zorder=3)
-            given = [source.removeprefix("memory.") for source in takes[name] if source not in made]
-            fed = [field for field in given if kept.get(field)]
-            for source in takes[name]:
-                if source in made:
-                    apart = chain.index(name) - chain.index(source) if source in chain else 1
-                    _arrow(panel, place[source], place[name], 0.22 * (apart > 1))
-            for field in fed:
-                if kept[field] != name:
-                    _arrow(panel, place[kept[field]], place[name], -0.3, "next step")
-            if plain := [field.replace("_", " ").replace("gnss", "fix") for field in given if field not in fed]:
-                panel.annotate(
-                    "\n".join(plain),
-                    (x, y + HALF),
-                    (x, y + 0.75),
-                    ha="center",
-                    fontsize=7,
-                    arrowprops={"arrowstyle": "->"},
-                )
-        panel.set(xlim=(-0.8, 1.45 * len(chain) - 0.6), ylim=(-1.85, 2.7))
-        panel.axis("off")
-    number = sum(parameter.numel() for parameter in net.parameters())
-    text = (
-        f"One step of {look(name).label}, {number:,} parameters, traced from the net itself. Shaded: recurrent layers, "
-        "which stand for the paper's R (process), prior covariance and W (innovation); dashed: for the next step. "
-        "The gain K makes the estimate x = prior + K (fix - prior)."
-    )
-    return Plot(figure, text)
-
-
-def _arrow(panel: Any, start: tuple[float, float], end: tuple[float, float], bend: float, words: str = "") -> None:
-    """An arrow between two boxes, bent below or above others, dashed if it has words."""
-    style = {"arrowstyle": "->", "color": "#0072B2" if words else "#555555", "linestyle": "--" if words else "-"}
-    gaps = {"shrinkA": 16, "shrinkB": 16} if start[0] == end[0] else {"shrinkA": 24, "shrinkB": 26}
-    if bend:
-        (start, end), gaps = ((x, y - HALF) for x, y in (start, end)), {"shrinkA": 4, "shrinkB": 4}
-    panel.annotate("", end, start, arrowprops={**style, **gaps, "connectionstyle": f"arc3,rad={bend}"})
+    drives: Any = weights.drives(str(results.settings["clients"]))
+    truth, shown = getattr(drives, "truth", drives), list(zip(range(1, 7), drives.ids, CLIENTS, strict=False))
+    same = {"squeeze": False, "sharex": True, "sharey": True}
+    with canvas(1, len(shown), width=2.0 * len(shown) + 0.4, height=2.6, **same) as (figure, (panels,)):
+        for panel, (number, name, color) in zip(panels, shown, strict=True):
+            column = truth.index(name)
+            there = truth.present[:, column]
+            x, speed = truth.position[there, column], np.linalg.norm(truth.velocity[there, column], axis=1)
+            panel.plot(*x[:, :2].T, color=color)
+            panel.plot(*x[0, :2], "ko", ms=3)
+            panel.set_title(f"Client {number}: {len(x)} steps\n{speed.min():.1f} to {speed.max():.1f} m/s")
+            panel.set(xlabel="East [m]", aspect="equal")
+        panels[0].set_ylabel("North [m]")
+    return Plot(figure, f"Paths of the clients of {truth.name} from the dot on, steps of {truth.dt:g} s; their speeds.")

@@ -157,10 +157,9 @@ def gaps(results: Results, first: Where, second: Where, value: str = "rt_le_m") 
 def alike(results: Results, first: Where, second: Where, value: str) -> bool:
     """Whether noise or training can explain the difference of two selections: an interval of it contains 0, or egos or
     runs are others, so that there is none."""
+    first, second = sorted((first, second), key=lambda where: -len(_seeds(results, where, value)))
     if results.values(value, first).shape != results.values(value, second).shape:
         return True
-    if len(_seeds(results, first, value)) < len(_seeds(results, second, value)):
-        first, second = second, first
     return any(gap.low <= 0 <= gap.high for gap in gaps(results, first, second, value).values())
 
 

@@ -235,7 +235,7 @@ def pivot(
     down = [name for name in down if name not in same] or down[:1]
     summary["_title"] = [", ".join(title(c, row[c]) for c in across) for _, row in summary.iterrows()]
     titles = list(dict.fromkeys(summary["_title"]))
-    body, chosen = [], dict[tuple[Entry, ...], dict[str, Where]]()
+    body, of = [], dict[tuple[Entry, ...], dict[str, Any]]()
     for names, group in summary.groupby(down, sort=False, dropna=False):
         entries = {
             row["_title"]: Interval(row["mean"], row["low"], row["high"], int(row["n"]))
@@ -243,8 +243,7 @@ def pivot(
             if row["n"]
         }
         body.append((*(label(d, n) for d, n in zip(down, names, strict=True)), *map(entries.get, titles)))
-        given = group[[*dict.fromkeys((*down, *across))]].to_dict("records")
-        chosen[body[-1]] = {t: {**(where or {}), **at} for t, at in zip(group["_title"], given, strict=True)}
+        of[body[-1]] = {row["_title"]: row for _, row in group.iterrows()}
     missing, smoothed = int(summary["missing"].sum()), [row for row in body if set(SMOOTHERS) & {*map(str, row)}]
     gone = [f"{missing} egos are left out because a run of theirs failed."] if missing else []
     if smoothed and best:
@@ -259,14 +258,14 @@ def pivot(
         intervals=intervals,
         notes=(*gone, *lost(results, where)),
     )
-    same_as_best = []
-    for (_, i, j), *others in made.ranked():
-        best_of = made.rows[i][j], chosen[made.rows[i]][made.header[j]]
-        for _, k, m in others:
-            entry, at = made.rows[k][m], chosen[made.rows[k]][made.header[m]]
-            apart = min(entry.high, best_of[0].high) < max(entry.low, best_of[0].low)  # then pairs are, too
-            if not apart and alike(results, best_of[1], at, value):
-                same_as_best.append((k, m))
+    keys, same_as_best = [*dict.fromkeys((*down, *across))], list[tuple[int, int]]()
+    for ranked in made.ranked():
+        first, *others = (of[made.rows[i]][made.header[j]] for _, i, j in ranked)
+        for (_, i, j), row in zip(ranked[1:], others, strict=True):
+            near = max(row["low"], first["low"]) <= min(row["high"], first["high"])  # else pairs are apart, too
+            one, other = ({**(where or {}), **each[keys]} for each in (first, row))
+            if near and alike(results, one, other, value):
+                same_as_best.append((i, j))
     return replace(made, alike=tuple(same_as_best))
 
 

@@ -38,28 +38,21 @@ def drawn(result: Check) -> Figure:
     figure = Figure(figsize=(6.4, 5.2 + rows), dpi=150, layout="constrained")
     ax, when = figure.subplots(2, 1, height_ratios=(5.2, rows))
     plot_recording(rec, axes(ax), step=0)
-    for k in moving:
+    for row, k in enumerate(moving):
         color = COLORS[k % len(COLORS)]
         ax.plot(*result.x[:, k, :2].T, color=color, lw=0.8)
         if truth is not None:
             ax.plot(*truth.position[:, k, :2].T, color=INK, lw=1, ls="--")
-        there = np.isfinite(rec.gnss[0, :, k]).any(axis=-1)
-        when.plot(rec.t[there], np.full(there.sum(), moving.index(k)), "|", ms=5, mew=0.6, color=color)
+        fixes = rec.t[np.isfinite(rec.gnss[0, :, k, 0])]
+        when.plot(fixes, 0 * fixes + row, "|", ms=5, mew=0.6, color=color)
     ax.plot(*np.delete(rec.gnss[0, 0, :, :2], moving, axis=0).T, "^", color=INK, ms=8)
-    extent = np.nanmax(result.x[:, moving, :2], axis=(0, 1)) - np.nanmin(result.x[:, moving, :2], axis=(0, 1))
-    if extent.max() > LONG * extent.min():
-        ax.set_aspect("auto")
-        ax.set_xlabel("East [m], on a scale of its own")
-    figure.suptitle(fill(picture(result.log.summary.name), 70), fontsize=10)
-    ax.set_title(
-        "Fixes (points; circles: the first), filters (lines), what stands (triangles), truth (dashed)", fontsize=8
-    )
-    when.set(xlabel="Time [s]", ylim=(len(moving) - 0.5, -0.5), xlim=(rec.t[0], rec.t[-1]))
-    when.set_title("When there are fixes", fontsize=9)
+    x, y = np.ptp(ax.dataLim.get_points(), axis=0)
+    if max(x, y) > LONG * min(x, y):
+        ax.set(aspect="auto", xlabel="East [m], on a scale of its own")
+    words = "fixes (points; circles: the first), filters (lines), what stands (triangles), truth (dashed)"
+    figure.suptitle(fill(f"{picture(result.log.summary.name)}: {words}", 72), fontsize=9)
     names = [picture(rec.ids[k]) for k in moving]
-    when.set_yticks(
-        range(len(moving)) if len(moving) <= NAMED else [], names if len(moving) <= NAMED else [], fontsize=7
-    )
-    if len(moving) <= NAMED and (legend := ax.get_legend()):
-        legend.remove()  # the rows below name the colours
+    when.set(xlabel="Time [s]", ylabel="Fixes", ylim=(len(names) - 0.5, -0.5))
+    when.set_yticks(range(len(names))[:: 1 + len(names) // NAMED], names[:: 1 + len(names) // NAMED], fontsize=7)
+    ax.legend().remove()  # the rows below name the colours
     return figure
