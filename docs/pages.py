@@ -58,7 +58,7 @@ FOUND = {
     "neighbours": (
         "index.md",
         "**With identity covariances the federated net alone beats cooperative filters; with fitted covariances it "
-        "does not**: 0.95 m, against 2.19 and 0.54 m for LKF-SA with ten neighbours.",
+        "does not**: 0.97 m, against 2.19 and 0.54 m for LKF-SA with ten neighbours.",
     ),
     "side_by_side": (
         "your_data.md",
