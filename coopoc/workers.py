@@ -65,9 +65,6 @@ class _Lines:
         if line := text.replace("\x1b[A", "").strip("\r\n "):
             print(line, file=sys.stderr)
 
-    def flush(self) -> None:
-        sys.stderr.flush()
-
 
 def progress_bar(*args: Any, **options: Any) -> Any:
     """A bar of tqdm on stderr; where that is no terminal, as of a batch job, a line a minute.

@@ -126,7 +126,8 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
     for warning in result.warnings or ("nothing looks wrong",):
         print(f"check: {warning.replace(f': {log.summary.columns}.', ', as listed above.')}")
     out = picture or Path(f"{Path(split(path)[0]).resolve().stem}-check.png")
-    print(f"picture: {draw(result, out)}", file=sys.stderr)
+    draw(result, out)
+    print(f"picture: {out}", file=sys.stderr)
 
 
 def convert_(source: tyro.conf.Positional[str], out: tyro.conf.Positional[Path]) -> None:

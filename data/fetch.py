@@ -132,8 +132,6 @@ def local(name: str) -> Path | None:
     entry = public().get(name)
     if entry is None:
         return None
-    if entry.by_hand:
-        return fetch(name)
     if not entry.fetched:
         raise InputError("data", repr(name), f"is not in {cache_folder()} yet", f"Run coopoc data get {name}.")
     return entry.path

@@ -1,4 +1,4 @@
-"""The picture of the net: layers with their sizes and what each takes, drawn from the net itself (paper, section II.B)."""
+"""The picture of the net: layers with their sizes and what each takes, drawn from the net itself (section II.B)."""
 
 from __future__ import annotations
 

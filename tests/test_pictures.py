@@ -19,7 +19,7 @@ from test_report import Page
 
 import coopoc as co
 from coopoc.data.log.check import check
-from coopoc.data.log.picture import draw, drawn
+from coopoc.data.log.picture import draw
 from coopoc.data.log.read import read_log
 from coopoc.study.plot import legend
 from coopoc.study.publish import views
@@ -145,7 +145,7 @@ def test_pictures_show_names_as_text(kind: str, tmp_path: Path) -> None:
         csv.writer(file).writerows([("t", "vehicle", "kind", "value"), *rows])
     log = read_log(tmp_path / "log.csv")
     figures = [co.plot_track(co.Kalman()(rec, [0]), fleet=fleet).figure, co.plot_recording(rec).figure, studied]
-    texts = [*map(words, figures), draw(check(log), tmp_path / "log.svg").read_text()]
+    texts = [*map(words, [*figures, draw(check(log), tmp_path / "log.svg")])]
     shown = re.sub(r"[^\w=]|_", "", name)[:6]
     for text in texts:
         assert "<script" not in text
@@ -155,24 +155,15 @@ def test_pictures_show_names_as_text(kind: str, tmp_path: Path) -> None:
 
 
 def test_a_convoy_in_a_tunnel_is_seen_in_the_picture_of_its_log(tmp_path: Path) -> None:
-    """Three cars in two lanes of 4 km, 30 s without fixes: lanes are apart, and so are the two parts of each row."""
-    name, noise = f"{'motorway' * 12}.csv", np.random.default_rng(0)
-    rows = [
-        (t, f"car{k}", 100 * t - 30 * k, 3.5 * (k % 2) + noise.normal())
-        for k in range(3)
-        for t in range(40)
-        if not 10 < t < 30
-    ]
-    with (tmp_path / name).open("w", newline="") as file:
-        csv.writer(file).writerows([("t", "vehicle", "x", "y"), *rows])
-    figure = drawn(check(read_log(tmp_path / name, dt=1.0, max_gap=60)))
-    figure.draw_without_rendering()
+    """Two lanes of 4 km with 20 s without fixes: lanes are apart, and so are the two parts of each row."""
+    path = tmp_path / f"{'motorway' * 12}.csv"
+    rows = [f"{t},car{k},{100 * t},{3.5 * k + t % 2}" for k in range(2) for t in range(40) if not 10 < t < 30]
+    path.write_text("\n".join(["t,vehicle,x,y", *rows]))
+    figure = draw(check(read_log(path, dt=1.0, max_gap=60)), tmp_path / "a.png")
     ax, when = figure.axes
-    assert ax.transData.transform([0, 3.5])[1] - ax.transData.transform([0, 0])[1] > 30, "pixels between lanes"
-    assert [max(np.diff(row.get_xdata())) for row in when.lines] == [20.0] * 3
-    assert [text.get_text() for text in when.get_yticklabels()] == ["car0", "car1", "car2"]
-    box = figure._suptitle.get_window_extent()
-    assert 0 <= box.x0 < box.x1 <= figure.bbox.x1
+    assert np.ptp(ax.transData.transform([[0, 0], [0, 3.5]])[:, 1]) > 30, "pixels between lanes"
+    assert [max(np.diff(row.get_xdata())) for row in when.lines] == [20.0] * 2
+    assert figure._suptitle.get_window_extent().x0 >= 0
 
 
 @pytest.mark.parametrize("kind", UNPRINTABLE)

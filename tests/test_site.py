@@ -36,10 +36,6 @@ def test_figures_fit_a_phone_and_lines_of_code_stay_whole() -> None:
     assert not re.search(r"pre-wrap|img[^}]*max-width: none", css)
     template = (ROOT / "coopoc" / "study" / "report.html.j2").read_text()
     assert all('class="wide"' in line for line in template.splitlines() if "{{ plot(" in line)
-    pytest.importorskip("mkdocs", reason="make docs installs it")
-    code = """import pages; print(pages.on_page_content('<p><img alt="A" src="a.png" /></p>'))"""
-    out = ran([sys.executable, "-c", code], cwd=ROOT / "docs", check=True).stdout
-    assert out == '<p><a href="a.png"><img alt="A" src="a.png" /></a></p>\n'
 
 
 def test_every_method_has_a_row_of_its_own_in_the_overview() -> None:

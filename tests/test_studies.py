@@ -20,7 +20,7 @@ from coopoc.learned.nets.gain_net import GainNet
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import Setting, jobs_of, load_method
 from coopoc.plugins import find
-from coopoc.studies import convergence, drawings, error_cdf, lineup, scene, weights
+from coopoc.studies import convergence, error_cdf, lineup, scene, weights
 from coopoc.studies.paper import reported
 from coopoc.study.numbers import seed_std
 from coopoc.study.publish import views as published
@@ -48,11 +48,10 @@ def drawn(name: str, frame: pd.DataFrame, *axes: str, **settings: object) -> Res
 
 
 def test_the_clients_are_drawn_where_they_drive() -> None:
-    plot = drawings.clients(drawn("convergence", pd.DataFrame()))
+    _, _, panel, _ = convergence._clients(drawn("convergence", pd.DataFrame())).figure.axes
     fleet = co.load_fleet("town10-clients")
-    for k, panel in enumerate(plot.figure.axes):
-        np.testing.assert_array_equal(panel.lines[0].get_xydata(), fleet.position[fleet.present[:, k], k, :2])
-    assert plot.figure.axes[2].get_title() == "Client 3: 1450 steps\n0.4 to 10.8 m/s"
+    np.testing.assert_array_equal(panel.lines[0].get_xydata(), fleet.position[:1450, 2, :2])
+    assert panel.get_title() == "Client 3: 1450 steps\n0.4 to 10.8 m/s"
 
 
 def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:

@@ -10,7 +10,6 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
-from matplotlib.colors import to_rgb
 
 from coopoc.plugins import find
 from coopoc.studies.error_cdf import quantile
@@ -79,17 +78,6 @@ def test_no_two_methods_look_alike() -> None:
     assert len({m.label for m in METHODS.values()}) == len(METHODS)
     assert look("msmv_r") == look("msmv-r")
     assert look("my own") == look("my own") != look("another")
-
-
-def test_the_nets_of_one_figure_differ_for_who_sees_no_green() -> None:
-    """Machado et al. (2009), deuteranopia, in linear RGB; distances in CIE L*a*b*: six shades of a purple have 7."""
-    seen = np.array([[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]])
-    xyz = np.array([[0.434, 0.376, 0.190], [0.213, 0.715, 0.072], [0.018, 0.109, 0.873]])  # divided by that of white
-    nets = ("fedkalmannet", "centralised", *(f"individual{k}" for k in range(1, 5)))
-    rgb = ((np.array([to_rgb(look(net).color) for net in nets]) + 0.055) / 1.055) ** 2.4
-    x, y, z = np.cbrt(xyz @ (seen @ rgb.T).clip(0))
-    lab = np.column_stack([116 * y, 500 * (x - y), 200 * (y - z)])
-    assert min(np.linalg.norm(a - b) for a, b in combinations(lab, 2)) > 15
 
 
 def test_a_sweep_draws_the_means_in_the_method_colour(results: Results) -> None:

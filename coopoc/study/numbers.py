@@ -136,31 +136,28 @@ def seed_std(results: Results, where: Where) -> float | None:
 
 
 def gaps(results: Results, first: Where, second: Where, value: str = "rt_le_m") -> dict[str, Interval]:
-    """What the difference of two selections is over -> its mean and interval: egos and runs, and training seeds.
+    """What the difference of two selections is over -> its mean and interval: egos and runs, and seeds of the first.
 
     Args:
         results: of the study.
         first: selection of one method.
-        second: selection of another one, over the same egos and runs; its seeds make pairs if they are as many.
+        second: selection of another one, over the same egos and runs.
         value: the metric.
     """
-    each, others = per_seed(results, first, value), per_seed(results, second, value)
-    base = results.values(value, second)
-    found = {
-        "over egos and runs": paired_difference(each.mean(axis=0) if len(each) else results.values(value, first), base)
-    }
+    each, base = per_seed(results, first, value), results.values(value, second)
+    found = {"over egos and runs": paired_difference(results.values(value, first), base)}
     if len(each) > 1:
-        found[f"over {len(each)} training seeds"] = over_seeds(each - (others if len(others) == len(each) else base))
+        found[f"over {len(each)} training seeds"] = over_seeds(each - base)
     return found
 
 
 def alike(results: Results, first: Where, second: Where, value: str) -> bool:
     """Whether noise or training can explain the difference of two selections: an interval of it contains 0, or egos or
     runs are others, so that there is none."""
-    first, second = sorted((first, second), key=lambda where: -len(_seeds(results, where, value)))
     if results.values(value, first).shape != results.values(value, second).shape:
         return True
-    return any(gap.low <= 0 <= gap.high for gap in gaps(results, first, second, value).values())
+    both = {**gaps(results, first, second, value), **gaps(results, second, first, value)}
+    return any(gap.low <= 0 <= gap.high for gap in both.values())
 
 
 def verdict(results: Results, trained: Where, other: Where, name: str) -> str:

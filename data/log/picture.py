@@ -14,27 +14,20 @@ from coopoc.world.pictures import COLORS, INK, axes
 
 from .residuals import Check
 
-LONG, NAMED = 5.0, 30
-"""Extent of a drive, in multiples of its width, above which the axes have two scales, so that lanes are apart; rows
-that have their names."""
+LONG = 5.0
+"""Extent of a drive, in multiples of its width, above which the axes have two scales, so that lanes are apart."""
 
 
-def draw(result: Check, path: Path) -> Path:
-    """Write the picture of a log as PNG (or what the ending says).
+def draw(result: Check, path: Path) -> Figure:
+    """Write the picture of a log as PNG (or what the ending says): the plane, and below it the times of fixes.
 
     Args:
         result: of `check`.
         path: of the picture.
     """
-    drawn(result).savefig(path)
-    return path
-
-
-def drawn(result: Check) -> Figure:
-    """The picture of a log: the plane above, the times of fixes below."""
     rec, truth = result.log.recording, result.log.truth
     moving = [rec.ids.index(row["vehicle"]) for row in result.vehicles]
-    rows = 0.5 + 0.14 * min(len(moving), NAMED)
+    rows = 0.5 + 0.14 * len(moving)
     figure = Figure(figsize=(6.4, 5.2 + rows), dpi=150, layout="constrained")
     ax, when = figure.subplots(2, 1, height_ratios=(5.2, rows))
     plot_recording(rec, axes(ax), step=0)
@@ -51,8 +44,8 @@ def drawn(result: Check) -> Figure:
         ax.set(aspect="auto", xlabel="East [m], on a scale of its own")
     words = "fixes (points; circles: the first), filters (lines), what stands (triangles), truth (dashed)"
     figure.suptitle(fill(f"{picture(result.log.summary.name)}: {words}", 72), fontsize=9)
-    names = [picture(rec.ids[k]) for k in moving]
-    when.set(xlabel="Time [s]", ylabel="Fixes", ylim=(len(names) - 0.5, -0.5))
-    when.set_yticks(range(len(names))[:: 1 + len(names) // NAMED], names[:: 1 + len(names) // NAMED], fontsize=7)
+    when.set(xlabel="Time [s]", ylabel="Fixes", ylim=(len(moving) - 0.5, -0.5))
+    when.set_yticks(range(len(moving)), [picture(rec.ids[k]) for k in moving], fontsize=7)
     ax.legend().remove()  # the rows below name the colours
+    figure.savefig(path)
     return figure
