@@ -51,12 +51,13 @@ def _cut(value: object) -> str:
 
 
 def suggestion(name: object, known: Iterable[str], otherwise: str) -> str:
-    """The hint for an unknown name: the nearest known one, or another hint if none is near.
+    """The hint for an unknown name: the nearest known one, or another hint if none is near; no single letter is.
 
     >>> suggestion("tracee", ("trace", "det"), "Pick one.")
     'Did you mean trace?'
     """
-    near = difflib.get_close_matches(name if isinstance(name, str) else shown(name), list(known), n=1)
+    names = [one for one in known if len(one) > 1]  # else a quaternion's qx would be meant as x
+    near = difflib.get_close_matches(name if isinstance(name, str) else shown(name), names, n=1)
     return f"Did you mean {near[0]}?" if near else otherwise
 
 

@@ -1,4 +1,4 @@
-"""Processes: workers end when the process that started them does; Ctrl-C ends the command while it loads."""
+"""Processes: workers end with the process that started them, Ctrl-C ends a command that loads, bars show progress."""
 
 from __future__ import annotations
 
@@ -12,6 +12,7 @@ import time
 from contextlib import suppress
 from functools import lru_cache
 from importlib import import_module
+from typing import Any
 
 
 def main() -> None:
@@ -51,3 +52,32 @@ def leave_with(parent: int) -> None:
     if os.getppid() == parent:
         signal.signal(signal.SIGINT, signal.SIG_IGN)
         threading.Thread(target=watch, daemon=True).start()
+
+
+SELDOM = 60.0
+"""s between two lines of a bar where stderr is no terminal."""
+
+
+class _Lines:
+    """stderr without what moves a cursor: a line for each state of a bar."""
+
+    def write(self, text: str) -> None:
+        if line := text.replace("\x1b[A", "").strip("\r\n "):
+            print(line, file=sys.stderr)
+
+
+def progress_bar(*args: Any, **options: Any) -> Any:
+    """A bar of tqdm on stderr; where that is no terminal, as of a batch job, a line a minute.
+
+    Args:
+        args: of tqdm.
+        options: of tqdm.
+
+    >>> list(progress_bar(range(2)))
+    [0, 1]
+    """
+    from tqdm import tqdm
+
+    if not sys.stderr.isatty():
+        options |= {"file": _Lines(), "mininterval": SELDOM, "maxinterval": SELDOM, "delay": SELDOM}
+    return tqdm(*args, **options)

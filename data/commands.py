@@ -87,7 +87,8 @@ def _fields(entry: Entry) -> dict[str, str]:
         f"{file}, {size:,} bytes": f"{address} {digest}".strip()
         for file, (address, size, digest) in entry.files.items()
     }
-    fetched = {"fetched": str(entry.path) if entry.fetched else f"no: coopoc data get {entry.name}"}
+    how = entry.by_hand or f"no: coopoc data get {entry.name}"
+    fetched = {"fetched": str(entry.path) if entry.fetched else how}
     return stated | {"addresses": entry.tried} | fetched | files
 
 
@@ -123,11 +124,12 @@ def check(path: tyro.conf.Positional[str], *, picture: Path | None = None) -> No
             print(tabulate(rows, headers="keys", tablefmt="github", floatfmt=".3g"))
     print()
     for warning in result.warnings or ("nothing looks wrong",):
-        print(f"check: {warning}")
+        print(f"check: {warning.replace(f': {log.summary.columns}.', ', as listed above.')}")
     for what in result.unseen:
         print(f"not seen: {what}")
     out = picture or Path(f"{Path(split(path)[0]).resolve().stem}-check.png")
-    print(f"picture: {draw(result, out)}", file=sys.stderr)
+    draw(result, out)
+    print(f"picture: {out}", file=sys.stderr)
 
 
 def convert_(source: tyro.conf.Positional[str], out: tyro.conf.Positional[Path]) -> None:

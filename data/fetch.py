@@ -39,6 +39,7 @@ class Entry:
         files: path below the folder of the name -> (address, bytes, SHA-256).
         archive: address of a ZIP archive with all files, "" if each has its own.
         opens: what `fetch` returns, below the folder of the name.
+        by_hand: what to do where no address serves the files, which then have no hashes either.
     """
 
     name: str
@@ -50,6 +51,7 @@ class Entry:
     files: Mapping[str, tuple[str, int, str]]
     archive: str = ""
     opens: str = ""
+    by_hand: str = ""
 
     @property
     def path(self) -> Path:
@@ -64,7 +66,9 @@ class Entry:
     @property
     def fetched(self) -> bool:
         """Whether every file is there with its size; `fetch` compares the hashes, too."""
-        return all(_size(cache_folder() / self.name / file) == size for file, (_, size, _) in self.files.items())
+        return not self.by_hand and all(
+            _size(cache_folder() / self.name / file) == size for file, (_, size, _) in self.files.items()
+        )
 
 
 @cache
@@ -152,6 +156,8 @@ def fetch(name: str, *, offline: bool = False, timeout: float = TIMEOUT) -> Path
     entry = public().get(name) if isinstance(name, str) else None
     if entry is None:
         raise unknown("data", name, public())
+    if entry.by_hand:
+        raise InputError("data", repr(name), f"is served by {entry.page} alone, to its users", entry.by_hand)
     number("timeout", timeout, 1e-3, allowed="s, above 0", hint="Give seconds.")
     from filelock import FileLock
 

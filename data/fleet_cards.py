@@ -14,6 +14,7 @@ def in_words(facts: dict[str, Any]) -> dict[str, str]:
         "sha256": facts["sha256"],
         "size": "{vehicles} vehicles x {steps} steps of {dt:g} s".format(**facts),
         "speed": "{min:g}..{max:g} m/s, mean {mean:g}, standing {standing:.0%}".format(**facts["speed"]),
+        **{f"speed of {k}": "{:g}..{:g} m/s".format(*ends) for k, ends in enumerate(facts.get("speeds", ()), start=1)},
         "neighbours": near.format(**facts["neighbours"]),
         "height": "{:g}..{:g} m".format(*facts["height"]),
         "acceleration": "at most {acceleration:g} m/s^2".format(**facts),

@@ -145,6 +145,8 @@ def facts(fleet: Fleet) -> dict[str, Any]:
     counts = np.minimum(np.array([n.sum(axis=1) for n in near]) - 1.0, CAP)[fleet.present]
     change = np.linalg.norm(np.diff(fleet.velocity, axis=0), axis=2)
     z = fleet.position[fleet.present][:, 2]
+    each = [np.linalg.norm(fleet.velocity[there, k], axis=1) for k, there in enumerate(fleet.present.T)]
+    ranges = [[round(float(end), 1) for end in (v.min(), v.max())] for v in each]
     lengths = sorted(set(fleet.present.sum(axis=0).tolist()))
     return {
         "sha256": fleet.digest,
@@ -152,6 +154,7 @@ def facts(fleet: Fleet) -> dict[str, Any]:
         "steps": lengths[0] if len(lengths) == 1 else f"{lengths[0]}..{lengths[-1]}",
         "dt": fleet.dt,
         "speed": _rounded(min=speed.min(), mean=speed.mean(), max=speed.max(), standing=np.mean(speed < 0.1)),
+        **({"speeds": ranges} if len(lengths) > 1 else {}),
         "neighbours": _rounded(radius=RADIUS, cap=CAP, mean=counts.mean(), any=np.mean(counts > 0)),
         "height": [round(float(z.min()), 3), round(float(z.max()), 3)],
         "acceleration": round(float(np.nanmax(change, initial=0.0)) / fleet.dt, 3),

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from functools import lru_cache
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
 
 from coopoc import rt_le
 from coopoc.arrays import Floats
@@ -12,14 +14,14 @@ from coopoc.evaluate.scores import rows_of
 from coopoc.evaluate.statistics import Interval
 from coopoc.study.numbers import Where, present, seed_means
 from coopoc.study.study import Params, Row
-from coopoc.study.style import Panel
+from coopoc.study.style import CLIENTS, Panel, look
 
 from . import lineup, scene, weights
 from .views import curves, table
 
 if TYPE_CHECKING:
     from coopoc import Results
-    from coopoc.study.figures import Plot
+    from coopoc.study.plot import Plot
 
 FEDERATED, CENTRALISED = "fedkalmannet", "centralised"
 BOTH = {"method": [FEDERATED, CENTRALISED]}
@@ -85,8 +87,32 @@ def _figure(results: Results) -> Plot | None:
         "RT-LE after every round with the weights that validated best so far (mean over training seeds, band from the "
         "lowest to the highest); horizontal: the individual nets at their end."
     )
-    lines, ends = ([{"method": name} for name in names] for names in (BOTH["method"], weights.INDIVIDUAL))
+    lines = [{"method": name, "label": look(name).label} for name in BOTH["method"]]
+    ends = [
+        {"method": name, "label": look(name).label, "linestyle": ("-", "--", ":", "-.")[k % 4]}
+        for k, name in enumerate(weights.INDIVIDUAL)
+    ]
     return curves([panel], lines, text, number=_seeds, levels=ends, width=6.4, log=True)(results)
+
+
+def _clients(results: Results) -> Plot:
+    """The path of each client on one scale, with its number of steps and its range of speeds (paper, Fig. 2)."""
+    from coopoc.study.plot import Plot, canvas
+
+    drives: Any = weights.drives(str(results.settings["clients"]))
+    truth, shown = getattr(drives, "truth", drives), list(zip(range(1, 7), drives.ids, CLIENTS, strict=False))
+    same = {"squeeze": False, "sharex": True, "sharey": True}
+    with canvas(1, len(shown), width=2.0 * len(shown) + 0.4, height=2.6, **same) as (figure, (panels,)):
+        for panel, (number, name, color) in zip(panels, shown, strict=True):
+            column = truth.index(name)
+            there = truth.present[:, column]
+            x, speed = truth.position[there, column], np.linalg.norm(truth.velocity[there, column], axis=1)
+            panel.plot(*x[:, :2].T, color=color)
+            panel.plot(*x[0, :2], "ko", ms=3)
+            panel.set_title(f"Client {number}: {len(x)} steps\n{speed.min():.1f} to {speed.max():.1f} m/s")
+            panel.set(xlabel="East [m]", aspect="equal")
+        panels[0].set_ylabel("North [m]")
+    return Plot(figure, f"Paths of the clients of {truth.name} from the dot on, steps of {truth.dt:g} s; their speeds.")
 
 
 def _findings(results: Results) -> dict[str, str]:
@@ -138,7 +164,7 @@ STUDY = lineup.study(
             "RT-LE [m] after every round.", rows="round", columns="method", where=BOTH, decimals=3, intervals=False
         )
     },
-    figures={"rounds": _figure},
+    figures={"rounds": _figure, "clients": _clients},
     findings=_findings,
     limitations=("The centralised net has no rounds: its schedule is divided into as many equal parts.",),
     metrics={"rt_le_m": "lower"},

@@ -248,12 +248,14 @@ def test_one_car_with_a_gap_and_columns_of_its_own(tmp_path: Path) -> None:
     fleet = bends(1)
     frame = fixes(fleet, "car0", 1.0, 1.0).merge(motion(fleet, "car0", 0.1, 0.1), how="outer", on=["t", "vehicle"])
     frame = frame[~frame["t"].between(60, 80)].drop(columns=["vehicle", "z", "vz"])
+    frame = frame.assign(qx=0.1)
     log = read_log(write(frame.assign(id=7, course_deg=90.0), tmp_path / "taxi.csv"))
     assert log.recording.ids == ("taxi",)
     (first, last), (again, end) = log.recording.stretches("taxi")
     assert (first, last, end) == (0, pytest.approx(600, abs=5), len(log.recording.t))
     assert again == pytest.approx(805, abs=5)  # with the first fix behind the gap
     text = said(log)
+    assert "x?" not in text, "a quaternion's qx is no x"
     assert "column id, Did you mean vehicle?; taxi.csv: column course_deg, Did you mean compass_deg?" in text
 
 

@@ -9,6 +9,7 @@ from conftest import refused
 from scipy.spatial import cKDTree
 from test_data_generate import script
 
+from coopoc.data.fleet_cards import in_words
 from coopoc.data.registry import DATASETS, FLEETS, card, convert, detect, list_datasets, load_fleet
 
 NAMES = ("town10", "town10-clients", "town10-validation", "town04")
@@ -58,6 +59,8 @@ def test_clients_have_the_papers_lengths_and_speeds() -> None:
     speed = np.linalg.norm(fleet.velocity, axis=2)
     ranges = np.column_stack([np.nanmin(speed, axis=0), np.nanmax(speed, axis=0)])
     np.testing.assert_allclose(ranges, [[8.9, 10.8], [9.2, 10.9], [0.7, 10.7], [3.6, 10.7]], atol=0.6)
+    words = in_words(card("town10-clients"))
+    assert [words[f"speed of {k}"] for k in (1, 4)] == ["8.6..10.9 m/s", "3..10.6 m/s"]
 
 
 def test_town04_is_hilly() -> None:

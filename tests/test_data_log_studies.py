@@ -229,6 +229,9 @@ def test_the_commands_take_a_log_and_options(
     assert "1 ego of with" in out
     assert "source" in shell("data", "show", str(folders / "with"))[1]
     assert shell("data", "check", "nowhere")[0] == 2
+    (tmp_path / "one.csv").write_text("t,vehicle,x,y,note\n0,a,0,0,k\n1,a,1,0,k\n2,a,2,0,k\n")
+    out = shell("data", "check", "one.csv")[1]
+    assert (out.count("column note"), out.count("columns not read, as listed above. Name what")) == (1, 1)
 
 
 def test_a_plane_has_two_dimensions(tmp_path: Path) -> None:

@@ -14,7 +14,7 @@ import pytest
 from shell import ran
 from tqdm import tqdm
 
-from coopoc import Sensors
+from coopoc import Sensors, workers
 from coopoc.kernels.compiling import compile, machine_code
 
 pytest.importorskip("numba")
@@ -121,6 +121,17 @@ def test_no_progress_bar_counts_the_time_of_compiling(monkeypatch: pytest.Monkey
         compile._say(compile._line(compile.rooms))
         assert bar.start_t == began + 5.0
     assert said.getvalue() == "compiling the compile kernel, once per machine\n"
+
+
+def test_a_bar_fills_no_log_with_carriage_returns(capsys: pytest.CaptureFixture[str]) -> None:
+    for seldom, last in ((60.0, ""), (0.0, "steps: 100%")):
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(workers, "SELDOM", seldom)
+            assert [*workers.progress_bar(range(2), desc="steps")] == [0, 1]
+        said = capsys.readouterr().err
+        assert not {"\r", "\x1b"} & {*said}
+        assert last in said
+        assert bool(said) == bool(last)
 
 
 def test_check_says_where_each_kernel_comes_from() -> None:

@@ -126,8 +126,7 @@ def test_a_study_of_ones_own_is_named_again_for_its_reference(
     assert status(*given, "--write", "--study", mine) == 0
     assert status(*given, "--study", mine) == 0
     assert "2 of 2 reference numbers hold." in capsys.readouterr().out
-    run_study(mine, tmp_path, progress=False)
-    assert "2 of 2 reference numbers hold" in (tmp_path / "mine" / "views.json").read_text()
+    assert "reference numbers" not in (tmp_path / "mine" / "views.json").read_text()  # no finding of the study
     known = Reference.load(tmp_path / "known.json")
     replace(known, numbers=tuple(replace(n, value=0.5 * n.value) for n in known.numbers)).save(tmp_path / "lower.json")
     assert status(*given, "--study", mine, "--file", str(tmp_path / "lower.json")) == 1

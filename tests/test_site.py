@@ -31,6 +31,13 @@ def test_every_study_has_a_finding_and_a_page_that_is_there() -> None:
     assert len(studies) == int(title.split()[0])
 
 
+def test_figures_fit_a_phone_and_lines_of_code_stay_whole() -> None:
+    css = (ROOT / "docs" / "site.css").read_text()
+    assert not re.search(r"pre-wrap|img[^}]*max-width: none", css)
+    template = (ROOT / "coopoc" / "study" / "report.html.j2").read_text()
+    assert all('class="wide"' in line for line in template.splitlines() if "{{ plot(" in line)
+
+
 def test_every_method_has_a_row_of_its_own_in_the_overview() -> None:
     from coopoc.methods.catalogue import METHODS
 

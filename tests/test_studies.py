@@ -47,6 +47,13 @@ def drawn(name: str, frame: pd.DataFrame, *axes: str, **settings: object) -> Res
     return Results(name, "", axes, {**study(name).settings, **settings}, frame, pd.DataFrame(), 0, {})
 
 
+def test_the_clients_are_drawn_where_they_drive() -> None:
+    _, _, panel, _ = convergence._clients(drawn("convergence", pd.DataFrame())).figure.axes
+    fleet = co.load_fleet("town10-clients")
+    np.testing.assert_array_equal(panel.lines[0].get_xydata(), fleet.position[:1450, 2, :2])
+    assert panel.get_title() == "Client 3: 1450 steps\n0.4 to 10.8 m/s"
+
+
 def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:
     """Only what is asked for is made: no weights for classical methods, and views of what was run."""
     results = run_study(study("neighbours", **CLASSIC, weights=str(tmp_path / "weights")), out=tmp_path, progress=False)

@@ -10,11 +10,11 @@ from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from ..arrays import Bools, Floats, Ints, checked, instance, refuse
 from ..errors import InputError
 from ..kernels.stars.messages import FORGOTTEN
+from ..workers import progress_bar
 from ..world.body_frames import body_motion, midway, true_heading, turned
 from ..world.fleet import Fleet, columns
 from ..world.links import Links, spherical
@@ -430,7 +430,7 @@ def covariances(stages: list[Stage], smoothing: bool) -> Iterator[tuple[int, Flo
     """
     filtered: list[Floats] = []
     cov: Floats = np.zeros((0, 0))
-    with tqdm(total=len(stages) * (1 + smoothing), desc="bound", unit="step", delay=2.0) as bar:
+    with progress_bar(total=len(stages) * (1 + smoothing), desc="bound", unit="step", delay=2.0) as bar:
         for t, stage in enumerate(stages):
             information = _onward(cov, stage) + stage.gained
             cov = np.linalg.inv(information)

@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
-from tqdm import tqdm
 
 from ..arrays import Floats
 from ..kernels.gate import FIX_GATE, REJECTED
+from ..workers import progress_bar
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.sensors import Sensors
 from .gaps import in_stretches
@@ -65,7 +65,7 @@ class CentralFilter(Checked):
             from ..kernels.fleets.central import run_filter
 
             x, cov = np.empty(measured.gnss.shape), np.empty((*measured.gnss.shape, 3))
-            for run in tqdm(range(len(x)), desc=self.name, unit="run", delay=2.0):
+            for run in progress_bar(range(len(x)), desc=self.name, unit="run", delay=2.0):
                 x[run], cov[run] = run_filter(measured, pairs, assumed, run)
             return Answer(x, cov, True, notes)
 
@@ -111,7 +111,7 @@ class BatchSmoother(Checked):
             cov: Floats = np.full((*x.shape, 3), np.nan)
             lost = 0
             start = solo_filter(recording, range(x.shape[2]), model, fix_noise(model, assumed.robust))[0]
-            for run in tqdm(range(len(x)), desc=self.name, unit="run", delay=2.0):
+            for run in progress_bar(range(len(x)), desc=self.name, unit="run", delay=2.0):
                 problem = drive_problem(recording, run, start[run], measured, pairs, assumed, model.sensors)
                 if assumed.robust:
                     problem = gated(problem)

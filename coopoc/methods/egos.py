@@ -7,12 +7,12 @@ from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
-from tqdm import tqdm
 
 from ..arrays import Floats, Ints
 from ..kernels.compiling.waiting import clock
 from ..kernels.geometry import components
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
+from ..workers import progress_bar
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, Vehicles, check_recording
 from .doubts import doubts
@@ -56,7 +56,7 @@ def follow_egos(
     neighbours = np.full((recording.runs, ends[-1], 3), np.nan)
     received, sent = np.zeros((2, recording.runs, len(columns)))
     extras: dict[str, list[Floats]] = {}
-    with tqdm(total=len(columns) * len(recording.t), desc=method.name, unit="step", delay=2.0) as bar:
+    with progress_bar(total=len(columns) * len(recording.t), desc=method.name, unit="step", delay=2.0) as bar:
         for e, ego in enumerate(columns):
             box = inbox(recording, ego, method.message)
             received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes

@@ -135,11 +135,10 @@ def curves(
     for panel in panels:
         drawn: list[tuple[Where, Any]] = []
         for of in lines:
-            columns = {name: value for name, value in of.items() if name not in STYLE}
-            points = {x: number(results, {**panel.where, **also, **columns}) for x, also in panel.x.items()}
+            points = {x: number(results, {**panel.where, **also, **_where(of)}) for x, also in panel.x.items()}
             drawn += [(of, ran(points))] if ran(points) else []
         if drawn or len(panels) == 1:
-            flat = [(of, number(results, {**panel.where, **of})) for of in levels]
+            flat = [(of, number(results, {**panel.where, **_where(of)})) for of in levels]
             shown.append((panel, [*drawn, *((of, value) for of, value in flat if value is not None)]))
     if not any(drawn for _, drawn in shown):
         return None
@@ -180,6 +179,11 @@ def curves(
         else:
             legend(axes[-1], named, also)
     return Plot(figure, caption)
+
+
+def _where(of: Where) -> Where:
+    """What a line selects."""
+    return {name: value for name, value in of.items() if name not in STYLE}
 
 
 def _name_alike(axes: Axes, drawn: Sequence[tuple[Where, Any]], log: bool, near: float) -> None:

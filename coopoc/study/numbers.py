@@ -110,16 +110,16 @@ def listed(numbers: Mapping[str, float | None]) -> str:
     return ", ".join(f"{name} {three(value)} m" for name, value in ran(numbers).items())
 
 
-def _seeds(results: Results, where: Where) -> list[Any]:
-    kept = present(results, where)
+def _seeds(results: Results, where: Where, value: str = "rt_le_m") -> list[Any]:
+    kept = present(results, where, value)
     frame = results.select(kept) if kept else results.frame.iloc[:0]
     return sorted(frame["train_seed"].dropna().unique()) if "train_seed" in frame else []
 
 
-def per_seed(results: Results, where: Where) -> Floats:
-    """(S, E, R) m, RT-LE for each training seed; S = 0 for a method that is not trained."""
-    seeds = _seeds(results, where)
-    return np.array([results.values("rt_le_m", {**where, "train_seed": seed}) for seed in seeds])
+def per_seed(results: Results, where: Where, value: str = "rt_le_m") -> Floats:
+    """(S, R, E) of a metric for each training seed; S = 0 for a method that is not trained."""
+    seeds = _seeds(results, where, value)
+    return np.array([results.values(value, {**where, "train_seed": seed}) for seed in seeds])
 
 
 def seed_means(results: Results, where: Where) -> list[float]:
@@ -135,6 +135,31 @@ def seed_std(results: Results, where: Where) -> float | None:
     return float(each.mean(axis=(1, 2)).std(ddof=1)) if len(each) > 1 else None
 
 
+def gaps(results: Results, first: Where, second: Where, value: str = "rt_le_m") -> dict[str, Interval]:
+    """What the difference of two selections is over -> its mean and interval: egos and runs, and seeds of the first.
+
+    Args:
+        results: of the study.
+        first: selection of one method.
+        second: selection of another one, over the same egos and runs.
+        value: the metric.
+    """
+    each, base = per_seed(results, first, value), results.values(value, second)
+    found = {"over egos and runs": paired_difference(results.values(value, first), base)}
+    if len(each) > 1:
+        found[f"over {len(each)} training seeds"] = over_seeds(each - base)
+    return found
+
+
+def alike(results: Results, first: Where, second: Where, value: str) -> bool:
+    """Whether noise or training can explain the difference of two selections: an interval of it contains 0, or egos or
+    runs are others, so that there is none."""
+    if results.values(value, first).shape != results.values(value, second).shape:
+        return True
+    both = {**gaps(results, first, second, value), **gaps(results, second, first, value)}
+    return any(gap.low <= 0 <= gap.high for gap in both.values())
+
+
 def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
     """Sentence on the RT-LE of `trained`, against `other`, which needs no training, with the evidence.
 
@@ -144,14 +169,11 @@ def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
         other: selection of another method, over the same egos and runs.
         name: of the other, for the sentence.
     """
-    base, each = results.values("rt_le_m", other), per_seed(results, trained)
-    gaps = {"over egos and runs": paired_difference(each.mean(axis=0), base)}
-    if len(each) > 1:
-        gaps[f"over {len(each)} training seeds"] = over_seeds(each - base)
-    ends = np.array([(gap.low, gap.high) for gap in gaps.values()])
+    found = gaps(results, trained, other)
+    ends = np.array([(gap.low, gap.high) for gap in found.values()])
     claim = "beats" if (ends < 0).all() else "is worse than" if (ends > 0).all() else "cannot be distinguished from"
     evidence = ", ".join(
-        f"{gap.mean:+.3f} m, 95 % [{gap.low:+.3f}, {gap.high:+.3f}] {over}" for over, gap in gaps.items()
+        f"{gap.mean:+.3f} m, 95 % [{gap.low:+.3f}, {gap.high:+.3f}] {over}" for over, gap in found.items()
     )
-    one = " of one training seed, whose spread is unknown" * (len(each) == 1)
+    one = " of one training seed, whose spread is unknown" * (len(_seeds(results, trained)) == 1)
     return f"{claim} {name} (paired difference {evidence}{one})"

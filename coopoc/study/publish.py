@@ -8,11 +8,10 @@ from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
-from tqdm import tqdm
-
 from ..errors import InputError, unknown
 from ..file_names import file_name, given_path
-from . import reference, store
+from ..workers import progress_bar
+from . import store
 from .results import Results
 from .study import Study
 from .tables import FORMATS, Table
@@ -55,7 +54,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
 
     shown: dict[str, list[dict[str, Any]]] = {"tables": [], "figures": []}
     total = len(study.tables) + len(study.figures)
-    with tqdm(total=total, desc=f"{study.name}: views", unit="view", disable=not progress, leave=False) as bar:
+    with progress_bar(total=total, desc=f"{study.name}: views", unit="view", disable=not progress, leave=False) as bar:
         for name, view in study.tables.items():
             if (table := made(name, view)) is not None:
                 for form, suffix in FORMATS.items():
@@ -76,7 +75,7 @@ def publish(study: Study, results: Results, folder: str | Path, progress: bool =
                     path.unlink()
     content = {
         **shown,
-        "findings": {**(made("findings", study.answers) or {}), **_reference(study, results)},
+        "findings": dict(made("findings", study.answers) or {}),
         "recipe": dict(made("recipe", study.recipe) or {}),
         "missing": missing,
         "idle": sorted(made("idle", study.idle) or ()),
@@ -117,17 +116,6 @@ def tables(folder: str | Path, form: str = "markdown", name: str | None = None) 
     if name is not None and name not in shown:
         raise unknown("table", name, shown)
     return [Table.from_data(shown[n].get("table")).render(form) for n in (shown if name is None else [name])]
-
-
-def _reference(study: Study, results: Results) -> dict[str, str]:
-    """How many reference values hold; nothing for a run of other settings."""
-    if study.reference is None or not Path(study.reference).is_file():
-        return {}
-    expected = reference.Reference.load(study.reference)
-    if reference.differing(results, expected):
-        return {}
-    changes = reference.check(results, expected)
-    return {"reference": f"{reference.table(changes).caption[:-1]} (coopoc reference)."} if changes else {}
 
 
 def _data(value: Any) -> Any:

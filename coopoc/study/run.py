@@ -15,6 +15,7 @@ from ..arrays import instance, named, number
 from ..errors import InputError
 from ..file_names import given_path
 from ..formats.trajectories import write_tum
+from ..workers import progress_bar
 from ..world.fleet import Fleet
 from ..world.recording import Recording
 from ..world.storage import digest, save_recording
@@ -169,7 +170,9 @@ def _work(
     outcomes = compute(study.cell, todo, jobs)
     total, done = len(cells), len(cells) - len(todo)
     with (
-        tqdm(total=total, initial=done, desc=study.name, unit="cell", smoothing=0.05, disable=not progress) as bar,
+        progress_bar(
+            total=total, initial=done, desc=study.name, unit="cell", smoothing=0.05, disable=not progress
+        ) as bar,
         closing(outcomes),
     ):
         bar.set_postfix_str(f"{failed} failed" if failed else "")

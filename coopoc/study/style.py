@@ -48,8 +48,8 @@ RC: Any = DATA["matplotlib"]
 """Options of matplotlib."""
 _COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00")
 """Okabe and Ito, Color Universal Design (2008): distinguishable under the common forms of colour blindness."""
-SHADES = (1.3, 0.45, 0.7, 1.0, 1.8)
-"""Of the clients of one method, by number: darker below 1, paler above."""
+CLIENTS = ("#0072B2", "#E69F00", "#009E73", "#D55E00", "#56B4E9", "#4D4D4D")
+"""Of the clients of one method, by number from 1."""
 _LINES = {"identity": (0, (1, 1.4)), "nominal": (0, (5, 2)), "oracle": (0, (5, 1, 1, 1)), "fitted": "-", "trained": "-"}
 
 SUFFIXES = {"m": "m", "s": "s", "hz": "Hz", "deg": "°"}
@@ -64,7 +64,7 @@ OWN: dict[str, str] = {}
 
 
 def look(method: str) -> Look:
-    """The look of a method; a number at its end is a client, in a shade of its own; an unknown one has a look that its
+    """The look of a method; a number at its end is a client, in a colour of its own; an unknown one has a look that its
     name alone decides.
 
     >>> look("okf").label, look("individual2").label, look("mine.py:Alpha").label
@@ -76,10 +76,8 @@ def look(method: str) -> Look:
     family = name.rstrip("0123456789-")
     if family in METHODS:
         shown, number = METHODS[family], name[len(family) :].strip("-")
-        shade = SHADES[int(number) % len(SHADES)] if number.isdecimal() else 1.0
-        rgb = (int(shown.color[k : k + 2], 16) for k in (1, 3, 5))
-        color = "".join(f"{round(v * shade if shade <= 1 else 255 - (255 - v) / shade):02X}" for v in rgb)
-        return Look(f"{shown.label} {number}", f"#{color}", shown.marker)
+        color = CLIENTS[(int(number) - 1) % len(CLIENTS)] if number.isdecimal() else shown.color
+        return Look(f"{shown.label} {number}", color, shown.marker)
     given, method = method, method.rpartition(".py:")[2]  # of a file: its name there
     row, column = divmod(zlib.crc32(method.encode()) % 25, len(_COLORS))
     return Look(OWN.get(given, method.replace("_", " ")), _COLORS[column], "<>d8H"[row])

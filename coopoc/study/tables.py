@@ -6,7 +6,7 @@ import csv
 import io
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from html import escape
 from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
@@ -16,7 +16,7 @@ from ..arrays import one_of
 from ..errors import InputError
 from ..escapes import markdown, spreadsheet, tex, visible
 from ..evaluate.statistics import Interval
-from .numbers import Number, Where
+from .numbers import Number, Where, alike
 from .style import METHODS, label, title, words
 
 if TYPE_CHECKING:
@@ -38,12 +38,13 @@ class Table:
         header: column titles, with units.
         rows: entries, as many per row as titles.
         caption: with the noise settings; it goes above the table in every format.
-        best: "min" or "max": the number in bold.
+        best: "min" or "max": the number in bold, and those alike; nothing where all are.
         along: "row" or "column": where the best number is sought.
         unranked: row labels and titles (or parts of a title between commas) that are never the best: bounds, oracles.
         decimals: of numbers.
         intervals: show the ends.
         notes: sentences under the table.
+        alike: (row, column) of numbers that noise may explain to be worse than the best.
 
     Raises:
         InputError: a row of another length than the header.
@@ -65,6 +66,7 @@ class Table:
     decimals: int = 2
     intervals: bool = True
     notes: tuple[str, ...] = ()
+    alike: tuple[tuple[int, int], ...] = ()
 
     def __post_init__(self) -> None:
         for row in self.rows:
@@ -81,6 +83,7 @@ class Table:
             if wrong := next((name for name, values in allowed.items() if given[name] not in values), ""):
                 raise ValueError(wrong)
             shown: dict[str, Any] = {name: given[name] for name in allowed}
+            shown["alike"] = tuple((int(i), int(j)) for i, j in given.get("alike", ()))
             return cls(rows=rows, caption=str(given["caption"]), intervals=bool(given["intervals"]), **texts, **shown)
         except (TypeError, KeyError, ValueError, OverflowError) as error:
             raise InputError("table", type(given).__name__, f"is damaged ({error})", "Repeat coopoc run.") from None
@@ -176,22 +179,26 @@ class Table:
         return tuple(left if any(isinstance(e, str) for e in column) else right for column in columns)
 
     def _bold(self) -> set[tuple[int, int]]:
-        """(row, column) of the best numbers, as far as they are shown."""
-        if self.best is None:
-            return set()
+        """(row, column) of the best numbers, as far as they are shown, and of those alike."""
+        bold = set[tuple[int, int]]()
+        for group in self.ranked():
+            same = [(i, j) for mean, i, j in group if mean == group[0][0] or (i, j) in self.alike]
+            if len(same) <= max(2, len(group) / 2) and len(same) < len(group):  # what three and most have is none
+                bold |= {*same}
+        return bold
+
+    def ranked(self) -> list[list[tuple[float, int, int]]]:
+        """For each row or column: its numbers as they are shown, each with row and column, the best first."""
         places: dict[int, list[tuple[float, int, int]]] = {}
+        if self.best is None:
+            return []
         for i, row in enumerate(self.rows):
             for j, entry in enumerate(row):
                 names = {*self.header[j].split(", "), *row}
                 mean = entry.mean if isinstance(entry, Interval) else entry
                 if isinstance(mean, float) and math.isfinite(mean) and not names & {*self.unranked, *SMOOTHERS}:
                     places.setdefault(i if self.along == "row" else j, []).append((round(mean, self.decimals), i, j))
-        pick = min if self.best == "min" else max
-        best = [[(i, j) for mean, i, j in group if mean == pick(group)[0]] for group in places.values()]
-        shares = zip(best, places.values(), strict=True)  # what three and most have is no distinction
-        return {
-            place for same, group in shares if len(same) <= max(2, len(group) / 2) and len(group) > 1 for place in same
-        }
+        return [sorted(group, reverse=self.best == "max") for group in places.values()]
 
 
 def pivot(
@@ -228,7 +235,7 @@ def pivot(
     down = [name for name in down if name not in same] or down[:1]
     summary["_title"] = [", ".join(title(c, row[c]) for c in across) for _, row in summary.iterrows()]
     titles = list(dict.fromkeys(summary["_title"]))
-    body = []
+    body, of = [], dict[tuple[Entry, ...], dict[str, Any]]()
     for names, group in summary.groupby(down, sort=False, dropna=False):
         entries = {
             row["_title"]: Interval(row["mean"], row["low"], row["high"], int(row["n"]))
@@ -236,11 +243,12 @@ def pivot(
             if row["n"]
         }
         body.append((*(label(d, n) for d, n in zip(down, names, strict=True)), *map(entries.get, titles)))
+        of[body[-1]] = {row["_title"]: row for _, row in group.iterrows()}
     missing, smoothed = int(summary["missing"].sum()), [row for row in body if set(SMOOTHERS) & {*map(str, row)}]
     gone = [f"{missing} egos are left out because a run of theirs failed."] if missing else []
     if smoothed and best:
         gone.append(f"{', '.join(SMOOTHERS)}: knows later measurements, too, and is not ranked.")
-    return Table(
+    made = Table(
         (*map(words, down), *titles),
         (*(row for row in body if row not in smoothed), *smoothed),
         caption,
@@ -250,6 +258,15 @@ def pivot(
         intervals=intervals,
         notes=(*gone, *lost(results, where)),
     )
+    keys, same_as_best = [*dict.fromkeys((*down, *across))], list[tuple[int, int]]()
+    for ranked in made.ranked():
+        first, *others = (of[made.rows[i]][made.header[j]] for _, i, j in ranked)
+        for (_, i, j), row in zip(ranked[1:], others, strict=True):
+            near = max(row["low"], first["low"]) <= min(row["high"], first["high"])  # else pairs are apart, too
+            one, other = ({**(where or {}), **each[keys]} for each in (first, row))
+            if near and alike(results, one, other, value):
+                same_as_best.append((i, j))
+    return replace(made, alike=tuple(same_as_best))
 
 
 def _all(column: Any) -> str:

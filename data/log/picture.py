@@ -1,33 +1,51 @@
-"""Plot of a log: fixes, a filter of each vehicle, what stands, and the truth."""
+"""Plot of a log: fixes, a filter of each vehicle, what stands, and the truth; below it when each vehicle has fixes."""
 
 from __future__ import annotations
 
 from pathlib import Path
+from textwrap import fill
 
 import numpy as np
+from matplotlib.figure import Figure
 
 from coopoc.escapes import picture
 from coopoc.plots import plot_recording
-from coopoc.world.pictures import COLORS, INK, finish
+from coopoc.world.pictures import COLORS, INK, axes
 
 from .residuals import Check
 
+LONG = 5.0
+"""Extent of a drive, in multiples of its width, above which the axes have two scales, so that lanes are apart."""
 
-def draw(result: Check, path: Path) -> Path:
-    """Write the picture of a log as PNG (or what the ending says).
+
+def draw(result: Check, path: Path) -> Figure:
+    """Write the picture of a log as PNG (or what the ending says): the plane, and below it the times of fixes.
 
     Args:
         result: of `check`.
         path: of the picture.
     """
     rec, truth = result.log.recording, result.log.truth
-    ax = plot_recording(rec, step=0)
     moving = [rec.ids.index(row["vehicle"]) for row in result.vehicles]
-    for k in moving:
-        ax.plot(*result.x[:, k, :2].T, color=COLORS[k % len(COLORS)], lw=1)
+    rows = 0.5 + 0.14 * len(moving)
+    figure = Figure(figsize=(6.4, 5.2 + rows), dpi=150, layout="constrained")
+    ax, when = figure.subplots(2, 1, height_ratios=(5.2, rows))
+    plot_recording(rec, axes(ax), step=0)
+    for row, k in enumerate(moving):
+        color = COLORS[k % len(COLORS)]
+        ax.plot(*result.x[:, k, :2].T, color=color, lw=0.8)
         if truth is not None:
             ax.plot(*truth.position[:, k, :2].T, color=INK, lw=1, ls="--")
+        fixes = rec.t[np.isfinite(rec.gnss[0, :, k, 0])]
+        when.plot(fixes, 0 * fixes + row, "|", ms=5, mew=0.6, color=color)
     ax.plot(*np.delete(rec.gnss[0, 0, :, :2], moving, axis=0).T, "^", color=INK, ms=8)
-    ax.set_title(f"{picture(result.log.summary.name)}: fixes, filters (lines), what stands (triangles), truth (dashed)")
-    finish(ax).figure.savefig(path)  # type: ignore[union-attr]
-    return path
+    x, y = np.ptp(ax.dataLim.get_points(), axis=0)
+    if max(x, y) > LONG * min(x, y):
+        ax.set(aspect="auto", xlabel="East [m], on a scale of its own")
+    words = "fixes (points; circles: the first), filters (lines), what stands (triangles), truth (dashed)"
+    figure.suptitle(fill(f"{picture(result.log.summary.name)}: {words}", 72), fontsize=9)
+    when.set(xlabel="Time [s]", ylabel="Fixes", ylim=(len(moving) - 0.5, -0.5))
+    when.set_yticks(range(len(moving)), [picture(rec.ids[k]) for k in moving], fontsize=7)
+    ax.legend().remove()  # the rows below name the colours
+    figure.savefig(path)
+    return figure

@@ -198,10 +198,14 @@ class Summary:
     @property
     def unread(self) -> str:
         """Sentences on columns that are of no kind."""
-        columns = [what for what in self.unused if ": column " in what]
-        truth = " A truth is another table: truth=FILE." * any("tru" in what or "gt" in what for what in columns)
+        truth = " A truth is another table: truth=FILE." * ("tru" in self.columns or "gt" in self.columns)
         name = "Name what is meant with columns= or kinds=."
-        return f"not read: {'; '.join(columns)}. {name}{truth}" if columns else ""
+        return f"columns not read: {self.columns}. {name}{truth}" if self.columns else ""
+
+    @property
+    def columns(self) -> str:
+        """Those of no kind, with their files."""
+        return "; ".join(what for what in self.unused if ": column " in what)
 
     def __str__(self) -> str:
         count = len(self.vehicles)

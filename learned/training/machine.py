@@ -10,9 +10,9 @@ from functools import cache
 from typing import TypeVar
 
 import torch
-from tqdm import tqdm
 
 from coopoc.errors import InputError, shown
+from coopoc.workers import progress_bar
 
 Item = TypeVar("Item")
 _line: ContextVar[int] = ContextVar("line", default=0)
@@ -62,4 +62,4 @@ def watched(items: Iterable[Item], name: str | None, unit: str, total: int | Non
     """The items, with a bar of that name on stderr; None: without."""
     if not isinstance(name, str | None):
         raise InputError("progress", shown(name), "must be the name of a stage", "Give None for no bar.")
-    return iter(tqdm(items, desc=name, unit=unit, total=total, disable=name is None, position=_line.get()))
+    return iter(progress_bar(items, desc=name, unit=unit, total=total, disable=name is None, position=_line.get()))

@@ -11,6 +11,7 @@ import numpy as np
 
 from ...arrays import Floats
 from ...kernels.compiling.waiting import clock
+from ...workers import progress_bar
 from ..algebra.sparse import Sparse
 from ..model.derivatives import Model
 
@@ -183,9 +184,7 @@ def progress(name: str) -> Iterator[Callable[[float], None]]:
         nonlocal count
         count += 1
         if not bars and clock() - began > DELAY:
-            from tqdm import tqdm
-
-            bars.append(tqdm(desc=name, unit=" steps", initial=count - 1))
+            bars.append(progress_bar(desc=name, unit=" steps", initial=count - 1))
         for bar in bars:
             bar.set_postfix_str(f"cost {cost:.6g}", refresh=False)
             bar.update()
