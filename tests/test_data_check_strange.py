@@ -57,7 +57,7 @@ def test_faults_of_a_convoy_are_named(tmp_path: Path, late: float) -> None:
 def test_millimetres_and_wheels_of_robots_are_named(tmp_path: Path) -> None:
     folder = strange(tmp_path / "log", "robot", 4, **ROBOTS)
     text = said(folder, "frame=body")
-    assert "scale=range:0.001 first" in text
+    assert "scale=range:0.001 (of mm" in text
     assert re.findall(r"(\w+): its odometry is too fast by 3\.0|2\.9", text)
     text = said(folder, "frame=body&scale=range:0.001")
     assert set(re.findall(r"(\w+): its odometry is too fast by", text)) == {"robot0", "robot1"}

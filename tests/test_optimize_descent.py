@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 import coopoc as co
+from coopoc import workers
 from coopoc.optimize import Problem, solve
 from coopoc.optimize.descent import levenberg_marquardt
 
@@ -63,6 +64,7 @@ def test_a_bar_shows_steps_and_cost(
     quick = co.solve(ranged(), backend)
     assert "solve" not in capsys.readouterr().err
     monkeypatch.setattr(levenberg_marquardt, "DELAY", -1.0)
+    monkeypatch.setattr(workers, "SELDOM", 0.0)  # no terminal: a line at every step
     shown = co.solve(ranged(), backend)
     assert "cost" in capsys.readouterr().err
     assert np.array_equal(shown.position, quick.position)

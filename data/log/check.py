@@ -318,7 +318,8 @@ def _of_clocks(c: Check) -> list[str]:
         for name, ahead, error in zip(c.world.ids, c.ahead, c.unsure, strict=True)
         if ahead
     ] + [
-        f"{row['vehicle']}: its odometry is {row['late_s']:.3f} +- {row['late_s_error']:.3f} s later than the truth: "
+        f"{row['vehicle']}: its odometry is {abs(row['late_s']):.3f} +- {row['late_s_error']:.3f} s "
+        f"{'later' if row['late_s'] > 0 else 'earlier'} than the truth: "
         f"its clock differs from that of the truth. clock={row['vehicle']}:{row['late_s']:.3f} mends it."
         for row in c.vehicles
         if _beyond(row, "late_s", max(LATE, 0.5 * c.world.dt)) and not c.ahead[c.world.ids.index(row["vehicle"])]
@@ -411,9 +412,7 @@ def _of_measurements(c: Check) -> list[str]:
             if scaled := other and robust_std(ratios) < 0.2 * ratio:
                 power = round(np.log10(ratio))
                 unit_of = 10.0**-power if power and abs(np.log10(ratio) - power) < 0.1 else 1 / ratio
-                hint = (
-                    f"They are {ratio:.3g} times as long: scale=range:{unit_of:.3g} first, of mm 0.001, of feet 0.3048."
-                )
+                hint = f"They are {ratio:.3g} times as long: scale=range:{unit_of:.3g} (of mm 0.001, of feet 0.3048); then check again."
         outliers, pairs = row["beyond_5_std"], _named(c, list(UNITS).index(name), row["stated_std"])
         if outliers > OUTLIERS and not scaled:
             sentences.append(
