@@ -412,7 +412,8 @@ def _of_measurements(c: Check) -> list[str]:
             if scaled := other and robust_std(ratios) < 0.2 * ratio:
                 power = round(np.log10(ratio))
                 unit_of = 10.0**-power if power and abs(np.log10(ratio) - power) < 0.1 else 1 / ratio
-                hint = f"They are {ratio:.3g} times as long: scale=range:{unit_of:.3g} (of mm 0.001, of feet 0.3048); then check again."
+                unit_text = f"scale=range:{unit_of:.3g} (of mm 0.001, of feet 0.3048); then check again."
+                hint = f"They are {ratio:.3g} times as long: {unit_text}"
         outliers, pairs = row["beyond_5_std"], _named(c, list(UNITS).index(name), row["stated_std"])
         if outliers > OUTLIERS and not scaled:
             sentences.append(
