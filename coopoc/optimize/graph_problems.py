@@ -18,7 +18,17 @@ from .convex.chordal import chordal_start
 from .model.factor import Factor
 from .model.problem import Problem, Search
 from .model.space import Space
-from .starts.graph_starts import STARTS, chained, contenders, incremental_start, parts, separated, unwound
+from .starts.graph_starts import (
+    STARTS,
+    chained,
+    contenders,
+    incremental_start,
+    parts,
+    position_variance,
+    rotation_variance,
+    separated,
+    unwound,
+)
 from .starts.race import eased, race
 
 Objective = Literal["chordal", "geodesic"]
@@ -77,8 +87,9 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     load(*LIBRARIES)
     began, notes, factors = clock(), _counted(graph.notes), _factors(graph, objective)
     poses = tuple(np.flatnonzero(graph.is_pose).tolist())
-    names = contenders(graph) if start == "auto" else ("odometry" if start == "incremental" else start,)
-    given = _x0(graph, poses, names[0])
+    first = "odometry" if start == "incremental" else start
+    names = contenders(graph) if start == "auto" else (first,)
+    given = _x0(graph, poses, "odometry" if start == "auto" else first)
     problem = Problem(graph.names, factors, given, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
     if len(problem.fixed) - len(graph.fixed) > (not len(graph.fixed)):
         notes = (
@@ -88,13 +99,13 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         )
     won = Search(names[0])
     if start == "auto":
-        starts = {name: (lambda: given) if name == names[0] else partial(_x0, graph, poses, name) for name in names}
+        starts = {name: (lambda: given) if name == "odometry" else partial(_x0, graph, poses, name) for name in names}
         late: dict[str, Any] = {}
         if not graph.guess and np.isfinite(graph.position).all():
             late["file"] = lambda _: (_x0(graph, poses, "file"), 0)
         late |= {"eased": lambda at: eased(at, given)} if poses and len(graph.ranges) else {}
         late |= {"incremental": lambda _: incremental_start(graph, problem)} if poses else {}
-        problem, won = race(problem, starts, late, partial(unwound, graph))
+        problem, won = race(problem, starts, late, partial(unwound, graph), "incremental" if len(graph.ranges) else "")
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
         problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
@@ -179,17 +190,6 @@ def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
         zero = np.zeros((int((~apart).sum()), d))
         found.append(Factor("displacement", ranges.nodes[~apart], zero, std=sigma[~apart] + zero))
     return tuple(found)
-
-
-def position_variance(covariance: Floats, d: int) -> Floats:
-    """(M,) mean variance of the position."""
-    return np.asarray(np.einsum("mii->m", covariance[:, :d, :d]) / d)
-
-
-def rotation_variance(covariance: Floats, d: int) -> Floats:
-    """(M,) of an entry of the rotation, as the chordal objective has it."""
-    turn = np.einsum("mii->m", covariance[:, d:, d:])
-    return np.asarray(turn if d == 2 else 2.0 * turn / 3.0)
 
 
 def _fixed(graph: Graph) -> tuple[int, ...]:

@@ -27,6 +27,8 @@ HIDDEN = 1e-9
 """Share of the cost below which rounding hides how much of a promised decrease came true."""
 OFF = 0.2
 """A share of the promised decrease this far from 1 casts doubt on J^T J."""
+BROKEN = 0.5
+"""A share of the promised decrease this far from 1 shows that a descent has left where its model holds."""
 DOUBT = 2
 """Doubtful steps before the exact Hessian takes over."""
 GROWTH, DECAY = 10.0, 5.0
@@ -69,7 +71,13 @@ class Arrival:
 
 
 def arrive(
-    system: Sparse, x: Floats, max_iterations: int, tolerance: float, step: Step | None = None, bounded: bool = False
+    system: Sparse,
+    x: Floats,
+    max_iterations: int,
+    tolerance: float,
+    step: Step | None = None,
+    bounded: bool = False,
+    smooth: bool = False,
 ) -> Arrival:
     """Minimise by Levenberg-Marquardt from x (n, ambient): (H + mu D) dx = -g, D the diagonal of J^T J, which scales by
     the geometry.
@@ -78,7 +86,8 @@ def arrive(
     Hessian, with which the last steps converge quadratically however large the residuals are. Where that is not
     positive definite J^T J takes over for some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where
     less than a quarter of the promised decrease comes true and falls where more than three quarters do. Where the steps
-    are `bounded`, J^T J stays, and the last step is one below the tolerance.
+    are `bounded`, J^T J stays, and the last step is one below the tolerance. A `smooth` descent ends with the first
+    step that breaks half of its promise.
 
     References:
         More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3.
@@ -106,6 +115,8 @@ def arrive(
                     cost, gradient, values = undamped = system.quadratic(x, model)
                 else:
                     mu = _grown(mu)
+                    if smooth:
+                        break
                 continue
             dx, push = taken
             promised = 0.5 * float((0.0 if damping is None else damping @ (dx * dx)) - gradient @ dx + push)
@@ -122,9 +133,13 @@ def arrive(
             converged = (hidden and small) or (not bounded and (promised <= ROUNDED * max(cost, 1.0) or still > STILL))
             if not share > 0.0:
                 mu = _grown(mu)
+                if smooth:
+                    break
                 continue
             x = there
             mu = _next(mu, share)
+            if smooth and abs(share - 1.0) >= BROKEN:
+                break
             if not bounded and model == "gauss-newton":
                 off = abs(share - 1.0) > OFF or (record[-1][1] == 0.0 and promised > SLOW * last)
                 doubt = doubt + 1 if doubt < 0 or off else max(doubt - 1, 0)

@@ -10,10 +10,11 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ...errors import InputError
 from ...formats.graph import Graph
+from ..algebra.cholesky import cholesky_of, columns_solved
 from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import GROWTH, arrive
 from ..model.problem import Problem
-from ..model.space import Space, carried
+from ..model.space import Space, carried, exp, log
 from .initial import initial_guess
 
 Roots = Iterable[tuple[int, Floats, Floats]]
@@ -28,6 +29,12 @@ MOST_STAGES = 200
 """Whatever the odometry."""
 DRIFT = 0.5
 """rad, standard deviation by which odometry may turn in a stage: beyond it a stage begins in no basin."""
+SWEEPS = 5
+"""Of rotation averaging in space; in the plane the first is exact."""
+WOUND = 2.0
+"""rad by which the errors along a cycle may sum; with another turn they would sum to twice as much and more."""
+WHOLE = 1.5
+"""Growth after which a stage moves all nodes; the others move what is new and was so one stage before, and points."""
 STEPS = 5
 """Of each stage."""
 TOLERANCE = 1e-2
@@ -68,6 +75,7 @@ def walk(n: int, d: int, moves: Moves, roots: Roots) -> tuple[Floats, Floats, Bo
             continue
         distance, before = dijkstra(graph, indices=root, return_predecessors=True)
         reached = np.flatnonzero(np.isfinite(distance) & (before >= 0))
+        before = before.astype(np.int64)  # SciPy's 32 bits hold no product of two numbers beyond 46,340
         used = np.searchsorted(key, before[reached] * n + reached)
         moved, turn = moves.position[edge[used]], moves.rotation[edge[used]]
         back = np.swapaxes(turn, 1, 2)
@@ -179,9 +187,47 @@ def chained(graph: Graph, apart: bool = False) -> Floats:
 
 def tree(graph: Graph) -> Floats:
     """(n, ambient): poses along the spanning tree of least variance over all relative poses, loop closures and those
-    between robots too; what it does not join hangs on as in `chained`."""
-    every = np.ones(len(graph.relative_pose), dtype=bool)
-    return _landmarks(graph, *_walked(graph, every, _roots(graph, False)))
+    between robots too, then averaged: first rotations, then positions with these; what it does not join hangs on as in
+    `chained`.
+
+    With turns w_k of R_k in the world and e = log(R_j R_ij^T R_i^T) sum |e + w_j - w_i|^2 / var is least where a
+    Laplacian of the graph, which is factored once, times w is the divergence of e.
+
+    References:
+        Govindu, Lie-algebraic averaging for globally consistent motion estimation, CVPR 2004; Carlone et al., A fast
+        and accurate approximation for planar pose graph optimization, IJRR 2014.
+    """
+    edges, d, roots = graph.relative_pose, graph.dimension, _roots(graph, False)
+    position, rotation, known = _walked(graph, np.ones(len(edges), dtype=bool), roots)
+    if len(edges) >= len(rotation) or len(edges) > int(known.sum()) - len(np.unique(parts(len(known), edges.nodes))):
+        (i, j), part = edges.nodes.T, parts(len(rotation), edges.nodes)
+        still = np.unique(part, return_index=True)[1]
+        for root, _, _ in reversed(roots):
+            still[part[root]] = root
+        turns = _averaging(edges.nodes, rotation_variance(edges.covariance, d), still, len(rotation))
+        for _ in range(SWEEPS):
+            step = turns(log(rotation[j] @ np.swapaxes(rotation[i] @ edges.rotation, 1, 2)))
+            rotation = exp(step) @ rotation
+            if np.abs(step).max(initial=0.0) <= TOLERANCE:
+                break
+        moved = _averaging(edges.nodes, position_variance(edges.covariance, d), still, len(rotation))
+        position += moved(position[j] - position[i] - np.einsum("mab,mb->ma", rotation[i], edges.position))
+    return _landmarks(graph, position, rotation, known)
+
+
+def _averaging(nodes: Ints, variance: Floats, still: Ints, n: int) -> Callable[[Floats], Floats]:
+    """Errors (M, k) of differences between pairs of nodes -> moves (n, k) of all but those that stay `still`, one in each
+    part, which make the sum of squares over the variances least."""
+    from scipy.sparse import csr_array, diags_array
+
+    weight, row = 1.0 / variance, np.arange(len(nodes))
+    sign = np.repeat([-1.0, 1.0], len(nodes))
+    gap = csr_array((sign, (np.concatenate([row, row]), nodes.T.ravel())), shape=(len(nodes), n))
+    held = np.zeros(n)
+    held[still] = weight.mean()  # of what may be shifted as a whole any weight holds a node where it is
+    factored = cholesky_of(gap.T @ diags_array(weight) @ gap + diags_array(held))
+    assert factored is not None
+    return lambda error: -columns_solved(factored, gap.T @ (weight[:, None] * error))
 
 
 def file(graph: Graph) -> Floats:
@@ -216,21 +262,28 @@ def contenders(graph: Graph) -> tuple[str, ...]:
         return ("odometry", *given)
     own = int(_own(graph).sum())
     closed = len(edges) > own or own > int(graph.is_pose.sum()) - len(graph.robots)
-    return ("odometry", *given, "tree", "linear") if closed else ("odometry", *given, "linear")
+    return ("tree", "odometry", *given, "linear") if closed else ("odometry", *given, "linear")
 
 
 def unwound(graph: Graph, x: Floats) -> bool:
-    """Whether the errors of all relative rotations at x (n, ambient) sum to less than half a turn, so that no cycle is
-    wound up by a whole one, as in the local minima of pose graphs; False where more than rotations may hide one."""
+    """Whether no cycle of relative rotations is wound up by a turn at x (n, ambient), as in the local minima of pose
+    graphs; False where more than rotations may hide one.
+
+    In the plane the errors sum to at most WOUND along each edge with the way back on the tree of least variance, and
+    these cycles span all; in space all errors sum to less than half a turn.
+    """
     if len(graph.ranges) or len(graph.relative_point) or len(graph.pose_prior) > 1:
         return False
     edges = graph.relative_pose
     if not len(edges):
         return True
-    turned = Space(graph.dimension, has_rotation=True).rotation(x)
-    gap = turned[edges.nodes[:, 1]] - turned[edges.nodes[:, 0]] @ edges.rotation
-    sine = np.linalg.norm(gap, axis=(1, 2)) / np.sqrt(8.0)  # |R - S|_F = sqrt(8) sin(angle / 2)
-    return bool(2.0 * np.arcsin(np.minimum(sine, 1.0)).sum() < np.pi)
+    (i, j), turned = edges.nodes.T, Space(graph.dimension, has_rotation=True).rotation(x)
+    error = log(np.swapaxes(turned[i] @ edges.rotation, 1, 2) @ turned[j])
+    if graph.dimension == 3:
+        return bool(np.linalg.norm(error, axis=1).sum() < np.pi)
+    tree = _walked(graph, np.ones(len(edges), dtype=bool), _roots(graph, False))[1]
+    along = log(np.swapaxes(tree, 1, 2) @ turned)  # more than half a turn of it shows as a jump on an edge
+    return bool(np.abs(along[i] + error - along[j]).max() < WOUND)
 
 
 def separated(graph: Graph, x0: Floats) -> Floats:
@@ -301,6 +354,7 @@ def _ranged(graph: Graph, point: int, placed: Bools) -> tuple[Ints, Floats]:
 def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
     """Nodes (n, ambient) and iterations: each stage solves the measurements among the poses so far.
 
+    Most stages move what is new alone, so that the whole costs a few steps of the last one (WHOLE).
     A stage begins at the answer of the one before, which it continues by the relative poses of the problem's x0, so
     that odometry drifts little. Points join when they are seen or have a prior, as x0 has them, or where enough ranges
     place them, and anew whenever these have doubled: few may have placed them on the wrong side.
@@ -310,8 +364,8 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
     """
     assert problem.x0 is not None
     space, x, n = problem.space, problem.x0.copy(), len(graph.names)
-    solved, ranges, iterations = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64), 0
-    count = _stages(graph)
+    solved, ranges, iterations, whole = np.zeros(n, dtype=bool), np.zeros(n, dtype=np.int64), 0, 0
+    last, count = solved, _stages(graph)
     for stage in range(count):
         used = np.zeros(n, dtype=bool)
         for places in graph.robots.values():
@@ -330,11 +384,27 @@ def incremental_start(graph: Graph, problem: Problem) -> tuple[Floats, int]:
             if joins[point] and len(others) >= 2 * ranges[point]:
                 x[point, : space.dimension] = trilaterate(x[others, : space.dimension], distance)
                 ranges[point] = len(others)
-        solved = used | joins
-        part = problem.restricted(solved, x)
+        before, solved = solved, used | joins
+        free = solved & (~before | last | ~graph.is_pose)
+        last = solved & ~before
+        if stage == count - 1 or solved.sum() >= WHOLE * whole:
+            free, whole = solved, int(solved.sum())
+        part, kept = _among(problem, solved, free, x)
         end = arrive(sparse(part), np.array(part.x0), STEPS, TOLERANCE)
-        x[solved], iterations = end.x, iterations + end.iterations
+        x[kept], iterations = end.x, iterations + end.iterations
     return x, iterations
+
+
+def _among(problem: Problem, used: Bools, free: Bools, x: Floats) -> tuple[Problem, Bools]:
+    """The problem from x (n, ambient) of the nodes that are `free` (n,) with their neighbours among the `used`, which
+    are fixed, and which nodes it has."""
+    rows = [k[free[f.nodes[k]].any(axis=1)] for f, k in zip(problem.factors, problem.rows_among(used), strict=True)]
+    kept = free.copy()
+    for f, own in zip(problem.factors, rows, strict=True):
+        kept[f.nodes[own]] = True
+    part = problem.restricted(kept, x, rows)
+    still = np.flatnonzero((~free)[kept]).tolist()
+    return part.replace_unchecked(fixed=tuple(sorted({*part.fixed, *still}))), kept
 
 
 def _stages(graph: Graph) -> int:
@@ -344,3 +414,14 @@ def _stages(graph: Graph) -> int:
     variance = np.median(np.einsum("mii->m", turns) / turns.shape[-1]) if len(turns) else 0.0
     drifting = min(longest * variance / DRIFT**2, MOST_STAGES)
     return max(min(longest // STAGE, max(STAGES, int(drifting))), 1)
+
+
+def position_variance(covariance: Floats, d: int) -> Floats:
+    """(M,) mean variance of the position."""
+    return np.asarray(np.einsum("mii->m", covariance[:, :d, :d]) / d)
+
+
+def rotation_variance(covariance: Floats, d: int) -> Floats:
+    """(M,) of an entry of the rotation, as the chordal objective has it."""
+    turn = np.einsum("mii->m", covariance[:, d:, d:])
+    return np.asarray(turn if d == 2 else 2.0 * turn / 3.0)

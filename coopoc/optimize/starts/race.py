@@ -9,7 +9,7 @@ import numpy as np
 from ...arrays import Floats, frozen
 from ..algebra.sparse import sparse
 from ..assess.assess import expected
-from ..descent.levenberg_marquardt import Arrival, arrive
+from ..descent.levenberg_marquardt import BROKEN, Arrival, arrive
 from ..model.factor import Factor, unchecked
 from ..model.problem import Problem, Search
 from .mirrors import across
@@ -40,6 +40,7 @@ def race(
     starts: Mapping[str, Callable[[], Floats]],
     late: Mapping[str, Callable[[Problem], tuple[Floats, int]]],
     unwound: Callable[[Floats], bool],
+    grown: str = "",
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
@@ -77,16 +78,28 @@ def race(
             notes = (f"ranges hardly distinguish {names} from a mirror image: a lower minimum may exist",)
         return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
 
+    late, rough = dict(late), list[str]()
     for name, start in starts.items():
         x = start()
-        end = arrive(system, x, STEPS, TOLERANCE)
+        end = arrive(system, x, STEPS, TOLERANCE, smooth=True)
         tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
-        if smooth(end):
+        if not smooth(end):
+            rough.append(name)
+        else:
             cost, calm = tried[name][0], [*calm, tried[name][0]]
             alike = sum(abs(cost - other) <= SAME * cost for other in calm) > 1
-            if cost <= limit and (alike or unwound(end.x)):
+            if (cost <= limit and alike) or (cost <= ROUNDS[0][0] * limit and unwound(end.x)):
                 return ended(*next((each, x) for each, (c, x) in tried.items() if abs(c - cost) <= SAME * cost))
             straight |= {name} if end.converged else set()
+    if grown in late and not straight and min(cost for cost, _ in tried.values()) > ROUNDS[0][0] * limit:
+        y, steps = late.pop(grown)(problem)
+        y, taken = descend(y), taken + steps
+        tried[grown] = system.cost(y), y
+        if tried[grown][0] <= limit:
+            return ended(grown, y)
+    for name in rough:
+        end = arrive(system, tried[name][1], STEPS, TOLERANCE)
+        tried[name], taken = (system.cost(end.x), end.x), taken + end.iterations
     reached = {name: cost for name, (cost, _) in tried.items()}
     least = min(reached.values())
     for within, steps in ROUNDS:
@@ -154,4 +167,4 @@ def smooth(end: Arrival) -> bool:
     """Whether all promises came true by half and more, without damping; that an exact Hessian was not positive definite
     is no trouble, since J^T J goes on."""
     _, damping, share = end.record.T
-    return bool(not damping.any() and (np.abs(share[np.isfinite(share)] - 1.0) < 0.5).all())
+    return bool(not damping.any() and (np.abs(share[np.isfinite(share)] - 1.0) < BROKEN).all())
