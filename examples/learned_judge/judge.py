@@ -7,23 +7,23 @@ from collections.abc import Sequence
 import numpy as np
 import numpy.typing as npt
 import torch
-from star import FEATURES, HEADS, HIDDEN, LEAST, SIZE, SPAN, Floats, Pack, Rows, follow
+from star import FEATURES, HEADS, HIDDEN, LEAST, SIZE, SPAN, Floats, Forest, Pack, Rows, follow
 
-PHASES, SAMPLED = 3, 60
-"""Times that rows are drawn with the judge of the last time; steps of a run that give rows, in the mean."""
-BATCH, STEPS, RATE = 1024, 1500, 3e-3
+PHASES, SAMPLED, ROUNDS = 3, 60, 12
+"""Times that rows are drawn with the judge of the last time; steps of a run that give rows, in the mean;
+rounds of a federation in each phase."""
+BATCH, STEPS, RATE = 1024, 1000, 3e-3
 """Rows of each head, optimiser steps of a phase, and the first step size."""
-TAIL = 20.0
-"""Squared normalised errors beyond it count as their logarithm: a filter that is lost teaches nothing."""
 
 
-def rows_of(packs: Sequence[Pack], weights: Floats | None, shown: Floats, seed: int) -> list[Rows]:
+def rows_of(packs: Sequence[Pack], judge: Floats | None, shown: Floats, seed: int) -> list[Rows]:
     """Rows of each head from drives with a judge."""
     each = [
-        follow(one, weights, shown, min(1.0, SAMPLED / (len(one.start) - 1)), seed + k)[2]
+        follow(one, judge, shown, min(1.0, SAMPLED / (len(one.start) - 1)), seed + k)[2]
         for k, one in enumerate(packs)
     ]
-    return [np.concatenate([rows[head] for rows in each]) for head in range(HEADS)]
+    none = [np.zeros((0, FEATURES + 1), np.float32)] * HEADS
+    return joined([none, *each])
 
 
 def begin(seed: int) -> Floats:
@@ -32,7 +32,9 @@ def begin(seed: int) -> Floats:
     made = []
     for width, wide in ((HIDDEN[0], FEATURES), (HIDDEN[1], HIDDEN[0]), (1, HIDDEN[1])):
         std = np.sqrt(2.0 / wide) if width > 1 else 0.01
-        bias = np.full((HEADS, width, 1), 0.0 if width > 1 else -np.log(-SPAN / LEAST - 1.0))
+        bias = np.zeros((HEADS, width, 1))
+        if width == 1:
+            bias[:, 0, 0] = -np.log(-np.array(SPAN) / LEAST - 1.0)
         made.append(np.concatenate([std * rng.normal(size=(HEADS, width, wide)), bias], axis=2).reshape(HEADS, -1))
     return np.concatenate(made, axis=1)
 
@@ -46,23 +48,14 @@ def logarithms(weights: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
         x = x @ layer[:, :, :wide].transpose(1, 2) + layer[:, None, :, wide]
         x = torch.relu(x) if width > 1 else x
         at += width * (wide + 1)
-    return LEAST + SPAN * torch.sigmoid(x[:, :, 0])
+    return LEAST + torch.tensor(SPAN)[:, None] * torch.sigmoid(x[:, :, 0])
 
 
 def loss(weights: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-    r"""Minus the log-likelihood of the true error e of a source, given its innovation.
-
-    With the prediction's variance p and the assumed one 1 times m, the error is
-    $N(\nu \, m / (p + m), \; p \, m / (p + m))$: where all is as assumed, m = 1 is best whatever the innovation is.
-    """
-    m = torch.exp(logarithms(weights, rows[:, :, :FEATURES]))[:, :, None]
-    e, gap, p = (rows[:, :, FEATURES + 3 * i : FEATURES + 3 * i + 3] for i in range(3))
-    axes = torch.arange(3) < rows[:, :, FEATURES + 9, None]
-    p = torch.where(axes, p, torch.ones_like(p)).clamp(min=1e-6)
-    v = p * m / (p + m)
-    q = (e - gap * m / (p + m)) ** 2 / v
-    q = torch.where(q < TAIL, q, TAIL * (1.0 + torch.log(q.clamp(min=TAIL) / TAIL)))
-    return torch.where(axes, 0.5 * (torch.log(v) - torch.log(p) + q), torch.zeros_like(v)).sum(dim=2).mean(dim=1).sum()
+    """Sum over heads of the mean Huber loss of logarithms."""
+    found, span = logarithms(weights, rows[:, :, :FEATURES]), torch.tensor(SPAN)[:, None]
+    target = torch.minimum(rows[:, :, FEATURES].clamp(min=LEAST), LEAST + span)
+    return torch.nn.functional.huber_loss(found, target, reduction="none", delta=2.0).mean(dim=1).sum()
 
 
 def fit(weights: Floats, rows: Sequence[Rows], steps: int, seed: int, rates: tuple[float, float] = (RATE, 0.0)) -> Floats:
@@ -75,7 +68,7 @@ def fit(weights: Floats, rows: Sequence[Rows], steps: int, seed: int, rates: tup
         adam.param_groups[0]["lr"] = rates[1] + (rates[0] - rates[1]) * 0.5 * (1.0 + np.cos(np.pi * step / steps))
         batch = torch.stack(
             [
-                each[torch.from_numpy(rng.integers(0, len(each), BATCH))] if len(each) else torch.zeros(BATCH, FEATURES + 10)
+                each[torch.from_numpy(rng.integers(0, len(each), BATCH))] if len(each) else torch.zeros(BATCH, FEATURES + 1)
                 for each in kept
             ]
         )
@@ -111,17 +104,17 @@ def train(packs: Sequence[Pack], seed: int, shown: Floats | None = None, phases:
     return weights
 
 
-def federate(clients: Sequence[Sequence[Pack]], seed: int, phases: int = PHASES, rounds: int = 12, steps: int = 60) -> Floats:
+def federate(clients: Sequence[Sequence[Pack]], seed: int, phases: int = PHASES, steps: int = STEPS) -> Floats:
     """Weights of a judge as the mean of those of clients, after each round; their drives stay where they are."""
     shown = np.ones((HEADS, FEATURES))
-    weights, seen = begin(seed), [list[list[Rows]]() for _ in clients]
+    weights, seen, rounds = begin(seed), [list[list[Rows]]() for _ in clients], ROUNDS
     for phase in range(phases):
         for c, packs in enumerate(clients):
             seen[c].append(rows_of(packs, weights, shown, 1000 * seed + 100_000 * phase + 10_000 * c))
         for r in range(rounds):
             rate = RATE * 0.5 * (1.0 + np.cos(np.pi * r / rounds))
             each = [
-                fit(weights, joined(rows[-2:]), steps, seed + 1000 * phase + 10 * r + c, (rate, rate))
+                fit(weights, joined(rows[-2:]), max(steps // rounds, 1), seed + 1000 * phase + 10 * r + c, (rate, rate))
                 for c, rows in enumerate(seen)
             ]
             weights = np.mean(each, axis=0)
@@ -131,3 +124,26 @@ def federate(clients: Sequence[Sequence[Pack]], seed: int, phases: int = PHASES,
 def size() -> npt.NDArray[np.int64]:
     """Weights, and bytes of a message with them in single precision."""
     return np.array([HEADS * SIZE, 4 * HEADS * SIZE])
+
+
+def fit_forest(rows: Sequence[Rows], seed: int, count: int = 20, most: int = 50_000) -> Forest | None:
+    """Regression trees of the same rows; None without scikit-learn."""
+    try:
+        from sklearn.ensemble import RandomForestRegressor
+    except ImportError:
+        return None
+    roots, first, parts, nodes = [0], [], list[npt.NDArray[np.float64]](), 0
+    for head, each in enumerate(rows):
+        some = each[np.random.default_rng(seed).permutation(len(each))[:most]]
+        target = np.clip(some[:, FEATURES], LEAST, LEAST + SPAN[head])
+        made = RandomForestRegressor(count, max_depth=12, min_samples_leaf=30, max_features=0.4, random_state=seed)
+        for tree in made.fit(some[:, :FEATURES], target).estimators_:
+            t = tree.tree_
+            leaf = t.children_left < 0
+            links = np.where(leaf, -1, t.feature), t.children_left + nodes, t.children_right + nodes
+            parts.append(np.array([*links, np.where(leaf, t.value[:, 0, 0], t.threshold)]))
+            first.append(nodes)
+            nodes += len(leaf)
+        roots.append(len(first))
+    feature, left, right, value = np.concatenate(parts, axis=1)
+    return Forest(np.array(roots), np.array(first), *(each.astype(np.int64) for each in (feature, left, right)), value)

@@ -7,7 +7,7 @@ range, angle and motion by a number of its own; with ones everywhere the filter 
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -25,11 +25,14 @@ OWN, OTHER, RANGE, ANGLE, MOTION = range(5)
 HEADS, FEATURES, HIDDEN = 5, 28, (20, 12)
 SIZE = (FEATURES + 1) * HIDDEN[0] + (HIDDEN[0] + 1) * HIDDEN[1] + HIDDEN[1] + 1
 """Weights of a head."""
-COLUMNS = FEATURES + 10
-"""Of a row for training: features; error, innovation and variance of the prediction on three axes, in units of the
-assumed deviation; number of axes."""
-LEAST, SPAN = -3.0, 13.0
-"""Logarithms of multipliers are in LEAST..LEAST + SPAN."""
+FEW, LONG = 7, 4.0
+"""Errors, and s, around a step, whose mean square and whose mean say how many times the assumed variance acts."""
+BIAS = {3: 0.42, 1: 0.74}
+"""By how much the logarithm of that estimate is too low where errors of 3 axes or of one are white."""
+LOST = 16.0
+"""Squared error over its variance from which on a position is wrong, and a motion's target is to admit it."""
+LEAST, SPAN = -3.0, (13.0, 13.0, 13.0, 13.0, 18.0)
+"""Logarithms of multipliers are in LEAST..LEAST + SPAN of the head."""
 FLAT, UNKNOWN = 1e6, 1e4
 """m^2, variance of a member that joins, and from which on nothing is known of where it is."""
 TAUS = np.array([1.0, 4.0, 16.0])
@@ -52,7 +55,8 @@ class Pack:
         std: (3,) m, rad, rad of relative measurements.
         least: m, least range for which angles count as lengths.
         dt: s.
-        true, before: (M, 3) m, where the members are and were a step ago.
+        true: (M, 3) m, where the members are.
+        fixes, motions, relatives: (R, M), (R, M) and (R, M, 3) logarithms of how many times the assumed variance acts.
     """
 
     start: npt.NDArray[np.int64]
@@ -67,38 +71,118 @@ class Pack:
     least: float
     dt: float
     true: Floats
-    before: Floats
+    fixes: Floats
+    motions: Floats
+    relatives: Floats
 
 
-def pack(recording: co.Recording, ego: int, fleet: co.Fleet, alone: bool = False) -> Pack:
-    """Stars of an ego; `alone`: without its neighbours."""
+def alone(stars: Pack) -> Pack:
+    """The same without the neighbours."""
+    egos, steps = stars.start[:-1], len(stars.start) - 1
+    names = ("moved", "process", "position", "variance", "relative", "new", "fixes", "motions", "relatives")
+    made = {name: np.ascontiguousarray(getattr(stars, name)[:, egos]) for name in names}
+    previous = np.minimum(np.arange(steps) - 1, 0)
+    return replace(stars, start=np.arange(steps + 1), previous=previous, true=stars.true[egos], **made)
+
+
+def pack(recording: co.Recording, ego: int, fleet: co.Fleet) -> Pack:
+    """Stars of an ego."""
     known = resolve("nominal", recording)
     std, least = relative_noise(known)
     parts: dict[str, list[Any]] = {name: [] for name in ("moved", "process", "position", "variance", "relative", "new")}
-    start, previous, true, before = [0], [], [], []
+    start, previous, true, before, member, step = [0], [], [], [], [], []
     for star in co.stars(recording, ego, known):
-        n = 1 if alone else len(star.member)
+        n = len(star.member)
         for name in ("moved", "process", "position", "variance", "new"):
-            parts[name].append(getattr(star, name)[:, :n])
-        parts["relative"].append(np.pad(star.relative[:, : n - 1], ((0, 0), (1, 0), (0, 0)), constant_values=np.nan))
-        previous.append(star.previous[:n])
+            parts[name].append(getattr(star, name))
+        parts["relative"].append(np.pad(star.relative, ((0, 0), (1, 0), (0, 0)), constant_values=np.nan))
+        previous.append(star.previous)
         start.append(start[-1] + n)
-        true.append(fleet.position[star.step, star.member[:n]])
-        before.append(fleet.position[max(star.step - 1, 0), star.member[:n]])
+        member.append(star.member)
+        step.append(np.full(n, star.step))
+        true.append(fleet.position[star.step, star.member])
+        before.append(fleet.position[max(star.step - 1, 0), star.member])
     made = {name: np.ascontiguousarray(np.concatenate(values, axis=1)) for name, values in parts.items()}
-    previous_all = np.concatenate(previous).astype(np.int64)
-    truth = np.concatenate(true), np.concatenate(before)
-    return Pack(np.array(start), previous_all, **made, std=std, least=least, dt=recording.dt, true=truth[0], before=truth[1])
+    first, there, then = np.array(start), np.concatenate(true), np.concatenate(before)
+    fixes = np.where(made["new"][..., None], (made["position"] - there) / np.sqrt(made["variance"]), np.nan)
+    motions = (there - then - made["moved"]) / np.sqrt(made["process"])
+    egos = np.repeat(there[first[:-1]], np.diff(first), axis=0)
+    relatives = (made["relative"] - _seen(there - egos)) / std
+    relatives[..., 1:] -= np.round(relatives[..., 1:] * std[1:] / (2 * np.pi)) * 2 * np.pi / std[1:]
+    groups = [np.flatnonzero(np.concatenate(member) == one) for one in np.unique(np.concatenate(member))]
+    when = recording.dt * np.concatenate(step)
+    found = {
+        "fixes": _excess(fixes, groups, when),
+        "motions": _excess(np.where(np.concatenate(previous)[:, None] < 0, np.nan, motions), groups, when),
+        "relatives": np.stack([_excess(relatives[..., c, None], groups, when) for c in range(3)], axis=-1),
+    }
+    links = np.concatenate(previous).astype(np.int64)
+    return Pack(first, links, **made, **found, std=std, least=least, dt=recording.dt, true=there)
+
+
+def _seen(gap: Floats) -> Floats:
+    """Range, azimuth and inclination of vectors."""
+    flat = np.hypot(gap[..., 0], gap[..., 1])
+    return np.stack([np.hypot(flat, gap[..., 2]), np.arctan2(gap[..., 1], gap[..., 0]), np.arctan2(flat, gap[..., 2])], -1)
+
+
+def _excess(errors: Floats, groups: list[npt.NDArray[np.int64]], when: Floats) -> Floats:
+    """(R, M) logarithms of how many times the assumed variance acts, of normalised errors (R, M, axes), NaN for none.
+
+    The mean square of the FEW errors around one, plus n times the squared mean of the n within LONG s, less one: one
+    where errors are white and as assumed, n times as much where they last.
+    """
+    found = np.full(errors.shape[:2], np.nan)
+    axes = errors.shape[2]
+    for run in range(len(errors)):
+        for group in groups:
+            here = group[np.isfinite(errors[run, group]).all(axis=-1)]
+            if not len(here):
+                continue
+            e, t, at = errors[run, here], when[here], np.arange(len(here))
+            low, high = np.maximum(at - FEW // 2, 0), np.minimum(at + FEW // 2 + 1, len(here))
+            squares = np.append(0.0, np.cumsum(np.square(e).mean(axis=1)))
+            sums = np.concatenate([np.zeros((1, axes)), np.cumsum(e, axis=0)])
+            near = (squares[high] - squares[low]) / (high - low)
+            low, high = np.searchsorted(t, t - LONG / 2 - 1e-6), np.searchsorted(t, t + LONG / 2 + 1e-6)
+            lasts = np.square(sums[high] - sums[low]).mean(axis=1) / (high - low)
+            found[run, here] = np.log(np.maximum(near + lasts - 1.0, 0.1)) + BIAS[axes]
+    return found
+
+
+@dataclass(frozen=True, eq=False)
+class Forest:
+    """Regression trees of each head in the place of a net, nodes one after the other.
+
+    Attributes:
+        roots: (HEADS + 1,) first of the trees of each head in `first`.
+        first: root of each tree.
+        feature, left, right: of each node, a leaf with feature -1.
+        value: threshold of a node, or the leaf's logarithm.
+    """
+
+    roots: npt.NDArray[np.int64]
+    first: npt.NDArray[np.int64]
+    feature: npt.NDArray[np.int64]
+    left: npt.NDArray[np.int64]
+    right: npt.NDArray[np.int64]
+    value: Floats
+
+
+NO_FOREST = Forest(*(np.zeros(HEADS + 1, np.int64) for _ in range(5)), np.zeros(1))
+NONE, NET, TREES, TRUTH = range(4)
+"""Who judges."""
 
 
 def follow(
-    stars: Pack, weights: Floats | None = None, shown: Floats | None = None, share: float = 0.0, seed: int = 0
+    stars: Pack, judge: Floats | Forest | str | None = None, shown: Floats | None = None, share: float = 0.0, seed: int = 0
 ) -> tuple[Floats, Floats, list[Rows]]:
     """Positions (R, T, 3) m of the ego, their covariance (R, T, 3, 3) m^2, and rows for training of each head.
 
     Args:
         stars: of the ego.
-        weights: (HEADS, SIZE) of the judge; None for multipliers of one.
+        judge: (HEADS, SIZE) weights of a net; a forest; "truth" for the true multipliers, a bound for all judges; None
+            for multipliers of one.
         shown: (HEADS, FEATURES) 0 for features that are hidden.
         share: of steps that give rows.
         seed: of the draw of these steps.
@@ -107,14 +191,15 @@ def follow(
     keep = np.random.default_rng(seed).uniform(size=(runs, steps)) < share
     most = int(np.diff(stars.start).max())
     room = int(keep.sum()) * most * 2 + 1
-    rows = np.zeros((HEADS, room, COLUMNS), np.float32)
-    judge = weights is not None
+    rows = np.zeros((HEADS, room, FEATURES + 1), np.float32)
+    mode = NONE if judge is None else TRUTH if isinstance(judge, str) else TREES if isinstance(judge, Forest) else NET
+    trees = judge if isinstance(judge, Forest) else NO_FOREST
     found = _follow(
         stars.start, stars.previous, stars.moved, stars.process, stars.position, stars.variance, stars.relative,
-        stars.new, stars.std, stars.least, stars.dt, stars.true, stars.before,
-        np.zeros((HEADS, SIZE)) if weights is None else weights,
+        stars.new, stars.std, stars.least, stars.dt, stars.true, stars.fixes, stars.motions, stars.relatives,
+        judge if isinstance(judge, np.ndarray) else np.zeros((HEADS, SIZE)),
         np.ones((HEADS, FEATURES)) if shown is None else shown,
-        judge, keep, rows, most,
+        trees.roots, trees.first, trees.feature, trees.left, trees.right, trees.value, mode, keep, rows, most,
     )  # fmt: skip
     x, cov, counts = found
     return x, cov, [rows[head, : counts[head]] for head in range(HEADS)]
@@ -132,7 +217,7 @@ def _clip(value: float, most: float) -> float:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _net(w: Floats, f: Floats, a: Floats, b: Floats) -> float:
+def _net(w: Floats, f: Floats, a: Floats, b: Floats, span: float) -> float:
     """Logarithm of a variance's multiplier."""
     at, n, m, features = 0, len(a), len(b), len(f)
     for i in range(n):
@@ -150,7 +235,24 @@ def _net(w: Floats, f: Floats, a: Floats, b: Floats) -> float:
     s = w[at + m]
     for j in range(m):
         s += w[at + j] * b[j]
-    return LEAST + SPAN / (1.0 + math.exp(-s))
+    return LEAST + span / (1.0 + math.exp(-s))
+
+
+@njit(cache=True)  # type: ignore[untyped-decorator]
+def _judged(
+    head: int, weights: Floats, f: Floats, a: Floats, b: Floats, roots: Any, firsts: Any, feature: Any, left: Any,
+    right: Any, value: Any, mode: int,
+) -> float:  # fmt: skip
+    """Logarithm of a multiplier, of the net or the mean of the trees."""
+    if mode == NET:
+        return _net(weights[head], f, a, b, SPAN[head])
+    total = 0.0
+    for tree in range(roots[head], roots[head + 1]):
+        node = firsts[tree]
+        while feature[node] >= 0:
+            node = left[node] if f[feature[node]] <= value[node] else right[node]
+        total += value[node]
+    return total / max(roots[head + 1] - roots[head], 1)
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
@@ -235,28 +337,23 @@ def _norm2(mem: Floats, k: int, channel: int, weight: int, tau: int) -> float:
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
-def _pick(rows: Rows, count: int, f: Floats, e: Floats, gap: Floats, p: Floats, r: Floats, axes: int) -> int:
+def _pick(rows: Rows, count: int, f: Floats, target: float) -> int:
     """Write a row for training."""
-    if count >= len(rows):
+    if count >= len(rows) or not math.isfinite(target):
         return count
-    row = rows[count]
-    for j in range(FEATURES):
-        row[j] = f[j]
-    for a in range(axes):
-        if not math.isfinite(e[a]):
-            return count
-        std = math.sqrt(r[a])
-        row[FEATURES + a], row[FEATURES + 3 + a], row[FEATURES + 6 + a] = e[a] / std, gap[a] / std, p[a] / r[a]
-    row[FEATURES + 9] = axes
+    rows[count, :FEATURES] = f
+    rows[count, FEATURES] = target
     return count + 1
 
 
 @njit(cache=True)  # type: ignore[untyped-decorator]
 def _follow(
     start: Any, previous: Any, moved: Any, process: Any, position: Any, variance: Any, relative: Any, new: Any,
-    std: Any, least: float, dt: float, true: Any, before: Any, weights: Any, shown: Any, judge: bool, keep: Any,
-    rows: Any, most: int,
+    std: Any, least: float, dt: float, true: Any, fixes: Any, motions: Any,
+    relatives: Any, weights: Any, shown: Any, roots: Any, firsts: Any, feature: Any, left: Any, right: Any, value: Any,
+    mode: int, keep: Any, rows: Any, most: int,
 ) -> Any:  # fmt: skip
+    judge, oracle = mode != NONE, mode == TRUTH
     runs, steps = moved.shape[0], len(start) - 1
     out_x, out_cov = np.zeros((runs, steps, 3)), np.zeros((runs, steps, 3, 3))
     counts = np.zeros(HEADS, np.int64)
@@ -355,20 +452,19 @@ def _follow(
                     if new[run, s0 + k]:
                         sources += 1
                         for a in range(3):
-                            v = variance[run, s0 + k, a] * math.exp(max(logs[k, 1], 0.0)) + p[3 * k + a, 3 * k + a]
+                            v = variance[run, s0 + k, a] * math.exp(logs[k, 1])
                             w = position[run, s0 + k, a] - x[3 * k + a]
                             tops[a] += w / v
                             bottoms[a] += 1.0 / v
                             spread += w * w / v
-                            own_q += w * w / (v + process[run, s0 + k, a]) / 3.0
+                            own_q += w * w / (v + p[3 * k + a, 3 * k + a] + process[run, s0 + k, a]) / 3.0
                     for j in range(1, n):
                         if (k > 0 and j != k) or not whole[j] or previous[s0 + j] < 0:
                             continue
                         sources += 1
-                        up = math.exp(max((logs[j, 2] + logs[j, 3] + logs[j, 4]) / 3.0, 0.0))
+                        up, other = math.exp((logs[j, 2] + logs[j, 3] + logs[j, 4]) / 3.0), j if k == 0 else 0
                         for a in range(3):
-                            v = cdiag[j, a] * up + p[3 * j + a, 3 * j + a] + p[a, a] - 2.0 * p[3 * j + a, a]
-                            v += process[run, s0 + (j if k == 0 else 0), a]
+                            v = cdiag[j, a] * up + p[3 * other + a, 3 * other + a] + process[run, s0 + other, a]
                             w = rho[j, a] * (1.0 if k > 0 else -1.0)
                             tops[a] += w / v
                             bottoms[a] += 1.0 / v
@@ -378,11 +474,12 @@ def _follow(
                     q_now, trv, trq, along, across, pace = 0.0, 0.0, 0.0, 0.0, 0.0, 0.0
                     for a in range(3):
                         gap3[a], p3[a], r3[a] = tops[a] / bottoms[a], 1.0 / bottoms[a], process[run, s0 + k, a]
+                        v3[a] = p[3 * k + a, 3 * k + a]
                         spread -= gap3[a] * gap3[a] / p3[a]
-                        q_now += gap3[a] ** 2 / (p3[a] + r3[a]) / 3.0
-                        trv += p3[a]
+                        q_now += gap3[a] ** 2 / (p3[a] + v3[a] + r3[a]) / 3.0
+                        trv += p3[a] + v3[a]
                         trq += r3[a]
-                        err[a] = true[s0 + k, a] - before[s0 + k, a] - moved[run, s0 + k, a]
+                        err[a] = true[s0 + k, a] - x[3 * k + a]
                     mx, my = moved[run, s0 + k, 0], moved[run, s0 + k, 1]
                     pace = math.sqrt(mx * mx + my * my)
                     unit = 1.0 / math.sqrt((trv + trq) / 3.0)
@@ -409,15 +506,24 @@ def _follow(
                     f[22] = _clip(0.5 * math.log((pace * pace + 1e-9) / (trq / 3.0)), 4.0)
                     f[23] = _half_log(max(spread, 0.0) / max(3.0 * (sources - 1), 1.0))
                     f[24] = math.log(1.0 + sources)
-                    f[25] = _half_log(_norm2(mem, k, UF, WF, 2))
+                    f[25] = _clip(0.5 * math.log((v3[0] + v3[1] + v3[2]) / trq), 6.0) / 2.0
                     f[26] = (logs[k, 2] + logs[k, 3] + logs[k, 4]) / 9.0
                     f[27] = _clip(0.5 * math.log(trq / (process[run, s0, 0] * 3.0)), 4.0)
                     for j in range(FEATURES):
                         f[j] *= shown[MOTION, j]
-                    if judge:
-                        logs[k, 0] = _net(weights[MOTION], f, a1, a2)
-                    if collect:
-                        counts[MOTION] = _pick(rows[MOTION], counts[MOTION], f, err, gap3, p3, r3, 3)
+                    if judge and not oracle:
+                        logs[k, 0] = _judged(MOTION, weights, f, a1, a2, roots, firsts, feature, left, right, value, mode)
+                    if collect or oracle:
+                        target, apart, known = motions[run, s0 + k], 0.0, 0.0
+                        for a in range(3):
+                            apart += err[a] ** 2
+                            known += v3[a] + r3[a]
+                        if apart > LOST * known:
+                            target = max(target, math.log(apart / trq))
+                        if oracle:
+                            logs[k, 0] = min(max(target, LEAST), LEAST + SPAN[MOTION])
+                        else:
+                            counts[MOTION] = _pick(rows[MOTION], counts[MOTION], f, target)
             for k in range(n):
                 if previous[s0 + k] < 0:
                     continue
@@ -480,11 +586,8 @@ def _follow(
                     head = OWN if k == 0 else OTHER
                     trp, trr = 0.0, 0.0
                     for a in range(3):
-                        err[a] = position[run, s0 + k, a] - true[s0 + k, a]
-                        gap3[a] = position[run, s0 + k, a] - x[3 * k + a]
-                        p3[a], r3[a] = p[3 * k + a, 3 * k + a], variance[run, s0 + k, a]
-                        trp += p3[a]
-                        trr += r3[a]
+                        trp += p[3 * k + a, 3 * k + a]
+                        trr += variance[run, s0 + k, a]
                     f[0] = _half_log(now[k, 0])
                     for tau in range(3):
                         f[1 + tau] = _half_log(_mean(mem, k, QF, WF, tau))
@@ -516,9 +619,9 @@ def _follow(
                     for j in range(FEATURES):
                         f[j] *= shown[head, j]
                     if judge:
-                        dd[k, 0] = _net(weights[head], f, a1, a2)
+                        dd[k, 0] = fixes[run, s0 + k] if oracle else _judged(head, weights, f, a1, a2, roots, firsts, feature, left, right, value, mode)
                     if collect:
-                        counts[head] = _pick(rows[head], counts[head], f, err, gap3, p3, r3, 3)
+                        counts[head] = _pick(rows[head], counts[head], f, fixes[run, s0 + k])
                 if judge:
                     for k in range(n):
                         if new[run, s0 + k]:
@@ -541,15 +644,7 @@ def _follow(
                             mem[k, WR + c, tau] += dt
                             mem[k, QR + c, tau] += dt * u * u
                             mem[k, SR + c, tau] += dt * _clip(u, 30.0)
-                _, et, gt = 0, et, gt
                 for k in range(1, n):
-                    for a in range(3):
-                        one[a] = true[s0 + k, a] - true[s0, a]
-                    if collect:
-                        _polar(one, et, pt)
-                        _residuals(relative[run, s0 + k], pt, err)
-                        for c in range(3):
-                            now[k, c] = err[c]  # of fixes no longer needed
                     for c in range(3):
                         if not math.isfinite(relative[run, s0 + k, c]):
                             continue
@@ -581,10 +676,9 @@ def _follow(
                         for j in range(FEATURES):
                             f[j] *= shown[head, j]
                         if judge:
-                            v3[c] = _net(weights[head], f, a1, a2)
+                            v3[c] = relatives[run, s0 + k, c] if oracle else _judged(head, weights, f, a1, a2, roots, firsts, feature, left, right, value, mode)
                         if collect:
-                            one[0], gap3[0], p3[0], r3[0] = now[k, c], res[k, c], now[k, 9 + c], std[c] ** 2
-                            counts[head] = _pick(rows[head], counts[head], f, one, gap3, p3, r3, 1)
+                            counts[head] = _pick(rows[head], counts[head], f, relatives[run, s0 + k, c])
                     if judge:
                         for c in range(3):
                             if math.isfinite(relative[run, s0 + k, c]):
