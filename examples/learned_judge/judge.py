@@ -1,42 +1,41 @@
-"""Training of a judge: likelihood of the true errors of sources, in worlds where the judge itself has filtered."""
+"""Training of a judge on the true errors of all sources, in worlds where it has filtered itself."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 
 import numpy as np
-import numpy.typing as npt
 import torch
-from star import FEATURES, HEADS, HIDDEN, LEAST, SIZE, SPAN, Floats, Forest, Pack, Rows, follow
+from star import FEATURES, HEADS, HIDDEN, LEAST, NET, SPAN, Floats, Judge, Pack, Rows, follow
 
-PHASES, SAMPLED, ROUNDS = 3, 60, 12
-"""Times that rows are drawn with the judge of the last time; steps of a run that give rows, in the mean;
-rounds of a federation in each phase."""
-BATCH, STEPS, RATE = 1024, 1000, 3e-3
-"""Rows of each head, optimiser steps of a phase, and the first step size."""
+SAMPLED, ROUNDS = 60, 10
+"""Steps of a run that give rows, in the mean, and rounds of a federation in each phase."""
+BATCH, RATE = 1024, 3e-3
+"""Rows of each head, and the first step size."""
+NEUTRAL = -np.log(-np.array(SPAN) / LEAST - 1.0)
+"""(HEADS,) outputs of nets for multipliers of one."""
+ALL = Judge(NET).shown
 
 
-def rows_of(packs: Sequence[Pack], judge: Floats | None, shown: Floats, seed: int) -> list[Rows]:
+def rows_of(packs: Sequence[Pack], judge: Judge, seed: int) -> list[Rows]:
     """Rows of each head from drives with a judge."""
-    each = [
-        follow(one, judge, shown, min(1.0, SAMPLED / (len(one.start) - 1)), seed + k)[2]
-        for k, one in enumerate(packs)
-    ]
-    none = [np.zeros((0, FEATURES + 1), np.float32)] * HEADS
-    return joined([none, *each])
+    each = [follow(one, judge, SAMPLED / len(one.start), seed + k)[2] for k, one in enumerate(packs)]
+    return joined([[np.zeros((0, FEATURES + 1), np.float32)] * HEADS, *each])
+
+
+def joined(parts: Sequence[Sequence[Rows]]) -> list[Rows]:
+    """Rows of several drives or phases as one set."""
+    return [np.concatenate([rows[head] for rows in parts]) for head in range(HEADS)]
 
 
 def begin(seed: int) -> Floats:
     """(HEADS, SIZE) weights of a judge that believes what is stated."""
-    rng = np.random.default_rng(seed)
-    made = []
+    rng, parts = np.random.default_rng(seed), []
     for width, wide in ((HIDDEN[0], FEATURES), (HIDDEN[1], HIDDEN[0]), (1, HIDDEN[1])):
-        std = np.sqrt(2.0 / wide) if width > 1 else 0.01
-        bias = np.zeros((HEADS, width, 1))
-        if width == 1:
-            bias[:, 0, 0] = -np.log(-np.array(SPAN) / LEAST - 1.0)
-        made.append(np.concatenate([std * rng.normal(size=(HEADS, width, wide)), bias], axis=2).reshape(HEADS, -1))
-    return np.concatenate(made, axis=1)
+        std, bias = (np.sqrt(2.0 / wide), 0.0 * NEUTRAL) if width > 1 else (0.01, NEUTRAL)
+        layer = std * rng.normal(size=(HEADS, width, wide))
+        parts.append(np.append(layer, np.tile(bias[:, None, None], (1, width, 1)), axis=2).reshape(HEADS, -1))
+    return np.concatenate(parts, axis=1)
 
 
 def logarithms(weights: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
@@ -51,99 +50,100 @@ def logarithms(weights: torch.Tensor, features: torch.Tensor) -> torch.Tensor:
     return LEAST + torch.tensor(SPAN)[:, None] * torch.sigmoid(x[:, :, 0])
 
 
-def loss(weights: torch.Tensor, rows: torch.Tensor) -> torch.Tensor:
-    """Sum over heads of the mean Huber loss of logarithms."""
-    found, span = logarithms(weights, rows[:, :, :FEATURES]), torch.tensor(SPAN)[:, None]
-    target = torch.minimum(rows[:, :, FEATURES].clamp(min=LEAST), LEAST + span)
-    return torch.nn.functional.huber_loss(found, target, reduction="none", delta=2.0).mean(dim=1).sum()
-
-
-def fit(weights: Floats, rows: Sequence[Rows], steps: int, seed: int, rates: tuple[float, float] = (RATE, 0.0)) -> Floats:
-    """Weights after Adam, whose step falls along a cosine between two sizes."""
+def fit(weights: Floats, rows: Sequence[Rows], steps: int, seed: int, first: float = RATE, last: float = 0.0) -> Floats:
+    """Weights after Adam on the Huber loss of logarithms; its step falls along a cosine from the first to the last."""
     rng, kept = np.random.default_rng(seed), [torch.from_numpy(each) for each in rows]
-    theta = torch.tensor(weights, dtype=torch.float32, requires_grad=True)
-    there = torch.tensor([float(len(each) > 0) for each in rows])[:, None]
-    adam = torch.optim.Adam([theta], lr=rates[0])
+    theta, span = torch.tensor(weights, dtype=torch.float32, requires_grad=True), torch.tensor(SPAN)[:, None]
+    there, nothing = torch.tensor([float(len(each) > 0) for each in rows])[:, None], torch.zeros(BATCH, FEATURES + 1)
+    adam = torch.optim.Adam([theta], lr=first)
     for step in range(steps):
-        adam.param_groups[0]["lr"] = rates[1] + (rates[0] - rates[1]) * 0.5 * (1.0 + np.cos(np.pi * step / steps))
-        batch = torch.stack(
-            [
-                each[torch.from_numpy(rng.integers(0, len(each), BATCH))] if len(each) else torch.zeros(BATCH, FEATURES + 1)
-                for each in kept
-            ]
-        )
+        adam.param_groups[0]["lr"] = last + (first - last) * 0.5 * (1.0 + np.cos(np.pi * step / steps))
+        some = [each[torch.from_numpy(rng.integers(0, len(each), BATCH))] if len(each) else nothing for each in kept]
+        batch = torch.stack(some)
+        target = torch.minimum(batch[:, :, FEATURES].clamp(min=LEAST), LEAST + span)
+        found = logarithms(theta, batch[:, :, :FEATURES])
+        loss = torch.nn.functional.huber_loss(found, target, reduction="none", delta=2.0).mean(dim=1, keepdim=True)
         adam.zero_grad()
-        value = loss(theta, batch)
-        value.backward()  # type: ignore[no-untyped-call]
-        theta.grad = theta.grad * there  # type: ignore[operator]
+        (there * loss).sum().backward()
         torch.nn.utils.clip_grad_norm_([theta], 5.0)
         adam.step()
-    return theta.detach().numpy().astype(float)
+    made: Floats = theta.detach().numpy().astype(float)
+    return made
 
 
-def joined(parts: Sequence[Sequence[Rows]]) -> list[Rows]:
-    """Rows of several drives or phases as one set."""
-    return [np.concatenate([rows[head] for rows in parts]) for head in range(HEADS)]
-
-
-def train(packs: Sequence[Pack], seed: int, shown: Floats | None = None, phases: int = PHASES, steps: int = STEPS) -> Floats:
+def train(packs: Sequence[Pack], seed: int, phases: int, steps: int, shown: Floats = ALL) -> Floats:
     """Weights of a judge from drives of one client, or of all.
 
     Args:
         packs: stars, with the truth.
         seed: of start, rows and batches.
-        shown: (HEADS, FEATURES) 0 for features that are hidden.
-        phases: times that rows are drawn.
+        phases: times that rows are drawn, with the judge of the last time; the rows of the last two count.
         steps: of the optimiser in each.
+        shown: (HEADS, FEATURES) 0 for features that are hidden.
     """
-    shown = np.ones((HEADS, FEATURES)) if shown is None else shown
     weights, seen = begin(seed), list[list[Rows]]()
     for phase in range(phases):
-        seen.append(rows_of(packs, weights, shown, 1000 * seed + 100_000 * phase))
+        seen.append(rows_of(packs, Judge(NET, weights, shown), 1000 * seed + 100_000 * phase))
         weights = fit(weights, joined(seen[-2:]), steps, seed + phase)
     return weights
 
 
-def federate(clients: Sequence[Sequence[Pack]], seed: int, phases: int = PHASES, steps: int = STEPS) -> Floats:
+def federate(clients: Sequence[Sequence[Pack]], seed: int, phases: int, steps: int) -> Floats:
     """Weights of a judge as the mean of those of clients, after each round; their drives stay where they are."""
-    shown = np.ones((HEADS, FEATURES))
-    weights, seen, rounds = begin(seed), [list[list[Rows]]() for _ in clients], ROUNDS
+    weights, seen = begin(seed), [list[list[Rows]]() for _ in clients]
     for phase in range(phases):
         for c, packs in enumerate(clients):
-            seen[c].append(rows_of(packs, weights, shown, 1000 * seed + 100_000 * phase + 10_000 * c))
-        for r in range(rounds):
-            rate = RATE * 0.5 * (1.0 + np.cos(np.pi * r / rounds))
+            seen[c].append(rows_of(packs, Judge(NET, weights), 1000 * seed + 100_000 * phase + 10_000 * c))
+        mine = [joined(rows[-2:]) for rows in seen]
+        for r in range(ROUNDS):
+            rate, local = RATE * 0.5 * (1.0 + np.cos(np.pi * r / ROUNDS)), max(steps // (2 * ROUNDS), 1)
             each = [
-                fit(weights, joined(rows[-2:]), max(steps // rounds, 1), seed + 1000 * phase + 10 * r + c, (rate, rate))
-                for c, rows in enumerate(seen)
+                fit(weights, rows, local, seed + 1000 * phase + 10 * r + c, rate, rate) for c, rows in enumerate(mine)
             ]
             weights = np.mean(each, axis=0)
     return weights
 
 
-def size() -> npt.NDArray[np.int64]:
-    """Weights, and bytes of a message with them in single precision."""
-    return np.array([HEADS * SIZE, 4 * HEADS * SIZE])
+def tune(weights: Floats, packs: Sequence[Pack], seed: int, turns: int, tries: int = 10, some: int = 60) -> Floats:
+    """Weights whose outputs are stretched and shifted, ten numbers, by an evolution strategy on errors and log scores.
 
+    Args:
+        weights: (HEADS, SIZE) of a judge.
+        packs: stars, with the truth.
+        seed: of the draws.
+        turns: generations.
+        tries: of each, half of them mirrored.
+        some: drives in which each is tried.
+    """
+    rng, base = np.random.default_rng(seed), dict[int, Floats]()
 
-def fit_forest(rows: Sequence[Rows], seed: int, count: int = 20, most: int = 50_000) -> Forest | None:
-    """Regression trees of the same rows; None without scikit-learn."""
-    try:
-        from sklearn.ensemble import RandomForestRegressor
-    except ImportError:
-        return None
-    roots, first, parts, nodes = [0], [], list[npt.NDArray[np.float64]](), 0
-    for head, each in enumerate(rows):
-        some = each[np.random.default_rng(seed).permutation(len(each))[:most]]
-        target = np.clip(some[:, FEATURES], LEAST, LEAST + SPAN[head])
-        made = RandomForestRegressor(count, max_depth=12, min_samples_leaf=30, max_features=0.4, random_state=seed)
-        for tree in made.fit(some[:, :FEATURES], target).estimators_:
-            t = tree.tree_
-            leaf = t.children_left < 0
-            links = np.where(leaf, -1, t.feature), t.children_left + nodes, t.children_right + nodes
-            parts.append(np.array([*links, np.where(leaf, t.value[:, 0, 0], t.threshold)]))
-            first.append(nodes)
-            nodes += len(leaf)
-        roots.append(len(first))
-    feature, left, right, value = np.concatenate(parts, axis=1)
-    return Forest(np.array(roots), np.array(first), *(each.astype(np.int64) for each in (feature, left, right)), value)
+    def turned(z: Floats) -> Floats:
+        made, by = weights.copy(), np.exp(z[:HEADS])
+        made[:, -HIDDEN[1] - 1 : -1] *= by[:, None]
+        made[:, -1] = NEUTRAL + (weights[:, -1] - NEUTRAL) * by + z[HEADS:]
+        return made
+
+    def level(k: int, judge: Judge) -> Floats:
+        x, covariance, _ = follow(packs[k], judge)
+        gap = x - packs[k].true[packs[k].start[:-1]]
+        nees = np.einsum("rti,rti->rt", gap, np.linalg.solve(covariance, gap[..., None])[..., 0])
+        score = np.minimum((np.linalg.slogdet(covariance)[1] + nees) / 6.0, 5.0).mean()
+        return np.array([np.log(np.sqrt(np.square(gap).sum(axis=-1).mean(axis=1)).mean() + 1e-3), score])
+
+    def cost(z: Floats, drives: Sequence[int]) -> float:
+        base.update({k: level(k, Judge(0)) for k in drives if k not in base})
+        judge = Judge(NET, turned(z))
+        each = np.array([np.clip(level(k, judge) - base[k], (-3.0, -5.0), (3.0, 5.0)) for k in drives])
+        return float((each @ [1.0, 0.3]).mean())
+
+    mean, std, best = np.zeros(2 * HEADS), np.full(2 * HEADS, 0.15), tries // 2
+    share = np.log(best + 0.5) - np.log(np.arange(1, best + 1))
+    share /= share.sum()
+    for _ in range(turns):
+        drives = rng.choice(len(packs), min(some, len(packs)), replace=False).tolist()
+        normal = rng.normal(size=(tries // 2, len(mean)))
+        tried = mean + std * np.concatenate([normal, -normal])
+        kept = tried[np.argsort([cost(z, drives) for z in tried])[:best]]
+        std = np.sqrt(0.8 * std**2 + 0.3 * (share @ np.square(kept - mean)))
+        mean = share @ kept
+    return turned(mean)
