@@ -19,7 +19,7 @@ ALL = Judge(NET).shown
 
 def rows_of(packs: Sequence[Pack], judge: Judge, seed: int) -> list[Rows]:
     """Rows of each head from drives with a judge."""
-    each = [follow(one, judge, SAMPLED / len(one.start), seed + k)[2] for k, one in enumerate(packs)]
+    each = [follow(one, judge, SAMPLED / (len(one.start) - 1), seed + k)[2] for k, one in enumerate(packs)]
     return joined([[np.zeros((0, FEATURES + 1), np.float32)] * HEADS, *each])
 
 
@@ -102,48 +102,3 @@ def federate(clients: Sequence[Sequence[Pack]], seed: int, phases: int, steps: i
             ]
             weights = np.mean(each, axis=0)
     return weights
-
-
-def tune(weights: Floats, packs: Sequence[Pack], seed: int, turns: int, tries: int = 10, some: int = 60) -> Floats:
-    """Weights whose outputs are stretched and shifted, ten numbers, by an evolution strategy on errors and log scores.
-
-    Args:
-        weights: (HEADS, SIZE) of a judge.
-        packs: stars, with the truth.
-        seed: of the draws.
-        turns: generations.
-        tries: of each, half of them mirrored.
-        some: drives in which each is tried.
-    """
-    rng, base = np.random.default_rng(seed), dict[int, Floats]()
-
-    def turned(z: Floats) -> Floats:
-        made, by = weights.copy(), np.exp(z[:HEADS])
-        made[:, -HIDDEN[1] - 1 : -1] *= by[:, None]
-        made[:, -1] = NEUTRAL + (weights[:, -1] - NEUTRAL) * by + z[HEADS:]
-        return made
-
-    def level(k: int, judge: Judge) -> Floats:
-        x, covariance, _ = follow(packs[k], judge)
-        gap = x - packs[k].true[packs[k].start[:-1]]
-        nees = np.einsum("rti,rti->rt", gap, np.linalg.solve(covariance, gap[..., None])[..., 0])
-        score = np.minimum((np.linalg.slogdet(covariance)[1] + nees) / 6.0, 5.0).mean()
-        return np.array([np.log(np.sqrt(np.square(gap).sum(axis=-1).mean(axis=1)).mean() + 1e-3), score])
-
-    def cost(z: Floats, drives: Sequence[int]) -> float:
-        base.update({k: level(k, Judge(0)) for k in drives if k not in base})
-        judge = Judge(NET, turned(z))
-        each = np.array([np.clip(level(k, judge) - base[k], (-3.0, -5.0), (3.0, 5.0)) for k in drives])
-        return float((each @ [1.0, 0.3]).mean())
-
-    mean, std, best = np.zeros(2 * HEADS), np.full(2 * HEADS, 0.15), tries // 2
-    share = np.log(best + 0.5) - np.log(np.arange(1, best + 1))
-    share /= share.sum()
-    for _ in range(turns):
-        drives = rng.choice(len(packs), min(some, len(packs)), replace=False).tolist()
-        normal = rng.normal(size=(tries // 2, len(mean)))
-        tried = mean + std * np.concatenate([normal, -normal])
-        kept = tried[np.argsort([cost(z, drives) for z in tried])[:best]]
-        std = np.sqrt(0.8 * std**2 + 0.3 * (share @ np.square(kept - mean)))
-        mean = share @ kept
-    return turned(mean)

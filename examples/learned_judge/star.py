@@ -115,8 +115,8 @@ class State(NamedTuple):
     b: Floats
 
 
-def pack(recording: co.Recording, ego: int, fleet: co.Fleet) -> Pack:
-    """Stars of an ego."""
+def pack(recording: co.Recording, ego: int, fleet: co.Fleet, outlier: float = OUTLIER) -> Pack:
+    """Stars of an ego; an error whose mean normalised square is below `outlier` does not count for its own target."""
     known = resolve("nominal", recording)
     std: Any
     std, least = relative_noise(known)
@@ -139,7 +139,9 @@ def pack(recording: co.Recording, ego: int, fleet: co.Fleet) -> Pack:
     relatives = (made["relative"] - seen) / std
     relatives[..., 1:] -= np.round(relatives[..., 1:] * std[1:] / (2 * np.pi)) * 2 * np.pi / std[1:]
     groups, when = [np.flatnonzero(member == one) for one in np.unique(member)], recording.dt * step
-    excess = [_excess(errors, groups, when) for errors in (fixes, motions, *(relatives[..., [c]] for c in range(3)))]
+    excess = [
+        _excess(errors, groups, when, outlier) for errors in (fixes, motions, *(relatives[..., [c]] for c in range(3)))
+    ]
     targets = {"fixes": excess[0], "motions": excess[1], "relatives": np.stack(excess[2:], axis=-1)}
     previous = previous.astype(np.int64)
     return Pack(start, previous, **made, **targets, std=std, least=least, dt=recording.dt, true=true)
@@ -154,7 +156,7 @@ def alone(stars: Pack) -> Pack:
     return stars._replace(start=np.arange(steps + 1), previous=previous, true=stars.true[egos], **made)
 
 
-def _excess(errors: Any, groups: list[npt.NDArray[np.intp]], when: Any) -> Floats:
+def _excess(errors: Any, groups: list[npt.NDArray[np.intp]], when: Any, outlier: float) -> Floats:
     """(R, M) logarithms of how many times the assumed variance acts, of normalised errors (R, M, axes), NaN for none.
 
     The mean square of the FEW errors around one, plus n times the squared mean of the n within LONG s, less one: one
@@ -170,7 +172,7 @@ def _excess(errors: Any, groups: list[npt.NDArray[np.intp]], when: Any) -> Float
         e, t, at = errors[run, here], when[here], np.arange(len(here))
         low, high = np.maximum(at - FEW // 2, 0), np.minimum(at + FEW // 2 + 1, len(here))
         own = np.square(e).mean(axis=1)
-        left = (own < OUTLIER) & (len(here) > FEW)
+        left = (own < outlier) & (len(here) > FEW)
         squares, sums = np.append(0.0, np.cumsum(own)), np.concatenate([np.zeros((1, axes)), np.cumsum(e, axis=0)])
         near = (squares[high] - squares[low] - left * own) / (high - low - left)
         low, high = np.searchsorted(t, t - LONG / 2 - 1e-6), np.searchsorted(t, t + LONG / 2 + 1e-6)
