@@ -30,6 +30,7 @@ import numpy as np
 from ...arrays import Floats
 from ..compiling.compile import part, storage
 from .cooperative_state import (
+    FIX_VARIANCE,
     ANSWER,
     COVARIANCE,
     DT,
@@ -228,11 +229,15 @@ def remember_speed(f: Filter, own: Floats) -> None:
 
 
 @part
-def slip_variance(f: Filter, model: Model, dt: float) -> float:
-    """m^2, of the ego's motion in a step, if it is assumed to slip; one that begins now may have for UNSEEN s."""
-    seconds = dt if f.ego[SLIPPED] > 0.5 else max(dt, UNSEEN)
-    variance: float = f.ego[NOW] * (model.slip * f.ego[SPEED_OF_LATE] * seconds) ** 2
-    return variance
+def slip_variance(f: Filter, model: Model, own: Floats) -> float:
+    """m^2, of the ego's motion in a step, if it is assumed to slip; one that begins now may have for UNSEEN s, but not by
+    more than fixes show."""
+    rate = (model.slip * f.ego[SPEED_OF_LATE]) ** 2
+    variance = rate * own[DT] ** 2
+    if f.ego[SLIPPED] <= 0.5 and own[DT] < UNSEEN:
+        fix = own[FIX_VARIANCE] + own[FIX_VARIANCE + 1] + own[FIX_VARIANCE + 2]
+        variance += min(rate * UNSEEN**2, fix)
+    return f.ego[NOW] * variance
 
 
 @part
