@@ -235,7 +235,8 @@ class Oracle:
             self.state["slips"] = 0.0
             return
         first, (self.state, self.revoked) = (self.state, self.revoked), before
-        self.step(t, (share * self.state["speed"] * (dt if p > 0.5 else max(dt, UNSEEN))) ** 2)
+        rate, shows = (share * self.state["speed"]) ** 2, self.r[t, self.ego] @ self.white
+        self.step(t, rate * dt**2 + (min(rate * UNSEEN**2, shows) if p <= 0.5 and dt < UNSEEN else 0.0))
         prior = p * math.exp(-dt / LASTS) + (1 - p) * min(dt / RARE, 0.5)
         odds = self.state["score"] - first[0]["score"] + math.log(prior / (1 - prior))
         if odds < 0:
