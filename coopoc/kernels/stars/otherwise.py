@@ -230,7 +230,7 @@ def remember_speed(f: Filter, own: Floats) -> None:
 
 @part
 def slip_variance(f: Filter, model: Model, own: Floats) -> float:
-    """m^2, of the ego's motion in a step, if it is assumed to slip; one that begins now may have for UNSEEN s, by no more
+    """m^2, of the ego's motion in a step, if it slips; one that begins now may have for UNSEEN s, by no more
     than fixes show."""
     rate = (model.slip * f.ego[SPEED_OF_LATE]) ** 2
     variance: float = rate * own[DT] ** 2
