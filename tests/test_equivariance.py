@@ -108,7 +108,7 @@ def test_every_method_follows_the_world(name: str, change: str, crossing: co.Fle
         co.PoseFilter("fleet", fusion="naive"),
         co.PoseFilter("fleet", fusion="intersection"),
     ],
-    ids=lambda m: f"{m.unit}-{m.fusion}" + "-lasting" * m.lasting,
+    ids=lambda m: f"{m.unit}-{m.fusion}" + "-lasting" * (m.lasting is True),
 )
 def test_every_pose_filter_follows_the_world(method: co.PoseFilter, change: str, crossing: co.Fleet) -> None:
     rec = co.observe(crossing.between(0, 25), NOISE, CHANNEL, runs=2, seed=5, frame="body")

@@ -3,13 +3,20 @@
 import ast
 import sys
 from pathlib import Path
+from typing import Any
 
+import judge
+import numpy as np
+import pytest
+import star
 from architecture import layers
 from shell import ran
 from torch.nn import GRUCell
 
 import coopoc
 from coopoc.learned.nets.gain_net import GainNet
+from coopoc.studies.world_faults import KINDS
+from coopoc.studies.worlds import World, world
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -35,3 +42,36 @@ def test_lazy_names_are_the_typed_names() -> None:
     assert typed - {None} == set(coopoc.__all__)
     for name in coopoc.__all__:
         assert getattr(coopoc, name).__name__.split(".")[-1] == name
+
+
+WITH_AND_WITHOUT = (world(9, "development", without=[*KINDS]), world(12, "development"))
+
+
+@pytest.mark.parametrize("drawn", WITH_AND_WITHOUT, ids=("nothing wrong", "faults"))
+def test_a_judge_of_ones_is_the_textbook_filter(drawn: World) -> None:
+    expected = coopoc.JointFilter(robust=False)(drawn.recording, list(drawn.egos))
+    believing = judge.begin(0)
+    believing[:, -star.HIDDEN[1] - 1 : -1] = 0.0
+    for e, ego in enumerate(drawn.egos):
+        stars = star.pack(drawn.recording, ego, drawn.fleet)
+        for one in (star.Judge(star.NONE), star.Judge(star.NET, believing)):
+            x, covariance, _ = star.follow(stars, one)
+            np.testing.assert_allclose(x, expected.x[:, :, e], atol=1e-7)
+            np.testing.assert_allclose(covariance, expected.covariance[:, :, e], atol=1e-9, rtol=1e-6)
+
+
+def test_a_judge_learns_its_targets() -> None:
+    packs = [star.pack(drawn.recording, drawn.egos[0], drawn.fleet) for drawn in WITH_AND_WITHOUT]
+    rows = judge.rows_of(packs, star.Judge(star.NONE), 0)
+    assert sum(map(len, rows)) > 100
+    assert all(np.isfinite(each).all() for each in rows)
+    before = judge.begin(0)
+    after = judge.fit(before, rows, 100, 0)
+
+    def loss(weights: Any, head: int) -> float:
+        every = np.tile(rows[head], (star.HEADS, 1, 1))
+        found = judge.logarithms(*map(judge.torch.from_numpy, (weights.astype(np.float32), every[:, :, :-1])))
+        return float(np.abs(found[head].numpy() - every[head, :, -1]).mean())
+
+    for head in (star.OWN, star.MOTION):
+        assert loss(after, head) < loss(before, head)

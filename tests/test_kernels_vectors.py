@@ -10,11 +10,11 @@ from shell import ran
 
 from coopoc.arrays import Floats
 from coopoc.kernels.compiling.compile import as_written
-from coopoc.kernels.compiling.small import store
+from coopoc.kernels.compiling.small import inverse, load, store, zeros
 from coopoc.kernels.compiling.vectors import LANES
 from coopoc.kernels.stars.joint_filter import eliminate, predict, substitute
 
-BLOCKS = 4
+BLOCKS, NINE = 4, (0,) * 9
 
 
 @as_written
@@ -27,6 +27,21 @@ def solved(a: Floats, eta: Floats, memory: Floats) -> None:
 @as_written
 def predicted(a: Floats, process: Floats, memory: Floats) -> None:
     predict(a, BLOCKS, BLOCKS, process, memory)
+
+
+@as_written
+def inverted(a: Floats) -> None:
+    store(a, 0, inverse(load(a, 0, zeros(1.0, NINE))))
+
+
+def test_a_covariance_with_an_unknown_angle_keeps_its_digits() -> None:
+    """In closed form: variances along three axes; the adjugate had lost the determinant."""
+    rng, variances = np.random.default_rng(5), np.array([0.4, 0.1, 8.6e8])
+    for _ in range(50):
+        axes = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        a = (axes * variances @ axes.T).ravel()
+        inverted(a)
+        assert a == pytest.approx((axes / variances @ axes.T).ravel(), abs=1e-5)
 
 
 def blockwise(matrix: Floats, d: int) -> Floats:

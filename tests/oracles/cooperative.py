@@ -235,7 +235,8 @@ class Oracle:
             self.state["slips"] = 0.0
             return
         first, (self.state, self.revoked) = (self.state, self.revoked), before
-        self.step(t, (share * self.state["speed"] * (dt if p > 0.5 else max(dt, UNSEEN))) ** 2)
+        rate, shows = (share * self.state["speed"]) ** 2, self.r[t, self.ego] @ self.white
+        self.step(t, rate * dt**2 + (min(rate * UNSEEN**2, shows) if p <= 0.5 and dt < UNSEEN else 0.0))
         prior = p * math.exp(-dt / LASTS) + (1 - p) * min(dt / RARE, 0.5)
         odds = self.state["score"] - first[0]["score"] + math.log(prior / (1 - prior))
         if odds < 0:
@@ -603,7 +604,12 @@ class Oracle:
             if c < 2 and ("compass",) in b.names:
                 terms[("compass",)] = np.array([[0, 0, 1], [1, 1, 0]][c])
             h.append(b.row(terms, c))
-        total = np.einsum("ci,ij,cj->c", h, b.p, h) + r
+        spread = np.einsum("ci,ij,cj->c", h, b.p, h)
+        if g.fix_gate and not vague:  # the variance of terms of second order, with what each number leaves of its error
+            p, own = spread * size**2, r * size**2
+            u, v, w = np.where(there, p * own / (p + own), p)
+            r = r + np.array([0.5 * (v**2 + w**2), u * p[1], u * p[2]]) / (reach * size) ** 2
+        total = spread + r
         for c in np.flatnonzero(there):
             log = math.log((float(h[c] @ b.p @ h[c]) + r[c]) * size[c] ** 2)
             q = b.update(h[c], z[c], r[c], 0.0 if vague or not g.fix_gate else GATE)

@@ -65,6 +65,7 @@ from .cooperative_state import (
 )
 from .gaussian import (
     COMPASS,
+    CURVE,
     LIMIT,
     MEASURED,
     PLACE,
@@ -410,6 +411,7 @@ def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
         h.three[LIMIT + c] = model.gate
     h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]
     h.block[TERMS] = 3 if has(g, 0, COMPASS) else 2
+    h.three[CURVE] = 1.0 / (reach * reach) if model.gate > 0.0 else 0.0
     if goes_on(f, rows, k):
         add_way(f, rows, k)
     return True

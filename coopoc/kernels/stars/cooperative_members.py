@@ -97,7 +97,7 @@ def predict(f: Filter, model: Model, own: Floats) -> None:
     fades = 1.0 - keep * keep
     drive(f, model, 0, vector_at(own, MOTION // 3), own[DT])
     for c in range(3):
-        g.p[first + c, first + c] += own[MOTION_VARIANCE + c] + slip_variance(f, model, own[DT])
+        g.p[first + c, first + c] += own[MOTION_VARIANCE + c] + slip_variance(f, model, own)
     for k in range(len(f.who)):
         if f.who[k, VEHICLE] >= 0 and has(g, k, ERROR):
             i, trusted = 3 * g.block[k, ERROR], f.status[f.who[k, VEHICLE], TRUSTED] > 0.0

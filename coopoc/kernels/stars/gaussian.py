@@ -54,10 +54,11 @@ class Gaussian(NamedTuple):
     vectors: Ints
 
 
-Z, VARIANCE, LIMIT, GAP, Q, WHITE, SCHUR, THREE = range(0, 24, 3)
+Z, VARIANCE, LIMIT, GAP, Q, WHITE, SCHUR, CURVE = range(0, 24, 3)
+THREE = CURVE + 1
 """Of three measured numbers: what was measured and its variance; the gate on each squared normalised innovation, 0 for
-none; and, out, innovations, these squared and normalised, 0 where nothing was measured, whitened innovations, and their
-variances."""
+none; out, innovations, these squared and normalised, 0 where nothing was measured, whitened innovations, and their
+variances; and of range, azimuth and inclination 1 / m^2, one over the squared distance, else 0."""
 MEASURED = TERMS + 1
 COV, SQUARE, TURNED, MATRIX = range(9 * TERMS, 9 * TERMS + 36, 9)
 """Behind the matrices of the terms: H P H^T, out, scratch, and derivatives of `otherwise.turned`."""
@@ -175,7 +176,7 @@ def widen(g: Gaussian, i: int, variance: float) -> None:
 @inside
 def term(h: Rows, k: int, block: int, weight: float) -> None:
     """Let the k-th term of the rows be `weight` times a vector, and the last one."""
-    h.block[k], o = block, 0.0
+    h.block[k], h.three[CURVE], o = block, 0.0, 0.0
     store(h.matrix, k, (weight, o, o, o, weight, o, o, o, weight))
     h.block[TERMS] = k + 1
 
@@ -233,6 +234,8 @@ def innovate(g: Gaussian, h: Rows) -> float:
     exceeds its gate, its variance is multiplied by q / gate, and by 100 more where it exceeds REJECTED times the gate.
     """
     project(g, h)
+    if h.three[CURVE] > 0.0:
+        bend(h)
     gain, wide, gap, cov = h.gain, len(g.x) // LANES, vector_at(h.three, GAP // 3), block_at(h.matrix, COV // 9)
     x, d = whitened(h, 0, gap[0], h.three[VARIANCE] + cov[0])
     s = cov[1] * d
@@ -248,6 +251,23 @@ def innovate(g: Gaussian, h: Rows) -> float:
         put(gain, wide + j, plus(e * q, a, p))
         put(gain, 2 * wide + j, plus(plus(f * r, c, q), b, p))
     return x * x + y * y + z * z
+
+
+@inside
+def bend(h: Rows) -> None:
+    """Add what range, azimuth and inclination are from linear: the variance of their terms of second order.
+
+    At a distance of d, u beyond and v and w aside of where they are linear, they are, in m,
+    d + u + (v^2 + w^2) / 2 d, v - u v / d and w - u w / d; of each error what its own number leaves counts.
+    """
+    u = v = w = 0.0
+    for c in range(3):
+        p = h.matrix[COV + 4 * c]
+        r = p * h.three[VARIANCE + c] / (p + h.three[VARIANCE + c]) if h.block[MEASURED + c] else p
+        u, v, w = (r, v, w) if c == 0 else (u, r, w) if c == 1 else (u, v, r)
+    h.three[VARIANCE] += 0.5 * h.three[CURVE] * (v * v + w * w)
+    h.three[VARIANCE + 1] += h.three[CURVE] * u * h.matrix[COV + 4]
+    h.three[VARIANCE + 2] += h.three[CURVE] * u * h.matrix[COV + 8]
 
 
 @inside

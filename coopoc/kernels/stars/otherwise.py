@@ -33,6 +33,7 @@ from .cooperative_state import (
     ANSWER,
     COVARIANCE,
     DT,
+    FIX_VARIANCE,
     FIXES,
     INFORMATION,
     KINDS_OF_NUMBERS,
@@ -228,11 +229,15 @@ def remember_speed(f: Filter, own: Floats) -> None:
 
 
 @part
-def slip_variance(f: Filter, model: Model, dt: float) -> float:
-    """m^2, of the ego's motion in a step, if it is assumed to slip; one that begins now may have for UNSEEN s."""
-    seconds = dt if f.ego[SLIPPED] > 0.5 else max(dt, UNSEEN)
-    variance: float = f.ego[NOW] * (model.slip * f.ego[SPEED_OF_LATE] * seconds) ** 2
-    return variance
+def slip_variance(f: Filter, model: Model, own: Floats) -> float:
+    """m^2, of the ego's motion in a step, if it slips; one that begins now may have for UNSEEN s, by no more
+    than fixes show."""
+    rate = (model.slip * f.ego[SPEED_OF_LATE]) ** 2
+    variance: float = rate * own[DT] ** 2
+    if f.ego[SLIPPED] <= 0.5 and own[DT] < UNSEEN:
+        fix = own[FIX_VARIANCE] + own[FIX_VARIANCE + 1] + own[FIX_VARIANCE + 2]
+        variance += min(rate * UNSEEN**2, fix)
+    return variance if f.ego[NOW] > 0.0 else 0.0
 
 
 @part
