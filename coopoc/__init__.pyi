@@ -43,6 +43,7 @@ from .methods.track import Track as Track
 from .optimize.backend import Backend as Backend
 from .optimize.backend import backends as backends
 from .optimize.graph_problems import read_graph as read_graph
+from .optimize.incremental import incremental as incremental
 from .optimize.model.factor import Constraint as Constraint
 from .optimize.model.factor import Factor as Factor
 from .optimize.model.factor import Loss as Loss

@@ -4,14 +4,21 @@ from many starts and from the truth."""
 import sys
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 from scipy.optimize import least_squares
 
 from coopoc.arrays import Floats
+from coopoc.formats.graph import Graph, PoseEdges
 from coopoc.optimize import Loss, Problem, solve, solve_gnc
+from coopoc.optimize.algebra.sparse import Sparse
+from coopoc.optimize.descent.levenberg_marquardt import Arrival, arrive
 from coopoc.optimize.graph_problems import from_graph
+from coopoc.optimize.model.space import Space, exp
+from coopoc.optimize.starts import graph_starts, race
+from coopoc.optimize.starts.graph_starts import Moves, tree, unwound, walk
 
 sys.path.insert(0, str(Path(__file__).resolve().parents[1] / "benchmarks"))
 from unseen_graphs import ranged_drives, world
@@ -130,3 +137,64 @@ def test_small_drives_end_as_low_as_restarts_or_say_so() -> None:
     for seed in (1002, 1018):
         found = solve(from_graph(ranged_drives(seed)), throw=False)
         assert found.cost < 40 or found.notes
+
+
+def test_a_walk_counts_beyond_what_32_bits_hold() -> None:
+    """Key a n + b of a pair in a graph of 50,000 poses; against the line that is driven."""
+    n, d = 50_000, 2
+    chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)
+    moves = Moves(chain, np.tile([1.0, 0.0], (n - 1, 1)), np.tile(np.eye(d), (n - 1, 1, 1)), np.ones(n - 1))
+    position, _, known = walk(n, d, moves, [(0, np.zeros(d), np.eye(d))])
+    assert known.all()
+    assert np.allclose(position[:, 0], np.arange(n))
+
+
+def ring(n: int, wrong: float) -> Graph:
+    """A drive round a circle whose turns are `wrong` by this in all, and its closure."""
+    edge, turn = np.stack([np.arange(n), np.roll(np.arange(n), -1)], axis=1), (2 * np.pi + wrong) / n
+    moved = PoseEdges(edge, np.tile([1.0, 0], (n, 1)), np.full((n, 1), turn), np.tile(0.01 * np.eye(3), (n, 1, 1)))
+    names = tuple(f"A{k}" for k in range(n))
+    nan = np.full((n, 2), np.nan)
+    return Graph(2, names, np.ones(n, bool), nan, np.zeros((n, 1)), relative_pose=moved)
+
+
+def test_the_tree_shares_what_a_loop_does_not_close() -> None:
+    """Of a ring with equal variances every turn takes the same part; against that closed form."""
+    graph = ring(8, 0.4)
+    turn = Space(2, has_rotation=True).rotation(tree(graph))
+    moved = np.swapaxes(turn, 1, 2) @ np.roll(turn, -1, axis=0)
+    assert np.arctan2(moved[:, 1, 0], moved[:, 0, 0]) == pytest.approx(2 * np.pi / 8, abs=1e-9)
+
+
+def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors() -> None:
+    """Errors of a ring that sum to 1.5 rad, of two thousand that sum to thousands, or to a whole turn."""
+    graph, space = ring(2000, 0.0), Space(2, has_rotation=True)
+    course = 2 * np.pi * np.arange(2000) / 2000
+    shaken = course + 0.5 * np.random.default_rng(0).choice([-1.0, 1.0], 2000)
+    for turns, expected in (
+        (course, True),
+        (course + 1.5 * course / (2 * np.pi), True),
+        (shaken, True),
+        (0 * course, False),
+    ):
+        assert unwound(graph, space.join(np.zeros((2000, 2)), exp(turns[:, None]))) is expected
+
+
+def test_a_search_takes_few_steps_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Bad odometry and random ranges: most steps move what is new alone; against the descent from the truth."""
+    drive, rng, sizes = world(0, 2, 1, 300), np.random.default_rng(1), list[int]()
+    pairs = rng.integers(0, 300, (700, 2))
+    pairs = pairs[np.abs(pairs[:, 0] - pairs[:, 1]) > 1][:600]
+    edges = drive.relative(drive.chain(), 0.1, 0.05)
+    graph = drive.graph(relative_pose=edges, ranges=drive.ranged(pairs, 0.1))
+
+    def counted(system: Sparse, *rest: Any, **options: Any) -> Arrival:
+        end = arrive(system, *rest, **options)
+        sizes.extend([system.size] * end.iterations)
+        return end
+
+    for module in (race, graph_starts):
+        monkeypatch.setattr(module, "arrive", counted)
+    found = solve(from_graph(replace(graph, position=np.full_like(graph.position, np.nan))))
+    assert found.cost == pytest.approx(solve(from_graph(graph, start="file")).cost, rel=1e-6)
+    assert sizes.count(max(sizes)) < 30

@@ -4,6 +4,7 @@ from . import backends as _package  # noqa: F401  (first: the function `backends
 from .assess.assess import joint_covariance
 from .backend import Backend, Capabilities, SolverResult, backends
 from .graph_problems import loop_closures
+from .incremental import Incremental, incremental
 from .model.factor import Constraint, Factor, Loss
 from .model.measurements import MEASUREMENTS, Measurement, measurement
 from .model.problem import Problem
@@ -18,6 +19,7 @@ __all__ = [
     "Capabilities",
     "Constraint",
     "Factor",
+    "Incremental",
     "Loss",
     "Measurement",
     "Problem",
@@ -27,6 +29,7 @@ __all__ = [
     "Space",
     "Status",
     "backends",
+    "incremental",
     "joint_covariance",
     "loop_closures",
     "measurement",

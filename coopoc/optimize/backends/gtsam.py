@@ -266,10 +266,12 @@ class Callbacks:
         return error
 
 
-def graph_of(problem: Problem, parts: Sequence[Form]) -> Any:
+def graph_of(problem: Problem, parts: Sequence[Form], keys: Sequence[int] | None = None) -> Any:
     """The gtsam.NonlinearFactorGraph of the factors, of which those without parts (see `forms`) are CustomFactors, and
-    of the nodes that are fixed, with their indices as keys."""
+    of the nodes that are fixed, with these keys, or their indices."""
     import gtsam
+
+    keys = range(len(problem.names)) if keys is None else keys
 
     graph, posed = gtsam.NonlinearFactorGraph(), which_turn(problem)
     lacking = [factor for factor, form in zip(problem.factors, parts, strict=True) if form is None]
@@ -287,20 +289,20 @@ def graph_of(problem: Problem, parts: Sequence[Form]) -> Any:
                     nodes = nodes[::-1]  # such as a range from a point to a pose
                 made = getattr(gtsam, part.names[tuple([posed[i] for i in nodes])])
                 if model is not None:
-                    graph.add(made(*nodes, *given, model))
+                    graph.add(made(*[keys[i] for i in nodes], *given, model))
     for i in problem.fixed:
         assert problem.x0 is not None
         name = f"NonlinearEquality{'Pose' if posed[i] else 'Point'}{problem.dimension}"
-        graph.add(getattr(gtsam, name)(i, _node(problem.dimension, problem.x0[i], posed[i])))
+        graph.add(getattr(gtsam, name)(keys[i], _node(problem.dimension, problem.x0[i], posed[i])))
     return graph
 
 
-def values(space: Space, posed: Sequence[bool], x: Floats) -> Any:
-    """gtsam.Values of nodes x (n, ambient), which are points or `posed`, under their indices."""
+def values(space: Space, posed: Sequence[bool], x: Floats, first: int = 0) -> Any:
+    """gtsam.Values of nodes x (n, ambient), which are points or `posed`, under their indices from `first` on."""
     import gtsam
 
     found = gtsam.Values()
-    for key, (node, turns) in enumerate(zip(x, posed, strict=True)):
+    for key, (node, turns) in enumerate(zip(x, posed, strict=True), first):
         found.insert(key, _node(space.dimension, node, turns))
     return found
 

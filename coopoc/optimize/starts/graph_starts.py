@@ -216,7 +216,7 @@ def tree(graph: Graph) -> Floats:
 
 
 def _averaging(nodes: Ints, variance: Floats, still: Ints, n: int) -> Callable[[Floats], Floats]:
-    """Errors (M, k) of differences between pairs of nodes -> moves (n, k) of all but those that stay `still`, one in each
+    """Errors (M, k) of differences between pairs of nodes -> moves (n, k) of all but the `still` ones, one in each
     part, which make the sum of squares over the variances least."""
     from scipy.sparse import csr_array, diags_array
 

@@ -29,8 +29,6 @@ MORE = 50
 """Steps before it is judged."""
 RIVAL = 10.0
 """Cost by which another minimum may be higher and still be the truth's: 1e-5 of chi-square with one degree."""
-RELAXED = 400
-"""Nodes up to which the convex relaxation of a problem is solved."""
 EASED = (30.0, 10.0, 3.0, 1.0)
 """Times as large standard deviations of ranges."""
 

@@ -1,0 +1,132 @@
+"""iSAM2 behind `co.incremental`, against GTSAM called by hand."""
+
+from __future__ import annotations
+
+from itertools import pairwise
+
+import gtsam
+import numpy as np
+import pytest
+
+import coopoc as co
+from coopoc.optimize import Incremental, Loss, joint_covariance
+
+STD = np.array([0.05, 0.05, 0.02])
+TRUE = [gtsam.Pose2(np.cos(0.3 * k) * 5.0, np.sin(0.3 * k) * 5.0, 0.3 * k) for k in range(25)]
+MARKS = {"l0": np.array([0.0, 1.0]), "l1": np.array([8.0, -3.0])}
+
+
+def measured() -> tuple[list[gtsam.Pose2], list[tuple[int, str, float]]]:
+    """Odometry, and the landmark that each pose ranges."""
+    rng = np.random.default_rng(3)
+    moved = [a.between(b).compose(gtsam.Pose2(*(STD * rng.normal(size=3)))) for a, b in pairwise(TRUE)]
+    far = [(k, f"l{k % 2}", TRUE[k].range(MARKS[f"l{k % 2}"]) + 0.1 * rng.normal()) for k in range(1, 25)]
+    return moved, far
+
+
+def our_pose(pose: gtsam.Pose2) -> np.ndarray:
+    return co.pose(np.array([pose.x(), pose.y()]), pose.theta())
+
+
+def followed(loss: Loss | None = None, lag: int = 0) -> Incremental:
+    """One step per pose."""
+    moved, far = measured()
+    start = co.Problem(("x0",), dimension=2, poses=(0,), x0=our_pose(TRUE[0])[None])
+    live = co.incremental(
+        start.add("pose", "x0", our_pose(TRUE[0]), std=0.01), relinearizeThreshold=0.01, relinearizeSkip=1, lag=lag
+    )
+    at = TRUE[0]
+    for step, (k, mark, distance) in zip(moved, far, strict=True):
+        at = at.compose(step)
+        new = {f"x{k}": our_pose(at)} | ({} if mark in live else {mark: MARKS[mark] + 0.3})
+        names = live.names + list(new)
+        seen = co.Factor("range", [[names.index(f"x{k}"), names.index(mark)]], [[distance]], std=[[0.1]], loss=loss)
+        live.add([("relative_pose_log", (f"x{k - 1}", f"x{k}"), our_pose(step), STD), seen], new)
+    for _ in range(5):  # steps without measurements
+        live.add()
+    return live
+
+
+def batch() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
+    """GTSAM's graph by hand, whose poses have keys 0, 1, ... and landmarks 100, 101, and its optimum."""
+    (moved, far), sigmas = measured(), gtsam.noiseModel.Diagonal.Sigmas
+    graph, guess = gtsam.NonlinearFactorGraph(), gtsam.Values()
+    graph.add(gtsam.PriorFactorPose2(0, TRUE[0], sigmas(np.full(3, 0.01))))
+    for k, pose in enumerate(TRUE):
+        guess.insert(k, pose)
+    for j, mark in enumerate(MARKS.values()):
+        guess.insert(100 + j, mark)
+    for k, step in enumerate(moved):
+        graph.add(gtsam.BetweenFactorPose2(k, k + 1, step, sigmas(STD)))
+    for k, mark, distance in far:
+        graph.add(gtsam.RangeFactor2D(k, 100 + int(mark[1]), distance, sigmas(np.array([0.1]))))
+    params = gtsam.LevenbergMarquardtParams()
+    params.setRelativeErrorTol(1e-15)
+    return graph, gtsam.LevenbergMarquardtOptimizer(graph, guess, params).optimize()
+
+
+def test_the_live_estimate_is_near_the_batch_and_an_update_at_it() -> None:
+    live, (_, best) = followed(), batch()
+    found = live.update()
+    assert found.status.name == "SOLVED"
+    assert found.extras["isam2_off"] < 0.02
+    for name in live.names:
+        key = int(name[1:]) + 100 * (name[0] == "l")
+        place = best.atPoint2(key) if name[0] == "l" else best.atPose2(key).translation()
+        assert live[name][:2] == pytest.approx(place, abs=0.02)
+        assert found[name][:2] == pytest.approx(place, abs=1e-4)
+    assert live.x[live.names.index("x7")] == pytest.approx(live["x7"])
+
+
+def test_marginals_are_gtsams_in_the_worlds_directions() -> None:
+    live, (graph, best) = followed(), batch()
+    marginals = gtsam.Marginals(graph, best)
+    pose, mark = marginals.marginalCovariance(9), marginals.marginalCovariance(101)
+    turn = np.eye(3)
+    turn[:2, :2] = best.atPose2(9).rotation().matrix()
+    scale = np.abs(pose).max()
+    assert live.marginal("x9") == pytest.approx(turn @ pose @ turn.T, abs=0.03 * scale)
+    assert live.marginal("l1")[:2, :2] == pytest.approx(mark, abs=0.03 * np.abs(mark).max())
+    solved = live.update()
+    exact = joint_covariance(live.problem, solved, ("x9",))[0, 0]
+    assert live.marginal("x9") == pytest.approx(exact, abs=0.03 * scale)
+
+
+def test_robust_losses_are_those_of_a_solve() -> None:
+    found = followed(Loss("huber", 1.0)).update()
+    assert found.status.name == "SOLVED"
+    assert found.extras["isam2_off"] < 0.05
+
+
+def test_with_a_lag_it_forgets_what_is_not_used_and_keeps_what_it_told() -> None:
+    live, (graph, best) = followed(lag=8), batch()
+    assert live["x24"][:2] == pytest.approx(best.atPose2(24).translation(), abs=0.02)
+    assert live["l0"][:2] == pytest.approx(best.atPoint2(100), abs=0.02)
+    exact = gtsam.Marginals(graph, best).marginalCovariance(24)
+    assert np.trace(live.marginal("x24")) == pytest.approx(np.trace(exact), rel=0.05)
+    assert len(live.isam.calculateEstimate().keys()) < 13
+    with pytest.raises(co.InputError, match="lag"):
+        live.update()
+    with pytest.raises(co.InputError, match="forgotten"):
+        live["x3"]
+
+
+def test_what_is_refused_leaves_the_estimate_as_it_was() -> None:
+    live = followed()
+    before, names = live.x, list(live.names)
+    new = {"x25": our_pose(TRUE[-1])}
+    for factors, values, field in (
+        ([("range", ("x25", "nowhere"), 1.0, 0.1)], new, "node"),
+        ([], {"x3": our_pose(TRUE[3])}, "values"),
+        ([], {"l9": [1.0, 2.0, 3.0]}, "values"),
+        ([("relative_pose", ("x24", "x25"), our_pose(TRUE[1]), [0.1, 0.2, 0.1])], new, "factors"),
+    ):
+        with pytest.raises(co.InputError, match=field):
+            live.add(factors, values)
+    assert live.names == names
+    assert (live.x == before).all()
+    problem = co.Problem(("a",), dimension=2).add("position", "a", [0, 0], std=1.0)
+    with pytest.raises(co.InputError, match="1 constraints"):
+        co.incremental(problem.constrain("position", "a", lower=0.0))
+    with pytest.raises(co.InputError, match="relinearizeSkip"):
+        co.incremental(problem, relinearizeSkip=0)
