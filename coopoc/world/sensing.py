@@ -75,7 +75,7 @@ def observe(
     one_of("frame", frame, Frame)
     assumed = sensors.known() if assumed is None else instance("assumed", assumed, Sensors)
     standing = columns("landmarks", landmarks, fleet.ids)
-    links = find_links(fleet, watching, v2x.max_neighbours, v2x.radius, sensors.min_range, standing)
+    links = find_links(fleet, watching, v2x, sensors.min_range, standing)
     broadcasts, arrival = schedule(fleet.ids, fleet.t, links, v2x, runs, seed)
     arrival[:, np.isin(links.neighbour, standing)] = -1
     broadcasts[:, standing] = False
@@ -120,38 +120,36 @@ def observe(
 def find_links(
     fleet: Fleet,
     observers: Sequence[int],
-    most: int,
-    radius: float,
+    v2x: V2X,
     min_range: float = 0.0,
     landmarks: Sequence[int] = (),
 ) -> Links:
-    """Links of each observer to its `most` nearest vehicles in [min_range, radius], by step, observer, distance.
+    """Links of each observer to its K nearest vehicles in [min_range, radius], by step, observer, distance.
 
     Vehicles at one distance come by column. Near vehicles are looked up in a k-d tree.
 
     Args:
         fleet: the truth.
         observers: columns.
-        most: K.
-        radius: m.
+        v2x: K and radius m.
         min_range: m.
-        landmarks: columns of members that are linked beside the `most`, and observe nothing.
+        landmarks: columns of members that are linked beside the K, and observe nothing.
     """
     found = [np.empty((0, 3), dtype=np.int64)]
     vehicles, columns = len(fleet.ids), np.array(list(observers), dtype=np.int64)
     columns, marks = np.setdiff1d(columns, landmarks), np.isin(np.arange(vehicles), landmarks)
     at_once = max(1, PAIRS // (vehicles * max(1, len(columns))))
-    for first in range(0, len(fleet.t), at_once) if (most or marks.any()) and len(columns) else ():
+    for first in range(0, len(fleet.t), at_once) if (v2x.max_neighbours or marks.any()) and len(columns) else ():
         position = fleet.position[first : first + at_once]
-        place, other = _near(position, columns, radius)
+        place, other = _near(position, columns, v2x.radius)
         gap = np.linalg.norm(position.reshape(-1, 3)[other] - position.reshape(-1, 3)[place], axis=1)
-        fits = (gap <= radius) & (gap >= min_range) & (place != other)
+        fits = (gap <= v2x.radius) & (gap >= min_range) & (place != other)
         place, other, gap = place[fits], other[fits], gap[fits]
         order = np.lexsort((other, gap, place))
         place, other = place[order], other[order]
         passed = np.append(0, np.cumsum(~marks[other % vehicles]))  # vehicles before each
         rank = passed[:-1] - passed[np.searchsorted(place, place)]
-        kept = (rank < most) | marks[other % vehicles]
+        kept = (rank < v2x.max_neighbours) | marks[other % vehicles]
         place, other = place[kept], other[kept]
         found.append(np.column_stack([place // vehicles + first, place % vehicles, other % vehicles]))
     rows = np.concatenate(found)
