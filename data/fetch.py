@@ -194,7 +194,6 @@ def _bring(entry: Entry, folder: Path, mirror: str, timeout: float) -> None:
         data = unpacked[file] if unpacked else _downloaded(entry, address, path, size, timeout)
         if (given := hashlib.sha256(data).hexdigest()) != digest:
             hint = f"It was removed: {address} serves another file."
-            path.unlink(missing_ok=True)
             raise _other_bytes(f"{entry.name}: {path.name}", given, digest, hint)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
