@@ -166,11 +166,11 @@ def search_rows(sizes: Sequence[tuple[int, int]]) -> list[dict[str, Any]]:
     out, args = [], (CHANNEL.max_neighbours, CHANNEL.radius, SENSORS.min_range)
     for vehicles, steps in sizes:
         fleet, everyone = town(vehicles, steps), range(vehicles)
-        found = sensing.find_links(fleet, everyone, *args)
+        found = sensing.find_links(fleet, everyone, CHANNEL, SENSORS.min_range)
         same = np.array_equal(by_pairs(fleet, *args), np.column_stack([found.step, found.observer, found.neighbour]))
         spent = [
             (
-                timed(lambda f=fleet, e=everyone: sensing.find_links(f, e, *args)),
+                timed(lambda f=fleet, e=everyone: sensing.find_links(f, e, CHANNEL, SENSORS.min_range)),
                 timed(lambda f=fleet: by_pairs(f, *args)),
             )
             for _ in range(ROUNDS)

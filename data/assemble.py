@@ -12,7 +12,6 @@ from coopoc.errors import InputError
 from coopoc.world.fleet import Fleet
 from coopoc.world.links import Links
 from coopoc.world.recording import Body, Recording
-from coopoc.world.sensing import schedule
 from coopoc.world.sensors import Sensors
 from coopoc.world.v2x import V2X
 
@@ -316,10 +315,6 @@ def planar_recording(
     gnss, moved, turning = np.full(shape, np.nan), np.zeros(shape), np.zeros(shape[:3])
     gnss[0, :, n:] = np.column_stack([place, np.zeros(len(place))])
     moved[0, :, :n, :2], turning[0, :, :n] = velocity, yaw_rate
-    still = np.zeros(shape[1:])
-    broadcasts, arrival = schedule(Fleet(tuple(ids), t, still, still), links, v2x, 1, 0)
-    arrival[:, links.neighbour >= n] = -1
-    broadcasts[:, n:] = False
     return Recording(
         ids=tuple(ids),
         t=t,
@@ -327,8 +322,8 @@ def planar_recording(
         velocity=moved,
         links=links,
         relative=np.column_stack([table[:, 3:], np.full(len(table), np.pi / 2)])[None],
-        broadcasts=broadcasts,
-        arrival=arrival,
+        broadcasts=np.broadcast_to(np.arange(len(ids)) < n, shape[1:3]),
+        arrival=np.where(links.neighbour < n, links.step, -1)[None],
         sensors=sensors,
         v2x=v2x,
         observers=tuple(range(len(ids))),

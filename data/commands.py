@@ -11,8 +11,7 @@ import tyro
 from coopoc.errors import InputError
 
 from .fetch import TIMEOUT, Entry, fetch, public
-from .fleet_cards import in_words
-from .registry import DATASETS, LOGS, card, convert, kind_of, list_datasets, load_fleet, load_log
+from .registry import DATASETS, LOGS, card, convert, in_words, kind_of, list_datasets, load_fleet, load_log
 from .source import split
 
 

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import hashlib
+import io
 import os
 import tomllib
 import urllib.request
 import zipfile
 from collections.abc import Mapping
 from dataclasses import dataclass
-from functools import cache, partial
+from functools import cache
 from http.client import HTTPException
 from pathlib import Path
 from typing import Any
@@ -22,7 +24,7 @@ TIMEOUT = 20.0
 CHUNK = 1 << 16
 """Bytes that are read at once."""
 ARCHIVE = "archive.zip"
-"""Name of an archive in the folder of its data set, until it is unpacked."""
+"""Name under which an archive is shown while it is fetched."""
 
 
 @dataclass(frozen=True)
@@ -182,20 +184,19 @@ def _absent(entry: Entry, folder: Path) -> list[str]:
 
 
 def _bring(entry: Entry, folder: Path, mirror: str, timeout: float) -> None:
-    """Download what is absent: each file from its address or the mirror's, else the archive of all."""
-    import pooch
-
-    pooch.get_logger().setLevel("WARNING")
-    absent = _absent(entry, folder)  # another process may have brought it meanwhile
+    """Download what is absent: each file from its address or the mirror's, else the archive of all; and keep what has
+    the right bytes."""
+    absent, unpacked = _absent(entry, folder), dict[str, bytes]()  # another process may have brought it meanwhile
     if absent and entry.archive and not mirror:
-        deliver = partial(_deliver, entry=entry, to=folder / ARCHIVE, size=entry.bytes, digest="", timeout=timeout)
-        pooch.retrieve(entry.archive, None, ARCHIVE, folder, downloader=deliver)
-        _unpack(entry, folder)
-        return
+        unpacked = _unpacked(entry, absent, _downloaded(entry, entry.archive, folder / ARCHIVE, entry.bytes, timeout))
     for file in absent:
-        _, size, digest = entry.files[file]
-        deliver = partial(_deliver, entry=entry, to=folder / file, size=size, digest=digest, timeout=timeout)
-        pooch.retrieve(_address(entry, file, mirror), f"sha256:{digest}", file, folder, downloader=deliver)
+        address, (_, size, digest), path = _address(entry, file, mirror), entry.files[file], folder / file
+        data = unpacked[file] if unpacked else _downloaded(entry, address, path, size, timeout)
+        if (given := hashlib.sha256(data).hexdigest()) != digest:
+            hint = f"It was removed: {address} serves another file."
+            raise _other_bytes(f"{entry.name}: {path.name}", given, digest, hint)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_bytes(data)
 
 
 def _address(entry: Entry, file: str, mirror: str) -> str:
@@ -203,18 +204,14 @@ def _address(entry: Entry, file: str, mirror: str) -> str:
     return f"{mirror.rstrip('/')}/{quote(f'{entry.name}/{file}')}" if mirror else entry.files[file][0] or entry.archive
 
 
-def _deliver(
-    address: str, out: str, _: Any, /, *, entry: Entry, to: Path, size: int, digest: str, timeout: float
-) -> None:
-    """Download to a temporary file, which pooch moves to its last place.
+def _downloaded(entry: Entry, address: str, to: Path, size: int, timeout: float) -> bytes:
+    """What an address serves, in memory: the largest data set has tens of megabytes.
 
     Args:
-        address: asked for.
-        out: path that takes the file.
         entry: that it belongs to.
-        to: its last place.
-        size: bytes of the file; of an archive the most that it may have.
-        digest: SHA-256, "" of an archive.
+        address: asked for.
+        to: its place, for the progress bar and for whom has to fetch it by hand.
+        size: bytes of the file; of an archive the most that it may have. One byte more shows another file.
         timeout: s without a byte.
 
     Raises:
@@ -222,44 +219,35 @@ def _deliver(
     """
     from tqdm import tqdm
 
+    data = bytearray()
     try:
         bar = tqdm(desc=to.name, total=size, unit="B", unit_scale=True, delay=2.0)
-        with urllib.request.urlopen(address, timeout=timeout) as answer, Path(out).open("wb") as file, bar:
-            while file.tell() <= size and (chunk := answer.read(CHUNK)):
-                file.write(chunk)
+        with urllib.request.urlopen(address, timeout=timeout) as answer, bar:
+            while len(data) <= size and (chunk := answer.read(CHUNK)):
+                data += chunk
                 bar.update(len(chunk))
-            got, rest = file.tell(), getattr(answer, "length", 0) or 0
-        if got <= size and rest:
-            raise ConnectionError(f"closed the connection after {got} of {got + rest} bytes")
+            rest = getattr(answer, "length", 0) or 0
+        if len(data) <= size and rest:
+            raise ConnectionError(f"closed the connection after {len(data)} of {len(data) + rest} bytes")
     except (OSError, HTTPException, ValueError) as error:
         late = isinstance(getattr(error, "reason", error), TimeoutError)
         raise _by_hand(entry, address, to, f"sent nothing for {timeout:g} s" if late else said(error)) from None
-    if digest and (given := _digest(Path(out))) != digest:
-        raise _other_bytes(f"{entry.name}: {to.name}", given, digest, f"It was removed: {address} serves another file.")
+    return bytes(data)
 
 
-def _unpack(entry: Entry, folder: Path) -> None:
-    """Take the files out of their archive, whichever folder they are in there, and verify each."""
+def _unpacked(entry: Entry, files: list[str], data: bytes) -> dict[str, bytes]:
+    """Bytes of files in an archive, whichever folder they are in there."""
+    reason = ""
     try:
-        with zipfile.ZipFile(folder / ARCHIVE) as archive:
-            members = {Path(member.filename).name: member for member in archive.infolist()}
-            for file in _absent(entry, folder):
-                _, size, digest = entry.files[file]
-                member = members.get(Path(file).name)
-                if member is None or member.file_size != size:
-                    given = "is not in it" if member is None else f"has {member.file_size} bytes in it, not {size}"
-                    raise _by_hand(entry, entry.archive, folder / file, f"{Path(file).name} {given}")
-                target = folder / file
-                target.parent.mkdir(parents=True, exist_ok=True)
-                target.write_bytes(archive.read(member))
-                if (given := _digest(target)) != digest:
-                    target.unlink()
-                    hint = f"It was removed: {entry.archive} holds another file."
-                    raise _other_bytes(f"{entry.name}: {target.name}", given, digest, hint)
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            members = {(Path(one.filename).name, one.file_size): one for one in archive.infolist()}
+            wanted = {file: members.get((Path(file).name, entry.files[file][1])) for file in files}
+            if not (missing := [file for file, member in wanted.items() if member is None]):
+                return {file: archive.read(member) for file, member in wanted.items() if member}
+        reason = f"{Path(missing[0]).name} is not in it with its {entry.files[missing[0]][1]} bytes"
     except (zipfile.BadZipFile, OSError) as error:
-        raise _by_hand(entry, entry.archive, folder / ARCHIVE, said(error)) from None
-    finally:
-        (folder / ARCHIVE).unlink(missing_ok=True)
+        reason = said(error)
+    raise _by_hand(entry, entry.archive, cache_folder() / entry.name / ARCHIVE, reason)
 
 
 def _by_hand(entry: Entry, address: str, to: Path, reason: str) -> InputError:
@@ -293,6 +281,4 @@ def _size(path: Path) -> int:
 
 def _digest(path: Path) -> str:
     """SHA-256 of a file in hex digits, "" without one."""
-    import pooch
-
-    return str(pooch.file_hash(str(path))) if path.is_file() else ""
+    return hashlib.sha256(path.read_bytes()).hexdigest() if path.is_file() else ""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -79,12 +79,11 @@ def tum_files(path: Path) -> list[Path]:
     return sorted(path.glob("*.tum")) or sorted(path.glob("*.txt"))
 
 
-def read_tum(path: Path, *, repeats: Literal["refuse", "drop"] = "refuse", **options: Any) -> Fleet:
+def read_tum(path: Path, **options: Any) -> Fleet:
     """Fleet of a TUM file or a folder of them; ids are file names, velocity is the backward difference.
 
     Args:
         path: file or folder; s and m; orientation is checked for a unit quaternion and not kept (a Fleet has none).
-        repeats: "drop" leaves out a pose whose stamp is that of the pose before, "refuse" raises.
         options: dt (s, resample: needed when the vehicles' stamps differ), max_gap and any_scale, as of `assemble`.
 
     Raises:
@@ -93,7 +92,7 @@ def read_tum(path: Path, *, repeats: Literal["refuse", "drop"] = "refuse", **opt
     files = tum_files(path)
     if not files:
         raise InputError("path", path, "must be a TUM file or a folder with .tum or .txt files", "Check the path.")
-    poses = [tum.read_tum(file, repeats=repeats) for file in files]
+    poses = [tum.read_tum(file) for file in files]
     ids = [file.stem for file, track in zip(files, poses, strict=True) for _ in range(len(track))]
     t, x = (np.concatenate([getattr(track, field) for track in poses]) for field in ("stamps", "position"))
     source = f"TUM {path.name}, velocity by backward difference"

@@ -66,8 +66,6 @@ class MrclamLog:
         landmarks: (L, 3) subject, x m, y m of the landmarks.
         sightings: (S, 5) time s on the fleet's clock, observer (column), landmark (row of `landmarks`, -1 if it has no
             position), range m, bearing rad, of every measurement of a landmark.
-        unknown: number of measurements of barcodes in no list, which are not among the M.
-        absent: number of measurements of robots whose files are not in the folder, which are not among the M.
     """
 
     fleet: Fleet
@@ -78,14 +76,14 @@ class MrclamLog:
     true_others: Floats
     landmarks: Floats
     sightings: Floats
-    unknown: int
-    absent: int
 
     __repr__ = short_repr
 
 
 def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP) -> MrclamLog:
     """Read RobotN_Groundtruth, _Odometry, _Measurement (of the robots that are there) and Barcodes.dat.
+
+    Measurements of barcodes in no list, and of robots whose files are not there, are left out.
 
     The fleet covers the interval in which every robot has truth and odometry. Gaps of truth up to `max_gap` are
     interpolated. The second column of a measurement is a barcode, though the header of the file says subject.
@@ -153,8 +151,6 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
         true_others=np.column_stack([np.hypot(dx, dy), wrap(np.arctan2(dy, dx) - here[:, 2])]),
         landmarks=marks,
         sightings=sightings,
-        unknown=int((subject == 0).sum()),
-        absent=int(((subject > 0) & (subject <= SUBJECTS)).sum()) - len(others),
     )
 
 

@@ -209,7 +209,7 @@ def bound_rows(p: Params) -> list[Row]:
     for ego in scene.egos(p):
         column = drive.index(ego)
         level = bound_rt_le(bound(drive, acting, column, v2x, recording=told))
-        near = len(find_links(drive, [column], v2x.max_neighbours, v2x.radius, acting.min_range)) / len(drive.t)
+        near = len(find_links(drive, [column], v2x, acting.min_range)) / len(drive.t)
         received = near * FIX_AND_VELOCITY.payload * rate
         sizes = {"bytes_per_second": received, "payload_bytes_per_second": received}
         rows_of_egos.append({"run": 0, "ego": ego, "rt_le_m": level, "neighbours_mean": near, **sizes})

@@ -39,8 +39,7 @@ def paper(
         data: fleet to test on, a name or a path.
     """
     from coopoc import Results, run_study
-    from coopoc.data.fleet_cards import in_words
-    from coopoc.data.registry import DATASETS, card
+    from coopoc.data.registry import DATASETS, card, in_words
     from coopoc.study.report import report
 
     began, results, given = time.perf_counter(), dict[str, Results](), {"weights": str(out / "weights"), "data": data}

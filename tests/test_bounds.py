@@ -50,7 +50,7 @@ def point_marginals(
 
     What a recording lacks in its first run has no factor, or, of one component, a standard deviation of UNSEEN.
     """
-    links = find_links(fleet, observers, v2x.max_neighbours, v2x.radius, S2.min_range)
+    links = find_links(fleet, observers, v2x, S2.min_range)
     graph, values, before = gtsam.NonlinearFactorGraph(), gtsam.Values(), set()
     for t in range(steps):
         mine = np.flatnonzero(links.step == t)
@@ -177,7 +177,7 @@ def sigmas(*std: float) -> Any:
 def pose_marginals(fleet: co.Fleet, steps: int, sensors: co.Sensors) -> Any:
     """Fixes, compasses, odometry, bearings and ranges in the plane at the truth, as GTSAM's own factors."""
     marks = [k for k, name in enumerate(fleet.ids) if name[0] == "m"]
-    links = find_links(fleet, range(len(fleet.ids)), NEAR.max_neighbours, NEAR.radius, sensors.min_range, marks)
+    links = find_links(fleet, range(len(fleet.ids)), NEAR, sensors.min_range, marks)
     graph, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
     heading, (u, _) = true_heading(fleet), body_motion(fleet)
     middle, dt, before = midway(heading), fleet.dt, {}

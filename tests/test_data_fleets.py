@@ -9,8 +9,7 @@ from conftest import refused
 from scipy.spatial import cKDTree
 from test_data_generate import script
 
-from coopoc.data.fleet_cards import in_words
-from coopoc.data.registry import DATASETS, FLEETS, card, convert, detect, list_datasets, load_fleet
+from coopoc.data.registry import DATASETS, FLEETS, card, convert, detect, in_words, list_datasets, load_fleet
 
 NAMES = ("town10", "town10-clients", "town10-validation", "town04")
 

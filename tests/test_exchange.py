@@ -30,7 +30,7 @@ def by_brute_force(fleet: Fleet, observers: Any, most: int, radius: float, min_r
 
 
 def assert_same_links(fleet: Fleet, observers: Any, most: int, radius: float, min_range: float = 2.0) -> int:
-    found = sensing.find_links(fleet, observers, most, radius, min_range)
+    found = sensing.find_links(fleet, observers, V2X(max_neighbours=most, radius=radius), min_range)
     wanted = by_brute_force(fleet, observers, most, radius, min_range)
     for name in ("step", "observer", "neighbour"):
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))

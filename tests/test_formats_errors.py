@@ -151,16 +151,12 @@ def test_a_bad_line_of_a_trajectory_is_named(tmp_path: Path, text: str, thing: s
     _assert_refused(lambda: read(_file(tmp_path / name, text)), thing, hint)
 
 
-def test_a_repeated_stamp_is_named_by_all_its_digits_and_can_be_left_out(tmp_path: Path) -> None:
-    """Stamps of Unix time differ in digits that %g does not print; only a pose at the very same stamp is left out."""
+def test_a_repeated_stamp_is_named_by_all_its_digits(tmp_path: Path) -> None:
+    """Stamps of Unix time differ in digits that %g does not print."""
     stamps = ("1311868231.1234567", "1311868231.1234569", "1311868231.1234569", "1311868231.2")
     file = _file(tmp_path / "a.tum", "".join(f"{stamp} {row} 0 0 0 0 0 1\n" for row, stamp in enumerate(stamps)))
     twice = f"{float(stamps[1])!r} s after {float(stamps[1])!r} s"
-    _assert_refused(lambda: read_tum(file), "a.tum: line 3, column t", twice, 'repeats="drop"')
-    kept = read_tum(file, repeats="drop")
-    assert (kept.stamps == [float(stamps[row]) for row in (0, 1, 3)]).all()
-    assert kept.position[:, 0].tolist() == [0, 1, 3]
-    _assert_refused(lambda: read_tum(file, repeats="keep"), "repeats", "drop")
+    _assert_refused(lambda: read_tum(file), "a.tum: line 3, column t", twice, "remove one that repeats")
 
 
 def test_stamps_of_kitti_stand_in_a_file_of_their_own(tmp_path: Path) -> None:

@@ -61,7 +61,7 @@ def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: st
     """By hand: 32 B at 10 Hz from each of the neighbours that are there; a CAM carries 350 B more."""
     drive = load_fleet(short_town)
     egos = [drive.index(ego) for ego in scene.egos({"data": short_town, "egos": 2})]
-    near = len(find_links(drive, egos, 2, 30.0, 2.0)) / len(egos) / len(drive.t)
+    near = len(find_links(drive, egos, V2X(2, 30.0), 2.0)) / len(egos) / len(drive.t)
     ideal = [numbers.mean(results, at(channel="ideal"), kind) for kind in SIZES]
     assert ideal == pytest.approx([near * 320, near * 320])
     payload, air = (numbers.mean(results, at(channel="cam"), kind) for kind in SIZES)

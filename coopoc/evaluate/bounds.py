@@ -75,7 +75,7 @@ def posterior_bound(
     if not fleet.present[:, column].all():
         raise InputError("ego", fleet.ids[column], "is absent at some steps", "Choose another or cut the drive.")
     instance("smoothing", smoothing, bool, "Give True for the bound of a smoother.")
-    links = find_links(fleet, [column], v2x.max_neighbours, v2x.radius, sensors.min_range)
+    links = find_links(fleet, [column], v2x, sensors.min_range)
     steps = np.split(links.neighbour, np.searchsorted(links.step, np.arange(1, len(fleet.t))))
     members = [np.append(column, near) for near in steps]
     return _bound(fleet, sensors, links, members, smoothing, recording)[:, column]
@@ -98,7 +98,7 @@ def past_bound(fleet: Fleet, sensors: Sensors, ego: int, v2x: V2X, *, recording:
     >>> float(past_bound(fleet, Sensors(gnss_std=(2, 2, 2)), 0, V2X(0))[1, 0, 0])  # standing still: 4 / 2
     2.0
     """
-    links = find_links(fleet, [ego], v2x.max_neighbours, v2x.radius, sensors.min_range)
+    links = find_links(fleet, [ego], v2x, sensors.min_range)
     near = np.isin(np.arange(len(fleet.ids)), [ego, *np.unique(links.neighbour)])  # the others say nothing about it
     members = [np.flatnonzero(row & near) for row in fleet.present]
     return _bound(fleet, sensors, links, members, False, recording)[:, ego]
@@ -123,7 +123,7 @@ def fleet_bound(
     """
     v2x = checked_noise(fleet, sensors, v2x)
     instance("smoothing", smoothing, bool, "Give True for the bound of a smoother.")
-    links = find_links(fleet, range(len(fleet.ids)), v2x.max_neighbours, v2x.radius, sensors.min_range)
+    links = find_links(fleet, range(len(fleet.ids)), v2x, sensors.min_range)
     return _bound(fleet, sensors, links, [np.flatnonzero(row) for row in fleet.present], smoothing, recording)
 
 
@@ -154,7 +154,7 @@ def pose_bound(fleet: Fleet, sensors: Sensors, v2x: V2X | None = None, *, landma
     """
     marks = columns("landmarks", landmarks, instance("fleet", fleet, Fleet).ids)
     v2x = checked_noise(fleet, sensors, v2x, bool(marks))
-    links = find_links(fleet, range(len(fleet.ids)), v2x.max_neighbours, v2x.radius, sensors.min_range, marks)
+    links = find_links(fleet, range(len(fleet.ids)), v2x, sensors.min_range, marks)
     members = [np.setdiff1d(np.flatnonzero(row), marks) for row in fleet.present]
     stages = pose_stages(fleet, sensors, links, members)
     return _marginals(fleet, stages, covariances(stages, smoothing=False))

@@ -5,12 +5,11 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import InitVar, dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked, frozen, one_of
+from ..arrays import Floats, checked, frozen
 from ..errors import InputError
 from ..file_names import given_path
 from ..short_repr import short_repr
@@ -70,8 +69,7 @@ def _check(poses: Trajectory, place: Callable[[int], str]) -> None:
     late = 1 + np.flatnonzero(np.diff(stamps) <= 0)
     if len(late):
         found = f"{stamps[late[0]]!s} s after {stamps[late[0] - 1]!s} s"
-        twice = stamps[late[0]] == stamps[late[0] - 1]
-        hint = 'Remove the repeated pose, or read with repeats="drop".' if twice else "Sort the poses by time."
+        hint = "Sort the poses by time, and remove one that repeats."
         raise InputError(f"{place(late[0])}, column t", found, "must increase", hint)
     off = np.abs(poses.rotation @ poses.rotation.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((off > ORTHONORMAL) | (np.linalg.det(poses.rotation) < 0))
@@ -84,12 +82,11 @@ def _check(poses: Trajectory, place: Callable[[int], str]) -> None:
         )
 
 
-def read_tum(path: str | Path, *, repeats: Literal["refuse", "drop"] = "refuse") -> Trajectory:
+def read_tum(path: str | Path) -> Trajectory:
     """Trajectory of a TUM file: unit quaternions with the scalar last; lines that start with # are comments.
 
     Args:
         path: s, m; a quaternion whose length is within 1 % of 1 was rounded and is normalised.
-        repeats: what happens to a pose whose stamp is that of the pose before: "refuse" raises, "drop" leaves it out.
 
     Raises:
         InputError: with the line, another number of words, one that is no finite number, stamps that do not increase, a
@@ -103,7 +100,6 @@ def read_tum(path: str | Path, *, repeats: Literal["refuse", "drop"] = "refuse")
     >>> read_tum(file).stamps
     array([0. , 0.1])
     """
-    one_of("repeats", repeats, ("refuse", "drop"))
     path = given_path(path)
     lines, table = read_table(path, "t x y z qx qy qz qw")
     off = np.flatnonzero(np.abs(np.linalg.norm(table[:, 4:], axis=1) - 1) > UNIT)
@@ -114,9 +110,6 @@ def read_tum(path: str | Path, *, repeats: Literal["refuse", "drop"] = "refuse")
             f"must have length 1 to within {UNIT:g}",
             "Order is qx qy qz qw; write 0 0 0 1 where the orientation is unknown.",
         )
-    if repeats == "drop":
-        first = np.append(True, np.diff(table[:, 0]) != 0)
-        lines, table = lines[first], table[first]
     rotation = to_rotation(table[:, 4:])
     return Trajectory(table[:, 0], table[:, 1:4], rotation, place=lambda row: f"{path.name}: line {lines[row]}")
 

@@ -13,7 +13,7 @@ from ..errors import InputError
 from .body_frames import body_measurements, body_motion, gauss_markov, in_body
 from .channels import lost
 from .faults import PAIRS, wrong_fixes, wrong_odometry, wrong_relative
-from .fleet import Fleet, columns
+from .fleet import Fleet, columns, interval
 from .links import Links, spherical, wrap
 from .recording import Recording, Vehicles
 from .sensors import Sensors, stream
@@ -75,8 +75,8 @@ def observe(
     one_of("frame", frame, Frame)
     assumed = sensors.known() if assumed is None else instance("assumed", assumed, Sensors)
     standing = columns("landmarks", landmarks, fleet.ids)
-    links = find_links(fleet, watching, v2x.max_neighbours, v2x.radius, sensors.min_range, standing)
-    broadcasts, arrival = schedule(fleet, links, v2x, runs, seed)
+    links = find_links(fleet, watching, v2x, sensors.min_range, standing)
+    broadcasts, arrival = schedule(fleet.ids, fleet.t, links, v2x, runs, seed)
     arrival[:, np.isin(links.neighbour, standing)] = -1
     broadcasts[:, standing] = False
     instance("told", told, bool, "Give True to remove outliers.")
@@ -120,38 +120,36 @@ def observe(
 def find_links(
     fleet: Fleet,
     observers: Sequence[int],
-    most: int,
-    radius: float,
+    v2x: V2X,
     min_range: float = 0.0,
     landmarks: Sequence[int] = (),
 ) -> Links:
-    """Links of each observer to its `most` nearest vehicles in [min_range, radius], by step, observer, distance.
+    """Links of each observer to its K nearest vehicles in [min_range, radius], by step, observer, distance.
 
     Vehicles at one distance come by column. Near vehicles are looked up in a k-d tree.
 
     Args:
         fleet: the truth.
         observers: columns.
-        most: K.
-        radius: m.
+        v2x: K and radius m.
         min_range: m.
-        landmarks: columns of members that are linked beside the `most`, and observe nothing.
+        landmarks: columns of members that are linked beside the K, and observe nothing.
     """
     found = [np.empty((0, 3), dtype=np.int64)]
     vehicles, columns = len(fleet.ids), np.array(list(observers), dtype=np.int64)
     columns, marks = np.setdiff1d(columns, landmarks), np.isin(np.arange(vehicles), landmarks)
     at_once = max(1, PAIRS // (vehicles * max(1, len(columns))))
-    for first in range(0, len(fleet.t), at_once) if (most or marks.any()) and len(columns) else ():
+    for first in range(0, len(fleet.t), at_once) if (v2x.max_neighbours or marks.any()) and len(columns) else ():
         position = fleet.position[first : first + at_once]
-        place, other = _near(position, columns, radius)
+        place, other = _near(position, columns, v2x.radius)
         gap = np.linalg.norm(position.reshape(-1, 3)[other] - position.reshape(-1, 3)[place], axis=1)
-        fits = (gap <= radius) & (gap >= min_range) & (place != other)
+        fits = (gap <= v2x.radius) & (gap >= min_range) & (place != other)
         place, other, gap = place[fits], other[fits], gap[fits]
         order = np.lexsort((other, gap, place))
         place, other = place[order], other[order]
         passed = np.append(0, np.cumsum(~marks[other % vehicles]))  # vehicles before each
         rank = passed[:-1] - passed[np.searchsorted(place, place)]
-        kept = (rank < most) | marks[other % vehicles]
+        kept = (rank < v2x.max_neighbours) | marks[other % vehicles]
         place, other = place[kept], other[kept]
         found.append(np.column_stack([place // vehicles + first, place % vehicles, other % vehicles]))
     rows = np.concatenate(found)
@@ -227,12 +225,12 @@ def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int, told: bool) 
     return velocity
 
 
-def _pairs(fleet: Fleet, links: Links) -> list[tuple[str, str, Ints]]:
+def _pairs(ids: Sequence[str], links: Links) -> list[tuple[str, str, Ints]]:
     """(observer id, neighbour id, link indices in time order) of every pair that is ever linked."""
-    key = links.observer * len(fleet.ids) + links.neighbour
+    key = links.observer * len(ids) + links.neighbour
     order = np.argsort(key, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(key[order])) + 1) if len(order) else []
-    return [(fleet.ids[links.observer[g[0]]], fleet.ids[links.neighbour[g[0]]], g) for g in groups]
+    return [(ids[links.observer[g[0]]], ids[links.neighbour[g[0]]], g) for g in groups]
 
 
 def _relative_measurements(
@@ -241,7 +239,7 @@ def _relative_measurements(
     """(R, L, 3): the step's own draw of the pair's stream, so a link that comes and goes keeps its draws."""
     vector = fleet.position[links.step, links.neighbour] - fleet.position[links.step, links.observer]
     exact = np.stack(spherical(*vector.T), axis=-1) if len(links) else np.empty((0, 3))
-    pairs = [(observer, neighbour, index, links.step[index]) for observer, neighbour, index in _pairs(fleet, links)]
+    pairs = [(observer, neighbour, index, links.step[index]) for observer, neighbour, index in _pairs(fleet.ids, links)]
     relative, turned = np.empty((runs, *exact.shape)), _own_errors(fleet, links, sensors, runs, seed, *HEADING)
     longer = _own_errors(fleet, links, sensors, runs, seed, "range_offset")
     scratch = np.empty((len(fleet.t), 3))
@@ -277,22 +275,23 @@ def _own_errors(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: i
     return turned
 
 
-def schedule(fleet: Fleet, links: Links, v2x: V2X, runs: int, seed: int) -> tuple[Bools, Ints]:
+def schedule(ids: Sequence[str], t: Floats, links: Links, v2x: V2X, runs: int, seed: int) -> tuple[Bools, Ints]:
     """Steps at which each vehicle broadcasts (T, N), and the arrival step (R, L) of the neighbour's broadcast over each
     link."""
-    per_step = 1.0 if v2x.rate is None else v2x.rate * fleet.dt
+    dt = interval(t)
+    per_step = 1.0 if v2x.rate is None else v2x.rate * dt
     if per_step > 1 + 1e-9:
-        limit = f"must be <= 1/dt = {1 / fleet.dt:g} Hz"
+        limit = f"must be <= 1/dt = {1 / dt:g} Hz"
         raise InputError("rate", f"{v2x.rate} Hz", limit, "Broadcast at most once a step.")
-    phase = np.array([stream(seed, "phase", 0, name).uniform() for name in fleet.ids])
-    count = np.floor((np.arange(-1, len(fleet.t))[:, None] + 1e-9) * per_step + phase)
+    phase = np.array([stream(seed, "phase", 0, name).uniform() for name in ids])
+    count = np.floor((np.arange(-1, len(t))[:, None] + 1e-9) * per_step + phase)
     sends = np.diff(count, axis=0) > 0
     sent = sends[links.step, links.neighbour]
-    delay = int(np.ceil(v2x.latency / fleet.dt - 1e-9))
+    delay = int(np.ceil(v2x.latency / dt - 1e-9))
     arrival = np.where(sent, links.step + delay, -1)[None].repeat(runs, axis=0)
     if v2x.loss > 0:
         number = (np.cumsum(sends, axis=0) - 1)[links.step, links.neighbour]
-        for observer, neighbour, pair in _pairs(fleet, links):
+        for observer, neighbour, pair in _pairs(ids, links):
             index = pair[sent[pair]]
             size = int(number[index].max(initial=-1)) + 1
             draws = np.stack([stream(seed, "loss", r, observer, neighbour).uniform(size=size) for r in range(runs)])

@@ -5,9 +5,7 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import tokenize
 import zipfile
-import zlib
 from dataclasses import asdict
 from pathlib import Path
 from typing import Any
@@ -37,22 +35,6 @@ NAMES = (
 )
 LARGEST, DENSEST = 2**31, 1032
 """Bytes of one unpacked file, and of each of its own: no deflated stream unpacks to more."""
-DAMAGES = (
-    OSError,
-    EOFError,
-    KeyError,
-    TypeError,
-    ValueError,
-    AttributeError,
-    zipfile.BadZipFile,
-    zlib.error,
-    NotImplementedError,
-    RuntimeError,
-    MemoryError,
-    SyntaxError,
-    tokenize.TokenError,
-)
-"""What zipfile, zlib and NumPy raise on a damaged file."""
 
 
 def save_recording(recording: Recording, path: str | Path, truth: Fleet | None = None) -> None:
@@ -71,10 +53,7 @@ def save_recording(recording: Recording, path: str | Path, truth: Fleet | None =
         truth.require(recording.ids, recording.t)
     settings = {"sensors": asdict(recording.sensors), "v2x": asdict(recording.v2x)}
     words = {"ids": recording.ids, "notes": recording.notes, **settings}
-    arrays: dict[str, Any] = {name: np.asarray(getattr(recording, name)) for name in ARRAYS}
-    arrays |= {f"links_{name}": getattr(recording.links, name) for name in LINKS}
-    if recording.body is not None:
-        arrays |= {name: getattr(recording.body, name) for name in BODY}
+    arrays = _arrays(recording)
     if truth is not None:
         words["truth"] = {"name": truth.name, "source": truth.source, "licence": truth.licence}
         arrays |= {"truth_position": truth.position, "truth_velocity": truth.velocity}
@@ -84,7 +63,7 @@ def save_recording(recording: Recording, path: str | Path, truth: Fleet | None =
 
 
 def unpacked(path: Path) -> dict[str, AnyArray]:
-    """Arrays of an .npz file by name; what is damaged, or larger than `LARGEST`, raises one of `DAMAGES`."""
+    """Arrays of an .npz file by name; ValueError for more than `LARGEST` bytes, and what zipfile and NumPy raise."""
     with zipfile.ZipFile(path) as packed:
         if (size := sum(part.file_size for part in packed.infolist())) > LARGEST:
             raise ValueError("more than 2 GB unpacked (too many runs?)")
@@ -124,7 +103,7 @@ def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
     try:
         arrays = unpacked(path)
         return _recording(json.loads(str(arrays.pop(WORDS))), arrays)
-    except DAMAGES as error:
+    except Exception as error:  # of zipfile, zlib and NumPy: a damaged file meets them all
         found = said(error)
     raise InputError(path.name, found, "must be a recording in .npz", "Write it again with save_recording.")
 
@@ -138,13 +117,16 @@ def digest(recording: Recording) -> str:
     False
     """
     sha = hashlib.sha256(repr((recording.ids, recording.notes, recording.sensors, recording.v2x)).encode())
-    for name in ARRAYS:
-        sha.update(np.ascontiguousarray(getattr(recording, name)).tobytes())
-    for name in LINKS:
-        sha.update(np.ascontiguousarray(getattr(recording.links, name)).tobytes())
-    for name in BODY if recording.body is not None else ():
-        sha.update(np.ascontiguousarray(getattr(recording.body, name)).tobytes())
+    for array in _arrays(recording).values():
+        sha.update(array.tobytes())
     return sha.hexdigest()
+
+
+def _arrays(recording: Recording) -> dict[str, Any]:
+    """All arrays of a recording by their names in a file, in a fixed order."""
+    arrays = {name: np.asarray(getattr(recording, name)) for name in ARRAYS}
+    arrays |= {f"links_{name}": getattr(recording.links, name) for name in LINKS}
+    return arrays | ({} if recording.body is None else {name: getattr(recording.body, name) for name in BODY})
 
 
 def _recording(words: dict[str, Any], arrays: dict[str, Any]) -> tuple[Recording, Fleet | None]:

@@ -10,7 +10,6 @@ import numpy as np
 import pandas as pd
 
 from coopoc.arrays import Bools, Floats, Ints
-from coopoc.world.fleet import Fleet
 from coopoc.world.links import Links, spherical, wrap
 from coopoc.world.recording import Recording
 from coopoc.world.sensing import schedule
@@ -111,9 +110,8 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
     parts |= {name: getattr(recording, name)[:, kept] for name in ("relative", "arrival")}
     broadcasts = recording.broadcasts
     if not logged:
-        still = np.zeros((len(recording.t), len(recording.ids), 3))
         runs = runs if v2x.loss > 0 and recording.runs == 1 else recording.runs
-        broadcasts, arrival = schedule(Fleet(recording.ids, recording.t, still, still), fewer, v2x, runs, seed)
+        broadcasts, arrival = schedule(recording.ids, recording.t, fewer, v2x, runs, seed)
         parts["arrival"] = np.where(np.isin(fewer.neighbour, marks), -1, arrival)
         broadcasts = broadcasts & np.isfinite(recording.velocity[0, :, :, 0])
         broadcasts[..., marks] = False

@@ -59,7 +59,7 @@ READERS: Mapping[str, Reader] = {
     "csv resampled": Reader({"a.csv": good.TABLE}, lambda d: load_fleet(d / "a.csv", dt=0.1)),
     "fcd": Reader({"a.xml": good.FCD}, lambda d: load_fleet(d / "a.xml")),
     "tum": Reader({"a.tum": good.TUM}, lambda d: load_fleet(d / "a.tum")),
-    "tum poses": Reader({"a.tum": good.TUM}, lambda d: read_tum(d / "a.tum", repeats="drop")),
+    "tum poses": Reader({"a.tum": good.TUM}, lambda d: read_tum(d / "a.tum")),
     "kitti": Reader({"a.txt": good.KITTI}, lambda d: read_kitti(d / "a.txt")),
     "g2o": Reader({"a.g2o": good.G2O}, lambda d: read_graph(d / "a.g2o")),
     "pyfg": Reader({"a.pyfg": good.PYFG}, lambda d: read_graph(d / "a.pyfg")),
