@@ -135,6 +135,10 @@ def test_curves_draw_numbers_of_their_selections(results: Results) -> None:
     np.testing.assert_allclose(joint.get_ydata(), expected.to_numpy())
     assert level.get_ydata()[0] == pytest.approx(results.select(GNSS)["rt_le_m"].mean())
     assert figures.curves(results, [panel], [{"method": "okf"}], "c") is None
+    mine, alike = {"method": "kalman", "label": "mine"}, [LINES[0], dict(LINES[0])]
+    both = figures.curves(results, [panel], [*alike, mine], "c")
+    assert both is not None
+    assert [text.get_text() for text in both.figure.axes[0].get_legend().get_texts()][1:] == ["mine"]
 
 
 def from_reference(file: Path) -> Results:

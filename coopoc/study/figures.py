@@ -132,6 +132,7 @@ def curves(
     """
     every, shown = [*lines, *levels], []
     models = {str(of.get("noise_model")) for of in every if of.get("method") != "bound"} - {"none", "trained"}
+    labelled = any("label" in of for of in every)
     for panel in panels:
         drawn: list[tuple[Where, Any]] = []
         for of in lines:
@@ -156,8 +157,8 @@ def curves(
                     names["noise_model"] = "none"
                 text = _joined(groups[id(of)], models)
                 style = {name: of[name] for name in STYLE if name in of}
-                if "label" in of or len(groups[id(of)]) > 1:
-                    style["label"] = text if "label" in of else f"_{text}"
+                if labelled or len(groups[id(of)]) > 1:
+                    style["label"] = text if labelled else f"_{text}"
                 _draw(axis, names, points, style)
                 named += [names] if names not in named else []
                 also[name_of(names)] = text.removeprefix(_joined([of]))
@@ -174,7 +175,7 @@ def curves(
             plain_log(axes[0].yaxis)
         else:
             axes[0].set_ylim(0)
-        if any("label" in of for of in every):
+        if labelled:
             axes[-1].legend(loc="upper left", bbox_to_anchor=(1.02, 1.0), borderaxespad=0)
         else:
             legend(axes[-1], named, also)
