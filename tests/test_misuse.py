@@ -272,6 +272,10 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
         {"nodes": ("a", "b"), "z": 10.0, "std": 1.0, "x0": np.array([[0.0, 0, 0], [9, 0, 1]])},
     ),
     "solve": (lambda **given: co.solve(**given).x, {"problem": PROBLEM, "backend": "gauss-newton"}),
+    "incremental": (
+        lambda **given: co.incremental(**given)[0],
+        {"problem": PROBLEM, "relinearizeThreshold": 0.1, "relinearizeSkip": 1, "wildfireThreshold": 1e-3, "lag": 2},
+    ),
     "pose": (co.pose, {"position": np.zeros((4, 2)), "turn": np.full(4, 0.7)}),
 }
 """Every public callable, and arguments that are right."""
