@@ -209,8 +209,8 @@ def read_log(
         summary.assume("origin= has no effect: no fix is in degrees")
     rows, true_rows = rows[rows["true"] == 0], rows[rows["true"] == 1]
     rows, origin = local(on_one_clock(rows, clock), origin)
-    given = factors(std, KINDS.keys() - {"message"}, "std")
-    stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * std for kind, std in given.items()}
+    deviations = factors(std, KINDS.keys() - {"message"}, "std")
+    stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * each for kind, each in deviations.items()}
     rows = distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary)
     if not any_scale:
         _check_scale(rows, path.name)
