@@ -134,9 +134,9 @@ def test_rejecting_a_quarter_is_doubtful() -> None:
 
 def test_small_drives_end_as_low_as_restarts_or_say_so() -> None:
     """Descents from random starts: benchmarks/unseen_graphs.py has fifty."""
-    for seed in (1002, 1018):
+    for seed, most in ((1002, 40.0), (1018, 40.0), (5008, 32.1)):
         found = solve(from_graph(ranged_drives(seed)), throw=False)
-        assert found.cost < 40 or found.notes
+        assert found.cost < most or found.notes
 
 
 def test_a_walk_counts_beyond_what_32_bits_hold() -> None:

@@ -19,8 +19,9 @@ SUBSETS = 60
 """Of the ranges of a point, whose spheres are cut."""
 TRIED = 32
 """Moves that are followed by descents, of few bodies and the most promising first."""
-NEAR = 10.0
-"""Cost, and as many times the cost of its ranges, that a move may add before the others have given way."""
+NEAR, TRY = 10.0, 100.0
+"""Cost, and as many times the cost of its ranges, that a move may add before the others have given way, to be a doubt
+and to be tried."""
 ROUNDS = 15
 """Of moves, of which three are usual."""
 SAME = 1e-6
@@ -170,7 +171,7 @@ def _moves(problem: Problem, seen: Ranges, x: Floats, single: list[Move]) -> Ite
             if (move := _elsewhere(problem, seen, y, body)) is not None and move[0] < 0:
                 y[body] = move[1]
         yield y
-    near = [move for move in single if move[0] <= NEAR * (1.0 + len(seen.nodes) / len(x))][:TRIED]
+    near = [move for move in single if move[0] <= TRY * (1.0 + len(seen.nodes) / len(x))][:TRIED]
     together = (chosen for size in range(1, len(near) + 1) for chosen in combinations(near, size))
     for chosen in islice(together, TRIED):
         y = x.copy()
