@@ -93,13 +93,6 @@ def at(values: Floats, run: int, t: int, n: int) -> Floats:
     return row
 
 
-@compiled
-def copy(source: Floats, target: Floats, count: int) -> None:
-    """The first numbers of a flat array: a slice would compile the text of its errors as well."""
-    for k in range(count):
-        target[k] = source[k]
-
-
 @part
 def correct(x: Floats, cov: Floats, run: int, t: int, n: int, measured: Measured, assumed: Assumed) -> None:
     """One Kalman step of vehicle n alone, in place: x += dt u, P += Q, then one update per axis that was measured.
