@@ -24,13 +24,22 @@ from coopoc.world.links import wrap
 ROUNDS, STEPS, RUNS = 5, 101, 10
 NEIGHBOURS = {0: 3, 10: 1}
 """K -> runs that filterpy follows."""
-SENSORS = co.Sensors(heading_std=0.05, yaw_rate_std=0.02, range_std=0.5, azimuth_std=0.03, inclination_std=0.03)
+SENSORS = co.Sensors(
+    velocity_std_ratio=1e-6,
+    velocity_floor=0.5,
+    heading_std=0.05,
+    yaw_rate_std=0.02,
+    range_std=0.5,
+    azimuth_std=0.03,
+    inclination_std=0.03,
+)
+"""The noise of velocities is the same at any speed: ours follows past ones, filterpy here the step's own."""
 FLAT, UNKNOWN = 1e6, np.pi**2 / 3
 
 
 def ours(recording: co.Recording) -> Callable[[], Any]:
     """The kernel over all runs; poses (R, T, 4) of the ego."""
-    method, members = co.PoseFilter(exact=False, robust=False), list(range(len(recording.ids)))
+    method, members = co.PoseFilter(exact=False, robust=False, lasting=False), list(range(len(recording.ids)))
     begin, links = first_poses(recording, None, members), np.arange(len(recording.links))
     return lambda: method.run_filter(recording, members, links, begin)[0][:, :, 0]
 
