@@ -1,4 +1,4 @@
-"""The command line: coopoc run, compare, table, report, list, and the commands of installed distributions."""
+"""The command line: coopoc run, table, report, list, and the commands of installed distributions."""
 
 from __future__ import annotations
 
@@ -103,32 +103,6 @@ def run(
     return int(results.failed > 0)
 
 
-def compare(
-    run_a: Annotated[Positional[Path], arg(metavar="RUN_A")],
-    run_b: Annotated[Positional[Path], arg(metavar="RUN_B")],
-    /,
-    value: Metric = "rt_le_m",
-    by: Annotated[tuple[str, ...], arg(metavar="COLUMN ...")] = (),
-    where: Chosen = (),
-    format: Format = "markdown",
-) -> None:
-    """Show the changes beyond noise between two runs of one study.
-
-    Example: coopoc compare before/neighbours after/neighbours --where method=okf,kalman
-
-    Args:
-        run_a: folder of a study.
-        run_b: folder of the same study, run with other code or settings.
-        value: metric to compare.
-        by: columns that identify a row in addition to the parameters, such as round.
-        where: compare only the rows with these values.
-        format: format of the table.
-    """
-    from .study.compare import compare as compare_runs
-
-    print(compare_runs(run_a, run_b, value, by, where).render(format).rstrip("\n"))
-
-
 def table(
     folder: Annotated[Positional[Path], arg(metavar="FOLDER")],
     /,
@@ -160,8 +134,7 @@ def table(
         print("\n\n".join(text.rstrip("\n") for text in tables(folder, format, name)))
         return
     results = Results.load(folder)
-    chosen = {name: list(values) for name, values in parsed([results.frame], where).items()}
-    print(pivot(results, rows, columns, value, chosen).render(format).rstrip("\n"))
+    print(pivot(results, rows, columns, value, parsed(results.frame, where)).render(format).rstrip("\n"))
 
 
 def report(
@@ -200,7 +173,6 @@ def list_names() -> None:
 
 OWN: Mapping[str, Command] = {
     "run": run,
-    "compare": compare,
     "table": table,
     "report": report,
     "list": list_names,

@@ -52,7 +52,7 @@ def test_help_a_list_and_a_mistake_load_nothing_heavy_and_show_what_others_add(t
     assert re.search(r"run +Run a study", own.stdout)
 
 
-NAMES = ("run", "compare", "table", "report", "list", "reference", "greet")
+NAMES = ("run", "table", "report", "list", "reference", "greet")
 MISTAKES = (
     ("run smal", "study = 'smal': must be one of"),
     ("rn", "command = 'rn': must be one of"),
@@ -64,7 +64,7 @@ MISTAKES = (
     ("run small --set rums=3", "Did you mean runs?"),
     ("run small --jobs 0", "jobs = 0: must be >= 1"),
     ("run small --shard 4/3", "shard = '4/3': must be i/n with 1 <= i <= n"),
-    ("compare nowhere nowhere", "folder = nowhere: holds no manifest.json"),
+    ("reference nowhere", "folder = nowhere: holds no manifest.json"),
     ("table nowhere", "folder = nowhere: holds no views yet"),
     ("report", "folders = none"),
 )

@@ -51,7 +51,7 @@ def results(tmp_path: Path) -> Results:
 
 
 def verdicts(now: Results, known: Reference) -> dict[tuple[float, str], str]:
-    return {(c.at["x"], c.metric): c.verdict for c in check(now, known)}
+    return {(c.was.where["x"], c.was.metric): c.verdict for c in check(now, known)}
 
 
 def changed(tmp_path: Path, **settings: float) -> Results:

@@ -111,9 +111,9 @@ def test_a_metric_that_a_method_does_not_have_is_no_failure(frame: pd.DataFrame)
 
 def test_selection_from_text(frame: pd.DataFrame) -> None:
     found = results(frame)
-    assert parsed([found.frame], ["k=0,4", "method=gnss"]) == {"k": (0, 4), "method": ("gnss",)}
+    assert parsed(found.frame, ["k=0,4", "method=gnss"]) == {"k": [0, 4], "method": ["gnss"]}
     with refused("k = 'x': must be a whole number"):
-        parsed([found.frame], ["k=x"])
+        parsed(found.frame, ["k=x"])
 
 
 def test_parquet_holds_every_digit(frame: pd.DataFrame, tmp_path: Any) -> None:

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, TypeAlias
 
 import numpy as np
+import pandas as pd
 from tyro.conf import Positional, arg
 
 from ..errors import InputError
@@ -17,10 +19,13 @@ from ..evaluate.statistics import Interval
 from ..file_names import given_path
 from ..plugins import names
 from . import store
-from .compare import Change, Direction, change_table, plain
 from .results import SEED, Results, ego_by_run
 from .study import Params, find_study
-from .tables import Table
+from .style import label, words
+from .tables import Entry, Table
+
+Direction: TypeAlias = str | float
+"""Of a metric: "lower" or "higher" is better, or the value that is best."""
 
 TOLERANCE, TRAINED = 0.01, 0.05
 """Share of a number by which it may move: draws are paired, but libraries differ in their last digits, and nets are
@@ -67,6 +72,36 @@ class Number:
     def key(self) -> tuple[str, str]:
         """Identifies the number in another set."""
         return json.dumps(dict(self.where), sort_keys=True, default=str), self.metric
+
+
+@dataclass(frozen=True)
+class Change:
+    """A reference number and the same number now.
+
+    Args:
+        was: the reference.
+        now: its value now.
+        difference: now less the reference, with what its tolerance and the noise of other runs allow.
+    """
+
+    was: Number
+    now: float
+    difference: Interval
+
+    @property
+    def verdict(self) -> str:
+        """within noise, better or worse.
+
+        >>> was = Number({}, "rt_le_m", 1.0, 3, 0.0, 0.01, "lower")
+        >>> Change(was, 1.2, Interval(0.2, 0.19, 0.21, 3)).verdict
+        'worse'
+        """
+        if self.difference.low <= 0 <= self.difference.high:
+            return "within noise"
+        better = self.was.better
+        if isinstance(better, str):
+            return "better" if (self.difference.mean > 0) == (better == "higher") else "worse"
+        return "better" if abs(self.now - better) < abs(self.was.value - better) else "worse"
 
 
 @dataclass(frozen=True)
@@ -144,7 +179,7 @@ def _change(was: Number, now: Number) -> Change:
     allowed = float(was.tolerance * abs(was.value) + noise)
     moved = now.value - was.value
     interval = Interval(moved, moved - allowed, moved + allowed, now.runs)
-    return Change(was.where, was.metric, was.value, now.value, interval, was.better)
+    return Change(was, now.value, interval)
 
 
 def table(changes: Sequence[Change], everything: bool = False) -> Table:
@@ -158,8 +193,14 @@ def table(changes: Sequence[Change], everything: bool = False) -> Table:
     moved = [f"; {counts[word]} {word}" for word in ("worse", "better") if counts[word]]
     text = f"{counts['within noise']} of {len(changes)} reference numbers hold{''.join(moved)}."
     shown = [change for change in changes if everything or change.verdict != "within noise"]
-    columns = [*dict.fromkeys(name for change in shown for name in change.at), "metric"]
-    return change_table(shown, ("Reference", "Now"), text, columns, 4)
+    names = [*dict.fromkeys(name for change in shown for name in change.was.where), "metric"]
+    header = (*map(words, names), "Reference", "Now", "Now - Reference", "Change")
+    rows: list[tuple[Entry, ...]] = []
+    for change in shown:
+        at = {"metric": change.was.metric, **change.was.where}
+        labels = (label(name, at.get(name)) for name in names)
+        rows.append((*labels, change.was.value, change.now, change.difference, change.verdict))
+    return Table(header, tuple(rows), text, decimals=4)
 
 
 def reference(
@@ -202,3 +243,11 @@ def reference(
     shown = table(changes, everything=all)
     print(shown.to_markdown() if shown.rows else shown.caption)
     return int(any(change.verdict == "worse" for change in changes))
+
+
+def plain(value: Any) -> Any:
+    """A parameter as JSON has it: Python's own number, None for NaN, a list for a tuple."""
+    value = value.item() if isinstance(value, np.generic) else value
+    if value is pd.NA or (isinstance(value, float) and math.isnan(value)):
+        return None
+    return list(value) if isinstance(value, tuple) else value

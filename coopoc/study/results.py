@@ -155,18 +155,17 @@ class Results:
                 raise InputError(axis, mixed, "would be averaged together", f"Name {axis} in where, rows or columns.")
 
 
-def parsed(frames: Sequence[pd.DataFrame], texts: Sequence[str]) -> dict[str, tuple[Any, ...]]:
-    """["method=okf,kalman"] as column -> values, read as the type of the column in the first frame that has it.
+def parsed(frame: pd.DataFrame, texts: Sequence[str]) -> dict[str, list[Any]]:
+    """["method=okf,kalman"] as column -> values of the column's type.
 
     Raises:
-        InputError: a column that no frame has, or a value of another type.
+        InputError: an unknown column, or a value of another type.
     """
     chosen = {}
     for name, text in assignments(texts).items():
-        columns = [frame[name].dropna() for frame in frames if name in frame]
-        if not columns:
-            raise unknown("column", name, [column for frame in frames for column in frame.columns])
-        chosen[name] = parse(name, text, tuple(pd.concat(columns).iloc[:1].tolist()))
+        if name not in frame:
+            raise unknown("column", name, frame.columns)
+        chosen[name] = list(parse(name, text, tuple(frame[name].dropna().iloc[:1].tolist())))
     return chosen
 
 
