@@ -42,8 +42,8 @@ class CentralFilter(Checked):
     Gauss-Newton step, at one solution a step. Cost O(n^3) of the n vehicles of a connected component, over others or at
     earlier steps: between components, covariances are zero.
 
-    A relative measurement reaches the centre if a message gets through between the two vehicles, either way. Bytes are
-    those of the way to the centre and back.
+    A reference for what cooperation may reach: a relative measurement counts at its step if a message gets through
+    between the two vehicles, either way, however late. Bytes are those of the way to the centre and back.
 
     Args:
         noise_model: "identity", "nominal" or a NoiseModel.
@@ -67,7 +67,7 @@ class CentralFilter(Checked):
             x, cov = np.empty(measured.gnss.shape), np.empty((*measured.gnss.shape, 3))
             for run in progress_bar(range(len(x)), desc=self.name, unit="run", delay=2.0):
                 x[run], cov[run] = run_filter(measured, pairs, assumed, run)
-            return Answer(x, cov, True, notes)
+            return Answer(x, cov, notes)
 
         relative = check_recording(recording).relative[0]
         alone = np.isnan(relative[:, 0]) & np.isfinite(relative[:, 1])
@@ -120,7 +120,7 @@ class BatchSmoother(Checked):
                 there = measured.active[run]
                 x[run, there], cov[run, there] = found.x, found.covariance
             note = (f"{lost} of {len(x)} runs did not end at a minimum",) if lost else ()
-            return Answer(x, cov, False, (NOT_CAUSAL, CENTRE, *note))
+            return Answer(x, cov, (NOT_CAUSAL, CENTRE, *note))
 
         return fleet_track(self, self.noise_model, self.robust, recording, egos, solve_all)
 

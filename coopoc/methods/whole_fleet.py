@@ -1,4 +1,4 @@
-"""Methods of a centre that has the whole fleet: arguments of their kernels, delayed fusion, bytes, the Track."""
+"""Methods of a centre that has the whole fleet: arguments of their kernels, bytes, the Track."""
 
 from __future__ import annotations
 
@@ -25,7 +25,8 @@ UPLOAD = Message("fix, velocity and relative measurements", 8, per_neighbour=4)
 DOWNLOAD = Message("estimate and covariance", 11)
 """From the centre: position (3), covariance (6), id and time (2)."""
 CENTRE = (
-    "needs a centre that every vehicle reaches; loss and delay act on relative measurements only, a byte cap on neither"
+    "needs a centre that every vehicle reaches, at once: loss acts on relative measurements only, delay and a byte cap "
+    "on nothing"
 )
 
 
@@ -38,15 +39,13 @@ class Answer(NamedTuple):
     """Estimates of the fleet at each step.
 
     Attributes:
-        x: (R, T, N, 3) m of all vehicles, of any shape.
-        covariance: (R, T, N, 3, 3) m^2, of any shape.
-        late: whether an answer waits for the messages of all vehicles that pairs connect.
+        x: (R, T, N, 3) m of all vehicles.
+        covariance: (R, T, N, 3, 3) m^2.
         notes: of the Track.
     """
 
     x: Floats
     covariance: Floats
-    late: bool
     notes: tuple[str, ...] = ()
 
 
@@ -79,27 +78,13 @@ def fleet_track(
         InputError: an ego that is unknown, absent at times or without a fix at first; a recording that not all vehicles
             observed.
     """
-    from ..kernels.fleets.graph import fuse_delayed, latest_available
-
     began = clock()
     columns = check_recording(recording).columns(egos)
     model = resolve(noise_model, recording)
     met = exchange(recording)
     measured, pairs, assumed = kernel_arguments(recording, met, model, robust)
     answer = solve(measured, pairs, assumed, model)
-    shape = (recording.runs, len(recording.t), len(columns))
-    x = answer.x.reshape(recording.gnss.shape).take(columns, axis=2)
-    cov = answer.covariance.reshape(*recording.gnss.shape[:3], 9).take(columns, axis=2)
-    if answer.late and (met.arrival > met.step).any():
-        arrival = np.where(pairs.alive, met.arrival, -1)
-        latest = latest_available(pairs, arrival, len(recording.ids)).take(columns, axis=2)
-        own = measured._replace(gnss=measured.gnss.take(columns, 2), velocity=measured.velocity.take(columns, 2))
-        process, fix = (
-            values.take(columns, 2) if values.shape[2] > 1 else values for values in (assumed.process, assumed.fix)
-        )
-        assumed = assumed._replace(process=process, fix=fix)
-        x, cov = fuse_delayed(latest, x.reshape(*shape[:2], -1), cov.reshape(*shape[:2], -1), own, assumed)
-    x, cov = x.reshape(*shape, 3), cov.reshape(*shape, 3, 3)
+    x, cov = answer.x.take(columns, axis=2), answer.covariance.take(columns, axis=2)
     moved = centre(recording, method.message)
     return Track(
         recording.t,

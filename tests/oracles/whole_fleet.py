@@ -1,4 +1,4 @@
-"""What the oracles of whole-fleet methods share, from the equations: rows of measurements, solo steps, late answers."""
+"""What the oracles of whole-fleet methods share, from the equations: who is there, pairs, rows of measurements."""
 
 import numpy as np
 
@@ -55,38 +55,6 @@ class Drive:
         shift = np.linalg.solve(np.eye(3) + cov @ W, cov @ eta)
         W, eta = self.factor(k, vector + shift, False)
         return W, eta + W @ shift
-
-    def solo(self, t, n, x, P):  # type: ignore[no-untyped-def]
-        """One step of the textbook Kalman filter; an axis without a fix is predicted only."""
-        x, P = x + self.dt * self.velocity[t, n], P + np.diag(self.q[t, n])
-        H = np.eye(3)[np.isfinite(self.gnss[t, n])]
-        if len(H):
-            K = P @ H.T @ np.linalg.inv(H @ P @ H.T + H @ np.diag(self.r[t, n]) @ H.T)
-            x, P = x + K @ (self.gnss[t, n][np.isfinite(self.gnss[t, n])] - H @ x), P - K @ H @ P
-        return x, P
-
-    def start(self, t, n):  # type: ignore[no-untyped-def]
-        return self.gnss[t, n].copy(), np.diag(self.r[t, n])
-
-    def late(self, x, P, n, rounds):  # type: ignore[no-untyped-def]
-        """What vehicle n believes at each step: the answer whose messages have arrived, and its own steps since."""
-        ready, when = np.zeros(self.vehicles, dtype=int), []
-        for t in range(self.steps):
-            ready = np.maximum(ready, t)
-            for _ in range(rounds):
-                before = ready.copy()
-                for k, i, j in self.pairs(t):
-                    ready[[i, j]] = np.maximum(ready[[i, j]], max(self.arrival[k], before[i], before[j]))
-            when.append(ready[n])
-        out = []
-        for t in range(self.steps):
-            held = [s for s in range(t + 1) if when[s] <= t]
-            s = held[-1] if held else 0
-            estimate = (x[s, n], P[s, n]) if held else self.start(0, n)
-            for u in range(s + 1, t + 1):
-                estimate = self.solo(u, n, *estimate)
-            out.append(estimate)
-        return np.array([a for a, _ in out]), np.array([b for _, b in out])
 
 
 def rows(vector, measured, sensors, converted):  # type: ignore[no-untyped-def]

@@ -1,6 +1,6 @@
-"""Measurement graph of a whole fleet: each vehicle's own filter, information of pairs, components, delayed fusion.
+"""Measurement graph of a whole fleet: what is measured and assumed, information of pairs, components.
 
-The methods of `coopoc.methods.whole_fleet` share it. A vector is a tuple of 3 numbers, a matrix one of 9
+A vector is a tuple of 3 numbers, a matrix one of 9
 (`coopoc.kernels.compiling.small`). A fix, a range or an angle that is missing (NaN) is no factor.
 """
 
@@ -9,11 +9,9 @@ from __future__ import annotations
 import math
 from typing import NamedTuple
 
-import numpy as np
-
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part, storage
-from ..compiling.small import add, add_diagonal, apply, load, plus_applied, scale, store, subtract
+from ..compiling.small import add, add_diagonal, apply, load, plus_applied, scale, subtract
 from ..gate import FIX_GATE, distance, inflation
 from ..geometry import Numbers, completed, direction, exact, information, with_std
 from ..geometry import vector as to_vector
@@ -91,44 +89,6 @@ def at(values: Floats, run: int, t: int, n: int) -> Floats:
     """Row (3,) of an array that is broadcastable to (R, T, N, 3)."""
     row: Floats = values[min(run, values.shape[0] - 1), min(t, values.shape[1] - 1), min(n, values.shape[2] - 1)]
     return row
-
-
-@part
-def correct(x: Floats, cov: Floats, run: int, t: int, n: int, measured: Measured, assumed: Assumed) -> None:
-    """One Kalman step of vehicle n alone, in place: x += dt u, P += Q, then one update per axis that was measured.
-
-    Args:
-        x: (3 N) m.
-        cov: (9 N) m^2.
-        run: of the measurements.
-        t: step.
-        n: column.
-        measured: what the fleet measured.
-        assumed: the noise model.
-    """
-    u, z, a, b = measured.velocity[run, t, n], measured.gnss[run, t, n], 3 * n, 9 * n
-    q, r = at(assumed.process, run, t, n), at(assumed.fix, run, t, n)
-    for c in range(3):
-        x[a + c] += measured.dt * u[c]
-        cov[b + 4 * c] += q[c]
-    for c in range(3):
-        if not math.isnan(z[c]):
-            row, innovation = load(cov, 3 * n + c, VECTOR), z[c] - x[a + c]
-            total = row[c] + r[c]
-            for i in range(3):
-                gain = row[i] / total
-                x[a + i] += gain * innovation
-                for j in range(3):
-                    cov[b + 3 * i + j] -= gain * row[j]
-
-
-@part
-def begin_at_fix(x: Floats, cov: Floats, run: int, t: int, n: int, measured: Measured, assumed: Assumed) -> None:
-    """Vehicle n stands at its fix, with the covariance of that."""
-    r = at(assumed.fix, run, t, n)
-    store(cov, n, MATRIX)
-    for c in range(3):
-        x[3 * n + c], cov[9 * n + 4 * c] = measured.gnss[run, t, n, c], r[c]
 
 
 @compiled
@@ -231,74 +191,3 @@ def connect(label: Ints, first: int, second: int) -> None:
     for n in range(len(label)):
         if label[n] == old:
             label[n] = label[first]
-
-
-@compiled
-def latest_available(pairs: Pairs, arrival: Ints, vehicles: int) -> Ints:
-    """(R, T, N) latest step whose result is available to a vehicle at each step, -1 for none.
-
-    A result is available when those of all vehicles that contribute to it are, and the messages between them have
-    arrived: of the vehicles in contact, of those in contact with these, and so on.
-
-    Args:
-        pairs: whose `alive` is not read.
-        arrival: (R, P) step at which a pair's messages have arrived, -1 if it takes no part.
-        vehicles: N.
-    """
-    runs, steps = len(arrival), len(pairs.start) - 1
-    latest = np.full((runs, steps, vehicles), -1)
-    for run in range(runs):
-        ready = np.zeros(vehicles, np.int64)
-        for t in range(steps):
-            ready = np.maximum(ready, t)
-            changed = True
-            while changed:
-                changed = False
-                for k in range(pairs.start[t], pairs.start[t + 1]):
-                    i, j = pairs.first[k], pairs.second[k]
-                    if arrival[run, k] >= 0:
-                        late = max(arrival[run, k], ready[i], ready[j])
-                        changed = changed or ready[i] < late or ready[j] < late
-                        ready[i] = ready[j] = late
-            for n in range(vehicles):
-                if ready[n] < steps:
-                    latest[run, ready[n], n] = t
-        for t in range(1, steps):
-            latest[run, t] = np.maximum(latest[run, t], latest[run, t - 1])
-    return latest
-
-
-@compiled
-def fuse_delayed(latest: Ints, x: Floats, cov: Floats, measured: Measured, assumed: Assumed) -> tuple[Floats, Floats]:
-    """Delayed fusion: the latest result available to each vehicle, and its own filter since that step.
-
-    Without a result the vehicle's own filter runs from its first fix: own measurements are never late.
-
-    Args:
-        latest: (R, T, N) as `latest_available` returns.
-        x: (R, T, 3 N) m, the result of each step.
-        cov: (R, T, 9 N) m^2.
-        measured: what these vehicles measured; they are present throughout.
-        assumed: the noise model.
-
-    Returns:
-        Positions (R, T, 3 N) m and covariances (R, T, 9 N) m^2.
-    """
-    now, covariance = np.empty_like(x), np.zeros_like(cov)
-    for run in range(x.shape[0]):
-        for t in range(x.shape[1]):
-            for n in range(latest.shape[2]):
-                step, last = latest[run, t, n], t - 1
-                if step < 0 and t == 0:
-                    begin_at_fix(now[run, 0], covariance[run, 0], run, 0, n, measured, assumed)
-                    continue
-                if step >= 0 and (t == 0 or step > latest[run, t - 1, n]):
-                    last = step
-                    store(now[run, t], n, load(x[run, step], n, VECTOR))
-                    store(covariance[run, t], n, load(cov[run, step], n, MATRIX))
-                else:
-                    store(now[run, t], n, load(now[run, t - 1], n, VECTOR))
-                    store(covariance[run, t], n, load(covariance[run, t - 1], n, MATRIX))
-                for u in range(last + 1, t + 1):
-                    correct(now[run, t], covariance[run, t], run, u, n, measured, assumed)
-    return now, covariance
