@@ -14,11 +14,13 @@ from ..gate import SLIP, count, inflation
 from .cooperative_members import stand, steady
 from .cooperative_state import (
     AGE,
+    ALIKE,
     CLOCK,
     COUNT,
     FIXES,
     INPUT,
     LAST,
+    LASTING,
     LEVEL,
     LOCKED,
     MEAN,
@@ -31,6 +33,9 @@ from .cooperative_state import (
     REVOKE,
     REVOKED,
     SHARE,
+    SLIGHT,
+    SLIGHTLY,
+    SLIGHTS,
     SLIPS,
     SOLO,
     SOLO_VARIANCE,
@@ -72,7 +77,7 @@ from .gaussian import (
     update,
 )
 from .messages import block_at, three_of, vector_at
-from .otherwise import drive, hold, learn_fix, score, turned
+from .otherwise import drive, learn_fix, score, turned
 
 FADES = 5.0
 """s, after which a fix weighs 1 / e in the mean that is sent."""
@@ -252,6 +257,7 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
     if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong_on_average(f, model, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
+            slighted(f, j)
         doubt(f, model, j)
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
             fix_terms(f, 0)
@@ -268,11 +274,10 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
     quiet = math.exp(-min(f.ego[LEVEL + (FIXES if k == 0 else MESSAGES)], 0.0))
     q *= (own + noise) / (own + quiet * noise)  # fixes that agree better than is assumed are as wrong as any, together
     if model.fix_gate > 0.0:
-        share = 1.0 / inflation(q, model.fix_gate, f.member[k, LOCKED])
+        share = 1.0 / inflation(q, model.fix_gate, 0.0 if judged else f.member[k, LOCKED])
         f.member[k, LOCKED] = count(q, model.fix_gate, f.member[k, LOCKED], own / (own + noise))
     score(f, h, FIX_SCORE, True)
     correct(g, h, share)
-    hold(f, share)
     return share
 
 
@@ -283,6 +288,26 @@ def members(f: Filter) -> int:
     for k in range(1, len(f.who)):
         count += f.who[k, VEHICLE] >= 0
     return count
+
+
+@part
+def slighted(f: Filter, j: int) -> None:
+    """Where two thirds of the receivers, three at least, have lost trust for small errors, each in a direction of its
+    own, errors of fixes last: what a mean innovation may have without a false receiver."""
+    x, y, z = vector_at(f.status[j], MEAN // 3)
+    square, n, ego, count, lost = x * x + y * y + z * z, SLIGHTS, f.ego, 0, 0
+    if square > SLIGHT**2 or ego[LASTING] > 0.0:
+        return
+    f.status[j, SLIGHTLY] += 1.0
+    for i, more in enumerate((1.0, square, x, y, z)):
+        ego[n + i] += more
+    for k in range(len(f.who)):
+        other = f.who[k, VEHICLE]
+        if other >= 0 and (k == 0 or f.status[other, USED] > -math.inf):
+            count, lost = count + 1, lost + (f.status[other, SLIGHTLY] > 0.0)
+    alike = (ego[n + 2] ** 2 + ego[n + 3] ** 2 + ego[n + 4] ** 2) / (ego[n] * ego[n + 1])
+    if lost >= 3 and 3 * lost >= 2 * count and alike < ALIKE:
+        ego[LASTING] = ego[n + 1] / (3.0 * ego[n])
 
 
 @inside
@@ -297,7 +322,7 @@ def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
     for c in range(3):
         status[MEAN + c] += (clip * h.three[GAP + c] - status[MEAN + c]) / count
     mean, (p, q, r) = vector_at(status, MEAN // 3), vector_at(h.three, VARIANCE // 3)
-    more = 1.0 if model.own > 0.0 else 0.0
+    more = f.ego[LASTING] + (1.0 if model.own > 0.0 else 0.0)
     s = add_diagonal(block_at(h.matrix, COV // 9), (p / count + more, q / count + more, r / count + more))
     odds = math.log((1.0 - SHARE) / SHARE)
     near, narrow = distance(s, mean)
@@ -315,7 +340,7 @@ def trust(f: Filter, model: Model) -> None:
     The odds p(b = 0 | all) / p(b = 0) of a Gaussian b are by Bayes' rule those of the two hypotheses.
     """
     g, h = f.g, f.h
-    wide, narrow, unit = TAU**2 + model.own, 0.0, TAU**2
+    wide, narrow, unit = TAU**2 + model.own, f.ego[LASTING], TAU**2 + f.ego[LASTING]
     if model.own > 0.0:
         narrow = 1.0 / (1.0 / model.own - 1.0 / wide)
         unit = wide / model.own * narrow
@@ -330,8 +355,8 @@ def trust(f: Filter, model: Model) -> None:
                 for d in range(3):
                     h.matrix[SQUARE + 3 * c + d] = g.p[first + c, first + d] + (narrow if c == d else 0.0)
             q, det = distance(block_at(h.matrix, SQUARE // 9), vector_at(g.x, first // 3))
-            odds = math.log((1.0 - SHARE) / SHARE) - PENALTY * f.status[j, REVOKED]
-            odds += 0.5 * math.log(unit**3 / det) - 0.5 * q
+            odds = math.log((1.0 - SHARE) / SHARE) + 0.5 * math.log(unit**3 / det) - 0.5 * q
+            odds -= PENALTY * f.status[j, REVOKED] if f.ego[LASTING] == 0.0 else 0.0
             if odds > most:
                 best, most = k, odds
         if best < 0:
