@@ -37,6 +37,7 @@ from .cooperative_state import (
     FIXES,
     INFORMATION,
     KINDS_OF_NUMBERS,
+    LASTING,
     LEVEL,
     MADE,
     MOTION,
@@ -71,9 +72,9 @@ from .gaussian import (
     shift,
 )
 
-HEADING, SCALE, OF_COMPASS, OF_RANGE, SLIPS, LEVELS = range(6)
-"""Places in TOLD: the ego's errors, rad, 1, rad, m, whether it slips, and the factors of standard
-deviations."""
+HEADING, SCALE, OF_COMPASS, OF_RANGE, SLIPS, OF_FIXES, LEVELS = range(7)
+"""Places in TOLD: the ego's errors, rad, 1, rad, m, whether it slips, what errors of all fixes that last are like, m,
+and the factors of standard deviations."""
 
 
 @part
@@ -146,7 +147,7 @@ def average(f: Filter, model: Model) -> None:
         i = own + kind - 2
         there = n > own if kind >= 2 else own > 3
         f.ego[TOLD + kind] = few[i, where - 1] if there else 0.0
-    f.ego[TOLD + SLIPS] = f.ego[SLIPPED]
+    f.ego[TOLD + SLIPS], f.ego[TOLD + OF_FIXES] = f.ego[SLIPPED], math.sqrt(f.ego[LASTING])
     for kind in range(KINDS_OF_NUMBERS):
         f.ego[TOLD + LEVELS + kind] = math.exp(0.5 * f.ego[LEVEL + kind])
 
