@@ -46,8 +46,8 @@ from .gaussian import ABSENT, COMMON, ERROR, KINDS, PLACE, has, insert, remove, 
 from .messages import vector_at
 from .otherwise import drive, slip_variance
 
-IMPLAUSIBLE = 16.0
-"""Gates of fixes beyond which a change of velocity is no vehicle's: odometers may be four times worse than assumed."""
+IMPLAUSIBLE = 4.0
+"""Gates of fixes beyond which a change of velocity is no vehicle's: odometers may be worse than assumed."""
 
 
 @inside
