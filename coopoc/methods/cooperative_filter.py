@@ -31,10 +31,9 @@ FOUND = {
     "compass error": "rad",
     "range offset": "m",
     "slips": "of the steps",
-    "drift of fixes": "m",
 }
 LEVELS = ("range", "azimuth", "inclination", "fix", "motion", "message")
-NOTED = (0.01, 0.01, 0.01, 0.1, 0.01, 0.1)
+NOTED = (0.01, 0.01, 0.01, 0.1, 0.01)
 """Least of what is found that is worth a note."""
 LOUD = 1.5
 """Level that is worth a note, or less than its inverse."""
@@ -111,8 +110,7 @@ class CooperativeFilter(Checked):
     - *Trust*: the fixes of a vehicle that is new have an unknown offset $b_j \sim N(0, \tau^2)$. When the odds
       $p(b_j = 0 \mid \text{all}) / p(b_j = 0)$ allow, $b_j$ is set to 0, the surest first, and all its fixes count in
       retrospect. A mean innovation that has become unlikely revokes the trust; in the
-      ego's own receiver, too, where there are neighbours. Where most receivers lose it for small errors, each in its
-      own direction, no receiver is false: fixes drift, and mean innovations may be as large.
+      ego's own receiver, too, where there are neighbours.
     - *Gates*: where the squared Mahalanobis distance $q$ of a fix, or of a component of a relative measurement,
       exceeds its gate, the innovation's covariance is multiplied by $q / \mathrm{gate}$; that of a component far beyond
       it by 100 more, and a fix far beyond it is left out, until many were (`kernels.gate`). A member that is
@@ -174,8 +172,7 @@ class CooperativeFilter(Checked):
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.
 
         `extras` hold what is found to be otherwise than assumed, (R, T, E) each: the ego's "heading_error" and
-        "compass_error" rad, "scale_error" and "range_offset" m; whether it "slips"; "drift_of_fixes" m, the deviation
-        of errors of all fixes that last, 0 while none show; "range_level" and so on, factors of
+        "compass_error" rad, "scale_error" and "range_offset" m; whether it "slips"; "range_level" and so on, factors of
         standard deviations. And the weights, 1 for a number that was believed, of each ego's "fix" (R, T, E) and by
         link (R, L) of "range", "azimuth", "inclination" and "message", NaN where there was none, and whether it is
         "trusted".
@@ -247,9 +244,9 @@ def otherwise(ego: str, found: Floats) -> list[str]:
 
     Args:
         ego: its name.
-        found: (R, T, 12) errors that last, whether it slips, drift of all fixes, and levels.
+        found: (R, T, 11) errors that last, whether it slips, and levels.
 
-    >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0, 1.0]]]))
+    >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0, 1.0]]]))
     ['scale error, a: 0.02', 'fix level, a: 3 times the assumed deviation']
     """
     late = found[:, found.shape[1] // 2 :]

@@ -15,16 +15,13 @@ import numpy as np
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
 from coopoc.kernels.gate import GATE, LEAK, PATIENCE, REJECTED, SLIP
-from coopoc.kernels.stars.cooperative_members import IMPLAUSIBLE
 from coopoc.kernels.stars.cooperative_messages import CLIP, FADES, FIX_SCORE
 from coopoc.kernels.stars.cooperative_state import (
     ACCELERATION,
-    ALIKE,
     CONTRADICTED,
     PENALTY,
     REVOKE,
     SHARE,
-    SLIGHT,
     SURE,
     TAU,
     WINDOW,
@@ -91,15 +88,25 @@ class Belief:
         """One number; its squared normalised innovation."""
         return self.updates(h[None], np.array([z]), np.array([r]), gate)
 
-    def updates(self, h: Floats, z: Floats, r: Floats, gate: float = 0.0, share: float = 1.0) -> float:
-        """Several numbers with one gate, or a share of their information; their squared Mahalanobis distance."""
-        gap, s = z - h @ self.x, (h @ self.p @ h.T + np.diag(r)) / share
+    def updates(self, h: Floats, z: Floats, r: Floats, gate: float = 0.0) -> float:
+        """Several numbers with one gate; their squared Mahalanobis distance."""
+        gap, s = z - h @ self.x, h @ self.p @ h.T + np.diag(r)
         q = float(gap @ np.linalg.solve(s, gap))
         if gate and q > gate:
             s = s * (q / gate * (100.0 if q > 4 * gate else 1.0))
         gain = np.linalg.solve(s, h @ self.p).T
         self.x, self.p = self.x + gain @ gap, self.p - gain @ s @ gain.T
         return q
+
+    def learn(self, h: Floats, z: Floats, r: Floats, share: float) -> None:
+        """Take a share of numbers' information, and of that the same share for errors of odometry."""
+        gap, s = z - h @ self.x, (h @ self.p @ h.T + np.diag(r)) / share
+        gain = np.linalg.solve(s, h @ self.p).T
+        slow = [self.at(name) for name in self.names if name[0] == "o"]
+        for at in slow:
+            gain[at] *= share
+        less = gain @ h @ self.p
+        self.x, self.p = self.x + gain @ gap, self.p - less - less.T + gain @ s @ gain.T
 
     def average(self, i: int, prior: float, odds: float) -> None:
         """Number i is 0 or N(0, prior)."""
@@ -185,7 +192,6 @@ class Oracle:
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.priors.fix_gate else {self.ego}
         levels = {"level": np.zeros(6), "learned": np.zeros(6), "information": np.zeros(6), "made": 0.0}
-        levels |= {"lasting": 0.0, "slights": []}
         levels |= {"slips": 0.0, "speed": 0.0, "score": 0.0, "numbers": 0, "squares": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
@@ -371,11 +377,10 @@ class Oracle:
             b.updates(h, z, r)
             s["vague"].discard(j)
             return 1.0
-        judged = j != self.ego or s["members"]
+        judged = j != self.ego or any(i in s["last"] for i in s["members"])
         if g.fix_gate and judged and again and len(used) == 3 and self.wrong_on_average(j, *self.mahalanobis(b, rows)):
             if j in s["trusted"]:
                 self.revoked[j] = self.revoked.get(j, 0) + 1
-                self.slighted(j)
             self.doubt(j)
             if j == self.ego:
                 h = np.array([b.row(self.fix_terms(j), c) for c in used])
@@ -389,25 +394,12 @@ class Oracle:
         q = min(square, float(gap @ gap) / SLIP) * total / (np.trace(own) + quiet * r.sum())
         share, hits = 1.0, locked.get(j, 0.0)
         if g.fix_gate:
-            if q > g.fix_gate and (judged or hits < PATIENCE):
+            if q > g.fix_gate and hits < PATIENCE:
                 share = g.fix_gate / q if q < REJECTED * g.fix_gate else 0.0
             locked[j] = hits + gain if q > g.fix_gate else max(hits - LEAK * gain, 0.0)
         if share:
-            b.updates(h, z, r, share=share)
+            b.learn(h, z, r, share)
         return share
-
-    def slighted(self, j: int) -> None:
-        """Errors of all fixes last, where most receivers have lost trust for small ones in directions of their own."""
-        s, (_, mean) = self.state, self.state["mean"][j]
-        if np.linalg.norm(mean) > SLIGHT or s["lasting"]:
-            return
-        s["slights"].append((j, mean))
-        whose, means = zip(*s["slights"], strict=True)
-        heard = [self.ego, *(i for i in s["members"] if i in s["last"])]
-        lost, square = len({*whose} & {*heard}), float(np.square(means).sum())
-        alike = float(np.square(np.sum(means, axis=0)).sum()) / (len(means) * square)
-        if lost >= 3 and 3 * lost >= 2 * len(heard) and alike < ALIKE:
-            s["lasting"] = square / (3 * len(means))
 
     def wrong_on_average(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """The clipped mean innovation, beside what another error of the fixes would make of it."""
@@ -419,7 +411,7 @@ class Oracle:
             return True
         mean = mean + (gap * min(1.0, math.sqrt(CLIP / q)) - mean) / count
         s["mean"][j] = count, mean
-        v = cov + np.diag(r) / count + (s["lasting"] + (1.0 if self.life.own else 0.0)) * np.eye(3)
+        v = cov + np.diag(r) / count + (1.0 if self.life.own else 0.0) * np.eye(3)
         odds = math.log((1 - SHARE) / SHARE) + normal(mean, v) - normal(mean, v + TAU**2 * np.eye(3))
         near = mean @ np.linalg.solve(v, mean)
         enough = near >= 2 * (math.log((1 - SHARE) / SHARE) + REVOKE)
@@ -489,7 +481,7 @@ class Oracle:
         if g.fix_gate and g.slip and before is not None:
             last, since, variance, slips = before
             changed = (ACCELERATION * max(t - since, 1) * dt) ** 2
-            if ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum() > IMPLAUSIBLE * g.fix_gate and slips < 5:
+            if ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum() > 2 * g.fix_gate and slips < 5:
                 self.state["pace"][j] = last, since, variance, slips + 1
                 return last, variance + changed * dt**2
         self.state["pace"][j] = u, t, q, 0
@@ -684,8 +676,7 @@ class Oracle:
         """The surest member first: p(b = 0 | all) / p(b = 0) by Bayes' rule, of Gaussians."""
         s, own = self.state, self.life.own
         b, wide = s["belief"], TAU**2 + own
-        lasting = s["lasting"]
-        narrow = 1 / (1 / own - 1 / wide) if own else max(lasting, 1e-6)
+        narrow = 1 / (1 / own - 1 / wide) if own else 1e-6
         while True:
             odds = {}
             for j in (self.ego, *s["members"]):
@@ -693,12 +684,11 @@ class Oracle:
                     continue
                 at = b.at(("b", j))
                 x, p = b.x[at], b.p[at, at]
-                odds[j] = math.log((1 - SHARE) / SHARE) - PENALTY * self.revoked.get(j, 0) * (not lasting)
+                odds[j] = math.log((1 - SHARE) / SHARE) - PENALTY * self.revoked.get(j, 0)
                 if own:
                     odds[j] += normal(x, narrow * np.eye(3) + p) + 1.5 * math.log(2 * math.pi * wide / own * narrow)
                 else:
-                    more = lasting * np.eye(3)
-                    odds[j] += normal(x, p + more) - normal(0 * x, TAU**2 * np.eye(3) + more)
+                    odds[j] += normal(x, p) - normal(0 * x, TAU**2 * np.eye(3))
             best = max(odds, key=lambda j: (odds[j], -s["slot"][j]), default=-1)
             if best < 0 or odds[best] <= SURE:
                 return

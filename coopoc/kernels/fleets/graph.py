@@ -1,7 +1,7 @@
 """Measurement graph of a whole fleet: what is measured and assumed, information of pairs, components.
 
-A vector is a tuple of 3 numbers, a matrix one of 9
-(`coopoc.kernels.compiling.small`). A fix, a range or an angle that is missing (NaN) is no factor.
+A vector is a tuple of 3 numbers, a matrix one of 9 (`coopoc.kernels.compiling.small`). A fix, a range or an angle that
+is missing (NaN) is no factor.
 """
 
 from __future__ import annotations

@@ -46,9 +46,6 @@ from .gaussian import ABSENT, COMMON, ERROR, KINDS, PLACE, has, insert, remove, 
 from .messages import vector_at
 from .otherwise import drive, slip_variance
 
-IMPLAUSIBLE = 4.0
-"""Gates of fixes beyond which a change of velocity is no vehicle's: odometers may be worse than assumed."""
-
 
 @inside
 def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
@@ -131,7 +128,7 @@ def steady(f: Filter, model: Model, j: int, given: Floats, first: int, variance:
     for c in range(3):
         gap = unit * given[first + c] - status[PACE + c]
         q += gap * gap / ((given[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
-    if model.slip > 0.0 and 0.0 < IMPLAUSIBLE * model.fix_gate < q and status[SLIPS] < SLIPPED:
+    if model.slip > 0.0 and 0.0 < 2.0 * model.fix_gate < q and status[SLIPS] < SLIPPED:
         status[SLIPS] += 1.0
         for c in range(3):
             given[first + c], given[variance + c] = status[PACE + c] / unit, status[PACE + 3 + c] + changed * dt * dt

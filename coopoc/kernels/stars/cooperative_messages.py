@@ -14,13 +14,11 @@ from ..gate import SLIP, count, inflation
 from .cooperative_members import stand, steady
 from .cooperative_state import (
     AGE,
-    ALIKE,
     CLOCK,
     COUNT,
     FIXES,
     INPUT,
     LAST,
-    LASTING,
     LEVEL,
     LOCKED,
     MEAN,
@@ -33,9 +31,6 @@ from .cooperative_state import (
     REVOKE,
     REVOKED,
     SHARE,
-    SLIGHT,
-    SLIGHTLY,
-    SLIGHTS,
     SLIPS,
     SOLO,
     SOLO_VARIANCE,
@@ -77,7 +72,7 @@ from .gaussian import (
     update,
 )
 from .messages import block_at, three_of, vector_at
-from .otherwise import drive, learn_fix, score, turned
+from .otherwise import drive, hold, learn_fix, score, turned
 
 FADES = 5.0
 """s, after which a fix weighs 1 / e in the mean that is sent."""
@@ -253,11 +248,10 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
         settle(g, h, k, f.member[k, VAGUE])
         f.member[k, VAGUE] = 0.0
         return 1.0
-    judged = k > 0 or members(f) > 0  # alone, errors of the receiver and of the odometer cannot be separated
+    judged = k > 0 or heard(f) > 0  # alone, errors of the receiver and of the odometer cannot be separated
     if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong_on_average(f, model, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
-            slighted(f, j)
         doubt(f, model, j)
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
             fix_terms(f, 0)
@@ -274,40 +268,22 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
     quiet = math.exp(-min(f.ego[LEVEL + (FIXES if k == 0 else MESSAGES)], 0.0))
     q *= (own + noise) / (own + quiet * noise)  # fixes that agree better than is assumed are as wrong as any, together
     if model.fix_gate > 0.0:
-        share = 1.0 / inflation(q, model.fix_gate, 0.0 if judged else f.member[k, LOCKED])
+        share = 1.0 / inflation(q, model.fix_gate, f.member[k, LOCKED])
         f.member[k, LOCKED] = count(q, model.fix_gate, f.member[k, LOCKED], own / (own + noise))
     score(f, h, FIX_SCORE, True)
     correct(g, h, share)
+    hold(f, share)
     return share
 
 
 @part
-def members(f: Filter) -> int:
-    """How many neighbours are in the star."""
+def heard(f: Filter) -> int:
+    """How many neighbours that have sent a message are in the star; others stand where the ego measures them."""
     count = 0
     for k in range(1, len(f.who)):
-        count += f.who[k, VEHICLE] >= 0
+        j = f.who[k, VEHICLE]
+        count += j >= 0 and f.status[j, USED] > -math.inf
     return count
-
-
-@part
-def slighted(f: Filter, j: int) -> None:
-    """Where two thirds of the receivers, three at least, have lost trust for small errors, each in a direction of its
-    own, errors of fixes last: what a mean innovation may have without a false receiver."""
-    x, y, z = vector_at(f.status[j], MEAN // 3)
-    square, n, ego, count, lost = x * x + y * y + z * z, SLIGHTS, f.ego, 0, 0
-    if square > SLIGHT**2 or ego[LASTING] > 0.0:
-        return
-    f.status[j, SLIGHTLY] += 1.0
-    for i, more in enumerate((1.0, square, x, y, z)):
-        ego[n + i] += more
-    for k in range(len(f.who)):
-        other = f.who[k, VEHICLE]
-        if other >= 0 and (k == 0 or f.status[other, USED] > -math.inf):
-            count, lost = count + 1, lost + (f.status[other, SLIGHTLY] > 0.0)
-    alike = (ego[n + 2] ** 2 + ego[n + 3] ** 2 + ego[n + 4] ** 2) / (ego[n] * ego[n + 1])
-    if lost >= 3 and 3 * lost >= 2 * count and alike < ALIKE:
-        ego[LASTING] = ego[n + 1] / (3.0 * ego[n])
 
 
 @inside
@@ -322,7 +298,7 @@ def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
     for c in range(3):
         status[MEAN + c] += (clip * h.three[GAP + c] - status[MEAN + c]) / count
     mean, (p, q, r) = vector_at(status, MEAN // 3), vector_at(h.three, VARIANCE // 3)
-    more = f.ego[LASTING] + (1.0 if model.own > 0.0 else 0.0)
+    more = 1.0 if model.own > 0.0 else 0.0
     s = add_diagonal(block_at(h.matrix, COV // 9), (p / count + more, q / count + more, r / count + more))
     odds = math.log((1.0 - SHARE) / SHARE)
     near, narrow = distance(s, mean)
@@ -340,7 +316,7 @@ def trust(f: Filter, model: Model) -> None:
     The odds p(b = 0 | all) / p(b = 0) of a Gaussian b are by Bayes' rule those of the two hypotheses.
     """
     g, h = f.g, f.h
-    wide, narrow, unit = TAU**2 + model.own, f.ego[LASTING], TAU**2 + f.ego[LASTING]
+    wide, narrow, unit = TAU**2 + model.own, 0.0, TAU**2
     if model.own > 0.0:
         narrow = 1.0 / (1.0 / model.own - 1.0 / wide)
         unit = wide / model.own * narrow
@@ -355,8 +331,8 @@ def trust(f: Filter, model: Model) -> None:
                 for d in range(3):
                     h.matrix[SQUARE + 3 * c + d] = g.p[first + c, first + d] + (narrow if c == d else 0.0)
             q, det = distance(block_at(h.matrix, SQUARE // 9), vector_at(g.x, first // 3))
-            odds = math.log((1.0 - SHARE) / SHARE) + 0.5 * math.log(unit**3 / det) - 0.5 * q
-            odds -= PENALTY * f.status[j, REVOKED] if f.ego[LASTING] == 0.0 else 0.0
+            odds = math.log((1.0 - SHARE) / SHARE) - PENALTY * f.status[j, REVOKED]
+            odds += 0.5 * math.log(unit**3 / det) - 0.5 * q
             if odds > most:
                 best, most = k, odds
         if best < 0:

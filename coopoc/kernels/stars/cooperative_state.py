@@ -37,7 +37,7 @@ FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, OWN = 0, 3, 6, 9, 12, 13
 RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
 """Of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none held), mean of its fixes m and its
 variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that of a fix m^2."""
-TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, REVOKED, SLIGHTLY, STATUS = (
+TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, REVOKED, STATUS = (
     0,
     1,
     2,
@@ -49,14 +49,13 @@ TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, REVOK
     27,
     28,
     29,
-    30,
     32,
 )
 """Of a vehicle's status: whether its fixes are assumed to be right, fixes in the mean innovation, when its last message
 that was used was sent s (-inf for none), mean innovation m, error of its fixes when it left m and its variance m^2, and
 SOLO, SOLO_VARIANCE and ODOMETER of that message; its last plausible velocity m/s, the variance of one step's
-motion with it m^2, when that was s (-inf for never), how many in a row were not; how often it lost trust, and how often
-for a mean innovation below SLIGHT."""
+motion with it m^2, when that was s (-inf for never), how many in a row were not, and how
+often it lost trust."""
 NO_POSITION = 1e200
 """m^2, variance of the mean of no fixes."""
 SLIPPED = 5.0
@@ -71,12 +70,9 @@ SURE, PENALTY, REVOKE = 2.0, 4.0, 2.0
 WINDOW, CONTRADICTED = 30.0, 30.0
 """Fixes in the mean innovation of a vehicle; steps in a row at most after which a member that is contradicted joins
 anew."""
-SLIGHT, ALIKE = 7.0, 0.35
-"""m, mean innovation for which most receivers may lose trust though none is false; least share of the squares of such
-innovations in the square of their sum that shows one cause, such as an ego that is wrong or liars that agree."""
 ACCELERATION = 5.0
 """m/s^2, of a vehicle at most, and of a member since it sent its newest message."""
-FIXES, MOTIONS, MESSAGES, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 6, 12
+FIXES, MOTIONS, MESSAGES, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 6, 11
 """Kinds of numbers that have a level, behind ranges, azimuths and inclinations; how many, and how much is found."""
 
 
@@ -148,13 +144,11 @@ that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of 
 normalised innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing
 was: the ego's are those of its fix."""
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
-LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, LASTING, SLIGHTS, EGO = 11, 17, 23, 29, 41, 44, 53, 54, 59
+LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, EGO = 11, 17, 23, 29, 40, 43, 52
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
 of motion makes, and the whole then; six numbers of `otherwise` on slips; by kind of number the logarithm of its level,
 the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what is
-otherwise than assumed; position m and covariance m^2; variance m^2 of the errors of all fixes that last, 0 while
-none show; and of the mean innovations below SLIGHT for which trust was lost how many there are, the sum of their
-squares m^2, and their sum m."""
+otherwise than assumed; and position m and covariance m^2."""
 
 
 class Filter(NamedTuple):
@@ -226,8 +220,6 @@ def copy_filter(source: Filter, target: Filter) -> None:
 @part
 def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: int) -> None:
     """The first step: no vehicle has been met."""
-    for i in range(LASTING, EGO):
-        f.ego[i] = 0.0
     for j in range(len(f.slot)):
         for c in range(STATUS):
             f.status[j, c] = 0.0

@@ -37,7 +37,6 @@ from .cooperative_state import (
     FIXES,
     INFORMATION,
     KINDS_OF_NUMBERS,
-    LASTING,
     LEVEL,
     MADE,
     MOTION,
@@ -66,15 +65,16 @@ from .gaussian import (
     TURN,
     TURNED,
     VARIANCE,
+    WHITE,
     Q,
     Rows,
     has,
     shift,
 )
 
-HEADING, SCALE, OF_COMPASS, OF_RANGE, SLIPS, OF_FIXES, LEVELS = range(7)
-"""Places in TOLD: the ego's errors, rad, 1, rad, m, whether it slips, what errors of all fixes that last are like, m,
-and the factors of standard deviations."""
+HEADING, SCALE, OF_COMPASS, OF_RANGE, SLIPS, LEVELS = range(6)
+"""Places in TOLD: the ego's errors, rad, 1, rad, m, whether it slips, and the factors of standard
+deviations."""
 
 
 @part
@@ -114,6 +114,29 @@ def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt
 
 
 @part
+def hold(f: Filter, share: float) -> None:
+    """After `correct` with that share of a fix: errors of odometry learn the share of what it says of them.
+
+    P' = P - K S K^T + (1 - share)^2 K_o S K_o^T in the block of these errors o.
+    """
+    g, h, wide = f.g, f.h, len(f.g.x)
+    if share >= 1.0:
+        return
+    for a in range(len(f.who)):
+        if f.who[a, VEHICLE] < 0 or not has(g, a, TURN):
+            continue
+        for i in range(3 * g.block[a, TURN], 3 * g.block[a, TURN] + 2):
+            for c in range(3):
+                g.x[i] -= (1.0 - share) * share * h.gain[c * wide + i] * h.three[WHITE + c]
+            for b in range(len(f.who)):
+                if f.who[b, VEHICLE] < 0 or not has(g, b, TURN):
+                    continue
+                for j in range(3 * g.block[b, TURN], 3 * g.block[b, TURN] + 2):
+                    for c in range(3):
+                        g.p[i, j] += (1.0 - share) ** 2 * share * h.gain[c * wide + i] * h.gain[c * wide + j]
+
+
+@part
 def average(f: Filter, model: Model) -> None:
     """Write the ego's position and covariance, averaged over which errors are there, to ANSWER, and these to TOLD.
 
@@ -147,7 +170,7 @@ def average(f: Filter, model: Model) -> None:
         i = own + kind - 2
         there = n > own if kind >= 2 else own > 3
         f.ego[TOLD + kind] = few[i, where - 1] if there else 0.0
-    f.ego[TOLD + SLIPS], f.ego[TOLD + OF_FIXES] = f.ego[SLIPPED], math.sqrt(f.ego[LASTING])
+    f.ego[TOLD + SLIPS] = f.ego[SLIPPED]
     for kind in range(KINDS_OF_NUMBERS):
         f.ego[TOLD + LEVELS + kind] = math.exp(0.5 * f.ego[LEVEL + kind])
 
