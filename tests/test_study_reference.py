@@ -70,6 +70,14 @@ def test_a_number_is_the_mean_and_its_runs_spread(results: Results, tmp_path: Pa
     assert json.loads((tmp_path / "numbers.json").read_text())["numbers"][0]["better"] == "lower"
 
 
+@pytest.mark.parametrize("field", ["value", "run_std", "tolerance"])
+def test_a_reference_that_is_no_number_is_damaged(results: Results, tmp_path: Path, field: str) -> None:
+    known = measure(results, METRICS)
+    replace(known, numbers=(replace(known.numbers[0], **{field: float("nan")}),)).save(tmp_path / "numbers.json")
+    with refused("is damaged .nan is no finite number"):
+        Reference.load(tmp_path / "numbers.json")
+
+
 def test_verdicts_know_the_direction(results: Results, tmp_path: Path) -> None:
     known = measure(results, METRICS)
     assert set(verdicts(results, known).values()) == {"within noise"}

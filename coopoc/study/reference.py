@@ -32,14 +32,23 @@ TOLERANCE, TRAINED = 0.01, 0.05
 trained by them."""
 SIGMA = 2.0
 """Standard errors by which means over other numbers of runs may differ in addition."""
+
+
+def _finite(value: Any) -> float:
+    """A number that can be compared."""
+    if not math.isfinite(value):
+        raise ValueError(f"{value} is no finite number")
+    return float(value)
+
+
 KINDS: Mapping[str, Any] = {
     "where": dict,
     "metric": str,
-    "value": float,
+    "value": _finite,
     "runs": lambda runs: max(int(runs), 1),
-    "run_std": float,
-    "tolerance": float,
-    "better": lambda better: better if better in ("lower", "higher") else float(better),
+    "run_std": _finite,
+    "tolerance": _finite,
+    "better": lambda better: better if better in ("lower", "higher") else _finite(better),
 }
 """Field of a number -> how it is read."""
 FREE = ("runs", "weights", "backend", "metric")
