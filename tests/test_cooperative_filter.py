@@ -111,6 +111,33 @@ def test_a_slip_is_found_before_fixes_are_lost(seed: int) -> None:
     assert ours.mean() < joint.mean()
 
 
+@pytest.mark.parametrize("most", [0, 4])
+def test_noisy_odometers_are_no_wild_ones(most: int) -> None:
+    """Law: velocities four times as noisy as assumed cost no more than in a filter that takes all of them; they were
+    replaced by older ones, as no vehicle changes its own so fast."""
+    fleet = load_fleet("town10").between(0, 400)
+    noisy = replace(S2, velocity_std_ratio=4 * S2.velocity_std_ratio)
+    for ego in (0, 24):
+        seen = replace(observe(fleet, noisy, V2X(most), runs=4, seed=3, observers=[ego]), sensors=S2)
+        ours, joint = (rt_le(m(seen, [ego]), fleet).mean() for m in (CooperativeFilter(), JointFilter()))
+        assert ours < joint
+
+
+@pytest.mark.parametrize("factor", [0.0, 0.5, 2.0])
+@pytest.mark.parametrize("most", [0, 4])
+def test_wheels_that_slip_leave_the_way_as_it_is(most: int, factor: float) -> None:
+    """Law: while wheels stand still or spin for 5 s, on a bend, too, the error is along the way, and fixes bound it."""
+    fleet = load_fleet("town10").between(0, 400)
+    sensors = replace(S2, gnss_std=(0.5, 0.5, 0.5))
+    for ego in (0, 24):
+        seen = observe(fleet, sensors, V2X(most), runs=4, seed=3, observers=[ego])
+        velocity = seen.velocity.copy()
+        velocity[:, 200:250, ego] *= factor
+        slipping = replace(seen, velocity=velocity)
+        ours, joint = (rt_le(m(slipping, [ego]), fleet).mean() for m in (CooperativeFilter(), JointFilter()))
+        assert ours < min(0.7, 1.05 * joint)
+
+
 def test_neighbours_that_send_nothing_judge_no_receiver() -> None:
     """Law: beside vehicles that are measured and silent an ego is alone, whatever its odometer says for a while."""
     fleet = load_fleet("town10").between(0, 400)

@@ -18,15 +18,30 @@ from coopoc.kernels.gate import GATE, LEAK, PATIENCE, REJECTED, SLIP
 from coopoc.kernels.stars.cooperative_messages import CLIP, FADES, FIX_SCORE
 from coopoc.kernels.stars.cooperative_state import (
     ACCELERATION,
+    CHANGES,
     CONTRADICTED,
     PENALTY,
     REVOKE,
     SHARE,
     SURE,
+    SURPRISE,
     TAU,
     WINDOW,
 )
-from coopoc.kernels.stars.otherwise import FASTEST, LASTS, LATE, LOUDEST, PRIOR, QUIETEST, RARE, SUDDEN, UNSEEN, USUAL
+from coopoc.kernels.stars.otherwise import (
+    FASTEST,
+    LASTS,
+    LATE,
+    LOUDEST,
+    PRIOR,
+    QUIETEST,
+    RARE,
+    SIDEWAYS,
+    SUDDEN,
+    TURNS,
+    UNSEEN,
+    USUAL,
+)
 from coopoc.methods.cooperative_filter import Priors
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector, wrap
@@ -192,6 +207,7 @@ class Oracle:
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.priors.fix_gate else {self.ego}
         levels = {"level": np.zeros(6), "learned": np.zeros(6), "information": np.zeros(6), "made": 0.0}
+        levels |= {"louder": {}, "shown": 0.0, "far": 0.0, "course": np.zeros(3), "blind": 0.0}
         levels |= {"slips": 0.0, "speed": 0.0, "score": 0.0, "numbers": 0, "squares": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
@@ -226,8 +242,12 @@ class Oracle:
     def tries(self, t: int) -> None:
         """A step, and perhaps one that slips."""
         share, dt = self.priors.slip * (self.known.sensors is not None), self.seen.dt
-        speed = float(np.linalg.norm(self.seen.velocity[self.run, t, self.ego]))
-        self.state["speed"] = max(speed, self.state["speed"] * math.exp(-dt / LATE))
+        u = self.seen.velocity[self.run, t, self.ego]
+        speed, late = float(np.linalg.norm(u)), self.state["speed"] * math.exp(-dt / LATE)
+        self.state["blind"] += dt
+        if speed > 0.5 * late:
+            self.state |= {"course": u / speed, "blind": 0.0}
+        self.state["speed"] = max(speed, late)
         before = copy.deepcopy((self.state, self.revoked)) if share else None
         self.step(t, 0.0)
         n, p = self.state["numbers"], self.state["slips"]
@@ -235,7 +255,7 @@ class Oracle:
             self.state["slips"] = 0.0
             return
         first, (self.state, self.revoked) = (self.state, self.revoked), before
-        rate, shows = (share * self.state["speed"]) ** 2, self.r[t, self.ego] @ self.white
+        rate, shows = (share * self.state["speed"]) ** 2, self.r[t, self.ego] @ self.white + self.state["shown"] ** 2
         self.step(t, rate * dt**2 + (min(rate * UNSEEN**2, shows) if p <= 0.5 and dt < UNSEEN else 0.0))
         prior = p * math.exp(-dt / LASTS) + (1 - p) * min(dt / RARE, 0.5)
         odds = self.state["score"] - first[0]["score"] + math.log(prior / (1 - prior))
@@ -259,8 +279,12 @@ class Oracle:
         s = int(self.box.newest[self.run, link])
         if s < 0:
             return None
-        velocity, q = self.seen.velocity[self.run, s, j], math.exp(self.state["level"][4]) * self.q[s, j]
+        velocity, q = self.seen.velocity[self.run, s, j], self.louder(j) * self.q[s, j]
         return Sent(s, self.mean[s, j], self.weight[s, j], self.odometer[s, j], velocity, q)
+
+    def louder(self, j: int) -> float:
+        """Level of a vehicle's motion."""
+        return math.exp(self.state["level"][4]) * float(self.state["louder"].get(j, 1.0))
 
     def learn(self, kind: int, more: float, share: float, numbers: int = 1) -> None:
         """What innovations show of a level: derivative and information of their log-likelihood."""
@@ -281,7 +305,7 @@ class Oracle:
         self.state |= {"score": 0.0, "numbers": 0, "squares": 0.0}
         s, g, b, life = self.state, self.priors, self.state["belief"], self.life
         here, others = self.neighbours(t)
-        louder = math.exp(s["level"][4])
+        louder = self.louder(self.ego)
         links = dict(zip(others, here.tolist(), strict=True))
         messages = {j: self.message(link, j) for j, link in links.items()}
         relative = {j: self.seen.relative[self.run, self.box.link[link]] for j, link in links.items()}
@@ -313,7 +337,9 @@ class Oracle:
         u, q = self.steady(t, self.ego, self.seen.velocity[self.run, t, self.ego], louder * self.q[t, self.ego])
         if t > s["joined"][self.ego]:
             self.predict(dt * u, q)
-            b.noise(("x", self.ego), slip)
+            x = b.at(("x", self.ego))
+            across = min(SIDEWAYS + (TURNS * s["blind"]) ** 2, 1.0)
+            b.p[x, x] += slip * (across * np.eye(3) + np.outer(s["course"], s["course"]))
         s["made"] = s["made"] + q.sum()
         self.before = self.own_variance()
         for j in [j for j in others if j not in s["members"]]:
@@ -346,6 +372,9 @@ class Oracle:
         rows = [(self.fix_terms(self.ego), fix[c], louder * self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
         if self.ego not in s["vague"]:
             self.learn_fix(3, rows)
+            _, gap, _, r = self.mahalanobis(self.state["belief"], rows)
+            far, most = float(np.linalg.norm(gap)), s["speed"] * self.seen.dt + 2 * math.sqrt(r.sum())
+            s["shown"], s["far"] = max(s["shown"] + min(far - s["far"], most), 0.0), far
         share = self.use_fix(t, self.ego, rows, True)
         s["hits"]["fix"] = s["hits"]["fix"] + 1 if share < 1 else 0
         self.corrected()
@@ -477,13 +506,15 @@ class Oracle:
 
     def steady(self, t: int, j: int, u: Floats, q: Floats) -> tuple[Floats, Floats]:
         """Velocity and variance of a step's motion, or the last ones where no vehicle can have changed that fast."""
-        g, dt, before = self.priors, self.seen.dt, self.state["pace"].get(j)
-        if g.fix_gate and g.slip and before is not None:
-            last, since, variance, slips = before
-            changed = (ACCELERATION * max(t - since, 1) * dt) ** 2
-            if ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum() > 2 * g.fix_gate and slips < 5:
-                self.state["pace"][j] = last, since, variance, slips + 1
-                return last, variance + changed * dt**2
+        g, dt, louder = self.priors, self.seen.dt, self.state["louder"]
+        last, since, variance, slips = self.state["pace"].get(j, (u, -math.inf, q, 0))
+        changed = (ACCELERATION * max(t - since, 1) * dt) ** 2
+        strange = ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum()
+        if g.forget:
+            louder[j] = max(louder.get(j, 1.0) * (1 + (min(strange, SURPRISE) / 3 - 1) / CHANGES), 1.0)
+        if g.slip * (self.known.sensors is not None) and g.fix_gate and strange > 2 * g.fix_gate and slips < 5:
+            self.state["pace"][j] = last, since, variance, slips + 1
+            return last, variance + changed * dt**2
         self.state["pace"][j] = u, t, q, 0
         return u, q
 

@@ -101,6 +101,7 @@ from .otherwise import (
     new_tries,
     remember_speed,
     score,
+    show,
     surprised,
 )
 
@@ -249,7 +250,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     """Predict and update, and count what that says of a slip."""
     f.ego[LIKELY] = f.ego[NUMBERS] = f.ego[SQUARES] = 0.0
     leave(f, model, own, rows, vehicles, count)
-    louder(f, own, rows, count)
+    louder(f, own, rows, vehicles, count)
     f.ego[SPAN] = own[DT]
     if f.ego[STEPS] > 0:
         f.ego[CLOCK] += own[DT]
@@ -331,6 +332,7 @@ def add_fix(f: Filter, model: Model, own: Floats) -> None:
     q = innovate(f.g, f.h)
     if f.member[0, VAGUE] == 0.0:
         learn_fix(f, FIXES)
+        show(f)
     f.member[0, OUT + 3] = share = use_fix(f, model, 0, True, q)
     f.who[0, HITS] = f.who[0, HITS] + 1 if share < 1.0 else 0
     corrected(f)

@@ -9,6 +9,7 @@ from ..compiling.compile import inside, part
 from .cooperative_state import (
     ACCELERATION,
     AGE,
+    CHANGES,
     CLOCK,
     CONTRADICTED,
     DT,
@@ -19,6 +20,7 @@ from .cooperative_state import (
     KEPT,
     KEPT_VARIANCE,
     LOCKED,
+    LOUDER,
     MOTION,
     MOTION_VARIANCE,
     PACE,
@@ -28,6 +30,7 @@ from .cooperative_state import (
     SPAN,
     SPEED,
     STEPS,
+    SURPRISE,
     TRUSTED,
     VAGUE,
     VEHICLE,
@@ -44,7 +47,7 @@ from .cooperative_state import (
 )
 from .gaussian import ABSENT, COMMON, ERROR, KINDS, PLACE, has, insert, remove, shift, widen
 from .messages import vector_at
-from .otherwise import drive, slip_variance
+from .otherwise import drive, slip
 
 
 @inside
@@ -97,7 +100,8 @@ def predict(f: Filter, model: Model, own: Floats) -> None:
     fades = 1.0 - keep * keep
     drive(f, model, 0, vector_at(own, MOTION // 3), own[DT])
     for c in range(3):
-        g.p[first + c, first + c] += own[MOTION_VARIANCE + c] + slip_variance(f, model, own)
+        g.p[first + c, first + c] += own[MOTION_VARIANCE + c]
+    slip(f, model, own)
     for k in range(len(f.who)):
         if f.who[k, VEHICLE] >= 0 and has(g, k, ERROR):
             i, trusted = 3 * g.block[k, ERROR], f.status[f.who[k, VEHICLE], TRUSTED] > 0.0
@@ -112,7 +116,8 @@ def predict(f: Filter, model: Model, own: Floats) -> None:
 
 @inside
 def steady(f: Filter, model: Model, j: int, given: Floats, first: int, variance: int, unit: float) -> None:
-    """Put vehicle j's last velocity in place of one that no vehicle can have reached since, if odometers may slip.
+    """Learn the level of vehicle j's motion from how its velocity changed, beyond what a vehicle can accelerate; where
+    odometers may slip, put its last velocity in place of one that it cannot have reached since.
 
     Args:
         f: filter.
@@ -128,6 +133,9 @@ def steady(f: Filter, model: Model, j: int, given: Floats, first: int, variance:
     for c in range(3):
         gap = unit * given[first + c] - status[PACE + c]
         q += gap * gap / ((given[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
+    if model.forget > 0.0:
+        more = (min(q, SURPRISE) / 3.0 - 1.0) / CHANGES
+        status[LOUDER] = max(status[LOUDER] + (1.0 + status[LOUDER]) * more, 0.0)
     if model.slip > 0.0 and 0.0 < 2.0 * model.fix_gate < q and status[SLIPS] < SLIPPED:
         status[SLIPS] += 1.0
         for c in range(3):

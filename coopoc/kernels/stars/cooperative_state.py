@@ -37,7 +37,7 @@ FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, OWN = 0, 3, 6, 9, 12, 13
 RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
 """Of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none held), mean of its fixes m and its
 variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that of a fix m^2."""
-TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, REVOKED, STATUS = (
+TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, REVOKED, LOUDER, STATUS = (
     0,
     1,
     2,
@@ -49,17 +49,20 @@ TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, REVOK
     27,
     28,
     29,
-    32,
+    30,
+    33,
 )
 """Of a vehicle's status: whether its fixes are assumed to be right, fixes in the mean innovation, when its last message
 that was used was sent s (-inf for none), mean innovation m, error of its fixes when it left m and its variance m^2, and
 SOLO, SOLO_VARIANCE and ODOMETER of that message; its last plausible velocity m/s, the variance of one step's
-motion with it m^2, when that was s (-inf for never), how many in a row were not, and how
-often it lost trust."""
+motion with it m^2, when that was s (-inf for never), how many in a row were not, how often it lost trust, and by which
+share of what is assumed the variance of its velocities is more."""
 NO_POSITION = 1e200
 """m^2, variance of the mean of no fixes."""
 SLIPPED = 5.0
 """Implausible velocities in a row after which one counts again."""
+CHANGES, SURPRISE = 20.0, 9.0
+"""Velocities in the level of their noise, and the most of a squared normalised change of velocity that counts in it."""
 
 
 TAU, SHARE = 20.0, 0.1
@@ -144,11 +147,11 @@ that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of 
 normalised innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing
 was: the ego's are those of its fix."""
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
-LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, EGO = 11, 17, 23, 29, 40, 43, 52
+LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, EGO = 17, 23, 29, 35, 46, 49, 58
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
-of motion makes, and the whole then; six numbers of `otherwise` on slips; by kind of number the logarithm of its level,
-the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what is
-otherwise than assumed; and position m and covariance m^2."""
+of motion makes, and the whole then; twelve numbers of `otherwise` on slips; by kind of number the logarithm of its
+level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
+is otherwise than assumed; and position m and covariance m^2."""
 
 
 class Filter(NamedTuple):

@@ -7,12 +7,14 @@ filter without that state. So one filter stands for all hypotheses, as long as a
 
 *Slips*: a step is tried once more, with a motion that is not known, and the likelier of both is kept. Numbers beyond
 their gate count with no more than it, a fix as one: a range that is too long, or a receiver that jumps, is no slip.
+Wheels slip along the way.
 
 *Levels*: by how much the variance of each kind of number differs from what is assumed, as its innovations show. The
 log-likelihood of an innovation v ~ N(0, S) has the derivative s (v^2 / S - 1) / 2 by the logarithm of a level, with s
 the share of S that the level makes, and the information s^2 / 2. Each step moves a level by the sum of its derivatives
 over their information, which is forgotten in `Model.forget` s. Of the ego's motion the share is D = dP / d log level,
-which a step of prediction makes D + q, and an update D (P+ / P-)^2.
+which a step of prediction makes D + q, and an update D (P+ / P-)^2; changes of velocity show the level of each
+vehicle's motion earlier, if it is more than is assumed.
 
 References:
     Friedland, Treatment of bias in recursive filtering, IEEE TAC 14(4), 1969; Mitchell, Beauchamp, Bayesian variable
@@ -27,7 +29,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Floats
+from ...arrays import Floats, Ints
 from ..compiling.compile import part, storage
 from .cooperative_state import (
     ANSWER,
@@ -38,6 +40,7 @@ from .cooperative_state import (
     INFORMATION,
     KINDS_OF_NUMBERS,
     LEVEL,
+    LOUDER,
     MADE,
     MOTION,
     MOTION_VARIANCE,
@@ -70,6 +73,7 @@ from .gaussian import (
     Rows,
     has,
     shift,
+    widen,
 )
 
 HEADING, SCALE, OF_COMPASS, OF_RANGE, SLIPS, LEVELS = range(6)
@@ -173,6 +177,7 @@ def average(f: Filter, model: Model) -> None:
     f.ego[TOLD + SLIPS] = f.ego[SLIPPED]
     for kind in range(KINDS_OF_NUMBERS):
         f.ego[TOLD + LEVELS + kind] = math.exp(0.5 * f.ego[LEVEL + kind])
+    f.ego[TOLD + LEVELS + MOTIONS] *= math.sqrt(1.0 + f.status[f.who[0, VEHICLE], LOUDER])
 
 
 @part
@@ -198,9 +203,12 @@ def collapse(f: Filter, i: int, n: int, prior: float, odds: float) -> None:
         few[i, k - 3] *= 1.0 + change * p
 
 
-SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES = range(SLIPPING, SLIPPING + 6)
-"""Of the ego: probability that the ego slips, its late speed m/s, whether this try assumes so, and of the step's
-numbers the logarithm of their likelihood, how many there are, and their squared normalised innovations."""
+SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, BEFORE, BLIND, COURSE = range(SLIPPING, SLIPPING + 10)
+"""Of the ego: probability that the ego slips, its late speed m/s, whether this try assumes so, of the step's numbers
+the logarithm of their likelihood, how many there are, and their squared normalised innovations; `show` m and the
+distance of the last fix m; and for how long s it has not measured its direction, and that."""
+SIDEWAYS, TURNS = 0.03, 0.3
+"""Share of a slip's variance that is across the way: some ten degrees; rad/s by which a vehicle may turn then."""
 LASTS, RARE, LATE, UNSEEN = 3.0, 3000.0, 10.0, 1.0
 """s: how long a slip lasts, how long none does, for which a speed is remembered, and until a slip shows."""
 
@@ -221,23 +229,47 @@ def new_tries(slots: int, vehicles: int) -> Tries:
 
 @part
 def remember_speed(f: Filter, own: Floats) -> None:
-    """The most of late speeds: wheels that are locked measure none."""
+    """The most of late speeds, and its direction: wheels that are locked measure none."""
     square = 0.0
     for c in range(3):
         square += (own[MOTION + c] / own[DT]) ** 2
-    f.ego[SPEED_OF_LATE] = max(math.sqrt(square), f.ego[SPEED_OF_LATE] * math.exp(-own[DT] / LATE))
+    speed, late = math.sqrt(square), f.ego[SPEED_OF_LATE] * math.exp(-own[DT] / LATE)
+    f.ego[BLIND] += own[DT]
+    if speed > 0.5 * late:
+        f.ego[BLIND] = 0.0
+        for c in range(3):
+            f.ego[COURSE + c] = own[MOTION + c] / (own[DT] * speed)
+    f.ego[SPEED_OF_LATE] = max(speed, late)
 
 
 @part
-def slip_variance(f: Filter, model: Model, own: Floats) -> float:
-    """m^2, of the ego's motion in a step, if it slips; one that begins now may have for UNSEEN s, by no more
-    than fixes show."""
-    rate = (model.slip * f.ego[SPEED_OF_LATE]) ** 2
-    variance: float = rate * own[DT] ** 2
+def show(f: Filter) -> None:
+    """After `innovate`: how far the ego may have gone unseen, the distance of its fix as far as that grew no faster
+    than the ego drives and fixes err."""
+    far, noise = 0.0, 0.0
+    for c in range(3):
+        far += f.h.three[GAP + c] ** 2
+        noise += f.h.three[VARIANCE + c]
+    far, most = math.sqrt(far), f.ego[SPEED_OF_LATE] * f.ego[SPAN] + 2.0 * math.sqrt(noise)
+    f.ego[SHOWN] = max(f.ego[SHOWN] + min(far - f.ego[BEFORE], most), 0.0)
+    f.ego[BEFORE] = far
+
+
+@part
+def slip(f: Filter, model: Model, own: Floats) -> None:
+    """Widen the ego along its way, if this try assumes that it slips; a slip that begins now may have lasted for UNSEEN
+    s, by no more than fixes err and have shown."""
+    if f.ego[NOW] == 0.0:
+        return
+    rate, first = (model.slip * f.ego[SPEED_OF_LATE]) ** 2, 3 * f.g.block[0, PLACE]
+    variance = rate * own[DT] ** 2
     if f.ego[SLIPPED] <= 0.5 and own[DT] < UNSEEN:
         fix = own[FIX_VARIANCE] + own[FIX_VARIANCE + 1] + own[FIX_VARIANCE + 2]
-        variance += min(rate * UNSEEN**2, fix)
-    return variance if f.ego[NOW] > 0.0 else 0.0
+        variance += min(rate * UNSEEN**2, fix + f.ego[SHOWN] ** 2)
+    widen(f.g, first, min(SIDEWAYS + (TURNS * f.ego[BLIND]) ** 2, 1.0) * variance)
+    for c in range(3):
+        for d in range(3):
+            f.g.p[first + c, first + d] += variance * f.ego[COURSE + c] * f.ego[COURSE + d]
 
 
 @part
@@ -280,13 +312,13 @@ PRIOR = 10.0
 
 
 @part
-def louder(f: Filter, own: Floats, rows: Floats, count: int) -> None:
-    """Multiply the variances of a step's motions by their level."""
+def louder(f: Filter, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+    """Multiply the variances of a step's motions by their level, and by that of each vehicle's velocities."""
     level = math.exp(f.ego[LEVEL + MOTIONS])
     for c in range(3):
-        own[MOTION_VARIANCE + c] *= level
+        own[MOTION_VARIANCE + c] *= level * (1.0 + f.status[f.who[0, VEHICLE], LOUDER])
         for i in range(count):
-            rows[i, STEP + c] *= level
+            rows[i, STEP + c] *= level * (1.0 + f.status[vehicles[i], LOUDER])
 
 
 @part
