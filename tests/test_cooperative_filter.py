@@ -138,6 +138,22 @@ def test_wheels_that_slip_leave_the_way_as_it_is(most: int, factor: float) -> No
         assert ours < min(0.7, 1.05 * joint)
 
 
+@pytest.mark.parametrize("step", [1, 5])
+def test_a_receiver_that_jumps_beside_neighbours_is_not_followed(step: int) -> None:
+    """Law: fixes of half a metre that jump by 24 m are rejected, teach no level of motion and, once they would be used
+    again, cost the receiver its trust: a neighbour knows better."""
+    whole = load_fleet("town10").between(0, 500)
+    fleet = Fleet(whole.ids, whole.t[::step], whole.position[::step], whole.velocity[::step])
+    sensors, steps = replace(S2, gnss_std=(0.5, 0.5, 0.5)), len(fleet.t)
+    for ego in (0, 12):
+        seen = observe(fleet, sensors, V2X(4), runs=2, seed=5, observers=[ego])
+        gnss = seen.gnss.copy()
+        gnss[:, 2 * steps // 5 :, ego] += [20.0, -14.0, 0.0]
+        jumping = replace(seen, gnss=gnss)
+        ours, joint = (rt_le(m(jumping, [ego]), fleet).mean() for m in (CooperativeFilter(), JointFilter()))
+        assert ours < 1.6 * joint
+
+
 def test_neighbours_that_send_nothing_judge_no_receiver() -> None:
     """Law: beside vehicles that are measured and silent an ego is alone, whatever its odometer says for a while."""
     fleet = load_fleet("town10").between(0, 400)

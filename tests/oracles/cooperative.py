@@ -384,7 +384,7 @@ class Oracle:
         total = np.trace(cov) + r.sum()
         more = min(gap @ gap / total, SUDDEN) - 1.0
         self.learn(kind, more, r.sum() / total, 3)
-        if kind == 3:
+        if kind == 3 and gap @ gap < SUDDEN * total:
             self.learn(4, more, self.state["made"] / total, 3)
 
     def mahalanobis(self, b: Belief, rows: list[Any]) -> tuple[float, Floats, Floats, Floats]:
@@ -407,11 +407,12 @@ class Oracle:
             s["vague"].discard(j)
             return 1.0
         judged = j != self.ego or any(i in s["last"] for i in s["members"])
-        if g.fix_gate and judged and again and len(used) == 3 and self.wrong_on_average(j, *self.mahalanobis(b, rows)):
+        if g.fix_gate and judged and again and len(used) == 3 and self.wrong(j, *self.mahalanobis(b, rows)):
             if j in s["trusted"]:
                 self.revoked[j] = self.revoked.get(j, 0) + 1
             self.doubt(j)
             if j == self.ego:
+                s["locked"][j] = 0.0
                 h = np.array([b.row(self.fix_terms(j), c) for c in used])
                 b.updates(h, z, r)
             return 0.0
@@ -429,6 +430,13 @@ class Oracle:
         if share:
             b.learn(h, z, r, share)
         return share
+
+    def wrong(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
+        """On average, or locked out beside a neighbour that is trusted."""
+        s = self.state
+        trusted = any(i in s["last"] and i in s["trusted"] for i in s["members"])
+        locked = j == self.ego and q > self.priors.fix_gate and s["locked"].get(j, 0.0) >= PATIENCE and trusted
+        return self.wrong_on_average(j, q, gap, cov, r) or locked
 
     def wrong_on_average(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
         """The clipped mean innovation, beside what another error of the fixes would make of it."""

@@ -10,7 +10,7 @@ from ...arrays import Floats
 from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import add_diagonal, scale, store
 from ..dead_reckoning import ROUNDING
-from ..gate import SLIP, count, inflation
+from ..gate import PATIENCE, SLIP, count, inflation
 from .cooperative_members import stand, steady
 from .cooperative_state import (
     AGE,
@@ -248,12 +248,13 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
         settle(g, h, k, f.member[k, VAGUE])
         f.member[k, VAGUE] = 0.0
         return 1.0
-    judged = k > 0 or heard(f) > 0  # alone, errors of the receiver and of the odometer cannot be separated
-    if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong_on_average(f, model, k, q):
+    judged = k > 0 or heard(f, False)  # alone, errors of the receiver and of the odometer cannot be separated
+    if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong(f, model, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
         doubt(f, model, j)
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
+            f.member[0, LOCKED] = 0.0
             fix_terms(f, 0)
             innovate(g, h)
             correct(g, h, 1.0)
@@ -277,13 +278,22 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
 
 
 @part
-def heard(f: Filter) -> int:
-    """How many neighbours that have sent a message are in the star; others stand where the ego measures them."""
-    count = 0
+def heard(f: Filter, trusted: bool) -> bool:
+    """Whether a neighbour that has sent a message, and perhaps is trusted, is in the star; others stand where the ego
+    measures them."""
     for k in range(1, len(f.who)):
         j = f.who[k, VEHICLE]
-        count += j >= 0 and f.status[j, USED] > -math.inf
-    return count
+        if j >= 0 and f.status[j, USED] > -math.inf and (f.status[j, TRUSTED] > 0.0 or not trusted):
+            return True
+    return False
+
+
+@inside
+def wrong(f: Filter, model: Model, k: int, q: float) -> bool:
+    """Whether it is the receiver of member k that errs: on average, or the ego's for so long that fixes would be used
+    again, beside a neighbour that is trusted."""
+    locked = k == 0 and q > model.fix_gate and f.member[0, LOCKED] >= PATIENCE and heard(f, True)
+    return wrong_on_average(f, model, k, q) or locked
 
 
 @inside

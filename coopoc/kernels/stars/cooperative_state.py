@@ -50,7 +50,7 @@ TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, REVOK
     28,
     29,
     30,
-    33,
+    32,
 )
 """Of a vehicle's status: whether its fixes are assumed to be right, fixes in the mean innovation, when its last message
 that was used was sent s (-inf for none), mean innovation m, error of its fixes when it left m and its variance m^2, and
@@ -307,8 +307,8 @@ def pause(f: Filter, dt: float) -> None:
     for k in range(f.g.vectors[0]):
         clear(f.g, 3 * k)
     f.g.vectors[0], f.who[0, HITS] = 0, 0
-    for c in range(6):
-        f.ego[SLIPPING + c] = 0.0
+    for c in range(SLIPPING, LEVEL):
+        f.ego[c] = 0.0
     for kind in range(KINDS):
         f.g.block[0, kind] = ABSENT
     f.ego[STEPS] += 1

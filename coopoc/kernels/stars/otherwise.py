@@ -361,7 +361,7 @@ def learn_fix(f: Filter, kind: int) -> None:
         s += h.three[VARIANCE + c] + h.matrix[COV + 4 * c]
     more = min(square / s, SUDDEN) - 1.0
     learn(f, kind, more, r / s, 3.0)
-    if kind == FIXES:
+    if kind == FIXES and square < SUDDEN * s:  # what is wild says nothing of motion
         learn(f, MOTIONS, more, f.ego[MADE] / s, 3.0)
 
 
