@@ -207,7 +207,7 @@ class Oracle:
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.priors.fix_gate else {self.ego}
         levels = {"level": np.zeros(6), "learned": np.zeros(6), "information": np.zeros(6), "made": 0.0}
-        levels |= {"louder": {}, "shown": 0.0, "far": 0.0, "course": np.zeros(3), "blind": 0.0}
+        levels |= {"louder": {}, "shown": 0.0, "far": 0.0, "course": np.zeros(3), "blind": 0.0, "jumped": False}
         levels |= {"slips": 0.0, "speed": 0.0, "score": 0.0, "numbers": 0, "squares": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
@@ -251,7 +251,8 @@ class Oracle:
         before = copy.deepcopy((self.state, self.revoked)) if share else None
         self.step(t, 0.0)
         n, p = self.state["numbers"], self.state["slips"]
-        if before is None or not (p > 0.1 or self.state["squares"] > n + math.sqrt(2 * n)):
+        strange = (p > 0.1 or self.state["squares"] > n + math.sqrt(2 * n)) and not self.state["jumped"]
+        if before is None or not strange:
             self.state["slips"] = 0.0
             return
         first, (self.state, self.revoked) = (self.state, self.revoked), before
@@ -372,8 +373,10 @@ class Oracle:
         rows = [(self.fix_terms(self.ego), fix[c], louder * self.r[t, self.ego, c] * self.white[c]) for c in range(3)]
         if self.ego not in s["vague"]:
             self.learn_fix(3, rows)
-            _, gap, _, r = self.mahalanobis(self.state["belief"], rows)
+            _, gap, _, r = self.mahalanobis(s["belief"], rows)
             far, most = float(np.linalg.norm(gap)), s["speed"] * self.seen.dt + 2 * math.sqrt(r.sum())
+            if far - s["far"] > most or far < 2 * math.sqrt(r.sum()):
+                s["jumped"] = far - s["far"] > most
             s["shown"], s["far"] = max(s["shown"] + min(far - s["far"], most), 0.0), far
         share = self.use_fix(t, self.ego, rows, True)
         s["hits"]["fix"] = s["hits"]["fix"] + 1 if share < 1 else 0

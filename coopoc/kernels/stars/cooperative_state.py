@@ -147,9 +147,9 @@ that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of 
 normalised innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing
 was: the ego's are those of its fix."""
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
-LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, EGO = 17, 23, 29, 35, 46, 49, 58
+LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, EGO = 18, 24, 30, 36, 47, 50, 59
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
-of motion makes, and the whole then; twelve numbers of `otherwise` on slips; by kind of number the logarithm of its
+of motion makes, and the whole then; thirteen numbers of `otherwise` on slips; by kind of number the logarithm of its
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
 is otherwise than assumed; and position m and covariance m^2."""
 

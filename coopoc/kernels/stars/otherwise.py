@@ -203,10 +203,13 @@ def collapse(f: Filter, i: int, n: int, prior: float, odds: float) -> None:
         few[i, k - 3] *= 1.0 + change * p
 
 
-SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, BEFORE, BLIND, COURSE = range(SLIPPING, SLIPPING + 10)
+SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, BEFORE, JUMPED, BLIND, COURSE = range(
+    SLIPPING, SLIPPING + 11
+)
 """Of the ego: probability that the ego slips, its late speed m/s, whether this try assumes so, of the step's numbers
-the logarithm of their likelihood, how many there are, and their squared normalised innovations; `show` m and the
-distance of the last fix m; and for how long s it has not measured its direction, and that."""
+the logarithm of their likelihood, how many there are, and their squared normalised innovations; `show` m, the
+distance of the last fix m, and whether fixes have jumped; and for how long s it has not measured its direction, and
+that."""
 SIDEWAYS, TURNS = 0.03, 0.3
 """Share of a slip's variance that is across the way: some ten degrees; rad/s by which a vehicle may turn then."""
 LASTS, RARE, LATE, UNSEEN = 3.0, 3000.0, 10.0, 1.0
@@ -245,13 +248,15 @@ def remember_speed(f: Filter, own: Floats) -> None:
 @part
 def show(f: Filter) -> None:
     """After `innovate`: how far the ego may have gone unseen, the distance of its fix as far as that grew no faster
-    than the ego drives and fixes err."""
+    than the ego drives and fixes err; if faster, they have jumped until they are near again, and that is no slip."""
     far, noise = 0.0, 0.0
     for c in range(3):
         far += f.h.three[GAP + c] ** 2
         noise += f.h.three[VARIANCE + c]
     far, most = math.sqrt(far), f.ego[SPEED_OF_LATE] * f.ego[SPAN] + 2.0 * math.sqrt(noise)
     f.ego[SHOWN] = max(f.ego[SHOWN] + min(far - f.ego[BEFORE], most), 0.0)
+    if far - f.ego[BEFORE] > most or far < 2.0 * math.sqrt(noise):
+        f.ego[JUMPED] = 1.0 if far - f.ego[BEFORE] > most else 0.0
     f.ego[BEFORE] = far
 
 
@@ -289,9 +294,11 @@ def score(f: Filter, h: Rows, gate: float, whole: bool) -> None:
 
 @part
 def surprised(f: Filter) -> bool:
-    """Whether the first try's numbers are worse than usual by a standard deviation, or the ego may have slipped."""
+    """Whether the first try's numbers are worse than usual by a standard deviation, or the ego may have slipped; not
+    for fixes that jumped."""
     n = f.ego[NUMBERS]
-    return bool(f.ego[SLIPPED] > 0.1 or f.ego[SQUARES] > n + math.sqrt(2.0 * n))
+    strange = f.ego[SLIPPED] > 0.1 or f.ego[SQUARES] > n + math.sqrt(2.0 * n)
+    return bool(strange and f.ego[JUMPED] == 0.0)
 
 
 @part
