@@ -114,14 +114,10 @@ class Belief:
         return q
 
     def learn(self, h: Floats, z: Floats, r: Floats, share: float) -> None:
-        """Take a share of numbers' information, and of that the same share for errors of odometry."""
-        gap, s = z - h @ self.x, (h @ self.p @ h.T + np.diag(r)) / share
+        """Take a share of numbers' information."""
+        s = (h @ self.p @ h.T + np.diag(r)) / share
         gain = np.linalg.solve(s, h @ self.p).T
-        slow = [self.at(name) for name in self.names if name[0] == "o"]
-        for at in slow:
-            gain[at] *= share
-        less = gain @ h @ self.p
-        self.x, self.p = self.x + gain @ gap, self.p - less - less.T + gain @ s @ gain.T
+        self.x, self.p = self.x + gain @ (z - h @ self.x), self.p - gain @ s @ gain.T
 
     def average(self, i: int, prior: float, odds: float) -> None:
         """Number i is 0 or N(0, prior)."""

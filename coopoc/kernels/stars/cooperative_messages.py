@@ -72,7 +72,7 @@ from .gaussian import (
     update,
 )
 from .messages import block_at, three_of, vector_at
-from .otherwise import drive, hold, learn_fix, score, turned
+from .otherwise import drive, learn_fix, score, turned
 
 FADES = 5.0
 """s, after which a fix weighs 1 / e in the mean that is sent."""
@@ -273,7 +273,6 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
         f.member[k, LOCKED] = count(q, model.fix_gate, f.member[k, LOCKED], own / (own + noise))
     score(f, h, FIX_SCORE, True)
     correct(g, h, share)
-    hold(f, share)
     return share
 
 

@@ -68,7 +68,6 @@ from .gaussian import (
     TURN,
     TURNED,
     VARIANCE,
-    WHITE,
     Q,
     Rows,
     has,
@@ -115,29 +114,6 @@ def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt
     shift(g, i, i, keep - 1.0)
     for c in range(2):
         g.p[i + c, i + c] += (1.0 - keep * keep) * model.turn[c]
-
-
-@part
-def hold(f: Filter, share: float) -> None:
-    """After `correct` with that share of a fix: errors of odometry learn the share of what it says of them.
-
-    P' = P - K S K^T + (1 - share)^2 K_o S K_o^T in the block of these errors o.
-    """
-    g, h, wide = f.g, f.h, len(f.g.x)
-    if share >= 1.0:
-        return
-    for a in range(len(f.who)):
-        if f.who[a, VEHICLE] < 0 or not has(g, a, TURN):
-            continue
-        for i in range(3 * g.block[a, TURN], 3 * g.block[a, TURN] + 2):
-            for c in range(3):
-                g.x[i] -= (1.0 - share) * share * h.gain[c * wide + i] * h.three[WHITE + c]
-            for b in range(len(f.who)):
-                if f.who[b, VEHICLE] < 0 or not has(g, b, TURN):
-                    continue
-                for j in range(3 * g.block[b, TURN], 3 * g.block[b, TURN] + 2):
-                    for c in range(3):
-                        g.p[i, j] += (1.0 - share) ** 2 * share * h.gain[c * wide + i] * h.gain[c * wide + j]
 
 
 @part
