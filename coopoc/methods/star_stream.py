@@ -18,7 +18,6 @@ from ..kernels.motion import MotionNoise
 from ..kernels.stars.cooperative_state import (
     AGE,
     FIX_VARIANCE,
-    KEPT_VARIANCE,
     MOTION,
     ODOMETER,
     OWN,
@@ -27,7 +26,6 @@ from ..kernels.stars.cooperative_state import (
     SOLO_VARIANCE,
     SPEED,
     STEP,
-    TAU,
     TRUSTED,
     USED,
     WIDTH,
@@ -234,7 +232,6 @@ class StarStream:
             status = self._filter.status[number]
             status[:] = 0.0
             status[TRUSTED], status[USED], status[SINCE] = self._trusted, -math.inf, -math.inf
-            status[KEPT_VARIANCE : KEPT_VARIANCE + 3] = TAU**2
 
     def _reserve(self, slots: int, vehicles: int) -> None:
         """Room for a star of that many members, of that many vehicles."""

@@ -198,7 +198,7 @@ class Oracle:
 
     def blank(self) -> dict[str, Any]:
         empty: dict[str, Any] = {
-            name: {} for name in ("last", "since", "way", "joined", "hits", "mean", "kept", "slot", "pace", "locked")
+            name: {} for name in ("last", "since", "way", "joined", "hits", "mean", "slot", "pace", "locked")
         }
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.priors.fix_gate else {self.ego}
@@ -324,9 +324,6 @@ class Oracle:
             if j not in others or again or self.contradicted(t, j):
                 if j in others and j not in s["trusted"]:
                     self.doubt(j)
-                if ("b", j) in b.names:
-                    at = b.at(("b", j))
-                    s["kept"][j] = b.x[at].copy(), np.maximum(np.diag(b.p)[at], 0.01)
                 for kind in "xbo":
                     b.drop((kind, j))
                 s["members"].remove(j)
@@ -418,9 +415,8 @@ class Oracle:
         gap, own = z - h @ b.x, h @ b.p @ h.T
         square = float(gap @ np.linalg.solve(own + np.diag(r), gap))
         self.count(min(square, FIX_SCORE), np.linalg.slogdet(own + np.diag(r))[1], len(used))
-        quiet = math.exp(-min(s["level"][3 if j == self.ego else 5], 0.0))
-        total, gain, locked = np.trace(own) + r.sum(), np.trace(own) / (np.trace(own) + r.sum()), s["locked"]
-        q = min(square, float(gap @ gap) / SLIP) * total / (np.trace(own) + quiet * r.sum())
+        gain, locked = np.trace(own) / (np.trace(own) + r.sum()), s["locked"]
+        q = min(square, float(gap @ gap) / SLIP)
         share, hits = 1.0, locked.get(j, 0.0)
         if g.fix_gate:
             if q > g.fix_gate and hits < PATIENCE:
@@ -457,7 +453,6 @@ class Oracle:
         s = self.state
         s["trusted"].discard(j)
         s["mean"].pop(j, None)
-        s["kept"].pop(j, None)
         if ("x", j) in s["belief"].names:
             s["belief"].drop(("b", j))
             s["belief"].add(("b", j), 0.0, TAU**2 + self.life.own)
@@ -591,11 +586,9 @@ class Oracle:
         s["locked"].pop(j, None)
         s["way"].pop(j, None)
         self.add_turn(j)
-        if j not in s["trusted"]:
-            mean, variance = s["kept"].get(j, (np.zeros(3), np.full(3, TAU**2)))
-            b.add(("b", j), mean, variance + self.life.own)
-        elif self.life.own:
-            b.add(("b", j), 0.0, self.life.own)
+        variance = self.life.own + (0.0 if j in s["trusted"] else TAU**2)
+        if variance:
+            b.add(("b", j), 0.0, variance)
 
     def measure(self, t: int, at: dict[int, Floats], order: list[int], relative: Any, messages: Any) -> None:
         """Linear at the prediction."""

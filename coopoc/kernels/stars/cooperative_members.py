@@ -17,8 +17,6 @@ from .cooperative_state import (
     HITS,
     INPUT,
     JOINED,
-    KEPT,
-    KEPT_VARIANCE,
     LOCKED,
     LOUDER,
     MOTION,
@@ -31,6 +29,7 @@ from .cooperative_state import (
     SPEED,
     STEPS,
     SURPRISE,
+    TAU,
     TRUSTED,
     VAGUE,
     VEHICLE,
@@ -69,11 +68,6 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, co
             continue
         if f.who[k, INPUT] >= 0 and f.status[j, TRUSTED] == 0.0:  # the error was estimated beside a wrong position
             doubt(f, model, j)
-        if has(f.g, k, ERROR):
-            first = 3 * f.g.block[k, ERROR]
-            for c in range(3):
-                f.status[j, KEPT + c] = f.g.x[first + c]
-                f.status[j, KEPT_VARIANCE + c] = max(f.g.p[first + c, first + c], 0.01)
         for kind in range(KINDS):
             remove(f.g, k, kind)
         f.slot[j], f.who[k, VEHICLE] = ABSENT, ABSENT
@@ -175,10 +169,6 @@ def join(f: Filter, model: Model, rows: Floats, vehicle: int, row: int) -> None:
         for c in range(3):
             g.x[first + c] -= age * rows[row, SPEED + c]
     insert_turn(g, model, k)
-    if f.status[vehicle, TRUSTED] == 0.0:
-        error = insert(g, k, ERROR, 0.0)
-        for c in range(3):
-            g.x[error + c] = f.status[vehicle, KEPT + c]
-            g.p[error + c, error + c] = f.status[vehicle, KEPT_VARIANCE + c] + model.own
-    elif model.own > 0.0:
-        insert(g, k, ERROR, model.own)
+    variance = model.own + (TAU**2 if f.status[vehicle, TRUSTED] == 0.0 else 0.0)
+    if variance > 0.0:
+        insert(g, k, ERROR, variance)

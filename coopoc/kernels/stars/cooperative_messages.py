@@ -16,7 +16,6 @@ from .cooperative_state import (
     AGE,
     CLOCK,
     COUNT,
-    FIXES,
     INPUT,
     LAST,
     LEVEL,
@@ -266,8 +265,6 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
         if h.block[MEASURED + c]:
             own, noise = own + h.matrix[COV + 4 * c], noise + h.three[VARIANCE + c]
     share = 1.0
-    quiet = math.exp(-min(f.ego[LEVEL + (FIXES if k == 0 else MESSAGES)], 0.0))
-    q *= (own + noise) / (own + quiet * noise)  # fixes that agree better than is assumed are as wrong as any, together
     if model.fix_gate > 0.0:
         share = 1.0 / inflation(q, model.fix_gate, f.member[k, LOCKED])
         f.member[k, LOCKED] = count(q, model.fix_gate, f.member[k, LOCKED], own / (own + noise))

@@ -37,23 +37,9 @@ FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, OWN = 0, 3, 6, 9, 12, 13
 RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
 """Of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none held), mean of its fixes m and its
 variance m^2, sum of all motions m, velocity m/s, the variance of one step's motion m^2, and that of a fix m^2."""
-TRUSTED, COUNT, USED, MEAN, KEPT, KEPT_VARIANCE, LAST, PACE, SINCE, SLIPS, REVOKED, LOUDER, STATUS = (
-    0,
-    1,
-    2,
-    3,
-    6,
-    9,
-    12,
-    21,
-    27,
-    28,
-    29,
-    30,
-    32,
-)
+TRUSTED, COUNT, USED, MEAN, LAST, PACE, SINCE, SLIPS, REVOKED, LOUDER, STATUS = 0, 1, 2, 3, 6, 15, 21, 22, 23, 24, 28
 """Of a vehicle's status: whether its fixes are assumed to be right, fixes in the mean innovation, when its last message
-that was used was sent s (-inf for none), mean innovation m, error of its fixes when it left m and its variance m^2, and
+that was used was sent s (-inf for none), mean innovation m, and
 SOLO, SOLO_VARIANCE and ODOMETER of that message; its last plausible velocity m/s, the variance of one step's
 motion with it m^2, when that was s (-inf for never), how many in a row were not, how often it lost trust, and by which
 share of what is assumed the variance of its velocities is more."""
@@ -228,8 +214,6 @@ def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: i
             f.status[j, c] = 0.0
         f.status[j, TRUSTED] = 1.0 if model.fix_gate == 0.0 or j == ego else 0.0
         f.status[j, USED] = f.status[j, SINCE] = -math.inf
-        for c in range(3):
-            f.status[j, KEPT_VARIANCE + c] = TAU**2
     f.who[0, VEHICLE], f.slot[ego] = ego, 0
     insert(f.g, 0, PLACE, 0.0)
     if model.common > 0.0:
@@ -320,8 +304,7 @@ def doubt(f: Filter, model: Model, j: int) -> None:
     """The fixes of vehicle j have an error of which nothing is known."""
     f.status[j, TRUSTED] = f.status[j, COUNT] = 0.0
     for c in range(3):
-        f.status[j, MEAN + c] = f.status[j, KEPT + c] = 0.0
-        f.status[j, KEPT_VARIANCE + c] = TAU**2
+        f.status[j, MEAN + c] = 0.0
     if f.slot[j] >= 0:
         remove(f.g, f.slot[j], ERROR)
         insert(f.g, f.slot[j], ERROR, TAU**2 + model.own)
