@@ -123,6 +123,15 @@ def test_noisy_odometers_are_no_wild_ones(most: int) -> None:
         assert ours < joint
 
 
+def test_seldom_messages_raise_no_level_of_motion() -> None:
+    """Law: neighbours that send every three seconds say nothing of the ego's odometer (it had 0.55 m)."""
+    fleet, egos = load_fleet("town10"), [24, 36]
+    seen = observe(fleet, S2, V2X(10, bytes_per_second=200, schedule="round robin"), runs=4, observers=egos)
+    track = CooperativeFilter()(seen, egos)
+    assert track.extras["motion_level"].max() < 1.5
+    assert rt_le(track, fleet).mean() < 0.46
+
+
 @pytest.mark.parametrize("factor", [0.0, 0.5, 2.0])
 @pytest.mark.parametrize("most", [0, 4])
 def test_wheels_that_slip_leave_the_way_as_it_is(most: int, factor: float) -> None:

@@ -64,6 +64,19 @@ def test_millimetres_and_wheels_of_robots_are_named(tmp_path: Path) -> None:
     assert "ranges" not in text
 
 
+@pytest.mark.parametrize("seed", [1, 2, 3])
+def test_the_filter_is_near_one_that_knows_the_faults(tmp_path: Path, seed: int) -> None:
+    """The reference: the same filter on the same drive without what was planted, the tunnel but."""
+    told = "clock=drone1:0.3,drone3:-0.12&offset=auto"
+    for kind, fault, options in (("car", CONVOY, ""), ("drone", DRONES, f"?{told}")):
+        errors = []
+        for name, planted, more in (("a", fault, options), ("b", {"tunnel": fault.get("tunnel", (-1, -1))}, "")):
+            log = load_log(f"{strange(tmp_path / (kind + name), kind, seed, **planted)}{more}")
+            assert log.truth is not None
+            errors.append(float(co.rt_le(co.CooperativeFilter()(log.recording, log.recording.ids), log.truth).mean()))
+        assert errors[0] < 1.3 * errors[1]
+
+
 @pytest.mark.parametrize("kind", ["drone", "car", "robot"])
 def test_nothing_is_named_in_clean_logs(tmp_path: Path, kind: str) -> None:
     rng, named = np.random.default_rng(len(kind)), []

@@ -32,7 +32,7 @@ FOUND = {
     "range offset": "m",
     "slips": "of the steps",
 }
-LEVELS = ("range", "azimuth", "inclination", "fix", "motion", "message")
+LEVELS = ("range", "azimuth", "inclination", "fix", "message", "motion")
 NOTED = (0.01, 0.01, 0.01, 0.1, 0.01)
 """Least of what is found that is worth a note."""
 LOUD = 1.5

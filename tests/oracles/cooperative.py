@@ -202,7 +202,7 @@ class Oracle:
         }
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.priors.fix_gate else {self.ego}
-        levels = {"level": np.zeros(6), "learned": np.zeros(6), "information": np.zeros(6), "made": 0.0}
+        levels = {"level": np.zeros(5), "learned": np.zeros(5), "information": np.zeros(5)}
         levels |= {"louder": {}, "shown": 0.0, "far": 0.0, "course": np.zeros(3), "blind": 0.0, "jumped": False}
         levels |= {"slips": 0.0, "speed": 0.0, "score": 0.0, "numbers": 0, "squares": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
@@ -281,22 +281,12 @@ class Oracle:
 
     def louder(self, j: int) -> float:
         """Level of a vehicle's motion."""
-        return math.exp(self.state["level"][4]) * float(self.state["louder"].get(j, 1.0))
+        return float(self.state["louder"].get(j, 1.0))
 
     def learn(self, kind: int, more: float, share: float, numbers: int = 1) -> None:
         """What innovations show of a level: derivative and information of their log-likelihood."""
         self.state["learned"][kind] += 0.5 * numbers * share * more
         self.state["information"][kind] += 0.5 * numbers * share**2
-
-    def own_variance(self) -> Any:
-        at = self.state["belief"].at(("x", self.ego))
-        return np.diag(self.state["belief"].p)[at].sum()
-
-    def corrected(self) -> None:
-        """What the level of motion makes of the ego's variance, after an update."""
-        s, now = self.state, self.own_variance()
-        s["made"] = min(s["made"] * (now / self.before) ** 2, now)
-        self.before = now
 
     def step(self, t: int, slip: float) -> None:
         self.state |= {"score": 0.0, "numbers": 0, "squares": 0.0}
@@ -334,8 +324,6 @@ class Oracle:
             x = b.at(("x", self.ego))
             across = min(SIDEWAYS + (TURNS * s["blind"]) ** 2, 1.0)
             b.p[x, x] += slip * (across * np.eye(3) + np.outer(s["course"], s["course"]))
-        s["made"] = s["made"] + q.sum()
-        self.before = self.own_variance()
         for j in [j for j in others if j not in s["members"]]:
             self.join(t, j, messages[j], relative[j])
         if np.isfinite(fix).all():
@@ -354,11 +342,10 @@ class Oracle:
             s["way"][j] = self.goes_on(t, j, messages[j])[0]
         if g.fix_gate:
             self.trust()
-        self.corrected()
         if g.forget:
             step = np.clip(s["learned"] / (s["information"] + PRIOR), -FASTEST, FASTEST)
             s["level"] = np.clip(s["level"] + step, QUIETEST, LOUDEST)
-        s["learned"] = np.zeros(6)
+        s["learned"] = np.zeros(5)
         s["information"] = s["information"] * (math.exp(-dt / g.forget) if g.forget else 1.0)
 
     def add_fix(self, t: int, fix: Floats) -> None:
@@ -373,15 +360,12 @@ class Oracle:
             s["shown"], s["far"] = max(s["shown"] + min(far - s["far"], most), 0.0), far
         share = self.use_fix(t, self.ego, rows, True)
         s["hits"]["fix"] = s["hits"]["fix"] + 1 if share < 1 else 0
-        self.corrected()
 
     def learn_fix(self, kind: int, rows: list[Any]) -> None:
         _, gap, cov, r = self.mahalanobis(self.state["belief"], rows)
         total = np.trace(cov) + r.sum()
         more = min(gap @ gap / total, SUDDEN) - 1.0
         self.learn(kind, more, r.sum() / total, 3)
-        if kind == 3 and gap @ gap < SUDDEN * total:
-            self.learn(4, more, self.state["made"] / total, 3)
 
     def mahalanobis(self, b: Belief, rows: list[Any]) -> tuple[float, Floats, Floats, Floats]:
         """Squared distance and innovations of rows, their covariance without noise, and the noise's variance."""
@@ -648,7 +632,6 @@ class Oracle:
                 self.count(min(q, GATE), log, 1)
                 hits[c] = hits[c] + 1 if g.fix_gate and q > GATE else 0
                 self.learn(c, min(q, SUDDEN) - USUAL, r[c] / total[c])
-                self.learn(4, min(q, SUDDEN) - USUAL, rows[c] @ rows[c] * s["made"] / 3 / total[c])
         s["vague"].discard(j)
 
     def receive(self, t: int, j: int, message: Sent | None, relative: Floats) -> Sent | None:
@@ -670,7 +653,7 @@ class Oracle:
         b.noise(("x", j), half * spent)
         rows = [self.said(message, last, j, q, moved, steps, follows, c) for c in range(3)]
         if last and j not in s["vague"] and j in s["trusted"] and None not in rows:
-            self.learn_fix(5, rows)
+            self.learn_fix(4, rows)
         self.use_fix(t, j, rows, last is not None)
         b.noise(("x", j), (1 - half) * spent)
         s["last"][j], s["since"][j] = message, message.step
@@ -683,7 +666,7 @@ class Oracle:
         old = old if weight > old * (1 - 1e-9) else 0.0
         if weight - old <= 1e-9 * weight or not weight:
             return None
-        louder, long = math.exp(self.state["level"][5]), 1 / (1 - fade**2)
+        louder, long = math.exp(self.state["level"][4]), 1 / (1 - fade**2)
         white = louder * self.white[c] / (weight - old)
         if old:
             before = last.mean[c] + moved[c]

@@ -61,7 +61,7 @@ WINDOW, CONTRADICTED = 30.0, 30.0
 anew."""
 ACCELERATION = 5.0
 """m/s^2, of a vehicle at most, and of a member since it sent its newest message."""
-FIXES, MOTIONS, MESSAGES, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 6, 11
+FIXES, MESSAGES, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 11
 """Kinds of numbers that have a level, behind ranges, azimuths and inclinations; how many, and how much is found."""
 
 
@@ -132,8 +132,8 @@ it was there, s, which is when it sent its newest message; the step at which it 
 that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of its fixes; and, out, the squared
 normalised innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing
 was: the ego's are those of its fix."""
-STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
-LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, EGO = 18, 24, 30, 36, 47, 50, 59
+STEPS, CLOCK, SPAN, SLIPPING = range(4)
+LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, EGO = 16, 21, 26, 31, 42, 45, 54
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
 of motion makes, and the whole then; thirteen numbers of `otherwise` on slips; by kind of number the logarithm of its
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
