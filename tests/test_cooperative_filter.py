@@ -163,6 +163,20 @@ def test_a_receiver_that_jumps_beside_neighbours_is_not_followed(step: int) -> N
         assert ours < 1.6 * joint
 
 
+@pytest.mark.parametrize("most", [1, 2])
+@pytest.mark.parametrize(("std", "off"), [(0.5, 10.0), (3.5, 30.0), (3.5, 100.0)])
+def test_a_wrong_start_is_left_soon_after_it(most: int, std: float, off: float) -> None:
+    """Law: fixes that are wrong for the first 10 s leave an ego with neighbours where it is 10 s later; beside one it
+    stayed off for good, neither receiver being trusted."""
+    fleet = load_fleet("town10").between(0, 300)
+    seen = observe(fleet, replace(S2, gnss_std=(std,) * 3), V2X(most, radius=100.0), runs=3, seed=7, observers=[24])
+    gnss = seen.gnss.copy()
+    gnss[:, :100, 24] += [0.8 * off, -0.6 * off, 0.0]
+    track = CooperativeFilter()(replace(seen, gnss=gnss), [24])
+    late = np.linalg.norm(track.x[:, 200:, 0] - fleet.position[200:, 24], axis=-1)
+    assert late.max() < 2.0 + std
+
+
 def test_neighbours_that_send_nothing_judge_no_receiver() -> None:
     """Law: beside vehicles that are measured and silent an ego is alone, whatever its odometer says for a while."""
     fleet = load_fleet("town10").between(0, 400)

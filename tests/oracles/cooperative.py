@@ -26,6 +26,7 @@ from coopoc.kernels.stars.cooperative_state import (
     SURE,
     SURPRISE,
     TAU,
+    WILD,
     WINDOW,
 )
 from coopoc.kernels.stars.otherwise import (
@@ -479,7 +480,8 @@ class Oracle:
             return False
         if self.ego in s["trusted"]:
             return bool(s["hits"]["fix"] >= 2 and t - s["joined"][self.ego] - s["hits"]["fix"] <= 1)
-        return len(held) >= 2
+        far = np.square(s["belief"].x[s["belief"].at(("b", self.ego))]).sum()
+        return len(held) >= 2 or bool(len(held) == 1 and far > WILD * (self.r[t, self.ego] @ self.white) / 3)
 
     def contradicted(self, t: int, j: int) -> bool:
         hits, since = self.state["hits"][("relative", j)], t - self.state["joined"][j]
@@ -497,8 +499,8 @@ class Oracle:
         changed = (ACCELERATION * max(t - since, 1) * dt) ** 2
         strange = ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum()
         if g.forget:
-            louder[j] = max(louder.get(j, 1.0) * (1 + (min(strange, SURPRISE) / 3 - 1) / CHANGES), 1.0)
-        if g.slip * (self.known.sensors is not None) and g.fix_gate and strange > 2 * g.fix_gate and slips < 5:
+            louder[j] = max(louder.get(j, 1.0) * (1 + (min(strange, SURPRISE) / 3 - 1) / min(t + 1, CHANGES)), 1.0)
+        if g.slip * (self.known.sensors is not None) and g.fix_gate and strange > WILD and slips < 5:
             self.state["pace"][j] = last, since, variance, slips + 1
             return last, variance + changed * dt**2
         self.state["pace"][j] = u, t, q, 0

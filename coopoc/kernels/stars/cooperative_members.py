@@ -35,6 +35,7 @@ from .cooperative_state import (
     VEHICLE,
     WAY,
     WHEN,
+    WILD,
     Filter,
     Model,
     across,
@@ -60,7 +61,7 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, co
     for i in range(count):
         if f.slot[vehicles[i]] >= 0:
             f.who[f.slot[vehicles[i]], INPUT] = i
-    again = model.fix_gate > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX]) and lost(f)
+    again = model.fix_gate > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX]) and lost(f, model, own)
     again = again and start(f, model, own, rows, count)
     for k in range(1, len(f.who)):
         j = f.who[k, VEHICLE]
@@ -128,9 +129,9 @@ def steady(f: Filter, model: Model, j: int, given: Floats, first: int, variance:
         gap = unit * given[first + c] - status[PACE + c]
         q += gap * gap / ((given[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
     if model.forget > 0.0:
-        more = (min(q, SURPRISE) / 3.0 - 1.0) / CHANGES
+        more = (min(q, SURPRISE) / 3.0 - 1.0) / min(f.ego[STEPS] + 1.0, CHANGES)
         status[LOUDER] = max(status[LOUDER] + (1.0 + status[LOUDER]) * more, 0.0)
-    if model.slip > 0.0 and 0.0 < 2.0 * model.fix_gate < q and status[SLIPS] < SLIPPED:
+    if model.slip > 0.0 and model.fix_gate > 0.0 and q > WILD and status[SLIPS] < SLIPPED:
         status[SLIPS] += 1.0
         for c in range(3):
             given[first + c], given[variance + c] = status[PACE + c] / unit, status[PACE + 3 + c] + changed * dt * dt

@@ -45,10 +45,12 @@ motion with it m^2, when that was s (-inf for never), how many in a row were not
 share of what is assumed the variance of its velocities is more."""
 NO_POSITION = 1e200
 """m^2, variance of the mean of no fixes."""
-SLIPPED = 5.0
-"""Implausible velocities in a row after which one counts again."""
+SLIPPED, WILD = 5.0, 32.0
+"""Implausible velocities in a row after which one counts again, and the squared normalised distance from which a
+velocity is, or an error of fixes, beyond doubt."""
 CHANGES, SURPRISE = 20.0, 9.0
-"""Velocities in the level of their noise, and the most of a squared normalised change of velocity that counts in it."""
+"""Velocities in the level of their noise, fewer at first, and the most of a squared normalised change of velocity that
+counts in it."""
 
 
 TAU, SHARE = 20.0, 0.1
@@ -270,9 +272,10 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
 
 
 @part
-def lost(f: Filter) -> bool:
+def lost(f: Filter, model: Model, own: Floats) -> bool:
     """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either all fixes but the first
-    contradict it, or its receiver is not trusted beside others that are not."""
+    contradict it, or its receiver is not trusted beside others that are not; one other suffices where the error of
+    the ego's fixes would be beyond all doubt."""
     ego, others = f.who[0, VEHICLE], 0
     for k in range(1, len(f.who)):
         j = f.who[k, VEHICLE]
@@ -282,7 +285,12 @@ def lost(f: Filter) -> bool:
             others += 1
     hits = f.who[0, HITS]
     young = hits >= 2 and f.ego[STEPS] - f.member[0, JOINED] - hits <= 1
-    return bool(young if f.status[ego, TRUSTED] > 0.0 else others >= 2)
+    if f.status[ego, TRUSTED] > 0.0:
+        return bool(young)
+    far, noise, first = 0.0, 0.0, 3 * f.g.block[0, ERROR]
+    for c in range(3):
+        far, noise = far + f.g.x[first + c] ** 2, noise + own[FIX_VARIANCE + c] / 3.0
+    return bool(others >= 2 or (others == 1 and far > WILD * noise))
 
 
 @part
