@@ -83,11 +83,11 @@ def test_calibration_helps_where_deviations_are_wrong(method: Any) -> None:
     recording, fleet = drive(0, 10.0, 1 / 3)
     fitted = method.fitted(recording.between(0, 900), fleet.between(0, 900))
     rest, truth = recording.between(900, 1800), fleet.between(900, 1800)
-    kalman = method is Kalman
-    assert rt_le(method()(rest), truth) < (1.01 if kalman else 0.5) * rt_le(Kalman()(rest), truth)
-    assert rt_le(fitted(rest), truth) < (0.8 if kalman else 1.01) * rt_le(method()(rest), truth)
+    usual, alone = rt_le(method()(rest), truth), rt_le(Kalman()(rest), truth)
+    assert rt_le(fitted(rest), truth) < min(0.39 * alone, usual)
+    assert method is Kalman or usual < 0.4 * alone
     blind = method.fitted(recording.between(0, 900))
-    assert rt_le(blind(rest), truth) < (0.9 if kalman else 1.05) * rt_le(method()(rest), truth)
+    assert rt_le(blind(rest), truth) < (0.9 if method is Kalman else 1.05) * usual
 
 
 @pytest.mark.parametrize("with_truth", [False, True])
@@ -161,6 +161,6 @@ def test_alone_it_is_the_best_on_real_roads(task: str) -> None:
     )
     others = usual["rt_le_m"][0], usual["calibrated_m"][0], adaptive["rt_le_m"][0]
     assert mine["rt_le_m"][0] < min(others)
-    assert 0.2 < mine["nees"] < 4.0
+    assert 0.35 < mine["nees"] < 4.0
     for row in (mine, usual):
         assert row["calibrated_m"][0] <= row["rt_le_m"][2]

@@ -24,7 +24,6 @@ from coopoc.kernels.stars.cooperative_state import (
     REVOKE,
     SHARE,
     SURE,
-    SURPRISE,
     TAU,
     WILD,
     WINDOW,
@@ -203,7 +202,7 @@ class Oracle:
         }
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.priors.fix_gate else {self.ego}
-        levels = {"level": np.zeros(5), "learned": np.zeros(5), "information": np.zeros(5)}
+        levels = {"level": np.zeros(6), "learned": np.zeros(6), "information": np.zeros(6), "made": 0.0}
         levels |= {"louder": {}, "shown": 0.0, "far": 0.0, "course": np.zeros(3), "blind": 0.0, "jumped": False}
         levels |= {"slips": 0.0, "speed": 0.0, "score": 0.0, "numbers": 0, "squares": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
@@ -282,12 +281,22 @@ class Oracle:
 
     def louder(self, j: int) -> float:
         """Level of a vehicle's motion."""
-        return float(self.state["louder"].get(j, 1.0))
+        return math.exp(self.state["level"][5]) * float(self.state["louder"].get(j, 1.0))
 
     def learn(self, kind: int, more: float, share: float, numbers: int = 1) -> None:
         """What innovations show of a level: derivative and information of their log-likelihood."""
         self.state["learned"][kind] += 0.5 * numbers * share * more
         self.state["information"][kind] += 0.5 * numbers * share**2
+
+    def own_variance(self) -> Any:
+        at = self.state["belief"].at(("x", self.ego))
+        return np.diag(self.state["belief"].p)[at].sum()
+
+    def corrected(self) -> None:
+        """What the level of motion makes of the ego's variance, after an update."""
+        s, now = self.state, self.own_variance()
+        s["made"] = min(s["made"] * (now / self.before) ** 2, now)
+        self.before = now
 
     def step(self, t: int, slip: float) -> None:
         self.state |= {"score": 0.0, "numbers": 0, "squares": 0.0}
@@ -325,6 +334,8 @@ class Oracle:
             x = b.at(("x", self.ego))
             across = min(SIDEWAYS + (TURNS * s["blind"]) ** 2, 1.0)
             b.p[x, x] += slip * (across * np.eye(3) + np.outer(s["course"], s["course"]))
+        s["made"] = s["made"] + q.sum()
+        self.before = self.own_variance()
         for j in [j for j in others if j not in s["members"]]:
             self.join(t, j, messages[j], relative[j])
         if np.isfinite(fix).all():
@@ -343,10 +354,11 @@ class Oracle:
             s["way"][j] = self.goes_on(t, j, messages[j])[0]
         if g.fix_gate:
             self.trust()
+        self.corrected()
         if g.forget:
             step = np.clip(s["learned"] / (s["information"] + PRIOR), -FASTEST, FASTEST)
             s["level"] = np.clip(s["level"] + step, QUIETEST, LOUDEST)
-        s["learned"] = np.zeros(5)
+        s["learned"] = np.zeros(6)
         s["information"] = s["information"] * (math.exp(-dt / g.forget) if g.forget else 1.0)
 
     def add_fix(self, t: int, fix: Floats) -> None:
@@ -361,12 +373,15 @@ class Oracle:
             s["shown"], s["far"] = max(s["shown"] + min(far - s["far"], most), 0.0), far
         share = self.use_fix(t, self.ego, rows, True)
         s["hits"]["fix"] = s["hits"]["fix"] + 1 if share < 1 else 0
+        self.corrected()
 
     def learn_fix(self, kind: int, rows: list[Any]) -> None:
         _, gap, cov, r = self.mahalanobis(self.state["belief"], rows)
         total = np.trace(cov) + r.sum()
         more = min(gap @ gap / total, SUDDEN) - 1.0
         self.learn(kind, more, r.sum() / total, 3)
+        if kind == 3 and gap @ gap < SUDDEN * total:
+            self.learn(5, more, self.state["made"] / total, 3)
 
     def mahalanobis(self, b: Belief, rows: list[Any]) -> tuple[float, Floats, Floats, Floats]:
         """Squared distance and innovations of rows, their covariance without noise, and the noise's variance."""
@@ -479,7 +494,9 @@ class Oracle:
         if any(j in s["trusted"] for j in held):
             return False
         if self.ego in s["trusted"]:
-            return bool(s["hits"]["fix"] >= 2 and t - s["joined"][self.ego] - s["hits"]["fix"] <= 1)
+            hits = s["hits"]["fix"]
+            young = hits >= 2 and t - s["joined"][self.ego] - hits <= 1
+            return bool(young or (hits > 0 and s["locked"].get(self.ego, 0.0) >= PATIENCE))
         far = np.square(s["belief"].x[s["belief"].at(("b", self.ego))]).sum()
         return len(held) >= 2 or bool(len(held) == 1 and far > WILD * (self.r[t, self.ego] @ self.white) / 3)
 
@@ -499,7 +516,7 @@ class Oracle:
         changed = (ACCELERATION * max(t - since, 1) * dt) ** 2
         strange = ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum()
         if g.forget:
-            louder[j] = max(louder.get(j, 1.0) * (1 + (min(strange, SURPRISE) / 3 - 1) / min(t + 1, CHANGES)), 1.0)
+            louder[j] = max(louder.get(j, 1.0) * (1 + (min(strange / 3, SUDDEN) - 1) / min(t + 1, CHANGES)), 1.0)
         if g.slip * (self.known.sensors is not None) and g.fix_gate and strange > WILD and slips < 5:
             self.state["pace"][j] = last, since, variance, slips + 1
             return last, variance + changed * dt**2

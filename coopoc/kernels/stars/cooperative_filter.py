@@ -93,9 +93,11 @@ from .otherwise import (
     adapt,
     average,
     chance,
+    corrected,
     learn_fix,
     learn_relative,
     louder,
+    moved,
     new_tries,
     remember_speed,
     score,
@@ -255,6 +257,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     steady(f, model, f.who[0, VEHICLE], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
     if f.ego[STEPS] > f.member[0, JOINED]:
         predict(f, model, own)
+    moved(f, own)
     for i in range(count):
         if f.slot[vehicles[i]] < 0:
             join(f, model, rows, vehicles[i], i)
@@ -279,6 +282,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     if model.fix_gate > 0.0:
         trust(f, model)
     f.ego[STEPS] += 1
+    corrected(f)
     adapt(f, model)
 
 
@@ -331,6 +335,7 @@ def add_fix(f: Filter, model: Model, own: Floats) -> None:
         show(f)
     f.member[0, OUT + 3] = share = use_fix(f, model, 0, True, q)
     f.who[0, HITS] = f.who[0, HITS] + 1 if share < 1.0 else 0
+    corrected(f)
 
 
 @inside

@@ -14,6 +14,7 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import inside, part, storage
 from ..compiling.vectors import LANES, put, take
+from ..gate import PATIENCE
 from .gaussian import (
     ABSENT,
     COMMON,
@@ -48,9 +49,8 @@ NO_POSITION = 1e200
 SLIPPED, WILD = 5.0, 32.0
 """Implausible velocities in a row after which one counts again, and the squared normalised distance from which a
 velocity is, or an error of fixes, beyond doubt."""
-CHANGES, SURPRISE = 20.0, 9.0
-"""Velocities in the level of their noise, fewer at first, and the most of a squared normalised change of velocity that
-counts in it."""
+CHANGES = 20.0
+"""Velocities in the level of their noise, fewer at first."""
 
 
 TAU, SHARE = 20.0, 0.1
@@ -63,7 +63,7 @@ WINDOW, CONTRADICTED = 30.0, 30.0
 anew."""
 ACCELERATION = 5.0
 """m/s^2, of a vehicle at most, and of a member since it sent its newest message."""
-FIXES, MESSAGES, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 11
+FIXES, MESSAGES, MOTIONS, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 6, 11
 """Kinds of numbers that have a level, behind ranges, azimuths and inclinations; how many, and how much is found."""
 
 
@@ -134,8 +134,8 @@ it was there, s, which is when it sent its newest message; the step at which it 
 that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of its fixes; and, out, the squared
 normalised innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing
 was: the ego's are those of its fix."""
-STEPS, CLOCK, SPAN, SLIPPING = range(4)
-LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, EGO = 16, 21, 26, 31, 42, 45, 54
+STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
+LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, EGO = 18, 24, 30, 36, 47, 50, 59
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
 of motion makes, and the whole then; thirteen numbers of `otherwise` on slips; by kind of number the logarithm of its
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
@@ -274,8 +274,9 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
 @part
 def lost(f: Filter, model: Model, own: Floats) -> bool:
     """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either all fixes but the first
-    contradict it, or its receiver is not trusted beside others that are not; one other suffices where the error of
-    the ego's fixes would be beyond all doubt."""
+    contradict it, or fixes have for so long that they would be used again (and turn its odometry towards them), or its
+    receiver is not trusted beside others that are not; one other suffices where the error of the ego's fixes would be
+    beyond all doubt."""
     ego, others = f.who[0, VEHICLE], 0
     for k in range(1, len(f.who)):
         j = f.who[k, VEHICLE]
@@ -286,7 +287,7 @@ def lost(f: Filter, model: Model, own: Floats) -> bool:
     hits = f.who[0, HITS]
     young = hits >= 2 and f.ego[STEPS] - f.member[0, JOINED] - hits <= 1
     if f.status[ego, TRUSTED] > 0.0:
-        return bool(young)
+        return bool(young or (hits > 0 and f.member[0, LOCKED] >= PATIENCE))
     far, noise, first = 0.0, 0.0, 3 * f.g.block[0, ERROR]
     for c in range(3):
         far, noise = far + f.g.x[first + c] ** 2, noise + own[FIX_VARIANCE + c] / 3.0

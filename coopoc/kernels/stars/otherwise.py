@@ -12,8 +12,9 @@ Wheels slip along the way.
 *Levels*: by how much the variance of each kind of number differs from what is assumed, as its innovations show. The
 log-likelihood of an innovation v ~ N(0, S) has the derivative s (v^2 / S - 1) / 2 by the logarithm of a level, with s
 the share of S that the level makes, and the information s^2 / 2. Each step moves a level by the sum of its derivatives
-over their information, which is forgotten in `Model.forget` s. Changes of velocity show the level of each vehicle's
-motion, if it is more than is assumed.
+over their information, which is forgotten in `Model.forget` s. Of the ego's motion the share is D = dP / d log level,
+which a step of prediction makes D + q, and an update D (P+ / P-)^2; changes of velocity show the level of each
+vehicle's motion earlier, if it is more than is assumed.
 
 References:
     Friedland, Treatment of bias in recursive filtering, IEEE TAC 14(4), 1969; Mitchell, Beauchamp, Bayesian variable
@@ -35,12 +36,15 @@ from .cooperative_state import (
     COVARIANCE,
     DT,
     FIX_VARIANCE,
+    FIXES,
     INFORMATION,
     KINDS_OF_NUMBERS,
     LEVEL,
     LOUDER,
+    MADE,
     MOTION,
     MOTION_VARIANCE,
+    MOTIONS,
     OWN,
     SLIPPING,
     SLOPE,
@@ -48,6 +52,7 @@ from .cooperative_state import (
     STEP,
     TOLD,
     VEHICLE,
+    WHOLE,
     WIDTH,
     Filter,
     Model,
@@ -148,7 +153,7 @@ def average(f: Filter, model: Model) -> None:
     f.ego[TOLD + SLIPS] = f.ego[SLIPPED]
     for kind in range(KINDS_OF_NUMBERS):
         f.ego[TOLD + LEVELS + kind] = math.exp(0.5 * f.ego[LEVEL + kind])
-    f.ego[TOLD + LEVELS + KINDS_OF_NUMBERS] = math.sqrt(1.0 + f.status[f.who[0, VEHICLE], LOUDER])
+    f.ego[TOLD + LEVELS + MOTIONS] *= math.sqrt(1.0 + f.status[f.who[0, VEHICLE], LOUDER])
 
 
 @part
@@ -291,11 +296,35 @@ PRIOR = 10.0
 
 @part
 def louder(f: Filter, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
-    """Multiply the variances of a step's motions by the level of each vehicle's velocities."""
+    """Multiply the variances of a step's motions by their level, and by that of each vehicle's velocities."""
+    level = math.exp(f.ego[LEVEL + MOTIONS])
     for c in range(3):
-        own[MOTION_VARIANCE + c] *= 1.0 + f.status[f.who[0, VEHICLE], LOUDER]
+        own[MOTION_VARIANCE + c] *= level * (1.0 + f.status[f.who[0, VEHICLE], LOUDER])
         for i in range(count):
-            rows[i, STEP + c] *= 1.0 + f.status[vehicles[i], LOUDER]
+            rows[i, STEP + c] *= level * (1.0 + f.status[vehicles[i], LOUDER])
+
+
+@part
+def moved(f: Filter, own: Floats) -> None:
+    """After the ego's prediction: D + q, both of the three axes together, so that no axis of the world counts."""
+    f.ego[MADE] += own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
+    f.ego[WHOLE] = ego_variance(f)
+
+
+@part
+def corrected(f: Filter) -> None:
+    """After an update of the ego: D (P+ / P-)^2."""
+    p, before = ego_variance(f), f.ego[WHOLE]
+    f.ego[MADE] = min(f.ego[MADE] * (p / before) ** 2, p) if before > 0.0 else 0.0
+    f.ego[WHOLE] = p
+
+
+@part
+def ego_variance(f: Filter) -> float:
+    """m^2, of the three axes together."""
+    first = 3 * f.g.block[0, PLACE]
+    total: float = f.g.p[first, first] + f.g.p[first + 1, first + 1] + f.g.p[first + 2, first + 2]
+    return total
 
 
 @part
@@ -315,6 +344,8 @@ def learn_fix(f: Filter, kind: int) -> None:
         s += h.three[VARIANCE + c] + h.matrix[COV + 4 * c]
     more = min(square / s, SUDDEN) - 1.0
     learn(f, kind, more, r / s, 3.0)
+    if kind == FIXES and square < SUDDEN * s:  # what is wild says nothing of motion
+        learn(f, MOTIONS, more, f.ego[MADE] / s, 3.0)
 
 
 @part
