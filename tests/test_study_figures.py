@@ -2,6 +2,7 @@
 
 import json
 from collections.abc import Callable
+from dataclasses import replace
 from itertools import combinations
 from pathlib import Path
 from typing import Any
@@ -139,6 +140,20 @@ def test_curves_draw_numbers_of_their_selections(results: Results) -> None:
     both = figures.curves(results, [panel], [*alike, mine], "c")
     assert both is not None
     assert [text.get_text() for text in both.figure.axes[0].get_legend().get_texts()][1:] == ["mine"]
+
+
+def test_every_line_that_coincides_is_named(results: Results) -> None:
+    """Also where a method has two, each with another method's line: the last one's name replaced the others."""
+    kalman = results.frame.query("method == 'kalman'")
+    names = {"identity": "fedkalmannet", "fitted": "okf"}
+    frame = pd.concat([kalman, kalman.assign(method=kalman["noise_model"].map(names), noise_model="trained")])
+    lines = [*({"method": "kalman", "noise_model": model} for model in names), *({"method": m} for m in names.values())]
+    plot = figures.curves(
+        replace(results, frame=frame), [Panel({k: {"max_neighbours": k} for k in (0, 2)})], lines, "c"
+    )
+    assert plot is not None
+    first, *_ = plot.figure.axes[0].get_legend().get_texts()
+    assert first.get_text() == "KF\nidentity = FedKalmanNet\nfitted = OKF"
 
 
 def from_reference(file: Path) -> Results:

@@ -161,7 +161,10 @@ def curves(
                     style["label"] = text if labelled else f"_{text}"
                 _draw(axis, names, points, style)
                 named += [names] if names not in named else []
-                also[name_of(names)] = text.removeprefix(_joined([of]))
+                more, model = text.removeprefix(_joined([of])), str(of.get("noise_model"))
+                more = f"\n{model}{more}" if more and model in models and len(models) > 1 else more
+                if more not in also.setdefault(name_of(names), ""):
+                    also[name_of(names)] += more
             alone = [(of, points) for of, points in drawn if id(of) in groups and isinstance(points, Mapping)]
             _name_alike(axis, alone, log, WIDTH * height_of)
             axis.set(title=picture(panel.title), xlabel=panel.xlabel)

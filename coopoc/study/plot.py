@@ -111,7 +111,10 @@ def legend(axes: Axes, lines: Sequence[Mapping[str, Any]], words: Mapping[str, s
         elif "method" in names and model != "none" and model not in styles.setdefault(line(model), []):
             styles[line(model)].append(model)
         entries.setdefault(text, strokes(names if method == "bound" or "method" not in names else {"method": method}))
-    handles = [Line2D([], [], **{**options, "label": picture(text)}) for text, options in entries.items()]
+    handles = [
+        Line2D([], [], **{**options, "label": "\n".join(map(picture, text.split("\n")))})
+        for text, options in entries.items()
+    ]
     if len(styles) > 1:
         grey = {dashes: picture(" / ".join(models)) for dashes, models in styles.items()}
         handles += [Line2D([], [], color="#555555", linestyle=dashes, label=text) for dashes, text in grey.items()]
