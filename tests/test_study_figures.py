@@ -147,7 +147,10 @@ def test_every_line_that_coincides_is_named(results: Results) -> None:
     kalman = results.frame.query("method == 'kalman'")
     names = {"identity": "fedkalmannet", "fitted": "okf"}
     frame = pd.concat([kalman, kalman.assign(method=kalman["noise_model"].map(names), noise_model="trained")])
-    lines = [*({"method": "kalman", "noise_model": model} for model in names), *({"method": m} for m in names.values())]
+    lines = [
+        *({"method": "kalman", "noise_model": model} for model in names),
+        *({"method": m, "noise_model": "trained"} for m in names.values()),
+    ]
     plot = figures.curves(
         replace(results, frame=frame), [Panel({k: {"max_neighbours": k} for k in (0, 2)})], lines, "c"
     )
