@@ -25,6 +25,7 @@ from coopoc.kernels.stars.cooperative_state import (
     SHARE,
     SURE,
     TAU,
+    WIDEST,
     WILD,
     WINDOW,
 )
@@ -516,7 +517,7 @@ class Oracle:
         changed = (ACCELERATION * max(t - since, 1) * dt) ** 2
         strange = ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum()
         if g.forget:
-            louder[j] = max(louder.get(j, 1.0) * (1 + (min(strange / 3, SUDDEN) - 1) / min(t + 1, CHANGES)), 1.0)
+            louder[j] = max(louder.get(j, 1.0) * (1 + (min(strange, WIDEST) / 3 - 1) / min(t + 1, CHANGES)), 1.0)
         if g.slip * (self.known.sensors is not None) and g.fix_gate and strange > WILD and slips < 5:
             self.state["pace"][j] = last, since, variance, slips + 1
             return last, variance + changed * dt**2

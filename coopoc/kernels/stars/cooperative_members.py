@@ -34,6 +34,7 @@ from .cooperative_state import (
     VEHICLE,
     WAY,
     WHEN,
+    WIDEST,
     WILD,
     Filter,
     Model,
@@ -46,7 +47,7 @@ from .cooperative_state import (
 )
 from .gaussian import ABSENT, COMMON, ERROR, KINDS, PLACE, has, insert, remove, shift, widen
 from .messages import vector_at
-from .otherwise import SUDDEN, drive, slip
+from .otherwise import drive, slip
 
 
 @inside
@@ -128,7 +129,7 @@ def steady(f: Filter, model: Model, j: int, given: Floats, first: int, variance:
         gap = unit * given[first + c] - status[PACE + c]
         q += gap * gap / ((given[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
     if model.forget > 0.0:
-        more = (min(q / 3.0, SUDDEN) - 1.0) / min(f.ego[STEPS] + 1.0, CHANGES)
+        more = (min(q, WIDEST) / 3.0 - 1.0) / min(f.ego[STEPS] + 1.0, CHANGES)
         status[LOUDER] = max(status[LOUDER] + (1.0 + status[LOUDER]) * more, 0.0)
     if model.slip > 0.0 and model.fix_gate > 0.0 and q > WILD and status[SLIPS] < SLIPPED:
         status[SLIPS] += 1.0

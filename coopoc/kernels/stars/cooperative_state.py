@@ -49,8 +49,8 @@ NO_POSITION = 1e200
 SLIPPED, WILD = 5.0, 32.0
 """Implausible velocities in a row after which one counts again, and the squared normalised distance from which a
 velocity is, or an error of fixes, beyond doubt."""
-CHANGES = 20.0
-"""Velocities in the level of their noise, fewer at first."""
+CHANGES, WIDEST = 20.0, 9.0
+"""Velocities in the level of their noise, fewer at first, and the most of a squared normalised change that counts."""
 
 
 TAU, SHARE = 20.0, 0.1
