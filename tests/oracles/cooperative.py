@@ -14,7 +14,7 @@ import numpy as np
 
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
-from coopoc.kernels.gate import GATE, LEAK, PATIENCE, REJECTED, SLIP
+from coopoc.kernels.gate import FIX_GATE, GATE, LEAK, PATIENCE, REJECTED, SLIP
 from coopoc.kernels.stars.cooperative_messages import CLIP, FADES, FIX_SCORE
 from coopoc.kernels.stars.cooperative_state import (
     ACCELERATION,
@@ -204,7 +204,16 @@ class Oracle:
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.priors.fix_gate else {self.ego}
         levels = {"level": np.zeros(6), "learned": np.zeros(6), "information": np.zeros(6), "made": 0.0}
-        levels |= {"louder": {}, "shown": 0.0, "far": 0.0, "course": np.zeros(3), "blind": 0.0, "jumped": False}
+        levels |= {
+            "louder": {},
+            "shown": 0.0,
+            "gap": np.zeros(3),
+            "left": None,
+            "cov": np.zeros(3),
+            "course": np.zeros(3),
+            "blind": 0.0,
+            "jumped": False,
+        }
         levels |= {"slips": 0.0, "speed": 0.0, "score": 0.0, "numbers": 0, "squares": 0.0}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
@@ -222,6 +231,7 @@ class Oracle:
             b = copy.deepcopy(true)
             self.average(b)
             x = b.at(("x", self.ego))
+            self.state["cov"] = np.diag(b.p[x, x])
             others = [true.x[true.at(("x", j))] + self.state["way"][j] for j in self.neighbours(t)[1]]
             found.append((b.x[x], b.p[x, x], others))
         neighbours = [np.array(o).reshape(-1, 3) for *_, o in found]
@@ -336,6 +346,8 @@ class Oracle:
             across = min(SIDEWAYS + (TURNS * s["blind"]) ** 2, 1.0)
             b.p[x, x] += slip * (across * np.eye(3) + np.outer(s["course"], s["course"]))
         s["made"] = s["made"] + q.sum()
+        if s["left"]:
+            s["left"] = s["left"][0] + dt * u, s["left"][1] + q.sum() / 3
         self.before = self.own_variance()
         for j in [j for j in others if j not in s["members"]]:
             self.join(t, j, messages[j], relative[j])
@@ -369,19 +381,27 @@ class Oracle:
             self.learn_fix(3, rows)
             _, gap, _, r = self.mahalanobis(s["belief"], rows)
             far, most = float(np.linalg.norm(gap)), s["speed"] * self.seen.dt + 2 * math.sqrt(r.sum())
-            if far - s["far"] > most or far < 2 * math.sqrt(r.sum()):
-                s["jumped"] = far - s["far"] > most
-            s["shown"], s["far"] = max(s["shown"] + min(far - s["far"], most), 0.0), far
+            more = far - float(np.linalg.norm(s["gap"]))
+            if more > most or far < 2 * math.sqrt(r.sum()):
+                s["jumped"] = more > most
+            s["shown"], s["gap"] = max(s["shown"] + min(more, most), 0.0), gap
+        beyond = self.mahalanobis(s["belief"], rows)[0] > self.priors.fix_gate > 0
+        if beyond and not s["left"] and not any(j in s["last"] for j in s["members"]):
+            self.leave()
         share = self.use_fix(t, self.ego, rows, True)
+        if share == 1 and s["left"] and not self.away(t):
+            s["left"] = None
         s["hits"]["fix"] = s["hits"]["fix"] + 1 if share < 1 else 0
         self.corrected()
 
     def learn_fix(self, kind: int, rows: list[Any]) -> None:
         _, gap, cov, r = self.mahalanobis(self.state["belief"], rows)
         total = np.trace(cov) + r.sum()
-        more = min(gap @ gap / total, SUDDEN) - 1.0
+        square = gap @ gap
+        wild = kind == 3 and square > SUDDEN * total
+        more = min((np.square(gap - self.state["gap"]).sum() / 2 if wild else square) / total, SUDDEN) - 1.0
         self.learn(kind, more, r.sum() / total, 3)
-        if kind == 3 and gap @ gap < SUDDEN * total:
+        if kind == 3 and not wild:
             self.learn(5, more, self.state["made"] / total, 3)
 
     def mahalanobis(self, b: Belief, rows: list[Any]) -> tuple[float, Floats, Floats, Floats]:
@@ -416,7 +436,10 @@ class Oracle:
         gap, own = z - h @ b.x, h @ b.p @ h.T
         square = float(gap @ np.linalg.solve(own + np.diag(r), gap))
         self.count(min(square, FIX_SCORE), np.linalg.slogdet(own + np.diag(r))[1], len(used))
-        gain, locked = np.trace(own) / (np.trace(own) + r.sum()), s["locked"]
+        mine, noise, locked = np.trace(own), r.sum(), s["locked"]
+        if not judged:
+            mine, noise = s["cov"].sum(), noise * math.exp(-s["level"][3])
+        gain = mine / (mine + noise)
         q = min(square, float(gap @ gap) / SLIP)
         share, hits = 1.0, locked.get(j, 0.0)
         if g.fix_gate:
@@ -440,7 +463,7 @@ class Oracle:
         count, mean = s["mean"].get(j, (0.0, np.zeros(3)))
         count = min(count + 1, WINDOW)
         s["mean"][j] = count, mean
-        if j not in s["trusted"] and q > g.fix_gate:
+        if j not in s["trusted"] and q > max(g.fix_gate, FIX_GATE):
             return True
         mean = mean + (gap * min(1.0, math.sqrt(CLIP / q)) - mean) / count
         s["mean"][j] = count, mean
@@ -473,6 +496,8 @@ class Oracle:
         best = int(np.argmax(votes))
         if self.ego not in s["trusted"] and votes[0] < max(len(votes), 2):
             return False
+        if b.names and not self.young(t):
+            self.leave()
         b.drop(("b", self.ego))
         b.transform(("x", self.ego), {})
         if self.life.own:
@@ -489,6 +514,29 @@ class Oracle:
             s["vague"].discard(self.ego)
         return True
 
+    def young(self, t: int) -> bool:
+        joined, hits = self.state["joined"].get(self.ego, t), self.state["hits"].get("fix", 0)
+        return bool(t - joined - hits <= 1)
+
+    def leave(self) -> None:
+        b, s = self.state["belief"], self.state
+        x = b.at(("x", self.ego))
+        s["left"] = (b.x[x].copy(), np.trace(b.p[x, x]) / 3) if b.p[x, x].any() else None
+
+    def away(self, t: int) -> bool:
+        b, left = self.state["belief"], self.state["left"]
+        fix = self.r[t, self.ego] * self.white * math.exp(max(self.state["level"][3], 0))
+        return bool(((b.x[b.at(("x", self.ego))] - left[0]) ** 2 / fix).sum() > 2 * FIX_GATE)
+
+    def returned(self, t: int) -> bool:
+        """Whether the fix is where the ego would be, had it not left."""
+        if not self.state["left"]:
+            return False
+        x, p = self.state["left"]
+        gap = self.seen.gnss[self.run, t, self.ego] - self.seen.dt * self.seen.velocity[self.run, t, self.ego] - x
+        whole = self.r[t, self.ego] * self.white + self.q[t, self.ego] + p + SLIP
+        return bool((gap**2 / whole).sum() < FIX_GATE) and self.away(t)
+
     def lost(self, t: int) -> bool:
         s = self.state
         held = [j for j in s["members"] if j in s["last"]]
@@ -496,10 +544,13 @@ class Oracle:
             return False
         if self.ego in s["trusted"]:
             hits = s["hits"]["fix"]
-            young = hits >= 2 and t - s["joined"][self.ego] - hits <= 1
-            return bool(young or (hits > 0 and s["locked"].get(self.ego, 0.0) >= PATIENCE))
-        far = np.square(s["belief"].x[s["belief"].at(("b", self.ego))]).sum()
-        return len(held) >= 2 or bool(len(held) == 1 and far > WILD * (self.r[t, self.ego] @ self.white) / 3)
+            again = s["locked"].get(self.ego, 0.0) >= PATIENCE or (not held and self.returned(t))
+            return bool((hits >= 2 and self.young(t)) or (hits > 0 and again))
+        b, noise = s["belief"], (self.r[t, self.ego] @ self.white) / 3
+        error = b.x[b.at(("b", self.ego))]
+        apart = [float(np.square(error - b.x[b.at(("b", j))]).sum()) for j in held]
+        agree = error @ error > FIX_GATE * noise and apart[:1] < [FIX_GATE * noise]
+        return len(held) >= 2 or bool(len(held) == 1 and (error @ error > WILD * noise or agree))
 
     def contradicted(self, t: int, j: int) -> bool:
         hits, since = self.state["hits"][("relative", j)], t - self.state["joined"][j]

@@ -17,7 +17,7 @@ from ..compiling.small import apply, negate, store, subtract
 from ..gate import GATE
 from ..geometry import angle
 from .cooperative_members import join, leave, predict, steady
-from .cooperative_messages import fix_terms, goes_on, receive, trust, use_fix
+from .cooperative_messages import fix_terms, goes_on, heard, receive, trust, use_fix
 from .cooperative_state import (
     ACCELERATION,
     AGE,
@@ -33,6 +33,7 @@ from .cooperative_state import (
     HITS,
     INPUT,
     JOINED,
+    LEFT,
     LEVEL,
     MOTION,
     MOTION_VARIANCE,
@@ -57,11 +58,13 @@ from .cooperative_state import (
     Filter,
     Model,
     Sent,
+    away,
     begin,
     copy_filter,
     measured_whole,
     new_filter,
     pause,
+    remember,
 )
 from .gaussian import (
     COMPASS,
@@ -333,7 +336,11 @@ def add_fix(f: Filter, model: Model, own: Floats) -> None:
     if f.member[0, VAGUE] == 0.0:
         learn_fix(f, FIXES)
         show(f)
+    if q > model.fix_gate > 0.0 == f.ego[LEFT + 3] and not heard(f, False):
+        remember(f)
     f.member[0, OUT + 3] = share = use_fix(f, model, 0, True, q)
+    if share == 1.0 and not away(f, own):
+        f.ego[LEFT + 3] = 0.0
     f.who[0, HITS] = f.who[0, HITS] + 1 if share < 1.0 else 0
     corrected(f)
 

@@ -10,12 +10,14 @@ from ...arrays import Floats
 from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import add_diagonal, scale, store
 from ..dead_reckoning import ROUNDING
-from ..gate import PATIENCE, SLIP, count, inflation
+from ..gate import FIX_GATE, PATIENCE, SLIP, count, inflation
 from .cooperative_members import stand, steady
 from .cooperative_state import (
     AGE,
     CLOCK,
     COUNT,
+    COVARIANCE,
+    FIXES,
     INPUT,
     LAST,
     LEVEL,
@@ -261,9 +263,10 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
     x, y, z = vector_at(h.three, GAP // 3)
     q = min(q, (x * x + y * y + z * z) / SLIP)
     own, noise = 1e-12, 0.0
-    for c in range(3):
+    for c in range(3):  # alone, what counts is the gain of the estimate: fixes that are rejected make no error likelier
         if h.block[MEASURED + c]:
-            own, noise = own + h.matrix[COV + 4 * c], noise + h.three[VARIANCE + c]
+            own += h.matrix[COV + 4 * c] if judged else f.ego[COVARIANCE + 4 * c]
+            noise += h.three[VARIANCE + c] * (1.0 if judged else math.exp(-f.ego[LEVEL + FIXES]))
     share = 1.0
     if model.fix_gate > 0.0:
         share = 1.0 / inflation(q, model.fix_gate, f.member[k, LOCKED])
@@ -298,7 +301,7 @@ def wrong_on_average(f: Filter, model: Model, k: int, q: float) -> bool:
     assumed; or, where that error is being estimated, with the last one alone."""
     h, status = f.h, f.status[f.who[k, VEHICLE]]
     status[COUNT] = count = min(status[COUNT] + 1.0, WINDOW)
-    if status[TRUSTED] == 0.0 and q > model.fix_gate:
+    if status[TRUSTED] == 0.0 and q > max(model.fix_gate, FIX_GATE):
         return True
     clip = math.sqrt(CLIP / q) if q > CLIP else 1.0
     for c in range(3):

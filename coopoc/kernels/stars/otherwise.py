@@ -14,7 +14,8 @@ log-likelihood of an innovation v ~ N(0, S) has the derivative s (v^2 / S - 1) /
 the share of S that the level makes, and the information s^2 / 2. Each step moves a level by the sum of its derivatives
 over their information, which is forgotten in `Model.forget` s. Of the ego's motion the share is D = dP / d log level,
 which a step of prediction makes D + q, and an update D (P+ / P-)^2; changes of velocity show the level of each
-vehicle's motion earlier, if it is more than is assumed.
+vehicle's motion earlier, if it is more than is assumed. Of fixes beyond doubt counts how they differ from one another:
+those that are all displaced by as much are no noisier.
 
 References:
     Friedland, Treatment of bias in recursive filtering, IEEE TAC 14(4), 1969; Mitchell, Beauchamp, Bayesian variable
@@ -39,6 +40,7 @@ from .cooperative_state import (
     FIXES,
     INFORMATION,
     KINDS_OF_NUMBERS,
+    LEFT,
     LEVEL,
     LOUDER,
     MADE,
@@ -179,13 +181,12 @@ def collapse(f: Filter, i: int, n: int, prior: float, odds: float) -> None:
         few[i, k - 3] *= 1.0 + change * p
 
 
-SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, BEFORE, JUMPED, BLIND, COURSE = range(
-    SLIPPING, SLIPPING + 11
+SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, JUMPED, BLIND, COURSE, _, _, BEFORE = range(
+    SLIPPING, SLIPPING + 13
 )
 """Of the ego: probability that the ego slips, its late speed m/s, whether this try assumes so, of the step's numbers
-the logarithm of their likelihood, how many there are, and their squared normalised innovations; `show` m, the
-distance of the last fix m, and whether fixes have jumped; and for how long s it has not measured its direction, and
-that."""
+the logarithm of their likelihood, how many there are, and their squared normalised innovations; `show` m, whether
+fixes have jumped; for how long s it has not measured its direction, and that; and the innovation of the last fix m."""
 SIDEWAYS, TURNS = 0.03, 0.3
 """Share of a slip's variance that is across the way: some ten degrees; rad/s by which a vehicle may turn then."""
 LASTS, RARE, LATE, UNSEEN = 3.0, 3000.0, 10.0, 1.0
@@ -225,15 +226,17 @@ def remember_speed(f: Filter, own: Floats) -> None:
 def show(f: Filter) -> None:
     """After `innovate`: how far the ego may have gone unseen, the distance of its fix as far as that grew no faster
     than the ego drives and fixes err; if faster, they have jumped until they are near again, and that is no slip."""
-    far, noise = 0.0, 0.0
+    far, noise, before = 0.0, 0.0, 0.0
     for c in range(3):
+        before += f.ego[BEFORE + c] ** 2
+        f.ego[BEFORE + c] = f.h.three[GAP + c]
         far += f.h.three[GAP + c] ** 2
         noise += f.h.three[VARIANCE + c]
     far, most = math.sqrt(far), f.ego[SPEED_OF_LATE] * f.ego[SPAN] + 2.0 * math.sqrt(noise)
-    f.ego[SHOWN] = max(f.ego[SHOWN] + min(far - f.ego[BEFORE], most), 0.0)
-    if far - f.ego[BEFORE] > most or far < 2.0 * math.sqrt(noise):
-        f.ego[JUMPED] = 1.0 if far - f.ego[BEFORE] > most else 0.0
-    f.ego[BEFORE] = far
+    more = far - math.sqrt(before)
+    f.ego[SHOWN] = max(f.ego[SHOWN] + min(more, most), 0.0)
+    if more > most or far < 2.0 * math.sqrt(noise):
+        f.ego[JUMPED] = 1.0 if more > most else 0.0
 
 
 @part
@@ -306,9 +309,14 @@ def louder(f: Filter, own: Floats, rows: Floats, vehicles: Ints, count: int) -> 
 
 @part
 def moved(f: Filter, own: Floats) -> None:
-    """After the ego's prediction: D + q, both of the three axes together, so that no axis of the world counts."""
-    f.ego[MADE] += own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
+    """After the ego's prediction: D + q, both of the three axes together, so that no axis of the world counts; and
+    where it would be, had it not left."""
+    q = own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
+    f.ego[MADE] += q
     f.ego[WHOLE] = ego_variance(f)
+    f.ego[LEFT + 3] += q / 3.0 if f.ego[LEFT + 3] > 0.0 else 0.0
+    for c in range(3):
+        f.ego[LEFT + c] += own[MOTION + c]
 
 
 @part
@@ -337,14 +345,16 @@ def learn(f: Filter, kind: int, more: float, share: float, numbers: float) -> No
 @part
 def learn_fix(f: Filter, kind: int) -> None:
     """Count the innovation of a fix."""
-    h, square, r, s = f.h, 0.0, 0.0, 0.0
+    h, square, apart, r, s = f.h, 0.0, 0.0, 0.0, 0.0
     for c in range(3):
         square += h.three[GAP + c] * h.three[GAP + c]
+        apart += (h.three[GAP + c] - f.ego[BEFORE + c]) ** 2
         r += h.three[VARIANCE + c]
         s += h.three[VARIANCE + c] + h.matrix[COV + 4 * c]
-    more = min(square / s, SUDDEN) - 1.0
+    wild = kind == FIXES and square > SUDDEN * s
+    more = min((0.5 * apart if wild else square) / s, SUDDEN) - 1.0  # where all are far away, they need not be noisier
     learn(f, kind, more, r / s, 3.0)
-    if kind == FIXES and square < SUDDEN * s:  # what is wild says nothing of motion
+    if kind == FIXES and not wild:  # what is wild says nothing of motion
         learn(f, MOTIONS, more, f.ego[MADE] / s, 3.0)
 
 
