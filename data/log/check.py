@@ -345,17 +345,11 @@ def _of_fixes(c: Check) -> list[str]:
                     f"antenna={name}:{factor[0]:.2f}/{factor[1]:.2f}/0 takes it off."
                 )
                 break
-        late = next(
-            (
-                row
-                for row in c.vehicles
-                if row["vehicle"] == name and _beyond(row, "late_s", max(LATE, 0.5 * c.world.dt))
-            ),
-            {},
-        )
-        if c.ahead[column] or late:
+        row = next((row for row in c.vehicles if row["vehicle"] == name), {})
+        if c.ahead[column] or _beyond(row, "late_s", max(LATE, 0.5 * c.world.dt)):
             continue
         derived = truth is None and rec.sensors.velocity_reading == "fixes"
+        derived |= truth is None and _off(row)  # what draws positions aside draws them along a bend, too
         if sure[2] and abs(lag := factor[2]) >= LATE and not derived:
             way = "ahead of" if lag > 0 else "behind"
             sentences.append(

@@ -131,6 +131,7 @@ def odometry(c: Check, column: int) -> Estimate:
         true = (np.abs(true) if heading is None else (true * np.exp(-1j * heading)).real).astype(complex)
     x = np.stack([true, 1j * true, np.gradient(true, rec.dt)], axis=1)
     known = np.isfinite(odometer + x.sum(axis=1)) & (np.arange(len(true)) > 0)
+    known &= np.maximum(np.abs(true), np.abs(odometer)) > MOVING  # standing, nothing errs
     found = factors(odometer[known], x[known])
     value, error = np.append(_polar(complex(*found.value[:2])), -found.value[2] / max(found.value[0], 0.1)), found.error
     if body is not None:

@@ -7,6 +7,9 @@ import numpy as np
 from .estimates import DRIFT, ENOUGH, LATE, SCALE, SURELY, TURNED
 from .residuals import Check
 
+PERHAPS = 2.0
+"""Standard errors from which an error may be one."""
+
 
 def unseen(c: Check) -> list[str]:
     """What the check could not see, and of whom."""
@@ -20,6 +23,12 @@ def unseen(c: Check) -> list[str]:
         errors = {row["vehicle"]: SURELY * row.get(f"{name}_error", np.inf) for row in c.vehicles}
         if blind := _below(errors, 2 * least):
             sentences.append(f"errors, {what} of {blind}")
+        for row in c.vehicles:
+            value, error = row.get(name, 0.0), row.get(f"{name}_error", np.inf)
+            if max(least, PERHAPS * error) < abs(value) <= SURELY * error:
+                sentences.append(
+                    f"whether an error of {value:.2g} +- {error:.2g} ({what} of {row['vehicle']}) is more than chance"
+                )
     late = {row["vehicle"]: row.get("late_s_error", np.inf) for row in c.vehicles}
     if blind := _below({who: SURELY * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LATE):
         sentences.append(f"errors, s, of the clocks of {blind}")
