@@ -33,11 +33,11 @@ def frozen(values: npt.ArrayLike, dtype: Any = np.float64) -> AnyArray:
     >>> frozen([1, 2]).flags.writeable
     False
     """
-    given = np.asarray(values)
-    array = np.array(given, dtype, order="C", copy=None)
+    values_array = np.asarray(values)
+    array = np.array(values_array, dtype, order="C", copy=None)
     if not array.flags.aligned:
         array = array.copy()
-    owners = (array, array.base) if array is given and not isinstance(values, list | tuple) else ()
+    owners = (array, array.base) if array is values_array and not isinstance(values, list | tuple) else ()
     if any(isinstance(owner, np.ndarray) and owner.flags.writeable for owner in owners):
         array = array.copy()  # the caller may go on writing to its own, or to what it shows a part of
     array.flags.writeable = False
@@ -64,18 +64,18 @@ def checked(
     coopoc.errors.InputError: t = shape (2,): must have shape (T,) = (3,). Give one entry per index of each axis.
     """
     kinds, word = KINDS[dtype]
-    given = plain(values)
-    if given.dtype.kind not in kinds and (given.size or given.dtype == object):
+    array = plain(values)
+    if array.dtype.kind not in kinds and (array.size or array.dtype == object):
         hint = "Convert it with numpy first: rows must be equally long, text is not parsed, floats are not rounded."
-        raise InputError(field, f"dtype {given.dtype}", f"must be an array of {word}s", hint)
+        raise InputError(field, f"dtype {array.dtype}", f"must be an array of {word}s", hint)
     wrong = shape is not None and (
-        given.ndim != len(shape) or any(n not in (size, -1) for n, size in zip(shape, given.shape, strict=True))
+        array.ndim != len(shape) or any(n not in (size, -1) for n, size in zip(shape, array.shape, strict=True))
     )
     if shape is not None and wrong:
         wanted = str(tuple("any" if n < 0 else n for n in shape)).replace("'", "")
         allowed = f"must have shape {axes} = {wanted}"
-        raise InputError(field, f"shape {given.shape}", allowed, "Give one entry per index of each axis.")
-    return frozen(given, dtype)
+        raise InputError(field, f"shape {array.shape}", allowed, "Give one entry per index of each axis.")
+    return frozen(array, dtype)
 
 
 def check_arrays(made: Any, shapes: Mapping[str, tuple[str, tuple[int, ...]]]) -> None:
@@ -148,13 +148,13 @@ def number(
     2.0
     """
     kinds, word = KINDS[kind]
-    given = np.asarray(value if isinstance(value, int | float | np.generic | np.ndarray) else None)
-    if given.ndim or given.dtype.kind not in kinds:
+    scalar = np.asarray(value if isinstance(value, int | float | np.generic | np.ndarray) else None)
+    if scalar.ndim or scalar.dtype.kind not in kinds:
         raise InputError(field, shown(value), f"must be a {word}, {allowed}", hint)
-    found = kind(given.item())
-    if not low <= found <= high:
+    result = kind(scalar.item())
+    if not low <= result <= high:
         raise InputError(field, value, f"must be {allowed}", hint)
-    return found
+    return result
 
 
 def seed_of(value: object) -> int:
@@ -169,10 +169,10 @@ def extent(field: str, value: Any, hint: str = "Give (low, high).") -> tuple[flo
     >>> extent("size", [3, 20])
     (3.0, 20.0)
     """
-    given = [number(field, each, 0, 1e9, allowed=">= 0", hint=hint) for each in listed(field, value, hint)]
-    if len(given) != 2 or given[0] > given[1]:
+    lengths = [number(field, each, 0, 1e9, allowed=">= 0", hint=hint) for each in listed(field, value, hint)]
+    if len(lengths) != 2 or lengths[0] > lengths[1]:
         raise InputError(field, value, "must be 2 numbers (low, high) with low <= high", hint)
-    return given[0], given[1]
+    return lengths[0], lengths[1]
 
 
 def one_of(noun: str, name: object, known: Any) -> str:
@@ -230,8 +230,8 @@ def refuse(field: str, values: AnyArray, wrong: npt.ArrayLike, allowed: str, hin
     coopoc.errors.InputError: step[1] = -1: must be >= 0. Count steps from 0.
     """
     if np.any(wrong):
-        place = tuple(np.argwhere(wrong)[0].tolist())
-        raise InputError(f"{field}{[*place] or ''}", values[place], allowed, hint)
+        first_wrong = tuple(np.argwhere(wrong)[0].tolist())
+        raise InputError(f"{field}{[*first_wrong] or ''}", values[first_wrong], allowed, hint)
 
 
 def texts(field: str, values: object) -> tuple[str, ...]:
@@ -241,10 +241,10 @@ def texts(field: str, values: object) -> tuple[str, ...]:
     ('a reconstruction',)
     """
     hint = 'Give a tuple such as ("a note",).'
-    found = listed(field, values, hint)
-    if not all(isinstance(value, str) for value in found):
+    values_listed = listed(field, values, hint)
+    if not all(isinstance(value, str) for value in values_listed):
         raise InputError(field, shown(values), "must be a sequence of texts", hint)
-    return tuple(found)
+    return tuple(values_listed)
 
 
 def check_texts(owner: object, *fields: str) -> None:

@@ -61,23 +61,23 @@ def suggestion(name: object, known: Iterable[str], otherwise: str) -> str:
     return f"Did you mean {near[0]}?" if near else otherwise
 
 
-def unknown(noun: str, name: object, known: Iterable[str], otherwise: str | None = None) -> InputError:
+def unknown(noun: str, name: object, names: Iterable[str], otherwise: str | None = None) -> InputError:
     """The error for an unknown name: lists the known ones and proposes the nearest.
 
     Args:
         noun: kind of the thing, such as "method".
         name: that was asked for.
-        known: names that exist.
+        names: names that exist.
         otherwise: hint if none is near; None for one about the list of names.
 
     >>> print(unknown("method", "kalmann", ["gnss", "kalman"]))
     method = 'kalmann': must be one of gnss, kalman. Did you mean kalman?
     """
-    known = list(known)
+    names = list(names)
     if otherwise is None:
-        otherwise = "Use one of these names." if known else "There is none to use."
-    allowed = "must be one of " + (", ".join(known) or "(there is none)")
-    return InputError(noun, shown(name), allowed, suggestion(name, known, otherwise))
+        otherwise = "Use one of these names." if names else "There is none to use."
+    allowed = "must be one of " + (", ".join(names) or "(there is none)")
+    return InputError(noun, shown(name), allowed, suggestion(name, names, otherwise))
 
 
 def said(error: BaseException) -> str:
@@ -131,5 +131,5 @@ def dependencies() -> dict[str, str]:
 def missing(error: ModuleNotFoundError, needed_for: str) -> ImportError:
     """The error for a library that could not be imported: with the line that installs it if coopoc needs it."""
     library = (error.name or "").partition(".")[0]
-    known = dependencies()
-    return MissingLibraryError(library, needed_for, known[library]) if library in known else error
+    packages = dependencies()
+    return MissingLibraryError(library, needed_for, packages[library]) if library in packages else error

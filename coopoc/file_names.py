@@ -22,13 +22,13 @@ def given_path(path: object) -> Path:
     '.pyfg'
     """
     try:
-        given = os.fsencode(path) if isinstance(path, str | os.PathLike) else b""
+        encoded = os.fsencode(path) if isinstance(path, str | os.PathLike) else b""
     except Exception:  # half a surrogate pair, or a class from elsewhere
-        given = b""
-    if not given or b"\0" in given or len(given) > 4095 or max(map(len, given.split(b"/"))) > 255:
+        encoded = b""
+    if not encoded or b"\0" in encoded or len(encoded) > 4095 or max(map(len, encoded.split(b"/"))) > 255:
         allowed = "must be text or a Path, of at most 255 bytes per part and 4095 in all, without NUL"
         raise InputError("path", shown(path), allowed, 'Give for example "graph.pyfg".')
-    return Path(os.fsdecode(given))
+    return Path(os.fsdecode(encoded))
 
 
 def file_name(field: str, name: object, hint: str) -> str:
@@ -50,12 +50,12 @@ def file_name(field: str, name: object, hint: str) -> str:
         device = name.partition(".")[0].strip().upper() in _DEVICES
         if not device and name == name.strip(" .") and len(name.encode()) <= _LONGEST:
             return name
-    given = repr(name) if len(repr(name)) < 60 else f"{repr(name)[:60]}..."
+    shown_name = repr(name) if len(repr(name)) < 60 else f"{repr(name)[:60]}..."
     allowed = (
         f'must be a file name: at most {_LONGEST} bytes, printable, without < > : " / \\ | ? *, '
         "no dot or space at its ends, and no device of Windows such as CON"
     )
-    raise InputError(field, given, allowed, hint)
+    raise InputError(field, shown_name, allowed, hint)
 
 
 def replaceable(path: Path) -> Path:

@@ -129,7 +129,7 @@ def plot_solution(solution: Solution, ax: Axes | None = None, *, problem: Proble
             ax.quiver(*at[poses].T, *heading.T, color=INK, angles="xy", width=0.004, zorder=4)
     if few:
         ellipses(ax, at, solution.covariance[:, :2, :2], COLORS[0], "95 %")
-        for name, place in zip(solution.names, at.tolist(), strict=True):
-            ax.annotate(picture(name), place, xytext=(5, 5), textcoords="offset points", fontsize=8, color=INK)
+        for name, position in zip(solution.names, at.tolist(), strict=True):
+            ax.annotate(picture(name), position, xytext=(5, 5), textcoords="offset points", fontsize=8, color=INK)
     ax.plot(*at.T, "o", ms=4 if few else 1.5, color=COLORS[0], zorder=3)
     return finish(ax)

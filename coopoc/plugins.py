@@ -38,13 +38,13 @@ def points(group: str) -> Mapping[str, metadata.EntryPoint]:
     Once the backport importlib_metadata is imported, as Dask does, Python's finder returns entry points of another
     class; each is therefore made anew as Python's own.
     """
-    found: dict[str, metadata.EntryPoint] = {}
+    entry_points: dict[str, metadata.EntryPoint] = {}
     for point in _installed(group, tuple(_changed(folder) for folder in sys.path)):
-        other = found.setdefault(point.name, metadata.EntryPoint(point.name, point.value, point.group))
+        other = entry_points.setdefault(point.name, metadata.EntryPoint(point.name, point.value, point.group))
         if other.value != point.value:
             claims = f"is claimed by {other.value} and {point.value}"
             raise InputError(group, repr(point.name), claims, "Uninstall one of the two.")
-    return found
+    return entry_points
 
 
 @lru_cache(64)
@@ -69,11 +69,11 @@ def names(group: str) -> tuple[str, ...]:
     >>> isinstance(names("coopoc.methods"), tuple)
     True
     """
-    found: list[str] = []
+    every: list[str] = []
     for name, point in points(group).items():
         written = names_in(point.value)
-        found += (_members(point) if written is None else written) or [name]
-    return tuple(sorted(found))
+        every += (_members(point) if written is None else written) or [name]
+    return tuple(sorted(every))
 
 
 @cache

@@ -27,10 +27,10 @@ def holds(content: bytes) -> bool | None:
     >>> holds(b"7") is None
     True
     """
-    found = _SEAL.findall(content)
-    if not found:
+    seals = _SEAL.findall(content)
+    if not seals:
         return None
-    before, seal, after = content.rpartition(found[-1])
+    before, seal, after = content.rpartition(seals[-1])
     return _seal(before + UNSEALED.encode() + after) == bytes(seal)
 
 

@@ -81,10 +81,10 @@ def assemble(
     late = order[1:][(np.diff(stamps[order]) <= 0) & (np.diff(column[order]) == 0)]
     if len(late):
         row, before = int(late[0]), order[np.flatnonzero(order == late[0])[0] - 1]
-        given = f"{stamps[row]!s} s after {stamps[before]!s} s of vehicle {ids[column[row]]}"
+        actual = f"{stamps[row]!s} s after {stamps[before]!s} s of vehicle {ids[column[row]]}"
         allowed = "dt must be > 0: the stamps of a vehicle increase from row to row"
         hint = "Sort the rows by time, or remove one that repeats."
-        raise InputError(f"{file}: row {row + 1}, column t", given, allowed, hint)
+        raise InputError(f"{file}: row {row + 1}, column t", actual, allowed, hint)
     by_vehicle = np.split(order, np.cumsum(np.bincount(column))[:-1])
     if not any_scale:
         check_scale(stamps, numbers[:, :3], by_vehicle, file)
@@ -102,9 +102,9 @@ def assemble(
     present = np.isfinite(table[..., 0])
     lonely = (np.bincount(column) > 1) & ~(present[1:] & present[:-1]).any(axis=0)
     for k in np.flatnonzero(~present.any(axis=0) | lonely).tolist():
-        given = f"{(column == k).sum()} rows, but {present[:, k].sum()} instants, no two in a row"
+        actual = f"{(column == k).sum()} rows, but {present[:, k].sum()} instants, no two in a row"
         hint = "Resample all with a dt like that of its rows, bridge longer gaps with max_gap=, or leave it out."
-        raise InputError(f"{file}: vehicle {ids[k]}", given, "must be there at instants in a row", hint)
+        raise InputError(f"{file}: vehicle {ids[k]}", actual, "must be there at instants in a row", hint)
     u = table[..., 3:] if velocity is not None else backward_difference(grid, table[..., :3], ids, file)
     return Fleet(ids, grid, table[..., :3], u, name=name, source=source)
 
@@ -132,9 +132,9 @@ def backward_difference(t: Floats, position: Floats, ids: Sequence[str], file: s
         u[:-1][starts] = u[1:][starts]
     alone = np.argwhere(np.isfinite(position[..., 0]) & ~np.isfinite(u[..., 0]))
     if len(alone):
-        given = f"none for {ids[alone[0, 1]]} at t = {t[alone[0, 0]]:g} s"
+        actual = f"none for {ids[alone[0, 1]]} at t = {t[alone[0, 0]]:g} s"
         hint = "Add the columns vx, vy, vz, or leave out the vehicle's single instants."
-        raise InputError(f"{file}: velocity", given, "needs two instants in a row to be derived", hint)
+        raise InputError(f"{file}: velocity", actual, "needs two instants in a row to be derived", hint)
     return u
 
 
@@ -180,14 +180,14 @@ metres in a local frame. Give latitude and longitude to co.load_recording, which
     (west, east), (south, north) = ((float(v.min()), float(v.max())) for v in position[:, :2].T)
     near = max(east - west, north - south) < REGION
     if 0 < speed < SLOWEST and near and max(-west, east) <= 360 and max(-south, north) <= 180:
-        given = f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}"
+        actual = f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}"
         hint = "Give latitude and longitude to co.load_recording, which converts them, or pass any_scale=True."
-        raise InputError(f"{file}: columns x, y", given, "look like degrees, must be metres in a local frame", hint)
+        raise InputError(f"{file}: columns x, y", actual, "look like degrees, must be metres in a local frame", hint)
     if speed > FASTEST:
         hint = "Check the units (t in s, of days as in spreadsheets scale=t:86400; positions in m) and that no two "
         hint += "vehicles share an id, or pass any_scale=True."
-        where, given = f"{file}: columns t, x, y, z", f"a typical speed of {speed:.4g} m/s"
-        raise InputError(where, given, f"must be below {FASTEST:g} m/s", hint)
+        where, actual = f"{file}: columns t, x, y, z", f"a typical speed of {speed:.4g} m/s"
+        raise InputError(where, actual, f"must be below {FASTEST:g} m/s", hint)
 
 
 def check_time(t: Floats, file: str, column: str = "t") -> float:
@@ -209,8 +209,8 @@ def check_time(t: Floats, file: str, column: str = "t") -> float:
     if unit < COARSE[0] or (t % unit).any() or not (t % (2 * unit)).any():
         return 0.0
     if unit >= COARSE[1]:
-        given, allowed = f"multiples of {unit:g} s, as of 32-bit floats", "must be resolved"
-        raise InputError(f"{file}: column {column}", given, allowed, "Write it in 64 bits, or from the first instant.")
+        actual, allowed = f"multiples of {unit:g} s, as of 32-bit floats", "must be resolved"
+        raise InputError(f"{file}: column {column}", actual, allowed, "Write it in 64 bits, or from the first instant.")
     return unit
 
 
@@ -238,9 +238,9 @@ def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tupl
         grid = np.round(np.linspace(instants[0], instants[-1], int(step[-1]) + 1), 6)
         spaced = bool(np.abs(grid[step.astype(np.int64)] - instants).max() <= 1e-3 * gaps.min() + 1e-6)
     if not spaced:
-        given = f"instants between {gaps.min():g} and {gaps.max():g} s apart"
+        actual = f"instants between {gaps.min():g} and {gaps.max():g} s apart"
         hint = "Resample: load_fleet(..., dt=0.1), or FILE?dt=0.1 on the command line."
-        raise InputError(f"{file}: t", given, "must be equally spaced", hint)
+        raise InputError(f"{file}: t", actual, "must be equally spaced", hint)
     grid[step.astype(np.int64)] = instants
     table = np.full((len(grid), column.max() + 1, numbers.shape[1]), np.nan)
     table[step.astype(np.int64)[row_of], column] = numbers
@@ -289,7 +289,7 @@ def planar_recording(
     t: Floats,
     velocity: Floats,
     yaw_rate: Floats,
-    place: Floats,
+    position: Floats,
     table: Floats,
     sensors: Sensors,
     note: str,
@@ -302,18 +302,18 @@ def planar_recording(
         t: (T,) s.
         velocity: (T, n, 2) m/s in the robots' frames, forward and left.
         yaw_rate: (T, n) rad/s.
-        place: (m, 2) m, of the landmarks.
+        position: (m, 2) m, of the landmarks.
         table: (L, 5) step, observer, neighbour, range m, bearing rad; NaN for what was not measured.
         sensors: the noise of all this.
         note: of the recording; that inclinations were not measured is added.
     """
-    n = len(ids) - len(place)
+    n = len(ids) - len(position)
     v2x = V2X(max_neighbours=n - 1, radius=np.inf)
     table = table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
     links = Links(*table[:, :3].astype(np.int64).T)
     shape = (1, len(t), len(ids), 3)
     gnss, moved, turning = np.full(shape, np.nan), np.zeros(shape), np.zeros(shape[:3])
-    gnss[0, :, n:] = np.column_stack([place, np.zeros(len(place))])
+    gnss[0, :, n:] = np.column_stack([position, np.zeros(len(position))])
     moved[0, :, :n, :2], turning[0, :, :n] = velocity, yaw_rate
     return Recording(
         ids=tuple(ids),

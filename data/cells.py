@@ -63,8 +63,8 @@ def read_frame(path: Path, *text: str) -> pd.DataFrame:
 
             size = read_metadata(path)  # a column of one value takes no room in the file
             if size.num_rows * size.num_columns > LARGEST_TABLE:
-                given = f"{size.num_rows} rows of {size.num_columns} columns"
-                raise InputError(path.name, given, f"must hold at most {LARGEST_TABLE} cells", "Split the drive.")
+                actual = f"{size.num_rows} rows of {size.num_columns} columns"
+                raise InputError(path.name, actual, f"must hold at most {LARGEST_TABLE} cells", "Split the drive.")
         if path.suffix.lower() == ".jsonl":
             lines = path.read_text("utf-8-sig").splitlines()
             frame = pd.DataFrame([json.loads(line) for line in lines if line.strip()])
@@ -127,23 +127,23 @@ def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
     """
     import pandas as pd
 
-    given = frame[column]
-    kind = getattr(given.dtype, "kind", "O")
-    text = kind == "O" or isinstance(given.dtype, pd.StringDtype)
-    if text and len(given) and not pd.to_numeric(given, errors="coerce").notna().any():
-        dates = pd.to_datetime(given, errors="coerce", format="ISO8601", utc=True)
+    column_values = frame[column]
+    kind = getattr(column_values.dtype, "kind", "O")
+    text = kind == "O" or isinstance(column_values.dtype, pd.StringDtype)
+    if text and len(column_values) and not pd.to_numeric(column_values, errors="coerce").notna().any():
+        dates = pd.to_datetime(column_values, errors="coerce", format="ISO8601", utc=True)
         if dates.notna().all():
-            given, kind = dates, "M"
+            column_values, kind = dates, "M"
     if kind not in "mM":
         try:
             return numeric(frame, column, file)
         except InputError as error:
             allowed = "must be seconds, or a date as 2024-05-01T12:00:00Z"
             raise InputError(error.field, error.value, allowed, "Mend the cell, or remove the row.") from None
-    _refuse(given, given.isna().to_numpy(), file, "must be a time")
+    _refuse(column_values, column_values.isna().to_numpy(), file, "must be a time")
     if kind == "m":
-        return np.asarray(given.dt.total_seconds(), dtype=float)
-    utc = pd.to_datetime(given, utc=True)
+        return np.asarray(column_values.dt.total_seconds(), dtype=float)
+    utc = pd.to_datetime(column_values, utc=True)
     return np.asarray(utc.dt.as_unit("us").astype("int64").to_numpy() / 1e6, dtype=float)  # in ns years end at 2262
 
 
@@ -194,28 +194,30 @@ def named_columns(
     for key in columns:
         if key not in allowed:
             raise unknown(f"{file}: key of columns", key, allowed, 'Give columns={"t": "name in the file"}.')
-    given = [str(header) for header in frame.columns]
+    header_names = [str(header) for header in frame.columns]
     frame = frame.rename(columns={header: key for key, header in columns.items()})
     for key in columns:
         if (frame.columns == key).sum() > 1:
             twice = f"is not the only column {key} then: the file has one of that name"
             raise InputError(f"{file}: columns[{key!r}]", repr(columns[key]), twice, "Rename or remove one of them.")
     for key in needed:
-        if columns.get(key, key) not in given:
-            raise missing_column(file, columns.get(key, key), given, f"columns {', '.join(needed)} are needed", key)
+        if columns.get(key, key) not in header_names:
+            raise missing_column(
+                file, columns.get(key, key), header_names, f"columns {', '.join(needed)} are needed", key
+            )
     return frame
 
 
-def missing_column(file: str, column: str, given: Sequence[str], allowed: str, key: str = "") -> InputError:
+def missing_column(file: str, column: str, names: Sequence[str], allowed: str, key: str = "") -> InputError:
     """The error of a table without a column; `key` is our name of it, and the hint a header that may be meant."""
     key = key or column
-    usual = [header for header in given if header.lower() in USUAL.get(key, "").split()]
+    usual = [header for header in names if header.lower() in USUAL.get(key, "").split()]
     header = usual[0] if usual else "..."
     hint = f'Add it, or pass columns={{"{key}": "{header}"}}; with a command, FILE?columns={key}:{header}.'
     if usual:
         hint = f"Did you mean {header}? {hint}"
-    allowed = f"{allowed}; the file has {', '.join(given)}"
-    return InputError(f"{file}: column {column}", "missing", allowed, suggestion(column, given, hint))
+    allowed = f"{allowed}; the file has {', '.join(names)}"
+    return InputError(f"{file}: column {column}", "missing", allowed, suggestion(column, names, hint))
 
 
 def _read_csv(path: Path, text: Sequence[str]) -> pd.DataFrame:
@@ -264,17 +266,17 @@ def _refuse(cells: pd.Series[Any], wrong: Bools, file: str, allowed: str) -> Non
     """InputError that names the first wrong cell."""
     bad = np.flatnonzero(wrong)
     if len(bad):
-        given = str(cells.iloc[int(bad[0])])[:60].strip() or "empty"
+        actual = str(cells.iloc[int(bad[0])])[:60].strip() or "empty"
         hint = "Mend the cell, or remove the row: a missing row means that there was no measurement."
-        raise InputError(f"{file}: row {cells.index[bad[0]]}, column {cells.name}", given, allowed, hint)
+        raise InputError(f"{file}: row {cells.index[bad[0]]}, column {cells.name}", actual, allowed, hint)
 
 
 def _too_wide(path: Path, row: int, cells: int, names: int) -> InputError:
     hint = "Name every column in the header; between commas, write decimal points and quote text."
-    given = f"{cells} cells under {names} names"
-    return InputError(f"{path.name}: row {row}", given, "must have one cell per name in the header", hint)
+    actual = f"{cells} cells under {names} names"
+    return InputError(f"{path.name}: row {row}", actual, "must have one cell per name in the header", hint)
 
 
-def _no_table(path: Path, given: str) -> InputError:
+def _no_table(path: Path, actual: str) -> InputError:
     allowed = "must be a table with a header and cells between commas, semicolons or tabs, or of Parquet"
-    return InputError(path.name, given, allowed, "Export it again as CSV in UTF-8, without empty rows and columns.")
+    return InputError(path.name, actual, allowed, "Export it again as CSV in UTF-8, without empty rows and columns.")

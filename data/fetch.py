@@ -85,11 +85,11 @@ def public() -> Mapping[str, Entry]:
 
 
 def _entry(name: str, files: Mapping[str, Mapping[str, Any]], base: str = "", **fields: str) -> Entry:
-    found = {
+    entry = {
         file: (urljoin(base, row["from"]) if base else "", int(row["bytes"]), str(row["sha256"]))
         for file, row in files.items()
     }
-    return Entry(name, files=found, **fields)
+    return Entry(name, files=entry, **fields)
 
 
 def cache_folder() -> Path:
@@ -192,9 +192,9 @@ def _bring(entry: Entry, folder: Path, mirror: str, timeout: float) -> None:
     for file in absent:
         address, (_, size, digest), path = _address(entry, file, mirror), entry.files[file], folder / file
         data = unpacked[file] if unpacked else _downloaded(entry, address, path, size, timeout)
-        if (given := hashlib.sha256(data).hexdigest()) != digest:
+        if (actual := hashlib.sha256(data).hexdigest()) != digest:
             hint = f"It was removed: {address} serves another file."
-            raise _other_bytes(f"{entry.name}: {path.name}", given, digest, hint)
+            raise _other_bytes(f"{entry.name}: {path.name}", actual, digest, hint)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
 
@@ -253,10 +253,10 @@ def _unpacked(entry: Entry, files: list[str], data: bytes) -> dict[str, bytes]:
 def _by_hand(entry: Entry, address: str, to: Path, reason: str) -> InputError:
     """The error of a download, with the address and the place of the file."""
     if address == entry.archive:
-        place = f"unpack it in {cache_folder() / entry.name}, so that {next(iter(entry.files))} is below"
+        advice = f"unpack it in {cache_folder() / entry.name}, so that {next(iter(entry.files))} is below"
     else:
-        place = f"save it as {to}"
-    hint = f"Fetch it by hand (the project: {entry.page}), {place}, and run coopoc data get {entry.name} again."
+        advice = f"save it as {to}"
+    hint = f"Fetch it by hand (the project: {entry.page}), {advice}, and run coopoc data get {entry.name} again."
     return InputError(f"{entry.name}: address", address, f"was not fetched: {reason}", hint)
 
 
@@ -270,8 +270,8 @@ def _offline(entry: Entry, folder: Path, absent: list[str], mirror: str) -> Inpu
     return _by_hand(entry, _address(entry, absent[0], mirror), file, more)
 
 
-def _other_bytes(field: str, given: str, digest: str, hint: str) -> InputError:
-    return InputError(field, f"SHA-256 {given}", f"must have SHA-256 {digest}", hint)
+def _other_bytes(field: str, actual: str, digest: str, hint: str) -> InputError:
+    return InputError(field, f"SHA-256 {actual}", f"must have SHA-256 {digest}", hint)
 
 
 def _size(path: Path) -> int:

@@ -39,17 +39,17 @@ def read_table(
     """
     names = dict(columns or {})
     frame = read_frame(path, names.get("id", "id"))
-    given = bool({*VELOCITY} & {*names, *frame.columns})
-    used = NEEDED + given * VELOCITY
+    has_velocity = bool({*VELOCITY} & {*names, *frame.columns})
+    used = NEEDED + has_velocity * VELOCITY
     frame = named_columns(frame, names, (*NEEDED, *VELOCITY), used, path.name)
-    source = f"table {path.name}" + ("" if given else ", velocity by backward difference")
+    source = f"table {path.name}" + ("" if has_velocity else ", velocity by backward difference")
     factor = factors(scale, (*NEEDED[1:], *VELOCITY))
     t, *axes = (
         factor.get(name, 1.0) * (seconds if name == "t" else numeric)(frame, name, path.name) for name in used[1:]
     )
     numbers = np.column_stack(axes)
     labels: dict[str, Any] = {"file": path.name, "name": path.stem, "source": source}
-    velocity = numbers[:, 3:] if given else None
+    velocity = numbers[:, 3:] if has_velocity else None
     return assemble(words(frame, "id", path.name), t, numbers[:, :3], velocity, **options, **labels)
 
 
@@ -129,9 +129,9 @@ def read_fcd(path: Path, *, vehicle_length: float = 5.0, **options: Any) -> Flee
     except ElementTree.ParseError as error:
         raise InputError(path.name, error, "must be XML of sumo --fcd-output", "Write the file again.") from None
     frame = pd.DataFrame(rows, columns=[*FCD, "t"], index=range(1, len(rows) + 1))
-    t, x, y, z, angle, slope, speed = (numeric(frame, name, path.name) for name in ("t", *FCD) if name != "id")
-    angle, slope = np.radians(angle), np.radians(slope)
-    ahead = np.column_stack([np.sin(angle) * np.cos(slope), np.cos(angle) * np.cos(slope), np.sin(slope)])
+    t, x, y, z, angle, incline, speed = (numeric(frame, name, path.name) for name in ("t", *FCD) if name != "id")
+    angle, incline = np.radians(angle), np.radians(incline)
+    ahead = np.column_stack([np.sin(angle) * np.cos(incline), np.cos(angle) * np.cos(incline), np.sin(incline)])
     centre, velocity = np.column_stack([x, y, z]) - 0.5 * vehicle_length * ahead, speed[:, None] * ahead
     source = f"SUMO FCD {path.name}, centres of vehicles {vehicle_length:g} m long"
     ids = words(frame, "id", path.name)

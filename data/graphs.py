@@ -98,8 +98,8 @@ def _chained(graph: Graph, places: Ints) -> Floats:
     steps = list(zip(places[:-1].tolist(), places[1:].tolist(), strict=True))
     for first, second in steps:
         if (first, second) not in edge_of:
-            given = f"no odometry from {graph.names[first]} to {graph.names[second]}"
-            raise InputError("graph", given, "must join all poses of a robot", "Cut the file at the gap.")
+            actual = f"no odometry from {graph.names[first]} to {graph.names[second]}"
+            raise InputError("graph", actual, "must join all poses of a robot", "Cut the file at the gap.")
     index = [edge_of[step] for step in steps]
     heading = np.concatenate([[0.0], np.cumsum(edges.orientation[index, 0])])
     moved = turned(np.pad(edges.position[index], ((0, 0), (0, 1))), heading[:-1])[:, :2]

@@ -277,8 +277,8 @@ def _delayed(log: MrclamLog, values: Floats, lag: float) -> Floats:
 def _factors(window: int, true: Floats, *logged: Floats) -> Floats:
     """(regressors, N) least-squares factors of logged values (T, N) on true ones, over sums of a window, where the true
     ones are known."""
-    known = np.isfinite(true)
-    parts = (np.where(known, values, 0.0)[: len(true) // window * window] for values in (true, *logged))
+    finite = np.isfinite(true)
+    parts = (np.where(finite, values, 0.0)[: len(true) // window * window] for values in (true, *logged))
     sums = [part.reshape(-1, window, true.shape[1]).sum(axis=1).T for part in parts]
     pairs = zip(np.stack(sums[1:], axis=-1), sums[0], strict=True)
     return np.array([np.linalg.lstsq(left, right)[0] for left, right in pairs]).T
@@ -321,8 +321,8 @@ def _relative(log: MrclamLog, until: float) -> tuple[float, float]:
     angle = wrap(np.append(log.others[:, 4] - log.true_others[:, 1], marks[:, 4] - (np.arctan2(dy, dx) - own[:, 2])))
     used = np.isfinite(reach) & (t >= 0) & (t < until)
     if used.sum() < FEWEST:
-        given, allowed = f"{used.sum()} measurements in {until:g} s", f"must be {FEWEST} or more"
-        raise InputError("calibrate_s", given, allowed, "Take longer.")
+        actual, allowed = f"{used.sum()} measurements in {until:g} s", f"must be {FEWEST} or more"
+        raise InputError("calibrate_s", actual, allowed, "Take longer.")
     ranges, bearings = (grouped(error[used], observer[used], t[used]) for error in (reach, angle))
     return ranges, bearings
 

@@ -231,9 +231,9 @@ def _real(path: Path, columns: Mapping[str, str] | None = None) -> str:
 
 def _split(name_or_path: str | Path, options: dict[str, Any]) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """Name, options of the reader, and the part that is kept."""
-    name, given = split(name_or_path)
-    given |= {key: value for key, value in options.items() if key != "format" or value is not None}
-    return name, given, {key: given.pop(key, None) for key in ("since", "until")}
+    name, options_given = split(name_or_path)
+    options_given |= {key: value for key, value in options.items() if key != "format" or value is not None}
+    return name, options_given, {key: options_given.pop(key, None) for key in ("since", "until")}
 
 
 def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:

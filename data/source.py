@@ -81,9 +81,9 @@ def parted(data: Any, since: float | None = None, until: float | None = None) ->
     begin, end, t = since or 0.0, np.inf if until is None else until, data.t
     first, last = np.searchsorted(t - t[0], np.array([begin, end]) - ROUNDING * (t[1] - t[0])).tolist()
     if not (last - first >= 2 and 0 <= begin < end):
-        given, length = f"since {begin:g} s until {end:g} s", f"{t[-1] - t[0]:g} s"
+        actual, length = f"since {begin:g} s until {end:g} s", f"{t[-1] - t[0]:g} s"
         raise InputError(
-            "since, until", given, f"must leave two steps of the {length}", "Count from the first step, 0 s."
+            "since, until", actual, f"must leave two steps of the {length}", "Count from the first step, 0 s."
         )
     part: Fleet | Recording = data.between(first, last)
     if isinstance(part, Recording):

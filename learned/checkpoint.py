@@ -136,9 +136,9 @@ def load(path: Path | str, net: str = "") -> Checkpoint:
     tensors, card = read(path)
     history = tensors.pop(_HISTORY, None)
     if not isinstance(card.get("kind"), str) or not isinstance(card.get("net"), dict):
-        given = {name: card.get(name) for name in ("kind", "net")}
+        kind_and_net = {name: card.get(name) for name in ("kind", "net")}
         allowed = "must name a kind of net and its settings"
-        raise InputError(f"checkpoint {path}: card", given, allowed, "Write it with save.")
+        raise InputError(f"checkpoint {path}: card", kind_and_net, allowed, "Write it with save.")
     if in_file(card["kind"]) and not net:
         allowed = "names a file, whose code does not run unless you name it, too"
         hint = f"If you trust that file: load({str(path)!r}, net={card['kind']!r})."

@@ -160,13 +160,13 @@ def recipe_of(name: str) -> Recipe:
     >>> recipe_of("okf").net
     'okf'
     """
-    given = find("coopoc.recipes", name)
-    if isinstance(given, type) and issubclass(given, Gain):
+    recipe = find("coopoc.recipes", name)
+    if isinstance(recipe, type) and issubclass(recipe, Gain):
         return Recipe("federated", net=name)
-    if not isinstance(given, Recipe):
+    if not isinstance(recipe, Recipe):
         hint = "Write RECIPE = Recipe(...), or a class that derives from Gain."
-        raise InputError("recipe", repr(name), f"is a {type(given).__name__}, no Recipe and no net", hint)
-    return given
+        raise InputError("recipe", repr(name), f"is a {type(recipe).__name__}, no Recipe and no net", hint)
+    return recipe
 
 
 def jobs_of(name: str, setting: Setting, fleet: Drives, aggregate: str | None = None) -> list[Job]:

@@ -80,8 +80,13 @@ def train_all(
     """
     fleet, out = drives_of(data), given_path(out)
     jobs = number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1")
-    given = {"seeds": seeds, "starts": starts, "readings": readings, "recipes": RECIPES if recipes is None else recipes}
-    seeds, starts, readings, recipes = (listed(name, v, f"Give {name}=[...].") for name, v in given.items())
+    arguments = {
+        "seeds": seeds,
+        "starts": starts,
+        "readings": readings,
+        "recipes": RECIPES if recipes is None else recipes,
+    }
+    seeds, starts, readings, recipes = (listed(name, v, f"Give {name}=[...].") for name, v in arguments.items())
     settings = [Setting(seed, start, reading) for reading in readings for start in starts for seed in seeds]
     wanted = {
         name: [job for setting in settings for job in jobs_of(name, setting, fleet, aggregate)] for name in recipes
@@ -126,22 +131,24 @@ def trained(group: Sequence[Job], fleet: Drives, progress: bool = True) -> list[
 def ratio_to_fitted_filter(model: Gain, job: Job, fleet: Drives) -> float:
     """RT-LE on the pieces that validate over that of a Kalman filter whose noise is fitted on those that train."""
     data = job_clients(job, fleet)
-    known = NoiseModel.fitted(*_drives(_joined(data, job.client, "training")))
-    seen, truth = _drives(_joined(data, job.client, "validation"))
-    methods = model.method(job.name), Kalman(known)
-    ours, theirs = (np.nansum((method(seen, seen.ids).x[0] - truth.position) ** 2) for method in methods)
+    noise_model = NoiseModel.fitted(*_drives(_joined(data, job.client, "training")))
+    recording, truth = _drives(_joined(data, job.client, "validation"))
+    methods = model.method(job.name), Kalman(noise_model)
+    ours, theirs = (np.nansum((method(recording, recording.ids).x[0] - truth.position) ** 2) for method in methods)
     return float(np.sqrt(ours / theirs))
 
 
-def _drives(given: Segments) -> tuple[Recording, Fleet]:
+def _drives(segments: Segments) -> tuple[Recording, Fleet]:
     """Pieces, as they were drawn once, as vehicles that drive at one time; where no piece has a true height it is 0."""
-    gnss, velocity, truth = (part.double().numpy().swapaxes(0, 1) for part in (given.gnss, given.velocity, given.truth))
+    gnss, velocity, truth = (
+        part.double().numpy().swapaxes(0, 1) for part in (segments.gnss, segments.velocity, segments.truth)
+    )
     truth = np.where(np.isnan(truth).all(axis=(0, 1)), 0.0, truth)
     names = tuple(map(str, range(gnss.shape[1])))
-    fleet = Fleet(names, given.dt * np.arange(len(gnss)), truth, 0 * truth)
+    fleet = Fleet(names, segments.dt * np.arange(len(gnss)), truth, 0 * truth)
     still = replace(fleet, position=np.zeros_like(truth), velocity=np.zeros_like(truth))
-    seen = observe(still, Sensors(), V2X(max_neighbours=0))
-    return replace(seen, gnss=gnss[None], velocity=velocity[None]), fleet
+    recording = observe(still, Sensors(), V2X(max_neighbours=0))
+    return replace(recording, gnss=gnss[None], velocity=velocity[None]), fleet
 
 
 def _in_worker(group: Sequence[Job], fleet: Drives, out: Path, worst: float, line: int | None, parent: int) -> None:

@@ -79,14 +79,14 @@ def benchmark(
             allowed = "must stand without --tasks and --data"
             raise InputError("worlds", worlds, allowed, "Run worlds and tasks one after the other.")
         return run_worlds(methods, out / "worlds", worlds, seed, validation, jobs)
-    known = {task.name: task for task in (VALIDATION if validation else TASKS)}
+    by_name = {task.name: task for task in (VALIDATION if validation else TASKS)}
     if seed is not None:
         drawn = number("seed", seed, kind=int, allowed=">= 0", hint="Any whole number will do.")
-        known = {name: replace(task, seed=drawn) for name, task in known.items()}
+        by_name = {name: replace(task, seed=drawn) for name, task in by_name.items()}
     real = [*LOGGED, *roads(data), *CONVOYS]
     for name in tasks:
-        if name not in (*known, *real):
-            raise unknown("tasks", name, [*known, *real], "Leave it out for all.")
+        if name not in (*by_name, *real):
+            raise unknown("tasks", name, [*by_name, *real], "Leave it out for all.")
     if not methods and not table:
         raise InputError("methods", "()", "must name a method", "coopoc list shows them; --table prints the cards.")
     for name in methods:
@@ -95,13 +95,13 @@ def benchmark(
         elif data is None and not tasks:
             hint = "Add --data FOLDER, or --tasks with what coopoc data get has fetched."
             raise InputError("data", None, f"must name the folder of measurements for {name}", hint)
-        own_tasks = [*(known if simulated(name) else ()), *measurable(name, data)]
+        own_tasks = [*(by_name if simulated(name) else ()), *measurable(name, data)]
         if tasks and not set(tasks) & {*own_tasks}:
             raise InputError(f"tasks of {name}", ", ".join(tasks), f"must be of {', '.join(own_tasks)}", "Name one.")
     failed = 0
     for name in methods:
         began = time.perf_counter()
-        chosen = [known[task] for task in tasks or known if task in known] if simulated(name) else []
+        chosen = [by_name[task] for task in tasks or by_name if task in by_name] if simulated(name) else []
         made = card(name, chosen, data, [task for task in tasks if task in real] if tasks else None)
         failed += sum("failed" in row for row in made["tasks"])
         file = card_folder(out, seed, validation) / card_file(name)
@@ -130,9 +130,9 @@ def tried(name: str, task: Task) -> Row:
     """A method's row for one task: error with its interval, bound, consistency, bytes and time."""
     one = named_method(name)
     held = information(name, one)
-    seen, fleet = recording(task, held in ("", "fleet"))
-    one(seen.between(0, 3), [task.columns[0]])  # compiles
-    scores = scored(one, seen, [fleet.ids[k] for k in task.columns], fleet)
+    recording_, fleet = recording(task, held in ("", "fleet"))
+    one(recording_.between(0, 3), [task.columns[0]])  # compiles
+    scores = scored(one, recording_, [fleet.ids[k] for k in task.columns], fleet)
     level = mean_interval(scores["rt_le_m"])
     row: Row = {"task": task.name}
     row |= {"rt_le_m": rounded(level)}
@@ -154,10 +154,10 @@ def measurable(name: str, data: Path | None) -> dict[str, Callable[[], Row]]:
         made = own(name) if in_file(name) else name
         return {task: partial(pose_row, task, data, made) for task in LOGGED}
     method, places = named_method(name), roads(data)
-    found: dict[str, Callable[[], Row]] = {task: partial(road_row, task, data, method) for task in places}
+    rows: dict[str, Callable[[], Row]] = {task: partial(road_row, task, data, method) for task in places}
     if places.keys() >= ROADS.keys():
-        found |= {task: partial(convoy_row, task, data, method) for task in CONVOYS}
-    return found
+        rows |= {task: partial(convoy_row, task, data, method) for task in CONVOYS}
+    return rows
 
 
 def _row(task: str, made: Callable[[], Row]) -> Row:
@@ -203,8 +203,8 @@ def page(cards: Iterable[Params]) -> str:
 
     Of simulated ones RT-LE in m and, in parentheses, over its bound, the least geometric mean over all tasks first.
     """
-    given = list(cards)
-    return "\n\n".join(markdown(rows) for rows in (_simulated(given), _logs(given)) if rows)
+    card_list = list(cards)
+    return "\n\n".join(markdown(rows) for rows in (_simulated(card_list), _logs(card_list)) if rows)
 
 
 def _logs(cards: Sequence[Params]) -> list[Row]:

@@ -36,7 +36,7 @@ def study(
     cases: Mapping[str, Where],
     pairs: Sequence[tuple[str, str]],
     note: str,
-    told: Sequence[str],
+    named: Sequence[str],
     number: Number = mean,
     **options: Any,
 ) -> Study:
@@ -48,7 +48,7 @@ def study(
         cases: title -> condition, as parameters of a cell.
         pairs: methods and noise models.
         note: end of the captions.
-        told: titles of the cases that findings name.
+        named: titles of the cases that findings name.
         number: of a selection.
         options: other fields of Study.
     """
@@ -56,7 +56,7 @@ def study(
 
     def findings(results: Results) -> dict[str, str]:
         texts = {}
-        for title in told:
+        for title in named:
             each = ran({label: number(results, {**cases[title], **line}) for label, line in methods.items()})
             if each:
                 texts[title] = f"{title}: {listed(dict(sorted(each.items(), key=itemgetter(1))))}."

@@ -80,8 +80,8 @@ def _ratio(measured: AnyArray, true: AnyArray, slow: float) -> AnyArray:
     """(T,) complex factor of the odometry's motion over the true one, as before where the vehicle is slow."""
     fast = (np.abs(true) > slow) & np.isfinite(measured)
     last = np.maximum.accumulate(np.where(fast, np.arange(len(true)), np.argmax(fast)))
-    found = (np.where(fast, measured, 1.0) / np.where(fast, true, 1.0))[last]
-    ratio: AnyArray = np.clip(np.abs(found), 0.5, 2.0) * np.exp(1j * np.clip(np.angle(found), -0.5, 0.5))
+    last_ratio = (np.where(fast, measured, 1.0) / np.where(fast, true, 1.0))[last]
+    ratio: AnyArray = np.clip(np.abs(last_ratio), 0.5, 2.0) * np.exp(1j * np.clip(np.angle(last_ratio), -0.5, 0.5))
     return ratio
 
 

@@ -204,11 +204,11 @@ def bound_rows(p: Params) -> list[Row]:
     drive, v2x = scene.fleet(p["data"]), scene.channel(p)
     if scene.is_real(p["data"]):
         return [{"run": 0, "ego": ego} for ego in scene.egos(p)]
-    acting, rate, told = scene.acting(p), min(v2x.rate or np.inf, 1 / drive.dt), scene.told(p)
+    acting, rate, clean = scene.acting(p), min(v2x.rate or np.inf, 1 / drive.dt), scene.without_outliers(p)
     rows_of_egos: list[Row] = []
     for ego in scene.egos(p):
         column = drive.index(ego)
-        level = bound_rt_le(bound(drive, acting, column, v2x, recording=told))
+        level = bound_rt_le(bound(drive, acting, column, v2x, recording=clean))
         near = len(find_links(drive, [column], v2x, acting.min_range)) / len(drive.t)
         received = near * FIX_AND_VELOCITY.payload * rate
         sizes = {"bytes_per_second": received, "payload_bytes_per_second": received}
@@ -221,11 +221,11 @@ def tracks(p: Params) -> Iterator[tuple[str, Floats, Floats]]:
     recording = scene.recording(p)
     for seed, method in methods(p) if p["method"] != "bound" else ():
         for ego in scene.egos(p):
-            found = [method(recording.between(*cut), [ego]) for cut in recording.stretches(ego)]
-            t = np.concatenate([track.t for track in found])
+            pieces = [method(recording.between(*cut), [ego]) for cut in recording.stretches(ego)]
+            t = np.concatenate([track.t for track in pieces])
             for run in range(recording.runs):
                 name = f"{ego}-run{run}" + (f"-seed{seed}" if seed is not None else "")
-                yield name, t, np.concatenate([track.x[run, :, 0] for track in found])
+                yield name, t, np.concatenate([track.x[run, :, 0] for track in pieces])
 
 
 RMS, MAXIMA, SUMS = ("rt_le_m", "neighbour_rt_le_m", "innovation_m"), ("max_error_m",), ("fixes", "seconds")

@@ -42,20 +42,20 @@ def paper(
     from coopoc.data.registry import DATASETS, card, in_words
     from coopoc.study.report import report
 
-    began, results, given = time.perf_counter(), dict[str, Results](), {"weights": str(out / "weights"), "data": data}
+    began, results, inputs = time.perf_counter(), dict[str, Results](), {"weights": str(out / "weights"), "data": data}
     for number, name in enumerate(PAPER, start=1):
         print(f"coopoc: stage {number} of {len(PAPER) + 1}: {name}", file=sys.stderr)
         study = find("coopoc.studies", name)
-        results[name] = run_study(study, out=out, jobs=jobs, settings=given, retry_failed=True)
+        results[name] = run_study(study, out=out, jobs=jobs, settings=inputs, retry_failed=True)
     print(f"coopoc: stage {len(PAPER) + 1} of {len(PAPER) + 1}: report", file=sys.stderr)
     texts = {results[name].question: reported(name, results[name], keys) for name, keys in PAPER.items()}
     bundled = [name for name in dict.fromkeys((data, "town10-clients")) if name in DATASETS]
-    place = "our fleets" if data in DATASETS else f"{Path(data).name} after training on ours"
+    chosen = "our fleets" if data in DATASETS else f"{Path(data).name} after training on ours"
     page = report(
         [out / name for name in PAPER],
         out / "report.html",
         title="Should vehicles collaborate while they train, or while they decide?",
-        lead=[reported("neighbours", results["neighbours"], ["answer"]), LEAD.format(where=place)],
+        lead=[reported("neighbours", results["neighbours"], ["answer"]), LEAD.format(where=chosen)],
         answers={question: answer for question, answer in texts.items() if answer},
         first="neighbours",
         cards={name: in_words(card(name)) for name in bundled},

@@ -131,8 +131,8 @@ def drive(data: str, until: float, v2x: V2X) -> Drive:
         recording = under(pose_recording(log, _calibration(data, until)), v2x, logged=False)
         return Drive(recording, pose_start(recording, gate=GATE), log.fleet, True)
     recording = under(log.recording, v2x, logged=log.messages)
-    told = recording.sensors
-    lasting = max(told.speed_scale_std, told.yaw_rate_bias_std, told.range_offset_std) > 0
+    stated = recording.sensors
+    lasting = max(stated.speed_scale_std, stated.yaw_rate_bias_std, stated.range_offset_std) > 0
     begin, spread, _ = _begin(data)
     return Drive(recording, begin, log.truth, lasting, spread)
 

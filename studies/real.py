@@ -133,13 +133,13 @@ def cell(p: Params) -> list[Row]:
         ways = (account.of("online", "on air", way)[0] for way in ("broadcast", "per receiver"))
         sent, received = (moved / account.seconds for moved in ways)
         scores = _scores(track, recording, drive.truth)
-        known = np.isfinite(next(iter(scores.values()), np.empty((0, len(who)))))[start : start + blocks * block]
+        finite = np.isfinite(next(iter(scores.values()), np.empty((0, len(who)))))[start : start + blocks * block]
         for ego, name in enumerate(who):  # as many blocks for each vehicle, of the steps at which it can be scored
-            for number, scored in enumerate(np.array_split(start + np.flatnonzero(known[:, ego]), blocks)):
-                found = {what: _reduced(what, score[scored, ego]) for what, score in scores.items()}
-                if any(np.isfinite(value) for value in found.values()):
+            for number, scored in enumerate(np.array_split(start + np.flatnonzero(finite[:, ego]), blocks)):
+                columns = {what: _reduced(what, score[scored, ego]) for what, score in scores.items()}
+                if any(np.isfinite(value) for value in columns.values()):
                     sizes = {"bytes_per_second": received[ego], "sent_bytes": once + sent[ego] * driven(p)}
-                    rows.append({"run": number, "ego": name, **found, **sizes})
+                    rows.append({"run": number, "ego": name, **columns, **sizes})
     return rows
 
 
@@ -151,9 +151,9 @@ def driven(p: Params) -> float:
 
 def _filters(p: Params, drive: Drive) -> tuple[list[PoseFilter], float]:
     """One filter for all vehicles or one for each, and bytes that a vehicle sent for its training."""
-    given = str(p["data"]), drives.calibrated(p), int(p["evaluations"])
+    data_and_calibration = str(p["data"]), drives.calibrated(p), int(p["evaluations"])
     name, k = str(p["method"]), int(p["max_neighbours"])
-    constants, once = trained(*given)[name] if name in TRAINED else ([None], 0.0)
+    constants, once = trained(*data_and_calibration)[name] if name in TRAINED else ([None], 0.0)
     made = _filter(METHODS.get(name, {}), k, drive)
     return [replace(made, assumed=one) for one in constants], once
 

@@ -253,14 +253,14 @@ def channel(p: Params) -> V2X:
     most = int(p.get("max_neighbours", 0))
     usual = channel_of(str(p["channel"]), most) if "channel" in p else V2X.ideal(most)
     losses = {"loss": p.get("loss"), "burst": p.get("burst"), "latency": p.get("latency_s")}
-    given: dict[str, Any] = {field: value for field, value in losses.items() if value is not None}
+    options: dict[str, Any] = {field: value for field, value in losses.items() if value is not None}
     return replace(
         usual,
         radius=float(p.get("radius_m", 30.0)) or (float("inf") if is_real(str(p["data"])) else 30.0),
         rate=p.get("rate_hz") or usual.rate,
         bytes_per_second=cap or float("inf"),
         schedule=p.get("schedule", usual.schedule),
-        **given,
+        **options,
     )
 
 
@@ -285,21 +285,21 @@ def _digests(data: str) -> Mapping[str, str]:
 
 def recording(p: Params) -> Recording:
     """Recording of the cell's vehicles; the real measurements where there are any."""
-    return _attacked(p, told=False)
+    return _attacked(p, remove_outliers=False)
 
 
-def told(p: Params) -> Recording | None:
+def without_outliers(p: Params) -> Recording | None:
     """The same without outliers and false fixes, as of an estimator which is told of them; None if there are none."""
-    return _attacked(p, told=True) if sensors(p).outliers or attacking(p) else None
+    return _attacked(p, remove_outliers=True) if sensors(p).outliers or attacking(p) else None
 
 
-def _attacked(p: Params, told: bool) -> Recording:
+def _attacked(p: Params, remove_outliers: bool) -> Recording:
     from coopoc.methods.catalogue import needs_whole_fleet
 
     who, attack = egos(p), attacking(p)
     observers = None if needs_whole_fleet(str(p.get("method"))) else who
-    drawn = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers, told)
-    return spoofed(drawn, attack, seed=int(p["seed"]), honest=who, told=told) if attack else drawn
+    drawn = _recording(p["data"], sensors(p), channel(p), int(p["runs"]), int(p["seed"]), observers, remove_outliers)
+    return spoofed(drawn, attack, seed=int(p["seed"]), honest=who, remove_outliers=remove_outliers) if attack else drawn
 
 
 def attacking(p: Params) -> Spoofing | None:
@@ -316,9 +316,9 @@ def trial(p: Params) -> tuple[Recording, tuple[str, ...], Fleet]:
 
 @lru_cache(maxsize=2)
 def _recording(
-    data: str, noise: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...] | None, told: bool
+    data: str, noise: Sensors, v2x: V2X, runs: int, seed: int, observers: tuple[str, ...] | None, remove_outliers: bool
 ) -> Recording:
     log = _log(data)
     if log is not None:
         return _under(log, v2x, runs, seed)
-    return observe(fleet(data), noise, v2x, runs=runs, seed=seed, observers=observers, told=told)
+    return observe(fleet(data), noise, v2x, runs=runs, seed=seed, observers=observers, remove_outliers=remove_outliers)

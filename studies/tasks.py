@@ -109,14 +109,18 @@ VALIDATION = tuple(replace(task, data="town10-validation", seed=1) for task in T
 
 
 @lru_cache(maxsize=2)
-def recording(task: Task, everyone: bool, told: bool = False) -> tuple[Recording, Fleet]:
-    """What a task's vehicles see, with what is wrong in it or `told` of it, and the truth."""
+def recording(task: Task, everyone: bool, remove_outliers: bool = False) -> tuple[Recording, Fleet]:
+    """What a task's vehicles see, with what is wrong in it or `remove_outliers` of it, and the truth."""
     fleet = load_fleet(task.data)
     egos = None if everyone else list(task.columns)
-    seen = observe(fleet, task.sensors, task.v2x, runs=task.runs, seed=task.seed, observers=egos, told=told)
+    observed = observe(
+        fleet, task.sensors, task.v2x, runs=task.runs, seed=task.seed, observers=egos, remove_outliers=remove_outliers
+    )
     if task.attack.share:
-        seen = spoofed(seen, task.attack, seed=task.seed, honest=list(task.columns), told=told)
-    return seen, fleet
+        observed = spoofed(
+            observed, task.attack, seed=task.seed, honest=list(task.columns), remove_outliers=remove_outliers
+        )
+    return observed, fleet
 
 
 FEW = 3
@@ -135,15 +139,17 @@ def bound(task: Task, information: str) -> float:
     v2x = V2X(max_neighbours=task.v2x.max_neighbours, radius=task.v2x.radius)
     wrong = bool(sensors.outliers or task.attack.share)
     runs = FEW if information in ("past", "fleet") else task.runs
-    told = recording(replace(task, v2x=v2x, runs=runs), information == "fleet", told=True)[0] if wrong else None
+    clean = (
+        recording(replace(task, v2x=v2x, runs=runs), information == "fleet", remove_outliers=True)[0] if wrong else None
+    )
     if information == "fleet":
-        bounds = [*np.moveaxis(fleet_bound(fleet, sensors, v2x, recording=told)[:, list(task.columns)], 1, 0)]
+        bounds = [*np.moveaxis(fleet_bound(fleet, sensors, v2x, recording=clean)[:, list(task.columns)], 1, 0)]
     else:
         of_ego, near = (
             past_bound if information == "past" else posterior_bound,
             V2X(0) if information == "solo" else v2x,
         )
-        bounds = [of_ego(fleet, sensors, ego, near, recording=told) for ego in task.columns]
+        bounds = [of_ego(fleet, sensors, ego, near, recording=clean) for ego in task.columns]
     return float(np.sqrt(np.mean([bound_rt_le(cov) ** 2 for cov in bounds])))
 
 
@@ -177,11 +183,11 @@ def located(folder: Path | None, name: str) -> Path:
     entry = public().get(holder(name))
     folders = [] if folder is None else [folder]
     folders += [cache_folder() / entry.name] if entry and entry.fetched else []
-    found = [path for one in folders if one.is_dir() for path in (one, *sorted(one.rglob(name))) if path.name == name]
-    if not found:
+    paths = [path for one in folders if one.is_dir() for path in (one, *sorted(one.rglob(name))) if path.name == name]
+    if not paths:
         searched = str(folder or cache_folder())
         raise InputError("data", searched, f"must hold {name}, however deep", bring(name, "Name its folder."))
-    return found[0]
+    return paths[0]
 
 
 @lru_cache(maxsize=2)
@@ -217,12 +223,12 @@ def pose_row(task: str, folder: Path | None, made: Any) -> Row:
     """
     file, block_s = LOGGED[task]
     path = located(folder, file)
-    recording, fleet, start, known = seen(task, path)
+    recording, fleet, start, assumed = seen(task, path)
     if isinstance(made, str):
-        made = PoseFilter(**{"lasting": task != "uwb", **known, **POSES[made]}, gate=GATE)
+        made = PoseFilter(**{"lasting": task != "uwb", **assumed, **POSES[made]}, gate=GATE)
     elif is_dataclass(made):
         own = {field.name for field in fields(made)}
-        made = replace(made, **{name: value for name, value in known.items() if name in own})  # type: ignore[type-var]
+        made = replace(made, **{name: value for name, value in assumed.items() if name in own})  # type: ignore[type-var]
     who = [k for k in range(len(recording.ids)) if k not in recording.landmarks]
     ids = [recording.ids[k] for k in who]
     made(recording.between(0, 3), ids)  # compiles
@@ -267,5 +273,5 @@ def blocks_of(error: Floats, start: int, length: float) -> Floats:
     """(E, B) root mean square of errors (T, E) over blocks of steps from the start on, of those without a gap."""
     size = max(int(length), 1)
     parts = [error[first : first + size] for first in range(start, len(error) - size + 1, size)]
-    found = np.array([np.sqrt(np.nanmean(part**2, axis=0)) for part in parts if np.isfinite(part).any(axis=0).all()])
-    return found.T
+    errors = np.array([np.sqrt(np.nanmean(part**2, axis=0)) for part in parts if np.isfinite(part).any(axis=0).all()])
+    return errors.T

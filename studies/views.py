@@ -83,8 +83,8 @@ def selections(
 
     def view(results: Results) -> Table | None:
         shown = rows(results) if callable(rows) else rows
-        place = {**results.settings, **(at or {})}
-        kept = {"decimals": scene.decimals(place), **options}
+        where = {**results.settings, **(at or {})}
+        kept = {"decimals": scene.decimals(where), **options}
         return crossed(results, head, shown, columns, scene.caption(results, *texts, **(at or {})), **kept)
 
     return view

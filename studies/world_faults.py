@@ -47,9 +47,9 @@ class Scene:
         """The same with one more edit."""
         return replace(self, edits=(*self.edits, edit))
 
-    def sensing(self, told: bool = False, **more: Any) -> Scene:
+    def sensing(self, stated: bool = False, **more: Any) -> Scene:
         """The same with other sensors, of which methods are told or not."""
-        assumed = replace(self.assumed, **more) if told else self.assumed
+        assumed = replace(self.assumed, **more) if stated else self.assumed
         return replace(self, acting=replace(self.acting, **more), assumed=assumed)
 
     def outliers(self, **more: Fault) -> Scene:
@@ -80,25 +80,25 @@ def _levels(scene: Scene, rng: Draws) -> Made:
     fix, speed, distance, angle = np.where(
         rng.uniform(size=4) < 0.3, 1.0, [log_uniform(rng, 0.3, 4.0) for _ in range(4)]
     ).tolist()
-    known = scene.acting
+    acting = scene.acting
     made = scene.sensing(
-        gnss_std=tuple(fix * std for std in known.gnss_std),
-        velocity_std_ratio=speed * known.velocity_std_ratio,
-        range_std=distance * known.range_std,
-        azimuth_std=angle * known.azimuth_std,
-        inclination_std=angle * known.inclination_std,
+        gnss_std=tuple(fix * std for std in acting.gnss_std),
+        velocity_std_ratio=speed * acting.velocity_std_ratio,
+        range_std=distance * acting.range_std,
+        azimuth_std=angle * acting.azimuth_std,
+        inclination_std=angle * acting.inclination_std,
     )
     words = f"fixes {fix:.2g}, velocities {speed:.2g}, ranges {distance:.2g}, angles {angle:.2g}"
     return made, f"{words} times what is assumed"
 
 
-def _drift(scene: Scene, rng: Draws, told: bool) -> Made:
+def _drift(scene: Scene, rng: Draws, stated: bool) -> Made:
     own, common, lasts = log_uniform(rng, 1.0, 5.0), log_uniform(rng, 0.3, 3.0), log_uniform(rng, 15.0, 120.0)
-    made = scene.sensing(told, gnss_drift_std=own, gnss_common_std=common, gnss_drift_time=lasts)
+    made = scene.sensing(stated, gnss_drift_std=own, gnss_common_std=common, gnss_drift_time=lasts)
     return made, f"{own:.2g} m, {common:.2g} m in common, for {lasts:.0f} s"
 
 
-def _compass(scene: Scene, rng: Draws, told: bool) -> Made:
+def _compass(scene: Scene, rng: Draws, stated: bool) -> Made:
     """Headings turn what is measured and where odometry leads by one angle a vehicle and run."""
     std = float(np.deg2rad(log_uniform(rng, 1.0, 8.0)))
 
@@ -106,18 +106,18 @@ def _compass(scene: Scene, rng: Draws, told: bool) -> Made:
         angle = std * _normals(recording, scene.seed, "heading_bias")  # the draw of the azimuths
         return replace(recording, velocity=turned(recording.velocity, angle[:, None]))
 
-    return scene.sensing(told, heading_bias_std=std).edited(edit), f"{np.rad2deg(std):.2g}°"
+    return scene.sensing(stated, heading_bias_std=std).edited(edit), f"{np.rad2deg(std):.2g}°"
 
 
-def _scale(scene: Scene, rng: Draws, told: bool) -> Made:
+def _scale(scene: Scene, rng: Draws, stated: bool) -> Made:
     std = log_uniform(rng, 0.01, 0.1)
 
     def edit(recording: Recording) -> Recording:
         scale = 1.0 + std * _normals(recording, scene.seed, "speed_scale")
         return replace(recording, velocity=recording.velocity * scale[:, None, :, None])
 
-    known = replace(scene.assumed, speed_scale_std=std) if told else scene.assumed
-    return replace(scene, assumed=known).edited(edit), f"{100 * std:.2g} %"
+    assumed_sensors = replace(scene.assumed, speed_scale_std=std) if stated else scene.assumed
+    return replace(scene, assumed=assumed_sensors).edited(edit), f"{100 * std:.2g} %"
 
 
 def _normals(recording: Recording, seed: int, sensor: str) -> Floats:
@@ -138,8 +138,8 @@ def _slip(scene: Scene, rng: Draws) -> Made:
 
 def _during(recording: Recording, when: Bools, columns: Ints | tuple[int, ...]) -> Bools:
     """(T, N, 1) True of some vehicles at some steps."""
-    found: Bools = (when[:, None] & np.isin(np.arange(len(recording.ids)), columns))[..., None]
-    return found
+    during: Bools = (when[:, None] & np.isin(np.arange(len(recording.ids)), columns))[..., None]
+    return during
 
 
 def _outage(scene: Scene, rng: Draws, start: bool) -> Made:
@@ -190,9 +190,9 @@ def _mistaken(scene: Scene, rng: Draws) -> Made:
     return scene.outliers(angles=Fault(rate, lasts=lasts)), f"{100 * rate:.0f} % for {lasts:g} s"
 
 
-def _long(scene: Scene, rng: Draws, told: bool) -> Made:
+def _long(scene: Scene, rng: Draws, stated: bool) -> Made:
     std = log_uniform(rng, 0.5, 5.0)
-    return scene.sensing(told, range_offset_std=std), f"{std:.2g} m"
+    return scene.sensing(stated, range_offset_std=std), f"{std:.2g} m"
 
 
 def _only(scene: Scene, _: Draws, columns: tuple[int, ...]) -> Made:
@@ -289,12 +289,12 @@ CREEP = (5.0, 30.0)
 """s, over which an error grows that does not jump."""
 KINDS: Mapping[str, Callable[[Scene, Draws], Made]] = {
     "noise levels": _levels,
-    "drift, told": partial(_drift, told=True),
-    "drift, not told": partial(_drift, told=False),
-    "compass, told": partial(_compass, told=True),
-    "compass, not told": partial(_compass, told=False),
-    "odometer scale, told": partial(_scale, told=True),
-    "odometer scale, not told": partial(_scale, told=False),
+    "drift, told": partial(_drift, stated=True),
+    "drift, not told": partial(_drift, stated=False),
+    "compass, told": partial(_compass, stated=True),
+    "compass, not told": partial(_compass, stated=False),
+    "odometer scale, told": partial(_scale, stated=True),
+    "odometer scale, not told": partial(_scale, stated=False),
     "odometer slip": _slip,
     "no fixes": partial(_outage, start=False),
     "no fixes, at first": partial(_outage, start=True),
@@ -304,8 +304,8 @@ KINDS: Mapping[str, Callable[[Scene, Draws], Made]] = {
     "multipath": _multipath,
     "NLOS": _nlos,
     "mistaken angles": _mistaken,
-    "range offset, told": partial(_long, told=True),
-    "range offset, not told": partial(_long, told=False),
+    "range offset, told": partial(_long, stated=True),
+    "range offset, not told": partial(_long, stated=False),
     "measured, ranges only": partial(_only, columns=(0,)),
     "measured, angles only": partial(_only, columns=(1, 2)),
     "measured, inclinations only": partial(_only, columns=(2,)),

@@ -129,12 +129,12 @@ def _nominal(key: int, split: Split) -> Scene:
 
 
 def _text(scene: Scene) -> str:
-    known, fleet = scene.assumed, scene.fleet
+    assumed, fleet = scene.assumed, scene.fleet
     return (
         f"{fleet.name}, {len(fleet.ids)} vehicles, {fleet.t[-1]:.0f} s in steps of {fleet.dt:g} s, "
-        f"K = {scene.v2x.max_neighbours} within {scene.v2x.radius:g} m, fixes {known.gnss_std[0]:.2g} m, velocities "
-        f"{100 * known.velocity_std_ratio:.2g} %, ranges {known.range_std:.2g} m, "
-        f"angles {np.rad2deg(known.azimuth_std):.2g}°"
+        f"K = {scene.v2x.max_neighbours} within {scene.v2x.radius:g} m, fixes {assumed.gnss_std[0]:.2g} m, velocities "
+        f"{100 * assumed.velocity_std_ratio:.2g} %, ranges {assumed.range_std:.2g} m, "
+        f"angles {np.rad2deg(assumed.azimuth_std):.2g}°"
     )
 
 
@@ -144,9 +144,9 @@ def _text(scene: Scene) -> str:
 def _town(rng: Draws, t: Floats, split: Split) -> Floats:
     name = str(rng.choice(("town10", "town04"))) if split == "test" else "town10-validation"
     town = _loaded(name)
-    place = (rng.uniform(1.5, town.t[-1] - t[-1] - town.dt) + t) / town.dt
-    step = place.astype(int)
-    share = (place - step)[:, None, None]
+    start = (rng.uniform(1.5, town.t[-1] - t[-1] - town.dt) + t) / town.dt
+    step = start.astype(int)
+    share = (start - step)[:, None, None]
     position: Floats = (1.0 - share) * town.position[step] + share * town.position[step + 1]
     return position
 
@@ -161,8 +161,8 @@ def _column(rng: Draws, travelled: Floats, gap: tuple[float, float]) -> Floats:
     count = travelled.shape[1]
     along = travelled - np.cumsum(rng.uniform(*gap, count))
     across = 3.5 * rng.integers(0, 2, count) + 0.3 * np.sin(along / 40.0 + rng.uniform(0, 6, count))
-    slope = rng.uniform(-0.04, 0.04)
-    road = np.stack([along, across, slope * along], axis=-1)
+    incline = rng.uniform(-0.04, 0.04)
+    road = np.stack([along, across, incline * along], axis=-1)
     return turned(road, np.array(rng.uniform(-np.pi, np.pi)))
 
 
@@ -200,8 +200,8 @@ def _crossing(rng: Draws, t: Floats, _: Split) -> Floats:
 def _standing(rng: Draws, t: Floats, _: Split) -> Floats:
     count = int(rng.integers(3, 11))
     grid = np.stack(np.meshgrid(np.arange(4), np.arange(4)), axis=-1).reshape(-1, 2)
-    place = rng.uniform(5.0, 9.0) * rng.permutation(grid)[:count] + rng.uniform(-1.0, 1.0, (count, 2))
-    return np.tile(np.column_stack([place, _heights(rng, count)]), (len(t), 1, 1))
+    position = rng.uniform(5.0, 9.0) * rng.permutation(grid)[:count] + rng.uniform(-1.0, 1.0, (count, 2))
+    return np.tile(np.column_stack([position, _heights(rng, count)]), (len(t), 1, 1))
 
 
 def _points(*axes: Floats) -> Floats:

@@ -53,18 +53,18 @@ def _compiled(name: str) -> Method:
     return one
 
 
-def world_row(name: str, split: Split, given: Params) -> list[Row]:
+def world_row(name: str, split: Split, params: Params) -> list[Row]:
     """RT-LE m of a method in one world, of the textbook filter and alone, on the same draws; its NEES and time.
 
     Args:
         name: of the method.
         split: of the worlds.
-        given: with the seed.
+        params: with the seed.
 
     Raises:
         InputError: estimates that are not finite.
     """
-    drawn = world(given["seed"], split, everyone=needs_whole_fleet(name))
+    drawn = world(params["seed"], split, everyone=needs_whole_fleet(name))
     egos = list(drawn.egos)
     tracks = {each: _compiled(each)(drawn.recording, egos) for each in {name: "", JOINT: "", ALONE: ""}}
     level = {each: float(rt_le(track, drawn.fleet).mean()) for each, track in tracks.items()}
@@ -167,14 +167,14 @@ def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", job
     rows.sort(key=lambda row: row["seed"])
     columns = {key: [_short(row[key]) for row in rows] for key in rows[0] if key != "failed"}
     failed = {str(row["seed"]): row["failed"] for row in rows if "failed" in row}
-    found = _frame(columns)
-    each_kind = found.assign(kind=found["kinds"].replace("", NONE).str.split("; ")).explode("kind")
+    frame = _frame(columns)
+    each_kind = frame.assign(kind=frame["kinds"].replace("", NONE).str.split("; ")).explode("kind")
     return {
         **card_head(name),
         "split": split,
-        "summary": summary(found),
+        "summary": summary(frame),
         "by_kind": {str(kind): summary(part) for kind, part in each_kind.groupby("kind")},
-        "worst": _worst(name, split, found),
+        "worst": _worst(name, split, frame),
         "failed": failed,
         "worlds": {key: columns[key] for key in ("seed", "rt_le_m", "joint_m", "alone_m")},
     }
@@ -192,13 +192,13 @@ def _frame(columns: Mapping[str, Sequence[Any]]) -> pd.DataFrame:
     method failed."""
     import pandas as pd
 
-    found = pd.DataFrame(columns)
-    for key in found.columns.difference(["seed", "kinds"]):
-        found[key] = found[key].astype(float)
-    better = found[["joint_m", "alone_m"]].min(axis=1)
-    for key, other in (("over_joint", found["joint_m"]), ("over_alone", found["alone_m"]), ("over_better", better)):
-        found[key] = (found["rt_le_m"] / other).fillna(np.inf)
-    return found
+    frame = pd.DataFrame(columns)
+    for key in frame.columns.difference(["seed", "kinds"]):
+        frame[key] = frame[key].astype(float)
+    better = frame[["joint_m", "alone_m"]].min(axis=1)
+    for key, other in (("over_joint", frame["joint_m"]), ("over_alone", frame["alone_m"]), ("over_better", better)):
+        frame[key] = (frame["rt_le_m"] / other).fillna(np.inf)
+    return frame
 
 
 def summary(found: pd.DataFrame) -> dict[str, Any]:

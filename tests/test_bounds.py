@@ -109,7 +109,7 @@ def test_an_estimator_that_is_told_what_is_wrong_has_gtsams_bound_without_it(
     """What is wrong is not in the recording (test_outliers), and has no factor in GTSAM's graph."""
     v2x, who = V2X(max_neighbours=neighbours, radius=30.0), range(8) if everyone else [0]
     clean, told = (
-        observe(crossing, replace(S2, outliers=o), v2x, runs=2, observers=list(who), told=True)
+        observe(crossing, replace(S2, outliers=o), v2x, runs=2, observers=list(who), remove_outliers=True)
         for o in (co.Outliers(), WRONG)
     )
 

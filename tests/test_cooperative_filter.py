@@ -204,6 +204,24 @@ def test_fixes_that_were_wrong_are_forgotten_soon_after(priors: Priors, most: in
         assert error.mean() < (0.5 if most else 1.7 * usual.mean())
 
 
+def test_a_position_of_a_minute_is_kept() -> None:
+    """Law: fixes that jump after a minute of agreement, and stay there, are no wrong start: they count as noisier, and
+    the ego goes on by its odometry. Against the oracle, too."""
+    whole = load_fleet("town10").select([24])
+    fleet = Fleet(whole.ids, whole.t[::10], whole.position[::10], np.gradient(whole.position[::10], axis=0))
+    seen = observe(fleet, replace(S2, gnss_std=(0.5,) * 3), V2X(0), runs=1, seed=3)
+    gnss = seen.gnss.copy()
+    gnss[:, 64:, 0] += [60.0, 45.0, 0.0]
+    jumped = replace(seen, gnss=gnss)
+    track = CooperativeFilter()(jumped)
+    assert track.covariance is not None
+    x, cov, _ = Oracle(jumped, 0, 0, resolve("nominal", jumped), Priors()).loop()
+    assert_allclose(track.x[0, :, 0], x, atol=1e-6)
+    assert_allclose(track.covariance[0, :, 0], cov, rtol=1e-6, atol=1e-6)
+    assert np.linalg.norm(track.x[0, 64:, 0] - fleet.position[64:, 0], axis=-1).max() < 15.0
+    assert np.linalg.norm(Kalman()(jumped).x[0, -1, 0] - fleet.position[-1, 0]) > 30.0
+
+
 def test_neighbours_that_send_nothing_judge_no_receiver() -> None:
     """Law: beside vehicles that are measured and silent an ego is alone, whatever its odometer says for a while."""
     fleet = load_fleet("town10").between(0, 400)

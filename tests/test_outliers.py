@@ -136,7 +136,7 @@ def test_draws_are_keyed_by_what_they_belong_to(crossing: Fleet) -> None:
 @pytest.mark.parametrize("frame", ["world", "body"])
 def test_what_is_told_is_what_differs_from_the_clean_recording(crossing: Fleet, frame: str) -> None:
     clean, bad, told = (
-        seen(crossing, o, frame=frame, told=t) for o, t in ((Outliers(), 0 > 1), (ALL, 0 > 1), (ALL, True))
+        seen(crossing, o, frame=frame, remove_outliers=t) for o, t in ((Outliers(), 0 > 1), (ALL, 0 > 1), (ALL, True))
     )
     by_hand = np.where(bad.relative == clean.relative, clean.relative, np.nan)
     by_hand[..., 2] = np.where(np.isnan(by_hand[..., 1]), np.nan, by_hand[..., 2])

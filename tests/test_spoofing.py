@@ -53,7 +53,7 @@ def test_an_attack_moves_the_fixes_of_some_by_a_constant(crossing: Fleet, clean:
         ({"attack": 1.2}, "share"),
         ({"attack": 0.1, "seed": -1}, "seed"),
         ({"attack": 0.1, "honest": ["missing"]}, "honest"),
-        ({"attack": 0.1, "told": 1}, "told"),
+        ({"attack": 0.1, "remove_outliers": 1}, "remove_outliers"),
         ({"offset": (9.0, 5.0)}, "offset"),
         ({"offset": 3.0}, "offset"),
         ({"start": -1.0}, "start"),
@@ -81,7 +81,7 @@ def test_an_attack_begins_creeps_and_colludes(crossing: Fleet, clean: Recording)
 
 def test_an_estimator_that_is_told_of_an_attack_lacks_the_false_fixes(clean: Recording) -> None:
     false = spoofed(clean, Spoofing(0.4, start=1.0), seed=2, honest=[0])
-    told = spoofed(clean, Spoofing(0.4, start=1.0), seed=2, honest=[0], told=True)
+    told = spoofed(clean, Spoofing(0.4, start=1.0), seed=2, honest=[0], remove_outliers=True)
     assert np.array_equal(told.gnss, np.where(false.gnss == clean.gnss, clean.gnss, np.nan), equal_nan=True)
     assert told.notes[-1].endswith("removed")
 

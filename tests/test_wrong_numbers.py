@@ -158,8 +158,8 @@ def wild_fixes(steps: int) -> tuple[co.Recording, np.ndarray, KalmanFilter]:
 
 
 def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() -> None:
-    """filterpy, its R such that S is q / limit times as large where q = y' S^-1 y exceeds the limit; beyond REJECTED
-    limits the fix is left out. The flat prior weighs 1e-6 of a fix."""
+    """filterpy, its R such that S is q / limit times as large where q = y' S^-1 y exceeds the limit; beyond
+    HARD_REJECT_FACTOR limits the fix is left out. The flat prior weighs 1e-6 of a fix."""
     alone = Priors(forget=0.0, heading=0.0, scale=0.0, slip=0.0)
     (drive, process, peer), method = wild_fixes(200), CooperativeFilter(priors=alone)
     track, limit, hits = method(drive, [0]), method.priors.fix_gate, 0.0
@@ -169,15 +169,15 @@ def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() ->
         q = innovation @ np.linalg.solve(S, innovation)
         gain, share = 1 - 3 * 12.25 / np.trace(S), max(q / limit, 1.0) if hits < gate.PATIENCE else 1.0
         hits = hits + gain if q > limit else max(hits - gate.LEAK * gain, 0.0)
-        if share < gate.REJECTED:
+        if share < gate.HARD_REJECT_FACTOR:
             peer.update(drive.gnss[0, t, 0], R=12.25 * np.eye(3) + (share - 1.0) * S)
         assert track.x[0, t, 0] == pytest.approx(peer.x, abs=1e-3), t
 
 
 def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
-    """As filterpy: a fix beyond the gate has q / gate times its variance, one beyond REJECTED gates is left out, until
-    the gains that they would have had, less LEAK of the others', sum to PATIENCE. After 120 fixes that were 60 m off it
-    goes back to a copy of filterpy's state before them, which has only been predicted since."""
+    """As filterpy: a fix beyond the gate has q / gate times its variance, one beyond HARD_REJECT_FACTOR gates is left
+    out, until the gains that they would have had, less LEAK of the others', sum to PATIENCE. After 120 fixes that were
+    60 m off it goes back to a copy of filterpy's state before them, which has only been predicted since."""
     drive, process, peer = wild_fixes(300)
     gnss = drive.gnss.copy()
     gnss[0, 150:270] += 60.0
@@ -194,9 +194,9 @@ def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
             x, p = copy[0] + 0.1 * moved, copy[1] + process[t]
             copy, vague = (x, p), p.sum() >= ((x - peer.x) ** 2).sum()
             other = float(((z - x) ** 2 / (p + r + gate.SLIP)).sum())
-            more = min(q, gate.REJECTED * gate.FIX_GATE) - other
+            more = min(q, gate.HARD_REJECT_FACTOR * gate.FIX_GATE) - other
             evidence = max(evidence + more, 0.0) if other <= gate.FIX_GATE else 0.0
-            if evidence > gate.EVIDENCE * gate.REJECTED * gate.FIX_GATE and not vague:
+            if evidence > gate.EVIDENCE * gate.HARD_REJECT_FACTOR * gate.FIX_GATE and not vague:
                 peer.x, peer.P, copy, q, hits = x, np.diag(p), None, other, 0.0
                 returns.append(t)
             elif q <= gate.FIX_GATE and vague and since > gate.AWAY:
@@ -205,7 +205,7 @@ def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
             copy, evidence = (peer.x.copy(), variance.copy()), 0.0
         share = max(q / gate.FIX_GATE, 1.0) if hits < gate.PATIENCE else 1.0
         hits = hits + gain if q > gate.FIX_GATE else max(hits - gate.LEAK * gain, 0.0)
-        if share <= gate.REJECTED:
+        if share <= gate.HARD_REJECT_FACTOR:
             used += share > 1.0 or q > gate.FIX_GATE
             peer.update(z, R=r * share)
         np.testing.assert_allclose(track.x[0, t, 0], peer.x, atol=1e-9)

@@ -60,8 +60,8 @@ def posterior_bound(
         ego: column or id.
         v2x: K and radius, not loss.
         smoothing: use measurements after t, too.
-        recording: of this drive, such as `observe(..., told=True)`: a fix, a range or an angle that it lacks (NaN) is
-            not measured, and the bound is the mean over its runs. Default: all is measured.
+        recording: of this drive, such as `observe(..., remove_outliers=True)`: a fix, a range or an angle that it lacks
+            (NaN) is not measured, and the bound is the mean over its runs. Default: all is measured.
 
     Raises:
         InputError: an acting std of zero, for which the bound is zero; an ego that is unknown or absent; a recording
@@ -215,12 +215,12 @@ def _measured(fleet: Fleet, links: Links, members: Ints, recording: Recording) -
     Raises:
         InputError: a recording of other vehicles or steps, or one that lacks a link.
     """
-    instance("recording", recording, Recording, "Give observe(..., told=True).")
+    instance("recording", recording, Recording, "Give observe(..., remove_outliers=True).")
     fleet.require(recording.ids, recording.t)
     sides = ("step", "observer", "neighbour")
-    known, wanted = (np.column_stack([getattr(of, side) for side in sides]) for of in (recording.links, links))
-    place = {link: k for k, link in enumerate(map(tuple, known.tolist()))}
-    rows = [place.get(tuple(link), -1) for link in wanted.tolist()]
+    measured, wanted = (np.column_stack([getattr(of, side) for side in sides]) for of in (recording.links, links))
+    row_of = {link: k for k, link in enumerate(map(tuple, measured.tolist()))}
+    rows = [row_of.get(tuple(link), -1) for link in wanted.tolist()]
     if -1 in rows:
         hint = "Observe the fleet with the same K and radius, and name the ego among the observers."
         raise InputError("recording", repr(recording), "must hold the links of the bound", hint)
@@ -343,14 +343,14 @@ def _motion(fleet: Fleet, sensors: Sensors, lasting: list[int]) -> tuple[Floats,
         noise[..., :3, axis] = dt * turned(std[..., axis, None] * unit, heading)
     noise[..., :3, 3], noise[..., 3, 3] = 0.5 * dt * sensors.yaw_rate_std * aside, dt * sensors.yaw_rate_std
     keep = float(np.exp(-dt / sensors.odometry_error_time))
-    for place, kind in enumerate(lasting, 4):
+    for column, kind in enumerate(lasting, 4):
         if kind == 0:
-            motion[..., :3, place] = -moved
+            motion[..., :3, column] = -moved
         elif kind == 1:
-            motion[..., :3, place], motion[..., 3, place] = -0.5 * dt * aside, -dt
+            motion[..., :3, column], motion[..., 3, column] = -0.5 * dt * aside, -dt
         if kind < 2:
             fresh = (sensors.speed_scale_std, sensors.yaw_rate_bias_std)[kind] * np.sqrt(1.0 - keep**2)
-            motion[..., place, place], noise[..., place, place] = keep, fresh
+            motion[..., column, column], noise[..., column, column] = keep, fresh
     return motion, noise @ noise.swapaxes(-1, -2)
 
 
@@ -376,13 +376,13 @@ def steps_of(
     """Members of each step, their places one step before (-1 for new ones), and its true vectors."""
     start, before = np.searchsorted(links.step, np.arange(len(fleet.t) + 1)), np.full(len(fleet.ids) + 1, -1)
     for t, now in enumerate(members):
-        place = np.full(len(before), -1)
-        place[now] = np.arange(len(now))
+        index = np.full(len(before), -1)
+        index[now] = np.arange(len(now))
         observer, neighbour = (side[start[t] : start[t + 1]] for side in (links.observer, links.neighbour))
         vector = fleet.position[t, neighbour] - fleet.position[t, observer]
         part = None if measured is None else measured[start[t] : start[t + 1]]
-        yield now, before[now], Edges(vector, place[observer], place[neighbour], part)
-        before = place
+        yield now, before[now], Edges(vector, index[observer], index[neighbour], part)
+        before = index
 
 
 def edge_information(edges: Edges, sizes: tuple[int, int], std: Floats, *, posed: bool = False) -> Floats:
@@ -403,11 +403,11 @@ def edge_information(edges: Edges, sizes: tuple[int, int], std: Floats, *, posed
         own[:, 0, 3], own[:, 1, 3] = vector[:, 1], -vector[:, 0]
     other[..., :3] = np.eye(3) * (neighbour >= 0)[:, None, None]
     weight = vector_information(edges, std)
-    found, ends = np.zeros((n, n, d, d)), ((observer, own), (np.maximum(neighbour, 0), other))
+    information, ends = np.zeros((n, n, d, d)), ((observer, own), (np.maximum(neighbour, 0), other))
     for here, rows in ends:
         for there, others in ends:
-            np.add.at(found, (here, there), rows.swapaxes(1, 2) @ weight @ others)
-    return found.swapaxes(1, 2).reshape(n * d, n * d)
+            np.add.at(information, (here, there), rows.swapaxes(1, 2) @ weight @ others)
+    return information.swapaxes(1, 2).reshape(n * d, n * d)
 
 
 def vector_information(edges: Edges, std: Floats) -> Floats:
@@ -454,9 +454,9 @@ def drifting(sensors: Sensors) -> bool:
 def require_white(sensors: Sensors, what: str) -> None:
     """InputError where fixes have time-correlated errors and `what` takes them as white."""
     if drifting(sensors):
-        given = (sensors.gnss_drift_std, sensors.gnss_common_std)
+        lasting_stds = (sensors.gnss_drift_std, sensors.gnss_common_std)
         hint = "Set them to 0, or take the filtering one."
-        raise InputError("gnss_drift_std, gnss_common_std", given, f"must be 0 for {what}", hint)
+        raise InputError("gnss_drift_std, gnss_common_std", lasting_stds, f"must be 0 for {what}", hint)
 
 
 def _onward(cov: Floats, stage: Stage) -> Floats:
@@ -486,9 +486,9 @@ def _backward(future: Floats, stage: Stage, n: int) -> Floats:
 def diagonal(blocks: Floats) -> Floats:
     """The matrix (nd, nd) that has n blocks (n, d, d) on its diagonal."""
     n, d = blocks.shape[:2]
-    found = np.zeros((n, d, n, d))
-    found[np.arange(n), :, np.arange(n)] = blocks
-    return found.reshape(n * d, n * d)
+    matrix = np.zeros((n, d, n, d))
+    matrix[np.arange(n), :, np.arange(n)] = blocks
+    return matrix.reshape(n * d, n * d)
 
 
 def _numbers(places: Ints, d: int) -> Ints:

@@ -61,9 +61,9 @@ class Ledger:
             self.__dict__[name] = values
         shape = (2, 2, *self.sent.shape[2:3], len(self.names))
         for name, wanted in (("seconds", shape[3:]), ("sent", shape), ("received", shape)):
-            found = getattr(self, name).shape
-            if found != wanted:
-                raise InputError(name, found, f"must have shape {wanted}", "See the Args of Ledger.")
+            actual = getattr(self, name).shape
+            if actual != wanted:
+                raise InputError(name, actual, f"must have shape {wanted}", "See the Args of Ledger.")
         if len(set(self.names)) < len(self.names) or not set(self.servers) <= set(self.names):
             raise InputError("names", self.names, f"must differ and hold the servers {self.servers}", "Rename them.")
 
@@ -110,8 +110,8 @@ def of_training(
     (120.0, 140.0)
     """
     overhead = number("overhead", overhead, 0, 10**9, kind=int, allowed=">= 0 bytes")
-    given = (("sent", sent), ("received", received))
-    payload = np.array([checked(name, values, "(V,)", (len(names),)) for name, values in given])
+    directions = (("sent", sent), ("received", received))
+    payload = np.array([checked(name, values, "(V,)", (len(names),)) for name, values in directions])
     kinds = np.stack([payload, payload + overhead * checked("messages", messages)], axis=1)[:, :, None]
     moved = np.stack([kinds, np.zeros_like(kinds)], axis=1)
     return Ledger(tuple(names), np.zeros(len(names)), moved[0], moved[1], tuple(servers))

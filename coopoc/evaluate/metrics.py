@@ -69,8 +69,8 @@ def neighbour_rt_le(track: Track, recording: Recording, fleet: Fleet) -> Floats:
     fleet.require(recording.ids, recording.t)
     if track.neighbours is None:
         return np.full((len(track.x), len(track.egos)), np.nan)
-    mine = [recording.links.of(ego) for ego in track.egos]
-    links, ends = np.concatenate(mine), np.cumsum([0, *map(len, mine)])
+    own_links = [recording.links.of(ego) for ego in track.egos]
+    links, ends = np.concatenate(own_links), np.cumsum([0, *map(len, own_links)])
     truth = fleet.position[recording.links.step[links], recording.links.neighbour[links]]
     square = np.square(track.neighbours - truth).sum(axis=-1)
     parts = [square[:, first:last] for first, last in pairwise(ends)]
@@ -102,12 +102,12 @@ def nees(track: Track, fleet: Fleet, *, method: str = "the method") -> Floats:
     if track.absent is not None:
         covariance = np.where(track.absent[..., None, None], np.eye(3), covariance)
     arrays = (np.ascontiguousarray(values) for values in (track.x, truth, covariance))
-    found, sound = normalised(*arrays)
-    _require_sound(track, covariance, found, method)
+    squares, sound = normalised(*arrays)
+    _require_sound(track, covariance, squares, method)
     if not sound:
         hint = "Assume noise in every direction: no standard deviation may be zero."
         raise InputError("covariance", "singular", "must have an inverse for NEES", hint)
-    return found
+    return squares
 
 
 def _require_sound(track: Track, p: Floats, square: Floats, method: str) -> None:
@@ -119,9 +119,9 @@ def _require_sound(track: Track, p: Floats, square: Floats, method: str) -> None
         wrong |= np.minimum(own, -skew) < -1e-6 * np.abs(p).max(axis=(-1, -2))
     if wrong.any():
         run, step, ego = np.argwhere(wrong)[0]
-        given = f"{p[run, step, ego].tolist()} of ego {track.egos[ego]} in run {run} at step {step}"
+        actual = f"{p[run, step, ego].tolist()} of ego {track.egos[ego]} in run {run} at step {step}"
         allowed = f"must be symmetric and positive semidefinite, and {method} returns another"
-        raise InputError("covariance", given, allowed, "Return (P + P.T) / 2; its eigenvalues are variances, m^2.")
+        raise InputError("covariance", actual, allowed, "Return (P + P.T) / 2; its eigenvalues are variances, m^2.")
 
 
 def nees_band(runs: int) -> tuple[float, float]:
@@ -139,8 +139,8 @@ def nees_band(runs: int) -> tuple[float, float]:
 
 def nees_inside(track: Track, fleet: Fleet) -> Floats:
     """Share of the steps whose run-averaged NEES lies inside the band, (E,); >= 0.95 passes the consistency gate."""
-    found = nees(track, fleet)
-    return share_of_average(found.mean(axis=0), len(found))
+    squares = nees(track, fleet)
+    return share_of_average(squares.mean(axis=0), len(squares))
 
 
 def share_of_average(average: Floats, runs: int) -> Floats:
@@ -247,10 +247,10 @@ def fix_innovations(track: Track, recording: Recording) -> Floats:
     (5, 2, 1, 3)
     """
     of_recording(track, recording)
-    egos, found = list(track.egos), np.full(track.x.shape, np.nan)
+    egos, innovations = list(track.egos), np.full(track.x.shape, np.nan)
     moved = recording.dt * turned(recording.velocity[:, 1:, egos], _halfway(track, recording))
-    found[:, 1:] = recording.gnss[:, 1:, egos] - (track.x[:, :-1] + moved)
-    return found
+    innovations[:, 1:] = recording.gnss[:, 1:, egos] - (track.x[:, :-1] + moved)
+    return innovations
 
 
 def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
@@ -280,11 +280,11 @@ def normalised_innovations(track: Track, recording: Recording) -> Floats | None:
         aside = recording.dt * np.nan_to_num(turned(u, angle + np.pi / 2) * [1.0, 1.0, 0.0])
         cross = shared[..., :, None] * aside[..., None, :]
         covariance += cross + np.swapaxes(cross, -1, -2) + variance * aside[..., :, None] * aside[..., None, :]
-    found, d = np.full(innovation.shape[:3], np.nan), innovation[:, 1:]
+    squares, d = np.full(innovation.shape[:3], np.nan), innovation[:, 1:]
     square = np.einsum("...i,...i->...", d, np.linalg.solve(covariance, d[..., None])[..., 0])
-    found[:, 1:] = square / dimensions(recording)
-    _require_sound(track, track.covariance, found, "the method")
-    return found
+    squares[:, 1:] = square / dimensions(recording)
+    _require_sound(track, track.covariance, squares, "the method")
+    return squares
 
 
 def _halfway(track: Track, recording: Recording) -> Floats:
@@ -312,10 +312,10 @@ def innovation_columns(track: Track, recording: Recording) -> dict[str, Floats]:
     square = (fix_innovations(track, recording) ** 2).sum(axis=-1)
     count, normalised_square = np.isfinite(square).sum(axis=1), normalised_innovations(track, recording)
     with np.errstate(invalid="ignore"):
-        found = {"innovation_m": np.sqrt(np.nansum(square, axis=1) / count), "fixes": count.astype(float)}
+        columns = {"innovation_m": np.sqrt(np.nansum(square, axis=1) / count), "fixes": count.astype(float)}
         if normalised_square is not None:
-            found["nis"] = np.nansum(normalised_square, axis=1) / count
-    return found
+            columns["nis"] = np.nansum(normalised_square, axis=1) / count
+    return columns
 
 
 def aligned(estimate: Floats, truth: Floats) -> Floats:

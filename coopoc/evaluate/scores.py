@@ -82,13 +82,13 @@ def scored(
             each = nees(track, drive, method=method.name)
             parts[-1]["nees"] = np.nanmean(each, axis=1)
             squares.append(each.sum(axis=0))
-    found = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
+    columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
     near = [len(recording.links.of(recording.ids.index(ego))) / len(recording.t) for ego in egos]
     served = len(recording.ids) if recording.observers == tuple(range(len(recording.ids))) else len(egos)
     more: dict[str, Any] = {"neighbours_mean": near, "seconds": seconds / recording.runs / served}
     if squares:
         more["nees_inside"] = share_of_average(np.sum(squares, axis=0) / recording.runs, recording.runs)
-    return {**{name: np.broadcast_to(value, found["rt_le_m"].shape) for name, value in more.items()}, **found}
+    return {**{name: np.broadcast_to(value, columns["rt_le_m"].shape) for name, value in more.items()}, **columns}
 
 
 def slabs(recording: Recording, egos: int) -> Iterator[Recording]:
@@ -109,7 +109,7 @@ def _columns(track: Track, recording: Recording, method: Method, drive: Fleet, q
     """Columns that need no average over runs."""
     error = errors(track, drive)
     level = np.sqrt((error**2).mean(axis=1))
-    found = {
+    columns = {
         "rt_le_m": level,
         "max_error_m": error.max(axis=1),
         "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
@@ -117,5 +117,5 @@ def _columns(track: Track, recording: Recording, method: Method, drive: Fleet, q
     }
     if quantiles:
         spaced = np.quantile(error, np.linspace(0, 1, quantiles), axis=1)
-        found["error_quantiles_m"] = np.moveaxis(spaced, 0, -1)
-    return found
+        columns["error_quantiles_m"] = np.moveaxis(spaced, 0, -1)
+    return columns

@@ -108,15 +108,15 @@ def _resampled(values: Floats) -> Floats:
 def _counts(egos: int, runs: int, resamples: int) -> AnyArray:
     """(resamples, egos x runs) how often each value is drawn: egos, then the runs of each."""
     size, rng = egos * runs, np.random.default_rng(0)
-    found = np.empty((resamples, size), dtype=np.uint16 if size < 2**16 else np.uint32)
+    counts = np.empty((resamples, size), dtype=np.uint16 if size < 2**16 else np.uint32)
     step = max(1, _CHUNK // size)
     for start in range(0, resamples, step):
         count = min(step, resamples - start)
         ego = rng.integers(egos, size=(count, egos, 1)) if egos > 1 else np.zeros((count, 1, 1), dtype=np.int64)
         run = rng.integers(runs, size=(count, egos, runs))
-        place = (np.arange(count)[:, None, None] * egos + ego) * runs + run
-        found[start : start + count] = np.bincount(place.ravel(), minlength=count * size).reshape(count, size)
-    return found
+        index = (np.arange(count)[:, None, None] * egos + ego) * runs + run
+        counts[start : start + count] = np.bincount(index.ravel(), minlength=count * size).reshape(count, size)
+    return counts
 
 
 def _interval(resampled: Floats, mean: float, values: Floats) -> Interval:

@@ -27,7 +27,7 @@ ENDS: dict[str, tuple[str, ...]] = {  # what the vertices of each kind of edge m
 NAME = re.compile(r"[A-Za-z](0|[1-9][0-9]{0,14})")
 ROUNDING = 1e-9
 """What may be left below zero, or unequal, of the largest eigenvalue or entry."""
-Place = Callable[[str, int], str]
+Location = Callable[[str, int], str]
 
 
 class Edges:
@@ -157,7 +157,7 @@ class Graph:
         fixed: (F,) places in names of the vertices that stay where they are (g2o's FIX).
         guess: the vertices are an initial guess, as in g2o, from which a solve may begin without being told.
         notes: what the reader changed, such as noise that it repaired.
-        place: (field, row) -> where it came from, for messages; readers pass the line of the file.
+        location: (field, row) -> where it came from, for messages; readers pass the line of the file.
 
     Raises:
         InputError: shapes, a repeated or malformed name, an edge to a vertex that is not there, to itself or of the
@@ -182,9 +182,9 @@ class Graph:
     fixed: Ints = ()  # type: ignore[assignment]
     guess: bool = False
     notes: tuple[str, ...] = ()
-    place: InitVar[Callable[[str, int], str] | None] = None
+    location: InitVar[Callable[[str, int], str] | None] = None
 
-    def __post_init__(self, place: Callable[[str, int], str] | None) -> None:
+    def __post_init__(self, location: Callable[[str, int], str] | None) -> None:
         self.__dict__["names"] = tuple(self.names)
         self.__dict__["is_pose"] = frozen(self.is_pose, bool)
         self.__dict__["fixed"] = frozen(self.fixed, np.int64)
@@ -196,7 +196,7 @@ class Graph:
             if not len(edges := getattr(self, field)):
                 empty = {name: np.zeros(shape) for name, shape in shapes(field, self.dimension, 0).items()}
                 self.__dict__[field] = type(edges)(**empty)
-        check(self, place or (lambda field, row: f"{field}[{row}]"))
+        check(self, location or (lambda field, row: f"{field}[{row}]"))
 
     @cached_property
     def rotation(self) -> Floats:
@@ -236,12 +236,12 @@ def shapes(field: str, dimension: int, rows: int) -> dict[str, tuple[int, ...]]:
     return {**common, **poses}
 
 
-def check(graph: Graph, place: Place) -> None:
+def check(graph: Graph, location: Location) -> None:
     """InputError at the first rule that a graph breaks: `Graph` lists them.
 
     Args:
         graph: all its fields as arrays.
-        place: (field, row) -> where it came from.
+        location: (field, row) -> where it came from.
     """
     if graph.dimension not in (2, 3):
         raise InputError("dimension", graph.dimension, "must be 2 or 3", "Give the dimension of the positions.")
@@ -251,44 +251,44 @@ def check(graph: Graph, place: Place) -> None:
     wanted = {"is_pose": (n,), "position": (n, d), "orientation": (n, 1 if d == 2 else 4), "stamps": (n,)}
     for field, shape in wanted.items():
         _shape(field, getattr(graph, field), shape)
-    _vertices(graph, place)
+    _vertices(graph, location)
     for field in ENDS:
         edges = getattr(graph, field)
         for name, shape in shapes(field, d, len(edges)).items():
             _shape(f"{field}.{name}", getattr(edges, name), shape)
         if len(edges):
-            _ends(graph, field, edges.nodes, place)
-            _values(edges, field, place)
+            _ends(graph, field, edges.nodes, location)
+            _values(edges, field, location)
     fixed = graph.fixed
-    _refuse(place, "fixed", (fixed < 0) | (fixed >= n), fixed, f"must be in 0..{n - 1}", "Give places in names.")
+    _refuse(location, "fixed", (fixed < 0) | (fixed >= n), fixed, f"must be in 0..{n - 1}", "Give places in names.")
 
 
-def _vertices(graph: Graph, place: Place) -> None:
+def _vertices(graph: Graph, location: Location) -> None:
     names, first = graph.names, dict[str, int]()
     for row, name in enumerate(names):
         if not NAME.fullmatch(name):
-            raise InputError(place("names", row), repr(name), "must be a letter and a number as A0", "Rename it.")
+            raise InputError(location("names", row), repr(name), "must be a letter and a number as A0", "Rename it.")
         if first.setdefault(name, row) != row:
-            before = f"must be given once, and is at {place('names', first[name])}"
-            raise InputError(place("names", row), f"vertex {name}", before, "Remove or rename one of them.")
+            before = f"must be given once, and is at {location('names', first[name])}"
+            raise InputError(location("names", row), f"vertex {name}", before, "Remove or rename one of them.")
     infinite = np.isinf(np.hstack([graph.position, graph.orientation])).any(axis=1)
     allowed = "must be finite, or NaN where unknown"
-    _refuse(place, "names", infinite, [f"vertex {name} at infinity" for name in names], allowed, "Mend the number.")
+    _refuse(location, "names", infinite, [f"vertex {name} at infinity" for name in names], allowed, "Mend the number.")
     timed = [f"stamp {stamp} of {name}" for stamp, name in zip(graph.stamps, names, strict=True)]
     wrong = np.isfinite(graph.stamps) & ~graph.is_pose
-    _refuse(place, "names", wrong, timed, "must be NaN: a point has none", "Give stamps to poses only.")
-    _unit(graph.orientation, "names", place)
+    _refuse(location, "names", wrong, timed, "must be NaN: a point has none", "Give stamps to poses only.")
+    _unit(graph.orientation, "names", location)
 
 
-def _ends(graph: Graph, field: str, nodes: Ints, place: Place) -> None:
+def _ends(graph: Graph, field: str, nodes: Ints, location: Location) -> None:
     n = len(graph.names)
     outside, hint = ((nodes < 0) | (nodes >= n)).any(axis=1), "Give places in names."
-    _refuse(place, field, outside, nodes, f"must be in 0..{n - 1}", hint, "vertices ")
+    _refuse(location, field, outside, nodes, f"must be in 0..{n - 1}", hint, "vertices ")
     for end, role in enumerate(ENDS[field]):
         if role != "any":
             wrong, called = graph.is_pose[nodes[:, end]] != (role == "pose"), np.array(graph.names)[nodes[:, end]]
             _refuse(
-                place,
+                location,
                 field,
                 wrong,
                 called,
@@ -297,51 +297,59 @@ def _ends(graph: Graph, field: str, nodes: Ints, place: Place) -> None:
                 "vertex ",
             )
     loops, twice = (nodes[:, :1] == nodes[:, 1:]).any(axis=1), [f"{graph.names[k]} twice" for k in nodes[:, 0]]
-    _refuse(place, field, loops, twice, "must be two vertices", "Remove the measurement.")
+    _refuse(location, field, loops, twice, "must be two vertices", "Remove the measurement.")
 
 
-def _values(edges: Edges, field: str, place: Place) -> None:
+def _values(edges: Edges, field: str, location: Location) -> None:
     """InputError for numbers that no edge may have; what is exact or of the least size may stay.
 
     >>> _values(PointEdges([[0], [0]], np.zeros((2, 2)), [np.zeros((2, 2)), LEAST * np.eye(2)]), "point_prior", str)
     """
     for name in [n for n in shapes(field, 2, 0) if n not in ("nodes", "stamps")]:
         values: Floats = getattr(edges, name).reshape(len(edges), -1)
-        mend, given = "Mend the number.", f"{name} "
-        _refuse(place, field, ~np.isfinite(values).all(axis=1), values, "must be finite", mend, given)
+        mend, actual = "Mend the number.", f"{name} "
+        _refuse(location, field, ~np.isfinite(values).all(axis=1), values, "must be finite", mend, actual)
         if name in ("distance", "variance"):
-            _refuse(place, field, values[:, 0] < 0, [f"{value:g}" for (value,) in values], "must be >= 0", mend, given)
+            _refuse(
+                location, field, values[:, 0] < 0, [f"{value:g}" for (value,) in values], "must be >= 0", mend, actual
+            )
         if name in ("variance", "covariance"):
             size = values[:, :: math.isqrt(values.shape[1]) + 1]  # the diagonal
             extreme = (((size > 0) & (size < LEAST)) | (size > 1 / LEAST)).any(axis=1)
             allowed = f"must be 0, or of a size in {LEAST:g}..{1 / LEAST:g}: its inverse overflows"
-            _refuse(place, field, extreme, values, allowed, mend, given)
+            _refuse(location, field, extreme, values, allowed, mend, actual)
         if name == "orientation":
-            _unit(getattr(edges, name), field, place)
+            _unit(getattr(edges, name), field, location)
         if name == "covariance":
             covariance: Floats = getattr(edges, name)
             eigenvalues = np.linalg.eigvalsh(covariance)
             least = ROUNDING * np.maximum(eigenvalues[:, -1], 0)
             uneven = np.abs(covariance - covariance.swapaxes(-1, -2)).max(axis=(-2, -1))
             wrong, hint = (eigenvalues[:, 0] < -least) | (uneven > least), "Order of the upper triangle: by rows."
-            _refuse(place, field, wrong, covariance, "must be symmetric and positive semi-definite", hint, given)
+            _refuse(location, field, wrong, covariance, "must be symmetric and positive semi-definite", hint, actual)
 
 
-def _unit(orientation: Floats, field: str, place: Place) -> None:
+def _unit(orientation: Floats, field: str, location: Location) -> None:
     if orientation.shape[-1] == 4:
         off = np.abs(np.linalg.norm(orientation, axis=1) - 1) > UNIT
         allowed, hint = f"must have length 1 to within {UNIT:g}", "Order is qx qy qz qw; 0 0 0 1 is no rotation."
-        _refuse(place, field, off, orientation, allowed, hint, "quaternion ")
+        _refuse(location, field, off, orientation, allowed, hint, "quaternion ")
 
 
 def _refuse(
-    place: Place, field: str, wrong: npt.ArrayLike, given: npt.ArrayLike, allowed: str, hint: str, label: str = ""
+    location: Location,
+    field: str,
+    wrong: npt.ArrayLike,
+    values: npt.ArrayLike,
+    allowed: str,
+    hint: str,
+    label: str = "",
 ) -> None:
     """InputError at the first row that is wrong, with what is given there."""
     rows = np.flatnonzero(wrong)
     if len(rows):
-        entry = np.asarray(given)[rows[0]].tolist()
-        raise InputError(place(field, int(rows[0])), f"{label}{entry}", allowed, hint)
+        entry = np.asarray(values)[rows[0]].tolist()
+        raise InputError(location(field, int(rows[0])), f"{label}{entry}", allowed, hint)
 
 
 def _shape(field: str, array: AnyArray, shape: tuple[int, ...]) -> None:

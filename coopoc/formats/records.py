@@ -136,11 +136,11 @@ class Grammar:
                 all, a singular information, or what `Graph` raises.
         """
         dimension, rows = self._collect(file, lines)
-        origin = {kind: given.lines for kind, given in rows.items()}
+        origin = {kind: of_kind.lines for kind, of_kind in rows.items()}
         origin["names"], words, arrays = self._vertices(file, rows, dimension)
         origin["fixed"] = [line for line, _ in fixed]
 
-        def place(kind: str, row: int) -> str:
+        def location(kind: str, row: int) -> str:
             return f"{file}: line {origin[kind][row]}"
 
         names, index = [], Index(pose={}, point={})
@@ -149,14 +149,16 @@ class Grammar:
             names.append(self.name(word, kind))
             if not names[-1]:
                 hint = "PyFG: a letter and a number as A0. g2o: a number."
-                raise InputError(place("names", row), f"vertex {word}", f"must be called as {self.format} does", hint)
+                raise InputError(
+                    location("names", row), f"vertex {word}", f"must be called as {self.format} does", hint
+                )
             index[kind][word] = row
-        vertices = Graph(dimension, tuple(names), **arrays, place=place)
+        vertices = Graph(dimension, tuple(names), **arrays, location=location)
         notes = list[str]() if repair else None
         edges: dict[str, Any] = {kind: self._edges(file, rows[kind], index, notes) for kind in ENDS if kind in rows}
-        still = [_find(place("fixed", row), word, "any", index) for row, (_, word) in enumerate(fixed)]
+        still = [_find(location("fixed", row), word, "any", index) for row, (_, word) in enumerate(fixed)]
         fixed_at = np.array(still, dtype=np.int64)
-        return replace(vertices, **edges, fixed=fixed_at, notes=tuple(notes or ()), place=place)
+        return replace(vertices, **edges, fixed=fixed_at, notes=tuple(notes or ()), location=location)
 
     def _collect(self, file: str, lines: Iterable[tuple[int, list[str]]]) -> tuple[int, dict[str, _Rows]]:
         """Dimension of a file, and its lines by kind."""
@@ -164,22 +166,22 @@ class Grammar:
         dimension, since = 0, ""
         width = {tag: record.width for tag, record in self.records.items()}
         for number, words in lines:
-            tag, place = words[0], f"{file}: line {number}"
+            tag, location = words[0], f"{file}: line {number}"
             record = self.records.get(tag)
             if record is None:
-                known = [*self.records, *self.others]
-                hint = suggestion(tag, known, "Remove or convert the line.")
-                raise InputError(place, tag, f"must be one of {', '.join(known)}", hint)
+                kinds = [*self.records, *self.others]
+                hint = suggestion(tag, kinds, "Remove or convert the line.")
+                raise InputError(location, tag, f"must be one of {', '.join(kinds)}", hint)
             if record.dimension and not dimension:
                 dimension, since = record.dimension, f"line {number}, {tag}"
             if record.dimension not in (0, dimension):
                 hint = "Keep 2-D and 3-D in separate files."
-                raise InputError(place, tag, f"must be {dimension}-D as {since}", hint)
+                raise InputError(location, tag, f"must be {dimension}-D as {since}", hint)
             if len(words) != width[tag]:
                 raise malformed(file, number, words, self.form(tag))
-            given = rows.setdefault(record.kind, _Rows(tag))
-            given.lines.append(number)
-            given.words.append(words)
+            of_kind = rows.setdefault(record.kind, _Rows(tag))
+            of_kind.lines.append(number)
+            of_kind.words.append(words)
         if not {"pose", "point"} & set(rows) and not (self.implied and dimension):
             hint = "Check that the file is complete."
             raise InputError(file, "0 vertices", "must have a line for every vertex", hint)
@@ -223,8 +225,8 @@ class Grammar:
         record, (stamps, ids, numbers) = self.records[rows.tag], self._split(file, rows)
         places = [f"{file}: line {line}" for line in rows.lines]
         nodes = [
-            [_find(place, word, role, index) for word, role in zip(words, record.ends, strict=True)]
-            for place, words in zip(places, ids, strict=True)
+            [_find(location, word, role, index) for word, role in zip(words, record.ends, strict=True)]
+            for location, words in zip(places, ids, strict=True)
         ]
         count = len(record.values.split())
         noise = symmetric(numbers[:, count:], record.size)
@@ -243,14 +245,14 @@ class Grammar:
         return stamps, [words[start:stop] for words in rows.words], numbers[:, start - 1 :]
 
 
-def _find(place: str, word: str, role: str, index: Index) -> int:
+def _find(location: str, word: str, role: str, index: Index) -> int:
     """Place of a vertex in the graph; InputError if there is none, or more than one."""
     roles = ("pose", "point") if role == "any" else (role,)
     candidates = [index[each][word] for each in roles if word in index[each]]
     if len(candidates) == 1:
         return candidates[0]
     if candidates:
-        raise InputError(place, f"vertex {word}", "is both a pose and a point", "Give every vertex its own id.")
+        raise InputError(location, f"vertex {word}", "is both a pose and a point", "Give every vertex its own id.")
     other = any(word in names for names in index.values())
     allowed = f"must be a {role}" if other else "must be one of the vertices of the file"
-    raise InputError(place, f"vertex {word}", allowed, "Check the order." if other else "Add its VERTEX line.")
+    raise InputError(location, f"vertex {word}", allowed, "Check the order." if other else "Add its VERTEX line.")

@@ -28,7 +28,7 @@ class Trajectory:
         stamps: (T,) s, increasing, or None where the file has none.
         position: (T, 3) m.
         rotation: (T, 3, 3), body to frame.
-        place: row -> where it came from, for messages; readers pass the line of the file.
+        location: row -> where it came from, for messages; readers pass the line of the file.
 
     Raises:
         InputError: shapes, a number that is not finite, stamps that do not increase, or a matrix that is no rotation:
@@ -41,20 +41,20 @@ class Trajectory:
     stamps: Floats | None
     position: Floats
     rotation: Floats
-    place: InitVar[Callable[[int], str] | None] = None
+    location: InitVar[Callable[[int], str] | None] = None
 
     __repr__ = short_repr
 
-    def __post_init__(self, place: Callable[[int], str] | None) -> None:
+    def __post_init__(self, location: Callable[[int], str] | None) -> None:
         for field in ("position", "rotation", *(() if self.stamps is None else ("stamps",))):
             self.__dict__[field] = frozen(getattr(self, field))
-        _check(self, place or "pose {}".format)
+        _check(self, location or "pose {}".format)
 
     def __len__(self) -> int:
         return len(self.position)
 
 
-def _check(poses: Trajectory, place: Callable[[int], str]) -> None:
+def _check(poses: Trajectory, location: Callable[[int], str]) -> None:
     count = len(poses)
     for field, shape in {"stamps": (count,), "position": (count, 3), "rotation": (count, 3, 3)}.items():
         array = getattr(poses, field)
@@ -65,17 +65,17 @@ def _check(poses: Trajectory, place: Callable[[int], str]) -> None:
         ~np.isfinite(np.column_stack([stamps, poses.position, poses.rotation.reshape(count, 9)])).all(1)
     )
     if len(bad):
-        raise InputError(place(bad[0]), poses.position[bad[0]], "must be finite numbers", "Remove the pose.")
+        raise InputError(location(bad[0]), poses.position[bad[0]], "must be finite numbers", "Remove the pose.")
     late = 1 + np.flatnonzero(np.diff(stamps) <= 0)
     if len(late):
-        found = f"{stamps[late[0]]!s} s after {stamps[late[0] - 1]!s} s"
+        order = f"{stamps[late[0]]!s} s after {stamps[late[0] - 1]!s} s"
         hint = "Sort the poses by time, and remove one that repeats."
-        raise InputError(f"{place(late[0])}, column t", found, "must increase", hint)
+        raise InputError(f"{location(late[0])}, column t", order, "must increase", hint)
     off = np.abs(poses.rotation @ poses.rotation.swapaxes(-1, -2) - np.eye(3)).max(axis=(1, 2))
     bad = np.flatnonzero((off > ORTHONORMAL) | (np.linalg.det(poses.rotation) < 0))
     if len(bad):
         raise InputError(
-            place(bad[0]),
+            location(bad[0]),
             f"rotation {poses.rotation[bad[0]].round(6).tolist()}",
             f"must be orthonormal to within {ORTHONORMAL:g}, with determinant 1",
             "Check the order of the numbers.",
@@ -111,7 +111,7 @@ def read_tum(path: str | Path) -> Trajectory:
             "Order is qx qy qz qw; write 0 0 0 1 where the orientation is unknown.",
         )
     rotation = to_rotation(table[:, 4:])
-    return Trajectory(table[:, 0], table[:, 1:4], rotation, place=lambda row: f"{path.name}: line {lines[row]}")
+    return Trajectory(table[:, 0], table[:, 1:4], rotation, location=lambda row: f"{path.name}: line {lines[row]}")
 
 
 def write_tum(
@@ -199,4 +199,4 @@ def read_kitti(path: str | Path, times: str | Path | None = None) -> Trajectory:
         allowed = f"must be {len(table)}, one per pose of {path.name}"
         raise InputError("times", f"{len(stamps)} stamps", allowed, "Check that both files belong together.")
     poses = table.reshape(-1, 3, 4)
-    return Trajectory(stamps, poses[..., 3], poses[..., :3], place=lambda row: f"{path.name}: line {lines[row]}")
+    return Trajectory(stamps, poses[..., 3], poses[..., :3], location=lambda row: f"{path.name}: line {lines[row]}")

@@ -72,8 +72,8 @@ def _number(word: str) -> float:
 def malformed(file: str, line: int, words: Sequence[str], form: str) -> InputError:
     """The error of a line that does not have its form."""
     shown = " ".join(word if len(word) <= 40 else f"{word[:40]}..." for word in words[:40])
-    given = f"{shown}{' ...' if len(words) > 40 else ''} ({len(words)} words)"
-    return InputError(f"{file}: line {line}", given, f"must be {form}, all finite numbers", "Mend or remove the line.")
+    actual = f"{shown}{' ...' if len(words) > 40 else ''} ({len(words)} words)"
+    return InputError(f"{file}: line {line}", actual, f"must be {form}, all finite numbers", "Mend or remove the line.")
 
 
 def read_table(path: Path, form: str) -> tuple[Ints, Floats]:
@@ -107,8 +107,8 @@ def to_rotation(orientation: Floats) -> Floats:
     from scipy.spatial.transform import Rotation  # a quarter of a second, which a missing file need not wait for
 
     quaternions = orientation.reshape(-1, 4)
-    matrices, known = np.full((len(quaternions), 3, 3), np.nan), np.isfinite(quaternions).all(axis=1)
-    matrices[known] = Rotation.from_quat(quaternions[known]).as_matrix()
+    matrices, finite = np.full((len(quaternions), 3, 3), np.nan), np.isfinite(quaternions).all(axis=1)
+    matrices[finite] = Rotation.from_quat(quaternions[finite]).as_matrix()
     return matrices.reshape(*orientation.shape[:-1], 3, 3)
 
 
@@ -148,14 +148,14 @@ REPAIRED = 1e-6
 """Share of the largest eigenvalue, after scaling, that a repaired matrix has at least: none would have no inverse."""
 
 
-def inverse(matrices: Floats, place: Callable[[int], str], repairs: list[str] | None = None) -> Floats:
+def inverse(matrices: Floats, location: Callable[[int], str], repairs: list[str] | None = None) -> Floats:
     """Inverses of M symmetric positive definite matrices of information.
 
     Rows and columns are first scaled by powers of two, which is exact, so that metres beside radians cost no digits.
 
     Args:
         matrices: (M, size, size).
-        place: row -> where it stands, for the message.
+        location: row -> where it stands, for the message.
         repairs: gets a line for each matrix that was not positive definite and whose eigenvalues, scaled to a unit
             diagonal, were raised to REPAIRED of the largest; None: such a matrix is an error.
 
@@ -175,13 +175,15 @@ def inverse(matrices: Floats, place: Callable[[int], str], repairs: list[str] | 
         own, axes = np.linalg.eigh(scaled[row])
         if repairs is None or not own[-1] > 0:
             raise InputError(
-                place(row),
+                location(row),
                 f"information {matrices[row][np.triu_indices(len(own))].tolist()}",
                 "must be positive definite: a singular one has no inverse",
                 "Give every component some information, leave the measurement out, or read the file with repair=True "
                 "(coopoc solve --repair), which takes the nearest that is.",
             )
         scaled[row] = axes * np.maximum(own, REPAIRED * own[-1]) @ axes.T
-        repairs.append(f"{place(row)}: information was not positive definite and was replaced by the nearest that is")
+        repairs.append(
+            f"{location(row)}: information was not positive definite and was replaced by the nearest that is"
+        )
     inverses = np.linalg.inv(scaled) * both
     return np.asarray(0.5 * (inverses + inverses.swapaxes(-1, -2)))

@@ -49,7 +49,7 @@ def constant_velocity(
         bank: (F,) w.
     """
     count, models = len(t), len(bank)
-    velocity, growth, known = np.zeros((count, 3)), np.zeros(count), np.zeros(count)
+    velocity, growth, count_of_fixes = np.zeros((count, 3)), np.zeros(count), np.zeros(count)
     x, u = np.zeros((models, 3)), np.zeros((models, 3))
     p, score = np.zeros((models, 3)), np.zeros((models, 3))
     v = np.zeros(3)
@@ -90,5 +90,5 @@ def constant_velocity(
                 best, most, growth[j] = m, likely, a - before
         for c in range(3):
             velocity[j, c] = u[best, c]
-        known[j] = p[best, 2]
-    return velocity, growth, known
+        count_of_fixes[j] = p[best, 2]
+    return velocity, growth, count_of_fixes

@@ -9,20 +9,21 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
-from .gate import FIX_GATE, REJECTED
+from .gate import FIX_GATE, HARD_REJECT_FACTOR
 from .geometry import direction, five, residuals, with_std
 
 LIMIT = 1.0 + 1e-9
 """A squared covariance over the product of its variances, at most, with what rounding adds."""
 TOGETHER, DOUBT = 5, 36.0
-"""Numbers that are judged together: they are far where all are beyond FIX_GATE, those of neighbours beyond REJECTED of
-it; and the square of their normalised mean, of three degrees of freedom, that chance does not reach."""
+"""Numbers that are judged together: they are far where all are beyond FIX_GATE, those of neighbours beyond
+HARD_REJECT_FACTOR of it; and the square of their normalised mean, of three degrees of freedom, that chance does not
+reach."""
 
 
 @compiled
 def unsound(cov: Floats) -> int:
     """Number of covariances (n, 3, 3) that are not finite, symmetric and positive semidefinite to a share of 1e-9."""
-    found = 0
+    count = 0
     for p in cov:
         a, b, c, d, e, f = p[0, 0], p[1, 1], p[2, 2], p[1, 0], p[2, 0], p[2, 1]
         skew = max(abs(p[0, 1] - d), abs(p[0, 2] - e), abs(p[1, 2] - f))
@@ -30,8 +31,8 @@ def unsound(cov: Floats) -> int:
         sides = d * d <= LIMIT * a * b and e * e <= LIMIT * a * c and f * f <= LIMIT * b * c
         sound = sides and a >= 0.0 and b >= 0.0 and c >= 0.0 and det >= (1.0 - LIMIT) * a * b * c
         if not (sound and skew <= (LIMIT - 1.0) * max(a, b, c) and math.isfinite(a + b + c)):
-            found += 1
-    return found
+            count += 1
+    return count
 
 
 @part
@@ -44,7 +45,7 @@ def less(a: Floats, b: Floats) -> tuple[float, float, float]:
 def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
     """e^T P^-1 e (R, T, E) by P = L D L^T, NaN where P is zero or the truth is unknown, and whether every other
     P could be inverted, but for a height without error."""
-    found, sound = np.empty(x.shape[:3]), True
+    squares, sound = np.empty(x.shape[:3]), True
     for run in range(len(x)):
         for t in range(x.shape[1]):
             for e in range(x.shape[2]):
@@ -58,8 +59,8 @@ def normalised(x: Floats, truth: Floats, cov: Floats) -> tuple[Floats, bool]:
                 if not math.isfinite(value):
                     sound &= math.isnan(a) or not p.any()
                     value = np.nan
-                found[run, t, e] = value
-    return found, sound
+                squares[run, t, e] = value
+    return squares, sound
 
 
 @compiled
@@ -180,11 +181,11 @@ def mark_neighbours(
         marks: (2, N, T) out, 1 where they are far: messages, relative measurements.
     """
     for run in range(len(gnss)):
-        seen = np.zeros((gnss.shape[2], 5), np.int64)
+        counts = np.zeros((gnss.shape[2], 5), np.int64)
         for i in range(len(links)):
             link, t, j = links[i]
             dx, dy, dz = less(neighbours[run, i], x[run, t])
-            if t < seen[j, 0] or math.isnan(dx):
+            if t < counts[j, 0] or math.isnan(dx):
                 continue
             d, a, b = relative[run, link]
             polar, p, message = direction(dx, dy, dz), cov[run, t], 0.0
@@ -195,13 +196,15 @@ def mark_neighbours(
             own += std[0] ** 2 + (polar[0] * std[1]) ** 2
             for c in range(3):
                 message += (gnss[run, t, j, c] - neighbours[run, i, c]) ** 2 / (fix[0, c] + fix[1, c] + own)
-            seen[j, 2] = t if seen[j, 1] == 0 else seen[j, 2]
-            seen[j, 0], seen[j, 1] = t + every, seen[j, 1] + 1
-            seen[j, 3] += message > REJECTED * FIX_GATE
-            seen[j, 4] += q > REJECTED * FIX_GATE
-            if seen[j, 1] == TOGETHER:
+            counts[j, 2] = t if counts[j, 1] == 0 else counts[j, 2]
+            counts[j, 0], counts[j, 1] = t + every, counts[j, 1] + 1
+            counts[j, 3] += message > HARD_REJECT_FACTOR * FIX_GATE
+            counts[j, 4] += q > HARD_REJECT_FACTOR * FIX_GATE
+            if counts[j, 1] == TOGETHER:
                 for kind in range(2):
-                    for k in range(seen[j, 2], min(t + every, len(cov[run])) if seen[j, 3 + kind] == TOGETHER else 0):
+                    for k in range(
+                        counts[j, 2], min(t + every, len(cov[run])) if counts[j, 3 + kind] == TOGETHER else 0
+                    ):
                         marks[kind, j, k] = 1
-                    seen[j, 3 + kind] = 0
-                seen[j, 1] = 0
+                    counts[j, 3 + kind] = 0
+                counts[j, 1] = 0

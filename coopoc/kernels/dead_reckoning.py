@@ -26,16 +26,16 @@ SQUARE = slice(4, 7)
 def push(history: Floats, dt: float, moved: Floats, variance: Floats) -> None:
     """Add the newest step, and drop the oldest ones that are not needed to reach back as far as is asked for."""
     capacity = len(history) - 1
-    first, count, seen = int(history[0, 0]), int(history[0, 1]), history[0, 2] + dt
+    first, count, age = int(history[0, 0]), int(history[0, 1]), history[0, 2] + dt
     row = 1 + (first + count) % capacity
     history[row, 0] = dt
     for c in range(3):
         history[row, 1 + c], history[row, 4 + c] = moved[c], variance[c]
     count += 1
-    while count > 1 and seen - history[1 + first, 0] >= history[0, 3]:
-        seen -= history[1 + first, 0]
+    while count > 1 and age - history[1 + first, 0] >= history[0, 3]:
+        age -= history[1 + first, 0]
         first, count = (first + 1) % capacity, count - 1
-    history[0, 0], history[0, 1], history[0, 2] = first, count, seen
+    history[0, 0], history[0, 1], history[0, 2] = first, count, age
 
 
 @compiled
@@ -56,27 +56,27 @@ def since(history: Floats, age: float, moved: Floats, variance: Floats) -> None:
 
 @part
 def dead_reckon(
-    given: Floats, history: Floats, motion: MotionNoise, moved: Floats, q: Floats, since_fix: Floats, late: Floats
+    row: Floats, history: Floats, motion: MotionNoise, moved: Floats, q: Floats, since_fix: Floats, late: Floats
 ) -> int:
     """Add a step to the history: its motion and the variance of that; what a fix of some age has missed since.
 
     Nothing is changed where the input is bad. NO_FIX_YET: there is no fix.
     """
-    dt, age, missing = given[DT], given[FIX_AGE], 0
+    dt, age, missing = row[DT], row[FIX_AGE], 0
     for c in range(3):
-        missing += math.isnan(given[c])
-        if math.isinf(given[c]) or not math.isfinite(given[3 + c]):
+        missing += math.isnan(row[c])
+        if math.isinf(row[c]) or not math.isfinite(row[3 + c]):
             return BAD_INPUT
     if not (dt > 0.0 and math.isfinite(dt)) or missing % 3 != 0:
         return BAD_INPUT
     if missing == 0 and not -ROUNDING <= age <= min(history[0, 2] + dt, history[0, 3]) + ROUNDING:
         return BAD_INPUT
     square = history[0, SQUARE]
-    process_variance(motion, square, given[VELOCITY], dt, q)
+    process_variance(motion, square, row[VELOCITY], dt, q)
     for c in range(3):
-        moved[c] = dt * given[3 + c]
+        moved[c] = dt * row[3 + c]
     push(history, dt, moved[:3], q)
-    keep_pace(square, given[VELOCITY], dt)
+    keep_pace(square, row[VELOCITY], dt)
     if missing > 0:
         return NO_FIX_YET
     since(history, age, since_fix, late)

@@ -22,14 +22,14 @@ from .compiling.vectors import choose
 
 GATE, FIX_GATE = 9.0, 12.0
 """Squared normalised innovation of a number, and of a position, from which it weighs less."""
-REJECTED = 2.0
+HARD_REJECT_FACTOR = 2.0
 """Gates beyond which it weighs nothing."""
 PATIENCE = 5.0
 """Sum of the gains of measurements beyond the gate from which it is the filter that is wrong."""
 LEAK = 0.5
 """Share of its gain that a measurement within the gate takes from that sum: those of a filter that is wrong are not
 all beyond."""
-YOUNG = 4.8
+INITIAL_LOCKOUT = 4.8
 """That sum at the start of a pose or of a relative vector, which a wrong heading or a wrong first measurement may have
 placed: the next ones that contradict it are believed. Of a position it is 0, since fixes err together."""
 SLIP = 0.25
@@ -50,11 +50,12 @@ Vector = tuple[float, ...]
 
 @inside
 def inflation(q: float, gate: float, hits: float) -> float:
-    """S' / S: 1 within the gate, q / gate beyond, infinite from REJECTED gates on; 1 again from PATIENCE hits on.
+    """S' / S: 1 within the gate, q / gate beyond, infinite from HARD_REJECT_FACTOR gates on; 1 again from PATIENCE hits
+    on.
 
     So the influence of an innovation falls as 1 / sqrt(q), and ends.
     """
-    share = choose(q - REJECTED * gate, math.inf, max(q / gate, 1.0))
+    share = choose(q - HARD_REJECT_FACTOR * gate, math.inf, max(q / gate, 1.0))
     counts: float = choose(PATIENCE - hits, share, 1.0)
     return counts
 
@@ -82,7 +83,7 @@ def remember(
         evidence: for it.
         since: sum of the gains of fixes since the last beyond the gate.
     """
-    none, most = 0.0 * q, REJECTED * gate
+    none, most = 0.0 * q, HARD_REJECT_FACTOR * gate
     since = choose(q - gate, none, since + gain)
     evidence = choose(other - gate, none, max(evidence + choose(q - most, most + none, q) - other, none))
     vague = spread - apart

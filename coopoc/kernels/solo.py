@@ -18,7 +18,7 @@ from ..arrays import Floats, Ints
 from .compiling.compile import compiled, inside, part
 from .compiling.small import load, store
 from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
-from .gate import BACK, BEGIN, KEEP, NOTHING, REJECTED, SLIP, count, inflation, remember
+from .gate import BACK, BEGIN, HARD_REJECT_FACTOR, KEEP, NOTHING, SLIP, count, inflation, remember
 from .motion import MotionNoise
 
 LEAST = 1e-4
@@ -122,18 +122,18 @@ def step(
         if what == BACK:
             x, share, motion = before, 0.0, spread
         spread = NOTHING
-    known = math.isinf(weight)
+    noise_known = math.isinf(weight)
     if not math.isnan(fix):
         p, innovation = share * noise + motion, fix - x
-        if not known:
+        if not noise_known:
             weight = min(weight + 1.0, rule.window)
-            within = min(1.0, REJECTED * rule.gate / q) if f > 1.0 else 1.0
+            within = min(1.0, HARD_REJECT_FACTOR * rule.gate / q) if f > 1.0 else 1.0
             noise = max(noise + (within * innovation * innovation - p - noise) / weight, LEAST)
             p = share * noise + motion
         if not math.isinf(f):
             k = p / (p + f * (noise + late))
             x, rest, own = x + k * innovation, (1.0 - k) * (1.0 - k), k * k * f
-            if known:
+            if noise_known:
                 motion = rest * p + own * (noise + late)
             else:
                 share, motion = rest * share + own, rest * motion + own * late
@@ -197,13 +197,13 @@ def filter_runs(
 
 
 @compiled
-def stream_step(given: Floats, state: Floats, history: Floats, noise: Floats, answer: Floats) -> int:
+def stream_step(row: Floats, state: Floats, history: Floats, noise: Floats, answer: Floats) -> int:
     """One step of a stream: dead reckoning, the fix brought forward, `step` on every axis.
 
     Nothing is changed where the input is bad. A state of NaN has not started yet.
 
     Args:
-        given: (8,) fix m, velocity m/s, dt s, age of the fix s.
+        row: (8,) fix m, velocity m/s, dt s, age of the fix s.
         state: (3, 10).
         history: of `motion`.
         noise: (15,) the numbers of a MotionNoise and a FixNoise: to hand over tuples takes longer than the step.
@@ -212,11 +212,11 @@ def stream_step(given: Floats, state: Floats, history: Floats, noise: Floats, an
     motion = MotionNoise(noise[:3], noise[3:6], noise[6], noise[7], noise[8])
     rule = FixNoise(noise[9:12], noise[12], noise[13], noise[14])
     q, late, moved = np.empty(3), np.zeros(3), np.zeros(3)
-    outcome = dead_reckon(given, history, motion, answer, q, moved, late)
+    outcome = dead_reckon(row, history, motion, answer, q, moved, late)
     starts = math.isnan(state[0, 0])
     if outcome == BAD_INPUT or (starts and outcome == NO_FIX_YET):
         return outcome
-    fix = given[0] + moved[0], given[1] + moved[1], given[2] + moved[2]
+    fix = row[0] + moved[0], row[1] + moved[1], row[2] + moved[2]
     gated = gate_fix(state, three(answer), three(q), fix, three(late), rule.gate)
     for c in range(3):
         if starts:

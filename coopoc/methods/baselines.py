@@ -45,15 +45,15 @@ class LKFSA(Checked):
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        known = resolve(self.noise_model, recording)
+        noise_model = resolve(self.noise_model, recording)
         return follow_egos(
             self,
             recording,
             egos,
             lambda ego, box: [
-                Estimate(*run_lkf_sa(measurements(recording, ego, box), assumptions(recording, known, ego, box)))
+                Estimate(*run_lkf_sa(measurements(recording, ego, box), assumptions(recording, noise_model, ego, box)))
             ],
-            known.notes,
+            noise_model.notes,
         )
 
 
@@ -88,15 +88,15 @@ class MSMV(Checked):
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos; InputError if one is unknown or absent."""
-        known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
-        x, p = solo_estimates(recording, known, columns)
+        noise_model, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
+        x, p = solo_estimates(recording, noise_model, columns)
 
-        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            assumed = assumptions(recording, known, ego, box)
+        def run(ego: int, inbox: Inbox) -> Iterator[Estimate]:
+            assumed = assumptions(recording, noise_model, ego, inbox)
             assumed = assumed._replace(broadcast=p, growth=(0.0, 1.0), acceleration=0.0)
-            yield Estimate(*run_intersection(measurements(recording, ego, box, x), assumed, False, False, True))
+            yield Estimate(*run_intersection(measurements(recording, ego, inbox, x), assumed, False, False, True))
 
-        return follow_egos(self, recording, egos, run, (*known.notes, RECONSTRUCTION))
+        return follow_egos(self, recording, egos, run, (*noise_model.notes, RECONSTRUCTION))
 
 
 def solo_estimates(

@@ -64,22 +64,24 @@ def calibrated(
     Raises:
         InputError: no vehicle that drives from a fix on; a truth of other vehicles or times.
     """
-    seen = check_recording(recording)
+    recording_ = check_recording(recording)
     if truth is not None:
-        instance("truth", truth, Fleet).require(seen.ids, seen.t)
-    split, default = int(FITTED * len(seen.t)), make(usual)
-    first, whole = (parts_of(seen.between(0, stop), truth and truth.between(0, stop)) for stop in (split, len(seen.t)))
-    rest = [part for part in whole if np.isfinite(part.target[:, part.recording.t >= seen.t[split]]).any()]
+        instance("truth", truth, Fleet).require(recording_.ids, recording_.t)
+    split, default = int(FITTED * len(recording_.t)), make(usual)
+    first, whole = (
+        parts_of(recording_.between(0, stop), truth and truth.between(0, stop)) for stop in (split, len(recording_.t))
+    )
+    rest = [part for part in whole if np.isfinite(part.target[:, part.recording.t >= recording_.t[split]]).any()]
     if not first or not rest:
         allowed = f"must hold {SHORTEST} steps of a vehicle without a break, with a target, in all of its thirds"
-        raise InputError("recording", repr(seen), allowed, "Give a longer part of the drive.")
-    change, by = held_out(make(fit(make, usual, first)), default, rest, seen.t[split])
+        raise InputError("recording", repr(recording_), allowed, "Give a longer part of the drive.")
+    change, by = held_out(make(fit(make, usual, first)), default, rest, recording_.t[split])
     text = f"the error on its last third by {change:.2g} +- {by:.2g} m"
     if not change + by < 0.0:
         return default, f"calibration keeps the usual numbers: fitted ones change {text}"
-    found = fit(make, usual, whole)
-    moved = ", ".join(f"{name} {usual[name]:.3g} -> {found[name]:.3g}" for name in usual)
-    return make(found), f"calibrated: {moved}; this changes {text}"
+    fitted = fit(make, usual, whole)
+    moved = ", ".join(f"{name} {usual[name]:.3g} -> {fitted[name]:.3g}" for name in usual)
+    return make(fitted), f"calibrated: {moved}; this changes {text}"
 
 
 def scaled(sensors: Sensors, fix: float, motion: float) -> Sensors:
@@ -145,10 +147,10 @@ def held_out(method: Method, usual: Method, parts: Sequence[Part], since: float)
 
     errors = [list[float](), list[float]()]
     for part in parts:
-        for one, found in zip((method, usual), errors, strict=True):
+        for one, block_errors in zip((method, usual), errors, strict=True):
             gap = (one(part.recording, [part.column]).x[:, :, 0] - part.target)[:, part.recording.t >= since, :2]
             blocks = np.array_split(np.linalg.norm(gap, axis=-1), max(1, BLOCKS // len(parts)), axis=1)
-            found += [float(np.sqrt(np.nanmean(b**2))) for b in blocks if np.isfinite(b).any()]
+            block_errors += [float(np.sqrt(np.nanmean(b**2))) for b in blocks if np.isfinite(b).any()]
     change, n = np.array(errors[0]) - errors[1], len(errors[0])
     half = t.ppf(0.975, n - 1) * change.std(ddof=1) / np.sqrt(n) if n > 1 else np.inf
     return float(change.mean()), float(half)

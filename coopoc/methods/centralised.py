@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from ..arrays import Floats
-from ..kernels.gate import FIX_GATE, REJECTED
+from ..kernels.gate import FIX_GATE, HARD_REJECT_FACTOR
 from ..workers import progress_bar
 from ..world.recording import Recording, Vehicles, check_recording
 from ..world.sensors import Sensors
@@ -115,10 +115,10 @@ class BatchSmoother(Checked):
                 problem = drive_problem(recording, run, start[run], measured, pairs, assumed, model.sensors)
                 if assumed.robust:
                     problem = gated(problem)
-                found = solve(problem, "gauss-newton", covariance=True, throw=False)
-                lost += found.status is not Status.SOLVED
+                solution = solve(problem, "gauss-newton", covariance=True, throw=False)
+                lost += solution.status is not Status.SOLVED
                 there = measured.active[run]
-                x[run, there], cov[run, there] = found.x, found.covariance
+                x[run, there], cov[run, there] = solution.x, solution.covariance
             note = (f"{lost} of {len(x)} runs did not end at a minimum",) if lost else ()
             return Answer(x, cov, (NOT_CAUSAL, CENTRE, *note))
 
@@ -158,7 +158,7 @@ def drive_problem(
     stds = fix_std, np.maximum(motion_std, STIFF * fix_std.min())
     if sensors is not None:
         sensors = replace(sensors, min_range=assumed.min_range)
-    relative = recording.told[run, link]
+    relative = recording.usable_relative[run, link]
     factors = drive_factors(recording, run, (step, column), link, relative, stds, sensors)
     return Problem(tuple(map(str, range(len(step)))), factors, x0=start[active])
 
@@ -172,11 +172,11 @@ def gated(problem: Problem) -> Problem:
 
     own = [factor.kind in ("position", "displacement") for factor in problem.factors]
     loss = Loss("huber", FIX_GATE**0.5)
-    bent = tuple(f if mine else unchecked(f, loss=loss) for f, mine in zip(problem.factors, own, strict=True))
+    bent = tuple(f if is_own else unchecked(f, loss=loss) for f, is_own in zip(problem.factors, own, strict=True))
     x = solve(problem.replace_unchecked(factors=bent), "gauss-newton", covariance=False, throw=False, tolerance=0.01).x
     factors = []
-    for factor, mine in zip(problem.factors, own, strict=True):
+    for factor, is_own in zip(problem.factors, own, strict=True):
         q = squared(problem, factor, x)
-        share = np.where(q > REJECTED * FIX_GATE, np.inf, np.maximum(q / FIX_GATE, 1.0))
-        factors.append(factor if mine else unchecked(factor, std=np.asarray(factor.std) * np.sqrt(share)[:, None]))
+        share = np.where(q > HARD_REJECT_FACTOR * FIX_GATE, np.inf, np.maximum(q / FIX_GATE, 1.0))
+        factors.append(factor if is_own else unchecked(factor, std=np.asarray(factor.std) * np.sqrt(share)[:, None]))
     return problem.replace_unchecked(factors=tuple(factors), x0=x)

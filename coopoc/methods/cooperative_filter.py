@@ -177,28 +177,28 @@ class CooperativeFilter(Checked):
         link (R, L) of "range", "azimuth", "inclination" and "message", NaN where there was none, and whether it is
         "trusted".
         """
-        known = resolve(self.noise_model, check_recording(recording))
-        priors = priors_of(self, known, recording.measured)
-        model, notes = model_of(known, priors), [*known.notes, *filter(None, [self.calibration])]
-        variance, sent = priors.fix**2 * known.fix_variance(recording), broadcasts(recording, known, priors)
+        noise_model = resolve(self.noise_model, check_recording(recording))
+        priors = priors_of(self, noise_model, recording.measured)
+        model, notes = model_of(noise_model, priors), [*noise_model.notes, *filter(None, [self.calibration])]
+        variance, sent = priors.fix**2 * noise_model.fix_variance(recording), broadcasts(recording, noise_model, priors)
 
-        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            seen, assumed = measurements(recording, ego, box), assumptions(recording, known, ego, box)
+        def run(ego: int, inbox: Inbox) -> Iterator[Estimate]:
+            inputs, assumed = measurements(recording, ego, inbox), assumptions(recording, noise_model, ego, inbox)
             assumed = assumed._replace(fixes=variance)
-            x, cov, neighbours, fixes, weights, found = run_filter(seen, assumed, sent, model)
+            x, cov, neighbours, fixes, weights, deviations = run_filter(inputs, assumed, sent, model)
             extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate(KINDS)}
             names = (*(name.replace(" ", "_") for name in FOUND), *(f"{kind}_level" for kind in LEVELS))
-            extras |= {name: found[..., i, None] for i, name in enumerate(names)}
-            mine = recording.ids[ego]
-            notes.extend(otherwise(mine, found) if priors.fix_gate else ())
-            notes.extend(rejected(f"fixes, {mine}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
+            extras |= {name: deviations[..., i, None] for i, name in enumerate(names)}
+            own_id = recording.ids[ego]
+            notes.extend(otherwise(own_id, deviations) if priors.fix_gate else ())
+            notes.extend(rejected(f"fixes, {own_id}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
             if model.own + model.common == 0.0 and priors.fix_gate:
-                notes.extend(lasting(mine, recording.gnss[:, :, ego] - x, recording.dt))
+                notes.extend(lasting(own_id, recording.gnss[:, :, ego] - x, recording.dt))
             low, measured = (weights < 0.1).sum(axis=0), np.isfinite(weights).sum(axis=0)
-            for j in np.unique(seen.neighbour):
-                here = seen.neighbour == j
+            for j in np.unique(inputs.neighbour):
+                here = inputs.neighbour == j
                 for kind, count, of in zip(KINDS, low[here].sum(axis=0), measured[here].sum(axis=0), strict=True):
-                    what = f"{kind}, {mine} and {recording.ids[j]}"
+                    what = f"{kind}, {own_id} and {recording.ids[j]}"
                     notes.extend(rejected(what, count, of, 0.5 if kind == "trusted" else 0.05))
             yield Estimate(x, cov, neighbours, extras=extras)
 
@@ -229,8 +229,8 @@ class CooperativeFilter(Checked):
             noise_model = NoiseModel.nominal(scaled(sensors, 1.0, own.pop("motion")))
             return cls(noise_model, priors._replace(**own))
 
-        method, found = calibrated(make, usual, recording, truth)
-        return replace(method, calibration=found)
+        method, sentence = calibrated(make, usual, recording, truth)
+        return replace(method, calibration=sentence)
 
 
 def broadcasts(recording: Recording, noise_model: NoiseModel, priors: Priors) -> Sent:
@@ -278,10 +278,14 @@ def lasting(ego: str, residual: Floats, dt: float) -> list[str]:
     """A note if the residuals (R, T, 3) m of an ego's fixes are correlated over a second: their errors last."""
     lag = max(round(1.0 / dt), 1)
     product, square = residual[:, lag:] * residual[:, :-lag], np.nansum(residual**2)
-    found = float(np.nanmean(product) / np.nanmean(residual**2)) if square > 0.0 and np.isfinite(product).any() else 0.0
-    if found < 0.1 + 4.0 / np.sqrt(max(np.isfinite(product).sum(), 1)):
+    correlation = (
+        float(np.nanmean(product) / np.nanmean(residual**2)) if square > 0.0 and np.isfinite(product).any() else 0.0
+    )
+    if correlation < 0.1 + 4.0 / np.sqrt(max(np.isfinite(product).sum(), 1)):
         return []
-    return [f"fixes, {ego}: errors a second apart are correlated by {found:.2f}; give Sensors(gnss_drift_std=...)"]
+    return [
+        f"fixes, {ego}: errors a second apart are correlated by {correlation:.2f}; give Sensors(gnss_drift_std=...)"
+    ]
 
 
 def priors_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool = False) -> Priors:

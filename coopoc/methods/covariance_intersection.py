@@ -62,12 +62,12 @@ class CovarianceIntersection(Checked):
         age (age + 2) of its variances at most. Relative noise is rotated to the predicted geometry: at the measured one
         the weight would depend on the noise.
         """
-        known, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
-        gates = self.robust and known.exact_relative
-        x, p = solo_estimates(recording, known, columns, gates)
+        noise_model, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
+        gates = self.robust and noise_model.exact_relative
+        x, p = solo_estimates(recording, noise_model, columns, gates)
 
-        def run(ego: int, box: Inbox) -> Iterator[Estimate]:
-            assumed = assumptions(recording, known, ego, box)._replace(broadcast=p, growth=ESTIMATE_GROWTH)
-            yield Estimate(*run_intersection(measurements(recording, ego, box, x), assumed, self.split, gates, False))
+        def run(ego: int, inbox: Inbox) -> Iterator[Estimate]:
+            assumed = assumptions(recording, noise_model, ego, inbox)._replace(broadcast=p, growth=ESTIMATE_GROWTH)
+            yield Estimate(*run_intersection(measurements(recording, ego, inbox, x), assumed, self.split, gates, False))
 
-        return follow_egos(self, recording, egos, run, known.notes)
+        return follow_egos(self, recording, egos, run, noise_model.notes)

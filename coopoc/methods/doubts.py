@@ -34,7 +34,7 @@ def doubts(
 
     Receivers that are rejected or filters that are lost: all fixes are beyond their gate. Covariances: the fixes' mean,
     or their mean square, is farther off than chance allows. Odometers: the fixes move otherwise, again beyond chance.
-    Neighbours: all messages, or relative measurements, are beyond REJECTED gates.
+    Neighbours: all messages, or relative measurements, are beyond HARD_REJECT_FACTOR gates.
 
     Args:
         recording: of all vehicles, with the noise that methods know.

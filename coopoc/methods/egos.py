@@ -60,13 +60,13 @@ def follow_egos(
         for e, ego in enumerate(columns):
             box = inbox(recording, ego, method.message)
             received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
-            for found in follow(ego, box):
-                x[:, found.step, e], cov[:, found.step, e] = found.x, found.covariance
-                here = slice(None) if found.links is None else np.searchsorted(box.link, found.links)
-                neighbours[:, ends[e] : ends[e + 1]][:, here] = found.neighbours
-                for name, values in found.extras.items():
+            for result in follow(ego, box):
+                x[:, result.step, e], cov[:, result.step, e] = result.x, result.covariance
+                here = slice(None) if result.links is None else np.searchsorted(box.link, result.links)
+                neighbours[:, ends[e] : ends[e + 1]][:, here] = result.neighbours
+                for name, values in result.extras.items():
                     extras.setdefault(name, []).append(values)
-                bar.update(1 if isinstance(found.step, int) else len(recording.t[found.step]))
+                bar.update(1 if isinstance(result.step, int) else len(recording.t[result.step]))
     stated = getattr(method, "noise_model", "nominal")
     notes = (*notes, *doubts(recording, columns, x, cov, stated, neighbours))
     for array in (x, cov, neighbours):
@@ -78,44 +78,44 @@ def follow_egos(
     )
 
 
-def measurements(recording: Recording, ego: int, box: Inbox, broadcast: Floats | None = None) -> Measurements:
+def measurements(recording: Recording, ego: int, inbox: Inbox, broadcast: Floats | None = None) -> Measurements:
     """Measurements and messages of one ego, as `coopoc.kernels.stars.messages.Measurements`.
 
     Args:
         recording: of all vehicles.
         ego: column.
-        box: its messages.
+        inbox: its messages.
         broadcast: (R, T, N, 3) m, position in a message; None for the fix.
     """
     neighbour, start, newest = (
         np.ascontiguousarray(numbers, dtype=np.int64)
-        for numbers in (recording.links.neighbour[box.link], box.start, box.newest)
+        for numbers in (recording.links.neighbour[inbox.link], inbox.start, inbox.newest)
     )
     gnss = recording.gnss
     return Measurements(
         gnss,
         recording.velocity,
         gnss if broadcast is None else broadcast,
-        components(recording.told, box.link),
+        components(recording.usable_relative, inbox.link),
         neighbour,
         start,
         newest,
-        np.ascontiguousarray(box.fresh),
+        np.ascontiguousarray(inbox.fresh),
         int(ego),
         recording.dt,
     )
 
 
-def assumptions(recording: Recording, noise_model: NoiseModel, ego: int, box: Inbox | None = None) -> Assumptions:
+def assumptions(recording: Recording, noise_model: NoiseModel, ego: int, inbox: Inbox | None = None) -> Assumptions:
     """The noise that a filter assumes, as `kernels.stars.messages.Assumptions`: a message holds a fix and a velocity.
 
     Args:
         recording: of all vehicles.
         noise_model: of the filter.
         ego: column.
-        box: its messages; None where it is alone.
+        inbox: its messages; None where it is alone.
     """
-    process = noise_model.process_variance(recording, [ego], box)
+    process = noise_model.process_variance(recording, [ego], inbox)
     fixes = np.ascontiguousarray(noise_model.fix_variance(recording))
     return Assumptions(process, fixes, fixes, FIX_GROWTH, *relative_noise(noise_model), FORGOTTEN, ACCELERATION_STD)
 

@@ -32,7 +32,7 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
         columns = check_recording(recording).observing(egos)
         whole = (0, len(recording.t))
         cuts = {column: recording.stretches(column) for column in columns}
-        if all(found in ((), (whole,)) for found in cuts.values()):
+        if all(pieces in ((), (whole,)) for pieces in cuts.values()):
             return call(self, recording, egos)
         parts = {
             (column, cut): call(_from(self, cut[0]), recording.between(*cut), [recording.ids[column]])
@@ -53,8 +53,8 @@ def _joined(recording: Recording, columns: list[int], parts: dict[tuple[int, tup
     """Tracks of one ego each, in stretches of the recording, as one of all."""
     shape = recording.runs, len(recording.t), len(columns)
     some, links = [*parts.values()], recording.links
-    mine = [links.of(column) for column in columns]
-    ends = np.cumsum([0, *map(len, mine)])
+    own_links = [links.of(column) for column in columns]
+    ends = np.cumsum([0, *map(len, own_links)])
     absent, notes = np.ones(shape[1:], bool), dict[str, None]()
     made: dict[str, Any] = {"neighbours": None if some[0].neighbours is None else (shape[0], ends[-1], 3)}
     for name in ("x", "covariance", "heading", "heading_covariance"):
@@ -70,7 +70,7 @@ def _joined(recording: Recording, columns: list[int], parts: dict[tuple[int, tup
         absent[start:stop, e] = False
         received[:, e] += track.received_bytes[:, 0]
         sent[:, e] += track.sent_bytes[:, 0]
-        here = ends[e] + np.flatnonzero((links.step[mine[e]] >= start) & (links.step[mine[e]] < stop))
+        here = ends[e] + np.flatnonzero((links.step[own_links[e]] >= start) & (links.step[own_links[e]] < stop))
         for name, values in (*((k, getattr(track, k)) for k in made), *track.extras.items()):
             of = made.get(name, extras.get(name))
             if of is not None and of.shape[1] == shape[1] and name != "neighbours" and values.ndim > 2:

@@ -49,8 +49,8 @@ class JointFilter(Checked):
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        known = resolve(self.noise_model, recording)
-        refine, gates = (wish and known.exact_relative for wish in (self.exact, self.robust))
+        noise_model = resolve(self.noise_model, recording)
+        refine, gates = (wish and noise_model.exact_relative for wish in (self.exact, self.robust))
         return follow_egos(
             self,
             recording,
@@ -58,9 +58,9 @@ class JointFilter(Checked):
             lambda ego, box: [
                 Estimate(
                     *run_filter(
-                        measurements(recording, ego, box), assumptions(recording, known, ego, box), refine, gates
+                        measurements(recording, ego, box), assumptions(recording, noise_model, ego, box), refine, gates
                     )
                 )
             ],
-            known.notes,
+            noise_model.notes,
         )

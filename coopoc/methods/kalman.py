@@ -79,9 +79,9 @@ class Kalman(Alone, Checked):
         """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
         began = clock()
         columns = check_recording(recording).columns(egos)
-        known = resolve(self.noise_model, recording, relative=False)
-        x, p, _ = solo_filter(recording, columns, known, fix_noise(known, self.robust), self.x0)
-        return solo_track(recording, columns, x, p, began, noise_model=known)
+        assumed = resolve(self.noise_model, recording, relative=False)
+        x, p, _ = solo_filter(recording, columns, assumed, fix_noise(assumed, self.robust), self.x0)
+        return solo_track(recording, columns, x, p, began, noise_model=assumed)
 
     def start(
         self, x0: npt.ArrayLike | None = None, *, interval: float | None = None, history: float = 10.0
@@ -100,8 +100,8 @@ class Kalman(Alone, Checked):
         >>> x.tolist(), covariance.trace()
         ([1.0, 2.0, 0.0], np.float64(3.0))
         """
-        known = constant_noise(self.noise_model)
-        return FilterStream(motion_noise(known, interval), fix_noise(known, self.robust), x0, history)
+        noise_model = constant_noise(self.noise_model)
+        return FilterStream(motion_noise(noise_model, interval), fix_noise(noise_model, self.robust), x0, history)
 
     @classmethod
     def fitted(cls, recording: Recording, truth: Fleet | None = None) -> Kalman:
@@ -187,15 +187,15 @@ class AdaptiveKalman(Alone):
     def gnss_std(self, recording: Recording, egos: Vehicles = (0,)) -> Floats:
         """(R, T, E, 3) m, the estimated standard deviation of the fixes at every step."""
         columns = check_recording(recording).columns(egos)
-        known = NoiseModel.nominal(self.assumed)
-        noise = solo_filter(recording, columns, known, self._fixes, self.x0)[2]
-        assumed = np.broadcast_to(known.gnss_variance, (recording.runs, len(recording.t), len(egos), 3))
+        noise_model = NoiseModel.nominal(self.assumed)
+        noise = solo_filter(recording, columns, noise_model, self._fixes, self.x0)[2]
+        assumed = np.broadcast_to(noise_model.gnss_variance, (recording.runs, len(recording.t), len(egos), 3))
         return np.sqrt(noise if noise.size else assumed)
 
     @property
     def _fixes(self) -> FixNoise:
-        known = fix_noise(NoiseModel.nominal(self.assumed), self.robust)
-        return known._replace(weight=float(self.prior_weight), window=float(self.window))
+        noise = fix_noise(NoiseModel.nominal(self.assumed), self.robust)
+        return noise._replace(weight=float(self.prior_weight), window=float(self.window))
 
 
 def fix_noise(noise_model: NoiseModel, robust: bool) -> FixNoise:
@@ -254,11 +254,11 @@ def solo_filter(
         process = own_variances(noise, velocity[:, :, columns], recording.dt, first)
     else:
         process = noise.process_variance(recording, columns, first=first)
-    seen = SoloMeasurements(gnss, velocity, np.broadcast_to(process, shape), columns, recording.dt)
+    inputs = SoloMeasurements(gnss, velocity, np.broadcast_to(process, shape), columns, recording.dt)
     if x0 is not None and np.shape(x0)[-2:] != shape[2:]:
         raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {shape[2:]}", "One start per ego.")
     index, size = (columns, gnss.shape) if in_place else (np.arange(len(columns)), shape)
     x, p = np.empty(size), np.empty(size)
     if x0 is not None:
         x[:, 0] = x0
-    return x, p, run_filter(seen, fixes, x0 is not None, index, x, p)
+    return x, p, run_filter(inputs, fixes, x0 is not None, index, x, p)

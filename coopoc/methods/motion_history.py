@@ -69,15 +69,15 @@ class MotionHistory:
         number("fix_age", fix_age, -ROUNDING, kept + ROUNDING, allowed=f"{allowed}, the motion that is kept", hint=hint)
 
     def write(
-        self, given: Floats, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float
+        self, row: Floats, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float
     ) -> None:
         """Write fix, velocity, dt and age of the fix to the input of a kernel; InputError as `check`."""
         simple = isinstance(dt, float) and isinstance(fix_age, float) and {type(gnss), type(velocity)} <= PLAIN
         try:
             if not simple or np.shape(velocity) != (3,) or (gnss is not None and np.shape(gnss) != (3,)):
                 self.check(gnss, velocity, dt, fix_age)
-            given[:3], given[3:6], given[6], given[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
-            if any(abs(number) > FARTHEST for number in given.tolist()):
+            row[:3], row[3:6], row[6], row[7] = np.nan if gnss is None else gnss, velocity, dt, fix_age
+            if any(abs(number) > FARTHEST for number in row.tolist()):
                 self.check(gnss, velocity, dt, fix_age)
         except Exception:  # a class from elsewhere may raise anything
             self.check(gnss, velocity, dt, fix_age)
@@ -102,21 +102,21 @@ def three(field: str, value: npt.ArrayLike, limit: float = FARTHEST) -> Floats:
     return array
 
 
-def names_of(field: str, given: Any, kind: type[Any]) -> list[str]:
+def names_of(field: str, name_list: Any, kind: type[Any]) -> list[str]:
     """Names of the vehicles that a stream is given measurements of, each once.
 
     Args:
         field: name of the argument.
-        given: a sequence of measurements.
+        name_list: a sequence of measurements.
         kind: their class.
 
     Raises:
         InputError: anything else, or a vehicle twice.
     """
-    names = [each.id for each in given if isinstance(each, kind)] if isinstance(given, Sequence) else None
-    if names is None or len(names) < len(given):
+    names = [each.id for each in name_list if isinstance(each, kind)] if isinstance(name_list, Sequence) else None
+    if names is None or len(names) < len(name_list):
         hint = f"Give a list of {kind.__name__}, empty for none."
-        raise InputError(field, shown(given), f"must hold {kind.__name__}s", hint)
+        raise InputError(field, shown(name_list), f"must hold {kind.__name__}s", hint)
     if len(set(names)) < len(names):
         raise InputError(field, names, "must be given once each", "Merge the measurements of one vehicle.")
     return names
@@ -124,8 +124,8 @@ def names_of(field: str, given: Any, kind: type[Any]) -> list[str]:
 
 def fix_or_none(gnss: npt.ArrayLike | None, field: str = "gnss") -> Floats:
     """(3,) m, all NaN if there is no fix; InputError for a fix in part."""
-    given = np.full(3, np.nan) if gnss is None else numbers(gnss)
-    return given if given.shape == (3,) and np.isnan(given).all() else three(field, "none" if gnss is None else gnss)
+    fix = np.full(3, np.nan) if gnss is None else numbers(gnss)
+    return fix if fix.shape == (3,) and np.isnan(fix).all() else three(field, "none" if gnss is None else gnss)
 
 
 def seconds(field: str, value: float) -> float:
@@ -140,5 +140,5 @@ def numbers(value: npt.ArrayLike) -> Floats:
     >>> numbers("east").size
     0
     """
-    given = plain(value)
-    return given.astype(float) if given.dtype.kind in "fiu" else np.empty(0)
+    array = plain(value)
+    return array.astype(float) if array.dtype.kind in "fiu" else np.empty(0)

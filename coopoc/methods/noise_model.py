@@ -112,7 +112,7 @@ class NoiseModel:
         self,
         recording: Recording,
         columns: Sequence[int] | Ints | None = None,
-        box: Inbox | None = None,
+        inbox: Inbox | None = None,
         first: int = 0,
     ) -> Floats:
         """Per-axis variance of x_t given x_{t-1}, m^2, broadcastable to (R, T, E, 3).
@@ -123,7 +123,7 @@ class NoiseModel:
         Args:
             recording: with the velocities.
             columns: (E,) of the vehicles; None for all.
-            box: of the one vehicle; then of all (R, T, N, 3) by what it knows, at the steps of messages that arrive.
+            inbox: of the one vehicle; then of all (R, T, N, 3) by what it knows, at the steps of messages that arrive.
             first: step at which the filter begins.
         """
         if self.process_std is not None:
@@ -133,16 +133,18 @@ class NoiseModel:
         if self.fleet is not None:
             self.fleet.require(recording.ids, recording.t)
             velocity = self.fleet.velocity[None]
-        if columns is not None and box is None:
+        if columns is not None and inbox is None:
             velocity = velocity[:, :, columns]
         if self.fleet is not None:
-            found: Floats = np.square(recording.dt * self.sensors.velocity_std(velocity, 1e-6))
-            return found
-        if box is None:
+            variance: Floats = np.square(recording.dt * self.sensors.velocity_std(velocity, 1e-6))
+            return variance
+        if inbox is None:
             return own_variances(self.sensors.motion_noise(), velocity, recording.dt, first)
-        use, neighbour = np.zeros(velocity.shape[:3], np.uint8), links.neighbour[box.link]
-        use[:, links.step[box.link], neighbour] = RECEIVED * (box.arrival >= 0)
-        use[np.arange(len(use))[:, None], box.newest, neighbour] = HELD  # -1, of none: the last step is before no other
+        use, neighbour = np.zeros(velocity.shape[:3], np.uint8), links.neighbour[inbox.link]
+        use[:, links.step[inbox.link], neighbour] = RECEIVED * (inbox.arrival >= 0)
+        use[np.arange(len(use))[:, None], inbox.newest, neighbour] = (
+            HELD  # -1, of none: the last step is before no other
+        )
         use[:, :, columns] = HELD
         velocity, longest = np.ascontiguousarray(velocity), recording.v2x.max_age
         return process_variances(self.sensors.motion_noise(), velocity, use, longest, recording.dt)
@@ -226,14 +228,14 @@ def _with_range_floor(noise_model: NoiseModel, recording: Recording | None) -> N
     if noise is None or recording is None or not links:
         return noise_model
     sample = recording.relative[0, np.linspace(0, links - 1, min(links, SAMPLED)).astype(np.int64)]
-    seen = sample[np.isfinite(sample[:, 0])]
-    directed = seen[np.isfinite(seen[:, 1])]
-    if not len(seen):
+    measured = sample[np.isfinite(sample[:, 0])]
+    directed = measured[np.isfinite(measured[:, 1])]
+    if not len(measured):
         return noise_model
-    far, notes = float(np.median((directed if len(directed) else seen)[:, 0])), noise_model.notes
+    far, notes = float(np.median((directed if len(directed) else measured)[:, 0])), noise_model.notes
     if noise.range_std > far / 2:
-        given = f"ranges of {far:.3g} m with a std of {noise.range_std:.3g} m"
-        return replace(noise_model, notes=(*notes, f"{given}: none is negative, so that their errors have a mean"))
+        actual = f"ranges of {far:.3g} m with a std of {noise.range_std:.3g} m"
+        return replace(noise_model, notes=(*notes, f"{actual}: none is negative, so that their errors have a mean"))
     if len(directed):
         arc = far * float(np.hypot(noise.azimuth_std**2, noise.inclination_std**2)) / np.sqrt(2.0)
         why = f"angles of {max(noise.azimuth_std, noise.inclination_std):.2g} rad"

@@ -75,10 +75,10 @@ def stars(
     >>> [star.member.tolist() for star in stars(observe(fleet, Sensors(), V2X()), "a")]
     [[0, 1], [0, 1]]
     """
-    known, ego = resolve(noise_model, recording), check_recording(recording).columns([ego])[0]
+    assumed_noise, ego = resolve(noise_model, recording), check_recording(recording).columns([ego])[0]
     box, shape, dt = inbox(recording, ego, message), recording.gnss.shape, recording.dt
-    q = np.broadcast_to(known.process_variance(recording, [ego], box), shape)
-    r = np.broadcast_to(known.fix_variance(recording), shape)
+    q = np.broadcast_to(assumed_noise.process_variance(recording, [ego], box), shape)
+    r = np.broadcast_to(assumed_noise.fix_variance(recording), shape)
     fixes, variances = sent or (recording.gnss, r)
     variances = np.broadcast_to(variances, shape)
     run, each = np.arange(recording.runs)[:, None], np.ones((recording.runs, 1), dtype=np.int64)

@@ -32,7 +32,7 @@ from ..kernels.stars.cooperative_state import (
 )
 from ..kernels.stars.gaussian import ABSENT
 from ..kernels.stars.streams import make_filter, restore, stream_rows, stream_step
-from ..world.links import told
+from ..world.links import drop_steep_azimuths
 from ..world.plausible import FARTHEST, radians
 from .cooperative_filter import Broadcast, CooperativeFilter, model_of, priors_of
 from .motion_history import MotionHistory, fix_or_none, names_of, numbers, seconds, three
@@ -76,7 +76,10 @@ class RelativeMeasurement:
             text = "must have a name and three numbers, the range first and > 0"
             raise InputError("relative", (self.id, self.relative), text, "Give NaN for what was not measured.")
         radians("relative angles", relative[1:])
-        row[:AGE], row[AGE] = components(told(relative)[None, None], FIRST)[0, 0], seconds("age", self.age)
+        row[:AGE], row[AGE] = (
+            components(drop_steep_azimuths(relative)[None, None], FIRST)[0, 0],
+            seconds("age", self.age),
+        )
         row[SOLO:SOLO_VARIANCE] = fix_or_none(self.gnss, "neighbour's gnss")
         if self.variance is not None:
             row[SOLO_VARIANCE:ODOMETER] = variance = three("neighbour's variance", self.variance, FARTHEST**2)
@@ -132,13 +135,13 @@ class StarStream:
         max_age: float = 1.0,
         measured: bool = False,
     ) -> None:
-        known = constant_noise(instance("filter", filter, CooperativeFilter).noise_model)
+        noise_model = constant_noise(instance("filter", filter, CooperativeFilter).noise_model)
         self._start = np.full(3, np.nan) if x0 is None else three("x0", x0)
-        priors = priors_of(filter, known, measured)
-        self._trusted, self._model = float(priors.fix_gate == 0.0), model_of(known, priors)
+        priors = priors_of(filter, noise_model, measured)
+        self._trusted, self._model = float(priors.fix_gate == 0.0), model_of(noise_model, priors)
         self._filter, self._tries = make_filter(1, 1)
-        self._motion: MotionNoise = motion_noise(known, interval)
-        self._fix = priors.fix**2 * np.array(known.gnss_variance)
+        self._motion: MotionNoise = motion_noise(noise_model, interval)
+        self._fix = priors.fix**2 * np.array(noise_model.gnss_variance)
         self.max_age, self.history = seconds("max_age", max_age), MotionHistory(history)
         self._given, self._time, self._begun = np.zeros(8), 0.0, x0 is not None
         self._numbers, self._names = dict[str, int](), list[str]()

@@ -121,8 +121,8 @@ class Track:
                 "The method diverged: lower its gain, or check the assumed standard deviations.",
             )
         if self.covariance is not None:
-            known = self.covariance if self.absent is None else self.covariance[:, there]
-            self._note_unsound(known.reshape(-1, 3, 3))
+            present = self.covariance if self.absent is None else self.covariance[:, there]
+            self._note_unsound(present.reshape(-1, 3, 3))
 
     def to_frame(self) -> pd.DataFrame:
         r"""A row per run, step and ego, for pandas.
@@ -154,8 +154,8 @@ class Track:
     def _note_unsound(self, covariance: Floats) -> None:
         from ..kernels.covariances import unsound
 
-        if (found := unsound(covariance)) and not any(UNSOUND in note for note in self.notes):
-            note = f"{found} of {len(covariance)} {UNSOUND}"
+        if (count := unsound(covariance)) and not any(UNSOUND in note for note in self.notes):
+            note = f"{count} of {len(covariance)} {UNSOUND}"
             self.__dict__["notes"] = (*self.notes, note)
 
 

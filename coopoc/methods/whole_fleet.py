@@ -122,7 +122,7 @@ def kernel_arguments(
     columns = (met.first, met.second, met.link, met.link_back, met.start)
     first, second, link, link_back, start = (np.ascontiguousarray(column, dtype=np.int64) for column in columns)
     pairs = Pairs(first, second, link, link_back, start, np.ascontiguousarray(both & (met.arrival >= 0)))
-    relative = components(recording.told, np.arange(len(recording.links)))
+    relative = components(recording.usable_relative, np.arange(len(recording.links)))
     relative = np.concatenate([relative, np.ones((*relative.shape[:2], 3))], axis=2)
     process, fix = model.process_variance(recording), model.fix_variance(recording)
     if robust := robust and model.exact_relative:
@@ -130,9 +130,9 @@ def kernel_arguments(
         fix = fix / model.gnss_variance * solo_filter(recording, vehicles, model, fix_noise(model, robust))[2]
     process, fix = (np.ascontiguousarray(variance, dtype=float) for variance in (process, fix))
     std: Floats = np.zeros(0)
-    known, min_range = model.sensors, 0.0
-    if known is not None:
-        std, min_range = known.relative_std, max(known.min_range, NEAREST * known.relative_std[0])
+    sensors, min_range = model.sensors, 0.0
+    if sensors is not None:
+        std, min_range = sensors.relative_std, max(sensors.min_range, NEAREST * sensors.relative_std[0])
     measured = Measured(recording.gnss, recording.velocity, relative, active, recording.dt)
     return measured, pairs, Assumed(process, fix, std, min_range, robust)
 

@@ -166,8 +166,8 @@ def _registered(name: str) -> Backend:
 
 
 def _checked(name: str) -> Backend:
-    found = find("coopoc.backends", name)
-    if not isinstance(found, Backend):
+    backend = find("coopoc.backends", name)
+    if not isinstance(backend, Backend):
         hint = "Give coopoc.Backend(name, prepare, purpose)."
-        raise InputError("backend", repr(name), f"is a {type(found).__name__}, no Backend", hint)
-    return found
+        raise InputError("backend", repr(name), f"is a {type(backend).__name__}, no Backend", hint)
+    return backend

@@ -89,8 +89,8 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     poses = tuple(np.flatnonzero(graph.is_pose).tolist())
     first = "odometry" if start == "incremental" else start
     names = contenders(graph) if start == "auto" else (first,)
-    given = _x0(graph, poses, "odometry" if start == "auto" else first)
-    problem = Problem(graph.names, factors, given, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
+    start_x = _x0(graph, poses, "odometry" if start == "auto" else first)
+    problem = Problem(graph.names, factors, start_x, dimension=graph.dimension, poses=poses, fixed=_fixed(graph))
     if len(problem.fixed) - len(graph.fixed) > (not len(graph.fixed)):
         notes = (
             *notes,
@@ -99,11 +99,11 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         )
     won = Search(names[0])
     if start == "auto":
-        starts = {name: (lambda: given) if name == "odometry" else partial(_x0, graph, poses, name) for name in names}
+        starts = {name: (lambda: start_x) if name == "odometry" else partial(_x0, graph, poses, name) for name in names}
         late: dict[str, Any] = {}
         if not graph.guess and np.isfinite(graph.position).all():
             late["file"] = lambda _: (_x0(graph, poses, "file"), 0)
-        late |= {"eased": lambda at: eased(at, given)} if poses and len(graph.ranges) else {}
+        late |= {"eased": lambda at: eased(at, start_x)} if poses and len(graph.ranges) else {}
         late |= {"incremental": lambda _: incremental_start(graph, problem)} if poses else {}
         problem, won = race(problem, starts, late, partial(unwound, graph), "incremental" if len(graph.ranges) else "")
     elif start == "incremental" and poses:
@@ -122,8 +122,8 @@ def _counted(notes: Sequence[str]) -> tuple[str, ...]:
     """
     places: dict[str, list[str]] = {}
     for note in notes:
-        place, _, what = note.rpartition(": ")
-        places.setdefault(what, []).append(place)
+        location, _, what = note.rpartition(": ")
+        places.setdefault(what, []).append(location)
     first = {what: f"{own[0]}: {what}" if own[0] else what for what, own in places.items()}
     return tuple(f"{n} times, first in {first[w]}" if (n := len(own)) > 1 else first[w] for w, own in places.items())
 
@@ -157,17 +157,17 @@ def loop_closures(problem: Problem) -> list[tuple[int, list[int]]]:
         if robot in last:
             after[last[robot]] = node
         last[robot] = node
-    found = []
+    closures = []
     for k, factor in enumerate(problem.factors):
         if factor.kind.startswith("relative_pose"):
             i, j = factor.nodes.T
             rows = np.flatnonzero((after[i] != j) & (after[j] != i)).tolist()
-            found += [(k, rows)] if rows else []
-    return found
+            closures += [(k, rows)] if rows else []
+    return closures
 
 
 def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
-    d, found = graph.dimension, list[Factor]()
+    d, factors = graph.dimension, list[Factor]()
     for name, kind in KINDS.items():
         edges: Any = getattr(graph, name)
         if not len(edges):
@@ -175,21 +175,21 @@ def _factors(graph: Graph, objective: Objective) -> tuple[Factor, ...]:
         turns = kind in ("relative_pose", "pose")
         z = Space(d, has_rotation=True).join(edges.position, edges.rotation) if turns else edges.position
         if objective == "geodesic":
-            found.append(Factor(kind, edges.nodes, z, cov=edges.covariance))
+            factors.append(Factor(kind, edges.nodes, z, cov=edges.covariance))
             continue
         std = np.sqrt(position_variance(edges.covariance, d))[:, None].repeat(d, axis=1)
         if turns:
             own = np.sqrt(rotation_variance(edges.covariance, d))[:, None].repeat(d * d, axis=1)
             kind, std = f"{kind}_chordal", np.concatenate([std, own], axis=1)
-        found.append(Factor(kind, edges.nodes, z, std=std))
+        factors.append(Factor(kind, edges.nodes, z, std=std))
     ranges, sigma = graph.ranges, np.sqrt(graph.ranges.variance)[:, None]
     apart = ranges.distance > 0
     if apart.any():
-        found.append(Factor("range", ranges.nodes[apart], ranges.distance[apart, None], std=sigma[apart]))
+        factors.append(Factor("range", ranges.nodes[apart], ranges.distance[apart, None], std=sigma[apart]))
     if not apart.all():  # (|v| - 0)^2 = |v|^2, which has a derivative at v = 0, too
         zero = np.zeros((int((~apart).sum()), d))
-        found.append(Factor("displacement", ranges.nodes[~apart], zero, std=sigma[~apart] + zero))
-    return tuple(found)
+        factors.append(Factor("displacement", ranges.nodes[~apart], zero, std=sigma[~apart] + zero))
+    return tuple(factors)
 
 
 def _fixed(graph: Graph) -> tuple[int, ...]:

@@ -62,19 +62,19 @@ class Incremental:
         for k, (name, value) in enumerate(new.items()):
             if name in self._place:
                 raise InputError("values", repr(name), "must be a new node", "Give guesses of new nodes alone.")
-            given = numbers("values", value).ravel()
-            if len(given) not in (d, space.ambient):
+            vector = numbers("values", value).ravel()
+            if len(vector) not in (d, space.ambient):
                 allowed = f"must be {d} numbers of a point or {space.ambient} of a pose"
-                raise InputError("values", f"{name}: {len(given)} numbers", allowed, "Make poses with coopoc.pose.")
-            turns.append(space.has_rotation and len(given) > d)
-            x[k] = given if turns[-1] else space.join(given[None, :d])[0]
+                raise InputError("values", f"{name}: {len(vector)} numbers", allowed, "Make poses with coopoc.pose.")
+            turns.append(space.has_rotation and len(vector) > d)
+            x[k] = vector if turns[-1] else space.join(vector[None, :d])[0]
         points(space, len(x), "values", x)
         fresh = {name: first + k for k, name in enumerate(new)}
 
         def index(node: Any) -> int:
-            found = fresh.get(node, self._place.get(node)) if isinstance(node, str) else node
-            if isinstance(found, int | np.integer) and 0 <= found < first + len(new):
-                return int(found) if found >= first else self._index(int(found))
+            known_index = fresh.get(node, self._place.get(node)) if isinstance(node, str) else node
+            if isinstance(known_index, int | np.integer) and 0 <= known_index < first + len(new):
+                return int(known_index) if known_index >= first else self._index(int(known_index))
             raise no_such_node(node, [*self.names, *new])
 
         made = list[Factor]()
@@ -134,11 +134,11 @@ class Incremental:
         """(ambient,) iSAM2's estimate of a node, in a time that does not grow with the others."""
         import gtsam
 
-        k, found = self._index(node), gtsam.Values()
+        k, value = self._index(node), gtsam.Values()
         turned = k in self._poses
         name = f"{'Pose' if turned else 'Point'}{self._problem.dimension}"
-        found.insert(0, getattr(self.isam, f"calculateEstimate{name}")(k))
-        return np.asarray(estimate(self._problem.space, [turned], found)[0])
+        value.insert(0, getattr(self.isam, f"calculateEstimate{name}")(k))
+        return np.asarray(estimate(self._problem.space, [turned], value)[0])
 
     def marginal(self, node: str | int) -> Floats:
         """(dof, dof) m^2, rad^2 covariance of a node at iSAM2's linearisation, as `Solution.covariance` has it."""
@@ -147,12 +147,12 @@ class Incremental:
         return np.asarray(turn @ self.isam.marginalCovariance(k) @ turn.T)
 
     def _index(self, node: str | int) -> int:
-        found = self._place.get(node) if isinstance(node, str) else node
-        if not isinstance(found, int | np.integer) or not 0 <= found < len(self.names):
+        index = self._place.get(node) if isinstance(node, str) else node
+        if not isinstance(index, int | np.integer) or not 0 <= index < len(self.names):
             raise no_such_node(node, self.names)
-        if self.lag and not self.isam.getLinearizationPoint().exists(found):
+        if self.lag and not self.isam.getLinearizationPoint().exists(index):
             raise InputError("node", node, f"is forgotten, {self.lag} steps after it was used", "Take a longer lag.")
-        return int(found)
+        return int(index)
 
     @property
     def problem(self) -> Problem:
@@ -180,10 +180,10 @@ class Incremental:
         estimate was from the answer. Arguments and errors as `solve`.
         """
         problem = self.problem
-        found, d = solve(problem, throw=throw, **options), problem.dimension
+        solution, d = solve(problem, throw=throw, **options), problem.dimension
         assert problem.x0 is not None
-        off = float(np.linalg.norm(found.x[:, :d] - problem.x0[:, :d], axis=1).max(initial=0.0))
-        return replace(found, extras=found.extras | {"isam2_off": off})
+        off = float(np.linalg.norm(solution.x[:, :d] - problem.x0[:, :d], axis=1).max(initial=0.0))
+        return replace(solution, extras=solution.extras | {"isam2_off": off})
 
 
 def incremental(

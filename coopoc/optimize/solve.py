@@ -70,16 +70,16 @@ def solve(
     array([-0.333,  9.333])
     """
     instance("problem", problem, Problem)
-    known = _chosen(problem) if backend is None else require_backend(backend)
+    chosen = _chosen(problem) if backend is None else require_backend(backend)
     instance("throw", throw, bool, "Give False to get the Solution whatever its status.")
     wanted = len(problem.names) <= MANY if covariance is None else instance("covariance", covariance, bool)
     if not problem.factors:
         raise InputError("problem", repr(problem), "has no measurements", "Add factors: problem.add(...).")
     if (factors := fused(problem.factors)) is not problem.factors:
         problem = problem.replace_unchecked(factors=factors)
-    solution = _solved(problem, known, options, wanted)
-    if backend is None and known.name != DEFAULTS[0]:
-        solution = replace(solution, notes=(f"solved by {known.name}: gauss-newton cannot", *solution.notes))
+    solution = _solved(problem, chosen, options, wanted)
+    if backend is None and chosen.name != DEFAULTS[0]:
+        solution = replace(solution, notes=(f"solved by {chosen.name}: gauss-newton cannot", *solution.notes))
     if throw and solution.status is not Status.SOLVED:
         _raise(solution)
     return solution
@@ -106,9 +106,9 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         problem = robust_start(problem, start)
         assert problem.x0 is not None
         start = problem.x0
-    found, search = solver(problem, start), problem.search
+    result, search = solver(problem, start), problem.search
     solved = clock()
-    x, iterations, infeasible = found.x, found.iterations, found.infeasible
+    x, iterations, infeasible = result.x, result.iterations, result.infeasible
     truth = assess(problem, x, covariance)
     out = truth.active is not None and (truth.violation > FEASIBLE or infeasible)
     violated = {"violated": truth.active.violated} if truth.active is not None and out else {}
@@ -136,7 +136,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         violation=truth.violation,
         expected=expected,
         notes=(*search.notes, *notes),
-        extras=found.extras | violated | (search.extras if search.start else {}),
+        extras=result.extras | violated | (search.extras if search.start else {}),
     )
 
 

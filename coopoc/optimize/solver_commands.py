@@ -94,8 +94,8 @@ def known_inliers_first(graph: Graph, objective: Objective, start: Start) -> Pro
     doubtful = [row for _, rows in loop_closures(problem) for row in rows]
     every = graph.relative_pose
     kept = np.setdiff1d(np.arange(len(every)), doubtful)
-    known = {field.name: getattr(every, field.name)[kept] for field in fields(every)}
-    began = from_graph(replace(graph, relative_pose=replace(every, **known)), objective, start)
+    kept_edges = {field.name: getattr(every, field.name)[kept] for field in fields(every)}
+    began = from_graph(replace(graph, relative_pose=replace(every, **kept_edges)), objective, start)
     return problem.replace_unchecked(x0=began.x0, search=began.search)
 
 
@@ -131,21 +131,21 @@ def described(solution: Solution) -> dict[str, Any]:
     """Status, cost and times of a solution, without its nodes."""
     times = "build_seconds solve_seconds check_seconds seconds load_seconds compile_seconds"
     named = f"backend cost expected gradient_norm iterations {times} notes".split()
-    found: dict[str, Any] = {"status": solution.status.name, "sentence": solution.status.value}
-    found |= {name: getattr(solution, name) for name in named}
-    found |= {"start": solution.extras.get("start"), "unobservable": list(solution.unobservable)}
-    return found | {key: solution.extras[key] for key in ("rejected", "joined") if key in solution.extras}
+    row: dict[str, Any] = {"status": solution.status.name, "sentence": solution.status.value}
+    row |= {name: getattr(solution, name) for name in named}
+    row |= {"start": solution.extras.get("start"), "unobservable": list(solution.unobservable)}
+    return row | {key: solution.extras[key] for key in ("rejected", "joined") if key in solution.extras}
 
 
 def nodes(solution: Solution) -> dict[str, Any]:
     """Positions m, rotation matrices and covariances (position m, then rotation rad) by name; NaN becomes null."""
-    found = {}
+    rows = {}
     for name, x, covariance in zip(solution.names, solution.x, solution.covariance, strict=True):
         node = {"position": solution.space.position(x).tolist()}
         if solution.space.has_rotation:
             node["rotation"] = solution.space.rotation(x).tolist()
-        found[name] = node | {"covariance": covariance.tolist() if np.isfinite(covariance).all() else None}
-    return {"nodes": found}
+        rows[name] = node | {"covariance": covariance.tolist() if np.isfinite(covariance).all() else None}
+    return {"nodes": rows}
 
 
 def tiny(kind: str = "spherical") -> Problem:
@@ -173,12 +173,14 @@ def check() -> int:
         kind = "range" if backend.capabilities.lacking(tiny()) else "spherical"
         expected = solve(tiny(kind))
         began = time.perf_counter()
-        found = solve(tiny(kind), name, throw=False)
+        solution = solve(tiny(kind), name, throw=False)
         took = 1e3 * (time.perf_counter() - began)
-        off = float(np.abs(found.x - expected.x).max())
-        good = found.status is Status.SOLVED and off < 1e-6
+        off = float(np.abs(solution.x - expected.x).max())
+        good = solution.status is Status.SOLVED and off < 1e-6
         failed += not good
-        print(f"{name:<14} {fixed:<12} {found.status.name:<10} {found.cost:12.6g} {off:11.1e} {took:8.1f}  {kind}")
+        print(
+            f"{name:<14} {fixed:<12} {solution.status.name:<10} {solution.cost:12.6g} {off:11.1e} {took:8.1f}  {kind}"
+        )
     print()
     with suppress(MissingLibraryError):  # nets have kernels, too, and need torch
         for net in names("coopoc.nets"):

@@ -203,8 +203,8 @@ def _name_alike(axes: Axes, drawn: Sequence[tuple[Where, Any]], log: bool, near:
         if len(group) > 1:
             x, y = list(next(points for of, points in drawn if of is group[0]).items())[-1]
             halo = [withStroke(linewidth=2, foreground="white")]
-            place: dict[str, Any] = {"xytext": (0, 5), "textcoords": "offset points", "ha": "right"}
-            axes.annotate(_joined(group), (x, _mean(y)), fontsize=7, path_effects=halo, **place)
+            offset: dict[str, Any] = {"xytext": (0, 5), "textcoords": "offset points", "ha": "right"}
+            axes.annotate(_joined(group), (x, _mean(y)), fontsize=7, path_effects=halo, **offset)
 
 
 WIDTH = 0.009

@@ -61,8 +61,8 @@ def read(folder: Path) -> Manifest:
         InputError: none, a damaged one, or one whose names are no file names: they would lead out of the folder.
     """
     path = folder / NAME
-    given = store.content(path, _FIELDS, f"holds no {NAME}", "Give a folder that coopoc run has made.")
-    manifest = Manifest(**{name: given[name] for name in _FIELDS})
+    fields = store.content(path, _FIELDS, f"holds no {NAME}", "Give a folder that coopoc run has made.")
+    manifest = Manifest(**{name: fields[name] for name in _FIELDS})
     texts = [*manifest.axes, *manifest.environment.values()]
     if not all(isinstance(text, str) for text in texts) or not all(
         isinstance(p, dict) for p in manifest.cells.values()
@@ -102,7 +102,7 @@ def environments(used: Sequence[Mapping[str, str]]) -> dict[str, str]:
 
 
 @contextmanager
-def locked(folder: Path, mine: Manifest, shard: str = "") -> Iterator[None]:
+def locked(folder: Path, own: Manifest, shard: str = "") -> Iterator[None]:
     """Make the folder, write its manifest, and lock both for this process, or for shards of the same manifest.
 
     A second run would replace the manifest under the first one. The operating system releases the locks when the
@@ -110,7 +110,7 @@ def locked(folder: Path, mine: Manifest, shard: str = "") -> Iterator[None]:
 
     Args:
         folder: of the study.
-        mine: manifest to write.
+        own: manifest to write.
         shard: "i/n", or nothing for a run of all cells.
 
     Raises:
@@ -121,7 +121,7 @@ def locked(folder: Path, mine: Manifest, shard: str = "") -> Iterator[None]:
         try:
             folder.mkdir(parents=True, exist_ok=True)
             with FileLock(folder / ".enter"):  # for milliseconds: one process at a time looks at the other locks
-                _enter(folder, mine, shard, stack)
+                _enter(folder, own, shard, stack)
         except OSError as error:
             allowed = f"cannot be written ({error.strerror or error})"
             raise InputError("out", str(folder), allowed, "Choose another --out.") from None
@@ -141,7 +141,7 @@ def one_at_a_time(folder: Path, waits: Callable[[], object]) -> Iterator[None]:
         lock.release()
 
 
-def _enter(folder: Path, mine: Manifest, shard: str, stack: ExitStack) -> None:
+def _enter(folder: Path, entry: Manifest, shard: str, stack: ExitStack) -> None:
     own = f".shard-{shard.replace('/', '-of-')}" if shard else ".lock"
     if not _taken(lock := FileLock(folder / own)):
         raise _in_use(folder, f"another process with shard {shard}" if shard else "another run")
@@ -149,11 +149,11 @@ def _enter(folder: Path, mine: Manifest, shard: str, stack: ExitStack) -> None:
     others = [path for path in (folder / ".lock", *folder.glob(".shard-*")) if path.name != own and _busy(path)]
     if others and (not shard or others[0].name == ".lock"):
         raise _in_use(folder, "another run")
-    if others and (fields := different(mine, read(folder))):
+    if others and (fields := different(entry, read(folder))):
         raise _in_use(folder, f"shards that differ in {', '.join(fields)}")
     for left in () if others else (*folder.glob(".*.part"), *folder.glob("*/.*.part")):  # of processes that were killed
         left.unlink()
-    mine.save(folder)
+    entry.save(folder)
 
 
 def _taken(lock: FileLock) -> bool:

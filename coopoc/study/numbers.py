@@ -145,10 +145,10 @@ def gaps(results: Results, first: Where, second: Where, value: str = "rt_le_m") 
         value: the metric.
     """
     each, base = per_seed(results, first, value), results.values(value, second)
-    found = {"over egos and runs": paired_difference(results.values(value, first), base)}
+    intervals = {"over egos and runs": paired_difference(results.values(value, first), base)}
     if len(each) > 1:
-        found[f"over {len(each)} training seeds"] = over_seeds(each - base)
-    return found
+        intervals[f"over {len(each)} training seeds"] = over_seeds(each - base)
+    return intervals
 
 
 def alike(results: Results, first: Where, second: Where, value: str) -> bool:
@@ -169,11 +169,11 @@ def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
         other: selection of another method, over the same egos and runs.
         name: of the other, for the sentence.
     """
-    found = gaps(results, trained, other)
-    ends = np.array([(gap.low, gap.high) for gap in found.values()])
+    intervals = gaps(results, trained, other)
+    ends = np.array([(gap.low, gap.high) for gap in intervals.values()])
     claim = "beats" if (ends < 0).all() else "is worse than" if (ends > 0).all() else "cannot be distinguished from"
     evidence = ", ".join(
-        f"{gap.mean:+.3f} m, 95 % [{gap.low:+.3f}, {gap.high:+.3f}] {over}" for over, gap in found.items()
+        f"{gap.mean:+.3f} m, 95 % [{gap.low:+.3f}, {gap.high:+.3f}] {over}" for over, gap in intervals.items()
     )
     one = " of one training seed, whose spread is unknown" * (len(_seeds(results, trained)) == 1)
     return f"{claim} {name} (paired difference {evidence}{one})"

@@ -132,12 +132,12 @@ class Reference:
         """Read what `save` wrote; InputError without such a file, or for a damaged one."""
         path, hint = given_path(path), "Write them with coopoc reference --write."
         fields = {"study": str, "settings": dict, "numbers": list}
-        given = store.content(path, fields, "holds no reference numbers", hint)
+        document = store.content(path, fields, "holds no reference numbers", hint)
         try:
-            numbers = tuple(Number(**{name: KINDS[name](each[name]) for name in KINDS}) for each in given["numbers"])
+            numbers = tuple(Number(**{name: KINDS[name](each[name]) for name in KINDS}) for each in document["numbers"])
         except (TypeError, KeyError, ValueError, OverflowError) as error:
             raise InputError("file", str(path), f"is damaged ({error})", hint) from None
-        return cls(given["study"], given["settings"], numbers)
+        return cls(document["study"], document["settings"], numbers)
 
 
 def measure(results: Results, metrics: Mapping[str, Direction]) -> Reference:
@@ -163,9 +163,9 @@ def measure(results: Results, metrics: Mapping[str, Direction]) -> Reference:
 
 def differing(results: Results, reference: Reference) -> list[str]:
     """Settings that must be equal for a comparison with the reference, and are not."""
-    mine = {name: plain(value) for name, value in results.settings.items()}
-    names = {*mine, *reference.settings} - set(FREE)
-    return sorted(name for name in names if mine.get(name) != reference.settings.get(name))
+    settings = {name: plain(value) for name, value in results.settings.items()}
+    names = {*settings, *reference.settings} - set(FREE)
+    return sorted(name for name in names if settings.get(name) != reference.settings.get(name))
 
 
 def check(results: Results, reference: Reference) -> list[Change]:

@@ -78,8 +78,8 @@ class Results:
             done += [table] if table is not None else []
             failed += [failure] if failure is not None else []
             pending += table is None and failure is None
-        given = manifest.study, manifest.question, tuple(manifest.axes), manifest.settings
-        return cls(*given, _joined(done), _joined(failed), pending, manifest.environment)
+        header = manifest.study, manifest.question, tuple(manifest.axes), manifest.settings
+        return cls(*header, _joined(done), _joined(failed), pending, manifest.environment)
 
     @property
     def failed(self) -> int:
@@ -173,7 +173,7 @@ def check_metric(frame: pd.DataFrame, value: str) -> None:
     """InputError unless `value` is a column of numbers."""
     if value not in frame:
         raise unknown("metric", value, frame.columns)
-    if len(given := frame[value].dropna()) and not pd.api.types.is_numeric_dtype(given):
+    if len(scores := frame[value].dropna()) and not pd.api.types.is_numeric_dtype(scores):
         raise InputError("metric", repr(value), "must be a column of numbers", "It holds text or lists.")
 
 

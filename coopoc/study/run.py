@@ -190,10 +190,10 @@ def _resolve(
     study: Study | str, out: str | Path, settings: Params | None, shard: str
 ) -> tuple[Study, list[Cell], list[Cell], Path]:
     """The study under its settings, all its cells, those of the shard, and its folder."""
-    found = find_study(study) if isinstance(study, str) else instance("study", study, Study)
+    resolved = find_study(study) if isinstance(study, str) else instance("study", study, Study)
     given_path(out)
-    given = named("settings", settings or {}, "Give settings={name: value}.")
-    changed = found.override({name: _as_path(name, value, out) for name, value in given.items()})
+    changes = named("settings", settings or {}, "Give settings={name: value}.")
+    changed = resolved.override({name: _as_path(name, value, out) for name, value in changes.items()})
     cells = changed.cells()
     return changed, cells, part_of(cells, changed.shares, shard) if shard else cells, Path(out) / changed.name
 

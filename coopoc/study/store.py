@@ -74,17 +74,19 @@ def content(path: Path, fields: Mapping[str, Any], absent: str, hint: str) -> di
         raise InputError("folder", str(path.parent), absent, hint)
     try:
         text = path.read_text()
-        given: Any = json.loads(text)
+        document: Any = json.loads(text)
         if "\\ud" in text.lower():
-            json.dumps(given, ensure_ascii=False).encode()  # half of a surrogate pair is no text: a ValueError
+            json.dumps(document, ensure_ascii=False).encode()  # half of a surrogate pair is no text: a ValueError
     except (ValueError, RecursionError) as error:
         raise damaged(path, str(error)) from None
-    if not isinstance(given, dict):
-        raise damaged(path, f"a {type(given).__name__} instead of fields")
+    if not isinstance(document, dict):
+        raise damaged(path, f"a {type(document).__name__} instead of fields")
     for name, kind in fields.items():
-        if not isinstance(given.get(name), kind):
-            raise damaged(path, f"{name} is a {type(given[name]).__name__}" if name in given else f"{name} is missing")
-    return given
+        if not isinstance(document.get(name), kind):
+            raise damaged(
+                path, f"{name} is a {type(document[name]).__name__}" if name in document else f"{name} is missing"
+            )
+    return document
 
 
 def damaged(path: Path, damage: str) -> InputError:

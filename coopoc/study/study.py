@@ -125,8 +125,8 @@ class Study:
         >>> Study("demo", "?", dict, {"x": (1,)}, findings=lambda results: {"a": "It does.", "b": ""}).answers(None)
         {'a': 'It does.'}
         """
-        given = self.findings(results) if self.findings else {}
-        return {key: text for key, text in given.items() if text}
+        by_name = self.findings(results) if self.findings else {}
+        return {key: text for key, text in by_name.items() if text}
 
     def override(self, changes: Params) -> Study:
         """The same study with other settings, or other values on an axis (a list, or words split at commas).
@@ -198,11 +198,11 @@ def _named(study: Study, params: Mapping[str, Scalar], code: Callable[[], str]) 
     for name, value in params.items():
         if not isinstance(value, Scalar):
             raise InputError(name, repr(value), "must be a number, a word, a bool or None", "Pass a name instead.")
-    given = {**study.settings, **params}
-    content = {"study": study.name, "given": given, "axes": sorted(params), "key": study.key(given)}
+    values = {**study.settings, **params}
+    content = {"study": study.name, "given": values, "axes": sorted(params), "key": study.key(values)}
     content["code"] = code()
-    content["files"] = {name: file_digest(v, name) for name, v in given.items() if isinstance(v, str) and in_file(v)}
-    return Cell(params, given, digest({**content, "coopoc": metadata.version("coopoc")}))
+    content["files"] = {name: file_digest(v, name) for name, v in values.items() if isinstance(v, str) and in_file(v)}
+    return Cell(params, values, digest({**content, "coopoc": metadata.version("coopoc")}))
 
 
 def points(study: Study) -> list[Mapping[str, Scalar]]:

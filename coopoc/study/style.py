@@ -78,9 +78,9 @@ def look(method: str) -> Look:
         shown, number = METHODS[family], name[len(family) :].strip("-")
         color = CLIENTS[(int(number) - 1) % len(CLIENTS)] if number.isdecimal() else shown.color
         return Look(f"{shown.label} {number}", color, shown.marker)
-    given, method = method, method.rpartition(".py:")[2]  # of a file: its name there
+    full_name, method = method, method.rpartition(".py:")[2]  # of a file: its name there
     row, column = divmod(zlib.crc32(method.encode()) % 25, len(_COLORS))
-    return Look(OWN.get(given, method.replace("_", " ")), _COLORS[column], "<>d8H"[row])
+    return Look(OWN.get(full_name, method.replace("_", " ")), _COLORS[column], "<>d8H"[row])
 
 
 def line(noise_model: object) -> Any:

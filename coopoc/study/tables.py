@@ -74,19 +74,19 @@ class Table:
                 raise InputError("rows", row, f"must have {len(self.header)} entries", f"Header: {self.header}.")
 
     @classmethod
-    def from_data(cls, given: Any) -> Table:
+    def from_data(cls, data: Any) -> Table:
         """The table whose `vars` were stored as JSON; InputError if it is none."""
         try:
-            rows = tuple(tuple(map(_entry, row)) for row in given["rows"])
-            texts: dict[str, Any] = {name: tuple(map(str, given[name])) for name in ("header", "unranked", "notes")}
+            rows = tuple(tuple(map(_entry, row)) for row in data["rows"])
+            texts: dict[str, Any] = {name: tuple(map(str, data[name])) for name in ("header", "unranked", "notes")}
             allowed = {"best": ("min", "max", None), "along": ("row", "column"), "decimals": range(20)}
-            if wrong := next((name for name, values in allowed.items() if given[name] not in values), ""):
+            if wrong := next((name for name, values in allowed.items() if data[name] not in values), ""):
                 raise ValueError(wrong)
-            shown: dict[str, Any] = {name: given[name] for name in allowed}
-            shown["alike"] = tuple((int(i), int(j)) for i, j in given.get("alike", ()))
-            return cls(rows=rows, caption=str(given["caption"]), intervals=bool(given["intervals"]), **texts, **shown)
+            shown: dict[str, Any] = {name: data[name] for name in allowed}
+            shown["alike"] = tuple((int(i), int(j)) for i, j in data.get("alike", ()))
+            return cls(rows=rows, caption=str(data["caption"]), intervals=bool(data["intervals"]), **texts, **shown)
         except (TypeError, KeyError, ValueError, OverflowError) as error:
-            raise InputError("table", type(given).__name__, f"is damaged ({error})", "Repeat coopoc run.") from None
+            raise InputError("table", type(data).__name__, f"is damaged ({error})", "Repeat coopoc run.") from None
 
     def render(self, form: str) -> str:
         """The table in one of FORMATS; InputError for another."""

@@ -31,9 +31,9 @@ def true_heading(fleet: Fleet) -> Floats:
     x, y = fleet.velocity[..., 0], fleet.velocity[..., 1]
     course = np.where(np.hypot(x, y) >= SLOWEST, np.arctan2(y, x), np.nan)
     for column in course.T:
-        known = np.flatnonzero(np.isfinite(column))
-        held = np.searchsorted(known, np.arange(len(column)), side="right") - 1
-        column[:] = np.unwrap(column[known])[np.maximum(held, 0)] if len(known) else 0.0
+        finite = np.flatnonzero(np.isfinite(column))
+        held = np.searchsorted(finite, np.arange(len(column)), side="right") - 1
+        column[:] = np.unwrap(column[finite])[np.maximum(held, 0)] if len(finite) else 0.0
     course[1:-1] = (course[1:-1] + course[2:]) / 2
     return np.where(fleet.present, course, np.nan)
 
@@ -86,8 +86,8 @@ def in_world(recording: Recording) -> Recording:
     needed[:, recording.links.step, recording.links.observer] = True
     if np.isnan(body.heading[needed]).any():
         _, step, column = np.argwhere(needed & np.isnan(body.heading))[0]
-        given = f"none of {recording.ids[column]} at step {step}"
-        raise InputError("heading", given, "must be there to turn a recording", "Take a pose filter.")
+        actual = f"none of {recording.ids[column]} at step {step}"
+        raise InputError("heading", actual, "must be there to turn a recording", "Take a pose filter.")
     relative, links = recording.relative.copy(), recording.links
     relative[..., 1] = wrap(relative[..., 1] + body.heading[:, links.step, links.observer])
     velocity = turned(recording.velocity, np.nan_to_num(midway(body.heading)))
@@ -130,9 +130,9 @@ def in_body(relative: Floats, fleet: Fleet, links: Links, turned: Floats) -> Flo
         links: L of them.
         turned: (R, L) rad, these errors, which a bearing does not have.
     """
-    found = relative.copy()
-    found[..., 1] = wrap(found[..., 1] - turned - true_heading(fleet)[links.step, links.observer])
-    return found
+    turned_back = relative.copy()
+    turned_back[..., 1] = wrap(turned_back[..., 1] - turned - true_heading(fleet)[links.step, links.observer])
+    return turned_back
 
 
 def _normals(fleet: Fleet, sensor: str, at: tuple[int, int], *size: int) -> Floats:

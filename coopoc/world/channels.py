@@ -56,9 +56,9 @@ def channel(name: str, max_neighbours: int = 6) -> V2X:
     >>> channel("bsm", 4).rate
     10.0
     """
-    found = find("coopoc.channels", name)(max_neighbours)
-    if not isinstance(found, V2X):
+    result = find("coopoc.channels", name)(max_neighbours)
+    if not isinstance(result, V2X):
         raise InputError(
-            "channel", name, f"returned {type(found).__name__}, no V2X", "Return V2X(max_neighbours, ...)."
+            "channel", name, f"returned {type(result).__name__}, no V2X", "Return V2X(max_neighbours, ...)."
         )
-    return found
+    return result

@@ -54,21 +54,23 @@ def episodes(fault: Fault, key: tuple[int, str, int, str, str], steps: int, dt: 
     return Episodes(held[:, 1] < fault.rate, low + (high - low) * share, held[:, 3:])
 
 
-def wrong_fixes(gnss: Floats, fleet: Fleet, outliers: Outliers, seed: int, told: bool) -> None:
-    """Displace and remove fixes (R, T, N, 3) in place; `told` removes the displaced ones, too."""
+def wrong_fixes(gnss: Floats, fleet: Fleet, outliers: Outliers, seed: int, remove_outliers: bool) -> None:
+    """Displace and remove fixes (R, T, N, 3) in place; `remove_outliers` removes the displaced ones, too."""
     for r, column, jump in _of_vehicles("fixes", outliers.fixes, fleet, len(gnss), seed):
         up, around = 2.0 * jump.turn[:, 0] - 1.0, 2.0 * np.pi * jump.turn[:, 1]
         flat = np.sqrt(1.0 - up**2)
         error = jump.size[:, None] * np.stack([flat * np.cos(around), flat * np.sin(around), up], axis=-1)
-        gnss[r, jump.wrong, column] += np.nan if told else error[jump.wrong]
+        gnss[r, jump.wrong, column] += np.nan if remove_outliers else error[jump.wrong]
     for r, column, gap in _of_vehicles("outages", outliers.outages, fleet, len(gnss), seed):
         gnss[r, gap.wrong, column] = np.nan
 
 
-def wrong_odometry(velocity: Floats, motion: Floats, fleet: Fleet, outliers: Outliers, seed: int, told: bool) -> None:
-    """Add slip to velocities (R, T, N, 3) in place, a share of the true motion (T, N, 3); none where it is `told`."""
+def wrong_odometry(
+    velocity: Floats, motion: Floats, fleet: Fleet, outliers: Outliers, seed: int, remove_outliers: bool
+) -> None:
+    """Add slip to velocities (R, T, N, 3) in place, a share of the true motion (T, N, 3), unless `remove_outliers`."""
     for r, column, slip in _of_vehicles("odometry", outliers.odometry, fleet, len(velocity), seed):
-        if not told:
+        if not remove_outliers:
             share = np.where(slip.turn[:, 0] < 0.5, slip.size, -np.minimum(slip.size, 1.0))
             velocity[r, :, column] += np.where(slip.wrong, share, 0.0)[:, None] * motion[:, column]
 
@@ -77,9 +79,9 @@ def _of_vehicles(kind: str, fault: Fault, fleet: Fleet, runs: int, seed: int) ->
     """Run, column and episodes of each vehicle, which never begin before its second step."""
     for r in range(runs if fault.rate else 0):
         for column, name in enumerate(fleet.ids):
-            found = episodes(fault, (seed, f"outlier {kind}", r, name, ""), len(fleet.t), fleet.dt)
-            found.wrong[: int(np.argmax(fleet.present[:, column])) + 1] = False
-            yield r, column, found
+            faulty = episodes(fault, (seed, f"outlier {kind}", r, name, ""), len(fleet.t), fleet.dt)
+            faulty.wrong[: int(np.argmax(fleet.present[:, column])) + 1] = False
+            yield r, column, faulty
 
 
 def wrong_relative(
@@ -90,9 +92,10 @@ def wrong_relative(
     outliers: Outliers,
     reach: tuple[float, float],
     seed: int,
-    told: bool,
+    remove_outliers: bool,
 ) -> None:
-    """Lengthen ranges and mistake angles of measurements (R, L, 3) in place; `told` removes these components.
+    """Lengthen ranges and mistake angles of measurements (R, L, 3) in place; `remove_outliers` removes these
+    components.
 
     Args:
         relative: m, rad, rad.
@@ -102,7 +105,7 @@ def wrong_relative(
         outliers: what goes wrong.
         reach: (min_range, radius) m, within which a vehicle may be mistaken for another.
         seed: of all draws.
-        told: whether NaN takes the place of what is wrong.
+        remove_outliers: whether NaN takes the place of what is wrong.
     """
     steps, dt = len(fleet.t), fleet.dt
     for r in range(len(relative) if outliers.ranges.rate else 0):
@@ -110,20 +113,20 @@ def wrong_relative(
             one, other = sorted((observer, neighbour))
             late = episodes(outliers.ranges, (seed, "outlier ranges", r, one, other), steps, dt)
             hit = late.wrong[step]
-            relative[r, index[hit], 0] += np.nan if told else late.size[step[hit]]
+            relative[r, index[hit], 0] += np.nan if remove_outliers else late.size[step[hit]]
     if not outliers.angles.rate:
         return
     mistaken = np.zeros(relative.shape[:2], dtype=bool)
     for r in range(len(relative)):
         for observer, neighbour, index, step in pairs:
-            found = episodes(outliers.angles, (seed, "outlier angles", r, observer, neighbour), steps, dt)
-            mistaken[r, index] = found.wrong[step]
+            faulty = episodes(outliers.angles, (seed, "outlier angles", r, observer, neighbour), steps, dt)
+            mistaken[r, index] = faulty.wrong[step]
     (at,) = np.nonzero(mistaken.any(axis=0))
     error, mistakable = mistaken_angles(fleet, links, at, reach)
-    run, place = np.nonzero(mistaken[:, at] & mistakable)
-    wrong = run, at[place]
-    relative[(*wrong, 1)] = wrap(relative[(*wrong, 1)] + (np.nan if told else error[place, 0]))
-    relative[(*wrong, 2)] += np.nan if told else error[place, 1]
+    run, row = np.nonzero(mistaken[:, at] & mistakable)
+    wrong = run, at[row]
+    relative[(*wrong, 1)] = wrap(relative[(*wrong, 1)] + (np.nan if remove_outliers else error[row, 0]))
+    relative[(*wrong, 2)] += np.nan if remove_outliers else error[row, 1]
 
 
 def mistaken_angles(fleet: Fleet, links: Links, at: Ints, reach: tuple[float, float]) -> tuple[Floats, Bools]:
@@ -136,7 +139,7 @@ def mistaken_angles(fleet: Fleet, links: Links, at: Ints, reach: tuple[float, fl
         at: M indices of links.
         reach: (min_range, radius) m.
     """
-    error, seen = np.zeros((len(at), 2)), np.zeros(len(at), dtype=bool)
+    error, done = np.zeros((len(at), 2)), np.zeros(len(at), dtype=bool)
     at_once = max(1, PAIRS // len(fleet.ids))
     for first in range(0, len(at), at_once):
         part = slice(first, first + at_once)
@@ -148,7 +151,7 @@ def mistaken_angles(fleet: Fleet, links: Links, at: Ints, reach: tuple[float, fl
         gap[~((away >= reach[0]) & (away <= reach[1]))] = np.inf  # of absent vehicles, too
         gap[rows, neighbour] = gap[rows, observer] = np.inf
         other = np.argmin(gap, axis=1)
-        seen[part] = np.isfinite(gap[rows, other])
+        done[part] = np.isfinite(gap[rows, other])
         angles = (np.stack(spherical(*(to - own).T)[1:], axis=-1) for to in (everyone[rows, other], right))
-        error[part] = np.where(seen[part, None], next(angles) - next(angles), 0.0)
-    return error, seen
+        error[part] = np.where(done[part, None], next(angles) - next(angles), 0.0)
+    return error, done

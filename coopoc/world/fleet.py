@@ -165,19 +165,19 @@ def names(ids: Iterable[object]) -> tuple[str, ...]:
     ('7', 'b')
     """
     hint = 'Give a tuple such as ("a", "b").'
-    given = listed("ids", ids, hint)
-    if isinstance(ids, set) or not all(isinstance(i, str | int | np.integer) for i in given):
+    listed_ids = listed("ids", ids, hint)
+    if isinstance(ids, set) or not all(isinstance(i, str | int | np.integer) for i in listed_ids):
         raise InputError("ids", shown(ids), "must be a sequence of names or whole numbers", hint)
-    found = tuple(str(i) for i in given)
-    if not found:
+    texts = tuple(str(i) for i in listed_ids)
+    if not texts:
         raise InputError("ids", "no vehicle", "must be at least one", "Check that the file holds a drive.")
-    for name in found:
+    for name in texts:
         if not name.isprintable():
             raise InputError("ids", shown(name), "must be printable", "Remove line ends and control characters.")
-    if len(set(found)) != len(found):
-        twice = sorted(i for i, count in Counter(found).items() if count > 1)
+    if len(set(texts)) != len(texts):
+        twice = sorted(i for i, count in Counter(texts).items() if count > 1)
         raise InputError("ids", twice[:3], "must be unique", "Rename the vehicles that share an id.")
-    return found
+    return texts
 
 
 def column(field: str, vehicle: object, ids: Sequence[str]) -> int:
@@ -191,9 +191,9 @@ def column(field: str, vehicle: object, ids: Sequence[str]) -> int:
             return ids.index(vehicle)
         raise unknown(field, vehicle, ids)
     if isinstance(vehicle, int | np.integer) and not isinstance(vehicle, bool | np.timedelta64):
-        place = int(vehicle)
-        if 0 <= place < len(ids):
-            return place
+        index = int(vehicle)
+        if 0 <= index < len(ids):
+            return index
     raise InputError(field, shown(vehicle), f"must be an index in 0..{len(ids) - 1} or an id", "List them with .ids.")
 
 
@@ -203,8 +203,8 @@ def columns(field: str, vehicles: Iterable[object], ids: Sequence[str]) -> list[
     >>> columns("egos", ["b", 0], ("a", "b"))
     [1, 0]
     """
-    given = listed(field, vehicles, "Give a list of indices or ids.")
-    return [column(field, vehicle, ids) for vehicle in given]
+    chosen = listed(field, vehicles, "Give a list of indices or ids.")
+    return [column(field, vehicle, ids) for vehicle in chosen]
 
 
 def clock(t: npt.ArrayLike) -> Floats:

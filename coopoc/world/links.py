@@ -107,11 +107,11 @@ STEEP = 0.2
 """rad from the vertical within which errors of the positions turn an azimuth as they like."""
 
 
-def told(relative: Floats) -> Floats:
+def drop_steep_azimuths(relative: Floats) -> Floats:
     """Measurements (..., 3) without the azimuths (NaN) of what is straight above or below: their variance grows without
     bound as the horizontal distance vanishes.
 
-    >>> told(np.array([9.0, 0.5, 0.1])).tolist()
+    >>> drop_steep_azimuths(np.array([9.0, 0.5, 0.1])).tolist()
     [9.0, nan, 0.1]
     """
     steep = np.abs(np.abs(relative[..., 2:]) - np.pi / 2) > np.pi / 2 - STEEP

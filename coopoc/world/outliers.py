@@ -101,22 +101,22 @@ class Outliers:
         ...
         coopoc.errors.InputError: outliers = 'ranges': must be one of ... Did you mean ranges=RATE?
         """
-        found, kinds = cls(), [field.name for field in fields(cls)]
+        outliers, kinds = cls(), [field.name for field in fields(cls)]
         for part in filter(None, instance("outliers", text, str).split("+")):
             name, _, numbers = part.partition("=")
             if name in PRESETS and not numbers:
                 preset = PRESETS[name]()
-                found = replace(found, **{k: getattr(preset, k) for k in kinds if getattr(preset, k).rate})
+                outliers = replace(outliers, **{k: getattr(preset, k) for k in kinds if getattr(preset, k).rate})
             elif name in kinds and numbers:
                 try:
-                    given = dict(zip(("rate", "lasts"), map(float, numbers.split(":", 1)), strict=False))
+                    changes = dict(zip(("rate", "lasts"), map(float, numbers.split(":", 1)), strict=False))
                 except ValueError:
                     hint = f"{name}=0.05 makes one in twenty wrong, {name}=0.05:2 for 2 s."
                     raise InputError(name, repr(numbers), "must be RATE or RATE:SECONDS", hint) from None
-                found = replace(found, **{name: replace(getattr(found, name), **given)})
+                outliers = replace(outliers, **{name: replace(getattr(outliers, name), **changes)})
             else:
                 raise unknown("outliers", part, [*PRESETS, *(f"{kind}=RATE" for kind in kinds)])
-        return found
+        return outliers
 
     @property
     def notes(self) -> tuple[str, ...]:

@@ -13,7 +13,7 @@ from ..arrays import Bools, Floats, Ints, checked, instance, listed, number, ref
 from ..errors import InputError, shown
 from ..short_repr import short_repr
 from .fleet import clock, columns, interval, names
-from .links import Links, stretches, told
+from .links import Links, drop_steep_azimuths, stretches
 from .plausible import FARTHEST, FASTEST, FASTEST_TURN, headings, plausible, radians
 from .sensors import Sensors
 from .v2x import V2X
@@ -114,8 +114,8 @@ class Recording:
     def __post_init__(self) -> None:
         for name, kind in (("links", Links), ("sensors", Sensors), ("v2x", V2X)):
             if not isinstance(getattr(self, name), kind):
-                given, allowed = shown(getattr(self, name)), f"must be {kind.__name__}"
-                raise InputError(name, given, allowed, f"Give {kind.__name__}(...).")
+                actual, allowed = shown(getattr(self, name)), f"must be {kind.__name__}"
+                raise InputError(name, actual, allowed, f"Give {kind.__name__}(...).")
         ids, t, links = names(self.ids), clock(self.t), len(self.links)
         gnss = checked("gnss", self.gnss, "(R, T, N, 3)", (-1, len(t), len(ids), 3))
         shapes: dict[str, tuple[str, tuple[int, ...], Any]] = {
@@ -220,9 +220,9 @@ class Recording:
         return tuple((a, b) for a, b in firsts if b - a >= shortest)
 
     @cached_property
-    def told(self) -> Floats:
+    def usable_relative(self) -> Floats:
         """(R, L, 3) `relative` without azimuths of what is straight above or below, as estimators take it."""
-        return told(self.relative)
+        return drop_steep_azimuths(self.relative)
 
     @cached_property
     def complete(self) -> bool:
@@ -254,11 +254,11 @@ class Recording:
         """Columns of the egos; InputError if one is unknown, no observer of this recording, absent at times, or without
         a first fix. Later ones may be missing (NaN)."""
         cols = self.observing(egos)
-        moves, seen = (np.isfinite(values.take(cols, axis=2)) for values in (self.velocity, self.gnss[:, :1]))
-        if moves.all() and seen.all():
+        moves, has_fix = (np.isfinite(values.take(cols, axis=2)) for values in (self.velocity, self.gnss[:, :1]))
+        if moves.all() and has_fix.all():
             return cols
         there: Bools = np.asarray(moves.all(axis=(0, 1, 3)))
-        fixed: Bools = np.asarray(seen.all(axis=(0, 1, 3)))
+        fixed: Bools = np.asarray(has_fix.all(axis=(0, 1, 3)))
         for ego, present, fix in zip(egos, there, fixed, strict=True):
             if not present:
                 hint = (
@@ -286,15 +286,15 @@ def check_recording(value: Any, body: bool = False) -> Recording:
     Raises:
         InputError: anything else.
     """
-    found = instance("recording", value, Recording, "co.observe(fleet, sensors) makes one of a fleet.")
-    if (found.body is None) == body:
+    recording = instance("recording", value, Recording, "co.observe(fleet, sensors) makes one of a fleet.")
+    if (recording.body is None) == body:
         hints = (
             "Take a pose filter, or co.in_world(recording) where there is a compass.",
             'observe(..., frame="body"), read_log(..., frame="body").',
         )
         frames = ("the world frame", "body frames")
         raise InputError("recording", f"in {frames[not body]}", f"must be in {frames[body]} here", hints[body])
-    return found
+    return recording
 
 
 def check_measurements(gnss: Floats, velocity: Floats, relative: Floats) -> None:
@@ -331,10 +331,10 @@ def check_landmarks(landmarks: tuple[int, ...], gnss: Floats, velocity: Floats) 
         gnss: (R, T, N, 3) m.
         velocity: (R, T, N, 3) m/s.
     """
-    mine = list(landmarks)
-    place, moves = gnss[:, :, mine], velocity[:, :, mine]
+    own = list(landmarks)
+    positions, moves = gnss[:, :, own], velocity[:, :, own]
     allowed, hint = "must be one position throughout, with a velocity of 0", "A vehicle is no landmark."
-    refuse("landmarks", place, ~(place == place[:1, :1]) | (moves != 0), allowed, hint)
+    refuse("landmarks", positions, ~(positions == positions[:1, :1]) | (moves != 0), allowed, hint)
 
 
 def check_links(
@@ -376,16 +376,16 @@ def check_links(
 def unlikely(recording: Recording) -> tuple[str, ...]:
     """Notes on a recording whose settings or measurements are rather in other units, or contradict each other."""
     sensors, v2x = recording.sensors, recording.v2x
-    found = [
+    sentences = [
         f"{name} is {std:.3g} rad, which is {np.rad2deg(std):.0f}°"
         for name in ("azimuth_std", "inclination_std", "heading_std", "heading_bias_std", "yaw_rate_std")
         if (std := getattr(sensors, name)) > WIDE
     ]
     if v2x.latency > v2x.max_age and len(recording.links):
-        found.append(f"no message is used: latency is {v2x.latency:g} s, max_age {v2x.max_age:g} s")
+        sentences.append(f"no message is used: latency is {v2x.latency:g} s, max_age {v2x.max_age:g} s")
     if sensors.velocity_reading != "fixes" and (share := _contradicting(recording)):
-        found.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive: {UNITS}")
-    return tuple(UNLIKELY + text for text in found)
+        sentences.append(f"fixes and odometry contradict each other in {100 * share:.0f} % of the drive: {UNITS}")
+    return tuple(UNLIKELY + text for text in sentences)
 
 
 def _contradicting(recording: Recording) -> float:

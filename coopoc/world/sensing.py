@@ -35,7 +35,7 @@ def observe(
     assumed: Sensors | None = None,
     frame: Frame = "world",
     landmarks: Vehicles = (),
-    told: bool = False,
+    remove_outliers: bool = False,
 ) -> Recording:
     """Measurements of a drive in `runs` noise realisations.
 
@@ -55,8 +55,8 @@ def observe(
         frame: "world" for velocities and azimuths in the world; "body" for forward, left and up, azimuths from the
             observer's heading, yaw rates, and headings by a compass if `sensors.compass`.
         landmarks: vehicles that stand at known positions: all within the radius are measured, and none sends.
-        told: whether outliers are removed, as for an estimator which is told of them: a wrong fix, range or angle is
-            missing (NaN), and odometry has no slip.
+        remove_outliers: as for an estimator which knows them: a wrong fix, range or angle is missing (NaN), and
+            odometry has no slip.
 
     Raises:
         InputError: runs < 1, seed < 0, a rate above 1/dt, an unknown observer, an assumed std of zero, another frame,
@@ -79,15 +79,15 @@ def observe(
     broadcasts, arrival = schedule(fleet.ids, fleet.t, links, v2x, runs, seed)
     arrival[:, np.isin(links.neighbour, standing)] = -1
     broadcasts[:, standing] = False
-    instance("told", told, bool, "Give True to remove outliers.")
-    drawn, key = (fleet, sensors, runs, seed, told), (fleet, repr(sensors), runs, seed, told)
+    instance("remove_outliers", remove_outliers, bool, "Give True to remove outliers.")
+    drawn, key = (fleet, sensors, runs, seed, remove_outliers), (fleet, repr(sensors), runs, seed, remove_outliers)
     gnss = _once(("gnss", *key), lambda: _gnss(*drawn))
     if standing:
         gnss = gnss.copy()
         gnss[:, :, standing] = fleet.position[:, standing]
     who = (watching, tuple(standing), v2x.radius, v2x.max_neighbours)
     relative = _once(
-        ("relative", *key, who), lambda: _relative_measurements(fleet, links, sensors, v2x, runs, seed, told)
+        ("relative", *key, who), lambda: _relative_measurements(fleet, links, sensors, v2x, runs, seed, remove_outliers)
     )
     body = None
     if frame == "world":
@@ -95,10 +95,10 @@ def observe(
     else:
         velocity, body = body_measurements(fleet, sensors, runs, seed)
         if sensors.outliers:
-            wrong_odometry(velocity, body_motion(fleet)[0], fleet, sensors.outliers, seed, told)
+            wrong_odometry(velocity, body_motion(fleet)[0], fleet, sensors.outliers, seed, remove_outliers)
         relative = in_body(relative, fleet, links, _own_errors(fleet, links, sensors, runs, seed, *HEADING))
     wrong = sensors.outliers.notes if sensors.outliers else ()
-    notes = tuple(f"{note}{', removed' * told}" for note in wrong)
+    notes = tuple(f"{note}{', removed' * remove_outliers}" for note in wrong)
     return Recording(
         ids=fleet.ids,
         t=fleet.t,
@@ -135,24 +135,24 @@ def find_links(
         min_range: m.
         landmarks: columns of members that are linked beside the K, and observe nothing.
     """
-    found = [np.empty((0, 3), dtype=np.int64)]
+    links = [np.empty((0, 3), dtype=np.int64)]
     vehicles, columns = len(fleet.ids), np.array(list(observers), dtype=np.int64)
     columns, marks = np.setdiff1d(columns, landmarks), np.isin(np.arange(vehicles), landmarks)
     at_once = max(1, PAIRS // (vehicles * max(1, len(columns))))
     for first in range(0, len(fleet.t), at_once) if (v2x.max_neighbours or marks.any()) and len(columns) else ():
         position = fleet.position[first : first + at_once]
-        place, other = _near(position, columns, v2x.radius)
-        gap = np.linalg.norm(position.reshape(-1, 3)[other] - position.reshape(-1, 3)[place], axis=1)
-        fits = (gap <= v2x.radius) & (gap >= min_range) & (place != other)
-        place, other, gap = place[fits], other[fits], gap[fits]
-        order = np.lexsort((other, gap, place))
-        place, other = place[order], other[order]
+        observer, other = _near(position, columns, v2x.radius)
+        gap = np.linalg.norm(position.reshape(-1, 3)[other] - position.reshape(-1, 3)[observer], axis=1)
+        fits = (gap <= v2x.radius) & (gap >= min_range) & (observer != other)
+        observer, other, gap = observer[fits], other[fits], gap[fits]
+        order = np.lexsort((other, gap, observer))
+        observer, other = observer[order], other[order]
         passed = np.append(0, np.cumsum(~marks[other % vehicles]))  # vehicles before each
-        rank = passed[:-1] - passed[np.searchsorted(place, place)]
+        rank = passed[:-1] - passed[np.searchsorted(observer, observer)]
         kept = (rank < v2x.max_neighbours) | marks[other % vehicles]
-        place, other = place[kept], other[kept]
-        found.append(np.column_stack([place // vehicles + first, place % vehicles, other % vehicles]))
-    rows = np.concatenate(found)
+        observer, other = observer[kept], other[kept]
+        links.append(np.column_stack([observer // vehicles + first, observer % vehicles, other % vehicles]))
+    rows = np.concatenate(links)
     return Links(rows[:, 0], rows[:, 1], rows[:, 2])
 
 
@@ -168,10 +168,10 @@ def _near(position: Floats, columns: Ints, radius: float) -> tuple[Ints, Ints]:
 
     vehicles = position.shape[1]
     here = np.flatnonzero(np.isfinite(position[..., 0]))
-    place = position.reshape(-1, 3)[here]
-    span = float(np.ptp(place, axis=0).max()) if len(place) else 0.0
+    positions = position.reshape(-1, 3)[here]
+    span = float(np.ptp(positions, axis=0).max()) if len(positions) else 0.0
     reach = 1.001 * min(radius, 2.0 * span) + 1e-9
-    tagged = np.column_stack([place, 4.0 * reach * (here // vehicles)])  # those of other steps are far away
+    tagged = np.column_stack([positions, 4.0 * reach * (here // vehicles)])  # those of other steps are far away
     looks = np.isin(here % vehicles, columns)
     observers, everyone = (KDTree(each, 32, False, balanced_tree=False) for each in (tagged[looks], tagged))
     pairs = observers.sparse_distance_matrix(everyone, reach, output_type="ndarray")
@@ -180,28 +180,28 @@ def _near(position: Floats, columns: Ints, radius: float) -> tuple[Ints, Ints]:
 
 def _once(key: tuple[Any, ...], draw: Callable[[], AnyArray]) -> AnyArray:
     """The draws of a key, shared while a recording holds them, else drawn now; read-only."""
-    found = _alive.get(key)
-    if found is None:
-        found = draw()
-        found.flags.writeable = False
-        _alive[key] = found
-    return found
+    value = _alive.get(key)
+    if value is None:
+        value = draw()
+        value.flags.writeable = False
+        _alive[key] = value
+    return value
 
 
 def _noisy(fleet: Fleet, sensor: str, runs: int, seed: int, mean: Floats, std: Floats) -> Floats:
     """(R, T, N, 3): mean (T, N, 3) and std, broadcastable to it, times standard normals, one stream per vehicle."""
     centre, scale = (np.ascontiguousarray(np.broadcast_to(a, mean.shape).swapaxes(0, 1)) for a in (mean, std))
-    found, drawn = np.empty((runs, *mean.shape)), np.empty_like(centre)
+    noisy, drawn = np.empty((runs, *mean.shape)), np.empty_like(centre)
     for r in range(runs):  # one after the other stays in the cache
         for name, normals in zip(fleet.ids, drawn, strict=True):
             stream(seed, sensor, r, name).standard_normal(out=normals)
         drawn *= scale
         drawn += centre
-        found[r] = drawn.swapaxes(0, 1)
-    return found
+        noisy[r] = drawn.swapaxes(0, 1)
+    return noisy
 
 
-def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int, told: bool) -> Floats:
+def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int, remove_outliers: bool) -> Floats:
     fixes = _noisy(fleet, "gnss", runs, seed, fleet.position, np.array(sensors.gnss_std))
     low, high = sensors.gnss_bias
     steps = len(fleet.t) if sensors.gnss_bias_mode == "sample" else 1
@@ -214,14 +214,14 @@ def _gnss(fleet: Fleet, sensors: Sensors, runs: int, seed: int, told: bool) -> F
                 draws = [stream(seed, "gnss_drift", r, name).standard_normal((len(fleet.t), 3)) for name in names]
                 fixes[r] += std * gauss_markov(np.stack(draws, axis=1), fleet.dt / sensors.gnss_drift_time)
     if sensors.outliers:
-        wrong_fixes(fixes, fleet, sensors.outliers, seed, told)
+        wrong_fixes(fixes, fleet, sensors.outliers, seed, remove_outliers)
     return fixes
 
 
-def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int, told: bool) -> Floats:
+def _velocity(fleet: Fleet, sensors: Sensors, runs: int, seed: int, remove_outliers: bool) -> Floats:
     velocity = _noisy(fleet, "velocity", runs, seed, fleet.velocity, sensors.velocity_std(fleet.velocity))
     if sensors.outliers:
-        wrong_odometry(velocity, fleet.velocity, fleet, sensors.outliers, seed, told)
+        wrong_odometry(velocity, fleet.velocity, fleet, sensors.outliers, seed, remove_outliers)
     return velocity
 
 
@@ -234,7 +234,7 @@ def _pairs(ids: Sequence[str], links: Links) -> list[tuple[str, str, Ints]]:
 
 
 def _relative_measurements(
-    fleet: Fleet, links: Links, sensors: Sensors, v2x: V2X, runs: int, seed: int, told: bool
+    fleet: Fleet, links: Links, sensors: Sensors, v2x: V2X, runs: int, seed: int, remove_outliers: bool
 ) -> Floats:
     """(R, L, 3): the step's own draw of the pair's stream, so a link that comes and goes keeps its draws."""
     vector = fleet.position[links.step, links.neighbour] - fleet.position[links.step, links.observer]
@@ -254,7 +254,7 @@ def _relative_measurements(
         relative[r, :, 1] = wrap(relative[r, :, 1] + turned[r])
     if sensors.outliers:
         reach = sensors.min_range, v2x.radius
-        wrong_relative(relative, pairs, fleet, links, sensors.outliers, reach, seed, told)
+        wrong_relative(relative, pairs, fleet, links, sensors.outliers, reach, seed, remove_outliers)
     return relative
 
 
@@ -268,10 +268,10 @@ def _own_errors(fleet: Fleet, links: Links, sensors: Sensors, runs: int, seed: i
     for kind in kinds:
         std = getattr(sensors, f"{kind}_std")
         for column in np.unique(links.observer) if std > 0 else ():
-            mine = links.of(column)
+            own_links = links.of(column)
             for r in range(runs):
                 normals = stream(seed, kind, r, fleet.ids[column]).standard_normal(len(fleet.t))
-                turned[r, mine] += std * normals[links.step[mine] * (kind == "heading")]
+                turned[r, own_links] += std * normals[links.step[own_links] * (kind == "heading")]
     return turned
 
 

@@ -89,10 +89,10 @@ class Sensors:
         }
         check_fields(self, limits, gnss_bias_mode=BiasMode, velocity_reading=VelocityReading, outliers=Outliers)
         hint = "Give metres in a tuple."
-        given = listed("gnss_std", self.gnss_std, hint, "must be 3 numbers")
-        if len(given) != 3:
+        stds = listed("gnss_std", self.gnss_std, hint, "must be 3 numbers")
+        if len(stds) != 3:
             raise InputError("gnss_std", self.gnss_std, "must be 3 numbers", hint)
-        self.__dict__["gnss_std"] = tuple(number("gnss_std", std, hint=hint) for std in given)
+        self.__dict__["gnss_std"] = tuple(number("gnss_std", std, hint=hint) for std in stds)
         self.__dict__["gnss_bias"] = extent("gnss_bias", self.gnss_bias, hint)
 
     @property

@@ -65,7 +65,7 @@ def spoofed(
     seed: int = 0,
     honest: Vehicles = (),
     *,
-    told: bool = False,
+    remove_outliers: bool = False,
 ) -> Recording:
     """The recording with the fixes of spoofed vehicles displaced, gnss' = gnss + o.
 
@@ -78,7 +78,7 @@ def spoofed(
         attack: or its share alone.
         seed: of the attack.
         honest: columns or ids of egos that are never spoofed.
-        told: whether false fixes are missing (NaN) instead, as for an estimator which is told of the attack.
+        remove_outliers: whether false fixes are missing (NaN) instead, as for an estimator which is told of the attack.
 
     Raises:
         InputError: a share outside [0, 1], seed < 0, an honest vehicle that is none of the recording.
@@ -92,7 +92,7 @@ def spoofed(
     """
     attack = attack if isinstance(attack, Spoofing) else Spoofing(attack)
     seed = seed_of(seed)
-    instance("told", told, bool, "Give True to remove false fixes.")
+    instance("remove_outliers", remove_outliers, bool, "Give True to remove false fixes.")
     spared = columns("honest", honest, recording.ids)
     offset = np.zeros((recording.runs, len(recording.ids), 3))
     for run in range(recording.runs):
@@ -102,8 +102,8 @@ def spoofed(
             if draws.uniform() < attack.share and column not in spared:
                 offset[run, column] = common if attack.collude else _offset(draws, attack)
     error = attack.size(recording.t)[:, None, None] * offset[:, None]
-    gnss = np.where(error != 0, np.nan, recording.gnss) if told else recording.gnss + error
-    note = attack.note + ", removed" * told
+    gnss = np.where(error != 0, np.nan, recording.gnss) if remove_outliers else recording.gnss + error
+    note = attack.note + ", removed" * remove_outliers
     return replace(recording, gnss=gnss, notes=(*recording.notes, note))
 
 

@@ -104,8 +104,8 @@ def read_recording(path: str | Path) -> tuple[Recording, Fleet | None]:
         arrays = unpacked(path)
         return _recording(json.loads(str(arrays.pop(WORDS))), arrays)
     except Exception as error:  # of zipfile, zlib and NumPy: a damaged file meets them all
-        found = said(error)
-    raise InputError(path.name, found, "must be a recording in .npz", "Write it again with save_recording.")
+        cause = said(error)
+    raise InputError(path.name, cause, "must be a recording in .npz", "Write it again with save_recording.")
 
 
 def digest(recording: Recording) -> str:

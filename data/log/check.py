@@ -148,9 +148,9 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
 
 def _with_error(name: str, found: Estimate, k: int) -> dict[str, float | None]:
     """Two columns of a table: an estimate and its standard error."""
-    known = bool(np.isfinite(found.error[k]))
+    finite = bool(np.isfinite(found.error[k]))
     return (
-        dict(zip((name, f"{name}_error"), map(float, (found.value[k], found.error[k])), strict=True)) if known else {}
+        dict(zip((name, f"{name}_error"), map(float, (found.value[k], found.error[k])), strict=True)) if finite else {}
     )
 
 
@@ -333,10 +333,10 @@ def _of_fixes(c: Check) -> list[str]:
     rec, truth, sentences = c.world, c.log.truth, []
     off, made = causes(c)
     for column, name in enumerate(rec.ids):
-        known = np.isfinite(off[:, column] + made[:, :, column].sum(axis=0))
-        every_one = np.zeros(known.sum(), int)
+        finite = np.isfinite(off[:, column] + made[:, :, column].sum(axis=0))
+        every_one = np.zeros(finite.sum(), int)
         for share in ([1, 1, 1], [0, 0, 1]):  # without an arm that is sure a clock may explain it all
-            factor, std = factors(off[known, column], made[:, known, column].T * share, every_one)
+            factor, std = factors(off[finite, column], made[:, finite, column].T * share, every_one)
             sure = np.abs(factor) > SIGMAS * std
             if (sure & (np.abs(factor) > ARM))[:2].any():
                 sentences.append(
@@ -418,11 +418,11 @@ def _of_measurements(c: Check) -> list[str]:
             sentences.append(f"{word}s miss the positions by {stated}. {hint}")
         if pairs and (not wrong or hint == HINTS["range"]):
             shown = ", ".join(f"{pair} by {offset:+.3g} +- {error:.2g} {unit}" for pair, offset, error in pairs)
-            given = ",".join(f"{pair.replace(' and ', '-')}:{offset:.3g}" for pair, offset, _ in pairs)
+            offsets_text = ",".join(f"{pair.replace(' and ', '-')}:{offset:.3g}" for pair, offset, _ in pairs)
             sentences.append(
                 f"{word}s of {shown} are off in the median, with {row['stated_std']:.3g} {unit} stated: an "
                 "offset of the sensors, of antennas, or of fixes or heights of one of the two; "
-                + (f"offset={given} takes it off." if word == "range" else "offset= takes it off.")
+                + (f"offset={offsets_text} takes it off." if word == "range" else "offset= takes it off.")
             )
         noise, least = row["noise"], row["stated_std"]
         if not wrong and not NARROW * least < noise < WIDE * np.hypot(least, position):
@@ -437,9 +437,10 @@ def _of_measurements(c: Check) -> list[str]:
 def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
     """Pairs whose measurements of one kind are off by more than chance and a quarter of their noise, with their offsets
     and standard errors, largest first."""
-    found = [(pair, *found) for pair, found in offsets(c, k, stated).items()]
+    offset_and_error = [(pair, *offset_and_error) for pair, offset_and_error in offsets(c, k, stated).items()]
     return sorted(
-        (row for row in found if abs(row[1]) > max(SURELY * row[2], 0.25 * stated)), key=lambda row: -abs(row[1])
+        (row for row in offset_and_error if abs(row[1]) > max(SURELY * row[2], 0.25 * stated)),
+        key=lambda row: -abs(row[1]),
     )
 
 
@@ -485,10 +486,10 @@ def less_offsets(log: Log) -> Log:
         c, by = replace(against_truth(c), variance=0 * c.variance), "the truth shows"
         rec = replace(rec, sensors=replace(rec.sensors, range_offset_std=0.0))
     relative, ends = rec.relative.copy(), np.sort([rec.links.observer, rec.links.neighbour], axis=0)
-    found = offsets(c, 0, rec.sensors.range_std)
+    known_offsets = offsets(c, 0, rec.sensors.range_std)
     for one, other in np.unique(ends, axis=1).T:
         pair = f"{rec.ids[one]} and {rec.ids[other]}"
-        offset, error = found.get(pair, (0.0, np.inf))
+        offset, error = known_offsets.get(pair, (0.0, np.inf))
         sure = abs(offset) > 2 * error
         text = (
             f"ranges are less what {by} in the first {until:.3g} s"

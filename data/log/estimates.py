@@ -118,11 +118,11 @@ def odometry(c: Check, column: int) -> Estimate:
         return Estimate(*c.lasting[:, column])
     if truth is None:
         moved, driven = moves(rec, column)
-        found = factors(moved, np.stack([driven, 1j * driven], axis=1))
+        estimate = factors(moved, np.stack([driven, 1j * driven], axis=1))
         noise = rec.sensors.velocity_std(rec.velocity[0, :, column, :2], rec.sensors.velocity_floor) * rec.dt
         flatter = 1.0 + float(np.nansum(noise**2)) / max(float(np.square(np.abs(driven)).sum()), 1e-12)
-        turned = complex(*found.value) * flatter  # noise of a cause makes its factor smaller
-        return Estimate(_polar(1 / turned) if turned else found.value, found.error)
+        turned = complex(*estimate.value) * flatter  # noise of a cause makes its factor smaller
+        return Estimate(_polar(1 / turned) if turned else estimate.value, estimate.error)
     true = truth.velocity[:, column, :2] @ [1, 1j]
     odometer = rec.velocity[0, :, column, :2] @ [1, 1j]
     if body is not None:
@@ -130,10 +130,13 @@ def odometry(c: Check, column: int) -> Estimate:
         heading = None if truth.heading is None else truth.heading[:, column]
         true = (np.abs(true) if heading is None else (true * np.exp(-1j * heading)).real).astype(complex)
     x = np.stack([true, 1j * true, np.gradient(true, rec.dt)], axis=1)
-    known = np.isfinite(odometer + x.sum(axis=1)) & (np.arange(len(true)) > 0)
-    known &= np.maximum(np.abs(true), np.abs(odometer)) > MOVING  # standing, nothing errs
-    found = factors(odometer[known], x[known])
-    value, error = np.append(_polar(complex(*found.value[:2])), -found.value[2] / max(found.value[0], 0.1)), found.error
+    used = np.isfinite(odometer + x.sum(axis=1)) & (np.arange(len(true)) > 0)
+    used &= np.maximum(np.abs(true), np.abs(odometer)) > MOVING  # standing, nothing errs
+    estimate = factors(odometer[used], x[used])
+    value, error = (
+        np.append(_polar(complex(*estimate.value[:2])), -estimate.value[2] / max(estimate.value[0], 0.1)),
+        estimate.error,
+    )
     if body is not None:
         error[1] = np.inf
         if truth.heading is not None:
@@ -164,14 +167,14 @@ def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
     made = np.stack([along, across], axis=1)[..., None] * ends[:, None]
     there = np.isfinite(c.relative[:, 0] + along)
     pairs = np.sort([links.observer, links.neighbour], axis=0)
-    given = c.relative[there, 0], made[there, 0], (pairs[0] * size + pairs[1])[there]
-    found = factors(*given)
-    seen = np.flatnonzero(np.isfinite(found.error))
-    if reference is None and len(seen):
-        apart = np.abs(np.subtract.outer(found.value[seen], found.value[seen]))
-        reference = int(seen[np.argmin((np.minimum(apart, LATE) + 1e-3 * apart).sum(axis=1))])
-    found = factors(*given, reference)
-    return found._replace(error=np.hypot(found.error, _of_filters(c, there, *given[1:], reference))), made
+    inputs = c.relative[there, 0], made[there, 0], (pairs[0] * size + pairs[1])[there]
+    estimate = factors(*inputs)
+    sure = np.flatnonzero(np.isfinite(estimate.error))
+    if reference is None and len(sure):
+        apart = np.abs(np.subtract.outer(estimate.value[sure], estimate.value[sure]))
+        reference = int(sure[np.argmin((np.minimum(apart, LATE) + 1e-3 * apart).sum(axis=1))])
+    estimate = factors(*inputs, reference)
+    return estimate._replace(error=np.hypot(estimate.error, _of_filters(c, there, *inputs[1:], reference))), made
 
 
 def _of_filters(c: Check, there: Bools, x: Floats, pairs: Ints, reference: int | None) -> Floats:
@@ -184,9 +187,9 @@ def _of_filters(c: Check, there: Bools, x: Floats, pairs: Ints, reference: int |
     position = np.maximum(c.expected[there, 0] ** 2 - c.world.sensors.range_std**2, 0.0)
     variance = np.zeros(x.shape[1])
     for pair in np.unique(pairs):
-        mine = pairs == pair
+        of_pair = pairs == pair
         line = np.zeros((len(c.world.t), x.shape[1]))
-        np.add.at(line, c.world.links.step[there][mine], gain[mine] * np.sqrt(position[mine, None]))
+        np.add.at(line, c.world.links.step[there][of_pair], gain[of_pair] * np.sqrt(position[of_pair, None]))
         variance += (2 * line * scipy.signal.lfilter([1.0], [1.0, -keep], line, axis=0) - line**2).sum(axis=0)
     return np.sqrt(np.maximum(variance, 0.0))
 
@@ -216,12 +219,12 @@ def by_pair(c: Check, k: int) -> Iterator[tuple[str, Floats, Floats, Floats]]:
     ends = np.column_stack([links.observer, links.neighbour])[there]
     pairs, index = np.unique(ends if k else np.sort(ends), axis=0, return_inverse=True)
     for number, (observer, neighbour) in enumerate(pairs.tolist()):
-        mine = np.flatnonzero(there)[index.reshape(-1) == number]
+        rows_of_pair = np.flatnonzero(there)[index.reshape(-1) == number]
         yield (
             f"{ids[observer]} {'to' if k else 'and'} {ids[neighbour]}",
-            c.relative[mine, k],
-            c.expected[mine, k],
-            c.slack[mine, min(k, 1)],
+            c.relative[rows_of_pair, k],
+            c.expected[rows_of_pair, k],
+            c.slack[rows_of_pair, min(k, 1)],
         )
 
 
@@ -238,11 +241,11 @@ def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
 
 def _beside(off: AnyArray, velocity: AnyArray) -> float:
     """By what fixes that are off by (T,) m lie beside the truth, m, however late they are; 0 where there are none."""
-    known = np.isfinite(off + velocity)
-    if not known.any():
+    finite = np.isfinite(off + velocity)
+    if not finite.any():
         return 0.0
-    x = np.column_stack([np.ones(known.sum()), velocity[known]])
-    return float(abs(np.linalg.lstsq(x, off[known])[0][0]))
+    x = np.column_stack([np.ones(finite.sum()), velocity[finite]])
+    return float(abs(np.linalg.lstsq(x, off[finite])[0][0]))
 
 
 def against_truth(c: Check) -> Check:
@@ -256,8 +259,8 @@ def against_truth(c: Check) -> Check:
     fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * np.hypot(*noise.fix_std[:2])
     x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
     residual, stated = residual_of(c.world, x)[1], [noise.range_std, noise.world_azimuth_std, noise.inclination_std]
-    known = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)
-    relative, expected = (np.where(known, new, old) for new, old in ((residual, c.relative), (stated, c.expected)))
+    used = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)
+    relative, expected = (np.where(used, new, old) for new, old in ((residual, c.relative), (stated, c.expected)))
     return replace(c, relative=relative, expected=expected)
 
 
@@ -267,14 +270,14 @@ def on_time(c: Check) -> Check:
     if c.log.truth is not None:
         off, (_, _, velocity) = causes(c)
         seconds = np.nansum((off * velocity.conj()).real, axis=0) / np.maximum(np.isfinite(off).sum(axis=0), 1e-12)
-        seen = np.isfinite(off).any(axis=0) & (c.variance[..., 0] > 0).any(axis=0)
-        reference = int(np.argmin(np.where(seen, np.abs(seconds), np.inf))) if seen.any() else None
-    found, made = clocks(c, reference)
-    ahead = np.where((np.abs(found.value) > np.maximum(SURELY * found.error, LATE)), found.value, 0.0)
+        covered = np.isfinite(off).any(axis=0) & (c.variance[..., 0] > 0).any(axis=0)
+        reference = int(np.argmin(np.where(covered, np.abs(seconds), np.inf))) if covered.any() else None
+    estimate, made = clocks(c, reference)
+    ahead = np.where((np.abs(estimate.value) > np.maximum(SURELY * estimate.error, LATE)), estimate.value, 0.0)
     relative = c.relative.copy()
     relative[:, :2] -= np.nan_to_num(made @ ahead)
-    slack = np.nan_to_num(made * np.where(ahead, found.error, 0.0))
-    return replace(c, relative=relative, ahead=ahead, unsure=found.error, slack=slack)
+    slack = np.nan_to_num(made * np.where(ahead, estimate.error, 0.0))
+    return replace(c, relative=relative, ahead=ahead, unsure=estimate.error, slack=slack)
 
 
 def worst(c: Check, column: int) -> tuple[float | None, float]:

@@ -71,10 +71,10 @@ def on_one_clock(rows: Rows, clock: Mapping[str, float]) -> Rows:
     rows = rows.assign(t=t, arrival=rows["arrival"] - partner_ahead)
     early = rows[rows["arrival"] < t - 1e-6]
     if len(early):
-        given = f"{early['arrival'].iloc[0]:.6f} s, sent at {early['t'].iloc[0]:.6f} s"
+        actual = f"{early['arrival'].iloc[0]:.6f} s, sent at {early['t'].iloc[0]:.6f} s"
         hint = 'Give the offsets of the clocks, as clock={"car2": 0.35}, or mend the row.'
         allowed = "must not come before the message was sent"
-        raise InputError(f"{place(early)}, column arrival", given, allowed, hint)
+        raise InputError(f"{place(early)}, column arrival", actual, allowed, hint)
     return rows
 
 
@@ -156,8 +156,8 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of("heading", default=HEADING_STD, unit="rad")
     if (drifts := max((member.wanders for member in members), default=0.0)) > 0.0:
-        known = of(*MOTION, default=base.velocity_floor, unit="m/s")
-        floor = max(float(np.sqrt(drifts / dt)), known)
+        motion_noise = of(*MOTION, default=base.velocity_floor, unit="m/s")
+        floor = max(float(np.sqrt(drifts / dt)), motion_noise)
         summary.assume(
             f"{floor:.2g} m/s as the noise of a velocity, as the fixes of what has none, or no heading, show it"
         )

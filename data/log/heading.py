@@ -79,30 +79,30 @@ def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) 
     """
     turned, t = integral(yaw_rate, speed.t), fixes.t
     way = speed.value * np.column_stack([np.cos(turned), np.sin(turned)])
-    path, place = integral(Signal(speed.t, way), t) @ [1, 1j], fixes.value[:, :2] @ [1, 1j]
-    state, cov, level, last, known = np.zeros(2), np.zeros((2, 2)), 1.0, 0, list[tuple[float, ...]]()
+    path, position = integral(Signal(speed.t, way), t) @ [1, 1j], fixes.value[:, :2] @ [1, 1j]
+    state, cov, level, last, samples = np.zeros(2), np.zeros((2, 2)), 1.0, 0, list[tuple[float, ...]]()
     for j in range(1, len(t)):
-        moved, driven = place[j] - place[last], path[j] - path[last]
+        moved, driven = position[j] - position[last], path[j] - path[last]
         if min(abs(moved), abs(driven)) < BASELINE * std:
             continue
         angle, variance = float(np.angle(moved / driven)), 2 * std**2 / abs(driven) ** 2
         h = np.array([1.0, 0.5 * (t[last] - t[j])])
-        if not known:
+        if not samples:
             state, cov = np.array([angle, 0.0]), np.diag([variance, GYRO_BIAS**2])
         else:
-            ahead = np.array([[1.0, t[j] - known[-1][0]], [0.0, 1.0]])
+            ahead = np.array([[1.0, t[j] - samples[-1][0]], [0.0, 1.0]])
             state, cov = ahead @ state, ahead @ cov @ ahead.T
-            cov += (t[j] - known[-1][0]) * np.diag([GYRO_WALK**2, GYRO_BIAS**2 / GYRO_LASTS])
+            cov += (t[j] - samples[-1][0]) * np.diag([GYRO_WALK**2, GYRO_BIAS**2 / GYRO_LASTS])
             gap = float(wrap(np.array(angle - h @ state)))
             level += (max(gap**2 / (h @ cov @ h + variance), 0.5) - level) / 10
             gain = cov @ h / (h @ cov @ h + max(level, 1.0) * variance)
             state, cov = state + gain * gap, cov - np.outer(gain, cov @ h)
         pace = abs(driven) / (t[j] - t[last])
-        known.append((float(t[j]), *state, cov[0, 0] * pace**2, t[j] - t[last]))
+        samples.append((float(t[j]), *state, cov[0, 0] * pace**2, t[j] - t[last]))
         last = j
-    if not known:
+    if not samples:
         return None
-    since = Signal(np.array([k[0] for k in known]), np.array(known))
+    since = Signal(np.array([k[0] for k in samples]), np.array(samples))
 
     def at(times: Floats) -> Floats:
         begun, offset, bias = held(since, times).T[:3]

@@ -61,10 +61,10 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
         stands = np.array([member.stands for member in members.values()])
         far = measured[(measured["component"] == 0) & ~stands[measured["neighbour"]]]
         aimed = measured.loc[measured["component"] == 1, PAIR]
-        seen = pd.MultiIndex.from_frame(far[PAIR]).isin(pd.MultiIndex.from_frame(aimed))
-        if seen.any():
-            summary.assume(RADAR, str(int(seen.sum())))
-        back = far[~seen]
+        reached = pd.MultiIndex.from_frame(far[PAIR]).isin(pd.MultiIndex.from_frame(aimed))
+        if reached.any():
+            summary.assume(RADAR, str(int(reached.sum())))
+        back = far[~reached]
         both = pd.concat([measured, back.rename(columns={"observer": "neighbour", "neighbour": "observer"})])
         both = both.drop_duplicates([*PAIR, "component"])
         if len(both) > len(measured):
@@ -122,9 +122,9 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
 def of_vehicles(rows: Rows, landmarks: Collection[str], summary: Summary) -> Rows:
     """Rows in which vehicles measure: a range that a landmark measured is one to it; whatever else it measured or sent
     says nothing without its heading."""
-    mine, theirs = (rows[who].isin(list(landmarks)) for who in ("vehicle", "partner"))
-    turned = mine & ~theirs & (rows["kind"] == "range")
-    left = mine & ~turned & in_group(rows, "relative", "message")
+    own, theirs = (rows[who].isin(list(landmarks)) for who in ("vehicle", "partner"))
+    turned = own & ~theirs & (rows["kind"] == "range")
+    left = own & ~turned & in_group(rows, "relative", "message")
     summary.refuse("messages of landmarks, and what they measured but ranges to vehicles", rows[left])
     swapped = {"vehicle": rows["partner"], "partner": rows["vehicle"]}
     return rows.assign(**{who: rows[who].where(~turned, other) for who, other in swapped.items()})[~left]
@@ -143,9 +143,11 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     t, turned = rows["t"].to_numpy(), rows["kind"].eq("azimuth" if body else "bearing").to_numpy()
     step, lag = steps.nearest(t)
     for column, (name, member) in enumerate(members.items()):
-        mine = turned & (observer == column)
-        value[mine] += (-1 if body else 1) * member.heading(t[mine]) if member.heading is not None else np.nan
-        if mine.any() and member.course:
+        of_observer = turned & (observer == column)
+        value[of_observer] += (
+            (-1 if body else 1) * member.heading(t[of_observer]) if member.heading is not None else np.nan
+        )
+        if of_observer.any() and member.course:
             summary.assume(COURSE.format("{}", member.course), name)
     members_too, inside = (observer >= 0) & (neighbour >= 0), step >= 0
     both = members_too & inside & there[step, observer] & there[step, neighbour]

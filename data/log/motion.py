@@ -233,10 +233,10 @@ def _in_world(
         if course:
             summary.assume(COURSE.format("{}", course), name)
         angle = np.full(len(standing), np.nan) if heading is None else heading(speed.t)
-        known = np.isfinite(angle) | standing
-        summary.refuse("speeds without a heading", speeds[speeds["t"].isin(speed.t[~known])])
+        usable = np.isfinite(angle) | standing
+        summary.refuse("speeds without a heading", speeds[speeds["t"].isin(speed.t[~usable])])
         velocity = speed.value * np.nan_to_num(turned(AHEAD, angle))
-        return Signal(speed.t[known], velocity[known]), heading, course, wanders
+        return Signal(speed.t[usable], velocity[usable]), heading, course, wanders
     if len(speed.t):
         allowed, hint = "needs heading, compass_deg, or fixes of a moving vehicle", "Add one, or give vx and vy."
         raise InputError(f"{place(speeds)}, speed", f"of {name}, which has no heading", allowed, hint)
@@ -262,8 +262,8 @@ def _heading(
         return heading_at(measured, rate, steps.gap(measured.t)), "", 0.0
     if gyro is not None and rate is not None and len(gyro[1].t) > 1:
         fixes, speed, std = gyro
-        if (found := heading_of_gyro(fixes, speed, rate, std)) is not None:
-            return found[0], "fixes", found[1]
+        if (filtered := heading_of_gyro(fixes, speed, rate, std)) is not None:
+            return filtered[0], "fixes", filtered[1]
     for move, source in moves:
         velocity, wanders = (move.velocity, move.wanders) if isinstance(move, Shown) else (move, 0.0)
         if (moving := np.hypot(*velocity.value[:, :2].T) > MOVING).any():
@@ -309,10 +309,10 @@ def velocity_of_fixes(fixes: Signal, steps: Steps, std: float) -> Shown:
     velocity, growth, spread = constant_velocity(
         fixes.t, fixes.value, interval, steps.gap(fixes.t) + SAME, std**2, UNKNOWN_SPEED, BANK
     )
-    seen, order = np.isfinite(growth), np.arange(len(growth))
-    since = order - np.maximum.accumulate(np.where(seen, 0, order))
-    wanders = float(std**2 * np.median(growth[seen]) / interval) if seen.any() else 0.0
-    return Shown(Signal(fixes.t, velocity), (since > 3) | (seen & (spread * longest**2 < 2.0)), wanders)
+    sure, order = np.isfinite(growth), np.arange(len(growth))
+    since = order - np.maximum.accumulate(np.where(sure, 0, order))
+    wanders = float(std**2 * np.median(growth[sure]) / interval) if sure.any() else 0.0
+    return Shown(Signal(fixes.t, velocity), (since > 3) | (sure & (spread * longest**2 < 2.0)), wanders)
 
 
 def _by_fixes(fixes: Signal, shown: Shown, steps: Steps) -> Floats:

@@ -181,9 +181,15 @@ def read_log(
             least = -np.inf if field in clocks else 1e-12
             number(field, value, least, allowed="a number, of dt and max_gap > 0 s", hint="Give seconds.")
     if origin is not None:
-        given = checked("origin", origin, "(3,)", (3,))
+        origin_array = checked("origin", origin, "(3,)", (3,))
         allowed = "must be latitude and longitude in degrees, and height in m"
-        refuse("origin", given, ~(np.abs(given) <= [90.0, 180.0, 1e6]), allowed, "Give origin=(48.14, 11.58, 520.0).")
+        refuse(
+            "origin",
+            origin_array,
+            ~(np.abs(origin_array) <= [90.0, 180.0, 1e6]),
+            allowed,
+            "Give origin=(48.14, 11.58, 520.0).",
+        )
     options: dict[str, Any] = {
         "columns": named("columns", columns or {}, "Give columns={name: header}."),
         "kinds": named("kinds", kinds or {}, "Give kinds={word: kind}."),
@@ -362,7 +368,7 @@ def _check_one_drive(rows: Rows, path: Path) -> None:
 
 
 def _check_scale(rows: Rows, name: str) -> None:
-    fixes = [samples(mine, ("x", "y", "z"), Summary(), 2) for _, mine in rows.groupby("vehicle", sort=False)]
+    fixes = [samples(group, ("x", "y", "z"), Summary(), 2) for _, group in rows.groupby("vehicle", sort=False)]
     t, position = (np.concatenate(parts) for parts in zip(*fixes, strict=True))
     if len(t):
         ends = np.cumsum([len(signal.t) for signal in fixes])[:-1]
@@ -436,8 +442,8 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
     axes = 3 if (rows["kind"] == "z").any() else 2
     poses = np.full((len(recording.t), len(ids), 4), np.nan)
     for column, vehicle in enumerate(ids):
-        mine = rows[rows["vehicle"] == vehicle]
-        true, heading = samples(mine, ("x", "y", "z"), Summary(), axes), samples(mine, ("heading",), Summary())
+        own_rows = rows[rows["vehicle"] == vehicle]
+        true, heading = samples(own_rows, ("x", "y", "z"), Summary(), axes), samples(own_rows, ("heading",), Summary())
         headings = np.unwrap(heading.value, axis=0)
         for first, t, value in ((0, true.t, np.nan_to_num(true.value)), (3, heading.t, headings)):
             out = poses[:, column, first : first + 3]
@@ -448,9 +454,9 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
                 out[:] = value[0]
     position, angle = poses[..., :3], poses[..., 3]
     if not np.isfinite(position).any():
-        given = f"{rows['t'].min():.10g} to {rows['t'].max():.10g} s"
+        actual = f"{rows['t'].min():.10g} to {rows['t'].max():.10g} s"
         allowed = f"must overlap the log, from {start:.10g} to {recording.t[-1]:.10g} s"
-        raise InputError(f"{rows['file'].iloc[0]}: column t", given, allowed, "Does its clock or its date differ?")
+        raise InputError(f"{rows['file'].iloc[0]}: column t", actual, allowed, "Does its clock or its date differ?")
     there = np.pad(np.isfinite(position[..., 0]), ((1, 1), (0, 0)))
     position[~(there[2:] | there[:-2])] = np.nan
     velocity = backward_difference(recording.t, position, ids)

@@ -174,9 +174,9 @@ def filtered(log: Log) -> Check:
     expected[:, 1] += heading_variance[links.step, links.observer]
     expected += np.square([noise.range_std, noise.world_azimuth_std, noise.inclination_std])
     log = replace(log, recording=rec)
-    none, known = np.zeros(vehicles), np.full(vehicles, np.inf)
+    none, infinite = np.zeros(vehicles), np.full(vehicles, np.inf)
     stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting
-    return Check(log, span + start, world, *stats, none, known, np.zeros((len(links), 2, vehicles)), scored)
+    return Check(log, span + start, world, *stats, none, infinite, np.zeros((len(links), 2, vehicles)), scored)
 
 
 def residual_of(world: Recording, x: Floats) -> tuple[Floats, Floats]:

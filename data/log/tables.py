@@ -31,9 +31,9 @@ def is_log_table(path: Path, columns: Mapping[str, str] | None = None) -> bool:
     without an id that lacks heights or has speeds, as no table of drives does."""
     if path.suffix.lower() not in TABLES:
         return False
-    given, ours = {name.lower() for name in headers(path)}, set(columns or ())
-    drive = "id" in given | ours or ("z" in given | ours and not {"speed", "heading"} & given)
-    return bool(ours & ({*LONG, *KINDS} - OF_FLEETS) or OF_LOGS & given or (given and not drive))
+    in_file, ours = {name.lower() for name in headers(path)}, set(columns or ())
+    drive = "id" in in_file | ours or ("z" in in_file | ours and not {"speed", "heading"} & in_file)
+    return bool(ours & ({*LONG, *KINDS} - OF_FLEETS) or OF_LOGS & in_file or (in_file and not drive))
 
 
 def read_log_table(
@@ -134,9 +134,9 @@ def _cells(frame: pd.DataFrame, file: str, value: str, std: str) -> pd.DataFrame
     if "t" in frame:
         made["t"] = seconds(frame, "t", file)
     if "partner" in frame:
-        given = filled(frame["partner"])
+        partners = filled(frame["partner"])
         made["partner"] = np.full(len(frame), "", dtype=object)
-        made["partner"][given] = words(frame[given], "partner", file)
+        made["partner"][partners] = words(frame[partners], "partner", file)
     if message.any():
         cells = frame["arrival"]
         lost = message & (cells.astype(str).str.strip().str.lower() == "lost").to_numpy()

@@ -75,9 +75,9 @@ def rows_of(frame: pd.DataFrame, file: str) -> Rows:
 
 def of_kinds(frame: pd.DataFrame, file: str) -> Rows:
     """Rows of a table with a column for each kind, and perhaps KIND_std beside it; an empty cell is no measurement."""
-    known = frame[frame.columns.intersection([*BLANK])].fillna({"partner": "", "true": 0.0})
+    columns = frame[frame.columns.intersection([*BLANK])].fillna({"partner": "", "true": 0.0})
     parts = [
-        known.assign(kind=kind, value=frame[kind], std=frame.get(f"{kind}_std", NONE))
+        columns.assign(kind=kind, value=frame[kind], std=frame.get(f"{kind}_std", NONE))
         for kind in KINDS
         if kind in frame
     ]
@@ -101,7 +101,7 @@ def check_values(rows: Rows) -> None:
     limit = kind.map({name: KINDS[name].limit for name in KINDS})
     alone = in_group(rows, "relative") & (partner == "")
     deviation = "standard deviation of {kind}"
-    for wrong, column, given, allowed, hint in (
+    for wrong, column, actual, allowed, hint in (
         (value.abs() > limit, "{kind}", value, "must be within +-{limit:.4g}", UNIT),
         ((kind == "range") & (value <= 0), "{kind}", value, "must be > 0", "Remove the row."),
         (
@@ -116,9 +116,9 @@ def check_values(rows: Rows) -> None:
         (partner == rows["vehicle"], "column partner", partner, ITSELF, "Mend or remove the row."),
     ):
         if wrong.any():
-            first, cell = kind[wrong].iloc[0], given[wrong].iloc[0]
+            first, cell = kind[wrong].iloc[0], actual[wrong].iloc[0]
             others = ", ".join(name for name in KINDS if KINDS[name].name == KINDS[first].name)
-            shown = (repr(cell) if cell else "empty") if given is partner else f"{cell:.10g}"
+            shown = (repr(cell) if cell else "empty") if actual is partner else f"{cell:.10g}"
             allowed, hint = allowed.format(limit=KINDS[first].limit), hint.format(kinds=others)
             raise InputError(f"{place(rows[wrong])}, {column.format(kind=first)}", shown, allowed, hint)
 

@@ -32,8 +32,8 @@ def unseen(c: Check) -> list[str]:
     late = {row["vehicle"]: row.get("late_s_error", np.inf) for row in c.vehicles}
     if blind := _below({who: SURELY * min(late[who], c.unsure[c.world.ids.index(who)]) for who in every}, 2 * LATE):
         sentences.append(f"errors, s, of the clocks of {blind}")
-    known = np.isfinite(c.fix[..., 0]).sum(axis=0)
-    if few := [who for who in every if known[c.world.ids.index(who)] < ENOUGH]:
+    fixes = np.isfinite(c.fix[..., 0]).sum(axis=0)
+    if few := [who for who in every if fixes[c.world.ids.index(who)] < ENOUGH]:
         sentences.append(f"late fixes of {', '.join(few)}, and whether their deviations are right: too few fixes")
     sensors = c.world.sensors
     stated = {"fixes": sensors.gnss_std[0]} | {f"{row['measurement']}s": row["stated_std"] for row in c.measurements}

@@ -91,8 +91,8 @@ def _step(theta: Tensor, shapes: Shapes, batch: Batch, moments: Moments, update:
 def _checked(theta: Tensor, shapes: Shapes, models: int, gnss: Tensor, velocity: Tensor, x0: Tensor, dt: Any) -> Drives:
     """The inputs of so many models as contiguous arrays of theta's dtype."""
     if theta.dtype not in (torch.float32, torch.float64) or theta.device.type != "cpu":
-        given = f"{theta.dtype} on {theta.device}"
-        raise InputError("theta", given, "must be float32 or float64 in main memory", "Use theta.cpu().float().")
+        actual = f"{theta.dtype} on {theta.device}"
+        raise InputError("theta", actual, "must be float32 or float64 in main memory", "Use theta.cpu().float().")
     steps, lanes = gnss.shape[0], gnss.shape[2]
     wanted = {
         "theta": (theta, (len(theta), plan_of(shapes).parameters)),

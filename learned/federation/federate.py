@@ -59,8 +59,8 @@ class Plan:
         """InputError for a rule that needs more clients than a round asks."""
         chosen, asked = self.rule, self.participation.count(clients)
         if asked < chosen.least:
-            given, allowed = f"{chosen.name} with {asked} clients a round", f"takes at least {chosen.least}"
-            raise InputError("aggregate", given, allowed, "Ask more clients, or take the median.")
+            actual, allowed = f"{chosen.name} with {asked} clients a round", f"takes at least {chosen.least}"
+            raise InputError("aggregate", actual, allowed, "Ask more clients, or take the median.")
 
 
 def federate(
@@ -107,8 +107,8 @@ def federate(
     >>> federate("gain_net", clients(line, piece=10), rounds=1, local_epochs=1).history[1].sent_bytes
     79756
     """
-    given = find("coopoc.nets", model) if isinstance(model, str) else model
-    start = given() if isinstance(given, type) else given
+    chosen_net = find("coopoc.nets", model) if isinstance(model, str) else model
+    start = chosen_net() if isinstance(chosen_net, type) else chosen_net
     if not isinstance(start, Gain):
         raise InputError("model", shown(start), "must be a Gain", "Give GainNet(), or its name.")
     optimiser = Schedule() if schedule is None else schedule

@@ -157,8 +157,8 @@ def ledger(federation: Federation, overhead: int = 0) -> Ledger:
     names = [*federation.names, SERVER]
     moved, messages = np.zeros((2, 2, len(names)))
     for column, name in enumerate(federation.names):
-        for way, given in enumerate(([row.sent for row in rounds], [row.received for row in rounds])):
-            sizes = [row[name] for row in given if name in row]
+        for way, totals in enumerate(([row.sent for row in rounds], [row.received for row in rounds])):
+            sizes = [row[name] for row in totals if name in row]
             moved[way, column], messages[way, column] = sum(sizes), len(sizes)
     downloads = [max(row.received.values()) for row in rounds if row.received]
     moved[:, -1], messages[:, -1] = (sum(downloads), moved[0].sum()), (len(downloads), messages[0].sum())

@@ -159,9 +159,9 @@ def krum_scores(weights: Tensor, byzantine: int) -> Tensor:
     """
     count = len(weights)
     if count <= 2 * byzantine + 2:
-        given = f"{count} with byzantine = {byzantine}"
+        actual = f"{count} with byzantine = {byzantine}"
         allowed = f"Krum needs more than 2 f + 2 = {2 * byzantine + 2} clients"
-        raise InputError("clients", given, allowed, "Tolerate fewer Byzantine clients, or take the median.")
+        raise InputError("clients", actual, allowed, "Tolerate fewer Byzantine clients, or take the median.")
     exact = weights.double()
     square = torch.stack([(exact - one).square().sum(1) for one in exact])
     nearest: Tensor = square.fill_diagonal_(torch.inf).sort(1).values[:, : count - byzantine - 2]
@@ -217,7 +217,7 @@ RULES: Mapping[str, Rule] = {
 """Bundled rules with their default parameters; others come from entry points in `coopoc.rules` or from files."""
 
 
-def rule(given: str | Rule | Combine) -> Rule:
+def rule(name_or_rule: str | Rule | Combine) -> Rule:
     """The rule of a name or of a path "mine.py:NAME"; a `Rule`, a class of rules or a plain function as a rule.
 
     Raises:
@@ -226,11 +226,15 @@ def rule(given: str | Rule | Combine) -> Rule:
     >>> rule("krum").least
     5
     """
-    chosen = (RULES.get(given) or find("coopoc.rules", given)) if isinstance(given, str) else given
+    chosen = (
+        (RULES.get(name_or_rule) or find("coopoc.rules", name_or_rule))
+        if isinstance(name_or_rule, str)
+        else name_or_rule
+    )
     made = chosen() if isinstance(chosen, type) else chosen
     if isinstance(made, Rule):
         return made
     if callable(made):
         return Function(made)
     hint = "Give a function of (weights, sizes), or a Rule."
-    raise InputError("aggregate", shown(given), f"is a {type(made).__name__}, no aggregation rule", hint)
+    raise InputError("aggregate", shown(name_or_rule), f"is a {type(made).__name__}, no aggregation rule", hint)

@@ -37,12 +37,12 @@ def job_of(config: Mapping[str, Any]) -> Job:
     base = recipe_of(name)
     if base.kind != "federated":
         raise InputError("recipe", repr(name), f'is "{base.kind}", must be "federated"', "Train it without Flower.")
-    given = {key.replace("-", "_"): value for key, value in {**config, **_words(config.get("change", ""))}.items()}
-    options = {key[len(PREFIX) :]: value for key, value in given.items() if key.startswith(PREFIX.replace("-", "_"))}
-    own = {} if given.get("net", base.net) != base.net else dict(base.options)
-    schedule, changed = replace(base.schedule, **_of(Schedule, given)), tuple((own | options).items())
-    recipe = replace(base, **_of(Recipe, given), schedule=schedule, options=changed)
-    return Job(name, recipe, Setting(**_of(Setting, given)))
+    settings = {key.replace("-", "_"): value for key, value in {**config, **_words(config.get("change", ""))}.items()}
+    options = {key[len(PREFIX) :]: value for key, value in settings.items() if key.startswith(PREFIX.replace("-", "_"))}
+    own = {} if settings.get("net", base.net) != base.net else dict(base.options)
+    schedule, changed = replace(base.schedule, **_of(Schedule, settings)), tuple((own | options).items())
+    recipe = replace(base, **_of(Recipe, settings), schedule=schedule, options=changed)
+    return Job(name, recipe, Setting(**_of(Setting, settings)))
 
 
 def local(job: Job) -> Schedule:
@@ -63,5 +63,5 @@ def _words(text: str) -> dict[str, Any]:
     return settings
 
 
-def _of(kind: type[Any], given: Mapping[str, Any]) -> dict[str, Any]:
-    return {field.name: given[field.name] for field in fields(kind) if field.name in given}
+def _of(kind: type[Any], settings: Mapping[str, Any]) -> dict[str, Any]:
+    return {field.name: settings[field.name] for field in fields(kind) if field.name in settings}

@@ -96,10 +96,12 @@ def configured(grid: Grid, context: Context) -> None:
     Raises:
         InputError: a net that is calibrated on the clients' segments, which stay with them.
     """
-    given: Any = context.run_config
-    job, began, rows, names = job_of(given), time.perf_counter(), list[Row](), dict[int, str]()
-    nodes = arrays.number("nodes", given["nodes"], 1, 10**6, kind=int, allowed=">= 1", hint="Of clients, to wait for.")
-    out = given_path(given["out"])
+    run_config: Any = context.run_config
+    job, began, rows, names = job_of(run_config), time.perf_counter(), list[Row](), dict[int, str]()
+    nodes = arrays.number(
+        "nodes", run_config["nodes"], 1, 10**6, kind=int, allowed=">= 1", hint="Of clients, to wait for."
+    )
+    out = given_path(run_config["out"])
     if type(untrained(job)).calibrate is not Gain.calibrate:
         allowed = "must be a net that needs no calibration on the clients' segments"
         raise InputError("recipe", job.name, allowed, "Train it in one process: coopoc train.")
@@ -113,7 +115,7 @@ def configured(grid: Grid, context: Context) -> None:
         save(out, replace(made, card={**made.card, "nodes": {str(node): name for node, name in names.items()}}))
         print(row.line, flush=True)
 
-    rounds(grid, job, nodes, given["timeout"], keep, names)
+    rounds(grid, job, nodes, run_config["timeout"], keep, names)
     print(out, flush=True)
 
 
@@ -146,8 +148,8 @@ def rounds(
     (theta,) = flatten([untrained(job)])
     one_of("aggregate", job.recipe.aggregate, tuple(STRATEGIES))
     Plan(aggregate=job.recipe.aggregate).check(nodes)
-    known = {} if names is None else names
-    strategy, until = _strategy(job.recipe.aggregate, theta, keep, known), time.monotonic() + timeout
+    named = {} if names is None else names
+    strategy, until = _strategy(job.recipe.aggregate, theta, keep, named), time.monotonic() + timeout
     while (online := len(list(grid.get_node_ids()))) < nodes:
         if time.monotonic() > until:
             state = f"only {online} came online in {timeout:g} s"

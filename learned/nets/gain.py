@@ -58,9 +58,9 @@ class Gain(nn.Module, ABC):
     def loss_and_gradient(self, theta: Tensor, batch: Batch) -> tuple[Tensor, Tensor]:
         """Loss (S,), the mean over the batch, and its gradient (S, P) at theta (S, P)."""
         with torch.enable_grad():
-            given = theta.detach().requires_grad_()
-            means = self.losses(given, batch).mean(1)
-            (gradient,) = torch.autograd.grad(means.sum(), given)
+            leaf = theta.detach().requires_grad_()
+            means = self.losses(leaf, batch).mean(1)
+            (gradient,) = torch.autograd.grad(means.sum(), leaf)
         return means.detach(), gradient
 
     def descend(
@@ -123,8 +123,8 @@ class Recurrent(Gain):
         rows = []
         for s in range(len(theta)):
             weights = {name: view[0] for name, view in named(theta[s : s + 1], self).items()}
-            given = gnss[:, s].transpose(0, 1), velocity[:, s].transpose(0, 1), x0[s], dt
-            rows.append(torch.func.functional_call(self, weights, given).transpose(0, 1))
+            inputs = gnss[:, s].transpose(0, 1), velocity[:, s].transpose(0, 1), x0[s], dt
+            rows.append(torch.func.functional_call(self, weights, inputs).transpose(0, 1))
         return torch.stack(rows, 1)
 
     def losses(self, theta: Tensor, batch: Batch) -> Tensor:

@@ -68,8 +68,8 @@ class Segments:
             value = getattr(self, name)
             if not isinstance(value, Tensor) or value.shape != wanted:
                 allowed = "must be a tensor (n, T + 1, 3) as the others are, true_start (n,)"
-                given = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else shown(value)
-                raise InputError(name, given, allowed, "Make segments with learned.clients(...).")
+                actual = f"shape {tuple(value.shape)}" if isinstance(value, Tensor) else shown(value)
+                raise InputError(name, actual, allowed, "Make segments with learned.clients(...).")
 
     def __len__(self) -> int:
         return len(self.truth)
@@ -188,13 +188,13 @@ def clients(
     check_pieces(piece, split)
     fleet = instance("fleet", fleet, Fleet)
     sensors = Sensors.paper_training() if sensors is None else instance("sensors", sensors, Sensors)
-    seen = observe(fleet, sensors, V2X(max_neighbours=0, rate=1 / fleet.dt), seed=seed)
+    recording = observe(fleet, sensors, V2X(max_neighbours=0, rate=1 / fleet.dt), seed=seed)
     agreed, longest = [], min(LONG * piece, max(int(fleet.present.sum(0).min()) - 1, 1))
     for column, name in enumerate(fleet.ids):
         there = np.flatnonzero(fleet.present[:, column])
         if len(there) and there[-1] - there[0] >= len(there):
             raise InputError("fleet", f"{name} leaves and comes back", "must be one drive", "Cut it with between(...).")
-        drive = [a[there, column] for a in (seen.gnss[0], seen.velocity[0], fleet.position)]
+        drive = [a[there, column] for a in (recording.gnss[0], recording.velocity[0], fleet.position)]
         pieces = _cut(drive, piece, fleet.dt, start)
         if len(pieces) < 2:
             hint = f"Give it at least {2 * (piece + 1)} steps or shorten the pieces."

@@ -47,20 +47,20 @@ class MeasuredDrives:
 
     def __post_init__(self) -> None:
         hint = "Add a table named truth to the folder of the log, or name one: read_log(..., truth=)."
-        seen, truth = check_recording(self.recording), instance("truth", self.truth, Fleet, hint)
-        if truth.ids != seen.ids or len(truth.t) != len(seen.t):
+        recording, truth = check_recording(self.recording), instance("truth", self.truth, Fleet, hint)
+        if truth.ids != recording.ids or len(truth.t) != len(recording.t):
             hint = "Give the truth on the steps of the recording, as read_log does."
             raise InputError("truth", repr(truth), "must hold the members and steps of the recording", hint)
-        moving = np.flatnonzero(np.abs(np.nan_to_num(seen.velocity)).max(axis=(0, 1, 3)))
+        moving = np.flatnonzero(np.abs(np.nan_to_num(recording.velocity)).max(axis=(0, 1, 3)))
         wanted = listed("ids", self.ids, "Give a tuple of ids, () for all that move.") or moving.tolist()
-        cols = columns("vehicles", wanted, seen.ids)
+        cols = columns("vehicles", wanted, recording.ids)
         if not cols:
-            raise InputError("recording", repr(seen), "has no vehicle that moves", "Give one with odometry.")
+            raise InputError("recording", repr(recording), "has no vehicle that moves", "Give one with odometry.")
         for column in cols:
             if not truth.present[:, column].any():
                 hint = "Add its truth, or name those that have one: MeasuredDrives(recording, truth, ids=...)."
-                raise InputError("truth", f"none of {seen.ids[column]}", "must be there for all that train", hint)
-        object.__setattr__(self, "ids", tuple(seen.ids[column] for column in cols))
+                raise InputError("truth", f"none of {recording.ids[column]}", "must be there for all that train", hint)
+        object.__setattr__(self, "ids", tuple(recording.ids[column] for column in cols))
 
     @property
     def name(self) -> str:

@@ -117,24 +117,24 @@ def fit_many(tasks: Sequence[Task], schedule: Schedule | None = None, progress: 
     plans = [rows[schedule.plan(len(rows), draw)] for rows, draw in zip(members, streams, strict=True)]
     long = [t.long for t in tasks if t.long is not None]
     if long and len(long) < len(tasks):
-        given = f"with {len(long)} of {len(tasks)} tasks"
-        raise InputError("long", given, "must be given with all tasks or with none", "Train them apart.")
+        actual = f"with {len(long)} of {len(tasks)} tasks"
+        raise InputError("long", actual, "must be given with all tasks or with none", "Train them apart.")
     judge = Judge([[t.validation for t in tasks], *([long] if long else [])], like)
     best, lowest = theta.clone(), judge(theta)
     history = [[Progress(0, w.clone(), math.nan, float(low))] for w, low in zip(theta, lowest, strict=True)]
     stopped: dict[int, str] = {}
-    seen: list[Tensor] = []
+    so_far: list[Tensor] = []
     rates = [schedule.learning_rate * cosine(len(plan)) for plan in plans]
     due = [set(np.linspace(0, len(plan), schedule.checks + 1).round().astype(int).tolist()) for plan in plans]
     draws = [generator(draw) for draw in streams]
     steps = descend(theta, like, pool, plans, rates, schedule, draws, stopped)
     for step, losses in watched(steps, progress, "step", max(map(len, plans))):
-        seen.append(losses)
+        so_far.append(losses)
         checked = [row for row in range(len(tasks)) if step in due[row] and row not in stopped]
         if checked:
             validated = judge(theta)
             for row in checked:
-                mean = torch.stack([one[row] for one in seen[history[row][-1].step :]]).mean()
+                mean = torch.stack([one[row] for one in so_far[history[row][-1].step :]]).mean()
                 history[row].append(Progress(step, theta[row].clone(), float(mean), float(validated[row])))
                 if validated[row] < lowest[row]:
                     best[row], lowest[row] = theta[row], validated[row]

@@ -99,19 +99,19 @@ def _next(true: Any, at: int) -> int:
 
 def _segments(drives: MeasuredDrives, column: int, cuts: Sequence[Cut], piece: int, start: Start) -> Segments:
     """Segments of these pieces, each relative to its first fix; of a drive in one plane the height has no loss."""
-    seen, truth = drives.recording, drives.truth
-    flat = not np.nan_to_num(seen.gnss[..., 2]).any() and not np.nan_to_num(seen.velocity[..., 2]).any()
+    recording, truth = drives.recording, drives.truth
+    flat = not np.nan_to_num(recording.gnss[..., 2]).any() and not np.nan_to_num(recording.velocity[..., 2]).any()
     target = np.where([False, False, flat], np.nan, truth.position)[None]
-    origin = np.stack([seen.gnss[run, at, column] for run, at in cuts])[:, None]
+    origin = np.stack([recording.gnss[run, at, column] for run, at in cuts])[:, None]
 
     def tensor(values: Floats, origin: Floats | float = 0.0) -> torch.Tensor:
         rows = np.stack([values[min(run, len(values) - 1), at : at + piece + 1, column] for run, at in cuts])
         return torch.tensor(rows - origin, dtype=torch.float32)
 
     return Segments(
-        gnss=tensor(seen.gnss, origin),
-        velocity=tensor(seen.velocity),
+        gnss=tensor(recording.gnss, origin),
+        velocity=tensor(recording.velocity),
         truth=tensor(target, origin),
         true_start=torch.full((len(cuts),), start == "true"),
-        dt=seen.dt,
+        dt=recording.dt,
     )

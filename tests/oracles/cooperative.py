@@ -14,12 +14,14 @@ import numpy as np
 
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
-from coopoc.kernels.gate import FIX_GATE, GATE, LEAK, PATIENCE, REJECTED, SLIP
+from coopoc.kernels.gate import FIX_GATE, GATE, HARD_REJECT_FACTOR, LEAK, PATIENCE, SLIP
 from coopoc.kernels.stars.cooperative_messages import CLIP, FADES, FIX_SCORE
 from coopoc.kernels.stars.cooperative_state import (
     ACCELERATION,
     CHANGES,
     CONTRADICTED,
+    ESTABLISHED,
+    LONGEST,
     PENALTY,
     REVOKE,
     SHARE,
@@ -306,8 +308,8 @@ class Oracle:
     def corrected(self) -> None:
         """What the level of motion makes of the ego's variance, after an update."""
         s, now = self.state, self.own_variance()
-        s["made"] = min(s["made"] * (now / self.before) ** 2, now)
-        self.before = now
+        s["made"] = min(s["made"] * (now / s["whole"]) ** 2, now)
+        s["whole"] = now
 
     def step(self, t: int, slip: float) -> None:
         self.state |= {"score": 0.0, "numbers": 0, "squares": 0.0}
@@ -339,6 +341,7 @@ class Oracle:
                     b.drop((kind, j))
                 s["members"].remove(j)
         dt = self.seen.dt
+        s["agreed"] += dt * (s["hits"].get("fix", 0) == 0)
         u, q = self.steady(t, self.ego, self.seen.velocity[self.run, t, self.ego], louder * self.q[t, self.ego])
         if t > s["joined"][self.ego]:
             self.predict(dt * u, q)
@@ -347,8 +350,8 @@ class Oracle:
             b.p[x, x] += slip * (across * np.eye(3) + np.outer(s["course"], s["course"]))
         s["made"] = s["made"] + q.sum()
         if s["left"]:
-            s["left"] = s["left"][0] + dt * u, s["left"][1] + q.sum() / 3
-        self.before = self.own_variance()
+            s["left"] = s["left"][0], s["left"][1] + max(self.own_variance() - s["whole"], q.sum()) / 3
+        s["whole"] = self.own_variance()
         for j in [j for j in others if j not in s["members"]]:
             self.join(t, j, messages[j], relative[j])
         if np.isfinite(fix).all():
@@ -399,7 +402,9 @@ class Oracle:
         total = np.trace(cov) + r.sum()
         square = gap @ gap
         wild = kind == 3 and square > SUDDEN * total
-        more = min((np.square(gap - self.state["gap"]).sum() / 2 if wild else square) / total, SUDDEN) - 1.0
+        s = self.state
+        displaced = wild and (s["agreed"] < ESTABLISHED or s["locked"].get(self.ego, 0.0) < LONGEST)
+        more = min((np.square(gap - s["gap"]).sum() / 2 if displaced else square) / total, SUDDEN) - 1.0
         self.learn(kind, more, r.sum() / total, 3)
         if kind == 3 and not wild:
             self.learn(5, more, self.state["made"] / total, 3)
@@ -444,8 +449,10 @@ class Oracle:
         share, hits = 1.0, locked.get(j, 0.0)
         if g.fix_gate:
             if q > g.fix_gate and hits < PATIENCE:
-                share = g.fix_gate / q if q < REJECTED * g.fix_gate else 0.0
+                share = g.fix_gate / q if q < HARD_REJECT_FACTOR * g.fix_gate else 0.0
             locked[j] = hits + gain if q > g.fix_gate else max(hits - LEAK * gain, 0.0)
+            if not judged and s["agreed"] >= ESTABLISHED:
+                locked[j] = min(locked[j], LONGEST)
         if share:
             b.learn(h, z, r, share)
         return share
@@ -506,6 +513,10 @@ class Oracle:
         b.x[b.at(("x", self.ego))] = places[best if votes[0] <= 1 else 0][0]
         s["joined"][self.ego], s["hits"]["fix"] = t, 0
         s["locked"].pop(self.ego, None)
+        if s["left"]:
+            moved = self.seen.dt * self.seen.velocity[self.run, t, self.ego]
+            s["left"] = s["left"][0] + moved, s["left"][1]
+        s["agreed"] = 0.0
         s["trusted"].add(self.ego)
         s["mean"].pop(self.ego, None)
         s["vague"].add(self.ego)
@@ -611,6 +622,8 @@ class Oracle:
     def drive(self, j: int, moved: Floats, steps: int = 1) -> None:
         b, (way, by) = self.state["belief"], self.turned(j, moved)
         b.x[b.at(("x", j))] += way
+        if j == self.ego and self.state["left"]:
+            self.state["left"] = self.state["left"][0] + way, self.state["left"][1]
         if ("o", j) not in b.names:
             return
         x, o, f, holds = b.at(("x", j)), b.at(("o", j)), np.eye(len(b.x)), self.life.holds**steps

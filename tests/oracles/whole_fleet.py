@@ -11,7 +11,7 @@ class Drive:
     def __init__(self, recording, noise_model, met, arrival, run):  # type: ignore[no-untyped-def]
         self.noise_model, self.met, self.dt, self.arrival = noise_model, met, recording.dt, arrival
         self.gnss, self.velocity, self.relative = (
-            values[run] for values in (recording.gnss, recording.velocity, recording.told)
+            values[run] for values in (recording.gnss, recording.velocity, recording.usable_relative)
         )
         self.q, self.r = (
             np.broadcast_to(values, recording.gnss.shape)[run]

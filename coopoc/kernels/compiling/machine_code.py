@@ -119,8 +119,8 @@ class MachineCode:
 
 def _locator(function: Any) -> Any:
     file = str(_file(function.__module__))
-    found = (locator.from_function(function, file) for locator in LOCATORS)  # type: ignore[no-untyped-call]
-    return next((locator for locator in found if locator is not None), None)
+    locators = (locator.from_function(function, file) for locator in LOCATORS)  # type: ignore[no-untyped-call]
+    return next((locator for locator in locators if locator is not None), None)
 
 
 @cache

@@ -173,8 +173,8 @@ class Memory:
         """Write that tuple."""
         batched = batched or self.kind.ndim == 2
         if self.build is not None:
-            for number, place in zip(numbers, self._places(at, len(numbers), batched), strict=True):
-                self.build.store(number.wide if batched else number.value, place, align=8)
+            for number, address in zip(numbers, self._places(at, len(numbers), batched), strict=True):
+                self.build.store(number.wide if batched else number.value, address, align=8)
 
 
 def _symbol(kind: Any, context: Any = None, build: Any = None, value: Any = None) -> Any:

@@ -46,8 +46,8 @@ def run_filter(measured: Measured, pairs: Pairs, assumed: Assumed, run: int) -> 
                 if assumed.robust:
                     joined = min(at(assumed.fix, run, t, i)[0], UNKNOWN) - UNKNOWN
                     joined *= (not present[i]) + (not present[j])
-                    known = add_diagonal(between, (joined, joined, joined))
-                    gate_pair(vector, known, k, pairs, measured.relative[run], assumed)
+                    joint_information = add_diagonal(between, (joined, joined, joined))
+                    gate_pair(vector, joint_information, k, pairs, measured.relative[run], assumed)
                 weight, eta = pair_at_agreement(vector, between, k, pairs, measured.relative[run], assumed)
                 store(information[k - pairs.start[t]], 0, weight)
                 store(total, i, subtract(load(total, i, VECTOR), eta))

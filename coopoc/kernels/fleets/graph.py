@@ -100,11 +100,11 @@ def measurement(vector: Vector, measured: Measurement, std: Floats, min_range: f
     """
     unit = len(std) == 0
     a, b, c = (1.0, 1.0, 1.0) if unit else (std[0], std[1], std[2])
-    seen = with_std(measured, (a * measured[5], b * measured[6], c * measured[7]))
+    measured_std = with_std(measured, (a * measured[5], b * measured[6], c * measured[7]))
     if not unit and not linear:
-        return exact(vector, seen, min_range)
-    here = completed(seen, direction(vector[0], vector[1], vector[2]))
-    weight = information(here, seen[5:], unit, min_range)
+        return exact(vector, measured_std, min_range)
+    here = completed(measured_std, direction(vector[0], vector[1], vector[2]))
+    weight = information(here, measured_std[5:], unit, min_range)
     return weight, apply(weight, subtract(to_vector(here), vector))
 
 
@@ -114,8 +114,8 @@ def pair(vector: Vector, k: int, pairs: Pairs, relative: Floats, assumed: Assume
     information, eta = MATRIX, VECTOR
     for link, sign in ((pairs.link[k], 1.0), (pairs.link_back[k], -1.0)):
         if link >= 0:
-            seen = load(relative[link], 0, SEEN)
-            weight, pair_eta = measurement(scale(vector, sign), seen, assumed.std, assumed.min_range, converted)
+            relative_row = load(relative[link], 0, SEEN)
+            weight, pair_eta = measurement(scale(vector, sign), relative_row, assumed.std, assumed.min_range, converted)
             information, eta = add(information, weight), add(eta, scale(pair_eta, sign))
     return information, eta
 
@@ -129,10 +129,10 @@ def gate_pair(vector: Vector, cov: Matrix, k: int, pairs: Pairs, relative: Float
     for link, sign in ((pairs.link[k], 1.0), (pairs.link_back[k], -1.0)):
         if link >= 0:
             there = scale(vector, sign)
-            seen = with_std(load(relative[link], 0, SEEN), assumed.std)
-            std = seen[5:]
-            _, _, factor, _ = gate_components(there, cov, seen, std, VECTOR, assumed.min_range)
-            here, extra = completed(seen, direction(there[0], there[1], there[2])), 0.0
+            relative_row = with_std(load(relative[link], 0, SEEN), assumed.std)
+            std = relative_row[5:]
+            _, _, factor, _ = gate_components(there, cov, relative_row, std, VECTOR, assumed.min_range)
+            here, extra = completed(relative_row, direction(there[0], there[1], there[2])), 0.0
             for c in range(3):
                 own = std[c] if c == 0 else std[c] * max(here[0], assumed.min_range)
                 extra += own * own if own < math.inf else 0.0

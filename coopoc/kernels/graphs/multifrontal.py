@@ -166,18 +166,18 @@ def locate(fronts: Fronts, s: int, where: Ints) -> None:
 
 
 @compiled
-def factorise(fronts: Fronts, place: Ints, values: Floats, factor: Floats) -> bool:
+def factorise(fronts: Fronts, position: Ints, values: Floats, factor: Floats) -> bool:
     """L^T of A = L L^T; False at the first pivot that is not positive.
 
     Args:
         fronts: of A's pattern.
-        place: (K,) where each number of A's triangle belongs in the factor's numbers.
+        position: (K,) where each number of A's triangle belongs in the factor's numbers.
         values: (K,) the triangle.
         factor: (fronts.start[-1],) in place.
     """
     factor[:] = 0.0
-    for k in range(len(place)):
-        factor[place[k]] = values[k]
+    for k in range(len(position)):
+        factor[position[k]] = values[k]
     count, where = len(fronts.first) - 1, np.empty(len(fronts.order), np.int64)
     below = np.diff(fronts.row)
     size, held, top, most = below * (below + 1) // 2, np.zeros(count, np.int64), 0, 0

@@ -10,7 +10,17 @@ import numpy as np
 from ...arrays import Bools, Floats, Ints
 from ..compiling.compile import compiled, part
 from .odometry import PoseNoise, join, predict
-from .scalar_update import ALONE, COST, USED, ZERO, Poses, settle, update_fix, update_heading, update_relative
+from .scalar_update import (
+    ALONE,
+    COST,
+    USED,
+    ZERO,
+    Poses,
+    apply_pending_rows,
+    update_fix,
+    update_heading,
+    update_relative,
+)
 
 UNPLACED = 7
 """Bits of all components: nothing is known of the position of one of the two."""
@@ -124,7 +134,7 @@ def step(
             update_fix(poses, d * k, (own[0], own[1], own[2]), noise.fix, noise.gate)
         if measured.active[t, k] and not math.isnan(own[3]):
             update_heading(poses, d * k, own[3], noise.heading, noise.gate)
-    settle(poses)
+    apply_pending_rows(poses)
     if measured.first[t] == measured.first[t + 1]:
         return
     if options.fusion == JOINT:
@@ -157,7 +167,7 @@ def update_jointly(
             ends = (d * measured.ends[k, 0], d * measured.ends[k, 1])
             bits = add_relative(measured, noise, poses, ends, run, k, left_out[k - begin])
             left_out[k - begin] = bits
-        settle(poses)
+        apply_pending_rows(poses)
 
 
 @part
@@ -165,9 +175,9 @@ def add_relative(
     measured: PoseMeasurements, noise: PoseNoise, poses: Poses, ends: tuple[int, int], run: int, k: int, left_out: int
 ) -> int:
     """Relative measurement k of members at `ends`."""
-    place = (measured.place[k, 0], measured.place[k, 1], measured.place[k, 2])
+    landmark = (measured.place[k, 0], measured.place[k, 1], measured.place[k, 2])
     relative = (measured.relative[run, k, 0], measured.relative[run, k, 1], measured.relative[run, k, 2])
-    return update_relative(poses, ends, place, relative, noise.relative, noise.gate, noise.longer, left_out)
+    return update_relative(poses, ends, landmark, relative, noise.relative, noise.gate, noise.longer, left_out)
 
 
 @part
@@ -208,7 +218,7 @@ def fuse_pair(
         for i in range(2 * d):
             pair.linear[i] = pair.x[i]
         add_relative(measured, noise, pair, ends, run, k, ZERO)
-        settle(pair)
+        apply_pending_rows(pair)
         total = 0.0
         for i in range(d):
             before = poses.cov[observer + i, observer + i]

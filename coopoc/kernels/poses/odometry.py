@@ -7,7 +7,7 @@ from typing import NamedTuple
 
 from ...arrays import Floats
 from ..compiling.compile import part
-from ..gate import YOUNG
+from ..gate import INITIAL_LOCKOUT
 from ..motion import MotionNoise, keep_pace, process_variance
 from .scalar_update import HEADING, OFFSET, Poses, Three
 
@@ -121,7 +121,7 @@ def move_rows(cov: Floats, member: int, d: int, moved: Three, scale: float, dt: 
 @part
 def join(poses: Poses, member: int, d: int, own: Floats, noise: PoseNoise) -> None:
     """Begin a member where its fix and compass place it, and know nothing of it yet."""
-    poses.hits[member] = poses.hits[member + 1] = YOUNG
+    poses.hits[member] = poses.hits[member + 1] = INITIAL_LOCKOUT
     for i in range(member, member + d):
         for j in range(len(poses.x)):
             poses.cov[i, j] = poses.cov[j, i] = 0.0

@@ -84,7 +84,7 @@ def new_poses(numbers: int) -> Poses:
 def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: float, gate: float) -> bool:
     """x += P h r / s, P -= P h h^T P / s with s = h^T P h + variance, inflated where r^2 > gate s.
 
-    The covariance follows when ROWS rows are pending, or with `settle`; a row sees those that are pending.
+    The covariance follows when ROWS rows are pending, or with `apply_pending_rows`; a row sees those that are pending.
 
     Args:
         poses: the state.
@@ -98,7 +98,7 @@ def update_row(poses: Poses, ends: Ends, row: Row, residual: float, variance: fl
         Whether the measurement is used.
     """
     if poses.totals[PENDING] == ROWS:
-        settle(poses)
+        apply_pending_rows(poses)
     cov, columns, pending, (k, o), (a, b, c, h, e) = poses.cov, poses.columns, int(poses.totals[PENDING]), ends, row
     tiles = len(poses.x) // LANES
     for tile in range(tiles):
@@ -153,7 +153,7 @@ def along(columns: Floats, q: int, ends: Ends, row: Row) -> float:
 
 
 @part
-def settle(poses: Poses) -> None:
+def apply_pending_rows(poses: Poses) -> None:
     """Apply the pending rows to the covariance, two of its rows at a time: each column is read half as often."""
     cov, columns, gains = poses.cov, poses.columns, poses.gains
     size, tiles, pending = len(poses.x), len(poses.x) // LANES, int(poses.totals[PENDING])
@@ -192,7 +192,7 @@ def update_fix(poses: Poses, member: int, fix: Three, variance: Three, gate: flo
     """A position m, gated as a whole."""
     share, m, cov, hits = 1.0, member, poses.cov, poses.hits
     if math.isfinite(gate):
-        settle(poses)
+        apply_pending_rows(poses)
         gap = fix[0] - poses.x[m], fix[1] - poses.x[m + 1], fix[2] - poses.x[m + 2]
         xy, xz, yz = cov[m, m + 1], cov[m, m + 2], cov[m + 1, m + 2]
         own = cov[m, m], xy, xz, xy, cov[m + 1, m + 1], yz, xz, yz, cov[m + 2, m + 2]
@@ -225,14 +225,21 @@ def relative_row(polar: Numbers, heading: float, component: int, measured: float
 
 @part
 def update_relative(
-    poses: Poses, ends: Ends, place: Three, measured: Three, variances: Three, gate: float, longer: float, left_out: int
+    poses: Poses,
+    ends: Ends,
+    landmark: Three,
+    measured: Three,
+    variances: Three,
+    gate: float,
+    longer: float,
+    left_out: int,
 ) -> int:
     """The components of one relative measurement, linear at `poses.linear`.
 
     Args:
         poses: the state.
         ends: observer, and the other or -1 for a landmark.
-        place: of the landmark, m.
+        landmark: of the landmark, m.
         measured: m, rad, rad, NaN where missing.
         variances: of the three.
         gate: on r^2 / s.
@@ -242,7 +249,7 @@ def update_relative(
     Returns:
         The bits, and those of the components that are rejected.
     """
-    (k, o), (px, py, pz), x, linear = ends, place, poses.x, poses.linear
+    (k, o), (px, py, pz), x, linear = ends, landmark, poses.x, poses.linear
     if o >= 0:
         px, py, pz = linear[o], linear[o + 1], linear[o + 2]
     polar = direction(px - linear[k], py - linear[k + 1], pz - linear[k + 2])

@@ -16,16 +16,18 @@ from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import apply, negate, store, subtract
 from ..gate import GATE
 from ..geometry import angle
-from .cooperative_members import join, leave, predict, steady
+from .cooperative_members import join, leave, predict, replace_implausible_velocity
 from .cooperative_messages import fix_terms, goes_on, heard, receive, trust, use_fix
 from .cooperative_state import (
     ACCELERATION,
     AGE,
+    AGREED,
     ANSWER,
     AT,
     CLOCK,
     COVARIANCE,
     DT,
+    EXTRA_VARIANCE,
     FIX,
     FIX_VARIANCE,
     FIXES,
@@ -50,7 +52,6 @@ from .cooperative_state import (
     TOLD,
     TRUSTED,
     TYPICAL,
-    VAGUE,
     VEHICLE,
     WAY,
     WHEN,
@@ -82,7 +83,7 @@ from .gaussian import (
     expect,
     has,
     innovate,
-    settle,
+    insert_from_measurement,
     weight,
 )
 from .messages import Assumptions, Measurements, three_of, vector_at
@@ -99,10 +100,10 @@ from .otherwise import (
     corrected,
     learn_fix,
     learn_relative,
-    louder,
     moved,
     new_tries,
     remember_speed,
+    scale_motion_noise,
     score,
     show,
     surprised,
@@ -130,7 +131,7 @@ def run_filter(
         most = max(most, measurements.start[t + 1] - measurements.start[t])
     x, cov, fixes = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, steps))
     neighbours, notes = np.empty((runs, links, 3)), np.empty((runs, links, 5))
-    found = np.zeros((runs, steps, FOUND))
+    deviations = np.zeros((runs, steps, FOUND))
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
     for run in range(runs):
         f, tries = new_filter(1 + most, vehicles), new_tries(1 + most, vehicles)
@@ -150,7 +151,7 @@ def run_filter(
             step(f, tries, model, own, rows, who, count)
             fixes[run, t] = f.member[0, OUT + 3]
             for i in range(FOUND):
-                found[run, t, i] = f.ego[TOLD + i]
+                deviations[run, t, i] = f.ego[TOLD + i]
             for c in range(3):
                 x[run, t, c] = f.ego[ANSWER + c]
                 for d in range(3):
@@ -162,7 +163,7 @@ def run_filter(
                     notes[run, first + i, c] = weight(f.member[k, OUT + c], model.gate)
                 notes[run, first + i, 3] = f.member[k, OUT + 3]
                 notes[run, first + i, 4] = f.status[who[i], TRUSTED]
-    return x, cov, neighbours, fixes, notes, found
+    return x, cov, neighbours, fixes, notes, deviations
 
 
 @inside
@@ -253,11 +254,12 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     """Predict and update, and count what that says of a slip."""
     f.ego[LIKELY] = f.ego[NUMBERS] = f.ego[SQUARES] = 0.0
     leave(f, model, own, rows, vehicles, count)
-    louder(f, own, rows, vehicles, count)
+    scale_motion_noise(f, own, rows, vehicles, count)
     f.ego[SPAN] = own[DT]
+    f.ego[AGREED] += own[DT] if f.who[0, HITS] == 0 else 0.0
     if f.ego[STEPS] > 0:
         f.ego[CLOCK] += own[DT]
-    steady(f, model, f.who[0, VEHICLE], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
+    replace_implausible_velocity(f, model, f.who[0, VEHICLE], own, MOTION, MOTION_VARIANCE, 1.0 / own[DT])
     if f.ego[STEPS] > f.member[0, JOINED]:
         predict(f, model, own)
     moved(f, own)
@@ -272,7 +274,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     members = nearest_first(f)
     for i in range(members):
         k = f.who[i, ORDER]
-        new = f.member[k, VAGUE] > 0.0 and rows[f.who[k, INPUT], AGE] >= 0.0
+        new = f.member[k, EXTRA_VARIANCE] > 0.0 and rows[f.who[k, INPUT], AGE] >= 0.0
         if not (new and model.fix_gate > 0.0 and measured_whole(rows, f.who[k, INPUT])):
             receive(f, model, rows, k)
         goes_on(f, rows, k)
@@ -333,7 +335,7 @@ def add_fix(f: Filter, model: Model, own: Floats) -> None:
     for c in range(3):
         expect(f.h, c, own[FIX + c], level * own[FIX_VARIANCE + c])
     q = innovate(f.g, f.h)
-    if f.member[0, VAGUE] == 0.0:
+    if f.member[0, EXTRA_VARIANCE] == 0.0:
         learn_fix(f, FIXES)
         show(f)
     if q > model.fix_gate > 0.0 == f.ego[LEFT + 3] and not heard(f, False):
@@ -367,9 +369,9 @@ def weigh(f: Filter, model: Model, rows: Floats, k: int) -> None:
     g, h = f.g, f.h
     if not relate(f, model, rows, k):
         return
-    if f.member[k, VAGUE] > 0.0:
-        settle(g, h, k, f.member[k, VAGUE])
-        f.member[k, VAGUE] = f.member[k, OUT] = f.member[k, OUT + 1] = f.member[k, OUT + 2] = 0.0
+    if f.member[k, EXTRA_VARIANCE] > 0.0:
+        insert_from_measurement(g, h, k, f.member[k, EXTRA_VARIANCE])
+        f.member[k, EXTRA_VARIANCE] = f.member[k, OUT] = f.member[k, OUT + 1] = f.member[k, OUT + 2] = 0.0
         return
     innovate(g, h)
     score(f, h, GATE, False)
@@ -386,7 +388,7 @@ def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
     """Rows of range, azimuth and inclination of member k in metres, linear at AT; False if its geometry is not
     known."""
     g, h, row, std = f.g, f.h, f.who[k, INPUT], model.std
-    if not measured_whole(rows, row) and f.member[k, VAGUE] > 0.0:
+    if not measured_whole(rows, row) and f.member[k, EXTRA_VARIANCE] > 0.0:
         return False
     x, y, z = subtract(vector_at(f.member[k], AT // 3), vector_at(f.member[0], AT // 3))
     d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]

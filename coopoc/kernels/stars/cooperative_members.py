@@ -13,6 +13,7 @@ from .cooperative_state import (
     CLOCK,
     CONTRADICTED,
     DT,
+    EXTRA_VARIANCE,
     FIX,
     HITS,
     INPUT,
@@ -30,7 +31,6 @@ from .cooperative_state import (
     STEPS,
     TAU,
     TRUSTED,
-    VAGUE,
     VEHICLE,
     WAY,
     WHEN,
@@ -38,11 +38,11 @@ from .cooperative_state import (
     WILD,
     Filter,
     Model,
-    across,
-    doubt,
     insert_turn,
-    lost,
+    measured_vector,
     measured_whole,
+    needs_restart,
+    reset_bias,
     start,
 )
 from .gaussian import ABSENT, COMMON, ERROR, KINDS, PLACE, has, insert, remove, shift, widen
@@ -61,14 +61,14 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, co
     for i in range(count):
         if f.slot[vehicles[i]] >= 0:
             f.who[f.slot[vehicles[i]], INPUT] = i
-    again = model.fix_gate > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX]) and lost(f, model, own)
+    again = model.fix_gate > 0.0 and f.ego[STEPS] > 0 and not math.isnan(own[FIX]) and needs_restart(f, model, own)
     again = again and start(f, model, own, rows, count)
     for k in range(1, len(f.who)):
         j = f.who[k, VEHICLE]
         if j < 0 or (f.who[k, INPUT] >= 0 and not again and not contradicted(f, k)):
             continue
         if f.who[k, INPUT] >= 0 and f.status[j, TRUSTED] == 0.0:  # the error was estimated beside a wrong position
-            doubt(f, model, j)
+            reset_bias(f, model, j)
         for kind in range(KINDS):
             remove(f.g, k, kind)
         f.slot[j], f.who[k, VEHICLE] = ABSENT, ABSENT
@@ -110,7 +110,9 @@ def predict(f: Filter, model: Model, own: Floats) -> None:
 
 
 @inside
-def steady(f: Filter, model: Model, j: int, given: Floats, first: int, variance: int, unit: float) -> None:
+def replace_implausible_velocity(
+    f: Filter, model: Model, j: int, row: Floats, first: int, variance: int, unit: float
+) -> None:
     """Learn the level of vehicle j's motion from how its velocity changed, beyond what a vehicle can accelerate; where
     odometers may slip, put its last velocity in place of one that it cannot have reached since.
 
@@ -118,7 +120,7 @@ def steady(f: Filter, model: Model, j: int, given: Floats, first: int, variance:
         f: filter.
         model: noise model.
         j: vehicle.
-        given: row of the input.
+        row: row of the input.
         first: of its velocity or motion in the row.
         variance: of one step's motion in the row.
         unit: m/s of what the row holds.
@@ -126,19 +128,19 @@ def steady(f: Filter, model: Model, j: int, given: Floats, first: int, variance:
     dt, status, q = f.ego[SPAN], f.status[j], 0.0
     changed = (ACCELERATION * max(f.ego[CLOCK] - status[SINCE], dt)) ** 2
     for c in range(3):
-        gap = unit * given[first + c] - status[PACE + c]
-        q += gap * gap / ((given[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
+        gap = unit * row[first + c] - status[PACE + c]
+        q += gap * gap / ((row[variance + c] + status[PACE + 3 + c]) / (dt * dt) + changed)
     if model.forget > 0.0:
         more = (min(q, WIDEST) / 3.0 - 1.0) / min(f.ego[STEPS] + 1.0, CHANGES)
         status[LOUDER] = max(status[LOUDER] + (1.0 + status[LOUDER]) * more, 0.0)
     if model.slip > 0.0 and model.fix_gate > 0.0 and q > WILD and status[SLIPS] < SLIPPED:
         status[SLIPS] += 1.0
         for c in range(3):
-            given[first + c], given[variance + c] = status[PACE + c] / unit, status[PACE + 3 + c] + changed * dt * dt
+            row[first + c], row[variance + c] = status[PACE + c] / unit, status[PACE + 3 + c] + changed * dt * dt
         return
     status[SINCE], status[SLIPS] = f.ego[CLOCK], 0.0
     for c in range(3):
-        status[PACE + c], status[PACE + 3 + c] = unit * given[first + c], given[variance + c]
+        status[PACE + c], status[PACE + 3 + c] = unit * row[first + c], row[variance + c]
 
 
 @part
@@ -149,7 +151,7 @@ def stand(f: Filter, rows: Floats, k: int) -> None:
     ego, first = 3 * g.block[0, PLACE], 3 * g.block[k, PLACE]
     near, whole = 1.0 + max(rows[row, 0], 0.0), measured_whole(rows, row)
     for c in range(3):
-        g.x[first + c] = g.x[ego + c] + (across(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
+        g.x[first + c] = g.x[ego + c] + (measured_vector(rows, row, c) if whole else near * (1.0 if c < 2 else 0.1))
 
 
 @part
@@ -160,7 +162,7 @@ def join(f: Filter, model: Model, rows: Floats, vehicle: int, row: int) -> None:
         k += 1
     f.who[k, VEHICLE], f.slot[vehicle], f.who[k, INPUT] = vehicle, k, row
     f.member[k, LOCKED] = 0.0
-    f.member[k, JOINED], f.member[k, VAGUE], age = f.ego[STEPS], model.flat, max(rows[row, AGE], 0.0)
+    f.member[k, JOINED], f.member[k, EXTRA_VARIANCE], age = f.ego[STEPS], model.flat, max(rows[row, AGE], 0.0)
     f.member[k, WHEN] = f.ego[CLOCK] - age
     for c in range(3):
         f.who[k, HITS + c], f.member[k, WAY + c] = 0, 0.0

@@ -11,17 +11,21 @@ from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import add_diagonal, scale, store
 from ..dead_reckoning import ROUNDING
 from ..gate import FIX_GATE, PATIENCE, SLIP, count, inflation
-from .cooperative_members import stand, steady
+from .cooperative_members import replace_implausible_velocity, stand
 from .cooperative_state import (
     AGE,
+    AGREED,
     CLOCK,
     COUNT,
     COVARIANCE,
+    ESTABLISHED,
+    EXTRA_VARIANCE,
     FIXES,
     INPUT,
     LAST,
     LEVEL,
     LOCKED,
+    LONGEST,
     MEAN,
     MESSAGES,
     NO_POSITION,
@@ -43,14 +47,13 @@ from .cooperative_state import (
     TRUSTED,
     TYPICAL,
     USED,
-    VAGUE,
     VEHICLE,
     WAY,
     WHEN,
     WINDOW,
     Filter,
     Model,
-    doubt,
+    reset_bias,
 )
 from .gaussian import (
     ABSENT,
@@ -67,8 +70,8 @@ from .gaussian import (
     expect,
     has,
     innovate,
+    insert_from_measurement,
     remove,
-    settle,
     term,
     update,
 )
@@ -158,7 +161,7 @@ def receive(f: Filter, model: Model, rows: Floats, k: int) -> None:
     sent = f.ego[CLOCK] - age
     if age < 0.0 and f.member[k, WHEN] < f.ego[CLOCK]:  # nothing is known of its motion
         f.member[k, WHEN] = f.ego[CLOCK]
-        f.member[k, VAGUE] += model.flat
+        f.member[k, EXTRA_VARIANCE] += model.flat
         stand(f, rows, k)
     if age < 0.0 or sent <= status[USED] + ROUNDING:
         return
@@ -169,15 +172,15 @@ def receive(f: Filter, model: Model, rows: Floats, k: int) -> None:
         f.member[k, WAY + c] = rows[row, ODOMETER + c] - status[LAST + 6 + c]
         status[LAST + 6 + c] = rows[row, ODOMETER + c]
         rows[row, ODOMETER + c] = f.member[k, WAY + c] / gap if follows and steps > 1.0 else rows[row, SPEED + c]
-    steady(f, model, j, rows[row], ODOMETER, STEP, 1.0)
+    replace_implausible_velocity(f, model, j, rows[row], ODOMETER, STEP, 1.0)
     drive(f, model, k, scale(vector_at(rows[row], ODOMETER // 3), gap), gap)
     half, often = 0.5 * (1.0 + 1.0 / steps), steps if follows else (gap / dt) ** 2
     for c in range(3):
         g.p[first + c, first + c] += half * often * rows[row, STEP + c]
-    if content(f, model, rows, k, sent, steps, again, follows):
+    if message_rows(f, model, rows, k, sent, steps, again, follows):
         q = innovate(g, f.h)
         whole = f.h.block[MEASURED] + f.h.block[MEASURED + 1] + f.h.block[MEASURED + 2] == 3
-        if again and f.member[k, VAGUE] == 0.0 and status[TRUSTED] > 0.0 and whole:
+        if again and f.member[k, EXTRA_VARIANCE] == 0.0 and status[TRUSTED] > 0.0 and whole:
             learn_fix(f, MESSAGES)
         f.member[k, OUT + 3] = use_fix(f, model, k, again, q)
     for c in range(3):
@@ -187,7 +190,7 @@ def receive(f: Filter, model: Model, rows: Floats, k: int) -> None:
 
 
 @inside
-def content(
+def message_rows(
     f: Filter, model: Model, rows: Floats, k: int, sent: float, steps: float, again: bool, follows: bool
 ) -> bool:
     """Rows of the fixes that member k has taken since its last message; False if there are none.
@@ -245,15 +248,15 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
     g, h, j, used = f.g, f.h, f.who[k, VEHICLE], 0
     for c in range(3):
         used += h.block[MEASURED + c]
-    if f.member[k, VAGUE] > 0.0 and used == 3:
-        settle(g, h, k, f.member[k, VAGUE])
-        f.member[k, VAGUE] = 0.0
+    if f.member[k, EXTRA_VARIANCE] > 0.0 and used == 3:
+        insert_from_measurement(g, h, k, f.member[k, EXTRA_VARIANCE])
+        f.member[k, EXTRA_VARIANCE] = 0.0
         return 1.0
     judged = k > 0 or heard(f, False)  # alone, errors of the receiver and of the odometer cannot be separated
     if model.fix_gate > 0.0 and judged and again and used == 3 and q > 0.0 and wrong(f, model, k, q):
         if f.status[j, TRUSTED] > 0.0:
             f.status[j, REVOKED] += 1.0
-        doubt(f, model, j)
+        reset_bias(f, model, j)
         if k == 0:  # so that it counts in retrospect, should its receiver be trusted again
             f.member[0, LOCKED] = 0.0
             fix_terms(f, 0)
@@ -271,6 +274,8 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
     if model.fix_gate > 0.0:
         share = 1.0 / inflation(q, model.fix_gate, f.member[k, LOCKED])
         f.member[k, LOCKED] = count(q, model.fix_gate, f.member[k, LOCKED], own / (own + noise))
+        if not judged and f.ego[AGREED] >= ESTABLISHED:
+            f.member[0, LOCKED] = min(f.member[0, LOCKED], LONGEST)
     score(f, h, FIX_SCORE, True)
     correct(g, h, share)
     return share

@@ -49,6 +49,9 @@ NO_POSITION = 1e200
 SLIPPED, WILD = 5.0, 32.0
 """Implausible velocities in a row after which one counts again, and the squared normalised distance from which a
 velocity is, or an error of fixes, beyond doubt."""
+ESTABLISHED, LONGEST = 60.0, 0.99 * PATIENCE
+"""s of agreement with fixes after which a position was no wrong start, and its count of lock-out at which fixes that
+contradict it are taken for noisier ones: it is not left."""
 CHANGES, WIDEST = 20.0, 9.0
 """Velocities in the level of their noise, fewer at first, and the most of a squared normalised change that counts."""
 
@@ -128,19 +131,19 @@ VEHICLE, INPUT, ORDER, HITS, WHO = 0, 1, 2, 3, 6
 """Of a slot: its vehicle, ABSENT for none, its row of the step's input, ABSENT for none, and how often in a row each of
 three components exceeded its gate; the ego's first counts its fixes. ORDER lists the slots of the members, nearest
 first: a gate depends on what was used before, not on how members are numbered."""
-WAY, AT, WHEN, JOINED, VAGUE, LOCKED, OUT, MEMBER = 0, 3, 6, 7, 8, 9, 10, 14
+WAY, AT, WHEN, JOINED, EXTRA_VARIANCE, LOCKED, OUT, MEMBER = 0, 3, 6, 7, 8, 9, 10, 14
 """Of a member: the way m that it has moved since it was at its position; where relative measurements are linear m; when
 it was there, s, which is when it sent its newest message; the step at which it joined; variance of its position beyond
 that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of its fixes; and, out, the squared
 normalised innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing
 was: the ego's are those of its fix."""
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
-LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, LEFT, EGO = 20, 26, 32, 38, 49, 52, 61, 65
+LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, LEFT, AGREED, EGO = 20, 26, 32, 38, 49, 52, 61, 65, 66
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
 of motion makes, and the whole then; fifteen numbers of `otherwise` on slips; by kind of number the logarithm of its
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
 is otherwise than assumed, and position m and covariance m^2; and where it would be m, had fixes not led it away, and
-the variance of that m^2, 0 for none."""
+the variance of that m^2, 0 for none; and for how long s fixes have agreed with its position."""
 
 
 class Filter(NamedTuple):
@@ -244,21 +247,27 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
     fix is not used. Of an ego that is not trusted all must agree with the fix: two that multipath displaced do so by
     chance; else nothing is changed, and False returned.
     """
-    best, most, heard, mine, g, ego = ABSENT, 1, 0, 0, f.g, f.who[0, VEHICLE]
+    best, most, heard, own_votes, g, ego = ABSENT, 1, 0, 0, f.g, f.who[0, VEHICLE]
     for i in range(-1, count if model.fix_gate > 0.0 else -1):
         agree = 0
         for j in range(-1, count):
-            agree += apart(own, rows, i, j) <= model.fix_gate
+            agree += mahalanobis2(own, rows, i, j) <= model.fix_gate
         heard += agree > 0
         if i < 0:
-            mine = agree
+            own_votes = agree
         if agree > most:
             best, most = i, agree
-    if mine < max(heard, 2) and f.status[ego, TRUSTED] == 0.0:
+    if own_votes < max(heard, 2) and f.status[ego, TRUSTED] == 0.0:
         return False
     if not young(f):
         remember(f)
-    f.member[0, VAGUE], f.member[0, JOINED], f.who[0, HITS], f.member[0, LOCKED] = model.flat, f.ego[STEPS], 0, 0.0
+    f.member[0, EXTRA_VARIANCE], f.member[0, JOINED], f.who[0, HITS], f.member[0, LOCKED] = (
+        model.flat,
+        f.ego[STEPS],
+        0,
+        0.0,
+    )
+    f.ego[AGREED] = 0.0
     f.status[ego, TRUSTED], f.status[ego, COUNT] = 1.0, 0.0
     clear(g, 0)
     remove(g, 0, ERROR)
@@ -266,8 +275,9 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
         insert(g, 0, ERROR, model.own)
     for c in range(3):
         g.x[c], f.status[ego, MEAN + c] = own[FIX + c], 0.0
-    if mine <= 1 and best >= 0:
-        f.member[0, VAGUE] = 0.0
+        f.ego[LEFT + c] += own[MOTION + c]
+    if own_votes <= 1 and best >= 0:
+        f.member[0, EXTRA_VARIANCE] = 0.0
         for c in range(3):
             g.x[c], own[FIX + c] = seen_from(rows, best, c), math.nan
         widen(g, 0, model.flat)
@@ -308,7 +318,7 @@ def returned(f: Filter, own: Floats) -> bool:
 
 
 @part
-def lost(f: Filter, model: Model, own: Floats) -> bool:
+def needs_restart(f: Filter, model: Model, own: Floats) -> bool:
     """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either all fixes but the first
     contradict it, or fixes have for so long that they would be used again (and turn its odometry towards them), or,
     alone, are where it was before they led it away; or its receiver is not trusted beside others that are not. One
@@ -325,12 +335,12 @@ def lost(f: Filter, model: Model, own: Floats) -> bool:
     if f.status[ego, TRUSTED] > 0.0:
         again = f.member[0, LOCKED] >= PATIENCE or (others == 0 and returned(f, own))
         return bool((hits >= 2 and young(f)) or (hits > 0 and again))
-    far, apart, noise = 0.0, 0.0, 0.0
+    far, between, noise = 0.0, 0.0, 0.0
     first, other = 3 * f.g.block[0, ERROR], 3 * f.g.block[last, ERROR]
     for c in range(3):
         far, noise = far + f.g.x[first + c] ** 2, noise + own[FIX_VARIANCE + c] / 3.0
-        apart += (f.g.x[first + c] - f.g.x[other + c]) ** 2
-    agree = far > FIX_GATE * noise and apart < FIX_GATE * noise
+        between += (f.g.x[first + c] - f.g.x[other + c]) ** 2
+    agree = far > FIX_GATE * noise and between < FIX_GATE * noise
     return bool(others >= 2 or (others == 1 and (far > WILD * noise or agree)))
 
 
@@ -350,7 +360,7 @@ def pause(f: Filter, dt: float) -> None:
 
 
 @part
-def doubt(f: Filter, model: Model, j: int) -> None:
+def reset_bias(f: Filter, model: Model, j: int) -> None:
     """The fixes of vehicle j have an error of which nothing is known."""
     f.status[j, TRUSTED] = f.status[j, COUNT] = 0.0
     for c in range(3):
@@ -361,7 +371,7 @@ def doubt(f: Filter, model: Model, j: int) -> None:
 
 
 @part
-def apart(own: Floats, rows: Floats, i: int, j: int) -> float:
+def mahalanobis2(own: Floats, rows: Floats, i: int, j: int) -> float:
     """Squared Mahalanobis distance of two positions of the ego: of a neighbour's message less the measured vector, or,
     -1, its own fix; infinite if one is missing."""
     total = 0.0
@@ -382,12 +392,12 @@ def apart(own: Floats, rows: Floats, i: int, j: int) -> float:
 @part
 def seen_from(rows: Floats, row: int, c: int) -> float:
     """Component c m of where the ego is by a neighbour's message; NaN if that has no position."""
-    position = rows[row, SOLO + c] + rows[row, AGE] * rows[row, SPEED + c] - across(rows, row, c)
+    position = rows[row, SOLO + c] + rows[row, AGE] * rows[row, SPEED + c] - measured_vector(rows, row, c)
     return float(position if rows[row, SOLO_VARIANCE + c] < NO_POSITION else math.nan)
 
 
 @part
-def across(rows: Floats, row: int, c: int) -> float:
+def measured_vector(rows: Floats, row: int, c: int) -> float:
     """Component c of the measured vector to a neighbour, m."""
     d, sa, ca, si, ci = rows[row, 0], rows[row, 1], rows[row, 2], rows[row, 3], rows[row, 4]
     return float(d * ci if c == 2 else d * si * (ca if c == 0 else sa))

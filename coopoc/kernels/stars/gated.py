@@ -16,7 +16,7 @@ from ...arrays import Floats
 from ..compiling.compile import inner, inside, storage
 from ..compiling.small import add, add_diagonal, choose_each, load, scale, store, subtract, times, zeros
 from ..compiling.vectors import LANES, choose, take
-from ..gate import FIX_GATE, LEAK, NOTHING, YOUNG, distance, gain_of, gated_update, inflation, remember, total
+from ..gate import FIX_GATE, INITIAL_LOCKOUT, LEAK, NOTHING, distance, gain_of, gated_update, inflation, remember, total
 from ..geometry import Numbers, axes, direction, incomplete, residuals
 from .messages import (
     BLOCK,
@@ -68,10 +68,10 @@ def carry(star: Star, gates: Gates, flat: float, n: int, old: int) -> None:
     there, spread = add(memory[:3], moved_of(star, 0)), add_diagonal(memory[3:12], own)
     store(gates.before, 0, (*there, *spread, *memory[12:]))
     for k in range(n):
-        place, process = star.previous[k], process_of(star, k)
-        before = load(gates.last, max(place, 0), STATE)
-        if place < 0:
-            y, f = 0.0 * own[0] + YOUNG, 0.0 * own[0] + flat
+        previous, process = star.previous[k], process_of(star, k)
+        before = load(gates.last, max(previous, 0), STATE)
+        if previous < 0:
+            y, f = 0.0 * own[0] + INITIAL_LOCKOUT, 0.0 * own[0] + flat
             before, process = (*zeros(y, BLOCK), y, y, y, 0.0 * y), (f, f, f)
             process = variance_of(star, 0) if k == 0 else process
         elif k > 0:
@@ -119,14 +119,14 @@ def gate_star(star: Star, gates: Gates, state: Floats, placed: Floats, least: fl
     o, hits = 0.0 * ego[12], ego[12]
     total = own = gate_position(star, 0, origin, ego[:9], hits)
     for k in range(1, n):
-        at, seen, memory = vector_at(state, k), load(star.relative, k, RELATIVE), load(gates.state, k, STATE)
-        std = seen[5:]
-        if incomplete(seen):
+        at, polar, memory = vector_at(state, k), load(star.relative, k, RELATIVE), load(gates.state, k, STATE)
+        std = polar[5:]
+        if incomplete(polar):
             far = o + math.inf
             std = choose_each(take(placed, k) - 0.5, std, (far, far, far))
-        cov, moved, factor, three = gate_components(subtract(at, origin), memory[:9], seen, std, memory[9:12], least)
+        cov, moved, factor, three = gate_components(subtract(at, origin), memory[:9], polar, std, memory[9:12], least)
         store(gates.state, k, (*cov, *three, o))
-        store(star.relative, k, inflated(seen, factor))
+        store(star.relative, k, inflated(polar, factor))
         total = total + gate_position(star, k, add(at, moved), add(ego[:9], cov), hits)
     store(gates.state, 0, (*ego[:12], choose(own, max(hits + total, o), max(hits + LEAK * own, o))))
 

@@ -30,11 +30,11 @@ from .messages import BLOCK, ROW, block_at, vector_at
 
 PLACE, ERROR, TURN, FRESH, COMMON, COMPASS = range(6)
 """Kinds of vectors: position m, error of its fixes m, (heading rad, scale, nothing) by which its odometry errs, and
-scratch of `settle`; of the ego the error m that all fixes share, and (bias, noise of this step) of its compass, rad,
-with the offset m of its ranges."""
+scratch of `insert_from_measurement`; of the ego the error m that all fixes share, and (bias, noise of this step) of its
+compass, rad, with the offset m of its ranges."""
 KINDS, TERMS = 6, 4
 ABSENT = -1
-REJECTED = 4.0
+HARD_REJECT_FACTOR = 4.0
 """Times the gate: from there on a number is not only down-weighted."""
 
 
@@ -192,7 +192,7 @@ def weight(q: float, gate: float) -> float:
     """Share of its information that a number keeps: 1 / (inflation of the innovation's covariance)."""
     if gate == 0.0 or not q > gate:
         return 1.0 + 0.0 * q
-    return gate / q * (0.01 if q > REJECTED * gate else 1.0)
+    return gate / q * (0.01 if q > HARD_REJECT_FACTOR * gate else 1.0)
 
 
 @part
@@ -231,7 +231,8 @@ def innovate(g: Gaussian, h: Rows) -> float:
     """Decorrelate each row from those before it, and gate it; squared Mahalanobis distance of the three.
 
     `gain` is U = P H^T L^-T, S = L L^T the innovation's covariance. Where the squared normalised innovation q of a row
-    exceeds its gate, its variance is multiplied by q / gate, and by 100 more where it exceeds REJECTED times the gate.
+    exceeds its gate, its variance is multiplied by q / gate, and by 100 more where it exceeds HARD_REJECT_FACTOR times
+    the gate.
     """
     project(g, h)
     if h.three[CURVE] > 0.0:
@@ -302,15 +303,15 @@ def correct(g: Gaussian, h: Rows, share: float) -> None:
 
 
 @part
-def settle(g: Gaussian, h: Rows, member: int, flat: float) -> None:
+def insert_from_measurement(g: Gaussian, h: Rows, member: int, flat: float) -> None:
     """Update by three rows of a position x whose variance is `flat` m^2 more than P says, without its large numbers.
 
     With z = A x + B y + w the position is A^-1 (z - B y - w), which is put into the state as another vector; that both
     are the same but for N(0, flat) is then the measurement, and the vector replaces the position.
     """
-    place, n, b = g.block[member, PLACE], 3 * g.vectors[0], BLOCK
+    position, n, b = g.block[member, PLACE], 3 * g.vectors[0], BLOCK
     for k in range(h.block[TERMS]):
-        if h.block[k] == place:
+        if h.block[k] == position:
             a = block_at(h.matrix, k)
             b = minus_product(inverse(less_transposed_product(BLOCK, a, a)), transpose(a))
             store(h.matrix, k, BLOCK)
@@ -328,12 +329,12 @@ def settle(g: Gaussian, h: Rows, member: int, flat: float) -> None:
             for k in range(3):
                 g.p[new + c, new + d] += b[3 * c + k] * h.three[VARIANCE + k] * b[3 * d + k]
     term(h, 0, new // 3, 1.0)
-    term(h, 1, place, -1.0)
+    term(h, 1, position, -1.0)
     for c in range(3):
         expect(h, c, 0.0, flat)
     update(g, h, 0.0)
     remove(g, member, PLACE)
-    g.block[member, PLACE], g.vectors[1 + place], g.block[member, FRESH] = place, member * KINDS + PLACE, ABSENT
+    g.block[member, PLACE], g.vectors[1 + position], g.block[member, FRESH] = position, member * KINDS + PLACE, ABSENT
 
 
 @part

@@ -188,11 +188,11 @@ def predict_state(star: Star, joint: Joint, n: int, old: int) -> None:
         store(joint.move, k, vector_at(joint.state, k))
     clear(joint.process)
     for k in range(n):
-        place = star.previous[k]
-        if place >= 0:
-            at = add(vector_at(joint.move, place), moved_of(star, k))
+        previous = star.previous[k]
+        if previous >= 0:
+            at = add(vector_at(joint.move, previous), moved_of(star, k))
             store(joint.state, k, at)
-            store(joint.process, block_of(place, old), process_information(star, k))
+            store(joint.process, block_of(previous, old), process_information(star, k))
         elif k == 0:
             store(joint.state, k, position_of(star, k))
         else:
@@ -202,16 +202,16 @@ def predict_state(star: Star, joint: Joint, n: int, old: int) -> None:
 @inside
 def first_place(star: Star, k: int, ego: Numbers) -> Numbers:
     """Position of a member that joins: as measured, else as broadcast, else somewhere near the ego."""
-    seen = load(star.relative, k, RELATIVE)
-    measured: Numbers = add(ego, vector(seen))
-    if not incomplete(seen):
+    polar = load(star.relative, k, RELATIVE)
+    measured: Numbers = add(ego, vector(polar))
+    if not incomplete(polar):
         return measured
     new = take(star.status, 5 * k + NEW) - 0.5
-    near = seen[0] + 1.0
+    near = polar[0] + 1.0
     somewhere = add(ego, (near, near, 0.1 * near))
     broadcast = choose_each(new, position_of(star, k), somewhere)
-    place: Numbers = choose_each(missing(seen), broadcast, measured)
-    return place
+    position: Numbers = choose_each(missing(polar), broadcast, measured)
+    return position
 
 
 @inner
@@ -275,24 +275,24 @@ def copy(source: Floats, target: Floats, n: int, stride: int) -> None:
 def relative_information(star: Star, joint: Joint, k: int, std: Floats, least: float) -> tuple[Numbers, Numbers]:
     """Information of the converted measurement of member k at the predicted geometry, and what it adds to the
     information vector: W and W (measured vector - predicted vector)."""
-    seen, gap = load(star.relative, k, RELATIVE), subtract(vector_at(joint.state, k), vector_at(joint.state, 0))
-    weight, eta = converted(gap, seen, len(std) == 0, least)
-    if incomplete(seen):
-        known = placed(joint, k, seen)
-        weight, eta = scale(weight, known), scale(eta, known)
+    polar, gap = load(star.relative, k, RELATIVE), subtract(vector_at(joint.state, k), vector_at(joint.state, 0))
+    weight, eta = converted(gap, polar, len(std) == 0, least)
+    if incomplete(polar):
+        is_placed = placed(joint, k, polar)
+        weight, eta = scale(weight, is_placed), scale(eta, is_placed)
     return weight, eta
 
 
 @inside
 def exact_information(star: Star, joint: Joint, k: int, n: int, least: float) -> tuple[Numbers, Numbers]:
     """The same of range and angles, linear at the state moved by `move`, as seen from the state."""
-    seen = load(star.relative, k, RELATIVE)
+    polar = load(star.relative, k, RELATIVE)
     ahead = subtract(vector_at(joint.move, k - 1), vector_at(joint.move, n - 1))
     gap = add(subtract(vector_at(joint.state, k), vector_at(joint.state, 0)), ahead)
-    weight, eta = exact(gap, seen, least)
-    if incomplete(seen):
-        known = placed(joint, k, seen)
-        weight, eta = scale(weight, known), scale(eta, known)
+    weight, eta = exact(gap, polar, least)
+    if incomplete(polar):
+        is_placed = placed(joint, k, polar)
+        weight, eta = scale(weight, is_placed), scale(eta, is_placed)
     return weight, plus_applied(eta, weight, ahead)
 
 

@@ -103,9 +103,9 @@ def add_laplacian(star: Star, joint: Joint, model: Assumptions, n: int) -> None:
 @inside
 def edge_to(star: Star, joint: Joint, k: int) -> tuple[float, Numbers]:
     """1 if the measurement of member k is complete, else 0; the measured vector less the predicted one m, or 0."""
-    seen = load(star.relative, k, RELATIVE)
-    edge = whole(seen)
-    gap = subtract(vector(seen), subtract(vector_at(joint.state, k), vector_at(joint.state, 0)))
+    polar = load(star.relative, k, RELATIVE)
+    edge = whole(polar)
+    gap = subtract(vector(polar), subtract(vector_at(joint.state, k), vector_at(joint.state, 0)))
     return edge, scale(gap, edge)
 
 

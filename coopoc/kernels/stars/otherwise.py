@@ -33,15 +33,19 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import part, storage
 from .cooperative_state import (
+    AGREED,
     ANSWER,
     COVARIANCE,
     DT,
+    ESTABLISHED,
     FIX_VARIANCE,
     FIXES,
     INFORMATION,
     KINDS_OF_NUMBERS,
     LEFT,
     LEVEL,
+    LOCKED,
+    LONGEST,
     LOUDER,
     MADE,
     MOTION,
@@ -104,6 +108,7 @@ def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt
     first, way = 3 * g.block[k, PLACE], turned(f, k, moved)
     for c in range(3):
         g.x[first + c] += way[c]
+        f.ego[LEFT + c] += way[c] if k == 0 else 0.0
     if not has(g, k, TURN):
         return
     i, n, keep = 3 * g.block[k, TURN], 3 * g.vectors[0], math.exp(-dt / model.lasts)
@@ -298,7 +303,7 @@ PRIOR = 10.0
 
 
 @part
-def louder(f: Filter, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
+def scale_motion_noise(f: Filter, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Multiply the variances of a step's motions by their level, and by that of each vehicle's velocities."""
     level = math.exp(f.ego[LEVEL + MOTIONS])
     for c in range(3):
@@ -313,10 +318,8 @@ def moved(f: Filter, own: Floats) -> None:
     where it would be, had it not left."""
     q = own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
     f.ego[MADE] += q
-    f.ego[WHOLE] = ego_variance(f)
-    f.ego[LEFT + 3] += q / 3.0 if f.ego[LEFT + 3] > 0.0 else 0.0
-    for c in range(3):
-        f.ego[LEFT + c] += own[MOTION + c]
+    more, f.ego[WHOLE] = max(ego_variance(f) - f.ego[WHOLE], q), ego_variance(f)
+    f.ego[LEFT + 3] += more / 3.0 if f.ego[LEFT + 3] > 0.0 else 0.0
 
 
 @part
@@ -345,14 +348,15 @@ def learn(f: Filter, kind: int, more: float, share: float, numbers: float) -> No
 @part
 def learn_fix(f: Filter, kind: int) -> None:
     """Count the innovation of a fix."""
-    h, square, apart, r, s = f.h, 0.0, 0.0, 0.0, 0.0
+    h, innovation2, change2, r, s = f.h, 0.0, 0.0, 0.0, 0.0
     for c in range(3):
-        square += h.three[GAP + c] * h.three[GAP + c]
-        apart += (h.three[GAP + c] - f.ego[BEFORE + c]) ** 2
+        innovation2 += h.three[GAP + c] * h.three[GAP + c]
+        change2 += (h.three[GAP + c] - f.ego[BEFORE + c]) ** 2
         r += h.three[VARIANCE + c]
         s += h.three[VARIANCE + c] + h.matrix[COV + 4 * c]
-    wild = kind == FIXES and square > SUDDEN * s
-    more = min((0.5 * apart if wild else square) / s, SUDDEN) - 1.0  # where all are far away, they need not be noisier
+    wild = kind == FIXES and innovation2 > SUDDEN * s
+    displaced = wild and (f.ego[AGREED] < ESTABLISHED or f.member[0, LOCKED] < LONGEST)
+    more = min((0.5 * change2 if displaced else innovation2) / s, SUDDEN) - 1.0
     learn(f, kind, more, r / s, 3.0)
     if kind == FIXES and not wild:  # what is wild says nothing of motion
         learn(f, MOTIONS, more, f.ego[MADE] / s, 3.0)

@@ -204,13 +204,13 @@ def add_neighbours(star: Star, model: Assumptions, fusion: Fusion, x: Numbers, n
             ahead = add(own_cov(fusion), theirs)
             _, _, factor, _ = gate_components(gap, ahead, relative, relative[5:], (o, o, o), model.min_range)
             relative = inflated(relative, factor)
-        seen = completed(relative, polar)
+        complete = completed(relative, polar)
         if len(model.relative_std):
-            noise = cov_of(seen if fusion.naive else polar, relative, model.min_range)
+            noise = cov_of(complete if fusion.naive else polar, relative, model.min_range)
         elif fusion.naive:
             theirs = scale(theirs, 0.0)
         held = take(star.status, 5 * k + (NEW if fusion.naive else HELD))
-        gap = subtract(gap, vector(seen))
+        gap = subtract(gap, vector(complete))
         if fusion.robust:
             f = inflation(distance(gap, add(ahead, noise)), FIX_GATE, o)
         counts = choose(o + 1e300 - f, held, o)
@@ -255,10 +255,10 @@ def source(fusion: Fusion, k: int, s: float) -> tuple[Numbers, Numbers, Numbers]
     root = scale(inverse(add(d, scale(i, s))), take(fusion.used, k))
     share = product(root, d)
     derivative = product(share, root)
-    bend = scale(derivative, 0.0)
+    d2p_dw2 = scale(derivative, 0.0)
     if fusion.split:
-        bend = scale(subtract(derivative, product(share, derivative)), 1.0 / max(s, 0.0 * s + 1e-12))
-    return scale(root, s), derivative, bend
+        d2p_dw2 = scale(subtract(derivative, product(share, derivative)), 1.0 / max(s, 0.0 * s + 1e-12))
+    return scale(root, s), derivative, d2p_dw2
 
 
 @inner
@@ -284,22 +284,22 @@ def best_weight(fusion: Fusion, fixed: Numbers, n: int, w: float) -> float:
 @inner
 def derivatives(fusion: Fusion, fixed: Numbers, n: int, w: float) -> tuple[float, float]:
     """First and second derivative of tr P by w."""
-    total, slope, bend = fixed, scale(fixed, 0.0), scale(fixed, 0.0)
+    total, dp_dw, d2p_dw2 = fixed, scale(fixed, 0.0), scale(fixed, 0.0)
     for k in range(n):
         information, derivative, curvature = source(fusion, k, w if k == 0 else 1.0 - w)
-        total, bend = add(total, information), add(bend, curvature)
-        slope = add(slope, derivative) if k == 0 else subtract(slope, derivative)
+        total, d2p_dw2 = add(total, information), add(d2p_dw2, curvature)
+        dp_dw = add(dp_dw, derivative) if k == 0 else subtract(dp_dw, derivative)
     p = inverse(total)
     twice = product(p, p)
-    bend = add(product(product(slope, p), slope), bend)
-    return -inner_product(twice, slope), 2.0 * inner_product(twice, transpose(bend))
+    d2p_dw2 = add(product(product(dp_dw, p), dp_dw), d2p_dw2)
+    return -inner_product(twice, dp_dw), 2.0 * inner_product(twice, transpose(d2p_dw2))
 
 
 @inside
 def product(a: Numbers, b: Numbers) -> Numbers:
     """A B."""
-    found: Numbers = negate(minus_product(a, b))
-    return found
+    result: Numbers = negate(minus_product(a, b))
+    return result
 
 
 @inside

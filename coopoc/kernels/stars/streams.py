@@ -20,6 +20,7 @@ from .cooperative_state import (
     AGE,
     ANSWER,
     DT,
+    EXTRA_VARIANCE,
     FIX,
     FIX_VARIANCE,
     MOTION,
@@ -29,7 +30,6 @@ from .cooperative_state import (
     STEP,
     STEPS,
     TYPICAL,
-    VAGUE,
     WAY,
     Filter,
     Model,
@@ -43,7 +43,7 @@ from .otherwise import Tries, new_tries
 
 @compiled
 def stream_rows(
-    given: Floats,
+    numbers: Floats,
     history: Floats,
     motion: MotionNoise,
     fix: Floats,
@@ -59,7 +59,7 @@ def stream_rows(
     the newest message of each. `kernels.dead_reckoning` says when it is NO_FIX_YET or BAD_INPUT; then nothing changes.
 
     Args:
-        given: (8,) fix m, velocity m/s, dt s, age of the fix s.
+        numbers: (8,) fix m, velocity m/s, dt s, age of the fix s.
         history: of `motion`.
         motion: noise.
         fix: (3,) m^2, variance of a fix.
@@ -71,13 +71,13 @@ def stream_rows(
         max_age: s, of the oldest message that counts.
         memory: of `remember`, of the ego.
     """
-    since, late, dt = np.zeros(3), np.zeros(3), given[6]
-    outcome = dead_reckon(given, history, motion, own[MOTION:MOTION_VARIANCE], own[MOTION_VARIANCE:DT], since, late)
+    since, late, dt = np.zeros(3), np.zeros(3), numbers[6]
+    outcome = dead_reckon(numbers, history, motion, own[MOTION:MOTION_VARIANCE], own[MOTION_VARIANCE:DT], since, late)
     if outcome == BAD_INPUT:
         return BAD_INPUT
     own[DT], interval = dt, motion.interval if motion.interval > 0.0 else dt
     for c in range(3):
-        own[FIX + c], own[FIX_VARIANCE + c] = given[c] + since[c], fix[c] + late[c]
+        own[FIX + c], own[FIX_VARIANCE + c] = numbers[c] + since[c], fix[c] + late[c]
     remember(memory, own[MOTION:MOTION_VARIANCE], own[FIX:FIX_VARIANCE], own[FIX_VARIANCE:MOTION], dt)
     for i in range(len(rows)):
         row, newest, sent = rows[i], last[vehicles[i]], time - rows[i, AGE]
@@ -123,7 +123,7 @@ def stream_step(
     if f.g.vectors[0] == 0:
         begin(f, model, own, rows, len(vehicles), 0)
         if math.isfinite(start[0]):
-            f.ego[STEPS], f.member[0, VAGUE] = 1, 0.0
+            f.ego[STEPS], f.member[0, EXTRA_VARIANCE] = 1, 0.0
             for c in range(3):
                 f.g.x[c] = start[c]
     step(f, tries, model, own, rows, vehicles, len(vehicles))

@@ -143,15 +143,15 @@ class PoseFilter:
             for k, column in enumerate(columns):
                 box = inbox(recording, column, self.message)
                 received[:, k], sent[:, k] = box.received_bytes, box.sent_bytes
-        found = np.ascontiguousarray(x[..., :3]), np.ascontiguousarray(cov[..., :3, :3])
-        notes += doubts(recording, columns, *found)
+        positions = np.ascontiguousarray(x[..., :3]), np.ascontiguousarray(cov[..., :3, :3])
+        notes += doubts(recording, columns, *positions)
         extras: dict[str, Floats] = {}
         for k, name in enumerate(("speed_scale", "yaw_rate_bias", "range_offset")[: x.shape[-1] - 4], 4):
             extras |= {name: x[..., k], f"{name}_std": np.sqrt(cov[..., k, k])}
         return Track(
             recording.t,
             tuple(columns),
-            *found,
+            *positions,
             received,
             sent,
             clock() - began,
@@ -219,10 +219,10 @@ class PoseFilter:
 
     def noise(self, sensors: Sensors, dt: float) -> PoseNoise:
         """What it assumes, as the kernel takes it."""
-        found = pose_noise(sensors, dt, self.gate)
-        lasting = any(found.lasting) if self.lasting is None else self.lasting
-        found = found if lasting else found._replace(longer=0.0, lasting=(0.0, 0.0, 0.0))
-        return found if self.robust else found._replace(gate=np.inf)
+        assumed = pose_noise(sensors, dt, self.gate)
+        lasting = any(assumed.lasting) if self.lasting is None else self.lasting
+        assumed = assumed if lasting else assumed._replace(longer=0.0, lasting=(0.0, 0.0, 0.0))
+        return assumed if self.robust else assumed._replace(gate=np.inf)
 
     def options(self, noise: PoseNoise) -> PoseOptions:
         """As the kernel takes them."""

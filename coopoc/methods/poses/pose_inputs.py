@@ -82,11 +82,13 @@ def first_poses(recording: Recording, begin: Floats | None, columns: Sequence[in
         InputError: another shape, or an unknown pose.
     """
     shape = (recording.runs, len(recording.ids), 4)
-    given = np.full(shape[1:], np.nan) if begin is None else checked("begin", begin)
-    if given.shape not in (shape, shape[1:]):
-        raise InputError("begin", f"shape {given.shape}", f"must have shape {shape[1:]} or {shape}", "One pose each.")
-    radians("headings of begin", given[..., 3])
-    poses = np.ascontiguousarray(np.broadcast_to(given, shape))
+    begin_poses = np.full(shape[1:], np.nan) if begin is None else checked("begin", begin)
+    if begin_poses.shape not in (shape, shape[1:]):
+        raise InputError(
+            "begin", f"shape {begin_poses.shape}", f"must have shape {shape[1:]} or {shape}", "One pose each."
+        )
+    radians("headings of begin", begin_poses[..., 3])
+    poses = np.ascontiguousarray(np.broadcast_to(begin_poses, shape))
     first = np.concatenate([recording.gnss[:, 0], body_of(recording).heading[:, 0, :, None]], axis=2)
     lacking = np.isnan(first) & np.isnan(poses) & np.isfinite(recording.velocity[:, 0, :, :1])
     for column in columns:

@@ -55,12 +55,12 @@ def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0
     filter_ = PoseFilter("solo", lasting=False, gate=gate, spread=spread)
     begin = np.full((recording.runs, len(recording.ids), 4), np.nan)
     for run in range(recording.runs):
-        known = np.full((len(part.t), len(part.ids), 3), np.nan)
-        known[:, list(part.landmarks)] = part.gnss[run][:, list(part.landmarks)]
+        positions = np.full((len(part.t), len(part.ids), 3), np.nan)
+        positions[:, list(part.landmarks)] = part.gnss[run][:, list(part.landmarks)]
         waiting = fleet_members(part)
         while waiting:
-            column, links = _next(part, run, waiting, known)
-            begin[run, column], known[:, column] = _most_likely(part, run, column, links, known, filter_)
+            column, links = _next(part, run, waiting, positions)
+            begin[run, column], positions[:, column] = _most_likely(part, run, column, links, positions, filter_)
             waiting.remove(column)
     return begin
 
@@ -86,14 +86,14 @@ def _most_likely(
 ) -> tuple[Floats, Floats]:
     """First pose (4,) of a vehicle, and its positions (T, 3) m from there on, by the solo filter of most likelihood."""
     angles = 2 * np.pi * np.arange(HEADINGS) / HEADINGS
-    place = places[recording.links.step[links], recording.links.neighbour[links]]
+    landmarks = places[recording.links.step[links], recording.links.neighbour[links]]
     tried = np.full((HEADINGS, len(recording.ids), 4), np.nan)
-    tried[:, column] = _hypotheses(recording, run, column, links, place, angles)
+    tried[:, column] = _hypotheses(recording, run, column, links, landmarks, angles)
     copies = recording.of_runs(np.full(HEADINGS, run))
     noise = recording.sensors
     if len(to_landmarks(recording, links)) < len(links):
         filter_ = replace(filter_, assumed=_of_vehicles(noise, recording.relative[run, links, 0]))
-    x, _, cost = filter_.run_filter(copies, [column], links, tried, place=place)
+    x, _, cost = filter_.run_filter(copies, [column], links, tried, place=landmarks)
     best = np.argmin(cost[:, 0] + _cost_of_bearings(recording, run, column, angles, noise))
     return tried[best, column], x[best, :, 0, :3]
 
@@ -129,8 +129,8 @@ def _cost_of_bearings(recording: Recording, run: int, column: int, angles: Float
     azimuth = np.arctan2(gap[:, 1], gap[:, 0]) - _turns(recording, run, column)[step]
     residual = wrap(recording.relative[run, links, 1] + angles[:, None] - azimuth)
     fixes = 2.0 * max(noise.fix_std[:2]) ** 2 / np.maximum(np.square(gap[:, :2]).sum(axis=1), 1.0)
-    found: Floats = np.nansum(residual**2 / (noise.azimuth_std**2 + fixes), axis=1)
-    return found
+    cost: Floats = np.nansum(residual**2 / (noise.azimuth_std**2 + fixes), axis=1)
+    return cost
 
 
 SHARP = 0.1
@@ -142,7 +142,7 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places
     `places` (L, 3) m of what the links measure."""
     body, relative = body_of(recording), recording.relative[run, links]
     fixes = np.flatnonzero(np.isfinite(recording.gnss[run, :, column, 0]))
-    seen = np.flatnonzero(np.isfinite(relative[:, :2]).all(axis=1))
+    complete = np.flatnonzero(np.isfinite(relative[:, :2]).all(axis=1))
     turns = _turns(recording, run, column)
     middle = turns - 0.5 * recording.dt * body.yaw_rate[run, :, column]
     way = recording.dt * turned(recording.velocity[run, :, column], middle)
@@ -150,7 +150,7 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places
     way = np.cumsum(way, axis=0)
     compass = body.heading[run, 0, column]
     angles = angles if np.isnan(compass) else np.full(len(angles), compass)
-    if not len(fixes) and not len(seen):
+    if not len(fixes) and not len(complete):
         ranged = np.flatnonzero(np.isfinite(relative[:, 0]))
         first = ranged[np.unique(places[ranged], axis=0, return_index=True)[1]]
         steps = recording.links.step[links[first]]
@@ -159,25 +159,29 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places
         apart = centres - centres.sum(axis=1, keepdims=True) / max(len(steps), 1)
         if len(steps) and np.linalg.matrix_rank(apart[0, :, :2], SHARP) > 1:  # squared ranges differ linearly
             square = np.square(centres[..., :2]).sum(axis=-1) - relative[first, 0] ** 2
-            place = 0.5 * np.linalg.pinv(apart[..., :2]) @ square[..., None]
-            return np.column_stack([place[..., 0], centres[..., 2].mean(axis=1), angles])
-        given = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
+            at = 0.5 * np.linalg.pinv(apart[..., :2]) @ square[..., None]
+            return np.column_stack([at[..., 0], centres[..., 2].mean(axis=1), angles])
+        actual = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
         allowed = (
             "must hold a fix, or a range and bearing of a landmark or of a vehicle whose pose is found, or three ranges"
         )
-        raise InputError("seconds", given, allowed, "Take more seconds, or give its pose.")
-    if not len(fixes) and np.isnan(body.heading[run, :, column]).all() and (places[seen] == places[seen[0]]).all():
-        given = f"{recording.ids[column]} sees one landmark alone, and has neither fix nor compass"
-        raise InputError("seconds", given, "must hold a second place", "Take more seconds, or give its pose.")
+        raise InputError("seconds", actual, allowed, "Take more seconds, or give its pose.")
+    if (
+        not len(fixes)
+        and np.isnan(body.heading[run, :, column]).all()
+        and (places[complete] == places[complete[0]]).all()
+    ):
+        actual = f"{recording.ids[column]} sees one landmark alone, and has neither fix nor compass"
+        raise InputError("seconds", actual, "must hold a second place", "Take more seconds, or give its pose.")
     if len(fixes):
         step = int(fixes[0])
-        place, offset = recording.gnss[run, step, column], way[step]
+        at, offset = recording.gnss[run, step, column], way[step]
     else:
-        link = links[seen[0]]
+        link = links[complete[0]]
         step = int(recording.links.step[link])
-        flat = np.array([*relative[seen[0], :2], np.pi / 2])
-        flat[2] = relative[seen[0], 2] if np.isfinite(relative[seen[0], 2]) else flat[2]
-        place = places[seen[0]]
+        flat = np.array([*relative[complete[0], :2], np.pi / 2])
+        flat[2] = relative[complete[0], 2] if np.isfinite(relative[complete[0], 2]) else flat[2]
+        at = places[complete[0]]
         offset = way[step] + turned(to_vector(flat), np.asarray(turns[step]))
-    position = place - turned(np.broadcast_to(offset, (len(angles), 3)), angles)
+    position = at - turned(np.broadcast_to(offset, (len(angles), 3)), angles)
     return np.column_stack([position, angles])

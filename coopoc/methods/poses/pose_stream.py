@@ -74,8 +74,8 @@ class LandmarkMeasurement:
                 or (np.abs(values) > FARTHEST).any()
                 or (name == "place" and np.isnan(values).any())
             ):
-                given, hint = getattr(self, name), "NaN stands for a component of `relative` that is missing."
-                raise InputError(name, given, "must be three numbers", hint)
+                component, hint = getattr(self, name), "NaN stands for a component of `relative` that is missing."
+                raise InputError(name, component, "must be three numbers", hint)
             self.__dict__[name] = values
         radians("relative angles", self.relative[1:])  # type: ignore[index, arg-type]
 
@@ -132,12 +132,12 @@ class PoseStream:
             what = "must give what the first fix and compass do not"
             raise InputError("begin", None, what, "Give (x, y, z, heading).")
         t, count = int(self._later), len(marks)
-        place = np.array([mark.place for mark in marks], dtype=float).reshape(-1, 3)
+        positions = np.array([mark.place for mark in marks], dtype=float).reshape(-1, 3)
         relative = np.array([mark.relative for mark in marks], dtype=float).reshape(1, -1, 3)
         both, ends = np.tile(own.row, (1, 2, 1, 1)), np.tile([0, -1], (count, 1))
         first = np.array([0, 0, count] if t else [0, count, count])
         active = np.ones((2, 1), dtype=bool)
-        measured = PoseMeasurements(both, active, ends, first, place, relative, self._dt)
+        measured = PoseMeasurements(both, active, ends, first, positions, relative, self._dt)
         step(measured, self._noise, self._begin, self._spread, self._options, self._poses, self._pair, 0, t)
         self._later, d = True, self._options.d
         x = self._poses.x[:d].copy()

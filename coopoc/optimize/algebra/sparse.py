@@ -84,9 +84,9 @@ def entries_of(movable: Bools, measured: Sequence[Ints]) -> Entries:
     row, column = np.broadcast_arrays(number[i][:, :, None], number[j][:, None, :])
     there = (row >= 0) & (row <= column)
     row, column = row[there], column[there]
-    order, place = np.lexsort((row, column)), np.full(there.shape, -1, dtype=np.int64)
-    place.ravel()[np.flatnonzero(there)[order]] = np.arange(len(order))
-    return Entries(number, key, place, np.searchsorted(column[order], np.arange(m + 1)), row[order])
+    order, index = np.lexsort((row, column)), np.full(there.shape, -1, dtype=np.int64)
+    index.ravel()[np.flatnonzero(there)[order]] = np.arange(len(order))
+    return Entries(number, key, index, np.searchsorted(column[order], np.arange(m + 1)), row[order])
 
 
 def places_of(entries: Entries, nodes: Ints, written: Ints) -> Any:

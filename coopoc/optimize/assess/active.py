@@ -92,8 +92,8 @@ def _rows_of(problem: Problem, x: Floats, k: int) -> tuple[tuple[Floats, Floats,
     columns = space.dof * item.nodes[row][:, :, None] + np.arange(space.dof)
     starts = np.arange(0, data.size + 1, item.nodes.shape[1] * space.dof)
     matrix = csr_array((data.ravel(), columns.ravel(), starts), shape=(len(row), len(problem.names) * space.dof))
-    place = np.stack([np.full(len(row), k), row, component], axis=1)
-    return (linear.residual[0][finite], item.lower[finite], item.upper[finite]), matrix, place
+    index = np.stack([np.full(len(row), k), row, component], axis=1)
+    return (linear.residual[0][finite], item.lower[finite], item.upper[finite]), matrix, index
 
 
 def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
@@ -113,9 +113,9 @@ def active_at(problem: Problem, x: Floats, gradient: Floats) -> Active:
     for members, columns, block in _apart(rows.matrix[touched]):
         own = touched[members]
         unit = block / length[own, None]
-        found = _multipliers(unit, gradient.ravel()[columns], low[own] | equal[own], high[own] | equal[own])
-        multipliers[own] = found / length[own]
-        pushes = equal[own] | (found != 0)
+        of_active = _multipliers(unit, gradient.ravel()[columns], low[own] | equal[own], high[own] | equal[own])
+        multipliers[own] = of_active / length[own]
+        pushes = equal[own] | (of_active != 0)
         gap = (rows.value - np.where(multipliers < 0, rows.lower, rows.upper))[own] / length[own]
         onto[columns], ways = _split(unit[pushes], gap[pushes])
         along.append((columns, ways))
@@ -145,8 +145,8 @@ def _multipliers(unit: Floats, gradient: Floats, low: Bools, high: Bools) -> Flo
 
     scale = max(np.abs(gradient).max(), 1e-300)
     bounds = (np.where(low, -np.inf, 0.0), np.where(high, np.inf, 0.0))
-    found = lsq_linear(unit.T, -gradient / scale, bounds, method="bvls", tol=1e-14)
-    return np.asarray(scale * found.x)
+    solution = lsq_linear(unit.T, -gradient / scale, bounds, method="bvls", tol=1e-14)
+    return np.asarray(scale * solution.x)
 
 
 def _split(unit: Floats, gap: Floats) -> tuple[Floats, Floats]:

@@ -35,7 +35,7 @@ TAIL = 1e-6
 """Probability below which a cost, or one above it, is not explained by the noise that is stated."""
 MANY = 0.25
 """Share of measurements whose rejection casts doubt on the minimum."""
-REJECTED = 0.5
+INLIER_WEIGHT = 0.5
 """Weight rho' below which a robust loss rejects a measurement."""
 
 
@@ -134,8 +134,8 @@ def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool
         return ended(cov, step) if held else unknown
     if not cholesky.factor(exact):
         return ended(none, calm)
-    found, less = _inverse(system)
-    return ended(found, cholesky.solve(gradient), True) if (2.0 * less < variance).any() else ended(cov, step)
+    inverse, less = _inverse(system)
+    return ended(inverse, cholesky.solve(gradient), True) if (2.0 * less < variance).any() else ended(cov, step)
 
 
 def _largest(problem: Problem, entries: Entries, values: Floats) -> Floats:
@@ -150,9 +150,9 @@ def _largest(problem: Problem, entries: Entries, values: Floats) -> Floats:
 def _inverse(system: Sparse) -> tuple[Floats, Floats]:
     """Marginals (n, dof, dof) by the factor that is at hand, and their diagonal (m,)."""
     free, rows, columns = system.entries.own
-    found, cov = system.cholesky.inverse(rows, columns), np.zeros(free.shape)
-    cov[free] = found
-    return cov, found[rows == columns]
+    blocks, cov = system.cholesky.inverse(rows, columns), np.zeros(free.shape)
+    cov[free] = blocks
+    return cov, blocks[rows == columns]
 
 
 def _symmetric(entries: Entries, values: Floats) -> Any:
@@ -317,11 +317,11 @@ def _lagrangian(problem: Problem, x: Floats, active: Active) -> Any:
     move."""
     from scipy.sparse import csr_array
 
-    system, structure, place = sparse(problem), structure_of(problem), constraint_rows(problem, x).place
+    system, structure, rows = sparse(problem), structure_of(problem), constraint_rows(problem, x).place
     terms, numbers = list(structure.factors), list(system.numbers)
     for k, (item, term) in enumerate(zip(problem.constraints, structure.constraints, strict=True)):
-        own, weight = place[:, 0] == k, np.zeros(item.lower.shape)
-        weight[place[own, 1], place[own, 2]] = active.multipliers[own]
+        own, weight = rows[:, 0] == k, np.zeros(item.lower.shape)
+        weight[rows[own, 1], rows[own, 2]] = active.multipliers[own]
         with np.errstate(divide="ignore"):
             numbers.append(numbers_of(unchecked(as_factor(item), std=1.0 / weight)))
         terms.append(term._replace(kind=term.kind._replace(bound=True)))
@@ -354,7 +354,7 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
     for factor in robust:
         square = squared(problem, factor, x)
         assert factor.loss is not None
-        beyond = np.asarray(factor.loss.weight(square)) < REJECTED
+        beyond = np.asarray(factor.loss.weight(square)) < INLIER_WEIGHT
         spent, out = spent + 0.5 * float(factor.loss.cost(square[beyond]).sum()), out + factor.size * int(beyond.sum())
         if beyond.any():
             rejected.append((f"{factor.loss.name} loss", int(beyond.sum()), len(square), f"measurements {factor.kind}"))
@@ -443,8 +443,8 @@ def joint_covariance(problem: Problem, solution: Solution, nodes: Sequence[str |
            [1., 2.]])
     """
     instance("problem", problem, Problem)
-    given: Any = getattr(solution, "x", None)
-    x = checked("solution", given, "(n, ambient)", (len(problem.names), problem.space.ambient))
+    values: Any = getattr(solution, "x", None)
+    x = checked("solution", values, "(n, ambient)", (len(problem.names), problem.space.ambient))
     if problem.constraints:
         raise InputError("problem", "constraints", "must have none", "Read solution.covariance instead.")
     places = [problem.index(node) for node in (nodes if isinstance(nodes, str) else several(nodes))]

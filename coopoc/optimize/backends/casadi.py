@@ -187,8 +187,8 @@ def programme(structure: Structure, method: str, max_iterations: int) -> Any:
     """CasADi's nlpsol of a structure by "fatrop" or "ipopt", kept for the next problems that share it."""
     import casadi as ca
 
-    found, scale = expressions(structure), ca.SX.sym("scale")
-    nlp = {**found, "p": ca.vertcat(found["p"], scale), "f": scale * found["f"]}
+    symbols, scale = expressions(structure), ca.SX.sym("scale")
+    nlp = {**symbols, "p": ca.vertcat(symbols["p"], scale), "f": scale * symbols["f"]}
     own = {"ipopt": IPOPT, "fatrop": FATROP}[method]
     options: dict[str, Any] = {**QUIET, method: {**own, "max_iter": max_iterations}}
     if method == "fatrop":

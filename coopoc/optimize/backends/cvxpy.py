@@ -23,9 +23,9 @@ def prepare(structure: Problem, refine: bool = True) -> Solver:
 
 def _relaxed(refine: bool, problem: Problem, x: Floats) -> SolverResult:
     """The relaxation's point; x is not looked at."""
-    found = shor(problem, refine)
-    end = (found.x, 0) if found.solution is None else (found.solution.x, found.solution.iterations)
-    extras = {"lower_bound": found.lower_bound, "rank_gap": found.rank_gap, "rounded_cost": found.cost}
+    relaxation = shor(problem, refine)
+    end = (relaxation.x, 0) if relaxation.solution is None else (relaxation.solution.x, relaxation.solution.iterations)
+    extras = {"lower_bound": relaxation.lower_bound, "rank_gap": relaxation.rank_gap, "rounded_cost": relaxation.cost}
     return SolverResult(*end, extras=extras | {"refined": refine})
 
 

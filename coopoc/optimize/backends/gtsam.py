@@ -59,13 +59,13 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
             params.setMaxIterations(max_iterations - used)
             params.setRelativeErrorTol(PRECISE)
             params.setAbsoluteErrorTol(0.0)
-            found = gtsam.LevenbergMarquardtOptimizer(graph, values(problem.space, posed, x), params)
+            optimizer = gtsam.LevenbergMarquardtOptimizer(graph, values(problem.space, posed, x), params)
             try:
-                x = estimate(problem.space, posed, found.optimize())
+                x = estimate(problem.space, posed, optimizer.optimize())
             except RuntimeError:  # a singular system: `solve` names the nodes that are free
                 break
-            used += found.iterations()
-            if used >= max_iterations or found.lambda_() <= params.getlambdaInitial():
+            used += optimizer.iterations()
+            if used >= max_iterations or optimizer.lambda_() <= params.getlambdaInitial():
                 break
         return SolverResult(x, used, extras={"custom_factors": custom})
 
@@ -105,8 +105,8 @@ def _form(problem: Problem, factor: Factor) -> Form:
     parts = FORMS[factor.kind](factor, factor.root[:1] if shared else factor.root, problem.dimension)
     if parts is None or (len(parts) > 1 and factor.loss is not None):  # which no robust loss can join
         return None
-    known = all(row in part.names or row[::-1] in part.names for row in kinds for part in parts)
-    return parts if known else None
+    supported = all(row in part.names or row[::-1] in part.names for row in kinds for part in parts)
+    return parts if supported else None
 
 
 def pose_of(d: int, x: Floats) -> Any:
@@ -258,9 +258,9 @@ class Callbacks:
                 self._linear = linearise(self._space, self._factors, None, x)
                 self._tangent = tangent(self._space, self._posed, x)
             if jacobians is not None:
-                for place, i in enumerate(nodes):
-                    by = self._linear.jacobian[k][place]
-                    jacobians[place] = by[row] @ self._tangent[i]
+                for slot, i in enumerate(nodes):
+                    by = self._linear.jacobian[k][slot]
+                    jacobians[slot] = by[row] @ self._tangent[i]
             return self._linear.residual[k][row]
 
         return error
@@ -284,12 +284,12 @@ def graph_of(problem: Problem, parts: Sequence[Form], keys: Sequence[int] | None
     for factor, form in zip(problem.factors, parts, strict=True):
         for part in form or ():
             models = _models(part.root, factor)
-            for nodes, given, model in zip(factor.nodes.tolist(), part.arguments(), models, strict=True):
+            for nodes, arguments, model in zip(factor.nodes.tolist(), part.arguments(), models, strict=True):
                 if tuple([posed[i] for i in nodes]) not in part.names:
                     nodes = nodes[::-1]  # such as a range from a point to a pose
                 made = getattr(gtsam, part.names[tuple([posed[i] for i in nodes])])
                 if model is not None:
-                    graph.add(made(*[keys[i] for i in nodes], *given, model))
+                    graph.add(made(*[keys[i] for i in nodes], *arguments, model))
     for i in problem.fixed:
         assert problem.x0 is not None
         name = f"NonlinearEquality{'Pose' if posed[i] else 'Point'}{problem.dimension}"
@@ -301,10 +301,10 @@ def values(space: Space, posed: Sequence[bool], x: Floats, first: int = 0) -> An
     """gtsam.Values of nodes x (n, ambient), which are points or `posed`, under their indices from `first` on."""
     import gtsam
 
-    found = gtsam.Values()
+    result = gtsam.Values()
     for key, (node, turns) in enumerate(zip(x, posed, strict=True), first):
-        found.insert(key, _node(space.dimension, node, turns))
-    return found
+        result.insert(key, _node(space.dimension, node, turns))
+    return result
 
 
 def estimate(space: Space, posed: Sequence[bool], values: Any) -> Floats:
@@ -342,12 +342,12 @@ def tangent(space: Space, posed: Sequence[bool], x: Floats) -> Sequence[Floats]:
            [ 1.,  0.,  0.],
            [ 0.,  0.,  1.]])
     """
-    d, still, found = space.dimension, np.eye(space.dof, space.dimension), []
+    d, still, blocks = space.dimension, np.eye(space.dof, space.dimension), []
     for turns, rotation in zip(posed, space.rotation(x), strict=True):
         matrix = np.eye(space.dof)
         matrix[:d, :d] = rotation
-        found.append(still if not turns else matrix if d == 2 else np.roll(matrix, space.angles, axis=1))
-    return found
+        blocks.append(still if not turns else matrix if d == 2 else np.roll(matrix, space.angles, axis=1))
+    return blocks
 
 
 def _node(d: int, x: Floats, turns: bool) -> Any:

@@ -247,12 +247,12 @@ class _Rows:
         """A over all nodes."""
         from scipy.sparse import csr_array, vstack
 
-        size, found = self.first_position + self.width * self.n, []
+        size, blocks = self.first_position + self.width * self.n, []
         for value, columns in self.parts:
             count, k, c = value.shape
             at = np.broadcast_to(columns[:, None], value.shape).ravel()
-            found.append(csr_array((value.ravel(), at, np.arange(0, count * k * c + 1, c)), shape=(count * k, size)))
-        A = vstack(found, format="csr")
+            blocks.append(csr_array((value.ravel(), at, np.arange(0, count * k * c + 1, c)), shape=(count * k, size)))
+        A = vstack(blocks, format="csr")
         A.sum_duplicates()
         return A
 

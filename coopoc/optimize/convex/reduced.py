@@ -60,9 +60,9 @@ class Reduced:
 
     @cached_property
     def _inverse(self) -> Cholesky:
-        found = cholesky_of(self.gram[self.problem.bound :, self.problem.bound :])
-        assert found is not None  # what could be moved as a whole is not among the rows
-        return found
+        factor = cholesky_of(self.gram[self.problem.bound :, self.problem.bound :])
+        assert factor is not None  # what could be moved as a whole is not among the rows
+        return factor
 
     @cached_property
     def _small(self) -> tuple[Floats, Floats] | None:

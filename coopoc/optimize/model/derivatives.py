@@ -140,7 +140,7 @@ def residual_of(kind: Kind, converted: bool = False) -> Residual:
     import casadi as ca
 
     measurement, space = kind.measurement, kind.space
-    arity, (given, constants, _) = measurement.arity, kind.widths
+    arity, (z_width, constants, _) = measurement.arity, kind.widths
     nodes, steps = ca.SX.sym("nodes", arity * space.ambient), ca.SX.sym("steps", arity * space.dof)
     number: Any = ca.SX.sym("number", sum(kind.widths))
     all_nodes, all_steps, numbers = (ca.vertsplit(each) for each in (nodes, steps, number))
@@ -148,7 +148,7 @@ def residual_of(kind: Kind, converted: bool = False) -> Residual:
         _moved(space, all_nodes[k * space.ambient :][: space.ambient], all_steps[k * space.dof :][: space.dof])
         for k in range(arity)
     ]
-    z, assumed, weight = numbers[:given], numbers[given : given + constants], numbers[given + constants :]
+    z, assumed, weight = numbers[:z_width], numbers[z_width : z_width + constants], numbers[z_width + constants :]
     vectors = converted and is_converted(measurement)
     try:
         local = _local(measurement, places)
@@ -199,9 +199,9 @@ def expressions(structure: Structure) -> dict[str, Any]:
         for white in each(term, numbers[-1]):
             cost += 0.5 * robust(ca.sumsqr(white), term.kind.loss)
     for term in structure.constraints:
-        given, constants, size = term.kind.widths
+        z_width, constants, size = term.kind.widths
         numbers.append(ca.SX.sym("number", len(term.nodes), constants))
-        plain = ca.horzcat(ca.SX.zeros(len(term.nodes), given), numbers[-1], ca.SX.ones(len(term.nodes), size))
+        plain = ca.horzcat(ca.SX.zeros(len(term.nodes), z_width), numbers[-1], ca.SX.ones(len(term.nodes), size))
         value = ca.vertcat(*each(term, plain))
         bounds.append(value[np.flatnonzero(np.frombuffer(term.steered, bool)).tolist()])
     f, g = ca.cse([ca.SX(cost), ca.vertcat(*bounds)])  # a node's turn is that of all its measurements
@@ -312,14 +312,14 @@ def write(kind: Kind, model: Model) -> Written:
         entries = [(i, j - 1) for i in range(whole.size1()) for j in range(whole.size2())]
         outputs = [whole[i, j + 1] for i, j in entries]
     elif model != "cost":
-        slope = ca.gradient(cost, steps)
+        gradient = ca.gradient(cost, steps)
         if model == "newton":
             curvature = ca.hessian(cost, steps)[0]
         else:
             J = ca.jacobian(white, steps)
             curvature = ca.mtimes(J.T, J) * ca.substitute(ca.jacobian(rho, square), square, ca.sumsqr(white))
         for i in range(steps.size1()):
-            outputs.append(slope[i])
+            outputs.append(gradient[i])
             entries.append((i, -1))
         for i in range(steps.size1()):
             for j in range(i, steps.size1()):
@@ -340,7 +340,7 @@ def _tape(function: Any, name: str) -> Tape:
     operations, constant = _operations(), int(Operation.CONST)
     read_in, write_out = int(Operation.INPUT), int(Operation.OUTPUT)
     count = function.n_instructions()
-    code, place, value = np.zeros(count, np.int64), np.zeros((count, 3), np.int64), np.zeros(count)
+    code, operands, value = np.zeros(count, np.int64), np.zeros((count, 3), np.int64), np.zeros(count)
     for k in range(count):
         instruction = function.instruction_id(k)
         if instruction not in operations:
@@ -349,14 +349,14 @@ def _tape(function: Any, name: str) -> Tape:
         code[k] = operation = operations[instruction]
         read, written = function.instruction_input(k), function.instruction_output(k)
         if operation == constant:
-            place[k, 0], value[k] = written[0], function.instruction_constant(k)
+            operands[k, 0], value[k] = written[0], function.instruction_constant(k)
         elif operation == read_in:
-            place[k, :2] = written[0], read[1]
+            operands[k, :2] = written[0], read[1]
         elif operation == write_out:
-            place[k, :2] = written[1], read[0]
+            operands[k, :2] = written[1], read[0]
         else:
-            place[k] = written[0], read[0], read[-1]
-    return Tape(code, place, value, function.sz_w())
+            operands[k] = written[0], read[0], read[-1]
+    return Tape(code, operands, value, function.sz_w())
 
 
 @lru_cache(maxsize=1)

@@ -114,14 +114,14 @@ class Factor:
     def __post_init__(self, cov: npt.ArrayLike | None) -> None:
         measurement = _checked(self)
         self.__dict__["z"] = check_values(measurement, self.z, len(self.nodes))
-        given = [
+        stds = [
             name
             for name, v in (("std", self.std), ("sqrt_information", self.sqrt_information), ("cov", cov))
             if v is not None
         ]
-        if len(given) != 1:
+        if len(stds) != 1:
             allowed = "exactly one of std, cov and sqrt_information must be given"
-            raise InputError("std", " and ".join(given) or "nothing", allowed, "Give std=.")
+            raise InputError("std", " and ".join(stds) or "nothing", allowed, "Give std=.")
         shape = len(self.nodes), self.size
         if self.std is not None:
             self.__dict__["std"] = check_std(measurement, self.std, shape)
@@ -170,11 +170,11 @@ class Factor:
 
 def _checked(item: Factor | Constraint) -> Measurement:
     """The measurement of an item, with its name, nodes and constants checked."""
-    known = item.measurement
-    nodes = check_nodes(known, item.nodes)
-    constants = check_constants(known, item.constants, len(nodes))
-    item.__dict__.update(kind=known.name, nodes=nodes, constants=constants)
-    return known
+    measurement = item.measurement
+    nodes = check_nodes(measurement, item.nodes)
+    constants = check_constants(measurement, item.constants, len(nodes))
+    item.__dict__.update(kind=measurement.name, nodes=nodes, constants=constants)
+    return measurement
 
 
 def of_checked(kind: str, nodes: Ints, z: Floats, std: Floats) -> Factor:
@@ -277,11 +277,11 @@ class Constraint:
         measurement = _checked(self)
         if measurement.compares_poses:
             raise InputError("kind", repr(self.kind), "compares poses and cannot bound them", "Hold the node instead.")
-        given = {name: numbers(name, getattr(self, name)) for name in ("lower", "upper")}
-        sizes = [side.shape[-1] for side in given.values() if side.ndim]
+        limits = {name: numbers(name, getattr(self, name)) for name in ("lower", "upper")}
+        sizes = [side.shape[-1] for side in limits.values() if side.ndim]
         size = max(sizes, default=measurement.size())
         fitting(measurement, size)
-        for name, side in given.items():
+        for name, side in limits.items():
             try:
                 self.__dict__[name] = frozen(np.broadcast_to(side, (len(self.nodes), size)))
             except ValueError:

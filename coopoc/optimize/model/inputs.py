@@ -39,14 +39,14 @@ def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
 
 
 @lru_cache(maxsize=256)
-def fitting(measurement: Measurement, given: int) -> int | None:
-    """The dimension whose z has `given` numbers; None if both have; InputError if none has."""
-    fits = [d for d in (2, 3) if (d == 3 or measurement.plane is not None) and measurement.given(d) == given]
+def fitting(measurement: Measurement, width: int) -> int | None:
+    """The dimension whose z has `width` numbers; None if both have; InputError if none has."""
+    fits = [d for d in (2, 3) if (d == 3 or measurement.plane is not None) and measurement.given(d) == width]
     if not fits:
         allowed = sorted({measurement.given(d) for d in (2, 3) if d == 3 or measurement.plane is not None})
         hint = "Write poses with coopoc.optimize.pose." if measurement.compares_poses else "Give one per component."
         words = f"must have {' or '.join(map(str, allowed))}"
-        raise InputError(f"z of {measurement.name}", f"{given} numbers per row", words, hint)
+        raise InputError(f"z of {measurement.name}", f"{width} numbers per row", words, hint)
     return fits[0] if len(fits) == 1 else None
 
 
@@ -72,18 +72,18 @@ def check_constants(measurement: Measurement, constants: npt.ArrayLike | None, c
     """(M, c) finite numbers, as many as the kind has."""
     if measurement.constants == 0 and (constants is None or np.size(constants) == 0):
         return frozen(np.empty((count, 0)))
-    given = numbers(f"constants of {measurement.name}", [] if constants is None else constants)
+    values = numbers(f"constants of {measurement.name}", [] if constants is None else constants)
     fits = (
-        given.ndim in (1, 2)
-        and given.shape[-1] == measurement.constants
-        and given.size in (measurement.constants, count * measurement.constants)
+        values.ndim in (1, 2)
+        and values.shape[-1] == measurement.constants
+        and values.size in (measurement.constants, count * measurement.constants)
     )
-    if not fits or not np.isfinite(given).all():
+    if not fits or not np.isfinite(values).all():
         hint = "Give them as constants=, such as constants=[0.1] for the dt of a speed."
         raise InputError(
-            "constants", given.tolist(), f"must be {measurement.constants} finite numbers for {measurement.name}", hint
+            "constants", values.tolist(), f"must be {measurement.constants} finite numbers for {measurement.name}", hint
         )
-    return frozen(np.broadcast_to(given, (count, measurement.constants)))
+    return frozen(np.broadcast_to(values, (count, measurement.constants)))
 
 
 def check_values(measurement: Measurement, z: npt.ArrayLike, count: int) -> Floats:
@@ -130,8 +130,8 @@ def check_std(measurement: Measurement, std: npt.ArrayLike | float, shape: tuple
         raise InputError("std", array.shape, allowed, "One standard deviation per component.")
     if not (wide > 0).all():
         hint, bad = "Give standard deviations; infinity means no information.", np.argwhere(~(wide > 0))[0]
-        given = f"{wide[tuple(bad)]} in row {bad[0]}"
-        raise InputError(f"std of {measurement.name}", given, "must be > 0", hint)
+        actual = f"{wide[tuple(bad)]} in row {bad[0]}"
+        raise InputError(f"std of {measurement.name}", actual, "must be > 0", hint)
     kept = measurement.kept(3 if size == len(measurement.components) else 2)
     angles = wide[:, [measurement.components[k] in ("angle", "turn") for k in kept]]
     if (np.isfinite(angles) & (angles > np.pi)).any():

@@ -141,8 +141,8 @@ def measurement(
     if isinstance(arity, bool) or not isinstance(arity, int) or not 1 <= arity <= (9 if frame == "nodes" else 2):
         hint = 'The formula gets one vector x, y, z; frame="nodes" gives it up to nine nodes.'
         raise InputError("arity", arity, "must be 1 (a node) or 2 (a pair)", hint)
-    given = components if isinstance(components, tuple | list) else ()
-    if not given or not all(isinstance(component, str) and component in get_args(Component) for component in given):
+    entries = components if isinstance(components, tuple | list) else ()
+    if not entries or not all(isinstance(component, str) and component in get_args(Component) for component in entries):
         hint = "Give one per number that the formula returns."
         raise InputError("components", components, f"must be among {get_args(Component)}", hint)
     constants = number("constants", constants, 0, kind=int, allowed=">= 0", hint="How many numbers each one carries.")

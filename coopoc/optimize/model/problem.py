@@ -219,8 +219,8 @@ class Problem:
         index = indices(self.index, kind, nodes)
         size = lookup(kind).size(self.dimension)
         low, high = (
-            np.broadcast_to(given, (len(index), size)) if given.ndim == 0 else given
-            for given in (numbers("lower", lower), numbers("upper", upper))
+            np.broadcast_to(limit, (len(index), size)) if limit.ndim == 0 else limit
+            for limit in (numbers("lower", lower), numbers("upper", upper))
         )
         constraint = Constraint(kind, index, low, high, constants)  # type: ignore[arg-type]
         return replace(self, constraints=(*self.constraints, constraint))
@@ -388,9 +388,9 @@ def points(space: Space, n: int, field: str, x: npt.ArrayLike) -> Floats:
     """x as an array (n, ambient); InputError if it is not one, or holds matrices of no rotation."""
     array = numbers(field, x)
     if array.shape != (n, space.ambient) or not np.isfinite(array).all():
-        given = f"shape {array.shape}" if np.isfinite(array).all() else "not finite"
+        actual = f"shape {array.shape}" if np.isfinite(array).all() else "not finite"
         hint = "Make it with coopoc.optimize.pose." if space.has_rotation else "Give one row of metres per point."
-        raise InputError(field, given, f"must be finite with shape ({n}, {space.ambient})", hint)
+        raise InputError(field, actual, f"must be finite with shape ({n}, {space.ambient})", hint)
     if space.has_rotation:
         check_rotations(field, space.rotation(array))
     return array

@@ -54,8 +54,8 @@ def mark(problem: Problem, candidates: Candidates, groups: npt.ArrayLike | None 
     labels = np.arange(len(places)) if groups is None else plain(groups)
     if labels.shape != (len(places),) or labels.dtype.kind not in "iuSU":
         allowed = f"must have shape ({len(places)},), one whole number or word per candidate measurement"
-        given = f"shape {labels.shape} of {labels.dtype}"
-        raise InputError("groups", given, allowed, "Leave it out to judge each alone.")
+        actual = f"shape {labels.shape} of {labels.dtype}"
+        raise InputError("groups", actual, allowed, "Leave it out to judge each alone.")
     factor_of, row = np.array(places).T
     return Marked(factor_of, row, np.unique(labels, return_inverse=True)[1])
 
@@ -90,8 +90,8 @@ def bounds(problem: Problem, marked: Marked, threshold: float) -> Floats:
 
 def _sums(problem: Problem, marked: Marked, of: Callable[[Factor], AnyArray]) -> Floats:
     """(G,) sums over each group of what there is of each measurement of a factor."""
-    found = np.empty(len(marked.row))
+    sums = np.empty(len(marked.row))
     for k in np.unique(marked.factor):
         here = marked.factor == k
-        found[here] = of(problem.factors[k])[marked.row[here]]
-    return marked.sums(found)
+        sums[here] = of(problem.factors[k])[marked.row[here]]
+    return marked.sums(sums)

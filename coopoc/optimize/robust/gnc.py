@@ -11,7 +11,7 @@ import numpy.typing as npt
 from ...arrays import Floats, instance, one_of
 from ...kernels.compiling.waiting import clock
 from ..algebra.sparse import sparse
-from ..assess.assess import REJECTED, rejection
+from ..assess.assess import INLIER_WEIGHT, rejection
 from ..backend import MAX_ITERATIONS, TOLERANCE, Backend
 from ..descent.levenberg_marquardt import arrive
 from ..model.problem import Problem
@@ -93,9 +93,9 @@ def solve_gnc(
 
     def inner(part: Problem) -> Floats:
         if problem.constraints:
-            found = solve(part, backend, throw=False, covariance=False, **options)
-            each.append(found.iterations)
-            return found.x
+            solution = solve(part, backend, throw=False, covariance=False, **options)
+            each.append(solution.iterations)
+            return solution.x
         end = arrive(sparse(part), np.array(part.x0), MAX_ITERATIONS, TOLERANCE)
         each.append(end.iterations)
         return end.x
@@ -110,9 +110,9 @@ def solve_gnc(
         return sparse(reweigh(problem, marked, np.zeros(len(bound)), at)).cost(at) + 0.5 * float(bound @ spent)
 
     if start == "known":
-        known = known_start(problem, marked, bound, inner)
-        before, end = known.rounds, finish(known.x, known.weight)
-        extras |= {"joined": known.joined} if known.joined else {}
+        start_x = known_start(problem, marked, bound, inner)
+        before, end = start_x.rounds, finish(start_x.x, start_x.weight)
+        extras |= {"joined": start_x.joined} if start_x.joined else {}
     else:
         first = initial_guess(problem)
         best, x, end = contest(problem, marked, bound, surrogate, inner, first, lambda at: finish(at).x, cost)
@@ -123,7 +123,7 @@ def solve_gnc(
     work: dict[str, Any] = {"iterations": sum(each) + final.iterations}
     work["solve_seconds"] = clock() - began - final.build_seconds - final.check_seconds
     status = final.status if end.settled else Status.MAX_ITERATIONS
-    out = int((end.weight < REJECTED).sum())
+    out = int((end.weight < INLIER_WEIGHT).sum())
     notes = (rejection("GNC", out, len(bound), "candidates", final.cost, final.expected),) if out else ()
     solution = replace(final, extras=final.extras | extras, status=status, notes=(*notes, *final.notes), **work)
     if throw and not end.settled:

@@ -142,8 +142,8 @@ def contest(
     ends = {name: finish(at) for name, at in starts.items()}
     costs = {name: np.nan_to_num(cost(at), nan=np.inf) for name, at in ends.items()}
     best = min(ends, key=costs.__getitem__)
-    found, moves, *_ = across(cauchy, ends[best], lambda at: finish(soft(at)), cost)
-    return best + ", mirrored" * (moves > 0), found, graduation
+    best_x, moves, *_ = across(cauchy, ends[best], lambda at: finish(soft(at)), cost)
+    return best + ", mirrored" * (moves > 0), best_x, graduation
 
 
 def softened(problem: Problem, marked: Marked, bound: Floats, loss: str) -> Problem:

@@ -143,12 +143,12 @@ class _Search:
     def ends(self, body: Ints) -> Ints:
         """(M, 2) bodies that each candidate joins, ascending; HELD is one of those of a measurement of a single
         node."""
-        found = np.full((len(self.marked.row), 2), HELD)
+        end_of = np.full((len(self.marked.row), 2), HELD)
         for k in np.unique(self.marked.factor):
             here = self.marked.factor == k
             nodes = self.problem.factors[k].nodes[self.marked.row[here], :2]
-            found[here, 2 - nodes.shape[1] :] = body[nodes]
-        return np.sort(found, axis=1)
+            end_of[here, 2 - nodes.shape[1] :] = body[nodes]
+        return np.sort(end_of, axis=1)
 
     def grow(self, problem: Problem, body: Ints, inner: Callable[[Problem], Floats]) -> int:
         """Rounds of a pinned problem until no more candidates join within the bodies."""
@@ -203,12 +203,12 @@ class _Search:
                 break
             leader, rival = self._vote(body, (int(pairs[p, 0]), int(pairs[p, 1])), groups[which.ravel() == p])
             to, of = ("world" if k == HELD else problem.names[k] for k in leader.bodies)
-            found = {"body": of, "to": to, "agree": leader.rank[0], "rival": rival, "candidates": int(count[p])}
+            row = {"body": of, "to": to, "agree": leader.rank[0], "rival": rival, "candidates": int(count[p])}
             if leader.rank[0] < AGREEING or leader.rank[0] <= rival:
                 sentence = "of {candidates} between {body} and {to} {agree} agree, {rival} otherwise"
-                undecided.append(sentence.format(**found))
+                undecided.append(sentence.format(**row))
             elif best is None or leader.rank > best.rank:
-                best, joined = leader, found
+                best, joined = leader, row
         if best is None:
             free = [problem.names[k] for k in np.unique(body[body != HELD])]
             what = "; ".join(undecided[:3]) or f"nothing between {', '.join(free[:3])} and the others"

@@ -64,14 +64,14 @@ def walk(n: int, d: int, moves: Moves, roots: Roots) -> tuple[Floats, Floats, Bo
     from scipy.sparse.csgraph import dijkstra
 
     position, rotation = np.zeros((n, d)), np.tile(np.eye(d), (n, 1, 1))
-    known = np.zeros(n, dtype=bool)
+    is_reached = np.zeros(n, dtype=bool)
     which = np.argsort(moves.length, kind="stable")
     ends = np.stack([moves.nodes[which], moves.nodes[which, ::-1]], axis=1).reshape(-1, 2)  # there and back
     key, first = np.unique(ends[:, 0] * n + ends[:, 1], return_index=True)  # of parallel edges the shortest
     edge, forward = which[first // 2], first % 2 == 0
     graph = csr_array((moves.length[edge], key % n, np.searchsorted(key, n * np.arange(n + 1))), shape=(n, n))
     for root, at, turned in roots:
-        if known[root]:
+        if is_reached[root]:
             continue
         distance, before = dijkstra(graph, indices=root, return_predecessors=True)
         reached = np.flatnonzero(np.isfinite(distance) & (before >= 0))
@@ -81,17 +81,17 @@ def walk(n: int, d: int, moves: Moves, roots: Roots) -> tuple[Floats, Floats, Bo
         back = np.swapaxes(turn, 1, 2)
         turn = np.where(forward[used, None, None], turn, back)
         moved = np.where(forward[used, None], moved, -(back @ moved[..., None])[..., 0])
-        place = np.full(n, -1)
-        place[reached] = np.arange(len(reached))
-        before = place[before[reached]]
+        index = np.full(n, -1)
+        index[reached] = np.arange(len(reached))
+        before = index[before[reached]]
         while (on := np.flatnonzero(before >= 0)).size:  # to poses as the root sees them: pointers jump
             by = before[on]
             moved[on] = moved[by] + (turn[by] @ moved[on, :, None])[..., 0]
             turn[on] = turn[by] @ turn[on]
             before[on] = before[by]
-        position[root], rotation[root], known[root] = at, turned, True
-        position[reached], rotation[reached], known[reached] = at + moved @ turned.T, turned @ turn, True
-    return position, rotation, known
+        position[root], rotation[root], is_reached[root] = at, turned, True
+        position[reached], rotation[reached], is_reached[reached] = at + moved @ turned.T, turned @ turn, True
+    return position, rotation, is_reached
 
 
 def along_poses(problem: Problem) -> Floats:
@@ -110,8 +110,8 @@ def along_poses(problem: Problem) -> Floats:
     if moved:
         roots = ((k, space.position(x[k]), space.rotation(x[k])) for k in (*problem.fixed, *problem.poses))
         moves = Moves(*(np.concatenate(part) for part in zip(*moved, strict=True)))
-        position, rotation, known = walk(len(x), d, moves, roots)
-        x[known] = space.join(position[known], rotation[known])
+        position, rotation, reached = walk(len(x), d, moves, roots)
+        x[reached] = space.join(position[reached], rotation[reached])
     still = np.concatenate([problem.fixed, *(f.nodes[on, 0] for f, on in used if f.kind == "position")])
     for f, on in used:
         if f.kind == "relative_position":
@@ -198,8 +198,10 @@ def tree(graph: Graph) -> Floats:
         and accurate approximation for planar pose graph optimization, IJRR 2014.
     """
     edges, d, roots = graph.relative_pose, graph.dimension, _roots(graph, False)
-    position, rotation, known = _walked(graph, np.ones(len(edges), dtype=bool), roots)
-    if len(edges) >= len(rotation) or len(edges) > int(known.sum()) - len(np.unique(parts(len(known), edges.nodes))):
+    position, rotation, reached = _walked(graph, np.ones(len(edges), dtype=bool), roots)
+    if len(edges) >= len(rotation) or len(edges) > int(reached.sum()) - len(
+        np.unique(parts(len(reached), edges.nodes))
+    ):
         (i, j), part = edges.nodes.T, parts(len(rotation), edges.nodes)
         still = np.unique(part, return_index=True)[1]
         for root, _, _ in reversed(roots):
@@ -212,7 +214,7 @@ def tree(graph: Graph) -> Floats:
                 break
         moved = _averaging(edges.nodes, position_variance(edges.covariance, d), still, len(rotation))
         position += moved(position[j] - position[i] - np.einsum("mab,mb->ma", rotation[i], edges.position))
-    return _landmarks(graph, position, rotation, known)
+    return _landmarks(graph, position, rotation, reached)
 
 
 def _averaging(nodes: Ints, variance: Floats, still: Ints, n: int) -> Callable[[Floats], Floats]:
@@ -254,15 +256,15 @@ STARTS: dict[str, Callable[[Graph], Floats]] = {
 def contenders(graph: Graph) -> tuple[str, ...]:
     """The starts that may differ on a graph, cheapest first: without loops all are chained odometry, but the file's
     vertices where they are a guess and not the truth."""
-    given = ("file",) if graph.guess and np.isfinite(graph.position).all() else ()
+    from_file = ("file",) if graph.guess and np.isfinite(graph.position).all() else ()
     edges = graph.relative_pose.nodes
     loops = len(edges) + len(graph.relative_point) + len(graph.point_prior) + len(graph.pose_prior)
     moved = len(graph.names) - len(np.setdiff1d(np.flatnonzero(~graph.is_pose), graph.relative_point.nodes[:, -1]))
     if loops <= moved - 1:
-        return ("odometry", *given)
+        return ("odometry", *from_file)
     own = int(_own(graph).sum())
     closed = len(edges) > own or own > int(graph.is_pose.sum()) - len(graph.robots)
-    return ("tree", "odometry", *given, "linear") if closed else ("odometry", *given, "linear")
+    return ("tree", "odometry", *from_file, "linear") if closed else ("odometry", *from_file, "linear")
 
 
 def unwound(graph: Graph, x: Floats) -> bool:
@@ -305,20 +307,20 @@ def _own(graph: Graph) -> Bools:
 
 def _roots(graph: Graph, apart: bool) -> list[tuple[int, Floats, Floats]]:
     """Poses with a prior at that, then each robot's first."""
-    priors, found = graph.pose_prior, []
+    priors, roots = graph.pose_prior, []
     if not apart:
-        found = [(int(i), priors.position[k], priors.rotation[k]) for k, i in enumerate(priors.nodes[:, 0])]
+        roots = [(int(i), priors.position[k], priors.rotation[k]) for k, i in enumerate(priors.nodes[:, 0])]
     robots = [places for places in graph.robots.values() if len(places)]
     around = float(graph.ranges.distance.mean()) if len(graph.ranges) else 1.0
     for k, places in enumerate(robots):
         first, angle = int(places[0]), 2.0 * np.pi * k / len(robots)
         if not apart and np.isfinite(graph.position[first]).all():
-            found.append((first, graph.position[first], graph.rotation[first]))
+            roots.append((first, graph.position[first], graph.rotation[first]))
         else:
             at = np.zeros(graph.dimension)
             at[:2] = around * np.cos(angle), around * np.sin(angle)
-            found.append((first, at, np.eye(graph.dimension)))
-    return found
+            roots.append((first, at, np.eye(graph.dimension)))
+    return roots
 
 
 def _walked(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools]:

@@ -80,8 +80,8 @@ def _apart(problem: Problem, x: Floats) -> Floats:
             continue
         touched[f.nodes[f.informative]] = True
     ranges = [f.z[:, 0].mean() for f in problem.factors if f.measurement.components[0] == "distance"]
-    place = np.cumsum(~touched) - 1
-    turn, radius = 2.4 * place, np.sqrt(1.0 + place) * (ranges[0] if ranges else 1.0)
+    index = np.cumsum(~touched) - 1
+    turn, radius = 2.4 * index, np.sqrt(1.0 + index) * (ranges[0] if ranges else 1.0)
     spiral = np.zeros_like(x)
     spiral[:, 0], spiral[:, 1] = radius * np.cos(turn), radius * np.sin(turn)
     middle = x[touched].sum(axis=0) / max(touched.sum(), 1)

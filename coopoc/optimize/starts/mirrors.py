@@ -28,6 +28,10 @@ SAME = 1e-6
 """Share of the cost that a move must save."""
 
 
+Move = tuple[float, Floats, Ints]
+"""What it adds to the cost of the ranges of a body, its nodes there, and the body."""
+
+
 class Ranges(NamedTuple):
     """M ranges: nodes (M, 2), distance (M,) m, weight (M,) 1/m and the loss of each, None for least squares."""
 
@@ -78,29 +82,29 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     """
     from scipy.sparse.csgraph import shortest_path
 
-    seen, n, d = ranges_of(problem), len(x), x.shape[1]
+    ranges, n, d = ranges_of(problem), len(x), x.shape[1]
     loose = np.concatenate([np.empty(0, np.int64), *bodies(problem)])
-    known = np.setdiff1d(np.arange(n), loose)
+    anchored = np.setdiff1d(np.arange(n), loose)
     if n > LARGEST or not len(loose):
         return x
-    table, (row, column) = np.full((n, n), np.inf), seen.nodes.T
-    np.minimum.at(table, (row, column), seen.distance)
+    table, (row, column) = np.full((n, n), np.inf), ranges.nodes.T
+    np.minimum.at(table, (row, column), ranges.distance)
     for f in problem.factors:
         if f.kind == "displacement":
             np.minimum.at(table, tuple(f.nodes.T), np.linalg.norm(f.z, axis=1))
-    apart = np.linalg.norm(x[known, None] - x[known], axis=2)
-    table[np.ix_(known, known)] = np.where(apart > 0, apart, np.inf)
+    apart = np.linalg.norm(x[anchored, None] - x[anchored], axis=2)
+    table[np.ix_(anchored, anchored)] = np.where(apart > 0, apart, np.inf)
     square = np.square(shortest_path(np.minimum(table, table.T), directed=False))
     if not np.isfinite(square).all():
         return x
     square -= square.mean(axis=0)
     values, vectors = np.linalg.eigh(-0.5 * (square - square.mean(axis=1, keepdims=True)))
     y = vectors[:, -d:] * np.sqrt(np.maximum(values[-d:], 0.0))
-    if len(known):
-        middle, origin = x[known].mean(axis=0), y[known].mean(axis=0)
-        left, _, right = np.linalg.svd((x[known] - middle).T @ (y[known] - origin))
+    if len(anchored):
+        middle, origin = x[anchored].mean(axis=0), y[anchored].mean(axis=0)
+        left, _, right = np.linalg.svd((x[anchored] - middle).T @ (y[anchored] - origin))
         y = (y - origin) @ (left @ right).T + middle
-    y[known] = x[known]
+    y[anchored] = x[anchored]
     return np.asarray(y)
 
 
@@ -123,55 +127,52 @@ def crossings(places: Floats, ranges: Floats) -> Floats:
     return np.asarray(np.stack([p[:, 0] + foot - up, p[:, 0] + foot + up], axis=1).reshape(-1, d))
 
 
-def _elsewhere(problem: Problem, seen: Ranges, x: Floats, body: Ints) -> tuple[float, Floats] | None:
-    """What the best other place of a body adds to the cost of its ranges, and its nodes there; None if it has none.
+def _elsewhere(problem: Problem, ranges: Ranges, x: Floats, body: Ints) -> list[Move]:
+    """Other places of a body, the cheapest first.
 
     It is reflected at the best-fit plane of what ranges it, keeping its handedness, and a point is also put where its
-    spheres cross.
+    spheres cross: where what ranges it has yet to give way, the cheapest of these need not be the image.
     """
-    space, d, inside = problem.space, problem.dimension, np.isin(seen.nodes, body)
-    rows = np.flatnonzero(inside.any(axis=1) & ~inside.all(axis=1) & (seen.weight > 0))
+    space, d, inside = problem.space, problem.dimension, np.isin(ranges.nodes, body)
+    rows = np.flatnonzero(inside.any(axis=1) & ~inside.all(axis=1) & (ranges.weight > 0))
     if len(rows) < 2:
-        return None
+        return []
     first = inside[rows, 0]
-    own, other = (np.where(side, *seen.nodes[rows].T) for side in (first, ~first))
+    own, other = (np.where(side, *ranges.nodes[rows].T) for side in (first, ~first))
     places, at = space.position(x[other]), space.position(x[body])
     middle = places.mean(axis=0)
     normal = np.linalg.eigh((places - middle).T @ (places - middle))[1][:, 0]
     flipped = at - 2.0 * np.outer((at - middle) @ normal, normal)
     there = x[body].copy()
     if len(body) == 1:
-        options = np.concatenate([at, flipped, *([crossings(places, seen.distance[rows])] if len(rows) >= d else [])])
-        costs = seen.cost(np.linalg.norm(options - places[:, None], axis=2), rows)
-        far = np.linalg.norm(options - at, axis=1) > 0.05 * seen.distance[rows].mean()
-        if not far.any():
-            return None
-        best = int(np.where(far, costs, np.inf).argmin())
-        there[0, :d] = options[best]
-        return float(costs[best] - costs[0]), there
+        options = np.concatenate([at, flipped, *([crossings(places, ranges.distance[rows])] if len(rows) >= d else [])])
+        costs = ranges.cost(np.linalg.norm(options - places[:, None], axis=2), rows)
+        least = 0.05 * ranges.distance[rows].mean()
+        moves = list[Move]()
+        for k in (int(np.where(np.linalg.norm(options - at, axis=1) > least, costs, np.inf).argmin()), 1):
+            if all(np.linalg.norm(options[k] - other) > least for other in (at[0], *(m[1][0, :d] for m in moves))):
+                there[0, :d] = options[k]
+                moves.append((float(costs[k] - costs[0]), there.copy(), body))
+        return moves
     left, _, right = np.linalg.svd((flipped - flipped.mean(axis=0)).T @ (at - at.mean(axis=0)))
     turn = left @ np.diag([*np.ones(d - 1), np.linalg.det(left @ right)]) @ right
     moved = (at - at.mean(axis=0)) @ turn.T + flipped.mean(axis=0)
     there = space.join(moved, turn @ space.rotation(x[body])) if space.has_rotation else moved
     index = np.searchsorted(body, own)
-    before, after = (seen.cost(np.linalg.norm(p[index] - places, axis=1)[:, None], rows)[0] for p in (at, moved))
-    return float(after - before), there
+    before, after = (ranges.cost(np.linalg.norm(p[index] - places, axis=1)[:, None], rows)[0] for p in (at, moved))
+    return [(float(after - before), there, body)]
 
 
-Move = tuple[float, Floats, Ints]
-"""What it adds to the cost of the ranges of a body, its nodes there, and the body."""
-
-
-def _moves(problem: Problem, seen: Ranges, x: Floats, single: list[Move]) -> Iterator[Floats]:
+def _moves(problem: Problem, ranges: Ranges, x: Floats, single: list[Move]) -> Iterator[Floats]:
     """Points (n, ambient) to descend from: all bodies where they cost less, one after the other, then one at a time,
     and several together."""
     if any(adds < 0 for adds, _, _ in single):
         y = x.copy()
         for *_, body in single:
-            if (move := _elsewhere(problem, seen, y, body)) is not None and move[0] < 0:
-                y[body] = move[1]
+            if (moves := _elsewhere(problem, ranges, y, body)) and moves[0][0] < 0:
+                y[body] = moves[0][1]
         yield y
-    near = [move for move in single if move[0] <= TRY * (1.0 + len(seen.nodes) / len(x))][:TRIED]
+    near = [move for move in single if move[0] <= TRY * (1.0 + len(ranges.nodes) / len(x))][:TRIED]
     together = (chosen for size in range(1, len(near) + 1) for chosen in combinations(near, size))
     for chosen in islice(together, TRIED):
         y = x.copy()
@@ -192,15 +193,16 @@ def across(
         descend: from a point to a minimum.
         cost: of a point.
     """
-    seen, loose, least, count = ranges_of(problem), bodies(problem), cost(x), 0
-    if len(loose) == len(problem.names) or not len(seen.nodes):  # nothing to mirror at
+    ranges, loose, least, count = ranges_of(problem), bodies(problem), cost(x), 0
+    if len(loose) == len(problem.names) or not len(ranges.nodes):  # nothing to mirror at
         loose = loose if len(loose) > 1 else []
     rivals, single = list[float](), list[Move]()
     while count < ROUNDS:
-        found = ((_elsewhere(problem, seen, x, body), body) for body in loose)
-        single = sorted(((*move, body) for move, body in found if move is not None), key=lambda move: move[0])
+        single = sorted(
+            (move for body in loose for move in _elsewhere(problem, ranges, x, body)), key=lambda move: move[0]
+        )
         rivals = []
-        for start in _moves(problem, seen, x, single):
+        for start in _moves(problem, ranges, x, single):
             end = descend(start)
             if (now := cost(end)) < (1.0 - SAME) * least - 1e-9:
                 x, least, count = end, now, count + 1
@@ -208,4 +210,4 @@ def across(
             rivals.append(now)
         else:
             break
-    return x, count, rivals, [body for adds, _, body in single if adds <= NEAR]
+    return x, count, rivals, [*{int(body[0]): body for adds, _, body in single if adds <= NEAR}.values()]

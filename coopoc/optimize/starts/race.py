@@ -154,11 +154,11 @@ def weaker(factor: Factor, times: float) -> Factor:
 
 def _distinct(tried: dict[str, tuple[float, Floats]]) -> dict[str, tuple[float, Floats]]:
     """Those whose cost differs from that of every one before, which is cheaper."""
-    found: dict[str, tuple[float, Floats]] = {}
+    distinct: dict[str, tuple[float, Floats]] = {}
     for name, (cost, x) in tried.items():
-        if all(abs(cost - other) > SAME * min(cost, other) for other, _ in found.values()):
-            found[name] = cost, x
-    return found
+        if all(abs(cost - other) > SAME * min(cost, other) for other, _ in distinct.values()):
+            distinct[name] = cost, x
+    return distinct
 
 
 def smooth(end: Arrival) -> bool:
