@@ -130,9 +130,9 @@ def tried(name: str, task: Task) -> Row:
     """A method's row for one task: error with its interval, bound, consistency, bytes and time."""
     one = named_method(name)
     held = information(name, one)
-    recording_, fleet = recording(task, held in ("", "fleet"))
-    one(recording_.between(0, 3), [task.columns[0]])  # compiles
-    scores = scored(one, recording_, [fleet.ids[k] for k in task.columns], fleet)
+    measured, fleet = recording(task, held in ("", "fleet"))
+    one(measured.between(0, 3), [task.columns[0]])  # compiles
+    scores = scored(one, measured, [fleet.ids[k] for k in task.columns], fleet)
     level = mean_interval(scores["rt_le_m"])
     row: Row = {"task": task.name}
     row |= {"rt_le_m": rounded(level)}

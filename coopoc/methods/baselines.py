@@ -45,15 +45,15 @@ class LKFSA(Checked):
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        noise_model = resolve(self.noise_model, recording)
+        noise = resolve(self.noise_model, recording)
         return follow_egos(
             self,
             recording,
             egos,
-            lambda ego, box: [
-                Estimate(*run_lkf_sa(measurements(recording, ego, box), assumptions(recording, noise_model, ego, box)))
+            lambda ego, inbox: [
+                Estimate(*run_lkf_sa(measurements(recording, ego, inbox), assumptions(recording, noise, ego, inbox)))
             ],
-            noise_model.notes,
+            noise.notes,
         )
 
 

@@ -64,18 +64,18 @@ def calibrated(
     Raises:
         InputError: no vehicle that drives from a fix on; a truth of other vehicles or times.
     """
-    recording_ = check_recording(recording)
+    checked = check_recording(recording)
     if truth is not None:
-        instance("truth", truth, Fleet).require(recording_.ids, recording_.t)
-    split, default = int(FITTED * len(recording_.t)), make(usual)
+        instance("truth", truth, Fleet).require(checked.ids, checked.t)
+    split, default = int(FITTED * len(checked.t)), make(usual)
     first, whole = (
-        parts_of(recording_.between(0, stop), truth and truth.between(0, stop)) for stop in (split, len(recording_.t))
+        parts_of(checked.between(0, stop), truth and truth.between(0, stop)) for stop in (split, len(checked.t))
     )
-    rest = [part for part in whole if np.isfinite(part.target[:, part.recording.t >= recording_.t[split]]).any()]
+    rest = [part for part in whole if np.isfinite(part.target[:, part.recording.t >= checked.t[split]]).any()]
     if not first or not rest:
         allowed = f"must hold {SHORTEST} steps of a vehicle without a break, with a target, in all of its thirds"
-        raise InputError("recording", repr(recording_), allowed, "Give a longer part of the drive.")
-    change, by = held_out(make(fit(make, usual, first)), default, rest, recording_.t[split])
+        raise InputError("recording", repr(checked), allowed, "Give a longer part of the drive.")
+    change, by = held_out(make(fit(make, usual, first)), default, rest, checked.t[split])
     text = f"the error on its last third by {change:.2g} +- {by:.2g} m"
     if not change + by < 0.0:
         return default, f"calibration keeps the usual numbers: fitted ones change {text}"

@@ -58,11 +58,11 @@ def follow_egos(
     extras: dict[str, list[Floats]] = {}
     with progress_bar(total=len(columns) * len(recording.t), desc=method.name, unit="step", delay=2.0) as bar:
         for e, ego in enumerate(columns):
-            box = inbox(recording, ego, method.message)
-            received[:, e], sent[:, e] = box.received_bytes, box.sent_bytes
-            for result in follow(ego, box):
+            messages = inbox(recording, ego, method.message)
+            received[:, e], sent[:, e] = messages.received_bytes, messages.sent_bytes
+            for result in follow(ego, messages):
                 x[:, result.step, e], cov[:, result.step, e] = result.x, result.covariance
-                here = slice(None) if result.links is None else np.searchsorted(box.link, result.links)
+                here = slice(None) if result.links is None else np.searchsorted(messages.link, result.links)
                 neighbours[:, ends[e] : ends[e + 1]][:, here] = result.neighbours
                 for name, values in result.extras.items():
                     extras.setdefault(name, []).append(values)

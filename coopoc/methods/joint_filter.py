@@ -49,18 +49,18 @@ class JointFilter(Checked):
     @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
-        noise_model = resolve(self.noise_model, recording)
-        refine, gates = (wish and noise_model.exact_relative for wish in (self.exact, self.robust))
+        noise = resolve(self.noise_model, recording)
+        refine, gates = (wish and noise.exact_relative for wish in (self.exact, self.robust))
         return follow_egos(
             self,
             recording,
             egos,
-            lambda ego, box: [
+            lambda ego, inbox: [
                 Estimate(
                     *run_filter(
-                        measurements(recording, ego, box), assumptions(recording, noise_model, ego, box), refine, gates
+                        measurements(recording, ego, inbox), assumptions(recording, noise, ego, inbox), refine, gates
                     )
                 )
             ],
-            noise_model.notes,
+            noise.notes,
         )

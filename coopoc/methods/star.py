@@ -76,19 +76,19 @@ def stars(
     [[0, 1], [0, 1]]
     """
     assumed_noise, ego = resolve(noise_model, recording), check_recording(recording).columns([ego])[0]
-    box, shape, dt = inbox(recording, ego, message), recording.gnss.shape, recording.dt
-    q = np.broadcast_to(assumed_noise.process_variance(recording, [ego], box), shape)
+    messages, shape, dt = inbox(recording, ego, message), recording.gnss.shape, recording.dt
+    q = np.broadcast_to(assumed_noise.process_variance(recording, [ego], messages), shape)
     r = np.broadcast_to(assumed_noise.fix_variance(recording), shape)
     fixes, variances = sent or (recording.gnss, r)
     variances = np.broadcast_to(variances, shape)
     run, each = np.arange(recording.runs)[:, None], np.ones((recording.runs, 1), dtype=np.int64)
     member, newest, uses = np.empty(0, np.int64), 0 * each[:, :0], 0 * each[:, :0]
     for t in range(len(recording.t)):
-        here = slice(box.start[t], box.start[t + 1])
-        before, member = member, np.append(ego, recording.links.neighbour[box.link[here]])
+        here = slice(messages.start[t], messages.start[t + 1])
+        before, member = member, np.append(ego, recording.links.neighbour[messages.link[here]])
         same = np.pad(member[:, None] == before, ((0, 0), (0, 1)), constant_values=True)
         previous = np.where(same[:, :-1].any(axis=1), same.argmax(axis=1), -1)
-        last, newest = np.append(newest, -2 * each, axis=1), np.append(t * each, box.newest[:, here], axis=1)
+        last, newest = np.append(newest, -2 * each, axis=1), np.append(t * each, messages.newest[:, here], axis=1)
         served = np.append(uses, each, axis=1)[:, previous]
         uses = np.where((previous >= 0) & (last[:, previous] == newest), served + 1, 1)
         held, s = newest >= 0, np.where(newest >= 0, newest, t)
@@ -103,11 +103,11 @@ def stars(
             t,
             member,
             previous,
-            box.link[here],
+            messages.link[here],
             moved,
             np.where(held[..., None], (2 * uses - 1)[..., None] * step_variance, FORGOTTEN),
             np.where(known_position[..., None], position, 0.0),
             np.where(known_position[..., None], variance, np.inf),
-            np.append(each > 0, box.fresh[:, here], axis=1) & known_position,
-            recording.relative[:, box.link[here]],
+            np.append(each > 0, messages.fresh[:, here], axis=1) & known_position,
+            recording.relative[:, messages.link[here]],
         )

@@ -141,8 +141,8 @@ class PoseFilter:
             moved[:] = met.received_bytes[:, columns], met.sent_bytes[:, columns]
         elif self.unit == "fleet":
             for k, column in enumerate(columns):
-                box = inbox(recording, column, self.message)
-                received[:, k], sent[:, k] = box.received_bytes, box.sent_bytes
+                messages = inbox(recording, column, self.message)
+                received[:, k], sent[:, k] = messages.received_bytes, messages.sent_bytes
         positions = np.ascontiguousarray(x[..., :3]), np.ascontiguousarray(cov[..., :3, :3])
         notes += doubts(recording, columns, *positions)
         extras: dict[str, Floats] = {}

@@ -127,6 +127,40 @@ def crossings(places: Floats, ranges: Floats) -> Floats:
     return np.asarray(np.stack([p[:, 0] + foot - up, p[:, 0] + foot + up], axis=1).reshape(-1, d))
 
 
+def _plane(places: Floats) -> tuple[Floats, Floats]:
+    """Middle and normal of the best-fit plane of points (K, d)."""
+    middle = places.mean(axis=0)
+    return middle, np.linalg.eigh((places - middle).T @ (places - middle))[1][:, 0]
+
+
+def _image(points: Floats, plane: tuple[Floats, Floats]) -> Floats:
+    """Points (K, d) reflected at a plane."""
+    middle, normal = plane
+    return np.asarray(points - 2.0 * np.outer((points - middle) @ normal, normal))
+
+
+def _mirrored(problem: Problem, nodes: Floats, plane: tuple[Floats, Floats]) -> Floats:
+    """Nodes (K, ambient) moved as a rigid body as near as possible to their image, keeping their handedness."""
+    space = problem.space
+    at = space.position(nodes)
+    image = _image(at, plane)
+    left, _, right = np.linalg.svd((image - image.mean(axis=0)).T @ (at - at.mean(axis=0)))
+    turn = left @ np.diag([*np.ones(problem.dimension - 1), np.linalg.det(left @ right)]) @ right
+    moved = (at - at.mean(axis=0)) @ turn.T + image.mean(axis=0)
+    return space.join(moved, turn @ space.rotation(nodes)) if space.has_rotation else moved
+
+
+def _all_mirrored(problem: Problem, ranges: Ranges, x: Floats, loose: list[Ints]) -> Iterator[Floats]:
+    """All bodies together, reflected at the plane of what ranges any of them: ranges among them hold them there."""
+    inside = np.isin(ranges.nodes, np.concatenate(loose)) if len(loose) > 1 else np.zeros((1, 2), dtype=bool)
+    one = inside.any(axis=1) & ~inside.all(axis=1)
+    if one.sum() >= 2:
+        plane, y = _plane(problem.space.position(x[np.where(inside[one, 0], *ranges.nodes[one, ::-1].T)])), x.copy()
+        for body in loose:
+            y[body] = _mirrored(problem, x[body], plane)
+        yield y
+
+
 def _elsewhere(problem: Problem, ranges: Ranges, x: Floats, body: Ints) -> list[Move]:
     """Other places of a body, the cheapest first.
 
@@ -140,9 +174,8 @@ def _elsewhere(problem: Problem, ranges: Ranges, x: Floats, body: Ints) -> list[
     first = inside[rows, 0]
     own, other = (np.where(side, *ranges.nodes[rows].T) for side in (first, ~first))
     places, at = space.position(x[other]), space.position(x[body])
-    middle = places.mean(axis=0)
-    normal = np.linalg.eigh((places - middle).T @ (places - middle))[1][:, 0]
-    flipped = at - 2.0 * np.outer((at - middle) @ normal, normal)
+    plane = _plane(places)
+    flipped = _image(at, plane)
     there = x[body].copy()
     if len(body) == 1:
         options = np.concatenate([at, flipped, *([crossings(places, ranges.distance[rows])] if len(rows) >= d else [])])
@@ -154,10 +187,8 @@ def _elsewhere(problem: Problem, ranges: Ranges, x: Floats, body: Ints) -> list[
                 there[0, :d] = options[k]
                 moves.append((float(costs[k] - costs[0]), there.copy(), body))
         return moves
-    left, _, right = np.linalg.svd((flipped - flipped.mean(axis=0)).T @ (at - at.mean(axis=0)))
-    turn = left @ np.diag([*np.ones(d - 1), np.linalg.det(left @ right)]) @ right
-    moved = (at - at.mean(axis=0)) @ turn.T + flipped.mean(axis=0)
-    there = space.join(moved, turn @ space.rotation(x[body])) if space.has_rotation else moved
+    there = _mirrored(problem, x[body], plane)
+    moved = space.position(there)
     index = np.searchsorted(body, own)
     before, after = (ranges.cost(np.linalg.norm(p[index] - places, axis=1)[:, None], rows)[0] for p in (at, moved))
     return [(float(after - before), there, body)]
@@ -172,6 +203,7 @@ def _moves(problem: Problem, ranges: Ranges, x: Floats, single: list[Move]) -> I
             if (moves := _elsewhere(problem, ranges, y, body)) and moves[0][0] < 0:
                 y[body] = moves[0][1]
         yield y
+    yield from _all_mirrored(problem, ranges, x, [*{int(body[0]): body for *_, body in single}.values()])
     near = [move for move in single if move[0] <= TRY * (1.0 + len(ranges.nodes) / len(x))][:TRIED]
     together = (chosen for size in range(1, len(near) + 1) for chosen in combinations(near, size))
     for chosen in islice(together, TRIED):
