@@ -158,7 +158,10 @@ def _all_mirrored(problem: Problem, ranges: Ranges, x: Floats, loose: list[Ints]
         plane, y = _plane(problem.space.position(x[np.where(inside[one, 0], *ranges.nodes[one, ::-1].T)])), x.copy()
         for body in loose:
             y[body] = _mirrored(problem, x[body], plane)
-        yield y
+        gap = problem.space.position(y)[ranges.nodes]
+        cost = ranges.cost(np.linalg.norm(gap[:, 0] - gap[:, 1], axis=1)[:, None], np.arange(len(gap)))
+        if float(cost[0]) <= TRY * (1.0 + len(gap) / len(x)) * len(loose):
+            yield y
 
 
 def _elsewhere(problem: Problem, ranges: Ranges, x: Floats, body: Ints) -> list[Move]:
