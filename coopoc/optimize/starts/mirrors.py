@@ -152,16 +152,20 @@ def _mirrored(problem: Problem, nodes: Floats, plane: tuple[Floats, Floats]) -> 
 
 def _all_mirrored(problem: Problem, ranges: Ranges, x: Floats, loose: list[Ints]) -> Iterator[Floats]:
     """All bodies together, reflected at the plane of what ranges any of them: ranges among them hold them there."""
-    inside = np.isin(ranges.nodes, np.concatenate(loose)) if len(loose) > 1 else np.zeros((1, 2), dtype=bool)
-    one = inside.any(axis=1) & ~inside.all(axis=1)
-    if one.sum() >= 2:
-        plane, y = _plane(problem.space.position(x[np.where(inside[one, 0], *ranges.nodes[one, ::-1].T)])), x.copy()
-        for body in loose:
-            y[body] = _mirrored(problem, x[body], plane)
-        gap = problem.space.position(y)[ranges.nodes]
-        cost = ranges.cost(np.linalg.norm(gap[:, 0] - gap[:, 1], axis=1)[:, None], np.arange(len(gap)))
-        if float(cost[0]) <= TRY * (1.0 + len(gap) / len(x)) * len(loose):
-            yield y
+    if len(loose) < 2:
+        return
+    inside = np.isin(ranges.nodes, np.concatenate(loose))
+    rows = inside.any(axis=1) & ~inside.all(axis=1) & (ranges.weight > 0)
+    if rows.sum() < 2:
+        return
+    outside = ranges.nodes[rows][~inside[rows]]
+    plane, y = _plane(problem.space.position(x[outside])), x.copy()
+    for body in loose:
+        y[body] = _mirrored(problem, x[body], plane)
+    gap = problem.space.position(y)[ranges.nodes]
+    cost = ranges.cost(np.linalg.norm(gap[:, 0] - gap[:, 1], axis=1)[:, None], np.arange(len(gap)))
+    if float(cost[0]) <= TRY * (1.0 + len(gap) / len(x)) * len(loose):
+        yield y
 
 
 def _elsewhere(problem: Problem, ranges: Ranges, x: Floats, body: Ints) -> list[Move]:
@@ -184,8 +188,8 @@ def _elsewhere(problem: Problem, ranges: Ranges, x: Floats, body: Ints) -> list[
         options = np.concatenate([at, flipped, *([crossings(places, ranges.distance[rows])] if len(rows) >= d else [])])
         costs = ranges.cost(np.linalg.norm(options - places[:, None], axis=2), rows)
         least = 0.05 * ranges.distance[rows].mean()
-        moves = list[Move]()
-        for k in (int(np.where(np.linalg.norm(options - at, axis=1) > least, costs, np.inf).argmin()), 1):
+        moves, image = list[Move](), 1
+        for k in (int(np.where(np.linalg.norm(options - at, axis=1) > least, costs, np.inf).argmin()), image):
             if all(np.linalg.norm(options[k] - other) > least for other in (at[0], *(m[1][0, :d] for m in moves))):
                 there[0, :d] = options[k]
                 moves.append((float(costs[k] - costs[0]), there.copy(), body))
