@@ -292,7 +292,7 @@ def test_the_filter_is_its_oracle(crossing: Fleet, case: str, priors: Priors) ->
             assert_allclose(track.neighbours[run], np.concatenate(others), atol=2e-6)
 
 
-@pytest.mark.parametrize("case", ["late", "lost", "attack", "measured"])
+@pytest.mark.parametrize("case", ["late", "lost", "attack", "measured", "displaced, late"])
 def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
     """A stream has no recording: each vehicle's broadcast of a step is that of a stream of its own."""
     sensors, v2x, change = BAD[case]
