@@ -19,7 +19,7 @@ from filterpy.kalman import KalmanFilter
 from timing import medians, report, timed
 
 import coopoc as co
-from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.methods.catalogue import METHODS
 from coopoc.methods.cooperative_filter import CooperativeFilter
 
 ROUNDS, NEIGHBOURS, STEPS, RUNS, EGO = 5, 6, 60, 10, 0
@@ -32,7 +32,6 @@ GAPS = (
     "cooperative-filter",
     "ci",
     "split-ci",
-    "central-filter",
 )
 """Methods that are tried with missing fixes and with vehicles that come and go."""
 NOISE = co.Sensors.paper_scenario2()
@@ -65,40 +64,39 @@ def absent(fleet: co.Fleet) -> co.Fleet:
     return replace(fleet, position=position, velocity=velocity)
 
 
-def seen(fleet: co.Fleet, noise: co.Sensors, everyone: bool, runs: int = RUNS, **channel: Any) -> co.Recording:
-    """What the ego, or everyone, measures."""
+def seen(fleet: co.Fleet, noise: co.Sensors, runs: int = RUNS, **channel: Any) -> co.Recording:
+    """What the ego measures."""
     v2x = co.V2X(max_neighbours=NEIGHBOURS, **channel)
-    return co.observe(fleet, noise, v2x, runs=runs, observers=None if everyone else [EGO])
+    return co.observe(fleet, noise, v2x, runs=runs, observers=[EGO])
 
 
 def method_cases() -> Iterator[Case]:
     """Each method plain, with missing fixes, with absences, over a late and lossy channel and in one run alone."""
     fleet = co.load_fleet("town10").between(0, STEPS)
 
-    def case(name: str, plain: str, method: Any, recording: co.Recording, everyone: bool) -> Case:
-        members = len(fleet.ids) if everyone else 1 + len(recording.links.of(EGO)) / STEPS
+    def case(name: str, plain: str, method: Any, recording: co.Recording) -> Case:
+        members = 1 + len(recording.links.of(EGO)) / STEPS
         return Case(name, plain, lambda: method(recording, [EGO]).x, round(STEPS * len(recording.gnss) * members))
 
     for name in GAPS:
-        method, everyone = METHODS[name]("nominal"), name in WHOLE_FLEET
-        recording = seen(fleet, NOISE, everyone)
-        yield case(f"{name}, plain", f"{name}, plain", method, recording, everyone)
-        yield case(f"{name}, missing fixes", f"{name}, plain", method, missing(recording), everyone)
-        yield case(f"{name}, absences", f"{name}, plain", method, seen(absent(fleet), NOISE, everyone), everyone)
-        late = seen(fleet, NOISE, everyone, latency=0.2, loss=0.3)
-        yield case(f"{name}, late and lost", f"{name}, plain", method, late, everyone)
-        yield case(f"{name}, one run", f"{name}, plain", method, seen(fleet, NOISE, everyone, runs=1), everyone)
-    recording, drifting = seen(fleet, NOISE, False), replace(NOISE, gnss_drift_std=2.0, gnss_common_std=1.0)
+        method, recording = METHODS[name]("nominal"), seen(fleet, NOISE)
+        yield case(f"{name}, plain", f"{name}, plain", method, recording)
+        yield case(f"{name}, missing fixes", f"{name}, plain", method, missing(recording))
+        yield case(f"{name}, absences", f"{name}, plain", method, seen(absent(fleet), NOISE))
+        late = seen(fleet, NOISE, latency=0.2, loss=0.3)
+        yield case(f"{name}, late and lost", f"{name}, plain", method, late)
+        yield case(f"{name}, one run", f"{name}, plain", method, seen(fleet, NOISE, runs=1))
+    recording, drifting = seen(fleet, NOISE), replace(NOISE, gnss_drift_std=2.0, gnss_common_std=1.0)
     others = {
         "cooperative-filter, time-correlated errors": (
             CooperativeFilter(),
-            seen(fleet, drifting, False),
+            seen(fleet, drifting),
             "joint, plain",
         ),
         "kalman-adaptive": (co.AdaptiveKalman(), recording, "kalman, plain"),
     }
     for name, (method, measured_by, plain) in others.items():
-        yield case(name, plain, method, measured_by, False)
+        yield case(name, plain, method, measured_by)
 
 
 def stream_cases() -> Iterator[Case]:

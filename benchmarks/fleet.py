@@ -18,8 +18,6 @@ from typing import Any, NamedTuple
 import gtsam
 import numpy as np
 from filterpy.kalman import KalmanFilter
-from growth import grid
-from scipy.linalg.lapack import dpotrf, dpotri
 from timing import medians, report, rows_of
 
 import coopoc as co
@@ -145,7 +143,6 @@ def seconds(rows: Sequence[Row]) -> dict[str, float]:
 
 
 GTSAM, FILTERPY = "GTSAM Levenberg-Marquardt, converted problem, no marginals", "filterpy, KalmanFilter"
-CENTRAL = "floor: LAPACK's factors and inverses of two covariances"
 
 
 def by_pairs(fleet: co.Fleet, most: int, radius: float, least: float) -> np.ndarray:
@@ -187,43 +184,12 @@ def search_rows(sizes: Sequence[tuple[int, int]]) -> list[dict[str, Any]]:
     return out
 
 
-def central_rows() -> list[Row]:
-    """The whole-fleet filter where its covariance is full, and what its matrices cost by themselves.
-
-    It is right if, where all is linear, its last step is that of the smoother.
-    """
-    recording, everyone, size = (
-        co.observe(grid(VEHICLES // 10, 10, SHORT), SENSORS, CHANNEL),
-        range(VEHICLES),
-        3 * VEHICLES,
-    )
-    method, factor = co.CentralFilter(), np.random.default_rng(0).normal(size=(size, 2 * size))
-    full, work = np.asfortranarray(factor @ factor.T), np.empty((size, size), order="F")
-
-    def ours() -> Any:
-        return method(recording, everyone)
-
-    def lapack() -> None:
-        for _ in range(2 * SHORT):
-            work[:] = full
-            dpotrf(work, lower=1, overwrite_a=1, clean=0)
-            dpotri(work, lower=1, overwrite_c=1)
-
-    linear, smoothed = (each("identity")(recording, everyone).x[:, -1] for each in (co.CentralFilter, co.BatchSmoother))
-    away = float(np.abs(linear - smoothed).max())
-    return [
-        Row("CentralFilter, compiled", ours, away < 1e-6),
-        Row(CENTRAL, lapack, True),
-    ]
-
-
 def parts() -> list[tuple[str, str, list[Row]]]:
     """The jobs of a short drive, each with the row that it is compared to."""
     recording = co.observe(town(VEHICLES, SHORT), SENSORS, CHANNEL)
     return [
         ("smoother", GTSAM, smoother_rows(recording)),
         ("solo", FILTERPY, solo_rows(recording)),
-        ("central", CENTRAL, central_rows()),
     ]
 
 

@@ -1,9 +1,9 @@
-"""Methods of a star that filter per axis, fuse pseudo-fixes or solve a window, rounds of messages, a whole fleet.
+"""Methods of a star that filter per axis or fuse pseudo-fixes.
 
     OMP_NUM_THREADS=1 python benchmarks/networked.py            # a Markdown table on stdout, about a minute
 
-Whole methods, each with its inbox and its Track, on town traffic at K = 6. Microseconds are per step and run of an ego,
-or of a vehicle where all take part; the ratio is to the joint filter's in the same rounds. Right: finite estimates;
+Whole methods, each with its inbox and its Track, on town traffic at K = 6. Microseconds are per step and run of an ego;
+the ratio is to the joint filter's in the same rounds. Right: finite estimates;
 the oracles of the tests hold the numbers.
 """
 
@@ -16,7 +16,7 @@ import numpy as np
 from timing import medians, report, timed
 
 import coopoc as co
-from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.methods.catalogue import METHODS
 
 ROUNDS, NEIGHBOURS, STEPS, RUNS = 3, 6, 60, 16
 EGO = 0
@@ -27,10 +27,7 @@ JOBS = {
     "msmv-r": "nominal",
     "split-ci": "nominal",
     "ci": "nominal",
-    "central-filter": "nominal",
-    "central-filter, identity": "identity",
     "joint, gates": "nominal",
-    "central-filter, gates": "nominal",
 }
 """What is assumed of the noise, by the method's name and a word more; only those with gates have any."""
 
@@ -40,14 +37,14 @@ def measured(rounds: int = ROUNDS, steps: int = STEPS, runs: int = RUNS) -> list
     fleet, calls, each, right = co.load_fleet("town10").between(0, steps), {}, {}, {}
     for name, known in JOBS.items():
         word = name.partition(",")[0]
-        everyone, method = word in WHOLE_FLEET, METHODS[word](known)
+        method = METHODS[word](known)
         if hasattr(method, "robust"):
             method = replace(method, robust="gates" in name)
-        channel, observers = co.V2X(max_neighbours=NEIGHBOURS), None if everyone else [EGO]
-        recording = co.observe(fleet, co.Sensors.paper_scenario2(), channel, runs=runs, observers=observers)
+        channel = co.V2X(max_neighbours=NEIGHBOURS)
+        recording = co.observe(fleet, co.Sensors.paper_scenario2(), channel, runs=runs, observers=[EGO])
         calls[name] = lambda method=method, recording=recording: method(recording, [EGO])
         right[name] = bool(np.isfinite(calls[name]().x).all())
-        each[name] = 1e6 / (steps * runs * (len(fleet.ids) if everyone else 1))
+        each[name] = 1e6 / (steps * runs)
     spent = medians({name: lambda call=call: timed(call) for name, call in calls.items()}, rounds)
     us = {name: each[name] * spent[name] for name in JOBS}
     return [

@@ -17,7 +17,7 @@ from tabulate import tabulate
 
 import coopoc as co
 from coopoc.evaluate.metrics import nees_inside
-from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.methods.catalogue import METHODS, needs_whole_fleet
 
 ORDER = (
     "gnss",
@@ -26,7 +26,6 @@ ORDER = (
     "split-ci",
     "msmv-r",
     "joint",
-    "central-filter",
     "batch-smoother",
 )
 SENSORS = co.Sensors.paper_scenario2()
@@ -36,7 +35,7 @@ def row(name: str, fleet: co.Fleet, recording: co.Recording, egos: tuple[int, ..
     """One method: RT-LE, NEES, share inside its band, bytes per second, milliseconds."""
     track = METHODS[name]("nominal")(recording, egos)
     duration = len(track.t) * recording.dt
-    served = len(fleet.ids) if name in WHOLE_FLEET else len(egos)
+    served = len(fleet.ids) if needs_whole_fleet(name) else len(egos)
     claims = track.covariance is not None
     return [
         name,

@@ -22,8 +22,7 @@ from .formats.trajectories import write_kitti as write_kitti
 from .formats.trajectories import write_tum as write_tum
 from .methods.baselines import LKFSA as LKFSA
 from .methods.baselines import MSMV as MSMV
-from .methods.centralised import BatchSmoother as BatchSmoother
-from .methods.centralised import CentralFilter as CentralFilter
+from .methods.batch_smoother import BatchSmoother as BatchSmoother
 from .methods.cooperative_filter import CooperativeFilter as CooperativeFilter
 from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
 from .methods.joint_filter import JointFilter as JointFilter

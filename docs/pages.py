@@ -22,7 +22,7 @@ from scipy import stats
 
 import coopoc as co
 from coopoc.evaluate.bounds import fleet_bound
-from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.methods.catalogue import METHODS, needs_whole_fleet
 from coopoc.plugins import find, names
 from coopoc.study import style
 
@@ -171,7 +171,7 @@ def _methods() -> Iterator[tuple[str, str | bytes]]:
         with contextlib.redirect_stdout(io.StringIO()) as said:
             exec(METHOD.format(name=name), names)
         track = names["track"]
-        bound = "fleet, smoothing" if name == "batch-smoother" else "fleet" if name in WHOLE_FLEET else "star"
+        bound = "fleet, smoothing" if needs_whole_fleet(name) else "star"
         curves = (solo, _error(track, fleet), bounds[bound if method.cooperative else "solo"])
         yield f"methods/{name}.png", _picture(fleet.t, curves, look, bound if method.cooperative else "solo")
         what, sends, covariance = table.get(name, ("", "", ""))
@@ -236,7 +236,6 @@ ORACLES = {
     "msmv-r": "msmv",
     "ci": "covariance_intersection",
     "split-ci": "covariance_intersection",
-    "central-filter": "central_filter",
     "batch-smoother": "batch_smoother",
 }
 """The textbook implementation of `tests/oracles` that each method is held against."""

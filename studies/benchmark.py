@@ -21,7 +21,7 @@ from coopoc.arrays import number
 from coopoc.errors import said, unknown
 from coopoc.evaluate.scores import scored
 from coopoc.evaluate.statistics import mean_interval
-from coopoc.methods.catalogue import WHOLE_FLEET, needs_whole_fleet
+from coopoc.methods.catalogue import needs_whole_fleet
 from coopoc.one_file import in_file
 from coopoc.plugins import find
 from coopoc.study.numbers import three
@@ -123,7 +123,7 @@ def information(name: str, one: Method) -> str:
     special = {"batch-smoother": "", "cooperative-filter": "past"}  # its newcomers bring what they did before
     if not one.cooperative or name in special:
         return special.get(name, "solo")
-    return "fleet" if name in WHOLE_FLEET or needs_whole_fleet(name) else "star"
+    return "fleet" if needs_whole_fleet(name) else "star"
 
 
 def tried(name: str, task: Task) -> Row:

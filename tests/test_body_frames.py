@@ -76,7 +76,7 @@ def test_landmarks_are_measured_beside_the_neighbours_and_stand_exactly(crossing
 
 
 def test_position_methods_refuse_body_frames(body: co.Recording) -> None:
-    for method in (co.Kalman(), co.JointFilter(), co.CentralFilter()):
+    for method in (co.Kalman(), co.JointFilter(), co.BatchSmoother()):
         with refused(r"body frames: must be in the world frame here.*in_world"):
             method(body)
     nothing = co.observe(co.load_fleet("town10").between(0, 3), co.Sensors(compass=False), frame="body")

@@ -9,7 +9,7 @@ import pytest
 from numpy.testing import assert_allclose
 
 import coopoc as co
-from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.methods.catalogue import METHODS, needs_whole_fleet
 from coopoc.optimize import Problem, solve
 
 NOISE = co.Sensors(
@@ -93,7 +93,7 @@ def test_every_method_follows_the_world(name: str, change: str, crossing: co.Fle
     """The law itself is the reference: the world has no preferred origin, direction, side or numbering."""
     if name in AXIS and change == "rotation":
         pytest.skip("estimates a variance for each axis of the world")
-    observers = None if name in WHOLE_FLEET else ["c0", "c3"]
+    observers = None if needs_whole_fleet(name) else ["c0", "c3"]
     rec = co.observe(crossing.between(0, 25), NOISE, CHANNEL, runs=2, seed=5, observers=observers)
     assert_equivariant(METHODS[name]("nominal"), rec, CHANGES[change], NEAR.get(name, 1e-6), ("c0", "c3"))
 

@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from conftest import coming_and_going, refused, standing
 
-from coopoc import V2X, BatchSmoother, CentralFilter, Fleet, Sensors, observe
-from coopoc.methods.whole_fleet import UPLOAD
+from coopoc import V2X, BatchSmoother, Fleet, Sensors, observe
+from coopoc.methods.batch_smoother import UPLOAD, counted
 from coopoc.world import sensing
-from coopoc.world.exchange import exchange
 from coopoc.world.inbox import inbox
 from coopoc.world.links import Links
 from coopoc.world.v2x import FIX_AND_VELOCITY, Message
 
 S2 = Sensors.paper_scenario2()
+SIDES = "step", "observer", "neighbour"
 
 
 def by_brute_force(fleet: Fleet, observers: Any, most: int, radius: float, min_range: float) -> Links:
@@ -32,7 +32,7 @@ def by_brute_force(fleet: Fleet, observers: Any, most: int, radius: float, min_r
 def assert_same_links(fleet: Fleet, observers: Any, most: int, radius: float, min_range: float = 2.0) -> int:
     found = sensing.find_links(fleet, observers, V2X(max_neighbours=most, radius=radius), min_range)
     wanted = by_brute_force(fleet, observers, most, radius, min_range)
-    for name in ("step", "observer", "neighbour"):
+    for name in SIDES:
         np.testing.assert_array_equal(getattr(found, name), getattr(wanted, name))
     return len(found)
 
@@ -62,13 +62,9 @@ def test_bytes_have_closed_forms() -> None:
     """Four vehicles in contact with each other for ten steps, 100 bytes on top of each message."""
     fleet = standing([[0, 0, 0], [9, 0, 0], [0, 9, 0], [9, 9, 0]], steps=10)
     recording = observe(fleet, S2, V2X(max_neighbours=3, overhead=100), runs=2)
-    for method, received, sent in (
-        (CentralFilter(), 44 + 100, 32 + 3 * 16 + 100),
-        (BatchSmoother(), 44 + 100, 32 + 3 * 16 + 100),
-    ):
-        track = method(recording, [0, 2])
-        assert (track.received_bytes == 10 * received).all()
-        assert (track.sent_bytes == 10 * sent).all()
+    track = BatchSmoother()(recording, [0, 2])
+    assert (track.received_bytes == 10 * (44 + 100)).all()
+    assert (track.sent_bytes == 10 * (32 + 3 * 16 + 100)).all()
     box = inbox(recording, 0, Message("thrice", 8, rounds=3))
     assert (box.received_bytes == 10 * 3 * 3 * 132).all()
     assert box.sent_bytes == 10 * 3 * 132
@@ -77,15 +73,15 @@ def test_bytes_have_closed_forms() -> None:
         inbox(recording, 0, UPLOAD)
 
 
-def test_the_first_message_of_either_way_counts(formation: Fleet) -> None:
-    """a and b see each other, c sees b: with K = 1 there are two contacts. A share of 0.3 of the messages is lost."""
-    met = exchange(observe(standing([[0, 0, 0], [9, 0, 0], [20, 0, 0]]), S2, V2X(max_neighbours=1)))
-    assert met.first.tolist() == [0, 1, 0, 1]
-    assert met.second.tolist() == [1, 2, 1, 2]
-    assert (met.link < 0).tolist() == [False, True, False, True]
-    assert (met.link_back < 0).tolist() == [False, False, False, False]
-    lossy = observe(formation.between(0, 200), S2, V2X(max_neighbours=10, radius=1e3, loss=0.3), runs=2)
-    met = exchange(lossy)
-    ways = lossy.arrival[:, [met.link, met.link_back]]
-    assert np.array_equal(met.arrival, np.where((ways < 0).any(axis=1), ways.max(axis=1), ways.min(axis=1)))
-    assert (met.arrival >= 0).mean() == pytest.approx(0.91, abs=0.02)
+def test_a_measurement_counts_by_a_message_of_either_way(formation: Fleet) -> None:
+    """A share of 0.3 of the messages is lost; measured both ways, 0.09 of the pairs hear nothing."""
+    fleet = formation.between(0, 200)
+    lossy = observe(fleet, S2, V2X(max_neighbours=len(fleet.ids), radius=1e3, loss=0.3), runs=2)
+    counts = counted(lossy, np.ones(lossy.gnss.shape[:3], dtype=bool))
+    pairs = {pair: k for k, pair in enumerate(zip(*(getattr(lossy.links, s) for s in SIDES), strict=True))}
+    back = [pairs[t, j, i] for t, i, j in pairs]
+    assert np.array_equal(counts, (lossy.arrival >= 0) | (lossy.arrival[:, back] >= 0))
+    assert counts.mean() == pytest.approx(0.91, abs=0.02)
+    one_way = observe(standing([[0, 0, 0], [9, 0, 0], [20, 0, 0]]), S2, V2X(max_neighbours=1))
+    assert counted(one_way, np.ones(one_way.gnss.shape[:3], dtype=bool)).all()
+    assert not counted(one_way, np.zeros(one_way.gnss.shape[:3], dtype=bool)).any()

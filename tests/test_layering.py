@@ -49,7 +49,7 @@ ROOMS = {
         "convex",
         "backends",
     ],
-    "kernels": ["compiling", "graphs", "stars", "poses", "fleets"],
+    "kernels": ["compiling", "graphs", "stars", "poses"],
 }
 """Folders of a floor, each of which imports those before it only; modules beside them stand above or below all."""
 

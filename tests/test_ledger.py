@@ -6,9 +6,8 @@ import numpy as np
 import pytest
 from conftest import refused
 
-from coopoc import V2X, Fleet, JointFilter, Kalman, Ledger, Sensors, break_even, observe
+from coopoc import V2X, BatchSmoother, Fleet, JointFilter, Kalman, Ledger, Sensors, break_even, observe
 from coopoc.evaluate.ledger import of_track, of_training
-from coopoc.methods.centralised import CentralFilter
 from coopoc.world.v2x import NO_MESSAGE
 
 S2 = Sensors.paper_scenario2()
@@ -18,7 +17,7 @@ ROOT = Path(__file__).parent.parent
 def test_the_ledger_of_a_track_is_its_bytes(crossing: Fleet) -> None:
     """Payload by hand: 32 of 132 B; to a centre as many as were measured."""
     seen, plain = (observe(crossing, S2, V2X(3, overhead=size), runs=2) for size in (100, 0))
-    for method in (JointFilter(), CentralFilter()):
+    for method in (JointFilter(), BatchSmoother()):
         track, bare = method(seen, [1, 4]), method(plain, [1, 4])
         account = of_track(track, seen, method.message)
         assert account.names == ("c1", "c4")

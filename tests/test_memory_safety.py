@@ -13,7 +13,7 @@ from shell import ran
 
 from coopoc import V2X, Fleet, InputError, JointFilter, Sensors, observe
 
-KERNELS = ("kalman", "lkf-sa", "msmv-r", "joint", "ci", "central-filter", "batch-smoother")
+KERNELS = ("kalman", "lkf-sa", "msmv-r", "joint", "ci", "batch-smoother")
 FLEET = Fleet(("a", "b"), [0, 0.1], np.tile([[0, 0, 0], [9, 0, 0]], (2, 1, 1)), np.zeros((2, 2, 3)))
 
 

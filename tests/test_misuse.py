@@ -87,7 +87,6 @@ METHODS: tuple[Any, ...] = (
     co.LKFSA,
     co.MSMV,
     co.BatchSmoother,
-    co.CentralFilter,
     co.CovarianceIntersection,
 )
 FLEET = co.load_fleet("town10").between(0, 6).select([0, 1, 2, 3])

@@ -36,7 +36,7 @@ def road(vehicles: int = 3, steps: int = 60) -> tuple[Fleet, Recording]:
 @pytest.mark.parametrize("name", sorted(METHODS.keys() - {"gnss"}))
 def test_no_method_falls_behind(name: str) -> None:
     """Along the road, within three standard errors of where it is with the true speed, or within MOST. With the
-    variance of each reading it was 0.19 m (kalman) to 0.55 m (central-filter)."""
+    variance of each reading it was 0.19 m (kalman) to 0.55 m (of the whole fleet)."""
     fleet, seen = road()
 
     def ahead(method: Method) -> np.ndarray:

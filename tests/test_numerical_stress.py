@@ -158,8 +158,8 @@ def without_azimuth(recording: co.Recording) -> co.Recording:
 
 
 def test_fine_ranges_alone_bend_as_fixes_are_uncertain() -> None:
-    """UWB of 1 mm between fixes of 1.5 m, 20 m apart. Taken as stated, the central filter was 27 m off
-    and joint 1 m, where a filter of the ego alone is 0.7 m off."""
+    """UWB of 1 mm between fixes of 1.5 m, 20 m apart. Taken as stated, joint was 1 m off, where a filter of the ego
+    alone is 0.7 m off."""
     drives = []
     for seed in (1, 2, 3):
         rng, t = np.random.default_rng(seed), np.arange(60) / 10
@@ -170,7 +170,7 @@ def test_fine_ranges_alone_bend_as_fixes_are_uncertain() -> None:
         fleet = co.Fleet(tuple("abcd"), t, position, velocity)
         seen = co.observe(fleet, sensors, co.V2X(5, radius=200.0), runs=3, seed=seed)
         drives.append((fleet, without_azimuth(seen)))
-    names = "kalman joint lkf-sa-edge central-filter batch-smoother"
+    names = "kalman joint lkf-sa-edge batch-smoother"
     error = errors_of(names, "no azimuth put what is", drives)
     assert all(each < 1.05 * error["kalman"] for each in error.values()), error
 
@@ -183,7 +183,7 @@ def test_ranges_between_rare_fixes_say_no_more_than_where_they_point() -> None:
     rare = np.where(np.arange(600)[:, None, None] % 100, np.nan, seen.gnss)
     velocity = seen.velocity + np.random.default_rng(0).normal(0, 0.1, seen.velocity.shape)
     seen = without_azimuth(replace(seen, gnss=rare, velocity=velocity))
-    error = errors_of("kalman joint central-filter", "100 ranges of a pair to a fix", [(fleet, seen)])
+    error = errors_of("kalman joint", "100 ranges of a pair to a fix", [(fleet, seen)])
     assert all(each <= error["kalman"] for each in error.values()), error
 
 
@@ -196,18 +196,8 @@ def test_an_estimate_that_its_fixes_contradict_is_noted() -> None:
     """Ranges fifty times as long as stated move the estimate away from the ego's fixes, which a note reports."""
     seen = observed(in_line(4, 10.0), co.Sensors())
     wrong = replace(seen, relative=seen.relative * [50.0, 1.0, 1.0])
-    for method in (textbook(METHODS[name]("nominal")) for name in ("joint", "central-filter")):
+    for method in (textbook(co.JointFilter()),):
         assert not any("fixes, " in note for note in method(seen, [0]).notes)
         assert any(
             "far from its estimates; it is lost, or rejects them (0 to " in n for n in method(wrong, [0]).notes
         ), method.name
-
-
-def test_the_central_filter_notes_that_bearings_alone_make_it_too_sure() -> None:
-    """Measured: median NEES of 80 to 2,700 at bearings of 0.6 to 17 degrees, where joint has 3."""
-    seen = observed(in_line(4, 10.0), co.Sensors())
-    blind = replace(seen, relative=np.where([True, False, False], np.nan, seen.relative))
-    assert any("most ranges are missing" in note for note in co.CentralFilter()(blind, [0]).notes)
-    nothing = replace(seen, relative=np.full_like(seen.relative, np.nan))
-    assert not any("most ranges are missing" in note for note in co.CentralFilter()(nothing, [0]).notes)
-    assert not any("most ranges are missing" in note for note in co.CentralFilter()(seen, [0]).notes)

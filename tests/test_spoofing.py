@@ -95,10 +95,10 @@ def test_the_example_prints_its_table(capsys: pytest.CaptureFixture[str]) -> Non
 
 def test_a_fleet_in_which_a_fifth_lies_is_better_than_alone() -> None:
     """At the first fixes, 5 m apart by noise, each number of a liar is within its gate: their vector is not. A centre
-    doubts the fixes that others contradict."""
+    doubts the fixes that others contradict (2.3 m if those were judged by their own vehicle's odometer alone)."""
     fleet = co.load_fleet("town10-validation").between(0, 100)
     seen = spoofed(observe(fleet, S2, V2X(max_neighbours=6), runs=2), 0.2, seed=1, honest=range(5))
     alone, together = (
-        co.rt_le(which("nominal")(seen, range(5)), fleet).mean() for which in (co.Kalman, co.CentralFilter)
+        co.rt_le(which("nominal")(seen, range(5)), fleet).mean() for which in (co.Kalman, co.BatchSmoother)
     )
-    assert together < 0.5 * alone
+    assert together < 0.25 * alone

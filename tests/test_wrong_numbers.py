@@ -23,7 +23,7 @@ from coopoc.evaluate.metrics import innovation_columns, neighbour_rt_le
 from coopoc.evaluate.scores import scored
 from coopoc.kernels import gate
 from coopoc.kernels.stars.cooperative_filter import run_filter
-from coopoc.methods.catalogue import METHODS, WHOLE_FLEET
+from coopoc.methods.catalogue import METHODS, needs_whole_fleet
 from coopoc.methods.cooperative_filter import Priors, broadcasts, model_of
 from coopoc.methods.egos import assumptions, measurements
 from coopoc.methods.noise_model import resolve
@@ -85,7 +85,7 @@ def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(
     moved further, by the largest ones at least."""
     method = METHODS[name]("nominal")
     robust = getattr(method, "robust", name == "cooperative-filter") is True
-    some = 15 if name in WHOLE_FLEET else 1
+    some = 15 if needs_whole_fleet(name) else 1
     runs, (once, after) = slice(0 if robust else RUNS - 4, RUNS, some), FURTHER.get(name, (AT_ONCE, LATER))
     step, clean = recording.links.step[links][runs], method(recording.of_runs(runs), [EGO]).x[:, :, 0]
     farthest = 0.0
@@ -301,14 +301,13 @@ def test_estimates_of_other_egos_are_refused() -> None:
 
 
 @pytest.mark.parametrize("gap", [(0.0, 0.0, 10.0), (1e-9, 0.0, 0.0)], ids=["above", "in one place"])
-@pytest.mark.parametrize("method", [co.JointFilter(), co.CentralFilter()])
 def test_who_flies_straight_above_or_in_one_place_helps_or_does_no_harm(
-    method: Any, gap: tuple[float, float, float]
+    gap: tuple[float, float, float],
 ) -> None:
     """The azimuth of what is straight above says nothing: with it the joint filter had 0.67 m, alone 0.54 m."""
     above = drive(gap)
     seen = co.observe(above, S, co.V2X(1, 60.0), runs=10, seed=1)
-    alone, together = (co.rt_le(which(seen, ["a"]), above).mean() for which in (co.Kalman(), method))
+    alone, together = (co.rt_le(which(seen, ["a"]), above).mean() for which in (co.Kalman(), co.JointFilter()))
     assert together < alone
 
 

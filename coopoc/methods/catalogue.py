@@ -8,7 +8,7 @@ from functools import partial
 from ..one_file import in_file
 from ..plugins import find, names
 from .baselines import LKFSA, MSMV
-from .centralised import BatchSmoother, CentralFilter
+from .batch_smoother import BatchSmoother
 from .cooperative_filter import CooperativeFilter
 from .covariance_intersection import CovarianceIntersection
 from .joint_filter import JointFilter
@@ -29,22 +29,16 @@ METHODS: Mapping[str, Factory] = {
     "cooperative-filter": CooperativeFilter,
     "ci": CovarianceIntersection,
     "split-ci": partial(CovarianceIntersection, split=True, name="split-ci"),
-    "central-filter": CentralFilter,
     "batch-smoother": BatchSmoother,
 }
 """Name -> a function of the noise model, and of options of the method by name."""
 
-WHOLE_FLEET = frozenset({"central-filter", "batch-smoother"})
-"""Methods that need what every vehicle measured, not only the egos."""
-
 
 def needs_whole_fleet(name: str) -> bool:
-    """Whether a method needs what every vehicle measured; one from elsewhere declares it by `whole_fleet = True`.
+    """Whether a method needs what every vehicle measured, not only the egos: it says so by `whole_fleet = True`.
 
-    >>> needs_whole_fleet("central-filter"), needs_whole_fleet("joint")
+    >>> needs_whole_fleet("batch-smoother"), needs_whole_fleet("joint")
     (True, False)
     """
-    if name in METHODS:
-        return name in WHOLE_FLEET
-    registered = in_file(name) or name in names("coopoc.methods")
-    return registered and bool(getattr(find("coopoc.methods", name), "whole_fleet", False))
+    made = METHODS.get(name) or ((in_file(name) or name in names("coopoc.methods")) and find("coopoc.methods", name))
+    return bool(getattr(made, "whole_fleet", False))

@@ -2,12 +2,24 @@
 
 import numpy as np
 
+from coopoc.world.links import spherical, to_vector, wrap
 
-def batch_smoother(drive, x, steps=40):  # type: ignore[no-untyped-def]
+
+def batch_smoother(recording, noise_model, run, x, most=40):  # type: ignore[no-untyped-def]
     """Positions (T, N, 3) from a start of that shape, and covariances (T, N, 3, 3), of one run."""
-    index = {key: 3 * k for k, key in enumerate((t, n) for t in range(drive.steps) for n in drive.here(t))}
-    x, size, eye = x.copy(), 3 * len(index), np.eye(3)
-    for _ in range(steps if drive.noise_model.sensors else 1):
+    gnss, velocity, seen = (v[run] for v in (recording.gnss, recording.velocity, recording.usable_relative))
+    q, r = (
+        np.broadcast_to(values, recording.gnss.shape)[run]
+        for values in (noise_model.process_variance(recording), noise_model.fix_variance(recording))
+    )
+    active = np.zeros(gnss.shape[:2], dtype=bool)
+    for t, n in np.ndindex(active.shape):
+        began = (t > 0 and active[t - 1, n]) or np.isfinite(gnss[t, n]).all()
+        active[t, n] = np.isfinite(velocity[t, n]).all() and began
+    index = {key: 3 * k for k, key in enumerate(zip(*np.nonzero(active), strict=True))}
+    size, eye = 3 * len(index), np.eye(3)
+    x = np.where(active[..., None], x, np.nan)
+    for _ in range(most if noise_model.sensors else 1):
         A, b = np.zeros((size, size)), np.zeros(size)
 
         def add(terms, W, w, A=A, b=b):  # type: ignore[no-untyped-def]
@@ -19,17 +31,15 @@ def batch_smoother(drive, x, steps=40):  # type: ignore[no-untyped-def]
                     A[at : at + 3, to : to + 3] += sign * also * W
 
         for t, n in index:
-            there = np.isfinite(drive.gnss[t, n])
-            W = np.diag(there / drive.r[t, n])
-            add([((t, n), 1.0)], W, W @ np.where(there, drive.gnss[t, n] - x[t, n], 0.0))
-            if drive.stays(t, n):
-                W = eye / drive.q[t, n]
-                gap = drive.dt * drive.velocity[t, n] - (x[t, n] - x[t - 1, n])
-                add([((t, n), 1.0), ((t - 1, n), -1.0)], W, W @ gap)
-        for t in range(drive.steps):
-            for k, i, j in drive.pairs(t):
-                W, w = drive.factor(k, x[t, j] - x[t, i], drive.noise_model.sensors is None)
-                add([((t, j), 1.0), ((t, i), -1.0)], W, w)
+            there = np.isfinite(gnss[t, n])
+            W = np.diag(there / r[t, n])
+            add([((t, n), 1.0)], W, W @ np.where(there, gnss[t, n] - x[t, n], 0.0))
+            if (t - 1, n) in index:
+                gap = recording.dt * velocity[t, n] - (x[t, n] - x[t - 1, n])
+                add([((t, n), 1.0), ((t - 1, n), -1.0)], eye / q[t, n], gap / q[t, n])
+        for k, t, i, j in measurements(recording, run, active):
+            H, off = rows(x[t, j] - x[t, i], seen[k], noise_model.sensors)
+            add([((t, j), 1.0), ((t, i), -1.0)], H.T @ H, H.T @ off)
         move = np.linalg.solve(A, b)
         for (t, n), at in index.items():
             x[t, n] += move[at : at + 3]
@@ -39,3 +49,33 @@ def batch_smoother(drive, x, steps=40):  # type: ignore[no-untyped-def]
     for (t, n), at in index.items():
         cov[t, n] = P[at : at + 3, at : at + 3]
     return x, cov
+
+
+def measurements(recording, run, active):  # type: ignore[no-untyped-def]
+    """(link, step, observer, neighbour) of those that count: a message of either of the two arrives."""
+    links, oldest = recording.links, recording.v2x.max_age / recording.dt + 1e-9
+    keys = list(zip(links.step.tolist(), links.observer.tolist(), links.neighbour.tolist(), strict=True))
+    arrival = dict(zip(keys, recording.arrival[run].tolist(), strict=True))
+    for k, (t, i, j) in enumerate(keys):
+        ways = [arrival.get(key, -1) for key in ((t, i, j), (t, j, i))]
+        if active[t, i] and active[t, j] and any(0 <= way <= t + oldest for way in ways):
+            yield k, t, i, j
+
+
+def rows(vector, measured, sensors):  # type: ignore[no-untyped-def]
+    """Whitened Jacobian and residual of what was measured of range, azimuth, inclination; without sensors, unit rows
+    along the three axes of the measured direction."""
+    there, least = np.isfinite(measured), max(sensors.min_range, 0.1 * sensors.range_std) if sensors else 0.0
+    measured = np.where(there, measured, np.array(spherical(*vector)))
+    at = vector if sensors else to_vector(measured)
+    r = np.linalg.norm(at)
+    d = max(r, least)
+    ground = max(np.hypot(at[0], at[1]), 1e-3 * d)
+    J = np.array([at / r, [-at[1] / ground**2, at[0] / ground**2, 0.0], [0.0, 0.0, -ground / d**2]])
+    J[2, :2] = at[:2] * at[2] / (ground * d**2)
+    if sensors is None:
+        J /= np.linalg.norm(J, axis=1)[:, None]
+        return J[there], J[there] @ (at - vector)
+    off = measured - np.array(spherical(*vector))
+    off[1:] = wrap(off[1:])
+    return (J / sensors.relative_std[:, None])[there], (off / sensors.relative_std)[there]

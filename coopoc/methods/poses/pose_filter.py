@@ -18,9 +18,9 @@ from ...world.plausible import radians
 from ...world.recording import Recording, Vehicles, check_recording
 from ...world.sensors import Sensors
 from ...world.v2x import NO_MESSAGE, Message
+from ..batch_smoother import CENTRE, centre
 from ..doubts import doubts
 from ..track import Track, check_options
-from ..whole_fleet import CENTRE, centre
 from .pose_inputs import (
     POSE,
     SPREAD,
@@ -137,8 +137,8 @@ class PoseFilter:
             x, cov, _ = self.run_filter(recording, members, own, begin, in_time[:, own])
             x, cov = (values[:, :, [members.index(column) for column in columns]] for values in (x, cov))
         if self.unit == "fleet" and self.fusion == "joint":
-            met, notes = centre(recording, self.message), (CENTRE,)
-            moved[:] = met.received_bytes[:, columns], met.sent_bytes[:, columns]
+            both, notes = centre(recording, self.message), (CENTRE,)
+            moved[:] = [each[:, columns] for each in both]
         elif self.unit == "fleet":
             for k, column in enumerate(columns):
                 messages = inbox(recording, column, self.message)

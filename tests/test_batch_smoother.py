@@ -1,4 +1,4 @@
-"""Whole-fleet methods against dense least squares, SciPy, GTSAM, closed forms, and the laws that they obey."""
+"""The whole-drive smoother against a dense oracle, SciPy's least squares, closed forms, and the laws that it obeys."""
 
 from dataclasses import replace
 from typing import Any
@@ -6,37 +6,96 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import coming_and_going, refused, textbook
-from oracles.whole_fleet import rows
+from oracles.batch_smoother import batch_smoother, rows
 from scipy import optimize, stats
 from scipy.optimize import least_squares
 
-from coopoc import V2X, Fleet, NoiseModel, Recording, Sensors, observe
+from coopoc import V2X, BatchSmoother, Fleet, NoiseModel, Recording, Sensors, observe
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound
 from coopoc.evaluate.metrics import nees_inside, rt_le
-from coopoc.kernels.fleets.graph import measurement
-from coopoc.kernels.geometry import components
-from coopoc.methods.centralised import BatchSmoother, CentralFilter
-from coopoc.world.links import spherical, to_vector, vector_cov, wrap
+from coopoc.methods.noise_model import resolve
+from coopoc.world.links import spherical, to_vector, wrap
 from coopoc.world.v2x import Message
 
 S2 = Sensors.paper_scenario2()
 SPEED = replace(S2, velocity_reading="speed")
+KNOWN = {"nominal": "nominal", "identity": "identity", "fitted": NoiseModel("fitted", S2, (0.3, 0.2, 0.01))}
+CHANNELS = {
+    "plain": V2X(max_neighbours=3),
+    "lossy and late": V2X(max_neighbours=3, loss=0.3, latency=0.2),
+    "all": V2X(max_neighbours=20, radius=200.0),
+    "none": V2X(max_neighbours=0),
+}
+
+
+def holed(recording: Recording, fixes: float, angles: float, delays: int = 0) -> Recording:
+    """Without shares of the fixes and of ranges and angles; messages up to so many steps later than sent."""
+    rng = np.random.default_rng(4)
+    gnss, relative, arrival = recording.gnss.copy(), recording.relative.copy(), recording.arrival.copy()
+    gone = rng.uniform(size=gnss.shape[:3]) < fixes
+    gone[:, 0, [0, 5]] = False
+    gnss[gone] = np.nan
+    relative[rng.uniform(size=relative.shape) < angles * np.array([0.3, 1.0, 1.0])] = np.nan
+    arrival = np.where(arrival >= 0, arrival + rng.integers(0, delays + 1, arrival.shape), -1)
+    return replace(recording, gnss=gnss, relative=relative, arrival=arrival)
+
+
+def drive(crossing: Fleet, channel: str, runs: int = 1, gaps: bool = True, absences: bool = True) -> Recording:
+    fleet = crossing.select(range(6)).between(0, 14)
+    position, velocity = fleet.position.copy(), fleet.velocity.copy()
+    for column, away in ((1, slice(4, 9)), (2, slice(0, 6)), (3, slice(9, 14))) if absences else ():
+        position[away, column] = velocity[away, column] = np.nan
+    recording = observe(replace(fleet, position=position, velocity=velocity), S2, CHANNELS[channel], runs=runs)
+    return holed(recording, 0.5, 0.2, 3 if channel == "lossy and late" else 0) if gaps else recording
+
+
+def compare(known: str, recording: Recording) -> None:
+    """Positions and covariances of all vehicles that are there throughout, in every run."""
+    model = KNOWN[known]
+    noise = resolve(model, recording)
+    there = np.isfinite(recording.velocity).all(axis=(0, 1, 3)) & np.isfinite(recording.gnss[:, 0]).all(axis=(0, 2))
+    egos = np.flatnonzero(there).tolist()
+    track = textbook(BatchSmoother(model))(recording, egos)
+    assert track.covariance is not None
+    for run in range(recording.runs):
+        x, P = batch_smoother(recording, noise, run, held(recording.gnss[run]))
+        for e, n in enumerate(egos):
+            np.testing.assert_allclose(track.x[run, :, e], x[:, n], atol=1e-7, rtol=0)
+            size = np.abs(P[:, n]).max(axis=(-1, -2), keepdims=True)
+            assert (np.abs(track.covariance[run, :, e] - P[:, n]) / size).max() < 1e-6
+
+
+def held(gnss: Any) -> Any:
+    """Each vehicle's last fix, its first one before that."""
+    t = np.maximum.accumulate(np.where(np.isfinite(gnss[..., 0]), np.arange(len(gnss))[:, None], -1))
+    first = np.isfinite(gnss[..., 0]).argmax(axis=0)
+    return gnss[np.where(t < 0, first, t), np.arange(gnss.shape[1])]
+
+
+@pytest.mark.parametrize("channel", CHANNELS)
+def test_gaps_absences_and_channels(channel: str, crossing: Fleet) -> None:
+    compare("nominal", drive(crossing, channel, runs=3))
+
+
+@pytest.mark.parametrize("known", ["identity", "fitted"])
+def test_noise_models(known: str, crossing: Fleet) -> None:
+    compare(known, drive(crossing, "lossy and late", gaps=known == "fitted"))
+
+
+@pytest.mark.parametrize("runs", [1, 5])
+def test_batches_of_runs_without_gaps(runs: int, crossing: Fleet) -> None:
+    compare("nominal", drive(crossing, "plain", runs=runs, gaps=False, absences=False))
 
 
 @pytest.mark.parametrize("distance", [0.02, 0.5, 2.5, 11.0])
-def test_the_linearised_measurement_is_the_spherical_measurement(distance: float) -> None:
-    """SciPy's finite differences, and the converted covariance, whose angles are those of `min_range` at least."""
+def test_the_oracles_measurement_is_the_spherical_measurement(distance: float) -> None:
+    """SciPy's finite differences; angles are no more certain than at `min_range`."""
     relative = np.array([distance, -0.8, 1.2])
     at = to_vector(relative)
-    root, residual = rows(at + 0.1, relative, S2, False)
+    root, residual = rows(at + 0.1, relative, S2)
     expected = optimize.approx_fprime(at + 0.1, lambda v: np.array(spherical(*v)) / S2.relative_std, 1e-7)
     assert distance < S2.min_range or root == pytest.approx(expected, abs=1e-4)
     assert residual * S2.relative_std == pytest.approx(relative - np.array(spherical(*(at + 0.1))))
-    seen = tuple(components(relative[None, None], np.array([0]))[0, 0].tolist()) + (1.0,) * 3
-    weight, eta = measurement(tuple(at.tolist()), seen, S2.relative_std, S2.min_range, True)
-    cov = np.linalg.inv(np.reshape(weight, (3, 3)))
-    assert cov == pytest.approx(vector_cov(relative, S2.relative_std, S2.min_range), rel=1e-9)
-    assert eta == pytest.approx(np.zeros(3), abs=1e-9)
 
 
 @pytest.fixture(scope="module")
@@ -46,16 +105,13 @@ def convoy(formation: Fleet) -> tuple[Fleet, Recording, V2X]:
     return fleet, observe(fleet, SPEED, v2x, runs=30, seed=3), v2x
 
 
-@pytest.mark.parametrize(
-    ("method", "smoothing"), [(CentralFilter(), False), (BatchSmoother(), True)], ids=["filter", "smoother"]
-)
-def test_they_are_consistent_and_do_not_beat_the_fleets_bound(method, smoothing: bool, convoy) -> None:
+def test_it_is_consistent_and_does_not_beat_the_fleets_bound(convoy: tuple[Fleet, Recording, V2X]) -> None:
     """NEES gate, and rms RT-LE against the bound beyond its interval (Student t on the runs), and not far above it."""
     fleet, recording, v2x = convoy
-    track = method(recording, [0, 4])
+    track = BatchSmoother()(recording, [0, 4])
     assert nees_inside(track, fleet).min() >= 0.95
     square = (rt_le(track, fleet) ** 2).mean(axis=1)
-    cov = fleet_bound(fleet, SPEED, v2x, smoothing=smoothing)
+    cov = fleet_bound(fleet, SPEED, v2x, smoothing=True)
     bound = np.mean([bound_rt_le(cov[:, e]) ** 2 for e in (0, 4)])
     half = stats.t.ppf(0.995, 29) * square.std(ddof=1) / np.sqrt(30)
     assert square.mean() + half > bound
@@ -64,11 +120,11 @@ def test_they_are_consistent_and_do_not_beat_the_fleets_bound(method, smoothing:
 
 def test_bad_settings_and_egos_are_named(crossing: Fleet) -> None:
     recording = observe(coming_and_going(crossing), S2)
-    absent = CentralFilter()(recording, [2]).absent
+    absent = BatchSmoother()(recording, [2]).absent
     assert absent is not None
     assert (absent[:, 0] >= np.isnan(recording.velocity[0, :, 2, 0])).all()
     with refused("observers"):
-        CentralFilter()(observe(crossing, S2, observers=[0, 3]), [0])
+        BatchSmoother()(observe(crossing, S2, observers=[0, 3]), [0])
     for method, bad in ((Message, {"name": "x", "numbers": -1}),):
         field = next(name for name in bad if name != "name")
         with refused(field):
