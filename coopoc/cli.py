@@ -51,7 +51,6 @@ def run(
     out: Folder = Path("runs"),
     jobs: Annotated[int, arg(metavar="N")] = 1,
     set: Annotated[tuple[tuple[str, ...], ...], UseAppendAction, arg(metavar="KEY=VALUE ...")] = (),
-    shard: Annotated[str, arg(metavar="I/N")] = "",
     retry_failed: bool = False,
     dry_run: bool = False,
     tracks: Literal["none", "tum"] = "none",
@@ -66,7 +65,6 @@ def run(
         out: folder of all studies; this one is written to FOLDER/NAME.
         jobs: number of worker processes; results do not depend on it.
         set: settings or axes of the study; commas separate the values of a list.
-        shard: compute only part I of N; a run without --shard completes and publishes them.
         retry_failed: repeat failed cells.
         dry_run: print which cells would be kept, repeated and computed, then stop.
         tracks: tum writes the estimates, a TUM file for each ego and run, to FOLDER/NAME/tracks.
@@ -84,22 +82,20 @@ def run(
     from .study.run import plan, run_study, write_tracks
 
     if dry_run:
-        print(json.dumps(plan(name, out, changes, shard, retry_failed), indent=1, default=str))
+        print(json.dumps(plan(name, out, changes, retry_failed), indent=1, default=str))
         return 0
-    results = run_study(name, out, jobs, changes, shard=shard, retry_failed=retry_failed)
+    results = run_study(name, out, jobs, changes, retry_failed=retry_failed)
     folder = out / results.study
-    for text in () if shard else tables(folder):
+    for text in tables(folder):
         print(text, end="\n\n")
     for _, row in results.failures.head(5).iterrows():
         params = ", ".join(f"{axis} = {row[axis]}" for axis in results.axes if axis in row)
         print(f"coopoc: failed: {row['reason']} ({params})", file=sys.stderr)
         print(textwrap.indent("\n".join(row["traceback"].splitlines()[-5:]), "  "), file=sys.stderr)
     if tracks == "tum":
-        print(f"coopoc: estimates are in {write_tracks(name, out, changes, shard)}", file=sys.stderr)
+        print(f"coopoc: estimates are in {write_tracks(name, out, changes)}", file=sys.stderr)
     failed = f"; cells failed: {results.failed}, try them again with --retry-failed" if results.failed else ""
-    done = f"shard {shard} is in {folder}" if shard else f"results are in {folder}"
-    then = "When all shards are: the same command without --shard" if shard else f"Report: coopoc report {folder}"
-    print(f"coopoc: {done}{failed}. {then}", file=sys.stderr)
+    print(f"coopoc: results are in {folder}{failed}. Report: coopoc report {folder}", file=sys.stderr)
     return int(results.failed > 0)
 
 

@@ -63,7 +63,6 @@ MISTAKES = (
     ("run small --set runs", "--set = 'runs': must be key=value"),
     ("run small --set rums=3", "Did you mean runs?"),
     ("run small --jobs 0", "jobs = 0: must be >= 1"),
-    ("run small --shard 4/3", "shard = '4/3': must be i/n with 1 <= i <= n"),
     ("reference nowhere", "folder = nowhere: holds no manifest.json"),
     ("table nowhere", "folder = nowhere: holds no views yet"),
     ("report", "folders = none"),

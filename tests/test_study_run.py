@@ -1,5 +1,6 @@
 """The engine: resume, failures, processes. The study is a real one that is installed as a third party's."""
 
+import shutil
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -7,7 +8,7 @@ from pathlib import Path
 import pandas as pd
 import pytest
 from conftest import refused
-from small_runs import files, numbers
+from small_runs import files, numbers, shown
 
 from coopoc.study import store
 from coopoc.study.compute import WorkerDiedError, compute, schedule
@@ -101,6 +102,21 @@ def test_what_cells_share_is_prepared_once_and_only_for_those_that_need_it(study
     run_study(study, tmp_path, settings={"max_neighbours": "0,2"}, progress=False)
     run_study(study, tmp_path, settings={"max_neighbours": "0,2"}, progress=False)
     assert asked == [[0], [2]]
+
+
+def test_files_of_cells_may_be_copied_between_folders(study: Study, tmp_path: Path) -> None:
+    """Half of the cells beside those of other settings; one is damaged, and is computed again as the rest is."""
+    run_study(study, tmp_path / "whole", progress=False)
+    run_study(study, tmp_path / "other", settings={"runs": 2}, progress=False)
+    cells = tmp_path / "all/small/cells"
+    shutil.copytree(tmp_path / "other/small/cells", cells)
+    for path in sorted((tmp_path / "whole/small/cells").glob("[!.]*"))[:4]:
+        shutil.copy2(path, cells)
+    assert plan(study, tmp_path / "all")["finished"] == 4
+    (cells / path.name).write_bytes(b"")
+    with pytest.warns(RuntimeWarning, match="is damaged and will be computed again"):
+        run_study(study, tmp_path / "all", progress=False)
+    assert shown(tmp_path / "all/small") == shown(tmp_path / "whole/small")
 
 
 def test_plan_counts_and_writes_nothing(study: Study, tmp_path: Path) -> None:

@@ -1,10 +1,9 @@
-"""compute: outcomes of cells as they come, here or in worker processes; their order, and shards of a study."""
+"""compute: outcomes of cells as they come, here or in worker processes; their order."""
 
 from __future__ import annotations
 
 import itertools
 import os
-import re
 import sys
 import time
 import traceback
@@ -47,46 +46,20 @@ class Outcome:
     seconds: float
 
 
-def groups(cells: Sequence[Cell], shares: Sequence[str]) -> list[list[Cell]]:
-    """Cells that agree on the parameters `shares`, and so on their recording, in the order of the grid."""
-    shared: dict[tuple[Any, ...], list[Cell]] = {}
-    for cell in cells:
-        shared.setdefault(tuple(cell.given.get(name) for name in shares), []).append(cell)
-    return list(shared.values())
-
-
 def schedule(cells: Sequence[Cell], shares: Sequence[str], jobs: int) -> list[Cell]:
-    """Cells in an order in which those that share a recording follow each other within one of `jobs` lanes.
+    """Cells in an order in which those that agree on the parameters `shares`, and so share a recording, follow each
+    other within one of `jobs` lanes.
 
     Groups are dealt to the lanes in turn and the lanes are interleaved, so that each worker mostly meets one group
     at a time. A worker that drifts into another lane computes that recording once more, nothing else changes. The last
     groups come first: grids mostly grow towards their end, and a long cell at the end would leave other workers idle.
     """
-    ordered = groups(cells, shares)[::-1]
+    shared: dict[tuple[Any, ...], list[Cell]] = {}
+    for cell in cells:
+        shared.setdefault(tuple(cell.given.get(name) for name in shares), []).append(cell)
+    ordered = [*shared.values()][::-1]
     lanes = [list(itertools.chain.from_iterable(ordered[lane::jobs])) for lane in range(jobs)]
     return [cell for step in itertools.zip_longest(*lanes) for cell in step if cell is not None]
-
-
-def part_of(cells: Sequence[Cell], shares: Sequence[str], shard: str) -> list[Cell]:
-    """Cells of shard "i/n": floor((i-1) N / n) to floor(i N / n) of the N, in an order that groups recordings.
-
-    Parts differ by one cell at most, and at most n - 1 recordings are made twice. They are the same on every machine
-    and at any time, since finished cells count, too.
-
-    Args:
-        cells: of the study.
-        shares: names of the parameters that a recording depends on.
-        shard: "i/n".
-
-    Raises:
-        InputError: anything but i/n with 1 <= i <= n.
-    """
-    numbers = re.fullmatch(r"([0-9]+)/([0-9]+)", shard.strip())
-    index, count = map(int, numbers.groups()) if numbers else (0, 0)
-    if not 1 <= index <= count:
-        raise InputError("shard", repr(shard), "must be i/n with 1 <= i <= n", "Write for example: --shard 2/3.")
-    ordered = [cell for group in groups(cells, shares) for cell in group]
-    return ordered[(index - 1) * len(ordered) // count : index * len(ordered) // count]
 
 
 def attempt(function: Function, cell: Cell) -> Outcome:

@@ -1,11 +1,11 @@
-"""Manifest: study, settings, cells and environments of a folder of results, and the locks of those who write it."""
+"""Manifest: study, settings, cells and environments of a folder of results, and the lock of who writes it."""
 
 from __future__ import annotations
 
 import json
 import re
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -102,74 +102,33 @@ def environments(used: Sequence[Mapping[str, str]]) -> dict[str, str]:
 
 
 @contextmanager
-def locked(folder: Path, own: Manifest, shard: str = "") -> Iterator[None]:
-    """Make the folder, write its manifest, and lock both for this process, or for shards of the same manifest.
+def locked(folder: Path, own: Manifest) -> Iterator[None]:
+    """Make the folder, write its manifest, and lock both for this process.
 
-    A second run would replace the manifest under the first one. The operating system releases the locks when the
+    A second run would replace the manifest under the first one. The operating system releases the lock when the
     process ends, however it ends.
 
     Args:
         folder: of the study.
         own: manifest to write.
-        shard: "i/n", or nothing for a run of all cells.
 
     Raises:
-        InputError: another run or the same shard holds the folder, shards with another manifest do, or the folder
-            cannot be written.
+        InputError: another run holds the folder, or it cannot be written.
     """
-    with ExitStack() as stack:
-        try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with FileLock(folder / ".enter"):  # for milliseconds: one process at a time looks at the other locks
-                _enter(folder, own, shard, stack)
-        except OSError as error:
-            allowed = f"cannot be written ({error.strerror or error})"
-            raise InputError("out", str(folder), allowed, "Choose another --out.") from None
-        yield
-
-
-@contextmanager
-def one_at_a_time(folder: Path, waits: Callable[[], object]) -> Iterator[None]:
-    """Lock for the preparation that shards share: the first makes it, the others call `waits` and find it done."""
-    lock = FileLock(folder / ".prepare")
-    if not _taken(lock):
-        waits()
-        lock.acquire()
+    lock = FileLock(folder / ".lock")
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        lock.acquire(blocking=False)
+        for left in (*folder.glob(".*.part"), *folder.glob("*/.*.part")):  # of processes that were killed
+            left.unlink()
+        own.save(folder)
+    except Timeout:
+        wait = "Wait until it ends, or choose another --out."
+        raise InputError("out", str(folder), "is in use by another run", wait) from None
+    except OSError as error:
+        allowed = f"cannot be written ({error.strerror or error})"
+        raise InputError("out", str(folder), allowed, "Choose another --out.") from None
     try:
         yield
     finally:
         lock.release()
-
-
-def _enter(folder: Path, entry: Manifest, shard: str, stack: ExitStack) -> None:
-    own = f".shard-{shard.replace('/', '-of-')}" if shard else ".lock"
-    if not _taken(lock := FileLock(folder / own)):
-        raise _in_use(folder, f"another process with shard {shard}" if shard else "another run")
-    stack.callback(lock.release)
-    others = [path for path in (folder / ".lock", *folder.glob(".shard-*")) if path.name != own and _busy(path)]
-    if others and (not shard or others[0].name == ".lock"):
-        raise _in_use(folder, "another run")
-    if others and (fields := different(entry, read(folder))):
-        raise _in_use(folder, f"shards that differ in {', '.join(fields)}")
-    for left in () if others else (*folder.glob(".*.part"), *folder.glob("*/.*.part")):  # of processes that were killed
-        left.unlink()
-    entry.save(folder)
-
-
-def _taken(lock: FileLock) -> bool:
-    try:
-        lock.acquire(blocking=False)
-    except Timeout:
-        return False
-    return True
-
-
-def _busy(path: Path) -> bool:
-    lock = FileLock(path)
-    if free := _taken(lock):
-        lock.release()
-    return not free
-
-
-def _in_use(folder: Path, by: str) -> InputError:
-    return InputError("out", str(folder), f"is in use by {by}", "Wait until it ends, or choose another --out.")

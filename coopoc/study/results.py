@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -59,12 +59,11 @@ class Results:
             OWN.update(own.mask(taken, own + " (" + own.index + ")"))
 
     @classmethod
-    def load(cls, folder: str | Path, names: Collection[str] | None = None) -> Results:
+    def load(cls, folder: str | Path) -> Results:
         """Read the results in the folder of a study, finished or not.
 
         Args:
             folder: of the study.
-            names: of cells; default all.
 
         Raises:
             InputError: as `coopoc.study.manifest.read`.
@@ -72,7 +71,7 @@ class Results:
         folder = given_path(folder)
         manifest = read(folder)
         done, failed, pending = [], [], 0
-        for name in manifest.cells if names is None else [name for name in manifest.cells if name in names]:
+        for name in manifest.cells:
             table = store.load(folder, name)
             failure = None if table is not None else store.load_failure(folder, name)
             done += [table] if table is not None else []

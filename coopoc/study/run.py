@@ -3,13 +3,10 @@
 from __future__ import annotations
 
 import re
-import sys
 from collections.abc import Sequence
-from contextlib import ExitStack, closing
+from contextlib import closing
 from pathlib import Path
 from typing import Any
-
-from tqdm import tqdm
 
 from ..arrays import instance, named, number
 from ..errors import InputError
@@ -21,8 +18,8 @@ from ..world.recording import Recording
 from ..world.storage import digest, save_recording
 from . import store
 from .cell import Cell, Params
-from .compute import compute, part_of, schedule
-from .manifest import Manifest, locked, one_at_a_time
+from .compute import compute, schedule
+from .manifest import Manifest, locked
 from .provenance import environment
 from .publish import publish
 from .results import Results
@@ -35,7 +32,6 @@ def run_study(
     jobs: int = 1,
     settings: Params | None = None,
     progress: bool = True,
-    shard: str = "",
     retry_failed: bool = False,
 ) -> Results:
     """Compute the results of a study in `jobs` processes; finished cells in `out/<study.name>` are not computed again.
@@ -51,27 +47,22 @@ def run_study(
         settings: changes of the study's settings or axes, see `Study.override`. A Recording, a Log of `read_log`, or
             (Recording, Fleet of its truth) is stored in `out/data` and its path taken.
         progress: show a bar on stderr.
-        shard: "i/n" computes the i-th of n parts and publishes nothing, see `part_of`. Shards of the same settings may
-            share a folder at the same time. A run without it completes and publishes what they have computed.
         retry_failed: compute failed cells once more.
 
     Returns:
-        Results of all cells, or of those of the shard.
+        Results of all cells.
 
     Raises:
-        InputError: an unknown study or setting, jobs < 1, an invalid shard, a folder that cannot be written or that
+        InputError: an unknown study or setting, jobs < 1, a folder that cannot be written or that
             another run uses or from which finished cells vanish, or an error of `study.key`.
         WorkerDiedError: a worker process was killed, mostly for want of memory; finished cells are kept.
     """
-    study, cells, part, folder = _resolve(study, out, settings, shard)
+    study, cells, folder = _resolve(study, out, settings)
     number("jobs", jobs, 1, 10**4, kind=int, allowed=">= 1", hint="Give the number of worker processes.")
-    with ExitStack() as stack:
-        params = {cell.name: dict(cell.params) for cell in cells}
-        manifest = Manifest(study.name, study.question, study.axes, dict(study.settings), params, environment())
-        stack.enter_context(locked(folder, manifest.as_stored(), shard))
-        _work(study, part, folder, jobs, progress, retry_failed)
-        if shard:
-            return Results.load(folder, {cell.name for cell in part})
+    params = {cell.name: dict(cell.params) for cell in cells}
+    manifest = Manifest(study.name, study.question, study.axes, dict(study.settings), params, environment())
+    with locked(folder, manifest.as_stored()):
+        _work(study, cells, folder, jobs, progress, retry_failed)
         results = Results.load(folder)
         if results.pending:
             lost = f"lost {results.pending} of {len(cells)} cells while it ran: something else removed or changed them"
@@ -80,14 +71,13 @@ def run_study(
         return results
 
 
-def write_tracks(study: Study | str, out: str | Path = "runs", settings: Params | None = None, shard: str = "") -> Path:
+def write_tracks(study: Study | str, out: str | Path = "runs", settings: Params | None = None) -> Path:
     """Estimate again what the cells of a study estimated, and write a TUM file for each ego and run of each cell.
 
     Args:
         study: as in `run_study`.
         out: folder of all studies.
         settings: changes of the study's settings or axes.
-        shard: "i/n", or nothing for all cells.
 
     Returns:
         The folder of the files, whose names begin with the parameters of the cell.
@@ -95,11 +85,11 @@ def write_tracks(study: Study | str, out: str | Path = "runs", settings: Params 
     Raises:
         InputError: a study whose cells have no estimates.
     """
-    study, _, part, folder = _resolve(study, out, settings, shard)
+    study, cells, folder = _resolve(study, out, settings)
     if study.tracks is None:
         raise InputError("tracks", study.name, "has cells without estimates of vehicles", "Take side_by_side.")
     (folder := folder / "tracks").mkdir(parents=True, exist_ok=True)
-    for cell in part:
+    for cell in cells:
         if store.load(folder.parent, cell.name) is not None:
             for name, *path in study.tracks(cell.given):
                 words = [str(value) for value in cell.params.values()]
@@ -111,7 +101,6 @@ def plan(
     study: Study | str,
     out: str | Path = "runs",
     settings: Params | None = None,
-    shard: str = "",
     retry_failed: bool = False,
 ) -> dict[str, Any]:
     """Number of cells that `run_study` would keep, repeat and compute, and the reasons of failures; nothing is written.
@@ -120,17 +109,15 @@ def plan(
         study: as in `run_study`.
         out: folder of all studies.
         settings: changes of the study's settings or axes.
-        shard: "i/n", or nothing for all cells.
         retry_failed: count failed cells among those to compute.
     """
-    study, _, part, folder = _resolve(study, out, settings, shard)
-    new, failed = _unfinished(part, folder)
+    study, cells, folder = _resolve(study, out, settings)
+    new, failed = _unfinished(cells, folder)
     return {
         "study": study.name,
         "folder": str(folder),
-        "shard": shard or None,
-        "cells": len(part),
-        "finished": len(part) - len(new) - len(failed),
+        "cells": len(cells),
+        "finished": len(cells) - len(new) - len(failed),
         "failed_before": len(failed),
         "to_compute": len(new) + len(failed) * retry_failed,
         "failures": [{**cell.params, "reason": reason, "repeated": retry_failed} for cell, reason in failed],
@@ -162,9 +149,7 @@ def _work(
     new, before = _unfinished(cells, folder)
     todo = [*new, *(cell for cell, _ in before if retry_failed)]
     if todo:
-        wait = f"coopoc: {study.name}: waits for a shard that prepares shared files"
-        with one_at_a_time(folder, lambda: tqdm.write(wait, file=sys.stderr) if progress else None):
-            study.prepare([cell.given for cell in todo], jobs)
+        study.prepare([cell.given for cell in todo], jobs)
     todo = schedule(todo, study.shares, jobs)
     failed = 0 if retry_failed else len(before)
     outcomes = compute(study.cell, todo, jobs)
@@ -186,16 +171,13 @@ def _work(
             bar.update()
 
 
-def _resolve(
-    study: Study | str, out: str | Path, settings: Params | None, shard: str
-) -> tuple[Study, list[Cell], list[Cell], Path]:
-    """The study under its settings, all its cells, those of the shard, and its folder."""
+def _resolve(study: Study | str, out: str | Path, settings: Params | None) -> tuple[Study, list[Cell], Path]:
+    """The study under its settings, its cells, and its folder."""
     resolved = find_study(study) if isinstance(study, str) else instance("study", study, Study)
     given_path(out)
     changes = named("settings", settings or {}, "Give settings={name: value}.")
     changed = resolved.override({name: _as_path(name, value, out) for name, value in changes.items()})
-    cells = changed.cells()
-    return changed, cells, part_of(cells, changed.shares, shard) if shard else cells, Path(out) / changed.name
+    return changed, changed.cells(), Path(out) / changed.name
 
 
 def _as_path(name: str, value: Any, out: str | Path) -> Any:
