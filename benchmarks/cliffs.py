@@ -86,17 +86,9 @@ def method_cases() -> Iterator[Case]:
         late = seen(fleet, NOISE, latency=0.2, loss=0.3)
         yield case(f"{name}, late and lost", f"{name}, plain", method, late)
         yield case(f"{name}, one run", f"{name}, plain", method, seen(fleet, NOISE, runs=1))
-    recording, drifting = seen(fleet, NOISE), replace(NOISE, gnss_drift_std=2.0, gnss_common_std=1.0)
-    others = {
-        "cooperative-filter, time-correlated errors": (
-            CooperativeFilter(),
-            seen(fleet, drifting),
-            "joint, plain",
-        ),
-        "kalman-adaptive": (co.AdaptiveKalman(), recording, "kalman, plain"),
-    }
-    for name, (method, measured_by, plain) in others.items():
-        yield case(name, plain, method, measured_by)
+    drifting = replace(NOISE, gnss_drift_std=2.0, gnss_common_std=1.0)
+    name, measured_by = "cooperative-filter, time-correlated errors", seen(fleet, drifting)
+    yield case(name, "joint, plain", CooperativeFilter(), measured_by)
 
 
 def stream_cases() -> Iterator[Case]:

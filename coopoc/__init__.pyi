@@ -27,7 +27,6 @@ from .methods.cooperative_filter import CooperativeFilter as CooperativeFilter
 from .methods.covariance_intersection import CovarianceIntersection as CovarianceIntersection
 from .methods.joint_filter import JointFilter as JointFilter
 from .methods.kalman import GNSS as GNSS
-from .methods.kalman import AdaptiveKalman as AdaptiveKalman
 from .methods.kalman import Kalman as Kalman
 from .methods.noise_model import NoiseModel as NoiseModel
 from .methods.poses.pose_filter import PoseFilter as PoseFilter

@@ -228,7 +228,6 @@ print(f"{{co.rt_le(track, fleet).mean():.2f}} m, {{track.received_bytes.mean() /
 
 ORACLES = {
     "kalman": "solo",
-    "kalman-adaptive": "solo",
     "lkf-sa": "lkf_sa",
     "lkf-sa-edge": "joint",
     "joint": "joint",

@@ -27,7 +27,6 @@ import coopoc as co
 from coopoc.arrays import Floats
 from coopoc.formats.trajectories import read_kitti
 from coopoc.learned import load_method
-from coopoc.methods.kalman import ASSUMED
 from coopoc.world.sensors import stream
 
 GNSS_STD = 2.5
@@ -104,13 +103,13 @@ def replay(filter: Any, drive: Iterable[Tick]) -> tuple[float, float]:
     return float(np.sqrt(square[np.isfinite(square)].mean())), len(errors) / seconds
 
 
-AXIS, SPEED = (replace(ASSUMED, velocity_reading=reading) for reading in ("axis", "speed"))
+AXIS, SPEED = (
+    co.Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02, velocity_reading=reading) for reading in ("axis", "speed")
+)
 """Velocity noise of 10 %, of each axis as in the training, or of the speed on every axis: odometry that also turns."""
 FILTERS: dict[str, Callable[[], Any]] = {
     "Kalman, GNSS known, 10 % of axis": lambda: co.Kalman(noise_model(AXIS)).start(),
     "Kalman, GNSS known, 10 % of speed": lambda: co.Kalman(noise_model(SPEED)).start(),
-    "adaptive, 10 % of axis": lambda: co.AdaptiveKalman(AXIS).start(),
-    "adaptive, 10 % of speed": lambda: co.AdaptiveKalman(SPEED).start(),
     "OKF": lambda: load_method("okf").start(),
     "FedKalmanNet": lambda: load_method("fedkalmannet").start(),
     "cooperative, 10 % of speed": lambda: co.StarStream(co.CooperativeFilter(noise_model(SPEED)), measured=True),

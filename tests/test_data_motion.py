@@ -141,7 +141,7 @@ def test_a_gap_splits_a_drive_in_every_method(tmp_path: Path) -> None:
     assert truth is not None
     (first, _), second = rec.stretches("a")
     assert first == 0
-    for method in (co.GNSS(), co.Kalman(), co.AdaptiveKalman(), co.JointFilter(), co.CooperativeFilter(), co.MSMV()):
+    for method in (co.GNSS(), co.Kalman(), co.JointFilter(), co.CooperativeFilter(), co.MSMV()):
         track = method(rec)
         assert track.absent is not None
         assert 20 < track.absent.sum() < 32

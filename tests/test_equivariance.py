@@ -19,8 +19,6 @@ CHANNEL = co.V2X(max_neighbours=4, radius=60.0, loss=0.2, latency=0.1)
 NEAR = {"cooperative-filter": 5e-5}
 """m, where an iteration or a cone solver stops at its own tolerance, of 0.1 mm and less, or of a state of which little
 is known beside much, or of an average over hypotheses, whose odds magnify rounding; 1e-6 elsewhere."""
-AXIS = ("kalman-adaptive",)
-"""Methods that estimate a variance for each axis, and so know directions."""
 
 
 class Change(NamedTuple):
@@ -91,8 +89,6 @@ def assert_equivariant(
 @pytest.mark.parametrize("name", METHODS)
 def test_every_method_follows_the_world(name: str, change: str, crossing: co.Fleet) -> None:
     """The law itself is the reference: the world has no preferred origin, direction, side or numbering."""
-    if name in AXIS and change == "rotation":
-        pytest.skip("estimates a variance for each axis of the world")
     observers = None if needs_whole_fleet(name) else ["c0", "c3"]
     rec = co.observe(crossing.between(0, 25), NOISE, CHANNEL, runs=2, seed=5, observers=observers)
     assert_equivariant(METHODS[name]("nominal"), rec, CHANGES[change], NEAR.get(name, 1e-6), ("c0", "c3"))

@@ -11,7 +11,7 @@ import pytest
 from conftest import formation_fleet, refused, winding
 from scipy.stats import chi2
 
-from coopoc import V2X, AdaptiveKalman, Fleet, JointFilter, Kalman, Method, NoiseModel, Recording, Sensors, observe
+from coopoc import V2X, Fleet, JointFilter, Kalman, Method, NoiseModel, Recording, Sensors, observe
 from coopoc.arrays import Floats
 from coopoc.evaluate.scores import scored
 from coopoc.kernels.covariances import DOUBT
@@ -113,7 +113,7 @@ def faulty(kind: str) -> Recording:
 @pytest.mark.parametrize(
     ("kind", "note", "names"),
     [
-        ("fixes", "fixes, v0: far from its estimates", "kalman kalman-adaptive lkf-sa joint cooperative-filter"),
+        ("fixes", "fixes, v0: far from its estimates", "kalman lkf-sa joint cooperative-filter"),
         ("covariances", "covariances, v0: contradicted", "kalman joint cooperative-filter"),
         ("odometer", "odometer, v0: contradicted", "kalman lkf-sa joint cooperative-filter"),
         ("messages", "messages, v0 and v3: far from estimates", "joint cooperative-filter"),
@@ -134,7 +134,6 @@ def test_nothing_is_noted_of_clean_vehicles() -> None:
         recording = observe(formation_fleet(6, 600), Sensors.paper_scenario2(), V2X(3), runs=2, seed=seed)
         for method in (
             Kalman(),
-            AdaptiveKalman(),
             JointFilter(),
             METHODS["split-ci"]("nominal"),
         ):

@@ -17,8 +17,6 @@ SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_
 COVARIANCES = {f"{name}-{noise}": (name, noise) for name in METHODS for noise in ("identity", "nominal")}
 SNAPSHOTS = {"gnss"}
 """Methods without a memory: alone they give the fix."""
-OWN = {"kalman-adaptive"}
-"""Alone neither a Kalman filter nor a fix: another noise model."""
 
 
 @pytest.mark.parametrize(("name", "noise"), COVARIANCES.values(), ids=COVARIANCES)
@@ -58,9 +56,8 @@ def test_without_messages_it_is_the_solo_method(name: str, noise: str, channel: 
     solo = Kalman(noise, robust=gates)
     alone = (GNSS() if name in SNAPSHOTS else solo)(recording, [0, 1])
     now = slice(-1, None) if name == "batch-smoother" else slice(None)
-    if name not in OWN:
-        assert track.x[:, now] == pytest.approx(alone.x[:, now], abs=1e-6 if name in SNAPSHOTS else 5e-4)
-    if name not in SNAPSHOTS | OWN:
+    assert track.x[:, now] == pytest.approx(alone.x[:, now], abs=1e-6 if name in SNAPSHOTS else 5e-4)
+    if name not in SNAPSHOTS:
         assert track.covariance[:, now] == pytest.approx(alone.covariance[:, now], abs=1e-3)
     assert needs_whole_fleet(name) or (track.received_bytes == 0).all()
 

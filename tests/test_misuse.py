@@ -82,7 +82,6 @@ ALL = (*WRONG, *RAGGED, *HOSTILE)
 METHODS: tuple[Any, ...] = (
     co.GNSS,
     co.Kalman,
-    co.AdaptiveKalman,
     co.JointFilter,
     co.LKFSA,
     co.MSMV,

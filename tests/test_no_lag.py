@@ -9,7 +9,7 @@ from filterpy.kalman import KalmanFilter
 from numpy.testing import assert_allclose
 from oracles.pace import heard
 
-from coopoc import V2X, AdaptiveKalman, Fleet, Kalman, NoiseModel, Recording, Sensors, observe
+from coopoc import V2X, Fleet, Kalman, NoiseModel, Recording, Sensors, observe
 from coopoc.methods.catalogue import METHODS
 from coopoc.methods.track import Method
 from coopoc.world.inbox import inbox
@@ -43,12 +43,8 @@ def test_no_method_falls_behind(name: str) -> None:
         error = method(seen, [0]).x[:, 10:, 0, 0] - fleet.position[10:, 0, 0]
         return np.asarray(error.mean(axis=1))
 
-    if name == "kalman-adaptive":  # it takes no noise model
-        true = replace(NOISY, velocity_std_ratio=0.0, velocity_floor=0.15 * SPEED)
-        found = ahead(AdaptiveKalman(NOISY)) - ahead(AdaptiveKalman(true))
-    else:
-        models = NoiseModel.nominal(NOISY), NoiseModel.oracle(NOISY, fleet)
-        found = np.subtract(*(ahead(METHODS[name](known)) for known in models))
+    models = NoiseModel.nominal(NOISY), NoiseModel.oracle(NOISY, fleet)
+    found = np.subtract(*(ahead(METHODS[name](known)) for known in models))
     most = SMOOTHED if name == "batch-smoother" else MOST
     assert abs(found.mean()) < max(3 * found.std() / np.sqrt(RUNS), most)
 

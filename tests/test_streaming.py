@@ -18,7 +18,6 @@ from coopoc import V2X, CooperativeFilter, Fleet, Kalman, NoiseModel, Sensors, S
 from coopoc.arrays import Floats
 from coopoc.learned import GainNet, LearnedGain, OptimisedKF
 from coopoc.methods.cooperative_filter import AS_STATED
-from coopoc.methods.kalman import AdaptiveKalman
 from coopoc.methods.motion_history import MotionHistory
 from coopoc.methods.star_stream import RelativeMeasurement
 from coopoc.world.recording import Recording
@@ -32,7 +31,6 @@ SOLO: dict[str, tuple[Any, Callable[..., Any]]] = {
     "identity": (Kalman("identity"), Kalman("identity").start),
     "nominal": (Kalman("nominal"), Kalman(NoiseModel.nominal(S2)).start),
     "fitted": (Kalman(FITTED), Kalman(FITTED).start),
-    "adaptive": (AdaptiveKalman(), AdaptiveKalman().start),
     "okf": (OKF, OKF.start),
 }
 STARTS: dict[str, Callable[..., Any]] = {
@@ -121,7 +119,7 @@ def test_a_long_step_is_two_short_ones(name: str) -> None:
         assert_allclose(once.step(Z, U, 0.1)[0], twice.step(Z, U, 0.1)[0], atol=1e-12)
 
 
-@pytest.mark.parametrize("name", ["nominal", "adaptive", "star", "net"])
+@pytest.mark.parametrize("name", ["nominal", "star", "net"])
 def test_nothing_is_known_before_the_first_fix(name: str) -> None:
     stream = STARTS[name]()
     for _ in range(3):

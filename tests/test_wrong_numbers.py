@@ -38,7 +38,7 @@ AT_ONCE, LATER, BEYOND = 0.5, 0.15, 0.1
 """m, how far one wrong number may move a robust filter's estimate, ever, from one second later on, and then where it is
 wrong by FAR or more. A fix of 20 m or a range of 3 m is within the gates, and weighs as any other."""
 SIZES, FAR = np.geomspace(1.0, 1e6, RUNS), 30.0
-FURTHER = {"kalman": (0.8, 0.45), "kalman-adaptive": (0.8, 0.45), "ci": (1.6, 0.9)}
+FURTHER = {"kalman": (0.8, 0.45), "ci": (1.6, 0.9)}
 """m, the same of filters that have nothing else than a fix, or one neighbour of many."""
 ESTABLISHED = 10
 """Steps that a member has been in the star: the first number of a newcomer has nothing to be compared with."""

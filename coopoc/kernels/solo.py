@@ -1,10 +1,8 @@
-"""Solo Kalman filters on position, axis by axis, with known or adaptively estimated noise of the fixes.
+"""The solo Kalman filter on position, axis by axis.
 
-The state of an axis is (x, share, motion, noise, weight, hits, before, spread, evidence, since): its position m, whose
-variance is share * noise + motion m^2, where `noise` m^2 is the variance of a fix as it is estimated now and `weight`
-the number of fixes behind that estimate; `hits` are those of fixes beyond the gate, and the rest is the position that
-`gate.remember` is about, m, its variance m^2, and the memory of that; all but these two are the same on all axes.
-With an infinite weight the noise is known, and the filter is the Kalman filter, whose variance is all in `motion`.
+The state of an axis is (x, variance, hits, before, spread, evidence, since): its position m and variance m^2; `hits`
+are those of fixes beyond the gate, and the rest is the position that `gate.remember` is about, m, its variance m^2, and
+the memory of that; all but these two are the same on all axes.
 """
 
 from __future__ import annotations
@@ -18,33 +16,25 @@ from ..arrays import Floats, Ints
 from .compiling.compile import compiled, inside, part
 from .compiling.small import load, store
 from .dead_reckoning import BAD_INPUT, ESTIMATE, NO_FIX_YET, dead_reckon
-from .gate import BACK, BEGIN, HARD_REJECT_FACTOR, KEEP, NOTHING, SLIP, count, inflation, remember
+from .gate import BACK, BEGIN, KEEP, NOTHING, SLIP, count, inflation, remember
 from .motion import MotionNoise
 
-LEAST = 1e-4
-"""m^2, least variance of a fix: 1 cm."""
-NEVER = (0.0, 0.0, 0.0)
-"""m^2, what fixes that are not late have more."""
-AxisState: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
-STATE: AxisState = (0.0,) * 7 + (NOTHING, 0.0, 0.0)
+AxisState: TypeAlias = tuple[float, float, float, float, float, float, float]
+STATE: AxisState = (0.0, 0.0, 0.0, 0.0, NOTHING, 0.0, 0.0)
 """Before the first fix; its length is the count that `load` takes."""
 Vector: TypeAlias = tuple[float, float, float]
-Gated: TypeAlias = tuple[float, float, float, float, float, float]
+Gated: TypeAlias = tuple[float, float, float, float, float]
 
 
 class FixNoise(NamedTuple):
-    """The noise of fixes: known, or estimated as a running mean.
+    """The noise of fixes.
 
     Attributes:
-        variance: (3,) m^2 at the start.
-        weight: fixes that the start counts for; infinite: known.
-        window: most fixes in the running mean.
+        variance: (3,) m^2.
         gate: squared normalised innovation of a fix from which it weighs less; 0 for none.
     """
 
     variance: Floats
-    weight: float = math.inf
-    window: float = math.inf
     gate: float = 0.0
 
 
@@ -67,84 +57,63 @@ class SoloMeasurements(NamedTuple):
 
 
 @inside
-def start_state(x: float, late: float, exact: bool, variance: float, weight: float) -> AxisState:
-    """State at a position that is known exactly, or as uncertain as a fix."""
-    if exact:
-        return x, 0.0, 0.0, variance, weight, 0.0, 0.0, NOTHING, 0.0, 0.0
-    share = 0.0 if math.isinf(weight) else 1.0
-    return x, share, (1.0 - share) * variance + late, variance, weight, 0.0, 0.0, NOTHING, 0.0, 0.0
+def start_state(x: float, variance: float) -> AxisState:
+    """State at a position."""
+    return x, variance, 0.0, 0.0, NOTHING, 0.0, 0.0
 
 
 @inside
-def gate_fix(states: Floats, moved: Vector, process: Vector, fix: Vector, late: Vector, gate: float) -> Gated:
-    """Squared normalised innovation of the axes' fix, its factor of their noise, and the hits that follow; what becomes
-    of the position that is remembered, and its evidence and time."""
-    q, other, gain, apart, spread, hits = 0.0, 0.0, 0.0, 0.0, 0.0, states[0, 5]
+def gate_fix(states: Floats, moved: Vector, process: Vector, fix: Vector, noise: Vector, gate: float) -> Gated:
+    """Squared normalised innovation of the axes' fix, of variance `noise`, its factor of that, and the hits that
+    follow; what becomes of the position that is remembered, and its evidence and time."""
+    q, other, gain, apart, spread, hits = 0.0, 0.0, 0.0, 0.0, 0.0, states[0, 2]
     if gate == 0.0:
-        return q, 1.0, hits, KEEP, 0.0, 0.0
+        return 1.0, hits, KEEP, 0.0, 0.0
     for c in range(3):
         innovation = fix[c] - states[c, 0] - moved[c]
         if not math.isnan(innovation):
-            s = (states[c, 1] + 1.0) * states[c, 3] + states[c, 2] + process[c] + late[c]
-            q += innovation * innovation / (s + SLIP)
-    if q <= gate and hits == 0.0 and states[0, 7] >= NOTHING:
-        return q, 1.0, 0.0, KEEP, 0.0, 0.0
+            q += innovation * innovation / (states[c, 1] + process[c] + noise[c] + SLIP)
+    if q <= gate and hits == 0.0 and states[0, 4] >= NOTHING:
+        return 1.0, 0.0, KEEP, 0.0, 0.0
     for c in range(3):
-        gap, p = states[c, 6] - states[c, 0], states[c, 7] + process[c]
+        gap, p = states[c, 3] - states[c, 0], states[c, 4] + process[c]
         apart, spread = apart + gap * gap, spread + p
         if not math.isnan(fix[c]):
-            innovation = fix[c] - states[c, 6] - moved[c]
-            other += innovation * innovation / (p + states[c, 3] + late[c] + SLIP)
-            p = states[c, 1] * states[c, 3] + states[c, 2] + process[c]
-            gain += p / (3.0 * (p + states[c, 3] + late[c]))
-    what, evidence, since = remember(q, other, gate, gain, apart, spread, states[0, 8], states[0, 9])
+            innovation = fix[c] - states[c, 3] - moved[c]
+            other += innovation * innovation / (p + noise[c] + SLIP)
+            p = states[c, 1] + process[c]
+            gain += p / (3.0 * (p + noise[c]))
+    what, evidence, since = remember(q, other, gate, gain, apart, spread, states[0, 5], states[0, 6])
     if what == BACK:
-        return other, 1.0, 0.0, what, 0.0, 0.0
-    return q, inflation(q, gate, hits), count(q, gate, hits, gain), what, evidence, since
+        return 1.0, 0.0, what, 0.0, 0.0
+    return inflation(q, gate, hits), count(q, gate, hits, gain), what, evidence, since
 
 
 @inside
-def step(
-    state: AxisState, moved: float, process: float, fix: float, late: float, rule: FixNoise, gated: Gated
-) -> AxisState:
-    """Predict x += dt u, p += q; where there is a fix z, estimate its noise r and update in Joseph's form.
+def step(state: AxisState, moved: float, process: float, fix: float, noise: float, gated: Gated) -> AxisState:
+    """Predict x += dt u, p += q; where there is a fix z of variance r, update in Joseph's form.
 
-    The running mean r <- r + (v^2 - p - r) / n of innovations v (Mehra, IEEE TAC 15(2), 1970) leaves out `late` m^2,
-    what a late fix has more: it and the prediction share the motion since; a v that is rejected counts as the largest
-    one that is not.
     x += k (z - x), k = p / (p + f r), p = (1 - k)^2 p + k^2 f r.
     """
-    (x, share, motion, noise, weight, _, before, spread, _, _), (q, f, hits, what, evidence, since) = state, gated
-    x, motion, before, spread = x + moved, motion + process, before + moved, spread + process
+    (x, p, _, before, spread, _, _), (f, hits, what, evidence, since) = state, gated
+    x, p, before, spread = x + moved, p + process, before + moved, spread + process
     if what == BEGIN:
-        before, spread = x, share * noise + motion
+        before, spread = x, p
     elif what != KEEP:
         if what == BACK:
-            x, share, motion = before, 0.0, spread
+            x, p = before, spread
         spread = NOTHING
-    noise_known = math.isinf(weight)
-    if not math.isnan(fix):
-        p, innovation = share * noise + motion, fix - x
-        if not noise_known:
-            weight = min(weight + 1.0, rule.window)
-            within = min(1.0, HARD_REJECT_FACTOR * rule.gate / q) if f > 1.0 else 1.0
-            noise = max(noise + (within * innovation * innovation - p - noise) / weight, LEAST)
-            p = share * noise + motion
-        if not math.isinf(f):
-            k = p / (p + f * (noise + late))
-            x, rest, own = x + k * innovation, (1.0 - k) * (1.0 - k), k * k * f
-            if noise_known:
-                motion = rest * p + own * (noise + late)
-            else:
-                share, motion = rest * share + own, rest * motion + own * late
-    return x, share, motion, noise, weight, hits, before, spread, evidence, since
+    if not (math.isnan(fix) or math.isinf(f)):
+        k = p / (p + f * noise)
+        x, p = x + k * (fix - x), (1.0 - k) * (1.0 - k) * p + k * k * f * noise
+    return x, p, hits, before, spread, evidence, since
 
 
 @compiled
 def run_filter(
     measurements: SoloMeasurements, rule: FixNoise, exact: bool, index: Ints, x: Floats, p: Floats
 ) -> Floats:
-    """Fill x m and p m^2 of the vehicles, and return the variance of each fix, where it is estimated or gated.
+    """Fill x m and p m^2 of the vehicles, and return the variance of each fix, where it is gated.
 
     A vehicle that was absent starts at its first fix.
 
@@ -156,8 +125,8 @@ def run_filter(
         x: (R, T, E or N, 3).
         p: the same.
     """
-    varies = math.isfinite(rule.weight) or rule.gate > 0.0
-    noise, states = np.empty(x.shape if varies else (0, 0, 0, 3)), np.empty((len(measurements.columns), 3, len(STATE)))
+    noise = np.empty(x.shape if rule.gate > 0.0 else (0, 0, 0, 3))
+    states = np.empty((len(measurements.columns), 3, len(STATE)))
     filter_runs(measurements, rule, exact, index, states, x, p, noise)
     return noise
 
@@ -174,7 +143,7 @@ def filter_runs(
     noise: Floats,
 ) -> None:
     """`run_filter` in given memory."""
-    adaptive, varies = math.isfinite(rule.weight), len(noise) > 0
+    r = three(rule.variance)
     for run in range(measurements.gnss.shape[0]):
         for t in range(measurements.gnss.shape[1]):
             for e in range(len(measurements.columns)):
@@ -182,18 +151,18 @@ def filter_runs(
                 u, q = measurements.velocity[run, t, n], three(measurements.process[run, t, e])
                 fix = three(measurements.gnss[run, t, n])
                 moved = measurements.dt * u[0], measurements.dt * u[1], measurements.dt * u[2]
-                gated = gate_fix(states[e], moved, q, fix, NEVER, rule.gate if t > 0 else 0.0)
+                gated = gate_fix(states[e], moved, q, fix, r, rule.gate if t > 0 else 0.0)
                 for c in range(3):
                     if t == 0 and exact:
-                        state = start_state(x[run, 0, at, c], 0.0, True, rule.variance[c], rule.weight)
+                        state = start_state(x[run, 0, at, c], 0.0)
                     elif t == 0 or math.isnan(states[e, c, 0] + moved[c]):
-                        state = start_state(fix[c], 0.0, False, rule.variance[c], rule.weight)
+                        state = start_state(fix[c], r[c])
                     else:
-                        state = step(load(states[e, c], 0, STATE), moved[c], q[c], fix[c], 0.0, rule, gated)
+                        state = step(load(states[e, c], 0, STATE), moved[c], q[c], fix[c], r[c], gated)
                     store(states[e, c], 0, state)
-                    x[run, t, at, c], p[run, t, at, c] = state[0], state[1] * state[3] + state[2]
-                    if varies:
-                        noise[run, t, at, c] = state[3] if adaptive else state[3] * gated[1]
+                    x[run, t, at, c], p[run, t, at, c] = state[0], state[1]
+                    if len(noise):
+                        noise[run, t, at, c] = r[c] * gated[0]
 
 
 @compiled
@@ -204,28 +173,28 @@ def stream_step(row: Floats, state: Floats, history: Floats, noise: Floats, answ
 
     Args:
         row: (8,) fix m, velocity m/s, dt s, age of the fix s.
-        state: (3, 10).
+        state: (3, 7).
         history: of `motion`.
-        noise: (15,) the numbers of a MotionNoise and a FixNoise: to hand over tuples takes longer than the step.
+        noise: (13,) the numbers of a MotionNoise and a FixNoise: to hand over tuples takes longer than the step.
         answer: (12,) position m, covariance m^2.
     """
     motion = MotionNoise(noise[:3], noise[3:6], noise[6], noise[7], noise[8])
-    rule = FixNoise(noise[9:12], noise[12], noise[13], noise[14])
     q, late, moved = np.empty(3), np.zeros(3), np.zeros(3)
     outcome = dead_reckon(row, history, motion, answer, q, moved, late)
     starts = math.isnan(state[0, 0])
     if outcome == BAD_INPUT or (starts and outcome == NO_FIX_YET):
         return outcome
     fix = row[0] + moved[0], row[1] + moved[1], row[2] + moved[2]
-    gated = gate_fix(state, three(answer), three(q), fix, three(late), rule.gate)
+    r = noise[9] + late[0], noise[10] + late[1], noise[11] + late[2]
+    gated = gate_fix(state, three(answer), three(q), fix, r, noise[12])
     for c in range(3):
         if starts:
-            store(state[c], 0, start_state(fix[c], late[c], False, rule.variance[c], rule.weight))
+            store(state[c], 0, start_state(fix[c], r[c]))
         else:
-            store(state[c], 0, step(load(state[c], 0, STATE), answer[c], q[c], fix[c], late[c], rule, gated))
+            store(state[c], 0, step(load(state[c], 0, STATE), answer[c], q[c], fix[c], r[c], gated))
     answer[:] = 0.0
     for c in range(3):
-        answer[c], answer[3 + 4 * c] = state[c, 0], state[c, 1] * state[c, 3] + state[c, 2]
+        answer[c], answer[3 + 4 * c] = state[c, 0], state[c, 1]
     return ESTIMATE
 
 

@@ -12,7 +12,7 @@ from .batch_smoother import BatchSmoother
 from .cooperative_filter import CooperativeFilter
 from .covariance_intersection import CovarianceIntersection
 from .joint_filter import JointFilter
-from .kalman import GNSS, AdaptiveKalman, Kalman
+from .kalman import GNSS, Kalman
 from .track import Method
 
 Factory = Callable[..., Method]
@@ -21,7 +21,6 @@ Factory = Callable[..., Method]
 METHODS: Mapping[str, Factory] = {
     "gnss": lambda noise_model: GNSS(),
     "kalman": Kalman,
-    "kalman-adaptive": lambda noise_model: AdaptiveKalman(),
     "lkf-sa": LKFSA,
     "lkf-sa-edge": partial(JointFilter, exact=False, robust=False, name="lkf-sa-edge"),
     "msmv-r": MSMV,

@@ -1,4 +1,4 @@
-"""Solo methods: the raw fix, the Kalman filter on position, and the Kalman filter that estimates its GNSS noise."""
+"""Solo methods: the raw fix, and the Kalman filter on position."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import TINY, Floats
+from ..arrays import Floats
 from ..errors import InputError
 from ..kernels.compiling.waiting import clock
 from ..kernels.gate import FIX_GATE
@@ -17,16 +17,12 @@ from ..kernels.solo import FixNoise, SoloMeasurements, run_filter
 from ..short_repr import short_repr
 from ..world.fleet import Fleet
 from ..world.recording import Recording, Vehicles, check_recording
-from ..world.sensors import Sensors
 from .calibration import calibrated, scaled
 from .doubts import doubts
 from .gaps import in_stretches
 from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
 from .stream import FilterStream
-from .track import Alone, Checked, Track, check_options, silent_track
-
-ASSUMED = Sensors(gnss_std=(2.5, 2.5, 2.5), velocity_floor=0.02)
-"""Velocity noise of the paper's training, 10 % per axis, and where the estimate of the fixes' noise starts."""
+from .track import Alone, Checked, Track, silent_track
 
 
 @dataclass(frozen=True)
@@ -121,86 +117,9 @@ class Kalman(Alone, Checked):
         return calibrated(make, usual, recording, truth)[0]
 
 
-@dataclass(frozen=True, eq=False)
-class AdaptiveKalman(Alone):
-    r"""Kalman filter whose GNSS variance r is estimated from its innovations, per axis.
-
-    With innovation $\nu$ of variance $p + r$, $p$ that of the prediction,
-
-    $$ r \leftarrow r + (\nu^2 - p - r) / n, \qquad n \leftarrow \min(n + 1, \mathrm{window}). $$
-
-    So $r$ is the mean of $\nu^2 - p$ over all fixes and `prior_weight` fixes of the assumed variance, and once there
-    are `window` it forgets exponentially. The process noise follows the pace as in NoiseModel.nominal. A
-    bias that is there from the first fix on does not show in innovations.
-
-    A position is a mean of past fixes moved forward. Joseph's form splits its variance into a part that is linear in r
-    and a part from motion. When r is revised, the past is reread with it: a start at a fix that was believed too good,
-    or too bad, does no lasting harm.
-
-    Args:
-        assumed: velocity noise (ratio, reading per axis or speed, floor), and the GNSS std to start from.
-        prior_weight: fixes that this start counts for; inf keeps it for ever.
-        x0: (R, E, 3) or (E, 3) m, a known start; None starts at the first fix.
-        window: fixes; inf never forgets.
-        robust: as of `Kalman`; a fix that is rejected counts in the estimate of r as the worst that is not.
-
-    References:
-        Mehra, IEEE TAC 15(2) 1970; Mohamed and Schwarz, Journal of Geodesy 73, 1999. Defaults were chosen on
-        `town10-validation` (docs/methods.md).
-
-    >>> from coopoc import Fleet, observe
-    >>> fleet = Fleet(("a",), np.arange(400) / 10, np.zeros((400, 1, 3)), np.zeros((400, 1, 3)))
-    >>> seen = observe(fleet, Sensors(gnss_std=(3.5, 3.5, 3.5)), runs=50)
-    >>> bool(abs(AdaptiveKalman().gnss_std(seen)[:, -1].mean() - 3.5) < 0.1)
-    True
-    """
-
-    assumed: Sensors = ASSUMED
-    prior_weight: float = 5.0
-    x0: Floats | None = None
-    window: float = 100.0
-    robust: bool = True
-    name: str = "kalman-adaptive"
-
-    __repr__ = short_repr
-
-    def __post_init__(self) -> None:
-        positive = (TINY, np.inf, "> 0, infinity for never")
-        check_options(self, {"prior_weight": positive, "window": positive})
-
-    @in_stretches
-    def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
-        """Track of the egos; InputError if one is unknown or absent, or x0 has another shape."""
-        began, columns = clock(), check_recording(recording).columns(egos)
-        x, p, _ = solo_filter(recording, columns, NoiseModel.nominal(self.assumed), self._fixes, self.x0)
-        of = "each axis" if self.assumed.velocity_reading == "axis" else "the speed"
-        share, floor = 100 * self.assumed.velocity_std_ratio, self.assumed.velocity_floor
-        note = f"assumes velocity noise of {share:g} % of {of}, at least {floor:g} m/s"
-        return solo_track(recording, columns, x, p, began, (note,))
-
-    def start(
-        self, x0: npt.ArrayLike | None = None, *, interval: float | None = None, history: float = 10.0
-    ) -> FilterStream:
-        """Start the filter for one step at a time, as `Kalman.start`; `state.noise` is the estimated variance."""
-        return FilterStream(motion_noise(NoiseModel.nominal(self.assumed), interval), self._fixes, x0, history)
-
-    def gnss_std(self, recording: Recording, egos: Vehicles = (0,)) -> Floats:
-        """(R, T, E, 3) m, the estimated standard deviation of the fixes at every step."""
-        columns = check_recording(recording).columns(egos)
-        noise_model = NoiseModel.nominal(self.assumed)
-        noise = solo_filter(recording, columns, noise_model, self._fixes, self.x0)[2]
-        assumed = np.broadcast_to(noise_model.gnss_variance, (recording.runs, len(recording.t), len(egos), 3))
-        return np.sqrt(noise if noise.size else assumed)
-
-    @property
-    def _fixes(self) -> FixNoise:
-        noise = fix_noise(NoiseModel.nominal(self.assumed), self.robust)
-        return noise._replace(weight=float(self.prior_weight), window=float(self.window))
-
-
 def fix_noise(noise_model: NoiseModel, robust: bool) -> FixNoise:
     """Known noise of fixes, gated if robust; not where no noise is stated that an innovation could exceed."""
-    return FixNoise(noise_model.gnss_variance, gate=FIX_GATE if robust and noise_model.exact_relative else 0.0)
+    return FixNoise(noise_model.gnss_variance, FIX_GATE if robust and noise_model.exact_relative else 0.0)
 
 
 def solo_track(
@@ -235,12 +154,12 @@ def solo_filter(
         recording: of all vehicles.
         columns: (E,) vehicles that are filtered.
         noise: of the motion.
-        fixes: noise of the fixes, known or estimated.
+        fixes: noise of the fixes.
         x0: (..., E, 3) m, exact at step 0; None starts at the first fix.
         in_place: leave the vehicles at their columns among all N; of others nothing is written.
 
     Returns:
-        Position m, variance m^2, and variance of each fix m^2 where it is estimated or gated (else of no length),
+        Position m, variance m^2, and variance of each fix m^2 where it is gated (else of no length),
         (R, T, E, 3) or (R, T, N, 3).
 
     Raises:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Generic, NamedTuple, Protocol, TypeVar
+from typing import Generic, Protocol, TypeVar
 
 import numpy as np
 import numpy.typing as npt
@@ -63,17 +63,6 @@ class Stream(Generic[State]):
         return self.solo.read(self.state)
 
 
-class AxisStates(NamedTuple):
-    """State of a compiled solo filter, (3,) each: position m, its variance share * noise + motion m^2, the variance of
-    a fix m^2, and the fixes behind that."""
-
-    x: Floats
-    share: Floats
-    motion: Floats
-    noise: Floats
-    weight: Floats
-
-
 class FilterStream:
     """A compiled solo filter, step by step: `step` takes the new measurements and returns the estimate.
 
@@ -93,12 +82,7 @@ class FilterStream:
         )
         if x0 is not None:
             self._state[:] = STATE
-            self._state[:, 0], self._state[:, 3], self._state[:, 4] = three("x0", x0), fixes.variance, fixes.weight
-
-    @property
-    def state(self) -> AxisStates | None:
-        """State of the filter; None before the first fix."""
-        return None if np.isnan(self._state[0, 0]) else AxisStates(*self._state.T[:5].copy())
+            self._state[:, 0] = three("x0", x0)
 
     def step(
         self, gnss: npt.ArrayLike | None, velocity: npt.ArrayLike, dt: float, fix_age: float = 0.0

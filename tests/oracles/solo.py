@@ -1,4 +1,4 @@
-"""Kalman and running-mean adaptive filters of one vehicle on one axis, as loops over time."""
+"""The Kalman filter of one vehicle on one axis, as a loop over time."""
 
 import numpy as np
 
@@ -17,23 +17,5 @@ def kalman(z: Floats, u: Floats, q: Floats, r: float, dt: float, x0: float | Non
             s = p + r
             x, p = x + p / s * (z[t] - x), p * r / s
         estimates.append((x, p))
-    mean, variance = np.array(estimates).T
-    return mean, variance
-
-
-def adaptive(z: Floats, u: Floats, q: Floats, r: float, dt: float, n: float, window: float) -> tuple[Floats, Floats]:
-    """Mean (T,) and estimated variance of the fixes (T,): r <- r + (v^2 - p - r) / n, n <- min(n + 1, window).
-
-    p = a r + b is kept as (a, b), so that a revised r rereads the past.
-    """
-    x, a, b, estimates = z[0], 1.0, 0.0, [(z[0], r)]
-    for t in range(1, len(z)):
-        x, b = x + dt * u[t], b + q[t]
-        if not np.isnan(z[t]):
-            v, n = z[t] - x, min(n + 1, window)
-            r = max(r + (v**2 - (a * r + b) - r) / n, 1e-4)
-            k = (a * r + b) / (a * r + b + r)
-            x, a, b = x + k * v, (1 - k) ** 2 * a + k**2, (1 - k) ** 2 * b
-        estimates.append((x, r))
     mean, variance = np.array(estimates).T
     return mean, variance
