@@ -60,7 +60,7 @@ def method(name: str, stored: bool = False) -> None:
     if stored:
         with tempfile.TemporaryDirectory() as folder:
             save_recording(seen, Path(folder) / "seen.npz")
-            seen = co.load_recording(Path(folder) / "seen.npz")
+            seen = co.read_log(Path(folder) / "seen.npz").recording
     track = made(seen, range(len(seen.ids)) if whole else [24])
     if track.covariance is not None:
         co.nees(track, drive())

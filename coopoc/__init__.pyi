@@ -7,7 +7,6 @@ from .evaluate.bounds import fleet_bound as fleet_bound
 from .evaluate.bounds import pose_bound as pose_bound
 from .evaluate.bounds import posterior_bound as posterior_bound
 from .evaluate.ledger import Ledger as Ledger
-from .evaluate.ledger import break_even as break_even
 from .evaluate.metrics import heading_error as heading_error
 from .evaluate.metrics import max_error as max_error
 from .evaluate.metrics import nees as nees
@@ -16,9 +15,7 @@ from .evaluate.metrics import rt_le as rt_le
 from .evaluate.statistics import paired_difference as paired_difference
 from .fleets import fetch as fetch
 from .fleets import load_fleet as load_fleet
-from .fleets import load_recording as load_recording
 from .fleets import read_log as read_log
-from .formats.trajectories import write_kitti as write_kitti
 from .formats.trajectories import write_tum as write_tum
 from .methods.baselines import LKFSA as LKFSA
 from .methods.baselines import MSMV as MSMV

@@ -1,4 +1,4 @@
-"""load_fleet: a fleet by name or file; load_recording: the user's own measurements; fetch: public ones by name."""
+"""load_fleet: a fleet by name or file; read_log: the user's own measurements; fetch: public ones by name."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from typing import Any
 
 from .plugins import find
 from .world.fleet import Fleet
-from .world.recording import Recording
 
 
 def load_fleet(name_or_path: str | Path, **options: Any) -> Fleet:
@@ -27,31 +26,18 @@ def load_fleet(name_or_path: str | Path, **options: Any) -> Fleet:
     return fleet
 
 
-def load_recording(path: str | Path, **options: Any) -> Recording:
-    """Recording of one's own measurements: tables (CSV, Parquet), NMEA, ROS bags, PyFG.
+def read_log(path: str | Path, **options: Any) -> Any:
+    """`coopoc.data.log.read.Log` of one's own measurements, tables (CSV, Parquet), NMEA, ROS bags, PyFG: recording,
+    truth (None without one), summary.
 
-    docs/your_data.md describes the tables. `read_log` gives the truth and the summary, too.
+    docs/your_data.md describes the tables.
 
     Args:
         path: a file, or a folder whose files belong to one drive.
-        options: of `read_log`, such as dt in seconds and columns.
+        options: of the reader, see `coopoc.data.log.read.read_log`, such as dt in seconds and columns.
 
     Raises:
         InputError: names file, row, column, value, what is allowed and how to correct it.
-    """
-    recording: Recording = read_log(path, **options).recording
-    return recording
-
-
-def read_log(path: str | Path, **options: Any) -> Any:
-    """`coopoc.data.log.read.Log` of one's own measurements: recording, truth (None without one), summary.
-
-    Args:
-        path: as in `load_recording`.
-        options: of the reader, see `coopoc.data.log.read.read_log`.
-
-    Raises:
-        InputError: as `load_recording`.
     """
     return find("coopoc.readers", "log")(path, **options)
 

@@ -170,7 +170,7 @@ def check_scale(t: Floats, position: Floats, by_vehicle: Sequence[Ints], file: s
     >>> check_scale(np.array([0.0, 1]), x, [np.arange(2)], "drive.csv")
     Traceback (most recent call last):
     coopoc.errors.InputError: drive.csv: columns x, y = 11.58..11.5801, 48.14..48.1401: look like degrees, must be \
-metres in a local frame. Give latitude and longitude to co.load_recording, which converts them, or pass any_scale=True.
+metres in a local frame. Give latitude and longitude to co.read_log, which converts them, or pass any_scale=True.
     """
     check_time(t, file)
     speed = 0.0
@@ -181,7 +181,7 @@ metres in a local frame. Give latitude and longitude to co.load_recording, which
     near = max(east - west, north - south) < REGION
     if 0 < speed < SLOWEST and near and max(-west, east) <= 360 and max(-south, north) <= 180:
         actual = f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}"
-        hint = "Give latitude and longitude to co.load_recording, which converts them, or pass any_scale=True."
+        hint = "Give latitude and longitude to co.read_log, which converts them, or pass any_scale=True."
         raise InputError(f"{file}: columns x, y", actual, "look like degrees, must be metres in a local frame", hint)
     if speed > FASTEST:
         hint = "Check the units (t in s, of days as in spreadsheets scale=t:86400; positions in m) and that no two "

@@ -133,7 +133,7 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     read = _read(readers[chosen], path, options)
     truth = read if chosen in DRIVES else read.truth
     if truth is None:
-        hint = "Add a table truth.csv to its folder, pass truth=, or take co.load_recording."
+        hint = "Add a table truth.csv to its folder, pass truth=, or take co.read_log."
         raise InputError(path.name, "no truth", "is a log without one: there is nothing to score against", hint)
     fleet: Fleet = parted(truth, **part)
     return fleet

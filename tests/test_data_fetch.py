@@ -113,7 +113,7 @@ def test_a_data_set_is_fetched_once_and_read_by_name(
     assert server.asked == ["/drive.csv"]
     assert capsys.readouterr().err == ""
     assert digest(co.read_log("car").recording) == digest(co.read_log(path).recording)
-    assert len(co.load_recording("car?until=100").t) == 100
+    assert len(co.read_log("car?until=100").recording.t) == 100
     assert kind_of("car") == "log"
 
 

@@ -50,7 +50,7 @@ def test_truth_is_read_on_the_steps_of_the_recording(folders: Path) -> None:
     assert log.truth is not None
     assert_allclose(log.truth.position, drive(4, gap=15.0).position, atol=1e-9)
     assert load_fleet(folders / "with").digest == log.truth.digest
-    assert co.load_recording(folders / "with").ids == log.recording.ids
+    assert co.read_log(folders / "with").recording.ids == log.recording.ids
     with refused(r"without = no truth: .*truth\.csv"):
         load_fleet(folders / "without")
     late = log.recording.gnss.copy()
@@ -129,7 +129,7 @@ def test_a_recording_is_stored_bit_by_bit(tmp_path: Path) -> None:
 
 def test_innovations_are_filterpys(folders: Path) -> None:
     """Independent reference: filterpy's y and S, step by step."""
-    rec = co.load_recording(folders / "with")
+    rec = co.read_log(folders / "with").recording
     track = co.Kalman()(rec, ["car0"])
     found, squares = fix_innovations(track, rec), normalised_innovations(track, rec)
     assert squares is not None

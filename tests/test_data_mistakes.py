@@ -200,7 +200,7 @@ def test_separators_and_decimal_commas_change_nothing(tmp_path: Path, text: str,
     (tmp_path / "b.csv").write_text(
         "\n".join([head.replace(",", mark), body.replace(",", mark).replace(".", point)]), encoding="utf-8-sig"
     )
-    assert same(co.load_recording(tmp_path / "a.csv"), co.load_recording(tmp_path / "b.csv"))
+    assert same(co.read_log(tmp_path / "a.csv").recording, co.read_log(tmp_path / "b.csv").recording)
 
 
 def parts(folder: Path) -> Path:
@@ -274,7 +274,7 @@ def test_a_header_may_stand_in_one_of_several_tables(tmp_path: Path) -> None:
     log = load_log(f"{parts(tmp_path / 'log')}?columns=vehicle:car,partner:peer&kinds=uwb:range")
     again = co.read_log(tmp_path / "log", columns={"vehicle": "car", "partner": "peer"}, kinds={"uwb": "range"})
     assert same(log.recording, again.recording)
-    assert same(log.recording, co.load_recording(tmp_path / "whole.csv"))
+    assert same(log.recording, co.read_log(tmp_path / "whole.csv").recording)
     assert log.truth is not None
 
 

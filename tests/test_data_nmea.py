@@ -156,7 +156,7 @@ def test_a_bag_is_read(tmp_path: Path, ros: int) -> None:
     assert np.isnan(log.truth.position[:, 1]).all()
     assert any("/car0/note" in what for what in log.summary.unused)
     assert float(co.rt_le(co.Kalman()(rec, [0]), log.truth)[0, 0]) < 0.05
-    assert np.isfinite(co.load_recording(path, dt=0.1).gnss[0, :, :, 0]).sum() == 80 * 2
+    assert np.isfinite(co.read_log(path, dt=0.1).recording.gnss[0, :, :, 0]).sum() == 80 * 2
 
 
 def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path: Path) -> None:
@@ -247,7 +247,7 @@ def test_topics_as_tables_are_the_bag(tmp_path: Path) -> None:
             file.parent.mkdir(parents=True, exist_ok=True)
             pd.DataFrame(stamp | columns).to_csv(file, index=False)
     log = read_log(tmp_path / "dump", origin=(48.14, 11.58, 560.0), std={"z": 1.5, "range": 0.15})
-    assert co.load_recording(tmp_path / "dump").ids == log.recording.ids == ("car0", "car1")
+    assert co.read_log(tmp_path / "dump").recording.ids == log.recording.ids == ("car0", "car1")
     assert log.summary.refused["fixes that the receiver calls invalid"][0] == 2
     there = np.isfinite(log.recording.gnss[0, :, :, 0])
     assert_allclose(log.recording.gnss[0][there], fleet.position[there], atol=1e-5)

@@ -1,4 +1,4 @@
-"""Tables and files that people take into their own notebook: `to_frame`, `write_tum`, `write_kitti`."""
+"""Tables and files that people take into their own notebook: `to_frame`, `write_tum`."""
 
 from pathlib import Path
 
@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose, assert_array_equal
 from scipy.spatial.transform import Rotation
 
 import coopoc as co
-from coopoc.formats.trajectories import read_kitti, read_tum
+from coopoc.formats.trajectories import read_tum
 
 rng = np.random.default_rng(5)
 IDS = ("red", "green", "blue")
@@ -85,13 +85,11 @@ def test_paths_as_other_programs_read_them(tmp_path: Path) -> None:
     """Independent check: columns by NumPy, and angles of SciPy's rotations; evo's own reader where it is installed."""
     t, position, heading = 1.6e9 + np.arange(7) * 0.1, rng.normal(0, 1e4, (7, 3)), rng.uniform(-3, 3, 7)
     co.write_tum(tmp_path / "a.tum", t, position, heading)
-    co.write_kitti(str(tmp_path / "a.txt"), position, heading)
-    tum, kitti = (np.loadtxt(tmp_path / name) for name in ("a.tum", "a.txt"))
+    tum = np.loadtxt(tmp_path / "a.tum")
     assert_allclose(tum[:, :4], np.column_stack([t, position]), rtol=0, atol=1e-6)
     assert_allclose(Rotation.from_quat(tum[:, 4:]).as_euler("zyx")[:, 0], heading, atol=1e-8)
-    assert_allclose(kitti.reshape(-1, 3, 4)[..., 3], position, atol=1e-8)
-    assert_allclose(Rotation.from_matrix(kitti.reshape(-1, 3, 4)[..., :3]).as_rotvec()[:, 2], heading, atol=1e-8)
-    assert_allclose(read_tum(tmp_path / "a.tum").rotation, read_kitti(tmp_path / "a.txt").rotation, atol=1e-8)
+    turned = Rotation.from_matrix(read_tum(tmp_path / "a.tum").rotation).as_rotvec()
+    assert_allclose(turned[:, 2], heading, atol=1e-8)
 
 
 def test_a_path_that_no_program_could_read_is_refused(tmp_path: Path) -> None:
@@ -100,9 +98,9 @@ def test_a_path_that_no_program_could_read_is_refused(tmp_path: Path) -> None:
         (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], gap), "pose 1"),
         (lambda: co.write_tum(tmp_path / "a", [0.1, 0.1], np.zeros((2, 3))), "column t"),
         (lambda: co.write_tum(tmp_path / "a", [0.0], np.zeros((2, 3))), "stamps"),
-        (lambda: co.write_kitti(tmp_path / "a", np.zeros((2, 2))), "position"),
-        (lambda: co.write_kitti(tmp_path / "a", np.zeros((2, 3)), [0.0]), "heading"),
-        (lambda: co.write_kitti("", np.zeros((2, 3))), "path"),
+        (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], np.zeros((2, 2))), "position"),
+        (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], np.zeros((2, 3)), [0.0]), "heading"),
+        (lambda: co.write_tum("", [0.0, 0.1], np.zeros((2, 3))), "path"),
     ):
         with pytest.raises(co.InputError, match=named):
             write()

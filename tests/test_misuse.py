@@ -242,7 +242,6 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     "in_world": (co.in_world, {"recording": BODY}),
     "stars": (lambda **given: list(co.stars(**given)), {"recording": SEEN, "ego": 0, "noise_model": "nominal"}),
     "paired_difference": (co.paired_difference, {"a": np.ones((3, 2)), "b": np.eye(3)[:, :2]}),
-    "break_even": (co.break_even, {"training": BYTES, "online": BYTES}),
     "NoiseModel": (
         co.NoiseModel,
         {"name": "n", "sensors": SENSORS, "process_std": (1, 1, 1), "gnss_std": (1, 1, 1), "compass": (0.1, 0.1)},
@@ -282,7 +281,7 @@ ELSEWHERE = {
     "InputError, MissingLibraryError": "what is raised",
     "Constraint, Factor, Solution, backends": "made by Problem and solve",
     "Results, Study, run_study": "settings: test_study_run",
-    "fetch, load_fleet, load_recording, read_log, read_graph, write_kitti, write_tum": "paths: test_data_readers",
+    "fetch, load_fleet, read_log, read_graph, write_tum": "paths: test_data_readers",
     "plot_recording, plot_solution, plot_track": "pictures: test_pictures",
 }
 ALLOWED = {
@@ -397,7 +396,6 @@ def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path: Path) ->
         read_g2o,
         read_pyfg,
         co.load_fleet,
-        co.load_recording,
         co.read_log,
     ):
         swept(lambda path, read=read: read(path), {"path": "nowhere.pyfg"})
@@ -443,7 +441,7 @@ def test_training_refuses_values_from_elsewhere() -> None:
 def test_paths_that_no_file_system_holds_are_refused(tmp_path: Path, path: Any) -> None:
     learned = pytest.importorskip("coopoc.learned")
     checkpoint = learned.Checkpoint(learned.NoiseParameters(), {})
-    reads = (co.read_graph, co.load_fleet, co.load_recording, co.read_log, co.Results.load, learned.load, views)
+    reads = (co.read_graph, co.load_fleet, co.read_log, co.Results.load, learned.load, views)
     others = (lambda p: learned.save(p, checkpoint), lambda p: report([p], tmp_path))
     for call in (*reads, learned.load_method, Reference.load, *others):
         with pytest.raises(co.InputError):

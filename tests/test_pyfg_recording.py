@@ -60,7 +60,7 @@ def test_graphs_that_are_no_recording_are_named(tmp_path: Path) -> None:
     assert np.allclose(seen.velocity[0, 1:, 0], [10.0, 0.0, 0.0])
     assert len(seen.links) == 0
     assert fleet.position[-1, 0, 0] == pytest.approx(29.0)
-    assert co.load_recording(file).ids == ("A",)
+    assert co.read_log(file).recording.ids == ("A",)
     file.write_text("\n".join(lines + edges[:9] + edges[10:]) + "\n")
     with refused("no odometry from A9 to A10"):
         graph_recording(read_pyfg(file))

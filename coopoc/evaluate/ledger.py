@@ -10,7 +10,7 @@ from typing import Literal, get_args
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, checked, instance, number, one_of, refuse, texts
+from ..arrays import Floats, checked, number, one_of, refuse, texts
 from ..errors import InputError
 from ..methods.track import Track, of_recording
 from ..short_repr import short_repr
@@ -147,27 +147,3 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
         moved[k, 1] = payload, on_air
     seconds = np.full(vehicles, len(track.t) * recording.dt)
     return Ledger(tuple(recording.ids[ego] for ego in track.egos), seconds, *moved)
-
-
-def break_even(training: Ledger, online: Ledger) -> float:
-    """Seconds of driving after which online cooperation has moved as many bytes per vehicle as the training; inf:
-    never.
-
-    Args:
-        training: its bytes are taken.
-        online: its rate is taken, as the bytes of payload per receiver.
-
-    Raises:
-        InputError: a training without bytes, or a drive of no time.
-
-    >>> moved = np.multiply.outer([0.0, 1280.0], np.ones((2, 1, 1)))
-    >>> break_even(of_training(["a", "b"], [400.0, 0.0], [0.0, 400.0]), Ledger(("a",), [10.0], moved, moved))
-    1.5625
-    """
-    instance("training", training, Ledger)
-    instance("online", online, Ledger)
-    bytes_ = training.per_vehicle("training")
-    if not bytes_ > 0:
-        raise InputError("training", bytes_, "must have moved some bytes", "Give the ledger of a training.")
-    rate = online.rate()
-    return bytes_ / rate if rate else np.inf

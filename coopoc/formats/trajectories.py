@@ -135,42 +135,13 @@ def write_tum(
     >>> read_tum(file).rotation[1].round(6).tolist()
     [[-1.0, 0.0, 0.0], [0.0, -1.0, 0.0], [0.0, 0.0, 1.0]]
     """
-    stamps = checked("t", t, "(T,)", (-1,))
-    poses = _level(stamps, position, heading)
-    rows = np.column_stack([stamps, poses.position, to_orientation(poses.rotation)])
-    np.savetxt(given_path(path), rows, fmt="%.9f")
-
-
-def write_kitti(path: str | Path, position: npt.ArrayLike, heading: npt.ArrayLike | None = None) -> None:
-    """Write a path as a KITTI file, the 12 numbers of [R | t] by rows; the format has no stamps.
-
-    Args:
-        path: of the file, which is replaced.
-        position: (T, 3) m.
-        heading: (T,) rad, as in `write_tum`.
-
-    Raises:
-        InputError: shapes, numbers that are not finite.
-
-    Source: the KITTI odometry benchmark (Geiger, Lenz, Urtasun, CVPR 2012).
-
-    >>> import tempfile
-    >>> write_kitti(file := Path(tempfile.mkdtemp()) / "a.txt", [[1, 2, 0]])
-    >>> read_kitti(file).position
-    array([[1., 2., 0.]])
-    """
-    poses = _level(None, position, heading)
-    rows = np.dstack([poses.rotation, poses.position]).reshape(len(poses), 12)
-    np.savetxt(given_path(path), rows, fmt="%.9f")
-
-
-def _level(t: Floats | None, position: npt.ArrayLike, heading: npt.ArrayLike | None) -> Trajectory:
-    """Poses whose z axis points up."""
-    where = checked("position", position, "(T, 3)", (-1, 3))
+    stamps, where = checked("t", t, "(T,)", (-1,)), checked("position", position, "(T, 3)", (-1, 3))
     course = np.zeros(len(where)) if heading is None else checked("heading", heading, "(T,)", (len(where),))
     rotation = np.tile(np.eye(3), (len(where), 1, 1))
     rotation[:, :2, :2] = to_rotation(course[:, None])
-    return Trajectory(t, where, rotation)
+    poses = Trajectory(stamps, where, rotation)
+    rows = np.column_stack([stamps, poses.position, to_orientation(poses.rotation)])
+    np.savetxt(given_path(path), rows, fmt="%.9f")
 
 
 def read_kitti(path: str | Path, times: str | Path | None = None) -> Trajectory:

@@ -39,7 +39,7 @@ KINDS = {
     "point_prior": "position",
 }
 """Of measurements, by the name of a graph's edges."""
-Start = Literal["odometry", "apart", "file", "tree", "linear", "incremental", "auto"]
+Start = Literal["odometry", "file", "tree", "linear", "incremental", "auto"]
 
 
 def read_graph(
@@ -65,14 +65,11 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
     Args:
         graph: of `coopoc.formats.load_graph`.
         start: "odometry" chains each robot's relative poses from a pose with a prior, else from its first vertex in the
-            file; "apart" from a ring as wide as the mean range, all facing one way, as if nothing were known of how the
-            robots stand to each other; "file" takes the vertices as they are, which in PyFG are the truth; "tree"
-            follows loop closures and measurements between robots, too; "linear" relaxes rotations
-            (`convex/chordal.py`); "incremental" solves the first poses of all robots, then more with them
-            (`starts/graph_starts.py`); "auto" tries all
-            that the graph offers and keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their
-            priors, or where the first pose that measures them sees them, or by ranges. The Solution names the start in
-            extras["start"].
+            file; "file" takes the vertices as they are, which in PyFG are the truth; "tree" follows loop closures and
+            measurements between robots, too; "linear" relaxes rotations (`convex/chordal.py`); "incremental" solves the
+            first poses of all robots, then more with them (`starts/graph_starts.py`); "auto" tries all that the graph
+            offers and keeps the one that leads lowest (`starts/race.py`). Landmarks are put at their priors, or where
+            the first pose that measures them sees them, or by ranges. The Solution names the start in extras["start"].
 
     Raises:
         InputError: an unknown objective or start, a measurement without variance, by its vertices.

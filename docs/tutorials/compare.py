@@ -78,7 +78,7 @@ both["error"] = sum((both[axis] - both[f"{axis}_true"]) ** 2 for axis in "xyz") 
 both.loc[both.run == 0, ["t", "ego", "x", "y", "std_x", "std_y", "error"]].iloc[::180].round(2)
 
 # %% [markdown]
-# `write_tum` and `write_kitti` write the path of one run for other programs, such as evo.
+# `write_tum` writes the path of one run for other programs, such as evo.
 
 # %%
 import tempfile

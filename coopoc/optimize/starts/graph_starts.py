@@ -179,10 +179,10 @@ def _squares(places: Floats, ranges: Floats, at: Floats) -> Floats:
     return np.asarray(rows.swapaxes(1, 2) @ rows)
 
 
-def chained(graph: Graph, apart: bool = False) -> Floats:
+def chained(graph: Graph) -> Floats:
     """(n, ambient): each robot's poses along its own relative poses, from a pose with a prior, else from its first
-    vertex in the file; where the file has none, or `apart`, from a place on a ring."""
-    return _landmarks(graph, *_walked(graph, _own(graph), _roots(graph, apart)))
+    vertex in the file; where the file has none, from a place on a ring."""
+    return _landmarks(graph, *_walked(graph, _own(graph), _roots(graph)))
 
 
 def tree(graph: Graph) -> Floats:
@@ -197,7 +197,7 @@ def tree(graph: Graph) -> Floats:
         Govindu, Lie-algebraic averaging for globally consistent motion estimation, CVPR 2004; Carlone et al., A fast
         and accurate approximation for planar pose graph optimization, IJRR 2014.
     """
-    edges, d, roots = graph.relative_pose, graph.dimension, _roots(graph, False)
+    edges, d, roots = graph.relative_pose, graph.dimension, _roots(graph)
     position, rotation, reached = _walked(graph, np.ones(len(edges), dtype=bool), roots)
     if len(edges) >= len(rotation) or len(edges) > int(reached.sum()) - len(
         np.unique(parts(len(reached), edges.nodes))
@@ -247,7 +247,6 @@ def file(graph: Graph) -> Floats:
 
 STARTS: dict[str, Callable[[Graph], Floats]] = {
     "odometry": chained,
-    "apart": lambda graph: chained(graph, apart=True),
     "file": file,
     "tree": tree,
 }
@@ -283,7 +282,7 @@ def unwound(graph: Graph, x: Floats) -> bool:
     error = log(np.swapaxes(turned[i] @ edges.rotation, 1, 2) @ turned[j])
     if graph.dimension == 3:
         return bool(np.linalg.norm(error, axis=1).sum() < np.pi)
-    tree = _walked(graph, np.ones(len(edges), dtype=bool), _roots(graph, False))[1]
+    tree = _walked(graph, np.ones(len(edges), dtype=bool), _roots(graph))[1]
     along = log(np.swapaxes(tree, 1, 2) @ turned)  # more than half a turn of it shows as a jump on an edge
     return bool(np.abs(along[i] + error - along[j]).max() < WOUND)
 
@@ -305,16 +304,15 @@ def _own(graph: Graph) -> Bools:
     return np.asarray(letter[edges[:, 0]] == letter[edges[:, 1]])
 
 
-def _roots(graph: Graph, apart: bool) -> list[tuple[int, Floats, Floats]]:
+def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
     """Poses with a prior at that, then each robot's first."""
-    priors, roots = graph.pose_prior, []
-    if not apart:
-        roots = [(int(i), priors.position[k], priors.rotation[k]) for k, i in enumerate(priors.nodes[:, 0])]
+    priors = graph.pose_prior
+    roots = [(int(i), priors.position[k], priors.rotation[k]) for k, i in enumerate(priors.nodes[:, 0])]
     robots = [places for places in graph.robots.values() if len(places)]
     around = float(graph.ranges.distance.mean()) if len(graph.ranges) else 1.0
     for k, places in enumerate(robots):
         first, angle = int(places[0]), 2.0 * np.pi * k / len(robots)
-        if not apart and np.isfinite(graph.position[first]).all():
+        if np.isfinite(graph.position[first]).all():
             roots.append((first, graph.position[first], graph.rotation[first]))
         else:
             at = np.zeros(graph.dimension)
