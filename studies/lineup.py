@@ -2,21 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from coopoc import Fleet, InputError, Recording, Study
-from coopoc.arrays import AnyArray, Floats
+from coopoc import InputError, Study
+from coopoc.arrays import Floats
 from coopoc.errors import unknown
 from coopoc.file_names import given_path
 from coopoc.one_file import in_file
 from coopoc.plugins import find, names
 from coopoc.study.study import Params, Row
-from coopoc.world.links import stretches
 from coopoc.world.sensing import find_links
 from coopoc.world.v2x import FIX_AND_VELOCITY
 
@@ -164,9 +163,7 @@ def start(p: Params) -> Floats | None:
     if scene.start(p) == "gnss":
         return None
     drive = scene.fleet(p["data"])
-    if not complete(scene.recording(p), scene.egos(p), drive):
-        raise InputError("start", "'true'", "needs egos that are there throughout", "Take start=gnss.")
-    return drive.position[0, [drive.index(i) for i in scene.egos(p)]]
+    return drive.position[0, scene.recording(p).columns(scene.egos(p))]
 
 
 def rows(p: Params, quantiles: int = 0) -> list[Row]:
@@ -182,9 +179,8 @@ def rows(p: Params, quantiles: int = 0) -> list[Row]:
     (recording, who, drive), metric = scene.trial(p), str(p.get("metric", ""))
     table: list[Row] = []
     strange = p["method"] not in METHODS and not weights.is_trained(p["method"])
-    score = scored if complete(recording, who, drive) else scored_where_present
     for seed, method in methods(p):
-        columns = score(method, recording, who, drive, quantiles, metric)
+        columns = scored(method, recording, who, drive, quantiles, metric)
         more = ({} if seed is None else {"train_seed": seed}) | ({"label": method.name} if strange else {})
         table += rows_of(columns, who, **more)
     return table
@@ -218,94 +214,13 @@ def bound_rows(p: Params) -> list[Row]:
 
 def tracks(p: Params) -> Iterator[tuple[str, Floats, Floats]]:
     """Name, times s and positions m of each ego's path in each run, as the cell's method estimates it."""
+    from coopoc.methods.gaps import follow
+
     recording = scene.recording(p)
     for seed, method in methods(p) if p["method"] != "bound" else ():
         for ego in scene.egos(p):
-            pieces = [method(recording.between(*cut), [ego]) for cut in recording.stretches(ego)]
-            t = np.concatenate([track.t for track in pieces])
+            track = follow(method, recording, [ego])
+            there = slice(None) if track.absent is None else ~track.absent[:, 0]
             for run in range(recording.runs):
                 name = f"{ego}-run{run}" + (f"-seed{seed}" if seed is not None else "")
-                yield name, t, np.concatenate([track.x[run, :, 0] for track in pieces])
-
-
-RMS, MAXIMA, SUMS = ("rt_le_m", "neighbour_rt_le_m", "innovation_m"), ("max_error_m",), ("fixes", "seconds")
-"""Columns that are not averaged over the stretches of a vehicle: root mean squares, maxima and sums."""
-
-
-def complete(recording: Recording, who: Sequence[str], drive: Fleet) -> bool:
-    """Whether all egos are there, with a truth, throughout."""
-    columns = [recording.ids.index(ego) for ego in who]
-    whole = np.isfinite(recording.velocity[0][:, columns]).all() and np.isfinite(recording.gnss[:, 0, columns]).all()
-    return bool(whole and drive.present[:, [drive.index(ego) for ego in who]].all())
-
-
-def scored_where_present(
-    method: Method, recording: Recording, who: Sequence[str], drive: Fleet, quantiles: int = 0, metric: str = ""
-) -> dict[str, AnyArray]:
-    """Columns (R, E) as of `scored`, over the stretches in which an ego and its truth are there.
-
-    A filter starts anew in each stretch. Without a truth the columns are innovations and bytes.
-
-    Args:
-        method: that follows the egos.
-        recording: its measurements and messages.
-        who: ids of the egos.
-        drive: the truth, NaN where it is unknown.
-        quantiles: number of quantiles of the distances, of egos that are there in one stretch.
-        metric: one more, by its name or "mine.py:NAME"; not used without a truth.
-
-    Raises:
-        InputError: an ego that is never there at two steps in a row.
-    """
-    each = [_ego(method, recording, ego, drive, quantiles, metric) for ego in who]
-    names = [name for name in each[0] if all(name in columns for columns in each)]
-    return {name: np.concatenate([columns[name] for columns in each], axis=1) for name in names}
-
-
-def _ego(
-    method: Method, recording: Recording, ego: str, drive: Fleet, quantiles: int, metric: str
-) -> dict[str, AnyArray]:
-    from coopoc.evaluate.metrics import innovation_columns
-    from coopoc.evaluate.scores import online_columns, scored
-
-    tracked = drive.present[:, drive.index(ego)]
-    parts, lengths = list[Mapping[str, AnyArray]](), list[int]()
-    cuts = recording.stretches(ego)
-    if tracked.any():
-        cuts = tuple((a + i, a + j) for a, b in cuts for i, j in stretches(tracked[a:b]) if j - i > 1)
-    for start, stop in cuts:
-        stretch = recording.between(start, stop)
-        # a truth that begins between two fixes leaves a start without one
-        begin = next(iter(stretch.stretches(ego)), None)
-        if begin is None or begin[1] - begin[0] < 2:
-            continue
-        stretch, truth = stretch.between(*begin), drive.between(start + begin[0], start + begin[1])
-        if tracked.any():
-            columns = scored(method, stretch, [ego], truth, quantiles, metric)
-        else:
-            track, shape = method(stretch, [ego]), (stretch.runs, 1)
-            near = len(stretch.links.of(stretch.ids.index(ego))) / len(stretch.t)
-            columns = {
-                **innovation_columns(track, stretch),
-                **online_columns(track, stretch, method),
-                "neighbours_mean": np.full(shape, near),
-                "seconds": np.full(shape, track.seconds / stretch.runs),
-            }
-        parts.append(columns)
-        lengths.append(len(stretch.t))
-    if not parts:
-        raise InputError("egos", repr(ego), "is never there at two steps in a row, with a fix", "Choose another ego.")
-    return {name: _merged(name, [part[name] for part in parts], lengths) for name in parts[0]}
-
-
-def _merged(name: str, parts: Sequence[AnyArray], lengths: Sequence[int]) -> AnyArray:
-    if len(parts) == 1:
-        return parts[0]
-    if name in MAXIMA:
-        return np.asarray(np.max(parts, axis=0))
-    if name in SUMS:
-        return np.asarray(np.sum(parts, axis=0))
-    power = 2 if name in RMS else 1
-    values = np.ma.masked_invalid(np.stack(parts).astype(float) ** power)
-    mean = np.ma.average(values, axis=0, weights=lengths)
-    return np.asarray(np.ma.filled(mean, np.nan) ** (1 / power))
+                yield name, recording.t[there], track.x[run, there, 0]

@@ -3,6 +3,7 @@
 import re
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -18,7 +19,8 @@ from coopoc.data.log.check import check
 from coopoc.data.log.read import read_log
 from coopoc.data.registry import load_fleet, load_log
 from coopoc.evaluate.metrics import fix_innovations, innovation_columns, normalised_innovations
-from coopoc.studies import lineup, neighbours, scene
+from coopoc.evaluate.scores import scored
+from coopoc.studies import neighbours, scene
 from coopoc.study.publish import views
 from coopoc.study.report import report
 from coopoc.world.storage import digest, read_recording, save_recording
@@ -53,11 +55,27 @@ def test_truth_is_read_on_the_steps_of_the_recording(folders: Path) -> None:
     assert co.read_log(folders / "with").recording.ids == log.recording.ids
     with refused(r"without = no truth: .*truth\.csv"):
         load_fleet(folders / "without")
-    late = log.recording.gnss.copy()
-    late[:, 0] = np.nan
-    for gnss in (late, log.recording.gnss):
-        recording = replace(log.recording, gnss=gnss)
-        assert lineup.complete(recording, ["car0"], log.truth) == (gnss is not late)
+
+
+def test_scores_are_of_the_steps_at_which_an_ego_is_there(folders: Path) -> None:
+    """Each stretch by itself, pooled by NumPy; bytes per second of driving."""
+    log, method = read_log(folders / "with"), co.JointFilter()
+    assert log.truth is not None
+    found, off, sent = scored(method, log.recording, ["car2"], log.truth), list[Any](), 0.0
+    cuts = log.recording.stretches("car2")
+    assert len(cuts) == 2
+    for cut in cuts:
+        track = method(log.recording.between(*cut), ["car2"])
+        off.append(np.linalg.norm(track.x[0, :, 0] - log.truth.position[slice(*cut), 2], axis=-1))
+        sent += track.sent_bytes.item()
+    every = np.concatenate(off)
+    assert found["rt_le_m"].item() == pytest.approx(np.sqrt(np.mean(every**2)))
+    assert found["max_error_m"].item() == pytest.approx(every.max())
+    assert found["sent_bytes_per_second"].item() == pytest.approx(sent / (len(every) * log.recording.dt))
+    gnss = log.recording.gnss.copy()
+    gnss[:, :, 2] = gnss[:, 0, 1] = np.nan
+    with refused("car2.*is never there at two steps in a row"):
+        method(replace(log.recording, gnss=gnss), ["car1", "car2"])
 
 
 def test_a_unit_at_the_road_is_no_ego_and_real_data_have_no_bound(tmp_path: Path) -> None:
@@ -90,9 +108,6 @@ def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> 
     assert 0.8 < rows.query("method == 'kalman'")["nis"].mean() < 1.2
     tables = sorted(file.stem for file in (tmp_path / "side_by_side").rglob("*.md"))
     assert {"innovation", "nis"} <= set(tables)
-    parts = [np.array([[3.0]]), np.array([[4.0]])]
-    merged = [lineup._merged(name, parts, (1, 3)).item() for name in ("innovation_m", "nis", "fixes", "max_error_m")]
-    assert merged == pytest.approx([np.sqrt(57 / 4), 15 / 4, 7, 4])
 
 
 @pytest.mark.parametrize(("options", "offset", "most"), [("", 2.0, 1.0), ("?dt=0.1", 0.0, 0.97), ("", 0.0, 0.93)])

@@ -145,5 +145,5 @@ def of_track(track: Track, recording: Recording, message: Message) -> Ledger:
         if message.per_neighbour:
             payload = on_air - overhead * np.isfinite(recording.velocity[0, :, track.egos, 0]).sum(axis=1)
         moved[k, 1] = payload, on_air
-    seconds = np.full(vehicles, len(track.t) * recording.dt)
-    return Ledger(tuple(recording.ids[ego] for ego in track.egos), seconds, *moved)
+    steps = np.full(vehicles, len(track.t)) if track.absent is None else (~track.absent).sum(axis=0)
+    return Ledger(tuple(recording.ids[ego] for ego in track.egos), steps * recording.dt, *moved)

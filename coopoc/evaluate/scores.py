@@ -9,11 +9,12 @@ import numpy as np
 
 from ..arrays import AnyArray, Floats
 from ..errors import InputError, shown
+from ..methods.gaps import follow
 from ..methods.track import Method, Track, far_off
 from ..world.fleet import Fleet
 from ..world.recording import Recording
 from .ledger import Kind, Way, of_track
-from .metrics import errors, measure, nees, neighbour_rt_le, share_of_average
+from .metrics import errors, innovation_columns, max_error, measure, nees, neighbour_rt_le, rt_le, share_of_average
 
 BYTES: Mapping[str, tuple[Kind, Way]] = {
     "bytes_per_second": ("on air", "per receiver"),
@@ -44,7 +45,8 @@ def rows_of(columns: Mapping[str, AnyArray], who: Sequence[str], **more: Any) ->
 def scored(
     method: Method, recording: Recording, egos: Sequence[str], drive: Fleet, quantiles: int = 0, metric: str = ""
 ) -> dict[str, AnyArray]:
-    """Errors, consistency and bytes of a method for E egos in R runs, some runs at a time.
+    """Errors, consistency and bytes of a method for E egos in R runs, some runs at a time, where an ego is there and
+    its truth known; without a truth of each, `metrics.innovation_columns` take the place of errors.
 
     Args:
         method: that follows the egos.
@@ -65,8 +67,9 @@ def scored(
     (3, 1)
     """
     seconds, parts, squares = 0.0, list[dict[str, AnyArray]](), list[Floats]()
+    known = bool(drive.present[:, [drive.index(ego) for ego in egos]].any(axis=0).all())
     for part in slabs(recording, len(egos)):
-        track = method(part, egos)
+        track = follow(method, part, egos)
         if getattr(track, "egos", None) != tuple(map(part.ids.index, egos)):
             raise InputError(
                 f"estimates of {method.name}",
@@ -75,7 +78,11 @@ def scored(
                 "Take egos in this order.",
             )
         seconds += track.seconds
-        parts.append(_columns(track, part, method, drive, quantiles))
+        rates = online_columns(track, part, method)
+        if not known:
+            parts.append({**innovation_columns(track, part), **rates})
+            continue
+        parts.append({**_columns(track, part, drive, quantiles), **rates})
         if metric:
             parts[-1][metric.rpartition(":")[2]] = measure(metric, track, drive)
         if track.covariance is not None:
@@ -83,12 +90,13 @@ def scored(
             parts[-1]["nees"] = np.nanmean(each, axis=1)
             squares.append(each.sum(axis=0))
     columns = {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-    near = [len(recording.links.of(recording.ids.index(ego))) / len(recording.t) for ego in egos]
+    steps = len(recording.t) if track.absent is None else (~track.absent).sum(axis=0)
+    near = np.array([len(recording.links.of(recording.ids.index(ego))) for ego in egos]) / steps
     served = len(recording.ids) if recording.observers == tuple(range(len(recording.ids))) else len(egos)
     more: dict[str, Any] = {"neighbours_mean": near, "seconds": seconds / recording.runs / served}
     if squares:
         more["nees_inside"] = share_of_average(np.sum(squares, axis=0) / recording.runs, recording.runs)
-    return {**{name: np.broadcast_to(value, columns["rt_le_m"].shape) for name, value in more.items()}, **columns}
+    return {**{name: np.broadcast_to(value, columns["left_fixes"].shape) for name, value in more.items()}, **columns}
 
 
 def slabs(recording: Recording, egos: int) -> Iterator[Recording]:
@@ -105,17 +113,15 @@ def online_columns(track: Track, recording: Recording, method: Method) -> dict[s
     return {**rates, "left_fixes": far_off(track.x, recording, list(track.egos)).astype(float)}
 
 
-def _columns(track: Track, recording: Recording, method: Method, drive: Fleet, quantiles: int) -> dict[str, AnyArray]:
-    """Columns that need no average over runs."""
-    error = errors(track, drive)
-    level = np.sqrt((error**2).mean(axis=1))
+def _columns(track: Track, recording: Recording, drive: Fleet, quantiles: int) -> dict[str, AnyArray]:
+    """Columns of errors that need no average over runs."""
     columns = {
-        "rt_le_m": level,
-        "max_error_m": error.max(axis=1),
+        "rt_le_m": rt_le(track, drive),
+        "max_error_m": max_error(track, drive),
         "neighbour_rt_le_m": neighbour_rt_le(track, recording, drive),
-        **online_columns(track, recording, method),
     }
     if quantiles:
-        spaced = np.quantile(error, np.linspace(0, 1, quantiles), axis=1)
-        columns["error_quantiles_m"] = np.moveaxis(spaced, 0, -1)
+        error = errors(track, drive)
+        quantile = np.quantile if np.isfinite(error).all() else np.nanquantile
+        columns["error_quantiles_m"] = np.moveaxis(quantile(error, np.linspace(0, 1, quantiles), axis=1), 0, -1)
     return columns

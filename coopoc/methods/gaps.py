@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
+from ..errors import InputError
 from ..world.recording import Recording, Vehicles, check_recording
-from .track import Track
+from .track import Method, Track
 
 
 def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
@@ -34,6 +35,10 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
         cuts = {column: recording.stretches(column) for column in columns}
         if all(pieces in ((), (whole,)) for pieces in cuts.values()):
             return call(self, recording, egos)
+        for column, pieces in cuts.items():
+            if not pieces:
+                never = "is never there at two steps in a row, with a fix"
+                raise InputError("egos", repr(recording.ids[column]), never, "Choose another ego.")
         parts = {
             (column, cut): call(_from(self, cut[0]), recording.between(*cut), [recording.ids[column]])
             for column in columns
@@ -42,6 +47,11 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
         return _joined(recording, columns, parts)
 
     return across
+
+
+def follow(method: Method, recording: Recording, egos: Vehicles) -> Track:
+    """The track of any method across gaps, of one that knows nothing of them, too."""
+    return in_stretches(type(method).__call__)(method, recording, egos)
 
 
 def _from(method: Any, start: int) -> Any:
