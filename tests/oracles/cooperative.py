@@ -106,21 +106,16 @@ class Belief:
         """One number; its squared normalised innovation."""
         return self.updates(h[None], np.array([z]), np.array([r]), gate)
 
-    def updates(self, h: Floats, z: Floats, r: Floats, gate: float = 0.0) -> float:
-        """Several numbers with one gate; their squared Mahalanobis distance."""
+    def updates(self, h: Floats, z: Floats, r: Floats, gate: float = 0.0, share: float = 1.0) -> float:
+        """Several numbers with one gate, or a share of their information; their squared Mahalanobis distance."""
         gap, s = z - h @ self.x, h @ self.p @ h.T + np.diag(r)
         q = float(gap @ np.linalg.solve(s, gap))
         if gate and q > gate:
             s = s * (q / gate * (100.0 if q > 4 * gate else 1.0))
+        s = s / share
         gain = np.linalg.solve(s, h @ self.p).T
         self.x, self.p = self.x + gain @ gap, self.p - gain @ s @ gain.T
         return q
-
-    def learn(self, h: Floats, z: Floats, r: Floats, share: float) -> None:
-        """Take a share of numbers' information."""
-        s = (h @ self.p @ h.T + np.diag(r)) / share
-        gain = np.linalg.solve(s, h @ self.p).T
-        self.x, self.p = self.x + gain @ (z - h @ self.x), self.p - gain @ s @ gain.T
 
     def average(self, i: int, prior: float, odds: float) -> None:
         """Number i is 0 or N(0, prior)."""
@@ -454,7 +449,7 @@ class Oracle:
             if not judged and s["agreed"] >= ESTABLISHED:
                 locked[j] = min(locked[j], LONGEST)
         if share:
-            b.learn(h, z, r, share)
+            b.updates(h, z, r, share=share)
         return share
 
     def wrong(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
