@@ -26,6 +26,7 @@ ORDER = (
     "split-ci",
     "msmv-r",
     "joint",
+    "cooperative-filter",
     "batch-smoother",
 )
 SENSORS = co.Sensors.paper_scenario2()

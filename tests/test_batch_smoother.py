@@ -141,7 +141,7 @@ solved = partial(least_squares, jac="3-point", method="lm", xtol=1e-14, ftol=1e-
 
 
 def test_the_smoother_is_the_least_squares_solution_of_scipy(crossing: Fleet) -> None:
-    """Positions of all vehicles at all steps, and every marginal."""
+    """SciPy's positions of all vehicles at all steps, and every marginal."""
     recording = observe(crossing.select(range(5)).between(0, 9), S2, V2X(max_neighbours=3))
     known = NoiseModel.nominal(S2)
     track = textbook(BatchSmoother())(recording, range(5))

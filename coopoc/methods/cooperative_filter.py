@@ -80,7 +80,7 @@ class Broadcast(NamedTuple):
     """What a vehicle with a cooperative filter broadcasts, with its id and the time.
 
     Attributes:
-        position: (3,) m, mean of its fixes, moved by the odometer, each with the weight exp(-age / 10 s) / variance.
+        position: (3,) m, mean of its fixes, moved by the odometer, each with the weight exp(-age / 5 s) / variance.
         velocity: (3,) m/s.
         variance: (3,) m^2, 1 over the sum of these weights.
         odometer: (3,) m, sum of all its motions.
