@@ -14,6 +14,7 @@ from scipy.optimize import least_squares
 from coopoc import V2X, BatchSmoother, Fleet, NoiseModel, Recording, Sensors, observe
 from coopoc.evaluate.bounds import bound_rt_le, fleet_bound
 from coopoc.evaluate.metrics import nees_inside, rt_le
+from coopoc.methods.batch_smoother import CENTRE, NOT_CAUSAL
 from coopoc.methods.noise_model import resolve
 from coopoc.world.links import spherical, wrap
 from coopoc.world.v2x import Message
@@ -100,6 +101,7 @@ def test_it_is_consistent_and_does_not_beat_the_fleets_bound(convoy: tuple[Fleet
     fleet, recording, v2x = convoy
     track = BatchSmoother()(recording, [0, 4])
     assert nees_inside(track, fleet).min() >= 0.95
+    assert track.notes == (NOT_CAUSAL, CENTRE)
     square = (rt_le(track, fleet) ** 2).mean(axis=1)
     cov = fleet_bound(fleet, SPEED, v2x, smoothing=True)
     bound = np.mean([bound_rt_le(cov[:, e]) ** 2 for e in (0, 4)])
@@ -111,7 +113,6 @@ def test_it_is_consistent_and_does_not_beat_the_fleets_bound(convoy: tuple[Fleet
 def test_absent_egos_and_observers_are_named(crossing: Fleet) -> None:
     recording = observe(coming_and_going(crossing), S2)
     absent = BatchSmoother()(recording, [2]).absent
-    assert absent is not None
     assert (absent[:, 0] >= np.isnan(recording.velocity[0, :, 2, 0])).all()
     with refused("observers"):
         BatchSmoother()(observe(crossing, S2, observers=[0, 3]), [0])

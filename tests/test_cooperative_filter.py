@@ -194,7 +194,7 @@ def test_fixes_that_were_wrong_are_forgotten_soon_after(priors: Priors, most: in
     to 320 m off. Alone it goes back to where it would have been; an error that its neighbour has, too, is the ego's."""
     fleet = load_fleet("town10").between(0, 700)
     during = (fleet.t >= fleet.t[0] + start) & (fleet.t < fleet.t[0] + end)
-    for off in (100.0, 360.0):
+    for off in (30.0, 100.0, 360.0):
         seen = observe(fleet, S2, V2X(most), runs=3, seed=3, observers=[24])
         gnss = seen.gnss.copy()
         gnss[:, during, 24] += [0.8 * off, 0.6 * off, 0.0]

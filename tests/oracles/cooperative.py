@@ -14,7 +14,7 @@ import numpy as np
 
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
-from coopoc.kernels.gate import FIX_GATE, GATE, HARD_REJECT_FACTOR, LEAK, PATIENCE, SLIP
+from coopoc.kernels.gate import AWAY, EVIDENCE, FIX_GATE, GATE, HARD_REJECT_FACTOR, LEAK, PATIENCE, SLIP
 from coopoc.kernels.stars.cooperative_messages import CLIP, FADES, FIX_SCORE
 from coopoc.kernels.stars.cooperative_state import (
     ACCELERATION,
@@ -200,18 +200,22 @@ class Oracle:
         }
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.priors.fix_gate else {self.ego}
-        levels = {"level": np.zeros(6), "learned": np.zeros(6), "information": np.zeros(6), "made": 0.0}
-        levels |= {
-            "louder": {},
-            "shown": 0.0,
-            "gap": np.zeros(3),
-            "left": None,
-            "cov": np.zeros(3),
-            "course": np.zeros(3),
-            "blind": 0.0,
-            "jumped": False,
-        }
-        levels |= {"slips": 0.0, "speed": 0.0, "score": 0.0, "numbers": 0, "squares": 0.0}
+        numbers = [
+            "made",
+            "shown",
+            "blind",
+            "evidence",
+            "driven",
+            "agree",
+            "slips",
+            "speed",
+            "score",
+            "numbers",
+            "squares",
+        ]
+        levels = {name: np.zeros(6) for name in ("level", "learned", "information")}
+        levels |= {name: np.zeros(3) for name in ("gap", "cov", "course")} | dict.fromkeys(numbers, 0.0)
+        levels |= {"louder": {}, "left": None, "jumped": False}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
     def loop(self) -> tuple[Floats, Floats, list[Floats]]:
@@ -345,7 +349,8 @@ class Oracle:
             b.p[x, x] += slip * (across * np.eye(3) + np.outer(s["course"], s["course"]))
         s["made"] = s["made"] + q.sum()
         if s["left"]:
-            s["left"] = s["left"][0], s["left"][1] + max(self.own_variance() - s["whole"], q.sum()) / 3
+            grown = 0.0 if self.ego in s["vague"] else self.own_variance() - s["whole"]
+            s["left"] = s["left"][0], s["left"][1] + max(grown, q.sum()) / 3
         s["whole"] = self.own_variance()
         for j in [j for j in others if j not in s["members"]]:
             self.join(t, j, messages[j], relative[j])
@@ -383,14 +388,38 @@ class Oracle:
             if more > most or far < 2 * math.sqrt(r.sum()):
                 s["jumped"] = more > most
             s["shown"], s["gap"] = max(s["shown"] + min(more, most), 0.0), gap
-        beyond = self.mahalanobis(s["belief"], rows)[0] > self.priors.fix_gate > 0
-        if beyond and not s["left"] and not any(j in s["last"] for j in s["members"]):
-            self.leave()
+        alone = not any(j in s["last"] for j in s["members"])
+        if self.priors.fix_gate and self.ego not in s["vague"] and alone:
+            self.go_back(fix, rows)
         share = self.use_fix(t, self.ego, rows, True)
-        if share == 1 and s["left"] and not self.away(t):
-            s["left"] = None
         s["hits"]["fix"] = s["hits"]["fix"] + 1 if share < 1 else 0
         self.corrected()
+
+    def go_back(self, fix: Floats, rows: list[Any]) -> None:
+        """To where the ego was before fixes contradicted it, if it is there again."""
+        s, b = self.state, self.state["belief"]
+        q, _, cov, r = self.mahalanobis(b, rows)
+        gate, at = max(self.priors.fix_gate, FIX_GATE), b.at(("x", self.ego))
+        s["agree"] = 0.0 if q > gate else s["agree"] + float(np.mean(np.diag(cov) / (np.diag(cov) + r)))
+        if not s["left"]:
+            if q > gate:
+                s["left"], s["evidence"] = (b.x[at].copy(), np.trace(b.p[at, at]) / 3), 0.0
+                s["driven"] = 0.0
+            return
+        (x, p), most = s["left"], HARD_REJECT_FACTOR * gate
+        if ("o", self.ego) in b.names and self.life.absent[0] == -math.inf:
+            p += s["driven"] ** 2 * np.diag(b.p)[b.at(("o", self.ego))].sum() / 3
+        other = ((fix - x) ** 2 / (p + r + SLIP)).sum()
+        s["evidence"] = 0.0 if other > gate else max(s["evidence"] + min(q, most) - other, 0.0)
+        near = np.square(b.x[at] - x).sum() < 3 * p
+        if not near and s["evidence"] > EVIDENCE * most:
+            b.transform(("x", self.ego), {})
+            b.x[at] = x
+            b.noise(("x", self.ego), p)
+            s["locked"].pop(self.ego, None)
+            s["left"] = None
+        elif near and s["agree"] > AWAY:
+            s["left"] = None
 
     def learn_fix(self, kind: int, rows: list[Any]) -> None:
         _, gap, cov, r = self.mahalanobis(self.state["belief"], rows)
@@ -498,8 +527,6 @@ class Oracle:
         best = int(np.argmax(votes))
         if self.ego not in s["trusted"] and votes[0] < max(len(votes), 2):
             return False
-        if b.names and not self.young(t):
-            self.leave()
         b.drop(("b", self.ego))
         b.transform(("x", self.ego), {})
         if self.life.own:
@@ -520,38 +547,14 @@ class Oracle:
             s["vague"].discard(self.ego)
         return True
 
-    def young(self, t: int) -> bool:
-        joined, hits = self.state["joined"].get(self.ego, t), self.state["hits"].get("fix", 0)
-        return bool(t - joined - hits <= 1)
-
-    def leave(self) -> None:
-        b, s = self.state["belief"], self.state
-        x = b.at(("x", self.ego))
-        s["left"] = (b.x[x].copy(), np.trace(b.p[x, x]) / 3) if b.p[x, x].any() else None
-
-    def away(self, t: int) -> bool:
-        b, left = self.state["belief"], self.state["left"]
-        fix = self.r[t, self.ego] * self.white * math.exp(max(self.state["level"][3], 0))
-        return bool(((b.x[b.at(("x", self.ego))] - left[0]) ** 2 / fix).sum() > 2 * FIX_GATE)
-
-    def returned(self, t: int) -> bool:
-        """Whether the fix is where the ego would be, had it not left."""
-        if not self.state["left"]:
-            return False
-        x, p = self.state["left"]
-        gap = self.seen.gnss[self.run, t, self.ego] - self.seen.dt * self.seen.velocity[self.run, t, self.ego] - x
-        whole = self.r[t, self.ego] * self.white + self.q[t, self.ego] + p + SLIP
-        return bool((gap**2 / whole).sum() < FIX_GATE) and self.away(t)
-
     def lost(self, t: int) -> bool:
         s = self.state
         held = [j for j in s["members"] if j in s["last"]]
         if any(j in s["trusted"] for j in held):
             return False
         if self.ego in s["trusted"]:
-            hits = s["hits"]["fix"]
-            again = s["locked"].get(self.ego, 0.0) >= PATIENCE or (not held and self.returned(t))
-            return bool((hits >= 2 and self.young(t)) or (hits > 0 and again))
+            hits, again = s["hits"]["fix"], s["locked"].get(self.ego, 0.0) >= PATIENCE
+            return bool((hits >= 2 and t - s["joined"][self.ego] - hits <= 1) or (hits > 0 and again))
         b, noise = s["belief"], (self.r[t, self.ego] @ self.white) / 3
         error = b.x[b.at(("b", self.ego))]
         apart = [float(np.square(error - b.x[b.at(("b", j))]).sum()) for j in held]
@@ -619,6 +622,7 @@ class Oracle:
         b.x[b.at(("x", j))] += way
         if j == self.ego and self.state["left"]:
             self.state["left"] = self.state["left"][0] + way, self.state["left"][1]
+            self.state["driven"] += math.hypot(way[0], way[1])
         if ("o", j) not in b.names:
             return
         x, o, f, holds = b.at(("x", j)), b.at(("o", j)), np.eye(len(b.x)), self.life.holds**steps

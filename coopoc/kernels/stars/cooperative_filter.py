@@ -14,7 +14,8 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import apply, negate, store, subtract
-from ..gate import GATE
+from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOTHING, SLIP
+from ..gate import remember as remembered
 from ..geometry import angle
 from .cooperative_members import join, leave, predict, replace_implausible_velocity
 from .cooperative_messages import fix_terms, goes_on, heard, receive, trust, use_fix
@@ -37,6 +38,7 @@ from .cooperative_state import (
     JOINED,
     LEFT,
     LEVEL,
+    LOCKED,
     MOTION,
     MOTION_VARIANCE,
     ODOMETER,
@@ -59,16 +61,15 @@ from .cooperative_state import (
     Filter,
     Model,
     Sent,
-    away,
     begin,
     copy_filter,
     measured_whole,
     new_filter,
     pause,
-    remember,
 )
 from .gaussian import (
     COMPASS,
+    COV,
     CURVE,
     LIMIT,
     MEASURED,
@@ -79,12 +80,14 @@ from .gaussian import (
     VARIANCE,
     Q,
     Z,
+    clear,
     correct,
     expect,
     has,
     innovate,
     insert_from_measurement,
     weight,
+    widen,
 )
 from .messages import Assumptions, Measurements, three_of, vector_at
 from .otherwise import (
@@ -338,13 +341,41 @@ def add_fix(f: Filter, model: Model, own: Floats) -> None:
     if f.member[0, EXTRA_VARIANCE] == 0.0:
         learn_fix(f, FIXES)
         show(f)
-    if q > model.fix_gate > 0.0 == f.ego[LEFT + 3] and not heard(f, False):
-        remember(f)
+    if model.fix_gate > 0.0 == f.member[0, EXTRA_VARIANCE] and not heard(f, False) and goes_back(f, model, own, q):
+        q = innovate(f.g, f.h)
     f.member[0, OUT + 3] = share = use_fix(f, model, 0, True, q)
-    if share == 1.0 and not away(f, own):
-        f.ego[LEFT + 3] = 0.0
     f.who[0, HITS] = f.who[0, HITS] + 1 if share < 1.0 else 0
     corrected(f)
+
+
+@inside
+def goes_back(f: Filter, model: Model, own: Floats, q: float) -> bool:
+    """Whether an ego alone is where it was before fixes contradicted it (`gate.remember`): then it goes back."""
+    g, h, left = f.g, f.h, f.ego[LEFT:]
+    other, apart, gain, spread = 0.0, 0.0, 0.0, left[3]
+    if has(g, 0, TURN) and model.absent[0] == -math.inf:  # an error that is surely there errs farther and farther
+        i = 3 * g.block[0, TURN]
+        spread += left[6] ** 2 * (g.p[i, i] + g.p[i + 1, i + 1]) / 3.0
+    for c in range(3):
+        p, r = h.matrix[COV + 4 * c], h.three[VARIANCE + c]
+        other += (own[FIX + c] - left[c]) ** 2 / (spread + r + SLIP)
+        apart, gain = apart + (g.x[c] - left[c]) ** 2, gain + p / (3.0 * (p + r))
+    gate = max(model.fix_gate, FIX_GATE)
+    what, left[4], left[5] = remembered(q, other, gate, gain, apart, 3.0 * spread, left[4], left[5])
+    if what == BEGIN:
+        for c in range(3):
+            left[c] = g.x[c]
+        left[3], left[6] = (g.p[0, 0] + g.p[1, 1] + g.p[2, 2]) / 3.0, 0.0
+        return False
+    if what == BACK:
+        clear(g, 0)
+        for c in range(3):
+            g.x[c] = left[c]
+        widen(g, 0, spread)
+        f.member[0, LOCKED] = 0.0
+    if what != KEEP:
+        left[3] = NOTHING
+    return what == BACK
 
 
 @inside

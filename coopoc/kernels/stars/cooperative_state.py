@@ -14,7 +14,7 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import inside, part, storage
 from ..compiling.vectors import LANES, put, take
-from ..gate import FIX_GATE, PATIENCE, SLIP
+from ..gate import FIX_GATE, NOTHING, PATIENCE
 from .gaussian import (
     ABSENT,
     COMMON,
@@ -138,12 +138,13 @@ that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of 
 normalised innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing
 was: the ego's are those of its fix."""
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
-LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, LEFT, AGREED, EGO = 20, 26, 32, 38, 49, 52, 61, 65, 66
+LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, LEFT, AGREED, EGO = 20, 26, 32, 38, 49, 52, 61, 68, 69
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
 of motion makes, and the whole then; fifteen numbers of `otherwise` on slips; by kind of number the logarithm of its
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
-is otherwise than assumed, and position m and covariance m^2; and where it would be m, had fixes not led it away, and
-the variance of that m^2, 0 for none; and for how long s fixes have agreed with its position."""
+is otherwise than assumed, and position m and covariance m^2; and where it would be m, had fixes not led it away, the
+variance of that m^2, NOTHING for none, the two numbers of `gate.remember` on it, and how far the ego has driven since
+m; and for how long s fixes have agreed with its position."""
 
 
 class Filter(NamedTuple):
@@ -220,6 +221,7 @@ def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: i
             f.status[j, c] = 0.0
         f.status[j, TRUSTED] = 1.0 if model.fix_gate == 0.0 or j == ego else 0.0
         f.status[j, USED] = f.status[j, SINCE] = -math.inf
+    f.ego[LEFT + 3] = NOTHING
     f.who[0, VEHICLE], f.slot[ego] = ego, 0
     insert(f.g, 0, PLACE, 0.0)
     if model.common > 0.0:
@@ -259,8 +261,6 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
             best, most = i, agree
     if own_votes < max(heard, 2) and f.status[ego, TRUSTED] == 0.0:
         return False
-    if not young(f):
-        remember(f)
     f.member[0, EXTRA_VARIANCE], f.member[0, JOINED], f.who[0, HITS], f.member[0, LOCKED] = (
         model.flat,
         f.ego[STEPS],
@@ -284,46 +284,12 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
     return True
 
 
-@inside
-def young(f: Filter) -> bool:
-    """Whether all fixes but the first, from which the ego started, contradict its position."""
-    return bool(f.ego[STEPS] - f.member[0, JOINED] - f.who[0, HITS] <= 1)
-
-
-@part
-def remember(f: Filter) -> None:
-    """Where the ego is now, before it leaves."""
-    f.ego[LEFT + 3] = 0.0
-    for c in range(3):
-        f.ego[LEFT + c], f.ego[LEFT + 3] = f.g.x[c], f.ego[LEFT + 3] + f.g.p[c, c] / 3.0
-
-
-@part
-def away(f: Filter, own: Floats) -> bool:
-    """Whether the ego is farther from where it would be, had it not left, than a fix errs."""
-    square = 0.0
-    for c in range(3):
-        square += (f.g.x[c] - f.ego[LEFT + c]) ** 2 / own[FIX_VARIANCE + c]
-    return bool(square > 2.0 * FIX_GATE * math.exp(max(f.ego[LEVEL + FIXES], 0.0)))
-
-
-@part
-def returned(f: Filter, own: Floats) -> bool:
-    """Whether the ego's fix is where the ego would be, had it not left."""
-    square = 0.0
-    for c in range(3):
-        gap = own[FIX + c] - own[MOTION + c] - f.ego[LEFT + c]
-        square += gap * gap / (own[FIX_VARIANCE + c] + own[MOTION_VARIANCE + c] + f.ego[LEFT + 3] + SLIP)
-    return bool(f.ego[LEFT + 3] > 0.0 and square < FIX_GATE and away(f, own))
-
-
 @part
 def needs_restart(f: Filter, model: Model, own: Floats) -> bool:
     """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either all fixes but the first
-    contradict it, or fixes have for so long that they would be used again (and turn its odometry towards them), or,
-    alone, are where it was before they led it away; or its receiver is not trusted beside others that are not. One
-    other suffices where the error of the ego's fixes would be beyond all doubt, or is the other's, too: it is the
-    ego's."""
+    contradict it, or fixes have for so long that they would be used again (and turn its odometry towards them); or its
+    receiver is not trusted beside others that are not. One other suffices where the error of the ego's fixes would be
+    beyond all doubt, or is the other's, too: it is the ego's."""
     ego, others, last = f.who[0, VEHICLE], 0, 0
     for k in range(1, len(f.who)):
         j = f.who[k, VEHICLE]
@@ -333,8 +299,8 @@ def needs_restart(f: Filter, model: Model, own: Floats) -> bool:
             others, last = others + 1, k
     hits = f.who[0, HITS]
     if f.status[ego, TRUSTED] > 0.0:
-        again = f.member[0, LOCKED] >= PATIENCE or (others == 0 and returned(f, own))
-        return bool((hits >= 2 and young(f)) or (hits > 0 and again))
+        young = f.ego[STEPS] - f.member[0, JOINED] - hits <= 1
+        return bool((hits >= 2 and young) or (hits > 0 and f.member[0, LOCKED] >= PATIENCE))
     far, between, noise = 0.0, 0.0, 0.0
     first, other = 3 * f.g.block[0, ERROR], 3 * f.g.block[last, ERROR]
     for c in range(3):
@@ -356,7 +322,6 @@ def pause(f: Filter, dt: float) -> None:
         f.g.block[0, kind] = ABSENT
     f.ego[STEPS] += 1
     f.ego[CLOCK] += dt
-    f.ego[LEFT + 3] = 0.0
 
 
 @part

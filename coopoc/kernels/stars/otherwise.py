@@ -109,6 +109,7 @@ def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt
     for c in range(3):
         g.x[first + c] += way[c]
         f.ego[LEFT + c] += way[c] if k == 0 else 0.0
+    f.ego[LEFT + 6] += math.sqrt(way[0] ** 2 + way[1] ** 2) if k == 0 else 0.0
     if not has(g, k, TURN):
         return
     i, n, keep = 3 * g.block[k, TURN], 3 * g.vectors[0], math.exp(-dt / model.lasts)
@@ -319,7 +320,7 @@ def moved(f: Filter, own: Floats) -> None:
     q = own[MOTION_VARIANCE] + own[MOTION_VARIANCE + 1] + own[MOTION_VARIANCE + 2]
     f.ego[MADE] += q
     more, f.ego[WHOLE] = max(ego_variance(f) - f.ego[WHOLE], q), ego_variance(f)
-    f.ego[LEFT + 3] += more / 3.0 if f.ego[LEFT + 3] > 0.0 else 0.0
+    f.ego[LEFT + 3] += more / 3.0
 
 
 @part
