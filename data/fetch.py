@@ -18,6 +18,7 @@ from urllib.parse import quote, urljoin
 
 from coopoc.arrays import number
 from coopoc.errors import InputError, said, suggestion, unknown
+from coopoc.workers import progress_bar
 
 TIMEOUT = 20.0
 """s without a byte, after which a server is given up."""
@@ -217,11 +218,9 @@ def _downloaded(entry: Entry, address: str, to: Path, size: int, timeout: float)
     Raises:
         InputError: what went wrong, and how to fetch it by hand.
     """
-    from tqdm import tqdm
-
     data = bytearray()
     try:
-        bar = tqdm(desc=to.name, total=size, unit="B", unit_scale=True, delay=2.0)
+        bar = progress_bar(desc=to.name, total=size, unit="B", unit_scale=True, delay=2.0)
         with urllib.request.urlopen(address, timeout=timeout) as answer, bar:
             while len(data) <= size and (chunk := answer.read(CHUNK)):
                 data += chunk

@@ -13,7 +13,6 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-from tqdm import tqdm
 from tyro.conf import Positional, arg
 
 from coopoc import InputError, Method, paired_difference
@@ -26,6 +25,7 @@ from coopoc.one_file import in_file
 from coopoc.plugins import find
 from coopoc.study.numbers import three
 from coopoc.study.study import Params, Row
+from coopoc.workers import progress_bar
 
 from .convoys import CONVOYS, convoy_row
 from .lineup import named_method, own
@@ -186,11 +186,10 @@ def card(name: str, tasks: Iterable[Task], data: Path | None = None, real: Seque
         data: folder of the real measurements, or None.
         real: tasks of real measurements; None for all that there are for the name, none without data.
     """
-    rows = [
-        _row(task.name, partial(tried, name, task)) for task in tqdm(list(tasks), desc=name, unit="task", delay=2.0)
-    ]
+    bar = progress_bar(list(tasks), desc=name, unit="task", delay=2.0)
+    rows = [_row(task.name, partial(tried, name, task)) for task in bar]
     if data or real is not None:
-        for task, run in tqdm(measurable(name, data).items(), name, delay=2.0):
+        for task, run in progress_bar(measurable(name, data).items(), name, delay=2.0):
             if real is None and data and task in PUBLISHED and not holds(data, task):
                 print(f"coopoc: {task} is left out: no {PUBLISHED[task][0]} below {data}", file=sys.stderr)
                 continue

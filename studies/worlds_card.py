@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from scipy import special
-from tqdm import tqdm
 
 from coopoc import InputError, Method, nees, rt_le
 from coopoc.arrays import number
@@ -25,6 +24,7 @@ from coopoc.study.compute import compute
 from coopoc.study.numbers import three
 from coopoc.study.provenance import environment
 from coopoc.study.study import Params, Row
+from coopoc.workers import progress_bar
 
 from .lineup import named_method
 from .tasks import VERSION
@@ -153,7 +153,7 @@ def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", job
     """
     cells = [Cell({"seed": k}, {"seed": k}, str(k)) for k in range(seed, seed + count)]
     rows = list[Row]()
-    done = tqdm(compute(partial(world_row, name, split), cells, jobs), name, count, unit="world", delay=2.0)
+    done = progress_bar(compute(partial(world_row, name, split), cells, jobs), name, count, unit="world", delay=2.0)
     for outcome in done:
         at = outcome.cell.given["seed"]
         if outcome.rows is not None:
