@@ -248,7 +248,7 @@ def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:
         raise InputError("data", str(path), "must be the path of a file or folder", bring(path, "Check the path."))
     if options.get("offset") != AUTO:
         return read(path, **options)
-    from .log.check import less_offsets
+    from .log.offsets import less_offsets
 
     return less_offsets(read(path, **{**options, "offset": None}))
 

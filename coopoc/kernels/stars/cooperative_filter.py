@@ -341,8 +341,8 @@ def add_fix(f: Filter, model: Model, own: Floats) -> None:
     if f.member[0, EXTRA_VARIANCE] == 0.0:
         learn_fix(f, FIXES)
         show(f)
-    if model.fix_gate > 0.0 == f.member[0, EXTRA_VARIANCE] and not heard(f, False) and goes_back(f, model, own, q):
-        q = innovate(f.g, f.h)
+        if model.fix_gate > 0.0 and not heard(f, False) and goes_back(f, model, own, q):
+            q = innovate(f.g, f.h)
     f.member[0, OUT + 3] = share = use_fix(f, model, 0, True, q)
     f.who[0, HITS] = f.who[0, HITS] + 1 if share < 1.0 else 0
     corrected(f)
