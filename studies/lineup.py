@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from coopoc import InputError, Study
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, refuse
 from coopoc.errors import unknown
 from coopoc.file_names import given_path
 from coopoc.one_file import in_file
@@ -163,7 +163,9 @@ def start(p: Params) -> Floats | None:
     if scene.start(p) == "gnss":
         return None
     drive = scene.fleet(p["data"])
-    return drive.position[0, scene.recording(p).columns(scene.egos(p))]
+    first = drive.position[0, scene.recording(p).columns(scene.egos(p))]
+    refuse("start", first, np.isnan(first), "needs a truth of each ego at the first step", "Take start=gnss.")
+    return first
 
 
 def rows(p: Params, quantiles: int = 0) -> list[Row]:

@@ -74,7 +74,7 @@ def test_bytes_have_closed_forms() -> None:
 
 
 def test_a_measurement_counts_by_a_message_of_either_way(formation: Fleet) -> None:
-    """A share of 0.3 of the messages is lost; measured both ways, 0.09 of the pairs hear nothing."""
+    """A share of 0.3 of the messages is lost; measured both ways, 0.09 of the pairs get no message."""
     fleet = formation.between(0, 200)
     lossy = observe(fleet, S2, V2X(max_neighbours=len(fleet.ids), radius=1e3, loss=0.3), runs=2)
     counts = counted(lossy, np.ones(lossy.gnss.shape[:3], dtype=bool))

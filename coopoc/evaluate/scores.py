@@ -67,7 +67,8 @@ def scored(
     (3, 1)
     """
     seconds, parts, squares = 0.0, list[dict[str, AnyArray]](), list[Floats]()
-    known = bool(drive.present[:, [drive.index(ego) for ego in egos]].any(axis=0).all())
+    there = np.isfinite(recording.velocity[0][:, [recording.ids.index(ego) for ego in egos], 0])
+    known = bool((there & drive.present[:, [drive.index(ego) for ego in egos]]).any(axis=0).all())
     for part in slabs(recording, len(egos)):
         track = follow(method, part, egos)
         if getattr(track, "egos", None) != tuple(map(part.ids.index, egos)):

@@ -34,7 +34,7 @@ METHODS: Mapping[str, Factory] = {
 
 
 def needs_whole_fleet(name: str) -> bool:
-    """Whether a method needs what every vehicle measured, not only the egos: it says so by `whole_fleet = True`.
+    """Whether a method needs what every vehicle measured, not only the egos: it declares `whole_fleet = True`.
 
     >>> needs_whole_fleet("batch-smoother"), needs_whole_fleet("joint")
     (True, False)

@@ -117,18 +117,18 @@ def locked(folder: Path, own: Manifest) -> Iterator[None]:
     """
     lock = FileLock(folder / ".lock")
     try:
-        folder.mkdir(parents=True, exist_ok=True)
-        lock.acquire(blocking=False)
-        for left in (*folder.glob(".*.part"), *folder.glob("*/.*.part")):  # of processes that were killed
-            left.unlink()
-        own.save(folder)
-    except Timeout:
-        wait = "Wait until it ends, or choose another --out."
-        raise InputError("out", str(folder), "is in use by another run", wait) from None
-    except OSError as error:
-        allowed = f"cannot be written ({error.strerror or error})"
-        raise InputError("out", str(folder), allowed, "Choose another --out.") from None
-    try:
+        try:
+            folder.mkdir(parents=True, exist_ok=True)
+            lock.acquire(blocking=False)
+            for left in (*folder.glob(".*.part"), *folder.glob("*/.*.part")):  # of processes that were killed
+                left.unlink()
+            own.save(folder)
+        except Timeout:
+            wait = "Wait until it ends, or choose another --out."
+            raise InputError("out", str(folder), "is in use by another run", wait) from None
+        except OSError as error:
+            allowed = f"cannot be written ({error.strerror or error})"
+            raise InputError("out", str(folder), allowed, "Choose another --out.") from None
         yield
     finally:
         lock.release()

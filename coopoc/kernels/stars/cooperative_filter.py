@@ -14,8 +14,7 @@ import numpy as np
 from ...arrays import Floats, Ints
 from ..compiling.compile import compiled, inner, inside, part
 from ..compiling.small import apply, negate, store, subtract
-from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOTHING, SLIP
-from ..gate import remember as remembered
+from ..gate import BACK, BEGIN, FIX_GATE, GATE, KEEP, NOTHING, SLIP, remember
 from ..geometry import angle
 from .cooperative_members import join, leave, predict, replace_implausible_velocity
 from .cooperative_messages import fix_terms, goes_on, heard, receive, trust, use_fix
@@ -361,7 +360,7 @@ def goes_back(f: Filter, model: Model, own: Floats, q: float) -> bool:
         other += (own[FIX + c] - left[c]) ** 2 / (spread + r + SLIP)
         apart, gain = apart + (g.x[c] - left[c]) ** 2, gain + p / (3.0 * (p + r))
     gate = max(model.fix_gate, FIX_GATE)
-    what, left[4], left[5] = remembered(q, other, gate, gain, apart, 3.0 * spread, left[4], left[5])
+    what, left[4], left[5] = remember(q, other, gate, gain, apart, 3.0 * spread, left[4], left[5])
     if what == BEGIN:
         for c in range(3):
             left[c] = g.x[c]
