@@ -186,7 +186,7 @@ def test_bearings_that_are_called_azimuths_are_named(tmp_path: Path, frame: Any,
 @pytest.mark.parametrize(
     ("kind", "change", "said"),
     [
-        ("yaw_rate", (-1, 0), "red: axes look swapped or mirrored"),
+        ("yaw_rate", (-1, 0), "fixes of red, .* turn the other way: scale=yaw_rate:-1"),
         ("bearing", (1, 1.5), "turned by -1.5. rad: add -1.5"),
     ],
 )

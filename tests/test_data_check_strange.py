@@ -5,6 +5,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from strange_logs import strange
 
@@ -87,3 +88,26 @@ def test_nothing_is_named_in_clean_logs(tmp_path: Path, kind: str) -> None:
         named += result.warnings
         assert ("robot0" in str(result.unseen)) == (kind == "robot")
     assert not named
+
+
+OTHER = {"drone1": "drone2", "drone2": "drone1"}
+OF_RANGES: dict[str, Any] = {
+    r"drone0 to drone1 by \S+ m, as if to drone2": lambda f: {
+        "partner": f["partner"].where(f["vehicle"] != "drone0", f["partner"].replace(OTHER))
+    },
+    r"ranges are 0\.[23]\d+ \+- \S+ s late": lambda f: {"t": f["t"] + 0.3 * f["range"].notna()},
+    r"ranges are too long by [45]\.\S+ \+- \S+ %: scale=": lambda f: {"range": 1.05 * f["range"]},
+}
+
+
+@pytest.mark.parametrize("truth", [True, False])
+@pytest.mark.parametrize("words", OF_RANGES)
+def test_what_ranges_share_is_named_and_no_offset_is(tmp_path: Path, words: str, truth: bool) -> None:
+    folder = strange(tmp_path / "log", "drone")
+    log = pd.read_csv(folder / "log.csv")
+    log.assign(**OF_RANGES[words](log)).to_csv(folder / "log.csv", index=False)
+    if not truth:
+        (folder / "truth.csv").unlink()
+    text = said(folder)
+    assert re.search(words, text), text
+    assert "offset=" not in text

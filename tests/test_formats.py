@@ -1,4 +1,4 @@
-"""PyFG, g2o, TUM and KITTI files: what comes back, and what CORA's matrices, GTSAM and SciPy say of it."""
+"""PyFG, g2o and TUM files: what comes back, and what CORA's matrices, GTSAM and SciPy say of it."""
 
 import time
 from dataclasses import fields, is_dataclass, replace
@@ -15,7 +15,7 @@ from scipy.spatial.transform import Rotation
 
 from coopoc.formats import load_graph
 from coopoc.formats.graph import ENDS, Graph, PointEdges, PoseEdges, RangeEdges
-from coopoc.formats.trajectories import Trajectory, read_kitti, read_tum
+from coopoc.formats.trajectories import Trajectory, read_tum
 from coopoc.formats.values import to_orientation, to_rotation
 
 
@@ -238,12 +238,6 @@ def random_trajectory(count: int = 40) -> Trajectory:
     return Trajectory(
         stamps, np.cumsum(rng.normal(size=(count, 3)), axis=0), Rotation.random(count, rng=rng).as_matrix()
     )
-
-
-def test_a_real_kitti_file_is_numpys_table() -> None:
-    poses = read_kitti(measured("KITTI_00_ORB.txt"))
-    table = np.loadtxt(measured("KITTI_00_ORB.txt")).reshape(-1, 3, 4)
-    np.testing.assert_array_equal(np.dstack([poses.rotation, poses.position]), table)
 
 
 def test_a_tum_file_is_numpys_table(tmp_path: Path) -> None:

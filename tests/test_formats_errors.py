@@ -1,4 +1,4 @@
-"""Every wrong line of a PyFG, g2o, TUM or KITTI file is named with its place and a hint."""
+"""Every wrong line of a PyFG, g2o or TUM file is named with its place and a hint."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,7 +11,7 @@ from conftest import refused
 from coopoc.errors import InputError
 from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph, PointEdges, RangeEdges
-from coopoc.formats.trajectories import read_kitti, read_tum
+from coopoc.formats.trajectories import read_tum
 
 PYFG = """VERTEX_SE2 0 A0 0 0 0
 VERTEX_SE2 1 A1 1 0 0.5
@@ -127,7 +127,6 @@ def test_a_bad_graph_is_named_by_its_row(case: str) -> None:
 
 
 TUM = "# t x y z qx qy qz qw\n0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 0.999\n"
-KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n0 -1 0 5 1 0 0 6 0 0 1 7\n"
 
 
 @pytest.mark.parametrize(
@@ -139,16 +138,11 @@ KITTI = "1 0 0 5 0 1 0 6 0 0 1 7\n0 -1 0 5 1 0 0 6 0 0 1 7\n"
         (TUM + "0.2 0 0 0 0 0 0 0\n", "a.tum: line 4 = quaternion [0.0, 0.0, 0.0, 0.0]", "length 1"),
         (TUM + "0.1 0 0 0 0 0 0 1\n", "a.tum: line 4, column t", "must increase"),
         ("# t x y z\n", "a.tum = 0 lines", "complete"),
-        (KITTI + "1 0 0 5 0 1 0 6\n", "a.txt: line 3 = 1 0 0 5 0 1 0 6 (8 words)", "r11 r12 r13 t1 r21"),
-        (KITTI + "1 0 0 5 0 1 0 6 0 0 nan 7\n", "a.txt: line 3", "finite"),
-        (KITTI + "1 0 0 5 0 1.01 0 6 0 0 1 7\n", "a.txt: line 3 = rotation", "orthonormal"),
-        (KITTI + "1 0 0 5 0 1 0 6 0 0 -1 7\n", "a.txt: line 3 = rotation", "determinant 1"),
     ],
 )
 def test_a_bad_line_of_a_trajectory_is_named(tmp_path: Path, text: str, thing: str, hint: str) -> None:
-    good, name, read = (KITTI, "a.txt", read_kitti) if "a.txt" in thing else (TUM, "a.tum", read_tum)
-    assert len(read(_file(tmp_path / name, good))) == 2
-    _assert_refused(lambda: read(_file(tmp_path / name, text)), thing, hint)
+    assert len(read_tum(_file(tmp_path / "a.tum", TUM))) == 2
+    _assert_refused(lambda: read_tum(_file(tmp_path / "a.tum", text)), thing, hint)
 
 
 def test_a_repeated_stamp_is_named_by_all_its_digits(tmp_path: Path) -> None:
@@ -157,14 +151,6 @@ def test_a_repeated_stamp_is_named_by_all_its_digits(tmp_path: Path) -> None:
     file = _file(tmp_path / "a.tum", "".join(f"{stamp} {row} 0 0 0 0 0 1\n" for row, stamp in enumerate(stamps)))
     twice = f"{float(stamps[1])!r} s after {float(stamps[1])!r} s"
     _assert_refused(lambda: read_tum(file), "a.tum: line 3, column t", twice, "remove one that repeats")
-
-
-def test_stamps_of_kitti_stand_in_a_file_of_their_own(tmp_path: Path) -> None:
-    _file(tmp_path / "a.txt", KITTI)
-    _file(tmp_path / "t.txt", "0\n1\n2\n")
-    _assert_refused(lambda: read_kitti(tmp_path / "a.txt", tmp_path / "t.txt"), "times = 3 stamps", "must be 2")
-    _file(tmp_path / "t.txt", "0.5\n1\n")
-    assert read_kitti(tmp_path / "a.txt", tmp_path / "t.txt").stamps.tolist() == [0.5, 1.0]
 
 
 def _file(path: Path, text: str) -> Path:

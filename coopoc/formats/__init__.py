@@ -1,4 +1,4 @@
-"""Files of graphs and trajectories: graphs in PyFG and g2o, trajectories in TUM and KITTI."""
+"""Files of graphs and trajectories: graphs in PyFG and g2o, trajectories in TUM."""
 
 from __future__ import annotations
 

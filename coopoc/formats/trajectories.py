@@ -1,4 +1,4 @@
-"""Trajectories: poses over time, in TUM (`t x y z qx qy qz qw`) and KITTI (12 numbers of [R | t] by rows) files."""
+"""Trajectories: poses over time, in TUM files (`t x y z qx qy qz qw`)."""
 
 from __future__ import annotations
 
@@ -17,7 +17,6 @@ from .values import UNIT, read_table, to_orientation, to_rotation
 
 ORTHONORMAL = 1e-3
 """Largest entry of |R R^T - I| of a matrix that was merely rounded."""
-KITTI = "r11 r12 r13 t1 r21 r22 r23 t2 r31 r32 r33 t3"
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,32 +141,3 @@ def write_tum(
     poses = Trajectory(stamps, where, rotation)
     rows = np.column_stack([stamps, poses.position, to_orientation(poses.rotation)])
     np.savetxt(given_path(path), rows, fmt="%.9f")
-
-
-def read_kitti(path: str | Path, times: str | Path | None = None) -> Trajectory:
-    """Trajectory of a KITTI file.
-
-    Args:
-        path: lines r11 r12 r13 t1 r21 ... t3; m.
-        times: file with one stamp per line, s.
-
-    Raises:
-        InputError: with the line, another number of words, one that is no finite number, a matrix that is no rotation;
-            a file without a pose, or another number of stamps.
-
-    Source: the KITTI odometry benchmark (Geiger, Lenz, Urtasun, CVPR 2012).
-
-    >>> import tempfile
-    >>> file = Path(tempfile.mkdtemp()) / "a.txt"
-    >>> _ = file.write_text("1 0 0 5 0 1 0 6 0 0 1 7\\n")
-    >>> read_kitti(file).position
-    array([[5., 6., 7.]])
-    """
-    path = given_path(path)
-    lines, table = read_table(path, KITTI)
-    stamps = None if times is None else read_table(Path(times), "t")[1][:, 0]
-    if stamps is not None and len(stamps) != len(table):
-        allowed = f"must be {len(table)}, one per pose of {path.name}"
-        raise InputError("times", f"{len(stamps)} stamps", allowed, "Check that both files belong together.")
-    poses = table.reshape(-1, 3, 4)
-    return Trajectory(stamps, poses[..., 3], poses[..., :3], location=lambda row: f"{path.name}: line {lines[row]}")

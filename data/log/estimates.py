@@ -22,12 +22,20 @@ SURELY = 4.0
 """Standard errors beyond which an estimate is no chance: one of hundreds that a few logs ask for lies beyond three."""
 LATE, SCALE, TURNED, DRIFT = 0.02, 0.01, 0.02, 2e-3
 """Least errors that are worth a word: of a clock, s; of odometry, share of a speed, rad, rad/s."""
+UNITS_APART = 0.2
+"""Share by which lengths are off from which their unit is wrong."""
 ENOUGH = 20
 """Measurements from which a statistic is worth a word."""
 FAR = 10.0
 """Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
+ALIKE = 0.97
+"""Correlation of the displacements of fixes and odometry that noise alone does not bring about."""
 OUTLYING, BLOCKS = 5.0, 10
 """Medians of the residuals beyond which one is left out; parts of a drive that show how sure an estimate is."""
+FAST = 2.0
+"""s, from which a lag is looked for, not estimated."""
+LONGEST = 60.0
+"""s, of lags that are looked for."""
 VARIED, NUDGE = 0.15, 0.01
 """Standard deviation over mean of a speed below which an arm ahead and a late clock look alike; m and s by which fixes
 are moved to see what a filter makes of an arm."""
@@ -40,12 +48,13 @@ class Estimate(NamedTuple):
     error: Floats
 
 
-def factors(y: AnyArray, x: AnyArray, groups: Ints | None = None, reference: int | None = None) -> Estimate:
+def factors(y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, less: Floats | None = None) -> Estimate:
     """Factors of causes x (M, k) that explain y (M,) best, outliers aside, with standard errors by parts that are left
-    out; less the means of groups (M,), and less the factor of a reference if any.
+    out; less the means of groups (M,); times a matrix (k, k), if any. None is known where half of y stays, and that is
+    OUTLYING times its noise: something else is wrong.
 
     >>> time = np.arange(40.0)
-    >>> factors(3 * time + 7, time[:, None], np.zeros(40, int)).value.round(6).tolist()
+    >>> factors(3 * time + 7, time[:, None], 0.1, np.zeros(40, int)).value.round(6).tolist()
     [3.0]
     """
     none = Estimate(np.zeros(x.shape[1]), np.full(x.shape[1], np.inf))
@@ -62,12 +71,16 @@ def factors(y: AnyArray, x: AnyArray, groups: Ints | None = None, reference: int
             factor: Floats = np.linalg.lstsq(left, right)[0]
             gap = np.abs(y - x @ factor)
             rows = rows[gap[rows] <= OUTLYING * np.median(gap[rows])]
-        return factor - (0.0 if reference is None else factor[reference])
+        return factor
 
     every = np.arange(len(y))
-    without = [fitted(np.setdiff1d(every, part)) for part in np.array_split(every, BLOCKS)]
+    value, *without = map(fitted, [every, *(np.setdiff1d(every, part) for part in np.array_split(every, BLOCKS))])
+    before, left = (float(np.median(np.abs(gap))) for gap in (y, y - x @ value))
+    if left > max(OUTLYING * noise, 0.5 * before):
+        return none
+    value, *without = (each if less is None else less @ each for each in (value, *without))
     error = np.sqrt(BLOCKS - 1.0) * np.std(without, axis=0)
-    return Estimate(fitted(every), np.where(np.any(x, axis=0), error, np.inf))
+    return Estimate(value, np.where(np.any(x, axis=0), error, np.inf))
 
 
 def causes(c: Check) -> tuple[AnyArray, AnyArray]:
@@ -107,6 +120,15 @@ def moves(rec: Recording, column: int) -> tuple[AnyArray, AnyArray]:
     return np.empty(0), np.empty(0)
 
 
+def ratio_of_moves(rec: Recording, column: int) -> complex | None:
+    """Displacements of a vehicle's fixes over those of its odometry, if one factor and their noise explain them."""
+    moved, driven = moves(rec, column)
+    ratio = complex(np.vdot(driven, moved)) / max(float(np.linalg.norm(driven)) ** 2, 1e-12)
+    noise = float(np.hypot(*rec.sensors.fix_std[:2])) * (2 * len(moved)) ** 0.5
+    most = max(2 * noise, (1 - ALIKE**2) ** 0.5 * float(np.linalg.norm(moved)))
+    return ratio if len(moved) and np.linalg.norm(moved - ratio * driven) < most else None
+
+
 def odometry(c: Check, column: int) -> Estimate:
     """By what share a vehicle's speeds are too large, and by what its directions are turned, rad; in body frames what
     its yaw rates are too large by, rad/s; and by what it is later than a truth, s: against the truth, else the fixes,
@@ -116,27 +138,28 @@ def odometry(c: Check, column: int) -> Estimate:
         return Estimate(np.zeros(3), np.full(3, np.inf))
     if truth is None and body is not None:
         return Estimate(*c.lasting[:, column])
+    velocity = rec.velocity[0, :, column, :2]
+    noise = np.nan_to_num(rec.sensors.velocity_std(velocity, rec.sensors.velocity_floor))
     if truth is None:
         moved, driven = moves(rec, column)
-        estimate = factors(moved, np.stack([driven, 1j * driven], axis=1))
-        noise = rec.sensors.velocity_std(rec.velocity[0, :, column, :2], rec.sensors.velocity_floor) * rec.dt
-        flatter = 1.0 + float(np.nansum(noise**2)) / max(float(np.square(np.abs(driven)).sum()), 1e-12)
-        turned = complex(*estimate.value) * flatter  # noise of a cause makes its factor smaller
-        return Estimate(_polar(1 / turned) if turned else estimate.value, estimate.error)
-    true = truth.velocity[:, column, :2] @ [1, 1j]
-    odometer = rec.velocity[0, :, column, :2] @ [1, 1j]
+        fix, square = float(np.hypot(*rec.sensors.fix_std[:2])), max(float(np.square(np.abs(driven)).sum()), 1e-12)
+        value, error = factors(moved - driven, np.stack([driven, 1j * driven], axis=1), 2**0.5 * fix)
+        turned = (1 + complex(*value)) * (1 + (float(np.linalg.norm(noise)) * rec.dt) ** 2 / square)
+        return Estimate(_polar(1 / turned) if turned else value, error)  # noise of a cause makes its factor smaller
+    path = truth.position[:, column, :2] @ [1, 1j]
+    true = np.diff(path, prepend=np.nan) / rec.dt  # as odometry, the mean over a step
+    odometer = velocity @ [1, 1j]
     if body is not None:
         odometer = c.log.recording.velocity[0, :, column, 0].astype(complex)
         heading = None if truth.heading is None else truth.heading[:, column]
         true = (np.abs(true) if heading is None else (true * np.exp(-1j * heading)).real).astype(complex)
     x = np.stack([true, 1j * true, np.gradient(true, rec.dt)], axis=1)
-    used = np.isfinite(odometer + x.sum(axis=1)) & (np.arange(len(true)) > 0)
+    used = np.isfinite(odometer + x.sum(axis=1))
     used &= np.maximum(np.abs(true), np.abs(odometer)) > MOVING  # standing, nothing errs
-    estimate = factors(odometer[used], x[used])
-    value, error = (
-        np.append(_polar(complex(*estimate.value[:2])), -estimate.value[2] / max(estimate.value[0], 0.1)),
-        estimate.error,
-    )
+    value, error = factors((odometer - true)[used], x[used], float(np.linalg.norm(noise)) / len(noise) ** 0.5)
+    late = -value[2] / max(1 + value[0], 0.1)
+    value = np.append(_polar(1 + complex(*value[:2])), late)
+    error[2] = error[2] if abs(late) < FAST else np.inf  # what is linear in a lag holds for small ones
     if body is not None:
         error[1] = np.inf
         if truth.heading is not None:
@@ -151,38 +174,44 @@ def _polar(turned: complex) -> Floats:
 
 
 def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
-    """By what each vehicle's clock is ahead of that of a reference, by default of one that most agree with, s (N,), and
-    what a range or direction misses for 1 s of each (L, 2, N).
+    """By what each vehicle's clock is ahead of that of a reference, by default of one that most agree with, s; by what
+    share ranges are too long; and by what they are late, s: (N + 2,), and what a range or direction misses for 1 of
+    each (L, 2, N + 2).
 
     Where i measures j, whose stamps are d s ahead of i's, it is u v_j d longer than between the filters, u being the
-    unit vector from i to j.
+    unit vector from i to j; where ranges are d s late, u (v_i - v_j) d.
     """
     links, size = c.world.links, len(c.world.ids)
     gap, _ = residual_of(c.world, c.x)
-    flat = np.maximum(np.linalg.norm(gap[:, :2], axis=1), 1.0)
-    velocity = np.nan_to_num(c.world.velocity[0, links.step, links.neighbour])
-    along = (gap * velocity).sum(axis=1) / np.maximum(np.linalg.norm(gap, axis=1), 1.0)
-    across = (gap[:, 0] * velocity[:, 1] - gap[:, 1] * velocity[:, 0]) / flat**2
+    flat, far = (np.maximum(np.linalg.norm(gap[:, :axes], axis=1), 1.0) for axes in (2, 3))
+    velocity = np.nan_to_num(c.world.velocity[0])
+    moves = velocity[links.step, links.neighbour]
+    along = (gap * moves).sum(axis=1) / far
+    across = (gap[:, 0] * moves[:, 1] - gap[:, 1] * moves[:, 0]) / flat**2
     ends = np.eye(size)[links.neighbour] - np.eye(size)[links.observer]
+    rate = (gap * (velocity[links.step, links.observer] - moves)).sum(axis=1) / far
     made = np.stack([along, across], axis=1)[..., None] * ends[:, None]
+    made = np.concatenate([made, np.stack([np.column_stack([far, rate]), np.zeros((len(far), 2))], axis=1)], axis=2)
     there = np.isfinite(c.relative[:, 0] + along)
     pairs = np.sort([links.observer, links.neighbour], axis=0)
-    inputs = c.relative[there, 0], made[there, 0], (pairs[0] * size + pairs[1])[there]
-    estimate = factors(*inputs)
-    sure = np.flatnonzero(np.isfinite(estimate.error))
+    noise = float(np.median(c.expected[there, 0])) if there.any() else 0.0
+    x, groups, less = made[there, 0], (pairs[0] * size + pairs[1])[there], np.eye(size + 2)
+    estimate = factors(c.relative[there, 0], x, noise, groups)
+    sure = np.flatnonzero(np.isfinite(estimate.error[:size]))
     if reference is None and len(sure):
         apart = np.abs(np.subtract.outer(estimate.value[sure], estimate.value[sure]))
         reference = int(sure[np.argmin((np.minimum(apart, LATE) + 1e-3 * apart).sum(axis=1))])
-    estimate = factors(*inputs, reference)
-    return estimate._replace(error=np.hypot(estimate.error, _of_filters(c, there, *inputs[1:], reference))), made
+    if reference is not None:
+        less[:size, reference] -= 1.0
+    estimate = factors(c.relative[there, 0], x, noise, groups, less)
+    return estimate._replace(error=np.hypot(estimate.error, _of_filters(c, there, x, groups, less))), made
 
 
-def _of_filters(c: Check, there: Bools, x: Floats, pairs: Ints, reference: int | None) -> Floats:
-    """Standard errors (N,) of factors of causes x (M, N), less means of pairs (M,), by errors of the filters that decay
-    in the time that a fix is remembered."""
+def _of_filters(c: Check, there: Bools, x: Floats, pairs: Ints, less: Floats) -> Floats:
+    """Standard errors (k,) of factors of causes x (M, k), less means of pairs (M,), times `less` (k, k), by errors of
+    the filters that decay in the time that a fix is remembered."""
     x = x - pd.DataFrame(x).groupby(pairs).transform("mean").to_numpy()
-    gain = x @ np.linalg.pinv(x.T @ x)
-    gain = gain if reference is None else gain - gain[:, [reference]]
+    gain = x @ np.linalg.pinv(x.T @ x) @ less.T
     keep = np.exp(-2.0 / max(share(c) * len(c.world.t), 1e-9))
     position = np.maximum(c.expected[there, 0] ** 2 - c.world.sensors.range_std**2, 0.0)
     variance = np.zeros(x.shape[1])
@@ -239,6 +268,25 @@ def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
     return made
 
 
+def lag_of_fixes(c: Check, column: int) -> float:
+    """s, by which fixes are late beside the odometry, or a truth, if a lag alone explains how they move, else 0."""
+    rec, truth = c.world, c.log.truth
+    velocity = (rec.velocity[0] if truth is None else truth.velocity)[:, column, :2] @ [1, 1j]
+    path = np.cumsum(np.nan_to_num(velocity) * rec.dt) + 0.0 * velocity
+    fixes, most, misses = rec.gnss[0, :, column, :2] @ [1, 1j], int(LONGEST / rec.dt), dict[int, float]()
+    at = np.flatnonzero(np.isfinite(fixes))
+    for steps in range(-most, most + 1):
+        then = at[(at >= steps) & (at < len(path) + steps)]
+        off = pd.Series(fixes[then] - path[then - steps]).dropna()
+        if len(off) > len(at) / 2:
+            apart = off - off.groupby(np.arange(len(off)) // ENOUGH).transform("mean")
+            misses[steps] = float(np.median(np.abs(apart)))
+    least = min(misses.values(), default=np.inf)
+    if least > min(OUTLYING * float(np.hypot(*rec.sensors.fix_std[:2])), misses.get(0, 0.0) / 2):
+        return 0.0
+    return min((steps for steps, miss in misses.items() if miss < 1.05 * least), key=abs) * rec.dt
+
+
 def _beside(off: AnyArray, velocity: AnyArray) -> float:
     """By what fixes that are off by (T,) m lie beside the truth, m, however late they are; 0 where there are none."""
     finite = np.isfinite(off + velocity)
@@ -250,7 +298,7 @@ def _beside(off: AnyArray, velocity: AnyArray) -> float:
 
 def against_truth(c: Check) -> Check:
     """The same, with ranges, and in the world directions, against the truth where both ends have one that
-    their fixes fit, or one stands as a landmark."""
+    their fixes fit, or one stands as a landmark; without those of vehicles whose fixes do not fit."""
     truth, noise = c.log.truth, c.world.sensors
     if truth is None:
         return c
@@ -261,11 +309,13 @@ def against_truth(c: Check) -> Check:
     residual, stated = residual_of(c.world, x)[1], [noise.range_std, noise.world_azimuth_std, noise.inclination_std]
     used = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)
     relative, expected = (np.where(used, new, old) for new, old in ((residual, c.relative), (stated, c.expected)))
-    return replace(c, relative=relative, expected=expected)
+    fit = (fits | marks)[[c.world.links.observer, c.world.links.neighbour]].all(axis=0)  # of others nothing is known
+    return replace(c, relative=np.where(fit[:, None], relative, np.nan), expected=expected)
 
 
-def on_time(c: Check) -> Check:
-    """The same with what its relative measurements say about clocks, and less what wrong ones explain."""
+def on_time(c: Check, alike: bool = True) -> Check:
+    """The same with what its relative measurements say about clocks and, if `alike`, about what all ranges share, and
+    less what wrong ones explain."""
     reference = None
     if c.log.truth is not None:
         off, (_, _, velocity) = causes(c)
@@ -273,11 +323,15 @@ def on_time(c: Check) -> Check:
         covered = np.isfinite(off).any(axis=0) & (c.variance[..., 0] > 0).any(axis=0)
         reference = int(np.argmin(np.where(covered, np.abs(seconds), np.inf))) if covered.any() else None
     estimate, made = clocks(c, reference)
-    ahead = np.where((np.abs(estimate.value) > np.maximum(SURELY * estimate.error, LATE)), estimate.value, 0.0)
+    size, error = len(c.world.ids), estimate.error
+    least = np.where(np.arange(size + 2) == size, SCALE, LATE)
+    off = np.where(np.abs(estimate.value) > np.maximum(SURELY * error, least), estimate.value, 0.0)
+    off[size:] *= alike & (abs(off[size]) < UNITS_APART)
     relative = c.relative.copy()
-    relative[:, :2] -= np.nan_to_num(made @ ahead)
-    slack = np.nan_to_num(made * np.where(ahead, estimate.error, 0.0))
-    return replace(c, relative=relative, ahead=ahead, unsure=estimate.error, slack=slack)
+    relative[:, :2] -= np.nan_to_num(made @ off)
+    slack = np.nan_to_num(made * np.where(off, error, 0.0))
+    ranges = tuple(zip(off[size:], error[size:], strict=True))
+    return replace(c, relative=relative, ahead=off[:size], unsure=error[:size], slack=slack, ranges=ranges)
 
 
 def worst(c: Check, column: int) -> tuple[float | None, float]:

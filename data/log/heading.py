@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -15,6 +15,8 @@ from ..assemble import SAME
 
 BASELINE = 10.0
 """Standard deviations of a fix, by which two must be apart to show a direction: to 0.14 rad."""
+TURNS = 7.5 / BASELINE
+"""Root of summed squared sines of turns above which their sense is no chance: fixes make 0.24 of it."""
 GYRO_BIAS, GYRO_LASTS, GYRO_WALK = 0.02, 600.0, 0.01
 """rad/s, bias of a yaw rate, and s, for which it lasts; rad in a root of a second, by which its integral wanders."""
 
@@ -77,14 +79,8 @@ def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) 
         yaw_rate: rad/s.
         std: m, of a fix on an axis.
     """
-    turned, t = integral(yaw_rate, speed.t), fixes.t
-    way = speed.value * np.column_stack([np.cos(turned), np.sin(turned)])
-    path, position = integral(Signal(speed.t, way), t) @ [1, 1j], fixes.value[:, :2] @ [1, 1j]
-    state, cov, level, last, samples = np.zeros(2), np.zeros((2, 2)), 1.0, 0, list[tuple[float, ...]]()
-    for j in range(1, len(t)):
-        moved, driven = position[j] - position[last], path[j] - path[last]
-        if min(abs(moved), abs(driven)) < BASELINE * std:
-            continue
+    t, state, cov, level, samples = fixes.t, np.zeros(2), np.zeros((2, 2)), 1.0, list[tuple[float, ...]]()
+    for last, j, moved, driven in far_apart(fixes, speed, yaw_rate, std):
         angle, variance = float(np.angle(moved / driven)), 2 * std**2 / abs(driven) ** 2
         h = np.array([1.0, 0.5 * (t[last] - t[j])])
         if not samples:
@@ -99,7 +95,6 @@ def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) 
             state, cov = state + gain * gap, cov - np.outer(gain, cov @ h)
         pace = abs(driven) / (t[j] - t[last])
         samples.append((float(t[j]), *state, cov[0, 0] * pace**2, t[j] - t[last]))
-        last = j
     if not samples:
         return None
     since = Signal(np.array([k[0] for k in samples]), np.array(samples))
@@ -110,6 +105,30 @@ def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) 
         return heading
 
     return at, float(np.prod(np.median(since.value[:, 3:], axis=0)))
+
+
+def far_apart(
+    fixes: Signal, speed: Signal, yaw_rate: Signal, std: float
+) -> Iterator[tuple[int, int, complex, complex]]:
+    """Indices of fixes that are BASELINE standard deviations apart, and x + iy m by which they and dead reckoning moved
+    in between."""
+    turned, last = integral(yaw_rate, speed.t), 0
+    way = speed.value * np.column_stack([np.cos(turned), np.sin(turned)])
+    path, position = integral(Signal(speed.t, way), fixes.t) @ [1, 1j], fixes.value[:, :2] @ [1, 1j]
+    for j in range(1, len(fixes.t)):
+        moved, driven = position[j] - position[last], path[j] - path[last]
+        if min(abs(moved), abs(driven)) >= BASELINE * std:
+            yield last, j, moved, driven
+            last = j
+
+
+def mirrored(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -> bool:
+    """Whether dead reckoning turns to the other side than fixes do, from one span of `far_apart` to the next."""
+    spans = [(moved, driven) for _, _, moved, driven in far_apart(fixes, speed, yaw_rate, std)]
+    if len(spans) < 3:
+        return False
+    a, b = (np.sin(np.angle(way[1:] * way[:-1].conj())) for way in np.array(spans).T)
+    return bool(a @ b < -max(0.5 * float(np.linalg.norm(a)), TURNS) * float(np.linalg.norm(b)))
 
 
 def held(signal: Signal, at: Floats) -> Floats:

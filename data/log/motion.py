@@ -25,6 +25,7 @@ from .heading import (
     heading_of_courses,
     heading_of_gyro,
     integral,
+    mirrored,
 )
 from .units import Rows, Summary, in_group, place
 
@@ -36,6 +37,8 @@ UNKNOWN_SPEED = 30.0
 """m/s, standard deviation of a velocity before fixes have shown it."""
 COURSE = "the heading of {} is the course of the {}: no vehicle slips or reverses"
 ARM = "fixes are those of the reference point, less the arm to the antenna, of {}; none slips or reverses"
+HOLDS = "fixes that stay while the odometry moves on"
+CLOCKWISE = "yaw rates are anticlockwise, but fixes of {} turn the other way: scale=yaw_rate:-1 mends it"
 DERIVED = "no odometry of {}: a nearly constant velocity is assumed, which its fixes until then have shown"
 
 AHEAD: Floats = np.array([1.0, 0.0, 0.0])
@@ -153,11 +156,12 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
     fixes = samples(rows, ("x", "y", "z"), summary, 2 if steps.planar else 3)
     if steps.planar:
         fixes.value[:, 2] = 0.0
+    again = pd.DataFrame(fixes.value).diff().eq(0).all(axis=1).to_numpy()
     measured, turn, speed = (samples(rows, (kind,), summary) for kind in ("heading", "yaw_rate", "speed"))
     still: Floats = np.zeros((len(grid), 3))
     wanders = 0.0
     none: Floats = np.full(len(grid), np.nan)
-    if len(fixes.t) == 1 and not in_group(rows, "odometry").any():
+    if len(fixes.t) and again[1:].all() and not in_group(rows, "odometry").any():
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m{', arm left in' * (arm is not None)}"
         heading = heading_at(measured, None, np.inf) if len(measured.t) and not body else None
         return Member(still + fixes.value[0], still, heading, text, "", True, still[:, 0], none)
@@ -175,6 +179,8 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         angle = pd.Series(pointing(fixes.t)).ffill().bfill().to_numpy()
         fixes = Signal(fixes.t, fixes.value - turned(off, angle))
         shown, gyro = velocity_of_fixes(fixes, steps, std), (fixes, speed, std)
+    if len(speed.t) > 1 and len(turn.t) > 1 and mirrored(fixes, speed, turn, std):
+        summary.assume(CLOCKWISE, name)
     if body:
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
             if not len(signal.t):
@@ -195,7 +201,7 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
     for signal in signals:
         interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
         there &= covered(signal.t, grid, steps.gap(signal.t), max(steps.dt, 0.6 * interval))
-    gnss = _fixes_on_steps(rows, fixes, carried, there, steps)
+    gnss = _fixes_on_steps(rows, fixes, carried, there, steps, again, std)
     fixed = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
     if fixed.any() or not body:
         summary.refuse(f"steps of {name} before its first fix", int((there & ~fixed).sum()))
@@ -333,14 +339,23 @@ def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, 
     return kept, step[kept], lag[kept]
 
 
-def _fixes_on_steps(rows: Rows, fixes: Signal, velocity: Floats, there: Bools, steps: Steps) -> Floats:
-    """(T, 3) fixes, each brought to the nearest step by the velocity; of several at a step the nearest in time."""
+def _fixes_on_steps(
+    rows: Rows, fixes: Signal, velocity: Floats, there: Bools, steps: Steps, again: Bools, std: float
+) -> Floats:
+    """(T, 3) fixes, each brought to the nearest step by the velocity; of several at a step the nearest in time; none
+    that is as the one before (`again`), though what moves has gone on by its standard deviation."""
     gnss, summary = np.full((len(steps.grid), 3), np.nan), steps.summary
     nearest, _ = steps.nearest(fixes.t)
+    moves = there & (np.linalg.norm(velocity, axis=1) > STANDS)
+    way = np.cumsum(np.where(moves[:, None], velocity, 0.0) * steps.dt, axis=0)[nearest]
+    before = np.maximum.accumulate(np.where(again, 0, np.arange(len(again))))
+    held = again & there[nearest] & (np.linalg.norm(way - way[before], axis=1) > std)
+    rows = rows[rows["kind"].eq("x")]
+    summary.refuse(HOLDS, rows[rows["t"].isin(fixes.t[held])])
+    fixes, nearest = Signal(*(values[~held] for values in fixes)), nearest[~held]
     kept, step, lag = _nearest_of_each(fixes, there, steps)
     absent = (nearest >= 0) & ~there[nearest]
     beside = ~np.isin(np.arange(len(nearest)), kept) & (nearest >= 0) & ~absent
-    rows = rows[rows["kind"].eq("x")]
     for why, left in (
         ("fixes outside the recording", nearest < 0),
         ("fixes in gaps of the odometry", absent),

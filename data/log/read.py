@@ -34,7 +34,7 @@ from .frames import ENU, Origin, assumed, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
 from .motion import Member, Steps, member, samples
 from .tables import is_log_table, read_log_table
-from .units import KINDS, Rows, Summary, check_values, distinct, in_group
+from .units import KINDS, Rows, Summary, check_values, distinct, fresh, in_group
 
 Frame = Literal["world", "body"]
 Stamps = Literal["header", "received"]
@@ -217,7 +217,7 @@ def read_log(
     rows, origin = local(on_one_clock(rows, clock), origin)
     deviations = factors(std, KINDS.keys() - {"message"}, "std")
     stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * each for kind, each in deviations.items()}
-    rows = distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary)
+    rows = fresh(distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary), summary)
     if not any_scale:
         _check_scale(rows, path.name)
     ids = _ids(rows, body, summary)

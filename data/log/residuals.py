@@ -44,7 +44,10 @@ class Check:
         lasting: (2, N, 2) scale error of speeds and bias of yaw rates rad/s as the filters end, and their deviations.
         ahead: (N,) s, of clocks, 0 where none is sure.
         unsure: (N,) s, standard errors of these.
-        slack: (L, 2, N) m and rad, of ranges and directions, that a standard error of each clock taken off makes.
+        slack: (L, 2, N + 2) m and rad, of ranges and directions, that a standard error of what is taken off makes: of
+            each clock, and of what follows.
+        ranges: share by which they are too long, s by which they are late, 0 where not sure; each with its standard
+            error.
         scored: x and variance that are held against the truth: in body frames those of the whole fleet's filter, since
             one anchor alone leaves a vehicle's states open.
         vehicles: table, a row per vehicle.
@@ -67,6 +70,7 @@ class Check:
     unsure: Floats
     slack: Floats
     scored: tuple[Floats, Floats]
+    ranges: tuple[tuple[float, float], ...] = ()
     vehicles: Sequence[Mapping[str, Any]] = ()
     measurements: Sequence[Mapping[str, Any]] = ()
     warnings: tuple[str, ...] = ()
@@ -176,7 +180,7 @@ def filtered(log: Log) -> Check:
     log = replace(log, recording=rec)
     none, infinite = np.zeros(vehicles), np.full(vehicles, np.inf)
     stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting
-    return Check(log, span + start, world, *stats, none, infinite, np.zeros((len(links), 2, vehicles)), scored)
+    return Check(log, span + start, world, *stats, none, infinite, np.zeros((len(links), 2, vehicles + 2)), scored)
 
 
 def residual_of(world: Recording, x: Floats) -> tuple[Floats, Floats]:

@@ -135,6 +135,21 @@ def distinct(rows: Rows, summary: Summary) -> Rows:
     return rows[~again]
 
 
+def fresh(rows: Rows, summary: Summary) -> Rows:
+    """Rows but fixes and relative measurements that only repeat the values before, where a table at the rate of another
+    sensor holds them: where most runs of equal values are of two or more, and not all are equal."""
+    keys, some = ["vehicle", "partner", "fix"], rows[in_group(rows, "fix", "relative")].sort_values("t", kind="stable")
+    same = some.groupby(["vehicle", "partner", "kind"])["value"].diff().eq(0)
+    some = some.assign(fix=in_group(some, "fix"), same=same)
+    held = some.groupby([*keys, "t"])["same"].all()
+    run = (~held).groupby(keys).cumsum()
+    length = held.groupby([*keys, run.to_numpy()]).transform("size").where(~held).groupby(keys).transform("median")
+    held &= (length >= 2) & (run.groupby(keys).transform("max") > 1)
+    lost = some.index[held.reindex(pd.MultiIndex.from_frame(some[[*keys, "t"]])).to_numpy(dtype=bool)]
+    summary.refuse("fixes and relative measurements that hold the values before", rows.loc[lost.sort_values()])
+    return rows.drop(lost)
+
+
 @dataclass
 class Summary:
     """What became of the rows of a log, counted while it is read.

@@ -31,7 +31,6 @@ ROBOTS = (
     + "VERTEX_XY L0 3 4\nEDGE_RANGE 0.2 A2 L0 4.0 0.04\nEDGE_RANGE 0.3 A3 B3 1.0 0.04\n"
 )
 TUM = "# t x y z qx qy qz qw\n" + "".join(f"{k / 10} {k} 0 0 0 0 0.6 0.8\n" for k in range(8))
-KITTI = "".join(f"1 0 0 {k} 0 1 0 0 0 0 1 0\n" for k in range(8))
 LIBRSF = {
     "a_Input.txt": "".join(
         f"range2 {k / 10} 4.0 0.01 {3 * (k % 3)} {k % 2} {k % 3} 0\nodom2diff {k / 10} 0.5 0.6 0 0.1 0.01 0.01 0.01\n"

@@ -10,7 +10,7 @@ from safetensors.torch import save as to_bytes
 from coopoc import read_graph
 from coopoc.data.log.read import read_log
 from coopoc.data.registry import load_fleet, load_log
-from coopoc.formats.trajectories import read_kitti, read_tum
+from coopoc.formats.trajectories import read_tum
 from coopoc.learned.checkpoint import load
 from coopoc.learned.nets.okf import NoiseParameters
 from coopoc.seals import UNSEALED, sealed
@@ -60,7 +60,6 @@ READERS: Mapping[str, Reader] = {
     "fcd": Reader({"a.xml": good.FCD}, lambda d: load_fleet(d / "a.xml")),
     "tum": Reader({"a.tum": good.TUM}, lambda d: load_fleet(d / "a.tum")),
     "tum poses": Reader({"a.tum": good.TUM}, lambda d: read_tum(d / "a.tum")),
-    "kitti": Reader({"a.txt": good.KITTI}, lambda d: read_kitti(d / "a.txt")),
     "g2o": Reader({"a.g2o": good.G2O}, lambda d: read_graph(d / "a.g2o")),
     "pyfg": Reader({"a.pyfg": good.PYFG}, lambda d: read_graph(d / "a.pyfg")),
     "pyfg recording": Reader({"a.pyfg": good.ROBOTS}, lambda d: load_log(d / "a.pyfg")),

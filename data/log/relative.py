@@ -1,0 +1,207 @@
+"""Relative measurements of a log against positions: scale, lateness, outliers, wrong partners, offsets of pairs."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pandas as pd
+
+from coopoc.arrays import Floats, Ints, robust_std
+from coopoc.world.links import wrap
+
+from .estimates import ENOUGH, FAR, OUTLYING, SURELY, by_pair, offsets
+from .motion import MOVING
+from .residuals import Check
+
+UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
+WIDE, NARROW = 2.0, 0.4
+"""Ratios of a measured to a stated standard deviation at which something is wrong."""
+COARSE = 0.5
+"""rad: no sensor's angles scatter as much about positions that are better known."""
+HINTS = {
+    "range": "Are clocks, or the positions of one, off?",
+    "azimuth": "Check their zero (+x, or the heading for a bearing), their sense (anticlockwise), their unit (rad), "
+    "whose heading they count from, and that no axis is mirrored.",
+    "inclination": "Inclinations count from +z, elevations from the horizon.",
+}
+"""What to look for where measurements of a kind miss the positions."""
+OUTLIERS = 0.01
+"""Share of measurements beyond 5 standard deviations that is worth a word."""
+WINDOW = 9
+"""Measurements of a pair whose median is taken off to count outliers."""
+SOLID, MANY = 0.8, 4
+"""Share of a part of a drive in which something is wrong, and of the drive that such a part may be; cases that a
+sentence names."""
+
+
+def measurements(c: Check) -> list[dict[str, Any]]:
+    rows = []
+    for k, (name, unit) in enumerate(UNITS.items()):
+        there = np.isfinite(c.relative[:, k])
+        residual = c.relative[there, k]
+        if not there.any() or np.ptp(c.log.recording.relative[0, there, k]) == 0:
+            continue
+        named = {pair: offset for pair, offset, _ in _named(c, k, float(c.world.sensors.relative_std[k]))}
+        less = np.concatenate([value - named.get(pair, 0.0) for pair, value, *_ in by_pair(c, k)])
+        std, median = robust_std(less), float(np.median(residual))
+        row: dict[str, Any] = {"measurement": name, "unit": unit, "number": len(residual), "median": median}
+        row |= {"robust_std": std, "stated_std": float(c.world.sensors.relative_std[k])}
+        row["expected_std"] = float(np.sqrt(np.mean(c.expected[there, k] ** 2)))
+        rows.append(row | _scatter(c, k, row["stated_std"]))
+    return rows
+
+
+def _scatter(c: Check, k: int, stated: float) -> dict[str, float]:
+    """Standard deviation of measurements about the running median of their pair, and the share beyond 5 of them: errors
+    of the filters last longer than that window."""
+    near = (value - pd.Series(value).rolling(WINDOW, 1, center=True).median() for _, value, *_ in by_pair(c, k))
+    off = np.concatenate([*near])
+    noise = robust_std(off)
+    least = max(noise, 0.2 * stated, float(np.nanmedian(c.expected[:, k])) / 2)
+    return {"noise": noise, "beyond_5_std": float(np.mean(np.abs(off) > OUTLYING * least))}
+
+
+def of_ranges(c: Check) -> list[str]:
+    """What all ranges share that positions contradict."""
+    (scale, unsure), (late, error) = c.ranges
+    return [
+        f"ranges are too {'long' if scale > 0 else 'short'} by {100 * abs(scale):.2f} +- {100 * unsure:.2f} %: "
+        f"scale=range:{1 / (1 + scale):.5g} mends it."
+    ] * bool(scale) + [
+        f"ranges are {abs(late):.3f} +- {error:.3f} s {'late' if late > 0 else 'early'} beside fixes and odometry: "
+        "stamp them when they are measured."
+    ] * bool(late)
+
+
+def of_measurements(c: Check) -> list[str]:
+    """Residuals of relative measurements that no stated noise explains: scale, outliers, offsets of pairs."""
+    sentences, links = [], c.world.links
+    for row in c.measurements:
+        name, unit, median, std, should = (
+            row[key] for key in ("measurement", "unit", "median", "robust_std", "expected_std")
+        )
+        if row["number"] < ENOUGH:
+            continue
+        word = "bearing" if name == "azimuth" and c.log.recording.body is not None else name
+        hint = HINTS[name]
+        stated = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
+        position = float(np.sqrt(max(should**2 - row["stated_std"] ** 2, 0.0)))
+        wrong = std > WIDE * should or (name == "azimuth" and std > COARSE > 3 * position)
+        scaled = False
+        if name != "range":
+            wrong |= abs(median) > 3 * should
+            hint = (_other_angle(c) if name == "azimuth" else "") or hint
+        else:
+            measured = c.world.relative[0, :, 0]
+            true = measured - c.relative[:, 0]
+            far = measured + true > 2 * FAR * position
+            ratios = measured[far] / np.maximum(true[far], 1e-3)
+            ratio = float(np.median(ratios)) if len(ratios) >= ENOUGH else 1.0
+            wrong |= (other := not 0.8 <= ratio <= 1.25)
+            if scaled := other and robust_std(ratios) < 0.2 * ratio:
+                power = round(np.log10(ratio))
+                unit_of = 10.0**-power if power and abs(np.log10(ratio) - power) < 0.1 else 1 / ratio
+                unit_text = f"scale=range:{unit_of:.3g} (of mm 0.001, of feet 0.3048); then check again."
+                hint = f"They are {ratio:.3g} times as long: {unit_text}"
+        k = list(UNITS).index(name)
+        outliers, misfits = row["beyond_5_std"], _misfits(c, k)
+        pairs = [
+            row for row in _named(c, k, row["stated_std"]) if not misfits.keys() & {row[0], row[0].replace("and", "to")}
+        ]
+        if outliers > OUTLIERS and not scaled and not misfits:
+            sentences.append(
+                f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
+                "as of reflections. Drop them, or take a method with a gate or a robust loss."
+            )
+        if wrong:
+            sentences.append(f"{word}s miss the positions by {stated}. {hint}")
+        if misfits and (not wrong or hint == HINTS[name]):
+            count = len(np.unique(np.column_stack([links.observer, links.neighbour]), axis=0))
+            ends = set.intersection(*(set(pair.split(" to ")) for pair in misfits))
+            one = "".join(ends) if len(ends) == 1 else ""
+            worst_of = sorted(misfits, key=lambda pair: -misfits[pair][0])[:MANY]
+            sentences.append(
+                f"{word}s of {len(misfits)} of {count} that measure another are off for long, by no offset: "
+                f"{', '.join(pair + misfits[pair][1] for pair in worst_of)}{', ...' * (len(misfits) > MANY)}. "
+                f"{f'All are with {one}: its' * bool(one)}{'A wrong partner,' * (not one)} position or clock, or a "
+                "value that is held."
+            )
+        if pairs and (not wrong or hint == HINTS["range"]):
+            shown = ", ".join(f"{pair} by {offset:+.3g} +- {error:.2g} {unit}" for pair, offset, error in pairs)
+            offsets_text = ",".join(f"{pair.replace(' and ', '-')}:{offset:.3g}" for pair, offset, _ in pairs)
+            sentences.append(
+                f"{word}s of {shown} are off in the median, with {row['stated_std']:.3g} {unit} stated: an "
+                "offset of the sensors, of antennas, or of fixes or heights of one of the two; "
+                + (f"offset={offsets_text} takes it off." if word == "range" else "offset= takes it off.")
+            )
+        noise, least = row["noise"], row["stated_std"]
+        if not wrong and not NARROW * least < noise < WIDE * np.hypot(least, position):
+            size = "less" if noise < least else "more"
+            sentences.append(
+                f"{word}s scatter {size} than stated, by {noise:.2g} {unit} from one to the next, {least:.2g} {unit} "
+                f"stated: std={word}:{noise:.2g}. Were variances given as deviations?"
+            )
+    return sentences
+
+
+def _misfits(c: Check, k: int) -> dict[str, tuple[float, str]]:
+    """Who measures whom -> by what that is off where it is for long, though an offset is taken off; and in words, with
+    whom else it fits."""
+    links, ids, measured, found = c.world.links, c.world.ids, c.world.relative[0, :, 0], dict[str, tuple[float, str]]()
+    there, t = np.isfinite(c.relative[:, k]), c.world.t - c.world.t[0]
+    for one, other in np.unique(np.column_stack([links.observer, links.neighbour])[there], axis=0).tolist():
+        rows = np.flatnonzero(there & (links.observer == one) & (links.neighbour == other))
+        off, expected = c.relative[rows, k], c.expected[rows, k]
+        less = off - np.median(off)
+        bad = long_off(np.abs(wrap(less) if k else less) / expected)
+        if len(bad) < ENOUGH:
+            continue
+        size, text = float(np.median(np.abs(off[bad]))), when(t[links.step[rows]], bad)
+        for like, x in zip(ids, np.moveaxis(c.x[links.step[rows]], 1, 0), strict=True):
+            gap = np.linalg.norm(x - c.x[links.step[rows], one], axis=1) - measured[rows]
+            if k == 0 and like != ids[other] and np.median(np.abs(gap)) < WIDE * np.median(expected) < 0.2 * size:
+                text += f", as if to {like}"
+        found[f"{ids[one]} to {ids[other]}"] = size, f" by {size:.3g} {list(UNITS.values())[k]}{text}"
+    return found
+
+
+def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
+    """Pairs whose measurements of one kind are off by more than chance and a quarter of their noise, with their offsets
+    and standard errors, largest first."""
+    offset_and_error = [(pair, *offset_and_error) for pair, offset_and_error in offsets(c, k, stated).items()]
+    return sorted(
+        (row for row in offset_and_error if abs(row[1]) > max(SURELY * row[2], 0.25 * stated)),
+        key=lambda row: -abs(row[1]),
+    )
+
+
+def _other_angle(c: Check) -> str:
+    """What azimuths look like that miss the positions by the course of their observers."""
+    links = c.world.links
+    moves = c.world.velocity[0, links.step, links.observer, :2] @ [1, 1j]
+    there = np.isfinite(c.relative[:, 1]) & (np.abs(moves) > MOVING)
+    residual, course, measured = c.relative[there, 1], np.angle(moves[there]), c.world.relative[0, there, 1]
+    off = float(np.angle(np.exp(1j * residual).sum()))
+    off += float(np.median(wrap(residual - off)))
+    for like, turn in (
+        ("bearings: name them bearing", course),
+        ("azimuths: name them azimuth", -course),
+        ("bearings clockwise from the heading: change their sign", 2 * (course - measured)),
+        (f"angles from an axis that is turned by {-off:.3g} rad: add {-off:.3g}", -off),
+    ):
+        if len(course) >= ENOUGH and 3 * np.median(np.abs(wrap(residual + turn))) < np.median(np.abs(residual)):
+            return f"They look like {like}."
+    return ""
+
+
+def long_off(errors: Floats) -> Ints:
+    """Indices at which most of WINDOW normalised errors (M,) are too large."""
+    return np.flatnonzero(pd.Series(errors).rolling(WINDOW, 1, center=True).median() > OUTLYING)
+
+
+def when(t: Floats, bad: Ints) -> str:
+    """The part of a drive with samples at t (M,) s that holds those which are bad, if it is one, in words."""
+    if len(bad) < WINDOW or len(bad) < SOLID * (bad[-1] - bad[0]) or len(bad) > SOLID * len(t):
+        return ""
+    return f" from {t[bad[0]]:.3g} to {t[bad[-1]]:.3g} s"
