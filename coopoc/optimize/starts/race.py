@@ -44,10 +44,10 @@ def race(
 
     All starts are tried, and those whose costs are near the least go on (ROUNDS), unless one leads by steps of which
     none was refused and whose promises came true by half and more, to a cost which the assumed noise explains, and to
-    an end that is `unwound` or to which another led as smoothly. Where the noise does not explain the end and the steps
-    to it had trouble, the late starts are tried, one after the other, unless a second start led there. Where the steps
-    went straight the noise is taken as stated too small, which a note of the Solution leaves open. What ranges alone
-    place is mirrored at last.
+    an end that is `unwound` or to which another led as smoothly. Where the noise does not explain the end, by a cost
+    far above or below its mean, and the steps to it had trouble, the late starts are tried, one after the other, unless
+    a second start led there. Where the steps went straight the noise is taken as stated too small, which a note of the
+    Solution leaves open. What ranges alone place is mirrored at last.
 
     Args:
         problem: at any start.
@@ -57,7 +57,8 @@ def race(
     """
     system, tried, taken, calm = sparse(problem), {}, 0, list[float]()
     mean, variance = expected(problem, system.size)
-    limit, straight, arrived = mean + EXCESS * np.sqrt(variance), set[str](), True
+    usual = EXCESS * np.sqrt(variance)
+    limit, straight, arrived = mean + usual, set[str](), True
     minima = list[float]()
 
     def descend(x: Floats) -> Floats:
@@ -65,6 +66,9 @@ def race(
         end = arrive(system, x, MORE, TOLERANCE)
         taken, arrived = taken + end.iterations, end.converged
         return end.x
+
+    def explained(x: Floats) -> bool:  # noise that is stated too large explains every minimum, and so none
+        return arrived and bool(abs(system.cost(x) - mean) <= usual)
 
     def ended(name: str, x: Floats) -> tuple[Problem, Search]:
         x, moves, rivals, doubtful = across(problem, x, descend, system.cost)
@@ -93,7 +97,7 @@ def race(
         y, steps = late.pop(grown)(problem)
         y, taken = descend(y), taken + steps
         tried[grown] = system.cost(y), y
-        if tried[grown][0] <= limit:
+        if explained(y):
             return ended(grown, y)
     for name in rough:
         end = arrive(system, tried[name][1], STEPS, TOLERANCE)
@@ -113,14 +117,10 @@ def race(
             minima = [cost for name, (cost, _) in tried.items() if ends[name].converged]
             least = min(reached.values())
     name, x = next((name, x) for name, (cost, x) in tried.items() if cost <= (1.0 + SAME) * least)
-    if (
-        name not in straight
-        and system.cost(x) > limit
-        and sum(c <= (1.0 + SAME) * least for c in reached.values()) == 1
-    ):
+    if name not in straight and not explained(x) and sum(c <= (1.0 + SAME) * least for c in reached.values()) == 1:
         x = descend(x)
         for other, made in late.items():
-            if arrived and system.cost(x) <= limit:
+            if explained(x):
                 break
             y, steps = made(problem.replace_unchecked(x0=frozen(x)))
             taken += steps
