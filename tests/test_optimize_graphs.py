@@ -204,7 +204,7 @@ def test_a_drive_of_thousands_of_poses_needs_few_factorisations() -> None:
     assert end.iterations <= 3 * theirs.iterations()
 
 
-@pytest.mark.parametrize(("seed", "stated"), [(208, 1), (209, 1), (208, 100), (213, 100)])
+@pytest.mark.parametrize(("seed", "stated"), [(208, 1), (209, 1), (208, 100)])
 def test_a_start_that_grows_undoes_drift_that_ranges_alone_correct(seed: int, stated: int) -> None:
     """One robot, ranges to landmarks and odometry that ends far off: to the minimum that the truth leads to, also where
     noise that is stated too large explains every minimum."""
