@@ -178,8 +178,8 @@ def _of_rows(c: Check) -> list[str]:
             + f" (first: {first})" * bool(first)
             + f". {hint}".rstrip(" ")
         )
-    clockwise = [CLOCKWISE.format(", ".join(names)) for names in [summary.assumed.get(CLOCKWISE)] if names]
-    return [*sentences, *clockwise, *filter(None, [summary.unread])]
+    mirrored = summary.assumed.get(CLOCKWISE, ())
+    return [*sentences, *filter(None, [CLOCKWISE.format(", ".join(mirrored)) * bool(mirrored), summary.unread])]
 
 
 def _of_errors(c: Check) -> list[str]:
@@ -300,7 +300,7 @@ def _of_fixes(c: Check) -> list[str]:
         if abs(lag := lag_of_fixes(c, column) if wrong else 0.0) >= FAST:
             way = "behind" if lag > 0 else "ahead of"
             sentences.append(
-                f"{name}: its fixes are {abs(lag):.1f} s {way} the {'odometry' if truth is None else 'truth'}, which "
+                f"{name}: its fixes are {abs(lag):.0f} s {way} the {'odometry' if truth is None else 'truth'}, which "
                 "they else follow: clocks differ, as by leap seconds, or files of two drives."
             )
             continue

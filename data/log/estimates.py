@@ -34,8 +34,8 @@ OUTLYING, BLOCKS = 5.0, 10
 """Medians of the residuals beyond which one is left out; parts of a drive that show how sure an estimate is."""
 FAST = 2.0
 """s, from which a lag is looked for, not estimated."""
-LONGEST = 60.0
-"""s, of lags that are looked for."""
+LONGEST, LAG = 60.0, 0.1
+"""s, of lags that are looked for, and from one to the next."""
 VARIED, NUDGE = 0.15, 0.01
 """Standard deviation over mean of a speed below which an arm ahead and a late clock look alike; m and s by which fixes
 are moved to see what a filter makes of an arm."""
@@ -270,21 +270,25 @@ def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
 
 def lag_of_fixes(c: Check, column: int) -> float:
     """s, by which fixes are late beside the odometry, or a truth, if a lag alone explains how they move, else 0."""
-    rec, truth = c.world, c.log.truth
-    velocity = (rec.velocity[0] if truth is None else truth.velocity)[:, column, :2] @ [1, 1j]
-    path = np.cumsum(np.nan_to_num(velocity) * rec.dt) + 0.0 * velocity
-    fixes, most, misses = rec.gnss[0, :, column, :2] @ [1, 1j], int(LONGEST / rec.dt), dict[int, float]()
+    rec, truth, misses = c.world, c.log.truth, dict[int, float]()
+    velocity = rec.velocity[0, :, column, :2] @ [1, 1j]
+    path = np.cumsum(np.nan_to_num(velocity) * rec.dt) + 0.0 * velocity  # unknown where it is absent
+    path = path if truth is None else truth.position[:, column, :2] @ [1, 1j]
+    fixes, most, every = rec.gnss[0, :, column, :2] @ [1, 1j], int(LONGEST / rec.dt), max(round(LAG / rec.dt), 1)
     at = np.flatnonzero(np.isfinite(fixes))
-    for steps in range(-most, most + 1):
+    for steps in range(-(most // every) * every, most + 1, every):
         then = at[(at >= steps) & (at < len(path) + steps)]
-        off = pd.Series(fixes[then] - path[then - steps]).dropna()
+        off = fixes[then] - path[then - steps]
+        off = off[np.isfinite(off)]
         if len(off) > len(at) / 2:
-            apart = off - off.groupby(np.arange(len(off)) // ENOUGH).transform("mean")
-            misses[steps] = float(np.median(np.abs(apart)))
+            part = np.arange(len(off)) // ENOUGH
+            mean = (np.bincount(part, off.real) + 1j * np.bincount(part, off.imag)) / np.bincount(part)
+            misses[steps] = float(np.median(np.abs(off - mean[part])))
     least = min(misses.values(), default=np.inf)
     if least > min(OUTLYING * float(np.hypot(*rec.sensors.fix_std[:2])), misses.get(0, 0.0) / 2):
         return 0.0
-    return min((steps for steps, miss in misses.items() if miss < 1.05 * least), key=abs) * rec.dt
+    first = min((steps for steps, miss in misses.items() if miss < 1.05 * least), key=abs)  # of a way that repeats
+    return min((steps for steps in misses if abs(steps - first) * rec.dt < FAST), key=misses.__getitem__) * rec.dt
 
 
 def _beside(off: AnyArray, velocity: AnyArray) -> float:

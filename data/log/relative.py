@@ -36,6 +36,7 @@ sentence names."""
 
 
 def measurements(c: Check) -> list[dict[str, Any]]:
+    """Rows of a table: each kind of relative measurement, and how it scatters about the positions."""
     rows = []
     for k, (name, unit) in enumerate(UNITS.items()):
         there = np.isfinite(c.relative[:, k])
@@ -106,9 +107,8 @@ def of_measurements(c: Check) -> list[str]:
                 hint = f"They are {ratio:.3g} times as long: {unit_text}"
         k = list(UNITS).index(name)
         outliers, misfits = row["beyond_5_std"], _misfits(c, k)
-        pairs = [
-            row for row in _named(c, k, row["stated_std"]) if not misfits.keys() & {row[0], row[0].replace("and", "to")}
-        ]
+        apart = {f"{a} to {b}" if k else f"{a} and {b}" for pair in misfits for a, b in (pair, pair[:: 1 if k else -1])}
+        pairs = [one for one in _named(c, k, row["stated_std"]) if one[0] not in apart]
         if outliers > OUTLIERS and not scaled and not misfits:
             sentences.append(
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
@@ -118,14 +118,14 @@ def of_measurements(c: Check) -> list[str]:
             sentences.append(f"{word}s miss the positions by {stated}. {hint}")
         if misfits and (not wrong or hint == HINTS[name]):
             count = len(np.unique(np.column_stack([links.observer, links.neighbour]), axis=0))
-            ends = set.intersection(*(set(pair.split(" to ")) for pair in misfits))
+            ends = set.intersection(*map(set, misfits))
             one = "".join(ends) if len(ends) == 1 else ""
             worst_of = sorted(misfits, key=lambda pair: -misfits[pair][0])[:MANY]
             sentences.append(
                 f"{word}s of {len(misfits)} of {count} that measure another are off for long, by no offset: "
-                f"{', '.join(pair + misfits[pair][1] for pair in worst_of)}{', ...' * (len(misfits) > MANY)}. "
-                f"{f'All are with {one}: its' * bool(one)}{'A wrong partner,' * (not one)} position or clock, or a "
-                "value that is held."
+                f"{', '.join(' to '.join(pair) + misfits[pair][1] for pair in worst_of)}"
+                f"{', ...' * (len(misfits) > MANY)}. {f'All are with {one}: a' if one else 'A'} wrong partner, "
+                "position or clock, or a value that is held."
             )
         if pairs and (not wrong or hint == HINTS["range"]):
             shown = ", ".join(f"{pair} by {offset:+.3g} +- {error:.2g} {unit}" for pair, offset, error in pairs)
@@ -145,10 +145,15 @@ def of_measurements(c: Check) -> list[str]:
     return sentences
 
 
-def _misfits(c: Check, k: int) -> dict[str, tuple[float, str]]:
+def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
     """Who measures whom -> by what that is off where it is for long, though an offset is taken off; and in words, with
     whom else it fits."""
-    links, ids, measured, found = c.world.links, c.world.ids, c.world.relative[0, :, 0], dict[str, tuple[float, str]]()
+    links, ids, measured, found = (
+        c.world.links,
+        c.world.ids,
+        c.world.relative[0, :, 0],
+        dict[tuple[str, str], tuple[float, str]](),
+    )
     there, t = np.isfinite(c.relative[:, k]), c.world.t - c.world.t[0]
     for one, other in np.unique(np.column_stack([links.observer, links.neighbour])[there], axis=0).tolist():
         rows = np.flatnonzero(there & (links.observer == one) & (links.neighbour == other))
@@ -162,7 +167,7 @@ def _misfits(c: Check, k: int) -> dict[str, tuple[float, str]]:
             gap = np.linalg.norm(x - c.x[links.step[rows], one], axis=1) - measured[rows]
             if k == 0 and like != ids[other] and np.median(np.abs(gap)) < WIDE * np.median(expected) < 0.2 * size:
                 text += f", as if to {like}"
-        found[f"{ids[one]} to {ids[other]}"] = size, f" by {size:.3g} {list(UNITS.values())[k]}{text}"
+        found[ids[one], ids[other]] = size, f" by {size:.3g} {list(UNITS.values())[k]}{text}"
     return found
 
 
