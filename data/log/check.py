@@ -12,6 +12,7 @@ import scipy  # its statistics take half a second, and are imported where they a
 
 from coopoc.arrays import Floats
 from coopoc.evaluate.metrics import dimensions
+from coopoc.workers import progress_bar
 
 from .estimates import (
     ALIKE,
@@ -79,9 +80,12 @@ def check(log: Log) -> Check:
     Raises:
         InputError: in body frames, vehicles that share no two steps, or first poses that are not known.
     """
+    bar = progress_bar(desc=f"check of {log.summary.name}", total=len(CHECKS) + 2, delay=2.0)
     first = filtered(log)
+    bar.update()
     errs = [first.world.ids.index(row["vehicle"]) for row in _vehicles(first) if _off(row)]
     result = on_time(first, alike=not errs)
+    bar.update()
     result = replace(result, vehicles=_vehicles(result))
     late = any(_beyond(row, "late_s", max(LATE, 0.5 * first.world.dt)) for row in result.vehicles)
     if log.truth is not None and not late and not result.slack.any():
@@ -91,7 +95,11 @@ def check(log: Log) -> Check:
         ends = np.isin(links.observer, errs) | np.isin(links.neighbour, errs)
         result = replace(result, relative=np.where(ends[:, None], np.nan, result.relative))
     result = replace(result, measurements=measurements(result))
-    sentences = [sentence for rule in CHECKS for sentence in rule(result)]
+    sentences = list[str]()
+    for rule in CHECKS:
+        sentences += rule(result)
+        bar.update()
+    bar.close()
     return replace(result, warnings=tuple(sentences), unseen=tuple(unseen(result)))
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -48,10 +48,12 @@ class Estimate(NamedTuple):
     error: Floats
 
 
-def factors(y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, less: Floats | None = None) -> Estimate:
+def factors(
+    y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, less: Callable[[Floats], Floats] | None = None
+) -> Estimate:
     """Factors of causes x (M, k) that explain y (M,) best, outliers aside, with standard errors by parts that are left
-    out; less the means of groups (M,); times a matrix (k, k), if any. None is known where half of y stays, and that is
-    OUTLYING times its noise: something else is wrong.
+    out; less the means of groups (M,); times a matrix (k, k) that `less` makes of them, if any. None is known where
+    half of y stays, and that is OUTLYING times its noise: something else is wrong.
 
     >>> time = np.arange(40.0)
     >>> factors(3 * time + 7, time[:, None], 0.1, np.zeros(40, int)).value.round(6).tolist()
@@ -78,7 +80,8 @@ def factors(y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, 
     before, left = (float(np.median(np.abs(gap))) for gap in (y, y - x @ value))
     if left > max(OUTLYING * noise, 0.5 * before):
         return none
-    value, *without = (each if less is None else less @ each for each in (value, *without))
+    turn = np.eye(len(value)) if less is None else less(value)
+    value, *without = (turn @ each for each in (value, *without))
     error = np.sqrt(BLOCKS - 1.0) * np.std(without, axis=0)
     return Estimate(value, np.where(np.any(x, axis=0), error, np.inf))
 
@@ -196,14 +199,15 @@ def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
     pairs = np.sort([links.observer, links.neighbour], axis=0)
     noise = float(np.median(c.expected[there, 0])) if there.any() else 0.0
     x, groups, less = made[there, 0], (pairs[0] * size + pairs[1])[there], np.eye(size + 2)
-    estimate = factors(c.relative[there, 0], x, noise, groups)
-    sure = np.flatnonzero(np.isfinite(estimate.error[:size]))
-    if reference is None and len(sure):
-        apart = np.abs(np.subtract.outer(estimate.value[sure], estimate.value[sure]))
-        reference = int(sure[np.argmin((np.minimum(apart, LATE) + 1e-3 * apart).sum(axis=1))])
-    if reference is not None:
-        less[:size, reference] -= 1.0
-    estimate = factors(c.relative[there, 0], x, noise, groups, less)
+
+    def against(value: Floats) -> Floats:
+        seen = np.flatnonzero(x[:, :size].any(axis=0))
+        apart = np.abs(np.subtract.outer(value[seen], value[seen]))
+        most = seen[np.argmin((np.minimum(apart, LATE) + 1e-3 * apart).sum(axis=1))] if len(seen) else 0
+        less[:size, most if reference is None else reference] -= 1.0
+        return less
+
+    estimate = factors(c.relative[there, 0], x, noise, groups, against)
     return estimate._replace(error=np.hypot(estimate.error, _of_filters(c, there, x, groups, less))), made
 
 
