@@ -26,8 +26,9 @@ def rms(recording: Recording, fleet: Fleet, **priors: float) -> tuple[float, co.
     return float(np.sqrt(np.square(track.x - fleet.position[:, [3, 8]]).sum(axis=-1).mean())), track
 
 
+@pytest.mark.parametrize("priors", [ONLY_SCALE, ONLY_SCALE._replace(absent=-np.inf, exact=8.0)], ids=["each", "all"])
 @pytest.mark.parametrize("scale", [0.0, 0.02, 0.05])
-def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale: float) -> None:
+def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale: float, priors: Priors) -> None:
     """filterpy: of the positions along a straight road one filter knows no scale error, one has it as a state; their
     estimates by Bayes' rule."""
     t = 0.5 * np.arange(120)
@@ -35,7 +36,7 @@ def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale: float) -
     fleet = Fleet(("a",), t, position, np.broadcast_to([8.0, 0, 0], position.shape))
     seen = observe(fleet, replace(S2, gnss_std=(1.0,) * 3), V2X(0), observers=[0], assumed=S2)
     seen = replace(seen, velocity=seen.velocity * (1 + scale))
-    track = CooperativeFilter(priors=ONLY_SCALE)(seen, [0])
+    track = CooperativeFilter(priors=priors)(seen, [0])
     process = co.NoiseModel.nominal(S2).process_variance(seen)[0, :, 0, 0]
     filters, likely = [], np.array([ONLY_SCALE.absent, 0.0])
     for n in (1, 2):

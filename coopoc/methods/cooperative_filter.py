@@ -50,6 +50,7 @@ class Priors(NamedTuple):
         compass: rad, and
         offset: m, of such errors of the ego's compass and ranges, where none is stated.
         absent: log odds that each of these is not there, before anything was measured.
+        exact: where absent is -inf, log odds that the odometry of no vehicle errs.
         slip: an ego that slips errs by that share of its late speed.
         fix: factor of the assumed standard deviation of fixes, which err together for a while.
         fix_gate: squared Mahalanobis distance from which the fixes of a step weigh less; 0 if no number is doubted.
@@ -62,6 +63,7 @@ class Priors(NamedTuple):
     compass: float = 0.05
     offset: float = 0.5
     absent: float = 8.0
+    exact: float = -np.inf
     slip: float = 0.7
     fix: float = 1.0
     fix_gate: float = 16.0
@@ -70,8 +72,8 @@ class Priors(NamedTuple):
 
 AS_STATED = Priors(heading=0.0, scale=0.0, compass=0.0, offset=0.0, slip=0.0, fix_gate=0.0, forget=0.0)
 """Nothing is otherwise: the textbook's filter."""
-ON_ROADS = Priors(heading=0.03, scale=0.03, lasts=1e4, compass=0.0, offset=0.0, absent=-np.inf, fix=2.0, fix_gate=3.5)
-"""Of measurements that are not simulated: no odometry is without such errors."""
+ON_ROADS = Priors(0.03, 0.03, compass=0.0, offset=0.0, absent=-np.inf, exact=-11.0, fix=2.0, fix_gate=3.5)
+"""Of measurements that are not simulated: hardly any odometry is without such errors."""
 NO_ODOMETRY = Priors(heading=0.0, scale=0.0, compass=0.0, offset=0.0, slip=0.0)
 """Of velocities that fixes have shown."""
 
@@ -130,8 +132,8 @@ class CooperativeFilter(Checked):
     Args:
         noise_model: "identity", "nominal" or a NoiseModel, whose errors that last (fixes, compass, ranges) are states.
         priors: of errors; the default was chosen on development worlds and validation tasks of CL-Bench, and is
-            ON_ROADS where measurements are not simulated: there errors of odometry are always assumed, and fixes to
-            err twice as far as is stated, together for a while.
+            ON_ROADS where measurements are not simulated: there errors of odometry are assumed until the whole fleet
+            speaks for none, and fixes to err twice as far as is stated, together for a while.
         calibration: what `fitted` has found, a note of its Tracks.
 
     References:
@@ -157,7 +159,7 @@ class CooperativeFilter(Checked):
     def __post_init__(self) -> None:
         check_options(self, priors=Priors)
         for name, value in self.priors._asdict().items():
-            least = -np.inf if name == "absent" else 0.0
+            least = -np.inf if name in ("absent", "exact") else 0.0
             number(
                 f"priors.{name}", value, least, allowed="a number, not negative", hint="Give Priors()._replace(...)."
             )
@@ -315,5 +317,5 @@ def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
         absent[2:][np.array([bias, offset]) > 0.0] = -np.inf
         bias, offset = bias or priors.compass**2, offset or priors.offset**2
     judged = GATE if priors.fix_gate else 0.0, priors.fix_gate, priors.forget
-    lasting = own, common, time, white, bias, heading, offset, np.square(turn), lasts, absent
+    lasting = own, common, time, white, bias, heading, offset, np.square(turn), lasts, absent, priors.exact
     return Model(std, float(least), FORGOTTEN, *lasting, priors.slip, *judged)

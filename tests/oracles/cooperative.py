@@ -117,15 +117,16 @@ class Belief:
         self.x, self.p = self.x + gain @ gap, self.p - gain @ s @ gain.T
         return q
 
-    def average(self, i: int, prior: float, odds: float) -> None:
-        """Number i is 0 or N(0, prior)."""
-        p, m = self.p[i, i], self.x[i]
-        if p <= 0 or odds == -math.inf:
+    def average(self, which: list[int], prior: Any, odds: float) -> None:
+        """All of these numbers are 0, or N(0, prior)."""
+        some = [i for i in which if self.p[i, i] > 0]
+        if not some or odds == -math.inf:
             return
-        there = 1 / (1 + math.exp(min(odds + 0.5 * math.log(prior / p) - 0.5 * m * m / p, 700)))
-        k = self.p[:, i] / p
-        self.x = self.x + k * (there * m - m)
-        self.p = self.p + np.outer(k, k) * (there * p + there * (1 - there) * m * m - p)
+        p, m = self.p[np.ix_(some, some)], self.x[some]
+        prior = np.broadcast_to(prior, len(which))[[i in some for i in which]]
+        odds += 0.5 * (np.log(prior).sum() - np.linalg.slogdet(p)[1] - m @ np.linalg.solve(p, m))
+        none, k = 1 / (1 + math.exp(min(-odds, 700))), np.linalg.solve(p, self.p[some]).T
+        self.x, self.p = self.x - none * k @ m, self.p - none * k @ (p - (1 - none) * np.outer(m, m)) @ k.T
 
 
 class Sent(NamedTuple):
@@ -240,12 +241,15 @@ class Oracle:
 
     def average(self, b: Belief) -> None:
         life, slot = self.life, self.state["slot"]
-        for j in sorted((self.ego, *self.state["members"]), key=lambda j: -slot[j]):
-            for i in range(2 * (("o", j) in b.names)):
-                b.average(b.at(("o", j)).start + i, life.turn[i], life.absent[i])
+        members = sorted((self.ego, *self.state["members"]), key=lambda j: -slot[j])
+        turns = [b.at(("o", j)).start + i for j in members if ("o", j) in b.names for i in range(2)]
+        for k, i in enumerate(turns):
+            b.average([i], life.turn[k % 2], life.absent[k % 2])
+        if life.absent[0] == -math.inf:
+            b.average(turns, np.tile(life.turn, len(turns) // 2), self.priors.exact)
         if ("compass",) in b.names:
-            b.average(b.at(("compass",)).start, life.bias, life.absent[2])
-            b.average(b.at(("compass",)).start + 2, life.offset, life.absent[3])
+            b.average([b.at(("compass",)).start], life.bias, life.absent[2])
+            b.average([b.at(("compass",)).start + 2], life.offset, life.absent[3])
 
     def tries(self, t: int) -> None:
         """A step, and perhaps one that slips."""

@@ -1,9 +1,10 @@
 """What is otherwise than assumed: errors that last and may not be there, an ego that slips, and levels of noise.
 
 *Errors* of heading and scale of an odometry, of a compass, of ranges are states with a wide prior N(0, W), and the
-estimate is the average over whether each is there. Of a scalar error b with the posterior N(m, p) the odds of b = 0
-are, by Bayes' rule, those of the prior times sqrt(W / p) exp(-m^2 / 2 p), and what is conditional on b = 0 is the
-filter without that state. So one filter stands for all hypotheses, as long as an error stays what it is.
+estimate is the average over whether each is there, or, of odometries of real vehicles, whether all are or none. Of a
+scalar error b with the posterior N(m, p) the odds of b = 0 are, by Bayes' rule, those of the prior times
+sqrt(W / p) exp(-m^2 / 2 p), and what is conditional on b = 0 is the filter without that state. So one filter stands for
+all hypotheses, as long as an error stays what it is.
 
 *Slips*: a step is tried once more, with a motion that is not known, and the likelier of both is kept. Numbers beyond
 their gate count with no more than it, a fix as one: a range that is too long, or a receiver that jumps, is no slip.
@@ -152,8 +153,11 @@ def average(f: Filter, model: Model) -> None:
             few[i, j - 3] = g.p[at, int(few[j, where])]
     for i in range(3, n):
         kind = (2 + i - own) if i >= own else (i - 3) % 2
-        prior = model.turn[kind] if kind < 2 else model.bias if kind == 2 else model.offset
-        collapse(f, i, n, prior, model.absent[kind])
+        if model.absent[kind] > -math.inf:
+            prior = model.turn[kind] if kind < 2 else model.bias if kind == 2 else model.offset
+            collapse(f, i, n, chance_of(-model.absent[kind] - evidence(f, i, prior)))
+    if own > 3 and model.absent[0] == -math.inf and model.exact > -math.inf:
+        average_over_all(f, model, own)
     for kind in range(4):
         i = own + kind - 2
         there = n > own if kind >= 2 else own > 3
@@ -165,13 +169,25 @@ def average(f: Filter, model: Model) -> None:
 
 
 @part
-def collapse(f: Filter, i: int, n: int, prior: float, odds: float) -> None:
-    """Average over whether the error of row i is there: moments are matched."""
+def chance_of(odds: float) -> float:
+    """Probability by its log odds."""
+    return 1.0 / (1.0 + math.exp(min(-odds, 700.0)))
+
+
+@part
+def evidence(f: Filter, i: int, prior: float) -> float:
+    """Log odds that the error of row i is 0, by its posterior."""
+    p, m = f.few[i, i - 3], f.few[i, len(f.few[0]) - 2]
+    return 0.5 * math.log(prior / p) - 0.5 * m * m / p if p > 0.0 else 0.0
+
+
+@part
+def collapse(f: Filter, i: int, n: int, there: float) -> None:
+    """Average over whether the error of row i is there, by that probability: moments are matched."""
     few, ego, width = f.few, f.ego, len(f.few[0]) - 2
     p, m = few[i, i - 3], few[i, width]
-    if odds == -math.inf or not p > 0.0:
+    if not p > 0.0:
         return
-    there = 1.0 / (1.0 + math.exp(min(odds + 0.5 * math.log(prior / p) - 0.5 * m * m / p, 700.0)))
     mean, change = (there - 1.0) * m / p, (there * p + there * (1.0 - there) * m * m - p) / (p * p)
     for c in range(3):
         ego[ANSWER + c] += mean * few[c, i - 3]
@@ -185,6 +201,26 @@ def collapse(f: Filter, i: int, n: int, prior: float, odds: float) -> None:
     few[i, width] = there * m
     for k in range(i + 1, n):
         few[i, k - 3] *= 1.0 + change * p
+
+
+@part
+def average_over_all(f: Filter, model: Model, own: int) -> None:
+    """Average over whether the errors of all odometries are there, or none: evidence that none errs adds up."""
+    ego, width, kept, odds = f.ego, len(f.few[0]) - 2, f.h.matrix, model.exact
+    for c in range(12):
+        kept[c] = ego[ANSWER + c]
+    heading, scale = f.few[own - 2, width], f.few[own - 1, width]
+    for i in range(3, own):
+        odds += evidence(f, i, model.turn[(i - 3) % 2])
+        collapse(f, i, own, 0.0)
+    none = chance_of(odds)
+    for c in range(12):
+        gap = ego[ANSWER + c] - kept[c]
+        ego[ANSWER + c], kept[c] = kept[c] + none * gap, gap
+    for c in range(3):
+        for d in range(3):
+            ego[COVARIANCE + 3 * c + d] += none * (1.0 - none) * kept[c] * kept[d]
+    f.few[own - 2, width], f.few[own - 1, width] = (1.0 - none) * heading, (1.0 - none) * scale
 
 
 SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, JUMPED, BLIND, COURSE, _, _, BEFORE = range(
@@ -292,7 +328,7 @@ def chance(f: Filter, first: Filter, dt: float) -> float:
     stays, begins = math.exp(-dt / LASTS), min(dt / RARE, 0.5)
     before = first.ego[SLIPPED] * stays + (1.0 - first.ego[SLIPPED]) * begins
     odds = f.ego[LIKELY] - first.ego[LIKELY] + math.log(before / (1.0 - before))
-    return 1.0 / (1.0 + math.exp(min(-odds, 700.0)))
+    return chance_of(odds)
 
 
 SUDDEN, USUAL = 5.0, 0.95
