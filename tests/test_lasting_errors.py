@@ -9,8 +9,9 @@ from numpy.testing import assert_allclose
 
 import coopoc as co
 from coopoc import V2X, CooperativeFilter, Fleet, Recording, observe
-from coopoc.methods.cooperative_filter import Priors
+from coopoc.methods.cooperative_filter import ON_ROADS, Priors
 from coopoc.world.body_frames import turned
+from coopoc.world.recording import MEASURED
 
 S2 = co.Sensors.paper_scenario2()
 ONLY_SCALE = Priors(forget=0.0, heading=0.0, slip=0.0, lasts=1e12)
@@ -86,3 +87,28 @@ def test_a_slip_is_found_and_ends(town: Fleet) -> None:
     assert any(note.startswith("slips, ") for note in track.notes)
     _, clean = rms(seen, town)
     assert clean.extras["slips"].mean() < 0.01
+
+
+@pytest.mark.parametrize(("factor", "said"), [(1.0, False), (3.0, True)])
+def test_notes_name_what_is_otherwise_than_stated_and_nothing_else(town: Fleet, factor: float, said: bool) -> None:
+    """Real fixes are assumed to err more than is stated; a note says by how much they do."""
+    sensors = replace(S2, range_offset_std=0.3)
+    acts = replace(sensors, gnss_std=tuple(factor * np.array(S2.gnss_std)))
+    seen = observe(town, acts, V2X(4), runs=2, observers=[3], assumed=sensors)
+    notes = CooperativeFilter()(replace(seen, notes=(MEASURED,)), [3]).notes
+    levels = [float(note.split()[-5]) for note in notes if note.startswith(f"fix level, {town.ids[3]}: ")]
+    assert levels == (pytest.approx([factor], rel=0.15) if said else [])
+    assert not any(note.startswith("range offset, ") for note in notes)
+
+
+def test_a_fleet_speaks_for_odometries_that_do_not_err() -> None:
+    """Five precise odometries, fixes of 1 Hz, 90 s: what is known of all counts, and where all err, nothing is lost."""
+    town, sensors = co.load_fleet("town10").between(0, 900), replace(S2, velocity_std_ratio=0.01, range_std=0.25)
+    seen = replace(observe(town, sensors, V2X(4), runs=3, observers=[3, 8]), notes=(MEASURED,))
+    seen = replace(seen, gnss=np.where(np.arange(900)[:, None, None] % 10, np.nan, seen.gnss))
+    wrong = replace(seen, velocity=turned(1.03 * seen.velocity, np.full(seen.velocity.shape[:3], 0.07)))
+    each, every, none = ON_ROADS._replace(exact=-np.inf), ON_ROADS, ON_ROADS._replace(heading=0.0, scale=0.0)
+    right, found, without = (rms(seen, town, **priors._asdict())[0] for priors in (none, every, each))
+    assert right < found < without - 0.15 * (without - right)
+    found, without = (rms(wrong, town, **priors._asdict())[0] for priors in (every, each))
+    assert found == pytest.approx(without, rel=0.01)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -183,6 +183,7 @@ class CooperativeFilter(Checked):
         priors = priors_of(self, noise_model, recording.measured)
         model, notes = model_of(noise_model, priors), [*noise_model.notes, *filter(None, [self.calibration])]
         variance, sent = priors.fix**2 * noise_model.fix_variance(recording), broadcasts(recording, noise_model, priors)
+        stated = noise_model.compass[1], noise_model.sensors.range_offset_std if noise_model.sensors else 0.0
 
         def run(ego: int, inbox: Inbox) -> Iterator[Estimate]:
             inputs, assumed = measurements(recording, ego, inbox), assumptions(recording, noise_model, ego, inbox)
@@ -192,7 +193,7 @@ class CooperativeFilter(Checked):
             names = (*(name.replace(" ", "_") for name in FOUND), *(f"{kind}_level" for kind in LEVELS))
             extras |= {name: deviations[..., i, None] for i, name in enumerate(names)}
             own_id = recording.ids[ego]
-            notes.extend(otherwise(own_id, deviations) if priors.fix_gate else ())
+            notes.extend(otherwise(own_id, deviations, priors.fix, stated) if priors.fix_gate else ())
             notes.extend(rejected(f"fixes, {own_id}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
             if model.own + model.common == 0.0 and priors.fix_gate:
                 notes.extend(lasting(own_id, recording.gnss[:, :, ego] - x, recording.dt))
@@ -241,27 +242,31 @@ def broadcasts(recording: Recording, noise_model: NoiseModel, priors: Priors) ->
     return Sent(*fading_memory(recording.gnss, recording.velocity, variance, recording.dt))
 
 
-def otherwise(ego: str, found: Floats) -> list[str]:
-    """Notes of what is otherwise than assumed in the second half of a drive, mean squares over runs and steps.
+def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float] = (0.0, 0.0)) -> list[str]:
+    """Notes of what is otherwise than stated in the second half of a drive, mean squares over runs and steps.
 
     Args:
         ego: its name.
         found: (R, T, 11) errors that last, whether it slips, and levels.
+        fix: factor of the stated deviation of fixes that was assumed.
+        stated: deviations of the errors of the compass, rad, and of ranges, m: no more than these is worth no note.
 
     >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0, 1.0]]]))
-    ['scale error, a: 0.02', 'fix level, a: 3 times the assumed deviation']
+    ['scale error, a: 0.02', 'fix level, a: 3 times the stated deviation']
     """
     late = found[:, found.shape[1] // 2 :]
     usual = np.sqrt(np.nanmean(np.square(late), axis=(0, 1)))
     usual[4] = np.nanmean(found[..., 4])
+    usual[8:10] *= fix
+    least = np.maximum(NOTED, (0.0, 0.0, *stated, 0.0))
     notes = [
         f"{name}, {ego}: {value:.2g} {unit}".rstrip()
-        for (name, unit), value, least in zip(FOUND.items(), usual, NOTED, strict=False)
-        if value > least
+        for (name, unit), value, most in zip(FOUND.items(), usual, least, strict=False)
+        if value > most
     ]
     levels = zip(LEVELS, usual[len(FOUND) :], strict=True)
     return notes + [
-        f"{kind} level, {ego}: {value:.2g} times the assumed deviation"
+        f"{kind} level, {ego}: {value:.2g} times the stated deviation"
         for kind, value in levels
         if not 1 / LOUD < value < LOUD
     ]
