@@ -175,52 +175,6 @@ def landmark_only(steps: int = 12, **noise: Any) -> co.Recording:
     return replace(seen, gnss=gnss, relative=relative)
 
 
-def test_a_solo_filter_moves_and_updates_covariances_as_gtsam() -> None:
-    """GTSAM's InvariantEKFPose2, whose covariance is of a step in the body: turned into the world it is the plain
-    filter's, after a prediction and after an update at the same state."""
-    gtsam = pytest.importorskip("gtsam")
-    seen, start = landmark_only(2), np.array([[0.1, -0.2, 0.0, 0.05], [0, 0, 0, 0]])
-    track = textbook(co.PoseFilter("solo", exact=False, begin=start, spread=(0.3, 0.2, 0.1, 0.1)))(seen)
-    noise = np.square([0.3, 0.03])
-
-    def turned(pose: Any) -> Any:
-        T = np.eye(3)
-        T[:2, :2] = pose.rotation().matrix()
-        return T
-
-    def update(ekf: Any, z: Any) -> Any:
-        pose, T = ekf.state(), turned(ekf.state())
-        own = np.array([pose.x(), pose.y(), 0.0, pose.theta()])
-        h = lambda s: oracle.spherical(s, np.array([3.0, 4.0, 0.0]))[:2]  # noqa: E731
-        H = oracle.jacobian(h, own)[:, [0, 1, 3]] @ T
-        ekf.updateWithVector(h(own), H, z, np.diag(noise), False)
-        return T @ ekf.covariance() @ T.T
-
-    first = gtsam.Pose2(0.1, -0.2, 0.05)
-    spread = np.diag(np.square([0.3, 0.2, 0.1]))
-    ekf = gtsam.InvariantEKFPose2(first, turned(first).T @ spread @ turned(first))
-    wanted = [update(ekf, seen.relative[0, 0, :2])]
-    assert seen.body is not None
-    u, w = seen.velocity[0, 1, 0], seen.body.yaw_rate[0, 1, 0]
-    state = np.array([*track.x[0, 0, 0], track.heading[0, 0, 0]])  # type: ignore[index]
-    after = oracle.motion(state, np.append(u, w), 0.1)
-    before, then = (gtsam.Pose2(s[0], s[1], s[3]) for s in (state, after))
-    cov = turned(before).T @ wanted[0] @ turned(before)
-    ekf = gtsam.InvariantEKFPose2(before, cov)
-    G = oracle.jacobian(lambda v: oracle.motion(state, v, 0.1), np.append(u, w))[[0, 1, 3]]
-    q = np.append(heard(seen, None, co.NoiseModel.nominal(seen.sensors), 0, 0)[1, 0] / 0.1**2, 0.02**2)
-    T = turned(then)
-    ekf.predict(before.between(then), T.T @ G @ np.diag(q) @ G.T @ T)
-    wanted.append(update(ekf, seen.relative[0, 1, :2]))
-    for t in range(2):
-        found = np.zeros((3, 3))
-        found[:2, :2] = track.covariance[0, t, 0, :2, :2]  # type: ignore[index]
-        found[2, :2] = found[:2, 2] = track.heading_covariance[0, t, 0, :2]  # type: ignore[index]
-        found[2, 2] = track.heading_covariance[0, t, 0, 3]  # type: ignore[index]
-        assert np.allclose(found, wanted[t], rtol=1e-6, atol=1e-9)
-    assert track.heading[0, 1, 0] == pytest.approx(ekf.state().theta(), abs=1e-9)  # type: ignore[index]
-
-
 def own_of(recording: co.Recording, run: int, t: int, column: int) -> co.OwnMeasurement:
     """What a vehicle measured of itself at a step."""
     assert recording.body is not None

@@ -66,7 +66,7 @@ ADVICE = {
     "relative measurements of members": PLACED,
     "odometry and headings of vehicles": PLACED,
     "azimuths at times without": "Do they count from the heading? Then name them bearing; else log a heading.",
-    "relative measurements while": "Do their clocks differ? Give clock=, or raise max_gap=.",
+    "relative measurements while": "A vehicle is there from its first fix on. Clocks: clock=; gaps: max_gap=.",
     HOLDS: "A receiver that has lost its satellites may send the last fix on.",
     "fixes beside": "A shorter dt= uses them.",
     "relative measurements beside": "A shorter dt= uses them.",
