@@ -101,7 +101,7 @@ def streams() -> None:
         seen = co.RelativeMeasurement("b", [11.8, 0.1, 1.57], *other.broadcast, age=0.1)
         ego.step([0.9 * k, 0.0, 0.0], [9.0, 0.0, 0.0], dt=0.1, neighbours=[seen])
     robot = co.PoseFilter("solo", assumed=BODY).start(dt=0.1)
-    mast = co.LandmarkMeasurement([20.1, 0.4, 1.4], place=[18.0, 9.0, 3.0])
+    mast = co.LandmarkMeasurement([20.1, 0.4, 1.4], position=[18.0, 9.0, 3.0])
     robot.step(co.OwnMeasurement([9.0, 0.0, 0.0], 0.02, gnss=[0.4, 0.2, 0.0], heading=0.1), [mast])
 
 

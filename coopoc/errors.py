@@ -93,11 +93,11 @@ class MissingLibraryError(ImportError):
     """An optional library or program is not installed: the message carries the line that installs it."""
 
     def __init__(self, library: str, needed_for: str, package: str, how: str = "pip install") -> None:
-        self.given = (library, needed_for, package, how)
+        self.arguments = (library, needed_for, package, how)
         super().__init__(f"{needed_for} needs {library}, which is not installed. Run: {how} {_where(package)}")
 
     def __reduce__(self) -> tuple[type[MissingLibraryError], tuple[str, str, str, str]]:
-        return type(self), self.given
+        return type(self), self.arguments
 
 
 def _where(package: str) -> str:

@@ -155,7 +155,7 @@ def worlds_card(name: str, count: int, seed: int = 0, split: Split = "test", job
     rows = list[Row]()
     done = progress_bar(compute(partial(world_row, name, split), cells, jobs), name, count, unit="world", delay=2.0)
     for outcome in done:
-        at = outcome.cell.given["seed"]
+        at = outcome.cell.settings["seed"]
         if outcome.rows is not None:
             rows += [{"seed": at, **row} for row in outcome.rows.to_pylist()]
             continue

@@ -83,7 +83,7 @@ def test_a_unit_at_the_road_is_no_ego_and_real_data_have_no_bound(tmp_path: Path
     stands = (frame["vehicle"] == "car2") & frame["kind"].isin(["vx", "vy", "vz"])
     data = str(write(frame.assign(value=frame["value"].mask(stands, 0.0)), tmp_path / "log.csv"))
     assert scene.egos({"data": data, "egos": "auto"}) == ("car0", "car1")
-    methods = {cell.given["method"] for cell in neighbours.STUDY.override({"data": data}).cells()}
+    methods = {cell.settings["method"] for cell in neighbours.STUDY.override({"data": data}).cells()}
     assert "bound" not in methods >= {"kalman"}
 
 

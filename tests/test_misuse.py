@@ -259,7 +259,7 @@ PUBLIC: dict[str, tuple[Callable[..., Any], dict[str, Any]]] = {
     ),
     "pose_start": (co.pose_start, {"recording": BODY, "seconds": 3.0, "gate": 5.0}),
     "OwnMeasurement": (own, {**MEASURED, "yaw_rate": 0.7, "heading": 0.7, "gate": 5.0}),
-    "LandmarkMeasurement": (co.LandmarkMeasurement, {"relative": [9.0, 0.7, 1.57], "place": [1.0, 2.0, 3.0]}),
+    "LandmarkMeasurement": (co.LandmarkMeasurement, {"relative": [9.0, 0.7, 1.57], "position": [1.0, 2.0, 3.0]}),
     "RelativeMeasurement": (co.RelativeMeasurement, MESSAGE),
     "StarStream": (star, {**MESSAGE, "dt": 0.1, "fix_age": 0.0}),
     "Message": (co.Message, {"name": "m", "numbers": 6, "rounds": 1, "per_neighbour": 0}),

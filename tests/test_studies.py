@@ -152,7 +152,7 @@ def test_there_are_as_many_individual_nets_as_clients(tmp_path: Path) -> None:
     write_table(co.load_fleet("town10-clients").select([0, 2]), tmp_path / "two.csv")
     for name in ("convergence", "error_cdf"):
         cells = study(name, clients=str(tmp_path / "two.csv"), train_seeds=1).cells()
-        named = {c.given["method"] for c in cells}
+        named = {c.settings["method"] for c in cells}
         assert {m for m in named if m.startswith("individual")} == {"individual1", "individual2"}
     with refused("individual9"):
         study("convergence", method="individual9").cells()

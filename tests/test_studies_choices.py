@@ -85,7 +85,7 @@ def test_every_condition_is_what_it_says() -> None:
 
 def test_no_cell_for_a_rule_without_enough_clients() -> None:
     cells = aggregation.STUDY.override({"members": "6"}).cells()
-    there = {(c.given["condition"], c.given["method"]) for c in cells}
+    there = {(c.settings["condition"], c.settings["method"]) for c in cells}
     assert ("iid", "krum") in there
     assert ("half absent", "krum") not in there
     assert ("half absent", "median") in there

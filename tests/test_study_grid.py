@@ -29,7 +29,7 @@ def names(**changes: object) -> list[str]:
 
 def test_the_grid_is_the_product_in_order() -> None:
     assert [tuple(c.params.values()) for c in study().cells()] == [(0, "a"), (0, "b"), (1, "a"), (1, "b")]
-    assert study().cells()[0].given == {"runs": 3, "egos": (0, 1), "ratio": 0.1, "k": 0, "method": "a"}
+    assert study().cells()[0].settings == {"runs": 3, "egos": (0, 1), "ratio": 0.1, "k": 0, "method": "a"}
     assert len(study(where=lambda p: p["k"] > 0 or p["method"] == "a").cells()) == 3
 
 

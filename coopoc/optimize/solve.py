@@ -176,7 +176,7 @@ def _start(problem: Problem) -> tuple[Floats, bool]:
             rows = constraint_rows(problem, start)
         bad = ~np.isfinite(rows.value + rows.matrix.sum(axis=1))
         if bad.any():
-            k, row, _ = rows.place[np.flatnonzero(bad)[0]]
+            k, row, _ = rows.origin[np.flatnonzero(bad)[0]]
             raise _without_direction(problem, problem.constraints[k].kind, problem.constraints[k].nodes[row])
     return start, placed
 

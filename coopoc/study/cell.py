@@ -23,12 +23,12 @@ class Cell:
 
     Args:
         params: its own parameters.
-        given: its own parameters and the settings of the study.
+        settings: its own parameters and the settings of the study.
         name: `digest` of everything that changes the numbers.
     """
 
     params: Mapping[str, Scalar]
-    given: Params
+    settings: Params
     name: str
 
 

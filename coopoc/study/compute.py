@@ -56,7 +56,7 @@ def schedule(cells: Sequence[Cell], shares: Sequence[str], jobs: int) -> list[Ce
     """
     shared: dict[tuple[Any, ...], list[Cell]] = {}
     for cell in cells:
-        shared.setdefault(tuple(cell.given.get(name) for name in shares), []).append(cell)
+        shared.setdefault(tuple(cell.settings.get(name) for name in shares), []).append(cell)
     ordered = [*shared.values()][::-1]
     lanes = [list(itertools.chain.from_iterable(ordered[lane::jobs])) for lane in range(jobs)]
     return [cell for step in itertools.zip_longest(*lanes) for cell in step if cell is not None]
@@ -67,7 +67,7 @@ def attempt(function: Function, cell: Cell) -> Outcome:
     start = time.perf_counter()
     try:
         with threadpool_limits(limits=1):
-            rows = _checked(function(cell.given), cell)
+            rows = _checked(function(cell.settings), cell)
     except (Exception, SystemExit) as error:
         reason = f"{type(error).__name__}: {error}"
         return Outcome(cell, None, reason, traceback.format_exc(), time.perf_counter() - start)

@@ -91,7 +91,7 @@ def write_tracks(study: Study | str, out: str | Path = "runs", settings: Params 
     (folder := folder / "tracks").mkdir(parents=True, exist_ok=True)
     for cell in cells:
         if store.load(folder.parent, cell.name) is not None:
-            for name, *path in study.tracks(cell.given):
+            for name, *path in study.tracks(cell.settings):
                 words = [str(value) for value in cell.params.values()]
                 write_tum(folder / (re.sub(r"[^\w.+-]", "_", "-".join([*words, name])) + ".tum"), *path)
     return folder
@@ -149,7 +149,7 @@ def _work(
     new, before = _unfinished(cells, folder)
     todo = [*new, *(cell for cell, _ in before if retry_failed)]
     if todo:
-        study.prepare([cell.given for cell in todo], jobs)
+        study.prepare([cell.settings for cell in todo], jobs)
     todo = schedule(todo, study.shares, jobs)
     failed = 0 if retry_failed else len(before)
     outcomes = compute(study.cell, todo, jobs)

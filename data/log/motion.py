@@ -49,12 +49,12 @@ class Shown(NamedTuple):
 
     Attributes:
         velocity: (M, 3) m/s at the times of fixes, by these and those before.
-        known: (M,) whether they show it.
+        certain: (M,) whether they show it.
         wanders: m^2/s, by which a position that is predicted with the last one becomes uncertain.
     """
 
     velocity: Signal
-    known: Bools
+    certain: Bools
     wanders: float
 
 
@@ -327,7 +327,7 @@ def _by_fixes(fixes: Signal, shown: Shown, steps: Steps) -> Floats:
     last = np.append(-1, arrived[:-1])
     new = (last >= 0) & (arrived > last)
     leads = np.where(new[:, None], (fixes.value[arrived] - fixes.value[last]) / steps.dt, 0.0)
-    return np.where(((last >= 0) & shown.known[last])[:, None], shown.velocity.value[last], leads)
+    return np.where(((last >= 0) & shown.certain[last])[:, None], shown.velocity.value[last], leads)
 
 
 def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, Ints, Floats]:

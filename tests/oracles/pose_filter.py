@@ -99,7 +99,7 @@ def relative(x, P, drive, noise, where, passes):  # type: ignore[no-untyped-def]
     def h(s):  # type: ignore[no-untyped-def]
         predicted = []
         for k in links:
-            mine, other = s[d * drive.ends[k, 0] :][:d], drive.place[k]
+            mine, other = s[d * drive.ends[k, 0] :][:d], drive.landmark[k]
             if drive.ends[k, 1] >= 0:
                 other = s[d * drive.ends[k, 1] :][:3]
             longer = np.array([mine[6], 0, 0]) if d > 6 else 0

@@ -32,13 +32,13 @@ class Tape(NamedTuple):
 
     Attributes:
         code: (K,) each an Operation.
-        place: (K, 3) slot written and the two read; of an INPUT slot and number, of an OUTPUT number and slot.
+        operands: (K, 3) slot written and the two read; of an INPUT slot and number, of an OUTPUT number and slot.
         value: (K,) of each CONST.
         slots: how many.
     """
 
     code: Ints
-    place: Ints
+    operands: Ints
     value: Floats
     slots: int
 
@@ -59,7 +59,7 @@ def accumulate(tape: Tape, x: Floats, nodes: Ints, numbers: Floats, goal: Ints, 
     for first in range(0, len(nodes), LANES):
         count = min(LANES, len(nodes) - first)
         for k in range(len(tape.code)):
-            code, o, a, b = tape.code[k], tape.place[k, 0], tape.place[k, 1], tape.place[k, 2]
+            code, o, a, b = tape.code[k], tape.operands[k, 0], tape.operands[k, 1], tape.operands[k, 2]
             if code == Operation.INPUT:
                 if a < own:
                     at, column = a // ambient, a % ambient

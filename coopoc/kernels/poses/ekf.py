@@ -39,7 +39,7 @@ class PoseMeasurements(NamedTuple):
         active: (T, n) whether a member is there.
         ends: (L, 2) numbers of observer and other, -1 for a landmark.
         first: (T+1,) first relative measurement of each step.
-        place: (L, 3) m, of the landmark.
+        landmark: (L, 3) m, its position.
         relative: (R, L, 3) m, rad from the observer's heading, rad; NaN where missing.
         dt: s.
     """
@@ -48,7 +48,7 @@ class PoseMeasurements(NamedTuple):
     active: Bools
     ends: Ints
     first: Ints
-    place: Floats
+    landmark: Floats
     relative: Floats
     dt: float
 
@@ -175,7 +175,7 @@ def add_relative(
     measured: PoseMeasurements, noise: PoseNoise, poses: Poses, ends: tuple[int, int], run: int, k: int, left_out: int
 ) -> int:
     """Relative measurement k of members at `ends`."""
-    landmark = (measured.place[k, 0], measured.place[k, 1], measured.place[k, 2])
+    landmark = (measured.landmark[k, 0], measured.landmark[k, 1], measured.landmark[k, 2])
     relative = (measured.relative[run, k, 0], measured.relative[run, k, 1], measured.relative[run, k, 2])
     return update_relative(poses, ends, landmark, relative, noise.relative, noise.gate, noise.longer, left_out)
 

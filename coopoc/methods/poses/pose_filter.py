@@ -195,24 +195,24 @@ class PoseFilter:
         links: Ints,
         begin: Floats,
         kept: Bools | None = None,
-        place: Floats | None = None,
+        landmark: Floats | None = None,
     ) -> tuple[Floats, Floats, Floats]:
         """States (R, T, n, d), covariances (R, T, n, d, d), and cost and number of rows (R, 2) of some members.
 
         Args:
             recording: in body frames.
             members: columns.
-            links: as of `pose_measurements`, like `kept` and `place`.
+            links: as of `pose_measurements`, like `kept` and `landmark`.
             begin: (R, N, 4) first poses.
             kept: which links count.
-            place: of what they measure.
+            landmark: position of what they measure.
         """
         from ...kernels.poses.ekf import run_filter
         from ...kernels.poses.scalar_update import new_poses
 
         noise = self.noise(self.assumed or recording.sensors, recording.dt)
         options = self.options(noise)
-        measured = pose_measurements(recording, members, links, kept, place)
+        measured = pose_measurements(recording, members, links, kept, landmark)
         memory = new_poses(len(members) * options.d), new_poses(2 * options.d)
         first, spread = np.ascontiguousarray(begin[:, members]), np.array(self.spread, dtype=float)
         return run_filter(measured, noise, first, spread, options, *memory)

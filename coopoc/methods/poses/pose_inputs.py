@@ -127,7 +127,7 @@ def pose_noise(sensors: Sensors, dt: float, gate: float) -> PoseNoise:
 
 
 def pose_measurements(
-    recording: Recording, members: Sequence[int], links: Ints, kept: Bools | None = None, place: Floats | None = None
+    recording: Recording, members: Sequence[int], links: Ints, kept: Bools | None = None, landmark: Floats | None = None
 ) -> PoseMeasurements:
     """Arguments of the kernel.
 
@@ -136,7 +136,7 @@ def pose_measurements(
         members: columns.
         links: indices of their relative measurements.
         kept: (R, links) whether a measurement counts in a run; None for all.
-        place: (links, 3) m, of what is measured and no member; None: landmarks stand at their fix.
+        landmark: (links, 3) m, of what is measured and no member; None: landmarks stand at their fix.
     """
     from ...kernels.poses.ekf import PoseMeasurements
 
@@ -149,7 +149,7 @@ def pose_measurements(
         np.ascontiguousarray(present(recording)[:, members]),
         np.stack([number[table.observer[links]], number[table.neighbour[links]]], axis=1),
         np.searchsorted(table.step[links], np.arange(len(recording.t) + 1)),
-        np.ascontiguousarray(recording.gnss[0, 0, table.neighbour[links]] if place is None else place),
+        np.ascontiguousarray(recording.gnss[0, 0, table.neighbour[links]] if landmark is None else landmark),
         np.ascontiguousarray(relative if kept is None else np.where(kept[..., None], relative, np.nan)),
         recording.dt,
     )

@@ -93,7 +93,7 @@ def _most_likely(
     noise = recording.sensors
     if len(to_landmarks(recording, links)) < len(links):
         filter_ = replace(filter_, assumed=_of_vehicles(noise, recording.relative[run, links, 0]))
-    x, _, cost = filter_.run_filter(copies, [column], links, tried, place=landmarks)
+    x, _, cost = filter_.run_filter(copies, [column], links, tried, landmark=landmarks)
     best = np.argmin(cost[:, 0] + _cost_of_bearings(recording, run, column, angles, noise))
     return tried[best, column], x[best, :, 0, :3]
 

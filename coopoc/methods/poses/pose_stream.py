@@ -57,22 +57,22 @@ class LandmarkMeasurement:
 
     Args:
         relative: (3,) range m, bearing from the heading rad, inclination rad, NaN for a component that is missing.
-        place: (3,) m, its position.
+        position: (3,) m, its own.
 
-    >>> LandmarkMeasurement([9.0, 0.1, 1.57], place=[5.0, 5.0, 3.0]).relative.tolist()
+    >>> LandmarkMeasurement([9.0, 0.1, 1.57], position=[5.0, 5.0, 3.0]).relative.tolist()
     [9.0, 0.1, 1.57]
     """
 
     relative: npt.ArrayLike
-    place: npt.ArrayLike
+    position: npt.ArrayLike
 
     def __post_init__(self) -> None:
-        for name in ("relative", "place"):
+        for name in ("relative", "position"):
             values = numbers(getattr(self, name))
             if (
                 values.shape != (3,)
                 or (np.abs(values) > FARTHEST).any()
-                or (name == "place" and np.isnan(values).any())
+                or (name == "position" and np.isnan(values).any())
             ):
                 component, hint = getattr(self, name), "NaN stands for a component of `relative` that is missing."
                 raise InputError(name, component, "must be three numbers", hint)
@@ -132,7 +132,7 @@ class PoseStream:
             what = "must give what the first fix and compass do not"
             raise InputError("begin", None, what, "Give (x, y, z, heading).")
         t, count = int(self._later), len(marks)
-        positions = np.array([mark.place for mark in marks], dtype=float).reshape(-1, 3)
+        positions = np.array([mark.position for mark in marks], dtype=float).reshape(-1, 3)
         relative = np.array([mark.relative for mark in marks], dtype=float).reshape(1, -1, 3)
         both, ends = np.tile(own.row, (1, 2, 1, 1)), np.tile([0, -1], (count, 1))
         first = np.array([0, 0, count] if t else [0, count, count])

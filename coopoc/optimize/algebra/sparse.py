@@ -32,13 +32,13 @@ class Entries:
     Args:
         number: (n, dof) which of the m unknowns a direction of a node is, -1 where it cannot move.
         key: sorted j n + i of the blocks of nodes (i, j), i <= j.
-        place: (blocks, dof, dof) of each number of a block, -1 below the diagonal and where nothing can move.
+        entry: (blocks, dof, dof) which one each number of a block, -1 below the diagonal and where nothing can move.
         indptr: (m + 1,) and indices: of the CSC matrix.
     """
 
     number: Ints
     key: Ints
-    place: Ints
+    entry: Ints
     indptr: Ints
     indices: Ints
 
@@ -57,7 +57,7 @@ class Entries:
         upper, lower = np.maximum(first, last), np.minimum(first, last)
         block, turned = np.searchsorted(self.key, upper * len(self.number) + lower), first > last
         row, column = row[:, None], column[:, None]
-        return self.place[block, np.where(turned, column, row), np.where(turned, row, column)]
+        return self.entry[block, np.where(turned, column, row), np.where(turned, row, column)]
 
     @cached_property
     def own(self) -> tuple[Bools, Ints, Ints]:

@@ -28,14 +28,14 @@ class Rows:
         lower: as `value`.
         upper: as `value`.
         matrix: (rows, n dof) sparse derivative of the values by the steps.
-        place: (rows, 3) constraint, row of its nodes and component.
+        origin: (rows, 3) constraint, row of its nodes and component.
     """
 
     value: Floats
     lower: Floats
     upper: Floats
     matrix: Any
-    place: Ints
+    origin: Ints
 
     @property
     def outside(self) -> Floats:
@@ -170,7 +170,7 @@ def _directions(size: int, blocks: list[tuple[Ints, Floats]]) -> Any:
 
 def _words(problem: Problem, rows: Rows, worst: int) -> str:
     """Which constraint is violated most, of which nodes, and by how much."""
-    k, row, component = rows.place[worst].tolist()
+    k, row, component = rows.origin[worst].tolist()
     item = problem.constraints[k]
     nodes = " and ".join(problem.names[n] for n in item.nodes[row])
     below = rows.value[worst] < rows.lower[worst]

@@ -317,7 +317,7 @@ def _lagrangian(problem: Problem, x: Floats, active: Active) -> Any:
     move."""
     from scipy.sparse import csr_array
 
-    system, structure, rows = sparse(problem), structure_of(problem), constraint_rows(problem, x).place
+    system, structure, rows = sparse(problem), structure_of(problem), constraint_rows(problem, x).origin
     terms, numbers = list(structure.factors), list(system.numbers)
     for k, (item, term) in enumerate(zip(problem.constraints, structure.constraints, strict=True)):
         own, weight = rows[:, 0] == k, np.zeros(item.lower.shape)

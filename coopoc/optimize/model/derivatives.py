@@ -51,7 +51,7 @@ class Kind(NamedTuple):
     def widths(self) -> tuple[int, int, int]:
         """How many numbers z, constants and weights a measurement has."""
         measurement, d = self.measurement, self.space.dimension
-        return measurement.given(d), measurement.constants, measurement.size(d) ** (1 + self.full)
+        return measurement.width(d), measurement.constants, measurement.size(d) ** (1 + self.full)
 
 
 class Term(NamedTuple):

@@ -41,9 +41,9 @@ def whitening(kind: str, cov: npt.ArrayLike) -> Floats:
 @lru_cache(maxsize=256)
 def fitting(measurement: Measurement, width: int) -> int | None:
     """The dimension whose z has `width` numbers; None if both have; InputError if none has."""
-    fits = [d for d in (2, 3) if (d == 3 or measurement.plane is not None) and measurement.given(d) == width]
+    fits = [d for d in (2, 3) if (d == 3 or measurement.plane is not None) and measurement.width(d) == width]
     if not fits:
-        allowed = sorted({measurement.given(d) for d in (2, 3) if d == 3 or measurement.plane is not None})
+        allowed = sorted({measurement.width(d) for d in (2, 3) if d == 3 or measurement.plane is not None})
         hint = "Write poses with coopoc.optimize.pose." if measurement.compares_poses else "Give one per component."
         words = f"must have {' or '.join(map(str, allowed))}"
         raise InputError(f"z of {measurement.name}", f"{width} numbers per row", words, hint)
@@ -90,7 +90,7 @@ def check_values(measurement: Measurement, z: npt.ArrayLike, count: int) -> Floa
     """z as (M, k): finite, distances > 0, angles in radians, rotations that are some."""
     array = numbers(f"z of {measurement.name}", z)
     if array.ndim != 2 or len(array) != count:
-        shape = f"must have shape ({count}, {measurement.given()}) for {measurement.name}"
+        shape = f"must have shape ({count}, {measurement.width()}) for {measurement.name}"
         raise InputError("z", array.shape, shape, "One row per row of nodes; a problem for each run.")
     dimension = fitting(measurement, array.shape[-1]) or 3
     if not np.isfinite(array).all():

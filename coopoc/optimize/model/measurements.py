@@ -66,7 +66,7 @@ class Measurement:
         """Residuals per measurement."""
         return len(self.kept(dimension))
 
-    def given(self, dimension: int = 3) -> int:
+    def width(self, dimension: int = 3) -> int:
         """Numbers z per measurement."""
         return Space(dimension, has_rotation=True).ambient if self.compares_poses else self.size(dimension)
 
