@@ -27,7 +27,7 @@ def rms(recording: Recording, fleet: Fleet, **priors: float) -> tuple[float, co.
     return float(np.sqrt(np.square(track.x - fleet.position[:, [3, 8]]).sum(axis=-1).mean())), track
 
 
-@pytest.mark.parametrize("priors", [ONLY_SCALE, ONLY_SCALE._replace(absent=-np.inf, exact=8.0)], ids=["each", "all"])
+@pytest.mark.parametrize("priors", [ONLY_SCALE, ONLY_SCALE._replace(absent=-np.inf, exact=4.0)], ids=["each", "all"])
 @pytest.mark.parametrize("scale", [0.0, 0.02, 0.05])
 def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale: float, priors: Priors) -> None:
     """filterpy: of the positions along a straight road one filter knows no scale error, one has it as a state; their

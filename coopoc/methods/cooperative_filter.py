@@ -50,7 +50,7 @@ class Priors(NamedTuple):
         compass: rad, and
         offset: m, of such errors of the ego's compass and ranges, where none is stated.
         absent: log odds that each of these is not there, before anything was measured.
-        exact: where absent is -inf, log odds that the odometry of no vehicle errs.
+        exact: where absent is -inf, log odds that no odometry errs, times the vehicles in the star, two at least.
         slip: an ego that slips errs by that share of its late speed.
         fix: factor of the assumed standard deviation of fixes, which err together for a while.
         fix_gate: squared Mahalanobis distance from which the fixes of a step weigh less; 0 if no number is doubted.
@@ -72,7 +72,7 @@ class Priors(NamedTuple):
 
 AS_STATED = Priors(heading=0.0, scale=0.0, compass=0.0, offset=0.0, slip=0.0, fix_gate=0.0, forget=0.0)
 """Nothing is otherwise: the textbook's filter."""
-ON_ROADS = Priors(0.03, 0.03, compass=0.0, offset=0.0, absent=-np.inf, exact=-11.0, fix=2.0, fix_gate=3.5)
+ON_ROADS = Priors(0.03, 0.03, compass=0.0, offset=0.0, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5)
 """Of measurements that are not simulated: hardly any odometry is without such errors."""
 NO_ODOMETRY = Priors(heading=0.0, scale=0.0, compass=0.0, offset=0.0, slip=0.0)
 """Of velocities that fixes have shown."""

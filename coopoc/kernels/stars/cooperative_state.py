@@ -101,7 +101,7 @@ class Model(NamedTuple):
         turn: (2,) rad^2 and 1, of errors of heading and scale of an odometry; zeros for none.
         lasts: s, their correlation time.
         absent: (4,) log odds that an error of heading, scale, compass or range is not there.
-        exact: log odds that no odometry errs, where each error of heading and scale is there for sure otherwise.
+        exact: log odds a vehicle that no odometry errs, where each error of heading and scale is there otherwise.
         slip: share of the late speed.
         gate: squared normalised innovation of a component of a relative measurement, 0 for none.
         fix_gate: squared Mahalanobis distance of a fix, of the fixes in a message, and of its odometer and velocity; 0

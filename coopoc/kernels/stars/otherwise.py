@@ -205,8 +205,9 @@ def collapse(f: Filter, i: int, n: int, there: float) -> None:
 
 @part
 def average_over_all(f: Filter, model: Model, own: int) -> None:
-    """Average over whether the errors of all odometries are there, or none: evidence that none errs adds up."""
-    ego, width, kept, odds = f.ego, len(f.few[0]) - 2, f.h.matrix, model.exact
+    """Average over whether the errors of all odometries are there, or none: evidence that none errs adds up,
+    and its prior odds, too: noise that is not white makes either look surer. One vehicle tells as little as two."""
+    ego, width, kept, odds = f.ego, len(f.few[0]) - 2, f.h.matrix, max((own - 3) // 2, 2) * model.exact
     for c in range(12):
         kept[c] = ego[ANSWER + c]
     heading, scale = f.few[own - 2, width], f.few[own - 1, width]
