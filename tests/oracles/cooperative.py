@@ -246,7 +246,7 @@ class Oracle:
         for k, i in enumerate(turns):
             b.average([i], life.turn[k % 2], life.absent[k % 2])
         if life.absent[0] == -math.inf:
-            b.average(turns, np.tile(life.turn, len(turns) // 2), self.priors.exact * max(len(turns) // 2, 2))
+            b.average(turns, np.tile(life.turn, len(members)), self.priors.exact * max(len(members), 2))
         if ("compass",) in b.names:
             b.average([b.at(("compass",)).start], life.bias, life.absent[2])
             b.average([b.at(("compass",)).start + 2], life.offset, life.absent[3])
