@@ -126,6 +126,7 @@ class CooperativeFilter(Checked):
       prior, and the estimate is the average over whether it is 0, by Bayes' rule (`kernels.stars.otherwise`).
     - *Slips*: a step whose numbers surprise is tried again with a motion that is not known, and the likelier of both
       is kept (`kernels.stars.otherwise`).
+    - *Starts*: at a fix, or where a neighbour that sends a position is measured whole, range and both angles.
     - *Messages* hold a fading mean of the sender's fixes, its weight, the odometer and the velocity. The mean of the
       fixes between any two of them follows: a lost message loses nothing, and no fix counts twice.
 
@@ -154,7 +155,7 @@ class CooperativeFilter(Checked):
     priors: Priors = Priors()
     name: str = "cooperative-filter"
     calibration: str = ""
-    cooperative = True
+    cooperative, needs_fix = True, False
 
     def __post_init__(self) -> None:
         check_options(self, priors=Priors)
@@ -193,7 +194,8 @@ class CooperativeFilter(Checked):
             names = (*(name.replace(" ", "_") for name in FOUND), *(f"{kind}_level" for kind in LEVELS))
             extras |= {name: deviations[..., i, None] for i, name in enumerate(names)}
             own_id = recording.ids[ego]
-            notes.extend(otherwise(own_id, deviations, priors.fix, stated) if priors.fix_gate else ())
+            if priors.fix_gate and np.isfinite(x).any():
+                notes.extend(otherwise(own_id, deviations, priors.fix, stated))
             notes.extend(rejected(f"fixes, {own_id}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
             if model.own + model.common == 0.0 and priors.fix_gate:
                 notes.extend(lasting(own_id, recording.gnss[:, :, ego] - x, recording.dt))
@@ -254,6 +256,7 @@ def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float]
     >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0, 1.0]]]))
     ['scale error, a: 0.02', 'fix level, a: 3 times the stated deviation']
     """
+    found = found[:, np.isfinite(found[..., 4]).any(axis=0)]  # from where it knows where it is
     late = found[:, found.shape[1] // 2 :]
     usual = np.sqrt(np.nanmean(np.square(late), axis=(0, 1)))
     usual[4] = np.nanmean(found[..., 4])

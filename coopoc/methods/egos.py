@@ -8,7 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from ..kernels.compiling.waiting import clock
 from ..kernels.geometry import components
 from ..kernels.stars.messages import ACCELERATION_STD, FIX_GROWTH, FORGOTTEN, Assumptions, Measurements
@@ -16,6 +16,7 @@ from ..workers import progress_bar
 from ..world.inbox import Inbox, inbox
 from ..world.recording import Recording, Vehicles, check_recording
 from .doubts import doubts
+from .gaps import needs_fix
 from .noise_model import NoiseModel
 from .track import Method, Track
 
@@ -49,7 +50,7 @@ def follow_egos(
         InputError: an ego that is unknown, no observer of this recording, absent at times, or without a first fix.
     """
     began = clock()
-    columns = check_recording(recording).columns(egos)
+    columns = check_recording(recording).columns(egos, needs_fix(method))
     shape = (recording.runs, len(recording.t), len(columns), 3)
     x, cov = np.empty(shape), np.empty((*shape, 3))
     ends = np.cumsum([0, *(len(recording.links.of(ego)) for ego in columns)])
@@ -67,15 +68,16 @@ def follow_egos(
                 for name, values in result.extras.items():
                     extras.setdefault(name, []).append(values)
                 bar.update(1 if isinstance(result.step, int) else len(recording.t[result.step]))
+    absent: Bools = np.logical_and.accumulate(np.isnan(x[..., 0]).any(axis=0))  # a later NaN is an error
     stated = getattr(method, "noise_model", "nominal")
     notes = (*notes, *doubts(recording, columns, x, cov, stated, neighbours))
     for array in (x, cov, neighbours):
         array.flags.writeable = False  # so that the Track need not copy them
     seconds = clock() - began
     whole = {name: np.concatenate(values, axis=-1) for name, values in extras.items()}
-    return Track(
-        recording.t, tuple(columns), x, cov, received, sent, seconds, neighbours, notes, extras=whole, ids=recording.ids
-    )
+    late = absent if absent.any() and not needs_fix(method) else None
+    counted = received, sent, seconds, neighbours, notes
+    return Track(recording.t, tuple(columns), x, cov, *counted, extras=whole, ids=recording.ids, absent=late)
 
 
 def measurements(recording: Recording, ego: int, inbox: Inbox, broadcast: Floats | None = None) -> Measurements:

@@ -32,9 +32,9 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
     def across(self: Any, recording: Recording, egos: Vehicles = (0,)) -> Track:
         columns = check_recording(recording).observing(egos)
         whole = (0, len(recording.t))
-        cuts = {column: recording.stretches(column) for column in columns}
+        cuts = {column: recording.stretches(column, fixed=needs_fix(self)) for column in columns}
         if all(pieces in ((), (whole,)) for pieces in cuts.values()):
-            return call(self, recording, egos)
+            return _noted(call(self, recording, egos))
         for column, pieces in cuts.items():
             if not pieces:
                 never = "is never there at two steps in a row, with a fix"
@@ -44,7 +44,7 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
             for column in columns
             for cut in cuts[column]
         }
-        return _joined(recording, columns, parts)
+        return _noted(_joined(recording, columns, parts))
 
     return across
 
@@ -52,6 +52,21 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
 def follow(method: Method, recording: Recording, egos: Vehicles) -> Track:
     """The track of any method across gaps, of one that knows nothing of them, too."""
     return in_stretches(type(method).__call__)(method, recording, egos)
+
+
+def needs_fix(method: Any) -> bool:
+    """Whether a method can begin with a fix only."""
+    return bool(getattr(method, "needs_fix", True))
+
+
+def _noted(track: Track) -> Track:
+    if track.absent is None:
+        return track
+    for ego in np.array(track.egos)[track.absent.all(axis=0)].tolist():
+        hint = "Choose another ego, or measure ranges and both angles to neighbours that have fixes."
+        raise InputError("egos", repr(track.ids[ego]), "has no fix, and no neighbour shows where it is", hint)
+    gaps = f"absent, or not placed yet, at {track.absent.sum()} of {track.absent.size} steps: no estimate there"
+    return replace(track, notes=tuple(dict.fromkeys((*track.notes, gaps))))
 
 
 def _from(method: Any, start: int) -> Any:
@@ -77,7 +92,7 @@ def _joined(recording: Recording, columns: list[int], parts: dict[tuple[int, tup
     received, sent = np.zeros((2, shape[0], len(columns)))
     for (column, (start, stop)), track in parts.items():
         e = columns.index(column)
-        absent[start:stop, e] = False
+        absent[start:stop, e] = False if track.absent is None else track.absent[:, 0]
         received[:, e] += track.received_bytes[:, 0]
         sent[:, e] += track.sent_bytes[:, 0]
         here = ends[e] + np.flatnonzero((links.step[own_links[e]] >= start) & (links.step[own_links[e]] < stop))
@@ -88,7 +103,6 @@ def _joined(recording: Recording, columns: list[int], parts: dict[tuple[int, tup
             elif of is not None:
                 of[:, here] = values
         notes |= dict.fromkeys(track.notes)
-    gaps = f"absent, or without a first fix, at {absent.sum()} of {absent.size} steps: no estimate there"
     seconds = sum(track.seconds for track in some)
     return Track(
         recording.t,
@@ -96,7 +110,7 @@ def _joined(recording: Recording, columns: list[int], parts: dict[tuple[int, tup
         received_bytes=received,
         sent_bytes=sent,
         seconds=seconds,
-        notes=(*notes, gaps),
+        notes=tuple(notes),
         extras=extras,
         ids=recording.ids,
         absent=absent,

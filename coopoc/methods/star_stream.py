@@ -106,7 +106,8 @@ class StarStream:
 
     Args:
         filter: its noise model is "identity" or holds constant noise. Neighbours send what `broadcast` of theirs holds.
-        x0: (3,) m, a position known before the first step; None starts at the first fix.
+        x0: (3,) m, a position known before the first step; None starts at the first fix, or where
+            neighbours see the ego.
         interval: s, the step that the assumed process noise belongs to: a motion of dt s has dt / interval times its
             variance. None: every step is one, with the error of one measured velocity, as in a recording.
         history: s, how old a delayed fix may be.
@@ -143,7 +144,7 @@ class StarStream:
         self._motion: MotionNoise = motion_noise(noise_model, interval)
         self._fix = priors.fix**2 * np.array(noise_model.gnss_variance)
         self.max_age, self.history = seconds("max_age", max_age), MotionHistory(history)
-        self._given, self._time, self._begun = np.zeros(8), 0.0, x0 is not None
+        self._given, self._time = np.zeros(8), 0.0
         self._numbers, self._names = dict[str, int](), list[str]()
         self._last: Floats = np.full((1, WIDTH), np.nan)
         self._answer: Floats = np.full(12, np.nan)
@@ -177,7 +178,8 @@ class StarStream:
         fix_age: float = 0.0,
         neighbours: Sequence[RelativeMeasurement] = (),
     ) -> tuple[Floats, Floats | None]:
-        """Position (3,) m and covariance (3, 3) m^2 of the ego; NaN and None before its first fix.
+        """Position (3,) m and covariance (3, 3) m^2 of the ego; NaN and None until a fix, or what a
+        neighbour sends and the ego measures of it (range and both angles), shows where it is.
 
         Args:
             gnss: (3,) m of the ego; None or NaN for no fix.
@@ -199,12 +201,11 @@ class StarStream:
         if outcome not in (ESTIMATE, NO_FIX_YET):
             self.history.check(gnss, velocity, dt, fix_age)
         self._time = time
-        self._begun |= outcome == ESTIMATE
-        if not self._begun:
-            return np.full(3, np.nan), None
         own[FIX_VARIANCE:MOTION] -= (1.0 - self._model.white) * self._fix
-        self._names, self._answer = names, np.empty(12 + 3 * len(columns))
-        stream_step(self._filter, self._tries, self._model, own, rows, columns, self._start, self._answer)
+        answer = np.empty(12 + 3 * len(columns))
+        if not stream_step(self._filter, self._tries, self._model, own, rows, columns, self._start, answer):
+            return np.full(3, np.nan), None
+        self._names, self._answer = names, answer
         return self._answer[:3], self._answer[3:12].reshape(3, 3)
 
     def _columns(self, names: list[str]) -> Ints:

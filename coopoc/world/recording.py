@@ -199,14 +199,16 @@ class Recording:
             body=body and Body(body.yaw_rate[:, start:stop], body.heading[:, start:stop]),
         )
 
-    def stretches(self, vehicle: int | str, shortest: int = 2) -> tuple[tuple[int, int], ...]:
-        """(start, stop) of the steps at which a vehicle is there without a break, each from a fix in all runs on.
+    def stretches(self, vehicle: int | str, shortest: int = 2, fixed: bool = True) -> tuple[tuple[int, int], ...]:
+        """(start, stop) of the steps at which a vehicle is there without a break, each from a fix in all runs
+        on, or else from the first step.
 
         `recording.between(start, stop)` is what a method takes that follows it.
 
         Args:
             vehicle: index or id.
             shortest: number of steps.
+            fixed: whether each begins with a fix.
 
         >>> from coopoc import Fleet, Sensors, observe
         >>> fleet = Fleet(("a",), [0, 0.1, 0.2], np.zeros((3, 1, 3)), np.zeros((3, 1, 3)))
@@ -215,8 +217,8 @@ class Recording:
         """
         (col,) = columns("vehicle", [vehicle], self.ids)
         there = np.isfinite(self.velocity[0, :, col, 0])
-        fixed: Bools = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0))
-        firsts = [(a + int(np.argmax(fixed[a:b])), b) for a, b in stretches(there) if fixed[a:b].any()]
+        known: Bools = np.asarray(np.isfinite(self.gnss[:, :, col, 0]).all(axis=0)) | (not fixed)
+        firsts = [(a + int(np.argmax(known[a:b])), b) for a, b in stretches(there) if known[a:b].any()]
         return tuple((a, b) for a, b in firsts if b - a >= shortest)
 
     @cached_property
@@ -250,23 +252,28 @@ class Recording:
                 raise InputError("egos", repr(ego), allowed, "Name it in observe(..., observers=[...]).")
         return cols
 
-    def columns(self, egos: Vehicles) -> list[int]:
-        """Columns of the egos; InputError if one is unknown, no observer of this recording, absent at times, or without
-        a first fix. Later ones may be missing (NaN)."""
+    def columns(self, egos: Vehicles, fixed: bool = True) -> list[int]:
+        """Columns of the egos; InputError if one is unknown, no observer of this recording, absent at times, or, if it
+        must be `fixed`, without a first fix. Later ones may be missing (NaN)."""
         cols = self.observing(egos)
         moves, has_fix = (np.isfinite(values.take(cols, axis=2)) for values in (self.velocity, self.gnss[:, :1]))
         if moves.all() and has_fix.all():
             return cols
         there: Bools = np.asarray(moves.all(axis=(0, 1, 3)))
-        fixed: Bools = np.asarray(has_fix.all(axis=(0, 1, 3)))
-        for ego, present, fix in zip(egos, there, fixed, strict=True):
+        begins: Bools = np.asarray(has_fix.all(axis=(0, 1, 3))) | (not fixed)
+        for ego, present, fix in zip(egos, there, begins, strict=True):
             if not present:
                 hint = (
                     "Cut it with recording.between(...), recording.stretches(ego) names its parts, or choose another."
                 )
                 raise InputError("egos", repr(ego), "is absent at some steps", hint)
             if not fix:
-                raise InputError("egos", repr(ego), "has no fix at step 0", "Cut the drive with fleet.between(...).")
+                raise InputError(
+                    "egos",
+                    repr(ego),
+                    "has no fix at step 0",
+                    "Cut the drive, or take the cooperative filter.",
+                )
         return cols
 
     def __repr__(self) -> str:

@@ -224,7 +224,7 @@ class Oracle:
         found: list[Any] = []
         for t in range(len(self.seen.t)):
             fix, u = self.seen.gnss[self.run, t, self.ego], self.seen.velocity[self.run, t, self.ego]
-            if np.isnan(u[0]) or (not self.state["belief"].names and np.isnan(fix[0])):
+            if np.isnan(u[0]) or not (self.state["belief"].names or self.places(t, fix, *self.heard(t)[1:])):
                 self.state, self.revoked = self.blank(), {}
                 found.append((np.full(3, np.nan), np.full((3, 3), np.nan), []))
                 continue
@@ -287,6 +287,22 @@ class Oracle:
         here = np.arange(self.box.start[t], self.box.start[t + 1])
         return here, self.seen.links.neighbour[self.box.link[here]].tolist()
 
+    def heard(self, t: int) -> tuple[list[int], dict[int, Any], dict[int, Floats]]:
+        """Neighbours of a step, the messages that are held, and what is measured."""
+        here, others = self.neighbours(t)
+        links = dict(zip(others, here.tolist(), strict=True))
+        relative = {j: self.seen.relative[self.run, self.box.link[link]] for j, link in links.items()}
+        return others, {j: self.message(link, j) for j, link in links.items()}, relative
+
+    def places(self, t: int, fix: Floats, messages: dict[int, Any], relative: dict[int, Floats]) -> list[Any]:
+        """Where the ego may be, and the variance: by its fix, and by each neighbour."""
+        found = [(fix.copy(), self.r[t, self.ego])] if np.isfinite(fix).all() else []
+        for j, message in messages.items():
+            if message is not None and np.isfinite(relative[j]).all() and message.weight.all():
+                late = (t - message.step) * self.seen.dt * message.velocity
+                found.append((message.mean + late - to_vector(relative[j]), 1 / message.weight + 1))
+        return found
+
     def message(self, link: int, j: int) -> Sent | None:
         """The newest one that is held."""
         s = int(self.box.newest[self.run, link])
@@ -317,11 +333,8 @@ class Oracle:
     def step(self, t: int, slip: float) -> None:
         self.state |= {"score": 0.0, "numbers": 0, "squares": 0.0}
         s, g, b, life = self.state, self.priors, self.state["belief"], self.life
-        here, others = self.neighbours(t)
+        others, messages, relative = self.heard(t)
         louder = self.louder(self.ego)
-        links = dict(zip(others, here.tolist(), strict=True))
-        messages = {j: self.message(link, j) for j, link in links.items()}
-        relative = {j: self.seen.relative[self.run, self.box.link[link]] for j, link in links.items()}
         fix = self.seen.gnss[self.run, t, self.ego].copy()
         if not b.names:
             b.add(("x", self.ego), 0.0, 0.0)
@@ -330,7 +343,7 @@ class Oracle:
             if life.bias + life.heading + life.offset:
                 b.add(("compass",), 0, [life.bias, 0, life.offset])
             self.add_turn(self.ego)
-            s["slot"][self.ego] = 0
+            s["slot"][self.ego], s["began"] = 0, t
             s["trusted"].add(self.ego)
             again = self.start(t, fix, messages, relative)
         else:
@@ -517,18 +530,13 @@ class Oracle:
             s["belief"].add(("b", j), 0.0, TAU**2 + self.life.own)
 
     def start(self, t: int, fix: Floats, messages: dict[int, Any], relative: dict[int, Floats]) -> bool:
-        """The ego at its fix, or where two messages put it that contradict the fix."""
+        """The ego at its fix, or where two messages put it that contradict the fix, or, without one, most."""
         s, g, b = self.state, self.priors, self.state["belief"]
-        places = [(fix.copy(), self.r[t, self.ego])]
-        for j, message in messages.items():
-            if message is not None and np.isfinite(relative[j]).all():
-                late = (t - message.step) * self.seen.dt * message.velocity
-                if message.weight.all():
-                    places.append((message.mean + late - to_vector(relative[j]), 1 / message.weight + 1))
-        votes = [1]
+        places, votes = self.places(t, fix, messages, relative), [1]
         if g.fix_gate:
             votes = [sum(((x - y) ** 2 / (p + q)).sum() <= g.fix_gate for y, q in places) for x, p in places]
         best = int(np.argmax(votes))
+        elsewhere = np.isnan(fix[0]) or (votes[0] <= 1 and max(votes) >= 2)
         if self.ego not in s["trusted"] and votes[0] < max(len(votes), 2):
             return False
         b.drop(("b", self.ego))
@@ -536,7 +544,7 @@ class Oracle:
         if self.life.own:
             b.add(("b", self.ego), 0, self.life.own)
         b.noise(("x", self.ego), FLAT)
-        b.x[b.at(("x", self.ego))] = places[best if votes[0] <= 1 else 0][0]
+        b.x[b.at(("x", self.ego))] = places[best if elsewhere else 0][0]
         s["joined"][self.ego], s["hits"]["fix"] = t, 0
         s["locked"].pop(self.ego, None)
         if s["left"]:
@@ -546,7 +554,7 @@ class Oracle:
         s["trusted"].add(self.ego)
         s["mean"].pop(self.ego, None)
         s["vague"].add(self.ego)
-        if votes[0] <= 1 and max(votes) >= 2:
+        if elsewhere:
             fix[:] = np.nan
             s["vague"].discard(self.ego)
         return True
@@ -581,7 +589,8 @@ class Oracle:
         changed = (ACCELERATION * max(t - since, 1) * dt) ** 2
         strange = ((u - last) ** 2 / ((q + variance) / dt**2 + changed)).sum()
         if g.forget:
-            louder[j] = max(louder.get(j, 1.0) * (1 + (min(strange, WIDEST) / 3 - 1) / min(t + 1, CHANGES)), 1.0)
+            seen = min(t - self.state["began"] + 1, CHANGES)
+            louder[j] = max(louder.get(j, 1.0) * (1 + (min(strange, WIDEST) / 3 - 1) / seen), 1.0)
         if g.slip * (self.known.sensors is not None) and g.fix_gate and strange > WILD and slips < 5:
             self.state["pace"][j] = last, since, variance, slips + 1
             return last, variance + changed * dt**2

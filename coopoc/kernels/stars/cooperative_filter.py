@@ -62,9 +62,9 @@ from .cooperative_state import (
     Sent,
     begin,
     copy_filter,
+    is_placed,
     measured_whole,
     new_filter,
-    pause,
 )
 from .gaussian import (
     COMPASS,
@@ -119,7 +119,7 @@ def run_filter(
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; weights of the ego's fix (R, T), and by link
     (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the neighbour is trusted.
 
-    A vehicle that is absent (a velocity of NaN) starts anew.
+    NaN until a fix, or what a neighbour sends and the ego measures of it, shows where the ego is.
 
     Args:
         measurements: measurements and messages of the ego.
@@ -131,9 +131,9 @@ def run_filter(
     links, most = measurements.relative.shape[1], 0
     for t in range(steps):
         most = max(most, measurements.start[t + 1] - measurements.start[t])
-    x, cov, fixes = np.empty((runs, steps, 3)), np.empty((runs, steps, 3, 3)), np.empty((runs, steps))
-    neighbours, notes = np.empty((runs, links, 3)), np.empty((runs, links, 5))
-    deviations = np.zeros((runs, steps, FOUND))
+    x, cov = np.full((runs, steps, 3), math.nan), np.full((runs, steps, 3, 3), math.nan)
+    fixes, deviations = np.full((runs, steps), math.nan), np.full((runs, steps, FOUND), math.nan)
+    neighbours, notes = np.full((runs, links, 3), math.nan), np.full((runs, links, 5), math.nan)
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
     for run in range(runs):
         f, tries = new_filter(1 + most, vehicles), new_tries(1 + most, vehicles)
@@ -144,11 +144,9 @@ def run_filter(
             for i in range(count):
                 who[i] = measurements.neighbour[first + i]
                 gather_neighbour(rows, measurements, assumed, sent, run, t, first + i, i)
-            if math.isnan(own[MOTION]) or (f.g.vectors[0] == 0 and math.isnan(own[FIX])):
-                pause(f, own[DT])
-                x[run, t], cov[run, t] = math.nan, math.nan
-                continue
             if f.g.vectors[0] == 0:
+                if not is_placed(own, rows, count):
+                    continue
                 begin(f, model, own, rows, count, measurements.ego)
             step(f, tries, model, own, rows, who, count)
             fixes[run, t] = f.member[0, OUT + 3]

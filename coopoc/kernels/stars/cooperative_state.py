@@ -245,14 +245,15 @@ def insert_turn(g: Gaussian, model: Model, k: int) -> None:
 
 @part
 def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> bool:
-    """The ego stands somewhere near its fix, which is trusted.
+    """The ego stands somewhere near its fix, which is trusted, or, without one, where most neighbours see it.
 
     Where no other position, of a message less its vector, agrees with the fix, but two or more do with one another, the
     fix is not used. Of an ego that is not trusted all must agree with the fix: two that multipath displaced do so by
     chance; else nothing is changed, and False returned.
     """
-    best, most, heard, own_votes, g, ego = ABSENT, 1, 0, 0, f.g, f.who[0, VEHICLE]
-    for i in range(-1, count if model.fix_gate > 0.0 else -1):
+    blind, best, heard, own_votes, g, ego = math.isnan(own[FIX]), ABSENT, 0, 0, f.g, f.who[0, VEHICLE]
+    most = 0 if blind else 1
+    for i in range(-1, count if model.fix_gate > 0.0 or blind else -1):
         agree = 0
         for j in range(-1, count):
             agree += mahalanobis2(own, rows, i, j) <= model.fix_gate
@@ -313,17 +314,12 @@ def needs_restart(f: Filter, model: Model, own: Floats) -> bool:
 
 
 @part
-def pause(f: Filter, dt: float) -> None:
-    """The ego is absent: it starts anew at its next fix."""
-    for k in range(f.g.vectors[0]):
-        clear(f.g, 3 * k)
-    f.g.vectors[0], f.who[0, HITS] = 0, 0
-    for c in range(SLIPPING, LEVEL):
-        f.ego[c] = 0.0
-    for kind in range(KINDS):
-        f.g.block[0, kind] = ABSENT
-    f.ego[STEPS] += 1
-    f.ego[CLOCK] += dt
+def is_placed(own: Floats, rows: Floats, count: int) -> bool:
+    """Whether a fix, or what a neighbour sends and the ego measures of it, shows where the ego is."""
+    for i in range(count):
+        if rows[i, AGE] >= 0.0 and measured_whole(rows, i) and math.isfinite(seen_from(rows, i, 0)):
+            return True
+    return math.isfinite(own[FIX])
 
 
 @part

@@ -35,6 +35,7 @@ from .cooperative_state import (
     Model,
     begin,
     copy_filter,
+    is_placed,
     new_filter,
 )
 from .gaussian import PLACE
@@ -107,8 +108,8 @@ def stream_step(
     vehicles: Ints,
     start: Floats,
     answer: Floats,
-) -> None:
-    """One step.
+) -> bool:
+    """One step; False, and nothing changed, where nothing shows yet where the ego is.
 
     Args:
         f: filter.
@@ -121,6 +122,8 @@ def stream_step(
         answer: (12 + 3 k,) out: position m, covariance m^2, positions of the neighbours m.
     """
     if f.g.vectors[0] == 0:
+        if not (is_placed(own, rows, len(vehicles)) or math.isfinite(start[0])):
+            return False
         begin(f, model, own, rows, len(vehicles), 0)
         if math.isfinite(start[0]):
             f.ego[STEPS], f.member[0, EXTRA_VARIANCE] = 1, 0.0
@@ -133,6 +136,7 @@ def stream_step(
         k = f.slot[vehicles[i]]
         for c in range(3):
             answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c]
+    return True
 
 
 @compiled
