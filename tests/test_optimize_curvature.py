@@ -8,6 +8,7 @@ from oracles.whitened import hessian
 
 from coopoc.optimize import Problem, SolveError, Status, backends, solve
 from coopoc.optimize.assess.assess import newton_decrease
+from coopoc.optimize.starts import race
 
 
 def tangle(seed: int) -> Problem:
@@ -44,11 +45,12 @@ def between_two() -> Problem:
 @pytest.mark.parametrize("backend", sorted(set(backends()) - {"cvxpy"}))
 def test_a_saddle_is_not_solved(backend: str) -> None:
     problem = between_two()
+    freely = solve(problem, backend)  # without an x0 its start is left, to one side or the other
+    assert freely.notes[0] == race.ELSEWHERE
+    problem = replace(problem, x0=problem.factors[0].z)
     stuck = solve(problem, backend, throw=False)
     assert stuck.status is Status.SADDLE
     assert np.linalg.eigvalsh(hessian(problem, stuck.x)).min() < -0.1
     with pytest.raises(SolveError, match="to the side"):
         solve(problem, backend)
-    aside = solve(replace(problem, x0=stuck.x + np.outer([1, 0, 0], [0, 1, 1])), backend)
-    assert aside.status is Status.SOLVED
-    assert aside.cost < stuck.cost / 100
+    assert freely.cost < stuck.cost / 100

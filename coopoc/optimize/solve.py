@@ -16,12 +16,13 @@ from .assess.active import constraint_rows
 from .assess.assess import Assessment, assess, is_constrained_minimum, judged, newton_decrease
 from .backend import MAX_ITERATIONS, Backend, Options, require_backend
 from .model.factor import fused
+from .model.measurements import is_converted
 from .model.problem import Problem
 from .robust.graduated import robust_start
 from .solution import Solution, SolveError, Status
 from .starts.initial import guessed, somewhere
 from .starts.mirrors import scaled
-from .starts.race import race
+from .starts.race import ELSEWHERE, race
 
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
@@ -97,12 +98,13 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     began = clock()
     solver = backend.solver(problem, options)
     start, placed = _start(problem)
-    if not placed and not problem.constraints:
+    whole = placed and all(f.measurement.linear or is_converted(f.measurement) for f in problem.factors)
+    if problem.x0 is None and not whole and not problem.constraints:
         problem = _unplaced(problem, start)
         assert problem.x0 is not None
         start = problem.x0
     built, earlier = clock(), problem.search.seconds
-    if any(f.loss is not None and not f.loss.convex for f in problem.factors):
+    if any(f.loss is not None and (not f.loss.convex or problem.x0 is None) for f in problem.factors):
         problem = robust_start(problem, start)
         assert problem.x0 is not None
         start = problem.x0
@@ -135,7 +137,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
         space=problem.space,
         violation=truth.violation,
         expected=expected,
-        notes=(*search.notes, *notes),
+        notes=(*(note for note in search.notes if not truth.unobservable or note != ELSEWHERE), *notes),
         extras=result.extras | violated | (search.extras if search.start else {}),
     )
 
@@ -151,7 +153,7 @@ def _unplaced(problem: Problem, start: Floats) -> Problem:
 
     starts = {"converted": lambda: start, "scaled": lambda: scaled(problem, start)}
     began = clock()
-    problem, won = race(problem, starts, {"relaxed": relaxed}, lambda x: False)
+    problem, won = race(problem, starts, {"relaxed": relaxed}, lambda x: False, draws=True)
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 

@@ -177,7 +177,7 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
     if problem.constraints:
         return problem
     steps, factors = 0, problem.factors
-    robust = {k: f.loss for k, f in enumerate(factors) if f.loss is not None and not f.loss.convex}
+    robust = {k: f.loss for k, f in enumerate(factors) if f.loss is not None}
     bare = tuple(unchecked(f, loss=None) if k in robust else f for k, f in enumerate(factors))
     marked = mark(problem.replace_unchecked(factors=bare), list(robust))
     bound = np.array([robust[k].scale ** 2 for k in marked.factor.tolist()])

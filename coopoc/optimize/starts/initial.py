@@ -40,7 +40,7 @@ def guessed(problem: Problem) -> tuple[Floats, bool]:
     if problem.x0 is not None:
         return problem.x0.copy(), True
     if problem.poses:
-        raise InputError("x0", "none", "is needed where there are poses", "Give poses: coopoc.optimize.pose, or chain.")
+        raise InputError("x0", "none", "is needed where there are poses", "Give coopoc.optimize.pose(position, angle).")
     x, touched = _solution(sparse(problem), "converted")
     return (x if touched else _apart(problem, x)), touched
 

@@ -9,10 +9,13 @@ from typing import NamedTuple
 import numpy as np
 
 from ...arrays import Bools, Floats, Ints
-from ..model.factor import Loss
+from ..assess.assess import squared
+from ..model.factor import Factor, Loss
 from ..model.problem import Problem
 from .graph_starts import parts
 
+RANGES = "range", "range_offset"
+"""Kinds of which the first two nodes are apart by z, or by z less the first coordinate of a third."""
 LARGEST = 2000
 """Nodes up to which all shortest paths are taken."""
 SUBSETS = 60
@@ -49,28 +52,41 @@ class Ranges(NamedTuple):
         return np.asarray(0.5 * square.sum(axis=0))
 
 
-def ranges_of(problem: Problem) -> Ranges:
-    """All ranges of a problem that have weight."""
-    factors = [f for f in problem.factors if f.kind == "range"]
+def ranges_of(problem: Problem, x: Floats) -> Ranges:
+    """All ranges of a problem that have weight; offsets are those of x (n, ambient)."""
+    factors = [f for f in problem.factors if f.kind in RANGES]
     own = np.repeat(np.arange(len(factors)), [len(f.nodes) for f in factors])
-    nodes = np.concatenate([np.empty((0, 2), np.int64), *(f.nodes for f in factors)])
+    nodes = np.concatenate([np.empty((0, 2), np.int64), *(f.nodes[:, :2] for f in factors)])
     distance, weight = (
         np.concatenate([np.empty(0), *parts_])
-        for parts_ in ([f.z[:, 0] for f in factors], [f.root[:, 0, 0] for f in factors])
+        for parts_ in (
+            [f.z[:, 0] - x[f.nodes[:, 2:], 0].sum(axis=1) for f in factors],
+            [f.root[:, 0, 0] for f in factors],
+        )
     )
     return Ranges(nodes, distance, weight, tuple((own == k, f.loss) for k, f in enumerate(factors)))
 
 
-def bodies(problem: Problem) -> list[Ints]:
+def bodies(problem: Problem, x: Floats) -> list[Ints]:
     """Nodes that ranges alone place, as what else is measured joins them: landmarks, points, robots with their
-    odometry."""
-    others = [f.nodes[f.informative] for f in problem.factors if f.kind != "range"]
+    odometry; at x (n, ambient), where robust losses may reject what would place others."""
+    others = [f.nodes[f.informative] for f in problem.factors if f.kind not in RANGES]
     part = parts(len(problem.names), *(n[:, k : k + 2] for n in others for k in range(n.shape[1] - 1)))
-    held = np.concatenate([np.array(problem.fixed, np.int64), *(n[:, 0] for n in others if n.shape[1] == 1)])
+    held = np.concatenate([np.array(problem.fixed, np.int64), *(_accepted(problem, f, x) for f in problem.factors)])
     loose = np.setdiff1d(part, part[held])
     order = np.argsort(part, kind="stable")
     groups = np.split(order, np.flatnonzero(np.diff(part[order])) + 1)
     return [group for group in groups if part[group[0]] in loose]
+
+
+def _accepted(problem: Problem, factor: Factor, x: Floats) -> Ints:
+    """Nodes that a factor of one node each holds at x."""
+    kept = factor.informative
+    if factor.nodes.shape[1] > 1:
+        return np.empty(0, np.int64)
+    if factor.loss is not None:
+        kept = kept & (squared(problem, factor, x) <= factor.loss.scale**2)
+    return np.asarray(factor.nodes[kept, 0])
 
 
 def scaled(problem: Problem, x: Floats) -> Floats:
@@ -82,30 +98,33 @@ def scaled(problem: Problem, x: Floats) -> Floats:
     """
     from scipy.sparse.csgraph import shortest_path
 
-    ranges, n, d = ranges_of(problem), len(x), x.shape[1]
-    loose = np.concatenate([np.empty(0, np.int64), *bodies(problem)])
-    anchored = np.setdiff1d(np.arange(n), loose)
-    if n > LARGEST or not len(loose):
+    ranges, (n, d) = ranges_of(problem, x), x.shape
+    moved = [f for f in problem.factors if f.kind == "displacement"]
+    loose = np.concatenate([np.empty(0, np.int64), *bodies(problem, x)])
+    if n > LARGEST or not len(loose) or not len(ranges.nodes):
         return x
-    table, (row, column) = np.full((n, n), np.inf), ranges.nodes.T
-    np.minimum.at(table, (row, column), ranges.distance)
-    for f in problem.factors:
-        if f.kind == "displacement":
-            np.minimum.at(table, tuple(f.nodes.T), np.linalg.norm(f.z, axis=1))
-    apart = np.linalg.norm(x[anchored, None] - x[anchored], axis=2)
-    table[np.ix_(anchored, anchored)] = np.where(apart > 0, apart, np.inf)
-    square = np.square(shortest_path(np.minimum(table, table.T), directed=False))
+    table = np.full((n, n), np.inf)
+    np.minimum.at(table, tuple(ranges.nodes.T), np.maximum(ranges.distance, 0.0))
+    for f in moved:
+        np.minimum.at(table, tuple(f.nodes.T), np.linalg.norm(f.z, axis=1))
+    placed = np.unique(np.concatenate([ranges.nodes, *(f.nodes for f in moved)]))  # no offset is
+    fixed = np.setdiff1d(placed, loose)
+    apart = np.linalg.norm(x[fixed, None] - x[fixed], axis=2)
+    table[np.ix_(fixed, fixed)] = np.where(apart > 0, apart, np.inf)
+    table, anchored = np.minimum(table, table.T)[np.ix_(placed, placed)], np.isin(placed, fixed)
+    square = np.square(shortest_path(table, directed=False))
     if not np.isfinite(square).all():
         return x
     square -= square.mean(axis=0)
     values, vectors = np.linalg.eigh(-0.5 * (square - square.mean(axis=1, keepdims=True)))
-    y = vectors[:, -d:] * np.sqrt(np.maximum(values[-d:], 0.0))
-    if len(anchored):
-        middle, origin = x[anchored].mean(axis=0), y[anchored].mean(axis=0)
-        left, _, right = np.linalg.svd((x[anchored] - middle).T @ (y[anchored] - origin))
+    y = np.pad(vectors * np.sqrt(np.maximum(values, 0.0)), ((0, 0), (d, 0)))[:, -d:]
+    if len(fixed):
+        middle, origin = x[fixed].mean(axis=0), y[anchored].mean(axis=0)
+        left, _, right = np.linalg.svd((x[fixed] - middle).T @ (y[anchored] - origin))
         y = (y - origin) @ (left @ right).T + middle
-    y[anchored] = x[anchored]
-    return np.asarray(y)
+    found = x.copy()
+    found[placed[~anchored]] = y[~anchored]
+    return found
 
 
 def crossings(places: Floats, ranges: Floats) -> Floats:
@@ -232,11 +251,12 @@ def across(
         descend: from a point to a minimum.
         cost: of a point.
     """
-    ranges, loose, least, count = ranges_of(problem), bodies(problem), cost(x), 0
+    ranges, loose, least, count = ranges_of(problem, x), bodies(problem, x), cost(x), 0
     if len(loose) == len(problem.names) or not len(ranges.nodes):  # nothing to mirror at
         loose = loose if len(loose) > 1 else []
     rivals, single = list[float](), list[Move]()
     while count < ROUNDS:
+        ranges = ranges_of(problem, x)
         single = sorted(
             (move for body in loose for move in _elsewhere(problem, ranges, x, body)), key=lambda move: move[0]
         )

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
 
@@ -12,7 +12,7 @@ from ..assess.assess import expected
 from ..descent.levenberg_marquardt import BROKEN, Arrival, arrive
 from ..model.factor import Factor, unchecked
 from ..model.problem import Problem, Search
-from .mirrors import across
+from .mirrors import RANGES, across
 
 STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
@@ -29,6 +29,9 @@ MORE = 50
 """Steps before it is judged."""
 RIVAL = 10.0
 """Cost by which another minimum may be higher and still be the truth's: 1e-5 of chi-square with one degree."""
+DRAWS, QUIET, POINTS = 90, 30, 1800
+"""Random starts at most, if the first lead to no other minimum of about the cost, and as many points together."""
+ELSEWHERE = "another minimum, elsewhere, costs as much"
 EASED = (30.0, 10.0, 3.0, 1.0)
 """Times as large standard deviations of ranges."""
 
@@ -39,6 +42,7 @@ def race(
     late: Mapping[str, Callable[[Problem], tuple[Floats, int]]],
     unwound: Callable[[Floats], bool],
     grown: str = "",
+    draws: bool = False,
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
@@ -47,13 +51,15 @@ def race(
     an end that is `unwound` or to which another led as smoothly. Where the noise does not explain the end, by a cost
     far above or below its mean, and the steps to it had trouble, the late starts are tried, one after the other, unless
     a second start led there. Where the steps went straight the noise is taken as stated too small, which a note of the
-    Solution leaves open. What ranges alone place is mirrored at last.
+    Solution leaves open. At last random starts around the end are tried, and what ranges alone place is mirrored.
 
     Args:
         problem: at any start.
         starts: name -> x0 (n, ambient), cheapest first.
         late: name -> a function of the problem at the best end so far, of x0 and the iterations that it took.
         unwound: x -> whether no other minimum of a lower cost is to be feared.
+        grown: which of the late starts is tried first where no other went straight.
+        draws: whether points are started from random places, too.
     """
     system, tried, taken, calm = sparse(problem), {}, 0, list[float]()
     mean, variance = expected(problem, system.size)
@@ -71,11 +77,25 @@ def race(
         return arrived and bool(abs(system.cost(x) - mean) <= usual)
 
     def ended(name: str, x: Floats) -> tuple[Problem, Search]:
+        ends, least, most = list[tuple[float, Floats]](), system.cost(x), QUIET
+        for k, away in enumerate(_away(problem, x) if draws else ()):
+            if k >= most:
+                break
+            y = descend(x + away)
+            cost = system.cost(y)
+            if arrived and cost < least + RIVAL:
+                ends.append((cost, y))
+                most = most if abs(cost - least) <= SAME * least else DRAWS
+                if cost < (1.0 - SAME) * least:
+                    name, x, least = "drawn", y, cost
         x, moves, rivals, doubtful = across(problem, x, descend, system.cost)
         name, cost = name + ", mirrored" * (moves > 0), system.cost(x)
-        near = [each for each in (*rivals, *minima) if (1.0 + SAME) * cost < each < cost + RIVAL]
+        others = *rivals, *minima, *(each for each, _ in ends)
+        near = [each for each in others if (1.0 + SAME) * cost < each < cost + RIVAL]
         notes = (f"another minimum costs {min(near) - cost:.3g} more: noise may decide between them",) if near else ()
-        if doubtful and not near:
+        if any(c <= (1.0 + SAME) * cost and np.abs(y - x).max() > SAME * np.abs(x).max() for c, y in ends):
+            notes = *notes, ELSEWHERE
+        elif doubtful and not near:
             names = ", ".join(problem.names[body[0]] for body in doubtful[:5])
             notes = (f"ranges hardly distinguish {names} from a mirror image: a lower minimum may exist",)
         return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
@@ -132,13 +152,29 @@ def race(
     return ended(name, x)
 
 
+def _away(problem: Problem, x: Floats) -> Iterator[Floats]:
+    """Random moves of points (n, d) as far as these are from one another: of all of them, across the plane or line that
+    they are nearest to, and of one."""
+    rng, (n, d), free = np.random.default_rng(0), x.shape, np.ones((len(x), 1))
+    free[list(problem.fixed)] = 0.0
+    around = x - x.mean(axis=0)
+    spread, (*_, thin) = np.sqrt(d * np.square(around).mean()), np.linalg.svd(around)[2]
+    for k in range(min(DRAWS, POINTS // n)):
+        away = spread * rng.normal(size=(n, d)) * free
+        if k % 2:
+            away[np.arange(n) != rng.integers(n)] = 0.0
+        elif k % 4:
+            away = np.outer(away @ thin, thin)
+        yield away
+
+
 def eased(problem: Problem, start: Floats) -> tuple[Floats, int]:
     """Nodes (n, ambient) and iterations from where ranges with larger standard deviations lead, and then smaller ones:
     at first odometry decides."""
     x, taken = start, 0
     for times in EASED:
         part = problem.replace_unchecked(
-            factors=tuple(weaker(f, times) if f.kind == "range" else f for f in problem.factors)
+            factors=tuple(weaker(f, times) if f.kind in RANGES else f for f in problem.factors)
         )
         end = arrive(sparse(part), x, STEPS, TOLERANCE)
         x, taken = end.x, taken + end.iterations
