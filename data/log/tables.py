@@ -16,6 +16,8 @@ from ..cells import TABLES, USUAL, filled, headers, missing_column, named_column
 from .units import KINDS, Rows, Summary, in_group, rows_of
 
 LONG = ("t", "vehicle", "kind", "partner", "value", "std", "arrival")
+UNITS = {"m", "cm", "mm", "rad", "deg", "rate", "raw"}
+"""Behind the name of a kind, these are no partners."""
 OF_FLEETS = {"id", "t", "x", "y", "z", "vx", "vy", "vz"}
 """Columns of a table of drives."""
 OF_LOGS = (
@@ -72,7 +74,7 @@ def read_log_table(
         frame = frame.assign(vehicle=path.stem)
     read = _long if "kind" in frame.columns else _wide
     rows = rows_of(read(frame, file, summary, kinds, ignore), file)
-    if "partner" not in frame.columns and in_group(rows, "relative").any():
+    if "partner" not in frame.columns and (in_group(rows, "relative") & rows["partner"].eq("")).any():
         raise missing_column(file, "partner", list(frame.columns), "is needed")
     return rows
 
@@ -102,7 +104,8 @@ def _wide(
     frame = frame.rename(columns={**kinds, **{f"{name}_std": f"{kind}_std" for name, kind in kinds.items()}})
     value = {kind: "arrival" if kind == "message" else kind for kind in KINDS if kind not in ignore}
     value = {kind: column for kind, column in value.items() if column in frame.columns}
-    if not value:
+    beside = {} if "partner" in frame else {column: found for column in frame if (found := _of_partner(column))}
+    if not (value or beside):
         allowed = f"must be there, or columns named after kinds ({', '.join(KINDS)})"
         error = missing_column(file, "kind", list(frame.columns), allowed)
         hint = f'{error.hint} Or name the columns: kinds={{"...": "speed_kmh"}}.'
@@ -110,15 +113,28 @@ def _wide(
     if "std" in frame.columns and {KINDS[kind].group for kind in value} == {"fix"}:
         summary.assume(f"column std of {file} is the standard deviation of each of {', '.join(value)}")
         frame = frame.assign(**{f"{kind}_std": frame["std"] for kind in value}).drop(columns="std")
-    used = ["t", "vehicle", "partner", *value.values(), *(f"{kind}_std" for kind in value)]
+    used = ["t", "vehicle", "partner", *value.values(), *(f"{name}_std" for name in (*value, *beside)), *beside]
     for column in frame.columns.difference(used, sort=False):
         near = next((key for key, usual in USUAL.items() if column.lower() in usual.split()), "")
         like = f"Did you mean {near}?" if near else suggestion(column, (*LONG, *KINDS), "")
         if column == "std":
             like = f"which belongs to no kind (name it {next(iter(value))}_std)"
         summary.leave(f"{file}: column {column}{', ' * bool(like)}{like}", len(frame))
-    parts = (frame[filled(frame[column])].assign(kind=kind) for kind, column in value.items())
-    return pd.concat([_cells(part, file, kind, f"{kind}_std") for part, kind in zip(parts, value, strict=True)])
+    parts = [_cells(frame[filled(frame[c])].assign(kind=kind), file, kind, f"{kind}_std") for kind, c in value.items()]
+    for column, (kind, partner) in beside.items():
+        if kind not in ignore:
+            part = frame[filled(frame[column])].assign(kind=kind, partner=partner)
+            parts.append(_cells(part, file, column, f"{column}_std"))
+    return pd.concat(parts)
+
+
+def _of_partner(column: str) -> tuple[str, str] | None:
+    """Kind and partner of a column such as range_car2 or azimuth_deg_car2; None for another."""
+    kinds = [kind for kind in KINDS if KINDS[kind].group == "relative" and column.startswith(f"{kind}_")]
+    kind = max(kinds, key=len, default="")
+    partner = column[len(kind) + 1 :]
+    known = not kind or column in KINDS or partner in UNITS or column.endswith("_std")
+    return None if known else (kind, partner)
 
 
 def _cells(frame: pd.DataFrame, file: str, value: str, std: str) -> pd.DataFrame:
