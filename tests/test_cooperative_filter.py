@@ -254,6 +254,7 @@ BAD: dict[str, tuple[Sensors, V2X, Callable[[Recording], Recording]]] = {
     "nothing": (S2, CHANNELS["ideal"], lambda r: r),
     "ranges": (S2, CHANNELS["ideal"], lambda r: too_long(r, 0.2)),
     "late": (S2, CHANNELS["slow"], lambda r: r),
+    "mirrored": (replace(S2, gnss_std=(1.0,) * 3), CHANNELS["late"], lambda r: mirrored(r)),
     "tunnel": (S2, CHANNELS["late"], lambda r: tunnel(r)),
     "lost": (S2, V2X(6, loss=0.3), lambda r: r),
     "measured": (S2, V2X(6, loss=0.1, latency=0.1), lambda r: replace(r, notes=(f"fixes: {MEASURED}",))),
@@ -274,6 +275,13 @@ BAD: dict[str, tuple[Sensors, V2X, Callable[[Recording], Recording]]] = {
 }
 
 
+def mirrored(recording: Recording) -> Recording:
+    """Ranges in another unit, azimuths of another sign; a fix of the ego each second."""
+    gnss = recording.gnss.copy()
+    gnss[:, np.arange(len(recording.t)) % 10 > 0, 0] = np.nan
+    return replace(recording, gnss=gnss, relative=recording.relative * [3.0, -1.0, 1.0])
+
+
 def tunnel(recording: Recording) -> Recording:
     """At first nobody has a fix, then for a while all but the ego."""
     gnss = recording.gnss.copy()
@@ -292,6 +300,7 @@ def test_the_filter_is_its_oracle(crossing: Fleet, case: str, priors: Priors) ->
     assert track.covariance is not None
     assert track.neighbours is not None
     assumed = ON_ROADS if seen.measured and priors == Priors() else priors
+    assert (track.extras["alone"] > 0).any() == (case == "mirrored" and priors == Priors())
     for run in range(2):
         x, cov, others = Oracle(seen, 0, run, known, assumed).loop()
         assert_allclose(track.x[run, :, 0], x, atol=1e-6)
@@ -300,7 +309,7 @@ def test_the_filter_is_its_oracle(crossing: Fleet, case: str, priors: Priors) ->
             assert_allclose(track.neighbours[run][-len(np.concatenate(others)) :], np.concatenate(others), atol=2e-6)
 
 
-@pytest.mark.parametrize("case", ["late", "tunnel", "lost", "attack", "measured", "displaced, late"])
+@pytest.mark.parametrize("case", ["late", "mirrored", "tunnel", "lost", "attack", "measured", "displaced, late"])
 def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
     """A stream has no recording: each vehicle's broadcast of a step is that of a stream of its own."""
     sensors, v2x, change = BAD[case]

@@ -31,9 +31,10 @@ FOUND = {
     "compass error": "rad",
     "range offset": "m",
     "slips": "of the steps",
+    "alone": "of the steps, as what is measured of its neighbours contradicts its fixes",
 }
 LEVELS = ("range", "azimuth", "inclination", "fix", "message", "motion")
-NOTED = (0.01, 0.01, 0.01, 0.1, 0.01)
+NOTED = (0.01, 0.01, 0.01, 0.1, 0.01, 0.0)
 """Least of what is found that is worth a note."""
 LOUD = 1.5
 """Level that is worth a note, or less than its inverse."""
@@ -126,6 +127,8 @@ class CooperativeFilter(Checked):
       prior, and the estimate is the average over whether it is 0, by Bayes' rule (`kernels.stars.otherwise`).
     - *Slips*: a step whose numbers surprise is tried again with a motion that is not known, and the likelier of both
       is kept (`kernels.stars.otherwise`).
+    - *The star*: an ego whose fixes and whose star contradict each other goes on alone for a while, where no noise
+      explains what is measured of its neighbours.
     - *Starts*: at a fix, or where a neighbour that sends a position is measured whole, range and both angles.
     - *Messages* hold a fading mean of the sender's fixes, its weight, the odometer and the velocity. The mean of the
       fixes between any two of them follows: a lost message loses nothing, and no fix counts twice.
@@ -175,10 +178,10 @@ class CooperativeFilter(Checked):
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.
 
         `extras` hold what is found to be otherwise than assumed, (R, T, E) each: the ego's "heading_error" and
-        "compass_error" rad, "scale_error" and "range_offset" m; whether it "slips"; "range_level" and so on, factors of
-        standard deviations. And the weights, 1 for a number that was believed, of each ego's "fix" (R, T, E) and by
-        link (R, L) of "range", "azimuth", "inclination" and "message", NaN where there was none, and whether it is
-        "trusted".
+        "compass_error" rad, "scale_error" and "range_offset" m; whether it "slips", or is "alone"; "range_level" and so
+        on, factors of standard deviations. And the weights, 1 for a number that was believed, of each ego's "fix"
+        (R, T, E) and by link (R, L) of "range", "azimuth", "inclination" and "message", NaN where there was none, and
+        whether it is "trusted".
         """
         noise_model = resolve(self.noise_model, check_recording(recording))
         priors = priors_of(self, noise_model, recording.measured)
@@ -249,19 +252,19 @@ def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float]
 
     Args:
         ego: its name.
-        found: (R, T, 11) errors that last, whether it slips, and levels.
+        found: (R, T, 12) errors that last, whether it slips, whether it is alone, and levels.
         fix: factor of the stated deviation of fixes that was assumed.
         stated: deviations of the errors of the compass, rad, and of ranges, m: no more than these is worth no note.
 
-    >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0, 1.0]]]))
+    >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0, 1.0]]]))
     ['scale error, a: 0.02', 'fix level, a: 3 times the stated deviation']
     """
     found = found[:, np.isfinite(found[..., 4]).any(axis=0)]  # from where it knows where it is
     late = found[:, found.shape[1] // 2 :]
     usual = np.sqrt(np.nanmean(np.square(late), axis=(0, 1)))
-    usual[4] = np.nanmean(found[..., 4])
-    usual[8:10] *= fix
-    least = np.maximum(NOTED, (0.0, 0.0, *stated, 0.0))
+    usual[4:6] = np.nanmean(found[..., 4:6], axis=(0, 1))
+    usual[9:11] *= fix
+    least = np.maximum(NOTED, (0.0, 0.0, *stated, 0.0, 0.0))
     notes = [
         f"{name}, {ego}: {value:.2g} {unit}".rstrip()
         for (name, unit), value, most in zip(FOUND.items(), usual, least, strict=False)

@@ -244,9 +244,9 @@ class StarStream:
             self._copy(max(len(before.who), 2 * slots), vehicles)
 
     def _copy(self, slots: int, vehicles: int) -> None:
-        before = self._filter
+        before = self._filter, self._tries
         self._filter, self._tries = make_filter(slots, vehicles)
-        restore(before, self._filter)
+        restore(*before, self._filter, self._tries)
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Arrays that share memory have come apart in the pickle."""

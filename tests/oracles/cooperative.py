@@ -179,10 +179,12 @@ class Oracle:
         shape = seen.gnss.shape
         self.r = priors.fix**2 * np.broadcast_to(known.fix_variance(seen), shape)[run]
         self.remember(seen.gnss[run], seen.velocity[run])
-        self.revoked: dict[int, int] = {}
+        self.revoked: dict[int, int]
+        self.lone: Any
         self.box = inbox(seen, ego, FIX_AND_VELOCITY)
         self.q = heard(seen, self.box, known, run, ego)
-        self.state = self.blank()
+        self.deaf = False
+        self.reset()
 
     def remember(self, gnss: Floats, velocity: Floats) -> None:
         """What every vehicle sends: a mean of its fixes, each of which fades with its age."""
@@ -194,6 +196,10 @@ class Oracle:
             m, o = m + moved, o + moved
             m = np.where(there, m + (z - m) / np.where(there, self.r[t] * w, 1.0), m)
             self.mean[t], self.weight[t], self.odometer[t] = m, w, o
+
+    def reset(self) -> None:
+        self.state, self.revoked, self.lone = self.blank(), {}, None
+        self.doubts, self.left, self.last = np.zeros(2), 0.0, 0.0
 
     def blank(self) -> dict[str, Any]:
         empty: dict[str, Any] = {
@@ -225,19 +231,55 @@ class Oracle:
         for t in range(len(self.seen.t)):
             fix, u = self.seen.gnss[self.run, t, self.ego], self.seen.velocity[self.run, t, self.ego]
             if np.isnan(u[0]) or not (self.state["belief"].names or self.places(t, fix, *self.heard(t)[1:])):
-                self.state, self.revoked = self.blank(), {}
+                self.reset()
                 found.append((np.full(3, np.nan), np.full((3, 3), np.nan), []))
                 continue
+            if not self.state["belief"].names:
+                self.begin(t)
+            if self.priors.forget and self.lone is None and self.neighbours(t)[1]:
+                self.lone = copy.deepcopy((self.state, self.revoked))
             self.tries(t)
-            true = self.state["belief"]
-            b = copy.deepcopy(true)
-            self.average(b)
-            x = b.at(("x", self.ego))
-            self.state["cov"] = np.diag(b.p[x, x])
-            others = [true.x[true.at(("x", j))] + self.state["way"][j] for j in self.neighbours(t)[1]]
-            found.append((b.x[x], b.p[x, x], others))
+            here = self.compare(t, *self.answer())
+            b, way = self.state["belief"], self.state["way"]
+            at = [b.x[b.at(("x", j))] + way[j] if j in way else np.full(3, np.nan) for j in self.neighbours(t)[1]]
+            found.append((*here, at))
         neighbours = [np.array(o).reshape(-1, 3) for *_, o in found]
         return np.array([x for x, *_ in found]), np.array([p for _, p, _ in found]), neighbours
+
+    def answer(self) -> tuple[Floats, Floats]:
+        """Position and covariance, averaged over which errors are there."""
+        b = copy.deepcopy(self.state["belief"])
+        self.average(b)
+        x = b.at(("x", self.ego))
+        self.state["cov"] = np.diag(b.p[x, x])
+        return b.x[x], b.p[x, x]
+
+    def compare(self, t: int, x: Floats, cov: Floats) -> tuple[Floats, Floats]:
+        """Beside the star, the ego alone: whose answer counts?"""
+        if self.lone is None:
+            return x, cov
+        fix, dt, before = self.seen.gnss[self.run, t, self.ego], self.seen.dt, (self.state, self.revoked)
+        if self.state.get("unused") == t:
+            fix = np.full(3, np.nan)
+        level = max(self.state["level"][:3])
+        (self.state, self.revoked), self.deaf = self.lone, True
+        self.pace(t)
+        self.step(t, 0.0)
+        y, q = self.answer()
+        self.lone, (self.state, self.revoked), self.deaf = (self.state, self.revoked), before, False
+        self.left -= dt
+        if np.isfinite(fix).all():
+            r = self.r[t, self.ego] * self.white
+            star, lone = (min(((fix - at) ** 2 / (r + np.diag(p))).sum(), 25) for at, p in ((x, cov), (y, q)))
+            self.doubts = math.exp(-dt / 10) * self.doubts + [star - lone, 1]
+            if level > 2.9 and self.doubts[1] > 3 and self.doubts[0] > 4 * self.doubts[1]:
+                self.state, self.revoked = copy.deepcopy(self.lone)
+                self.doubts, self.last = np.zeros(2), max(2 * self.last, 20.0)
+                self.left = self.last
+        if self.left > 0:
+            x, cov = y, q
+        self.state["cov"] = np.diag(cov)
+        return x, cov
 
     def average(self, b: Belief) -> None:
         life, slot = self.life, self.state["slot"]
@@ -251,15 +293,19 @@ class Oracle:
             b.average([b.at(("compass",)).start], life.bias, life.absent[2])
             b.average([b.at(("compass",)).start + 2], life.offset, life.absent[3])
 
-    def tries(self, t: int) -> None:
-        """A step, and perhaps one that slips."""
-        share, dt = self.priors.slip * (self.known.sensors is not None), self.seen.dt
-        u = self.seen.velocity[self.run, t, self.ego]
+    def pace(self, t: int) -> None:
+        """The most of late speeds, and its direction."""
+        dt, u = self.seen.dt, self.seen.velocity[self.run, t, self.ego]
         speed, late = float(np.linalg.norm(u)), self.state["speed"] * math.exp(-dt / LATE)
         self.state["blind"] += dt
         if speed > 0.5 * late:
             self.state |= {"course": u / speed, "blind": 0.0}
         self.state["speed"] = max(speed, late)
+
+    def tries(self, t: int) -> None:
+        """A step, and perhaps one that slips."""
+        share, dt = self.priors.slip * (self.known.sensors is not None), self.seen.dt
+        self.pace(t)
         before = copy.deepcopy((self.state, self.revoked)) if share else None
         self.step(t, 0.0)
         n, p = self.state["numbers"], self.state["slips"]
@@ -289,7 +335,7 @@ class Oracle:
 
     def heard(self, t: int) -> tuple[list[int], dict[int, Any], dict[int, Floats]]:
         """Neighbours of a step, the messages that are held, and what is measured."""
-        here, others = self.neighbours(t)
+        here, others = (np.empty(0, int), []) if self.deaf else self.neighbours(t)
         links = dict(zip(others, here.tolist(), strict=True))
         relative = {j: self.seen.relative[self.run, self.box.link[link]] for j, link in links.items()}
         return others, {j: self.message(link, j) for j, link in links.items()}, relative
@@ -330,25 +376,29 @@ class Oracle:
         s["made"] = min(s["made"] * (now / s["whole"]) ** 2, now)
         s["whole"] = now
 
+    def begin(self, t: int) -> None:
+        """The first step."""
+        s, b, life = self.state, self.state["belief"], self.life
+        b.add(("x", self.ego), 0.0, 0.0)
+        if life.common:
+            b.add(("common",), 0, life.common)
+        if life.bias + life.heading + life.offset:
+            b.add(("compass",), 0, [life.bias, 0, life.offset])
+        self.add_turn(self.ego)
+        s["slot"][self.ego], s["began"] = 0, t
+        s["trusted"].add(self.ego)
+        self.start(t, self.seen.gnss[self.run, t, self.ego].copy(), *self.heard(t)[1:])
+
     def step(self, t: int, slip: float) -> None:
         self.state |= {"score": 0.0, "numbers": 0, "squares": 0.0}
-        s, g, b, life = self.state, self.priors, self.state["belief"], self.life
+        s, g, b = self.state, self.priors, self.state["belief"]
         others, messages, relative = self.heard(t)
         louder = self.louder(self.ego)
         fix = self.seen.gnss[self.run, t, self.ego].copy()
-        if not b.names:
-            b.add(("x", self.ego), 0.0, 0.0)
-            if life.common:
-                b.add(("common",), 0, life.common)
-            if life.bias + life.heading + life.offset:
-                b.add(("compass",), 0, [life.bias, 0, life.offset])
-            self.add_turn(self.ego)
-            s["slot"][self.ego], s["began"] = 0, t
-            s["trusted"].add(self.ego)
-            again = self.start(t, fix, messages, relative)
-        else:
-            again = bool(g.fix_gate and np.isfinite(fix).all() and self.lost(t))
-            again = again and self.start(t, fix, messages, relative)
+        if s.get("unused") == t:
+            fix[:] = np.nan
+        again = bool(g.fix_gate and t > s["began"] and np.isfinite(fix).all() and self.lost(t))
+        again = again and self.start(t, fix, messages, relative)
         for j in list(s["members"]):
             if j not in others or again or self.contradicted(t, j):
                 if j in others and j not in s["trusted"]:
@@ -555,7 +605,7 @@ class Oracle:
         s["mean"].pop(self.ego, None)
         s["vague"].add(self.ego)
         if elsewhere:
-            fix[:] = np.nan
+            fix[:], s["unused"] = np.nan, t
             s["vague"].discard(self.ego)
         return True
 

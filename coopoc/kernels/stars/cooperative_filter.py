@@ -90,7 +90,18 @@ from .gaussian import (
 )
 from .messages import Assumptions, Measurements, three_of, vector_at
 from .otherwise import (
+    ALONE,
+    AT_FIRST,
+    CLIPPED,
+    FARTHER,
+    FEW,
+    HEARD,
+    LAST_TIME,
+    LEFT_FOR,
     LIKELY,
+    MEMORY,
+    MUCH,
+    NO_NOISE,
     NOW,
     NUMBERS,
     SLIPPED,
@@ -158,6 +169,8 @@ def run_filter(
                     cov[run, t, c, d] = f.ego[COVARIANCE + 3 * c + d]
             for i in range(count):
                 k = f.slot[who[i]]
+                if k < 0:  # the star was left
+                    continue
                 for c in range(3):
                     neighbours[run, first + i, c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c]
                     notes[run, first + i, c] = weight(f.member[k, OUT + c], model.gate)
@@ -209,7 +222,8 @@ def step(
     vehicles: Ints,
     count: int,
 ) -> None:
-    """A step; where its numbers surprise, the chance of two: of an ego that slips, and of one that does not.
+    """A step; where its numbers surprise, the chance of two: of an ego that slips, and of one that does not; beside it
+    one of the ego alone, once it has met a neighbour.
 
     Args:
         f: filter, after `begin`.
@@ -222,6 +236,10 @@ def step(
     """
     slips, other = model.slip > 0.0, tries.other
     f.ego[NOW] = 0.0
+    if model.forget > 0.0 and count > 0 and tries.alone.g.vectors[0] == 0:
+        copy_filter(f, tries.alone)
+    for i in range(OWN):
+        tries.first[i] = own[i]
     remember_speed(f, own)
     if slips:
         copy_filter(f, other)
@@ -237,6 +255,42 @@ def step(
     else:
         f.ego[SLIPPED] = 0.0
     average(f, model)
+    if tries.alone.g.vectors[0] > 0:
+        compare(f, tries, model, rows, vehicles)
+
+
+@inside
+def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints) -> None:
+    """A step of the ego alone, whose answer counts where something is wrong with its star."""
+    alone, doubts, own = tries.alone, tries.doubts, tries.first
+    alone.ego[NOW] = 0.0
+    remember_speed(alone, own)
+    attempt(alone, model, own, rows, vehicles, 0)
+    average(alone, model)
+    doubts[LEFT_FOR] -= own[DT]
+    if not math.isnan(own[FIX]):
+        keep = math.exp(-own[DT] / MEMORY)
+        doubts[FARTHER] = keep * doubts[FARTHER] + gap_to_fix(f, own) - gap_to_fix(alone, own)
+        doubts[HEARD] = keep * doubts[HEARD] + 1.0
+        loudest = max(f.ego[LEVEL], f.ego[LEVEL + 1], f.ego[LEVEL + 2])
+        if loudest > NO_NOISE and doubts[HEARD] > FEW and doubts[FARTHER] > MUCH * doubts[HEARD]:
+            copy_filter(alone, f)
+            doubts[FARTHER] = doubts[HEARD] = 0.0
+            doubts[LEFT_FOR] = doubts[LAST_TIME] = max(2.0 * doubts[LAST_TIME], AT_FIRST)
+    f.ego[TOLD + ALONE] = 1.0 if doubts[LEFT_FOR] > 0.0 else 0.0
+    if doubts[LEFT_FOR] > 0.0:
+        for i in range(12):
+            f.ego[ANSWER + i] = alone.ego[ANSWER + i]
+
+
+@part
+def gap_to_fix(f: Filter, own: Floats) -> float:
+    """Squared normalised distance of the answer from the fix, clipped."""
+    square = 0.0
+    for c in range(3):
+        gap = own[FIX + c] - f.ego[ANSWER + c]
+        square += gap * gap / (own[FIX_VARIANCE + c] + f.ego[COVARIANCE + 4 * c])
+    return min(square, CLIPPED)
 
 
 @part

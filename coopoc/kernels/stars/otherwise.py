@@ -10,6 +10,11 @@ all hypotheses, as long as an error stays what it is.
 their gate count with no more than it, a fix as one: a range that is too long, or a receiver that jumps, is no slip.
 Wheels slip along the way.
 
+*The star*: beside the filter runs that of the ego alone. Where the star's estimate is far from the ego's fixes, those
+of the other near, and no noise explains what is measured of neighbours, something is wrong with them all, as an angle
+of another sign or a partner of another name: the filter begins anew from the lone one, which counts for a while, twice
+as long each time.
+
 *Levels*: by how much the variance of each kind of number differs from what is assumed, as its innovations show. The
 log-likelihood of an innovation v ~ N(0, S) has the derivative s (v^2 / S - 1) / 2 by the logarithm of a level, with s
 the share of S that the level makes, and the information s^2 / 2. Each step moves a level by the sum of its derivatives
@@ -82,9 +87,9 @@ from .gaussian import (
     widen,
 )
 
-HEADING, SCALE, OF_COMPASS, OF_RANGE, SLIPS, LEVELS = range(6)
-"""Places in TOLD: the ego's errors, rad, 1, rad, m, whether it slips, and the factors of standard
-deviations."""
+HEADING, SCALE, OF_COMPASS, OF_RANGE, SLIPS, ALONE, LEVELS = range(7)
+"""Places in TOLD: the ego's errors, rad, 1, rad, m, whether it slips, whether it has left its star, and the factors of
+standard deviations."""
 
 
 @part
@@ -237,17 +242,30 @@ LASTS, RARE, LATE, UNSEEN = 3.0, 3000.0, 10.0, 1.0
 
 
 class Tries(NamedTuple):
-    """The filter before a step, for the second try, and the step's rows."""
+    """The filter before a step, for the second try, and the step's rows; the filter of the ego alone, its row, and
+    the doubts of the star."""
 
     other: Filter
     own: Floats
     rows: Floats
+    alone: Filter
+    first: Floats
+    doubts: Floats
+
+
+FARTHER, HEARD, LEFT_FOR, LAST_TIME, DOUBTS = range(5)
+"""Sums, fading in MEMORY s, of how much farther the star's estimate is from the ego's fixes than that of the ego alone,
+and of these fixes; s for which the latter still counts, and for which it did the last time."""
+MEMORY, FEW, MUCH, CLIPPED, NO_NOISE, AT_FIRST = 10.0, 3.0, 4.0, 25.0, 2.9, 20.0
+"""s; fixes; squared normalised distance a fix from which the star is left, and the most that counts of one, if at the
+same time what is measured of neighbours has this logarithm of a level, beyond all noise; s for which, at first."""
 
 
 @storage
 def new_tries(slots: int, vehicles: int) -> Tries:
     """Memory for as many members and vehicles."""
-    return Tries(new_filter(slots, vehicles), np.zeros(OWN), np.zeros((slots, WIDTH)))
+    other, alone = new_filter(slots, vehicles), new_filter(slots, vehicles)
+    return Tries(other, np.zeros(OWN), np.zeros((slots, WIDTH)), alone, np.zeros(OWN), np.zeros(DOUBTS))
 
 
 @part

@@ -39,7 +39,7 @@ from .cooperative_state import (
     new_filter,
 )
 from .gaussian import PLACE
-from .otherwise import Tries, new_tries
+from .otherwise import DOUBTS, Tries, new_tries
 
 
 @compiled
@@ -135,7 +135,7 @@ def stream_step(
     for i in range(len(vehicles)):
         k = f.slot[vehicles[i]]
         for c in range(3):
-            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c]
+            answer[12 + 3 * i + c] = f.g.x[3 * f.g.block[k, PLACE] + c] + f.member[k, WAY + c] if k >= 0 else math.nan
     return True
 
 
@@ -146,6 +146,9 @@ def make_filter(slots: int, vehicles: int) -> tuple[Filter, Tries]:
 
 
 @compiled
-def restore(source: Filter, target: Filter) -> None:
-    """Copy a state."""
+def restore(source: Filter, tries: Tries, target: Filter, targets: Tries) -> None:
+    """Copy a state, and that of the ego alone."""
     copy_filter(source, target)
+    copy_filter(tries.alone, targets.alone)
+    for i in range(DOUBTS):
+        targets.doubts[i] = tries.doubts[i]
