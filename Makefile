@@ -8,7 +8,7 @@
 # make fuzz    every text reader under coverage-guided fuzzing, MINUTES each (default 10); finds go to build/fuzz
 # make docs    the site in build/site, tutorials executed; a warning is an error
 # make benchmark   every benchmark, its ratios against benchmarks/baseline.json
-# make release   wheels (with machine code for each of PYTHONS), sdist, what they need (CycloneDX; requirements.txt with hashes) in dist/, built twice and compared
+# make release   wheel, sdist, what they need (CycloneDX; requirements.txt with hashes) in dist/, built twice and compared
 # make clean   forget the environment (results in runs/ stay)
 #
 # TORCH_INDEX: where the package index serves torch's CUDA build (several GB; it works, too), name an index of CPU builds:
@@ -16,7 +16,6 @@
 PYTHON ?= python3
 TORCH_INDEX ?=
 JOBS ?= 2
-PYTHONS ?= python3.11 python3.12 python3.13
 MINUTES ?= 10
 VENV := .venv
 READY := $(VENV)/.ready
@@ -81,8 +80,7 @@ release: $(READY)
 	for out in build/first dist; do \
 		$(VENV)/bin/python -m build --no-isolation --outdir $$out . && rm -rf build/lib build/bdist.* && cd $$out && \
 		tar xzf *.tar.gz && name=$$(basename *.tar.gz .tar.gz) && tar --sort=name --mtime=@$$SOURCE_DATE_EPOCH --owner=0 \
-		--group=0 --numeric-owner --format=ustar -cf - $$name | gzip -9n > $$name.tar.gz && rm -r $$name && cd $(CURDIR) && \
-		$(VENV)/bin/python .ci/wheels.py $$out $(PYTHONS) || exit 1; \
+		--group=0 --numeric-owner --format=ustar -cf - $$name | gzip -9n > $$name.tar.gz && rm -r $$name && cd $(CURDIR) || exit 1; \
 	done
 	cd dist && sha256sum coopoc-* | tee SHA256SUMS && cd ../build/first && sha256sum -c ../../dist/SHA256SUMS
 	$(VENV)/bin/cyclonedx-py environment --pyproject pyproject.toml --output-reproducible --of JSON \

@@ -1,23 +1,20 @@
 """CPU seconds until the first answer of each method, solve and stream: everything that a user waits for.
 
     OMP_NUM_THREADS=1 python benchmarks/compile.py [NAME ...]        # some minutes; a Markdown table on stdout
-    python benchmarks/compile.py --into build/machine_code           # compile every kernel, as `make release` does
     python benchmarks/compile.py --record                            # renew the seconds that a line on stderr names
 
 Each name runs in a process of its own, from its start to its answer, twice: with an empty cache of machine code, and
-again with what the first run has kept. The difference is compiled once per machine; a wheel ships it.
+again with what the first run has kept. The difference is compiled once per machine.
 """
 
 from __future__ import annotations
 
 import argparse
 import importlib
-import itertools
 import json
 import os
 import pkgutil
 import resource
-import shutil
 import subprocess
 import sys
 import tempfile
@@ -30,7 +27,6 @@ from tabulate import tabulate
 from unseen_graphs import joined, world
 
 import coopoc as co
-from coopoc.kernels.compiling.machine_code import SHIPPED_TARGET, versions
 from coopoc.methods.catalogue import METHODS, needs_whole_fleet
 from coopoc.optimize.graph_problems import from_graph
 from coopoc.world.storage import save_recording
@@ -173,54 +169,9 @@ def run_all() -> list[Any]:
         if name in METHODS:
             method(name, stored=True)
     kernels = all_kernels()
-    if missing := [kernel._cache.name for kernel in kernels if not kernel.signatures]:
+    if missing := [kernel.py_func.__qualname__ for kernel in kernels if not kernel.signatures]:
         sys.exit(f"no call compiles {', '.join(missing)}")
     return kernels
-
-
-RELATIVE = """
-import os, runpy, sys
-from importlib.machinery import SourceFileLoader as Loader
-
-def relative(loader, data, path, plain=Loader.source_to_code, **options):
-    ours = loader.name.partition(".")[0] in ("numba", "coopoc")
-    return plain(loader, data, loader.name.replace(".", "/") + ".py" if ours else path, **options)
-
-Loader.source_to_code = relative
-sys.argv = sys.argv[1:]
-sys.path.insert(0, os.path.dirname(sys.argv[0]))
-runpy.run_path(sys.argv[0], run_name="__main__")
-"""
-"""Start of a process whose functions name their files without the folder of the environment: machine code holds these
-names, and shall be the same wherever it is made."""
-
-
-def build(out: Path) -> None:
-    """Compile every kernel for the processors that a wheel serves, into a folder, in a process of its own."""
-    with tempfile.TemporaryDirectory() as folder:
-        code = Path(folder) / "code"
-        own = {"PYTHONHASHSEED": "0", "PYTHONPYCACHEPREFIX": f"{folder}/python", "NUMBA_CACHE_DIR": str(code)}
-        own["NUMBA_CPU_NAME"], own["NUMBA_CPU_FEATURES"] = SHIPPED_TARGET[1:]
-        command = [sys.executable, "-B", "-P", "-c", RELATIVE, __file__, "--compiled", str(code)]
-        subprocess.run(command, env={**os.environ, **own, "OMP_NUM_THREADS": "1"}, check=True)
-        shutil.rmtree(out, ignore_errors=True)
-        out.mkdir(parents=True)
-        for file in (*code.glob("*/*.nb?"), code / "about.json"):
-            shutil.copyfile(file, out / file.name)
-
-
-def compile_all(folder: Path) -> None:
-    """Compile every kernel in this process and keep the machine code."""
-    from numba.np.ufunc import array_exprs
-
-    names: Any = array_exprs  # numba names an expression of arrays by its address, which differs from run to run
-    names.hash = lambda expression, count=itertools.count(): next(count)
-    for kernel in run_all():
-        if not any(folder.glob(f"*/{kernel._cache.name}.*.nbc")):
-            sys.exit(f"nothing is kept of {kernel._cache.name}")
-        if (target := kernel.targetctx.codegen().magic_tuple()) != SHIPPED_TARGET:
-            sys.exit(f"kernels are for {target}, not for {SHIPPED_TARGET}")
-    (folder / "about.json").write_text(json.dumps(versions(), indent=1) + "\n")
 
 
 def record() -> None:
@@ -242,16 +193,10 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.partition("\n")[0])
     parser.add_argument("names", nargs="*", choices=[*CALLS, []], metavar="NAME")
     parser.add_argument("--here", action="store_true", help=argparse.SUPPRESS)
-    parser.add_argument("--into", type=Path)
-    parser.add_argument("--compiled", type=Path, help=argparse.SUPPRESS)
     parser.add_argument("--record", action="store_true")
     given = parser.parse_args(arguments)
     if given.here:
         CALLS[given.names[0]]()
-    elif given.compiled:
-        compile_all(given.compiled)
-    elif given.into:
-        build(given.into)
     elif given.record:
         record()
     else:

@@ -1,11 +1,8 @@
 """Machine code: when it is made anew, and that the package imports no numba."""
 
 import importlib
-import json
 import os
 import pickle
-import re
-import shutil
 import sys
 from io import StringIO
 from pathlib import Path
@@ -80,37 +77,6 @@ def test_machine_code_of_types_that_are_gone_is_made_again(tmp_path: Path) -> No
     assert (run(), run()) == ("8.0 0\n", "8.0 1\n")
 
 
-def test_a_wheel_ships_machine_code_that_another_folder_loads_and_says_why_it_does_not(tmp_path: Path) -> None:
-    """Compiled for x86-64-v3, copied beside other sources, and loaded where nothing can be written."""
-    code = (
-        "import sys\nfrom pathlib import Path\nimport numba\n"
-        "from coopoc.kernels.compiling import compile, machine_code\n"
-        "machine_code.SHIPPED = Path(sys.argv[1])\ncpu = sys.argv[2:]\n"
-        "if cpu: _, numba.config.CPU_NAME, numba.config.CPU_FEATURES = machine_code.SHIPPED_TARGET\n"
-        "@compile.compiled\ndef twice(x):\n    return 2.0 * x\n"
-        "print(twice(4.0), twice._cache.origin, machine_code.mismatch())\n"
-    )
-    shipped = tmp_path / "shipped"
-    for folder in "ab":
-        (tmp_path / folder).mkdir()
-        (tmp_path / folder / "own.py").write_text(code)
-
-    def run(folder: str, *cpu: str) -> str:
-        return ran([sys.executable, tmp_path / folder / "own.py", shipped, *cpu], check=True).stdout
-
-    assert run("a", "x86-64-v3") == "8.0 compiled -\n"
-    shutil.copytree(tmp_path / "a/__pycache__", shipped)
-    about = shipped / "about.json"
-    about.write_text(json.dumps(machine_code.versions()))
-    assert run("b") == "8.0 shipped \n"
-    assert not (tmp_path / "b/__pycache__").exists() or not list((tmp_path / "b/__pycache__").iterdir())
-    (tmp_path / "b/own.py").write_text(code.replace("2.0", "3.0"))
-    assert run("b") == "12.0 compiled \n"
-    about.write_text(json.dumps(machine_code.versions() | {"numba": "0.1"}))
-    assert "shipped" not in (told := run("a"))
-    assert "machine code is for numba 0.1, this is 0." in told
-
-
 def test_no_progress_bar_counts_the_time_of_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
     """A bar that is open while a kernel compiles begins to count when it has; a line says what and how long."""
     said = StringIO()
@@ -118,7 +84,7 @@ def test_no_progress_bar_counts_the_time_of_compiling(monkeypatch: pytest.Monkey
     with tqdm(total=1, delay=2.0, file=said) as bar:
         began = bar.start_t
         compile._hold_bars(5.0)
-        compile._say(compile._line(compile.rooms))
+        compile._say(compile._line(compile.compiled))
         assert bar.start_t == began + 5.0
     assert said.getvalue() == "compiling the compile kernel, once per machine\n"
 
@@ -132,11 +98,3 @@ def test_a_bar_fills_no_log_with_carriage_returns(capsys: pytest.CaptureFixture[
         assert not {"\r", "\x1b"} & {*said}
         assert last in said
         assert bool(said) == bool(last)
-
-
-def test_check_says_where_each_kernel_comes_from() -> None:
-    rooms = compile.rooms()
-    assert {"coopoc.kernels.stars", "coopoc.kernels.graphs"} <= set(rooms)
-    assert all(
-        re.fullmatch(r"(\d+ (shipped|compiled here, \S+|not compiled yet)(; )?)+", line) for line in rooms.values()
-    )

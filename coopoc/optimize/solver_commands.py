@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 import sys
 import time
-from contextlib import suppress
 from dataclasses import fields, replace
 from functools import partial
 from importlib.util import find_spec
@@ -15,11 +14,9 @@ from typing import Annotated, Any
 import numpy as np
 from tyro.conf import Positional, arg
 
-from ..errors import InputError, MissingLibraryError, dependencies
+from ..errors import InputError, dependencies
 from ..formats import load_graph
 from ..formats.graph import Graph
-from ..kernels.compiling.compile import rooms
-from ..plugins import find, names
 from .backend import backends
 from .graph_problems import Objective, Start, from_graph, loop_closures
 from .model.problem import Problem
@@ -156,7 +153,7 @@ def tiny(kind: str = "spherical") -> Problem:
 
 
 def check() -> int:
-    """Name libraries that are missing, solve one tiny problem with every backend, and say where kernels come from.
+    """Name libraries that are missing, and solve one tiny problem with every backend.
 
     Example: coopoc check
     """
@@ -181,11 +178,5 @@ def check() -> int:
         print(
             f"{name:<14} {fixed:<12} {solution.status.name:<10} {solution.cost:12.6g} {off:11.1e} {took:8.1f}  {kind}"
         )
-    print()
-    with suppress(MissingLibraryError):  # nets have kernels, too, and need torch
-        for net in names("coopoc.nets"):
-            find("coopoc.nets", net)
-    for room, code in rooms().items():
-        print(f"{room:<24} {code}")
     say(f"{len(backends())} backends, {failed} disagree with gauss-newton")
     return int(failed > 0 or bool(absent))

@@ -8,13 +8,10 @@ import os
 import sys
 import threading
 import time
-from collections import Counter, defaultdict
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache
-from importlib import import_module
 from pathlib import Path
-from pkgutil import walk_packages
 from typing import Any, TypeVar, cast
 
 from .waiting import clock, spent, waiting
@@ -123,19 +120,6 @@ def _watch() -> None:
     event.register("numba:compile", Watcher())
 
 
-def rooms() -> dict[str, str]:
-    """Room of kernels -> how many are shipped, compiled here, and when; and why what is shipped is not used."""
-    package = import_module("coopoc.kernels")
-    for module in walk_packages(package.__path__, "coopoc.kernels."):
-        import_module(module.name)
-    kept: dict[str, Counter[str]] = defaultdict(Counter)
-    for kernel in kernels:
-        kept[kernel._cache.name.rpartition(".")[0].rpartition(".")[0]][kernel._cache.kept] += 1
-    lines = {room: "; ".join(f"{n} {how}" for how, n in sorted(hows.items())) for room, hows in sorted(kept.items())}
-    why = (hooks := _hooks()) and hooks[1].mismatch().strip("-")
-    return lines | ({"not used": why} if why else {})
-
-
 def _name(function: Any) -> str:
     return f"{function.__module__}.{function.__qualname__}"
 
@@ -145,8 +129,7 @@ def _line(function: Any) -> str:
     usual = USUAL_SECONDS.get(_name(function), 0.0)
     title = function.__module__.rpartition(".")[2].replace("_", " ")
     often = f", usually {usual:.0f} s on an idle core" if usual > PATIENCE else ""
-    why = (hooks := _hooks()) and hooks[1].mismatch().strip("-")
-    return f"compiling the {title} kernel, once per machine{often}{' (' * bool(why)}{why or ''}{')' * bool(why)}"
+    return f"compiling the {title} kernel, once per machine{often}"
 
 
 def _bars() -> list[Any]:

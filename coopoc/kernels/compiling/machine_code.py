@@ -1,4 +1,4 @@
-"""Machine code on disk: shipped with the wheel or compiled here, found again by the content of its sources."""
+"""Machine code on disk: compiled once per machine, found again by the content of its sources."""
 
 from __future__ import annotations
 
@@ -6,9 +6,8 @@ import hashlib
 import json
 import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from contextlib import suppress
-from datetime import date
 from functools import cache
 from importlib.util import resolve_name
 from pathlib import Path
@@ -23,19 +22,12 @@ from numba.core.compiler import CompileResult
 from .waiting import waiting
 
 KERNELS = Path(__file__).resolve().parents[1]
-SHIPPED = KERNELS / "shipped"
-"""Folder of the machine code that a wheel holds; a clone has none."""
-SHIPPED_CPU = "x86-64-v3"
-SHIPPED_TARGET = ("x86_64-unknown-linux-gnu", SHIPPED_CPU, "")
-"""LLVM's triple, processor and features, for which a wheel's kernels are compiled."""
-NEEDED = ("avx2", "bmi", "bmi2", "f16c", "fma", "lzcnt", "movbe")
-"""Instructions of x86-64-v3; a processor without one compiles."""
 IMPORT = re.compile(r"^from (\.*[\w.]*) import (\([^)]*\)|.*)", re.MULTILINE)
 LOCATORS = (UserProvidedCacheLocator, InTreeCacheLocator, UserWideCacheLocator)
 
 
 class MachineCode:
-    """The machine code of one function: what a wheel ships, else what was compiled here. Numba's cache protocol.
+    """The machine code of one function, kept from an earlier process. Numba's cache protocol.
 
     A key is the types of the arguments, the processor, the function's byte code, and the options that change the code;
     the index holds the digest of all sources that the code was made of (`stamp`). So folders can be copied, and nothing
@@ -44,13 +36,9 @@ class MachineCode:
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function, self.locator = function, _locator(function)
-        self.name = f"{function.__module__}.{function.__qualname__}".replace("<locals>.", "")
-        self.origin: str | None = None
-        version = ".py{}{}".format(*sys.version_info)
-        names = str(SHIPPED), self.cache_path
-        self.files: list[Any] = [
-            folder and IndexDataCacheFile(folder, self.name + version, stamp(function)) for folder in names
-        ]
+        name = f"{function.__module__}.{function.__qualname__}".replace("<locals>.", "")
+        version, path = ".py{}{}".format(*sys.version_info), self.cache_path
+        self.file: Any = path and IndexDataCacheFile(path, name + version, stamp(function))
 
     @property
     def cache_path(self) -> str | None:
@@ -62,82 +50,42 @@ class MachineCode:
         """Compiled function for the types of a signature, or None."""
         with waiting("load"):
             context.refresh()
-            for origin, file, target in self._places(context.codegen()):
-                try:
-                    data = file.load(self._key(signature, target))
-                    made = None if data is None else CompileResult._rebuild(context, *data)
-                except Exception:  # a damaged file, or types that were renamed: any error of pickle or LLVM
-                    continue
-                if made is not None:
-                    self.origin = origin
-                    return made
-        return None
+            try:
+                data = self.file and self.file.load(self._key(signature, context.codegen()))
+                return data and CompileResult._rebuild(context, *data)
+            except Exception:  # a damaged file, or types that were renamed: any error of pickle or LLVM
+                return None
 
     def save_overload(self, signature: Any, made: Any) -> None:
         """Keep what was compiled here, but what refers to addresses of this process."""
-        self.origin = "compiled"
-        if self.locator is None or made.library.has_dynamic_globals:
+        if not self.file or made.library.has_dynamic_globals:
             return
         code, *rest = made._reduce()
         rest[5] = ""  # numba's listing of types, which names folders
-        key = self._key(signature, made.codegen.magic_tuple())
+        key = self._key(signature, made.codegen)
         with suppress(OSError):  # a full disk: the next process compiles again
             try:
-                self.files[1].save(key, (code, *rest))
+                self.file.save(key, (code, *rest))
             except Exception:  # the index that is there cannot be read
                 self.flush()
-                self.files[1].save(key, (code, *rest))
+                self.file.save(key, (code, *rest))
 
     def flush(self) -> None:
         """Forget what was compiled here."""
-        if self.locator:
-            self.files[1].flush()
+        if self.file:
+            self.file.flush()
 
-    @property
-    def kept(self) -> str:
-        """What a process here finds: "shipped", "compiled here" with the day, or "not compiled yet"."""
-        for origin, file, _ in self._places(None):
-            try:
-                if file._load_index():
-                    day = date.fromtimestamp(Path(file._index_path).stat().st_mtime)
-                    return origin if origin == "shipped" else f"compiled here, {day}"
-            except Exception:  # as in `load_overload`
-                continue
-        return "not compiled yet"
-
-    def _places(self, codegen: Any) -> Iterator[tuple[str, Any, Any]]:
-        if not mismatch():
-            yield "shipped", self.files[0], SHIPPED_TARGET
-        if self.files[1]:
-            yield "compiled", self.files[1], codegen and codegen.magic_tuple()
-
-    def _key(self, signature: Any, target: Any) -> tuple[Any, ...]:
+    def _key(self, signature: Any, codegen: Any) -> tuple[Any, ...]:
         code = hashlib.sha256(self.function.__code__.co_code).hexdigest()
         config: Any = numba.config
-        return signature, target, code, (bool(config.BOUNDSCHECK), config.OPT == 3, bool(config.DEBUGINFO_DEFAULT))
+        options = bool(config.BOUNDSCHECK), config.OPT == 3, bool(config.DEBUGINFO_DEFAULT)
+        return signature, codegen.magic_tuple(), code, options
 
 
 def _locator(function: Any) -> Any:
     file = str(_file(function.__module__))
     locators = (locator.from_function(function, file) for locator in LOCATORS)  # type: ignore[no-untyped-call]
     return next((locator for locator in locators if locator is not None), None)
-
-
-@cache
-def mismatch() -> str:
-    """Why this process cannot use what a wheel ships; "" if it can, "-" if there is nothing shipped."""
-    try:
-        about = json.loads((SHIPPED / "about.json").read_text())
-    except (OSError, ValueError):
-        return "-"
-    here = versions()
-    for name, version in about.items():
-        if here.get(name) != version:
-            return f"the wheel's machine code is for {name} {version}, this is {here.get(name)}"
-    features = llvm.get_host_cpu_features()
-    if lacking := [name for name in NEEDED if not features.get(name)]:
-        return f"the wheel's machine code needs a processor with {', '.join(lacking)}"
-    return ""
 
 
 def versions() -> dict[str, str]:
