@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from scipy.optimize import least_squares
 
 import coopoc as co
 from coopoc import V2X, Fleet, NoiseModel, Sensors, observe
@@ -63,35 +62,6 @@ def test_a_late_message_is_no_surer_than_it_is() -> None:
         late = (age >= 5) & np.isfinite(star.variance[:, 1:]).all(axis=-1) & (t >= 20)
         share += [*(gap**2 / star.variance[:, 1:])[late]]
     assert 0.3 < np.array(share)[:, :2].mean() < 1.1
-
-
-def test_the_relaxation_finds_what_many_starts_find() -> None:
-    """Independent check: the best of forty random starts of scipy.optimize.least_squares, on the neighbours
-    received."""
-    fleet = co.load_fleet("town10").between(0, 2)
-    recording = observe(fleet, S2, V2X(max_neighbours=5, loss=0.4), runs=4, observers=[12])
-    track = QCQPRelaxation()(recording, [12])
-    rng = np.random.default_rng(11)
-    first = np.flatnonzero(recording.links.step == 0)
-    assert {1, 2, 3, 4} & set((recording.arrival[:, first] == 0).sum(axis=1).tolist())
-    for run in range(4):
-        here = first[recording.arrival[run, first] == 0]
-        z, ranges = recording.gnss[run, 0, [12, *recording.links.neighbour[here]]], recording.relative[run, here, 0]
-
-        def residual(flat: np.ndarray, z: np.ndarray = z, ranges: np.ndarray = ranges) -> np.ndarray:
-            x = flat.reshape(-1, 3)
-            return np.concatenate([((x - z) / 3.5).ravel(), np.linalg.norm(x[1:] - x[0], axis=1) - ranges])
-
-        found = [least_squares(residual, (z + rng.normal(0, 15, z.shape)).ravel()) for _ in range(40)]
-        best = min(found, key=lambda f: f.cost)
-        assert track.x[run, 0, 0] == pytest.approx(best.x[:3], abs=1e-3)
-        assert track.neighbours[run, here] == pytest.approx(best.x[3:].reshape(-1, 3), abs=1e-3)
-        assert np.isnan(track.neighbours[run, np.setdiff1d(first, here)]).all()
-        cov = np.linalg.inv(best.jac.T @ best.jac)[:3, :3]
-        assert track.covariance[run, 0, 0] == pytest.approx(cov, abs=1e-3)
-    tight, of, total = track.notes[0].split()[:3]
-    assert of == "of"
-    assert int(total) - 1 <= int(tight) <= int(total) <= 8
 
 
 def brief(method: object, fleet: Fleet) -> Fleet:

@@ -24,7 +24,7 @@ from coopoc.optimize.backends.gtsam import forms, graph_of, values, which_turn
 from coopoc.optimize.descent.levenberg_marquardt import arrive
 from coopoc.optimize.graph_problems import Objective, from_graph, read_graph
 from coopoc.optimize.model.factor import Factor
-from coopoc.optimize.starts.graph_starts import separated, trilaterate
+from coopoc.optimize.starts.graph_starts import separated
 
 
 def moved(problem: Problem, x: np.ndarray, v: np.ndarray) -> np.ndarray:
@@ -234,20 +234,6 @@ def test_a_start_whose_steps_went_straight_is_kept_however_badly_noise_is_stated
     assert found.extras["start"] == "odometry"
     assert found.extras["start_iterations"] <= 12
     assert found.cost == pytest.approx(solve(from_graph(graph, start="incremental")).cost, rel=1e-9)
-
-
-def test_a_point_is_located_as_scipy_finds_it() -> None:
-    """From many random guesses, in space and where all places lie in one plane."""
-    rng = np.random.default_rng(210)
-    for d, flat in ((2, 1.0), (3, 1.0), (3, 1e-3)):
-        places = rng.normal(0, 10, (8, d)) * np.r_[np.ones(d - 1), flat]
-        ranges = np.linalg.norm(places - rng.normal(0, 10, d), axis=1) + 0.1 * rng.normal(size=8)
-
-        def residual(at: np.ndarray, p: np.ndarray = places, r: np.ndarray = ranges) -> np.ndarray:
-            return np.linalg.norm(at - p, axis=1) - r
-
-        best = min(least_squares(residual, rng.normal(0, 10, d)).cost for _ in range(30))
-        assert 0.5 * np.square(residual(trilaterate(places, ranges))).sum() == pytest.approx(best, rel=1e-6)
 
 
 def test_ranges_of_zero_and_ends_in_one_place_are_taken() -> None:
