@@ -259,7 +259,7 @@ def step(
         compare(f, tries, model, rows, vehicles)
 
 
-@inside
+@inner
 def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints) -> None:
     """A step of the ego alone, whose answer counts where something is wrong with its star."""
     alone, doubts, own = tries.alone, tries.doubts, tries.first
