@@ -207,21 +207,12 @@ class Oracle:
         }
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.priors.fix_gate else {self.ego}
-        numbers = [
-            "made",
-            "shown",
-            "blind",
-            "evidence",
-            "driven",
-            "agree",
-            "slips",
-            "speed",
-            "score",
-            "numbers",
-            "squares",
-        ]
+        numbers = ["made", "shown", "unseen", "blind", "evidence", "driven", "agree", "slips", "speed"]
+        numbers += ["score", "numbers", "squares"]
         levels = {name: np.zeros(6) for name in ("level", "learned", "information")}
-        levels |= {name: np.zeros(3) for name in ("gap", "cov", "course")} | dict.fromkeys(numbers, 0.0)
+        levels |= {name: np.zeros(3) for name in ("gap", "cov", "course")} | dict.fromkeys(
+            [*numbers, "numbers", "squares"], 0.0
+        )
         levels |= {"louder": {}, "left": None, "jumped": False}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
@@ -311,7 +302,7 @@ class Oracle:
         n, p = self.state["numbers"], self.state["slips"]
         strange = (p > 0.1 or self.state["squares"] > n + math.sqrt(2 * n)) and not self.state["jumped"]
         if before is None or not strange:
-            self.state["slips"] = 0.0
+            self.state["slips"] *= 0.0 if n else math.exp(-dt / LASTS)
             return
         first, (self.state, self.revoked) = (self.state, self.revoked), before
         rate, shows = (share * self.state["speed"]) ** 2, self.r[t, self.ego] @ self.white + self.state["shown"] ** 2
@@ -408,6 +399,7 @@ class Oracle:
                 s["members"].remove(j)
         dt = self.seen.dt
         s["agreed"] += dt * (s["hits"].get("fix", 0) == 0)
+        s["unseen"] += dt
         u, q = self.steady(t, self.ego, self.seen.velocity[self.run, t, self.ego], louder * self.q[t, self.ego])
         if t > s["joined"][self.ego]:
             self.predict(dt * u, q)
@@ -450,11 +442,11 @@ class Oracle:
         if self.ego not in s["vague"]:
             self.learn_fix(3, rows)
             _, gap, _, r = self.mahalanobis(s["belief"], rows)
-            far, most = float(np.linalg.norm(gap)), s["speed"] * self.seen.dt + 2 * math.sqrt(r.sum())
+            far, most = float(np.linalg.norm(gap)), s["speed"] * s["unseen"] + 2 * math.sqrt(r.sum())
             more = far - float(np.linalg.norm(s["gap"]))
             if more > most or far < 2 * math.sqrt(r.sum()):
                 s["jumped"] = more > most
-            s["shown"], s["gap"] = max(s["shown"] + min(more, most), 0.0), gap
+            s["shown"], s["gap"], s["unseen"] = max(s["shown"] + min(more, most), 0.0), gap, 0.0
         alone = not any(j in s["last"] for j in s["members"])
         if self.priors.fix_gate and self.ego not in s["vague"] and alone:
             self.go_back(fix, rows)

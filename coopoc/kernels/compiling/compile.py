@@ -22,8 +22,9 @@ Function = TypeVar("Function", bound=Callable[..., Any])
 def compiled(function: Function) -> Function:
     """Compiled at the first call. A product and a sum may become one instruction; nothing is reordered.
 
-    The machine code is kept beside the source, or in the user's cache where that is read-only. It holds what it calls: it is made anew after a change of the function's file, or of a file of the
-    kernels or of its own folder that it imports, directly or through others.
+    The machine code is kept beside the source, or in the user's cache where that is read-only. It holds what it calls:
+    it is made anew after a change of the function's file, or of a file of the kernels or of its own folder that it
+    imports, directly or through others.
     """
     return _kept(function, {"contract"})
 

@@ -53,6 +53,7 @@ from .cooperative_state import (
     TOLD,
     TRUSTED,
     TYPICAL,
+    UNSEEN_FOR,
     VEHICLE,
     WAY,
     WHEN,
@@ -97,6 +98,7 @@ from .otherwise import (
     FEW,
     HEARD,
     LAST_TIME,
+    LASTS,
     LEFT_FOR,
     LIKELY,
     MEMORY,
@@ -252,8 +254,10 @@ def step(
         if probably >= 0.5:
             copy_filter(other, f)
         f.ego[SLIPPED] = probably
-    else:
+    elif f.ego[NUMBERS] > 0.0:
         f.ego[SLIPPED] = 0.0
+    else:
+        f.ego[SLIPPED] *= math.exp(-own[DT] / LASTS)
     average(f, model)
     if tries.alone.g.vectors[0] > 0:
         compare(f, tries, model, rows, vehicles)
@@ -310,6 +314,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     leave(f, model, own, rows, vehicles, count)
     scale_motion_noise(f, own, rows, vehicles, count)
     f.ego[SPAN] = own[DT]
+    f.ego[UNSEEN_FOR] += own[DT]
     f.ego[AGREED] += own[DT] if f.who[0, HITS] == 0 else 0.0
     if f.ego[STEPS] > 0:
         f.ego[CLOCK] += own[DT]

@@ -6,7 +6,8 @@ scalar error b with the posterior N(m, p) the odds of b = 0 are, by Bayes' rule,
 sqrt(W / p) exp(-m^2 / 2 p), and what is conditional on b = 0 is the filter without that state. So one filter stands for
 all hypotheses, as long as an error stays what it is.
 
-*Slips*: a step is tried once more, with a motion that is not known, and the likelier of both is kept. Numbers beyond
+*Slips*: a step is tried once more, with a motion that is not known, and the likelier of both is kept; how probable a
+slip is fades between two fixes. Numbers beyond
 their gate count with no more than it, a fix as one: a range that is too long, or a receiver that jumps, is no slip.
 Wheels slip along the way.
 
@@ -63,6 +64,7 @@ from .cooperative_state import (
     SPAN,
     STEP,
     TOLD,
+    UNSEEN_FOR,
     VEHICLE,
     WHOLE,
     WIDTH,
@@ -293,8 +295,8 @@ def show(f: Filter) -> None:
         f.ego[BEFORE + c] = f.h.three[GAP + c]
         far += f.h.three[GAP + c] ** 2
         noise += f.h.three[VARIANCE + c]
-    far, most = math.sqrt(far), f.ego[SPEED_OF_LATE] * f.ego[SPAN] + 2.0 * math.sqrt(noise)
-    more = far - math.sqrt(before)
+    far, most = math.sqrt(far), f.ego[SPEED_OF_LATE] * f.ego[UNSEEN_FOR] + 2.0 * math.sqrt(noise)
+    more, f.ego[UNSEEN_FOR] = far - math.sqrt(before), 0.0
     f.ego[SHOWN] = max(f.ego[SHOWN] + min(more, most), 0.0)
     if more > most or far < 2.0 * math.sqrt(noise):
         f.ego[JUMPED] = 1.0 if more > most else 0.0
