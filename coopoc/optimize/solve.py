@@ -100,7 +100,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     start, placed = _start(problem)
     whole = placed and all(f.measurement.linear or is_converted(f.measurement) for f in problem.factors)
     if problem.x0 is None and not whole and not problem.constraints:
-        problem = _unplaced(problem, start)
+        problem = _searched(problem, start)
         assert problem.x0 is not None
         start = problem.x0
     built, earlier = clock(), problem.search.seconds
@@ -142,9 +142,9 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     )
 
 
-def _unplaced(problem: Problem, start: Floats) -> Problem:
-    """A problem of points without an x0 from where its converted measurements (n, d) or multidimensional scaling leads
-    lowest, or, where noise does not explain the cost, a small convex relaxation."""
+def _searched(problem: Problem, start: Floats) -> Problem:
+    """A problem of points without an x0 from where its converted measurements (n, d), multidimensional scaling or
+    random starts lead lowest, or, where noise does not explain the cost, a small convex relaxation."""
 
     def relaxed(at: Problem) -> tuple[Floats, int]:
         with suppress(InputError, MissingLibraryError):  # too large, or no such relaxation

@@ -162,7 +162,7 @@ def softened(problem: Problem, marked: Marked, bound: Floats, loss: str) -> Prob
 
 
 def robust_start(problem: Problem, start: Floats) -> Problem:
-    """The problem from where its losses that are not convex lead lowest: see `contest`; its search names the start.
+    """The problem from where its losses lead lowest: see `contest`; its search names the start.
 
     Far from the minimum truncated and Geman-McClure losses are flat: every measurement is rejected, and no step is
     left. Cauchy's has a minimum for each subset that agrees.

@@ -31,6 +31,8 @@ RIVAL = 10.0
 """Cost by which another minimum may be higher and still be the truth's: 1e-5 of chi-square with one degree."""
 DRAWS, QUIET, POINTS = 90, 30, 1800
 """Random starts at most, if the first lead to no other minimum of about the cost, and as many points together."""
+ALIKE = 1e-5
+"""Share by which the costs of two random starts that led to the same minimum differ."""
 ELSEWHERE = "another minimum, elsewhere, costs as much"
 EASED = (30.0, 10.0, 3.0, 1.0)
 """Times as large standard deviations of ranges."""
@@ -85,15 +87,15 @@ def race(
             cost = system.cost(y)
             if arrived and cost < least + RIVAL:
                 ends.append((cost, y))
-                most = most if abs(cost - least) <= SAME * least else DRAWS
-                if cost < (1.0 - SAME) * least:
+                most = most if abs(cost - least) <= ALIKE * least else DRAWS
+                if cost < (1.0 - ALIKE) * least:
                     name, x, least = "drawn", y, cost
         x, moves, rivals, doubtful = across(problem, x, descend, system.cost)
         name, cost = name + ", mirrored" * (moves > 0), system.cost(x)
-        others = *rivals, *minima, *(each for each, _ in ends)
-        near = [each for each in others if (1.0 + SAME) * cost < each < cost + RIVAL]
+        near = [each for each in (*rivals, *minima) if (1.0 + SAME) * cost < each < cost + RIVAL]
+        near += [each for each, _ in ends if (1.0 + ALIKE) * cost < each < cost + RIVAL]
         notes = (f"another minimum costs {min(near) - cost:.3g} more: noise may decide between them",) if near else ()
-        if any(c <= (1.0 + SAME) * cost and np.abs(y - x).max() > SAME * np.abs(x).max() for c, y in ends):
+        if any(c <= (1.0 + ALIKE) * cost and np.abs(y - x).max() > SAME * np.abs(x).max() for c, y in ends):
             notes = *notes, ELSEWHERE
         elif doubtful and not near:
             names = ", ".join(problem.names[body[0]] for body in doubtful[:5])
@@ -158,7 +160,7 @@ def _away(problem: Problem, x: Floats) -> Iterator[Floats]:
     rng, (n, d), free = np.random.default_rng(0), x.shape, np.ones((len(x), 1))
     free[list(problem.fixed)] = 0.0
     around = x - x.mean(axis=0)
-    spread, (*_, thin) = np.sqrt(d * np.square(around).mean()), np.linalg.svd(around)[2]
+    spread, (*_, thin) = np.sqrt(d * np.square(around).mean()), np.linalg.svd(around, full_matrices=False)[2]
     for k in range(min(DRAWS, POINTS // n)):
         away = spread * rng.normal(size=(n, d)) * free
         if k % 2:
