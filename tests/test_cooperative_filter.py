@@ -283,7 +283,7 @@ def mirrored(recording: Recording) -> Recording:
 
 
 def tunnel(recording: Recording) -> Recording:
-    """At first nobody has a fix, then for a while all but the ego."""
+    """At first no vehicle has a fix, then for a while all but the ego."""
     gnss = recording.gnss.copy()
     gnss[:, :3] = gnss[:, :25, 0] = np.nan
     return replace(recording, gnss=gnss)

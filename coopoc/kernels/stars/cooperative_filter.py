@@ -44,6 +44,7 @@ from .cooperative_state import (
     ORDER,
     OUT,
     OWN,
+    SINCE_FIX,
     SOLO,
     SOLO_VARIANCE,
     SPAN,
@@ -53,7 +54,6 @@ from .cooperative_state import (
     TOLD,
     TRUSTED,
     TYPICAL,
-    UNSEEN_FOR,
     VEHICLE,
     WAY,
     WHEN,
@@ -92,18 +92,17 @@ from .gaussian import (
 from .messages import Assumptions, Measurements, three_of, vector_at
 from .otherwise import (
     ALONE,
-    AT_FIRST,
-    CLIPPED,
-    FARTHER,
-    FEW,
-    HEARD,
-    LAST_TIME,
+    ALONE_FOR,
+    ALONE_LAST,
+    COUNTED,
+    EXCESS,
+    FIRST_ALONE,
     LASTS,
-    LEFT_FOR,
+    LEAST_COUNTED,
     LIKELY,
+    LOUDEST_NOISE,
     MEMORY,
-    MUCH,
-    NO_NOISE,
+    MOST_EXCESS,
     NOW,
     NUMBERS,
     SLIPPED,
@@ -112,7 +111,9 @@ from .otherwise import (
     adapt,
     average,
     chance,
+    copy_rows,
     corrected,
+    gap_to_fix,
     learn_fix,
     learn_relative,
     moved,
@@ -224,8 +225,8 @@ def step(
     vehicles: Ints,
     count: int,
 ) -> None:
-    """A step; where its numbers surprise, the chance of two: of an ego that slips, and of one that does not; beside it
-    one of the ego alone, once it has met a neighbour.
+    """A step; where its numbers are unlikely, the likelier of two: of an ego that slips, and of one that does not;
+    beside it one of the ego alone, once it has met a neighbour.
 
     Args:
         f: filter, after `begin`.
@@ -271,40 +272,24 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints)
     remember_speed(alone, own)
     attempt(alone, model, own, rows, vehicles, 0)
     average(alone, model)
-    doubts[LEFT_FOR] -= own[DT]
+    doubts[ALONE_FOR] -= own[DT]
     if not math.isnan(own[FIX]):
         keep = math.exp(-own[DT] / MEMORY)
-        doubts[FARTHER] = keep * doubts[FARTHER] + gap_to_fix(f, own) - gap_to_fix(alone, own)
-        doubts[HEARD] = keep * doubts[HEARD] + 1.0
+        doubts[EXCESS] = keep * doubts[EXCESS] + gap_to_fix(f, own) - gap_to_fix(alone, own)
+        doubts[COUNTED] = keep * doubts[COUNTED] + 1.0
         loudest = max(f.ego[LEVEL], f.ego[LEVEL + 1], f.ego[LEVEL + 2])
-        if loudest > NO_NOISE and doubts[HEARD] > FEW and doubts[FARTHER] > MUCH * doubts[HEARD]:
+        if (
+            loudest > LOUDEST_NOISE
+            and doubts[COUNTED] > LEAST_COUNTED
+            and doubts[EXCESS] > MOST_EXCESS * doubts[COUNTED]
+        ):
             copy_filter(alone, f)
-            doubts[FARTHER] = doubts[HEARD] = 0.0
-            doubts[LEFT_FOR] = doubts[LAST_TIME] = max(2.0 * doubts[LAST_TIME], AT_FIRST)
-    f.ego[TOLD + ALONE] = 1.0 if doubts[LEFT_FOR] > 0.0 else 0.0
-    if doubts[LEFT_FOR] > 0.0:
+            doubts[EXCESS] = doubts[COUNTED] = 0.0
+            doubts[ALONE_FOR] = doubts[ALONE_LAST] = max(2.0 * doubts[ALONE_LAST], FIRST_ALONE)
+    f.ego[TOLD + ALONE] = 1.0 if doubts[ALONE_FOR] > 0.0 else 0.0
+    if doubts[ALONE_FOR] > 0.0:
         for i in range(12):
             f.ego[ANSWER + i] = alone.ego[ANSWER + i]
-
-
-@part
-def gap_to_fix(f: Filter, own: Floats) -> float:
-    """Squared normalised distance of the answer from the fix, clipped."""
-    square = 0.0
-    for c in range(3):
-        gap = own[FIX + c] - f.ego[ANSWER + c]
-        square += gap * gap / (own[FIX_VARIANCE + c] + f.ego[COVARIANCE + 4 * c])
-    return min(square, CLIPPED)
-
-
-@part
-def copy_rows(own: Floats, rows: Floats, tries: Tries, count: int) -> None:
-    """Copy a step's numbers, which trying it changes."""
-    for i in range(OWN):
-        tries.own[i] = own[i]
-    for i in range(count):
-        for j in range(WIDTH):
-            tries.rows[i, j] = rows[i, j]
 
 
 @inner
@@ -314,7 +299,7 @@ def attempt(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, 
     leave(f, model, own, rows, vehicles, count)
     scale_motion_noise(f, own, rows, vehicles, count)
     f.ego[SPAN] = own[DT]
-    f.ego[UNSEEN_FOR] += own[DT]
+    f.ego[SINCE_FIX] += own[DT]
     f.ego[AGREED] += own[DT] if f.who[0, HITS] == 0 else 0.0
     if f.ego[STEPS] > 0:
         f.ego[CLOCK] += own[DT]

@@ -141,7 +141,7 @@ normalised innovations of range, azimuth and inclination and the share of its me
 was: the ego's are those of its fix."""
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
 LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, LEFT = 20, 26, 32, 38, 50, 53, 62
-AGREED, UNSEEN_FOR, EGO = 69, 70, 71
+AGREED, SINCE_FIX, EGO = 69, 70, 71
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
 of motion makes, and the whole then; fifteen numbers of `otherwise` on slips; by kind of number the logarithm of its
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what

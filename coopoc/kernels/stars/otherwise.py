@@ -45,6 +45,7 @@ from .cooperative_state import (
     COVARIANCE,
     DT,
     ESTABLISHED,
+    FIX,
     FIX_VARIANCE,
     FIXES,
     INFORMATION,
@@ -59,12 +60,12 @@ from .cooperative_state import (
     MOTION_VARIANCE,
     MOTIONS,
     OWN,
+    SINCE_FIX,
     SLIPPING,
     SLOPE,
     SPAN,
     STEP,
     TOLD,
-    UNSEEN_FOR,
     VEHICLE,
     WHOLE,
     WIDTH,
@@ -213,7 +214,7 @@ def collapse(f: Filter, i: int, n: int, there: float) -> None:
 @part
 def average_over_all(f: Filter, model: Model, own: int) -> None:
     """Average over whether the errors of all odometries are there, or none: evidence that none errs adds up,
-    and its prior odds, too: noise that is not white makes either look surer. One vehicle tells as little as two."""
+    and its prior odds, too: noise that is not white makes either look surer. One vehicle counts as two."""
     ego, width, kept, odds = f.ego, len(f.few[0]) - 2, f.h.matrix, max((own - 3) // 2, 2) * model.exact
     for c in range(12):
         kept[c] = ego[ANSWER + c]
@@ -255,12 +256,14 @@ class Tries(NamedTuple):
     doubts: Floats
 
 
-FARTHER, HEARD, LEFT_FOR, LAST_TIME, DOUBTS = range(5)
-"""Sums, fading in MEMORY s, of how much farther the star's estimate is from the ego's fixes than that of the ego alone,
-and of these fixes; s for which the latter still counts, and for which it did the last time."""
-MEMORY, FEW, MUCH, CLIPPED, NO_NOISE, AT_FIRST = 10.0, 3.0, 4.0, 25.0, 2.9, 20.0
-"""s; fixes; squared normalised distance a fix from which the star is left, and the most that counts of one, if at the
-same time what is measured of neighbours has this logarithm of a level, beyond all noise; s for which, at first."""
+EXCESS, COUNTED, ALONE_FOR, ALONE_LAST, DOUBTS = range(5)
+"""Of the star as a whole: sums over the ego's fixes, fading in MEMORY s, of how much larger their squared normalised
+distance from the star's estimate is than from that of the ego alone, and of 1; for how many s the latter counts from
+now on, and counted last."""
+MEMORY, LEAST_COUNTED, MOST_EXCESS, LARGEST_GAP = 10.0, 3.0, 4.0, 25.0
+"""s; fixes, and the mean excess, from which the star is left; the most that one distance counts."""
+LOUDEST_NOISE, FIRST_ALONE = 2.9, 20.0
+"""Logarithm of a level that no noise reaches, 4.3 times the assumed deviation; s alone for the first time."""
 
 
 @storage
@@ -268,6 +271,26 @@ def new_tries(slots: int, vehicles: int) -> Tries:
     """Memory for as many members and vehicles."""
     other, alone = new_filter(slots, vehicles), new_filter(slots, vehicles)
     return Tries(other, np.zeros(OWN), np.zeros((slots, WIDTH)), alone, np.zeros(OWN), np.zeros(DOUBTS))
+
+
+@part
+def copy_rows(own: Floats, rows: Floats, tries: Tries, count: int) -> None:
+    """Copy a step's numbers, which trying it changes."""
+    for i in range(OWN):
+        tries.own[i] = own[i]
+    for i in range(count):
+        for j in range(WIDTH):
+            tries.rows[i, j] = rows[i, j]
+
+
+@part
+def gap_to_fix(f: Filter, own: Floats) -> float:
+    """Squared normalised distance of the answer from the fix, clipped."""
+    square = 0.0
+    for c in range(3):
+        gap = own[FIX + c] - f.ego[ANSWER + c]
+        square += gap * gap / (own[FIX_VARIANCE + c] + f.ego[COVARIANCE + 4 * c])
+    return min(square, LARGEST_GAP)
 
 
 @part
@@ -295,8 +318,8 @@ def show(f: Filter) -> None:
         f.ego[BEFORE + c] = f.h.three[GAP + c]
         far += f.h.three[GAP + c] ** 2
         noise += f.h.three[VARIANCE + c]
-    far, most = math.sqrt(far), f.ego[SPEED_OF_LATE] * f.ego[UNSEEN_FOR] + 2.0 * math.sqrt(noise)
-    more, f.ego[UNSEEN_FOR] = far - math.sqrt(before), 0.0
+    far, most = math.sqrt(far), f.ego[SPEED_OF_LATE] * f.ego[SINCE_FIX] + 2.0 * math.sqrt(noise)
+    more, f.ego[SINCE_FIX] = far - math.sqrt(before), 0.0
     f.ego[SHOWN] = max(f.ego[SHOWN] + min(more, most), 0.0)
     if more > most or far < 2.0 * math.sqrt(noise):
         f.ego[JUMPED] = 1.0 if more > most else 0.0
