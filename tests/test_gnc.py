@@ -142,7 +142,7 @@ def test_gnc_that_rejects_every_fix_is_reported() -> None:
 
 
 def test_a_limit_of_rounds_is_a_status(monkeypatch: pytest.MonkeyPatch) -> None:
-    z = np.repeat([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [40.0, 0.0, 0.0]], 4, axis=0)
+    z = np.outer([0.0, 1.0, 40.0] * 4, [1.0, 0.0, 0.0])
     problem = Problem(("a",)).add("position", ["a"] * 12, z, std=1.0)
     monkeypatch.setattr(graduated, "ROUNDS", 2)
     with pytest.raises(SolveError) as caught:

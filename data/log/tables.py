@@ -104,7 +104,7 @@ def _wide(
     frame = frame.rename(columns={**kinds, **{f"{name}_std": f"{kind}_std" for name, kind in kinds.items()}})
     value = {kind: "arrival" if kind == "message" else kind for kind in KINDS if kind not in ignore}
     value = {kind: column for kind, column in value.items() if column in frame.columns}
-    columns = [] if "partner" in frame else [*map(str, frame.columns)]
+    columns = [] if "partner" in frame else [*map(str, frame.select_dtypes("number").columns)]
     beside = {column: found for column in columns if (found := _of_partner(column))}
     if not (value or beside):
         allowed = f"must be there, or columns named after kinds ({', '.join(KINDS)})"
