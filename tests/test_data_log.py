@@ -88,12 +88,12 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path: Path) -> None:
 
 def test_columns_that_end_with_a_partner_are_measurements_of_it(tmp_path: Path) -> None:
     t = np.arange(0, 10, 0.5)
-    for name, other, x in (("a", "b", 0.0), ("b", "a", 12.0)):
+    for name, other, x in zip("ab", "ba", (0.0, 12.0), strict=True):
         seen = {f"range_{other}": 12.0, f"range_{other}_std": 0.2, "range_kept": "yes"}
         write(pd.DataFrame({"t": t, "x": 5 * t + x, "y": 0.0, "vx": 5.0, "vy": 0.0} | seen), tmp_path / f"{name}.csv")
     log = read_log(tmp_path)
     assert (log.recording.sensors.range_std, np.nanmax(log.recording.relative)) == pytest.approx((0.2, 12.0))
-    assert [*log.summary.unused.values()] == [20, 20]
+    assert sum(log.summary.unused.values()) == 40
 
 
 def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhere(tmp_path: Path) -> None:
