@@ -116,7 +116,7 @@ def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Flo
         getattr(sent, kind)[sender, run, step] += error
     box = inbox(given, EGO, method.message)
     seen, assumed = measurements(given, EGO, box), assumptions(given, known, EGO, box)
-    x, cov = run_filter(seen, assumed, sent, model_of(known, method.priors))[:2]
+    x, cov = run_filter(seen, assumed, sent, np.empty((0, 0, 4)), model_of(known, method.priors))[:2]
     return x, np.sqrt(np.trace(cov, axis1=-2, axis2=-1))
 
 

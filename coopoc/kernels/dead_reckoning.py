@@ -7,6 +7,7 @@ import math
 from ..arrays import Floats
 from .compiling.compile import compiled, part
 from .motion import MotionNoise, keep_pace, process_variance
+from .odometry_fault import correct, judge
 
 ROUNDING = 1e-9
 """s, by how much sums of time steps may miss a time."""
@@ -56,11 +57,32 @@ def since(history: Floats, age: float, moved: Floats, variance: Floats) -> None:
 
 @part
 def dead_reckon(
-    row: Floats, history: Floats, motion: MotionNoise, moved: Floats, q: Floats, since_fix: Floats, late: Floats
+    row: Floats,
+    history: Floats,
+    motion: MotionNoise,
+    fix: Floats,
+    odometry: Floats,
+    moved: Floats,
+    q: Floats,
+    since_fix: Floats,
+    late: Floats,
+    by_fixes: Floats,
 ) -> int:
     """Add a step to the history: its motion and the variance of that; what a fix of some age has missed since.
 
     Nothing is changed where the input is bad. NO_FIX_YET: there is no fix.
+
+    Args:
+        row: the step's numbers; a velocity of odometry that fails is corrected.
+        history: of the motions.
+        motion: noise.
+        fix: (3,) m^2, variance of a fix.
+        odometry: state of `kernels.odometry_fault`, of no length where odometry is believed.
+        moved: (3,) m, out, the motion.
+        q: (3,) m^2, out, its variance.
+        since_fix: (3,) m, out, the motion since the fix.
+        late: (3,) m^2, out, its variance.
+        by_fixes: (4,) m and m^2, out, what of the motion and of its variance is of a correction.
     """
     dt, age, missing = row[DT], row[FIX_AGE], 0
     for c in range(3):
@@ -72,12 +94,22 @@ def dead_reckon(
     if missing == 0 and not -ROUNDING <= age <= min(history[0, 2] + dt, history[0, 3]) + ROUNDING:
         return BAD_INPUT
     square = history[0, SQUARE]
+    for c in range(3):
+        by_fixes[c] = -dt * row[3 + c]
+    by_fixes[3] = correct(odometry, motion, row[VELOCITY], dt)
     process_variance(motion, square, row[VELOCITY], dt, q)
     for c in range(3):
         moved[c] = dt * row[3 + c]
+        by_fixes[c] += moved[c]
+        q[c] += by_fixes[3]
     push(history, dt, moved[:3], q)
     keep_pace(square, row[VELOCITY], dt)
     if missing > 0:
         return NO_FIX_YET
     since(history, age, since_fix, late)
+    r = 0.5 * (fix[0] + late[0] + fix[1] + late[1])
+    lost = judge(odometry, row[0] + since_fix[0], row[1] + since_fix[1], r)
+    by_fixes[3] += lost
+    for c in range(3):
+        q[c] += lost
     return ESTIMATE

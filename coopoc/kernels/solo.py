@@ -166,7 +166,7 @@ def filter_runs(
 
 
 @compiled
-def stream_step(row: Floats, state: Floats, history: Floats, noise: Floats, answer: Floats) -> int:
+def stream_step(row: Floats, state: Floats, history: Floats, odometry: Floats, noise: Floats, answer: Floats) -> int:
     """One step of a stream: dead reckoning, the fix brought forward, `step` on every axis.
 
     Nothing is changed where the input is bad. A state of NaN has not started yet.
@@ -175,12 +175,13 @@ def stream_step(row: Floats, state: Floats, history: Floats, noise: Floats, answ
         row: (8,) fix m, velocity m/s, dt s, age of the fix s.
         state: (3, 7).
         history: of `motion`.
+        odometry: of `dead_reckon`.
         noise: (13,) the numbers of a MotionNoise and a FixNoise: to hand over tuples takes longer than the step.
         answer: (12,) position m, covariance m^2.
     """
     motion = MotionNoise(noise[:3], noise[3:6], noise[6], noise[7], noise[8])
-    q, late, moved = np.empty(3), np.zeros(3), np.zeros(3)
-    outcome = dead_reckon(row, history, motion, answer, q, moved, late)
+    q, late, moved, by_fixes = np.empty(3), np.zeros(3), np.zeros(3), np.zeros(4)
+    outcome = dead_reckon(row, history, motion, noise[9:12], odometry, answer, q, moved, late, by_fixes)
     starts = math.isnan(state[0, 0])
     if outcome == BAD_INPUT or (starts and outcome == NO_FIX_YET):
         return outcome

@@ -23,6 +23,7 @@ from .calibration import calibrated, scaled
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
 from .gaps import in_stretches
 from .noise_model import NoiseModel, resolve
+from .odometry_fault import with_odometry
 from .track import Checked, Track, check_options
 
 FOUND = {
@@ -185,6 +186,11 @@ class CooperativeFilter(Checked):
         """
         noise_model = resolve(self.noise_model, check_recording(recording))
         priors = priors_of(self, noise_model, recording.measured)
+        velocity = recording.velocity
+        if priors.fix_gate:
+            columns = recording.observing(egos)
+            recording, noise_model = with_odometry(recording, columns, noise_model, priors.fix)
+        extra, noise_model = noise_model.extra, replace(noise_model, extra=None)
         model, notes = model_of(noise_model, priors), [*noise_model.notes, *filter(None, [self.calibration])]
         variance, sent = priors.fix**2 * noise_model.fix_variance(recording), broadcasts(recording, noise_model, priors)
         stated = noise_model.compass[1], noise_model.sensors.range_offset_std if noise_model.sensors else 0.0
@@ -192,7 +198,11 @@ class CooperativeFilter(Checked):
         def run(ego: int, inbox: Inbox) -> Iterator[Estimate]:
             inputs, assumed = measurements(recording, ego, inbox), assumptions(recording, noise_model, ego, inbox)
             assumed = assumed._replace(fixes=variance)
-            x, cov, neighbours, fixes, weights, deviations = run_filter(inputs, assumed, sent, model)
+            odometry = np.empty((0, 0, 4))
+            if extra is not None:
+                by_fixes = recording.dt * (recording.velocity - velocity)[:, :, ego]
+                odometry = np.concatenate([by_fixes, extra[:, :, ego, None]], axis=-1)
+            x, cov, neighbours, fixes, weights, deviations = run_filter(inputs, assumed, sent, odometry, model)
             extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate(KINDS)}
             names = (*(name.replace(" ", "_") for name in FOUND), *(f"{kind}_level" for kind in LEVELS))
             extras |= {name: deviations[..., i, None] for i, name in enumerate(names)}

@@ -10,6 +10,7 @@ from ..world.v2x import FIX_AND_VELOCITY
 from .egos import Estimate, assumptions, follow_egos, measurements
 from .gaps import in_stretches
 from .noise_model import NoiseModel, resolve
+from .odometry_fault import with_odometry
 from .track import Checked, Track
 
 
@@ -50,6 +51,8 @@ class JointFilter(Checked):
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent."""
         noise = resolve(self.noise_model, recording)
+        if self.robust:
+            recording, noise = with_odometry(recording, recording.observing(egos), noise)
         refine, gates = (wish and noise.exact_relative for wish in (self.exact, self.robust))
         return follow_egos(
             self,

@@ -21,6 +21,7 @@ from .calibration import calibrated, scaled
 from .doubts import doubts
 from .gaps import in_stretches
 from .noise_model import NoiseModel, constant_noise, motion_noise, resolve
+from .odometry_fault import with_odometry
 from .stream import FilterStream
 from .track import Alone, Checked, Track, silent_track
 
@@ -76,8 +77,10 @@ class Kalman(Alone, Checked):
         began = clock()
         columns = check_recording(recording).columns(egos)
         assumed = resolve(self.noise_model, recording, relative=False)
+        if self.robust:
+            recording, assumed = with_odometry(recording, columns, assumed)
         x, p, _ = solo_filter(recording, columns, assumed, fix_noise(assumed, self.robust), self.x0)
-        return solo_track(recording, columns, x, p, began, noise_model=assumed)
+        return solo_track(recording, columns, x, p, began, assumed.notes, noise_model=assumed)
 
     def start(
         self, x0: npt.ArrayLike | None = None, *, interval: float | None = None, history: float = 10.0

@@ -35,7 +35,8 @@ class NoiseModel:
         gnss_std: (3,) m.
         fleet: whose true velocity is known, for the oracle only.
         compass: (2,) rad, noise and constant error of the heading, both of which are within the azimuth's std.
-        notes: of the Track, what was changed to stay within double precision.
+        notes: of the Track, what was changed of the recording or of the noise.
+        extra: (R, T, N) m^2, what the variance of each motion has more where `methods.odometry_fault` corrects it.
     """
 
     name: str
@@ -45,6 +46,7 @@ class NoiseModel:
     fleet: Fleet | None = None
     compass: tuple[float, float] = (0.0, 0.0)
     notes: tuple[str, ...] = ()
+    extra: Floats | None = None
 
     __repr__ = short_repr
 
@@ -126,6 +128,16 @@ class NoiseModel:
             inbox: of the one vehicle; then of all (R, T, N, 3) by what it knows, at the steps of messages that arrive.
             first: step at which the filter begins.
         """
+        more: Floats | None = self.extra
+        if more is not None:
+            columns = np.arange(len(recording.ids)) if columns is None else columns
+            usual = replace(self, extra=None).process_variance(recording, columns, inbox, first)
+            own = columns if inbox is not None else slice(None)
+            variance: Floats = np.broadcast_to(
+                usual, (*more.shape[:2], len(recording.ids if inbox is not None else columns), 3)
+            ).copy()
+            variance[:, :, own] += more[:, :, columns, None]
+            return variance
         if self.process_std is not None:
             return np.square(self.process_std)[None, None, None]
         assert self.sensors is not None
@@ -136,8 +148,8 @@ class NoiseModel:
         if columns is not None and inbox is None:
             velocity = velocity[:, :, columns]
         if self.fleet is not None:
-            variance: Floats = np.square(recording.dt * self.sensors.velocity_std(velocity, 1e-6))
-            return variance
+            of_truth: Floats = np.square(recording.dt * self.sensors.velocity_std(velocity, 1e-6))
+            return of_truth
         if inbox is None:
             return own_variances(self.sensors.motion_noise(), velocity, recording.dt, first)
         use, neighbour = np.zeros(velocity.shape[:3], np.uint8), links.neighbour[inbox.link]

@@ -15,6 +15,7 @@ from ..errors import InputError
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.geometry import components
 from ..kernels.motion import MotionNoise
+from ..kernels.odometry_fault import SIZE
 from ..kernels.stars.cooperative_state import (
     AGE,
     FIX_VARIANCE,
@@ -149,6 +150,7 @@ class StarStream:
         self._last: Floats = np.full((1, WIDTH), np.nan)
         self._answer: Floats = np.full(12, np.nan)
         self._memory: Floats = np.zeros(9)
+        self._odometry: Floats = np.full(SIZE if priors.fix_gate else 0, np.nan)
         if x0 is not None:
             self._memory[:6] = *self._start, *np.full(3, 1.0 / KNOWN)
 
@@ -197,7 +199,10 @@ class StarStream:
         rows: Floats = np.frombuffer(bytearray().join([each.row for each in neighbours])).reshape(len(names), WIDTH)
         own, history, last = np.empty(OWN), self.history.reserve(), self._last
         own_memory, oldest = self._memory, self.max_age
-        outcome = stream_rows(self._given, history, motion, fix, own, rows, columns, last, time, oldest, own_memory)
+        state = self._odometry
+        outcome = stream_rows(
+            self._given, history, motion, fix, state, own, rows, columns, last, time, oldest, own_memory
+        )
         if outcome not in (ESTIMATE, NO_FIX_YET):
             self.history.check(gnss, velocity, dt, fix_age)
         self._time = time

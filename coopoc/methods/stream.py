@@ -10,6 +10,7 @@ import numpy.typing as npt
 from ..arrays import Floats
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.motion import MotionNoise
+from ..kernels.odometry_fault import SIZE
 from ..kernels.solo import STATE, FixNoise, stream_step
 from .motion_history import MotionHistory, three
 
@@ -80,6 +81,7 @@ class FilterStream:
             np.zeros(8),
             np.hstack((*motion, *fixes)),
         )
+        self._odometry = np.full(SIZE if fixes.gate > 0.0 else 0, np.nan)
         if x0 is not None:
             self._state[:] = STATE
             self._state[:, 0] = three("x0", x0)
@@ -105,7 +107,7 @@ class FilterStream:
         """
         self.history.write(self._given, gnss, velocity, dt, fix_age)
         answer = np.empty(12)
-        outcome = stream_step(self._given, self._state, self.history.reserve(), self._noise, answer)
+        outcome = stream_step(self._given, self._state, self.history.reserve(), self._odometry, self._noise, answer)
         if outcome == NO_FIX_YET:
             return np.full(3, np.nan), None
         if outcome != ESTIMATE:

@@ -24,6 +24,7 @@ from .cooperative_state import (
     AGREED,
     ANSWER,
     AT,
+    BY_FIXES,
     CLOCK,
     COVARIANCE,
     DT,
@@ -38,6 +39,7 @@ from .cooperative_state import (
     LEFT,
     LEVEL,
     LOCKED,
+    MORE,
     MOTION,
     MOTION_VARIANCE,
     ODOMETER,
@@ -96,6 +98,7 @@ from .otherwise import (
     ALONE_LAST,
     COUNTED,
     EXCESS,
+    FAILED,
     FIRST_ALONE,
     LASTS,
     LEAST_COUNTED,
@@ -113,9 +116,11 @@ from .otherwise import (
     chance,
     copy_rows,
     corrected,
+    corrected_motion,
     gap_to_fix,
     learn_fix,
     learn_relative,
+    measured_motion,
     moved,
     new_tries,
     remember_speed,
@@ -128,7 +133,7 @@ from .otherwise import (
 
 @compiled
 def run_filter(
-    measurements: Measurements, assumed: Assumptions, sent: Sent, model: Model
+    measurements: Measurements, assumed: Assumptions, sent: Sent, odometry: Floats, model: Model
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; weights of the ego's fix (R, T), and by link
     (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the neighbour is trusted.
@@ -139,6 +144,8 @@ def run_filter(
         measurements: measurements and messages of the ego.
         assumed: process noise, and the variance of fixes.
         sent: in messages.
+        odometry: (R, T, 4) m and m^2, by how much fixes correct the ego's motion, and its variance is larger
+            then; of no length where its odometry never fails.
         model: noise model.
     """
     runs, steps, vehicles = measurements.gnss.shape[0], len(measurements.start) - 1, measurements.gnss.shape[2]
@@ -155,6 +162,9 @@ def run_filter(
             first = measurements.start[t]
             count = measurements.start[t + 1] - first
             gather_own(own, measurements, assumed, model.white, run, t)
+            for i in range(4 if len(odometry) else 0):
+                own[BY_FIXES + i] = odometry[run, t, i]
+            measured_motion(own)
             for i in range(count):
                 who[i] = measurements.neighbour[first + i]
                 gather_neighbour(rows, measurements, assumed, sent, run, t, first + i, i)
@@ -225,7 +235,8 @@ def step(
     vehicles: Ints,
     count: int,
 ) -> None:
-    """A step; where its numbers are unlikely, the likelier of two: of an ego that slips, and of one that does not;
+    """A step; where its numbers are unlikely, the likelier of two: of an ego that slips, or whose odometry fails as its
+    fixes show, and of one that does not;
     beside it one of the ego alone, once it has met a neighbour.
 
     Args:
@@ -237,7 +248,8 @@ def step(
         vehicles: (count,) which they are.
         count: of them.
     """
-    slips, other = model.slip > 0.0, tries.other
+    slips, other, fails = model.slip > 0.0, tries.other, own[MORE] > 0.0 and tries.doubts[FAILED] == 0.0
+    tries.doubts[FAILED] = own[MORE]
     f.ego[NOW] = 0.0
     if model.forget > 0.0 and count > 0 and tries.alone.g.vectors[0] == 0:
         copy_filter(f, tries.alone)
@@ -248,10 +260,11 @@ def step(
         copy_filter(f, other)
         copy_rows(own, rows, tries, count)
     attempt(f, model, own, rows, vehicles, count)
-    if slips and surprised(f):
+    if slips and (fails or surprised(f)):
         other.ego[NOW] = 1.0
+        corrected_motion(tries.own)
         attempt(other, model, tries.own, tries.rows, vehicles, count)
-        probably = chance(other, f, own[DT])
+        probably = chance(other, f, own, fails)
         if probably >= 0.5:
             copy_filter(other, f)
         f.ego[SLIPPED] = probably
@@ -270,6 +283,7 @@ def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints)
     alone, doubts, own = tries.alone, tries.doubts, tries.first
     alone.ego[NOW] = 0.0
     remember_speed(alone, own)
+    corrected_motion(own)
     attempt(alone, model, own, rows, vehicles, 0)
     average(alone, model)
     doubts[ALONE_FOR] -= own[DT]

@@ -33,7 +33,7 @@ from .gaussian import (
     widen,
 )
 
-FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, OWN = 0, 3, 6, 9, 12, 13
+FIX, FIX_VARIANCE, MOTION, MOTION_VARIANCE, DT, BY_FIXES, MORE, OWN = 0, 3, 6, 9, 12, 13, 16, 17
 """Of the ego's row: fix m (NaN for none), its variance m^2, motion m, its variance m^2, three each, and dt s."""
 RELATIVE, AGE, SOLO, SOLO_VARIANCE, ODOMETER, SPEED, STEP, TYPICAL, WIDTH = 0, 5, 6, 9, 12, 15, 18, 21, 24
 """Of a neighbour's row: `geometry.five`, and its newest message: age s (-1 for none held), mean of its fixes m and its

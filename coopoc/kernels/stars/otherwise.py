@@ -39,9 +39,11 @@ import numpy as np
 
 from ...arrays import Floats, Ints
 from ..compiling.compile import part, storage
+from ..odometry_fault import DECISIVE
 from .cooperative_state import (
     AGREED,
     ANSWER,
+    BY_FIXES,
     COVARIANCE,
     DT,
     ESTABLISHED,
@@ -56,6 +58,7 @@ from .cooperative_state import (
     LONGEST,
     LOUDER,
     MADE,
+    MORE,
     MOTION,
     MOTION_VARIANCE,
     MOTIONS,
@@ -256,10 +259,10 @@ class Tries(NamedTuple):
     doubts: Floats
 
 
-EXCESS, COUNTED, ALONE_FOR, ALONE_LAST, DOUBTS = range(5)
+EXCESS, COUNTED, ALONE_FOR, ALONE_LAST, FAILED, DOUBTS = range(6)
 """Of the star as a whole: sums over the ego's fixes, fading in MEMORY s, of how much larger their squared normalised
 distance from the star's estimate is than from that of the ego alone, and of 1; for how many s the latter counts from
-now on, and counted last."""
+now on, and counted last; MORE of the step before."""
 MEMORY, LEAST_COUNTED, MOST_EXCESS, LARGEST_GAP = 10.0, 3.0, 4.0, 25.0
 """s; fixes, and the mean excess, from which the star is left; the most that one distance counts."""
 LOUDEST_NOISE, FIRST_ALONE = 2.9, 20.0
@@ -294,17 +297,32 @@ def gap_to_fix(f: Filter, own: Floats) -> float:
 
 
 @part
+def measured_motion(own: Floats) -> None:
+    """Take back what fixes have corrected of a motion."""
+    for c in range(3):
+        own[MOTION + c] -= own[BY_FIXES + c]
+
+
+@part
+def corrected_motion(own: Floats) -> None:
+    """Correct a motion as fixes show, where the odometry fails."""
+    for c in range(3):
+        own[MOTION + c] += own[BY_FIXES + c]
+        own[MOTION_VARIANCE + c] += own[MORE]
+
+
+@part
 def remember_speed(f: Filter, own: Floats) -> None:
     """The most of late speeds, and its direction: wheels that are locked measure none."""
     square = 0.0
     for c in range(3):
-        square += (own[MOTION + c] / own[DT]) ** 2
+        square += ((own[MOTION + c] + own[BY_FIXES + c]) / own[DT]) ** 2
     speed, late = math.sqrt(square), f.ego[SPEED_OF_LATE] * math.exp(-own[DT] / LATE)
     f.ego[BLIND] += own[DT]
     if speed > 0.5 * late:
         f.ego[BLIND] = 0.0
         for c in range(3):
-            f.ego[COURSE + c] = own[MOTION + c] / (own[DT] * speed)
+            f.ego[COURSE + c] = (own[MOTION + c] + own[BY_FIXES + c]) / (own[DT] * speed)
     f.ego[SPEED_OF_LATE] = max(speed, late)
 
 
@@ -367,11 +385,12 @@ def surprised(f: Filter) -> bool:
 
 
 @part
-def chance(f: Filter, first: Filter, dt: float) -> float:
-    """Probability of a slip, after both tries of a step, by that before it."""
-    stays, begins = math.exp(-dt / LASTS), min(dt / RARE, 0.5)
+def chance(f: Filter, first: Filter, own: Floats, fails: bool) -> float:
+    """Probability of a slip, after both tries of a step, by that before it, or by the evidence of an odometry that
+    `fails` from now on, which does not end by itself."""
+    stays, begins = 1.0 if own[MORE] > 0.0 else math.exp(-own[DT] / LASTS), min(own[DT] / RARE, 0.5)
     before = first.ego[SLIPPED] * stays + (1.0 - first.ego[SLIPPED]) * begins
-    odds = f.ego[LIKELY] - first.ego[LIKELY] + math.log(before / (1.0 - before))
+    odds = f.ego[LIKELY] - first.ego[LIKELY] + (DECISIVE if fails else math.log(before / (1.0 - before)))
     return chance_of(odds)
 
 

@@ -19,12 +19,15 @@ from .cooperative_messages import remember
 from .cooperative_state import (
     AGE,
     ANSWER,
+    BY_FIXES,
     DT,
     EXTRA_VARIANCE,
     FIX,
     FIX_VARIANCE,
+    MORE,
     MOTION,
     MOTION_VARIANCE,
+    OWN,
     SOLO,
     SPEED,
     STEP,
@@ -39,7 +42,7 @@ from .cooperative_state import (
     new_filter,
 )
 from .gaussian import PLACE
-from .otherwise import DOUBTS, Tries, new_tries
+from .otherwise import DOUBTS, Tries, measured_motion, new_tries
 
 
 @compiled
@@ -48,6 +51,7 @@ def stream_rows(
     history: Floats,
     motion: MotionNoise,
     fix: Floats,
+    odometry: Floats,
     own: Floats,
     rows: Floats,
     vehicles: Ints,
@@ -64,6 +68,7 @@ def stream_rows(
         history: of `motion`.
         motion: noise.
         fix: (3,) m^2, variance of a fix.
+        odometry: of `dead_reckon`.
         own: (OWN,) out.
         rows: (k, WIDTH) measurements and new messages with their age, NaN for none; then with the newest message.
         vehicles: (k,) which they are; the ego is vehicle 0.
@@ -73,13 +78,17 @@ def stream_rows(
         memory: of `remember`, of the ego.
     """
     since, late, dt = np.zeros(3), np.zeros(3), numbers[6]
-    outcome = dead_reckon(numbers, history, motion, own[MOTION:MOTION_VARIANCE], own[MOTION_VARIANCE:DT], since, late)
+    moved, q = own[MOTION:MOTION_VARIANCE], own[MOTION_VARIANCE:DT]
+    outcome = dead_reckon(numbers, history, motion, fix, odometry, moved, q, since, late, own[BY_FIXES:OWN])
     if outcome == BAD_INPUT:
         return BAD_INPUT
     own[DT], interval = dt, motion.interval if motion.interval > 0.0 else dt
     for c in range(3):
         own[FIX + c], own[FIX_VARIANCE + c] = numbers[c] + since[c], fix[c] + late[c]
-    remember(memory, own[MOTION:MOTION_VARIANCE], own[FIX:FIX_VARIANCE], own[FIX_VARIANCE:MOTION], dt)
+    remember(memory, moved, own[FIX:FIX_VARIANCE], own[FIX_VARIANCE:MOTION], dt)
+    measured_motion(own)
+    for c in range(3):
+        q[c] -= own[MORE]
     for i in range(len(rows)):
         row, newest, sent = rows[i], last[vehicles[i]], time - rows[i, AGE]
         if math.isfinite(row[SPEED]) and sent >= newest[AGE] - ROUNDING:

@@ -1,0 +1,49 @@
+"""Recordings whose odometry fails: as fixes correct it (`coopoc.kernels.odometry_fault`)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+
+import numpy as np
+
+from ..kernels.odometry_fault import correct_drives
+from ..world.links import stretches
+from ..world.recording import Recording
+from .noise_model import NoiseModel, motion_noise
+
+
+def with_odometry(
+    recording: Recording, egos: Sequence[int], noise_model: NoiseModel, fix: float = 1.0
+) -> tuple[Recording, NoiseModel]:
+    """The recording with velocities that fixes correct, of vehicles whose odometry fails, and the noise of these, with
+    a note; both as they are where none fails, no noise is stated, or velocities are those of fixes.
+
+    Args:
+        recording: in the world frame.
+        egos: columns that are followed; their neighbours correct what they send.
+        noise_model: of the method.
+        fix: factor of the standard deviation of fixes.
+    """
+    sensors, links = noise_model.sensors, recording.links
+    if sensors is None or noise_model.fleet is not None or sensors.velocity_reading == "fixes":
+        return recording, noise_model
+    columns = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
+    columns = columns[~np.isin(columns, recording.landmarks)]
+    gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
+    motion, variance = motion_noise(noise_model, recording.dt), fix**2 * noise_model.gnss_variance
+    corrected, more = correct_drives(gnss, velocity, motion, variance, columns, recording.dt)
+    if not more.any():
+        return recording, noise_model
+    velocity, extra = velocity.copy(), np.zeros(velocity.shape[:3])
+    velocity[:, :, columns], extra[:, :, columns] = corrected, more
+    notes = [*noise_model.notes]
+    for n, failed in zip(columns.tolist(), (more > 0).any(axis=0).T, strict=True):
+        if failed.any():
+            times = [f"{recording.t[a]:.10g} to {recording.t[b - 1]:.10g}" for a, b in stretches(failed)]
+            text = f"odometry, {recording.ids[n]}: fails, as fixes show, which correct it"
+            more_times = f", and {len(times) - 3} times more" * (len(times) > 3)
+            notes.append(f"{text} ({', '.join(times[:3])} s{more_times})")
+    corrected_recording = replace(recording, velocity=velocity)
+    notes.extend(note for note in recording.unlikely if note not in corrected_recording.unlikely)
+    return corrected_recording, replace(noise_model, extra=extra, notes=tuple(notes))
