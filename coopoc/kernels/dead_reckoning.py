@@ -96,7 +96,7 @@ def dead_reckon(
     square = history[0, SQUARE]
     for c in range(3):
         by_fixes[c] = -dt * row[3 + c]
-    by_fixes[3] = correct(odometry, motion, row[VELOCITY], dt)
+    by_fixes[3] = correct(odometry, row[VELOCITY], dt)
     process_variance(motion, square, row[VELOCITY], dt, q)
     for c in range(3):
         moved[c] = dt * row[3 + c]
@@ -108,7 +108,7 @@ def dead_reckon(
         return NO_FIX_YET
     since(history, age, since_fix, late)
     r = 0.5 * (fix[0] + late[0] + fix[1] + late[1])
-    lost = judge(odometry, row[0] + since_fix[0], row[1] + since_fix[1], r)
+    lost = judge(odometry, motion, row[0] + since_fix[0], row[1] + since_fix[1], r, dt)
     by_fixes[3] += lost
     for c in range(3):
         q[c] += lost

@@ -20,17 +20,35 @@ import numpy as np
 
 from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
-from .motion import MotionNoise, keep_pace, process_variance
+from .motion import MotionNoise
 
-PLACE, ERROR, VARIANCE, BELIEVED, SURE, LEVEL, FIX, AGE = 0, 2, 4, 7, 9, 10, 11, 13
-"""Places in a state: position m and b m/s with the variances and covariance (pp, pb, bb) of an axis, the position by
-odometry alone and its variance, the level of the noise of fixes, the last fix m and how long ago it was s."""
-EVIDENCE, SINCE, PATH, BEFORE, FAILS, SPEED, FASTEST, TRUE, PACE, Q, SIZE = 14, 15, 16, 17, 19, 20, 21, 22, 23, 26, 29
-"""The evidence, for how long s and how far m there is some, where odometry alone has led since m, and whether it fails;
-the most of late speeds, of all by odometry, and that with b, m/s; the square of the pace and the motion's variance."""
+PLACE, ERROR, VARIANCE, BELIEVED, SURE, LEVEL, FAILS, EVIDENCE, LASTS, PATH, BEFORE, SPEED, FASTEST = (
+    0,
+    2,
+    4,
+    7,
+    9,
+    10,
+    11,
+    12,
+    13,
+    14,
+    15,
+    17,
+    18,
+)
+"""Places in a state, when fixes were last taken: position m and b m/s with the variances and covariance (pp, pb, bb)
+of an axis, the position by odometry alone and its variance, and the level of the noise of fixes; whether the odometry
+fails, the evidence, for how long s and how far m there is some, and where odometry alone has led since m; squares of
+the most of late speeds and of all by odometry m^2/s^2."""
+WAY, SINCE, FIX, GAPS, TIMES, COUNT, SIZE = 19, 21, 22, 24, 26, 27, 28
+"""Since then: the way by odometry m, the time s; the last fix m, sums of how far fixes were from the position and the
+way m, and of their times s, and how many there were."""
+TOGETHER = 0.4
+"""s, of which fixes are taken together."""
 JERKY = 1.0
 """m^2/s^3, density of the acceleration of b."""
-FAR = 16.0
+FAR = 25.0
 """Squared normalised innovation from which a filter begins anew, and the most that counts."""
 DECISIVE, MOST = 15.0, 18.0
 """Evidence from which the odometry fails, and the most that is counted; logarithms of a likelihood ratio."""
@@ -47,42 +65,28 @@ LATE = 10.0
 
 
 @part
-def correct(state: Floats, noise: MotionNoise, velocity: Floats, dt: float) -> float:
-    """Add b to a velocity where the odometry fails, and return by how many m^2 its motion is more uncertain.
+def correct(state: Floats, velocity: Floats, dt: float) -> float:
+    """Add b to a velocity (3,) m/s where the odometry fails, and return by how many m^2 its motion is more uncertain.
 
     Args:
         state: (SIZE,), NaN before the first fix; of no length where odometry is believed.
-        noise: of the motion.
         velocity: (3,) m/s.
         dt: s.
     """
     if len(state) == 0 or math.isnan(state[PLACE]):
         return 0.0
-    process_variance(noise, state[PACE:Q], velocity, dt, state[Q:SIZE])
-    keep_pace(state[PACE:Q], velocity, dt)
-    q, pb, bb, fails = 0.5 * (state[Q] + state[Q + 1]), state[VARIANCE + 1], state[VARIANCE + 2], state[FAILS] > 0.0
-    speed, true = math.sqrt(velocity[0] ** 2 + velocity[1] ** 2), 0.0
-    for c in range(2):
-        state[BEFORE + c] += dt * velocity[c]
-        state[BELIEVED + c] += dt * velocity[c]
-        state[PLACE + c] += dt * (velocity[c] + state[ERROR + c])
-        true += (velocity[c] + state[ERROR + c]) ** 2
-        velocity[c] += state[ERROR + c] if fails else 0.0
-    state[TRUE], state[FASTEST] = math.sqrt(true), max(state[FASTEST], speed)
-    speed = max(speed, state[TRUE]) if fails else speed
-    state[SPEED] = max(state[SPEED] * math.exp(-dt / LATE), speed)
-    state[PATH] += dt * speed
+    state[WAY] += dt * velocity[0]
+    state[WAY + 1] += dt * velocity[1]
     state[SINCE] += dt
-    state[AGE] += dt
-    more = 2.0 * dt * pb + dt * dt * bb + JERKY * dt**3 / 3.0
-    state[VARIANCE] += more + q
-    state[VARIANCE + 1], state[VARIANCE + 2] = pb + dt * bb + 0.5 * JERKY * dt * dt, bb + JERKY * dt
-    state[SURE] += q
-    return more if fails else 0.0
+    if state[FAILS] == 0.0:
+        return 0.0
+    velocity[0] += state[ERROR]
+    velocity[1] += state[ERROR + 1]
+    return 2.0 * dt * state[VARIANCE + 1] + dt * (2.0 * state[SINCE] - dt) * state[VARIANCE + 2] + JERKY * dt**3 / 3.0
 
 
 @part
-def judge(state: Floats, x: float, y: float, r: float) -> float:
+def judge(state: Floats, noise: MotionNoise, x: float, y: float, r: float, dt: float) -> float:
     """Take a fix, m, NaN for none, whose axes have the variance r m^2; by how many m^2 the position is more uncertain
     than the odometry says if it has failed from now on."""
     if len(state) == 0 or math.isnan(x):
@@ -90,62 +94,93 @@ def judge(state: Floats, x: float, y: float, r: float) -> float:
     if math.isnan(state[PLACE]):
         state[:] = 0.0
         state[VARIANCE], state[VARIANCE + 2], state[SURE], state[LEVEL] = r, 1.0, r, 1.0
-        for at in (PLACE, BELIEVED, FIX, BEFORE):
+        for at in (PLACE, BELIEVED, BEFORE, FIX):
             state[at], state[at + 1] = x, y
-        state[PACE:Q] = math.nan
         return 0.0
     if x == state[FIX] and y == state[FIX + 1]:  # to all digits: the receiver holds it
         return 0.0
-    failed, state[FIX], state[FIX + 1] = state[FAILS] > 0.0, x, y
-    r *= state[LEVEL]
-    gather_evidence(state, r)
-    gap = math.sqrt((state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2)
-    least = max(SHARE * state[PATH], RATE * state[SINCE], DEVIATIONS * math.sqrt(r))
-    size = math.sqrt(state[ERROR] ** 2 + state[ERROR + 1] ** 2) * state[SINCE]
-    if state[EVIDENCE] > DECISIVE and state[SINCE] > LONG and min(gap, size) > least:
-        state[FAILS] = 1.0
-    return gap * gap if state[FAILS] > 0.0 and not failed else 0.0
+    state[FIX], state[FIX + 1] = x, y
+    state[GAPS] += x - state[PLACE] - state[WAY]
+    state[GAPS + 1] += y - state[PLACE + 1] - state[WAY + 1]
+    state[TIMES] += state[SINCE]
+    state[COUNT] += 1.0
+    if state[SINCE] < TOGETHER - 0.5 * dt:
+        return 0.0
+    failed, r = state[FAILS] > 0.0, r * state[LEVEL]
+    gather_evidence(state, noise, r / state[COUNT], dt)
+    if failed or state[EVIDENCE] < DECISIVE or state[LASTS] < LONG:
+        return 0.0
+    gap2 = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
+    size2 = (state[ERROR] ** 2 + state[ERROR + 1] ** 2) * state[LASTS] ** 2
+    least = max(SHARE * state[PATH], RATE * state[LASTS], DEVIATIONS * math.sqrt(r))
+    if min(gap2, size2) < least * least:
+        return 0.0
+    state[FAILS] = 1.0
+    return gap2
 
 
 @part
-def gather_evidence(state: Floats, r: float) -> None:
-    """Update both filters by the fix, and the evidence."""
-    state[SURE], state[AGE] = max(state[SURE], r * state[AGE] / WANDERS), 0.0
+def gather_evidence(state: Floats, noise: MotionNoise, r: float, dt: float) -> None:
+    """Move both filters on, and update them and the evidence by the mean of the fixes since, of variance r m^2."""
+    time, interval = state[SINCE], noise.interval if noise.interval > 0.0 else dt
+    east, north = state[WAY] / time, state[WAY + 1] / time
+    speed2, true2 = east**2 + north**2, (east + state[ERROR]) ** 2 + (north + state[ERROR + 1]) ** 2
+    state[FASTEST] = max(state[FASTEST], speed2)
+    speed2 = max(speed2, true2) if state[FAILS] > 0.0 else speed2
+    state[SPEED] = max(state[SPEED] * max(1.0 - 2.0 * time / LATE, 0.0), speed2)
+    q = 0.0
+    for c in range(2):
+        q += noise.base[c] ** 2 + max((noise.ratio[c] * interval) ** 2 * speed2, (interval * noise.floor) ** 2)
+    q *= 0.5 * time / interval
+    pb, bb = state[VARIANCE + 1], state[VARIANCE + 2]
+    state[VARIANCE] += 2.0 * time * pb + time * time * bb + JERKY * time**3 / 3.0 + q
+    state[VARIANCE + 1], state[VARIANCE + 2] = pb + time * bb + 0.5 * JERKY * time * time, bb + JERKY * time
+    state[SURE] = max(state[SURE] + q, r * time / WANDERS)
     s, sure = state[VARIANCE] + r, state[SURE] + r
     square = believed = 0.0
     for c in range(2):
-        square += (state[FIX + c] - state[PLACE + c]) ** 2 / s
-        believed += (state[FIX + c] - state[BELIEVED + c]) ** 2 / sure
+        gap, moved = state[GAPS + c] / state[COUNT], state[WAY + c] + time * state[ERROR + c]
+        state[GAPS + c] = gap - state[ERROR + c] * state[TIMES] / state[COUNT]
+        square += state[GAPS + c] ** 2 / s
+        gap += state[PLACE + c] - state[BELIEVED + c]
+        believed += gap**2 / sure
+        state[PLACE + c] += moved
+        state[BEFORE + c] += state[WAY + c]
+        state[BELIEVED + c] += state[WAY + c]
+        state[WAY + c] = gap
     anew, gain = square > FAR, state[VARIANCE + 1] / s
     share, trust = 1.0 if anew else state[VARIANCE] / s, 1.0 if believed > FAR else state[SURE] / sure
     for c in range(2):
-        gap = state[FIX + c] - state[PLACE + c]
+        gap = state[GAPS + c]
         state[PLACE + c] += share * gap
         state[BEFORE + c] += gap if anew else 0.0
         state[ERROR + c] += 0.0 if anew else gain * gap
-        state[BELIEVED + c] += trust * (state[FIX + c] - state[BELIEVED + c])
+        state[BELIEVED + c] += trust * state[WAY + c]
+        state[GAPS + c] = state[WAY + c] = 0.0
     if anew:
         state[VARIANCE], state[VARIANCE + 1] = r, 0.0
-        state[VARIANCE + 2] = max(state[VARIANCE + 2], state[SPEED] ** 2)
+        state[VARIANCE + 2] = max(state[VARIANCE + 2], state[SPEED])
     else:
         state[VARIANCE + 2] -= gain * state[VARIANCE + 1]
         state[VARIANCE], state[VARIANCE + 1] = share * r, (1.0 - share) * state[VARIANCE + 1]
     state[SURE] = trust * r
-    state[LEVEL] = max(state[LEVEL] * math.exp(NOISIER * (0.5 * min(square, FAR) - 1.0)), 1.0)
-    state[EVIDENCE] += 0.5 * (min(believed, FAR) - min(square, FAR)) + math.log(sure / s)
-    too_fast = state[TRUE] > FASTER * state[FASTEST] and state[FASTEST] > RATE
-    state[EVIDENCE] = 0.0 if too_fast else min(max(state[EVIDENCE], 0.0), MOST)
+    state[LEVEL] = max(state[LEVEL] * (1.0 + NOISIER * (0.5 * min(square, FAR) - 1.0)), 1.0)
+    state[LASTS] += time
+    state[PATH] += time * math.sqrt(speed2)
+    more = 0.5 * (min(believed, FAR) - min(square, FAR)) + math.log(sure / s)
+    too_fast = true2 > FASTER**2 * state[FASTEST] and state[FASTEST] > RATE**2
+    state[EVIDENCE] = 0.0 if too_fast else min(max(state[EVIDENCE] + more, 0.0), MOST)
     if state[EVIDENCE] == 0.0:
-        state[FAILS] = state[PATH] = state[SINCE] = 0.0
+        state[FAILS] = state[PATH] = state[LASTS] = 0.0
         state[BEFORE], state[BEFORE + 1] = state[PLACE], state[PLACE + 1]
+    state[SINCE] = state[TIMES] = state[COUNT] = 0.0
 
 
 @compiled
 def correct_drives(
-    gnss: Floats, velocity: Floats, noise: MotionNoise, variance: Floats, columns: Ints, dt: float
-) -> tuple[Floats, Floats]:
-    """Velocities (R, T, E, 3) m/s of the columns, corrected where their odometry fails, and by how many m^2 the
-    variance of each motion is larger (R, T, E).
+    gnss: Floats, velocity: Floats, noise: MotionNoise, variance: Floats, columns: Ints, dt: float, out: Floats
+) -> bool:
+    """Whether the odometry of one of the columns fails; write what then corrects it.
 
     Args:
         gnss: (R, T, N, 3) m, NaN for no fix.
@@ -154,21 +189,25 @@ def correct_drives(
         variance: (3,) m^2 of a fix.
         columns: (E,) of the vehicles.
         dt: s.
+        out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion.s variance is larger m^2; of no
+            length only to ask.
     """
-    runs, steps = gnss.shape[:2]
-    out, more = np.empty((runs, steps, len(columns), 3)), np.zeros((runs, steps, len(columns)))
-    state, r = np.empty(SIZE), 0.5 * (variance[0] + variance[1])
-    for run in range(runs):
-        for e in range(len(columns)):
-            n = columns[e]
-            state[:] = math.nan
-            for t in range(steps):
-                for c in range(3):
-                    out[run, t, e, c] = velocity[run, t, n, c]
-                if math.isnan(velocity[run, t, n, 0]):
-                    state[:] = math.nan
+    states, moved = np.empty((len(columns), SIZE)), np.empty(3)
+    r, fails = 0.5 * (variance[0] + variance[1]), False
+    for run in range(gnss.shape[0]):
+        states[:] = math.nan
+        for t in range(gnss.shape[1]):
+            for e in range(len(columns)):
+                n, extra = columns[e], 0.0
+                moved[0], moved[1] = velocity[run, t, n, 0], velocity[run, t, n, 1]
+                if math.isnan(moved[0]):
+                    states[e, PLACE] = math.nan
                     continue
                 if t > 0:
-                    more[run, t, e] = correct(state, noise, out[run, t, e], dt)
-                more[run, t, e] += judge(state, gnss[run, t, n, 0], gnss[run, t, n, 1], r)
-    return out, more
+                    extra = correct(states[e], moved, dt)
+                extra += judge(states[e], noise, gnss[run, t, n, 0], gnss[run, t, n, 1], r, dt)
+                fails = fails or extra > 0.0
+                if len(out):
+                    out[run, t, n, 0] = moved[0] - velocity[run, t, n, 0]
+                    out[run, t, n, 1], out[run, t, n, 2] = moved[1] - velocity[run, t, n, 1], extra
+    return fails

@@ -32,13 +32,14 @@ def with_odometry(
     columns = columns[~np.isin(columns, recording.landmarks)]
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     motion, variance = motion_noise(noise_model, recording.dt), fix**2 * noise_model.gnss_variance
-    corrected, more = correct_drives(gnss, velocity, motion, variance, columns, recording.dt)
-    if not more.any():
+    given = gnss, velocity, motion, variance, columns, recording.dt
+    if not correct_drives(*given, np.empty((0, 0, 0, 3))):
         return recording, noise_model
-    velocity, extra = velocity.copy(), np.zeros(velocity.shape[:3])
-    velocity[:, :, columns], extra[:, :, columns] = corrected, more
+    correct_drives(*given, found := np.zeros(velocity.shape))
+    velocity, extra = velocity.copy(), found[..., 2]
+    velocity[..., :2] += found[..., :2]
     notes = [*noise_model.notes]
-    for n, failed in zip(columns.tolist(), (more > 0).any(axis=0).T, strict=True):
+    for n, failed in enumerate((extra > 0).any(axis=0).T):
         if failed.any():
             times = [f"{recording.t[a]:.10g} to {recording.t[b - 1]:.10g}" for a, b in stretches(failed)]
             text = f"odometry, {recording.ids[n]}: fails, as fixes show, which correct it"

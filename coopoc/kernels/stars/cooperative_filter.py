@@ -260,7 +260,7 @@ def step(
         copy_filter(f, other)
         copy_rows(own, rows, tries, count)
     attempt(f, model, own, rows, vehicles, count)
-    if slips and (fails or surprised(f)):
+    if slips and (fails or surprised(f, own)):
         other.ego[NOW] = 1.0
         corrected_motion(tries.own)
         attempt(other, model, tries.own, tries.rows, vehicles, count)

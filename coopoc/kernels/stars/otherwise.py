@@ -376,12 +376,12 @@ def score(f: Filter, h: Rows, gate: float, whole: bool) -> None:
 
 
 @part
-def surprised(f: Filter) -> bool:
+def surprised(f: Filter, own: Floats) -> bool:
     """Whether the first try's numbers are worse than usual by a standard deviation, or the ego may have slipped; not
-    for fixes that jumped."""
+    for fixes that jumped while odometry works."""
     n = f.ego[NUMBERS]
     strange = f.ego[SLIPPED] > 0.1 or f.ego[SQUARES] > n + math.sqrt(2.0 * n)
-    return bool(strange and f.ego[JUMPED] == 0.0)
+    return bool(strange and (f.ego[JUMPED] == 0.0 or own[MORE] > 0.0))
 
 
 @part
