@@ -255,6 +255,7 @@ BAD: dict[str, tuple[Sensors, V2X, Callable[[Recording], Recording]]] = {
     "ranges": (S2, CHANNELS["ideal"], lambda r: too_long(r, 0.2)),
     "late": (S2, CHANNELS["slow"], lambda r: r),
     "mirrored": (replace(S2, gnss_std=(1.0,) * 3), CHANNELS["late"], lambda r: mirrored(r)),
+    "failing": (replace(S2, gnss_std=(0.5,) * 3), CHANNELS["late"], lambda r: failing(r)),
     "tunnel": (S2, CHANNELS["late"], lambda r: tunnel(r)),
     "lost": (S2, V2X(6, loss=0.3), lambda r: r),
     "measured": (S2, V2X(6, loss=0.1, latency=0.1), lambda r: replace(r, notes=(f"fixes: {MEASURED}",))),
@@ -280,6 +281,13 @@ def mirrored(recording: Recording) -> Recording:
     gnss = recording.gnss.copy()
     gnss[:, np.arange(len(recording.t)) % 10 > 0, 0] = np.nan
     return replace(recording, gnss=gnss, relative=recording.relative * [3.0, -1.0, 1.0])
+
+
+def failing(recording: Recording) -> Recording:
+    """The odometers of the ego and of a neighbour lead backwards after a while."""
+    velocity = recording.velocity.copy()
+    velocity[:, 15:, :2] *= -1.0
+    return replace(recording, velocity=velocity)
 
 
 def tunnel(recording: Recording) -> Recording:
@@ -309,7 +317,9 @@ def test_the_filter_is_its_oracle(crossing: Fleet, case: str, priors: Priors) ->
             assert_allclose(track.neighbours[run][-len(np.concatenate(others)) :], np.concatenate(others), atol=2e-6)
 
 
-@pytest.mark.parametrize("case", ["late", "mirrored", "tunnel", "lost", "attack", "measured", "displaced, late"])
+@pytest.mark.parametrize(
+    "case", ["late", "mirrored", "failing", "tunnel", "lost", "attack", "measured", "displaced, late"]
+)
 def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
     """A stream has no recording: each vehicle's broadcast of a step is that of a stream of its own."""
     sensors, v2x, change = BAD[case]

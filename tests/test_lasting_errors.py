@@ -89,16 +89,6 @@ def test_a_slip_is_found_and_ends(town: Fleet) -> None:
     assert clean.extras["slips"].mean() < 0.01
 
 
-def test_wheels_that_spin_on_are_found_by_a_fix_a_second() -> None:
-    """Alone, 30 % too fast for half a minute: dead reckoning ends 60 m off."""
-    town = co.load_fleet("town10")
-    seen = observe(town, replace(S2, gnss_std=(1.2,) * 3), V2X(0), runs=2, observers=[3, 8])
-    gnss, velocity = seen.gnss.copy(), seen.velocity.copy()
-    gnss[:, np.arange(900) % 10 > 0], velocity[:, 600:] = np.nan, 1.3 * velocity[:, 600:]
-    _, track = rms(replace(seen, gnss=gnss, velocity=velocity), town)
-    assert np.linalg.norm(track.x - town.position[:, [3, 8]], axis=-1)[:, 600:].mean() < 5.0
-
-
 @pytest.mark.parametrize(("factor", "said"), [(1.0, False), (3.0, True)])
 def test_notes_name_what_is_otherwise_than_stated_and_nothing_else(town: Fleet, factor: float, said: bool) -> None:
     """Real fixes are assumed to err more than is stated; a note says by how much they do."""

@@ -48,8 +48,8 @@ TOGETHER = 0.4
 """s, of which fixes are taken together."""
 JERKY = 1.0
 """m^2/s^3, density of the acceleration of b."""
-FAR = 25.0
-"""Squared normalised innovation from which a filter begins anew, and the most that counts."""
+FAR, COUNTS = 14.0, 25.0
+"""Squared normalised innovation from which a filter begins anew, and the most that counts as evidence."""
 DECISIVE, MOST = 15.0, 18.0
 """Evidence from which the odometry fails, and the most that is counted; logarithms of a likelihood ratio."""
 SHARE, RATE, DEVIATIONS, LONG = 0.2, 0.5, 5.0, 2.0
@@ -58,8 +58,9 @@ FASTER = 2.0
 """Times the fastest by odometry that a vehicle may go, if that is above RATE."""
 WANDERS = 2.0
 """s, in which the errors of all fixes may change together."""
-NOISIER = 0.1
-"""Share of what a fix says of the level of the noise of all, which is no less than it is stated."""
+NOISIER, UNKNOWN = 0.1, 4.0
+"""Share of what fixes say of the level of the noise of all, which is no less than it is stated, and what it is taken
+for at first."""
 LATE = 10.0
 """s, for which a speed is remembered."""
 
@@ -93,7 +94,7 @@ def judge(state: Floats, noise: MotionNoise, x: float, y: float, r: float, dt: f
         return 0.0
     if math.isnan(state[PLACE]):
         state[:] = 0.0
-        state[VARIANCE], state[VARIANCE + 2], state[SURE], state[LEVEL] = r, 1.0, r, 1.0
+        state[VARIANCE], state[VARIANCE + 2], state[SURE], state[LEVEL] = r, 1.0, r, UNKNOWN
         for at in (PLACE, BELIEVED, BEFORE, FIX):
             state[at], state[at + 1] = x, y
         return 0.0
@@ -164,10 +165,10 @@ def gather_evidence(state: Floats, noise: MotionNoise, r: float, dt: float) -> N
         state[VARIANCE + 2] -= gain * state[VARIANCE + 1]
         state[VARIANCE], state[VARIANCE + 1] = share * r, (1.0 - share) * state[VARIANCE + 1]
     state[SURE] = trust * r
-    state[LEVEL] = max(state[LEVEL] * (1.0 + NOISIER * (0.5 * min(square, FAR) - 1.0)), 1.0)
+    state[LEVEL] = max(state[LEVEL] * (1.0 + NOISIER * (0.5 * min(square, COUNTS) - 1.0)), 1.0)
     state[LASTS] += time
     state[PATH] += time * math.sqrt(speed2)
-    more = 0.5 * (min(believed, FAR) - min(square, FAR)) + math.log(sure / s)
+    more = 0.5 * (min(believed, COUNTS) - min(square, COUNTS)) + math.log(sure / s)
     too_fast = true2 > FASTER**2 * state[FASTEST] and state[FASTEST] > RATE**2
     state[EVIDENCE] = 0.0 if too_fast else min(max(state[EVIDENCE] + more, 0.0), MOST)
     if state[EVIDENCE] == 0.0:

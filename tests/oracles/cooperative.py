@@ -15,6 +15,7 @@ import numpy as np
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
 from coopoc.kernels.gate import AWAY, EVIDENCE, FIX_GATE, GATE, HARD_REJECT_FACTOR, LEAK, PATIENCE, SLIP
+from coopoc.kernels.odometry_fault import DECISIVE
 from coopoc.kernels.stars.cooperative_messages import CLIP, FADES, FIX_SCORE
 from coopoc.kernels.stars.cooperative_state import (
     ACCELERATION,
@@ -46,6 +47,7 @@ from coopoc.kernels.stars.otherwise import (
     USUAL,
 )
 from coopoc.methods.cooperative_filter import Priors
+from coopoc.methods.odometry_fault import with_odometry
 from coopoc.world.inbox import inbox
 from coopoc.world.links import spherical, to_vector, wrap
 from coopoc.world.v2x import FIX_AND_VELOCITY
@@ -159,7 +161,11 @@ class Oracle:
     """The filter of one ego in one run."""
 
     def __init__(self, seen: Recording, ego: int, run: int, known: NoiseModel, priors: Priors) -> None:
-        s = known.sensors
+        s, measured, self.more = known.sensors, seen.velocity, np.zeros(len(seen.t))
+        if priors.fix_gate:  # `test_odometry_fault` has what refers to that
+            seen, fault = with_odometry(seen, [ego], known, priors.fix)
+            self.more = self.more if fault.extra is None else fault.extra[run, :, ego]
+        self.by, self.corrected_now = (seen.velocity - measured)[run, :, ego], False
         self.seen, self.ego, self.run, self.known, self.priors = seen, ego, run, known, priors
         self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(2), 1, np.zeros(4)), np.ones(3)
         self.std: Floats = np.ones(3)
@@ -255,7 +261,9 @@ class Oracle:
         level = max(self.state["level"][:3])
         (self.state, self.revoked), self.deaf = self.lone, True
         self.pace(t)
+        self.corrected_now = True
         self.step(t, 0.0)
+        self.corrected_now = False
         y, q = self.answer()
         self.lone, (self.state, self.revoked), self.deaf = (self.state, self.revoked), before, False
         self.left -= dt
@@ -284,6 +292,11 @@ class Oracle:
             b.average([b.at(("compass",)).start], life.bias, life.absent[2])
             b.average([b.at(("compass",)).start + 2], life.offset, life.absent[3])
 
+    def motion(self, t: int) -> tuple[Floats, Floats]:
+        """The ego's velocity and the variance of its motion, corrected by fixes or not."""
+        u, q = self.seen.velocity[self.run, t, self.ego], self.q[t, self.ego]
+        return (u, q + self.more[t]) if self.corrected_now else (u - self.by[t], q)
+
     def pace(self, t: int) -> None:
         """The most of late speeds, and its direction."""
         dt, u = self.seen.dt, self.seen.velocity[self.run, t, self.ego]
@@ -300,15 +313,19 @@ class Oracle:
         before = copy.deepcopy((self.state, self.revoked)) if share else None
         self.step(t, 0.0)
         n, p = self.state["numbers"], self.state["slips"]
-        strange = (p > 0.1 or self.state["squares"] > n + math.sqrt(2 * n)) and not self.state["jumped"]
+        strange, more = p > 0.1 or self.state["squares"] > n + math.sqrt(2 * n), self.more[t] > 0
+        fails = more and self.more[t - 1] == 0
+        strange = fails or (strange and (more or not self.state["jumped"]))
         if before is None or not strange:
             self.state["slips"] *= 0.0 if n else math.exp(-dt / LASTS)
             return
         first, (self.state, self.revoked) = (self.state, self.revoked), before
         rate, shows = (share * self.state["speed"]) ** 2, self.r[t, self.ego] @ self.white + self.state["shown"] ** 2
+        self.corrected_now = True
         self.step(t, rate * dt**2 + (min(rate * UNSEEN**2, shows) if p <= 0.5 and dt < UNSEEN else 0.0))
-        prior = p * math.exp(-dt / LASTS) + (1 - p) * min(dt / RARE, 0.5)
-        odds = self.state["score"] - first[0]["score"] + math.log(prior / (1 - prior))
+        self.corrected_now = False
+        prior = p * (1.0 if more else math.exp(-dt / LASTS)) + (1 - p) * min(dt / RARE, 0.5)
+        odds = self.state["score"] - first[0]["score"] + (DECISIVE if fails else math.log(prior / (1 - prior)))
         if odds < 0:
             self.state, self.revoked = first
         self.state["slips"] = 1 / (1 + math.exp(min(-odds, 700)))
@@ -400,7 +417,8 @@ class Oracle:
         dt = self.seen.dt
         s["agreed"] += dt * (s["hits"].get("fix", 0) == 0)
         s["unseen"] += dt
-        u, q = self.steady(t, self.ego, self.seen.velocity[self.run, t, self.ego], louder * self.q[t, self.ego])
+        u, q = self.motion(t)
+        u, q = self.steady(t, self.ego, u, louder * q)
         if t > s["joined"][self.ego]:
             self.predict(dt * u, q)
             x = b.at(("x", self.ego))
@@ -590,7 +608,7 @@ class Oracle:
         s["joined"][self.ego], s["hits"]["fix"] = t, 0
         s["locked"].pop(self.ego, None)
         if s["left"]:
-            moved = self.seen.dt * self.seen.velocity[self.run, t, self.ego]
+            moved = self.seen.dt * self.motion(t)[0]
             s["left"] = s["left"][0] + moved, s["left"][1]
         s["agreed"] = 0.0
         s["trusted"].add(self.ego)

@@ -1,0 +1,101 @@
+"""Odometry that fails for good, and what only looks like it."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from filterpy.kalman import KalmanFilter
+from numpy.testing import assert_allclose
+
+import coopoc as co
+from coopoc import V2X, CooperativeFilter, JointFilter, Kalman, NoiseModel, Recording, observe
+from coopoc.arrays import Floats
+from coopoc.kernels.odometry_fault import COUNTS, JERKY, NOISIER, UNKNOWN
+from coopoc.methods.odometry_fault import with_odometry
+from coopoc.world.body_frames import turned
+
+S2, EGOS, STEPS, BEGINS = co.Sensors.paper_scenario2(), [3, 8], 600, 200
+FAULTS: dict[str, Callable[[Floats], Floats]] = {
+    "wheels stand": lambda u: 0.0 * u,
+    "wheels spin": lambda u: 2.0 * u,
+    "a speed freezes": lambda u: u[:, :1] + 0.0 * u,
+    "a compass turns": lambda u: turned(u, np.full(u.shape[:-1], 1.0)),
+}
+LOOK_ALIKE: dict[str, Callable[[Floats], Floats]] = {
+    "a receiver jumps": lambda z: z + np.array([30.0, 0.0, 0.0]),
+    "it is displaced at times": lambda z: z + 60.0 * (np.arange(z.shape[1]) % 100 < 30)[:, None, None],
+    "it holds its fix": lambda z: np.where(np.arange(z.shape[1])[:, None, None] < 100, z[:, :1], z),
+}
+
+
+def drive(every: int, std: float, most: int = 0, act: float = 1.0) -> tuple[Recording, Floats]:
+    """A minute in town with a fix at every so many steps, and the truth."""
+    town = co.load_fleet("town10").between(0, STEPS)
+    stated = replace(S2, gnss_std=(std,) * 3)
+    acting = replace(stated, gnss_std=(act * std,) * 3)
+    seen = observe(town, acting, V2X(most), runs=2, observers=EGOS, assumed=stated)
+    thinned = np.where(np.arange(STEPS)[:, None, None] % every, np.nan, seen.gnss)
+    return replace(seen, gnss=thinned), town.position[:, EGOS]
+
+
+@pytest.mark.parametrize("begins", [0, BEGINS])
+@pytest.mark.parametrize(("every", "std"), [(10, 1.5), (2, 1.5), (1, 3.5)])
+@pytest.mark.parametrize("fault", FAULTS)
+def test_odometry_that_fails_for_good_costs_no_more_than_doing_without(
+    fault: str, every: int, std: float, begins: int
+) -> None:
+    """The last 30 s, beside raw fixes, which are held: where errors grew to 80 m and more."""
+    seen, truth = drive(every, std)
+    velocity = seen.velocity.copy()
+    velocity[:, begins:, EGOS] = FAULTS[fault](velocity[:, begins:, EGOS])
+    broken = replace(seen, velocity=velocity)
+
+    def late(method: co.Method) -> tuple[float, co.Track]:
+        track = method(broken, EGOS)
+        return float(np.sqrt(np.square(track.x - truth)[:, 300:].sum(axis=-1).mean())), track
+
+    raw = late(co.GNSS())[0]
+    for method in (Kalman(), JointFilter(), CooperativeFilter()):
+        error, track = late(method)
+        assert error < 1.1 * raw
+        assert sum("fails, as fixes show" in note for note in track.notes) == len(EGOS)
+
+
+@pytest.mark.parametrize("act", [1.0, 3.0])
+@pytest.mark.parametrize("alike", [None, *LOOK_ALIKE])
+def test_a_receiver_that_errs_is_no_fault_of_odometry(alike: str | None, act: float) -> None:
+    """Right odometry is left as it is, whatever fixes do, and if they err three times as far as is stated."""
+    seen, _ = drive(2, 1.5, most=3, act=act)
+    gnss = seen.gnss.copy()
+    if alike:
+        gnss[:, BEGINS:] = LOOK_ALIKE[alike](gnss[:, BEGINS:])
+    seen, known = replace(seen, gnss=gnss), NoiseModel.nominal(seen.sensors)
+    assert with_odometry(seen, EGOS, known)[1] is known
+
+
+def test_the_correction_is_the_velocity_of_filterpys_filter() -> None:
+    """Position and error of the velocity, a random walk, from a fix a second, whose noise is as loud as they show."""
+    seen, _ = drive(10, 3.5)
+    velocity = seen.velocity.copy()
+    velocity[:, BEGINS:] = turned(velocity[:, BEGINS:], np.full(velocity[:, BEGINS:].shape[:-1], 0.5))
+    broken, known = replace(seen, velocity=velocity), NoiseModel.nominal(seen.sensors)
+    corrected, noise = with_odometry(broken, EGOS, known)
+    assert noise.extra is not None
+    by = (corrected.velocity - velocity)[0, :, EGOS[0], :2]
+    peer, level, u = KalmanFilter(dim_x=4, dim_z=2), UNKNOWN, velocity[0, :, EGOS[0], :2]
+    peer.x, peer.P = np.array([*seen.gnss[0, 0, EGOS[0], :2], 0.0, 0.0]), np.diag([12.25, 12.25, 1.0, 1.0])
+    peer.H, found = np.eye(2, 4), []
+    for k in range(10, STEPS, 10):
+        way, r = 0.1 * u[k - 9 : k + 1].sum(axis=0), 12.25 * level
+        process = (0.1 * S2.velocity_std_ratio) ** 2 * (way**2).sum() * 10
+        walk = np.kron(JERKY * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]), np.eye(2))
+        peer.F, peer.R = np.eye(4) + np.eye(4, k=2), r * np.eye(2)
+        peer.predict(Q=walk + np.diag([process, process, 0.0, 0.0]))
+        peer.x[:2] += way
+        peer.update(seen.gnss[0, k, EGOS[0], :2])
+        level = max(level * (1 + NOISIER * (0.5 * min(float(peer.y @ peer.SI @ peer.y), COUNTS) - 1)), 1.0)
+        found.append(peer.x[2:].copy())
+    wrong = np.flatnonzero(noise.extra[0, 10:, EGOS[0]]) + 10
+    assert len(wrong) > 150
+    assert_allclose(by[wrong[10:]], np.array(found)[(wrong[10:] - 1) // 10 - 1], atol=0.02)
