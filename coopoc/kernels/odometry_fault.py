@@ -41,9 +41,9 @@ PLACE, ERROR, VARIANCE, BELIEVED, SURE, LEVEL, FAILS, EVIDENCE, LASTS, PATH, BEF
 of an axis, the position by odometry alone and its variance, and the level of the noise of fixes; whether the odometry
 fails, the evidence, for how long s and how far m there is some, and where odometry alone has led since m; squares of
 the most of late speeds and of all by odometry m^2/s^2."""
-WAY, SINCE, FIX, GAPS, TIMES, COUNT, SIZE = 19, 21, 22, 24, 26, 27, 28
+WAY, SINCE, FIX, GAPS, TIMES, COUNT, SHARE, SIZE = 19, 21, 22, 24, 26, 27, 28, 29
 """Since then: the way by odometry m, the time s; the last fix m, sums of how far fixes were from the position and the
-way m, and of their times s, and how many there were."""
+way m, and of their times s, and how many there were; and, all the time, the share of `new_state`."""
 TOGETHER = 0.4
 """s, of which fixes are taken together."""
 JERKY = 1.0
@@ -52,8 +52,10 @@ FAR, COUNTS = 14.0, 25.0
 """Squared normalised innovation from which a filter begins anew, and the most that counts as evidence."""
 DECISIVE, MOST = 15.0, 18.0
 """Evidence from which the odometry fails, and the most that is counted; logarithms of a likelihood ratio."""
-SHARE, RATE, DEVIATIONS, LONG = 0.2, 0.5, 5.0, 2.0
-"""Of the way, m for each second, and deviations of a fix: the odometry errs by as much at least, for as many s."""
+ERRS, ERRS_MODELLED = 0.2, 0.3
+"""SHARE of the way by which an odometry errs at least that fails, also where errors of heading and scale are states."""
+RATE, DEVIATIONS, LONG = 0.5, 5.0, 2.0
+"""m for each second, and deviations of a fix: it errs by as much at least, for as many s."""
 FASTER = 2.0
 """Times the fastest by odometry that a vehicle may go, if that is above RATE."""
 WANDERS = 2.0
@@ -65,12 +67,23 @@ LATE = 10.0
 """s, for which a speed is remembered."""
 
 
+def new_state(share: float) -> Floats:
+    """(SIZE,) before the first fix; of no length for a share of 0, where odometry is believed.
+
+    Args:
+        share: of the way, by which an odometry errs at least that fails.
+    """
+    state = np.full(SIZE if share else 0, math.nan)
+    state[SHARE:] = share
+    return state
+
+
 @part
 def correct(state: Floats, velocity: Floats, dt: float) -> float:
     """Add b to a velocity (3,) m/s where the odometry fails, and return by how many m^2 its motion is more uncertain.
 
     Args:
-        state: (SIZE,), NaN before the first fix; of no length where odometry is believed.
+        state: of `new_state`.
         velocity: (3,) m/s.
         dt: s.
     """
@@ -93,7 +106,7 @@ def judge(state: Floats, noise: MotionNoise, x: float, y: float, r: float, dt: f
     if len(state) == 0 or math.isnan(x):
         return 0.0
     if math.isnan(state[PLACE]):
-        state[:] = 0.0
+        state[:SHARE] = 0.0
         state[VARIANCE], state[VARIANCE + 2], state[SURE], state[LEVEL] = r, 1.0, r, UNKNOWN
         for at in (PLACE, BELIEVED, BEFORE, FIX):
             state[at], state[at + 1] = x, y
@@ -113,7 +126,7 @@ def judge(state: Floats, noise: MotionNoise, x: float, y: float, r: float, dt: f
         return 0.0
     gap2 = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
     size2 = (state[ERROR] ** 2 + state[ERROR + 1] ** 2) * state[LASTS] ** 2
-    least = max(SHARE * state[PATH], RATE * state[LASTS], DEVIATIONS * math.sqrt(r))
+    least = max(state[SHARE] * state[PATH], RATE * state[LASTS], DEVIATIONS * math.sqrt(r))
     if min(gap2, size2) < least * least:
         return 0.0
     state[FAILS] = 1.0
@@ -179,7 +192,14 @@ def gather_evidence(state: Floats, noise: MotionNoise, r: float, dt: float) -> N
 
 @compiled
 def correct_drives(
-    gnss: Floats, velocity: Floats, noise: MotionNoise, variance: Floats, columns: Ints, dt: float, out: Floats
+    gnss: Floats,
+    velocity: Floats,
+    noise: MotionNoise,
+    variance: Floats,
+    columns: Ints,
+    share: float,
+    dt: float,
+    out: Floats,
 ) -> bool:
     """Whether the odometry of one of the columns fails; write what then corrects it.
 
@@ -189,6 +209,7 @@ def correct_drives(
         noise: of motions.
         variance: (3,) m^2 of a fix.
         columns: (E,) of the vehicles.
+        share: of the way.
         dt: s.
         out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion.s variance is larger m^2; of no
             length only to ask.
@@ -196,7 +217,7 @@ def correct_drives(
     states, moved = np.empty((len(columns), SIZE)), np.empty(3)
     r, fails = 0.5 * (variance[0] + variance[1]), False
     for run in range(gnss.shape[0]):
-        states[:] = math.nan
+        states[:], states[:, SHARE] = math.nan, share
         for t in range(gnss.shape[1]):
             for e in range(len(columns)):
                 n, extra = columns[e], 0.0

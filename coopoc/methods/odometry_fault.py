@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..kernels.odometry_fault import correct_drives
+from ..kernels.odometry_fault import ERRS, correct_drives
 from ..world.links import stretches
 from ..world.recording import Recording
 from .noise_model import NoiseModel, motion_noise
 
 
 def with_odometry(
-    recording: Recording, egos: Sequence[int], noise_model: NoiseModel, fix: float = 1.0
+    recording: Recording, egos: Sequence[int], noise_model: NoiseModel, fix: float = 1.0, share: float = ERRS
 ) -> tuple[Recording, NoiseModel]:
     """The recording with velocities that fixes correct, of vehicles whose odometry fails, and the noise of these, with
     a note; both as they are where none fails, no noise is stated, or velocities are those of fixes.
@@ -24,6 +24,7 @@ def with_odometry(
         egos: columns that are followed; their neighbours correct what they send.
         noise_model: of the method.
         fix: factor of the standard deviation of fixes.
+        share: of the way, by which an odometry errs at least that fails.
     """
     sensors, links = noise_model.sensors, recording.links
     if sensors is None or noise_model.fleet is not None or sensors.velocity_reading == "fixes":
@@ -32,7 +33,7 @@ def with_odometry(
     columns = columns[~np.isin(columns, recording.landmarks)]
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
     motion, variance = motion_noise(noise_model, recording.dt), fix**2 * noise_model.gnss_variance
-    given = gnss, velocity, motion, variance, columns, recording.dt
+    given = gnss, velocity, motion, variance, columns, share, recording.dt
     if not correct_drives(*given, np.empty((0, 0, 0, 3))):
         return recording, noise_model
     correct_drives(*given, found := np.zeros(velocity.shape))

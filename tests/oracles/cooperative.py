@@ -15,7 +15,7 @@ import numpy as np
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
 from coopoc.kernels.gate import AWAY, EVIDENCE, FIX_GATE, GATE, HARD_REJECT_FACTOR, LEAK, PATIENCE, SLIP
-from coopoc.kernels.odometry_fault import DECISIVE
+from coopoc.kernels.odometry_fault import DECISIVE, ERRS_MODELLED
 from coopoc.kernels.stars.cooperative_messages import CLIP, FADES, FIX_SCORE
 from coopoc.kernels.stars.cooperative_state import (
     ACCELERATION,
@@ -34,6 +34,7 @@ from coopoc.kernels.stars.cooperative_state import (
 )
 from coopoc.kernels.stars.otherwise import (
     FASTEST,
+    KNOWN,
     LASTS,
     LATE,
     LOUDEST,
@@ -163,9 +164,9 @@ class Oracle:
     def __init__(self, seen: Recording, ego: int, run: int, known: NoiseModel, priors: Priors) -> None:
         s, measured, self.more = known.sensors, seen.velocity, np.zeros(len(seen.t))
         if priors.fix_gate:  # `test_odometry_fault` has what refers to that
-            seen, fault = with_odometry(seen, [ego], known, priors.fix)
+            seen, fault = with_odometry(seen, [ego], known, priors.fix, ERRS_MODELLED)
             self.more = self.more if fault.extra is None else fault.extra[run, :, ego]
-        self.by, self.corrected_now = (seen.velocity - measured)[run, :, ego], False
+        self.by, self.corrected_now, self.grown = (seen.velocity - measured)[run, :, ego], False, 0.0
         self.seen, self.ego, self.run, self.known, self.priors = seen, ego, run, known, priors
         self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(2), 1, np.zeros(4)), np.ones(3)
         self.std: Floats = np.ones(3)
@@ -205,7 +206,7 @@ class Oracle:
 
     def reset(self) -> None:
         self.state, self.revoked, self.lone = self.blank(), {}, None
-        self.doubts, self.left, self.last = np.zeros(2), 0.0, 0.0
+        self.doubts, self.left, self.last, self.pending = np.zeros(2), 0.0, 0.0, 0.0
 
     def blank(self) -> dict[str, Any]:
         empty: dict[str, Any] = {
@@ -261,7 +262,7 @@ class Oracle:
         level = max(self.state["level"][:3])
         (self.state, self.revoked), self.deaf = self.lone, True
         self.pace(t)
-        self.corrected_now = True
+        self.corrected_now, self.grown = self.pending == KNOWN, self.more[t]
         self.step(t, 0.0)
         self.corrected_now = False
         y, q = self.answer()
@@ -295,7 +296,7 @@ class Oracle:
     def motion(self, t: int) -> tuple[Floats, Floats]:
         """The ego's velocity and the variance of its motion, corrected by fixes or not."""
         u, q = self.seen.velocity[self.run, t, self.ego], self.q[t, self.ego]
-        return (u, q + self.more[t]) if self.corrected_now else (u - self.by[t], q)
+        return (u, q + self.grown) if self.corrected_now else (u - self.by[t], q)
 
     def pace(self, t: int) -> None:
         """The most of late speeds, and its direction."""
@@ -310,24 +311,29 @@ class Oracle:
         """A step, and perhaps one that slips."""
         share, dt = self.priors.slip * (self.known.sensors is not None), self.seen.dt
         self.pace(t)
+        more = self.more[t]
+        self.pending = 0.0 if more == 0 else KNOWN if self.pending == KNOWN else self.pending + more
         before = copy.deepcopy((self.state, self.revoked)) if share else None
         self.step(t, 0.0)
         n, p = self.state["numbers"], self.state["slips"]
-        strange, more = p > 0.1 or self.state["squares"] > n + math.sqrt(2 * n), self.more[t] > 0
-        fails = more and self.more[t - 1] == 0
-        strange = fails or (strange and (more or not self.state["jumped"]))
+        known, fails = self.pending == KNOWN, self.pending > 0
+        strange = (p > 0.1 or self.state["squares"] > n + math.sqrt(2 * n)) and (
+            fails or known or not self.state["jumped"]
+        )
         if before is None or not strange:
             self.state["slips"] *= 0.0 if n else math.exp(-dt / LASTS)
             return
         first, (self.state, self.revoked) = (self.state, self.revoked), before
         rate, shows = (share * self.state["speed"]) ** 2, self.r[t, self.ego] @ self.white + self.state["shown"] ** 2
-        self.corrected_now = True
+        self.corrected_now, self.grown = fails or known, self.more[t] if known else self.pending
         self.step(t, rate * dt**2 + (min(rate * UNSEEN**2, shows) if p <= 0.5 and dt < UNSEEN else 0.0))
         self.corrected_now = False
-        prior = p * (1.0 if more else math.exp(-dt / LASTS)) + (1 - p) * min(dt / RARE, 0.5)
+        prior = p * (1.0 if known else math.exp(-dt / LASTS)) + (1 - p) * min(dt / RARE, 0.5)
         odds = self.state["score"] - first[0]["score"] + (DECISIVE if fails else math.log(prior / (1 - prior)))
         if odds < 0:
             self.state, self.revoked = first
+        elif fails:
+            self.pending = KNOWN
         self.state["slips"] = 1 / (1 + math.exp(min(-odds, 700)))
 
     def count(self, q: float, log: float, numbers: int) -> None:
@@ -682,7 +688,7 @@ class Oracle:
     def turned(self, j: int, moved: Floats) -> tuple[Floats, Floats]:
         """A motion by odometry, corrected, and its derivatives by the errors of it."""
         b, by = self.state["belief"], np.zeros((3, 3))
-        if ("o", j) not in b.names:
+        if ("o", j) not in b.names or (j == self.ego and self.corrected_now):
             return moved, by
         turn, scale, _ = self.turn(j)
         c, s = math.cos(turn), math.sin(turn)

@@ -26,6 +26,7 @@ from .cooperative_state import (
     AT,
     BY_FIXES,
     CLOCK,
+    CORRECTED,
     COVARIANCE,
     DT,
     EXTRA_VARIANCE,
@@ -98,8 +99,8 @@ from .otherwise import (
     ALONE_LAST,
     COUNTED,
     EXCESS,
-    FAILED,
     FIRST_ALONE,
+    KNOWN,
     LASTS,
     LEAST_COUNTED,
     LIKELY,
@@ -108,6 +109,7 @@ from .otherwise import (
     MOST_EXCESS,
     NOW,
     NUMBERS,
+    PENDING,
     SLIPPED,
     SQUARES,
     Tries,
@@ -248,9 +250,10 @@ def step(
         vehicles: (count,) which they are.
         count: of them.
     """
-    slips, other, fails = model.slip > 0.0, tries.other, own[MORE] > 0.0 and tries.doubts[FAILED] == 0.0
-    tries.doubts[FAILED] = own[MORE]
-    f.ego[NOW] = 0.0
+    slips, other, known = model.slip > 0.0, tries.other, own[MORE] > 0.0 and tries.doubts[PENDING] == KNOWN
+    if not known:
+        tries.doubts[PENDING] = tries.doubts[PENDING] + own[MORE] if own[MORE] > 0.0 else 0.0
+    f.ego[NOW] = f.ego[CORRECTED] = 0.0
     if model.forget > 0.0 and count > 0 and tries.alone.g.vectors[0] == 0:
         copy_filter(f, tries.alone)
     for i in range(OWN):
@@ -260,13 +263,16 @@ def step(
         copy_filter(f, other)
         copy_rows(own, rows, tries, count)
     attempt(f, model, own, rows, vehicles, count)
-    if slips and (fails or surprised(f, own)):
+    fails = tries.doubts[PENDING] > 0.0
+    if slips and surprised(f, fails or known):
         other.ego[NOW] = 1.0
-        corrected_motion(tries.own)
+        if fails or known:
+            corrected_motion(other, tries.own, tries.own[MORE] if known else tries.doubts[PENDING])
         attempt(other, model, tries.own, tries.rows, vehicles, count)
-        probably = chance(other, f, own, fails)
+        probably = chance(other, f, own[DT], fails, known)
         if probably >= 0.5:
             copy_filter(other, f)
+            tries.doubts[PENDING] = KNOWN if fails else tries.doubts[PENDING]
         f.ego[SLIPPED] = probably
     elif f.ego[NUMBERS] > 0.0:
         f.ego[SLIPPED] = 0.0
@@ -281,9 +287,10 @@ def step(
 def compare(f: Filter, tries: Tries, model: Model, rows: Floats, vehicles: Ints) -> None:
     """A step of the ego alone, whose answer counts where something is wrong with its star."""
     alone, doubts, own = tries.alone, tries.doubts, tries.first
-    alone.ego[NOW] = 0.0
+    alone.ego[NOW] = alone.ego[CORRECTED] = 0.0
     remember_speed(alone, own)
-    corrected_motion(own)
+    if doubts[PENDING] == KNOWN:
+        corrected_motion(alone, own, own[MORE])
     attempt(alone, model, own, rows, vehicles, 0)
     average(alone, model)
     doubts[ALONE_FOR] -= own[DT]

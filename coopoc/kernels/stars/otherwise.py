@@ -44,6 +44,7 @@ from .cooperative_state import (
     AGREED,
     ANSWER,
     BY_FIXES,
+    CORRECTED,
     COVARIANCE,
     DT,
     ESTABLISHED,
@@ -58,7 +59,6 @@ from .cooperative_state import (
     LONGEST,
     LOUDER,
     MADE,
-    MORE,
     MOTION,
     MOTION_VARIANCE,
     MOTIONS,
@@ -100,11 +100,12 @@ standard deviations."""
 
 @part
 def turned(f: Filter, k: int, moved: tuple[float, float, float]) -> tuple[float, float, float]:
-    """(1 + s) R(b) m, and its derivatives by b and s in TURNED; m itself where odometry does not err."""
+    """(1 + s) R(b) m, and its derivatives by b and s in TURNED; m itself where odometry does not err, or fixes correct
+    it."""
     g, w = f.g, f.h.matrix[TURNED:]
     for i in range(6):
         w[i] = 0.0
-    if not has(g, k, TURN):
+    if not has(g, k, TURN) or (k == 0 and f.ego[CORRECTED] > 0.0):
         return moved
     i = 3 * g.block[k, TURN]
     c, s, scale = math.cos(g.x[i]), math.sin(g.x[i]), 1.0 + g.x[i + 1]
@@ -259,10 +260,11 @@ class Tries(NamedTuple):
     doubts: Floats
 
 
-EXCESS, COUNTED, ALONE_FOR, ALONE_LAST, FAILED, DOUBTS = range(6)
+EXCESS, COUNTED, ALONE_FOR, ALONE_LAST, PENDING, DOUBTS = range(6)
 """Of the star as a whole: sums over the ego's fixes, fading in MEMORY s, of how much larger their squared normalised
 distance from the star's estimate is than from that of the ego alone, and of 1; for how many s the latter counts from
-now on, and counted last; MORE of the step before."""
+now on, and counted last; and sum of MORE, m^2, since the odometry has failed, KNOWN once it was taken to."""
+KNOWN = -1.0
 MEMORY, LEAST_COUNTED, MOST_EXCESS, LARGEST_GAP = 10.0, 3.0, 4.0, 25.0
 """s; fixes, and the mean excess, from which the star is left; the most that one distance counts."""
 LOUDEST_NOISE, FIRST_ALONE = 2.9, 20.0
@@ -304,11 +306,12 @@ def measured_motion(own: Floats) -> None:
 
 
 @part
-def corrected_motion(own: Floats) -> None:
-    """Correct a motion as fixes show, where the odometry fails."""
+def corrected_motion(f: Filter, own: Floats, more: float) -> None:
+    """Take the motion as fixes correct it, whose variance is larger by `more` m^2."""
+    f.ego[CORRECTED] = 1.0
     for c in range(3):
         own[MOTION + c] += own[BY_FIXES + c]
-        own[MOTION_VARIANCE + c] += own[MORE]
+        own[MOTION_VARIANCE + c] += more
 
 
 @part
@@ -376,19 +379,19 @@ def score(f: Filter, h: Rows, gate: float, whole: bool) -> None:
 
 
 @part
-def surprised(f: Filter, own: Floats) -> bool:
+def surprised(f: Filter, fails: bool) -> bool:
     """Whether the first try's numbers are worse than usual by a standard deviation, or the ego may have slipped; not
-    for fixes that jumped while odometry works."""
+    for fixes that jumped while odometry does not fail."""
     n = f.ego[NUMBERS]
     strange = f.ego[SLIPPED] > 0.1 or f.ego[SQUARES] > n + math.sqrt(2.0 * n)
-    return bool(strange and (f.ego[JUMPED] == 0.0 or own[MORE] > 0.0))
+    return bool(strange and (f.ego[JUMPED] == 0.0 or fails))
 
 
 @part
-def chance(f: Filter, first: Filter, own: Floats, fails: bool) -> float:
+def chance(f: Filter, first: Filter, dt: float, fails: bool, known: bool) -> float:
     """Probability of a slip, after both tries of a step, by that before it, or by the evidence of an odometry that
-    `fails` from now on, which does not end by itself."""
-    stays, begins = 1.0 if own[MORE] > 0.0 else math.exp(-own[DT] / LASTS), min(own[DT] / RARE, 0.5)
+    `fails`; once that is known, it does not end by itself."""
+    stays, begins = 1.0 if known else math.exp(-dt / LASTS), min(dt / RARE, 0.5)
     before = first.ego[SLIPPED] * stays + (1.0 - first.ego[SLIPPED]) * begins
     odds = f.ego[LIKELY] - first.ego[LIKELY] + (DECISIVE if fails else math.log(before / (1.0 - before)))
     return chance_of(odds)
