@@ -88,7 +88,7 @@ def test_the_correction_is_the_velocity_of_filterpys_filter() -> None:
     peer.H, found = np.eye(2, 4), []
     for k in range(10, STEPS, 10):
         way, r = 0.1 * u[k - 9 : k + 1].sum(axis=0), 12.25 * level
-        process = (0.1 * S2.velocity_std_ratio) ** 2 * (way**2).sum() * 10
+        process = UNKNOWN * (0.1 * S2.velocity_std_ratio) ** 2 * (way**2).sum() * 10
         walk = np.kron(JERKY * np.array([[1 / 3, 1 / 2], [1 / 2, 1.0]]), np.eye(2))
         peer.F, peer.R = np.eye(4) + np.eye(4, k=2), r * np.eye(2)
         peer.predict(Q=walk + np.diag([process, process, 0.0, 0.0]))

@@ -62,7 +62,7 @@ WANDERS = 2.0
 """s, in which the errors of all fixes may change together."""
 NOISIER, UNKNOWN = 0.1, 4.0
 """Share of what fixes say of the level of the noise of all, which is no less than it is stated, and what it is taken
-for at first."""
+for at first, and that of odometry all the time."""
 LATE = 10.0
 """s, for which a speed is remembered."""
 
@@ -113,14 +113,17 @@ def judge(state: Floats, noise: MotionNoise, x: float, y: float, r: float, dt: f
         return 0.0
     if x == state[FIX] and y == state[FIX + 1]:  # to all digits: the receiver holds it
         return 0.0
-    state[FIX], state[FIX + 1] = x, y
-    state[GAPS] += x - state[PLACE] - state[WAY]
-    state[GAPS + 1] += y - state[PLACE + 1] - state[WAY + 1]
+    state[FIX], state[FIX + 1], n, r = x, y, state[COUNT], r * state[LEVEL]
+    east, north = x - state[PLACE] - state[WAY], y - state[PLACE + 1] - state[WAY + 1]
+    if (n * east - state[GAPS]) ** 2 + (n * north - state[GAPS + 1]) ** 2 > 2.0 * n * n * FAR * r:  # it has jumped
+        state[GAPS] = state[GAPS + 1] = state[TIMES] = state[COUNT] = 0.0
+    state[GAPS] += east
+    state[GAPS + 1] += north
     state[TIMES] += state[SINCE]
     state[COUNT] += 1.0
     if state[SINCE] < TOGETHER - 0.5 * dt:
         return 0.0
-    failed, r = state[FAILS] > 0.0, r * state[LEVEL]
+    failed = state[FAILS] > 0.0
     gather_evidence(state, noise, r / state[COUNT], dt)
     if failed or state[EVIDENCE] < DECISIVE or state[LASTS] < LONG:
         return 0.0
@@ -145,7 +148,7 @@ def gather_evidence(state: Floats, noise: MotionNoise, r: float, dt: float) -> N
     q = 0.0
     for c in range(2):
         q += noise.base[c] ** 2 + max((noise.ratio[c] * interval) ** 2 * speed2, (interval * noise.floor) ** 2)
-    q *= 0.5 * time / interval
+    q *= 0.5 * UNKNOWN * time / interval
     pb, bb = state[VARIANCE + 1], state[VARIANCE + 2]
     state[VARIANCE] += 2.0 * time * pb + time * time * bb + JERKY * time**3 / 3.0 + q
     state[VARIANCE + 1], state[VARIANCE + 2] = pb + time * bb + 0.5 * JERKY * time * time, bb + JERKY * time
