@@ -84,6 +84,11 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path: Path) -> None:
     assert free.origin == pytest.approx((lat[0], lon[0], h[0]))
     assert_allclose(free.recording.gnss[0, 0, 0], 0, atol=1e-9)
     assert read_log(tmp_path / "car7.csv", columns=names, ignore=["height"]).origin == (lat[0], lon[0], 0.0)
+    frame.loc[:9, ["lat", "lon", "alt"]] = 0.0
+    write(frame, tmp_path / "car7.csv")
+    late = read_log(tmp_path / "car7.csv", columns=names)
+    assert late.origin == pytest.approx((lat[10], lon[10], h[10]))
+    assert late.summary.refused["fixes at 0 N 0 E, which are none"][0] == 30
 
 
 def test_columns_that_end_with_a_partner_are_measurements_of_it(tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from ..arrays import Floats, Ints
+from ..arrays import Bools, Floats, Ints
 from ..kernels.covariances import DOUBT, TOGETHER, mark_estimates, mark_neighbours, mark_odometers
 from ..world.links import stretches
 from ..world.recording import Recording
@@ -20,6 +20,17 @@ DOUBTS = (
     "odometer, {}: contradicted by fixes; it slips, or they jump",
 )
 NEIGHBOURS = "messages, {} and {}: far from estimates", "relative measurements, {} and {}: far from estimates"
+
+
+def when(t: Floats, marked: Bools) -> str:
+    """The first three stretches of marked steps, and how many more there are.
+
+    >>> when(np.arange(4.0), np.array([True, True, False, True]))
+    '(0 to 1, 3 to 3 s)'
+    """
+    times = [f"{t[a]:.10g} to {t[b - 1]:.10g}" for a, b in stretches(marked)]
+    more = f", and {len(times) - 3} times more" * (len(times) > 3)
+    return f"({', '.join(times[:3])} s{more})"
 
 
 def doubts(
@@ -62,10 +73,8 @@ def doubts(
         mark_odometers(recording.gnss, recording.velocity, egos, doubtful, fix, motion, every, recording.dt, marks)
 
     def add(text: str, marked: Ints, *names: int) -> None:
-        times = [f"{recording.t[a]:.10g} to {recording.t[b - 1]:.10g}" for a, b in stretches(marked > 0)]
-        if times:
-            more = f", and {len(times) - 3} times more" * (len(times) > 3)
-            notes.append(f"{text.format(*(recording.ids[name] for name in names))} ({', '.join(times[:3])} s{more})")
+        if marked.any():
+            notes.append(f"{text.format(*(recording.ids[name] for name in names))} {when(recording.t, marked > 0)}")
 
     first = 0
     for k, ego in enumerate(columns):

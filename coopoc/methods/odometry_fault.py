@@ -8,8 +8,8 @@ from dataclasses import replace
 import numpy as np
 
 from ..kernels.odometry_fault import ERRS, correct_drives
-from ..world.links import stretches
 from ..world.recording import Recording
+from .doubts import when
 from .noise_model import NoiseModel, motion_noise
 
 
@@ -42,10 +42,8 @@ def with_odometry(
     notes = [*noise_model.notes]
     for n, failed in enumerate((extra > 0).any(axis=0).T):
         if failed.any():
-            times = [f"{recording.t[a]:.10g} to {recording.t[b - 1]:.10g}" for a, b in stretches(failed)]
             text = f"odometry, {recording.ids[n]}: fails, as fixes show, which correct it"
-            more_times = f", and {len(times) - 3} times more" * (len(times) > 3)
-            notes.append(f"{text} ({', '.join(times[:3])} s{more_times})")
+            notes.append(f"{text} {when(recording.t, failed)}")
     corrected_recording = replace(recording, velocity=velocity)
     notes.extend(note for note in recording.unlikely if note not in corrected_recording.unlikely)
     return corrected_recording, replace(noise_model, extra=extra, notes=tuple(notes))

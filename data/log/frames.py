@@ -78,10 +78,10 @@ def on_one_clock(rows: Rows, clock: Mapping[str, float]) -> Rows:
     return rows
 
 
-def local(rows: Rows, origin: Origin | None) -> tuple[Rows, Origin | None]:
+def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Origin | None]:
     """Rows in SI units, with x, y, z (east, north, up) in place of latitude, longitude, height of WGS84; and the origin
     of that frame: the given one, or the first complete fix in degrees (its height 0 where there is none in the log),
-    None where positions were local.
+    None where positions were local. A fix at 0 N 0 E is none: receivers write it where they have none.
 
     Raises:
         InputError: positions in metres beside those in degrees without an origin, or degrees that are never complete.
@@ -91,6 +91,12 @@ def local(rows: Rows, origin: Origin | None) -> tuple[Rows, Origin | None]:
     rows = rows.assign(kind=[kind.name for kind in kinds], value=scale * rows["value"] + offset)
     angle = rows["kind"].isin(ANGLES[:3])
     rows = rows.assign(value=rows["value"].mask(angle, wrap(rows["value"])), std=rows["std"] * abs(scale))
+    keys, geodetic = ["t", "vehicle", "kind"], rows["kind"].isin([*ENU])
+    zero = rows[geodetic & (rows["kind"] != "height") & (rows["value"] == 0.0)]
+    both = zero[zero.duplicated(keys[:2])].set_index(keys[:2]).index
+    nowhere = geodetic & rows.set_index(keys[:2]).index.isin(both)
+    summary.refuse("fixes at 0 N 0 E, which are none", rows[nowhere])
+    rows = rows[~nowhere]
     geodetic, metric = rows["kind"].isin([*ENU]), rows[rows["kind"].isin(["x", "y"])]
     if not geodetic.any():
         return rows, origin
@@ -98,7 +104,6 @@ def local(rows: Rows, origin: Origin | None) -> tuple[Rows, Origin | None]:
         hint = "Pass origin=(latitude, longitude, height) of the local frame, or give all positions in one of the two; "
         hint += "ignore= leaves out kinds, and topics of a bag."
         raise InputError(f"{place(metric)}, x", "metres", "stand beside fixes in degrees", hint)
-    keys = ["t", "vehicle", "kind"]
     fixes = rows[geodetic].drop_duplicates(keys).pivot(index=keys[:2], columns="kind", values="value")
     if "height" not in fixes:
         fixes["height"] = origin[2] if origin else 0.0

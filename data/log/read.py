@@ -214,7 +214,7 @@ def read_log(
     if origin is not None and not rows["kind"].isin([*ENU]).any():
         summary.assume("origin= has no effect: no fix is in degrees")
     rows, true_rows = rows[rows["true"] == 0], rows[rows["true"] == 1]
-    rows, origin = local(on_one_clock(rows, clock), origin)
+    rows, origin = local(on_one_clock(rows, clock), origin, summary)
     deviations = factors(std, KINDS.keys() - {"message"}, "std")
     stated = {ENU.get(kind, KINDS[kind].name): abs(KINDS[kind].scale) * each for kind, each in deviations.items()}
     rows = fresh(distinct(rows.assign(std=rows["kind"].map(stated).fillna(rows["std"])), summary), summary)
@@ -231,7 +231,7 @@ def read_log(
     recording = _recording(rows, members, steps, mutual and not body, sensors)
     fleet = None
     if len(true_rows):
-        true_rows = local(true_rows, origin)[0]
+        true_rows = local(true_rows, origin, summary)[0]
         true_rows = true_rows[~(steps.planar & (true_rows["kind"] == "z"))]
         fleet = _truth(distinct(true_rows, Summary()), recording, max_gap, path.stem)
     summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
