@@ -40,8 +40,8 @@ def with_odometry(
     velocity, extra = velocity.copy(), found[..., 2]
     velocity[..., :2] += found[..., :2]
     notes = [*noise_model.notes]
-    for n, failed in enumerate((extra > 0).any(axis=0).T):
-        if failed.any():
+    for n in columns.tolist():
+        if (failed := np.asarray((extra[:, :, n] > 0).any(axis=0))).any():
             text = f"odometry, {recording.ids[n]}: fails, as fixes show, which correct it"
             notes.append(f"{text} {when(recording.t, failed)}")
     corrected_recording = replace(recording, velocity=velocity)
