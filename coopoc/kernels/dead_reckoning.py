@@ -108,7 +108,7 @@ def dead_reckon(
         return NO_FIX_YET
     since(history, age, since_fix, late)
     r = 0.5 * (fix[0] + late[0] + fix[1] + late[1])
-    lost = judge(odometry, motion, row[0] + since_fix[0], row[1] + since_fix[1], r, dt)
+    lost = judge(odometry, row[0] + since_fix[0], row[1] + since_fix[1], r, dt)
     by_fixes[3] += lost
     for c in range(3):
         q[c] += lost

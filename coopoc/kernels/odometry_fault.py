@@ -22,28 +22,16 @@ from ..arrays import Floats, Ints
 from .compiling.compile import compiled, part
 from .motion import MotionNoise
 
-PLACE, ERROR, VARIANCE, BELIEVED, SURE, LEVEL, FAILS, EVIDENCE, LASTS, PATH, BEFORE, SPEED, FASTEST = (
-    0,
-    2,
-    4,
-    7,
-    9,
-    10,
-    11,
-    12,
-    13,
-    14,
-    15,
-    17,
-    18,
-)
+PLACE, ERROR, VARIANCE, BELIEVED, SURE, LEVEL, FAILS, EVIDENCE = 0, 2, 4, 7, 9, 10, 11, 12
+LASTS, PATH, BEFORE, SPEED, FASTEST = 13, 14, 15, 17, 18
 """Places in a state, when fixes were last taken: position m and b m/s with the variances and covariance (pp, pb, bb)
 of an axis, the position by odometry alone and its variance, and the level of the noise of fixes; whether the odometry
 fails, the evidence, for how long s and how far m there is some, and where odometry alone has led since m; squares of
 the most of late speeds and of all by odometry m^2/s^2."""
-WAY, SINCE, FIX, GAPS, TIMES, COUNT, SHARE, SIZE = 19, 21, 22, 24, 26, 27, 28, 29
+WAY, SINCE, FIX, GAPS, TIMES, COUNT, SHARE, BASE, RATIO, FLOOR, INTERVAL, SIZE = 19, 21, 22, 24, 26, 27, *range(28, 34)
 """Since then: the way by odometry m, the time s; the last fix m, sums of how far fixes were from the position and the
-way m, and of their times s, and how many there were; and, all the time, the share of `new_state`."""
+way m, and of their times s, and how many there were; and, all the time, the arguments of `new_state`, base and ratio
+of the noise squared."""
 TOGETHER = 0.4
 """s, of which fixes are taken together."""
 JERKY = 1.0
@@ -67,15 +55,17 @@ LATE = 10.0
 """s, for which a speed is remembered."""
 
 
-def new_state(share: float) -> Floats:
+def new_state(share: float, noise: MotionNoise) -> Floats:
     """(SIZE,) before the first fix; of no length for a share of 0, where odometry is believed.
 
     Args:
         share: of the way, by which an odometry errs at least that fails.
+        noise: of the motion.
     """
-    state = np.full(SIZE if share else 0, math.nan)
-    state[SHARE:] = share
-    return state
+    state = np.full(SIZE, math.nan)
+    base, ratio = (float(np.square(std[:2]).mean()) for std in (noise.base, noise.ratio))
+    state[SHARE:] = share, base, ratio, noise.floor, noise.interval
+    return state if share else state[:0]
 
 
 @part
@@ -103,16 +93,17 @@ def correct(state: Floats, velocity: Floats, dt: float) -> float:
 
 
 @part
-def judge(state: Floats, noise: MotionNoise, x: float, y: float, r: float, dt: float) -> float:
+def judge(state: Floats, x: float, y: float, r: float, dt: float) -> float:
     """Take a fix, m, NaN for none, whose axes have the variance r m^2; by how many m^2 the position is more uncertain
     than the odometry says if it has failed from now on."""
     if len(state) == 0 or math.isnan(x):
         return 0.0
     if math.isnan(state[PLACE]):
-        state[:SHARE] = 0.0
+        for i in range(SHARE):
+            state[i] = 0.0
         state[VARIANCE], state[VARIANCE + 2], state[SURE], state[LEVEL] = r, 1.0, r, UNKNOWN
-        for at in (PLACE, BELIEVED, BEFORE, FIX):
-            state[at], state[at + 1] = x, y
+        state[PLACE] = state[BELIEVED] = state[BEFORE] = state[FIX] = x
+        state[PLACE + 1] = state[BELIEVED + 1] = state[BEFORE + 1] = state[FIX + 1] = y
         return 0.0
     if x == state[FIX] and y == state[FIX + 1]:  # to all digits: the receiver holds it
         return 0.0
@@ -127,7 +118,7 @@ def judge(state: Floats, noise: MotionNoise, x: float, y: float, r: float, dt: f
     if state[SINCE] < TOGETHER - 0.5 * dt:
         return 0.0
     failed = state[FAILS] > 0.0
-    gather_evidence(state, noise, r / state[COUNT], dt)
+    gather_evidence(state, r / state[COUNT], dt)
     if failed or state[EVIDENCE] < DECISIVE or state[LASTS] < LONG:
         return 0.0
     gap2: float = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
@@ -140,18 +131,16 @@ def judge(state: Floats, noise: MotionNoise, x: float, y: float, r: float, dt: f
 
 
 @part
-def gather_evidence(state: Floats, noise: MotionNoise, r: float, dt: float) -> None:
+def gather_evidence(state: Floats, r: float, dt: float) -> None:
     """Move both filters on, and update them and the evidence by the mean of the fixes since, of variance r m^2."""
-    time, interval = state[SINCE], noise.interval if noise.interval > 0.0 else dt
+    time, interval = state[SINCE], state[INTERVAL] if state[INTERVAL] > 0.0 else dt
     east, north = state[WAY] / time, state[WAY + 1] / time
     speed2, true2 = east**2 + north**2, (east + state[ERROR]) ** 2 + (north + state[ERROR + 1]) ** 2
     state[FASTEST] = max(state[FASTEST], speed2)
     speed2 = max(speed2, true2) if state[FAILS] > 0.0 else speed2
     state[SPEED] = max(state[SPEED] * max(1.0 - 2.0 * time / LATE, 0.0), speed2)
-    q = 0.0
-    for c in range(2):
-        q += noise.base[c] ** 2 + max((noise.ratio[c] * interval) ** 2 * speed2, (interval * noise.floor) ** 2)
-    q *= 0.5 * UNKNOWN * time / interval
+    q = state[BASE] + interval**2 * max(state[RATIO] * speed2, state[FLOOR] ** 2)
+    q *= UNKNOWN * time / interval
     pb, bb = state[VARIANCE + 1], state[VARIANCE + 2]
     state[VARIANCE] += 2.0 * time * pb + time * time * bb + JERKY * time**3 / 3.0 + q
     state[VARIANCE + 1], state[VARIANCE + 2] = pb + time * bb + 0.5 * JERKY * time * time, bb + JERKY * time
@@ -200,10 +189,9 @@ def gather_evidence(state: Floats, noise: MotionNoise, r: float, dt: float) -> N
 def correct_drives(
     gnss: Floats,
     velocity: Floats,
-    noise: MotionNoise,
+    fresh: Floats,
     variance: Floats,
     columns: Ints,
-    share: float,
     dt: float,
     out: Floats,
 ) -> bool:
@@ -212,10 +200,9 @@ def correct_drives(
     Args:
         gnss: (R, T, N, 3) m, NaN for no fix.
         velocity: (R, T, N, 3) m/s, NaN for an absent vehicle, which begins anew.
-        noise: of motions.
+        fresh: of `new_state`.
         variance: (3,) m^2 of a fix.
         columns: (E,) of the vehicles.
-        share: of the way.
         dt: s.
         out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion.s variance is larger m^2; of no
             length only to ask.
@@ -223,17 +210,19 @@ def correct_drives(
     states, moved = np.empty((len(columns), SIZE)), np.empty(3)
     r, fails = 0.5 * (variance[0] + variance[1]), False
     for run in range(gnss.shape[0]):
-        states[:], states[:, SHARE] = math.nan, share
+        for e in range(len(columns)):
+            for i in range(SIZE):
+                states[e, i] = fresh[i]
         for t in range(gnss.shape[1]):
             for e in range(len(columns)):
-                n, extra = columns[e], 0.0
+                n, extra, state = columns[e], 0.0, states[e]
                 moved[0], moved[1] = velocity[run, t, n, 0], velocity[run, t, n, 1]
                 if math.isnan(moved[0]):
-                    states[e, PLACE] = math.nan
+                    state[PLACE] = math.nan
                     continue
                 if t > 0:
-                    extra = correct(states[e], moved, dt)
-                extra += judge(states[e], noise, gnss[run, t, n, 0], gnss[run, t, n, 1], r, dt)
+                    extra = correct(state, moved, dt)
+                extra += judge(state, gnss[run, t, n, 0], gnss[run, t, n, 1], r, dt)
                 fails = fails or extra > 0.0
                 if len(out):
                     out[run, t, n, 0] = moved[0] - velocity[run, t, n, 0]

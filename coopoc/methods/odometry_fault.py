@@ -7,7 +7,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..kernels.odometry_fault import ERRS, correct_drives
+from ..kernels.odometry_fault import ERRS, correct_drives, new_state
 from ..world.recording import Recording
 from .doubts import when
 from .noise_model import NoiseModel, motion_noise
@@ -32,8 +32,8 @@ def with_odometry(
     columns = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
     columns = columns[~np.isin(columns, recording.landmarks)]
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
-    motion, variance = motion_noise(noise_model, recording.dt), fix**2 * noise_model.gnss_variance
-    given = gnss, velocity, motion, variance, columns, share, recording.dt
+    fresh, variance = new_state(share, motion_noise(noise_model, recording.dt)), fix**2 * noise_model.gnss_variance
+    given = gnss, velocity, fresh, variance, columns, recording.dt
     if not correct_drives(*given, np.empty((0, 0, 0, 3))):
         return recording, noise_model
     correct_drives(*given, found := np.zeros(velocity.shape))

@@ -150,7 +150,7 @@ class StarStream:
         self._last: Floats = np.full((1, WIDTH), np.nan)
         self._answer: Floats = np.full(12, np.nan)
         self._memory: Floats = np.zeros(9)
-        self._odometry: Floats = new_state(ERRS_MODELLED if priors.fix_gate else 0.0)
+        self._odometry: Floats = new_state(ERRS_MODELLED if priors.fix_gate else 0.0, self._motion)
         if x0 is not None:
             self._memory[:6] = *self._start, *np.full(3, 1.0 / KNOWN)
 

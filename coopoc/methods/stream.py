@@ -81,7 +81,7 @@ class FilterStream:
             np.zeros(8),
             np.hstack((*motion, *fixes)),
         )
-        self._odometry = new_state(ERRS if fixes.gate > 0.0 else 0.0)
+        self._odometry = new_state(ERRS if fixes.gate > 0.0 else 0.0, motion)
         if x0 is not None:
             self._state[:] = STATE
             self._state[:, 0] = three("x0", x0)
