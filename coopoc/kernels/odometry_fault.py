@@ -28,10 +28,10 @@ LASTS, PATH, BEFORE, SPEED, FASTEST = 13, 14, 15, 17, 18
 of an axis, the position by odometry alone and its variance, and the level of the noise of fixes; whether the odometry
 fails, the evidence, for how long s and how far m there is some, and where odometry alone has led since m; squares of
 the most of late speeds and of all by odometry m^2/s^2."""
-WAY, SINCE, FIX, GAPS, TIMES, COUNT, SHARE, BASE, RATIO, FLOOR, INTERVAL, SIZE = 19, 21, 22, 24, 26, 27, *range(28, 34)
+WAY, SINCE, FIX, GAPS, TIMES, COUNT, BASE, RATIO, FLOOR, INTERVAL, SIZE = 19, 21, 22, 24, 26, 27, *range(28, 33)
 """Since then: the way by odometry m, the time s; the last fix m, sums of how far fixes were from the position and the
-way m, and of their times s, and how many there were; and, all the time, the arguments of `new_state`, base and ratio
-of the noise squared."""
+way m, and of their times s, and how many there were; and, all the time, the numbers of a MotionNoise, base and
+ratio squared."""
 TOGETHER = 0.4
 """s, of which fixes are taken together."""
 JERKY = 1.0
@@ -40,10 +40,8 @@ FAR, COUNTS = 14.0, 25.0
 """Squared normalised innovation from which a filter begins anew, and the most that counts as evidence."""
 DECISIVE, MOST = 15.0, 18.0
 """Evidence from which the odometry fails, and the most that is counted; logarithms of a likelihood ratio."""
-ERRS, ERRS_MODELLED = 0.2, 0.3
-"""SHARE of the way by which an odometry errs at least that fails, also where errors of heading and scale are states."""
-RATE, DEVIATIONS, LONG = 0.5, 5.0, 2.0
-"""m for each second, and deviations of a fix: it errs by as much at least, for as many s."""
+SHARE, RATE, DEVIATIONS, LONG = 0.2, 0.5, 5.0, 2.0
+"""Of the way, m for each second, and deviations of a fix: it errs by as much at least, for as many s."""
 FASTER = 2.0
 """Times the fastest by odometry that a vehicle may go, if that is above RATE."""
 WANDERS = 2.0
@@ -55,17 +53,16 @@ LATE = 10.0
 """s, for which a speed is remembered."""
 
 
-def new_state(share: float, noise: MotionNoise) -> Floats:
-    """(SIZE,) before the first fix; of no length for a share of 0, where odometry is believed.
+def new_state(noise: MotionNoise) -> Floats:
+    """(SIZE,) before the first fix.
 
     Args:
-        share: of the way, by which an odometry errs at least that fails.
         noise: of the motion.
     """
     state = np.full(SIZE, math.nan)
     base, ratio = (float(np.square(std[:2]).mean()) for std in (noise.base, noise.ratio))
-    state[SHARE:] = share, base, ratio, noise.floor, noise.interval
-    return state if share else state[:0]
+    state[BASE:] = base, ratio, noise.floor, noise.interval
+    return state
 
 
 @part
@@ -73,7 +70,7 @@ def correct(state: Floats, velocity: Floats, dt: float) -> float:
     """Add b to a velocity (3,) m/s where the odometry fails, and return by how many m^2 its motion is more uncertain.
 
     Args:
-        state: of `new_state`.
+        state: of `new_state`, or of no length where odometry is believed.
         velocity: (3,) m/s.
         dt: s.
     """
@@ -99,7 +96,7 @@ def judge(state: Floats, x: float, y: float, r: float, dt: float) -> float:
     if len(state) == 0 or math.isnan(x):
         return 0.0
     if math.isnan(state[PLACE]):
-        for i in range(SHARE):
+        for i in range(BASE):
             state[i] = 0.0
         state[VARIANCE], state[VARIANCE + 2], state[SURE], state[LEVEL] = r, 1.0, r, UNKNOWN
         state[PLACE] = state[BELIEVED] = state[BEFORE] = state[FIX] = x
@@ -123,7 +120,7 @@ def judge(state: Floats, x: float, y: float, r: float, dt: float) -> float:
         return 0.0
     gap2: float = (state[PLACE] - state[BEFORE]) ** 2 + (state[PLACE + 1] - state[BEFORE + 1]) ** 2
     size2 = (state[ERROR] ** 2 + state[ERROR + 1] ** 2) * state[LASTS] ** 2
-    least = max(state[SHARE] * state[PATH], RATE * state[LASTS], DEVIATIONS * math.sqrt(r))
+    least = max(SHARE * state[PATH], RATE * state[LASTS], DEVIATIONS * math.sqrt(r))
     if min(gap2, size2) < least * least:
         return 0.0
     state[FAILS] = 1.0

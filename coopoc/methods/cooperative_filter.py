@@ -11,7 +11,6 @@ import numpy.typing as npt
 
 from ..arrays import Floats, number
 from ..kernels.gate import GATE
-from ..kernels.odometry_fault import ERRS_MODELLED
 from ..kernels.stars.cooperative_filter import run_filter
 from ..kernels.stars.cooperative_messages import fading_memory
 from ..kernels.stars.cooperative_state import Model, Sent
@@ -190,7 +189,7 @@ class CooperativeFilter(Checked):
         velocity = recording.velocity
         if priors.fix_gate:
             columns = recording.observing(egos)
-            recording, noise_model = with_odometry(recording, columns, noise_model, priors.fix, ERRS_MODELLED)
+            recording, noise_model = with_odometry(recording, columns, noise_model, priors.fix)
         extra, noise_model = noise_model.extra, replace(noise_model, extra=None)
         model, notes = model_of(noise_model, priors), [*noise_model.notes, *filter(None, [self.calibration])]
         variance, sent = priors.fix**2 * noise_model.fix_variance(recording), broadcasts(recording, noise_model, priors)

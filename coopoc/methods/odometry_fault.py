@@ -7,14 +7,14 @@ from dataclasses import replace
 
 import numpy as np
 
-from ..kernels.odometry_fault import ERRS, correct_drives, new_state
+from ..kernels.odometry_fault import correct_drives, new_state
 from ..world.recording import Recording
 from .doubts import when
 from .noise_model import NoiseModel, motion_noise
 
 
 def with_odometry(
-    recording: Recording, egos: Sequence[int], noise_model: NoiseModel, fix: float = 1.0, share: float = ERRS
+    recording: Recording, egos: Sequence[int], noise_model: NoiseModel, fix: float = 1.0
 ) -> tuple[Recording, NoiseModel]:
     """The recording with velocities that fixes correct, of vehicles whose odometry fails, and the noise of these, with
     a note; both as they are where none fails, no noise is stated, or velocities are those of fixes.
@@ -24,7 +24,6 @@ def with_odometry(
         egos: columns that are followed; their neighbours correct what they send.
         noise_model: of the method.
         fix: factor of the standard deviation of fixes.
-        share: of the way, by which an odometry errs at least that fails.
     """
     sensors, links = noise_model.sensors, recording.links
     if sensors is None or noise_model.fleet is not None or sensors.velocity_reading == "fixes":
@@ -32,7 +31,7 @@ def with_odometry(
     columns = np.union1d(egos, links.neighbour[np.isin(links.observer, egos)])
     columns = columns[~np.isin(columns, recording.landmarks)]
     gnss, velocity = np.ascontiguousarray(recording.gnss), np.ascontiguousarray(recording.velocity)
-    fresh, variance = new_state(share, motion_noise(noise_model, recording.dt)), fix**2 * noise_model.gnss_variance
+    fresh, variance = new_state(motion_noise(noise_model, recording.dt)), fix**2 * noise_model.gnss_variance
     given = gnss, velocity, fresh, variance, columns, recording.dt
     if not correct_drives(*given, np.empty((0, 0, 0, 3))):
         return recording, noise_model

@@ -15,7 +15,7 @@ from ..errors import InputError
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.geometry import components
 from ..kernels.motion import MotionNoise
-from ..kernels.odometry_fault import ERRS_MODELLED, new_state
+from ..kernels.odometry_fault import new_state
 from ..kernels.stars.cooperative_state import (
     AGE,
     FIX_VARIANCE,
@@ -150,7 +150,7 @@ class StarStream:
         self._last: Floats = np.full((1, WIDTH), np.nan)
         self._answer: Floats = np.full(12, np.nan)
         self._memory: Floats = np.zeros(9)
-        self._odometry: Floats = new_state(ERRS_MODELLED if priors.fix_gate else 0.0, self._motion)
+        self._odometry: Floats = new_state(self._motion) if priors.fix_gate else np.empty(0)
         if x0 is not None:
             self._memory[:6] = *self._start, *np.full(3, 1.0 / KNOWN)
 

@@ -10,7 +10,7 @@ import numpy.typing as npt
 from ..arrays import Floats
 from ..kernels.dead_reckoning import ESTIMATE, NO_FIX_YET
 from ..kernels.motion import MotionNoise
-from ..kernels.odometry_fault import ERRS, new_state
+from ..kernels.odometry_fault import new_state
 from ..kernels.solo import STATE, FixNoise, stream_step
 from .motion_history import MotionHistory, three
 
@@ -81,7 +81,7 @@ class FilterStream:
             np.zeros(8),
             np.hstack((*motion, *fixes)),
         )
-        self._odometry = new_state(ERRS if fixes.gate > 0.0 else 0.0, motion)
+        self._odometry = new_state(motion) if fixes.gate > 0.0 else np.empty(0)
         if x0 is not None:
             self._state[:] = STATE
             self._state[:, 0] = three("x0", x0)

@@ -15,7 +15,7 @@ import numpy as np
 from coopoc import NoiseModel, Recording
 from coopoc.arrays import Floats
 from coopoc.kernels.gate import AWAY, EVIDENCE, FIX_GATE, GATE, HARD_REJECT_FACTOR, LEAK, PATIENCE, SLIP
-from coopoc.kernels.odometry_fault import DECISIVE, ERRS_MODELLED
+from coopoc.kernels.odometry_fault import DECISIVE
 from coopoc.kernels.stars.cooperative_messages import CLIP, FADES, FIX_SCORE
 from coopoc.kernels.stars.cooperative_state import (
     ACCELERATION,
@@ -164,7 +164,7 @@ class Oracle:
     def __init__(self, seen: Recording, ego: int, run: int, known: NoiseModel, priors: Priors) -> None:
         s, measured, self.more = known.sensors, seen.velocity, np.zeros(len(seen.t))
         if priors.fix_gate:  # `test_odometry_fault` has what refers to that
-            seen, fault = with_odometry(seen, [ego], known, priors.fix, ERRS_MODELLED)
+            seen, fault = with_odometry(seen, [ego], known, priors.fix)
             self.more = self.more if fault.extra is None else fault.extra[run, :, ego]
         self.by, self.corrected_now, self.grown = (seen.velocity - measured)[run, :, ego], False, 0.0
         self.seen, self.ego, self.run, self.known, self.priors = seen, ego, run, known, priors
