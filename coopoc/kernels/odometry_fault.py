@@ -153,7 +153,7 @@ def gather_evidence(state: Floats, r: float, dt: float) -> None:
         state[PLACE + c] += moved
         state[BEFORE + c] += state[WAY + c]
         state[BELIEVED + c] += state[WAY + c]
-        state[WAY + c] = gap
+        state[WAY + c] = gap  # until the update below
     anew, gain = square > FAR, state[VARIANCE + 1] / s
     share, trust = 1.0 if anew else state[VARIANCE] / s, 1.0 if believed > FAR else state[SURE] / sure
     for c in range(2):
@@ -201,7 +201,7 @@ def correct_drives(
         variance: (3,) m^2 of a fix.
         columns: (E,) of the vehicles.
         dt: s.
-        out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion.s variance is larger m^2; of no
+        out: (R, T, N, 3) of a velocity east and north m/s, and by how much a motion's variance is larger m^2; of no
             length only to ask.
     """
     states, moved = np.empty((len(columns), SIZE)), np.empty(3)

@@ -14,6 +14,7 @@ from .baselines import solo_estimates
 from .egos import Estimate, assumptions, follow_egos, measurements
 from .gaps import in_stretches
 from .noise_model import NoiseModel, resolve
+from .odometry_fault import with_odometry
 from .track import Checked, Track
 
 
@@ -64,6 +65,8 @@ class CovarianceIntersection(Checked):
         """
         noise_model, columns = resolve(self.noise_model, recording), check_recording(recording).columns(egos)
         gates = self.robust and noise_model.exact_relative
+        if gates:
+            recording, noise_model = with_odometry(recording, columns, noise_model)
         x, p = solo_estimates(recording, noise_model, columns, gates)
 
         def run(ego: int, inbox: Inbox) -> Iterator[Estimate]:

@@ -128,16 +128,12 @@ class NoiseModel:
             inbox: of the one vehicle; then of all (R, T, N, 3) by what it knows, at the steps of messages that arrive.
             first: step at which the filter begins.
         """
-        more: Floats | None = self.extra
-        if more is not None:
-            columns = np.arange(len(recording.ids)) if columns is None else columns
-            usual = replace(self, extra=None).process_variance(recording, columns, inbox, first)
-            own = columns if inbox is not None else slice(None)
-            variance: Floats = np.broadcast_to(
-                usual, (*more.shape[:2], len(recording.ids if inbox is not None else columns), 3)
-            ).copy()
-            variance[:, :, own] += more[:, :, columns, None]
-            return variance
+        if self.extra is not None:
+            more = np.zeros(self.extra.shape)
+            own = slice(None) if columns is None else columns
+            more[:, :, own] = self.extra[:, :, own]  # a vehicle knows of no other's
+            more = more[:, :, own] if inbox is None else more
+            return replace(self, extra=None).process_variance(recording, columns, inbox, first) + more[..., None]
         if self.process_std is not None:
             return np.square(self.process_std)[None, None, None]
         assert self.sensors is not None
@@ -148,8 +144,8 @@ class NoiseModel:
         if columns is not None and inbox is None:
             velocity = velocity[:, :, columns]
         if self.fleet is not None:
-            of_truth: Floats = np.square(recording.dt * self.sensors.velocity_std(velocity, 1e-6))
-            return of_truth
+            variance: Floats = np.square(recording.dt * self.sensors.velocity_std(velocity, 1e-6))
+            return variance
         if inbox is None:
             return own_variances(self.sensors.motion_noise(), velocity, recording.dt, first)
         use, neighbour = np.zeros(velocity.shape[:3], np.uint8), links.neighbour[inbox.link]

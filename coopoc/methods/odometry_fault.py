@@ -41,7 +41,7 @@ def with_odometry(
     notes = [*noise_model.notes]
     for n in columns.tolist():
         if (failed := np.asarray((extra[:, :, n] > 0).any(axis=0))).any():
-            text = f"odometry, {recording.ids[n]}: fails, as fixes show, which correct it"
+            text = f"odometry, {recording.ids[n]}: fails, or its fixes drift; they correct it"
             notes.append(f"{text} {when(recording.t, failed)}")
     corrected_recording = replace(recording, velocity=velocity)
     notes.extend(note for note in recording.unlikely if note not in corrected_recording.unlikely)

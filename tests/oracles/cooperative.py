@@ -328,7 +328,7 @@ class Oracle:
         self.corrected_now, self.grown = fails or known, self.more[t] if known else self.pending
         self.step(t, rate * dt**2 + (min(rate * UNSEEN**2, shows) if p <= 0.5 and dt < UNSEEN else 0.0))
         self.corrected_now = False
-        prior = p * (1.0 if known else math.exp(-dt / LASTS)) + (1 - p) * min(dt / RARE, 0.5)
+        prior = p * (1.0 if known else math.exp(-dt / LASTS)) + (1 - p) * min(dt / (LASTS if known else RARE), 0.5)
         odds = self.state["score"] - first[0]["score"] + (DECISIVE if fails else math.log(prior / (1 - prior)))
         if odds < 0:
             self.state, self.revoked = first

@@ -238,8 +238,7 @@ def step(
     count: int,
 ) -> None:
     """A step; where its numbers are unlikely, the likelier of two: of an ego that slips, or whose odometry fails as its
-    fixes show, and of one that does not;
-    beside it one of the ego alone, once it has met a neighbour.
+    fixes show, and of one that does not; beside it one of the ego alone, once it has met a neighbour.
 
     Args:
         f: filter, after `begin`.

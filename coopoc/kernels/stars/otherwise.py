@@ -391,7 +391,7 @@ def surprised(f: Filter, fails: bool) -> bool:
 def chance(f: Filter, first: Filter, dt: float, fails: bool, known: bool) -> float:
     """Probability of a slip, after both tries of a step, by that before it, or by the evidence of an odometry that
     `fails`; once that is known, it does not end by itself."""
-    stays, begins = 1.0 if known else math.exp(-dt / LASTS), min(dt / RARE, 0.5)
+    stays, begins = 1.0 if known else math.exp(-dt / LASTS), min(dt / (LASTS if known else RARE), 0.5)
     before = first.ego[SLIPPED] * stays + (1.0 - first.ego[SLIPPED]) * begins
     odds = f.ego[LIKELY] - first.ego[LIKELY] + (DECISIVE if fails else math.log(before / (1.0 - before)))
     return chance_of(odds)
