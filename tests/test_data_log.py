@@ -88,7 +88,7 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path: Path) -> None:
     write(frame, tmp_path / "car7.csv")
     late = read_log(tmp_path / "car7.csv", columns=names)
     assert late.origin == pytest.approx((lat[10], lon[10], h[10]))
-    assert late.summary.refused["fixes at 0 N 0 E, which are none"][0] == 30
+    assert late.summary.refused["fixes at zero, which are none"][0] == 30
 
 
 def test_columns_that_end_with_a_partner_are_measurements_of_it(tmp_path: Path) -> None:

@@ -342,3 +342,25 @@ def test_places_need_no_times(tmp_path: Path) -> None:
     (tmp_path / "c.csv").write_text("vehicle,x,y\nmast,5,6\npost,7,6\n")
     with refused("t = in no file"):
         co.read_log(tmp_path / "c.csv")
+
+
+@pytest.mark.parametrize(
+    ("code", "kinds"), [(-1, ["range"]), (0, ["range"]), (9999, ["range"]), (511, ["heading"]), (0, ["x", "y"])]
+)
+def test_numbers_that_stand_for_none_are_none(tmp_path: Path, code: float, kinds: list[str]) -> None:
+    """Every fourth row: the log is that with empty cells; one alone, or a mast at the origin, is what it says."""
+    t = np.arange(0.0, 12.0, 0.2)
+    car = pd.DataFrame({"t": t, "vehicle": "car", "x": 5e3 + 8 * t, "y": 300.0, "speed": 8.0, "heading": 0.01 * t})
+    car = car.assign(partner="mast", range=np.hypot(car["x"], 300.0 + 10 * np.sin(t)))
+    for name, rows, cell in (("a", slice(3, None, 4), code), ("b", slice(3, None, 4), np.nan), ("one", [3], code)):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "mast.csv").write_text("vehicle,x,y\nmast,0,0\n")
+        frame = car.astype(dict.fromkeys(kinds, float))
+        frame.loc[frame.index[rows], kinds] = cell
+        frame.to_csv(tmp_path / name / "car.csv", index=False)
+    a, b = (read_log(tmp_path / name) for name in "ab")
+    assert same(a.recording, b.recording)
+    assert [number for why, (number, _) in a.summary.refused.items() if "none" in why] == [15 * len(kinds)]
+    if (code, *kinds) in ((-1, "range"), (0, "range"), (511, "heading")):
+        with refused("row 4"):
+            read_log(tmp_path / "one")

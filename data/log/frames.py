@@ -10,13 +10,14 @@ import numpy as np
 import pandas as pd
 import pymap3d
 
+from coopoc.arrays import Bools
 from coopoc.errors import InputError
 from coopoc.world.fleet import columns
 from coopoc.world.links import wrap
 from coopoc.world.sensors import Sensors
 
 from ..assemble import PLANE_STD
-from .units import ANGLES, KINDS, Rows, Summary, place
+from .units import ANGLES, KINDS, Rows, Summary, in_group, place
 
 if TYPE_CHECKING:
     from .motion import Member
@@ -30,6 +31,8 @@ SCALE_STD, RATE_BIAS_STD = 0.03, 0.005
 """Of wheels and gyros, which a log in body frames does not state: share of a speed, and rad/s."""
 OFFSET_STD = 1.0
 """m, assumed of what all ranges of a radio are too long by: a log does not say whether its delays are calibrated."""
+MANY = 10
+"""Fixes of a vehicle that show where it is."""
 SELDOM = 0.02
 """Share of rows that are earlier than the one before, where a file is else in the order of its stamps."""
 HEADING_STD = 0.05
@@ -81,7 +84,7 @@ def on_one_clock(rows: Rows, clock: Mapping[str, float]) -> Rows:
 def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Origin | None]:
     """Rows in SI units, with x, y, z (east, north, up) in place of latitude, longitude, height of WGS84; and the origin
     of that frame: the given one, or the first complete fix in degrees (its height 0 where there is none in the log),
-    None where positions were local. A fix at 0 N 0 E is none: receivers write it where they have none.
+    None where positions were local. Fixes `_nowhere` are none.
 
     Raises:
         InputError: positions in metres beside those in degrees without an origin, or degrees that are never complete.
@@ -91,12 +94,10 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
     rows = rows.assign(kind=[kind.name for kind in kinds], value=scale * rows["value"] + offset)
     angle = rows["kind"].isin(ANGLES[:3])
     rows = rows.assign(value=rows["value"].mask(angle, wrap(rows["value"])), std=rows["std"] * abs(scale))
-    keys, geodetic = ["t", "vehicle", "kind"], rows["kind"].isin([*ENU])
-    zero = rows[geodetic & (rows["kind"] != "height") & (rows["value"] == 0.0)]
-    both = zero[zero.duplicated(keys[:2])].set_index(keys[:2]).index
-    nowhere = geodetic & rows.set_index(keys[:2]).index.isin(both)
-    summary.refuse("fixes at 0 N 0 E, which are none", rows[nowhere])
-    rows = rows[~nowhere]
+    keys = ["t", "vehicle", "kind"]
+    none = _nowhere(rows)
+    summary.refuse("fixes at zero, which are none", rows[none])
+    rows = rows[~none]
     geodetic, metric = rows["kind"].isin([*ENU]), rows[rows["kind"].isin(["x", "y"])]
     if not geodetic.any():
         return rows, origin
@@ -118,6 +119,19 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
     value = rows.merge(enu, how="left", on=keys, suffixes=("", "_enu"))["value_enu"].set_axis(rows.index)
     value = value.where(geodetic, rows["value"])
     return rows.assign(value=value, kind=rows["kind"].replace(ENU))[value.notna() | ~geodetic], origin
+
+
+def _nowhere(rows: Rows) -> Bools:
+    """(L,) fixes of receivers that have none: at 0 N 0 E, or at x = y = 0 far from all others of the vehicle."""
+    key, some = ["t", "vehicle"], rows[rows["kind"].isin(["latitude", "longitude", "x", "y"])]
+    zero = some[some["value"] == 0.0].drop_duplicates([*key, "kind"])
+    zero = zero[zero.duplicated(key, keep=False)]
+    ends = some.drop(zero.index).groupby(["vehicle", "kind"])["value"].agg(["min", "max", "size"])
+    least = np.maximum(ends["min"], -ends["max"])
+    away = ends.index[(least > ends["max"] - ends["min"]) & (ends["size"] >= MANY)].get_level_values("vehicle")
+    zero = zero[zero["kind"].isin([*ENU]) | zero["vehicle"].isin(away)]
+    at = rows.set_index(key).index.isin(zero.set_index(key).index)
+    return np.asarray(at & in_group(rows, "fix"))
 
 
 def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, members: Sequence[Member]) -> Sensors:

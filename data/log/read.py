@@ -34,7 +34,7 @@ from .frames import ENU, Origin, assumed, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
 from .motion import Member, Steps, member, samples
 from .tables import is_log_table, read_log_table
-from .units import KINDS, Rows, Summary, check_values, distinct, fresh, in_group
+from .units import KINDS, Rows, Summary, check_values, distinct, fresh, in_group, without_codes
 
 Frame = Literal["world", "body"]
 Stamps = Literal["header", "received"]
@@ -204,7 +204,7 @@ def read_log(
     less = key.map(factors(offset, {*KINDS, *key}, "offset")).fillna(0.0)
     rows = rows.assign(value=by_kind * rows["value"] - less, std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
-    rows = unwrapped(rows, summary)
+    rows = without_codes(unwrapped(rows, summary), summary)
     check_values(rows)
     for column in ("t", "arrival"):
         unit = check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)

@@ -52,6 +52,11 @@ the observer's heading, inclination from +z, elevation above the horizon. A unit
 for _name in ("yaw_rate", "heading", "azimuth", "bearing", "inclination", "elevation"):
     KINDS[f"{_name}_deg"] = KINDS[_name]._replace(scale=DEGREE * KINDS[_name].scale, limit=KINDS[_name].limit / DEGREE)
 KINDS["compass_deg"] = KINDS["heading_deg"]._replace(scale=-DEGREE, offset=float(np.pi / 2))
+LIMITS = {name: kind.limit for name, kind in KINDS.items()}
+LEAST = dict.fromkeys(("range", "inclination", "inclination_deg"), 0.0)
+CODES, FEW = 3, 10
+"""Most numbers of a kind that stand for none; least rows of one that could be meant, and times the usual step from one
+range of a pair to the next that is a leap."""
 ITSELF = "must be another member: a vehicle neither measures itself nor sends to itself"
 UNIT = "Is it in another unit? Other kinds: {kinds}; or give scale=. An angle over several turns? Write it within one."
 ANGLES = ("heading", "azimuth", "bearing", "inclination")
@@ -95,22 +100,45 @@ def place(rows: Rows) -> str:
     return f"{first['file']}: row {first['row']}"
 
 
+def without_codes(rows: Rows, summary: Summary) -> Rows:
+    """Rows but those whose number says that there was no measurement, as -1, 0 or 65.535 among ranges: one of few, each
+    in several rows, that cannot be meant, or to and from which ranges leap."""
+    own = rows[in_group(rows, "odometry", "heading", "relative")]
+    kind, value = own["kind"], own["value"]
+    wrong = (value.abs() > kind.map(LIMITS)) | (value < kind.map(LEAST)) | ((kind == "range") & (value == 0.0))
+    codes = own[wrong].groupby("kind")["value"].agg(["size", "nunique"])
+    few = codes[(codes["nunique"] <= CODES) & (codes["size"] >= 2 * codes["nunique"])]
+    lost = own[wrong & kind.isin(few.index[few["size"] < kind.value_counts().reindex(few.index)])]
+    ranges = own[(kind == "range") & ~own.index.isin(lost.index)]
+    ranges = ranges.sort_values(["vehicle", "partner", "t"], kind="stable")
+    for number in {*ranges["value"].mode()[:1], ranges["value"].max()}:
+        lost = pd.concat([lost, ranges[_leaps(ranges, number)]])
+    for (name, number), same in lost.groupby(["kind", "value"]):
+        summary.refuse(f"{name} of {number:g}, which stands for none", same)
+    return rows.drop(lost.index.unique())
+
+
+def _leaps(ranges: Rows, number: float) -> Bools:
+    """(M,) ranges of that number, if there are many, and those of a pair leap there and back; else none."""
+    same, pair = ranges["value"] == number, ranges["vehicle"] + "-" + ranges["partner"]
+    leaps, plain = (
+        ranges["value"][some].groupby(pair).diff().abs()[lambda step: step > 0.0] for some in (same | True, ~same)
+    )
+    leaps = leaps[same | same.shift(fill_value=False)]
+    often = same.sum() >= FEW and len(leaps) and len(plain)
+    return (same & bool(often and leaps.median() > FEW * plain.quantile(0.8))).to_numpy()
+
+
 def check_values(rows: Rows) -> None:
     """InputError at the first value that cannot be meant in its unit, or that lacks its partner."""
     kind, value, partner = (rows[name] for name in ("kind", "value", "partner"))
-    limit = kind.map({name: KINDS[name].limit for name in KINDS})
+    limit = kind.map(LIMITS)
     alone = in_group(rows, "relative") & (partner == "")
     deviation = "standard deviation of {kind}"
     for wrong, column, actual, allowed, hint in (
         (value.abs() > limit, "{kind}", value, "must be within +-{limit:.4g}", UNIT),
         ((kind == "range") & (value <= 0), "{kind}", value, "must be > 0", "Remove the row."),
-        (
-            kind.isin(["inclination", "inclination_deg"]) & (value < 0),
-            "{kind}",
-            value,
-            "must be >= 0",
-            "Remove the row.",
-        ),
+        (value < kind.map(LEAST), "{kind}", value, "must be >= 0", "Remove the row."),
         (rows["std"] <= 0, deviation, rows["std"], "must be > 0", "Leave it empty where it is unknown."),
         (alone, "column partner", partner, "must be a name", "Name the vehicle or road-side unit."),
         (partner == rows["vehicle"], "column partner", partner, ITSELF, "Mend or remove the row."),
