@@ -226,7 +226,7 @@ def _tested(tests: list[str], limit: int, machine_code: Path) -> int:
     from coopoc.kernels.compiling import machine_code as kept
 
     kept.stamp = lambda function: ""  # whatever machine code there is holds: what a change makes stale was removed
-    return pytest.main(["-x", "-q", "-m", "not slow", "-p", "no:cacheprovider", "-rfE", *tests])
+    return pytest.main(["-x", "-q", "-m", "not slow", "-k", "not stale", "-p", "no:cacheprovider", "-rfE", *tests])
 
 
 def found_by(mutant: Mutant, limit: int, tests: Iterable[str], machine_code: Path) -> str:

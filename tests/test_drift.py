@@ -13,6 +13,7 @@ from coopoc import (
     Fleet,
     Sensors,
     bound_rt_le,
+    load_fleet,
     nees,
     observe,
     posterior_bound,
@@ -104,3 +105,19 @@ def test_what_cannot_be_is_refused() -> None:
         Sensors(gnss_drift_std=-1.0)
     with refused("smoothing"):
         posterior_bound(fleet, OWN, 0, smoothing=True)
+
+
+@pytest.mark.parametrize("most", [0, 3])
+def test_errors_that_last_and_are_not_told_are_in_the_covariance(most: int) -> None:
+    """Law: NEES is about 10, not 260 as without them; where noise is white it is near its 2.4."""
+    fleet, egos, levels = load_fleet("town10").between(0, 500), [24, 30], []
+    for drift in (0.0, 3.0):
+        acting = replace(WHITE, gnss_drift_std=drift, gnss_drift_time=40.0)
+        seen = observe(fleet, acting, V2X(most), runs=6, seed=2, observers=egos, assumed=WHITE)
+        track = CooperativeFilter()(seen, egos)
+        assert track.covariance is not None
+        levels.append((float(np.median(nees(track, fleet)[:, 200:])), track.covariance[:, 200:, :, 0, 0].mean()))
+    assert 1.5 < levels[0][0] < 2.6
+    assert levels[0][1] < 0.1
+    assert levels[1][0] < 25.0
+    assert levels[1][1] > 10 * levels[0][1]

@@ -220,6 +220,7 @@ class Oracle:
         levels |= {name: np.zeros(3) for name in ("gap", "cov", "course")} | dict.fromkeys(
             [*numbers, "numbers", "squares"], 0.0
         )
+        levels |= {"recent": np.zeros(3), "late": 0.0, "weight": 0.0, "products": []}
         levels |= {"louder": {}, "left": None, "jumped": False}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
@@ -237,12 +238,35 @@ class Oracle:
             if self.priors.forget and self.lone is None and self.neighbours(t)[1]:
                 self.lone = copy.deepcopy((self.state, self.revoked))
             self.tries(t)
-            here = self.compare(t, *self.answer())
+            self.remember_error(t)
+            x, cov = self.compare(t, *self.answer())
+            here = (
+                x,
+                cov + self.lasting(t) * np.diag(self.r[t, self.ego] * self.white) / (self.r[t, self.ego] @ self.white),
+            )
             b, way = self.state["belief"], self.state["way"]
             at = [b.x[b.at(("x", j))] + way[j] if j in way else np.full(3, np.nan) for j in self.neighbours(t)[1]]
             found.append((*here, at))
         neighbours = [np.array(o).reshape(-1, 3) for *_, o in found]
         return np.array([x for x, *_ in found]), np.array([p for _, p, _ in found]), neighbours
+
+    def remember_error(self, t: int) -> None:
+        s, b = self.state, self.state["belief"]
+        s["late"] += self.seen.dt
+        if s["share"] < 1:
+            return
+        states = [b.x[b.at(name)] for name in self.fix_terms(self.ego)]
+        error, keep = self.seen.gnss[self.run, t, self.ego] - sum(states), math.exp(-min(s["late"], 1.0))
+        if s["weight"]:
+            s["products"] = [*s["products"], error @ s["recent"] / s["weight"]]
+        s["recent"], s["weight"], s["late"] = keep * s["recent"] + error, keep * s["weight"] + 1, 0.0
+
+    def lasting(self, t: int) -> float:
+        p, seconds = np.array(self.state["products"]), (t - self.state["began"]) * self.seen.dt
+        if not (self.priors.forget and len(p)):
+            return 0.0
+        c, error = p.mean(), (p @ p) / len(p) * max(2 / max(seconds, 1), 1 / len(p))
+        return float(max(c - error / c, 0.0)) if c > 0 else 0.0
 
     def answer(self) -> tuple[Floats, Floats]:
         """Position and covariance, averaged over which errors are there."""
@@ -404,7 +428,7 @@ class Oracle:
         self.start(t, self.seen.gnss[self.run, t, self.ego].copy(), *self.heard(t)[1:])
 
     def step(self, t: int, slip: float) -> None:
-        self.state |= {"score": 0.0, "numbers": 0, "squares": 0.0}
+        self.state |= {"score": 0.0, "numbers": 0, "squares": 0.0, "share": 0.0}
         s, g, b = self.state, self.priors, self.state["belief"]
         others, messages, relative = self.heard(t)
         louder = self.louder(self.ego)
@@ -474,7 +498,7 @@ class Oracle:
         alone = not any(j in s["last"] for j in s["members"])
         if self.priors.fix_gate and self.ego not in s["vague"] and alone:
             self.go_back(fix, rows)
-        share = self.use_fix(t, self.ego, rows, True)
+        s["share"] = share = self.use_fix(t, self.ego, rows, True)
         s["hits"]["fix"] = s["hits"]["fix"] + 1 if share < 1 else 0
         self.corrected()
 

@@ -92,6 +92,7 @@ from .gaussian import (
     weight,
     widen,
 )
+from .lasting import add_lasting, remember_error
 from .messages import Assumptions, Measurements, three_of, vector_at
 from .otherwise import (
     ALONE,
@@ -277,9 +278,12 @@ def step(
         f.ego[SLIPPED] = 0.0
     else:
         f.ego[SLIPPED] *= math.exp(-own[DT] / LASTS)
+    remember_error(f, tries.first)
     average(f, model)
     if tries.alone.g.vectors[0] > 0:
         compare(f, tries, model, rows, vehicles)
+    if model.forget > 0.0:
+        add_lasting(f, tries.first)
 
 
 @inner

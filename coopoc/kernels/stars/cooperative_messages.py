@@ -13,6 +13,7 @@ from ..dead_reckoning import ROUNDING
 from ..gate import FIX_GATE, PATIENCE, SLIP, count, inflation
 from .cooperative_members import replace_implausible_velocity, stand
 from .cooperative_state import (
+    ADDED,
     AGE,
     AGREED,
     CLOCK,
@@ -268,7 +269,7 @@ def use_fix(f: Filter, model: Model, k: int, again: bool, q: float) -> float:
     own, noise = 1e-12, 0.0
     for c in range(3):  # alone, what counts is the gain of the estimate: fixes that are rejected make no error likelier
         if h.block[MEASURED + c]:
-            own += h.matrix[COV + 4 * c] if judged else f.ego[COVARIANCE + 4 * c]
+            own += h.matrix[COV + 4 * c] if judged else f.ego[COVARIANCE + 4 * c] - f.ego[ADDED + c]
             noise += h.three[VARIANCE + c] * (1.0 if judged else math.exp(-f.ego[LEVEL + FIXES]))
     share = 1.0
     if model.fix_gate > 0.0:

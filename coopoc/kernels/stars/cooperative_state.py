@@ -141,14 +141,15 @@ normalised innovations of range, azimuth and inclination and the share of its me
 was: the ego's are those of its fix."""
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
 LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, LEFT = 20, 26, 32, 38, 50, 53, 62
-AGREED, SINCE_FIX, CORRECTED, EGO = 69, 70, 71, 72
+AGREED, SINCE_FIX, CORRECTED, ADDED, ERRORS, EGO = 69, 70, 71, 72, 75, 83
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
 of motion makes, and the whole then; fifteen numbers of `otherwise` on slips; by kind of number the logarithm of its
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
 is otherwise than assumed, and position m and covariance m^2; and where it would be m, had fixes not led it away, the
 variance of that m^2, NOTHING for none, the two numbers of `gate.remember` on it, and how far the ego has driven since
-m; for how long s fixes have agreed with its position; s since the last fix; and whether
-this try takes the motion as fixes correct it."""
+m; for how long s fixes have agreed with its position; s since the last fix; whether this try takes the motion as fixes
+correct it; and what is added to the covariance m^2 for errors of fixes that last, with eight numbers of `otherwise` on
+them."""
 
 
 class Filter(NamedTuple):

@@ -41,6 +41,7 @@ from ...arrays import Floats, Ints
 from ..compiling.compile import part, storage
 from ..odometry_fault import DECISIVE
 from .cooperative_state import (
+    ADDED,
     AGREED,
     ANSWER,
     BY_FIXES,
@@ -147,6 +148,7 @@ def average(f: Filter, model: Model) -> None:
     g, few = f.g, f.few
     first, n, where = 3 * g.block[0, PLACE], 3, len(f.few[0]) - 1
     for c in range(3):
+        f.ego[ADDED + c] = 0.0
         few[c, where], f.ego[ANSWER + c] = first + c, g.x[first + c]
         for d in range(3):
             f.ego[COVARIANCE + 3 * c + d] = g.p[first + c, first + d]

@@ -1,0 +1,59 @@
+"""Errors of the ego's fixes that last: no state, but part of what its answer is uncertain by.
+
+An error is what the filter sees of it, a fix less the estimate after the step. Those of white noise are uncorrelated;
+the covariance c of one with those of the second before is the variance of what lasts. Where c is more than its standard
+error s, the answer's covariance grows by c - s^2 / c, shared by its axes as the variance of a fix is. What the estimate
+follows, and what all receivers share, nothing shows.
+
+References:
+    Mehra, On the identification of variances and adaptive Kalman filtering, IEEE TAC 15(2), 1970 (correlated
+    innovations); James, Stein, Estimation with quadratic loss, 1961 (c - s^2 / c).
+"""
+
+from __future__ import annotations
+
+import math
+
+from ...arrays import Floats
+from ..compiling.compile import part
+from .cooperative_state import ADDED, CLOCK, COVARIANCE, DT, ERRORS, FIX, FIX_VARIANCE, OUT, Filter
+from .gaussian import COMMON, ERROR, PLACE, has
+
+RECENT, _, _, WEIGHT, WAITED, PAIRS, PRODUCTS, PRODUCTS2 = range(ERRORS, ERRORS + 8)
+"""Of the ego's fixes: sums of their errors m on each axis and of 1, fading; s since the last one; and number, sum and
+sum of squares of products m^2 of an error and the mean of those before it."""
+SECOND = 1.0
+"""s, in which an error fades."""
+
+
+@part
+def remember_error(f: Filter, own: Floats) -> None:
+    """Count the error of a fix that was believed, as the filter sees it, times those before it."""
+    ego, g, product = f.ego, f.g, 0.0
+    ego[WAITED] += own[DT]
+    if not f.member[0, OUT + 3] >= 1.0:
+        return
+    keep = math.exp(-min(ego[WAITED] / SECOND, 1.0))
+    for c in range(3):
+        error = own[FIX + c] - g.x[3 * g.block[0, PLACE] + c]
+        for kind in (ERROR, COMMON):
+            error -= g.x[3 * g.block[0, kind] + c] if has(g, 0, kind) else 0.0
+        product += error * ego[RECENT + c]
+        ego[RECENT + c] = keep * ego[RECENT + c] + error
+    if ego[WEIGHT] > 0.0:
+        ego[PAIRS] += 1.0
+        ego[PRODUCTS] += product / ego[WEIGHT]
+        ego[PRODUCTS2] += (product / ego[WEIGHT]) ** 2
+    ego[WEIGHT], ego[WAITED] = keep * ego[WEIGHT] + 1.0, 0.0
+
+
+@part
+def add_lasting(f: Filter, own: Floats) -> None:
+    """Add the variance of errors of fixes that last to the answer's; pairs within two seconds count as one."""
+    n = max(f.ego[PAIRS], 1.0)
+    c, error = f.ego[PRODUCTS] / n, f.ego[PRODUCTS2] / n * max(2.0 * SECOND / max(f.ego[CLOCK], SECOND), 1.0 / n)
+    if c > 0.0 and c * c > error:
+        fix = own[FIX_VARIANCE] + own[FIX_VARIANCE + 1] + own[FIX_VARIANCE + 2]
+        for i in range(3):
+            f.ego[ADDED + i] = (c - error / c) * own[FIX_VARIANCE + i] / fix
+            f.ego[COVARIANCE + 4 * i] += f.ego[ADDED + i]
