@@ -14,6 +14,7 @@ from numpy.testing import assert_allclose
 
 import coopoc as co
 from coopoc.arrays import Floats
+from coopoc.data.log.check import check
 from coopoc.data.log.read import Log
 from coopoc.kernels.constant_velocity import constant_velocity
 
@@ -113,6 +114,14 @@ def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path: Pa
     for method in (co.Kalman(), co.CooperativeFilter()):
         assert error(turning, method) < max(0.85 * alone, 1.3 * known)
         assert error(course_of_fixes, method) < 1.3 * alone
+
+
+def test_yaw_rates_of_the_other_sense_are_named_and_no_speed_is_blamed(tmp_path: Path) -> None:
+    speed, course = car()
+    read = log(tmp_path / "log", "car", 1.5, 10, speed=speed, yaw_rate=-np.gradient(course, 0.1))[0]
+    sentences = " ".join(check(read).warnings)
+    assert "scale=yaw_rate:-1 mends it" in sentences
+    assert "odometry" not in sentences.replace("of fixes and odometry are", "")
 
 
 @pytest.mark.parametrize("given", ["", "speed", "speed,yaw_rate"])
