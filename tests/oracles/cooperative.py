@@ -240,10 +240,8 @@ class Oracle:
             self.tries(t)
             self.remember_error(t)
             x, cov = self.compare(t, *self.answer())
-            here = (
-                x,
-                cov + self.lasting(t) * np.diag(self.r[t, self.ego] * self.white) / (self.r[t, self.ego] @ self.white),
-            )
+            more, white = max(self.lasting(t) - np.trace(cov), 0.0), self.r[t, self.ego] * self.white
+            here = x, cov + more * np.diag(white / white.sum())
             b, way = self.state["belief"], self.state["way"]
             at = [b.x[b.at(("x", j))] + way[j] if j in way else np.full(3, np.nan) for j in self.neighbours(t)[1]]
             found.append((*here, at))

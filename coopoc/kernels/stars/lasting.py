@@ -1,9 +1,9 @@
 """Errors of the ego's fixes that last: no state, but part of what its answer is uncertain by.
 
 An error is what the filter sees of it, a fix less the estimate after the step. Those of white noise are uncorrelated;
-the covariance c of one with those of the second before is the variance of what lasts. Where c is more than its standard
-error s, the answer's covariance grows by c - s^2 / c, shared by its axes as the variance of a fix is. What the estimate
-follows, and what all receivers share, nothing shows.
+the covariance c of one with those of the second before is the variance of what lasts, the estimate's own error among
+it. Where c is more than its standard error s, the answer's covariance, axes together, is c - s^2 / c at least; what is
+added is shared as the variance of a fix is. What the estimate follows, and what all receivers share, nothing shows.
 
 References:
     Mehra, On the identification of variances and adaptive Kalman filtering, IEEE TAC 15(2), 1970 (correlated
@@ -52,8 +52,10 @@ def add_lasting(f: Filter, own: Floats) -> None:
     """Add the variance of errors of fixes that last to the answer's; pairs within two seconds count as one."""
     n = max(f.ego[PAIRS], 1.0)
     c, error = f.ego[PRODUCTS] / n, f.ego[PRODUCTS2] / n * max(2.0 * SECOND / max(f.ego[CLOCK], SECOND), 1.0 / n)
-    if c > 0.0 and c * c > error:
-        fix = own[FIX_VARIANCE] + own[FIX_VARIANCE + 1] + own[FIX_VARIANCE + 2]
-        for i in range(3):
-            f.ego[ADDED + i] = (c - error / c) * own[FIX_VARIANCE + i] / fix
-            f.ego[COVARIANCE + 4 * i] += f.ego[ADDED + i]
+    if c <= 0.0 or c * c <= error:
+        return
+    stated = f.ego[COVARIANCE] + f.ego[COVARIANCE + 4] + f.ego[COVARIANCE + 8]
+    more = max(c - error / c - stated, 0.0) / (own[FIX_VARIANCE] + own[FIX_VARIANCE + 1] + own[FIX_VARIANCE + 2])
+    for i in range(3):
+        f.ego[ADDED + i] = more * own[FIX_VARIANCE + i]
+        f.ego[COVARIANCE + 4 * i] += f.ego[ADDED + i]
