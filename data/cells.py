@@ -168,7 +168,8 @@ def words(frame: pd.DataFrame, column: str, file: str) -> list[str]:
         file,
         "must be a name",
     )
-    return [WHOLE.sub(r"\1", str(value).strip()) for value in frame[column].tolist()]
+    cells = frame[column].astype(str)
+    return list(cells.map({cell: WHOLE.sub(r"\1", cell.strip()) for cell in cells.unique()}))
 
 
 def filled(cells: pd.Series[Any]) -> Bools:
