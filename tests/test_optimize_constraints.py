@@ -299,6 +299,17 @@ EMPTY = {
 }
 
 
+@pytest.mark.parametrize("backend", ["casadi", "osqp"])
+def test_what_equalities_place_is_known_exactly(backend: str) -> None:
+    problem, places = PAIR, np.array([[1.0, 0, 0], [8, 0, 0]])
+    for name, place in zip("ab", places, strict=True):
+        problem = problem.constrain("position", name, place, place)
+    solution = solve(problem, backend)
+    assert np.abs(solution.x - places).max() < 1e-6
+    assert solution.covariance is not None
+    assert not solution.covariance.any()
+
+
 @pytest.mark.parametrize("case", EMPTY)
 def test_an_empty_set_is_infeasible_and_names_the_worst(case: str) -> None:
     problem, able = EMPTY[case]
