@@ -21,6 +21,7 @@ from coopoc.data.registry import load_fleet, load_log
 from coopoc.evaluate.metrics import fix_innovations, innovation_columns, normalised_innovations
 from coopoc.evaluate.scores import scored
 from coopoc.studies import neighbours, scene
+from coopoc.studies.roads import roads, seen
 from coopoc.study.publish import views
 from coopoc.study.report import report
 from coopoc.world.storage import digest, read_recording, save_recording
@@ -267,3 +268,10 @@ def test_a_report_of_a_log_shows_no_settings_of_simulated_noise(folders: Path, t
         assert words not in page
     for words in ("GNSS repeats a fix", "is not ranked"):
         assert words in page
+
+
+def test_a_log_that_is_a_task_needs_a_truth(folders: Path) -> None:
+    assert [*roads(folders / "with"), *roads(folders / "without")] == ["with", "without"]
+    assert len(seen("with", folders / "with")[1].t)
+    with refused("must hold a truth"):
+        seen("without", folders / "without")
