@@ -364,3 +364,7 @@ def test_numbers_that_stand_for_none_are_none(tmp_path: Path, code: float, kinds
     if (code, *kinds) in ((-1, "range"), (0, "range"), (511, "heading")):
         with refused("row 4"):
             read_log(tmp_path / "one")
+    car["heading"] = np.round(4 + 4.4 * np.sin(t / 5))  # whole degrees for radians: no number stands for none
+    car.to_csv(tmp_path / "a" / "car.csv", index=False)
+    with refused("heading = [78]: must be within"):
+        read_log(tmp_path / "a")

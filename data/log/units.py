@@ -54,9 +54,9 @@ for _name in ("yaw_rate", "heading", "azimuth", "bearing", "inclination", "eleva
 KINDS["compass_deg"] = KINDS["heading_deg"]._replace(scale=-DEGREE, offset=float(np.pi / 2))
 LIMITS = {name: kind.limit for name, kind in KINDS.items()}
 LEAST = dict.fromkeys(("range", "inclination", "inclination_deg"), 0.0)
-CODES, FEW = 3, 10
-"""Most numbers of a kind that stand for none; least rows of one that could be meant, and times the usual step from one
-range of a pair to the next that is a leap."""
+CODES, APART, FEW = 3, 1.4, 10
+"""Most numbers of a kind that stand for none, and times the largest that can be meant beyond which they are; least rows
+of one that could be meant, and times the usual step from one range of a pair to the next that is a leap."""
 ITSELF = "must be another member: a vehicle neither measures itself nor sends to itself"
 UNIT = "Is it in another unit? Other kinds: {kinds}; or give scale=. An angle over several turns? Write it within one."
 ANGLES = ("heading", "azimuth", "bearing", "inclination")
@@ -102,11 +102,13 @@ def place(rows: Rows) -> str:
 
 def without_codes(rows: Rows, summary: Summary) -> Rows:
     """Rows but those whose number says that there was no measurement, as -1, 0 or 65.535 among ranges: one of few, each
-    in several rows, that cannot be meant, or to and from which ranges leap."""
+    in several rows, that are far from what can be meant, or to and from which ranges leap."""
     own = rows[in_group(rows, "odometry", "heading", "relative")]
     kind, value = own["kind"], own["value"]
     wrong = (value.abs() > kind.map(LIMITS)) | (value < kind.map(LEAST)) | ((kind == "range") & (value == 0.0))
-    codes = own[wrong].groupby("kind")["value"].agg(["size", "nunique"])
+    usual = kind.map(value[~wrong].abs().groupby(kind).max())
+    near = (value.abs() > kind.map(LIMITS)) & (value.abs() <= APART * usual)  # as of an angle in degrees
+    codes = own[wrong & ~kind.isin(kind[near])].groupby("kind")["value"].agg(["size", "nunique"])
     few = codes[(codes["nunique"] <= CODES) & (codes["size"] >= 2 * codes["nunique"])]
     lost = own[wrong & kind.isin(few.index[few["size"] < kind.value_counts().reindex(few.index)])]
     ranges = own[(kind == "range") & ~own.index.isin(lost.index)]
