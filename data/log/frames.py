@@ -126,7 +126,8 @@ def _nowhere(rows: Rows) -> Bools:
     key, some = ["t", "vehicle"], rows[rows["kind"].isin(["latitude", "longitude", "x", "y"])]
     zero = some[some["value"] == 0.0].drop_duplicates([*key, "kind"])
     zero = zero[zero.duplicated(key, keep=False)]
-    ends = some.drop(zero.index).groupby(["vehicle", "kind"])["value"].agg(["min", "max", "size"])
+    others = some[~some.set_index(key).index.isin(zero.set_index(key).index)]
+    ends = others.groupby(["vehicle", "kind"])["value"].agg(["min", "max", "size"])
     least = np.maximum(ends["min"], -ends["max"])
     away = ends.index[(least > ends["max"] - ends["min"]) & (ends["size"] >= MANY)].get_level_values("vehicle")
     zero = zero[zero["kind"].isin([*ENU]) | zero["vehicle"].isin(away)]

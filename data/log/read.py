@@ -202,9 +202,10 @@ def read_log(
         pair = one + "-" + other
         key = key.mask((rows["kind"] == "range") & pair.isin(list(offset)), pair)
     less = key.map(factors(offset, {*KINDS, *key}, "offset")).fillna(0.0)
-    rows = rows.assign(value=by_kind * rows["value"] - less, std=by_kind.abs() * rows["std"])
+    rows = rows.assign(value=by_kind * rows["value"], std=by_kind.abs() * rows["std"])
     rows[["t", "arrival"]] *= factor.get("t", 1.0)
     rows = without_codes(unwrapped(rows, summary), summary)
+    rows = rows.assign(value=rows["value"] - less)
     check_values(rows)
     for column in ("t", "arrival"):
         unit = check_time(rows.loc[np.isfinite(rows[column]), column].to_numpy(), path.name, column)

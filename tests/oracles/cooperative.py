@@ -256,14 +256,16 @@ class Oracle:
         states = [b.x[b.at(name)] for name in self.fix_terms(self.ego)]
         error, keep = self.seen.gnss[self.run, t, self.ego] - sum(states), math.exp(-min(s["late"], 1.0))
         if s["weight"]:
-            s["products"] = [*s["products"], error @ s["recent"] / s["weight"]]
+            s["products"] = [*s["products"], (t, error @ s["recent"] / s["weight"])]
         s["recent"], s["weight"], s["late"] = keep * s["recent"] + error, keep * s["weight"] + 1, 0.0
 
     def lasting(self, t: int) -> float:
-        p, seconds = np.array(self.state["products"]), (t - self.state["began"]) * self.seen.dt
-        if not (self.priors.forget and len(p)):
+        if not (self.priors.forget and self.state["products"]):
             return 0.0
-        c, error = p.mean(), (p @ p) / len(p) * max(2 / max(seconds, 1), 1 / len(p))
+        when, p = np.array(self.state["products"]).T
+        w, seconds = np.exp(-(t - when) * self.seen.dt / 100), (t - self.state["began"]) * self.seen.dt
+        n = max(w.sum(), 1.0)
+        c, error = w @ p / n, w @ p**2 / n * max(2 / np.clip(seconds, 1, 100), 1 / n)
         return float(max(c - error / c, 0.0)) if c > 0 else 0.0
 
     def answer(self) -> tuple[Floats, Floats]:

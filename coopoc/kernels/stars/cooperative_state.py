@@ -148,7 +148,7 @@ level, the sum of that one's derivatives in this step, and information; out: FOU
 is otherwise than assumed, and position m and covariance m^2; and where it would be m, had fixes not led it away, the
 variance of that m^2, NOTHING for none, the two numbers of `gate.remember` on it, and how far the ego has driven since
 m; for how long s fixes have agreed with its position; s since the last fix; whether this try takes the motion as fixes
-correct it; and what is added to the covariance m^2 for errors of fixes that last, with eight numbers of `otherwise` on
+correct it; and what is added to the covariance m^2 for errors of fixes that last, with eight numbers of `lasting` on
 them."""
 
 

@@ -22,8 +22,8 @@ from .gaussian import COMMON, ERROR, PLACE, has
 RECENT, _, _, WEIGHT, WAITED, PAIRS, PRODUCTS, PRODUCTS2 = range(ERRORS, ERRORS + 8)
 """Of the ego's fixes: sums of their errors m on each axis and of 1, fading; s since the last one; and number, sum and
 sum of squares of products m^2 of an error and the mean of those before it."""
-SECOND = 1.0
-"""s, in which an error fades."""
+SECOND, MEMORY = 1.0, 100.0
+"""s, in which an error fades, and in which products do."""
 
 
 @part
@@ -31,6 +31,8 @@ def remember_error(f: Filter, own: Floats) -> None:
     """Count the error of a fix that was believed, as the filter sees it, times those before it."""
     ego, g, product = f.ego, f.g, 0.0
     ego[WAITED] += own[DT]
+    for i in range(PAIRS, PRODUCTS2 + 1):
+        ego[i] *= math.exp(-own[DT] / MEMORY)
     if not f.member[0, OUT + 3] >= 1.0:
         return
     keep = math.exp(-min(ego[WAITED] / SECOND, 1.0))
@@ -51,7 +53,8 @@ def remember_error(f: Filter, own: Floats) -> None:
 def add_lasting(f: Filter, own: Floats) -> None:
     """Add the variance of errors of fixes that last to the answer's; pairs within two seconds count as one."""
     n = max(f.ego[PAIRS], 1.0)
-    c, error = f.ego[PRODUCTS] / n, f.ego[PRODUCTS2] / n * max(2.0 * SECOND / max(f.ego[CLOCK], SECOND), 1.0 / n)
+    seconds = min(max(f.ego[CLOCK], SECOND), MEMORY)
+    c, error = f.ego[PRODUCTS] / n, f.ego[PRODUCTS2] / n * max(2.0 * SECOND / seconds, 1.0 / n)
     if c <= 0.0 or c * c <= error:
         return
     stated = f.ego[COVARIANCE] + f.ego[COVARIANCE + 4] + f.ego[COVARIANCE + 8]
