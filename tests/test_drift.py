@@ -110,10 +110,11 @@ def test_what_cannot_be_is_refused() -> None:
 @pytest.mark.parametrize("most", [0, 3])
 def test_errors_that_last_and_are_not_told_are_in_the_covariance(most: int) -> None:
     """Law: NEES is about 10, not 260 as without them; where noise is white it is near its 2.4."""
-    fleet, egos, levels = load_fleet("town10").between(0, 500), [24, 30], []
+    fleet, egos, levels, drawn = load_fleet("town10").between(0, 500), [24, 30], [], []
     for drift in (0.0, 3.0):
         acting = replace(WHITE, gnss_drift_std=drift, gnss_drift_time=40.0)
         seen = observe(fleet, acting, V2X(most), runs=6, seed=2, observers=egos, assumed=WHITE)
+        drawn.append(seen)
         track = CooperativeFilter()(seen, egos)
         assert track.covariance is not None
         levels.append((float(np.median(nees(track, fleet)[:, 200:])), track.covariance[:, 200:, :, 0, 0].mean()))
@@ -121,3 +122,7 @@ def test_errors_that_last_and_are_not_told_are_in_the_covariance(most: int) -> N
     assert levels[0][1] < 0.1
     assert levels[1][0] < 25.0
     assert levels[1][1] > 10 * levels[0][1]
+    late = replace(seen, gnss=np.where((np.arange(500) < 200)[:, None, None], drawn[0].gnss, seen.gnss))
+    shown = CooperativeFilter()(late, egos).covariance
+    assert shown is not None
+    assert shown[:, 450:, :, 0, 0].mean() > 5 * shown[:, 150:200, :, 0, 0].mean()
