@@ -10,8 +10,6 @@ hand-written" is a row's time over that of the loop. A row counts only if its an
 within 1e-6 relative and positions within 1 mm.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

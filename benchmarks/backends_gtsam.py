@@ -1,7 +1,5 @@
 """GTSAM's rows of backends.py."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import gtsam

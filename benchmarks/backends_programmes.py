@@ -1,7 +1,5 @@
 """CasADi's and OSQP's rows of backends.py."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import casadi

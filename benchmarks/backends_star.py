@@ -1,7 +1,5 @@
 """The star that the rows of backends.py solve, what a row is and ours; one star after the other through `solve`."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

@@ -7,8 +7,6 @@ immutable, so that each `add` copies the arrays of its factors: beyond ten thous
 is what the readers do. Right: the same cost as GTSAM's graph at the same poses.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

@@ -8,8 +8,6 @@ starts; ours are given with and without what the method does around the kernel. 
 of its problem, within 1e-9 m.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, NamedTuple
 

@@ -8,8 +8,6 @@ filterpy's step of the same state. One run alone leaves the other lanes of a ker
 a call itself. Right means finite estimates for every ego at every step.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import Any, NamedTuple

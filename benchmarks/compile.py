@@ -7,8 +7,6 @@ Each name runs in a process of its own, from its start to its answer, twice: wit
 again with what the first run has kept. The difference is compiled once per machine.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json

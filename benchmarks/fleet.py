@@ -8,8 +8,6 @@ matrices NumPy has made beforehand. A row counts only if its answer is that of i
 cost within 1e-6 of the reference, links the same in the same order, the solo filter within 1e-9 m.
 """
 
-from __future__ import annotations
-
 import gc
 import time
 from collections.abc import Callable, Sequence

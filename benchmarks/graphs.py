@@ -11,8 +11,6 @@ that landmarks are poses whose rotation is not measured. Ours is `solve` with st
 its seconds contain the search for the start, the checks and all marginals, GTSAM's the building of its graph.
 """
 
-from __future__ import annotations
-
 import argparse
 import os
 import resource

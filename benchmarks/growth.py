@@ -3,8 +3,6 @@
 OMP_NUM_THREADS=1 python benchmarks/growth.py            # a Markdown table on stdout, about half a minute
 """
 
-from __future__ import annotations
-
 import subprocess
 import sys
 from functools import partial

@@ -1,7 +1,5 @@
 """Hard variants of a factor graph: cropped, without most of its loops, with odometry that is worse."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

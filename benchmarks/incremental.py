@@ -3,8 +3,6 @@
 Run:  python benchmarks/incremental.py 5000     (steps)
 """
 
-from __future__ import annotations
-
 import sys
 from time import process_time
 

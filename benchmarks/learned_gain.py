@@ -7,8 +7,6 @@ after the other in every round; the ratios are to be compared, the times are thi
 of KalmanNet's public training code re-expressed with our reference module: one Python step after the other, autograd,
 and torch.optim.AdamW. A row counts only if its answer is the reference's."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable
 from typing import Any, NamedTuple

@@ -9,8 +9,6 @@ first and must pass; the machine code that they leave serves the mutants, but fo
 mutant that survives is equivalent or shows a missing test.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import copy

@@ -7,8 +7,6 @@ the ratio is to the joint filter's in the same rounds. Right: finite estimates;
 the oracles of the tests hold the numbers.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any
 

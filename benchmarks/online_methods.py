@@ -8,8 +8,6 @@ share of steps whose run-averaged NEES lies in its 99 % band. Milliseconds are p
 methods: per step, run and vehicle), on whatever this machine was doing.
 """
 
-from __future__ import annotations
-
 import argparse
 
 import numpy as np

@@ -7,8 +7,6 @@
 that stay and right ones that go; ATE is that of the poses after alignment.
 """
 
-from __future__ import annotations
-
 import argparse
 import time
 from dataclasses import replace

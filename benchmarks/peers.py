@@ -9,8 +9,6 @@ eliminates the neighbours. Stone Soup's rows are in stone_soup.py. "x peer" is a
 a row counts only if its answer is that of the reference. A line names what is not installed. What the index has as
 jaxls is a language server for JAX, not the solver of that name."""
 
-from __future__ import annotations
-
 import math
 import sys
 from collections.abc import Callable

@@ -7,8 +7,6 @@ all members at once. Times are this thread's own, medians of interleaved rounds,
 its poses are those of filterpy to 1e-6 m.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

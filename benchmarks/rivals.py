@@ -9,8 +9,6 @@ Mahalanobis distance of 3.4 (99.7 % of those in the plane), as robot_localizatio
 2012) with Geman and McClure's kernel.
 """
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -273,7 +271,7 @@ class Net:
         track: Track = (self.method or load_method("centralised"))(recording, egos)
         return track
 
-    def fitted(self, recording: Recording, truth: Fleet) -> Net:
+    def fitted(self, recording: Recording, truth: Fleet) -> "Net":
         """The net trained on a drive with a truth."""
         from coopoc.learned import GainNet, Schedule, fit
         from coopoc.learned.training.drives import MeasuredDrives

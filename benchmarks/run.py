@@ -10,8 +10,6 @@ gate compares it with baseline.json and names the rows that are slower by more t
 measured. A row whose answer is wrong fails always. Rows that the baseline does not name are peers or new.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib
 import json

@@ -3,8 +3,6 @@
 python benchmarks/shipped_weights.py fedokf okf            # largest difference of each from training again
 """
 
-from __future__ import annotations
-
 import hashlib
 import platform
 import sys

@@ -4,8 +4,6 @@ Stone Soup has no measurement between two parts of a state, so a user subclasses
 prior and the relative measurements the measurement; from there its iterated update is Gauss-Newton on the same cost,
 and ends at the same minimum. One extended update does not: it is up to 19 m away."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

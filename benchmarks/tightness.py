@@ -3,8 +3,6 @@
 Run:  python benchmarks/tightness.py [seeds]      (about a minute for 30)
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import replace

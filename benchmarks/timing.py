@@ -1,7 +1,5 @@
 """What the benchmarks share: time of this thread, medians of interleaved rounds, the table of a report."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any

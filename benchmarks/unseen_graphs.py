@@ -4,8 +4,6 @@ Run:  python benchmarks/unseen_graphs.py 1000 100     (small graphs of so many s
                                                       from 50 random starts each)
 """
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable
 from dataclasses import dataclass, replace

@@ -4,8 +4,6 @@ A Fleet drives. `observe` turns it into a Recording under Sensors and a V2X budg
 Track. `rt_le` compares Track and Fleet. A Study does this over a grid and yields Results.
 """
 
-from __future__ import annotations
-
 import importlib
 import re
 from pathlib import Path

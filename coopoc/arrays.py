@@ -1,10 +1,9 @@
 """Array types used in every signature, and checks of values; shapes stand in docstrings as (R, T, N, 3)."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Mapping
 from dataclasses import fields
+from types import NoneType, UnionType
 from typing import Any, Literal, TypeAlias, TypeVar, get_args, get_origin
 
 import numpy as np
@@ -19,8 +18,6 @@ AnyArray: TypeAlias = npt.NDArray[Any]
 
 KINDS: dict[Any, tuple[str, str]] = {float: ("fiu", "number"), int: ("iu", "whole number"), bool: ("b", "boolean")}
 """Allowed kinds of dtype -> the name of one entry."""
-TYPES: dict[str, Any] = {"int": int, "float": float, "bool": bool | np.bool_, "str": str}
-"""Annotation of a field -> its class."""
 TINY = 5e-324
 """The least positive number."""
 Limits: TypeAlias = Mapping[str, tuple[float, float, str]]
@@ -87,7 +84,7 @@ def check_arrays(made: Any, shapes: Mapping[str, tuple[str, tuple[int, ...]]]) -
     """
     for field in fields(made):
         value = getattr(made, field.name)
-        if field.name in shapes and (value is not None or not str(field.type).endswith("None")):
+        if field.name in shapes and (value is not None or NoneType not in get_args(field.type)):
             made.__dict__[field.name] = checked(field.name, value, *shapes[field.name])
 
 
@@ -260,13 +257,12 @@ def check_texts(owner: object, *fields: str) -> None:
             raise InputError(field, shown(value), "must be text", "Leave it out, or give a word.")
 
 
-def check_fields(made: Any, limits: Limits | None = None, **kinds: Any) -> None:
+def check_fields(made: Any, limits: Limits | None = None) -> None:
     """InputError for a value of another type than its field of a dataclass has; NumPy's numbers become Python's.
 
     Args:
-        made: instance of a dataclass, in its `__post_init__`.
+        made: instance of a dataclass, in its `__post_init__`; fields of generic types and protocols are not checked.
         limits: of numbers; default no NaN.
-        kinds: field=class, or Literal, of those that are no number, array, bool or text.
 
     >>> from coopoc import V2X
     >>> V2X(loss=2.0)
@@ -274,19 +270,21 @@ def check_fields(made: Any, limits: Limits | None = None, **kinds: Any) -> None:
     coopoc.errors.InputError: loss = 2.0: must be in [0, 1]. Give V2X(loss=...).
     """
     for field in fields(made):
-        name, value, text = field.name, getattr(made, field.name), str(field.type).removesuffix(" | None")
-        if not field.init or (value is None and text != str(field.type)):
+        name, value = field.name, getattr(made, field.name)
+        kinds = get_args(field.type) if isinstance(field.type, UnionType) else (field.type,)
+        if not field.init or (value is None and NoneType in kinds):
             continue
-        hint, kind = f"Give {type(made).__name__}({name}=...).", kinds.get(name) or TYPES.get(text)
-        if kind is None and isinstance(field.default, str):  # one of some words, which the class lists
-            kind, text = str, "str"
+        hint, kind = f"Give {type(made).__name__}({name}=...).", kinds[0]
         if kind in (int, float):
             most = 2**62 if kind is int else np.inf
             low, high, words = (limits or {}).get(name, (-most, most, "no NaN"))
             made.__dict__[name] = number(name, value, low, high, kind=kind, allowed=words, hint=hint)
-        elif text == "Floats":
+        elif kind == Floats:
             made.__dict__[name] = checked(name, value)
         elif get_origin(kind) is Literal:
             one_of(name, value, kind)
-        elif kind is not None and not isinstance(value, kind):
+        elif not all(isinstance(one, type) and not getattr(one, "_is_protocol", False) for one in kinds):
+            continue
+        elif not isinstance(value, (*kinds, np.bool_) if kind is bool else kinds):
+            text = " | ".join(one.__name__ for one in kinds if one is not NoneType)
             raise InputError(name, shown(value), f"must be {text}", hint)

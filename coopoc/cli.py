@@ -1,7 +1,5 @@
 """The command line: coopoc run, table, report, list, and the commands of installed distributions."""
 
-from __future__ import annotations
-
 import json
 import os
 import sys

@@ -1,7 +1,5 @@
 """Exceptions that name the wrong field, the allowed values and a way to correct it."""
 
-from __future__ import annotations
-
 import difflib
 import json
 import re
@@ -25,7 +23,7 @@ class InputError(ValueError):
         self.field, self.value, self.allowed, self.hint = field, value, allowed, hint
         super().__init__(f"{_cut(field)} = {_cut(value)}: {_cut(allowed).rstrip('.')}. {_cut(hint)}")
 
-    def __reduce__(self) -> tuple[type[InputError], tuple[str, object, str, str]]:
+    def __reduce__(self) -> "tuple[type[InputError], tuple[str, object, str, str]]":
         return type(self), (self.field, self.value, self.allowed, self.hint)
 
 
@@ -96,7 +94,7 @@ class MissingLibraryError(ImportError):
         self.arguments = (library, needed_for, package, how)
         super().__init__(f"{needed_for} needs {library}, which is not installed. Run: {how} {_where(package)}")
 
-    def __reduce__(self) -> tuple[type[MissingLibraryError], tuple[str, str, str, str]]:
+    def __reduce__(self) -> "tuple[type[MissingLibraryError], tuple[str, str, str, str]]":
         return type(self), self.arguments
 
 

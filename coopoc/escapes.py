@@ -1,7 +1,5 @@
 """Text from data in tables, pages and pictures, where it must not act as markup, a command, a formula or a control."""
 
-from __future__ import annotations
-
 import re
 import unicodedata
 

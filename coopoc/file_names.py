@@ -1,7 +1,5 @@
 """Names that come from data, used as names of files: they must neither leave their folder nor clash with a device."""
 
-from __future__ import annotations
-
 import os
 import re
 from pathlib import Path

@@ -1,7 +1,5 @@
 """load_fleet: a fleet by name or file; read_log: the user's own measurements; fetch: public ones by name."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

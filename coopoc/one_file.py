@@ -1,7 +1,5 @@
 """Objects of one's own in one Python file, by path: "folder/mine.py:NAME" is accepted wherever a name is."""
 
-from __future__ import annotations
-
 import difflib
 import hashlib
 import importlib.util

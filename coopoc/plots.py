@@ -1,7 +1,5 @@
 """Pictures of recordings, tracks and solutions in the plane."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -24,7 +22,7 @@ NAMED = 30
 """Nodes of a solution up to which each has its name and its ellipse."""
 
 
-def plot_recording(recording: Recording, ax: Axes | None = None, *, run: int = 0, step: int | None = None) -> Axes:
+def plot_recording(recording: Recording, ax: "Axes | None" = None, *, run: int = 0, step: int | None = None) -> "Axes":
     """Fixes of one run, vehicle by vehicle, and at one step who measures whom.
 
     Args:
@@ -56,8 +54,8 @@ def plot_recording(recording: Recording, ax: Axes | None = None, *, run: int = 0
 
 
 def plot_track(
-    track: Track, ax: Axes | None = None, *, fleet: Fleet | None = None, run: int = 0, every: int | None = None
-) -> Axes:
+    track: Track, ax: "Axes | None" = None, *, fleet: Fleet | None = None, run: int = 0, every: int | None = None
+) -> "Axes":
     """Estimated paths of one run with 95 % ellipses, and the truth if a fleet is given.
 
     Args:
@@ -93,7 +91,7 @@ def plot_track(
     return finish(ax)
 
 
-def plot_solution(solution: Solution, ax: Axes | None = None, *, problem: Problem | None = None) -> Axes:
+def plot_solution(solution: "Solution", ax: "Axes | None" = None, *, problem: "Problem | None" = None) -> "Axes":
     """Nodes in the plane, 95 % ellipses and names where they are few; with the problem its factors and headings.
 
     Args:

@@ -1,7 +1,5 @@
 """Entry points: data sets, methods, studies, backends and commands, which the core finds by name and never imports."""
 
-from __future__ import annotations
-
 import ast
 import os
 import sys

@@ -1,7 +1,5 @@
 """Checksums inside files: SHA-256 over the whole file, computed with zeros where the checksum then stands."""
 
-from __future__ import annotations
-
 import hashlib
 import re
 

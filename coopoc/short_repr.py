@@ -1,7 +1,5 @@
 """The `repr` of results that hold arrays: a line of names and shapes in place of all numbers."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import fields
 from enum import Enum

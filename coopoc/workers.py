@@ -1,7 +1,5 @@
 """Processes: workers end with the process that started them, Ctrl-C ends a command that loads, bars show progress."""
 
-from __future__ import annotations
-
 import atexit
 import gc
 import os

@@ -1,7 +1,5 @@
 """Rows at their own times on equal steps: drives -> Fleet, measurements in a plane -> Recording in body frames."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

@@ -4,8 +4,6 @@ Every table is read here; fleets (`fleet_files`) and logs (`log.tables`) are its
 index of a frame is the row in the file, from 1, so that an error names it whatever part of the frame is at hand.
 """
 
-from __future__ import annotations
-
 import csv
 import json
 import re
@@ -43,7 +41,7 @@ LARGEST_TABLE = 2**27
 """Cells of a Parquet table: 1 GB of numbers."""
 
 
-def read_frame(path: Path, *text: str) -> pd.DataFrame:
+def read_frame(path: Path, *text: str) -> "pd.DataFrame":
     """Table of a .parquet, .jsonl or (any other ending) CSV file.
 
     Args:
@@ -95,7 +93,7 @@ def headers(path: Path) -> list[str]:
         return []
 
 
-def numeric(frame: pd.DataFrame, column: str, file: str, given: Bools | None = None) -> Floats:
+def numeric(frame: "pd.DataFrame", column: str, file: str, given: Bools | None = None) -> Floats:
     """A column as finite numbers, NaN where not `given` (default: everywhere); InputError with the row of the first
     cell that is none."""
     import pandas as pd
@@ -118,7 +116,7 @@ def numeric(frame: pd.DataFrame, column: str, file: str, given: Bools | None = N
     return values
 
 
-def seconds(frame: pd.DataFrame, column: str, file: str) -> Floats:
+def seconds(frame: "pd.DataFrame", column: str, file: str) -> Floats:
     """A column of times: numbers are seconds, dates become seconds since 1970 (UTC), durations seconds.
 
     >>> import pandas as pd
@@ -160,7 +158,7 @@ def factors(given: Mapping[str, float] | None, names: Collection[str], field: st
     return dict(given or {})
 
 
-def words(frame: pd.DataFrame, column: str, file: str) -> list[str]:
+def words(frame: "pd.DataFrame", column: str, file: str) -> list[str]:
     """A column of names; InputError with the row of the first empty cell."""
     _refuse(
         frame[column].astype(object).where(filled(frame[column]), "empty"),
@@ -173,14 +171,14 @@ def words(frame: pd.DataFrame, column: str, file: str) -> list[str]:
     return names
 
 
-def filled(cells: pd.Series[Any]) -> Bools:
+def filled(cells: "pd.Series[Any]") -> Bools:
     """(L,) True where a cell holds something."""
     return np.asarray(cells.notna() & (cells.astype(str).str.strip() != ""))
 
 
 def named_columns(
-    frame: pd.DataFrame, columns: Mapping[str, str], allowed: Sequence[str], needed: Sequence[str], file: str
-) -> pd.DataFrame:
+    frame: "pd.DataFrame", columns: Mapping[str, str], allowed: Sequence[str], needed: Sequence[str], file: str
+) -> "pd.DataFrame":
     """The frame with our names of its columns.
 
     Args:
@@ -222,7 +220,7 @@ def missing_column(file: str, column: str, names: Sequence[str], allowed: str, k
     return InputError(f"{file}: column {column}", "missing", allowed, suggestion(column, names, hint))
 
 
-def _read_csv(path: Path, text: Sequence[str]) -> pd.DataFrame:
+def _read_csv(path: Path, text: Sequence[str]) -> "pd.DataFrame":
     import pandas as pd
 
     separator, header, first = _first_lines(path)
@@ -264,7 +262,7 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
         raise InputError(f"{path.name}: header", f"{name[:40]!r} twice", allowed, "Rename or remove the other one.")
 
 
-def _refuse(cells: pd.Series[Any], wrong: Bools, file: str, allowed: str) -> None:
+def _refuse(cells: "pd.Series[Any]", wrong: Bools, file: str, allowed: str) -> None:
     """InputError that names the first wrong cell."""
     bad = np.flatnonzero(wrong)
     if len(bad):

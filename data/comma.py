@@ -1,7 +1,5 @@
 """Segments of comma2k19 (NumPy arrays without an ending) as rows of a log: fixes, speed, course, true positions."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

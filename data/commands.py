@@ -1,7 +1,5 @@
 """coopoc data list | get | show | check | convert."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Callable, Mapping
 from pathlib import Path

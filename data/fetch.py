@@ -1,7 +1,5 @@
 """Public measurements by name: download, verify by SHA-256, and keep in the user's cache."""
 
-from __future__ import annotations
-
 import hashlib
 import io
 import os

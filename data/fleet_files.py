@@ -1,7 +1,5 @@
 """Readers of drives: tables, TUM trajectories, SUMO's floating-car data; a writer of tables."""
 
-from __future__ import annotations
-
 import xml.etree.ElementTree as ElementTree
 from collections.abc import Mapping
 from pathlib import Path

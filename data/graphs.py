@@ -1,7 +1,5 @@
 """PyFG -> Recording in body frames: odometry and ranges of several robots, on equal steps, with the file's truth."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 import numpy as np

@@ -1,7 +1,5 @@
 """libRSF's text (TU Chemnitz) as rows of a log: ranges to anchors that stand, odometry, and true points."""
 
-from __future__ import annotations
-
 import re
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """UTIAS MR.CLAM: reader, noise calibrated against Vicon on the first part, and the Recording in body frames."""
 
-from __future__ import annotations
-
 import re
 from dataclasses import dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Drives of the NCLT Segway as KalmanNet4SensorFusion publishes them (tensors of torch) as rows of a log."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from typing import Any
 

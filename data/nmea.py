@@ -1,7 +1,5 @@
 """NMEA 0183 sentences of a receiver as rows of a log: fixes, speed, course and standard deviations (GST)."""
 
-from __future__ import annotations
-
 import datetime
 import re
 from pathlib import Path

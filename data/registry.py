@@ -1,7 +1,5 @@
 """load_fleet, load_log: a bundled name, a file or a folder -> Fleet or Log, by the registry of formats."""
 
-from __future__ import annotations
-
 import inspect
 import json
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """Parse a data set's name with options and its part: "drive.csv?dt=0.1&columns=t:time,id:car&since=300"."""
 
-from __future__ import annotations
-
 import os
 from collections.abc import Callable, Mapping
 from dataclasses import replace

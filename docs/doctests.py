@@ -1,7 +1,5 @@
 """Doctests of docstrings as blocks of code on the site's pages."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import griffe

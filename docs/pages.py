@@ -1,7 +1,5 @@
 """Pages that are made from the code when the site is built: a page per method, the gallery of studies, the API."""
 
-from __future__ import annotations
-
 import contextlib
 import html
 import io

@@ -1,7 +1,5 @@
 """A tutorial of cells (`# %%`) as a page, with what its code prints, shows and draws, and as a Jupyter notebook."""
 
-from __future__ import annotations
-
 import ast
 import contextlib
 import io

@@ -5,8 +5,6 @@
 A study of one's own in one file: docs/extend.md. What it finds stands in docs/federation.md.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from functools import lru_cache
@@ -94,7 +92,7 @@ def noise(p: Params) -> list[Sensors]:
     return [kinds[i % len(kinds)] for i in range(count)]
 
 
-def clients(p: Params, seed: int) -> tuple[Client, ...]:
+def clients(p: Params, seed: int) -> "tuple[Client, ...]":
     """The clients of a condition for one training seed; the one in the middle is the poisoned one.
 
     The noise of a vehicle is keyed by its name: it is the same as with its sensors for all. Of the training pieces the
@@ -115,7 +113,7 @@ def clients(p: Params, seed: int) -> tuple[Client, ...]:
     return tuple(group)
 
 
-def moved(client: Client, offset: float) -> Client:
+def moved(client: "Client", offset: float) -> "Client":
     """The client with its reference drive `offset` m beside the true one on every axis."""
     parts = {name: getattr(client, name) for name in ("training", "validation", "long")}
     return replace(client, **{name: replace(part, truth=part.truth + offset) for name, part in parts.items()})
@@ -151,7 +149,7 @@ def trained(condition: str, method: str, given: tuple[tuple[str, Any], ...]) -> 
     return tuple(fed.model for fed in federate_many(nets, groups, range(len(nets)), plan))
 
 
-def _pooled(p: Params, nets: list[Any], groups: list[tuple[Client, ...]]) -> tuple[Any, ...]:
+def _pooled(p: Params, nets: list[Any], groups: "list[tuple[Client, ...]]") -> tuple[Any, ...]:
     """Nets trained on all pieces in one place."""
     from coopoc.learned.training.clients import Segments
     from coopoc.learned.training.fit import Task, fit_many
@@ -195,7 +193,7 @@ def key(p: Params) -> dict[str, str]:
     return {**scene.facts(p), "clients": members(p).digest, "torch": version("torch")}
 
 
-def _error(results: Results, where: Where) -> Interval | str | None:
+def _error(results: "Results", where: Where) -> Interval | str | None:
     each = interval(results, where)
     return "diverged" if each and not each.mean < LOST / 1e3 else each
 
@@ -204,7 +202,7 @@ def _table(scenario: int) -> TableView:
     """Methods down, conditions across."""
     at = {"scenario": scenario}
 
-    def rows(results: Results) -> Any:
+    def rows(results: "Results") -> Any:
         names = dict.fromkeys((*METHODS, *results.frame.get("method", ())))
         return [((look(method).label,), {"method": method}) for method in names]
 
@@ -222,14 +220,14 @@ def _table(scenario: int) -> TableView:
     )
 
 
-def _multiple(results: Results, where: Where) -> list[float]:
+def _multiple(results: "Results", where: Where) -> list[float]:
     """RT-LE of each training seed as a multiple of the mean's under iid."""
     whole = mean(results, {"scenario": where["scenario"], "condition": "iid", "method": "mean"})
     each = seed_means(results, {name: value for name, value in where.items() if name != "noise_model"})
     return [value / whole for value in each] if whole else []
 
 
-def _finding(results: Results, at: dict[str, Any]) -> str:
+def _finding(results: "Results", at: dict[str, Any]) -> str:
     """RT-LE of the mean under a condition, and which rules are better or worse over all training seeds."""
     plain = per_seed(results, {**at, "method": "mean"})
     if not len(plain):
@@ -250,7 +248,7 @@ def _finding(results: Results, at: dict[str, Any]) -> str:
     )
 
 
-def _multiples(results: Results) -> Plot | None:
+def _multiples(results: "Results") -> "Plot | None":
     """Multiples of each rule under each condition as dots, one per training seed; a line marks the mean under iid."""
     from coopoc.study.plot import Plot, canvas, plain_log, strokes
 

@@ -1,7 +1,5 @@
 """The picture of the net: layers with their sizes and what each takes, drawn from the net itself (section II.B)."""
 
-from __future__ import annotations
-
 import sys
 from typing import Any
 

@@ -3,8 +3,6 @@
 python examples/export_onnx.py learned/weights/fedkalmannet.safetensors fedkalmannet.onnx
 """
 
-from __future__ import annotations
-
 import importlib
 import json
 import logging

@@ -1,7 +1,5 @@
 """The three uses in one file: observe a drive, solve one snapshot, compare filters with the bound."""
 
-from __future__ import annotations
-
 import coopoc as co
 from coopoc.learned import load_method
 

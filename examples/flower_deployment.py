@@ -8,8 +8,6 @@ Run:  python examples/flower_deployment.py --rounds 3
       python examples/flower_deployment.py --rounds 3 --kill 2     vehicle 2 is killed in the second round
 """
 
-from __future__ import annotations
-
 import ipaddress
 import os
 import random
@@ -80,9 +78,9 @@ class Site:
     folder: Path
     port: int
     tls: bool = True
-    started: list[subprocess.Popen[bytes]] = field(default_factory=list)
+    started: "list[subprocess.Popen[bytes]]" = field(default_factory=list)
 
-    def start(self, name: str, *command: str) -> subprocess.Popen[bytes]:
+    def start(self, name: str, *command: str) -> "subprocess.Popen[bytes]":
         """A process with the Flower home FOLDER/NAME that writes to FOLDER/NAME.log."""
         home = self.folder / name
         home.mkdir(exist_ok=True)
@@ -99,7 +97,7 @@ class Site:
         self.started.append(process)
         return process
 
-    def operator(self, name: str, *arguments: str) -> subprocess.Popen[bytes]:
+    def operator(self, name: str, *arguments: str) -> "subprocess.Popen[bytes]":
         """`flwr`, the command of the server's operator."""
         (self.folder / name).mkdir(exist_ok=True)
         safe = f'root-certificates = "{self.folder / "ca.pem"}"' if self.tls else "insecure = true"
@@ -156,7 +154,7 @@ def deployment(folder: Path, tls: bool = True) -> Iterator[Site]:
         stop(site.started)
 
 
-def join(site: Site, drives: Mapping[str, Fleet], port: int | None = None) -> list[subprocess.Popen[bytes]]:
+def join(site: Site, drives: Mapping[str, Fleet], port: int | None = None) -> "list[subprocess.Popen[bytes]]":
     """A SuperNode for each vehicle, with a file of its own drive, and its key registered under its name.
 
     Args:
@@ -190,7 +188,7 @@ def identity(site: Site, home: Path) -> list[str]:
     return ["--root-certificates", str(site.folder / "ca.pem"), "--auth-supernode-private-key", str(home / "key")]
 
 
-def supernode(site: Site, name: str, who: Sequence[str], port: int | None = None) -> subprocess.Popen[bytes]:
+def supernode(site: Site, name: str, who: Sequence[str], port: int | None = None) -> "subprocess.Popen[bytes]":
     """A SuperNode that reads its drive from FOLDER/NAME/drive.parquet."""
     drive, link = site.folder / name / "drive.parquet", f"{HOST}:{port or site.port}"
     return site.start(
@@ -210,7 +208,7 @@ def supernode(site: Site, name: str, who: Sequence[str], port: int | None = None
     )
 
 
-def submit(site: Site, words: Sequence[str], app: Path = APP) -> subprocess.Popen[bytes]:
+def submit(site: Site, words: Sequence[str], app: Path = APP) -> "subprocess.Popen[bytes]":
     """Send the app to the SuperLink and follow its run: the process ends when the run does."""
     return site.operator("run", "run", str(app), "here", "--stream", "--run-config", " ".join(words))
 
@@ -277,7 +275,7 @@ def logged(site: Site, name: str, text: str) -> bool:
     return text in log(site, name)
 
 
-def wait(true: Callable[[], bool], alive: subprocess.Popen[bytes], what: str) -> None:
+def wait(true: Callable[[], bool], alive: "subprocess.Popen[bytes]", what: str) -> None:
     """Wait until something is true, as long as a process lives that makes it so."""
     until = time.monotonic() + PATIENCE
     while not true():
@@ -286,7 +284,7 @@ def wait(true: Callable[[], bool], alive: subprocess.Popen[bytes], what: str) ->
         time.sleep(0.1)
 
 
-def finished(process: subprocess.Popen[bytes], what: str, patience: float = PATIENCE) -> None:
+def finished(process: "subprocess.Popen[bytes]", what: str, patience: float = PATIENCE) -> None:
     """Wait for a process to end well."""
     if process.wait(patience) != 0:
         raise RuntimeError(f"{what} failed: see the logs")
@@ -306,7 +304,7 @@ def listens(port: int) -> bool:
     return False
 
 
-def family(processes: Sequence[subprocess.Popen[bytes]]) -> set[int]:
+def family(processes: "Sequence[subprocess.Popen[bytes]]") -> set[int]:
     """Ids of the processes and of all that they started (where there is /proc)."""
     parents = dict[int, int]()
     for status in Path("/proc").glob("[0-9]*/stat"):
@@ -318,7 +316,7 @@ def family(processes: Sequence[subprocess.Popen[bytes]]) -> set[int]:
     return found
 
 
-def stop(processes: Sequence[subprocess.Popen[bytes]]) -> None:
+def stop(processes: "Sequence[subprocess.Popen[bytes]]") -> None:
     """End processes and all that they started: politely, nodes before the server, then with force."""
     everyone = family(processes)
     for process in reversed(processes):

@@ -6,8 +6,6 @@ first vertex. Positions are compared after SE(2) alignment, as usual for traject
 Run:  python examples/graph_file.py ../shared/data/pyfg/mrclam5a.pyfg trajectories.png
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 

@@ -6,8 +6,6 @@ CARLA's maps (MIT licence) are not part of the package; SUMO comes with pip inst
 the SUMO that the card names give the same bytes.
 """
 
-from __future__ import annotations
-
 import argparse
 import importlib.util
 import json

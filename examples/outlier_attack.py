@@ -8,8 +8,6 @@ the same vehicles, moved by the same offsets, are among the spoofed of every lar
 Run:  python examples/outlier_attack.py
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The picture of the README: a town and one vehicle's star; errors of five egos over time beside their bounds."""
 
-from __future__ import annotations
-
 import sys
 
 import numpy as np

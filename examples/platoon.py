@@ -10,8 +10,6 @@ measures range, azimuth and inclination of the one in front. Three things are kn
 Run:  python examples/platoon.py
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from itertools import pairwise

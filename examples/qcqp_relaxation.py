@@ -5,18 +5,16 @@
 A method that optimises, in one file: docs/extend.md. It has no memory, and 4.5 m where fixes have 6.1 m.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
-from coopoc.arrays import Floats, Ints
+from coopoc.arrays import Floats, Ints, check_fields
 from coopoc.methods.egos import Estimate, follow_egos
 from coopoc.methods.noise_model import NoiseModel, resolve
 from coopoc.methods.star import StarStep, stars
-from coopoc.methods.track import Track, check_options
+from coopoc.methods.track import Track
 from coopoc.optimize.convex.relaxation import shor
 from coopoc.optimize.model.problem import Problem
 from coopoc.optimize.solve import solve
@@ -54,7 +52,7 @@ class QCQPRelaxation:
     message: Message = FIX_AND_VELOCITY
 
     def __post_init__(self) -> None:
-        check_options(self)
+        check_fields(self)
 
     def __call__(self, recording: Recording, egos: Sequence[int | str] = (0,)) -> Track:
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.

@@ -11,8 +11,6 @@ solves the semidefinite relaxation, whose value no point can beat, and starts Ga
 Run:  python examples/range_only.py
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

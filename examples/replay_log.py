@@ -10,8 +10,6 @@ fixes left out, ten seconds of them in a row; fixes that arrive up to half a sec
 simulated drive is replayed instead.
 """
 
-from __future__ import annotations
-
 import argparse
 import sys
 import time

@@ -1,7 +1,5 @@
 """Checkpoints: weights in safetensors with a card and a checksum, written atomically, refused if they do not fit."""
 
-from __future__ import annotations
-
 import json
 import os
 import platform
@@ -17,7 +15,7 @@ import safetensors
 from safetensors.torch import save as to_bytes
 from torch import Tensor
 
-from coopoc.arrays import check_fields, instance
+from coopoc.arrays import check_fields, instance, named
 from coopoc.errors import InputError, shown
 from coopoc.file_names import given_path, replaceable
 from coopoc.one_file import in_file, path_of
@@ -45,7 +43,8 @@ class Checkpoint:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_fields(self, model=Gain, card=Mapping, history=Tensor)
+        check_fields(self)
+        named("card", self.card, "Give name -> value.")
 
     def after(self, row: int) -> Gain:
         """The net at row `row` of the history: the round of a federation, the check of a fit; 0 is the start."""

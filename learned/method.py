@@ -1,7 +1,5 @@
 """LearnedGain: a trained net as a method, Recording -> Track."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,13 +7,13 @@ import numpy.typing as npt
 import torch
 from torch import Tensor
 
-from coopoc.arrays import Floats
+from coopoc.arrays import Floats, check_fields
 from coopoc.errors import InputError, shown
 from coopoc.kernels.compiling.waiting import clock
 from coopoc.methods.doubts import doubts
 from coopoc.methods.gaps import in_stretches
 from coopoc.methods.stream import Stream
-from coopoc.methods.track import Alone, Track, check_options, silent_track
+from coopoc.methods.track import Alone, Track, silent_track
 from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, Vehicles, check_recording
 
@@ -53,7 +51,7 @@ class LearnedGain(Alone):
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_options(self)
+        check_fields(self)
         if not callable(self.model) or not callable(getattr(self.model, "start", None)):
             raise InputError("model", shown(self.model), "must be a net with start and step", "Give GainNet().")
 

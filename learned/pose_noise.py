@@ -1,7 +1,5 @@
 """Noise of a pose filter that is learned: the standard deviations under which true poses are most likely."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Recipes: a net, its training data and its schedule; settings and the jobs that they make."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from dataclasses import asdict, dataclass, field, replace
@@ -77,8 +75,8 @@ class Recipe:
         one_of("kind of recipe", self.kind, KINDS)
         if instance("noise", self.noise, str) != STATIC:
             Outliers.named(self.noise)
-        limits = {"rounds": STEPS, "local_epochs": STEPS}
-        check_fields(self, limits, schedule=Schedule, options=tuple)
+        check_fields(self, {"rounds": STEPS, "local_epochs": STEPS})
+        instance("options", self.options, tuple)
         check_pieces(self.piece, self.split)
 
 
@@ -101,7 +99,7 @@ class Setting:
     reading: VelocityReading = "axis"
 
     def __post_init__(self) -> None:
-        check_fields(self, {"seed": (0, 2**63 - 1, "in 0..2^63 - 1")}, start=Start, reading=VelocityReading)
+        check_fields(self, {"seed": (0, 2**63 - 1, "in 0..2^63 - 1")})
 
 
 @dataclass(frozen=True)

@@ -1,7 +1,5 @@
 """A net that filters step by step, as a `Solo`: one step at a time, near its own origin."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple, Protocol

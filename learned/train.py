@@ -1,7 +1,5 @@
 """Training of recipes: `train_all` makes every checkpoint that a study needs, or finds it."""
 
-from __future__ import annotations
-
 import math
 import os
 from collections.abc import Callable, Sequence

@@ -1,7 +1,5 @@
 """coopoc benchmark: a score card of any method on CL-Bench's tasks, and the table of all cards."""
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -1,7 +1,5 @@
 """Accuracy against bytes, sent once for a training or in every second of a drive."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -70,7 +68,7 @@ def _grid() -> list[Where]:
     ]
 
 
-def _figure(results: Results) -> Plot | None:
+def _figure(results: "Results") -> "Plot | None":
     from coopoc.study import figures
 
     where = present(results, {"channel": "ideal"})
@@ -84,7 +82,7 @@ def _figure(results: Results) -> Plot | None:
     return figures.pareto(results, scene.caption(results, text), PAYLOAD, where=where)
 
 
-def choices(results: Results) -> pd.DataFrame:
+def choices(results: "Results") -> "pd.DataFrame":
     """Mean RT-LE m and payload B/s of all methods that were run over an ideal channel."""
     rows, names = results.frame, [*AXES, "method", "noise_model"]
     if not {*names, PAYLOAD} <= set(rows):
@@ -93,7 +91,7 @@ def choices(results: Results) -> pd.DataFrame:
     return ideal.groupby(names, sort=False)[["rt_le_m", PAYLOAD]].mean().reset_index()
 
 
-def _findings(results: Results) -> dict[str, str]:
+def _findings(results: "Results") -> dict[str, str]:
     texts, each = {}, choices(results)
     for limit in LIMITS if len(each) else ():
         if len(within := each[each[PAYLOAD] <= limit]):
@@ -105,7 +103,7 @@ def _findings(results: Results) -> dict[str, str]:
     return texts
 
 
-def _rate(results: Results, where: Where, value: str = PAYLOAD) -> int | None:
+def _rate(results: "Results", where: Where, value: str = PAYLOAD) -> int | None:
     rate = mean(results, where, value)
     return None if rate is None else round(rate)
 

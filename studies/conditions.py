@@ -1,7 +1,5 @@
 """Studies of conditions: late and lost messages, GNSS errors that last, wrong measurements and attacks."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from functools import partial
 from operator import itemgetter
@@ -54,7 +52,7 @@ def study(
     """
     methods, rows = labelled(*pairs), [((title,), case) for title, case in cases.items()]
 
-    def findings(results: Results) -> dict[str, str]:
+    def findings(results: "Results") -> dict[str, str]:
         texts = {}
         for title in named:
             each = ran({label: number(results, {**cases[title], **line}) for label, line in methods.items()})

@@ -1,7 +1,5 @@
 """Does federated training reach the centralised net, and when? RT-LE after every round (paper, Fig. 3)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import lru_cache
 from typing import TYPE_CHECKING, Any
@@ -66,20 +64,20 @@ def meaningful(p: Params) -> bool:
     return p["train_seed"] in weights.seeds(p) and weights.trainable(p)
 
 
-def _curve(results: Results, method: str) -> list[float]:
+def _curve(results: "Results", method: str) -> list[float]:
     """Mean RT-LE after every round; empty if the net was not run."""
     where = present(results, {"method": method})
     rounds = sorted(results.select(where)["round"].unique()) if where else []
     return [results.interval("rt_le_m", method=method, round=number).mean for number in rounds]
 
 
-def _seeds(results: Results, where: Where) -> Interval | None:
+def _seeds(results: "Results", where: Where) -> Interval | None:
     """Mean over training seeds, with the lowest and the highest of them."""
     each = seed_means(results, where)
     return Interval(sum(each) / len(each), min(each), max(each), len(each)) if each else None
 
 
-def _figure(results: Results) -> Plot | None:
+def _figure(results: "Results") -> "Plot | None":
     rounds = sorted(results.frame["round"].unique()) if "round" in results.frame else ()
     ticks = {number: str(number) for number in rounds if number % 5 == 0}
     panel = Panel({number: {"round": number} for number in rounds}, xlabel="Round", ticks=ticks)
@@ -95,7 +93,7 @@ def _figure(results: Results) -> Plot | None:
     return curves([panel], lines, text, number=_seeds, levels=ends, width=6.4, log=True)(results)
 
 
-def _clients(results: Results) -> Plot:
+def _clients(results: "Results") -> "Plot":
     """The path of each client on one scale, with its number of steps and its range of speeds (paper, Fig. 2)."""
     from coopoc.study.plot import Plot, canvas
 
@@ -115,7 +113,7 @@ def _clients(results: Results) -> Plot:
     return Plot(figure, f"Paths of the clients of {truth.name} from the dot on, steps of {truth.dt:g} s; their speeds.")
 
 
-def _findings(results: Results) -> dict[str, str]:
+def _findings(results: "Results") -> dict[str, str]:
     fed, centralised = _curve(results, FEDERATED), _curve(results, CENTRALISED)
     texts = {}
     if fed and centralised:

@@ -1,7 +1,5 @@
 """CL-Bench's convoys: errors of one real drive, cut into pieces, of vehicles that drive together; ranges are drawn."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache

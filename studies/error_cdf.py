@@ -1,7 +1,5 @@
 """Learned gains among themselves and against fair filters: the distribution of the error (paper, Fig. 4)."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -50,7 +48,7 @@ def _table(at: Params) -> TableView:
     return selections(HEAD, labelled(LINEUP, **at), COLUMNS, text, at=at)
 
 
-def quantile(results: Results, where: Where) -> float | None:
+def quantile(results: "Results", where: Where) -> float | None:
     """Error m below which a share of all steps lies; `where` holds the share beside the selection."""
     kept = present(results, {name: value for name, value in where.items() if name != "share"}, "error_quantiles_m")
     if kept is None:
@@ -67,7 +65,7 @@ def _cdf(at: Where) -> FigureView:
     )
 
 
-def _finding(results: Results, at: Params) -> str:
+def _finding(results: "Results", at: Params) -> str:
     """RT-LE in a case, and the verdict on the federated net; nothing where nothing was run."""
     names = {"federated": "fedkalmannet", "centralised": "centralised", "OKF": "okf"}
     means = {words: mean(results, {**at, "method": name}) for words, name in names.items()}

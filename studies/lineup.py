@@ -1,7 +1,5 @@
 """Make the method of a cell by name and noise model, run it, and score every ego."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -82,7 +80,7 @@ def key(p: Params) -> dict[str, str]:
     return digests
 
 
-def noise_model(p: Params) -> NoiseModel | str:
+def noise_model(p: Params) -> "NoiseModel | str":
     """Noise model of the cell's method.
 
     Raises:
@@ -100,7 +98,7 @@ def noise_model(p: Params) -> NoiseModel | str:
     return str(p["noise_model"])
 
 
-def methods(p: Params) -> list[tuple[int | None, Method]]:
+def methods(p: Params) -> "list[tuple[int | None, Method]]":
     """The method of a cell, once per training seed if it is trained.
 
     Raises:
@@ -118,7 +116,7 @@ def methods(p: Params) -> list[tuple[int | None, Method]]:
     return [(None, method)]
 
 
-def own(name: str, noise: NoiseModel | str = "nominal") -> Any:
+def own(name: str, noise: "NoiseModel | str" = "nominal") -> Any:
     """A registered method or "mine.py:NAME" under a noise model.
 
     Raises:
@@ -141,7 +139,7 @@ def own(name: str, noise: NoiseModel | str = "nominal") -> Any:
     return method
 
 
-def named_method(name: str) -> Method:
+def named_method(name: str) -> "Method":
     """A registered method under the nominal noise model, a shipped learned gain, or "mine.py:NAME".
 
     Raises:

@@ -1,7 +1,5 @@
 """Collaborative training against collaborative decision: RT-LE against neighbours (paper, Fig. 5)."""
 
-from __future__ import annotations
-
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -48,7 +46,7 @@ BOUND_NOTE = "The bound is for the rms over runs of causal estimates, over an id
 k_table = partial(table, intervals=False)
 
 
-def _sides(results: Results) -> Plot | None:
+def _sides(results: "Results") -> "Plot | None":
     """Training against cooperation: identity covariances on the left, fitted ones on the right."""
     x = {k: {"max_neighbours": k} for k in NEIGHBOURS}
     panels = [
@@ -65,11 +63,11 @@ def _sides(results: Results) -> Plot | None:
     return curves(panels, [*solo, *shared, of(*BOUND)], text, BOUND_NOTE, **options)(results)
 
 
-def _interval(results: Results, where: Where) -> Any:
+def _interval(results: "Results", where: Where) -> Any:
     return (mean if where["method"] == "bound" else interval)(results, where)
 
 
-def findings(results: Results) -> dict[str, str]:
+def findings(results: "Results") -> dict[str, str]:
     """Which of training and cooperation is better, and the errors under known covariances beside the bound."""
     k = _most(results, "nominal")
     pairs = {"KF alone": ("kalman", "nominal"), "joint filter": ("joint", "nominal"), "bound": BOUND}
@@ -78,7 +76,7 @@ def findings(results: Results) -> dict[str, str]:
     return {"answer": _answer(results), "nominal": text if each else ""}
 
 
-def _answer(results: Results) -> str:
+def _answer(results: "Results") -> str:
     """Which of the two is better at the largest K, with fitted covariances and with the paper's."""
     k = _most(results, "fitted")
     fed, joint, paper = (
@@ -94,7 +92,7 @@ def _answer(results: Results) -> str:
     )
 
 
-def _most(results: Results, noise_model: str) -> int:
+def _most(results: "Results", noise_model: str) -> int:
     """The largest K at which a cooperative method was run with this noise model; 0 for none."""
     where = present(results, {"method": list(lineup.COOPERATIVE), "noise_model": noise_model})
     return int(results.select(where)["max_neighbours"].max()) if where else 0

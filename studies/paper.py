@@ -1,7 +1,5 @@
 """coopoc paper: its studies with shared weights, and one report that answers their questions."""
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Mapping, Sequence
@@ -65,7 +63,7 @@ def paper(
     return int(failed > 0)
 
 
-def reported(name: str, results: Results, keys: Sequence[str]) -> str:
+def reported(name: str, results: "Results", keys: Sequence[str]) -> str:
     """The findings of a study under these keys, one after the other."""
     texts = find("coopoc.studies", name).answers(results)
     return " ".join(texts[key][:1].upper() + texts[key][1:] for key in keys if key in texts)

@@ -1,7 +1,5 @@
 """Real drives whose headings are estimated: measurements, first poses, truth, and the part that is scored."""
 
-from __future__ import annotations
-
 import hashlib
 from dataclasses import dataclass, replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """Real vehicles with nothing simulated: when does a neighbour replace a landmark, such as a road-side unit?"""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache, partial
@@ -196,7 +194,7 @@ UNFIT = 100.0
 """Mean NEES of a pose that no drift explains: units, axes or noise are other ones."""
 
 
-def _caption(results: Results, text: str) -> str:
+def _caption(results: "Results", text: str) -> str:
     p = results.settings
     data = str(p["data"])
     marks = drives.counts(data)[1]
@@ -213,7 +211,7 @@ def _caption(results: Results, text: str) -> str:
     return " ".join(parts)
 
 
-def _numbers(results: Results) -> tuple[list[int], list[int]]:
+def _numbers(results: "Results") -> tuple[list[int], list[int]]:
     """The numbers of neighbours and of landmarks that were run with one state; none without."""
     rows = results.select(BASE) if "method" in results.frame else results.frame
     axes = ("max_neighbours", "landmarks")
@@ -221,7 +219,7 @@ def _numbers(results: Results) -> tuple[list[int], list[int]]:
     return ks, marks
 
 
-def _table(results: Results, value: str, text: str, **options: Any) -> Table | None:
+def _table(results: "Results", value: str, text: str, **options: Any) -> Table | None:
     """A metric of all methods, by K and landmarks, and the bytes that a vehicle sends."""
     if present(results, {}, value) is None:
         return None
@@ -240,32 +238,32 @@ BYTES = (
 )
 
 
-def _rows(results: Results) -> list[tuple[tuple[int, str], Where]]:
+def _rows(results: "Results") -> list[tuple[tuple[int, str], Where]]:
     ks, _ = _numbers(results)
     return [((k, look(name).label), {"method": name, "max_neighbours": k}) for k in ks for name in EVERY]
 
 
-def _columns(results: Results) -> dict[str, Where]:
+def _columns(results: "Results") -> dict[str, Where]:
     return {f"{words('landmarks')} = {n}": {"landmarks": n} for n in _numbers(results)[1]}
 
 
-def _sent(results: Results, where: Where) -> int | None:
+def _sent(results: "Results", where: Where) -> int | None:
     sent = mean(results, {"landmarks": _numbers(results)[1][-1], **where}, "sent_bytes")
     return None if sent is None else round(sent)
 
 
-def _gains(results: Results) -> Table | None:
+def _gains(results: "Results") -> Table | None:
     """Paired differences of RT-LE from the filter with the same K and the noise as assumed."""
     rows = [row for row in _rows(results) if row[1]["method"] != BASE["method"]]
 
-    def gap(results: Results, where: Where) -> Any:
+    def gap(results: "Results", where: Where) -> Any:
         return difference(results, where, {**where, **BASE})
 
     text = f"RT-LE [m] less that of {look(BASE['method']).label} with the same K, paired."
     return crossed(results, HEAD, rows, across(gap, _columns(results)), _caption(results, text), decimals=3)
 
 
-def _trade(results: Results) -> Plot | None:
+def _trade(results: "Results") -> "Plot | None":
     """RT-LE over the bytes sent, a panel per number of landmarks; no bytes stand at the left."""
     from coopoc.study import figures
 
@@ -274,7 +272,7 @@ def _trade(results: Results) -> Plot | None:
     if all(where["method"] == base for where in each):
         return None
 
-    def error(results: Results, where: Where) -> Any:
+    def error(results: "Results", where: Where) -> Any:
         at = {**each[where["at"]], "landmarks": where["landmarks"]}
         kind = 0 if at["method"] == base else 2 if at["max_neighbours"] else 1
         return interval(results, at) if kind == where["kind"] else None
@@ -292,7 +290,7 @@ def _trade(results: Results) -> Plot | None:
     return figures.curves(results, panels, lines, caption, error, log=True, logx=True)
 
 
-def _findings(results: Results) -> dict[str, str]:
+def _findings(results: "Results") -> dict[str, str]:
     """Key and sentence of what the cells show; a finding whose cells are missing is left out."""
 
     def of(k: int, n: int, value: str = "rt_le_m") -> float | None:

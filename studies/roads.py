@@ -1,7 +1,5 @@
 """CL-Bench's real roads: methods alone on a log with a truth, whose fixes are thinned and cut off alike for all."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache

@@ -1,7 +1,5 @@
 """The scene of a cell: which fleet drives, under which sensors and channel, and which vehicles are scored."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
@@ -49,7 +47,7 @@ def fleet(data: str) -> Fleet:
 
 
 @lru_cache(maxsize=2)
-def _log(data: str) -> Log | None:
+def _log(data: str) -> "Log | None":
     """The log of a name or a path that holds one; None for anything else.
 
     Raises:
@@ -81,7 +79,7 @@ def measured(data: str) -> Recording | None:
     return _under(log, V2X(len(fleet(data).ids), radius=float("inf")), runs=1, seed=0)
 
 
-def _under(log: Log, v2x: V2X, runs: int, seed: int) -> Recording:
+def _under(log: "Log", v2x: V2X, runs: int, seed: int) -> Recording:
     from coopoc.data.log.links import under
 
     return under(log.recording, v2x, runs=runs, seed=seed, logged=log.messages)
@@ -216,7 +214,7 @@ SIMULATED = ("scenario", "velocity_ratio", "drift_time_s", "heading_std_deg", "h
 TRAINING = ("clients", "weights", "train_seeds", "velocity_reading")
 
 
-def idle(results: Results) -> set[str]:
+def idle(results: "Results") -> set[str]:
     """Settings that do nothing in these results: of noise where it was measured, of training where there was none, and
     those that are off."""
     p = results.settings
@@ -226,13 +224,13 @@ def idle(results: Results) -> set[str]:
     return off | set(drawn) | set(() if trained else TRAINING)
 
 
-def caption(results: Results, *texts: str, **at: Any) -> str:
+def caption(results: "Results", *texts: str, **at: Any) -> str:
     """The texts, which may name settings in braces, and the conditions of the study, or of the selection `at` of it."""
     p = shown(results, **at)
     return " ".join([*(text.format(**p) for text in texts), conditions(p)])
 
 
-def shown(results: Results, **at: Any) -> dict[str, Any]:
+def shown(results: "Results", **at: Any) -> dict[str, Any]:
     """Parameters of results, or of a selection; training seeds only where something was trained."""
     frame = results.frame
     trained = "train_seed" in frame and frame["train_seed"].notna().any()

@@ -1,7 +1,5 @@
 """Any methods beside each other, and beside the bound, under conditions of one's own choice."""
 
-from __future__ import annotations
-
 from typing import TYPE_CHECKING, Any
 
 from coopoc.study.numbers import present, ran, rms
@@ -40,7 +38,7 @@ errors, errors of the heading, the start."""
 HELD = "GNSS repeats a fix until the next one, and errs by the way driven since."
 
 
-def _changed(results: Results) -> str:
+def _changed(results: "Results") -> str:
     kept, idle = results.settings, scene.idle(results)
     changed = [name for name, usual in CONDITIONS.items() if kept[name] != usual]
     acting, others = [f"{n} {kept[n]}" for n in changed if n not in idle], [n for n in changed if n in idle and kept[n]]
@@ -51,7 +49,7 @@ def _changed(results: Results) -> str:
 def _table(text: str, value: str, **options: Any) -> TableView:
     """Methods that have the metric, and K across."""
 
-    def view(results: Results) -> Table | None:
+    def view(results: "Results") -> "Table | None":
         if value not in results.frame:
             return None
         methods = [str(name) for name in results.frame.dropna(subset=[value])["method"].unique()]
@@ -65,7 +63,7 @@ def _table(text: str, value: str, **options: Any) -> TableView:
     return view
 
 
-def _figure(results: Results) -> Plot | None:
+def _figure(results: "Results") -> "Plot | None":
     from coopoc.study import figures
 
     if present(results, {}) is None or results.frame["max_neighbours"].nunique() < 2:
@@ -75,7 +73,7 @@ def _figure(results: Results) -> Plot | None:
     return figures.sweep(results, x="max_neighbours", log=True, caption=caption)
 
 
-def _findings(results: Results) -> dict[str, str]:
+def _findings(results: "Results") -> dict[str, str]:
     """The best filter at each K, the largest first; smoothers know later measurements and are no filters."""
     texts, rows = {}, results.frame
     for k in sorted(rows["max_neighbours"].unique(), reverse=True) if len(rows) else ():

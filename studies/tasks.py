@@ -1,7 +1,5 @@
 """CL-Bench: its tasks, fixed by version: simulated drives with what goes wrong, logs of real robots, and graphs."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Mapping
 from dataclasses import dataclass, fields, is_dataclass, replace

@@ -1,7 +1,5 @@
 """Views of studies declared as data: tables and figures whose captions end with the conditions of the study."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -51,7 +49,7 @@ def table(
         options: of `pivot`.
     """
 
-    def view(results: Results) -> Table | None:
+    def view(results: "Results") -> Table | None:
         kept = present(results, where or {}, value)
         if kept is None:
             return None
@@ -64,7 +62,7 @@ def table(
 
 def selections(
     head: Sequence[str],
-    rows: Rows | Callable[[Results], Rows],
+    rows: "Rows | Callable[[Results], Rows]",
     columns: Mapping[str, Number],
     *texts: str,
     at: Where | None = None,
@@ -81,7 +79,7 @@ def selections(
         options: of `Table`.
     """
 
-    def view(results: Results) -> Table | None:
+    def view(results: "Results") -> Table | None:
         shown = rows(results) if callable(rows) else rows
         where = {**results.settings, **(at or {})}
         kept = {"decimals": scene.decimals(where), **options}
@@ -103,7 +101,7 @@ def curves(
         options: of `coopoc.study.figures.curves`.
     """
 
-    def view(results: Results) -> Plot | None:
+    def view(results: "Results") -> "Plot | None":
         from coopoc.study import figures
 
         return figures.curves(results, panels, lines, scene.caption(results, *texts, **(at or {})), **options)

@@ -1,7 +1,5 @@
 """coopoc train, and the weights that studies need: trained once for a setting, found by a hash of all that counts."""
 
-from __future__ import annotations
-
 import hashlib
 import math
 import sys
@@ -57,7 +55,7 @@ def key(name: str, p: Params) -> str:
 
 
 @lru_cache(maxsize=4)
-def drives(clients: str) -> Drives:
+def drives(clients: str) -> "Drives":
     """What nets are trained on: a fleet, whose measurements are simulated, or of real data its own measurements."""
     if not is_real(clients):
         return fleet(clients)
@@ -111,7 +109,7 @@ def prepare(cells: Iterable[Params], jobs: int = 1) -> None:
 
 
 @lru_cache(maxsize=64)
-def _checkpoint(path: Path, key: str, net: str) -> Checkpoint:
+def _checkpoint(path: Path, key: str, net: str) -> "Checkpoint":
     from coopoc.learned.checkpoint import load
 
     checkpoint = load(path, net)
@@ -120,7 +118,7 @@ def _checkpoint(path: Path, key: str, net: str) -> Checkpoint:
     return checkpoint
 
 
-def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:
+def checkpoint(name: str, p: Params, seed: int) -> "Checkpoint":
     """The trained checkpoint of a method for one training seed.
 
     Raises:
@@ -136,7 +134,7 @@ def checkpoint(name: str, p: Params, seed: int) -> Checkpoint:
 
 
 @lru_cache
-def _fitted(clients: str, reading: VelocityReading) -> NoiseModel:
+def _fitted(clients: str, reading: VelocityReading) -> "NoiseModel":
     from coopoc import NoiseModel
 
     if is_real(clients):
@@ -147,13 +145,13 @@ def _fitted(clients: str, reading: VelocityReading) -> NoiseModel:
     return NoiseModel.fitted(observe(moving, acting, V2X(max_neighbours=0), seed=0), moving)
 
 
-def trained(results: Results) -> list[str]:
+def trained(results: "Results") -> list[str]:
     """The trained methods that a study has run."""
     ran = results.frame["method"].unique() if "method" in results.frame else ()
     return sorted((name for name in ran if is_trained(name)), key=lambda name: (*LEARNED, name).index(name))
 
 
-def described(results: Results) -> Mapping[str, str]:
+def described(results: "Results") -> Mapping[str, str]:
     """Descriptions of the training of the methods that were run, from the cards of the first seed."""
     texts = {}
     for name in trained(results):
@@ -170,7 +168,7 @@ def described(results: Results) -> Mapping[str, str]:
     return texts
 
 
-def fitted(p: Params) -> NoiseModel:
+def fitted(p: Params) -> "NoiseModel":
     """Noise fitted on the recording that the nets of training seed 0 saw, or on the measurements of real data."""
     return _fitted(p["clients"], p["velocity_reading"])
 

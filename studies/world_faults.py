@@ -1,7 +1,5 @@
 """What may be wrong in a world: kinds of fault, each of which makes another scene of a scene."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -43,16 +41,16 @@ class Scene:
     seed: int
     edits: tuple[Edit, ...] = ()
 
-    def edited(self, edit: Edit) -> Scene:
+    def edited(self, edit: Edit) -> "Scene":
         """The same with one more edit."""
         return replace(self, edits=(*self.edits, edit))
 
-    def sensing(self, stated: bool = False, **more: Any) -> Scene:
+    def sensing(self, stated: bool = False, **more: Any) -> "Scene":
         """The same with other sensors, of which methods are told or not."""
         assumed = replace(self.assumed, **more) if stated else self.assumed
         return replace(self, acting=replace(self.acting, **more), assumed=assumed)
 
-    def outliers(self, **more: Fault) -> Scene:
+    def outliers(self, **more: Fault) -> "Scene":
         """The same with more outliers."""
         return self.sensing(outliers=replace(self.acting.outliers or Outliers(), **more))
 

@@ -1,7 +1,5 @@
 """Worlds: random draws of fleets, sensors, channels and faults, on which a cooperative filter is judged."""
 
-from __future__ import annotations
-
 import zlib
 from collections.abc import Callable, Collection, Mapping
 from dataclasses import dataclass, replace

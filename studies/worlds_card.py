@@ -1,7 +1,5 @@
 """Score card of a method on worlds: how often and by how much it is worse than being alone or a textbook filter."""
 
-from __future__ import annotations
-
 import json
 import re
 import sys
@@ -187,7 +185,7 @@ def _short(value: Any) -> Any:
     return float(f"{value:.5g}") if np.isfinite(value) else None
 
 
-def _frame(columns: Mapping[str, Sequence[Any]]) -> pd.DataFrame:
+def _frame(columns: Mapping[str, Sequence[Any]]) -> "pd.DataFrame":
     """Worlds with the ratios to the textbook filter, to being alone and to the better of both; infinite where the
     method failed."""
     import pandas as pd
@@ -201,7 +199,7 @@ def _frame(columns: Mapping[str, Sequence[Any]]) -> pd.DataFrame:
     return frame
 
 
-def summary(found: pd.DataFrame) -> dict[str, Any]:
+def summary(found: "pd.DataFrame") -> dict[str, Any]:
     """Shares and means over worlds with 95 % bootstrap intervals, percentile, NEES and time.
 
     Args:
@@ -223,13 +221,13 @@ def summary(found: pd.DataFrame) -> dict[str, Any]:
     return made
 
 
-def _interval(values: pd.Series[float]) -> list[float]:
+def _interval(values: "pd.Series[float]") -> list[float]:
     """Mean and ends of its interval; of one world without ends."""
     level = mean_interval(values.to_numpy())
     return [_short(end) for end in (level.mean, level.low, level.high) if np.isfinite(end)]
 
 
-def _worst(name: str, split: Split, found: pd.DataFrame) -> list[Row]:
+def _worst(name: str, split: Split, found: "pd.DataFrame") -> list[Row]:
     """Worlds with the largest ratios, what is in them, and the command that runs each again."""
     more = " --validation" * (split == "validation")
     return [

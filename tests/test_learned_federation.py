@@ -1,7 +1,5 @@
 """Federation: laws on gains that are no net; rules against Flower's own, SciPy and closed forms; Byzantine clients."""
 
-from __future__ import annotations
-
 import math
 import warnings
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """The Flower apps: the weights of `federate`, Flower's own average, bad and missing answers, silent errors."""
 
-from __future__ import annotations
-
 import importlib.util
 import sys
 import tomllib
@@ -86,11 +84,11 @@ def room(nodes: Mapping[int, Node]) -> Any:
 
         def get_nodes(self) -> Iterable[Any]: ...
 
-        def push_messages(self, messages: Iterable[Message]) -> Iterable[str]: ...
+        def push_messages(self, messages: "Iterable[Message]") -> Iterable[str]: ...
 
-        def pull_messages(self, message_ids: Iterable[str]) -> Iterable[Message]: ...
+        def pull_messages(self, message_ids: Iterable[str]) -> "Iterable[Message]": ...
 
-        def send_and_receive(self, messages: Iterable[Message], *, timeout: float | None = None) -> Any:
+        def send_and_receive(self, messages: "Iterable[Message]", *, timeout: float | None = None) -> Any:
             return [reply for m in reversed([*messages]) if (reply := nodes[m.metadata.dst_node_id](m))]
 
     return Room()
@@ -121,7 +119,7 @@ def sends(name: str, weights: Tensor, **changes: object) -> Node:
     """A node that answers with these weights, and with values of its own."""
     from flwr.app import Array, ArrayRecord, ConfigRecord, Message, MetricRecord, RecordDict
 
-    def node(message: Message) -> Message:
+    def node(message: "Message") -> "Message":
         loss = "training-loss" if message.metadata.message_type == "train" else "validation-loss"
         metrics: dict[str, Any] = {"num-examples": 3, loss: 1.0}
         about: dict[str, Any] = {"name": name, "version": version("coopoc")}
@@ -171,7 +169,7 @@ def test_bad_answers_are_rejected_and_training_goes_on() -> None:
         lambda content: content["metrics"].update(more=1.0),
     ]
 
-    def changed(message: Message, change: Callable[[Any], object]) -> Message:
+    def changed(message: "Message", change: Callable[[Any], object]) -> "Message":
         reply: Any = sends("more", theta)(message)
         change(reply.content)
         return reply
@@ -245,7 +243,7 @@ def test_a_silent_client_is_absent_and_welcome_back() -> None:
     job, fleet = job_of(TINY), drives(3)
     nodes = {i: honest(job, fleet, i) for i in range(3)}
 
-    def sometimes(message: Message) -> Message | None:
+    def sometimes(message: "Message") -> "Message | None":
         number: Any = message.content["config"]
         return None if number["server-round"] == 2 else honest(job, fleet, 1)(message)
 

@@ -4,8 +4,6 @@ The wire, the server's memory and its files are searched for a drive that is dis
 gives this drive away shows that the search would find it.
 """
 
-from __future__ import annotations
-
 import importlib.util
 import os
 import re
@@ -89,7 +87,7 @@ def alive(word: str) -> list[str]:
     return found
 
 
-def until(true: Callable[[], bool], seconds: float = 300, alive: subprocess.Popen[bytes] | None = None) -> None:
+def until(true: Callable[[], bool], seconds: float = 300, alive: "subprocess.Popen[bytes] | None" = None) -> None:
     """Wait for something that a process, if one is named, must live to do."""
     end = time.monotonic() + seconds
     while not true():

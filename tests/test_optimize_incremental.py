@@ -1,7 +1,5 @@
 """iSAM2 behind `co.incremental`, against GTSAM called by hand."""
 
-from __future__ import annotations
-
 from itertools import pairwise
 
 import gtsam

@@ -3,8 +3,6 @@
 One recursion over the steps of a drive with members that come and go serves all, filtering or smoothing.
 """
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -229,7 +227,7 @@ def _measured(fleet: Fleet, links: Links, members: Ints, recording: Recording) -
     return [Measured(fixes[r], relative[r]) for r in range(1 if alike else recording.runs)]
 
 
-def _marginals(fleet: Fleet, stages: list[Stage], found: Iterator[tuple[int, Floats]]) -> Floats:
+def _marginals(fleet: Fleet, stages: "list[Stage]", found: Iterator[tuple[int, Floats]]) -> Floats:
     """(T, N, d, d) of each member from the covariances of all at each step."""
     d, vehicles = stages[0].motion.shape[-1], len(fleet.ids)
     out = np.full((*fleet.position.shape[:2], d, d), np.nan)

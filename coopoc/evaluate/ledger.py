@@ -1,8 +1,6 @@
 """Ledger: the bytes of training and of online cooperation on one axis, as payload and on air, sent once or per
 receiver."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, get_args

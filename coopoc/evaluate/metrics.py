@@ -1,7 +1,5 @@
 """Errors of a Track against its Fleet: RT-LE, maximum, heading, NEES; metrics by name; innovations without a truth."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from itertools import pairwise
 

@@ -1,7 +1,5 @@
 """Scores of a method in each run and for each ego of a recording, as columns and as rows."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Paired intervals: bootstrap over egos, then runs; training seeds apart."""
 
-from __future__ import annotations
-
 import math
 from dataclasses import dataclass
 from functools import lru_cache

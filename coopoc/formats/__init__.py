@@ -1,7 +1,5 @@
 """Files of graphs and trajectories: graphs in PyFG and g2o, trajectories in TUM."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ..errors import InputError, suggestion

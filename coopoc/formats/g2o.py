@@ -1,7 +1,5 @@
 """g2o text files: pose graphs with landmarks, an initial guess and information matrices; no stamps."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from pathlib import Path
 

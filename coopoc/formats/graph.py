@@ -1,7 +1,5 @@
 """Graph: the vertices and measurements of a PyFG or g2o file, and the rules that they keep."""
 
-from __future__ import annotations
-
 import math
 import re
 from collections.abc import Callable, Mapping

@@ -1,7 +1,5 @@
 """PyFG text files: range-aided factor graphs with ground truth, stamps and covariances (PyFactorGraph, CORA)."""
 
-from __future__ import annotations
-
 from pathlib import Path
 
 from ..file_names import given_path

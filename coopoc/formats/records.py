@@ -1,7 +1,5 @@
 """Records of PyFG and g2o: a line is a tag, perhaps a stamp, vertices, numbers and the noise of a measurement."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any

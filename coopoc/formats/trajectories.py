@@ -1,7 +1,5 @@
 """Trajectories: poses over time, in TUM files (`t x y z qx qy qz qw`)."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import InitVar, dataclass
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Values in text files: words and finite numbers by line, rotations, and symmetric matrices by their upper triangle."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 

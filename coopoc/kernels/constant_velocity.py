@@ -9,8 +9,6 @@ References:
     acceleration) and 11.6 (static multiple models).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

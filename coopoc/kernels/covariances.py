@@ -1,8 +1,6 @@
 """NEES of a track, e^T P^-1 e by P = L D L^T, covariances that are none, and what contradicts a track, in one pass
 each."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Dead reckoning of one vehicle: its newest motions, which bring a late fix forward."""
 
-from __future__ import annotations
-
 import math
 
 from ..arrays import Floats

@@ -12,8 +12,6 @@ A number, or LANES runs side by side. Filters call it where a measurement become
 cooperative filter (`stars.gaussian.weight`) have a shape of their own.
 """
 
-from __future__ import annotations
-
 import math
 
 from .compiling.compile import inside

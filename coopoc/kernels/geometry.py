@@ -5,8 +5,6 @@ them the three standard deviations, infinite for a missing component, which henc
 vectors e_r, e_a, e_i along which the three grow, the rows of the Jacobian are e_r^T, e_a^T / (r sin i) and e_i^T / r.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import Any, TypeAlias

@@ -1,7 +1,5 @@
 """Process noise of a motion dt u, constant or a share of the pace: of the velocities measured before."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias

@@ -12,8 +12,6 @@ References:
     Estimation with applications to tracking and navigation, Wiley 2001, 6.2.2 (white acceleration).
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -5,8 +5,6 @@ are those of fixes beyond the gate, and the rest is the position that `gate.reme
 the memory of that; all but these two are the same on all axes.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple, TypeAlias
 

@@ -1,7 +1,5 @@
 """Published baselines: LKF-SA, the Laplacian Kalman filter over the star, and MSMV-R, pseudo-fixes of neighbours."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """The whole-drive smoother at a centre that has the whole fleet: its problem, its bytes, its Track."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
@@ -100,7 +98,7 @@ def drive_problem(
     counts: Bools,
     stds: tuple[Floats, Floats],
     model: NoiseModel,
-) -> Problem:
+) -> "Problem":
     """The problem of a whole drive of the fleet: a point per vehicle and step at which it is active.
 
     Args:
@@ -125,7 +123,7 @@ def drive_problem(
     return Problem(tuple(map(str, range(len(step)))), factors, x0=start[active])
 
 
-def gated(problem: Problem) -> Problem:
+def gated(problem: "Problem") -> "Problem":
     """A drive whose fixes and relative measurements weigh less, or nothing, where they do not fit a solution with
     Huber's loss, from which it starts."""
     from ..optimize import Loss, solve

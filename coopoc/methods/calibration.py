@@ -1,7 +1,5 @@
 """Calibration of a filter on a drive: what is fitted to its first two thirds must be better on the rest."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import NamedTuple, TypeVar

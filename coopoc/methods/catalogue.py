@@ -1,7 +1,5 @@
 """The methods that need no training, by the names of tables, figures and the command line."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from functools import partial
 

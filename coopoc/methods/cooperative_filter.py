@@ -1,7 +1,5 @@
 """CooperativeFilter: the filter of a star where receivers, compasses, channels, odometers and senders may be wrong."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
@@ -9,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import numpy.typing as npt
 
-from ..arrays import Floats, number
+from ..arrays import Floats, check_fields, number
 from ..kernels.gate import GATE
 from ..kernels.stars.cooperative_filter import run_filter
 from ..kernels.stars.cooperative_messages import fading_memory
@@ -24,7 +22,7 @@ from .egos import Estimate, assumptions, follow_egos, measurements, relative_noi
 from .gaps import in_stretches
 from .noise_model import NoiseModel, resolve
 from .odometry_fault import with_odometry
-from .track import Checked, Track, check_options
+from .track import Checked, Track
 
 FOUND = {
     "heading error": "rad",
@@ -162,7 +160,7 @@ class CooperativeFilter(Checked):
     cooperative, needs_fix = True, False
 
     def __post_init__(self) -> None:
-        check_options(self, priors=Priors)
+        check_fields(self)
         for name, value in self.priors._asdict().items():
             least = -np.inf if name in ("absent", "exact") else 0.0
             number(
@@ -223,7 +221,7 @@ class CooperativeFilter(Checked):
         return follow_egos(self, recording, egos, run, notes)
 
     @classmethod
-    def fitted(cls, recording: Recording, truth: Fleet | None = None) -> CooperativeFilter:
+    def fitted(cls, recording: Recording, truth: Fleet | None = None) -> "CooperativeFilter":
         """The filter calibrated on a drive by itself: factors of the deviations of fixes and motion, and deviations of
         the errors of heading and scale and how long they last, by `calibration.calibrated`. Its gates stay. Innovations
         do not show errors that fixes share for longer: without a truth their factor stays, too.

@@ -1,7 +1,5 @@
 """CovarianceIntersection: each neighbour's solo estimate, seen from the ego, fused without assuming independence."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

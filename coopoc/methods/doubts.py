@@ -1,7 +1,5 @@
 """What contradicts the estimates of a track: fixes, the odometer, and what is had of neighbours."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

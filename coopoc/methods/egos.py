@@ -1,7 +1,5 @@
 """The loop of filters of a star: each ego opens its inbox, hands arguments to its kernel, and fills its Track."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from types import MappingProxyType
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Methods across gaps: an ego that is absent for a while, or has no fix at first, is followed stretch by stretch."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import replace
 from functools import wraps

@@ -1,7 +1,5 @@
 """The joint cooperative filter: ego and neighbours in one state, with one exact Gauss-Newton step."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 from ..kernels.stars.joint_filter import run_filter

@@ -1,7 +1,5 @@
 """Solo methods: the raw fix, and the Kalman filter on position."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
@@ -103,7 +101,7 @@ class Kalman(Alone, Checked):
         return FilterStream(motion_noise(noise_model, interval), fix_noise(noise_model, self.robust), x0, history)
 
     @classmethod
-    def fitted(cls, recording: Recording, truth: Fleet | None = None) -> Kalman:
+    def fitted(cls, recording: Recording, truth: Fleet | None = None) -> "Kalman":
         """The filter with factors of the deviations of fixes and motion calibrated on a drive; without a truth that of
         the motion alone.
 

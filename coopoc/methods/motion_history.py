@@ -1,7 +1,5 @@
 """Inputs of streams: checks of a step, and the newest motions of a vehicle, which bring a late fix forward."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from typing import Any

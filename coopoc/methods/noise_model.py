@@ -1,7 +1,5 @@
 """NoiseModel: the noise that a filter assumes. It is an axis of every study, never a hidden default."""
 
-from __future__ import annotations
-
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -71,12 +69,12 @@ class NoiseModel:
                 self.__dict__[field] = _three(value)
 
     @classmethod
-    def identity(cls) -> NoiseModel:
+    def identity(cls) -> "NoiseModel":
         """Unit covariances: 1 m per step, 1 m GNSS, 1 m relative vector, per axis."""
         return cls("identity", process_std=(1.0, 1.0, 1.0))
 
     @classmethod
-    def nominal(cls, sensors: Sensors) -> NoiseModel:
+    def nominal(cls, sensors: Sensors) -> "NoiseModel":
         """The standard deviations of `sensors`, process noise from the measured pace; all of the error of a fix or
         an azimuth as if it were white and its own."""
         sensors = instance("sensors", sensors, Sensors).check_assumed().known()
@@ -85,12 +83,12 @@ class NoiseModel:
         return cls("nominal", sensors, gnss_std=sensors.fix_std, compass=compass)
 
     @classmethod
-    def oracle(cls, sensors: Sensors, fleet: Fleet) -> NoiseModel:
+    def oracle(cls, sensors: Sensors, fleet: Fleet) -> "NoiseModel":
         """`nominal` with the true velocity: the bias-ignorant oracle filter that a learned gain is compared with."""
         return replace(cls.nominal(sensors), name="oracle", fleet=instance("fleet", fleet, Fleet))
 
     @classmethod
-    def fitted(cls, recording: Recording, fleet: Fleet) -> NoiseModel:
+    def fitted(cls, recording: Recording, fleet: Fleet) -> "NoiseModel":
         """Per-axis standard deviations of a training recording against its truth.
 
         process: rms of x_t - x_{t-1} - dt u_t, at least dt times the velocity floor; GNSS: rms of z_t - x_t. Relative

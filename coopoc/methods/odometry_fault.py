@@ -1,7 +1,5 @@
 """Recordings whose odometry fails: as fixes correct it (`coopoc.kernels.odometry_fault`)."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import replace
 

@@ -1,7 +1,5 @@
 """The star of an ego and its neighbours in plain NumPy, step by step: newest messages brought forward, measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 

@@ -1,7 +1,5 @@
 """Streaming with neighbours: the star around one vehicle, fed step by step with measurements and messages."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field

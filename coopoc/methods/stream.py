@@ -1,7 +1,5 @@
 """Streaming: a solo filter that is fed one step at a time, with missing and delayed fixes and whatever dt there is."""
 
-from __future__ import annotations
-
 from typing import Generic, Protocol, TypeVar
 
 import numpy as np

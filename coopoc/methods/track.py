@@ -1,23 +1,19 @@
 """Track: a method's estimates of its egos, and their bytes. Method: the protocol that all follow; checks of options."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from ..arrays import Bools, Floats, Limits, check_arrays, check_fields, checked, instance, number, refuse, texts
+from ..arrays import Bools, Floats, check_arrays, check_fields, checked, instance, number, refuse, texts
 from ..errors import InputError, shown
 from ..kernels.compiling.waiting import clock
 from ..short_repr import short_repr
 from ..world.fleet import columns, same_drive
 from ..world.long_table import long_table
 from ..world.recording import Recording, Vehicles
-from ..world.sensors import Sensors
 from ..world.v2x import NO_MESSAGE, Message
-from .noise_model import NoiseModel
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -124,7 +120,7 @@ class Track:
             present = self.covariance if self.absent is None else self.covariance[:, there]
             self._note_unsound(present.reshape(-1, 3, 3))
 
-    def to_frame(self) -> pd.DataFrame:
+    def to_frame(self) -> "pd.DataFrame":
         r"""A row per run, step and ego, for pandas.
 
         Columns: `run`, `step`, `t` s, `ego` (the vehicle's id, or its column in the Recording where the track has no
@@ -223,19 +219,13 @@ class Alone:
 
 
 class Checked:
-    """A dataclass whose options are checked when it is made."""
-
-    def __post_init__(self) -> None:
-        check_options(self)
-
-
-def check_options(made: Any, limits: Limits | None = None, **kinds: Any) -> None:
-    """`check_fields` of a method, whose noise may be assumed.
+    """A dataclass whose options are checked when it is made.
 
     >>> from coopoc import JointFilter
     >>> JointFilter(exact="no")
     Traceback (most recent call last):
-    ...
     coopoc.errors.InputError: exact = 'no': must be bool. Give JointFilter(exact=...).
     """
-    check_fields(made, limits, noise_model=NoiseModel | str, assumed=Sensors, **kinds)
+
+    def __post_init__(self) -> None:
+        check_fields(self)

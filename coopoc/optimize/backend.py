@@ -1,7 +1,5 @@
 """Backend: the protocol of a solver, what it can solve as data, and the backends by name."""
 
-from __future__ import annotations
-
 import inspect
 from collections.abc import Callable
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """A graph of poses and landmarks as a Problem, and where to start it."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from functools import partial
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Solution: the estimate, its covariance and the status of the solve."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from enum import Enum
 from typing import Any
@@ -125,5 +123,5 @@ class SolveError(RuntimeError):
         violated = f" Violated: {solution.extras['violated']}." if "violated" in solution.extras else ""
         super().__init__(f"{solution.backend}: {solution.status.value}{violated} ({solution})")
 
-    def __reduce__(self) -> tuple[type[SolveError], tuple[Solution]]:
+    def __reduce__(self) -> "tuple[type[SolveError], tuple[Solution]]":
         return type(self), (self.solution,)

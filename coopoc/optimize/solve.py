@@ -1,7 +1,5 @@
 """solve: a Problem and the name of a backend give a Solution, verified independently of the solver."""
 
-from __future__ import annotations
-
 from contextlib import suppress
 from dataclasses import replace
 from typing import Any

@@ -1,7 +1,5 @@
 """coopoc solve and coopoc check: the solvers from the command line."""
 
-from __future__ import annotations
-
 import json
 import sys
 import time

@@ -1,7 +1,5 @@
 """Cell: one point of a study's grid, named by a hash of all that changes its numbers; values as --set gives them."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 from collections.abc import Mapping, Sequence

@@ -1,7 +1,5 @@
 """compute: outcomes of cells as they come, here or in worker processes; their order."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import sys

@@ -1,7 +1,5 @@
 """Figures of a study: a metric over an axis, and its bytes."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
@@ -22,7 +20,7 @@ if TYPE_CHECKING:
 __all__ = ["Plot", "curves", "pareto", "sweep"]
 
 
-def sweep(results: Results, x: str, where: Where | None = None, caption: str = "", log: bool = False) -> Plot:
+def sweep(results: "Results", x: str, where: Where | None = None, caption: str = "", log: bool = False) -> Plot:
     """Plot RT-LE against an axis: one line per method and noise model with its 95 % band; "bound" is dashed.
 
     Without a column `method` there is one line per combination of the other axes.
@@ -48,7 +46,7 @@ def sweep(results: Results, x: str, where: Where | None = None, caption: str = "
     return plot
 
 
-def pareto(results: Results, caption: str, x: str = "bytes_per_second", where: Where | None = None) -> Plot:
+def pareto(results: "Results", caption: str, x: str = "bytes_per_second", where: Where | None = None) -> Plot:
     """Plot RT-LE against received bytes per second, a mark per cell; a line joins those that no cheaper one beats.
 
     Methods that receive nothing are horizontal lines.
@@ -102,7 +100,7 @@ STYLE = ("label", "color", "marker", "linestyle", "linewidth")
 
 
 def curves(
-    results: Results,
+    results: "Results",
     panels: Sequence[Panel],
     lines: Sequence[Where],
     caption: str,
@@ -255,7 +253,7 @@ def _joined(lines: Sequence[Where], models: Collection[str] = ()) -> str:
     return " = ".join([first, *shown])
 
 
-def _line_names(results: Results, *across: str) -> list[str]:
+def _line_names(results: "Results", *across: str) -> list[str]:
     """Columns that identify a line of a figure: method and noise model, or all axes but those of the figure."""
     usual = [name for name in ("method", "noise_model") if name in results.frame]
     return usual if "method" in usual else [name for name in results.axes if name not in across]

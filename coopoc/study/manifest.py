@@ -1,7 +1,5 @@
 """Manifest: study, settings, cells and environments of a folder of results, and the lock of who writes it."""
 
-from __future__ import annotations
-
 import json
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -40,7 +38,7 @@ class Manifest:
     cells: Mapping[str, Mapping[str, Any]]
     environment: Mapping[str, str]
 
-    def as_stored(self) -> Manifest:
+    def as_stored(self) -> "Manifest":
         """The manifest as it comes back from its file, where a tuple has become a list."""
         return Manifest(**json.loads(json.dumps(asdict(self), default=str)))
 

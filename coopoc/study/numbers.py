@@ -1,7 +1,5 @@
 """numbers: one number of a selection of a study's rows, for tables, figures and findings; None where it was not run."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from typing import TYPE_CHECKING, Any, TypeAlias
 
@@ -19,7 +17,7 @@ Number: TypeAlias = Callable[["Results", Where], Any]
 """An entry of a table for a selection; None where it was not run."""
 
 
-def present(results: Results, where: Where, value: str = "rt_le_m") -> dict[str, Any] | None:
+def present(results: "Results", where: Where, value: str = "rt_le_m") -> dict[str, Any] | None:
     """`where` without the values for which nothing was run; None if that leaves no row with a number.
 
     Args:
@@ -39,19 +37,19 @@ def present(results: Results, where: Where, value: str = "rt_le_m") -> dict[str,
     return {name: [v for v in wanted if v in set(rows[name][kept])] for name, wanted in lists.items()}
 
 
-def mean(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
+def mean(results: "Results", where: Where, value: str = "rt_le_m") -> float | None:
     """Mean of a metric over egos, runs and training seeds."""
     kept = present(results, where, value)
     return None if kept is None else float(results.values(value, kept).mean())
 
 
-def interval(results: Results, where: Where, value: str = "rt_le_m") -> Interval | None:
+def interval(results: "Results", where: Where, value: str = "rt_le_m") -> Interval | None:
     """Mean of a metric over egos, runs and training seeds, with its interval over egos, then runs."""
     kept = present(results, where, value)
     return None if kept is None else results.interval(value, kept)
 
 
-def rms(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
+def rms(results: "Results", where: Where, value: str = "rt_le_m") -> float | None:
     """sqrt(mean over runs of RT-LE^2), averaged over egos and training seeds: the quantity that the bound bounds."""
     kept = present(results, where, value)
     if kept is None:
@@ -61,7 +59,7 @@ def rms(results: Results, where: Where, value: str = "rt_le_m") -> float | None:
     return float(np.sqrt(frame.groupby(["ego", *(["train_seed"] if seeded else [])])["square"].mean()).mean())
 
 
-def difference(results: Results, method: Where, base: Where) -> Interval | None:
+def difference(results: "Results", method: Where, base: Where) -> Interval | None:
     """RT-LE of `method` less that of `base` in metres, paired by ego and run; None where either was not run."""
     first, second = present(results, method), present(results, base)
     if first is None or second is None:
@@ -110,32 +108,32 @@ def listed(numbers: Mapping[str, float | None]) -> str:
     return ", ".join(f"{name} {three(value)} m" for name, value in ran(numbers).items())
 
 
-def _seeds(results: Results, where: Where, value: str = "rt_le_m") -> list[Any]:
+def _seeds(results: "Results", where: Where, value: str = "rt_le_m") -> list[Any]:
     kept = present(results, where, value)
     frame = results.select(kept) if kept else results.frame.iloc[:0]
     return sorted(frame["train_seed"].dropna().unique()) if "train_seed" in frame else []
 
 
-def per_seed(results: Results, where: Where, value: str = "rt_le_m") -> Floats:
+def per_seed(results: "Results", where: Where, value: str = "rt_le_m") -> Floats:
     """(S, R, E) of a metric for each training seed; S = 0 for a method that is not trained."""
     seeds = _seeds(results, where, value)
     return np.array([results.values(value, {**where, "train_seed": seed}) for seed in seeds])
 
 
-def seed_means(results: Results, where: Where) -> list[float]:
+def seed_means(results: "Results", where: Where) -> list[float]:
     """Mean RT-LE for each training seed, m; of a method that is not trained one, and none if it was not run."""
     seeds = _seeds(results, where)
     wheres = [{**where, "train_seed": seed} for seed in seeds] or [dict(where)]
     return [value for each in wheres if (value := mean(results, each)) is not None]
 
 
-def seed_std(results: Results, where: Where) -> float | None:
+def seed_std(results: "Results", where: Where) -> float | None:
     """Standard deviation over training seeds of the mean RT-LE, m; None for fewer than two seeds."""
     each = per_seed(results, where)
     return float(each.mean(axis=(1, 2)).std(ddof=1)) if len(each) > 1 else None
 
 
-def gaps(results: Results, first: Where, second: Where, value: str = "rt_le_m") -> dict[str, Interval]:
+def gaps(results: "Results", first: Where, second: Where, value: str = "rt_le_m") -> dict[str, Interval]:
     """What the difference of two selections is over -> its mean and interval: egos and runs, and seeds of the first.
 
     Args:
@@ -151,7 +149,7 @@ def gaps(results: Results, first: Where, second: Where, value: str = "rt_le_m") 
     return intervals
 
 
-def alike(results: Results, first: Where, second: Where, value: str) -> bool:
+def alike(results: "Results", first: Where, second: Where, value: str) -> bool:
     """Whether noise or training can explain the difference of two selections: an interval of it contains 0, or egos or
     runs are others, so that there is none."""
     if results.values(value, first).shape != results.values(value, second).shape:
@@ -160,7 +158,7 @@ def alike(results: Results, first: Where, second: Where, value: str) -> bool:
     return any(gap.low <= 0 <= gap.high for gap in both.values())
 
 
-def verdict(results: Results, trained: Where, other: Where, name: str) -> str:
+def verdict(results: "Results", trained: Where, other: Where, name: str) -> str:
     """Sentence on the RT-LE of `trained`, against `other`, which needs no training, with the evidence.
 
     Args:

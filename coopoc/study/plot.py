@@ -1,7 +1,5 @@
 """Plot: a figure with its caption, saved as the same bytes for the same numbers; axes, lines and legends."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass

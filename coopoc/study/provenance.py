@@ -1,7 +1,5 @@
 """Provenance of results: versions and processor, the git revision, and hashes of the source code that cells run."""
 
-from __future__ import annotations
-
 import ast
 import functools
 import hashlib

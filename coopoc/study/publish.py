@@ -1,7 +1,5 @@
 """publish: write the tables and figures of a study beside its cells, and the views.json that the report reads."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Callable, Mapping
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """Reference values: the committed numbers of a study, their tolerances, and the command that checks results by them."""
 
-from __future__ import annotations
-
 import json
 import math
 import sys
@@ -128,7 +126,7 @@ class Reference:
         store.write(given_path(path), f'{head},\n "numbers": [\n{lines}\n ]\n}}\n')
 
     @classmethod
-    def load(cls, path: str | Path) -> Reference:
+    def load(cls, path: str | Path) -> "Reference":
         """Read what `save` wrote; InputError without such a file, or for a damaged one."""
         path, hint = given_path(path), "Write them with coopoc reference --write."
         fields = {"study": str, "settings": dict, "numbers": list}

@@ -1,7 +1,5 @@
 """report: one self-contained page from folders of studies; it needs neither network nor what ran."""
 
-from __future__ import annotations
-
 import base64
 import re
 from collections.abc import Mapping, Sequence

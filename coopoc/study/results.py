@@ -1,7 +1,5 @@
 """Results: the tidy frame of a study, one row per (cell, run, ego), and its means with intervals."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -59,7 +57,7 @@ class Results:
             OWN.update(own.mask(taken, own + " (" + own.index + ")"))
 
     @classmethod
-    def load(cls, folder: str | Path) -> Results:
+    def load(cls, folder: str | Path) -> "Results":
         """Read the results in the folder of a study, finished or not.
 
         Args:
@@ -176,7 +174,7 @@ def check_metric(frame: pd.DataFrame, value: str) -> None:
         raise InputError("metric", repr(value), "must be a column of numbers", "It holds text or lists.")
 
 
-def _is(column: pd.Series[Any], value: Any) -> pd.Series[bool]:
+def _is(column: "pd.Series[Any]", value: Any) -> "pd.Series[bool]":
     return column.isna() if value is None else column == value
 
 

@@ -1,7 +1,5 @@
 """run_study: compute the cells of a study that are not finished, write each at once, and publish the views."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Sequence
 from contextlib import closing

@@ -1,7 +1,5 @@
 """The folder of a study: one Parquet file per cell, written whole or not at all, with a checksum."""
 
-from __future__ import annotations
-
 import json
 import os
 import tempfile

@@ -1,7 +1,5 @@
 """Study: a question, a grid of cells named by a hash of all that changes their numbers, and views of the results."""
 
-from __future__ import annotations
-
 import inspect
 import itertools
 from collections import Counter
@@ -77,11 +75,11 @@ class Study:
     prepare: Callable[[Sequence[Params], int], None] = lambda cells, jobs: None
     where: Callable[[Params], bool] | None = None
     shares: tuple[str, ...] = ()
-    tables: Mapping[str, Callable[[Results], Table | None]] = field(default_factory=dict)
-    figures: Mapping[str, Callable[[Results], Plot | None]] = field(default_factory=dict)
-    findings: Callable[[Results], Mapping[str, str]] | None = None
-    recipe: Callable[[Results], Params] | None = None
-    idle: Callable[[Results], Collection[str]] | None = None
+    tables: "Mapping[str, Callable[[Results], Table | None]]" = field(default_factory=dict)
+    figures: "Mapping[str, Callable[[Results], Plot | None]]" = field(default_factory=dict)
+    findings: "Callable[[Results], Mapping[str, str]] | None" = None
+    recipe: "Callable[[Results], Params] | None" = None
+    idle: "Callable[[Results], Collection[str]] | None" = None
     limitations: tuple[str, ...] = ()
     metrics: Mapping[str, str | float] = field(default_factory=dict)
     reference: str | Path | None = None
@@ -119,7 +117,7 @@ class Study:
             raise InputError("grid", twice[0], "must not be there twice", "Give each value once.")
         return cells
 
-    def answers(self, results: Results) -> dict[str, str]:
+    def answers(self, results: "Results") -> dict[str, str]:
         """Findings by key: those whose numbers were run.
 
         >>> Study("demo", "?", dict, {"x": (1,)}, findings=lambda results: {"a": "It does.", "b": ""}).answers(None)
@@ -128,7 +126,7 @@ class Study:
         by_name = self.findings(results) if self.findings else {}
         return {key: text for key, text in by_name.items() if text}
 
-    def override(self, changes: Params) -> Study:
+    def override(self, changes: Params) -> "Study":
         """The same study with other settings, or other values on an axis (a list, or words split at commas).
 
         Text is read as the type of the default. On a list of parameter mappings an axis is filtered, not replaced.

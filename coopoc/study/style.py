@@ -1,7 +1,5 @@
 """One look per method in every figure and table: colour, marker and label; the line style is its noise model."""
 
-from __future__ import annotations
-
 import tomllib
 import zlib
 from collections.abc import Mapping

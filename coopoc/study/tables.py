@@ -1,7 +1,5 @@
 """Tables with intervals for papers and pages (Markdown, CSV, LaTeX, HTML), and tables of a study's results."""
 
-from __future__ import annotations
-
 import csv
 import io
 import math
@@ -74,7 +72,7 @@ class Table:
                 raise InputError("rows", row, f"must have {len(self.header)} entries", f"Header: {self.header}.")
 
     @classmethod
-    def from_data(cls, data: Any) -> Table:
+    def from_data(cls, data: Any) -> "Table":
         """The table whose `vars` were stored as JSON; InputError if it is none."""
         try:
             rows = tuple(tuple(map(_entry, row)) for row in data["rows"])
@@ -202,7 +200,7 @@ class Table:
 
 
 def pivot(
-    results: Results,
+    results: "Results",
     rows: str | Sequence[str],
     columns: str | Sequence[str],
     value: str,
@@ -274,7 +272,7 @@ def _all(column: Any) -> str:
     return f"{words(str(column.name))}: {label(str(column.name), column.iloc[0])}."
 
 
-def lost(results: Results, where: Where | None = None) -> list[str]:
+def lost(results: "Results", where: Where | None = None) -> list[str]:
     """A sentence for each method whose estimates left the fixes by more than 100 standard deviations."""
     frame = results.select(where or {})
     if "left_fixes" not in frame or "method" not in frame:
@@ -288,7 +286,7 @@ ALIKE, WORSE = 1e-3, 1.1
 """m, difference of errors that is none; ratio of the mean error with neighbours to that of a vehicle alone."""
 
 
-def unused(results: Results, real: bool) -> list[str]:
+def unused(results: "Results", real: bool) -> list[str]:
     """A sentence for each method and K whose errors are those of a vehicle alone, in every run and for every ego, or on
     real data larger."""
     rows, texts, by = results.frame, list[str](), ["method", "max_neighbours"]
@@ -317,7 +315,7 @@ def unused(results: Results, real: bool) -> list[str]:
 
 
 def crossed(
-    results: Results,
+    results: "Results",
     head: Sequence[str],
     rows: Iterable[tuple[Sequence[Entry], Where]],
     columns: Mapping[str, Number],

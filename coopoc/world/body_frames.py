@@ -1,7 +1,5 @@
 """Body frames: headings, motion, yaw rate, compass and bearings in a vehicle's own frame, and back to the world."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

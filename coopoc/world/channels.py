@@ -1,7 +1,5 @@
 """Channels by name, and the losses that they draw."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 
 import numpy as np

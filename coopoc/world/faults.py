@@ -1,7 +1,5 @@
 """Faults: draws of outliers. Each is added to a clean draw of the same seed: recordings with and without are pairs."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 

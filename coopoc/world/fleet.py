@@ -1,7 +1,5 @@
 """Fleet: the ground truth of N vehicles that drive; their unique names and equally spaced instants."""
 
-from __future__ import annotations
-
 import hashlib
 from collections import Counter
 from collections.abc import Iterable, Sequence
@@ -99,19 +97,19 @@ those that were recorded. Give the fleet that was observed, its vehicles in the 
         """Column of a vehicle given by its id or its index; InputError if there is none."""
         return column("vehicle", vehicle, self.ids)
 
-    def select(self, vehicles: Sequence[str | int]) -> Fleet:
+    def select(self, vehicles: Sequence[str | int]) -> "Fleet":
         """The same drive with these vehicles only."""
         cols = columns("vehicles", vehicles, self.ids)
         parts = {name: getattr(self, name)[:, cols] for name in self._arrays}
         return replace(self, ids=tuple(self.ids[c] for c in cols), **parts)
 
-    def between(self, start: int, stop: int) -> Fleet:
+    def between(self, start: int, stop: int) -> "Fleet":
         """Steps start..stop-1 of the drive; negative ones count from the end. InputError if one is no whole number."""
         for name, step in (("start", start), ("stop", stop)):
             number(name, step, -(2**62), 2**62, kind=int, allowed="a step", hint="Count steps from 0.")
         return replace(self, t=self.t[start:stop], **{name: getattr(self, name)[start:stop] for name in self._arrays})
 
-    def to_frame(self) -> pd.DataFrame:
+    def to_frame(self) -> "pd.DataFrame":
         """A row per step and vehicle that is present, for pandas; a step at which a vehicle is absent has no row.
 
         Columns: `step`, `t` s, `vehicle` (its id), `x`, `y`, `z` m, `vx`, `vy`, `vz` m/s, and `heading` rad where the

@@ -1,7 +1,5 @@
 """Inbox: which messages one vehicle holds at each step, after loss, delay and the cap on its bytes."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Links: which vehicle measured which at each step, and range, azimuth and inclination between two vehicles."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

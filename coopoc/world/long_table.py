@@ -1,7 +1,5 @@
 """Long ("tidy") tables of pandas from arrays that share axes: a row per element, a column per array."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from typing import TYPE_CHECKING
 
@@ -14,7 +12,7 @@ if TYPE_CHECKING:
     import pandas as pd
 
 
-def long_table(needed_for: str, columns: Mapping[str, AnyArray], where: Bools | None = None) -> pd.DataFrame:
+def long_table(needed_for: str, columns: Mapping[str, AnyArray], where: Bools | None = None) -> "pd.DataFrame":
     """A row per element of the arrays' common shape, the last axis fastest.
 
     Args:

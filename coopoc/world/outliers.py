@@ -1,7 +1,5 @@
 """Outliers: which measurements are wrong by more than noise, how often, by how much and for how long."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
@@ -33,7 +31,7 @@ class Fault:
 
     def __post_init__(self) -> None:
         lasts = (0, 1e18, ">= 0 s, 0 for every measurement by itself")
-        check_fields(self, {"rate": (0, 1, "in [0, 1], 0.05 for one measurement in twenty"), "lasts": lasts}, law=Law)
+        check_fields(self, {"rate": (0, 1, "in [0, 1], 0.05 for one measurement in twenty"), "lasts": lasts})
         self.__dict__["size"] = extent("size", self.size)
 
 
@@ -58,10 +56,10 @@ class Outliers:
     """Slip: the speed is measured too high or too low by a share of itself; wheels that lock measure none."""
 
     def __post_init__(self) -> None:
-        check_fields(self, None, **{field.name: Fault for field in fields(self)})
+        check_fields(self)
 
     @classmethod
-    def uwb_nlos(cls) -> Outliers:
+    def uwb_nlos(cls) -> "Outliers":
         """Ultra-wideband ranging past obstacles: 5 % of the ranges too long by 0.3 m and more, 0.42 m on average.
 
         Share and sizes are those of the 233 measured ranges of libRSF's Labyrinth data set, whose stated standard
@@ -73,7 +71,7 @@ class Outliers:
         return cls(ranges=Fault(0.05, (0.3, 0.42), "exponential", 0.5))
 
     @classmethod
-    def urban_canyon(cls) -> Outliers:
+    def urban_canyon(cls) -> "Outliers":
         """Dense high buildings: 10 % of the fixes off by tens of metres, 5 % missing, for seconds.
 
         Reflections lengthen pseudoranges by "typically a few tens of meters" and positions are off as far (Groves,
@@ -84,7 +82,7 @@ class Outliers:
         return cls(fixes=Fault(0.10, (10.0, 50.0), lasts=10.0), outages=Fault(0.05, lasts=5.0))
 
     @classmethod
-    def named(cls, text: str) -> Outliers:
+    def named(cls, text: str) -> "Outliers":
         """Of presets and kinds joined by "+", as settings of studies name them; "" is none.
 
         A kind has a rate and may have a duration in s: ranges=0.05, ranges=0.05:2.

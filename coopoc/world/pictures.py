@@ -1,7 +1,5 @@
 """What pictures of positions share: axes in metres, covariance ellipses, pairs of points."""
 
-from __future__ import annotations
-
 import io
 from typing import TYPE_CHECKING, Any
 
@@ -20,7 +18,7 @@ SHARE_95 = 5.991464547107979
 """Quantile of chi-square with two degrees of freedom: squared radius of a 95 % ellipse in standard deviations."""
 
 
-def axes(ax: Axes | None) -> Axes:
+def axes(ax: "Axes | None") -> "Axes":
     """The axes themselves, or new ones, with east and north in metres on one scale.
 
     Raises:
@@ -50,14 +48,14 @@ def axes(ax: Axes | None) -> Axes:
     return ax
 
 
-def finish(ax: Axes) -> Axes:
+def finish(ax: "Axes") -> "Axes":
     """With a legend of what has a label."""
     if ax.get_legend_handles_labels()[0]:
         ax.legend(loc="best", fontsize=8, frameon=False)
     return ax
 
 
-def ellipses(ax: Axes, center: Floats, covariance: Floats, color: str, label: str | None = None) -> None:
+def ellipses(ax: "Axes", center: Floats, covariance: Floats, color: str, label: str | None = None) -> None:
     """95 % ellipses of positions in the plane; none where the covariance is not finite.
 
     Args:
@@ -81,7 +79,7 @@ def ellipses(ax: Axes, center: Floats, covariance: Floats, color: str, label: st
 
 
 def pairs(
-    ax: Axes, first: Floats, second: Floats, color: str = PALE, label: str | None = None, width: float = 0.9
+    ax: "Axes", first: Floats, second: Floats, color: str = PALE, label: str | None = None, width: float = 0.9
 ) -> None:
     """Lines between points (n, 2) and points (n, 2) m."""
     from matplotlib.collections import LineCollection

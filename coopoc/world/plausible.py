@@ -1,7 +1,5 @@
 """Plausibility: refuse numbers that nothing measures, degrees, and positions that float32 has rounded."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ..arrays import Floats, refuse

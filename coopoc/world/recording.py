@@ -1,7 +1,5 @@
 """Recording: all that vehicles may see of a drive, in R noise realisations. It holds no truth."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -158,7 +156,7 @@ class Recording:
         """R."""
         return int(self.gnss.shape[0])
 
-    def of_runs(self, runs: slice | Ints) -> Recording:
+    def of_runs(self, runs: slice | Ints) -> "Recording":
         """The same drive in some of its runs; a slice of them copies nothing.
 
         >>> from coopoc import Fleet, Sensors, observe
@@ -175,7 +173,7 @@ class Recording:
         body = None if self.body is None else Body(self.body.yaw_rate[runs], self.body.heading[runs])
         return replace(self, body=body, **parts)
 
-    def between(self, start: int, stop: int) -> Recording:
+    def between(self, start: int, stop: int) -> "Recording":
         """Steps start..stop-1 of the drive; a message that arrives later is lost.
 
         >>> from coopoc import Fleet, Sensors, observe

@@ -1,7 +1,5 @@
 """observe: a Fleet seen through Sensors and a V2X channel becomes a Recording."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 from weakref import WeakValueDictionary

@@ -1,7 +1,5 @@
 """Sensors: what noise acts on the measurements, or what noise a method assumes; and streams of keyed noise."""
 
-from __future__ import annotations
-
 import sys
 import zlib
 from dataclasses import dataclass, fields, replace
@@ -87,7 +85,7 @@ class Sensors:
             **dict.fromkeys(ANGULAR, (0.0, np.pi, "in 0..pi rad or rad/s, by np.deg2rad")),
             **dict.fromkeys(("velocity_std_ratio", "speed_scale_std"), (0.0, 1.0, "in [0, 1], 0.15 for 15 %")),
         }
-        check_fields(self, limits, gnss_bias_mode=BiasMode, velocity_reading=VelocityReading, outliers=Outliers)
+        check_fields(self, limits)
         hint = "Give metres in a tuple."
         stds = listed("gnss_std", self.gnss_std, hint, "must be 3 numbers")
         if len(stds) != 3:
@@ -121,7 +119,7 @@ class Sensors:
         std: Floats = self.velocity_std_ratio * size
         return np.maximum(std, floor or 0.0, out=std)
 
-    def motion_noise(self, interval: float = 0.0) -> MotionNoise:
+    def motion_noise(self, interval: float = 0.0) -> "MotionNoise":
         """Noise of a motion that a method assumes, never below `velocity_floor`; `interval` s as of MotionNoise."""
         from ..kernels.motion import MotionNoise
 
@@ -135,11 +133,11 @@ class Sensors:
 
         return np.sqrt(own_variances(self.motion_noise(), velocity, dt))
 
-    def known(self) -> Sensors:
+    def known(self) -> "Sensors":
         """The same sensors as a method may know them: it knows neither the bias nor the outliers."""
         return replace(self, gnss_bias=(0.0, 0.0), outliers=None)
 
-    def check_assumed(self) -> Sensors:
+    def check_assumed(self) -> "Sensors":
         """Itself, if a method may assume it; InputError where an assumed std is zero."""
         stds = {
             "gnss_std": min(self.gnss_std),
@@ -159,17 +157,17 @@ class Sensors:
         return self
 
     @classmethod
-    def paper_training(cls, velocity_reading: VelocityReading = "axis") -> Sensors:
+    def paper_training(cls, velocity_reading: VelocityReading = "axis") -> "Sensors":
         """Noise of the paper's training set: 1.5 m per axis, 10 % of the velocity (section IV.A)."""
         return cls(velocity_reading=velocity_reading)
 
     @classmethod
-    def paper_scenario1(cls) -> Sensors:
+    def paper_scenario1(cls) -> "Sensors":
         """Learned methods among themselves: 1.8 m plus a bias U[0.5, 1] m, 15 % of the velocity (section IV.B.1)."""
         return cls(gnss_std=(1.8, 1.8, 1.8), gnss_bias=(0.5, 1.0), velocity_std_ratio=0.15)
 
     @classmethod
-    def paper_scenario2(cls, velocity_std_ratio: float = 0.15) -> Sensors:
+    def paper_scenario2(cls, velocity_std_ratio: float = 0.15) -> "Sensors":
         """Training against decision: 3.5 m, 1 m, 4 deg, 4 deg (section IV.B.2); the velocity noise is not stated there,
         15 % (the paper's test setting) is the default and 10 % (its training setting) the other reading."""
         return cls(gnss_std=(3.5, 3.5, 3.5), velocity_std_ratio=velocity_std_ratio)

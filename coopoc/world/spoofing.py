@@ -1,7 +1,5 @@
 """Attack: a share of the vehicles broadcasts displaced fixes, as a spoofed or a lying receiver does."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 
 import numpy as np

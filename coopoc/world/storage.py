@@ -1,7 +1,5 @@
 """A Recording, and its truth if there is one, as an .npz file: numbers and names only, nothing in it is ever run."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import math

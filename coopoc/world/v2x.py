@@ -1,7 +1,5 @@
 """V2X: neighbourhood, rate, latency, loss and byte budget of the channel, its presets, and the messages on it."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from typing import Any, Literal
 
@@ -51,15 +49,15 @@ class V2X:
             "bytes_per_second": (0, np.inf, ">= 0"),
             "overhead": (0, 1e6, ">= 0 bytes"),
         }
-        check_fields(self, limits, schedule=Schedule)
+        check_fields(self, limits)
 
     @classmethod
-    def ideal(cls, max_neighbours: int = 6) -> V2X:
+    def ideal(cls, max_neighbours: int = 6) -> "V2X":
         """Every message at every step, at once, for free, as the paper's baselines assume."""
         return cls(max_neighbours=max_neighbours)
 
     @classmethod
-    def cam(cls, max_neighbours: int = 6) -> V2X:
+    def cam(cls, max_neighbours: int = 6) -> "V2X":
         """Cooperative Awareness Messages in town: 2.2 Hz, 350 B on air, and what a method adds to them.
 
         In unaligned PER (ETSI EN 302 637-2) a CAM takes 41 B, with a path history of ten points each half second 129 B:
@@ -72,7 +70,7 @@ class V2X:
         return cls(max_neighbours, rate=2.2, latency=0.02, loss=0.02, burst=5.0, overhead=350)
 
     @classmethod
-    def bsm(cls, max_neighbours: int = 6) -> V2X:
+    def bsm(cls, max_neighbours: int = 6) -> "V2X":
         """Basic Safety Messages: 10 Hz, 190 B on air and 300 B every fifth time, 60 ms, and what a method adds.
 
         Source: SAE J2735; 3GPP's traffic model of 190 and 300 B at 100 ms (TR 36.885).
@@ -80,7 +78,7 @@ class V2X:
         return cls(max_neighbours, rate=10.0, latency=0.06, loss=0.03, burst=5.0, overhead=212)
 
     @classmethod
-    def cpm(cls, max_neighbours: int = 6) -> V2X:
+    def cpm(cls, max_neighbours: int = 6) -> "V2X":
         """Collective Perception Messages: 5 Hz, 200 B on air, 50 ms, 5 % lost, and what a method adds.
 
         In unaligned PER (ETSI TS 103 324 V2.1.1) a CPM takes 33 B without objects and 16.75 B more for each object with

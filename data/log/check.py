@@ -1,7 +1,5 @@
 """Innovation and residual statistics of a log (`residuals`), and sentences on what is implausible."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import replace
 from typing import Any

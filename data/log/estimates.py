@@ -1,7 +1,5 @@
 """Errors of a log's clocks, odometry, antennas and pairs, with standard errors by parts of the drive."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Clock offsets, SI units and the local east-north-up frame of a log's rows; the sensor noise that they state."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING, Any
@@ -135,7 +133,7 @@ def _nowhere(rows: Rows) -> Bools:
     return np.asarray(at & in_group(rows, "fix"))
 
 
-def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, members: Sequence[Member]) -> Sensors:
+def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, members: "Sequence[Member]") -> Sensors:
     """Sensors of a log: the root mean square of the logged standard deviations of each kind.
 
     A Recording holds one standard deviation per kind; what is not logged is that of `Sensors()`, and reported.

@@ -1,7 +1,5 @@
 """Headings of a member of a log: as they were measured, or by its course, or by gyro, odometer and fixes."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 

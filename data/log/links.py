@@ -1,7 +1,5 @@
 """Association of relative measurements and messages of a log with steps and pairs: the links of a Recording."""
 
-from __future__ import annotations
-
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
 from typing import Any, NamedTuple
@@ -130,7 +128,7 @@ def of_vehicles(rows: Rows, landmarks: Collection[str], summary: Summary) -> Row
     return rows.assign(**{who: rows[who].where(~turned, other) for who, other in swapped.items()})[~left]
 
 
-def _columns(names: pd.Series[str], ids: Collection[str]) -> Ints:
+def _columns(names: "pd.Series[str]", ids: Collection[str]) -> Ints:
     """(M,) columns of names, -1 where they are no member."""
     return pd.Index(list(ids)).get_indexer(pd.Index(names)).astype(np.int64)
 

@@ -1,7 +1,5 @@
 """Resampling of one member of a log to steps: fixes, velocity or speed and yaw rate, heading, presence."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Ranges of a log less what each pair measures too long: radios whose delays are not calibrated."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Plot of a log: fixes, a filter of each vehicle, what stands, and the truth; below it when each vehicle has fixes."""
 
-from __future__ import annotations
-
 from pathlib import Path
 from textwrap import fill
 

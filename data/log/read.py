@@ -1,7 +1,5 @@
 """A log of one's own -> Recording: what any reader finds in files, on steps, and the truth where there is some."""
 
-from __future__ import annotations
-
 import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -78,7 +76,7 @@ class Log:
 
     __repr__ = short_repr
 
-    def part(self, since: float | None = None, until: float | None = None) -> Log:
+    def part(self, since: float | None = None, until: float | None = None) -> "Log":
         """The same log from `since` to `until` s after its first step, such as a part to train on and the rest.
 
         Raises:

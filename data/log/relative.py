@@ -1,7 +1,5 @@
 """Relative measurements of a log against positions: scale, lateness, outliers, wrong partners, offsets of pairs."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A log against a filter of each vehicle alone: innovations of fixes, residuals of relative measurements."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Any

@@ -1,7 +1,5 @@
 """Tables of a log: one row per measurement (long), or one column per kind (wide)."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any

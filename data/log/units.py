@@ -1,7 +1,5 @@
 """Kinds of measurements in a log and their units, the table of its rows, and the counts of what became of them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 from typing import Any, NamedTuple
 
@@ -100,7 +98,7 @@ def place(rows: Rows) -> str:
     return f"{first['file']}: row {first['row']}"
 
 
-def without_codes(rows: Rows, summary: Summary) -> Rows:
+def without_codes(rows: Rows, summary: "Summary") -> Rows:
     """Rows but those whose number says that there was no measurement, as -1, 0 or 65.535 among ranges: one of few, each
     in several rows, that are far from what can be meant, or to and from which ranges leap."""
     own = rows[in_group(rows, "odometry", "heading", "relative")]
@@ -153,7 +151,7 @@ def check_values(rows: Rows) -> None:
             raise InputError(f"{place(rows[wrong])}, {column.format(kind=first)}", shown, allowed, hint)
 
 
-def distinct(rows: Rows, summary: Summary) -> Rows:
+def distinct(rows: Rows, summary: "Summary") -> Rows:
     """Rows but those that repeat a kind of measurement of one vehicle, or pair, at one time; nothing is lost where a
     wide table repeats a fix beside each of several partners."""
     of_pair, key = in_group(rows, "relative", "message"), ["t", "vehicle", "kind", "partner"]
@@ -165,7 +163,7 @@ def distinct(rows: Rows, summary: Summary) -> Rows:
     return rows[~again]
 
 
-def fresh(rows: Rows, summary: Summary) -> Rows:
+def fresh(rows: Rows, summary: "Summary") -> Rows:
     """Rows but fixes and relative measurements that only repeat the values before, where a table at the rate of another
     sensor holds them: where most runs of equal values are of two or more, and not all are equal."""
     keys, some = ["vehicle", "partner", "fix"], rows[in_group(rows, "fix", "relative")].sort_values("t", kind="stable")

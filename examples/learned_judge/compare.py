@@ -8,8 +8,6 @@ The filter is in star.py, the training in judge.py. Five clients are vehicles th
 the client whose group has its first fault. Convoys of real errors need the roads of `coopoc data get`.
 """
 
-from __future__ import annotations
-
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence

@@ -1,7 +1,5 @@
 """Training of a judge on the true errors of all sources, in worlds where it has filtered itself."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 
 import numpy as np

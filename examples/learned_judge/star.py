@@ -5,8 +5,6 @@ range, angle and motion by a number of its own; with ones everywhere the filter 
 have no units; their time constants are in seconds.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

@@ -1,7 +1,5 @@
 """Compiled training step of GainNets: rollout, loss, backpropagation through time and AdamW."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from coopoc.arrays import Floats

@@ -1,7 +1,5 @@
 """Compiled rollout of a GainNet along a drive: the arithmetic of `GainNet.step`, and the tape that backward reads."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

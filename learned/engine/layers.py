@@ -5,8 +5,6 @@ The tape has a row of numbers per step and drive: inputs and outputs of every la
 Products write whole vectors, so that a field is followed by room or by what is written later.
 """
 
-from __future__ import annotations
-
 import math
 from functools import cache
 from typing import Any, NamedTuple, TypeAlias

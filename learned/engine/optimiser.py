@@ -1,7 +1,5 @@
 """Compiled optimiser step of many models: clipping and AdamW in two passes over the weights of each."""
 
-from __future__ import annotations
-
 from typing import Any, NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The compiled engine of GainNet: rollouts of many models, their losses and gradients."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -4,8 +4,6 @@ A loop in Python's syntax keeps its sums in memory, and to call BLAS takes longe
 rows by 252 x 32 weights take plain numba 8 to 15 multiply-adds per ns, these tiles 25 to 40 (one core with AVX-512).
 """
 
-from __future__ import annotations
-
 from typing import Any, TypeAlias
 
 import numpy as np

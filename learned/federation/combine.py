@@ -1,7 +1,5 @@
 """The server's half of a round: screening of the clients' answers, then their aggregation by a rule."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping
 from statistics import median
 from typing import NamedTuple

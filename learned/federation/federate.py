@@ -1,7 +1,5 @@
 """Federated training: local training on every client and aggregation at a server, for some rounds."""
 
-from __future__ import annotations
-
 import math
 import time
 import warnings
@@ -42,8 +40,7 @@ class Plan:
     participation: Participation = field(default_factory=Participation)
 
     def __post_init__(self) -> None:
-        limits = {"rounds": STEPS, "local_epochs": STEPS}
-        check_fields(self, limits, aggregate=object, schedule=Schedule, participation=Participation)
+        check_fields(self, {"rounds": STEPS, "local_epochs": STEPS})
 
     @property
     def rule(self) -> Rule:

@@ -1,7 +1,5 @@
 """The record of a federated training: its rounds, the selected net, and the traffic."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field

@@ -1,7 +1,5 @@
 """The clients' half of a round: local training, of one client or of all clients as one stack."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Sequence
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Participation: the clients that a round asks; Byzantine clients."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 

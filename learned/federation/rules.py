@@ -1,7 +1,5 @@
 """Aggregation rules: mean, median, trimmed mean and Krum."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass

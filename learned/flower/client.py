@@ -1,7 +1,5 @@
 """ClientApp of a vehicle: it trains received weights on its own drive and answers with weights and numbers."""
 
-from __future__ import annotations
-
 import os
 import sys
 import traceback
@@ -42,7 +40,7 @@ def require_flower(needed_for: str) -> None:
         raise MissingLibraryError("flwr", needed_for, "'coopoc[flower]'") from None
 
 
-def client_app(source: Source | None = None) -> ClientApp:
+def client_app(source: "Source | None" = None) -> "ClientApp":
     """The ClientApp of one vehicle: `local_fit` on its own drive, hence the weights that `federate` would give it.
 
     Any strategy of Flower's Message API can ask it: it reads "arrays" and "server-round", and answers with "arrays" and
@@ -61,17 +59,17 @@ def client_app(source: Source | None = None) -> ClientApp:
     app, data = ClientApp(), source or configured
 
     @app.train()
-    def train(message: Message, context: Context) -> Message:
+    def train(message: "Message", context: "Context") -> "Message":
         return _replied(message, context, data, training=True)
 
     @app.evaluate()
-    def evaluate(message: Message, context: Context) -> Message:
+    def evaluate(message: "Message", context: "Context") -> "Message":
         return _replied(message, context, data, training=False)
 
     return app
 
 
-def configured(context: Context) -> tuple[Client, Job]:
+def configured(context: "Context") -> tuple[Client, Job]:
     """The vehicle by the node's own configuration, `data` (a name or a path of a fleet, whose measurements are
     simulated) or `log` (a path of measurements with their truth), and `vehicle` (an id, not needed if the data hold one
     vehicle), and the job by the run's. Drives of other vehicles are not used.
@@ -93,7 +91,7 @@ def configured(context: Context) -> tuple[Client, Job]:
 
 
 @one_core()
-def answer(client: Client, job: Job, content: RecordDict, training: bool) -> RecordDict:
+def answer(client: Client, job: Job, content: "RecordDict", training: bool) -> "RecordDict":
     """The client's half of a round: the loss of the received weights on its own validation pieces or, if asked to
     train, new weights and their training loss; its name, and the number of its training pieces.
 
@@ -118,7 +116,7 @@ def answer(client: Client, job: Job, content: RecordDict, training: bool) -> Rec
     return made
 
 
-def _replied(message: Message, context: Context, source: Source, training: bool) -> Message:
+def _replied(message: "Message", context: "Context", source: Source, training: bool) -> "Message":
     """The reply. Only the type of an exception leaves, because its text may quote a coordinate."""
     from flwr.app import Error, Message
 

@@ -1,7 +1,5 @@
 """The training job of a Flower run's configuration."""
 
-from __future__ import annotations
-
 import json
 from collections.abc import Mapping
 from contextlib import suppress

@@ -1,7 +1,5 @@
 """ServerApp of a federation: one of Flower's strategies, fed with screened answers, and its rounds as a checkpoint."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Callable, Iterable, Sequence
@@ -71,7 +69,7 @@ class Row(NamedTuple):
         return f"round {self.number}: validation {mean:.4f} m^2 over {len(losses)} clients{why}"
 
 
-def server_app(main: Callable[[Grid, Context], None] | None = None) -> ServerApp:
+def server_app(main: "Callable[[Grid, Context], None] | None" = None) -> "ServerApp":
     """The ServerApp of a federation.
 
     Args:
@@ -89,7 +87,7 @@ def server_app(main: Callable[[Grid, Context], None] | None = None) -> ServerApp
     return app
 
 
-def configured(grid: Grid, context: Context) -> None:
+def configured(grid: "Grid", context: "Context") -> None:
     """All rounds by the run's configuration; the checkpoint is written after each of them, with the names of the nodes,
     which a new run with the same `out` keeps.
 
@@ -120,7 +118,7 @@ def configured(grid: Grid, context: Context) -> None:
 
 
 def rounds(
-    grid: Grid,
+    grid: "Grid",
     job: Job,
     nodes: int,
     timeout: float,
@@ -172,7 +170,7 @@ def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object], name
             self.usual: float | None = None
             keep(self.row)
 
-        def aggregate_train(self, server_round: int, replies: Iterable[Message]) -> tuple[Any, Any]:
+        def aggregate_train(self, server_round: int, replies: "Iterable[Message]") -> tuple[Any, Any]:
             answers, rejected, note = read(replies, names, "training-loss")
             weights = {name: _theta(reply) for name, reply in answers.items()}
             refused, self.usual = screen(self.row.weights, weights, self.usual)
@@ -189,7 +187,7 @@ def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object], name
             self.row = Row(server_round, now, losses, {}, {n: int(k) for n, k in pieces.items()}, rejected, note)
             return combined, metrics
 
-        def aggregate_evaluate(self, server_round: int, replies: Iterable[Message]) -> Any:
+        def aggregate_evaluate(self, server_round: int, replies: "Iterable[Message]") -> Any:
             answers, rejected, _ = read(replies, names, "validation-loss")
             losses, counts = _numbers(answers, "validation-loss"), _numbers(answers, "num-examples")
             pieces = {name: int(count) for name, count in counts.items()}
@@ -201,8 +199,8 @@ def _strategy(aggregate: str, theta: Tensor, keep: Callable[[Row], object], name
 
 
 def read(
-    replies: Iterable[Message], names: dict[int, str], loss: str
-) -> tuple[dict[str, Message], dict[str, str], str]:
+    replies: "Iterable[Message]", names: dict[int, str], loss: str
+) -> "tuple[dict[str, Message], dict[str, str], str]":
     """Readable answers by client name, in the order of the names, reasons of the others, and a note.
 
     A client is its node, which Flower knows by its key. The name that it gives is a label, and belongs to the node that
@@ -267,12 +265,12 @@ def _problem(content: Any, loss: str) -> str:
     return ""
 
 
-def _numbers(answers: dict[str, Message], name: str) -> dict[str, float]:
+def _numbers(answers: "dict[str, Message]", name: str) -> dict[str, float]:
     """A metric by client."""
     return {client: float(reply.content["metrics"][name]) for client, reply in answers.items()}  # type: ignore[arg-type]
 
 
-def _theta(reply: Message) -> Tensor:
+def _theta(reply: "Message") -> Tensor:
     arrays: Any = reply.content["arrays"]
     return torch.from_numpy(arrays["theta"].numpy().copy())
 

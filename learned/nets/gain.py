@@ -12,8 +12,6 @@ of a batch is NaN where there is no truth; `error`, `has_truth` and `over_time` 
 Arguments of the constructor that are kept as attributes of the same name make the net again from a checkpoint.
 """
 
-from __future__ import annotations
-
 import inspect
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
@@ -51,7 +49,7 @@ class Gain(nn.Module, ABC):
     def method(self, name: str, x0: Floats | None = None) -> Method:
         """This net as a method, Recording -> Track, from the first fix or an exact start (R, E, 3) or (E, 3) m."""
 
-    def calibrate(self, parts: Sequence[Segments]) -> Gain:
+    def calibrate(self, parts: Sequence[Segments]) -> "Gain":
         """The trained net, with what the loss cannot see set from the training segments of each client."""
         return self
 

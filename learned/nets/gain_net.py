@@ -1,7 +1,5 @@
 """GainNet: the three-GRU KalmanNet gain for a position state with a velocity control."""
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """OptimisedKF: a Kalman filter whose noise parameters are trained on the loss and the segments of the nets."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -10,7 +8,7 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
-from coopoc.arrays import Floats, checked, seed_of
+from coopoc.arrays import Floats, check_fields, checked, seed_of
 from coopoc.errors import InputError
 from coopoc.kernels.compiling.waiting import clock
 from coopoc.kernels.motion import MotionNoise, own_variances
@@ -19,7 +17,7 @@ from coopoc.methods.gaps import in_stretches
 from coopoc.methods.kalman import solo_filter, solo_track
 from coopoc.methods.noise_model import check_interval
 from coopoc.methods.stream import FilterStream
-from coopoc.methods.track import Alone, Track, check_options
+from coopoc.methods.track import Alone, Track
 from coopoc.short_repr import short_repr
 from coopoc.world.recording import Recording, Vehicles, check_recording
 
@@ -60,7 +58,7 @@ class OptimisedKF(Alone):
             value = checked(field, getattr(self, field), "(3,)", (3,))
             if not (np.isfinite(value) & (value >= 0)).all():
                 raise InputError(field, getattr(self, field), "must be three numbers >= 0", "Train it with fit_okf.")
-        check_options(self)
+        check_fields(self)
         if min(self.gnss_std) == 0:
             raise InputError("gnss_std", self.gnss_std, "must be > 0", "Assumed noise may not be zero.")
 
@@ -117,7 +115,7 @@ class NoiseParameters(Gain):
         """a m, b, r m per axis (S, 3, 3) of weights (S, 9)."""
         return theta.view(-1, 3, 3).exp()
 
-    def with_logs(self, logs: Tensor) -> NoiseParameters:
+    def with_logs(self, logs: Tensor) -> "NoiseParameters":
         """A filter of this kind with other log a, log b, log r (3, 3)."""
         made = NoiseParameters()
         with torch.no_grad():
@@ -135,7 +133,7 @@ class NoiseParameters(Gain):
         return OptimisedKF(process, ratio, gnss, x0, name)
 
     @one_core()
-    def calibrate(self, parts: Sequence[Segments]) -> NoiseParameters:
+    def calibrate(self, parts: Sequence[Segments]) -> "NoiseParameters":
         """The same filter with the scale that gives the normalised innovations of all training segments unit variance.
 
         Of each client's segments it needs the mean square per axis only: three numbers per client.

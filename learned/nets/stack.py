@@ -1,7 +1,5 @@
 """Many nets of one shape as one matrix of weights: row s of theta (S, P) is net s."""
 
-from __future__ import annotations
-
 import copy
 from collections.abc import Sequence
 from typing import TypeVar

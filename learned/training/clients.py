@@ -1,7 +1,5 @@
 """Clients: the training drives, each with its own noise, cut into private segments."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 from functools import cached_property
@@ -94,19 +92,19 @@ class Segments:
         """Whether any piece starts at the truth."""
         return bool(self.true_start.any())
 
-    def take(self, index: Sequence[int]) -> Segments:
+    def take(self, index: Sequence[int]) -> "Segments":
         """The pieces `index`."""
         return self._each(lambda name: getattr(self, name)[list(index)])
 
     @classmethod
-    def join(cls, parts: Sequence[Segments]) -> Segments:
+    def join(cls, parts: "Sequence[Segments]") -> "Segments":
         """All pieces of several parts in their order; the parts agree in length and dt."""
         if len({(p.truth.shape[1], p.dt) for p in parts}) != 1:
             agreed = [(p.truth.shape[1], p.dt) for p in parts]
             raise InputError("pieces", agreed, "must agree in length and dt", "Cut all clients alike.")
         return parts[0]._each(lambda name: torch.cat([getattr(p, name) for p in parts]))
 
-    def _each(self, made: Callable[[str], Tensor]) -> Segments:
+    def _each(self, made: Callable[[str], Tensor]) -> "Segments":
         """The same pieces with every tensor field replaced by what `made` gives for its name."""
         tensors = {f.name: made(f.name) for f in fields(self) if isinstance(getattr(self, f.name), Tensor)}
         return Segments(**tensors, dt=self.dt)
@@ -147,7 +145,7 @@ class Client:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_fields(self, training=Segments, validation=Segments, long=Segments)
+        check_fields(self)
 
 
 def clients(

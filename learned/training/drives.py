@@ -1,7 +1,5 @@
 """Measured drives: what vehicles measured and where they truly were, to train on in place of a fleet."""
 
-from __future__ import annotations
-
 import hashlib
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -16,9 +14,6 @@ from coopoc.short_repr import short_repr
 from coopoc.world.fleet import Fleet, columns
 from coopoc.world.recording import Recording, check_recording
 from coopoc.world.storage import digest
-
-Drives: TypeAlias = "Fleet | MeasuredDrives"
-"""What clients are made of: a fleet, whose measurements are simulated, or what was measured."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,9 +68,13 @@ class MeasuredDrives:
         parts = digest(self.recording), self.truth.digest, *self.ids
         return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
-    def select(self, vehicles: Sequence[str]) -> MeasuredDrives:
+    def select(self, vehicles: Sequence[str]) -> "MeasuredDrives":
         """The same drives with these vehicles as the only clients."""
         return replace(self, ids=tuple(vehicles))
+
+
+Drives: TypeAlias = Fleet | MeasuredDrives
+"""What clients are made of: a fleet, whose measurements are simulated, or what was measured."""
 
 
 class Logged(Protocol):

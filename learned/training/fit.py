@@ -1,7 +1,5 @@
 """fit: train nets on pieces, one or many at once, and keep the weights that validate best."""
 
-from __future__ import annotations
-
 import math
 import time
 from collections.abc import Iterator, Sequence
@@ -36,7 +34,7 @@ class Task:
     long: Segments | None = None
 
     def __post_init__(self) -> None:
-        check_fields(self, model=Gain, training=Segments, validation=Segments, long=Segments)
+        check_fields(self)
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,5 @@
 """Resources of training: one core per process, memory that it keeps, a line of the terminal to report on."""
 
-from __future__ import annotations
-
 import ctypes
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager

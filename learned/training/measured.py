@@ -1,7 +1,5 @@
 """Clients of measured drives: the fixes and odometry of a recording in pieces, with its truth as the target."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator, Sequence
 from typing import Any
 

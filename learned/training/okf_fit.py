@@ -1,7 +1,5 @@
 """fit_okf: train the nine parameters of an OptimisedKF on all segments at once, in double precision."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Sequence
 from typing import Any

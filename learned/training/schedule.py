@@ -1,7 +1,5 @@
 """Schedule: how a net is optimised; plans of batches; the optimiser of many models at once."""
 
-from __future__ import annotations
-
 import sys
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
@@ -48,7 +46,7 @@ class Schedule:
     kept."""
 
     def __post_init__(self) -> None:
-        check_fields(self, LIMITS, epoch=Epoch)
+        check_fields(self, LIMITS)
 
     def plan(self, pieces: int, draw: np.random.Generator) -> Ints:
         """(steps, batch) indices of the pieces that each optimiser step sees, without repetition within a pass."""

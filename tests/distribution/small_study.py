@@ -1,7 +1,5 @@
 """A third party's study, as it would be installed: one circle of traffic, two filters, a row of neighbours."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

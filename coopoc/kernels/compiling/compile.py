@@ -1,7 +1,5 @@
 """How kernels are compiled: machine code at the first call, kept on disk, no interpreter's lock."""
 
-from __future__ import annotations
-
 import gc
 import json
 import os

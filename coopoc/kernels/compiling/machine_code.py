@@ -1,7 +1,5 @@
 """Machine code on disk: compiled once per machine, found again by the content of its sources."""
 
-from __future__ import annotations
-
 import hashlib
 import json
 import re

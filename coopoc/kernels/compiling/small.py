@@ -8,8 +8,6 @@ Products and sums are fused where `plus` and `less` stand and nowhere else, so t
 alone.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any
 

@@ -8,8 +8,6 @@ a run gets the digits that it gets alone.
 an ordinary loop, of which nothing is left at run time, and numba infers no types for its inside.
 """
 
-from __future__ import annotations
-
 import math
 import operator
 from collections.abc import Callable, Sequence
@@ -60,7 +58,7 @@ class Number:
         everywhere = ir.Constant(ir.VectorType(ir.IntType(32), LANES), [0] * LANES)
         return self.build.shuffle_vector(self.build.insert_element(nothing, self.value, first), nothing, everywhere)
 
-    def apply(self, make: Callable[..., Any], *others: Number | float, kind: Any = None) -> Number:
+    def apply(self, make: Callable[..., Any], *others: "Number | float", kind: Any = None) -> "Number":
         """What an LLVM instruction makes of this number and others, a vector if one of them is."""
         numbers = [
             n if isinstance(n, Number) else Number(types.float64, self.build, _constant(n)) for n in (self, *others)
@@ -71,7 +69,7 @@ class Number:
             return Number(own)
         return Number(own, self.build, make(self.build, *(n.wide if batched else n.value for n in numbers)))
 
-    def call(self, name: str, *others: Number | float) -> Number:
+    def call(self, name: str, *others: "Number | float") -> "Number":
         """An LLVM intrinsic of numbers, such as fma."""
 
         def make(build: Any, *values: Any) -> Any:
@@ -82,38 +80,38 @@ class Number:
 
         return self.apply(make, *others)
 
-    def __add__(self, other: Number | float) -> Number:
+    def __add__(self, other: "Number | float") -> "Number":
         return self.apply(lambda build, a, b: build.fadd(a, b), other)
 
-    def __sub__(self, other: Number | float) -> Number:
+    def __sub__(self, other: "Number | float") -> "Number":
         return self.apply(lambda build, a, b: build.fsub(a, b), other)
 
-    def __mul__(self, other: Number | float) -> Number:
+    def __mul__(self, other: "Number | float") -> "Number":
         return self.apply(lambda build, a, b: build.fmul(a, b), other)
 
-    def __truediv__(self, other: Number | float) -> Number:
+    def __truediv__(self, other: "Number | float") -> "Number":
         return self.apply(lambda build, a, b: build.fdiv(a, b), other)
 
-    def __neg__(self) -> Number:
+    def __neg__(self) -> "Number":
         return self.apply(lambda build, a: build.fneg(a))
 
-    def over(self) -> Number:
+    def over(self) -> "Number":
         """1 / x."""
         return self.apply(lambda build, a, one: build.fdiv(one, a), 1.0)
 
-    def plus(self, a: Number, b: Number) -> Number:
+    def plus(self, a: "Number", b: "Number") -> "Number":
         """self + a b, rounded once."""
         return a.call("fma", b, self)
 
-    def less(self, a: Number, b: Number) -> Number:
+    def less(self, a: "Number", b: "Number") -> "Number":
         """self - a b, rounded once."""
         return (-a).call("fma", b, self)
 
-    def larger(self, other: Number | float) -> Number:
+    def larger(self, other: "Number | float") -> "Number":
         """self where it is at least the other, else that."""
         return self.apply(lambda build, a, b: build.select(build.fcmp_ordered(">=", a, b), a, b), other)
 
-    def choose(self, a: Number, b: Number) -> Number:
+    def choose(self, a: "Number", b: "Number") -> "Number":
         """a where this number is positive, else b."""
 
         def make(build: Any, sign: Any, x: Any, y: Any) -> Any:
@@ -121,7 +119,7 @@ class Number:
 
         return self.apply(make, a, b)
 
-    def at_most(self, other: Number) -> Number:
+    def at_most(self, other: "Number") -> "Number":
         """Whether self <= other in all lanes, which a NaN is not."""
 
         def make(build: Any, a: Any, b: Any) -> Any:

@@ -1,7 +1,5 @@
 """Time that goes to loading libraries and to compiling, kept apart from that of computing."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from contextlib import contextmanager
 from importlib import import_module

@@ -4,8 +4,6 @@ One kernel runs every kind of measurement, those of plug-ins too, so that nothin
 loop over a block of measurements within each operation leaves little of the cost of reading the tape.
 """
 
-from __future__ import annotations
-
 from enum import IntEnum
 from typing import NamedTuple
 

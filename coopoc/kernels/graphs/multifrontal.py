@@ -9,8 +9,6 @@ References:
     multifrontal method for sparse matrix solution, SIAM Review 1992.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Extended Kalman filter of poses: one vehicle, or a fleet in one state or by fusion of pairs of estimates."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

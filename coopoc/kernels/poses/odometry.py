@@ -1,7 +1,5 @@
 """Prediction of poses: odometry of speed and yaw rate moves a member's state and its covariance."""
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -6,8 +6,6 @@ that offset, (a, b, c, h, o), and at most in the position of another, (-a, -b, -
 vector between the two and of the first one's heading.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple
 

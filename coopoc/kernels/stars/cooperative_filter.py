@@ -5,8 +5,6 @@ measurements, and at last who is trusted. A member stands where it
 was when it sent its newest message. A drive and a stream call the same `step`.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

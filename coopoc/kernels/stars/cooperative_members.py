@@ -1,7 +1,5 @@
 """Members of the cooperative filter's star leave, move and join; what is remembered of a vehicle is its status."""
 
-from __future__ import annotations
-
 import math
 
 from ...arrays import Floats, Ints

@@ -1,7 +1,5 @@
 """What the vehicles of a star send, and what their fixes say: a fading memory of fixes, and whose are trusted."""
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

@@ -4,8 +4,6 @@ A member is in one of the slots while the ego measures it; slot 0 is the ego's. 
 star or not, is its status.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ vector from the ego, which the member's own relative measurements and both motio
 a gate is never tighter than that of the exact innovation.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -5,8 +5,6 @@ stand side by side in x and P, and zeros behind them, so that every loop runs ov
 `block` holds where.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

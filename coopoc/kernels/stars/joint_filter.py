@@ -9,8 +9,6 @@ A matrix of n x n blocks stands in memory as `compiling.small` keeps it: block (
 i stride + j; those below the diagonal are never read.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -10,8 +10,6 @@ References:
     innovations); James, Stein, Estimation with quadratic loss, 1961 (c - s^2 / c).
 """
 
-from __future__ import annotations
-
 import math
 
 from ...arrays import Floats

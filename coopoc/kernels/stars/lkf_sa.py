@@ -1,7 +1,5 @@
 """The Laplacian Kalman filter (LKF-SA) of an ego's star, in the blocks of the joint filter."""
 
-from __future__ import annotations
-
 from ..compiling.compile import as_written, inner, inside
 from ..compiling.small import add, add_diagonal, load, negate, scale, store, subtract, zeros
 from ..compiling.vectors import LANES, choose

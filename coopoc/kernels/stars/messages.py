@@ -5,8 +5,6 @@ since then, and its position as broadcast, brought forward to now. A message tha
 whose position was used before, or has no fix, has new = 0.
 """
 
-from __future__ import annotations
-
 import math
 from typing import Any, NamedTuple, TypeAlias, cast
 

@@ -30,8 +30,6 @@ References:
     Identification, MIT Press, 1983, chapter 3.
 """
 
-from __future__ import annotations
-
 import math
 from typing import NamedTuple
 

@@ -9,8 +9,6 @@ and w makes the trace of P = (F + sum of L)^-1 least, F the information that dep
 convex function, by Newton's method within brackets from the weight of the step before. LANES runs side by side.
 """
 
-from __future__ import annotations
-
 from typing import NamedTuple
 
 import numpy as np

@@ -4,8 +4,6 @@ Times are in seconds, and any dt will do: a velocity that has served for L s and
 (L + dt)^2 - L^2 times its own variance.
 """
 
-from __future__ import annotations
-
 import math
 
 import numpy as np

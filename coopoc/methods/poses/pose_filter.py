@@ -1,14 +1,12 @@
 """The pose filter: extended Kalman filter of position and heading of a vehicle alone or of the whole fleet."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Ints, checked, number
+from ...arrays import Bools, Floats, Ints, check_fields, checked, number
 from ...errors import InputError
 from ...kernels.compiling.waiting import clock
 from ...short_repr import short_repr
@@ -20,7 +18,7 @@ from ...world.sensors import Sensors
 from ...world.v2x import NO_MESSAGE, Message
 from ..batch_smoother import CENTRE, centre
 from ..doubts import doubts
-from ..track import Track, check_options
+from ..track import Track
 from .pose_inputs import (
     POSE,
     SPREAD,
@@ -95,7 +93,7 @@ class PoseFilter:
     __repr__ = short_repr
 
     def __post_init__(self) -> None:
-        check_options(self, unit=Unit, fusion=Fusion)
+        check_fields(self)
         if self.fusion != "joint" and self.unit != "fleet":
             raise InputError("fusion", self.fusion, "is for a fleet", 'Take unit="fleet".')
         number("gate", self.gate, 1.0, np.inf, allowed=">= 1 standard deviation", hint="4 leaves outliers out.")
@@ -217,14 +215,14 @@ class PoseFilter:
         first, spread = np.ascontiguousarray(begin[:, members]), np.array(self.spread, dtype=float)
         return run_filter(measured, noise, first, spread, options, *memory)
 
-    def noise(self, sensors: Sensors, dt: float) -> PoseNoise:
+    def noise(self, sensors: Sensors, dt: float) -> "PoseNoise":
         """What it assumes, as the kernel takes it."""
         assumed = pose_noise(sensors, dt, self.gate)
         lasting = any(assumed.lasting) if self.lasting is None else self.lasting
         assumed = assumed if lasting else assumed._replace(longer=0.0, lasting=(0.0, 0.0, 0.0))
         return assumed if self.robust else assumed._replace(gate=np.inf)
 
-    def options(self, noise: PoseNoise) -> PoseOptions:
+    def options(self, noise: "PoseNoise") -> "PoseOptions":
         """As the kernel takes them."""
         from ...kernels.poses.ekf import PoseOptions
 

@@ -1,7 +1,5 @@
 """Inputs of pose methods: egos, first poses, the noise that is assumed, and arguments of the kernel."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
@@ -99,7 +97,7 @@ def first_poses(recording: Recording, begin: Floats | None, columns: Sequence[in
     return poses
 
 
-def pose_noise(sensors: Sensors, dt: float, gate: float) -> PoseNoise:
+def pose_noise(sensors: Sensors, dt: float, gate: float) -> "PoseNoise":
     """What a pose filter assumes of its sensors.
 
     Args:
@@ -128,7 +126,7 @@ def pose_noise(sensors: Sensors, dt: float, gate: float) -> PoseNoise:
 
 def pose_measurements(
     recording: Recording, members: Sequence[int], links: Ints, kept: Bools | None = None, landmark: Floats | None = None
-) -> PoseMeasurements:
+) -> "PoseMeasurements":
     """Arguments of the kernel.
 
     Args:

@@ -1,7 +1,5 @@
 """First poses of vehicles that do not know theirs: several headings are tried, and the most likely one is kept."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Streaming poses: a vehicle alone, fed step by step with what is measured on board."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, NamedTuple
@@ -103,7 +101,7 @@ class PoseStream:
         dt: s of a step.
     """
 
-    def __init__(self, noise: PoseNoise, options: PoseOptions, begin: Floats, spread: Floats, dt: float) -> None:
+    def __init__(self, noise: "PoseNoise", options: "PoseOptions", begin: Floats, spread: Floats, dt: float) -> None:
         from ...kernels.poses.scalar_update import new_poses
 
         self._noise, self._options, self._spread, self._dt = noise, options, spread, dt

@@ -1,7 +1,5 @@
 """Sparse Cholesky factors of a Hessian with their analysis kept: solve, definiteness, marginals of any unknowns."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

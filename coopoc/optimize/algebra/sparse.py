@@ -1,7 +1,5 @@
 """The cost of a problem by tapes: value, gradient and sparse Hessian at a point, and factors of it."""
 
-from __future__ import annotations
-
 import threading
 from collections.abc import Sequence
 from dataclasses import dataclass

@@ -1,7 +1,5 @@
 """Active constraints at a point: their multipliers, the directions that remain, and the largest violation."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any

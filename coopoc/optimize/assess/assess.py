@@ -1,7 +1,5 @@
 """Assessment of a point independently of its solver: covariance, free nodes, curvature, plausible cost."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
@@ -419,7 +417,7 @@ def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
     return mean, mean + max(turns, 0)
 
 
-def joint_covariance(problem: Problem, solution: Solution, nodes: Sequence[str | int]) -> Floats:
+def joint_covariance(problem: Problem, solution: "Solution", nodes: Sequence[str | int]) -> Floats:
     """Covariance of some nodes together: their rows and columns of (J^T J)^-1 at the solution.
 
     Two nodes of it give the covariance of their difference, which their marginals do not: P_ii + P_jj - P_ij - P_ji.

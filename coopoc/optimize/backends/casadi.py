@@ -6,8 +6,6 @@ centre that moves to each answer until the step is below the tolerance. FATROP (
 small problems without inequalities, IPOPT the others and those where FATROP fails.
 """
 
-from __future__ import annotations
-
 from dataclasses import replace
 from functools import lru_cache
 from typing import Any
@@ -94,7 +92,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
 
 def _run(
     form: Structure,
-    nlp: NlpSolver,
+    nlp: "NlpSolver",
     problem: Problem,
     numbers: Floats,
     x: Floats,

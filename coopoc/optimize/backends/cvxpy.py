@@ -1,7 +1,5 @@
 """cvxpy: Shor's semidefinite relaxation, rounded and refined; the extras hold its bound."""
 
-from __future__ import annotations
-
 from functools import partial
 
 from ...arrays import Floats

@@ -1,7 +1,5 @@
 """gauss-newton: the reference. Levenberg-Marquardt with sparse Cholesky factors."""
 
-from __future__ import annotations
-
 from ...arrays import Floats
 from ..algebra.sparse import sparse
 from ..backend import MAX_ITERATIONS, TOLERANCE, Backend, Solver, SolverResult

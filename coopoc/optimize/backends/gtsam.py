@@ -7,8 +7,6 @@ twenty times as long: a bearing in space, and range, azimuth and inclination in 
 is a Point2/3, a pose a Pose2/3.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import lru_cache
 from typing import Any, NamedTuple, TypeAlias

@@ -10,8 +10,6 @@ and 1.6 would make 40 of them out of one), and a repair is further iterations. W
 exactly for the active set that the iterations have found (polishing).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import lru_cache
 from threading import get_ident

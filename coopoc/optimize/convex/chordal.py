@@ -1,7 +1,5 @@
 """Chordal initialisation: rotations relaxed to matrices together with all positions, then positions alone."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ...arrays import Floats, Ints

@@ -11,8 +11,6 @@ changes nothing; H = I picks the world's. A scalar weight w acts on all d column
 displacement weighs its axes differently the columns are stacked into one, X = [1; vec s; vec t], of d times the rows.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property

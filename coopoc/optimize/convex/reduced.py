@@ -4,8 +4,6 @@
 C = Q_cc - Q_cf Q_ff^-1 Q_fc. Whatever block-diagonal L is subtracted, C - L is the Schur complement of Q - diag(L, 0).
 """
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any

@@ -5,8 +5,6 @@ semidefinite with the diagonal blocks that the constraints give it, and drops it
 a start from which to refine.
 """
 
-from __future__ import annotations
-
 import importlib
 import time
 from collections.abc import Callable

@@ -1,7 +1,5 @@
 """Levenberg-Marquardt by sparse Cholesky factors, or by quadratic programmes, with exact Hessians at the end."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass

@@ -4,8 +4,6 @@ CasADi runs the measurement's own formula, differentiates what it costs and hand
 which the kernel in kernels/graphs/graph_tape.py runs for all measurements.
 """
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -284,7 +282,7 @@ class Written(NamedTuple):
         entries: (outputs, 2); the cost has -1 twice.
     """
 
-    tape: Tape
+    tape: "Tape"
     entries: Ints
 
 
@@ -333,7 +331,7 @@ def write(kind: Kind, model: Model) -> Written:
     return Written(tape, np.array([entries[k] for k in kept], dtype=np.int64).reshape(-1, 2))
 
 
-def _tape(function: Any, name: str) -> Tape:
+def _tape(function: Any, name: str) -> "Tape":
     """The operations of a CasADi function of one vector."""
     from ...kernels.graphs.graph_tape import Operation, Tape
 

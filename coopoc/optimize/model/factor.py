@@ -1,7 +1,5 @@
 """Factor, Loss and Constraint: M measurements of one kind and their noise, robust losses, bounds on formulas."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import InitVar, dataclass, fields
 from functools import cache, cached_property
@@ -168,7 +166,7 @@ class Factor:
         return f"Factor({self.kind} x {len(self.nodes)})"
 
 
-def _checked(item: Factor | Constraint) -> Measurement:
+def _checked(item: "Factor | Constraint") -> Measurement:
     """The measurement of an item, with its name, nodes and constants checked."""
     measurement = item.measurement
     nodes = check_nodes(measurement, item.nodes)

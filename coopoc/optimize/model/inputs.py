@@ -1,7 +1,5 @@
 """Nodes, values and standard deviations as users give them, checked."""
 
-from __future__ import annotations
-
 from functools import lru_cache
 
 import numpy as np

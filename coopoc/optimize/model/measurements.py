@@ -3,8 +3,6 @@
 Fixes, odometry, ranges and angles of points and of poses are registered here; other distributions add theirs.
 """
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, get_args

@@ -1,7 +1,5 @@
 """Problem: nodes and factors between them; whitened residuals, their exact Jacobian and the cost."""
 
-from __future__ import annotations
-
 from collections import Counter
 from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, replace
@@ -177,8 +175,8 @@ class Problem:
         cov: npt.ArrayLike | None = None,
         sqrt_information: npt.ArrayLike | None = None,
         constants: npt.ArrayLike | None = None,
-        loss: Loss | None = None,
-    ) -> Problem:
+        loss: "Loss | None" = None,
+    ) -> "Problem":
         """The problem with one more measurement, or with M of one kind; the arguments are those of Factor.
 
         Args:
@@ -198,7 +196,7 @@ class Problem:
         )
         return self._with(factor)
 
-    def _with(self, factor: Factor) -> Problem:
+    def _with(self, factor: Factor) -> "Problem":
         """The problem with one more factor, which alone is checked: what was checked and found before is kept."""
         check_item(factor, self.names, self._turning, self.dimension)
         return self.replace_unchecked(factors=(*self.factors, factor))
@@ -210,7 +208,7 @@ class Problem:
         lower: npt.ArrayLike = -np.inf,
         upper: npt.ArrayLike = np.inf,
         constants: npt.ArrayLike | None = None,
-    ) -> Problem:
+    ) -> "Problem":
         """The problem with lower <= h(x) <= upper for the kind's formula h; the arguments are those of Constraint.
 
         >>> Problem(("a",)).constrain("position", "a", lower=[0, 0, -np.inf]).constraints
@@ -225,7 +223,7 @@ class Problem:
         constraint = Constraint(kind, index, low, high, constants)  # type: ignore[arg-type]
         return replace(self, constraints=(*self.constraints, constraint))
 
-    def replace_unchecked(self, **changes: Any) -> Problem:
+    def replace_unchecked(self, **changes: Any) -> "Problem":
         """The problem with changes that come from checked parts and need not be checked again."""
         changed, kept = unchecked(self, **changes), self.__dict__
         for name, inputs in DERIVED:
@@ -233,7 +231,7 @@ class Problem:
                 changed.__dict__[name] = kept[name]
         return changed
 
-    def restricted(self, used: Bools, x: Floats, rows: Sequence[Ints] | None = None) -> Problem:
+    def restricted(self, used: Bools, x: Floats, rows: Sequence[Ints] | None = None) -> "Problem":
         """The problem of some nodes, from x, which has no separator.
 
         Args:
@@ -283,8 +281,8 @@ class Problem:
 
     @classmethod
     def from_snapshot(
-        cls, recording: Recording, step: int, ego: int | str, run: int = 0, noise: Noise | None = None
-    ) -> Problem:
+        cls, recording: "Recording", step: int, ego: int | str, run: int = 0, noise: Noise | None = None
+    ) -> "Problem":
         """The star of one step: fixes of the ego and its linked neighbours, spherical factors between them.
 
         All messages of the step are taken as received; the methods obey the channel instead. Missing
@@ -305,13 +303,13 @@ class Problem:
     @classmethod
     def from_window(
         cls,
-        recording: Recording,
+        recording: "Recording",
         step: int,
         ego: int | str,
         length: int,
         run: int = 0,
         noise: Noise | None = None,
-    ) -> Problem:
+    ) -> "Problem":
         """The stars of the last `length` steps, one point per vehicle and step, joined by odometry dt u.
 
         A missing fix makes no factor; of a relative measurement its parts make one each where some are missing.

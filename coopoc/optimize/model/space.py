@@ -1,7 +1,5 @@
 """Space: where the nodes of a problem live, and how a small step moves them."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass
 
 import numpy as np

@@ -1,7 +1,5 @@
 """The factors of what was measured in a drive: of the star of an ego over a window of steps, or of a whole fleet."""
 
-from __future__ import annotations
-
 from typing import Protocol, runtime_checkable
 
 import numpy as np

@@ -1,7 +1,5 @@
 """Candidates of GNC: measurements that may be outliers, in groups that share a weight, and the problem reweighed."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 

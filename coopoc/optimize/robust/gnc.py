@@ -1,7 +1,5 @@
 """Graduated non-convexity (GNC): least squares whose weights find the outliers."""
 
-from __future__ import annotations
-
 from dataclasses import replace
 from typing import Any, Literal
 

@@ -1,7 +1,5 @@
 """The graduated loop: weighted least squares and weights alternate while a nearly convex surrogate becomes the loss."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple

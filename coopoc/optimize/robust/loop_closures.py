@@ -1,7 +1,5 @@
 """Loop closures by gating and consensus: candidates join known inliers where these predict them, as a start of GNC."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple

@@ -1,7 +1,5 @@
 """Starts of a graph: chained odometry, a spanning tree, points by trilateration, and one that grows with the drive."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterable
 from typing import NamedTuple
 

@@ -1,7 +1,5 @@
 """Where to start: the linear least-squares solution of the converted measurements."""
 
-from __future__ import annotations
-
 import numpy as np
 
 from ...arrays import Floats

@@ -1,7 +1,5 @@
 """Mirror images of what ranges alone place: multidimensional scaling, and moves across planes to lower minima."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator
 from itertools import combinations, islice
 from typing import NamedTuple

@@ -1,7 +1,5 @@
 """Multi-start: a few steps of Levenberg-Marquardt from each start, and the lowest goes on."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Iterator, Mapping
 
 import numpy as np
