@@ -60,6 +60,7 @@ class Priors(NamedTuple):
     heading: float = 0.1
     scale: float = 0.1
     lasts: float = 1e5
+    clock: float = 0.05
     compass: float = 0.05
     offset: float = 0.5
     absent: float = 8.0
@@ -70,11 +71,11 @@ class Priors(NamedTuple):
     forget: float = 10.0
 
 
-AS_STATED = Priors(heading=0.0, scale=0.0, compass=0.0, offset=0.0, slip=0.0, fix_gate=0.0, forget=0.0)
+AS_STATED = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0, fix_gate=0.0, forget=0.0)
 """Nothing is otherwise: the textbook's filter."""
-ON_ROADS = Priors(0.03, 0.03, compass=0.0, offset=0.0, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5)
+ON_ROADS = Priors(0.03, 0.03, clock=0.0, compass=0.0, offset=0.0, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5)
 """Of measurements that are not simulated: hardly any odometry is without such errors."""
-NO_ODOMETRY = Priors(heading=0.0, scale=0.0, compass=0.0, offset=0.0, slip=0.0)
+NO_ODOMETRY = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0)
 """Of velocities that fixes have shown."""
 
 
@@ -323,9 +324,9 @@ def priors_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool
 def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
     """The noise model of the kernel."""
     std, least = relative_noise(noise_model)
-    white, time, absent = np.ones(3), 1.0, np.full(4, priors.absent)
+    white, time, absent = np.ones(3), 1.0, np.full(5, priors.absent)
     own = common = bias = heading = offset = 0.0
-    turn, lasts = np.array([priors.heading, priors.scale]), priors.lasts
+    turn, lasts = np.array([priors.heading, priors.scale, priors.clock]), priors.lasts
     if noise_model.sensors is not None:
         sensors, std = noise_model.sensors, np.array(std)
         own, common, offset = sensors.gnss_drift_std**2, sensors.gnss_common_std**2, sensors.range_offset_std**2
@@ -333,7 +334,7 @@ def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
         time = float(sensors.gnss_drift_time)
         heading, bias = (float(value**2) for value in noise_model.compass)
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
-        absent[2:][np.array([bias, offset]) > 0.0] = -np.inf
+        absent[3:][np.array([bias, offset]) > 0.0] = -np.inf
         bias, offset = bias or priors.compass**2, offset or priors.offset**2
     judged = GATE if priors.fix_gate else 0.0, priors.fix_gate, priors.forget
     lasting = own, common, time, white, bias, heading, offset, np.square(turn), lasts, absent, priors.exact

@@ -33,6 +33,7 @@ from coopoc.kernels.stars.cooperative_state import (
     WINDOW,
 )
 from coopoc.kernels.stars.otherwise import (
+    AGREEING,
     FASTEST,
     KNOWN,
     LASTS,
@@ -45,6 +46,7 @@ from coopoc.kernels.stars.otherwise import (
     SUDDEN,
     TURNS,
     UNSEEN,
+    UNTRUSTED,
     USUAL,
 )
 from coopoc.methods.cooperative_filter import Priors
@@ -145,7 +147,7 @@ class Sent(NamedTuple):
 
 class Life(NamedTuple):
     """Parameters of lasting errors: own and common m^2, their correlation of a step, compass bias and noise rad^2,
-    offset of ranges m^2, heading and scale of odometry, their correlation of a step, log odds that there is none."""
+    offset of ranges m^2, heading and scale of odometry and offset of a clock, their correlation of a step, log odds that there is none."""
 
     own: float
     common: float
@@ -168,17 +170,17 @@ class Oracle:
             self.more = self.more if fault.extra is None else fault.extra[run, :, ego]
         self.by, self.corrected_now, self.grown = (seen.velocity - measured)[run, :, ego], False, 0.0
         self.seen, self.ego, self.run, self.known, self.priors = seen, ego, run, known, priors
-        self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(2), 1, np.zeros(4)), np.ones(3)
+        self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(3), 1, np.zeros(5)), np.ones(3)
         self.std: Floats = np.ones(3)
         if s is not None:
             self.std = s.relative_std.copy()
             heading, bias = (float(v**2) for v in known.compass)
             self.std[1] = math.sqrt(self.std[1] ** 2 - heading - bias)
             keep = math.exp(-seen.dt / s.gnss_drift_time)
-            offset, absent = s.range_offset_std**2, np.full(4, priors.absent)
-            absent[2:][[bias > 0, offset > 0]] = -math.inf
+            offset, absent = s.range_offset_std**2, np.full(5, priors.absent)
+            absent[3:][[bias > 0, offset > 0]] = -math.inf
             bias, offset = bias or priors.compass**2, offset or priors.offset**2
-            holds, turn = math.exp(-seen.dt / priors.lasts), np.square([priors.heading, priors.scale])
+            holds, turn = math.exp(-seen.dt / priors.lasts), np.square([priors.heading, priors.scale, priors.clock])
             self.life = Life(
                 s.gnss_drift_std**2, s.gnss_common_std**2, keep, bias, heading, offset, turn, holds, absent
             )
@@ -308,14 +310,15 @@ class Oracle:
     def average(self, b: Belief) -> None:
         life, slot = self.life, self.state["slot"]
         members = sorted((self.ego, *self.state["members"]), key=lambda j: -slot[j])
-        turns = [b.at(("o", j)).start + i for j in members if ("o", j) in b.names for i in range(2)]
+        turns = [b.at(("o", j)).start + i for j in members if ("o", j) in b.names for i in range(3)]
         for k, i in enumerate(turns):
-            b.average([i], life.turn[k % 2], life.absent[k % 2])
+            b.average([i], life.turn[k % 3], life.absent[k % 3])
         if life.absent[0] == -math.inf:
-            b.average(turns, np.tile(life.turn, len(members)), self.priors.exact * max(len(members), 2))
+            turns = [i for k, i in enumerate(turns) if k % 3 < 2]
+            b.average(turns, np.tile(life.turn[:2], len(members)), self.priors.exact * max(len(members), 2))
         if ("compass",) in b.names:
-            b.average([b.at(("compass",)).start], life.bias, life.absent[2])
-            b.average([b.at(("compass",)).start + 2], life.offset, life.absent[3])
+            b.average([b.at(("compass",)).start], life.bias, life.absent[3])
+            b.average([b.at(("compass",)).start + 2], life.offset, life.absent[4])
 
     def motion(self, t: int) -> tuple[Floats, Floats]:
         """The ego's velocity and the variance of its motion, corrected by fixes or not."""
@@ -397,7 +400,9 @@ class Oracle:
 
     def louder(self, j: int) -> float:
         """Level of a vehicle's motion."""
-        return math.exp(self.state["level"][5]) * float(self.state["louder"].get(j, 1.0))
+        s, few = self.state, self.state["mean"].get(j, (0.0, 0.0))[0] < AGREEING
+        doubted = few and j in s["last"] and j not in s["trusted"] and j != self.ego
+        return (UNTRUSTED if doubted else 1.0) * math.exp(s["level"][5]) * float(s["louder"].get(j, 1.0))
 
     def learn(self, kind: int, more: float, share: float, numbers: int = 1) -> None:
         """What innovations show of a level: derivative and information of their log-likelihood."""
@@ -589,10 +594,10 @@ class Oracle:
         return share
 
     def wrong(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
-        """On average, or locked out beside a neighbour that is trusted."""
+        """On average, or locked out, the ego beside a neighbour that is trusted."""
         s = self.state
         trusted = any(i in s["last"] and i in s["trusted"] for i in s["members"])
-        locked = j == self.ego and q > self.priors.fix_gate and s["locked"].get(j, 0.0) >= PATIENCE and trusted
+        locked = q > self.priors.fix_gate and s["locked"].get(j, 0.0) >= PATIENCE and (j != self.ego or trusted)
         return self.wrong_on_average(j, q, gap, cov, r) or locked
 
     def wrong_on_average(self, j: int, q: float, gap: Floats, cov: Floats, r: Floats) -> bool:
@@ -702,7 +707,7 @@ class Oracle:
 
     def add_turn(self, j: int) -> None:
         if self.life.turn.any():
-            self.state["belief"].add(("o", j), 0.0, [*self.life.turn, 0.0])
+            self.state["belief"].add(("o", j), 0.0, self.life.turn)
 
     def turn(self, j: int) -> Floats:
         """Errors of an odometry, where they are linear."""
@@ -732,7 +737,7 @@ class Oracle:
         f[x, o], f[o, o] = by, holds * np.eye(3)
         b.p = f @ b.p @ f.T
         b.x[o] *= holds
-        b.noise(("o", j), [*((1 - holds**2) * self.life.turn), 0.0])
+        b.noise(("o", j), (1 - holds**2) * self.life.turn)
 
     def near(self, relative: Floats) -> Floats:
         """Where the ego measures a vehicle."""
@@ -863,7 +868,10 @@ class Oracle:
             n = weight * self.r[new.step, j, c]
             white *= (2 - min(n * (1 - fade), 1)) / (1 + fade)
             way = long * max(0, 1 - 1 / n)
-        return self.fix_terms(j), z, white + way * q[c]
+        terms: dict[Name, Any] = dict(self.fix_terms(j))
+        if ("o", j) in self.state["belief"].names:  # by a clock that is ahead
+            terms["o", j] = np.outer(-new.velocity, [0, 0, 1])
+        return terms, z, white + way * q[c]
 
     def goes_on(self, t: int, j: int, message: Sent | None) -> tuple[Floats, Floats]:
         """The way since the newest message, and its derivatives by the errors of odometry."""

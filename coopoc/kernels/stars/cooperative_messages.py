@@ -63,6 +63,8 @@ from .gaussian import (
     MEASURED,
     PLACE,
     SQUARE,
+    TERMS,
+    TURN,
     VARIANCE,
     correct,
     distance,
@@ -202,6 +204,11 @@ def message_rows(
     long = 1.0 / (1.0 - fade * fade)
     way = (steps - 1.0 / steps) / 12.0 if follows else min((steps - 1.0) * (2.0 * steps - 1.0) / (6.0 * steps), long)
     fix_terms(f, k)
+    if has(f.g, k, TURN):  # of a clock that is ahead
+        n = h.block[TERMS]
+        x, y, z = vector_at(rows[row], SPEED // 3)
+        store(h.matrix, n, (0.0, 0.0, -x, 0.0, 0.0, -y, 0.0, 0.0, -z))
+        h.block[n], h.block[TERMS] = f.g.block[k, TURN], n + 1
     for c in range(3):
         weight, r = 1.0 / rows[row, SOLO_VARIANCE + c], rows[row, TYPICAL + c]
         old = keep / status[LAST + 3 + c] if again else 0.0
@@ -293,9 +300,9 @@ def heard(f: Filter, trusted: bool) -> bool:
 
 @inside
 def wrong(f: Filter, model: Model, k: int, q: float) -> bool:
-    """Whether it is the receiver of member k that errs: on average, or the ego's for so long that fixes would be used
-    again, beside a neighbour that is trusted."""
-    locked = k == 0 and q > model.fix_gate and f.member[0, LOCKED] >= PATIENCE and heard(f, True)
+    """Whether it is the receiver of member k that errs: on average, or for so long that fixes would be used again, the
+    ego's beside a neighbour that is trusted."""
+    locked = q > model.fix_gate and f.member[k, LOCKED] >= PATIENCE and (k > 0 or heard(f, True))
     return wrong_on_average(f, model, k, q) or locked
 
 

@@ -96,9 +96,9 @@ class Model(NamedTuple):
         bias: rad^2 of the compass.
         heading: rad^2 of the compass's noise.
         offset: m^2, of what all the ego's ranges are too long by.
-        turn: (2,) rad^2 and 1, of errors of heading and scale of an odometry; zeros for none.
+        turn: (3,) rad^2, 1 and s^2, of errors of heading and scale of an odometry and of a clock; zeros for none.
         lasts: s, their correlation time.
-        absent: (4,) log odds that an error of heading, scale, compass or range is not there.
+        absent: (5,) log odds that an error of heading, scale, clock, compass or range is not there.
         exact: log odds a vehicle that no odometry errs, where each error of heading and scale is there otherwise.
         slip: share of the late speed.
         gate: squared normalised innovation of a component of a relative measurement, 0 for none.
@@ -163,7 +163,7 @@ class Filter(NamedTuple):
         slot: (vehicles,) of each vehicle, ABSENT for none.
         status: (vehicles, STATUS).
         ego: (EGO,).
-        few: (2 slots + 5, 2 slots + 4) memory.
+        few: (3 slots + 5, 3 slots + 4) memory.
     """
 
     g: Gaussian
@@ -187,7 +187,7 @@ def new_filter(slots: int, vehicles: int) -> Filter:
         np.full(vehicles, ABSENT),
         np.zeros((vehicles, STATUS)),
         np.zeros(EGO),
-        np.zeros((2 * slots + 5, 2 * slots + 4)),
+        np.zeros((3 * slots + 5, 3 * slots + 4)),
     )
 
 
@@ -238,10 +238,11 @@ def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: i
 
 @part
 def insert_turn(g: Gaussian, model: Model, k: int) -> None:
-    """Give a member errors of heading and scale of its odometry, where there are any."""
+    """Give a member errors of heading and scale of its odometry, and of its clock, where there are any."""
     if model.turn[0] + model.turn[1] > 0.0:
         i = insert(g, k, TURN, 0.0)
-        g.p[i, i], g.p[i + 1, i + 1] = model.turn[0], model.turn[1]
+        for c in range(3):
+            g.p[i + c, i + c] = model.turn[c]
 
 
 @part

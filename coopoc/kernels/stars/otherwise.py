@@ -44,6 +44,7 @@ from .cooperative_state import (
     ANSWER,
     BY_FIXES,
     CORRECTED,
+    COUNT,
     COVARIANCE,
     DT,
     ESTABLISHED,
@@ -68,6 +69,8 @@ from .cooperative_state import (
     SPAN,
     STEP,
     TOLD,
+    TRUSTED,
+    USED,
     VEHICLE,
     WHOLE,
     WIDTH,
@@ -132,7 +135,7 @@ def drive(f: Filter, model: Model, k: int, moved: tuple[float, float, float], dt
         for c in range(2):
             g.p[j, first + c] += w[3 * c] * g.p[j, i] + w[3 * c + 1] * g.p[j, i + 1]
     shift(g, i, i, keep - 1.0)
-    for c in range(2):
+    for c in range(3):
         g.p[i + c, i + c] += (1.0 - keep * keep) * model.turn[c]
 
 
@@ -152,8 +155,9 @@ def average(f: Filter, model: Model) -> None:
             f.ego[COVARIANCE + 3 * c + d] = g.p[first + c, first + d]
     for k in range(len(f.who) - 1, -1, -1):
         if f.who[k, VEHICLE] >= 0 and has(g, k, TURN):
-            few[n, where], few[n + 1, where] = 3 * g.block[k, TURN], 3 * g.block[k, TURN] + 1
-            n += 2
+            for c in range(3):
+                few[n + c, where] = 3 * g.block[k, TURN] + c
+            n += 3
     own = n
     if has(g, 0, COMPASS):
         few[n, where], few[n + 1, where] = 3 * g.block[0, COMPASS], 3 * g.block[0, COMPASS] + 2
@@ -164,14 +168,14 @@ def average(f: Filter, model: Model) -> None:
         for j in range(3, n):
             few[i, j - 3] = g.p[at, int(few[j, where])]
     for i in range(3, n):
-        kind = (2 + i - own) if i >= own else (i - 3) % 2
+        kind = (3 + i - own) if i >= own else (i - 3) % 3
         if model.absent[kind] > -math.inf:
-            prior = model.turn[kind] if kind < 2 else model.bias if kind == 2 else model.offset
+            prior = model.turn[kind] if kind < 3 else model.bias if kind == 3 else model.offset
             collapse(f, i, n, chance_of(-model.absent[kind] - evidence(f, i, prior)))
     if own > 3 and model.absent[0] == -math.inf and model.exact > -math.inf:
         average_over_all(f, model, own)
     for kind in range(4):
-        i = own + kind - 2
+        i = own + kind - (3 if kind < 2 else 2)
         there = n > own if kind >= 2 else own > 3
         f.ego[TOLD + kind] = few[i, where - 1] if there else 0.0
     f.ego[TOLD + SLIPS] = f.ego[SLIPPED]
@@ -219,13 +223,14 @@ def collapse(f: Filter, i: int, n: int, there: float) -> None:
 def average_over_all(f: Filter, model: Model, own: int) -> None:
     """Average over whether the errors of all odometries are there, or none: evidence that none errs adds up,
     and its prior odds, too: noise that is not white makes either look surer. One vehicle counts as two."""
-    ego, width, kept, odds = f.ego, len(f.few[0]) - 2, f.h.matrix, max((own - 3) // 2, 2) * model.exact
+    ego, width, kept, odds = f.ego, len(f.few[0]) - 2, f.h.matrix, max((own - 3) // 3, 2) * model.exact
     for c in range(12):
         kept[c] = ego[ANSWER + c]
-    heading, scale = f.few[own - 2, width], f.few[own - 1, width]
+    heading, scale = f.few[own - 3, width], f.few[own - 2, width]
     for i in range(3, own):
-        odds += evidence(f, i, model.turn[(i - 3) % 2])
-        collapse(f, i, own, 0.0)
+        if i % 3 < 2:
+            odds += evidence(f, i, model.turn[i % 3])
+            collapse(f, i, own, 0.0)
     none = chance_of(odds)
     for c in range(12):
         gap = ego[ANSWER + c] - kept[c]
@@ -233,7 +238,7 @@ def average_over_all(f: Filter, model: Model, own: int) -> None:
     for c in range(3):
         for d in range(3):
             ego[COVARIANCE + 3 * c + d] += none * (1.0 - none) * kept[c] * kept[d]
-    f.few[own - 2, width], f.few[own - 1, width] = (1.0 - none) * heading, (1.0 - none) * scale
+    f.few[own - 3, width], f.few[own - 2, width] = (1.0 - none) * heading, (1.0 - none) * scale
 
 
 SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, JUMPED, BLIND, COURSE, _, _, BEFORE = range(
@@ -403,16 +408,22 @@ QUIETEST, LOUDEST, FASTEST = -2.0, 3.5, 0.5
 """Least and most logarithm of a level, and the most that it changes in a step."""
 PRIOR = 10.0
 """Information that the assumed level counts as: that of twenty numbers."""
+UNTRUSTED, AGREEING = 30.0, 10.0
+"""Times the variance of the motion of a vehicle whose fixes are not trusted, until so many of its messages agree with
+the error that these are found to have: what it sends may all be wrong."""
 
 
 @part
 def scale_motion_noise(f: Filter, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
-    """Multiply the variances of a step's motions by their level, and by that of each vehicle's velocities."""
-    level = math.exp(f.ego[LEVEL + MOTIONS])
+    """Multiply the variances of a step's motions by their level, that of each vehicle's velocities, and UNTRUSTED."""
+    level, ego = math.exp(f.ego[LEVEL + MOTIONS]), f.status[f.who[0, VEHICLE]]
     for c in range(3):
-        own[MOTION_VARIANCE + c] *= level * (1.0 + f.status[f.who[0, VEHICLE], LOUDER])
-        for i in range(count):
-            rows[i, STEP + c] *= level * (1.0 + f.status[vehicles[i], LOUDER])
+        own[MOTION_VARIANCE + c] *= level * (1.0 + ego[LOUDER])
+    for i in range(count):
+        status = f.status[vehicles[i]]
+        doubted = status[TRUSTED] == 0.0 and status[COUNT] < AGREEING and status[USED] > -math.inf
+        for c in range(3):
+            rows[i, STEP + c] *= level * (1.0 + status[LOUDER]) * (UNTRUSTED if doubted else 1.0)
 
 
 @part
