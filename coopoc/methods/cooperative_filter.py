@@ -38,6 +38,8 @@ NOTED = (0.01, 0.01, 0.01, 0.1, 0.01, 0.0)
 LOUD = 1.5
 """Level that is worth a note, or less than its inverse."""
 KINDS = ("range", "azimuth", "inclination", "message", "trusted")
+LATE = 0.02
+"""s, of a clock that is worth a note."""
 
 
 class Priors(NamedTuple):
@@ -49,6 +51,7 @@ class Priors(NamedTuple):
         lasts: s, for which they do.
         compass: rad, and
         offset: m, of such errors of the ego's compass and ranges, where none is stated.
+        clock: s, of a neighbour's clock.
         absent: log odds that each of these is not there, before anything was measured.
         exact: where absent is -inf, log odds that no odometry errs, times the vehicles in the star, two at least.
         slip: an ego that slips errs by that share of its late speed.
@@ -180,8 +183,8 @@ class CooperativeFilter(Checked):
         `extras` hold what is found to be otherwise than assumed, (R, T, E) each: the ego's "heading_error" and
         "compass_error" rad, "scale_error" and "range_offset" m; whether it "slips", or is "alone"; "range_level" and so
         on, factors of standard deviations. And the weights, 1 for a number that was believed, of each ego's "fix"
-        (R, T, E) and by link (R, L) of "range", "azimuth", "inclination" and "message", NaN where there was none, and
-        whether it is "trusted".
+        (R, T, E) and by link (R, L) of "range", "azimuth", "inclination" and "message", NaN where there was none,
+        whether it is "trusted", and by how many s its "clock" is ahead.
         """
         noise_model = resolve(self.noise_model, check_recording(recording))
         priors = priors_of(self, noise_model, recording.measured)
@@ -202,7 +205,7 @@ class CooperativeFilter(Checked):
                 by_fixes = recording.dt * (recording.velocity - velocity)[:, :, ego]
                 odometry = np.concatenate([by_fixes, extra[:, :, ego, None]], axis=-1)
             x, cov, neighbours, fixes, weights, deviations = run_filter(inputs, assumed, sent, odometry, model)
-            extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate(KINDS)}
+            extras = {"fix": fixes[..., None]} | {kind: weights[..., k] for k, kind in enumerate((*KINDS, "clock"))}
             names = (*(name.replace(" ", "_") for name in FOUND), *(f"{kind}_level" for kind in LEVELS))
             extras |= {name: deviations[..., i, None] for i, name in enumerate(names)}
             own_id = recording.ids[ego]
@@ -211,9 +214,14 @@ class CooperativeFilter(Checked):
             notes.extend(rejected(f"fixes, {own_id}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
             if model.own + model.common == 0.0 and priors.fix_gate:
                 notes.extend(lasting(own_id, recording.gnss[:, :, ego] - x, recording.dt))
-            low, measured = (weights < 0.1).sum(axis=0), np.isfinite(weights).sum(axis=0)
+            low, measured = (weights[..., :5] < 0.1).sum(axis=0), np.isfinite(weights[..., :5]).sum(axis=0)
             for j in np.unique(inputs.neighbour):
                 here = inputs.neighbour == j
+                clock = weights[:, here, 5]
+                ahead = float(np.median(clock[np.isfinite(clock)])) if np.isfinite(clock).any() else 0.0
+                if abs(ahead) > LATE:
+                    way = "ahead, or its messages are late" if ahead > 0 else "behind"
+                    notes.append(f"clock, {recording.ids[j]}: {abs(ahead):.2g} s {way}")
                 for kind, count, of in zip(KINDS, low[here].sum(axis=0), measured[here].sum(axis=0), strict=True):
                     what = f"{kind}, {own_id} and {recording.ids[j]}"
                     notes.extend(rejected(what, count, of, 0.5 if kind == "trusted" else 0.05))

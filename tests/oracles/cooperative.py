@@ -147,7 +147,8 @@ class Sent(NamedTuple):
 
 class Life(NamedTuple):
     """Parameters of lasting errors: own and common m^2, their correlation of a step, compass bias and noise rad^2,
-    offset of ranges m^2, heading and scale of odometry and offset of a clock, their correlation of a step, log odds that there is none."""
+    offset of ranges m^2, heading and scale of odometry and offset of a clock, their correlation of a step, log odds
+    that there is none."""
 
     own: float
     common: float

@@ -115,6 +115,7 @@ from .otherwise import (
     adapt,
     average,
     chance,
+    clock_of,
     copy_rows,
     corrected,
     corrected_motion,
@@ -137,7 +138,8 @@ def run_filter(
     measurements: Measurements, assumed: Assumptions, sent: Sent, odometry: Floats, model: Model
 ) -> tuple[Floats, Floats, Floats, Floats, Floats, Floats]:
     """x (R, T, 3) m, covariance (R, T, 3, 3) m^2, neighbours (R, M, 3) m; weights of the ego's fix (R, T), and by link
-    (R, M, 5) of range, azimuth, inclination and message, NaN for none, and whether the neighbour is trusted.
+    (R, M, 6) of range, azimuth, inclination and message, NaN for none, whether the neighbour is trusted, and by how
+    many s its clock is ahead.
 
     NaN until a fix, or what a neighbour sends and the ego measures of it, shows where the ego is.
 
@@ -155,7 +157,7 @@ def run_filter(
         most = max(most, measurements.start[t + 1] - measurements.start[t])
     x, cov = np.full((runs, steps, 3), math.nan), np.full((runs, steps, 3, 3), math.nan)
     fixes, deviations = np.full((runs, steps), math.nan), np.full((runs, steps, FOUND), math.nan)
-    neighbours, notes = np.full((runs, links, 3), math.nan), np.full((runs, links, 5), math.nan)
+    neighbours, notes = np.full((runs, links, 3), math.nan), np.full((runs, links, 6), math.nan)
     own, rows, who = np.zeros(OWN), np.zeros((most, WIDTH)), np.zeros(most, np.int64)
     for run in range(runs):
         f, tries = new_filter(1 + most, vehicles), new_tries(1 + most, vehicles)
@@ -190,6 +192,7 @@ def run_filter(
                     notes[run, first + i, c] = weight(f.member[k, OUT + c], model.gate)
                 notes[run, first + i, 3] = f.member[k, OUT + 3]
                 notes[run, first + i, 4] = f.status[who[i], TRUSTED]
+                notes[run, first + i, 5] = clock_of(f, model, k)
     return x, cov, neighbours, fixes, notes, deviations
 
 

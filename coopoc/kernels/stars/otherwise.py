@@ -198,6 +198,17 @@ def evidence(f: Filter, i: int, prior: float) -> float:
 
 
 @part
+def clock_of(f: Filter, model: Model, k: int) -> float:
+    """s, by which the clock of member k is ahead, averaged over whether it is."""
+    if not has(f.g, k, TURN):
+        return 0.0
+    i = 3 * f.g.block[k, TURN] + 2
+    p, m = f.g.p[i, i], f.g.x[i]
+    odds = model.absent[2] + 0.5 * math.log(model.turn[2] / p) - 0.5 * m * m / p if p > 0.0 else math.inf
+    return float(m * chance_of(-odds))
+
+
+@part
 def collapse(f: Filter, i: int, n: int, there: float) -> None:
     """Average over whether the error of row i is there, by that probability: moments are matched."""
     few, ego, width = f.few, f.ego, len(f.few[0]) - 2
