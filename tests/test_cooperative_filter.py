@@ -390,7 +390,7 @@ def test_a_neighbour_that_repeats_its_messages_never_leads_far_off(seed: int) ->
 
 
 def test_clocks_of_neighbours_are_found() -> None:
-    """Messages of a third that hold what was 0.5 s ago cost a seventh of the error, not a third; the others' clocks
+    """Messages of a third that hold what was 0.5 s ago cost an eighth of the error, not a third; the others' clocks
     are right. Both are the same drive with the same draws."""
     fleet = load_fleet("town10-validation").between(0, 300)
     seen = observe(fleet, replace(S2, gnss_std=(0.5,) * 3), V2X(6), runs=3, seed=4, observers=[0, 7])
