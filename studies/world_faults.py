@@ -214,7 +214,7 @@ def _clocks(scene: Scene, rng: Draws) -> Made:
     """Messages of some hold what was a while before the time that they state."""
     who, steps = _some(scene, rng), max(1, round(rng.uniform(0.1, 1.0) / scene.fleet.dt))
     words = f"{len(who)} are {steps * scene.fleet.dt:.2g} s late"
-    return scene.edited(partial(_behind, who=who, steps=steps, start=0)), words
+    return scene.edited(partial(delayed, who=who, steps=steps, start=0)), words
 
 
 def _replay(scene: Scene, rng: Draws) -> Made:
@@ -222,7 +222,7 @@ def _replay(scene: Scene, rng: Draws) -> Made:
     who, seconds, begin = _some(scene, rng), rng.uniform(3.0, 20.0), rng.uniform(0.0, 25.0)
     steps, start = round(seconds / scene.fleet.dt), round(begin / scene.fleet.dt)
     words = f"{len(who)} repeat those of {seconds:.0f} s before, from {begin:.0f} s on"
-    return scene.edited(partial(_behind, who=who, steps=steps, start=start)), words
+    return scene.edited(partial(delayed, who=who, steps=steps, start=start)), words
 
 
 def _some(scene: Scene, rng: Draws) -> Ints:
@@ -231,7 +231,7 @@ def _some(scene: Scene, rng: Draws) -> Ints:
     return np.sort(rng.permutation(scene.others)[:count])
 
 
-def _behind(recording: Recording, who: Ints, steps: int, start: int) -> Recording:
+def delayed(recording: Recording, who: Ints, steps: int, start: int) -> Recording:
     """Fixes and velocities of some as they were so many steps ago, from a step on, wherever they were there then."""
     now = np.arange(len(recording.t))
     then = np.where(now >= start, np.maximum(now - steps, 0), now)

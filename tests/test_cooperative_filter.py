@@ -19,7 +19,7 @@ from coopoc.evaluate.metrics import neighbour_rt_le
 from coopoc.methods.cooperative_filter import AS_STATED, ON_ROADS, Broadcast, CooperativeFilter, Priors, lasting
 from coopoc.methods.noise_model import NoiseModel, resolve
 from coopoc.methods.star_stream import RelativeMeasurement, StarStream
-from coopoc.studies.world_faults import _behind
+from coopoc.studies.world_faults import delayed
 from coopoc.studies.worlds import world
 from coopoc.world.inbox import inbox
 from coopoc.world.recording import MEASURED
@@ -389,19 +389,20 @@ def test_a_neighbour_that_repeats_its_messages_never_leads_far_off(seed: int) ->
     assert ours < 1.4 * alone
 
 
-def test_clocks_of_neighbours_are_found() -> None:
+@pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])
+def test_clocks_of_neighbours_are_found(priors: Priors) -> None:
     """Messages of a third that hold what was 0.5 s ago cost an eighth of the error, not a third; the others' clocks
     are right. Both are the same drive with the same draws."""
     fleet = load_fleet("town10-validation").between(0, 300)
     seen = observe(fleet, replace(S2, gnss_std=(0.5,) * 3), V2X(6), runs=3, seed=4, observers=[0, 7])
     who = np.setdiff1d(np.arange(len(fleet.ids)), [0, 7])[::3]
-    late = _behind(seen, who, 5, 0)
+    late = delayed(seen, who, 5, 0)
     usual, found, without = (
         method(recording, [0, 7])
         for method, recording in (
-            (CooperativeFilter(), seen),
-            (CooperativeFilter(), late),
-            (CooperativeFilter(priors=Priors(clock=0.0)), late),
+            (CooperativeFilter(priors=priors), seen),
+            (CooperativeFilter(priors=priors), late),
+            (CooperativeFilter(priors=priors._replace(clock=0.0)), late),
         )
     )
     best, ours, worse = (rt_le(track, fleet).mean() for track in (usual, found, without))

@@ -52,7 +52,7 @@ class Priors(NamedTuple):
         compass: rad, and
         offset: m, of such errors of the ego's compass and ranges, where none is stated.
         clock: s, of a neighbour's clock.
-        absent: log odds that each of these is not there, before anything was measured.
+        absent: log odds that each of these is not there, before anything was measured; of a clock 8 at least.
         exact: where absent is -inf, log odds that no odometry errs, times the vehicles in the star, two at least.
         slip: an ego that slips errs by that share of its late speed.
         fix: factor of the assumed standard deviation of fixes, which err together for a while.
@@ -76,7 +76,7 @@ class Priors(NamedTuple):
 
 AS_STATED = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0, fix_gate=0.0, forget=0.0)
 """Nothing is otherwise: the textbook's filter."""
-ON_ROADS = Priors(0.03, 0.03, clock=0.0, compass=0.0, offset=0.0, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5)
+ON_ROADS = Priors(0.03, 0.03, clock=0.2, compass=0.0, offset=0.0, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5)
 """Of measurements that are not simulated: hardly any odometry is without such errors."""
 NO_ODOMETRY = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0)
 """Of velocities that fixes have shown."""
@@ -214,10 +214,11 @@ class CooperativeFilter(Checked):
             notes.extend(rejected(f"fixes, {own_id}", (fixes < 0.1).sum(), np.isfinite(fixes).sum()))
             if model.own + model.common == 0.0 and priors.fix_gate:
                 notes.extend(lasting(own_id, recording.gnss[:, :, ego] - x, recording.dt))
-            low, measured = (weights[..., :5] < 0.1).sum(axis=0), np.isfinite(weights[..., :5]).sum(axis=0)
+            shares = weights[..., : len(KINDS)]
+            low, measured = (shares < 0.1).sum(axis=0), np.isfinite(shares).sum(axis=0)
             for j in np.unique(inputs.neighbour):
                 here = inputs.neighbour == j
-                clock = weights[:, here, 5]
+                clock = weights[:, here, len(KINDS)]
                 ahead = float(np.median(clock[np.isfinite(clock)])) if np.isfinite(clock).any() else 0.0
                 if abs(ahead) > LATE:
                     way = "ahead, or its messages are late" if ahead > 0 else "behind"
@@ -334,6 +335,7 @@ def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
     std, least = relative_noise(noise_model)
     white, time, absent = np.ones(3), 1.0, np.full(5, priors.absent)
     own = common = bias = heading = offset = 0.0
+    absent[2] = max(priors.absent, Priors().absent)  # most clocks are right, on roads, too
     turn, lasts = np.array([priors.heading, priors.scale, priors.clock]), priors.lasts
     if noise_model.sensors is not None:
         sensors, std = noise_model.sensors, np.array(std)

@@ -179,6 +179,7 @@ class Oracle:
             self.std[1] = math.sqrt(self.std[1] ** 2 - heading - bias)
             keep = math.exp(-seen.dt / s.gnss_drift_time)
             offset, absent = s.range_offset_std**2, np.full(5, priors.absent)
+            absent[2] = max(priors.absent, 8.0)
             absent[3:][[bias > 0, offset > 0]] = -math.inf
             bias, offset = bias or priors.compass**2, offset or priors.offset**2
             holds, turn = math.exp(-seen.dt / priors.lasts), np.square([priors.heading, priors.scale, priors.clock])

@@ -239,7 +239,7 @@ def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: i
 @part
 def insert_turn(g: Gaussian, model: Model, k: int) -> None:
     """Give a member errors of heading and scale of its odometry, and of its clock, where there are any."""
-    if model.turn[0] + model.turn[1] > 0.0:
+    if model.turn[0] + model.turn[1] + model.turn[2] > 0.0:
         i = insert(g, k, TURN, 0.0)
         for c in range(3):
             g.p[i + c, i + c] = model.turn[c]

@@ -171,7 +171,7 @@ def average(f: Filter, model: Model) -> None:
         kind = (3 + i - own) if i >= own else (i - 3) % 3
         if model.absent[kind] > -math.inf:
             prior = model.turn[kind] if kind < 3 else model.bias if kind == 3 else model.offset
-            collapse(f, i, n, chance_of(-model.absent[kind] - evidence(f, i, prior)))
+            collapse(f, i, n, chance_of(-model.absent[kind] - evidence(few[i, i - 3], few[i, where - 1], prior)))
     if own > 3 and model.absent[0] == -math.inf and model.exact > -math.inf:
         average_over_all(f, model, own)
     for kind in range(4):
@@ -191,9 +191,8 @@ def chance_of(odds: float) -> float:
 
 
 @part
-def evidence(f: Filter, i: int, prior: float) -> float:
-    """Log odds that the error of row i is 0, by its posterior."""
-    p, m = f.few[i, i - 3], f.few[i, len(f.few[0]) - 2]
+def evidence(p: float, m: float, prior: float) -> float:
+    """Log odds that an error is 0, by the variance p and the mean m of its posterior."""
     return 0.5 * math.log(prior / p) - 0.5 * m * m / p if p > 0.0 else 0.0
 
 
@@ -203,9 +202,8 @@ def clock_of(f: Filter, model: Model, k: int) -> float:
     if not has(f.g, k, TURN):
         return 0.0
     i = 3 * f.g.block[k, TURN] + 2
-    p, m = f.g.p[i, i], f.g.x[i]
-    odds = model.absent[2] + 0.5 * math.log(model.turn[2] / p) - 0.5 * m * m / p if p > 0.0 else math.inf
-    return float(m * chance_of(-odds))
+    m = f.g.x[i]
+    return float(m * chance_of(-model.absent[2] - evidence(f.g.p[i, i], m, model.turn[2])))
 
 
 @part
@@ -240,7 +238,7 @@ def average_over_all(f: Filter, model: Model, own: int) -> None:
     heading, scale = f.few[own - 3, width], f.few[own - 2, width]
     for i in range(3, own):
         if i % 3 < 2:
-            odds += evidence(f, i, model.turn[i % 3])
+            odds += evidence(f.few[i, i - 3], f.few[i, width], model.turn[i % 3])
             collapse(f, i, own, 0.0)
     none = chance_of(odds)
     for c in range(12):
@@ -427,9 +425,9 @@ the error that these are found to have: what it sends may all be wrong."""
 @part
 def scale_motion_noise(f: Filter, own: Floats, rows: Floats, vehicles: Ints, count: int) -> None:
     """Multiply the variances of a step's motions by their level, that of each vehicle's velocities, and UNTRUSTED."""
-    level, ego = math.exp(f.ego[LEVEL + MOTIONS]), f.status[f.who[0, VEHICLE]]
+    level = math.exp(f.ego[LEVEL + MOTIONS])
     for c in range(3):
-        own[MOTION_VARIANCE + c] *= level * (1.0 + ego[LOUDER])
+        own[MOTION_VARIANCE + c] *= level * (1.0 + f.status[f.who[0, VEHICLE], LOUDER])
     for i in range(count):
         status = f.status[vehicles[i]]
         doubted = status[TRUSTED] == 0.0 and status[COUNT] < AGREEING and status[USED] > -math.inf
