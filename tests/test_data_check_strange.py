@@ -111,3 +111,38 @@ def test_what_ranges_share_is_named_and_no_offset_is(tmp_path: Path, words: str,
     text = said(folder)
     assert re.search(words, text), text
     assert "offset=" not in text
+
+
+@pytest.mark.parametrize(
+    ("pace", "factor", "words"),
+    [(1.2, np.exp(0.1j), "turned by [56]"), (9.0, 1.04, "too fast by [34]"), (9.0, 0.96, "too slow by [34]")],
+)
+def test_odometry_of_one_that_errs_is_no_clock_of_others(
+    tmp_path: Path, pace: float, factor: complex, words: str
+) -> None:
+    rng, t, k = np.random.default_rng(5), np.arange(0, 150, 0.2), np.arange(4)[:, None]
+    u = pace * (1 + 0.25 * np.sin(0.08 * t + k)) * np.exp(1.2j * np.sin(0.07 * t + 0.3 * k))
+    x = 0.2 * np.cumsum(u, axis=1) - 0.1 * u + 9j * k
+    u[1] *= factor
+    tables = list[pd.DataFrame]()
+    for own, name in enumerate("abcd"):
+        columns = {
+            "vx": (u[own].real, 0.05),
+            "vy": (u[own].imag, 0.05),
+            "x": (x[own].real, 1.2),
+            "y": (x[own].imag, 1.2),
+        }
+        columns |= {
+            f"range_{other}": (abs(at - x[own]), 0.1) for other, at in zip("abcd", x, strict=True) if other != name
+        }
+        noisy = {kind: values + rng.normal(0, std, len(t)) for kind, (values, std) in columns.items()}
+        tables.append(
+            pd.DataFrame({"t": t, "vehicle": name, **noisy}).assign(
+                **{f"{kind}_std": columns[kind][1] for kind in columns}
+            )
+        )
+    pd.concat(tables).to_csv(tmp_path / "log.csv", index=False)
+    text = said(tmp_path)
+    assert re.findall(rf"(\w): its odometry is {words}", text) == ["b"]
+    assert text.count("its odometry") == 1
+    assert "clock=" not in text

@@ -1,6 +1,6 @@
 """Innovation and residual statistics of a log (`residuals`), and sentences on what is implausible."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -81,17 +81,17 @@ def check(log: Log) -> Check:
     bar = progress_bar(desc=f"check of {log.summary.name}", total=len(CHECKS) + 2, delay=2.0)
     first = filtered(log)
     bar.update()
-    errs = [first.world.ids.index(row["vehicle"]) for row in _vehicles(first) if _off(row)]
-    result = on_time(first, alike=not errs)
+    rows = _vehicles(first)
+    every = first.world.ids
+    errs, drifts = ([every.index(row["vehicle"]) for row in rows if off(row)] for off in (_off, _drifts))
+    result = on_time(first if log.recording.body else _without(first, drifts), alike=not errs)
     bar.update()
     result = replace(result, vehicles=_vehicles(result))
     late = any(_beyond(row, "late_s", max(LATE, 0.5 * first.world.dt)) for row in result.vehicles)
     if log.truth is not None and not late and not result.slack.any():
         result = against_truth(result)
     elif log.recording.body is None:  # what errs says nothing of others
-        links = result.world.links
-        ends = np.isin(links.observer, errs) | np.isin(links.neighbour, errs)
-        result = replace(result, relative=np.where(ends[:, None], np.nan, result.relative))
+        result = _without(result, errs)
     result = replace(result, measurements=measurements(result))
     sentences = list[str]()
     for rule in CHECKS:
@@ -99,6 +99,13 @@ def check(log: Log) -> Check:
         bar.update()
     bar.close()
     return replace(result, warnings=tuple(sentences), unseen=tuple(unseen(result)))
+
+
+def _without(c: Check, columns: Sequence[int]) -> Check:
+    """The same without relative measurements of these vehicles."""
+    links = c.world.links
+    ends = np.isin(links.observer, columns) | np.isin(links.neighbour, columns)
+    return replace(c, relative=np.where(ends[:, None], np.nan, c.relative))
 
 
 def _vehicles(c: Check) -> list[dict[str, Any]]:
@@ -229,8 +236,9 @@ def _of_vehicles(c: Check) -> list[str]:
             unit = next((hint for low, high, hint in MISTAKEN if low < distance < high), "Check the units of both.")
             sentences.append(f"{name}: fixes travel {distance:.2g} times as far as the odometry says. {unit}")
         elif row.get("speed_excess") is not None and _beyond(row, "speed_excess", SCALE):
+            word = "fast" if row["speed_excess"] > 0 else "slow"
             sentences.append(
-                f"{name}: its odometry is too fast by {100 * row['speed_excess']:.2f} +- "
+                f"{name}: its odometry is too {word} by {100 * abs(row['speed_excess']):.2f} +- "
                 f"{100 * row['speed_excess_error']:.2f} %: multiply its speeds by "
                 f"{1 / (1 + row['speed_excess']):.4g}, or take a pose filter, which estimates it."
             )
@@ -258,10 +266,15 @@ def _beyond(row: Mapping[str, Any], name: str, least: float) -> bool:
     return float(abs(row.get(name) or 0.0)) > max(least, SURELY * (row.get(f"{name}_error") or 0.0))
 
 
+def _drifts(row: Mapping[str, Any]) -> bool:
+    """Whether the odometry of a row errs."""
+    errors = ("speed_excess", SCALE), ("turned", TURNED), ("yaw_rate_bias", DRIFT)
+    return any(_beyond(row, *one) for one in errors)
+
+
 def _off(row: Mapping[str, Any]) -> bool:
     """Whether the odometry of a row errs, or fixes do not fit it."""
-    errors = ("speed_excess", SCALE), ("turned", TURNED), ("yaw_rate_bias", DRIFT)
-    return (row.get("nis") or 0.0) > OUTLYING or any(_beyond(row, *one) for one in errors)
+    return (row.get("nis") or 0.0) > OUTLYING or _drifts(row)
 
 
 def _of_clocks(c: Check) -> list[str]:

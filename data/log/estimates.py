@@ -102,19 +102,25 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray]:
     return c.fix[..., :2] @ [1, 1j], made
 
 
-def moves(rec: Recording, column: int) -> tuple[AnyArray, AnyArray]:
+def moves(rec: Recording, column: int, means: int = 1) -> tuple[AnyArray, AnyArray]:
     """Displacements (M,) m, x + iy, of the fixes and of the odometry over the same spans, in which the odometry (if
-    that stands still, the fixes) moves far; none where too little moves."""
+    that stands still, the fixes) moves far; none where too little moves. Of a short way the means of several fixes
+    tell more than each."""
     fixes, velocity = rec.gnss[0, :, column, :2] @ [1, 1j], rec.velocity[0, :, column, :2] @ [1, 1j]
     path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
-    for places, far in ((path, FAR), (fixes, 2 * FAR)):
-        pairs, last = [], -1
-        for step in np.flatnonzero(np.isfinite(fixes)).tolist():
-            if last < 0 or gaps[step] != gaps[last]:
-                last = step
-            elif abs(places[step] - places[last]) > far * np.hypot(*rec.sensors.fix_std[:2]):
-                pairs.append((last, step))
-                last = step
+    at = np.flatnonzero(np.isfinite(fixes))
+    parts = at[: len(at) // means * means].reshape(-1, means)
+    parts = parts[gaps[parts[:, 0]] == gaps[parts[:, -1]]]
+    fixes, path, gaps = fixes[parts].mean(axis=1), path[parts].mean(axis=1), gaps[parts[:, 0]]
+    times = FAR if means == 1 else FAR / 3
+    for places, far in ((path, times), (fixes, 2 * times)):
+        pairs, last = [], 0
+        for k in range(1, len(parts)):
+            if gaps[k] != gaps[last]:
+                last = k
+            elif abs(places[k] - places[last]) > far * np.hypot(*rec.sensors.fix_std[:2]) / means**0.5:
+                pairs.append((last, k))
+                last = k
         if len(pairs) >= 3:
             a, b = np.array(pairs).T
             return fixes[b] - fixes[a], path[b] - path[a]
@@ -143,10 +149,14 @@ def odometry(c: Check, column: int) -> Estimate:
     noise = np.nan_to_num(rec.sensors.velocity_std(velocity, rec.sensors.velocity_floor))
     if truth is None:
         moved, driven = moves(rec, column)
+        if len(moved) < ENOUGH:
+            means = int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * ENOUGH // 2)
+            moved, driven = moves(rec, column, max(means, 2))
         fix, square = float(np.hypot(*rec.sensors.fix_std[:2])), max(float(np.square(np.abs(driven)).sum()), 1e-12)
         value, error = factors(moved - driven, np.stack([driven, 1j * driven], axis=1), 2**0.5 * fix)
-        turned = (1 + complex(*value)) * (1 + (float(np.linalg.norm(noise)) * rec.dt) ** 2 / square)
-        return Estimate(_polar(1 / turned) if turned else value, error)  # noise of a cause makes its factor smaller
+        less = (float(np.linalg.norm(noise)) * rec.dt) ** 2 / square  # noise of a cause makes its factor smaller
+        turned = (1 + complex(*value)) * (1 + less)
+        return Estimate(_polar(1 / turned) if turned else value, np.hypot(error, less))
     path = truth.position[:, column, :2] @ [1, 1j]
     true = np.diff(path, prepend=np.nan) / rec.dt  # as odometry, the mean over a step
     odometer = velocity @ [1, 1j]
