@@ -74,7 +74,9 @@ def test_ranges_that_are_eased_lead_from_bad_odometry() -> None:
     assert "may be the truth" in truth.notes[0]
 
 
-@pytest.mark.parametrize("case", ["ranges", "ranges and azimuths", "an offset", "fixes of all", "a wrong fix"])
+@pytest.mark.parametrize(
+    "case", ["ranges", "ranges and azimuths", "an offset", "fixes of all", "a wrong fix", "inclinations"]
+)
 def test_ambiguous_points_end_at_the_lowest_minimum(case: str) -> None:
     """SciPy from 12 random starts, 6 draws of each; a lower minimum is left once, with a note, at most."""
     left, loss = 0, Loss("truncated", 3.0) if case == "a wrong fix" else None
@@ -91,6 +93,9 @@ def test_ambiguous_points_end_at_the_lowest_minimum(case: str) -> None:
         if case == "an offset":
             problem = problem.add("position", [6], [[0, 0, 0]], std=[9.0, 1.0, 1.0])
             problem = problem.add("range_offset", pairs.tolist(), z + 3.0, std=0.2)
+        elif case == "inclinations":
+            z = np.arccos(apart[:, 2] / np.linalg.norm(apart, axis=1)) + 0.01 * rng.normal(size=15)
+            problem = problem.add("inclination", pairs[:, :2].tolist(), z, std=0.01)
         else:
             problem = problem.add("range", pairs[:, :2].tolist(), z, std=0.2)
         if case == "ranges and azimuths":

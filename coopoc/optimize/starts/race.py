@@ -27,8 +27,9 @@ MORE = 50
 """Steps before it is judged."""
 RIVAL = 10.0
 """Cost by which another minimum may be higher and still be the truth's: 1e-5 of chi-square with one degree."""
-DRAWS, QUIET, POINTS = 90, 30, 1800
-"""Random starts at most, if the first lead to no other minimum of about the cost, and as many points together."""
+DRAWS, QUIET, POINTS, HIGH = 90, 30, 1800, 2.0
+"""Random starts at most, if the first lead to no other minimum of about the cost and this is no more than so many
+standard deviations above its mean, and as many points together."""
 ALIKE = 1e-5
 """Share by which the costs of two random starts that led to the same minimum differ."""
 ELSEWHERE = "another minimum, elsewhere, costs as much"
@@ -67,9 +68,9 @@ def race(
     limit, straight, arrived = mean + usual, set[str](), True
     minima = list[float]()
 
-    def descend(x: Floats) -> Floats:
+    def descend(x: Floats, steps: int = MORE) -> Floats:
         nonlocal taken, arrived
-        end = arrive(system, x, MORE, TOLERANCE)
+        end = arrive(system, x, steps, TOLERANCE)
         taken, arrived = taken + end.iterations, end.converged
         return end.x
 
@@ -77,11 +78,13 @@ def race(
         return arrived and bool(abs(system.cost(x) - mean) <= usual)
 
     def ended(name: str, x: Floats) -> tuple[Problem, Search]:
-        ends, least, most = list[tuple[float, Floats]](), system.cost(x), QUIET
+        x = descend(x, ROUNDS[-1][1]) if draws else x
+        ends, least = list[tuple[float, Floats]](), system.cost(x)
+        most = QUIET if least <= mean + HIGH * np.sqrt(variance) else DRAWS
         for k, away in enumerate(_away(problem, x) if draws else ()):
             if k >= most:
                 break
-            y = descend(x + away)
+            y = descend(x + away, ROUNDS[-1][1])
             cost = system.cost(y)
             if arrived and cost < least + RIVAL:
                 ends.append((cost, y))
