@@ -47,7 +47,7 @@ def tuned(ratio: float = 1.0, gnss: float = 3.5) -> NoiseModel:
     ],
     ids=["gnss", "identity", "tuned 10 %", "tuned 15 %"],
 )
-def test_solo_anchors(method, ratio: float, expected: float, formation: Fleet) -> None:
+def test_solo_anchors(method, ratio, expected, formation):
     assert score(method, fixture(formation, 0, ratio), formation) == pytest.approx(expected, rel=0.05)
 
 
@@ -61,14 +61,14 @@ def test_solo_anchors(method, ratio: float, expected: float, formation: Fleet) -
         (10, 1.35, 0.37),
     ],
 )
-def test_laplacian_filter_anchors(neighbours: int, identity: float, weighted: float, formation: Fleet) -> None:
+def test_laplacian_filter_anchors(neighbours, identity, weighted, formation):
     recording = fixture(formation, neighbours)
     pragmatic = NoiseModel("fitted", SENSORS, process_std=(0.07, 0.07, 0.07), gnss_std=(3.5,) * 3)
     assert score(LKFSA("identity"), recording, formation) == pytest.approx(identity, rel=0.05)
     assert score(LKFSA(pragmatic), recording, formation) == pytest.approx(weighted, rel=0.05)
 
 
-def test_scenario1_anchors(formation: Fleet) -> None:
+def test_scenario1_anchors(formation):
     """Bias drawn at every sample, 15 %: GNSS 3.38, identity 2.46, tuned 1.42, maxima 8.0 / 5.7 / 3.6 m.
 
     The last maximum is a 40-run mean of a start-up that varies by 1 m from run to run, so both it and ours have a

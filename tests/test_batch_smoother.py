@@ -75,28 +75,28 @@ def held(gnss: Any) -> Any:
 
 
 @pytest.mark.parametrize("channel", CHANNELS)
-def test_gaps_absences_and_channels(channel: str, crossing: Fleet) -> None:
+def test_gaps_absences_and_channels(channel, crossing):
     compare("nominal", drive(crossing, channel, runs=3))
 
 
 @pytest.mark.parametrize("known", ["identity", "fitted"])
-def test_noise_models(known: str, crossing: Fleet) -> None:
+def test_noise_models(known, crossing):
     compare(known, drive(crossing, "lossy and late", gaps=known == "fitted"))
 
 
 @pytest.mark.parametrize("runs", [1, 5])
-def test_batches_of_runs_without_gaps(runs: int, crossing: Fleet) -> None:
+def test_batches_of_runs_without_gaps(runs, crossing):
     compare("nominal", drive(crossing, "plain", runs=runs, gaps=False, absences=False))
 
 
 @pytest.fixture(scope="module")
-def convoy(formation: Fleet) -> tuple[Fleet, Recording, V2X]:
+def convoy(formation):
     """Six vehicles, 150 steps, 30 runs, noise that the filters model exactly."""
     fleet, v2x = formation.select([0, 1, 2, 3, 5, 8]).between(0, 150), V2X(max_neighbours=3)
     return fleet, observe(fleet, SPEED, v2x, runs=30, seed=3), v2x
 
 
-def test_it_is_consistent_and_does_not_beat_the_fleets_bound(convoy: tuple[Fleet, Recording, V2X]) -> None:
+def test_it_is_consistent_and_does_not_beat_the_fleets_bound(convoy):
     """NEES gate, and rms RT-LE against the bound beyond its interval (Student t on the runs), and not far above it."""
     fleet, recording, v2x = convoy
     track = BatchSmoother()(recording, [0, 4])
@@ -110,7 +110,7 @@ def test_it_is_consistent_and_does_not_beat_the_fleets_bound(convoy: tuple[Fleet
     assert square.mean() - half < 1.1 * bound
 
 
-def test_absent_egos_and_observers_are_named(crossing: Fleet) -> None:
+def test_absent_egos_and_observers_are_named(crossing):
     recording = observe(coming_and_going(crossing), S2)
     absent = BatchSmoother()(recording, [2]).absent
     assert (absent[:, 0] >= np.isnan(recording.velocity[0, :, 2, 0])).all()
@@ -141,7 +141,7 @@ def problem(recording: Recording, known: NoiseModel) -> Any:
 solved = partial(least_squares, jac="3-point", method="lm", xtol=1e-14, ftol=1e-14, gtol=1e-14)
 
 
-def test_the_smoother_is_the_least_squares_solution_of_scipy(crossing: Fleet) -> None:
+def test_the_smoother_is_the_least_squares_solution_of_scipy(crossing):
     """SciPy's positions of all vehicles at all steps, and every marginal."""
     recording = observe(crossing.select(range(5)).between(0, 9), S2, V2X(max_neighbours=3))
     known = NoiseModel.nominal(S2)
@@ -156,7 +156,7 @@ def test_the_smoother_is_the_least_squares_solution_of_scipy(crossing: Fleet) ->
 
 
 @pytest.mark.parametrize("least", [1e-3, 1e-6, 1e-9])
-def test_who_hardly_moves_does_not_drown_the_rest(least: float, crossing: Fleet) -> None:
+def test_who_hardly_moves_does_not_drown_the_rest(least, crossing):
     """Motion known to a nanometre, all at rest: SciPy's solution of the whole drive as one point per vehicle."""
     fleet = replace(crossing, position=np.repeat(crossing.position[:1], 60, axis=0), velocity=0 * crossing.velocity)
     recording = observe(fleet, replace(S2, velocity_floor=1e-12), V2X(max_neighbours=4))

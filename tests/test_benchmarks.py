@@ -7,7 +7,7 @@ import re
 import sys
 from dataclasses import replace
 from pathlib import Path
-from types import ModuleType, SimpleNamespace
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -25,13 +25,13 @@ BASELINE = {"a: ours": {"ratio": 1.0, "tolerance": 1.5}, "b: ours": {"ratio": 0.
 
 
 @pytest.fixture
-def load() -> Any:
+def load():
     """Import a benchmark by name; some need libraries."""
     return importlib.import_module
 
 
 @pytest.fixture
-def run() -> ModuleType:
+def run():
     return importlib.import_module("run")
 
 
@@ -40,19 +40,19 @@ def row(name: str, ratio: float, right: bool | None = True) -> dict[str, Any]:
 
 
 @pytest.mark.parametrize("ratio", [1.51, float("nan")])
-def test_the_gate_names_the_row_that_is_slower(run: ModuleType, ratio: float) -> None:
+def test_the_gate_names_the_row_that_is_slower(run, ratio):
     printed = run.slower([row("a: ours", ratio), row("b: ours", 0.01)], BASELINE, ["a", "b"])
     assert len(printed) == 1
     assert printed[0].startswith("a: ours: ratio")
     assert "1.5 allowed" in printed[0]
 
 
-def test_a_row_that_was_not_measured_fails_unless_its_benchmark_did_not_run(run: ModuleType) -> None:
+def test_a_row_that_was_not_measured_fails_unless_its_benchmark_did_not_run(run):
     assert run.slower([row("a: ours", 1.0)], BASELINE, ["a", "b"]) == ["b: ours: in the baseline, but not measured"]
     assert run.slower([row("a: ours", 1.0)], BASELINE, ["a"]) == []
 
 
-def test_a_new_baseline_keeps_tolerances_and_leaves_out_peers_and_wrong_rows(run: ModuleType) -> None:
+def test_a_new_baseline_keeps_tolerances_and_leaves_out_peers_and_wrong_rows(run):
     rows = [
         row("b: ours", 0.0123456),
         row("a: ours, new", 3.0),
@@ -75,14 +75,14 @@ def test_a_new_baseline_keeps_tolerances_and_leaves_out_peers_and_wrong_rows(run
     ],
 )
 def test_the_command_prints_writes_and_fails(
-    run: ModuleType,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-    capsys: pytest.CaptureFixture[str],
-    rows: list[dict[str, Any]],
-    arguments: list[str],
-    code: int,
-) -> None:
+    run,
+    monkeypatch,
+    tmp_path,
+    capsys,
+    rows,
+    arguments,
+    code,
+):
     monkeypatch.setattr(run, "RESULTS", tmp_path / "results.json")
     monkeypatch.setattr(run, "BASELINE", tmp_path / "baseline.json")
     run.BASELINE.write_text(json.dumps({"growth: ours": BASELINE["a: ours"]}))
@@ -96,7 +96,7 @@ def test_the_command_prints_writes_and_fails(
     assert ("FAILED growth: ours" in printed) == bool(code)
 
 
-def test_stone_soup_ends_where_we_end(load: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_stone_soup_ends_where_we_end(load, monkeypatch):
     """Its iterated update and its filter; one extended update does not."""
     pytest.importorskip("stonesoup", reason="pip install stonesoup")
     classical = load("classical")
@@ -134,13 +134,13 @@ class Own:
 
 
 @pytest.fixture
-def short(monkeypatch: pytest.MonkeyPatch) -> None:
+def short(monkeypatch):
     """Tasks with two runs and two egos."""
     few = tuple(replace(task, runs=2, egos=2) for task in TASKS if task.name in ("alone", "paper", "spoofed"))
     monkeypatch.setattr(benchmark, "TASKS", few)
 
 
-def test_parameters_are_chosen_on_other_drives_and_draws() -> None:
+def test_parameters_are_chosen_on_other_drives_and_draws():
     for task, other in zip(TASKS, VALIDATION, strict=True):
         assert (task.name, task.sensors, task.v2x) == (other.name, other.sensors, other.v2x)
         assert task.seed != other.seed
@@ -150,7 +150,7 @@ def test_parameters_are_chosen_on_other_drives_and_draws() -> None:
     assert {task.data for task in VALIDATION} == {"town10-validation"}
 
 
-def test_the_cards_method_is_scored_as_by_hand(short: None, tmp_path: Path) -> None:
+def test_the_cards_method_is_scored_as_by_hand(short, tmp_path):
     assert benchmark.benchmark(("joint", "kalman"), out=tmp_path) == 0
     card = json.loads((tmp_path / "joint.json").read_text())
     assert (card["benchmark"], card["method"], card["source"]) == (VERSION, "joint", "")
@@ -172,9 +172,7 @@ def test_the_cards_method_is_scored_as_by_hand(short: None, tmp_path: Path) -> N
     assert 0 < abs(other["rt_le_m"][0] - solo["paper"]["rt_le_m"][0]) < 2 * (low + high)
 
 
-def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(
-    short: None, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(short, tmp_path, capsys):
     (tmp_path / "mine.py").write_text(OWN)
     name = f"{tmp_path / 'mine.py'}:Own"
     assert benchmark.benchmark((name,), out=tmp_path) == 1
@@ -189,7 +187,7 @@ def test_a_method_of_ones_own_gets_a_card_and_its_failures_are_rows(
     assert "failed" in benchmark.page([card])
 
 
-def test_wrong_words_are_named(tmp_path: Path) -> None:
+def test_wrong_words_are_named(tmp_path):
     for given, message in (
         (((), {}), "must name a method"),
         ((("joint",), {"tasks": ("papr",)}), "must be one of alone, paper"),
@@ -203,7 +201,7 @@ def test_wrong_words_are_named(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_no_committed_card_lies_below_its_bound() -> None:
+def test_no_committed_card_lies_below_its_bound():
     assert len(CARDS) > 20
     for file in CARDS:
         card = json.loads(file.read_text())
@@ -216,7 +214,7 @@ def test_no_committed_card_lies_below_its_bound() -> None:
                 assert row["over_bound"] > share, (card["method"], row)
 
 
-def test_the_page_shows_the_committed_cards() -> None:
+def test_the_page_shows_the_committed_cards():
     """`coopoc benchmark --table --out benchmarks/cards` prints the table."""
     assert (
         benchmark.page([json.loads(file.read_text()) for file in CARDS]) in (ROOT / "docs" / "benchmark.md").read_text()
@@ -242,7 +240,7 @@ class Own:
 
 
 @pytest.mark.slow
-def test_real_measurements_are_tasks_for_pose_filters(tmp_path: Path) -> None:
+def test_real_measurements_are_tasks_for_pose_filters(tmp_path):
     """The row's RT-LE is that of a PoseFilter by hand; a method of one's own gets the first poses and the noise."""
     (tmp_path / "mine.py").write_text(OWN_POSES)
     (tmp_path / "alone").mkdir()

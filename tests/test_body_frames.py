@@ -1,7 +1,5 @@
 """Recordings in body frames: turned by the compass they are those of the world, draw by draw."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from conftest import refused
@@ -14,11 +12,11 @@ NOISE = co.Sensors(heading_std=0.02, heading_bias_std=0.03, velocity_reading="sp
 
 
 @pytest.fixture
-def body(crossing: co.Fleet) -> co.Recording:
+def body(crossing):
     return co.observe(crossing, NOISE, co.V2X(max_neighbours=3), runs=3, frame="body")
 
 
-def test_turned_by_the_compass_the_draws_are_those_of_the_world(crossing: co.Fleet, body: co.Recording) -> None:
+def test_turned_by_the_compass_the_draws_are_those_of_the_world(crossing, body):
     """Closed form: a bearing plus the compass is the azimuth, with the same errors; fixes and ranges are equal."""
     world = co.observe(crossing, NOISE, co.V2X(max_neighbours=3), runs=3)
     again = in_world(body)
@@ -28,7 +26,7 @@ def test_turned_by_the_compass_the_draws_are_those_of_the_world(crossing: co.Fle
     assert np.abs(np.angle(gap)).max() < 1e-12
 
 
-def test_exact_sensors_give_the_true_motion_back(crossing: co.Fleet) -> None:
+def test_exact_sensors_give_the_true_motion_back(crossing):
     exact = co.Sensors(velocity_std_ratio=0.0, yaw_rate_std=0.0)
     seen = co.observe(crossing, exact, frame="body")
     assert seen.body is not None
@@ -37,7 +35,7 @@ def test_exact_sensors_give_the_true_motion_back(crossing: co.Fleet) -> None:
     assert np.allclose(np.diff(heading, axis=0), crossing.dt * seen.body.yaw_rate[0, 1:], atol=1e-12)
 
 
-def test_lasting_errors_of_odometry_have_their_spread_and_change_no_other_draws(crossing: co.Fleet) -> None:
+def test_lasting_errors_of_odometry_have_their_spread_and_change_no_other_draws(crossing):
     plain, biased = (
         co.observe(crossing, co.Sensors(**more), runs=400, frame="body")
         for more in ({}, {"yaw_rate_bias_std": 0.05, "speed_scale_std": 0.1})
@@ -54,7 +52,7 @@ def test_lasting_errors_of_odometry_have_their_spread_and_change_no_other_draws(
     assert scale.std() == pytest.approx(0.1, rel=0.1)
 
 
-def test_landmarks_are_measured_beside_the_neighbours_and_stand_exactly(crossing: co.Fleet) -> None:
+def test_landmarks_are_measured_beside_the_neighbours_and_stand_exactly(crossing):
     still = co.Fleet(
         (*crossing.ids, "mast"),
         crossing.t,
@@ -75,7 +73,7 @@ def test_landmarks_are_measured_beside_the_neighbours_and_stand_exactly(crossing
         co.observe(crossing, co.Sensors(), landmarks=["c0"])
 
 
-def test_position_methods_refuse_body_frames(body: co.Recording) -> None:
+def test_position_methods_refuse_body_frames(body):
     for method in (co.Kalman(), co.JointFilter(), co.BatchSmoother()):
         with refused(r"body frames: must be in the world frame here.*in_world"):
             method(body)
@@ -86,7 +84,7 @@ def test_position_methods_refuse_body_frames(body: co.Recording) -> None:
         in_world(in_world(body))
 
 
-def test_a_recording_in_body_frames_is_cut_and_stored_as_any(body: co.Recording, tmp_path: Path) -> None:
+def test_a_recording_in_body_frames_is_cut_and_stored_as_any(body, tmp_path):
     save_recording(body, tmp_path / "body.npz")
     again, _ = read_recording(tmp_path / "body.npz")
     assert again.body is not None
@@ -97,7 +95,7 @@ def test_a_recording_in_body_frames_is_cut_and_stored_as_any(body: co.Recording,
     assert np.array_equal(part.body.heading, body.body.heading[1:3, 10:20])
 
 
-def test_a_cap_acts_in_body_frames(crossing: co.Fleet) -> None:
+def test_a_cap_acts_in_body_frames(crossing):
     capped = co.V2X(max_neighbours=3, bytes_per_second=500.0)
     track = co.PoseFilter(fusion="naive")(co.observe(crossing, NOISE, capped, frame="body"))
     assert track.received_bytes.max() <= 500.0 * 7.0

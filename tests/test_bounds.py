@@ -34,7 +34,7 @@ UNSEEN = 1e3
 NEAR = co.V2X(max_neighbours=2, radius=60.0)
 
 
-def test_solo_bound_tends_to_the_riccati_solution() -> None:
+def test_solo_bound_tends_to_the_riccati_solution():
     """Closed form: p = -q/2 + sqrt(q^2/4 + q r) after the update."""
     fleet = Fleet(("a",), np.arange(900) * 0.1, np.zeros((900, 1, 3)), np.full((900, 1, 3), 10 / np.sqrt(3)))
     q, r = (0.1 * 1.5) ** 2, 3.5**2
@@ -76,7 +76,7 @@ def point_marginals(
 
 
 @pytest.mark.parametrize(("neighbours", "everyone"), [(0, False), (5, False), (3, True)])
-def test_bounds_equal_gtsam_marginals(neighbours: int, everyone: bool, crossing: Fleet) -> None:
+def test_bounds_equal_gtsam_marginals(neighbours, everyone, crossing):
     """A graph up to step t gives the filtering bound at t, the whole graph the smoothing bound."""
     v2x, ego = V2X(max_neighbours=neighbours, radius=30.0), 7 if everyone else 0
     fleet = coming_and_going(crossing).between(15, 45) if everyone else crossing
@@ -103,9 +103,7 @@ WRONG = co.Outliers(
 
 
 @pytest.mark.parametrize(("neighbours", "everyone"), [(0, False), (4, False), (3, True)])
-def test_an_estimator_that_is_told_what_is_wrong_has_gtsams_bound_without_it(
-    neighbours: int, everyone: bool, crossing: Fleet
-) -> None:
+def test_an_estimator_that_is_told_what_is_wrong_has_gtsams_bound_without_it(neighbours, everyone, crossing):
     """What is wrong is not in the recording (test_outliers), and has no factor in GTSAM's graph."""
     v2x, who = V2X(max_neighbours=neighbours, radius=30.0), range(8) if everyone else [0]
     clean, told = (
@@ -134,7 +132,7 @@ def near(square: np.ndarray, bound: float) -> None:
     assert square.mean() < 1.15 * bound
 
 
-def test_a_recording_of_something_else_is_refused(crossing: Fleet) -> None:
+def test_a_recording_of_something_else_is_refused(crossing):
     v2x = V2X(max_neighbours=4)
     for other in (observe(crossing.between(0, 9), S2, v2x), observe(crossing, S2, V2X(max_neighbours=1))):
         with refused("record"):
@@ -142,7 +140,7 @@ def test_a_recording_of_something_else_is_refused(crossing: Fleet) -> None:
 
 
 @pytest.mark.parametrize("what", ["gnss_std", "range_std", "azimuth_std", "velocity_std_ratio"])
-def test_more_noise_is_never_more_information(what: str, crossing: Fleet) -> None:
+def test_more_noise_is_never_more_information(what, crossing):
     more = replace(S2, **{what: np.multiply(getattr(S2, what), 1.5).tolist()})
     small, large = (posterior_bound(crossing, noise, 0, V2X(3, 60.0)) for noise in (S2, more))
     assert np.linalg.eigvalsh(large - small).min() > -1e-9
@@ -152,7 +150,7 @@ def test_more_noise_is_never_more_information(what: str, crossing: Fleet) -> Non
 @pytest.mark.parametrize(
     ("method", "neighbours"), [(Kalman("nominal"), 0), (JointFilter("nominal"), 6)], ids=["solo", "star"]
 )
-def test_no_filter_beats_the_bound_of_its_own_information(method, neighbours: int, formation: Fleet) -> None:
+def test_no_filter_beats_the_bound_of_its_own_information(method, neighbours, formation):
     """rms RT-LE against the bound beyond its interval (chi-square on the runs), and not far above it."""
     fleet = formation.between(0, 400)
     v2x = V2X(max_neighbours=neighbours)
@@ -161,7 +159,7 @@ def test_no_filter_beats_the_bound_of_its_own_information(method, neighbours: in
     near(square, bound_rt_le(posterior_bound(fleet, S2, 0, v2x)) ** 2)
 
 
-def test_exact_fixes_have_no_bound(crossing: Fleet) -> None:
+def test_exact_fixes_have_no_bound(crossing):
     with refused("relative_std"):
         posterior_bound(crossing, Sensors(range_std=0), 0, V2X(max_neighbours=2))
     with refused("vehicle"):
@@ -221,7 +219,7 @@ def pose_marginals(fleet: co.Fleet, steps: int, sensors: co.Sensors) -> Any:
 
 @pytest.mark.parametrize("compass", [True, False])
 @pytest.mark.parametrize("masts", [0, 1])
-def test_pose_bounds_equal_gtsam_marginals(masts: int, compass: bool) -> None:
+def test_pose_bounds_equal_gtsam_marginals(masts, compass):
     """A graph up to step t gives the filtering bound at t; GTSAM's covariance is of a step in the body."""
     fleet, sensors = convoy(4, 16, masts), replace(NOISE, compass=compass)
     flat = co.Fleet(fleet.ids, fleet.t, fleet.position * [1, 1, 0], fleet.velocity)
@@ -236,7 +234,7 @@ def test_pose_bounds_equal_gtsam_marginals(masts: int, compass: bool) -> None:
         assert own == pytest.approx(world @ marginal @ world.T, rel=1e-6, abs=1e-9)
 
 
-def test_a_compass_and_a_gyro_alone_are_a_scalar_filter() -> None:
+def test_a_compass_and_a_gyro_alone_are_a_scalar_filter():
     """Closed form at rest: p = -q/2 + sqrt(q^2/4 + q r); a bias of the compass adds its variance."""
     fleet = co.Fleet(("a",), np.arange(2000) * 0.1, np.zeros((2000, 1, 3)), np.zeros((2000, 1, 3)))
     sensors = co.Sensors(heading_std=0.1, yaw_rate_std=0.02)
@@ -258,7 +256,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("method", "k", "masts"), CASES, ids=lambda value: getattr(value, "name", value))
-def test_no_pose_filter_beats_its_bound_and_the_optimum_reaches_it(method: co.PoseFilter, k: int, masts: int) -> None:
+def test_no_pose_filter_beats_its_bound_and_the_optimum_reaches_it(method, k, masts):
     """Monte Carlo at small noise: mean squares of position and heading over 120 runs, t intervals of the runs."""
     fleet = convoy(4, 120, masts)
     lasting = (
@@ -290,6 +288,6 @@ def test_no_pose_filter_beats_its_bound_and_the_optimum_reaches_it(method: co.Po
         (lambda f: co.pose_bound(f, NOISE, landmarks=["m9"]), "landmarks"),
     ],
 )
-def test_mistakes_are_named(make: Any, words: str) -> None:
+def test_mistakes_are_named(make, words):
     with refused(words):
         make(convoy(2, 5, 1))

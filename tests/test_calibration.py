@@ -42,14 +42,14 @@ def seen(steps: int = 300, runs: int = 2, **noise: Any) -> tuple[Recording, Flee
 
 
 @pytest.fixture
-def rivals(monkeypatch: pytest.MonkeyPatch) -> Any:
+def rivals(monkeypatch):
     """benchmarks/rivals.py."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[1] / "benchmarks"))
     return importlib.import_module("rivals")
 
 
 @pytest.mark.parametrize("name", ["EKF", "StoneSoup"])
-def test_without_priors_it_is_the_extended_filter_of_others(rivals: Any, name: str) -> None:
+def test_without_priors_it_is_the_extended_filter_of_others(rivals, name):
     if name == "StoneSoup":
         pytest.importorskip("stonesoup", reason="pip install stonesoup")
     recording, _ = seen(runs=1)
@@ -59,7 +59,7 @@ def test_without_priors_it_is_the_extended_filter_of_others(rivals: Any, name: s
     assert_allclose(mine.covariance[..., :2, :2], other.covariance[..., :2, :2], rtol=1e-4, atol=1e-5)
 
 
-def test_heading_and_scale_are_found() -> None:
+def test_heading_and_scale_are_found():
     """-0.15 rad turns the odometry back and 1 / 1.05 its scale; the errors cost a Kalman filter twice as much."""
     recording, fleet = seen(900, runs=10, gnss_std=(1.0, 1.0, 1.0))
     track = CooperativeFilter(priors=ON_ROADS._replace(heading=0.1))(recording)
@@ -77,7 +77,7 @@ def drive(seed: int, motion: float, fix: float) -> tuple[Recording, Fleet]:
 
 
 @pytest.mark.parametrize("method", [Kalman, CooperativeFilter])
-def test_calibration_helps_where_deviations_are_wrong(method: Any) -> None:
+def test_calibration_helps_where_deviations_are_wrong(method):
     """Odometry ten times worse than assumed and fixes three times better, on a drive that it did not see. The
     cooperative filter's levels find most of it without calibration: 0.8 m, where Kalman has 2.1 m."""
     recording, fleet = drive(0, 10.0, 1 / 3)
@@ -91,7 +91,7 @@ def test_calibration_helps_where_deviations_are_wrong(method: Any) -> None:
 
 
 @pytest.mark.parametrize("with_truth", [False, True])
-def test_calibration_harms_no_drive(with_truth: bool) -> None:
+def test_calibration_harms_no_drive(with_truth):
     """Deviations as assumed, or other ones on the rest than where it was fitted: no worse than the usual numbers by
     more than a few percent, and the Track says what was done."""
     for seed in range(4):
@@ -105,7 +105,7 @@ def test_calibration_harms_no_drive(with_truth: bool) -> None:
 
 
 @pytest.mark.parametrize(("motion", "fix"), [(0.1, 1.0), (0.3, 3.0)])
-def test_a_drive_whose_odometry_is_right_blinds_no_filter(motion: float, fix: float) -> None:
+def test_a_drive_whose_odometry_is_right_blinds_no_filter(motion, fix):
     """Of heading and scale a drive holds one error: calibrated where both are 0, the filter still finds a turn of 6
     degrees and a scale of 5 % in another drive."""
     recording, fleet = drive(0, motion, fix)
@@ -116,7 +116,7 @@ def test_a_drive_whose_odometry_is_right_blinds_no_filter(motion: float, fix: fl
     assert rt_le(fitted(other), truth) < rt_le(CooperativeFilter()(other), truth)
 
 
-def test_what_cannot_be_calibrated_is_refused() -> None:
+def test_what_cannot_be_calibrated_is_refused():
     recording, fleet = drive(0, 1.0, 1.0)
     with refused("ids and times differ"):
         CooperativeFilter.fitted(recording, fleet.between(0, 20))
@@ -126,7 +126,7 @@ def test_what_cannot_be_calibrated_is_refused() -> None:
         CooperativeFilter.fitted(recording.between(0, 10))
 
 
-def test_a_log_of_ones_own_is_a_task(tmp_path: Path) -> None:
+def test_a_log_of_ones_own_is_a_task(tmp_path):
     """Odometry turned by 0.15 rad: the cooperative filter alone is better as it comes, and no worse calibrated."""
     recording, fleet = seen(6000, runs=1)
     rows = ["t,vehicle,x,y,vx,vy"]
@@ -152,7 +152,7 @@ def test_a_log_of_ones_own_is_a_task(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("task", ["f9k", "kitti", "comma2k19"])
-def test_alone_it_is_the_best_on_real_roads(task: str) -> None:
+def test_alone_it_is_the_best_on_real_roads(task):
     """Before Kalman filters, as they come or calibrated; calibration makes nothing worse by more than its interval."""
     for name in ROADS[task]:
         measured(name)

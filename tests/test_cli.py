@@ -8,7 +8,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import Any
 
 import pytest
 from shell import ran
@@ -22,7 +21,7 @@ def coopoc(*words: str, cwd: Path) -> "subprocess.CompletedProcess[str]":
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """A folder in which the small study has run."""
     out = tmp_path_factory.mktemp("cli")
     done = coopoc("run small --jobs 2 --set runs=3 --set max_neighbours=0,2", cwd=out)
@@ -33,7 +32,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_help_a_list_and_a_mistake_load_nothing_heavy_and_show_what_others_add(tmp_path: Path) -> None:
+def test_help_a_list_and_a_mistake_load_nothing_heavy_and_show_what_others_add(tmp_path):
     heavy = ["numpy", "torch", "pandas", "pyarrow", "matplotlib", "joblib", "scipy", "gtsam", "casadi", "cvxpy"]
     mistake = ["run", "real", "--data", "nowhere"]
     for status, command, unused in (
@@ -83,7 +82,7 @@ for words in json.loads(sys.argv[1]):
 
 
 @pytest.fixture(scope="module")
-def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, ...], list[Any]]:
+def answers(tmp_path_factory):
     """Status, stdout and stderr of commands that do nothing, one after the other in one process: most is its start."""
     lines = [
         *([name, "--help"] for name in NAMES),
@@ -99,13 +98,13 @@ def answers(tmp_path_factory: pytest.TempPathFactory) -> dict[tuple[str, ...], l
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_each_command_explains_itself_with_an_example(answers: dict[tuple[str, ...], list[Any]], name: str) -> None:
+def test_each_command_explains_itself_with_an_example(answers, name):
     status, out, err = answers[name, "--help"]
     assert status == 0, err
     assert f"Example: coopoc {name}" in out
 
 
-def test_tables_on_stdout(folder: Path) -> None:
+def test_tables_on_stdout(folder):
     assert coopoc("table runs/small --format latex", cwd=folder).stdout.startswith(r"\begin{table}")
     more = "--rows max_neighbours --value max_error_m --where method=kalman,joint --format csv"
     done = coopoc("table runs/small", more, cwd=folder)
@@ -116,7 +115,7 @@ def test_tables_on_stdout(folder: Path) -> None:
 
 
 @pytest.mark.parametrize("format", ["markdown", "latex"])
-def test_a_reader_that_leaves_early_is_no_error(folder: Path, format: str) -> None:
+def test_a_reader_that_leaves_early_is_no_error(folder, format):
     words = " ".join([*COMMAND, "table", "runs/small", "--format", format])
     done = ran(
         ["bash", "-c", f"{words} | true; exit ${{PIPESTATUS[0]}}"],
@@ -127,7 +126,7 @@ def test_a_reader_that_leaves_early_is_no_error(folder: Path, format: str) -> No
     assert (done.returncode, done.stderr) == (0, "")
 
 
-def test_the_list_names_what_is_installed(tmp_path: Path) -> None:
+def test_the_list_names_what_is_installed(tmp_path):
     done = coopoc("list", cwd=tmp_path)
     assert re.search(r"^studies: .*\bsmall\b", done.stdout, re.M)
     groups = [line.split(":")[0] for line in done.stdout.splitlines()]
@@ -135,7 +134,7 @@ def test_the_list_names_what_is_installed(tmp_path: Path) -> None:
     assert groups == ["datasets", "methods", "studies", "backends", *open_sets]
 
 
-def test_commands_of_others(answers: dict[tuple[str, ...], list[Any]]) -> None:
+def test_commands_of_others(answers):
     assert answers["greet", "--name", "x"] == [0, "hello x\n", ""]
     assert answers["kin", "greet"] == [0, "hello you\n", ""]
     assert "greet" in answers["kin", "--help"][1]
@@ -143,7 +142,7 @@ def test_commands_of_others(answers: dict[tuple[str, ...], list[Any]]) -> None:
 
 
 @pytest.mark.parametrize(("words", "message"), MISTAKES)
-def test_bad_usage_is_one_readable_line(answers: dict[tuple[str, ...], list[Any]], words: str, message: str) -> None:
+def test_bad_usage_is_one_readable_line(answers, words, message):
     status, out, err = answers[tuple(words.split())]
     assert status == 2
     assert err.startswith("coopoc: ")
@@ -153,7 +152,7 @@ def test_bad_usage_is_one_readable_line(answers: dict[tuple[str, ...], list[Any]
     assert out == ""
 
 
-def test_ctrl_c_while_libraries_load_ends_without_a_traceback(tmp_path: Path) -> None:
+def test_ctrl_c_while_libraries_load_ends_without_a_traceback(tmp_path):
     code = (
         "import sys\nclass Stop:\n    def find_spec(self, name, *rest):\n        if name == 'tyro':\n"
         "            raise KeyboardInterrupt\nsys.meta_path.insert(0, Stop())\nfrom coopoc.workers import main\nmain()"
@@ -162,7 +161,7 @@ def test_ctrl_c_while_libraries_load_ends_without_a_traceback(tmp_path: Path) ->
     assert (done.returncode, done.stderr) == (130, "")
 
 
-def test_failed_cells_set_the_status(tmp_path: Path) -> None:
+def test_failed_cells_set_the_status(tmp_path):
     (tmp_path / "trouble").write_text("raise")
     done = coopoc("run small --set runs=2", f"trouble={tmp_path / 'trouble'}", cwd=tmp_path)
     assert done.returncode == 1
@@ -173,7 +172,7 @@ def test_failed_cells_set_the_status(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("jobs", ["1", "2"])
-def test_an_interrupted_run_says_so_and_resumes(tmp_path: Path, jobs: str) -> None:
+def test_an_interrupted_run_says_so_and_resumes(tmp_path, jobs):
     words = ["run", "small", "--jobs", jobs, "--set", "runs=2", "pause=0.4"]
     process = subprocess.Popen(
         [*COMMAND, *words],

@@ -78,7 +78,7 @@ def parsed(argv: list[str]) -> tuple[str, dict[str, Any]]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """What the pages assume that a reader has: the files of two pages, a log, drives, a graph, a method."""
     out = tmp_path_factory.mktemp("reader")
     for page in ("extend", "your_data"):
@@ -112,9 +112,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize(("page", "line"), COMMANDS, ids=lambda text: text.replace("coopoc ", ""))
-def test_a_command_parses_and_names_what_exists(
-    page: str, line: str, folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_command_parses_and_names_what_exists(page, line, folder, monkeypatch, capsys):
     name, given = parsed(words(line))
     monkeypatch.chdir(folder)
     monkeypatch.setenv("COOPOC_DATA", str(folder / "fetched"))
@@ -151,7 +149,7 @@ CHEAP = [
 """In this order, each from a page."""
 
 
-def test_the_cheap_ones_run(folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_cheap_ones_run(folder, tmp_path, monkeypatch):
     shown = {line for _, line in COMMANDS}
     shutil.copytree(folder, tmp_path / "reader", symlinks=True)
     monkeypatch.chdir(tmp_path / "reader")
@@ -161,7 +159,7 @@ def test_the_cheap_ones_run(folder: Path, tmp_path: Path, monkeypatch: pytest.Mo
     assert Path("report.html").stat().st_size > 1e5
 
 
-def test_scripts_and_targets_of_the_pages_exist() -> None:
+def test_scripts_and_targets_of_the_pages_exist():
     pages = [path.read_text() for path in PAGES]
     scripts = {
         name for text in pages for name in re.findall(r"python (?:-m )?((?:examples|benchmarks|tests)/\w+\.py)", text)
@@ -174,7 +172,7 @@ def test_scripts_and_targets_of_the_pages_exist() -> None:
     assert targets - set(re.findall(r"^([a-z-]+):", (ROOT / "Makefile").read_text(), flags=re.MULTILINE)) == set()
 
 
-def test_the_help_of_a_study_lists_its_settings() -> None:
+def test_the_help_of_a_study_lists_its_settings():
     done = ran([sys.executable, "-m", "coopoc.cli", "run", "neighbours", "--help"])
     assert done.returncode == 0
     for line in ("  runs=30", "  max_neighbours=0,1,2,3,4,6,8,10", "  data=town10  (of town04, town10, "):

@@ -1,7 +1,6 @@
 """Convoys: pieces of one real drive side by side keep its errors; star filters get rows on them."""
 
 import json
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,7 +13,7 @@ TASKS = ("convoy-kitti", "convoy-f9k", "convoy-comma2k19")
 
 
 @pytest.mark.parametrize("task", TASKS)
-def test_vehicles_err_as_the_pieces_of_the_drive(task: str) -> None:
+def test_vehicles_err_as_the_pieces_of_the_drive(task):
     for name in roads.ROADS[convoys.CONVOYS[task]]:
         measured(name)
     recording, fleet = convoys.convoy(task, measured())
@@ -44,7 +43,7 @@ def test_vehicles_err_as_the_pieces_of_the_drive(task: str) -> None:
     assert not np.array_equal(recording.relative[0], recording.relative[1])
 
 
-def test_star_filters_get_rows_on_convoys(tmp_path: Path) -> None:
+def test_star_filters_get_rows_on_convoys(tmp_path):
     measured("KITTI_00_gt.txt")
     assert benchmark.benchmark(("joint", "kalman"), data=measured(), tasks=("convoy-kitti",), out=tmp_path) == 0
     joint, alone = (json.loads((tmp_path / f"{name}.json").read_text())["tasks"][0] for name in ("joint", "kalman"))

@@ -34,7 +34,7 @@ def drive(steps: int = 80) -> Fleet:
 
 
 @pytest.mark.parametrize("change", [lambda r: r, holed], ids=["whole", "holed"])
-def test_with_everything_off_it_is_the_joint_filter(change: Callable[[Recording], Recording]) -> None:
+def test_with_everything_off_it_is_the_joint_filter(change):
     """Neighbours are there from the start, messages of now, and fixes so fine that it does not matter where rows are
     linear: at the prediction, or at a solution."""
     fleet, fine = winding(80, vehicles=5), replace(S2, gnss_std=(0.01,) * 3, range_std=0.02, velocity_std_ratio=0.01)
@@ -63,7 +63,7 @@ def displaced(seen: Recording) -> Recording:
     return replace(seen, gnss=gnss)
 
 
-def test_wrong_ranges_cost_little_and_are_named() -> None:
+def test_wrong_ranges_cost_little_and_are_named():
     fleet = drive(300)
     seen = observe(fleet, S2, V2X(6), runs=4, observers=[0])
     wrong = too_long(seen)
@@ -80,7 +80,7 @@ def test_wrong_ranges_cost_little_and_are_named() -> None:
     assert "correlated by 0.5" in lasting("a", np.repeat(white, 2, axis=1), 1.0)[0]
 
 
-def test_an_offset_of_all_ranges_is_a_state() -> None:
+def test_an_offset_of_all_ranges_is_a_state():
     """Delays of a radio, the same for a whole run, are estimated; less well where none is stated."""
     fleet, told = drive(300), replace(S2, range_offset_std=1.0)
     seen, longer = (observe(fleet, each, V2X(6), runs=4, observers=[0, 3]) for each in (S2, told))
@@ -99,7 +99,7 @@ def test_an_offset_of_all_ranges_is_a_state() -> None:
     assert state < 1.05 * clean
 
 
-def test_inclinations_alone_do_not_lose_the_ego() -> None:
+def test_inclinations_alone_do_not_lose_the_ego():
     """Near a fix of 3.5 m they are not linear: taken for it they left vehicles 7 to 12 m off; Kalman is the referee."""
     fleet = load_fleet("town10").between(0, 200)
     seen = observe(fleet, S2, V2X(6), runs=6, seed=1, observers=[12, 24, 36])
@@ -110,7 +110,7 @@ def test_inclinations_alone_do_not_lose_the_ego() -> None:
 
 
 @pytest.mark.parametrize("seed", [40, 697, 700])
-def test_a_slip_is_found_before_fixes_are_lost(seed: int) -> None:
+def test_a_slip_is_found_before_fixes_are_lost(seed):
     """One that fixes have not shown yet is no more than they show: else each large innovation passed for one of 1 s."""
     drawn = world(seed, "development")
     ours, joint = (
@@ -120,7 +120,7 @@ def test_a_slip_is_found_before_fixes_are_lost(seed: int) -> None:
 
 
 @pytest.mark.parametrize("most", [0, 4])
-def test_noisy_odometers_are_no_wild_ones(most: int) -> None:
+def test_noisy_odometers_are_no_wild_ones(most):
     """Law: velocities four times as noisy as assumed cost no more than in a filter that takes all of them; they were
     replaced by older ones, as no vehicle changes its own so fast."""
     fleet = load_fleet("town10").between(0, 400)
@@ -131,7 +131,7 @@ def test_noisy_odometers_are_no_wild_ones(most: int) -> None:
         assert ours < joint
 
 
-def test_seldom_messages_raise_no_level_of_motion() -> None:
+def test_seldom_messages_raise_no_level_of_motion():
     """Law: neighbours that send every three seconds say nothing of the ego's odometer (it had 0.55 m)."""
     fleet, egos = load_fleet("town10"), [24, 36]
     seen = observe(fleet, S2, V2X(10, bytes_per_second=200, schedule="round robin"), runs=4, observers=egos)
@@ -142,7 +142,7 @@ def test_seldom_messages_raise_no_level_of_motion() -> None:
 
 @pytest.mark.parametrize("factor", [0.0, 0.5, 2.0])
 @pytest.mark.parametrize("most", [0, 4])
-def test_wheels_that_slip_leave_the_way_as_it_is(most: int, factor: float) -> None:
+def test_wheels_that_slip_leave_the_way_as_it_is(most, factor):
     """Law: while wheels stand still or spin for 5 s, on a bend, too, the error is along the way, and fixes bound it."""
     fleet = load_fleet("town10").between(0, 400)
     sensors = replace(S2, gnss_std=(0.5, 0.5, 0.5))
@@ -156,7 +156,7 @@ def test_wheels_that_slip_leave_the_way_as_it_is(most: int, factor: float) -> No
 
 
 @pytest.mark.parametrize("step", [1, 5])
-def test_a_receiver_that_jumps_beside_neighbours_is_not_followed(step: int) -> None:
+def test_a_receiver_that_jumps_beside_neighbours_is_not_followed(step):
     """Law: fixes of half a metre that jump by 24 m are rejected, teach no level of motion and, once they would be used
     again, cost the receiver its trust: a neighbour knows better."""
     whole = load_fleet("town10").between(0, 500)
@@ -175,7 +175,7 @@ def test_a_receiver_that_jumps_beside_neighbours_is_not_followed(step: int) -> N
     ("most", "std", "off"),
     [(0, 0.5, 10.0), (0, 0.5, 100.0), (1, 0.5, 10.0), (1, 3.5, 30.0), (1, 3.5, 100.0), (2, 3.5, 30.0)],
 )
-def test_a_wrong_start_is_left_soon_after_it(most: int, std: float, off: float) -> None:
+def test_a_wrong_start_is_left_soon_after_it(most, std, off):
     """Law: fixes that are wrong for the first 10 s leave the ego where it is 10 s later. Beside one neighbour it stayed
     off for good, neither receiver being trusted; alone it turned its odometry until it met the fixes."""
     fleet = load_fleet("town10").between(0, 300)
@@ -189,7 +189,7 @@ def test_a_wrong_start_is_left_soon_after_it(most: int, std: float, off: float) 
 
 @pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])
 @pytest.mark.parametrize(("most", "start", "end"), [(0, 0, 20), (0, 20, 30), (0, 20, 50), (1, 0, 20), (1, 20, 50)])
-def test_fixes_that_were_wrong_are_forgotten_soon_after(priors: Priors, most: int, start: int, end: int) -> None:
+def test_fixes_that_were_wrong_are_forgotten_soon_after(priors, most, start, end):
     """Law: fixes that are wrong for 10 to 30 s, at first or later, cost no more 10 s after than in a Kalman filter that
     is alone. They passed for noisy ones and were rejected for a minute, or had led the ego away for as long: it was up
     to 320 m off. Alone it goes back to where it would have been; an error that its neighbour has, too, is the ego's."""
@@ -205,7 +205,7 @@ def test_fixes_that_were_wrong_are_forgotten_soon_after(priors: Priors, most: in
         assert error.mean() < (0.5 if most else 1.7 * usual.mean())
 
 
-def test_a_position_of_a_minute_is_kept() -> None:
+def test_a_position_of_a_minute_is_kept():
     """Law: fixes that jump after a minute of agreement, and stay there, are no wrong start: they count as noisier, and
     the ego goes on by its odometry. Against the oracle, too."""
     whole = load_fleet("town10").select([24])
@@ -223,7 +223,7 @@ def test_a_position_of_a_minute_is_kept() -> None:
     assert np.linalg.norm(Kalman()(jumped).x[0, -1, 0] - fleet.position[-1, 0]) > 30.0
 
 
-def test_neighbours_that_send_nothing_judge_no_receiver() -> None:
+def test_neighbours_that_send_nothing_judge_no_receiver():
     """Law: beside vehicles that are measured and silent an ego is alone, whatever its odometer says for a while."""
     fleet = load_fleet("town10").between(0, 400)
     tracks = []
@@ -236,7 +236,7 @@ def test_neighbours_that_send_nothing_judge_no_receiver() -> None:
     assert np.abs(tracks[2] - tracks[0]).max() < 0.1
 
 
-def test_a_lost_message_costs_no_more_than_the_message() -> None:
+def test_a_lost_message_costs_no_more_than_the_message():
     """Two of a hundred lost, alone and in runs; what was said once counted twice made that 20 % worse, NEES 4.2."""
     fleet = drive(600)
     channels = V2X(6), V2X(6, loss=0.02), V2X(6, loss=0.3), V2X(6, loss=0.3, burst=10.0), V2X(6, rate=2.0)
@@ -300,7 +300,7 @@ def tunnel(recording: Recording) -> Recording:
 
 @pytest.mark.parametrize("priors", [Priors(), AS_STATED], ids=["guarded", "open"])
 @pytest.mark.parametrize("case", BAD)
-def test_the_filter_is_its_oracle(crossing: Fleet, case: str, priors: Priors) -> None:
+def test_the_filter_is_its_oracle(crossing, case, priors):
     """Against dense matrices, one number at a time; members come, go and lose trust."""
     sensors, v2x, change = BAD[case]
     fleet = gappy(crossing)
@@ -321,7 +321,7 @@ def test_the_filter_is_its_oracle(crossing: Fleet, case: str, priors: Priors) ->
 @pytest.mark.parametrize(
     "case", ["late", "mirrored", "failing", "tunnel", "lost", "attack", "measured", "displaced, late"]
 )
-def test_step_by_step_it_is_the_track(crossing: Fleet, case: str) -> None:
+def test_step_by_step_it_is_the_track(crossing, case):
     """A stream has no recording: each vehicle's broadcast of a step is that of a stream of its own."""
     sensors, v2x, change = BAD[case]
     seen = change(observe(gappy(crossing), sensors, v2x, runs=1, observers=[0]))
@@ -367,7 +367,7 @@ def newest(seen: Recording, sent: Mapping[tuple[int, int], Any], t: int, s: int,
     }
 
 
-def test_neighbours_that_are_silent_for_seconds_stand_where_they_are_measured() -> None:
+def test_neighbours_that_are_silent_for_seconds_stand_where_they_are_measured():
     """White noise as assumed, steps of 1 s, a third of the messages lost: not worse than the textbook's filter."""
     town = load_fleet("town10-validation")
     fleet = Fleet(town.ids, town.t[::10], town.position[::10], town.velocity[::10]).select(range(0, 30))
@@ -381,7 +381,7 @@ def test_neighbours_that_are_silent_for_seconds_stand_where_they_are_measured() 
 
 
 @pytest.mark.parametrize("seed", [798, 1325, 2588])
-def test_a_neighbour_that_repeats_its_messages_never_leads_far_off(seed: int) -> None:
+def test_a_neighbour_that_repeats_its_messages_never_leads_far_off(seed):
     """Law: what was rejected for long is not used after all. 20 times a second the lock-out ended before trust did, and
     messages 100 m off were taken: errors of 15 to 32 times those alone."""
     drawn = world(seed, "development")
@@ -390,7 +390,7 @@ def test_a_neighbour_that_repeats_its_messages_never_leads_far_off(seed: int) ->
 
 
 @pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])
-def test_clocks_of_neighbours_are_found(priors: Priors) -> None:
+def test_clocks_of_neighbours_are_found(priors):
     """Messages of a third that hold what was 0.5 s ago cost an eighth of the error, not a third; the others' clocks
     are right. Both are the same drive with the same draws."""
     fleet = load_fleet("town10-validation").between(0, 300)

@@ -79,7 +79,7 @@ def written(folder: Path, **options: Any) -> Path:
     return folder
 
 
-def test_what_was_measured_is_what_the_recording_holds(tmp_path: Path) -> None:
+def test_what_was_measured_is_what_the_recording_holds(tmp_path):
     log = load_log(f"{written(tmp_path / 'log')}?frame=body")
     rec, cars = log.recording, drives()
     assert rec.body is not None
@@ -111,7 +111,7 @@ def test_what_was_measured_is_what_the_recording_holds(tmp_path: Path) -> None:
     assert_allclose(wrapped(log.truth.heading[:, rec.ids.index("blue")] - cars["blue"][1]), 0, atol=1e-9)
 
 
-def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path: Path) -> None:
+def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path):
     """One car has fixes; the others measure it and each other, and none has a compass."""
     folder = written(tmp_path / "log", noise=1.0, compass=False)
     frame = pd.read_csv(folder / "log.csv")
@@ -132,7 +132,7 @@ def test_a_vehicle_without_a_fix_starts_from_what_it_sees_of_others(tmp_path: Pa
         co.pose_start(co.read_log(folder, frame="body").recording)
 
 
-def test_a_log_without_a_fix_is_read_and_what_landmarks_cannot_measure_is_counted(tmp_path: Path) -> None:
+def test_a_log_without_a_fix_is_read_and_what_landmarks_cannot_measure_is_counted(tmp_path):
     frame, _ = table()
     frame = frame[~frame["kind"].isin(["x", "y"]) | (frame["vehicle"] == "mast")]
     more = [(0.4, "mast", "bearing", "red", 0.3, 0.1), (0.4, "red", "vx", "", 1.0, 0.1)]
@@ -157,7 +157,7 @@ def test_a_log_without_a_fix_is_read_and_what_landmarks_cannot_measure_is_counte
         ("", {"frame": "boddy"}, "Did you mean body"),
     ],
 )
-def test_mistakes_are_named(tmp_path: Path, drop: str, options: dict[str, Any], message: str) -> None:
+def test_mistakes_are_named(tmp_path, drop, options, message):
     frame, _ = table()
     frame[(frame["kind"] != drop) | (frame["vehicle"] != "red")].to_csv(tmp_path / "log.csv", index=False)
     with refused(message):
@@ -165,7 +165,7 @@ def test_mistakes_are_named(tmp_path: Path, drop: str, options: dict[str, Any], 
 
 
 @pytest.mark.parametrize("mirrored", [False, True])
-def test_the_check_follows_the_fleet_and_finds_mirrored_bearings(tmp_path: Path, mirrored: bool) -> None:
+def test_the_check_follows_the_fleet_and_finds_mirrored_bearings(tmp_path, mirrored):
     folder = written(tmp_path / "log", noise=1.0, mirrored=mirrored, compass=False)
     command = [sys.executable, "-W", "error", "-m", "coopoc.cli", "data", "check", f"{folder}?frame=body"]
     done = ran(command, cwd=tmp_path, check=True)
@@ -177,7 +177,7 @@ def test_the_check_follows_the_fleet_and_finds_mirrored_bearings(tmp_path: Path,
 
 
 @pytest.mark.parametrize(("frame", "hint"), [("world", "They look like bearings"), ("body", "Then name them bearing")])
-def test_bearings_that_are_called_azimuths_are_named(tmp_path: Path, frame: Any, hint: str) -> None:
+def test_bearings_that_are_called_azimuths_are_named(tmp_path, frame, hint):
     log, _ = table(noise=1.0, compass=frame == "world")
     log.replace({"kind": {"bearing": "azimuth"}}).to_csv(tmp_path / "log.csv", index=False)
     assert hint in "\n".join(check_poses(co.read_log(tmp_path / "log.csv", frame=frame)).warnings)
@@ -190,7 +190,7 @@ def test_bearings_that_are_called_azimuths_are_named(tmp_path: Path, frame: Any,
         ("bearing", (1, 1.5), "turned by -1.5. rad: add -1.5"),
     ],
 )
-def test_axes_that_are_turned_or_flipped_are_named(tmp_path: Path, kind: str, change: Any, said: str) -> None:
+def test_axes_that_are_turned_or_flipped_are_named(tmp_path, kind, change, said):
     log, _ = table(noise=1.0, compass=False)
     own = log["kind"] == kind
     log.loc[own, "value"] = wrapped(change[0] * log["value"][own] + change[1])
@@ -198,7 +198,7 @@ def test_axes_that_are_turned_or_flipped_are_named(tmp_path: Path, kind: str, ch
     assert re.search(said, "\n".join(check_poses(co.read_log(tmp_path / "log.csv", frame="body")).warnings))
 
 
-def test_the_check_scores_those_whose_truth_is_known(tmp_path: Path) -> None:
+def test_the_check_scores_those_whose_truth_is_known(tmp_path):
     folder = written(tmp_path / "log", noise=1.0)
     truth = table()[1]
     truth[truth["vehicle"] == "blue"].assign(x=lambda frame: frame["x"] + 50).to_csv(folder / "truth.csv", index=False)
@@ -211,7 +211,7 @@ def test_the_check_scores_those_whose_truth_is_known(tmp_path: Path) -> None:
     assert ["blue: fixes lie -5" in warning for warning in found.warnings] == [False, True]
 
 
-def test_what_no_filter_can_follow_is_still_summarised(tmp_path: Path) -> None:
+def test_what_no_filter_can_follow_is_still_summarised(tmp_path):
     frame, _ = table(compass=False)
     frame = frame[~frame["kind"].isin(["x", "y"]) & (frame["vehicle"] != "mast")]
     frame.to_csv(tmp_path / "log.csv", index=False)
@@ -221,7 +221,7 @@ def test_what_no_filter_can_follow_is_still_summarised(tmp_path: Path) -> None:
     assert "no filter follows it" in done.stdout
 
 
-def test_innovations_of_poses_are_consistent_where_all_is_white() -> None:
+def test_innovations_of_poses_are_consistent_where_all_is_white():
     """Closed form: normalised innovations of a right filter average 1 (Bar-Shalom et al. 2001, section 5.4)."""
     fleet = co.load_fleet("town10").between(0, 300)
     noise = co.Sensors(gnss_std=(1.0, 1.0, 1.0), heading_std=0.1, yaw_rate_std=0.05)
@@ -232,7 +232,7 @@ def test_innovations_of_poses_are_consistent_where_all_is_white() -> None:
     assert sure > whole == pytest.approx(1.0, abs=0.03)
 
 
-def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path, monkeypatch):
     """What the filter alone, called here, does with the same log is in the study's rows."""
     data = f"{written(tmp_path / 'log', noise=1.0)}?frame=body"
     settings = {"data": data, "evaluations": 5, "calibrate_s": 10.0, "block_s": 5.0}
@@ -259,7 +259,7 @@ def test_the_study_of_real_poses_takes_a_log_of_ones_own(tmp_path: Path, monkeyp
     assert "No row is trained" in real._caption(results, "")
 
 
-def test_studies_say_where_a_log_belongs(tmp_path: Path) -> None:
+def test_studies_say_where_a_log_belongs(tmp_path):
     folder = written(tmp_path / "log")
     with refused("Take coopoc run real"):
         co.run_study("side_by_side", tmp_path, settings={"data": f"{folder}?frame=body"}, progress=False)
@@ -292,7 +292,7 @@ def librsf(folder: Path, wheels: bool) -> tuple[Any, Any]:
 
 
 @pytest.mark.parametrize("wheels", [True, False])
-def test_libRSFs_text_is_followed_from_ranges_alone(tmp_path: Path, wheels: bool) -> None:
+def test_libRSFs_text_is_followed_from_ranges_alone(tmp_path, wheels):
     """The pose of a robot without a fix, bearing or compass comes from ranges to four anchors."""
     place, heading = librsf(tmp_path / "hall", wheels)
     log = load_log(f"{tmp_path / 'hall'}?frame=body")
@@ -312,7 +312,7 @@ def test_libRSFs_text_is_followed_from_ranges_alone(tmp_path: Path, wheels: bool
         co.read_log(tmp_path / "hall")
 
 
-def test_two_anchors_leave_the_side_open(tmp_path: Path) -> None:
+def test_two_anchors_leave_the_side_open(tmp_path):
     librsf(tmp_path / "hall", True)
     file = tmp_path / "hall" / "Hall_Input.txt"
     file.write_text("\n".join(line for line in file.read_text().split("\n") if not line.endswith(("102 0", "103 0"))))
@@ -321,7 +321,7 @@ def test_two_anchors_leave_the_side_open(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("share", [0.03, -0.05])
-def test_wheels_of_another_size_cost_little_from_a_known_pose(tmp_path: Path, share: float) -> None:
+def test_wheels_of_another_size_cost_little_from_a_known_pose(tmp_path, share):
     """The references are the same filter with right wheels, and one that takes wheels as right."""
     found = {}
     for wheels in (0.0, share):

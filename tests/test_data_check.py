@@ -37,7 +37,7 @@ def cars(folder: Path, change: Callable[[pd.DataFrame], pd.DataFrame] = lambda f
     return folder
 
 
-def test_nothing_looks_wrong_where_nothing_is(tmp_path: Path) -> None:
+def test_nothing_looks_wrong_where_nothing_is(tmp_path):
     assert said(read_log(cars(tmp_path / "log"))) == ""
 
 
@@ -79,7 +79,7 @@ FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
 }
 
 
-def test_an_offset_of_ranges_is_taken_off(tmp_path: Path) -> None:
+def test_an_offset_of_ranges_is_taken_off(tmp_path):
     """Two metres on every range, and a range that is too large by two metres in millimetres."""
     folder = cars(tmp_path / "log", lambda f: f.assign(range=1000 * (f["range"] + 2)))
     log = read_log(folder, scale={"range": 1e-3}, std={"range": 0.3}, offset={"range": 2.0})
@@ -93,7 +93,7 @@ def test_an_offset_of_ranges_is_taken_off(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("truth", [True, False])
-def test_an_antenna_elsewhere_is_found_and_taken_off(tmp_path: Path, truth: bool) -> None:
+def test_an_antenna_elsewhere_is_found_and_taken_off(tmp_path, truth):
     """1.5 m ahead and 0.6 m to the right of a car whose speed changes, with fixes of 0.5 m that come 0.1 s late."""
     t, arm = 0.02 * np.arange(9000), (1.5, -0.6)
     ahead, speed = np.exp(2.5j * np.sin(0.1 * t)), 8 + 4 * np.sin(0.21 * t)
@@ -116,7 +116,7 @@ def test_an_antenna_elsewhere_is_found_and_taken_off(tmp_path: Path, truth: bool
     assert "antenna=" not in said(log)
 
 
-def test_wrong_ranges_are_named_and_mislead_no_filter(tmp_path: Path) -> None:
+def test_wrong_ranges_are_named_and_mislead_no_filter(tmp_path):
     """From the file to the study's rows: with wrong ranges cooperation still helps, without gates it does not."""
     folder = cars(tmp_path / "log", lambda f: f.assign(range=outliers(f["range"], 0.1)))
     log = read_log(folder)
@@ -132,7 +132,7 @@ def test_wrong_ranges_are_named_and_mislead_no_filter(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("fault", FAULTS)
-def test_a_fault_has_a_line(tmp_path: Path, fault: str) -> None:
+def test_a_fault_has_a_line(tmp_path, fault):
     change, message = FAULTS[fault]
     options = {"dt": 0.2} if "stamps" in fault else {}
     text = said(read_log(cars(tmp_path / "log", change), **options))
@@ -141,7 +141,7 @@ def test_a_fault_has_a_line(tmp_path: Path, fault: str) -> None:
         assert "look" not in text
 
 
-def test_a_range_is_known_to_both_ends_and_used_between_steps(tmp_path: Path) -> None:
+def test_a_range_is_known_to_both_ends_and_used_between_steps(tmp_path):
     """Odometry at 50 Hz, ranges at 5 Hz that one car logged: both are helped, at steps as fixes and ranges come."""
     log = read_log(cars(tmp_path / "log", rate=0.02))
     assert log.truth is not None
@@ -160,7 +160,7 @@ def test_a_range_is_known_to_both_ends_and_used_between_steps(tmp_path: Path) ->
     assert read_log(tmp_path / "log", dt=0.02).recording.dt == 0.02
 
 
-def test_the_height_of_a_truth_above_another_surface_is_named(tmp_path: Path) -> None:
+def test_the_height_of_a_truth_above_another_surface_is_named(tmp_path):
     """Four drones with a folder each of fixes and of their radio; the truth is above the geoid, one is 0.8 m off."""
     fleet, log = bends(4, climb=20.0), tmp_path / "drones"
     log.mkdir()
@@ -198,7 +198,7 @@ def three(log: Path, **offsets: float) -> Path:
 
 
 @pytest.mark.parametrize(("who", "offset"), [("logged", 0.8), ("not logged", 0.8), ("logged", 20.0)])
-def test_an_offset_of_the_ranges_of_one_is_named(tmp_path: Path, who: str, offset: float) -> None:
+def test_an_offset_of_the_ranges_of_one_is_named(tmp_path, who, offset):
     log = three(tmp_path / "log", car0_car2=offset, car1_car2=offset)
     text = said(read_log(log, std=None if who == "logged" else {"range": 1.0}))
     assert "car0 and car2 by +" in text
@@ -208,7 +208,7 @@ def test_an_offset_of_the_ranges_of_one_is_named(tmp_path: Path, who: str, offse
 
 
 @pytest.mark.parametrize("known", [True, False])
-def test_offsets_of_pairs_are_found_on_the_first_part(tmp_path: Path, known: bool) -> None:
+def test_offsets_of_pairs_are_found_on_the_first_part(tmp_path, known):
     """Those that were added, to 0.03 m with a truth and 0.1 m without one: the rest is as if they had not been."""
     path, fleet = three(tmp_path / "log", car0_car1=0.5, car0_car2=-0.3), bends(3)
     if known:
@@ -227,7 +227,7 @@ def test_offsets_of_pairs_are_found_on_the_first_part(tmp_path: Path, known: boo
         assert np.median(off[pair]) == pytest.approx(added - found[f"car0 and {other}"], abs=1e-3)
 
 
-def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path: Path) -> None:
+def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path):
     """As receivers do, which give a course to what moves alone: a third of the drive stands."""
     t = np.round(np.arange(0, 90, 0.2), 1)
     moves = (t < 30) | (t >= 60)
@@ -246,7 +246,7 @@ def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path: Path) -> 
     assert "Where a vehicle stands, log a speed of 0" in text
 
 
-def test_one_car_with_a_gap_and_columns_of_its_own(tmp_path: Path) -> None:
+def test_one_car_with_a_gap_and_columns_of_its_own(tmp_path):
     fleet = bends(1)
     frame = fixes(fleet, "car0", 1.0, 1.0).merge(motion(fleet, "car0", 0.1, 0.1), how="outer", on=["t", "vehicle"])
     frame = frame[~frame["t"].between(60, 80)].drop(columns=["vehicle", "z", "vz"])
@@ -262,7 +262,7 @@ def test_one_car_with_a_gap_and_columns_of_its_own(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("given", ["vx,vy", "heading,speed", "", "speed,yaw_rate"])
-def test_an_arm_of_an_antenna_is_taken_off(tmp_path: Path, given: str) -> None:
+def test_an_arm_of_an_antenna_is_taken_off(tmp_path, given):
     """Closed form: on a circle of radius r to the left an antenna drives one of hypot(r - left, forward), and its own
     course is off by arctan2(forward, r - left)."""
     t, r, arm = np.round(np.arange(0, 90, 0.1), 1), 30.0, 1.5 + 0.5j
@@ -304,7 +304,7 @@ def turned_drive(folder: Path, speed: Callable[[Floats], Floats], turn: float, s
     return folder
 
 
-def test_a_turned_odometry_on_a_circle_is_no_late_clock(tmp_path: Path) -> None:
+def test_a_turned_odometry_on_a_circle_is_no_late_clock(tmp_path):
     """Positions that it draws aside lie behind those of the filter along a bend: fixes passed for 0.5 s late."""
     log = turned_drive(tmp_path / "log", lambda t: np.full(len(t), 10.0), 0.05)
     (log / "truth.csv").unlink()
@@ -313,14 +313,14 @@ def test_a_turned_odometry_on_a_circle_is_no_late_clock(tmp_path: Path) -> None:
     assert "behind" not in sentences
 
 
-def test_what_moves_half_of_the_time_is_no_outlier(tmp_path: Path) -> None:
+def test_what_moves_half_of_the_time_is_no_outlier(tmp_path):
     """A turn of 3 degrees, of a car that stands half of the time, was 0 +- 0 beside a truth."""
     log = turned_drive(tmp_path / "log", lambda t: np.clip(10 * np.sin(t * np.pi / 20), 0, None), 0.05)
     sentences = said(read_log(log, std={"x": 1.0, "y": 1.0}))
     assert re.search(r"its odometry is turned by (2\.[89]|3\.0)\d? \+- 0\.[01]\d deg", sentences)
 
 
-def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path: Path) -> None:
+def test_what_may_be_chance_is_said_from_two_standard_errors_on(tmp_path):
     """Whatever the seed of the noise, an error of 1.7 degrees is named, or said to be perhaps one."""
     for seconds in (70, 80, 90):
         log = turned_drive(tmp_path / str(seconds), lambda t: 10 + 4 * np.sin(t / 6), 0.03, seconds)

@@ -25,7 +25,7 @@ def said(folder: Path, options: str = "") -> str:
 
 @pytest.mark.parametrize("truth", [True, False])
 @pytest.mark.parametrize("seed", [1, 2])
-def test_offsets_of_drones_and_both_clocks_are_named(tmp_path: Path, seed: int, truth: bool) -> None:
+def test_offsets_of_drones_and_both_clocks_are_named(tmp_path, seed, truth):
     folder = strange(tmp_path / "log", "drone", seed, rate=seed, **DRONES)
     if not truth:
         (folder / "truth.csv").unlink()
@@ -46,7 +46,7 @@ def test_offsets_of_drones_and_both_clocks_are_named(tmp_path: Path, seed: int, 
 
 
 @pytest.mark.parametrize("late", [0.0, 0.4])
-def test_faults_of_a_convoy_are_named(tmp_path: Path, late: float) -> None:
+def test_faults_of_a_convoy_are_named(tmp_path, late):
     text = said(strange(tmp_path / "log", "car", 3, late=late, **CONVOY))
     assert text.startswith("car2: its filter errs by")
     assert re.findall(r"(\w+): its odometry is too fast by (\d)", text) in ([("car2", "3")], [("car2", "2")])
@@ -55,7 +55,7 @@ def test_faults_of_a_convoy_are_named(tmp_path: Path, late: float) -> None:
     assert len(re.findall(r"fixes are 0\.[34]\d s behind the truth", text)) == 4 * (late > 0)
 
 
-def test_millimetres_and_wheels_of_robots_are_named(tmp_path: Path) -> None:
+def test_millimetres_and_wheels_of_robots_are_named(tmp_path):
     folder = strange(tmp_path / "log", "robot", 4, **ROBOTS)
     text = said(folder, "frame=body")
     assert "scale=range:0.001 (of mm" in text
@@ -66,7 +66,7 @@ def test_millimetres_and_wheels_of_robots_are_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
-def test_the_filter_is_near_one_that_knows_the_faults(tmp_path: Path, seed: int) -> None:
+def test_the_filter_is_near_one_that_knows_the_faults(tmp_path, seed):
     """The reference: the same filter on the same drive without what was planted, the tunnel but."""
     told = "clock=drone1:0.3,drone3:-0.12&offset=auto"
     for kind, fault, options in (("car", CONVOY, ""), ("drone", DRONES, f"?{told}")):
@@ -79,7 +79,7 @@ def test_the_filter_is_near_one_that_knows_the_faults(tmp_path: Path, seed: int)
 
 
 @pytest.mark.parametrize("kind", ["drone", "car", "robot"])
-def test_nothing_is_named_in_clean_logs(tmp_path: Path, kind: str) -> None:
+def test_nothing_is_named_in_clean_logs(tmp_path, kind):
     rng, named = np.random.default_rng(len(kind)), []
     for seed in rng.integers(1000, size=3).tolist():
         options = {"rate": float(rng.choice([0.5, 1.0, 2.0])), "seconds": float(rng.choice([90, 180]))}
@@ -102,7 +102,7 @@ OF_RANGES: dict[str, Any] = {
 
 @pytest.mark.parametrize("truth", [True, False])
 @pytest.mark.parametrize("words", OF_RANGES)
-def test_what_ranges_share_is_named_and_no_offset_is(tmp_path: Path, words: str, truth: bool) -> None:
+def test_what_ranges_share_is_named_and_no_offset_is(tmp_path, words, truth):
     folder = strange(tmp_path / "log", "drone")
     log = pd.read_csv(folder / "log.csv")
     log.assign(**OF_RANGES[words](log)).to_csv(folder / "log.csv", index=False)
@@ -117,9 +117,7 @@ def test_what_ranges_share_is_named_and_no_offset_is(tmp_path: Path, words: str,
     ("pace", "factor", "words"),
     [(1.2, np.exp(0.1j), "turned by [56]"), (9.0, 1.04, "too fast by [34]"), (9.0, 0.96, "too slow by [34]")],
 )
-def test_odometry_of_one_that_errs_is_no_clock_of_others(
-    tmp_path: Path, pace: float, factor: complex, words: str
-) -> None:
+def test_odometry_of_one_that_errs_is_no_clock_of_others(tmp_path, pace, factor, words):
     rng, t, k = np.random.default_rng(5), np.arange(0, 150, 0.2), np.arange(4)[:, None]
     u = pace * (1 + 0.25 * np.sin(0.08 * t + k)) * np.exp(1.2j * np.sin(0.07 * t + 0.3 * k))
     x = 0.2 * np.cumsum(u, axis=1) - 0.1 * u + 9j * k

@@ -8,7 +8,6 @@ import socket
 import threading
 import time
 import zipfile
-from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -46,7 +45,7 @@ class Server:
 
 
 @pytest.fixture
-def server() -> Iterator[Server]:
+def server():
     state, over = Server({}), threading.Event()
 
     class Handler(http.server.BaseHTTPRequestHandler):
@@ -79,7 +78,7 @@ def server() -> Iterator[Server]:
 
 
 @pytest.fixture
-def cache(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def cache(tmp_path, monkeypatch):
     monkeypatch.setenv("COOPOC_DATA", str(tmp_path / "cache"))
     monkeypatch.delenv("COOPOC_MIRROR", raising=False)
     return tmp_path / "cache"
@@ -92,7 +91,7 @@ def entry(name: str, files: dict[str, bytes], address: str = "", **more: str) ->
 
 
 @pytest.fixture
-def car(cache: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> bytes:
+def car(cache, server, monkeypatch):
     """A data set of one drive, which the server has as its project would."""
     data = DRIVE.encode()
     server.files["/drive.csv"] = data
@@ -101,9 +100,7 @@ def car(cache: Path, server: Server, monkeypatch: pytest.MonkeyPatch) -> bytes:
     return data
 
 
-def test_a_data_set_is_fetched_once_and_read_by_name(
-    car: bytes, cache: Path, server: Server, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_data_set_is_fetched_once_and_read_by_name(car, cache, server, capsys):
     with refused("Run coopoc data get car"):
         co.load_fleet("car")
     path = co.fetch("car")
@@ -117,16 +114,14 @@ def test_a_data_set_is_fetched_once_and_read_by_name(
     assert kind_of("car") == "log"
 
 
-def test_a_local_path_goes_before_a_name(
-    car: bytes, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_local_path_goes_before_a_name(car, cache, tmp_path, monkeypatch):
     (tmp_path / "car").mkdir()
     (tmp_path / "car" / "mine.csv").write_text("\n".join(DRIVE.splitlines()[:10]))
     monkeypatch.chdir(tmp_path)
     assert len(load_log("car").recording.t) == len(load_log("car?dt=1").recording.t) == 9
 
 
-def test_one_wrong_byte_is_refused_with_both_hashes_and_removed(car: bytes, cache: Path, server: Server) -> None:
+def test_one_wrong_byte_is_refused_with_both_hashes_and_removed(car, cache, server):
     wrong = b"T" + car[1:]
     server.files["/drive.csv"] = wrong
     with refused(f"{hashlib.sha256(wrong).hexdigest()}.*{hashlib.sha256(car).hexdigest()}.*removed"):
@@ -142,9 +137,7 @@ def test_one_wrong_byte_is_refused_with_both_hashes_and_removed(car: bytes, cach
     assert co.fetch("car").read_bytes() == car
 
 
-def test_a_connection_that_breaks_is_named_and_the_next_call_begins_anew(
-    car: bytes, cache: Path, server: Server
-) -> None:
+def test_a_connection_that_breaks_is_named_and_the_next_call_begins_anew(car, cache, server):
     server.cut = len(car) // 5
     with refused(f"closed the connection after {server.cut} of {len(car)} bytes.*save it as {cache}/car/drive.csv"):
         co.fetch("car")
@@ -156,9 +149,7 @@ def test_a_connection_that_breaks_is_named_and_the_next_call_begins_anew(
 
 
 @pytest.mark.parametrize("silent", ["all", "body"])
-def test_a_silent_server_is_given_up_after_the_stated_seconds(
-    car: bytes, server: Server, silent: str, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_silent_server_is_given_up_after_the_stated_seconds(car, server, silent, capsys):
     server.silent, server.cut, began = silent, 100, time.perf_counter()
     assert _status(["data", "get", "car", "--timeout", "0.5"]) == 2
     assert time.perf_counter() - began < 5
@@ -167,9 +158,7 @@ def test_a_silent_server_is_given_up_after_the_stated_seconds(
     assert len(told.strip().splitlines()) == 1
 
 
-def test_no_network_offline_and_a_missing_page_name_address_and_place(
-    car: bytes, cache: Path, server: Server, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_no_network_offline_and_a_missing_page_name_address_and_place(car, cache, server, monkeypatch, capsys):
     assert _status(["data", "get", "car", "--offline"]) == 2
     told = capsys.readouterr().err
     assert f"{server.address}/drive.csv" in told
@@ -195,7 +184,7 @@ def test_no_network_offline_and_a_missing_page_name_address_and_place(
     assert _status(["data", "get"]) == 2
 
 
-def test_a_file_that_is_placed_by_hand_is_verified(car: bytes, cache: Path) -> None:
+def test_a_file_that_is_placed_by_hand_is_verified(car, cache):
     place = cache / "car" / "drive.csv"
     place.parent.mkdir(parents=True)
     place.write_bytes(b"another")
@@ -205,17 +194,13 @@ def test_a_file_that_is_placed_by_hand_is_verified(car: bytes, cache: Path) -> N
     assert co.fetch("car", offline=True) == place
 
 
-def test_a_mirror_serves_a_copy_of_the_folder(
-    car: bytes, cache: Path, server: Server, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_mirror_serves_a_copy_of_the_folder(car, cache, server, monkeypatch):
     server.files = {"/lab/car/drive.csv": car}
     monkeypatch.setenv("COOPOC_MIRROR", f"{server.address}/lab/")
     assert co.fetch("car").read_bytes() == car
 
 
-def test_files_of_an_archive_are_verified_one_by_one(
-    cache: Path, server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_files_of_an_archive_are_verified_one_by_one(cache, server, tmp_path, monkeypatch):
     files = {"set/a.csv": DRIVE.encode(), "set/b.csv": b"t,x\n"}
     made = entry("zipped", files, archive=f"{server.address}/all.zip", opens="set")
     monkeypatch.setattr(fetching, "public", lambda: {"zipped": made})
@@ -241,7 +226,7 @@ def test_files_of_an_archive_are_verified_one_by_one(
     assert sorted(path.name for path in (cache / "zipped").rglob("*") if path.is_file()) == [".lock", "a.csv", "b.csv"]
 
 
-def test_the_registry_is_complete_and_pins_every_address(cache: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_registry_is_complete_and_pins_every_address(cache, capsys):
     for one in public().values():
         assert all((one.what, one.licence, one.citation, one.tried))
         assert one.page.startswith("http")
@@ -256,7 +241,7 @@ def test_the_registry_is_complete_and_pins_every_address(cache: Path, capsys: py
     assert "coopoc data get f9k" in told
 
 
-def test_what_no_address_serves_says_how_it_is_read(tmp_path: Path) -> None:
+def test_what_no_address_serves_says_how_it_is_read(tmp_path):
     """The paper's drives: the options of the message read a table with CARLA's axes under other names."""
     with refused(r"carla-60' *: is served by https://dx\.doi\.org/10\.21227/511y.*\?columns=.*&scale=y:-1,vy:-1"):
         co.fetch("carla-60")
@@ -267,9 +252,7 @@ def test_what_no_address_serves_says_how_it_is_read(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", [name for name, one in public().items() if one.files])
-def test_the_registry_has_the_hashes_of_what_the_pages_were_computed_from(
-    name: str, cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_registry_has_the_hashes_of_what_the_pages_were_computed_from(name, cache, tmp_path, monkeypatch):
     """Through a mirror made of the files; what it returns is read by the commands that take it."""
     for file in public()[name].files:
         source = measured("/".join(Path(file).parts[-3:]))
@@ -287,7 +270,7 @@ def test_the_registry_has_the_hashes_of_what_the_pages_were_computed_from(
         assert load_log(name + {"comma2k19": "?dt=0.1", "labyrinth": "?frame=body"}.get(name, "")).truth is not None
 
 
-def test_a_folder_of_several_drives_is_refused_and_lists_them(tmp_path: Path) -> None:
+def test_a_folder_of_several_drives_is_refused_and_lists_them(tmp_path):
     rows = DRIVE.splitlines()
     for name, begin in {"monday": 0, "tuesday": 90000, "friday": 1580000000}.items():
         table = [f"{begin + t}{row[row.index(',') :]}" for t, row in enumerate(rows[1:50])]
@@ -302,7 +285,7 @@ def test_a_folder_of_several_drives_is_refused_and_lists_them(tmp_path: Path) ->
         co.read_log(tmp_path)
 
 
-def test_vehicles_that_come_later_are_of_one_drive(tmp_path: Path) -> None:
+def test_vehicles_that_come_later_are_of_one_drive(tmp_path):
     rows = DRIVE.splitlines()
     (tmp_path / "a.csv").write_text("\n".join(rows[:2000]))
     later = [row.replace(",a,", ",b,") for row in rows[2500:]]
@@ -311,7 +294,7 @@ def test_vehicles_that_come_later_are_of_one_drive(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("name", ["truth.csv", "span_truth.csv", "GroundTruth.csv", "car_GT.csv"])
-def test_a_file_with_the_name_of_a_truth_is_one(name: str, tmp_path: Path) -> None:
+def test_a_file_with_the_name_of_a_truth_is_one(name, tmp_path):
     (tmp_path / "car.csv").write_text(DRIVE)
     (tmp_path / name).write_text("\n".join(",".join(row.split(",")[:4]) for row in DRIVE.splitlines()))
     log = co.read_log(tmp_path)
@@ -320,9 +303,7 @@ def test_a_file_with_the_name_of_a_truth_is_one(name: str, tmp_path: Path) -> No
     assert np.isfinite(log.truth.position).all()
 
 
-def test_what_is_missing_names_the_command_that_brings_it(
-    cache: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_what_is_missing_names_the_command_that_brings_it(cache, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     for words, name in {
         "run real": "mrclam-set6",
@@ -343,9 +324,7 @@ def test_what_is_missing_names_the_command_that_brings_it(
     assert "f9k, kitti, comma2k19" in capsys.readouterr().err
 
 
-def test_a_task_of_real_measurements_runs_alone(
-    cache: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_task_of_real_measurements_runs_alone(cache, tmp_path, capsys):
     measured("span_truth.gga")
     folder = measured("ublox_f9k.nmea").parent
     words = ["benchmark", "cooperative-filter", "--tasks", "f9k", "--data", str(folder), "--out", str(tmp_path)]

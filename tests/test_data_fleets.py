@@ -1,7 +1,6 @@
 """The bundled fleets: exact storage, cards that tell the truth, the properties that the studies build on."""
 
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,14 +13,14 @@ from coopoc.data.registry import DATASETS, FLEETS, card, convert, detect, in_wor
 NAMES = ("town10", "town10-clients", "town10-validation", "town04")
 
 
-def test_the_four_fleets_are_bundled_in_less_than_4_mb() -> None:
+def test_the_four_fleets_are_bundled_in_less_than_4_mb():
     assert set(DATASETS) == set(NAMES)
     assert sum(file.stat().st_size for file in FLEETS.iterdir()) < 4e6
     assert [row["name"] for row in list_datasets()] == sorted(NAMES)
 
 
 @pytest.mark.parametrize("name", NAMES)
-def test_digest_source_and_licence_are_those_of_the_card(name: str) -> None:
+def test_digest_source_and_licence_are_those_of_the_card(name):
     fleet, stated = load_fleet(name), card(name)
     assert fleet.digest == stated["sha256"]
     assert (fleet.name, fleet.licence) == (name, stated["map_licence"])
@@ -32,14 +31,14 @@ def test_digest_source_and_licence_are_those_of_the_card(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["town10", "town10-validation", "town04"])
-def test_card_counts_the_neighbours_that_a_kd_tree_finds(name: str) -> None:
+def test_card_counts_the_neighbours_that_a_kd_tree_finds(name):
     """Independent check: SciPy's cKDTree."""
     fleet = load_fleet(name)
     counts = np.array([[len(n) - 1 for n in cKDTree(x).query_ball_point(x, 30.0)] for x in fleet.position[::25]])
     assert np.mean(np.minimum(counts, 10)) == pytest.approx(card(name)["neighbours"]["mean"], rel=0.05)
 
 
-def test_town10_is_dense_and_urban() -> None:
+def test_town10_is_dense_and_urban():
     fleet, stated = load_fleet("town10"), card("town10")
     assert fleet.position.shape == (900, 60, 3)
     assert fleet.present.all()
@@ -50,7 +49,7 @@ def test_town10_is_dense_and_urban() -> None:
     assert path.min() > 90, "every vehicle drives, m in 90 s"
 
 
-def test_clients_have_the_papers_lengths_and_speeds() -> None:
+def test_clients_have_the_papers_lengths_and_speeds():
     """Published values: section IV.A, 8.9-10.8, 9.2-10.9, 0.7-10.7 and 3.6-10.7 m/s; lengths from its figure."""
     fleet = load_fleet("town10-clients")
     assert fleet.present.sum(axis=0).tolist() == [1550, 4600, 1450, 1420]
@@ -62,7 +61,7 @@ def test_clients_have_the_papers_lengths_and_speeds() -> None:
     assert [words[f"speed of {k}"] for k in (1, 4)] == ["8.6..10.9 m/s", "3..10.6 m/s"]
 
 
-def test_town04_is_hilly() -> None:
+def test_town04_is_hilly():
     fleet = load_fleet("town04")
     assert np.ptp(fleet.position[..., 2]) > 10
     gap = fleet.position[:, None] - fleet.position[:, :, None]
@@ -72,7 +71,7 @@ def test_town04_is_hilly() -> None:
     assert np.mean(elevation > 1) > 0.15, "share of neighbours that are seen more than one degree above or below"
 
 
-def test_fleets_are_disjoint() -> None:
+def test_fleets_are_disjoint():
     for one, other in combinations(map(load_fleet, NAMES), 2):
         assert not set(one.ids) & set(other.ids)
         steps = min(len(one.t), len(other.t), 900)
@@ -81,7 +80,7 @@ def test_fleets_are_disjoint() -> None:
             assert same.mean(axis=0).max() < 0.5, "no vehicle drives where one of another fleet drives"
 
 
-def test_unknown_names_and_formats_are_refused_with_the_known_ones(tmp_path: Path) -> None:
+def test_unknown_names_and_formats_are_refused_with_the_known_ones(tmp_path):
     with refused("town10-validation"):
         load_fleet("town11")
     with refused(r"data = 'town10-client'.* Did you mean town10-clients\?"):

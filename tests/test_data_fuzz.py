@@ -46,7 +46,7 @@ def mutated(text: str, rng: np.random.Generator) -> bytes:
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_a_mutated_file_ends_in_our_exceptions(tmp_path: Path, name: str) -> None:
+def test_a_mutated_file_ends_in_our_exceptions(tmp_path, name):
     reader = READERS[name]
     files = {file: text.encode() for file, text in reader.files.items()}
     assert not verdict(reader, packed(files), tmp_path)
@@ -61,7 +61,7 @@ def test_a_mutated_file_ends_in_our_exceptions(tmp_path: Path, name: str) -> Non
 
 
 @pytest.mark.parametrize("name", READERS)
-def test_the_corpus_of_the_coverage_guided_run_ends_in_our_exceptions(tmp_path: Path, name: str) -> None:
+def test_the_corpus_of_the_coverage_guided_run_ends_in_our_exceptions(tmp_path, name):
     """Finds of `make fuzz`, each mended since, and inputs that reach other lines than the good files."""
     found = {}
     for path in sorted((CORPUS / name.replace(" ", "-")).glob("*")):

@@ -32,7 +32,7 @@ with_sumo = pytest.mark.skipif(
 
 
 @with_sumo
-def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path: Path) -> None:
+def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path):
     one, two = (make(TINY, measured("Town10HD.xodr").parent, tmp_path / name) for name in ("one", "two"))
     other = make(replace(TINY, seed=2), measured("Town10HD.xodr").parent, tmp_path / "other")
     for suffix in ("parquet", "json"):
@@ -46,7 +46,7 @@ def test_the_same_seed_gives_the_same_bytes_and_another_does_not(tmp_path: Path)
 
 
 @with_sumo
-def test_a_bundled_fleet_is_made_again_bit_by_bit(tmp_path: Path) -> None:
+def test_a_bundled_fleet_is_made_again_bit_by_bit(tmp_path):
     """The smallest one here; all four were made again by hand with the SUMO that their cards name."""
     stated = card("town10-clients")
     if version("eclipse-sumo") != stated["sumo"]:
@@ -56,7 +56,7 @@ def test_a_bundled_fleet_is_made_again_bit_by_bit(tmp_path: Path) -> None:
     assert Recipe(**made["recipe"]) == script.bundled_recipe("town10-clients")
 
 
-def test_elevation_is_that_of_the_map() -> None:
+def test_elevation_is_that_of_the_map():
     """Independent check: elevation polynomials of the OpenDRIVE file at its reference lines, without netconvert."""
     points = []
     for road in ElementTree.parse(measured("Town04.xodr")).getroot().iter("road"):
@@ -73,7 +73,7 @@ def test_elevation_is_that_of_the_map() -> None:
     assert np.ptp([z for index, z in zip(near, x[:, 2], strict=True) if index]) > 10
 
 
-def test_smoothing_halves_the_cutoff_and_keeps_slow_motion() -> None:
+def test_smoothing_halves_the_cutoff_and_keeps_slow_motion():
     """Closed form of the gain, 1/(1 + (f/fc)^6), and the frequency response of sin by its amplitude."""
     t = np.arange(2000) * 0.1
     for f, gain in ((0.05, 1.0), (0.5, 0.5), (1.0, 1 / (1 + 2.0**6))):
@@ -83,7 +83,7 @@ def test_smoothing_halves_the_cutoff_and_keeps_slow_motion() -> None:
         assert amplitude == pytest.approx(gain, abs=0.03)
 
 
-def test_smoothing_solves_the_penalised_least_squares() -> None:
+def test_smoothing_solves_the_penalised_least_squares():
     """Independent check: numpy.linalg.lstsq on the stacked problem."""
     x = np.random.default_rng(0).normal(size=(40, 3))
     weight = (2 * np.pi * 0.5 * 0.1) ** -3
@@ -93,19 +93,19 @@ def test_smoothing_solves_the_penalised_least_squares() -> None:
 
 
 @with_sumo
-def test_a_missing_map_is_named(tmp_path: Path) -> None:
+def test_a_missing_map_is_named(tmp_path):
     with refused(r"Town10HD\.xodr"):
         make(TINY, tmp_path, tmp_path)
 
 
-def test_without_sumo_the_pip_line_is_shown(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_sumo_the_pip_line_is_shown(monkeypatch):
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
     with pytest.raises(MissingLibraryError, match=r"pip install .*\[sumo\]'"):
         script.program("sumo")
 
 
 @with_sumo
-def test_what_was_made_is_loaded_and_converted(tmp_path: Path) -> None:
+def test_what_was_made_is_loaded_and_converted(tmp_path):
     made = tmp_path / "tiny.parquet"
     make(TINY, measured("Town10HD.xodr").parent, tmp_path)
     fleet = load_fleet(made)

@@ -21,7 +21,7 @@ from coopoc.evaluate.metrics import nees
 
 
 @pytest.mark.parametrize("suffix", ["csv", "parquet"])
-def test_a_recording_comes_back_from_its_rows(tmp_path: Path, suffix: str) -> None:
+def test_a_recording_comes_back_from_its_rows(tmp_path, suffix):
     """Fixes, velocities, relative measurements and messages; late and lost ones, too. Velocities are means over steps
     of samples joined by lines, so those of the rows are made such that their means are the recording's."""
     fleet = drive(start=1.7e9)
@@ -56,7 +56,7 @@ def test_a_recording_comes_back_from_its_rows(tmp_path: Path, suffix: str) -> No
 
 
 @pytest.mark.parametrize("latitude", [48.14, -33.9, 0.0, 89.9])
-def test_degrees_are_metres_by_the_radii_of_curvature(tmp_path: Path, latitude: float) -> None:
+def test_degrees_are_metres_by_the_radii_of_curvature(tmp_path, latitude):
     """Closed form: east N cos(lat) dlon and north M dlat of WGS84 (Hofmann-Wellenhof et al. 2008, section 8)."""
     d, a, e2 = 1e-4 * np.arange(20), 6378137.0, 0.00669437999014
     frame = {"t": np.arange(20.0), "latitude": latitude + d, "longitude": 11.58 + d, "height": 20.0}
@@ -67,7 +67,7 @@ def test_degrees_are_metres_by_the_radii_of_curvature(tmp_path: Path, latitude: 
     assert_allclose(x, (normal + 20) * np.cos(np.radians(latitude + d)) * np.radians(d), rtol=1e-4)
 
 
-def test_a_drive_in_degrees_is_one_in_metres(tmp_path: Path) -> None:
+def test_a_drive_in_degrees_is_one_in_metres(tmp_path):
     fleet = drive(1)
     origin = (48.14, 11.58, 520.0)
     lat, lon, h = pymap3d.enu2geodetic(*fleet.position[:, 0].T, *origin)
@@ -91,7 +91,7 @@ def test_a_drive_in_degrees_is_one_in_metres(tmp_path: Path) -> None:
     assert late.summary.refused["fixes at zero, which are none"][0] == 30
 
 
-def test_columns_that_end_with_a_partner_are_measurements_of_it(tmp_path: Path) -> None:
+def test_columns_that_end_with_a_partner_are_measurements_of_it(tmp_path):
     t = np.arange(0, 10, 0.5)
     for name, other, x in zip("ab", "ba", (0.0, 12.0), strict=True):
         seen = {f"range_{other}": 12.0, f"range_{other}_std": 0.2, "range_kept": "yes"}
@@ -101,7 +101,7 @@ def test_columns_that_end_with_a_partner_are_measurements_of_it(tmp_path: Path) 
     assert sum(log.summary.unused.values()) == 40
 
 
-def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhere(tmp_path: Path) -> None:
+def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhere(tmp_path):
     t = np.arange(0, 10, 0.5)
     fixes = pd.DataFrame({"t": t, "vehicle": "car", "x": 5 * t, "y": 0.0, "std": 2.5})
     motion = pd.DataFrame({"t": t, "vehicle": "car", "vx": 5.0, "vy": 0.0})
@@ -118,7 +118,7 @@ def test_a_std_that_names_no_kind_is_that_of_fixes_alone_and_is_reported_elsewhe
     assert "column value" in unused
 
 
-def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path: Path) -> None:
+def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path):
     """The observer turns at 0.5 rad/s and measures a road-side unit between the steps; closed form, there and at the
     step."""
     t = np.arange(0, 10, 0.1)
@@ -148,7 +148,7 @@ def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path: Path) -> N
     assert "stands at" in log.summary.vehicles["rsu"]
 
 
-def test_slow_fixes_are_brought_to_their_step_by_the_odometry(tmp_path: Path) -> None:
+def test_slow_fixes_are_brought_to_their_step_by_the_odometry(tmp_path):
     """1 Hz fixes 0.03 s beside the steps of 10 Hz odometry: without the motion they were 0.24 m off."""
     fleet = drive(1)
     velocity = pd.DataFrame(
@@ -167,7 +167,7 @@ def test_slow_fixes_are_brought_to_their_step_by_the_odometry(tmp_path: Path) ->
     assert log.summary.refused["steps of a before its first fix"][0] == 3
 
 
-def test_a_clock_that_is_ahead_is_set_back(tmp_path: Path) -> None:
+def test_a_clock_that_is_ahead_is_set_back(tmp_path):
     true = observed(drive(2, start=100.0), k=1, latency=0.2)
     frame = long(true)
     late = frame["vehicle"] == "car1"
@@ -181,7 +181,7 @@ def test_a_clock_that_is_ahead_is_set_back(tmp_path: Path) -> None:
         read_log(tmp_path / "log.csv", clock={"car9": 1.0})
 
 
-def test_vehicles_come_and_go_and_nothing_is_dropped_in_silence(tmp_path: Path) -> None:
+def test_vehicles_come_and_go_and_nothing_is_dropped_in_silence(tmp_path):
     frame = long(observed(drive(3)), messages=False)
     gone = (frame["vehicle"] == "car2") & (frame["t"] > 5.02) & (frame["t"] < 12.02)
     odometry = frame["kind"].isin(["vx", "vy", "vz"])
@@ -199,7 +199,7 @@ def test_vehicles_come_and_go_and_nothing_is_dropped_in_silence(tmp_path: Path) 
     assert bridged.stretches("car2") == ((0, 200),)
 
 
-def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path: Path) -> None:
+def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path):
     """Closed form: eight cars at 10 m/s on bends, headings of 0.05 rad every 0.4 s; NEES is 2 in a plane if consistent,
     and was 43 with the noise of the speeds alone."""
     rng, rows, truth = np.random.default_rng(8), [], []
@@ -248,7 +248,7 @@ def read_rows(rows: list[tuple[Any, ...]], folder: Path, **options: Any) -> co.R
 
 
 @pytest.mark.parametrize("late", [0.0, LATE, -LATE])
-def test_ranges_and_azimuths_of_passing_cars_are_those_at_the_step(tmp_path: Path, late: float) -> None:
+def test_ranges_and_azimuths_of_passing_cars_are_those_at_the_step(tmp_path, late):
     """Moved by the nearest step alone, ranges were wrong by 1 m."""
     rows: list[tuple[Any, ...]] = [(0.0, "mast", kind, "", MAST[k]) for k, kind in enumerate("xy")]
     for t in np.round(np.arange(0, 8, 0.1), 1):
@@ -273,7 +273,7 @@ def test_ranges_and_azimuths_of_passing_cars_are_those_at_the_step(tmp_path: Pat
 
 
 @pytest.mark.parametrize("late", [LATE, -LATE])
-def test_bearings_in_body_frames_turn_with_the_car(tmp_path: Path, late: float) -> None:
+def test_bearings_in_body_frames_turn_with_the_car(tmp_path, late):
     """Closed form: the bearing of what is far away."""
     rows: list[tuple[Any, ...]] = []
     far = 1e6 * MAST
@@ -294,7 +294,7 @@ def test_bearings_in_body_frames_turn_with_the_car(tmp_path: Path, late: float) 
 
 
 @pytest.mark.parametrize("seed", range(4))
-def test_the_mean_over_a_step_is_that_over_its_halves(seed: int) -> None:
+def test_the_mean_over_a_step_is_that_over_its_halves(seed):
     rng = np.random.default_rng(seed)
     signal = Signal(np.cumsum(rng.uniform(0.01, 1.0, 9)), rng.uniform(-1e6, 1e6, (9, 1)))
     halves = step_means(signal, 0.15 * np.arange(-1, 17))[:, 0]
@@ -302,7 +302,7 @@ def test_the_mean_over_a_step_is_that_over_its_halves(seed: int) -> None:
     assert_allclose(whole, (halves[::2] + halves[1::2]) / 2, atol=1e-6, rtol=1e-9)
 
 
-def test_deviations_are_stated_in_any_unit(tmp_path: Path) -> None:
+def test_deviations_are_stated_in_any_unit(tmp_path):
     """The closed form: 3.6 km/h are 1 m/s, and those of a latitude are m."""
     rows = "t,vehicle,latitude,longitude,height,speed_kmh,compass_deg\n"
     rows += "".join(f"{k},a,48,{11 + 1e-5 * k},1,3,90\n" for k in range(9))
@@ -311,7 +311,7 @@ def test_deviations_are_stated_in_any_unit(tmp_path: Path) -> None:
     assert (found.gnss_std, found.velocity_floor) == ((1.0, 2.0, 3.0), pytest.approx(1.0))
 
 
-def test_a_radars_range_is_not_known_to_its_partner(tmp_path: Path) -> None:
+def test_a_radars_range_is_not_known_to_its_partner(tmp_path):
     log = read_log(strange(tmp_path, "car", seconds=30.0))
     assert (log.recording.links.observer > log.recording.links.neighbour).all()
     assert "ranges beside a direction count for who measured them alone" in str(log.summary)

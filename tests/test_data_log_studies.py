@@ -2,7 +2,6 @@
 
 import re
 from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -35,7 +34,7 @@ def truth(fleet: co.Fleet) -> pd.DataFrame:
 
 
 @pytest.fixture(scope="module")
-def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folders(tmp_path_factory):
     """A log without and one with a truth; car2 is away for seven seconds."""
     out = tmp_path_factory.mktemp("logs")
     fleet = drive(4, gap=15.0)
@@ -48,7 +47,7 @@ def folders(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_truth_is_read_on_the_steps_of_the_recording(folders: Path) -> None:
+def test_truth_is_read_on_the_steps_of_the_recording(folders):
     log = read_log(folders / "with")
     assert log.truth is not None
     assert_allclose(log.truth.position, drive(4, gap=15.0).position, atol=1e-9)
@@ -58,7 +57,7 @@ def test_truth_is_read_on_the_steps_of_the_recording(folders: Path) -> None:
         load_fleet(folders / "without")
 
 
-def test_scores_are_of_the_steps_at_which_an_ego_is_there(folders: Path) -> None:
+def test_scores_are_of_the_steps_at_which_an_ego_is_there(folders):
     """Each stretch by itself, pooled by NumPy; bytes per second of driving."""
     log, method = read_log(folders / "with"), co.JointFilter()
     assert log.truth is not None
@@ -79,7 +78,7 @@ def test_scores_are_of_the_steps_at_which_an_ego_is_there(folders: Path) -> None
         method(replace(log.recording, gnss=gnss), ["car1", "car2"])
 
 
-def test_a_unit_at_the_road_is_no_ego_and_real_data_have_no_bound(tmp_path: Path) -> None:
+def test_a_unit_at_the_road_is_no_ego_and_real_data_have_no_bound(tmp_path):
     frame = long(observed(drive(3)), messages=False)
     stands = (frame["vehicle"] == "car2") & frame["kind"].isin(["vx", "vy", "vz"])
     data = str(write(frame.assign(value=frame["value"].mask(stands, 0.0)), tmp_path / "log.csv"))
@@ -88,7 +87,7 @@ def test_a_unit_at_the_road_is_no_ego_and_real_data_have_no_bound(tmp_path: Path
     assert "bound" not in methods >= {"kalman"}
 
 
-def test_settings_of_simulated_noise_do_nothing_on_a_log_and_the_caption_says_so(folders: Path, tmp_path: Path) -> None:
+def test_settings_of_simulated_noise_do_nothing_on_a_log_and_the_caption_says_so(folders, tmp_path):
     more = {"heading_bias_deg": 3.0, "own_share": 0.3, "spoofed_share": 0.5, "egos": "car2", "loss": 0.1}
     settings = {**FEW, "data": str(folders / "without"), **more}
     assert not co.run_study("side_by_side", tmp_path, settings=settings, progress=False).failed
@@ -98,7 +97,7 @@ def test_settings_of_simulated_noise_do_nothing_on_a_log_and_the_caption_says_so
         scene.channel({**more, "data": "town10", "loss": "x"})
 
 
-def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> None:
+def test_innovations_take_the_place_of_scores(folders, tmp_path):
     settings = {**FEW, "data": str(folders / "without")}
     results = co.run_study("side_by_side", tmp_path, settings=settings, progress=False)
     assert not results.failed
@@ -112,7 +111,7 @@ def test_innovations_take_the_place_of_scores(folders: Path, tmp_path: Path) -> 
 
 
 @pytest.mark.parametrize(("options", "offset", "most"), [("", 2.0, 1.0), ("?dt=0.1", 0.0, 0.97), ("", 0.0, 0.93)])
-def test_ranges_help_or_do_no_harm(tmp_path: Path, options: str, offset: float, most: float) -> None:
+def test_ranges_help_or_do_no_harm(tmp_path, options, offset, most):
     """Radios with uncalibrated delays, and steps at half of which nothing is measured; beside the filter alone."""
     fleet, parts = bends(4, 2.0), list[pd.DataFrame]()
     for k, name in enumerate(fleet.ids):
@@ -128,7 +127,7 @@ def test_ranges_help_or_do_no_harm(tmp_path: Path, options: str, offset: float, 
     assert rms[0] < most * rms[1]
 
 
-def test_a_recording_is_stored_bit_by_bit(tmp_path: Path) -> None:
+def test_a_recording_is_stored_bit_by_bit(tmp_path):
     fleet = drive(3)
     recording = co.observe(fleet, co.Sensors.paper_scenario2(), co.V2X(2, loss=0.3), runs=4, seed=1)
     save_recording(recording, tmp_path / "a.npz", fleet)
@@ -143,7 +142,7 @@ def test_a_recording_is_stored_bit_by_bit(tmp_path: Path) -> None:
         save_recording(recording, tmp_path / "c.npz", fleet.between(0, 50))
 
 
-def test_innovations_are_filterpys(folders: Path) -> None:
+def test_innovations_are_filterpys(folders):
     """Independent reference: filterpy's y and S, step by step."""
     rec = co.read_log(folders / "with").recording
     track = co.Kalman()(rec, ["car0"])
@@ -164,7 +163,7 @@ def test_innovations_are_filterpys(folders: Path) -> None:
     assert columns["nis"] == pytest.approx(np.nanmean(squares, axis=1))
 
 
-def test_the_check_finds_nothing_wrong_but_what_was_left_out(folders: Path) -> None:
+def test_the_check_finds_nothing_wrong_but_what_was_left_out(folders):
     found = check(read_log(folders / "with"))
     assert ["not used, first of all 621" in warning for warning in found.warnings] == [True]
     assert all(0.7 < row["nis"] < 1.3 for row in found.vehicles)
@@ -172,7 +171,7 @@ def test_the_check_finds_nothing_wrong_but_what_was_left_out(folders: Path) -> N
     assert ranges["expected_std"] / 2 < ranges["robust_std"] < 1.5 * ranges["expected_std"]
 
 
-def test_a_truth_in_another_frame_is_found(folders: Path, tmp_path: Path) -> None:
+def test_a_truth_in_another_frame_is_found(folders, tmp_path):
     moved = truth(drive(4, gap=15.0)).assign(x=lambda frame: frame["x"] - 40, y=lambda frame: frame["y"] + 9)
     write(moved, tmp_path / "vicon.csv")
     warnings = check(read_log(folders / "without", truth=tmp_path / "vicon.csv")).warnings
@@ -182,7 +181,7 @@ def test_a_truth_in_another_frame_is_found(folders: Path, tmp_path: Path) -> Non
         assert [float(each) for each in offset] == pytest.approx([40, -9], abs=0.7)
 
 
-def test_a_truth_with_another_clock_is_named(folders: Path, tmp_path: Path) -> None:
+def test_a_truth_with_another_clock_is_named(folders, tmp_path):
     late = truth(drive(4, gap=15.0)).assign(t=lambda frame: frame["t"] + 1.0)
     warnings = check(read_log(folders / "without", truth=write(late, tmp_path / "vicon.csv"))).warnings
     offsets = re.findall(r"odometry is (\S+) \+- (\S+) s earlier than the truth", " ".join(warnings))
@@ -210,7 +209,7 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_the_check_says_what_looks_wrong(tmp_path: Path, case: str) -> None:
+def test_the_check_says_what_looks_wrong(tmp_path, case):
     kinds, change, message = WRONG[case]
     frame = long(observed(drive(4, gap=15.0)), messages=False)
     frame["value"] = frame["value"].mask(frame["kind"].isin(kinds), change(frame["value"]))
@@ -218,15 +217,13 @@ def test_the_check_says_what_looks_wrong(tmp_path: Path, case: str) -> None:
     assert any(pd.Series([warning]).str.contains(message, regex=True)[0] for warning in warnings), warnings
 
 
-def test_stamps_in_milliseconds_are_found(tmp_path: Path) -> None:
+def test_stamps_in_milliseconds_are_found(tmp_path):
     frame = long(observed(drive(4, gap=15.0)), messages=False)
     file = write(frame.assign(t=1000 * frame["t"]), tmp_path / "log.csv")
     assert any("Is t in ms" in warning for warning in check(read_log(file, dt=100, max_gap=1e4)).warnings)
 
 
-def test_the_commands_take_a_log_and_options(
-    folders: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_commands_take_a_log_and_options(folders, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
     def shell(*words: str) -> tuple[int, str]:
@@ -252,7 +249,7 @@ def test_the_commands_take_a_log_and_options(
     assert (out.count("column note"), out.count("columns not read, as listed above. Name what")) == (1, 1)
 
 
-def test_a_plane_has_two_dimensions(tmp_path: Path) -> None:
+def test_a_plane_has_two_dimensions(tmp_path):
     """Without heights NIS is per two degrees of freedom: 1, and not 2/3."""
     frame = long(observed(drive(4, steps=600, gap=15.0)), messages=False)
     frame = frame[~frame["kind"].isin(["z", "vz", "inclination"])]
@@ -260,7 +257,7 @@ def test_a_plane_has_two_dimensions(tmp_path: Path) -> None:
     assert np.mean([row["nis"] for row in found.vehicles]) == pytest.approx(1.0, abs=0.1)
 
 
-def test_a_report_of_a_log_shows_no_settings_of_simulated_noise(folders: Path, tmp_path: Path) -> None:
+def test_a_report_of_a_log_shows_no_settings_of_simulated_noise(folders, tmp_path):
     given = {**FEW, "method": "gnss,kalman,joint,batch-smoother", "data": str(folders / "with"), "egos": "car0+car2"}
     co.run_study("side_by_side", tmp_path, settings=given, progress=False)
     page = report([tmp_path / "side_by_side"], tmp_path / "report.html").read_text()
@@ -270,7 +267,7 @@ def test_a_report_of_a_log_shows_no_settings_of_simulated_noise(folders: Path, t
         assert words in page
 
 
-def test_a_log_that_is_a_task_needs_a_truth(folders: Path) -> None:
+def test_a_log_that_is_a_task_needs_a_truth(folders):
     assert [*roads(folders / "with"), *roads(folders / "without")] == ["with", "without"]
     assert len(seen("with", folders / "with")[1].t)
     with refused("must hold a truth"):

@@ -85,7 +85,7 @@ MISTAKES: dict[str, tuple[str, dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("mistake", MISTAKES)
-def test_a_mistake_is_named_as_the_page_says(tmp_path: Path, mistake: str) -> None:
+def test_a_mistake_is_named_as_the_page_says(tmp_path, mistake):
     text, options, place = MISTAKES[mistake]
     (tmp_path / "log.csv").write_text(text)
     if "truth" in options:
@@ -102,7 +102,7 @@ def test_a_mistake_is_named_as_the_page_says(tmp_path: Path, mistake: str) -> No
     assert error.value.hint
 
 
-def test_all_unknown_kinds_are_named_at_once(tmp_path: Path) -> None:
+def test_all_unknown_kinds_are_named_at_once(tmp_path):
     text = "t,car,kind,value\n0,red,gyro,0.1\n0,red,v2x,1\n0,red,gyro,0.1\n"
     (tmp_path / "log.csv").write_text(text)
     with refused(r"'gyro'.*\{\"gyro\": \.\.\.\}.*Unknown too: 'v2x'\."):
@@ -124,24 +124,24 @@ def test_all_unknown_kinds_are_named_at_once(tmp_path: Path) -> None:
         {"dt": "x"},
     ],
 )
-def test_options_of_the_wrong_kind_are_refused(tmp_path: Path, option: dict[str, Any]) -> None:
+def test_options_of_the_wrong_kind_are_refused(tmp_path, option):
     (tmp_path / "log.csv").write_text(GOOD)
     with refused(next(iter(option))):
         read_log(tmp_path / "log.csv", **option)
 
 
-def test_every_mistake_of_the_page_is_tested() -> None:
+def test_every_mistake_of_the_page_is_tested():
     table = PAGE[PAGE.index("| mistake |") : PAGE.index("`coopoc data check` warns")]
     assert {row.split(" | ")[0][2:] for row in table.splitlines()[2:] if row} == set(MISTAKES)
 
 
-def test_the_good_file_is_good(tmp_path: Path) -> None:
+def test_the_good_file_is_good(tmp_path):
     for text in (GOOD, WIDE):
         (tmp_path / "log.csv").write_text(text)
         assert not read_log(tmp_path / "log.csv").summary.refused
 
 
-def test_a_row_that_comes_late_changes_nothing_and_is_named(tmp_path: Path) -> None:
+def test_a_row_that_comes_late_changes_nothing_and_is_named(tmp_path):
     late = "0.5,red,x,,4.0,1.5,\n"
     for name, text in (("a.csv", GOOD), ("b.csv", swap(late, "") + late)):
         (tmp_path / name).write_text(text)
@@ -176,7 +176,7 @@ KEPT: dict[str, tuple[Callable[[str], str], str]] = {
 
 
 @pytest.mark.parametrize("case", KEPT)
-def test_what_does_not_fit_is_counted_with_its_place(tmp_path: Path, case: str) -> None:
+def test_what_does_not_fit_is_counted_with_its_place(tmp_path, case):
     change, reason = KEPT[case]
     (tmp_path / "log.csv").write_text(change(GOOD))
     refused = read_log(tmp_path / "log.csv").summary.refused
@@ -194,7 +194,7 @@ def same(a: co.Recording, b: co.Recording) -> bool:
 
 @pytest.mark.parametrize("text", [GOOD, WIDE], ids=["long", "wide"])
 @pytest.mark.parametrize(("mark", "point"), [(";", ","), ("\t", ".")])
-def test_separators_and_decimal_commas_change_nothing(tmp_path: Path, text: str, mark: str, point: str) -> None:
+def test_separators_and_decimal_commas_change_nothing(tmp_path, text, mark, point):
     (tmp_path / "a.csv").write_text(text)
     head, body = text.split("\n", 1)
     (tmp_path / "b.csv").write_text(
@@ -215,7 +215,7 @@ def parts(folder: Path) -> Path:
     return folder
 
 
-def test_a_wide_table_repeats_a_fix_beside_each_partner(tmp_path: Path) -> None:
+def test_a_wide_table_repeats_a_fix_beside_each_partner(tmp_path):
     """The long table without a word is the reference; names are whole numbers that pandas has written as floats."""
     t, made = np.arange(0, 20, 0.5), {"wide": [], "long": []}
     names, at = ["1.0", "2.0", "007"], np.array([[0.0, 0.0], [0.0, 9.0], [12.0, 0.0]])
@@ -238,7 +238,7 @@ def test_a_wide_table_repeats_a_fix_beside_each_partner(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("period", [86400, 604800])
-def test_clocks_that_begin_anew_go_on(tmp_path: Path, period: int) -> None:
+def test_clocks_that_begin_anew_go_on(tmp_path, period):
     """Seconds of the day at midnight, of the GPS week at its end: the file with stamps that go on is the reference. One
     vehicle comes after the turn, one cell per object of JSON and per cell of CSV."""
     t, rows = period - 10 + np.arange(0, 20, 0.5), []
@@ -269,7 +269,7 @@ def test_clocks_that_begin_anew_go_on(tmp_path: Path, period: int) -> None:
         co.read_log(tmp_path / "bad.jsonl")
 
 
-def test_a_header_may_stand_in_one_of_several_tables(tmp_path: Path) -> None:
+def test_a_header_may_stand_in_one_of_several_tables(tmp_path):
     (tmp_path / "whole.csv").write_text(GOOD)
     log = load_log(f"{parts(tmp_path / 'log')}?columns=vehicle:car,partner:peer&kinds=uwb:range")
     again = co.read_log(tmp_path / "log", columns={"vehicle": "car", "partner": "peer"}, kinds={"uwb": "range"})
@@ -278,14 +278,14 @@ def test_a_header_may_stand_in_one_of_several_tables(tmp_path: Path) -> None:
     assert log.truth is not None
 
 
-def test_a_header_that_no_table_has_is_named(tmp_path: Path) -> None:
+def test_a_header_that_no_table_has_is_named(tmp_path):
     with refused(r"columns\['partner'\] = 'pear': is in no table, .* Did you mean peer"):
         co.read_log(parts(tmp_path / "log"), columns={"vehicle": "car", "partner": "pear"}, kinds={"uwb": "range"})
     with refused(r"columns\['t'\] = 'tme': is in no table, .*"):
         co.read_log(tmp_path / "log", columns={"t": "tme"}, ignore=["uwb"], truth=tmp_path / "log" / "car.csv")
 
 
-def test_options_behind_a_question_mark_are_those_of_python(tmp_path: Path) -> None:
+def test_options_behind_a_question_mark_are_those_of_python(tmp_path):
     text = "t,vehicle,latitude,longitude,height,vx,vy\n" + "".join(
         f"{k / 10},{name},{48.14 + 1e-5 * k},11.58,500,0,8\n" for k in range(20) for name in ('"a,"', "b")
     )
@@ -314,7 +314,7 @@ def test_options_behind_a_question_mark_are_those_of_python(tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("begin", [0.0, 1e5, 1.7e9])
-def test_stamps_of_32_bits_are_named(tmp_path: Path, begin: float) -> None:
+def test_stamps_of_32_bits_are_named(tmp_path, begin):
     frame = pd.read_csv(io.StringIO(WIDE))
     frame.assign(t=(begin + 99.93 * frame["t"]).astype("f4")).to_parquet(tmp_path / "log.parquet")
     with refused("column t = multiples of 128 s") if begin > 1e9 else nullcontext():
@@ -323,7 +323,7 @@ def test_stamps_of_32_bits_are_named(tmp_path: Path, begin: float) -> None:
         assert "origin= has no effect" in summary
 
 
-def test_places_need_no_times(tmp_path: Path) -> None:
+def test_places_need_no_times(tmp_path):
     """The same log, once with the mast's place at the first instant, once in a table of its own without one."""
     head, *rows = GOOD.splitlines()
     begin = min(float(row.split(",")[0]) for row in rows)
@@ -347,7 +347,7 @@ def test_places_need_no_times(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("code", "kinds"), [(-1, ["range"]), (0, ["range"]), (9999, ["range"]), (511, ["heading"]), (0, ["x", "y"])]
 )
-def test_numbers_that_stand_for_none_are_none(tmp_path: Path, code: float, kinds: list[str]) -> None:
+def test_numbers_that_stand_for_none_are_none(tmp_path, code, kinds):
     """Every fourth row: the log is that with empty cells; one alone, or a mast at the origin, is what it says."""
     t = np.arange(0.0, 12.0, 0.2)
     car = pd.DataFrame({"t": t, "vehicle": "car", "x": 5e3 + 8 * t, "y": 300.0, "speed": 8.0, "heading": 0.01 * t})

@@ -75,7 +75,7 @@ def filtered(t: Floats, z: Floats, std: float, density: float, spread: float = 1
     return x, u
 
 
-def test_one_filter_of_the_bank_is_filterpys() -> None:
+def test_one_filter_of_the_bank_is_filterpys():
     rng = np.random.default_rng(3)
     t, w, std = np.cumsum(rng.uniform(0.2, 0.6, 60)), 0.4, 1.5
     z = np.stack([3 * t, 0.2 * t**2, 0 * t], axis=1) + rng.normal(0, 0.1, (60, 3))  # no innovation is clipped
@@ -88,9 +88,7 @@ CASES = [("car", 1.5, 10), ("car", 1.5, 1), ("drone", 0.1, 1), ("robot", 0.3, 2)
 
 
 @pytest.mark.parametrize(("name", "std", "every"), CASES)
-def test_fixes_alone_are_filtered_as_by_the_best_constant_velocity(
-    tmp_path: Path, name: str, std: float, every: int
-) -> None:
+def test_fixes_alone_are_filtered_as_by_the_best_constant_velocity(tmp_path, name, std, every):
     read, t, z = log(tmp_path, name, std, every)
     assert "no odometry of a" in " ".join(read.recording.notes)
     x = path(name)[np.searchsorted(T, t)]
@@ -101,7 +99,7 @@ def test_fixes_alone_are_filtered_as_by_the_best_constant_velocity(
 
 
 @pytest.mark.parametrize(("std", "bias"), [(1.5, 0.0), (1.5, 0.01), (15.0, 0.003)])
-def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path: Path, std: float, bias: float) -> None:
+def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path, std, bias):
     """Beside the same log with a compass of 1 degree; without a gyro beside fixes alone."""
     rng, (speed, course) = np.random.default_rng(1), car()
     odometry = {"speed": 1.01 * speed + rng.normal(0, 0.1, len(T))}
@@ -116,7 +114,7 @@ def test_a_heading_that_no_one_measured_follows_from_gyro_and_fixes(tmp_path: Pa
         assert error(course_of_fixes, method) < 1.3 * alone
 
 
-def test_yaw_rates_of_the_other_sense_are_named_and_no_speed_is_blamed(tmp_path: Path) -> None:
+def test_yaw_rates_of_the_other_sense_are_named_and_no_speed_is_blamed(tmp_path):
     speed, course = car()
     read = log(tmp_path / "log", "car", 1.5, 10, speed=speed, yaw_rate=-np.gradient(course, 0.1))[0]
     sentences = " ".join(check(read).warnings)
@@ -125,7 +123,7 @@ def test_yaw_rates_of_the_other_sense_are_named_and_no_speed_is_blamed(tmp_path:
 
 
 @pytest.mark.parametrize("given", ["", "speed", "speed,yaw_rate"])
-def test_nothing_looks_ahead(tmp_path: Path, given: str) -> None:
+def test_nothing_looks_ahead(tmp_path, given):
     """A fix at 120 s that is 40 m off changes no estimate before it."""
     speed, course = car()
     every = {"speed": speed, "yaw_rate": np.gradient(course, 0.1)}
@@ -143,7 +141,7 @@ def test_nothing_looks_ahead(tmp_path: Path, given: str) -> None:
         assert_allclose(one, other, atol=1e-9)
 
 
-def test_a_gap_splits_a_drive_in_every_method(tmp_path: Path) -> None:
+def test_a_gap_splits_a_drive_in_every_method(tmp_path):
     """Law: beyond a gap a method is what it is on the drive behind it alone."""
     read = log(tmp_path, "car", 1.5, 10, steps=[k for k in range(0, len(T), 10) if not 600 < k < 900])[0]
     rec, truth = read.recording, read.truth
@@ -162,13 +160,13 @@ def test_a_gap_splits_a_drive_in_every_method(tmp_path: Path) -> None:
         assert any("no estimate there" in note for note in track.notes)
 
 
-def test_a_vehicle_that_is_never_there_is_refused(tmp_path: Path) -> None:
+def test_a_vehicle_that_is_never_there_is_refused(tmp_path):
     rec = log(tmp_path, "car", 1.5, 10)[0].recording
     with pytest.raises(co.InputError, match="absent"):
         co.Kalman()(replace(rec, velocity=np.full_like(rec.velocity, np.nan)))
 
 
-def test_stamps_at_two_rates_are_kept(tmp_path: Path) -> None:
+def test_stamps_at_two_rates_are_kept(tmp_path):
     steps = np.cumsum(np.tile([2, 3], 300))
     read, t, _ = log(tmp_path, "car", 1.5, 1, steps=steps[steps < len(T)].tolist())
     assert np.isfinite(read.recording.gnss[0, :, 0, 0]).sum() == len(t)
@@ -184,7 +182,7 @@ STRANGE = {
 
 
 @pytest.mark.parametrize("name", STRANGE)
-def test_fixes_of_another_kind_are_followed_throughout(tmp_path: Path, name: str) -> None:
+def test_fixes_of_another_kind_are_followed_throughout(tmp_path, name):
     """Without noise: no estimate is farther from a fix than its standard deviation once there have been four."""
     speed, t = STRANGE[name]
     pd.DataFrame({"t": t, "vehicle": "a", "x": speed * t, "y": 0.0}).to_csv(tmp_path / "a.csv", index=False)

@@ -11,7 +11,7 @@ from scipy.linalg import lstsq
 
 import coopoc as co
 from coopoc.arrays import robust_std
-from coopoc.data.mrclam import Calibration, MrclamLog, calibrate, grouped, pose_recording, read_mrclam, summed
+from coopoc.data.mrclam import calibrate, grouped, pose_recording, read_mrclam, summed
 from coopoc.data.registry import load_fleet, load_log
 from coopoc.studies.pose_drives import thinned
 from coopoc.world.body_frames import gauss_markov, midway, turned
@@ -21,21 +21,21 @@ SET = "MRCLAM_Dataset6"
 
 
 @pytest.fixture(scope="module")
-def log() -> MrclamLog:
+def log():
     return read_mrclam(measured(SET))
 
 
 @pytest.fixture(scope="module")
-def known(log: MrclamLog) -> Calibration:
+def known(log):
     return calibrate(log, 300.0)
 
 
 @pytest.fixture(scope="module")
-def seen(log: MrclamLog, known: Calibration) -> co.Recording:
+def seen(log, known):
     return pose_recording(log, known)
 
 
-def test_every_line_of_the_files_is_there_or_stands_beside_a_nearer_one(seen: co.Recording) -> None:
+def test_every_line_of_the_files_is_there_or_stands_beside_a_nearer_one(seen):
     """Counted from the raw text: steps, robots and subjects that were measured, and what was measured there."""
     folder = measured(SET)
     barcodes = {int(a[1]): int(a[0]) for a in np.loadtxt(folder / "Barcodes.dat")}
@@ -59,7 +59,7 @@ def test_every_line_of_the_files_is_there_or_stands_beside_a_nearer_one(seen: co
     assert np.isnan(seen.body.heading).all()
 
 
-def test_white_noise_keeps_its_standard_deviation_and_errors_that_last_are_widened() -> None:
+def test_white_noise_keeps_its_standard_deviation_and_errors_that_last_are_widened():
     """Closed form: sums of n terms of an autoregression have variance n s^2 (1 + c) / (1 - c) (Bartlett 1946)."""
     normals = np.random.default_rng(0).standard_normal((200_000, 1))
     assert summed(normals, 200) == pytest.approx(1.0, rel=0.05)
@@ -71,7 +71,7 @@ def test_white_noise_keeps_its_standard_deviation_and_errors_that_last_are_widen
     assert grouped(lasting[:, 0], robot, t) == pytest.approx(np.sqrt((1 + c) / (1 - c)), rel=0.06)
 
 
-def test_odometry_follows_its_log_late_and_slower_in_turns(log: MrclamLog, known: Calibration) -> None:
+def test_odometry_follows_its_log_late_and_slower_in_turns(log, known):
     """SciPy's correlation and least squares over 5 s of the first 300 s; the rest, which calibrated nothing, moves by
     what it says with half the error of a scale alone."""
     rate = np.diff(log.heading[:3000], axis=0) / 0.1
@@ -89,9 +89,7 @@ def test_odometry_follows_its_log_late_and_slower_in_turns(log: MrclamLog, known
         calibrate(log, 1e4)
 
 
-def test_no_landmark_and_one_are_no_worse_than_published_filters_of_the_same_state(
-    log: MrclamLog, seen: co.Recording
-) -> None:
+def test_no_landmark_and_one_are_no_worse_than_published_filters_of_the_same_state(log, seen):
     """A plain extended Kalman filter of 25 numbers, written elsewhere: 0.32 m without and 0.25 m with a landmark."""
     begin = co.pose_start(seen, gate=5.0)
     for landmarks, most in ((0, 0.32), (1, 0.25)):
@@ -101,7 +99,7 @@ def test_no_landmark_and_one_are_no_worse_than_published_filters_of_the_same_sta
         assert np.sqrt(np.nanmean(squares.reshape(-1, 300, 5), axis=1)).mean() < most
 
 
-def test_first_poses_are_found_from_what_is_seen(log: MrclamLog, seen: co.Recording) -> None:
+def test_first_poses_are_found_from_what_is_seen(log, seen):
     """Vicon's poses, which the start does not know."""
     begin = co.pose_start(seen)[0, :5]
     turn = np.angle(np.exp(1j * (begin[:, 3] - log.heading[0])))
@@ -115,7 +113,7 @@ def test_first_poses_are_found_from_what_is_seen(log: MrclamLog, seen: co.Record
 
 
 @pytest.fixture(scope="module")
-def other_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def other_set(tmp_path_factory):
     """Another folder of MR.CLAM: four robots, in another order, 500 s."""
     source, folder = measured(SET), tmp_path_factory.mktemp("sets") / "MRCLAM_Dataset0"
     folder.mkdir()
@@ -134,7 +132,7 @@ def other_set(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.mark.parametrize("which", [pytest.param("set 6", marks=pytest.mark.slow), "another"])
-def test_the_study_runs_on_any_set(which: str, other_set: Path, tmp_path: Path) -> None:
+def test_the_study_runs_on_any_set(which, other_set, tmp_path):
     data = measured(SET) if which == "set 6" else other_set
     most = 4 if which == "set 6" else 3
     settings: dict[str, Any] = {"data": str(data), "max_neighbours": f"0,{most}", "landmarks": "0,15"}
@@ -157,7 +155,7 @@ def test_the_study_runs_on_any_set(which: str, other_set: Path, tmp_path: Path) 
     assert (folder / "figures" / "training.png").stat().st_size > 10_000
 
 
-def test_folders_that_cannot_be_used_are_named(other_set: Path, tmp_path: Path) -> None:
+def test_folders_that_cannot_be_used_are_named(other_set, tmp_path):
     bare = tmp_path / "bare"
     shutil.copytree(other_set, bare)
     (bare / "Landmark_Groundtruth.dat").unlink()
@@ -172,7 +170,7 @@ def test_folders_that_cannot_be_used_are_named(other_set: Path, tmp_path: Path) 
             co.run_study("real", tmp_path / "out", settings={"data": str(data), **more}, progress=False)
 
 
-def test_real_measurements_have_the_stated_noise(log: MrclamLog) -> None:
+def test_real_measurements_have_the_stated_noise(log):
     """Published value for this set, found independently of this reader: 0.095 m and 0.007 rad, robust."""
     error = (log.others[:, 3:] - log.true_others)[np.isfinite(log.true_others[:, 0])]
     residuals = error[:, 0], wrap(error[:, 1])
@@ -182,7 +180,7 @@ def test_real_measurements_have_the_stated_noise(log: MrclamLog) -> None:
         assert 0.001 < outliers.mean() < 0.05, "rare"
 
 
-def test_measurements_are_counted_like_the_description(log: MrclamLog) -> None:
+def test_measurements_are_counted_like_the_description(log):
     """Stated for this set: 15383 of landmarks, 3906 between robots that have truth."""
     assert len(log.sightings) == 15383
     assert abs(int(np.isfinite(log.true_others[:, 0]).sum()) - 3906) <= 4, "4 more fall into the gap of robot 4's truth"
@@ -190,7 +188,7 @@ def test_measurements_are_counted_like_the_description(log: MrclamLog) -> None:
     assert not (log.others[:, 2] == log.others[:, 1]).any()
 
 
-def test_fleet_is_vicon_at_10_hz_with_the_gap_of_robot_4(log: MrclamLog) -> None:
+def test_fleet_is_vicon_at_10_hz_with_the_gap_of_robot_4(log):
     fleet = load_fleet(measured(SET))
     assert fleet.digest == log.fleet.digest
     assert fleet.dt == 0.1
@@ -219,14 +217,14 @@ def small(folder: Path, robots: tuple[int, ...] = (1, 2)) -> Path:
 
 
 @pytest.mark.parametrize("robots", [(1, 2), (2, 4, 5), (1, 2, 3, 4)])
-def test_a_folder_with_fewer_robots_is_one(tmp_path: Path, robots: tuple[int, ...]) -> None:
+def test_a_folder_with_fewer_robots_is_one(tmp_path, robots):
     log = read_mrclam(small(tmp_path, robots))
     assert log.fleet.ids == tuple(f"robot{n}" for n in robots)
     np.testing.assert_allclose(log.others[:, 3:], log.true_others, atol=1e-4)
     assert len(log.others) == 18 * len(robots)
 
 
-def test_a_robot_without_files_is_left_out(tmp_path: Path) -> None:
+def test_a_robot_without_files_is_left_out(tmp_path):
     small(tmp_path, (1, 2, 3))
     for file in tmp_path.glob("Robot3_*"):
         file.unlink()
@@ -250,7 +248,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_line_is_named(tmp_path: Path, case: str) -> None:
+def test_a_bad_line_is_named(tmp_path, case):
     name, line, text, message = BAD[case]
     lines = (small(tmp_path) / name).read_text().split("\n")
     (tmp_path / name).write_text("\n".join([*lines[:line], text, *lines[line + 1 :]]))
@@ -258,7 +256,7 @@ def test_a_bad_line_is_named(tmp_path: Path, case: str) -> None:
         load_fleet(tmp_path)
 
 
-def test_robots_share_an_interval(tmp_path: Path) -> None:
+def test_robots_share_an_interval(tmp_path):
     assert len(read_mrclam(small(tmp_path), dt=3.0).fleet.t) == 2
     for kind in ("Groundtruth", "Odometry"):
         file = tmp_path / f"Robot2_{kind}.dat"

@@ -52,7 +52,7 @@ def nmea(fleet: co.Fleet, column: int, start: datetime, rmc: bool = True) -> str
     return "".join(lines)
 
 
-def test_nmea_is_fixes_speed_and_course(tmp_path: Path) -> None:
+def test_nmea_is_fixes_speed_and_course(tmp_path):
     """Written through midnight by hand and pymap3d, whose positions come back; stamps are seconds since 1970."""
     pytest.importorskip("pynmeagps")
     fleet = drive(2, steps=100)
@@ -71,7 +71,7 @@ def test_nmea_is_fixes_speed_and_course(tmp_path: Path) -> None:
     assert np.linalg.norm(rec.velocity[0, 5:-5, 0], axis=-1) == pytest.approx(8.0, abs=0.2)
 
 
-def test_a_truth_in_nmea_is_of_the_only_car_and_of_its_day(tmp_path: Path) -> None:
+def test_a_truth_in_nmea_is_of_the_only_car_and_of_its_day(tmp_path):
     """A truth of GGA alone has no date; one of another time is refused."""
     pytest.importorskip("pynmeagps")
     fleet, start = drive(1, steps=100), datetime(2024, 2, 28, 12)
@@ -85,7 +85,7 @@ def test_a_truth_in_nmea_is_of_the_only_car_and_of_its_day(tmp_path: Path) -> No
         read_log(tmp_path)
 
 
-def test_a_real_car_that_stops_keeps_all_its_fixes() -> None:
+def test_a_real_car_that_stops_keeps_all_its_fixes():
     """1,653 fixes of a u-blox F9K, a third of them at standstill, where it gives no course; and a surveyed truth."""
     pytest.importorskip("pynmeagps")
     log = read_log(measured("ublox_f9k.nmea"), truth=measured("span_truth.gga"))
@@ -96,7 +96,7 @@ def test_a_real_car_that_stops_keeps_all_its_fixes() -> None:
     assert np.nanmedian(error) == pytest.approx(0.49, abs=0.05)  # stated by those who published it
 
 
-def test_damaged_sentences_are_counted(tmp_path: Path) -> None:
+def test_damaged_sentences_are_counted(tmp_path):
     pytest.importorskip("pynmeagps")
     lines = nmea(drive(1, steps=60), 0, datetime(2024, 1, 1)).splitlines(keepends=True)
     lines[6] = lines[6].replace("N", "S", 1).replace("GSGGA", "GNGGA")[:-4] + "00\r\n"
@@ -116,7 +116,7 @@ def test_damaged_sentences_are_counted(tmp_path: Path) -> None:
         read_log(tmp_path)
 
 
-def test_without_pynmeagps_the_pip_line_is_shown(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_without_pynmeagps_the_pip_line_is_shown(tmp_path, monkeypatch):
     (tmp_path / "a.nmea").write_text("x")
     (tmp_path / "a.bag").write_text("x")
     for file, extra, library in (("a.nmea", "nmea", "pynmeagps"), ("a.bag", "ros", "rosbags.highlevel")):
@@ -125,7 +125,7 @@ def test_without_pynmeagps_the_pip_line_is_shown(tmp_path: Path, monkeypatch: py
             read_log(tmp_path / file)
 
 
-def test_the_cats_cars_agree_with_pynmeagps_and_pymap3d() -> None:
+def test_the_cats_cars_agree_with_pynmeagps_and_pymap3d():
     """Real data: 100 positions of the first car, parsed and converted by the libraries alone."""
     pynmeagps = pytest.importorskip("pynmeagps")
     log = read_log(measured("AV_veh1.nmea"), dt=0.1)
@@ -139,7 +139,7 @@ def test_the_cats_cars_agree_with_pynmeagps_and_pymap3d() -> None:
 
 
 @pytest.mark.parametrize("ros", [1, 2])
-def test_a_bag_is_read(tmp_path: Path, ros: int) -> None:
+def test_a_bag_is_read(tmp_path, ros):
     """Written here: fixes, odometry and imu of two vehicles, a truth by PoseStamped, and a topic of another kind."""
     pytest.importorskip("rosbags")
     fleet = drive(2, steps=80, start=1.7e9)
@@ -159,7 +159,7 @@ def test_a_bag_is_read(tmp_path: Path, ros: int) -> None:
     assert np.isfinite(co.read_log(path, dt=0.1).recording.gnss[0, :, :, 0]).sum() == 80 * 2
 
 
-def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path: Path) -> None:
+def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path):
     """A pose of another program beside fixes in degrees; a simulator's truth by Odometry, whose heading counts."""
     pytest.importorskip("rosbags")
     fleet, path = drive(2, steps=80, start=1.7e9), tmp_path / "drive"
@@ -187,7 +187,7 @@ def test_topics_of_a_bag_are_left_out_or_are_the_truth(tmp_path: Path) -> None:
             read_log(path, dt=0.1, **wrong)
 
 
-def test_motion_capture_and_radios_of_a_public_bag() -> None:
+def test_motion_capture_and_radios_of_a_public_bag():
     """TIERS: /vrpn_client_node/turtlebot1/pose, /uwb/tof/n_1/n_2/distance. By rosbags and NumPy: the same poses, and
     ranges of radios that have no delays calibrated, 0.39 m too long in the median."""
     highlevel = pytest.importorskip("rosbags.highlevel")
@@ -224,7 +224,7 @@ def test_motion_capture_and_radios_of_a_public_bag() -> None:
 COVARIANCE = [[f"position_covariance{form.format(at)}" for at in (0, 4, 8)] for form in ("[{}]", "_{}")]
 
 
-def test_topics_as_tables_are_the_bag(tmp_path: Path) -> None:
+def test_topics_as_tables_are_the_bag(tmp_path):
     """A folder per namespace, a column per field, variances as one of two programs names them; speeds stay along the
     vehicle, whose imu has the heading."""
     fleet = drive(2, steps=80, start=1.7e9)
@@ -255,7 +255,7 @@ def test_topics_as_tables_are_the_bag(tmp_path: Path) -> None:
     assert log.recording.sensors.gnss_std == pytest.approx(np.sqrt([1.5 * 0.25, 1.5 * 0.36, 2.25]))
 
 
-def test_times_of_a_bag_are_those_of_its_headers_or_of_its_reception(tmp_path: Path) -> None:
+def test_times_of_a_bag_are_those_of_its_headers_or_of_its_reception(tmp_path):
     pytest.importorskip("rosbags")
     fleet = drive(1, steps=60, start=1.7e9)
     write_bag(tmp_path / "drive", fleet, 2, late=0.25)
@@ -350,7 +350,7 @@ def write_bag(
                     writer.write(topics[column, what], round((t + late) * 1e9), raw)
 
 
-def test_what_is_no_bag_is_named(tmp_path: Path) -> None:
+def test_what_is_no_bag_is_named(tmp_path):
     pytest.importorskip("rosbags")
     (tmp_path / "a.bag").write_bytes(b"no bag")
     with refused(r"a\.bag = .*must be a ROS bag"):
@@ -358,7 +358,7 @@ def test_what_is_no_bag_is_named(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("ros", [1, 2])
-def test_a_damaged_bag_is_named(tmp_path: Path, ros: int) -> None:
+def test_a_damaged_bag_is_named(tmp_path, ros):
     """Each of 60 bags with a few wrong bytes is read, or refused with an error of ours."""
     pytest.importorskip("rosbags")
     path = tmp_path / ("drive.bag" if ros == 1 else "drive")
@@ -395,7 +395,7 @@ INVISIBLE: dict[str, Callable[[list[str]], list[str]]] = {
 
 
 @pytest.mark.parametrize("mistake", [*NMEA, *INVISIBLE, "none"])
-def test_a_mistake_in_nmea_of_a_receiver(tmp_path: Path, mistake: str) -> None:
+def test_a_mistake_in_nmea_of_a_receiver(tmp_path, mistake):
     """CATS, two receivers, two minutes; checksums are those of the changed sentences."""
     change = NMEA[mistake][0] if mistake in NMEA else INVISIBLE.get(mistake, lambda words: words)
     for name in ("AV_veh1", "AV_veh2"):

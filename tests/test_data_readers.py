@@ -23,12 +23,12 @@ GOOD = "id,t,x,y,z\na,0.0,0,0,0\nb,0.0,5,0,0\na,0.1,1,0,0\nb,0.1,5,1,0\na,0.2,2,
 
 @pytest.mark.parametrize("out", ["fleet.csv", "fleet.parquet"])
 @pytest.mark.parametrize("name", ["town10-clients", "town04"])
-def test_tables_come_back_bit_by_bit(tmp_path: Path, name: str, out: str) -> None:
+def test_tables_come_back_bit_by_bit(tmp_path, name, out):
     written = convert(name, tmp_path / out)
     assert load_fleet(tmp_path / out).digest == written.digest == load_fleet(name).digest
 
 
-def test_tum_files_are_what_evo_reads(tmp_path: Path) -> None:
+def test_tum_files_are_what_evo_reads(tmp_path):
     """Independent check: evo reads the file that we write (evo is a tool of the tests only)."""
     fleet = load_fleet("town10-clients")
     x = fleet.position[:1550, 0]
@@ -43,7 +43,7 @@ def test_tum_files_are_what_evo_reads(tmp_path: Path) -> None:
     np.testing.assert_array_equal(load_fleet(tmp_path).position[:, 0], x)
 
 
-def test_velocity_is_derived_backwards_and_absence_is_a_missing_row(tmp_path: Path) -> None:
+def test_velocity_is_derived_backwards_and_absence_is_a_missing_row(tmp_path):
     (tmp_path / "a.csv").write_text(GOOD.replace("b,0.0,5,0,0\n", ""))
     fleet = load_fleet(tmp_path / "a.csv")
     assert fleet.present.tolist() == [[True, False], [True, True], [True, True]]
@@ -75,7 +75,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD)
-def test_a_bad_table_names_the_thing_and_the_mend(tmp_path: Path, case: str) -> None:
+def test_a_bad_table_names_the_thing_and_the_mend(tmp_path, case):
     text, thing, hint = BAD[case]
     (tmp_path / "drive.csv").write_text(text)
     with pytest.raises(InputError) as error:
@@ -84,7 +84,7 @@ def test_a_bad_table_names_the_thing_and_the_mend(tmp_path: Path, case: str) -> 
     assert hint in str(error.value)
 
 
-def test_dt_must_be_positive_and_resamples_stamps_that_differ(tmp_path: Path) -> None:
+def test_dt_must_be_positive_and_resamples_stamps_that_differ(tmp_path):
     (tmp_path / "a.csv").write_text(GOOD)
     with refused("dt = 0 s: must be > 0"):
         load_fleet(tmp_path / "a.csv", dt=0)
@@ -95,7 +95,7 @@ def test_dt_must_be_positive_and_resamples_stamps_that_differ(tmp_path: Path) ->
 
 
 @pytest.mark.parametrize(("stamp", "thing"), [("0.2", "none for c at t = 0.2 s"), ("0.17", "c = 1 rows, but 0")])
-def test_resampling_loses_no_vehicle(tmp_path: Path, stamp: str, thing: str) -> None:
+def test_resampling_loses_no_vehicle(tmp_path, stamp, thing):
     (tmp_path / "a.csv").write_text(GOOD + f"c,{stamp},9,9,9\n")
     with refused(thing):
         load_fleet(tmp_path / "a.csv", dt=0.1)
@@ -104,7 +104,7 @@ def test_resampling_loses_no_vehicle(tmp_path: Path, stamp: str, thing: str) -> 
 TUM = "# t x y z qx qy qz qw\n0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 1\n"
 
 
-def test_an_empty_tum_file_is_named_and_a_byte_order_mark_skipped(tmp_path: Path) -> None:
+def test_an_empty_tum_file_is_named_and_a_byte_order_mark_skipped(tmp_path):
     (tmp_path / "car.tum").write_text(TUM, encoding="utf-8-sig")
     assert load_fleet(tmp_path).ids == ("car",)
     (tmp_path / "lost.tum").write_text("# t x y z qx qy qz qw\n")
@@ -119,7 +119,7 @@ FCD = """<fcd-export>
 </fcd-export>"""
 
 
-def test_fcd_angles_are_clockwise_from_north_and_positions_the_front_bumper(tmp_path: Path) -> None:
+def test_fcd_angles_are_clockwise_from_north_and_positions_the_front_bumper(tmp_path):
     """Closed form: a vehicle 4 m long that faces east has its middle 2 m west of its front bumper."""
     (tmp_path / "a.xml").write_text(FCD)
     fleet = load_fleet(tmp_path / "a.xml", vehicle_length=4.0)
@@ -141,19 +141,19 @@ def test_fcd_angles_are_clockwise_from_north_and_positions_the_front_bumper(tmp_
         (FCD.replace('"0.10"', '"nan"'), "row 2, column t = nan"),
     ],
 )
-def test_a_bad_fcd_file_is_named(tmp_path: Path, text: str, thing: str) -> None:
+def test_a_bad_fcd_file_is_named(tmp_path, text, thing):
     (tmp_path / "a.xml").write_text(text)
     with refused(thing):
         load_fleet(tmp_path / "a.xml")
 
 
-def test_a_column_by_a_wrong_name_is_proposed(tmp_path: Path) -> None:
+def test_a_column_by_a_wrong_name_is_proposed(tmp_path):
     (tmp_path / "drive.csv").write_text(GOOD.replace("id,t,x,y,z", "id,t,easting,y,z"))
     with refused(r"column estings = missing: .* Did you mean easting\?"):
         load_fleet(tmp_path / "drive.csv", columns={"x": "estings"})
 
 
-def test_a_left_handed_table_is_mirrored(tmp_path: Path) -> None:
+def test_a_left_handed_table_is_mirrored(tmp_path):
     """As CARLA exports it, with y to the right; stamps in ms."""
     fleet = load_fleet("town10").between(0, 100).select([0, 6])
     write_table(fleet, tmp_path / "drive.csv")
@@ -173,7 +173,7 @@ def drive(t: np.ndarray, **more: object) -> pd.DataFrame:
 
 
 @pytest.mark.parametrize("start", [0.0, 1.7e9])
-def test_a_gap_is_one_whenever_time_starts(tmp_path: Path, start: float) -> None:
+def test_a_gap_is_one_whenever_time_starts(tmp_path, start):
     """13 s are missing between 4.9 and 18 s: 130 instants, and every other one is there."""
     t = start + np.round(np.r_[np.arange(0, 5, 0.1), np.arange(18, 23, 0.1)], 6)
     drive(t).to_csv(tmp_path / "a.csv", index=False)
@@ -185,7 +185,7 @@ def test_a_gap_is_one_whenever_time_starts(tmp_path: Path, start: float) -> None
     assert_allclose(bridged.position[:, 0, 0], 8 * (bridged.t - start), atol=1e-5)
 
 
-def test_interpolation_agrees_with_pandas() -> None:
+def test_interpolation_agrees_with_pandas():
     """Independent reference: pandas, with the gaps cut out by hand."""
     t = 1.7e9 + np.array([0.0, 0.1, 0.2, 0.9, 1.0])
     grid = 1.7e9 + np.arange(0, 1.01, 0.05)
@@ -196,7 +196,7 @@ def test_interpolation_agrees_with_pandas() -> None:
     assert_allclose(interpolate(t, series.to_numpy()[:, None], grid, 0.5)[:, 0], wanted, atol=1e-6)
 
 
-def test_degrees_are_not_metres(tmp_path: Path) -> None:
+def test_degrees_are_not_metres(tmp_path):
     t = np.arange(0, 5, 0.1)
     degrees = {"x": 11.58 + 1e-5 * t, "y": 48.14 + 4e-5 * t}
     drive(t).assign(**degrees).to_csv(tmp_path / "a.csv", index=False)
@@ -207,7 +207,7 @@ def test_degrees_are_not_metres(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("unit", ["ms", "us", "ns"])
 @pytest.mark.parametrize("zone", [None, "Europe/Berlin"])
-def test_dates_are_seconds_since_1970(tmp_path: Path, unit: str, zone: str | None) -> None:
+def test_dates_are_seconds_since_1970(tmp_path, unit, zone):
     t = pd.to_datetime(1_700_000_000_000 + 100 * np.arange(5), unit="ms").astype(f"datetime64[{unit}]")
     stamps = t if zone is None else t.tz_localize("UTC").tz_convert(zone)
     frame = drive(np.arange(5) / 10).assign(t=stamps)
@@ -227,13 +227,13 @@ def test_dates_are_seconds_since_1970(tmp_path: Path, unit: str, zone: str | Non
         ("a,0.1,1e308,0,0", r"row 2, column x = 1e\+308"),
     ],
 )
-def test_a_row_that_is_none_is_named(tmp_path: Path, row: str, message: str) -> None:
+def test_a_row_that_is_none_is_named(tmp_path, row, message):
     (tmp_path / "a.csv").write_text(f"id,t,x,y,z\na,0,0,0,0\n{row}\na,0.2,2,0,0\n")
     with refused(message):
         load_fleet(tmp_path / "a.csv")
 
 
-def test_damaged_tables_are_named(tmp_path: Path) -> None:
+def test_damaged_tables_are_named(tmp_path):
     drive(np.arange(50) / 10).to_parquet(tmp_path / "a.parquet")
     whole = (tmp_path / "a.parquet").read_bytes()
     rng = np.random.default_rng(1)
@@ -248,7 +248,7 @@ def test_damaged_tables_are_named(tmp_path: Path) -> None:
             assert "a.parquet" in str(error)  # noqa: PT017 (most mutants still load)
 
 
-def test_what_no_memory_holds_is_refused_at_once(tmp_path: Path) -> None:
+def test_what_no_memory_holds_is_refused_at_once(tmp_path):
     began = time.process_time()
     drive(1e18 + 1e8 * np.arange(5)).to_csv(tmp_path / "a.csv", index=False)
     with refused(r"a\.csv: column t with dt = 0\.1 s = .* steps .*nanoseconds"):
@@ -279,7 +279,7 @@ def segment(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     return fixes, ecef
 
 
-def test_a_segment_of_comma2k19(tmp_path: Path) -> None:
+def test_a_segment_of_comma2k19(tmp_path):
     """Fixes lie on the truth, by pymap3d, and speed with course follows them."""
     fixes, _ = segment(tmp_path / "drive")
     log = co.read_log(tmp_path / "drive")
@@ -290,7 +290,7 @@ def test_a_segment_of_comma2k19(tmp_path: Path) -> None:
     assert_allclose(log.recording.velocity[0, 2:-1, 0], np.diff(true, axis=0)[1:-1] / 0.1, atol=0.05)
 
 
-def test_a_real_robot_of_libRSF() -> None:
+def test_a_real_robot_of_libRSF():
     robot = co.read_log(measured("Indoor_UWB_Input.txt").parent, frame="body")
     assert robot.truth is not None
     assert robot.summary.read == {"ranges": 233}
@@ -299,7 +299,7 @@ def test_a_real_robot_of_libRSF() -> None:
     assert np.sqrt(np.nanmean(np.square((track.x[0, :, 0] - robot.truth.position[:, ego])[:, :2]).sum(1))) < 0.2
 
 
-def test_tensors_of_nclt_are_read_and_scored_as_published(tmp_path: Path) -> None:
+def test_tensors_of_nclt_are_read_and_scored_as_published(tmp_path):
     """NumPy: mean of both wheels along either heading, the rms of an axis, all fixes; val.pt calibrates."""
     torch, rng, drives = pytest.importorskip("torch"), np.random.default_rng(3), []
     for date, steps in (("2013-01-10", 90), ("2013-02-23", 60)):
@@ -341,7 +341,7 @@ def test_tensors_of_nclt_are_read_and_scored_as_published(tmp_path: Path) -> Non
         ("processed_log/GNSS/live_gnss_ublox/t", b"huge", "must be an array of numpy.save"),
     ],
 )
-def test_a_damaged_array_of_comma2k19_is_named(tmp_path: Path, name: str, wrong: object, thing: str) -> None:
+def test_a_damaged_array_of_comma2k19_is_named(tmp_path, name, wrong, thing):
     segment(tmp_path / "drive")
     file = tmp_path / "drive" / name
     good = file.read_bytes()
@@ -356,7 +356,7 @@ def test_a_damaged_array_of_comma2k19_is_named(tmp_path: Path, name: str, wrong:
         co.read_log(tmp_path / "drive")
 
 
-def test_a_parquet_table_is_refused_by_its_metadata(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_parquet_table_is_refused_by_its_metadata(tmp_path, monkeypatch):
     """A column of one value takes 3 kB for any number of rows."""
     pd.DataFrame({"id": 0.0, "t": 0.0}, index=range(100)).to_parquet(tmp_path / "a.parquet")
     monkeypatch.setattr("coopoc.data.cells.LARGEST_TABLE", 150)

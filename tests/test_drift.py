@@ -38,7 +38,7 @@ def convoy(vehicles: int = 4, steps: int = 150, dt: float = 0.1) -> Fleet:
     return Fleet(tuple(f"v{k}" for k in range(vehicles)), t, position, velocity)
 
 
-def test_gauss_markov_has_the_stated_correlation() -> None:
+def test_gauss_markov_has_the_stated_correlation():
     """Closed form: variance 1 and correlation exp(-k / 20) at k steps."""
     error = gauss_markov(np.random.default_rng(0).standard_normal((400, 3000)), 1 / 20)
     assert error.var(axis=1) == pytest.approx(np.ones(400), abs=0.15)
@@ -46,7 +46,7 @@ def test_gauss_markov_has_the_stated_correlation() -> None:
         assert (error[lag:] * error[:-lag]).mean() == pytest.approx(np.exp(-lag / 20), abs=0.02)
 
 
-def test_drift_is_each_receivers_and_the_common_error_everyones() -> None:
+def test_drift_is_each_receivers_and_the_common_error_everyones():
     fleet = convoy()
     apart, alike = (
         observe(fleet, replace(s, gnss_std=(0.0,) * 3), assumed=WHITE, runs=40).gnss - fleet.position
@@ -58,7 +58,7 @@ def test_drift_is_each_receivers_and_the_common_error_everyones() -> None:
     np.testing.assert_allclose(alike[:, :, 0], alike[:, :, 1], atol=1e-12)
 
 
-def test_alone_it_is_filterpys_augmented_filter() -> None:
+def test_alone_it_is_filterpys_augmented_filter():
     """filterpy with state (x, drift, common) per axis, from the first fix with a vague position."""
     fleet = convoy(1)
     seen = observe(fleet, BOTH, V2X(0), runs=1, seed=3)
@@ -77,7 +77,7 @@ def test_alone_it_is_filterpys_augmented_filter() -> None:
             assert track.covariance[0, t, 0, axis, axis] == pytest.approx(kf.P[0, 0], rel=1e-4)
 
 
-def test_bound_of_a_single_vehicle_is_the_riccati_equations() -> None:
+def test_bound_of_a_single_vehicle_is_the_riccati_equations():
     """SciPy's solve_discrete_are of (x, drift) per axis, after many steps at constant velocity."""
     fleet, keep = convoy(1, steps=3000), np.exp(-0.1 / 5.0)
     found = posterior_bound(fleet, OWN, 0)[-1, 0, 0]
@@ -87,7 +87,7 @@ def test_bound_of_a_single_vehicle_is_the_riccati_equations() -> None:
     assert found == pytest.approx((prior - np.outer(gain, prior.sum(axis=0)))[0, 0], rel=1e-3)
 
 
-def test_rms_and_nees_agree_with_the_bound() -> None:
+def test_rms_and_nees_agree_with_the_bound():
     fleet, v2x = convoy(), V2X(3, 25.0)
     for sensors in (OWN, COMMON, BOTH):
         seen = observe(fleet, sensors, v2x, runs=60, observers=[0])
@@ -97,7 +97,7 @@ def test_rms_and_nees_agree_with_the_bound() -> None:
         assert np.nanmean(nees(track, fleet)) == pytest.approx(3.0, abs=0.45)
 
 
-def test_what_cannot_be_is_refused() -> None:
+def test_what_cannot_be_is_refused():
     fleet = convoy()
     with refused("gnss_drift_time"):
         Sensors(gnss_drift_time=0.0)
@@ -108,7 +108,7 @@ def test_what_cannot_be_is_refused() -> None:
 
 
 @pytest.mark.parametrize("most", [0, 3])
-def test_errors_that_last_and_are_not_told_are_in_the_covariance(most: int) -> None:
+def test_errors_that_last_and_are_not_told_are_in_the_covariance(most):
     """Law: NEES is about 10, not 260 as without them; where noise is white it is near its 2.4."""
     fleet, egos, levels, drawn = load_fleet("town10").between(0, 500), [24, 30], [], []
     for drift in (0.0, 3.0):

@@ -87,7 +87,7 @@ def assert_equivariant(
 
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("name", METHODS)
-def test_every_method_follows_the_world(name: str, change: str, crossing: co.Fleet) -> None:
+def test_every_method_follows_the_world(name, change, crossing):
     """The law itself is the reference: the world has no preferred origin, direction, side or numbering."""
     observers = None if needs_whole_fleet(name) else ["c0", "c3"]
     rec = co.observe(crossing.between(0, 25), NOISE, CHANNEL, runs=2, seed=5, observers=observers)
@@ -106,14 +106,14 @@ def test_every_method_follows_the_world(name: str, change: str, crossing: co.Fle
     ],
     ids=lambda m: f"{m.unit}-{m.fusion}" + "-lasting" * (m.lasting is True),
 )
-def test_every_pose_filter_follows_the_world(method: co.PoseFilter, change: str, crossing: co.Fleet) -> None:
+def test_every_pose_filter_follows_the_world(method, change, crossing):
     rec = co.observe(crossing.between(0, 25), NOISE, CHANNEL, runs=2, seed=5, frame="body")
     assert_equivariant(method, rec, CHANGES[change], 1e-6, ("c0", "c3"))
 
 
 @pytest.mark.parametrize("change", CHANGES)
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "casadi", "osqp"])
-def test_every_solver_follows_the_world(backend: str, change: str, crossing: co.Fleet) -> None:
+def test_every_solver_follows_the_world(backend, change, crossing):
     """A star and a window of it; marginals turn with the world."""
     rec, world = co.observe(crossing.between(0, 8), NOISE, CHANNEL, seed=5, observers=["c0"]), CHANGES[change]
     for window in (1, 5):

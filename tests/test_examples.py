@@ -16,19 +16,19 @@ from torch.nn import GRUCell
 import coopoc
 from coopoc.learned.nets.gain_net import GainNet
 from coopoc.studies.world_faults import KINDS
-from coopoc.studies.worlds import World, world
+from coopoc.studies.worlds import world
 
 ROOT = Path(__file__).resolve().parents[1]
 
 
-def test_first_steps_runs() -> None:
+def test_first_steps_runs():
     script = ROOT / "examples" / "first_steps.py"
     out = ran([sys.executable, "-W", "error", script], check=True).stdout
     assert out.count("SOLVED") == 4
     assert "FedKalmanNet" in out
 
 
-def test_the_net_is_drawn_from_itself() -> None:
+def test_the_net_is_drawn_from_itself():
     """The paper's order of three GRUs (section II.B), of which the gain takes the last two."""
     made, takes, kept = layers(GainNet(in_mult=2))
     assert [name for name, layer in made.items() if isinstance(layer, GRUCell)] == ["process", "prior", "innovation"]
@@ -36,7 +36,7 @@ def test_the_net_is_drawn_from_itself() -> None:
     assert kept == {"process": "process", "prior": "posterior", "innovation": "innovation"}
 
 
-def test_lazy_names_are_the_typed_names() -> None:
+def test_lazy_names_are_the_typed_names():
     tree = ast.parse((ROOT / "coopoc" / "__init__.pyi").read_text())
     typed = {alias.asname for node in ast.walk(tree) if isinstance(node, ast.ImportFrom) for alias in node.names}
     assert typed - {None} == set(coopoc.__all__)
@@ -48,7 +48,7 @@ WITH_AND_WITHOUT = (world(9, "development", without=[*KINDS]), world(12, "develo
 
 
 @pytest.mark.parametrize("drawn", WITH_AND_WITHOUT, ids=("nothing wrong", "faults"))
-def test_a_judge_of_ones_is_the_textbook_filter(drawn: World) -> None:
+def test_a_judge_of_ones_is_the_textbook_filter(drawn):
     expected = coopoc.JointFilter(robust=False)(drawn.recording, list(drawn.egos))
     believing = judge.begin(0)
     believing[:, -star.HIDDEN[1] - 1 : -1] = 0.0
@@ -60,7 +60,7 @@ def test_a_judge_of_ones_is_the_textbook_filter(drawn: World) -> None:
             np.testing.assert_allclose(covariance, expected.covariance[:, :, e], atol=1e-9, rtol=1e-6)
 
 
-def test_a_judge_learns_its_targets() -> None:
+def test_a_judge_learns_its_targets():
     packs = [star.pack(drawn.recording, drawn.egos[0], drawn.fleet) for drawn in WITH_AND_WITHOUT]
     rows = judge.rows_of(packs, star.Judge(star.NONE), 0)
     assert sum(map(len, rows)) > 100

@@ -40,13 +40,13 @@ def assert_same_links(fleet: Fleet, observers: Any, most: int, radius: float, mi
 @pytest.mark.parametrize("most", [0, 1, 4, 100])
 @pytest.mark.parametrize("radius", [0.0, 1e-3, 12.0, 30.0, np.inf])
 @pytest.mark.parametrize("observers", [[3], [1, 2, 7], range(8), []])
-def test_neighbours_are_those_of_brute_force(crossing: Fleet, most: int, radius: float, observers: Any) -> None:
+def test_neighbours_are_those_of_brute_force(crossing, most, radius, observers):
     fleet = coming_and_going(crossing).between(15, 45)
     count = assert_same_links(fleet, observers, most, radius)
     assert (count > 0) == (most > 0 and radius >= 12 and len(observers) > 0)
 
 
-def test_neighbours_on_cell_borders_and_at_equal_distances_come_by_column() -> None:
+def test_neighbours_on_cell_borders_and_at_equal_distances_come_by_column():
     """A lattice whose spacing is the radius, turned over time, moved far away; in a random order of columns."""
     rng = np.random.default_rng(1)
     lattice = 30.0 * np.stack(np.meshgrid(np.arange(5), np.arange(4), [0.0]), axis=-1).reshape(-1, 3)
@@ -58,7 +58,7 @@ def test_neighbours_on_cell_borders_and_at_equal_distances_come_by_column() -> N
     assert assert_same_links(fleet, range(20), 4, np.nextafter(30.0, 0)) == 0
 
 
-def test_bytes_have_closed_forms() -> None:
+def test_bytes_have_closed_forms():
     """Four vehicles in contact with each other for ten steps, 100 bytes on top of each message."""
     fleet = standing([[0, 0, 0], [9, 0, 0], [0, 9, 0], [9, 9, 0]], steps=10)
     recording = observe(fleet, S2, V2X(max_neighbours=3, overhead=100), runs=2)
@@ -73,7 +73,7 @@ def test_bytes_have_closed_forms() -> None:
         inbox(recording, 0, UPLOAD)
 
 
-def test_a_measurement_counts_by_a_message_of_either_way(formation: Fleet) -> None:
+def test_a_measurement_counts_by_a_message_of_either_way(formation):
     """A share of 0.3 of the messages is lost; measured both ways, 0.09 of the pairs get no message."""
     fleet = formation.between(0, 200)
     lossy = observe(fleet, S2, V2X(max_neighbours=len(fleet.ids), radius=1e3, loss=0.3), runs=2)

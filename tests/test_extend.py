@@ -15,7 +15,7 @@ import pytest
 from conftest import refused, textbook
 from shell import ran
 
-from coopoc import GNSS, V2X, Fleet, JointFilter, Kalman, Sensors, observe, rt_le
+from coopoc import GNSS, V2X, JointFilter, Kalman, Sensors, observe, rt_le
 from coopoc.evaluate.metrics import measure
 from coopoc.fleets import load_fleet
 from coopoc.formats.trajectories import read_tum
@@ -45,7 +45,7 @@ def shell(command: str, folder: Path, **env: str) -> str:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     """The page's files: a block that begins with the name of a file is that file."""
     out = tmp_path_factory.mktemp("own")
     for text in blocks("python"):
@@ -68,7 +68,7 @@ def output(folder: Path, word: str, change: Callable[[str], str] = str) -> str:
     return done.stdout
 
 
-def test_a_method_of_ones_own_beside_others(folder: Path) -> None:
+def test_a_method_of_ones_own_beside_others(folder):
     (command,) = commands("alpha.py:Alpha")
     table = shell(f"{command} --tracks tum", folder)
     rows, fleet = Results.load(folder / "runs/side_by_side").select(method="alpha.py:Alpha"), load_fleet("town10")
@@ -83,7 +83,7 @@ def test_a_method_of_ones_own_beside_others(folder: Path) -> None:
     assert float(alpha[1]) > float(bound[1])
 
 
-def test_a_cooperative_filter_in_thirty_lines(folder: Path, formation: Fleet) -> None:
+def test_a_cooperative_filter_in_thirty_lines(folder, formation):
     """It errs as the joint filter does, through losses and delays, and alone it is the Kalman filter."""
     ekf, fleet, sensors = (
         from_file(f"{folder}/ekf.py:CooperativeEKF")(),
@@ -97,14 +97,14 @@ def test_a_cooperative_filter_in_thirty_lines(folder: Path, formation: Fleet) ->
     np.testing.assert_allclose(ekf(alone, [0]).x, textbook(Kalman())(alone, [0]).x, atol=2e-4)
 
 
-def test_a_fleet_made_by_code(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_fleet_made_by_code(folder, monkeypatch):
     (command,) = commands("--data ring.py:ring")
     assert "egos of ring.py:ring" in shell(command, folder)
     monkeypatch.chdir(folder)
     assert len(load_fleet("ring.py:ring").ids) == 12
 
 
-def test_a_backend_is_checked_as_all_are(folder: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_backend_is_checked_as_all_are(folder, monkeypatch):
     assert output(folder, "least_squares.py:BACKEND").startswith("SOLVED")
     monkeypatch.chdir(folder)
     problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 4, 0]], std=[1.0, 2.0, 3.0])
@@ -119,9 +119,7 @@ def test_a_backend_is_checked_as_all_are(folder: Path, monkeypatch: pytest.Monke
         solve(problem, "least_squares.py:prepare")
 
 
-def test_a_measurement_is_at_once_in_the_backends_and_in_constraints(
-    folder: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_measurement_is_at_once_in_the_backends_and_in_constraints(folder, monkeypatch):
     assert output(folder, '"lidar.py:elevation"').startswith("SOLVED")
     monkeypatch.chdir(folder)
     problem = Problem(("ego", "b")).add("position", ["ego", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
@@ -153,14 +151,14 @@ def test_a_measurement_is_at_once_in_the_backends_and_in_constraints(
         ("measure(name", ["rt_le_m", "nees", "late.py:final_error_m"]),
     ],
 )
-def test_a_channel_and_a_metric_go_by_their_file(folder: Path, word: str, names: list[str]) -> None:
+def test_a_channel_and_a_metric_go_by_their_file(folder, word, names):
     rows = [line.split() for line in output(folder, word).splitlines()]
     assert [row[0] for row in rows] == names
     assert all(float(row[1]) > 0 for row in rows)
 
 
 @pytest.mark.parametrize(("word", "column"), [("rain.py:rain", "rt_le_m"), ("late.py:final_error_m", "final_error_m")])
-def test_a_study_takes_a_channel_and_a_metric_by_their_file(folder: Path, word: str, column: str) -> None:
+def test_a_study_takes_a_channel_and_a_metric_by_their_file(folder, word, column):
     command = commands(f"={word}")[0]
     shell(command, folder)
     frame = pd.read_parquet(folder / command.split("--out ")[1] / "side_by_side" / "results.parquet")
@@ -168,7 +166,7 @@ def test_a_study_takes_a_channel_and_a_metric_by_their_file(folder: Path, word: 
     assert set(frame["method"]) == {"joint", "kalman"}
 
 
-def test_a_channel_and_a_metric_keep_their_promise(tmp_path: Path, crossing: Fleet) -> None:
+def test_a_channel_and_a_metric_keep_their_promise(tmp_path, crossing):
     (tmp_path / "own.py").write_text(
         "def none(k):\n    return k\ndef flat(track, fleet):\n    return track.x[0, 0, 0]\n"
     )
@@ -185,7 +183,7 @@ def test_a_channel_and_a_metric_keep_their_promise(tmp_path: Path, crossing: Fle
 
 
 @pytest.mark.slow
-def test_an_aggregation_rule_goes_wherever_a_bundled_one_goes(folder: Path, tmp_path: Path) -> None:
+def test_an_aggregation_rule_goes_wherever_a_bundled_one_goes(folder, tmp_path):
     """In `federate`, in the study of rules, in `coopoc train`; an unknown rule is named with the nearest one."""
     differ = "\nassert not all(fed.history[0].weights == fed.history[2].weights)\n"
     output(folder, "own_rules.py:ClippedMean", lambda block: block + differ)
@@ -200,19 +198,19 @@ def test_an_aggregation_rule_goes_wherever_a_bundled_one_goes(folder: Path, tmp_
 
 
 @pytest.mark.slow
-def test_a_study_runs_in_worker_processes_and_reports(folder: Path) -> None:
+def test_a_study_runs_in_worker_processes_and_reports(folder):
     ran, report = commands("rates")[:2]
     assert "| Every" in shell(ran, folder)
     assert (folder / shell(report, folder).strip()).is_file()
 
 
-def test_a_notebook_gets_a_frame_and_a_table(folder: Path) -> None:
+def test_a_notebook_gets_a_frame_and_a_table(folder):
     checks = "\nassert gain.low > 0, gain\nassert '<table>' in table._repr_html_()\n"
     output(folder, "results.frame", lambda block: f"if __name__ == '__main__':\n{indent(block + checks, '    ')}")
 
 
 @pytest.mark.slow
-def test_entry_points_give_names(folder: Path, tmp_path: Path) -> None:
+def test_entry_points_give_names(folder, tmp_path):
     (toml,) = blocks("toml")
     info = tmp_path / "my_coopoc-1.0.dist-info"
     info.mkdir()
@@ -236,13 +234,13 @@ def test_entry_points_give_names(folder: Path, tmp_path: Path) -> None:
     assert "egos of ring" in shell(ran, tmp_path, **env)
 
 
-def test_a_method_may_ask_for_the_whole_fleet(tmp_path: Path) -> None:
+def test_a_method_may_ask_for_the_whole_fleet(tmp_path):
     (tmp_path / "own.py").write_text("class All:\n    whole_fleet = True\nclass Some:\n    pass\n")
     assert needs_whole_fleet(f"{tmp_path}/own.py:All")
     assert not needs_whole_fleet(f"{tmp_path}/own.py:Some")
 
 
-def test_what_is_not_there_is_named(tmp_path: Path) -> None:
+def test_what_is_not_there_is_named(tmp_path):
     (tmp_path / "own.py").write_text(
         "import math\nALPHA = 1\nclass Mute:\n    def __init__(self, noise):\n        pass\n"
     )

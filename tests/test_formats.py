@@ -90,7 +90,7 @@ COUNTS = {  # poses, points, relative poses, relative points, ranges, robots: by
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_real_pyfg_files_read_whole_and_come_back_bit_by_bit(tmp_path: Path, name: str) -> None:
+def test_real_pyfg_files_read_whole_and_come_back_bit_by_bit(tmp_path, name):
     start = time.process_time()
     graph = load_graph(measured(f"{name}.pyfg"))
     assert time.process_time() - start < 2
@@ -99,7 +99,7 @@ def test_real_pyfg_files_read_whole_and_come_back_bit_by_bit(tmp_path: Path, nam
     assert_same(written(graph, tmp_path / "again.pyfg"), graph)
 
 
-def test_pyfg_numbers_are_what_cora_made_of_them() -> None:
+def test_pyfg_numbers_are_what_cora_made_of_them():
     """CORA's expected matrices: rows of X_gt are R_i^T, then bearings of ranges, then positions."""
     folder = measured("cora_unit/small_ra_slam_problem")
     graph = load_graph(folder / "factor_graph.pyfg")
@@ -112,7 +112,7 @@ def test_pyfg_numbers_are_what_cora_made_of_them() -> None:
     np.testing.assert_array_equal(tau, mmread(folder / "OmegaPose.mm").diagonal())
 
 
-def test_relative_poses_and_points_are_in_the_frame_of_the_first() -> None:
+def test_relative_poses_and_points_are_in_the_frame_of_the_first():
     """MR.CLAM against its own Vicon truth: R_i^T (p_j - p_i) is what was measured, to the noise that it claims."""
     graph = load_graph(measured("mrclam6.pyfg"))
     for edges, bound in ((graph.relative_pose, 0.02), (graph.relative_point, 0.2)):
@@ -129,7 +129,7 @@ def test_relative_poses_and_points_are_in_the_frame_of_the_first() -> None:
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("seed", range(5))
-def test_every_pyfg_record_comes_back_bit_by_bit(tmp_path: Path, dimension: int, seed: int) -> None:
+def test_every_pyfg_record_comes_back_bit_by_bit(tmp_path, dimension, seed):
     graph, rng = replace(random_graph(dimension, seed), fixed=()), np.random.default_rng(seed)
     timed = {kind: replace(e := getattr(graph, kind), stamps=rng.uniform(0, 2e9, len(e))) for kind in ENDS}
     graph = replace(graph, stamps=np.where(graph.is_pose, rng.uniform(0, 2e9, 6), np.nan), **timed)
@@ -138,7 +138,7 @@ def test_every_pyfg_record_comes_back_bit_by_bit(tmp_path: Path, dimension: int,
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("names", ["A0 L5 A1 B0 L7 B1", "A0 L0 A1 A2 L1 A4", "x0 L5 x1 x2 m7 L6"])
-def test_every_g2o_record_comes_back_to_rounding(tmp_path: Path, dimension: int, names: str) -> None:
+def test_every_g2o_record_comes_back_to_rounding(tmp_path, dimension, names):
     graph = replace(random_graph(dimension, seed=1), names=tuple(names.split()), guess=True)
     assert_same(written(graph, tmp_path / "a.g2o"), graph, rtol=1e-12)
 
@@ -169,7 +169,7 @@ def _assert_gtsam_agrees(graph: Graph, factors: Any, values: Any, keys: dict[str
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_we_read_what_gtsam_writes(tmp_path: Path, dimension: int) -> None:
+def test_we_read_what_gtsam_writes(tmp_path, dimension):
     gtsam = pytest.importorskip("gtsam")
     rng = np.random.default_rng(dimension)
     factors, values = gtsam.NonlinearFactorGraph(), gtsam.Values()
@@ -189,7 +189,7 @@ def test_we_read_what_gtsam_writes(tmp_path: Path, dimension: int) -> None:
     _assert_gtsam_agrees(graph, factors, values, {f"A{k}": k for k in range(4)}, atol=2e-5)  # it writes 6 to 12 digits
 
 
-def test_gtsams_own_landmark_graph_reads_as_gtsam_reads_it() -> None:
+def test_gtsams_own_landmark_graph_reads_as_gtsam_reads_it():
     """Poses and points share ids there, and offsets are given."""
     gtsam = pytest.importorskip("gtsam")
     path = Path(gtsam.__file__).parent / "Data/known_landmark_localization_20.g2o"
@@ -204,7 +204,7 @@ def test_gtsams_own_landmark_graph_reads_as_gtsam_reads_it() -> None:
     assert_allclose(np.linalg.norm(graph.relative_point.position, axis=1), distance, atol=1e-12)
 
 
-def test_a_graph_cannot_be_changed_and_lists_its_robots() -> None:
+def test_a_graph_cannot_be_changed_and_lists_its_robots():
     graph = random_graph(2, seed=0)
     assert {robot: own.tolist() for robot, own in graph.robots.items()} == {"A": [0, 2], "B": [3, 5]}
     for array in (graph.position, graph.ranges.distance, graph.relative_pose.covariance):
@@ -212,7 +212,7 @@ def test_a_graph_cannot_be_changed_and_lists_its_robots() -> None:
             array[0] = 1
 
 
-def test_rotations_are_scipys() -> None:
+def test_rotations_are_scipys():
     q = np.random.default_rng(0).normal(size=(500, 4))
     q[:8] = [
         [0, 0, 0, 1],
@@ -240,7 +240,7 @@ def random_trajectory(count: int = 40) -> Trajectory:
     )
 
 
-def test_a_tum_file_is_numpys_table(tmp_path: Path) -> None:
+def test_a_tum_file_is_numpys_table(tmp_path):
     """Independent check: SciPy's rotations of the quaternions that NumPy writes."""
     poses = random_trajectory()
     quaternion = Rotation.from_matrix(poses.rotation).as_quat()

@@ -45,7 +45,7 @@ BAD_PYFG = {
 
 
 @pytest.mark.parametrize("case", BAD_PYFG)
-def test_a_bad_pyfg_line_is_named(tmp_path: Path, case: str) -> None:
+def test_a_bad_pyfg_line_is_named(tmp_path, case):
     old, new, thing, hint = BAD_PYFG[case]
     assert len(load_graph(_file(tmp_path / "good.pyfg", PYFG)).ranges) == 1
     assert old in PYFG
@@ -81,7 +81,7 @@ BAD_G2O = {
 
 
 @pytest.mark.parametrize("case", BAD_G2O)
-def test_a_bad_g2o_line_is_named(tmp_path: Path, case: str) -> None:
+def test_a_bad_g2o_line_is_named(tmp_path, case):
     old, new, thing, hint = BAD_G2O[case]
     assert load_graph(_file(tmp_path / "good.g2o", G2O)).fixed.tolist() == [0, 1]
     assert old in G2O
@@ -99,7 +99,7 @@ GRAPH = Graph(
 )
 
 
-def test_a_file_of_another_format_is_refused(tmp_path: Path) -> None:
+def test_a_file_of_another_format_is_refused(tmp_path):
     _assert_refused(lambda: load_graph(tmp_path / "a"), "path = a", ".pyfg or .g2o")
     _assert_refused(lambda: load_graph(tmp_path / "a.pfg"), "path = a.pfg", "Did you mean .pyfg?")
     _assert_refused(lambda: load_graph(tmp_path / "none.g2o"), "none.g2o", "must be a file")
@@ -121,7 +121,7 @@ GRAPH_RULES: dict[str, tuple[dict[str, Any], str]] = {
 
 
 @pytest.mark.parametrize("case", GRAPH_RULES)
-def test_a_bad_graph_is_named_by_its_row(case: str) -> None:
+def test_a_bad_graph_is_named_by_its_row(case):
     change, thing = GRAPH_RULES[case]
     _assert_refused(lambda: replace(GRAPH, **change), thing)
 
@@ -140,12 +140,12 @@ TUM = "# t x y z qx qy qz qw\n0.0 0 0 0 0 0 0 1\n0.1 1 0 0 0 0 0 0.999\n"
         ("# t x y z\n", "a.tum = 0 lines", "complete"),
     ],
 )
-def test_a_bad_line_of_a_trajectory_is_named(tmp_path: Path, text: str, thing: str, hint: str) -> None:
+def test_a_bad_line_of_a_trajectory_is_named(tmp_path, text, thing, hint):
     assert len(read_tum(_file(tmp_path / "a.tum", TUM))) == 2
     _assert_refused(lambda: read_tum(_file(tmp_path / "a.tum", text)), thing, hint)
 
 
-def test_a_repeated_stamp_is_named_by_all_its_digits(tmp_path: Path) -> None:
+def test_a_repeated_stamp_is_named_by_all_its_digits(tmp_path):
     """Stamps of Unix time differ in digits that %g does not print."""
     stamps = ("1311868231.1234567", "1311868231.1234569", "1311868231.1234569", "1311868231.2")
     file = _file(tmp_path / "a.tum", "".join(f"{stamp} {row} 0 0 0 0 0 1\n" for row, stamp in enumerate(stamps)))
@@ -166,7 +166,7 @@ def _assert_refused(call: Any, *parts: str) -> None:
 
 
 @pytest.mark.parametrize("word", ["1_0", "١", "１", "1e308", "nan"])
-def test_a_number_is_one_as_c_writes_it(tmp_path: Path, word: str) -> None:
+def test_a_number_is_one_as_c_writes_it(tmp_path, word):
     """Python's float takes underscores and the digits of any script; no other program does."""
     for name, text in (
         ("a.tum", f"0 {word} 0 0 0 0 0 1\n"),
@@ -182,7 +182,7 @@ def test_a_number_is_one_as_c_writes_it(tmp_path: Path, word: str) -> None:
 
 
 @pytest.mark.parametrize("share", [-1e-3, -1e-6, 1e-3])
-def test_a_covariance_with_a_small_negative_eigenvalue_is_refused(tmp_path: Path, share: float) -> None:
+def test_a_covariance_with_a_small_negative_eigenvalue_is_refused(tmp_path, share):
     """Rounding is 1e-9 of the largest eigenvalue; what is a thousand times more was written so."""
     turn = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))[0]
     covariance = turn @ np.diag([1.0, 0.5, share]) @ turn.T

@@ -26,7 +26,7 @@ def paper_rho(loss: str, r: float, mu: float, c: float = 1.0) -> float:
 
 @pytest.mark.parametrize("loss", graduated.SURROGATES)
 @pytest.mark.parametrize("mu", [0.05, 1.0, 7.0, 300.0])
-def test_weights_are_those_of_the_surrogate(loss: str, mu: float) -> None:
+def test_weights_are_those_of_the_surrogate(loss, mu):
     """w = d rho_mu / d r^2, and the minimiser of w r^2 + Phi_mu(w), whose minimum is rho_mu (Black and Rangarajan)."""
     penalties = {
         "truncated": lambda w: mu * (1 - w) / (mu + w),
@@ -41,7 +41,7 @@ def test_weights_are_those_of_the_surrogate(loss: str, mu: float) -> None:
         assert weight == pytest.approx(dual.x, abs=2e-3)
 
 
-def test_of_all_subsets_it_finds_the_best() -> None:
+def test_of_all_subsets_it_finds_the_best():
     """Truncated least squares of one point is a choice among 2^9 subsets; each is a weighted mean."""
     found = 0
     for seed in range(20):
@@ -62,7 +62,7 @@ def test_of_all_subsets_it_finds_the_best() -> None:
     assert found >= 19
 
 
-def test_a_group_is_one_hypothesis() -> None:
+def test_a_group_is_one_hypothesis():
     """Five fixes 3 std off: 9 is within the 11.3 of one, 45 is not within the 30.6 of five (chi-square, 99 %)."""
     z = np.outer(np.arange(14) >= 9, [3.0, 0, 0])
     problem = Problem(("a",)).add("position", ["a"] * 4, z[:4], std=0.05).add("position", ["a"] * 10, z[4:], std=1.0)
@@ -73,7 +73,7 @@ def test_a_group_is_one_hypothesis() -> None:
     assert together.x[0] == pytest.approx([0, 0, 0], abs=1e-9)
 
 
-def test_wrong_loop_closures_are_those_that_gtsam_finds() -> None:
+def test_wrong_loop_closures_are_those_that_gtsam_finds():
     """Poses in the plane, against BetweenFactorPose2 under GncLMOptimizer."""
     rng = np.random.default_rng(4)
     turn, std = np.repeat([0, 0, 0, np.pi / 2], 1).tolist() * 5, np.array([0.1, 0.1, 0.02])
@@ -128,12 +128,12 @@ LOST = PAIR.add("range", ("a", "b"), 1.0, std=1.0, loss=Loss("huber", 1.0))
         (lambda: solve_gnc("problem", [0]), "problem"),
     ],
 )
-def test_wrong_input_says_what_to_do(make, field: str) -> None:
+def test_wrong_input_says_what_to_do(make, field):
     with refused(field):
         make()
 
 
-def test_gnc_that_rejects_every_fix_is_reported() -> None:
+def test_gnc_that_rejects_every_fix_is_reported():
     """Two fixes of one point 80 m apart, both candidates: believing neither is cheapest, and then the point is free."""
     torn = Problem(("a",)).add("position", ["a"] * 2, [[-40, 0, 0], [40, 0, 0]], std=1.0)
     assert solve_gnc(torn, [0], throw=False).status is Status.RANK_DEFICIENT
@@ -141,7 +141,7 @@ def test_gnc_that_rejects_every_fix_is_reported() -> None:
         solve_gnc(torn, [0])
 
 
-def test_a_limit_of_rounds_is_a_status(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_limit_of_rounds_is_a_status(monkeypatch):
     z = np.outer([0.0, 1.0, 40.0] * 4, [1.0, 0.0, 0.0])
     problem = Problem(("a",)).add("position", ["a"] * 12, z, std=1.0)
     monkeypatch.setattr(graduated, "ROUNDS", 2)

@@ -3,7 +3,6 @@ refuses weights that are no use."""
 
 import re
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pandas as pd
@@ -11,7 +10,7 @@ import pytest
 from conftest import formation_fleet, refused, winding
 from scipy.stats import chi2
 
-from coopoc import V2X, Fleet, JointFilter, Kalman, Method, NoiseModel, Recording, Sensors, observe
+from coopoc import V2X, Fleet, JointFilter, Kalman, NoiseModel, Recording, Sensors, observe
 from coopoc.arrays import Floats
 from coopoc.evaluate.scores import scored
 from coopoc.kernels.covariances import DOUBT
@@ -30,7 +29,7 @@ def seen(**noise: float) -> Recording:
     return observe(FLEET, Sensors(**noise), V2X(max_neighbours=0), runs=3)  # type: ignore[arg-type]
 
 
-def test_a_filter_that_leaves_the_fixes_says_so_in_its_notes_and_in_the_table() -> None:
+def test_a_filter_that_leaves_the_fixes_says_so_in_its_notes_and_in_the_table():
     """Process noise of 1 um a step beside odometry that is a tenth too fast, at 10 m/s: 300 m in five minutes."""
     recording = seen()
     blind = Kalman(NoiseModel("blind", process_std=(1e-6,) * 3, gnss_std=(1e3,) * 3))
@@ -53,7 +52,7 @@ def test_a_filter_that_leaves_the_fixes_says_so_in_its_notes_and_in_the_table() 
     assert note.startswith("KF diverged in 2 rows")
 
 
-def test_no_net_invents_a_height() -> None:
+def test_no_net_invents_a_height():
     """Fixes and velocities of a drive in one plane have none: it is held to the last digit, and what moves is not."""
     net, recording = GainNet(4, 1), seen()
     gnss: Floats = recording.gnss.copy()
@@ -63,7 +62,7 @@ def test_no_net_invents_a_height() -> None:
     assert np.ptp(LearnedGain(net)(recording).x[..., 2]) > 0.1
 
 
-def test_useless_weights_are_not_saved(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+def test_useless_weights_are_not_saved(monkeypatch, tmp_path):
     """A net that starts far from a stable gain and takes one tiny step, unless it is asked for."""
     bad = Recipe("centralised", Schedule(epochs=1, learning_rate=1e-9), piece=20, options=(("start_gain", 0.9),))
     monkeypatch.setitem(recipes.RECIPES, "centralised", bad)
@@ -75,7 +74,7 @@ def test_useless_weights_are_not_saved(monkeypatch: pytest.MonkeyPatch, tmp_path
 
 @pytest.mark.parametrize("dt", [0.1, 0.5, 1.0])
 @pytest.mark.parametrize("method", [Kalman(), JointFilter()], ids=["kalman", "joint"])
-def test_a_filter_is_back_within_five_seconds_of_the_end_of_an_attack(method: Method, dt: float) -> None:
+def test_a_filter_is_back_within_five_seconds_of_the_end_of_an_attack(method, dt):
     """Fixes ten of their deviations off for 30 s, which filters follow in the end: 5 s after them the mean error is
     less than one deviation more than without them, and was ten."""
     t = np.arange(0.0, 80.0, dt)
@@ -120,7 +119,7 @@ def faulty(kind: str) -> Recording:
         ("relative measurements", "messages, v0 and v3: far from estimates", "joint"),  # which are believed at last
     ],
 )
-def test_what_contradicts_a_filter_is_noted_with_its_vehicle_and_time(kind: str, note: str, names: str) -> None:
+def test_what_contradicts_a_filter_is_noted_with_its_vehicle_and_time(kind, note, names):
     for name in names.split():
         (found,) = [each for each in METHODS[name]("nominal")(faulty(kind), [0]).notes if each.startswith(note)]
         begin, end = re.findall(r"\(([0-9.]+) to .*?([0-9.]+) s", found)[0]
@@ -128,7 +127,7 @@ def test_what_contradicts_a_filter_is_noted_with_its_vehicle_and_time(kind: str,
         assert float(end) <= 46.0, (name, found)
 
 
-def test_nothing_is_noted_of_clean_vehicles() -> None:
+def test_nothing_is_noted_of_clean_vehicles():
     """At most 1 % of 480 vehicles, each alone and with neighbours; the fixed draws have none."""
     for seed in range(10):
         recording = observe(formation_fleet(6, 600), Sensors.paper_scenario2(), V2X(3), runs=2, seed=seed)
@@ -141,7 +140,7 @@ def test_nothing_is_noted_of_clean_vehicles() -> None:
             assert not [n for n in notes if "far from" in n or "contradicted" in n], (method.name, notes)
 
 
-def test_covariances_are_doubted_where_scipys_chi_square_law_leaves_no_chance() -> None:
+def test_covariances_are_doubted_where_scipys_chi_square_law_leaves_no_chance():
     """Estimates 0 to 2 m off the truth that claim 0.1 m: five fixes of 1 m, a second apart, have a mean error of
     sqrt(1 / 5 + 0.01) m."""
     still = Fleet(("a",), np.arange(5.0), np.zeros((5, 1, 3)), np.zeros((5, 1, 3)))

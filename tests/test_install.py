@@ -17,7 +17,7 @@ PARTS = ["coopoc", "learned", "studies", "data", "pyproject.toml", "README.md", 
 
 
 @pytest.fixture(scope="module")
-def site(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def site(tmp_path_factory):
     """A folder with nothing but the installed wheel; built from a copy, so that the tree stays clean."""
     source, site = tmp_path_factory.mktemp("source"), tmp_path_factory.mktemp("site")
     for part in PARTS:
@@ -36,7 +36,7 @@ def outside(site: Path, tmp_path: Path, *command: str) -> str:
     return done.stdout
 
 
-def test_everything_imports_from_the_wheel(site: Path, tmp_path: Path) -> None:
+def test_everything_imports_from_the_wheel(site, tmp_path):
     code = """
 import coopoc, coopoc.learned, coopoc.studies, coopoc.data, joblib
 from coopoc.data.registry import load_fleet as load
@@ -53,7 +53,7 @@ print(load("town04"), joblib.Parallel(n_jobs=2)(joblib.delayed(load)(n) for n in
 
 
 @pytest.mark.slow
-def test_installed_package_is_strictly_typed(site: Path, tmp_path: Path) -> None:
+def test_installed_package_is_strictly_typed(site, tmp_path):
     config = str(ROOT / "pyproject.toml")
     outside(site, tmp_path, sys.executable, "-m", "mypy", "--strict", "--config-file", config, "-p", "coopoc")
 
@@ -71,7 +71,7 @@ sys.meta_path.insert(0, Absent())
 """Not installed: `torch` and its extra are left out of the core."""
 
 
-def test_without_torch_all_but_learned_gains_works(tmp_path: Path) -> None:
+def test_without_torch_all_but_learned_gains_works(tmp_path):
     code = f"""{WITHOUT_TORCH}
 import coopoc as co
 from coopoc.cli import main
@@ -104,7 +104,7 @@ for words in (["train", "okf"], ["run", "neighbours", "--set", "method=okf", "ru
 
 
 @pytest.mark.parametrize("library", ["casadi", "pyarrow", "cvxpy", "osqp", "gtsam", "pandas"])
-def test_what_is_missing_is_named_and_the_rest_works(tmp_path: Path, library: str) -> None:
+def test_what_is_missing_is_named_and_the_rest_works(tmp_path, library):
     code = f"""
 import sys
 from functools import partial

@@ -5,7 +5,6 @@ import os
 import pickle
 import sys
 from io import StringIO
-from pathlib import Path
 
 import pytest
 from shell import ran
@@ -18,9 +17,7 @@ pytest.importorskip("numba")
 S2 = Sensors.paper_scenario2()
 
 
-def test_machine_code_is_stale_after_a_change_of_a_file_that_it_imports_and_no_other(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_machine_code_is_stale_after_a_change_of_a_file_that_it_imports_and_no_other(tmp_path, monkeypatch):
     """a calls b, which calls c; d is beside them."""
     monkeypatch.syspath_prepend(tmp_path)
     for name, text in (
@@ -45,20 +42,20 @@ def test_machine_code_is_stale_after_a_change_of_a_file_that_it_imports_and_no_o
     assert stamp() != before
 
 
-def test_a_kernel_depends_on_all_kernels_below_it() -> None:
+def test_a_kernel_depends_on_all_kernels_below_it():
     importlib.import_module("coopoc.kernels.stars.joint_filter")
     names = {name.rpartition(".")[2] for name in machine_code.sources("coopoc.kernels.stars.joint_filter")}
     assert {"messages", "geometry", "small", "compile"} <= names
     assert "smoother" not in names
 
 
-def test_importing_the_package_imports_no_numba() -> None:
+def test_importing_the_package_imports_no_numba():
     code = "import sys, coopoc; print('numba' in sys.modules)"
     done = ran([sys.executable, "-c", code], check=True)
     assert done.stdout.strip() == "False"
 
 
-def test_machine_code_of_types_that_are_gone_is_made_again(tmp_path: Path) -> None:
+def test_machine_code_of_types_that_are_gone_is_made_again(tmp_path):
     """A cache from before a type was renamed cannot be read: the kernel compiles anew and is kept again."""
     (tmp_path / "own.py").write_text(
         "from coopoc.kernels.compiling.compile import compiled\n\n\n@compiled\ndef twice(x):\n    return 2.0 * x\n\n\n"
@@ -77,7 +74,7 @@ def test_machine_code_of_types_that_are_gone_is_made_again(tmp_path: Path) -> No
     assert (run(), run()) == ("8.0 0\n", "8.0 1\n")
 
 
-def test_no_progress_bar_counts_the_time_of_compiling(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_progress_bar_counts_the_time_of_compiling(monkeypatch):
     """A bar that is open while a kernel compiles begins to count when it has; a line says what and how long."""
     said = StringIO()
     monkeypatch.setattr(sys, "stderr", said)
@@ -89,7 +86,7 @@ def test_no_progress_bar_counts_the_time_of_compiling(monkeypatch: pytest.Monkey
     assert said.getvalue() == "compiling the compile kernel, once per machine\n"
 
 
-def test_a_bar_fills_no_log_with_carriage_returns(capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_bar_fills_no_log_with_carriage_returns(capsys):
     for seldom, last in ((60.0, ""), (0.0, "steps: 100%")):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(workers, "SELDOM", seldom)

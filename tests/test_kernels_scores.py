@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose
 
-from coopoc import V2X, Fleet, JointFilter, Kalman, Sensors, Track, observe
+from coopoc import V2X, JointFilter, Kalman, Sensors, Track, observe
 from coopoc.evaluate import scores
 from coopoc.evaluate.metrics import errors, nees, neighbour_rt_le
 
@@ -12,18 +12,18 @@ S2 = Sensors.paper_scenario2()
 
 
 @pytest.fixture
-def track(crossing: Fleet) -> Track:
+def track(crossing):
     return JointFilter()(observe(crossing, S2, V2X(max_neighbours=4), runs=3), [0, 5])
 
 
-def test_errors_and_nees_are_numpys(track: Track, crossing: Fleet) -> None:
+def test_errors_and_nees_are_numpys(track, crossing):
     gap = track.x - crossing.position[:, [0, 5]]
     assert_allclose(errors(track, crossing), np.linalg.norm(gap, axis=-1), rtol=1e-14)
     solved = np.linalg.solve(track.covariance, gap[..., None])[..., 0]
     assert_allclose(nees(track, crossing), (gap * solved).sum(axis=-1), rtol=1e-9)
 
 
-def test_what_egos_think_of_neighbours(track: Track, crossing: Fleet) -> None:
+def test_what_egos_think_of_neighbours(track, crossing):
     """Root mean square over the links that the ego knows something of, NaN without any."""
     seen = observe(crossing, S2, V2X(max_neighbours=4, loss=0.5, max_age=0.2), runs=3)
     theirs = track.neighbours.copy()
@@ -36,7 +36,7 @@ def test_what_egos_think_of_neighbours(track: Track, crossing: Fleet) -> None:
     assert np.isnan(found[2]).all()
 
 
-def test_neighbours_are_counted_per_step(crossing: Fleet, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_neighbours_are_counted_per_step(crossing, monkeypatch):
     """All eight are within the radius at every step, and the three nearest are linked; runs are scored by fours."""
     seen = observe(crossing, S2, V2X(max_neighbours=3, radius=1e4), runs=6)
     monkeypatch.setattr(scores, "SLAB", 1)
@@ -47,7 +47,7 @@ def test_neighbours_are_counted_per_step(crossing: Fleet, monkeypatch: pytest.Mo
     assert_allclose(found["nees"], each, rtol=1e-12)
 
 
-def test_a_start_that_is_known_has_no_nees(crossing: Fleet) -> None:
+def test_a_start_that_is_known_has_no_nees(crossing):
     known = Kalman("nominal", x0=crossing.position[0, [0]])(observe(crossing, S2, runs=2), [0])
     found = nees(known, crossing)
     assert np.isnan(found[:, 0]).all()

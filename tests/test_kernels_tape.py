@@ -15,7 +15,7 @@ UNARY = [one.name for one in Operation if one > Operation.ASSIGN and one.name no
 
 
 @pytest.mark.parametrize("name", [*UNARY, *sorted(BINARY)])
-def test_an_operation_is_casadis(name: str) -> None:
+def test_an_operation_is_casadis(name):
     """For numbers of both signs, equal ones and zeros, in more measurements than stand side by side."""
     rng = np.random.default_rng(1)
     a, b = rng.uniform(-2, 2, (2, 75))

@@ -2,7 +2,6 @@
 
 import os
 import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -34,7 +33,7 @@ def inverted(a: Floats) -> None:
     store(a, 0, inverse(load(a, 0, zeros(1.0, NINE))))
 
 
-def test_a_covariance_with_an_unknown_angle_keeps_its_digits() -> None:
+def test_a_covariance_with_an_unknown_angle_keeps_its_digits():
     """In closed form: variances along three axes; the adjugate had lost the determinant."""
     rng, variances = np.random.default_rng(5), np.array([0.4, 0.1, 8.6e8])
     for _ in range(50):
@@ -55,7 +54,7 @@ def drawn(d: int) -> tuple[Floats, Floats, Floats]:
 
 
 @pytest.mark.parametrize("batched", [False, True])
-def test_blocks_against_numpy(batched: bool) -> None:
+def test_blocks_against_numpy(batched):
     d = 3
     a, eta, process = drawn(d)
     shape = (lambda v: np.repeat(v[:, None], LANES, axis=1)) if batched else np.copy
@@ -79,7 +78,7 @@ def test_blocks_against_numpy(batched: bool) -> None:
                 assert found[i, j][tuple(upper)] == pytest.approx(expected[i, j][tuple(upper)], rel=1e-9, abs=1e-12)
 
 
-def test_plain_njit_gives_the_same_without_the_private_hooks(tmp_path: Path) -> None:
+def test_plain_njit_gives_the_same_without_the_private_hooks(tmp_path):
     env = {**os.environ, "COOPOC_PLAIN_NJIT": "1", "NUMBA_CACHE_DIR": str(tmp_path)}
     command = [
         sys.executable,
@@ -96,7 +95,7 @@ def test_plain_njit_gives_the_same_without_the_private_hooks(tmp_path: Path) -> 
     assert done.returncode == 0, done.stdout
 
 
-def test_angles_side_by_side_are_those_of_atan2() -> None:
+def test_angles_side_by_side_are_those_of_atan2():
     """Where all are small, where some are, and where one is missing."""
     import numba
 

@@ -18,7 +18,7 @@ ONLY_SCALE = Priors(forget=0.0, heading=0.0, slip=0.0, lasts=1e12)
 
 
 @pytest.fixture(scope="module")
-def town() -> Fleet:
+def town():
     return co.load_fleet("town10").between(0, 300)
 
 
@@ -29,7 +29,7 @@ def rms(recording: Recording, fleet: Fleet, **priors: float) -> tuple[float, co.
 
 @pytest.mark.parametrize("priors", [ONLY_SCALE, ONLY_SCALE._replace(absent=-np.inf, exact=4.0)])
 @pytest.mark.parametrize("scale", [0.0, 0.02, 0.05])
-def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale: float, priors: Priors) -> None:
+def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale, priors):
     """filterpy: of the positions along a straight road one filter knows no scale error, one has it as a state; their
     estimates by Bayes' rule."""
     t = 0.5 * np.arange(120)
@@ -59,7 +59,7 @@ def test_the_average_is_that_of_two_filters_by_their_likelihoods(scale: float, p
     assert track.extras["scale_error"][0, -1, 0] == pytest.approx(there * filters[1].x[1, 0], abs=1e-4)
 
 
-def test_odometry_that_errs_is_found_and_said(town: Fleet) -> None:
+def test_odometry_that_errs_is_found_and_said(town):
     """All headings 4 degrees off, and all scales 3 %: half the error; where nothing errs, it costs next to nothing."""
     seen = observe(town, S2, V2X(4), runs=3, observers=[3, 8])
     wrong = replace(seen, velocity=turned(1.03 * seen.velocity, np.full(seen.velocity.shape[:3], 0.07)))
@@ -72,7 +72,7 @@ def test_odometry_that_errs_is_found_and_said(town: Fleet) -> None:
     assert not any("error" in note for note in track.notes)
 
 
-def test_a_slip_is_found_and_ends(town: Fleet) -> None:
+def test_a_slip_is_found_and_ends(town):
     """Wheels of the egos are locked for three seconds, beside three neighbours or one."""
     seen = observe(town, S2, V2X(6), runs=3, observers=[3, 8])
     velocity = seen.velocity.copy()
@@ -90,7 +90,7 @@ def test_a_slip_is_found_and_ends(town: Fleet) -> None:
 
 
 @pytest.mark.parametrize(("factor", "said"), [(1.0, False), (3.0, True)])
-def test_notes_name_what_is_otherwise_than_stated_and_nothing_else(town: Fleet, factor: float, said: bool) -> None:
+def test_notes_name_what_is_otherwise_than_stated_and_nothing_else(town, factor, said):
     """Real fixes are assumed to err more than is stated; a note says by how much they do."""
     sensors = replace(S2, range_offset_std=0.3)
     acts = replace(sensors, gnss_std=tuple(factor * np.array(S2.gnss_std)))
@@ -101,7 +101,7 @@ def test_notes_name_what_is_otherwise_than_stated_and_nothing_else(town: Fleet, 
     assert not any(note.startswith("range offset, ") for note in notes)
 
 
-def test_a_fleet_speaks_for_odometries_that_do_not_err() -> None:
+def test_a_fleet_speaks_for_odometries_that_do_not_err():
     """Five precise odometries, fixes of 1 Hz, 90 s: what is known of all counts, and where all err, nothing is lost."""
     town = co.load_fleet("town10").between(0, 900)
     precise = replace(S2, velocity_std_ratio=0.01)

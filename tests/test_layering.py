@@ -55,7 +55,7 @@ ROOMS = {
 
 
 @pytest.mark.parametrize("floor", ROOMS)
-def test_rooms_of_a_floor_import_one_way(floor: str) -> None:
+def test_rooms_of_a_floor_import_one_way(floor):
     order = ROOMS[floor]
     assert {p.parent.name for p in (ROOT / "coopoc" / floor).glob("*/__init__.py")} == set(order)
     for module, path in CORE.items():
@@ -68,7 +68,7 @@ def test_rooms_of_a_floor_import_one_way(floor: str) -> None:
 
 
 @pytest.mark.parametrize("module", CORE)
-def test_imports_run_one_way(module: str) -> None:
+def test_imports_run_one_way(module):
     floor = module.split(".")[1] if "." in module else ""
     for target in {name for source, names in imports(module, CORE[module]) for name in (source, *names)}:
         assert not target.startswith(tuple(FOLDERS)), f"{module} imports {target}"
@@ -95,11 +95,11 @@ def circles(package: str) -> list[list[str]]:
 
 
 @pytest.mark.parametrize("package", ["coopoc", *FOLDERS])
-def test_no_file_imports_in_a_circle(package: str) -> None:
+def test_no_file_imports_in_a_circle(package):
     assert circles(package) == []
 
 
-def test_import_is_light() -> None:
+def test_import_is_light():
     """`import coopoc` and the core nouns load none of the heavy libraries."""
     heavy = {"torch", "cvxpy", "gtsam", "casadi", "osqp", "pandas", "matplotlib", "sklearn"}
     code = "import sys, coopoc; coopoc.Fleet, coopoc.observe; print(*sys.modules)"

@@ -1,7 +1,6 @@
 """The compiled engine against plain torch: values, gradients, missing fixes, rows that do not know of each other."""
 
 import copy
-from collections.abc import Callable, Iterator
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from coopoc.learned.training.schedule import Moving, Schedule
 
 
 @pytest.fixture(autouse=True)
-def _one_core() -> Iterator[None]:
+def _one_core():
     with one_core():
         yield
 
@@ -60,7 +59,7 @@ def grad(leaf: Tensor) -> Tensor:
     return leaf.grad
 
 
-def test_tanh_and_sigmoid_against_numpy() -> None:
+def test_tanh_and_sigmoid_against_numpy():
     @njit(error_model="numpy")
     def both(x: np.ndarray, out: np.ndarray) -> None:
         for i in range(len(x)):
@@ -83,7 +82,7 @@ def test_tanh_and_sigmoid_against_numpy() -> None:
     ("models", "lanes", "steps"),
     [(3, 1, 100), pytest.param(1, 2, 900, marks=pytest.mark.slow), (2, 7, 100), (1, 72, 100)],
 )
-def test_float32_agrees_with_the_reference(models: int, lanes: int, steps: int) -> None:
+def test_float32_agrees_with_the_reference(models, lanes, steps):
     """Values to 1e-5. Gradients are about as near to float64's as torch's own float32 ones: rounding turns the
     direction of a short vector, so that torch itself is up to 1e-4 off."""
     nets = [GainNet(seed=s) for s in range(models)]
@@ -96,7 +95,7 @@ def test_float32_agrees_with_the_reference(models: int, lanes: int, steps: int) 
     assert (far < 2 * near + 3e-5 * exact.norm(dim=1)).all()
 
 
-def test_float64_agrees_with_the_reference_with_gaps_and_variable_dt() -> None:
+def test_float64_agrees_with_the_reference_with_gaps_and_variable_dt():
     nets = [GainNet(4, 2, seed=s).double() for s in range(2)]
     dt = torch.linspace(0.05, 0.3, 60, dtype=torch.float64)
     found, mine, expected, theirs = gradients(nets, batch(2, 9, 60, gaps=0.4), dt)
@@ -110,7 +109,7 @@ def moving(nets: list[GainNet]) -> Moving:
 
 
 @pytest.mark.parametrize("descend", [GainNet.descend, Gain.descend], ids=["whole", "by parts"])
-def test_descent_is_that_of_torch(descend: Callable[..., tuple[Tensor, Tensor]]) -> None:
+def test_descent_is_that_of_torch(descend):
     """torch.optim.AdamW after clip_grad_norm_ on autograd's gradient of the reference; other rows stay, and so does a
     row whose loss is not finite."""
     nets, data = [GainNet(2, 1, seed=s).double() for s in range(4)], batch(3, 3, 12, gaps=0.2)
@@ -134,7 +133,7 @@ def test_descent_is_that_of_torch(descend: Callable[..., tuple[Tensor, Tensor]])
     assert torch.equal(state.theta[1:3], started[1:3])
 
 
-def test_gradients_of_inputs_and_weights_go_through_the_reference() -> None:
+def test_gradients_of_inputs_and_weights_go_through_the_reference():
     data, net = batch(1, 2, 5), GainNet(2, 1).double()
     gnss = data.gnss[:, 0].transpose(0, 1).clone().requires_grad_()
     net(gnss, data.velocity[:, 0].transpose(0, 1), data.x0[0], 0.1).sum().backward()
@@ -144,7 +143,7 @@ def test_gradients_of_inputs_and_weights_go_through_the_reference() -> None:
     torch.testing.assert_close(by_torch, net.loss_and_gradient(theta, data)[1])
 
 
-def test_what_does_not_fit_is_named() -> None:
+def test_what_does_not_fit_is_named():
     data, net = batch(1, 2, 5), GainNet(2, 1)
     theta = flatten([net])
     with refused("theta"):

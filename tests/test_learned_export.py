@@ -26,12 +26,12 @@ Step = Callable[[Sequence[AnyArray]], Sequence[AnyArray]]
 
 
 @pytest.fixture(scope="module")
-def shipped() -> checkpoint.Checkpoint:
+def shipped():
     return checkpoint.load(WEIGHTS / "fedkalmannet.safetensors")
 
 
 @pytest.fixture(scope="module")
-def file(shipped: checkpoint.Checkpoint, tmp_path_factory: pytest.TempPathFactory) -> Path:
+def file(shipped, tmp_path_factory):
     return to_onnx(shipped, tmp_path_factory.mktemp("export") / "step.onnx")
 
 
@@ -42,7 +42,7 @@ def steps(file: Path) -> Step:
 
 
 @pytest.mark.parametrize("lanes", [1, 7])
-def test_any_number_of_lanes_with_missing_fixes(lanes: int, file: Path, shipped: checkpoint.Checkpoint) -> None:
+def test_any_number_of_lanes_with_missing_fixes(lanes, file, shipped):
     net, step, draw = shipped.model, steps(file), np.random.default_rng(3)
     assert isinstance(net, GainNet)
     inputs = first_inputs(net, draw.normal(0, 2, (lanes, 3)).tolist())
@@ -52,7 +52,7 @@ def test_any_number_of_lanes_with_missing_fixes(lanes: int, file: Path, shipped:
         np.testing.assert_allclose(ours, theirs.detach().numpy(), atol=1e-5)
 
 
-def test_the_file_is_checked_before_it_is_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_file_is_checked_before_it_is_kept(tmp_path, monkeypatch):
     """A step that is off by 2e-5 m in one number after twenty steps is refused, and no file appears."""
     net, calls = GainNet(2, 1), iter(range(10 * STEPS))
     good = steps(to_onnx(net, tmp_path / "good.onnx"))
@@ -74,12 +74,12 @@ def test_the_file_is_checked_before_it_is_kept(tmp_path: Path, monkeypatch: pyte
     assert sorted(p.name for p in tmp_path.iterdir()) == ["good.onnx", "other.onnx"]
 
 
-def test_the_card_travels_along(file: Path, shipped: checkpoint.Checkpoint) -> None:
+def test_the_card_travels_along(file, shipped):
     props = {p.key: p.value for p in onnx.load(file).metadata_props}
     assert json.loads(props["card"]) == dict(shipped.card)
 
 
-def test_the_file_names_its_arrays_and_no_machine(file: Path) -> None:
+def test_the_file_names_its_arrays_and_no_machine(file):
     graph = onnx.load(file).graph
     onnx.checker.check_model(onnx.load(file), full_check=True)
     assert [i.name for i in graph.input] == list(INPUTS)
@@ -92,7 +92,7 @@ def test_the_file_names_its_arrays_and_no_machine(file: Path) -> None:
         assert os.fsencode(place) not in file.read_bytes()
 
 
-def test_other_models_and_a_missing_library_are_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_other_models_and_a_missing_library_are_named(tmp_path, monkeypatch):
     okf = OptimisedKF((0.1,) * 3, (0.1,) * 3, (1.5,) * 3)
     with refused("model = OptimisedKF"):
         to_onnx(okf, tmp_path / "a.onnx")  # type: ignore[arg-type]
@@ -106,7 +106,7 @@ def test_other_models_and_a_missing_library_are_named(tmp_path: Path, monkeypatc
     assert not list(tmp_path.iterdir())
 
 
-def test_the_documented_program_needs_onnxruntime_and_numpy_only(file: Path, tmp_path: Path) -> None:
+def test_the_documented_program_needs_onnxruntime_and_numpy_only(file, tmp_path):
     """The last block of docs/streaming.md, as it stands, in a Python that cannot import coopoc, torch or onnx."""
     text = (ROOT / "docs" / "streaming.md").read_text()
     (block,) = [b for b in re.findall(r"```python\n(.*?)```", text, flags=re.DOTALL) if "onnxruntime" in b]

@@ -2,7 +2,6 @@
 
 import re
 import sys
-from pathlib import Path
 
 import pytest
 import torch
@@ -20,14 +19,14 @@ NET = "constant_gain.py:ConstantGain"
 
 
 @pytest.fixture
-def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def folder(tmp_path, monkeypatch):
     (text,) = (text for text in blocks("python") if text.startswith("# constant_gain.py"))
     (tmp_path / "constant_gain.py").write_text(text)
     monkeypatch.chdir(tmp_path)
     return tmp_path
 
 
-def test_a_net_of_ones_own_federates_saves_loads_and_streams(folder: Path) -> None:
+def test_a_net_of_ones_own_federates_saves_loads_and_streams(folder):
     (block,) = (text for text in blocks("python") if "load_method" in text)
     script = folder / "own_net.py"
     script.write_text(f"{block}\nassert abs(x - track.x[0, -1, 0]).max() < 1e-4\n")
@@ -36,7 +35,7 @@ def test_a_net_of_ones_own_federates_saves_loads_and_streams(folder: Path) -> No
 
 
 @pytest.mark.slow
-def test_a_recipe_of_ones_own_trains_and_runs_beside_others(folder: Path) -> None:
+def test_a_recipe_of_ones_own_trains_and_runs_beside_others(folder):
     trained, ran = (line for line in commands("constant_gain.py"))
     assert "constant_gain.RECIPE-gnss-axis-0.safetensors  3 parameters" in shell(trained, folder)
     table = shell(ran, folder)
@@ -44,7 +43,7 @@ def test_a_recipe_of_ones_own_trains_and_runs_beside_others(folder: Path) -> Non
     assert float(rows["RECIPE"]) < 2.0, table
 
 
-def test_a_checkpoint_of_a_file_runs_no_file_by_itself(folder: Path) -> None:
+def test_a_checkpoint_of_a_file_runs_no_file_by_itself(folder):
     net = find("coopoc.nets", NET)()
     path = save(folder / "own.safetensors", Checkpoint(net, {}))
     with refused("names a file, whose code does not run"):
@@ -54,7 +53,7 @@ def test_a_checkpoint_of_a_file_runs_no_file_by_itself(folder: Path) -> None:
         to_onnx(net, folder / "own.onnx")
 
 
-def test_what_is_neither_recipe_nor_net_is_refused(folder: Path) -> None:
+def test_what_is_neither_recipe_nor_net_is_refused(folder):
     assert recipe_of(NET).net == NET
     with refused("no Recipe and no net"):
         recipe_of("constant_gain.py:nn")

@@ -4,7 +4,6 @@ import math
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from types import ModuleType
 from typing import Any
 
 import numpy as np
@@ -67,7 +66,7 @@ def drives(count: int = 4) -> Fleet:
 
 
 @pytest.fixture(scope="module")
-def four() -> tuple[Client, ...]:
+def four():
     return clients(drives(), piece=10)
 
 
@@ -80,7 +79,7 @@ def trained(group: Sequence[Client], rounds: int = 3, model: Gain | None = None,
 @pytest.mark.parametrize(
     "options", [{}, {"aggregate": "median", "participation": Participation(0.5)}], ids=["mean", "median"]
 )
-def test_the_order_of_the_clients_changes_nothing(four: tuple[Client, ...], options: dict[str, Any]) -> None:
+def test_the_order_of_the_clients_changes_nothing(four, options):
     """Same seed, same weights, bit for bit, whatever the order of the clients."""
     one, other = trained(four, seed=3, **options), trained(four[::-1], seed=3, **options)
     how: dict[str, Any] = {"rounds": 3, "local_epochs": 1, "schedule": Schedule(learning_rate=0.02), **options}
@@ -110,7 +109,7 @@ class Faulty(Participation):
     ids=lambda faults: "+".join(faults.values()),
 )
 @pytest.mark.parametrize("number", [1, 4])
-def test_bad_answers_are_rejected_and_training_goes_on(number: int, faults: dict[str, str]) -> None:
+def test_bad_answers_are_rejected_and_training_goes_on(number, faults):
     """The result is that of the honest clients alone, bit for bit: among five of them, and beside a single one."""
     group = clients(drives(4 + number), piece=10)
     honest = [client for client in group if client.name not in faults]
@@ -123,7 +122,7 @@ def test_bad_answers_are_rejected_and_training_goes_on(number: int, faults: dict
     assert all("changes the weights by" in row.rejected["b"] for row in two.history[1:])
 
 
-def test_a_client_that_never_answered_does_not_choose_the_weights(four: tuple[Client, ...]) -> None:
+def test_a_client_that_never_answered_does_not_choose_the_weights(four):
     """Its pieces are not finite, so that its loss is infinite in every round; the others' best round is kept."""
 
     def without_fixes(pieces: Any) -> Any:
@@ -136,7 +135,7 @@ def test_a_client_that_never_answered_does_not_choose_the_weights(four: tuple[Cl
     assert "a" not in fed.history[1].sent
 
 
-def test_absent_clients_count_with_their_last_answer(four: tuple[Client, ...]) -> None:
+def test_absent_clients_count_with_their_last_answer(four):
     fed = trained(four, 4, participation=Participation(0.5), seed=1)
     assert torch.equal(flatten([fed.after(1)])[0], fed.history[1].weights)
     with refused("round = 5"):
@@ -146,7 +145,7 @@ def test_absent_clients_count_with_their_last_answer(four: tuple[Client, ...]) -
             assert (row.validation_loss[i] == before.validation_loss[i]) == (name in row.absent)
 
 
-def test_too_few_answers_for_the_rule_are_said(four: tuple[Client, ...]) -> None:
+def test_too_few_answers_for_the_rule_are_said(four):
     fed = trained(clients(drives(5), piece=10), 2, aggregate="krum", participation=Faulty(faults=(("b", "nan"),)))
     assert all(torch.equal(row.weights, fed.history[0].weights) for row in fed.history)
     assert fed.history[1].note == "4 answers accepted, Krum(byzantine=1, keep=1) takes at least 5: weights unchanged"
@@ -160,20 +159,18 @@ def test_too_few_answers_for_the_rule_are_said(four: tuple[Client, ...]) -> None
         ({"rounds": 0}, "rounds = 0"),
     ],
 )
-def test_what_cannot_be_federated_is_said_at_once(
-    four: tuple[Client, ...], options: dict[str, Any], words: str
-) -> None:
+def test_what_cannot_be_federated_is_said_at_once(four, options, words):
     with refused(words):
         trained(four, **options)
 
 
-def test_clients_have_names_of_their_own(four: tuple[Client, ...]) -> None:
+def test_clients_have_names_of_their_own(four):
     for name in ("a", SERVER):
         with refused("clients = "):
             trained([four[0], replace(four[1], name=name), replace(four[2], name=name)])
 
 
-def test_the_server_asks_a_share_of_the_clients(four: tuple[Client, ...]) -> None:
+def test_the_server_asks_a_share_of_the_clients(four):
     """As many each round, by lots that do not depend on the order of the names; the history names the others."""
     names = [f"v{i}" for i in range(40)]
     given = Participation(share=0.5)
@@ -190,7 +187,7 @@ def test_the_server_asks_a_share_of_the_clients(four: tuple[Client, ...]) -> Non
         assert [np.isnan(loss) for loss in row.training_loss] == [name in row.absent for name in fed.names]
 
 
-def test_the_ledger_counts_every_byte(four: tuple[Client, ...]) -> None:
+def test_the_ledger_counts_every_byte(four):
     """Three weights and one loss up, three weights down, per round in which a client is asked."""
     fed = trained(four, 3, participation=Participation(0.5), seed=1)
     account, air = ledger(fed), ledger(fed, overhead=100)
@@ -203,7 +200,7 @@ def test_the_ledger_counts_every_byte(four: tuple[Client, ...]) -> None:
     np.testing.assert_array_equal(air.of("training", "on air")[0] - received, [*100 * rounds, 100 * rounds.sum()])
 
 
-def test_poisoned_updates(four: tuple[Client, ...]) -> None:
+def test_poisoned_updates(four):
     """A turned update is the mirror image of the honest one."""
     honest, byzantine = trained(four[:1], 1), trained(four[:1], 1, participation=Byzantine(names=("a",), scale=-1.0))
     torch.testing.assert_close(byzantine.history[1].weights - 0.3, 0.3 - honest.history[1].weights)
@@ -214,7 +211,7 @@ def test_poisoned_updates(four: tuple[Client, ...]) -> None:
     assert losses[0] < losses[1]
 
 
-def test_a_score_does_not_depend_on_who_is_judged_beside() -> None:
+def test_a_score_does_not_depend_on_who_is_judged_beside():
     """Bit for bit, with pieces of different number, and equal to the mean of the pieces' losses."""
     whole = clients(drives(3), Sensors(), piece=10)
     group = [replace(c, training=c.training.take(range(n))) for c, n in zip(whole, (8, 4, 2), strict=True)]
@@ -243,7 +240,7 @@ def combined(which: Rule, weights: Tensor, sizes: Tensor = SIZES) -> Tensor:
 
 
 @pytest.fixture(scope="module")
-def flower() -> ModuleType:
+def flower():
     """Flower's strategies; its import warns about libraries of its own."""
     pytest.importorskip("flwr")
     with warnings.catch_warnings():
@@ -298,7 +295,7 @@ def flat(record: Any) -> Tensor:
     ],
     ids=lambda value: value.name if isinstance(value, Rule) else str(value),
 )
-def test_rules_are_those_of_flower(flower: ModuleType, ours: Rule, theirs: str, options: dict[str, Any]) -> None:
+def test_rules_are_those_of_flower(flower, ours, theirs, options):
     """Against flwr.serverapp.strategy; Flower weighs what Multi-Krum keeps by examples, the paper does not."""
     sizes = torch.ones_like(SIZES) if theirs == "MultiKrum" else SIZES
     for seed in range(5):
@@ -308,7 +305,7 @@ def test_rules_are_those_of_flower(flower: ModuleType, ours: Rule, theirs: str, 
 
 
 @pytest.mark.parametrize("share", [0.0, 0.1, 0.25, 0.49])
-def test_trimmed_mean_is_that_of_scipy(share: float) -> None:
+def test_trimmed_mean_is_that_of_scipy(share):
     for count in (1, 4, 7):
         weights = answers(count)
         theirs = stats.trim_mean(weights.numpy(), share, axis=0)
@@ -316,7 +313,7 @@ def test_trimmed_mean_is_that_of_scipy(share: float) -> None:
 
 
 @pytest.mark.parametrize("name", [*RULES, Krum(2)])
-def test_a_rule_holds_as_many_byzantine_clients_as_it_tolerates_and_no_more(name: str | Rule) -> None:
+def test_a_rule_holds_as_many_byzantine_clients_as_it_tolerates_and_no_more(name):
     """Of ten some send what is far off, together: within the hull of the honest, and far from it with one more."""
     chosen = rule(name)
     most = chosen.tolerated(10)
@@ -329,14 +326,14 @@ def test_a_rule_holds_as_many_byzantine_clients_as_it_tolerates_and_no_more(name
     assert moved > 1e4
 
 
-def test_a_federation_says_how_many_it_tolerates_and_warns_beyond(four: tuple[Client, ...]) -> None:
+def test_a_federation_says_how_many_it_tolerates_and_warns_beyond(four):
     assert trained(four, 1, aggregate="trimmed_mean").tolerated == 1
     assert trained(four, 1).tolerated == 0
     with pytest.warns(RuntimeWarning, match=r"2 Byzantine clients of 4: TrimmedMean\(share=0.25\) tolerates 1 a round"):
         trained(four, 1, aggregate="trimmed_mean", participation=Byzantine(names=("a", "b")))
 
 
-def test_a_plain_function_is_a_rule() -> None:
+def test_a_plain_function_is_a_rule():
     weights = answers()
     torch.testing.assert_close(combined(rule(lambda w, n: w[0]), weights), weights[0])
     assert rule(uniform).name == "uniform"
@@ -352,18 +349,18 @@ def test_a_plain_function_is_a_rule() -> None:
         (lambda: rule("vote"), "aggregation rule"),
     ],
 )
-def test_impossible_parameters_are_named(make: Any, field: str) -> None:
+def test_impossible_parameters_are_named(make, field):
     with refused(f"^{field} = "):
         make()
 
 
-def test_krum_says_how_many_clients_it_needs() -> None:
+def test_krum_says_how_many_clients_it_needs():
     with refused(r"4 with byzantine = 1: Krum needs more than 2 f \+ 2 = 4 clients"):
         krum_scores(answers(4), 1)
     assert (Krum(1).least, Krum(1, keep=9).least, RULES["median"].least) == (5, 9, 1)
 
 
-def test_the_guard_remembers_what_is_usual() -> None:
+def test_the_guard_remembers_what_is_usual():
     """With two answers the round before decides: a small change of huge weights is still seen as far too large."""
     theta = torch.full((100,), 1e6)
     honest, wrong = theta + 1.0, theta + 1000.0
@@ -378,13 +375,13 @@ def test_the_guard_remembers_what_is_usual() -> None:
         assert set(screen(theta[:1], {name: theta[:1] + step for name, step in steps.items()})[0]) == out
 
 
-def test_the_guard_lets_a_change_in_where_most_changed_nothing() -> None:
+def test_the_guard_lets_a_change_in_where_most_changed_nothing():
     theta = torch.ones(3)
     assert screen(theta, {"a": theta, "b": theta, "c": theta + 0.1})[0] == {}
     assert set(screen(theta, {"a": theta, "b": theta, "c": theta + 1e3})[0]) == {"c"}
 
 
-def test_weights_that_are_not_finite_are_never_taken() -> None:
+def test_weights_that_are_not_finite_are_never_taken():
     """Of a rule that divides by zero; the round says why nothing changed."""
     given = {name: Answer(torch.full((2,), 0.1), 1) for name in "ab"}
     done, _, note = combine(rule(lambda w, n: w.sum(0) / 0.0), Standing(torch.zeros(2)), given)
@@ -403,7 +400,7 @@ def federation(losses: np.ndarray) -> Federation:  # type: ignore[type-arg]
 
 @pytest.mark.parametrize("false", [math.nan, math.inf, 1e308, 1e5, 0.0])
 @pytest.mark.parametrize("clients", [3, 4, 12])
-def test_one_client_cannot_select_the_untrained_round(false: float, clients: int) -> None:
+def test_one_client_cannot_select_the_untrained_round(false, clients):
     """It praises the start and condemns every other round; the others' losses fall from 4 to 1 m^2."""
     curve = np.linspace(4.0, 1.0, 8)[:, None] * np.linspace(0.8, 1.2, clients)
     assert federation(curve).best.number == 7
@@ -411,7 +408,7 @@ def test_one_client_cannot_select_the_untrained_round(false: float, clients: int
     assert federation(curve).best.number >= 6
 
 
-def test_honest_reports_select_the_least_mean() -> None:
+def test_honest_reports_select_the_least_mean():
     """Within ten percent of the least median the mean decides, as it did before."""
     curve = 1.0 + 0.04 * np.random.default_rng(3).random((20, 4))
     assert federation(curve).best.number == int(curve.mean(1).argmin())

@@ -101,7 +101,7 @@ def deployed(job: Job, nodes: Mapping[int, Node]) -> tuple[list[Row], Federation
 
 
 @pytest.mark.parametrize("rule", ["mean", "median", "trimmed_mean"])
-def test_the_rounds_are_those_of_federate(rule: str) -> None:
+def test_the_rounds_are_those_of_federate(rule):
     """Weights and losses to rounding, and the round that is kept, whatever the order in which answers arrive."""
     job, fleet = job_of(TINY | {"aggregate": rule}), drives()
     expected = in_process(job, fleet)
@@ -135,7 +135,7 @@ def sends(name: str, weights: Tensor, **changes: object) -> Node:
     return node
 
 
-def test_bad_answers_are_rejected_and_training_goes_on() -> None:
+def test_bad_answers_are_rejected_and_training_goes_on():
     """The rest trains as if the Byzantine clients were not there; the history has the reason for each.
 
     Where one reply holds more than the others, strategies raise InconsistentMessageReplies for all.
@@ -198,7 +198,7 @@ def test_bad_answers_are_rejected_and_training_goes_on() -> None:
             assert any(reason in found for found in row.rejected.values()), (reason, row.rejected)
 
 
-def test_no_node_answers_in_place_of_another() -> None:
+def test_no_node_answers_in_place_of_another():
     """Every honest vehicle takes part, whichever client claims its name, whenever, and with any node number."""
     job, fleet, known = job_of(TINY), drives(3), dict[int, str]()
     theta = in_process(job, fleet).history[0].weights
@@ -213,7 +213,7 @@ def test_no_node_answers_in_place_of_another() -> None:
     assert "calls itself b" in str(deployed(job, two)[0][2].rejected)
 
 
-def test_a_claimed_number_of_pieces_counts_ten_times_the_median_at_most() -> None:
+def test_a_claimed_number_of_pieces_counts_ten_times_the_median_at_most():
     job, fleet = job_of(TINY), drives(3)
     theta = in_process(job, fleet).history[0].weights
     rows, found = deployed(
@@ -225,7 +225,7 @@ def test_a_claimed_number_of_pieces_counts_ten_times_the_median_at_most() -> Non
 
 
 @pytest.mark.parametrize(("aggregate", "least"), [("krum", 5), ("trimmed_mean", 4)])
-def test_rules_take_the_same_number_of_clients_in_both_paths(aggregate: str, least: int) -> None:
+def test_rules_take_the_same_number_of_clients_in_both_paths(aggregate, least):
     """Refused at the start; where too few answers are accepted later, the weights stay, and the round has a note."""
     job, fleet = job_of(TINY | {"aggregate": aggregate}), drives(least)
     few = {i: honest(job, fleet, i) for i in range(least - 1)}
@@ -239,7 +239,7 @@ def test_rules_take_the_same_number_of_clients_in_both_paths(aggregate: str, lea
     assert "weights unchanged" in found.history[1].note
 
 
-def test_a_silent_client_is_absent_and_welcome_back() -> None:
+def test_a_silent_client_is_absent_and_welcome_back():
     job, fleet = job_of(TINY), drives(3)
     nodes = {i: honest(job, fleet, i) for i in range(3)}
 
@@ -253,14 +253,14 @@ def test_a_silent_client_is_absent_and_welcome_back() -> None:
     assert found.history[2].validation_loss[1] == found.history[1].validation_loss[1]
 
 
-def test_too_few_nodes_end_the_run() -> None:
+def test_too_few_nodes_end_the_run():
     with pytest.raises(TimeoutError, match="only 1 came online in 0 s"):
         rounds(room({1: lambda _: None}), job_of(TINY), 2, 0.0, print)
     with refused("aggregate = 'uniform'"):
         rounds(room({1: lambda _: None}), job_of(TINY | {"aggregate": "uniform"}), 1, 1.0, print)
 
 
-def test_the_text_of_an_error_stays_in_the_client(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_text_of_an_error_stays_in_the_client(tmp_path, capsys):
     """A faulty drive raises an error that quotes a coordinate: it is in the client's log and not in its answer."""
     from flwr.app import ConfigRecord, Context, Message, RecordDict
 
@@ -277,7 +277,7 @@ def test_the_text_of_an_error_stays_in_the_client(tmp_path: Path, capsys: pytest
     assert "in the client, see its own log" in str(reply.error.reason)
 
 
-def test_a_node_must_say_which_drive_is_its_own(tmp_path: Path) -> None:
+def test_a_node_must_say_which_drive_is_its_own(tmp_path):
     from flwr.app import Context, RecordDict
 
     from coopoc.learned.flower.client import configured
@@ -293,7 +293,7 @@ def test_a_node_must_say_which_drive_is_its_own(tmp_path: Path) -> None:
     assert (client.name, job) == ("b", job_of(TINY))
 
 
-def test_a_node_may_train_on_what_it_measured(tmp_path: Path) -> None:
+def test_a_node_may_train_on_what_it_measured(tmp_path):
     """The node's client has the fixes of its log, to a digit of float32."""
     from flwr.app import Context, RecordDict
 
@@ -312,7 +312,7 @@ def test_a_node_may_train_on_what_it_measured(tmp_path: Path) -> None:
     np.testing.assert_allclose(client.training.gnss[0], fixes - fixes[0], atol=1e-4)
 
 
-def test_one_vehicle_alone_has_the_pieces_that_it_has_in_the_fleet() -> None:
+def test_one_vehicle_alone_has_the_pieces_that_it_has_in_the_fleet():
     fleet = drives(3)
     for number, whole in enumerate(clients(fleet, piece=10, seed=4)):
         (alone,) = clients(fleet.select([number]), piece=10, seed=4)
@@ -320,20 +320,20 @@ def test_one_vehicle_alone_has_the_pieces_that_it_has_in_the_fleet() -> None:
             assert torch.equal(getattr(getattr(alone, part), field), getattr(getattr(whole, part), field))
 
 
-def test_the_apps_configuration_is_the_recipe() -> None:
+def test_the_apps_configuration_is_the_recipe():
     config = tomllib.loads((ROOT / "examples" / "flower" / "pyproject.toml").read_text())
     assert job_of(config["tool"]["flwr"]["app"]["config"]) == Job("fedkalmannet", RECIPES["fedkalmannet"], Setting())
     with refused(r"change = 'round'.*Did you mean rounds"):
         job_of({"recipe": "fedkalmannet", "change": "round=3"})
 
 
-def test_a_missing_library_is_named(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_library_is_named(monkeypatch):
     monkeypatch.setitem(sys.modules, "flwr.app", None)
     with pytest.raises(MissingLibraryError, match=r"pip install .*\[flower\]'"):
         client_app()
 
 
-def test_a_new_run_keeps_the_names_of_the_nodes(tmp_path: Path) -> None:
+def test_a_new_run_keeps_the_names_of_the_nodes(tmp_path):
     """They are in the card of the checkpoint that the killed server left."""
     from flwr.app import Context, RecordDict
 

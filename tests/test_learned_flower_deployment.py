@@ -12,7 +12,7 @@ import subprocess
 import sys
 import time
 import uuid
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from contextlib import suppress
 from pathlib import Path
 from types import ModuleType
@@ -47,13 +47,13 @@ def each(fleet: Fleet) -> dict[str, Fleet]:
 
 
 @pytest.fixture(scope="module", autouse=True)
-def _compiled() -> None:
+def _compiled():
     """The engine, before four processes compile it side by side."""
     in_process(job_of({"recipe": "fedkalmannet", "rounds": 1, **TINY}), winding(100, 4.0, 4.0))
 
 
 @pytest.fixture(scope="module")
-def example() -> ModuleType:
+def example():
     """examples/flower_deployment.py as a module."""
     return imported("flower_deployment")
 
@@ -68,7 +68,7 @@ def imported(name: str) -> ModuleType:
 
 
 @pytest.fixture
-def mark(monkeypatch: pytest.MonkeyPatch) -> Iterator[str]:
+def mark(monkeypatch):
     """A word in the environment of all processes that the test starts; in the end none of them is alive."""
     word = f"FLOWER_TEST={uuid.uuid4().hex}"
     monkeypatch.setenv(*word.split("="))
@@ -119,7 +119,7 @@ def script(folder: Path, *options: object) -> list[str]:
     return [str(word) for word in words]
 
 
-def test_the_script_survives_the_death_of_a_node(tmp_path: Path, mark: str) -> None:
+def test_the_script_survives_the_death_of_a_node(tmp_path, mark):
     """Four vehicles, TLS, keys, three rounds; the second vehicle is killed in the second."""
     fleet = winding(100, 4.0, 4.0, 4)
     write_table(fleet, tmp_path / "four.parquet")
@@ -134,7 +134,7 @@ def test_the_script_survives_the_death_of_a_node(tmp_path: Path, mark: str) -> N
     assert len(re.findall(r"^ +\d ", done.stdout, flags=re.MULTILINE)) == 4
 
 
-def test_a_run_that_fails_ends_the_script_with_an_error(tmp_path: Path, mark: str) -> None:
+def test_a_run_that_fails_ends_the_script_with_an_error(tmp_path, mark):
     """Flower has no strategy for the rule: the ServerApp raises, and the exit status is not zero."""
     write_table(winding(100, 4.0, 4.0), tmp_path / "one.parquet")
     command = script(tmp_path / "site", "--data", tmp_path / "one.parquet", "--change", f"aggregate=uniform {CHANGE}")
@@ -144,7 +144,7 @@ def test_a_run_that_fails_ends_the_script_with_an_error(tmp_path: Path, mark: st
     assert "aggregate = 'uniform'" in (tmp_path / "site" / "run.log").read_text()
 
 
-def test_the_script_stops_everything_on_ctrl_c(tmp_path: Path, mark: str) -> None:
+def test_the_script_stops_everything_on_ctrl_c(tmp_path, mark):
     with subprocess.Popen(script(tmp_path), stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL) as process:
         until(lambda: (tmp_path / "node-4.log").exists())
         assert len(alive(mark)) > 5
@@ -152,7 +152,7 @@ def test_the_script_stops_everything_on_ctrl_c(tmp_path: Path, mark: str) -> Non
         assert process.wait(60) != 0
 
 
-def test_only_registered_keys_over_tls_come_in(tmp_path: Path, mark: str, example: Any) -> None:
+def test_only_registered_keys_over_tls_come_in(tmp_path, mark, example):
     """Two known nodes make the weights of `federate`; those who lack the key, TLS or the right server stay out."""
     fleet = winding(100, 4.0, 4.0, 2)
     with example.deployment(tmp_path) as site:

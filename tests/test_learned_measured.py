@@ -23,7 +23,6 @@ from coopoc.learned import (
     train_all,
 )
 from coopoc.learned.checkpoint import read_card
-from coopoc.learned.nets.gain import Gain
 from coopoc.learned.nets.stack import flatten
 from coopoc.learned.recipes import RECIPES
 from coopoc.learned.training.clients import Batch
@@ -57,7 +56,7 @@ def batch(seed: int = 0, steps: int = 30, lanes: int = 4) -> Batch:
     return Batch(truth + noise[0], 10.0 * truth.diff(dim=0, prepend=truth[:1]) + noise[1], truth, x0, 0.1)
 
 
-def test_pieces_are_what_was_measured_from_a_fix_on() -> None:
+def test_pieces_are_what_was_measured_from_a_fix_on():
     """Ten fixes at every seventh step are 70 steps; the next piece begins at the first fix after that."""
     recording, fleet = walk(1700, every=7)
     first = measured_clients(MeasuredDrives(recording, fleet), piece=10)[0]
@@ -71,14 +70,14 @@ def test_pieces_are_what_was_measured_from_a_fix_on() -> None:
     assert first.long.truth.shape[1] == 9 * 70 + 1
 
 
-def test_pieces_are_shorter_where_a_vehicle_would_have_few() -> None:
+def test_pieces_are_shorter_where_a_vehicle_would_have_few():
     """1700 steps with 243 fixes hold twenty pieces of 84 steps, not of 30 fixes; they have 100 at the least."""
     drives = MeasuredDrives(*walk(1700, every=7))
     for piece, steps in ((10, 70), (30, 84), (100, 100)):
         assert measured_clients(drives, piece=piece)[0].training.truth.shape[1] == steps + 1
 
 
-def test_a_gap_of_the_odometry_is_in_no_piece_and_one_of_the_truth_has_no_loss() -> None:
+def test_a_gap_of_the_odometry_is_in_no_piece_and_one_of_the_truth_has_no_loss():
     recording, fleet = walk(vehicles=1)
     velocity, gnss = recording.velocity.copy(), recording.gnss.copy()
     velocity[:, 50:60], gnss[:, 50:60] = np.nan, np.nan
@@ -92,7 +91,7 @@ def test_a_gap_of_the_odometry_is_in_no_piece_and_one_of_the_truth_has_no_loss()
 
 
 @pytest.mark.parametrize("net", NETS, ids=lambda net: f"{type(net).__name__}{sum(p.numel() for p in net.parameters())}")
-def test_steps_without_a_truth_have_no_loss(net: Gain) -> None:
+def test_steps_without_a_truth_have_no_loss(net):
     """A truth that ends early: losses and gradients of the drive that ends there, which knows nothing of masks."""
     whole, theta = batch(), flatten([net])
     known = torch.arange(30)[:, None, None, None] < 18
@@ -104,7 +103,7 @@ def test_steps_without_a_truth_have_no_loss(net: Gain) -> None:
         torch.testing.assert_close(ours, theirs, rtol=1e-4, atol=1e-5)
 
 
-def test_a_piece_with_little_truth_counts_as_much_as_another() -> None:
+def test_a_piece_with_little_truth_counts_as_much_as_another():
     """The engine's loss is the mean over pieces of the mean over the known steps of the reference net in torch."""
     net, seen = GainNet(2, 1), batch(1)
     truth = seen.truth.clone()
@@ -115,7 +114,7 @@ def test_a_piece_with_little_truth_counts_as_much_as_another() -> None:
     assert float(loss) == pytest.approx(float(squares.nanmean(0).mean()), rel=1e-5)
 
 
-def test_what_cannot_be_learned_from_is_refused() -> None:
+def test_what_cannot_be_learned_from_is_refused():
     recording, fleet = walk(60)
     with refused(r"truth = None: must be a Fleet.*read_log"):
         MeasuredDrives(recording, None)  # type: ignore[arg-type]
@@ -136,7 +135,7 @@ def test_what_cannot_be_learned_from_is_refused() -> None:
 
 
 @pytest.fixture(scope="module")
-def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def log(tmp_path_factory):
     """Two vehicles and a road-side unit for 80 s: odometry at 10 Hz, fixes at 2 Hz that are off by 4 m to the east of
     one vehicle, and the truth of both."""
     rng, rows, truth = np.random.default_rng(0), list[Any](), list[Any]()
@@ -157,7 +156,7 @@ def log(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def test_a_part_of_a_log_by_time(log: Path) -> None:
+def test_a_part_of_a_log_by_time(log):
     whole, first, rest = (co.read_log(f"{log}{part}") for part in ("", "?until=30", "?since=30"))
     assert_allclose(np.concatenate([first.recording.t, rest.recording.t]), whole.recording.t)
     assert (len(first.recording.t), len(first.truth.t)) == (300, 300)
@@ -168,7 +167,7 @@ def test_a_part_of_a_log_by_time(log: Path) -> None:
         co.read_log(f"{log}?since=90")
 
 
-def test_a_log_trains_and_its_rest_scores(log: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_log_trains_and_its_rest_scores(log, tmp_path, capsys):
     """The command trains on the first part, and the study follows the rest with these weights, which learned from the
     fixes that y is three times as noisy as x."""
     weights = str(tmp_path / "weights")
@@ -197,9 +196,7 @@ def test_a_log_trains_and_its_rest_scores(log: Path, tmp_path: Path, capsys: pyt
 
 
 @pytest.mark.parametrize("name", RECIPES)
-def test_every_recipe_trains_on_a_log_and_follows_the_rest(
-    name: str, log: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_every_recipe_trains_on_a_log_and_follows_the_rest(name, log, tmp_path, monkeypatch):
     """A few steps, with fixes at every fifth step, in one plane: losses and estimates stay finite, and weights move."""
     quick = replace(RECIPES[name], schedule=Schedule(epochs=4, batch=2, checks=2), rounds=2, local_epochs=1)
     monkeypatch.setitem(RECIPES, name, quick)

@@ -1,7 +1,5 @@
 """GainNet and its method, against an independent wiring of the published architecture and filters by hand."""
 
-from collections.abc import Iterator
-
 import numpy as np
 import pytest
 import torch
@@ -17,13 +15,13 @@ from coopoc.methods.track import Method
 
 
 @pytest.fixture(autouse=True)
-def _one_core() -> Iterator[None]:
+def _one_core():
     with one_core():
         yield
 
 
 @pytest.mark.parametrize(("in_mult", "out_mult", "count"), [(40, 5, 19_938), (5, 40, 23_928), (5, 32, 19_896)])
-def test_parameter_count(in_mult: int, out_mult: int, count: int) -> None:
+def test_parameter_count(in_mult, out_mult, count):
     """Published: "almost 20K" (the paper), 23,928 at KalmanNet_TSP's defaults; closed form 390 i + 504 o + 1818."""
     assert sum(p.numel() for p in GainNet(in_mult, out_mult).parameters()) == count
     assert count == 390 * in_mult + 504 * out_mult + 1818
@@ -71,7 +69,7 @@ class Published(nn.Module):
         return torch.stack(out, 1)
 
 
-def test_wiring_and_features_as_published() -> None:
+def test_wiring_and_features_as_published():
     net, data = GainNet(seed=3).double(), batch(1, 4, 12)
     gnss, velocity = data.gnss[:, 0].transpose(0, 1), data.velocity[:, 0].transpose(0, 1)
     with torch.no_grad():
@@ -90,7 +88,7 @@ def constant(gain: np.ndarray) -> GainNet:
     return net
 
 
-def test_constant_gain_equals_the_constant_gain_filter_by_hand() -> None:
+def test_constant_gain_equals_the_constant_gain_filter_by_hand():
     gain = np.array([[0.1, 0.02, 0.0], [-0.03, 0.2, 0.0], [0.0, 0.0, 0.5]])
     rec = observe(winding(vehicles=2), Sensors(), runs=3)
     track = LearnedGain(constant(gain))(rec, [0, 1])
@@ -101,7 +99,7 @@ def test_constant_gain_equals_the_constant_gain_filter_by_hand() -> None:
         np.testing.assert_allclose(track.x[:, t], x, atol=2e-4)
 
 
-def test_nothing_is_sent_online_and_no_covariance_is_claimed() -> None:
+def test_nothing_is_sent_online_and_no_covariance_is_claimed():
     method = LearnedGain(GainNet())
     assert isinstance(method, Method)
     track = method(observe(winding(), Sensors(), runs=2))
@@ -110,14 +108,14 @@ def test_nothing_is_sent_online_and_no_covariance_is_claimed() -> None:
     assert track.covariance is None
 
 
-def test_translating_the_world_translates_the_estimate() -> None:
+def test_translating_the_world_translates_the_estimate():
     here = winding()
     there = Fleet(here.ids, here.t, here.position + np.array([4e5, -5e6, 100.0]), here.velocity)
     tracks = [LearnedGain(GainNet())(observe(f, Sensors(), runs=2)).x for f in (here, there)]
     np.testing.assert_allclose(tracks[1] - tracks[0], np.broadcast_to([4e5, -5e6, 100.0], tracks[0].shape), atol=1e-4)
 
 
-def test_a_given_start_is_used_and_its_shape_checked() -> None:
+def test_a_given_start_is_used_and_its_shape_checked():
     fleet = winding()
     rec = observe(fleet, Sensors(), runs=2)
     track = LearnedGain(GainNet(), x0=fleet.position[0])(rec)
@@ -126,7 +124,7 @@ def test_a_given_start_is_used_and_its_shape_checked() -> None:
         LearnedGain(GainNet(), x0=np.zeros((5, 3)))(rec)
 
 
-def test_divergence_is_reported_and_nan_is_refused() -> None:
+def test_divergence_is_reported_and_nan_is_refused():
     rec = observe(winding(200), Sensors(), runs=2)
     assert LearnedGain(constant(0.1 * np.eye(3)))(rec).notes == ()
     (note,) = LearnedGain(constant(2.05 * np.eye(3)))(rec).notes

@@ -27,7 +27,7 @@ def walk(steps: int, seed: int = 0) -> Fleet:
 
 
 @pytest.mark.parametrize("start", ["gnss", "true"])
-def test_recovers_the_noise_of_a_linear_problem(start: str) -> None:
+def test_recovers_the_noise_of_a_linear_problem(start):
     """Known: 0.2 m per step and 1.5 m; the loss fixes the ratio, the innovations fix the scale."""
     (client,) = clients(walk(8100), Sensors(), piece=100, start=start)  # type: ignore[arg-type]
     ((model, card),) = fit_okf([(client.training, client.validation)], steps=120)
@@ -38,7 +38,7 @@ def test_recovers_the_noise_of_a_linear_problem(start: str) -> None:
 
 
 @pytest.mark.slow
-def test_recovers_the_share_of_the_velocity() -> None:
+def test_recovers_the_share_of_the_velocity():
     """Known: 10 % of each velocity component (the "axis" reading of the paper's training noise)."""
     t = np.arange(8100) / 10
     velocity = np.stack([9 * np.cos(t / 9), 9 * np.sin(t / 9), 4 * np.cos(t / 5)], axis=-1)[:, None]
@@ -49,7 +49,7 @@ def test_recovers_the_share_of_the_velocity() -> None:
     assert_allclose(found.gnss_std, 1.5, rtol=0.05)
 
 
-def test_equals_filterpy() -> None:
+def test_equals_filterpy():
     """Where fixes are missing, too; so do the estimates and innovations that are trained."""
     method = OptimisedKF((0.1, 0.2, 0.05), (0.1, 0.05, 0.0), (1.5, 2.0, 0.7))
     velocity = np.random.default_rng(0).normal(0, 8, (50, 1, 3))
@@ -81,7 +81,7 @@ def test_equals_filterpy() -> None:
 
 
 @pytest.mark.slow
-def test_trained_covariance_is_calibrated() -> None:
+def test_trained_covariance_is_calibrated():
     """Mean NEES of a three-state filter with the right covariance is 3."""
     (client,) = clients(walk(8100), Sensors())
     method = fit_okf([(client.training, client.validation)], steps=120)[0][0].method("okf")
@@ -90,7 +90,7 @@ def test_trained_covariance_is_calibrated() -> None:
     assert claimed[:, 50:].mean() == pytest.approx(3.0, rel=0.15)
 
 
-def test_padding_does_not_weigh() -> None:
+def test_padding_does_not_weigh():
     """A short set of pieces keeps its own mean when it is stacked with a long one."""
     (client,) = clients(walk(900), Sensors(), piece=20)
     few, many = client.training.take(range(3)), client.training
@@ -100,7 +100,7 @@ def test_padding_does_not_weigh() -> None:
     assert_allclose(stacked[1][1]["validation_loss"][0], alone[0], rtol=1e-10)
 
 
-def test_noise_that_cannot_be_is_refused() -> None:
+def test_noise_that_cannot_be_is_refused():
     with refused("gnss_std"):
         OptimisedKF((0.1, 0.1, 0.1), (0, 0, 0), (1.5, 0.0, 1.5))
     with refused("process_std"):

@@ -2,7 +2,6 @@
 
 import json
 from dataclasses import asdict, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,7 +25,6 @@ from coopoc.learned import (
     train_all,
 )
 from coopoc.learned.checkpoint import read_card
-from coopoc.learned.nets.gain import Gain
 from coopoc.learned.nets.stack import flatten
 
 
@@ -35,7 +33,7 @@ def drives() -> Fleet:
 
 
 @pytest.fixture
-def quick(monkeypatch: pytest.MonkeyPatch) -> None:
+def quick(monkeypatch):
     """The recipes with a few steps on short pieces."""
     for name, recipe in recipes.RECIPES.items():
         schedule = Schedule(epochs=3, batch=2, checks=2)
@@ -43,7 +41,7 @@ def quick(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setitem(recipes.RECIPES, name, quicker)
 
 
-def test_checkpoint_round_trip(tmp_path: Path) -> None:
+def test_checkpoint_round_trip(tmp_path):
     net, history = GainNet(seed=4), flatten([GainNet(seed=1), GainNet(seed=2)])
     path = save(tmp_path / "net.safetensors", Checkpoint(net, {"recipe": "mine", "best": 3}, history))
     again = load(path)
@@ -58,14 +56,14 @@ def test_checkpoint_round_trip(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("net", [GainNet(2, 1), NoiseParameters()])
-def test_every_kind_of_net_round_trips(net: Gain, tmp_path: Path) -> None:
+def test_every_kind_of_net_round_trips(net, tmp_path):
     again = load(save(tmp_path / "net.safetensors", Checkpoint(net, {}))).model
     assert type(again) is type(net)
     assert (again.settings, torch.equal(flatten([again]), flatten([net]))) == (net.settings, True)
 
 
 @pytest.mark.filterwarnings("ignore:.*has no checksum")
-def test_another_shape_history_and_kind_are_refused_naming_both(tmp_path: Path) -> None:
+def test_another_shape_history_and_kind_are_refused_naming_both(tmp_path):
     path = save(tmp_path / "net.safetensors", Checkpoint(GainNet(5, 40), {}))
     tensors, card = load_file(path), read_card(path)
     tensors["gain.weight"] = torch.zeros(9, 90)
@@ -83,7 +81,7 @@ def test_another_shape_history_and_kind_are_refused_naming_both(tmp_path: Path) 
 
 
 @pytest.mark.filterwarnings("ignore:.*has no checksum")
-def test_files_that_are_no_checkpoint_are_refused(tmp_path: Path) -> None:
+def test_files_that_are_no_checkpoint_are_refused(tmp_path):
     (tmp_path / "text.safetensors").write_text("not weights")
     save_file({"x": torch.zeros(1)}, tmp_path / "bare.safetensors")
     for name, message in (("none", "existing file"), ("text", "no safetensors"), ("bare", "card")):
@@ -95,7 +93,7 @@ def test_files_that_are_no_checkpoint_are_refused(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.usefixtures("quick")
-def test_train_all_makes_every_recipe_and_resumes(tmp_path: Path) -> None:
+def test_train_all_makes_every_recipe_and_resumes(tmp_path):
     fleet = drives()
     made = train_all(fleet, tmp_path, seeds=[0, 1], starts=("gnss", "true"), progress=False)
     names = {*recipes.RECIPES, "individual1", "individual2"} - {"individual"}
@@ -113,7 +111,7 @@ def test_train_all_makes_every_recipe_and_resumes(tmp_path: Path) -> None:
 
 
 @pytest.mark.usefixtures("quick")
-def test_what_changes_the_weights_changes_the_key(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_what_changes_the_weights_changes_the_key(tmp_path, monkeypatch):
     fleet = drives()
     train_all(fleet, tmp_path, seeds=[0], recipes=["centralised"], progress=False)
     (path,) = tmp_path.iterdir()
@@ -125,7 +123,7 @@ def test_what_changes_the_weights_changes_the_key(tmp_path: Path, monkeypatch: p
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_recipe_names_what_is_wrong_in_its_drives(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_recipe_names_what_is_wrong_in_its_drives(monkeypatch):
     """Jumps and gaps reach the clients' pieces, none of which begins in a gap."""
     plain, text = recipes.RECIPES["fedkalmannet"], "fixes=0.2:1+outages=0.3:1"
     monkeypatch.setitem(recipes.RECIPES, "fedkalmannet", replace(plain, noise=text, piece=10))
@@ -143,7 +141,7 @@ def test_a_recipe_names_what_is_wrong_in_its_drives(monkeypatch: pytest.MonkeyPa
 
 
 @pytest.mark.usefixtures("quick")
-def test_a_trained_net_is_a_method(tmp_path: Path) -> None:
+def test_a_trained_net_is_a_method(tmp_path):
     train_all(drives(), tmp_path, seeds=[0], recipes=["individual"], progress=False)
     method = load_method(tmp_path / "individual2-gnss-axis-0.safetensors")
     assert isinstance(method, LearnedGain)
@@ -151,7 +149,7 @@ def test_a_trained_net_is_a_method(tmp_path: Path) -> None:
     assert method(observe(drives(), Sensors(), runs=2), [1]).x.shape == (2, 80, 1, 3)
 
 
-def test_recipes_follow_the_paper() -> None:
+def test_recipes_follow_the_paper():
     """Section IV.A: 20 rounds; 1500 and 500 epochs; pieces of 100; 80/20; all nets with one optimiser setting."""
     fed, centralised, individual = (recipes.RECIPES[n] for n in ("fedkalmannet", "centralised", "individual"))
     assert (fed.rounds, fed.aggregate, fed.local_epochs) == (20, "mean", 5)
@@ -161,7 +159,7 @@ def test_recipes_follow_the_paper() -> None:
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in recipes.WEIGHTS.glob("*.safetensors")))
-def test_shipped_weights_hold_over_unseen_drives(name: str) -> None:
+def test_shipped_weights_hold_over_unseen_drives(name):
     """They trained on pieces of 100 steps and other vehicles; here are 900 steps, and no run may drift away."""
     fleet, method = load_fleet("town10"), load_method(name)
     card = read_card(recipes.WEIGHTS / f"{name}.safetensors")
@@ -175,7 +173,7 @@ def test_shipped_weights_hold_over_unseen_drives(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", sorted(path.stem for path in recipes.WEIGHTS.glob("*.safetensors")))
-def test_cards_say_what_was_trained_and_how_well(name: str) -> None:
+def test_cards_say_what_was_trained_and_how_well(name):
     checkpoint = load(recipes.WEIGHTS / f"{name}.safetensors")
     card = checkpoint.card
     assert card["sha256"] == shipped.digest(checkpoint)
@@ -194,7 +192,7 @@ def test_cards_say_what_was_trained_and_how_well(name: str) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["fedokf"])
-def test_shipped_weights_are_made_again_from_their_recipe(name: str) -> None:
+def test_shipped_weights_are_made_again_from_their_recipe(name):
     """To 1e-5 with the versions and the kind of machine that the card names, a few last bits of float32 after thousands
     of steps on another processor of that kind; elsewhere training ends within a few percent."""
     card = read_card(recipes.WEIGHTS / f"{name}.safetensors")
@@ -202,7 +200,7 @@ def test_shipped_weights_are_made_again_from_their_recipe(name: str) -> None:
     assert shipped.differences(name, progress=False)[name] < (1e-5 if same else 0.3)
 
 
-def test_every_flipped_bit_of_a_checkpoint_is_noticed(tmp_path: Path) -> None:
+def test_every_flipped_bit_of_a_checkpoint_is_noticed(tmp_path):
     """All bits of the weights, and a sample of those of the card and the header."""
     path = save(tmp_path / "okf.safetensors", Checkpoint(NoiseParameters(), {"recipe": "okf", "seconds": 5.25}))
     whole = path.read_bytes()
@@ -218,7 +216,7 @@ def test_every_flipped_bit_of_a_checkpoint_is_noticed(tmp_path: Path) -> None:
     assert load(path).card["checksum"].startswith("sha256:")
 
 
-def test_a_checkpoint_without_a_checksum_is_read_with_a_warning(tmp_path: Path) -> None:
+def test_a_checkpoint_without_a_checksum_is_read_with_a_warning(tmp_path):
     path = tmp_path / "okf.safetensors"
     card = {"kind": "okf", "net": {}}
     save_file(NoiseParameters().state_dict(), path, metadata={"card": json.dumps(card)})

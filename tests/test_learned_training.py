@@ -26,14 +26,14 @@ def drives(lengths: tuple[int, ...] = (130, 260)) -> Fleet:
     return replace(fleet, **{name: np.where(gone, np.nan, getattr(fleet, name)) for name in ("position", "velocity")})
 
 
-def test_pieces_as_in_the_paper() -> None:
+def test_pieces_as_in_the_paper():
     """T = 1550, 4600, 1450, 1420 give 15, 45, 14, 14 pieces of 100 steps after a start; 80 % of them train."""
     found = clients(drives((1550, 4600, 1450, 1420)))
     assert [(len(c.training), len(c.validation)) for c in found] == [(12, 3), (36, 9), (11, 3), (11, 3)]
     assert found[0].training.truth.shape == (12, 101, 3)
 
 
-def test_training_and_validation_pieces_are_disjoint() -> None:
+def test_training_and_validation_pieces_are_disjoint():
     for client in clients(drives(), piece=10):
         used = {row.numpy().tobytes() for row in client.training.gnss}
         kept = {row.numpy().tobytes() for row in client.validation.gnss}
@@ -41,7 +41,7 @@ def test_training_and_validation_pieces_are_disjoint() -> None:
         assert not used & kept
 
 
-def test_pieces_are_the_noisy_drive() -> None:
+def test_pieces_are_the_noisy_drive():
     fleet, sensors = drives((2100,)), Sensors.paper_training()
     (client,) = clients(fleet, sensors, piece=20)
     pieces = Segments.join([client.training, client.validation])
@@ -51,14 +51,14 @@ def test_pieces_are_the_noisy_drive() -> None:
     assert float(pieces.truth[:, 0].abs().max()) == 0.0
 
 
-def test_start_at_the_fix_or_the_truth() -> None:
+def test_start_at_the_fix_or_the_truth():
     index = torch.arange(4)[None]
     first = {start: clients(drives(), piece=10, start=start)[0].training for start in ("gnss", "true")}
     torch.testing.assert_close(first["gnss"].batch(index).x0[0], first["gnss"].gnss[:4, 0])
     assert float(first["true"].batch(index).x0.abs().max()) == 0.0
 
 
-def test_steps_are_those_of_torch() -> None:
+def test_steps_are_those_of_torch():
     """torch.optim.AdamW on autograd's gradient, a piece a step."""
     net, pieces = GainNet(2, 1).double(), clients(drives(), piece=10)[0].training
     double = {name: getattr(pieces, name).double() for name in ("gnss", "velocity", "truth")}
@@ -76,7 +76,7 @@ def test_steps_are_those_of_torch() -> None:
     torch.testing.assert_close(theta, flatten([net]), rtol=1e-6, atol=1e-9)
 
 
-def test_mirroring_keeps_motion_and_noise() -> None:
+def test_mirroring_keeps_motion_and_noise():
     pieces = clients(drives(), piece=10)[0].training
     given = pieces.batch(torch.arange(8)[None])
     seen = mirrored(given, [torch.Generator().manual_seed(2)])
@@ -93,17 +93,17 @@ def test_mirroring_keeps_motion_and_noise() -> None:
     ("field", "options"),
     [("start", {"start": "zero"}), ("piece", {"piece": 1}), ("fleet", {"piece": 100})],
 )
-def test_clients_refuse_what_cannot_be(field: str, options: dict[str, object]) -> None:
+def test_clients_refuse_what_cannot_be(field, options):
     with refused(field):
         clients(drives((130,)), **options)  # type: ignore[arg-type]
 
 
-def test_a_vehicle_that_is_never_there_is_named() -> None:
+def test_a_vehicle_that_is_never_there_is_named():
     with refused("b with 0 pieces"):
         clients(drives((130, 0)), piece=10)
 
 
-def test_one_federated_client_is_local_training() -> None:
+def test_one_federated_client_is_local_training():
     """Law: federating one client for one round is `fit` on its pieces, bit for bit, and so is a uniform average."""
     (client,) = clients(drives((300,)), piece=10)
     schedule = replace(QUICK, epochs=2, epoch="pass", batch=4)
@@ -113,7 +113,7 @@ def test_one_federated_client_is_local_training() -> None:
         assert torch.equal(fed.history[1].weights, local.history[-1].weights)
 
 
-def test_same_seed_same_weights_and_another_seed_another_net() -> None:
+def test_same_seed_same_weights_and_another_seed_another_net():
     (client,) = clients(drives((300,)), piece=10)
     nets = [fit(GainNet(seed=s), client.training, client.validation, QUICK, seed=s).model for s in (1, 1, 2)]
     first, again, other = flatten(nets)
@@ -121,7 +121,7 @@ def test_same_seed_same_weights_and_another_seed_another_net() -> None:
     assert not torch.allclose(first, other)
 
 
-def test_stacking_changes_no_net() -> None:
+def test_stacking_changes_no_net():
     group = clients(drives(), piece=10)
     tasks = [Task(GainNet(seed=s), c.training, c.validation, s) for s, c in enumerate(group)]
     together = fit_many(tasks, QUICK)
@@ -130,14 +130,14 @@ def test_stacking_changes_no_net() -> None:
         torch.testing.assert_close(flatten([alone.model]), flatten([fitted.model]), rtol=1e-5, atol=1e-6)
 
 
-def test_long_pieces_for_some_tasks_only_are_refused() -> None:
+def test_long_pieces_for_some_tasks_only_are_refused():
     (client,) = clients(drives((300,)), piece=10)
     tasks = [Task(GainNet(), client.training, client.validation, long=long) for long in (client.long, None)]
     with refused("long = with 1 of 2 tasks"):
         fit_many(tasks, QUICK)
 
 
-def test_training_lowers_the_loss_and_keeps_the_best_weights() -> None:
+def test_training_lowers_the_loss_and_keeps_the_best_weights():
     group = clients(drives((600, 600)), piece=20)
     training, validation = (Segments.join([getattr(c, part) for c in group]) for part in ("training", "validation"))
     found = fit(GainNet(start_gain=0.3), training, validation, Schedule(epochs=60, learning_rate=3e-3))
@@ -145,7 +145,7 @@ def test_training_lowers_the_loss_and_keeps_the_best_weights() -> None:
     assert torch.equal(flatten([found.model])[0], found.best.weights)
 
 
-def test_a_pass_sees_every_piece_and_a_step_one_batch() -> None:
+def test_a_pass_sees_every_piece_and_a_step_one_batch():
     draw = np.random.default_rng(0)
     plan = Schedule(epochs=3, epoch="pass", batch=5).plan(10, draw)
     assert plan.shape == (6, 5)
@@ -154,7 +154,7 @@ def test_a_pass_sees_every_piece_and_a_step_one_batch() -> None:
     assert all(len(set(row)) == 4 for row in Schedule(epochs=50, batch=4).plan(10, draw).tolist())
 
 
-def test_a_net_that_breaks_stops_with_a_reason_and_the_others_go_on() -> None:
+def test_a_net_that_breaks_stops_with_a_reason_and_the_others_go_on():
     (client,) = clients(drives((300,)), piece=10)
     broken = replace(client.training, gnss=client.training.gnss.clone().fill_(float("nan")))
     tasks = [Task(GainNet(), t, client.validation) for t in (client.training, broken)]
@@ -165,21 +165,21 @@ def test_a_net_that_breaks_stops_with_a_reason_and_the_others_go_on() -> None:
     assert not torch.equal(flatten([good.model]), flatten([GainNet()]))
 
 
-def test_a_net_without_finite_weights_says_so() -> None:
+def test_a_net_without_finite_weights_says_so():
     (client,) = clients(drives((300,)), piece=100)
     theirs = fit(GainNet(start_gain=20.0), client.training, client.validation, replace(QUICK, epochs=2))
     assert theirs.stopped is not None
     assert "finite" in theirs.stopped
 
 
-def test_a_loss_that_overflows_is_infinite() -> None:
+def test_a_loss_that_overflows_is_infinite():
     """A loop with gain 3 grows by 2 a step: over 100 steps its squared error is beyond float32."""
     (client,) = clients(drives((300,)), piece=100)
     net = GainNet(start_gain=3.0)
     assert train.Judge([[client.validation]], net)(flatten([net])).tolist() == [np.inf]
 
 
-def test_rates_fall_as_torchs_cosine() -> None:
+def test_rates_fall_as_torchs_cosine():
     optimiser = torch.optim.SGD([torch.zeros(1)], lr=1.0)
     scheduler = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, 8)
     for factor in cosine(8):
@@ -189,6 +189,6 @@ def test_rates_fall_as_torchs_cosine() -> None:
 
 
 @pytest.mark.parametrize("field", ["epochs", "batch", "learning_rate", "clip", "checks"])
-def test_schedule_refuses_zero(field: str) -> None:
+def test_schedule_refuses_zero(field):
     with refused(field):
         Schedule(**{field: 0})  # type: ignore[arg-type]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import refused
 
-from coopoc import V2X, BatchSmoother, Fleet, JointFilter, Kalman, Ledger, Sensors, observe
+from coopoc import V2X, BatchSmoother, JointFilter, Kalman, Ledger, Sensors, observe
 from coopoc.evaluate.ledger import of_track, of_training
 from coopoc.world.v2x import NO_MESSAGE
 
@@ -14,7 +14,7 @@ S2 = Sensors.paper_scenario2()
 ROOT = Path(__file__).parent.parent
 
 
-def test_the_ledger_of_a_track_is_its_bytes(crossing: Fleet) -> None:
+def test_the_ledger_of_a_track_is_its_bytes(crossing):
     """Payload by hand: 32 of 132 B; to a centre as many as were measured."""
     seen, plain = (observe(crossing, S2, V2X(3, overhead=size), runs=2) for size in (100, 0))
     for method in (JointFilter(), BatchSmoother()):
@@ -31,7 +31,7 @@ def test_the_ledger_of_a_track_is_its_bytes(crossing: Fleet) -> None:
     assert alone.rate() == alone.rate("on air", "broadcast") == 0.0
 
 
-def test_the_papers_training_costs_as_much_as_an_hour_of_driving() -> None:
+def test_the_papers_training_costs_as_much_as_an_hour_of_driving():
     """20 rounds of 19,938 weights both ways are 3.2 MB per vehicle: about an hour of a CAM
     stream of 0.9 kB/s, or 15 min of 350 B at 10 Hz."""
     weights = 20 * 4 * 19_938.0
@@ -46,7 +46,7 @@ def test_the_papers_training_costs_as_much_as_an_hour_of_driving() -> None:
         once.rate()
 
 
-def test_a_ledger_refuses_what_does_not_fit() -> None:
+def test_a_ledger_refuses_what_does_not_fit():
     with refused("seconds"):
         Ledger(("a",), np.zeros(2), np.zeros((2, 2, 1, 1)), np.zeros((2, 2, 1, 1)))
     with refused("names"):

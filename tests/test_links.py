@@ -41,14 +41,14 @@ def broken(page: str, text: str, there: set[str]) -> list[str]:
     return found
 
 
-def test_a_broken_link_is_found() -> None:
+def test_a_broken_link_is_found():
     there = tracked()
     text = '[a](nowhere.md) [b](install.md#no-such-place) ![c](no.png) `[d](x.md)` <img src="f">'
     text += " [e](https://example.org/x) [g](install.md) [h](../studies)\n[i]: gone.md\n"
     assert len(broken("docs/index.md", text, there)) == 5
 
 
-def test_every_relative_link_leads_to_a_tracked_file() -> None:
+def test_every_relative_link_leads_to_a_tracked_file():
     if not (ROOT / ".git").exists():
         pytest.skip("Not a clone: git knows no files.")
     there = tracked()
@@ -61,7 +61,7 @@ def test_every_relative_link_leads_to_a_tracked_file() -> None:
         assert broken(str(path.relative_to(ROOT)), text, there) == []
 
 
-def test_links_to_sources_lead_to_the_made_pages_of_the_site() -> None:
+def test_links_to_sources_lead_to_the_made_pages_of_the_site():
     pytest.importorskip("mkdocs")
     code = "import pages; print(pages.on_page_markdown('[a](tutorials/solve.py) [b](../studies) [c](learned.md)'))"
     out = ran([sys.executable, "-c", code], cwd=ROOT / "docs", check=True)
@@ -69,7 +69,7 @@ def test_links_to_sources_lead_to_the_made_pages_of_the_site() -> None:
 
 
 @pytest.mark.parametrize("path", sorted((ROOT / "docs" / "tutorials").glob("*.py")), ids=lambda path: path.stem)
-def test_a_notebook_is_valid_and_has_the_cells_that_the_page_runs(path: Path) -> None:
+def test_a_notebook_is_valid_and_has_the_cells_that_the_page_runs(path):
     """Independent check: nbformat's schema, and the cells as `page` cuts them; `make docs` runs these."""
     pytest.importorskip("jupytext")
     import nbformat

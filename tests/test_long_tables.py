@@ -1,7 +1,5 @@
 """Tables and files that people take into their own notebook: `to_frame`, `write_tum`."""
 
-from pathlib import Path
-
 import numpy as np
 import pandas as pd
 import pytest
@@ -35,7 +33,7 @@ def track(runs: int = 2, steps: int = 4, egos: tuple[int, ...] = (2, 0)) -> co.T
     )
 
 
-def test_a_track_as_a_table() -> None:
+def test_a_track_as_a_table():
     made = track()
     frame = made.to_frame()
     wanted = "run step t ego x y z std_x std_y std_z heading std_heading bias"
@@ -49,7 +47,7 @@ def test_a_track_as_a_table() -> None:
         assert (row.heading, row.std_heading, row.bias) == (made.heading[at], 0.2, made.extras["bias"][at])
 
 
-def test_a_table_gives_the_score() -> None:
+def test_a_table_gives_the_score():
     """Independent check: RT-LE by pandas alone, from the tables of a track and of its fleet."""
     fleet = co.load_fleet("town10").between(0, 60)
     seen = co.observe(fleet, co.Sensors.paper_scenario2(), co.V2X(), runs=3, seed=0)
@@ -60,12 +58,12 @@ def test_a_table_gives_the_score() -> None:
     assert_allclose(score, co.rt_le(made, fleet))
 
 
-def test_a_track_without_ids_names_columns_and_leaves_out_what_it_has_not() -> None:
+def test_a_track_without_ids_names_columns_and_leaves_out_what_it_has_not():
     bare = co.Track([0.0], (3,), np.ones((1, 1, 1, 3)), None, [[0]], [[0]], 0.0).to_frame()
     assert bare.to_dict("records") == [{"run": 0, "step": 0, "t": 0.0, "ego": 3, "x": 1.0, "y": 1.0, "z": 1.0}]
 
 
-def test_the_table_of_a_fleet_is_read_again_without_the_absent(tmp_path: Path) -> None:
+def test_the_table_of_a_fleet_is_read_again_without_the_absent(tmp_path):
     position, velocity = rng.normal(size=(2, 5, 3, 3))
     position[:2, 1] = velocity[:2, 1] = np.nan
     fleet = co.Fleet(IDS, np.arange(5) * 0.1, position, velocity, heading=rng.uniform(-3, 3, (5, 3)))
@@ -81,7 +79,7 @@ def test_the_table_of_a_fleet_is_read_again_without_the_absent(tmp_path: Path) -
     assert_allclose(again.velocity[:, columns], velocity)
 
 
-def test_paths_as_other_programs_read_them(tmp_path: Path) -> None:
+def test_paths_as_other_programs_read_them(tmp_path):
     """Independent check: columns by NumPy, and angles of SciPy's rotations; evo's own reader where it is installed."""
     t, position, heading = 1.6e9 + np.arange(7) * 0.1, rng.normal(0, 1e4, (7, 3)), rng.uniform(-3, 3, 7)
     co.write_tum(tmp_path / "a.tum", t, position, heading)
@@ -92,7 +90,7 @@ def test_paths_as_other_programs_read_them(tmp_path: Path) -> None:
     assert_allclose(turned[:, 2], heading, atol=1e-8)
 
 
-def test_a_path_that_no_program_could_read_is_refused(tmp_path: Path) -> None:
+def test_a_path_that_no_program_could_read_is_refused(tmp_path):
     gap = [[0.0, 0, 0], [np.nan, 0, 0]]
     for write, named in (
         (lambda: co.write_tum(tmp_path / "a", [0.0, 0.1], gap), "pose 1"),
@@ -107,7 +105,7 @@ def test_a_path_that_no_program_could_read_is_refused(tmp_path: Path) -> None:
     assert not list(tmp_path.iterdir())
 
 
-def test_the_table_needs_pandas(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_table_needs_pandas(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pandas", None)
     with pytest.raises(co.MissingLibraryError, match=r"Track\.to_frame.*pip install pandas"):
         track().to_frame()

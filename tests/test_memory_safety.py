@@ -3,7 +3,6 @@
 import os
 import sys
 from pathlib import Path
-from typing import Any
 
 import corrupted
 import numpy as np
@@ -18,7 +17,7 @@ FLEET = Fleet(("a", "b"), [0, 0.1], np.tile([[0, 0, 0], [9, 0, 0]], (2, 1, 1)), 
 
 
 @pytest.mark.parametrize("whole", [True, False], ids=["complete", "with gaps"])
-def test_arrays_that_do_not_fit_are_refused(whole: bool) -> None:
+def test_arrays_that_do_not_fit_are_refused(whole):
     """Every field cut, shifted, reordered, of another kind, or not finite: an InputError, by `replace` too."""
     valid, cases = corrupted.recording(whole=whole), 0
     for what, parts in corrupted.wrong(valid):
@@ -41,7 +40,7 @@ def test_arrays_that_do_not_fit_are_refused(whole: bool) -> None:
     ],
     ids=lambda value: next(iter(value)) if isinstance(value, dict) else "",
 )
-def test_the_error_names_field_value_and_allowed(parts: dict[str, Any], words: str) -> None:
+def test_the_error_names_field_value_and_allowed(parts, words):
     with refused(words):
         corrupted.with_parts(corrupted.recording(), **parts)
 
@@ -55,12 +54,12 @@ def program(*given: str, **env: str) -> str:
 
 
 @pytest.mark.slow
-def test_every_method_reads_any_memory_layout_and_survives_odd_recordings() -> None:
+def test_every_method_reads_any_memory_layout_and_survives_odd_recordings():
     """Views, Fortran order, unaligned and swapped bytes give the digits of the valid recording; none crashes."""
     assert program("odd", *KERNELS) == ""
 
 
-def test_what_is_held_cannot_be_written_to() -> None:
+def test_what_is_held_cannot_be_written_to():
     valid = corrupted.recording()
     given = {name: np.array(array) for name, array in corrupted.arrays(valid).items()}
     held = corrupted.with_parts(valid, **given)
@@ -71,7 +70,7 @@ def test_what_is_held_cannot_be_written_to() -> None:
         assert not array.flags.writeable
 
 
-def test_whole_numbers_are_as_good_as_floats() -> None:
+def test_whole_numbers_are_as_good_as_floats():
     given = Sensors(gnss_std=[2, 2, 2], range_std=1, min_range=2, gnss_drift_time=np.int64(9))  # type: ignore[arg-type]
     assert isinstance(given.min_range, float)
     assert given == Sensors((2.0,) * 3, range_std=1.0, min_range=2.0, gnss_drift_time=9.0)
@@ -108,7 +107,7 @@ for which, (name, last) in enumerate((("copied", 2), ("plain", 11))):
 """
 
 
-def test_under_the_switch_scalar_and_vector_access_is_checked() -> None:
+def test_under_the_switch_scalar_and_vector_access_is_checked():
     """NUMBA_BOUNDSCHECK=1 holds for the intrinsics, which work on pointers, too."""
     command = [sys.executable, "-c", CODE]
     env = {**os.environ, "NUMBA_BOUNDSCHECK": "1"}

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from conftest import refused
 
-from coopoc import GNSS, V2X, Fleet, JointFilter, Kalman, NoiseModel, Sensors, observe
+from coopoc import GNSS, V2X, JointFilter, Kalman, NoiseModel, Sensors, observe
 from coopoc.evaluate.metrics import errors, nees, nees_inside
 from coopoc.methods.catalogue import METHODS, needs_whole_fleet
 from coopoc.methods.cooperative_filter import Priors
@@ -20,7 +20,7 @@ SNAPSHOTS = {"gnss"}
 
 
 @pytest.mark.parametrize(("name", "noise"), COVARIANCES.values(), ids=COVARIANCES)
-def test_zero_noise_gives_zero_error(name: str, noise: str, crossing: Fleet) -> None:
+def test_zero_noise_gives_zero_error(name, noise, crossing):
     method = METHODS[name](noise)
     fleet = crossing.between(0, 40)
     recording = observe(fleet, SILENT, V2X(max_neighbours=7, radius=200.0), assumed=S2)
@@ -28,7 +28,7 @@ def test_zero_noise_gives_zero_error(name: str, noise: str, crossing: Fleet) -> 
 
 
 @pytest.mark.parametrize(("name", "noise"), COVARIANCES.values(), ids=COVARIANCES)
-def test_a_run_and_a_step_know_nothing_of_others(name: str, noise: str, crossing: Fleet) -> None:
+def test_a_run_and_a_step_know_nothing_of_others(name, noise, crossing):
     """One run is the first of five, a short drive the beginning of a long one (estimates are causal), and seconds count
     from anywhere."""
     method = METHODS[name](noise)
@@ -44,7 +44,7 @@ def test_a_run_and_a_step_know_nothing_of_others(name: str, noise: str, crossing
 
 @pytest.mark.parametrize("channel", [V2X(max_neighbours=0), V2X(4, loss=1.0)], ids=["alone", "no message arrives"])
 @pytest.mark.parametrize(("name", "noise"), COVARIANCES.values(), ids=COVARIANCES)
-def test_without_messages_it_is_the_solo_method(name: str, noise: str, channel: V2X, crossing: Fleet) -> None:
+def test_without_messages_it_is_the_solo_method(name, noise, channel, crossing):
     """The Kalman filter with its covariance, or the fix; flat priors of positions weigh 1e-6 of a fix. The
     cooperative filter assumes that nothing is wrong."""
     method = METHODS[name](noise)
@@ -62,14 +62,14 @@ def test_without_messages_it_is_the_solo_method(name: str, noise: str, channel: 
     assert needs_whole_fleet(name) or (track.received_bytes == 0).all()
 
 
-def test_stale_velocities_do_not_make_the_filter_sure_of_itself(formation: Fleet) -> None:
+def test_stale_velocities_do_not_make_the_filter_sure_of_itself(formation):
     """A velocity held for ten steps makes the same error ten times: NEES stays near 3 at one message a second."""
     fleet = formation.between(0, 300)
     recording = observe(fleet, S2, V2X(max_neighbours=6, rate=1.0, loss=0.3), runs=30, observers=[0])
     assert nees(JointFilter("nominal")(recording, [0]), fleet).mean() < 4.0
 
 
-def test_identity_gain_is_the_golden_ratio(formation: Fleet) -> None:
+def test_identity_gain_is_the_golden_ratio(formation):
     """Closed form: with unit covariances gain and posterior variance tend to (sqrt 5 - 1)/2."""
     track = Kalman("identity")(observe(formation, S2, observers=[0]), [0])
     assert track.covariance is not None
@@ -77,14 +77,14 @@ def test_identity_gain_is_the_golden_ratio(formation: Fleet) -> None:
 
 
 @pytest.mark.parametrize("name", ["kalman", "joint", "lkf-sa-edge"])
-def test_filters_that_claim_a_covariance_are_consistent(name: str, formation: Fleet) -> None:
+def test_filters_that_claim_a_covariance_are_consistent(name, formation):
     """NEES gate: 95 % of the steps have their run-averaged NEES in the 99 % chi-square band; noise without bias."""
     fleet = formation.between(0, 300)
     recording = observe(fleet, S2, V2X(max_neighbours=6), runs=40, seed=1, observers=[0])
     assert nees_inside(METHODS[name]("nominal")(recording, [0]), fleet).min() >= 0.95
 
 
-def test_a_fitted_noise_model_finds_the_acting_noise(formation: Fleet) -> None:
+def test_a_fitted_noise_model_finds_the_acting_noise(formation):
     training = observe(formation, Sensors(gnss_std=(1.0, 2.0, 3.0), velocity_reading="speed"), runs=2)
     fitted = NoiseModel.fitted(training, formation)
     assert fitted.gnss_std == pytest.approx((1.0, 2.0, 3.0), rel=0.02)
@@ -93,7 +93,7 @@ def test_a_fitted_noise_model_finds_the_acting_noise(formation: Fleet) -> None:
     assert NoiseModel.fitted(late, formation).gnss_std[0] == pytest.approx(np.hypot(1.0, 2.0), rel=0.01)
 
 
-def test_the_floor_of_a_range_is_the_spread_of_its_arc(formation: Fleet) -> None:
+def test_the_floor_of_a_range_is_the_spread_of_its_arc(formation):
     """Closed form: d e^2 / 2 of an angle's error e has a standard deviation of d std^2 / sqrt(2)."""
     seen = observe(formation, Sensors(range_std=0.01, azimuth_std=0.1, inclination_std=0.05), V2X(2))
     seen = replace(seen, relative=np.where([True, False, False], 20.0, seen.relative))
@@ -103,7 +103,7 @@ def test_the_floor_of_a_range_is_the_spread_of_its_arc(formation: Fleet) -> None
     assert known.range_std == pytest.approx(np.hypot(arc, 0.01), rel=1e-9)
 
 
-def test_a_bad_noise_model_is_named(crossing: Fleet) -> None:
+def test_a_bad_noise_model_is_named(crossing):
     recording = observe(crossing, S2)
     with refused("noise_model = 'guess'"):
         Kalman("guess")(recording)
@@ -115,7 +115,7 @@ def test_a_bad_noise_model_is_named(crossing: Fleet) -> None:
         Kalman("nominal", x0=np.zeros((2, 3)))(recording, [0])
 
 
-def test_absent_neighbour_is_left_out_and_absent_ego_not_estimated(crossing: Fleet) -> None:
+def test_absent_neighbour_is_left_out_and_absent_ego_not_estimated(crossing):
     position, velocity = crossing.position.copy(), crossing.velocity.copy()
     position[20:40, 1] = velocity[20:40, 1] = np.nan
     gappy = replace(crossing, position=position, velocity=velocity).between(18, 42)
@@ -127,7 +127,7 @@ def test_absent_neighbour_is_left_out_and_absent_ego_not_estimated(crossing: Fle
     np.testing.assert_array_equal(absent[:, 0], np.isnan(recording.velocity[0, :, 1, 0]))
 
 
-def test_nees_of_a_singular_covariance_is_refused(crossing: Fleet) -> None:
+def test_nees_of_a_singular_covariance_is_refused(crossing):
     track = JointFilter()(observe(crossing, S2, V2X(max_neighbours=3), runs=3), [0, 2])
     assert track.covariance is not None
     flat = replace(track, covariance=track.covariance * np.outer([1, 1, 0], [1, 1, 0]))

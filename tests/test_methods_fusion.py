@@ -36,7 +36,7 @@ def label(method: object) -> str:
     return f"{method.name}-{method.noise_model}"  # type: ignore[attr-defined]
 
 
-def test_ci_is_not_over_confident_in_traffic() -> None:
+def test_ci_is_not_over_confident_in_traffic():
     """NEES on a crop of town10: mean at most 3 beyond its interval, far above for the naive sum of MSMV-R."""
     fleet = co.load_fleet("town10").between(0, 250)
     recording = observe(fleet, S2, V2X(max_neighbours=10), runs=8, seed=2, observers=[0, 12, 24])
@@ -49,7 +49,7 @@ def test_ci_is_not_over_confident_in_traffic() -> None:
     assert found["msmv-r"].mean() > 6.0
 
 
-def test_a_late_message_is_no_surer_than_it_is() -> None:
+def test_a_late_message_is_no_surer_than_it_is():
     """Monte Carlo: an estimate brought forward by half a second and more errs by no more than its variance."""
     fleet = co.load_fleet("town10").between(0, 200)
     recording = observe(fleet, S2, V2X(max_neighbours=6, rate=1.0), runs=20, observers=[0])
@@ -70,7 +70,7 @@ def brief(method: object, fleet: Fleet) -> Fleet:
 
 
 @pytest.mark.parametrize("method", METHODS, ids=label)
-def test_bytes_by_closed_form(method, crossing: Fleet) -> None:
+def test_bytes_by_closed_form(method, crossing):
     """One message per link and step: 14 numbers for an estimate with its covariance, 8 for a fix."""
     fleet = brief(method, crossing)
     recording = observe(fleet, S2, V2X(max_neighbours=3, overhead=10), runs=1)
@@ -81,7 +81,7 @@ def test_bytes_by_closed_form(method, crossing: Fleet) -> None:
 
 
 @pytest.mark.parametrize("method", [*FILTERS[:2], QCQPRelaxation()], ids=label)
-def test_what_has_not_arrived_is_not_used(method, crossing: Fleet) -> None:
+def test_what_has_not_arrived_is_not_used(method, crossing):
     """Poison: what the others measured at steps whose messages the inbox never yields changes nothing. An estimate
     remembers all fixes before it: there, those after the last message that is used."""
     recording = observe(crossing, S2, V2X(max_neighbours=4, rate=2.5, latency=0.2, loss=0.3), runs=1)

@@ -3,7 +3,6 @@
 from collections.abc import Callable
 from dataclasses import fields, replace
 from functools import partial
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -139,12 +138,12 @@ BARE, OTHER = replace(TRACK, covariance=None), replace(RECORDING, ids=("e", "f",
         (lambda: fix_innovations(TRACK, OTHER), "ids and times differ from those that were recorded"),
     ],
 )
-def test_what_cannot_be_computed_says_why(call: Callable[[], object], words: str) -> None:
+def test_what_cannot_be_computed_says_why(call, words):
     with refused(words):
         call()
 
 
-def test_a_noun_keeps_no_array_that_its_owner_can_change() -> None:
+def test_a_noun_keeps_no_array_that_its_owner_can_change():
     whole = np.arange(6) / 10
     part = whole.view()
     part.flags.writeable = False
@@ -166,7 +165,7 @@ def init(instance: Any) -> dict[str, Any]:
     return {f.name: getattr(instance, f.name) for f in fields(instance) if f.init and f.name != "priors"}
 
 
-def test_a_stream_that_refused_a_step_is_as_before() -> None:
+def test_a_stream_that_refused_a_step_is_as_before():
     start = co.Kalman("identity").start
     stream, given = start(), ([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], 0.1)
     before = stream.step(*given)[0]
@@ -343,14 +342,14 @@ def answered(found: Any, right: Any, change: str) -> bool:
     return sum(np.sum(~np.isfinite(a)) for a in arrays(found)) <= sum(np.sum(~np.isfinite(a)) for a in arrays(right))
 
 
-def test_every_public_name_is_tried() -> None:
+def test_every_public_name_is_tried():
     assert {*(name.split(".")[0] for name in PUBLIC), *(name for names in ELSEWHERE for name in names.split(", "))} == {
         *co.__all__
     }
 
 
 @pytest.mark.parametrize("name", PUBLIC)
-def test_a_wrong_argument_gives_an_error_of_ours_a_right_number_or_a_note(name: str) -> None:
+def test_a_wrong_argument_gives_an_error_of_ours_a_right_number_or_a_note(name):
     call, given = PUBLIC[name]
     right = call(**given)
     for field, value in given.items():
@@ -370,7 +369,7 @@ def test_a_wrong_argument_gives_an_error_of_ours_a_right_number_or_a_note(name: 
     swept(call, given)
 
 
-def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
+def test_solvers_refuse_arguments_of_the_wrong_kind():
     whole = PROBLEM.add("range", ("a", "b"), 10.0, std=1.0)
     solution = co.solve(whole)
     swept(optimize.solve_gnc, {"problem": whole, "candidates": [0], "loss": "truncated", "threshold": 0.99})
@@ -389,7 +388,7 @@ def test_solvers_refuse_arguments_of_the_wrong_kind() -> None:
     swept(lambda **given: optimize.measurement(**given), {**named, "constants": 0})
 
 
-def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path: Path) -> None:
+def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path):
     for read in (
         co.read_graph,
         load_graph,
@@ -406,14 +405,14 @@ def test_files_and_studies_refuse_arguments_of_the_wrong_kind(tmp_path: Path) ->
             co.run_study("neighbours", value, progress=False)  # type: ignore[arg-type]
 
 
-def test_a_duration_and_a_mask_are_no_numbers() -> None:
+def test_a_duration_and_a_mask_are_no_numbers():
     with refused(r"dt = np\.timedelta64"):  # 300 ms are no 300 s
         co.Kalman("identity").start().step([0.0, 0.0, 0.0], [1.0, 0.0, 0.0], np.timedelta64(300, "ms"))  # type: ignore[arg-type]
     with refused("a = dtype object"):  # numbers behind a mask are none
         co.paired_difference(np.ma.masked_array([1.0, 2.0], [True, False]), np.ones(2))
 
 
-def test_training_refuses_values_from_elsewhere() -> None:
+def test_training_refuses_values_from_elsewhere():
     learned = pytest.importorskip("coopoc.learned")
     drive = co.load_fleet("town10").between(0, 44).select([0])
     (client,) = learned.clients(drive, piece=10)
@@ -438,7 +437,7 @@ def test_training_refuses_values_from_elsewhere() -> None:
 
 
 @pytest.mark.parametrize("path", [np.array(3), pd.NA, None, "", "a" * 300, "a/" * 3000, "a\0b", "\ud800", Foreign()])
-def test_paths_that_no_file_system_holds_are_refused(tmp_path: Path, path: Any) -> None:
+def test_paths_that_no_file_system_holds_are_refused(tmp_path, path):
     learned = pytest.importorskip("coopoc.learned")
     checkpoint = learned.Checkpoint(learned.NoiseParameters(), {})
     reads = (co.read_graph, co.load_fleet, co.read_log, co.Results.load, learned.load, views)

@@ -34,7 +34,7 @@ def road(vehicles: int = 3, steps: int = 60) -> tuple[Fleet, Recording]:
 
 
 @pytest.mark.parametrize("name", sorted(METHODS.keys() - {"gnss"}))
-def test_no_method_falls_behind(name: str) -> None:
+def test_no_method_falls_behind(name):
     """Along the road, within three standard errors of where it is with the true speed, or within MOST. With the
     variance of each reading it was 0.19 m (kalman) to 0.55 m (of the whole fleet)."""
     fleet, seen = road()
@@ -51,7 +51,7 @@ def test_no_method_falls_behind(name: str) -> None:
 
 @pytest.mark.parametrize("reading", ["axis", "speed"])
 @pytest.mark.parametrize("v2x", [V2X(4), V2X(3, loss=0.5, burst=2.0, max_age=0.3), V2X(4, latency=0.3, rate=2.0)])
-def test_a_receiver_knows_the_pace_of_what_it_has_received(crossing: Fleet, v2x: V2X, reading: str) -> None:
+def test_a_receiver_knows_the_pace_of_what_it_has_received(crossing, v2x, reading):
     """Neighbours come and go; textbook: `oracles.pace`. Where nothing is lost it is the sender's own."""
     seen = observe(crossing, Sensors(velocity_reading=reading), v2x, runs=2, observers=[0])
     box, known = inbox(seen, 0, FIX_AND_VELOCITY), NoiseModel.nominal(seen.sensors)
@@ -69,7 +69,7 @@ def test_a_receiver_knows_the_pace_of_what_it_has_received(crossing: Fleet, v2x:
     assert_allclose(known.process_variance(always, [0], box), known.process_variance(always), rtol=1e-12)
 
 
-def test_the_pace_of_a_step_does_not_know_its_velocity() -> None:
+def test_the_pace_of_a_step_does_not_know_its_velocity():
     """A wrong one changes the noise of later steps alone, by no more than twice the pace and 10 m/s^2 allow, and
     a third of that is left a second later."""
     seen, known = road()[1], NoiseModel.nominal(NOISY)
@@ -82,7 +82,7 @@ def test_the_pace_of_a_step_does_not_know_its_velocity() -> None:
     assert_allclose(gained[12:16] / gained[11], 3.0 ** -np.arange(1, 5), rtol=1e-9)
 
 
-def test_it_is_filterpys_filter_with_the_noise_of_the_pace() -> None:
+def test_it_is_filterpys_filter_with_the_noise_of_the_pace():
     seen = road()[1]
     track, q = Kalman(robust=False)(seen, [1]), heard(seen, None, NoiseModel.nominal(NOISY), 7, 1)
     peer = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)

@@ -72,7 +72,7 @@ def situations() -> Iterator[tuple[str, co.Fleet, co.Sensors]]:
 
 
 @pytest.mark.parametrize(("fleet", "sensors"), [pytest.param(*rest, id=name) for name, *rest in situations()])
-def test_estimates_stay_sane_where_digits_are_few(fleet: co.Fleet, sensors: co.Sensors) -> None:
+def test_estimates_stay_sane_where_digits_are_few(fleet, sensors):
     """No method leaves its own fixes by more than their noise may; every covariance is symmetric, none is negative."""
     recording = observed(fleet, sensors)
     fixes = np.abs(recording.gnss[:, :, 0] - fleet.position[:, 0]).max()
@@ -86,7 +86,7 @@ def test_estimates_stay_sane_where_digits_are_few(fleet: co.Fleet, sensors: co.S
             assert (np.linalg.eigvalsh(track.covariance / size) > -1e-9).all(), name
 
 
-def test_a_relative_measurement_that_outruns_the_digits_is_assumed_coarser_and_the_track_says_so() -> None:
+def test_a_relative_measurement_that_outruns_the_digits_is_assumed_coarser_and_the_track_says_so():
     """Least std (3e-7 x 800 m x 1 m)^(1/2), with the range's 1 m: finer ones made the joint covariance negative."""
     fleet, sensors = in_line(4, 10.0), co.Sensors(gnss_std=(800.0, 2.0, 0.02), azimuth_std=1.5e-6, inclination_std=6e-6)
     track = co.JointFilter("nominal")(observed(fleet, sensors), [0])
@@ -97,7 +97,7 @@ def test_a_relative_measurement_that_outruns_the_digits_is_assumed_coarser_and_t
 
 
 @pytest.mark.parametrize("damage", [np.diag([1.0, -1e-6, 1.0]), np.eye(3) + 2 * (np.eye(3, k=1) + np.eye(3, k=-1))])
-def test_a_track_notes_covariances_that_are_none(damage: np.ndarray) -> None:
+def test_a_track_notes_covariances_that_are_none(damage):
     track = co.Kalman()(observed(in_line(2, 9.0), co.Sensors()), [0])
     assert not track.notes
     covariance = track.covariance.copy()
@@ -107,7 +107,7 @@ def test_a_track_notes_covariances_that_are_none(damage: np.ndarray) -> None:
     assert replace(noted, seconds=1.0).notes == noted.notes
 
 
-def test_the_smoother_descends_where_whole_steps_lead_away() -> None:
+def test_the_smoother_descends_where_whole_steps_lead_away():
     """Azimuths of 9 degrees, ranges of a tenth of a millimetre, poor fixes: undamped Gauss-Newton ends 36 km off."""
     fleet = in_line(5, 11.84)
     sensors = co.Sensors(
@@ -136,7 +136,7 @@ def errors_of(names: str, words: str, drives: Iterable[tuple[co.Fleet, co.Record
 
 
 @pytest.mark.parametrize(("range_std", "angle_std"), [(0.05, 0.3), (0.001, 1.0), (1e-4, 0.1)])
-def test_a_fine_range_in_a_coarse_direction_is_not_taken_for_exact(range_std: float, angle_std: float) -> None:
+def test_a_fine_range_in_a_coarse_direction_is_not_taken_for_exact(range_std, angle_std):
     """Uncertain angles put a neighbour on an arc. Taken as stated, joint is 34, 42 and 12 m off, and LKF-SA's edge form
     6, 31 and 2 m, where a filter of the ego alone is 0.7 m off; and claims centimetres."""
     drives = []
@@ -157,7 +157,7 @@ def without_azimuth(recording: co.Recording) -> co.Recording:
     return replace(recording, relative=relative)
 
 
-def test_fine_ranges_alone_bend_as_fixes_are_uncertain() -> None:
+def test_fine_ranges_alone_bend_as_fixes_are_uncertain():
     """UWB of 1 mm between fixes of 1.5 m, 20 m apart. Taken as stated, joint was 1 m off, where a filter of the ego
     alone is 0.7 m off."""
     drives = []
@@ -175,7 +175,7 @@ def test_fine_ranges_alone_bend_as_fixes_are_uncertain() -> None:
     assert all(each < 1.05 * error["kalman"] for each in error.values()), error
 
 
-def test_ranges_between_rare_fixes_say_no_more_than_where_they_point() -> None:
+def test_ranges_between_rare_fixes_say_no_more_than_where_they_point():
     """Three vehicles abreast, ranges at 5 Hz, a fix every 20 s. With each range taken for new joint is
     1.69 m off, where a filter of the ego alone is 1.58 m off."""
     fleet = drive(3, 600, 0.2, gap=12.0)
@@ -187,12 +187,12 @@ def test_ranges_between_rare_fixes_say_no_more_than_where_they_point() -> None:
     assert all(each <= error["kalman"] for each in error.values()), error
 
 
-def test_ranges_that_noise_reflects_at_zero_are_noted() -> None:
+def test_ranges_that_noise_reflects_at_zero_are_noted():
     seen = observed(in_line(4, 10.0), co.Sensors(range_std=1e3))
     assert any("none is negative" in note for note in co.JointFilter()(seen, [0]).notes)
 
 
-def test_an_estimate_that_its_fixes_contradict_is_noted() -> None:
+def test_an_estimate_that_its_fixes_contradict_is_noted():
     """Ranges fifty times as long as stated move the estimate away from the ego's fixes, which a note reports."""
     seen = observed(in_line(4, 10.0), co.Sensors())
     wrong = replace(seen, relative=seen.relative * [50.0, 1.0, 1.0])

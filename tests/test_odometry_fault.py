@@ -42,9 +42,7 @@ def drive(every: int, std: float, most: int = 0, act: float = 1.0) -> tuple[Reco
 @pytest.mark.parametrize("begins", [0, BEGINS])
 @pytest.mark.parametrize(("every", "std"), [(10, 1.5), (2, 1.5), (1, 3.5)])
 @pytest.mark.parametrize("fault", FAULTS)
-def test_odometry_that_fails_for_good_costs_no_more_than_doing_without(
-    fault: str, every: int, std: float, begins: int
-) -> None:
+def test_odometry_that_fails_for_good_costs_no_more_than_doing_without(fault, every, std, begins):
     """The last 30 s, beside raw fixes, which are held: where errors grew to 80 m and more."""
     seen, truth = drive(every, std)
     velocity = seen.velocity.copy()
@@ -64,7 +62,7 @@ def test_odometry_that_fails_for_good_costs_no_more_than_doing_without(
 
 @pytest.mark.parametrize("act", [1.0, 3.0])
 @pytest.mark.parametrize("alike", [None, *LOOK_ALIKE])
-def test_a_receiver_that_errs_is_no_fault_of_odometry(alike: str | None, act: float) -> None:
+def test_a_receiver_that_errs_is_no_fault_of_odometry(alike, act):
     """Right odometry is left as it is, whatever fixes do, and if they err three times as far as is stated."""
     seen, _ = drive(2, 1.5, most=3, act=act)
     gnss = seen.gnss.copy()
@@ -74,7 +72,7 @@ def test_a_receiver_that_errs_is_no_fault_of_odometry(alike: str | None, act: fl
     assert with_odometry(seen, EGOS, known)[1] is known
 
 
-def test_the_correction_is_the_velocity_of_filterpys_filter() -> None:
+def test_the_correction_is_the_velocity_of_filterpys_filter():
     """Position and error of the velocity, a random walk, from a fix a second, whose noise is as loud as they show."""
     seen, _ = drive(10, 3.5)
     velocity = seen.velocity.copy()

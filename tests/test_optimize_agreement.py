@@ -122,7 +122,7 @@ def reference(name: str) -> Solution:
 
 @pytest.mark.parametrize("name", CASES)
 @pytest.mark.parametrize("backend", EVERY)
-def test_every_backend_agrees_or_is_refused_by_name(backend: str, name: str) -> None:
+def test_every_backend_agrees_or_is_refused_by_name(backend, name):
     if (backend, name) in UNSUPPORTED:
         with refused(UNSUPPORTED[backend, name]):
             solve(case(name), EVERY[backend])
@@ -134,7 +134,7 @@ def test_every_backend_agrees_or_is_refused_by_name(backend: str, name: str) -> 
 
 
 @pytest.mark.parametrize("name", sorted(name for _, name in RELAXED))
-def test_a_tight_relaxation_is_near_before_it_is_refined(name: str) -> None:
+def test_a_tight_relaxation_is_near_before_it_is_refined(name):
     found = solve(case(name), "cvxpy", throw=False, refine=False)
     ours = reference(name)
     assert found.extras["lower_bound"] <= ours.cost * (1 + 1e-7)
@@ -152,7 +152,7 @@ ONE_PLACE = Problem(("a", "b"), x0=np.zeros((2, 3))).add("position", "a", [0, 0,
 @pytest.mark.parametrize("loss", ["huber", "cauchy", "geman-mcclure"])
 @pytest.mark.parametrize("name", ["spherical K = 10", "SE(2) window", "SE(3) window"])
 @pytest.mark.parametrize("backend", EVERY)
-def test_every_backend_agrees_on_robust_losses(backend: str, name: str, loss: str) -> None:
+def test_every_backend_agrees_on_robust_losses(backend, name, loss):
     """From the least-squares solution, so that all descend into one minimum."""
     plain = case(name)
     robust = replace(plain.factors[-1], loss=Loss(loss, 1.5))
@@ -170,7 +170,7 @@ def backends_lacking(backend: str, problem: Problem) -> list[str]:
     return require_backend(EVERY[backend]).capabilities.lacking(problem)
 
 
-def test_graduated_non_convexity_calls_a_plug_in() -> None:
+def test_graduated_non_convexity_calls_a_plug_in():
     seen = observe(load_fleet("town10").between(0, 40), Sensors.paper_scenario2(), V2X.ideal(6), runs=2, observers=[5])
     star = Problem.from_snapshot(seen, 36, 5, run=1)
     wrong = star.add("position", 1, star.factors[0].z[1] + 40.0, std=3.5)
@@ -180,7 +180,7 @@ def test_graduated_non_convexity_calls_a_plug_in() -> None:
 
 
 @pytest.mark.parametrize("backend", backends())
-def test_what_cannot_be_solved_is_said_by_every_backend(backend: str) -> None:
+def test_what_cannot_be_solved_is_said_by_every_backend(backend):
     for problem, free in ((NO_FIX, {"a", "b", "c"}), (DETACHED, {"c", "d"})):
         found = solve(problem, backend, throw=False)
         assert found.status is Status.RANK_DEFICIENT

@@ -10,11 +10,10 @@ from oracles.bayes_tree import bayes_tree_marginals
 from random_graphs import star
 from scipy.optimize import least_squares
 
-from coopoc import V2X, Fleet, MissingLibraryError, Sensors, observe
+from coopoc import V2X, MissingLibraryError, Sensors, observe
 from coopoc.optimize import Backend, Problem, SolverResult, Status, backends, solve
 from coopoc.optimize.backends import osqp
 from coopoc.optimize.starts.initial import initial_guess
-from coopoc.world.recording import Recording
 
 S2 = Sensors.paper_scenario2()
 LOCAL = sorted(set(backends()) - {"cvxpy"})
@@ -23,19 +22,19 @@ OTHERS = [name for name in LOCAL if name != "gauss-newton"]
 
 
 @pytest.fixture(scope="module")
-def dense(formation: Fleet) -> Recording:
+def dense(formation):
     """Ten neighbours at 22 m."""
     return observe(formation.between(0, 40), S2, V2X.ideal(10), runs=4, observers=[0])
 
 
 @pytest.fixture(scope="module")
-def crossing_recording(crossing: Fleet) -> Recording:
+def crossing_recording(crossing):
     """Neighbours that come and go."""
     return observe(crossing, S2, V2X(max_neighbours=6, radius=60), runs=2, observers=[0, 3])
 
 
 @pytest.mark.parametrize("backend", LOCAL)
-def test_where_plain_gauss_newton_overshoots_for_ever(backend: str) -> None:
+def test_where_plain_gauss_newton_overshoots_for_ever(backend):
     """Flat range-only stars: the height's true curvature exceeds twice that of J^T J."""
     cycling = 0
     for seed in range(8):
@@ -62,7 +61,7 @@ def scipys(problem: Problem) -> tuple[np.ndarray, float]:
 
 @pytest.mark.parametrize("backend", LOCAL)
 @pytest.mark.parametrize("case", ["ten neighbours", "snapshot", "window", "range", "azimuth"])
-def test_scipy_finds_the_same_minimum(dense: Recording, crossing_recording: Recording, case: str, backend: str) -> None:
+def test_scipy_finds_the_same_minimum(dense, crossing_recording, case, backend):
     for seed in range(2):
         problem = {
             "ten neighbours": lambda s: Problem.from_snapshot(dense, 20, 0, s),
@@ -79,7 +78,7 @@ def test_scipy_finds_the_same_minimum(dense: Recording, crossing_recording: Reco
 
 @pytest.mark.parametrize("backend", LOCAL)
 @pytest.mark.parametrize("length", [1, 5])
-def test_marginals_are_those_of_gtsams_bayes_tree(crossing_recording: Recording, length: int, backend: str) -> None:
+def test_marginals_are_those_of_gtsams_bayes_tree(crossing_recording, length, backend):
     problem = Problem.from_window(crossing_recording, 20, 0, length)
     solution = solve(problem, backend)
     theirs = bayes_tree_marginals(problem.whiten(solution.x)[1], None, len(problem.names), 3)
@@ -98,7 +97,7 @@ def chain_of(points: int, separator: tuple[int, ...] = ()) -> Problem:
 
 @pytest.mark.parametrize("backend", LOCAL)
 @pytest.mark.parametrize("points", [5, 40, 300])
-def test_a_linear_problem_equals_lstsq(points: int, backend: str) -> None:
+def test_a_linear_problem_equals_lstsq(points, backend):
     """Dense, sparse (300 points without a separator) and osqp's and gtsam's own elimination, against NumPy's lstsq."""
     problem = chain_of(points)
     r, J = problem.whiten(np.zeros((points, 3)))
@@ -110,7 +109,7 @@ def test_a_linear_problem_equals_lstsq(points: int, backend: str) -> None:
     assert solution.covariance == pytest.approx(own, rel=1e-9, abs=1e-12)
 
 
-def test_a_solution_is_verified_independently_of_the_solver(dense: Recording) -> None:
+def test_a_solution_is_verified_independently_of_the_solver(dense):
     """A backend that returns its start and claims one iteration is found out."""
     overconfident = Backend("overconfident", lambda structure: lambda problem, x: SolverResult(x + 0.1, 1))
     solution = solve(Problem.from_snapshot(dense, 10, 0), overconfident, throw=False)
@@ -118,7 +117,7 @@ def test_a_solution_is_verified_independently_of_the_solver(dense: Recording) ->
     assert solution.gradient_norm > 0.01
 
 
-def test_osqp_ends_the_same_whatever_it_solved_before(dense: Recording) -> None:
+def test_osqp_ends_the_same_whatever_it_solved_before(dense):
     """The workspace of a structure is kept, one per thread; nothing of what it has solved shows."""
     near, far = (Problem.from_snapshot(dense, step, 0, run=1) for step in (10, 11))
     osqp.unbounded.cache_clear()
@@ -130,7 +129,7 @@ def test_osqp_ends_the_same_whatever_it_solved_before(dense: Recording) -> None:
     assert np.array_equal(first.covariance, again.covariance)
 
 
-def test_osqp_repairs_what_fails_its_kkt_check(dense: Recording) -> None:
+def test_osqp_repairs_what_fails_its_kkt_check(dense):
     problem = Problem.from_window(dense, 20, 0, 5)
     loose = {**osqp.SETTINGS, "eps_abs": 1e-2, "eps_rel": 1e-2, "sigma": 1.0}
     with pytest.MonkeyPatch.context() as patch:
@@ -149,15 +148,13 @@ def test_osqp_repairs_what_fails_its_kkt_check(dense: Recording) -> None:
         (lambda p: solve(p, "gtsam", max_iteration=3), r"Did you mean max_iterations\?"),
     ],
 )
-def test_unknown_names_list_the_known(dense: Recording, call, words: str) -> None:
+def test_unknown_names_list_the_known(dense, call, words):
     with refused(words):
         call(Problem.from_snapshot(dense, 0, 0))
 
 
 @pytest.mark.parametrize("backend", OTHERS)
-def test_a_missing_library_says_how_to_install_it(
-    monkeypatch: pytest.MonkeyPatch, dense: Recording, backend: str
-) -> None:
+def test_a_missing_library_says_how_to_install_it(monkeypatch, dense, backend):
     for module in ("coopoc.optimize.backend", "coopoc.errors"):
         lacking = lambda name: None if name == backend else find_spec(name)  # noqa: E731
         monkeypatch.setattr(sys.modules[module], "find_spec", lacking)
@@ -168,7 +165,7 @@ def test_a_missing_library_says_how_to_install_it(
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
-def test_a_point_that_an_infinite_std_leaves_free_is_named(backend: str) -> None:
+def test_a_point_that_an_infinite_std_leaves_free_is_named(backend):
     """Its weighted fixes are by hand: the mean of 0 and 4."""
     problem = Problem(("a", "b")).add("position", "a", [[0, 0, 0]], std=1.0).add("position", "a", [4, 4, 4], std=1.0)
     held, free = (solve(problem.add("position", "b", [4, 4, 4], std=s), backend, throw=False) for s in (1.0, np.inf))

@@ -16,7 +16,7 @@ from coopoc.optimize.starts.initial import initial_guess
 
 
 @pytest.mark.parametrize("start", [None, 20.0])
-def test_ranges_end_where_scipy_ends(start: float | None) -> None:
+def test_ranges_end_where_scipy_ends(start):
     """From the linear start and from 20 m off; SciPy's trust region may go elsewhere from there."""
     for seed in range(12):
         problem, rng = star("range", seed, 8, 3.0), np.random.default_rng(seed)
@@ -43,12 +43,12 @@ def test_ranges_end_where_scipy_ends(start: float | None) -> None:
         ({"structure": 0}, "is no option of casadi"),
     ],
 )
-def test_wrong_options(options: dict[str, object], words: str) -> None:
+def test_wrong_options(options, words):
     with refused(words):
         solve(star("range", 0, 8, 3.0), "casadi", **options)
 
 
-def test_a_truncated_loss_is_refused_with_the_way_out() -> None:
+def test_a_truncated_loss_is_refused_with_the_way_out():
     problem = star("range", 0, 8, 3.0)
     doubted = replace(problem, factors=tuple(replace(f, loss=Loss("truncated", 3.0)) for f in problem.factors))
     with refused(r"loss truncated: cannot be solved by casadi, only by .*gauss-newton"):
@@ -56,7 +56,7 @@ def test_a_truncated_loss_is_refused_with_the_way_out() -> None:
 
 
 @pytest.mark.parametrize("w", [(0.3, -0.2, 0.9), (1e-9, 0.0, 0.0), (-2.0, 1.0, 3.0)])
-def test_steps_of_a_rotation_are_scipys(w: tuple[float, float, float]) -> None:
+def test_steps_of_a_rotation_are_scipys(w):
     """Cayley's map turns about w by 2 atan(|w| / 2), to first order by |w|."""
     size = float(np.linalg.norm(w))
     wanted = Rotation.from_rotvec(2.0 * np.arctan(size / 2.0) * np.array(w) / size).as_matrix()

@@ -30,7 +30,7 @@ def upper(matrix: np.ndarray) -> csc_matrix:
 @pytest.mark.parametrize(
     ("nodes", "pairs", "width"), [(1, 0, 3), (2, 0, 1), (40, 5, 3), (60, 30, 6), (90, 900, 2), (200, 600, 3)]
 )
-def test_it_solves_and_inverts_as_numpy_does(nodes: int, pairs: int, width: int) -> None:
+def test_it_solves_and_inverts_as_numpy_does(nodes, pairs, width):
     """The last two fill in nearly everywhere, so that blocks of hundreds of columns take the way of BLAS."""
     A = graph_matrix(nodes + pairs, nodes, pairs, width)
     pattern = upper(A)
@@ -45,7 +45,7 @@ def test_it_solves_and_inverts_as_numpy_does(nodes: int, pairs: int, width: int)
 
 
 @pytest.mark.parametrize("pairs", [3, 900])
-def test_a_matrix_that_curves_downwards_is_refused(pairs: int) -> None:
+def test_a_matrix_that_curves_downwards_is_refused(pairs):
     """The smallest eigenvalue is NumPy's; slightly above it the shifted matrix is indefinite, slightly below not."""
     A = graph_matrix(pairs, 90, pairs, 2)
     least = np.linalg.eigvalsh(A)[0]
@@ -54,7 +54,7 @@ def test_a_matrix_that_curves_downwards_is_refused(pairs: int) -> None:
         assert cholesky.factor(upper(A - share * least * np.eye(len(A))).data) is definite
 
 
-def test_parts_that_nothing_joins_are_factored_apart() -> None:
+def test_parts_that_nothing_joins_are_factored_apart():
     A = np.zeros((30, 30))
     A[:12, :12], A[12:, 12:] = graph_matrix(7, 4, 2, 3), graph_matrix(8, 6, 1, 3)
     order = np.random.default_rng(0).permutation(30)
@@ -64,7 +64,7 @@ def test_parts_that_nothing_joins_are_factored_apart() -> None:
     assert cholesky.solve(rhs) == pytest.approx(np.linalg.solve(A[np.ix_(order, order)], rhs), rel=1e-8)
 
 
-def test_a_chain_is_cut_where_half_of_a_block_would_be_zeros() -> None:
+def test_a_chain_is_cut_where_half_of_a_block_would_be_zeros():
     """w columns of a chain hold 2 w numbers in a block of w (w + 3) / 2: at w = 5 half of it is zeros."""
     n = 20
     parent, begin, rows = np.arange(1, n + 1), np.r_[np.arange(n), n - 1], np.arange(1, n)

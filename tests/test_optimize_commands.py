@@ -18,7 +18,7 @@ ROOT = Path(__file__).resolve().parents[1]
 
 
 @pytest.fixture
-def file(tmp_path: Path) -> Path:
+def file(tmp_path):
     """Three poses in a row and a landmark ranged by all, measured without error: cost zero at the truth."""
     position = np.array([[0.0, 0.0], [4.0, 0.0], [8.0, 1.0], [3.0, 6.0]])
     angle = np.array([[0.0], [0.2], [0.1], [0.0]])
@@ -50,7 +50,7 @@ def run(capsys: pytest.CaptureFixture[str], *words: str) -> tuple[int, str, str]
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "casadi"])
-def test_solve_writes_the_solution(file: Path, capsys: pytest.CaptureFixture[str], backend: str) -> None:
+def test_solve_writes_the_solution(file, capsys, backend):
     target = file.with_suffix(".json")
     status, out, err = run(capsys, "solve", str(file), "--backend", backend, "--output", str(target))
     assert (status, json.loads(out)["status"]) == (0, "SOLVED")
@@ -62,7 +62,7 @@ def test_solve_writes_the_solution(file: Path, capsys: pytest.CaptureFixture[str
     assert np.shape(found["nodes"]["A2"]["covariance"]) == (3, 3)
 
 
-def test_a_wrong_line_and_an_unknown_backend_are_named(file: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_wrong_line_and_an_unknown_backend_are_named(file, capsys):
     status, _, err = run(capsys, "solve", str(file), "--backend", "ceres")
     assert (status, "gauss-newton" in err) == (2, True)
     file.write_text(file.read_text() + "EDGE_RANGE 0.1 A0 L9 5.0 0.01\n")
@@ -71,9 +71,7 @@ def test_a_wrong_line_and_an_unknown_backend_are_named(file: Path, capsys: pytes
     assert f"{file.name}: line {len(file.read_text().splitlines())} = vertex L9" in err
 
 
-def test_check_solves_one_problem_with_every_backend(
-    capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_check_solves_one_problem_with_every_backend(capsys, monkeypatch):
     status, out, err = run(capsys, "check")
     assert (status, out.count("SOLVED")) == (0, len(backends()))
     assert "0 disagree" in err
@@ -82,7 +80,7 @@ def test_check_solves_one_problem_with_every_backend(
     assert (status, out.count(" needs "), "pip install casadi" in err) == (1, len(backends()), True)
 
 
-def test_the_example_draws_a_graph_file(tmp_path: Path) -> None:
+def test_the_example_draws_a_graph_file(tmp_path):
     picture, script = tmp_path / "drive.png", ROOT / "examples" / "graph_file.py"
     command = [sys.executable, "-W", "error", script, measured("mrclam5a.pyfg"), picture]
     out = ran(command, check=True).stdout

@@ -10,7 +10,7 @@ from conftest import refused, same_minimum
 from scipy.linalg import null_space
 from scipy.optimize import LinearConstraint, NonlinearConstraint, lsq_linear, minimize
 
-from coopoc import V2X, Fleet, Sensors, observe
+from coopoc import V2X, Sensors, observe
 from coopoc.optimize import (
     MEASUREMENTS,
     Backend,
@@ -26,7 +26,6 @@ from coopoc.optimize import (
     solve,
 )
 from coopoc.optimize.assess.active import active_at
-from coopoc.world.recording import Recording
 
 INF = np.inf
 LINEAR: list[tuple[str, dict[str, str]]] = [("osqp", {}), ("casadi", {})]
@@ -56,7 +55,7 @@ def kinds():
 
 
 @pytest.fixture(scope="module")
-def dense(formation: Fleet) -> Recording:
+def dense(formation):
     return observe(formation.between(0, 40), Sensors.paper_scenario2(), V2X.ideal(10), runs=2, observers=[0])
 
 
@@ -74,7 +73,7 @@ def gradient(problem: Problem, x: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize(("backend", "options"), ANY)
 @pytest.mark.parametrize("seed", range(4))
-def test_a_fix_on_a_plane_is_projected(seed: int, backend: str, options: dict[str, str]) -> None:
+def test_a_fix_on_a_plane_is_projected(seed, backend, options):
     """Closed form: x = p - S n (n.p - c) / (n.S n), covariance S - S n n^T S / (n.S n)."""
     rng = np.random.default_rng(seed)
     n, p, c, std = rng.normal(size=3), rng.normal(size=3) * 5, rng.normal(), rng.uniform(1, 4, 3)
@@ -97,7 +96,7 @@ def chain(points: int, seed: int) -> Problem:
 
 @pytest.mark.parametrize(("backend", "options"), LINEAR)
 @pytest.mark.parametrize("seed", range(3))
-def test_a_linear_problem_in_a_box_is_scipys(seed: int, backend: str, options: dict[str, str]) -> None:
+def test_a_linear_problem_in_a_box_is_scipys(seed, backend, options):
     """scipy.optimize.lsq_linear (BVLS); with bounds alone x - clip(x - gradient) vanishes at the minimum."""
     problem = chain(12, seed)
     free = solve(problem).x
@@ -116,9 +115,7 @@ def test_a_linear_problem_in_a_box_is_scipys(seed: int, backend: str, options: d
 
 @pytest.mark.parametrize(("backend", "options"), LINEAR)
 @pytest.mark.parametrize("length", [1, 5])
-def test_constraints_that_do_not_push_change_nothing(
-    dense: Recording, length: int, backend: str, options: dict[str, str]
-) -> None:
+def test_constraints_that_do_not_push_change_nothing(dense, length, backend, options):
     problem = Problem.from_window(dense, 20, 0, length)
     free = solve(problem)
     wide = problem.constrain("position", problem.names, free.x - 1.0, free.x + 0.1)
@@ -198,7 +195,7 @@ def scipys(problem: Problem) -> tuple[np.ndarray, float]:
 
 @pytest.mark.parametrize(("backend", "options"), ANY)
 @pytest.mark.parametrize("seed", range(4))
-def test_surface_lane_and_top_speed_are_scipys(seed: int, backend: str, options: dict[str, str]) -> None:
+def test_surface_lane_and_top_speed_are_scipys(seed, backend, options):
     problem = drive(seed)
     x, cost = scipys(problem)
     solution = solved(problem, backend, options)
@@ -210,7 +207,7 @@ def test_surface_lane_and_top_speed_are_scipys(seed: int, backend: str, options:
     assert np.abs(solution.x[:, 1]).max() <= 0.8 + 1e-9
 
 
-def test_the_covariance_holds_equalities_exactly() -> None:
+def test_the_covariance_holds_equalities_exactly():
     """Against Z (Z^T J^T J Z)^-1 Z^T with SciPy's null space; the inequalities that push are left out."""
     problem = drive(1)
     solution = solve(problem, "casadi")
@@ -224,7 +221,7 @@ def test_the_covariance_holds_equalities_exactly() -> None:
     assert solution.covariance == pytest.approx(own, abs=1e-9)
 
 
-def test_multipliers_are_those_of_ipopt() -> None:
+def test_multipliers_are_those_of_ipopt():
     """An NLP written in CasADi here: its multipliers have our signs and values."""
     problem = drive(2)
     solution = solve(problem, "casadi")
@@ -245,7 +242,7 @@ def test_multipliers_are_those_of_ipopt() -> None:
     assert np.abs(held.multipliers[n:]).max() > 0.01
 
 
-def test_poses_in_a_slab() -> None:
+def test_poses_in_a_slab():
     """osqp holds bounds on positions of poses; casadi agrees, and a step of SciPy's BVLS around it moves nothing."""
     rng, n = np.random.default_rng(0), 6
     at = np.stack([5.0 * np.arange(n), rng.normal(0, 1, n)], axis=1)
@@ -300,7 +297,7 @@ EMPTY = {
 
 
 @pytest.mark.parametrize("backend", ["casadi", "osqp"])
-def test_what_equalities_place_is_known_exactly(backend: str) -> None:
+def test_what_equalities_place_is_known_exactly(backend):
     problem, places = PAIR, np.array([[1.0, 0, 0], [8, 0, 0]])
     for name, place in zip("ab", places, strict=True):
         problem = problem.constrain("position", name, place, place)
@@ -311,7 +308,7 @@ def test_what_equalities_place_is_known_exactly(backend: str) -> None:
 
 
 @pytest.mark.parametrize("case", EMPTY)
-def test_an_empty_set_is_infeasible_and_names_the_worst(case: str) -> None:
+def test_an_empty_set_is_infeasible_and_names_the_worst(case):
     problem, able = EMPTY[case]
     for backend, options in able:
         solution = solve(problem, backend, throw=False, **options)
@@ -326,7 +323,7 @@ def test_an_empty_set_is_infeasible_and_names_the_worst(case: str) -> None:
 
 
 @pytest.mark.parametrize("backend", sorted(set(backends()) - {"casadi"}))
-def test_a_backend_without_constraints_names_those_that_hold_them(backend: str) -> None:
+def test_a_backend_without_constraints_names_those_that_hold_them(backend):
     """Only osqp holds linear ones beside casadi."""
     if backend != "osqp":
         with refused(rf"on position: cannot be solved by {backend}, only by .*casadi.*osqp"):
@@ -336,7 +333,7 @@ def test_a_backend_without_constraints_names_those_that_hold_them(backend: str) 
 
 
 @pytest.mark.parametrize(("backend", "options"), ANY)
-def test_the_far_side_of_a_range_is_a_maximum(backend: str, options: dict[str, str]) -> None:
+def test_the_far_side_of_a_range_is_a_maximum(backend, options):
     """b must be 8 m from a, and is seen at 9 m to the right: the point 8 m to the left is stationary too."""
     problem = Problem(("a", "b"), x0=[[0, 0, 0], [-8, 0, 0]]).add("position", "a", [0, 0, 0], std=0.1)
     problem = problem.add("position", "b", [9, 0, 0], std=3.0).constrain("range", ("a", "b"), 8.0, 8.0)
@@ -349,7 +346,7 @@ def test_the_far_side_of_a_range_is_a_maximum(backend: str, options: dict[str, s
     assert aside.x[:, 0] == pytest.approx([0.01 * gap, 9.0 - 9.0 * gap], abs=1e-6)
 
 
-def test_osqp_holds_answers_against_all_kkt_conditions() -> None:
+def test_osqp_holds_answers_against_all_kkt_conditions():
     """min 1/2 x^2 + q x in [-1, 1]: by hand."""
     from scipy.sparse import eye
 
@@ -369,7 +366,7 @@ def test_osqp_holds_answers_against_all_kkt_conditions() -> None:
     assert not holds(-0.5, 0.0, 0.0)  # not stationary
 
 
-def test_more_equalities_than_numbers_are_refused_by_casadi() -> None:
+def test_more_equalities_than_numbers_are_refused_by_casadi():
     fixed = PAIR.constrain("position", ["a", "b"], [[1, 0, 0], [6, 0, 0]], [[1, 0, 0], [6, 0, 0]])
     assert solve(fixed, "casadi").x == pytest.approx(np.array([[1, 0, 0], [6, 0, 0]]), abs=1e-9)
     more = fixed.constrain("displacement", ("a", "b"), [5, 0, 0], [5, 0, 0])
@@ -386,7 +383,7 @@ def test_more_equalities_than_numbers_are_refused_by_casadi() -> None:
         ([[6, 0, 0], [9, 0, 0]], Status.INFEASIBLE),
     ],
 )
-def test_a_claim_is_verified_independently_of_the_solver(claim: list[list[float]], status: Status) -> None:
+def test_a_claim_is_verified_independently_of_the_solver(claim, status):
     claims = Backend(
         "claims",
         lambda structure: lambda problem, x: SolverResult(np.array(claim, dtype=float), 1),

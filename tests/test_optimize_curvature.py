@@ -23,7 +23,7 @@ def tangle(seed: int) -> Problem:
     return problem.add("azimuth", ("a", "c"), 1.0, std=0.5).add("inclination", ("b", "d"), 1.5, std=0.5)
 
 
-def test_the_sign_of_the_curvature_is_that_of_casadis_hessian() -> None:
+def test_the_sign_of_the_curvature_is_that_of_casadis_hessian():
     signs = []
     for seed in range(40):
         problem = tangle(seed)
@@ -43,7 +43,7 @@ def between_two() -> Problem:
 
 
 @pytest.mark.parametrize("backend", sorted(set(backends()) - {"cvxpy"}))
-def test_a_saddle_is_not_solved(backend: str) -> None:
+def test_a_saddle_is_not_solved(backend):
     problem = between_two()
     freely = solve(problem, backend)  # without an x0 its start is left, to one side or the other
     assert freely.notes[0] == race.ELSEWHERE

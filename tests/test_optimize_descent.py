@@ -9,7 +9,7 @@ from coopoc.optimize import Problem, solve
 from coopoc.optimize.descent import levenberg_marquardt
 
 
-def test_damping_grows_until_a_step_helps_however_much_that_takes() -> None:
+def test_damping_grows_until_a_step_helps_however_much_that_takes():
     """A range that is too short, seen nearly along the height that is known: J^T J has a 4,000th of the curvature
     across it, so that no step helps below that damping. Closed form: straight above, and the range's share of the
     height is its information's."""
@@ -21,7 +21,7 @@ def test_damping_grows_until_a_step_helps_however_much_that_takes() -> None:
 
 
 @pytest.mark.parametrize("seed", range(3))
-def test_the_unit_of_the_noise_changes_no_step(seed: int) -> None:
+def test_the_unit_of_the_noise_changes_no_step(seed):
     """A law of damped least squares: all standard deviations times c divide every cost by c^2, and nothing else. One
     step less is taken where it promises 1e-9 standard deviations."""
     rng, names = np.random.default_rng(seed), list("abcde")
@@ -56,9 +56,7 @@ def ranged() -> co.Problem:
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "osqp"])
-def test_a_bar_shows_steps_and_cost(
-    backend: str, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_bar_shows_steps_and_cost(backend, monkeypatch, capsys):
     co.solve(ranged(), backend)  # the first call on a machine compiles
     capsys.readouterr()
     quick = co.solve(ranged(), backend)

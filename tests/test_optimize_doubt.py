@@ -3,7 +3,6 @@
 import json
 from dataclasses import replace
 from itertools import combinations
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -32,7 +31,7 @@ def ranged(seed: int) -> Problem:
     return problem.add("range", pairs, z, std=0.1)
 
 
-def test_a_cost_that_the_noise_does_not_explain_is_noted() -> None:
+def test_a_cost_that_the_noise_does_not_explain_is_noted():
     """Ranges from random starts; SciPy's chi-square is the referee."""
     noted = []
     for seed in range(12):
@@ -46,13 +45,13 @@ def test_a_cost_that_the_noise_does_not_explain_is_noted() -> None:
     assert 0 < sum(noted) < len(noted)
 
 
-def test_points_that_a_loss_sets_free_are_told_from_unmeasured_ones() -> None:
+def test_points_that_a_loss_sets_free_are_told_from_unmeasured_ones():
     torn = Problem(("a",)).add("position", ["a"] * 2, [[-40, 0, 0], [40, 0, 0]], std=1.0, loss=Loss("truncated", 1.0))
     with refused(r"a can move|truncated loss rejects 2 of 2.*larger scale"):
         solve(torn)
 
 
-def test_edges_alone_are_read_and_solved_as_with_vertices(tmp_path: Path) -> None:
+def test_edges_alone_are_read_and_solved_as_with_vertices(tmp_path):
     graph = replace(random_graph(3, robots=1, steps=30, landmarks=0, seen=0, loops=8), ranges=RangeEdges())
     write_graph(graph, whole := tmp_path / "whole.g2o")
     lines = [line for line in whole.read_text().splitlines() if line.startswith("EDGE")]
@@ -61,7 +60,7 @@ def test_edges_alone_are_read_and_solved_as_with_vertices(tmp_path: Path) -> Non
     assert solve(co.read_graph(alone)).cost == pytest.approx(solve(co.read_graph(whole)).cost, rel=1e-9)
 
 
-def test_an_indefinite_information_is_repaired_where_asked(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_an_indefinite_information_is_repaired_where_asked(tmp_path, capsys):
     (file := tmp_path / "bad.g2o").write_text("EDGE_SE2 0 1 1 0 0 4 0 0 4 0 9\nEDGE_SE2 1 2 1 0 0 1 2 0 1 0 9\n")
     with refused(r"line 2 = information.*positive definite.*--repair"):
         load_graph(file)
@@ -77,7 +76,7 @@ def test_an_indefinite_information_is_repaired_where_asked(tmp_path: Path, capsy
 
 
 @pytest.mark.parametrize("seed", [9, 12])
-def test_a_race_ends_where_the_best_of_all_starts_ends(seed: int) -> None:
+def test_a_race_ends_where_the_best_of_all_starts_ends(seed):
     """Odometry that turns by 0.6 rad a step: some starts end in other minima."""
     graph = random_graph(seed, robots=1, steps=40, landmarks=0, ranges=0, seen=0, loops=4, turn_std=0.6)
     graph = replace(graph, ranges=RangeEdges(), guess=True)
@@ -90,7 +89,7 @@ def test_a_race_ends_where_the_best_of_all_starts_ends(seed: int) -> None:
     assert any("may be the truth" in note for note in truth.notes)
 
 
-def test_covariances_of_many_nodes_are_computed_where_asked() -> None:
+def test_covariances_of_many_nodes_are_computed_where_asked():
     """Also without them a free node is named, and the time that is printed is what was waited."""
     graph = replace(random_graph(5, robots=1, steps=1100, landmarks=0, seen=0, loops=20), ranges=RangeEdges())
     problem = from_graph(graph)
@@ -105,7 +104,7 @@ def test_covariances_of_many_nodes_are_computed_where_asked() -> None:
     assert (found.status, found.unobservable) == (Status.RANK_DEFICIENT, ("L0",))
 
 
-def test_anchors_among_poses_and_constraints_without_a_backend() -> None:
+def test_anchors_among_poses_and_constraints_without_a_backend():
     with refused(r"anchors.*co.pose\(anchor, 0\)"):
         Problem(("a", "l"), x0=[[*co.pose([0.0, 0.0])], [3, 4, 0, 0, 0, 0]], dimension=2, poses=("a",))
     pair = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)

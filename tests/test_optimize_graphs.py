@@ -22,7 +22,7 @@ from coopoc.optimize.algebra.sparse import Sparse, sparse
 from coopoc.optimize.assess.assess import SMALL, _seen, assess, expected, newton_decrease
 from coopoc.optimize.backends.gtsam import forms, graph_of, values, which_turn
 from coopoc.optimize.descent.levenberg_marquardt import arrive
-from coopoc.optimize.graph_problems import Objective, from_graph, read_graph
+from coopoc.optimize.graph_problems import from_graph, read_graph
 from coopoc.optimize.model.factor import Factor
 from coopoc.optimize.starts.graph_starts import separated
 
@@ -34,7 +34,7 @@ def moved(problem: Problem, x: np.ndarray, v: np.ndarray) -> np.ndarray:
     return problem.space.retract(x, step)
 
 
-def test_a_newton_step_promises_the_square_of_its_decrement() -> None:
+def test_a_newton_step_promises_the_square_of_its_decrement():
     """Against the dense Hessian by differences of the gradient."""
     problem = from_graph(random_graph(11, steps=8, landmarks=2, ranges=12, seen=8, loops=3), start="file")
     moving = np.flatnonzero(problem.movable)
@@ -51,7 +51,7 @@ def test_a_newton_step_promises_the_square_of_its_decrement() -> None:
 
 
 @pytest.mark.parametrize("seed", [101, 102])
-def test_what_is_solved_is_scipys_minimum(seed: int) -> None:
+def test_what_is_solved_is_scipys_minimum(seed):
     problem = from_graph(random_graph(seed, steps=30, ranges=60))
     found = solve(problem)
     moving = np.flatnonzero(problem.movable)
@@ -75,7 +75,7 @@ def without_noise(seed: int, dimension: int) -> Graph:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_linear_solves_find_the_truth_whatever_the_odometry_was(dimension: int) -> None:
+def test_linear_solves_find_the_truth_whatever_the_odometry_was(dimension):
     graph = replace(without_noise(201, dimension), relative_point=PointEdges())
     truth = Space(dimension, has_rotation=True).join(graph.position, graph.rotation)
     poses = np.flatnonzero(graph.is_pose)[:60]  # robot B may not be joined to A by loops
@@ -85,7 +85,7 @@ def test_linear_solves_find_the_truth_whatever_the_odometry_was(dimension: int) 
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("seed", [203, 204, 205])
-def test_the_automatic_start_undoes_bad_odometry(dimension: int, seed: int) -> None:
+def test_the_automatic_start_undoes_bad_odometry(dimension, seed):
     """Odometry of 6 degrees a step, which loops and landmarks correct: to the minimum that the truth leads to."""
     graph = random_graph(seed, dimension, steps=150, turn_std=0.1, loops=80, seen=120)
     found = solve(from_graph(graph))
@@ -97,7 +97,7 @@ def test_the_automatic_start_undoes_bad_odometry(dimension: int, seed: int) -> N
 @pytest.mark.parametrize(
     ("name", "best"), [("mrclam5a", 69.10354), ("mrclam6", 3144.2732), ("plaza1", 1332.7948), ("tiers", 2050.1013)]
 )
-def test_real_graphs_reach_the_best_that_is_known(name: str, best: float) -> None:
+def test_real_graphs_reach_the_best_that_is_known(name, best):
     found = solve(read_graph(measured(f"{name}.pyfg")))
     assert found.status is Status.SOLVED
     assert found.cost == pytest.approx(best, rel=1e-6)
@@ -106,7 +106,7 @@ def test_real_graphs_reach_the_best_that_is_known(name: str, best: float) -> Non
 @pytest.mark.parametrize("objective", ["chordal", "geodesic"])
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("loss", [None, "huber", "cauchy", "geman-mcclure", "truncated"])
-def test_tapes_are_the_formulas(dimension: int, objective: Objective, loss: str | None) -> None:
+def test_tapes_are_the_formulas(dimension, objective, loss):
     """Cost, gradient, J^T J and the exact Hessian of the tapes against r and J of a problem and differences of them."""
     graph = random_graph(207, dimension, steps=20, priors=objective == "chordal", ranges=40)
     problem = from_graph(graph, objective, start="file")
@@ -139,7 +139,7 @@ def upper(system: Sparse, values: np.ndarray) -> np.ndarray:
     return csc_array((values, entries.indices, entries.indptr), shape=(size, size)).toarray()
 
 
-def test_a_formula_that_casadi_cannot_run_is_refused() -> None:
+def test_a_formula_that_casadi_cannot_run_is_refused():
     @measurement("half_range_of_test", arity=2, components=("coordinate",), plane=(0,))
     def half_range(dx, dy, dz, m=np):  # type: ignore[no-untyped-def]
         return (0.5 * np.hypot(float(dx), dy),)
@@ -153,7 +153,7 @@ def test_a_formula_that_casadi_cannot_run_is_refused() -> None:
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_marginals_are_those_of_gtsams_bayes_tree(dimension: int) -> None:
+def test_marginals_are_those_of_gtsams_bayes_tree(dimension):
     problem = from_graph(random_graph(211, dimension, steps=60))
     found = solve(problem)
     theirs = bayes_tree_marginals(problem.whiten(found.x)[1], ~problem.movable, len(problem.names), problem.space.dof)
@@ -162,7 +162,7 @@ def test_marginals_are_those_of_gtsams_bayes_tree(dimension: int) -> None:
     assert found.covariance == pytest.approx(theirs, rel=1e-6, abs=1e-9 * theirs.max())
 
 
-def test_marginals_beside_a_constraint_that_does_not_hold_are_those_of_gtsams_bayes_tree() -> None:
+def test_marginals_beside_a_constraint_that_does_not_hold_are_those_of_gtsams_bayes_tree():
     """A graph with a constraint is not evaluated by tapes, and too large here for a dense inverse."""
     problem = from_graph(random_graph(215, 2, steps=110))
     x = solve(problem).x
@@ -183,7 +183,7 @@ def gtsams(problem: Problem) -> tuple[gtsam.NonlinearFactorGraph, gtsam.Levenber
 
 
 @pytest.mark.parametrize("seed", [212, 213, 214])
-def test_no_minimum_lies_above_gtsams(seed: int) -> None:
+def test_no_minimum_lies_above_gtsams(seed):
     """From the same chained odometry, bad enough to matter, on graphs that GTSAM has every factor of."""
     graph = random_graph(seed, steps=120, seen=0, loops=40, ranges=120, turn_std=0.05)
     problem = from_graph(graph, start="odometry")
@@ -193,7 +193,7 @@ def test_no_minimum_lies_above_gtsams(seed: int) -> None:
     assert found.cost <= native.error(theirs.optimize()) * (1 + 1e-9)
 
 
-def test_a_drive_of_thousands_of_poses_needs_few_factorisations() -> None:
+def test_a_drive_of_thousands_of_poses_needs_few_factorisations():
     """GTSAM's Levenberg-Marquardt from the same chained odometry needs five; damping that begins at 1e-4 needs 50."""
     problem = from_graph(range_aided(0), start="odometry")
     system = sparse(problem)
@@ -205,7 +205,7 @@ def test_a_drive_of_thousands_of_poses_needs_few_factorisations() -> None:
 
 
 @pytest.mark.parametrize(("seed", "stated"), [(208, 1), (209, 1), (208, 100)])
-def test_a_start_that_grows_undoes_drift_that_ranges_alone_correct(seed: int, stated: int) -> None:
+def test_a_start_that_grows_undoes_drift_that_ranges_alone_correct(seed, stated):
     """One robot, ranges to landmarks and odometry that ends far off: to the minimum that the truth leads to, also where
     noise that is stated too large explains every minimum."""
     graph = random_graph(seed, robots=1, steps=800, loops=0, seen=0, ranges=500, turn_std=0.03)
@@ -221,7 +221,7 @@ def test_a_start_that_grows_undoes_drift_that_ranges_alone_correct(seed: int, st
     assert solve(from_graph(graph, start="odometry"), throw=False).cost > 1.2 * best
 
 
-def test_a_start_whose_steps_went_straight_is_kept_however_badly_noise_is_stated() -> None:
+def test_a_start_whose_steps_went_straight_is_kept_however_badly_noise_is_stated():
     """Ranges ten times as noisy as stated: a start that grows would end at the same minimum, and is not tried."""
     drive = world(31, 2, 1, 300, 3)
     ranges = drive.ranged(drive.to_points(300), 1.0)
@@ -236,7 +236,7 @@ def test_a_start_whose_steps_went_straight_is_kept_however_badly_noise_is_stated
     assert found.cost == pytest.approx(solve(from_graph(graph, start="incremental")).cost, rel=1e-9)
 
 
-def test_ranges_of_zero_and_ends_in_one_place_are_taken() -> None:
+def test_ranges_of_zero_and_ends_in_one_place_are_taken():
     """|v|^2 has a derivative at v = 0; a range whose ends coincide at the start has a direction after a nudge."""
     graph = random_graph(211, robots=1, steps=70, landmarks=0, ranges=0, seen=0, loops=20)
     a, b, c = 3, 40, 60
@@ -258,7 +258,7 @@ def test_ranges_of_zero_and_ends_in_one_place_are_taken() -> None:
     assert 0 < np.linalg.norm(moved[c] - x0[c]) < 0.01 * ranges.distance[1]
 
 
-def test_each_part_has_a_fixed_pose_unless_it_has_a_prior() -> None:
+def test_each_part_has_a_fixed_pose_unless_it_has_a_prior():
     graph = replace(random_graph(212, robots=3, steps=40, landmarks=0, seen=0, loops=0), ranges=RangeEdges())
     found = solve(from_graph(graph))
     assert from_graph(graph).fixed == (0, 40, 80)
@@ -268,7 +268,7 @@ def test_each_part_has_a_fixed_pose_unless_it_has_a_prior() -> None:
     assert from_graph(replace(graph, pose_prior=prior)).fixed == (0, 80)
 
 
-def test_where_gtsams_optimizer_does_not_arrive_it_is_said() -> None:
+def test_where_gtsams_optimizer_does_not_arrive_it_is_said():
     """Lengths in micrometres: GTSAM's least damping is one of the unit metre, and its Levenberg-Marquardt creeps.
     Referee: the minimum, which does not depend on the unit."""
     graph = replace(random_graph(216, robots=1, steps=40, landmarks=0, seen=0, loops=12), ranges=RangeEdges())
@@ -284,7 +284,7 @@ def test_where_gtsams_optimizer_does_not_arrive_it_is_said() -> None:
 
 
 @pytest.mark.parametrize("objective", ["chordal", "geodesic"])
-def test_a_measurement_without_variance_is_named(objective: Objective) -> None:
+def test_a_measurement_without_variance_is_named(objective):
     graph = random_graph(217, robots=1, steps=20, landmarks=1, ranges=4, seen=0, loops=0)
     covariance, variance = np.array(graph.relative_pose.covariance), np.array(graph.ranges.variance)
     covariance[7, 2] = covariance[7, :, 2] = 0.0
@@ -296,7 +296,7 @@ def test_a_measurement_without_variance_is_named(objective: Objective) -> None:
 
 
 @pytest.mark.parametrize("weight", [1.0, 1e-4])
-def test_a_weak_measurement_is_no_free_node(weight: float) -> None:
+def test_a_weak_measurement_is_no_free_node(weight):
     """Two halves of a chain whose link has standard deviations 1 / weight as large: observed, however weakly; without
     the link the second half is free."""
     graph = random_graph(213, robots=1, steps=100, landmarks=0, ranges=0, seen=0, loops=0)
@@ -318,7 +318,7 @@ def test_a_weak_measurement_is_no_free_node(weight: float) -> None:
 
 @pytest.mark.parametrize("unseen", [1, 40])
 @pytest.mark.parametrize("steps", [60, 800])
-def test_landmarks_that_nobody_measures_are_named_and_the_rest_arrives(steps: int, unseen: int) -> None:
+def test_landmarks_that_nobody_measures_are_named_and_the_rest_arrives(steps, unseen):
     """Beside a chain with loops stand landmarks without a measurement: they are free, and harm neither the minimum nor
     the number of steps. Referee: the same graph without them."""
     graph = random_graph(218, robots=1, steps=steps, landmarks=0, ranges=0, seen=0, loops=20)
@@ -339,7 +339,7 @@ def test_landmarks_that_nobody_measures_are_named_and_the_rest_arrives(steps: in
 
 
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_the_cost_of_a_minimum_is_what_its_noise_makes_expected(dimension: int) -> None:
+def test_the_cost_of_a_minimum_is_what_its_noise_makes_expected(dimension):
     """Closed form: half a chi-square, whose angles count twice in the plane; mean and spread over 40 graphs."""
     found, known = [], (0.0, 0.0)
     for seed in range(40):
@@ -353,7 +353,7 @@ def test_the_cost_of_a_minimum_is_what_its_noise_makes_expected(dimension: int) 
     assert np.std(found) == pytest.approx(np.sqrt(variance), rel=0.4)
 
 
-def test_a_start_that_leads_smoothly_to_a_poor_minimum_is_not_believed() -> None:
+def test_a_start_that_leads_smoothly_to_a_poor_minimum_is_not_believed():
     """The truth leads lower: a robot in space with ranges, whose chained odometry meets no trouble on its way."""
     graph = drone(51)
     best = solve(from_graph(graph, start="file"), throw=False).cost
@@ -379,7 +379,7 @@ def least(graph: Any, values: Any, first: Any) -> float:
 
 
 @pytest.mark.parametrize("name", ["goats_15", "goats_16"])
-def test_acoustic_ranges_of_an_underwater_vehicle_end_where_gtsam_does(name: str) -> None:
+def test_acoustic_ranges_of_an_underwater_vehicle_end_where_gtsam_does(name):
     """Oracle: GTSAM's factors, made here from the lines of the file."""
     lines = [line.split() for line in (DATA / f"{name}.pyfg").read_text().splitlines()]
     graph, values, keys = gtsam.NonlinearFactorGraph(), gtsam.Values(), {}
@@ -411,7 +411,7 @@ def test_acoustic_ranges_of_an_underwater_vehicle_end_where_gtsam_does(name: str
 
 
 @pytest.mark.parametrize("name", ["known_landmark_localization_3.g2o", "Klaus3.g2o", "toyExample.g2o", "w100.graph"])
-def test_graphs_that_gtsam_reads_end_where_gtsam_does(name: str, tmp_path: Path) -> None:
+def test_graphs_that_gtsam_reads_end_where_gtsam_does(name, tmp_path):
     """Oracle: GTSAM's own reader and optimiser."""
     file, planar = DATA / name, name.endswith("graph")
     graph, values = (gtsam.load2D if planar else gtsam.load3D)(str(file))

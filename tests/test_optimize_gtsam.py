@@ -85,7 +85,7 @@ NATIVE = [
 
 
 @pytest.mark.parametrize(("dimension", "name", "loss"), NATIVE)
-def test_gtsams_own_factors_have_our_cost_and_gradient(dimension: int, name: str, loss: str | None) -> None:
+def test_gtsams_own_factors_have_our_cost_and_gradient(dimension, name, loss):
     """Against gtsam.NonlinearFactorGraph.error, to 1e-12, and the gradient of its linearisation."""
     kind, nodes, noise, _ = natives(dimension)[name]
     for scale in (0.5, 50.0):  # on either side of the loss's corner
@@ -117,7 +117,7 @@ def assert_same_objective(problem: Problem) -> None:
         (2, "azimuth", PAIRS, {"std": 0.1}, None),
     ],
 )
-def test_what_gtsam_lacks_is_a_custom_factor(dimension: int, kind: str, nodes: list, noise: dict, loss) -> None:
+def test_what_gtsam_lacks_is_a_custom_factor(dimension, kind, nodes, noise, loss):
     problem = measured(dimension, kind, nodes, noise, Loss(loss, 50.0) if loss else None)
     assert forms(problem) == [None]
     assert_same_objective(problem)
@@ -214,7 +214,7 @@ CASES: dict[str, Callable[[Fleet], Problem]] = {
 
 
 @pytest.mark.parametrize("case", CASES)
-def test_optimizers_find_the_minimum_of_gauss_newton(formation: Fleet, case: str) -> None:
+def test_optimizers_find_the_minimum_of_gauss_newton(formation, case):
     """Cost to 1e-9, estimates and covariances to 1e-6, before any refinement of ours."""
     problem = CASES[case](formation)
     ours, theirs = solve(problem), solve(problem, "gtsam")
@@ -223,7 +223,7 @@ def test_optimizers_find_the_minimum_of_gauss_newton(formation: Fleet, case: str
 
 
 @pytest.mark.parametrize("case", ["ranges 0", "SE(2)"])
-def test_a_limit_of_iterations_is_kept(formation: Fleet, case: str) -> None:
+def test_a_limit_of_iterations_is_kept(formation, case):
     problem = CASES[case](formation)
     solution = solve(replace(problem, x0=initial_guess(problem)), "gtsam", max_iterations=2, throw=False)
     assert solution.status is Status.MAX_ITERATIONS
@@ -231,7 +231,7 @@ def test_a_limit_of_iterations_is_kept(formation: Fleet, case: str) -> None:
 
 
 @pytest.mark.parametrize("problem", [plane(noise=0.0), space(noise=0.0), space(chordal=True, noise=0.0)])
-def test_marginals_equal_gtsams(problem: Problem) -> None:
+def test_marginals_equal_gtsams(problem):
     """gtsam.Marginals, which moves a pose along its body's axes, with the rotation first in space; without residuals,
     on which J^T J of GTSAM's chords depends."""
     solution, posed = solve(problem), which_turn(problem)

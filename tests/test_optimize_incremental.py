@@ -63,7 +63,7 @@ def batch() -> tuple[gtsam.NonlinearFactorGraph, gtsam.Values]:
     return graph, gtsam.LevenbergMarquardtOptimizer(graph, guess, params).optimize()
 
 
-def test_the_live_estimate_is_near_the_batch_and_an_update_at_it() -> None:
+def test_the_live_estimate_is_near_the_batch_and_an_update_at_it():
     live, (_, best) = followed(), batch()
     found = live.update()
     assert found.status.name == "SOLVED"
@@ -76,7 +76,7 @@ def test_the_live_estimate_is_near_the_batch_and_an_update_at_it() -> None:
     assert live.x[live.names.index("x7")] == pytest.approx(live["x7"])
 
 
-def test_marginals_are_gtsams_in_the_worlds_directions() -> None:
+def test_marginals_are_gtsams_in_the_worlds_directions():
     live, (graph, best) = followed(), batch()
     marginals = gtsam.Marginals(graph, best)
     pose, mark = marginals.marginalCovariance(9), marginals.marginalCovariance(101)
@@ -90,13 +90,13 @@ def test_marginals_are_gtsams_in_the_worlds_directions() -> None:
     assert live.marginal("x9") == pytest.approx(exact, abs=0.03 * scale)
 
 
-def test_robust_losses_are_those_of_a_solve() -> None:
+def test_robust_losses_are_those_of_a_solve():
     found = followed(Loss("huber", 1.0)).update()
     assert found.status.name == "SOLVED"
     assert found.extras["isam2_off"] < 0.05
 
 
-def test_with_a_lag_it_forgets_what_is_not_used_and_keeps_what_it_told() -> None:
+def test_with_a_lag_it_forgets_what_is_not_used_and_keeps_what_it_told():
     live, (graph, best) = followed(lag=8), batch()
     assert live["x24"][:2] == pytest.approx(best.atPose2(24).translation(), abs=0.02)
     assert live["l0"][:2] == pytest.approx(best.atPoint2(100), abs=0.02)
@@ -109,7 +109,7 @@ def test_with_a_lag_it_forgets_what_is_not_used_and_keeps_what_it_told() -> None
         live["x3"]
 
 
-def test_what_is_refused_leaves_the_estimate_as_it_was() -> None:
+def test_what_is_refused_leaves_the_estimate_as_it_was():
     live = followed()
     before, names = live.x, list(live.names)
     new = {"x25": our_pose(TRUE[-1])}

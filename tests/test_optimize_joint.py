@@ -14,7 +14,7 @@ from coopoc.optimize.graph_problems import from_graph
 
 @pytest.mark.parametrize("steps", [10, 60])
 @pytest.mark.parametrize("dimension", [2, 3])
-def test_a_joint_covariance_is_a_part_of_the_inverse(dimension: int, steps: int) -> None:
+def test_a_joint_covariance_is_a_part_of_the_inverse(dimension, steps):
     """Few nodes by a dense factor, many by a sparse one; a fixed node has none."""
     problem = from_graph(random_graph(1, dimension, steps=steps))
     found, dof = solve(problem), problem.space.dof
@@ -41,7 +41,7 @@ def ring(kind: str = "range") -> Problem:
     return problem.add(kind, pairs, apart, std=0.1)
 
 
-def test_joint_marginals_are_gtsams() -> None:
+def test_joint_marginals_are_gtsams():
     problem = ring()
     found = solve(problem)
     graph = graph_of(problem, forms(problem))
@@ -53,7 +53,7 @@ def test_joint_marginals_are_gtsams() -> None:
             assert joint[i, j] == pytest.approx(whole.at(a, b), rel=1e-6, abs=1e-12)
 
 
-def test_what_has_no_covariance_is_refused() -> None:
+def test_what_has_no_covariance_is_refused():
     problem = Problem("ab").add("displacement", ("a", "b"), [1, 0, 0], std=1.0)
     with refused("must hold all nodes"):
         joint_covariance(problem, solve(problem, throw=False), "ab")

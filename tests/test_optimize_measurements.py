@@ -22,7 +22,7 @@ COUNT = 12
 
 @pytest.mark.parametrize("dimension", [2, 3])
 @pytest.mark.parametrize("kind", sorted(MEASUREMENTS))
-def test_derivatives_equal_torchs(kind: str, dimension: int) -> None:
+def test_derivatives_equal_torchs(kind, dimension):
     """By the steps (dp, w) of the nodes, R Exp(w), far from the measured values, near them and at them."""
     known, space, d = MEASUREMENTS[kind], Space(dimension, has_rotation=True), dimension
     if d == 2 and known.plane is None:
@@ -75,7 +75,7 @@ def errors(known: Measurement, rotations: Any, z: Any) -> Any:
     return np.column_stack(known.residual([*VECTORS.T, *rotations.reshape(-1, 9).T], [*z.T], (), np))
 
 
-def test_a_relative_pose_is_scipys_logarithm() -> None:
+def test_a_relative_pose_is_scipys_logarithm():
     known, space = MEASUREMENTS["relative_pose"], Space(3, has_rotation=True)
     z = space.join(VECTORS[::-1], ROTATIONS[::-1])
     found = errors(known, ROTATIONS, z)
@@ -85,7 +85,7 @@ def test_a_relative_pose_is_scipys_logarithm() -> None:
 
 
 @pytest.mark.parametrize("far", [1.0, 1e-2, 1e-6])
-def test_the_logarithm_of_a_relative_pose_is_scipys(far: float) -> None:
+def test_the_logarithm_of_a_relative_pose_is_scipys(far):
     """scipy.linalg.logm of the homogeneous matrix Tz^-1 T, near the measured pose and far from it."""
     known, space = MEASUREMENTS["relative_pose_log"], Space(3, has_rotation=True)
     near = ROTATIONS @ exp(far * VECTORS / np.linalg.norm(VECTORS, axis=1, keepdims=True))
@@ -99,7 +99,7 @@ def test_the_logarithm_of_a_relative_pose_is_scipys(far: float) -> None:
         assert found[k, 3:] == pytest.approx([twist[2, 1], twist[0, 2], twist[1, 0]], abs=1e-7)
 
 
-def test_angles_wrap() -> None:
+def test_angles_wrap():
     """A bearing measured just beyond -x from a point just before it is a small residual, whatever the turn."""
     problem = Problem(("a", "b")).add("azimuth", ("a", "b"), np.pi - 0.01, std=1.0)
     x = np.array([[0, 0, 0], [-10.0, -0.1, 0]])
@@ -109,7 +109,7 @@ def test_angles_wrap() -> None:
     assert same.whiten(x)[0] == pytest.approx(residual)
 
 
-def test_a_wrong_frame_and_a_name_that_is_taken_are_named() -> None:
+def test_a_wrong_frame_and_a_name_that_is_taken_are_named():
     with refused(r"frame = 'bodi': .* Did you mean body\?"):
         measurement("squared range", arity=2, components=("coordinate",), frame="bodi")  # type: ignore[arg-type]
     with refused("registered already"):
@@ -125,7 +125,7 @@ def test_a_wrong_frame_and_a_name_that_is_taken_are_named() -> None:
         ({"linear": True}, "the vector itself"),
     ],
 )
-def test_a_measurement_that_cannot_be(options: dict[str, object], words: str) -> None:
+def test_a_measurement_that_cannot_be(options, words):
     with refused(words):
         measurement("odd", **{"arity": 2, "components": ("distance",), **options})
     assert "odd" not in MEASUREMENTS

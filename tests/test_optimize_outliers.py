@@ -3,7 +3,6 @@ dense algebra."""
 
 import json
 from dataclasses import fields, replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,7 +59,7 @@ def from_known(graph: Graph) -> tuple[co.Solution, Ints, Bools]:
 
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("wrong", [0.1, 0.4, 0.7])
-def test_wrong_loops_are_found_where_odometry_is_known(seed: int, wrong: float) -> None:
+def test_wrong_loops_are_found_where_odometry_is_known(seed, wrong):
     """Oracle: the labels, and the solution of the graph that never had the wrong ones."""
     graph, bad = drive(seed, wrong=wrong)
     solution, rows, rejected = from_known(graph)
@@ -73,7 +72,7 @@ def test_wrong_loops_are_found_where_odometry_is_known(seed: int, wrong: float) 
     assert np.abs(solution.position - wanted.position).max() < 0.1
 
 
-def test_predictions_are_those_of_dense_algebra() -> None:
+def test_predictions_are_those_of_dense_algebra():
     """Oracle: the inverse of J^T J of the known inliers by NumPy."""
     problem = replace(from_graph(drive(1, steps=150, loops=20)[0], start="odometry"), fixed=(75,))
     (candidate,) = loop_closures(problem)
@@ -94,7 +93,7 @@ def test_predictions_are_those_of_dense_algebra() -> None:
         assert spread[k] == pytest.approx(np.log(np.linalg.det(S)), rel=1e-6)
 
 
-def test_known_inliers_that_do_not_hold_a_body_in_itself_are_refused() -> None:
+def test_known_inliers_that_do_not_hold_a_body_in_itself_are_refused():
     problem = Problem(("A0", "A1", "L0"), x0=pose(np.zeros((3, 2))), dimension=2, poses=(0, 1), fixed=(0,))
     problem = problem.add("relative_position", ("A1", "L0"), [1.0, 0.0], std=0.1)
     problem = problem.add("range", ("A0", "A1"), 1.0, std=0.1)
@@ -103,7 +102,7 @@ def test_known_inliers_that_do_not_hold_a_body_in_itself_are_refused() -> None:
         solve_gnc(problem.replace_unchecked(x0=pose(np.array([[0.0, 0], [1, 0], [2, 0]]))), [2], start="known")
 
 
-def test_points_join_as_poses_do() -> None:
+def test_points_join_as_poses_do():
     """Closed form: of two fixes beside a known one the near one fits, and the mean of both is the answer."""
     problem = Problem(("a",)).add("position", "a", [0, 0, 0], std=1.0)
     problem = problem.add("position", ["a", "a"], [[1.0, 0, 0], [50, 0, 0]], std=1.0)
@@ -112,7 +111,7 @@ def test_points_join_as_poses_do() -> None:
     assert solution.extras["weights"].tolist() == [1.0, 0.0]
 
 
-def test_the_command_names_what_it_rejects(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_names_what_it_rejects(tmp_path, capsys):
 
     graph, bad = drive(1)
     write_graph(graph, tmp_path / "drive.g2o")
@@ -216,7 +215,7 @@ def judged(fleet: Fleet, graph: Graph, bad: Bools) -> tuple[int, int, float, flo
 @pytest.mark.parametrize("seed", [1, 2, 3])
 @pytest.mark.parametrize("wrong", [0.1, 0.3, 0.6])
 @pytest.mark.parametrize(("d", "robots"), [(2, 5), (3, 3)])
-def test_robots_are_joined_by_what_agrees(seed: int, wrong: float, d: int, robots: int) -> None:
+def test_robots_are_joined_by_what_agrees(seed, wrong, d, robots):
     """Oracle: the labels, the truth, and the solution of the graph that never had the wrong ones."""
     fleet = Fleet(seed, d, robots)
     pairs = fleet.between(120)
@@ -230,7 +229,7 @@ def test_robots_are_joined_by_what_agrees(seed: int, wrong: float, d: int, robot
     assert all(joint["agree"] > joint["rival"] for joint in solution.extras["joined"])
 
 
-def test_wrong_loops_that_agree_with_each_other_are_reported() -> None:
+def test_wrong_loops_that_agree_with_each_other_are_reported():
     """Of two robots' 40 loops 12 place the second 5 m to the side: 28 are kept, and the answer names the 12; of two
     groups of 20 neither is taken."""
     fleet = Fleet(5, 2, 2)
@@ -262,7 +261,7 @@ def test_wrong_loops_that_agree_with_each_other_are_reported() -> None:
         solve_gnc(problem, loop_closures(problem), start="known")
 
 
-def test_one_measurement_decides_nothing() -> None:
+def test_one_measurement_decides_nothing():
     problem = Problem(("A0", "B0"), x0=pose(np.zeros((2, 2))), dimension=2, poses=(0, 1), fixed=(0,))
     problem = problem.add("relative_pose", ("A0", "B0"), pose([1.0, 0.0]), std=[0.1, 0.1, 0.1])
     with refused(r"of 1 between B0 and world 1 agree"):

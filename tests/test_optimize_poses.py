@@ -62,7 +62,7 @@ def free(problem: Problem) -> np.ndarray:
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam"])
 @pytest.mark.parametrize("dimension", [2, pytest.param(3, marks=pytest.mark.slow)])
-def test_scipy_finds_the_same_minimum_and_covariance(dimension: int, backend: str) -> None:
+def test_scipy_finds_the_same_minimum_and_covariance(dimension, backend):
     problem, truth = everything(dimension)
     found = solve(problem, backend)
     space, movable = problem.space, free(problem).ravel().astype(bool)
@@ -85,7 +85,7 @@ def test_scipy_finds_the_same_minimum_and_covariance(dimension: int, backend: st
     assert found.covariance == pytest.approx(own, abs=1e-9)
 
 
-def test_a_turned_world_turns_the_estimate() -> None:
+def test_a_turned_world_turns_the_estimate():
     """What is measured between bodies does not depend on the world: only the held pose turns, and all with it."""
     graph = small()
     problem = from_graph(graph, start="file")
@@ -106,7 +106,7 @@ def small() -> Graph:
     )
 
 
-def test_exp_and_log_are_scipys() -> None:
+def test_exp_and_log_are_scipys():
     w = np.random.default_rng(0).normal(size=(40, 3))
     w[0] = 0.0
     assert exp(w) == pytest.approx(Rotation.from_rotvec(w).as_matrix(), abs=1e-12)
@@ -114,7 +114,7 @@ def test_exp_and_log_are_scipys() -> None:
     assert log(exp(np.array([[0.3], [-3.0]]))) == pytest.approx(np.array([[0.3], [-3.0]]))
 
 
-def test_full_covariances_weigh_as_their_inverse() -> None:
+def test_full_covariances_weigh_as_their_inverse():
     cov = np.array([[4.0, 1.0, 0], [1.0, 2.0, 0.5], [0, 0.5, 3.0]])
     problem = Problem(("a",)).add("position", "a", [1.0, 2, 3], cov=cov)
     gap = np.array([1.0, -2.0, 0.5])
@@ -139,13 +139,13 @@ WRONG = {
 
 
 @pytest.mark.parametrize("case", WRONG)
-def test_wrong_input_says_what_to_do(case: str) -> None:
+def test_wrong_input_says_what_to_do(case):
     call, words = WRONG[case]
     with refused(words):
         call()
 
 
-def test_mrclam5a_reaches_the_reference() -> None:
+def test_mrclam5a_reaches_the_reference():
     """An independent Levenberg-Marquardt reached 69.10 and 0.214 m; CORA's log has 75.28."""
     graph = load_graph(measured("mrclam5a.pyfg"))
     found = solve(from_graph(graph))
@@ -153,7 +153,7 @@ def test_mrclam5a_reaches_the_reference() -> None:
     assert alignment_error(found.position[graph.is_pose], graph.position[graph.is_pose]) <= 0.25
 
 
-def test_a_graph_without_its_gauge_names_what_is_free() -> None:
+def test_a_graph_without_its_gauge_names_what_is_free():
     problem = from_graph(load_graph(measured("factor_graph_small.pyfg")))
     loose = Problem(problem.names, problem.factors, problem.x0, dimension=2, poses=problem.poses)
     found = solve(loose, throw=False)
@@ -162,7 +162,7 @@ def test_a_graph_without_its_gauge_names_what_is_free() -> None:
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "casadi"])
-def test_offsets_that_ranges_share_are_scipys(backend: str) -> None:
+def test_offsets_that_ranges_share_are_scipys(backend):
     """Of two anchors, 2 and -0.4 m, with a point per step: minimum and covariance of a residual written here."""
     rng, steps = np.random.default_rng(4), 120
     path = np.cumsum(rng.normal(0.0, 2.0, (steps, 2)), axis=0)
@@ -192,7 +192,7 @@ def test_offsets_that_ranges_share_are_scipys(backend: str) -> None:
     assert (np.abs(found.x[-2:, 0] - [2.0, -0.4]) < 4 * std).all()
 
 
-def test_an_antenna_stands_at_the_end_of_its_arm() -> None:
+def test_an_antenna_stands_at_the_end_of_its_arm():
     turn, at, arm = Rotation.from_rotvec([0.3, -0.2, 2.0]), np.array([5.0, 1.0, -2.0]), np.array([1.5, -0.6, 0.3])
     x = np.stack([pose(at, turn.as_rotvec()), pose(arm, np.zeros(3))])
     problem = Problem(("car", "arm"), x0=x, poses=["car"]).add("antenna", ("car", "arm"), np.zeros(3), std=1.0)

@@ -8,20 +8,19 @@ import pytest
 from conftest import refused
 from oracles.whitened import whitened
 
-from coopoc import V2X, Fleet, NoiseModel, Sensors, load_fleet, observe
+from coopoc import V2X, NoiseModel, Sensors, load_fleet, observe
 from coopoc.optimize import Factor, Loss, Problem, SolveError, Status, pose, solve
 from coopoc.optimize.convex.qcqp import quadratic
 from coopoc.optimize.model.window import relative_std
 from coopoc.optimize.starts.initial import initial_guess
 from coopoc.world.links import to_vector, vector_cov
-from coopoc.world.recording import Recording
 
 S2 = Sensors.paper_scenario2()
 PAIR = Problem(("a", "b")).add("position", ["a", "b"], [[0, 0, 0], [9, 0, 0]], std=1.0)
 
 
 @pytest.fixture(scope="module")
-def recording(crossing: Fleet) -> Recording:
+def recording(crossing):
     return observe(crossing, S2, V2X(max_neighbours=4, radius=60), runs=3)
 
 
@@ -36,7 +35,7 @@ def mixed(seed: int = 0) -> Problem:
     return p.add("inclination", ("a", "d"), 1.4, std=0.1)
 
 
-def test_jacobian_equals_casadis() -> None:
+def test_jacobian_equals_casadis():
     problem = mixed()
     x = ca.SX.sym("x", 3, 4)
     residual = whitened(problem, x)
@@ -48,7 +47,7 @@ def test_jacobian_equals_casadis() -> None:
     assert problem.cost(problem.x0) == pytest.approx(0.5 * r @ r)
 
 
-def test_window_chains_who_stays(recording: Recording) -> None:
+def test_window_chains_who_stays(recording):
     problem = Problem.from_window(recording, step=20, ego=0, length=4)
     moved = next(f for f in problem.factors if f.kind == "displacement")
     for (i, j), z in zip(moved.nodes, moved.z, strict=True):
@@ -62,7 +61,7 @@ def test_window_chains_who_stays(recording: Recording) -> None:
     assert [problem.names[h] for h in problem.separator] == [f"c0@{s}" for s in range(17, 21)]
 
 
-def test_the_noise_model_sets_the_weights(recording: Recording) -> None:
+def test_the_noise_model_sets_the_weights(recording):
     nominal = Problem.from_window(recording, 20, 0, 3)
     stated = Problem.from_window(recording, 20, 0, 3, noise=NoiseModel.nominal(S2))
     x = np.random.default_rng(0).normal(size=(len(nominal.names), 3)) * 30
@@ -72,7 +71,7 @@ def test_the_noise_model_sets_the_weights(recording: Recording) -> None:
     assert all((f.std == 1).all() for f in identity.factors)
 
 
-def test_a_range_below_the_gate_widens_its_angles(recording: Recording) -> None:
+def test_a_range_below_the_gate_widens_its_angles(recording):
     """The tangential std in metres is that at min_range, as in the converted covariance (vector_cov)."""
     near = np.array([[0.5, 0.3, 1.5]])
     std = relative_std(near, S2)[0]
@@ -81,7 +80,7 @@ def test_a_range_below_the_gate_widens_its_angles(recording: Recording) -> None:
     assert relative_std(near * [10, 1, 1], S2).shape == (3,)
 
 
-def test_infinite_std_is_no_measurement() -> None:
+def test_infinite_std_is_no_measurement():
     with_blank = PAIR.add("spherical", ("a", "b"), [9.5, 0.1, 1.5], std=np.inf).add("range", ("a", "b"), 10, std=1.0)
     without = PAIR.add("range", ("a", "b"), 10, std=1.0)
     for backend in ("gauss-newton", "gtsam", "osqp"):
@@ -143,7 +142,7 @@ BAD = {
 
 
 @pytest.mark.parametrize("case", BAD, ids=str)
-def test_wrong_input_says_what_to_do(case: str) -> None:
+def test_wrong_input_says_what_to_do(case):
     wrong, words = BAD[case]
     with refused(words) as caught:
         wrong()
@@ -161,20 +160,20 @@ def test_wrong_input_says_what_to_do(case: str) -> None:
         ((5, 0, 1, 3), "run"),
     ],
 )
-def test_a_window_that_does_not_exist(recording: Recording, arguments: tuple[int, ...], field: str) -> None:
+def test_a_window_that_does_not_exist(recording, arguments, field):
     with refused(field):
         Problem.from_window(recording, *arguments)
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
-def test_the_limit_of_iterations_is_an_error_with_the_solution(backend: str) -> None:
+def test_the_limit_of_iterations_is_an_error_with_the_solution(backend):
     with pytest.raises(SolveError, match="limit of iterations") as caught:
         solve(mixed(), backend, max_iterations=1)
     assert caught.value.solution.status is Status.MAX_ITERATIONS
     assert solve(mixed(), backend, throw=False, max_iterations=1).status is Status.MAX_ITERATIONS
 
 
-def test_a_start_is_the_least_squares_of_the_converted_vectors(recording: Recording) -> None:
+def test_a_start_is_the_least_squares_of_the_converted_vectors(recording):
     """Against NumPy's least squares with vectors d u and vector_cov; ranges and losses have no part in it."""
     star = Problem.from_snapshot(recording, 20, 0)
     fixes, edges = star.factors
@@ -198,7 +197,7 @@ def test_a_start_is_the_least_squares_of_the_converted_vectors(recording: Record
     assert initial_guess(problem).ravel() == pytest.approx(wanted, abs=1e-5)
 
 
-def test_fine_measurements_do_not_hide_what_is_free() -> None:
+def test_fine_measurements_do_not_hide_what_is_free():
     """What rounding leaves of J^T J along a free direction looks like a variance of 1e-8 m^2."""
     for fine in np.random.default_rng(0).uniform(1e-4, 2e-4, (60, 3, 3)):
         free = Problem("ab").add("displacement", [(0, 1)] * 3, fine, std=fine)
@@ -206,7 +205,7 @@ def test_fine_measurements_do_not_hide_what_is_free() -> None:
 
 
 @pytest.mark.parametrize("backend", ["gauss-newton", "gtsam", "osqp"])
-def test_a_point_that_can_turn_around_another_is_free(backend: str) -> None:
+def test_a_point_that_can_turn_around_another_is_free(backend):
     """One range leaves two of its three directions open, and the rounding of J^T J does not hide it."""
     rng = np.random.default_rng(0)
     for _ in range(20):
@@ -220,7 +219,7 @@ def test_a_point_that_can_turn_around_another_is_free(backend: str) -> None:
 
 
 @pytest.fixture(scope="module")
-def incomplete() -> Recording:
+def incomplete():
     """Half of the fixes are missing; of the relative measurements some all, some the azimuth, some the range."""
     fleet = load_fleet("town10").between(0, 30)
     seen = observe(fleet, Sensors.paper_scenario2(), V2X.ideal(6), runs=4, observers=[5])
@@ -234,7 +233,7 @@ def incomplete() -> Recording:
 
 
 @pytest.mark.parametrize("noise", [None, NoiseModel.identity()])
-def test_what_is_missing_is_no_factor(incomplete: Recording, noise: NoiseModel | None) -> None:
+def test_what_is_missing_is_no_factor(incomplete, noise):
     """A window by hand from each number that is there; SciPy's trust region finds the same minimum."""
     steps, solved = range(16, 21), 0
     sensors = incomplete.sensors
@@ -268,7 +267,7 @@ def test_what_is_missing_is_no_factor(incomplete: Recording, noise: NoiseModel |
 
 
 @pytest.mark.parametrize("poses", [(), (1,), (0, 2)])
-def test_a_point_among_poses_has_no_rotation_to_move(poses: tuple[int, ...]) -> None:
+def test_a_point_among_poses_has_no_rotation_to_move(poses):
     x0 = pose(np.zeros((3, 2))) if poses else np.zeros((3, 2))
     problem = Problem("abc", x0=x0, dimension=2, poses=poses)
     wanted = np.full(3, 2) + np.isin(range(3), poses)

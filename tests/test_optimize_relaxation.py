@@ -123,7 +123,7 @@ def tangent(form: Quadratic, X: Floats, V: Floats) -> Floats:
 
 
 @pytest.mark.parametrize("name", ["single_range", "single_rpm", "small_ra_slam_problem"])
-def test_matrices_are_coras(name: str) -> None:
+def test_matrices_are_coras(name):
     """Data matrix, lifted truth, gradients, certificate matrix and Hessian product that CORA's own tests expect."""
     form, problem, expected = cora(name)
     Q = (form.rows.T @ form.rows).toarray()
@@ -149,7 +149,7 @@ def test_matrices_are_coras(name: str) -> None:
 
 @pytest.mark.parametrize("up", [1.0, UP])
 @pytest.mark.parametrize("d", [2, 3])
-def test_the_bound_is_that_of_the_programme_written_out(d: int, up: float) -> None:
+def test_the_bound_is_that_of_the_programme_written_out(d, up):
     """Matrix form (d + m rows) and stacked form have the value of [1; t; s][1; t; s]^T, solved by CVXPY."""
     for seed in range(3):
         problem = swarm(seed, d, vehicles=3, up=up)
@@ -170,7 +170,7 @@ def test_the_bound_is_that_of_the_programme_written_out(d: int, up: float) -> No
     ],
 )
 @pytest.mark.parametrize("seed", range(3))
-def test_no_point_beats_the_bounds(make: Any, seed: int) -> None:
+def test_no_point_beats_the_bounds(make, seed):
     """Random points, minima from random starts and the solution all cost at least what each relaxation says."""
     problem = make(seed)
     began = time.perf_counter()
@@ -193,7 +193,7 @@ def test_no_point_beats_the_bounds(make: Any, seed: int) -> None:
 
 @pytest.mark.parametrize("make", [swarm, partial(swarm, d=2), partial(swarm, up=UP), partial(two_robots, prior=True)])
 @pytest.mark.parametrize("seed", range(2))
-def test_tight_relaxations_reach_what_brute_force_reaches(make: Any, seed: int) -> None:
+def test_tight_relaxations_reach_what_brute_force_reaches(make, seed):
     """scipy.optimize.least_squares from random starts finds nothing better, and its best is our solution."""
     problem = make(seed)
     relaxed = shor(problem)
@@ -208,7 +208,7 @@ def test_tight_relaxations_reach_what_brute_force_reaches(make: Any, seed: int) 
 @pytest.mark.parametrize(
     "make", [two_robots, partial(two_robots, d=3), partial(two_robots, fixed=True), swarm, partial(swarm, up=UP)]
 )
-def test_the_elimination_is_numpys(make: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_the_elimination_is_numpys(make, monkeypatch):
     """C and its products by numpy.linalg.lstsq, eigenvalues by eigh and by Lanczos."""
     form = quadratic(make(0))
     small, A = Reduced(form), form.rows.toarray()
@@ -231,7 +231,7 @@ def test_the_elimination_is_numpys(make: Any, monkeypatch: pytest.MonkeyPatch) -
     assert a == pytest.approx(b, rel=1e-7)
 
 
-def test_the_backend_is_held_to_the_same_check_as_the_others() -> None:
+def test_the_backend_is_held_to_the_same_check_as_the_others():
     """`solve` recomputes cost, gradient and status: gauss-newton's answer, and the bound in the extras."""
     for problem in (swarm(0), swarm(1, d=2), replace(swarm(2), factors=swarm(2).factors[:1])):
         ours, theirs = solve(problem), solve(problem, "cvxpy")
@@ -243,7 +243,7 @@ def test_the_backend_is_held_to_the_same_check_as_the_others() -> None:
         solve(swarm(0), "cvxpy", max_iterations=3)
 
 
-def test_what_has_no_relaxation_is_refused() -> None:
+def test_what_has_no_relaxation_is_refused():
     problem = swarm(0)
     with refused("not quadratic: it must be one of"):
         shor(problem.add("azimuth", ("v0", "v1"), 0.1, 0.1))
@@ -271,7 +271,7 @@ def minima(problem: Problem, starts: int = 15) -> list[Solution]:
 
 
 @pytest.mark.parametrize("seed", [1, 2, 6])
-def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed: int) -> None:
+def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed):
     """Gauss-Newton reports SOLVED at both; scipy.optimize.least_squares finds nothing below the certified one."""
     problem = tightness.anchored(seed, 4, 2, 2, 0.1)
     best, *others = minima(problem)
@@ -294,7 +294,7 @@ def test_a_local_minimum_is_refused_where_the_global_one_is_certified(seed: int)
         assert found.cost >= verdict.lower_bound * (1 - 1e-9)
 
 
-def test_the_eigenvalue_is_that_of_the_whole_matrix() -> None:
+def test_the_eigenvalue_is_that_of_the_whole_matrix():
     """Schur complement and Q - diag(L, 0) are indefinite together; numpy.linalg.eigvalsh on the latter."""
     for seed in range(4):
         problem = tightness.anchored(seed, 4, 2, 2, 0.1)
@@ -314,7 +314,7 @@ def test_the_eigenvalue_is_that_of_the_whole_matrix() -> None:
             assert (np.linalg.eigvalsh(S)[0] < -tolerance) == (smallest < -tolerance)
 
 
-def test_the_example_tells_local_from_global(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_example_tells_local_from_global(capsys):
     rows = range_only.main()
     printed = capsys.readouterr().out
     assert printed.count("\n") == len(rows) + 3

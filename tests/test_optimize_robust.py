@@ -19,7 +19,7 @@ GTSAMS = {"huber": M.Huber, "cauchy": M.Cauchy, "geman-mcclure": M.GemanMcClure,
 
 @pytest.mark.parametrize("name", GTSAMS)
 @pytest.mark.parametrize("scale", [0.4, 1.3])
-def test_losses_and_weights_are_gtsams(name: str, scale: float) -> None:
+def test_losses_and_weights_are_gtsams(name, scale):
     r = np.array([0.0, 0.1, 0.39, 0.41, 1.29, 1.31, 3.0, 50.0])
     ours, theirs = Loss(name, scale), GTSAMS[name].Create(scale)
     assert ours.cost(r**2) == pytest.approx([2 * theirs.loss(v) for v in r], rel=1e-12)
@@ -68,7 +68,7 @@ def values(x: np.ndarray) -> gtsam.Values:
 
 
 @pytest.mark.parametrize("name", GTSAMS)
-def test_a_robust_problem_costs_what_it_costs_in_gtsam(name: str) -> None:
+def test_a_robust_problem_costs_what_it_costs_in_gtsam(name):
     """The cost, and J^T r as its gradient (SciPy's differences)."""
     problem = native(0, wrong=4, loss=Loss(name, 1.5))
     x = problem.x0 + np.random.default_rng(1).normal(0, 0.5, (12, 3))
@@ -100,7 +100,7 @@ def geman_mcclure(s: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("name", LOSSES)
 @pytest.mark.parametrize("seed", range(3))
-def test_scipy_finds_the_same_robust_minimum(name: str, seed: int) -> None:
+def test_scipy_finds_the_same_robust_minimum(name, seed):
     """SciPy's own huber and cauchy (elementwise, rho of (r / C)^2 times C^2), its solver and differences."""
     problem = observed(name, seed)
     plain = replace(problem, factors=tuple(replace(f, loss=None) for f in problem.factors))
@@ -120,7 +120,7 @@ def test_scipy_finds_the_same_robust_minimum(name: str, seed: int) -> None:
     assert ours.x[4:].ravel() == pytest.approx(best.x, abs=1e-5)
 
 
-def test_the_robust_curvature_is_casadis() -> None:
+def test_the_robust_curvature_is_casadis():
     """At random points, minima of the cost or not: newton_decrease says whether CasADi's Hessian is positive."""
     signs = []
     for seed, name in itertools.product(range(8), LOSSES):
@@ -134,7 +134,7 @@ def test_the_robust_curvature_is_casadis() -> None:
 
 
 @pytest.mark.parametrize("wrong", [0, 1, 5, 9])
-def test_gtsam_doubts_the_same_measurements(wrong: int) -> None:
+def test_gtsam_doubts_the_same_measurements(wrong):
     """GncLMOptimizer at the same probability, all but the second fixes known inliers."""
     for seed in range(3):
         problem = native(seed, wrong)
@@ -154,7 +154,7 @@ def test_gtsam_doubts_the_same_measurements(wrong: int) -> None:
         assert ours.cost == pytest.approx(sum(f.error(result) for f in kept), rel=1e-6)
 
 
-def test_geman_mcclure_ends_where_its_loss_is_least() -> None:
+def test_geman_mcclure_ends_where_its_loss_is_least():
     """solve with Loss("geman-mcclure", c) started at the result has nowhere to go, and its cost is GTSAM's GNC's."""
     for seed in range(3):
         problem = native(seed, 5)

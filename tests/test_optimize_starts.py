@@ -49,7 +49,7 @@ def flat_drive(seed: int) -> Problem:
 
 
 @pytest.mark.parametrize("seed", [2, 3, 5])
-def test_landmarks_beside_a_plane_are_mirrored(seed: int) -> None:
+def test_landmarks_beside_a_plane_are_mirrored(seed):
     """Each landmark on either side of z = 0, all eight, solved on: none is lower, and that they compete is said."""
     problem = flat_drive(seed)
     found, costs = solve(problem), list[float]()
@@ -61,7 +61,7 @@ def test_landmarks_beside_a_plane_are_mirrored(seed: int) -> None:
     assert any("minimum" in note for note in found.notes) == (sorted(costs)[1] < found.cost + 10)
 
 
-def test_ranges_that_are_eased_lead_from_bad_odometry() -> None:
+def test_ranges_that_are_eased_lead_from_bad_odometry():
     """As low as from the truth, which the graph does not hold."""
     w, rng = world(2, 2, 2, 250), np.random.default_rng(2)
     pairs = np.sort(rng.integers(0, 500, (500, 2)), axis=1)
@@ -77,7 +77,7 @@ def test_ranges_that_are_eased_lead_from_bad_odometry() -> None:
 @pytest.mark.parametrize(
     "case", ["ranges", "ranges and azimuths", "an offset", "fixes of all", "a wrong fix", "inclinations"]
 )
-def test_ambiguous_points_end_at_the_lowest_minimum(case: str) -> None:
+def test_ambiguous_points_end_at_the_lowest_minimum(case):
     """SciPy from 12 random starts, 6 draws of each; a lower minimum is left once, with a note, at most."""
     left, loss = 0, Loss("truncated", 3.0) if case == "a wrong fix" else None
     for seed in range(6):
@@ -126,7 +126,7 @@ def outliers(seed: int) -> tuple[Problem, Floats, Floats]:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_robust_solves_find_what_the_truth_leads_to(seed: int) -> None:
+def test_robust_solves_find_what_the_truth_leads_to(seed):
     problem, truth, bad = outliers(seed)
 
     def truncated(x: Floats) -> float:
@@ -143,7 +143,7 @@ def test_robust_solves_find_what_the_truth_leads_to(seed: int) -> None:
     assert solve(lossy, throw=False).cost <= best.cost * (1 + 1e-6)
 
 
-def test_rejecting_a_quarter_is_doubtful() -> None:
+def test_rejecting_a_quarter_is_doubtful():
     """Closed form: of 8 fixes of a point 3 are 50 m off."""
     z = np.zeros((8, 3))
     z[:3] = 50.0
@@ -151,14 +151,14 @@ def test_rejecting_a_quarter_is_doubtful() -> None:
     assert solve_gnc(problem, [0]).notes[0].startswith("DOUBTFUL: GNC rejects 3 of 8 candidates")
 
 
-def test_small_drives_end_as_low_as_restarts_or_say_so() -> None:
+def test_small_drives_end_as_low_as_restarts_or_say_so():
     """Descents from random starts: benchmarks/unseen_graphs.py has fifty."""
     for seed, most in ((1002, 40.0), (1018, 40.0), (5008, 32.1), (88044, 32.0), (95101, 43.0)):
         found = solve(from_graph(ranged_drives(seed)), throw=False)
         assert found.cost < most or found.notes
 
 
-def test_a_walk_counts_beyond_what_32_bits_hold() -> None:
+def test_a_walk_counts_beyond_what_32_bits_hold():
     """Key a n + b of a pair in a graph of 50,000 poses; against the line that is driven."""
     n, d = 50_000, 2
     chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)
@@ -177,7 +177,7 @@ def ring(n: int, wrong: float) -> Graph:
     return Graph(2, names, np.ones(n, bool), nan, np.zeros((n, 1)), relative_pose=moved)
 
 
-def test_the_tree_shares_what_a_loop_does_not_close() -> None:
+def test_the_tree_shares_what_a_loop_does_not_close():
     """Of a ring with equal variances every turn takes the same part; against that closed form."""
     graph = ring(8, 0.4)
     turn = Space(2, has_rotation=True).rotation(tree(graph))
@@ -185,7 +185,7 @@ def test_the_tree_shares_what_a_loop_does_not_close() -> None:
     assert np.arctan2(moved[:, 1, 0], moved[:, 0, 0]) == pytest.approx(2 * np.pi / 8, abs=1e-9)
 
 
-def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors() -> None:
+def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors():
     """Errors of a ring that sum to 1.5 rad, of two thousand that sum to thousands, or to a whole turn."""
     graph, space = ring(2000, 0.0), Space(2, has_rotation=True)
     course = 2 * np.pi * np.arange(2000) / 2000
@@ -199,7 +199,7 @@ def test_a_cycle_that_is_wound_up_is_told_from_many_small_errors() -> None:
         assert unwound(graph, space.join(np.zeros((2000, 2)), exp(turns[:, None]))) is expected
 
 
-def test_a_search_takes_few_steps_of_the_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_search_takes_few_steps_of_the_whole(monkeypatch):
     """Bad odometry and random ranges: most steps move what is new alone; against the descent from the truth."""
     drive, rng, sizes = world(0, 2, 1, 300), np.random.default_rng(1), list[int]()
     pairs = rng.integers(0, 300, (700, 2))

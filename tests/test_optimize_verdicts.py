@@ -21,7 +21,7 @@ def ranged(anchors: Floats, start: Floats, ranges: Floats, std: float) -> Proble
 
 
 @pytest.mark.parametrize(("z", "std"), [(1e308, 1.0), (1.0, 1e-160)])
-def test_an_infinite_cost_is_no_minimum(z: float, std: float) -> None:
+def test_an_infinite_cost_is_no_minimum(z, std):
     found = solve(
         ranged(np.zeros((1, 2)), np.ones(2), np.array([z]), std).add("position", "r", [1, 1], 1.0), throw=False
     )
@@ -30,7 +30,7 @@ def test_an_infinite_cost_is_no_minimum(z: float, std: float) -> None:
 
 
 @pytest.mark.parametrize("seed", range(12))
-def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed: int) -> None:
+def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed):
     """SciPy's curvature by differences of its own cost is the inverse of the covariance."""
     rng = np.random.default_rng(seed)
     angle = rng.uniform(0, np.pi)
@@ -51,7 +51,7 @@ def test_a_robot_on_the_line_of_its_anchors_is_at_a_minimum(seed: int) -> None:
         assert found.covariance[3] == pytest.approx(np.linalg.inv(np.array(hessian) / 4e-6), rel=1e-3)
 
 
-def test_a_saddle_between_two_anchors_is_one() -> None:
+def test_a_saddle_between_two_anchors_is_one():
     """Closed form: ranges of 15 m to anchors 10 m apart are met 14.1 m off their line."""
     problem = ranged(np.array([[0, 0], [10, 0.0]]), np.array([5, 0.0]), np.full(2, 15.0), 1.0)
     assert solve(problem, throw=False).status is Status.SADDLE
@@ -59,7 +59,7 @@ def test_a_saddle_between_two_anchors_is_one() -> None:
     assert solve(unknown, throw=False).status is Status.RANK_DEFICIENT
 
 
-def test_a_certified_mirror_image_is_not_unique() -> None:
+def test_a_certified_mirror_image_is_not_unique():
     anchors = np.array([[0, 0], [10, 0.0]])
     pair = ranged(anchors, np.array([5, 1.0]), np.array([7, 8.0]), 1.0)
     verdict = certify(pair, solve(pair))
@@ -71,7 +71,7 @@ def test_a_certified_mirror_image_is_not_unique() -> None:
 
 
 @pytest.mark.parametrize("seed", range(8))
-def test_a_lower_bound_is_below_the_cost(seed: int) -> None:
+def test_a_lower_bound_is_below_the_cost(seed):
     """Closed form: the least cost of a chain of fixes by elimination in exact fractions."""
     rng = np.random.default_rng(seed)
     z, u = 1e4 * rng.normal(size=6), rng.normal(size=5)
@@ -95,7 +95,7 @@ def held(lower: float) -> Solution:
     return solve(Problem(("a",)).add("position", "a", [0, 0, 0], std=1.0).constrain("position", "a", lower=lower))
 
 
-def test_bounds_that_push_are_no_local_minimum() -> None:
+def test_bounds_that_push_are_no_local_minimum():
     """Closed form: each bound at b costs b^2 / 2."""
     assert not any("cost" in note for note in held(1.5).notes)
     (note,) = (note for note in held(9.0).notes if "cost" in note)
@@ -104,5 +104,5 @@ def test_bounds_that_push_are_no_local_minimum() -> None:
     assert held(-1.0).expected == 0
 
 
-def test_what_is_said_of_many_lines_is_said_once() -> None:
+def test_what_is_said_of_many_lines_is_said_once():
     assert _counted([f"line {k}: repaired" for k in range(5021)]) == ("5021 times, first in line 0: repaired",)

@@ -1,7 +1,6 @@
 """Outliers: their rates, sizes and durations, pairs with clean draws, what an estimator is told, and the bounds."""
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -27,7 +26,7 @@ def seen(fleet: Fleet, outliers: Outliers = ALL, **options: object) -> Recording
 
 
 @pytest.mark.parametrize("lasts", [0.0, 0.7])
-def test_a_fault_has_the_rate_the_size_and_the_duration_that_it_names(lasts: float) -> None:
+def test_a_fault_has_the_rate_the_size_and_the_duration_that_it_names(lasts):
     """The state is redrawn with probability 1 - exp(-dt / lasts), so that it is correlated as a Gauss-Markov error."""
     dt, steps = 0.1, 400_000
     uniform, rare = (episodes(Fault(q, (3, 20), lasts=lasts), (0, "x", 0, "a", "b"), steps, dt) for q in (0.2, 0.05))
@@ -44,7 +43,7 @@ def test_a_fault_has_the_rate_the_size_and_the_duration_that_it_names(lasts: flo
     assert (centred[1:] * centred[:-1]).mean() / centred.var() == pytest.approx(keep, abs=0.02)
 
 
-def test_without_a_rate_nothing_changes_by_a_bit(crossing: Fleet) -> None:
+def test_without_a_rate_nothing_changes_by_a_bit(crossing):
     none = Outliers(ranges=Fault(0.0, (5.0, 6.0), "exponential", 3.0))
     for frame in ("world", "body"):
         clean, same = (seen(crossing, o, frame=frame) for o in (Outliers(), none))
@@ -54,7 +53,7 @@ def test_without_a_rate_nothing_changes_by_a_bit(crossing: Fleet) -> None:
 
 
 @pytest.mark.parametrize("frame", ["world", "body"])
-def test_outliers_are_added_to_the_clean_draws(crossing: Fleet, frame: str) -> None:
+def test_outliers_are_added_to_the_clean_draws(crossing, frame):
     clean, bad = (seen(crossing, o, frame=frame, runs=20) for o in (Outliers(), ALL))
     longer = bad.relative[..., 0] - clean.relative[..., 0]
     hit = longer != 0
@@ -74,7 +73,7 @@ def test_outliers_are_added_to_the_clean_draws(crossing: Fleet, frame: str) -> N
     assert [note.split()[0] for note in bad.notes] == ["5", "2", "10", "5", "10"]
 
 
-def test_a_slip_is_a_share_of_the_true_motion(crossing: Fleet) -> None:
+def test_a_slip_is_a_share_of_the_true_motion(crossing):
     clean, bad = (seen(crossing, o, runs=20) for o in (Outliers(), ALL))
     speed = np.linalg.norm(crossing.velocity, axis=-1)
     share = np.einsum("rtni,tni->rtn", bad.velocity - clean.velocity, crossing.velocity) / speed**2
@@ -85,7 +84,7 @@ def test_a_slip_is_a_share_of_the_true_motion(crossing: Fleet) -> None:
     assert bad.velocity - clean.velocity == pytest.approx(share[..., None] * crossing.velocity, abs=1e-9)
 
 
-def test_a_wrong_association_is_the_direction_of_the_nearest_other_vehicle(crossing: Fleet) -> None:
+def test_a_wrong_association_is_the_direction_of_the_nearest_other_vehicle(crossing):
     exact = replace(S2, range_std=1e-9, azimuth_std=1e-9, inclination_std=1e-9)
     v2x = V2X(max_neighbours=4)
     clean, bad = (
@@ -104,7 +103,7 @@ def test_a_wrong_association_is_the_direction_of_the_nearest_other_vehicle(cross
         assert direction[run, link] == pytest.approx(expected, abs=1e-6)
 
 
-def test_a_range_past_an_obstacle_is_too_long_for_both_vehicles(crossing: Fleet) -> None:
+def test_a_range_past_an_obstacle_is_too_long_for_both_vehicles(crossing):
     clean, bad = (seen(crossing, o) for o in (Outliers(), Outliers(ranges=Fault(0.3, (3.0, 20.0), lasts=1.0))))
     late = {
         (r, int(bad.links.step[k]), int(bad.links.observer[k]), int(bad.links.neighbour[k])): value
@@ -116,7 +115,7 @@ def test_a_range_past_an_obstacle_is_too_long_for_both_vehicles(crossing: Fleet)
     assert all(late[one] == pytest.approx(late[other], abs=1e-9) for one, other in both)
 
 
-def test_draws_are_keyed_by_what_they_belong_to(crossing: Fleet) -> None:
+def test_draws_are_keyed_by_what_they_belong_to(crossing):
     """30 runs are a prefix of 100, a shorter drive of a longer one, K = 2 of K = 4; and one kind changes no other."""
     base = seen(crossing, runs=5)
     fewer, shorter = seen(crossing, runs=2), seen(crossing.between(0, 30), runs=2)
@@ -134,7 +133,7 @@ def test_draws_are_keyed_by_what_they_belong_to(crossing: Fleet) -> None:
 
 
 @pytest.mark.parametrize("frame", ["world", "body"])
-def test_what_is_told_is_what_differs_from_the_clean_recording(crossing: Fleet, frame: str) -> None:
+def test_what_is_told_is_what_differs_from_the_clean_recording(crossing, frame):
     clean, bad, told = (
         seen(crossing, o, frame=frame, remove_outliers=t) for o, t in ((Outliers(), 0 > 1), (ALL, 0 > 1), (ALL, True))
     )
@@ -162,12 +161,12 @@ def test_what_is_told_is_what_differs_from_the_clean_recording(crossing: Fleet, 
         (lambda: Outliers.named("ranges"), "ranges"),
     ],
 )
-def test_a_wrong_setting_is_named(make: object, field: str) -> None:
+def test_a_wrong_setting_is_named(make, field):
     with refused(field):
         make()  # type: ignore[operator]
 
 
-def test_settings_of_studies_name_presets_and_rates() -> None:
+def test_settings_of_studies_name_presets_and_rates():
     assert Outliers.named("") == Outliers()
     found = Outliers.named("urban_canyon+uwb_nlos+angles=0.01")
     assert (found.fixes, found.ranges) == (Outliers.urban_canyon().fixes, Outliers.uwb_nlos().ranges)
@@ -182,7 +181,7 @@ def test_settings_of_studies_name_presets_and_rates() -> None:
     )
 
 
-def test_a_recording_that_assumes_outliers_is_saved_with_them(crossing: Fleet, tmp_path: Path) -> None:
+def test_a_recording_that_assumes_outliers_is_saved_with_them(crossing, tmp_path):
     base = seen(crossing.between(0, 3))
     kept = replace(base, sensors=replace(base.sensors, outliers=ALL))
     save_recording(kept, tmp_path / "kept.npz")

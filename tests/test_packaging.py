@@ -32,14 +32,14 @@ def closure(names: list[str]) -> set[str]:
     return found
 
 
-def test_every_action_is_pinned_by_its_commit_and_one_commit_each() -> None:
+def test_every_action_is_pinned_by_its_commit_and_one_commit_each():
     used = [line.strip(" -") for path in WORKFLOWS for line in path.read_text().splitlines() if "uses:" in line]
     found = {match.groups() for line in used if (match := PINNED.fullmatch(line))}
     assert len(used) == sum(bool(PINNED.fullmatch(line)) for line in used) > 4
     assert len({action for action, _ in found}) == len(found)
 
 
-def test_only_the_job_that_publishes_may_ask_for_a_token() -> None:
+def test_only_the_job_that_publishes_may_ask_for_a_token():
     release = yaml.safe_load((ROOT / ".github" / "workflows" / "release.yml").read_text())
     jobs = release["jobs"]
     assert release[True] == {"push": {"tags": ["v[0-9]+.[0-9]+.[0-9]+"]}}  # YAML 1.1 reads "on" as true
@@ -54,7 +54,7 @@ def test_only_the_job_that_publishes_may_ask_for_a_token() -> None:
     assert "secrets." not in (ROOT / ".github" / "workflows" / "release.yml").read_text()
 
 
-def test_every_package_that_is_installed_is_pinned() -> None:
+def test_every_package_that_is_installed_is_pinned():
     needed = [Requirement(text).name for text in PROJECT["dependencies"]]
     missing = closure(needed) - set(pins())
     assert missing == set()
@@ -62,7 +62,7 @@ def test_every_package_that_is_installed_is_pinned() -> None:
     assert (ROOT / "Makefile").read_text().count("\t$(PIP) pip\n") == 1
 
 
-def test_the_conda_recipe_needs_what_the_wheel_needs() -> None:
+def test_the_conda_recipe_needs_what_the_wheel_needs():
     recipe = yaml.safe_load((ROOT / ".ci" / "conda" / "recipe.yaml").read_text())
     python, *run = recipe["requirements"]["run"]
     assert python == "python >=${{ python_min }}"
@@ -73,7 +73,7 @@ def test_the_conda_recipe_needs_what_the_wheel_needs() -> None:
     assert recipe["about"]["license_file"] == PROJECT["license-files"]
 
 
-def test_the_image_and_the_editor_run_targets_that_are_there() -> None:
+def test_the_image_and_the_editor_run_targets_that_are_there():
     image = (ROOT / "Dockerfile").read_text()
     editor = json.loads((ROOT / ".devcontainer" / "devcontainer.json").read_text())
     bases = re.findall(r"^FROM (\S+) AS (\w+)", image, re.MULTILINE)
@@ -88,6 +88,6 @@ def test_the_image_and_the_editor_run_targets_that_are_there() -> None:
         assert re.search(rf"^{re.escape(target)}:", made, re.MULTILINE), target
 
 
-def test_the_tag_of_a_release_is_looked_up_as_it_stands() -> None:
+def test_the_tag_of_a_release_is_looked_up_as_it_stands():
     """The workflow searches this line for the version of the tag."""
     assert (ROOT / "pyproject.toml").read_text().splitlines().count(f'version = "{PROJECT["version"]}"') == 1

@@ -60,14 +60,14 @@ def close(shown: str, found: str) -> bool:
 
 
 @pytest.mark.parametrize("page", HERE)
-def test_the_python_of_a_page_prints_what_the_page_shows(page: str, tmp_path: Path) -> None:
+def test_the_python_of_a_page_prints_what_the_page_shows(page, tmp_path):
     shown = "".join(output for _, output in blocks(page)).splitlines()
     found = printed(page, tmp_path).splitlines()
     pairs = list(zip_longest(shown, found, fillvalue=""))
     assert [(a, b) for a, b in pairs if not agree(a, b)] == []
 
 
-def test_every_page_with_python_is_run() -> None:
+def test_every_page_with_python_is_run():
     pages = [
         path.stem for path in (ROOT / "README.md", *(ROOT / "docs").glob("*.md")) if "```python" in path.read_text()
     ]

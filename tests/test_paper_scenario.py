@@ -32,7 +32,7 @@ def published(most: int, method: str, noise_model: str) -> tuple[float, float]:
         pytest.param(10, marks=pytest.mark.slow),
     ],
 )
-def test_an_independent_simulation_gives_the_published_errors(most: int) -> None:
+def test_an_independent_simulation_gives_the_published_errors(most):
     fleet = co.load_fleet("town10")
     draws = [np.random.default_rng([most, ego]) for ego in range(0, 60, 12)]
     errors = [simulate(fleet.position, fleet.velocity, 12 * k, most, rng) for k, rng in enumerate(draws)]

@@ -4,7 +4,6 @@ import csv
 import io
 import re
 import unicodedata
-from pathlib import Path
 
 import matplotlib
 import numpy as np
@@ -32,12 +31,12 @@ from coopoc.world.pictures import ellipses
 
 
 @pytest.fixture(scope="module")
-def seen() -> tuple[co.Fleet, co.Recording]:
+def seen():
     fleet = co.load_fleet("town10").between(0, 60)
     return fleet, co.observe(fleet, co.Sensors.paper_scenario2(), co.V2X(4), runs=2, seed=0, observers=[24, 3])
 
 
-def test_an_ellipse_holds_95_percent() -> None:
+def test_an_ellipse_holds_95_percent():
     """Independent check: chi-square of SciPy, and points drawn by NumPy."""
     cov = np.array([[4.0, 1.5], [1.5, 1.0]])
     ax = Figure().add_subplot()
@@ -49,7 +48,7 @@ def test_an_ellipse_holds_95_percent() -> None:
     assert ((along**2).sum(axis=1) < 1).mean() == pytest.approx(0.95, abs=0.005)
 
 
-def test_a_recording_shows_its_fixes_and_links(seen: tuple[co.Fleet, co.Recording]) -> None:
+def test_a_recording_shows_its_fixes_and_links(seen):
     _fleet, recording = seen
     ax = co.plot_recording(recording, run=1, step=20)
     np.testing.assert_array_equal(ax.lines[7].get_xydata(), recording.gnss[1, :, 7, :2])
@@ -59,7 +58,7 @@ def test_a_recording_shows_its_fixes_and_links(seen: tuple[co.Fleet, co.Recordin
     assert co.plot_recording(recording, again) is again
 
 
-def test_a_notebook_shows_a_picture_without_pyplot(seen: tuple[co.Fleet, co.Recording]) -> None:
+def test_a_notebook_shows_a_picture_without_pyplot(seen):
     """IPython's own formatter makes a PNG of the figure; a plain Figure gives text alone."""
     formatters = pytest.importorskip("IPython.core.formatters", reason="pip install ipython")
 
@@ -67,7 +66,7 @@ def test_a_notebook_shows_a_picture_without_pyplot(seen: tuple[co.Fleet, co.Reco
     assert shown["image/png"].startswith(b"\x89PNG")
 
 
-def test_a_track_shows_paths_and_truth(seen: tuple[co.Fleet, co.Recording]) -> None:
+def test_a_track_shows_paths_and_truth(seen):
     fleet, recording = seen
     track = co.JointFilter("nominal")(recording, [24, 3])
     ax = co.plot_track(track, fleet=fleet, every=20)
@@ -85,9 +84,7 @@ def test_a_track_shows_paths_and_truth(seen: tuple[co.Fleet, co.Recording]) -> N
         ({"ax": "here"}, r"ax = 'here': must be axes of matplotlib"),
     ],
 )
-def test_what_cannot_be_drawn_is_named(
-    seen: tuple[co.Fleet, co.Recording], options: dict[str, object], message: str
-) -> None:
+def test_what_cannot_be_drawn_is_named(seen, options, message):
     with refused(message):
         co.plot_recording(seen[1], **options)  # type: ignore[arg-type]
 
@@ -121,13 +118,13 @@ def words(figure: Figure) -> str:
 
 
 @pytest.fixture(autouse=True)
-def text_as_text(monkeypatch: pytest.MonkeyPatch) -> None:
+def text_as_text(monkeypatch):
     """In SVG, where matplotlib draws letters as paths otherwise."""
     monkeypatch.setitem(matplotlib.rcParams, "svg.fonttype", "none")
 
 
 @pytest.mark.parametrize("kind", NAMES)
-def test_pictures_show_names_as_text(kind: str, tmp_path: Path) -> None:
+def test_pictures_show_names_as_text(kind, tmp_path):
     """Of recordings, tracks, logs and studies; the name is in the legend, whatever it holds."""
     name, t = NAMES[kind], np.arange(40) / 10
     position = np.stack([np.column_stack([8 * t, y + 0 * t, 0 * t]) for y in (0.0, 9.0)], axis=1)
@@ -154,7 +151,7 @@ def test_pictures_show_names_as_text(kind: str, tmp_path: Path) -> None:
         assert shown in re.sub(r"[^\w=]|_", "", plain)
 
 
-def test_a_convoy_in_a_tunnel_is_seen_in_the_picture_of_its_log(tmp_path: Path) -> None:
+def test_a_convoy_in_a_tunnel_is_seen_in_the_picture_of_its_log(tmp_path):
     """Two lanes of 4 km with 20 s without fixes: lanes are apart, and so are the two parts of each row."""
     path = tmp_path / f"{'motorway' * 12}.csv"
     rows = [f"{t},car{k},{100 * t},{3.5 * k + t % 2}" for k in range(2) for t in range(40) if not 10 < t < 30]
@@ -167,7 +164,7 @@ def test_a_convoy_in_a_tunnel_is_seen_in_the_picture_of_its_log(tmp_path: Path) 
 
 
 @pytest.mark.parametrize("kind", UNPRINTABLE)
-def test_no_vehicle_has_a_name_that_acts_on_a_terminal(kind: str) -> None:
+def test_no_vehicle_has_a_name_that_acts_on_a_terminal(kind):
     still = np.zeros((2, 1, 3))
     with refused("must be printable"):
         co.Fleet((UNPRINTABLE[kind],), [0.0, 0.1], still, still)
@@ -177,7 +174,7 @@ def cell(p: Params) -> list[Row]:
     return [{"run": run, "ego": p["name"], "rt_le_m": 1.0 + run} for run in range(2)]
 
 
-def test_pages_and_tables_show_names_as_text(tmp_path: Path) -> None:
+def test_pages_and_tables_show_names_as_text(tmp_path):
     def table(results: Results) -> Table:
         rows = tuple((name, 1.0, f"{name} [m]") for name in ALL.values())
         return Table(("Name", "RT-LE", r"$\input{x}$"), rows, " ".join(ALL.values()), notes=tuple(ALL.values()))
@@ -203,7 +200,7 @@ def test_pages_and_tables_show_names_as_text(tmp_path: Path) -> None:
     assert not {name.strip("./") for name in ALL.values()} & {path.name for path in tmp_path.rglob("*")}
 
 
-def test_a_solution_shows_nodes_factors_and_headings(seen: tuple[co.Fleet, co.Recording]) -> None:
+def test_a_solution_shows_nodes_factors_and_headings(seen):
     problem = co.Problem.from_snapshot(seen[1], step=10, ego=24)
     solution = co.solve(problem)
     ax = co.plot_solution(solution, problem=problem)

@@ -14,7 +14,6 @@ from coopoc import (
     Fleet,
     JointFilter,
     Kalman,
-    Method,
     Recording,
     Sensors,
     nees,
@@ -39,7 +38,7 @@ STARS = (
 
 
 @pytest.mark.parametrize("method", [*SOLO, *STARS], ids=lambda m: f"{m.name}{getattr(m, 'exact', '')}")
-def test_missing_fixes_cost_and_do_not_crash(crossing: Fleet, method) -> None:  # type: ignore[no-untyped-def]
+def test_missing_fixes_cost_and_do_not_crash(crossing, method):  # type: ignore[no-untyped-def]
     whole = observe(crossing, Sensors(gnss_std=(4, 4, 4)), V2X(4, 80.0), runs=6)
     some, few = (float(rt_le(method(holed(whole, share), [0, 3]), crossing).mean()) for share in (0.0, 0.7))
     assert np.isfinite(few)
@@ -47,7 +46,7 @@ def test_missing_fixes_cost_and_do_not_crash(crossing: Fleet, method) -> None:  
     assert method.name in ("fedkalmannet", "lkf-sa") or few > some
 
 
-def test_a_drive_starts_with_a_fix(crossing: Fleet) -> None:
+def test_a_drive_starts_with_a_fix(crossing):
     seen = observe(crossing, Sensors(), V2X(0), runs=1)
     gnss = seen.gnss.copy()
     gnss[:, 0] = np.nan
@@ -85,7 +84,7 @@ def ranged() -> tuple[Fleet, Recording]:
     ],
     ids=lambda method: f"{method.name}-{getattr(method, 'exact', '')}",
 )
-def test_a_range_to_a_neighbour_whose_first_fix_comes_late_does_no_harm(method: Method) -> None:
+def test_a_range_to_a_neighbour_whose_first_fix_comes_late_does_no_harm(method):
     """Against the Kalman filter alone, and the bound of the same measurements."""
     fleet, seen = ranged()
     bound = bound_rt_le(posterior_bound(fleet, seen.sensors, "ego", seen.v2x, recording=seen))
@@ -100,7 +99,7 @@ NOISE = Sensors(heading_std=0.05)
 BIAS = Sensors(heading_bias_std=0.05)
 
 
-def test_a_heading_turns_all_that_is_seen_at_a_step_alike(crossing: Fleet) -> None:
+def test_a_heading_turns_all_that_is_seen_at_a_step_alike(crossing):
     """Against the same draws without it: azimuths of one observer and step move by one number, nothing else moves."""
     v2x, plain = V2X(4, 80.0), observe(crossing, Sensors(), V2X(4, 80.0), runs=30)
     for sensors, per_step in ((NOISE, True), (BIAS, False)):
@@ -115,7 +114,7 @@ def test_a_heading_turns_all_that_is_seen_at_a_step_alike(crossing: Fleet) -> No
         assert turned.std() == pytest.approx(0.05, rel=0.2)
 
 
-def test_nominal_knowledge_adds_the_heading_to_the_azimuth() -> None:
+def test_nominal_knowledge_adds_the_heading_to_the_azimuth():
     both = replace(NOISE, heading_bias_std=0.12, azimuth_std=0.0)
     known = NoiseModel.nominal(replace(both, azimuth_std=1e-12))
     assert known.sensors is not None

@@ -54,7 +54,7 @@ def with_masts(fleet: co.Fleet) -> co.Fleet:
 
 
 @pytest.fixture(scope="module")
-def rough(crossing: co.Fleet) -> co.Recording:
+def rough(crossing):
     """Vehicle 1 is away for a while, vehicle 2 comes late."""
     position, velocity = crossing.position.copy(), crossing.velocity.copy()
     for column, away in ((1, slice(25, 30)), (2, slice(0, 10))):
@@ -66,7 +66,7 @@ def rough(crossing: co.Fleet) -> co.Recording:
 @pytest.mark.parametrize(
     ("kind", "d", "exact"), [("solo", 6, False), ("fleet", 4, True), ("fleet", 6, False), ("fleet", 7, True)]
 )
-def test_the_kernel_is_the_dense_oracle(rough: co.Recording, kind: str, d: int, exact: bool) -> None:
+def test_the_kernel_is_the_dense_oracle(rough, kind, d, exact):
     """Gaps, losses, members that come and go, landmarks, range only and bearing only."""
     mine = rough.links.of(0)
     members = [0] if kind == "solo" else list(range(8))
@@ -87,7 +87,7 @@ def test_the_kernel_is_the_dense_oracle(rough: co.Recording, kind: str, d: int, 
 
 
 @pytest.mark.parametrize("neighbours", [0, 3])
-def test_with_a_perfect_heading_it_is_the_position_filter(neighbours: int, formation: co.Fleet) -> None:
+def test_with_a_perfect_heading_it_is_the_position_filter(neighbours, formation):
     """Same draws turned into the world by the exact compass: alone it is the Kalman filter, together near the bound of
     all positions."""
     drive = formation.select(range(4)).between(0, 200)
@@ -101,7 +101,7 @@ def test_with_a_perfect_heading_it_is_the_position_filter(neighbours: int, forma
     assert 1.0 < np.square(co.rt_le(here, drive)).mean() / square < 1.2
 
 
-def test_a_fleet_is_filterpys_extended_kalman_filter(formation: co.Fleet) -> None:
+def test_a_fleet_is_filterpys_extended_kalman_filter(formation):
     """filterpy's predict and update with this model's derivatives, four members, 40 steps."""
     filterpy = pytest.importorskip("filterpy.kalman")
     drive = formation.select(range(4)).between(0, 40)
@@ -143,7 +143,7 @@ def test_a_fleet_is_filterpys_extended_kalman_filter(formation: co.Fleet) -> Non
         assert np.allclose(track.covariance[0, t, 0], ekf.P[:3, :3], rtol=1e-4, atol=1e-7)  # type: ignore[index]
 
 
-def test_it_is_as_good_as_the_dense_iterated_filter(crossing: co.Fleet) -> None:
+def test_it_is_as_good_as_the_dense_iterated_filter(crossing):
     """Ten Gauss-Newton steps of the dense oracle, where headings are vague beside ranges and bearings."""
     drive, runs = crossing.select(range(4)), 3
     sharp = replace(NOISE, gnss_std=(3.5,) * 3, heading_std=0.09, speed_scale_std=0.0, yaw_rate_bias_std=0.0)
@@ -183,7 +183,7 @@ def own_of(recording: co.Recording, run: int, t: int, column: int) -> co.OwnMeas
 
 
 @pytest.mark.parametrize("how", [{}, {"lasting": True, "exact": False, "gate": 3.0}])
-def test_a_stream_gives_the_numbers_of_its_track(rough: co.Recording, how: Any) -> None:
+def test_a_stream_gives_the_numbers_of_its_track(rough, how):
     method, links = co.PoseFilter("solo", assumed=replace(NOISE, range_offset_std=0.5), **how), rough.links
     track, mine = method(rough, [0]), to_landmarks(rough, rough.links.of(0))
     for run in range(2):
@@ -200,7 +200,7 @@ def test_a_stream_gives_the_numbers_of_its_track(rough: co.Recording, how: Any) 
             np.testing.assert_array_equal(cov[3, :4], track.heading_covariance[run, t, 0])  # type: ignore[index]
 
 
-def test_a_known_start_needs_no_compass() -> None:
+def test_a_known_start_needs_no_compass():
     sensors = co.Sensors(heading_std=0.05)
     method = co.PoseFilter("solo", assumed=sensors)
     still = co.OwnMeasurement([1.0, 0.0, 0.0], 0.0)
@@ -219,13 +219,13 @@ def test_a_known_start_needs_no_compass() -> None:
         (lambda: co.PoseFilter("solo", assumed=NOISE).start(0.1).step(co.OwnMeasurement([1, 0, 0], 0.0)), "begin"),
     ],
 )
-def test_mistakes_of_streams_are_named(make: Any, words: str) -> None:
+def test_mistakes_of_streams_are_named(make, words):
     with refused(words):
         make()
 
 
 @pytest.mark.slow
-def test_no_kernel_of_poses_reads_beyond_its_arrays(tmp_path: Path) -> None:
+def test_no_kernel_of_poses_reads_beyond_its_arrays(tmp_path):
     """numba's bounds checks, over members that come and go, in a process of its own."""
     words = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", __file__, "-k", "dense_oracle"]
     env = {**os.environ, "NUMBA_BOUNDSCHECK": "1", "NUMBA_CACHE_DIR": str(tmp_path)}

@@ -43,7 +43,7 @@ def observed(fleet: co.Fleet, sensors: co.Sensors = WHITE, runs: int = 30, **mor
     ],
     ids=lambda value: getattr(value, "name", value),
 )
-def test_white_noise_stays_inside_the_band(method: co.PoseFilter, masts: int) -> None:
+def test_white_noise_stays_inside_the_band(method, masts):
     """Chi-square of 3 degrees of freedom, run-averaged, on at least 95 % of the steps."""
     fleet = convoy(masts=masts)
     track = method(observed(fleet, replace(WHITE, velocity_reading="speed")), ["v1", "v2"])
@@ -53,7 +53,7 @@ def test_white_noise_stays_inside_the_band(method: co.PoseFilter, masts: int) ->
     assert low < found.mean() < high
 
 
-def test_a_fleet_is_consistent_where_noise_is_a_share_of_the_speed() -> None:
+def test_a_fleet_is_consistent_where_noise_is_a_share_of_the_speed():
     """Chi-square of (x, y), 2 on average: with the variance of each measured speed its slow ones counted more, the
     fleet fell 0.14 m behind, and the mean was 2.7."""
     fleet = convoy(4, 200)
@@ -65,7 +65,7 @@ def test_a_fleet_is_consistent_where_noise_is_a_share_of_the_speed() -> None:
     assert abs(error.mean(axis=(0, 1, 2))).max() < 0.05
 
 
-def test_joint_is_best_intersection_is_cautious_and_naive_is_not() -> None:
+def test_joint_is_best_intersection_is_cautious_and_naive_is_not():
     """The optimum has all cross-covariances; without them estimates are used twice (Julier, Uhlmann, ACC 1997)."""
     fleet = convoy()
     seen = observed(fleet, runs=12)
@@ -81,7 +81,7 @@ def test_joint_is_best_intersection_is_cautious_and_naive_is_not() -> None:
     assert nees["joint"] == pytest.approx(3.0, abs=0.8)  # errors that all share: about 120 independent values
 
 
-def test_scale_and_bias_are_found_where_they_act() -> None:
+def test_scale_and_bias_are_found_where_they_act():
     """Closed form: the drawn errors, known from the exact odometry; ignoring them is over-confident."""
     fleet, runs = convoy(2, 400), 20
     wrong = replace(WHITE, yaw_rate_bias_std=0.05, speed_scale_std=0.05, gnss_std=(0.5,) * 3)
@@ -100,7 +100,7 @@ def test_scale_and_bias_are_found_where_they_act() -> None:
     assert np.abs(co.heading_error(track, fleet)).mean() < np.abs(co.heading_error(ignored, fleet)).mean()
 
 
-def test_ranges_that_are_too_long_cost_little_where_that_is_a_state() -> None:
+def test_ranges_that_are_too_long_cost_little_where_that_is_a_state():
     """Closed form: the offsets that were drawn; they are found within their standard deviations."""
     fleet, told = convoy(3, 400), replace(WHITE, range_offset_std=2.0, range_std=0.1)
     right, wrong = (observed(fleet, noise, 20) for noise in (replace(told, range_offset_std=0.0), told))
@@ -116,7 +116,7 @@ def test_ranges_that_are_too_long_cost_little_where_that_is_a_state() -> None:
     assert error < 1.15 * least < 0.5 * without
 
 
-def test_the_gate_keeps_outliers_out() -> None:
+def test_the_gate_keeps_outliers_out():
     """Every twentieth range is 20 m too long; without outliers the gate changes next to nothing."""
     fleet = convoy(masts=2)
     seen = observed(fleet, runs=6)
@@ -147,6 +147,6 @@ def test_the_gate_keeps_outliers_out() -> None:
         (lambda r: co.heading_error(co.Kalman()(co.observe(convoy(), WHITE)), convoy()), "estimates none"),
     ],
 )
-def test_mistakes_are_named(make: Any, words: str) -> None:
+def test_mistakes_are_named(make, words):
     with refused(words):
         make(observed(convoy(masts=1), runs=1))

@@ -14,7 +14,7 @@ from coopoc.learned.pose_noise import PoseTask, fit_pose_noise, log_score
 from coopoc.world.body_frames import true_heading
 
 
-def test_the_log_score_is_the_density_of_the_truth() -> None:
+def test_the_log_score_is_the_density_of_the_truth():
     """scipy.stats.multivariate_normal, less the constant of three dimensions."""
     fleet = convoy(2, 20)
     track = co.PoseFilter("fleet")(observed(fleet, runs=1), [0, 1])
@@ -27,7 +27,7 @@ def test_the_log_score_is_the_density_of_the_truth() -> None:
         assert scores[0, t, ego] == pytest.approx(wanted, abs=1e-6)
 
 
-def test_noise_that_acts_is_learned_from_a_wrong_start() -> None:
+def test_noise_that_acts_is_learned_from_a_wrong_start():
     """Closed form: the log score is proper, so that no noise beats the acting one but by chance."""
     fleet = convoy(3, 150)
     acting = replace(WHITE, velocity_reading="speed", velocity_floor=0.01)
@@ -48,7 +48,7 @@ def test_noise_that_acts_is_learned_from_a_wrong_start() -> None:
         fit_pose_noise([], wrong)
 
 
-def test_odometry_that_means_nothing_is_learned_to_mean_nothing() -> None:
+def test_odometry_that_means_nothing_is_learned_to_mean_nothing():
     """Speeds of another drive: the likelihood rises with their noise up to what Sensors allow, and no further."""
     fleet = convoy(2, 60)
     seen = observed(fleet, replace(WHITE, velocity_reading="speed", velocity_floor=0.01), runs=1)

@@ -4,7 +4,6 @@ import json
 import re
 import sys
 from dataclasses import fields, is_dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,11 +21,11 @@ from coopoc.world.body_frames import body_motion
 
 
 @pytest.fixture(scope="module")
-def tiers() -> tuple[co.Recording, co.Fleet]:
+def tiers():
     return graph_recording(read_pyfg(measured("tiers.pyfg")))
 
 
-def test_odometry_and_ranges_are_those_of_the_file(tiers: tuple[co.Recording, co.Fleet]) -> None:
+def test_odometry_and_ranges_are_those_of_the_file(tiers):
     """Counts of the raw text, and the truth of its vertices: ranges err by their stated 0.04 m."""
     seen, fleet = tiers
     assert fleet.ids == ("A", "B", "C", "D", "L0")
@@ -43,7 +42,7 @@ def test_odometry_and_ranges_are_those_of_the_file(tiers: tuple[co.Recording, co
     assert np.corrcoef(seen.body.yaw_rate[0, 1:, :4].ravel(), rate[1:, :4].ravel())[0, 1] > 0.5
 
 
-def test_the_command_says_what_was_read(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_command_says_what_was_read(tmp_path, capsys):
     data_check(str(measured("tiers.pyfg")), picture=tmp_path / "tiers.png")
     said = capsys.readouterr().out
     assert "read: 7092 ranges" in said
@@ -51,7 +50,7 @@ def test_the_command_says_what_was_read(tmp_path: Path, capsys: pytest.CaptureFi
     assert re.search("(?m)^check: 9% of what was logged is not used, first of all 697 edges outside the steps", said)
 
 
-def test_graphs_that_are_no_recording_are_named(tmp_path: Path) -> None:
+def test_graphs_that_are_no_recording_are_named(tmp_path):
     lines = [f"VERTEX_SE2 {0.1 * k} A{k} {k} 0 0" for k in range(30)]
     edges = [f"EDGE_SE2 {0.1 * k} A{k} A{k + 1} 1 0 0 0.01 0 0 0.01 0 0.01" for k in range(29)]
     file = tmp_path / "one.pyfg"
@@ -68,7 +67,7 @@ def test_graphs_that_are_no_recording_are_named(tmp_path: Path) -> None:
         graph_recording(read_pyfg(file), dt=5.0)
 
 
-def test_points_and_poses_of_others_are_ranges_and_bearings() -> None:
+def test_points_and_poses_of_others_are_ranges_and_bearings():
     """13,121 points and 3,537 ranges of mrclam6.pyfg, of which the points were left out without a word."""
     log = load_log(measured("mrclam6.pyfg"))
     assert log.summary.read == {"ranges": 16381, "bearings": 12905}
@@ -96,7 +95,7 @@ def inverted(line: str) -> str:
     return " ".join(words)
 
 
-def test_covariances_for_information_are_named_where_a_graph_is_solved(tmp_path: Path) -> None:
+def test_covariances_for_information_are_named_where_a_graph_is_solved(tmp_path):
     write_graph(without_stamps(read_pyfg(measured("mrclam5a.pyfg"))), tmp_path / "right.g2o")
     lines = (tmp_path / "right.g2o").read_text().splitlines()
     (tmp_path / "wrong.g2o").write_text("\n".join(map(inverted, lines)) + "\n")

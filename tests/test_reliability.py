@@ -8,7 +8,7 @@ from oracle_page import page
 TESTS, DOCS = Path(__file__).parent, Path(__file__).resolve().parents[1] / "docs"
 
 
-def test_every_fault_of_the_page_has_its_test() -> None:
+def test_every_fault_of_the_page_has_its_test():
     rows = [row for row in (DOCS / "reliability.md").read_text().splitlines() if re.match(r"\| (?!fault|---)", row)]
     assert len(rows) > 30
     for row in rows:
@@ -18,6 +18,6 @@ def test_every_fault_of_the_page_has_its_test() -> None:
             assert f"def {test}(" in (TESTS / f"{file}.py").read_text(), row
 
 
-def test_the_page_of_oracles_is_current() -> None:
+def test_the_page_of_oracles_is_current():
     """`python tests/oracle_page.py` writes it."""
     assert (DOCS / "oracles.md").read_text() == page()

@@ -45,7 +45,7 @@ class Page(HTMLParser):
 
 
 @pytest.fixture(scope="module")
-def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
+def made(tmp_path_factory):
     out = tmp_path_factory.mktemp("report")
     (out / "trouble").write_text("raise")
     with pytest.MonkeyPatch.context() as patch:
@@ -57,7 +57,7 @@ def made(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Page]:
     return path, Page(path.read_text())
 
 
-def test_nothing_outside_the_file_is_needed(made: tuple[Path, Page]) -> None:
+def test_nothing_outside_the_file_is_needed(made):
     path, page = made
     assert page.open == []
     assert not [r for r in page.references if not r.startswith(("data:", "#"))]
@@ -92,24 +92,24 @@ def test_nothing_outside_the_file_is_needed(made: tuple[Path, Page]) -> None:
         "Pause",
     ],
 )
-def test_it_says(made: tuple[Path, Page], words: str) -> None:
+def test_it_says(made, words):
     assert words in made[1].text
 
 
-def test_files_can_be_taken_out_of_it(made: tuple[Path, Page]) -> None:
+def test_files_can_be_taken_out_of_it(made):
     text = made[0].read_text()
     for name in ("small-rt_le.csv", "small-rt_le.tex", "small-rt_le.pdf", "small-rt_le.png"):
         assert f'download="{name}"' in text
 
 
-def test_the_same_folders_give_the_same_page(made: tuple[Path, Page], tmp_path: Path) -> None:
+def test_the_same_folders_give_the_same_page(made, tmp_path):
     path, _ = made
     folder = path.parents[1] / "small"
     first, second = (report([folder], tmp_path / name) for name in ("a.html", "b.html"))
     assert first.read_bytes() == second.read_bytes()
 
 
-def test_folders_that_cannot_be_shown_are_named(made: tuple[Path, Page], tmp_path: Path) -> None:
+def test_folders_that_cannot_be_shown_are_named(made, tmp_path):
     folder = made[0].parents[1] / "small"
     with refused("different studies"):
         report([folder, folder], tmp_path / "r.html")

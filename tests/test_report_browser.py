@@ -3,7 +3,6 @@
 import importlib
 import re
 import shutil
-from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -40,7 +39,7 @@ def _wide(results: Results) -> Table:
 
 
 @pytest.fixture(scope="module")
-def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def page_file(tmp_path_factory):
     out = tmp_path_factory.mktemp("browser")
     with pytest.MonkeyPatch.context() as patch:
         patch.syspath_prepend(str(Path(__file__).parent / "distribution"))
@@ -51,7 +50,7 @@ def page_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def browser() -> Iterator[Any]:
+def browser():
     program = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "google-chrome"))), None)
     if program is None:
         pytest.skip("there is no Chromium: apt-get install chromium")
@@ -62,7 +61,7 @@ def browser() -> Iterator[Any]:
 
 
 @pytest.fixture(params=WIDTHS)
-def page(request: pytest.FixtureRequest, browser: Any, page_file: Path) -> Iterator[Any]:
+def page(request, browser, page_file):
     """The page at both widths; nothing may be asked of the network or said in the console, whatever the test does."""
     width, height = WIDTHS[request.param]
     context = browser.new_context(viewport={"width": width, "height": height})
@@ -92,7 +91,7 @@ def _column(page: Any, table: str, index: int) -> list[str]:
         ("Duration", ["a", "b 9", "b 10", "c"], ["c", "b 10", "b 9", "a"]),
     ],
 )
-def test_a_click_on_a_header_sorts(page: Any, title: str, upwards: list[str], downwards: list[str]) -> None:
+def test_a_click_on_a_header_sorts(page, title, upwards, downwards):
     head = page.locator("#small-table-numbers th", has_text=title)
     button = head.get_by_role("button")
     orders = []
@@ -103,7 +102,7 @@ def test_a_click_on_a_header_sorts(page: Any, title: str, upwards: list[str], do
     assert orders == [upwards, downwards, ["b 10", "a", "b 9", "c"]]
 
 
-def test_intervals_sort_by_their_mean_from_the_keyboard(page: Any) -> None:
+def test_intervals_sort_by_their_mean_from_the_keyboard(page):
     heads = page.locator("#small-table-rt_le thead th")
     for index, key in ((1, "Enter"), (2, "Space")):
         heads.nth(index).get_by_role("button").focus()
@@ -113,7 +112,7 @@ def test_intervals_sort_by_their_mean_from_the_keyboard(page: Any) -> None:
     assert [head.get_attribute("aria-sort") for head in heads.all()] == [None, None, "ascending", None]
 
 
-def test_nothing_is_wider_than_the_page(page: Any) -> None:
+def test_nothing_is_wider_than_the_page(page):
     wide, window = page.evaluate("[document.documentElement.scrollWidth, innerWidth]")
     assert wide <= window
     box = page.locator("figure img").bounding_box()
@@ -124,7 +123,7 @@ def test_nothing_is_wider_than_the_page(page: Any) -> None:
     assert page.evaluate(beyond) == []
 
 
-def test_a_figure_can_be_enlarged_on_a_phone(page: Any) -> None:
+def test_a_figure_can_be_enlarged_on_a_phone(page):
     figure = page.locator("figure:visible")
     button = figure.get_by_role("button", name="Enlarge")
     if page.viewport_size["width"] > 640:
@@ -138,7 +137,7 @@ def test_a_figure_can_be_enlarged_on_a_phone(page: Any) -> None:
     assert figure.locator("img").bounding_box()["width"] == fits
 
 
-def test_without_javascript_everything_is_there(browser: Any, page_file: Path) -> None:
+def test_without_javascript_everything_is_there(browser, page_file):
     context = browser.new_context(java_script_enabled=False)
     plain = context.new_page()
     plain.goto(page_file.as_uri())

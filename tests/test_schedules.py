@@ -8,7 +8,7 @@ from conftest import refused
 
 from coopoc import LKFSA, V2X, Fleet, JointFilter, Recording, Sensors, observe
 from coopoc.world.inbox import inbox, within_cap
-from coopoc.world.v2x import FIX_AND_VELOCITY, Schedule
+from coopoc.world.v2x import FIX_AND_VELOCITY
 
 S2 = Sensors.paper_scenario2()
 
@@ -24,7 +24,7 @@ def received_steps(fleet: Fleet, **given: float) -> list[int]:
     return np.flatnonzero(inbox(seen, 0, FIX_AND_VELOCITY).arrival[0] >= 0).tolist()
 
 
-def test_the_token_bucket_by_hand() -> None:
+def test_the_token_bucket_by_hand():
     """100 B/s: 100 at first, 10 more a step, 32 for a message; what is left after each is 68, 46, 24, 2, 0, 8, ..."""
     pair = still([[0, 0, 0], [9, 0, 0]])
     assert received_steps(pair, bytes_per_second=100.0) == [0, 1, 2, 3, 6, 10, 13, 16, 19]
@@ -46,7 +46,7 @@ def test_the_token_bucket_by_hand() -> None:
     ]  # two are on their way
 
 
-def test_messages_of_many_sizes_pass_the_bucket_nearest_first(crossing: Fleet) -> None:
+def test_messages_of_many_sizes_pass_the_bucket_nearest_first(crossing):
     """A later one may fit where an earlier one did not; against the rules, a message at a time."""
     channel, rng = V2X(4, loss=0.3, latency=0.1, bytes_per_second=500.0), np.random.default_rng(0)
     seen = observe(crossing, S2, channel, runs=5)
@@ -87,7 +87,7 @@ def by_hand(seen: Recording, ego: int, size: int) -> list[set[tuple[int, int]]]:
 
 @pytest.mark.parametrize("schedule", ["nearest", "round robin"])
 @pytest.mark.parametrize("cap", [150.0, 700.0])
-def test_nearest_first_and_turns(crossing: Fleet, schedule: Schedule, cap: float) -> None:
+def test_nearest_first_and_turns(crossing, schedule, cap):
     """Against a loop over runs and messages, with losses, rates, and neighbours that come and go."""
     channel = V2X(4, rate=7.0, loss=0.3, burst=2.0, latency=0.1, bytes_per_second=cap, overhead=20, schedule=schedule)
     seen = observe(crossing, S2, channel, runs=3)
@@ -100,7 +100,7 @@ def test_nearest_first_and_turns(crossing: Fleet, schedule: Schedule, cap: float
             assert len(found) > 10
 
 
-def test_schedules_are_paired_and_repeat(crossing: Fleet) -> None:
+def test_schedules_are_paired_and_repeat(crossing):
     """Fewer runs are a part of more; another schedule takes other messages of the same, for the same bytes."""
     channel = V2X(5, radius=60.0, loss=0.2, bytes_per_second=300.0, schedule="round robin")
     many, few = (inbox(observe(crossing, S2, channel, runs=runs), 2, FIX_AND_VELOCITY) for runs in (4, 2))
@@ -114,6 +114,6 @@ def test_schedules_are_paired_and_repeat(crossing: Fleet) -> None:
         assert np.array_equal(track.received_bytes[:, 0], few.received_bytes)
 
 
-def test_an_unknown_schedule_is_named() -> None:
+def test_an_unknown_schedule_is_named():
     with refused(r"schedule = 'farthest': must be one of nearest, round robin.*Did you mean"):
         V2X(schedule="farthest")  # type: ignore[arg-type]

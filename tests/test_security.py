@@ -50,14 +50,14 @@ STUDY = Study(
 
 
 @pytest.fixture
-def folder(tmp_path: Path) -> Path:
+def folder(tmp_path):
     """A folder in which STUDY has run."""
     run_study(STUDY, tmp_path, progress=False)
     return tmp_path / "made"
 
 
 @pytest.fixture
-def evil(tmp_path: Path) -> tuple[Path, Path]:
+def evil(tmp_path):
     """A file that leaves a mark when it is run, and the mark."""
     mark = tmp_path / "mark"
     path = tmp_path / "evil.py"
@@ -80,7 +80,7 @@ def status(*words: str) -> int:
 
 
 @pytest.mark.filterwarnings("ignore:.*has no checksum")
-def test_weights_run_no_code_that_their_card_names(evil: tuple[Path, Path], tmp_path: Path) -> None:
+def test_weights_run_no_code_that_their_card_names(evil, tmp_path):
     torch = pytest.importorskip("torch")
     from safetensors.torch import save_file
 
@@ -95,9 +95,7 @@ def test_weights_run_no_code_that_their_card_names(evil: tuple[Path, Path], tmp_
 
 
 @pytest.mark.parametrize("command", ["reference", "report", "table"])
-def test_results_run_no_code_that_their_manifest_names(
-    folder: Path, evil: tuple[Path, Path], command: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_results_run_no_code_that_their_manifest_names(folder, evil, command, monkeypatch):
     path, mark = evil
     monkeypatch.chdir(folder.parent)
     edited(folder / "manifest.json", lambda m: {**m, "study": f"{path}:STUDY"})
@@ -105,9 +103,7 @@ def test_results_run_no_code_that_their_manifest_names(
     assert not mark.exists()
 
 
-def test_a_study_of_ones_own_is_named_again_for_its_reference(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_a_study_of_ones_own_is_named_again_for_its_reference(tmp_path, capsys):
     (tmp_path / "mine.py").write_text(
         "from coopoc.study.study import Study\n"
         "def cell(p):\n    return [{'run': 0, 'ego': 'a', 'rt_le_m': p['x']}]\n"
@@ -132,19 +128,19 @@ def test_a_study_of_ones_own_is_named_again_for_its_reference(
 
 
 @pytest.mark.parametrize("name", ["../out", "/tmp/coopoc-out", "a/b", "..", "", "CON", "a\nb", 3, None])
-def test_a_manifest_cannot_name_another_folder(folder: Path, tmp_path: Path, name: object) -> None:
+def test_a_manifest_cannot_name_another_folder(folder, tmp_path, name):
     edited(folder / "manifest.json", lambda m: {**m, "study": name})
     with refused(r"must be a file name|holds a damaged manifest\.json \(study is a"):
         Results.load(folder)
 
 
-def test_a_study_cannot_be_named_like_a_path() -> None:
+def test_a_study_cannot_be_named_like_a_path():
     with refused("must be a file name"):
         replace(STUDY, name="../out")
 
 
 @pytest.mark.parametrize("name", ["../../../x", "/tmp/x", "a", "0123456789abcdef012G"])
-def test_a_manifest_cannot_name_other_files(folder: Path, tmp_path: Path, name: str) -> None:
+def test_a_manifest_cannot_name_other_files(folder, tmp_path, name):
     first = next(iter(json.loads((folder / "manifest.json").read_text())["cells"]))
     content = (folder / "cells" / f"{first}.parquet").read_bytes()
     edited(folder / "manifest.json", lambda m: {**m, "cells": {name: next(iter(m["cells"].values()))}})
@@ -153,7 +149,7 @@ def test_a_manifest_cannot_name_other_files(folder: Path, tmp_path: Path, name: 
         Results.load(folder)
 
 
-def test_a_report_embeds_no_html_of_the_disk_and_escapes_all_text(folder: Path) -> None:
+def test_a_report_embeds_no_html_of_the_disk_and_escapes_all_text(folder):
     (folder / "tables" / "rt_le.html").write_text("<script>stolen()</script>")
     text = report([folder], folder / "report.html").read_text()
     page = Page(text)
@@ -165,7 +161,7 @@ def test_a_report_embeds_no_html_of_the_disk_and_escapes_all_text(folder: Path) 
 
 @pytest.mark.parametrize("kind", ["tables", "figures"])
 @pytest.mark.parametrize("name", ["../../secret", "/etc/passwd", "a/../../../secret", "..", "", 7])
-def test_views_show_and_remove_no_file_outside_their_folder(folder: Path, kind: str, name: object) -> None:
+def test_views_show_and_remove_no_file_outside_their_folder(folder, kind, name):
     secrets = [folder.parent / f"secret.{form}" for form in ("html", "csv", "tex", "md", "svg", "pdf", "png")]
     for secret in secrets:
         secret.write_text("secret")
@@ -180,7 +176,7 @@ def test_views_show_and_remove_no_file_outside_their_folder(folder: Path, kind: 
     assert [view["name"] for view in views(folder)["tables"]] == ["rt_le"]
 
 
-def test_a_figure_that_is_a_link_out_of_the_folder_is_not_embedded(folder: Path, tmp_path: Path) -> None:
+def test_a_figure_that_is_a_link_out_of_the_folder_is_not_embedded(folder, tmp_path):
     (folder / "figures").mkdir()
     for form in ("svg", "pdf", "png"):
         (tmp_path / f"secret.{form}").write_text("secret")
@@ -196,7 +192,7 @@ def test_a_figure_that_is_a_link_out_of_the_folder_is_not_embedded(folder: Path,
 
 @pytest.mark.parametrize("stored", ["null", "{}", "[" * 100_000, '{"study": ["made"]}', "\0"])
 @pytest.mark.parametrize("name", ["manifest.json", "views.json"])
-def test_a_description_of_another_form_is_named_and_written_again(folder: Path, name: str, stored: str) -> None:
+def test_a_description_of_another_form_is_named_and_written_again(folder, name, stored):
     (folder / name).write_text(stored)
     read: Callable[[], object] = {
         "manifest.json": lambda: Results.load(folder),
@@ -211,7 +207,7 @@ def test_a_description_of_another_form_is_named_and_written_again(folder: Path, 
 FORMULAS = ("=1+1", "+1+1", "-1+1", "@SUM(A1)", "\t=1", '=cmd|"/c calc"!A1')
 
 
-def test_no_text_of_a_csv_is_a_formula() -> None:
+def test_no_text_of_a_csv_is_a_formula():
     made = Table(("=head", "b"), tuple((text, -0.5) for text in (*FORMULAS, "-3", "–")), "")
     found = list(csv.reader(io.StringIO(made.to_csv())))
     assert found[0] == ["'=head", "b"]
@@ -219,12 +215,12 @@ def test_no_text_of_a_csv_is_a_formula() -> None:
     assert {row[1] for row in found[1:]} == {"-0.5"}
 
 
-def test_no_text_of_a_csv_starts_a_row_or_reaches_the_terminal() -> None:
+def test_no_text_of_a_csv_starts_a_row_or_reaches_the_terminal():
     text = Table(("a\x1b[31m", "b"), (("x\r=1+1", 1),), "").to_csv()
     assert text == "a [31m,b\nx =1+1,1\n"
 
 
-def test_no_text_of_a_markdown_table_is_a_tag_or_ends_a_row() -> None:
+def test_no_text_of_a_markdown_table_is_a_tag_or_ends_a_row():
     made = Table((SCRIPT, "a|b"), ((SCRIPT, "x\ny"), ("</td>", "2 < 3")), f"{SCRIPT}\n# head", notes=("<!-- -->",))
     text = made.to_markdown()
     assert "<script" not in text.replace(r"\<", "")
@@ -235,7 +231,7 @@ def test_no_text_of_a_markdown_table_is_a_tag_or_ends_a_row() -> None:
     assert not any(line.startswith("#") for line in text.splitlines())
 
 
-def test_a_flipped_bit_is_noticed(tmp_path: Path) -> None:
+def test_a_flipped_bit_is_noticed(tmp_path):
     """Of 4,000 flips without checksums 200 gave other numbers; now every one is noticed, that of the seal, too."""
 
     def noise(p: Params) -> list[Row]:
@@ -256,7 +252,7 @@ def test_a_flipped_bit_is_noticed(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("kind", ["folder", "pipe"])
-def test_no_device_and_no_folder_is_replaced_by_a_file(folder: Path, tmp_path: Path, kind: str) -> None:
+def test_no_device_and_no_folder_is_replaced_by_a_file(folder, tmp_path, kind):
     """As root, a report "written to" /dev/null took its place for every program of the machine."""
     learned = pytest.importorskip("coopoc.learned")
     out = tmp_path / "out.html"
@@ -279,7 +275,7 @@ def test_no_device_and_no_folder_is_replaced_by_a_file(folder: Path, tmp_path: P
         {"question": None},
     ],
 )
-def test_a_manifest_with_a_wrong_field_is_named(folder: Path, change: dict[str, Any]) -> None:
+def test_a_manifest_with_a_wrong_field_is_named(folder, change):
     edited(folder / "manifest.json", lambda m: {**m, **change})
     with refused(r"holds a damaged manifest\.json"):
         Results.load(folder)
@@ -295,7 +291,7 @@ def test_a_manifest_with_a_wrong_field_is_named(folder: Path, change: dict[str, 
         {"header": None},
     ],
 )
-def test_a_stored_table_of_another_form_is_named(folder: Path, change: dict[str, Any]) -> None:
+def test_a_stored_table_of_another_form_is_named(folder, change):
     stored = views(folder)["tables"][0]["table"]
     assert Table.from_data(stored) == Table.from_data(json.loads(json.dumps(stored)))
     with refused("table = dict: is damaged"):
@@ -305,7 +301,7 @@ def test_a_stored_table_of_another_form_is_named(folder: Path, change: dict[str,
 
 
 @pytest.mark.parametrize("escape", ["\\ud800", "\\uDFff"])
-def test_half_a_surrogate_pair_is_no_text_and_a_whole_one_is(folder: Path, escape: str) -> None:
+def test_half_a_surrogate_pair_is_no_text_and_a_whole_one_is(folder, escape):
     path = folder / "views.json"
     known = path.read_text()
     path.write_text(known.replace("Caption", f"Caption {escape}"))
@@ -315,7 +311,7 @@ def test_half_a_surrogate_pair_is_no_text_and_a_whole_one_is(folder: Path, escap
     assert "\U0001f697" in report([folder], folder / "report.html").read_text()
 
 
-def test_a_stored_table_is_the_table(folder: Path) -> None:
+def test_a_stored_table_is_the_table(folder):
     made = table(Results.load(folder))
     assert Table.from_data(views(folder)["tables"][0]["table"]) == made
     assert tables(folder, "latex") == [made.to_latex()]

@@ -3,7 +3,6 @@
 import dataclasses
 import importlib
 import re
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -26,12 +25,12 @@ def one_line(result: object) -> str:
 
 
 @pytest.fixture(scope="module")
-def recording() -> co.Recording:
+def recording():
     fleet = co.load_fleet("town10").between(0, 60)
     return co.observe(fleet, co.Sensors.paper_scenario2(), co.V2X(max_neighbours=6), runs=8, seed=0, observers=[24])
 
 
-def test_tracks_and_methods_show_their_sizes(recording: co.Recording) -> None:
+def test_tracks_and_methods_show_their_sizes(recording):
     track = co.Kalman("nominal", x0=np.zeros((8, 1, 3)))(recording, egos=[24])
     assert "x (8, 60, 1, 3)" in one_line(track)
     assert "egos=(24,)" in repr(track)
@@ -41,14 +40,14 @@ def test_tracks_and_methods_show_their_sizes(recording: co.Recording) -> None:
     one_line(recording)
 
 
-def test_solutions_show_status_and_cost(recording: co.Recording) -> None:
+def test_solutions_show_status_and_cost(recording):
     problem = co.Problem.from_snapshot(recording, step=20, ego=24)
     solution = co.solve(problem)
     assert "status=SOLVED" in one_line(solution)
     assert f"cost={solution.cost:.6g}" in repr(solution)
 
 
-def test_trained_nets_do_not_show_their_weights(tmp_path: Path) -> None:
+def test_trained_nets_do_not_show_their_weights(tmp_path):
     drives = co.load_fleet("town10-clients").between(0, 400)
     federation = federate(GainNet(), clients(drives), rounds=1, local_epochs=1, seed=0)
     assert "history=2 x Round" in one_line(federation)
@@ -57,7 +56,7 @@ def test_trained_nets_do_not_show_their_weights(tmp_path: Path) -> None:
     assert "history" not in one_line(load(save(tmp_path / "net.safetensors", Checkpoint(federation.model, {}))))
 
 
-def test_exported_dataclasses_of_arrays_show_shapes() -> None:
+def test_exported_dataclasses_of_arrays_show_shapes():
     """All that `co`, `co.optimize` and `co.learned` export, whether a test above makes one or not."""
     made_by_users = "Measurement$|^SolverResult$"  # a user or a solver makes these of a few numbers
     for module in ("coopoc", "coopoc.optimize", "coopoc.optimize.convex", "coopoc.learned"):

@@ -12,13 +12,13 @@ TUTORIALS = sorted((ROOT / "docs" / "tutorials").glob("*.py"))
 SLOW = ("learned", "compare", "paper")
 
 
-def test_every_page_has_a_place() -> None:
+def test_every_page_has_a_place():
     placed = set(re.findall(r"[\w/]+\.md", (ROOT / "mkdocs.yml").read_text().split("\nnav:\n")[1]))
     pages = {str(p.with_suffix(".md").relative_to(ROOT / "docs")) for p in [*(ROOT / "docs").glob("*.md"), *TUTORIALS]}
     assert placed ^ pages == {"gallery.md"}
 
 
-def test_every_study_has_a_finding_and_a_page_that_is_there() -> None:
+def test_every_study_has_a_finding_and_a_page_that_is_there():
     pytest.importorskip("mkdocs", reason="make docs installs it")
     code = "import pages; print(len(pages.names('coopoc.studies')), pages._gallery())"
     out = ran([sys.executable, "-c", code], cwd=ROOT / "docs", check=True)
@@ -31,14 +31,14 @@ def test_every_study_has_a_finding_and_a_page_that_is_there() -> None:
     assert len(studies) == int(title.split()[0])
 
 
-def test_figures_fit_a_phone_and_lines_of_code_stay_whole() -> None:
+def test_figures_fit_a_phone_and_lines_of_code_stay_whole():
     css = (ROOT / "docs" / "site.css").read_text()
     assert not re.search(r"pre-wrap|img[^}]*max-width: none", css)
     template = (ROOT / "coopoc" / "study" / "report.html.j2").read_text()
     assert all('class="wide"' in line for line in template.splitlines() if "{{ plot(" in line)
 
 
-def test_every_method_has_a_row_of_its_own_in_the_overview() -> None:
+def test_every_method_has_a_row_of_its_own_in_the_overview():
     from coopoc.methods.catalogue import METHODS
 
     page = (ROOT / "docs" / "methods.md").read_text()
@@ -51,7 +51,7 @@ def test_every_method_has_a_row_of_its_own_in_the_overview() -> None:
     [pytest.param(path, marks=pytest.mark.slow) if path.stem in SLOW else path for path in TUTORIALS],
     ids=lambda path: path.stem,
 )
-def test_a_tutorial_runs(tutorial: Path, tmp_path: Path) -> None:
+def test_a_tutorial_runs(tutorial, tmp_path):
     done = ran([sys.executable, "-W", "error", tutorial], cwd=tmp_path)
     assert done.returncode == 0, done.stderr
     assert done.stdout
@@ -71,7 +71,7 @@ def says_what_it_prints(printed: str) -> None:
     assert rows["joint filter, nominal"][4] < 1.1 * rows["bound"][4]
 
 
-def test_doctests_and_tutorials_of_pages(capsys: pytest.CaptureFixture[str]) -> None:
+def test_doctests_and_tutorials_of_pages(capsys):
     """What the package does not contain: the extension of the API pages, and what a tutorial becomes."""
     pytest.importorskip("griffe", reason="make docs installs it")
     sys.path.insert(0, str(ROOT / "docs"))
@@ -92,7 +92,7 @@ def test_doctests_and_tutorials_of_pages(capsys: pytest.CaptureFixture[str]) -> 
     assert pictures["sum-1.png"].startswith(b"\x89PNG")
 
 
-def test_an_unknown_command_of_a_formula_fails_the_build() -> None:
+def test_an_unknown_command_of_a_formula_fails_the_build():
     pytest.importorskip("mkdocs", reason="make docs installs it")
     code = """
 import pages

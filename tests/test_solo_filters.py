@@ -18,7 +18,7 @@ S2 = Sensors.paper_scenario2()
 
 
 @pytest.mark.parametrize("std", [1.5, 3.5])
-def test_noise_of_fixes_need_not_be_known(std: float) -> None:
+def test_noise_of_fixes_need_not_be_known(std):
     """The cooperative filter alone, which assumes 2.5 m, within 1 % of the Kalman filter that knows it."""
     fleet = winding(900, 10.0, 7.0)
     recording = observe(fleet, Sensors(gnss_std=(std,) * 3), V2X(max_neighbours=0), runs=60)
@@ -28,7 +28,7 @@ def test_noise_of_fixes_need_not_be_known(std: float) -> None:
     assert 2.5 < nees(track, fleet).mean() < 3.3
 
 
-def test_bad_settings_are_named(crossing: Fleet) -> None:
+def test_bad_settings_are_named(crossing):
     with refused("^x0 = "):
         Kalman(x0=np.zeros((2, 3)))(gaps(crossing, absent=False))
     with refused("^velocity_floor = "):
@@ -56,7 +56,7 @@ def series(seen: Recording, q: Floats, r: Floats, *at: int) -> tuple[Floats | fl
 
 @pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("noise", ["nominal", "identity"])
-def test_kalman(crossing: Fleet, noise: str, known: bool) -> None:
+def test_kalman(crossing, noise, known):
     seen = gaps(crossing, absent=True)
     model = NoiseModel.identity() if noise == "identity" else NoiseModel.nominal(S2)
     q, r = np.broadcast_to(model.process_variance(seen, first=int(known)), seen.gnss.shape), model.gnss_variance
@@ -68,7 +68,7 @@ def test_kalman(crossing: Fleet, noise: str, known: bool) -> None:
         assert_allclose(p[run, :, n, c], variance, rtol=1e-10)
 
 
-def test_gnss_holds_the_last_fix(crossing: Fleet) -> None:
+def test_gnss_holds_the_last_fix(crossing):
     seen = gaps(crossing, absent=False)
     track = GNSS()(seen, [1, 3])
     assert 0 < track.seconds < 60

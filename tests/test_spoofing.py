@@ -6,26 +6,25 @@ import pytest
 from conftest import refused
 
 import coopoc as co
-from coopoc import V2X, Fleet, Sensors, observe
-from coopoc.world.recording import Recording
+from coopoc import V2X, Sensors, observe
 from coopoc.world.spoofing import Spoofing, spoofed
 
 S2 = Sensors.paper_scenario2()
 
 
 @pytest.fixture(scope="module")
-def lied_to(crossing: Fleet) -> Recording:
+def lied_to(crossing):
     """Neighbours that come and go, two thirds of them spoofed, some messages lost."""
     seen = observe(crossing.between(0, 14), S2, V2X(max_neighbours=4, radius=40), runs=3, observers=[0, 3])
     return spoofed(seen, 0.6, honest=[0, 3])
 
 
 @pytest.fixture(scope="module")
-def clean(crossing: Fleet) -> Recording:
+def clean(crossing):
     return observe(crossing, S2, V2X(max_neighbours=4), runs=40)
 
 
-def test_an_attack_moves_the_fixes_of_some_by_a_constant(crossing: Fleet, clean: Recording) -> None:
+def test_an_attack_moves_the_fixes_of_some_by_a_constant(crossing, clean):
     few, many = (spoofed(clean, share, seed=2, honest=["c0"]) for share in (0.2, 0.5))
     offset = few.gnss - clean.gnss
     assert np.ptp(offset, axis=1).max() < 1e-9
@@ -60,12 +59,12 @@ def test_an_attack_moves_the_fixes_of_some_by_a_constant(crossing: Fleet, clean:
         ({"collude": 1}, "c"),
     ],
 )
-def test_an_attack_says_what_is_wrong(lied_to: Recording, options: dict, field: str) -> None:
+def test_an_attack_says_what_is_wrong(lied_to, options, field):
     with refused(field):
         spoofed(lied_to, **options) if "attack" in options else Spoofing(0.2, **options)
 
 
-def test_an_attack_begins_creeps_and_colludes(crossing: Fleet, clean: Recording) -> None:
+def test_an_attack_begins_creeps_and_colludes(crossing, clean):
     full, late, slow, alike = (
         spoofed(clean, Spoofing(0.4, **options), seed=2, honest=[0]).gnss - clean.gnss
         for options in ({}, {"start": 1.0}, {"start": 1.0, "ramp": 2.0}, {"collude": True})
@@ -79,21 +78,21 @@ def test_an_attack_begins_creeps_and_colludes(crossing: Fleet, clean: Recording)
         assert np.abs(offsets[one] - offsets[one][:1]).max(initial=0.0) < 1e-9
 
 
-def test_an_estimator_that_is_told_of_an_attack_lacks_the_false_fixes(clean: Recording) -> None:
+def test_an_estimator_that_is_told_of_an_attack_lacks_the_false_fixes(clean):
     false = spoofed(clean, Spoofing(0.4, start=1.0), seed=2, honest=[0])
     told = spoofed(clean, Spoofing(0.4, start=1.0), seed=2, honest=[0], remove_outliers=True)
     assert np.array_equal(told.gnss, np.where(false.gnss == clean.gnss, clean.gnss, np.nan), equal_nan=True)
     assert told.notes[-1].endswith("removed")
 
 
-def test_the_example_prints_its_table(capsys: pytest.CaptureFixture[str]) -> None:
+def test_the_example_prints_its_table(capsys):
     clean, few = outlier_attack.main(shares=(0.0, 0.2))
     assert capsys.readouterr().out.count("\n") == 3
     assert few.least_squares > 3 * clean.least_squares
     assert few.robust < 1.3 * clean.least_squares
 
 
-def test_a_fleet_in_which_a_fifth_lies_is_better_than_alone() -> None:
+def test_a_fleet_in_which_a_fifth_lies_is_better_than_alone():
     """At the first fixes, 5 m apart by noise, each number of a liar is within its gate: their vector is not. A centre
     doubts the fixes that others contradict (2.3 m if those were judged by their own vehicle's odometer alone)."""
     fleet = co.load_fleet("town10-validation").between(0, 100)

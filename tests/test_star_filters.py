@@ -134,16 +134,14 @@ def assert_is_the_oracle(method: Method, oracle: Callable[..., Any], recording: 
 
 @pytest.mark.parametrize("channel", CHANNELS)
 @pytest.mark.parametrize("pair", ORACLES, ids=label)
-def test_the_filter_is_its_oracle(crossing: Fleet, pair: Any, channel: str) -> None:
+def test_the_filter_is_its_oracle(crossing, pair, channel):
     """Neighbours join and leave; messages are lost, late, slow and rejected; K = 0 and K > N."""
     assert_is_the_oracle(*pair, observe(crossing, S2, CHANNELS[channel], runs=2, observers=[0]))
 
 
 @pytest.mark.parametrize("damage", [holed, slow_fixes, partial], ids=lambda f: f.__name__)
 @pytest.mark.parametrize("pair", ORACLES, ids=label)
-def test_it_is_with_missing_fixes_and_measurements(
-    crossing: Fleet, pair: Any, damage: Callable[..., Recording]
-) -> None:
+def test_it_is_with_missing_fixes_and_measurements(crossing, pair, damage):
     """A missing component is no row of the dense oracle; in the kernel of covariance intersection its deviation of 1e3
     leaves it 1e-8 of the information of others."""
     recording = damage(observe(gappy(crossing), S2, V2X(4, loss=0.2), runs=2, observers=[0]))
@@ -156,7 +154,7 @@ def test_it_is_with_missing_fixes_and_measurements(
 
 @pytest.mark.parametrize("runs", [1, 3, 5])
 @pytest.mark.parametrize("pair", ORACLES, ids=label)
-def test_it_is_in_any_batch_and_with_absences(crossing: Fleet, pair: Any, runs: int) -> None:
+def test_it_is_in_any_batch_and_with_absences(crossing, pair, runs):
     fleet = gappy(crossing).between(0, 45)
     assert_is_the_oracle(*pair, observe(fleet, S2, V2X(max_neighbours=5, loss=0.2), runs=runs, observers=[0]))
 
@@ -171,7 +169,7 @@ NOISES = {
 
 @pytest.mark.parametrize("noise", NOISES)
 @pytest.mark.parametrize("pair", [ORACLES[0], ORACLES[5], ORACLES[6], ORACLES[8]], ids=label)
-def test_it_is_whatever_the_noise(crossing: Fleet, pair: Any, noise: str) -> None:
+def test_it_is_whatever_the_noise(crossing, pair, noise):
     """Little, constant and true process noise, and noise that grows with the speed."""
     sensors, known = NOISES[noise]
     recording = observe(crossing, sensors, V2X(max_neighbours=4, loss=0.2, latency=0.1), runs=2, observers=[0])
@@ -179,7 +177,7 @@ def test_it_is_whatever_the_noise(crossing: Fleet, pair: Any, noise: str) -> Non
     assert_is_the_oracle(method, pair[1], recording, 1e-5 if noise == "still" else 1e-7)
 
 
-def test_a_state_without_process_noise_stays_finite(crossing: Fleet) -> None:
+def test_a_state_without_process_noise_stays_finite(crossing):
     known = NoiseModel("fitted", S2, (1e-60, 1e-30, 1e-60))
     still = replace(crossing, position=np.repeat(crossing.position[:1], 60, axis=0), velocity=0 * crossing.velocity)
     recording = observe(still, S2, V2X(max_neighbours=4, loss=0.2), runs=2)
@@ -201,7 +199,7 @@ def begin(peer: KalmanFilter, z: np.ndarray, noise: np.ndarray, at: np.ndarray) 
     peer.x = at + peer.P @ weight @ (z - peer.H @ at)
 
 
-def test_the_linear_filter_equals_filterpy(formation: Fleet) -> None:
+def test_the_linear_filter_equals_filterpy(formation):
     """Independent check over the stacked star of a formation that never changes, from its first estimate on."""
     recording, known = star_of_four(formation)
     track = textbook(JointFilter(known, exact=False))(recording, [0])
@@ -232,12 +230,12 @@ def test_the_linear_filter_equals_filterpy(formation: Fleet) -> None:
         assert track.covariance[0, t, 0] == pytest.approx(peer.P[:3, :3], rel=1e-9, abs=1e-12)
 
 
-def test_the_angle_is_atan2() -> None:
+def test_the_angle_is_atan2():
     for turn in np.concatenate([np.linspace(-3.14, 3.14, 301), [0.0, 1e-9, -1e-300, 0.2449, -0.245]]):
         assert angle(3 * math.sin(turn), 3 * math.cos(turn)) == pytest.approx(turn, rel=1e-15, abs=0)
 
 
-def test_the_laplacian_filter_equals_filterpy(formation: Fleet) -> None:
+def test_the_laplacian_filter_equals_filterpy(formation):
     """Per axis, over the star of a formation that never changes, from its first estimate on."""
     recording, known = star_of_four(formation)
     track = LKFSA(known)(recording, [0])

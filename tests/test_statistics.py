@@ -10,7 +10,7 @@ from coopoc.evaluate import statistics
 from coopoc.evaluate.statistics import mean_interval, over_seeds, paired_difference
 
 
-def test_one_ego_agrees_with_scipy_bootstrap(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_one_ego_agrees_with_scipy_bootstrap(monkeypatch):
     monkeypatch.setattr(statistics, "RESAMPLES", 20000)
     values = np.random.default_rng(0).gamma(4.0, 0.3, 200)
     ours = mean_interval(values)
@@ -22,7 +22,7 @@ def test_one_ego_agrees_with_scipy_bootstrap(monkeypatch: pytest.MonkeyPatch) ->
     assert ours.n == 200
 
 
-def test_pairing_cancels_what_both_share() -> None:
+def test_pairing_cancels_what_both_share():
     rng = np.random.default_rng(3)
     shared = rng.normal(5, 2, (50, 4))
     a, b = shared + 0.1 + rng.normal(0, 0.05, shared.shape), shared
@@ -33,7 +33,7 @@ def test_pairing_cancels_what_both_share() -> None:
 
 
 @pytest.mark.parametrize(("egos", "runs", "between", "low"), [(1, 40, 0.0, 0.90), (8, 20, 1.0, 0.88)])
-def test_intervals_hold_the_mean_as_often_as_they_promise(egos: int, runs: int, between: float, low: float) -> None:
+def test_intervals_hold_the_mean_as_often_as_they_promise(egos, runs, between, low):
     rng = np.random.default_rng(4)
     hits = 0
     for _ in range(300):
@@ -43,7 +43,7 @@ def test_intervals_hold_the_mean_as_often_as_they_promise(egos: int, runs: int, 
     assert low < hits / 300 < 0.98
 
 
-def test_scores_go_in_as_they_come_out() -> None:
+def test_scores_go_in_as_they_come_out():
     """A difference that all runs share and egos do not: over egos, whose interval is wide."""
     fleet = load_fleet("town10-validation").between(0, 40)
     seen = observe(fleet, Sensors.paper_scenario2(), V2X(4), runs=20, observers=[0, 3, 5])
@@ -55,13 +55,13 @@ def test_scores_go_in_as_they_come_out() -> None:
     assert 0.5 * half < ours.high - ours.mean < 2.0 * half
 
 
-def test_few_egos_that_differ_give_a_wider_interval_than_pooled_runs() -> None:
+def test_few_egos_that_differ_give_a_wider_interval_than_pooled_runs():
     values = np.array([1.0, 2.0, 3.0]) + 0.01 * np.random.default_rng(5).normal(size=(100, 3))
     nested, pooled = mean_interval(values), mean_interval(values.ravel())
     assert nested.high - nested.low > 4 * (pooled.high - pooled.low)
 
 
-def test_seeds_agree_with_scipy_t_interval() -> None:
+def test_seeds_agree_with_scipy_t_interval():
     values = np.random.default_rng(7).normal(1.1, 0.1, (5, 40, 3))
     found = over_seeds(values)
     means = values.mean(axis=(1, 2))
@@ -69,14 +69,14 @@ def test_seeds_agree_with_scipy_t_interval() -> None:
     assert (found.low, found.mean, found.high) == pytest.approx((expected.low, means.mean(), expected.high))
 
 
-def test_one_value_has_no_interval() -> None:
+def test_one_value_has_no_interval():
     found = mean_interval(np.array([2.0]))
     assert found.mean == 2.0
     assert np.isnan(found.low)
     assert np.isnan(found.high)
 
 
-def test_what_cannot_be_averaged_is_named() -> None:
+def test_what_cannot_be_averaged_is_named():
     with refused("values = not finite"):
         mean_interval(np.array([1.0, np.nan]))
     with refused("must have shape"):

@@ -50,7 +50,7 @@ def play(stream: Any, recording: Recording, ego: int, run: int, first: int = 0) 
 
 @pytest.mark.parametrize("known", [False, True])
 @pytest.mark.parametrize("name", SOLO)
-def test_step_by_step_is_the_track(name: str, known: bool, crossing: Fleet) -> None:
+def test_step_by_step_is_the_track(name, known, crossing):
     """From the first fix, and from a known start, whose own step is no step of the stream; a third has no fix."""
     method, start = SOLO[name]
     recording, x0 = holed(observe(crossing, S2, V2X(max_neighbours=0), runs=2)), crossing.position[0, 3]
@@ -61,7 +61,7 @@ def test_step_by_step_is_the_track(name: str, known: bool, crossing: Fleet) -> N
 
 
 @pytest.mark.parametrize("known", [False, True])
-def test_a_net_step_by_step_is_its_track(known: bool, crossing: Fleet) -> None:
+def test_a_net_step_by_step_is_its_track(known, crossing):
     recording, x0 = observe(crossing, S2, V2X(max_neighbours=0)), crossing.position[0, 3]
     track = LearnedGain(NET, x0=x0[None] if known else None)(recording, [3])
     stream = LearnedGain(NET).start(x0 if known else None)
@@ -83,7 +83,7 @@ def peer(x: Floats, known: NoiseModel) -> Any:
     ("start", "near"),
     [(textbook(Kalman(FITTED)).start, 1e-9), (partial(StarStream, CooperativeFilter(FITTED, AS_STATED)), 1e-4)],
 )
-def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(start: Any, near: float) -> None:
+def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(start, near):
     """filterpy gets a late fix moved by, and with the variance of, the motion since, from the sum of all steps. The
     star's flat prior of 1e6 m^2 weighs 1e-5 of a fix."""
     draw, stream = np.random.default_rng(0), start(interval=0.1)
@@ -103,7 +103,7 @@ def test_alone_it_is_filterpy_with_missing_and_late_fixes_and_any_dt(start: Any,
 
 
 @pytest.mark.parametrize("name", STARTS)
-def test_a_long_step_is_two_short_ones(name: str) -> None:
+def test_a_long_step_is_two_short_ones(name):
     """Where motion is white noise of steps of 0.1 s."""
     given = {} if name == "net" else {"interval": 0.1}
     once, twice = STARTS[name](**given), STARTS[name](**given)
@@ -120,7 +120,7 @@ def test_a_long_step_is_two_short_ones(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ["nominal", "star", "net"])
-def test_nothing_is_known_before_the_first_fix(name: str) -> None:
+def test_nothing_is_known_before_the_first_fix(name):
     stream = STARTS[name]()
     for _ in range(3):
         x, cov = stream.step(None, U, 0.1, fix_age=9.0)
@@ -154,7 +154,7 @@ def window(draw: np.random.Generator, steps: int, late: int, q: float, r: float)
     return x[0] - truth[-1], best - truth[-1], without[0] - truth[-1], std
 
 
-def test_a_late_fix_is_nearly_used_up() -> None:
+def test_a_late_fix_is_nearly_used_up():
     """0.3 s late at the noise of scenario 2 at 10 m/s: within 2 % of the least squares over the whole window, which
     is itself as good as it says; without the late fixes a filter is clearly worse."""
     draw = np.random.default_rng(5)
@@ -176,7 +176,7 @@ def test_a_late_fix_is_nearly_used_up() -> None:
     ],
 )
 @pytest.mark.parametrize("name", ["nominal", "star", "net"])
-def test_bad_input_is_named_and_forgotten(name: str, field: str, given: dict[str, Any]) -> None:
+def test_bad_input_is_named_and_forgotten(name, field, given):
     one, other = STARTS[name](), STARTS[name]()
     for stream in (one, other):
         stream.step(Z, U, 0.1)
@@ -186,7 +186,7 @@ def test_bad_input_is_named_and_forgotten(name: str, field: str, given: dict[str
     np.testing.assert_array_equal(one.history.rows, other.history.rows)
 
 
-def test_the_motion_that_is_kept_is_its_integral() -> None:
+def test_the_motion_that_is_kept_is_its_integral():
     """Closed form: the summed motion, interpolated at any age, while the ring of steps wraps around and grows."""
     rng, history = np.random.default_rng(0), MotionHistory(10.0)
     dt = np.concatenate([rng.uniform(0.2, 0.9, 100), rng.uniform(0.01, 0.05, 500), rng.uniform(0.2, 0.9, 50)])
@@ -204,7 +204,7 @@ def test_the_motion_that_is_kept_is_its_integral() -> None:
             assert_allclose([*(fix - [5.0, 0.0, -1.0]), *late], since, atol=1e-9)
 
 
-def test_bad_starts_are_named() -> None:
+def test_bad_starts_are_named():
     for field, make in {
         "x0": lambda: Kalman("identity").start([0.0, 0.0]),
         "interval": lambda: Kalman("identity").start(interval=0.0),
@@ -223,7 +223,7 @@ def test_bad_starts_are_named() -> None:
 
 
 @pytest.mark.parametrize("first", [None, Z + 1.0])
-def test_a_star_from_a_known_place_is_the_kalman_filter(first: Floats | None) -> None:
+def test_a_star_from_a_known_place_is_the_kalman_filter(first):
     star = StarStream(CooperativeFilter(FITTED, AS_STATED), Z)
     alone = textbook(Kalman(FITTED)).start(Z)
     for z in (first, None, Z + U):
@@ -232,7 +232,7 @@ def test_a_star_from_a_known_place_is_the_kalman_filter(first: Floats | None) ->
         assert_allclose(cov, same_cov, atol=1e-6)
 
 
-def test_a_stream_forgets_whom_it_met_long_ago() -> None:
+def test_a_stream_forgets_whom_it_met_long_ago():
     stream, other = (StarStream(CooperativeFilter(FITTED)) for _ in range(2))
     for k in range(400):
         other.step(Z, U, 0.1)
@@ -243,7 +243,7 @@ def test_a_stream_forgets_whom_it_met_long_ago() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("log", ["bundled", "KITTI 00"])
-def test_the_replay_runs(log: str) -> None:
+def test_the_replay_runs(log):
     arguments = []
     if log != "bundled":
         arguments = [measured(f"KITTI_00_{part}.txt") for part in ("ORB", "gt_times", "gt")]
@@ -257,7 +257,7 @@ def test_the_replay_runs(log: str) -> None:
     assert (numbers[:, 5] > 50).all(), "steps per second"
 
 
-def test_a_range_of_zero_is_refused_and_forgotten(crossing: Fleet) -> None:
+def test_a_range_of_zero_is_refused_and_forgotten(crossing):
     """No direction is seen in one place: a filter of a star gave NaN from there on."""
     stream, other = (StarStream(CooperativeFilter(FITTED)) for _ in range(2))
     stream.step([0, 0, 0], [1, 0, 0], 0.1)

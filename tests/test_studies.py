@@ -33,7 +33,7 @@ CLASSIC = {"method": "gnss,kalman,lkf-sa,joint,bound", "runs": 4, "egos": "2", "
 
 
 @pytest.fixture(scope="module")
-def town10() -> co.Fleet:
+def town10():
     return co.load_fleet("town10")
 
 
@@ -47,14 +47,14 @@ def drawn(name: str, frame: pd.DataFrame, *axes: str, **settings: object) -> Res
     return Results(name, "", axes, {**study(name).settings, **settings}, frame, pd.DataFrame(), 0, {})
 
 
-def test_the_clients_are_drawn_where_they_drive() -> None:
+def test_the_clients_are_drawn_where_they_drive():
     _, _, panel, _ = convergence._clients(drawn("convergence", pd.DataFrame())).figure.axes
     fleet = co.load_fleet("town10-clients")
     np.testing.assert_array_equal(panel.lines[0].get_xydata(), fleet.position[:1450, 2, :2])
     assert panel.get_title() == "Client 3: 1450 steps\n0.4 to 10.8 m/s"
 
 
-def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:
+def test_neighbours_runs_without_any_training(tmp_path):
     """Only what is asked for is made: no weights for classical methods, and views of what was run."""
     results = run_study(study("neighbours", **CLASSIC, weights=str(tmp_path / "weights")), out=tmp_path, progress=False)
     assert results.failed == 0
@@ -80,7 +80,7 @@ def test_neighbours_runs_without_any_training(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("rate", [10.0, 2.0])
-def test_the_bound_receives_what_the_channel_sends(rate: float) -> None:
+def test_the_bound_receives_what_the_channel_sends(rate):
     """As many bytes as the joint filter counts by itself, at every step and at a fifth of them."""
     p = {
         **study("neighbours", runs=1, egos="1").settings,
@@ -115,7 +115,7 @@ def cdf(net: Sequence[float]) -> Results:
         ((0.1,), "of one training seed, whose spread is unknown"),
     ],
 )
-def test_a_verdict_needs_runs_and_training_seeds(net: tuple[float, ...], words: str) -> None:
+def test_a_verdict_needs_runs_and_training_seeds(net, words):
     results = cdf(net)
     ((key, text),) = error_cdf.STUDY.answers(results).items()
     spread = seed_std(results, {"method": "fedkalmannet"}) or 0.0
@@ -139,7 +139,7 @@ def plant(folder: Path, name: str, p: Params, rounds: int = 2) -> Checkpoint:
     return made
 
 
-def test_weights_of_another_training_are_refused(tmp_path: Path) -> None:
+def test_weights_of_another_training_are_refused(tmp_path):
     """Two client fleets share a folder in one process: what one has trained is not taken for the other's."""
     p = {**study("error_cdf", weights=str(tmp_path), train_seeds=1).settings, "method": "okf"}
     plant(tmp_path, "okf", p)
@@ -148,7 +148,7 @@ def test_weights_of_another_training_are_refused(tmp_path: Path) -> None:
         weights.checkpoint("okf", {**p, "clients": "town04"}, 0)
 
 
-def test_there_are_as_many_individual_nets_as_clients(tmp_path: Path) -> None:
+def test_there_are_as_many_individual_nets_as_clients(tmp_path):
     write_table(co.load_fleet("town10-clients").select([0, 2]), tmp_path / "two.csv")
     for name in ("convergence", "error_cdf"):
         cells = study(name, clients=str(tmp_path / "two.csv"), train_seeds=1).cells()
@@ -158,7 +158,7 @@ def test_there_are_as_many_individual_nets_as_clients(tmp_path: Path) -> None:
         study("convergence", method="individual9").cells()
 
 
-def test_convergence_counts_federated_rounds_and_starts_where_it_is_told(tmp_path: Path, town10: co.Fleet) -> None:
+def test_convergence_counts_federated_rounds_and_starts_where_it_is_told(tmp_path, town10):
     """The start moves the result; the last row is the net itself from that start."""
     for start in ("gnss", "true"):
         p = {
@@ -175,7 +175,7 @@ def test_convergence_counts_federated_rounds_and_starts_where_it_is_told(tmp_pat
         assert [row["rt_le_m"] for row in found[-2:]] == pytest.approx(rt_le(alone, town10)[:, 0])
 
 
-def test_order_of_the_paper_under_identity_and_the_honest_order(town10: co.Fleet) -> None:
+def test_order_of_the_paper_under_identity_and_the_honest_order(town10):
     """Scenario 2, three egos: federated < LKF-SA < GNSS at every K >= 1 and LKF-SA falls with K under identity
     covariances; with fitted or known noise the joint filter is ahead of the net. No run of the net diverges."""
     egos, sensors = ["town10-00", "town10-24", "town10-48"], co.Sensors.paper_scenario2()
@@ -210,7 +210,7 @@ def test_order_of_the_paper_under_identity_and_the_honest_order(town10: co.Fleet
         ("data show town11", "town10"),
     ],
 )
-def test_mistakes_end_with_a_sentence_and_status_2(arguments: str, words: str, tmp_path: Path) -> None:
+def test_mistakes_end_with_a_sentence_and_status_2(arguments, words, tmp_path):
     command = [str(Path(sys.executable).with_name("coopoc")), *arguments.split()]
     done = ran(command, cwd=tmp_path)
     assert done.returncode == 2, done.stderr

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from conftest import refused
 
-from coopoc import V2X, JointFilter, Results, load_fleet, observe, run_study
+from coopoc import V2X, JointFilter, load_fleet, observe, run_study
 from coopoc.evaluate.metrics import rt_le
 from coopoc.evaluate.statistics import Interval, paired_difference
 from coopoc.learned import Checkpoint, save
@@ -22,13 +22,13 @@ SIZES = ("payload_bytes_per_second", "bytes_per_second")
 
 
 @pytest.fixture(scope="module")
-def results(tmp_path_factory: pytest.TempPathFactory, short_town: str) -> Results:
+def results(tmp_path_factory, short_town):
     wanted = {**QUICK, "data": short_town}
     return run_study("budget", tmp_path_factory.mktemp("budget"), settings=wanted, progress=False)
 
 
 @pytest.fixture(scope="module")
-def tight(tmp_path_factory: pytest.TempPathFactory, short_town: str) -> Results:
+def tight(tmp_path_factory, short_town):
     """Under caps and schedules, and a training: the shipped weights."""
     folder, shipped = tmp_path_factory.mktemp("weights"), load_weights(WEIGHTS / "fedokf.safetensors")
     drives = load_fleet("town10-clients")
@@ -57,7 +57,7 @@ def at(**where: object) -> dict[str, object]:
 
 
 @pytest.mark.slow
-def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: str) -> None:
+def test_bytes_are_payload_and_what_goes_on_air(results, short_town):
     """By hand: 32 B at 10 Hz from each of the neighbours that are there; a CAM carries 350 B more."""
     drive = load_fleet(short_town)
     egos = [drive.index(ego) for ego in scene.egos({"data": short_town, "egos": 2})]
@@ -71,14 +71,14 @@ def test_bytes_are_payload_and_what_goes_on_air(results: Results, short_town: st
 
 
 @pytest.mark.slow
-def test_channels_keep_their_order(results: Results) -> None:
+def test_channels_keep_their_order(results):
     error = {name: numbers.mean(results, at(channel=name)) for name in CHANNELS}
     assert error["ideal"] == min(error.values())  # type: ignore[type-var]
     assert numbers.mean(results, at(method="bound", noise_model="with its past", channel="ideal")) is not None
 
 
 @pytest.mark.slow
-def test_best_within_a_budget_never_gets_worse_with_it(results: Results) -> None:
+def test_best_within_a_budget_never_gets_worse_with_it(results):
     texts = study.STUDY.answers(results)
     errors = [float(text.split()[-2]) for text in texts.values()]
     assert len(errors) == len(study.LIMITS)
@@ -86,7 +86,7 @@ def test_best_within_a_budget_never_gets_worse_with_it(results: Results) -> None
     assert "K =" not in texts["0 B/s"]
 
 
-def test_a_channel_that_is_not_there_is_named() -> None:
+def test_a_channel_that_is_not_there_is_named():
     with refused("channel"):
         scene.channel({"channel": "wifi"})
     assert scene.channel({"channel": "bsm", "max_neighbours": 4, "radius_m": 50.0}) == V2X(
@@ -95,7 +95,7 @@ def test_a_channel_that_is_not_there_is_named() -> None:
 
 
 @pytest.mark.slow
-def test_schedules_are_compared_on_the_same_egos_and_runs(tight: Results, short_town: str) -> None:
+def test_schedules_are_compared_on_the_same_egos_and_runs(tight, short_town):
     """The row of a cap, by hand."""
     fleet = load_fleet(short_town)
     egos, errors = scene.egos({"data": short_town, "egos": 2}), []

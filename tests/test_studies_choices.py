@@ -24,7 +24,7 @@ TWO = {"egos": "2", "runs": 2}
 
 
 @pytest.mark.slow
-def test_side_by_side_takes_any_methods_and_conditions(tmp_path: Path, short_town: str) -> None:
+def test_side_by_side_takes_any_methods_and_conditions(tmp_path, short_town):
     harsh = {**TWO, "data": short_town, "max_neighbours": "0,4", "latency_s": 0.2, "common_share": 0.5}
     results = run_study("side_by_side", tmp_path, settings={**harsh, "method": "joint,bound"}, progress=False)
     caption = (tmp_path / "side_by_side" / "tables" / "rt_le.md").read_text()
@@ -40,7 +40,7 @@ def test_side_by_side_takes_any_methods_and_conditions(tmp_path: Path, short_tow
     assert (results.values("rt_le_m", {"method": "bound", "max_neighbours": 4}) > 0).all()
 
 
-def test_what_no_cell_can_be_computed_with_is_refused_before_any(tmp_path: Path, short_town: str) -> None:
+def test_what_no_cell_can_be_computed_with_is_refused_before_any(tmp_path, short_town):
     for wrong, said in (
         ({"method": "kalman,jont"}, r"method = 'jont': must be one of .* Did you mean joint\?"),
         ({"runs": 0}, r"runs = 0: must be >= 1"),
@@ -68,7 +68,7 @@ def given(**more: Any) -> dict[str, Any]:
     return {**aggregation.STUDY.settings, **TINY, "condition": "iid", "method": "mean", "scenario": 1, **more}
 
 
-def test_every_condition_is_what_it_says() -> None:
+def test_every_condition_is_what_it_says():
     """Noise of each client against its sensors, amounts, the moved truth."""
     plain, unlike = (aggregation.clients(given(condition=c, members=12), 0) for c in ("iid", "heterogeneous"))
     noise = aggregation.noise(given(condition="heterogeneous", members=12))
@@ -83,7 +83,7 @@ def test_every_condition_is_what_it_says() -> None:
     assert shift == pytest.approx([0.0] * 6 + [10.0] + [0.0] * 5, abs=1e-4)
 
 
-def test_no_cell_for_a_rule_without_enough_clients() -> None:
+def test_no_cell_for_a_rule_without_enough_clients():
     cells = aggregation.STUDY.override({"members": "6"}).cells()
     there = {(c.settings["condition"], c.settings["method"]) for c in cells}
     assert ("iid", "krum") in there
@@ -93,7 +93,7 @@ def test_no_cell_for_a_rule_without_enough_clients() -> None:
         aggregation.STUDY.override({"members": "61"}).cells()
 
 
-def test_a_cell_is_the_federation_of_its_seed() -> None:
+def test_a_cell_is_the_federation_of_its_seed():
     """Its rows are the RT-LE of `federate` by hand, on the noise that all methods share."""
     p = given(scenario=2)
     rows = aggregation.cell(p)
@@ -108,7 +108,7 @@ def test_a_cell_is_the_federation_of_its_seed() -> None:
 
 
 @pytest.mark.slow
-def test_the_study_runs_and_says_what_it_found(tmp_path: Path) -> None:
+def test_the_study_runs_and_says_what_it_found(tmp_path):
     wanted = {**TINY, "runs": 1, "method": "mean,centralised,kalman,bound", "condition": "iid,poisoned update"}
     study = aggregation.STUDY.override({name: str(value) for name, value in wanted.items()})
     results = run_study(study, out=tmp_path, progress=False)
@@ -127,7 +127,7 @@ def test_the_study_runs_and_says_what_it_found(tmp_path: Path) -> None:
         ((-0.1, 0.12, 0.05), "Better than the mean over training seeds (95 %): no rule; worse: no rule."),
     ],
 )
-def test_a_rule_is_better_only_if_all_training_seeds_agree(gaps: tuple[float, ...], words: str) -> None:
+def test_a_rule_is_better_only_if_all_training_seeds_agree(gaps, words):
     at = {"condition": "iid", "scenario": 1}
     places: list[dict[str, Any]] = [
         {"train_seed": s, "ego": e, "run": r} for s in range(3) for e in range(2) for r in range(3)

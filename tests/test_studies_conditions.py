@@ -33,7 +33,7 @@ def conditions(file: Path) -> Iterator[tuple[dict[str, Any], dict[tuple[str, str
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_no_mark_lies_below_its_bound(file: Path) -> None:
+def test_no_mark_lies_below_its_bound(file):
     for where, marks in conditions(file):
         bounds = {known: mark["value"] for (method, known), mark in marks.items() if method == "bound"}
         for (method, known), mark in marks.items():
@@ -46,12 +46,12 @@ def test_no_mark_lies_below_its_bound(file: Path) -> None:
             assert rms + 3.0 * error > own, (where, method, known, rms, own)
 
 
-def test_most_studies_show_a_bound() -> None:
+def test_most_studies_show_a_bound():
     shown = {file.stem for file in FILES for _, marks in conditions(file) if any(m == "bound" for m, _ in marks)}
     assert {"budget", "correlated_gnss", "neighbours"} <= shown
 
 
-def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path, short_town: str) -> None:
+def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path, short_town):
     wanted = {
         "data": short_town,
         "runs": 3,
@@ -72,7 +72,7 @@ def test_late_and_lost_messages_cost_and_the_table_says_so(tmp_path: Path, short
     assert "0.3 s" in table
 
 
-def test_what_is_wrong_harms_those_who_use_it(tmp_path: Path, short_town: str) -> None:
+def test_what_is_wrong_harms_those_who_use_it(tmp_path, short_town):
     wanted = {
         "data": short_town,
         "runs": 1,
@@ -106,7 +106,7 @@ def test_what_is_wrong_harms_those_who_use_it(tmp_path: Path, short_town: str) -
 QUICK = {"method": "kalman,joint,cooperative-filter,bound", "max_neighbours": "0,6,10", "runs": 3, "egos": "2"}
 
 
-def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path: Path, short_town: str) -> None:
+def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path, short_town):
     wanted = {"own_share": "0.9,0.0", "common_share": "0.0,0.9"}
     results = run_study("correlated_gnss", tmp_path, settings={**QUICK, **wanted, "data": short_town}, progress=False)
     value = {
@@ -127,7 +127,7 @@ def test_own_errors_average_out_over_neighbours_and_common_ones_do_not(tmp_path:
     assert (folder / "figures" / "rms.pdf").stat().st_size > 5_000
 
 
-def test_shares_keep_the_variance_of_a_fix() -> None:
+def test_shares_keep_the_variance_of_a_fix():
     noise = scene.lasting(Sensors.paper_scenario2(), 0.45, 0.45)
     assert noise.fix_std == pytest.approx((3.5, 3.5, 3.5))
     assert noise.gnss_drift_std == pytest.approx(3.5 * np.sqrt(0.45))
@@ -136,7 +136,7 @@ def test_shares_keep_the_variance_of_a_fix() -> None:
             scene.lasting(Sensors(), own, common)
 
 
-def test_bound_with_the_past_is_the_stars_where_nobody_comes_or_goes() -> None:
+def test_bound_with_the_past_is_the_stars_where_nobody_comes_or_goes():
     fleet, noise = formation_fleet(5, 40), co.Sensors.paper_scenario2()
     for k in (0, 4):
         np.testing.assert_allclose(
@@ -144,7 +144,7 @@ def test_bound_with_the_past_is_the_stars_where_nobody_comes_or_goes() -> None:
         )
 
 
-def test_bound_with_the_past_is_lower_where_they_do(crossing: co.Fleet) -> None:
+def test_bound_with_the_past_is_lower_where_they_do(crossing):
     noise, v2x = co.Sensors.paper_scenario2(), co.V2X(3)
     past, star = (np.trace(b(crossing, noise, 1, v2x), axis1=1, axis2=2) for b in (past_bound, posterior_bound))
     assert (past <= star * (1 + 1e-9)).all()

@@ -19,7 +19,7 @@ from coopoc.study.style import METHODS, Panel, look
 
 
 @pytest.fixture(scope="module")
-def results() -> Results:
+def results():
     rng = np.random.default_rng(0)
     rows = []
     lines = [
@@ -62,7 +62,7 @@ PLOTS: dict[str, Callable[[Results], Any]] = {
 
 
 @pytest.mark.parametrize("make", PLOTS.values(), ids=PLOTS)
-def test_the_same_numbers_give_the_same_bytes(results: Results, tmp_path: Path, make: Callable[[Results], Any]) -> None:
+def test_the_same_numbers_give_the_same_bytes(results, tmp_path, make):
     assert make(results).save(tmp_path / "a") == make(results).save(tmp_path / "b") != ""
     for suffix in ("pdf", "png", "svg"):
         first, second = ((tmp_path / f"{n}.{suffix}").read_bytes() for n in "ab")
@@ -72,7 +72,7 @@ def test_the_same_numbers_give_the_same_bytes(results: Results, tmp_path: Path, 
     assert b"<image" not in (tmp_path / "a.svg").read_bytes()
 
 
-def test_no_two_methods_look_alike() -> None:
+def test_no_two_methods_look_alike():
     looks = [(m.color, m.marker) for m in METHODS.values()]
     assert len(set(looks)) == len(looks)
     assert len({m.label for m in METHODS.values()}) == len(METHODS)
@@ -80,7 +80,7 @@ def test_no_two_methods_look_alike() -> None:
     assert look("my own") == look("my own") != look("another")
 
 
-def test_a_sweep_draws_the_means_in_the_method_colour(results: Results) -> None:
+def test_a_sweep_draws_the_means_in_the_method_colour(results):
     where = {"noise_model": ["fitted", "nominal"]}
     axes = figures.sweep(results, "max_neighbours", where=where, log=True).figure.axes[0]
     drawn = {line.get_color(): line for line in axes.lines}
@@ -95,7 +95,7 @@ def test_a_sweep_draws_the_means_in_the_method_colour(results: Results) -> None:
     assert (one.get_text(), other.get_text()) == ("identity", "fitted / trained")
 
 
-def test_a_distribution_is_that_of_all_steps(results: Results) -> None:
+def test_a_distribution_is_that_of_all_steps(results):
     where = {"max_neighbours": 2, "method": "joint"}
     errors = np.concatenate(results.select(where)["error_quantiles_m"].to_list())
     found = quantile(results, {**where, "share": 0.9})
@@ -105,7 +105,7 @@ def test_a_distribution_is_that_of_all_steps(results: Results) -> None:
 
 
 @pytest.mark.parametrize("suffix", ["svg", "png"])
-def test_no_letter_of_the_legend_is_cut_off(results: Results, tmp_path: Path, suffix: str) -> None:
+def test_no_letter_of_the_legend_is_cut_off(results, tmp_path, suffix):
     """Letters are hinted wider at the 72 dpi of PDF and SVG than at others, and the legend must fit in all of them."""
     plot = PLOTS["curves"](results)
     plot.save(tmp_path / "a")
@@ -114,7 +114,7 @@ def test_no_letter_of_the_legend_is_cut_off(results: Results, tmp_path: Path, su
     assert plot.figure.axes[0].get_legend().get_window_extent().x1 <= plot.figure.bbox.x1
 
 
-def test_a_front_joins_what_no_cheaper_method_beats(results: Results) -> None:
+def test_a_front_joins_what_no_cheaper_method_beats(results):
     axes = figures.pareto(results, "c", where={"method": ["joint", "gnss"]}).figure.axes[0]
     marks, front, level = axes.lines
     means = (
@@ -127,7 +127,7 @@ def test_a_front_joins_what_no_cheaper_method_beats(results: Results) -> None:
     )
 
 
-def test_curves_draw_numbers_of_their_selections(results: Results) -> None:
+def test_curves_draw_numbers_of_their_selections(results):
     panel = Panel({k: {"max_neighbours": k} for k in (0, 2, 10, 99)}, {"noise_model": "fitted"}, "a title")
     plot = figures.curves(results, [panel], LINES, "c", levels=[GNSS])
     assert plot is not None
@@ -142,7 +142,7 @@ def test_curves_draw_numbers_of_their_selections(results: Results) -> None:
     assert [text.get_text() for text in both.figure.axes[0].get_legend().get_texts()][1:] == ["mine"]
 
 
-def test_every_line_that_coincides_is_named(results: Results) -> None:
+def test_every_line_that_coincides_is_named(results):
     """Also where a method has two, each with another method's line: the last one's name replaced the others."""
     kalman = results.frame.query("method == 'kalman'")
     names = {"identity": "fedkalmannet", "fitted": "okf"}
@@ -188,7 +188,7 @@ FILES = sorted((Path(__file__).resolve().parents[1] / "studies" / "reference").g
 
 
 @pytest.mark.parametrize("file", FILES, ids=lambda file: file.stem)
-def test_no_figure_of_the_gallery_hides_a_line(file: Path) -> None:
+def test_no_figure_of_the_gallery_hides_a_line(file):
     results, lines_seen = from_reference(file), 0
     for view in find("coopoc.studies", file.stem).figures.values():
         plot = view(results)

@@ -3,9 +3,7 @@
 import hashlib
 import importlib
 import sys
-from collections.abc import Iterator
 from functools import partial
-from pathlib import Path
 
 import pytest
 from conftest import refused
@@ -27,13 +25,13 @@ def names(**changes: object) -> list[str]:
     return [cell.name for cell in study(**changes).cells()]
 
 
-def test_the_grid_is_the_product_in_order() -> None:
+def test_the_grid_is_the_product_in_order():
     assert [tuple(c.params.values()) for c in study().cells()] == [(0, "a"), (0, "b"), (1, "a"), (1, "b")]
     assert study().cells()[0].settings == {"runs": 3, "egos": (0, 1), "ratio": 0.1, "k": 0, "method": "a"}
     assert len(study(where=lambda p: p["k"] > 0 or p["method"] == "a").cells()) == 3
 
 
-def test_a_list_of_cells_is_taken_as_it_stands() -> None:
+def test_a_list_of_cells_is_taken_as_it_stands():
     listed = study(grid=[{"k": 1, "method": "a"}, {"k": 0, "method": "b"}])
     assert listed.axes == ("k", "method")
     assert [c.params["k"] for c in listed.cells()] == [1, 0]
@@ -42,7 +40,7 @@ def test_a_list_of_cells_is_taken_as_it_stands() -> None:
         listed.override({"k": 7})
 
 
-def test_all_that_changes_the_numbers_changes_the_name_and_nothing_else_does() -> None:
+def test_all_that_changes_the_numbers_changes_the_name_and_nothing_else_does():
     base = names()
     assert len(set(base)) == 4
     assert names() == base
@@ -52,12 +50,12 @@ def test_all_that_changes_the_numbers_changes_the_name_and_nothing_else_does() -
         assert not set(names(**changed)) & set(base)
 
 
-def test_names_are_stable_between_processes() -> None:
+def test_names_are_stable_between_processes():
     text = b'{"data":"town10","ratio":0.1,"runs":3}'
     assert digest({"runs": 3, "data": "town10", "ratio": 0.1}) == hashlib.sha256(text).hexdigest()[:20]
 
 
-def test_settings_are_read_as_the_type_of_their_default() -> None:
+def test_settings_are_read_as_the_type_of_their_default():
     changed = study().override({"runs": "100", "egos": "4,5,6", "ratio": "0.15", "k": "2"})
     assert changed.settings == {"runs": 100, "egos": (4, 5, 6), "ratio": 0.15}
     assert [c.params["k"] for c in changed.cells()] == [2, 2]
@@ -74,12 +72,12 @@ def test_settings_are_read_as_the_type_of_their_default() -> None:
         ({"egos": "0,x"}, "egos = 'x': must be a whole number"),
     ],
 )
-def test_a_setting_that_cannot_be_is_named(changes: dict[str, str], message: str) -> None:
+def test_a_setting_that_cannot_be_is_named(changes, message):
     with refused(message):
         study().override(changes)
 
 
-def test_grids_that_cannot_be() -> None:
+def test_grids_that_cannot_be():
     with refused("must not name an axis"):
         study(settings={"k": 1})
     with refused("must have at least one"):
@@ -92,7 +90,7 @@ def test_grids_that_cannot_be() -> None:
         study(settings={"fleet": object()}).cells()
 
 
-def test_assignments() -> None:
+def test_assignments():
     assert assignments(["a=1", "b=x=y"]) == {"a": "1", "b": "x=y"}
     with refused("must be key=value"):
         assignments(["runs"])
@@ -119,7 +117,7 @@ def cell(p):
 
 
 @pytest.fixture
-def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
+def package(tmp_path, monkeypatch):
     folder = tmp_path / "reached_package"
     folder.mkdir()
     for name, text in PACKAGE.items():
@@ -145,7 +143,7 @@ def package(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
         ("views", "return CAPTION", "return CAPTION * 2", True),
     ],
 )
-def test_only_what_a_cell_reaches_is_in_its_name(package: Path, name: str, old: str, new: str, same: bool) -> None:
+def test_only_what_a_cell_reaches_is_in_its_name(package, name, old, new, same):
     before = code_of(importlib.import_module("reached_package.cells").cell)
     file = package / f"{name}.py"
     assert old in file.read_text()
@@ -172,7 +170,7 @@ STUDY = co.Study("own", "Does it?", cell, {{"x": (1, 2)}}, tables={{"{name}": sh
 """
 
 
-def test_a_caption_or_a_views_name_recomputes_nothing(tmp_path: Path) -> None:
+def test_a_caption_or_a_views_name_recomputes_nothing(tmp_path):
     """A file study: caption and name of its table change, and all cells are finished; a number changes, and none is."""
     file, out = tmp_path / "mine.py", tmp_path / "runs"
     study = f"{file}:STUDY"
@@ -185,7 +183,7 @@ def test_a_caption_or_a_views_name_recomputes_nothing(tmp_path: Path) -> None:
         assert caption in (out / "own" / "tables" / f"{name}.md").read_text()
 
 
-def test_bundled_cells_count_by_what_they_run() -> None:
+def test_bundled_cells_count_by_what_they_run():
     """`robustness` and `latency_loss` share their cell and none of their views; `real` has a cell of its own."""
     codes = {name: code_of(find_study(name).cell) for name in ("robustness", "latency_loss", "real")}
     assert codes["robustness"] == codes["latency_loss"] != codes["real"]
@@ -212,12 +210,12 @@ def no_results() -> Table | None:
         (3, "must be a function of the Results alone"),
     ],
 )
-def test_a_view_is_checked_before_the_first_cell(tmp_path: Path, view: object, message: str) -> None:
+def test_a_view_is_checked_before_the_first_cell(tmp_path, view, message):
     with refused(message):
         run_study(demo(view), tmp_path, progress=False)
 
 
-def test_names_of_views_are_names_of_files(tmp_path: Path) -> None:
+def test_names_of_views_are_names_of_files(tmp_path):
     def view(results: Results) -> Table | None:
         return None
 

@@ -20,12 +20,12 @@ def install(folder: Path, name: str, points: str) -> None:
 
 
 @pytest.fixture
-def site(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+def site(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(tmp_path))
     return tmp_path
 
 
-def test_an_entry_point_is_one_object_or_a_mapping_of_several(site: Path) -> None:
+def test_an_entry_point_is_one_object_or_a_mapping_of_several(site):
     install(site, "one", "[some.group]\nwave = math:pi\ntable = string_table:TABLE\n")
     (site / "string_table.py").write_text("TABLE = {'a': 1, 'b': 2}\n")
     assert plugins.names("some.group") == ("a", "b", "wave")
@@ -36,7 +36,7 @@ def test_an_entry_point_is_one_object_or_a_mapping_of_several(site: Path) -> Non
 
 
 @pytest.mark.parametrize("group", [group for group in plugins.GROUPS if group != "coopoc.commands"])
-def test_every_open_set_takes_a_file_of_ones_own_and_names_what_is_wrong_with_it(tmp_path: Path, group: str) -> None:
+def test_every_open_set_takes_a_file_of_ones_own_and_names_what_is_wrong_with_it(tmp_path, group):
     (tmp_path / "mine.py").write_text("def huber(x):\n    return x\n")
     own, noun = f"{tmp_path / 'mine.py'}:huber", plugins.GROUPS[group]
     assert plugins.find(group, own)(3) == 3
@@ -48,7 +48,7 @@ def test_every_open_set_takes_a_file_of_ones_own_and_names_what_is_wrong_with_it
         plugins.find(group, "no such thing")
 
 
-def test_distributions_are_read_once_until_another_comes(site: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_distributions_are_read_once_until_another_comes(site, monkeypatch):
     reads, read = [], metadata.entry_points
     monkeypatch.setattr(metadata, "entry_points", lambda **chosen: reads.append(chosen) or read(**chosen))
     install(site, "one", "[some.group]\nwave = math:pi\n")
@@ -61,7 +61,7 @@ def test_distributions_are_read_once_until_another_comes(site: Path, monkeypatch
     assert len(reads) == 2
 
 
-def test_what_cannot_be_loaded_hides_nothing_else(site: Path) -> None:
+def test_what_cannot_be_loaded_hides_nothing_else(site):
     install(site, "broken", "[some.group]\nbroken = no_such_module:THING\nfine = math:pi\n")
     assert plugins.names("some.group") == ("broken", "fine")
     with pytest.raises(ModuleNotFoundError, match="no_such_module"):
@@ -70,14 +70,14 @@ def test_what_cannot_be_loaded_hides_nothing_else(site: Path) -> None:
         plugins.find("some.group", "other")
 
 
-def test_two_distributions_may_not_claim_one_name(site: Path) -> None:
+def test_two_distributions_may_not_claim_one_name(site):
     install(site, "first", "[some.group]\nx = math:pi\n")
     install(site, "second", "[some.group]\nx = math:tau\n")
     with refused(r"'x': is claimed by math:\w+ and math:\w+\. Uninstall one"):
         plugins.find("some.group", "x")
 
 
-def test_entry_points_are_pythons_own_after_the_backport_was_imported() -> None:
+def test_entry_points_are_pythons_own_after_the_backport_was_imported():
     """importlib_metadata, which Dask imports, replaces the finder of the whole process."""
     code = (
         "import importlib_metadata\nfrom importlib.metadata import EntryPoint\nfrom coopoc.plugins import points\n"

@@ -46,7 +46,7 @@ METRICS: dict[str, str | float] = {"rt_le_m": "lower", "nees": 3.0}
 
 
 @pytest.fixture
-def results(tmp_path: Path) -> Results:
+def results(tmp_path):
     return run_study(STUDY, tmp_path, progress=False)
 
 
@@ -60,7 +60,7 @@ def changed(tmp_path: Path, **settings: float) -> Results:
     return replace(now, settings={**STUDY.settings, "runs": now.settings["runs"]})
 
 
-def test_a_number_is_the_mean_and_its_runs_spread(results: Results, tmp_path: Path) -> None:
+def test_a_number_is_the_mean_and_its_runs_spread(results, tmp_path):
     known = measure(results, METRICS)
     first = known.numbers[0]
     assert (first.where, first.metric, first.value, first.runs) == ({"x": 1.0}, "rt_le_m", pytest.approx(1.1), 3)
@@ -71,14 +71,14 @@ def test_a_number_is_the_mean_and_its_runs_spread(results: Results, tmp_path: Pa
 
 
 @pytest.mark.parametrize("field", ["value", "run_std", "tolerance"])
-def test_a_reference_that_is_no_number_is_damaged(results: Results, tmp_path: Path, field: str) -> None:
+def test_a_reference_that_is_no_number_is_damaged(results, tmp_path, field):
     known = measure(results, METRICS)
     replace(known, numbers=(replace(known.numbers[0], **{field: float("nan")}),)).save(tmp_path / "numbers.json")
     with refused("is damaged .nan is no finite number"):
         Reference.load(tmp_path / "numbers.json")
 
 
-def test_verdicts_know_the_direction(results: Results, tmp_path: Path) -> None:
+def test_verdicts_know_the_direction(results, tmp_path):
     known = measure(results, METRICS)
     assert set(verdicts(results, known).values()) == {"within noise"}
     assert set(verdicts(changed(tmp_path / "0", scale=1.009), known).values()) == {"within noise"}
@@ -100,7 +100,7 @@ def test_verdicts_know_the_direction(results: Results, tmp_path: Path) -> None:
     assert not table(check(results, known)).rows
 
 
-def test_other_runs_are_allowed_their_standard_errors(results: Results, tmp_path: Path) -> None:
+def test_other_runs_are_allowed_their_standard_errors(results, tmp_path):
     """3 runs against 12 whose mean is 1.55: 0.45 away, 2 x 0.1 sqrt(1/3 + 1/12) + 0.011 = 0.14 allowed."""
     known = measure(results, METRICS)
     more = changed(tmp_path, runs=12)
@@ -112,7 +112,7 @@ def test_other_runs_are_allowed_their_standard_errors(results: Results, tmp_path
     assert check(fewer, known)[0].verdict == "within noise"
 
 
-def test_numbers_of_other_settings_are_refused(results: Results, tmp_path: Path) -> None:
+def test_numbers_of_other_settings_are_refused(results, tmp_path):
     known = measure(results, METRICS)
     other = run_study(STUDY, tmp_path / "other", settings={"scale": 2.0, "weights": "there"}, progress=False)
     assert differing(other, known) == ["scale"]
@@ -121,7 +121,7 @@ def test_numbers_of_other_settings_are_refused(results: Results, tmp_path: Path)
 
 
 @pytest.mark.slow
-def test_every_study_that_names_metrics_has_numbers_of_its_own_settings() -> None:
+def test_every_study_that_names_metrics_has_numbers_of_its_own_settings():
     for name in names("coopoc.studies"):
         study: Study = find("coopoc.studies", name)
         if study.metrics:
@@ -137,7 +137,7 @@ def test_every_study_that_names_metrics_has_numbers_of_its_own_settings() -> Non
 
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CHEAP)
-def test_committed_numbers_come_out_again(name: str, tmp_path: Path) -> None:
+def test_committed_numbers_come_out_again(name, tmp_path):
     study: Study = find("coopoc.studies", name)
     results = run_study(study, tmp_path, settings=CHEAP[name], progress=False)
     assert results.failed == 0

@@ -2,8 +2,6 @@
 
 import json
 from html.parser import HTMLParser
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -22,7 +20,7 @@ def results(frame: pd.DataFrame, axes: tuple[str, ...] = ("method", "noise_model
 
 
 @pytest.fixture
-def frame() -> pd.DataFrame:
+def frame():
     rng = np.random.default_rng(0)
     rows = [
         {"method": m, "noise_model": kn, "k": k, "ego": ego, "run": run, "rt_le_m": rng.gamma(4.0)}
@@ -34,7 +32,7 @@ def frame() -> pd.DataFrame:
     return pd.DataFrame(rows)
 
 
-def test_means_are_those_of_pandas(frame: pd.DataFrame) -> None:
+def test_means_are_those_of_pandas(frame):
     by = ["method", "noise_model", "k"]
     summary = results(frame).summary(by, "rt_le_m").set_index(by)["mean"]
     expected = frame.groupby(by)["rt_le_m"].mean()
@@ -43,7 +41,7 @@ def test_means_are_those_of_pandas(frame: pd.DataFrame) -> None:
     assert list(dict.fromkeys(summary.index.get_level_values("method"))) == ["gnss", "kalman", "bound"]
 
 
-def test_values_are_paired_by_ego_and_run_whatever_the_order_of_rows(frame: pd.DataFrame) -> None:
+def test_values_are_paired_by_ego_and_run_whatever_the_order_of_rows(frame):
     where = {"noise_model": "identity", "k": 0}
     straight = results(frame).values("rt_le_m", where, method="gnss")
     mixed = results(frame.sample(frac=1.0, random_state=1)).values("rt_le_m", where, method="gnss")
@@ -53,7 +51,7 @@ def test_values_are_paired_by_ego_and_run_whatever_the_order_of_rows(frame: pd.D
     np.testing.assert_array_equal(straight[:, 0], first)
 
 
-def test_training_seeds_are_averaged_before_the_interval(frame: pd.DataFrame) -> None:
+def test_training_seeds_are_averaged_before_the_interval(frame):
     one = frame.query("method == 'gnss'")
     many = pd.concat([one.assign(train_seed=s, rt_le_m=one["rt_le_m"] + s) for s in (0, 1, 2)])
     found = results(many, ("method", "noise_model", "k", "train_seed")).interval("rt_le_m", k=0)
@@ -61,7 +59,7 @@ def test_training_seeds_are_averaged_before_the_interval(frame: pd.DataFrame) ->
     assert found.n == 12
 
 
-def test_what_would_be_mixed_is_named(frame: pd.DataFrame) -> None:
+def test_what_would_be_mixed_is_named(frame):
     found = results(frame)
     with refused("noise_model = identity, fitted: would be averaged together"):
         found.interval("rt_le_m", method="kalman", k=0)
@@ -75,13 +73,13 @@ def test_what_would_be_mixed_is_named(frame: pd.DataFrame) -> None:
         found.select(k=7)
 
 
-def test_classes_of_one_name_are_told_apart_by_their_files() -> None:
+def test_classes_of_one_name_are_told_apart_by_their_files():
     names = ["a.py:A", "b.py:A", "c.py:B", "d.py:C"]
     results(pd.DataFrame({"method": names, "label": ["Mine", "Mine", look("kalman").label, "Other"]}))
     assert [look(name).label for name in names] == ["Mine (a.py:A)", "Mine (b.py:A)", "KF (c.py:B)", "Other"]
 
 
-def test_an_ego_without_all_its_runs_is_left_out_and_said_so(frame: pd.DataFrame) -> None:
+def test_an_ego_without_all_its_runs_is_left_out_and_said_so(frame):
     gone = frame.drop(frame.query("method == 'gnss' and k == 0 and ego == 'b' and run == 3").index)
     summary = results(gone).summary(["method", "noise_model", "k"], "rt_le_m")
     assert summary.query("method == 'gnss' and k == 0")[["n", "missing"]].to_numpy().tolist() == [[6, 1]]
@@ -89,7 +87,7 @@ def test_an_ego_without_all_its_runs_is_left_out_and_said_so(frame: pd.DataFrame
     assert "1 egos are left out" in table.notes[0]
 
 
-def test_a_seed_that_diverged_is_not_averaged_away(frame: pd.DataFrame) -> None:
+def test_a_seed_that_diverged_is_not_averaged_away(frame):
     """The mean over the other seeds would look like a mean over all."""
     one = frame.query("method == 'gnss' and k == 0")
     many = pd.concat([one.assign(train_seed=s) for s in (0, 1)], ignore_index=True)
@@ -99,7 +97,7 @@ def test_a_seed_that_diverged_is_not_averaged_away(frame: pd.DataFrame) -> None:
         assert summary[["n", "missing"]].to_numpy().tolist() == [counts]
 
 
-def test_a_metric_that_a_method_does_not_have_is_no_failure(frame: pd.DataFrame) -> None:
+def test_a_metric_that_a_method_does_not_have_is_no_failure(frame):
     frame = frame.query("noise_model == 'identity'").copy()
     frame["nees"] = np.where(frame["method"] == "gnss", np.nan, 3.0)
     table = pivot(results(frame), "k", "method", "nees")
@@ -109,14 +107,14 @@ def test_a_metric_that_a_method_does_not_have_is_no_failure(frame: pd.DataFrame)
         results(frame).interval("nees", method="gnss", k=0)
 
 
-def test_selection_from_text(frame: pd.DataFrame) -> None:
+def test_selection_from_text(frame):
     found = results(frame)
     assert parsed(found.frame, ["k=0,4", "method=gnss"]) == {"k": [0, 4], "method": ["gnss"]}
     with refused("k = 'x': must be a whole number"):
         parsed(found.frame, ["k=x"])
 
 
-def test_parquet_holds_every_digit(frame: pd.DataFrame, tmp_path: Any) -> None:
+def test_parquet_holds_every_digit(frame, tmp_path):
     frame = frame.assign(quantiles=[[0.1, 0.2]] * len(frame))
     results(frame).to_parquet(tmp_path / "r.parquet")
     back = pd.read_parquet(tmp_path / "r.parquet")
@@ -124,14 +122,14 @@ def test_parquet_holds_every_digit(frame: pd.DataFrame, tmp_path: Any) -> None:
     assert back["quantiles"].iloc[0].tolist() == [0.1, 0.2]
 
 
-def test_tables_over_several_columns(frame: pd.DataFrame) -> None:
+def test_tables_over_several_columns(frame):
     frame = frame.query("method == 'kalman'")
     table = pivot(results(frame), "k", ["method", "noise_model"], "rt_le_m")
     assert table.header == ("K", "KF, identity", "KF, fitted")
     assert table.rows[1][2].mean == pytest.approx(frame.query("k == 4 and noise_model == 'fitted'")["rt_le_m"].mean())
 
 
-def test_what_noise_or_training_explains_is_not_the_best() -> None:
+def test_what_noise_or_training_explains_is_not_the_best():
     """20 draws of a common noise: the joint filter is better by 0.1 m at k = 4; trainings differ by as much."""
     draws = np.random.default_rng(0).normal(1.5, [[0.2], [0.01], [0.01]], (3, 20))
     for other, seeds, bold in (("joint", (None,), [0, 2]), ("fedkalmannet", (0, 1, 2, 3, 4), [0, 0])):
@@ -156,7 +154,7 @@ TABLE = Table(
 )
 
 
-def test_markdown() -> None:
+def test_markdown():
     assert TABLE.to_markdown().splitlines() == [
         "RT-LE [m] at σ = 3.5 m, ±4°.",
         "",
@@ -169,7 +167,7 @@ def test_markdown() -> None:
     ]
 
 
-def test_latex() -> None:
+def test_latex():
     assert TABLE.to_latex().splitlines() == [
         r"\begin{table}",
         r"\centering",
@@ -188,7 +186,7 @@ def test_latex() -> None:
     ]
 
 
-def test_csv_keeps_every_digit_and_the_interval() -> None:
+def test_csv_keeps_every_digit_and_the_interval():
     assert TABLE.to_csv().splitlines() == [
         "K,KF & co,KF & co low,KF & co high,50 %_x,50 %_x low,50 %_x high,Cramér-Rao bound",
         "0,0.8047,0.75,0.85,1.2,1.1,1.3,0.5",
@@ -196,7 +194,7 @@ def test_csv_keeps_every_digit_and_the_interval() -> None:
     ]
 
 
-def test_html_is_well_formed_and_escaped() -> None:
+def test_html_is_well_formed_and_escaped():
     opened: list[str] = []
 
     class Checker(HTMLParser):
@@ -213,7 +211,7 @@ def test_html_is_well_formed_and_escaped() -> None:
     assert "<strong>0.80</strong>" in html
 
 
-def test_best_is_sought_among_methods_and_never_the_bound() -> None:
+def test_best_is_sought_among_methods_and_never_the_bound():
     rows = (("GNSS", 6.0, 5.0), ("KF", 1.0, 2.0), ("OKF", 1.001, 1.5), ("Oracle KF", 0.5, 0.5))
     table = Table(("Method", "a", "b"), rows, "", best="min", along="column")
     lines = table.to_markdown().splitlines()[2:]
@@ -222,7 +220,7 @@ def test_best_is_sought_among_methods_and_never_the_bound() -> None:
     assert "**6.00**" in Table(("Method", "a"), tuple(r[:2] for r in rows), "", "max", "column").to_markdown()
 
 
-def test_what_cannot_be_shown_is_named() -> None:
+def test_what_cannot_be_shown_is_named():
     with refused("must have 2 entries"):
         Table(("a", "b"), ((1,),), "")
     with refused("format = 'word': must be one of markdown, csv, latex, html"):
@@ -230,7 +228,7 @@ def test_what_cannot_be_shown_is_named() -> None:
     assert all(TABLE.render(form) for form in FORMATS)
 
 
-def test_latex_compiles(tmp_path: Path) -> None:
+def test_latex_compiles(tmp_path):
     odd = Table(tuple(r"&%$#_{}~^\<>|"), (tuple("±–≤≥×σ°²wxyz|"),) * 2, "100 % & more_")
     wide = Table(("Method", *map(str, range(12))), (("KF", *(Interval(0.5, 0.4, 0.6, 30),) * 12),), "Wide.")
     assert "Overfull" not in compiled(TABLE.to_latex() + odd.to_latex() + wide.to_latex(), tmp_path)

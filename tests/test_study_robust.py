@@ -15,11 +15,11 @@ from small_runs import COMMAND, ENV, files, numbers, shown, start
 
 from coopoc.study import store
 from coopoc.study.run import plan, run_study
-from coopoc.study.study import Params, Row, Study
+from coopoc.study.study import Params, Row
 
 
 @pytest.mark.slow
-def test_ten_kills_at_random_moments_change_nothing(study: Study, tmp_path: Path) -> None:
+def test_ten_kills_at_random_moments_change_nothing(study, tmp_path):
     """Thirty cells; each process goes on where the one before was killed: at its start, in a cell, or in a file."""
     settings = {"max_neighbours": ",".join(map(str, range(10)))}
     whole = run_study(study, tmp_path / "whole", settings=settings, progress=False)
@@ -49,7 +49,7 @@ def test_ten_kills_at_random_moments_change_nothing(study: Study, tmp_path: Path
     assert not list(folder.rglob(".*.part"))
 
 
-def test_a_kill_while_tables_and_figures_are_written_is_mended_by_the_next_run(study: Study, tmp_path: Path) -> None:
+def test_a_kill_while_tables_and_figures_are_written_is_mended_by_the_next_run(study, tmp_path):
     run_study(study, tmp_path, progress=False)
     whole = shown(tmp_path / "small")
     process = multiprocessing.get_context("forkserver").Process(
@@ -67,7 +67,7 @@ def test_a_kill_while_tables_and_figures_are_written_is_mended_by_the_next_run(s
 
 
 @pytest.mark.slow
-def test_two_runners_that_start_together(study: Study, tmp_path: Path) -> None:
+def test_two_runners_that_start_together(study, tmp_path):
     both = [start(tmp_path) for _ in "ab"]
     ends = [(process, *process.communicate(timeout=60)) for process in both]
     statuses = sorted(process.returncode for process, _, _ in ends)
@@ -97,7 +97,7 @@ def in_a_small_disk(script: str, tmp_path: Path) -> list[str]:
 
 
 @pytest.mark.slow
-def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterwards(study: Study, tmp_path: Path) -> None:
+def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterwards(study, tmp_path):
     table = " ".join([*COMMAND[:-2], "table", "disk/small"])
     said = in_a_small_disk(
         f"""
@@ -126,7 +126,7 @@ def test_a_disk_that_is_full_or_read_only_is_named_and_the_run_goes_on_afterward
     assert shown(tmp_path / "small") == shown(tmp_path / "whole/small")
 
 
-def test_cells_that_vanish_during_a_run_end_it_with_their_number_and_no_tables(study: Study, tmp_path: Path) -> None:
+def test_cells_that_vanish_during_a_run_end_it_with_their_number_and_no_tables(study, tmp_path):
     def cell(params: Params) -> list[Row]:
         for finished in sorted((tmp_path / "small/cells").glob("*.parquet"))[:1]:
             finished.unlink()

@@ -3,7 +3,6 @@
 import shutil
 import sys
 from dataclasses import replace
-from pathlib import Path
 
 import pandas as pd
 import pytest
@@ -17,7 +16,7 @@ from coopoc.study.run import plan, run_study
 from coopoc.study.study import Cell, Study
 
 
-def test_two_processes_compute_what_one_computes(study: Study, tmp_path: Path) -> None:
+def test_two_processes_compute_what_one_computes(study, tmp_path):
     one = run_study(study, tmp_path / "one", jobs=1, progress=False)
     with pytest.MonkeyPatch.context() as before:  # workers that are left over know not where the study is
         before.setattr(sys, "path", [place for place in sys.path if not place.endswith("distribution")])
@@ -28,9 +27,7 @@ def test_two_processes_compute_what_one_computes(study: Study, tmp_path: Path) -
         assert (tmp_path / "one/small" / name).read_bytes() == (tmp_path / "two/small" / name).read_bytes()
 
 
-def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_for(
-    study: Study, tmp_path: Path
-) -> None:
+def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_for(study, tmp_path):
     trouble = tmp_path / "trouble"
     trouble.write_text("raise")
     changes = {"trouble": str(trouble)}
@@ -53,7 +50,7 @@ def test_a_failed_cell_is_a_row_with_its_reason_and_stays_one_until_it_is_asked_
     assert {name: files(tmp_path / "small")[name] for name in finished} == finished
 
 
-def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study: Study, tmp_path: Path) -> None:
+def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study, tmp_path):
     trouble = tmp_path / "trouble"
     trouble.write_text("exit")
     changes = {"trouble": str(trouble), "max_neighbours": 1, "method": "kalman"}
@@ -62,7 +59,7 @@ def test_a_view_that_needs_a_failed_cell_is_named_with_its_reason(study: Study, 
     assert set(views(tmp_path / "small")["missing"]) == {"rt_le", "findings"}
 
 
-def test_a_view_that_fails_is_raised_and_named_beside_the_others(study: Study, tmp_path: Path) -> None:
+def test_a_view_that_fails_is_raised_and_named_beside_the_others(study, tmp_path):
     def broken(results: object) -> None:
         raise ZeroDivisionError("of the study")
 
@@ -74,7 +71,7 @@ def test_a_view_that_fails_is_raised_and_named_beside_the_others(study: Study, t
     assert len(found["tables"]) == len(study.tables)
 
 
-def test_a_worker_that_is_killed_is_an_error_and_the_run_resumes(study: Study, tmp_path: Path) -> None:
+def test_a_worker_that_is_killed_is_an_error_and_the_run_resumes(study, tmp_path):
     trouble = tmp_path / "trouble"
     trouble.write_text("kill")
     with pytest.raises(WorkerDiedError, match="repeat the command"):
@@ -84,7 +81,7 @@ def test_a_worker_that_is_killed_is_an_error_and_the_run_resumes(study: Study, t
 
 
 @pytest.mark.parametrize("damage", ["truncated", "empty", "of another cell"])
-def test_a_damaged_file_is_computed_again(study: Study, tmp_path: Path, damage: str) -> None:
+def test_a_damaged_file_is_computed_again(study, tmp_path, damage):
     whole = run_study(study, tmp_path, progress=False)
     first, second = sorted((tmp_path / "small/cells").iterdir())[:2]
     content = first.read_bytes()
@@ -95,7 +92,7 @@ def test_a_damaged_file_is_computed_again(study: Study, tmp_path: Path, damage: 
     pd.testing.assert_frame_equal(numbers(again.frame), numbers(whole.frame), check_exact=True)
 
 
-def test_what_cells_share_is_prepared_once_and_only_for_those_that_need_it(study: Study, tmp_path: Path) -> None:
+def test_what_cells_share_is_prepared_once_and_only_for_those_that_need_it(study, tmp_path):
     asked: list[list[int]] = []
     study = replace(study, prepare=lambda cells, jobs: asked.append(sorted({p["max_neighbours"] for p in cells})))
     run_study(study, tmp_path, settings={"max_neighbours": "0"}, progress=False)
@@ -104,7 +101,7 @@ def test_what_cells_share_is_prepared_once_and_only_for_those_that_need_it(study
     assert asked == [[0], [2]]
 
 
-def test_files_of_cells_may_be_copied_between_folders(study: Study, tmp_path: Path) -> None:
+def test_files_of_cells_may_be_copied_between_folders(study, tmp_path):
     """Half of the cells beside those of other settings; one is damaged, and is computed again as the rest is."""
     run_study(study, tmp_path / "whole", progress=False)
     run_study(study, tmp_path / "other", settings={"runs": 2}, progress=False)
@@ -119,13 +116,13 @@ def test_files_of_cells_may_be_copied_between_folders(study: Study, tmp_path: Pa
     assert shown(tmp_path / "all/small") == shown(tmp_path / "whole/small")
 
 
-def test_plan_counts_and_writes_nothing(study: Study, tmp_path: Path) -> None:
+def test_plan_counts_and_writes_nothing(study, tmp_path):
     found = plan(study, tmp_path / "new", {"max_neighbours": "0,2"})
     assert (found["cells"], found["finished"], found["to_compute"]) == (6, 0, 6)
     assert not (tmp_path / "new").exists()
 
 
-def test_changed_settings_compute_anew_and_keep_what_is_there(study: Study, tmp_path: Path) -> None:
+def test_changed_settings_compute_anew_and_keep_what_is_there(study, tmp_path):
     run_study(study, tmp_path, settings={"max_neighbours": 0}, progress=False)
     before = files(tmp_path / "small")
     more = run_study(study, tmp_path, settings={"max_neighbours": 0, "runs": 5}, progress=False)
@@ -135,7 +132,7 @@ def test_changed_settings_compute_anew_and_keep_what_is_there(study: Study, tmp_
     assert {name: after[name] for name in before} == before
 
 
-def test_bad_input_is_named_before_any_work(study: Study, tmp_path: Path) -> None:
+def test_bad_input_is_named_before_any_work(study, tmp_path):
     with refused("max_neighbours = -1: must be >= 0"):
         run_study(study, tmp_path, settings={"max_neighbours": -1})
     with refused("jobs = 0: must be >= 1"):
@@ -148,7 +145,7 @@ def test_bad_input_is_named_before_any_work(study: Study, tmp_path: Path) -> Non
     assert not (tmp_path / "small").exists()
 
 
-def test_rows_that_a_study_may_not_return_fail_the_cell(tmp_path: Path) -> None:
+def test_rows_that_a_study_may_not_return_fail_the_cell(tmp_path):
     study = Study(
         "odd",
         "?",
@@ -161,7 +158,7 @@ def test_rows_that_a_study_may_not_return_fail_the_cell(tmp_path: Path) -> None:
     assert reasons[2].startswith("Arrow")
 
 
-def test_cells_of_one_recording_follow_each_other_in_a_lane_the_last_first() -> None:
+def test_cells_of_one_recording_follow_each_other_in_a_lane_the_last_first():
     cells = [Cell({}, {"k": k, "m": m}, f"{k}{m}") for m in "ab" for k in range(4)]
     assert [c.name for c in schedule(cells, ("k",), 1)] == ["3a", "3b", "2a", "2b", "1a", "1b", "0a", "0b"]
     two = [c.name for c in schedule(cells, ("k",), 2)]
@@ -170,7 +167,7 @@ def test_cells_of_one_recording_follow_each_other_in_a_lane_the_last_first() -> 
     assert sorted(c.name for c in schedule(cells[:5], ("k",), 3)) == sorted(c.name for c in cells[:5])
 
 
-def test_a_cell_runs_on_one_thread(tmp_path: Path) -> None:
+def test_a_cell_runs_on_one_thread(tmp_path):
     def cell(p: object) -> list[dict[str, object]]:
         from threadpoolctl import threadpool_info
 
@@ -180,7 +177,7 @@ def test_a_cell_runs_on_one_thread(tmp_path: Path) -> None:
     assert set(results.frame["threads"]) == {1}
 
 
-def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
+def test_a_file_is_written_whole_or_not_at_all(tmp_path):
     path = tmp_path / "kept"
     store.write(path, "old")
 
@@ -194,7 +191,7 @@ def test_a_file_is_written_whole_or_not_at_all(tmp_path: Path) -> None:
     assert path.read_text() == "old"
 
 
-def test_views_of_an_earlier_run_do_not_stay_among_those_of_this_one(study: Study, tmp_path: Path) -> None:
+def test_views_of_an_earlier_run_do_not_stay_among_those_of_this_one(study, tmp_path):
     more = replace(study, tables={**study.tables, "extra": study.tables["rt_le"]})
     run_study(more, tmp_path, progress=False)
     (tmp_path / "small/tables/mine.md").write_text("by hand")

@@ -42,7 +42,7 @@ S2 = Sensors.paper_scenario2()
         ({"position": np.full((3, 2, 3), np.inf)}, "position/velocity"),
     ],
 )
-def test_unusable_fleet_names_the_field(change: dict, field: str) -> None:
+def test_unusable_fleet_names_the_field(change, field):
     good = {"ids": ("a", "b"), "t": [0.0, 0.1, 0.2], "position": np.zeros((3, 2, 3)), "velocity": np.zeros((3, 2, 3))}
     with pytest.raises(InputError) as error:
         Fleet(**{**good, **change})
@@ -50,7 +50,7 @@ def test_unusable_fleet_names_the_field(change: dict, field: str) -> None:
     assert error.value.hint
 
 
-def test_unknown_vehicle_lists_the_known(crossing: Fleet) -> None:
+def test_unknown_vehicle_lists_the_known(crossing):
     with refused("c0, c1"):
         crossing.select(["nobody"])
     with refused(r"0\.\.7"):
@@ -71,12 +71,12 @@ def test_unknown_vehicle_lists_the_known(crossing: Fleet) -> None:
         (lambda: PoseFilter("solo", assumed=S2).start(0.1, np.array([0, 0, 0, 90.0])), "begin.0. = 90"),
     ],
 )
-def test_bad_configuration_is_named(build, words: str) -> None:
+def test_bad_configuration_is_named(build, words):
     with refused(words):
         build()
 
 
-def test_float32_is_refused_and_unwrapped_headings_are_not() -> None:
+def test_float32_is_refused_and_unwrapped_headings_are_not():
     """Two vehicles that circle for nearly five turns; degrees are refused with all other mistakes (test_misuse)."""
     t = np.arange(300) / 10
     turn = np.stack([t, -t], axis=1)
@@ -96,7 +96,7 @@ def test_float32_is_refused_and_unwrapped_headings_are_not() -> None:
         stream.step(OwnMeasurement([9.0, 0.0, 0.0], 1.0, heading=90.0))
 
 
-def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track() -> None:
+def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track():
     town = load_fleet("town10").between(0, 600)
     world, body = (observe(town, S2, V2X(2), frame=frame, observers=[8]) for frame in ("world", "body"))
     for right in (world, body, observe(town, replace(S2, heading_std=0.1, yaw_rate_bias_std=0.02), frame="body")):
@@ -122,7 +122,7 @@ def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track() -> None:
     assert not (*mended.notes, *Kalman()(mended, [8]).notes)
 
 
-def test_zero_noise_may_act_but_not_be_assumed(crossing: Fleet) -> None:
+def test_zero_noise_may_act_but_not_be_assumed(crossing):
     silent = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
     with refused(r"gnss_std.*assumed=Sensors"):
         observe(crossing, silent)
@@ -130,7 +130,7 @@ def test_zero_noise_may_act_but_not_be_assumed(crossing: Fleet) -> None:
     assert np.array_equal(recording.gnss[0], crossing.position)
 
 
-def test_draws_belong_to_their_key(crossing: Fleet) -> None:
+def test_draws_belong_to_their_key(crossing):
     """30 runs are a prefix of 100, K = 2 a part of K = 6, a smaller fleet keeps its draws."""
     few = observe(crossing, S2, V2X(max_neighbours=2), runs=3, seed=5)
     many = observe(crossing, S2, V2X(max_neighbours=6), runs=5, seed=5)
@@ -149,7 +149,7 @@ def test_draws_belong_to_their_key(crossing: Fleet) -> None:
     assert not np.array_equal(observe(crossing, S2, runs=3, seed=6).gnss, few.gnss)
 
 
-def test_noise_has_the_stated_moments() -> None:
+def test_noise_has_the_stated_moments():
     """Independent check: SciPy's Kolmogorov-Smirnov test against the normal and uniform distributions."""
     apart = np.broadcast_to(np.array([[0.0, 0, 0], [20, 0, 0]]), (400, 2, 3))
     fleet = Fleet(("a", "b"), np.arange(400) * 0.1, apart, np.full((400, 2, 3), 8.0))
@@ -169,21 +169,21 @@ def test_noise_has_the_stated_moments() -> None:
     assert np.ptp(sampled.gnss - observe(fleet, sensors, runs=2).gnss, axis=1).min() > 0.4
 
 
-def test_velocity_readings() -> None:
+def test_velocity_readings():
     velocity = np.array([3.0, 4.0, 0.0])
     assert Sensors(velocity_reading="axis").velocity_std(velocity) == pytest.approx([0.3, 0.4, 0.0])
     assert Sensors(velocity_reading="speed").velocity_std(velocity) == pytest.approx([0.5, 0.5, 0.5])
     assert Sensors().motion_std(velocity[None, None, None], 0.1)[0, 0, 0, 2] == pytest.approx(0.005)
 
 
-def test_vector_cov_against_sampling() -> None:
+def test_vector_cov_against_sampling():
     """Independent check: the sample covariance of converted draws (small angles, so that first order holds)."""
     relative, std = np.array([25.0, 0.7, 1.3]), np.array([0.3, 0.01, 0.02])
     draws = to_vector(relative + np.random.default_rng(1).standard_normal((200_000, 3)) * std)
     assert vector_cov(relative, std) == pytest.approx(np.cov(draws.T), abs=2e-3)
 
 
-def test_gilbert_elliott_share_and_burst() -> None:
+def test_gilbert_elliott_share_and_burst():
     """Closed form: stationary loss and mean run length of the two-state chain."""
     bad = lost(np.random.default_rng(0).uniform(size=(40, 20_000)), loss=0.1, burst=5.0)
     starts = (bad[:, 1:] & ~bad[:, :-1]).sum()
@@ -191,7 +191,7 @@ def test_gilbert_elliott_share_and_burst() -> None:
     assert bad.sum() / starts == pytest.approx(5.0, rel=0.03)
 
 
-def test_loss_delay_and_rate_act_on_messages(formation: Fleet) -> None:
+def test_loss_delay_and_rate_act_on_messages(formation):
     fleet = formation.between(0, 200)
     ideal = observe(fleet, S2, V2X(max_neighbours=4), runs=6, observers=[0])
     box = inbox(ideal, 0, FIX_AND_VELOCITY)
@@ -210,7 +210,7 @@ def test_loss_delay_and_rate_act_on_messages(formation: Fleet) -> None:
     assert slow.fresh.mean() == pytest.approx(0.2, abs=0.02)
 
 
-def test_recording_holds_no_truth(crossing: Fleet) -> None:
+def test_recording_holds_no_truth(crossing):
     """No array of the recording holds a true position or velocity, and no field leads to the fleet."""
     recording = observe(crossing, S2, V2X(max_neighbours=3), runs=2)
     truths = (crossing.position, crossing.velocity)
@@ -221,7 +221,7 @@ def test_recording_holds_no_truth(crossing: Fleet) -> None:
             assert not any(np.isclose(value, truth, atol=1e-6).all(axis=-1).any() for truth in truths), name
 
 
-def test_unknown_and_unrecorded_egos(crossing: Fleet) -> None:
+def test_unknown_and_unrecorded_egos(crossing):
     recording = observe(crossing, S2, observers=[1, 2])
     with refused("observers"):
         recording.columns([0])
@@ -231,14 +231,14 @@ def test_unknown_and_unrecorded_egos(crossing: Fleet) -> None:
 
 
 @pytest.mark.parametrize(("seed", "run"), [(0, 0), (7, 99), (2**32 - 1, 3), (2**32, 2)])
-def test_a_stream_is_that_of_its_key(seed: int, run: int) -> None:
+def test_a_stream_is_that_of_its_key(seed, run):
     """Against NumPy's own way from a tuple of numbers."""
     key = (seed, run, *(zlib.crc32(word.encode()) for word in ("gnss", "a", "b")))
     wanted = np.random.Generator(np.random.Philox(np.random.SeedSequence(key)))
     assert stream(seed, "gnss", run, "a", "b").normal() == wanted.normal()
 
 
-def test_what_one_recording_drew_another_shares_and_nobody_keeps(crossing: Fleet) -> None:
+def test_what_one_recording_drew_another_shares_and_nobody_keeps(crossing):
     import gc
 
     from coopoc.world import sensing
@@ -257,7 +257,7 @@ def test_what_one_recording_drew_another_shares_and_nobody_keeps(crossing: Fleet
     assert not np.array_equal(other.gnss, wide.gnss)
 
 
-def test_a_message_is_held_until_it_is_too_old() -> None:
+def test_a_message_is_held_until_it_is_too_old():
     """By the definition, link by link: the newest message of the sender that has arrived, unless older than max_age."""
     fleet = Fleet(("a", "b", "c"), np.arange(40) / 10, *np.moveaxis(np.zeros((2, 40, 3, 3)), 0, 0))
     fleet = replace(fleet, position=fleet.position + np.array([[0.0, 0, 0], [9, 0, 0], [0, 9, 0]]))
@@ -276,7 +276,7 @@ def test_a_message_is_held_until_it_is_too_old() -> None:
     assert forgotten > 3
 
 
-def test_a_range_that_would_be_negative_is_reflected() -> None:
+def test_a_range_that_would_be_negative_is_reflected():
     """|d + n| at 3 m with a noise of 10 m: never negative, and its mean is that of a folded normal (SciPy)."""
     fleet = Fleet(("a", "b"), np.arange(2000) / 10, np.zeros((2000, 2, 3)), np.zeros((2000, 2, 3)))
     fleet = replace(fleet, position=fleet.position + np.array([[0.0, 0, 0], [3, 0, 0]]))

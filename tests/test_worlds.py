@@ -98,7 +98,7 @@ def different(one: World, other: World) -> set[str]:
     }
 
 
-def test_a_world_is_the_same_whenever_it_is_drawn() -> None:
+def test_a_world_is_the_same_whenever_it_is_drawn():
     np.random.seed(1)  # noqa: NPY002
     again = world(11)
     assert not different(again, drawn()[11])
@@ -106,14 +106,14 @@ def test_a_world_is_the_same_whenever_it_is_drawn() -> None:
     assert again.fleet.digest == drawn()[11].fleet.digest
 
 
-def test_splits_share_no_draw() -> None:
+def test_splits_share_no_draw():
     first = [one.recording.gnss[0, 0, 0, 0] for split in SPLITS for one in (world(k, split) for k in range(20))]
     assert len({*first}) == 60
     towns = {split: {one.fleet.position[0, 0, 0] for one in (world(k, split) for k in range(20))} for split in SPLITS}
     assert not towns["test"] & (towns["validation"] | towns["development"])
 
 
-def test_a_fifth_of_the_worlds_has_no_fault_and_no_world_more_than_three() -> None:
+def test_a_fifth_of_the_worlds_has_no_fault_and_no_world_more_than_three():
     counts = np.bincount([len(one.kinds) for one in drawn()], minlength=4)
     assert len(counts) == 4
     assert 0.15 < counts[0] / 300 < 0.3
@@ -125,7 +125,7 @@ def test_a_fifth_of_the_worlds_has_no_fault_and_no_world_more_than_three() -> No
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_fault_changes_what_it_says_and_nothing_else(kind: str) -> None:
+def test_a_fault_changes_what_it_says_and_nothing_else(kind):
     found = set[str]()
     for one in with_kind(kind):
         changed = different(one, world(one.seed, without=[kind]))
@@ -134,7 +134,7 @@ def test_a_fault_changes_what_it_says_and_nothing_else(kind: str) -> None:
     assert found == CHANGES[kind]
 
 
-def test_a_slip_alters_the_velocities_of_its_interval_alone() -> None:
+def test_a_slip_alters_the_velocities_of_its_interval_alone():
     for one in with_kind("odometer slip"):
         right = world(one.seed, without=["odometer slip"]).recording.velocity[:, :, list(one.egos)]
         wrong = one.recording.velocity[:, :, list(one.egos)]
@@ -145,7 +145,7 @@ def test_a_slip_alters_the_velocities_of_its_interval_alone() -> None:
         assert np.array_equal(wrong[:, inside], factor * right[:, inside])
 
 
-def test_late_clocks_repeat_what_was_before() -> None:
+def test_late_clocks_repeat_what_was_before():
     """Where another fault acts on the same messages later, it is left out."""
     for one in with_kind("clock offsets"):
         seconds = float(re.findall(r"clock offsets: \d+ are (\S+) s late", one.text)[0])
@@ -159,7 +159,7 @@ def test_late_clocks_repeat_what_was_before() -> None:
         assert np.array_equal(gnss[:, steps:, who][there], before[:, :-steps, who][there])
 
 
-def test_wrong_words_are_named() -> None:
+def test_wrong_words_are_named():
     for given, more, message in (
         (-1, {}, "seed = -1"),
         (0, {"split": "train"}, "split = 'train'"),
@@ -188,7 +188,7 @@ class Fails(co.Kalman):
 """
 
 
-def test_a_failed_world_is_worse_and_has_its_reason(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_failed_world_is_worse_and_has_its_reason(tmp_path, capsys):
     (tmp_path / "mine.py").write_text(OWN)
     assert benchmark.benchmark((f"{tmp_path / 'mine.py'}:Fails",), worlds=4, out=tmp_path) == 1
     (file,) = (tmp_path / "worlds").glob("*.json")
@@ -203,9 +203,7 @@ def test_a_failed_world_is_worse_and_has_its_reason(tmp_path: Path, capsys: pyte
     assert f"failed: world {many[0]}: ValueError: too many" in printed.err
 
 
-def test_the_command_of_a_worst_world_repeats_its_number(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_the_command_of_a_worst_world_repeats_its_number(tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     assert benchmark.benchmark(("lkf-sa",), worlds=6, validation=True, jobs=2) == 0
     worst = json.loads(Path("runs/benchmark/worlds/validation/lkf-sa.json").read_text())["worst"][0]
@@ -216,7 +214,7 @@ def test_the_command_of_a_worst_world_repeats_its_number(
     assert json.loads(file.read_text())["worst"] == [worst]
 
 
-def test_nees_and_ratios_are_as_by_hand() -> None:
+def test_nees_and_ratios_are_as_by_hand():
     card = worlds_card.worlds_card("joint", 1, seed=2)
     one = world(2)
     tracks = [method(one.recording, list(one.egos)) for method in (co.JointFilter("nominal"), co.Kalman("nominal"))]
@@ -230,7 +228,7 @@ def test_nees_and_ratios_are_as_by_hand() -> None:
     assert math.isclose(card["summary"]["nees_median"], np.median(square), rel_tol=1e-4)
 
 
-def test_the_page_shows_the_committed_cards() -> None:
+def test_the_page_shows_the_committed_cards():
     """`coopoc benchmark --table --out benchmarks/cards` prints the table."""
     root = Path(__file__).resolve().parents[1]
     cards = [json.loads(file.read_text()) for file in (root / "benchmarks" / "cards" / "worlds").glob("*.json")]

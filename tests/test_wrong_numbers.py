@@ -7,7 +7,6 @@ import zipfile
 from collections.abc import Callable
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -45,12 +44,12 @@ ESTABLISHED = 10
 
 
 @pytest.fixture(scope="module")
-def recording() -> Recording:
+def recording():
     return observe(load_fleet("town10-validation").between(0, 80), S2, V2X(6), runs=RUNS, seed=7)
 
 
 @pytest.fixture(scope="module")
-def links(recording: Recording) -> Ints:
+def links(recording):
     """The link of each run that gets a wrong number."""
     of, step = recording.links.neighbour, recording.links.step
     own = recording.links.of(EGO)
@@ -78,9 +77,7 @@ def damaged(recording: Recording, kind: str, links: Ints) -> Recording:
 
 
 @pytest.mark.parametrize("name", sorted(METHODS))
-def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(
-    name: str, recording: Recording, links: Ints
-) -> None:
+def test_one_wrong_number_moves_a_robust_filter_by_less_than_half_a_metre(name, recording, links):
     """Of any size up to 1e6 m, and one second later by next to nothing; a method that is not robust is
     moved further, by the largest ones at least."""
     method = METHODS[name]("nominal")
@@ -122,9 +119,7 @@ def estimates(recording: Recording, kind: str, links: Ints) -> tuple[Floats, Flo
 
 @pytest.mark.parametrize("kind", [*KINDS, "position", "odometer", "velocity"])
 @pytest.mark.parametrize("first", [0, 20], ids=["at any step", "after two seconds"])
-def test_one_wrong_number_of_any_size_moves_the_cooperative_filter_by_a_stated_distance(
-    first: int, kind: str, recording: Recording
-) -> None:
+def test_one_wrong_number_of_any_size_moves_the_cooperative_filter_by_a_stated_distance(first, kind, recording):
     """Of 1 to 1e6 m, a neighbour's first one, too. After two seconds by less than 0.25 m, and one second later by 0.16
     m, 0.1 m of more than FAR, 0.3 m of a velocity; at any step, the first one, too, by twice the stated std and then by
     1.2 of it, but for the ego's very first fix."""
@@ -157,7 +152,7 @@ def wild_fixes(steps: int) -> tuple[co.Recording, np.ndarray, KalmanFilter]:
     return replace(drive, gnss=gnss), S2.motion_std(drive.velocity, 0.1)[0, :, 0] ** 2, peer
 
 
-def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() -> None:
+def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation():
     """filterpy, its R such that S is q / limit times as large where q = y' S^-1 y exceeds the limit; beyond
     HARD_REJECT_FACTOR limits the fix is left out. The flat prior weighs 1e-6 of a fix."""
     alone = Priors(forget=0.0, heading=0.0, scale=0.0, slip=0.0)
@@ -174,7 +169,7 @@ def test_the_weight_of_a_wrong_fix_is_that_of_filterpys_inflated_innovation() ->
         assert track.x[0, t, 0] == pytest.approx(peer.x, abs=1e-3), t
 
 
-def test_the_solo_filter_is_filterpys_with_the_gates_variances() -> None:
+def test_the_solo_filter_is_filterpys_with_the_gates_variances():
     """As filterpy: a fix beyond the gate has q / gate times its variance, one beyond HARD_REJECT_FACTOR gates is left
     out, until the gains that they would have had, less LEAK of the others', sum to PATIENCE. After 120 fixes that were
     60 m off it goes back to a copy of filterpy's state before them, which has only been predicted since."""
@@ -240,7 +235,7 @@ USES: dict[str, Callable[[co.Fleet], Any]] = {
 
 @pytest.mark.parametrize("use", USES)
 @pytest.mark.parametrize("other", ["order", "ids", "times", "steps"])
-def test_no_truth_of_another_drive_is_taken(use: str, other: str) -> None:
+def test_no_truth_of_another_drive_is_taken(use, other):
     USES[use](FLEET)
     wrong = {
         "order": FLEET.select(["b", "a"]),
@@ -269,7 +264,7 @@ class Negative:
 
 
 @pytest.mark.parametrize("share", [0.0, 1e-7, 1e-5, 0.1])
-def test_a_covariance_that_is_none_is_named_with_its_method_and_step(share: float) -> None:
+def test_a_covariance_that_is_none_is_named_with_its_method_and_step(share):
     """-I, and an identity whose halves differ by more than rounding: with a truth, and without one."""
     method = Negative(share=share)
     with nullcontext() if share == 1e-7 else refused("at step 5: must be symmetric .*, and negative returns another"):
@@ -278,7 +273,7 @@ def test_a_covariance_that_is_none_is_named_with_its_method_and_step(share: floa
         innovation_columns(method(SEEN, ["a"]), SEEN)
 
 
-def test_nees_is_unknown_with_the_truth_and_of_two_dimensions_in_the_plane() -> None:
+def test_nees_is_unknown_with_the_truth_and_of_two_dimensions_in_the_plane():
     there = np.where(np.arange(80) < 77, 1.0, np.nan)[:, None, None]
     part = replace(FLEET, position=there * FLEET.position, velocity=there * FLEET.velocity)
     assert np.isfinite(co.nees(TRACK, part)).sum() == 3 * 77
@@ -295,15 +290,15 @@ class Swapped(Negative):
         return co.Kalman()(recording, egos[::-1])
 
 
-def test_estimates_of_other_egos_are_refused() -> None:
+def test_estimates_of_other_egos_are_refused():
     with refused("must be a Track of a, b. Take egos in this order"):
         scored(Swapped(), SEEN, ["a", "b"], FLEET)
 
 
 @pytest.mark.parametrize("gap", [(0.0, 0.0, 10.0), (1e-9, 0.0, 0.0)], ids=["above", "in one place"])
 def test_who_flies_straight_above_or_in_one_place_helps_or_does_no_harm(
-    gap: tuple[float, float, float],
-) -> None:
+    gap,
+):
     """The azimuth of what is straight above says nothing: with it the joint filter had 0.67 m, alone 0.54 m."""
     above = drive(gap)
     seen = co.observe(above, S, co.V2X(1, 60.0), runs=10, seed=1)
@@ -311,7 +306,7 @@ def test_who_flies_straight_above_or_in_one_place_helps_or_does_no_harm(
     assert together < alone
 
 
-def test_plausible_limits_hold_where_a_noun_is_made() -> None:
+def test_plausible_limits_hold_where_a_noun_is_made():
     for field, value in (("position", 1e9), ("velocity", 1e5)):
         with refused(rf"{field}\[0, 0, 0\] = .*: must be within"):
             replace(FLEET, **{field: np.full((80, 2, 3), value)})
@@ -333,7 +328,7 @@ BAD = (header((3, 80, 2, 99)), header((10**11,)), header((2**61,)), b"\x93NUMPY\
 
 
 @pytest.mark.parametrize("content", BAD)
-def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_file_is_refused_by_its_headers(tmp_path, content, monkeypatch):
     with refused("recording = .*must be a Recording"):
         save_recording(tmp_path / "good.npz", SEEN)  # type: ignore[arg-type]
     save_recording(SEEN, tmp_path / "good.npz", FLEET)
@@ -360,7 +355,7 @@ def test_a_file_is_refused_by_its_headers(tmp_path: Path, content: bytes, monkey
         ("gnss", header((3, 80, 2, 3))),
     ],
 )
-def test_a_small_file_takes_no_memory(tmp_path: Path, member: str, content: bytes) -> None:
+def test_a_small_file_takes_no_memory(tmp_path, member, content):
     """Measured by tracemalloc: a file of some kB whose headers claim GB, or with a member that no recording has."""
     save_recording(SEEN, tmp_path / "good.npz")
     with zipfile.ZipFile(tmp_path / "good.npz") as good:
@@ -379,7 +374,7 @@ def test_a_small_file_takes_no_memory(tmp_path: Path, member: str, content: byte
         tracemalloc.stop()
 
 
-def test_cooperation_that_changes_nothing_is_said_below_the_table() -> None:
+def test_cooperation_that_changes_nothing_is_said_below_the_table():
     """LKF-SA where only ranges were measured receives, and is the filter alone; the joint filter is helped."""
     pytest.importorskip("coopoc.studies")
     from coopoc.studies.side_by_side import STUDY
@@ -406,7 +401,7 @@ def test_cooperation_that_changes_nothing_is_said_below_the_table() -> None:
     assert "Joint filter, K = 2: worse than alone" in " ".join(unused(worse, True))
 
 
-def test_calls_that_raised_what_is_no_error_of_ours(tmp_path: Path) -> None:
+def test_calls_that_raised_what_is_no_error_of_ours(tmp_path):
     learned, study = pytest.importorskip("coopoc.learned"), co.Study("s", "?", dict, {"x": (1,)})
     net = learned.NoiseParameters()
     import torch

@@ -27,7 +27,7 @@ def words(line: str) -> list[str]:
 
 
 @pytest.fixture(scope="module")
-def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("page")
     (script,) = [text for text in blocks("python") if text.startswith("# make_log.py\n")]
     (out / "make_log.py").write_text(script)
@@ -35,7 +35,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return out
 
 
-def test_the_table_of_the_page_is_a_log(tmp_path: Path) -> None:
+def test_the_table_of_the_page_is_a_log(tmp_path):
     (tmp_path / "measurements.csv").write_text(blocks("csv")[0])
     log = co.read_log(tmp_path)
     assert log.recording.ids == ("red", "blue")
@@ -44,7 +44,7 @@ def test_the_table_of_the_page_is_a_log(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_every_command_runs(folder: Path) -> None:
+def test_every_command_runs(folder):
     commands = [line for block in blocks("sh") for line in block.splitlines()]
     assert len(commands) == 10
     for command in commands[1:]:
@@ -60,7 +60,7 @@ def test_every_command_runs(folder: Path) -> None:
     assert level["joint", 3] < level["kalman", 3] < level["gnss", 3]
 
 
-def test_every_block_of_python_runs(folder: Path) -> None:
+def test_every_block_of_python_runs(folder):
     code = "\n".join(text for text in blocks("python") if not text.startswith("# make_log"))
     script = folder / "page.py"
     script.write_text(code)
@@ -73,13 +73,13 @@ def test_every_block_of_python_runs(folder: Path) -> None:
     assert error < 1.0
 
 
-def test_every_kind_is_on_the_page() -> None:
+def test_every_kind_is_on_the_page():
     table = PAGE[PAGE.index("| kinds |") : PAGE.index("A relative measurement may")]
     for kind in KINDS:
         assert f"`{kind}`" in table or kind.endswith("_deg"), kind
 
 
-def test_egos_are_a_number_a_list_or_a_name(folder: Path, tmp_path: Path) -> None:
+def test_egos_are_a_number_a_list_or_a_name(folder, tmp_path):
     settings = {"data": str(folder / "mylog"), "method": "kalman", "max_neighbours": "0"}
     for egos, wanted in ((2, 2), (["red", "blue"], 2), ("green", 1), ("red,blue", 2), ("auto", 3)):
         frame = co.run_study("side_by_side", tmp_path, settings={**settings, "egos": egos}, progress=False).frame
