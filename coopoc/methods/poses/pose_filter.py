@@ -1,7 +1,7 @@
 """The pose filter: extended Kalman filter of position and heading of a vehicle alone or of the whole fleet."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
@@ -127,12 +127,14 @@ class PoseFilter:
             begin = first_poses(recording, self.begin, columns)
             alone = [self.run_filter(recording, [c], to_landmarks(recording, links.of(c)), begin) for c in columns]
             x, cov = (np.concatenate(parts, axis=2) for parts in list(zip(*alone, strict=True))[:2])
+            theirs = _seen(recording, columns, x, [])
         else:
             members = fleet_members(recording)
             begin = first_poses(recording, self.begin, members)
             own = np.flatnonzero(~np.isin(links.observer, recording.landmarks))
             in_time = (recording.arrival == links.step) | np.isin(links.neighbour, recording.landmarks)
             x, cov, _ = self.run_filter(recording, members, own, begin, in_time[:, own])
+            theirs = _seen(recording, columns, x, members)
             x, cov = (values[:, :, [members.index(column) for column in columns]] for values in (x, cov))
         if self.unit == "fleet" and self.fusion == "joint":
             both, notes = centre(recording, self.message), (CENTRE,)
@@ -142,7 +144,7 @@ class PoseFilter:
                 messages = inbox(recording, column, self.message)
                 received[:, k], sent[:, k] = messages.received_bytes, messages.sent_bytes
         positions = np.ascontiguousarray(x[..., :3]), np.ascontiguousarray(cov[..., :3, :3])
-        notes += doubts(recording, columns, *positions)
+        notes += doubts(_in_world(recording, columns, x[..., 3]), columns, *positions, neighbours=theirs)
         extras: dict[str, Floats] = {}
         for k, name in enumerate(("speed_scale", "yaw_rate_bias", "range_offset")[: x.shape[-1] - 4], 4):
             extras |= {name: x[..., k], f"{name}_std": np.sqrt(cov[..., k, k])}
@@ -231,3 +233,23 @@ class PoseFilter:
             PASSES if self.exact else 1,
             get_args(Fusion).index(self.fusion),
         )
+
+
+def _seen(recording: Recording, columns: Sequence[int], x: Floats, members: Sequence[int]) -> Floats:
+    """(R, L, 3) m, by link of each ego, where what it measures is: a landmark, or a member by its state x (R, T, n, d);
+    NaN where nothing is known."""
+    places = np.full(recording.gnss.shape, np.nan)
+    places[:, :, list(recording.landmarks)] = recording.gnss[:, :, list(recording.landmarks)]
+    places[:, :, list(members)] = x[:, :, : len(members), :3]
+    links, own = recording.links, np.concatenate([recording.links.of(column) for column in columns])
+    return places[:, links.step[own], links.neighbour[own]]
+
+
+def _in_world(recording: Recording, columns: Sequence[int], heading: Floats) -> Recording:
+    """A recording whose bearings are azimuths, by the headings (R, T, E) rad of the egos."""
+    turn, links = np.zeros(recording.gnss.shape[:3]), recording.links
+    turn[:, :, list(columns)] = heading
+    azimuth = wrap(recording.relative[..., 1] + turn[:, links.step, links.observer])
+    return replace(
+        recording, relative=np.stack([recording.relative[..., 0], azimuth, recording.relative[..., 2]], axis=-1)
+    )

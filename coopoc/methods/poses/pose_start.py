@@ -13,15 +13,17 @@ from ...world.sensors import Sensors
 from .pose_filter import PoseFilter
 from .pose_inputs import body_of, fleet_members, to_landmarks
 
-HEADINGS = 24
-"""That are tried, around the circle."""
+HEADINGS, SEEN = 24, 3
+"""That are tried, around the circle and then around the best of them; and from how many places at most."""
+STEP = 2 * np.pi / HEADINGS
+"""rad."""
 
 
 def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0) -> Floats:
     """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN for landmarks.
 
     With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
-    odometry until then its pose at the first step; or its first ranges to three landmarks or more, by least squares. A
+    odometry until then its pose at the first step; or its ranges to three landmarks or more, by least squares. A
     solo filter starts from each of some headings around the circle; the one whose innovations, and bearings of other
     vehicles from fix to fix, have the largest likelihood over the first seconds is kept. A compass leaves one. Vehicles
     without a fix that see fewer than two landmarks come last: for them those that were found before are places, too.
@@ -50,7 +52,7 @@ def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0
     steps = int(min(number("seconds", seconds, hint="30 is the default.") / recording.dt + 1.0, len(recording.t)))
     part = recording.between(0, max(steps, 2))
     spread = (*_spread(recording.sensors), np.pi / HEADINGS)
-    filter_ = PoseFilter("solo", lasting=False, gate=gate, spread=spread)
+    filter_ = PoseFilter("solo", gate=gate, spread=spread)
     begin = np.full((recording.runs, len(recording.ids), 4), np.nan)
     for run in range(recording.runs):
         positions = np.full((len(part.t), len(part.ids), 3), np.nan)
@@ -82,18 +84,22 @@ def _next(recording: Recording, run: int, waiting: list[int], places: Floats) ->
 def _most_likely(
     recording: Recording, run: int, column: int, links: Ints, places: Floats, filter_: PoseFilter
 ) -> tuple[Floats, Floats]:
-    """First pose (4,) of a vehicle, and its positions (T, 3) m from there on, by the solo filter of most likelihood."""
-    angles = 2 * np.pi * np.arange(HEADINGS) / HEADINGS
+    """First pose (4,) of a vehicle, and its positions (T, 3) m from there on, by the solo filter of most likelihood: of
+    headings around the circle, then around the best of them."""
     landmarks = places[recording.links.step[links], recording.links.neighbour[links]]
-    tried = np.full((HEADINGS, len(recording.ids), 4), np.nan)
-    tried[:, column] = _hypotheses(recording, run, column, links, landmarks, angles)
-    copies = recording.of_runs(np.full(HEADINGS, run))
-    noise = recording.sensors
+    noise, angles = recording.sensors, STEP * np.arange(HEADINGS)
     if len(to_landmarks(recording, links)) < len(links):
         filter_ = replace(filter_, assumed=_of_vehicles(noise, recording.relative[run, links, 0]))
-    x, _, cost = filter_.run_filter(copies, [column], links, tried, landmark=landmarks)
-    best = np.argmin(cost[:, 0] + _cost_of_bearings(recording, run, column, angles, noise))
-    return tried[best, column], x[best, :, 0, :3]
+    for _ in range(2):
+        poses = _hypotheses(recording, run, column, links, landmarks, angles)
+        tried = np.full((len(poses), len(recording.ids), 4), np.nan)
+        tried[:, column] = poses
+        copies = recording.of_runs(np.full(len(poses), run))
+        x, _, cost = filter_.run_filter(copies, [column], links, tried, landmark=landmarks)
+        best = np.argmin(cost[:, 0] + _cost_of_bearings(recording, run, column, poses[:, 3], noise))
+        angles = poses[best, 3] + STEP * np.linspace(-1.0, 1.0, HEADINGS)
+        filter_ = replace(filter_, spread=(*filter_.spread[:3], 2 * STEP / HEADINGS))
+    return poses[best], x[best, :, 0, :3]
 
 
 def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
@@ -119,7 +125,7 @@ def _turns(recording: Recording, run: int, column: int) -> Floats:
 
 
 def _cost_of_bearings(recording: Recording, run: int, column: int, angles: Floats, noise: Sensors) -> Floats:
-    """(headings,) sum of r^2 / s of bearings against the azimuths between both fixes of their step, per heading."""
+    """(hypotheses,) sum of r^2 / s of bearings against the azimuths between both fixes of their step, per heading."""
     links = recording.links.of(column)
     links = links[~np.isin(recording.links.neighbour[links], recording.landmarks)]
     step, other = recording.links.step[links], recording.links.neighbour[links]
@@ -131,13 +137,14 @@ def _cost_of_bearings(recording: Recording, run: int, column: int, angles: Float
     return cost
 
 
-SHARP = 0.1
-"""m, of landmarks beside a line, below which ranges leave the side open."""
+SHARP, TOGETHER = 0.1, 5.0
+"""m, of landmarks beside a line, below which ranges leave the side open; and s for which ranges count once all were
+seen."""
 
 
 def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places: Floats, angles: Floats) -> Floats:
-    """(headings, 4) poses at the first step that the first fix, or what is seen first, leaves for each heading, with
-    `places` (L, 3) m of what the links measure."""
+    """(hypotheses, 4) poses at the first step that the first fix, or what is seen first in SEEN places, leaves for each
+    heading, with `places` (L, 3) m of what the links measure."""
     body, relative = body_of(recording), recording.relative[run, links]
     fixes = np.flatnonzero(np.isfinite(recording.gnss[run, :, column, 0]))
     complete = np.flatnonzero(np.isfinite(relative[:, :2]).all(axis=1))
@@ -150,15 +157,16 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places
     angles = angles if np.isnan(compass) else np.full(len(angles), compass)
     if not len(fixes) and not len(complete):
         ranged = np.flatnonzero(np.isfinite(relative[:, 0]))
-        first = ranged[np.unique(places[ranged], axis=0, return_index=True)[1]]
-        steps = recording.links.step[links[first]]
-        moved = turned(np.broadcast_to(way[steps], (len(angles), len(steps), 3)), angles[:, None])
-        centres = places[first] - moved
-        apart = centres - centres.sum(axis=1, keepdims=True) / max(len(steps), 1)
-        if len(steps) and np.linalg.matrix_rank(apart[0, :, :2], SHARP) > 1:  # squared ranges differ linearly
-            square = np.square(centres[..., :2]).sum(axis=-1) - relative[first, 0] ** 2
-            at = 0.5 * np.linalg.pinv(apart[..., :2]) @ square[..., None]
-            return np.column_stack([at[..., 0], centres[..., 2].mean(axis=1), angles])
+        at, first = np.unique(places[ranged], axis=0, return_index=True)
+        if len(at) and np.linalg.matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), SHARP) > 1:
+            steps = recording.links.step[links[ranged]]
+            soon = steps <= steps[first.max()] + TOGETHER / recording.dt
+            moved = turned(np.broadcast_to(way[steps[soon]], (len(angles), soon.sum(), 3)), angles[:, None])
+            centres = places[ranged[soon]] - moved  # squared ranges differ linearly
+            square = np.square(centres[..., :2]).sum(axis=-1) - relative[ranged[soon], 0] ** 2
+            matrix = np.concatenate([2.0 * centres[..., :2], np.ones((*square.shape, 1))], axis=-1)
+            position = (np.linalg.pinv(matrix) @ square[..., None])[:, :2, 0]
+            return np.column_stack([position, centres[..., 2].mean(axis=1), angles])
         actual = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
         allowed = (
             "must hold a fix, or a range and bearing of a landmark or of a vehicle whose pose is found, or three ranges"
@@ -172,14 +180,12 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places
         actual = f"{recording.ids[column]} sees one landmark alone, and has neither fix nor compass"
         raise InputError("seconds", actual, "must hold a second place", "Take more seconds, or give its pose.")
     if len(fixes):
-        step = int(fixes[0])
+        step = fixes[:1]
         at, offset = recording.gnss[run, step, column], way[step]
     else:
-        link = links[complete[0]]
-        step = int(recording.links.step[link])
-        flat = np.array([*relative[complete[0], :2], np.pi / 2])
-        flat[2] = relative[complete[0], 2] if np.isfinite(relative[complete[0], 2]) else flat[2]
-        at = places[complete[0]]
-        offset = way[step] + turned(to_vector(flat), np.asarray(turns[step]))
-    position = at - turned(np.broadcast_to(offset, (len(angles), 3)), angles)
-    return np.column_stack([position, angles])
+        first = complete[np.sort(np.unique(places[complete], axis=0, return_index=True)[1])[:SEEN]]
+        step, at = recording.links.step[links[first]], places[first]
+        seen = np.where(np.isfinite(relative[first]), relative[first], np.pi / 2)
+        offset = way[step] + turned(to_vector(seen), turns[step])
+    position = at - turned(np.broadcast_to(offset, (len(angles), *offset.shape)), angles[:, None])
+    return np.column_stack([position.reshape(-1, 3), np.repeat(angles, len(step))])
