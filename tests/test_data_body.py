@@ -187,7 +187,7 @@ def test_bearings_that_are_called_azimuths_are_named(tmp_path, frame, hint):
     ("kind", "change", "said"),
     [
         ("yaw_rate", (-1, 0), "fixes of red, .* turn the other way: scale=yaw_rate:-1"),
-        ("bearing", (1, 1.5), "turned by -1.5. rad: add -1.5"),
+        ("bearing", (1, 1.5), r"turned by -1\.5\d? rad: add -1\.5"),
     ],
 )
 def test_axes_that_are_turned_or_flipped_are_named(tmp_path, kind, change, said):

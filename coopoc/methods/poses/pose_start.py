@@ -51,8 +51,7 @@ def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0
     check_recording(recording, body=True)
     steps = int(min(number("seconds", seconds, hint="30 is the default.") / recording.dt + 1.0, len(recording.t)))
     part = recording.between(0, max(steps, 2))
-    spread = (*_spread(recording.sensors), np.pi / HEADINGS)
-    filter_ = PoseFilter("solo", gate=gate, spread=spread)
+    filter_ = PoseFilter("solo", gate=gate)
     begin = np.full((recording.runs, len(recording.ids), 4), np.nan)
     for run in range(recording.runs):
         positions = np.full((len(part.t), len(part.ids), 3), np.nan)
@@ -90,16 +89,36 @@ def _most_likely(
     noise, angles = recording.sensors, STEP * np.arange(HEADINGS)
     if len(to_landmarks(recording, links)) < len(links):
         filter_ = replace(filter_, assumed=_of_vehicles(noise, recording.relative[run, links, 0]))
-    for _ in range(2):
-        poses = _hypotheses(recording, run, column, links, landmarks, angles)
+
+    def filtered(poses: Floats, turn: float) -> tuple[Floats, Floats]:
+        """Positions and errors of odometry (H, T, d), and costs (H,), from poses (H, 4) whose headings err by that."""
         tried = np.full((len(poses), len(recording.ids), 4), np.nan)
         tried[:, column] = poses
+        own = replace(filter_, spread=(*_spread(noise), turn))
         copies = recording.of_runs(np.full(len(poses), run))
-        x, _, cost = filter_.run_filter(copies, [column], links, tried, landmark=landmarks)
-        best = np.argmin(cost[:, 0] + _cost_of_bearings(recording, run, column, poses[:, 3], noise))
-        angles = poses[best, 3] + STEP * np.linspace(-1.0, 1.0, HEADINGS)
-        filter_ = replace(filter_, spread=(*filter_.spread[:3], 2 * STEP / HEADINGS))
-    return poses[best], x[best, :, 0, :3]
+        x, _, cost = own.run_filter(copies, [column], links, tried, landmark=landmarks)
+        return x[:, :, 0], cost[:, 0] + _cost_of_bearings(recording, run, column, poses[:, 3], noise)
+
+    for turn in (STEP / 2, 2 * STEP / HEADINGS):
+        poses = _hypotheses(recording, run, column, links, landmarks, angles)
+        best = poses[[np.argmin(filtered(poses, turn)[1])]]
+        angles = best[0, 3] + STEP * np.linspace(-1.0, 1.0, HEADINGS)
+    ((x,), _) = filtered(best, STEP / 2)
+    return _back(recording, run, column, x), x[:, :3]
+
+
+def _back(recording: Recording, run: int, column: int, x: Floats) -> Floats:
+    """Pose (4,) at the first step from which odometry, less the errors that a filter has found of it, leads to its last
+    state of x (T, d)."""
+    body, dt = body_of(recording), recording.dt
+    last = int(np.flatnonzero(np.isfinite(x[:, 0]))[-1])
+    scale, bias = x[last, 4:6] if x.shape[1] > 4 else (0.0, 0.0)
+    rate = body.yaw_rate[run, : last + 1, column] - bias
+    rate[0] = 0.0
+    turn = np.cumsum(dt * rate)
+    heading = x[last, 3] - turn[-1]
+    way = turned(dt * recording.velocity[run, : last + 1, column] / (1.0 + scale), heading + turn - 0.5 * dt * rate)
+    return np.append(x[last, :3] - way[1:].sum(axis=0), heading)
 
 
 def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
