@@ -4,11 +4,13 @@ from dataclasses import replace
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 from conftest import refused
 
 import coopoc as co
 from coopoc.evaluate.metrics import nees_band, share_of_average
+from coopoc.world.links import wrap
 
 WHITE = co.Sensors(
     gnss_std=(1.5, 1.5, 1.5), heading_std=0.05, yaw_rate_std=0.02, range_std=0.3, azimuth_std=0.02, inclination_std=0.02
@@ -150,3 +152,39 @@ def test_the_gate_keeps_outliers_out():
 def test_mistakes_are_named(make, words):
     with refused(words):
         make(observed(convoy(masts=1), runs=1))
+
+
+@pytest.mark.parametrize("bearings", [True, False])
+@pytest.mark.parametrize("wild", [0.0, 0.1])
+def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings, wild):
+    """Scale and bias of the odometry, ranges that are all too long, a tenth of them reflected; and the truth."""
+    rng, t, anchors = np.random.default_rng(5), np.arange(0, 60, 0.1), np.array([4 + 5j, -6 + 1j, 2 - 6j])
+    truths, tables = [], [pd.DataFrame({"t": 0, "vehicle": list("uvw"), "x": anchors.real, "y": anchors.imag})]
+    for k, name in enumerate("abc"):
+        turn = 0.15 * (-1) ** k + 0.1 * np.cos(0.1 * t + k)
+        heading = k + np.cumsum(0.1 * turn)
+        place = (2 * k - 2) * (1 + 0.5j) + np.cumsum(0.08 * np.exp(1j * (heading - 0.05 * turn)))
+        columns = {"speed": (0.97 * 0.8 + 0 * t, 0.02), "yaw_rate": (turn - 0.01, 0.01)}
+        for mark, gap in zip("uvw", anchors[:, None] - place, strict=True):
+            longer = 0.2 + rng.exponential(3, len(t)) * (rng.random(len(t)) < wild)
+            columns[f"range_{mark}"] = np.abs(gap) + longer, 0.05
+            columns |= {f"bearing_{mark}": (np.angle(gap * np.exp(-1j * heading)), 0.05)} if bearings else {}
+        noisy = {kind: values + rng.normal(0, std, len(t)) for kind, (values, std) in columns.items()}
+        noisy |= {f"{kind}_std": std for kind, (_, std) in columns.items()}
+        tables.append(pd.DataFrame({"t": t, "vehicle": name, **noisy}))
+        truths.append(
+            pd.DataFrame({"t": t, "vehicle": name, "x": place.real, "y": place.imag, "heading": wrap(heading)})
+        )
+    pd.concat(tables).to_csv(tmp_path / "log.csv", index=False)
+    pd.concat(truths).to_csv(tmp_path / "truth.csv", index=False)
+    log = co.read_log(tmp_path, frame="body")
+    rec, own = log.recording, [log.recording.ids.index(name) for name in "abc"]
+    begin = co.pose_start(rec)
+    assert np.linalg.norm(begin[0, own, :2] - log.truth.position[0, own, :2], axis=1).max() < 1.0
+    assert np.abs(wrap(begin[0, own, 3] - log.truth.heading[0, own])).max() < 0.15
+    track = co.PoseFilter(begin=begin)(rec, own)
+    assert co.rt_le(track, log.truth).max() < 0.1
+    assert len(track.notes) == 1
+    moved = rec.gnss + 5.0 * (np.arange(len(rec.ids)) == rec.ids.index("u"))[:, None]
+    lost = co.PoseFilter(begin=begin)(replace(rec, gnss=moved), own).notes
+    assert any(note.startswith("relative measurements, a and u: far from estimates (") for note in lost)
