@@ -110,9 +110,9 @@ def _most_likely(
 
 def _back(recording: Recording, run: int, column: int, x: Floats) -> Floats:
     """Pose (4,) at the first step from which odometry, less the errors that a filter has found of it, leads to its last
-    state of x (T, d)."""
+    state of x (T, d), before it is absent."""
     body, dt = body_of(recording), recording.dt
-    last = int(np.flatnonzero(np.isfinite(x[:, 0]))[-1])
+    last = (int(np.argmin(np.isfinite(x[:, 0]))) or len(x)) - 1
     scale, bias = x[last, 4:6] if x.shape[1] > 4 else (0.0, 0.0)
     rate = body.yaw_rate[run, : last + 1, column] - bias
     rate[0] = 0.0
