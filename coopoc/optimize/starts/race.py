@@ -164,9 +164,9 @@ def _away(problem: Problem, x: Floats) -> Iterator[Floats]:
     spread, (*_, thin) = np.sqrt(d * np.square(around).mean()), np.linalg.svd(around, full_matrices=False)[2]
     for k in range(min(DRAWS, POINTS // n)):
         away = spread * rng.normal(size=(n, d)) * free
-        if k % 2:
+        if k % 4 == 1:
             away[np.arange(n) != rng.integers(n)] = 0.0
-        elif k % 4:
+        elif k % 4 == 3:
             away = np.outer(away @ thin, thin)
         yield away
 
