@@ -157,7 +157,7 @@ def _cost_of_bearings(recording: Recording, run: int, column: int, angles: Float
     return cost
 
 
-SHARP, TOGETHER = 0.1, 5.0
+SHARP, SOON = 0.1, 5.0
 """m, of landmarks beside a line, below which ranges leave the side open; and s for which ranges count once all were
 seen."""
 
@@ -180,7 +180,7 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places
         at, first = np.unique(places[ranged], axis=0, return_index=True)
         if len(at) and np.linalg.matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), SHARP) > 1:
             steps = recording.links.step[links[ranged]]
-            soon = steps <= steps[first.max()] + TOGETHER / recording.dt
+            soon = steps <= steps[first.max()] + SOON / recording.dt
             moved = turned(np.broadcast_to(way[steps[soon]], (len(angles), soon.sum(), 3)), angles[:, None])
             centres = places[ranged[soon]] - moved  # squared ranges differ linearly
             square = np.square(centres[..., :2]).sum(axis=-1) - relative[ranged[soon], 0] ** 2
