@@ -104,8 +104,8 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray]:
 
 def moves(rec: Recording, column: int, means: int = 1) -> tuple[AnyArray, AnyArray]:
     """Displacements (M,) m, x + iy, of the fixes and of the odometry over the same spans, in which the odometry (if
-    that stands still, the fixes) moves far; none where too little moves. Of a short way the means of several fixes
-    tell more than each."""
+    that stands still, the fixes) moves far; none where too little moves. On a short way the means of several
+    fixes are less noisy."""
     fixes, velocity = rec.gnss[0, :, column, :2] @ [1, 1j], rec.velocity[0, :, column, :2] @ [1, 1j]
     path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
     at = np.flatnonzero(np.isfinite(fixes))
@@ -154,9 +154,9 @@ def odometry(c: Check, column: int) -> Estimate:
             moved, driven = moves(rec, column, max(means, 2))
         fix, square = float(np.hypot(*rec.sensors.fix_std[:2])), max(float(np.square(np.abs(driven)).sum()), 1e-12)
         value, error = factors(moved - driven, np.stack([driven, 1j * driven], axis=1), 2**0.5 * fix)
-        less = (float(np.linalg.norm(noise)) * rec.dt) ** 2 / square  # noise of a cause makes its factor smaller
-        turned = (1 + complex(*value)) * (1 + less)
-        return Estimate(_polar(1 / turned) if turned else value, np.hypot(error, less))
+        attenuation = (float(np.linalg.norm(noise)) * rec.dt) ** 2 / square  # by noise of the cause
+        turned = (1 + complex(*value)) * (1 + attenuation)
+        return Estimate(_polar(1 / turned) if turned else value, np.hypot(error, attenuation))
     path = truth.position[:, column, :2] @ [1, 1j]
     true = np.diff(path, prepend=np.nan) / rec.dt  # as odometry, the mean over a step
     odometer = velocity @ [1, 1j]

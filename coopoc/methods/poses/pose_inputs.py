@@ -22,7 +22,8 @@ POSE = Message("pose and covariance", 16)
 UPLOAD = Message("fix, compass, odometry and relative measurements", 10, per_neighbour=4)
 """Fix (3), compass (1), velocity (3), yaw rate (1), id and time (2); of each other vehicle range, angles and id (4)."""
 SPREAD = (0.5, 0.5, 0.5, 0.15)
-"""m and rad, standard deviations of poses at the first step given: 90 % of those of `pose_start` err by less."""
+"""m and rad, standard deviations of poses at the first step that are given; of robots that range landmarks 90 % of
+those of `pose_start` err by less."""
 LEAST_HEADING_STD, LEAST_YAW_RATE_STD = 1e-6, 1e-5
 """rad and rad/s: a filter needs some noise, however exact its sensors are."""
 

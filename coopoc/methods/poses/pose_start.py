@@ -111,15 +111,24 @@ def _most_likely(
 def _back(recording: Recording, run: int, column: int, x: Floats) -> Floats:
     """Pose (4,) at the first step from which odometry, less the errors that a filter has found of it, leads to its last
     state of x (T, d), before it is absent."""
-    body, dt = body_of(recording), recording.dt
     last = (int(np.argmin(np.isfinite(x[:, 0]))) or len(x)) - 1
     scale, bias = x[last, 4:6] if x.shape[1] > 4 else (0.0, 0.0)
-    rate = body.yaw_rate[run, : last + 1, column] - bias
+    turns, way = _reckoned(recording, run, column, scale, bias)
+    heading = x[last, 3] - turns[last]
+    return np.append(x[last, :3] - turned(way[last], heading), heading)
+
+
+def _reckoned(
+    recording: Recording, run: int, column: int, scale: float = 0.0, bias: float = 0.0
+) -> tuple[Floats, Floats]:
+    """How far a vehicle has turned (T,) rad and moved (T, 3) m in its first body frame, by its odometry less a scale
+    error and a bias of yaw rates, rad/s."""
+    dt, rate = recording.dt, body_of(recording).yaw_rate[run, :, column] - bias
     rate[0] = 0.0
-    turn = np.cumsum(dt * rate)
-    heading = x[last, 3] - turn[-1]
-    way = turned(dt * recording.velocity[run, : last + 1, column] / (1.0 + scale), heading + turn - 0.5 * dt * rate)
-    return np.append(x[last, :3] - way[1:].sum(axis=0), heading)
+    turns = np.cumsum(dt * rate)
+    moved = turned(dt / (1.0 + scale) * recording.velocity[run, :, column], turns - 0.5 * dt * rate)
+    moved[0] = 0.0
+    return turns, np.cumsum(moved, axis=0)
 
 
 def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
@@ -139,25 +148,20 @@ def _spread(sensors: Sensors) -> tuple[float, float, float]:
     return 2 * x, 2 * y, 2 * z
 
 
-def _turns(recording: Recording, run: int, column: int) -> Floats:
-    """(T,) rad that a vehicle has turned since the first step, by its yaw rates."""
-    return np.append(0.0, np.cumsum(recording.dt * body_of(recording).yaw_rate[run, 1:, column]))
-
-
 def _cost_of_bearings(recording: Recording, run: int, column: int, angles: Floats, noise: Sensors) -> Floats:
     """(hypotheses,) sum of r^2 / s of bearings against the azimuths between both fixes of their step, per heading."""
     links = recording.links.of(column)
     links = links[~np.isin(recording.links.neighbour[links], recording.landmarks)]
     step, other = recording.links.step[links], recording.links.neighbour[links]
     gap = recording.gnss[run, step, other] - recording.gnss[run, step, column]
-    azimuth = np.arctan2(gap[:, 1], gap[:, 0]) - _turns(recording, run, column)[step]
+    azimuth = np.arctan2(gap[:, 1], gap[:, 0]) - _reckoned(recording, run, column)[0][step]
     residual = wrap(recording.relative[run, links, 1] + angles[:, None] - azimuth)
     fixes = 2.0 * max(noise.fix_std[:2]) ** 2 / np.maximum(np.square(gap[:, :2]).sum(axis=1), 1.0)
     cost: Floats = np.nansum(residual**2 / (noise.azimuth_std**2 + fixes), axis=1)
     return cost
 
 
-SHARP, SOON = 0.1, 5.0
+SHARP, WINDOW = 0.1, 5.0
 """m, of landmarks beside a line, below which ranges leave the side open; and s for which ranges count once all were
 seen."""
 
@@ -168,11 +172,7 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places
     body, relative = body_of(recording), recording.relative[run, links]
     fixes = np.flatnonzero(np.isfinite(recording.gnss[run, :, column, 0]))
     complete = np.flatnonzero(np.isfinite(relative[:, :2]).all(axis=1))
-    turns = _turns(recording, run, column)
-    middle = turns - 0.5 * recording.dt * body.yaw_rate[run, :, column]
-    way = recording.dt * turned(recording.velocity[run, :, column], middle)
-    way[0] = 0.0
-    way = np.cumsum(way, axis=0)
+    turns, way = _reckoned(recording, run, column)
     compass = body.heading[run, 0, column]
     angles = angles if np.isnan(compass) else np.full(len(angles), compass)
     if not len(fixes) and not len(complete):
@@ -180,10 +180,10 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places
         at, first = np.unique(places[ranged], axis=0, return_index=True)
         if len(at) and np.linalg.matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), SHARP) > 1:
             steps = recording.links.step[links[ranged]]
-            soon = steps <= steps[first.max()] + SOON / recording.dt
-            moved = turned(np.broadcast_to(way[steps[soon]], (len(angles), soon.sum(), 3)), angles[:, None])
-            centres = places[ranged[soon]] - moved  # squared ranges differ linearly
-            square = np.square(centres[..., :2]).sum(axis=-1) - relative[ranged[soon], 0] ** 2
+            early = steps <= steps[first.max()] + WINDOW / recording.dt
+            moved = turned(np.broadcast_to(way[steps[early]], (len(angles), early.sum(), 3)), angles[:, None])
+            centres = places[ranged[early]] - moved  # squared ranges differ linearly
+            square = np.square(centres[..., :2]).sum(axis=-1) - relative[ranged[early], 0] ** 2
             matrix = np.concatenate([2.0 * centres[..., :2], np.ones((*square.shape, 1))], axis=-1)
             position = (np.linalg.pinv(matrix) @ square[..., None])[:, :2, 0]
             return np.column_stack([position, centres[..., 2].mean(axis=1), angles])
