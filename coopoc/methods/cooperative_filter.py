@@ -29,11 +29,13 @@ FOUND = {
     "scale error": "",
     "compass error": "rad",
     "range offset": "m",
+    "range scale": "",
+    "late": "s",
     "slips": "of the steps",
     "alone": "of the steps, as what is measured of its neighbours contradicts its fixes",
 }
 LEVELS = ("range", "azimuth", "inclination", "fix", "message", "motion")
-NOTED = (0.01, 0.01, 0.01, 0.1, 0.01, 0.0)
+NOTED = (0.01, 0.01, 0.01, 0.1, 0.01, 0.05, 0.01, 0.0)
 """Least of what is found that is worth a note."""
 LOUD = 1.5
 """Level that is worth a note, or less than its inverse."""
@@ -66,6 +68,8 @@ class Priors(NamedTuple):
     clock: float = 0.05
     compass: float = 0.05
     offset: float = 0.5
+    ranges: float = 0.0
+    late: float = 0.0
     absent: float = 8.0
     exact: float = -np.inf
     slip: float = 0.7
@@ -76,7 +80,7 @@ class Priors(NamedTuple):
 
 AS_STATED = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0, fix_gate=0.0, forget=0.0)
 """Nothing is otherwise: the textbook's filter."""
-ON_ROADS = Priors(0.03, 0.03, clock=0.2, compass=0.0, offset=0.0, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5)
+ON_ROADS = Priors(0.03, 0.03, clock=0.2, compass=0.0, offset=0.0, ranges=0.03, late=0.2, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5)
 """Of measurements that are not simulated: hardly any odometry is without such errors."""
 NO_ODOMETRY = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0)
 """Of velocities that fixes have shown."""
@@ -280,9 +284,9 @@ def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float]
     found = found[:, np.isfinite(found[..., 4]).any(axis=0)]  # from where it knows where it is
     late = found[:, found.shape[1] // 2 :]
     usual = np.sqrt(np.nanmean(np.square(late), axis=(0, 1)))
-    usual[4:6] = np.nanmean(found[..., 4:6], axis=(0, 1))
-    usual[9:11] *= fix
-    least = np.maximum(NOTED, (0.0, 0.0, *stated, 0.0, 0.0))
+    usual[6:8] = np.nanmean(found[..., 6:8], axis=(0, 1))
+    usual[11:13] *= fix
+    least = np.maximum(NOTED, (0.0, 0.0, *stated, 0.0, 0.0, 0.0, 0.0))
     notes = [
         f"{name}, {ego}: {value:.2g} {unit}".rstrip()
         for (name, unit), value, most in zip(FOUND.items(), usual, least, strict=False)
@@ -333,10 +337,11 @@ def priors_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool
 def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
     """The noise model of the kernel."""
     std, least = relative_noise(noise_model)
-    white, time, absent = np.ones(3), 1.0, np.full(5, priors.absent)
+    white, time, absent = np.ones(3), 1.0, np.full(7, priors.absent)
     own = common = bias = heading = offset = 0.0
-    absent[2] = max(priors.absent, Priors().absent)  # most clocks are right, on roads, too
+    absent[[2, 5, 6]] = max(priors.absent, Priors().absent)  # most clocks are right, on roads, too
     turn, lasts = np.array([priors.heading, priors.scale, priors.clock]), priors.lasts
+    ranged = np.square([priors.ranges, priors.late])
     if noise_model.sensors is not None:
         sensors, std = noise_model.sensors, np.array(std)
         own, common, offset = sensors.gnss_drift_std**2, sensors.gnss_common_std**2, sensors.range_offset_std**2
@@ -344,8 +349,8 @@ def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
         time = float(sensors.gnss_drift_time)
         heading, bias = (float(value**2) for value in noise_model.compass)
         std[1] = np.sqrt(std[1] ** 2 - heading - bias)
-        absent[3:][np.array([bias, offset]) > 0.0] = -np.inf
+        absent[3:5][np.array([bias, offset]) > 0.0] = -np.inf
         bias, offset = bias or priors.compass**2, offset or priors.offset**2
     judged = GATE if priors.fix_gate else 0.0, priors.fix_gate, priors.forget
-    lasting = own, common, time, white, bias, heading, offset, np.square(turn), lasts, absent, priors.exact
+    lasting = own, common, time, white, bias, heading, offset, np.square(turn), lasts, ranged, absent, priors.exact
     return Model(std, float(least), FORGOTTEN, *lasting, priors.slip, *judged)

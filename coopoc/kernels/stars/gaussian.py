@@ -26,11 +26,11 @@ from ..compiling.small import (
 from ..compiling.vectors import LANES, less, plus, put, take
 from .messages import BLOCK, ROW, block_at, vector_at
 
-PLACE, ERROR, TURN, FRESH, COMMON, COMPASS = range(6)
+PLACE, ERROR, TURN, FRESH, COMMON, COMPASS, RANGED = range(7)
 """Kinds of vectors: position m, error of its fixes m, (heading rad, scale, nothing) by which its odometry errs, and
 scratch of `insert_from_measurement`; of the ego the error m that all fixes share, and (bias, noise of this step) of its
-compass, rad, with the offset m of its ranges."""
-KINDS, TERMS = 6, 4
+compass, rad, with the offset m of its ranges, and (scale of its ranges, s by which what it measures is late, nothing)."""
+KINDS, TERMS = 7, 5
 ABSENT = -1
 HARD_REJECT_FACTOR = 4.0
 """Times the gate: from there on a number is not only down-weighted."""
