@@ -70,6 +70,7 @@ class Priors(NamedTuple):
     offset: float = 0.5
     ranges: float = 0.0
     late: float = 0.0
+    pair: float = 0.0
     absent: float = 8.0
     exact: float = -np.inf
     slip: float = 0.7
@@ -80,7 +81,7 @@ class Priors(NamedTuple):
 
 AS_STATED = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0, fix_gate=0.0, forget=0.0)
 """Nothing is otherwise: the textbook's filter."""
-ON_ROADS = Priors(0.03, 0.03, clock=0.2, compass=0.0, offset=0.0, ranges=0.03, late=0.2, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5)
+ON_ROADS = Priors(0.03, 0.03, clock=0.2, compass=0.05, offset=0.0, ranges=0.03, late=0.2, pair=0.3, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5)
 """Of measurements that are not simulated: hardly any odometry is without such errors."""
 NO_ODOMETRY = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0)
 """Of velocities that fixes have shown."""
@@ -339,9 +340,9 @@ def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
     std, least = relative_noise(noise_model)
     white, time, absent = np.ones(3), 1.0, np.full(7, priors.absent)
     own = common = bias = heading = offset = 0.0
-    absent[[2, 5, 6]] = max(priors.absent, Priors().absent)  # most clocks are right, on roads, too
+    absent[[2, 3, 5, 6]] = max(priors.absent, Priors().absent)  # most clocks are right, on roads, too
     turn, lasts = np.array([priors.heading, priors.scale, priors.clock]), priors.lasts
-    ranged = np.square([priors.ranges, priors.late])
+    ranged = np.square([priors.ranges, priors.late, priors.pair])
     if noise_model.sensors is not None:
         sensors, std = noise_model.sensors, np.array(std)
         own, common, offset = sensors.gnss_drift_std**2, sensors.gnss_common_std**2, sensors.range_offset_std**2

@@ -537,6 +537,9 @@ def add_ranged(f: Filter, k: int, far: float, w: tuple[float, ...]) -> None:
     x, y, z = apply(w, subtract(vector_at(ego, PACE // 3), vector_at(other, PACE // 3)))
     store(h.matrix, n, (far, x, 0.0, 0.0, y, 0.0, 0.0, z, 0.0))
     h.block[n], h.block[TERMS] = f.g.block[0, RANGED], n + 1
+    if has(f.g, k, RANGED):
+        store(h.matrix, n + 1, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        h.block[n + 1], h.block[TERMS] = f.g.block[k, RANGED], n + 2
 
 
 @part
