@@ -276,6 +276,8 @@ def step(
         if probably >= 0.5:
             copy_filter(other, f)
             tries.doubts[PENDING] = KNOWN if fails else tries.doubts[PENDING]
+        elif known and not heard(f, True):
+            tries.doubts[PENDING] = own[MORE]
         f.ego[SLIPPED] = probably
     elif f.ego[NUMBERS] > 0.0:
         f.ego[SLIPPED] = 0.0
