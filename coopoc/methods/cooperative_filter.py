@@ -30,12 +30,11 @@ FOUND = {
     "compass error": "rad",
     "range offset": "m",
     "range scale": "",
-    "late": "s",
     "slips": "of the steps",
     "alone": "of the steps, as what is measured of its neighbours contradicts its fixes",
 }
 LEVELS = ("range", "azimuth", "inclination", "fix", "message", "motion")
-NOTED = (0.01, 0.01, 0.01, 0.1, 0.01, 0.05, 0.01, 0.0)
+NOTED = (0.01, 0.01, 0.01, 0.1, 0.01, 0.01, 0.0)
 """Least of what is found that is worth a note."""
 LOUD = 1.5
 """Level that is worth a note, or less than its inverse."""
@@ -69,7 +68,6 @@ class Priors(NamedTuple):
     compass: float = 0.05
     offset: float = 0.5
     ranges: float = 0.0
-    late: float = 0.0
     pair: float = 0.0
     absent: float = 8.0
     exact: float = -np.inf
@@ -81,7 +79,7 @@ class Priors(NamedTuple):
 
 AS_STATED = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0, fix_gate=0.0, forget=0.0)
 """Nothing is otherwise: the textbook's filter."""
-ON_ROADS = Priors(0.03, 0.03, clock=0.2, compass=0.05, offset=0.0, ranges=0.03, late=0.2, pair=0.3, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5)
+ON_ROADS = Priors(0.03, 0.03, clock=0.2, compass=0.05, offset=0.0, ranges=0.03, pair=0.3, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5)
 """Of measurements that are not simulated: hardly any odometry is without such errors."""
 NO_ODOMETRY = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0)
 """Of velocities that fixes have shown."""
@@ -275,19 +273,19 @@ def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float]
 
     Args:
         ego: its name.
-        found: (R, T, 12) errors that last, whether it slips, whether it is alone, and levels.
+        found: (R, T, 13) errors that last, whether it slips, whether it is alone, and levels.
         fix: factor of the stated deviation of fixes that was assumed.
         stated: deviations of the errors of the compass, rad, and of ranges, m: no more than these is worth no note.
 
-    >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0, 1.0]]]))
+    >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0, 1.0]]]))
     ['scale error, a: 0.02', 'fix level, a: 3 times the stated deviation']
     """
     found = found[:, np.isfinite(found[..., 4]).any(axis=0)]  # from where it knows where it is
     late = found[:, found.shape[1] // 2 :]
     usual = np.sqrt(np.nanmean(np.square(late), axis=(0, 1)))
-    usual[6:8] = np.nanmean(found[..., 6:8], axis=(0, 1))
-    usual[11:13] *= fix
-    least = np.maximum(NOTED, (0.0, 0.0, *stated, 0.0, 0.0, 0.0, 0.0))
+    usual[5:7] = np.nanmean(found[..., 5:7], axis=(0, 1))
+    usual[10:12] *= fix
+    least = np.maximum(NOTED, (0.0, 0.0, *stated, 0.0, 0.0, 0.0))
     notes = [
         f"{name}, {ego}: {value:.2g} {unit}".rstrip()
         for (name, unit), value, most in zip(FOUND.items(), usual, least, strict=False)
@@ -338,11 +336,11 @@ def priors_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool
 def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
     """The noise model of the kernel."""
     std, least = relative_noise(noise_model)
-    white, time, absent = np.ones(3), 1.0, np.full(7, priors.absent)
+    white, time, absent = np.ones(3), 1.0, np.full(6, priors.absent)
     own = common = bias = heading = offset = 0.0
-    absent[[2, 3, 5, 6]] = max(priors.absent, Priors().absent)  # most clocks are right, on roads, too
+    absent[[2, 3, 5]] = max(priors.absent, Priors().absent)  # most clocks are right, on roads, too
     turn, lasts = np.array([priors.heading, priors.scale, priors.clock]), priors.lasts
-    ranged = np.square([priors.ranges, priors.late, priors.pair])
+    ranged = np.square([priors.ranges, priors.pair])
     if noise_model.sensors is not None:
         sensors, std = noise_model.sensors, np.array(std)
         own, common, offset = sensors.gnss_drift_std**2, sensors.gnss_common_std**2, sensors.range_offset_std**2

@@ -45,7 +45,6 @@ from .cooperative_state import (
     ORDER,
     OUT,
     OWN,
-    PACE,
     SINCE_FIX,
     SOLO,
     SOLO_VARIANCE,
@@ -524,7 +523,7 @@ def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
     h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]
     h.block[TERMS] = 3 if has(g, 0, COMPASS) else 2
     if has(g, 0, RANGED):
-        add_ranged(f, k, far, w)
+        add_ranged(f, k, far)
     h.three[CURVE] = 1.0 / (reach * reach) if model.gate > 0.0 else 0.0
     if goes_on(f, rows, k):
         add_way(f, rows, k)
@@ -532,12 +531,10 @@ def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
 
 
 @part
-def add_ranged(f: Filter, k: int, far: float, w: tuple[float, ...]) -> None:
-    """Rows of the scale of ranges, and of how late what is measured of member k is."""
+def add_ranged(f: Filter, k: int, far: float) -> None:
+    """Rows of the scale of ranges, and of the offset of those to member k."""
     h, n = f.h, f.h.block[TERMS]
-    ego, other = f.status[f.who[0, VEHICLE]], f.status[f.who[k, VEHICLE]]
-    x, y, z = apply(w, subtract(vector_at(ego, PACE // 3), vector_at(other, PACE // 3)))
-    store(h.matrix, n, (far, x, 0.0, 0.0, y, 0.0, 0.0, z, 0.0))
+    store(h.matrix, n, (far, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
     h.block[n], h.block[TERMS] = f.g.block[0, RANGED], n + 1
     if has(f.g, k, RANGED):
         store(h.matrix, n + 1, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))

@@ -103,7 +103,7 @@ def predict(f: Filter, model: Model, own: Floats) -> None:
         if f.who[k, VEHICLE] >= 0 and has(g, k, RANGED):
             i = 3 * g.block[k, RANGED]
             shift(g, i, i, lost - 1.0)
-            g.p[i, i] += (1.0 - lost * lost) * model.ranged[2]
+            g.p[i, i] += (1.0 - lost * lost) * model.ranged[1]
     for k in range(len(f.who)):
         if f.who[k, VEHICLE] >= 0 and has(g, k, ERROR):
             i, trusted = 3 * g.block[k, ERROR], f.status[f.who[k, VEHICLE], TRUSTED] > 0.0
@@ -179,9 +179,9 @@ def join(f: Filter, model: Model, rows: Floats, vehicle: int, row: int) -> None:
         for c in range(3):
             g.x[first + c] -= age * rows[row, SPEED + c]
     insert_turn(g, model, k)
-    if model.ranged[2] > 0.0:
+    if model.ranged[1] > 0.0:
         i = insert(g, k, RANGED, 0.0)
-        g.p[i, i] = model.ranged[2]
+        g.p[i, i] = model.ranged[1]
     variance = model.own + (TAU**2 if f.status[vehicle, TRUSTED] == 0.0 else 0.0)
     if variance > 0.0:
         insert(g, k, ERROR, variance)

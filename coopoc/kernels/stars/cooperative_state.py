@@ -65,7 +65,7 @@ WINDOW, CONTRADICTED = 30.0, 30.0
 anew."""
 ACCELERATION = 5.0
 """m/s^2, of a vehicle at most, and of a member since it sent its newest message."""
-FIXES, MESSAGES, MOTIONS, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 6, 14
+FIXES, MESSAGES, MOTIONS, KINDS_OF_NUMBERS, FOUND = 3, 4, 5, 6, 13
 """Kinds of numbers that have a level, behind ranges, azimuths and inclinations; how many, and how much is found."""
 
 
@@ -99,8 +99,8 @@ class Model(NamedTuple):
         offset: m^2, of what all the ego's ranges are too long by.
         turn: (3,) rad^2, 1 and s^2, of errors of heading and scale of an odometry and of a clock; zeros for none.
         lasts: s, their correlation time.
-        ranged: (2,) 1 and s^2, of the scale of ranges and of how late relative measurements are; zeros for none.
-        absent: (7,) log odds that an error of heading, scale, clock, compass, range, its scale or lateness is not there.
+        ranged: (2,) of the scale of ranges, and m^2 of the offset of those of a pair; zeros for none.
+        absent: (6,) log odds that an error of heading, scale, clock, compass, range or its scale is not there.
         exact: log odds a vehicle that no odometry errs, where each error of heading and scale is there otherwise.
         slip: share of the late speed.
         gate: squared normalised innovation of a component of a relative measurement, 0 for none.
@@ -141,8 +141,8 @@ that in P m^2, next to nothing being known of it, 0 once it is; `gate.count` of 
 normalised innovations of range, azimuth and inclination and the share of its message that was used, NaN where nothing
 was: the ego's are those of its fix."""
 STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
-LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, LEFT = 20, 26, 32, 38, 52, 55, 64
-AGREED, SINCE_FIX, CORRECTED, ADDED, ERRORS, EGO = 71, 72, 73, 74, 77, 85
+LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, LEFT = 20, 26, 32, 38, 51, 54, 63
+AGREED, SINCE_FIX, CORRECTED, ADDED, ERRORS, EGO = 70, 71, 72, 73, 76, 84
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
 of motion makes, and the whole then; fifteen numbers of `otherwise` on slips; by kind of number the logarithm of its
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
@@ -166,7 +166,7 @@ class Filter(NamedTuple):
         slot: (vehicles,) of each vehicle, ABSENT for none.
         status: (vehicles, STATUS).
         ego: (EGO,).
-        few: (3 slots + 7, 3 slots + 6) memory.
+        few: (3 slots + 6, 3 slots + 5) memory.
     """
 
     g: Gaussian
@@ -190,7 +190,7 @@ def new_filter(slots: int, vehicles: int) -> Filter:
         np.full(vehicles, ABSENT),
         np.zeros((vehicles, STATUS)),
         np.zeros(EGO),
-        np.zeros((3 * slots + 7, 3 * slots + 6)),
+        np.zeros((3 * slots + 6, 3 * slots + 5)),
     )
 
 
@@ -235,10 +235,9 @@ def begin(f: Filter, model: Model, own: Floats, rows: Floats, count: int, ego: i
     if model.bias + model.heading + model.offset > 0.0:
         first = insert(f.g, 0, COMPASS, model.bias)
         f.g.p[first + 2, first + 2] = model.offset
-    if model.ranged[0] + model.ranged[1] > 0.0:
+    if model.ranged[0] > 0.0:
         first = insert(f.g, 0, RANGED, 0.0)
-        for c in range(2):
-            f.g.p[first + c, first + c] = model.ranged[c]
+        f.g.p[first, first] = model.ranged[0]
     insert_turn(f.g, model, 0)
     start(f, model, own, rows, count)
 

@@ -96,8 +96,8 @@ from .gaussian import (
     widen,
 )
 
-HEADING, SCALE, OF_COMPASS, OF_RANGE, OF_SCALE, LATENESS, SLIPS, ALONE, LEVELS = range(9)
-"""Places in TOLD: the ego's errors, rad, 1, rad, m, 1, s, whether it slips, whether it has left its star, and the factors of
+HEADING, SCALE, OF_COMPASS, OF_RANGE, OF_SCALE, SLIPS, ALONE, LEVELS = range(8)
+"""Places in TOLD: the ego's errors, rad, 1, rad, m, 1, whether it slips, whether it has left its star, and the factors of
 standard deviations."""
 
 
@@ -163,17 +163,17 @@ def average(f: Filter, model: Model) -> None:
     if has(g, 0, COMPASS):
         few[n, where], few[n + 1, where] = 3 * g.block[0, COMPASS], 3 * g.block[0, COMPASS] + 2
         n += 2
-    late = n
+    scaled = n
     if has(g, 0, RANGED):
-        few[n, where], few[n + 1, where] = 3 * g.block[0, RANGED], 3 * g.block[0, RANGED] + 1
-        n += 2
+        few[n, where] = 3 * g.block[0, RANGED]
+        n += 1
     for i in range(n):
         at = int(few[i, where])
         few[i, where - 1] = g.x[at]
         for j in range(3, n):
             few[i, j - 3] = g.p[at, int(few[j, where])]
     for i in range(3, n):
-        kind = 5 + i - late if i >= late else 3 + i - own if i >= own else (i - 3) % 3
+        kind = 5 if i >= scaled else 3 + i - own if i >= own else (i - 3) % 3
         if model.absent[kind] > -math.inf:
             prior = (
                 model.turn[kind]
@@ -182,14 +182,14 @@ def average(f: Filter, model: Model) -> None:
                 if kind == 3
                 else model.offset
                 if kind == 4
-                else model.ranged[kind - 5]
+                else model.ranged[0]
             )
             collapse(f, i, n, chance_of(-model.absent[kind] - evidence(few[i, i - 3], few[i, where - 1], prior)))
     if own > 3 and model.absent[0] == -math.inf and model.exact > -math.inf:
         average_over_all(f, model, own)
-    for kind in range(6):
-        i = late + kind - 4 if kind >= 4 else own + kind - (3 if kind < 2 else 2)
-        there = n > late if kind >= 4 else late > own if kind >= 2 else own > 3
+    for kind in range(5):
+        i = scaled if kind == 4 else own + kind - (3 if kind < 2 else 2)
+        there = n > scaled if kind == 4 else scaled > own if kind >= 2 else own > 3
         f.ego[TOLD + kind] = few[i, where - 1] if there else 0.0
     f.ego[TOLD + SLIPS] = f.ego[SLIPPED]
     for kind in range(KINDS_OF_NUMBERS):
