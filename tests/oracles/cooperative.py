@@ -57,6 +57,7 @@ from coopoc.world.v2x import FIX_AND_VELOCITY
 from oracles.pace import heard
 
 FLAT = 1e6
+PAIR_TIME = 60.0
 Name = tuple[Any, ...]
 
 
@@ -147,7 +148,7 @@ class Sent(NamedTuple):
 
 class Life(NamedTuple):
     """Parameters of lasting errors: own and common m^2, their correlation of a step, compass bias and noise rad^2,
-    offset of ranges m^2, heading and scale of odometry and offset of a clock, their correlation of a step, log odds
+    offset of ranges m^2, their scale and the offset m^2 of those of a pair, heading and scale of odometry and offset of a clock, their correlation of a step, log odds
     that there is none."""
 
     own: float
@@ -156,6 +157,7 @@ class Life(NamedTuple):
     bias: float
     heading: float
     offset: float
+    ranged: Floats
     turn: Floats
     holds: float
     absent: Floats
@@ -171,21 +173,20 @@ class Oracle:
             self.more = self.more if fault.extra is None else fault.extra[run, :, ego]
         self.by, self.corrected_now, self.grown = (seen.velocity - measured)[run, :, ego], False, 0.0
         self.seen, self.ego, self.run, self.known, self.priors = seen, ego, run, known, priors
-        self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(3), 1, np.zeros(5)), np.ones(3)
+        self.life, self.white = Life(0, 0, 1, 0, 0, 0, np.zeros(2), np.zeros(3), 1, np.zeros(6)), np.ones(3)
         self.std: Floats = np.ones(3)
         if s is not None:
             self.std = s.relative_std.copy()
             heading, bias = (float(v**2) for v in known.compass)
             self.std[1] = math.sqrt(self.std[1] ** 2 - heading - bias)
             keep = math.exp(-seen.dt / s.gnss_drift_time)
-            offset, absent = s.range_offset_std**2, np.full(5, priors.absent)
-            absent[2] = max(priors.absent, 8.0)
-            absent[3:][[bias > 0, offset > 0]] = -math.inf
+            offset, absent = s.range_offset_std**2, np.full(6, priors.absent)
+            absent[[2, 3, 5]] = max(priors.absent, 8.0)
+            absent[3:5][[bias > 0, offset > 0]] = -math.inf
             bias, offset = bias or priors.compass**2, offset or priors.offset**2
             holds, turn = math.exp(-seen.dt / priors.lasts), np.square([priors.heading, priors.scale, priors.clock])
-            self.life = Life(
-                s.gnss_drift_std**2, s.gnss_common_std**2, keep, bias, heading, offset, turn, holds, absent
-            )
+            ranged, lasting = np.square([priors.ranges, priors.pair]), (s.gnss_drift_std**2, s.gnss_common_std**2)
+            self.life = Life(*lasting, keep, bias, heading, offset, ranged, turn, holds, absent)
             self.white = np.square(s.gnss_std) / np.square(s.fix_std)
         shape = seen.gnss.shape
         self.r = priors.fix**2 * np.broadcast_to(known.fix_variance(seen), shape)[run]
@@ -315,12 +316,14 @@ class Oracle:
         turns = [b.at(("o", j)).start + i for j in members if ("o", j) in b.names for i in range(3)]
         for k, i in enumerate(turns):
             b.average([i], life.turn[k % 3], life.absent[k % 3])
-        if life.absent[0] == -math.inf:
-            turns = [i for k, i in enumerate(turns) if k % 3 < 2]
-            b.average(turns, np.tile(life.turn[:2], len(members)), self.priors.exact * max(len(members), 2))
         if ("compass",) in b.names:
             b.average([b.at(("compass",)).start], life.bias, life.absent[3])
             b.average([b.at(("compass",)).start + 2], life.offset, life.absent[4])
+        if ("r", self.ego) in b.names:
+            b.average([b.at(("r", self.ego)).start], life.ranged[0], life.absent[5])
+        if life.absent[0] == -math.inf:
+            turns = [i for k, i in enumerate(turns) if k % 3 < 2]
+            b.average(turns, np.tile(life.turn[:2], len(members)), self.priors.exact * max(len(members), 2))
 
     def motion(self, t: int) -> tuple[Floats, Floats]:
         """The ego's velocity and the variance of its motion, corrected by fixes or not."""
@@ -429,6 +432,8 @@ class Oracle:
             b.add(("common",), 0, life.common)
         if life.bias + life.heading + life.offset:
             b.add(("compass",), 0, [life.bias, 0, life.offset])
+        if life.ranged[0]:
+            b.add(("r", self.ego), 0, [life.ranged[0], 0, 0])
         self.add_turn(self.ego)
         s["slot"][self.ego], s["began"] = 0, t
         s["trusted"].add(self.ego)
@@ -448,7 +453,7 @@ class Oracle:
             if j not in others or again or self.contradicted(t, j):
                 if j in others and j not in s["trusted"]:
                     self.doubt(j)
-                for kind in "xbo":
+                for kind in "xbor":
                     b.drop((kind, j))
                 s["members"].remove(j)
         dt = self.seen.dt
@@ -703,6 +708,10 @@ class Oracle:
                 if name[1] in self.state["trusted"]:
                     b.transform(name, {name: life.keep})
                 b.noise(name, life.own * (1 - life.keep**2))
+            if name[0] == "r" and name[1] != self.ego:
+                keep = math.exp(-self.seen.dt / PAIR_TIME)
+                b.transform(name, {name: keep})
+                b.noise(name, [(1 - keep**2) * life.ranged[1], 0, 0])
         if life.common:
             b.transform(("common",), {("common",): life.keep})
             b.noise(("common",), life.common * (1 - life.keep**2))
@@ -763,6 +772,8 @@ class Oracle:
         s["locked"].pop(j, None)
         s["way"].pop(j, None)
         self.add_turn(j)
+        if self.life.ranged[1]:
+            b.add(("r", j), 0, [self.life.ranged[1], 0, 0])
         variance = self.life.own + (0.0 if j in s["trusted"] else TAU**2)
         if variance:
             b.add(("b", j), 0.0, variance)
@@ -811,6 +822,9 @@ class Oracle:
                 z[c] += rows[c] @ by @ self.turn(j)
             if c < 2 and ("compass",) in b.names:
                 terms[("compass",)] = np.array([[0, 0, 1], [1, 1, 0]][c])
+            for who, factor in ((self.ego, far), (j, 1.0)):
+                if c == 0 and ("r", who) in b.names:
+                    terms[("r", who)] = np.array([factor, 0, 0])
             h.append(b.row(terms, c))
         spread = np.einsum("ci,ij,cj->c", h, b.p, h)
         if g.fix_gate and not vague:  # the variance of terms of second order, with what each number leaves of its error

@@ -48,7 +48,8 @@ from .messages import vector_at
 from .otherwise import drive, slip
 
 
-PAIR, PAIR_TIME = 0.3, 60.0
+PAIR_TIME = 60.0
+"""s, in which an offset of a pair's ranges changes."""
 
 
 @inside

@@ -184,7 +184,8 @@ def average(f: Filter, model: Model) -> None:
                 if kind == 4
                 else model.ranged[0]
             )
-            collapse(f, i, n, chance_of(-model.absent[kind] - evidence(few[i, i - 3], few[i, where - 1], prior)))
+            there = chance_of(-model.absent[kind] - evidence(few[i, i - 3], few[i, where - 1], prior))
+            collapse(f, i, n, there, 3 if model.absent[0] == -math.inf else i + 1)
     if own > 3 and model.absent[0] == -math.inf and model.exact > -math.inf:
         average_over_all(f, model, own)
     for kind in range(5):
@@ -220,8 +221,9 @@ def clock_of(f: Filter, model: Model, k: int) -> float:
 
 
 @part
-def collapse(f: Filter, i: int, n: int, there: float) -> None:
-    """Average over whether the error of row i is there, by that probability: moments are matched."""
+def collapse(f: Filter, i: int, n: int, there: float, first: int) -> None:
+    """Average over whether the error of row i is there, by that probability: moments are matched, those of the errors
+    from row `first` on, which are still to be averaged over."""
     few, ego, width = f.few, f.ego, len(f.few[0]) - 2
     p, m = few[i, i - 3], few[i, width]
     if not p > 0.0:
@@ -234,10 +236,11 @@ def collapse(f: Filter, i: int, n: int, there: float) -> None:
     for j in range(n):
         if j != i:
             few[j, width] += mean * few[j, i - 3]
-            for k in range(i + 1, n):
-                few[j, k - 3] += change * few[j, i - 3] * few[i, k - 3]
+            for k in range(first, n):
+                if k != i:
+                    few[j, k - 3] += change * few[j, i - 3] * few[i, k - 3]
     few[i, width] = there * m
-    for k in range(i + 1, n):
+    for k in range(first, n):
         few[i, k - 3] *= 1.0 + change * p
 
 
@@ -252,7 +255,7 @@ def average_over_all(f: Filter, model: Model, own: int) -> None:
     for i in range(3, own):
         if i % 3 < 2:
             odds += evidence(f.few[i, i - 3], f.few[i, width], model.turn[i % 3])
-            collapse(f, i, own, 0.0)
+            collapse(f, i, own, 0.0, i + 1)
     none = chance_of(odds)
     for c in range(12):
         gap = ego[ANSWER + c] - kept[c]
