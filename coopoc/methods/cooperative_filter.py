@@ -52,8 +52,11 @@ class Priors(NamedTuple):
         lasts: s, for which they do.
         compass: rad, and
         offset: m, of such errors of the ego's compass and ranges, where none is stated.
+        ranges: of such an error of their scale.
+        pair: m, of the offset of the ranges of a pair, which changes in a minute.
         clock: s, of a neighbour's clock.
-        absent: log odds that each of these is not there, before anything was measured; of a clock 8 at least.
+        absent: log odds that each of these, but that of a pair, is not there, before anything was measured; of a
+            clock, a compass and the scale of ranges 8 at least.
         exact: where absent is -inf, log odds that no odometry errs, times the vehicles in the star, two at least.
         slip: an ego that slips errs by that share of its late speed.
         fix: factor of the assumed standard deviation of fixes, which err together for a while.
@@ -79,7 +82,9 @@ class Priors(NamedTuple):
 
 AS_STATED = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0, fix_gate=0.0, forget=0.0)
 """Nothing is otherwise: the textbook's filter."""
-ON_ROADS = Priors(0.03, 0.03, clock=0.2, compass=0.05, offset=0.0, ranges=0.03, pair=0.3, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5)
+ON_ROADS = Priors(
+    0.03, 0.03, clock=0.2, offset=0.0, ranges=0.03, pair=0.3, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5
+)
 """Of measurements that are not simulated: hardly any odometry is without such errors."""
 NO_ODOMETRY = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0)
 """Of velocities that fixes have shown."""
@@ -129,7 +134,8 @@ class CooperativeFilter(Checked):
       follow their innovations, between 0.14 and 33 times what is assumed, by recursive maximum likelihood
       (`kernels.stars.otherwise`).
     - *Errors that last and may not be there*: of heading $b$ and scale $s$ of each odometry,
-      $x_t = x_{t-1} + (1 + s) R(b) \Delta t \, u$, of the ego's compass and of its ranges. Each is a state with a wide
+      $x_t = x_{t-1} + (1 + s) R(b) \Delta t \, u$, of the ego's compass and of its ranges (of measured ones also their
+      scale, and an offset of each pair). Each is a state with a wide
       prior, and the estimate is the average over whether it is 0, by Bayes' rule (`kernels.stars.otherwise`).
     - *Slips*: a step whose numbers surprise is tried again with a motion that is not known, and the likelier of both
       is kept (`kernels.stars.otherwise`).
@@ -184,8 +190,8 @@ class CooperativeFilter(Checked):
         """Track of the egos and of the neighbours in their stars; InputError if an ego is unknown or absent.
 
         `extras` hold what is found to be otherwise than assumed, (R, T, E) each: the ego's "heading_error" and
-        "compass_error" rad, "scale_error" and "range_offset" m; whether it "slips", or is "alone"; "range_level" and so
-        on, factors of standard deviations. And the weights, 1 for a number that was believed, of each ego's "fix"
+        "compass_error" rad, "scale_error", "range_offset" m and "range_scale"; whether it "slips", or is "alone";
+        "range_level" and so on, factors of standard deviations. And the weights, 1 for a number that was believed, of each ego's "fix"
         (R, T, E) and by link (R, L) of "range", "azimuth", "inclination" and "message", NaN where there was none,
         whether it is "trusted", and by how many s its "clock" is ahead.
         """
@@ -338,7 +344,7 @@ def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
     std, least = relative_noise(noise_model)
     white, time, absent = np.ones(3), 1.0, np.full(6, priors.absent)
     own = common = bias = heading = offset = 0.0
-    absent[[2, 3, 5]] = max(priors.absent, Priors().absent)  # most clocks are right, on roads, too
+    absent[[2, 3, 5]] = max(priors.absent, Priors().absent)  # most are right, on roads, too
     turn, lasts = np.array([priors.heading, priors.scale, priors.clock]), priors.lasts
     ranged = np.square([priors.ranges, priors.pair])
     if noise_model.sensors is not None:

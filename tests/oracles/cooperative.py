@@ -148,8 +148,8 @@ class Sent(NamedTuple):
 
 class Life(NamedTuple):
     """Parameters of lasting errors: own and common m^2, their correlation of a step, compass bias and noise rad^2,
-    offset of ranges m^2, their scale and the offset m^2 of those of a pair, heading and scale of odometry and offset of a clock, their correlation of a step, log odds
-    that there is none."""
+    offset of ranges m^2, their scale and the offset m^2 of those of a pair, heading and scale of odometry and offset of
+    a clock, their correlation of a step, log odds that there is none."""
 
     own: float
     common: float

@@ -47,7 +47,6 @@ from .gaussian import ABSENT, COMMON, ERROR, KINDS, PLACE, RANGED, has, insert, 
 from .messages import vector_at
 from .otherwise import drive, slip
 
-
 PAIR_TIME = 60.0
 """s, in which an offset of a pair's ranges changes."""
 

@@ -29,8 +29,8 @@ from .messages import BLOCK, ROW, block_at, vector_at
 PLACE, ERROR, TURN, FRESH, COMMON, COMPASS, RANGED = range(7)
 """Kinds of vectors: position m, error of its fixes m, (heading rad, scale, nothing) by which its odometry errs, and
 scratch of `insert_from_measurement`; of the ego the error m that all fixes share, and (bias, noise of this step) of its
-compass, rad, with the offset m of its ranges, and the scale
-of its ranges; of a neighbour the offset m of ranges to it."""
+compass, rad, with the offset m of its ranges, and the error of their scale; of a neighbour the offset m of ranges to
+it."""
 KINDS, TERMS = 7, 6
 ABSENT = -1
 HARD_REJECT_FACTOR = 4.0

@@ -97,8 +97,8 @@ from .gaussian import (
 )
 
 HEADING, SCALE, OF_COMPASS, OF_RANGE, OF_SCALE, SLIPS, ALONE, LEVELS = range(8)
-"""Places in TOLD: the ego's errors, rad, 1, rad, m, 1, whether it slips, whether it has left its star, and the factors of
-standard deviations."""
+"""Places in TOLD: the ego's errors, rad, 1, rad, m, 1, whether it slips, whether it has left its star, and the
+factors of standard deviations."""
 
 
 @part
@@ -175,15 +175,8 @@ def average(f: Filter, model: Model) -> None:
     for i in range(3, n):
         kind = 5 if i >= scaled else 3 + i - own if i >= own else (i - 3) % 3
         if model.absent[kind] > -math.inf:
-            prior = (
-                model.turn[kind]
-                if kind < 3
-                else model.bias
-                if kind == 3
-                else model.offset
-                if kind == 4
-                else model.ranged[0]
-            )
+            of_ego = model.bias if kind == 3 else model.offset if kind == 4 else model.ranged[0]
+            prior = model.turn[kind] if kind < 3 else of_ego
             there = chance_of(-model.absent[kind] - evidence(few[i, i - 3], few[i, where - 1], prior))
             collapse(f, i, n, there, 3 if model.absent[0] == -math.inf else i + 1)
     if own > 3 and model.absent[0] == -math.inf and model.exact > -math.inf:
