@@ -22,6 +22,7 @@ from coopoc.methods.star_stream import RelativeMeasurement, StarStream
 from coopoc.studies.world_faults import delayed
 from coopoc.studies.worlds import world
 from coopoc.world.inbox import inbox
+from coopoc.world.links import wrap
 from coopoc.world.recording import MEASURED
 from coopoc.world.spoofing import Spoofing, spoofed
 
@@ -43,8 +44,6 @@ def test_with_everything_off_it_is_the_joint_filter(change):
     seen = change(observe(apart, fine, V2X(20, radius=1e4), runs=2, observers=[0, 3]))
     ours, joint = CooperativeFilter(priors=AS_STATED)(seen, [0, 3]), textbook(JointFilter())(seen, [0, 3])
     assert_allclose(ours.x, joint.x, atol=2e-5)
-    assert ours.covariance is not None
-    assert joint.covariance is not None
     assert_allclose(ours.covariance[:, 1:], joint.covariance[:, 1:], rtol=2e-3, atol=1e-8)
 
 
@@ -215,7 +214,6 @@ def test_a_position_of_a_minute_is_kept():
     gnss[:, 64:, 0] += [60.0, 45.0, 0.0]
     jumped = replace(seen, gnss=gnss)
     track = CooperativeFilter()(jumped)
-    assert track.covariance is not None
     x, cov, _ = Oracle(jumped, 0, 0, resolve("nominal", jumped), Priors()).loop()
     assert_allclose(track.x[0, :, 0], x, atol=1e-6)
     assert_allclose(track.covariance[0, :, 0], cov, rtol=1e-6, atol=1e-6)
@@ -306,8 +304,6 @@ def test_the_filter_is_its_oracle(crossing, case, priors):
     fleet = gappy(crossing)
     seen = change(observe(fleet, sensors, v2x, runs=2, observers=[0]))
     track, known = CooperativeFilter(priors=priors)(seen), resolve("nominal", seen)
-    assert track.covariance is not None
-    assert track.neighbours is not None
     assumed = ON_ROADS if seen.measured and priors == Priors() else priors
     assert (track.extras["alone"] > 0).any() == (case == "mirrored" and priors == Priors())
     for run in range(2):
@@ -346,7 +342,6 @@ def test_step_by_step_it_is_the_track(crossing, case):
         streams[0] = pickle.loads(pickle.dumps(streams[0]))
         x, cov = streams[0].step(seen.gnss[0, t, 0], seen.velocity[0, t, 0], seen.dt, neighbours=given)
         assert_allclose(x, track.x[0, t, 0], atol=1e-6)
-        assert track.covariance is not None
         assert_allclose(np.full((3, 3), np.nan) if cov is None else cov, track.covariance[0, t, 0], atol=1e-6)
         trusted |= set(streams[0].trusted.values())
     assert np.isfinite(track.x[:, 24 if case == "tunnel" else 0 :]).all()
@@ -389,11 +384,31 @@ def test_a_neighbour_that_repeats_its_messages_never_leads_far_off(seed):
     assert ours < 1.4 * alone
 
 
+@pytest.mark.parametrize(("factor", "turn"), [(1.05, 0.0), (1.0, 0.09)])
+def test_measured_ranges_and_azimuths_may_all_err(factor, turn):
+    """Ranges 5 % too long, and a compass 5 degrees off: without states for them both are worse than being alone."""
+    seen = observe(drive(), Sensors(), V2X(6), seed=4, observers=[0, 7])
+    wrapped = seen.relative * (factor, 1, 1) + (0, turn, 0)
+    wrapped[..., 1] = wrap(wrapped[..., 1])
+    wrong = replace(seen, relative=wrapped)
+    ours, alone = (rt_le(m(wrong, [0, 7]), drive()).mean() for m in (CooperativeFilter(priors=ON_ROADS), Kalman()))
+    assert ours < 0.9 * alone
+
+
+def test_an_odometry_that_is_mirrored_is_asked_about_again():
+    """It was not, once fixes were taken to drift for a moment: 19 m."""
+    fleet = drive(300)
+    seen = observe(fleet, Sensors(), V2X(0), seed=5, observers=[0, 2])
+    mirrored = replace(seen, velocity=seen.velocity * (1, -1, 1))
+    ours, kalman = (rt_le(method(mirrored, [0, 2]), fleet).mean() for method in (CooperativeFilter(), Kalman()))
+    assert ours < kalman
+
+
 @pytest.mark.parametrize("priors", [Priors(), ON_ROADS], ids=["simulated", "roads"])
 def test_clocks_of_neighbours_are_found(priors):
     """Messages of a third that hold what was 0.5 s ago cost an eighth of the error, not a third; the others' clocks
     are right. Both are the same drive with the same draws."""
-    fleet = load_fleet("town10-validation").between(0, 300)
+    fleet = drive(300)
     seen = observe(fleet, replace(S2, gnss_std=(0.5,) * 3), V2X(6), runs=3, seed=4, observers=[0, 7])
     who = np.setdiff1d(np.arange(len(fleet.ids)), [0, 7])[::3]
     late = delayed(seen, who, 5, 0)

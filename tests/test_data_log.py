@@ -219,7 +219,6 @@ def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path):
     write(pd.DataFrame(rows, columns=["t", "vehicle", "kind", "value", "std"]), tmp_path / "log.csv")
     write(pd.DataFrame(truth, columns=["t", "vehicle", "x", "y"]), tmp_path / "truth.csv")
     log = read_log(tmp_path / "log.csv", truth=tmp_path / "truth.csv")
-    assert log.truth is not None
     assert log.recording.sensors.velocity_floor == pytest.approx(np.sqrt((0.1**2 + 4 * (10 * 0.05) ** 2) / 2), rel=0.01)
     track = co.Kalman()(log.recording, list(log.recording.ids))
     assert 1.2 < nees(track, log.truth)[:, 100:].mean() < 2.8

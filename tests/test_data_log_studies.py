@@ -49,7 +49,6 @@ def folders(tmp_path_factory):
 
 def test_truth_is_read_on_the_steps_of_the_recording(folders):
     log = read_log(folders / "with")
-    assert log.truth is not None
     assert_allclose(log.truth.position, drive(4, gap=15.0).position, atol=1e-9)
     assert load_fleet(folders / "with").digest == log.truth.digest
     assert co.read_log(folders / "with").recording.ids == log.recording.ids
@@ -60,7 +59,6 @@ def test_truth_is_read_on_the_steps_of_the_recording(folders):
 def test_scores_are_of_the_steps_at_which_an_ego_is_there(folders):
     """Each stretch by itself, pooled by NumPy; bytes per second of driving."""
     log, method = read_log(folders / "with"), co.JointFilter()
-    assert log.truth is not None
     found, off, sent = scored(method, log.recording, ["car2"], log.truth), list[Any](), 0.0
     cuts = log.recording.stretches("car2")
     assert len(cuts) == 2

@@ -283,7 +283,6 @@ def test_a_segment_of_comma2k19(tmp_path):
     """Fixes lie on the truth, by pymap3d, and speed with course follows them."""
     fixes, _ = segment(tmp_path / "drive")
     log = co.read_log(tmp_path / "drive")
-    assert log.truth is not None
     true = np.column_stack(pymap3d.geodetic2enu(*fixes.T, *fixes[0]))
     assert_allclose(log.truth.position[1:-1, 0], true[1:-1], atol=1e-5)
     assert_allclose(log.recording.gnss[0, 1:-1, 0], true[1:-1], atol=1e-5)
@@ -292,7 +291,6 @@ def test_a_segment_of_comma2k19(tmp_path):
 
 def test_a_real_robot_of_libRSF():
     robot = co.read_log(measured("Indoor_UWB_Input.txt").parent, frame="body")
-    assert robot.truth is not None
     assert robot.summary.read == {"ranges": 233}
     ego = robot.recording.ids.index("Indoor_UWB")
     track = co.PoseFilter("solo", begin=co.pose_start(robot.recording), gate=5.0)(robot.recording, [ego])

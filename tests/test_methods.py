@@ -72,7 +72,6 @@ def test_stale_velocities_do_not_make_the_filter_sure_of_itself(formation):
 def test_identity_gain_is_the_golden_ratio(formation):
     """Closed form: with unit covariances gain and posterior variance tend to (sqrt 5 - 1)/2."""
     track = Kalman("identity")(observe(formation, S2, observers=[0]), [0])
-    assert track.covariance is not None
     assert track.covariance[0, -1, 0] == pytest.approx((np.sqrt(5) - 1) / 2 * np.eye(3))
 
 
@@ -129,7 +128,6 @@ def test_absent_neighbour_is_left_out_and_absent_ego_not_estimated(crossing):
 
 def test_nees_of_a_singular_covariance_is_refused(crossing):
     track = JointFilter()(observe(crossing, S2, V2X(max_neighbours=3), runs=3), [0, 2])
-    assert track.covariance is not None
     flat = replace(track, covariance=track.covariance * np.outer([1, 1, 0], [1, 1, 0]))
     with refused("singular"):
         nees(flat, crossing)

@@ -61,7 +61,6 @@ def test_a_fleet_is_consistent_where_noise_is_a_share_of_the_speed():
     fleet = convoy(4, 200)
     track = co.PoseFilter("fleet")(observed(fleet, replace(WHITE, range_std=0.1, azimuth_std=0.01), 80), range(4))
     error = (track.x - fleet.position)[:, 20:, :, :2]
-    assert track.covariance is not None
     inverse = np.linalg.inv(track.covariance[:, 20:, :, :2, :2])
     assert 1.8 < np.einsum("...i,...ij,...j->...", error, inverse, error).mean() < 2.2
     assert abs(error.mean(axis=(0, 1, 2))).max() < 0.05

@@ -191,7 +191,8 @@ class CooperativeFilter(Checked):
 
         `extras` hold what is found to be otherwise than assumed, (R, T, E) each: the ego's "heading_error" and
         "compass_error" rad, "scale_error", "range_offset" m and "range_scale"; whether it "slips", or is "alone";
-        "range_level" and so on, factors of standard deviations. And the weights, 1 for a number that was believed, of each ego's "fix"
+        "range_level" and so on, factors of standard deviations. And the weights, 1 for a number that was believed, of
+        each ego's "fix"
         (R, T, E) and by link (R, L) of "range", "azimuth", "inclination" and "message", NaN where there was none,
         whether it is "trusted", and by how many s its "clock" is ahead.
         """
