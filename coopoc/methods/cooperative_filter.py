@@ -52,8 +52,8 @@ class Priors(NamedTuple):
         lasts: s, for which they do.
         compass: rad, and
         offset: m, of such errors of the ego's compass and ranges, where none is stated.
-        ranges: of such an error of their scale.
-        pair: m, of the offset of the ranges of a pair, which changes in a minute.
+        range_scale: of such an error of the scale of these.
+        pair_offset: m, of the offset of the ranges of a pair, which changes in a minute.
         clock: s, of a neighbour's clock.
         absent: log odds that each of these, but that of a pair, is not there, before anything was measured; of a
             clock, a compass and the scale of ranges 8 at least.
@@ -70,8 +70,8 @@ class Priors(NamedTuple):
     clock: float = 0.05
     compass: float = 0.05
     offset: float = 0.5
-    ranges: float = 0.0
-    pair: float = 0.0
+    range_scale: float = 0.0
+    pair_offset: float = 0.0
     absent: float = 8.0
     exact: float = -np.inf
     slip: float = 0.7
@@ -83,7 +83,16 @@ class Priors(NamedTuple):
 AS_STATED = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0, fix_gate=0.0, forget=0.0)
 """Nothing is otherwise: the textbook's filter."""
 ON_ROADS = Priors(
-    0.03, 0.03, clock=0.2, offset=0.0, ranges=0.03, pair=0.3, absent=-np.inf, exact=-4.0, fix=2.0, fix_gate=3.5
+    heading=0.03,
+    scale=0.03,
+    clock=0.2,
+    offset=0.0,
+    range_scale=0.03,
+    pair_offset=0.3,
+    absent=-np.inf,
+    exact=-4.0,
+    fix=2.0,
+    fix_gate=3.5,
 )
 """Of measurements that are not simulated: hardly any odometry is without such errors."""
 NO_ODOMETRY = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0)
@@ -192,9 +201,8 @@ class CooperativeFilter(Checked):
         `extras` hold what is found to be otherwise than assumed, (R, T, E) each: the ego's "heading_error" and
         "compass_error" rad, "scale_error", "range_offset" m and "range_scale"; whether it "slips", or is "alone";
         "range_level" and so on, factors of standard deviations. And the weights, 1 for a number that was believed, of
-        each ego's "fix"
-        (R, T, E) and by link (R, L) of "range", "azimuth", "inclination" and "message", NaN where there was none,
-        whether it is "trusted", and by how many s its "clock" is ahead.
+        each ego's "fix" (R, T, E) and by link (R, L) of "range", "azimuth", "inclination" and "message", NaN where
+        there was none, whether it is "trusted", and by how many s its "clock" is ahead.
         """
         noise_model = resolve(self.noise_model, check_recording(recording))
         priors = priors_of(self, noise_model, recording.measured)
@@ -347,7 +355,7 @@ def model_of(noise_model: NoiseModel, priors: Priors) -> Model:
     own = common = bias = heading = offset = 0.0
     absent[[2, 3, 5]] = max(priors.absent, Priors().absent)  # most are right, on roads, too
     turn, lasts = np.array([priors.heading, priors.scale, priors.clock]), priors.lasts
-    ranged = np.square([priors.ranges, priors.pair])
+    ranged = np.square([priors.range_scale, priors.pair_offset])
     if noise_model.sensors is not None:
         sensors, std = noise_model.sensors, np.array(std)
         own, common, offset = sensors.gnss_drift_std**2, sensors.gnss_common_std**2, sensors.range_offset_std**2

@@ -185,7 +185,10 @@ class Oracle:
             absent[3:5][[bias > 0, offset > 0]] = -math.inf
             bias, offset = bias or priors.compass**2, offset or priors.offset**2
             holds, turn = math.exp(-seen.dt / priors.lasts), np.square([priors.heading, priors.scale, priors.clock])
-            ranged, lasting = np.square([priors.ranges, priors.pair]), (s.gnss_drift_std**2, s.gnss_common_std**2)
+            ranged, lasting = (
+                np.square([priors.range_scale, priors.pair_offset]),
+                (s.gnss_drift_std**2, s.gnss_common_std**2),
+            )
             self.life = Life(*lasting, keep, bias, heading, offset, ranged, turn, holds, absent)
             self.white = np.square(s.gnss_std) / np.square(s.fix_std)
         shape = seen.gnss.shape

@@ -522,8 +522,8 @@ def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
         h.three[LIMIT + c] = model.gate
     h.block[0], h.block[1], h.block[2] = g.block[k, PLACE], g.block[0, PLACE], g.block[0, COMPASS]
     h.block[TERMS] = 3 if has(g, 0, COMPASS) else 2
-    if has(g, 0, RANGED):
-        add_ranged(f, k, far)
+    add_ranged(f, 0, far)
+    add_ranged(f, k, 1.0)
     h.three[CURVE] = 1.0 / (reach * reach) if model.gate > 0.0 else 0.0
     if goes_on(f, rows, k):
         add_way(f, rows, k)
@@ -531,14 +531,12 @@ def relate(f: Filter, model: Model, rows: Floats, k: int) -> bool:
 
 
 @part
-def add_ranged(f: Filter, k: int, far: float) -> None:
-    """Rows of the scale of ranges, and of the offset of those to member k."""
-    h, n = f.h, f.h.block[TERMS]
-    store(h.matrix, n, (far, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-    h.block[n], h.block[TERMS] = f.g.block[0, RANGED], n + 1
+def add_ranged(f: Filter, k: int, factor: float) -> None:
+    """Row of a range's error that is `factor` times that of slot k, if it has one."""
     if has(f.g, k, RANGED):
-        store(h.matrix, n + 1, (1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
-        h.block[n + 1], h.block[TERMS] = f.g.block[k, RANGED], n + 2
+        n = f.h.block[TERMS]
+        store(f.h.matrix, n, (factor, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0))
+        f.h.block[n], f.h.block[TERMS] = f.g.block[k, RANGED], n + 1
 
 
 @part

@@ -98,18 +98,16 @@ def predict(f: Filter, model: Model, own: Floats) -> None:
     for c in range(3):
         g.p[first + c, first + c] += own[MOTION_VARIANCE + c]
     slip(f, model, own)
-    lost = math.exp(-own[DT] / PAIR_TIME)
-    for k in range(1, len(f.who)):
-        if f.who[k, VEHICLE] >= 0 and has(g, k, RANGED):
-            i = 3 * g.block[k, RANGED]
-            shift(g, i, i, lost - 1.0)
-            g.p[i, i] += (1.0 - lost * lost) * model.ranged[1]
     for k in range(len(f.who)):
         if f.who[k, VEHICLE] >= 0 and has(g, k, ERROR):
             i, trusted = 3 * g.block[k, ERROR], f.status[f.who[k, VEHICLE], TRUSTED] > 0.0
             if trusted:
                 shift(g, i, i, keep - 1.0)
             widen(g, i, model.own * fades)
+        if k > 0 and f.who[k, VEHICLE] >= 0 and has(g, k, RANGED):
+            i, holds = 3 * g.block[k, RANGED], math.exp(-own[DT] / PAIR_TIME)
+            shift(g, i, i, holds - 1.0)
+            g.p[i, i] += (1.0 - holds * holds) * model.ranged[1]
     if model.common > 0.0:
         i = 3 * g.block[0, COMMON]
         shift(g, i, i, keep - 1.0)
