@@ -286,6 +286,9 @@ def broadcasts(recording: Recording, noise_model: NoiseModel, priors: Priors) ->
 def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float] = (0.0, 0.0)) -> list[str]:
     """Notes of what is otherwise than stated in the second half of a drive, mean squares over runs and steps.
 
+    A level that nothing has moved is no news; nor are, where fixes are assumed to err more than is stated, quiet
+    numbers of other kinds.
+
     Args:
         ego: its name.
         found: (R, T, 13) errors that last, whether it slips, whether it is alone, and levels.
@@ -294,11 +297,14 @@ def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float]
 
     >>> otherwise("a", np.array([[[0.0, 0.02, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 3.0, 1.0, 1.0]]]))
     ['scale error, a: 0.02', 'fix level, a: 3 times the stated deviation']
+    >>> otherwise("a", np.array([[[0.0] * 7 + [0.4] + [1.0] * 5]]), 2.0)  # of a road, where nothing was wrong
+    []
     """
     found = found[:, np.isfinite(found[..., 4]).any(axis=0)]  # from where it knows where it is
     late = found[:, found.shape[1] // 2 :]
     usual = np.sqrt(np.nanmean(np.square(late), axis=(0, 1)))
     usual[5:7] = np.nanmean(found[..., 5:7], axis=(0, 1))
+    usual[len(FOUND) :][(late[..., len(FOUND) :] == 1.0).all(axis=(0, 1))] = np.nan
     usual[10:12] *= fix
     least = np.maximum(NOTED, (0.0, 0.0, *stated, 0.0, 0.0, 0.0))
     notes = [
@@ -310,7 +316,7 @@ def otherwise(ego: str, found: Floats, fix: float = 1.0, stated: Sequence[float]
     return notes + [
         f"{kind} level, {ego}: {value:.2g} times the stated deviation"
         for kind, value in levels
-        if not 1 / LOUD < value < LOUD
+        if value > LOUD or (value < 1 / LOUD and (fix == 1.0 or kind in ("fix", "message")))
     ]
 
 
