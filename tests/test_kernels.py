@@ -55,7 +55,7 @@ def test_importing_the_package_imports_no_numba():
     assert done.stdout.strip() == "False"
 
 
-def test_machine_code_of_types_that_are_gone_is_made_again(tmp_path):
+def test_stale_machine_code_of_types_that_are_gone_is_made_again(tmp_path):
     """A cache from before a type was renamed cannot be read: the kernel compiles anew and is kept again."""
     (tmp_path / "own.py").write_text(
         "from coopoc.kernels.compiling.compile import compiled\n\n\n@compiled\ndef twice(x):\n    return 2.0 * x\n\n\n"

@@ -1,5 +1,6 @@
 """Points and poses in one problem: derivatives against finite differences, minima against SciPy, files."""
 
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -13,6 +14,7 @@ from coopoc.formats import load_graph
 from coopoc.formats.graph import Graph, PoseEdges, RangeEdges
 from coopoc.optimize import MEASUREMENTS, Problem, Status, pose, solve
 from coopoc.optimize.graph_problems import from_graph
+from coopoc.optimize.model.measurements import lookup
 from coopoc.optimize.model.space import Space, exp, log
 
 
@@ -132,7 +134,6 @@ WRONG = {
     "not positive": (lambda: PLANE.add("position", "a", [0, 0], cov=[[1, 2], [2, 1]]), "symmetric positive definite"),
     "not symmetric": (lambda: PLANE.add("position", "a", [0, 0], cov=[[1, 2], [0, 9]]), "not symmetric"),
     "no dt": (lambda: PLANE.add("speed", ("a", "b"), 10.0, std=0.1), "1 finite numbers for speed"),
-    "no start": (lambda: solve(PLANE.add("pose", "a", pose([0.0, 0], 0.1), std=1.0)), "where there are poses"),
     "held nowhere": (lambda: Problem(("a",), fixed=("a",)), "needs an x0"),
     "four dimensions": (lambda: Problem(("a",), dimension=4), "must be 2 or 3"),
 }
@@ -143,6 +144,31 @@ def test_wrong_input_says_what_to_do(case):
     call, words = WRONG[case]
     with refused(words):
         call()
+
+
+@pytest.mark.parametrize("d", [2, 3])
+@pytest.mark.parametrize("kind", ["position", "range", "bearing", "body_spherical"])
+def test_poses_without_an_x0_are_solved_as_from_the_truth(kind, d):
+    """Neither headings nor a pose are given: odometry is turned to where fixes of poses or points put it."""
+    rng, n = np.random.default_rng(d), 30
+    turn, names = np.cumsum(rng.normal(0, 0.2, (n, 1 if d == 2 else 3)), axis=0), [f"step {k}" for k in range(n + 4)]
+    turned = exp(turn)
+    at = np.vstack([np.cumsum(3 * turned[:, :, 0], axis=0), rng.normal(0, 30, (4, d))])
+    truth = Space(d, True).join(at, np.concatenate([turned, np.tile(np.eye(d), (4, 1, 1))]))
+    move = np.einsum("nba,nb->na", turned[:-1], np.diff(at[:n], axis=0)) + rng.normal(0, 0.01, (n - 1, d))
+    moves = Space(d, True).join(move, np.swapaxes(turned[:-1], 1, 2) @ turned[1:])
+    problem = Problem(names, dimension=d, poses=range(n)).add(
+        "relative_pose", np.column_stack([range(n - 1), range(1, n)]), moves, std=0.01
+    )
+    fixed = np.arange(0, n, 3) if kind == "position" else np.arange(n, n + 4)
+    problem = problem.add("position", fixed[:, None], at[fixed] + rng.normal(0, 0.1, (len(fixed), d)), std=0.1)
+    pairs = np.column_stack([np.arange(n), n + np.arange(n) % 4])
+    gap = np.einsum("nba,nb->na", turned, at[pairs[:, 1]] - at[:n])
+    seen = lookup("body_spherical" if kind == "position" else kind).predict(gap)
+    problem = problem.add("body_spherical" if kind == "position" else kind, pairs, seen, std=0.02)
+    solution = solve(problem)
+    assert solution.cost == pytest.approx(solve(replace(problem, x0=truth)).cost, rel=1e-6)
+    assert solution.notes == ()
 
 
 def test_mrclam5a_reaches_the_reference():

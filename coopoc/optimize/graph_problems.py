@@ -1,6 +1,6 @@
 """A graph of poses and landmarks as a Problem, and where to start it."""
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any, Literal
@@ -12,7 +12,6 @@ from ..formats import load_graph
 from ..formats.graph import Graph
 from ..kernels.compiling.waiting import clock, load
 from .algebra.sparse import LIBRARIES
-from .convex.chordal import chordal_start
 from .model.factor import Factor
 from .model.problem import Problem, Search
 from .model.space import Space
@@ -27,6 +26,7 @@ from .starts.graph_starts import (
     separated,
     unwound,
 )
+from .starts.pose_starts import graph_of, placed
 from .starts.race import eased, race
 
 Objective = Literal["chordal", "geodesic"]
@@ -37,6 +37,8 @@ KINDS = {
     "point_prior": "position",
 }
 """Of measurements, by the name of a graph's edges."""
+PLACES = 3
+"""Of a body among what it ranges, that are tried: mirror images of a nearly straight drive fit nearly as well."""
 Start = Literal["odometry", "file", "tree", "linear", "incremental", "auto"]
 
 
@@ -94,19 +96,48 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
         )
     won = Search(names[0])
     if start == "auto":
-        starts = {name: (lambda: start_x) if name == "odometry" else partial(_x0, graph, poses, name) for name in names}
-        late: dict[str, Any] = {}
-        if not graph.guess and np.isfinite(graph.position).all():
-            late["file"] = lambda _: (_x0(graph, poses, "file"), 0)
-        late |= {"eased": lambda at: eased(at, start_x)} if poses and len(graph.ranges) else {}
-        late |= {"incremental": lambda _: incremental_start(graph, problem)} if poses else {}
-        problem, won = race(problem, starts, late, partial(unwound, graph), "incremental" if len(graph.ranges) else "")
+        starts = {name: partial(_x0, graph, poses, name) for name in names} | {"odometry": lambda: start_x}
+        problem, won = _raced(graph, problem, starts, partial(unwound, graph))
     elif start == "incremental" and poses:
         x0, steps = incremental_start(graph, problem)
         problem, won = problem.replace_unchecked(x0=frozen(x0)), Search(start, steps)
     if won.start.startswith("file") and not graph.guess:
         notes = (*notes, "the start is the file's vertices, which may be the truth")
     return problem.replace_unchecked(search=won._replace(seconds=clock() - began, notes=(*notes, *won.notes)))
+
+
+def _raced(
+    graph: Graph, problem: Problem, starts: Mapping[str, Callable[[], Floats]], unwound: Callable[[Floats], bool]
+) -> tuple[Problem, Search]:
+    """The race of what a graph offers; the problem starts at chained odometry."""
+    late: dict[str, Any] = {}
+    if not graph.guess and np.isfinite(graph.position).all():
+        late["file"] = lambda _: (_x0(graph, problem.poses, "file"), 0)
+    if problem.poses:
+        assert problem.x0 is not None
+        late |= {"eased": partial(eased, start=problem.x0)} if len(graph.ranges) else {}
+        late["incremental"] = lambda _: incremental_start(graph, problem)
+    return race(problem, starts, late, unwound, "incremental" if len(graph.ranges) else "")
+
+
+def started(problem: Problem) -> Problem:
+    """A problem of poses without an x0 from where what it measures leads lowest; any other as it is.
+
+    >>> from coopoc.optimize import pose
+    >>> problem = Problem(("here", "there"), dimension=2, poses=(0, 1)).add("pose", "here", pose([1.0, 2.0]), std=0.1)
+    >>> started(problem.add("relative_pose", ("here", "there"), pose([3.0, 0.0]), std=0.1)).x0[1, :2]
+    array([4., 2.])
+    """
+    if not problem.poses or problem.x0 is not None:
+        return problem
+    began, graph = clock(), graph_of(problem)
+    own = {name: _x0(graph, problem.poses, name) for name in contenders(graph)}
+    starts = {name: partial(placed, problem, x) for name, x in own.items()}
+    for k in range(1, PLACES if len(graph.ranges) else 1):
+        starts[f"odometry, place {k + 1}"] = partial(placed, problem, own["odometry"], k)
+    at = problem.replace_unchecked(x0=frozen(starts["odometry"]()))
+    at, won = _raced(graph, at, starts, lambda x: False)
+    return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 
 def _counted(notes: Sequence[str]) -> tuple[str, ...]:
@@ -127,6 +158,8 @@ def _x0(graph: Graph, poses: tuple[int, ...], name: str) -> Floats:
     """(n, ambient) of a start that needs no search."""
     x0 = STARTS.get(name, chained)(graph)
     if name == "linear" and poses:
+        from .convex.chordal import chordal_start  # convex solves, and solve starts here
+
         factors = _factors(graph, "chordal")
         x0 = chordal_start(Problem(graph.names, factors, x0, dimension=graph.dimension, poses=poses))
     x0 = separated(graph, x0)

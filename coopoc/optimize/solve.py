@@ -13,6 +13,7 @@ from .algebra.sparse import LIBRARIES, sparse
 from .assess.active import constraint_rows
 from .assess.assess import Assessment, assess, is_constrained_minimum, judged, newton_decrease
 from .backend import MAX_ITERATIONS, Backend, Options, require_backend
+from .graph_problems import started
 from .model.factor import fused
 from .model.measurements import is_converted
 from .model.problem import Problem
@@ -47,8 +48,8 @@ def solve(
 
     Cost, gradient, covariance, status and times are computed here from x alone, independently of the solver; what makes
     the answer doubtful is in `Solution.notes`. Where neither an x0 nor a measurement with a direction places a node,
-    several starts race, and extras["start"] names the one that won. Losses that are not convex start where several
-    lead lowest (`robust/graduated.py`).
+    and of poses without an x0, several starts race, and extras["start"] names the one that won. Losses that are not
+    convex start where several lead lowest (`robust/graduated.py`).
 
     Args:
         problem: what to solve.
@@ -94,7 +95,7 @@ def _solved(problem: Problem, backend: Backend, options: Options, covariance: bo
     """The result of a backend, and its assessment."""
     load(*LIBRARIES)
     began = clock()
-    solver = backend.solver(problem, options)
+    solver, problem = backend.solver(problem, options), started(problem)
     start, placed = _start(problem)
     whole = placed and all(f.measurement.linear or is_converted(f.measurement) for f in problem.factors)
     if problem.x0 is None and not whole and not problem.constraints:

@@ -68,8 +68,8 @@ class Problem:
     Args:
         names: (n,) unique names of the nodes.
         factors: the measurements.
-        x0: (n, ambient) where the solver starts. None: the converted measurements' linear solution;
-            poses need an x0.
+        x0: (n, ambient) where the solver starts. None: the converted measurements' linear solution, or what `solve`
+            finds.
         separator: nodes that the others hang on, such as the ego at each step. What remains without them must fall into
             small groups (the neighbours); they are eliminated last; the last of them is the one a Solution shows.
         dimension: 2 or 3.

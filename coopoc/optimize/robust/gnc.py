@@ -12,6 +12,7 @@ from ..algebra.sparse import sparse
 from ..assess.assess import INLIER_WEIGHT, rejection
 from ..backend import MAX_ITERATIONS, TOLERANCE, Backend
 from ..descent.levenberg_marquardt import arrive
+from ..graph_problems import started
 from ..model.problem import Problem
 from ..solution import Solution, SolveError, Status
 from ..solve import solve
@@ -84,7 +85,7 @@ def solve_gnc(
     >>> float(solution.x[0, 0].round(3)), solution.extras["weights"]
     (0.5, array([1., 1., 0.]))
     """
-    instance("problem", problem, Problem)
+    problem = started(instance("problem", problem, Problem))
     marked, surrogate = mark(problem, candidates, groups), surrogate_of(loss, threshold)
     one_of("start", start, Start)
     bound, each, extras, began = bounds(problem, marked, threshold), list[int](), dict[str, Any](), clock()

@@ -20,7 +20,7 @@ def converted(problem: Problem) -> Problem:
     d u = h^-1(d, az, inc), W' = W diag(1, 1/(d sin inc), 1/d) [u e_az e_inc]^T, from the measured values themselves, so
     that the first guess needs none. It is within 0.02 % of the maximum-likelihood accuracy of a snapshot.
     """
-    factors = [_vector(f) if is_converted(f.measurement) else unchecked(f, loss=None) for f in problem.factors]
+    factors = [as_vectors(f) if is_converted(f.measurement) else unchecked(f, loss=None) for f in problem.factors]
     return problem.replace_unchecked(factors=tuple(f for f in factors if f.measurement.linear), x0=None, fixed=())
 
 
@@ -86,7 +86,8 @@ def _apart(problem: Problem, x: Floats) -> Floats:
     return np.where(touched[:, None], x, middle + spiral)
 
 
-def _vector(factor: Factor) -> Factor:
+def as_vectors(factor: Factor) -> Factor:
+    """A spherical factor as one of vectors."""
     d, rows = converted_rows(columns(factor.z), np)
     inverse = np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
     z, nothing = d[:, None] * inverse[:, 0], np.empty((len(factor.nodes), 0))

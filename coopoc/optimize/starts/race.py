@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterator, Mapping
 import numpy as np
 
 from ...arrays import Floats, frozen
-from ..algebra.sparse import sparse
+from ..algebra.sparse import Sparse, sparse
 from ..assess.assess import expected
 from ..descent.levenberg_marquardt import BROKEN, Arrival, arrive
 from ..model.factor import Factor, unchecked
@@ -173,14 +173,21 @@ def _away(problem: Problem, x: Floats) -> Iterator[Floats]:
 
 def eased(problem: Problem, start: Floats) -> tuple[Floats, int]:
     """Nodes (n, ambient) and iterations from where ranges with larger standard deviations lead, and then smaller ones:
-    at first odometry decides."""
+    at first odometry decides, and what ranges alone place is mirrored before they bend it."""
     x, taken = start, 0
     for times in EASED:
         part = problem.replace_unchecked(
             factors=tuple(weaker(f, times) if f.kind in RANGES else f for f in problem.factors)
         )
-        end = arrive(sparse(part), x, STEPS, TOLERANCE)
-        x, taken = end.x, taken + end.iterations
+        system = sparse(part)
+
+        def descend(y: Floats, system: Sparse = system) -> Floats:
+            nonlocal taken
+            end = arrive(system, y, STEPS, TOLERANCE)
+            taken += end.iterations
+            return end.x
+
+        x = across(part, descend(x), descend, system.cost)[0]
     return x, taken
 
 

@@ -1,0 +1,188 @@
+"""Starts of poses without an x0: the graph of what is measured, each body where fixes and ranges put it."""
+
+from collections import defaultdict
+from typing import Any
+
+import numpy as np
+
+from ...arrays import Floats
+from ...formats.graph import NAME, Graph, edges_of
+from ...formats.values import to_orientation
+from ..model.factor import Factor, taken
+from ..model.problem import Problem
+from ..model.space import Space, exp
+from .graph_starts import parts, trilaterate
+from .initial import as_vectors
+from .mirrors import ranges_of
+
+FIELDS = {
+    "pose": "pose_prior",
+    "relative_pose": "relative_pose",
+    "relative_position": "relative_point",
+    "body_spherical": "relative_point",
+    "position": "point_prior",
+    "range": "ranges",
+}
+"""Kinds of a graph's edges, by the kind of a factor without what follows its name."""
+UNKNOWN = 1e-9
+"""1/m^2 or 1/rad^2, of a component that is not measured."""
+ROWS = 300
+"""Fixes and ranges of a body that are used, spread over all."""
+FEW, MANY = 10, 100
+"""Steps from each turn of a body, and from the best of these."""
+APART = 0.1
+"""Share of the size of a body by which places of it differ."""
+LEVER = 1e-2
+"""1/m^2 beside directions of length 1: a point of which there are no more bearings lies a few metres ahead."""
+
+
+def graph_of(problem: Problem) -> Graph:
+    """The graph of what a problem measures; what a graph has no edge for is left out.
+
+    >>> problem = Problem(("here", "there"), dimension=2, poses=(0,)).add("position", "there", [3.0, 4.0], std=1.0)
+    >>> graph_of(problem.add("range", ("here", "there"), 5.0, std=0.1))
+    Graph(2-D: 1 poses of 1 robots, 1 points; 1 point_prior, 1 ranges)
+    """
+    d, n, poses = problem.dimension, len(problem.names), np.isin(np.arange(len(problem.names)), problem.poses)
+    rows = defaultdict[str, list[Any]](list)
+    for factor in problem.factors:
+        field = _field(factor)
+        used = factor.informative & (~poses[factor.nodes[:, -1]] if "point" in field else True)
+        if field and used.any():
+            rows[field].append([part[used] for part in (factor.nodes, *_measured(problem, factor))])
+    edges = {}
+    for field, own in rows.items():
+        nodes, values, covariance = map(np.concatenate, zip(*own, strict=True))
+        edges[field] = edges_of(field, nodes, values, covariance, ())
+    names = problem.names
+    if not all(map(NAME.fullmatch, names)):
+        part = parts(n, *(nodes for nodes, *_ in rows["relative_pose"]))
+        names = tuple(f"{chr(65 + part[k] % 26)}{k}" for k in range(n))
+    unknown = np.full((n, d), np.nan)
+    return Graph(d, names, poses, unknown, unknown[:, :1] if d == 2 else np.full((n, 4), np.nan), **edges)  # type: ignore[arg-type]
+
+
+def _field(factor: Factor) -> str:
+    return FIELDS.get(factor.kind.removesuffix("_chordal").removesuffix("_log"), "")
+
+
+def _measured(problem: Problem, factor: Factor) -> tuple[Floats, Floats]:
+    """Values and covariances of a factor as a graph's edges have them."""
+    d, space = problem.dimension, problem.space
+    if factor.kind == "body_spherical":
+        factor = as_vectors(factor)
+    information = np.swapaxes(factor.root, 1, 2) @ factor.root
+    covariance = np.linalg.inv(information + UNKNOWN * np.eye(factor.size))
+    if not factor.measurement.compares_poses:
+        return factor.z, covariance
+    values = np.concatenate([space.position(factor.z), to_orientation(space.rotation(factor.z))], axis=1)
+    if not factor.kind.endswith("_chordal"):
+        return values, covariance
+    entry = np.einsum("mii->m", covariance[:, d:, d:]) / d**2
+    both = np.zeros((len(values), d + space.angles, d + space.angles))
+    both[:, :d, :d] = covariance[:, :d, :d]
+    both[:, d:, d:] = (entry / (1 if d == 2 else 2))[:, None, None] * np.eye(space.angles)
+    return values, both
+
+
+def placed(problem: Problem, x: Floats, rank: int = 0) -> Floats:
+    """Nodes x (n, ambient) with each body, which relative measurements hold together, turned and moved to where its
+    fixes, and its ranges to what is placed, fit best: those with most fixes first, then those with most ranges.
+
+    A body with a measured pose stays, and so does the first where nothing is placed. At last points go where bearings
+    from poses cross. Of the places that ranges allow that of `rank` is taken, 0 the best.
+    """
+    d, space, x = problem.dimension, problem.space, x.copy()
+    joined = [f.nodes[f.informative] for f in problem.factors if _field(f).startswith("relative")]
+    part, ranges = parts(len(x), *joined), ranges_of(problem, x)
+    fixes = [taken(f, np.flatnonzero(f.informative)) for f in problem.factors if f.kind == "position"]
+    fixed = np.concatenate([np.empty(0, np.int64), *(f.nodes[:, 0] for f in fixes)])
+    fix = np.concatenate([np.empty((0, d)), *(f.z for f in fixes)])
+    weight = np.concatenate([np.empty(0), *(np.linalg.norm(f.root, axis=(1, 2)) / d**0.5 for f in fixes)])
+    held = [part[f.nodes[:, 0]] for f in problem.factors if f.kind.startswith("pose")]
+    known, left = np.isin(part, np.concatenate([[-1], *held])), set(part.tolist())
+    left -= set(part[known].tolist())
+    while left:
+        inside = {body: part == body for body in left}
+        ranged = {
+            body: np.nonzero(known[ranges.nodes[:, ::-1]] & own[ranges.nodes] & (ranges.weight > 0)[:, None])
+            for body, own in inside.items()
+        }
+        most = {body: (int(own[fixed].sum()), len(ranged[body][0])) for body, own in inside.items()}
+        body = max(sorted(left), key=most.__getitem__)
+        left.remove(body)
+        mine, (k, side), here = inside[body], ranged[body], inside[body][fixed]
+        known |= mine
+        if not any(most[body]):
+            continue
+        places, distance = x[ranges.nodes[k, 1 - side], :d], ranges.distance[k]
+        if mine.sum() > 1 or here.any():
+            ranged_from = x[ranges.nodes[k, side], :d], places, distance, ranges.weight[k]
+            x[mine] = _fitted(space, x[mine], (x[fixed[here], :d], fix[here], weight[here]), ranged_from, rank)
+        else:
+            x[mine, :d] = trilaterate(places, distance)
+    return _crossed(problem, x)
+
+
+def _fitted(space: Space, body: Floats, fixes: tuple[Floats, ...], ranges: tuple[Floats, ...], rank: int) -> Floats:
+    """Nodes of a body (K, ambient) where it fits best, from turns that are spread over all.
+
+    Args:
+        space: of the nodes.
+        body: its nodes.
+        fixes: where they are on it (F, d), their fixes (F, d) and 1/m.
+        ranges: where they are on it (M, d), the places (M, d) to which they have ranges, these (M,) and 1/m.
+    """
+    from scipy.optimize import least_squares
+    from scipy.spatial.transform import Rotation
+
+    d = space.dimension
+    seen, fix, precise = (part[:: len(part) // ROWS + 1] for part in fixes)
+    near, places, distance, weight = (part[:: len(part) // ROWS + 1] for part in ranges)
+    middle, to = space.position(body).mean(axis=0), np.concatenate([fix, places]).mean(axis=0)
+
+    def moved(v: Floats, turn: Floats, at: Floats) -> Floats:
+        return np.asarray(to + v[:d] + (at - middle) @ (exp(v[d:]) @ turn).T)
+
+    def residuals(v: Floats, turn: Floats) -> Floats:
+        off = (moved(v, turn, seen) - fix) * precise[:, None]
+        length = np.linalg.norm(moved(v, turn, near) - places, axis=1)
+        return np.concatenate([off.ravel(), (length - distance) * weight])
+
+    def fitted(v: Floats, turn: Floats, steps: int) -> tuple[float, Floats, Floats]:
+        end = least_squares(residuals, v, args=(turn,), max_nfev=steps)
+        return float(end.cost), end.x, turn
+
+    turns = exp(np.arange(8)[:, None] * np.pi / 4) if d == 2 else Rotation.create_group("O").as_matrix()
+    ends = sorted((fitted(np.zeros(space.dof), each, FEW) for each in turns), key=lambda end: end[0])
+    best, apart = list[Floats](), np.linalg.norm(space.position(body) - middle, axis=1).max()
+    for _, v, turn in ends:
+        _, v, turn = fitted(v, turn, MANY)
+        there = space.join(moved(v, turn, space.position(body)), exp(v[d:]) @ turn @ space.rotation(body))
+        if all(np.abs(space.position(there - other)).max() > APART * apart for other in best):
+            best.append(there)
+        if len(best) > rank:
+            break
+    return best[-1]
+
+
+def _crossed(problem: Problem, x: Floats) -> Floats:
+    """x with points of which there are bearings alone at the crossing of the vertical planes of these."""
+    d, rotation = problem.dimension, problem.space.rotation(x)
+    bearings = [f for f in problem.factors if f.kind == "bearing"]
+    if not bearings:
+        return x
+    pose, seen = np.concatenate([f.nodes for f in bearings]).T
+    angle = np.concatenate([f.z[:, 0] for f in bearings])
+    others = [f.nodes.ravel() for f in problem.factors if f.kind != "bearing"]
+    for point in np.setdiff1d(seen, np.concatenate([np.array(problem.poses), *others])):
+        own = seen == point
+        turned = rotation[pose[own]] @ np.eye(d)[:, :2]
+        along, across = (
+            np.einsum("mab,bm->ma", turned, [np.cos(angle[own] + turn), np.sin(angle[own] + turn)])
+            for turn in (0.0, np.pi / 2)
+        )
+        ahead = x[pose[own][0], :d] + along[0]
+        gap = np.einsum("ma,ma->m", across, x[pose[own], :d] - ahead)
+        x[point, :d] = ahead + np.linalg.solve(across.T @ across + LEVER * np.eye(d), across.T @ gap)
+    return x
