@@ -21,7 +21,7 @@ from ..model.problem import Problem
 from ..model.space import Space, exp, log
 
 STARTS = 3
-"""Times that the optimiser begins anew where it ended, with damping as at first, while it ended with more."""
+"""Times that the optimiser begins where it ended, with damping as at first, while it ended with more; once if linear."""
 PRECISE = 1e-15
 """Share of the cost by which a step must lower it to be followed by another; GTSAM's own 1e-5 leaves millimetres."""
 POINT, POSE = False, True
@@ -52,7 +52,7 @@ def prepare(structure: Problem, max_iterations: int = MAX_ITERATIONS, tolerance:
 
         posed, parts = which_turn(problem), forms(problem)
         graph, used, custom = graph_of(problem, parts), 0, parts.count(None)
-        for _ in range(STARTS):
+        for _ in range(1 if problem.linear else STARTS):
             params = gtsam.LevenbergMarquardtParams()
             params.setMaxIterations(max_iterations - used)
             params.setRelativeErrorTol(PRECISE)
