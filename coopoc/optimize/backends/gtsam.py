@@ -21,7 +21,7 @@ from ..model.problem import Problem
 from ..model.space import Space, exp, log
 
 STARTS = 3
-"""Times that the optimiser begins where it ended, with damping as at first, while it ended with more; once if linear."""
+"""Times that the optimiser begins where it ended, damped as at first, while it ended damped more; once if linear."""
 PRECISE = 1e-15
 """Share of the cost by which a step must lower it to be followed by another; GTSAM's own 1e-5 leaves millimetres."""
 POINT, POSE = False, True
