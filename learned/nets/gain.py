@@ -171,8 +171,8 @@ def over_time(values: Tensor, counted: Tensor) -> Tensor:
     """Mean (...) over time of the values (T, ...) that are counted (T, ...), in an order that does not depend on the
     number of rows; 0 where none is.
 
-    >>> over_time(torch.tensor([1.0, 2.0, 6.0]), torch.tensor([True, False, True])).item()
-    3.5
+    >>> over_time(torch.tensor([[1.0, 2.0], [6.0, 4.0]]), torch.tensor([[True, False], [True, True]])).tolist()
+    [3.5, 4.0]
     """
     rows, there = values.movedim(0, -1).contiguous(), counted.movedim(0, -1)
     if there.all():
