@@ -63,7 +63,7 @@ test-lower:
 
 fuzz: $(VENV)/.ready-fuzz
 	export OMP_NUM_THREADS=1 PYTHONPATH=tests; $(VENV)/bin/python -c "from fuzz.readers import READERS as r; print(*r, sep='\n')" | \
-	while read -r name; do $(VENV)/bin/python -m fuzz.run "$$name" --minutes $(MINUTES) --executions 1000000; done
+	while read -r name; do $(VENV)/bin/python -m fuzz.run "$$name" --minutes $(MINUTES); done
 
 docs: $(VENV)/.ready-docs
 	NO_MKDOCS_2_WARNING=1 TQDM_DISABLE=1 OMP_NUM_THREADS=1 $(VENV)/bin/python -m mkdocs build

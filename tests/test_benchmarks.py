@@ -20,7 +20,6 @@ from coopoc.data.registry import load_log
 from coopoc.studies import benchmark, tasks
 from coopoc.studies.tasks import TASKS, VALIDATION, VERSION
 
-FOLDER = Path(__file__).resolve().parents[1] / "benchmarks"
 BASELINE = {"a: ours": {"ratio": 1.0, "tolerance": 1.5}, "b: ours": {"ratio": 0.01, "tolerance": 2.0}}
 
 

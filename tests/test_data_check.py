@@ -10,7 +10,7 @@ import pandas as pd
 import pytest
 from conftest import refused
 from logs import bends, fixes, motion, outliers, ranges, write
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 import coopoc as co
 from coopoc.arrays import Floats
@@ -91,7 +91,7 @@ def test_an_offset_of_ranges_is_taken_off(tmp_path):
     plain = read_log(cars(tmp_path / "plain"))
     assert_allclose(log.recording.relative, plain.recording.relative, atol=1e-9)
     pair = read_log(folder, scale={"range": 1e-3}, std={"range": 0.3}, offset={"car1-car0": 2.0, "range": 9.0})
-    np.testing.assert_array_equal(pair.recording.relative, log.recording.relative)
+    assert_array_equal(pair.recording.relative, log.recording.relative)
     with refused("offset = 'uwb': must be one of"):
         read_log(folder, offset={"uwb": 1.0})
 

@@ -10,7 +10,7 @@ import pymap3d
 import pytest
 from conftest import refused
 from logs import NOISE, drive, long, observed, write
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from strange_logs import strange
 
 import coopoc as co
@@ -40,12 +40,12 @@ def test_a_recording_comes_back_from_its_rows(tmp_path, suffix):
         pd.DataFrame({key: getattr(recording.links, key) for key in keys}).sort_values(keys)
         for recording in (true, found)
     )
-    np.testing.assert_array_equal(one, other)
+    assert_array_equal(one, other)
     order, back = one.index, other.index
     assert_allclose(found.relative[0, back], true.relative[0, order], atol=1e-9)
     sent = true.broadcasts[true.links.step, true.links.neighbour]
     wanted = np.where(sent, true.arrival[0], -1)
-    np.testing.assert_array_equal(found.arrival[0, back], wanted[order])
+    assert_array_equal(found.arrival[0, back], wanted[order])
     assert found.sensors == replace(
         NOISE, min_range=0.0, range_offset_std=1.0, velocity_floor=found.sensors.velocity_floor
     )
@@ -176,7 +176,7 @@ def test_a_clock_that_is_ahead_is_set_back(tmp_path):
     frame.loc[received, "arrival"] = [f"{float(a) + 0.37:.6f}" for a in frame.loc[received, "arrival"]]
     log = read_log(write(frame, tmp_path / "log.csv"), clock={"car1": 0.37}, dt=0.1)
     assert_allclose(log.recording.gnss, true.gnss, atol=1e-5)
-    np.testing.assert_array_equal(np.sort(log.recording.arrival), np.sort(true.arrival))
+    assert_array_equal(np.sort(log.recording.arrival), np.sort(true.arrival))
     with refused(r"clock = 'car9'.*car0, car1"):
         read_log(tmp_path / "log.csv", clock={"car9": 1.0})
 

@@ -9,7 +9,7 @@ import pandas as pd
 import pymap3d
 import pytest
 from conftest import measured, refused
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 
 import coopoc as co
 from coopoc.data.assemble import interpolate
@@ -38,9 +38,9 @@ def test_tum_files_are_what_evo_reads(tmp_path):
         warnings.simplefilter("ignore")
         file_interface = pytest.importorskip("evo.tools.file_interface", reason="pip install evo")
         path = file_interface.read_tum_trajectory_file(str(tmp_path / "car.tum"))
-    np.testing.assert_array_equal(path.positions_xyz, x)
+    assert_array_equal(path.positions_xyz, x)
     assert_allclose(path.timestamps, fleet.t[:1550], atol=1e-9)
-    np.testing.assert_array_equal(load_fleet(tmp_path).position[:, 0], x)
+    assert_array_equal(load_fleet(tmp_path).position[:, 0], x)
 
 
 def test_velocity_is_derived_backwards_and_absence_is_a_missing_row(tmp_path):

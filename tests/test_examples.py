@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import star
 from architecture import layers
+from numpy.testing import assert_allclose
 from shell import ran
 from torch.nn import GRUCell
 
@@ -56,8 +57,8 @@ def test_a_judge_of_ones_is_the_textbook_filter(drawn):
         stars = star.pack(drawn.recording, ego, drawn.fleet)
         for one in (star.Judge(star.NONE), star.Judge(star.NET, believing)):
             x, covariance, _ = star.follow(stars, one)
-            np.testing.assert_allclose(x, expected.x[:, :, e], atol=1e-7)
-            np.testing.assert_allclose(covariance, expected.covariance[:, :, e], atol=1e-9, rtol=1e-6)
+            assert_allclose(x, expected.x[:, :, e], atol=1e-7)
+            assert_allclose(covariance, expected.covariance[:, :, e], atol=1e-9, rtol=1e-6)
 
 
 def test_a_judge_learns_its_targets():

@@ -10,11 +10,10 @@ import pytest
 from shell import ran
 from tqdm import tqdm
 
-from coopoc import Sensors, workers
+from coopoc import workers
 from coopoc.kernels.compiling import compile, machine_code
 
 pytest.importorskip("numba")
-S2 = Sensors.paper_scenario2()
 
 
 def test_machine_code_is_stale_after_a_change_of_a_file_that_it_imports_and_no_other(tmp_path, monkeypatch):

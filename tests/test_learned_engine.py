@@ -7,6 +7,7 @@ import pytest
 import torch
 from conftest import refused
 from numba import njit
+from numpy.testing import assert_allclose
 from torch import Tensor
 
 from coopoc.learned import GainNet
@@ -71,8 +72,8 @@ def test_tanh_and_sigmoid_against_numpy():
         out = np.empty((2, len(x)), dtype)
         both(x, out)
         exact = x.astype(np.float64)
-        np.testing.assert_allclose(out[0], np.tanh(exact), rtol=tolerance)
-        np.testing.assert_allclose(out[1], 0.5 + 0.5 * np.tanh(0.5 * exact), atol=tolerance)
+        assert_allclose(out[0], np.tanh(exact), rtol=tolerance)
+        assert_allclose(out[1], 0.5 + 0.5 * np.tanh(0.5 * exact), atol=tolerance)
     nothing = np.full(1, np.nan)
     both(nothing, out := np.empty((2, 1)))
     assert np.isnan(out).all()

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import refused, winding
+from numpy.testing import assert_allclose, assert_array_equal
 from scipy import stats
 from torch import Tensor, nn
 
@@ -194,10 +195,10 @@ def test_the_ledger_counts_every_byte(four):
     assert (account.names, account.servers) == ((*fed.names, SERVER), (SERVER,))
     sent, received = (account.of("training", way=way)[0] for way in ("broadcast", "per receiver"))
     rounds = np.array([sum(name not in row.absent for row in fed.history[1:]) for name in fed.names])
-    np.testing.assert_array_equal(sent, [*rounds * 16, 3 * 12])  # the server broadcasts
-    np.testing.assert_array_equal(received, [*rounds * 12, rounds.sum() * 16])
-    np.testing.assert_array_equal(air.of("training", "on air", "broadcast")[0] - sent, [*100 * rounds, 300])
-    np.testing.assert_array_equal(air.of("training", "on air")[0] - received, [*100 * rounds, 100 * rounds.sum()])
+    assert_array_equal(sent, [*rounds * 16, 3 * 12])  # the server broadcasts
+    assert_array_equal(received, [*rounds * 12, rounds.sum() * 16])
+    assert_array_equal(air.of("training", "on air", "broadcast")[0] - sent, [*100 * rounds, 300])
+    assert_array_equal(air.of("training", "on air")[0] - received, [*100 * rounds, 100 * rounds.sum()])
 
 
 def test_poisoned_updates(four):
@@ -309,7 +310,7 @@ def test_trimmed_mean_is_that_of_scipy(share):
     for count in (1, 4, 7):
         weights = answers(count)
         theirs = stats.trim_mean(weights.numpy(), share, axis=0)
-        np.testing.assert_allclose(combined(TrimmedMean(share), weights, SIZES[:count]), theirs, rtol=1e-12)
+        assert_allclose(combined(TrimmedMean(share), weights, SIZES[:count]), theirs, rtol=1e-12)
 
 
 @pytest.mark.parametrize("name", [*RULES, Krum(2)])

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 import torch
 from conftest import refused, winding
+from numpy.testing import assert_allclose, assert_array_equal
 from test_learned_engine import batch
 from torch import nn
 
@@ -96,7 +97,7 @@ def test_constant_gain_equals_the_constant_gain_filter_by_hand():
     for t in range(1, len(rec.t)):
         prior = x + 0.1 * rec.velocity[:, t]
         x = prior + (rec.gnss[:, t] - prior) @ gain.T
-        np.testing.assert_allclose(track.x[:, t], x, atol=2e-4)
+        assert_allclose(track.x[:, t], x, atol=2e-4)
 
 
 def test_nothing_is_sent_online_and_no_covariance_is_claimed():
@@ -112,14 +113,14 @@ def test_translating_the_world_translates_the_estimate():
     here = winding()
     there = Fleet(here.ids, here.t, here.position + np.array([4e5, -5e6, 100.0]), here.velocity)
     tracks = [LearnedGain(GainNet())(observe(f, Sensors(), runs=2)).x for f in (here, there)]
-    np.testing.assert_allclose(tracks[1] - tracks[0], np.broadcast_to([4e5, -5e6, 100.0], tracks[0].shape), atol=1e-4)
+    assert_allclose(tracks[1] - tracks[0], np.broadcast_to([4e5, -5e6, 100.0], tracks[0].shape), atol=1e-4)
 
 
 def test_a_given_start_is_used_and_its_shape_checked():
     fleet = winding()
     rec = observe(fleet, Sensors(), runs=2)
     track = LearnedGain(GainNet(), x0=fleet.position[0])(rec)
-    np.testing.assert_array_equal(track.x[:, 0], np.broadcast_to(fleet.position[0], (2, 1, 3)))
+    assert_array_equal(track.x[:, 0], np.broadcast_to(fleet.position[0], (2, 1, 3)))
     with refused("x0"):
         LearnedGain(GainNet(), x0=np.zeros((5, 3)))(rec)
 

@@ -1,17 +1,15 @@
 """The ledger: training and online cooperation on one axis, as payload and on air, sent once and per receiver."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from conftest import refused
+from numpy.testing import assert_allclose, assert_array_equal
 
 from coopoc import V2X, BatchSmoother, JointFilter, Kalman, Ledger, Sensors, observe
 from coopoc.evaluate.ledger import of_track, of_training
 from coopoc.world.v2x import NO_MESSAGE
 
 S2 = Sensors.paper_scenario2()
-ROOT = Path(__file__).parent.parent
 
 
 def test_the_ledger_of_a_track_is_its_bytes(crossing):
@@ -21,10 +19,10 @@ def test_the_ledger_of_a_track_is_its_bytes(crossing):
         track, bare = method(seen, [1, 4]), method(plain, [1, 4])
         account = of_track(track, seen, method.message)
         assert account.names == ("c1", "c4")
-        np.testing.assert_array_equal(account.of("online", "on air"), track.received_bytes)
-        np.testing.assert_array_equal(account.of("online", "on air", "broadcast"), track.sent_bytes)
-        np.testing.assert_allclose(account.of("online"), bare.received_bytes, rtol=1e-12)
-        np.testing.assert_allclose(account.of("online", way="broadcast"), bare.sent_bytes, rtol=1e-12)
+        assert_array_equal(account.of("online", "on air"), track.received_bytes)
+        assert_array_equal(account.of("online", "on air", "broadcast"), track.sent_bytes)
+        assert_allclose(account.of("online"), bare.received_bytes, rtol=1e-12)
+        assert_allclose(account.of("online", way="broadcast"), bare.sent_bytes, rtol=1e-12)
         assert account.rate("on air") == pytest.approx(track.received_bytes.mean() / 6.0)
         assert account.per_vehicle("training") == 0.0
     alone = of_track(Kalman()(seen, [1]), seen, NO_MESSAGE)

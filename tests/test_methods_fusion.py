@@ -19,7 +19,6 @@ from coopoc.one_file import from_file
 from coopoc.world.inbox import inbox
 
 S2 = Sensors.paper_scenario2()
-SILENT = Sensors(gnss_std=(0, 0, 0), velocity_std_ratio=0, range_std=0, azimuth_std=0, inclination_std=0)
 SPLIT = CovarianceIntersection(split=True, name="split-ci")
 FILTERS = [
     CovarianceIntersection(),

@@ -13,6 +13,7 @@ from latex import compiled
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.patches import Ellipse
+from numpy.testing import assert_array_equal
 from scipy import stats
 from test_report import Page
 
@@ -51,7 +52,7 @@ def test_an_ellipse_holds_95_percent():
 def test_a_recording_shows_its_fixes_and_links(seen):
     _fleet, recording = seen
     ax = co.plot_recording(recording, run=1, step=20)
-    np.testing.assert_array_equal(ax.lines[7].get_xydata(), recording.gnss[1, :, 7, :2])
+    assert_array_equal(ax.lines[7].get_xydata(), recording.gnss[1, :, 7, :2])
     (lines,) = [c for c in ax.collections if isinstance(c, LineCollection)]
     assert len(lines.get_segments()) == int((recording.links.step == 20).sum()) > 0
     again = Figure().add_subplot()
@@ -70,8 +71,8 @@ def test_a_track_shows_paths_and_truth(seen):
     fleet, recording = seen
     track = co.JointFilter("nominal")(recording, [24, 3])
     ax = co.plot_track(track, fleet=fleet, every=20)
-    np.testing.assert_array_equal(ax.lines[0].get_xydata(), fleet.position[:, 24, :2])
-    np.testing.assert_array_equal(ax.lines[3].get_xydata(), track.x[0, :, 1, :2])
+    assert_array_equal(ax.lines[0].get_xydata(), fleet.position[:, 24, :2])
+    assert_array_equal(ax.lines[3].get_xydata(), track.x[0, :, 1, :2])
     assert len(ax.patches) == 2 * 3
     assert len(co.plot_track(co.GNSS()(recording, [24])).patches) in (0, 60)
 
@@ -204,7 +205,7 @@ def test_a_solution_shows_nodes_factors_and_headings(seen):
     problem = co.Problem.from_snapshot(seen[1], step=10, ego=24)
     solution = co.solve(problem)
     ax = co.plot_solution(solution, problem=problem)
-    np.testing.assert_array_equal(ax.lines[0].get_xydata(), solution.position[:, :2])
+    assert_array_equal(ax.lines[0].get_xydata(), solution.position[:, :2])
     assert [text.get_text() for text in ax.texts] == list(solution.names)
     with refused("must be the one that was solved"):
         co.plot_solution(

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import holed
+from numpy.testing import assert_array_equal
 
 from coopoc import (
     LKFSA,
@@ -104,8 +105,8 @@ def test_a_heading_turns_all_that_is_seen_at_a_step_alike(crossing):
     v2x, plain = V2X(4, 80.0), observe(crossing, Sensors(), V2X(4, 80.0), runs=30)
     for sensors, per_step in ((NOISE, True), (BIAS, False)):
         seen = observe(crossing, sensors, v2x, runs=30)
-        np.testing.assert_array_equal(seen.gnss, plain.gnss)
-        np.testing.assert_array_equal(seen.relative[..., [0, 2]], plain.relative[..., [0, 2]])
+        assert_array_equal(seen.gnss, plain.gnss)
+        assert_array_equal(seen.relative[..., [0, 2]], plain.relative[..., [0, 2]])
         turned, mine = wrap(seen.relative[..., 1] - plain.relative[..., 1]), plain.links.of(2)
         steps = plain.links.step[mine]
         for t in np.unique(steps):

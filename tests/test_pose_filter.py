@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 from conftest import refused, textbook
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from oracles import pose_filter as oracle
 from oracles.pace import heard
 from shell import ran
@@ -194,10 +194,10 @@ def test_a_stream_gives_the_numbers_of_its_track(rough, how):
                 co.LandmarkMeasurement(rough.relative[run, k], rough.gnss[run, t, links.neighbour[k]]) for k in now
             ]
             x, cov = stream.step(own_of(rough, run, t, 0), marks)
-            np.testing.assert_array_equal(x[:3], track.x[run, t, 0])
-            np.testing.assert_array_equal(x[3], track.heading[run, t, 0])  # type: ignore[index]
-            np.testing.assert_array_equal(cov[:3, :3], track.covariance[run, t, 0])  # type: ignore[index]
-            np.testing.assert_array_equal(cov[3, :4], track.heading_covariance[run, t, 0])  # type: ignore[index]
+            assert_array_equal(x[:3], track.x[run, t, 0])
+            assert_array_equal(x[3], track.heading[run, t, 0])  # type: ignore[index]
+            assert_array_equal(cov[:3, :3], track.covariance[run, t, 0])  # type: ignore[index]
+            assert_array_equal(cov[3, :4], track.heading_covariance[run, t, 0])  # type: ignore[index]
 
 
 def test_a_known_start_needs_no_compass():

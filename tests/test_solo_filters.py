@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conftest import refused, winding
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from oracles import solo as oracle
 
 from coopoc import GNSS, V2X, CooperativeFilter, Fleet, Kalman, NoiseModel, Recording, Sensors, observe
@@ -74,6 +74,6 @@ def test_gnss_holds_the_last_fix(crossing):
     assert 0 < track.seconds < 60
     for t in range(len(seen.t)):
         newest = max(k for k in range(t + 1) if np.isfinite(seen.gnss[0, k, 1]).all())
-        np.testing.assert_array_equal(track.x[0, t, 0], seen.gnss[0, newest, 1])
+        assert_array_equal(track.x[0, t, 0], seen.gnss[0, newest, 1])
     missing = np.isnan(seen.gnss[:, :, [1, 3], 0]).mean()
     assert track.notes == (f"holds the last fix where there is none: {100 * missing:.0f} % of the steps",)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from conftest import holed, measured, refused, textbook
 from filterpy.kalman import KalmanFilter
-from numpy.testing import assert_allclose
+from numpy.testing import assert_allclose, assert_array_equal
 from shell import ran
 
 from coopoc import V2X, CooperativeFilter, Fleet, Kalman, NoiseModel, Sensors, StarStream, observe
@@ -182,8 +182,8 @@ def test_bad_input_is_named_and_forgotten(name, field, given):
         stream.step(Z, U, 0.1)
     with refused(f"^{field} = "):
         one.step(**{"gnss": Z, "velocity": U, "dt": 0.1} | given)
-    np.testing.assert_array_equal(one.step(Z, U, 0.1)[0], other.step(Z, U, 0.1)[0])
-    np.testing.assert_array_equal(one.history.rows, other.history.rows)
+    assert_array_equal(one.step(Z, U, 0.1)[0], other.step(Z, U, 0.1)[0])
+    assert_array_equal(one.history.rows, other.history.rows)
 
 
 def test_the_motion_that_is_kept_is_its_integral():

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 import pytest
+from numpy.testing import assert_allclose
 
 from coopoc.plugins import find
 from coopoc.studies.error_cdf import quantile
@@ -86,7 +87,7 @@ def test_a_sweep_draws_the_means_in_the_method_colour(results):
     drawn = {line.get_color(): line for line in axes.lines}
     assert set(drawn) == {look(m).color for m in ("kalman", "joint", "bound")}
     expected = results.frame.query("method == 'joint'").groupby("max_neighbours")["rt_le_m"].mean()
-    np.testing.assert_allclose(drawn[look("joint").color].get_ydata(), expected.to_numpy())
+    assert_allclose(drawn[look("joint").color].get_ydata(), expected.to_numpy())
     assert drawn[look("bound").color].get_linestyle() == "--"
     assert len(axes.collections) == 3
     axes.set_ylim(1.0, 2e4)
@@ -133,7 +134,7 @@ def test_curves_draw_numbers_of_their_selections(results):
     assert plot is not None
     joint, level = plot.figure.axes[0].lines  # the bound has another noise model, and no K = 99 was run
     expected = results.frame.query("method == 'joint'").groupby("max_neighbours")["rt_le_m"].mean()
-    np.testing.assert_allclose(joint.get_ydata(), expected.to_numpy())
+    assert_allclose(joint.get_ydata(), expected.to_numpy())
     assert level.get_ydata()[0] == pytest.approx(results.select(GNSS)["rt_le_m"].mean())
     assert figures.curves(results, [panel], [{"method": "okf"}], "c") is None
     mine, alike = {"method": "kalman", "label": "mine"}, [LINES[0], dict(LINES[0])]

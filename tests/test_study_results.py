@@ -8,6 +8,7 @@ import pandas as pd
 import pytest
 from conftest import refused
 from latex import compiled
+from numpy.testing import assert_array_equal
 
 from coopoc.evaluate.statistics import Interval
 from coopoc.study.results import Results, parsed
@@ -46,9 +47,9 @@ def test_values_are_paired_by_ego_and_run_whatever_the_order_of_rows(frame):
     straight = results(frame).values("rt_le_m", where, method="gnss")
     mixed = results(frame.sample(frac=1.0, random_state=1)).values("rt_le_m", where, method="gnss")
     assert straight.shape == (6, 2)
-    np.testing.assert_array_equal(straight, mixed)
+    assert_array_equal(straight, mixed)
     first = frame.query("method == 'gnss' and k == 0 and ego == 'a'").sort_values("run")["rt_le_m"]
-    np.testing.assert_array_equal(straight[:, 0], first)
+    assert_array_equal(straight[:, 0], first)
 
 
 def test_training_seeds_are_averaged_before_the_interval(frame):
@@ -118,7 +119,7 @@ def test_parquet_holds_every_digit(frame, tmp_path):
     frame = frame.assign(quantiles=[[0.1, 0.2]] * len(frame))
     results(frame).to_parquet(tmp_path / "r.parquet")
     back = pd.read_parquet(tmp_path / "r.parquet")
-    np.testing.assert_array_equal(back["rt_le_m"], frame["rt_le_m"])
+    assert_array_equal(back["rt_le_m"], frame["rt_le_m"])
     assert back["quantiles"].iloc[0].tolist() == [0.1, 0.2]
 
 

@@ -14,6 +14,7 @@ import pandas as pd
 import pytest
 from conftest import refused, winding
 from filterpy.kalman import KalmanFilter
+from numpy.testing import assert_allclose
 
 import coopoc as co
 from coopoc import V2X, CooperativeFilter, Kalman, Recording, Sensors, load_fleet, observe
@@ -203,7 +204,7 @@ def test_the_solo_filter_is_filterpys_with_the_gates_variances():
         if share <= gate.HARD_REJECT_FACTOR:
             used += share > 1.0 or q > gate.FIX_GATE
             peer.update(z, R=r * share)
-        np.testing.assert_allclose(track.x[0, t, 0], peer.x, atol=1e-9)
+        assert_allclose(track.x[0, t, 0], peer.x, atol=1e-9)
     assert used > 10
     assert [t for t in returns if t >= 270] == returns[-1:]
     assert returns[-1] < 285
@@ -280,7 +281,7 @@ def test_nees_is_unknown_with_the_truth_and_of_two_dimensions_in_the_plane():
     x, covariance = TRACK.x * [1, 1, 0], np.array(TRACK.covariance)
     covariance[..., 2, :] = covariance[..., :, 2] = 0
     flat = [co.nees(replace(TRACK, x=x, covariance=covariance + np.diag([0, 0, v])), FLEET) for v in (0, 1)]
-    np.testing.assert_allclose(*flat)
+    assert_allclose(*flat)
 
 
 class Swapped(Negative):

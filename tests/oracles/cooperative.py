@@ -223,13 +223,10 @@ class Oracle:
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.priors.fix_gate else {self.ego}
         numbers = ["made", "shown", "unseen", "blind", "evidence", "driven", "agree", "slips", "speed"]
-        numbers += ["score", "numbers", "squares"]
+        numbers += ["score", "numbers", "squares", "late", "weight"]
         levels = {name: np.zeros(6) for name in ("level", "learned", "information")}
-        levels |= {name: np.zeros(3) for name in ("gap", "cov", "course")} | dict.fromkeys(
-            [*numbers, "numbers", "squares"], 0.0
-        )
-        levels |= {"recent": np.zeros(3), "late": 0.0, "weight": 0.0, "products": []}
-        levels |= {"louder": {}, "left": None, "jumped": False}
+        levels |= {name: np.zeros(3) for name in ("gap", "cov", "course", "recent")} | dict.fromkeys(numbers, 0.0)
+        levels |= {"products": [], "louder": {}, "left": None, "jumped": False}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
     def loop(self) -> tuple[Floats, Floats, list[Floats]]:
