@@ -100,27 +100,24 @@ def placed(problem: Problem, x: Floats, rank: int = 0) -> Floats:
     fix = np.concatenate([np.empty((0, d)), *(f.z for f in fixes)])
     weight = np.concatenate([np.empty(0), *(np.linalg.norm(f.root, axis=(1, 2)) / d**0.5 for f in fixes)])
     held = [part[f.nodes[:, 0]] for f in problem.factors if f.kind.startswith("pose")]
-    known, left = np.isin(part, np.concatenate([[-1], *held])), set(part.tolist())
-    left -= set(part[known].tolist())
-    while left:
-        inside = {body: part == body for body in left}
-        ranged = {
-            body: np.nonzero(known[ranges.nodes[:, ::-1]] & own[ranges.nodes] & (ranges.weight > 0)[:, None])
-            for body, own in inside.items()
-        }
-        most = {body: (int(own[fixed].sum()), len(ranged[body][0])) for body, own in inside.items()}
-        body = max(sorted(left), key=most.__getitem__)
-        left.remove(body)
-        mine, (k, side), here = inside[body], ranged[body], inside[body][fixed]
-        known |= mine
-        if not any(most[body]):
-            continue
-        places, distance = x[ranges.nodes[k, 1 - side], :d], ranges.distance[k]
-        if mine.sum() > 1 or here.any():
-            ranged_from = x[ranges.nodes[k, side], :d], places, distance, ranges.weight[k]
-            x[mine] = _fitted(space, x[mine], (x[fixed[here], :d], fix[here], weight[here]), ranged_from, rank)
-        else:
-            x[mine, :d] = trilaterate(places, distance)
+    known, single = np.isin(part, np.concatenate([[-1], *held])), np.bincount(part)[part] == 1
+    here = (single & ~known)[fixed]
+    x[fixed[here], :d], known[fixed[here]] = fix[here], True
+    while not known.all():
+        k, side = np.nonzero(known[ranges.nodes[:, ::-1]] & ~known[ranges.nodes] & (ranges.weight > 0)[:, None])
+        own, places = ranges.nodes[k, side], ranges.nodes[k, 1 - side]
+        seen = np.bincount(part[own], minlength=len(x))[part]
+        best = np.lexsort([~single, seen, np.bincount(part[fixed], minlength=len(x))[part], ~known])[-1]
+        moving, here = np.flatnonzero(part == part[best]), part[fixed] == part[best]
+        if single[best]:
+            moving = np.flatnonzero(single & ~known & (seen >= min(seen[best], d + 1)))
+            for node in moving[seen[moving] > 0].tolist():
+                x[node, :d] = trilaterate(x[places[own == node], :d], ranges.distance[k[own == node]])
+        elif here.any() or seen[best]:
+            rows = part[own] == part[best]
+            distances = x[own[rows], :d], x[places[rows], :d], ranges.distance[k[rows]], ranges.weight[k[rows]]
+            x[moving] = _fitted(space, x[moving], (x[fixed[here], :d], fix[here], weight[here]), distances, rank)
+        known[moving] = True
     return _crossed(problem, x)
 
 
