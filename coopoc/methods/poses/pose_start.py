@@ -20,7 +20,7 @@ STEP = 2 * np.pi / HEADINGS
 
 
 def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0) -> Floats:
-    """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN for landmarks.
+    """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN of landmarks and who is absent.
 
     With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
     odometry until then its pose at the first step; or its ranges to three landmarks or more, by least squares. A
