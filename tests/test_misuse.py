@@ -103,18 +103,6 @@ def ours(call: Callable[[], object], what: str) -> None:
         pytest.fail(f"{what}: {type(error).__name__}: {error}")
 
 
-GONE = co.observe(
-    replace(
-        FLEET,
-        **{
-            n: np.where(FLEET.t[:, None, None] + [[[0], [1], [0], [0]]] > 1.3, np.nan, getattr(FLEET, n))
-            for n in ("position", "velocity")
-        },
-    ),
-    SENSORS,
-    CHANNEL,
-    frame="body",
-)
 BARE, OTHER = replace(TRACK, covariance=None), replace(RECORDING, ids=("e", "f", "g", "h"))
 
 
@@ -132,7 +120,6 @@ BARE, OTHER = replace(TRACK, covariance=None), replace(RECORDING, ids=("e", "f",
         ),
         (lambda: replace(TRACK, t=TRACK.t[::-1]), r"t\[1\] = 0.4: must be finite and increase"),
         (lambda: co.NoiseModel("m"), "process_std = None: must be given"),
-        (lambda: co.PoseFilter("solo")(GONE, [1]), "egos = 1: is absent at some steps"),
         (lambda: of_track(TRACK, OTHER, co.Kalman().message), "ids and times differ from those that were recorded"),
         (lambda: of_track(TRACK, RECORDING.of_runs([0, 0]), co.Kalman().message), "track = 1 runs: must have 2"),
         (lambda: fix_innovations(TRACK, OTHER), "ids and times differ from those that were recorded"),

@@ -187,3 +187,13 @@ def test_first_poses_allow_for_errors_of_odometry_and_ranges(tmp_path, bearings,
     moved = rec.gnss + 5.0 * (np.arange(len(rec.ids)) == rec.ids.index("u"))[:, None]
     lost = co.PoseFilter(begin=begin)(replace(rec, gnss=moved), own).notes
     assert any(note.startswith("relative measurements, a and u: far from estimates (") for note in lost)
+
+
+def test_after_a_gap_it_begins_anew():
+    fleet, there = convoy(2, 60), np.ones((60, 1, 1))
+    there[20:30] = np.nan
+    fleet = replace(fleet, position=fleet.position * there, velocity=fleet.velocity * there)
+    seen = observed(fleet, replace(WHITE, compass=False), runs=1)
+    track, rest = co.PoseFilter(begin=co.pose_start(seen))(seen, [1]), seen.between(30, 60)
+    assert track.absent[:, 0].nonzero()[0].tolist() == [*range(20, 30)]
+    np.testing.assert_array_equal(track.x[:, 30:], co.PoseFilter(begin=co.pose_start(rest))(rest, [1]).x)

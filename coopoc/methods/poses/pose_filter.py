@@ -18,6 +18,7 @@ from ...world.sensors import Sensors
 from ...world.v2x import NO_MESSAGE, Message
 from ..batch_smoother import CENTRE, centre
 from ..doubts import doubts
+from ..gaps import in_stretches
 from ..track import Track
 from .pose_inputs import (
     POSE,
@@ -26,7 +27,6 @@ from .pose_inputs import (
     check_spread,
     first_poses,
     fleet_members,
-    pose_egos,
     pose_measurements,
     pose_noise,
     to_landmarks,
@@ -89,6 +89,7 @@ class PoseFilter:
     spread: tuple[float, ...] = SPREAD
     assumed: Sensors | None = None
     name: str = ""
+    needs_fix = False
 
     __repr__ = short_repr
 
@@ -113,15 +114,29 @@ class PoseFilter:
             return NO_MESSAGE
         return UPLOAD if self.fusion == "joint" else POSE
 
+    def begun(self, recording: Recording) -> "PoseFilter":
+        """This filter where a drive goes on after a gap: what no fix and compass show begins at `pose_start`."""
+        from .pose_start import pose_start
+
+        try:
+            first_poses(recording, None, fleet_members(recording))
+        except InputError:
+            return replace(self, begin=pose_start(recording))
+        return replace(self, begin=None)
+
+    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos.
 
         Raises:
-            InputError: a recording in the world frame, an ego that is unknown, absent at times or a landmark, or one
-                whose first pose is not known.
+            InputError: a recording in the world frame, an ego that is unknown or a landmark, or one whose first pose is
+                not known.
         """
         began, recording = clock(), check_recording(recording, body=True)
-        columns, links, notes = pose_egos(recording, egos), recording.links, tuple[str, ...]()
+        columns, links, notes = recording.observing(egos), recording.links, tuple[str, ...]()
+        for column in columns:
+            if column in recording.landmarks:
+                raise InputError("egos", repr(recording.ids[column]), "is a landmark", "Its position is known.")
         received, sent = moved = np.zeros((2, recording.runs, len(columns)))
         if self.unit == "solo":
             begin = first_poses(recording, self.begin, columns)

@@ -5,11 +5,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from ...arrays import Bools, Floats, Ints, checked, listed
+from ...arrays import Bools, Floats, Ints, checked
 from ...errors import InputError
 from ...kernels.stars.messages import FORGOTTEN
 from ...world.plausible import radians
-from ...world.recording import Body, Recording, Vehicles
+from ...world.recording import Body, Recording
 from ...world.sensors import Sensors
 from ...world.v2x import Message
 
@@ -26,18 +26,6 @@ SPREAD = (0.5, 0.5, 0.5, 0.15)
 those of `pose_start` err by less."""
 LEAST_HEADING_STD, LEAST_YAW_RATE_STD = 1e-6, 1e-5
 """rad and rad/s: a filter needs some noise, however exact its sensors are."""
-
-
-def pose_egos(recording: Recording, egos: Vehicles) -> list[int]:
-    """Columns of egos that are there throughout; InputError for one that is not, and for a landmark."""
-    egos = listed("egos", egos, "Give [0] for the first.")
-    columns = recording.observing(egos)
-    for ego, column in zip(egos, columns, strict=True):
-        if column in recording.landmarks:
-            raise InputError("egos", repr(ego), "is a landmark", "Its position is known.")
-        if np.isnan(recording.velocity[0, :, column, 0]).any():
-            raise InputError("egos", repr(ego), "is absent at some steps", "Cut it with recording.between(...).")
-    return columns
 
 
 def body_of(recording: Recording) -> Body:
