@@ -14,8 +14,9 @@ from ..model.derivatives import linearise
 from ..model.factor import taken
 from ..model.problem import Problem
 from ..model.space import carried
-from ..starts.graph_starts import along_poses, parts
+from ..starts.graph_starts import parts
 from ..starts.initial import initial_guess
+from ..starts.pose_starts import along_poses
 from .candidates import Marked, reweigh, squares
 
 ROUNDS = 100

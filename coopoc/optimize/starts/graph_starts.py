@@ -13,7 +13,6 @@ from ..algebra.sparse import sparse
 from ..descent.levenberg_marquardt import GROWTH, arrive
 from ..model.problem import Problem
 from ..model.space import Space, carried, exp, log
-from .initial import initial_guess
 
 Roots = Iterable[tuple[int, Floats, Floats]]
 """(pose, position, rotation) in the order in which the walk may start from them."""
@@ -92,33 +91,6 @@ def walk(n: int, d: int, moves: Moves, roots: Roots) -> tuple[Floats, Floats, Bo
     return position, rotation, is_reached
 
 
-def along_poses(problem: Problem) -> Floats:
-    """x0 (n, ambient) with poses where relative poses lead, from fixed poses, then from others, and points without a
-    fix where a pose sees them.
-
-    The start of a graph may follow measurements that have no weight here.
-    """
-    space, x, d = problem.space, initial_guess(problem), problem.dimension
-    used = [(f, f.informative) for f in problem.factors]
-    moved = [
-        Moves(f.nodes[on], space.position(f.z[on]), space.rotation(f.z[on]), 1.0 / np.square(f.root[on]).sum((1, 2)))
-        for f, on in used
-        if f.kind.startswith("relative_pose")
-    ]
-    if moved:
-        roots = ((k, space.position(x[k]), space.rotation(x[k])) for k in (*problem.fixed, *problem.poses))
-        moves = Moves(*(np.concatenate(part) for part in zip(*moved, strict=True)))
-        position, rotation, reached = walk(len(x), d, moves, roots)
-        x[reached] = space.join(position[reached], rotation[reached])
-    still = np.concatenate([problem.fixed, *(f.nodes[on, 0] for f, on in used if f.kind == "position")])
-    for f, on in used:
-        if f.kind == "relative_position":
-            rows = np.flatnonzero(on & ~np.isin(f.nodes[:, 1], still))[::-1]  # the first that sees a point places it
-            i, j = f.nodes[rows].T
-            x[j, :d] = x[i, :d] + np.einsum("mab,mb->ma", space.rotation(x[i]), f.z[rows])
-    return x
-
-
 def parts(n: int, *joined: Ints) -> Ints:
     """(n,) the connected component that each is in, by pairs, (M, 2) each, that are joined; counted by first nodes.
 
@@ -180,7 +152,7 @@ def _squares(places: Floats, ranges: Floats, at: Floats) -> Floats:
 def chained(graph: Graph) -> Floats:
     """(n, ambient): each robot's poses along its own relative poses, from a pose with a prior, else from its first
     vertex in the file; where the file has none, from a place on a ring."""
-    return _landmarks(graph, *_walked(graph, _own(graph), _roots(graph)))
+    return with_points(graph, *walked(graph, _own(graph), _roots(graph)))
 
 
 def tree(graph: Graph) -> Floats:
@@ -196,7 +168,7 @@ def tree(graph: Graph) -> Floats:
         and accurate approximation for planar pose graph optimization, IJRR 2014.
     """
     edges, d, roots = graph.relative_pose, graph.dimension, _roots(graph)
-    position, rotation, reached = _walked(graph, np.ones(len(edges), dtype=bool), roots)
+    position, rotation, reached = walked(graph, np.ones(len(edges), dtype=bool), roots)
     if len(edges) >= len(rotation) or len(edges) > int(reached.sum()) - len(
         np.unique(parts(len(reached), edges.nodes))
     ):
@@ -212,7 +184,7 @@ def tree(graph: Graph) -> Floats:
                 break
         moved = _averaging(edges.nodes, position_variance(edges.covariance, d), still, len(rotation))
         position += moved(position[j] - position[i] - np.einsum("mab,mb->ma", rotation[i], edges.position))
-    return _landmarks(graph, position, rotation, reached)
+    return with_points(graph, position, rotation, reached)
 
 
 def _averaging(nodes: Ints, variance: Floats, still: Ints, n: int) -> Callable[[Floats], Floats]:
@@ -280,7 +252,7 @@ def unwound(graph: Graph, x: Floats) -> bool:
     error = log(np.swapaxes(turned[i] @ edges.rotation, 1, 2) @ turned[j])
     if graph.dimension == 3:
         return bool(np.linalg.norm(error, axis=1).sum() < np.pi)
-    tree = _walked(graph, np.ones(len(edges), dtype=bool), _roots(graph))[1]
+    tree = walked(graph, np.ones(len(edges), dtype=bool), _roots(graph))[1]
     along = log(np.swapaxes(tree, 1, 2) @ turned)  # more than half a turn of it shows as a jump on an edge
     return bool(np.abs(along[i] + error - along[j]).max() < WOUND)
 
@@ -319,7 +291,7 @@ def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
     return roots
 
 
-def _walked(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools]:
+def walked(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bools]:
     """The walk along the `used` relative poses, whose length is their variance."""
     edges = graph.relative_pose
     length = np.trace(edges.covariance, axis1=1, axis2=2) + 1e-12 if len(edges) else np.empty(0)
@@ -327,7 +299,7 @@ def _walked(graph: Graph, used: Bools, roots: Roots) -> tuple[Floats, Floats, Bo
     return walk(len(graph.names), graph.dimension, moves, roots)
 
 
-def _landmarks(graph: Graph, position: Floats, rotation: Floats, placed: Bools) -> Floats:
+def with_points(graph: Graph, position: Floats, rotation: Floats, placed: Bools) -> Floats:
     """Nodes with the points at their priors, where a pose sees them, or by ranges."""
     points = graph.point_prior
     position[points.nodes[:, 0]], placed[points.nodes[:, 0]] = points.position, True

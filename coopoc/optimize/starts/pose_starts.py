@@ -8,11 +8,11 @@ import numpy as np
 from ...arrays import Floats
 from ...formats.graph import NAME, Graph, edges_of
 from ...formats.values import to_orientation
-from ..model.factor import Factor, taken
+from ..model.factor import Factor, fused, taken
 from ..model.problem import Problem
 from ..model.space import Space, exp
-from .graph_starts import parts, trilaterate
-from .initial import as_vectors
+from .graph_starts import parts, trilaterate, walked, with_points
+from .initial import as_vectors, initial_guess
 from .mirrors import ranges_of
 
 FIELDS = {
@@ -62,27 +62,35 @@ def graph_of(problem: Problem) -> Graph:
     return Graph(d, names, poses, unknown, unknown[:, :1] if d == 2 else np.full((n, 4), np.nan), **edges)  # type: ignore[arg-type]
 
 
+def along_poses(problem: Problem) -> Floats:
+    """x0 (n, ambient) with poses where relative poses lead, from fixed poses, then from others, and points without a
+    fix where a pose sees them, or by ranges.
+
+    The start of a graph may follow measurements that have no weight here.
+    """
+    graph, space, x = graph_of(problem), problem.space, initial_guess(problem)
+    roots = [(k, space.position(x[k]), space.rotation(x[k])) for k in (*problem.fixed, *problem.poses)]
+    position, rotation, placed = walked(graph, np.ones(len(graph.relative_pose), dtype=bool), roots)
+    position[~placed], rotation[~placed] = space.position(x[~placed]), space.rotation(x[~placed])
+    placed[list(problem.fixed)] = True
+    return with_points(graph, position, rotation, placed)[:, : space.ambient]
+
+
 def _field(factor: Factor) -> str:
     return FIELDS.get(factor.kind.removesuffix("_chordal").removesuffix("_log"), "")
 
 
 def _measured(problem: Problem, factor: Factor) -> tuple[Floats, Floats]:
-    """Values and covariances of a factor as a graph's edges have them."""
+    """Values and covariances of a factor as a graph's edges have them, the same along all axes and about them."""
     d, space = problem.dimension, problem.space
-    if factor.kind == "body_spherical":
-        factor = as_vectors(factor)
-    information = np.swapaxes(factor.root, 1, 2) @ factor.root
-    covariance = np.linalg.inv(information + UNKNOWN * np.eye(factor.size))
-    if not factor.measurement.compares_poses:
-        return factor.z, covariance
-    values = np.concatenate([space.position(factor.z), to_orientation(space.rotation(factor.z))], axis=1)
-    if not factor.kind.endswith("_chordal"):
-        return values, covariance
-    entry = np.einsum("mii->m", covariance[:, d:, d:]) / d**2
-    both = np.zeros((len(values), d + space.angles, d + space.angles))
-    both[:, :d, :d] = covariance[:, :d, :d]
-    both[:, d:, d:] = (entry / (1 if d == 2 else 2))[:, None, None] * np.eye(space.angles)
-    return values, both
+    factor = as_vectors(factor) if factor.kind == "body_spherical" else factor
+    information, z = np.square(factor.root).sum(axis=1) + UNKNOWN, factor.z
+    variance = 1.0 / np.repeat(information[:, :d].mean(axis=1, keepdims=True), d, axis=1)
+    if factor.measurement.compares_poses:
+        z = np.concatenate([space.position(z), to_orientation(space.rotation(z))], axis=1)
+        turn = 1.0 / information[:, d:].mean(axis=1, keepdims=True)
+        variance = np.concatenate([variance, np.repeat(turn, space.angles, axis=1)], axis=1)
+    return z, variance[:, :, None] * np.eye(variance.shape[1])
 
 
 def placed(problem: Problem, x: Floats, rank: int = 0) -> Floats:
@@ -164,22 +172,14 @@ def _fitted(space: Space, body: Floats, fixes: tuple[Floats, ...], ranges: tuple
 
 
 def _crossed(problem: Problem, x: Floats) -> Floats:
-    """x with points of which there are bearings alone at the crossing of the vertical planes of these."""
+    """x with points of which there are bearings alone where these cross, as if all were level with the poses."""
     d, rotation = problem.dimension, problem.space.rotation(x)
-    bearings = [f for f in problem.factors if f.kind == "bearing"]
-    if not bearings:
-        return x
-    pose, seen = np.concatenate([f.nodes for f in bearings]).T
-    angle = np.concatenate([f.z[:, 0] for f in bearings])
     others = [f.nodes.ravel() for f in problem.factors if f.kind != "bearing"]
-    for point in np.setdiff1d(seen, np.concatenate([np.array(problem.poses), *others])):
-        own = seen == point
-        turned = rotation[pose[own]] @ np.eye(d)[:, :2]
-        along, across = (
-            np.einsum("mab,bm->ma", turned, [np.cos(angle[own] + turn), np.sin(angle[own] + turn)])
-            for turn in (0.0, np.pi / 2)
-        )
-        ahead = x[pose[own][0], :d] + along[0]
-        gap = np.einsum("ma,ma->m", across, x[pose[own], :d] - ahead)
-        x[point, :d] = ahead + np.linalg.solve(across.T @ across + LEVER * np.eye(d), across.T @ gap)
+    for f in fused([f for f in problem.factors if f.kind == "bearing"])[:1]:
+        for point in np.setdiff1d(f.nodes[:, 1], np.concatenate([problem.poses, *others])):
+            (pose, _), angle = f.nodes[f.nodes[:, 1] == point].T, f.z[f.nodes[:, 1] == point, 0]
+            ahead = np.einsum("mab,bm->ma", rotation[pose][:, :, :2], [np.cos(angle), np.sin(angle)])
+            across = np.eye(d) - ahead[:, :, None] * ahead[:, None]
+            right = np.einsum("mab,mb->a", across, x[pose, :d]) + LEVER * (x[pose[0], :d] + ahead[0])
+            x[point, :d] = np.linalg.solve(across.sum(axis=0) + LEVER * np.eye(d), right)
     return x
