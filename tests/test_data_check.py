@@ -71,10 +71,6 @@ FAULTS: dict[str, tuple[Callable[[pd.DataFrame], pd.DataFrame], str]] = {
         r"\d+% of what was logged is not used, first of all \d+ relative measurements of members without a position",
     ),
     "leap seconds": (lambda f: f.assign(t=f["t"] + 18 * f["x"].notna()), r"car1: its fixes are 18 s behind the"),
-    "late fixes": (
-        lambda f: f.assign(t=f["t"] + 0.4 * f["x"].notna()),
-        r"car0: its fixes are 0.39 s behind .*looks alike",
-    ),
     "a fix held": (lambda f: f.assign(x=f["x"].where(~f["t"].between(9, 30), 5), y=0 * f["x"]), "fixes that stay"),
     "fixes far from the truth of who stands": (
         lambda f: f.assign(**dict.fromkeys(["x", "y", "vx", "vy"], 0 * f["x"])),
