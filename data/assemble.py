@@ -5,13 +5,8 @@ from collections.abc import Sequence
 import numpy as np
 import pandas as pd
 
+from coopoc import V2X, Body, Fleet, InputError, Links, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints
-from coopoc.errors import InputError
-from coopoc.world.fleet import Fleet
-from coopoc.world.links import Links
-from coopoc.world.recording import Body, Recording
-from coopoc.world.sensors import Sensors
-from coopoc.world.v2x import V2X
 
 SAME = 1e-6
 """s, stamps this close are one instant: the digits that a double keeps of seconds since 1970."""

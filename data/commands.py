@@ -6,7 +6,7 @@ from pathlib import Path
 
 import tyro
 
-from coopoc.errors import InputError
+from coopoc import InputError
 
 from .fetch import TIMEOUT, Entry, fetch, public
 from .registry import DATASETS, LOGS, card, convert, in_words, kind_of, list_datasets, load_fleet, load_log

@@ -7,10 +7,9 @@ from typing import Any
 
 import numpy as np
 
-from coopoc.errors import InputError
+from coopoc import Fleet, InputError
 from coopoc.escapes import spreadsheet
 from coopoc.formats import trajectories as tum
-from coopoc.world.fleet import Fleet
 
 from .assemble import assemble
 from .cells import factors, named_columns, numeric, read_frame, seconds, words

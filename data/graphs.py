@@ -4,14 +4,11 @@ from pathlib import Path
 
 import numpy as np
 
+from coopoc import Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints
-from coopoc.errors import InputError
 from coopoc.formats.graph import Graph, PointEdges
 from coopoc.formats.pyfg import read_pyfg
 from coopoc.world.body_frames import midway, turned
-from coopoc.world.fleet import Fleet
-from coopoc.world.recording import Recording
-from coopoc.world.sensors import Sensors
 
 from .assemble import backward_difference, nearest, planar_recording, steps_of
 from .log.read import Log, steps_in_words

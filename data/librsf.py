@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pandas as pd
 
-from coopoc.errors import InputError
+from coopoc import InputError
 from coopoc.formats.values import read_words, to_numbers
 
 from .log.units import Rows, Summary, of_kinds

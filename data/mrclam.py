@@ -8,16 +8,13 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 
+from coopoc import Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints, robust_std
-from coopoc.errors import InputError
 from coopoc.file_names import given_path
 from coopoc.formats.values import LARGEST, read_table, read_words
 from coopoc.short_repr import short_repr
 from coopoc.world.body_frames import midway, turned
-from coopoc.world.fleet import Fleet
 from coopoc.world.links import wrap
-from coopoc.world.recording import Recording
-from coopoc.world.sensors import Sensors
 
 from .assemble import (
     PLANE_STD,

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from coopoc.errors import InputError, MissingLibraryError
+from coopoc import InputError, MissingLibraryError
 
 from .log.units import Rows, Summary, rows_of
 

@@ -8,11 +8,11 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-from coopoc.errors import InputError, suggestion, unknown
+from coopoc import Fleet, InputError
+from coopoc.errors import suggestion, unknown
 from coopoc.file_names import given_path
 from coopoc.one_file import in_file
 from coopoc.plugins import find, names
-from coopoc.world.fleet import Fleet
 from coopoc.world.storage import read_recording
 
 from .cells import TABLES

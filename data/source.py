@@ -10,12 +10,11 @@ from urllib.parse import unquote
 
 import numpy as np
 
-from coopoc.errors import InputError, suggestion
+from coopoc import Fleet, InputError, Recording
+from coopoc.errors import suggestion
 from coopoc.file_names import given_path
 from coopoc.one_file import in_file
 from coopoc.plugins import names
-from coopoc.world.fleet import Fleet
-from coopoc.world.recording import Recording
 
 from .fetch import bring, local
 

@@ -7,14 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from scipy.optimize import minimize
 
+from coopoc import Fleet, InputError, PoseFilter, Recording, Sensors, Track, pose_nees
 from coopoc.arrays import Floats, number
-from coopoc.errors import InputError
-from coopoc.evaluate.metrics import pose_covariance, pose_nees
-from coopoc.methods.poses.pose_filter import PoseFilter
-from coopoc.methods.track import Track
-from coopoc.world.fleet import Fleet
-from coopoc.world.recording import Recording
-from coopoc.world.sensors import ANGULAR, Sensors
+from coopoc.evaluate.metrics import pose_covariance
+from coopoc.world.sensors import ANGULAR
 
 LEARNED = "velocity_std_ratio velocity_floor yaw_rate_std range_std azimuth_std speed_scale_std yaw_rate_bias_std"
 """Numbers of Sensors that are learned where they are positive."""

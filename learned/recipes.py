@@ -8,14 +8,13 @@ from typing import Any, ClassVar
 
 import torch
 
+from coopoc import InputError, Method, Outliers, Sensors
 from coopoc.arrays import check_fields, instance, one_of
-from coopoc.errors import InputError, unknown
+from coopoc.errors import unknown
 from coopoc.file_names import given_path
-from coopoc.methods.track import Method
 from coopoc.one_file import file_digest, in_file
 from coopoc.plugins import find
-from coopoc.world.outliers import Outliers
-from coopoc.world.sensors import Sensors, VelocityReading
+from coopoc.world.sensors import VelocityReading
 
 from .checkpoint import load
 from .nets.gain import Gain

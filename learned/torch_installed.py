@@ -1,6 +1,6 @@
 """What every module of learned gains needs, imported before them: an extra, as it is larger than all the rest."""
 
-from coopoc.errors import MissingLibraryError
+from coopoc import MissingLibraryError
 
 try:
     import torch as torch  # the larger one is named first

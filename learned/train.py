@@ -13,18 +13,12 @@ from typing import Any
 import numpy as np
 import torch
 
+from coopoc import V2X, Fleet, InputError, Kalman, NoiseModel, Recording, Sensors, observe
 from coopoc.arrays import listed, number
-from coopoc.errors import InputError
 from coopoc.file_names import given_path
-from coopoc.methods.kalman import Kalman
-from coopoc.methods.noise_model import NoiseModel
 from coopoc.one_file import in_file
 from coopoc.workers import leave_with
-from coopoc.world.fleet import Fleet
-from coopoc.world.recording import Recording
-from coopoc.world.sensing import observe
-from coopoc.world.sensors import Sensors, VelocityReading
-from coopoc.world.v2x import V2X
+from coopoc.world.sensors import VelocityReading
 
 from .checkpoint import Checkpoint, load, read_card, save
 from .federation.federate import Plan, federate_many

@@ -8,10 +8,10 @@ import numpy as np
 import pandas as pd
 import scipy  # its signals take half a second, and are imported where they are used
 
+from coopoc import Recording
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions
 from coopoc.world.links import wrap
-from coopoc.world.recording import Recording
 
 from .motion import MOVING
 from .residuals import Check, filtered, residual_of

@@ -8,11 +8,10 @@ import numpy as np
 import pandas as pd
 import pymap3d
 
+from coopoc import InputError, Sensors
 from coopoc.arrays import Bools
-from coopoc.errors import InputError
 from coopoc.world.fleet import columns
 from coopoc.world.links import wrap
-from coopoc.world.sensors import Sensors
 
 from ..assemble import PLANE_STD
 from .units import ANGLES, KINDS, Rows, Summary, in_group, place

@@ -7,11 +7,10 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from coopoc import V2X, Links, Recording
 from coopoc.arrays import Bools, Floats, Ints
-from coopoc.world.links import Links, spherical, wrap
-from coopoc.world.recording import Recording
+from coopoc.world.links import spherical, wrap
 from coopoc.world.sensing import schedule
-from coopoc.world.v2x import V2X
 
 from ..assemble import first_of_each
 from .motion import COURSE, Member, Steps

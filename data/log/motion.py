@@ -7,12 +7,11 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from coopoc import InputError, Sensors
 from coopoc.arrays import Bools, Floats, Ints, checked
-from coopoc.errors import InputError
 from coopoc.kernels.constant_velocity import BANK, constant_velocity
 from coopoc.world.body_frames import turned
 from coopoc.world.links import wrap
-from coopoc.world.sensors import Sensors
 
 from ..assemble import SAME, longest_gap, nearest, steps_of
 from .heading import (

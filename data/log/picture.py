@@ -6,8 +6,8 @@ from textwrap import fill
 import numpy as np
 from matplotlib.figure import Figure
 
+from coopoc import plot_recording
 from coopoc.escapes import picture
-from coopoc.plots import plot_recording
 from coopoc.world.pictures import COLORS, INK, axes
 
 from .residuals import Check

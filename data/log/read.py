@@ -9,16 +9,14 @@ from typing import Any, Literal
 import numpy as np
 import pandas as pd
 
+from coopoc import V2X, Body, Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Floats, checked, instance, named, number, one_of, refuse, texts
-from coopoc.errors import InputError, suggestion
+from coopoc.errors import suggestion
 from coopoc.file_names import given_path
 from coopoc.short_repr import short_repr
-from coopoc.world.fleet import Fleet
 from coopoc.world.fleet import columns as columns_of
 from coopoc.world.links import wrap
-from coopoc.world.recording import MEASURED, Body, Recording
-from coopoc.world.sensors import Sensors
-from coopoc.world.v2x import V2X
+from coopoc.world.recording import MEASURED
 
 from ..assemble import backward_difference, check_scale, check_size, check_time, interpolate, longest_gap
 from ..bag import STAMP, read_bag

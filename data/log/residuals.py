@@ -6,16 +6,12 @@ from typing import Any
 
 import numpy as np
 
+from coopoc import InputError, Kalman, PoseFilter, Recording, pose_start
 from coopoc.arrays import Bools, Floats
-from coopoc.errors import InputError
 from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
-from coopoc.methods.kalman import Kalman
-from coopoc.methods.poses.pose_filter import PoseFilter
 from coopoc.methods.poses.pose_inputs import SPREAD
-from coopoc.methods.poses.pose_start import pose_start
 from coopoc.world.body_frames import midway, turned
 from coopoc.world.links import spherical, stretches, wrap
-from coopoc.world.recording import Recording
 
 from .read import Log
 

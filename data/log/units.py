@@ -6,8 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import pandas as pd
 
+from coopoc import InputError
 from coopoc.arrays import Bools
-from coopoc.errors import InputError
 
 DEGREE, TURN = float(np.pi / 180), float(2 * np.pi) + 1e-3
 

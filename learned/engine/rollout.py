@@ -6,8 +6,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coopoc import InputError
 from coopoc.arrays import AnyArray, Floats, Ints
-from coopoc.errors import InputError
 
 from ..training.clients import Batch
 from ..training.schedule import Moving, Schedule, update_of

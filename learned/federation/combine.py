@@ -7,7 +7,7 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from coopoc.errors import InputError
+from coopoc import InputError
 
 from .rules import Rule
 

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coopoc import InputError, Ledger
 from coopoc.arrays import instance
-from coopoc.errors import InputError
-from coopoc.evaluate.ledger import Ledger, of_training
+from coopoc.evaluate.ledger import of_training
 from coopoc.short_repr import short_repr
 
 from ..nets.gain import Gain

@@ -9,8 +9,7 @@ from typing import TYPE_CHECKING, Any, TypeAlias
 
 import torch
 
-from coopoc.errors import InputError, MissingLibraryError
-from coopoc.fleets import load_fleet, read_log
+from coopoc import InputError, MissingLibraryError, load_fleet, read_log
 
 from ..federation.local import local_fit
 from ..recipes import Job, job_clients, untrained

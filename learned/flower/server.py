@@ -11,9 +11,8 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import torch
 from torch import Tensor
 
-from coopoc import arrays
+from coopoc import InputError, arrays
 from coopoc.arrays import one_of
-from coopoc.errors import InputError
 from coopoc.escapes import visible
 from coopoc.file_names import given_path
 

@@ -21,8 +21,8 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from coopoc import Method
 from coopoc.arrays import Floats, Ints, number
-from coopoc.methods.track import Method
 
 from ..method import LearnedGain
 from ..training.clients import Batch, Segments

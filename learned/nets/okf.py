@@ -8,8 +8,8 @@ import numpy.typing as npt
 import torch
 from torch import Tensor, nn
 
+from coopoc import InputError, Recording, Track
 from coopoc.arrays import Floats, check_fields, checked, seed_of
-from coopoc.errors import InputError
 from coopoc.kernels.compiling.waiting import clock
 from coopoc.kernels.motion import MotionNoise, own_variances
 from coopoc.kernels.solo import FixNoise
@@ -17,9 +17,9 @@ from coopoc.methods.gaps import in_stretches
 from coopoc.methods.kalman import solo_filter, solo_track
 from coopoc.methods.noise_model import check_interval
 from coopoc.methods.stream import FilterStream
-from coopoc.methods.track import Alone, Track
+from coopoc.methods.track import Alone
 from coopoc.short_repr import short_repr
-from coopoc.world.recording import Recording, Vehicles, check_recording
+from coopoc.world.recording import Vehicles, check_recording
 
 from ..training.clients import Batch, Segments
 from ..training.machine import one_core

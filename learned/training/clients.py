@@ -9,13 +9,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coopoc import V2X, Fleet, InputError, Sensors, observe
 from coopoc.arrays import AnyArray, Floats, check_fields, instance, number, one_of
-from coopoc.errors import InputError, shown
+from coopoc.errors import shown
 from coopoc.short_repr import short_repr
-from coopoc.world.fleet import Fleet
-from coopoc.world.sensing import observe
-from coopoc.world.sensors import Sensors, stream
-from coopoc.world.v2x import V2X
+from coopoc.world.sensors import stream
 
 Start = Literal["gnss", "true"]
 LONG = 9

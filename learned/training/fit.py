@@ -10,8 +10,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from coopoc import InputError
 from coopoc.arrays import Floats, Ints, check_fields, instance
-from coopoc.errors import InputError
 from coopoc.short_repr import short_repr
 from coopoc.world.sensors import stream
 

@@ -6,10 +6,9 @@ from typing import Any
 import numpy as np
 import torch
 
+from coopoc import InputError, Recording
 from coopoc.arrays import Floats, instance, one_of
-from coopoc.errors import InputError
 from coopoc.world.fleet import columns
-from coopoc.world.recording import Recording
 
 from .clients import LONG, Client, Segments, Start, check_pieces
 from .drives import MeasuredDrives
