@@ -142,7 +142,7 @@ def _largest(problem: Problem, entries: Entries, values: Floats) -> Floats:
     table = np.append(values[entries.diagonal], 0.0)[number]
     for part in (table[:, :d], table[:, d:]):
         part[:] = part.max(axis=1, initial=0.0, keepdims=True)
-    return np.asarray(table[number >= 0])
+    return table[number >= 0]
 
 
 def _inverse(system: Sparse) -> tuple[Floats, Floats]:

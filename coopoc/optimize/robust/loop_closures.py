@@ -137,7 +137,7 @@ class _Search:
         nodes = np.concatenate([problem.poses, np.setdiff1d(np.arange(len(part)), problem.poses)]).astype(np.int64)
         first = nodes[np.unique(part[nodes], return_index=True)[1]]
         first[part[np.concatenate([problem.fixed, *alone]).astype(np.int64)]] = HELD
-        return np.asarray(first[part])
+        return first[part]
 
     def ends(self, body: Ints) -> Ints:
         """(M, 2) bodies that each candidate joins, ascending; HELD is one of those of a measurement of a single

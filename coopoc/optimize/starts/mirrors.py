@@ -141,7 +141,7 @@ def crossings(places: Floats, ranges: Floats) -> Floats:
     foot = (np.linalg.pinv(gap) @ right[..., None])[..., 0]
     height = np.sqrt(np.maximum(np.square(r[:, 0]) - np.square(foot).sum(axis=1), 0.0))
     up = height[:, None] * np.linalg.svd(gap)[2][:, -1]
-    return np.asarray(np.stack([p[:, 0] + foot - up, p[:, 0] + foot + up], axis=1).reshape(-1, d))
+    return np.stack([p[:, 0] + foot - up, p[:, 0] + foot + up], axis=1).reshape(-1, d)
 
 
 def _plane(places: Floats) -> tuple[Floats, Floats]:
@@ -153,7 +153,7 @@ def _plane(places: Floats) -> tuple[Floats, Floats]:
 def _image(points: Floats, plane: tuple[Floats, Floats]) -> Floats:
     """Points (K, d) reflected at a plane."""
     middle, normal = plane
-    return np.asarray(points - 2.0 * np.outer((points - middle) @ normal, normal))
+    return points - 2.0 * np.outer((points - middle) @ normal, normal)
 
 
 def _mirrored(problem: Problem, nodes: Floats, plane: tuple[Floats, Floats]) -> Floats:
