@@ -27,7 +27,7 @@ from .methods.kalman import GNSS as GNSS
 from .methods.kalman import Kalman as Kalman
 from .methods.noise_model import NoiseModel as NoiseModel
 from .methods.poses.pose_filter import PoseFilter as PoseFilter
-from .methods.poses.pose_start import pose_start as pose_start
+from .methods.poses.pose_filter import pose_start as pose_start
 from .methods.poses.pose_stream import LandmarkMeasurement as LandmarkMeasurement
 from .methods.poses.pose_stream import OwnMeasurement as OwnMeasurement
 from .methods.star import stars as stars

@@ -31,6 +31,7 @@ from .pose_inputs import (
     pose_noise,
     to_landmarks,
 )
+from .pose_start import likely_poses
 from .pose_stream import PoseStream
 
 if TYPE_CHECKING:
@@ -116,8 +117,6 @@ class PoseFilter:
 
     def begun(self, recording: Recording) -> "PoseFilter":
         """This filter where a drive goes on after a gap: what no fix and compass show begins at `pose_start`."""
-        from .pose_start import pose_start
-
         try:
             first_poses(recording, None, fleet_members(recording))
         except InputError:
@@ -248,6 +247,42 @@ class PoseFilter:
             PASSES if self.exact else 1,
             get_args(Fusion).index(self.fusion),
         )
+
+
+def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0) -> Floats:
+    """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN of landmarks and who is absent.
+
+    With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
+    odometry until then its pose at the first step; or its ranges to three landmarks or more, by least squares. A
+    solo filter starts from each of some headings around the circle, then around the best; the one whose innovations,
+    and bearings of other vehicles from fix to fix, have the largest likelihood over the first seconds is kept, and
+    odometry leads back from where it ends. A compass leaves one. Vehicles without a fix that see fewer than two
+    landmarks come last: for them those that were found before are places, too.
+
+    Args:
+        recording: in body frames.
+        seconds: of it that are used.
+        gate: as of the filter.
+
+    Raises:
+        InputError: a vehicle that has no fix and sees neither a landmark nor a vehicle with a pose in that time.
+
+    References:
+        Thrun, Burgard, Fox, Probabilistic Robotics, 2005, section 7.5 (multi-hypothesis tracking).
+
+    >>> from coopoc import Fleet, Sensors, observe
+    >>> t = np.arange(40) * 0.1
+    >>> path = np.stack([20 * np.sin(0.3 * t), -20 * np.cos(0.3 * t), 0 * t], axis=1)[:, None]
+    >>> fleet = Fleet(("a",), t, path, np.gradient(path, 0.1, axis=0))
+    >>> exact = Sensors(gnss_std=(0.1, 0.1, 0.1), compass=False)
+    >>> begin = pose_start(observe(fleet, exact, assumed=exact, frame="body"))
+    >>> bool(abs(begin[0, 0, 3]) < 0.3)  # it sets out to the east
+    True
+    """
+    check_recording(recording, body=True)
+    steps = int(min(number("seconds", seconds, hint="30 is the default.") / recording.dt + 1.0, len(recording.t)))
+    part = recording.between(0, max(steps, 2))
+    return likely_poses(part, PoseFilter("solo", gate=gate))
 
 
 def _seen(recording: Recording, columns: Sequence[int], x: Floats, members: Sequence[int]) -> Floats:

@@ -1,16 +1,16 @@
 """First poses of vehicles that do not know theirs: several headings are tried, and the most likely one is kept."""
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
-from ...arrays import Floats, Ints, number
+from ...arrays import Floats, Ints
 from ...errors import InputError
 from ...world.body_frames import turned
 from ...world.links import to_vector, wrap
-from ...world.recording import Recording, check_recording
+from ...world.recording import Recording
 from ...world.sensors import Sensors
-from .pose_filter import PoseFilter
 from .pose_inputs import body_of, fleet_members, to_landmarks
 
 HEADINGS, SEEN = 24, 3
@@ -19,48 +19,16 @@ STEP = 2 * np.pi / HEADINGS
 """rad."""
 
 
-def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0) -> Floats:
-    """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN of landmarks and who is absent.
-
-    With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
-    odometry until then its pose at the first step; or its ranges to three landmarks or more, by least squares. A
-    solo filter starts from each of some headings around the circle, then around the best; the one whose innovations,
-    and bearings of other vehicles from fix to fix, have the largest likelihood over the first seconds is kept, and
-    odometry leads back from where it ends. A compass leaves one. Vehicles without a fix that see fewer than two
-    landmarks come last: for them those that were found before are places, too.
-
-    Args:
-        recording: in body frames.
-        seconds: of it that are used.
-        gate: as of the filter.
-
-    Raises:
-        InputError: a vehicle that has no fix and sees neither a landmark nor a vehicle with a pose in that time.
-
-    References:
-        Thrun, Burgard, Fox, Probabilistic Robotics, 2005, section 7.5 (multi-hypothesis tracking).
-
-    >>> from coopoc import Fleet, Sensors, observe
-    >>> t = np.arange(40) * 0.1
-    >>> path = np.stack([20 * np.sin(0.3 * t), -20 * np.cos(0.3 * t), 0 * t], axis=1)[:, None]
-    >>> fleet = Fleet(("a",), t, path, np.gradient(path, 0.1, axis=0))
-    >>> exact = Sensors(gnss_std=(0.1, 0.1, 0.1), compass=False)
-    >>> begin = pose_start(observe(fleet, exact, assumed=exact, frame="body"))
-    >>> bool(abs(begin[0, 0, 3]) < 0.3)  # it sets out to the east
-    True
-    """
-    check_recording(recording, body=True)
-    steps = int(min(number("seconds", seconds, hint="30 is the default.") / recording.dt + 1.0, len(recording.t)))
-    part = recording.between(0, max(steps, 2))
-    filter_ = PoseFilter("solo", gate=gate)
+def likely_poses(recording: Recording, filter_: Any) -> Floats:
+    """Poses (R, N, 4) of all vehicles at the first step, as `pose_start` says, by a solo PoseFilter."""
     begin = np.full((recording.runs, len(recording.ids), 4), np.nan)
     for run in range(recording.runs):
-        positions = np.full((len(part.t), len(part.ids), 3), np.nan)
-        positions[:, list(part.landmarks)] = part.gnss[run][:, list(part.landmarks)]
-        waiting = fleet_members(part)
+        positions = np.full((len(recording.t), len(recording.ids), 3), np.nan)
+        positions[:, list(recording.landmarks)] = recording.gnss[run][:, list(recording.landmarks)]
+        waiting = fleet_members(recording)
         while waiting:
-            column, links = _next(part, run, waiting, positions)
-            begin[run, column], positions[:, column] = _most_likely(part, run, column, links, positions, filter_)
+            column, links = _next(recording, run, waiting, positions)
+            begin[run, column], positions[:, column] = _most_likely(recording, run, column, links, positions, filter_)
             waiting.remove(column)
     return begin
 
@@ -82,7 +50,7 @@ def _next(recording: Recording, run: int, waiting: list[int], places: Floats) ->
 
 
 def _most_likely(
-    recording: Recording, run: int, column: int, links: Ints, places: Floats, filter_: PoseFilter
+    recording: Recording, run: int, column: int, links: Ints, places: Floats, filter_: Any
 ) -> tuple[Floats, Floats]:
     """First pose (4,) of a vehicle, and its positions (T, 3) m from there on, by the solo filter of most likelihood: of
     headings around the circle, then around the best of them."""
