@@ -130,13 +130,15 @@ def started(problem: Problem) -> Problem:
     """
     if not problem.poses or problem.x0 is not None:
         return problem
-    began, graph = clock(), graph_of(problem)
-    own = {name: _x0(graph, problem.poses, name) for name in contenders(graph)}
-    starts = {name: partial(placed, problem, x) for name, x in own.items()}
-    for k in range(1, PLACES if len(graph.ranges) else 1):
-        starts[f"odometry, place {k + 1}"] = partial(placed, problem, own["odometry"], k)
-    at = problem.replace_unchecked(x0=frozen(starts["odometry"]()))
-    at, won = _raced(graph, at, starts, lambda x: False)
+    began = clock()
+    with np.errstate(all="ignore"):  # the status of what is beyond all numbers is that of the answer
+        graph = graph_of(problem)
+        own = {name: _x0(graph, problem.poses, name) for name in contenders(graph)}
+        starts = {name: partial(placed, problem, x) for name, x in own.items()}
+        for k in range(1, PLACES if len(graph.ranges) else 1):
+            starts[f"odometry, place {k + 1}"] = partial(placed, problem, own["odometry"], k)
+        at = problem.replace_unchecked(x0=frozen(starts["odometry"]()))
+        at, won = _raced(graph, at, starts, lambda x: False)
     return at.replace_unchecked(search=won._replace(seconds=clock() - began))
 
 

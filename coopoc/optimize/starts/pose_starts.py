@@ -30,6 +30,8 @@ ROWS = 300
 """Fixes and ranges of a body that are used, spread over all."""
 FEW, MANY = 10, 100
 """Steps from each turn of a body, and from the best of these."""
+LARGEST = 1e100
+"""Standard deviations, whose square is a number."""
 APART = 0.1
 """Share of the size of a body by which places of it differ."""
 LEVER = 1e-2
@@ -152,7 +154,8 @@ def _fitted(space: Space, body: Floats, fixes: tuple[Floats, ...], ranges: tuple
     def residuals(v: Floats, turn: Floats) -> Floats:
         off = (moved(v, turn, seen) - fix) * precise[:, None]
         length = np.linalg.norm(moved(v, turn, near) - places, axis=1)
-        return np.concatenate([off.ravel(), (length - distance) * weight])
+        every = np.concatenate([off.ravel(), (length - distance) * weight])
+        return np.asarray(np.clip(np.nan_to_num(every), -LARGEST, LARGEST))
 
     def fitted(v: Floats, turn: Floats, steps: int) -> tuple[float, Floats, Floats]:
         end = least_squares(residuals, v, args=(turn,), max_nfev=steps)
