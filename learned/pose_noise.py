@@ -47,7 +47,7 @@ def log_score(track: Track, fleet: Fleet) -> Floats:
         track: of a pose filter.
         fleet: the truth.
     """
-    return -0.5 * (pose_nees(track, fleet) + np.linalg.slogdet(pose_covariance(track))[1])
+    return np.asarray(-0.5 * (pose_nees(track, fleet) + np.linalg.slogdet(pose_covariance(track))[1]))
 
 
 def fit_pose_noise(tasks: Sequence[PoseTask], start: Sensors, evaluations: int = 150) -> Sensors:
