@@ -275,19 +275,22 @@ def _own(graph: Graph) -> Bools:
 
 
 def _roots(graph: Graph) -> list[tuple[int, Floats, Floats]]:
-    """Poses with a prior at that, then each robot's first."""
-    priors = graph.pose_prior
+    """Poses with a prior at that, then each robot's first, and the first of each part that its odometry joins."""
+    priors, poses = graph.pose_prior, np.flatnonzero(graph.is_pose)
     roots = [(int(i), priors.position[k], priors.rotation[k]) for k, i in enumerate(priors.nodes[:, 0])]
-    robots = [places for places in graph.robots.values() if len(places)]
+    part = parts(len(graph.names), graph.relative_pose.nodes[_own(graph)])[poses]
+    _, first, count = np.unique(part, return_index=True, return_counts=True)
+    robots = [int(places[0]) for places in graph.robots.values()]
+    firsts = [*robots, *np.setdiff1d(poses[first[count > 1]], robots).tolist()]
     around = float(graph.ranges.distance.mean()) if len(graph.ranges) else 1.0
-    for k, places in enumerate(robots):
-        first, angle = int(places[0]), 2.0 * np.pi * k / len(robots)
-        if np.isfinite(graph.position[first]).all():
-            roots.append((first, graph.position[first], graph.rotation[first]))
+    for k, node in enumerate(firsts):
+        angle = 2.0 * np.pi * k / len(firsts)
+        if np.isfinite(graph.position[node]).all() and (graph.guess or k < len(robots)):
+            roots.append((node, graph.position[node], graph.rotation[node]))
         else:
             at = np.zeros(graph.dimension)
             at[:2] = around * np.cos(angle), around * np.sin(angle)
-            roots.append((first, at, np.eye(graph.dimension)))
+            roots.append((node, at, np.eye(graph.dimension)))
     return roots
 
 
