@@ -120,7 +120,6 @@ def test_all_unknown_kinds_are_named_at_once(tmp_path):
         {"ignore": 3},
         {"antenna": (1, 2)},
         {"origin": (1, 2)},
-        {"origin": (1, 181, 0)},
         {"any_scale": "x"},
         {"dt": "x"},
     ],

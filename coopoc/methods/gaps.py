@@ -15,7 +15,7 @@ from .track import Method, Track
 def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
     """A method's `__call__` that begins anew after each gap of an ego; its estimate is NaN where there is none.
 
-    A position x0 or poses that are known at first hold for a stretch that begins there.
+    A position x0 that is known at first holds for a stretch that begins there.
 
     >>> from coopoc import Fleet, Kalman, Sensors, observe
     >>> fleet = Fleet(("a",), np.arange(6) / 10, np.zeros((6, 1, 3)), np.zeros((6, 1, 3)))
@@ -28,22 +28,21 @@ def in_stretches(call: Callable[..., Track]) -> Callable[..., Track]:
 
     @wraps(call)
     def across(self: Any, recording: Recording, egos: Vehicles = (0,)) -> Track:
-        columns = check_recording(recording, body=hasattr(self, "begun")).observing(egos)
+        columns = check_recording(recording).observing(egos)
         whole = (0, len(recording.t))
         cuts = {column: recording.stretches(column, fixed=needs_fix(self)) for column in columns}
         if all(pieces in ((), (whole,)) for pieces in cuts.values()):
-            return _noted(call(self, recording, egos))
+            return noted(call(self, recording, egos))
         for column, pieces in cuts.items():
             if not pieces:
                 never = "is never there at two steps in a row, with a fix"
                 raise InputError("egos", repr(recording.ids[column]), never, "Choose another ego.")
         parts = {
-            (column, cut): call(_from(self, cut[0], part), part, [recording.ids[column]])
+            (column, cut): call(_from(self, cut[0]), recording.between(*cut), [recording.ids[column]])
             for column in columns
             for cut in cuts[column]
-            for part in [recording.between(*cut)]
         }
-        return _noted(_joined(recording, columns, parts))
+        return noted(_joined(recording, columns, parts))
 
     return across
 
@@ -58,7 +57,8 @@ def needs_fix(method: Any) -> bool:
     return bool(getattr(method, "needs_fix", True))
 
 
-def _noted(track: Track) -> Track:
+def noted(track: Track) -> Track:
+    """The track with a note of its gaps; InputError for an ego that has no estimate at all."""
     if track.absent is None:
         return track
     for ego in np.array(track.egos)[track.absent.all(axis=0)].tolist():
@@ -68,10 +68,8 @@ def _noted(track: Track) -> Track:
     return replace(track, notes=tuple(dict.fromkeys((*track.notes, gaps))))
 
 
-def _from(method: Any, start: int, part: Recording) -> Any:
-    """The method in a part that begins later, where a first position or pose is not known."""
-    if start > 0 and hasattr(method, "begun"):
-        return method.begun(part)
+def _from(method: Any, start: int) -> Any:
+    """The method at a later start, where a first position is not known."""
     return replace(method, x0=None) if start > 0 and getattr(method, "x0", None) is not None else method
 
 

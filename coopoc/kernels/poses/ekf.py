@@ -80,7 +80,8 @@ def run_filter(
     Args:
         measured: by the members.
         noise: that is assumed.
-        begin: (R, n, 4) m and rad, poses at the first step; NaN for the first fix and compass.
+        begin: (R, S, n, 4) m and rad, poses at the first step, and where a member begins for the s-th time after that;
+            NaN for its fix and compass there.
         spread: (4,) standard deviations of these.
         options: of the filter.
         poses: memory for the members.
@@ -122,9 +123,12 @@ def step(
             predict(poses, member, d, (own[4], own[5], own[6]), own[7], measured.dt, noise)
         elif measured.active[t, k]:
             join(poses, member, d, own, noise)
-            for i in range(4 if t == 0 else 0):
-                if not math.isnan(begin[run, k, i]):
-                    poses.x[member + i] = begin[run, k, i]
+            again = 0
+            for s in range(t):
+                again += measured.active[s + 1, k] and not measured.active[s, k]
+            for i in range(4 if again < begin.shape[1] else 0):
+                if not math.isnan(begin[run, again, k, i]):
+                    poses.x[member + i] = begin[run, again, k, i]
                     poses.cov[member + i, member + i] = spread[i] * spread[i]
     for k in range(measured.own.shape[2]):
         own = measured.own[run, t, k]

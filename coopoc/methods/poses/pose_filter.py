@@ -1,6 +1,7 @@
 """The pose filter: extended Kalman filter of position and heading of a vehicle alone or of the whole fleet."""
 
 from collections.abc import Sequence
+from contextlib import suppress
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, get_args
 
@@ -18,17 +19,19 @@ from ...world.sensors import Sensors
 from ...world.v2x import NO_MESSAGE, Message
 from ..batch_smoother import CENTRE, centre
 from ..doubts import doubts
-from ..gaps import in_stretches
+from ..gaps import noted
 from ..track import Track
 from .pose_inputs import (
     POSE,
     SPREAD,
     UPLOAD,
+    body_of,
     check_spread,
     first_poses,
     fleet_members,
     pose_measurements,
     pose_noise,
+    present,
     to_landmarks,
 )
 from .pose_start import likely_poses
@@ -40,6 +43,8 @@ if TYPE_CHECKING:
 
 PASSES = 3
 """Of the iterated filter: from one more on nothing moves by a hundredth of its standard deviation."""
+START, START_GATE = 30.0, 5.0
+"""s of a drive that show a first pose, and standard deviations of an innovation there."""
 Unit = Literal["solo", "fleet"]
 Fusion = Literal["joint", "naive", "intersection"]
 
@@ -90,7 +95,6 @@ class PoseFilter:
     spread: tuple[float, ...] = SPREAD
     assumed: Sensors | None = None
     name: str = ""
-    needs_fix = False
 
     __repr__ = short_repr
 
@@ -115,15 +119,6 @@ class PoseFilter:
             return NO_MESSAGE
         return UPLOAD if self.fusion == "joint" else POSE
 
-    def begun(self, recording: Recording) -> "PoseFilter":
-        """This filter where a drive goes on after a gap: what no fix and compass show begins at `pose_start`."""
-        try:
-            first_poses(recording, None, fleet_members(recording))
-        except InputError:
-            return replace(self, begin=pose_start(recording))
-        return replace(self, begin=None)
-
-    @in_stretches
     def __call__(self, recording: Recording, egos: Vehicles = (0,)) -> Track:
         """Track of the egos.
 
@@ -138,13 +133,13 @@ class PoseFilter:
                 raise InputError("egos", repr(recording.ids[column]), "is a landmark", "Its position is known.")
         received, sent = moved = np.zeros((2, recording.runs, len(columns)))
         if self.unit == "solo":
-            begin = first_poses(recording, self.begin, columns)
+            begin = self.begins(recording, columns)
             alone = [self.run_filter(recording, [c], to_landmarks(recording, links.of(c)), begin) for c in columns]
             x, cov = (np.concatenate(parts, axis=2) for parts in list(zip(*alone, strict=True))[:2])
             theirs = _seen(recording, columns, x, [])
         else:
             members = fleet_members(recording)
-            begin = first_poses(recording, self.begin, members)
+            begin = self.begins(recording, members)
             own = np.flatnonzero(~np.isin(links.observer, recording.landmarks))
             in_time = (recording.arrival == links.step) | np.isin(links.neighbour, recording.landmarks)
             x, cov, _ = self.run_filter(recording, members, own, begin, in_time[:, own])
@@ -162,7 +157,8 @@ class PoseFilter:
         extras: dict[str, Floats] = {}
         for k, name in enumerate(("speed_scale", "yaw_rate_bias", "range_offset")[: x.shape[-1] - 4], 4):
             extras |= {name: x[..., k], f"{name}_std": np.sqrt(cov[..., k, k])}
-        return Track(
+        absent = ~present(recording)[:, columns]
+        track = Track(
             recording.t,
             tuple(columns),
             *positions,
@@ -174,7 +170,26 @@ class PoseFilter:
             heading_covariance=cov[..., 3, :4],
             extras=extras,
             ids=recording.ids,
+            absent=absent if absent.any() else None,
         )
+        return noted(track)
+
+    def begins(self, recording: Recording, members: Sequence[int]) -> Floats:
+        """Poses (R, S, N, 4) at the first step, and where members begin after a gap: NaN where a fix and a compass are,
+        else those of `pose_start`; in a fleet NaN where it finds none."""
+        there, every = present(recording), [first_poses(recording, self.begin, members)]
+        known: Bools = np.isfinite(recording.gnss[..., 0] + body_of(recording).heading).min(axis=0)
+        for column in members:
+            starts = 1 + np.flatnonzero(there[1:, column] & ~there[:-1, column])
+            for again, start in enumerate(starts.tolist(), 1):
+                if again == len(every):
+                    every.append(np.full_like(every[0], np.nan))
+                part = recording.between(start, min(start + int(START / recording.dt) + 2, len(there)))
+                with suppress(*[InputError] * (self.unit == "fleet")):
+                    if not known[start, column] and len(part.t) > 1:
+                        one = PoseFilter("solo", gate=START_GATE)
+                        every[again][:, column] = likely_poses(part, one, [column])[:, column]
+        return np.stack(every, axis=1)
 
     def start(self, dt: float, begin: Floats | None = None) -> PoseStream:
         """This filter for a vehicle alone that is fed as it drives, one `step` of dt s after the other.
@@ -217,7 +232,7 @@ class PoseFilter:
             recording: in body frames.
             members: columns.
             links: as of `pose_measurements`, like `kept` and `landmark`.
-            begin: (R, N, 4) first poses.
+            begin: (R, N, 4) poses at the first step, or (R, S, N, 4) at it and where a member begins anew.
             kept: which links count.
             landmark: position of what they measure.
         """
@@ -228,7 +243,8 @@ class PoseFilter:
         options = self.options(noise)
         measured = pose_measurements(recording, members, links, kept, landmark)
         memory = new_poses(len(members) * options.d), new_poses(2 * options.d)
-        first, spread = np.ascontiguousarray(begin[:, members]), np.array(self.spread, dtype=float)
+        first, spread = begin.reshape(len(begin), -1, *begin.shape[-2:]), np.array(self.spread, dtype=float)
+        first = np.ascontiguousarray(first[:, :, members])
         return run_filter(measured, noise, first, spread, options, *memory)
 
     def noise(self, sensors: Sensors, dt: float) -> "PoseNoise":
@@ -249,7 +265,7 @@ class PoseFilter:
         )
 
 
-def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0) -> Floats:
+def pose_start(recording: Recording, *, seconds: float = START, gate: float = START_GATE) -> Floats:
     """Poses (R, N, 4) m and rad at the first step, for `PoseFilter(begin=...)`; NaN of landmarks and who is absent.
 
     With a heading, a vehicle's first fix or first range and bearing of a landmark gives its pose there, and the
@@ -282,7 +298,7 @@ def pose_start(recording: Recording, *, seconds: float = 30.0, gate: float = 5.0
     check_recording(recording, body=True)
     steps = int(min(number("seconds", seconds, hint="30 is the default.") / recording.dt + 1.0, len(recording.t)))
     part = recording.between(0, max(steps, 2))
-    return likely_poses(part, PoseFilter("solo", gate=gate))
+    return likely_poses(part, PoseFilter("solo", gate=gate), fleet_members(part))
 
 
 def _seen(recording: Recording, columns: Sequence[int], x: Floats, members: Sequence[int]) -> Floats:

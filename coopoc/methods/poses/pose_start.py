@@ -1,5 +1,6 @@
 """First poses of vehicles that do not know theirs: several headings are tried, and the most likely one is kept."""
 
+from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
 
@@ -11,7 +12,7 @@ from ...world.body_frames import turned
 from ...world.links import to_vector, wrap
 from ...world.recording import Recording
 from ...world.sensors import Sensors
-from .pose_inputs import body_of, fleet_members, to_landmarks
+from .pose_inputs import body_of, to_landmarks
 
 HEADINGS, SEEN = 24, 3
 """That are tried, around the circle and then around the best of them; and from how many places at most."""
@@ -19,13 +20,13 @@ STEP = 2 * np.pi / HEADINGS
 """rad."""
 
 
-def likely_poses(recording: Recording, filter_: Any) -> Floats:
-    """Poses (R, N, 4) of all vehicles at the first step, as `pose_start` says, by a solo PoseFilter."""
+def likely_poses(recording: Recording, filter_: Any, members: Sequence[int]) -> Floats:
+    """Poses (R, N, 4) of some vehicles at the first step, as `pose_start` says, by a solo PoseFilter."""
     begin = np.full((recording.runs, len(recording.ids), 4), np.nan)
     for run in range(recording.runs):
         positions = np.full((len(recording.t), len(recording.ids), 3), np.nan)
         positions[:, list(recording.landmarks)] = recording.gnss[run][:, list(recording.landmarks)]
-        waiting = fleet_members(recording)
+        waiting = list(members)
         while waiting:
             column, links = _next(recording, run, waiting, positions)
             begin[run, column], positions[:, column] = _most_likely(recording, run, column, links, positions, filter_)

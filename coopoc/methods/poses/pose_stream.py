@@ -105,7 +105,7 @@ class PoseStream:
         from ...kernels.poses.scalar_update import new_poses
 
         self._noise, self._options, self._spread, self._dt = noise, options, spread, dt
-        self._begin, self._later, self._heading = begin[None, None], False, np.nan
+        self._begin, self._later, self._heading = begin[None, None, None], False, np.nan
         self._poses, self._pair = new_poses(options.d), new_poses(2 * options.d)
 
     def step(self, own: OwnMeasurement, landmarks: Sequence[LandmarkMeasurement] = ()) -> PoseEstimate:
