@@ -188,6 +188,20 @@ def test_a_truth_with_another_clock_is_named(folders, tmp_path):
     assert max(off) < 3
 
 
+def test_odometry_that_alone_is_late_is_no_clock(tmp_path):
+    """car1's velocities are stamped 0.4 s late; all that car2 has measured is."""
+    fleet = drive(4, gap=15.0)
+    frame = long(observed(fleet), messages=False)
+    own, moving = frame["vehicle"].eq("car1"), frame["kind"].isin(["vx", "vy"])
+    frame.loc[(own & moving) | frame["vehicle"].eq("car2"), "t"] += 0.4
+    write(truth(fleet), tmp_path / "truth.csv")
+    write(frame, tmp_path / "measurements.csv")
+    found = " ".join(check(read_log(tmp_path)).warnings)
+    assert re.search(r"car1: its odometry is 0\.\d+ \+- \S+ s later than the truth, its fixes are not", found)
+    assert "clock=car1" not in found
+    assert re.search(r"clock=car2:0\.[34]", found)
+
+
 WRONG = {
     "speeds in km/h": (["vx", "vy"], lambda v: 3.6 * v, r"fixes travel 0\.2\d times as far.*speed_kmh"),
     "speeds in miles an hour": (

@@ -16,6 +16,7 @@ from ..kernels.stars.messages import FORGOTTEN
 from ..world.fleet import Fleet
 from ..world.inbox import Inbox
 from ..world.recording import Recording, Vehicles, check_recording
+from ..world.sensors import Sensors
 from ..world.v2x import Message
 from .calibration import calibrated, scaled
 from .egos import Estimate, assumptions, follow_egos, measurements, relative_noise
@@ -92,9 +93,11 @@ ON_ROADS = Priors(
     absent=-np.inf,
     exact=-4.0,
     fix=2.0,
-    fix_gate=3.5,
+    fix_gate=5.5,
 )
 """Of measurements that are not simulated: hardly any odometry is without such errors."""
+STATED = ON_ROADS._replace(exact=0.0, fix=1.5)
+"""Of those whose log states how far its odometry errs: that none errs otherwise is as likely as not."""
 NO_ODOMETRY = Priors(heading=0.0, scale=0.0, clock=0.0, compass=0.0, offset=0.0, slip=0.0)
 """Of velocities that fixes have shown."""
 
@@ -158,7 +161,8 @@ class CooperativeFilter(Checked):
         noise_model: "identity", "nominal" or a NoiseModel, whose errors that last (fixes, compass, ranges) are states.
         priors: of errors; the default was chosen on development worlds and validation tasks of CL-Bench, and is
             ON_ROADS where measurements are not simulated: there errors of odometry are assumed until the whole fleet
-            speaks for none, and fixes to err twice as far as is stated, together for a while.
+            speaks for none, and fixes to err twice as far as is stated, together for a while; STATED where the log says
+            how far its odometry errs.
         calibration: what `fitted` has found, a note of its Tracks.
 
     References:
@@ -261,7 +265,8 @@ class CooperativeFilter(Checked):
         Raises:
             InputError: no vehicle that drives from a fix on; a truth of other vehicles or times.
         """
-        sensors, priors = check_recording(recording).sensors, ON_ROADS if recording.measured else Priors()
+        sensors = check_recording(recording).sensors
+        priors = on_roads(sensors) if recording.measured else Priors()
         usual = {name: getattr(priors, name) for name in ("fix", "heading", "scale", "lasts")} | {"motion": 1.0}
         if truth is None:
             del usual["fix"]
@@ -350,8 +355,13 @@ def priors_of(method: CooperativeFilter, noise_model: NoiseModel, measured: bool
     if sensors is None:
         return AS_STATED
     if measured and priors == Priors():
-        priors = NO_ODOMETRY if sensors.velocity_reading == "fixes" else ON_ROADS
+        priors = NO_ODOMETRY if sensors.velocity_reading == "fixes" else on_roads(sensors)
     return priors
+
+
+def on_roads(sensors: Sensors) -> Priors:
+    """Priors of measurements: a share of the speed is what is assumed where none is stated."""
+    return ON_ROADS if sensors.velocity_std_ratio > 0.0 else STATED
 
 
 def model_of(noise_model: NoiseModel, priors: Priors) -> Model:

@@ -287,11 +287,25 @@ def _of_clocks(c: Check) -> list[str]:
         if ahead
     ] + [
         f"{row['vehicle']}: its odometry is {abs(row['late_s']):.3f} +- {row['late_s_error']:.3f} s "
-        f"{'later' if row['late_s'] > 0 else 'earlier'} than the truth: "
-        f"its clock differs from that of the truth. clock={row['vehicle']}:{row['late_s']:.3f} mends it."
+        f"{'later' if row['late_s'] > 0 else 'earlier'} than the truth{_with_fixes(c, row)}"
         for row in c.vehicles
         if _beyond(row, "late_s", max(LATE, 0.5 * c.world.dt)) and not c.ahead[c.world.ids.index(row["vehicle"])]
     ]
+
+
+def _with_fixes(c: Check, row: Mapping[str, Any]) -> str:
+    """Whether the fixes of a vehicle are as late beside the truth as its odometry, and what mends it."""
+    off, made = causes(c)
+    name, late = row["vehicle"], row["late_s"]
+    column, mends = c.world.ids.index(name), f"clock={name}:{late:.3f}"
+    used = np.isfinite(off[:, column])
+    noise = float(np.hypot(*c.world.sensors.fix_std[:2])) * max(row.get("nis") or 1.0, 1.0) ** 0.5
+    (ahead,), (unsure,) = factors(off[used, column], made[2:, used, column].T, noise)
+    if abs(ahead + late) > SURELY * np.hypot(unsure, row["late_s_error"]):
+        return ", its fixes are not: is a velocity the mean of the interval before its stamp, which is half of it late?"
+    if abs(ahead) > SURELY * unsure:
+        return f", as its fixes are: its clock differs from that of the truth. {mends} mends it."
+    return f": its clock differs, which {mends} mends, or velocities are means of the interval before their stamps."
 
 
 def _of_fixes(c: Check) -> list[str]:
