@@ -93,7 +93,7 @@ ON_ROADS = Priors(
     absent=-np.inf,
     exact=-4.0,
     fix=2.0,
-    fix_gate=5.5,
+    fix_gate=6.0,
 )
 """Of measurements that are not simulated: hardly any odometry is without such errors."""
 STATED = ON_ROADS._replace(exact=0.0, fix=1.5)
