@@ -58,7 +58,6 @@ def compare(known: str, recording: Recording) -> None:
     there = np.isfinite(recording.velocity).all(axis=(0, 1, 3)) & np.isfinite(recording.gnss[:, 0]).all(axis=(0, 2))
     egos = np.flatnonzero(there).tolist()
     track = textbook(BatchSmoother(model))(recording, egos)
-    assert track.covariance is not None
     for run in range(recording.runs):
         x, P = batch_smoother(recording, noise, run, held(recording.gnss[run]))
         for e, n in enumerate(egos):
@@ -125,7 +124,6 @@ def problem(recording: Recording, known: NoiseModel) -> Any:
     steps, vehicles = recording.gnss.shape[1:3]
     motion_std = np.sqrt(np.broadcast_to(known.process_variance(recording), recording.gnss.shape)[0, 1:])
     links, seen = recording.links, recording.relative[0]
-    assert known.sensors is not None
     std = known.sensors.relative_std
 
     def residual(flat: Any) -> Any:

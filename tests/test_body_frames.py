@@ -29,7 +29,6 @@ def test_turned_by_the_compass_the_draws_are_those_of_the_world(crossing, body):
 def test_exact_sensors_give_the_true_motion_back(crossing):
     exact = co.Sensors(velocity_std_ratio=0.0, yaw_rate_std=0.0)
     seen = co.observe(crossing, exact, frame="body")
-    assert seen.body is not None
     assert np.allclose(in_world(seen).velocity[0, 1:], crossing.velocity[1:], atol=1e-12)
     heading = true_heading(crossing)
     assert np.allclose(np.diff(heading, axis=0), crossing.dt * seen.body.yaw_rate[0, 1:], atol=1e-12)
@@ -40,8 +39,6 @@ def test_lasting_errors_of_odometry_have_their_spread_and_change_no_other_draws(
         co.observe(crossing, co.Sensors(**more), runs=400, frame="body")
         for more in ({}, {"yaw_rate_bias_std": 0.05, "speed_scale_std": 0.1})
     )
-    assert plain.body is not None
-    assert biased.body is not None
     assert np.array_equal(plain.gnss, biased.gnss)
     assert np.array_equal(plain.body.heading, biased.body.heading)
     bias = biased.body.yaw_rate - plain.body.yaw_rate
@@ -87,11 +84,8 @@ def test_position_methods_refuse_body_frames(body):
 def test_a_recording_in_body_frames_is_cut_and_stored_as_any(body, tmp_path):
     save_recording(body, tmp_path / "body.npz")
     again, _ = read_recording(tmp_path / "body.npz")
-    assert again.body is not None
-    assert body.body is not None
     assert np.array_equal(again.body.yaw_rate, body.body.yaw_rate)
     part = body.between(10, 20).of_runs(slice(1, 3))
-    assert part.body is not None
     assert np.array_equal(part.body.heading, body.body.heading[1:3, 10:20])
 
 

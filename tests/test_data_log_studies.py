@@ -133,7 +133,6 @@ def test_a_recording_is_stored_bit_by_bit(tmp_path):
     save_recording(recording, tmp_path / "a.npz", fleet)
     read, true = read_recording(tmp_path / "a.npz")
     assert digest(read) == digest(recording)
-    assert true is not None
     assert true.digest == fleet.digest
     save_recording(read, tmp_path / "b.npz", true)
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
@@ -147,7 +146,6 @@ def test_innovations_are_filterpys(folders):
     rec = co.read_log(folders / "with").recording
     track = co.Kalman()(rec, ["car0"])
     found, squares = fix_innovations(track, rec), normalised_innovations(track, rec)
-    assert squares is not None
     q = rec.sensors.motion_std(rec.velocity, rec.dt)[0, :, 0] ** 2
     kf = KalmanFilter(dim_x=3, dim_z=3, dim_u=3)
     kf.x, kf.F, kf.H, kf.B = rec.gnss[0, 0, 0], np.eye(3), np.eye(3), rec.dt * np.eye(3)
@@ -194,12 +192,11 @@ def test_odometry_that_alone_is_late_is_no_clock(tmp_path):
     """car1's velocities are stamped 0.4 s late; all that car2 has measured is."""
     fleet = drive(4, gap=15.0)
     frame = long(observed(fleet), messages=False)
-    own, moving = frame["vehicle"].eq("car1"), frame["kind"].isin(["vx", "vy"])
-    frame.loc[(own & moving) | frame["vehicle"].eq("car2"), "t"] += 0.4
+    late = frame["vehicle"].eq("car1") & frame["kind"].isin(["vx", "vy"]) | frame["vehicle"].eq("car2")
+    write(frame.assign(t=frame["t"] + 0.4 * late), tmp_path / "measurements.csv")
     write(truth(fleet), tmp_path / "truth.csv")
-    write(frame, tmp_path / "measurements.csv")
     found = " ".join(check(read_log(tmp_path)).warnings)
-    assert re.search(r"car1: its odometry is 0\.\d+ \+- \S+ s later than the truth, its fixes are not", found)
+    assert re.search(r"car1: its odometry is \S+ \+- \S+ s later than the truth, its fixes are not", found)
     assert "clock=car1" not in found
     assert re.search(r"clock=car2:0\.[34]", found)
 

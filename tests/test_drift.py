@@ -123,5 +123,4 @@ def test_errors_that_last_and_are_not_told_are_in_the_covariance(most):
     assert levels[1][1] > 10 * levels[0][1]
     late = replace(seen, gnss=np.where((np.arange(500) < 200)[:, None, None], drawn[0].gnss, seen.gnss))
     shown = CooperativeFilter()(late, egos).covariance
-    assert shown is not None
     assert shown[:, 450:, :, 0, 0].mean() > 5 * shown[:, 150:200, :, 0, 0].mean()

@@ -60,8 +60,6 @@ def example():
 
 def imported(name: str) -> ModuleType:
     spec = importlib.util.spec_from_file_location(name, ROOT / "examples" / f"{name}.py")
-    assert spec is not None
-    assert spec.loader is not None
     sys.modules[name] = importlib.util.module_from_spec(spec)
     spec.loader.exec_module(sys.modules[name])
     return sys.modules[name]
@@ -100,7 +98,6 @@ def checked(path: Path, job: Job, fleet: Fleet) -> Mapping[str, Any]:
     """The card of a checkpoint whose weights are, round by round, NumPy's average of what the clients that counted
     made."""
     recipe, found = job.recipe, load(path)
-    assert found.history is not None
     for row, theta, before in zip(found.card["history"][1:], found.history[1:], found.history[:-1], strict=True):
         own = [c for c in job_clients(job, fleet) if c.name not in row["absent"].keys() | row["rejected"].keys()]
         fitted = [

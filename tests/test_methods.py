@@ -97,7 +97,6 @@ def test_the_floor_of_a_range_is_the_spread_of_its_arc(formation):
     seen = observe(formation, Sensors(range_std=0.01, azimuth_std=0.1, inclination_std=0.05), V2X(2))
     seen = replace(seen, relative=np.where([True, False, False], 20.0, seen.relative))
     known = resolve("nominal", seen).sensors
-    assert known is not None
     arc = 20.0 * np.hypot(0.1**2, 0.05**2) / np.sqrt(2)
     assert known.range_std == pytest.approx(np.hypot(arc, 0.01), rel=1e-9)
 
@@ -122,7 +121,6 @@ def test_absent_neighbour_is_left_out_and_absent_ego_not_estimated(crossing):
     for make in METHODS.values():
         assert np.isfinite(make("nominal")(recording, [0]).x).all()
     absent = Kalman()(recording, [1]).absent
-    assert absent is not None
     np.testing.assert_array_equal(absent[:, 0], np.isnan(recording.velocity[0, :, 1, 0]))
 
 

@@ -79,7 +79,6 @@ def test_the_correction_is_the_velocity_of_filterpys_filter():
     velocity[:, BEGINS:] = turned(velocity[:, BEGINS:], np.full(velocity[:, BEGINS:].shape[:-1], 0.5))
     broken, known = replace(seen, velocity=velocity), NoiseModel.nominal(seen.sensors)
     corrected, noise = with_odometry(broken, EGOS, known)
-    assert noise.extra is not None
     by = (corrected.velocity - velocity)[0, :, EGOS[0], :2]
     peer, level, u = KalmanFilter(dim_x=4, dim_z=2), UNKNOWN, velocity[0, :, EGOS[0], :2]
     peer.x, peer.P = np.array([*seen.gnss[0, 0, EGOS[0], :2], 0.0, 0.0]), np.diag([12.25, 12.25, 1.0, 1.0])

@@ -35,7 +35,6 @@ LATE = co.V2X(max_neighbours=3, radius=40.0, rate=5.0, loss=0.3, latency=0.2)
 def with_gaps(recording: co.Recording, seed: int = 0) -> co.Recording:
     """A third of the fixes and compasses after the first step, and of each relative component, are missing."""
     rng, body = np.random.default_rng(seed), recording.body
-    assert body is not None
     gnss, heading, relative = recording.gnss.copy(), body.heading.copy(), recording.relative.copy()
     moving = ~np.isin(np.arange(len(recording.ids)), recording.landmarks)
     for values in (gnss, heading):
@@ -177,7 +176,6 @@ def landmark_only(steps: int = 12, **noise: Any) -> co.Recording:
 
 def own_of(recording: co.Recording, run: int, t: int, column: int) -> co.OwnMeasurement:
     """What a vehicle measured of itself at a step."""
-    assert recording.body is not None
     rate, heading = (values[run, t, column] for values in (recording.body.yaw_rate, recording.body.heading))
     return co.OwnMeasurement(recording.velocity[run, t, column], rate, recording.gnss[run, t, column], heading)
 

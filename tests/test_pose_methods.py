@@ -88,8 +88,6 @@ def test_scale_and_bias_are_found_where_they_act():
     wrong = replace(WHITE, yaw_rate_bias_std=0.05, speed_scale_std=0.05, gnss_std=(0.5,) * 3)
     seen = observed(fleet, wrong, runs)
     exact = observed(fleet, replace(wrong, yaw_rate_bias_std=0.0), runs)
-    assert seen.body is not None
-    assert exact.body is not None
     bias = (seen.body.yaw_rate - exact.body.yaw_rate)[:, -1, 0]
     track = co.PoseFilter("solo", lasting=True)(seen, [0])
     found, std = (track.extras[name][:, -1, 0] for name in ("yaw_rate_bias", "yaw_rate_bias_std"))

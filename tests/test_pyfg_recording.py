@@ -37,7 +37,6 @@ def test_odometry_and_ranges_are_those_of_the_file(tiers):
     assert seen.sensors.range_std == pytest.approx(0.04, abs=0.005)
     assert seen.sensors.velocity_std_ratio == 0
     motion, rate = body_motion(fleet)
-    assert seen.body is not None
     assert np.corrcoef(seen.velocity[0, 1:, :4, 0].ravel(), motion[1:, :4, 0].ravel())[0, 1] > 0.75
     assert np.corrcoef(seen.body.yaw_rate[0, 1:, :4].ravel(), rate[1:, :4].ravel())[0, 1] > 0.5
 

@@ -118,8 +118,6 @@ def assert_is_the_oracle(method: Method, oracle: Callable[..., Any], recording: 
     if isinstance(method, MSMV):
         sent |= {"growth": (0.0, 1.0), "acceleration_std": 0.0}
     steps = list(stars(recording, ego, known, method.message, **sent))
-    assert track.covariance is not None
-    assert track.neighbours is not None
     for run in range(recording.runs):
         each = [messages.members(star, run) for star in steps]
         x, cov, *others = oracle(method, recording, each)

@@ -131,7 +131,6 @@ def test_a_front_joins_what_no_cheaper_method_beats(results):
 def test_curves_draw_numbers_of_their_selections(results):
     panel = Panel({k: {"max_neighbours": k} for k in (0, 2, 10, 99)}, {"noise_model": "fitted"}, "a title")
     plot = figures.curves(results, [panel], LINES, "c", levels=[GNSS])
-    assert plot is not None
     joint, level = plot.figure.axes[0].lines  # the bound has another noise model, and no K = 99 was run
     expected = results.frame.query("method == 'joint'").groupby("max_neighbours")["rt_le_m"].mean()
     assert_allclose(joint.get_ydata(), expected.to_numpy())
@@ -139,7 +138,6 @@ def test_curves_draw_numbers_of_their_selections(results):
     assert figures.curves(results, [panel], [{"method": "okf"}], "c") is None
     mine, alike = {"method": "kalman", "label": "mine"}, [LINES[0], dict(LINES[0])]
     both = figures.curves(results, [panel], [*alike, mine], "c")
-    assert both is not None
     assert [text.get_text() for text in both.figure.axes[0].get_legend().get_texts()][1:] == ["mine"]
 
 
@@ -155,7 +153,6 @@ def test_every_line_that_coincides_is_named(results):
     plot = figures.curves(
         replace(results, frame=frame), [Panel({k: {"max_neighbours": k} for k in (0, 2)})], lines, "c"
     )
-    assert plot is not None
     first, *_ = plot.figure.axes[0].get_legend().get_texts()
     assert first.get_text() == "KF\nidentity = FedKalmanNet\nfitted = OKF"
 

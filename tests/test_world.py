@@ -86,7 +86,6 @@ def test_float32_is_refused_and_unwrapped_headings_are_not():
         replace(fleet, position=(circles + np.array([5e5, 5.8e6, 0])).astype(np.float32))
     late = observe(fleet, S2, V2X(2), frame="body").between(200, 300)
     body = late.body
-    assert body is not None
     unwrapped = replace(late, body=Body(body.yaw_rate, np.unwrap(body.heading, axis=1) + 12 * np.pi))
     assert not late.unlikely + unwrapped.unlikely
     stream = PoseFilter("solo", assumed=S2).start(0.1)
@@ -102,7 +101,6 @@ def test_what_is_unlikely_stands_in_the_notes_of_recording_and_track():
     for right in (world, body, observe(town, replace(S2, heading_std=0.1, yaw_rate_bias_std=0.02), frame="body")):
         assert not right.unlikely
     own = body.body
-    assert own is not None
     motions = r"contradict each other in \d+ % of the drive: velocities are in m/s"
     wrong = [
         (motions, replace(world, velocity=3.6 * world.velocity)),
