@@ -18,6 +18,8 @@ HEADINGS, SEEN = 24, 3
 """That are tried, around the circle and then around the best of them; and from how many places at most."""
 STEP = 2 * np.pi / HEADINGS
 """rad."""
+ELSEWHERE, RIVAL = 3.1 * STEP, 9.0
+"""rad, and cost above the least, by which another heading makes one that bearings alone give a doubtful one."""
 
 
 def likely_poses(recording: Recording, filter_: Any, members: Sequence[int]) -> Floats:
@@ -35,15 +37,19 @@ def likely_poses(recording: Recording, filter_: Any, members: Sequence[int]) -> 
 
 
 def _next(recording: Recording, run: int, waiting: list[int], places: Floats) -> tuple[int, Ints]:
-    """The vehicle whose pose is found next, and its links that count: those to landmarks of one that has a fix or sees
-    two of them; else, of the one with most, those to all whose places `places` (T, N, 3) m are finite."""
+    """The vehicle whose pose is found next, and its links that count: those to landmarks of one that has a fix, sees
+    two of them or has bearings of AIMED; else, of the one with most, those to all whose `places` (T, N, 3) m are
+    finite."""
     every: list[Ints] = []
     for column in waiting:
         links = recording.links.of(column)
         marks = to_landmarks(recording, links)
-        whole = marks[np.isfinite(recording.relative[run, marks, :2]).all(axis=1)]
+        there = np.isfinite(recording.relative[run, marks])
+        whole, aimed = (
+            len(np.unique(recording.links.neighbour[marks[each]])) for each in (there[:, :2].all(axis=1), there[:, 1])
+        )
         fix = np.isfinite(recording.gnss[run, :, column, 0]).any()
-        if fix or len(np.unique(recording.links.neighbour[whole])) > 1:
+        if fix or whole > 1 or aimed >= AIMED:
             return column, marks
         every.append(links[np.isfinite(places[recording.links.step[links], recording.links.neighbour[links], 0])])
     most = int(np.argmax([np.isfinite(recording.relative[run, links, :2]).all(axis=1).sum() for links in every]))
@@ -58,7 +64,8 @@ def _most_likely(
     landmarks = places[recording.links.step[links], recording.links.neighbour[links]]
     noise, angles = recording.sensors, STEP * np.arange(HEADINGS)
     if len(to_landmarks(recording, links)) < len(links):
-        filter_ = replace(filter_, assumed=_of_vehicles(noise, recording.relative[run, links, 0]))
+        apart, ranges = np.linalg.norm(landmarks - landmarks.mean(axis=0), axis=1), recording.relative[run, links, 0]
+        filter_ = replace(filter_, assumed=_of_vehicles(noise, np.where(np.isnan(ranges), apart, ranges)))
 
     def filtered(poses: Floats, turn: float) -> tuple[Floats, Floats]:
         """Positions and errors of odometry (H, T, d), and costs (H,), from poses (H, 4) whose headings err by that."""
@@ -69,9 +76,14 @@ def _most_likely(
         x, _, cost = own.run_filter(copies, [column], links, tried, landmark=landmarks)
         return x[:, :, 0], cost[:, 0] + _cost_of_bearings(recording, run, column, poses[:, 3], noise)
 
+    bare = np.isnan(recording.gnss[run, :, column, 0]).all() and np.isnan(recording.relative[run, links, 0]).all()
     for turn in (STEP / 2, 2 * STEP / HEADINGS):
         poses = _hypotheses(recording, run, column, links, landmarks, angles)
-        best = poses[[np.argmin(filtered(poses, turn)[1])]]
+        costs = filtered(poses, turn)[1]
+        best = poses[[np.argmin(costs)]]
+        apart = np.abs(wrap(poses[:, 3] - best[0, 3])) > ELSEWHERE
+        if bare and (costs[apart] < costs.min() + RIVAL).any():
+            raise _too_little(recording, column)
         angles = best[0, 3] + STEP * np.linspace(-1.0, 1.0, HEADINGS)
     ((x,), _) = filtered(best, STEP / 2)
     return _back(recording, run, column, x), x[:, :3]
@@ -103,7 +115,7 @@ def _reckoned(
 def _of_vehicles(noise: Sensors, ranges: Floats) -> Sensors:
     """Noise of measurements of vehicles whose places are as uncertain as a fix, at these ranges (L,) m."""
     fix = max(noise.fix_std[:2])
-    apart = max(float(np.nanmedian(ranges)), fix)
+    apart = max(float(np.median(ranges)), fix)
     return replace(
         noise,
         range_std=float(np.hypot(noise.range_std, fix)),
@@ -130,9 +142,9 @@ def _cost_of_bearings(recording: Recording, run: int, column: int, angles: Float
     return cost
 
 
-SHARP, WINDOW = 0.1, 5.0
-"""m, of landmarks beside a line, below which ranges leave the side open; and s for which ranges count once all were
-seen."""
+AIMED, SHARP, WINDOW = 4, 0.1, 5.0
+"""Landmarks to which there are bearings at least: three leave a pose open near the circle through them; m, of places
+beside a line, below which ranges leave the side open; and s for which measurements count once all were seen."""
 
 
 def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places: Floats, angles: Floats) -> Floats:
@@ -145,22 +157,7 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places
     compass = body.heading[run, 0, column]
     angles = angles if np.isnan(compass) else np.full(len(angles), compass)
     if not len(fixes) and not len(complete):
-        ranged = np.flatnonzero(np.isfinite(relative[:, 0]))
-        at, first = np.unique(places[ranged], axis=0, return_index=True)
-        if len(at) and np.linalg.matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), SHARP) > 1:
-            steps = recording.links.step[links[ranged]]
-            early = steps <= steps[first.max()] + WINDOW / recording.dt
-            moved = turned(np.broadcast_to(way[steps[early]], (len(angles), early.sum(), 3)), angles[:, None])
-            centres = places[ranged[early]] - moved  # squared ranges differ linearly
-            square = np.square(centres[..., :2]).sum(axis=-1) - relative[ranged[early], 0] ** 2
-            matrix = np.concatenate([2.0 * centres[..., :2], np.ones((*square.shape, 1))], axis=-1)
-            position = (np.linalg.pinv(matrix) @ square[..., None])[:, :2, 0]
-            return np.column_stack([position, centres[..., 2].mean(axis=1), angles])
-        actual = f"{recording.ids[column]} has no fix and sees no landmark in {recording.t[-1] - recording.t[0]:g} s"
-        allowed = (
-            "must hold a fix, or a range and bearing of a landmark or of a vehicle whose pose is found, or three ranges"
-        )
-        raise InputError("seconds", actual, allowed, "Take more seconds, or give its pose.")
+        return _of_parts(recording, run, column, links, places, angles, (turns, way))
     if (
         not len(fixes)
         and np.isnan(body.heading[run, :, column]).all()
@@ -178,3 +175,46 @@ def _hypotheses(recording: Recording, run: int, column: int, links: Ints, places
         offset = way[step] + turned(to_vector(seen), turns[step])
     position = at - turned(np.broadcast_to(offset, (len(angles), *offset.shape)), angles[:, None])
     return np.column_stack([position.reshape(-1, 3), np.repeat(angles, len(step))])
+
+
+def _of_parts(
+    recording: Recording,
+    run: int,
+    column: int,
+    links: Ints,
+    places: Floats,
+    angles: Floats,
+    odometry: tuple[Floats, ...],
+) -> Floats:
+    """(hypotheses, 4) poses that ranges alone, or bearings of landmarks alone, leave for each heading."""
+    (turns, way), relative = odometry, recording.relative[run, links]
+    standing = np.isin(recording.links.neighbour[links], recording.landmarks)
+    ranged, aimed = (np.flatnonzero(np.isfinite(relative[:, k]) & (standing | (k == 0))) for k in (0, 1))
+    for rows, is_range in ((ranged, True), (aimed, False)):
+        at, first = np.unique(places[rows], axis=0, return_index=True)
+        spread = np.linalg.matrix_rank(at[:, :2] - at[:, :2].mean(axis=0), SHARP) if len(at) else 0
+        if (spread < 2) if is_range else (len(at) < AIMED):
+            continue
+        steps = recording.links.step[links[rows]]
+        early = steps <= steps[first.max()] + WINDOW / recording.dt
+        rows, steps = rows[early], steps[early]
+        centres = places[rows] - turned(np.broadcast_to(way[steps], (len(angles), len(steps), 3)), angles[:, None])
+        if is_range:  # squared ranges differ linearly
+            right = np.square(centres[..., :2]).sum(axis=-1) - relative[rows, 0] ** 2
+            matrix = np.concatenate([2.0 * centres[..., :2], np.ones((*right.shape, 1))], axis=-1)
+        else:  # a place lies nowhere beside its direction
+            ahead = angles[:, None] + turns[steps] + relative[rows, 1]
+            matrix = np.stack([np.sin(ahead), -np.cos(ahead)], axis=-1)
+            right = (matrix * centres[..., :2]).sum(axis=-1)
+        position = (np.linalg.pinv(matrix) @ right[..., None])[:, :2, 0]
+        return np.column_stack([position, centres[..., 2].mean(axis=1), angles])
+    raise _too_little(recording, column)
+
+
+def _too_little(recording: Recording, column: int) -> InputError:
+    actual = f"{recording.ids[column]} has no fix and sees too little in {recording.t[-1] - recording.t[0]:g} s"
+    allowed = (
+        "must hold a fix, bearings of four landmarks that leave no doubt, or, of these and of vehicles whose poses "
+    )
+    allowed += "are found, a range and bearing or three ranges"
+    return InputError("seconds", actual, allowed, "Take more seconds, or give its pose.")
