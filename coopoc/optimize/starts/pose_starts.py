@@ -8,6 +8,7 @@ import numpy as np
 from ...arrays import Floats
 from ...formats.graph import NAME, Graph, edges_of
 from ...formats.values import to_orientation
+from ...world.links import wrap
 from ..model.factor import Factor, fused, taken
 from ..model.problem import Problem
 from ..model.space import Space, exp
@@ -97,7 +98,7 @@ def _measured(problem: Problem, factor: Factor) -> tuple[Floats, Floats]:
 
 def placed(problem: Problem, x: Floats, rank: int = 0) -> Floats:
     """Nodes x (n, ambient) with each body, which relative measurements hold together, turned and moved to where its
-    fixes, and its ranges to what is placed, fit best: those with most fixes first, then those with most ranges.
+    fixes, and its ranges to and bearings of what is placed, fit best: those with most fixes first, then most ranges.
 
     A body with a measured pose stays, and so does the first where nothing is placed. At last points go where bearings
     from poses cross. Of the places that ranges allow that of `rank` is taken, 0 the best.
@@ -111,6 +112,9 @@ def placed(problem: Problem, x: Floats, rank: int = 0) -> Floats:
     weight = np.concatenate([np.empty(0), *(np.linalg.norm(f.root, axis=(1, 2)) / d**0.5 for f in fixes)])
     held = [part[f.nodes[:, 0]] for f in problem.factors if f.kind.startswith("pose")]
     known, single = np.isin(part, np.concatenate([[-1], *held])), np.bincount(part)[part] == 1
+    aims = [f for f in problem.factors if f.kind == "bearing"]
+    aimed = np.concatenate([np.empty((0, 2), np.int64), *(f.nodes for f in aims)])
+    angle, sure = np.concatenate([np.empty((0, 2)), *(np.column_stack([f.z[:, 0], f.root[:, 0, 0]]) for f in aims)]).T
     here = (single & ~known)[fixed]
     x[fixed[here], :d], known[fixed[here]] = fix[here], True
     while not known.all():
@@ -119,19 +123,29 @@ def placed(problem: Problem, x: Floats, rank: int = 0) -> Floats:
         seen = np.bincount(part[own], minlength=len(x))[part]
         best = np.lexsort([~single, seen, np.bincount(part[fixed], minlength=len(x))[part], ~known])[-1]
         moving, here = np.flatnonzero(part == part[best]), part[fixed] == part[best]
+        there = (part[aimed[:, 0]] == part[best]) & known[aimed[:, 1]]
         if single[best]:
             moving = np.flatnonzero(single & ~known & (seen >= min(seen[best], d + 1)))
             for node in moving[seen[moving] > 0].tolist():
                 x[node, :d] = trilaterate(x[places[own == node], :d], ranges.distance[k[own == node]])
-        elif here.any() or seen[best]:
+        elif here.any() or seen[best] or there.any():
             rows = part[own] == part[best]
             distances = x[own[rows], :d], x[places[rows], :d], ranges.distance[k[rows]], ranges.weight[k[rows]]
-            x[moving] = _fitted(space, x[moving], (x[fixed[here], :d], fix[here], weight[here]), distances, rank)
+            bearings = x[aimed[there, 0]], x[aimed[there, 1], :d], angle[there], sure[there]
+            fixes_ = x[fixed[here], :d], fix[here], weight[here]
+            x[moving] = _fitted(space, x[moving], fixes_, distances, bearings, rank)
         known[moving] = True
     return _crossed(problem, x)
 
 
-def _fitted(space: Space, body: Floats, fixes: tuple[Floats, ...], ranges: tuple[Floats, ...], rank: int) -> Floats:
+def _fitted(
+    space: Space,
+    body: Floats,
+    fixes: tuple[Floats, ...],
+    ranges: tuple[Floats, ...],
+    bearings: tuple[Floats, ...],
+    rank: int,
+) -> Floats:
     """Nodes of a body (K, ambient) where it fits best, from turns that are spread over all.
 
     Args:
@@ -139,6 +153,7 @@ def _fitted(space: Space, body: Floats, fixes: tuple[Floats, ...], ranges: tuple
         body: its nodes.
         fixes: where they are on it (F, d), their fixes (F, d) and 1/m.
         ranges: where they are on it (M, d), the places (M, d) to which they have ranges, these (M,) and 1/m.
+        bearings: poses of it (B, ambient), the places (B, d) of which they have bearings, these (B,) and 1/rad.
     """
     from scipy.optimize import least_squares
     from scipy.spatial.transform import Rotation
@@ -146,7 +161,8 @@ def _fitted(space: Space, body: Floats, fixes: tuple[Floats, ...], ranges: tuple
     d = space.dimension
     seen, fix, precise = (part[:: len(part) // ROWS + 1] for part in fixes)
     near, places, distance, weight = (part[:: len(part) // ROWS + 1] for part in ranges)
-    middle, to = space.position(body).mean(axis=0), np.concatenate([fix, places]).mean(axis=0)
+    poses, marks, angle, sure = (part[:: len(part) // ROWS + 1] for part in bearings)
+    middle, to = space.position(body).mean(axis=0), np.concatenate([fix, places, marks]).mean(axis=0)
 
     def moved(v: Floats, turn: Floats, at: Floats) -> Floats:
         return np.asarray(to + v[:d] + (at - middle) @ (exp(v[d:]) @ turn).T)
@@ -154,7 +170,10 @@ def _fitted(space: Space, body: Floats, fixes: tuple[Floats, ...], ranges: tuple
     def residuals(v: Floats, turn: Floats) -> Floats:
         off = (moved(v, turn, seen) - fix) * precise[:, None]
         length = np.linalg.norm(moved(v, turn, near) - places, axis=1)
-        every = np.concatenate([off.ravel(), (length - distance) * weight])
+        gap = marks - moved(v, turn, space.position(poses))
+        east, north = np.einsum("mab,ma->bm", exp(v[d:]) @ turn @ space.rotation(poses), gap)[:2]
+        aside = wrap(np.arctan2(north, east) - angle)
+        every = np.concatenate([off.ravel(), (length - distance) * weight, aside * sure])
         return np.asarray(np.clip(np.nan_to_num(every), -LARGEST, LARGEST))
 
     def fitted(v: Floats, turn: Floats, steps: int) -> tuple[float, Floats, Floats]:
