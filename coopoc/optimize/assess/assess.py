@@ -131,7 +131,7 @@ def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool
     if exact is None:
         return ended(cov, step) if held else unknown
     if not cholesky.factor(exact):
-        return ended(none, calm)
+        return ended(none, calm, True)
     inverse, less = _inverse(system)
     return ended(inverse, cholesky.solve(gradient), True) if (2.0 * less < variance).any() else ended(cov, step)
 
@@ -345,7 +345,9 @@ def judged(problem: Problem, x: Floats, truth: Assessment) -> tuple[float, tuple
     if not np.isfinite(truth.cost):
         return np.nan, ("the cost overflows: z, x0 or 1/std is too large",)
     if truth.curved:
-        notes.append("J^T J is singular at this minimum, whose covariance is that of the exact Hessian")
+        lost = "which has no covariance, and others may cost as little"
+        what = lost if np.isnan(truth.covariance).all() else "whose covariance is that of the exact Hessian"
+        notes.append(f"J^T J is singular at this minimum, {what}")
     if truth.active is not None:
         free, along, exact = truth.active.along.shape[0], truth.active.along.shape[1], truth.active.exact.shape[1]
         unknowns, pushing = unknowns - free + along, exact - along

@@ -14,6 +14,8 @@ from .graph_starts import parts
 
 RANGES = "range", "range_offset"
 """Kinds of which the first two nodes are apart by z, or by z less the first coordinate of a third."""
+LEVEL = "bearing", "azimuth"
+"""Kinds that in space do not tell a node from its image at a level plane."""
 LARGEST = 2000
 """Nodes up to which all shortest paths are taken."""
 SUBSETS = 60
@@ -66,9 +68,11 @@ def ranges_of(problem: Problem, x: Floats) -> Ranges:
 
 
 def bodies(problem: Problem, x: Floats) -> list[Ints]:
-    """Nodes that ranges alone place, as what else is measured joins them: landmarks, points, robots with their
-    odometry; at x (n, ambient), where robust losses may reject what would place others."""
-    others = [f.nodes[f.informative] for f in problem.factors if f.kind not in RANGES]
+    """Nodes that ranges alone, or in space with directions in a level plane, place, as what else is measured joins
+    them: landmarks, points, robots with their odometry; at x (n, ambient), where robust losses may reject what would
+    place others."""
+    vague = RANGES + LEVEL * (problem.dimension == 3)
+    others = [f.nodes[f.informative] for f in problem.factors if f.kind not in vague]
     part = parts(len(problem.names), *(n[:, k : k + 2] for n in others for k in range(n.shape[1] - 1)))
     held = np.concatenate([np.array(problem.fixed, np.int64), *(_accepted(problem, f, x) for f in problem.factors)])
     loose = np.setdiff1d(part, part[held])
@@ -241,7 +245,8 @@ def across(
     problem: Problem, x: Floats, descend: Callable[[Floats], Floats], cost: Callable[[Floats], float]
 ) -> tuple[Floats, int, list[float], list[Ints]]:
     """The lowest end (n, ambient) of descents from x and from mirror images of what ranges alone place, how many
-    moves led down, the costs of the other ends, and the bodies that ranges alone hardly distinguish from elsewhere.
+    moves led down, the costs of the other ends, and the bodies that ranges or level directions hardly
+    distinguish from elsewhere.
 
     Args:
         problem: whose ranges, and their losses, place the bodies.
@@ -250,6 +255,7 @@ def across(
         cost: of a point.
     """
     ranges, loose, least, count = ranges_of(problem, x), bodies(problem, x), cost(x), 0
+    every = loose
     if len(loose) == len(problem.names) or not len(ranges.nodes):  # nothing to mirror at
         loose = loose if len(loose) > 1 else []
     rivals, single = list[float](), list[Move]()
@@ -267,4 +273,8 @@ def across(
             rivals.append(now)
         else:
             break
-    return x, count, rivals, [*{int(body[0]): body for adds, _, body in single if adds <= NEAR}.values()]
+    doubtful = {int(body[0]): body for adds, _, body in single if adds <= NEAR}
+    if problem.dimension == 3 and any(f.kind in LEVEL for f in problem.factors):
+        moved = {int(body[0]) for *_, body in single}
+        doubtful |= {int(body[0]): body for body in every if body[0] not in moved}
+    return x, count, rivals, [*doubtful.values()]
