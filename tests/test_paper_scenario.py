@@ -23,15 +23,7 @@ def published(most: int, method: str, noise_model: str) -> tuple[float, float]:
     raise AssertionError((most, method, noise_model))
 
 
-@pytest.mark.parametrize(
-    "most",
-    [
-        0,
-        pytest.param(1, marks=pytest.mark.slow),
-        pytest.param(4, marks=pytest.mark.slow),
-        pytest.param(10, marks=pytest.mark.slow),
-    ],
-)
+@pytest.mark.parametrize("most", [0, *(pytest.param(k, marks=pytest.mark.slow) for k in (1, 4, 10))])
 def test_an_independent_simulation_gives_the_published_errors(most):
     fleet = co.load_fleet("town10")
     draws = [np.random.default_rng([most, ego]) for ego in range(0, 60, 12)]

@@ -70,7 +70,15 @@ def ranges_of(problem: Problem, x: Floats) -> Ranges:
 def bodies(problem: Problem, x: Floats) -> list[Ints]:
     """Nodes that ranges alone, or in space with directions in a level plane, place, as what else is measured joins
     them: landmarks, points, robots with their odometry; at x (n, ambient), where robust losses may reject what would
-    place others."""
+    place others.
+
+    >>> from coopoc.optimize import pose
+    >>> x = pose([[0.0, 0.0, 0.0], [3.0, 4.0, 2.0]])
+    >>> near = Problem(("A", "p"), x0=x, poses=(0,)).add("pose", "A", x[0], std=0.1)
+    >>> near = near.add("range", ("A", "p"), 5.4, std=0.1).add("bearing", ("A", "p"), 0.9, std=0.1)
+    >>> bodies(near, x)  # below the pose or above it
+    [array([1])]
+    """
     vague = RANGES + LEVEL * (problem.dimension == 3)
     others = [f.nodes[f.informative] for f in problem.factors if f.kind not in vague]
     part = parts(len(problem.names), *(n[:, k : k + 2] for n in others for k in range(n.shape[1] - 1)))
