@@ -210,7 +210,11 @@ WRONG = {
     ),
     "positions in feet": (["x", "y"], lambda v: v / 0.3048, r"fixes travel 3\.\d+ times as far"),
     "positions in km": (["x", "y"], lambda v: v / 1000, r"are positions in km\?"),
-    "azimuths clockwise from north": (["azimuth"], lambda v: (np.pi / 2 - v) % (2 * np.pi), r"azimuths miss"),
+    "azimuths clockwise from north": (
+        ["azimuth"],
+        lambda v: (np.pi / 2 - v) % (2 * np.pi),
+        r"azimuths miss.*clockwise from north",
+    ),
     "ranges in feet": (
         ["range"],
         lambda v: v / 0.3048,

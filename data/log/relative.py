@@ -183,19 +183,23 @@ def _other_angle(c: Check) -> str:
     """What azimuths look like that miss the positions by the course of their observers."""
     links = c.world.links
     moves = c.world.velocity[0, links.step, links.observer, :2] @ [1, 1j]
-    there = np.isfinite(c.relative[:, 1]) & (np.abs(moves) > MOVING)
-    residual, course, measured = c.relative[there, 1], np.angle(moves[there]), c.world.relative[0, there, 1]
+    there, heading = np.isfinite(c.relative[:, 1]), np.where(np.abs(moves) > MOVING, np.angle(moves), np.nan)
+    residual, course, measured = c.relative[there, 1], heading[there], c.world.relative[0, there, 1]
     off = float(np.angle(np.exp(1j * residual).sum()))
     off += float(np.median(wrap(residual - off)))
-    for like, turn in (
-        ("bearings: name them bearing", course),
-        ("azimuths: name them azimuth", -course),
-        ("bearings clockwise from the heading: change their sign", 2 * (course - measured)),
-        (f"angles from an axis that is turned by {-off:.3g} rad: add {-off:.3g}", -off),
-    ):
-        if len(course) >= ENOUGH and 3 * np.median(np.abs(wrap(residual + turn))) < np.median(np.abs(residual)):
-            return f"They look like {like}."
-    return ""
+    causes = {
+        "bearings: name them bearing": course,
+        "azimuths: name them azimuth": -course,
+        "bearings clockwise from the heading: change their sign": 2 * (course - measured),
+        "azimuths clockwise from north: take each from pi / 2": np.pi / 2 - 2 * measured,
+        "azimuths clockwise: change their sign": -2 * measured,
+        f"angles from an axis that is turned by {-off:.3g} rad: add {-off:.3g}": -off,
+    }
+    enough = {like: np.isfinite(residual + turn).sum() >= ENOUGH for like, turn in causes.items()}
+    left = {like: float(np.nanmedian(np.abs(wrap(residual + causes[like])))) for like in causes if enough[like]}
+    if 3 * (least := min(left.values(), default=np.inf)) > np.median(np.abs(residual)):
+        return ""
+    return f"They look like {next(like for like, rest in left.items() if rest <= 1.5 * least)}."
 
 
 def long_off(errors: Floats) -> Ints:
