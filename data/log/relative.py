@@ -54,10 +54,12 @@ def measurements(c: Check) -> list[dict[str, Any]]:
 def _scatter(c: Check, k: int, stated: float) -> dict[str, float]:
     """Standard deviation of measurements about the running median of their pair, and the share beyond 5 of them: errors
     of the filters last longer than that window."""
-    near = (value - pd.Series(value).rolling(WINDOW, 1, center=True).median() for _, value, *_ in by_pair(c, k))
-    off = np.concatenate([*near])
+    near = [
+        (value - pd.Series(value).rolling(WINDOW, 1, center=True).median(), each) for _, value, each, _ in by_pair(c, k)
+    ]
+    off, expected = (np.concatenate(parts) for parts in zip(*near, strict=True))
     noise = robust_std(off)
-    least = max(noise, 0.2 * stated, float(np.nanmedian(c.expected[:, k])) / 2)
+    least = np.maximum(max(noise, 0.2 * stated), expected / 2)  # a direction of what is near hardly counts
     return {"noise": noise, "beyond_5_std": float(np.mean(np.abs(off) > OUTLYING * least))}
 
 
