@@ -272,9 +272,9 @@ def pose_start(recording: Recording, *, seconds: float = START, gate: float = ST
     odometry until then its pose at the first step; or, by least squares, its ranges to three landmarks or more, or its
     bearings of four, if no other heading costs about as much. A solo filter starts from each of some headings around
     the circle, then around the best; the one whose innovations, and bearings of other vehicles from fix to fix, have
-    the largest likelihood over the first seconds is kept, and odometry leads back from where it ends. A compass leaves
-    one. Vehicles without a fix that see fewer than two landmarks come last: for them those that were found before are
-    places, too.
+    the largest likelihood over the first seconds is kept, and odometry leads back from where that is surest. A compass
+    leaves one. Vehicles without a fix that see fewer than two landmarks come last: for them those that were found
+    before are places, too.
 
     Args:
         recording: in body frames.
@@ -294,6 +294,10 @@ def pose_start(recording: Recording, *, seconds: float = START, gate: float = ST
     >>> exact = Sensors(gnss_std=(0.1, 0.1, 0.1), compass=False)
     >>> begin = pose_start(observe(fleet, exact, assumed=exact, frame="body"))
     >>> bool(abs(begin[0, 0, 3]) < 0.3)  # it sets out to the east
+    True
+    >>> rough = Sensors(gnss_std=(0.1, 0.1, 0.1), yaw_rate_std=0.3, compass=False)
+    >>> begin = pose_start(observe(fleet, rough, assumed=rough, frame="body", runs=9))
+    >>> bool(np.linalg.norm(begin[:, 0, :2] - path[0, 0, :2], axis=1).max() < 0.4)  # though odometry leads astray
     True
     """
     check_recording(recording, body=True)

@@ -67,36 +67,46 @@ def _most_likely(
         apart, ranges = np.linalg.norm(landmarks - landmarks.mean(axis=0), axis=1), recording.relative[run, links, 0]
         filter_ = replace(filter_, assumed=_of_vehicles(noise, np.where(np.isnan(ranges), apart, ranges)))
 
-    def filtered(poses: Floats, turn: float) -> tuple[Floats, Floats]:
-        """Positions and errors of odometry (H, T, d), and costs (H,), from poses (H, 4) whose headings err by that."""
+    def filtered(poses: Floats, turn: float) -> tuple[Floats, Floats, Floats]:
+        """States (H, T, d), their covariances, and costs (H,), from poses (H, 4) whose headings err by that."""
         tried = np.full((len(poses), len(recording.ids), 4), np.nan)
         tried[:, column] = poses
         own = replace(filter_, spread=(*_spread(noise), turn))
         copies = recording.of_runs(np.full(len(poses), run))
-        x, _, cost = own.run_filter(copies, [column], links, tried, landmark=landmarks)
-        return x[:, :, 0], cost[:, 0] + _cost_of_bearings(recording, run, column, poses[:, 3], noise)
+        x, cov, cost = own.run_filter(copies, [column], links, tried, landmark=landmarks)
+        return x[:, :, 0], cov[:, :, 0], cost[:, 0] + _cost_of_bearings(recording, run, column, poses[:, 3], noise)
 
     bare = np.isnan(recording.gnss[run, :, column, 0]).all() and np.isnan(recording.relative[run, links, 0]).all()
     for turn in (STEP / 2, 2 * STEP / HEADINGS):
         poses = _hypotheses(recording, run, column, links, landmarks, angles)
-        costs = filtered(poses, turn)[1]
+        costs = filtered(poses, turn)[2]
         best = poses[[np.argmin(costs)]]
         apart = np.abs(wrap(poses[:, 3] - best[0, 3])) > ELSEWHERE
         if bare and (costs[apart] < costs.min() + RIVAL).any():
             raise _too_little(recording, column)
         angles = best[0, 3] + STEP * np.linspace(-1.0, 1.0, HEADINGS)
-    ((x,), _) = filtered(best, STEP / 2)
-    return _back(recording, run, column, x), x[:, :3]
+    (x,), (cov,), _ = filtered(best, STEP / 2)
+    return _back(recording, run, column, x, cov), x[:, :3]
 
 
-def _back(recording: Recording, run: int, column: int, x: Floats) -> Floats:
-    """Pose (4,) at the first step from which odometry, less the errors that a filter has found of it, leads to its last
-    state of x (T, d), before it is absent."""
-    last = (int(np.argmin(np.isfinite(x[:, 0]))) or len(x)) - 1
-    scale, bias = x[last, 4:6] if x.shape[1] > 4 else (0.0, 0.0)
+def _back(recording: Recording, run: int, column: int, x: Floats, cov: Floats) -> Floats:
+    """Pose (4,) at the first step: its heading, and then its place, from the state of x (T, d), of covariance
+    (T, d, d), from which odometry, less the errors that the filter has found of it, leads back most surely."""
+    count = int(np.argmin(np.isfinite(x[:, 0]))) or len(x)  # before it is absent
+    scale, bias = x[count - 1, 4:6] if x.shape[1] > 4 else (0.0, 0.0)
     turns, way = _reckoned(recording, run, column, scale, bias)
-    heading = x[last, 3] - turns[last]
-    return np.append(x[last, :3] - turned(way[last], heading), heading)
+    noise, since = recording.sensors, recording.dt * recording.dt * np.arange(count)
+    white = noise.yaw_rate_std**2 * since
+    sure = cov[:count, 3, 3] + white
+    best = int(np.argmin(sure))
+    heading = x[best, 3] - turns[best]
+    drift = np.square(noise.velocity_std(recording.velocity[run, :count, column, :2], noise.velocity_floor)).sum(
+        axis=-1
+    )
+    off = np.trace(cov[:count, :2, :2], axis1=1, axis2=2) + recording.dt**2 * np.cumsum(drift)
+    off += np.square(way[:count]).sum(axis=1) * (sure[best] + white / 3.0)
+    near = int(np.argmin(off))
+    return np.append(x[near, :3] - turned(way[near], heading), heading)
 
 
 def _reckoned(
