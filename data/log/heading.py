@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from coopoc.arrays import Bools, Floats
+from coopoc.arrays import AnyArray, Bools, Floats
 from coopoc.world.links import wrap
 
 from ..assemble import SAME
@@ -17,6 +17,9 @@ TURNS = 7.5 / BASELINE
 """Root of summed squared sines of turns above which their sense is no chance: fixes make 0.24 of it."""
 GYRO_BIAS, GYRO_LASTS, GYRO_WALK = 0.02, 600.0, 0.01
 """rad/s, bias of a yaw rate, and s, for which it lasts; rad in a root of a second, by which its integral wanders."""
+FADES, SEEN = 30.0, 4.0
+"""s, in which fixes fade; standard deviations of a fix, by which two must be apart to show a direction as well as all
+must before they count: to 0.35 rad."""
 
 HeadingAt = Callable[[Floats], Floats]
 
@@ -110,14 +113,44 @@ def far_apart(
 ) -> Iterator[tuple[int, int, complex, complex]]:
     """Indices of fixes that are BASELINE standard deviations apart, and x + iy m by which they and dead reckoning moved
     in between."""
-    turned, last = integral(yaw_rate, speed.t), 0
-    way = speed.value * np.column_stack([np.cos(turned), np.sin(turned)])
-    path, position = integral(Signal(speed.t, way), fixes.t) @ [1, 1j], fixes.value[:, :2] @ [1, 1j]
+    (path, position), last = _ways(fixes, speed, yaw_rate), 0
     for j in range(1, len(fixes.t)):
         moved, driven = position[j] - position[last], path[j] - path[last]
         if min(abs(moved), abs(driven)) >= BASELINE * std:
             yield last, j, moved, driven
             last = j
+
+
+def _ways(fixes: Signal, speed: Signal, yaw_rate: Signal) -> tuple[AnyArray, AnyArray]:
+    """Places x + iy m at the fixes by dead reckoning, and by them."""
+    turned = integral(yaw_rate, speed.t)
+    way = speed.value * np.column_stack([np.cos(turned), np.sin(turned)])
+    return integral(Signal(speed.t, way), fixes.t) @ [1, 1j], fixes.value[:, :2] @ [1, 1j]
+
+
+def heading_of_all(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -> tuple[HeadingAt, float] | None:
+    """As `heading_of_gyro`, of what stays near: the turn of dead reckoning onto all fixes until then, which fade in
+    FADES s, by least squares; once it is as sure as by two that are SEEN standard deviations apart.
+
+    >>> t = np.arange(0, 60, 0.5)
+    >>> circle = 2.0 * np.column_stack([np.sin(0.2 * t), -np.cos(0.2 * t)])
+    >>> signals = Signal(t, circle), Signal(t, np.full((120, 1), 0.4)), Signal(t, np.full((120, 1), 0.2))
+    >>> heading_of_gyro(*signals, 1.0) is None, heading_of_all(*signals, 1.0)[0](np.array([50.0])).round(2)  # 10 rad
+    (True, array([-2.57]))
+    """
+    (path, position), t, sums, samples = _ways(fixes, speed, yaw_rate), fixes.t, np.zeros(5, complex), list[Floats]()
+    for j, (d, z) in enumerate(zip(path - path[:1], position - position[:1], strict=True)):
+        sums = sums * np.exp((t[max(j - 1, 0)] - t[j]) / FADES) + [1.0, d, z, abs(d) ** 2, z * d.conjugate()]
+        n, far, moved, square, product = sums
+        spread = (square - abs(far) ** 2 / n).real
+        if spread * 2.0 >= (SEEN * std) ** 2:
+            samples.append(np.array([t[j], np.angle(product - moved * far.conjugate() / n), std**2 / spread]))
+    if not samples:
+        return None
+    since, pace = np.array(samples), float(np.median(np.abs(speed.value)))
+    offset = Signal(since[:, 0], since[:, 1:2])
+    at = lambda times: wrap(held(offset, times)[:, 0] + integral(yaw_rate, times)[:, 0])  # noqa: E731
+    return at, float(np.median(since[:, 2])) * pace**2 * FADES
 
 
 def mirrored(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -> bool:

@@ -19,6 +19,7 @@ from .heading import (
     Signal,
     covered,
     heading_at,
+    heading_of_all,
     heading_of_courses,
     heading_of_gyro,
     integral,
@@ -265,7 +266,8 @@ def _heading(
         return heading_at(measured, rate, steps.gap(measured.t)), "", 0.0
     if gyro is not None and rate is not None and len(gyro[1].t) > 1:
         fixes, speed, std = gyro
-        if (filtered := heading_of_gyro(fixes, speed, rate, std)) is not None:
+        way = fixes, speed, rate, std
+        if (filtered := heading_of_gyro(*way) or heading_of_all(*way)) is not None:
             return filtered[0], "fixes", filtered[1]
     for move, source in moves:
         velocity, wanders = (move.velocity, move.wanders) if isinstance(move, Shown) else (move, 0.0)
