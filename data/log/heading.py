@@ -17,7 +17,7 @@ TURNS = 7.5 / BASELINE
 """Root of summed squared sines of turns above which their sense is no chance: fixes make 0.24 of it."""
 GYRO_BIAS, GYRO_LASTS, GYRO_WALK = 0.02, 600.0, 0.01
 """rad/s, bias of a yaw rate, and s, for which it lasts; rad in a root of a second, by which its integral wanders."""
-FADES, SEEN = 30.0, 4.0
+FADES, SEEN = 20.0, 4.0
 """s, in which fixes fade; standard deviations of a fix, by which two must be apart to show a direction as well as all
 must before they count: to 0.35 rad."""
 

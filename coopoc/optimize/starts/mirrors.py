@@ -15,7 +15,7 @@ from .graph_starts import parts
 RANGES = "range", "range_offset"
 """Kinds of which the first two nodes are apart by z, or by z less the first coordinate of a third."""
 LEVEL = "bearing", "azimuth"
-"""Kinds that in space do not tell a node from its image at a level plane."""
+"""Kinds whose measurements of a node in space fit its mirror image at a level plane as well."""
 LARGEST = 2000
 """Nodes up to which all shortest paths are taken."""
 SUBSETS = 60

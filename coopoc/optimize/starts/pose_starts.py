@@ -132,8 +132,8 @@ def placed(problem: Problem, x: Floats, rank: int = 0) -> Floats:
             rows = part[own] == part[best]
             distances = x[own[rows], :d], x[places[rows], :d], ranges.distance[k[rows]], ranges.weight[k[rows]]
             bearings = x[aimed[there, 0]], x[aimed[there, 1], :d], angle[there], sure[there]
-            fixes_ = x[fixed[here], :d], fix[here], weight[here]
-            x[moving] = _fitted(space, x[moving], fixes_, distances, bearings, rank)
+            own_fixes = x[fixed[here], :d], fix[here], weight[here]
+            x[moving] = _fitted(space, x[moving], own_fixes, distances, bearings, rank)
         known[moving] = True
     return _crossed(problem, x)
 

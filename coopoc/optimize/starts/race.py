@@ -100,7 +100,7 @@ def race(
             notes = *notes, ELSEWHERE
         elif doubtful and not near:
             names = ", ".join(problem.names[body[0]] for body in doubtful[:5])
-            notes = (f"what is measured hardly tells {names} from elsewhere: a lower minimum may exist",)
+            notes = (f"the measurements fit other places of {names} nearly as well: a lower minimum may exist",)
         return problem.replace_unchecked(x0=frozen(x)), Search(name, taken, notes=notes)
 
     late, rough = dict(late), list[str]()
