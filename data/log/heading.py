@@ -143,8 +143,9 @@ def heading_of_all(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -
         sums = sums * np.exp((t[max(j - 1, 0)] - t[j]) / FADES) + [1.0, d, z, abs(d) ** 2, z * d.conjugate()]
         n, far, moved, square, product = sums
         spread = (square - abs(far) ** 2 / n).real
-        if spread * 2.0 >= (SEEN * std) ** 2:
-            samples.append(np.array([t[j], np.angle(product - moved * far.conjugate() / n), std**2 / spread]))
+        turn = product - moved * far.conjugate() / n
+        if spread * 2.0 >= (SEEN * std) ** 2 and abs(turn) > 0.5 * spread:  # fixes move, too
+            samples.append(np.array([t[j], np.angle(turn), std**2 / spread]))
     if not samples:
         return None
     since, pace = np.array(samples), float(np.median(np.abs(speed.value)))
