@@ -1,37 +1,12 @@
-"""Processes: workers end with the process that started them, Ctrl-C ends a command that loads, bars show progress."""
+"""Processes: workers end with the process that started them; bars show progress."""
 
-import atexit
-import gc
 import os
 import signal
 import sys
 import threading
 import time
-from contextlib import suppress
 from functools import lru_cache
-from importlib import import_module
 from typing import Any
-
-
-def main() -> None:
-    """The console script: without a traceback where it is interrupted while libraries load.
-
-    It ends without the destructors of C++ libraries: one whose thread still runs would call "terminate".
-    """
-    status: object = 130
-    gc.set_threshold(100_000)  # a tenth of a short command is spent on collecting what libraries make while they load
-    try:
-        import_module("coopoc.cli").main()
-    except SystemExit as ended:
-        status = ended.code
-    except KeyboardInterrupt:
-        pass
-    threading._shutdown()  # type: ignore[attr-defined]  # as Python does first: a thread that waits there ends the workers
-    atexit._run_exitfuncs()
-    with suppress(OSError):
-        sys.stdout.flush()
-        sys.stderr.flush()
-    os._exit(status if isinstance(status, int) else bool(status))
 
 
 @lru_cache

@@ -17,7 +17,7 @@ REGION = 2.0
 LATEST = 1e11
 """s since 1970, the year 5138."""
 COARSE = 1e-3, 64.0
-"""s, between stamps of 32-bit floats: worth a word; of seconds since 1970, or GPS seconds, too coarse for steps."""
+"""s, between stamps of 32-bit floats: reported; of seconds since 1970, or GPS seconds, too coarse for steps."""
 CELLS, PER_ROW = 500_000, 200
 """Steps times vehicles that any file may take, and how many more a row of it may."""
 PLANE_STD = 0.01

@@ -155,7 +155,7 @@ def test_bad_usage_is_one_readable_line(answers, words, message):
 def test_ctrl_c_while_libraries_load_ends_without_a_traceback(tmp_path):
     code = (
         "import sys\nclass Stop:\n    def find_spec(self, name, *rest):\n        if name == 'tyro':\n"
-        "            raise KeyboardInterrupt\nsys.meta_path.insert(0, Stop())\nfrom coopoc.workers import main\nmain()"
+        "            raise KeyboardInterrupt\nsys.meta_path.insert(0, Stop())\nfrom coopoc.__main__ import main\nmain()"
     )
     done = ran([sys.executable, "-c", code, "list"], cwd=tmp_path)
     assert (done.returncode, done.stderr) == (130, "")

@@ -1,12 +1,13 @@
-"""Innovation gating: a redescending weight of the normalised innovation squared, release after lock-out, and the way
-back.
+"""Innovation gating: a redescending weight of the normalised innovation squared, release after lock-out, and return to
+an earlier position.
 
-Many are as many as hold, together, more information than the prediction that contradicts them: the sum of the gains
-that they would have had. A filter that is sure of itself stays so for long, one that has just begun does not.
+A counter sums the gains that rejected measurements would have had; above PATIENCE gating is suspended. These
+measurements then hold, together, more information than the prediction that contradicts them. A filter with a small
+covariance rejects for long, one that has just begun does not.
 
-A fix that is rejected does not show whether the receiver or the filter is wrong. So a position is remembered as it was
-before the first fix that contradicted it, moved by the odometer alone; when fixes agree with it again, and no longer
-with the filter, it is the filter's.
+A rejected fix does not show whether the receiver or the filter is wrong. So the filter keeps the position from before
+the first fix that contradicted it, moved by the odometer alone. Once fixes agree with that position again, and no
+longer with the estimate, the filter returns to it.
 
 A number, or LANES runs side by side. Filters call it where a measurement becomes information; blocks of the
 cooperative filter (`stars.gaussian.weight`) have a shape of their own.

@@ -26,9 +26,10 @@ from .starts.race import ELSEWHERE, race
 POSITION_TOLERANCE = 1e-6
 """m, what one more Gauss-Newton step may still move."""
 DECREASE = 1e-10
-"""Share of the cost that one more step may still promise: in a flat valley points move far for no gain."""
-PROMISE = 1e-8
-"""What a Newton step may promise where Gauss-Newton's is below the tolerance: 1e-4 standard deviations away."""
+"""Predicted decrease of one more step, as a share of the cost, at a minimum: in a flat valley points move far for no
+gain."""
+NEWTON_DECREASE = 1e-8
+"""That of a Newton step where Gauss-Newton's step is below the tolerance: 1e-4 standard deviations away."""
 FEASIBLE = 1e-6
 """m, rad or m/s by which a constraint may be violated."""
 MANY = 1000
@@ -201,14 +202,14 @@ def _status(problem: Problem, x: Floats, truth: Assessment) -> Status:
     if truth.unobservable:
         return Status.RANK_DEFICIENT
     still = truth.remaining <= POSITION_TOLERANCE
-    if not (still or truth.promised <= DECREASE * truth.cost):
+    if not (still or truth.predicted <= DECREASE * truth.cost):
         return Status.FAILED
     if truth.active is not None:
         return Status.SOLVED if is_constrained_minimum(problem, x, truth.active) else Status.SADDLE
     left = newton_decrease(problem, x)
     if left is None:
         return Status.SADDLE
-    return Status.SOLVED if left <= max(DECREASE * truth.cost, PROMISE * still) else Status.FAILED
+    return Status.SOLVED if left <= max(DECREASE * truth.cost, NEWTON_DECREASE * still) else Status.FAILED
 
 
 def _raise(solution: Solution) -> None:

@@ -52,7 +52,7 @@ FEW, APART = 5, 1.5
 SIGMAS = 6.0
 """Standard errors of an offset beyond which it is no chance."""
 ARM, LONGEST_ARM = 0.2, 30.0
-"""m, least arm of an antenna that is worth a word, and longest that is one."""
+"""m, least arm of an antenna that is reported, and longest that is one."""
 CONFIDENT = 3.0
 """Errors over the deviations that a filter states, in a part of the drive, from which it is wrong."""
 UNUSED = 0.05

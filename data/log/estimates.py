@@ -19,11 +19,11 @@ from .residuals import Check, filtered, residual_of
 SURELY = 4.0
 """Standard errors beyond which an estimate is no chance: one of hundreds that a few logs ask for lies beyond three."""
 LATE, SCALE, TURNED, DRIFT = 0.02, 0.01, 0.02, 2e-3
-"""Least errors that are worth a word: of a clock, s; of odometry, share of a speed, rad, rad/s."""
+"""Least errors that are reported: of a clock, s; of odometry, share of a speed, rad, rad/s."""
 UNITS_APART = 0.2
 """Share by which lengths are off from which their unit is wrong."""
 ENOUGH = 20
-"""Measurements from which a statistic is worth a word."""
+"""Measurements from which a statistic is reported."""
 FAR = 10.0
 """Standard deviations of a fix that odometry must have moved, so that noise does not look like motion."""
 ALIKE = 0.97

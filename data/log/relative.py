@@ -25,7 +25,7 @@ HINTS = {
 }
 """What to look for where measurements of a kind miss the positions."""
 OUTLIERS = 0.01
-"""Share of measurements beyond 5 standard deviations that is worth a word."""
+"""Share of measurements beyond 5 standard deviations that is reported."""
 WINDOW = 9
 """Measurements of a pair whose median is taken off to count outliers."""
 SOLID, MANY = 0.8, 4

@@ -48,7 +48,7 @@ class Assessment:
         remaining: m or rad, largest move of a Gauss-Newton step.
         unobservable: names of nodes that can move without changing the cost.
         active: what holds x, None without constraints.
-        promised: decrease of the cost that this step promises; infinite where constraints hold it.
+        predicted: decrease of the cost by this step, as its model predicts; infinite where constraints hold it.
         curved: J^T J hardly sees some direction, and the exact Hessian, which does, stands in for it.
     """
 
@@ -58,7 +58,7 @@ class Assessment:
     remaining: float
     unobservable: tuple[str, ...] = ()
     active: Active | None = None
-    promised: float = np.inf
+    predicted: float = np.inf
     curved: bool = False
 
     @property
@@ -110,7 +110,7 @@ def _unconstrained(problem: Problem, system: Sparse, x: Floats, covariance: bool
 
     def ended(cov: Floats, dx: Floats, curved: bool = False) -> Assessment:
         far = float(np.abs(dx).max(initial=0.0))
-        return Assessment(cost, size, cov, far, promised=0.5 * abs(float(gradient @ dx)), curved=curved)
+        return Assessment(cost, size, cov, far, predicted=0.5 * abs(float(gradient @ dx)), curved=curved)
 
     own, cov = _largest(problem, entries, values), none
     step = variance = np.full(entries.size, np.inf)
@@ -274,12 +274,11 @@ def _seen(J: Any, ways: Floats) -> Bools:
 
 
 def newton_decrease(problem: Problem, x: Floats) -> float | None:
-    """By how much a full Newton step from x (n, ambient) promises to lower the cost, 1/2 g^T H^-1 g; None if it curves
-    downwards there.
+    """Predicted decrease of the cost, 1/2 g^T H^-1 g, by a full Newton step from x (n, ambient); None if the cost
+    curves downwards there.
 
     It is half the squared Newton decrement, the distance to the minimum in standard deviations, whatever the units of
-    the nodes (Boyd and Vandenberghe, Convex Optimization, section 9.5.1). A linear problem has J^T J alone and promises
-    nothing more here.
+    the nodes (Boyd and Vandenberghe, Convex Optimization, section 9.5.1). A linear problem has J^T J alone: 0 here.
     """
     if problem.linear or problem.constraints:
         return 0.0

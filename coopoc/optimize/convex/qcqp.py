@@ -121,7 +121,7 @@ class Multipliers:
 
     @property
     def trace(self) -> float:
-        """What they promise: 1/2 trace is a lower bound if C - L is positive semidefinite."""
+        """1/2 trace is a lower bound if C - L is positive semidefinite."""
         return float(np.einsum("nii->", self.stiefel) + self.sphere.sum())
 
     @property

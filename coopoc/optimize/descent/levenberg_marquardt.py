@@ -22,13 +22,13 @@ GIVE_UP = 1e12
 LEAST_DAMPING = 1e-9
 """Damping below which none is left: far below any diagonal it changes no digit of a step."""
 HIDDEN = 1e-9
-"""Share of the cost below which rounding hides how much of a promised decrease came true."""
-OFF = 0.2
-"""A share of the promised decrease this far from 1 casts doubt on J^T J."""
-BROKEN = 0.5
-"""A share of the promised decrease this far from 1 shows that a descent has left where its model holds."""
-DOUBT = 2
-"""Doubtful steps before the exact Hessian takes over."""
+"""Predicted decrease, as a share of the cost, below which rounding hides the actual one."""
+MISMATCH = 0.2
+"""Distance of the gain ratio, actual over predicted decrease, from 1 that is evidence against J^T J."""
+NONQUADRATIC = 0.5
+"""Distance of the gain ratio from 1 at which a step has left the region where the quadratic model holds."""
+AGAINST = 2
+"""Steps of evidence against J^T J after which the exact Hessian takes over."""
 GROWTH, DECAY = 10.0, 5.0
 """Factors by which damping grows after a refused step and falls after a good one; two that share no power find the
 middle where a step overshoots."""
@@ -36,12 +36,12 @@ FIRST = 1e-8
 """Damping once some is needed, relative to the diagonal: the smooth modes of a chain of thousands of poses, which need
 it first, have that share of a pose's information."""
 ROUNDED = 1e-18
-"""Share of the cost, or of 1, whose promise ends the loop: some 1e-8 standard deviations to go, before the step that is
-taken."""
+"""Predicted decrease, as a share of the cost or of 1, that ends the loop: some 1e-8 standard deviations to go, before
+the step that is taken."""
 LEAST_INFORMATION = 1e-9
 """1/m^2 or 1/rad^2: the scale of what no measurement holds."""
 SLOW = 0.2
-"""A promise above this share of the one before shows that J^T J converges slowly, which casts doubt, too."""
+"""A predicted decrease above this share of the one before is evidence against J^T J, too: it converges slowly."""
 NEAR = 1e-3
 """Share of the cost from which on the exact Hessian makes the last steps."""
 STILL = 12
@@ -55,9 +55,9 @@ class Arrival:
     Args:
         x: (n, ambient).
         iterations: factorisations.
-        converged: the last step was below the tolerance, or what it promised is rounding.
-        record: (iterations, 3) the cost before each, its damping, and which share of the promised decrease came true
-            (NaN where the matrix was not positive definite).
+        converged: the last step was below the tolerance, or its predicted decrease is rounding.
+        record: (iterations, 3) the cost before each, its damping, and its gain ratio (NaN where the matrix was not
+            positive definite).
         newton_steps: how many iterations used the exact Hessian.
     """
 
@@ -80,17 +80,17 @@ def arrive(
     """Minimise by Levenberg-Marquardt from x (n, ambient): (H + mu D) dx = -g, D the diagonal of J^T J, which scales by
     the geometry.
 
-    H = J^T J, until two of its promises failed by more than a fifth or hardly fell, or the end is NEAR; then the exact
-    Hessian, with which the last steps converge quadratically however large the residuals are. Where that is not
-    positive definite J^T J takes over for some steps. mu is the multiplier of a trust region |D^1/2 dx|: it grows where
-    less than a quarter of the promised decrease comes true and falls where more than three quarters do. Where the steps
-    are `bounded`, J^T J stays, and the last step is one below the tolerance. A `smooth` descent ends with the first
-    step that breaks half of its promise.
+    H = J^T J, until two gain ratios were off by more than a fifth, or two predicted decreases hardly fell, or the end
+    is NEAR; then the exact Hessian, with which the last steps converge quadratically however large the residuals are.
+    Where that is not positive definite J^T J takes over for some steps. mu is the multiplier of a trust region
+    |D^1/2 dx|: it grows where the gain ratio is below 1/4 and falls where it is above 3/4. Where the steps are
+    `bounded`, J^T J stays, and the last step is one below the tolerance. A `smooth` descent ends with the first step
+    whose gain ratio is not within 1/2 .. 3/2.
 
     References:
         More, The Levenberg-Marquardt algorithm, 1978; Nocedal and Wright, Numerical Optimization, section 10.3.
     """
-    mu, doubt = 0.0, 0
+    mu, against = 0.0, 0
     step = step or _factored(system)
     model: Model = "gauss-newton"
     record: list[tuple[float, float, float]] = []
@@ -109,7 +109,7 @@ def arrive(
             if taken is None:
                 record.append((cost, mu, np.nan))
                 if model == "newton":
-                    doubt, model = -DOUBT, "gauss-newton"
+                    against, model = -AGAINST, "gauss-newton"
                     cost, gradient, values = undamped = system.quadratic(x, model)
                 else:
                     mu = _grown(mu)
@@ -117,33 +117,33 @@ def arrive(
                         break
                 continue
             dx, push = taken
-            promised = 0.5 * float((0.0 if damping is None else damping @ (dx * dx)) - gradient @ dx + push)
+            predicted = 0.5 * float((0.0 if damping is None else damping @ (dx * dx)) - gradient @ dx + push)
             there = system.retract(x, dx)
-            near = promised <= NEAR * cost and doubt >= 0 and not bounded
+            near = predicted <= NEAR * cost and against >= 0 and not bounded
             used: Model = "newton" if near else model
             trial = system.quadratic(there, used)
             after = trial[0]
             small = np.abs(dx).max(initial=0.0) <= tolerance
-            hidden = promised <= HIDDEN * cost and (after <= cost * (1.0 + 1e-13) or (small and bounded))
-            share = 1.0 if hidden else (cost - after) / abs(promised)
+            hidden = predicted <= HIDDEN * cost and (after <= cost * (1.0 + 1e-13) or (small and bounded))
+            gain = 1.0 if hidden else (cost - after) / abs(predicted)
             still = still + 1 if hidden else 0
-            record.append((cost, mu, share))
-            converged = (hidden and small) or (not bounded and (promised <= ROUNDED * max(cost, 1.0) or still > STILL))
-            if not share > 0.0:
+            record.append((cost, mu, gain))
+            converged = (hidden and small) or (not bounded and (predicted <= ROUNDED * max(cost, 1.0) or still > STILL))
+            if not gain > 0.0:
                 mu = _grown(mu)
                 if smooth:
                     break
                 continue
             x = there
-            mu = _next(mu, share)
-            if smooth and abs(share - 1.0) >= BROKEN:
+            mu = _next(mu, gain)
+            if smooth and abs(gain - 1.0) >= NONQUADRATIC:
                 break
             if not bounded and model == "gauss-newton":
-                off = abs(share - 1.0) > OFF or (record[-1][1] == 0.0 and promised > SLOW * last)
-                doubt = doubt + 1 if doubt < 0 or off else max(doubt - 1, 0)
-                doubt = DOUBT if near else doubt
-                model = "newton" if doubt >= DOUBT else model
-            last = promised
+                off = abs(gain - 1.0) > MISMATCH or (record[-1][1] == 0.0 and predicted > SLOW * last)
+                against = against + 1 if against < 0 or off else max(against - 1, 0)
+                against = AGAINST if near else against
+                model = "newton" if against >= AGAINST else model
+            last = predicted
             if not converged:
                 cost, gradient, values = trial if model == used else system.quadratic(x, model)
                 undamped = (cost, gradient, values) if model == "gauss-newton" else undamped
@@ -164,10 +164,10 @@ def _grown(mu: float) -> float:
     return GROWTH * mu if mu > 0.0 else FIRST
 
 
-def _next(mu: float, share: float) -> float:
-    if share > 0.75:
+def _next(mu: float, gain: float) -> float:
+    if gain > 0.75:
         return mu / DECAY if mu > LEAST_DAMPING else 0.0
-    return _grown(mu) if share < 0.25 else mu
+    return _grown(mu) if gain < 0.25 else mu
 
 
 def _marquardt(system: Sparse, values: Floats, mu: float, hold: float) -> Floats | None:

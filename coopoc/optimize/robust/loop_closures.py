@@ -21,12 +21,12 @@ from .candidates import Marked, reweigh, squares
 
 ROUNDS = 100
 """About 15 are needed: half of those that fit join in each."""
-CHANCES = 2
-"""Times that a candidate may join: one that a wrong neighbour has pushed out comes back once that is gone."""
-CURVED = 10.0
-"""Times its bound up to which a d^2 is checked by a solve: predictions along a drive are linear, and its arc is not."""
-TRIED = 10
-"""Of these, the least certain predictions first."""
+MAX_JOINS = 2
+"""Times that a candidate may join: one that a wrong neighbour has displaced returns once that is gone."""
+NONLINEAR_FACTOR = 10.0
+"""Times its bound up to which a d^2 is checked by a solve: predictions along a drive are linear, its arc is not."""
+MAX_RESOLVES = 10
+"""Solves of these at most, the least certain predictions first."""
 STEPS = 20
 """Of such a solve; a loop that fits needs fewer."""
 TOLERANCE = 1e-3
@@ -36,8 +36,8 @@ HYPOTHESES = 20
 60 % of the candidates are wrong, 20 of them hold no right one in 4 of 100,000 cases."""
 AGREEING = 2
 """Candidates that must agree, the placement's own included: one alone proves nothing."""
-HELD = -1
-"""The body of what known inliers join to the world: to fixed nodes, or to nodes that are measured alone."""
+WORLD_BODY = -1
+"""The body that known inliers join to the world: to fixed nodes, or to nodes with measurements of their own."""
 HINT = 'Name fewer measurements as candidates, or use start="all".'
 
 
@@ -67,9 +67,9 @@ def known_start(problem: Problem, marked: Marked, bound: Floats, inner: Callable
     bound leaves, and when it leaves again stays rejected. Of a group the d^2 are added, as if independent. Where none
     fits, the least certain are solved for: the cost must grow by no more than half the bound.
 
-    A body that known inliers leave free, such as a robot that only others see, is solved in a frame of its own. Each of
-    some candidates between two bodies then places one of them; the placement that predicts most of the other candidates
-    is taken, the pair with most agreement first, and the rounds go on.
+    A component without a gauge, such as a robot that only others observe, is a body in a frame of its own. Some of the
+    candidates between two bodies each propose a placement; the one that predicts most of the other candidates is taken,
+    the pair with most agreement first, and the rounds go on.
 
     Args:
         problem: a single one.
@@ -99,7 +99,7 @@ class Placement(NamedTuple):
     """A hypothesis of how two bodies stand to each other.
 
     Attributes:
-        bodies: HELD or the first node of one, and the first node of the other, which moves.
+        bodies: WORLD_BODY or the first node of one, and the first node of the other, which moves.
         group: of candidates that places it.
         move: (2, ambient) a pose of the other before and after.
         fits: (G,) candidates between them that agree, itself included.
@@ -128,7 +128,7 @@ class _Search:
         self.x = along_poses(reweigh(problem, marked, self.weight, initial_guess(problem)))
 
     def bodies(self) -> Ints:
-        """(n,) the body of each node, HELD or its first pose (if it has none, its first node)."""
+        """(n,) the body of each node, WORLD_BODY or its first pose (if it has none, its first node)."""
         problem = self.problem
         measured = [f.nodes[f.informative] for f in reweigh(problem, self.marked, self.weight, self.x).factors]
         pairs = (nodes[:, k : k + 2] for nodes in measured for k in range(nodes.shape[1] - 1))
@@ -136,13 +136,13 @@ class _Search:
         alone = [nodes[:, 0] for nodes in measured if nodes.shape[1] == 1]
         nodes = np.concatenate([problem.poses, np.setdiff1d(np.arange(len(part)), problem.poses)]).astype(np.int64)
         first = nodes[np.unique(part[nodes], return_index=True)[1]]
-        first[part[np.concatenate([problem.fixed, *alone]).astype(np.int64)]] = HELD
+        first[part[np.concatenate([problem.fixed, *alone]).astype(np.int64)]] = WORLD_BODY
         return first[part]
 
     def ends(self, body: Ints) -> Ints:
-        """(M, 2) bodies that each candidate joins, ascending; HELD is one of those of a measurement of a single
+        """(M, 2) bodies that each candidate joins, ascending; WORLD_BODY is one of those of a measurement of a single
         node."""
-        end_of = np.full((len(self.marked.row), 2), HELD)
+        end_of = np.full((len(self.marked.row), 2), WORLD_BODY)
         for k in np.unique(self.marked.factor):
             here = self.marked.factor == k
             nodes = self.problem.factors[k].nodes[self.marked.row[here], :2]
@@ -154,21 +154,21 @@ class _Search:
         marked, bound, weight, left, ends = self.marked, self.bound, self.weight, self.left, self.ends(body)
         judged = marked.sums(ends[:, 0] != ends[:, 1]) == 0
         sparse(problem)  # is kept as long as the problem is, so that all rounds share its analysis
-        chances, rounds = 1, 0
+        most_joins, rounds = 1, 0
         while rounds < ROUNDS:
             self.x, rounds = inner(reweigh(problem, marked, weight, self.x)), rounds + 1
             leaving = judged & (weight > 0) & (squares(problem, marked, self.x) > bound)
             left[leaving], weight[leaving] = left[leaving] + 1, 0.0
             distance, volume = predicted(problem, marked, weight, self.x)
-            others = judged & (weight == 0) & (left < chances)
+            others = judged & (weight == 0) & (left < most_joins)
             fits = others & (distance <= bound)
             if fits.any():
                 weight[fits & (volume <= np.median(volume[fits]))] = 1.0
-            elif chances < CHANCES:
-                chances = CHANCES
+            elif most_joins < MAX_JOINS:
+                most_joins = MAX_JOINS
             else:
-                some = np.flatnonzero(others & (distance <= CURVED * bound))
-                some = some[np.argsort(-volume[some], kind="stable")][:TRIED]
+                some = np.flatnonzero(others & (distance <= NONLINEAR_FACTOR * bound))
+                some = some[np.argsort(-volume[some], kind="stable")][:MAX_RESOLVES]
                 if not any(self._explained(problem, group) for group in some.tolist()):
                     break
         return rounds
@@ -194,14 +194,16 @@ class _Search:
         own = between[first]  # of each group
         poses = np.array([factor.kind.startswith("relative_pose") for factor in problem.factors])
         alike = marked.sums((between != own[marked.group]).any(axis=1)) == 0
-        groups = np.flatnonzero(alike & poses[marked.factor[first]] & (own[:, 0] != own[:, 1]) & (self.left < CHANCES))
+        groups = np.flatnonzero(
+            alike & poses[marked.factor[first]] & (own[:, 0] != own[:, 1]) & (self.left < MAX_JOINS)
+        )
         pairs, which, count = np.unique(own[groups], axis=0, return_inverse=True, return_counts=True)
         best, joined, undecided = None, dict[str, Any](), list[str]()
         for p in np.argsort(-count, kind="stable").tolist():
             if best is not None and count[p] <= best.rank[0]:
                 break
             leader, rival = self._vote(body, (int(pairs[p, 0]), int(pairs[p, 1])), groups[which.ravel() == p])
-            to, of = ("world" if k == HELD else problem.names[k] for k in leader.bodies)
+            to, of = ("world" if k == WORLD_BODY else problem.names[k] for k in leader.bodies)
             row = {"body": of, "to": to, "agree": leader.rank[0], "rival": rival, "candidates": int(count[p])}
             if leader.rank[0] < AGREEING or leader.rank[0] <= rival:
                 sentence = "of {candidates} between {body} and {to} {agree} agree, {rival} otherwise"
@@ -209,7 +211,7 @@ class _Search:
             elif best is None or leader.rank > best.rank:
                 best, joined = leader, row
         if best is None:
-            free = [problem.names[k] for k in np.unique(body[body != HELD])]
+            free = [problem.names[k] for k in np.unique(body[body != WORLD_BODY])]
             what = "; ".join(undecided[:3]) or f"nothing between {', '.join(free[:3])} and the others"
             allowed = "must join what known inliers leave free, two and more that agree"
             raise InputError("candidates", what, allowed, HINT)
@@ -260,7 +262,7 @@ class _Search:
 
 def pinned(problem: Problem, body: Ints) -> Problem:
     """The problem with the first node of each free body fixed; itself if there is none."""
-    first = np.unique(body[body != HELD]).tolist()
+    first = np.unique(body[body != WORLD_BODY]).tolist()
     return problem.replace_unchecked(fixed=(*problem.fixed, *first)) if first else problem
 
 

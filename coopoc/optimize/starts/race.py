@@ -7,7 +7,7 @@ import numpy as np
 from ...arrays import Floats, frozen
 from ..algebra.sparse import Sparse, sparse
 from ..assess.assess import expected
-from ..descent.levenberg_marquardt import BROKEN, Arrival, arrive
+from ..descent.levenberg_marquardt import NONQUADRATIC, Arrival, arrive
 from ..model.factor import Factor, unchecked
 from ..model.problem import Problem, Search
 from .mirrors import RANGES, across
@@ -47,12 +47,12 @@ def race(
 ) -> tuple[Problem, Search]:
     """The problem from the start that leads lowest, its x0 where the steps from there have led; and the search.
 
-    All starts are tried, and those whose costs are near the least go on (ROUNDS), unless one leads by steps of which
-    none was refused and whose promises came true by half and more, to a cost which the assumed noise explains, and to
-    an end that is `unwound` or to which another led as smoothly. Where the noise does not explain the end, by a cost
-    far above or below its mean, and the steps to it had trouble, the late starts are tried, one after the other, unless
-    a second start led there. Where the steps went straight the noise is taken as stated too small, which a note of the
-    Solution leaves open. At last random starts around the end are tried, and what ranges alone place is mirrored.
+    All starts are tried, and those whose costs are near the least go on (ROUNDS). One start ends the race at once: its
+    descent is `smooth`, its cost is within its chi-square bound, and either its end is `unwound` or a second start led
+    there as smoothly. Where the cost is outside that bound, the descent was not smooth, and no second start led to the
+    same end, the late starts are tried, one after the other. Where it was smooth, the stated noise is taken to be too
+    small, and a note of the Solution reports it. At last random starts around the end are tried, and what ranges alone
+    place is mirrored.
 
     Args:
         problem: at any start.
@@ -208,7 +208,7 @@ def _distinct(tried: dict[str, tuple[float, Floats]]) -> dict[str, tuple[float, 
 
 
 def smooth(end: Arrival) -> bool:
-    """Whether all promises came true by half and more, without damping; that an exact Hessian was not positive definite
-    is no trouble, since J^T J goes on."""
-    _, damping, share = end.record.T
-    return bool(not damping.any() and (np.abs(share[np.isfinite(share)] - 1.0) < BROKEN).all())
+    """Whether the gain ratio of every step was within 1/2 .. 3/2, without damping. An exact Hessian that was not
+    positive definite does not count: J^T J goes on from there."""
+    _, damping, gain = end.record.T
+    return bool(not damping.any() and (np.abs(gain[np.isfinite(gain)] - 1.0) < NONQUADRATIC).all())
