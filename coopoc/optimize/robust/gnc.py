@@ -89,6 +89,7 @@ def solve_gnc(
     marked, surrogate = mark(problem, candidates, groups), surrogate_of(loss, threshold)
     one_of("start", start, Start)
     bound, each, extras, began = bounds(problem, marked, threshold), list[int](), dict[str, Any](), clock()
+    doubts: tuple[str, ...] = ()
 
     def inner(part: Problem) -> Floats:
         if problem.constraints:
@@ -114,7 +115,7 @@ def solve_gnc(
         extras |= {"joined": start_x.joined} if start_x.joined else {}
     else:
         first = initial_guess(problem)
-        best, x, end = contest(problem, marked, bound, surrogate, inner, first, lambda at: finish(at).x, cost)
+        best, x, end, doubts = contest(problem, marked, bound, surrogate, inner, first, lambda at: finish(at).x, cost)
         before, extras["start"] = 0, best
         end = end if best == "graduated" else finish(x)
     final = solve(reweigh(problem, marked, end.weight, end.x), backend, throw=throw and end.settled, **options)
@@ -124,7 +125,9 @@ def solve_gnc(
     status = final.status if end.settled else Status.MAX_ITERATIONS
     out = int((end.weight < INLIER_WEIGHT).sum())
     notes = (rejection("GNC", out, len(bound), "candidates", final.cost, final.expected),) if out else ()
-    solution = replace(final, extras=final.extras | extras, status=status, notes=(*notes, *final.notes), **work)
+    solution = replace(
+        final, extras=final.extras | extras, status=status, notes=(*notes, *doubts, *final.notes), **work
+    )
     if throw and not end.settled:
         raise SolveError(solution)
     return solution

@@ -6,14 +6,14 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Floats, frozen, number, one_of
+from ...arrays import Floats, Ints, frozen, number, one_of
 from ...errors import InputError
 from ..algebra.sparse import sparse
 from ..backend import MAX_ITERATIONS, TOLERANCE
 from ..descent.levenberg_marquardt import arrive
 from ..model.factor import Factor, Loss, taken, unchecked
 from ..model.problem import Problem
-from ..starts.mirrors import across
+from ..starts.mirrors import across, movable, regrown
 from .candidates import Marked, mark, reweigh, squares
 
 ROUNDS = 300
@@ -24,6 +24,16 @@ SETTLED = 1e-6
 """Largest change of a weight that is none."""
 EASY = 1e-6
 """Below this mu is not inverted: all candidates are far within their thresholds."""
+DRAWS, POINTS, ENOUGH = 30, 1800, 3
+"""Random starts at most, and as many points together, and how many must lead to the lowest minimum to end them."""
+ALIKE = 1e-5
+"""Share of the cost by which two minima that are the same differ."""
+AGAIN = 17.0
+"""Squared ratio of a residual to its threshold from which the end graduates once more: it may then give up other
+measurements, as good as those that it rejects."""
+RIVAL, APART = 10.0, 0.05
+"""Cost by which another minimum may be higher and still be the truth's, and the share of the extent by which it must be
+elsewhere."""
 
 
 @dataclass(frozen=True)
@@ -112,11 +122,12 @@ def contest(
     start: Floats,
     finish: Callable[[Floats], Floats],
     cost: Callable[[Floats], float],
-) -> tuple[str, Floats, Graduation]:
-    """The start of least cost after `finish`, its end (n, ambient), and the graduation from the convex surrogate.
+) -> tuple[str, Floats, Graduation, tuple[str, ...]]:
+    """The start of least cost after `finish`, its end (n, ambient), the graduation from the convex surrogate, notes.
 
     That graduation races with the start itself and with descents of Huber's and Cauchy's losses, which reject nothing.
-    What ranges alone place is then put where Cauchy's loss likes it better.
+    Points that ranges place are then drawn and placed anew by consensus (`drawn`), and what is lowest graduates once
+    more. At last what ranges alone place is mirrored.
 
     Args:
         problem: whose candidates have no loss.
@@ -129,19 +140,63 @@ def contest(
     mu = surrogate.first(float((squares(problem, marked, x) / bound).max()))
     graduation = graduate(problem, marked, bound, surrogate, inner, x, np.ones(len(bound)), mu)
     if bool((graduation.weight == 1.0).all()):
-        return "graduated", finish(graduation.x), graduation
+        return "graduated", finish(graduation.x), graduation, ()
     huber, cauchy = (softened(problem, marked, bound, name) for name in ("huber", "cauchy"))
 
     def soft(at: Floats) -> Floats:
         return inner(cauchy.replace_unchecked(x0=frozen(at)))
+
+    def both(at: Floats) -> Floats:
+        return min((finish(at), finish(soft(at))), key=cost)
 
     starts = {"graduated": graduation.x, "x0": start, "cauchy": soft(start)}
     starts["huber"] = soft(inner(huber.replace_unchecked(x0=frozen(start))))
     ends = {name: finish(at) for name, at in starts.items()}
     costs = {name: np.nan_to_num(cost(at), nan=np.inf) for name, at in ends.items()}
     best = min(ends, key=costs.__getitem__)
-    best_x, moves, *_ = across(cauchy, ends[best], lambda at: finish(soft(at)), cost)
-    return best + ", mirrored" * (moves > 0), best_x, graduation
+    truncated, loose, moved = softened(problem, marked, bound, "truncated"), movable(cauchy), 0
+    best_x, notes = drawn(cauchy, ends[best], loose, lambda at: finish(soft(at)), cost)
+    name = best if best_x is ends[best] else "drawn"
+    while True:
+        least = cost(best_x)
+        if len(loose):
+            mu = surrogate.first(AGAIN)
+            again = graduate(problem, marked, bound, surrogate, inner, best_x, np.ones(len(bound)), mu)
+            best_x = min((best_x, finish(again.x)), key=cost)
+        best_x, moves, *_ = across(truncated, best_x, both, cost)
+        moved += moves
+        if not cost(best_x) < (1.0 - ALIKE) * least:
+            break
+    return name + ", mirrored" * (moved > 0), best_x, graduation, notes
+
+
+def drawn(
+    problem: Problem, x: Floats, loose: Ints, descend: Callable[[Floats], Floats], cost: Callable[[Floats], float]
+) -> tuple[Floats, tuple[str, ...]]:
+    """The lowest end (n, ambient) of descents from x and from random places of the `loose` points, each `regrown` while
+    that leads lower; and what makes it doubtful: no other start leads there, or some lead elsewhere for about the same
+    cost."""
+    d, rng, ends, most = problem.dimension, np.random.default_rng(0), list[tuple[float, Floats]](), POINTS // len(x)
+    everywhere = np.concatenate([x[:, :d], *(f.z for f in problem.factors if f.kind == "position")])
+    low, high = everywhere.min(axis=0), everywhere.max(axis=0)
+    best, least, count = x, np.nan_to_num(cost(x), nan=np.inf), 0
+    while len(loose) and len(ends) <= min(most, DRAWS) and count < ENOUGH:
+        y = x.copy()
+        if ends:
+            y[loose, :d] = rng.uniform(low, high, (len(loose), d))
+            y = descend(y)
+        now = np.nan_to_num(cost(y), nan=np.inf)
+        while (after := cost(z := descend(regrown(problem, y)))) < (1.0 - ALIKE) * now:
+            y, now = z, after
+        ends.append((now, y))
+        best, least = (y, now) if now < (1.0 - ALIKE) * least else (best, least)
+        count = sum(each <= (1.0 + ALIKE) * least for each, _ in ends)
+    size = APART * (high - low).max()
+    near = [each - least for each, y in ends if each < least + RIVAL and np.abs(y - best)[:, :d].max() > size]
+    notes = (f"another minimum costs {min(near):.3g} more: noise may decide between them",) if near else ()
+    if count == 1 < len(ends):
+        notes = *notes, f"one of {len(ends)} starts leads to this minimum: a lower one may exist"
+    return best, notes
 
 
 def softened(problem: Problem, marked: Marked, bound: Floats, loss: str) -> Problem:
@@ -187,7 +242,7 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
         return end.x
 
     surrogate = SURROGATES.get(next(iter(robust.values())).name, SURROGATES["truncated"])
-    best, x, _ = contest(
+    best, x, _, notes = contest(
         problem.replace_unchecked(factors=bare),
         marked,
         bound,
@@ -200,5 +255,6 @@ def robust_start(problem: Problem, start: Floats) -> Problem:
     search = problem.search
     name = search.start if best == "x0" and search.start else best
     return problem.replace_unchecked(
-        x0=frozen(x), search=search._replace(start=name, iterations=search.iterations + steps)
+        x0=frozen(x),
+        search=search._replace(start=name, iterations=search.iterations + steps, notes=(*search.notes, *notes)),
     )

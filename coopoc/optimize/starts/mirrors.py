@@ -1,4 +1,4 @@
-"""Mirror images of what ranges alone place: multidimensional scaling, and moves across planes to lower minima."""
+"""What ranges alone place: multidimensional scaling, moves across planes to lower minima, and consensus of ranges."""
 
 from collections.abc import Callable, Iterator
 from itertools import combinations, islice
@@ -29,6 +29,10 @@ ROUNDS = 15
 """Of moves, of which three are usual."""
 SAME = 1e-6
 """Share of the cost that a move must save."""
+BELIEVED, MAJORITY = 4.0, 0.55
+"""Standard deviations within which a range fits a place, and the share of them that must, so that a point stays."""
+MOST_RANGED = 6
+"""Points with most ranges to others that are tried for the next one that is placed."""
 
 
 Move = tuple[float, Floats, Ints]
@@ -286,3 +290,74 @@ def across(
         moved = {int(body[0]) for *_, body in single}
         doubtful |= {int(body[0]): body for body in every if body[0] not in moved}
     return x, count, rivals, [*doubtful.values()]
+
+
+def movable(problem: Problem) -> Ints:
+    """Points of which nothing but ranges, and fixes with a loss, is measured."""
+    held = [f.nodes.ravel() for f in problem.factors if f.kind != "range" and (f.kind != "position" or f.loss is None)]
+    return np.setdiff1d(np.arange(len(problem.names)), np.concatenate([problem.fixed, problem.poses, *held]))
+
+
+def regrown(problem: Problem, x: Floats) -> Floats:
+    """Nodes x (n, ambient) with points that disagree with most of their ranges placed anew by those to the others.
+
+    What disagrees most is left out, one point after the other, until the others agree. Of the crossings of the spheres
+    of a point, and its fixes, that counts with which most measurements agree; the point with most comes first.
+
+    References:
+        Fischler, Bolles, Random Sample Consensus, 1981; Moore et al., Robust distributed network localization with
+        noisy range measurements, SenSys 2004.
+    """
+    d, n, x = problem.dimension, len(x), x.copy()
+    places, ranges = x[:, :d], ranges_of(problem, x)
+    fixes = [f for f in problem.factors if f.kind == "position"]
+    fixed, fix, root = (
+        np.concatenate([empty, *parts_])
+        for empty, parts_ in (
+            (np.empty(0, np.int64), [f.nodes[:, 0] for f in fixes]),
+            (np.empty((0, d)), [f.z for f in fixes]),
+            (np.empty((0, d, d)), [f.root for f in fixes]),
+        )
+    )
+
+    def agree(at: Floats, rows: Ints, others: Ints, own: Ints) -> tuple[Bools, Bools]:
+        """Whether ranges (K,) to others and fixes (F,) fit places (C, d): (C, K), (C, F)."""
+        length = np.linalg.norm(at[:, None] - places[others], axis=2)
+        off = np.einsum("fab,cfb->cfa", root[own], at[:, None] - fix[own])
+        fits = np.abs(length - ranges.distance[rows]) * ranges.weight[rows] <= BELIEVED
+        return fits, np.linalg.norm(off, axis=2) <= BELIEVED
+
+    kept, loose = np.ones(n, dtype=bool), movable(problem)
+    length = np.linalg.norm(places[ranges.nodes[:, 0]] - places[ranges.nodes[:, 1]], axis=1)
+    fits = np.abs(length - ranges.distance) * ranges.weight <= BELIEVED
+    near = np.linalg.norm(np.einsum("fab,fb->fa", root, places[fixed] - fix), axis=1) <= BELIEVED
+    while True:
+        both = kept[ranges.nodes].all(axis=1)
+        of, good = (
+            np.bincount(ranges.nodes[rows].ravel(), minlength=n) + d * np.bincount(fixed[own], minlength=n)
+            for rows, own in ((both, np.ones(len(fixed), dtype=bool)), (both & fits, near))
+        )
+        share = good[loose] / np.maximum(of[loose], 1)
+        out = kept[loose] & ((good[loose] <= d) | (share < MAJORITY))
+        if not out.any():
+            break
+        kept[loose[np.argmin(np.where(out, share, np.inf))]] = False
+    while not kept.all():
+        rows = np.flatnonzero(kept[ranges.nodes].sum(axis=1) == 1)
+        own = np.where(kept[ranges.nodes[rows, 0]], *ranges.nodes[rows, ::-1].T)
+        count, best, at = np.bincount(own, minlength=n), 0.0, None
+        left = np.flatnonzero(~kept)
+        for point in left[np.argsort(-count[left], kind="stable")][:MOST_RANGED].tolist():
+            of_point, own_fixes = rows[own == point], np.flatnonzero(fixed == point)
+            others = ranges.nodes[of_point].sum(axis=1) - point
+            if len(others) >= d or len(own_fixes):
+                there = crossings(places[others], ranges.distance[of_point]) if len(others) >= d else fix[:0]
+                there = np.concatenate([there, fix[own_fixes]])
+                by_range, by_fix = agree(there, of_point, others, own_fixes)
+                votes = by_range.sum(axis=1) + d * by_fix.sum(axis=1)
+                if votes.max() > best:
+                    best, at = votes.max(), (point, there[np.argmax(votes)])
+        if at is None:
+            break
+        places[at[0]], kept[at[0]] = at[1], True
+    return x
