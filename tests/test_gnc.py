@@ -133,12 +133,15 @@ def test_wrong_input_says_what_to_do(make, field):
         make()
 
 
-def test_gnc_that_rejects_every_fix_is_reported():
-    """Two fixes of one point 80 m apart, both candidates: believing neither is cheapest, and then the point is free."""
-    torn = Problem(("a",)).add("position", ["a"] * 2, [[-40, 0, 0], [40, 0, 0]], std=1.0)
-    assert solve_gnc(torn, [0], throw=False).status is Status.RANK_DEFICIENT
+def test_gnc_that_rejects_every_measurement_is_reported():
+    """Two displacements 80 m apart, both candidates, and fixes that are: beside the first no start believes either, and
+    then the point is free; of the fixes it believes one, and reports the other."""
+    torn = [[-40, 0, 0], [40, 0, 0]]
+    moved = Problem(("o", "a"), x0=np.zeros((2, 3)), fixed=("o",)).add("displacement", [("o", "a")] * 2, torn, std=1.0)
+    assert solve_gnc(moved, [0], throw=False).status is Status.RANK_DEFICIENT
     with pytest.raises((InputError, SolveError)):
-        solve_gnc(torn, [0])
+        solve_gnc(moved, [0])
+    assert "another minimum" in solve_gnc(Problem(("a",)).add("position", ["a"] * 2, torn, std=1.0), [0]).notes[1]
 
 
 def test_a_limit_of_rounds_is_a_status(monkeypatch):

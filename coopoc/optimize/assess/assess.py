@@ -407,12 +407,9 @@ def expected(problem: Problem, unknowns: int) -> tuple[float, float]:
     angle's error over its variance, and adds 1 and 2.
     """
     d, angles = problem.dimension, problem.space.angles
-    matrices = sum(len(f.nodes) for f in problem.factors if f.kind in ("pose_chordal", "relative_pose_chordal"))
-    spare = (
-        sum(f.size * int(np.count_nonzero(f.informative)) for f in problem.factors)
-        - (d * d - angles) * matrices
-        - unknowns
-    )
+    counts = [(f, int(np.count_nonzero(f.informative))) for f in problem.factors]
+    matrices = sum(count for f, count in counts if f.kind in ("pose_chordal", "relative_pose_chordal"))
+    spare = sum(f.size * count for f, count in counts) - (d * d - angles) * matrices - unknowns
     turns = matrices - len({*problem.poses} - {*problem.fixed}) if matrices and d == 2 else 0
     mean = 0.5 * (max(spare, 0) + max(turns, 0))
     return mean, mean + max(turns, 0)

@@ -7,9 +7,10 @@ import numpy as np
 import numpy.typing as npt
 
 from ...arrays import Floats, instance, one_of
+from ...errors import InputError
 from ...kernels.compiling.waiting import clock
 from ..algebra.sparse import sparse
-from ..assess.assess import INLIER_WEIGHT, rejection
+from ..assess.assess import INLIER_WEIGHT, expected, implausible, rejection
 from ..backend import MAX_ITERATIONS, TOLERANCE, Backend
 from ..descent.levenberg_marquardt import arrive
 from ..graph_problems import started
@@ -104,20 +105,32 @@ def solve_gnc(
         weight = np.ones(len(bound)) if weight is None else weight
         return graduate(problem, marked, bound, surrogate, inner, at, weight, surrogate.last)
 
+    def explained(end: Graduation) -> bool:
+        part = reweigh(problem, marked, end.weight, end.x)
+        return not implausible(sparse(part).cost(end.x), *expected(part, sparse(part).size))
+
     def cost(at: Floats) -> float:
         s = squares(problem, marked, at) / bound
         spent = np.minimum(s, 1.0) if loss == "truncated" else s / (1.0 + s)
         return sparse(reweigh(problem, marked, np.zeros(len(bound)), at)).cost(at) + 0.5 * float(bound @ spent)
 
-    if start == "known":
-        start_x = known_start(problem, marked, bound, inner)
-        before, end = start_x.rounds, finish(start_x.x, start_x.weight)
-        extras |= {"joined": start_x.joined} if start_x.joined else {}
-    else:
-        first = initial_guess(problem)
-        best, x, end, doubts = contest(problem, marked, bound, surrogate, inner, first, lambda at: finish(at).x, cost)
-        before, extras["start"] = 0, best
-        end = end if best == "graduated" else finish(x)
+    try:
+        from_known = known_start(problem, marked, bound, inner)
+    except InputError:  # known inliers leave nodes free, and candidates do not place them
+        if start == "known":
+            raise
+        from_known = None
+    best, before, end = "known", 0, None
+    if from_known is not None:
+        before, end = from_known.rounds, finish(from_known.x, from_known.weight)
+        extras |= {"joined": from_known.joined} if from_known.joined else {}
+    if end is None or (start == "all" and not explained(end)):
+        best, x, graduation, doubts = contest(
+            problem, marked, bound, surrogate, inner, initial_guess(problem), lambda at: finish(at).x, cost
+        )
+        other = graduation if best == "graduated" else finish(x)
+        best, end = ("known", end) if end is not None and cost(end.x) <= cost(other.x) else (best, other)
+    extras["start"] = best
     final = solve(reweigh(problem, marked, end.weight, end.x), backend, throw=throw and end.settled, **options)
     extras |= {"weights": end.weight[marked.group], "rounds": before + end.rounds, "mu": float(end.mu)}
     work: dict[str, Any] = {"iterations": sum(each) + final.iterations}
