@@ -22,7 +22,7 @@ from .candidates import Candidates, bounds, mark, reweigh, squares
 from .graduated import Graduation, contest, graduate, surrogate_of
 from .loop_closures import known_start
 
-Start = Literal["all", "known"]
+Start = Literal["any", "known"]
 
 
 def solve_gnc(
@@ -33,7 +33,7 @@ def solve_gnc(
     groups: npt.ArrayLike | None = None,
     backend: str | Backend = "gauss-newton",
     throw: bool = True,
-    start: Start = "all",
+    start: Start = "any",
     **options: Any,
 ) -> Solution:
     """A minimum of 1/2 sum |r_inlier|^2 + 1/2 sum_g rho(r_g^2), r_g^2 = sum over the group of |W (h(x) - z)|^2.
@@ -45,14 +45,14 @@ def solve_gnc(
         truncated: w = sqrt(mu (mu + 1)) c/|r| - mu within [0, 1], mu from c^2 / (2 r_max^2 - c^2) up by 1.4 a round
         geman-mcclure: w = (mu c^2 / (r^2 + mu c^2))^2, mu from 2 r_max^2 / c^2 down to 1
 
-    until the weights no longer change, truncated ones at 0 or 1. That races with other starts where it rejects any
-    (`graduated.py`), and the least cost wins. Inlier groups must agree better than the others: a majority of consistent
-    outliers wins, and so does an error that all share.
+    until the weights no longer change, truncated ones at 0 or 1. Inlier groups must agree better than the others: a
+    majority of consistent outliers wins, and so does an error that all share.
 
-    start="known" begins with the known inliers alone, which candidates join where they are predicted
-    (`loop_closures.py`), and then alternates with rho itself. Long drives with wrong loop closures need that: the first
-    least squares over all of them bends the whole drive. Robots that only candidates join are placed by those that
-    agree most.
+    Where known inliers hold every node, as odometry does, they are the start, which candidates join where they are
+    predicted (`loop_closures.py`): a first least squares over wrong loop closures would bend a long drive. Robots that
+    only candidates join are placed by those that agree most. Where known inliers leave nodes free, or the noise does
+    not explain what that rejects nothing of, the graduation races with other starts (`graduated.py`), and the least
+    cost wins.
 
     Args:
         problem: a single one; measurements that are no candidates are known inliers.
@@ -63,7 +63,7 @@ def solve_gnc(
             each on its own.
         backend: of `solve`, for the last problem, and with constraints for every round.
         throw: as in `solve`.
-        start: "all" with full weights, or "known" inliers.
+        start: "known" refuses what known inliers leave free and candidates do not decide; "any" goes on from elsewhere.
         options: of the backend.
 
     Returns:
@@ -124,7 +124,7 @@ def solve_gnc(
     if from_known is not None:
         before, end = from_known.rounds, finish(from_known.x, from_known.weight)
         extras |= {"joined": from_known.joined} if from_known.joined else {}
-    if end is None or (start == "all" and not explained(end)):
+    if end is None or (start == "any" and not explained(end)):
         best, x, graduation, doubts = contest(
             problem, marked, bound, surrogate, inner, initial_guess(problem), lambda at: finish(at).x, cost
         )
