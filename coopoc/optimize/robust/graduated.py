@@ -154,9 +154,10 @@ def contest(
     ends = {name: finish(at) for name, at in starts.items()}
     costs = {name: np.nan_to_num(cost(at), nan=np.inf) for name, at in ends.items()}
     best = min(ends, key=costs.__getitem__)
-    truncated, loose, moved = softened(problem, marked, bound, "truncated"), movable(cauchy), 0
-    best_x, notes = drawn(cauchy, ends[best], loose, lambda at: finish(soft(at)), cost)
-    name = best if best_x is ends[best] else "drawn"
+    truncated, loose = softened(problem, marked, bound, "truncated"), movable(cauchy)
+    mirrored_x, moved, *_ = across(cauchy, ends[best], lambda at: finish(soft(at)), cost)
+    best_x, notes = drawn(cauchy, mirrored_x, loose, lambda at: finish(soft(at)), cost)
+    name = best if best_x is mirrored_x else "drawn"
     while True:
         least = cost(best_x)
         if len(loose):
