@@ -13,7 +13,7 @@ from ..backend import MAX_ITERATIONS, TOLERANCE
 from ..descent.levenberg_marquardt import arrive
 from ..model.factor import Factor, Loss, taken, unchecked
 from ..model.problem import Problem
-from ..starts.mirrors import across, movable, regrown
+from ..starts.mirrors import across, movable, regrown, scaled
 from .candidates import Marked, mark, reweigh, squares
 
 ROUNDS = 300
@@ -26,6 +26,8 @@ EASY = 1e-6
 """Below this mu is not inverted: all candidates are far within their thresholds."""
 DRAWS, POINTS, ENOUGH = 30, 1800, 3
 """Random starts at most, and as many points together, and how many must lead to the lowest minimum to end them."""
+PART = 0.8
+"""Share of the ranges whose shortest paths make every other start."""
 ALIKE = 1e-5
 """Share of the cost by which two minima that are the same differ."""
 AGAIN = 17.0
@@ -174,9 +176,9 @@ def contest(
 def drawn(
     problem: Problem, x: Floats, loose: Ints, descend: Callable[[Floats], Floats], cost: Callable[[Floats], float]
 ) -> tuple[Floats, tuple[str, ...]]:
-    """The lowest end (n, ambient) of descents from x and from random places of the `loose` points, each `regrown` while
-    that leads lower; and what makes it doubtful: no other start leads there, or some lead elsewhere for about the same
-    cost."""
+    """The lowest end (n, ambient) of descents from x, from random places of the `loose` points, and from where shortest
+    paths along a part of the ranges put them, each `regrown` while that leads lower; and what makes it doubtful: no
+    other start leads there, or some lead elsewhere for about the same cost."""
     d, rng, ends, most = problem.dimension, np.random.default_rng(0), list[tuple[float, Floats]](), POINTS // len(x)
     everywhere = np.concatenate([x[:, :d], *(f.z for f in problem.factors if f.kind == "position")])
     low, high = everywhere.min(axis=0), everywhere.max(axis=0)
@@ -185,6 +187,9 @@ def drawn(
         y = x.copy()
         if ends:
             y[loose, :d] = rng.uniform(low, high, (len(loose), d))
+            if len(ends) % 2 and not problem.space.has_rotation:
+                by_paths = scaled(thinned(problem, rng), x)
+                y = y if by_paths is x else by_paths
             y = descend(y)
         now = np.nan_to_num(cost(y), nan=np.inf)
         while (after := cost(z := descend(regrown(problem, y)))) < (1.0 - ALIKE) * now:
@@ -198,6 +203,14 @@ def drawn(
     if count == 1 < len(ends):
         notes = *notes, f"one of {len(ends)} starts leads to this minimum: a lower one may exist"
     return best, notes
+
+
+def thinned(problem: Problem, rng: np.random.Generator) -> Problem:
+    """The problem with a random part of its ranges: what is left out need not be wrong."""
+    factors = (
+        taken(f, np.flatnonzero(rng.random(len(f.nodes)) < PART)) if f.kind == "range" else f for f in problem.factors
+    )
+    return problem.replace_unchecked(factors=tuple(factors))
 
 
 def softened(problem: Problem, marked: Marked, bound: Floats, loss: str) -> Problem:
