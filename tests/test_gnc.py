@@ -139,7 +139,7 @@ def test_gnc_that_rejects_every_measurement_is_reported():
     torn = [[-40, 0, 0], [40, 0, 0]]
     moved = Problem(("o", "a"), x0=np.zeros((2, 3)), fixed=("o",)).add("displacement", [("o", "a")] * 2, torn, std=1.0)
     assert solve_gnc(moved, [0], throw=False).status is Status.RANK_DEFICIENT
-    with pytest.raises((InputError, SolveError)):
+    with pytest.raises(InputError):
         solve_gnc(moved, [0])
     assert "another minimum" in solve_gnc(Problem(("a",)).add("position", ["a"] * 2, torn, std=1.0), [0]).notes[1]
 
