@@ -659,7 +659,7 @@ class Oracle:
             return False
         if self.ego in s["trusted"]:
             hits, again = s["hits"]["fix"], s["locked"].get(self.ego, 0.0) >= PATIENCE
-            return bool(hits > 0 and again)
+            return bool((hits >= 2 and t - s["joined"][self.ego] - hits <= 1) or (hits > 0 and again))
         b, noise = s["belief"], (self.r[t, self.ego] @ self.white) / 3
         error = b.x[b.at(("b", self.ego))]
         apart = [float(np.square(error - b.x[b.at(("b", j))]).sum()) for j in held]

@@ -297,8 +297,8 @@ def start(f: Filter, model: Model, own: Floats, rows: Floats, count: int) -> boo
 
 @part
 def needs_restart(f: Filter, model: Model, own: Floats) -> bool:
-    """Whether the ego's position rests on nothing that is trusted: no neighbour is, and fixes have contradicted it
-    for so long that they would be used again (and turn its odometry towards them); or its
+    """Whether the ego's position rests on nothing that is trusted: no neighbour is, and either all fixes but the first
+    contradict it, or fixes have for so long that they would be used again (and turn its odometry towards them); or its
     receiver is not trusted beside others that are not. One other suffices where the error of the ego's fixes would be
     beyond all doubt, or is the other's, too: it is the ego's."""
     ego, others, last = f.who[0, VEHICLE], 0, 0
@@ -310,7 +310,8 @@ def needs_restart(f: Filter, model: Model, own: Floats) -> bool:
             others, last = others + 1, k
     hits = f.who[0, HITS]
     if f.status[ego, TRUSTED] > 0.0:
-        return bool(hits > 0 and f.member[0, LOCKED] >= PATIENCE)
+        young = f.ego[STEPS] - f.member[0, JOINED] - hits <= 1
+        return bool((hits >= 2 and young) or (hits > 0 and f.member[0, LOCKED] >= PATIENCE))
     far, between, noise = 0.0, 0.0, 0.0
     first, other = 3 * f.g.block[0, ERROR], 3 * f.g.block[last, ERROR]
     for c in range(3):
