@@ -10,7 +10,7 @@ from ...arrays import Floats, Ints, frozen, number, one_of
 from ...errors import InputError
 from ..algebra.sparse import sparse
 from ..backend import MAX_ITERATIONS, TOLERANCE
-from ..descent.levenberg_marquardt import arrive
+from ..descent.levenberg_marquardt import arrive, progress
 from ..model.factor import Factor, Loss, taken, unchecked
 from ..model.problem import Problem
 from ..starts.mirrors import across, movable, regrown, scaled
@@ -28,8 +28,8 @@ DRAWS, POINTS, ENOUGH = 30, 1800, 3
 """Random starts at most, and as many points together, and how many must lead to the lowest minimum to end them."""
 PART = 0.8
 """Share of the ranges whose shortest paths make every other start."""
-ALIKE = 1e-5
-"""Share of the cost by which two minima that are the same differ."""
+ALIKE, GAINED = 1e-5, 1e-3
+"""Share of the cost by which two minima that are the same differ, and that another round must save."""
 AGAIN = 17.0
 """Squared ratio of a residual to its threshold from which the end graduates once more: it may then give up other
 measurements, as good as those that it rejects."""
@@ -145,31 +145,35 @@ def contest(
         return "graduated", finish(graduation.x), graduation, ()
     huber, cauchy = (softened(problem, marked, bound, name) for name in ("huber", "cauchy"))
 
-    def soft(at: Floats) -> Floats:
-        return inner(cauchy.replace_unchecked(x0=frozen(at)))
+    with progress("robust") as counted:
 
-    def both(at: Floats) -> Floats:
-        return min((finish(at), finish(soft(at))), key=cost)
+        def landed(at: Floats) -> Floats:
+            end = finish(at)
+            counted(cost(end))
+            return end
 
-    starts = {"graduated": graduation.x, "x0": start, "cauchy": soft(start)}
-    starts["huber"] = soft(inner(huber.replace_unchecked(x0=frozen(start))))
-    ends = {name: finish(at) for name, at in starts.items()}
-    costs = {name: np.nan_to_num(cost(at), nan=np.inf) for name, at in ends.items()}
-    best = min(ends, key=costs.__getitem__)
-    truncated, loose = softened(problem, marked, bound, "truncated"), movable(cauchy)
-    mirrored_x, moved, *_ = across(cauchy, ends[best], lambda at: finish(soft(at)), cost)
-    best_x, notes = drawn(cauchy, mirrored_x, loose, lambda at: finish(soft(at)), cost)
-    name = best if best_x is mirrored_x else "drawn"
-    while True:
-        least = cost(best_x)
-        if len(loose):
-            mu = surrogate.first(AGAIN)
-            again = graduate(problem, marked, bound, surrogate, inner, best_x, np.ones(len(bound)), mu)
-            best_x = min((best_x, finish(again.x)), key=cost)
-        best_x, moves, *_ = across(truncated, best_x, both, cost)
-        moved += moves
-        if not cost(best_x) < (1.0 - ALIKE) * least:
-            break
+        def soft(at: Floats) -> Floats:
+            return inner(cauchy.replace_unchecked(x0=frozen(at)))
+
+        starts = {"graduated": graduation.x, "x0": start, "cauchy": soft(start)}
+        starts["huber"] = soft(inner(huber.replace_unchecked(x0=frozen(start))))
+        ends = {name: landed(at) for name, at in starts.items()}
+        costs = {name: np.nan_to_num(cost(at), nan=np.inf) for name, at in ends.items()}
+        best = min(ends, key=costs.__getitem__)
+        truncated, loose = softened(problem, marked, bound, "truncated"), movable(cauchy)
+        mirrored_x, moved, *_ = across(cauchy, ends[best], lambda at: landed(soft(at)), cost)
+        best_x, notes = drawn(cauchy, mirrored_x, loose, lambda at: landed(soft(at)), cost)
+        name, least = best if best_x is mirrored_x else "drawn", np.inf
+        while cost(best_x) < (1.0 - GAINED) * least:
+            least = cost(best_x)
+            if len(loose):
+                mu = surrogate.first(AGAIN)
+                again = graduate(problem, marked, bound, surrogate, inner, best_x, np.ones(len(bound)), mu)
+                best_x = min((best_x, landed(again.x)), key=cost)
+            best_x, moves, *_ = across(
+                truncated, best_x, lambda at: min((landed(at), landed(soft(at))), key=cost), cost
+            )
+            moved += moves
     return name + ", mirrored" * (moved > 0), best_x, graduation, notes
 
 
