@@ -293,8 +293,10 @@ def predicted(problem: Problem, marked: Marked, weight: Floats, x: Floats) -> tu
         P = np.zeros(row.shape)
         P[free] = system.cholesky.inverse(row[free], column[free])
         S = J @ P @ np.swapaxes(J, 1, 2) + np.eye(factor.size)
-        squared = np.einsum("mk,mk->m", r, np.linalg.solve(S, r[..., None])[..., 0])
-        distance[here] = np.where(lost, np.inf, squared)
-        volume[here] = np.linalg.slogdet(S)[1]
+        lost |= ~np.isfinite(S).all(axis=(1, 2))
+        variance, axes = np.linalg.eigh(np.where(lost[:, None, None], np.eye(factor.size), S))
+        variance = np.maximum(variance, 1.0)  # as it is but for rounding, of nodes that are nearly free
+        distance[here] = np.where(lost, np.inf, (np.einsum("mkj,mk->mj", axes, r) ** 2 / variance).sum(axis=1))
+        volume[here] = np.log(variance).sum(axis=1)
     sums = [np.asarray(np.bincount(marked.group, each, len(weight)), np.float64) for each in (distance, volume)]
     return sums[0], sums[1]
