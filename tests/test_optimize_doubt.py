@@ -46,10 +46,10 @@ def test_a_cost_that_the_noise_does_not_explain_is_noted():
 
 
 def test_points_that_a_loss_sets_free_are_told_from_unmeasured_ones():
-    torn, far = {"std": 1.0, "loss": Loss("truncated", 1.0)}, [[-40, 0, 0], [40, 0, 0]]
-    from_o = Problem(("o", "a"), x0=np.zeros((2, 3)), fixed=("o",)).add("displacement", [("o", "a")] * 2, far, **torn)
+    torn = Problem(("o", "a"), x0=np.eye(2, 3), fixed=(0,))
+    torn = torn.add("displacement", [(0, 1)] * 2, [[-40] * 3, [40] * 3], std=1.0, loss=Loss("truncated", 1.0))
     with refused(r"a can move|truncated loss rejects 2 of 2.*larger scale"):
-        solve(from_o)
+        solve(torn)
 
 
 def test_edges_alone_are_read_and_solved_as_with_vertices(tmp_path):

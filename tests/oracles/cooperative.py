@@ -44,6 +44,7 @@ from coopoc.kernels.stars.otherwise import (
     RARE,
     SIDEWAYS,
     SUDDEN,
+    TURNS,
     UNSEEN,
     UNTRUSTED,
     USUAL,
@@ -221,11 +222,11 @@ class Oracle:
         }
         everyone = set(range(self.seen.gnss.shape[2]))
         trusted = everyone if not self.priors.fix_gate else {self.ego}
-        numbers = ["made", "shown", "unseen", "evidence", "driven", "agree", "slips", "speed"]
+        numbers = ["made", "shown", "unseen", "blind", "evidence", "driven", "agree", "slips", "speed"]
         numbers += ["score", "numbers", "squares", "late", "weight"]
         levels = {name: np.zeros(6) for name in ("level", "learned", "information")}
         levels |= {name: np.zeros(3) for name in ("gap", "cov", "course", "recent")} | dict.fromkeys(numbers, 0.0)
-        levels |= {"products": [], "louder": {}, "left": None}
+        levels |= {"products": [], "louder": {}, "left": None, "jumped": False}
         return empty | levels | {"belief": Belief(), "members": [], "vague": set(), "trusted": trusted}
 
     def loop(self) -> tuple[Floats, Floats, list[Floats]]:
@@ -333,8 +334,9 @@ class Oracle:
         """The most of late speeds, and its direction."""
         dt, u = self.seen.dt, self.seen.velocity[self.run, t, self.ego]
         speed, late = float(np.linalg.norm(u)), self.state["speed"] * math.exp(-dt / LATE)
+        self.state["blind"] += dt
         if speed > 0.5 * late:
-            self.state["course"] = u / speed
+            self.state |= {"course": u / speed, "blind": 0.0}
         self.state["speed"] = max(speed, late)
 
     def tries(self, t: int) -> None:
@@ -347,7 +349,9 @@ class Oracle:
         self.step(t, 0.0)
         n, p = self.state["numbers"], self.state["slips"]
         known, fails = self.pending == KNOWN, self.pending > 0
-        strange = p > 0.1 or self.state["squares"] > n + math.sqrt(2 * n)
+        strange = (p > 0.1 or self.state["squares"] > n + math.sqrt(2 * n)) and (
+            fails or known or not self.state["jumped"]
+        )
         if before is None or not strange:
             self.state["slips"] *= 0.0 if n else math.exp(-dt / LASTS)
             return
@@ -447,6 +451,8 @@ class Oracle:
         again = again and self.start(t, fix, messages, relative)
         for j in list(s["members"]):
             if j not in others or again or self.contradicted(t, j):
+                if j in others and j not in s["trusted"]:
+                    self.doubt(j)
                 for kind in "xbor":
                     b.drop((kind, j))
                 s["members"].remove(j)
@@ -458,7 +464,8 @@ class Oracle:
         if t > s["joined"][self.ego]:
             self.predict(dt * u, q)
             x = b.at(("x", self.ego))
-            b.p[x, x] += slip * (SIDEWAYS * np.eye(3) + np.outer(s["course"], s["course"]))
+            across = min(SIDEWAYS + (TURNS * s["blind"]) ** 2, 1.0)
+            b.p[x, x] += slip * (across * np.eye(3) + np.outer(s["course"], s["course"]))
         s["made"] = s["made"] + q.sum()
         if s["left"]:
             grown = 0.0 if self.ego in s["vague"] else self.own_variance() - s["whole"]
@@ -497,6 +504,8 @@ class Oracle:
             _, gap, _, r = self.mahalanobis(s["belief"], rows)
             far, most = float(np.linalg.norm(gap)), s["speed"] * s["unseen"] + 2 * math.sqrt(r.sum())
             more = far - float(np.linalg.norm(s["gap"]))
+            if more > most or far < 2 * math.sqrt(r.sum()):
+                s["jumped"] = more > most
             s["shown"], s["gap"], s["unseen"] = max(s["shown"] + min(more, most), 0.0), gap, 0.0
         alone = not any(j in s["last"] for j in s["members"])
         if self.priors.fix_gate and self.ego not in s["vague"] and alone:

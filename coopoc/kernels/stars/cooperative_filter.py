@@ -266,7 +266,7 @@ def step(
         copy_rows(own, rows, tries, count)
     attempt(f, model, own, rows, vehicles, count)
     fails = tries.doubts[PENDING] > 0.0
-    if slips and surprised(f):
+    if slips and surprised(f, fails or known):
         other.ego[NOW] = 1.0
         if fails or known:
             corrected_motion(other, tries.own, tries.own[MORE] if known else tries.doubts[PENDING])

@@ -40,6 +40,7 @@ from .cooperative_state import (
     measured_vector,
     measured_whole,
     needs_restart,
+    reset_bias,
     start,
 )
 from .gaussian import ABSENT, COMMON, ERROR, KINDS, PLACE, RANGED, has, insert, remove, shift, widen
@@ -67,6 +68,8 @@ def leave(f: Filter, model: Model, own: Floats, rows: Floats, vehicles: Ints, co
         j = f.who[k, VEHICLE]
         if j < 0 or (f.who[k, INPUT] >= 0 and not again and not contradicted(f, k)):
             continue
+        if f.who[k, INPUT] >= 0 and f.status[j, TRUSTED] == 0.0:  # the error was estimated beside a wrong position
+            reset_bias(f, model, j)
         for kind in range(KINDS):
             remove(f.g, k, kind)
         f.slot[j], f.who[k, VEHICLE] = ABSENT, ABSENT

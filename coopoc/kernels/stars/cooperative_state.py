@@ -144,7 +144,7 @@ STEPS, CLOCK, SPAN, MADE, WHOLE, SLIPPING = range(6)
 LEVEL, SLOPE, INFORMATION, TOLD, ANSWER, COVARIANCE, LEFT = 20, 26, 32, 38, 51, 54, 63
 AGREED, SINCE_FIX, CORRECTED, ADDED, ERRORS, EGO = 70, 71, 72, 73, 76, 84
 """Of the ego: number of the step; s, now, and since the last step; of its variance m^2, axes together, what the level
-of motion makes, and the whole then; thirteen numbers of `otherwise` on slips; by kind of number the logarithm of its
+of motion makes, and the whole then; fifteen numbers of `otherwise` on slips; by kind of number the logarithm of its
 level, the sum of that one's derivatives in this step, and information; out: FOUND numbers of `otherwise.average`, what
 is otherwise than assumed, and position m and covariance m^2; and where it would be m, had fixes not led it away, the
 variance of that m^2, NOTHING for none, the two numbers of `gate.remember` on it, and how far the ego has driven since

@@ -259,12 +259,14 @@ def average_over_all(f: Filter, model: Model, own: int) -> None:
     f.few[own - 3, width], f.few[own - 2, width] = (1.0 - none) * heading, (1.0 - none) * scale
 
 
-SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, COURSE, _, _, BEFORE = range(SLIPPING, SLIPPING + 11)
+SLIPPED, SPEED_OF_LATE, NOW, LIKELY, NUMBERS, SQUARES, SHOWN, JUMPED, BLIND, COURSE, _, _, BEFORE = range(
+    SLIPPING, SLIPPING + 13
+)
 """Of the ego: probability that the ego slips, its late speed m/s, whether this try assumes so, of the step's numbers
-the logarithm of their likelihood, how many there are, and their squared normalised innovations; `show` m, the direction
-of its late speed, three numbers; and the innovation of the last fix m."""
-SIDEWAYS = 0.03
-"""Share of a slip's variance that is across the way: some ten degrees."""
+the logarithm of their likelihood, how many there are, and their squared normalised innovations; `show` m, whether
+fixes have jumped; for how long s it has not measured its direction, and that; and the innovation of the last fix m."""
+SIDEWAYS, TURNS = 0.03, 0.3
+"""Share of a slip's variance that is across the way: some ten degrees; rad/s by which a vehicle may turn then."""
 LASTS, RARE, LATE, UNSEEN = 3.0, 3000.0, 10.0, 1.0
 """s: how long a slip lasts, how long none does, for which a speed is remembered, and until a slip shows."""
 
@@ -342,7 +344,9 @@ def remember_speed(f: Filter, own: Floats) -> None:
     for c in range(3):
         square += ((own[MOTION + c] + own[BY_FIXES + c]) / own[DT]) ** 2
     speed, late = math.sqrt(square), f.ego[SPEED_OF_LATE] * math.exp(-own[DT] / LATE)
+    f.ego[BLIND] += own[DT]
     if speed > 0.5 * late:
+        f.ego[BLIND] = 0.0
         for c in range(3):
             f.ego[COURSE + c] = (own[MOTION + c] + own[BY_FIXES + c]) / (own[DT] * speed)
     f.ego[SPEED_OF_LATE] = max(speed, late)
@@ -350,17 +354,19 @@ def remember_speed(f: Filter, own: Floats) -> None:
 
 @part
 def show(f: Filter) -> None:
-    """After `innovate`: how far the ego may have gone unseen, the distance of its fix, as far as that grew no
-    faster than the ego drives and fixes err: if faster, they have jumped."""
+    """After `innovate`: how far the ego may have gone unseen, the distance of its fix as far as that grew no faster
+    than the ego drives and fixes err; if faster, they have jumped until they are near again, and that is no slip."""
     far, noise, before = 0.0, 0.0, 0.0
     for c in range(3):
         before += f.ego[BEFORE + c] ** 2
         f.ego[BEFORE + c] = f.h.three[GAP + c]
         far += f.h.three[GAP + c] ** 2
         noise += f.h.three[VARIANCE + c]
-    most = f.ego[SPEED_OF_LATE] * f.ego[SINCE_FIX] + 2.0 * math.sqrt(noise)
-    f.ego[SHOWN] = max(f.ego[SHOWN] + min(math.sqrt(far) - math.sqrt(before), most), 0.0)
-    f.ego[SINCE_FIX] = 0.0
+    far, most = math.sqrt(far), f.ego[SPEED_OF_LATE] * f.ego[SINCE_FIX] + 2.0 * math.sqrt(noise)
+    more, f.ego[SINCE_FIX] = far - math.sqrt(before), 0.0
+    f.ego[SHOWN] = max(f.ego[SHOWN] + min(more, most), 0.0)
+    if more > most or far < 2.0 * math.sqrt(noise):
+        f.ego[JUMPED] = 1.0 if more > most else 0.0
 
 
 @part
@@ -374,7 +380,7 @@ def slip(f: Filter, model: Model, own: Floats) -> None:
     if f.ego[SLIPPED] <= 0.5 and own[DT] < UNSEEN:
         fix = own[FIX_VARIANCE] + own[FIX_VARIANCE + 1] + own[FIX_VARIANCE + 2]
         variance += min(rate * UNSEEN**2, fix + f.ego[SHOWN] ** 2)
-    widen(f.g, first, SIDEWAYS * variance)
+    widen(f.g, first, min(SIDEWAYS + (TURNS * f.ego[BLIND]) ** 2, 1.0) * variance)
     for c in range(3):
         for d in range(3):
             f.g.p[first + c, first + d] += variance * f.ego[COURSE + c] * f.ego[COURSE + d]
@@ -396,10 +402,12 @@ def score(f: Filter, h: Rows, gate: float, whole: bool) -> None:
 
 
 @part
-def surprised(f: Filter) -> bool:
-    """Whether the first try's numbers are worse than usual by a standard deviation, or the ego may have slipped."""
+def surprised(f: Filter, fails: bool) -> bool:
+    """Whether the first try's numbers are worse than usual by a standard deviation, or the ego may have slipped; not
+    for fixes that jumped while odometry does not fail."""
     n = f.ego[NUMBERS]
-    return bool(f.ego[SLIPPED] > 0.1 or f.ego[SQUARES] > n + math.sqrt(2.0 * n))
+    strange = f.ego[SLIPPED] > 0.1 or f.ego[SQUARES] > n + math.sqrt(2.0 * n)
+    return bool(strange and (f.ego[JUMPED] == 0.0 or fails))
 
 
 @part
