@@ -111,7 +111,7 @@ def main() -> None:
         return
     ways = ["coopoc", *["gtsam"] * given.gtsam]
     table = [row for share in SHARES for row in rows(share, ways)]
-    header = ["share", "wrong", "start", "missed", "false", "ATE m", "CPU s"]
+    header = ["share", "wrong", "by", "missed", "false", "ATE m", "CPU s"]
     print(tabulate(table, header, tablefmt="github", floatfmt=".3g"))
 
 

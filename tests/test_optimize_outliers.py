@@ -52,7 +52,7 @@ def from_known(graph: Graph) -> tuple[co.Solution, Ints, Bools]:
     """The answer of GNC that begins with odometry, its candidates, and which of them it rejects."""
     problem = from_graph(graph, start="odometry")
     ((factor, rows),) = loop_closures(problem)
-    solution = solve_gnc(problem, [(factor, rows)], start="known")
+    solution = solve_gnc(problem, [(factor, rows)])
     rejected = solution.extras["weights"] < 0.5
     return solution, np.asarray(rows), rejected
 

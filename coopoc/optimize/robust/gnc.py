@@ -50,9 +50,9 @@ def solve_gnc(
 
     Where known inliers hold every node, as odometry does, they are the start, which candidates join where they are
     predicted (`loop_closures.py`): a first least squares over wrong loop closures would bend a long drive. Robots that
-    only candidates join are placed by those that agree most. Where known inliers leave nodes free, or the noise does
-    not explain what that rejects nothing of, the graduation races with other starts (`graduated.py`), and the least
-    cost wins.
+    only candidates join are placed by those that agree most. The graduation and other starts (`graduated.py`) race with
+    that, and the least cost wins, unless every candidate is a relative pose or linear, and the noise explains what
+    remains of them.
 
     Args:
         problem: a single one; measurements that are no candidates are known inliers.
@@ -85,6 +85,8 @@ def solve_gnc(
     >>> solution = solve_gnc(problem, candidates=[0])
     >>> float(solution.x[0, 0].round(3)), solution.extras["weights"]
     (0.5, array([1., 1., 0.]))
+    >>> solve_gnc(Problem(("a",)).add("position", ["a"] * 2, [[-40, 0, 0], [40, 0, 0]], std=1.0), [0]).notes[1]
+    'another minimum, elsewhere, costs as much'
     """
     problem = started(instance("problem", problem, Problem))
     marked, surrogate = mark(problem, candidates, groups), surrogate_of(loss, threshold)
@@ -105,9 +107,10 @@ def solve_gnc(
         weight = np.ones(len(bound)) if weight is None else weight
         return graduate(problem, marked, bound, surrogate, inner, at, weight, surrogate.last)
 
-    def explained(end: Graduation) -> bool:
+    def explained(end: Graduation) -> bool:  # the minimum of ranges and angles need not be the only one
         part = reweigh(problem, marked, end.weight, end.x)
-        return not implausible(sparse(part).cost(end.x), *expected(part, sparse(part).size))
+        single = all(m.linear or m.compares_poses for m in {problem.factors[k].measurement for k in marked.factor})
+        return single and not implausible(sparse(part).cost(end.x), *expected(part, sparse(part).size))
 
     def cost(at: Floats) -> float:
         s = squares(problem, marked, at) / bound

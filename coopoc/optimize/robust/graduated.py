@@ -6,14 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from ...arrays import Floats, Ints, frozen, number, one_of
+from ...arrays import Floats, frozen, number, one_of
 from ...errors import InputError
 from ..algebra.sparse import sparse
 from ..backend import MAX_ITERATIONS, TOLERANCE
 from ..descent.levenberg_marquardt import arrive, progress
 from ..model.factor import Factor, Loss, taken, unchecked
 from ..model.problem import Problem
-from ..starts.mirrors import across, movable, regrown, scaled
+from ..starts.mirrors import across, movable
+from ..starts.race import drawn
 from .candidates import Marked, mark, reweigh, squares
 
 ROUNDS = 300
@@ -24,18 +25,11 @@ SETTLED = 1e-6
 """Largest change of a weight that is none."""
 EASY = 1e-6
 """Below this mu is not inverted: all candidates are far within their thresholds."""
-DRAWS, POINTS, ENOUGH = 30, 1800, 3
-"""Random starts at most, and as many points together, and how many must lead to the lowest minimum to end them."""
-PART = 0.8
-"""Share of the ranges whose shortest paths make every other start."""
-ALIKE, GAINED = 1e-5, 1e-3
-"""Share of the cost by which two minima that are the same differ, and that another round must save."""
 AGAIN = 17.0
 """Squared ratio of a residual to its threshold from which the end graduates once more: it may then give up other
 measurements, as good as those that it rejects."""
-RIVAL, APART = 10.0, 0.05
-"""Cost by which another minimum may be higher and still be the truth's, and the share of the extent by which it must be
-elsewhere."""
+GAINED = 1e-3
+"""Share of the cost that another round must save."""
 
 
 @dataclass(frozen=True)
@@ -175,46 +169,6 @@ def contest(
             )
             moved += moves
     return name + ", mirrored" * (moved > 0), best_x, graduation, notes
-
-
-def drawn(
-    problem: Problem, x: Floats, loose: Ints, descend: Callable[[Floats], Floats], cost: Callable[[Floats], float]
-) -> tuple[Floats, tuple[str, ...]]:
-    """The lowest end (n, ambient) of descents from x, from random places of the `loose` points, and from where shortest
-    paths along a part of the ranges put them, each `regrown` while that leads lower; and what makes it doubtful: no
-    other start leads there, or some lead elsewhere for about the same cost."""
-    d, rng, ends, most = problem.dimension, np.random.default_rng(0), list[tuple[float, Floats]](), POINTS // len(x)
-    everywhere = np.concatenate([x[:, :d], *(f.z for f in problem.factors if f.kind == "position")])
-    low, high = everywhere.min(axis=0), everywhere.max(axis=0)
-    best, least, count = x, np.nan_to_num(cost(x), nan=np.inf), 0
-    while len(loose) and len(ends) <= min(most, DRAWS) and count < ENOUGH:
-        y = x.copy()
-        if ends:
-            y[loose, :d] = rng.uniform(low, high, (len(loose), d))
-            if len(ends) % 2 and not problem.space.has_rotation:
-                by_paths = scaled(thinned(problem, rng), x)
-                y = y if by_paths is x else by_paths
-            y = descend(y)
-        now = np.nan_to_num(cost(y), nan=np.inf)
-        while (after := cost(z := descend(regrown(problem, y)))) < (1.0 - ALIKE) * now:
-            y, now = z, after
-        ends.append((now, y))
-        best, least = (y, now) if now < (1.0 - ALIKE) * least else (best, least)
-        count = sum(each <= (1.0 + ALIKE) * least for each, _ in ends)
-    size = APART * (high - low).max()
-    near = [each - least for each, y in ends if each < least + RIVAL and np.abs(y - best)[:, :d].max() > size]
-    notes = (f"another minimum costs {min(near):.3g} more: noise may decide between them",) if near else ()
-    if count == 1 < len(ends):
-        notes = *notes, f"one of {len(ends)} starts leads to this minimum: a lower one may exist"
-    return best, notes
-
-
-def thinned(problem: Problem, rng: np.random.Generator) -> Problem:
-    """The problem with a random part of its ranges: what is left out need not be wrong."""
-    factors = (
-        taken(f, np.flatnonzero(rng.random(len(f.nodes)) < PART)) if f.kind == "range" else f for f in problem.factors
-    )
-    return problem.replace_unchecked(factors=tuple(factors))
 
 
 def softened(problem: Problem, marked: Marked, bound: Floats, loss: str) -> Problem:

@@ -293,8 +293,8 @@ def across(
 
 
 def movable(problem: Problem) -> Ints:
-    """Points of which nothing but ranges, and fixes with a loss, is measured."""
-    held = [f.nodes.ravel() for f in problem.factors if f.kind != "range" and (f.kind != "position" or f.loss is None)]
+    """Points of which nothing but ranges and fixes is measured."""
+    held = [f.nodes.ravel() for f in problem.factors if f.kind not in ("range", "position")]
     return np.setdiff1d(np.arange(len(problem.names)), np.concatenate([problem.fixed, problem.poses, *held]))
 
 
@@ -307,16 +307,24 @@ def regrown(problem: Problem, x: Floats) -> Floats:
     References:
         Fischler, Bolles, Random Sample Consensus, 1981; Moore et al., Robust distributed network localization with
         noisy range measurements, SenSys 2004.
+
+    >>> truth = np.array([[0.0, 0], [9, 0], [0, 9], [9, 9], [4, 5]])
+    >>> pairs = np.stack(np.triu_indices(5, 1), axis=1)
+    >>> problem = Problem(tuple("abcde"), dimension=2)
+    >>> problem = problem.add("range", pairs, np.linalg.norm(np.diff(truth[pairs], axis=1), axis=(1, 2)), std=0.1)
+    >>> regrown(problem, np.vstack([truth[:4], [[30.0, 30.0]]]))[4].round(6)
+    array([4., 5.])
     """
     d, n, x = problem.dimension, len(x), x.copy()
     places, ranges = x[:, :d], ranges_of(problem, x)
     fixes = [f for f in problem.factors if f.kind == "position"]
-    fixed, fix, root = (
+    fixed, fix, root, known = (
         np.concatenate([empty, *parts_])
         for empty, parts_ in (
             (np.empty(0, np.int64), [f.nodes[:, 0] for f in fixes]),
             (np.empty((0, d)), [f.z for f in fixes]),
             (np.empty((0, d, d)), [f.root for f in fixes]),
+            (np.empty(0, bool), [np.full(len(f.z), f.loss is None) for f in fixes]),
         )
     )
 
@@ -355,6 +363,7 @@ def regrown(problem: Problem, x: Floats) -> Floats:
                 there = np.concatenate([there, fix[own_fixes]])
                 by_range, by_fix = agree(there, of_point, others, own_fixes)
                 votes = by_range.sum(axis=1) + d * by_fix.sum(axis=1)
+                votes *= (by_fix | ~known[own_fixes]).all(axis=1)
                 if votes.max() > best:
                     best, at = votes.max(), (point, there[np.argmax(votes)])
         if at is None:

@@ -1,16 +1,17 @@
 """Multi-start: a few steps of Levenberg-Marquardt from each start, and the lowest goes on."""
 
 from collections.abc import Callable, Iterator, Mapping
+from itertools import count
 
 import numpy as np
 
-from ...arrays import Floats, frozen
+from ...arrays import Floats, Ints, frozen
 from ..algebra.sparse import Sparse, sparse
 from ..assess.assess import expected
 from ..descent.levenberg_marquardt import NONQUADRATIC, Arrival, arrive
-from ..model.factor import Factor, unchecked
+from ..model.factor import Factor, taken, unchecked
 from ..model.problem import Problem, Search
-from .mirrors import RANGES, across
+from .mirrors import RANGES, across, regrown, scaled
 
 STEPS = 12
 """Of each start at first; a good one has nearly arrived by then."""
@@ -32,6 +33,9 @@ DRAWS, QUIET, POINTS, HIGH = 90, 30, 1800, 2.0
 standard deviations above its mean, and as many points together."""
 ALIKE = 1e-5
 """Share by which the costs of two random starts that led to the same minimum differ."""
+ENOUGH, APART, PART = 3, 0.05, 0.8
+"""Random starts that must lead to the lowest minimum to end them, the share of the extent by which another minimum is
+elsewhere, and that of the ranges whose shortest paths make a start."""
 ELSEWHERE = "another minimum, elsewhere, costs as much"
 EASED = (30.0, 10.0, 3.0, 1.0)
 """Times as large standard deviations of ranges."""
@@ -95,7 +99,7 @@ def race(
         name, cost = name + ", mirrored" * (moves > 0), system.cost(x)
         near = [each for each in (*rivals, *minima) if (1.0 + SAME) * cost < each < cost + RIVAL]
         near += [each for each, _ in ends if (1.0 + ALIKE) * cost < each < cost + RIVAL]
-        notes = (f"another minimum costs {min(near) - cost:.3g} more: noise may decide between them",) if near else ()
+        notes = (rival(min(near) - cost),) if near else ()
         if any(c <= (1.0 + ALIKE) * cost and np.abs(y - x).max() > SAME * np.abs(x).max() for c, y in ends):
             notes = *notes, ELSEWHERE
         elif doubtful and not near:
@@ -212,3 +216,58 @@ def smooth(end: Arrival) -> bool:
     positive definite does not count: J^T J goes on from there."""
     _, damping, gain = end.record.T
     return bool(not damping.any() and (np.abs(gain[np.isfinite(gain)] - 1.0) < NONQUADRATIC).all())
+
+
+def drawn(
+    problem: Problem, x: Floats, loose: Ints, descend: Callable[[Floats], Floats], cost: Callable[[Floats], float]
+) -> tuple[Floats, tuple[str, ...]]:
+    """The lowest end (n, ambient) of descents from x and from random places of the `loose` points, each `regrown` while
+    that leads lower; and what makes it doubtful: no other start leads there, or some lead elsewhere for about the same
+    cost.
+    """
+    ends, most, d = list[tuple[float, Floats]](), min(POINTS // len(x), QUIET), problem.dimension
+    best, least, agree = x, np.nan_to_num(cost(x), nan=np.inf), 0
+    for y in _places(problem, x, loose) if len(loose) else ():
+        y = descend(y) if ends else x
+        now = np.nan_to_num(cost(y), nan=np.inf)
+        while (after := cost(z := descend(regrown(problem, y)))) < (1.0 - ALIKE) * now:
+            y, now = z, after
+        ends.append((now, y))
+        best, least = (y, now) if now < (1.0 - ALIKE) * least else (best, least)
+        agree = sum(each <= (1.0 + ALIKE) * least for each, _ in ends)
+        if agree == ENOUGH or len(ends) > most:
+            break
+    size = APART * np.ptp(np.concatenate([y[:, :d] for _, y in ends] or [x]), axis=0).max()
+    near = [each - least for each, y in ends if each < least + RIVAL and np.abs(y - best)[:, :d].max() > size]
+    notes = (rival(min(near)) if min(near) > ALIKE * least else ELSEWHERE,) if near else ()
+    if agree == 1 < len(ends):
+        notes = *notes, f"one of {len(ends)} starts leads to this minimum: a lower one may exist"
+    return best, notes
+
+
+def rival(more: float) -> str:
+    """The note on a minimum that costs more."""
+    return f"another minimum costs {more:.3g} more: noise may decide between them"
+
+
+def _places(problem: Problem, x: Floats, loose: Ints) -> Iterator[Floats]:
+    """x (n, ambient), and then without end the `loose` points anywhere among the others and the fixes, as known fixes
+    have them, and every other time where shortest paths along a part of the ranges put them."""
+    rng, d, fixes = np.random.default_rng(0), problem.dimension, [f for f in problem.factors if f.kind == "position"]
+    everywhere = np.concatenate([x[:, :d], *(f.z for f in fixes)])
+    yield x
+    for k in count(1):
+        y = x.copy()
+        y[loose, :d] = rng.uniform(everywhere.min(axis=0), everywhere.max(axis=0), (len(loose), d))
+        for f in fixes:
+            here = np.isin(f.nodes[:, 0], loose) & (f.loss is None)
+            noise = np.linalg.pinv(f.root[here]) @ rng.normal(size=(here.sum(), d, 1))
+            y[f.nodes[here, 0], :d] = f.z[here] + noise[..., 0]
+        if k % 2 and not problem.space.has_rotation:
+            part = (
+                taken(f, np.flatnonzero(rng.random(len(f.nodes)) < PART)) if f.kind == "range" else f
+                for f in problem.factors
+            )
+            by_paths = scaled(problem.replace_unchecked(factors=tuple(part)), x)
+            y = y if by_paths is x else by_paths
+        yield y
