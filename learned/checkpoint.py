@@ -18,9 +18,9 @@ from torch import Tensor
 from coopoc.arrays import check_fields, instance, named
 from coopoc.errors import InputError, shown
 from coopoc.file_names import given_path, replaceable
+from coopoc.formats.seals import UNSEALED, holds, sealed
 from coopoc.one_file import in_file, path_of
 from coopoc.plugins import find, points
-from coopoc.seals import UNSEALED, holds, sealed
 from coopoc.short_repr import short_repr
 
 from .nets.gain import Gain
@@ -67,7 +67,7 @@ class Checkpoint:
 def save(path: Path | str, checkpoint: Checkpoint) -> Path:
     """Write weights, history and card to one safetensors file; a reader sees the old file or the new one whole.
 
-    The card's "checksum" is the SHA-256 of the whole file (`coopoc.seals`).
+    The card's "checksum" is the SHA-256 of the whole file (`coopoc.formats.seals`).
 
     Raises:
         InputError: a net of a class that is no entry point in `coopoc.nets`: the file could not be read again; a card

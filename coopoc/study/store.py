@@ -14,7 +14,7 @@ import pyarrow.parquet as pq
 
 from ..errors import InputError
 from ..file_names import replaceable
-from ..seals import UNSEALED, holds, sealed
+from ..formats.seals import UNSEALED, holds, sealed
 from .cell import Cell, Row
 
 OWN_COLUMNS = ("cell", "status", "reason", "cell_seconds")

@@ -10,10 +10,10 @@ from safetensors.torch import save as to_bytes
 from coopoc import read_graph
 from coopoc.data.log.read import read_log
 from coopoc.data.registry import load_fleet, load_log
+from coopoc.formats.seals import UNSEALED, sealed
 from coopoc.formats.trajectories import read_tum
 from coopoc.learned.checkpoint import load
 from coopoc.learned.nets.okf import NoiseParameters
-from coopoc.seals import UNSEALED, sealed
 from coopoc.study import publish, reference
 from coopoc.study.results import Results
 from coopoc.study.tables import FORMATS
