@@ -20,6 +20,8 @@ KINDS: dict[Any, tuple[str, str]] = {float: ("fiu", "number"), int: ("iu", "whol
 """Allowed kinds of dtype -> the name of one entry."""
 TINY = 5e-324
 """The least positive number."""
+TWO_TURNS = 4 * np.pi
+"""rad, beyond which an angle is in degrees or unwrapped."""
 Limits: TypeAlias = Mapping[str, tuple[float, float, str]]
 """Field -> least and largest value, and both in words."""
 

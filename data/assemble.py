@@ -196,7 +196,7 @@ def check_time(t: Floats, file: str, column: str = "t") -> float:
     if len(late):
         allowed = "must be seconds: it looks like milliseconds or nanoseconds since 1970"
         raise InputError(
-            f"{file}: column {column}", f"{late[0]:.15g}", allowed, "Divide it by 1e3 or 1e9, or store dates."
+            f"{file}: column {column}", f"{late[0]:.15g}", allowed, "Pass scale=t:1e-3 or t:1e-9, or store dates."
         )
     unit = float(np.spacing(np.float32(np.abs(t).max(initial=0.0))))
     if unit < COARSE[0] or (t % unit).any() or not (t % (2 * unit)).any():

@@ -33,8 +33,11 @@ USUAL = {
     "latitude": "lat",
     "longitude": "lon lng long",
     "height": "alt altitude",
+    "compass_deg": "bearing course cog track",
+    "speed": "sog",
+    "yaw_rate": "gyro gyr",
 }
-"""Headers that others give to the columns."""
+"""Words in headers that others give to the columns, in wide tables."""
 
 
 LARGEST_TABLE = 2**27
@@ -208,10 +211,21 @@ def named_columns(
     return frame
 
 
+def usual_key(header: str) -> str:
+    """Our name of the column that a header of others has, by the words in it; "" for none.
+
+    >>> [usual_key(header) for header in ("UnixTimeMillis", "GPS_lat [deg]", "BearingDegrees", "rank")]
+    ['t', 'latitude', 'compass_deg', '']
+    """
+    words_of = re.findall(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]+", header)
+    words_of = {header.lower(), *(word.lower() for word in words_of)}
+    return next((key for key, usual in USUAL.items() if words_of & {key, *usual.split()}), "")
+
+
 def missing_column(file: str, column: str, names: Sequence[str], allowed: str, key: str = "") -> InputError:
     """The error of a table without a column; `key` is our name of it, and the hint a header that may be meant."""
     key = key or column
-    usual = [header for header in names if header.lower() in USUAL.get(key, "").split()]
+    usual = [header for header in names if usual_key(header) == key]
     header = usual[0] if usual else "..."
     hint = f'Add it, or pass columns={{"{key}": "{header}"}}; with a command, FILE?columns={key}:{header}.'
     if usual:

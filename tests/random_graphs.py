@@ -4,7 +4,9 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from coopoc.formats.graph import Graph, PointEdges, PoseEdges, RangeEdges
+from coopoc.formats.values import to_orientation
 from coopoc.optimize import Loss, Problem
+from coopoc.optimize.model.space import exp
 
 REACH = 12.0
 """m within which robots see one another and landmarks."""
@@ -56,14 +58,15 @@ def random_graph(
     ranged = ranged[np.sort(np.unique(ranged, axis=0, return_index=True)[1])]
     bodies = to_mark[rng.permutation(len(to_mark))[:seen]]
     rotation = np.concatenate([turned, np.tile(np.eye(d), (landmarks, 1, 1))])
-    cov = np.diag(np.r_[np.full(d, step_std**2), np.full(1 if d == 2 else 3, turn_std**2)])
+    angles = 2 * d - 3
+    cov = np.diag(np.r_[np.full(d, step_std**2), np.full(angles, turn_std**2)])
 
     def local(nodes: np.ndarray, std: float) -> np.ndarray:
         gap = world[nodes[:, 1]] - world[nodes[:, 0]]
         return np.einsum("mji,mj->mi", turned[nodes[:, 0]], gap) + std * rng.normal(size=(len(nodes), d))
 
     relative = np.einsum("mji,mjk->mik", turned[pairs[:, 0]], turned[pairs[:, 1]])
-    relative = relative @ _small(rng, d, len(pairs), turn_std)
+    relative = relative @ exp(turn_std * rng.normal(size=(len(pairs), angles)))
     moved = local(pairs, step_std)
     distance = far[ranged[:, 0], ranged[:, 1]] + range_std * rng.normal(size=len(ranged))
     marked = np.arange(count, count + landmarks)[:, None]
@@ -72,14 +75,10 @@ def random_graph(
         names,
         np.arange(len(names)) < count,
         world,
-        _orientation(rotation),
-        relative_pose=PoseEdges(pairs, moved, _orientation(relative), np.tile(cov, (len(pairs), 1, 1))),
-        relative_point=PointEdges(bodies, local(bodies, 0.2), np.tile(0.04 * np.eye(d), (len(bodies), 1, 1)))
-        if len(bodies)
-        else PointEdges(),
-        ranges=RangeEdges(ranged, np.maximum(distance, 0.1), np.full(len(ranged), range_std**2))
-        if len(ranged)
-        else RangeEdges(),
+        to_orientation(rotation),
+        relative_pose=PoseEdges(pairs, moved, to_orientation(relative), np.tile(cov, (len(pairs), 1, 1))),
+        relative_point=PointEdges(bodies, local(bodies, 0.2), np.tile(0.04 * np.eye(d), (len(bodies), 1, 1))),
+        ranges=RangeEdges(ranged, np.maximum(distance, 0.1), np.full(len(ranged), range_std**2)),
         point_prior=PointEdges(
             marked, world[count:] + 0.1 * rng.normal(size=(landmarks, d)), np.tile(0.01 * np.eye(d), (landmarks, 1, 1))
         )
@@ -99,28 +98,12 @@ def _paths(rng: np.random.Generator, d: int, robots: int, steps: int) -> tuple[n
             bend = 0.8 * bend + 0.08 * rng.normal()
             course += bend + homing
             tilt = [] if d == 2 else [0.1 * rng.normal(), 0.1 * rng.normal()]
-            angles = [course, *tilt]
             positions.append(at.copy())
             turned.append(
-                [[np.cos(course), -np.sin(course)], [np.sin(course), np.cos(course)]]
-                if d == 2
-                else Rotation.from_euler("zyx", angles).as_matrix()
+                exp(np.array([course])) if d == 2 else Rotation.from_euler("zyx", [course, *tilt]).as_matrix()
             )
             at += np.array(turned[-1])[:, 0]
     return np.array(positions), np.array(turned)
-
-
-def _small(rng: np.random.Generator, d: int, count: int, std: float) -> np.ndarray:
-    if d == 3:
-        return Rotation.from_rotvec(std * rng.normal(size=(count, 3))).as_matrix()
-    angle = std * rng.normal(size=count)
-    return np.array([[np.cos(angle), -np.sin(angle)], [np.sin(angle), np.cos(angle)]]).transpose(2, 0, 1)
-
-
-def _orientation(rotation: np.ndarray) -> np.ndarray:
-    if rotation.shape[-1] == 2:
-        return np.arctan2(rotation[:, 1, 0], rotation[:, 0, 0])[:, None]
-    return Rotation.from_matrix(rotation).as_quat()
 
 
 def star(

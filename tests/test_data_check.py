@@ -9,7 +9,7 @@ import numpy as np
 import pandas as pd
 import pytest
 from conftest import refused
-from logs import bends, fixes, motion, outliers, ranges, write
+from logs import bends, drive, fixes, motion, outliers, ranges, write
 from numpy.testing import assert_allclose, assert_array_equal
 
 import coopoc as co
@@ -242,6 +242,20 @@ def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path):
     assert "first of all 14" in text
     assert "fixes in gaps of the odometry" in text
     assert "Where a vehicle stands, log a speed of 0" in text
+
+
+def test_fixes_of_what_stands_err_too(tmp_path):
+    x, y = np.random.default_rng(0).normal(0, 10, (2, 300))
+    frame = pd.DataFrame({"t": np.arange(300), "vehicle": "a", "x": x, "y": y, "vx": 0, "vy": 0})
+    assert "NIS is" in said(read_log(write(frame, tmp_path / "a.csv")))
+    assert "none of which changes" in str(check(read_log(write(frame.assign(x=0, y=0), tmp_path / "a.csv"))).unseen)
+
+
+def test_noise_of_velocities_is_no_late_clock(tmp_path):
+    """At steps of 1 s the noise of a velocity moves the filter at once."""
+    fleet = drive(1, 300, 1.0)
+    log = fixes(fleet, "car0", 1.0, 0.5).merge(motion(fleet, "car0", 1.0, 1.5, 5)).drop(columns=["z", "vz"])
+    assert said(read_log(write(log, tmp_path / "a.csv"))) == ""
 
 
 def test_one_car_with_a_gap_and_columns_of_its_own(tmp_path):

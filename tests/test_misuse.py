@@ -282,7 +282,6 @@ ALLOWED = {
     "observe fleet ids": "draws belong to names",
     "pose position nan": "unknown",
     "pose position inf": "refused by Problem",
-    "pose turn degrees": "a rotation vector may be long",
     "Problem z 1e+200": "NumPy warns of the overflow",
 }
 """What is accepted although it looks wrong -> why."""

@@ -110,6 +110,15 @@ def test_ambiguous_points_end_at_the_lowest_minimum(case):
     assert left <= 1
 
 
+def test_exact_ranges_end_at_the_truth_without_a_word():
+    truth = np.random.default_rng(0).uniform(0, 100, (8, 3))
+    pairs = np.column_stack(np.triu_indices(8, 1))
+    problem = Problem("abcdefgh").add("position", range(5), truth[:5], std=0.1)
+    found = solve(problem.add("range", pairs, np.linalg.norm(np.diff(truth[pairs], axis=1), axis=(1, 2)), std=0.1))
+    assert np.abs(found.x - truth).max() < 1e-6
+    assert not found.notes
+
+
 def outliers(seed: int) -> tuple[Problem, Floats, Floats]:
     """A network of 30 points in the plane from anywhere, with a tenth of its ranges too long; its truth, and which
     these are."""

@@ -165,15 +165,6 @@ def lone(steps: int = 12) -> co.Fleet:
     return co.Fleet(("a", "mast"), t, position, velocity, heading=np.stack([t, 0 * t], axis=1))
 
 
-def landmark_only(steps: int = 12, **noise: Any) -> co.Recording:
-    """Its recording without fixes, compass and inclinations."""
-    sensors = replace(NOISE, speed_scale_std=0.0, yaw_rate_bias_std=0.0, compass=False, **noise)
-    seen = co.observe(lone(steps), sensors, co.V2X(max_neighbours=0), frame="body", landmarks=["mast"], seed=2)
-    gnss, relative = seen.gnss.copy(), seen.relative.copy()
-    gnss[:, :, 0], relative[..., 2] = np.nan, np.nan
-    return replace(seen, gnss=gnss, relative=relative)
-
-
 def own_of(recording: co.Recording, run: int, t: int, column: int) -> co.OwnMeasurement:
     """What a vehicle measured of itself at a step."""
     rate, heading = (values[run, t, column] for values in (recording.body.yaw_rate, recording.body.heading))

@@ -7,7 +7,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from ..arrays import Floats, frozen, instance, one_of
+from ..arrays import TWO_TURNS, Floats, frozen, instance, one_of
 from ..formats import load_graph
 from ..formats.graph import Graph
 from ..kernels.compiling.waiting import clock, load
@@ -94,6 +94,8 @@ def from_graph(graph: Graph, objective: Objective = "chordal", start: Start = "a
             f"no measurement joins all parts: {', '.join(graph.names[k] for k in problem.fixed[:5])} are fixed, "
             "and nothing places one to another",
         )
+    if graph.dimension == 2 and (beyond := int((np.abs(graph.relative_pose.orientation) > TWO_TURNS).sum())):
+        notes = *notes, f"relative poses beyond two turns, {beyond} in all: are angles in degrees?"
     won = Search(names[0])
     if start == "auto":
         starts = {name: partial(_x0, graph, poses, name) for name in names} | {"odometry": lambda: start_x}

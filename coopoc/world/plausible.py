@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from ..arrays import Floats, refuse
+from ..arrays import TWO_TURNS, Floats, refuse
 from .links import wrap
 
 FARTHEST, FASTEST, FASTEST_TURN = 1e8, 1e4, 100.0
 """m, m/s and rad/s (16 turns; odometry of mrclam6.pyfg has 10): what lies beyond was not measured on Earth, and its
 square leaves no digits to what stands beside it."""
-TWO_TURNS, UNWRAPPED = 4 * np.pi, 1e6
-"""rad, beyond which an angle is in degrees or unwrapped; and beyond which an unwrapped one has lost its digits."""
+UNWRAPPED = 1e6
+"""rad, beyond which an unwrapped angle has lost its digits."""
 COARSE = 0.01
 """m, of the resolution of float32 that matters."""
 

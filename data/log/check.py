@@ -112,13 +112,13 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
     rows, rec, truth = [], c.world, c.log.truth
     for column, name in enumerate(rec.ids):
         fixed = np.isfinite(c.normalised[:, column])
-        speed = np.linalg.norm(rec.velocity[0, :, column], axis=-1)
-        if not np.nanmax(speed, initial=0.0) > 0:
+        speed, fixes = np.linalg.norm(rec.velocity[0, :, column], axis=-1), pd.DataFrame(rec.gnss[0, :, column])
+        if not max(np.nanmax(speed, initial=0.0), *(fixes.max() - fixes.min())) > 0:  # a place
             continue
         wheels, ratio = odometry(c, column), ratio_of_moves(rec, column)
         row: dict[str, Any] = {
             "vehicle": name,
-            "fixes": int(np.isfinite(rec.gnss[0, :, column, 0]).sum()),
+            "fixes": int(fixes[0].count()),
             "there": float(np.isfinite(speed).mean()),
             "innovation_m": _rms(c.fix[fixed, column]),
             "nis": float(c.normalised[fixed, column].mean()) if fixed.any() else None,
@@ -295,7 +295,7 @@ def _of_clocks(c: Check) -> list[str]:
 
 def _with_fixes(c: Check, row: Mapping[str, Any]) -> str:
     """Whether the fixes of a vehicle are as late beside the truth as its odometry, and what mends it."""
-    off, made = causes(c)
+    off, made, _ = causes(c)
     name, late = row["vehicle"], row["late_s"]
     column, mends = c.world.ids.index(name), f"clock={name}:{late:.3f}"
     used = np.isfinite(off[:, column])
@@ -313,14 +313,15 @@ def _of_fixes(c: Check) -> list[str]:
     the same time at any speed, or beside it by more than their noise explains, as where the truth has another
     origin."""
     rec, truth, sentences = c.world, c.log.truth, []
-    off, made = causes(c)
+    off, made, then = causes(c)
     usual = float(np.hypot(*rec.sensors.fix_std[:2]))
     for column, name in enumerate(rec.ids):
         row: Mapping[str, Any] = next((row for row in c.vehicles if row["vehicle"] == name), {})
         finite = np.isfinite(off[:, column] + made[:, :, column].sum(axis=0))
         every_one = np.zeros(finite.sum(), int)
         for share in ([1, 1, 1], [0, 0, 1]):  # without an arm that is sure a clock may explain it all
-            factor, std = factors(off[finite, column], made[:, finite, column].T * share, usual, every_one)
+            x, z = (each[:, finite, column].T * share for each in (made, then))
+            factor, std = factors(off[finite, column], x, usual, every_one, z=z)
             sure = np.abs(factor) > SIGMAS * std * max(row.get("nis") or 1.0, 1.0) ** 0.5
             if (sure & (np.abs(factor) > ARM))[:2].any() and np.abs(factor[:2]).max() < LONGEST_ARM:
                 sentences.append(

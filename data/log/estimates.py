@@ -47,28 +47,37 @@ class Estimate(NamedTuple):
 
 
 def factors(
-    y: AnyArray, x: AnyArray, noise: float, groups: Ints | None = None, less: Callable[[Floats], Floats] | None = None
+    y: AnyArray,
+    x: AnyArray,
+    noise: float,
+    groups: Ints | None = None,
+    less: Callable[[Floats], Floats] | None = None,
+    z: AnyArray | None = None,
 ) -> Estimate:
-    """Factors of causes x (M, k) that explain y (M,) best, outliers aside, with standard errors by parts that are left
-    out; less the means of groups (M,); times a matrix (k, k) that `less` makes of them, if any. None is known where
-    half of y stays, and that is OUTLYING times its noise: something else is wrong.
+    """Factors (z^T x)^-1 z^T y of causes x (M, k) that explain y (M,), outliers aside, with standard errors by parts
+    that are left out; less the means of groups (M,); times a matrix (k, k) that `less` makes of them, if any. None is
+    known where half of y stays, and that is OUTLYING times its noise: something else is wrong.
+
+    The instruments z (M, k), x itself if not given, are causes without the noise that is in both x and y.
 
     >>> time = np.arange(40.0)
     >>> factors(3 * time + 7, time[:, None], 0.1, np.zeros(40, int)).value.round(6).tolist()
     [3.0]
     """
-    none = Estimate(np.zeros(x.shape[1]), np.full(x.shape[1], np.inf))
+    k, all_of = x.shape[1], np.column_stack([y, x] if z is None else [y, x, z])
+    none = Estimate(np.zeros(k), np.full(k, np.inf))
     if len(y) < ENOUGH:
         return none
     if groups is not None:
-        both = pd.DataFrame(np.column_stack([y, x]))
-        both = both - both.groupby(groups).transform("mean")
-        y, x = both[0].to_numpy(), both.to_numpy()[:, 1:]
+        frame = pd.DataFrame(all_of)
+        all_of = (frame - frame.groupby(groups).transform("mean")).to_numpy()
+    y, x = all_of[:, 0], all_of[:, 1 : k + 1]
 
     def fitted(rows: Ints) -> Floats:
         for _ in range(3):
-            left, right = (np.concatenate([each[rows].real, each[rows].imag]) for each in (x, y))
-            factor: Floats = np.linalg.lstsq(left, right)[0]
+            both = np.concatenate([all_of[rows].real, all_of[rows].imag])
+            both = both if z is None else both[:, k + 1 :].T @ both[:, : k + 1]
+            factor: Floats = np.linalg.lstsq(both[:, 1 : k + 1], both[:, 0])[0]
             gap = np.abs(y - x @ factor)
             rows = rows[gap[rows] <= OUTLYING * np.median(gap[rows])]
         return factor
@@ -84,9 +93,10 @@ def factors(
     return Estimate(value, np.where(np.any(x, axis=0), error, np.inf))
 
 
-def causes(c: Check) -> tuple[AnyArray, AnyArray]:
+def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
     """What fixes are off by, x + iy m (T, N), and what an arm of 1 m ahead, one to the left, and a clock that is 1 s
-    late make of it (3, T, N): against the truth, else against a filter, which is linear in what is added to fixes."""
+    late make of it (3, T, N): against the truth, else against a filter, which is linear in what is added to fixes; and
+    instruments, by a later velocity: the filter errs by the noise of those until then."""
     rec, truth = c.world, c.log.truth
     velocity = (rec.velocity[0] if truth is None else truth.velocity)[..., :2] @ [1, 1j]
     speed = pd.DataFrame(np.abs(velocity)).where(lambda v: v > MOVING)
@@ -94,12 +104,19 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray]:
     ahead = np.nan_to_num(np.exp(1j * course)) * np.array(speed.std() > VARIED * speed.mean())
     made = np.stack([ahead, 1j * ahead, velocity])
     if truth is not None:
-        return (rec.gnss[0] - truth.position)[..., :2] @ [1, 1j], made
+        return (rec.gnss[0] - truth.position)[..., :2] @ [1, 1j], made, made
+    then = np.nan_to_num(following(made, axis=1))
     for k, cause in enumerate(np.nan_to_num(NUDGE * made)):
         gnss = c.log.recording.gnss + np.stack([cause.real, cause.imag, 0 * cause.real], axis=-1)
         moved = filtered(replace(c.log, recording=replace(c.log.recording, gnss=gnss)))
         made[k] = (moved.fix - c.fix)[..., :2] @ [1, 1j] / NUDGE
-    return c.fix[..., :2] @ [1, 1j], made
+    return c.fix[..., :2] @ [1, 1j], made, then
+
+
+def following(of_step: AnyArray, axis: int = 0) -> AnyArray:
+    """What is of each step, of the one after the next, as two share a sample of the odometry; at the end of the last."""
+    steps = of_step.shape[axis]
+    return of_step.take(np.minimum(np.arange(2, steps + 2), steps - 1), axis)
 
 
 def moves(rec: Recording, column: int, means: int = 1) -> tuple[AnyArray, AnyArray]:
@@ -195,18 +212,22 @@ def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
     links, size = c.world.links, len(c.world.ids)
     gap, _ = residual_of(c.world, c.x)
     flat, far = (np.maximum(np.linalg.norm(gap[:, :axes], axis=1), 1.0) for axes in (2, 3))
-    velocity = np.nan_to_num(c.world.velocity[0])
-    moves = velocity[links.step, links.neighbour]
-    along = (gap * moves).sum(axis=1) / far
-    across = (gap[:, 0] * moves[:, 1] - gap[:, 1] * moves[:, 0]) / flat**2
     ends = np.eye(size)[links.neighbour] - np.eye(size)[links.observer]
-    rate = (gap * (velocity[links.step, links.observer] - moves)).sum(axis=1) / far
-    made = np.stack([along, across], axis=1)[..., None] * ends[:, None]
-    made = np.concatenate([made, np.stack([np.column_stack([far, rate]), np.zeros((len(far), 2))], axis=1)], axis=2)
-    there = np.isfinite(c.relative[:, 0] + along)
+
+    def made_by(velocity: Floats) -> Floats:
+        moves = velocity[links.step, links.neighbour]
+        along = (gap * moves).sum(axis=1) / far
+        across = (gap[:, 0] * moves[:, 1] - gap[:, 1] * moves[:, 0]) / flat**2
+        rate = (gap * (velocity[links.step, links.observer] - moves)).sum(axis=1) / far
+        made = np.stack([along, across], axis=1)[..., None] * ends[:, None]
+        return np.concatenate([made, np.stack([np.column_stack([far, rate]), np.zeros((len(far), 2))], axis=1)], axis=2)
+
+    velocity = np.nan_to_num(c.world.velocity[0])
+    made, then = made_by(velocity), made_by(following(velocity))
+    there = np.isfinite(c.relative[:, 0] + gap[:, 0])
     pairs = np.sort([links.observer, links.neighbour], axis=0)
     noise = float(np.median(c.expected[there, 0])) if there.any() else 0.0
-    x, groups, less = made[there, 0], (pairs[0] * size + pairs[1])[there], np.eye(size + 2)
+    x, z, groups, less = made[there, 0], then[there, 0], (pairs[0] * size + pairs[1])[there], np.eye(size + 2)
 
     def against(value: Floats) -> Floats:
         seen = np.flatnonzero(x[:, :size].any(axis=0))
@@ -215,15 +236,15 @@ def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
         less[:size, most if reference is None else reference] -= 1.0
         return less
 
-    estimate = factors(c.relative[there, 0], x, noise, groups, against)
-    return estimate._replace(error=np.hypot(estimate.error, _of_filters(c, there, x, groups, less))), made
+    estimate = factors(c.relative[there, 0], x, noise, groups, against, z)
+    return estimate._replace(error=np.hypot(estimate.error, _of_filters(c, there, x, z, groups, less))), made
 
 
-def _of_filters(c: Check, there: Bools, x: Floats, pairs: Ints, less: Floats) -> Floats:
-    """Standard errors (k,) of factors of causes x (M, k), less means of pairs (M,), times `less` (k, k), by errors of
-    the filters that decay in the time that a fix is remembered."""
-    x = x - pd.DataFrame(x).groupby(pairs).transform("mean").to_numpy()
-    gain = x @ np.linalg.pinv(x.T @ x) @ less.T
+def _of_filters(c: Check, there: Bools, x: Floats, z: Floats, pairs: Ints, less: Floats) -> Floats:
+    """Standard errors (k,) of factors of causes x (M, k) by instruments z (M, k), less means of pairs (M,), times
+    `less` (k, k), by errors of the filters that decay in the time that a fix is remembered."""
+    x, z = (each - pd.DataFrame(each).groupby(pairs).transform("mean").to_numpy() for each in (x, z))
+    gain = z @ np.linalg.pinv(z.T @ x).T @ less.T
     keep = np.exp(-2.0 / max(share(c) * len(c.world.t), 1e-9))
     position = np.maximum(c.expected[there, 0] ** 2 - c.world.sensors.range_std**2, 0.0)
     variance = np.zeros(x.shape[1])
@@ -319,7 +340,7 @@ def against_truth(c: Check) -> Check:
     if truth is None:
         return c
     marks = np.isin(np.arange(len(c.world.ids)), c.world.landmarks)
-    off, (_, _, velocity) = causes(c)
+    off, (_, _, velocity), _ = causes(c)
     fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * np.hypot(*noise.fix_std[:2])
     x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
     residual, stated = residual_of(c.world, x)[1], [noise.range_std, noise.world_azimuth_std, noise.inclination_std]
@@ -334,7 +355,7 @@ def on_time(c: Check, alike: bool = True) -> Check:
     less what wrong ones explain."""
     reference = None
     if c.log.truth is not None:
-        off, (_, _, velocity) = causes(c)
+        off, (_, _, velocity), _ = causes(c)
         seconds = np.nansum((off * velocity.conj()).real, axis=0) / np.maximum(np.isfinite(off).sum(axis=0), 1e-12)
         covered = np.isfinite(off).any(axis=0) & (c.variance[..., 0] > 0).any(axis=0)
         reference = int(np.argmin(np.where(covered, np.abs(seconds), np.inf))) if covered.any() else None

@@ -42,7 +42,7 @@ def draw(result: Check, path: Path) -> Figure:
         ax.set(aspect="auto", xlabel="East [m], on a scale of its own")
     words = "fixes (points; circles: the first), filters (lines), what stands (triangles), truth (dashed)"
     figure.suptitle(fill(f"{picture(result.log.summary.name)}: {words}", 72), fontsize=9)
-    when.set(xlabel="Time [s]", ylabel="Fixes", ylim=(len(moving) - 0.5, -0.5))
+    when.set(xlabel="Time [s]", ylabel="Fixes", ylim=(max(len(moving), 1) - 0.5, -0.5))
     when.set_yticks(range(len(moving)), [picture(rec.ids[k]) for k in moving], fontsize=7)
     ax.legend().remove()  # the rows below name the colours
     figure.savefig(path)

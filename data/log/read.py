@@ -400,8 +400,8 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     step = dt or float(f"{moves if moves > 0 else fixes:.3g}")
     if not step > 0:
         raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
-    if dt is None and not body and pairs > step and min(pairs, fixes, LONGEST) > step:
-        seldom = float(f"{min(pairs, fixes, LONGEST):.3g}")
+    seldom = float(f"{min(pairs, fixes, LONGEST):.3g}")  # unknown where there are no pairs
+    if dt is None and not body and pairs > step and seldom > step:
         summary.assume(f"steps of {seldom:g} s, as fixes and pairs are measured; odometry every {step:g} s is averaged")
         step = seldom
     if dt is None:

@@ -15,8 +15,9 @@ from .residuals import Check
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
 WIDE, NARROW = 2.0, 0.4
 """Ratios of a measured to a stated standard deviation at which something is wrong."""
-COARSE = 0.5
-"""rad: no sensor's angles scatter as much about positions that are better known."""
+COARSE, EXACT = 0.5, 1e-3
+"""rad: no sensor's angles scatter as much about positions that are better known; least share of a stated deviation that
+is offered, as to numbers without noise."""
 HINTS = {
     "range": "Are clocks, or the positions of one, off?",
     "azimuth": "Check their zero (+x, or the heading for a bearing), their sense (anticlockwise), their unit (rad), "
@@ -137,10 +138,10 @@ def of_measurements(c: Check) -> list[str]:
             )
         noise, least = row["noise"], row["stated_std"]
         if not wrong and not NARROW * least < noise < WIDE * np.hypot(least, position):
-            size = "less" if noise < least else "more"
+            size, std_of = ("less", max(noise, EXACT * least)) if noise < least else ("more", noise)
             sentences.append(
                 f"{word}s scatter {size} than stated, by {noise:.2g} {unit} from one to the next, {least:.2g} {unit} "
-                f"stated: std={word}:{noise:.2g}. Were variances given as deviations?"
+                f"stated: std={word}:{std_of:.2g}. Were variances given as deviations?"
             )
     return sentences
 

@@ -10,7 +10,18 @@ import pandas as pd
 from coopoc.errors import InputError, suggestion
 
 from ..bag import STAMP, TRUTH, of_topic
-from ..cells import TABLES, USUAL, filled, headers, missing_column, named_columns, numeric, read_frame, seconds, words
+from ..cells import (
+    TABLES,
+    filled,
+    headers,
+    missing_column,
+    named_columns,
+    numeric,
+    read_frame,
+    seconds,
+    usual_key,
+    words,
+)
 from .units import KINDS, Rows, Summary, in_group, rows_of
 
 LONG = ("t", "vehicle", "kind", "partner", "value", "std", "arrival")
@@ -114,8 +125,8 @@ def _wide(
         frame = frame.assign(**{f"{kind}_std": frame["std"] for kind in value}).drop(columns="std")
     used = ["t", "vehicle", "partner", *value.values(), *(f"{name}_std" for name in (*value, *beside)), *beside]
     for column in frame.columns.difference(used, sort=False):
-        near = next((key for key, usual in USUAL.items() if column.lower() in usual.split()), "")
-        like = f"Did you mean {near}?" if near else suggestion(column, (*LONG, *KINDS), "")
+        near = f"Did you mean {near}?" if (near := usual_key(column)) and "partner" not in frame else ""
+        like = near or suggestion(column, (*LONG, *KINDS), "")
         if column == "std":
             like = f"which belongs to no kind (name it {next(iter(value))}_std)"
         summary.leave(f"{file}: column {column}{', ' * bool(like)}{like}", len(frame))

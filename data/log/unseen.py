@@ -16,6 +16,8 @@ def unseen(c: Check) -> list[str]:
     sentences, every = [], [row["vehicle"] for row in c.vehicles]
     if c.log.truth is None:
         sentences.append("errors that all sensors share, and a clock that is wrong for all alike: there is no truth")
+    if not every:
+        sentences.append("errors of fixes, none of which changes while nothing moves")
     turns = ("turned", TURNED, "rad, of the direction of the odometry")
     if c.log.recording.body is not None:
         turns = ("yaw_rate_bias", DRIFT, "rad/s, of the yaw rates")

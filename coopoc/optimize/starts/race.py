@@ -31,8 +31,8 @@ RIVAL = 10.0
 DRAWS, QUIET, POINTS, HIGH = 90, 30, 1800, 2.0
 """Random starts at most, if the first lead to no other minimum of about the cost and this is no more than so many
 standard deviations above its mean, and as many points together."""
-ALIKE = 1e-5
-"""Share by which the costs of two random starts that led to the same minimum differ."""
+ALIKE, ROUNDED = 1e-5, 1e-9
+"""Share by which the costs of two random starts that led to the same minimum differ, and cost that is rounding."""
 ENOUGH, APART, PART = 3, 0.05, 0.8
 """Random starts that must lead to the lowest minimum to end them, the share of the extent by which another minimum is
 elsewhere, and that of the ranges whose shortest paths make a start."""
@@ -92,15 +92,15 @@ def race(
             cost = system.cost(y)
             if arrived and cost < least + RIVAL:
                 ends.append((cost, y))
-                most = most if abs(cost - least) <= ALIKE * least else DRAWS
-                if cost < (1.0 - ALIKE) * least:
+                most = DRAWS if higher(cost, least) or higher(least, cost) else most
+                if higher(least, cost):
                     name, x, least = "drawn", y, cost
         x, moves, rivals, doubtful = across(problem, x, descend, system.cost)
         name, cost = name + ", mirrored" * (moves > 0), system.cost(x)
-        near = [each for each in (*rivals, *minima) if (1.0 + SAME) * cost < each < cost + RIVAL]
-        near += [each for each, _ in ends if (1.0 + ALIKE) * cost < each < cost + RIVAL]
+        near = [each for each in (*rivals, *minima) if higher(each, cost, SAME) and each < cost + RIVAL]
+        near += [each for each, _ in ends if higher(each, cost) and each < cost + RIVAL]
         notes = (rival(min(near) - cost),) if near else ()
-        if any(c <= (1.0 + ALIKE) * cost and np.abs(y - x).max() > SAME * np.abs(x).max() for c, y in ends):
+        if any(not higher(c, cost) and np.abs(y - x).max() > SAME * np.abs(x).max() for c, y in ends):
             notes = *notes, ELSEWHERE
         elif doubtful and not near:
             names = ", ".join(problem.names[body[0]] for body in doubtful[:5])
@@ -230,19 +230,24 @@ def drawn(
     for y in _places(problem, x, loose) if len(loose) else ():
         y = descend(y) if ends else x
         now = np.nan_to_num(cost(y), nan=np.inf)
-        while (after := cost(z := descend(regrown(problem, y)))) < (1.0 - ALIKE) * now:
+        while higher(now, after := cost(z := descend(regrown(problem, y)))):
             y, now = z, after
         ends.append((now, y))
-        best, least = (y, now) if now < (1.0 - ALIKE) * least else (best, least)
-        agree = sum(each <= (1.0 + ALIKE) * least for each, _ in ends)
+        best, least = (y, now) if higher(least, now) else (best, least)
+        agree = sum(not higher(each, least) for each, _ in ends)
         if agree == ENOUGH or len(ends) > most:
             break
     size = APART * np.ptp(np.concatenate([y[:, :d] for _, y in ends] or [x]), axis=0).max()
     near = [each - least for each, y in ends if each < least + RIVAL and np.abs(y - best)[:, :d].max() > size]
-    notes = (rival(min(near)) if min(near) > ALIKE * least else ELSEWHERE,) if near else ()
+    notes = (rival(min(near)) if higher(least + min(near), least) else ELSEWHERE,) if near else ()
     if agree == 1 < len(ends):
         notes = *notes, f"one of {len(ends)} starts leads to this minimum: a lower one may exist"
     return best, notes
+
+
+def higher(cost: float, least: float, share: float = ALIKE) -> bool:
+    """Whether a cost is above another by more than that share, and than rounding makes of exact data."""
+    return cost > (1.0 + share) * least + ROUNDED
 
 
 def rival(more: float) -> str:
