@@ -116,7 +116,7 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
 def following(of_step: AnyArray, axis: int = 0) -> AnyArray:
     """What is of each step, of the one after the next, as two share a sample of the odometry; at the end of the last."""
     steps = of_step.shape[axis]
-    return of_step.take(np.minimum(np.arange(2, steps + 2), steps - 1), axis)
+    return np.asarray(of_step.take(np.minimum(np.arange(2, steps + 2), steps - 1), axis))
 
 
 def moves(rec: Recording, column: int, means: int = 1) -> tuple[AnyArray, AnyArray]:
