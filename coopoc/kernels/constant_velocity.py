@@ -33,9 +33,10 @@ BEYOND = 3.0
 @compiled
 def constant_velocity(
     t: Floats, fixes: Floats, interval: float, gap: float, variance: float, speed: float, bank: Floats
-) -> tuple[Floats, Floats, Floats]:
+) -> tuple[Floats, Floats, Floats, Floats]:
     """(M, 3) velocity m/s after each fix, by this and those before; of the filter that has predicted best (M,) by how
-    much a position's variance grows from the last fix to this one, and 1/s^2 the variance of the velocity, shares of R.
+    much a position's variance grows from the last fix to this one, and 1/s^2 the variance of the velocity, shares of R;
+    and m^2 R as it has proved.
 
     Args:
         t: (M,) s, increasing.
@@ -47,7 +48,7 @@ def constant_velocity(
         bank: (F,) w.
     """
     count, models = len(t), len(bank)
-    velocity, growth, count_of_fixes = np.zeros((count, 3)), np.zeros(count), np.zeros(count)
+    velocity, growth, spread, proved = np.zeros((count, 3)), np.zeros(count), np.zeros(count), np.zeros(count)
     x, u = np.zeros((models, 3)), np.zeros((models, 3))
     p, score = np.zeros((models, 3)), np.zeros((models, 3))
     v = np.zeros(3)
@@ -88,5 +89,5 @@ def constant_velocity(
                 best, most, growth[j] = m, likely, a - before
         for c in range(3):
             velocity[j, c] = u[best, c]
-        count_of_fixes[j] = p[best, 2]
-    return velocity, growth, count_of_fixes
+        spread[j], proved[j] = p[best, 2], score[best, 1] / score[best, 0]
+    return velocity, growth, spread, proved

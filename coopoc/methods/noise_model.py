@@ -145,7 +145,7 @@ class NoiseModel:
             variance: Floats = np.square(recording.dt * self.sensors.velocity_std(velocity, 1e-6))
             return variance
         if inbox is None:
-            return own_variances(self.sensors.motion_noise(), velocity, recording.dt, first)
+            return own_variances(self.sensors.motion_noise(recording.dt), velocity, recording.dt, first)
         use, neighbour = np.zeros(velocity.shape[:3], np.uint8), links.neighbour[inbox.link]
         use[:, links.step[inbox.link], neighbour] = RECEIVED * (inbox.arrival >= 0)
         use[np.arange(len(use))[:, None], inbox.newest, neighbour] = (
@@ -153,7 +153,7 @@ class NoiseModel:
         )
         use[:, :, columns] = HELD
         velocity, longest = np.ascontiguousarray(velocity), recording.v2x.max_age
-        return process_variances(self.sensors.motion_noise(), velocity, use, longest, recording.dt)
+        return process_variances(self.sensors.motion_noise(recording.dt), velocity, use, longest, recording.dt)
 
     def fix_variance(self, recording: Recording) -> Floats:
         """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""

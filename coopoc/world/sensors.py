@@ -48,6 +48,8 @@ class Sensors:
     since a log holds no odometry: there is none that could slip or be turned."""
     velocity_floor: float = 0.05
     """m/s, the least velocity std that a method assumes; it never acts. Without it "axis" is singular."""
+    climb_std: float = 0.0
+    """m/s, what a method assumes of a vertical velocity that is not measured, new at every step; it never acts."""
     range_std: float = 1.0
     """m."""
     azimuth_std: float = float(np.deg2rad(4.0))
@@ -124,14 +126,15 @@ class Sensors:
         from ..kernels.motion import MotionNoise
 
         ratio, of_speed = np.full(3, self.velocity_std_ratio), self.velocity_reading == "speed"
-        return MotionNoise(np.zeros(3), ratio, float(self.velocity_floor), float(of_speed), interval)
+        base = np.array([0.0, 0.0, self.climb_std * interval])
+        return MotionNoise(base, ratio, float(self.velocity_floor), float(of_speed), interval)
 
     def motion_std(self, velocity: Floats, dt: float) -> Floats:
         """Noise std (R, T, N, 3) m that a method assumes of motions of dt s with *measured* velocities (R, T, N, 3)
         m/s, by the pace before each."""
         from ..kernels.motion import own_variances
 
-        return np.sqrt(own_variances(self.motion_noise(), velocity, dt))
+        return np.sqrt(own_variances(self.motion_noise(dt), velocity, dt))
 
     def known(self) -> "Sensors":
         """The same sensors as a method may know them: it knows neither the bias nor the outliers."""

@@ -114,7 +114,7 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
 
 
 def following(of_step: AnyArray, axis: int = 0) -> AnyArray:
-    """What is of each step, of the one after the next, as two share a sample of the odometry; at the end of the last."""
+    """What is of each step, of the one after the next, as two share a sample of the odometry; the last at the end."""
     steps = of_step.shape[axis]
     return np.asarray(of_step.take(np.minimum(np.arange(2, steps + 2), steps - 1), axis))
 
@@ -125,6 +125,7 @@ def moves(rec: Recording, column: int, means: int = 1) -> tuple[AnyArray, AnyArr
     fixes are less noisy."""
     fixes, velocity = rec.gnss[0, :, column, :2] @ [1, 1j], rec.velocity[0, :, column, :2] @ [1, 1j]
     path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
+    walk = rec.dt * float(np.mean(rec.sensors.velocity_std(np.nan_to_num(rec.velocity), rec.sensors.velocity_floor)))
     at = np.flatnonzero(np.isfinite(fixes))
     parts = at[: len(at) // means * means].reshape(-1, means)
     parts = parts[gaps[parts[:, 0]] == gaps[parts[:, -1]]]
@@ -135,7 +136,10 @@ def moves(rec: Recording, column: int, means: int = 1) -> tuple[AnyArray, AnyArr
         for k in range(1, len(parts)):
             if gaps[k] != gaps[last]:
                 last = k
-            elif abs(places[k] - places[last]) > far * np.hypot(*rec.sensors.fix_std[:2]) / means**0.5:
+            elif abs(places[k] - places[last]) > max(
+                far * np.hypot(*rec.sensors.fix_std[:2]) / means**0.5,
+                OUTLYING * walk * (parts[k, 0] - parts[last, 0]) ** 0.5,
+            ):
                 pairs.append((last, k))
                 last = k
         if len(pairs) >= 3:
@@ -158,8 +162,9 @@ def odometry(c: Check, column: int) -> Estimate:
     its yaw rates are too large by, rad/s; and by what it is later than a truth, s: against the truth, else the fixes,
     in body frames else the filter."""
     rec, truth, body = c.world, c.log.truth, c.log.recording.body
+    none = Estimate(np.zeros(3), np.full(3, np.inf))
     if rec.sensors.velocity_reading == "fixes":
-        return Estimate(np.zeros(3), np.full(3, np.inf))
+        return none
     if truth is None and body is not None:
         return Estimate(*c.lasting[:, column])
     velocity = rec.velocity[0, :, column, :2]
@@ -173,7 +178,7 @@ def odometry(c: Check, column: int) -> Estimate:
         value, error = factors(moved - driven, np.stack([driven, 1j * driven], axis=1), 2**0.5 * fix)
         attenuation = (float(np.linalg.norm(noise)) * rec.dt) ** 2 / square  # by noise of the cause
         turned = (1 + complex(*value)) * (1 + attenuation)
-        return Estimate(_polar(1 / turned) if turned else value, np.hypot(error, attenuation))
+        return Estimate(_polar(1 / turned), np.hypot(error, attenuation) / abs(turned) ** 2) if turned else none
     path = truth.position[:, column, :2] @ [1, 1j]
     true = np.diff(path, prepend=np.nan) / rec.dt  # as odometry, the mean over a step
     odometer = velocity @ [1, 1j]

@@ -147,6 +147,7 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
     """
     base, used = Sensors(), set(rows["kind"])
     square = (rows["std"] ** 2).groupby(rows["kind"]).mean().dropna()
+    rare = _lasting(rows, square, dt)
 
     def of(*names: str, default: float, unit: str) -> float:
         stated = rows["std"][rows["kind"].isin(names)].dropna()
@@ -167,13 +168,20 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
         "min_range": 0.0,
     }
     if body:
-        rate = of("yaw_rate", default=base.yaw_rate_std, unit="rad/s")
+        rate = rare * of("yaw_rate", default=base.yaw_rate_std, unit="rad/s")
         noise |= {"velocity_reading": "speed", "yaw_rate_std": rate, "compass": "heading" in used}
         noise |= {"speed_scale_std": SCALE_STD, "yaw_rate_bias_std": RATE_BIAS_STD}
+    derived = max((member.turns for member in members), default=0.0) if "bearing" in used else 0.0
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of("heading", default=HEADING_STD, unit="rad")
+    elif derived:
+        noise["heading_std"] = derived
+        summary.assume(f"{derived:.2g} rad as the noise of headings that are derived, by which bearings are turned")
+    if (climbs := max((member.climbs for member in members), default=0.0)) > 0.0:
+        noise["climb_std"] = float(np.sqrt(climbs / dt))
+        summary.assume(f"heights change by {np.sqrt(10.0 * climbs):.2g} m in 10 s, as fixes show: no vz was measured")
     if (drifts := max((member.wanders for member in members), default=0.0)) > 0.0:
-        motion_noise = of(*MOTION, default=base.velocity_floor, unit="m/s")
+        motion_noise = rare * of(*MOTION, default=base.velocity_floor, unit="m/s")
         floor = max(float(np.sqrt(drifts / dt)), motion_noise)
         summary.assume(
             f"{floor:.2g} m/s as the noise of a velocity, as the fixes of what has none, or no heading, show it"
@@ -183,13 +191,31 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
             noise["velocity_reading"] = "fixes"
         return replace(base, **noise)
     if {*MOTION}.isdisjoint(square.index):
-        summary.assume(f"{base.velocity_std_ratio:.0%} of a velocity as its noise, {base.velocity_floor} m/s at least")
-        return replace(base, **noise)
-    speed = of(*MOTION, default=0.0, unit="m/s")
+        ratio, floor = min(rare * base.velocity_std_ratio, 1.0), rare * base.velocity_floor
+        summary.assume(f"{ratio:.0%} of a velocity as its noise, {floor:.2g} m/s at least")
+        return replace(base, **noise, velocity_std_ratio=ratio, velocity_floor=floor)
+    speed = rare * of(*MOTION, default=0.0, unit="m/s")
     if not body and {"speed", "heading"} <= set(square.index):
         speed = _across(speed, float(np.sqrt(square["heading"])), rows, dt)
         summary.assume(f"{speed:.2g} m/s as the noise of a velocity, with that of the headings which turn the speeds")
     return replace(base, **noise, velocity_std_ratio=0.0, velocity_floor=speed)
+
+
+def _lasting(rows: Rows, square: "pd.Series[float]", dt: float) -> float:
+    """Factor of the deviation of a motion that is measured seldom: its error lasts for the n steps until the next, or
+    for the m after which fixes have made up for it; the variances of so many are in one.
+
+    Where fixes of deviation r a step hold a walk of errors s dt, m sqrt(m) is r / (s dt).
+    """
+    steps, noise = dict[str, float](), dict[str, float]()
+    for name, kinds, usual in (("motion", MOTION, 0.0), ("fix", ("x",), Sensors().gnss_std[0])):
+        own = rows[rows["kind"].isin(kinds)].drop_duplicates(["vehicle", "t"]).sort_values("t")
+        steps[name] = float(np.fmax(own.groupby("vehicle")["t"].diff().median() / dt, 1.0))
+        stated = square.reindex(kinds).mean()
+        usual = usual or Sensors().velocity_std_ratio * float(np.nan_to_num(own["value"].abs().mean()))
+        noise[name] = float(np.sqrt(stated)) if stated > 0.0 else usual
+    held = noise["fix"] * steps["fix"] ** 0.5 / max(noise["motion"] * dt, 1e-12)
+    return float(np.sqrt(min(max(held ** (2 / 3), 1.0), steps["motion"])))
 
 
 def _across(speed: float, heading: float, rows: Rows, dt: float) -> float:

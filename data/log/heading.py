@@ -66,10 +66,12 @@ def heading_of_courses(velocity: Signal, yaw_rate: Signal | None) -> HeadingAt:
     return lambda at: wrap(held(offset, at)[:, 0] + turned(at))
 
 
-def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -> tuple[HeadingAt, float] | None:
+def heading_of_gyro(
+    fixes: Signal, speed: Signal, yaw_rate: Signal, std: float
+) -> tuple[HeadingAt, float, float] | None:
     """Function from times (G,) s to headings (G,) rad of what measures speed and yaw rate alone: a Kalman filter of the
-    heading at the start and of the yaw rate's bias, NaN before the first; and m^2/s, by which a position that is
-    predicted with it becomes uncertain. None if nothing moves far.
+    heading at the start and of the yaw rate's bias, NaN before the first; m^2/s, by which a position that is
+    predicted with it becomes uncertain; and rad, its own standard deviation. None if nothing moves far.
 
     Fixes that are BASELINE standard deviations apart measure the angle by which the way between them is turned from
     that of dead reckoning, in the middle of it; where angles scatter more than fixes explain, they weigh less.
@@ -95,7 +97,7 @@ def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) 
             gain = cov @ h / (h @ cov @ h + max(level, 1.0) * variance)
             state, cov = state + gain * gap, cov - np.outer(gain, cov @ h)
         pace = abs(driven) / (t[j] - t[last])
-        samples.append((float(t[j]), *state, cov[0, 0] * pace**2, t[j] - t[last]))
+        samples.append((float(t[j]), *state, cov[0, 0] * pace**2, t[j] - t[last], cov[0, 0]))
     if not samples:
         return None
     since = Signal(np.array([k[0] for k in samples]), np.array(samples))
@@ -105,7 +107,8 @@ def heading_of_gyro(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) 
         heading: Floats = wrap(offset + bias * (times - begun) + integral(yaw_rate, times)[:, 0])
         return heading
 
-    return at, float(np.prod(np.median(since.value[:, 3:], axis=0)))
+    wander, interval, variance = np.median(since.value[:, 3:], axis=0)
+    return at, float(wander * interval), float(np.sqrt(variance + GYRO_WALK**2 * interval))
 
 
 def far_apart(
@@ -128,7 +131,7 @@ def _ways(fixes: Signal, speed: Signal, yaw_rate: Signal) -> tuple[AnyArray, Any
     return integral(Signal(speed.t, way), fixes.t) @ [1, 1j], fixes.value[:, :2] @ [1, 1j]
 
 
-def heading_of_all(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -> tuple[HeadingAt, float] | None:
+def heading_of_all(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -> tuple[HeadingAt, float, float] | None:
     """As `heading_of_gyro`, of what stays near: the turn of dead reckoning onto all fixes until then, which fade in
     FADES s, by least squares; once it is as sure as by two that are SEEN standard deviations apart.
 
@@ -151,7 +154,8 @@ def heading_of_all(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -
     since, pace = np.array(samples), float(np.median(np.abs(speed.value)))
     offset = Signal(since[:, 0], since[:, 1:2])
     at = lambda times: wrap(held(offset, times)[:, 0] + integral(yaw_rate, times)[:, 0])  # noqa: E731
-    return at, float(np.median(since[:, 2])) * pace**2 * FADES
+    variance = float(np.median(since[:, 2]))
+    return at, variance * pace**2 * FADES, float(np.sqrt(variance + GYRO_WALK**2 * FADES))
 
 
 def mirrored(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -> bool:

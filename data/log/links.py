@@ -194,11 +194,11 @@ def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> t
 def _to_step(table: pd.DataFrame, members: Sequence[Member], steps: Steps) -> Floats:
     """Values (M,) at their steps: z + f(g) - f(g + lag du), f being the range, azimuth or inclination of the vector g
     from the observer to the neighbour at the step, from the last fixes and the odometry since, and du the difference of
-    their velocities. Nothing is moved where g or the range is not far longer than lag du. In body frames a bearing
-    grows by lag w, with the observer's yaw rate w; how the two move in the observer's frame is not known.
+    their velocities in the world. Nothing is moved where these are not known, or g or the range is not far longer than
+    lag du. In body frames a bearing grows by lag w, too, with the observer's yaw rate w.
     """
     velocity, fixes, rate = (
-        np.stack([getattr(member, name) for member in members], axis=1) for name in ("velocity", "gnss", "yaw_rate")
+        np.stack([getattr(member, name) for member in members], axis=1) for name in ("moves", "gnss", "yaw_rate")
     )
     step, observer, neighbour, component = (table[name].to_numpy() for name in (*PAIR, "component"))
     value, lag = table["value"].to_numpy(), table["lag"].to_numpy()
@@ -209,7 +209,7 @@ def _to_step(table: pd.DataFrame, members: Sequence[Member], steps: Steps) -> Fl
         return of_step[np.where(np.isnan(velocity[after, column, 0]), step, after), column]
 
     if steps.body:
-        return np.where(component == 1, wrap(value + lag * during(rate, observer)), value)
+        value = np.where(component == 1, value + lag * during(rate, observer), value)
     path = np.cumsum(np.nan_to_num(velocity) * steps.dt, axis=0)
     fixed = np.where(np.isfinite(fixes[..., 0]), np.arange(len(path))[:, None], -1)
     last = np.maximum.accumulate(fixed, axis=0)

@@ -29,10 +29,16 @@ from .units import Rows, Summary, in_group, place
 
 MOVING = 1.0
 """m/s, least speed at which a course is a heading."""
+SURE = 3.0
+"""Standard deviations of a velocity that fixes have shown, above which it is one."""
 STANDS = 0.5
 """m/s, a speed below which what has no heading is taken to stand."""
 UNKNOWN_SPEED = 30.0
 """m/s, standard deviation of a velocity before fixes have shown it."""
+BETWEEN = (0.25, 0.5, 0.75)
+"""Of the way from one speed to the next, where headings are interpolated, too: on a bend the chord is shorter."""
+CLIMBS = 10.0
+"""s, in which heights change by more than from one fix to the next where a road climbs."""
 COURSE = "the heading of {} is the course of the {}: no vehicle slips or reverses"
 ARM = "fixes are those of the reference point, less the arm to the antenna, of {}; none slips or reverses"
 HOLDS = "fixes that stay while the odometry moves on"
@@ -49,11 +55,13 @@ class Shown(NamedTuple):
         velocity: (M, 3) m/s at the times of fixes, by these and those before.
         certain: (M,) whether they show it.
         wanders: m^2/s, by which a position that is predicted with the last one becomes uncertain.
+        std: (M,) m/s, of the velocity.
     """
 
     velocity: Signal
     certain: Bools
     wanders: float
+    std: Floats
 
 
 class Steps(NamedTuple):
@@ -101,8 +109,11 @@ class Member:
         stands: whether it stands, as a road-side unit does.
         yaw_rate: (T,) rad/s as velocity, of body frames.
         compass: (T,) rad, NaN without a heading, of body frames.
+        moves: (T, 3) m/s, as velocity, in the world; in body frames NaN where no heading is known.
         wanders: m^2/s, variance of a velocity or direction that fixes have shown, by its time; 0 for odometry.
         shown: whether they alone have, without a gyro.
+        climbs: m^2/s, as `climbing`, of heights whose velocity was not measured.
+        turns: rad, standard deviation of a heading that was derived.
     """
 
     gnss: Floats
@@ -113,8 +124,11 @@ class Member:
     stands: bool
     yaw_rate: Floats
     compass: Floats
+    moves: Floats
     wanders: float = 0.0
     shown: bool = False
+    climbs: float = 0.0
+    turns: float = 0.0
 
 
 def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 1) -> Signal:
@@ -157,18 +171,18 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
     again = pd.DataFrame(fixes.value).diff().eq(0).all(axis=1).to_numpy()
     measured, turn, speed = (samples(rows, (kind,), summary) for kind in ("heading", "yaw_rate", "speed"))
     still: Floats = np.zeros((len(grid), 3))
-    wanders = 0.0
+    wanders = turns = 0.0
     none: Floats = np.full(len(grid), np.nan)
     if len(fixes.t) and again[1:].all() and not in_group(rows, "odometry").any():
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m{', arm left in' * (arm is not None)}"
         heading = heading_at(measured, None, np.inf) if len(measured.t) and not body else None
-        return Member(still + fixes.value[0], still, heading, text, "", True, still[:, 0], none)
+        return Member(still + fixes.value[0], still, heading, text, "", True, still[:, 0], none, still)
     std = fix_std(rows)
     shown, gyro = velocity_of_fixes(fixes, steps, std), (fixes, speed, std)
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
         world, ever = samples(rows, ("vx", "vy"), Summary(), 2), steps._replace(max_gap=np.inf)
-        pointing, source, _ = _heading(measured, turn, ((world, "odometry"), (shown, "fixes")), ever, gyro)
+        pointing, source, *_ = _heading(measured, turn, ((world, "odometry"), (shown, "fixes")), ever, gyro)
         if pointing is None or not np.isfinite(off).all():
             hint = f"Log heading or compass_deg, or vx and vy; a course counts above {MOVING:g} m/s."
             raise InputError(f"antenna of {name}", f"{arm} m", "needs numbers, and a heading of the vehicle", hint)
@@ -189,17 +203,17 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         heading = heading_at(measured, turn, np.inf) if len(measured.t) else None
         along, *_ = _heading(measured, turn, ((shown, "fixes"),), steps, gyro)
         forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
-        carried: Floats = still if along is None else np.nan_to_num(forward * turned(AHEAD, along(grid)))
+        moves: Floats = forward * turned(AHEAD, none if along is None else along(grid))
         velocity: Floats = forward * AHEAD
     else:
-        moved, heading, course, wanders = _in_world(name, rows, (measured, turn), shown, gyro, steps)
-        signals, rate = [moved or fixes], none
-        velocity = carried = _by_fixes(fixes, shown, steps) if moved is None else step_means(moved, grid)
+        moved, times, heading, course, wanders, turns = _in_world(name, rows, (measured, turn), shown, gyro, steps)
+        signals, rate = [times or fixes], none
+        velocity = moves = _by_fixes(fixes, shown, steps) if moved is None else step_means(moved, grid)
     there = np.ones(len(grid), dtype=bool)
     for signal in signals:
         interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
         there &= covered(signal.t, grid, steps.gap(signal.t), max(steps.dt, 0.6 * interval))
-    gnss = _fixes_on_steps(rows, fixes, carried, there, steps, again, std)
+    gnss = _fixes_on_steps(rows, fixes, np.nan_to_num(moves), there, steps, again, std)
     fixed = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
     if fixed.any() or not body:
         summary.refuse(f"steps of {name} before its first fix", int((there & ~fixed).sum()))
@@ -213,7 +227,26 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
     alone = wanders > 0.0 and (signals[0] is fixes or len(turn.t) < 2)
     velocity = velocity + absent[:, None]
-    return Member(gnss, velocity, heading, text, course, False, rate + absent, compass, wanders, alone)
+    climbs = 0.0 if steps.planar or signals[0] is fixes or rows["kind"].eq("vz").any() else climbing(fixes)
+    rate, moves = rate + absent, moves + absent[:, None]
+    return Member(gnss, velocity, heading, text, course, False, rate, compass, moves, wanders, alone, climbs, turns)
+
+
+def climbing(fixes: Signal) -> float:
+    """m^2/s, by which heights wander: how much more they change in CLIMBS s than from one fix to the next, beyond
+    chance.
+
+    >>> t = np.arange(60.0)
+    >>> climbing(Signal(t, 0.5 * t[:, None] * [1, 1, 1])) > 1.0, climbing(Signal(t, np.zeros((60, 3))))
+    (True, 0.0)
+    """
+    t, z = fixes.t, fixes.value[:, 2]
+    later = np.searchsorted(t, t + max(CLIMBS, 5.0 * float(np.median(np.diff(t))) if len(t) > 1 else 0.0))
+    now = np.flatnonzero(later < len(t))
+    if len(now) < 3:
+        return 0.0
+    near, far = (float(np.quantile(np.abs(gap), 0.75) / 1.15) ** 2 for gap in (np.diff(z), z[later[now]] - z[now]))
+    return max(far - near * (1.0 + 2.0 / len(now) ** 0.5), 0.0) / float(np.mean(t[later[now]] - t[now]))
 
 
 def _in_world(
@@ -223,24 +256,29 @@ def _in_world(
     shown: Shown,
     gyro: tuple[Signal, Signal, float],
     steps: Steps,
-) -> tuple[Signal | None, HeadingAt | None, str, float]:
-    """Velocity at its own times, None where the fixes have to show it; heading, whose course that is, and m^2/s by
-    which that makes a position uncertain; `turning` are heading and yaw rate, `gyro` as of `_heading`."""
+) -> tuple[Signal | None, Signal | None, HeadingAt | None, str, float, float]:
+    """Velocity, and the samples that it is of, None where the fixes have to show it; heading, and the rest of
+    `_heading`; `turning` are heading and yaw rate."""
     summary, (measured, turn), (fixes, speed, _) = steps.summary, turning, gyro
     world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), rows[rows["kind"] == "speed"]
-    heading, course, wanders = _heading(measured, turn, ((world, "odometry"), (shown, "fixes")), steps, gyro)
+    heading, course, *unsure = _heading(measured, turn, ((world, "odometry"), (shown, "fixes")), steps, gyro)
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
-        return Signal(world.t, np.nan_to_num(world.value)), heading, course, 0.0
-    standing = np.abs(speed.value[:, 0]) < STANDS
-    if len(speed.t) and (heading is not None or standing.all()):
+        return Signal(world.t, np.nan_to_num(world.value)), world, heading, course, 0.0, unsure[1]
+    if len(speed.t) and (heading is not None or np.median(np.abs(speed.value)) < STANDS):
         if course:
             summary.assume(COURSE.format("{}", course), name)
-        angle = np.full(len(standing), np.nan) if heading is None else heading(speed.t)
-        usable = np.isfinite(angle) | standing
-        summary.refuse("speeds without a heading", speeds[speeds["t"].isin(speed.t[~usable])])
-        velocity = speed.value * np.nan_to_num(turned(AHEAD, angle))
-        return Signal(speed.t[usable], velocity[usable]), heading, course, wanders
+
+        def usable(angle: Floats, pace: Floats) -> Bools:
+            return np.isfinite(angle) | (np.abs(pace) < STANDS) | (heading is None)
+
+        at = np.unique(np.concatenate([speed.t, *(speed.t[:-1] + part * np.diff(speed.t) for part in BETWEEN)]))
+        pace = np.interp(at, speed.t, speed.value[:, 0])
+        angle = np.full(len(at), np.nan) if heading is None else heading(at)
+        kept, own = usable(angle, pace), np.isin(at, speed.t)
+        summary.refuse("speeds without a heading", speeds[speeds["t"].isin(at[own & ~kept])])
+        velocity = pace[:, None] * np.nan_to_num(turned(AHEAD, angle))
+        return Signal(at[kept], velocity[kept]), Signal(at[own & kept], at), heading, course, unsure[0], unsure[1]
     if len(speed.t):
         allowed, hint = "needs heading, compass_deg, or fixes of a moving vehicle", "Add one, or give vx and vy."
         raise InputError(f"{place(speeds)}, speed", f"of {name}, which has no heading", allowed, hint)
@@ -248,7 +286,7 @@ def _in_world(
         hint = "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z."
         raise InputError(f"vehicle {name}", "no odometry, and less than two fixes", "cannot be placed", hint)
     summary.assume(DERIVED, name)
-    return None, heading, course, shown.wanders
+    return None, None, heading, course, shown.wanders, unsure[1]
 
 
 def _heading(
@@ -257,23 +295,25 @@ def _heading(
     moves: Sequence[tuple[Signal | Shown, str]],
     steps: Steps,
     gyro: tuple[Signal, Signal, float] | None = None,
-) -> tuple[HeadingAt | None, str, float]:
+) -> tuple[HeadingAt | None, str, float, float]:
     """Heading that was measured, else by `gyro` (fixes, speed, their standard deviation) and the yaw rate, else the
-    course of the first of `moves` that moves; what it was derived from, and m^2/s as of
+    course of the first of `moves` that moves; what it was derived from, and m^2/s and rad as of
     `heading_of_gyro`."""
     rate = turn if len(turn.t) > 1 else None
     if len(measured.t):
-        return heading_at(measured, rate, steps.gap(measured.t)), "", 0.0
+        return heading_at(measured, rate, steps.gap(measured.t)), "", 0.0, 0.0
     if gyro is not None and rate is not None and len(gyro[1].t) > 1:
         fixes, speed, std = gyro
         way = fixes, speed, rate, std
         if (filtered := heading_of_gyro(*way) or heading_of_all(*way)) is not None:
-            return filtered[0], "fixes", filtered[1]
+            return filtered[0], "fixes", *filtered[1:]
     for move, source in moves:
-        velocity, wanders = (move.velocity, move.wanders) if isinstance(move, Shown) else (move, 0.0)
-        if (moving := np.hypot(*velocity.value[:, :2].T) > MOVING).any():
-            return heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate), source, wanders
-    return None, "", 0.0
+        velocity, wanders, std = (move[0], *move[2:]) if isinstance(move, Shown) else (move, 0.0, np.zeros(len(move.t)))
+        pace = np.hypot(*velocity.value[:, :2].T)
+        if (moving := pace > np.maximum(MOVING, SURE * std)).any():
+            courses = heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate)
+            return courses, source, wanders, float(np.median(std[moving] / pace[moving]))
+    return None, "", 0.0, 0.0
 
 
 def _longest(there: Bools, grid: Floats) -> str:
@@ -308,16 +348,18 @@ def velocity_of_fixes(fixes: Signal, steps: Steps, std: float) -> Shown:
     """Velocity by fixes of that standard deviation m, by a Kalman filter (`kernels.constant_velocity`). It is known by
     four of them at the latest, or as well as by two that are as far apart as nine in ten."""
     if len(fixes.t) < 2:
-        return Shown(Signal(fixes.t, np.zeros_like(fixes.value)), np.zeros(len(fixes.t), bool), 0.0)
+        none: Floats = np.zeros(len(fixes.t))
+        return Shown(Signal(fixes.t, np.zeros_like(fixes.value)), none > 0, 0.0, none)
     between = np.diff(fixes.t)
     interval, longest = float(np.median(between)), float(np.quantile(between, 0.9))
-    velocity, growth, spread = constant_velocity(
+    velocity, growth, spread, proved = constant_velocity(
         fixes.t, fixes.value, interval, steps.gap(fixes.t) + SAME, std**2, UNKNOWN_SPEED, BANK
     )
     sure, order = np.isfinite(growth), np.arange(len(growth))
     since = order - np.maximum.accumulate(np.where(sure, 0, order))
     wanders = float(std**2 * np.median(growth[sure]) / interval) if sure.any() else 0.0
-    return Shown(Signal(fixes.t, velocity), (since > 3) | (sure & (spread * longest**2 < 2.0)), wanders)
+    certain = (since > 3) | (sure & (spread * longest**2 < 2.0))
+    return Shown(Signal(fixes.t, velocity), certain, wanders, np.sqrt(proved * spread))
 
 
 def _by_fixes(fixes: Signal, shown: Shown, steps: Steps) -> Floats:

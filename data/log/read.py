@@ -38,8 +38,10 @@ DAY = 86400.0
 """s."""
 LOST = 0.02
 """Most of the fixes that may fall on a step that has one."""
-LONGEST, PAIR = 1.0, ("vehicle", "partner")
+SHORTEST, LONGEST, PAIR = 0.02, 1.0, ("vehicle", "partner")
 """s, of a step that is not given; what names a pair."""
+OFTEN = 0.1
+"""Share of the measurements of the most frequent vehicle, or pair, from which one counts for the step."""
 READERS: Mapping[str, Callable[..., Rows]] = {
     **dict.fromkeys(TABLES, read_log_table),
     **dict.fromkeys((".nmea", ".nme", ".gga"), read_nmea),
@@ -388,8 +390,8 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     """(T,) s, steps over all fixes and odometry."""
 
     def densest(group: str, *keys: str) -> float:
-        times = rows[in_group(rows, group)].drop_duplicates([*keys, "t"]).sort_values("t")
-        return float(times.groupby(list(keys))["t"].agg(lambda t: t.diff().median()).min())
+        times = rows[in_group(rows, group)].drop_duplicates([*keys, "t"]).sort_values("t").groupby(list(keys))["t"]
+        return float(times.agg(lambda t: t.diff().median())[times.size() >= OFTEN * times.size().max()].min())
 
     moves, fixes, pairs = densest("odometry", "vehicle"), densest("fix", "vehicle"), densest("relative", *PAIR)
     t = rows["t"][in_group(rows, "odometry", "fix")]
@@ -400,6 +402,10 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     step = dt or float(f"{moves if moves > 0 else fixes:.3g}")
     if not step > 0:
         raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
+    dense = float(f"{max(np.nanmin([fixes, pairs, step]), SHORTEST):.3g}")
+    if dt is None and dense < step:
+        summary.assume(f"steps of {dense:g} s, as fixes or pairs are measured; odometry every {step:g} s is joined")
+        step = dense
     seldom = float(f"{min(pairs, fixes, LONGEST):.3g}")  # unknown where there are no pairs
     if dt is None and not body and pairs > step and seldom > step:
         summary.assume(f"steps of {seldom:g} s, as fixes and pairs are measured; odometry every {step:g} s is averaged")
