@@ -217,9 +217,9 @@ def usual_key(header: str) -> str:
     >>> [usual_key(header) for header in ("UnixTimeMillis", "GPS_lat [deg]", "BearingDegrees", "rank")]
     ['t', 'latitude', 'compass_deg', '']
     """
-    words_of = re.findall(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]+", header)
-    words_of = {header.lower(), *(word.lower() for word in words_of)}
-    return next((key for key, usual in USUAL.items() if words_of & {key, *usual.split()}), "")
+    found = re.findall(r"[a-z]+|[A-Z]+(?![a-z])|[A-Z][a-z]+", header)
+    parts = {header.lower(), *(word.lower() for word in found)}
+    return next((key for key, usual in USUAL.items() if parts & {key, *usual.split()}), "")
 
 
 def missing_column(file: str, column: str, names: Sequence[str], allowed: str, key: str = "") -> InputError:

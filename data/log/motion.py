@@ -246,7 +246,8 @@ def climbing(fixes: Signal) -> float:
     if len(now) < 3:
         return 0.0
     near, far = (float(np.quantile(np.abs(gap), 0.75) / 1.15) ** 2 for gap in (np.diff(z), z[later[now]] - z[now]))
-    return max(far - near * (1.0 + 2.0 / len(now) ** 0.5), 0.0) / float(np.mean(t[later[now]] - t[now]))
+    more: float = far - near * (1.0 + 2.0 / len(now) ** 0.5)
+    return max(more, 0.0) / float(np.mean(t[later[now]] - t[now]))
 
 
 def _in_world(
@@ -308,11 +309,12 @@ def _heading(
         if (filtered := heading_of_gyro(*way) or heading_of_all(*way)) is not None:
             return filtered[0], "fixes", *filtered[1:]
     for move, source in moves:
-        velocity, wanders, std = (move[0], *move[2:]) if isinstance(move, Shown) else (move, 0.0, np.zeros(len(move.t)))
+        none: Floats = np.zeros(len(move[0]))
+        velocity, wanders, unsure = (move[0], *move[2:]) if isinstance(move, Shown) else (move, 0.0, none)
         pace = np.hypot(*velocity.value[:, :2].T)
-        if (moving := pace > np.maximum(MOVING, SURE * std)).any():
+        if (moving := pace > np.maximum(MOVING, SURE * unsure)).any():
             courses = heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate)
-            return courses, source, wanders, float(np.median(std[moving] / pace[moving]))
+            return courses, source, wanders, float(np.median(unsure[moving] / pace[moving]))
     return None, "", 0.0, 0.0
 
 
