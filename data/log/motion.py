@@ -266,7 +266,7 @@ def _in_world(
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
         return Signal(world.t, np.nan_to_num(world.value)), world, heading, course, 0.0, unsure[1]
-    if len(speed.t) and (heading is not None or np.median(np.abs(speed.value)) < STANDS):
+    if len(speed.t) and (heading is not None or abs(speed.value.mean()) < STANDS):
         if course:
             summary.assume(COURSE.format("{}", course), name)
 
