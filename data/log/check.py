@@ -36,7 +36,7 @@ from .estimates import (
 from .estimates import median as median_of
 from .motion import CLOCKWISE, HOLDS
 from .read import Log
-from .relative import OUTLIERS, long_off, measurements, of_measurements, of_ranges, when
+from .relative import OUTLIERS, SEVERAL, long_off, measurements, of_measurements, of_ranges, when
 from .residuals import Check, filtered
 from .unseen import unseen
 
@@ -215,7 +215,7 @@ def _of_vehicles(c: Check) -> list[str]:
         square = size * c.normalised[np.isfinite(c.normalised[:, column]), column]
         usual = max(float(np.median(square)) / scipy.stats.chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
         outliers = float(np.mean(square > OUTLYING**2 * usual)) if len(square) else 0.0
-        if outliers > OUTLIERS:
+        if outliers > max(OUTLIERS, SEVERAL / max(len(square), 1)):
             sentences.append(
                 f"{name}: {outliers:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: "
                 "outliers, which a filter without a gate follows."

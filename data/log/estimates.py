@@ -165,10 +165,12 @@ def odometry(c: Check, column: int) -> Estimate:
     none = Estimate(np.zeros(3), np.full(3, np.inf))
     if rec.sensors.velocity_reading == "fixes":
         return none
-    if truth is None and body is not None:
-        return Estimate(*c.lasting[:, column])
     velocity = rec.velocity[0, :, column, :2]
     noise = np.nan_to_num(rec.sensors.velocity_std(velocity, rec.sensors.velocity_floor))
+    if truth is None and body is not None:
+        value, error = c.lasting[:, column]
+        attenuation = np.square(noise).sum() / max(float(np.nansum(np.square(velocity))), 1e-12)
+        return Estimate(value, np.hypot(error, [attenuation, 0.0]))
     if truth is None:
         moved, driven = moves(rec, column)
         if len(moved) < ENOUGH:

@@ -404,7 +404,8 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
     dense = float(f"{max(np.nanmin([fixes, pairs, step]), SHORTEST):.3g}")
     if dt is None and dense < step:
-        summary.assume(f"steps of {dense:g} s, as fixes or pairs are measured; odometry every {step:g} s is joined")
+        seen = f"odometry every {step:g} s is joined by straight lines, so much of it ahead"
+        summary.assume(f"steps of {dense:g} s, as fixes or pairs are measured; {seen}")
         step = dense
     seldom = float(f"{min(pairs, fixes, LONGEST):.3g}")  # unknown where there are no pairs
     if dt is None and not body and pairs > step and seldom > step:

@@ -25,8 +25,8 @@ HINTS = {
     "inclination": "Inclinations count from +z, elevations from the horizon.",
 }
 """What to look for where measurements of a kind miss the positions."""
-OUTLIERS = 0.01
-"""Share of measurements beyond 5 standard deviations that is reported."""
+OUTLIERS, SEVERAL = 0.01, 3
+"""Share of measurements beyond 5 standard deviations that is reported, if these are more than several."""
 WINDOW = 9
 """Measurements of a pair whose median is taken off to count outliers."""
 SOLID, MANY = 0.8, 4
@@ -110,7 +110,7 @@ def of_measurements(c: Check) -> list[str]:
         outliers, misfits = row["beyond_5_std"], _misfits(c, k)
         apart = {f"{a} to {b}" if k else f"{a} and {b}" for pair in misfits for a, b in (pair, pair[:: 1 if k else -1])}
         pairs = [one for one in _named(c, k, row["stated_std"]) if one[0] not in apart]
-        if outliers > OUTLIERS and not scaled and not misfits:
+        if outliers > max(OUTLIERS, SEVERAL / row["number"]) and not scaled and not misfits:
             sentences.append(
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
                 "as of reflections. Drop them, or take a method with a gate or a robust loss."
