@@ -147,7 +147,7 @@ def heading_of_all(fixes: Signal, speed: Signal, yaw_rate: Signal, std: float) -
         n, far, moved, square, product = sums
         spread = (square - abs(far) ** 2 / n).real
         turn = product - moved * far.conjugate() / n
-        if spread * 2.0 >= (SEEN * std) ** 2 and abs(turn) > 0.5 * spread:  # fixes move, too
+        if abs(turn) ** 2 >= 0.75 * (SEEN * std) ** 2 * spread and abs(turn) > 0.5 * spread:  # fixes move, too
             samples.append(np.array([t[j], np.angle(turn), std**2 / spread]))
     if not samples:
         return None

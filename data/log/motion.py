@@ -312,7 +312,8 @@ def _heading(
         none: Floats = np.zeros(len(move[0]))
         velocity, wanders, unsure = (move[0], *move[2:]) if isinstance(move, Shown) else (move, 0.0, none)
         pace = np.hypot(*velocity.value[:, :2].T)
-        if (moving := pace > np.maximum(MOVING, SURE * unsure)).any():
+        certain = move.certain if isinstance(move, Shown) else True
+        if (moving := (pace > np.maximum(MOVING, SURE * unsure)) & certain).any():
             courses = heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate)
             return courses, source, wanders, float(np.median(unsure[moving] / pace[moving]))
     return None, "", 0.0, 0.0
