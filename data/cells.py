@@ -76,6 +76,7 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
         raise _no_table(path, said(error)) from None
     frame.columns = pd.Index([str(name).strip() for name in frame.columns])
+    frame = frame.iloc[:, 1:] if list(frame.columns[:1]) == [""] else frame  # an index, as pandas writes it
     _check_header(path, list(frame.columns))
     frame.index += 1
     return frame

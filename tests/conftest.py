@@ -86,10 +86,10 @@ def formation_fleet(vehicles: int = 11, steps: int = 901, ring: float = 22.0) ->
     """Rigid formation within 30 m on a gently sinuous path at 10 m/s: ten on a ring (docs/decisions.md)."""
     t = np.arange(steps) * 0.1
     course = 0.3 * np.sin(2 * np.pi * t / 60)
-    path = np.cumsum(np.stack([np.cos(course), np.sin(course), 0 * t], axis=1), axis=0)
+    path = np.cumsum(np.c_[np.cos(course), np.sin(course), 0 * t], axis=0)
     around = np.linspace(0, 2 * np.pi, vehicles - 1, endpoint=False)
     gap = np.linspace(ring, ring + 0.1, vehicles - 1)
-    offset = np.vstack([np.zeros(3), np.stack([gap * np.cos(around), gap * np.sin(around), 0 * gap], axis=1)])
+    offset = np.vstack([np.zeros(3), np.c_[gap * np.cos(around), gap * np.sin(around), 0 * gap]])
     position = path[:, None] + offset
     return moving("v", t, position)
 

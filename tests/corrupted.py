@@ -20,7 +20,7 @@ def drive(steps: int = 12, vehicles: int = 5) -> Fleet:
     t = 0.1 * np.arange(steps)
     velocity = np.tile([8.0, 1.0, 0.0], (steps, vehicles, 1))
     velocity[:, 1::2, 1] *= -1
-    place = np.column_stack([7.0 * np.arange(vehicles), 4.0 * (np.arange(vehicles) % 3), np.zeros(vehicles)])
+    place = np.c_[7.0 * np.arange(vehicles), 4.0 * (np.arange(vehicles) % 3), np.zeros(vehicles)]
     position = place + t[:, None, None] * velocity
     for array in (position, velocity):
         array[:3, 3], array[9:, 4] = np.nan, np.nan

@@ -14,7 +14,7 @@ def drive(vehicles: int = 4, steps: int = 200, dt: float = 0.1, start: float = 0
     """Vehicles side by side on a wide bend at 8 m/s, `gap` metres apart."""
     t = dt * np.arange(steps)
     course = 0.4 * np.sin(0.15 * t)
-    step = dt * 8 * np.stack([np.cos(course), np.sin(course), 0 * t], axis=1)
+    step = dt * 8 * np.c_[np.cos(course), np.sin(course), 0 * t]
     path = np.cumsum(step, axis=0)
     aside = gap * np.arange(vehicles)[:, None] * [0.2, 1.0, 0.0]
     position = path[:, None] + aside
@@ -100,7 +100,7 @@ def bends(vehicles: int = 2, minutes: float = 3.0, climb: float = 0.0) -> Fleet:
     """Vehicles on bends through all directions at 8 m/s, 12 m apart; `climb` m of height that come and go."""
     t = 0.02 * np.arange(int(minutes * 3000))
     course = 2.5 * np.sin(0.1 * t)
-    velocity = np.stack([8 * np.cos(course), 8 * np.sin(course), 0.1 * climb * np.cos(0.1 * t)], axis=1)
+    velocity = np.c_[8 * np.cos(course), 8 * np.sin(course), 0.1 * climb * np.cos(0.1 * t)]
     apart = 12.0 * np.arange(vehicles)[:, None] * [0.3, 0.9, 0.0]
     position = np.cumsum(0.02 * velocity, axis=0)[:, None] + apart
     return Fleet(tuple(f"car{k}" for k in range(vehicles)), t, position, np.repeat(velocity[:, None], vehicles, axis=1))

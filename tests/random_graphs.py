@@ -49,7 +49,7 @@ def random_graph(
     pairs = np.concatenate([odometry, loop.reshape(-1, 2)])
     to_mark = np.argwhere(far[:count, count:] < 2 * REACH) + np.array([0, count])
     other = np.argwhere(far[:count, :count] < 2 * REACH)
-    other = other[(other[:, 0] // steps) < (other[:, 1] // steps)]
+    other = other[np.diff(other // steps)[:, 0] > 0]
     to_mark = to_mark[rng.permutation(len(to_mark))]
     marks = range(count, count + landmarks)
     enough = np.concatenate([to_mark[:0], *(to_mark[to_mark[:, 1] == mark][:5] for mark in marks)])
@@ -62,13 +62,13 @@ def random_graph(
     cov = np.diag(np.r_[np.full(d, step_std**2), np.full(angles, turn_std**2)])
 
     def local(nodes: np.ndarray, std: float) -> np.ndarray:
-        gap = world[nodes[:, 1]] - world[nodes[:, 0]]
-        return np.einsum("mji,mj->mi", turned[nodes[:, 0]], gap) + std * rng.normal(size=(len(nodes), d))
+        i, j = nodes.T
+        return np.einsum("mji,mj->mi", turned[i], world[j] - world[i]) + std * rng.normal(size=(len(nodes), d))
 
-    relative = np.einsum("mji,mjk->mik", turned[pairs[:, 0]], turned[pairs[:, 1]])
+    relative = np.einsum("mji,mjk->mik", *(turned[ends] for ends in pairs.T))
     relative = relative @ exp(turn_std * rng.normal(size=(len(pairs), angles)))
     moved = local(pairs, step_std)
-    distance = far[ranged[:, 0], ranged[:, 1]] + range_std * rng.normal(size=len(ranged))
+    distance = far[*ranged.T] + range_std * rng.normal(size=len(ranged))
     marked = np.arange(count, count + landmarks)[:, None]
     return Graph(
         d,

@@ -39,7 +39,7 @@ def strange(folder: Path, kind: str, seed: int = 0, seconds: float = 180.0, rate
         speed[name] = pace * (1 + 0.3 * np.sin(0.15 * c * s))
         path = np.cumsum(0.02 * speed[name] * np.exp(1j * course[name]))
         path += -k * apart if cars else apart * np.exp(1.9j * k) * (k > 0)
-        place[name] = np.column_stack([path.real, path.imag, climb * np.sin(0.1 * t + k)])
+        place[name] = np.c_[path.real, path.imag, climb * np.sin(0.1 * t + k)]
     place |= {"anchor": 0 * place[names[0]] + [2.0, -1.0, 0.0]} if robots else {}
 
     def at(values: Any, times: Any) -> Any:

@@ -129,7 +129,7 @@ def problem(recording: Recording, known: NoiseModel) -> Any:
     def residual(flat: Any) -> Any:
         x = flat.reshape(steps, vehicles, 3)
         d, az, inc = spherical(*(x[links.step, links.neighbour] - x[links.step, links.observer]).T)
-        off = np.stack([d - seen[:, 0], wrap(az - seen[:, 1]), wrap(inc - seen[:, 2])], axis=1)
+        off = np.c_[d - seen[:, 0], wrap(az - seen[:, 1]), wrap(inc - seen[:, 2])]
         moved = (np.diff(x, axis=0) - recording.dt * recording.velocity[0, 1:]) / motion_std
         return np.concatenate([((x - recording.gnss[0]) / known.gnss_std).ravel(), moved.ravel(), (off / std).ravel()])
 

@@ -253,7 +253,7 @@ def test_real_measurements_are_tasks_for_pose_filters(tmp_path):
     solo, whole = rows["pose-solo"]["uwb"], rows["pose-fleet"]["uwb"]
     assert whole["rt_le_m"][2] < solo["rt_le_m"][0]
     log = load_log(measured("tiers.pyfg"))
-    begin = np.column_stack([log.truth.position[0], log.truth.heading[0]])
+    begin = np.c_[log.truth.position[0], log.truth.heading[0]]
     begin[4] = np.nan
     noise = replace(log.recording.sensors, range_std=tasks.RANGE_STD)
     size = int(10 / log.truth.dt)

@@ -36,7 +36,7 @@ def drives() -> dict[str, tuple[Any, Any, float, float]]:
     out = {}
     for name, (start, radius, rate) in CARS.items():
         angle = start + rate * T
-        place = radius * np.column_stack([np.cos(angle), np.sin(angle)])
+        place = radius * np.c_[np.cos(angle), np.sin(angle)]
         out[name] = place, wrapped(angle + np.pi / 2), radius * rate, rate
     return out
 
@@ -267,7 +267,7 @@ def librsf(folder: Path, wheels: bool) -> tuple[Any, Any]:
     """A robot on a circle of 5 m ranges four anchors without error, as libRSF writes it; its true way and headings."""
     t = np.arange(0, 40, 0.1)
     angle = 0.15 * t
-    place = 5 * np.column_stack([np.cos(angle), np.sin(angle)])
+    place = 5 * np.c_[np.cos(angle), np.sin(angle)]
     measured, true = [], []
     for k, (now, (x, y)) in enumerate(zip(t, place, strict=True)):
         number = k % 4
@@ -304,6 +304,18 @@ def test_libRSFs_text_is_followed_from_ranges_alone(tmp_path, wheels):
     assert np.abs(wrapped(track.heading[0, 50:, 0] - heading[50:])).max() < 0.05
     with refused("where ranges to anchors place it"):
         co.read_log(tmp_path / "hall")
+
+
+def test_ranges_are_moved_to_their_step(tmp_path):
+    """Closed form: cars that pass each other at 30 m/s range 0.04 s after a step."""
+    t = np.arange(90) / 10
+    x, cars = 15 * t - 60, [pd.DataFrame({"t": t + 0.04, "vehicle": "a", "partner": "b", "range": 118.8 - 30 * t})]
+    for name, way in (("a", 1), ("b", -1)):
+        own = {"vehicle": name, "speed": 15, "yaw_rate": 0, "x": way * x, "y": 0, "heading": np.arccos(way)}
+        cars.append(pd.DataFrame({"t": t, **own}))
+    pd.concat(cars).query("t < 3").to_csv(tmp_path / "log.csv")
+    rec = co.read_log(tmp_path / "log.csv", frame="body").recording
+    assert_allclose(rec.relative[0, :, 0], -2 * x[rec.links.step], atol=1e-6)
 
 
 def test_two_anchors_leave_the_side_open(tmp_path):

@@ -98,12 +98,11 @@ def test_an_antenna_elsewhere_is_found_and_taken_off(tmp_path, truth):
     t, arm = 0.02 * np.arange(9000), (1.5, -0.6)
     ahead, speed = np.exp(2.5j * np.sin(0.1 * t)), 8 + 4 * np.sin(0.21 * t)
     position, velocity = (
-        np.stack([part.real, part.imag, 0 * t], axis=1)[:, None]
-        for part in (np.cumsum(0.02 * speed * ahead), speed * ahead)
+        np.c_[part.real, part.imag, 0 * t][:, None] for part in (np.cumsum(0.02 * speed * ahead), speed * ahead)
     )
     reference = co.Fleet(("car",), t, position, velocity)
     seen = position[:, 0, :2] @ [1, 1j] + complex(*arm) * ahead - 0.1 * speed * ahead
-    moved = replace(reference, position=np.stack([seen.real, seen.imag, 0 * t], axis=1)[:, None])
+    moved = replace(reference, position=np.c_[seen.real, seen.imag, 0 * t][:, None])
     parts = [fixes(moved, "car", 0.5, 0.5), motion(reference, "car", 0.1, 0.1)]
     write(pd.concat(parts).drop(columns=["z", "vz"]), tmp_path / "log.csv")
     if truth:
@@ -246,7 +245,7 @@ def test_a_car_that_stands_without_a_heading_keeps_its_fixes(tmp_path):
 
 def test_fixes_of_what_stands_err_too(tmp_path):
     x, y = np.random.default_rng(0).normal(0, 10, (2, 300))
-    frame = pd.DataFrame({"t": np.arange(300), "vehicle": "a", "x": x, "y": y, "vx": 0, "vy": 0})
+    frame = pd.DataFrame({"t": np.arange(300), "x": x, "y": y, "vx": 0, "vy": 0})
     assert "NIS is" in said(read_log(write(frame, tmp_path / "a.csv")))
     assert "none of which changes" in str(check(read_log(write(frame.assign(x=0, y=0), tmp_path / "a.csv"))).unseen)
 

@@ -124,7 +124,7 @@ def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path):
     t = np.arange(0, 10, 0.1)
     at = t[10:90:5] + 0.04
     heading = 0.3 + 0.5 * np.append(t, at)
-    way = 6 * np.column_stack([np.sin(heading) - np.sin(0.3), np.cos(0.3) - np.cos(heading)])
+    way = 6 * np.c_[np.sin(heading) - np.sin(0.3), np.cos(0.3) - np.cos(heading)]
     (x, own), (heading, h) = (np.split(values, [len(t)]) for values in (way, heading))
     wide = pd.DataFrame({"t": t, "vehicle": "car", "x": x[:, 0], "y": x[:, 1], "speed": 3.0, "yaw_rate": 0.5})
     wide.loc[::50, "heading"] = np.arctan2(np.sin(heading[::50]), np.cos(heading[::50]))
@@ -142,7 +142,7 @@ def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path):
     gap = np.array([20.0, 5.0]) - x[10:90:5]
     assert_allclose(rec.relative[0, :, 1], np.arctan2(gap[:, 1], gap[:, 0]), atol=2e-4)
     assert np.isnan(rec.relative[0, :, [0, 2]]).all()
-    true = 3 * np.column_stack([np.cos(heading), np.sin(heading)])
+    true = 3 * np.c_[np.cos(heading), np.sin(heading)]
     assert_allclose(rec.velocity[0, 1:, col, :2], (true[1:] + true[:-1]) / 2, atol=2e-3)
     assert (rec.gnss[0, :, rec.ids.index("rsu")] == [20.0, 5.0, 0.0]).all()
     assert "stands at" in log.summary.vehicles["rsu"]
@@ -207,7 +207,7 @@ def test_a_speed_that_is_turned_by_a_noisy_heading_is_as_uncertain(tmp_path):
     for car in range(8):
         turn = 0.2 * np.sin(0.3 * t + car)
         heading = car + np.cumsum(turn) * 0.1
-        x = np.cumsum(1.0 * np.column_stack([np.cos(heading - turn / 20), np.sin(heading - turn / 20)]), axis=0)
+        x = np.cumsum(1.0 * np.c_[np.cos(heading - turn / 20), np.sin(heading - turn / 20)], axis=0)
         for k, now in enumerate(t):
             truth.append((now, f"car{car}", *x[k]))
             rows.append((now, f"car{car}", "speed", 10 + rng.normal(0, 0.1), 0.1))

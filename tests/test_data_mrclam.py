@@ -79,7 +79,7 @@ def test_odometry_follows_its_log_late_and_slower_in_turns(log, known):
     assert abs(known.lag - 0.1 * int(np.argmax(late))) <= 0.1
     wheel, turning = (np.interp(log.fleet.t - known.lag, log.fleet.t, v[:, 0]) for v in (log.speed, log.turn_rate))
     way = turned(log.fleet.velocity[:, 0], -midway(log.heading)[:, 0])[:, 0]
-    sums = np.stack([way, wheel, wheel * np.abs(turning)], axis=1)[1:7501].reshape(-1, 50, 3).sum(axis=1)
+    sums = np.c_[way, wheel, wheel * np.abs(turning)][1:7501].reshape(-1, 50, 3).sum(axis=1)
     ahead, lost = lstsq(sums[:59, 1:], sums[:59, 0])[0]
     assert (known.speed[0], known.slip[0]) == pytest.approx((ahead, -lost / ahead), rel=0.01)
     slope = lstsq(sums[:59, 1:2], sums[:59, 0])[0][0]

@@ -33,7 +33,7 @@ def test_tum_files_are_what_evo_reads(tmp_path):
     fleet = load_fleet("town10-clients")
     x = fleet.position[:1550, 0]
     still = np.tile([0.0, 0.0, 0.0, 1.0], (1550, 1))
-    np.savetxt(tmp_path / "car.tum", np.column_stack([fleet.t[:1550], x, still]), fmt="%.17g")
+    np.savetxt(tmp_path / "car.tum", np.c_[fleet.t[:1550], x, still], fmt="%.17g")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         file_interface = pytest.importorskip("evo.tools.file_interface", reason="pip install evo")
@@ -262,9 +262,9 @@ def test_what_no_memory_holds_is_refused_at_once(tmp_path):
 def segment(folder: Path) -> tuple[np.ndarray, np.ndarray]:
     """A minute on a road to the north-east, as comma2k19 stores it; its fixes in degrees and its true places."""
     t = 5000 + np.arange(0, 60, 0.1)
-    fixes = np.column_stack([37.7 + 1e-6 * np.arange(600), -122.4 + 1e-6 * np.arange(600), 0 * t + 50.0])
+    fixes = np.c_[37.7 + 1e-6 * np.arange(600), -122.4 + 1e-6 * np.arange(600), 0 * t + 50.0]
     ecef = np.column_stack(pymap3d.geodetic2ecef(*fixes.T))
-    gnss = np.column_stack([fixes[:, :2], 0 * t + 1.4, 1e3 * t, fixes[:, 2], 0 * t + 38.4])
+    gnss = np.c_[fixes[:, :2], 0 * t + 1.4, 1e3 * t, fixes[:, 2], 0 * t + 38.4]
     for name, array in {
         "processed_log/GNSS/live_gnss_ublox/t": t,
         "processed_log/GNSS/live_gnss_ublox/value": gnss,
@@ -302,10 +302,10 @@ def test_tensors_of_nclt_are_read_and_scored_as_published(tmp_path):
     torch, rng, drives = pytest.importorskip("torch"), np.random.default_rng(3), []
     for date, steps in (("2013-01-10", 90), ("2013-02-23", 60)):
         heading = np.linspace(0.0, 3.0, steps)
-        way = np.cumsum(1.2 * np.column_stack([np.cos(heading), np.sin(heading)]), axis=0)
+        way = np.cumsum(1.2 * np.c_[np.cos(heading), np.sin(heading)], axis=0)
         gps = way + rng.normal(0.0, 3.0, way.shape)
         gps[20:25] = np.nan
-        imu = np.column_stack([0 * heading, 0 * heading, heading + 0.1, 0 * heading])
+        imu = np.c_[0 * heading, 0 * heading, heading + 0.1, 0 * heading]
         arrays = {"filtered_gps": gps, "filtered_wheel": np.tile([1.1, 1.3], (steps, 1)), "imu_sensor": imu}
         arrays |= {"theta_gt": heading[:, None], "ground_truth": way, "initial_state": np.zeros(6)}
         drives.append({name: torch.tensor(array) for name, array in arrays.items()} | {"data_date": date})

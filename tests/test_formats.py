@@ -244,7 +244,7 @@ def test_a_tum_file_is_numpys_table(tmp_path):
     """Independent check: SciPy's rotations of the quaternions that NumPy writes."""
     poses = random_trajectory()
     quaternion = Rotation.from_matrix(poses.rotation).as_quat()
-    np.savetxt(tmp_path / "a.tum", np.column_stack([poses.stamps, poses.position, quaternion]), fmt="%.17g")
+    np.savetxt(tmp_path / "a.tum", np.c_[poses.stamps, poses.position, quaternion], fmt="%.17g")
     again = read_tum(tmp_path / "a.tum")
     assert_same(replace(again, rotation=poses.rotation), poses)
     assert_allclose(again.rotation, poses.rotation, atol=1e-15)

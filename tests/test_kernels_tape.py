@@ -29,7 +29,7 @@ def test_an_operation_is_casadis(name):
     found = np.zeros(len(a))
     accumulate(
         Tape(np.array(code, np.int64), np.array(place), np.zeros(4), 3),
-        np.column_stack([a, b]),
+        np.c_[a, b],
         np.arange(len(a))[:, None],
         np.empty((0, len(a))),
         np.arange(len(a))[None],

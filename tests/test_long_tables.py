@@ -84,7 +84,7 @@ def test_paths_as_other_programs_read_them(tmp_path):
     t, position, heading = 1.6e9 + np.arange(7) * 0.1, rng.normal(0, 1e4, (7, 3)), rng.uniform(-3, 3, 7)
     co.write_tum(tmp_path / "a.tum", t, position, heading)
     tum = np.loadtxt(tmp_path / "a.tum")
-    assert_allclose(tum[:, :4], np.column_stack([t, position]), rtol=0, atol=1e-6)
+    assert_allclose(tum[:, :4], np.c_[t, position], rtol=0, atol=1e-6)
     assert_allclose(Rotation.from_quat(tum[:, 4:]).as_euler("zyx")[:, 0], heading, atol=1e-8)
     turned = Rotation.from_matrix(read_tum(tmp_path / "a.tum").rotation).as_rotvec()
     assert_allclose(turned[:, 2], heading, atol=1e-8)

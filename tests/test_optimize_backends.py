@@ -89,8 +89,8 @@ def chain_of(points: int, separator: tuple[int, ...] = ()) -> Problem:
     """A random walk with some fixes: a linear problem."""
     rng = np.random.default_rng(points)
     problem = Problem(tuple(f"p{i}" for i in range(points)), separator=separator)
-    pairs = np.stack([np.arange(points - 1), np.arange(1, points)], axis=1)
-    problem = problem.add("displacement", pairs.tolist(), rng.normal(size=(points - 1, 3)), std=0.1)
+    pairs = np.c_[np.arange(points - 1), np.arange(1, points)]
+    problem = problem.add("displacement", pairs, rng.normal(size=(points - 1, 3)), std=0.1)
     seen = sorted(rng.choice(points, points // 4, replace=False).tolist())
     return problem.add("position", seen, rng.normal(size=(len(seen), 3)) * 5, std=rng.uniform(1, 3, (len(seen), 3)))
 

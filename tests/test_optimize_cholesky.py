@@ -12,7 +12,7 @@ def graph_matrix(seed: int, nodes: int, pairs: int, width: int) -> np.ndarray:
     """J^T J of a chain of nodes and of random pairs, each with a full block of rows; a prior on the first."""
     rng = np.random.default_rng(seed)
     k = np.arange(nodes - 1)
-    ends = np.concatenate([np.stack([k, k + 1], axis=1), rng.integers(0, nodes, (pairs, 2))])
+    ends = np.concatenate([np.c_[k, k + 1], rng.integers(0, nodes, (pairs, 2))])
     J = np.zeros((len(ends) + 1, width, nodes, width))
     J[np.arange(len(ends)), :, ends[:, 0]] = rng.normal(size=(len(ends), width, width))
     J[np.arange(len(ends)), :, ends[:, 1]] += rng.normal(size=(len(ends), width, width))

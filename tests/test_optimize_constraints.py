@@ -245,11 +245,11 @@ def test_multipliers_are_those_of_ipopt():
 def test_poses_in_a_slab():
     """osqp holds bounds on positions of poses; casadi agrees, and a step of SciPy's BVLS around it moves nothing."""
     rng, n = np.random.default_rng(0), 6
-    at = np.stack([5.0 * np.arange(n), rng.normal(0, 1, n)], axis=1)
+    at = np.c_[5.0 * np.arange(n), rng.normal(0, 1, n)]
     turn = rng.normal(0, 0.3, n)
     c, s = np.cos(turn[:-1]), np.sin(turn[:-1])
     gap = np.diff(at, axis=0)
-    seen = np.stack([c * gap[:, 0] + s * gap[:, 1], c * gap[:, 1] - s * gap[:, 0]], axis=1)
+    seen = np.c_[c * gap[:, 0] + s * gap[:, 1], c * gap[:, 1] - s * gap[:, 0]]
     z = pose(seen + rng.normal(0, 0.1, seen.shape), np.diff(turn) + rng.normal(0, 0.05, n - 1))
     names = tuple("abcdef")
     problem = Problem(names, dimension=2, poses=range(n), x0=pose(at + 0.2, turn + 0.1))
@@ -261,7 +261,7 @@ def test_poses_in_a_slab():
     r, J = problem.whiten(first.x)
     room = np.full((n, 3), INF)
     room[:, 1] = 0.5
-    y = np.stack([0 * turn, first.x[:, 1], 0 * turn], axis=1)
+    y = np.c_[0 * turn, first.x[:, 1], 0 * turn]
     bounds = (np.minimum(-room - y, -1e-12).ravel(), np.maximum(room - y, 1e-12).ravel())
     assert lsq_linear(J.toarray(), -r, bounds, method="bvls", tol=1e-15).x == pytest.approx(0.0, abs=1e-6)
     assert np.abs(first.position[:, 1]).max() == pytest.approx(0.5, abs=1e-9)

@@ -17,7 +17,7 @@ def test_damping_grows_until_a_step_helps_however_much_that_takes():
     problem = Problem("av", dimension=2, x0=[[0, 0], [0.05, 10]], fixed=(0,))
     problem = problem.add("position", "v", [0.0, 10.0], std=[1e3, 1e-3])
     found = [solve(problem.add("range", ("a", "v"), length, std=1.0)).x[1] for length in z]
-    assert np.array(found) == pytest.approx(np.column_stack([0 * z, (1e6 * 10.0 + z) / (1e6 + 1.0)]), abs=1e-6)
+    assert np.array(found) == pytest.approx(np.c_[0 * z, (1e6 * 10.0 + z) / (1e6 + 1.0)], abs=1e-6)
 
 
 @pytest.mark.parametrize("seed", range(3))

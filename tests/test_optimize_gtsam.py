@@ -140,7 +140,7 @@ def plane(
     """Two vehicles in the plane: odometry, ranges, bearings of each other and of a landmark, fixes, a first pose."""
     rng = np.random.default_rng(5)
     turn = np.cumsum(rng.normal(0, 0.2, steps))
-    first = np.cumsum(5.0 * np.stack([np.cos(turn), np.sin(turn)], axis=1), axis=0)
+    first = np.cumsum(5.0 * np.c_[np.cos(turn), np.sin(turn)], axis=0)
     at, angle = (
         np.concatenate([first, first + np.array([8, 3]), [[10.0, -9.0]]]),
         np.concatenate([turn, turn + 0.1, [0.0]]),
@@ -159,14 +159,14 @@ def plane(
         seen(i, i + 1) + noise * rng.normal(0, 0.1, (len(i), 2)),
         angle[i + 1] - angle[i] + noise * rng.normal(0, 0.02, len(i)),
     )
-    problem = problem.add("relative_pose", np.stack([i, i + 1], axis=1).tolist(), z, std=odometry)
+    problem = problem.add("relative_pose", np.c_[i, i + 1], z, std=odometry)
     i, j = np.arange(steps), steps + np.arange(steps)
     gap = np.linalg.norm(at[i] - at[j], axis=1) + noise * rng.normal(0, 0.3, steps) + 6.0 * (np.arange(steps) < wrong)
-    problem = problem.add("range", np.stack([i, j], axis=1).tolist(), gap[:, None], std=0.3, loss=loss)
+    problem = problem.add("range", np.c_[i, j], gap[:, None], std=0.3, loss=loss)
     v = seen(j, i)
-    z = np.stack([np.linalg.norm(v, axis=1), np.arctan2(v[:, 1], v[:, 0])], axis=1)
+    z = np.c_[np.linalg.norm(v, axis=1), np.arctan2(v[:, 1], v[:, 0])]
     z = z + noise * rng.normal(0, [0.5, 0.05], z.shape)
-    problem = problem.add("body_spherical", np.stack([j, i], axis=1).tolist(), z, std=[0.5, 0.05])
+    problem = problem.add("body_spherical", np.c_[j, i], z, std=[0.5, 0.05])
     v = seen(i, np.full(steps, n))
     bearing = np.arctan2(v[:, 1], v[:, 0]) + noise * rng.normal(0, 0.05, steps)
     problem = problem.add("bearing", [(k, n) for k in i.tolist()], bearing[:, None], std=0.05)
@@ -190,7 +190,7 @@ def space(chordal: bool = False, noise: float = 1.0) -> Problem:
     moved = np.einsum("kji,kj->ki", rotation[i], at[j] - at[i]) + error[:, :3]
     z = np.concatenate([moved, turned.reshape(-1, 9)], axis=1)
     std = np.array([0.1] * 3 + ([0.05] * 9 if chordal else [0.03] * 3))
-    problem = problem.add("relative_pose" + "_chordal" * chordal, np.stack([i, j], axis=1).tolist(), z, std=std)
+    problem = problem.add("relative_pose" + "_chordal" * chordal, np.c_[i, j], z, std=std)
     pairs = [(k, 6 + k % 2) for k in range(6)]
     far = np.array([np.linalg.norm(at[k] - at[b]) for k, b in pairs]) + noise * rng.normal(0, 0.3, 6)
     problem = problem.add("range", pairs, far[:, None], std=0.3).add("position", [6, 7], at[6:], std=0.5)

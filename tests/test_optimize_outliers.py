@@ -30,12 +30,12 @@ def drive(seed: int, steps: int = 400, loops: int = 120, wrong: float = 0.4) -> 
     rng = np.random.default_rng(seed)
     turn = np.where(np.arange(steps) % 5 == 4, rng.choice([-1, 0, 1], steps), 0) * np.pi / 2
     heading = np.cumsum(turn)
-    position = np.cumsum(np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+    position = np.cumsum(np.c_[np.cos(heading), np.sin(heading)], axis=0)
     rotation = exp(heading[:, None])
     i, j = np.triu_indices(steps, 11)
     near = rng.permutation(np.flatnonzero(np.linalg.norm(position[i] - position[j], axis=1) < 1.5))[:loops]
     k = np.arange(steps - 1)
-    pairs = np.concatenate([np.stack([k, k + 1], axis=1), np.stack([i[near], j[near]], axis=1)])
+    pairs = np.concatenate([np.c_[k, k + 1], np.c_[i[near], j[near]]])
     bad = np.append(np.zeros(steps - 1, dtype=bool), rng.random(len(near)) < wrong)
     noise = STD * rng.normal(size=(len(pairs), 3))
     gap = position[pairs[:, 1]] - position[pairs[:, 0]]
@@ -153,14 +153,14 @@ class Fleet:
                 at = at + turn[:, 0]
         k = np.arange(robots * STEPS - 1)
         k = k[(k + 1) % STEPS > 0]
-        self.chain = np.stack([k, k + 1], axis=1)
+        self.chain = np.c_[k, k + 1]
 
     def between(self, count: int) -> Ints:
         """(count, 2) poses of two robots within reach of each other."""
         i, j = np.triu_indices(len(self.position), STEPS // 2)
         near = np.linalg.norm(self.position[i] - self.position[j], axis=1) < REACH
         rows = self.rng.permutation(np.flatnonzero(near & (i // STEPS != j // STEPS)))[:count]
-        return np.stack([i[rows], j[rows]], axis=1)
+        return np.c_[i[rows], j[rows]]
 
     def relative(self, pairs: Ints, std: tuple[float, float], bad: Bools) -> PoseEdges:
         """Relative poses with noise; those that are bad are anything."""

@@ -89,18 +89,18 @@ def test_ambiguous_points_end_at_the_lowest_minimum(case):
         fixes = truth[:many] + std * rng.normal(size=(many, 3))
         fixes[-1] += 100.0 * (case == "a wrong fix")
         problem = Problem("abcdefo"[:nodes]).add("position", range(many), fixes, std=std, loss=loss)
-        pairs = np.stack([i, j, np.full(15, 6)], axis=1)
+        pairs = np.c_[i, j, np.full(15, 6)]
         if case == "an offset":
             problem = problem.add("position", [6], [[0, 0, 0]], std=[9.0, 1.0, 1.0])
-            problem = problem.add("range_offset", pairs.tolist(), z + 3.0, std=0.2)
+            problem = problem.add("range_offset", pairs, z + 3.0, std=0.2)
         elif case == "inclinations":
             z = np.arccos(apart[:, 2] / np.linalg.norm(apart, axis=1)) + 0.01 * rng.normal(size=15)
-            problem = problem.add("inclination", pairs[:, :2].tolist(), z, std=0.01)
+            problem = problem.add("inclination", pairs[:, :2], z, std=0.01)
         else:
-            problem = problem.add("range", pairs[:, :2].tolist(), z, std=0.2)
+            problem = problem.add("range", pairs[:, :2], z, std=0.2)
         if case == "ranges and azimuths":
             azimuths = np.arctan2(apart[:, 1], apart[:, 0])
-            problem = problem.add("azimuth", pairs[:, :2].tolist(), azimuths, std=0.05)
+            problem = problem.add("azimuth", pairs[:, :2], azimuths, std=0.05)
         found = solve(problem, throw=False)
         starts = truth + 20.0 * rng.normal(size=(12, nodes, 3))
         costs = [solve(replace(problem, x0=x), throw=False).cost if loss else scipys(problem, x) for x in starts]
@@ -131,7 +131,7 @@ def outliers(seed: int) -> tuple[Problem, Floats, Floats]:
     z = length[rows] + 0.3 * rng.normal(size=len(rows)) + bad * rng.uniform(5, 40, len(rows))
     anywhere = np.concatenate([truth[:5], rng.uniform(0, 100, (25, 2))])
     problem = Problem(tuple(map(str, range(30))), x0=anywhere, fixed=range(5), dimension=2)
-    return problem.add("range", np.stack([i, j], axis=1)[rows].tolist(), z, std=0.3), truth, bad
+    return problem.add("range", np.c_[i, j][rows], z, std=0.3), truth, bad
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -168,7 +168,7 @@ def test_small_drives_end_as_low_as_restarts_or_say_so():
 def test_a_walk_counts_beyond_what_32_bits_hold():
     """Key a n + b of a pair in a graph of 50,000 poses; against the line that is driven."""
     n, d = 50_000, 2
-    chain = np.stack([np.arange(n - 1), np.arange(1, n)], axis=1)
+    chain = np.c_[np.arange(n - 1), np.arange(1, n)]
     moves = Moves(chain, np.tile([1.0, 0.0], (n - 1, 1)), np.tile(np.eye(d), (n - 1, 1, 1)), np.ones(n - 1))
     position, _, known = walk(n, d, moves, [(0, np.zeros(d), np.eye(d))])
     assert known.all()
@@ -177,7 +177,7 @@ def test_a_walk_counts_beyond_what_32_bits_hold():
 
 def ring(n: int, wrong: float) -> Graph:
     """A drive round a circle whose turns are `wrong` by this in all, and its closure."""
-    edge, turn = np.stack([np.arange(n), np.roll(np.arange(n), -1)], axis=1), (2 * np.pi + wrong) / n
+    edge, turn = np.c_[np.arange(n), np.roll(np.arange(n), -1)], (2 * np.pi + wrong) / n
     moved = PoseEdges(edge, np.tile([1.0, 0], (n, 1)), np.full((n, 1), turn), np.tile(0.01 * np.eye(3), (n, 1, 1)))
     names = tuple(f"A{k}" for k in range(n))
     nan = np.full((n, 2), np.nan)

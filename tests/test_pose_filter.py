@@ -159,10 +159,10 @@ def test_it_is_as_good_as_the_dense_iterated_filter(crossing):
 def lone(steps: int = 12) -> co.Fleet:
     """A vehicle on a circle with a landmark at its side."""
     t = np.arange(steps) * 0.1
-    way = np.stack([10 * np.sin(t), 10 - 10 * np.cos(t), 0 * t], axis=1)
-    position = np.stack([way, np.broadcast_to([3.0, 4.0, 0.0], way.shape)], axis=1)
+    way = np.c_[10 * np.sin(t), 10 - 10 * np.cos(t), 0 * t]
+    position = np.c_[way, np.broadcast_to([3.0, 4.0, 0.0], way.shape)]
     velocity = np.diff(position, axis=0, prepend=position[:1]) / 0.1
-    return co.Fleet(("a", "mast"), t, position, velocity, heading=np.stack([t, 0 * t], axis=1))
+    return co.Fleet(("a", "mast"), t, position, velocity, heading=np.c_[t, 0 * t])
 
 
 def own_of(recording: co.Recording, run: int, t: int, column: int) -> co.OwnMeasurement:

@@ -22,9 +22,9 @@ def convoy(vehicles: int = 5, steps: int = 200, masts: int = 0) -> co.Fleet:
     t = np.arange(steps) * 0.1
     course = 0.5 * np.sin(0.3 * t[:, None] + 0.4 * np.arange(vehicles))
     velocity = 10 * np.stack([np.cos(course), np.sin(course), 0 * course], axis=2)
-    start = np.stack([8.0 * np.arange(vehicles), 3.0 * (np.arange(vehicles) % 2), 0.0 * np.arange(vehicles)], axis=1)
+    start = np.c_[8.0 * np.arange(vehicles), 3.0 * (np.arange(vehicles) % 2), 0.0 * np.arange(vehicles)]
     position = start + np.cumsum(0.1 * velocity, axis=0)
-    stands = np.stack([60.0 * np.arange(masts), 12.0 + 0 * np.arange(masts), 4.0 + 0 * np.arange(masts)], axis=1)
+    stands = np.c_[60.0 * np.arange(masts), 12.0 + 0 * np.arange(masts), 4.0 + 0 * np.arange(masts)]
     places = np.broadcast_to(stands, (steps, masts, 3))
     ids = tuple([f"v{k}" for k in range(vehicles)] + [f"m{k}" for k in range(masts)])
     return co.Fleet(ids, t, np.append(position, places, axis=1), np.append(velocity, 0 * places, axis=1))

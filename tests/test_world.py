@@ -79,7 +79,7 @@ def test_bad_configuration_is_named(build, words):
 def test_float32_is_refused_and_unwrapped_headings_are_not():
     """Two vehicles that circle for nearly five turns; degrees are refused with all other mistakes (test_misuse)."""
     t = np.arange(300) / 10
-    turn = np.stack([t, -t], axis=1)
+    turn = np.c_[t, -t]
     circles = np.stack([9 * np.sin(turn), -9 * np.cos(turn), 0 * turn], axis=2)
     fleet = Fleet(("a", "b"), t, circles, np.gradient(circles, 0.1, axis=0), heading=turn + np.array([0, np.pi]))
     with refused(r"position.*float32, which are 0.5 m apart.*Subtract a local origin"):
