@@ -105,7 +105,7 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
     made = np.stack([ahead, 1j * ahead, velocity])
     if truth is not None:
         return (rec.gnss[0] - truth.position)[..., :2] @ [1, 1j], made, made
-    then = np.nan_to_num(following(made, axis=1))
+    then = np.nan_to_num(following(c, made, axis=1))
     for k, cause in enumerate(np.nan_to_num(NUDGE * made)):
         gnss = c.log.recording.gnss + np.stack([cause.real, cause.imag, 0 * cause.real], axis=-1)
         moved = filtered(replace(c.log, recording=replace(c.log.recording, gnss=gnss)))
@@ -113,10 +113,12 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
     return c.fix[..., :2] @ [1, 1j], made, then
 
 
-def following(of_step: AnyArray, axis: int = 0) -> AnyArray:
-    """What is of each step, of the one after the next, as two share a sample of the odometry; the last at the end."""
-    steps = of_step.shape[axis]
-    return np.asarray(of_step.take(np.minimum(np.arange(2, steps + 2), steps - 1), axis))
+def following(c: Check, of_step: AnyArray, axis: int = 0) -> AnyArray:
+    """What is of each step, of the one two samples of the odometry later, as two steps may share one; the last at the
+    end."""
+    later = 2 * max(round(c.log.summary.odometry / c.world.dt), 1)
+    at = np.minimum(np.arange(of_step.shape[axis]) + later, of_step.shape[axis] - 1)
+    return np.asarray(of_step.take(at, axis))
 
 
 def moves(rec: Recording, column: int, means: int = 1) -> tuple[AnyArray, AnyArray]:
@@ -230,7 +232,7 @@ def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
         return np.concatenate([made, np.stack([np.column_stack([far, rate]), np.zeros((len(far), 2))], axis=1)], axis=2)
 
     velocity = np.nan_to_num(c.world.velocity[0])
-    made, then = made_by(velocity), made_by(following(velocity))
+    made, then = made_by(velocity), made_by(following(c, velocity))
     there = np.isfinite(c.relative[:, 0] + gap[:, 0])
     pairs = np.sort([links.observer, links.neighbour], axis=0)
     noise = float(np.median(c.expected[there, 0])) if there.any() else 0.0

@@ -37,8 +37,8 @@ UNKNOWN_SPEED = 30.0
 """m/s, standard deviation of a velocity before fixes have shown it."""
 BETWEEN = (0.25, 0.5, 0.75)
 """Of the way from one speed to the next, where headings are interpolated, too: on a bend the chord is shorter."""
-CLIMBS = 10.0
-"""s, in which heights change by more than from one fix to the next where a road climbs."""
+CLIMBS = (0.5, 1.0, 2.0, 5.0, 10.0)
+"""s, or halves of an interval of fixes that is longer, in which heights change where a road climbs."""
 COURSE = "the heading of {} is the course of the {}: no vehicle slips or reverses"
 ARM = "fixes are those of the reference point, less the arm to the antenna, of {}; none slips or reverses"
 HOLDS = "fixes that stay while the odometry moves on"
@@ -233,21 +233,26 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
 
 
 def climbing(fixes: Signal) -> float:
-    """m^2/s, by which heights wander: how much more they change in CLIMBS s than from one fix to the next, beyond
-    chance.
+    """m^2/s, by which heights wander: how much more they change in a while than from one fix to the next, beyond
+    chance; in the shortest of CLIMBS in which that makes more than noise does, else in the longest.
 
     >>> t = np.arange(60.0)
-    >>> climbing(Signal(t, 0.5 * t[:, None] * [1, 1, 1])) > 1.0, climbing(Signal(t, np.zeros((60, 3))))
+    >>> climbing(Signal(t, 0.5 * t[:, None] * [1, 1, 1])) > 0.1, climbing(Signal(t, np.zeros((60, 3))))
     (True, 0.0)
     """
-    t, z = fixes.t, fixes.value[:, 2]
-    later = np.searchsorted(t, t + max(CLIMBS, 5.0 * float(np.median(np.diff(t))) if len(t) > 1 else 0.0))
-    now = np.flatnonzero(later < len(t))
-    if len(now) < 3:
-        return 0.0
-    near, far = (float(np.quantile(np.abs(gap), 0.75) / 1.15) ** 2 for gap in (np.diff(z), z[later[now]] - z[now]))
-    more: float = far - near * (1.0 + 2.0 / len(now) ** 0.5)
-    return max(more, 0.0) / float(np.mean(t[later[now]] - t[now]))
+    t, z, wander = fixes.t, fixes.value[:, 2], 0.0
+    least = max(1.0, 0.5 * float(np.median(np.diff(t)))) if len(t) > 1 else 1.0
+    for times in CLIMBS:
+        later = np.searchsorted(t, t + times * least)
+        now = np.flatnonzero(later < len(t))
+        if len(now) < 3:
+            break
+        near, far = (float(np.quantile(np.abs(gap), 0.75) / 1.15) ** 2 for gap in (np.diff(z), z[later[now]] - z[now]))
+        near *= 1.0 + 2.0 / len(now) ** 0.5
+        wander = max(far - near, 0.0) / float(np.mean(t[later[now]] - t[now]))
+        if far > 2.0 * near:
+            break
+    return wander
 
 
 def _in_world(

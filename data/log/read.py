@@ -394,7 +394,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         return float(times.agg(lambda t: t.diff().median())[times.size() >= OFTEN * times.size().max()].min())
 
     moves, fixes, pairs = densest("odometry", "vehicle"), densest("fix", "vehicle"), densest("relative", *PAIR)
-    t = rows["t"][in_group(rows, "odometry", "fix")]
+    t, summary.odometry = rows["t"][in_group(rows, "odometry", "fix")], moves if moves > 0 else 0.0
     span = float(t.max() - t.min())
     if not span:
         allowed = "must hold two instants or more"

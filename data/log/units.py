@@ -189,6 +189,7 @@ class Summary:
         read: what -> number of measurements in the Recording.
         refused: reason -> (number, place of the first) of measurements that are not in it.
         unused: what was never meant to be read -> number of cells.
+        odometry: s, from one sample of it to the next, 0 where there is none.
         assumed: sentence on what the log does not say, with {} for names -> the names, none where it is about all.
 
     >>> summary = Summary("drive", "3 steps of 0.1 s", {"a": "3 fixes"}, {"fixes": 3})
@@ -209,6 +210,7 @@ class Summary:
     read: dict[str, int] = field(default_factory=dict)
     refused: dict[str, tuple[int, str]] = field(default_factory=dict)
     unused: dict[str, int] = field(default_factory=dict)
+    odometry: float = 0.0
     assumed: dict[str, list[str]] = field(default_factory=dict)
 
     def count(self, what: str, number: int) -> None:
