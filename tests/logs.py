@@ -85,7 +85,7 @@ def motion(fleet: Fleet, name: str, every: float, std: float, seed: int = 0) -> 
     t = np.arange(fleet.t[0], fleet.t[-1], every)
     u = (at(fleet, name, t + 0.05) - at(fleet, name, t - 0.05)) / 0.1
     u += np.random.default_rng(seed).normal(0, std, u.shape)
-    return pd.DataFrame({"t": t, "vehicle": name, "vx": u[:, 0], "vy": u[:, 1], "vz": u[:, 2], "vx_std": std})
+    return pd.DataFrame({"t": t, "vehicle": name, "vx_std": std, **dict(zip(("vx", "vy", "vz"), u.T, strict=True))})
 
 
 def ranges(fleet: Fleet, name: str, other: str, every: float, std: float, seed: int = 0) -> pd.DataFrame:

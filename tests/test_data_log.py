@@ -9,7 +9,7 @@ import pandas as pd
 import pymap3d
 import pytest
 from conftest import refused
-from logs import NOISE, drive, long, observed, write
+from logs import NOISE, at, drive, fixes, long, motion, observed, ranges, write
 from numpy.testing import assert_allclose, assert_array_equal
 from strange_logs import strange
 
@@ -124,14 +124,12 @@ def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path):
     t = np.arange(0, 10, 0.1)
     at = t[10:90:5] + 0.04
     heading = 0.3 + 0.5 * np.append(t, at)
-    way = 6 * np.c_[np.sin(heading) - np.sin(0.3), np.cos(0.3) - np.cos(heading)]
-    (x, own), (heading, h) = (np.split(values, [len(t)]) for values in (way, heading))
-    wide = pd.DataFrame({"t": t, "vehicle": "car", "x": x[:, 0], "y": x[:, 1], "speed": 3.0, "yaw_rate": 0.5})
-    wide.loc[::50, "heading"] = np.arctan2(np.sin(heading[::50]), np.cos(heading[::50]))
-    gap = np.array([20.0, 5.0]) - own
-    azimuth = np.arctan2(gap[:, 1], gap[:, 0])
-    body = np.arctan2(np.sin(azimuth - h), np.cos(azimuth - h))
-    radio = pd.DataFrame({"t": at, "vehicle": "car", "partner": "rsu", "bearing_deg": np.degrees(body)})
+    (x, own), (heading, h) = (np.split(values, [len(t)]) for values in (-6j * np.exp(1j * heading), heading))
+    wide = pd.DataFrame({"t": t, "vehicle": "car", "x": x.real, "y": x.imag, "speed": 3.0, "yaw_rate": 0.5})
+    wide.loc[::50, "heading"] = np.angle(np.exp(1j * heading[::50]))
+    azimuth = np.angle(20 + 5j - own)
+    body = np.degrees(np.angle(np.exp(1j * (azimuth - h))))
+    radio = pd.DataFrame({"t": at, "vehicle": "car", "partner": "rsu", "bearing_deg": body})
     (tmp_path / "log").mkdir()
     write(wide, tmp_path / "log" / "car.csv")
     write(radio, tmp_path / "log" / "camera.csv")
@@ -139,11 +137,10 @@ def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path):
     log = read_log(tmp_path / "log", dt=0.1)
     rec, col = log.recording, log.recording.ids.index("car")
     assert_allclose(rec.relative[0, :, 1], azimuth, atol=0.01)
-    gap = np.array([20.0, 5.0]) - x[10:90:5]
-    assert_allclose(rec.relative[0, :, 1], np.arctan2(gap[:, 1], gap[:, 0]), atol=2e-4)
+    assert_allclose(rec.relative[0, :, 1], np.angle(20 + 5j - x[10:90:5]), atol=2e-4)
     assert np.isnan(rec.relative[0, :, [0, 2]]).all()
-    true = 3 * np.c_[np.cos(heading), np.sin(heading)]
-    assert_allclose(rec.velocity[0, 1:, col, :2], (true[1:] + true[:-1]) / 2, atol=2e-3)
+    true = 3 * np.exp(1j * heading)
+    assert_allclose(rec.velocity[0, 1:, col] @ [1, 1j, 0], (true[1:] + true[:-1]) / 2, atol=2e-3)
     assert (rec.gnss[0, :, rec.ids.index("rsu")] == [20.0, 5.0, 0.0]).all()
     assert "stands at" in log.summary.vehicles["rsu"]
 
@@ -151,20 +148,27 @@ def test_a_bearing_is_turned_by_the_heading_at_its_own_time(tmp_path):
 def test_slow_fixes_are_brought_to_their_step_by_the_odometry(tmp_path):
     """1 Hz fixes 0.03 s beside the steps of 10 Hz odometry: without the motion they were 0.24 m off."""
     fleet = drive(1)
-    velocity = pd.DataFrame(
-        {"t": fleet.t, "vehicle": "a", "vx": fleet.velocity[:, 0, 0], "vy": fleet.velocity[:, 0, 1]}
-    )
-    at = np.arange(3, 190, 10) * 0.1 + 0.03
-    x = np.column_stack([np.interp(at, fleet.t, fleet.position[:, 0, k]) for k in range(2)])
+    u, times = fleet.velocity[:, 0], np.arange(3, 190, 10) * 0.1 + 0.03
+    x, y, _ = at(fleet, "car0", times).T
     (tmp_path / "log").mkdir()
-    write(velocity, tmp_path / "log" / "odometry.csv")
-    write(pd.DataFrame({"t": at, "vehicle": "a", "x": x[:, 0], "y": x[:, 1]}), tmp_path / "log" / "gnss.csv")
+    write(pd.DataFrame({"t": fleet.t, "vehicle": "a", "vx": u[:, 0], "vy": u[:, 1]}), tmp_path / "log" / "odometry.csv")
+    write(pd.DataFrame({"t": times, "vehicle": "a", "x": x, "y": y}), tmp_path / "log" / "gnss.csv")
     log = read_log(tmp_path / "log")
     fixed = np.isfinite(log.recording.gnss[0, :, 0, 0])
     assert np.flatnonzero(fixed).tolist() == list(range(3, 190, 10))
     assert_allclose(log.recording.gnss[0, fixed, 0], fleet.position[fixed, 0], atol=0.01)
     assert log.recording.stretches("a") == ((3, 200),)
     assert log.summary.refused["steps of a before its first fix"][0] == 3
+
+
+def test_a_good_receiver_is_weighed_as_it_states(tmp_path):
+    """By the root mean square of both it erred by 0.5 m beside a receiver of 4 m, and helped it half as much."""
+    fleet = drive(2, 600)
+    parts = [fixes(fleet, *each) for each in (("car0", 1, 0.05), ("car1", 1, 4.0))]
+    parts += [ranges(fleet, *fleet.ids, 0.1, 0.3), *(motion(fleet, name, 0.1, 0.3) for name in fleet.ids)]
+    rec = read_log(write(pd.concat(parts), tmp_path / "log.csv")).recording
+    for method in (co.Kalman(), co.CooperativeFilter()):
+        assert np.abs(method(rec).x[0, :, 0] - at(fleet, "car0", rec.t)).mean() < 0.1
 
 
 def test_a_clock_that_is_ahead_is_set_back(tmp_path):

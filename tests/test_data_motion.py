@@ -45,13 +45,11 @@ def log(
     k = np.array(steps) if len(steps) else np.arange(0, len(T), every)
     z = np.full_like(x, np.nan)
     z[k] = x[k] + rng.normal(0, std, (len(k), 3))
-    frame = {"t": T, "vehicle": "a"} | {c: z[:, i] for i, c in enumerate("xyz")} | more
-    frame |= {f"{c}_std": np.where(np.isfinite(z[:, 0]), std, np.nan) for c in "xyz"}
-    drive = pd.DataFrame(frame)
+    drive = pd.DataFrame(z, columns=[*"xyz"]).assign(t=T, vehicle="a", **more)
+    drive[["x_std", "y_std", "z_std"]] = np.where(np.isfinite(z), std, np.nan)
     folder.mkdir(parents=True, exist_ok=True)
     drive[drive[["x", *more]].notna().any(axis=1)].to_csv(folder / "a.csv", index=False)
-    truth = {"t": T, "vehicle": "a"} | {c: x[:, i] for i, c in enumerate("xyz")}
-    pd.DataFrame(truth).to_csv(folder / "truth.csv", index=False)
+    pd.DataFrame(x, columns=[*"xyz"]).assign(t=T, vehicle="a").to_csv(folder / "truth.csv", index=False)
     return co.read_log(folder), T[k], z[k]
 
 

@@ -71,7 +71,7 @@ class BatchSmoother(Checked):
         model, active = resolve(self.noise_model, recording), located(recording)
         counts, robust, lost = counted(recording, active), self.robust and model.exact_relative, 0
         start, _, noise = solo_filter(recording, range(len(recording.ids)), model, fix_noise(model, robust))
-        fix = model.fix_variance(recording) * (noise / model.gnss_variance if robust else 1.0)
+        fix = noise if robust else model.fix_variance(recording)
         stds = [np.sqrt(np.broadcast_to(v, start.shape)) for v in (fix, model.process_variance(recording))]
         cov: Floats = np.full((*start.shape, 3), np.nan)
         x = np.full_like(start, np.nan)

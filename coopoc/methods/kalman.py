@@ -1,7 +1,7 @@
 """Solo methods: the raw fix, and the Kalman filter on position."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import numpy.typing as npt
@@ -41,7 +41,8 @@ class GNSS(Alone):
         newest = np.maximum.accumulate(np.where(there, np.arange(len(recording.t))[:, None, None], 0), axis=1)
         x, missing = np.take_along_axis(fixes, newest, axis=1), 100 * (1 - there.mean())
         notes = (f"holds the last fix where there is none: {missing:.0f} % of the steps",) if missing else ()
-        variance = np.broadcast_to(np.square(recording.sensors.gnss_std), x.shape)
+        variance = np.square(recording.sensors.gnss_std * recording.fix_scale[columns])
+        variance = np.broadcast_to(variance, x.shape)
         return solo_track(recording, columns, x, variance, began, notes)
 
 
@@ -179,6 +180,18 @@ def solo_filter(
         raise InputError("x0", np.shape(x0), f"must end in (E, 3) = {shape[2:]}", "One start per ego.")
     index, size = (columns, gnss.shape) if in_place else (np.arange(len(columns)), shape)
     x, p = np.empty(size), np.empty(size)
+    scale = np.ones(1) if isinstance(noise, MotionNoise) else noise.fix_scale(recording)[:, 0]
+    if (scale != 1.0).any():
+        plain, gated, start = replace(recording, fix_factor=()), np.empty(size), None if x0 is None else np.asarray(x0)
+        for factor in np.unique(scale[columns]):
+            own = np.flatnonzero(scale[columns] == factor)
+            part = fixes._replace(variance=factor**2 * fixes.variance)
+            found = solo_filter(plain, columns[own], noise, part, None if start is None else start[..., own, :])
+            x[:, :, index[own]], p[:, :, index[own]] = found[:2]
+            gated = gated[:, :, :0] if not found[2].size else gated
+            if found[2].size:
+                gated[:, :, index[own]] = found[2]
+        return x, p, gated
     if x0 is not None:
         x[:, 0] = x0
     return x, p, run_filter(inputs, fixes, x0 is not None, index, x, p)

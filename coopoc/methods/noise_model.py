@@ -157,7 +157,11 @@ class NoiseModel:
 
     def fix_variance(self, recording: Recording) -> Floats:
         """Per-axis variance of each fix, broadcastable to (R, T, N, 3), m^2."""
-        return self.gnss_variance[None, None, None]
+        return self.gnss_variance[None, None, None] * self.fix_scale(recording) ** 2
+
+    def fix_scale(self, recording: Recording) -> Floats:
+        """(N, 1) or 1: factors of the deviations of fixes, which the identity does not know."""
+        return recording.fix_scale if recording.fix_factor and self.sensors is not None else np.ones((1, 1))
 
     @property
     def gnss_variance(self) -> Floats:

@@ -88,6 +88,7 @@ class Recording:
             count from the observer's heading; None for a recording in the world frame.
         landmarks: columns of members that stand at their `gnss`, which is known exactly; they need no message, and
             links to them count in no budget.
+        fix_factor: (N,) by which the deviations of each one's fixes are larger than `sensors` says; none: all are 1.
 
     Raises:
         InputError: arrays of other shapes or kinds, links of steps or columns that are not there, more of them than
@@ -108,6 +109,7 @@ class Recording:
     notes: tuple[str, ...] = ()
     body: Body | None = None
     landmarks: tuple[int, ...] = ()
+    fix_factor: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         for name, kind in (("links", Links), ("sensors", Sensors), ("v2x", V2X)):
@@ -133,6 +135,11 @@ class Recording:
         check_links(self.links, self.observers, self.velocity, self.arrival, self.v2x.max_neighbours, vehicles)
         if self.body is not None:
             instance("body", self.body, Body).check(self.velocity)
+        factor = checked("fix_factor", self.fix_factor, "(N,) or (0,)", (-1,))
+        factor = checked("fix_factor", factor, "(N,) or (0,)", (len(ids) if len(factor) else 0,))
+        wrong, allowed = ~((factor > 0) & (factor < np.inf)), "must be > 0 and finite"
+        refuse("fix_factor", factor, wrong, allowed, "1 is as `sensors` says.")
+        self.__dict__["fix_factor"] = tuple(factor.tolist())
         self.sensors.check_assumed()
         self.__dict__["notes"] = (*(note for note in self.notes if UNLIKELY not in note), *unlikely(self))
 
@@ -140,6 +147,11 @@ class Recording:
     def dt(self) -> float:
         """Sampling interval, s."""
         return interval(self.t)
+
+    @property
+    def fix_scale(self) -> Floats:
+        """(N, 1) `fix_factor`, or ones."""
+        return np.array(self.fix_factor or [1.0] * len(self.ids))[:, None]
 
     @property
     def measured(self) -> bool:

@@ -21,7 +21,7 @@ from .recording import Body, Recording
 from .sensors import Sensors
 from .v2x import V2X
 
-ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers", "landmarks")
+ARRAYS = ("t", "gnss", "velocity", "relative", "broadcasts", "arrival", "observers", "landmarks", "fix_factor")
 LINKS = ("step", "observer", "neighbour")
 BODY = ("yaw_rate", "heading")
 WORDS = "coopoc_recording"
@@ -139,7 +139,7 @@ def _recording(words: dict[str, Any], arrays: dict[str, Any]) -> tuple[Recording
         v2x=V2X(**words["v2x"]),
         notes=tuple(words["notes"]),
         body=Body(arrays["yaw_rate"], arrays["heading"]) if "yaw_rate" in arrays else None,
-        **{name: arrays[name] for name in ARRAYS},
+        **{name: arrays[name] for name in ARRAYS if name in arrays},
     )
     if "truth" not in words:
         return recording, None

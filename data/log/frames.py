@@ -32,6 +32,8 @@ MANY = 10
 """Fixes of a vehicle that show where it is."""
 SELDOM = 0.02
 """Share of rows that are earlier than the one before, where a file is else in the order of its stamps."""
+ALIKE = 0.1
+"""Logarithm of a factor of deviations that is none."""
 HEADING_STD = 0.05
 """rad, of a compass in body frames whose noise was not logged."""
 
@@ -199,6 +201,15 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
         speed = _across(speed, float(np.sqrt(square["heading"])), rows, dt)
         summary.assume(f"{speed:.2g} m/s as the noise of a velocity, with that of the headings which turn the speeds")
     return replace(base, **noise, velocity_std_ratio=0.0, velocity_floor=speed)
+
+
+def fix_factors(rows: Rows, ids: Sequence[str]) -> tuple[float, ...]:
+    """(N,) by which the fixes of each member err more than those of all, in the root mean square of what was logged;
+    none where these are alike."""
+    fixes = rows[rows["kind"].isin(["x", "y"])]
+    square = np.square(fixes["std"])
+    factor = np.sqrt(square.groupby(fixes["vehicle"]).mean() / square.mean()).reindex(ids).fillna(1.0)
+    return tuple(factor.tolist()) if (np.abs(np.log(factor)) > ALIKE).any() else ()
 
 
 def _lasting(rows: Rows, square: "pd.Series[float]", dt: float) -> float:

@@ -26,7 +26,7 @@ from ..librsf import is_librsf, read_librsf
 from ..nclt import is_nclt, read_nclt
 from ..nmea import read_nmea
 from ..source import parted
-from .frames import ENU, Origin, assumed, local, on_one_clock, unwrapped
+from .frames import ENU, Origin, assumed, fix_factors, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
 from .motion import Member, Steps, member, samples
 from .tables import is_log_table, read_log_table
@@ -254,6 +254,7 @@ def _recording(
         np.stack([getattr(part, name) for part in members.values()], axis=1)[None]
         for name in ("gnss", "velocity", "yaw_rate", "compass")
     )
+    factor = () if body or sensors else fix_factors(rows, ids)
     sensors = sensors or assumed(rows, steps.planar, body, summary, steps.dt, [*members.values()])
     return Recording(
         ids=ids,
@@ -270,6 +271,7 @@ def _recording(
         notes=(f"measurements of {summary.name}, {MEASURED}", *summary.sentences),
         body=Body(yaw_rate, compass) if body else None,
         landmarks=tuple(marks),
+        fix_factor=factor,
     )
 
 

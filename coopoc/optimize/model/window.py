@@ -20,9 +20,8 @@ class Noise(Protocol):
     def sensors(self) -> Sensors | None:
         """Relative noise in range and angles; None: unit covariance of the converted vector."""
 
-    @property
-    def gnss_variance(self) -> Floats:
-        """(3,) m^2."""
+    def fix_variance(self, recording: Recording) -> Floats:
+        """Of fixes, broadcastable to (R, T, N, 3), m^2."""
 
     def process_variance(self, recording: Recording) -> Floats:
         """Of x_t given x_{t-1}, broadcastable to (R, T, N, 3), m^2."""
@@ -112,10 +111,10 @@ def window(
     _check(recording, step, length, run)
     sensors: Sensors | None = recording.sensors
     if noise is None:
-        fix_std = np.array(recording.sensors.gnss_std)
+        fix_std = np.array(recording.sensors.gnss_std) * recording.fix_scale
         motion_std = recording.sensors.motion_std(recording.velocity[[run]], recording.dt)[0]
     else:
-        sensors, fix_std = noise.sensors, np.sqrt(noise.gnss_variance)
+        sensors, fix_std = noise.sensors, np.sqrt(noise.fix_variance(recording)[0, 0])
         motion_std = np.sqrt(np.broadcast_to(noise.process_variance(recording), recording.velocity.shape)[run])
     first, links = step - length + 1, recording.links
     link = links.of(column)
