@@ -33,7 +33,7 @@ DRAWS, QUIET, POINTS, HIGH = 90, 30, 1800, 2.0
 standard deviations above its mean, and as many points together."""
 ALIKE, ROUNDED = 1e-5, 1e-9
 """Share by which the costs of two random starts that led to the same minimum differ, and cost that is rounding."""
-ENOUGH, APART, PART = 3, 0.05, 0.8
+ENOUGH, APART, PART = 6, 0.05, 0.8
 """Random starts that must lead to the lowest minimum to end them, the share of the extent by which another minimum is
 elsewhere, and that of the ranges whose shortest paths make a start."""
 ELSEWHERE = "another minimum, elsewhere, costs as much"
