@@ -64,6 +64,8 @@ def doubts(
     fix = np.square([sensors.gnss_std, (sensors.gnss_drift_std, sensors.gnss_common_std, sensors.gnss_bias[1])])
     fix[1] = fix[1].sum()
     every, marks = max(min(round(SECOND / recording.dt), steps // TOGETHER), 1), np.zeros((3, len(egos), steps), int)
+    turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
+    motion = sensors.velocity_std_ratio**2, turn, sensors.velocity_floor**2
     scale, usual = recording.fix_scale[egos, 0], DOUBT * (neighbours is not None)
     for factor in np.unique(scale):
         of = slice(None) if (scale == factor).all() else np.flatnonzero(scale == factor)
@@ -71,8 +73,6 @@ def doubts(
         part, its = marks[:, of], claimed[:, :, of] if claimed.size else claimed
         doubtful = mark_estimates(recording.gnss, x[:, :, of], its, egos[of], own, every, part) + usual
         if recording.body is None:
-            turn = sensors.speed_scale_std**2 + sensors.heading_std**2 + sensors.heading_bias_std**2
-            motion = sensors.velocity_std_ratio**2, turn, sensors.velocity_floor**2
             drive = recording.gnss, recording.velocity, egos[of], doubtful
             mark_odometers(*drive, own, motion, every, recording.dt, part)
         marks[:, of] = part

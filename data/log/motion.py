@@ -315,9 +315,8 @@ def _heading(
             return filtered[0], "fixes", *filtered[1:]
     for move, source in moves:
         none: Floats = np.zeros(len(move[0]))
-        velocity, wanders, unsure = (move[0], *move[2:]) if isinstance(move, Shown) else (move, 0.0, none)
+        velocity, certain, wanders, unsure = move if isinstance(move, Shown) else Shown(move, none == 0, 0.0, none)
         pace = np.hypot(*velocity.value[:, :2].T)
-        certain = move.certain if isinstance(move, Shown) else True
         if (moving := (pace > np.maximum(MOVING, SURE * unsure)) & certain).any():
             courses = heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate)
             return courses, source, wanders, float(np.median(unsure[moving] / pace[moving]))
