@@ -173,34 +173,35 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
         rate = rare * of("yaw_rate", default=base.yaw_rate_std, unit="rad/s")
         noise |= {"velocity_reading": "speed", "yaw_rate_std": rate, "compass": "heading" in used}
         noise |= {"speed_scale_std": SCALE_STD, "yaw_rate_bias_std": RATE_BIAS_STD}
-    derived = max((member.turns for member in members), default=0.0) if "bearing" in used else 0.0
+    wandering = [(member.heading.unsure, member.climbs, member.heading.wanders) for member in members]
+    derived, climbs, drifts = np.max(wandering, axis=0).tolist()
     if body or ("heading" in square and "bearing" in used):
         noise["heading_std"] = of("heading", default=HEADING_STD, unit="rad")
-    elif derived:
+    elif derived and "bearing" in used:
         noise["heading_std"] = derived
         summary.assume(f"{derived:.2g} rad as the noise of headings that are derived, by which bearings are turned")
-    if (climbs := max((member.climbs for member in members), default=0.0)) > 0.0:
+    if climbs > 0.0:
         noise["climb_std"] = float(np.sqrt(climbs / dt))
         summary.assume(f"heights change by {np.sqrt(10.0 * climbs):.2g} m in 10 s, as fixes show: no vz was measured")
-    if (drifts := max((member.wanders for member in members), default=0.0)) > 0.0:
-        motion_noise = rare * of(*MOTION, default=base.velocity_floor, unit="m/s")
-        floor = max(float(np.sqrt(drifts / dt)), motion_noise)
+    ratio = 0.0
+    if drifts > 0.0:
+        floor = max(float(np.sqrt(drifts / dt)), rare * of(*MOTION, default=base.velocity_floor, unit="m/s"))
         summary.assume(
             f"{floor:.2g} m/s as the noise of a velocity, as the fixes of what has none, or no heading, show it"
         )
-        noise |= {"velocity_std_ratio": 0.0, "velocity_floor": floor}
         if any(member.shown for member in members):
             noise["velocity_reading"] = "fixes"
-        return replace(base, **noise)
-    if {*MOTION}.isdisjoint(square.index):
+    elif {*MOTION}.isdisjoint(square.index):
         ratio, floor = min(rare * base.velocity_std_ratio, 1.0), rare * base.velocity_floor
         summary.assume(f"{ratio:.0%} of a velocity as its noise, {floor:.2g} m/s at least")
-        return replace(base, **noise, velocity_std_ratio=ratio, velocity_floor=floor)
-    speed = rare * of(*MOTION, default=0.0, unit="m/s")
-    if not body and {"speed", "heading"} <= set(square.index):
-        speed = _across(speed, float(np.sqrt(square["heading"])), rows, dt)
-        summary.assume(f"{speed:.2g} m/s as the noise of a velocity, with that of the headings which turn the speeds")
-    return replace(base, **noise, velocity_std_ratio=0.0, velocity_floor=speed)
+    else:
+        floor = rare * of(*MOTION, default=0.0, unit="m/s")
+        if not body and {"speed", "heading"} <= set(square.index):
+            floor = _across(floor, float(np.sqrt(square["heading"])), rows, dt)
+            summary.assume(
+                f"{floor:.2g} m/s as the noise of a velocity, with that of the headings which turn the speeds"
+            )
+    return replace(base, **noise, velocity_std_ratio=ratio, velocity_floor=floor)
 
 
 def fix_factors(rows: Rows, ids: Sequence[str]) -> tuple[float, ...]:

@@ -2,7 +2,7 @@
 
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -103,17 +103,16 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
     near = near[first_of_each(v2x.max_neighbours, links.step[near], links.observer[near])]
     kept = np.union1d(near, np.flatnonzero(marked))
     fewer = Links(links.step[kept], links.observer[kept], links.neighbour[kept])
-    parts: dict[str, Any] = {"gnss": recording.gnss, "velocity": recording.velocity}
-    parts |= {name: getattr(recording, name)[:, kept] for name in ("relative", "arrival")}
-    broadcasts = recording.broadcasts
-    if not logged:
-        runs = runs if v2x.loss > 0 and recording.runs == 1 else recording.runs
-        broadcasts, arrival = schedule(recording.ids, recording.t, fewer, v2x, runs, seed)
-        parts["arrival"] = np.where(np.isin(fewer.neighbour, marks), -1, arrival)
-        broadcasts = broadcasts & np.isfinite(recording.velocity[0, :, :, 0])
-        broadcasts[..., marks] = False
-        parts = {name: np.broadcast_to(part, (runs, *part.shape[1:])) for name, part in parts.items()}
-    return replace(recording, links=fewer, broadcasts=broadcasts, v2x=v2x, **parts)
+    measured = {name: getattr(recording, name)[:, kept] for name in ("relative", "arrival")}
+    recording = replace(recording, links=fewer, v2x=v2x, **measured)
+    if logged:
+        return recording
+    if v2x.loss > 0 and recording.runs == 1:
+        recording = recording.of_runs(np.zeros(runs, dtype=np.int64))
+    broadcasts, arrival = schedule(recording.ids, recording.t, fewer, v2x, recording.runs, seed)
+    broadcasts = broadcasts & np.isfinite(recording.velocity[0, :, :, 0])
+    broadcasts[..., marks] = False
+    return replace(recording, broadcasts=broadcasts, arrival=np.where(marked[kept], -1, arrival))
 
 
 def of_vehicles(rows: Rows, landmarks: Collection[str], summary: Summary) -> Rows:
@@ -141,11 +140,10 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     step, lag = steps.nearest(t)
     for column, (name, member) in enumerate(members.items()):
         of_observer = turned & (observer == column)
-        value[of_observer] += (
-            (-1 if body else 1) * member.heading(t[of_observer]) if member.heading is not None else np.nan
-        )
-        if of_observer.any() and member.course:
-            summary.assume(COURSE.format("{}", member.course), name)
+        heading = np.nan if member.heading.at is None else member.heading.at(t[of_observer])
+        value[of_observer] += -heading if body else heading
+        if of_observer.any() and member.heading.source:
+            summary.assume(COURSE.format("{}", member.heading.source), name)
     members_too, inside = (observer >= 0) & (neighbour >= 0), step >= 0
     both = members_too & inside & there[step, observer] & there[step, neighbour]
     good = both & np.isfinite(value)
@@ -172,7 +170,7 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
 
 def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> tuple[pd.DataFrame, Bools]:
     """Step of arrival, or -1, of each step, observer and neighbour with a message, and (T, N) who sends when."""
-    sender, receiver, columns = _columns(rows["vehicle"], ids), _columns(rows["partner"], ids), np.arange(len(ids))
+    sender, receiver = (_columns(rows[who], ids) for who in ("vehicle", "partner"))
     (step, _), summary, to_all = steps.nearest(rows["t"].to_numpy()), steps.summary, rows["partner"].eq("").to_numpy()
     sent = (sender >= 0) & (step >= 0) & there[step, sender]
     absent = sent & ~to_all & ~((receiver >= 0) & there[step, receiver])
@@ -180,6 +178,7 @@ def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> t
     summary.refuse("messages to a receiver that is absent or has no position", rows[absent])
     broadcasts = np.zeros(there.shape, dtype=bool)
     broadcasts[step[sent], sender[sent]] = True
+    columns = np.arange(len(ids))
     meant = np.where(to_all[:, None], sender[:, None] != columns, receiver[:, None] == columns)
     k, j = np.nonzero(meant & there[step] & sent[:, None])
     late = (rows["arrival"] - rows["t"]).to_numpy()

@@ -15,7 +15,8 @@ from coopoc.world.links import wrap
 
 from ..assemble import SAME, longest_gap, nearest, steps_of
 from .heading import (
-    HeadingAt,
+    Course,
+    Reckoning,
     Signal,
     covered,
     heading_at,
@@ -103,32 +104,26 @@ class Member:
     Args:
         gnss: (T, 3) m, NaN without a fix.
         velocity: (T, 3) m/s, mean over the step that ends at each instant, in body frames forward; NaN where absent.
-        heading: function from times s to headings rad, NaN where unknown; None if there is none at all.
+        heading: measured or derived; what wanders is the variance of a velocity or direction that fixes have shown.
         text: what was read, in words.
-        course: what its heading is the course of, "" where it was measured.
         stands: whether it stands, as a road-side unit does.
         yaw_rate: (T,) rad/s as velocity, of body frames.
         compass: (T,) rad, NaN without a heading, of body frames.
         moves: (T, 3) m/s, as velocity, in the world; in body frames NaN where no heading is known.
-        wanders: m^2/s, variance of a velocity or direction that fixes have shown, by its time; 0 for odometry.
-        shown: whether they alone have, without a gyro.
+        shown: whether fixes alone have shown its velocity, or its direction without a gyro.
         climbs: m^2/s, as `climbing`, of heights whose velocity was not measured.
-        turns: rad, standard deviation of a heading that was derived.
     """
 
     gnss: Floats
     velocity: Floats
-    heading: HeadingAt | None
+    heading: Course
     text: str
-    course: str
     stands: bool
     yaw_rate: Floats
     compass: Floats
     moves: Floats
-    wanders: float = 0.0
     shown: bool = False
     climbs: float = 0.0
-    turns: float = 0.0
 
 
 def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 1) -> Signal:
@@ -171,27 +166,27 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
     again = pd.DataFrame(fixes.value).diff().eq(0).all(axis=1).to_numpy()
     measured, turn, speed = (samples(rows, (kind,), summary) for kind in ("heading", "yaw_rate", "speed"))
     still: Floats = np.zeros((len(grid), 3))
-    wanders = turns = 0.0
     none: Floats = np.full(len(grid), np.nan)
     if len(fixes.t) and again[1:].all() and not in_group(rows, "odometry").any():
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m{', arm left in' * (arm is not None)}"
-        heading = heading_at(measured, None, np.inf) if len(measured.t) and not body else None
-        return Member(still + fixes.value[0], still, heading, text, "", True, still[:, 0], none, still)
-    std = fix_std(rows)
-    shown, gyro = velocity_of_fixes(fixes, steps, std), (fixes, speed, std)
+        heading = Course(heading_at(measured, None, np.inf) if len(measured.t) and not body else None)
+        return Member(still + fixes.value[0], still, heading, text, True, still[:, 0], none, still)
+    way = Reckoning(fixes, speed, turn, fix_std(rows))
+    shown = velocity_of_fixes(way, steps)
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
         world, ever = samples(rows, ("vx", "vy"), Summary(), 2), steps._replace(max_gap=np.inf)
-        pointing, source, *_ = _heading(measured, turn, ((world, "odometry"), (shown, "fixes")), ever, gyro)
-        if pointing is None or not np.isfinite(off).all():
+        pointing = _heading(measured, world, shown, way, ever)
+        if pointing.at is None or not np.isfinite(off).all():
             hint = f"Log heading or compass_deg, or vx and vy; a course counts above {MOVING:g} m/s."
             raise InputError(f"antenna of {name}", f"{arm} m", "needs numbers, and a heading of the vehicle", hint)
-        by = f"{f'the course of the {source}' if source else 'its heading'}"
+        by = f"the course of the {pointing.source}" if pointing.source else "its heading"
         summary.assume(ARM, f"{name} ({', '.join(map('{:g}'.format, off))} m forward, left, up, by {by})")
-        angle = pd.Series(pointing(fixes.t)).ffill().bfill().to_numpy()
+        angle = pd.Series(pointing.at(fixes.t)).ffill().bfill().to_numpy()
         fixes = Signal(fixes.t, fixes.value - turned(off, angle))
-        shown, gyro = velocity_of_fixes(fixes, steps, std), (fixes, speed, std)
-    if len(speed.t) > 1 and len(turn.t) > 1 and mirrored(fixes, speed, turn, std):
+        way = way._replace(fixes=fixes)
+        shown = velocity_of_fixes(way, steps)
+    if len(speed.t) > 1 and len(turn.t) > 1 and mirrored(way):
         summary.assume(CLOCKWISE, name)
     if body:
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
@@ -199,21 +194,20 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
                 allowed, hint = "must have speeds and yaw rates in body frames", 'Log both, or pass frame="world".'
                 raise InputError(f"vehicle {name}", f"no {kind}", allowed, hint)
         summary.refuse("world velocities in body frames", rows[rows["kind"].isin(["vx", "vy", "vz"])])
-        signals, course = [speed, turn], ""
-        heading = heading_at(measured, turn, np.inf) if len(measured.t) else None
-        along, *_ = _heading(measured, turn, ((shown, "fixes"),), steps, gyro)
+        signals, heading = [speed, turn], Course(heading_at(measured, turn, np.inf) if len(measured.t) else None)
+        along = _heading(measured, None, shown, way, steps).at
         forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
         moves: Floats = forward * turned(AHEAD, none if along is None else along(grid))
         velocity: Floats = forward * AHEAD
     else:
-        moved, times, heading, course, wanders, turns = _in_world(name, rows, (measured, turn), shown, gyro, steps)
-        signals, rate = [times or fixes], none
+        moved, times, heading = _in_world(name, rows, measured, shown, way, steps)
+        signals, rate = [times], none
         velocity = moves = _by_fixes(fixes, shown, steps) if moved is None else step_means(moved, grid)
     there = np.ones(len(grid), dtype=bool)
     for signal in signals:
         interval = float(np.median(np.diff(signal.t))) if len(signal.t) > 1 else 0.0
         there &= covered(signal.t, grid, steps.gap(signal.t), max(steps.dt, 0.6 * interval))
-    gnss = _fixes_on_steps(rows, fixes, np.nan_to_num(moves), there, steps, again, std)
+    gnss = _fixes_on_steps(rows, fixes, np.nan_to_num(moves), there, steps, again, way.std)
     fixed = np.maximum.accumulate(np.isfinite(gnss[:, 0]))
     if fixed.any() or not body:
         summary.refuse(f"steps of {name} before its first fix", int((there & ~fixed).sum()))
@@ -225,11 +219,11 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
     if body:
         kept, step, lag = _nearest_of_each(measured, there, steps)
         compass[step] = wrap(measured.value[kept, 0] - lag * rate[step])
-    alone = wanders > 0.0 and (signals[0] is fixes or len(turn.t) < 2)
+    alone = heading.wanders > 0.0 and (signals[0] is fixes or len(turn.t) < 2)
     velocity = velocity + absent[:, None]
     climbs = 0.0 if steps.planar or signals[0] is fixes or rows["kind"].eq("vz").any() else climbing(fixes)
     rate, moves = rate + absent, moves + absent[:, None]
-    return Member(gnss, velocity, heading, text, course, False, rate, compass, moves, wanders, alone, climbs, turns)
+    return Member(gnss, velocity, heading, text, False, rate, compass, moves, alone, climbs)
 
 
 def climbing(fixes: Signal) -> float:
@@ -256,71 +250,54 @@ def climbing(fixes: Signal) -> float:
 
 
 def _in_world(
-    name: str,
-    rows: Rows,
-    turning: tuple[Signal, Signal],
-    shown: Shown,
-    gyro: tuple[Signal, Signal, float],
-    steps: Steps,
-) -> tuple[Signal | None, Signal | None, HeadingAt | None, str, float, float]:
-    """Velocity, and the samples that it is of, None where the fixes have to show it; heading, and the rest of
-    `_heading`; `turning` are heading and yaw rate."""
-    summary, (measured, turn), (fixes, speed, _) = steps.summary, turning, gyro
+    name: str, rows: Rows, measured: Signal, shown: Shown, way: Reckoning, steps: Steps
+) -> tuple[Signal | None, Signal, Course]:
+    """Velocity, None where the fixes have to show it; the samples that it is of; and the heading, by `measured` ones or
+    derived."""
+    summary, speed = steps.summary, way.speed
     world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), rows[rows["kind"] == "speed"]
-    heading, course, *unsure = _heading(measured, turn, ((world, "odometry"), (shown, "fixes")), steps, gyro)
+    heading = _heading(measured, world, shown, way, steps)
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
-        return Signal(world.t, np.nan_to_num(world.value)), world, heading, course, 0.0, unsure[1]
-    if len(speed.t) and (heading is not None or abs(speed.value.mean()) < STANDS):
-        if course:
-            summary.assume(COURSE.format("{}", course), name)
-
-        def usable(angle: Floats, pace: Floats) -> Bools:
-            return np.isfinite(angle) | (np.abs(pace) < STANDS) | (heading is None)
-
+        return Signal(world.t, np.nan_to_num(world.value)), world, heading._replace(wanders=0.0)
+    if len(speed.t) and (heading.at is not None or abs(speed.value.mean()) < STANDS):
+        if heading.source:
+            summary.assume(COURSE.format("{}", heading.source), name)
         at = np.unique(np.concatenate([speed.t, *(speed.t[:-1] + part * np.diff(speed.t) for part in BETWEEN)]))
         pace = np.interp(at, speed.t, speed.value[:, 0])
-        angle = np.full(len(at), np.nan) if heading is None else heading(at)
-        kept, own = usable(angle, pace), np.isin(at, speed.t)
+        angle = np.full(len(at), np.nan) if heading.at is None else heading.at(at)
+        kept, own = np.isfinite(angle) | (np.abs(pace) < STANDS) | (heading.at is None), np.isin(at, speed.t)
         summary.refuse("speeds without a heading", speeds[speeds["t"].isin(at[own & ~kept])])
         velocity = pace[:, None] * np.nan_to_num(turned(AHEAD, angle))
-        return Signal(at[kept], velocity[kept]), Signal(at[own & kept], at), heading, course, unsure[0], unsure[1]
+        return Signal(at[kept], velocity[kept]), Signal(at[own & kept], at), heading
     if len(speed.t):
         allowed, hint = "needs heading, compass_deg, or fixes of a moving vehicle", "Add one, or give vx and vy."
         raise InputError(f"{place(speeds)}, speed", f"of {name}, which has no heading", allowed, hint)
-    if len(fixes.t) < 2:
+    if len(way.fixes.t) < 2:
         hint = "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z."
         raise InputError(f"vehicle {name}", "no odometry, and less than two fixes", "cannot be placed", hint)
     summary.assume(DERIVED, name)
-    return None, None, heading, course, shown.wanders, unsure[1]
+    return None, way.fixes, heading._replace(wanders=shown.wanders)
 
 
-def _heading(
-    measured: Signal,
-    turn: Signal,
-    moves: Sequence[tuple[Signal | Shown, str]],
-    steps: Steps,
-    gyro: tuple[Signal, Signal, float] | None = None,
-) -> tuple[HeadingAt | None, str, float, float]:
-    """Heading that was measured, else by `gyro` (fixes, speed, their standard deviation) and the yaw rate, else the
-    course of the first of `moves` that moves; what it was derived from, and m^2/s and rad as of
-    `heading_of_gyro`."""
-    rate = turn if len(turn.t) > 1 else None
+def _heading(measured: Signal, world: Signal | None, shown: Shown, way: Reckoning, steps: Steps) -> Course:
+    """Heading that was measured, else by the yaw rate and fixes, else the course of the velocities in the world that
+    were measured, else of those that fixes have shown."""
+    rate = way.yaw_rate if len(way.yaw_rate.t) > 1 else None
     if len(measured.t):
-        return heading_at(measured, rate, steps.gap(measured.t)), "", 0.0, 0.0
-    if gyro is not None and rate is not None and len(gyro[1].t) > 1:
-        fixes, speed, std = gyro
-        way = fixes, speed, rate, std
-        if (filtered := heading_of_gyro(*way) or heading_of_all(*way)) is not None:
-            return filtered[0], "fixes", *filtered[1:]
-    for move, source in moves:
-        none: Floats = np.zeros(len(move[0]))
-        velocity, certain, wanders, unsure = move if isinstance(move, Shown) else Shown(move, none == 0, 0.0, none)
+        return Course(heading_at(measured, rate, steps.gap(measured.t)))
+    if rate is not None and len(way.speed.t) > 1 and (derived := heading_of_gyro(way) or heading_of_all(way)):
+        return derived
+    sources = [("fixes", shown)]
+    if world is not None:
+        none: Floats = np.zeros(len(world.t))
+        sources.insert(0, ("odometry", Shown(world, none == 0, 0.0, none)))
+    for source, (velocity, certain, wanders, unsure) in sources:
         pace = np.hypot(*velocity.value[:, :2].T)
         if (moving := (pace > np.maximum(MOVING, SURE * unsure)) & certain).any():
             courses = heading_of_courses(Signal(velocity.t[moving], velocity.value[moving]), rate)
-            return courses, source, wanders, float(np.median(unsure[moving] / pace[moving]))
-    return None, "", 0.0, 0.0
+            return Course(courses, source, wanders, float(np.median(unsure[moving] / pace[moving])))
+    return Course()
 
 
 def _longest(there: Bools, grid: Floats) -> str:
@@ -351,20 +328,21 @@ def fix_std(rows: Rows) -> float:
     return float(np.sqrt((stated**2).mean())) if len(stated) else Sensors().gnss_std[0]
 
 
-def velocity_of_fixes(fixes: Signal, steps: Steps, std: float) -> Shown:
-    """Velocity by fixes of that standard deviation m, by a Kalman filter (`kernels.constant_velocity`). It is known by
+def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
+    """Velocity by fixes, by a Kalman filter (`kernels.constant_velocity`). It is known by
     four of them at the latest, or as well as by two that are as far apart as nine in ten."""
+    fixes, variance = way.fixes, way.std**2
     if len(fixes.t) < 2:
         none: Floats = np.zeros(len(fixes.t))
         return Shown(Signal(fixes.t, np.zeros_like(fixes.value)), none > 0, 0.0, none)
     between = np.diff(fixes.t)
     interval, longest = float(np.median(between)), float(np.quantile(between, 0.9))
     velocity, growth, spread, proved = constant_velocity(
-        fixes.t, fixes.value, interval, steps.gap(fixes.t) + SAME, std**2, UNKNOWN_SPEED, BANK
+        fixes.t, fixes.value, interval, steps.gap(fixes.t) + SAME, variance, UNKNOWN_SPEED, BANK
     )
     sure, order = np.isfinite(growth), np.arange(len(growth))
     since = order - np.maximum.accumulate(np.where(sure, 0, order))
-    wanders = float(std**2 * np.median(growth[sure]) / interval) if sure.any() else 0.0
+    wanders = float(variance * np.median(growth[sure]) / interval) if sure.any() else 0.0
     certain = (since > 3) | (sure & (spread * longest**2 < 2.0))
     return Shown(Signal(fixes.t, velocity), certain, wanders, np.sqrt(proved * spread))
 
