@@ -115,7 +115,7 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
         speed, fixes = np.linalg.norm(rec.velocity[0, :, column], axis=-1), pd.DataFrame(rec.gnss[0, :, column])
         if not max(np.nanmax(speed, initial=0.0), *(fixes.max() - fixes.min())) > 0:  # a place
             continue
-        wheels, ratio = odometry(c, column), ratio_of_moves(rec, column)
+        wheels, ratio = odometry(c, column), ratio_of_moves(c, column)
         row: dict[str, Any] = {
             "vehicle": name,
             "fixes": int(fixes[0].count()),
@@ -156,7 +156,7 @@ def _axes(c: Check, column: int) -> str:
     """What is wrong with the axes of velocities that explain the fixes once they are mirrored, or whose direction never
     changes while that of the fixes does; nothing where they agree."""
     rec = c.world
-    moved, driven = moves(rec, column)
+    moved, driven = moves(c, column)
     size = np.linalg.norm(moved) * np.linalg.norm(driven)
     u = rec.velocity[0, np.isfinite(rec.velocity[0, :, column, 0]), column, :2]
     if not size or abs(np.vdot(driven, moved)) > ALIKE * size:
@@ -299,7 +299,7 @@ def _with_fixes(c: Check, row: Mapping[str, Any]) -> str:
     name, late = row["vehicle"], row["late_s"]
     column, mends = c.world.ids.index(name), f"clock={name}:{late:.3f}"
     used = np.isfinite(off[:, column])
-    noise = float(np.hypot(*c.world.sensors.fix_std[:2])) * max(row.get("nis") or 1.0, 1.0) ** 0.5
+    noise = c.fix_noise * max(row.get("nis") or 1.0, 1.0) ** 0.5
     (ahead,), (unsure,) = factors(off[used, column], made[2:, used, column].T, noise)
     if abs(ahead + late) > SURELY * np.hypot(unsure, row["late_s_error"]):
         return ", its fixes are not: is a velocity the mean of the interval before its stamp, which is half of it late?"
@@ -314,7 +314,7 @@ def _of_fixes(c: Check) -> list[str]:
     origin."""
     rec, truth, sentences = c.world, c.log.truth, []
     off, made, then = causes(c)
-    usual = float(np.hypot(*rec.sensors.fix_std[:2]))
+    usual = c.fix_noise
     for column, name in enumerate(rec.ids):
         row: Mapping[str, Any] = next((row for row in c.vehicles if row["vehicle"] == name), {})
         finite = np.isfinite(off[:, column] + made[:, :, column].sum(axis=0))

@@ -8,13 +8,12 @@ import numpy as np
 import pandas as pd
 import scipy  # its signals take half a second, and are imported where they are used
 
-from coopoc import Recording
 from coopoc.arrays import AnyArray, Bools, Floats, Ints
 from coopoc.evaluate.metrics import dimensions
 from coopoc.world.links import wrap
 
 from .motion import MOVING
-from .residuals import Check, filtered, residual_of
+from .residuals import Check, filtered, plane, residual_of
 
 SURELY = 4.0
 """Standard errors beyond which an estimate is no chance: one of hundreds that a few logs ask for lies beyond three."""
@@ -98,19 +97,19 @@ def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
     late make of it (3, T, N): against the truth, else against a filter, which is linear in what is added to fixes; and
     instruments, by a later velocity: the filter errs by the noise of those until then."""
     rec, truth = c.world, c.log.truth
-    velocity = (rec.velocity[0] if truth is None else truth.velocity)[..., :2] @ [1, 1j]
+    velocity = plane(rec.velocity[0] if truth is None else truth.velocity)
     speed = pd.DataFrame(np.abs(velocity)).where(lambda v: v > MOVING)
     course = pd.DataFrame(np.angle(velocity)).where(speed > 0).ffill().bfill().to_numpy()
     ahead = np.nan_to_num(np.exp(1j * course)) * np.array(speed.std() > VARIED * speed.mean())
     made = np.stack([ahead, 1j * ahead, velocity])
     if truth is not None:
-        return (rec.gnss[0] - truth.position)[..., :2] @ [1, 1j], made, made
+        return plane(rec.gnss[0] - truth.position), made, made
     then = np.nan_to_num(following(c, made, axis=1))
     for k, cause in enumerate(np.nan_to_num(NUDGE * made)):
         gnss = c.log.recording.gnss + np.stack([cause.real, cause.imag, 0 * cause.real], axis=-1)
         moved = filtered(replace(c.log, recording=replace(c.log.recording, gnss=gnss)))
-        made[k] = (moved.fix - c.fix)[..., :2] @ [1, 1j] / NUDGE
-    return c.fix[..., :2] @ [1, 1j], made, then
+        made[k] = plane(moved.fix - c.fix) / NUDGE
+    return plane(c.fix), made, then
 
 
 def following(c: Check, of_step: AnyArray, axis: int = 0) -> AnyArray:
@@ -121,11 +120,12 @@ def following(c: Check, of_step: AnyArray, axis: int = 0) -> AnyArray:
     return np.asarray(of_step.take(at, axis))
 
 
-def moves(rec: Recording, column: int, means: int = 1) -> tuple[AnyArray, AnyArray]:
+def moves(c: Check, column: int, means: int = 1) -> tuple[AnyArray, AnyArray]:
     """Displacements (M,) m, x + iy, of the fixes and of the odometry over the same spans, in which the odometry (if
     that stands still, the fixes) moves far; none where too little moves. On a short way the means of several
     fixes are less noisy."""
-    fixes, velocity = rec.gnss[0, :, column, :2] @ [1, 1j], rec.velocity[0, :, column, :2] @ [1, 1j]
+    rec = c.world
+    fixes, velocity = plane(rec.gnss[0, :, column]), plane(rec.velocity[0, :, column])
     path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
     walk = rec.dt * float(np.mean(rec.sensors.velocity_std(np.nan_to_num(rec.velocity), rec.sensors.velocity_floor)))
     at = np.flatnonzero(np.isfinite(fixes))
@@ -139,7 +139,7 @@ def moves(rec: Recording, column: int, means: int = 1) -> tuple[AnyArray, AnyArr
             if gaps[k] != gaps[last]:
                 last = k
             elif abs(places[k] - places[last]) > max(
-                far * np.hypot(*rec.sensors.fix_std[:2]) / means**0.5,
+                far * c.fix_noise / means**0.5,
                 OUTLYING * walk * (parts[k, 0] - parts[last, 0]) ** 0.5,
             ):
                 pairs.append((last, k))
@@ -150,12 +150,11 @@ def moves(rec: Recording, column: int, means: int = 1) -> tuple[AnyArray, AnyArr
     return np.empty(0), np.empty(0)
 
 
-def ratio_of_moves(rec: Recording, column: int) -> complex | None:
+def ratio_of_moves(c: Check, column: int) -> complex | None:
     """Displacements of a vehicle's fixes over those of its odometry, if one factor and their noise explain them."""
-    moved, driven = moves(rec, column)
+    moved, driven = moves(c, column)
     ratio = complex(np.vdot(driven, moved)) / max(float(np.linalg.norm(driven)) ** 2, 1e-12)
-    noise = float(np.hypot(*rec.sensors.fix_std[:2])) * (2 * len(moved)) ** 0.5
-    most = max(2 * noise, (1 - ALIKE**2) ** 0.5 * float(np.linalg.norm(moved)))
+    most = max(2 * c.fix_noise * (2 * len(moved)) ** 0.5, (1 - ALIKE**2) ** 0.5 * float(np.linalg.norm(moved)))
     return ratio if len(moved) and np.linalg.norm(moved - ratio * driven) < most else None
 
 
@@ -174,16 +173,16 @@ def odometry(c: Check, column: int) -> Estimate:
         attenuation = np.square(noise).sum() / max(float(np.nansum(np.square(velocity))), 1e-12)
         return Estimate(value, np.hypot(error, [attenuation, 0.0]))
     if truth is None:
-        moved, driven = moves(rec, column)
+        moved, driven = moves(c, column)
         if len(moved) < ENOUGH:
             means = int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * ENOUGH // 2)
-            moved, driven = moves(rec, column, max(means, 2))
-        fix, square = float(np.hypot(*rec.sensors.fix_std[:2])), max(float(np.square(np.abs(driven)).sum()), 1e-12)
-        value, error = factors(moved - driven, np.stack([driven, 1j * driven], axis=1), 2**0.5 * fix)
+            moved, driven = moves(c, column, max(means, 2))
+        square = max(float(np.square(np.abs(driven)).sum()), 1e-12)
+        value, error = factors(moved - driven, np.stack([driven, 1j * driven], axis=1), 2**0.5 * c.fix_noise)
         attenuation = (float(np.linalg.norm(noise)) * rec.dt) ** 2 / square  # by noise of the cause
         turned = (1 + complex(*value)) * (1 + attenuation)
         return Estimate(_polar(1 / turned), np.hypot(error, attenuation) / abs(turned) ** 2) if turned else none
-    path = truth.position[:, column, :2] @ [1, 1j]
+    path = plane(truth.position[:, column])
     true = np.diff(path, prepend=np.nan) / rec.dt  # as odometry, the mean over a step
     odometer = velocity @ [1, 1j]
     if body is not None:
@@ -313,10 +312,10 @@ def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
 def lag_of_fixes(c: Check, column: int) -> float:
     """s, by which fixes are late beside the odometry, or a truth, if a lag alone explains how they move, else 0."""
     rec, truth, misses = c.world, c.log.truth, dict[int, float]()
-    velocity = rec.velocity[0, :, column, :2] @ [1, 1j]
+    velocity = plane(rec.velocity[0, :, column])
     path = np.cumsum(np.nan_to_num(velocity) * rec.dt) + 0.0 * velocity  # unknown where it is absent
-    path = path if truth is None else truth.position[:, column, :2] @ [1, 1j]
-    fixes, most, every = rec.gnss[0, :, column, :2] @ [1, 1j], int(LONGEST / rec.dt), max(round(LAG / rec.dt), 1)
+    path = path if truth is None else plane(truth.position[:, column])
+    fixes, most, every = plane(rec.gnss[0, :, column]), int(LONGEST / rec.dt), max(round(LAG / rec.dt), 1)
     at = np.flatnonzero(np.isfinite(fixes))
     for steps in range(-(most // every) * every, most + 1, every):
         then = at[(at >= steps) & (at < len(path) + steps)]
@@ -327,7 +326,7 @@ def lag_of_fixes(c: Check, column: int) -> float:
             mean = (np.bincount(part, off.real) + 1j * np.bincount(part, off.imag)) / np.bincount(part)
             misses[steps] = float(np.median(np.abs(off - mean[part])))
     least = min(misses.values(), default=np.inf)
-    if least > min(OUTLYING * float(np.hypot(*rec.sensors.fix_std[:2])), misses.get(0, 0.0) / 2):
+    if least > min(OUTLYING * c.fix_noise, misses.get(0, 0.0) / 2):
         return 0.0
     first = min((steps for steps, miss in misses.items() if miss < 1.05 * least), key=abs)  # of a way that repeats
     return min((steps for steps in misses if abs(steps - first) * rec.dt < FAST), key=misses.__getitem__) * rec.dt
@@ -350,7 +349,7 @@ def against_truth(c: Check) -> Check:
         return c
     marks = np.isin(np.arange(len(c.world.ids)), c.world.landmarks)
     off, (_, _, velocity), _ = causes(c)
-    fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * np.hypot(*noise.fix_std[:2])
+    fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * c.fix_noise
     x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
     residual, stated = residual_of(c.world, x)[1], [noise.range_std, noise.world_azimuth_std, noise.inclination_std]
     used = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)

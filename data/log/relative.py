@@ -10,7 +10,7 @@ from coopoc.world.links import wrap
 
 from .estimates import ENOUGH, FAR, OUTLYING, SURELY, by_pair, offsets
 from .motion import MOVING
-from .residuals import Check
+from .residuals import Check, plane
 
 UNITS = {"range": "m", "azimuth": "rad", "inclination": "rad"}
 WIDE, NARROW = 2.0, 0.4
@@ -185,7 +185,7 @@ def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
 def _other_angle(c: Check) -> str:
     """What azimuths look like that miss the positions by the course of their observers."""
     links = c.world.links
-    moves = c.world.velocity[0, links.step, links.observer, :2] @ [1, 1j]
+    moves = plane(c.world.velocity[0, links.step, links.observer])
     there, heading = np.isfinite(c.relative[:, 1]), np.where(np.abs(moves) > MOVING, np.angle(moves), np.nan)
     residual, course, measured = c.relative[there, 1], heading[there], c.world.relative[0, there, 1]
     off = float(np.angle(np.exp(1j * residual).sum()))

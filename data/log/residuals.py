@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from coopoc import InputError, Kalman, PoseFilter, Recording, pose_start
-from coopoc.arrays import Bools, Floats
+from coopoc.arrays import AnyArray, Bools, Floats
 from coopoc.evaluate.metrics import fix_innovations, normalised_innovations
 from coopoc.methods.poses.pose_inputs import SPREAD
 from coopoc.world.body_frames import midway, turned
@@ -69,6 +69,11 @@ class Check:
     measurements: Sequence[Mapping[str, Any]] = ()
     warnings: tuple[str, ...] = ()
     unseen: tuple[str, ...] = ()
+
+    @property
+    def fix_noise(self) -> float:
+        """m, of a fix in the plane."""
+        return float(np.hypot(*self.world.sensors.fix_std[:2]))
 
 
 def together(log: Log) -> tuple[Log, str]:
@@ -175,6 +180,11 @@ def filtered(log: Log) -> Check:
     none, infinite = np.zeros(vehicles), np.full(vehicles, np.inf)
     stats = x, variance, fix, normalised, residual, np.sqrt(expected), lasting
     return Check(log, span + start, world, *stats, none, infinite, np.zeros((len(links), 2, vehicles + 2)), scored)
+
+
+def plane(vectors: Floats) -> AnyArray:
+    """East and north of vectors (..., 3) as x + iy."""
+    return vectors[..., :2] @ [1, 1j]
 
 
 def residual_of(world: Recording, x: Floats) -> tuple[Floats, Floats]:
