@@ -80,7 +80,8 @@ def assemble(
         raise InputError(f"{file}: row {row + 1}, column t", actual, allowed, hint)
     by_vehicle = np.split(order, np.cumsum(np.bincount(column))[:-1])
     if not any_scale:
-        check_scale(stamps, numbers[:, :3], by_vehicle, file)
+        check_time(stamps, file)
+        check_scale([(stamps[rows], numbers[rows]) for rows in by_vehicle], file)
     if dt is None:
         grid, table = _on_stamps(stamps, column, numbers, file)
     else:
@@ -147,30 +148,26 @@ def interpolate(t: Floats, values: Floats, grid: Floats, max_gap: float) -> Floa
     return out
 
 
-def check_scale(t: Floats, position: Floats, by_vehicle: Sequence[Ints], file: str) -> None:
-    """InputError where rows look like degrees or milliseconds, or move too fast for metres and seconds.
+def check_scale(paths: Sequence[tuple[Floats, Floats]], file: str) -> None:
+    """InputError where paths look like degrees, or move too fast for metres and seconds.
 
     The typical speed of a vehicle is the median of |dx| / dt over the pairs of rows between which it moves, that of a
     file the largest of its vehicles. A file in which nothing moves has none.
 
     Args:
-        t: (L,) s.
-        position: (L, 3) m.
-        by_vehicle: rows of each vehicle in time order.
+        paths: (L,) s and (L, 2 or more) m of each vehicle in time order.
         file: named in the error.
 
-    >>> x = np.array([[11.58, 48.14, 0.0], [11.5801, 48.1401, 0]])
-    >>> check_scale(np.array([0.0, 1]), x, [np.arange(2)], "drive.csv")
+    >>> check_scale([(np.array([0.0, 1]), np.array([[11.58, 48.14], [11.5801, 48.1401]]))], "drive.csv")
     Traceback (most recent call last):
     coopoc.errors.InputError: drive.csv: columns x, y = 11.58..11.5801, 48.14..48.1401: look like degrees, must be \
 metres in a local frame. Give latitude and longitude to co.read_log, which converts them, or pass any_scale=True.
     """
-    check_time(t, file)
-    speed = 0.0
-    for rows in by_vehicle:
-        each = np.linalg.norm(np.diff(position[rows, :2], axis=0), axis=1) / np.diff(t[rows])
+    speed, places = 0.0, np.concatenate([position[:, :2] for _, position in paths])
+    for t, position in paths:
+        each = np.linalg.norm(np.diff(position[:, :2], axis=0), axis=1) / np.diff(t)
         speed = max(speed, float(np.median(each[each > 0])) if (each > 0).any() else 0.0)
-    (west, east), (south, north) = ((float(v.min()), float(v.max())) for v in position[:, :2].T)
+    (west, south), (east, north) = places.min(axis=0).tolist(), places.max(axis=0).tolist()
     near = max(east - west, north - south) < REGION
     if 0 < speed < SLOWEST and near and max(-west, east) <= 360 and max(-south, north) <= 180:
         actual = f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}"

@@ -57,8 +57,9 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
     """
     import pandas as pd
 
+    ending = path.suffix.lower()
     try:
-        if parquet := path.suffix.lower() == ".parquet":
+        if ending == ".parquet":
             require("pyarrow", "a Parquet table")
             from pyarrow.parquet import read_metadata
 
@@ -66,11 +67,12 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
             if size.num_rows * size.num_columns > LARGEST_TABLE:
                 actual = f"{size.num_rows} rows of {size.num_columns} columns"
                 raise InputError(path.name, actual, f"must hold at most {LARGEST_TABLE} cells", "Split the drive.")
-        if path.suffix.lower() == ".jsonl":
+            frame = pd.read_parquet(path).reset_index(drop=True)
+        elif ending == ".jsonl":
             lines = path.read_text("utf-8-sig").splitlines()
             frame = pd.DataFrame([json.loads(line) for line in lines if line.strip()])
         else:
-            frame = pd.read_parquet(path).reset_index(drop=True) if parquet else _read_csv(path, text)
+            frame = _read_csv(path, text)
     except (InputError, ImportError):
         raise
     except Exception as error:  # of pandas and Arrow: a damaged file meets them all
@@ -164,14 +166,11 @@ def factors(given: Mapping[str, float] | None, names: Collection[str], field: st
 
 def words(frame: "pd.DataFrame", column: str, file: str) -> list[str]:
     """A column of names; InputError with the row of the first empty cell."""
-    _refuse(
-        frame[column].astype(object).where(filled(frame[column]), "empty"),
-        ~filled(frame[column]),
-        file,
-        "must be a name",
-    )
-    number, cells = frame[column].astype(str).factorize()
-    names: list[str] = np.array([WHOLE.sub(r"\1", cell.strip()) for cell in cells], dtype=object)[number].tolist()
+    cells = frame[column]
+    named_cells = filled(cells)
+    _refuse(cells.astype(object).where(named_cells, "empty"), ~named_cells, file, "must be a name")
+    number, each = cells.astype(str).factorize()
+    names: list[str] = np.array([WHOLE.sub(r"\1", cell.strip()) for cell in each], dtype=object)[number].tolist()
     return names
 
 
@@ -226,11 +225,11 @@ def usual_key(header: str) -> str:
 def missing_column(file: str, column: str, names: Sequence[str], allowed: str, key: str = "") -> InputError:
     """The error of a table without a column; `key` is our name of it, and the hint a header that may be meant."""
     key = key or column
-    usual = [header for header in names if usual_key(header) == key]
-    header = usual[0] if usual else "..."
+    usual = next((header for header in names if usual_key(header) == key), "")
+    header = usual or "..."
     hint = f'Add it, or pass columns={{"{key}": "{header}"}}; with a command, FILE?columns={key}:{header}.'
     if usual:
-        hint = f"Did you mean {header}? {hint}"
+        hint = f"Did you mean {usual}? {hint}"
     allowed = f"{allowed}; the file has {', '.join(names)}"
     return InputError(f"{file}: column {column}", "missing", allowed, suggestion(column, names, hint))
 

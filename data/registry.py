@@ -94,6 +94,7 @@ DRIVES: Mapping[str, Callable[..., Fleet]] = {
     "mrclam": _mrclam_fleet,
 }
 """Formats of drives -> reader; of MR.CLAM Vicon's truth, whose measurements `coopoc run real` takes."""
+MEASURED = {".npz": "recording", ".pyfg": "pyfg"}
 ENDINGS = {**dict.fromkeys(TABLES, "table"), ".xml": "fcd", ".tum": "tum", ".txt": "tum"}
 
 
@@ -115,8 +116,9 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     >>> load_fleet("town10-clients").present.sum(axis=0)
     array([1550, 4600, 1450, 1420])
     """
-    name, options, part = _split(name_or_path, {"format": format, **options})
-    chosen = options.pop("format", None)
+    name, options, part = _split(name_or_path, options)
+    stated = options.pop("format", None)
+    chosen = stated if format is None else format
     if chosen is None and (in_file(name) or name in names("coopoc.datasets")):
         if options:
             raise InputError("options", sorted(options), f"{name} is bundled and takes none", "Leave them out.")
@@ -220,18 +222,16 @@ def _real(path: Path, columns: Mapping[str, str] | None = None) -> str:
     """Format of measurements, "" for anything else."""
     if (path / "Barcodes.dat").is_file():
         return "mrclam"
-    if path.suffix in (".npz", ".pyfg"):
-        return "recording" if path.suffix == ".npz" else "pyfg"
-    if path.is_dir() and any(path.glob("*.tum")):
-        return ""
-    return "log" if is_log(path, columns) else ""
+    if path.suffix in MEASURED:
+        return MEASURED[path.suffix]
+    return "log" if not any(path.glob("*.tum")) and is_log(path, columns) else ""
 
 
 def _split(name_or_path: str | Path, options: dict[str, Any]) -> tuple[str, dict[str, Any], dict[str, Any]]:
     """Name, options of the reader, and the part that is kept."""
-    name, options_given = split(name_or_path)
-    options_given |= {key: value for key, value in options.items() if key != "format" or value is not None}
-    return name, options_given, {key: options_given.pop(key, None) for key in ("since", "until")}
+    name, stated = split(name_or_path)
+    options = stated | options
+    return name, options, {key: options.pop(key, None) for key in ("since", "until")}
 
 
 def _read(read: Callable[..., Any], path: Path, options: dict[str, Any]) -> Any:

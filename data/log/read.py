@@ -49,7 +49,8 @@ READERS: Mapping[str, Callable[..., Rows]] = {
     ".txt": read_librsf,
     ".pt": read_nclt,
 }
-"""Ending of a file -> (path, summary, *, columns, kinds, ignore) -> its rows. A new format is one more entry."""
+"""Ending of a file -> (path, summary, *, columns, kinds, ignore, stamps, ...) -> its rows. A new format is one more
+entry."""
 TRUTH = re.compile(r"(.*[_ -])?(ground[_ -]?)?(truth|gt)", re.IGNORECASE)
 """Stem of a file of a folder that holds a truth, as truth, span_truth, groundtruth or robot_GT."""
 APART = 3600.0
@@ -192,8 +193,9 @@ def read_log(
         "columns": named("columns", columns or {}, "Give columns={name: header}."),
         "kinds": named("kinds", kinds or {}, "Give kinds={word: kind}."),
         "ignore": ignore,
+        "stamps": stamps,
     }
-    rows = _rows(path, truth, summary, {**options, "stamps": stamps})
+    rows = _rows(path, truth, summary, options)
     factor = factors(scale, ("t", *KINDS))
     by_kind, key, ends = rows["kind"].map(factor).fillna(1.0), rows["kind"], (rows["vehicle"], rows["partner"])
     for one, other in (ends, ends[::-1]):
@@ -331,8 +333,6 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
 
 def _read_file(file: Path, path: Path, summary: Summary, **options: Any) -> Rows:
     """Rows of a file of a log; what names no vehicle in a folder below is of the vehicle of that folder."""
-    if not _is_bag(file):
-        options = {name: value for name, value in options.items() if name not in ("truth", "stamps")}
     rows = READERS.get(file.suffix.lower(), read_log_table)(file, summary, **options)
     if path not in file.parents or file.parent == path:
         return rows
@@ -367,11 +367,11 @@ def _check_one_drive(rows: Rows, path: Path) -> None:
 
 
 def _check_scale(rows: Rows, name: str) -> None:
-    fixes = [samples(group, ("x", "y", "z"), Summary(), 2) for _, group in rows.groupby("vehicle", sort=False)]
-    t, position = (np.concatenate(parts) for parts in zip(*fixes, strict=True))
+    paths = [samples(group, ("x", "y"), Summary(), 2) for _, group in rows.groupby("vehicle", sort=False)]
+    t = np.concatenate([path.t for path in paths])
     if len(t):
-        ends = np.cumsum([len(signal.t) for signal in fixes])[:-1]
-        check_scale(t, np.nan_to_num(position), np.split(np.arange(len(t)), ends), name)
+        check_time(t, name)
+        check_scale(paths, name)
 
 
 def _ids(rows: Rows, body: bool, summary: Summary) -> list[str]:

@@ -11,7 +11,6 @@ from coopoc.errors import InputError, suggestion
 
 from ..bag import STAMP, TRUTH, of_topic
 from ..cells import (
-    TABLES,
     filled,
     headers,
     missing_column,
@@ -38,10 +37,8 @@ OF_LOGS = (
 
 
 def is_log_table(path: Path, columns: Mapping[str, str] | None = None) -> bool:
-    """Whether a file is a table with a column that only a log has, by its header or by our names in `columns`; or one
+    """Whether a table has a column that only a log has, by its header or by our names in `columns`; or one
     without an id that lacks heights or has speeds, as no table of drives does."""
-    if path.suffix.lower() not in TABLES:
-        return False
     in_file, ours = {name.lower() for name in headers(path)}, set(columns or ())
     drive = "id" in in_file | ours or ("z" in in_file | ours and not {"speed", "heading"} & in_file)
     return bool(ours & ({*LONG, *KINDS} - OF_FLEETS) or OF_LOGS & in_file or (in_file and not drive))
@@ -54,6 +51,7 @@ def read_log_table(
     columns: Mapping[str, str],
     kinds: Mapping[str, str],
     ignore: Sequence[str],
+    **_: Any,
 ) -> Rows:
     """Rows of a CSV or Parquet table, long if it has a column kind, else wide.
 
