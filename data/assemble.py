@@ -6,7 +6,7 @@ import numpy as np
 import pandas as pd
 
 from coopoc import V2X, Body, Fleet, InputError, Links, Recording, Sensors
-from coopoc.arrays import Bools, Floats, Ints
+from coopoc.arrays import Floats, Ints
 
 SAME = 1e-6
 """s, stamps this close are one instant: the digits that a double keeps of seconds since 1970."""
@@ -65,15 +65,14 @@ def assemble(
             raise InputError(field, f"{value} s", "must be > 0", "Give seconds.")
     if not len(t):
         raise InputError(file, "0 rows", "must hold at least two instants", "Check that the file is complete.")
-    names, column = np.unique(np.array(vehicle, dtype=str), return_inverse=True)
-    first = pd.Series(column).drop_duplicates().to_numpy()
-    ids, column = tuple(names[first].tolist()), np.argsort(first)[column]
+    column, names = pd.Series(vehicle).factorize()
+    ids = tuple(names)
     numbers = np.hstack([position, velocity]) if velocity is not None else np.asarray(position, dtype=float)
     stamps = np.round(np.asarray(t, dtype=float), 6)
     order = np.argsort(column, kind="stable")
-    late = order[1:][(np.diff(stamps[order]) <= 0) & (np.diff(column[order]) == 0)]
-    if len(late):
-        row, before = int(late[0]), order[np.flatnonzero(order == late[0])[0] - 1]
+    back = np.flatnonzero((np.diff(stamps[order]) <= 0) & (np.diff(column[order]) == 0))
+    if len(back):
+        before, row = order[back[0] : back[0] + 2].tolist()
         actual = f"{stamps[row]!s} s after {stamps[before]!s} s of vehicle {ids[column[row]]}"
         allowed = "dt must be > 0: the stamps of a vehicle increase from row to row"
         hint = "Sort the rows by time, or remove one that repeats."
@@ -90,8 +89,8 @@ def assemble(
         steps = (since.max() + SAME) / dt + 1
         check_size(steps, len(ids), len(stamps), dt, file)
         grid = dt * np.arange(int(steps))
-        each = [(since[rows], numbers[rows], grid, longest_gap(since[rows], dt, max_gap)) for rows in by_vehicle]
-        table = np.stack([interpolate(*rows) for rows in each], axis=1)
+        paths = [(since[rows], numbers[rows]) for rows in by_vehicle]
+        table = np.stack([interpolate(t, x, grid, longest_gap(t, dt, max_gap)) for t, x in paths], axis=1)
         grid = start + grid
     present = np.isfinite(table[..., 0])
     lonely = (np.bincount(column) > 1) & ~(present[1:] & present[:-1]).any(axis=0)
@@ -223,36 +222,33 @@ def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tupl
     instants, row_of = np.unique(stamps, return_inverse=True)
     gaps = np.diff(instants) if len(instants) > 1 else np.ones(1)
     step = np.rint((instants - instants[0]) / gaps.min())
-    spaced = bool(step[-1] <= 50 * len(step))
-    if spaced:
-        grid = np.round(np.linspace(instants[0], instants[-1], int(step[-1]) + 1), 6)
-        spaced = bool(np.abs(grid[step.astype(np.int64)] - instants).max() <= 1e-3 * gaps.min() + 1e-6)
-    if not spaced:
-        actual = f"instants between {gaps.min():g} and {gaps.max():g} s apart"
-        hint = "Resample: load_fleet(..., dt=0.1), or FILE?dt=0.1 on the command line."
-        raise InputError(f"{file}: t", actual, "must be equally spaced", hint)
-    grid[step.astype(np.int64)] = instants
-    table = np.full((len(grid), column.max() + 1, numbers.shape[1]), np.nan)
-    table[step.astype(np.int64)[row_of], column] = numbers
-    return grid, table
+    if step[-1] <= 50 * len(step):
+        index = step.astype(np.int64)
+        grid = np.round(np.linspace(instants[0], instants[-1], index[-1] + 1), 6)
+        if np.abs(grid[index] - instants).max() <= 1e-3 * gaps.min() + 1e-6:
+            grid[index] = instants
+            table = np.full((len(grid), column.max() + 1, numbers.shape[1]), np.nan)
+            table[index[row_of], column] = numbers
+            return grid, table
+    actual = f"instants between {gaps.min():g} and {gaps.max():g} s apart"
+    hint = "Resample: load_fleet(..., dt=0.1), or FILE?dt=0.1 on the command line."
+    raise InputError(f"{file}: t", actual, "must be equally spaced", hint)
 
 
-def nearest(late: Floats, step: Ints, observer: Ints, neighbour: Ints) -> Ints:
-    """Indices of one measurement per step, observer and neighbour, the nearest in time, sorted by these.
+def nearest(late: Floats, *keys: Ints) -> Ints:
+    """Indices of one measurement per combination of keys, the nearest in time, sorted by these.
 
     Args:
         late: (M,) s between a measurement and its step.
-        step: (M,); negative ones are left out.
-        observer: (M,) columns; negative ones are left out.
-        neighbour: (M,) as `observer`.
+        keys: (M,) step, and columns of who measures and is measured; what has a negative one is left out.
 
     >>> nearest(np.array([0.04, 0.01, 0.02]), np.array([3, 3, -1]), np.zeros(3, int), np.ones(3, int))
     array([1])
     """
-    keys = ["step", "observer", "neighbour"]
-    rows = pd.DataFrame(dict(zip([*keys, "late"], (step, observer, neighbour, late), strict=True)))
-    rows = rows[(rows[keys] >= 0).all(axis=1)].sort_values([*keys, "late"], kind="stable")
-    return np.asarray(rows.drop_duplicates(keys).index)
+    names = [*range(len(keys))]
+    rows = pd.DataFrame(dict(enumerate(keys))).assign(late=late)
+    rows = rows[(rows[names] >= 0).all(axis=1)].sort_values([*names, "late"], kind="stable")
+    return np.asarray(rows.drop_duplicates(names).index)
 
 
 def steps_of(t: Floats, dt: float, steps: int) -> tuple[Ints, Floats]:
@@ -263,15 +259,6 @@ def steps_of(t: Floats, dt: float, steps: int) -> tuple[Ints, Floats]:
     """
     step = np.rint(t / dt)
     return np.where((step >= 0) & (step < steps), step, -1).astype(np.int64), np.abs(t - dt * step)
-
-
-def first_of_each(most: int, *keys: Ints | Floats) -> Bools:
-    """True for the first `most` of the rows with equal keys.
-
-    >>> first_of_each(1, np.array([0, 0, 1])).tolist()
-    [True, False, True]
-    """
-    return np.asarray(pd.DataFrame(np.column_stack(keys)).groupby(list(range(len(keys)))).cumcount() < most)
 
 
 def planar_recording(
@@ -298,8 +285,7 @@ def planar_recording(
         note: of the recording; that inclinations were not measured is added.
     """
     n = len(ids) - len(position)
-    v2x = V2X(max_neighbours=n - 1, radius=np.inf)
-    table = table[np.lexsort((table[:, 3], table[:, 1], table[:, 0]))]
+    table = table[np.lexsort(table[:, [3, 1, 0]].T)]
     links = Links(*table[:, :3].astype(np.int64).T)
     shape = (1, len(t), len(ids), 3)
     gnss, moved, turning = np.full(shape, np.nan), np.zeros(shape), np.zeros(shape[:3])
@@ -315,7 +301,7 @@ def planar_recording(
         broadcasts=np.broadcast_to(np.arange(len(ids)) < n, shape[1:3]),
         arrival=np.where(links.neighbour < n, links.step, -1)[None],
         sensors=sensors,
-        v2x=v2x,
+        v2x=V2X(max_neighbours=n - 1, radius=np.inf),
         observers=tuple(range(len(ids))),
         notes=(note, "inclination was not measured: pi/2 by the constraint z = 0"),
         body=Body(turning, np.full(turning.shape, np.nan)),

@@ -108,15 +108,16 @@ def read_bag(
             for c, received, raw in reader.messages(connections=wanted) if wanted else ():
                 (name, partner), true = of[c.topic]
                 message: Any = reader.deserialize(raw, c.msgtype)
-                numbers = _numbers(READ[c.msgtype], message, true)
-                if not numbers and (what := READ[c.msgtype]) in INVALID:
+                what, stamp, arrived = READ[c.msgtype], message.header.stamp, received * 1e-9
+                numbers = _numbers(what, message, true)
+                if not numbers and what in INVALID:
                     summary.refuse(INVALID[what], 1, f"{path.name}: {c.topic}")
-                t, late = message.header.stamp.sec + message.header.stamp.nanosec * 1e-9, received * 1e-9
-                behind.append(late - t)
-                t = t if stamps == "header" else late
+                sent = stamp.sec + stamp.nanosec * 1e-9
+                behind.append(arrived - sent)
+                t = sent if stamps == "header" else arrived
                 for kind, value, std in numbers:
                     if kind.partition(" of ")[0] not in ignore:
-                        rows.append((true, t, name, partner, kind, value, std if std > 0 else np.nan))
+                        rows.append((true, t, name, partner, kind, value, std))
     except InputError:
         raise
     except Exception as error:  # of rosbags: a damaged file meets them all

@@ -280,7 +280,7 @@ def _refuse(cells: "pd.Series[Any]", wrong: Bools, file: str, allowed: str) -> N
     """InputError that names the first wrong cell."""
     bad = np.flatnonzero(wrong)
     if len(bad):
-        actual = str(cells.iloc[int(bad[0])])[:60].strip() or "empty"
+        actual = str(cells.iloc[bad[0]])[:60].strip() or "empty"
         hint = "Mend the cell, or remove the row: a missing row means that there was no measurement."
         raise InputError(f"{file}: row {cells.index[bad[0]]}, column {cells.name}", actual, allowed, hint)
 

@@ -55,9 +55,14 @@ class Entry:
     by_hand: str = ""
 
     @property
+    def folder(self) -> Path:
+        """Of its files."""
+        return cache_folder() / self.name
+
+    @property
     def path(self) -> Path:
         """Of the file or folder that readers take."""
-        return cache_folder() / self.name / self.opens
+        return self.folder / self.opens
 
     @property
     def bytes(self) -> int:
@@ -67,9 +72,17 @@ class Entry:
     @property
     def fetched(self) -> bool:
         """Whether every file is there with its size; `fetch` compares the hashes, too."""
-        return not self.by_hand and all(
-            _size(cache_folder() / self.name / file) == size for file, (_, size, _) in self.files.items()
-        )
+        files = {self.folder / file: size for file, (_, size, _) in self.files.items()}
+        return not self.by_hand and all(path.is_file() and path.stat().st_size == files[path] for path in files)
+
+    def absent(self) -> list[str]:
+        """Files that are not there, or with other bytes."""
+        return [file for file, (_, _, digest) in self.files.items() if _digest(self.folder / file) != digest]
+
+    def address(self, file: str) -> str:
+        """Where a file is served; below a mirror as it lies in the folder of all data."""
+        mirror = os.environ.get("COOPOC_MIRROR", "")
+        return f"{mirror.rstrip('/')}/{quote(f'{self.name}/{file}')}" if mirror else self.files[file][0] or self.archive
 
 
 @cache
@@ -162,45 +175,35 @@ def fetch(name: str, *, offline: bool = False, timeout: float = TIMEOUT) -> Path
     number("timeout", timeout, 1e-3, allowed="s, above 0", hint="Give seconds.")
     from filelock import FileLock
 
-    folder, mirror = cache_folder() / name, os.environ.get("COOPOC_MIRROR", "")
-    absent = _absent(entry, folder)
+    absent = entry.absent()
     if absent and offline:
-        raise _offline(entry, folder, absent, mirror)
+        raise _offline(entry, absent)
     if absent:
         try:
-            folder.mkdir(parents=True, exist_ok=True)
-            with FileLock(folder / ".lock"):
-                _bring(entry, folder, mirror, timeout)
+            entry.folder.mkdir(parents=True, exist_ok=True)
+            with FileLock(entry.folder / ".lock"):
+                _bring(entry, timeout)
         except OSError as error:
             allowed = f"must be a folder that can be written: {said(error)}"
-            raise InputError("COOPOC_DATA", str(folder), allowed, "Set COOPOC_DATA to one.") from None
+            raise InputError("COOPOC_DATA", str(entry.folder), allowed, "Set COOPOC_DATA to one.") from None
     return entry.path
 
 
-def _absent(entry: Entry, folder: Path) -> list[str]:
-    """Files that are not there, or with other bytes."""
-    return [file for file, (_, _, digest) in entry.files.items() if _digest(folder / file) != digest]
-
-
-def _bring(entry: Entry, folder: Path, mirror: str, timeout: float) -> None:
+def _bring(entry: Entry, timeout: float) -> None:
     """Download what is absent: each file from its address or the mirror's, else the archive of all; and keep what has
     the right bytes."""
-    absent, unpacked = _absent(entry, folder), dict[str, bytes]()  # another process may have brought it meanwhile
-    if absent and entry.archive and not mirror:
-        unpacked = _unpacked(entry, absent, _downloaded(entry, entry.archive, folder / ARCHIVE, entry.bytes, timeout))
+    absent, unpacked = entry.absent(), dict[str, bytes]()  # another process may have brought it meanwhile
+    if absent and entry.address(absent[0]) == entry.archive:
+        data = _downloaded(entry, entry.archive, entry.folder / ARCHIVE, entry.bytes, timeout)
+        unpacked = _unpacked(entry, absent, data)
     for file in absent:
-        address, (_, size, digest), path = _address(entry, file, mirror), entry.files[file], folder / file
+        address, (_, size, digest), path = entry.address(file), entry.files[file], entry.folder / file
         data = unpacked[file] if unpacked else _downloaded(entry, address, path, size, timeout)
         if (actual := hashlib.sha256(data).hexdigest()) != digest:
             hint = f"It was removed: {address} serves another file."
             raise _other_bytes(f"{entry.name}: {path.name}", actual, digest, hint)
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
-
-
-def _address(entry: Entry, file: str, mirror: str) -> str:
-    """Where a file is served; below a mirror as it lies in the folder of all data."""
-    return f"{mirror.rstrip('/')}/{quote(f'{entry.name}/{file}')}" if mirror else entry.files[file][0] or entry.archive
 
 
 def _downloaded(entry: Entry, address: str, to: Path, size: int, timeout: float) -> bytes:
@@ -244,36 +247,31 @@ def _unpacked(entry: Entry, files: list[str], data: bytes) -> dict[str, bytes]:
         reason = f"{Path(missing[0]).name} is not in it with its {entry.files[missing[0]][1]} bytes"
     except (zipfile.BadZipFile, OSError) as error:
         reason = said(error)
-    raise _by_hand(entry, entry.archive, cache_folder() / entry.name / ARCHIVE, reason)
+    raise _by_hand(entry, entry.archive, entry.folder / ARCHIVE, reason)
 
 
 def _by_hand(entry: Entry, address: str, to: Path, reason: str) -> InputError:
     """The error of a download, with the address and the place of the file."""
     if address == entry.archive:
-        advice = f"unpack it in {cache_folder() / entry.name}, so that {next(iter(entry.files))} is below"
+        advice = f"unpack it in {entry.folder}, so that {next(iter(entry.files))} is below"
     else:
         advice = f"save it as {to}"
     hint = f"Fetch it by hand (the project: {entry.page}), {advice}, and run coopoc data get {entry.name} again."
     return InputError(f"{entry.name}: address", address, f"was not fetched: {reason}", hint)
 
 
-def _offline(entry: Entry, folder: Path, absent: list[str], mirror: str) -> InputError:
+def _offline(entry: Entry, absent: list[str]) -> InputError:
     """The error of what is absent and may not be downloaded."""
-    file = folder / absent[0]
+    file = entry.folder / absent[0]
     if file.exists():
         hint = f"Remove {file}; then run coopoc data get {entry.name} with a network."
         return _other_bytes(f"{entry.name}: {file.name}", _digest(file), entry.files[absent[0]][2], hint)
     more = f"offline, and {len(absent)} of {len(entry.files)} files are missing (coopoc data show {entry.name})"
-    return _by_hand(entry, _address(entry, absent[0], mirror), file, more)
+    return _by_hand(entry, entry.address(absent[0]), file, more)
 
 
 def _other_bytes(field: str, actual: str, digest: str, hint: str) -> InputError:
     return InputError(field, f"SHA-256 {actual}", f"must have SHA-256 {digest}", hint)
-
-
-def _size(path: Path) -> int:
-    """Bytes of a file, -1 without one."""
-    return path.stat().st_size if path.is_file() else -1
 
 
 def _digest(path: Path) -> str:

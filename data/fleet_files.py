@@ -45,9 +45,8 @@ def read_table(
         factor.get(name, 1.0) * (seconds if name == "t" else numeric)(frame, name, path.name) for name in used[1:]
     )
     numbers = np.column_stack(axes)
-    labels: dict[str, Any] = {"file": path.name, "name": path.stem, "source": source}
-    velocity = numbers[:, 3:] if has_velocity else None
-    return assemble(words(frame, "id", path.name), t, numbers[:, :3], velocity, **options, **labels)
+    velocity, ids = numbers[:, 3:] if has_velocity else None, words(frame, "id", path.name)
+    return assemble(ids, t, numbers[:, :3], velocity, **options, file=path.name, name=path.stem, source=source)
 
 
 def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
@@ -62,11 +61,11 @@ def write_table(fleet: Fleet, path: Path, velocity: bool = True) -> None:
     frame[["x", "y", "z"]] = fleet.position[step, column]
     if velocity:
         frame[list(VELOCITY)] = fleet.velocity[step, column]
-    if not text:
+    if text:
+        frame.to_csv(path, index=False, lineterminator="\n")
+    else:
         split = dict.fromkeys(frame.columns[2:], "BYTE_STREAM_SPLIT")
         frame.to_parquet(path, index=False, compression="zstd", use_dictionary=["id", "t"], column_encoding=split)
-    else:
-        frame.to_csv(path, index=False, lineterminator="\n")
 
 
 def tum_files(path: Path) -> list[Path]:
@@ -90,7 +89,7 @@ def read_tum(path: Path, **options: Any) -> Fleet:
     if not files:
         raise InputError("path", path, "must be a TUM file or a folder with .tum or .txt files", "Check the path.")
     poses = [tum.read_tum(file) for file in files]
-    ids = [file.stem for file, track in zip(files, poses, strict=True) for _ in range(len(track))]
+    ids = np.repeat([file.stem for file in files], [len(track) for track in poses]).tolist()
     t, x = (np.concatenate([getattr(track, field) for track in poses]) for field in ("stamps", "position"))
     source = f"TUM {path.name}, velocity by backward difference"
     return assemble(ids, t, x, **options, file=path.name, name=path.stem, source=source)

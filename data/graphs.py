@@ -1,5 +1,6 @@
 """PyFG -> Recording in body frames: odometry and ranges of several robots, on equal steps, with the file's truth."""
 
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +27,7 @@ def read_graph_log(path: Path, *, dt: float = 0.1) -> Log:
     summary = Summary(path.name, steps_in_words(recording), vehicles)
     summary.count("ranges", len(recording.links))
     summary.count("bearings", int(np.isfinite(recording.relative[0, :, 1]).sum()))
-    left = len(graph.ranges) + len(graph.relative_point) + int(_others(graph).sum()) - len(recording.links)
+    left = len(graph.ranges) + len(_vectors(graph)) - len(recording.links)
     where = "outside the steps that all robots share, beside another of the same pair and step, or between points"
     summary.refuse(f"edges {where}", left)
     summary.refuse("priors", len(graph.pose_prior) + len(graph.point_prior))
@@ -90,7 +91,7 @@ def _chained(graph: Graph, places: Ints) -> Floats:
     """(n, 3) m, m, rad, poses of a robot by its odometry, the first at the origin."""
     edges = graph.relative_pose
     edge_of = {(a, b): k for k, (a, b) in enumerate(edges.nodes.tolist())}
-    steps = list(zip(places[:-1].tolist(), places[1:].tolist(), strict=True))
+    steps = list(pairwise(places.tolist()))
     for first, second in steps:
         if (first, second) not in edge_of:
             actual = f"no odometry from {graph.names[first]} to {graph.names[second]}"

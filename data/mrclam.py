@@ -1,12 +1,12 @@
 """UTIAS MR.CLAM: reader, noise calibrated against Vicon on the first part, and the Recording in body frames."""
 
-import re
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
+import scipy
 
 from coopoc import Fleet, InputError, Recording, Sensors
 from coopoc.arrays import Bools, Floats, Ints, robust_std
@@ -98,8 +98,7 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
     if not dt > 0:
         raise InputError("dt", f"{dt} s", "must be > 0", "Give the sampling interval in seconds.")
     folder = given_path(folder)
-    named = [re.fullmatch(r"Robot([1-9])_Groundtruth\.dat", file.name) for file in folder.glob("Robot*")]
-    numbers = sorted(int(match[1]) for match in named if match) or [1]
+    numbers = [n for n in range(1, 10) if (folder / f"Robot{n}_Groundtruth.dat").exists()] or [1]
     truths = [_read(folder / f"Robot{n}_Groundtruth.dat", "time x y heading", strictly=True) for n in numbers]
     wheels = [_read(folder / f"Robot{n}_Odometry.dat", "time speed turn_rate") for n in numbers]
     for table in truths:
@@ -235,7 +234,7 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
         raise InputError("calibrate_s", f"{until:g} s", allowed, "Leave a part to score.")
     velocity = turned(log.fleet.velocity, -midway(log.heading))[first]
     rate = np.diff(log.heading, axis=0)[: len(velocity)] / dt
-    lag = min(LAGS, key=lambda lag: float(np.nanvar(rate - _delayed(log, log.turn_rate, lag)[first])))
+    lag = min(LAGS, key=lambda lag: np.nanvar(rate - _delayed(log, log.turn_rate, lag)[first]))
     wheel, turning = (_delayed(log, values, lag)[first] for values in (log.speed, log.turn_rate))
     speed, lost = _factors(window, velocity[..., 0], wheel, wheel * np.abs(turning))
     (turn,), slip = _factors(window, rate, turning), -lost / speed
@@ -244,7 +243,7 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
     forward, side, yaw = (summed(error, window) for error in (ahead, aside, off))
     ranges, bearings = _relative(log, until)
     sensors = Sensors(
-        velocity_std_ratio=forward / float(np.sqrt(np.mean(driven**2))),
+        velocity_std_ratio=forward / np.sqrt(np.mean(driven**2)),
         velocity_floor=side,
         yaw_rate_std=yaw,
         range_std=ranges,
@@ -324,7 +323,7 @@ def _relative(log: MrclamLog, until: float) -> tuple[float, float]:
 
 def _step_means(t: Floats, values: Floats, grid: Floats) -> Floats:
     """(T, C) mean over the step that ends at each instant: difference of the trapezoidal integral."""
-    integral = np.vstack([0 * values[:1], np.cumsum(np.diff(t)[:, None] * (values[1:] + values[:-1]) / 2, axis=0)])
+    integral = scipy.integrate.cumulative_trapezoid(values, t, axis=0, initial=0)
     on_grid = np.column_stack([np.interp(grid, t, column) for column in integral.T])
     mean = np.diff(on_grid, axis=0) / np.diff(grid)[:, None]
     return np.vstack([mean[:1], mean])

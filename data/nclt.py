@@ -41,29 +41,20 @@ def read_nclt(path: Path, summary: Summary, **_: Any) -> Rows:
         import torch
     except ImportError:
         raise MissingLibraryError("torch", "reading tensors", "'coopoc[learned]'") from None
+    parts = list[pd.DataFrame]()
     try:
-        drives = [
-            {name: np.asarray(drive[name], dtype=float)[:, :n] for name, n in FIELDS.items()}
-            | {"date": drive["data_date"]}
-            for drive in torch.load(path, map_location="cpu", weights_only=True)
-        ]
-        tables = [
-            pd.DataFrame({"t": np.arange(len(gps)), "x": gps[:, 0], "y": gps[:, 1], "speed": wheel.mean(axis=1)})
-            for gps, wheel in ((drive["filtered_gps"], drive["filtered_wheel"]) for drive in drives)
-        ]
-    except Exception as error:  # of torch and NumPy: another file meets them all
+        for drive in torch.load(path, map_location="cpu", weights_only=True):
+            arrays = {name: np.asarray(drive[name], dtype=float)[:, :n] for name, n in FIELDS.items()}
+            date, (x, y), (true_x, true_y) = drive["data_date"], arrays["filtered_gps"].T, arrays["ground_truth"].T
+            speed = arrays["filtered_wheel"].mean(axis=1)
+            table = pd.DataFrame({"t": np.arange(len(x)), "x": x, "y": y, "speed": speed})
+            truth = table[["t"]].assign(x=true_x, y=true_y, true=1.0)
+            headings = {date: arrays["imu_sensor"][:, 2], f"{date}-true-heading": arrays["theta_gt"][:, 0]}
+            for name, heading in headings.items():
+                parts += [table.assign(heading=heading, vehicle=name), truth.assign(vehicle=name)]
+        frame = pd.concat(parts, ignore_index=True)
+    except Exception as error:  # of torch, NumPy and pandas: another file meets them all
         allowed = f"must be a list of drives with {', '.join(FIELDS)} and data_date"
         raise InputError(path.name, said(error), allowed, "Take the file as it was published.") from None
     summary.assume("speed: the mean of both wheels; each drive twice, with its own and with its true heading")
-    parts = []
-    for drive, table in zip(drives, tables, strict=True):
-        x, y = drive["ground_truth"].T
-        for name, heading in (
-            (drive["date"], drive["imu_sensor"][:, 2]),
-            (f"{drive['date']}-true-heading", drive["theta_gt"][:, 0]),
-        ):
-            parts += [
-                table.assign(heading=heading, vehicle=name),
-                table[["t"]].assign(x=x, y=y, true=1.0, vehicle=name),
-            ]
-    return of_kinds(pd.concat(parts, ignore_index=True).sort_values("t", kind="stable"), path.name)
+    return of_kinds(frame.sort_values("t", kind="stable"), path.name)

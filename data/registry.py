@@ -25,8 +25,6 @@ from .mrclam import MAX_GAP, read_mrclam
 from .source import AUTO, parted, split, there
 
 FLEETS = Path(__file__).parent / "fleets"
-LISTED = ("name", "map", "map_licence", "vehicles", "steps", "dt", "sha256")
-"""Fields of a card in the list of bundled fleets."""
 
 
 def card(name: str) -> dict[str, Any]:
@@ -195,7 +193,8 @@ def list_datasets() -> list[dict[str, Any]]:
     >>> [row["name"] for row in list_datasets()][:2]
     ['town04', 'town10']
     """
-    return [{column: card(name)[column] for column in LISTED} for name in DATASETS]
+    columns = ("name", "map", "map_licence", "vehicles", "steps", "dt", "sha256")
+    return [{column: card(name)[column] for column in columns} for name in DATASETS]
 
 
 def convert(name_or_path: str | Path, out: str | Path, **options: Any) -> Fleet:

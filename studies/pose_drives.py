@@ -215,4 +215,4 @@ def _calibration(data: str, until: float) -> Calibration:
 def _begin(data: str) -> tuple[Floats | None, tuple[float, ...], str]:
     log = _part(data)
     assert isinstance(log, Log)
-    return begin_of(log, GATE)
+    return begin_of(log)

@@ -87,8 +87,7 @@ def check(log: Log) -> Check:
     result = on_time(first if log.recording.body else _without(first, drifts), alike=not errs)
     bar.update()
     result = replace(result, vehicles=_vehicles(result))
-    late = any(_beyond(row, "late_s", max(LATE, 0.5 * first.world.dt)) for row in result.vehicles)
-    if log.truth is not None and not late and not result.slack.any():
+    if log.truth is not None and not any(_late(first, row) for row in result.vehicles) and not result.slack.any():
         result = against_truth(result)
     elif log.recording.body is None:  # what errs says nothing of others
         result = _without(result, errs)
@@ -140,10 +139,9 @@ def _vehicles(c: Check) -> list[dict[str, Any]]:
 
 def _with_error(name: str, found: Estimate, k: int) -> dict[str, float | None]:
     """Two columns of a table: an estimate and its standard error."""
-    finite = bool(np.isfinite(found.error[k]))
-    return (
-        dict(zip((name, f"{name}_error"), map(float, (found.value[k], found.error[k])), strict=True)) if finite else {}
-    )
+    if not np.isfinite(found.error[k]):
+        return {}
+    return {name: float(found.value[k]), f"{name}_error": float(found.error[k])}
 
 
 def _rms(vectors: Floats) -> float | None:
@@ -213,8 +211,8 @@ def _of_vehicles(c: Check) -> list[str]:
         name, nis, distance, turn = (row[key] for key in ("vehicle", "nis", "fixes_per_odometry", "turned_deg"))
         column = c.world.ids.index(name)
         square = size * c.normalised[np.isfinite(c.normalised[:, column]), column]
-        usual = max(float(np.median(square)) / scipy.stats.chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
-        outliers = float(np.mean(square > OUTLYING**2 * usual)) if len(square) else 0.0
+        usual = max(np.median(square) / scipy.stats.chi2.median(size), 0.04) if len(square) > ENOUGH else np.inf
+        outliers = np.mean(square > OUTLYING**2 * usual) if len(square) else 0.0
         if outliers > max(OUTLIERS, SEVERAL / max(len(square), 1)):
             sentences.append(
                 f"{name}: {outliers:.1%} of the fixes lie beyond 5 standard deviations of their usual innovation: "
@@ -266,6 +264,11 @@ def _beyond(row: Mapping[str, Any], name: str, least: float) -> bool:
     return float(abs(row.get(name) or 0.0)) > max(least, SURELY * (row.get(f"{name}_error") or 0.0))
 
 
+def _late(c: Check, row: Mapping[str, Any]) -> bool:
+    """Whether the odometry of a row is late beside the truth."""
+    return _beyond(row, "late_s", max(LATE, 0.5 * c.world.dt))
+
+
 def _drifts(row: Mapping[str, Any]) -> bool:
     """Whether the odometry of a row errs."""
     errors = ("speed_excess", SCALE), ("turned", TURNED), ("yaw_rate_bias", DRIFT)
@@ -289,7 +292,7 @@ def _of_clocks(c: Check) -> list[str]:
         f"{row['vehicle']}: its odometry is {abs(row['late_s']):.3f} +- {row['late_s_error']:.3f} s "
         f"{'later' if row['late_s'] > 0 else 'earlier'} than the truth{_with_fixes(c, row)}"
         for row in c.vehicles
-        if _beyond(row, "late_s", max(LATE, 0.5 * c.world.dt)) and not c.ahead[c.world.ids.index(row["vehicle"])]
+        if _late(c, row) and not c.ahead[c.world.ids.index(row["vehicle"])]
     ]
 
 
@@ -338,7 +341,7 @@ def _of_fixes(c: Check) -> list[str]:
                 "they else follow: clocks differ, as by leap seconds, or files of two drives."
             )
             continue
-        if c.ahead[column] or _beyond(row, "late_s", max(LATE, 0.5 * c.world.dt)):
+        if c.ahead[column] or _late(c, row):
             continue
         derived = truth is None and rec.sensors.velocity_reading == "fixes"
         derived |= truth is None and _off(row)  # what draws positions aside draws them along a bend, too

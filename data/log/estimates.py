@@ -68,8 +68,7 @@ def factors(
     if len(y) < ENOUGH:
         return none
     if groups is not None:
-        frame = pd.DataFrame(all_of)
-        all_of = (frame - frame.groupby(groups).transform("mean")).to_numpy()
+        all_of = _centred(all_of, groups)
     y, x = all_of[:, 0], all_of[:, 1 : k + 1]
 
     def fitted(rows: Ints) -> Floats:
@@ -83,13 +82,19 @@ def factors(
 
     every = np.arange(len(y))
     value, *without = map(fitted, [every, *(np.setdiff1d(every, part) for part in np.array_split(every, BLOCKS))])
-    before, left = (float(np.median(np.abs(gap))) for gap in (y, y - x @ value))
+    before, left = (np.median(np.abs(gap)) for gap in (y, y - x @ value))
     if left > max(OUTLYING * noise, 0.5 * before):
         return none
     turn = np.eye(len(value)) if less is None else less(value)
     value, *without = (turn @ each for each in (value, *without))
     error = np.sqrt(BLOCKS - 1.0) * np.std(without, axis=0)
     return Estimate(value, np.where(np.any(x, axis=0), error, np.inf))
+
+
+def _centred(values: AnyArray, groups: Ints) -> AnyArray:
+    """Values (M, k) less the means of their groups (M,)."""
+    frame = pd.DataFrame(values)
+    return (frame - frame.groupby(groups).transform("mean")).to_numpy()
 
 
 def causes(c: Check) -> tuple[AnyArray, AnyArray, AnyArray]:
@@ -127,7 +132,7 @@ def moves(c: Check, column: int, means: int = 1) -> tuple[AnyArray, AnyArray]:
     rec = c.world
     fixes, velocity = plane(rec.gnss[0, :, column]), plane(rec.velocity[0, :, column])
     path, gaps = np.cumsum(np.nan_to_num(velocity) * rec.dt), np.cumsum(np.isnan(velocity))
-    walk = rec.dt * float(np.mean(rec.sensors.velocity_std(np.nan_to_num(rec.velocity), rec.sensors.velocity_floor)))
+    walk = rec.dt * np.mean(rec.sensors.velocity_std(np.nan_to_num(rec.velocity), rec.sensors.velocity_floor))
     at = np.flatnonzero(np.isfinite(fixes))
     parts = at[: len(at) // means * means].reshape(-1, means)
     parts = parts[gaps[parts[:, 0]] == gaps[parts[:, -1]]]
@@ -153,8 +158,8 @@ def moves(c: Check, column: int, means: int = 1) -> tuple[AnyArray, AnyArray]:
 def ratio_of_moves(c: Check, column: int) -> complex | None:
     """Displacements of a vehicle's fixes over those of its odometry, if one factor and their noise explain them."""
     moved, driven = moves(c, column)
-    ratio = complex(np.vdot(driven, moved)) / max(float(np.linalg.norm(driven)) ** 2, 1e-12)
-    most = max(2 * c.fix_noise * (2 * len(moved)) ** 0.5, (1 - ALIKE**2) ** 0.5 * float(np.linalg.norm(moved)))
+    ratio: complex = np.vdot(driven, moved) / max(float(np.linalg.norm(driven)) ** 2, 1e-12)
+    most = max(2 * c.fix_noise * (2 * len(moved)) ** 0.5, (1 - ALIKE**2) ** 0.5 * np.linalg.norm(moved))
     return ratio if len(moved) and np.linalg.norm(moved - ratio * driven) < most else None
 
 
@@ -170,16 +175,16 @@ def odometry(c: Check, column: int) -> Estimate:
     noise = np.nan_to_num(rec.sensors.velocity_std(velocity, rec.sensors.velocity_floor))
     if truth is None and body is not None:
         value, error = c.lasting[:, column]
-        attenuation = np.square(noise).sum() / max(float(np.nansum(np.square(velocity))), 1e-12)
+        attenuation = np.square(noise).sum() / max(np.nansum(np.square(velocity)), 1e-12)
         return Estimate(value, np.hypot(error, [attenuation, 0.0]))
     if truth is None:
         moved, driven = moves(c, column)
         if len(moved) < ENOUGH:
             means = int(np.isfinite(rec.gnss[0, :, column, 0]).sum()) // (3 * ENOUGH // 2)
             moved, driven = moves(c, column, max(means, 2))
-        square = max(float(np.square(np.abs(driven)).sum()), 1e-12)
+        square = max(np.square(np.abs(driven)).sum(), 1e-12)
         value, error = factors(moved - driven, np.stack([driven, 1j * driven], axis=1), 2**0.5 * c.fix_noise)
-        attenuation = (float(np.linalg.norm(noise)) * rec.dt) ** 2 / square  # by noise of the cause
+        attenuation = (np.linalg.norm(noise) * rec.dt) ** 2 / square  # by noise of the cause
         turned = (1 + complex(*value)) * (1 + attenuation)
         return Estimate(_polar(1 / turned), np.hypot(error, attenuation) / abs(turned) ** 2) if turned else none
     path = plane(truth.position[:, column])
@@ -192,7 +197,7 @@ def odometry(c: Check, column: int) -> Estimate:
     x = np.stack([true, 1j * true, np.gradient(true, rec.dt)], axis=1)
     used = np.isfinite(odometer + x.sum(axis=1))
     used &= np.maximum(np.abs(true), np.abs(odometer)) > MOVING  # standing, nothing errs
-    value, error = factors((odometer - true)[used], x[used], float(np.linalg.norm(noise)) / len(noise) ** 0.5)
+    value, error = factors((odometer - true)[used], x[used], np.linalg.norm(noise) / len(noise) ** 0.5)
     late = -value[2] / max(1 + value[0], 0.1)
     value = np.append(_polar(1 + complex(*value[:2])), late)
     error[2] = error[2] if abs(late) < FAST else np.inf  # what is linear in a lag holds for small ones
@@ -209,8 +214,8 @@ def _polar(turned: complex) -> Floats:
     return np.array([abs(turned) - 1.0, np.angle(turned)]) if turned else np.zeros(2)
 
 
-def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
-    """By what each vehicle's clock is ahead of that of a reference, by default of one that most agree with, s; by what
+def clocks(c: Check, reference: int | None) -> tuple[Estimate, AnyArray]:
+    """By what each vehicle's clock is ahead of that of a reference, or of one that most agree with, s; by what
     share ranges are too long; and by what they are late, s: (N + 2,), and what a range or direction misses for 1 of
     each (L, 2, N + 2).
 
@@ -234,7 +239,7 @@ def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
     made, then = made_by(velocity), made_by(following(c, velocity))
     there = np.isfinite(c.relative[:, 0] + gap[:, 0])
     pairs = np.sort([links.observer, links.neighbour], axis=0)
-    noise = float(np.median(c.expected[there, 0])) if there.any() else 0.0
+    noise = np.median(c.expected[there, 0]) if there.any() else 0.0
     x, z, groups, less = made[there, 0], then[there, 0], (pairs[0] * size + pairs[1])[there], np.eye(size + 2)
 
     def against(value: Floats) -> Floats:
@@ -251,7 +256,7 @@ def clocks(c: Check, reference: int | None = None) -> tuple[Estimate, AnyArray]:
 def _of_filters(c: Check, there: Bools, x: Floats, z: Floats, pairs: Ints, less: Floats) -> Floats:
     """Standard errors (k,) of factors of causes x (M, k) by instruments z (M, k), less means of pairs (M,), times
     `less` (k, k), by errors of the filters that decay in the time that a fix is remembered."""
-    x, z = (each - pd.DataFrame(each).groupby(pairs).transform("mean").to_numpy() for each in (x, z))
+    x, z = _centred(x, pairs), _centred(z, pairs)
     gain = z @ np.linalg.pinv(z.T @ x).T @ less.T
     keep = np.exp(-2.0 / max(share(c) * len(c.world.t), 1e-9))
     position = np.maximum(c.expected[there, 0] ** 2 - c.world.sensors.range_std**2, 0.0)
@@ -266,7 +271,7 @@ def _of_filters(c: Check, there: Bools, x: Floats, z: Floats, pairs: Ints, less:
 
 def share(c: Check) -> float:
     """Share of the variance of filters that the mean over the drive keeps: their errors last for some time."""
-    fixes, noise = np.isfinite(c.normalised).sum(axis=0), float(np.square(c.world.sensors.fix_std[:2]).mean())
+    fixes, noise = np.isfinite(c.normalised).sum(axis=0), np.square(c.world.sensors.fix_std[:2]).mean()
     there = np.isfinite(c.variance[..., 0]).sum(axis=0)
     variance = np.nansum(c.variance[..., :2], axis=(0, 2)) / np.maximum(2 * there, 1)
     ratio = (variance + noise) / np.maximum(variance * fixes, 1e-12)
@@ -304,7 +309,7 @@ def offsets(c: Check, k: int, stated: float) -> dict[str, tuple[float, float]]:
     made, lasts = {}, share(c)
     for pair, value, expected, slack in by_pair(c, k):
         (offset, error), position = median(value), max(float(np.mean(expected**2)) - stated**2, 0.0)
-        lasting = stated**2 / len(value) + position * lasts + float(np.square(slack.mean(axis=0)).sum())
+        lasting = stated**2 / len(value) + position * lasts + np.square(slack.mean(axis=0)).sum()
         made[pair] = offset, float(np.sqrt(error**2 + lasting))
     return made
 
@@ -349,7 +354,7 @@ def against_truth(c: Check) -> Check:
         return c
     marks = np.isin(np.arange(len(c.world.ids)), c.world.landmarks)
     off, (_, _, velocity), _ = causes(c)
-    fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * c.fix_noise
+    fits = np.array([_beside(*one) for one in zip(off.T, velocity.T, strict=True)]) < 3 * np.hypot(*noise.fix_std[:2])
     x = np.where(marks[:, None], c.x, np.where(fits[:, None], truth.position, np.nan))
     residual, stated = residual_of(c.world, x)[1], [noise.range_std, noise.world_azimuth_std, noise.inclination_std]
     used = np.isfinite(residual) & (c.log.recording.body is None or np.arange(3) == 0)

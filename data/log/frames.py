@@ -14,7 +14,7 @@ from coopoc.world.fleet import columns
 from coopoc.world.links import wrap
 
 from ..assemble import PLANE_STD
-from .units import ANGLES, KINDS, Rows, Summary, in_group, place
+from .units import ANGLES, KINDS, Rows, Summary, in_group, only, place, stated_std
 
 if TYPE_CHECKING:
     from .motion import Member
@@ -97,7 +97,7 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
     none = _nowhere(rows)
     summary.refuse("fixes at zero, which are none", rows[none])
     rows = rows[~none]
-    geodetic, metric = rows["kind"].isin([*ENU]), rows[rows["kind"].isin(["x", "y"])]
+    geodetic, metric = rows["kind"].isin([*ENU]), only(rows, "x", "y")
     if not geodetic.any():
         return rows, origin
     if origin is None and len(metric):
@@ -122,7 +122,7 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
 
 def _nowhere(rows: Rows) -> Bools:
     """(L,) fixes of receivers that have none: at 0 N 0 E, or at x = y = 0 far from all others of the vehicle."""
-    key, some = ["t", "vehicle"], rows[rows["kind"].isin(["latitude", "longitude", "x", "y"])]
+    key, some = ["t", "vehicle"], only(rows, "latitude", "longitude", "x", "y")
     zero = some[some["value"] == 0.0].drop_duplicates([*key, "kind"])
     zero = zero[zero.duplicated(key, keep=False)]
     others = some[~some.set_index(key).index.isin(zero.set_index(key).index)]
@@ -152,9 +152,9 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
     rare = _lasting(rows, square, dt)
 
     def of(*names: str, default: float, unit: str) -> float:
-        stated = rows["std"][rows["kind"].isin(names)].dropna()
-        if len(stated):
-            return float(np.sqrt((stated**2).mean()))
+        stated = stated_std(rows, *names)
+        if stated > 0.0:
+            return stated
         if used & set(names):
             summary.assume("standard deviations of {}: none was logged", f"{default:.3g} {unit} ({names[0]})")
         return default
@@ -181,11 +181,11 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
         noise["heading_std"] = derived
         summary.assume(f"{derived:.2g} rad as the noise of headings that are derived, by which bearings are turned")
     if climbs > 0.0:
-        noise["climb_std"] = float(np.sqrt(climbs / dt))
+        noise["climb_std"] = np.sqrt(climbs / dt)
         summary.assume(f"heights change by {np.sqrt(10.0 * climbs):.2g} m in 10 s, as fixes show: no vz was measured")
     ratio = 0.0
     if drifts > 0.0:
-        floor = max(float(np.sqrt(drifts / dt)), rare * of(*MOTION, default=base.velocity_floor, unit="m/s"))
+        floor = max(np.sqrt(drifts / dt), rare * of(*MOTION, default=base.velocity_floor, unit="m/s"))
         summary.assume(
             f"{floor:.2g} m/s as the noise of a velocity, as the fixes of what has none, or no heading, show it"
         )
@@ -207,7 +207,7 @@ def assumed(rows: Rows, planar: bool, body: bool, summary: Summary, dt: float, m
 def fix_factors(rows: Rows, ids: Sequence[str]) -> tuple[float, ...]:
     """(N,) by which the fixes of each member err more than those of all, in the root mean square of what was logged;
     none where these are alike."""
-    fixes = rows[rows["kind"].isin(["x", "y"])]
+    fixes = only(rows, "x", "y")
     square = np.square(fixes["std"])
     factor = np.sqrt(square.groupby(fixes["vehicle"]).mean() / square.mean()).reindex(ids).fillna(1.0)
     return tuple(factor.tolist()) if (np.abs(np.log(factor)) > ALIKE).any() else ()
@@ -221,21 +221,26 @@ def _lasting(rows: Rows, square: "pd.Series[float]", dt: float) -> float:
     """
     steps, noise = dict[str, float](), dict[str, float]()
     for name, kinds, usual in (("motion", MOTION, 0.0), ("fix", ("x",), Sensors().gnss_std[0])):
-        own = rows[rows["kind"].isin(kinds)].drop_duplicates(["vehicle", "t"]).sort_values("t")
-        steps[name] = float(np.fmax(own.groupby("vehicle")["t"].diff().median() / dt, 1.0))
-        stated = square.reindex(kinds).mean()
-        usual = usual or Sensors().velocity_std_ratio * float(np.nan_to_num(own["value"].abs().mean()))
-        noise[name] = float(np.sqrt(stated)) if stated > 0.0 else usual
+        steps[name], stated = _apart(rows, kinds, dt), square.reindex(kinds).mean()
+        usual = usual or Sensors().velocity_std_ratio * np.nan_to_num(_once(rows, kinds)["value"].abs().mean())
+        noise[name] = np.sqrt(stated) if stated > 0.0 else usual
     held = noise["fix"] * steps["fix"] ** 0.5 / max(noise["motion"] * dt, 1e-12)
     return float(np.sqrt(min(max(held ** (2 / 3), 1.0), steps["motion"])))
+
+
+def _once(rows: Rows, kinds: Sequence[str]) -> Rows:
+    """One of these kinds for each vehicle and time."""
+    return only(rows, *kinds).drop_duplicates(["vehicle", "t"]).sort_values("t")
+
+
+def _apart(rows: Rows, kinds: Sequence[str], dt: float) -> float:
+    """Steps from one measurement of these kinds to the next, 1 at least."""
+    return float(np.fmax(_once(rows, kinds).groupby("vehicle")["t"].diff().median() / dt, 1.0))
 
 
 def _across(speed: float, heading: float, rows: Rows, dt: float) -> float:
     """Standard deviation m/s of each axis of a velocity that is a speed v turned by a measured heading: the mean of the
     variances along, s_v^2, and across, v^2 s_h^2 n, where a heading's error lasts for the n steps to the next one; at
     least s_v."""
-    turned = rows[rows["kind"] == "heading"].sort_values("t").drop_duplicates(["vehicle", "t"])
-    intervals = turned.groupby("vehicle")["t"].diff().dropna()
-    interval = float(intervals.median()) if len(intervals) else dt
-    across = float((rows["value"][rows["kind"] == "speed"] ** 2).mean()) * heading**2 * max(interval / dt, 1.0)
+    across = (only(rows, "speed")["value"] ** 2).mean() * heading**2 * _apart(rows, ["heading"], dt)
     return max(speed, float(np.sqrt((speed**2 + across) / 2)))

@@ -31,17 +31,22 @@ class Signal(NamedTuple):
     value: Floats
 
 
+def unknown(at: Floats) -> Floats:
+    """(G,) headings of what has none: NaN."""
+    return np.full(len(at), np.nan)
+
+
 class Course(NamedTuple):
     """A heading.
 
     Attributes:
-        at: function from times (G,) s to headings (G,) rad, NaN where unknown; None if there is none at all.
+        at: function from times (G,) s to headings (G,) rad, NaN where unknown.
         source: what it is the course of, "" where it was measured.
         wanders: m^2/s, by which a position that is predicted with it becomes uncertain.
         unsure: rad, standard deviation of a heading that was derived.
     """
 
-    at: HeadingAt | None = None
+    at: HeadingAt = unknown
     source: str = ""
     wanders: float = 0.0
     unsure: float = 0.0
@@ -83,12 +88,14 @@ def heading_at(heading: Signal, yaw_rate: Signal | None, gap: float) -> HeadingA
     """Function from times (G,) s to headings (G,) rad, NaN where unknown.
 
     Between measured headings h_j it is W(t) + the line through h_j - W(t_j), with the integral W of the yaw rate, which
-    is zero where there is none. Without a yaw rate, gaps longer than `gap` are unknown.
+    is zero where there is none. Without a yaw rate, gaps longer than `gap` are unknown; without a heading all is.
 
     >>> heading = heading_at(Signal(np.array([0.0, 1]), np.array([[3.0], [-3.1]])), None, 2.0)
     >>> heading(np.array([0.5, 9.0])).round(3).tolist()
     [3.092, nan]
     """
+    if not len(heading.t):
+        return unknown
     offset = np.unwrap(heading.value[:, 0] - _angle(yaw_rate, heading.t))
     sampled = heading.t if yaw_rate is None else yaw_rate.t
 
@@ -121,7 +128,7 @@ def heading_of_gyro(way: Reckoning) -> Course | None:
     """
     t, state, cov, level, samples = way.fixes.t, np.zeros(2), np.zeros((2, 2)), 1.0, list[tuple[float, ...]]()
     for last, j, moved, driven in way.far_apart():
-        angle, variance, since = float(np.angle(moved / driven)), 2 * way.std**2 / abs(driven) ** 2, t[j] - t[last]
+        angle, variance, since = np.angle(moved / driven), 2 * way.std**2 / abs(driven) ** 2, t[j] - t[last]
         h = np.array([1.0, -0.5 * since])
         if not samples:
             state, cov = np.array([angle, 0.0]), np.diag([variance, GYRO_BIAS**2])
@@ -130,7 +137,7 @@ def heading_of_gyro(way: Reckoning) -> Course | None:
             ahead = np.array([[1.0, later], [0.0, 1.0]])
             state, cov = ahead @ state, ahead @ cov @ ahead.T
             cov += later * np.diag([GYRO_WALK**2, GYRO_BIAS**2 / GYRO_LASTS])
-            gap = float(wrap(np.array(angle - h @ state)))
+            gap = wrap(angle - h @ state)
             level += (max(gap**2 / (h @ cov @ h + variance), 0.5) - level) / 10
             gain = cov @ h / (h @ cov @ h + max(level, 1.0) * variance)
             state, cov = state + gain * gap, cov - np.outer(gain, cov @ h)
@@ -167,7 +174,7 @@ def heading_of_all(way: Reckoning) -> Course | None:
             samples.append(np.array([t[j], np.angle(turn), way.std**2 / spread]))
     if not samples:
         return None
-    since, pace = np.array(samples), float(np.median(np.abs(way.speed.value)))
+    since, pace = np.array(samples), np.median(np.abs(way.speed.value))
     offset, variance = Signal(since[:, 0], since[:, 1:2]), float(np.median(since[:, 2]))
     return Course(
         lambda at: wrap(held(offset, at)[:, 0] + _angle(way.yaw_rate, at)),
@@ -183,7 +190,7 @@ def mirrored(way: Reckoning) -> bool:
     if len(spans) < 3:
         return False
     a, b = (np.sin(np.angle(ends[1:] * ends[:-1].conj())) for ends in np.array(spans).T)
-    return bool(a @ b < -max(0.5 * float(np.linalg.norm(a)), TURNS) * float(np.linalg.norm(b)))
+    return bool(a @ b < -max(0.5 * float(np.linalg.norm(a)), TURNS) * np.linalg.norm(b))
 
 
 def held(signal: Signal, at: Floats) -> Floats:

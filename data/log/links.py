@@ -1,8 +1,7 @@
 """Association of relative measurements and messages of a log with steps and pairs: the links of a Recording."""
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -12,9 +11,8 @@ from coopoc.arrays import Bools, Floats, Ints
 from coopoc.world.links import spherical, wrap
 from coopoc.world.sensing import schedule
 
-from ..assemble import first_of_each
-from .motion import COURSE, Member, Steps
-from .units import Rows, Summary, in_group
+from .motion import COURSE, Member, Steps, stacked
+from .units import Rows, Summary, in_group, only
 
 COMPONENTS: Mapping[str, int] = {"range": 0, "azimuth": 1, "bearing": 1, "inclination": 2}
 PAIR = ["step", "observer", "neighbour"]
@@ -24,23 +22,7 @@ RADAR = "{} ranges beside a direction count for who measured them alone: a radar
 TWO_WAY = "{} ranges count for the other end, too: two-way ranging is known to both ends (else mutual=False)"
 
 
-class Linked(NamedTuple):
-    """Links of a log, sorted as `Links` wants them.
-
-    Attributes:
-        links: who measured whom, or received a message of whom.
-        relative: (L, 3) m, rad, rad, NaN where it was not measured.
-        broadcasts: (T, N) True where a vehicle sends.
-        arrival: (L,) step of arrival, -1 where lost or not sent.
-    """
-
-    links: Links
-    relative: Floats
-    broadcasts: Bools
-    arrival: Ints
-
-
-def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool) -> Linked:
+def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool) -> tuple[Links, Floats, Bools, Ints]:
     """Links of all relative measurements and messages.
 
     A bearing becomes an azimuth by the heading of its observer at its own time; in body frames an azimuth becomes a
@@ -50,9 +32,13 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
     heights are all 0, an inclination that was not measured is pi/2 beside a range and a direction. A message at a step
     without a measurement is a link without one. Where no message was logged at all, every vehicle sends at every step
     and all arrives at once.
+
+    Returns:
+        Who measured whom, or received a message of whom; (L, 3) m, rad, rad, NaN where it was not measured; (T, N) True
+        where a vehicle sends; (L,) step of arrival, -1 where lost or not sent.
     """
-    there = np.stack([np.isfinite(member.velocity[:, 0]) for member in members.values()], axis=1)
-    summary, sent = steps.summary, rows[rows["kind"] == "message"]
+    there = np.isfinite(stacked(members, "velocity")[..., 0])
+    summary, sent = steps.summary, only(rows, "message")
     measured = _measured(rows[in_group(rows, "relative")], members, there, steps)
     if mutual:
         stands = np.array([member.stands for member in members.values()])
@@ -82,7 +68,7 @@ def linked(rows: Rows, members: Mapping[str, Member], steps: Steps, mutual: bool
         arrival, broadcasts = links.step.copy(), there
         if len(links):
             summary.assume("no messages were logged: every vehicle sends at every step, and all arrive at once")
-    return Linked(links, relative, broadcasts, arrival)
+    return links, relative, broadcasts, arrival
 
 
 def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logged: bool = True) -> Recording:
@@ -100,7 +86,8 @@ def under(recording: Recording, v2x: V2X, *, runs: int = 1, seed: int = 0, logge
     links, marks = recording.links, list(recording.landmarks)
     marked = np.isin(links.neighbour, marks)
     near = np.flatnonzero(~(recording.relative[0, :, 0] > v2x.radius) & ~marked)
-    near = near[first_of_each(v2x.max_neighbours, links.step[near], links.observer[near])]
+    rank = pd.DataFrame({"step": links.step[near], "observer": links.observer[near]}).groupby(["step", "observer"])
+    near = near[rank.cumcount() < v2x.max_neighbours]
     kept = np.union1d(near, np.flatnonzero(marked))
     fewer = Links(links.step[kept], links.observer[kept], links.neighbour[kept])
     measured = {name: getattr(recording, name)[:, kept] for name in ("relative", "arrival")}
@@ -140,7 +127,7 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     step, lag = steps.nearest(t)
     for column, (name, member) in enumerate(members.items()):
         of_observer = turned & (observer == column)
-        heading = np.nan if member.heading.at is None else member.heading.at(t[of_observer])
+        heading = member.heading.at(t[of_observer])
         value[of_observer] += -heading if body else heading
         if of_observer.any() and member.heading.source:
             summary.assume(COURSE.format("{}", member.heading.source), name)
@@ -162,9 +149,9 @@ def _measured(rows: Rows, members: Mapping[str, Member], there: Bools, steps: St
     summary.refuse(reason, table[again].sort_index())
     table = table[~again]
     words = ("ranges", "bearings" if body else "azimuths", "inclinations or elevations")
-    for k, number in table["component"].value_counts().sort_index().items():
-        summary.count(words[int(str(k))], int(number))
-    moved: pd.DataFrame = table.assign(value=_to_step(table, list(members.values()), steps))
+    for word, number in zip(words, np.bincount(table["component"], minlength=3).tolist(), strict=True):
+        summary.count(word, number)
+    moved: pd.DataFrame = table.assign(value=_to_step(table, members, steps))
     return moved[[*PAIR, "component", "value"]]
 
 
@@ -190,15 +177,13 @@ def _messages(rows: Rows, ids: Collection[str], there: Bools, steps: Steps) -> t
     return table.groupby(PAIR)[["arrival"]].min().replace(np.inf, -1), broadcasts
 
 
-def _to_step(table: pd.DataFrame, members: Sequence[Member], steps: Steps) -> Floats:
+def _to_step(table: pd.DataFrame, members: Mapping[str, Member], steps: Steps) -> Floats:
     """Values (M,) at their steps: z + f(g) - f(g + lag du), f being the range, azimuth or inclination of the vector g
     from the observer to the neighbour at the step, from the last fixes and the odometry since, and du the difference of
     their velocities in the world. Nothing is moved where these are not known, or g or the range is not far longer than
     lag du. In body frames a bearing grows by lag w, too, with the observer's yaw rate w.
     """
-    velocity, fixes, rate = (
-        np.stack([getattr(member, name) for member in members], axis=1) for name in ("moves", "gnss", "yaw_rate")
-    )
+    velocity, fixes, rate = (stacked(members, name) for name in ("moves", "gnss", "yaw_rate"))
     step, observer, neighbour, component = (table[name].to_numpy() for name in (*PAIR, "component"))
     value, lag = table["value"].to_numpy(), table["lag"].to_numpy()
     after = np.minimum(step + (lag > 0), len(velocity) - 1)

@@ -1,6 +1,6 @@
 """Resampling of one member of a log to steps: fixes, velocity or speed and yaw rate, heading, presence."""
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -25,8 +25,9 @@ from .heading import (
     heading_of_gyro,
     integral,
     mirrored,
+    unknown,
 )
-from .units import Rows, Summary, in_group, place
+from .units import Rows, Summary, in_group, only, place, stated_std
 
 MOVING = 1.0
 """m/s, least speed at which a course is a heading."""
@@ -126,6 +127,11 @@ class Member:
     climbs: float = 0.0
 
 
+def stacked(members: Mapping[str, Member], field: str) -> Floats:
+    """(T, N, ...) a field of all members."""
+    return np.stack([getattr(member, field) for member in members.values()], axis=1)
+
+
 def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 1) -> Signal:
     """Rows of one vehicle as samples (M, C) of some kinds at one time each, NaN where a kind is missing.
 
@@ -135,15 +141,15 @@ def samples(rows: Rows, names: Sequence[str], summary: Summary, required: int = 
         summary: counts samples without the first `required` kinds.
         required: how many of the kinds a sample needs.
     """
-    rows = rows[rows["kind"].isin(names)]
+    rows = only(rows, *names)
     table = rows.pivot(index="t", columns="kind", values="value").reindex(columns=list(names))
     whole = table[list(names[:required])].notna().all(axis=1)
     reason = f"incomplete rows, without all of {', '.join(names[:required])} at one time"
-    summary.refuse(reason, rows[rows["t"].isin(table.index[~whole]) & rows["kind"].isin(names[:required])])
+    summary.refuse(reason, only(rows[rows["t"].isin(table.index[~whole])], *names[:required]))
     return Signal(table.index[whole].to_numpy(), table[whole].to_numpy(copy=True))
 
 
-def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
+def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     """A vehicle, or what stands: a road-side unit, in body frames a landmark, has fixes at one instant and no odometry.
 
     With an arm a, a fix z becomes that of the reference point, z - R(h) a; h is the heading that was measured, else the
@@ -169,15 +175,16 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
     none: Floats = np.full(len(grid), np.nan)
     if len(fixes.t) and again[1:].all() and not in_group(rows, "odometry").any():
         text = f"stands at ({', '.join(f'{v:.1f}' for v in fixes.value[0])}) m{', arm left in' * (arm is not None)}"
-        heading = Course(heading_at(measured, None, np.inf) if len(measured.t) and not body else None)
+        heading = Course(unknown if body else heading_at(measured, None, np.inf))
         return Member(still + fixes.value[0], still, heading, text, True, still[:, 0], none, still)
-    way = Reckoning(fixes, speed, turn, fix_std(rows))
+    std = stated_std(rows, "x", "y")
+    way = Reckoning(fixes, speed, turn, std if std > 0.0 else Sensors().gnss_std[0])
     shown = velocity_of_fixes(way, steps)
     if arm is not None:
         off = checked(f"antenna of {name}", arm, "(3,)", (3,)) * [1, 1, 1 - steps.planar]
         world, ever = samples(rows, ("vx", "vy"), Summary(), 2), steps._replace(max_gap=np.inf)
         pointing = _heading(measured, world, shown, way, ever)
-        if pointing.at is None or not np.isfinite(off).all():
+        if pointing.at is unknown or not np.isfinite(off).all():
             hint = f"Log heading or compass_deg, or vx and vy; a course counts above {MOVING:g} m/s."
             raise InputError(f"antenna of {name}", f"{arm} m", "needs numbers, and a heading of the vehicle", hint)
         by = f"the course of the {pointing.source}" if pointing.source else "its heading"
@@ -193,11 +200,11 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any = None) -> Member:
             if not len(signal.t):
                 allowed, hint = "must have speeds and yaw rates in body frames", 'Log both, or pass frame="world".'
                 raise InputError(f"vehicle {name}", f"no {kind}", allowed, hint)
-        summary.refuse("world velocities in body frames", rows[rows["kind"].isin(["vx", "vy", "vz"])])
-        signals, heading = [speed, turn], Course(heading_at(measured, turn, np.inf) if len(measured.t) else None)
-        along = _heading(measured, None, shown, way, steps).at
+        summary.refuse("world velocities in body frames", only(rows, "vx", "vy", "vz"))
+        signals, heading = [speed, turn], Course(heading_at(measured, turn, np.inf))
+        along = _heading(measured, None, shown, way, steps)
         forward, rate = step_means(speed, grid), step_means(turn, grid)[:, 0]
-        moves: Floats = forward * turned(AHEAD, none if along is None else along(grid))
+        moves: Floats = forward * turned(AHEAD, along.at(grid))
         velocity: Floats = forward * AHEAD
     else:
         moved, times, heading = _in_world(name, rows, measured, shown, way, steps)
@@ -241,7 +248,7 @@ def climbing(fixes: Signal) -> float:
         now = np.flatnonzero(later < len(t))
         if len(now) < 3:
             break
-        near, far = (float(np.quantile(np.abs(gap), 0.75) / 1.15) ** 2 for gap in (np.diff(z), z[later[now]] - z[now]))
+        near, far = ((np.quantile(np.abs(gap), 0.75) / 1.15) ** 2 for gap in (np.diff(z), z[later[now]] - z[now]))
         near *= 1.0 + 2.0 / len(now) ** 0.5
         wander = max(far - near, 0.0) / float(np.mean(t[later[now]] - t[now]))
         if far > 2.0 * near:
@@ -255,18 +262,18 @@ def _in_world(
     """Velocity, None where the fixes have to show it; the samples that it is of; and the heading, by `measured` ones or
     derived."""
     summary, speed = steps.summary, way.speed
-    world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), rows[rows["kind"] == "speed"]
+    world, speeds = samples(rows, ("vx", "vy", "vz"), summary, 2), only(rows, "speed")
     heading = _heading(measured, world, shown, way, steps)
     if len(world.t):
         summary.refuse("speeds where a world velocity is given", speeds)
         return Signal(world.t, np.nan_to_num(world.value)), world, heading._replace(wanders=0.0)
-    if len(speed.t) and (heading.at is not None or abs(speed.value.mean()) < STANDS):
+    if len(speed.t) and (heading.at is not unknown or abs(speed.value.mean()) < STANDS):
         if heading.source:
             summary.assume(COURSE.format("{}", heading.source), name)
         at = np.unique(np.concatenate([speed.t, *(speed.t[:-1] + part * np.diff(speed.t) for part in BETWEEN)]))
         pace = np.interp(at, speed.t, speed.value[:, 0])
-        angle = np.full(len(at), np.nan) if heading.at is None else heading.at(at)
-        kept, own = np.isfinite(angle) | (np.abs(pace) < STANDS) | (heading.at is None), np.isin(at, speed.t)
+        angle = heading.at(at)
+        kept, own = np.isfinite(angle) | (np.abs(pace) < STANDS) | (heading.at is unknown), np.isin(at, speed.t)
         summary.refuse("speeds without a heading", speeds[speeds["t"].isin(at[own & ~kept])])
         velocity = pace[:, None] * np.nan_to_num(turned(AHEAD, angle))
         return Signal(at[kept], velocity[kept]), Signal(at[own & kept], at), heading
@@ -306,7 +313,7 @@ def _longest(there: Bools, grid: Floats) -> str:
     gaps = np.diff(grid[at])
     if not len(gaps) or gaps.max() < 1.0:
         return ""
-    k = int(np.argmax(gaps))
+    k = np.argmax(gaps)
     return f", longest gap {gaps[k]:.1f} s from {grid[at[k]] - grid[0]:.1f} s on"
 
 
@@ -322,12 +329,6 @@ def step_means(signal: Signal, grid: Floats) -> Floats:
     return means
 
 
-def fix_std(rows: Rows) -> float:
-    """m, of a fix on an axis of the plane as it was logged, else as it is assumed."""
-    stated = rows["std"][rows["kind"].isin(["x", "y"])].dropna()
-    return float(np.sqrt((stated**2).mean())) if len(stated) else Sensors().gnss_std[0]
-
-
 def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
     """Velocity by fixes, by a Kalman filter (`kernels.constant_velocity`). It is known by
     four of them at the latest, or as well as by two that are as far apart as nine in ten."""
@@ -336,7 +337,7 @@ def velocity_of_fixes(way: Reckoning, steps: Steps) -> Shown:
         none: Floats = np.zeros(len(fixes.t))
         return Shown(Signal(fixes.t, np.zeros_like(fixes.value)), none > 0, 0.0, none)
     between = np.diff(fixes.t)
-    interval, longest = float(np.median(between)), float(np.quantile(between, 0.9))
+    interval, longest = float(np.median(between)), np.quantile(between, 0.9)
     velocity, growth, spread, proved = constant_velocity(
         fixes.t, fixes.value, interval, steps.gap(fixes.t) + SAME, variance, UNKNOWN_SPEED, BANK
     )
@@ -360,8 +361,7 @@ def _nearest_of_each(signal: Signal, there: Bools, steps: Steps) -> tuple[Ints, 
     """Index of the sample nearest in time to each step that has one while the member is there, these steps, and how
     much later the samples are, s."""
     step, lag = steps.nearest(signal.t)
-    here = np.where(there[step], step, -1)
-    kept = nearest(np.abs(lag), here, step, step)
+    kept = nearest(np.abs(lag), np.where(there[step], step, -1), step)
     return kept, step[kept], lag[kept]
 
 
@@ -376,7 +376,7 @@ def _fixes_on_steps(
     way = np.cumsum(np.where(moves[:, None], velocity, 0.0) * steps.dt, axis=0)[nearest]
     before = np.maximum.accumulate(np.where(again, 0, np.arange(len(again))))
     held = again & there[nearest] & (np.linalg.norm(way - way[before], axis=1) > std)
-    rows = rows[rows["kind"].eq("x")]
+    rows = only(rows, "x")
     summary.refuse(HOLDS, rows[rows["t"].isin(fixes.t[held])])
     fixes, nearest = Signal(*(values[~held] for values in fixes)), nearest[~held]
     kept, step, lag = _nearest_of_each(fixes, there, steps)

@@ -28,9 +28,9 @@ from ..nmea import read_nmea
 from ..source import parted
 from .frames import ENU, Origin, assumed, fix_factors, local, on_one_clock, unwrapped
 from .links import linked, of_vehicles
-from .motion import Member, Steps, member, samples
+from .motion import Member, Steps, member, samples, stacked
 from .tables import is_log_table, read_log_table
-from .units import KINDS, Rows, Summary, check_values, distinct, fresh, in_group, without_codes
+from .units import KINDS, Rows, Summary, check_values, distinct, fresh, in_group, only, without_codes
 
 Frame = Literal["world", "body"]
 Stamps = Literal["header", "received"]
@@ -230,13 +230,12 @@ def read_log(
     columns_of("antenna", [*named("antenna", arms, "Give antenna={name: (forward, left, up)}.")], ids)
     members = {name: member(name, rows[rows["vehicle"] == name], steps, arms.get(name)) for name in ids}
     recording = _recording(rows, members, steps, mutual and not body, sensors)
+    summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
     fleet = None
     if len(true_rows):
         true_rows = local(true_rows, origin, summary)[0]
         true_rows = true_rows[~(steps.planar & (true_rows["kind"] == "z"))]
         fleet = _truth(distinct(true_rows, Summary()), recording, max_gap, path.stem)
-    summary.grid, summary.vehicles = steps_in_words(recording), {name: part.text for name, part in members.items()}
-    if fleet is not None:
         for name, share in zip(ids, np.isfinite(fleet.position[..., 0]).mean(axis=0), strict=True):
             summary.vehicles[name] += f", truth {share:.0%}"
     return Log(recording, fleet, summary, "messages" in summary.read, origin)
@@ -249,13 +248,11 @@ def _recording(
     ids, body, summary = tuple(members), steps.body, steps.summary
     marks = [k for k, name in enumerate(ids) if body and members[name].stands]
     rows = of_vehicles(rows, [ids[k] for k in marks], summary)
-    measured = linked(rows, members, steps, mutual)
-    to_landmark = np.isin(measured.links.neighbour, marks)
-    pairs = (measured.links.step * len(ids) + measured.links.observer)[~to_landmark]
-    gnss, velocity, yaw_rate, compass = (
-        np.stack([getattr(part, name) for part in members.values()], axis=1)[None]
-        for name in ("gnss", "velocity", "yaw_rate", "compass")
-    )
+    links, relative, broadcasts, arrival = linked(rows, members, steps, mutual)
+    to_landmark = np.isin(links.neighbour, marks)
+    pairs = (links.step * len(ids) + links.observer)[~to_landmark]
+    names = ("gnss", "velocity", "yaw_rate", "compass")
+    gnss, velocity, yaw_rate, compass = (stacked(members, name)[None] for name in names)
     factor = () if body or sensors else fix_factors(rows, ids)
     sensors = sensors or assumed(rows, steps.planar, body, summary, steps.dt, [*members.values()])
     return Recording(
@@ -263,10 +260,10 @@ def _recording(
         t=steps.grid,
         gnss=gnss,
         velocity=velocity,
-        links=measured.links,
-        relative=measured.relative[None],
-        broadcasts=measured.broadcasts & ~np.isin(np.arange(len(ids)), marks),
-        arrival=np.where(to_landmark, -1, measured.arrival)[None],
+        links=links,
+        relative=relative[None],
+        broadcasts=broadcasts & ~np.isin(np.arange(len(ids)), marks),
+        arrival=np.where(to_landmark, -1, arrival)[None],
         sensors=sensors,
         v2x=V2X(max_neighbours=int(np.bincount(pairs).max(initial=0)), radius=np.inf),
         observers=tuple(range(len(ids))),
@@ -333,7 +330,8 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
 
 def _read_file(file: Path, path: Path, summary: Summary, **options: Any) -> Rows:
     """Rows of a file of a log; what names no vehicle in a folder below is of the vehicle of that folder."""
-    rows = READERS.get(file.suffix.lower(), read_log_table)(file, summary, **options)
+    read: Callable[..., Rows] = READERS.get(file.suffix.lower(), read_log_table)
+    rows = read(file, summary, **options)
     if path not in file.parents or file.parent == path:
         return rows
     rows = rows.assign(file=str(file.relative_to(path)))
@@ -358,7 +356,7 @@ def _check_one_drive(rows: Rows, path: Path) -> None:
     spans = rows[rows["true"] == 0].groupby("file", sort=False)["t"].agg(["min", "max"]).dropna().sort_values("min")
     begins, ends = spans["min"].to_numpy(), np.maximum.accumulate(spans["max"].to_numpy())
     gaps = begins[1:] - ends[:-1]
-    covered = float(ends[-1] - begins[0] - gaps.clip(0.0).sum()) if len(spans) else 0.0
+    covered = ends[-1] - begins[0] - gaps.clip(0.0).sum() if len(spans) else 0.0
     if (gaps <= max(APART, covered)).all():
         return
     listed = "; ".join(f"{file}: {begin:.0f} to {end:.0f} s" for file, begin, end in spans.itertuples())
@@ -397,7 +395,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
 
     moves, fixes, pairs = densest("odometry", "vehicle"), densest("fix", "vehicle"), densest("relative", *PAIR)
     t, summary.odometry = rows["t"][in_group(rows, "odometry", "fix")], moves if moves > 0 else 0.0
-    span = float(t.max() - t.min())
+    span = t.max() - t.min()
     if not span:
         allowed = "must hold two instants or more"
         raise InputError(f"{summary.name}: t", f"{t.min():.10g} s throughout", allowed, "Is the file complete?")
@@ -414,7 +412,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
         summary.assume(f"steps of {seldom:g} s, as fixes and pairs are measured; odometry every {step:g} s is averaged")
         step = seldom
     if dt is None:
-        at = rows[rows["kind"] == "x"].drop_duplicates(["vehicle", "t"])
+        at = only(rows, "x").drop_duplicates(["vehicle", "t"])
 
         def lost(step: float) -> float:
             steps = at.assign(t=((at["t"] - t.min()) / step).round())
@@ -442,7 +440,7 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
         field = f"{rows['file'].iloc[0]}: column vehicle"
         raise InputError(field, ", ".join(vehicles), allowed, "Rename them, or leave the truth out.")
     if rows["t"].max() < 2 * DAY:  # seconds of the day, as of NMEA without a date, are of the day of the log
-        rows = rows.assign(t=rows["t"] + DAY * round((float(recording.t.mean()) - rows["t"].mean()) / DAY))
+        rows = rows.assign(t=rows["t"] + DAY * round((recording.t.mean() - rows["t"].mean()) / DAY))
     axes = 3 if (rows["kind"] == "z").any() else 2
     poses = np.full((len(recording.t), len(ids), 4), np.nan)
     for column, vehicle in enumerate(ids):

@@ -38,17 +38,22 @@ def measurements(c: Check) -> list[dict[str, Any]]:
     """Rows of a table: each kind of relative measurement, and how it scatters about the positions."""
     rows = []
     for k, (name, unit) in enumerate(UNITS.items()):
-        there = np.isfinite(c.relative[:, k])
+        there, stated = np.isfinite(c.relative[:, k]), float(c.world.sensors.relative_std[k])
         residual = c.relative[there, k]
         if not there.any() or np.ptp(c.log.recording.relative[0, there, k]) == 0:
             continue
-        named = {pair: offset for pair, offset, _ in _named(c, k, float(c.world.sensors.relative_std[k]))}
+        named = {pair: offset for pair, offset, _ in _named(c, k, stated)}
         less = np.concatenate([value - named.get(pair, 0.0) for pair, value, *_ in by_pair(c, k)])
-        std, median = robust_std(less), float(np.median(residual))
-        row: dict[str, Any] = {"measurement": name, "unit": unit, "number": len(residual), "median": median}
-        row |= {"robust_std": std, "stated_std": float(c.world.sensors.relative_std[k])}
-        row["expected_std"] = float(np.sqrt(np.mean(c.expected[there, k] ** 2)))
-        rows.append(row | _scatter(c, k, row["stated_std"]))
+        row = {
+            "measurement": name,
+            "unit": unit,
+            "number": len(residual),
+            "median": float(np.median(residual)),
+            "robust_std": robust_std(less),
+            "stated_std": stated,
+            "expected_std": float(np.sqrt(np.mean(c.expected[there, k] ** 2))),
+        }
+        rows.append(row | _scatter(c, k, stated))
     return rows
 
 
@@ -80,15 +85,13 @@ def of_measurements(c: Check) -> list[str]:
     """Residuals of relative measurements that no stated noise explains: scale, outliers, offsets of pairs."""
     sentences, links = [], c.world.links
     for row in c.measurements:
-        name, unit, median, std, should = (
-            row[key] for key in ("measurement", "unit", "median", "robust_std", "expected_std")
-        )
-        if row["number"] < ENOUGH:
+        name, unit, number, median, std, least, should, noise, outliers = row.values()
+        if number < ENOUGH:
             continue
         word = "bearing" if name == "azimuth" and c.log.recording.body is not None else name
         hint = HINTS[name]
         stated = f"{median:.3g} +- {std:.3g} {unit}, {should:.3g} {unit} expected"
-        position = float(np.sqrt(max(should**2 - row["stated_std"] ** 2, 0.0)))
+        position = max(should**2 - least**2, 0.0) ** 0.5
         wrong = std > WIDE * should or (name == "azimuth" and std > COARSE > 3 * position)
         scaled = False
         if name != "range":
@@ -99,7 +102,7 @@ def of_measurements(c: Check) -> list[str]:
             true = measured - c.relative[:, 0]
             far = measured + true > 2 * FAR * position
             ratios = measured[far] / np.maximum(true[far], 1e-3)
-            ratio = float(np.median(ratios)) if len(ratios) >= ENOUGH else 1.0
+            ratio = np.median(ratios) if len(ratios) >= ENOUGH else 1.0
             wrong |= (other := not 0.8 <= ratio <= 1.25)
             if scaled := other and robust_std(ratios) < 0.2 * ratio:
                 power = round(np.log10(ratio))
@@ -107,10 +110,10 @@ def of_measurements(c: Check) -> list[str]:
                 unit_text = f"scale=range:{unit_of:.3g} (of mm 0.001, of feet 0.3048); then check again."
                 hint = f"They are {ratio:.3g} times as long: {unit_text}"
         k = list(UNITS).index(name)
-        outliers, misfits = row["beyond_5_std"], _misfits(c, k)
+        misfits = _misfits(c, k)
         apart = {f"{a} to {b}" if k else f"{a} and {b}" for pair in misfits for a, b in (pair, pair[:: 1 if k else -1])}
-        pairs = [one for one in _named(c, k, row["stated_std"]) if one[0] not in apart]
-        if outliers > max(OUTLIERS, SEVERAL / row["number"]) and not scaled and not misfits:
+        pairs = [one for one in _named(c, k, least) if one[0] not in apart]
+        if outliers > max(OUTLIERS, SEVERAL / number) and not scaled and not misfits:
             sentences.append(
                 f"{outliers:.1%} of the {word}s lie beyond 5 standard deviations of those before and after: outliers, "
                 "as of reflections. Drop them, or take a method with a gate or a robust loss."
@@ -132,11 +135,10 @@ def of_measurements(c: Check) -> list[str]:
             shown = ", ".join(f"{pair} by {offset:+.3g} +- {error:.2g} {unit}" for pair, offset, error in pairs)
             offsets_text = ",".join(f"{pair.replace(' and ', '-')}:{offset:.3g}" for pair, offset, _ in pairs)
             sentences.append(
-                f"{word}s of {shown} are off in the median, with {row['stated_std']:.3g} {unit} stated: an "
+                f"{word}s of {shown} are off in the median, with {least:.3g} {unit} stated: an "
                 "offset of the sensors, of antennas, or of fixes or heights of one of the two; "
                 + (f"offset={offsets_text} takes it off." if word == "range" else "offset= takes it off.")
             )
-        noise, least = row["noise"], row["stated_std"]
         if not wrong and not NARROW * least < noise < WIDE * np.hypot(least, position):
             size, std_of = ("less", max(noise, EXACT * least)) if noise < least else ("more", noise)
             sentences.append(
@@ -149,12 +151,8 @@ def of_measurements(c: Check) -> list[str]:
 def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
     """Who measures whom -> by what that is off where it is for long, though an offset is taken off; and in words, with
     whom else it fits."""
-    links, ids, measured, found = (
-        c.world.links,
-        c.world.ids,
-        c.world.relative[0, :, 0],
-        dict[tuple[str, str], tuple[float, str]](),
-    )
+    links, ids, measured = c.world.links, c.world.ids, c.world.relative[0, :, 0]
+    found = dict[tuple[str, str], tuple[float, str]]()
     there, t = np.isfinite(c.relative[:, k]), c.world.t - c.world.t[0]
     for one, other in np.unique(np.column_stack([links.observer, links.neighbour])[there], axis=0).tolist():
         rows = np.flatnonzero(there & (links.observer == one) & (links.neighbour == other))
@@ -164,8 +162,9 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
         if len(bad) < ENOUGH:
             continue
         size, text = float(np.median(np.abs(off[bad]))), when(t[links.step[rows]], bad)
-        for like, x in zip(ids, np.moveaxis(c.x[links.step[rows]], 1, 0), strict=True):
-            gap = np.linalg.norm(x - c.x[links.step[rows], one], axis=1) - measured[rows]
+        x = c.x[links.step[rows]]
+        gaps = np.linalg.norm(x - x[:, [one]], axis=2) - measured[rows, None]
+        for like, gap in zip(ids, gaps.T, strict=True):
             if k == 0 and like != ids[other] and np.median(np.abs(gap)) < WIDE * np.median(expected) < 0.2 * size:
                 text += f", as if to {like}"
         found[ids[one], ids[other]] = size, f" by {size:.3g} {list(UNITS.values())[k]}{text}"
@@ -175,11 +174,12 @@ def _misfits(c: Check, k: int) -> dict[tuple[str, str], tuple[float, str]]:
 def _named(c: Check, k: int, stated: float) -> list[tuple[str, float, float]]:
     """Pairs whose measurements of one kind are off by more than chance and a quarter of their noise, with their offsets
     and standard errors, largest first."""
-    offset_and_error = [(pair, *offset_and_error) for pair, offset_and_error in offsets(c, k, stated).items()]
-    return sorted(
-        (row for row in offset_and_error if abs(row[1]) > max(SURELY * row[2], 0.25 * stated)),
-        key=lambda row: -abs(row[1]),
-    )
+    named = [
+        (pair, offset, error)
+        for pair, (offset, error) in offsets(c, k, stated).items()
+        if abs(offset) > max(SURELY * error, 0.25 * stated)
+    ]
+    return sorted(named, key=lambda row: -abs(row[1]))
 
 
 def _other_angle(c: Check) -> str:
@@ -188,8 +188,8 @@ def _other_angle(c: Check) -> str:
     moves = plane(c.world.velocity[0, links.step, links.observer])
     there, heading = np.isfinite(c.relative[:, 1]), np.where(np.abs(moves) > MOVING, np.angle(moves), np.nan)
     residual, course, measured = c.relative[there, 1], heading[there], c.world.relative[0, there, 1]
-    off = float(np.angle(np.exp(1j * residual).sum()))
-    off += float(np.median(wrap(residual - off)))
+    off = np.angle(np.exp(1j * residual).sum())
+    off += np.median(wrap(residual - off))
     causes = {
         "bearings: name them bearing": course,
         "azimuths: name them azimuth": -course,
@@ -199,7 +199,7 @@ def _other_angle(c: Check) -> str:
         f"angles from an axis that is turned by {-off:.3g} rad: add {-off:.3g}": -off,
     }
     enough = {like: np.isfinite(residual + turn).sum() >= ENOUGH for like, turn in causes.items()}
-    left = {like: float(np.nanmedian(np.abs(wrap(residual + causes[like])))) for like in causes if enough[like]}
+    left = {like: np.nanmedian(np.abs(wrap(residual + causes[like]))) for like in causes if enough[like]}
     if 3 * (least := min(left.values(), default=np.inf)) > np.median(np.abs(residual)):
         return ""
     return f"They look like {next(like for like, rest in left.items() if rest <= 1.5 * least)}."

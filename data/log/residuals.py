@@ -94,13 +94,12 @@ def together(log: Log) -> tuple[Log, str]:
     return replace(log, recording=rec.between(first, last), truth=truth), span
 
 
-def begin_of(log: Log, gate: float = GATE) -> tuple[Floats | None, tuple[float, ...], str]:
+def begin_of(log: Log) -> tuple[Floats | None, tuple[float, ...], str]:
     """First poses: those of fixes and compasses (None), those found in the first seconds, or the truth's; their
     standard deviations; and which, where it is the last.
 
     Args:
         log: in body frames, all vehicles there at its first step.
-        gate: of the filters that find them, standard deviations.
 
     Raises:
         InputError: a vehicle that has neither a fix nor sees a landmark in the first seconds, nor a true pose.
@@ -110,7 +109,7 @@ def begin_of(log: Log, gate: float = GATE) -> tuple[Floats | None, tuple[float, 
     if np.isfinite(np.column_stack([rec.gnss[0, 0], rec.body.heading[0, 0]])[moving]).all():
         return None, SPREAD, ""
     try:
-        return pose_start(rec, gate=gate), SPREAD, ""
+        return pose_start(rec, gate=GATE), SPREAD, ""
     except InputError:
         if truth is None or truth.heading is None:
             raise

@@ -166,7 +166,8 @@ def _cells(frame: pd.DataFrame, file: str, value: str, std: str) -> pd.DataFrame
         lost = message & (cells.astype(str).str.strip().str.lower() == "lost").to_numpy()
         if cells.dtype.kind in "OUT" or str(cells.dtype) == "str":
             cells = cells.astype(str).str.replace(",", ".")  # text, as it may hold "lost", whatever the decimal mark
+        timed = message & ~lost
         made["arrival"] = np.where(lost, np.inf, np.nan)
-        if (message & ~lost).any():
-            made["arrival"][message & ~lost] = seconds(frame.assign(arrival=cells)[message & ~lost], "arrival", file)
+        if timed.any():
+            made["arrival"][timed] = seconds(frame.assign(arrival=cells)[timed], "arrival", file)
     return frame[["kind"]].assign(**made)

@@ -87,9 +87,20 @@ def of_kinds(frame: pd.DataFrame, file: str) -> Rows:
     return rows_of(pd.concat(parts).dropna(subset="value"), file)
 
 
+def only(rows: Rows, *kinds: str) -> Rows:
+    """Those of these kinds."""
+    return rows[rows["kind"].isin(kinds)]
+
+
 def in_group(rows: Rows, *groups: str) -> Bools:
     """(L,) True for rows whose kinds are of these groups."""
     return rows["kind"].isin([name for name, kind in KINDS.items() if kind.group in groups]).to_numpy()
+
+
+def stated_std(rows: Rows, *kinds: str) -> float:
+    """Root mean square of the standard deviations of these kinds that were logged; NaN if none was."""
+    std = only(rows, *kinds)["std"].dropna()
+    return float(np.sqrt((std**2).mean()))
 
 
 def place(rows: Rows) -> str:
@@ -103,9 +114,10 @@ def without_codes(rows: Rows, summary: "Summary") -> Rows:
     in several rows, that are far from what can be meant, or to and from which ranges leap."""
     own = rows[in_group(rows, "odometry", "heading", "relative")]
     kind, value = own["kind"], own["value"]
-    wrong = (value.abs() > kind.map(LIMITS)) | (value < kind.map(LEAST)) | ((kind == "range") & (value == 0.0))
-    usual = kind.map(value[~wrong].abs().groupby(kind).max())
-    near = (value.abs() > kind.map(LIMITS)) & (value.abs() <= APART * usual)  # as of an angle in degrees
+    size, limit = value.abs(), kind.map(LIMITS)
+    wrong = (size > limit) | (value < kind.map(LEAST)) | ((kind == "range") & (value == 0.0))
+    usual = kind.map(size[~wrong].groupby(kind).max())
+    near = (size > limit) & (size <= APART * usual)  # as of an angle in degrees
     codes = own[wrong & ~kind.isin(kind[near])].groupby("kind")["value"].agg(["size", "nunique"])
     few = codes[(codes["nunique"] <= CODES) & (codes["size"] >= 2 * codes["nunique"])]
     lost = own[wrong & kind.isin(few.index[few["size"] < kind.value_counts().reindex(few.index)])]
