@@ -73,10 +73,12 @@ def assemble(
     back = np.flatnonzero((np.diff(stamps[order]) <= 0) & (np.diff(column[order]) == 0))
     if len(back):
         before, row = order[back[0] : back[0] + 2].tolist()
-        actual = f"{stamps[row]!s} s after {stamps[before]!s} s of vehicle {ids[column[row]]}"
-        allowed = "dt must be > 0: the stamps of a vehicle increase from row to row"
-        hint = "Sort the rows by time, or remove one that repeats."
-        raise InputError(f"{file}: row {row + 1}, column t", actual, allowed, hint)
+        raise InputError(
+            f"{file}: row {row + 1}, column t",
+            f"{stamps[row]!s} s after {stamps[before]!s} s of vehicle {ids[column[row]]}",
+            "dt must be > 0: the stamps of a vehicle increase from row to row",
+            "Sort the rows by time, or remove one that repeats.",
+        )
     by_vehicle = np.split(order, np.cumsum(np.bincount(column))[:-1])
     if not any_scale:
         check_time(stamps, file)
@@ -95,9 +97,12 @@ def assemble(
     present = np.isfinite(table[..., 0])
     lonely = (np.bincount(column) > 1) & ~(present[1:] & present[:-1]).any(axis=0)
     for k in np.flatnonzero(~present.any(axis=0) | lonely).tolist():
-        actual = f"{(column == k).sum()} rows, but {present[:, k].sum()} instants, no two in a row"
-        hint = "Resample all with a dt like that of its rows, bridge longer gaps with max_gap=, or leave it out."
-        raise InputError(f"{file}: vehicle {ids[k]}", actual, "must be there at instants in a row", hint)
+        raise InputError(
+            f"{file}: vehicle {ids[k]}",
+            f"{(column == k).sum()} rows, but {present[:, k].sum()} instants, no two in a row",
+            "must be there at instants in a row",
+            "Resample all with a dt like that of its rows, bridge longer gaps with max_gap=, or leave it out.",
+        )
     u = table[..., 3:] if velocity is not None else backward_difference(grid, table[..., :3], ids, file)
     return Fleet(ids, grid, table[..., :3], u, name=name, source=source)
 
@@ -125,9 +130,12 @@ def backward_difference(t: Floats, position: Floats, ids: Sequence[str], file: s
         u[:-1][starts] = u[1:][starts]
     alone = np.argwhere(np.isfinite(position[..., 0]) & ~np.isfinite(u[..., 0]))
     if len(alone):
-        actual = f"none for {ids[alone[0, 1]]} at t = {t[alone[0, 0]]:g} s"
-        hint = "Add the columns vx, vy, vz, or leave out the vehicle's single instants."
-        raise InputError(f"{file}: velocity", actual, "needs two instants in a row to be derived", hint)
+        raise InputError(
+            f"{file}: velocity",
+            f"none for {ids[alone[0, 1]]} at t = {t[alone[0, 0]]:g} s",
+            "needs two instants in a row to be derived",
+            "Add the columns vx, vy, vz, or leave out the vehicle's single instants.",
+        )
     return u
 
 
@@ -169,14 +177,20 @@ metres in a local frame. Give latitude and longitude to co.read_log, which conve
     (west, south), (east, north) = places.min(axis=0).tolist(), places.max(axis=0).tolist()
     near = max(east - west, north - south) < REGION
     if 0 < speed < SLOWEST and near and max(-west, east) <= 360 and max(-south, north) <= 180:
-        actual = f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}"
-        hint = "Give latitude and longitude to co.read_log, which converts them, or pass any_scale=True."
-        raise InputError(f"{file}: columns x, y", actual, "look like degrees, must be metres in a local frame", hint)
+        raise InputError(
+            f"{file}: columns x, y",
+            f"{west:.8g}..{east:.8g}, {south:.8g}..{north:.8g}",
+            "look like degrees, must be metres in a local frame",
+            "Give latitude and longitude to co.read_log, which converts them, or pass any_scale=True.",
+        )
     if speed > FASTEST:
-        hint = "Check the units (t in s, of days as in spreadsheets scale=t:86400; positions in m) and that no two "
-        hint += "vehicles share an id, or pass any_scale=True."
-        where, actual = f"{file}: columns t, x, y, z", f"a typical speed of {speed:.4g} m/s"
-        raise InputError(where, actual, f"must be below {FASTEST:g} m/s", hint)
+        raise InputError(
+            f"{file}: columns t, x, y, z",
+            f"a typical speed of {speed:.4g} m/s",
+            f"must be below {FASTEST:g} m/s",
+            "Check the units (t in s, of days as in spreadsheets scale=t:86400; positions in m) and that no two "
+            "vehicles share an id, or pass any_scale=True.",
+        )
 
 
 def check_time(t: Floats, file: str, column: str = "t") -> float:
@@ -190,16 +204,22 @@ def check_time(t: Floats, file: str, column: str = "t") -> float:
     """
     late = t[np.abs(t) > LATEST]
     if len(late):
-        allowed = "must be seconds: it looks like milliseconds or nanoseconds since 1970"
         raise InputError(
-            f"{file}: column {column}", f"{late[0]:.15g}", allowed, "Pass scale=t:1e-3 or t:1e-9, or store dates."
+            f"{file}: column {column}",
+            f"{late[0]:.15g}",
+            "must be seconds: it looks like milliseconds or nanoseconds since 1970",
+            "Pass scale=t:1e-3 or t:1e-9, or store dates.",
         )
     unit = float(np.spacing(np.float32(np.abs(t).max(initial=0.0))))
     if unit < COARSE[0] or (t % unit).any() or not (t % (2 * unit)).any():
         return 0.0
     if unit >= COARSE[1]:
-        actual, allowed = f"multiples of {unit:g} s, as of 32-bit floats", "must be resolved"
-        raise InputError(f"{file}: column {column}", actual, allowed, "Write it in 64 bits, or from the first instant.")
+        raise InputError(
+            f"{file}: column {column}",
+            f"multiples of {unit:g} s, as of 32-bit floats",
+            "must be resolved",
+            "Write it in 64 bits, or from the first instant.",
+        )
     return unit
 
 
@@ -230,9 +250,12 @@ def _on_stamps(stamps: Floats, column: Ints, numbers: Floats, file: str) -> tupl
             table = np.full((len(grid), column.max() + 1, numbers.shape[1]), np.nan)
             table[index[row_of], column] = numbers
             return grid, table
-    actual = f"instants between {gaps.min():g} and {gaps.max():g} s apart"
-    hint = "Resample: load_fleet(..., dt=0.1), or FILE?dt=0.1 on the command line."
-    raise InputError(f"{file}: t", actual, "must be equally spaced", hint)
+    raise InputError(
+        f"{file}: t",
+        f"instants between {gaps.min():g} and {gaps.max():g} s apart",
+        "must be equally spaced",
+        "Resample: load_fleet(..., dt=0.1), or FILE?dt=0.1 on the command line.",
+    )
 
 
 def nearest(late: Floats, *keys: Ints) -> Ints:

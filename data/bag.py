@@ -84,8 +84,12 @@ def read_bag(
         MissingLibraryError: rosbags is not installed.
     """
     if columns or kinds:
-        hint = 'Leave out a topic or a kind by ignore=["/car/pose"]; name the truth\'s by truth="/car/pose".'
-        raise InputError("columns, kinds", path.name, "are of tables, and this is a bag", hint)
+        raise InputError(
+            "columns, kinds",
+            path.name,
+            "are of tables, and this is a bag",
+            'Leave out a topic or a kind by ignore=["/car/pose"]; name the truth\'s by truth="/car/pose".',
+        )
     try:
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore

@@ -65,8 +65,12 @@ def read_frame(path: Path, *text: str) -> "pd.DataFrame":
 
             size = read_metadata(path)  # a column of one value takes no room in the file
             if size.num_rows * size.num_columns > LARGEST_TABLE:
-                actual = f"{size.num_rows} rows of {size.num_columns} columns"
-                raise InputError(path.name, actual, f"must hold at most {LARGEST_TABLE} cells", "Split the drive.")
+                raise InputError(
+                    path.name,
+                    f"{size.num_rows} rows of {size.num_columns} columns",
+                    f"must hold at most {LARGEST_TABLE} cells",
+                    "Split the drive.",
+                )
             frame = pd.read_parquet(path).reset_index(drop=True)
         elif ending == ".jsonl":
             lines = path.read_text("utf-8-sig").splitlines()
@@ -111,8 +115,9 @@ def numeric(frame: "pd.DataFrame", column: str, file: str, given: Bools | None =
         return out
     cells = frame[column]
     if cells.dtype.kind in "bmM":
-        allowed = "must be a finite number"
-        raise InputError(f"{file}: column {column}", f"of type {cells.dtype}", allowed, "Convert the column.")
+        raise InputError(
+            f"{file}: column {column}", f"of type {cells.dtype}", "must be a finite number", "Convert the column."
+        )
     try:
         values = pd.to_numeric(cells, errors="coerce").to_numpy(dtype=float)
     except (TypeError, ValueError, OverflowError):  # a list in a cell, an integer of a thousand digits
@@ -142,8 +147,12 @@ def seconds(frame: "pd.DataFrame", column: str, file: str) -> Floats:
         try:
             return numeric(frame, column, file)
         except InputError as error:
-            allowed = "must be seconds, or a date as 2024-05-01T12:00:00Z"
-            raise InputError(error.field, error.value, allowed, "Mend the cell, or remove the row.") from None
+            raise InputError(
+                error.field,
+                error.value,
+                "must be seconds, or a date as 2024-05-01T12:00:00Z",
+                "Mend the cell, or remove the row.",
+            ) from None
     _refuse(column_values, column_values.isna().to_numpy(), file, "must be a time")
     if kind == "m":
         return np.asarray(column_values.dt.total_seconds(), dtype=float)
@@ -201,8 +210,12 @@ def named_columns(
     frame = frame.rename(columns={header: key for key, header in columns.items()})
     for key in columns:
         if (frame.columns == key).sum() > 1:
-            twice = f"is not the only column {key} then: the file has one of that name"
-            raise InputError(f"{file}: columns[{key!r}]", repr(columns[key]), twice, "Rename or remove one of them.")
+            raise InputError(
+                f"{file}: columns[{key!r}]",
+                repr(columns[key]),
+                f"is not the only column {key} then: the file has one of that name",
+                "Rename or remove one of them.",
+            )
     for key in needed:
         if columns.get(key, key) not in header_names:
             raise missing_column(
@@ -230,8 +243,12 @@ def missing_column(file: str, column: str, names: Sequence[str], allowed: str, k
     hint = f'Add it, or pass columns={{"{key}": "{header}"}}; with a command, FILE?columns={key}:{header}.'
     if usual:
         hint = f"Did you mean {usual}? {hint}"
-    allowed = f"{allowed}; the file has {', '.join(names)}"
-    return InputError(f"{file}: column {column}", "missing", allowed, suggestion(column, names, hint))
+    return InputError(
+        f"{file}: column {column}",
+        "missing",
+        f"{allowed}; the file has {', '.join(names)}",
+        suggestion(column, names, hint),
+    )
 
 
 def _read_csv(path: Path, text: Sequence[str]) -> "pd.DataFrame":
@@ -268,29 +285,44 @@ def _check_header(path: Path, header: Sequence[str]) -> None:
     if len(header) < 2:
         raise _no_table(path, repr("".join(header))[:80])
     if len(header) > COLUMNS:
-        allowed = f"must be at most {COLUMNS}"
-        raise InputError(path.name, f"{len(header)} columns", allowed, "Write one row per instant.")
+        raise InputError(
+            path.name, f"{len(header)} columns", f"must be at most {COLUMNS}", "Write one row per instant."
+        )
     name, count = Counter(name.strip() for name in header).most_common(1)[0]
     if count > 1:
-        allowed = "must name one column only"
-        raise InputError(f"{path.name}: header", f"{name[:40]!r} twice", allowed, "Rename or remove the other one.")
+        raise InputError(
+            f"{path.name}: header",
+            f"{name[:40]!r} twice",
+            "must name one column only",
+            "Rename or remove the other one.",
+        )
 
 
 def _refuse(cells: "pd.Series[Any]", wrong: Bools, file: str, allowed: str) -> None:
     """InputError that names the first wrong cell."""
     bad = np.flatnonzero(wrong)
     if len(bad):
-        actual = str(cells.iloc[bad[0]])[:60].strip() or "empty"
-        hint = "Mend the cell, or remove the row: a missing row means that there was no measurement."
-        raise InputError(f"{file}: row {cells.index[bad[0]]}, column {cells.name}", actual, allowed, hint)
+        raise InputError(
+            f"{file}: row {cells.index[bad[0]]}, column {cells.name}",
+            str(cells.iloc[bad[0]])[:60].strip() or "empty",
+            allowed,
+            "Mend the cell, or remove the row: a missing row means that there was no measurement.",
+        )
 
 
 def _too_wide(path: Path, row: int, cells: int, names: int) -> InputError:
-    hint = "Name every column in the header; between commas, write decimal points and quote text."
-    actual = f"{cells} cells under {names} names"
-    return InputError(f"{path.name}: row {row}", actual, "must have one cell per name in the header", hint)
+    return InputError(
+        f"{path.name}: row {row}",
+        f"{cells} cells under {names} names",
+        "must have one cell per name in the header",
+        "Name every column in the header; between commas, write decimal points and quote text.",
+    )
 
 
 def _no_table(path: Path, actual: str) -> InputError:
-    allowed = "must be a table with a header and cells between commas, semicolons or tabs, or of Parquet"
-    return InputError(path.name, actual, allowed, "Export it again as CSV in UTF-8, without empty rows and columns.")
+    return InputError(
+        path.name,
+        actual,
+        "must be a table with a header and cells between commas, semicolons or tabs, or of Parquet",
+        "Export it again as CSV in UTF-8, without empty rows and columns.",
+    )

@@ -184,8 +184,12 @@ def fetch(name: str, *, offline: bool = False, timeout: float = TIMEOUT) -> Path
             with FileLock(entry.folder / ".lock"):
                 _bring(entry, timeout)
         except OSError as error:
-            allowed = f"must be a folder that can be written: {said(error)}"
-            raise InputError("COOPOC_DATA", str(entry.folder), allowed, "Set COOPOC_DATA to one.") from None
+            raise InputError(
+                "COOPOC_DATA",
+                str(entry.folder),
+                f"must be a folder that can be written: {said(error)}",
+                "Set COOPOC_DATA to one.",
+            ) from None
     return entry.path
 
 
@@ -200,8 +204,9 @@ def _bring(entry: Entry, timeout: float) -> None:
         address, (_, size, digest), path = entry.address(file), entry.files[file], entry.folder / file
         data = unpacked[file] if unpacked else _downloaded(entry, address, path, size, timeout)
         if (actual := hashlib.sha256(data).hexdigest()) != digest:
-            hint = f"It was removed: {address} serves another file."
-            raise _other_bytes(f"{entry.name}: {path.name}", actual, digest, hint)
+            raise _other_bytes(
+                f"{entry.name}: {path.name}", actual, digest, f"It was removed: {address} serves another file."
+            )
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_bytes(data)
 
@@ -256,18 +261,30 @@ def _by_hand(entry: Entry, address: str, to: Path, reason: str) -> InputError:
         advice = f"unpack it in {entry.folder}, so that {next(iter(entry.files))} is below"
     else:
         advice = f"save it as {to}"
-    hint = f"Fetch it by hand (the project: {entry.page}), {advice}, and run coopoc data get {entry.name} again."
-    return InputError(f"{entry.name}: address", address, f"was not fetched: {reason}", hint)
+    return InputError(
+        f"{entry.name}: address",
+        address,
+        f"was not fetched: {reason}",
+        f"Fetch it by hand (the project: {entry.page}), {advice}, and run coopoc data get {entry.name} again.",
+    )
 
 
 def _offline(entry: Entry, absent: list[str]) -> InputError:
     """The error of what is absent and may not be downloaded."""
     file = entry.folder / absent[0]
     if file.exists():
-        hint = f"Remove {file}; then run coopoc data get {entry.name} with a network."
-        return _other_bytes(f"{entry.name}: {file.name}", _digest(file), entry.files[absent[0]][2], hint)
-    more = f"offline, and {len(absent)} of {len(entry.files)} files are missing (coopoc data show {entry.name})"
-    return _by_hand(entry, entry.address(absent[0]), file, more)
+        return _other_bytes(
+            f"{entry.name}: {file.name}",
+            _digest(file),
+            entry.files[absent[0]][2],
+            f"Remove {file}; then run coopoc data get {entry.name} with a network.",
+        )
+    return _by_hand(
+        entry,
+        entry.address(absent[0]),
+        file,
+        f"offline, and {len(absent)} of {len(entry.files)} files are missing (coopoc data show {entry.name})",
+    )
 
 
 def _other_bytes(field: str, actual: str, digest: str, hint: str) -> InputError:

@@ -49,8 +49,9 @@ def graph_recording(graph: Graph, *, dt: float = 0.1) -> tuple[Recording, Fleet]
         InputError: a graph in space, poses without stamps, a robot whose odometry has a gap, robots that share no time.
     """
     if graph.dimension != 2 or np.isnan(graph.stamps[graph.is_pose]).any():
-        hint = "Take formats and solve for others."
-        raise InputError("graph", repr(graph), "must be in the plane, with stamps", hint)
+        raise InputError(
+            "graph", repr(graph), "must be in the plane, with stamps", "Take formats and solve for others."
+        )
     robots, n = graph.robots, len(graph.robots)
     begin = max(graph.stamps[places[0]] for places in robots.values())
     end = min(graph.stamps[places[-1]] for places in robots.values())
@@ -94,8 +95,12 @@ def _chained(graph: Graph, places: Ints) -> Floats:
     steps = list(pairwise(places.tolist()))
     for first, second in steps:
         if (first, second) not in edge_of:
-            actual = f"no odometry from {graph.names[first]} to {graph.names[second]}"
-            raise InputError("graph", actual, "must join all poses of a robot", "Cut the file at the gap.")
+            raise InputError(
+                "graph",
+                f"no odometry from {graph.names[first]} to {graph.names[second]}",
+                "must join all poses of a robot",
+                "Cut the file at the gap.",
+            )
     index = [edge_of[step] for step in steps]
     heading = np.concatenate([[0.0], np.cumsum(edges.orientation[index, 0])])
     moved = turned(np.pad(edges.position[index], ((0, 0), (0, 1))), heading[:-1])[:, :2]

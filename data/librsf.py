@@ -67,6 +67,10 @@ def read_librsf(path: Path, summary: Summary, **_: Any) -> Rows:
             f = f.drop(columns=[*"xyz"], errors="ignore")
         parts.append(f)
     if not parts:
-        allowed = f"must hold lines that begin with {', '.join(FORMS)}"
-        raise InputError(path.name, "none of them", allowed, "Check that this is the file you meant.")
+        raise InputError(
+            path.name,
+            "none of them",
+            f"must hold lines that begin with {', '.join(FORMS)}",
+            "Check that this is the file you meant.",
+        )
     return of_kinds(pd.concat(parts), path.name)

@@ -105,8 +105,12 @@ def read_mrclam(folder: str | Path, *, dt: float = 0.1, max_gap: float = MAX_GAP
         table[:, 3] = np.unwrap(table[:, 3])
     start, end = max(a[0, 0] for a in truths + wheels), min(a[-1, 0] for a in truths + wheels)
     if not end - start >= dt:
-        allowed = "the robots' files must share an interval with truth and odometry"
-        raise InputError("folder", folder.name, allowed, "Check the times in the .dat files.")
+        raise InputError(
+            "folder",
+            folder.name,
+            "the robots' files must share an interval with truth and odometry",
+            "Check the times in the .dat files.",
+        )
     check_size((end - start) / dt, len(numbers), sum(map(len, truths + wheels)), dt, folder.name)
     t = dt * np.arange(int((end - start) / dt) + 1)
     poses = np.stack([interpolate(a[:, 0] - start, a[:, 1:], t, max_gap) for a in truths], axis=1)
@@ -230,8 +234,12 @@ def calibrate(log: MrclamLog, until: float) -> Calibration:
     dt = log.fleet.dt
     first, window, block = slice(1, int(until / dt)), int(WINDOW / dt), int(LASTING / dt)
     if not 10 * WINDOW <= until < log.fleet.t[-1]:
-        allowed = f"must be {10 * WINDOW:g} s or more and end before the log, {log.fleet.t[-1]:g} s"
-        raise InputError("calibrate_s", f"{until:g} s", allowed, "Leave a part to score.")
+        raise InputError(
+            "calibrate_s",
+            f"{until:g} s",
+            f"must be {10 * WINDOW:g} s or more and end before the log, {log.fleet.t[-1]:g} s",
+            "Leave a part to score.",
+        )
     velocity = turned(log.fleet.velocity, -midway(log.heading))[first]
     rate = np.diff(log.heading, axis=0)[: len(velocity)] / dt
     lag = min(LAGS, key=lambda lag: np.nanvar(rate - _delayed(log, log.turn_rate, lag)[first]))
@@ -315,8 +323,9 @@ def _relative(log: MrclamLog, until: float) -> tuple[float, float]:
     angle = wrap(np.append(log.others[:, 4] - log.true_others[:, 1], marks[:, 4] - (np.arctan2(dy, dx) - own[:, 2])))
     used = np.isfinite(reach) & (t >= 0) & (t < until)
     if used.sum() < FEWEST:
-        actual, allowed = f"{used.sum()} measurements in {until:g} s", f"must be {FEWEST} or more"
-        raise InputError("calibrate_s", actual, allowed, "Take longer.")
+        raise InputError(
+            "calibrate_s", f"{used.sum()} measurements in {until:g} s", f"must be {FEWEST} or more", "Take longer."
+        )
     ranges, bearings = (grouped(error[used], observer[used], t[used]) for error in (reach, angle))
     return ranges, bearings
 
@@ -353,8 +362,9 @@ def _measurements(folder: Path, numbers: list[int]) -> Floats:
 def _read(file: Path, form: str, *, strictly: bool = False) -> Floats:
     """(M, C) numbers of a file; a column time increases, the last column, an angle or its rate, is within a turn."""
     if not file.is_file():
-        hint = "Point at a folder MRCLAM_DatasetN with its .dat files."
-        raise InputError("folder", file.parent, f"has no {file.name}", hint)
+        raise InputError(
+            "folder", file.parent, f"has no {file.name}", "Point at a folder MRCLAM_DatasetN with its .dat files."
+        )
     try:
         table = pd.read_csv(file, sep=r"\s+", comment="#", header=None, dtype=float).to_numpy()
     except (ValueError, OverflowError):  # those of pandas for text, empty files and bytes among them

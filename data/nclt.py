@@ -54,7 +54,11 @@ def read_nclt(path: Path, summary: Summary, **_: Any) -> Rows:
                 parts += [table.assign(heading=heading, vehicle=name), truth.assign(vehicle=name)]
         frame = pd.concat(parts, ignore_index=True)
     except Exception as error:  # of torch, NumPy and pandas: another file meets them all
-        allowed = f"must be a list of drives with {', '.join(FIELDS)} and data_date"
-        raise InputError(path.name, said(error), allowed, "Take the file as it was published.") from None
+        raise InputError(
+            path.name,
+            said(error),
+            f"must be a list of drives with {', '.join(FIELDS)} and data_date",
+            "Take the file as it was published.",
+        ) from None
     summary.assume("speed: the mean of both wheels; each drive twice, with its own and with its true heading")
     return of_kinds(frame.sort_values("t", kind="stable"), path.name)

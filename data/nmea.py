@@ -58,8 +58,9 @@ def read_nmea(path: Path, summary: Summary, **_: Any) -> Rows:
         elif reason:
             summary.refuse(reason, 1, where)
     if not sentences.rows:
-        hint = "Check that it holds GGA sentences with a fix."
-        raise InputError(path.name, "0 fixes", "must hold NMEA sentences $..GGA", hint)
+        raise InputError(
+            path.name, "0 fixes", "must hold NMEA sentences $..GGA", "Check that it holds GGA sentences with a fix."
+        )
     frame = pd.DataFrame(sentences.rows, columns=["t", "kind", "value", "row"]).set_index("row")
     frame["std"] = [sentences.std.get((t, kind), np.nan) for t, kind in zip(frame["t"], frame["kind"], strict=True)]
     early = frame["t"] < sentences.first_day  # sentences before the first date are of its day

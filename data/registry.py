@@ -131,8 +131,12 @@ def load_fleet(name_or_path: str | Path, *, format: str | None = None, **options
     read = _read(readers[chosen], path, options)
     truth = read if chosen in DRIVES else read.truth
     if truth is None:
-        hint = "Add a table truth.csv to its folder, pass truth=, or take co.read_log."
-        raise InputError(path.name, "no truth", "is a log without one: there is nothing to score against", hint)
+        raise InputError(
+            path.name,
+            "no truth",
+            "is a log without one: there is nothing to score against",
+            "Add a table truth.csv to its folder, pass truth=, or take co.read_log.",
+        )
     fleet: Fleet = parted(truth, **part)
     return fleet
 
@@ -151,8 +155,12 @@ def load_log(name_or_path: str | Path, **options: Any) -> Log:
     name, options, part = _split(name_or_path, options)
     kind = _real(Path(name))
     if kind == "mrclam":
-        hint = "Take coopoc run real, or read_mrclam, calibrate and pose_recording of coopoc.data.mrclam."
-        raise InputError("data", name, "is a folder of MR.CLAM, whose noise has to be calibrated first", hint)
+        raise InputError(
+            "data",
+            name,
+            "is a folder of MR.CLAM, whose noise has to be calibrated first",
+            "Take coopoc run real, or read_mrclam, calibrate and pose_recording of coopoc.data.mrclam.",
+        )
     log: Log = _read(LOGS.get(kind, read_log), Path(name), options)
     return log.part(**part)
 
@@ -182,8 +190,12 @@ def detect(path: Path, columns: Mapping[str, str] | None = None) -> str:
     kind = _real(path, columns) or ("tum" if path.is_dir() and tum_files(path) else ENDINGS.get(path.suffix))
     if kind is None:
         endings = ".csv, .parquet, .jsonl, .tum, .txt, .xml, .nmea, .bag, .pyfg or .npz"
-        allowed = f"must end in {endings}, or be a folder of TUM, MR.CLAM or log files"
-        raise InputError("data", path.name, allowed, f"Pass format= one of {', '.join((*DRIVES, *LOGS))}.")
+        raise InputError(
+            "data",
+            path.name,
+            f"must end in {endings}, or be a folder of TUM, MR.CLAM or log files",
+            f"Pass format= one of {', '.join((*DRIVES, *LOGS))}.",
+        )
     return kind
 
 

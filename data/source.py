@@ -46,14 +46,22 @@ def split(name_or_path: str | Path) -> tuple[str, dict[str, Any]]:
     for part in query.split("&"):
         key, equals, value = part.partition("=")
         if not (key and equals and value) or key in options:
-            hint = 'Write NAME?option=value&option=value, such as "drive.csv?dt=0.1".'
-            raise InputError("data", repr(text), "must give each option behind ? one value", hint)
+            raise InputError(
+                "data",
+                repr(text),
+                "must give each option behind ? one value",
+                'Write NAME?option=value&option=value, such as "drive.csv?dt=0.1".',
+            )
         read, allowed, example = READ.get(key, (str, "", ""))
         try:
             options[key] = read(value)
         except ValueError:
-            hint = f"Write {key}={example}; of a name a comma as %2C, a colon as %3A, & as %26."
-            raise InputError(key, repr(value), f"must be {allowed}", hint) from None
+            raise InputError(
+                key,
+                repr(value),
+                f"must be {allowed}",
+                f"Write {key}={example}; of a name a comma as %2C, a colon as %3A, & as %26.",
+            ) from None
     return name, options
 
 
@@ -61,9 +69,13 @@ def there(name: str) -> None:
     """InputError for what is neither the name of a data set nor a path."""
     registered = names("coopoc.datasets")
     if not (in_file(name) or name in registered or Path(name).exists()):
-        allowed = f"must be one of {', '.join(registered)} or the path of a file or folder"
         hint = bring(name, "List all data sets with coopoc data list, or check the path.")
-        raise InputError("data", repr(name), allowed, suggestion(name, registered, hint))
+        raise InputError(
+            "data",
+            repr(name),
+            f"must be one of {', '.join(registered)} or the path of a file or folder",
+            suggestion(name, registered, hint),
+        )
 
 
 def parted(data: Any, since: float | None = None, until: float | None = None) -> Any:

@@ -391,9 +391,10 @@ def worst(c: Check, column: int) -> tuple[float | None, float]:
     size, t = dimensions(c.world), c.world.t
     square, stated = np.square(c.scored[0] - c.log.truth.position)[:, column, :size], c.scored[1][:, column, :size]
     stated = np.where(np.isfinite(square), stated, np.nan)
-    worst, when = None, 0.0
+    ratios = dict[float, float]()
     for part in np.array_split(np.arange(len(t)), BLOCKS):
-        if np.isfinite(square[part]).any() and (all_of := np.nansum(stated[part])) > 0:
-            ratio = float(np.sqrt(np.nansum(square[part]) / all_of))
-            worst, when = (ratio, float(t[part[0]] - t[0])) if ratio > (worst or 0.0) else (worst, when)
-    return worst, when
+        all_of = np.nansum(stated[part])
+        if all_of > 0:
+            ratios[float(t[part[0]] - t[0])] = float(np.sqrt(np.nansum(square[part]) / all_of))
+    when = max(ratios, key=ratios.__getitem__, default=0.0)
+    return ratios.get(when), when

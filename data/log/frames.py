@@ -73,10 +73,12 @@ def on_one_clock(rows: Rows, clock: Mapping[str, float]) -> Rows:
     rows = rows.assign(t=t, arrival=rows["arrival"] - partner_ahead)
     early = rows[rows["arrival"] < t - 1e-6]
     if len(early):
-        actual = f"{early['arrival'].iloc[0]:.6f} s, sent at {early['t'].iloc[0]:.6f} s"
-        hint = 'Give the offsets of the clocks, as clock={"car2": 0.35}, or mend the row.'
-        allowed = "must not come before the message was sent"
-        raise InputError(f"{place(early)}, column arrival", actual, allowed, hint)
+        raise InputError(
+            f"{place(early)}, column arrival",
+            f"{early['arrival'].iloc[0]:.6f} s, sent at {early['t'].iloc[0]:.6f} s",
+            "must not come before the message was sent",
+            'Give the offsets of the clocks, as clock={"car2": 0.35}, or mend the row.',
+        )
     return rows
 
 
@@ -101,9 +103,13 @@ def local(rows: Rows, origin: Origin | None, summary: Summary) -> tuple[Rows, Or
     if not geodetic.any():
         return rows, origin
     if origin is None and len(metric):
-        hint = "Pass origin=(latitude, longitude, height) of the local frame, or give all positions in one of the two; "
-        hint += "ignore= leaves out kinds, and topics of a bag."
-        raise InputError(f"{place(metric)}, x", "metres", "stand beside fixes in degrees", hint)
+        raise InputError(
+            f"{place(metric)}, x",
+            "metres",
+            "stand beside fixes in degrees",
+            "Pass origin=(latitude, longitude, height) of the local frame, or give all positions in one of the two; "
+            "ignore= leaves out kinds, and topics of a bag.",
+        )
     fixes = rows[geodetic].drop_duplicates(keys).pivot(index=keys[:2], columns="kind", values="value")
     if "height" not in fixes:
         fixes["height"] = origin[2] if origin else 0.0

@@ -185,8 +185,12 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
         world, ever = samples(rows, ("vx", "vy"), Summary(), 2), steps._replace(max_gap=np.inf)
         pointing = _heading(measured, world, shown, way, ever)
         if pointing.at is unknown or not np.isfinite(off).all():
-            hint = f"Log heading or compass_deg, or vx and vy; a course counts above {MOVING:g} m/s."
-            raise InputError(f"antenna of {name}", f"{arm} m", "needs numbers, and a heading of the vehicle", hint)
+            raise InputError(
+                f"antenna of {name}",
+                f"{arm} m",
+                "needs numbers, and a heading of the vehicle",
+                f"Log heading or compass_deg, or vx and vy; a course counts above {MOVING:g} m/s.",
+            )
         by = f"the course of the {pointing.source}" if pointing.source else "its heading"
         summary.assume(ARM, f"{name} ({', '.join(map('{:g}'.format, off))} m forward, left, up, by {by})")
         angle = pd.Series(pointing.at(fixes.t)).ffill().bfill().to_numpy()
@@ -198,8 +202,12 @@ def member(name: str, rows: Rows, steps: Steps, arm: Any) -> Member:
     if body:
         for kind, signal in (("speed", speed), ("yaw_rate", turn)):
             if not len(signal.t):
-                allowed, hint = "must have speeds and yaw rates in body frames", 'Log both, or pass frame="world".'
-                raise InputError(f"vehicle {name}", f"no {kind}", allowed, hint)
+                raise InputError(
+                    f"vehicle {name}",
+                    f"no {kind}",
+                    "must have speeds and yaw rates in body frames",
+                    'Log both, or pass frame="world".',
+                )
         summary.refuse("world velocities in body frames", only(rows, "vx", "vy", "vz"))
         signals, heading = [speed, turn], Course(heading_at(measured, turn, np.inf))
         along = _heading(measured, None, shown, way, steps)
@@ -278,11 +286,19 @@ def _in_world(
         velocity = pace[:, None] * np.nan_to_num(turned(AHEAD, angle))
         return Signal(at[kept], velocity[kept]), Signal(at[own & kept], at), heading
     if len(speed.t):
-        allowed, hint = "needs heading, compass_deg, or fixes of a moving vehicle", "Add one, or give vx and vy."
-        raise InputError(f"{place(speeds)}, speed", f"of {name}, which has no heading", allowed, hint)
+        raise InputError(
+            f"{place(speeds)}, speed",
+            f"of {name}, which has no heading",
+            "needs heading, compass_deg, or fixes of a moving vehicle",
+            "Add one, or give vx and vy.",
+        )
     if len(way.fixes.t) < 2:
-        hint = "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z."
-        raise InputError(f"vehicle {name}", "no odometry, and less than two fixes", "cannot be placed", hint)
+        raise InputError(
+            f"vehicle {name}",
+            "no odometry, and less than two fixes",
+            "cannot be placed",
+            "Log a fix and odometry, or two fixes and more; give a road-side unit one row with x, y, z.",
+        )
     summary.assume(DERIVED, name)
     return None, way.fixes, heading._replace(wanders=shown.wanders)
 

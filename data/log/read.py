@@ -305,21 +305,29 @@ def _rows(path: Path, truth: str | Path | None, summary: Summary, options: dict[
             raise InputError("truth", str(truth), "must be a file", "Check the path.")
         files = _files(path) if path.is_dir() else [path]
         if segments := [str(p.relative_to(path)) for p in path.rglob("*") if p.is_dir() and is_segment(p)]:
-            allowed = "must be one log; segments of comma2k19 are logs of their own"
-            raise InputError(path.name, ", ".join(sorted(segments)), allowed, "Name one of them, or the other files.")
+            raise InputError(
+                path.name,
+                ", ".join(sorted(segments)),
+                "must be one log; segments of comma2k19 are logs of their own",
+                "Name one of them, or the other files.",
+            )
         summary.refuse("files in folders of a folder with files", len(_every_file(path)) - len(files) * path.is_dir())
         true_files = true_files or [f for f in files if TRUTH.fullmatch(f.stem) and f != path]
         files = [f for f in files if f not in true_files and (not TRUTH.fullmatch(f.stem) or f == path)]
         if not files:
-            allowed = f"must hold files in {', '.join(READERS)}"
-            raise InputError("path", str(path), allowed, "Point at the folder of the log.")
+            raise InputError(
+                "path", str(path), f"must hold files in {', '.join(READERS)}", "Point at the folder of the log."
+            )
         tables = [file for file in (*files, *true_files) if options["columns"] and file.suffix.lower() in TABLES]
         names = {header for file in tables for header in headers(file)}
         for key, header in options["columns"].items():
             if header not in names:
-                allowed = f"is in no table, which have {', '.join(sorted(names))}"
-                hint = suggestion(header, names, "Name a column of a table.")
-                raise InputError(f"{path.name}: columns[{key!r}]", repr(header), allowed, hint)
+                raise InputError(
+                    f"{path.name}: columns[{key!r}]",
+                    repr(header),
+                    f"is in no table, which have {', '.join(sorted(names))}",
+                    suggestion(header, names, "Name a column of a table."),
+                )
         parts = [_read_file(file, path, summary, **options) for file in files]
     if not any(map(len, parts)):
         raise InputError(path.name, "0 rows", "must hold measurements", "Check that the files are complete.")
@@ -359,9 +367,12 @@ def _check_one_drive(rows: Rows, path: Path) -> None:
     covered = ends[-1] - begins[0] - gaps.clip(0.0).sum() if len(spans) else 0.0
     if (gaps <= max(APART, covered)).all():
         return
-    listed = "; ".join(f"{file}: {begin:.0f} to {end:.0f} s" for file, begin, end in spans.itertuples())
-    allowed = f"must hold the files of one drive; these are up to {gaps.max() / 3600:.3g} h apart"
-    raise InputError(path.name, listed, allowed, "Give each drive a folder of its own, and name that.")
+    raise InputError(
+        path.name,
+        "; ".join(f"{file}: {begin:.0f} to {end:.0f} s" for file, begin, end in spans.itertuples()),
+        f"must hold the files of one drive; these are up to {gaps.max() / 3600:.3g} h apart",
+        "Give each drive a folder of its own, and name that.",
+    )
 
 
 def _check_scale(rows: Rows, name: str) -> None:
@@ -379,11 +390,19 @@ def _ids(rows: Rows, body: bool, summary: Summary) -> list[str]:
     if names and (not moving or names & moving):
         return [name for name in rows["vehicle"].unique() if name in names]
     if body:
-        hint = f"Give speed and yaw_rate of every vehicle, and x, y (and z) of landmarks. {summary.unread}".rstrip()
-        raise InputError("fixes, odometry", "none", "must be there: a pose is carried on by odometry", hint)
+        raise InputError(
+            "fixes, odometry",
+            "none",
+            "must be there: a pose is carried on by odometry",
+            f"Give speed and yaw_rate of every vehicle, and x, y (and z) of landmarks. {summary.unread}".rstrip(),
+        )
     hint = "Give x, y (and z) or latitude, longitude (and height) of every vehicle, at least once; where ranges to "
-    hint = f'{hint}anchors place it, read frame="body". {summary.unread}'.rstrip()
-    raise InputError("fixes", "none", "must be there: a position in the local frame starts from one", hint)
+    raise InputError(
+        "fixes",
+        "none",
+        "must be there: a position in the local frame starts from one",
+        f'{hint}anchors place it, read frame="body". {summary.unread}'.rstrip(),
+    )
 
 
 def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
@@ -397,8 +416,12 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
     t, summary.odometry = rows["t"][in_group(rows, "odometry", "fix")], moves if moves > 0 else 0.0
     span = t.max() - t.min()
     if not span:
-        allowed = "must hold two instants or more"
-        raise InputError(f"{summary.name}: t", f"{t.min():.10g} s throughout", allowed, "Is the file complete?")
+        raise InputError(
+            f"{summary.name}: t",
+            f"{t.min():.10g} s throughout",
+            "must hold two instants or more",
+            "Is the file complete?",
+        )
     step = dt or float(f"{moves if moves > 0 else fixes:.3g}")
     if not step > 0:
         raise InputError("dt", "unknown", "must be given where no vehicle has two instants", "Pass dt=0.1.")
@@ -424,8 +447,7 @@ def _grid(rows: Rows, dt: float | None, body: bool, summary: Summary) -> Floats:
             summary.assume(f"steps of {step:g} s, since fixes come at two rates or more")
     check_size(span / step + 1.5, rows["vehicle"].nunique(), len(rows), step, summary.name)
     if span / step < 0.5:
-        allowed = f"must be well below the {span:g} s of the log"
-        raise InputError("dt", f"{step:g} s", allowed, "Take a shorter dt.")
+        raise InputError("dt", f"{step:g} s", f"must be well below the {span:g} s of the log", "Take a shorter dt.")
     return float(t.min()) + step * np.arange(int(span / step + 1.5))
 
 
@@ -436,9 +458,12 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
     if len(ids) == 1 and vehicles == [Path(rows["file"].iloc[0]).stem]:
         rows = rows.assign(vehicle=ids[0])
     elif not set(vehicles) & set(ids):
-        allowed = f"must name vehicles of the log: {', '.join(ids)}"
-        field = f"{rows['file'].iloc[0]}: column vehicle"
-        raise InputError(field, ", ".join(vehicles), allowed, "Rename them, or leave the truth out.")
+        raise InputError(
+            f"{rows['file'].iloc[0]}: column vehicle",
+            ", ".join(vehicles),
+            f"must name vehicles of the log: {', '.join(ids)}",
+            "Rename them, or leave the truth out.",
+        )
     if rows["t"].max() < 2 * DAY:  # seconds of the day, as of NMEA without a date, are of the day of the log
         rows = rows.assign(t=rows["t"] + DAY * round((recording.t.mean() - rows["t"].mean()) / DAY))
     axes = 3 if (rows["kind"] == "z").any() else 2
@@ -456,9 +481,12 @@ def _truth(rows: Rows, recording: Recording, max_gap: float | None, name: str) -
                 out[:] = value[0]
     position, angle = poses[..., :3], poses[..., 3]
     if not np.isfinite(position).any():
-        actual = f"{rows['t'].min():.10g} to {rows['t'].max():.10g} s"
-        allowed = f"must overlap the log, from {start:.10g} to {recording.t[-1]:.10g} s"
-        raise InputError(f"{rows['file'].iloc[0]}: column t", actual, allowed, "Does its clock or its date differ?")
+        raise InputError(
+            f"{rows['file'].iloc[0]}: column t",
+            f"{rows['t'].min():.10g} to {rows['t'].max():.10g} s",
+            f"must overlap the log, from {start:.10g} to {recording.t[-1]:.10g} s",
+            "Does its clock or its date differ?",
+        )
     there = np.pad(np.isfinite(position[..., 0]), ((1, 1), (0, 0)))
     position[~(there[2:] | there[:-2])] = np.nan
     velocity = backward_difference(recording.t, position, ids)

@@ -86,8 +86,12 @@ def together(log: Log) -> tuple[Log, str]:
     there: Bools = np.isfinite(rec.velocity[0][:, _moving(rec), 0]).all(axis=1)
     first, last = max(stretches(there), key=lambda edge: edge[1] - edge[0], default=(0, 0))
     if last - first < 2 or not _moving(rec):
-        hint = "Raise max_gap, give clock= where stamps differ, or leave out files of vehicles that are hardly there."
-        raise InputError("log", log.summary.name, "must hold steps at which all vehicles are there", hint)
+        raise InputError(
+            "log",
+            log.summary.name,
+            "must hold steps at which all vehicles are there",
+            "Raise max_gap, give clock= where stamps differ, or leave out files of vehicles that are hardly there.",
+        )
     t = rec.t - rec.t[0]
     span = "throughout" if there.all() else f"from {t[first]:.1f} to {t[last - 1]:.1f} s, where all are there"
     truth = None if log.truth is None else log.truth.between(first, last)

@@ -74,8 +74,9 @@ def read_log_table(
     if "t" not in frame.columns:
         placed = {"x", "y"} <= set(frame.columns) or {"latitude", "longitude"} <= set(frame.columns)
         if not (placed and "vehicle" in frame.columns and frame["vehicle"].is_unique):
-            allowed = "is needed; one of places alone has vehicle, x, y, each vehicle once"
-            raise missing_column(file, "t", list(frame.columns), allowed)
+            raise missing_column(
+                file, "t", list(frame.columns), "is needed; one of places alone has vehicle, x, y, each vehicle once"
+            )
         summary.assume("members of a table without times stand where it says, from the first instant on")
     if "vehicle" not in frame.columns:
         frame = frame.assign(vehicle=path.stem)
@@ -99,9 +100,12 @@ def _long(
         first, *others = dict.fromkeys(strange.tolist())
         more = f" Unknown too: {', '.join(map(repr, others))}." if others else ""
         hint = f'Map it with kinds={{"{first}": ...}}, or leave it out: ignore=["{first}"].{more}'
-        hint = f"{suggestion(first, KINDS, '')} {hint}".lstrip()
-        field, allowed = f"{file}: row {strange.index[0]}, column kind", f"must be one of {', '.join(KINDS)}"
-        raise InputError(field, repr(first), allowed, hint)
+        raise InputError(
+            f"{file}: row {strange.index[0]}, column kind",
+            repr(first),
+            f"must be one of {', '.join(KINDS)}",
+            f"{suggestion(first, KINDS, '')} {hint}".lstrip(),
+        )
     return _cells(frame, file, "value", "std")
 
 
@@ -116,8 +120,9 @@ def _wide(
     if not (value or beside):
         allowed = f"must be there, or columns named after kinds ({', '.join(KINDS)})"
         error = missing_column(file, "kind", list(frame.columns), allowed)
-        hint = f'{error.hint} Or name the columns: kinds={{"...": "speed_kmh"}}.'
-        raise InputError(error.field, error.value, error.allowed, hint)
+        raise InputError(
+            error.field, error.value, error.allowed, f'{error.hint} Or name the columns: kinds={{"...": "speed_kmh"}}.'
+        )
     if "std" in frame.columns and {KINDS[kind].group for kind in value} == {"fix"}:
         summary.assume(f"column std of {file} is the standard deviation of each of {', '.join(value)}")
         frame = frame.assign(**{f"{kind}_std": frame["std"] for kind in value}).drop(columns="std")

@@ -158,9 +158,12 @@ def check_values(rows: Rows) -> None:
         if wrong.any():
             first, cell = kind[wrong].iloc[0], actual[wrong].iloc[0]
             others = ", ".join(name for name in KINDS if KINDS[name].name == KINDS[first].name)
-            shown = (repr(cell) if cell else "empty") if actual is partner else f"{cell:.10g}"
-            allowed, hint = allowed.format(limit=KINDS[first].limit), hint.format(kinds=others)
-            raise InputError(f"{place(rows[wrong])}, {column.format(kind=first)}", shown, allowed, hint)
+            raise InputError(
+                f"{place(rows[wrong])}, {column.format(kind=first)}",
+                (repr(cell) if cell else "empty") if actual is partner else f"{cell:.10g}",
+                allowed.format(limit=KINDS[first].limit),
+                hint.format(kinds=others),
+            )
 
 
 def distinct(rows: Rows, summary: "Summary") -> Rows:
