@@ -111,11 +111,8 @@ class Factor:
     def __post_init__(self, cov: npt.ArrayLike | None) -> None:
         measurement = _checked(self)
         self.__dict__["z"] = check_values(measurement, self.z, len(self.nodes))
-        stds = [
-            name
-            for name, v in (("std", self.std), ("sqrt_information", self.sqrt_information), ("cov", cov))
-            if v is not None
-        ]
+        noise = {"std": self.std, "sqrt_information": self.sqrt_information, "cov": cov}
+        stds = [name for name, value in noise.items() if value is not None]
         if len(stds) != 1:
             allowed = "exactly one of std, cov and sqrt_information must be given"
             raise InputError("std", " and ".join(stds) or "nothing", allowed, "Give std=.")
@@ -147,12 +144,7 @@ class Factor:
     @property
     def informative(self) -> Bools:
         """(M,) True where the measurement carries information."""
-        if self.std is not None:
-            informed = np.isfinite(self.std).any(axis=-1)
-        else:
-            assert self.sqrt_information is not None
-            informed = (self.sqrt_information != 0).any(axis=(-2, -1))
-        return np.broadcast_to(informed, len(self.nodes))
+        return np.asarray((self.root != 0).any(axis=(1, 2)))
 
     @property
     def root(self) -> Floats:
@@ -201,9 +193,9 @@ def names_of(kind: Any) -> tuple[str, ...]:
 def taken(factor: Factor, rows: Ints) -> Factor:
     """Some measurements of a factor."""
     parts = {
-        name: array[rows] if len(array := getattr(factor, name)) == len(factor.nodes) else array
+        name: array[rows]
         for name in ("z", "std", "sqrt_information", "constants")
-        if getattr(factor, name) is not None
+        if (array := getattr(factor, name)) is not None and len(array) == len(factor.nodes)
     }
     return unchecked(factor, nodes=factor.nodes[rows], **parts)
 
